@@ -1,0 +1,16 @@
+//! The law of midshift: what a task, an attempt, a robot and a place are, and every rule about them.
+//!
+//! Invariant: nothing here does IO, reads a clock, draws a random number by itself or awaits. Functions take
+//! `now` and values and return values; services act on what is returned.
+
+pub mod authority;
+pub mod ids;
+pub mod limits;
+pub mod policy;
+pub mod reason;
+pub mod robot;
+pub mod rows;
+pub mod site;
+pub mod task;
+pub mod time;
+pub mod work;

@@ -1,0 +1,98 @@
+//! Every limit and constant, in one place, with its unit and why. L = link clock, S = site clock in the type.
+
+use crate::time::{LinkDuration, SiteDuration};
+
+/// Period of the heartbeat, which is the status: one message a second is what a person watching needs.
+pub const HEARTBEAT: LinkDuration = LinkDuration::from_secs(1);
+/// No heartbeat for this long: SUSPECT, no new work.
+pub const SUSPECT_AFTER: LinkDuration = LinkDuration::from_secs(3);
+/// No heartbeat for this long: OFFLINE. One second past the robot's own authority, so the robot always ends first.
+pub const OFFLINE_AFTER: LinkDuration = LinkDuration::from_secs(31);
+/// Robot side: authority to go on with an attempt after sending the newest heartbeat that was echoed.
+pub const AUTHORITY: LinkDuration = LinkDuration::from_secs(30);
+/// Server side: the lease over the same authority; 2 % and more above [`AUTHORITY`] for clock drift.
+pub const LEASE: LinkDuration = LinkDuration::from_secs(31);
+/// Validity of an offer from the heartbeat that anchors it.
+pub const OFFER_VALID: LinkDuration = LinkDuration::from_secs(5);
+/// Validity of a permission to enter a place.
+pub const PLACE_ENTRY_VALID: LinkDuration = LinkDuration::from_secs(10);
+/// Validity of a resume order.
+pub const RESUME_VALID: LinkDuration = LinkDuration::from_secs(10);
+/// Heartbeats whose send time a robot remembers. 64 s at one a second covers every validity.
+pub const HEARTBEATS_REMEMBERED: usize = 64;
+/// How long a robot may take to confirm a stop before a person is asked.
+pub const STOP_CONFIRM: LinkDuration = LinkDuration::from_secs(15);
+/// How long an attempt may stay UNCERTAIN before a person is asked.
+pub const UNCERTAIN_LIMIT: LinkDuration = LinkDuration::from_secs(300);
+/// After a start of fleet no timer fires for this long: robots say hello first.
+pub const TIMER_GRACE: LinkDuration = LinkDuration::from_secs(10);
+/// No progress of a running step for this long: stall.
+pub const STALL_DEFAULT: SiteDuration = SiteDuration::from_secs(60);
+/// Default wait for a robot.
+pub const SCHEDULE_TO_START_DEFAULT: SiteDuration = SiteDuration::from_secs(15 * 60);
+/// Waiting this long promotes a task by one class.
+pub const MAX_WAIT: SiteDuration = SiteDuration::from_secs(15 * 60);
+/// The agent's own start_to_close ends this much earlier than the server's, permille.
+pub const AGENT_TIMEOUT_EARLIER_PERMILLE: u64 = 50;
+/// Robot breaker: this many failed attempts ...
+pub const BREAKER_FAILURES: usize = 3;
+/// ... within this time take the robot out of dispatch until a person says so.
+pub const BREAKER_WINDOW: SiteDuration = SiteDuration::from_secs(600);
+/// Refusals in a row before a person is asked: NO_ROBOT_ACCEPTS.
+pub const REFUSALS_IN_ROW: u32 = 5;
+/// Steps of one task.
+pub const STEPS_MAX: usize = 64;
+/// Labels of one task or robot.
+pub const LABELS_MAX: usize = 32;
+/// Dependencies of one task.
+pub const DEPENDS_ON_MAX: usize = 32;
+/// Attempts of one task after the first.
+pub const RETRY_TIMES_MAX: u32 = 100;
+/// Shortest and longest timeout of a task, milliseconds of site time.
+pub const TASK_TIMEOUT_MS: std::ops::RangeInclusive<u64> = 1_000..=86_400_000;
+/// Items in one SubmitTasks call.
+pub const SUBMIT_ITEMS_MAX: usize = 10_000;
+/// Items committed together from one SubmitTasks call.
+pub const SUBMIT_SLICE: usize = 500;
+/// A reason given by a person, bytes.
+pub const REASON_BYTES_MAX: usize = 256;
+/// Parameters of one action as JSON, bytes.
+pub const PARAMS_BYTES_MAX: usize = 8 * 1024;
+/// Page size if none is asked, and at most.
+pub const PAGE_DEFAULT: usize = 100;
+/// Largest page.
+pub const PAGE_MAX: usize = 1_000;
+/// A control message, bytes.
+pub const CONTROL_MESSAGE_BYTES: usize = 64 * 1024;
+/// A telemetry batch, bytes.
+pub const TELEMETRY_BATCH_BYTES: usize = 1024 * 1024;
+/// Concurrent streams of one connection.
+pub const STREAMS_PER_CONNECTION: u32 = 64;
+/// Items one group commit takes at most.
+pub const GROUP_COMMIT_ITEMS: usize = 2_000;
+/// Bytes of row bodies one group commit takes at most.
+pub const GROUP_COMMIT_BYTES: usize = 1024 * 1024;
+/// Rows one item may touch, and facts it may state.
+pub const ITEM_ROWS_MAX: usize = 256;
+/// Samples in one uplink message.
+pub const SAMPLES_PER_MESSAGE: usize = 256;
+/// CRITICAL and EVENT samples a robot may send a second before it summarises.
+pub const EVENTS_PER_SECOND: u32 = 50;
+/// Unacknowledged STATUS a robot may have under way, bytes.
+pub const STATUS_IN_FLIGHT_BYTES: usize = 64 * 1024;
+/// STATUS samples a ring keeps per robot before it thins.
+pub const RING_STATUS_MAX: usize = 4_096;
+/// Days a request_id, an event and a finished id on the robot's ledger are kept.
+pub const REMEMBER_DAYS: u64 = 7;
+/// Finished ids a ledger keeps whatever their age.
+pub const LEDGER_IDS_MIN: usize = 100_000;
+/// Longest unary call. L
+pub const UNARY_DEADLINE: LinkDuration = LinkDuration::from_secs(30);
+/// How long CancelTask waits for fleet before it answers with the task as it is.
+pub const CANCEL_WAIT: LinkDuration = LinkDuration::from_secs(1);
+/// A person's or another process' late wake costs at most this.
+pub const SWEEP: LinkDuration = LinkDuration(250);
+/// Open streams are cut this long after Ctrl-C.
+pub const HARD_DRAIN: LinkDuration = LinkDuration::from_secs(2);
+/// A clone or fenced robot may come back after this.
+pub const FENCED_RETRY: LinkDuration = LinkDuration::from_secs(60);

@@ -1,0 +1,275 @@
+//! Why something is refused, waits or ended: the closed list of reasons, the closed set of error kinds, and violations.
+//!
+//! Invariant: every error a caller can see is one [`Kind`] and one [`Code`]; the only door to a gRPC status is in `midshift-proto`.
+
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::fmt;
+
+/// Closed set of error kinds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// Bad input; carries violations.
+    Invalid,
+    /// No such thing.
+    NotFound,
+    /// Same id, other body.
+    AlreadyExists,
+    /// The state of the world forbids it now.
+    Precondition,
+    /// A generation or etag moved.
+    Conflict,
+    /// A limit was reached; try later.
+    Exhausted,
+    /// Not now, nobody's fault; try later.
+    Unavailable,
+    /// Too late.
+    Deadline,
+    /// Ours; the text is hidden.
+    Internal,
+}
+
+macro_rules! codes {
+    ($($variant:ident = $text:literal, $help:literal;)*) => {
+        /// One reason, UPPER_SNAKE on the wire.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+        pub enum Code {
+            $(#[doc = $help] #[serde(rename = $text)] $variant,)*
+        }
+        impl Code {
+            /// Every code.
+            pub const ALL: &'static [Code] = &[$(Self::$variant),*];
+            /// The name on the wire.
+            pub const fn as_str(self) -> &'static str {
+                match self { $(Self::$variant => $text),* }
+            }
+            /// What it means and what to try, for a person.
+            pub const fn help(self) -> &'static str {
+                match self { $(Self::$variant => $help),* }
+            }
+        }
+    };
+}
+
+codes! {
+    // --- answers to a caller
+    InvalidRequest = "INVALID_REQUEST", "The request broke one or more rules; each is listed. Mend them all and send it again.";
+    TaskNotFound = "TASK_NOT_FOUND", "No task has this id. Check the id, or list tasks.";
+    RobotNotFound = "ROBOT_NOT_FOUND", "No robot has this id. List robots to see who has ever connected.";
+    PlaceNotFound = "PLACE_NOT_FOUND", "The site has no such place. List places.";
+    AreaNotFound = "AREA_NOT_FOUND", "The site has no such area.";
+    RequestIdReused = "REQUEST_ID_REUSED", "This request_id was used with another body. Use a new one for a new request.";
+    TaskIdTaken = "TASK_ID_TAKEN", "A task with this id exists with another body. Choose another id or leave it empty.";
+    EtagMismatch = "ETAG_MISMATCH", "The object changed since you read it. Read it again and decide again.";
+    NotSupportedYet = "NOT_SUPPORTED_YET", "This field is reserved and does nothing yet, so it is refused rather than ignored. Leave it out.";
+    TaskEnded = "TASK_ENDED", "The task is over and cannot be changed.";
+    NotAllowedNow = "NOT_ALLOWED_NOW", "The state of the object does not allow this now. Read it again.";
+    ResolutionNotAllowed = "RESOLUTION_NOT_ALLOWED", "This resolution is not among the task's allowed resolutions.";
+    PlaceNotClear = "PLACE_NOT_CLEAR", "A robot reports that it stands in this place; move it out first.";
+    CursorExpired = "CURSOR_EXPIRED", "The cursor is older than what is kept. Start again without one.";
+    CursorOfOtherStore = "CURSOR_OF_OTHER_STORE", "The cursor comes from another store. Start again without one.";
+    StoreUnavailable = "STORE_UNAVAILABLE", "The store does not answer. Nothing was decided; try again.";
+    CommitUnknown = "COMMIT_UNKNOWN", "Nobody knows whether it was committed. Send it again with the same request_id.";
+    Overloaded = "OVERLOADED", "A queue is full. Try again later.";
+    DeadlineExceeded = "DEADLINE_EXCEEDED", "The call took longer than its deadline. The outcome is unknown; ask again with the same request_id.";
+    Internal = "INTERNAL", "A fault of midshift. The request_id is in the log.";
+    // --- why a robot does not get a task
+    RobotPinnedElsewhere = "ROBOT_PINNED_ELSEWHERE", "The task names another robot.";
+    MissingCapability = "MISSING_CAPABILITY", "The robot cannot do one of the task's actions or lacks a required capability.";
+    LabelMismatch = "LABEL_MISMATCH", "The robot's labels do not match the task's selector.";
+    PayloadTooHeavy = "PAYLOAD_TOO_HEAVY", "The task needs more payload than the robot can carry.";
+    SoftwareTooOld = "SOFTWARE_TOO_OLD", "The robot's software is older than the task asks for.";
+    RobotOffline = "ROBOT_OFFLINE", "No heartbeat for 31 s or never connected. Look at its network and power.";
+    RobotSuspect = "ROBOT_SUSPECT", "No heartbeat for 3 s; it gets no new work until it is heard again.";
+    RobotManual = "ROBOT_MANUAL", "The robot is in manual or service mode.";
+    RobotCordoned = "ROBOT_CORDONED", "A person took the robot out of dispatch. Uncordon it.";
+    RobotBrokenOff = "ROBOT_BROKEN_OFF", "Three failed attempts in ten minutes took the robot out of dispatch. Look at it, then uncordon it.";
+    RobotHeld = "ROBOT_HELD", "A hold token stands on the robot. Resume it.";
+    RobotStopped = "ROBOT_STOPPED", "The robot reports a stop of its own safety system.";
+    RobotBusy = "ROBOT_BUSY", "The robot has other work.";
+    RobotReconciling = "ROBOT_RECONCILING", "The robot's report differs from the record; it gets work once they agree.";
+    RobotObserved = "ROBOT_OBSERVED", "Two sessions claim this robot id. This one is watched and gets no work.";
+    RobotLoaded = "ROBOT_LOADED", "The robot carries something that is not of this task.";
+    RobotFault = "ROBOT_FAULT", "The robot reports a fault that a person must look at.";
+    RobotUnlocated = "ROBOT_UNLOCATED", "The robot has not reported a waypoint of this site.";
+    BatteryLow = "BATTERY_LOW", "The charge does not reach pickup, drop and a charger with its reserve.";
+    NoRoute = "NO_ROUTE", "No lane leads there.";
+    PlaceBlocked = "PLACE_BLOCKED", "A place on the way is quarantined. A person must look and clear it.";
+    ExcludedAfterFailure = "EXCLUDED_AFTER_FAILURE", "The robot failed this task and the task asks for another.";
+    BoundElsewhere = "BOUND_ELSEWHERE", "The task is opened: its item is on another robot.";
+    // --- why a task waits or ended
+    WaitingForRobot = "WAITING_FOR_ROBOT", "No robot passes all filters now.";
+    WaitingForDependency = "WAITING_FOR_DEPENDENCY", "A task it depends on has not succeeded yet.";
+    WaitingForTime = "WAITING_FOR_TIME", "Its not_before lies ahead.";
+    WaitingForHold = "WAITING_FOR_HOLD", "A hold token stands on the task. Resume it.";
+    WaitingInQueue = "WAITING_IN_QUEUE", "Tasks of higher priority or age go first.";
+    WaitingForRetry = "WAITING_FOR_RETRY", "It failed and waits out its back-off.";
+    DependencyFailed = "DEPENDENCY_FAILED", "A task it depends on ended without success.";
+    NoRobotAccepts = "NO_ROBOT_ACCEPTS", "Five robots in a row refused it.";
+    NoRobotCan = "NO_ROBOT_CAN", "Every candidate refused it for its content; it cannot be done as asked.";
+    AttemptsSpent = "ATTEMPTS_SPENT", "Every allowed attempt failed.";
+    FaultNotRecoverable = "FAULT_NOT_RECOVERABLE", "The robot reported a fault that is never retried.";
+    TaskFailed = "TASK_FAILED", "The attempt failed and the task asks for no retry.";
+    ScheduleToStart = "SCHEDULE_TO_START", "No robot started it in time.";
+    StartToClose = "START_TO_CLOSE", "The attempt took longer than the task's timeout.";
+    Stalled = "STALLED", "The robot made no progress for too long.";
+    DeadlinePassed = "DEADLINE_PASSED", "The task's deadline passed.";
+    OfferNotAnswered = "OFFER_NOT_ANSWERED", "The robot did not answer the offer in time.";
+    StopNotConfirmed = "STOP_NOT_CONFIRMED", "The robot did not confirm its stop. Its places stay taken until it reports or a person clears them.";
+    LeaseOver = "LEASE_OVER", "The robot was not heard for longer than its authority.";
+    ManualMode = "MANUAL_MODE", "A person took the robot over.";
+    StepUnknown = "STEP_UNKNOWN", "The robot restarted inside a step that must not be done twice.";
+    UncertainTooLong = "UNCERTAIN_TOO_LONG", "Nobody could say for five minutes what the robot did.";
+    RobotDroppedIt = "ROBOT_DROPPED_IT", "The robot no longer has the attempt.";
+    Forced = "FORCED", "A person ended it by force; robot and places stay kept until the robot reports.";
+    CanceledByUser = "CANCELED_BY_USER", "A person or program canceled it.";
+    ResolvedByUser = "RESOLVED_BY_USER", "A person resolved it.";
+    BatterySuspend = "BATTERY_SUSPEND", "The robot goes to charge first.";
+    // --- a robot's refusals and session answers
+    StaleAuthority = "STALE_AUTHORITY", "The message reached the robot after its authority had ended, or was anchored to another session.";
+    StaleEpoch = "STALE_EPOCH", "The robot has passed this epoch.";
+    AlreadyFinished = "ALREADY_FINISHED", "The robot's ledger says the task is finished; the stored answer was sent.";
+    UnknownWaypoint = "UNKNOWN_WAYPOINT", "The robot's map has no such waypoint.";
+    UnsupportedAction = "UNSUPPORTED_ACTION", "The robot's body cannot do this action.";
+    NotAutomatic = "NOT_AUTOMATIC", "The robot is not in automatic mode.";
+    AnotherHolder = "ANOTHER_HOLDER", "The robot's ledger already has a holder.";
+    Fenced = "FENCED", "A newer session of this robot proved its succession.";
+    ProtocolError = "PROTOCOL_ERROR", "A message broke the session's rules.";
+    ClockRateMismatch = "CLOCK_RATE_MISMATCH", "The robot's clock rate differs from the server's.";
+    ShuttingDown = "SHUTTING_DOWN", "The server is stopping; come back soon.";
+    MoveOver = "MOVE_OVER", "The session is old; open the next one before this one closes.";
+    Overflow = "OVERFLOW", "The robot's ring was full and thinned its oldest status.";
+    FreedAfterAck = "FREED_AFTER_ACK", "The robot freed this range after it was acknowledged.";
+    Poison = "POISON", "A sample could not be read; it was recorded, acknowledged and skipped.";
+    CloneSeen = "CLONE_SEEN", "Two sessions with one robot id were alive at once. Find the second machine.";
+    StoreBehindRobot = "STORE_BEHIND_ROBOT", "A robot knows a newer generation than the store: the store was restored from a backup.";
+    RobotBreakerOpened = "ROBOT_BREAKER_OPENED", "A robot failed three attempts in ten minutes.";
+    PlaceQuarantined = "PLACE_QUARANTINED", "A place is kept closed until the robot inside reports or a person clears it.";
+    HoldByPerson = "HOLD_BY_PERSON", "A person asked for a pause.";
+    HoldByBody = "HOLD_BY_BODY", "The robot's own safety system stopped it.";
+}
+
+impl fmt::Display for Code {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+impl std::str::FromStr for Code {
+    type Err = ();
+    fn from_str(text: &str) -> Result<Self, ()> {
+        Self::ALL.iter().copied().find(|c| c.as_str() == text).ok_or(())
+    }
+}
+
+/// A code, a sentence and the facts behind it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Reason {
+    /// The code.
+    pub code: Code,
+    /// One plain sentence; empty means the code's help text.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub message: String,
+    /// Ids, measured values, limits; at most 16.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub metadata: BTreeMap<String, String>,
+}
+
+impl From<Code> for Reason {
+    fn from(code: Code) -> Self {
+        Self { code, message: String::new(), metadata: BTreeMap::new() }
+    }
+}
+
+impl Reason {
+    /// With a sentence of its own.
+    pub fn new(code: Code, message: impl Into<String>) -> Self {
+        Self { code, message: message.into(), metadata: BTreeMap::new() }
+    }
+    /// Adds one fact.
+    #[must_use]
+    pub fn with(mut self, key: &str, value: impl fmt::Display) -> Self {
+        self.metadata.insert(key.to_owned(), value.to_string());
+        self
+    }
+    /// The sentence to show.
+    pub fn text(&self) -> &str {
+        if self.message.is_empty() { self.code.help() } else { &self.message }
+    }
+}
+
+/// One broken rule of a request.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Violation {
+    /// Path into the request, e.g. `spec.steps[2].goto.waypoint`.
+    pub field: String,
+    /// The rule, as a person reads it.
+    pub description: String,
+}
+
+/// Collects every violation of one request, so that a caller hears them all at once.
+#[derive(Debug, Default)]
+pub struct Violations(pub Vec<Violation>);
+
+impl Violations {
+    /// Notes one violation.
+    pub fn add(&mut self, field: impl Into<String>, description: impl Into<String>) {
+        self.0.push(Violation { field: field.into(), description: description.into() });
+    }
+    /// Takes the value of `result`, or notes the error under `field`.
+    pub fn take<T, E: fmt::Display>(&mut self, field: &str, result: Result<T, E>) -> Option<T> {
+        result.map_err(|e| self.add(field, e.to_string())).ok()
+    }
+    /// `Ok` if nothing was noted.
+    pub fn finish(self) -> Result<(), Refusal> {
+        if self.0.is_empty() { Ok(()) } else { Err(Refusal::invalid(self.0)) }
+    }
+}
+
+/// The answer to a caller that did not get what it asked for.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{}: {}", reason.code, reason.text())]
+pub struct Refusal {
+    /// Why.
+    pub reason: Reason,
+    /// For [`Kind::Invalid`]: each broken rule.
+    pub violations: Vec<Violation>,
+    kind: Kind,
+}
+
+
+impl Refusal {
+    /// A refusal of `kind` for `reason`.
+    pub fn new(kind: Kind, reason: impl Into<Reason>) -> Self {
+        Self { reason: reason.into(), violations: Vec::new(), kind }
+    }
+    /// Bad input with all its violations.
+    pub fn invalid(violations: Vec<Violation>) -> Self {
+        let text = violations.iter().map(|v| format!("{}: {}", v.field, v.description)).collect::<Vec<_>>().join("; ");
+        Self { violations, ..Self::new(Kind::Invalid, Reason::new(Code::InvalidRequest, text)) }
+    }
+    /// One violation.
+    pub fn field(field: &str, description: impl Into<String>) -> Self {
+        Self::invalid(vec![Violation { field: field.to_owned(), description: description.into() }])
+    }
+    /// The kind.
+    pub fn kind(&self) -> Kind {
+        self.kind
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_code_is_upper_snake_unique_and_helps() {
+        let mut seen = std::collections::BTreeSet::new();
+        for code in Code::ALL {
+            assert!(code.as_str().chars().all(|c| c.is_ascii_uppercase() || c == '_'), "{code}");
+            assert!(seen.insert(code.as_str()), "{code} twice");
+            assert!(code.help().ends_with('.'), "{code}");
+            assert_eq!(code.as_str().parse(), Ok(*code));
+        }
+    }
+}

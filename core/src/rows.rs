@@ -1,0 +1,348 @@
+//! Rows as values: which tables exist, who writes them, and what one atomic item of a commit is.
+//!
+//! Invariant: each table has one writing service; the single exception is declared in [`Table::born_by`]. The store refuses
+//! any other write at run time, and the architecture test holds this list against `docs/rows.md`.
+//! A revision counts the writes of one row, from 1. Ids of rows that can be deleted are never used again, so
+//! a revision never means two things.
+
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+/// A service that writes rows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Writer {
+    /// Task intake.
+    Task,
+    /// Fleet scheduling.
+    Fleet,
+    /// Telemetry ingest.
+    Telemetry,
+}
+
+impl Writer {
+    /// All writers.
+    pub const ALL: [Writer; 3] = [Writer::Task, Writer::Fleet, Writer::Telemetry];
+    /// Name in tables and logs.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Task => "task",
+            Self::Fleet => "fleet",
+            Self::Telemetry => "telemetry",
+        }
+    }
+}
+
+macro_rules! tables {
+    ($($variant:ident $name:literal $writer:ident, $doc:literal;)*) => {
+        /// Closed list of the tables of control.db.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+        pub enum Table { $(#[doc = $doc] $variant,)* }
+        impl Table {
+            /// Every table.
+            pub const ALL: &'static [Table] = &[$(Self::$variant),*];
+            /// Its name in SQL.
+            pub const fn name(self) -> &'static str { match self { $(Self::$variant => $name),* } }
+            /// The one service that changes it.
+            pub const fn writer(self) -> Writer { match self { $(Self::$variant => Writer::$writer),* } }
+        }
+    };
+}
+
+tables! {
+    TaskIntake "task_intake" Task, "What was asked for: immutable. id = task_id, order = admission number.";
+    TaskRequest "task_request" Task, "What people ask of a task or robot afterwards (cancel, resolve, resume): append-only.";
+    RequestKey "request_key" Task, "request_id -> payload hash and answer; kept 7 days.";
+    TaskState "task_state" Fleet, "Where a task is. Born QUEUED with its intake. state = phase.";
+    Attempt "attempt" Fleet, "One grant of a task or errand to one robot. id = subject/epoch, parent = subject.";
+    Timer "timer" Fleet, "A deadline in serving time. id = kind and attempt.";
+    HoldToken "hold_token" Fleet, "A reason why a task or robot must not move. id = scope, owner and token.";
+    PlaceGrant "place_grant" Fleet, "One passage or standing place: holders, queue, quarantine. id = place_id.";
+    RobotAuthority "robot_authority" Fleet, "The robot's mutex: none, a task's attempt, an errand, maintenance. id = robot_id.";
+    RobotControl "robot_control" Fleet, "Cordon, breaker, counters of failures, errand number. id = robot_id.";
+    RobotCounter "robot_counter" Fleet, "Work done per robot and software version. id = robot_id@software.";
+    Site "site" Fleet, "The site as text and its version. id = site_id.";
+    AreaPolicy "area_policy" Fleet, "Live rules of one area. id = area_id.";
+    DesiredWork "desired_work" Fleet, "Section `work` of a robot's desired state. id = robot_id.";
+    DesiredPolicy "desired_policy" Fleet, "Section `policy` of a robot's desired state. id = robot_id.";
+    ServiceClock "service_clock" Fleet, "Serving time of fleet, written with any commit, at most once a second.";
+    FleetMark "fleet_mark" Fleet, "Last position of each log that fleet has consumed.";
+    Incident "incident" Fleet, "Something a person should look into.";
+    Session "session" Telemetry, "A robot's newest session: epoch, secret, hello inventory. id = robot_id.";
+    Presence "presence" Telemetry, "ONLINE, SUSPECT, OFFLINE of a robot. id = robot_id.";
+    LaneMark "lane_mark" Telemetry, "Highest durable CRITICAL and EVENT number per ring. id = robot_id/ring.";
+}
+
+impl Table {
+    /// Who may create a row. `task_state` is born with its `task_intake`: the one declared exception.
+    pub const fn born_by(self) -> Writer {
+        match self {
+            Self::TaskState => Writer::Task,
+            other => other.writer(),
+        }
+    }
+}
+
+/// A stream of facts in commit order. Row changes go to the log of their writer; robots' events have one of their own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Log {
+    /// `task_event`.
+    Task,
+    /// `fleet_event`.
+    Fleet,
+    /// `telemetry_event`.
+    Telemetry,
+    /// `robot_inbox`: EVENT and CRITICAL of robots, acknowledged from here. Written by telemetry.
+    RobotInbox,
+}
+
+impl Log {
+    /// All logs.
+    pub const ALL: [Log; 4] = [Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox];
+    /// Its name in SQL.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Task => "task_event",
+            Self::Fleet => "fleet_event",
+            Self::Telemetry => "telemetry_event",
+            Self::RobotInbox => "robot_inbox",
+        }
+    }
+    /// The one service that writes it.
+    pub const fn writer(self) -> Writer {
+        match self {
+            Self::Task => Writer::Task,
+            Self::Fleet => Writer::Fleet,
+            Self::Telemetry | Self::RobotInbox => Writer::Telemetry,
+        }
+    }
+    /// The log that row changes of `writer` go to.
+    pub const fn of(writer: Writer) -> Self {
+        match writer {
+            Writer::Task => Self::Task,
+            Writer::Fleet => Self::Fleet,
+            Writer::Telemetry => Self::Telemetry,
+        }
+    }
+}
+
+/// Name of one row.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Key {
+    /// Its table.
+    pub table: Table,
+    /// Its id, unique within site and table.
+    pub id: Arc<str>,
+}
+
+impl Key {
+    /// A key.
+    pub fn new(table: Table, id: impl AsRef<str>) -> Self {
+        Self { table, id: Arc::from(id.as_ref()) }
+    }
+}
+
+/// Number of writes of one row, from 1.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, Default)]
+pub struct Revision(pub u64);
+
+impl Revision {
+    /// The revision after the next write.
+    #[must_use]
+    pub const fn next(self) -> Self {
+        Self(self.0 + 1)
+    }
+}
+
+/// Position in the commit order of one store. Starts at unix ms of the store's creation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, Default)]
+pub struct Seq(pub u64);
+
+/// The few columns that a list may filter and sort by.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Index {
+    /// State number of the row, if it has states.
+    pub state: Option<i64>,
+    /// Owner of the row (robot of an attempt, task of a request).
+    pub parent: Option<Arc<str>>,
+    /// Sort key.
+    pub order: Option<i64>,
+}
+
+/// A core type that is a row of control.db. The body is JSON.
+pub trait Record: Serialize + DeserializeOwned + Clone + Send + Sync + 'static {
+    /// Where it is kept.
+    const TABLE: Table;
+    /// Its id within the table.
+    fn id(&self) -> String;
+    /// Its index columns.
+    fn index(&self) -> Index {
+        Index::default()
+    }
+    /// Its key.
+    fn key(&self) -> Key {
+        Key::new(Self::TABLE, self.id())
+    }
+    /// The row body.
+    fn body(&self) -> Arc<str> {
+        // A record holds only plain data, which serde_json cannot fail to write.
+        serde_json::to_string(self).map_or_else(|e| unreachable!("record is not JSON: {e}"), Arc::from)
+    }
+}
+
+/// One stored row.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Row {
+    /// Its name.
+    pub key: Key,
+    /// Writes so far.
+    pub revision: Revision,
+    /// Index columns.
+    pub index: Index,
+    /// JSON.
+    pub body: Arc<str>,
+}
+
+impl Row {
+    /// Reads the body; an error names the row.
+    pub fn decode<R: Record>(&self) -> Result<R, BadRow> {
+        serde_json::from_str(&self.body).map_err(|source| BadRow { key: self.key.clone(), source: Arc::new(source) })
+    }
+}
+
+/// A row whose body is not what its table holds.
+#[derive(Clone, Debug, thiserror::Error)]
+#[error("row {key:?} cannot be read")]
+pub struct BadRow {
+    key: Key,
+    #[source]
+    source: Arc<serde_json::Error>,
+}
+
+/// What must be true of a row for its item to be applied.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Expect {
+    /// There is none.
+    Absent,
+    /// It stands at this revision.
+    At(Revision),
+}
+
+/// What happens to a row.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Write {
+    /// It becomes this.
+    Put {
+        /// Index columns.
+        index: Index,
+        /// JSON.
+        body: Arc<str>,
+    },
+    /// It goes.
+    Delete,
+    /// It was relied upon and stays as it is.
+    Keep,
+}
+
+/// One row of an item.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RowChange {
+    /// Which row.
+    pub key: Key,
+    /// On what condition.
+    pub expect: Expect,
+    /// What is done.
+    pub write: Write,
+    /// What happened, for the log (`task.assigned`); shown by event lists and audits.
+    pub kind: &'static str,
+}
+
+/// A fact that is not a row change: a robot's event in its inbox.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Fact {
+    /// Where it is kept.
+    pub log: Log,
+    /// What it is about (`robot_id` for the inbox).
+    pub subject: Arc<str>,
+    /// What happened.
+    pub kind: &'static str,
+    /// JSON.
+    pub body: Arc<str>,
+}
+
+/// All or nothing. Small on purpose: a plan is many items, so that one stale row costs one assignment and not the plan.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Item {
+    /// Who writes.
+    pub writer: Writer,
+    /// On whose behalf: a principal, a robot, or the service itself.
+    pub actor: Arc<str>,
+    /// The request behind it, if any.
+    pub request_id: Option<Arc<str>>,
+    /// Rows with their conditions, each key at most once.
+    pub rows: Vec<RowChange>,
+    /// Facts beside the rows.
+    pub facts: Vec<Fact>,
+}
+
+impl Item {
+    /// An empty item of `writer` on behalf of `actor`.
+    pub fn new(writer: Writer, actor: impl AsRef<str>) -> Self {
+        Self { writer, actor: Arc::from(actor.as_ref()), request_id: None, rows: Vec::new(), facts: Vec::new() }
+    }
+    /// Creates a row.
+    pub fn create<R: Record>(&mut self, record: &R, kind: &'static str) -> &mut Self {
+        self.put(record, Expect::Absent, kind)
+    }
+    /// Changes a row that stands at `revision`.
+    pub fn update<R: Record>(&mut self, record: &R, revision: Revision, kind: &'static str) -> &mut Self {
+        self.put(record, Expect::At(revision), kind)
+    }
+    /// Creates or changes a row.
+    pub fn put<R: Record>(&mut self, record: &R, expect: Expect, kind: &'static str) -> &mut Self {
+        let write = Write::Put { index: record.index(), body: record.body() };
+        self.rows.push(RowChange { key: record.key(), expect, write, kind });
+        self
+    }
+    /// Guards a row that is only relied upon.
+    pub fn keep(&mut self, key: Key, expect: Expect) -> &mut Self {
+        self.rows.push(RowChange { key, expect, write: Write::Keep, kind: "" });
+        self
+    }
+    /// Deletes a row that stands at `revision`.
+    pub fn delete(&mut self, key: Key, revision: Revision, kind: &'static str) -> &mut Self {
+        self.rows.push(RowChange { key, expect: Expect::At(revision), write: Write::Delete, kind });
+        self
+    }
+    /// Whether it would change anything.
+    pub fn is_empty(&self) -> bool {
+        self.facts.is_empty() && self.rows.iter().all(|r| matches!(r.write, Write::Keep))
+    }
+}
+
+/// One entry of a log: a row change with its after-image, or a fact.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Entry {
+    /// Its number; number order is commit order.
+    pub seq: Seq,
+    /// Its log.
+    pub log: Log,
+    /// The row that changed; none for a fact.
+    pub table: Option<Table>,
+    /// Row id, or the fact's subject.
+    pub subject: Arc<str>,
+    /// The row's revision after the change; 0 for a fact.
+    pub revision: Revision,
+    /// Index columns of the row after the change.
+    pub index: Index,
+    /// After-image of the row, or the fact. None: the row was deleted.
+    pub body: Option<Arc<str>>,
+    /// What happened.
+    pub kind: Arc<str>,
+    /// On whose behalf.
+    pub actor: Arc<str>,
+    /// The request behind it.
+    pub request_id: Option<Arc<str>>,
+    /// UTC of the wall when committed, unix ms.
+    pub at_unix_ms: i64,
+}
