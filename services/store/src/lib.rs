@@ -1,1 +1,244 @@
-//! Under construction.
+//! The one memory of midshift: rows changed by items under compare-and-set, and a feed of every change in commit order.
+//!
+//! Invariant: an item is applied whole or not at all, by the one service that owns its tables ([`Table::writer`]), and is
+//! acknowledged only once it is as durable as the store can make it. No decision about the fleet is made here.
+//! Called by the services through [`Store`]; [`MemoryStore`] and [`SqliteStore`] pass one contract suite (`tests/contract.rs`).
+//!
+//! What is volatile (heartbeats, poses) is on the [`LiveBoard`]; what is bulky (samples) is in the [`FrameLog`]; neither is a row.
+
+mod board;
+mod check;
+mod frames;
+mod model;
+mod model_table;
+mod projection;
+
+pub use board::{Dirty, LiveBoard};
+pub use frames::{FRAME_BYTES_DEFAULT, Frame, FrameLog, FrameMark, GAPS_MAX, Gap, MemoryFrames, StoredFrame};
+pub use model::MemoryStore;
+pub use projection::{Change, Fold, Projection};
+
+use async_trait::async_trait;
+use midshift_core::ids::SiteId;
+use midshift_core::limits;
+use midshift_core::rows::{BadRow, Entry, Item, Key, Log, Record, Revision, Row, Seq, Table, Writer};
+use std::fmt;
+use std::sync::Arc;
+use tokio::sync::watch;
+
+/// Most entries one feed page holds, whatever the caller asks for.
+pub const FEED_PAGE_MAX: usize = 5_000;
+/// Most keys of one [`Store::get`].
+pub const GET_KEYS_MAX: usize = 10_000;
+
+/// Random text, made when a store is created or restored. A cursor of another store means: rebuild.
+#[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub struct StoreId(pub Arc<str>);
+
+impl fmt::Display for StoreId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+/// A failure below the store, shared by everyone who waited for it.
+pub type Cause = Arc<dyn std::error::Error + Send + Sync>;
+
+/// Why nothing could be read.
+#[derive(Clone, Debug, thiserror::Error)]
+pub enum Error {
+    /// The log no longer (or, after a restore, not yet) reaches the cursor: read a snapshot and go on from its number.
+    #[error("cursor {} is outside the log, whose oldest is {}", asked.0, oldest.0)]
+    CursorExpired {
+        /// The cursor.
+        asked: Seq,
+        /// The oldest cursor that would have worked.
+        oldest: Seq,
+    },
+    /// More was asked in one call than its limit.
+    #[error("{asked} keys asked in one call, at most {GET_KEYS_MAX}")]
+    TooManyKeys {
+        /// How many.
+        asked: usize,
+    },
+    /// A row that this binary cannot read.
+    #[error(transparent)]
+    BadRow(#[from] BadRow),
+    /// The store cannot answer now.
+    #[error("store unavailable")]
+    Unavailable(#[source] Cause),
+}
+
+/// Why an item was not applied.
+#[derive(Clone, Debug, thiserror::Error)]
+pub enum CommitError {
+    /// A row was not as expected: plan again from what is there.
+    #[error("row {key:?} is at {found:?}, not as expected")]
+    Conflict {
+        /// The first such row.
+        key: Key,
+        /// Its revision; none if there is no such row.
+        found: Option<Revision>,
+    },
+    /// A service tried to write what another one owns. A defect of the caller.
+    #[error("{} may not write {owned}", writer.as_str())]
+    NotTheWriter {
+        /// Who tried.
+        writer: Writer,
+        /// Name of the table or log.
+        owned: &'static str,
+    },
+    /// More rows, facts or bytes than one item may hold.
+    #[error("item over its limit of {} rows or {} bytes", limits::ITEM_ROWS_MAX, limits::GROUP_COMMIT_BYTES)]
+    TooLarge,
+    /// A row named twice in one item. A defect of the caller.
+    #[error("row {key:?} is named twice in one item")]
+    DuplicateKey {
+        /// The row.
+        key: Key,
+    },
+    /// Nobody knows whether it was applied: read before you act again.
+    #[error("commit outcome unknown")]
+    Unknown(#[source] Cause),
+    /// It was not applied; the store cannot write now.
+    #[error("store unavailable")]
+    Unavailable(#[source] Cause),
+}
+
+/// An item that was applied.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Applied {
+    /// Number of its last entry; of the newest entry of the store if it wrote none.
+    pub seq: Seq,
+    /// Revision of every row it put, in the item's order. Deleted and kept rows are left out.
+    pub revisions: Vec<(Key, Revision)>,
+}
+
+/// Position of a row in a list.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Cursor {
+    /// Its sort key; rows without one come before all others.
+    pub order: i64,
+    /// Its id.
+    pub id: Arc<str>,
+}
+
+impl Cursor {
+    /// Where `row` stands.
+    pub fn of(row: &Row) -> Self {
+        Self { order: row.index.order.unwrap_or(i64::MIN), id: row.key.id.clone() }
+    }
+}
+
+/// Which rows of one table to list. Sorted by (order, id).
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Query {
+    /// The table.
+    pub table: Table,
+    /// Only rows in one of these states; empty = any.
+    pub states: Vec<i64>,
+    /// Only rows of this owner.
+    pub parent: Option<Arc<str>>,
+    /// Only rows behind this one, in the direction of the list.
+    pub after: Option<Cursor>,
+    /// From the highest order downwards.
+    pub newest_first: bool,
+    /// At most so many rows; never more than [`limits::PAGE_MAX`].
+    pub limit: usize,
+}
+
+impl Query {
+    /// The first page of all rows of `table`, lowest order first.
+    pub fn all(table: Table) -> Self {
+        Self { table, states: Vec::new(), parent: None, after: None, newest_first: false, limit: limits::PAGE_MAX }
+    }
+    /// Only rows of `parent`.
+    #[must_use]
+    pub fn of_parent(mut self, parent: impl AsRef<str>) -> Self {
+        self.parent = Some(Arc::from(parent.as_ref()));
+        self
+    }
+    /// Only rows in one of `states`.
+    #[must_use]
+    pub fn in_states(mut self, states: impl IntoIterator<Item = i64>) -> Self {
+        self.states = states.into_iter().collect();
+        self
+    }
+    fn rows_max(&self) -> usize {
+        self.limit.min(limits::PAGE_MAX)
+    }
+}
+
+/// Some tables whole, all at one moment.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Snapshot {
+    /// The moment: everything up to this entry is in, nothing after it. The feed goes on from here.
+    pub seq: Seq,
+    /// The rows, sorted by key.
+    pub rows: Vec<Row>,
+}
+
+/// A stretch of the feed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct FeedPage {
+    /// Entries in commit order.
+    pub entries: Vec<Entry>,
+    /// The cursor to go on from. It may stand inside a commit; nothing is lost by that.
+    pub next: Seq,
+    /// Newest entry of the store, of whatever log. `next == head`: the reader is up to date.
+    pub head: Seq,
+}
+
+/// Which entries of the logs are kept. An entry goes when it is too old *or* too many, but never past `floor`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Retention {
+    /// Entries committed before this moment may go, UTC unix ms.
+    pub before_unix_ms: i64,
+    /// Entries a log keeps at most.
+    pub entries_max: u64,
+    /// Position of the slowest consumer: nothing after it goes.
+    pub floor: Seq,
+}
+
+/// The memory that services share. All its calls may be made from many tasks at once.
+#[async_trait]
+pub trait Store: Send + Sync + 'static {
+    /// Which store this is. Constant while it is open.
+    fn id(&self) -> &StoreId;
+    /// The site whose rows these are; it is in every key.
+    fn site_id(&self) -> &SiteId;
+    /// Applies items in order, each for itself; results in the same order. Returns after the fsync that holds them. A later
+    /// item may expect the revision that an earlier one writes.
+    async fn commit(&self, items: Vec<Item>) -> Vec<Result<Applied, CommitError>>;
+    /// The rows of `keys` that exist, in the order of `keys`. At most [`GET_KEYS_MAX`].
+    async fn get(&self, keys: Vec<Key>) -> Result<Vec<Row>, Error>;
+    /// One page of a table.
+    async fn list(&self, query: Query) -> Result<Vec<Row>, Error>;
+    /// Tables whole, at one moment.
+    async fn snapshot(&self, tables: &[Table]) -> Result<Snapshot, Error>;
+    /// Entries of `logs` after a cursor, in commit order, without holes.
+    ///
+    /// # Errors
+    /// [`Error::CursorExpired`] if entries after the cursor are gone, or the cursor is ahead of the store.
+    async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error>;
+    /// Entries of one log about some subjects (robots of the inbox, row ids); like [`Store::feed`] otherwise.
+    async fn feed_of(&self, log: Log, subjects: &[Arc<str>], after: Seq, limit: usize) -> Result<FeedPage, Error>;
+    /// A hint: the newest number committed. May skip values, never the last one. Carries no data; read the feed.
+    fn wake(&self) -> watch::Receiver<Seq>;
+    /// Makes the next number higher than `at_least`: someone has seen a number that this store never gave (it was restored
+    /// from an old backup). Returns the head.
+    async fn raise_head(&self, at_least: Seq) -> Result<Seq, Error>;
+    /// Takes old entries out of the logs, in small slices that let commits pass. Returns how many went.
+    async fn prune(&self, keep: Retention) -> Result<u64, Error>;
+}
+
+/// Reads one record with its revision.
+///
+/// # Errors
+/// As [`Store::get`]; [`Error::BadRow`] if the row does not decode.
+pub async fn load<R: Record>(store: &dyn Store, id: &str) -> Result<Option<(R, Revision)>, Error> {
+    match store.get(vec![Key::new(R::TABLE, id)]).await?.first() {
+        Some(row) => Ok(Some((row.decode()?, row.revision))),
+        None => Ok(None),
+    }
+}

@@ -1,0 +1,200 @@
+//! Samples as they came from the robots, in bulk and in order of arrival: a log of frames, not rows with revisions.
+//!
+//! Invariant: a frame is acknowledged only once it is durable, and what is missing is said in a gap, never left out silently.
+//! Frames are not decoded here. Called by telemetry; if this log fails, nothing else does.
+
+use crate::Error;
+use async_trait::async_trait;
+use midshift_core::ids::RobotId;
+use midshift_core::time::Clock;
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// Bytes of frames kept unless configured otherwise.
+pub const FRAME_BYTES_DEFAULT: u64 = 2 * 1024 * 1024 * 1024;
+/// Gaps kept in memory by [`MemoryFrames`], and listed at most by one call.
+pub const GAPS_MAX: usize = 10_000;
+
+/// Consecutive STATUS samples of one robot, encoded by the caller.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Frame {
+    /// Whose.
+    pub robot_id: RobotId,
+    /// The robot's ring that numbers them.
+    pub ring: Arc<str>,
+    /// Number of the first sample.
+    pub first_seq: u64,
+    /// Number of the last sample.
+    pub last_seq: u64,
+    /// The samples.
+    pub bytes: Arc<[u8]>,
+}
+
+/// A frame with its place in the log.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct StoredFrame {
+    /// Rises with every group of frames; frames of one group share it.
+    pub position: u64,
+    /// When the group became durable, UTC unix ms.
+    pub at_unix_ms: i64,
+    /// The frame.
+    pub frame: Frame,
+}
+
+/// How far a robot's ring has become durable: the acknowledgement.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct FrameMark {
+    /// Whose.
+    pub robot_id: RobotId,
+    /// Its ring.
+    pub ring: Arc<str>,
+    /// Highest sample number.
+    pub seq: u64,
+}
+
+/// Samples that will never come, and why.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Gap {
+    /// Whose.
+    pub robot_id: RobotId,
+    /// Its ring.
+    pub ring: Arc<str>,
+    /// Lane in the spelling of the wire (`STATUS`).
+    pub lane: Arc<str>,
+    /// First missing number.
+    pub from_seq: u64,
+    /// Last missing number.
+    pub to_seq: u64,
+    /// Why (`thinned`, `not durable`).
+    pub reason: Arc<str>,
+    /// When it was noticed, UTC unix ms.
+    pub at_unix_ms: i64,
+}
+
+/// The log of frames.
+#[async_trait]
+pub trait FrameLog: Send + Sync + 'static {
+    /// Appends frames; returns after the fsync that holds them. All or none.
+    async fn append(&self, frames: Vec<Frame>) -> Result<(), Error>;
+    /// How far each ring has come, sorted by robot and ring; for start-up.
+    async fn marks(&self) -> Result<Vec<FrameMark>, Error>;
+    /// Frames after a position, whole groups, until `bytes_max` is passed. Empty: there is nothing newer.
+    async fn read(&self, after: u64, bytes_max: usize) -> Result<Vec<StoredFrame>, Error>;
+    /// Writes gaps down; durable on return.
+    async fn report_gaps(&self, gaps: Vec<Gap>) -> Result<(), Error>;
+    /// Newest gaps of one robot or of all, newest first, at most [`GAPS_MAX`].
+    async fn gaps(&self, robot_id: Option<&RobotId>, limit: usize) -> Result<Vec<Gap>, Error>;
+    /// Takes the oldest frames out until the kept ones are within their bytes; in small slices. Returns the bytes freed.
+    async fn prune(&self) -> Result<u64, Error>;
+}
+
+/// Highest number per robot and ring.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Marks(BTreeMap<(RobotId, Arc<str>), u64>);
+
+impl Marks {
+    pub(crate) fn raise(&mut self, robot_id: &RobotId, ring: &Arc<str>, seq: u64) {
+        let mark = self.0.entry((robot_id.clone(), ring.clone())).or_default();
+        *mark = seq.max(*mark);
+    }
+
+    pub(crate) fn list(&self) -> Vec<FrameMark> {
+        let mark = |((robot_id, ring), seq): (&(RobotId, Arc<str>), &u64)| FrameMark {
+            robot_id: robot_id.clone(),
+            ring: ring.clone(),
+            seq: *seq,
+        };
+        self.0.iter().map(mark).collect()
+    }
+}
+
+/// A [`FrameLog`] in memory; the oldest frames go by themselves.
+pub struct MemoryFrames {
+    clock: Arc<dyn Clock>,
+    bytes_max: u64,
+    state: Mutex<Kept>,
+}
+
+#[derive(Default)]
+struct Kept {
+    frames: VecDeque<StoredFrame>,
+    bytes: u64,
+    position: u64,
+    marks: Marks,
+    gaps: VecDeque<Gap>,
+}
+
+impl MemoryFrames {
+    /// An empty log that keeps about `bytes_max` bytes of frames.
+    pub fn new(clock: Arc<dyn Clock>, bytes_max: u64) -> Self {
+        Self { clock, bytes_max, state: Mutex::default() }
+    }
+
+    fn state(&self) -> MutexGuard<'_, Kept> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Kept {
+    fn prune(&mut self, bytes_max: u64) -> u64 {
+        let before = self.bytes;
+        while self.bytes > bytes_max {
+            let Some(oldest) = self.frames.pop_front() else { break };
+            self.bytes -= oldest.frame.bytes.len() as u64;
+        }
+        before - self.bytes
+    }
+}
+
+#[async_trait]
+impl FrameLog for MemoryFrames {
+    async fn append(&self, frames: Vec<Frame>) -> Result<(), Error> {
+        let at_unix_ms = self.clock.now().wall.0;
+        let mut state = self.state();
+        state.position += 1;
+        let position = state.position;
+        for frame in frames {
+            state.marks.raise(&frame.robot_id, &frame.ring, frame.last_seq);
+            state.bytes += frame.bytes.len() as u64;
+            state.frames.push_back(StoredFrame { position, at_unix_ms, frame });
+        }
+        state.prune(self.bytes_max);
+        Ok(())
+    }
+
+    async fn marks(&self) -> Result<Vec<FrameMark>, Error> {
+        Ok(self.state().marks.list())
+    }
+
+    async fn read(&self, after: u64, bytes_max: usize) -> Result<Vec<StoredFrame>, Error> {
+        let state = self.state();
+        let start = state.frames.partition_point(|f| f.position <= after);
+        let (mut page, mut bytes): (Vec<StoredFrame>, usize) = (Vec::new(), 0);
+        for stored in state.frames.range(start..) {
+            if bytes > bytes_max && page.last().is_some_and(|last| last.position != stored.position) {
+                break;
+            }
+            bytes += stored.frame.bytes.len();
+            page.push(stored.clone());
+        }
+        Ok(page)
+    }
+
+    async fn report_gaps(&self, gaps: Vec<Gap>) -> Result<(), Error> {
+        let mut state = self.state();
+        state.gaps.extend(gaps);
+        let over = state.gaps.len().saturating_sub(GAPS_MAX);
+        state.gaps.drain(..over);
+        Ok(())
+    }
+
+    async fn gaps(&self, robot_id: Option<&RobotId>, limit: usize) -> Result<Vec<Gap>, Error> {
+        let state = self.state();
+        let of_robot = state.gaps.iter().rev().filter(|gap| robot_id.is_none_or(|id| *id == gap.robot_id));
+        Ok(of_robot.take(limit.min(GAPS_MAX)).cloned().collect())
+    }
+
+    async fn prune(&self) -> Result<u64, Error> {
+        Ok(self.state().prune(self.bytes_max))
+    }
+}

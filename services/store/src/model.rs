@@ -1,0 +1,236 @@
+//! The store as a plain value in memory: the reference that other engines are held against, and the store of `midshift dev`
+//! and of the simulation.
+//!
+//! Invariant: synchronous and deterministic: no task, no file, no randomness; same calls, same clock readings, same answers.
+//! Nothing survives the process.
+
+use crate::check::{expectations, form, log_index, written};
+use crate::model_table::Rows;
+use crate::{
+    Applied, CommitError, Error, FEED_PAGE_MAX, FeedPage, GET_KEYS_MAX, Query, Retention, Snapshot, Store, StoreId,
+};
+use async_trait::async_trait;
+use midshift_core::ids::SiteId;
+use midshift_core::rows::{Entry, Index, Item, Key, Log, Revision, Row, Seq, Table, Write};
+use midshift_core::time::Clock;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use tokio::sync::watch;
+
+/// Entries a log keeps unless told otherwise: about 200 MB for all four at 250 bytes an entry.
+const LOG_ENTRIES_DEFAULT: usize = 200_000;
+
+/// A [`Store`] in memory.
+pub struct MemoryStore {
+    id: StoreId,
+    site_id: SiteId,
+    clock: Arc<dyn Clock>,
+    log_entries_max: usize,
+    state: Mutex<State>,
+    wake: watch::Sender<Seq>,
+}
+
+struct State {
+    head: Seq,
+    tables: BTreeMap<Table, Rows>,
+    logs: [Kept; Log::ALL.len()],
+}
+
+/// What is left of one log.
+#[derive(Default)]
+struct Kept {
+    entries: VecDeque<Entry>,
+    /// Number of the newest entry that is gone.
+    pruned: Seq,
+}
+
+impl Kept {
+    fn after(&self, after: Seq) -> impl Iterator<Item = &Entry> {
+        self.entries.range(self.entries.partition_point(|e| e.seq <= after)..)
+    }
+
+    fn drop_oldest(&mut self) {
+        if let Some(entry) = self.entries.pop_front() {
+            self.pruned = entry.seq;
+        }
+    }
+}
+
+impl MemoryStore {
+    /// An empty store whose numbers start at the clock's wall time now.
+    pub fn new(site_id: SiteId, id: StoreId, clock: Arc<dyn Clock>) -> Self {
+        let head = Seq(clock.now().wall.0.max(0).cast_unsigned());
+        let state = State { head, tables: BTreeMap::new(), logs: Default::default() };
+        let wake = watch::Sender::new(head);
+        Self { id, site_id, clock, log_entries_max: LOG_ENTRIES_DEFAULT, state: Mutex::new(state), wake }
+    }
+
+    /// Keeps at most `entries` in each log instead of 200,000.
+    #[must_use]
+    pub fn with_log_entries_max(mut self, entries: usize) -> Self {
+        self.log_entries_max = entries;
+        self
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    fn apply(&mut self, item: Item, at_unix_ms: i64, log_entries_max: usize) -> Result<Applied, CommitError> {
+        form(&item)?;
+        expectations(&item, |key| self.row(key).map(|row| row.revision))?;
+        let mut applied = Applied { seq: self.head, revisions: Vec::new() };
+        let Item { writer, actor, request_id, rows, facts } = item;
+        let entry = |log, subject, kind: &str| Entry {
+            seq: Seq(0),
+            log,
+            table: None,
+            subject,
+            revision: Revision(0),
+            index: Index::default(),
+            body: None,
+            kind: Arc::from(kind),
+            actor: actor.clone(),
+            request_id: request_id.clone(),
+            at_unix_ms,
+        };
+        for change in rows {
+            let revision = written(change.expect);
+            let mut entry = Entry {
+                table: Some(change.key.table),
+                revision,
+                ..entry(Log::of(writer), change.key.id.clone(), change.kind)
+            };
+            let table = self.tables.entry(change.key.table).or_default();
+            match change.write {
+                Write::Put { index, body } => {
+                    applied.revisions.push((change.key.clone(), revision));
+                    entry.index = index.clone();
+                    entry.body = Some(body.clone());
+                    table.put(Row { key: change.key, revision, index, body });
+                }
+                Write::Delete => table.delete(&change.key.id),
+                Write::Keep => continue,
+            }
+            self.log(entry, log_entries_max);
+        }
+        for fact in facts {
+            let entry = Entry { body: Some(fact.body), ..entry(fact.log, fact.subject, fact.kind) };
+            self.log(entry, log_entries_max);
+        }
+        applied.seq = self.head;
+        Ok(applied)
+    }
+
+    fn log(&mut self, mut entry: Entry, log_entries_max: usize) {
+        self.head = Seq(self.head.0 + 1);
+        entry.seq = self.head;
+        let kept = &mut self.logs[log_index(entry.log)];
+        kept.entries.push_back(entry);
+        if kept.entries.len() > log_entries_max {
+            kept.drop_oldest();
+        }
+    }
+
+    fn row(&self, key: &Key) -> Option<&Row> {
+        self.tables.get(&key.table)?.get(&key.id)
+    }
+
+    fn page(&self, after: Seq, logs: &[Log], limit: usize, keep: impl Fn(&Entry) -> bool) -> Result<FeedPage, Error> {
+        let logs: BTreeSet<usize> = logs.iter().map(|log| log_index(*log)).collect();
+        let oldest = logs.iter().map(|log| self.logs[*log].pruned).max().unwrap_or_default();
+        if after < oldest || after > self.head {
+            return Err(Error::CursorExpired { asked: after, oldest });
+        }
+        let limit = limit.clamp(1, FEED_PAGE_MAX);
+        let mut entries: Vec<&Entry> = Vec::new();
+        for log in logs {
+            entries.extend(self.logs[log].after(after).filter(|e| keep(e)).take(limit));
+        }
+        entries.sort_unstable_by_key(|e| e.seq);
+        entries.truncate(limit);
+        let next = if entries.len() < limit { self.head } else { entries[limit - 1].seq };
+        Ok(FeedPage { entries: entries.into_iter().cloned().collect(), next, head: self.head })
+    }
+}
+
+#[async_trait]
+impl Store for MemoryStore {
+    fn id(&self) -> &StoreId {
+        &self.id
+    }
+
+    fn site_id(&self) -> &SiteId {
+        &self.site_id
+    }
+
+    async fn commit(&self, items: Vec<Item>) -> Vec<Result<Applied, CommitError>> {
+        let at_unix_ms = self.clock.now().wall.0;
+        let mut state = self.state();
+        let before = state.head;
+        let results = items.into_iter().map(|item| state.apply(item, at_unix_ms, self.log_entries_max)).collect();
+        if state.head > before {
+            self.wake.send_replace(state.head);
+        }
+        results
+    }
+
+    async fn get(&self, keys: Vec<Key>) -> Result<Vec<Row>, Error> {
+        if keys.len() > GET_KEYS_MAX {
+            return Err(Error::TooManyKeys { asked: keys.len() });
+        }
+        let state = self.state();
+        Ok(keys.iter().filter_map(|key| state.row(key).cloned()).collect())
+    }
+
+    async fn list(&self, query: Query) -> Result<Vec<Row>, Error> {
+        Ok(self.state().tables.get(&query.table).map_or_else(Vec::new, |rows| rows.list(&query)))
+    }
+
+    async fn snapshot(&self, tables: &[Table]) -> Result<Snapshot, Error> {
+        let tables: BTreeSet<Table> = tables.iter().copied().collect();
+        let state = self.state();
+        let rows = tables.iter().filter_map(|table| state.tables.get(table)).flat_map(Rows::iter).cloned().collect();
+        Ok(Snapshot { seq: state.head, rows })
+    }
+
+    async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error> {
+        self.state().page(after, logs, limit, |_| true)
+    }
+
+    async fn feed_of(&self, log: Log, subjects: &[Arc<str>], after: Seq, limit: usize) -> Result<FeedPage, Error> {
+        let subjects: BTreeSet<&Arc<str>> = subjects.iter().collect();
+        self.state().page(after, &[log], limit, |entry| subjects.contains(&entry.subject))
+    }
+
+    fn wake(&self) -> watch::Receiver<Seq> {
+        self.wake.subscribe()
+    }
+
+    async fn raise_head(&self, at_least: Seq) -> Result<Seq, Error> {
+        let mut state = self.state();
+        if at_least > state.head {
+            state.head = at_least;
+            self.wake.send_replace(state.head);
+        }
+        Ok(state.head)
+    }
+
+    async fn prune(&self, keep: Retention) -> Result<u64, Error> {
+        let mut state = self.state();
+        let mut gone = 0;
+        for kept in &mut state.logs {
+            while let Some(oldest) = kept.entries.front() {
+                let old = oldest.at_unix_ms < keep.before_unix_ms || kept.entries.len() as u64 > keep.entries_max;
+                if !old || oldest.seq > keep.floor {
+                    break;
+                }
+                kept.drop_oldest();
+                gone += 1;
+            }
+        }
+        Ok(gone)
+    }
+}

@@ -1,0 +1,104 @@
+//! One table of the in-memory model, with the three orders that lists need. Used by [`crate::MemoryStore`] alone.
+//!
+//! Invariant: every row is in `rows` and in each order that its index columns put it in, and nowhere else.
+
+use crate::{Cursor, Query};
+use midshift_core::rows::{Index, Row};
+use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Bound;
+use std::sync::Arc;
+
+type Order = BTreeSet<Cursor>;
+
+#[derive(Default)]
+pub(crate) struct Rows {
+    rows: BTreeMap<Arc<str>, Row>,
+    by_order: Order,
+    by_parent: BTreeMap<Arc<str>, Order>,
+    by_state: BTreeMap<i64, Order>,
+}
+
+impl Rows {
+    pub(crate) fn get(&self, id: &str) -> Option<&Row> {
+        self.rows.get(id)
+    }
+
+    pub(crate) fn iter(&self) -> impl Iterator<Item = &Row> {
+        self.rows.values()
+    }
+
+    pub(crate) fn put(&mut self, row: Row) {
+        let place = Cursor::of(&row);
+        let index = row.index.clone();
+        match self.rows.insert(row.key.id.clone(), row) {
+            Some(old) if old.index == index => return,
+            Some(old) => self.unlink(&Cursor::of(&old), &old.index),
+            None => {}
+        }
+        if let Some(parent) = index.parent {
+            self.by_parent.entry(parent).or_default().insert(place.clone());
+        }
+        if let Some(state) = index.state {
+            self.by_state.entry(state).or_default().insert(place.clone());
+        }
+        self.by_order.insert(place);
+    }
+
+    pub(crate) fn delete(&mut self, id: &str) {
+        if let Some(old) = self.rows.remove(id) {
+            self.unlink(&Cursor::of(&old), &old.index);
+        }
+    }
+
+    fn unlink(&mut self, place: &Cursor, index: &Index) {
+        self.by_order.remove(place);
+        if let Some(parent) = &index.parent {
+            remove_from(&mut self.by_parent, parent, place);
+        }
+        if let Some(state) = &index.state {
+            remove_from(&mut self.by_state, state, place);
+        }
+    }
+
+    pub(crate) fn list(&self, query: &Query) -> Vec<Row> {
+        let limit = query.rows_max();
+        let fits = |row: &&Row| {
+            (query.states.is_empty() || row.index.state.is_some_and(|s| query.states.contains(&s)))
+                && (query.parent.is_none() || row.index.parent == query.parent)
+        };
+        let empty = Order::new();
+        let orders: Vec<&Order> = match &query.parent {
+            Some(parent) => vec![self.by_parent.get(parent).unwrap_or(&empty)],
+            None if query.states.is_empty() => vec![&self.by_order],
+            None => {
+                let states: BTreeSet<i64> = query.states.iter().copied().collect();
+                states.iter().filter_map(|state| self.by_state.get(state)).collect()
+            }
+        };
+        let mut places: Vec<(&Cursor, &Row)> = Vec::new();
+        for order in orders {
+            let rows = walk(order, query).filter_map(|place| Some((place, self.rows.get(&place.id)?)));
+            places.extend(rows.filter(|(_, row)| fits(row)).take(limit));
+        }
+        places.sort_unstable_by(|a, b| if query.newest_first { b.0.cmp(a.0) } else { a.0.cmp(b.0) });
+        places.into_iter().take(limit).map(|(_, row)| row.clone()).collect()
+    }
+}
+
+fn walk<'a>(order: &'a Order, query: &Query) -> Box<dyn Iterator<Item = &'a Cursor> + 'a> {
+    let after = query.after.clone().map_or(Bound::Unbounded, Bound::Excluded);
+    if query.newest_first {
+        Box::new(order.range((Bound::Unbounded, after)).rev())
+    } else {
+        Box::new(order.range((after, Bound::Unbounded)))
+    }
+}
+
+fn remove_from<K: Ord>(orders: &mut BTreeMap<K, Order>, key: &K, place: &Cursor) {
+    if let Some(order) = orders.get_mut(key) {
+        order.remove(place);
+        if order.is_empty() {
+            orders.remove(key);
+        }
+    }
+}
