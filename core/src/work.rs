@@ -1,1 +1,465 @@
-//! work
+//! What goes down to a robot (desired state by sections) and what comes up (events): the values behind the link.
+//!
+//! Robots get desired state, not commands. Each section has the generation of its one writer and never moves backwards.
+//! Written by fleet, composed and sent by telemetry, obeyed by the agent.
+
+use crate::authority::Authority;
+use crate::ids::{AreaId, AttemptId, PlaceId, RobotId, WaypointId};
+use crate::reason::Reason;
+use crate::robot::{Fault, HardwareStop, HeldPlace, Lane, Load, Mode, Vitals};
+use crate::rows::{Index, Record, Table};
+use serde::{Deserialize, Serialize};
+
+/// Section `work` of a robot's desired state: whole, newest wins.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct DesiredWork {
+    /// Whose.
+    pub robot_id: RobotId,
+    /// max(previous + 1, unix ms): rises also across a restore of the store.
+    pub generation: u64,
+    /// What to do. None: no work; what runs under an attempt not named here is to be stopped and confirmed.
+    pub assignment: Option<Assignment>,
+    /// Every place it may enter or stay in.
+    pub grants: Vec<GrantedPlace>,
+    /// Hold tokens of robot or task scope stand: stand still where it is safe and keep the work.
+    pub held: bool,
+    /// Permission to move again after a hold. Needed once per hold; a buffered one is refused.
+    pub resume: Option<Authority>,
+    /// Attempts whose end the server has stored: the robot may forget them from its report.
+    pub closed: Vec<AttemptId>,
+}
+
+impl Record for DesiredWork {
+    const TABLE: Table = Table::DesiredWork;
+    fn id(&self) -> String {
+        self.robot_id.to_string()
+    }
+    fn index(&self) -> Index {
+        Index { order: Some(self.generation as i64), ..Index::default() }
+    }
+}
+
+/// One attempt as it is given to a robot.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Assignment {
+    /// Which attempt.
+    pub attempt: AttemptId,
+    /// Permission to accept it. Going on with it afterwards lives from the echo of heartbeats.
+    pub offer: Authority,
+    /// Milliseconds of site time from acceptance until the agent itself ends it (5 % before the server does).
+    pub timeout_ms: u64,
+    /// All steps of the task.
+    pub steps: Vec<WorkStep>,
+    /// Where to begin: steps before it are done.
+    pub from_step: u32,
+    /// Rises when the server chose another way; `released_index` counts in this route.
+    pub route_number: u32,
+    /// The whole way through all goto steps that are left.
+    pub route: Vec<RoutePoint>,
+    /// Index in `route` up to which the robot may drive: always a standing place or the end. None: stay.
+    pub released_index: Option<u32>,
+    /// Stop at the next point where it is safe and give it back; stays here until the stop is confirmed.
+    pub stop: bool,
+    /// Stop at the next step boundary without a load and give it back.
+    pub suspend: bool,
+    /// Millimetres per second for this task. None: the area's.
+    pub speed_limit_mm_s: Option<u32>,
+}
+
+/// One step as the robot does it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct WorkStep {
+    /// What.
+    pub kind: StepKind,
+    /// What may happen if nobody knows whether it was done.
+    pub effect: Effect,
+    /// May be paused inside.
+    pub pause_allowed: bool,
+    /// May be stopped inside.
+    pub cancel_allowed: bool,
+    /// Milliseconds of site time for this step; none: only the attempt's timeout.
+    pub timeout_ms: Option<u64>,
+    /// Go on with the next step if this one fails.
+    pub continue_on_fail: bool,
+}
+
+/// What a step is.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum StepKind {
+    /// Drive to a waypoint.
+    Goto {
+        /// Goal.
+        waypoint: WaypointId,
+    },
+    /// Do something where it stands.
+    Action {
+        /// `pick`, `place`, `inspect`, …
+        name: String,
+        /// Parameters, a JSON object.
+        params: serde_json::Map<String, serde_json::Value>,
+    },
+    /// Stand.
+    Wait {
+        /// Milliseconds of site time.
+        duration_ms: u64,
+    },
+}
+
+/// What may happen if nobody knows whether a step was done.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Effect {
+    /// Doing it twice does no harm.
+    Repeatable,
+    /// The body can tell whether it was done.
+    CheckFirst,
+    /// Must not be done twice.
+    AtMostOnce,
+}
+
+/// One waypoint of a route.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RoutePoint {
+    /// Which.
+    pub waypoint: WaypointId,
+    /// Millimetres.
+    pub x_mm: i32,
+    /// Millimetres.
+    pub y_mm: i32,
+    /// The goto step that ends here, if one does.
+    pub ends_step: Option<u32>,
+    /// A standing place the robot must hold before it enters.
+    pub standing: Option<PlaceId>,
+    /// Passages the lane that leads here crosses; each must be held before it is entered.
+    pub passages: Vec<PlaceId>,
+    /// Limit of the lane that leads here, millimetres per second. None: none of its own.
+    pub speed_limit_mm_s: Option<u32>,
+    /// Area of this point, whose policy holds here.
+    pub area_id: AreaId,
+}
+
+/// Permission to enter one place. Single use: after leaving, another is needed.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct GrantedPlace {
+    /// Which.
+    pub place_id: PlaceId,
+    /// Never used again.
+    pub grant_id: u64,
+    /// Permission to *enter*; a robot inside stays, whatever this says. None: it is inside already.
+    pub entry: Option<Authority>,
+}
+
+/// Section `policy`: limits and rules of the areas, whole.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DesiredPolicy {
+    /// Whose.
+    pub robot_id: RobotId,
+    /// max(previous + 1, unix ms).
+    pub generation: u64,
+    /// One entry an area.
+    pub areas: Vec<crate::policy::AreaPolicy>,
+}
+
+impl Record for DesiredPolicy {
+    const TABLE: Table = Table::DesiredPolicy;
+    fn id(&self) -> String {
+        self.robot_id.to_string()
+    }
+}
+
+/// What a robot does with an attempt.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum WorkState {
+    /// It took it and has not moved yet.
+    Accepted,
+    /// It refused it.
+    Refused,
+    /// It drives.
+    Navigating,
+    /// It acts or waits.
+    Executing,
+    /// It stands and keeps it.
+    Paused,
+    /// It is on its way to a stop.
+    Stopping,
+    /// Done.
+    Succeeded,
+    /// Ended by a fault.
+    Failed,
+    /// Stopped on request, or dropped by a person at the robot.
+    Aborted,
+    /// Stopped at a step boundary on request; the rest is handed back.
+    Suspended,
+    /// Restarted inside a step that must not be done twice: nobody knows.
+    StepUnknown,
+}
+
+impl WorkState {
+    /// Whether the robot will do nothing more with it.
+    pub const fn is_over(self) -> bool {
+        matches!(self, Self::Refused | Self::Succeeded | Self::Failed | Self::Aborted | Self::Suspended)
+    }
+}
+
+/// What was driven and spent in one attempt.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WorkStats {
+    /// Millimetres.
+    pub path_mm: u64,
+    /// Of these, with a load.
+    pub loaded_path_mm: u64,
+    /// Milliseconds of site time from acceptance.
+    pub duration_ms: u64,
+    /// Milliwatt-hours.
+    pub energy_mwh: u64,
+    /// Tenths of a degree, highest joint temperature seen.
+    pub hottest_joint_decidegrees: i32,
+}
+
+impl std::ops::AddAssign for WorkStats {
+    fn add_assign(&mut self, other: Self) {
+        self.path_mm += other.path_mm;
+        self.loaded_path_mm += other.loaded_path_mm;
+        self.duration_ms += other.duration_ms;
+        self.energy_mwh += other.energy_mwh;
+        self.hottest_joint_decidegrees = self.hottest_joint_decidegrees.max(other.hottest_joint_decidegrees);
+    }
+}
+
+/// News of one attempt from the robot, lane EVENT.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct AttemptReport {
+    /// Which attempt.
+    pub attempt: AttemptId,
+    /// What the robot does with it now.
+    pub state: WorkState,
+    /// Steps done so far = index of the step at hand.
+    pub step_index: u32,
+    /// The first irreversible step is done or unknown.
+    pub opened: bool,
+    /// Why it refused.
+    pub refusal: Option<Reason>,
+    /// Why it failed.
+    pub fault: Option<Fault>,
+    /// So far in this attempt.
+    pub stats: WorkStats,
+}
+
+/// What happened to a place.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PlaceNews {
+    /// The contour reached in.
+    Entered,
+    /// The contour is out again: the grant is used up.
+    Left,
+    /// It will not enter on this grant: revoked, stale or not needed.
+    NotEntered,
+}
+
+/// One fact from a robot, lanes CRITICAL and EVENT.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RobotEvent {
+    /// News of an attempt: accepted, refused, step done, ended.
+    Attempt(AttemptReport),
+    /// A place was entered, left or given back.
+    Place {
+        /// Which.
+        place_id: PlaceId,
+        /// On which grant; 0: none.
+        grant_id: u64,
+        /// What happened.
+        news: PlaceNews,
+    },
+    /// A fault began or ended.
+    Fault {
+        /// Which.
+        fault: Fault,
+        /// It is over.
+        cleared: bool,
+    },
+    /// Who drives changed.
+    Mode(Mode),
+    /// The maker's safety system changed.
+    HardwareStop(HardwareStop),
+    /// What it carries changed.
+    Load(Option<Load>),
+    /// It refused a message for its authority.
+    StaleAuthority {
+        /// What was refused: `offer`, `grant`, `resume`.
+        what: String,
+        /// Why, for a person.
+        detail: String,
+    },
+    /// The state of charge fell below the critical threshold.
+    BatteryCritical {
+        /// Permille.
+        battery_permille: u16,
+    },
+}
+
+/// One numbered sample of a lane.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Sample {
+    /// From 1, +1 each per (ring, lane); survives restarts.
+    pub seq: u64,
+    /// Robot's wall clock, unix ms UTC. Shown, never used for order.
+    pub robot_unix_ms: i64,
+    /// What.
+    pub body: SampleBody,
+}
+
+/// What a sample carries.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SampleBody {
+    /// Lanes CRITICAL and EVENT.
+    Event(RobotEvent),
+    /// Lane STATUS.
+    Status(Vitals),
+}
+
+/// A range that will never come, said by the robot: loss is never silent.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Gap {
+    /// Lane.
+    pub lane: Lane,
+    /// First missing number.
+    pub from_seq: u64,
+    /// Last missing number.
+    pub to_seq: u64,
+    /// Why.
+    pub reason: Reason,
+}
+
+/// Body of a fact in the robot inbox.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct InboxEntry {
+    /// Who said it.
+    pub robot_id: RobotId,
+    /// In which session it arrived.
+    pub session_epoch: u64,
+    /// Ring it comes from.
+    pub ring: String,
+    /// Its lane: CRITICAL or EVENT.
+    pub lane: Lane,
+    /// What.
+    pub what: InboxItem,
+    /// The robot's stamp was ahead of ours by more than the known offset and error. Never rewritten.
+    #[serde(default)]
+    pub stamp_in_future: bool,
+}
+
+/// A sample, a gap, or a sample nobody could read.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum InboxItem {
+    /// A sample.
+    Sample(Sample),
+    /// A gap.
+    Gap(Gap),
+    /// Skipped, recorded, acknowledged.
+    Poison {
+        /// Its number.
+        seq: u64,
+        /// What was wrong.
+        detail: String,
+    },
+}
+
+/// A robot's newest session, written by telemetry at each Hello.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Session {
+    /// Whose.
+    pub robot_id: RobotId,
+    /// max(old + 1, unix ms): sessions with less are fenced.
+    pub session_epoch: u64,
+    /// Proves succession in the next Hello.
+    pub secret: String,
+    /// New for each start of the agent.
+    pub boot_id: String,
+    /// Random, made when the robot's ring was formatted.
+    pub ring: String,
+    /// What it said of itself.
+    pub inventory: crate::robot::Inventory,
+    /// A clone is suspected: attached, no work.
+    pub observed: bool,
+    /// Highest generation of section work the robot had applied.
+    pub applied_work: u64,
+    /// Places it said it holds, at Hello.
+    pub places: Vec<HeldPlace>,
+    /// Robot clock minus server clock, milliseconds; none until measured.
+    pub clock_offset_ms: Option<i64>,
+}
+
+impl Record for Session {
+    const TABLE: Table = Table::Session;
+    fn id(&self) -> String {
+        self.robot_id.to_string()
+    }
+}
+
+/// Presence of a robot as telemetry sees it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PresenceRow {
+    /// Whose.
+    pub robot_id: RobotId,
+    /// Heard or not.
+    pub presence: crate::robot::Presence,
+    /// UTC of the wall, since when.
+    pub since_unix_ms: i64,
+}
+
+impl Record for PresenceRow {
+    const TABLE: Table = Table::Presence;
+    fn id(&self) -> String {
+        self.robot_id.to_string()
+    }
+}
+
+/// Highest durable numbers of one ring; guards each append to the inbox, so nothing is stored twice.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LaneMark {
+    /// Whose ring.
+    pub robot_id: RobotId,
+    /// The ring.
+    pub ring: String,
+    /// Highest CRITICAL number stored.
+    pub critical: u64,
+    /// Highest EVENT number stored.
+    pub event: u64,
+}
+
+impl Record for LaneMark {
+    const TABLE: Table = Table::LaneMark;
+    fn id(&self) -> String {
+        format!("{}/{}", self.robot_id, self.ring)
+    }
+    fn index(&self) -> Index {
+        Index { parent: Some(self.robot_id.as_str().into()), ..Index::default() }
+    }
+}
+
+/// The newest heartbeat of a robot with what the server knows about it: the volatile face, never a row.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Live {
+    /// Whose.
+    pub robot_id: RobotId,
+    /// What it said.
+    pub report: crate::robot::ReportedState,
+    /// When the server had processed it.
+    pub processed_at: crate::time::LinkTime,
+    /// The same moment on the site clock.
+    pub processed_site: crate::time::SiteTime,
+    /// UTC of the wall at receipt.
+    pub received_unix_ms: i64,
+    /// When its progress number last changed, site clock.
+    pub progress_at: crate::time::SiteTime,
+    /// Robot clock minus server clock, milliseconds, and its error.
+    pub clock_offset_ms: Option<(i64, u64)>,
+    /// Attached without proof of succession: no work.
+    pub observed: bool,
+}

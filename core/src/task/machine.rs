@@ -1,0 +1,447 @@
+//! The task's table of transitions: one enum of phases, one of events, one function. Nothing else decides where a task goes.
+//!
+//! Called by `fleet`. Invariant: UNCERTAIN is a property of the attempt, never a phase: cancel and hold stay legal, and a robot
+//! that is heard again brings the task to what its hold set and `then` demand. A timeout never frees a robot or a place.
+
+use serde::{Deserialize, Serialize};
+
+/// Where a task is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Phase {
+    /// Waits for a robot.
+    Queued,
+    /// Offered to a robot.
+    Assigned,
+    /// A robot has it.
+    Running,
+    /// A robot has it and a hold token stands.
+    Held,
+    /// Handed back at a step boundary; waits to be queued again.
+    Suspended,
+    /// The robot was told to stop and has not confirmed.
+    Stopping,
+    /// Failed in a way that is tried again, waits out its back-off.
+    RetryWait,
+    /// A person must decide.
+    NeedsOperator,
+    /// Done. Terminal.
+    Succeeded,
+    /// Given up. Terminal.
+    Failed,
+    /// Not wanted any more. Terminal.
+    Canceled,
+    /// Its deadline passed. Terminal.
+    Expired,
+}
+
+impl Phase {
+    /// All phases.
+    pub const ALL: [Phase; 12] = [
+        Self::Queued,
+        Self::Assigned,
+        Self::Running,
+        Self::Held,
+        Self::Suspended,
+        Self::Stopping,
+        Self::RetryWait,
+        Self::NeedsOperator,
+        Self::Succeeded,
+        Self::Failed,
+        Self::Canceled,
+        Self::Expired,
+    ];
+    /// No way out.
+    pub const fn is_terminal(self) -> bool {
+        matches!(self, Self::Succeeded | Self::Failed | Self::Canceled | Self::Expired)
+    }
+    /// A robot has, or may have, a live attempt of it.
+    pub const fn has_attempt(self) -> bool {
+        matches!(self, Self::Assigned | Self::Running | Self::Held | Self::Stopping)
+    }
+    /// Number in indices and on the wire.
+    pub const fn number(self) -> i64 {
+        self as i64 + 1
+    }
+    /// Name, UPPER_SNAKE.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Queued => "QUEUED",
+            Self::Assigned => "ASSIGNED",
+            Self::Running => "RUNNING",
+            Self::Held => "HELD",
+            Self::Suspended => "SUSPENDED",
+            Self::Stopping => "STOPPING",
+            Self::RetryWait => "RETRY_WAIT",
+            Self::NeedsOperator => "NEEDS_OPERATOR",
+            Self::Succeeded => "SUCCEEDED",
+            Self::Failed => "FAILED",
+            Self::Canceled => "CANCELED",
+            Self::Expired => "EXPIRED",
+        }
+    }
+}
+
+/// Where STOPPING leads, once the robot has confirmed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Then {
+    /// CANCELED.
+    Canceled,
+    /// FAILED.
+    Failed,
+    /// RETRY_WAIT, or NEEDS_OPERATOR if it is opened or its attempts are spent.
+    Retry,
+    /// SUSPENDED.
+    Suspended,
+    /// QUEUED: nobody took it.
+    Requeue,
+    /// EXPIRED.
+    Expired,
+    /// NEEDS_OPERATOR.
+    NeedsOperator,
+}
+
+/// What happened to a task.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Event {
+    /// The planner offers it to a robot.
+    PlanOffers,
+    /// Nobody started it in time.
+    ScheduleToStart,
+    /// Its deadline passed.
+    Deadline,
+    /// Somebody cancels.
+    Cancel,
+    /// Somebody ends the record at once.
+    CancelForce,
+    /// A hold token came.
+    Hold,
+    /// The last hold token went.
+    LastHoldGone,
+    /// Somebody changed a queued task. No producer until edits land.
+    Edit,
+    /// The robot took it.
+    Accepted,
+    /// The robot did not take it.
+    Refused,
+    /// The robot did not answer.
+    OfferAckTimeout,
+    /// The robot reports a step.
+    Progress,
+    /// The robot reports the end.
+    Succeeded,
+    /// A fault that may be tried again.
+    FailedRecoverable,
+    /// A fault that must not be.
+    FailedFinal,
+    /// The robot confirmed that it does not have it (stopped, dropped, never had it).
+    StopConfirmed,
+    /// The attempt took too long.
+    StartToClose,
+    /// No progress.
+    Stall,
+    /// The robot was not heard for longer than its authority, or a person drives it.
+    LeaseOver,
+    /// The robot lists it as live.
+    SeenRunning,
+    /// The robot restarted inside a step that must not be done twice.
+    StepUnknown,
+    /// Hand it back at the next boundary.
+    Suspend,
+    /// No confirmation of the stop.
+    StopConfirmTimeout,
+    /// The back-off is over, or a suspended task may queue again.
+    RetryDue,
+    /// UNCERTAIN for too long.
+    UncertainTimeout,
+    /// A person: try again.
+    ResolveRequeue,
+    /// A person: done by hand.
+    ResolveSucceeded,
+    /// A person: give up.
+    ResolveFailed,
+    /// A person: not wanted.
+    ResolveCanceled,
+}
+
+impl Event {
+    /// All events.
+    pub const ALL: [Event; 29] = [
+        Self::PlanOffers,
+        Self::ScheduleToStart,
+        Self::Deadline,
+        Self::Cancel,
+        Self::CancelForce,
+        Self::Hold,
+        Self::LastHoldGone,
+        Self::Edit,
+        Self::Accepted,
+        Self::Refused,
+        Self::OfferAckTimeout,
+        Self::Progress,
+        Self::Succeeded,
+        Self::FailedRecoverable,
+        Self::FailedFinal,
+        Self::StopConfirmed,
+        Self::StartToClose,
+        Self::Stall,
+        Self::LeaseOver,
+        Self::SeenRunning,
+        Self::StepUnknown,
+        Self::Suspend,
+        Self::StopConfirmTimeout,
+        Self::RetryDue,
+        Self::UncertainTimeout,
+        Self::ResolveRequeue,
+        Self::ResolveSucceeded,
+        Self::ResolveFailed,
+        Self::ResolveCanceled,
+    ];
+}
+
+/// Where a task stands when an event arrives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Standing {
+    /// Its phase.
+    pub phase: Phase,
+    /// Its attempt is UNCERTAIN.
+    pub uncertain: bool,
+    /// Where STOPPING leads.
+    pub then: Option<Then>,
+}
+
+/// Facts that choose between the outcomes of one table cell.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Facts {
+    /// Retries asked for and not spent, counting the attempt that ends now.
+    pub retries_left: bool,
+    /// Any retry was asked for at all.
+    pub retry_wanted: bool,
+    /// First irreversible step done or unknown.
+    pub opened: bool,
+    /// Every step begun in this attempt may be repeated.
+    pub begun_repeatable: bool,
+    /// This refusal is the last allowed in a row.
+    pub refusals_spent: bool,
+    /// Every candidate refused it for its content.
+    pub refused_by_all: bool,
+    /// The fault says that the work cannot be done as asked.
+    pub semantic: bool,
+    /// A hold token stands.
+    pub held: bool,
+    /// The robot had accepted.
+    pub accepted: bool,
+}
+
+/// What becomes of the attempt.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Fate {
+    /// It goes on, or there is none.
+    Keep,
+    /// It is told to stop.
+    Stop,
+    /// Nobody knows any more.
+    Uncertain,
+    /// It is known again.
+    Known,
+    /// It is over and the robot is free.
+    End,
+    /// The record lets it go, but robot and places stay kept until the robot reports.
+    Abandon,
+}
+
+/// The answer of the table.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Next {
+    /// New phase.
+    pub phase: Phase,
+    /// New `then`.
+    pub then: Option<Then>,
+    /// What becomes of the attempt.
+    pub fate: Fate,
+}
+
+/// Where a confirmed stop leads.
+fn after_stop(then: Then, facts: &Facts) -> Phase {
+    match then {
+        Then::Canceled => Phase::Canceled,
+        Then::Failed => Phase::Failed,
+        Then::Retry if facts.opened || !facts.retries_left => Phase::NeedsOperator,
+        Then::Retry => Phase::RetryWait,
+        Then::Suspended => Phase::Suspended,
+        Then::Requeue => Phase::Queued,
+        Then::Expired => Phase::Expired,
+        Then::NeedsOperator => Phase::NeedsOperator,
+    }
+}
+
+/// Where an attempt that failed recoverably leads.
+fn after_recoverable(facts: &Facts) -> Phase {
+    if facts.retries_left {
+        Phase::RetryWait
+    } else if facts.retry_wanted || facts.opened {
+        Phase::NeedsOperator
+    } else {
+        Phase::Failed
+    }
+}
+
+/// Where an attempt that failed for good leads.
+fn after_final(facts: &Facts) -> Phase {
+    if facts.semantic && !facts.opened && facts.refused_by_all { Phase::Failed } else { Phase::NeedsOperator }
+}
+
+/// Where a robot's drop of a running task leads: it stands without anybody having asked for it.
+fn after_drop(facts: &Facts) -> Phase {
+    if facts.begun_repeatable && !facts.opened && facts.retries_left {
+        Phase::RetryWait
+    } else if facts.begun_repeatable && !facts.opened {
+        Phase::Queued
+    } else {
+        Phase::NeedsOperator
+    }
+}
+
+/// The table. `None`: the event means nothing there (fenced, duplicate, too late) and is counted, not obeyed.
+pub fn next(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
+    if at.phase.is_terminal() {
+        return None;
+    }
+    if at.uncertain && at.phase.has_attempt() {
+        return uncertain(at, event, facts);
+    }
+    match at.phase {
+        Phase::Queued | Phase::Suspended | Phase::RetryWait => waiting(at, event),
+        Phase::Assigned => assigned(at, event, facts),
+        Phase::Running | Phase::Held => running(at, event, facts),
+        Phase::Stopping => stopping(at, event, facts),
+        Phase::NeedsOperator => needs_operator(at, event),
+        Phase::Succeeded | Phase::Failed | Phase::Canceled | Phase::Expired => None,
+    }
+}
+
+fn go(phase: Phase, fate: Fate) -> Option<Next> {
+    Some(Next { phase, then: None, fate })
+}
+
+fn stop(then: Then) -> Option<Next> {
+    Some(Next { phase: Phase::Stopping, then: Some(then), fate: Fate::Stop })
+}
+
+fn stay(at: Standing) -> Option<Next> {
+    Some(Next { phase: at.phase, then: at.then, fate: Fate::Keep })
+}
+
+fn waiting(at: Standing, event: Event) -> Option<Next> {
+    match (at.phase, event) {
+        (Phase::Queued, Event::PlanOffers) => go(Phase::Assigned, Fate::Keep),
+        (Phase::Queued | Phase::RetryWait, Event::ScheduleToStart) => go(Phase::NeedsOperator, Fate::Keep),
+        (_, Event::Deadline) => go(Phase::Expired, Fate::Keep),
+        (_, Event::Cancel | Event::CancelForce) => go(Phase::Canceled, Fate::Keep),
+        (Phase::Suspended | Phase::RetryWait, Event::RetryDue) => go(Phase::Queued, Fate::Keep),
+        (_, Event::Hold | Event::LastHoldGone) | (Phase::Queued | Phase::RetryWait, Event::Edit) => stay(at),
+        _ => None,
+    }
+}
+
+fn assigned(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
+    let work = if facts.held { Phase::Held } else { Phase::Running };
+    match event {
+        Event::Accepted | Event::Progress | Event::SeenRunning => go(work, Fate::Keep),
+        Event::Refused if facts.refused_by_all => go(Phase::Failed, Fate::End),
+        Event::Refused if facts.refusals_spent => go(Phase::NeedsOperator, Fate::End),
+        Event::Refused | Event::StopConfirmed => go(Phase::Queued, Fate::End),
+        Event::OfferAckTimeout | Event::Suspend => stop(Then::Requeue),
+        Event::ScheduleToStart => stop(Then::NeedsOperator),
+        Event::Deadline => stop(Then::Expired),
+        Event::Cancel => stop(Then::Canceled),
+        Event::CancelForce => go(Phase::Canceled, Fate::Abandon),
+        Event::Succeeded => go(Phase::Succeeded, Fate::End),
+        Event::FailedRecoverable => go(after_recoverable(facts), Fate::End),
+        Event::FailedFinal => go(after_final(facts), Fate::End),
+        Event::LeaseOver | Event::StepUnknown => Some(Next { fate: Fate::Uncertain, ..stay(at)? }),
+        Event::Hold | Event::LastHoldGone => stay(at),
+        _ => None,
+    }
+}
+
+fn running(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
+    let too_long = if facts.retry_wanted { Then::Retry } else { Then::Failed };
+    match event {
+        Event::Accepted | Event::Progress | Event::SeenRunning => stay(at),
+        Event::Hold => go(Phase::Held, Fate::Keep),
+        Event::LastHoldGone if at.phase == Phase::Held => go(Phase::Running, Fate::Keep),
+        Event::Suspend => stop(Then::Suspended),
+        Event::Succeeded => go(Phase::Succeeded, Fate::End),
+        Event::FailedRecoverable => go(after_recoverable(facts), Fate::End),
+        Event::FailedFinal => go(after_final(facts), Fate::End),
+        Event::StopConfirmed => go(after_drop(facts), Fate::End),
+        Event::Stall if at.phase == Phase::Running => stop(too_long),
+        Event::StartToClose => stop(too_long),
+        Event::Deadline => stop(Then::Expired),
+        Event::Cancel => stop(Then::Canceled),
+        Event::CancelForce => go(Phase::Canceled, Fate::Abandon),
+        Event::LeaseOver | Event::StepUnknown => Some(Next { fate: Fate::Uncertain, ..stay(at)? }),
+        _ => None,
+    }
+}
+
+fn stopping(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
+    let then = at.then.unwrap_or(Then::NeedsOperator);
+    match event {
+        Event::Succeeded => go(Phase::Succeeded, Fate::End),
+        Event::Refused | Event::FailedRecoverable | Event::StopConfirmed => go(after_stop(then, facts), Fate::End),
+        Event::FailedFinal if then == Then::Retry => go(after_final(facts), Fate::End),
+        Event::FailedFinal => go(after_stop(then, facts), Fate::End),
+        Event::Cancel => stop(Then::Canceled),
+        Event::Deadline if then != Then::Canceled => stop(Then::Expired),
+        Event::CancelForce => go(Phase::Canceled, Fate::Abandon),
+        Event::StopConfirmTimeout => go(Phase::NeedsOperator, Fate::Abandon),
+        Event::LeaseOver | Event::StepUnknown => Some(Next { fate: Fate::Uncertain, ..stay(at)? }),
+        Event::Accepted | Event::Progress | Event::SeenRunning | Event::Hold | Event::LastHoldGone | Event::Deadline => stay(at),
+        _ => None,
+    }
+}
+
+fn uncertain(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
+    let wish = |then| Some(Next { phase: at.phase, then: Some(then), fate: Fate::Keep });
+    let known = |phase| Some(Next { phase, then: at.then, fate: Fate::Known });
+    let too_long = if facts.retry_wanted { Then::Retry } else { Then::Failed };
+    match event {
+        Event::Accepted | Event::Progress | Event::SeenRunning => match (at.then, facts.held) {
+            (Some(_), _) => Some(Next { phase: Phase::Stopping, then: at.then, fate: Fate::Known }),
+            (None, true) => known(Phase::Held),
+            (None, false) => known(Phase::Running),
+        },
+        Event::Succeeded => go(Phase::Succeeded, Fate::End),
+        Event::FailedRecoverable => go(at.then.map_or_else(|| after_recoverable(facts), |t| after_stop(t, facts)), Fate::End),
+        Event::FailedFinal => go(after_final(facts), Fate::End),
+        Event::Refused => go(at.then.map_or(Phase::Queued, |t| after_stop(t, facts)), Fate::End),
+        Event::StopConfirmed => match at.then {
+            Some(then) => go(after_stop(then, facts), Fate::End),
+            None if !facts.accepted => go(Phase::Queued, Fate::End),
+            None => go(after_drop(facts), Fate::End),
+        },
+        Event::StartToClose => wish(at.then.unwrap_or(too_long)),
+        Event::Deadline if at.then != Some(Then::Canceled) => wish(Then::Expired),
+        Event::Cancel => wish(Then::Canceled),
+        Event::CancelForce => go(Phase::Canceled, Fate::Abandon),
+        Event::StepUnknown | Event::UncertainTimeout => go(Phase::NeedsOperator, Fate::Abandon),
+        Event::Hold | Event::LastHoldGone | Event::Deadline => stay(at),
+        _ => None,
+    }
+}
+
+fn needs_operator(at: Standing, event: Event) -> Option<Next> {
+    match event {
+        Event::Succeeded => go(Phase::Succeeded, Fate::End),
+        Event::StopConfirmed => Some(Next { fate: Fate::End, ..stay(at)? }),
+        Event::Deadline | Event::SeenRunning | Event::Hold | Event::LastHoldGone => stay(at),
+        Event::Cancel | Event::CancelForce | Event::ResolveCanceled => go(Phase::Canceled, Fate::Keep),
+        Event::ResolveRequeue => go(Phase::Queued, Fate::Keep),
+        Event::ResolveSucceeded => go(Phase::Succeeded, Fate::Keep),
+        Event::ResolveFailed => go(Phase::Failed, Fate::Keep),
+        _ => None,
+    }
+}

@@ -1,0 +1,356 @@
+//! The rows of a task: what was asked for, where it is, its attempts, and what people asked afterwards.
+
+use super::machine::{Phase, Then};
+use super::spec::TaskSpec;
+use crate::authority::Authority;
+use crate::ids::{AttemptId, RobotId, Subject, TaskId};
+use crate::reason::Reason;
+use crate::robot::Fault;
+use crate::rows::{Index, Record, Table};
+use crate::time::Utc;
+use crate::work::WorkStats;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
+
+/// What was asked for. Immutable.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TaskIntake {
+    /// Its id.
+    pub task_id: TaskId,
+    /// What is wanted.
+    pub spec: TaskSpec,
+    /// Who submitted it.
+    pub actor: String,
+    /// The client's request_id; empty: none.
+    pub request_id: String,
+    /// SHA-256 of the request's canonical form, hex.
+    pub payload_hash: String,
+    /// UTC, site clock.
+    pub created: Utc,
+    /// Admission number: rises by one a task, orders lists and queues.
+    pub number: u64,
+}
+
+impl Record for TaskIntake {
+    const TABLE: Table = Table::TaskIntake;
+    fn id(&self) -> String {
+        self.task_id.to_string()
+    }
+    fn index(&self) -> Index {
+        Index { state: None, parent: None, order: Some(self.number as i64) }
+    }
+}
+
+/// Where a task is. Born QUEUED with its intake, changed by fleet alone.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TaskState {
+    /// Which task.
+    pub task_id: TaskId,
+    /// Admission number of its intake.
+    pub number: u64,
+    /// Where it is.
+    pub phase: Phase,
+    /// Why it is there.
+    pub reason: Option<Reason>,
+    /// Where STOPPING leads once the robot confirmed; kept also while UNCERTAIN.
+    pub then: Option<Then>,
+    /// Tokens that hold it; survive every transition.
+    pub holds: BTreeSet<String>,
+    /// Highest epoch granted; 0: none.
+    pub epoch: u64,
+    /// Robot of the live or last attempt.
+    pub robot_id: Option<RobotId>,
+    /// Set once the first irreversible step is done or unknown: bound to that robot.
+    pub opened: Option<RobotId>,
+    /// Steps done: where the next attempt begins.
+    pub next_step: u32,
+    /// Attempts that were accepted and ended without success.
+    pub failures: u32,
+    /// Offers refused in a row.
+    pub refusals_in_row: u32,
+    /// Robots whose attempt failed.
+    pub failed_robots: BTreeSet<RobotId>,
+    /// Robots that refused it for its content.
+    pub semantic_refusers: BTreeSet<RobotId>,
+    /// UTC, since when it waits (admission, hand-back, end of back-off).
+    pub queued_since: Utc,
+    /// UTC, end of the back-off in RETRY_WAIT.
+    pub retry_at: Option<Utc>,
+    /// UTC, a cancel was asked for and has not ended yet.
+    pub cancel_requested: Option<Utc>,
+    /// UTC, first acceptance.
+    pub started: Option<Utc>,
+    /// UTC, entry into a terminal phase.
+    pub ended: Option<Utc>,
+    /// UTC, last change.
+    pub changed: Utc,
+    /// Sum over its ended attempts.
+    pub stats: WorkStats,
+}
+
+impl TaskState {
+    /// QUEUED, as born with its intake.
+    pub fn born(intake: &TaskIntake) -> Self {
+        Self {
+            task_id: intake.task_id.clone(),
+            number: intake.number,
+            phase: Phase::Queued,
+            reason: None,
+            then: None,
+            holds: BTreeSet::new(),
+            epoch: 0,
+            robot_id: None,
+            opened: None,
+            next_step: 0,
+            failures: 0,
+            refusals_in_row: 0,
+            failed_robots: BTreeSet::new(),
+            semantic_refusers: BTreeSet::new(),
+            queued_since: intake.spec.not_before.map_or(intake.created, |t| t.max(intake.created)),
+            retry_at: None,
+            cancel_requested: None,
+            started: None,
+            ended: None,
+            changed: intake.created,
+            stats: WorkStats::default(),
+        }
+    }
+    /// Id of its newest attempt, if it ever had one.
+    pub fn attempt_id(&self) -> Option<AttemptId> {
+        (self.epoch > 0).then(|| AttemptId { subject: Subject::Task(self.task_id.clone()), epoch: self.epoch })
+    }
+}
+
+impl Record for TaskState {
+    const TABLE: Table = Table::TaskState;
+    fn id(&self) -> String {
+        self.task_id.to_string()
+    }
+    fn index(&self) -> Index {
+        let parent = self.robot_id.as_ref().map(|r| r.as_str().into());
+        Index { state: Some(self.phase.number()), parent, order: Some(self.number as i64) }
+    }
+}
+
+/// Where an attempt is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum AttemptPhase {
+    /// Written, not answered.
+    Offered,
+    /// Taken.
+    Accepted,
+    /// Driving.
+    Navigating,
+    /// Acting or waiting.
+    Executing,
+    /// Standing with it.
+    Paused,
+    /// Told to stop, not confirmed.
+    Stopping,
+    /// The robot did not take it.
+    Refused,
+    /// Nobody answered and the robot confirmed that it does not have it.
+    OfferExpired,
+    /// Done.
+    Succeeded,
+    /// Ended by a fault.
+    Failed,
+    /// Stopped.
+    Aborted,
+    /// Given up by a person while nobody knew.
+    Lost,
+}
+
+impl AttemptPhase {
+    /// No way out.
+    pub const fn is_terminal(self) -> bool {
+        matches!(self, Self::Refused | Self::OfferExpired | Self::Succeeded | Self::Failed | Self::Aborted | Self::Lost)
+    }
+    /// Number in indices and on the wire.
+    pub const fn number(self) -> i64 {
+        self as i64 + 1
+    }
+    /// Where a live attempt may go. LOST may still turn into the truth (a late report) while no newer epoch was granted.
+    pub const fn transitions(self) -> &'static [AttemptPhase] {
+        use AttemptPhase::{Aborted, Accepted, Executing, Failed, Lost, Navigating, OfferExpired, Offered, Paused, Refused, Stopping, Succeeded};
+        match self {
+            Offered => &[Accepted, Navigating, Executing, Paused, Refused, OfferExpired, Stopping, Succeeded, Failed, Aborted, Lost],
+            Accepted => &[Navigating, Executing, Paused, Stopping, Succeeded, Failed, Aborted, Lost],
+            Navigating => &[Executing, Paused, Stopping, Succeeded, Failed, Aborted, Lost],
+            Executing => &[Navigating, Paused, Stopping, Succeeded, Failed, Aborted, Lost],
+            Paused => &[Navigating, Executing, Stopping, Succeeded, Failed, Aborted, Lost],
+            Stopping => &[Refused, OfferExpired, Succeeded, Failed, Aborted, Lost],
+            Lost => &[Succeeded, Failed, Aborted],
+            Refused | OfferExpired | Succeeded | Failed | Aborted => &[],
+        }
+    }
+}
+
+/// Fleet's own wishes of a robot, without a task row.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Errand {
+    /// Drive to a charger and charge.
+    Charge,
+    /// Drive to a parking or hold place.
+    Park,
+}
+
+/// Nobody knows what the robot does with the attempt.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Uncertain {
+    /// UTC, since when.
+    pub since: Utc,
+    /// Why.
+    pub cause: Reason,
+}
+
+/// One grant of a task or errand to one robot.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Attempt {
+    /// Its id: subject and epoch.
+    pub attempt: AttemptId,
+    /// Given to.
+    pub robot_id: RobotId,
+    /// What kind of errand; none for a task.
+    pub errand: Option<Errand>,
+    /// Where it is.
+    pub phase: AttemptPhase,
+    /// None: known.
+    pub uncertain: Option<Uncertain>,
+    /// The offer's anchor.
+    pub offer: Authority,
+    /// Steps done so far.
+    pub step_index: u32,
+    /// Its first irreversible step is done or unknown.
+    pub opened: bool,
+    /// UTC.
+    pub offered: Utc,
+    /// UTC.
+    pub accepted: Option<Utc>,
+    /// UTC.
+    pub ended: Option<Utc>,
+    /// What the robot reported.
+    pub fault: Option<Fault>,
+    /// Why the robot refused.
+    pub refusal: Option<Reason>,
+    /// Driven and spent so far.
+    pub stats: WorkStats,
+    /// Version of the robot's base software when it was granted.
+    pub software: String,
+}
+
+impl Record for Attempt {
+    const TABLE: Table = Table::Attempt;
+    fn id(&self) -> String {
+        self.attempt.to_string()
+    }
+    fn index(&self) -> Index {
+        let parent = Some(self.attempt.subject.to_string().as_str().into());
+        Index { state: Some(self.phase.number()), parent, order: Some(self.attempt.epoch as i64) }
+    }
+}
+
+/// A person's answer to NEEDS_OPERATOR.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Resolution {
+    /// Try again; an opened task goes on at the robot that carries its item.
+    Requeue,
+    /// Try again elsewhere: a person handed the item to whichever robot comes (it goes on after the pick).
+    RequeueHandedOver,
+    /// Try again from the first step: a person put the item back.
+    RequeuePutBack,
+    /// Done by hand.
+    Succeeded,
+    /// Give up.
+    Failed,
+    /// Give up, the item is lost.
+    FailedItemLost,
+    /// Not wanted any more.
+    Canceled,
+}
+
+/// What somebody asks of a task or robot after admission.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Ask {
+    /// End it.
+    Cancel {
+        /// Which.
+        task_id: TaskId,
+        /// End the record at once; robot and places stay kept until the robot reports.
+        force: bool,
+    },
+    /// Answer NEEDS_OPERATOR.
+    Resolve {
+        /// Which.
+        task_id: TaskId,
+        /// How.
+        resolution: Resolution,
+    },
+    /// Take away `resume:<stop_id>` tokens (of all if none is named) from these tasks and robots.
+    ResumeHeld {
+        /// Only the tokens of this stop.
+        stop_id: Option<String>,
+        /// Everything in this area.
+        area_id: Option<crate::ids::AreaId>,
+        /// These tasks.
+        task_ids: Vec<TaskId>,
+        /// These robots.
+        robot_ids: Vec<RobotId>,
+    },
+}
+
+/// One such request: append-only, consumed by fleet in order.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TaskRequest {
+    /// Drawn at random; unique.
+    pub id: String,
+    /// What.
+    pub ask: Ask,
+    /// Why, as the person said.
+    pub reason: String,
+    /// Who.
+    pub actor: String,
+    /// UTC of the wall.
+    pub at_unix_ms: i64,
+}
+
+impl Record for TaskRequest {
+    const TABLE: Table = Table::TaskRequest;
+    fn id(&self) -> String {
+        self.id.clone()
+    }
+    fn index(&self) -> Index {
+        let parent = match &self.ask {
+            Ask::Cancel { task_id, .. } | Ask::Resolve { task_id, .. } => Some(task_id.as_str().into()),
+            Ask::ResumeHeld { .. } => None,
+        };
+        Index { parent, order: Some(self.at_unix_ms), ..Index::default() }
+    }
+}
+
+/// A used request_id and what it was answered: kept 7 days.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RequestKey {
+    /// The client's request_id, with the verb before it.
+    pub id: String,
+    /// SHA-256 of the request's canonical form, hex.
+    pub payload_hash: String,
+    /// The task it is about.
+    pub task_id: Option<TaskId>,
+    /// UTC of the wall.
+    pub at_unix_ms: i64,
+}
+
+impl Record for RequestKey {
+    const TABLE: Table = Table::RequestKey;
+    fn id(&self) -> String {
+        self.id.clone()
+    }
+    fn index(&self) -> Index {
+        Index { order: Some(self.at_unix_ms), ..Index::default() }
+    }
+}
