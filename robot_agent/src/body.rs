@@ -1,0 +1,139 @@
+//! What a machine must offer so that the agent can drive it: the whole of `trait Body`, for makers to implement.
+//!
+//! A vendor SDK, a ROS 2 node or a simulator stands behind it; `examples/` of this crate has one that reads in two minutes.
+//! Every call returns at once. The agent polls; a body never calls back, never blocks and never reads a clock of its own:
+//! `now` is the site clock. Invariant: the agent never asks for more than `limits` allow, and a body may always do less.
+
+use midshift_core::ids::WaypointId;
+use midshift_core::robot::{Fault, HardwareStop, Inventory, Load, Mode, Pose, StopLevel};
+use midshift_core::time::SiteTime;
+use midshift_core::work::StepKind;
+
+/// What the maker allows, whatever anybody asks for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BodyLimits {
+    /// Millimetres per second.
+    pub speed_mm_s: u32,
+    /// Below this the governor never goes: a body that cannot move at all cannot clear a lane. Millimetres per second.
+    pub floor_speed_mm_s: u32,
+    /// State of charge at which the body says critical, permille.
+    pub battery_critical_permille: u16,
+}
+
+/// One point of a path to drive.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PathPoint {
+    /// Its waypoint.
+    pub waypoint: WaypointId,
+    /// Millimetres in the site's frame.
+    pub x_mm: i32,
+    /// Millimetres in the site's frame.
+    pub y_mm: i32,
+    /// Speed on the way to this point, millimetres per second: already the lowest of all layers.
+    pub speed_mm_s: u32,
+}
+
+/// One order to the body.
+#[derive(Clone, Debug, PartialEq)]
+pub enum BodyOrder {
+    /// Drive along these points and stand at the last. A new path that begins with what is left of the old one extends
+    /// it without a stop; the body goes on from where it is.
+    Drive(Vec<PathPoint>),
+    /// Do this action, or stand for this wait, where it is. Never a goto.
+    Act(StepKind),
+}
+
+/// What came of it since the last poll, in order.
+#[derive(Clone, Debug, PartialEq)]
+pub enum BodyNews {
+    /// The body reached this waypoint of its path (drives through it or stands on it).
+    Reached(WaypointId),
+    /// The order is done.
+    Done,
+    /// The order ended by a fault; the body stands.
+    Failed(Fault),
+    /// Who drives changed.
+    Mode(Mode),
+    /// The maker's safety system changed.
+    HardwareStop(HardwareStop),
+    /// What it carries changed.
+    Load(Option<Load>),
+    /// A standing fault began (`true`) or ended.
+    Fault(Fault, bool),
+}
+
+/// Whether a step was done, as far as the body can tell.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Checked {
+    /// It was.
+    Done,
+    /// It was not.
+    NotDone,
+    /// The body cannot tell.
+    Unknown,
+}
+
+/// Readings that change all the time.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BodyState {
+    /// Where it is.
+    pub pose: Pose,
+    /// Last waypoint reached or stood on; none until it knows.
+    pub waypoint: Option<WaypointId>,
+    /// Millimetres per second.
+    pub speed_mm_s: u32,
+    /// State of charge, permille.
+    pub battery_permille: u16,
+    /// Energy flows in.
+    pub charging: bool,
+    /// Tenths of a degree Celsius, hottest joint.
+    pub hottest_joint_decidegrees: i32,
+    /// Millimetres since the body was made; with a load, `loaded_odometer_mm` of them.
+    pub odometer_mm: u64,
+    /// Millimetres driven with a load.
+    pub loaded_odometer_mm: u64,
+    /// Milliwatt-hours spent since the body was made.
+    pub energy_mwh: u64,
+    /// The maker's protective field is violated.
+    pub field_violation: bool,
+}
+
+/// A machine that can be driven.
+pub trait Body: Send {
+    /// Actions it can do (`pick`, `place`, …), labels, payload, versions.
+    fn capabilities(&self) -> Inventory;
+    /// What the maker allows.
+    fn limits(&self) -> BodyLimits;
+    /// Begins an order. An error is a fault that was clear at once (unknown action); the body stands.
+    fn start(&mut self, now: SiteTime, order: BodyOrder) -> Result<(), Fault>;
+    /// Stands still and keeps its order.
+    fn pause(&mut self, now: SiteTime);
+    /// Goes on after a pause.
+    fn resume(&mut self, now: SiteTime);
+    /// Brings it to this level of operational stop and drops its order, except for [`StopLevel::Slow`].
+    fn stop(&mut self, now: SiteTime, level: StopLevel);
+    /// It stands and will not move by itself.
+    fn standstill(&self, now: SiteTime) -> bool;
+    /// Takes the posture in which it may stand for long.
+    fn park(&mut self, now: SiteTime);
+    /// Starts or stops charging; only called while it stands at a charger.
+    fn charge(&mut self, now: SiteTime, on: bool);
+    /// What happened since the last call, in order. Called after every other call and at `next_change`.
+    fn poll(&mut self, now: SiteTime) -> Vec<BodyNews>;
+    /// When the next news will come if nobody asks for anything else; none: not before it is asked for something.
+    fn next_change(&self, now: SiteTime) -> Option<SiteTime>;
+    /// Readings at this moment.
+    fn state(&self, now: SiteTime) -> BodyState;
+    /// What it carries.
+    fn load(&self) -> Option<Load>;
+    /// Whether a step that may have been under way at a restart was done. `task_id` names whose step it was.
+    fn check(&self, step: &StepKind, task_id: Option<&midshift_core::ids::TaskId>) -> Checked;
+    /// The maker's own test; an error says what is broken.
+    fn self_test(&mut self, now: SiteTime) -> Result<(), Fault>;
+    /// State of the maker's own safety system.
+    fn hardware_stop(&self) -> HardwareStop;
+    /// Who drives.
+    fn mode(&self) -> Mode;
+    /// Waypoints it stands on or reaches into now, as far as it knows, e.g. after a restart.
+    fn stands_on(&self) -> Vec<WaypointId>;
+}
