@@ -1,2 +1,66 @@
-//! Under construction.
-fn main() {}
+//! What a developer and CI run: tests, long fault sweeps, golden files, formatting.
+//!
+//! Invariant: nothing here decides what is right. It installs tools, builds once, calls cargo and counts; every
+//! judgement is a test. Called as `cargo xtask VERB` (an alias in `.cargo/config.toml`).
+
+mod fetch_tools;
+mod go;
+mod parts;
+mod run;
+mod suite;
+mod sweep;
+mod workspace;
+
+use clap::{Parser, Subcommand};
+use std::process::ExitCode;
+
+/// Command line of the task runner.
+#[derive(Parser)]
+#[command(name = "cargo xtask", about = "Tests and chores of midshift")]
+struct Cli {
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+#[derive(Subcommand)]
+enum Verb {
+    /// Run the whole suite, or only the named parts, and print the minutes of each.
+    Test {
+        /// First install what the tests of real components need (grpcurl, buf, a Python with gRPC) into target/tools.
+        #[arg(long)]
+        install: bool,
+        /// Parts to run, in the suite's order whatever the order here; none: all.
+        #[arg(value_enum)]
+        parts: Vec<parts::Part>,
+    },
+    /// Run the deterministic simulation over many seeds, far more than CI does.
+    Torture {
+        /// How many seeds.
+        #[arg(long, default_value_t = 2_000)]
+        seeds: u64,
+        /// The first seed. A failing seed alone: `--from SEED --seeds 1`.
+        #[arg(long, default_value_t = 1)]
+        from: u64,
+    },
+    /// Write the golden files anew from what the code does now. Read the diff before you commit it.
+    Golden,
+    /// Format everything, then `golden`.
+    Tidy,
+}
+
+fn main() -> ExitCode {
+    let outcome = workspace::Workspace::find().and_then(|workspace| match Cli::parse().verb {
+        Verb::Test { install, parts } => suite::test(&workspace, install, &parts),
+        Verb::Torture { seeds, from } => sweep::torture(&workspace, from, seeds),
+        Verb::Golden => sweep::golden(&workspace),
+        Verb::Tidy => sweep::tidy(&workspace),
+    });
+    match outcome {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::FAILURE,
+        Err(error) => {
+            run::say(&format!("error: {error:#}"));
+            ExitCode::FAILURE
+        }
+    }
+}

@@ -1,0 +1,146 @@
+//! The outside programs that tests of real components talk to, pinned, under `target/tools`.
+//!
+//! Invariant: without `--install` nothing is fetched and nothing is skipped: what is missing is listed and the suite fails.
+//! A tool counts as there when its program exists and its stamp names the pinned version, so a second install is quick.
+
+use crate::workspace::{Programs, Workspace};
+use crate::{go, run};
+use anyhow::{Context, Result, bail, ensure};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+const GRPCURL: &str = "github.com/fullstorydev/grpcurl/cmd/grpcurl@v1.9.3";
+const BUF: &str = "github.com/bufbuild/buf/cmd/buf@v1.57.2";
+const PYTHON: &[&str] = &["grpcio==1.80.0", "grpcio-tools==1.80.0"];
+
+/// Paths of the tools.
+pub struct Tools {
+    /// grpcurl.
+    pub grpcurl: PathBuf,
+    /// buf.
+    pub buf: PathBuf,
+    /// A Python that can import grpc and grpc_tools.
+    pub python: PathBuf,
+}
+
+impl Tools {
+    /// Where they are or will be.
+    fn of(workspace: &Workspace) -> Self {
+        let tools = workspace.tools();
+        Self { grpcurl: tools.join("bin/grpcurl"), buf: tools.join("bin/buf"), python: tools.join("venv/bin/python") }
+    }
+
+    fn each(&self) -> [(&'static str, &PathBuf, String); 3] {
+        [
+            ("grpcurl", &self.grpcurl, GRPCURL.to_owned()),
+            ("buf", &self.buf, BUF.to_owned()),
+            ("python with gRPC", &self.python, PYTHON.join(" ")),
+        ]
+    }
+
+    /// All tools, or an error that lists the missing ones.
+    pub fn find(workspace: &Workspace) -> Result<Self> {
+        let tools = Self::of(workspace);
+        let missing: Vec<_> =
+            tools.each().into_iter().filter(|t| !present(t.1, &t.2)).map(|t| format!("  {}: {}", t.0, t.2)).collect();
+        if missing.is_empty() {
+            return Ok(tools);
+        }
+        bail!(
+            "missing under {}:\n{}\nnext: cargo xtask test --install",
+            workspace.tools().display(),
+            missing.join("\n")
+        )
+    }
+
+    /// Installs what is missing.
+    pub fn install(workspace: &Workspace) -> Result<Self> {
+        let tools = Self::of(workspace);
+        std::fs::create_dir_all(workspace.tools().join("bin")).context("creating target/tools/bin")?;
+        let absent = [(&tools.grpcurl, GRPCURL), (&tools.buf, BUF)].into_iter().filter(|t| !present(t.0, t.1));
+        let absent: Vec<_> = absent.collect();
+        if !absent.is_empty() {
+            let go = go::find_or_install(workspace)?;
+            for (program, module) in absent {
+                go.install(workspace, module)?;
+                stamp(program, module)?;
+            }
+        }
+        if !present(&tools.python, &PYTHON.join(" ")) {
+            install_python(workspace, &tools.python)?;
+        }
+        Self::find(workspace)
+    }
+
+    /// Tells tests where tools and programs are.
+    pub fn export(&self, programs: &Programs, command: &mut Command) {
+        command.env("MIDSHIFT_TEST_GRPCURL", &self.grpcurl);
+        command.env("MIDSHIFT_TEST_BUF", &self.buf);
+        command.env("MIDSHIFT_TEST_PYTHON", &self.python);
+        command.env("MIDSHIFT_TEST_BIN", &programs.midshift);
+        command.env("MIDSHIFT_TEST_LAUNCHER", &programs.launcher);
+    }
+}
+
+fn install_python(workspace: &Workspace, python: &Path) -> Result<()> {
+    let can_make_venvs = || run::quietly(Command::new("python3").args(["-c", "import venv, ensurepip"]));
+    if !can_make_venvs() {
+        apt_install(workspace, &["python3", "python3-venv"])?;
+        ensure!(can_make_venvs(), "python3 cannot make virtual environments");
+    }
+    let venv = workspace.tools().join("venv");
+    let mut make = workspace.command("python3");
+    ensure!(run::succeeds(make.args(["-m", "venv", "--clear"]).arg(&venv))?, "creating {}", venv.display());
+    let mut pip = workspace.command(python);
+    pip.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--only-binary", ":all:"]).args(PYTHON);
+    run::install(&mut pip)?;
+    stamp(python, &PYTHON.join(" "))
+}
+
+/// Installs packages of Debian or Ubuntu; as another user it says what to type.
+pub fn apt_install(workspace: &Workspace, packages: &[&str]) -> Result<()> {
+    let root = run::output(Command::new("id").arg("-u")).is_some_and(|id| id.trim() == "0");
+    let apt = run::quietly(Command::new("apt-get").arg("--version"));
+    if !root || !apt {
+        bail!(
+            "missing on this machine: {0}; next: sudo apt-get install {0} (or your system's own)",
+            packages.join(" ")
+        );
+    }
+    run::install(workspace.command("apt-get").args(["update", "-q"]))?;
+    let mut command = workspace.command("apt-get");
+    command.args(["install", "-y", "-q", "--no-install-recommends"]).args(packages);
+    run::install(command.env("DEBIAN_FRONTEND", "noninteractive"))
+}
+
+/// The stamp of the venv's Python lies in the venv, so that making it anew removes it.
+fn stamp_of(program: &Path) -> PathBuf {
+    program.with_extension("installed")
+}
+
+fn stamp(program: &Path, version: &str) -> Result<()> {
+    ensure!(program.exists(), "the install left no {}", program.display());
+    std::fs::write(stamp_of(program), version).with_context(|| format!("stamping {}", program.display()))
+}
+
+fn present(program: &Path, version: &str) -> bool {
+    program.exists() && std::fs::read_to_string(stamp_of(program)).is_ok_and(|stamp| stamp == version)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{present, stamp};
+
+    #[test]
+    fn a_tool_of_another_version_is_not_there() {
+        let directory = std::env::temp_dir().join(format!("xtask-{}", std::process::id()));
+        std::fs::create_dir_all(&directory).unwrap();
+        let program = directory.join("tool");
+        assert!(stamp(&program, "v1").is_err(), "an install that left nothing is stamped");
+        std::fs::write(&program, "").unwrap();
+        stamp(&program, "v1").unwrap();
+        assert!(present(&program, "v1"));
+        assert!(!present(&program, "v2"));
+        std::fs::remove_dir_all(&directory).unwrap();
+    }
+}

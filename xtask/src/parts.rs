@@ -1,0 +1,133 @@
+//! The parts of the suite, in their order, and how each is run.
+//!
+//! Invariant: no part is skipped; a part that cannot run fails. All cargo calls select the whole workspace, so that features
+//! are the same in each and nothing is compiled twice.
+
+use crate::fetch_tools::Tools;
+use crate::run;
+use crate::workspace::Workspace;
+use anyhow::Result;
+use clap::ValueEnum;
+
+/// One part.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
+pub enum Part {
+    /// Everything is formatted.
+    Fmt,
+    /// No lint fires.
+    Clippy,
+    /// The documentation builds without a warning.
+    Rustdoc,
+    /// The .proto files keep buf's STANDARD rules.
+    Buf,
+    /// The programs build; tests get their paths.
+    Build,
+    /// Tests inside the crates.
+    Unit,
+    /// The integration suite.
+    Suite,
+    /// Examples in the documentation.
+    Doc,
+}
+
+/// What cargo's closing lines added up to.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Count {
+    /// Tests that passed.
+    pub passed: u64,
+    /// Tests that failed.
+    pub failed: u64,
+    /// Tests marked as ignored.
+    pub ignored: u64,
+}
+
+impl Part {
+    /// Its name on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Fmt => "fmt",
+            Self::Clippy => "clippy",
+            Self::Rustdoc => "rustdoc",
+            Self::Buf => "buf",
+            Self::Build => "build",
+            Self::Unit => "unit",
+            Self::Suite => "suite",
+            Self::Doc => "doc",
+        }
+    }
+
+    /// Whether outside tools take part.
+    pub fn needs_tools(self) -> bool {
+        matches!(self, Self::Buf | Self::Unit | Self::Suite)
+    }
+
+    /// Whether it runs tests, which need the built programs.
+    pub fn runs_tests(self) -> bool {
+        matches!(self, Self::Unit | Self::Suite | Self::Doc)
+    }
+
+    /// Runs it; whether it succeeded. Tests are added to `count`.
+    pub fn run(self, workspace: &Workspace, tools: Option<&Tools>, count: &mut Count) -> Result<bool> {
+        match self {
+            Self::Fmt => run::succeeds(&mut workspace.cargo(&["fmt", "--all", "--check"])),
+            Self::Clippy => {
+                run::succeeds(&mut workspace.cargo(&["clippy", "--workspace", "--all-targets", "--", "-D", "warnings"]))
+            }
+            Self::Rustdoc => {
+                let mut command = workspace.cargo(&["doc", "--workspace", "--no-deps"]);
+                run::succeeds(command.env("RUSTDOCFLAGS", "-D warnings"))
+            }
+            Self::Buf => {
+                let Some(tools) = tools else { return Ok(false) };
+                run::succeeds(workspace.command(&tools.buf).arg("lint").current_dir(workspace.root.join("proto")))
+            }
+            Self::Build => run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins"])),
+            Self::Unit => Self::tests(workspace, tools, count, &["--lib", "--bins"]),
+            Self::Suite => Self::tests(workspace, tools, count, &["--test", "*"]),
+            Self::Doc => Self::tests(workspace, tools, count, &["--doc"]),
+        }
+    }
+
+    fn tests(workspace: &Workspace, tools: Option<&Tools>, count: &mut Count, targets: &[&str]) -> Result<bool> {
+        let mut command = workspace.cargo(&["test", "--workspace", "--no-fail-fast"]);
+        command.args(targets);
+        if let Some(tools) = tools {
+            tools.export(&workspace.programs()?, &mut command);
+        }
+        run::reading(&mut command, |line| count.add(line))
+    }
+}
+
+impl Count {
+    /// Adds a closing line of a test program; every other line changes nothing.
+    pub fn add(&mut self, line: &str) {
+        let Some((_, numbers)) = line.strip_prefix("test result: ").and_then(|rest| rest.split_once(". ")) else {
+            return;
+        };
+        for field in numbers.split(';') {
+            let mut words = field.split_whitespace();
+            let (Some(Ok(number)), Some(word)) = (words.next().map(str::parse::<u64>), words.next()) else { continue };
+            match word {
+                "passed" => self.passed += number,
+                "failed" => self.failed += number,
+                "ignored" => self.ignored += number,
+                _ => {}
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Count;
+
+    #[test]
+    fn closing_lines_add_up_and_other_lines_do_not_count() {
+        let mut count = Count::default();
+        count.add("test result: ok. 7 passed; 0 failed; 1 ignored; 0 measured; 0 filtered out; finished in 0.02s");
+        count.add("test result: FAILED. 3 passed; 2 failed; 0 ignored; 0 measured; 4 filtered out; finished in 1.50s");
+        count.add("test a_result::is_ok ... ok");
+        count.add("8 passed; 8 failed");
+        assert_eq!(count, Count { passed: 10, failed: 2, ignored: 1 });
+    }
+}

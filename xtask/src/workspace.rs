@@ -1,0 +1,71 @@
+//! Where things are: the root of the repository, cargo's target directory, the tools, the built programs.
+//!
+//! Invariant: every path that xtask uses comes from here, so that `CARGO_TARGET_DIR` holds everywhere.
+
+use anyhow::{Context, Result, ensure};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// Paths of this checkout.
+pub struct Workspace {
+    /// The directory of the root Cargo.toml.
+    pub root: PathBuf,
+    /// Cargo's target directory.
+    pub target: PathBuf,
+}
+
+/// The programs under test, built once.
+pub struct Programs {
+    /// `midshift`.
+    pub midshift: PathBuf,
+    /// `midshift-launcher`.
+    pub launcher: PathBuf,
+}
+
+impl Workspace {
+    /// Asks cargo.
+    pub fn find() -> Result<Self> {
+        let output = Command::new(cargo())
+            .args(["metadata", "--no-deps", "--format-version", "1"])
+            .current_dir(Path::new(env!("CARGO_MANIFEST_DIR")))
+            .output()
+            .context("running cargo metadata")?;
+        ensure!(output.status.success(), "cargo metadata: {}", String::from_utf8_lossy(&output.stderr).trim());
+        let metadata: serde_json::Value = serde_json::from_slice(&output.stdout).context("reading cargo metadata")?;
+        let path = |key: &str| metadata[key].as_str().map(PathBuf::from).with_context(|| format!("no {key}"));
+        Ok(Self { root: path("workspace_root")?, target: path("target_directory")? })
+    }
+
+    /// Where downloaded tools are kept.
+    pub fn tools(&self) -> PathBuf {
+        self.target.join("tools")
+    }
+
+    /// A command that runs in the root.
+    pub fn command(&self, program: impl AsRef<std::ffi::OsStr>) -> Command {
+        let mut command = Command::new(program);
+        command.current_dir(&self.root).stdin(std::process::Stdio::null());
+        command
+    }
+
+    /// A cargo command that runs in the root.
+    pub fn cargo(&self, args: &[&str]) -> Command {
+        let mut command = self.command(cargo());
+        command.args(args);
+        command
+    }
+
+    /// The debug programs; an error names the one that was not built.
+    pub fn programs(&self) -> Result<Programs> {
+        let built = |name: &str| {
+            let path = self.target.join("debug").join(format!("{name}{}", std::env::consts::EXE_SUFFIX));
+            ensure!(path.is_file(), "the build left no {}", path.display());
+            Ok(path)
+        };
+        Ok(Programs { midshift: built("midshift")?, launcher: built("midshift-launcher")? })
+    }
+}
+
+fn cargo() -> std::ffi::OsString {
+    std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into())
+}
