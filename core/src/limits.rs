@@ -96,3 +96,17 @@ pub const SWEEP: LinkDuration = LinkDuration(250);
 pub const HARD_DRAIN: LinkDuration = LinkDuration::from_secs(2);
 /// A clone or fenced robot may come back after this.
 pub const FENCED_RETRY: LinkDuration = LinkDuration::from_secs(60);
+/// Bytes of one site, map or layout file.
+pub const SITE_FILE_BYTES: usize = 64 * 1024 * 1024;
+/// Waypoints of one site; the largest public grid benchmark has about 55,000.
+pub const SITE_WAYPOINTS_MAX: usize = 250_000;
+/// Lanes of one site: four a waypoint.
+pub const SITE_LANES_MAX: usize = 1_000_000;
+/// Places of one site.
+pub const SITE_PLACES_MAX: usize = 50_000;
+/// Areas of one site.
+pub const SITE_AREAS_MAX: usize = 1_000;
+/// Memory that a router keeps for distance fields, bytes; the least recently used go first.
+pub const ROUTE_FIELDS_BYTES: usize = 64 * 1024 * 1024;
+/// Tasks of one list file.
+pub const TASK_LIST_MAX: usize = 1_000_000;

@@ -1,0 +1,199 @@
+//! Ways through a site: shortest routes from distance fields, one per goal, and their cut into what is released at once.
+//!
+//! Invariant: the same site, ends and blocked places give the same route, whatever was asked before; never all pairs, and
+//! what is remembered is bounded by [`crate::limits::ROUTE_FIELDS_BYTES`]. Called by fleet's planner and the simulator.
+
+use super::{PlaceIx, Site, WaypointIx};
+use crate::limits::ROUTE_FIELDS_BYTES;
+use lru::LruCache;
+use std::cmp::Reverse;
+use std::collections::{BTreeSet, BinaryHeap};
+use std::num::NonZeroUsize;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// No way to the goal.
+const NEVER: u32 = u32::MAX;
+
+/// Places that no route may lead into: quarantined or closed ones. Routes may leave them.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]
+pub struct Blocked(Arc<[PlaceIx]>);
+
+impl Blocked {
+    /// These places, in any order.
+    pub fn new(places: impl IntoIterator<Item = PlaceIx>) -> Self {
+        Self(places.into_iter().collect::<BTreeSet<_>>().into_iter().collect())
+    }
+    /// Whether a place is among them.
+    pub fn contains(&self, place: PlaceIx) -> bool {
+        self.0.binary_search(&place).is_ok()
+    }
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+}
+
+/// The way from everywhere to one goal.
+#[derive(Debug)]
+pub struct DistanceField {
+    goal: WaypointIx,
+    distance_mm: Vec<u32>,
+    next: Vec<WaypointIx>,
+}
+
+impl DistanceField {
+    /// Where it leads.
+    pub fn goal(&self) -> WaypointIx {
+        self.goal
+    }
+    /// Millimetres to drive from `from`; none if no lanes lead there.
+    pub fn distance_mm(&self, from: WaypointIx) -> Option<u64> {
+        let distance = self.distance_mm[from.at()];
+        (distance != NEVER).then_some(u64::from(distance))
+    }
+    /// The waypoint to drive to next; none at the goal and where no way leads.
+    pub fn next(&self, from: WaypointIx) -> Option<WaypointIx> {
+        (from != self.goal && self.distance_mm[from.at()] != NEVER).then(|| self.next[from.at()])
+    }
+    /// The whole route with both ends; only the goal if `from` is the goal.
+    pub fn route(&self, from: WaypointIx) -> Option<Vec<WaypointIx>> {
+        self.distance_mm(from)?;
+        Some(std::iter::successors(Some(from), |at| self.next(*at)).collect())
+    }
+
+    fn compute(site: &Site, goal: WaypointIx, blocked: &Blocked) -> Self {
+        let count = site.waypoints().len();
+        let mut field = Self { goal, distance_mm: vec![NEVER; count], next: vec![goal; count] };
+        let mut settled = vec![false; count];
+        let mut heap = BinaryHeap::new();
+        let shut = |at: WaypointIx| site.standing_at(at).is_some_and(|p| blocked.contains(p));
+        if !shut(goal) {
+            heap.push(Reverse((0_u32, goal)));
+        }
+        field.distance_mm[goal.at()] = 0;
+        while let Some(Reverse((distance, at))) = heap.pop() {
+            if std::mem::replace(&mut settled[at.at()], true) || (at != goal && (!site.is_through(at) || shut(at))) {
+                continue;
+            }
+            for lane in site.arriving(at).filter(|l| !l.passages.iter().any(|p| blocked.contains(*p))) {
+                let from = lane.from.at();
+                let longer = distance.saturating_add(lane.length_mm);
+                let known = field.distance_mm[from];
+                if longer < known || (longer == known && longer != NEVER && !settled[from] && at < field.next[from]) {
+                    field.distance_mm[from] = longer;
+                    field.next[from] = at;
+                    heap.push(Reverse((longer, lane.from)));
+                }
+            }
+        }
+        field
+    }
+}
+
+/// Answers route questions on one site, remembering the fields of the newest goals.
+#[derive(Debug)]
+pub struct Router {
+    site: Arc<Site>,
+    fields: Mutex<LruCache<(WaypointIx, Blocked), Arc<DistanceField>>>,
+}
+
+impl Router {
+    /// A router with nothing remembered.
+    pub fn new(site: Arc<Site>) -> Self {
+        let field_bytes = site.waypoints().len() * size_of::<(u32, WaypointIx)>() + 64;
+        let most = NonZeroUsize::new(ROUTE_FIELDS_BYTES / field_bytes).unwrap_or(NonZeroUsize::MIN);
+        Self { site, fields: Mutex::new(LruCache::new(most)) }
+    }
+    /// The site.
+    pub fn site(&self) -> &Arc<Site> {
+        &self.site
+    }
+    /// The way from everywhere to `goal`.
+    pub fn field(&self, goal: WaypointIx) -> Arc<DistanceField> {
+        self.field_around(goal, &Blocked::default())
+    }
+    /// The way from everywhere to `goal` around blocked places. A blocked goal is reached from nowhere but itself.
+    pub fn field_around(&self, goal: WaypointIx, blocked: &Blocked) -> Arc<DistanceField> {
+        let key = (goal, blocked.clone());
+        if let Some(field) = self.remembered().get(&key) {
+            return field.clone();
+        }
+        let field = Arc::new(DistanceField::compute(&self.site, goal, blocked));
+        self.remembered().put(key, field.clone());
+        field
+    }
+    /// Millimetres from one waypoint to another; none if no lanes lead there.
+    pub fn distance_mm(&self, from: WaypointIx, to: WaypointIx) -> Option<u64> {
+        self.field(to).distance_mm(from)
+    }
+    /// The shortest route with both ends; none if no lanes lead there.
+    pub fn route(&self, from: WaypointIx, to: WaypointIx) -> Option<Vec<WaypointIx>> {
+        self.field(to).route(from)
+    }
+    /// As [`Self::route`], around blocked places.
+    pub fn route_around(&self, from: WaypointIx, to: WaypointIx, blocked: &Blocked) -> Option<Vec<WaypointIx>> {
+        self.field_around(to, blocked).route(from)
+    }
+    /// The nearest of `goals` by distance, then by index; none if no lanes lead to any.
+    pub fn nearest(&self, from: WaypointIx, goals: impl IntoIterator<Item = WaypointIx>) -> Option<(WaypointIx, u64)> {
+        let reached = goals.into_iter().filter_map(|g| self.distance_mm(from, g).map(|d| (d, g)));
+        reached.min().map(|(d, g)| (g, d))
+    }
+
+    fn remembered(&self) -> std::sync::MutexGuard<'_, LruCache<(WaypointIx, Blocked), Arc<DistanceField>>> {
+        self.fields.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// One passage on a route, from the first waypoint before it to the first behind it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Crossing {
+    /// The passage.
+    pub place: PlaceIx,
+    /// Index into the route of the waypoint at which the robot enters: it must not leave that one without the grant.
+    pub enter: usize,
+    /// Index into the route of the first waypoint at which the robot is outside again.
+    pub leave: usize,
+}
+
+/// The part of a route that is released at once: up to the next standing place or the end.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Segment {
+    /// Index into the route where it begins.
+    pub start: usize,
+    /// Index into the route where it ends.
+    pub end: usize,
+    /// Passages crossed, by (enter, place), each once; the last one may reach the end of the segment, none goes beyond.
+    pub crossings: Vec<Crossing>,
+    /// The standing place at the end; none only where nothing is reserved.
+    pub standing: Option<PlaceIx>,
+}
+
+impl Segment {
+    /// Everything to be granted before this segment is released: passages and the standing place, ascending.
+    pub fn places(&self) -> Vec<PlaceIx> {
+        let all: BTreeSet<_> = self.crossings.iter().map(|c| c.place).chain(self.standing).collect();
+        all.into_iter().collect()
+    }
+}
+
+/// Cuts a route at its standing places. A route of one waypoint has no segment.
+pub fn segments(site: &Site, route: &[WaypointIx]) -> Vec<Segment> {
+    let mut cut = Vec::new();
+    let mut start = 0;
+    let mut crossings: Vec<Crossing> = Vec::new();
+    for end in 1..route.len() {
+        for place in site.passages_of_lane(route[end - 1], route[end]) {
+            match crossings.iter_mut().find(|c| c.place == *place) {
+                Some(crossing) => crossing.leave = end,
+                None => crossings.push(Crossing { place: *place, enter: end - 1, leave: end }),
+            }
+        }
+        let standing = site.standing_at(route[end]);
+        if standing.is_some() || end + 1 == route.len() {
+            cut.push(Segment { start, end, crossings: std::mem::take(&mut crossings), standing });
+            start = end;
+        }
+    }
+    cut
+}
