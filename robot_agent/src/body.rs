@@ -104,6 +104,9 @@ pub trait Body: Send {
     fn capabilities(&self) -> Inventory;
     /// What the maker allows.
     fn limits(&self) -> BodyLimits;
+    /// Whose work the orders after this call are: the task and the index of its step; none for an errand or none. Said before
+    /// [`Body::start`], so that the body's own records and its [`Load`] can name the task. A body that keeps no records ignores it.
+    fn work_for(&mut self, _task_id: Option<&midshift_core::ids::TaskId>, _step_index: u32) {}
     /// Begins an order. An error is a fault that was clear at once (unknown action); the body stands.
     fn start(&mut self, now: SiteTime, order: BodyOrder) -> Result<(), Fault>;
     /// Stands still and keeps its order.
