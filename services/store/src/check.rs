@@ -2,10 +2,11 @@
 //!
 //! Invariant: nothing here depends on the engine, so that all engines refuse the same items for the same reason.
 
-use crate::CommitError;
+use crate::{Applied, CommitError};
 use midshift_core::limits;
-use midshift_core::rows::{Expect, Fact, Item, Key, Log, Revision, RowChange, Write};
+use midshift_core::rows::{Entry, Expect, Fact, Index, Item, Key, Log, Revision, Row, RowChange, Seq, Write};
 use std::collections::BTreeSet;
+use std::sync::Arc;
 
 /// Bytes that count against [`limits::GROUP_COMMIT_BYTES`]: row bodies, facts, ids.
 pub(crate) fn item_bytes(item: &Item) -> usize {
@@ -18,7 +19,7 @@ pub(crate) fn item_bytes(item: &Item) -> usize {
 }
 
 /// What can be said of an item without looking at any row.
-pub(crate) fn form(item: &Item) -> Result<(), CommitError> {
+fn form(item: &Item) -> Result<(), CommitError> {
     let over = item.rows.len() > limits::ITEM_ROWS_MAX
         || item.facts.len() > limits::ITEM_ROWS_MAX
         || item_bytes(item) > limits::GROUP_COMMIT_BYTES;
@@ -55,8 +56,82 @@ fn may_state(item: &Item, fact: &Fact) -> Result<(), CommitError> {
     Err(CommitError::NotTheWriter { writer: item.writer, owned: fact.log.name() })
 }
 
-/// Whether every row stands as the item expects; `found` says where a row stands.
-pub(crate) fn expectations(item: &Item, found: impl Fn(&Key) -> Option<Revision>) -> Result<(), CommitError> {
+/// What a row becomes.
+#[derive(Clone, Debug)]
+pub(crate) enum After {
+    /// It stands.
+    Row(Row),
+    /// There is none.
+    Gone(Key),
+}
+
+/// What an item does once it is taken.
+#[derive(Debug)]
+pub(crate) struct Decided {
+    /// Each row that changes.
+    pub(crate) rows: Vec<After>,
+    /// Its entries, numbered from the head given.
+    pub(crate) entries: Vec<Entry>,
+    /// The answer.
+    pub(crate) applied: Applied,
+}
+
+/// Judges one item against where the rows stand (`found`) and says what it does. `head` is the newest number given so far.
+pub(crate) fn decide(
+    item: Item,
+    head: Seq,
+    at_unix_ms: i64,
+    found: impl Fn(&Key) -> Option<Revision>,
+) -> Result<Decided, CommitError> {
+    form(&item)?;
+    expectations(&item, found)?;
+    let Item { writer, actor, request_id, rows, facts } = item;
+    let mut decided =
+        Decided { rows: Vec::new(), entries: Vec::new(), applied: Applied { seq: head, revisions: Vec::new() } };
+    let entry = |seq: &mut Seq, log, subject, kind: &str, body| {
+        *seq = Seq(seq.0 + 1);
+        Entry {
+            seq: *seq,
+            log,
+            table: None,
+            subject,
+            revision: Revision(0),
+            index: Index::default(),
+            body,
+            kind: Arc::from(kind),
+            actor: actor.clone(),
+            request_id: request_id.clone(),
+            at_unix_ms,
+        }
+    };
+    let seq = &mut decided.applied.seq;
+    for RowChange { key, expect, write, kind } in rows {
+        let revision = match expect {
+            Expect::Absent => Revision(1),
+            Expect::At(revision) => revision.next(),
+        };
+        let (index, body) = match write {
+            Write::Keep => continue,
+            Write::Put { index, body } => (index, Some(body)),
+            Write::Delete => (Index::default(), None),
+        };
+        let entry = entry(seq, Log::of(writer), key.id.clone(), kind, body.clone());
+        decided.entries.push(Entry { table: Some(key.table), revision, index: index.clone(), ..entry });
+        match body {
+            Some(body) => {
+                decided.applied.revisions.push((key.clone(), revision));
+                decided.rows.push(After::Row(Row { key, revision, index, body }));
+            }
+            None => decided.rows.push(After::Gone(key)),
+        }
+    }
+    for Fact { log, subject, kind, body } in facts {
+        decided.entries.push(entry(seq, log, subject, kind, Some(body)));
+    }
+    Ok(decided)
+}
+
+fn expectations(item: &Item, found: impl Fn(&Key) -> Option<Revision>) -> Result<(), CommitError> {
     for change in &item.rows {
         let found = found(&change.key);
         let holds = match change.expect {
@@ -69,14 +144,6 @@ pub(crate) fn expectations(item: &Item, found: impl Fn(&Key) -> Option<Revision>
         }
     }
     Ok(())
-}
-
-/// The revision that a change writes.
-pub(crate) fn written(expect: Expect) -> Revision {
-    match expect {
-        Expect::Absent => Revision(1),
-        Expect::At(revision) => revision.next(),
-    }
 }
 
 /// Where a log stands in [`Log::ALL`].

@@ -2,7 +2,7 @@
 //!
 //! Invariant: an item is applied whole or not at all, by the one service that owns its tables ([`Table::writer`]), and is
 //! acknowledged only once it is as durable as the store can make it. No decision about the fleet is made here.
-//! Called by the services through [`Store`]; [`MemoryStore`] and [`SqliteStore`] pass one contract suite (`tests/contract.rs`).
+//! Called by the services through [`Store`]; [`MemoryStore`] and [`SqliteStore`] pass one contract suite (`tests/store/contract.rs`).
 //!
 //! What is volatile (heartbeats, poses) is on the [`LiveBoard`]; what is bulky (samples) is in the [`FrameLog`]; neither is a row.
 
@@ -12,11 +12,13 @@ mod frames;
 mod model;
 mod model_table;
 mod projection;
+mod sqlite;
 
 pub use board::{Dirty, LiveBoard};
 pub use frames::{FRAME_BYTES_DEFAULT, Frame, FrameLog, FrameMark, GAPS_MAX, Gap, MemoryFrames, StoredFrame};
 pub use model::MemoryStore;
 pub use projection::{Change, Fold, Projection};
+pub use sqlite::{Migrated, OpenError, SqliteFrames, SqliteStore, migrate};
 
 use async_trait::async_trait;
 use midshift_core::ids::SiteId;

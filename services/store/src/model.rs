@@ -4,14 +4,14 @@
 //! Invariant: synchronous and deterministic: no task, no file, no randomness; same calls, same clock readings, same answers.
 //! Nothing survives the process.
 
-use crate::check::{expectations, form, log_index, written};
+use crate::check::{After, decide, log_index};
 use crate::model_table::Rows;
 use crate::{
     Applied, CommitError, Error, FEED_PAGE_MAX, FeedPage, GET_KEYS_MAX, Query, Retention, Snapshot, Store, StoreId,
 };
 use async_trait::async_trait;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Entry, Index, Item, Key, Log, Revision, Row, Seq, Table, Write};
+use midshift_core::rows::{Entry, Item, Key, Log, Row, Seq, Table};
 use midshift_core::time::Clock;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -79,59 +79,22 @@ impl MemoryStore {
 
 impl State {
     fn apply(&mut self, item: Item, at_unix_ms: i64, log_entries_max: usize) -> Result<Applied, CommitError> {
-        form(&item)?;
-        expectations(&item, |key| self.row(key).map(|row| row.revision))?;
-        let mut applied = Applied { seq: self.head, revisions: Vec::new() };
-        let Item { writer, actor, request_id, rows, facts } = item;
-        let entry = |log, subject, kind: &str| Entry {
-            seq: Seq(0),
-            log,
-            table: None,
-            subject,
-            revision: Revision(0),
-            index: Index::default(),
-            body: None,
-            kind: Arc::from(kind),
-            actor: actor.clone(),
-            request_id: request_id.clone(),
-            at_unix_ms,
-        };
-        for change in rows {
-            let revision = written(change.expect);
-            let mut entry = Entry {
-                table: Some(change.key.table),
-                revision,
-                ..entry(Log::of(writer), change.key.id.clone(), change.kind)
-            };
-            let table = self.tables.entry(change.key.table).or_default();
-            match change.write {
-                Write::Put { index, body } => {
-                    applied.revisions.push((change.key.clone(), revision));
-                    entry.index = index.clone();
-                    entry.body = Some(body.clone());
-                    table.put(Row { key: change.key, revision, index, body });
-                }
-                Write::Delete => table.delete(&change.key.id),
-                Write::Keep => continue,
+        let decided = decide(item, self.head, at_unix_ms, |key| self.row(key).map(|row| row.revision))?;
+        for after in decided.rows {
+            match after {
+                After::Row(row) => self.tables.entry(row.key.table).or_default().put(row),
+                After::Gone(key) => self.tables.entry(key.table).or_default().delete(&key.id),
             }
-            self.log(entry, log_entries_max);
         }
-        for fact in facts {
-            let entry = Entry { body: Some(fact.body), ..entry(fact.log, fact.subject, fact.kind) };
-            self.log(entry, log_entries_max);
+        for entry in decided.entries {
+            let kept = &mut self.logs[log_index(entry.log)];
+            kept.entries.push_back(entry);
+            if kept.entries.len() > log_entries_max {
+                kept.drop_oldest();
+            }
         }
-        applied.seq = self.head;
-        Ok(applied)
-    }
-
-    fn log(&mut self, mut entry: Entry, log_entries_max: usize) {
-        self.head = Seq(self.head.0 + 1);
-        entry.seq = self.head;
-        let kept = &mut self.logs[log_index(entry.log)];
-        kept.entries.push_back(entry);
-        if kept.entries.len() > log_entries_max {
-            kept.drop_oldest();
-        }
+        self.head = decided.applied.seq;
+        Ok(decided.applied)
     }
 
     fn row(&self, key: &Key) -> Option<&Row> {

@@ -1,6 +1,6 @@
 //! A service's view of some tables, kept in memory: built from a snapshot at start and carried forward by the feed.
 //!
-//! Invariant: carried forward or built anew, a projection is the same (`tests/projection.rs`). It never writes.
+//! Invariant: carried forward or built anew, a projection is the same (`tests/store/projection.rs`). It never writes.
 //! Called by the reconcilers; a fold turns rows into whatever shape their planner reads.
 
 use crate::{Error, FEED_PAGE_MAX, Store, StoreId};

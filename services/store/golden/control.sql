@@ -1,0 +1,347 @@
+CREATE TABLE area_policy (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE attempt (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE desired_policy (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE desired_work (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE fleet_event (
+    site_id TEXT NOT NULL,
+    seq BIGINT NOT NULL,
+    tbl TEXT,
+    subject TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT,
+    body TEXT,
+    kind TEXT NOT NULL,
+    actor TEXT NOT NULL,
+    request_id TEXT,
+    at_unix_ms BIGINT NOT NULL,
+    UNIQUE (site_id, seq)
+);
+
+CREATE TABLE fleet_mark (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE hold_token (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE incident (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE lane_mark (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE log_mark (
+    site_id TEXT NOT NULL,
+    log TEXT NOT NULL,
+    pruned_seq BIGINT NOT NULL,
+    UNIQUE (site_id, log)
+);
+
+CREATE TABLE place_grant (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE presence (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE request_key (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE robot_authority (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE robot_control (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE robot_counter (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE robot_inbox (
+    site_id TEXT NOT NULL,
+    seq BIGINT NOT NULL,
+    tbl TEXT,
+    subject TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT,
+    body TEXT,
+    kind TEXT NOT NULL,
+    actor TEXT NOT NULL,
+    request_id TEXT,
+    at_unix_ms BIGINT NOT NULL,
+    UNIQUE (site_id, seq)
+);
+
+CREATE TABLE schema_version (version BIGINT NOT NULL, name TEXT NOT NULL, UNIQUE (version));
+
+CREATE TABLE service_clock (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE session (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE site (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE store_head (
+    site_id TEXT NOT NULL,
+    store_id TEXT NOT NULL,
+    seq BIGINT NOT NULL,
+    UNIQUE (site_id)
+);
+
+CREATE TABLE task_event (
+    site_id TEXT NOT NULL,
+    seq BIGINT NOT NULL,
+    tbl TEXT,
+    subject TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT,
+    body TEXT,
+    kind TEXT NOT NULL,
+    actor TEXT NOT NULL,
+    request_id TEXT,
+    at_unix_ms BIGINT NOT NULL,
+    UNIQUE (site_id, seq)
+);
+
+CREATE TABLE task_intake (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE task_request (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE task_state (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE telemetry_event (
+    site_id TEXT NOT NULL,
+    seq BIGINT NOT NULL,
+    tbl TEXT,
+    subject TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT,
+    body TEXT,
+    kind TEXT NOT NULL,
+    actor TEXT NOT NULL,
+    request_id TEXT,
+    at_unix_ms BIGINT NOT NULL,
+    UNIQUE (site_id, seq)
+);
+
+CREATE TABLE timer (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE INDEX attempt_by_parent ON attempt (site_id, parent, ord, id);
+
+CREATE INDEX attempt_by_state ON attempt (site_id, state, ord, id);
+
+CREATE INDEX fleet_event_by_subject ON fleet_event (site_id, subject, seq);
+
+CREATE INDEX incident_by_ord ON incident (site_id, ord, id);
+
+CREATE INDEX incident_by_state ON incident (site_id, state, ord, id);
+
+CREATE INDEX request_key_by_ord ON request_key (site_id, ord, id);
+
+CREATE INDEX robot_inbox_by_subject ON robot_inbox (site_id, subject, seq);
+
+CREATE INDEX task_event_by_subject ON task_event (site_id, subject, seq);
+
+CREATE INDEX task_intake_by_ord ON task_intake (site_id, ord, id);
+
+CREATE INDEX task_request_by_ord ON task_request (site_id, ord, id);
+
+CREATE INDEX task_request_by_parent ON task_request (site_id, parent, ord, id);
+
+CREATE INDEX task_state_by_ord ON task_state (site_id, ord, id);
+
+CREATE INDEX task_state_by_parent ON task_state (site_id, parent, ord, id);
+
+CREATE INDEX task_state_by_state ON task_state (site_id, state, ord, id);
+
+CREATE INDEX telemetry_event_by_subject ON telemetry_event (site_id, subject, seq);
+
+CREATE INDEX timer_by_ord ON timer (site_id, ord, id);
+

@@ -1,0 +1,1 @@
+CREATE INDEX task_event_by_subject ON task_event (site_id, subject, seq)

@@ -1,0 +1,1 @@
+CREATE INDEX task_request_by_ord ON task_request (site_id, ord, id)

@@ -1,0 +1,1 @@
+CREATE INDEX request_key_by_ord ON request_key (site_id, ord, id)

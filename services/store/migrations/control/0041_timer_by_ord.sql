@@ -1,0 +1,1 @@
+CREATE INDEX timer_by_ord ON timer (site_id, ord, id)

@@ -1,0 +1,370 @@
+//! The writer task of `telemetry.db`: frames queue while one fsync runs, and the next transaction takes them all.
+//!
+//! Invariant: nobody is told "durable" before the COMMIT has returned. Marks are kept in memory, written down every 5 s, and after
+//! a start folded again from the log's tail: a keyed write per frame would cost more than the frame.
+
+use super::file::DataFile;
+use super::frames_pack::{pack, unpack};
+use super::write_sql::placeholders;
+use super::{OpenError, unavailable};
+use crate::frames::Marks;
+use crate::{Error, Frame, FrameMark, Gap};
+use midshift_core::ids::{RobotId, SiteId};
+use midshift_core::time::Clock;
+use sqlx::{AssertSqlSafe, Connection, Row, SqliteConnection};
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::{mpsc, oneshot};
+use tokio::time::Instant;
+
+/// One `frame_log` row holds about so many bytes and samples; one transaction so many bytes.
+const ROW_BYTES: usize = 64 * 1024;
+const ROW_SAMPLES: u64 = 2_000;
+const GROUP_BYTES: usize = 1024 * 1024;
+/// Marks are written down this often while frames arrive.
+const MARKS_PERIOD: Duration = Duration::from_secs(5);
+/// Rows of one statement of marks or gaps, and rows one slice of pruning takes.
+const SLICE_ROWS: usize = 100;
+/// Gaps kept, newest first.
+const GAPS_KEPT: i64 = 1_000_000;
+
+type Reply<T> = oneshot::Sender<Result<T, Error>>;
+
+pub(super) enum Command {
+    Append { frames: Vec<Frame>, reply: Reply<()> },
+    Marks { reply: Reply<Vec<FrameMark>> },
+    Gaps { gaps: Vec<Gap>, reply: Reply<()> },
+    Prune { reply: Reply<u64> },
+    Close { reply: Reply<()> },
+}
+
+/// What is known of the open file; none of it outlives a failure.
+struct Open {
+    connection: SqliteConnection,
+    marks: Marks,
+    /// Marks that moved since they were last written down.
+    moved: Marks,
+    marked_at: Instant,
+    position: i64,
+    bytes: u64,
+    gap_position: i64,
+}
+
+pub(super) struct FramesWriter {
+    file: DataFile,
+    site_id: SiteId,
+    clock: Arc<dyn Clock>,
+    bytes_max: u64,
+    open: Option<Open>,
+}
+
+/// One `frame_log` row.
+#[derive(Default)]
+struct Packed {
+    body: Vec<u8>,
+    samples: u64,
+}
+
+impl FramesWriter {
+    pub(super) async fn open(
+        file: DataFile,
+        site_id: SiteId,
+        clock: Arc<dyn Clock>,
+        bytes_max: u64,
+    ) -> Result<Self, OpenError> {
+        let mut writer = Self { file, site_id, clock, bytes_max, open: None };
+        writer.open = Some(writer.load().await?);
+        Ok(writer)
+    }
+
+    async fn load(&self) -> Result<Open, OpenError> {
+        let mut connection = self.file.writer().await?;
+        let (marks, position, bytes, gap_position) = tail(&mut connection, &self.site_id)
+            .await
+            .map_err(|source| OpenError::Sql { doing: "reading the tail of the frame log", source })?;
+        let marked_at = Instant::now();
+        // What was folded from the tail is not written down yet.
+        let moved = marks.clone();
+        Ok(Open { connection, marks, moved, marked_at, position, bytes, gap_position })
+    }
+
+    async fn ready(&mut self) -> Result<(), Error> {
+        if self.open.is_none() {
+            self.open = Some(self.load().await.map_err(|e| Error::Unavailable(Arc::new(e)))?);
+        }
+        Ok(())
+    }
+
+    pub(super) async fn run(mut self, mut queue: mpsc::Receiver<Command>) {
+        let mut put_back = None;
+        loop {
+            let command = match put_back.take() {
+                Some(command) => command,
+                None => match queue.recv().await {
+                    Some(command) => command,
+                    None => return,
+                },
+            };
+            // Who asked may have stopped waiting; the work is done all the same.
+            match command {
+                Command::Append { frames, reply } => {
+                    let (frames, replies) = gather(frames, reply, &mut queue, &mut put_back);
+                    let outcome = self.append(&frames).await;
+                    replies.into_iter().for_each(|reply| drop(reply.send(outcome.clone())));
+                }
+                Command::Marks { reply } => {
+                    let ready = self.ready().await;
+                    drop(reply.send(ready.map(|()| self.open.as_ref().map_or_else(Vec::new, |o| o.marks.list()))));
+                }
+                Command::Gaps { gaps, reply } => drop(reply.send(self.gaps(&gaps).await)),
+                Command::Prune { reply } => drop(reply.send(self.prune().await)),
+                Command::Close { reply } => {
+                    let outcome = self.write_marks().await;
+                    if let Some(open) = self.open.take() {
+                        drop(open.connection.close().await);
+                    }
+                    drop(reply.send(outcome));
+                    return;
+                }
+            }
+        }
+    }
+
+    async fn append(&mut self, frames: &[Frame]) -> Result<(), Error> {
+        let rows = packed(frames)?;
+        let at_unix_ms = self.clock.now().wall.0;
+        let started = Instant::now();
+        self.ready().await?;
+        // Whatever fails, the file is opened again and read: sending frames twice does no harm.
+        let Some(mut open) = self.open.take() else { return Ok(()) };
+        for frame in frames {
+            open.moved.raise(&frame.robot_id, &frame.ring, frame.last_seq);
+        }
+        let write_marks = open.marked_at.elapsed() >= MARKS_PERIOD;
+        write(&mut open, &self.site_id, &rows, at_unix_ms, write_marks).await.map_err(unavailable)?;
+        for frame in frames {
+            open.marks.raise(&frame.robot_id, &frame.ring, frame.last_seq);
+        }
+        self.open = Some(open);
+        metrics::histogram!("midshift_store_frames_commit_seconds").record(started.elapsed().as_secs_f64());
+        Ok(())
+    }
+
+    async fn write_marks(&mut self) -> Result<(), Error> {
+        self.ready().await?;
+        let Some(mut open) = self.open.take() else { return Ok(()) };
+        write(&mut open, &self.site_id, &[], 0, true).await.map_err(unavailable)?;
+        self.open = Some(open);
+        Ok(())
+    }
+
+    async fn gaps(&mut self, gaps: &[Gap]) -> Result<(), Error> {
+        self.ready().await?;
+        let Some(mut open) = self.open.take() else { return Ok(()) };
+        write_gaps(&mut open, &self.site_id, gaps).await.map_err(unavailable)?;
+        self.open = Some(open);
+        Ok(())
+    }
+
+    /// Takes the oldest rows out; returns the bytes freed, 0 when the kept ones are within their limit.
+    async fn prune(&mut self) -> Result<u64, Error> {
+        self.ready().await?;
+        if self.open.as_ref().is_none_or(|open| open.bytes <= self.bytes_max) {
+            return Ok(0);
+        }
+        // What is pruned is no longer there to fold marks from.
+        self.write_marks().await?;
+        let Some(mut open) = self.open.take() else { return Ok(0) };
+        let freed = prune(&mut open, &self.site_id, self.bytes_max).await.map_err(unavailable)?;
+        self.open = Some(open);
+        Ok(freed)
+    }
+}
+
+fn gather(
+    mut frames: Vec<Frame>,
+    reply: Reply<()>,
+    queue: &mut mpsc::Receiver<Command>,
+    put_back: &mut Option<Command>,
+) -> (Vec<Frame>, Vec<Reply<()>>) {
+    let mut replies = vec![reply];
+    let mut bytes: usize = frames.iter().map(|f| f.bytes.len()).sum();
+    while bytes < GROUP_BYTES {
+        match queue.try_recv() {
+            Ok(Command::Append { frames: more, reply }) => {
+                bytes += more.iter().map(|f| f.bytes.len()).sum::<usize>();
+                frames.extend(more);
+                replies.push(reply);
+            }
+            Ok(other) => {
+                *put_back = Some(other);
+                break;
+            }
+            Err(_) => break,
+        }
+    }
+    (frames, replies)
+}
+
+fn packed(frames: &[Frame]) -> Result<Vec<Packed>, Error> {
+    let mut rows: Vec<Packed> = Vec::new();
+    for frame in frames {
+        if rows.last().is_none_or(|row| row.body.len() >= ROW_BYTES || row.samples >= ROW_SAMPLES) {
+            rows.push(Packed::default());
+        }
+        if let Some(row) = rows.last_mut() {
+            pack(frame, &mut row.body).map_err(|error| Error::Unavailable(Arc::new(error)))?;
+            row.samples += frame.last_seq.saturating_sub(frame.first_seq) + 1;
+        }
+    }
+    Ok(rows)
+}
+
+async fn write(
+    open: &mut Open,
+    site_id: &SiteId,
+    rows: &[Packed],
+    at_unix_ms: i64,
+    with_marks: bool,
+) -> Result<(), sqlx::Error> {
+    let mut transaction = open.connection.begin_with("BEGIN IMMEDIATE").await?;
+    for row in rows {
+        open.position += 1;
+        open.bytes += row.body.len() as u64;
+        sqlx::query("INSERT INTO frame_log (site_id, position, at_unix_ms, size, body) VALUES ($1, $2, $3, $4, $5)")
+            .bind(site_id.as_str())
+            .bind(open.position)
+            .bind(at_unix_ms)
+            .bind(row.body.len() as i64)
+            .bind(row.body.as_slice())
+            .execute(&mut *transaction)
+            .await?;
+    }
+    if with_marks {
+        save_marks(&mut transaction, site_id, &open.moved.list(), open.position).await?;
+    }
+    transaction.commit().await?;
+    if with_marks {
+        open.moved = Marks::default();
+        open.marked_at = Instant::now();
+    }
+    Ok(())
+}
+
+async fn save_marks(
+    connection: &mut SqliteConnection,
+    site_id: &SiteId,
+    marks: &[FrameMark],
+    position: i64,
+) -> Result<(), sqlx::Error> {
+    for slice in marks.chunks(SLICE_ROWS) {
+        let mut upsert = sqlx::query(AssertSqlSafe(format!(
+            "INSERT INTO frame_mark (site_id, robot_id, ring, seq) VALUES {} \
+             ON CONFLICT (site_id, robot_id, ring) DO UPDATE SET seq = excluded.seq WHERE excluded.seq > frame_mark.seq",
+            placeholders(slice.len(), 4)
+        )));
+        for mark in slice {
+            upsert = upsert
+                .bind(site_id.as_str())
+                .bind(mark.robot_id.as_str())
+                .bind(mark.ring.clone())
+                .bind(mark.seq.cast_signed());
+        }
+        upsert.execute(&mut *connection).await?;
+    }
+    sqlx::query(
+        "INSERT INTO frame_head (site_id, marked_position) VALUES ($1, $2) \
+         ON CONFLICT (site_id) DO UPDATE SET marked_position = excluded.marked_position",
+    )
+    .bind(site_id.as_str())
+    .bind(position)
+    .execute(connection)
+    .await?;
+    Ok(())
+}
+
+async fn write_gaps(open: &mut Open, site_id: &SiteId, gaps: &[Gap]) -> Result<(), sqlx::Error> {
+    let mut transaction = open.connection.begin_with("BEGIN IMMEDIATE").await?;
+    for slice in gaps.chunks(SLICE_ROWS) {
+        let mut insert = sqlx::query(AssertSqlSafe(format!(
+            "INSERT INTO gap (site_id, position, robot_id, ring, lane, from_seq, to_seq, reason, at_unix_ms) VALUES {}",
+            placeholders(slice.len(), 9)
+        )));
+        for gap in slice {
+            open.gap_position += 1;
+            insert = insert
+                .bind(site_id.as_str())
+                .bind(open.gap_position)
+                .bind(gap.robot_id.as_str())
+                .bind(gap.ring.clone())
+                .bind(gap.lane.clone())
+                .bind(gap.from_seq.cast_signed())
+                .bind(gap.to_seq.cast_signed())
+                .bind(gap.reason.clone())
+                .bind(gap.at_unix_ms);
+        }
+        insert.execute(&mut *transaction).await?;
+    }
+    sqlx::query("DELETE FROM gap WHERE site_id = $1 AND position <= $2")
+        .bind(site_id.as_str())
+        .bind(open.gap_position - GAPS_KEPT)
+        .execute(&mut *transaction)
+        .await?;
+    transaction.commit().await
+}
+
+async fn prune(open: &mut Open, site_id: &SiteId, bytes_max: u64) -> Result<u64, sqlx::Error> {
+    let oldest = sqlx::query("SELECT position, size FROM frame_log WHERE site_id = $1 ORDER BY position LIMIT $2")
+        .bind(site_id.as_str())
+        .bind(SLICE_ROWS as i64)
+        .fetch_all(&mut open.connection)
+        .await?;
+    let (mut freed, mut up_to) = (0, 0);
+    for row in oldest {
+        if open.bytes - freed <= bytes_max {
+            break;
+        }
+        up_to = row.try_get::<i64, _>(0)?;
+        freed += row.try_get::<i64, _>(1)?.cast_unsigned();
+    }
+    sqlx::query("DELETE FROM frame_log WHERE site_id = $1 AND position <= $2")
+        .bind(site_id.as_str())
+        .bind(up_to)
+        .execute(&mut open.connection)
+        .await?;
+    open.bytes -= freed;
+    Ok(freed)
+}
+
+/// Marks as written down and folded forward from the log's tail; the last position; the bytes kept; the last gap.
+async fn tail(connection: &mut SqliteConnection, site_id: &SiteId) -> Result<(Marks, i64, u64, i64), sqlx::Error> {
+    let mut marks = Marks::default();
+    let saved = sqlx::query("SELECT robot_id, ring, seq FROM frame_mark WHERE site_id = $1").bind(site_id.as_str());
+    for row in saved.fetch_all(&mut *connection).await? {
+        let robot_id = RobotId::parse(row.try_get(0)?).map_err(|error| sqlx::Error::Decode(Box::new(error)))?;
+        marks.raise(&robot_id, &Arc::from(row.try_get::<&str, _>(1)?), row.try_get::<i64, _>(2)?.cast_unsigned());
+    }
+    let head = "SELECT COALESCE(MAX(marked_position), 0) FROM frame_head WHERE site_id = $1";
+    let mut position: i64 = sqlx::query(head).bind(site_id.as_str()).fetch_one(&mut *connection).await?.try_get(0)?;
+    loop {
+        let newer = sqlx::query(
+            "SELECT position, body FROM frame_log WHERE site_id = $1 AND position > $2 ORDER BY position LIMIT $3",
+        );
+        let rows = newer.bind(site_id.as_str()).bind(position).bind(SLICE_ROWS as i64);
+        let rows = rows.fetch_all(&mut *connection).await?;
+        if rows.is_empty() {
+            break;
+        }
+        for row in rows {
+            position = row.try_get(0)?;
+            for frame in unpack(row.try_get(1)?).map_err(|error| sqlx::Error::Decode(Box::new(error)))? {
+                marks.raise(&frame.robot_id, &frame.ring, frame.last_seq);
+            }
+        }
+    }
+    let sum = "SELECT COALESCE(SUM(size), 0) FROM frame_log WHERE site_id = $1";
+    let bytes: i64 = sqlx::query(sum).bind(site_id.as_str()).fetch_one(&mut *connection).await?.try_get(0)?;
+    let gap = "SELECT COALESCE(MAX(position), 0) FROM gap WHERE site_id = $1";
+    let gap_position: i64 = sqlx::query(gap).bind(site_id.as_str()).fetch_one(connection).await?.try_get(0)?;
+    Ok((marks, position, bytes.cast_unsigned(), gap_position))
+}

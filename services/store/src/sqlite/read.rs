@@ -1,0 +1,238 @@
+//! Reads of `control.db`, beside the writer and never in its way.
+//!
+//! Invariant: what must hold together (rows and their number, entries and the head) is read in one transaction. Only names from
+//! closed lists are spliced into text.
+
+use super::tail::page_of;
+use super::unavailable;
+use super::write_sql::{ord, placeholders};
+use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, Query, Snapshot};
+use midshift_core::ids::SiteId;
+use midshift_core::rows::{Entry, Index, Key, Log, Revision, Row, Seq, Table};
+use sqlx::sqlite::{SqliteArguments, SqliteRow};
+use sqlx::{AssertSqlSafe, Row as _, Sqlite, SqliteConnection, SqlitePool};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+const ROW_COLUMNS: &str = "id, revision, state, parent, ord, body";
+/// Ids of one statement.
+const IDS_PER_STATEMENT: usize = 500;
+
+type Statement<'q> = sqlx::query::Query<'q, Sqlite, SqliteArguments>;
+
+fn prepared<'q>(sql: String) -> Statement<'q> {
+    sqlx::query(AssertSqlSafe(sql))
+}
+
+fn row(table: Table, row: &SqliteRow) -> Result<Row, sqlx::Error> {
+    let order: i64 = row.try_get(4)?;
+    Ok(Row {
+        key: Key::new(table, row.try_get::<&str, _>(0)?),
+        revision: Revision(row.try_get::<i64, _>(1)?.cast_unsigned()),
+        index: Index {
+            state: row.try_get(2)?,
+            parent: row.try_get::<Option<&str>, _>(3)?.map(Arc::from),
+            order: (order != ord(None)).then_some(order),
+        },
+        body: Arc::from(row.try_get::<&str, _>(5)?),
+    })
+}
+
+pub(super) async fn get(readers: &SqlitePool, site_id: &SiteId, keys: &[Key]) -> Result<Vec<Row>, sqlx::Error> {
+    let mut ids: BTreeMap<Table, Vec<&Arc<str>>> = BTreeMap::new();
+    for key in keys {
+        ids.entry(key.table).or_default().push(&key.id);
+    }
+    let mut found: BTreeMap<Key, Row> = BTreeMap::new();
+    let mut transaction = readers.begin().await?;
+    for (table, ids) in ids {
+        for slice in ids.chunks(IDS_PER_STATEMENT) {
+            let list = placeholders(1, slice.len());
+            let sql = format!("SELECT {ROW_COLUMNS} FROM {} WHERE site_id = ? AND id IN {list}", table.name());
+            let mut select = prepared(sql).bind(site_id.as_str());
+            for id in slice {
+                select = select.bind(Arc::clone(id));
+            }
+            for found_row in select.fetch_all(&mut *transaction).await? {
+                let found_row = row(table, &found_row)?;
+                found.insert(found_row.key.clone(), found_row);
+            }
+        }
+    }
+    Ok(keys.iter().filter_map(|key| found.get(key).cloned()).collect())
+}
+
+pub(super) async fn list(readers: &SqlitePool, site_id: &SiteId, query: &Query) -> Result<Vec<Row>, sqlx::Error> {
+    let mut sql = format!("SELECT {ROW_COLUMNS} FROM {} WHERE site_id = ?", query.table.name());
+    if query.parent.is_some() {
+        sql += " AND parent = ?";
+    }
+    if !query.states.is_empty() {
+        sql += &format!(" AND state IN {}", placeholders(1, query.states.len()));
+    }
+    if query.after.is_some() {
+        sql += if query.newest_first { " AND (ord, id) < (?, ?)" } else { " AND (ord, id) > (?, ?)" };
+    }
+    sql += if query.newest_first { " ORDER BY ord DESC, id DESC LIMIT ?" } else { " ORDER BY ord, id LIMIT ?" };
+    let mut select = prepared(sql).bind(site_id.as_str());
+    if let Some(parent) = &query.parent {
+        select = select.bind(parent.clone());
+    }
+    for state in &query.states {
+        select = select.bind(*state);
+    }
+    if let Some(Cursor { order, id }) = &query.after {
+        select = select.bind(*order).bind(id.clone());
+    }
+    let rows = select.bind(query.rows_max() as i64).fetch_all(readers).await?;
+    rows.iter().map(|found| row(query.table, found)).collect()
+}
+
+pub(super) async fn snapshot(
+    readers: &SqlitePool,
+    site_id: &SiteId,
+    tables: &BTreeSet<Table>,
+) -> Result<Snapshot, sqlx::Error> {
+    let mut transaction = readers.begin().await?;
+    let seq = super::writer::head(&mut transaction, site_id).await?;
+    let mut rows = Vec::new();
+    for table in tables {
+        let select = prepared(format!("SELECT {ROW_COLUMNS} FROM {} WHERE site_id = $1 ORDER BY id", table.name()));
+        for found in select.bind(site_id.as_str()).fetch_all(&mut *transaction).await? {
+            rows.push(row(*table, &found)?);
+        }
+    }
+    Ok(Snapshot { seq, rows })
+}
+
+pub(super) async fn feed(
+    readers: &SqlitePool,
+    site_id: &SiteId,
+    logs: &BTreeSet<Log>,
+    subjects: Option<&BTreeSet<Arc<str>>>,
+    after: Seq,
+    limit: usize,
+) -> Result<FeedPage, Error> {
+    let limit = limit.clamp(1, FEED_PAGE_MAX);
+    let mut transaction = readers.begin().await.map_err(unavailable)?;
+    let head = super::writer::head(&mut transaction, site_id).await.map_err(unavailable)?;
+    let oldest = oldest_cursor(&mut transaction, site_id, logs).await.map_err(unavailable)?;
+    if after < oldest || after > head {
+        return Err(Error::CursorExpired { asked: after, oldest });
+    }
+    let mut entries = Vec::new();
+    for log in logs {
+        let of_log = match subjects {
+            None => log_page(&mut transaction, site_id, *log, &[], after, limit).await,
+            Some(of) => {
+                let of: Vec<&Arc<str>> = of.iter().collect();
+                subject_pages(&mut transaction, site_id, *log, &of, after, limit).await
+            }
+        };
+        entries.extend(of_log.map_err(unavailable)?);
+    }
+    entries.sort_unstable_by_key(|e: &Entry| e.seq);
+    Ok(page_of(entries, limit, head))
+}
+
+async fn oldest_cursor(
+    connection: &mut SqliteConnection,
+    site_id: &SiteId,
+    logs: &BTreeSet<Log>,
+) -> Result<Seq, sqlx::Error> {
+    let marks = sqlx::query("SELECT log, pruned_seq FROM log_mark WHERE site_id = $1");
+    let mut oldest = Seq(0);
+    for mark in marks.bind(site_id.as_str()).fetch_all(connection).await? {
+        let name: &str = mark.try_get(0)?;
+        if logs.iter().any(|log| log.name() == name) {
+            oldest = oldest.max(Seq(mark.try_get::<i64, _>(1)?.cast_unsigned()));
+        }
+    }
+    Ok(oldest)
+}
+
+/// The first `limit` entries about any of `subjects`: the first of each slice of subjects hold the first of all.
+async fn subject_pages(
+    connection: &mut SqliteConnection,
+    site_id: &SiteId,
+    log: Log,
+    subjects: &[&Arc<str>],
+    after: Seq,
+    limit: usize,
+) -> Result<Vec<Entry>, sqlx::Error> {
+    let mut entries = Vec::new();
+    for slice in subjects.chunks(IDS_PER_STATEMENT) {
+        entries.extend(log_page(connection, site_id, log, slice, after, limit).await?);
+    }
+    Ok(entries)
+}
+
+async fn log_page(
+    connection: &mut SqliteConnection,
+    site_id: &SiteId,
+    log: Log,
+    subjects: &[&Arc<str>],
+    after: Seq,
+    limit: usize,
+) -> Result<Vec<Entry>, sqlx::Error> {
+    let about = if subjects.is_empty() {
+        String::new()
+    } else {
+        format!(" AND subject IN {}", placeholders(1, subjects.len()))
+    };
+    let mut select = prepared(format!(
+        "SELECT seq, tbl, subject, revision, state, parent, ord, body, kind, actor, request_id, at_unix_ms \
+         FROM {} WHERE site_id = ? AND seq > ?{about} ORDER BY seq LIMIT ?",
+        log.name()
+    ))
+    .bind(site_id.as_str())
+    .bind(after.0.cast_signed());
+    for subject in subjects {
+        select = select.bind(Arc::clone(subject));
+    }
+    let rows = select.bind(limit as i64).fetch_all(connection).await?;
+    rows.iter().map(|row| entry(log, row)).collect()
+}
+
+fn entry(log: Log, row: &SqliteRow) -> Result<Entry, sqlx::Error> {
+    let text = |column: usize| Ok::<_, sqlx::Error>(row.try_get::<Option<&str>, _>(column)?.map(Arc::from));
+    let table = match row.try_get::<Option<&str>, _>(1)? {
+        None => None,
+        Some(name) => {
+            let table = Table::ALL.iter().copied().find(|table| table.name() == name);
+            Some(table.ok_or_else(|| sqlx::Error::Decode(format!("no table is called {name}").into()))?)
+        }
+    };
+    Ok(Entry {
+        seq: Seq(row.try_get::<i64, _>(0)?.cast_unsigned()),
+        log,
+        table,
+        subject: Arc::from(row.try_get::<&str, _>(2)?),
+        revision: Revision(row.try_get::<i64, _>(3)?.cast_unsigned()),
+        index: Index { state: row.try_get(4)?, parent: text(5)?, order: row.try_get(6)? },
+        body: text(7)?,
+        kind: Arc::from(row.try_get::<&str, _>(8)?),
+        actor: Arc::from(row.try_get::<&str, _>(9)?),
+        request_id: text(10)?,
+        at_unix_ms: row.try_get(11)?,
+    })
+}
+
+/// How many entries a log holds.
+pub(super) async fn count(readers: &SqlitePool, site_id: &SiteId, log: Log) -> Result<u64, sqlx::Error> {
+    let select = prepared(format!("SELECT COUNT(*) FROM {} WHERE site_id = $1", log.name()));
+    Ok(select.bind(site_id.as_str()).fetch_one(readers).await?.try_get::<i64, _>(0)?.cast_unsigned())
+}
+
+/// Number and commit time of the oldest entries of a log.
+pub(super) async fn oldest(
+    readers: &SqlitePool,
+    site_id: &SiteId,
+    log: Log,
+    limit: usize,
+) -> Result<Vec<(Seq, i64)>, sqlx::Error> {
+    let select =
+        prepared(format!("SELECT seq, at_unix_ms FROM {} WHERE site_id = $1 ORDER BY seq LIMIT $2", log.name()));
+    let rows = select.bind(site_id.as_str()).bind(limit as i64).fetch_all(readers).await?;
+    rows.iter().map(|row| Ok((Seq(row.try_get::<i64, _>(0)?.cast_unsigned()), row.try_get(1)?))).collect()
+}

@@ -1,0 +1,135 @@
+//! What is on disk outlives the process that wrote it, and one process at a time has it.
+
+use crate::support::{at, clock, one, put, site};
+use midshift_core::ids::{RobotId, SiteId};
+use midshift_core::rows::{Expect, Key, Log, Revision, Seq, Table, Writer};
+use midshift_store::{Error, Frame, FrameLog, Gap, MemoryFrames, OpenError, SqliteFrames, SqliteStore, Store};
+use std::path::Path;
+use std::sync::Arc;
+
+async fn open(dir: &Path) -> SqliteStore {
+    SqliteStore::open(dir, site(), clock()).await.unwrap()
+}
+
+#[tokio::test]
+async fn a_store_that_was_dropped_without_closing_has_everything_it_acknowledged() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = open(dir.path()).await;
+    let id = store.id().clone();
+    one(&store, Writer::Fleet, vec![put(Table::Attempt, "a", Expect::Absent, "1")]).await.unwrap();
+    let applied = one(&store, Writer::Fleet, vec![put(Table::Attempt, "a", at(1), "2")]).await.unwrap();
+    drop(store);
+    let store = open(dir.path()).await;
+    assert_eq!(store.id(), &id);
+    let row = store.get(vec![Key::new(Table::Attempt, "a")]).await.unwrap().remove(0);
+    assert_eq!((row.revision, &*row.body), (Revision(2), "2"));
+    assert_eq!(store.feed(Seq(0), &[Log::Fleet], 10).await.unwrap().entries.len(), 2);
+    let next = one(&store, Writer::Fleet, vec![put(Table::Attempt, "a", at(2), "3")]).await.unwrap();
+    assert_eq!(next.seq, Seq(applied.seq.0 + 1));
+}
+
+#[tokio::test]
+async fn a_closed_store_refuses_and_can_be_opened_again() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = open(dir.path()).await;
+    store.close().await;
+    let refused = one(&store, Writer::Fleet, vec![put(Table::Attempt, "a", Expect::Absent, "1")]).await;
+    assert!(matches!(refused, Err(midshift_store::CommitError::Unavailable(_))), "{refused:?}");
+    assert!(matches!(store.snapshot(&[]).await, Err(Error::Unavailable(_))));
+    open(dir.path()).await;
+}
+
+#[tokio::test]
+async fn a_second_server_and_another_site_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = open(dir.path()).await;
+    let second = SqliteStore::open(dir.path(), site(), clock()).await;
+    assert!(matches!(second, Err(OpenError::Locked { .. })));
+    store.close().await;
+    let other = SqliteStore::open(dir.path(), SiteId::parse("south").unwrap(), clock()).await;
+    assert!(matches!(other, Err(OpenError::OtherSite { .. })));
+}
+
+#[cfg(unix)]
+#[tokio::test]
+async fn a_data_directory_is_made_for_its_owner_alone() {
+    use std::os::unix::fs::PermissionsExt;
+    let dir = tempfile::tempdir().unwrap();
+    let data = dir.path().join("data");
+    let steps = midshift_store::migrate(&data).await.unwrap();
+    assert!(steps.iter().all(|file| file.from == 0 && file.to > 0), "{steps:?}");
+    assert_eq!(data.metadata().unwrap().permissions().mode() & 0o777, 0o700);
+    let again = midshift_store::migrate(&data).await.unwrap();
+    assert!(again.iter().all(|file| file.applied.is_empty()), "{again:?}");
+}
+
+fn frame(robot: &str, first_seq: u64, last_seq: u64, bytes: usize) -> Frame {
+    let robot_id = RobotId::parse(robot).unwrap();
+    Frame { robot_id, ring: Arc::from("ring"), first_seq, last_seq, bytes: vec![7; bytes].into() }
+}
+
+fn gap(robot: &str, from_seq: u64) -> Gap {
+    Gap {
+        robot_id: RobotId::parse(robot).unwrap(),
+        ring: Arc::from("ring"),
+        lane: Arc::from("STATUS"),
+        from_seq,
+        to_seq: from_seq + 3,
+        reason: Arc::from("thinned"),
+        at_unix_ms: 5,
+    }
+}
+
+async fn marks(log: &dyn FrameLog) -> Vec<(String, u64)> {
+    log.marks().await.unwrap().into_iter().map(|mark| (mark.robot_id.to_string(), mark.seq)).collect()
+}
+
+async fn the_frame_contract(log: &dyn FrameLog) {
+    log.append(vec![frame("a", 1, 3, 10), frame("b", 1, 9, 10)]).await.unwrap();
+    log.append(vec![frame("a", 4, 4, 10)]).await.unwrap();
+    // A robot that did not hear the acknowledgement sends again; its mark does not fall.
+    log.append(vec![frame("a", 1, 3, 10)]).await.unwrap();
+    assert_eq!(marks(log).await, [("a".to_owned(), 4), ("b".to_owned(), 9)]);
+    let all = log.read(0, usize::MAX).await.unwrap();
+    assert_eq!(all.len(), 4);
+    let first = log.read(0, 1).await.unwrap();
+    assert_eq!(first, all[..2], "whole groups");
+    assert_eq!(log.read(first[1].position, usize::MAX).await.unwrap(), all[2..]);
+    assert!(log.read(all[3].position, usize::MAX).await.unwrap().is_empty());
+    log.report_gaps(vec![gap("a", 10), gap("b", 20), gap("a", 30)]).await.unwrap();
+    let of_a = log.gaps(Some(&RobotId::parse("a").unwrap()), 10).await.unwrap();
+    assert_eq!(of_a, [gap("a", 30), gap("a", 10)]);
+    assert_eq!(log.gaps(None, 1).await.unwrap(), [gap("a", 30)]);
+}
+
+#[tokio::test]
+async fn frames_in_memory_keep_the_contract() {
+    let log = MemoryFrames::new(clock(), 1_000);
+    the_frame_contract(&log).await;
+    log.append(vec![frame("c", 1, 1, 990)]).await.unwrap();
+    assert_eq!(log.read(0, usize::MAX).await.unwrap().len(), 2, "the oldest are gone");
+}
+
+#[tokio::test]
+async fn frames_on_disk_keep_the_contract_and_their_marks_over_a_start() {
+    let dir = tempfile::tempdir().unwrap();
+    let open = async || SqliteFrames::open(dir.path(), site(), clock(), 300_000).await.unwrap();
+    let log = open().await;
+    the_frame_contract(&log).await;
+    drop(log);
+    let log = open().await;
+    let before = [("a".to_owned(), 4), ("b".to_owned(), 9)];
+    assert_eq!(marks(&log).await, before, "folded from the log's tail");
+    for _ in 0..5 {
+        log.append(vec![frame("c", 1, 1, 100_000)]).await.unwrap();
+    }
+    assert!(log.prune().await.unwrap() > 200_000);
+    assert_eq!(log.prune().await.unwrap(), 0);
+    drop(log);
+    let log = open().await;
+    assert_eq!(marks(&log).await[..2], before, "written down before their frames went");
+    let left = log.read(0, usize::MAX).await.unwrap();
+    assert_eq!(left.len(), 2);
+    log.close().await;
+    assert!(log.append(vec![frame("a", 5, 5, 1)]).await.is_err());
+}

@@ -1,0 +1,68 @@
+//! What the store's tests share: items without records, a clock that stands still, both engines.
+
+use midshift_core::ids::SiteId;
+use midshift_core::rows::{Expect, Index, Item, Key, Revision, RowChange, Table, Write, Writer};
+use midshift_core::time::{Clock, Now, Utc};
+use midshift_store::{Applied, CommitError, MemoryStore, SqliteStore, Store, StoreId};
+use std::sync::Arc;
+
+/// Wall time of every test.
+pub const WALL: i64 = 1_780_000_000_000;
+
+pub struct StandingClock;
+
+impl Clock for StandingClock {
+    fn now(&self) -> Now {
+        Now { wall: Utc(WALL), utc: Utc(WALL), ..Now::default() }
+    }
+    fn rate_permille(&self) -> u32 {
+        1000
+    }
+}
+
+pub fn clock() -> Arc<dyn Clock> {
+    Arc::new(StandingClock)
+}
+
+pub fn site() -> SiteId {
+    SiteId::parse("north").expect("a site id")
+}
+
+/// A store under test; the directory goes when it does.
+pub struct Bench {
+    pub store: Arc<dyn Store>,
+    pub _dir: Option<tempfile::TempDir>,
+}
+
+pub fn memory() -> Bench {
+    let store = MemoryStore::new(site(), StoreId(Arc::from("memory")), clock());
+    Bench { store: Arc::new(store), _dir: None }
+}
+
+pub async fn sqlite() -> Bench {
+    let dir = tempfile::tempdir().expect("a directory");
+    let store = SqliteStore::open(dir.path(), site(), clock()).await.expect("a new store");
+    Bench { store: Arc::new(store), _dir: Some(dir) }
+}
+
+pub fn put(table: Table, id: &str, expect: Expect, body: &str) -> RowChange {
+    indexed(table, id, expect, body, Index::default())
+}
+
+pub fn indexed(table: Table, id: &str, expect: Expect, body: &str, index: Index) -> RowChange {
+    let write = Write::Put { index, body: Arc::from(body) };
+    RowChange { key: Key::new(table, id), expect, write, kind: "row.put" }
+}
+
+pub fn item(writer: Writer, rows: Vec<RowChange>) -> Item {
+    Item { rows, ..Item::new(writer, "test") }
+}
+
+/// Commits one item.
+pub async fn one(store: &dyn Store, writer: Writer, rows: Vec<RowChange>) -> Result<Applied, CommitError> {
+    store.commit(vec![item(writer, rows)]).await.remove(0)
+}
+
+pub const fn at(revision: u64) -> Expect {
+    Expect::At(Revision(revision))
+}
