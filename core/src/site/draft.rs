@@ -71,10 +71,10 @@ impl Draft {
     /// Checks everything; `found` may already hold what the reader noted.
     pub fn build(self, mut found: Violations) -> Result<Site, Refusal> {
         let v = &mut found;
-        let site_id = v.take("site.id", SiteId::parse(&self.site_id));
-        check_text(v, "site.name", &self.name, 200);
-        check_text(v, "site.map_id", &self.map_id, 64);
-        check_text(v, "site.map_version", &self.map_version, 64);
+        let site_id = v.take("site_id", SiteId::parse(&self.site_id));
+        check_text(v, "name", &self.name, 200);
+        check_text(v, "map_id", &self.map_id, 64);
+        check_text(v, "map_version", &self.map_version, 64);
         check_count(v, "area", self.areas.len(), 1, SITE_AREAS_MAX);
         check_count(v, "waypoint", self.waypoints.len(), 1, SITE_WAYPOINTS_MAX);
         check_count(v, "lane", self.lanes.len(), 0, SITE_LANES_MAX);

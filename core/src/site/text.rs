@@ -3,21 +3,25 @@
 //! Invariant: `parse(render(site)) == site`; an unknown key is a mistake. Called by the binary and by tests.
 //!
 //! ```toml
-//! [site]
-//! id = "shop"
+//! site_id = "shop"
 //! name = "A small shop"
 //! map_id = "shop"
 //! map_version = "1"
-//!
-//! [[area]]
-//! id = "floor"
-//! speed_limit_mm_s = 1500
-//!
-//! waypoint = [ { id = "A01", at = [1000, 2000], kind = "station" } ]  # kind: junction, station, charger, park, hold
+//! area = [ { id = "floor", speed_limit_mm_s = 1500 } ]    # a waypoint without an area lies in the first one
+//! waypoint = [
+//!   { id = "j1", at = [0, 0] },                           # millimetres east and north
+//!   { id = "j2", at = [4000, 0] },
+//!   { id = "A01", at = [2000, 1000], kind = "station" },  # kind: junction, station, charger, park, hold
+//! ]
+//! lane = [
+//!   { path = ["j1", "A01", "j2"] },                       # one-way, straight from each to the next
+//!   { path = ["j1", "j2"], ways = "two" },                # ways: one, two (single width), wide (side by side)
+//! ]
+//! passage = [ { id = "door", rule = "exclusive", lanes = [["j1", "j2"], ["j2", "j1"]] } ]
 //! ```
 
 use super::draft::{Draft, DraftArea, DraftLane, DraftPassage, DraftWaypoint};
-use super::{AreaDefaults, Kind, Lane, PlaceKind, Site, Source};
+use super::{Area, AreaDefaults, Kind, Lane, Place, PlaceKind, Site, Source, Waypoint};
 use crate::limits::SITE_FILE_BYTES;
 use crate::reason::{Refusal, Violations};
 use serde::Deserialize;
@@ -28,7 +32,14 @@ use toml::Spanned;
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RawFile {
-    site: Spanned<toml::Table>,
+    #[serde(default)]
+    site_id: String,
+    #[serde(default)]
+    name: String,
+    #[serde(default)]
+    map_id: String,
+    #[serde(default)]
+    map_version: String,
     #[serde(default)]
     area: Vec<Spanned<toml::Table>>,
     #[serde(default)]
@@ -37,15 +48,6 @@ struct RawFile {
     lane: Vec<Spanned<toml::Table>>,
     #[serde(default)]
     passage: Vec<Spanned<toml::Table>>,
-}
-
-#[derive(Deserialize, Default)]
-#[serde(deny_unknown_fields)]
-struct RawSite {
-    id: String,
-    name: String,
-    map_id: String,
-    map_version: String,
 }
 
 #[derive(Deserialize)]
@@ -118,19 +120,13 @@ struct RawPassage {
 /// Reads a site file. Errors: every mistake, each with its line.
 pub fn parse(text: &str) -> Result<Site, Refusal> {
     if text.len() > SITE_FILE_BYTES {
-        return Err(Refusal::field("site", format!("must be at most {SITE_FILE_BYTES} bytes")));
+        return Err(Refusal::field("file", format!("must be at most {SITE_FILE_BYTES} bytes")));
     }
     let file: RawFile = toml::from_str(text).map_err(|e| {
         let line = e.span().map_or_else(String::new, |s| format!("line {}", line_of(text, s.start)));
-        Refusal::field(if line.is_empty() { "site" } else { &line }, e.message())
+        Refusal::field(if line.is_empty() { "file" } else { &line }, e.message())
     })?;
     let mut reader = Reader { text, violations: Violations::default() };
-    let site: RawSite = reader.one("site", file.site).map(|(_, s)| s).unwrap_or_else(|| RawSite {
-        id: "unread".into(),
-        name: "unread".into(),
-        map_id: "unread".into(),
-        map_version: "unread".into(),
-    });
     let areas = reader.many("area", file.area).into_iter().map(area).collect();
     let waypoints = reader.many("waypoint", file.waypoint).into_iter().map(waypoint).collect();
     let mut lanes = Vec::new();
@@ -140,10 +136,10 @@ pub fn parse(text: &str) -> Result<Site, Refusal> {
     let raw_passages = reader.many("passage", file.passage);
     let passages = raw_passages.into_iter().map(|(f, raw)| passage(&mut reader.violations, f, raw)).collect();
     let draft = Draft {
-        site_id: site.id,
-        name: site.name,
-        map_id: site.map_id,
-        map_version: site.map_version,
+        site_id: file.site_id,
+        name: file.name,
+        map_id: file.map_id,
+        map_version: file.map_version,
         source: Source::Authored,
         collisions_modelled: true,
         areas,
@@ -243,58 +239,66 @@ fn quoted(text: &str) -> String {
 }
 
 fn write_site(site: &Site, out: &mut String) -> std::fmt::Result {
-    // The arrays stand first: in TOML nothing of the top level can follow a `[table]`.
-    writeln!(out, "waypoint = [")?;
-    for w in site.waypoints() {
-        write!(out, "  {{ id = {}, at = [{}, {}]", quoted(w.waypoint_id.as_str()), w.x_mm, w.y_mm)?;
-        if w.kind != Kind::Junction {
-            write!(out, ", kind = \"{}\"", w.kind.as_str())?;
-        }
-        if w.area.0 != 0 {
-            write!(out, ", area = {}", quoted(site.area(w.area).area_id.as_str()))?;
-        }
-        if let Some(capacity) = w.standing.map(|p| site.place(p).capacity).filter(|c| *c != 1) {
-            write!(out, ", capacity = {capacity}")?;
-        }
-        writeln!(out, " }},")?;
-    }
-    writeln!(out, "]\n\nlane = [")?;
-    for lane in site.lanes() {
-        write_lane(site, lane, out)?;
-    }
-    writeln!(out, "]\n\n[site]\nid = {}", quoted(site.site_id().as_str()))?;
+    writeln!(out, "site_id = {}", quoted(site.site_id().as_str()))?;
     writeln!(out, "name = {}\nmap_id = {}", quoted(site.name()), quoted(site.map_id()))?;
-    writeln!(out, "map_version = {}", quoted(site.map_version()))?;
-    for area in site.areas() {
-        writeln!(out, "\n[[area]]\nid = {}\npeople = {}", quoted(area.area_id.as_str()), area.people)?;
-        let d = &area.defaults;
-        for (key, value) in [
-            ("speed_limit_mm_s", d.speed_limit_mm_s),
-            ("avoidance_distance_mm", d.avoidance_distance_mm),
-            ("charge_mandatory_permille", d.charge_mandatory_permille.map(u32::from)),
-            ("charge_preemptible_permille", d.charge_preemptible_permille.map(u32::from)),
-            ("charge_opportunistic_permille", d.charge_opportunistic_permille.map(u32::from)),
-            ("charge_stop_permille", d.charge_stop_permille.map(u32::from)),
-        ] {
-            if let Some(value) = value {
-                writeln!(out, "{key} = {value}")?;
-            }
+    writeln!(out, "map_version = {}\n\narea = [", quoted(site.map_version()))?;
+    site.areas().iter().try_for_each(|area| write_area(area, out))?;
+    writeln!(out, "]\n\nwaypoint = [")?;
+    site.waypoints().iter().try_for_each(|w| write_waypoint(site, w, out))?;
+    writeln!(out, "]\n\nlane = [")?;
+    site.lanes().iter().try_for_each(|lane| write_lane(site, lane, out))?;
+    writeln!(out, "]\n\npassage = [")?;
+    site.places().iter().try_for_each(|place| write_passage(site, place, out))?;
+    writeln!(out, "]")
+}
+
+fn write_area(area: &Area, out: &mut String) -> std::fmt::Result {
+    write!(out, "  {{ id = {}", quoted(area.area_id.as_str()))?;
+    if area.people {
+        write!(out, ", people = true")?;
+    }
+    let d = &area.defaults;
+    for (key, value) in [
+        ("speed_limit_mm_s", d.speed_limit_mm_s),
+        ("avoidance_distance_mm", d.avoidance_distance_mm),
+        ("charge_mandatory_permille", d.charge_mandatory_permille.map(u32::from)),
+        ("charge_preemptible_permille", d.charge_preemptible_permille.map(u32::from)),
+        ("charge_opportunistic_permille", d.charge_opportunistic_permille.map(u32::from)),
+        ("charge_stop_permille", d.charge_stop_permille.map(u32::from)),
+    ] {
+        if let Some(value) = value {
+            write!(out, ", {key} = {value}")?;
         }
     }
-    for place in site.places() {
-        let Some(inside) = place.inside() else { continue };
-        writeln!(out, "\n[[passage]]\nid = {}", quoted(place.place_id.as_str()))?;
-        match place.kind {
-            PlaceKind::Capacity(_) => writeln!(out, "rule = \"capacity\"\ncapacity = {}", place.capacity)?,
-            _ => writeln!(out, "rule = \"exclusive\"")?,
-        }
-        let name = |at| quoted(site.name_of(at).as_str());
-        let lanes = inside.lanes.iter().map(|l| site.lane(*l));
-        let lanes: Vec<_> = lanes.map(|l| format!("[{}, {}]", name(l.from), name(l.to))).collect();
-        let inner: Vec<_> = inside.waypoints.iter().map(|w| name(*w)).collect();
-        writeln!(out, "lanes = [{}]\nwaypoints = [{}]", lanes.join(", "), inner.join(", "))?;
+    writeln!(out, " }},")
+}
+
+fn write_waypoint(site: &Site, w: &Waypoint, out: &mut String) -> std::fmt::Result {
+    write!(out, "  {{ id = {}, at = [{}, {}]", quoted(w.waypoint_id.as_str()), w.x_mm, w.y_mm)?;
+    if w.kind != Kind::Junction {
+        write!(out, ", kind = \"{}\"", w.kind.as_str())?;
     }
-    Ok(())
+    if w.area.0 != 0 {
+        write!(out, ", area = {}", quoted(site.area(w.area).area_id.as_str()))?;
+    }
+    if let Some(capacity) = w.standing.map(|p| site.place(p).capacity).filter(|c| *c != 1) {
+        write!(out, ", capacity = {capacity}")?;
+    }
+    writeln!(out, " }},")
+}
+
+fn write_passage(site: &Site, place: &Place, out: &mut String) -> std::fmt::Result {
+    let Some(inside) = place.inside() else { return Ok(()) };
+    write!(out, "  {{ id = {}, ", quoted(place.place_id.as_str()))?;
+    match place.kind {
+        PlaceKind::Capacity(_) => write!(out, "rule = \"capacity\", capacity = {}", place.capacity)?,
+        PlaceKind::Exclusive(_) | PlaceKind::Standing(_) => write!(out, "rule = \"exclusive\"")?,
+    }
+    let name = |at| quoted(site.name_of(at).as_str());
+    let lanes = inside.lanes.iter().map(|l| site.lane(*l));
+    let lanes: Vec<_> = lanes.map(|l| format!("[{}, {}]", name(l.from), name(l.to))).collect();
+    let inner: Vec<_> = inside.waypoints.iter().map(|w| name(*w)).collect();
+    writeln!(out, ", lanes = [{}], waypoints = [{}] }},", lanes.join(", "), inner.join(", "))
 }
 
 /// Writes a lane, or both directions in one line where they are alike; the second of such a pair is left out.
@@ -316,4 +320,69 @@ fn write_lane(site: &Site, lane: &Lane, out: &mut String) -> std::fmt::Result {
         write!(out, ", speed_limit_mm_s = {speed}")?;
     }
     writeln!(out, " }},")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::site::{CORRIDOR, DEMO};
+
+    fn text_of(lanes: &str, more: &str) -> String {
+        format!(
+            "site_id = \"s\"\nname = \"S\"\nmap_id = \"s\"\nmap_version = \"1\"\narea = [{{ id = \"a\" }}]\n\
+             waypoint = [\n{{ id = \"p\", at = [0, 0] }},\n{{ id = \"q\", at = [3000, 4000] }},\n\
+             {{ id = \"st\", at = [0, 9000], kind = \"station\" }},\n]\nlane = [{lanes}]\n{more}"
+        )
+    }
+
+    #[test]
+    fn what_is_rendered_reads_back_as_the_same_site() {
+        for text in [DEMO, CORRIDOR] {
+            let site = parse(text).expect("reads");
+            let again = parse(&render(&site)).expect("its own text reads");
+            assert_eq!(again, site);
+        }
+    }
+
+    #[test]
+    fn a_lane_is_as_long_as_the_straight_line_unless_told() {
+        let site = parse(&text_of("{ path = [\"p\", \"q\", \"st\"] }", "")).expect("reads");
+        let lengths: Vec<_> = site.lanes().iter().map(|l| l.length_mm).collect();
+        assert_eq!(lengths, [5000, 5831]);
+    }
+
+    #[test]
+    fn every_mistake_is_listed_at_once_with_its_line() {
+        let text = text_of(
+            "\n{ path = [\"p\", \"nowhere\"] },\n{ path = [\"q\", \"p\"], colour = \"red\" },\n\
+             { path = [\"p\", \"q\"], length_mm = 4000 }",
+            "passage = [{ id = \"st\", rule = \"capacity\", waypoints = [\"st\"] }]",
+        );
+        let refusal = parse(&text).expect_err("five mistakes");
+        let all: Vec<_> = refusal.violations.iter().map(|v| format!("{}: {}", v.field, v.description)).collect();
+        let all = all.join("\n");
+        for part in [
+            "lane (line 12): there is no waypoint \"nowhere\"",
+            "lane (line 13): unknown field `colour`",
+            "lane (line 14).length_mm: must be at least the straight line, 5000 mm",
+            "passage (line 15).capacity: is needed",
+            "two places are called st",
+            "st is a standing place and cannot lie inside passage st",
+        ] {
+            assert!(all.contains(part), "{part} is not in:\n{all}");
+        }
+    }
+
+    #[test]
+    fn a_file_that_is_no_toml_names_the_line() {
+        let refusal = parse("site_id = \"s\"\nname = = 3\n").expect_err("no toml");
+        assert_eq!(refusal.violations[0].field, "line 2");
+    }
+
+    #[test]
+    fn an_empty_file_says_all_that_is_needed() {
+        let refusal = parse("").expect_err("nothing there");
+        let fields: Vec<_> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
+        assert_eq!(fields, ["site_id", "name", "map_id", "map_version", "area", "waypoint"]);
+    }
 }
