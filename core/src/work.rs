@@ -50,8 +50,11 @@ pub struct Assignment {
     pub timeout_ms: u64,
     /// All steps of the task.
     pub steps: Vec<WorkStep>,
-    /// Where to begin: steps before it are done.
+    /// Where to begin: steps before it are done. A goto if the robot must first drive to where `resume_step` is done.
     pub from_step: u32,
+    /// Where to go on after the goto at `from_step`: steps between them are done and must not be done again. Equal to
+    /// `from_step` if there is no such goto.
+    pub resume_step: u32,
     /// Rises when the server chose another way; `released_index` counts in this route.
     pub route_number: u32,
     /// The whole way through all goto steps that are left.

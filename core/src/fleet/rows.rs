@@ -1,0 +1,345 @@
+//! Rows that fleet alone writes, apart from tasks and attempts: places, the robot's mutex, control, timers, holds, counters, marks.
+
+use crate::authority::Authority;
+use crate::ids::{AreaId, AttemptId, PlaceId, RobotId, SiteId, TaskId};
+use crate::reason::Reason;
+use crate::robot::Duty;
+use crate::rows::{Index, Record, Seq, Table};
+use crate::time::Utc;
+use crate::work::WorkStats;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// How far a holder is with its grant.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum HolderState {
+    /// It may enter.
+    Granted,
+    /// It reported that it is inside.
+    Inside,
+    /// Taken back; counts as granted until the robot says that it did not enter.
+    Revoking,
+}
+
+/// One robot in or before a place.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PlaceHolder {
+    /// Who.
+    pub robot_id: RobotId,
+    /// Unique per robot; 0: it stood there without a grant.
+    pub grant_id: u64,
+    /// How far.
+    pub state: HolderState,
+    /// Anchor of the permission to enter.
+    pub entry: Option<Authority>,
+    /// UTC, site clock.
+    pub since: Utc,
+}
+
+/// A passage or a standing place: the one row that is fought over.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Place {
+    /// Which.
+    pub place_id: PlaceId,
+    /// Robots admitted at once.
+    pub capacity: u32,
+    /// Robots may stand in it.
+    pub standing: bool,
+    /// Who has it.
+    pub holders: Vec<PlaceHolder>,
+    /// Set: nobody enters until the robot inside reports or a person clears it.
+    pub quarantine: Option<Reason>,
+}
+
+impl Place {
+    /// The entry of `robot`.
+    pub fn holder(&self, robot: &RobotId) -> Option<&PlaceHolder> {
+        self.holders.iter().find(|h| h.robot_id == *robot)
+    }
+    /// Whether one more may be admitted.
+    pub fn has_room(&self) -> bool {
+        self.quarantine.is_none() && self.holders.len() < self.capacity as usize
+    }
+}
+
+impl Record for Place {
+    const TABLE: Table = Table::PlaceGrant;
+    fn id(&self) -> String {
+        self.place_id.to_string()
+    }
+}
+
+/// What a robot is taken by.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RobotHolder {
+    /// Nothing.
+    #[default]
+    None,
+    /// An attempt of a task or errand.
+    Attempt(AttemptId),
+    /// Maintenance of a drain. No producer until OTA lands.
+    Maintenance(String),
+}
+
+/// The robot's mutex: an assignment and a drain are both an update of this one row.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RobotAuthority {
+    /// Whose.
+    pub robot_id: RobotId,
+    /// Who has it.
+    pub holder: RobotHolder,
+}
+
+impl Record for RobotAuthority {
+    const TABLE: Table = Table::RobotAuthority;
+    fn id(&self) -> String {
+        self.robot_id.to_string()
+    }
+}
+
+/// Out of dispatch because a person said so.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Cordon {
+    /// Why.
+    pub reason: String,
+    /// Who.
+    pub actor: String,
+    /// UTC, site clock.
+    pub since: Utc,
+}
+
+/// What people and the breaker decided about a robot.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RobotControl {
+    /// Whose.
+    pub robot_id: RobotId,
+    /// Out of dispatch by a person.
+    pub cordon: Option<Cordon>,
+    /// Out of dispatch by the breaker since, UTC, site clock.
+    pub breaker: Option<Utc>,
+    /// Failed attempts within the breaker's window, UTC, site clock.
+    pub failures: Vec<Utc>,
+    /// Errands asked of it so far.
+    pub errands: u64,
+    /// Tasks given to it so far; breaks ties between equally near robots.
+    pub tasks: u64,
+}
+
+impl RobotControl {
+    /// A robot nobody has said anything about.
+    pub fn new(robot_id: RobotId) -> Self {
+        Self { robot_id, cordon: None, breaker: None, failures: Vec::new(), errands: 0, tasks: 0 }
+    }
+    /// Whether it gets work.
+    pub fn duty(&self) -> Duty {
+        match (&self.cordon, self.breaker) {
+            (Some(_), _) => Duty::Cordoned,
+            (None, Some(_)) => Duty::BrokenOff,
+            (None, None) => Duty::InWork,
+        }
+    }
+}
+
+impl Record for RobotControl {
+    const TABLE: Table = Table::RobotControl;
+    fn id(&self) -> String {
+        self.robot_id.to_string()
+    }
+}
+
+/// What a timer is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TimerKind {
+    /// A robot's answer to an offer. Link clock.
+    OfferAck,
+    /// A robot's confirmation of a stop. Link clock.
+    StopConfirm,
+    /// UNCERTAIN for too long. Link clock.
+    Uncertain,
+    /// From acceptance to completion. Site clock; stands still while held.
+    StartToClose,
+    /// From admission to acceptance. Site clock.
+    ScheduleToStart,
+    /// End of a back-off. Site clock.
+    RetryDue,
+}
+
+impl TimerKind {
+    /// Whether it counts on the site clock.
+    pub const fn is_site(self) -> bool {
+        matches!(self, Self::StartToClose | Self::ScheduleToStart | Self::RetryDue)
+    }
+    /// Name in ids.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::OfferAck => "offer_ack",
+            Self::StopConfirm => "stop_confirm",
+            Self::Uncertain => "uncertain",
+            Self::StartToClose => "start_to_close",
+            Self::ScheduleToStart => "schedule_to_start",
+            Self::RetryDue => "retry_due",
+        }
+    }
+}
+
+/// A deadline in serving time: it counts only while fleet serves, and a restart re-arms what is left.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Timer {
+    /// What for.
+    pub kind: TimerKind,
+    /// Which attempt, or which task with epoch 0.
+    pub attempt: AttemptId,
+    /// Serving time at which it fires, milliseconds of its clock. None: it stands still with `remaining_ms` left.
+    pub fires_at_service_ms: Option<u64>,
+    /// Left while it stands still.
+    pub remaining_ms: u64,
+}
+
+impl Timer {
+    /// Its row id.
+    pub fn id_of(kind: TimerKind, attempt: &AttemptId) -> String {
+        format!("{}:{attempt}", kind.as_str())
+    }
+}
+
+impl Record for Timer {
+    const TABLE: Table = Table::Timer;
+    fn id(&self) -> String {
+        Self::id_of(self.kind, &self.attempt)
+    }
+    fn index(&self) -> Index {
+        Index { order: self.fires_at_service_ms.map(|v| v as i64), ..Index::default() }
+    }
+}
+
+/// Why a robot must not move. Tokens of tasks live in the task's own hold set.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct HoldToken {
+    /// Whose.
+    pub robot_id: RobotId,
+    /// `stop:body:<robot>` while the body's own safety system stops it, `resume:body:<robot>` until a person resumes.
+    pub token: String,
+    /// UTC, site clock.
+    pub since: Utc,
+}
+
+impl HoldToken {
+    /// Its row id.
+    pub fn id_of(robot_id: &RobotId, token: &str) -> String {
+        format!("robot:{robot_id}:{token}")
+    }
+}
+
+impl Record for HoldToken {
+    const TABLE: Table = Table::HoldToken;
+    fn id(&self) -> String {
+        Self::id_of(&self.robot_id, &self.token)
+    }
+    fn index(&self) -> Index {
+        Index { parent: Some(self.robot_id.as_str().into()), ..Index::default() }
+    }
+}
+
+/// Work done by one robot on one version of its software.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RobotCounter {
+    /// Whose.
+    pub robot_id: RobotId,
+    /// Version of base software; empty: not reported.
+    pub software: String,
+    /// Attempts of tasks that succeeded.
+    pub succeeded: u64,
+    /// Attempts of tasks that failed, by fault code.
+    pub failures: BTreeMap<u32, u64>,
+    /// Sums over all attempts, errands included.
+    pub stats: WorkStats,
+}
+
+impl Record for RobotCounter {
+    const TABLE: Table = Table::RobotCounter;
+    fn id(&self) -> String {
+        format!("{}@{}", self.robot_id, self.software)
+    }
+    fn index(&self) -> Index {
+        Index { parent: Some(self.robot_id.as_str().into()), ..Index::default() }
+    }
+}
+
+/// The site this store serves.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SiteRow {
+    /// Which.
+    pub site_id: SiteId,
+    /// Map version, as its file says.
+    pub map_version: String,
+    /// The site file's text.
+    pub text: String,
+}
+
+impl Record for SiteRow {
+    const TABLE: Table = Table::Site;
+    fn id(&self) -> String {
+        self.site_id.to_string()
+    }
+}
+
+/// Serving time of fleet.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ServiceClock {
+    /// Milliseconds served on the site clock.
+    pub site_ms: u64,
+    /// Milliseconds served on the link clock.
+    pub link_ms: u64,
+}
+
+impl Record for ServiceClock {
+    const TABLE: Table = Table::ServiceClock;
+    fn id(&self) -> String {
+        "fleet".to_owned()
+    }
+}
+
+/// How far fleet has consumed the feed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FleetMark {
+    /// Every entry up to here has had its effect.
+    pub seq: Seq,
+}
+
+impl Record for FleetMark {
+    const TABLE: Table = Table::FleetMark;
+    fn id(&self) -> String {
+        "fleet".to_owned()
+    }
+}
+
+/// Something a person should look into.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Incident {
+    /// Unique: code, subject and opening time.
+    pub id: String,
+    /// What.
+    pub reason: Reason,
+    /// About which robot.
+    pub robot_id: Option<RobotId>,
+    /// About which task.
+    pub task_id: Option<TaskId>,
+    /// About which area.
+    pub area_id: Option<AreaId>,
+    /// UTC, site clock.
+    pub opened: Utc,
+}
+
+impl Record for Incident {
+    const TABLE: Table = Table::Incident;
+    fn id(&self) -> String {
+        self.id.clone()
+    }
+    fn index(&self) -> Index {
+        let parent = self.robot_id.as_ref().map(|r| r.as_str().into());
+        Index { state: Some(1), parent, order: Some(self.opened.0) }
+    }
+}

@@ -1,0 +1,364 @@
+//! Fleet's picture of the rows: built from a snapshot, kept by the feed, and already holding what fleet itself is about to commit.
+//!
+//! Called by every room of `fleet`. Invariant: a row here is at the revision it has in the store, or one that an item of the
+//! running cycle will write; after a conflict the whole view is built again, never patched.
+
+use super::rows::{FleetMark, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotCounter, ServiceClock, SiteRow, Timer};
+use crate::ids::{AttemptId, RobotId, TaskId};
+use crate::policy::AreaPolicy;
+use crate::rows::{BadRow, Key, Record, Revision, Row, Table};
+use crate::site::Site;
+use crate::task::{Attempt, Phase, TaskIntake, TaskState};
+use crate::time::Now;
+use crate::work::{DesiredPolicy, DesiredWork, LaneMark, PresenceRow, Session};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+/// A row with its revision.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Rowed<R> {
+    /// Writes so far.
+    pub revision: Revision,
+    /// The row.
+    pub row: R,
+}
+
+/// Rows of one table by id.
+pub type Slot<R> = BTreeMap<String, Rowed<R>>;
+
+/// Fleet's picture.
+pub struct View {
+    /// The site, which never changes while fleet runs.
+    pub site: Arc<Site>,
+    /// What was asked for, of tasks that have not ended.
+    pub intakes: Slot<TaskIntake>,
+    /// Where tasks are that have not ended.
+    pub tasks: Slot<TaskState>,
+    /// How ended tasks ended: what `depends_on` looks at.
+    pub ended: BTreeMap<TaskId, Phase>,
+    /// Attempts that are live or still hold a robot, and the last one of each task that has not ended.
+    pub attempts: Slot<Attempt>,
+    /// Deadlines.
+    pub timers: Slot<Timer>,
+    /// Hold tokens of robots.
+    pub holds: Slot<HoldToken>,
+    /// Passages and standing places.
+    pub places: Slot<Place>,
+    /// Robots' mutexes.
+    pub authority: Slot<RobotAuthority>,
+    /// Cordons and breakers.
+    pub control: Slot<RobotControl>,
+    /// Work done.
+    pub counters: Slot<RobotCounter>,
+    /// The site row.
+    pub sites: Slot<SiteRow>,
+    /// Rules of areas.
+    pub policies: Slot<AreaPolicy>,
+    /// Section `work` of each robot.
+    pub desired_work: Slot<DesiredWork>,
+    /// Section `policy` of each robot.
+    pub desired_policy: Slot<DesiredPolicy>,
+    /// Serving time.
+    pub clocks: Slot<ServiceClock>,
+    /// Consumed position.
+    pub marks: Slot<FleetMark>,
+    /// What people should look into.
+    pub incidents: Slot<Incident>,
+    /// Newest sessions (telemetry's).
+    pub sessions: Slot<Session>,
+    /// Presence (telemetry's).
+    pub presence: Slot<PresenceRow>,
+    /// Durable lane numbers (telemetry's).
+    pub lane_marks: Slot<LaneMark>,
+    /// Places a robot holds: robot → place ids.
+    pub held_places: BTreeMap<RobotId, BTreeSet<String>>,
+    /// Robots whose desired work must be composed again in this cycle.
+    pub dirty: BTreeSet<RobotId>,
+    /// Reading of the clocks when this view was first built.
+    pub started: Now,
+    /// Serving time at that moment.
+    pub served: ServiceClock,
+    /// Since when a robot waits for a place it cannot have, site clock. Volatile.
+    pub waits: BTreeMap<RobotId, super::places::Waiting>,
+    /// Distances and routes, remembered.
+    pub router: crate::site::Router,
+}
+
+/// A record that fleet's picture keeps.
+pub trait Viewed: Record {
+    /// Where.
+    fn slot(view: &mut View) -> &mut Slot<Self>;
+    /// What else changes with it: indices and dirty robots. Called after the slot changed.
+    fn changed(_view: &mut View, _id: &str, _old: Option<&Self>) {}
+}
+
+macro_rules! viewed {
+    ($($record:ty => $slot:ident;)*) => { $(impl Viewed for $record {
+        fn slot(view: &mut View) -> &mut Slot<Self> { &mut view.$slot }
+    })* };
+}
+
+viewed! {
+    TaskIntake => intakes;
+    Timer => timers;
+    RobotControl => control;
+    RobotCounter => counters;
+    SiteRow => sites;
+    AreaPolicy => policies;
+    DesiredWork => desired_work;
+    DesiredPolicy => desired_policy;
+    ServiceClock => clocks;
+    FleetMark => marks;
+    Incident => incidents;
+    PresenceRow => presence;
+    LaneMark => lane_marks;
+}
+
+impl Viewed for TaskState {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.tasks
+    }
+    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+        let Some(task) = view.tasks.get(id).map(|t| &t.row) else { return };
+        if let Some(robot) = &task.robot_id {
+            view.dirty.insert(robot.clone());
+        }
+        if task.phase.is_terminal() {
+            view.ended.insert(task.task_id.clone(), task.phase);
+        }
+    }
+}
+
+impl Viewed for Attempt {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.attempts
+    }
+    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+        if let Some(attempt) = view.attempts.get(id) {
+            view.dirty.insert(attempt.row.robot_id.clone());
+        }
+    }
+}
+
+impl Viewed for HoldToken {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.holds
+    }
+    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+        let robot = view.holds.get(id).map(|h| h.row.robot_id.clone()).or_else(|| old.map(|h| h.robot_id.clone()));
+        view.dirty.extend(robot);
+    }
+}
+
+impl Viewed for RobotAuthority {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.authority
+    }
+    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+        view.dirty.extend(view.authority.get(id).map(|a| a.row.robot_id.clone()));
+    }
+}
+
+impl Viewed for Session {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.sessions
+    }
+    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+        view.dirty.extend(view.sessions.get(id).map(|s| s.row.robot_id.clone()));
+    }
+}
+
+impl Viewed for Place {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.places
+    }
+    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+        for robot in old.into_iter().flat_map(|p| &p.holders).map(|h| &h.robot_id) {
+            view.dirty.insert(robot.clone());
+            if let Some(places) = view.held_places.get_mut(robot) {
+                places.remove(id);
+            }
+        }
+        let now: Vec<RobotId> = view.places.get(id).into_iter().flat_map(|p| &p.row.holders).map(|h| h.robot_id.clone()).collect();
+        for robot in now {
+            view.held_places.entry(robot.clone()).or_default().insert(id.to_owned());
+            view.dirty.insert(robot);
+        }
+    }
+}
+
+/// Tables that fleet's picture is made of.
+pub const TABLES: &[Table] = &[
+    Table::TaskIntake,
+    Table::TaskState,
+    Table::Attempt,
+    Table::Timer,
+    Table::HoldToken,
+    Table::PlaceGrant,
+    Table::RobotAuthority,
+    Table::RobotControl,
+    Table::RobotCounter,
+    Table::Site,
+    Table::AreaPolicy,
+    Table::DesiredWork,
+    Table::DesiredPolicy,
+    Table::ServiceClock,
+    Table::FleetMark,
+    Table::Incident,
+    Table::Session,
+    Table::Presence,
+    Table::LaneMark,
+];
+
+impl View {
+    /// An empty picture of `site`.
+    pub fn new(site: Arc<Site>, started: Now) -> Self {
+        Self {
+            router: crate::site::Router::new(site.clone()),
+            site,
+            intakes: Slot::new(),
+            tasks: Slot::new(),
+            ended: BTreeMap::new(),
+            attempts: Slot::new(),
+            timers: Slot::new(),
+            holds: Slot::new(),
+            places: Slot::new(),
+            authority: Slot::new(),
+            control: Slot::new(),
+            counters: Slot::new(),
+            sites: Slot::new(),
+            policies: Slot::new(),
+            desired_work: Slot::new(),
+            desired_policy: Slot::new(),
+            clocks: Slot::new(),
+            marks: Slot::new(),
+            incidents: Slot::new(),
+            sessions: Slot::new(),
+            presence: Slot::new(),
+            lane_marks: Slot::new(),
+            held_places: BTreeMap::new(),
+            dirty: BTreeSet::new(),
+            started,
+            served: ServiceClock::default(),
+            waits: BTreeMap::new(),
+        }
+    }
+
+    /// Takes every row of a snapshot. Ended tasks keep only how they ended.
+    pub fn load(&mut self, rows: &[Row]) -> Result<(), BadRow> {
+        for row in rows {
+            self.absorb(&row.key, row.revision, Some(row))?;
+        }
+        self.served = self.clocks.get("fleet").map(|c| c.row).unwrap_or_default();
+        self.forget_ended();
+        Ok(())
+    }
+
+    /// Takes one row as the store has it; none: deleted. What this picture already has is passed over.
+    pub fn absorb(&mut self, key: &Key, revision: Revision, row: Option<&Row>) -> Result<(), BadRow> {
+        match key.table {
+            Table::TaskIntake => self.take::<TaskIntake>(key, revision, row),
+            Table::TaskState => self.take::<TaskState>(key, revision, row),
+            Table::Attempt => self.take::<Attempt>(key, revision, row),
+            Table::Timer => self.take::<Timer>(key, revision, row),
+            Table::HoldToken => self.take::<HoldToken>(key, revision, row),
+            Table::PlaceGrant => self.take::<Place>(key, revision, row),
+            Table::RobotAuthority => self.take::<RobotAuthority>(key, revision, row),
+            Table::RobotControl => self.take::<RobotControl>(key, revision, row),
+            Table::RobotCounter => self.take::<RobotCounter>(key, revision, row),
+            Table::Site => self.take::<SiteRow>(key, revision, row),
+            Table::AreaPolicy => self.take::<AreaPolicy>(key, revision, row),
+            Table::DesiredWork => self.take::<DesiredWork>(key, revision, row),
+            Table::DesiredPolicy => self.take::<DesiredPolicy>(key, revision, row),
+            Table::ServiceClock => self.take::<ServiceClock>(key, revision, row),
+            Table::FleetMark => self.take::<FleetMark>(key, revision, row),
+            Table::Incident => self.take::<Incident>(key, revision, row),
+            Table::Session => self.take::<Session>(key, revision, row),
+            Table::Presence => self.take::<PresenceRow>(key, revision, row),
+            Table::LaneMark => self.take::<LaneMark>(key, revision, row),
+            Table::TaskRequest | Table::RequestKey => Ok(()),
+        }
+    }
+
+    fn take<R: Viewed>(&mut self, key: &Key, revision: Revision, row: Option<&Row>) -> Result<(), BadRow> {
+        let known = R::slot(self).get(&*key.id).map(|r| r.revision);
+        if known.is_some_and(|k| k >= revision) || (known.is_none() && self.is_past(key)) {
+            return Ok(());
+        }
+        let old = match row {
+            Some(row) => R::slot(self).insert(key.id.to_string(), Rowed { revision, row: row.decode()? }),
+            None => R::slot(self).remove(&*key.id),
+        };
+        R::changed(self, &key.id, old.as_ref().map(|r| &r.row));
+        Ok(())
+    }
+
+    /// A row that this picture has let go on purpose: of an ended task, or an attempt that no task names any more.
+    fn is_past(&self, key: &Key) -> bool {
+        match key.table {
+            Table::TaskIntake | Table::TaskState => {
+                TaskId::parse(&key.id).is_ok_and(|id| self.ended.contains_key(&id))
+            }
+            _ => false,
+        }
+    }
+
+    /// Lets go of tasks that have ended and of attempts that neither hold a robot nor are the newest of a live task.
+    pub fn forget_ended(&mut self) {
+        let ended: Vec<String> =
+            self.tasks.iter().filter(|(_, t)| t.row.phase.is_terminal()).map(|(id, _)| id.clone()).collect();
+        for id in &ended {
+            self.tasks.remove(id);
+            self.intakes.remove(id);
+        }
+        let tasks = &self.tasks;
+        let authority = &self.authority;
+        self.attempts.retain(|_, a| {
+            let a = &a.row;
+            let holds = authority
+                .get(a.robot_id.as_str())
+                .is_some_and(|r| matches!(&r.row.holder, super::rows::RobotHolder::Attempt(id) if *id == a.attempt));
+            let newest = a.attempt.subject.task_id().is_some_and(|t| {
+                tasks.get(t.as_str()).is_some_and(|t| t.row.epoch == a.attempt.epoch)
+            });
+            holds || newest || !a.phase.is_terminal()
+        });
+    }
+
+    /// Serving time at `now`.
+    pub fn serving(&self, now: &Now) -> ServiceClock {
+        ServiceClock {
+            site_ms: self.served.site_ms + now.site.since(self.started.site).as_ms(),
+            link_ms: self.served.link_ms + now.link.since(self.started.link).as_ms(),
+        }
+    }
+
+    /// The task's row.
+    pub fn task(&self, id: &TaskId) -> Option<&TaskState> {
+        self.tasks.get(id.as_str()).map(|t| &t.row)
+    }
+    /// What was asked for.
+    pub fn intake(&self, id: &TaskId) -> Option<&TaskIntake> {
+        self.intakes.get(id.as_str()).map(|t| &t.row)
+    }
+    /// The attempt's row.
+    pub fn attempt(&self, id: &AttemptId) -> Option<&Attempt> {
+        self.attempts.get(&id.to_string()).map(|a| &a.row)
+    }
+    /// The attempt that holds the robot.
+    pub fn held_by(&self, robot: &RobotId) -> Option<&AttemptId> {
+        match self.authority.get(robot.as_str()).map(|a| &a.row.holder) {
+            Some(super::rows::RobotHolder::Attempt(id)) => Some(id),
+            _ => None,
+        }
+    }
+    /// Hold tokens of the robot.
+    pub fn robot_holds(&self, robot: &RobotId) -> impl Iterator<Item = &HoldToken> {
+        let from = format!("robot:{robot}:");
+        self.holds.range(from.clone()..).take_while(move |(id, _)| id.starts_with(&from)).map(|(_, h)| &h.row)
+    }
+    /// Rules of an area.
+    pub fn policy(&self, area: &crate::ids::AreaId) -> AreaPolicy {
+        self.policies.get(area.as_str()).map_or_else(|| AreaPolicy::default_of(area.clone()), |p| p.row.clone())
+    }
+}
