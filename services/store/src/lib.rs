@@ -32,6 +32,9 @@ use tokio::sync::watch;
 pub const FEED_PAGE_MAX: usize = 5_000;
 /// Most keys of one [`Store::get`].
 pub const GET_KEYS_MAX: usize = 10_000;
+/// Highest number [`Store::raise_head`] believes: as unix ms it is the year 287396. A number above it is a lie or a defect, and
+/// following it would leave the store without numbers to give.
+pub const SEQ_PLAUSIBLE_MAX: Seq = Seq(1 << 53);
 
 /// Random text, made when a store is created or restored. A cursor of another store means: rebuild.
 #[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
@@ -62,6 +65,12 @@ pub enum Error {
     TooManyKeys {
         /// How many.
         asked: usize,
+    },
+    /// A number that no store can have given.
+    #[error("number {} is beyond what any store has given", asked.0)]
+    ImplausibleSeq {
+        /// The number.
+        asked: Seq,
     },
     /// A row that this binary cannot read.
     #[error(transparent)]
@@ -210,7 +219,7 @@ pub trait Store: Send + Sync + 'static {
     /// The site whose rows these are; it is in every key.
     fn site_id(&self) -> &SiteId;
     /// Applies items in order, each for itself; results in the same order. Returns after the fsync that holds them. A later
-    /// item may expect the revision that an earlier one writes.
+    /// item may expect the revision that an earlier one writes. Dropping the future takes nothing back.
     async fn commit(&self, items: Vec<Item>) -> Vec<Result<Applied, CommitError>>;
     /// The rows of `keys` that exist, in the order of `keys`. At most [`GET_KEYS_MAX`].
     async fn get(&self, keys: Vec<Key>) -> Result<Vec<Row>, Error>;
@@ -228,7 +237,7 @@ pub trait Store: Send + Sync + 'static {
     /// A hint: the newest number committed. May skip values, never the last one. Carries no data; read the feed.
     fn wake(&self) -> watch::Receiver<Seq>;
     /// Makes the next number higher than `at_least`: someone has seen a number that this store never gave (it was restored
-    /// from an old backup). Returns the head.
+    /// from an old backup). Returns the head; a number above [`SEQ_PLAUSIBLE_MAX`] is refused.
     async fn raise_head(&self, at_least: Seq) -> Result<Seq, Error>;
     /// Takes old entries out of the logs, in small slices that let commits pass. Returns how many went.
     async fn prune(&self, keep: Retention) -> Result<u64, Error>;

@@ -7,7 +7,8 @@
 use crate::check::{After, decide, log_index};
 use crate::model_table::Rows;
 use crate::{
-    Applied, CommitError, Error, FEED_PAGE_MAX, FeedPage, GET_KEYS_MAX, Query, Retention, Snapshot, Store, StoreId,
+    Applied, CommitError, Error, FEED_PAGE_MAX, FeedPage, GET_KEYS_MAX, Query, Retention, SEQ_PLAUSIBLE_MAX, Snapshot,
+    Store, StoreId,
 };
 use async_trait::async_trait;
 use midshift_core::ids::SiteId;
@@ -173,6 +174,9 @@ impl Store for MemoryStore {
     }
 
     async fn raise_head(&self, at_least: Seq) -> Result<Seq, Error> {
+        if at_least > SEQ_PLAUSIBLE_MAX {
+            return Err(Error::ImplausibleSeq { asked: at_least });
+        }
         let mut state = self.state();
         if at_least > state.head {
             state.head = at_least;

@@ -20,7 +20,10 @@ pub use frames::SqliteFrames;
 pub use schema::Migrated;
 
 use crate::check::item_bytes;
-use crate::{Applied, Cause, CommitError, Error, FeedPage, GET_KEYS_MAX, Query, Retention, Snapshot, Store, StoreId};
+use crate::{
+    Applied, Cause, CommitError, Error, FeedPage, GET_KEYS_MAX, Query, Retention, SEQ_PLAUSIBLE_MAX, Snapshot, Store,
+    StoreId,
+};
 use async_trait::async_trait;
 use file::DataFile;
 use midshift_core::ids::SiteId;
@@ -268,6 +271,9 @@ impl Store for SqliteStore {
     }
 
     async fn raise_head(&self, at_least: Seq) -> Result<Seq, Error> {
+        if at_least > SEQ_PLAUSIBLE_MAX {
+            return Err(Error::ImplausibleSeq { asked: at_least });
+        }
         self.ask(|reply| Command::RaiseHead { at_least, reply }).await
     }
 

@@ -17,6 +17,8 @@ use std::sync::Arc;
 const ROW_COLUMNS: &str = "id, revision, state, parent, ord, body";
 /// Ids of one statement.
 const IDS_PER_STATEMENT: usize = 500;
+/// Up to so many subjects are sought one by one through the index of subjects; for more it is cheaper to walk the log.
+const SUBJECTS_SOUGHT: usize = 64;
 
 type Statement<'q> = sqlx::query::Query<'q, Sqlite, SqliteArguments>;
 
@@ -62,13 +64,38 @@ pub(super) async fn get(readers: &SqlitePool, site_id: &SiteId, keys: &[Key]) ->
     Ok(keys.iter().filter_map(|key| found.get(key).cloned()).collect())
 }
 
+/// Each state is read from its own stretch of the index and the stretches are merged: with a list of states SQLite would walk the
+/// whole table in order of `ord` and throw most of it away.
 pub(super) async fn list(readers: &SqlitePool, site_id: &SiteId, query: &Query) -> Result<Vec<Row>, sqlx::Error> {
+    let states: BTreeSet<i64> = query.states.iter().copied().collect();
+    let mut transaction = readers.begin().await?;
+    if states.is_empty() {
+        return list_one(&mut transaction, site_id, query, None).await;
+    }
+    let mut rows = Vec::new();
+    for state in states {
+        rows.extend(list_one(&mut transaction, site_id, query, Some(state)).await?);
+    }
+    rows.sort_by_cached_key(Cursor::of);
+    if query.newest_first {
+        rows.reverse();
+    }
+    rows.truncate(query.rows_max());
+    Ok(rows)
+}
+
+async fn list_one(
+    connection: &mut SqliteConnection,
+    site_id: &SiteId,
+    query: &Query,
+    state: Option<i64>,
+) -> Result<Vec<Row>, sqlx::Error> {
     let mut sql = format!("SELECT {ROW_COLUMNS} FROM {} WHERE site_id = ?", query.table.name());
     if query.parent.is_some() {
         sql += " AND parent = ?";
     }
-    if !query.states.is_empty() {
-        sql += &format!(" AND state IN {}", placeholders(1, query.states.len()));
+    if state.is_some() {
+        sql += " AND state = ?";
     }
     if query.after.is_some() {
         sql += if query.newest_first { " AND (ord, id) < (?, ?)" } else { " AND (ord, id) > (?, ?)" };
@@ -78,13 +105,13 @@ pub(super) async fn list(readers: &SqlitePool, site_id: &SiteId, query: &Query) 
     if let Some(parent) = &query.parent {
         select = select.bind(parent.clone());
     }
-    for state in &query.states {
-        select = select.bind(*state);
+    if let Some(state) = state {
+        select = select.bind(state);
     }
     if let Some(Cursor { order, id }) = &query.after {
         select = select.bind(*order).bind(id.clone());
     }
-    let rows = select.bind(query.rows_max() as i64).fetch_all(readers).await?;
+    let rows = select.bind(query.rows_max() as i64).fetch_all(connection).await?;
     rows.iter().map(|found| row(query.table, found)).collect()
 }
 
@@ -161,7 +188,8 @@ async fn subject_pages(
     limit: usize,
 ) -> Result<Vec<Entry>, sqlx::Error> {
     let mut entries = Vec::new();
-    for slice in subjects.chunks(IDS_PER_STATEMENT) {
+    let per_statement = if subjects.len() <= SUBJECTS_SOUGHT { 1 } else { IDS_PER_STATEMENT };
+    for slice in subjects.chunks(per_statement) {
         entries.extend(log_page(connection, site_id, log, slice, after, limit).await?);
     }
     Ok(entries)

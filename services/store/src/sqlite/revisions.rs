@@ -39,3 +39,36 @@ impl Revisions {
         *self = Self::default();
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use midshift_core::rows::Table;
+
+    #[test]
+    fn a_row_that_is_asked_for_stays_and_one_that_is_not_goes() {
+        let key = |n: usize| Key::new(Table::Attempt, n.to_string());
+        let mut revisions = Revisions::default();
+        revisions.put(key(0), Some(Revision(7)));
+        revisions.put(key(1), None);
+        for n in 2..3 * GENERATION_KEYS {
+            revisions.put(key(n), Some(Revision(1)));
+            if n % (GENERATION_KEYS / 2) == 0 {
+                assert_eq!(revisions.get(&key(0)), Some(Some(Revision(7))), "after {n}");
+            }
+        }
+        assert_eq!(revisions.get(&key(1)), None);
+        assert!(revisions.young.len() + revisions.old.len() <= 2 * GENERATION_KEYS);
+    }
+
+    #[test]
+    fn a_write_replaces_what_an_older_generation_knows() {
+        let key = Key::new(Table::Attempt, "a");
+        let mut revisions = Revisions::default();
+        revisions.old.insert(key.clone(), Some(Revision(1)));
+        revisions.put(key.clone(), None);
+        assert_eq!(revisions.get(&key), Some(None));
+        revisions.forget_all();
+        assert_eq!(revisions.get(&key), None);
+    }
+}

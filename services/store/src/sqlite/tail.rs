@@ -78,3 +78,48 @@ pub(super) fn page_of(mut entries: Vec<Entry>, limit: usize, head: Seq) -> FeedP
 fn bytes(entry: &Entry) -> usize {
     entry.body.as_ref().map_or(0, |b| b.len()) + entry.subject.len()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use midshift_core::rows::{Index, Log, Revision};
+    use std::sync::Arc;
+
+    fn entry(seq: u64) -> Entry {
+        Entry {
+            seq: Seq(seq),
+            log: Log::Fleet,
+            table: None,
+            subject: Arc::from("r1"),
+            revision: Revision(0),
+            index: Index::default(),
+            body: None,
+            kind: Arc::from("event"),
+            actor: Arc::from("fleet"),
+            request_id: None,
+            at_unix_ms: 0,
+        }
+    }
+
+    #[test]
+    fn a_full_tail_answers_from_its_oldest_entry_on_and_sends_older_cursors_to_the_file() {
+        let tail = Tail::new(Seq(100));
+        let newest = 100 + ENTRIES_MAX as u64 + 5;
+        tail.extend((101..=newest).map(entry).collect(), Seq(newest));
+        assert_eq!(tail.page(Seq(104), 10, |_| true), None);
+        let page = tail.page(Seq(105), 10, |_| true).expect("a page");
+        let numbers: Vec<u64> = page.entries.iter().map(|e| e.seq.0).collect();
+        assert_eq!((numbers, page.next), ((106..=115).collect(), Seq(115)));
+        assert_eq!(tail.page(Seq(newest + 1), 10, |_| true), None, "only the file knows a number that came later");
+        tail.restart(Seq(newest));
+        assert_eq!(tail.page(Seq(105), 10, |_| true), None);
+    }
+
+    #[test]
+    fn a_short_page_of_a_filter_leads_to_the_head() {
+        let tail = Tail::new(Seq(0));
+        tail.extend((1..=4).map(entry).collect(), Seq(4));
+        let page = tail.page(Seq(0), 10, |e| e.seq.0 == 2).expect("a page");
+        assert_eq!((page.entries.len(), page.next, page.head), (1, Seq(4), Seq(4)));
+    }
+}

@@ -334,6 +334,7 @@ async fn a_raised_head_is_never_lowered(store: Arc<dyn Store>) {
     let raised = Seq(head.0 + 1_000);
     assert_eq!(store.raise_head(raised).await.unwrap(), raised);
     assert_eq!(store.raise_head(head).await.unwrap(), raised);
+    assert!(matches!(store.raise_head(Seq(u64::MAX)).await, Err(Error::ImplausibleSeq { .. })));
     let applied = one(&*store, Writer::Fleet, vec![put(Table::Attempt, "a", Expect::Absent, "{}")]).await.unwrap();
     assert_eq!(applied.seq, Seq(raised.0 + 1));
     assert_eq!(store.feed(head, &[Log::Fleet], 10).await.unwrap().entries.len(), 1);
