@@ -1,1 +1,41 @@
-//! Under construction.
+//! The wire of midshift: generated messages, servers and clients, what they mean as core types, and the one door from refusals to `Status`.
+//!
+//! Invariant: no rule is decided here. Conversions parse into core types, listing every violation, or write core types out; rules live in core.
+//! Called by every service, the agent, the simulator and the CLI.
+
+/// Descriptors of all packages with their comments, for reflection and JSON.
+pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptor_set.bin"));
+
+macro_rules! packages {
+    ($($(#[$doc:meta])* $noun:ident $package:literal;)*) => {
+        $(
+            $(#[$doc])*
+            pub mod $noun {
+                /// Version 1.
+                pub mod v1 {
+                    tonic::include_proto!($package);
+                }
+            }
+        )*
+    };
+}
+
+packages! {
+    /// `midshift.common.v1`: words that more than one package needs.
+    common "midshift.common.v1";
+    /// `midshift.task.v1`: tasks in, results out.
+    #[expect(clippy::allow_attributes, reason = "generated service code")]
+    task "midshift.task.v1";
+    /// `midshift.fleet.v1`: robots as the dispatcher sees them, places, areas, and why.
+    #[expect(clippy::allow_attributes, reason = "generated service code")]
+    fleet "midshift.fleet.v1";
+    /// `midshift.link.v1`: the robot's session.
+    #[expect(clippy::allow_attributes, reason = "generated service code")]
+    link "midshift.link.v1";
+    /// `midshift.telemetry.v1`: what robots said.
+    #[expect(clippy::allow_attributes, reason = "generated service code")]
+    telemetry "midshift.telemetry.v1";
+    /// `midshift.sim.v1`: the simulator's own face.
+    #[expect(clippy::allow_attributes, reason = "generated service code")]
+    sim "midshift.sim.v1";
+}

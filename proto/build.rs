@@ -1,0 +1,28 @@
+//! Compiles the .proto files with protox (no protoc to install) into messages, servers, clients and one descriptor set.
+
+use prost::Message;
+use std::path::PathBuf;
+
+const FILES: [&str; 9] = [
+    "midshift/common/v1/common.proto",
+    "midshift/task/v1/task.proto",
+    "midshift/task/v1/task_service.proto",
+    "midshift/fleet/v1/fleet.proto",
+    "midshift/fleet/v1/fleet_service.proto",
+    "midshift/link/v1/link.proto",
+    "midshift/telemetry/v1/telemetry.proto",
+    "midshift/telemetry/v1/telemetry_service.proto",
+    "midshift/sim/v1/sim_service.proto",
+];
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    println!("cargo:rerun-if-changed=midshift");
+    let mut compiler = protox::Compiler::new(["."])?;
+    // Comments stay in: reflection shows them, and a test holds them against the rules of core.
+    compiler.include_source_info(true).include_imports(true).open_files(FILES)?;
+    let set = compiler.file_descriptor_set();
+    let out = PathBuf::from(std::env::var("OUT_DIR")?);
+    std::fs::write(out.join("descriptor_set.bin"), set.encode_to_vec())?;
+    tonic_prost_build::configure().btree_map(".").compile_fds(set)?;
+    Ok(())
+}
