@@ -24,18 +24,18 @@ packages! {
     /// `midshift.common.v1`: words that more than one package needs.
     common "midshift.common.v1";
     /// `midshift.task.v1`: tasks in, results out.
-    #[expect(clippy::allow_attributes, reason = "generated service code")]
+    #[expect(clippy::allow_attributes, clippy::large_enum_variant, reason = "generated code")]
     task "midshift.task.v1";
     /// `midshift.fleet.v1`: robots as the dispatcher sees them, places, areas, and why.
-    #[expect(clippy::allow_attributes, reason = "generated service code")]
+    #[expect(clippy::allow_attributes, reason = "generated code")]
     fleet "midshift.fleet.v1";
     /// `midshift.link.v1`: the robot's session.
-    #[expect(clippy::allow_attributes, reason = "generated service code")]
+    #[expect(clippy::allow_attributes, clippy::large_enum_variant, reason = "generated code")]
     link "midshift.link.v1";
     /// `midshift.telemetry.v1`: what robots said.
-    #[expect(clippy::allow_attributes, reason = "generated service code")]
+    #[expect(clippy::allow_attributes, reason = "generated code")]
     telemetry "midshift.telemetry.v1";
     /// `midshift.sim.v1`: the simulator's own face.
-    #[expect(clippy::allow_attributes, reason = "generated service code")]
+    #[expect(clippy::allow_attributes, reason = "generated code")]
     sim "midshift.sim.v1";
 }
