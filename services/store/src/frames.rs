@@ -6,6 +6,7 @@
 use crate::Error;
 use async_trait::async_trait;
 use midshift_core::ids::RobotId;
+use midshift_core::limits;
 use midshift_core::time::Clock;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -14,6 +15,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 pub const FRAME_BYTES_DEFAULT: u64 = 2 * 1024 * 1024 * 1024;
 /// Gaps kept in memory by [`MemoryFrames`], and listed at most by one call.
 pub const GAPS_MAX: usize = 10_000;
+/// Bytes of a ring's name.
+const RING_BYTES_MAX: usize = 64;
 
 /// Consecutive STATUS samples of one robot, encoded by the caller.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -88,6 +91,32 @@ pub trait FrameLog: Send + Sync + 'static {
     async fn prune(&self) -> Result<u64, Error>;
 }
 
+/// Refuses what would spoil the group it is written with.
+pub(crate) fn frames_well_formed(frames: &[Frame]) -> Result<(), Error> {
+    for frame in frames {
+        numbers_well_formed(&frame.ring, frame.first_seq, frame.last_seq)?;
+        if frame.bytes.len() > limits::TELEMETRY_BATCH_BYTES {
+            return Err(Error::BadFrame("holds more bytes than one telemetry batch"));
+        }
+    }
+    Ok(())
+}
+
+/// As [`frames_well_formed`].
+pub(crate) fn gaps_well_formed(gaps: &[Gap]) -> Result<(), Error> {
+    gaps.iter().try_for_each(|gap| numbers_well_formed(&gap.ring, gap.from_seq, gap.to_seq))
+}
+
+fn numbers_well_formed(ring: &str, first: u64, last: u64) -> Result<(), Error> {
+    if ring.is_empty() || ring.len() > RING_BYTES_MAX {
+        return Err(Error::BadFrame("ring must be 1-64 bytes"));
+    }
+    if first > last || last > i64::MAX.cast_unsigned() {
+        return Err(Error::BadFrame("numbers must rise and stay below 2^63"));
+    }
+    Ok(())
+}
+
 /// Highest number per robot and ring.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Marks(BTreeMap<(RobotId, Arc<str>), u64>);
@@ -149,6 +178,7 @@ impl Kept {
 #[async_trait]
 impl FrameLog for MemoryFrames {
     async fn append(&self, frames: Vec<Frame>) -> Result<(), Error> {
+        frames_well_formed(&frames)?;
         let at_unix_ms = self.clock.now().wall.0;
         let mut state = self.state();
         state.position += 1;
@@ -181,6 +211,7 @@ impl FrameLog for MemoryFrames {
     }
 
     async fn report_gaps(&self, gaps: Vec<Gap>) -> Result<(), Error> {
+        gaps_well_formed(&gaps)?;
         let mut state = self.state();
         state.gaps.extend(gaps);
         let over = state.gaps.len().saturating_sub(GAPS_MAX);

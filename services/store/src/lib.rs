@@ -72,6 +72,9 @@ pub enum Error {
         /// The number.
         asked: Seq,
     },
+    /// A frame or gap that cannot be kept; nothing of its call was.
+    #[error("frame {0}")]
+    BadFrame(&'static str),
     /// A row that this binary cannot read.
     #[error(transparent)]
     BadRow(#[from] BadRow),

@@ -24,12 +24,15 @@ const STATEMENTS_CACHED: usize = 512;
 const READERS: u32 = 4;
 /// Pause between checkpoints.
 const CHECKPOINT_PAUSE: Duration = Duration::from_secs(1);
+/// A checkpoint that empties the log holds the writer up while it waits for a slow reader: at most so long, then it tries later.
+const CHECKPOINT_BUSY: &str = "PRAGMA busy_timeout = 200";
 /// A write-ahead log above this is emptied with the writer waiting, which bounds the disk and the next start.
 const WAL_BYTES_MAX: u64 = 64 * 1024 * 1024;
 
 /// One of the two files of a data directory, locked.
 #[derive(Clone)]
 pub(crate) struct DataFile {
+    name: &'static str,
     path: PathBuf,
     /// Held until the last task that uses the file has ended.
     _lock: Arc<File>,
@@ -45,7 +48,7 @@ impl DataFile {
         make_private_dir(dir).map_err(|source| OpenError::Io { doing: "creating the data directory", source })?;
         let stem = name.strip_suffix(".db").unwrap_or(name);
         let lock = lock(dir, stem).await?;
-        let file = Self { path: dir.join(name), _lock: Arc::new(lock) };
+        let file = Self { name, path: dir.join(name), _lock: Arc::new(lock) };
         let mut connection = file.writer().await?;
         let migrated = schema::apply(&mut connection, name, migrations).await?;
         Ok((file, migrated))
@@ -98,6 +101,13 @@ impl DataFile {
         }
     }
 
+    async fn checkpointer(&self) -> Result<SqliteConnection, OpenError> {
+        let mut connection = self.writer().await?;
+        let set = sqlx::query(CHECKPOINT_BUSY).execute(&mut connection).await;
+        set.map_err(|source| OpenError::Sql { doing: "opening for checkpoints", source })?;
+        Ok(connection)
+    }
+
     async fn checkpoint_once(&self, connection: &mut Option<SqliteConnection>) -> Result<(), OpenError> {
         let wal = self.path.with_extension("db-wal");
         let bytes = wal.metadata().map_or(0, |m| m.len());
@@ -106,7 +116,7 @@ impl DataFile {
         }
         let connection = match connection {
             Some(connection) => connection,
-            None => connection.insert(self.writer().await?),
+            None => connection.insert(self.checkpointer().await?),
         };
         let sql =
             if bytes > WAL_BYTES_MAX { "PRAGMA wal_checkpoint(TRUNCATE)" } else { "PRAGMA wal_checkpoint(PASSIVE)" };
@@ -114,7 +124,7 @@ impl DataFile {
             .execute(connection)
             .await
             .map_err(|source| OpenError::Sql { doing: "checkpointing", source })?;
-        metrics::gauge!("midshift_store_wal_bytes").set(bytes as f64);
+        metrics::gauge!("midshift_store_wal_bytes", "file" => self.name).set(bytes as f64);
         Ok(())
     }
 }

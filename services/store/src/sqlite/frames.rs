@@ -6,7 +6,7 @@ use super::file::DataFile;
 use super::frames_pack::unpack;
 use super::frames_writer::{Command, FramesWriter};
 use super::{OpenError, TELEMETRY_DB, closed, schema, unavailable};
-use crate::frames::GAPS_MAX;
+use crate::frames::{GAPS_MAX, frames_well_formed, gaps_well_formed};
 use crate::{Error, Frame, FrameLog, FrameMark, Gap, StoredFrame};
 use async_trait::async_trait;
 use midshift_core::ids::{RobotId, SiteId};
@@ -66,6 +66,7 @@ impl SqliteFrames {
 #[async_trait]
 impl FrameLog for SqliteFrames {
     async fn append(&self, frames: Vec<Frame>) -> Result<(), Error> {
+        frames_well_formed(&frames)?;
         self.ask(|reply| Command::Append { frames, reply }).await
     }
 
@@ -109,6 +110,7 @@ impl FrameLog for SqliteFrames {
     }
 
     async fn report_gaps(&self, gaps: Vec<Gap>) -> Result<(), Error> {
+        gaps_well_formed(&gaps)?;
         self.ask(|reply| Command::Gaps { gaps, reply }).await
     }
 

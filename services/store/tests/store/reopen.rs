@@ -85,6 +85,9 @@ async fn marks(log: &dyn FrameLog) -> Vec<(String, u64)> {
 }
 
 async fn the_frame_contract(log: &dyn FrameLog) {
+    let backwards = vec![frame("a", 1, 3, 10), frame("a", 9, 8, 10)];
+    assert!(matches!(log.append(backwards).await, Err(Error::BadFrame(_))));
+    assert!(marks(log).await.is_empty(), "nothing of a refused call is kept");
     log.append(vec![frame("a", 1, 3, 10), frame("b", 1, 9, 10)]).await.unwrap();
     log.append(vec![frame("a", 4, 4, 10)]).await.unwrap();
     // A robot that did not hear the acknowledgement sends again; its mark does not fall.
