@@ -5,6 +5,7 @@
 //! operator's `map` commands.
 
 mod draft;
+pub mod lint;
 pub mod route;
 pub mod text;
 
@@ -411,5 +412,64 @@ impl Site {
         }
         seats.truncate(robots);
         seats
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(site: &Site, name: &str) -> WaypointIx {
+        site.find(&WaypointId::parse(name).expect("a name")).expect(name)
+    }
+
+    #[test]
+    fn the_demo_factory_has_what_its_heading_says() {
+        let site = text::parse(DEMO).expect("reads");
+        assert_eq!((site.waypoints().len(), site.stations().count(), site.chargers().count()), (56, 17, 5));
+        let seats = [Kind::Station, Kind::Hold, Kind::Park].map(|k| site.standing_capacity(k));
+        assert_eq!(seats, [32, 31, 12]);
+        for name in ["A01", "B03", "D01", "L1-in", "P01", "Q01"] {
+            assert!(site.can_handle(at(&site, name)), "{name}");
+        }
+        assert_eq!(site.starting_places(20).len(), 20);
+    }
+
+    #[test]
+    fn in_the_demo_only_ways_through_the_door_or_the_aisle_pass_a_hold_point() {
+        let site = std::sync::Arc::new(text::parse(DEMO).expect("reads"));
+        let router = route::Router::new(site.clone());
+        let (mut sum, mut count) = (0, 0);
+        for from in site.stations() {
+            for to in site.stations().filter(|to| *to != from) {
+                let way = router.route(from, to).expect("a way");
+                let far = [from, to].iter().any(|w| ["Q01", "C01"].contains(&site.name_of(*w).as_str()));
+                assert!(far || route::segments(&site, &way).len() == 1, "{way:?}");
+                sum += router.distance_mm(from, to).expect("a way");
+                count += 1;
+            }
+        }
+        assert!((24_000..28_000).contains(&(sum / count)), "mean way is {} mm", sum / count);
+    }
+
+    #[test]
+    fn lanes_are_found_from_both_ends_and_know_their_passages_and_limits() {
+        let site = text::parse(DEMO).expect("reads");
+        let (door, room) = (at(&site, "door-1"), at(&site, "door-2"));
+        let inside = site.passages_of_lane(door, room);
+        assert_eq!(inside.iter().map(|p| site.place(*p).place_id.as_str()).collect::<Vec<_>>(), ["door"]);
+        let lane = site.lane(site.find_lane(door, room).expect("a lane"));
+        assert_eq!(site.lane_speed_limit_mm_s(lane), Some(1000), "the slower of both areas");
+        let ends: Vec<_> = site.arriving(door).map(|l| site.name_of(l.from).as_str()).collect();
+        assert_eq!(ends, ["door-hall", "door-2"]);
+        assert_eq!(site.passages_of_lane(room, at(&site, "j11")), []);
+    }
+
+    #[test]
+    fn an_area_without_values_of_its_own_has_the_default_policy() {
+        let site = text::parse(CORRIDOR).expect("reads");
+        let area = &site.areas()[0];
+        let policy = area.policy();
+        assert_eq!(policy, AreaPolicy { speed_limit_mm_s: Some(1500), ..AreaPolicy::default_of(area.area_id.clone()) });
     }
 }

@@ -197,3 +197,77 @@ pub fn segments(site: &Site, route: &[WaypointIx]) -> Vec<Segment> {
     }
     cut
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ids::WaypointId;
+    use crate::site::{CORRIDOR, DEMO, Kind, text};
+
+    fn site(text: &str) -> Arc<Site> {
+        Arc::new(text::parse(text).expect("reads"))
+    }
+    fn at(site: &Site, name: &str) -> WaypointIx {
+        site.find(&WaypointId::parse(name).expect("a name")).expect(name)
+    }
+    fn names(site: &Site, route: &[WaypointIx]) -> Vec<String> {
+        route.iter().map(|w| site.name_of(*w).to_string()).collect()
+    }
+
+    #[test]
+    fn a_route_is_released_up_to_each_standing_place_with_its_passages() {
+        let site = site(CORRIDOR);
+        let router = Router::new(site.clone());
+        let route = router.route(at(&site, "A"), at(&site, "B")).expect("a way");
+        assert_eq!(names(&site, &route), ["A", "a-out", "wait-a", "c-1", "c-2", "b-in", "B"]);
+        let cut = segments(&site, &route);
+        assert_eq!(cut.len(), 2);
+        assert_eq!((cut[0].start, cut[0].end, cut[0].crossings.len()), (0, 2, 0));
+        assert_eq!(cut[0].standing, site.standing_at(at(&site, "wait-a")));
+        let corridor = cut[1].crossings[0];
+        assert_eq!(site.place(corridor.place).place_id.as_str(), "corridor");
+        assert_eq!((corridor.enter, corridor.leave), (2, 5));
+        assert_eq!(cut[1].places().len(), 2);
+        assert_eq!(segments(&site, &route[..1]), []);
+    }
+
+    #[test]
+    fn a_route_never_leads_over_a_station_charger_or_park() {
+        let site = site(DEMO);
+        let router = Router::new(site.clone());
+        for goal in 0..site.waypoints().len() as u32 {
+            for from in 0..site.waypoints().len() as u32 {
+                let route =
+                    router.route(WaypointIx(from), WaypointIx(goal)).expect("every waypoint reaches every other");
+                let inner = route.iter().skip(1).rev().skip(1);
+                assert!(inner.copied().all(|w| site.is_through(w)), "{:?}", names(&site, &route));
+                let driven = route.windows(2).map(|p| site.lane(site.find_lane(p[0], p[1]).expect("a lane")).length_mm);
+                let driven: u64 = driven.map(u64::from).sum();
+                assert_eq!(router.distance_mm(WaypointIx(from), WaypointIx(goal)), Some(driven));
+            }
+        }
+    }
+
+    #[test]
+    fn blocked_places_are_driven_around_or_end_the_way() {
+        let site = site(CORRIDOR);
+        let router = Router::new(site.clone());
+        let place = |name: &str| site.find_place(&crate::ids::PlaceId::parse(name).expect("a name")).expect(name);
+        let (a, b) = (at(&site, "A"), at(&site, "B"));
+        assert_eq!(router.route_around(a, b, &Blocked::new([place("corridor")])), None);
+        assert_eq!(router.route_around(a, b, &Blocked::new([place("wait-a")])), None);
+        assert_eq!(router.route_around(a, b, &Blocked::new([place("B")])), None);
+        let leaving = router.route_around(a, at(&site, "park-a"), &Blocked::new([place("A")]));
+        assert!(leaving.is_some(), "a robot may leave a blocked place");
+        assert!(router.route(a, b).is_some(), "what is blocked in one question is open in the next");
+    }
+
+    #[test]
+    fn the_nearest_goal_is_by_distance_then_by_index() {
+        let site = site(CORRIDOR);
+        let router = Router::new(site.clone());
+        let (nearest, _) = router.nearest(at(&site, "A"), site.of_kind(Kind::Hold)).expect("one");
+        assert_eq!(names(&site, &[nearest]), ["wait-a"]);
+        assert_eq!(router.nearest(at(&site, "A"), []), None);
+    }
+}
