@@ -3,7 +3,7 @@
 //! Invariant: without `--install` nothing is fetched and nothing is skipped: what is missing is listed and the suite fails.
 //! A tool counts as there when its program exists and its stamp names the pinned version, so a second install is quick.
 
-use crate::workspace::{Programs, Workspace};
+use crate::workspace::Workspace;
 use crate::{go, run};
 use anyhow::{Context, Result, bail, ensure};
 use std::path::{Path, PathBuf};
@@ -72,13 +72,11 @@ impl Tools {
         Self::find(workspace)
     }
 
-    /// Tells tests where tools and programs are.
-    pub fn export(&self, programs: &Programs, command: &mut Command) {
+    /// Tells tests where the tools are.
+    pub fn export(&self, command: &mut Command) {
         command.env("MIDSHIFT_TEST_GRPCURL", &self.grpcurl);
         command.env("MIDSHIFT_TEST_BUF", &self.buf);
         command.env("MIDSHIFT_TEST_PYTHON", &self.python);
-        command.env("MIDSHIFT_TEST_BIN", &programs.midshift);
-        command.env("MIDSHIFT_TEST_LAUNCHER", &programs.launcher);
     }
 }
 

@@ -91,8 +91,9 @@ impl Part {
     fn tests(workspace: &Workspace, tools: Option<&Tools>, count: &mut Count, targets: &[&str]) -> Result<bool> {
         let mut command = workspace.cargo(&["test", "--workspace", "--no-fail-fast"]);
         command.args(targets);
+        workspace.export_programs(&mut command)?;
         if let Some(tools) = tools {
-            tools.export(&workspace.programs()?, &mut command);
+            tools.export(&mut command);
         }
         run::reading(&mut command, |line| count.add(line))
     }

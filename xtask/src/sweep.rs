@@ -23,7 +23,9 @@ pub fn torture(workspace: &Workspace, from: u64, seeds: u64) -> Result<bool> {
 
 /// Runs the tests that hold golden files and lets them write what they see.
 pub fn golden(workspace: &Workspace) -> Result<bool> {
-    let mut command = workspace.cargo(&["test", "--workspace", "--lib", "--bins", "--tests", "--", "golden"]);
+    ensure!(run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins"]))?, "the programs do not build");
+    let mut command = workspace.cargo(&["test", "--workspace", "--tests", "--", "golden"]);
+    workspace.export_programs(&mut command)?;
     let passed = counted(command.env("BLESS", "1"))?;
     run::say("next: git diff, and read it before you commit it");
     Ok(passed)

@@ -6,20 +6,16 @@ use anyhow::{Context, Result, ensure};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+/// The programs under test, built once, and how tests hear of them.
+const PROGRAMS: [(&str, &str); 2] =
+    [("MIDSHIFT_TEST_BIN", "midshift"), ("MIDSHIFT_TEST_LAUNCHER", "midshift-launcher")];
+
 /// Paths of this checkout.
 pub struct Workspace {
     /// The directory of the root Cargo.toml.
     pub root: PathBuf,
     /// Cargo's target directory.
     pub target: PathBuf,
-}
-
-/// The programs under test, built once.
-pub struct Programs {
-    /// `midshift`.
-    pub midshift: PathBuf,
-    /// `midshift-launcher`.
-    pub launcher: PathBuf,
 }
 
 impl Workspace {
@@ -55,14 +51,14 @@ impl Workspace {
         command
     }
 
-    /// The debug programs; an error names the one that was not built.
-    pub fn programs(&self) -> Result<Programs> {
-        let built = |name: &str| {
+    /// Tells tests where the debug programs are; an error names the one that was not built.
+    pub fn export_programs(&self, command: &mut Command) -> Result<()> {
+        for (variable, name) in PROGRAMS {
             let path = self.target.join("debug").join(format!("{name}{}", std::env::consts::EXE_SUFFIX));
             ensure!(path.is_file(), "the build left no {}", path.display());
-            Ok(path)
-        };
-        Ok(Programs { midshift: built("midshift")?, launcher: built("midshift-launcher")? })
+            command.env(variable, path);
+        }
+        Ok(())
     }
 }
 
