@@ -13,7 +13,7 @@ const INSTALL_LIMIT: Duration = Duration::from_secs(900);
 const INSTALL_TRIES: u32 = 3;
 const POLL: Duration = Duration::from_millis(100);
 
-/// Tells the person at the terminal; data goes to [`print`].
+/// Tells the person at the terminal; data goes to [`print()`].
 #[expect(clippy::print_stderr, reason = "the one place where xtask talks")]
 pub fn say(line: &str) {
     eprintln!("{line}");
