@@ -5,8 +5,12 @@
 //! operator's `map` commands.
 
 mod draft;
+pub mod grid;
+pub mod lif;
 pub mod lint;
 pub mod route;
+pub mod show;
+pub mod task_list;
 pub mod text;
 
 use crate::ids::{AreaId, PlaceId, SiteId, WaypointId};

@@ -1,0 +1,118 @@
+//! A site as text for a person: a sketch of the floor and tables of places and areas. Called by `map show`.
+
+use super::{Kind, Site};
+use std::fmt::Write;
+
+/// Size of the sketch, characters; a character is about twice as high as wide.
+const SKETCH: (usize, usize) = (96, 36);
+/// Waypoints up to which the sketch has names; larger sites show marks only.
+const NAMED_MAX: usize = 100;
+
+/// The whole description, ending in a line break.
+pub fn show(site: &Site) -> String {
+    let mut out = String::new();
+    describe(site, &mut out).unwrap_or_default();
+    out
+}
+
+fn describe(site: &Site, out: &mut String) -> std::fmt::Result {
+    writeln!(out, "{} ({}), map {} version {}", site.name(), site.site_id(), site.map_id(), site.map_version())?;
+    let count = |kind| site.of_kind(kind).count();
+    writeln!(
+        out,
+        "{} waypoints: {} stations, {} chargers, {} parking places, {} hold points; {} lanes; {} passages",
+        site.waypoints().len(),
+        count(Kind::Station),
+        count(Kind::Charger),
+        count(Kind::Park),
+        count(Kind::Hold),
+        site.lanes().len(),
+        site.places().iter().filter(|p| p.inside().is_some()).count(),
+    )?;
+    if !site.collisions_modelled() {
+        writeln!(out, "collisions: not modelled")?;
+    }
+    writeln!(out, "\n{}", sketch(site))?;
+    writeln!(out, "{:<16} {:>6} {:>12} {:>14}  PEOPLE", "AREA", "SEATS", "SPEED mm/s", "DISTANCE mm")?;
+    for (at, area) in site.areas().iter().enumerate() {
+        let shown = |value: Option<u32>| value.map_or_else(|| "-".to_owned(), |v| v.to_string());
+        let speed = shown(area.defaults.speed_limit_mm_s);
+        let distance = shown(area.defaults.avoidance_distance_mm);
+        let seats = site.area_capacity(super::AreaIx(at as u32));
+        let people = if area.people { "yes" } else { "no" };
+        writeln!(out, "{:<16} {seats:>6} {speed:>12} {distance:>14}  {people}", area.area_id.as_str())?;
+    }
+    writeln!(out, "\n{:<16} {:<10} {:>8}  AT", "PLACE", "KIND", "CAPACITY")?;
+    for place in site.places() {
+        let name = |w| site.name_of(w).as_str();
+        let at = match (place.waypoint(), place.inside()) {
+            (Some(w), _) => site.waypoint(w).kind.as_str().to_owned(),
+            (None, Some(inside)) => {
+                let lanes = inside.lanes.iter().map(|l| site.lane(*l));
+                lanes.map(|l| format!("{}>{}", name(l.from), name(l.to))).collect::<Vec<_>>().join(" ")
+            }
+            (None, None) => String::new(),
+        };
+        writeln!(out, "{:<16} {:<10} {:>8}  {at}", place.place_id.as_str(), place.kind_str(), place.capacity)?;
+    }
+    Ok(())
+}
+
+/// Names (or marks) at their positions, north up; what would cover another is moved aside or left out.
+fn sketch(site: &Site) -> String {
+    let xs = || site.waypoints().iter().map(|w| w.x_mm);
+    let ys = || site.waypoints().iter().map(|w| w.y_mm);
+    let (Some(west), Some(east), Some(south), Some(north)) = (xs().min(), xs().max(), ys().min(), ys().max()) else {
+        return String::new();
+    };
+    let (columns, rows) = SKETCH;
+    let scale = |value: i64, least: i64, most: i64, cells: usize| {
+        (((value - least) as i128 * (cells as i128 - 1)) / i128::from((most - least).max(1))) as usize
+    };
+    let mut floor = vec![vec![' '; columns + 12]; rows];
+    for w in site.waypoints() {
+        let row = rows - 1 - scale(w.y_mm, south, north, rows);
+        let column = scale(w.x_mm, west, east, columns);
+        let mark = match w.kind {
+            Kind::Junction => "+",
+            Kind::Station => "s",
+            Kind::Charger => "c",
+            Kind::Park => "p",
+            Kind::Hold => "h",
+        };
+        let named = site.waypoints().len() <= NAMED_MAX && w.kind != Kind::Junction;
+        let text = if named { w.waypoint_id.as_str() } else { mark };
+        let free = |line: &[char]| line.iter().skip(column).take(text.len() + 1).all(|c| *c == ' ');
+        let tries = [row, row.saturating_sub(1), (row + 1).min(rows - 1)];
+        let at = tries.into_iter().find(|r| free(&floor[*r])).unwrap_or(row);
+        let cells = floor[at].iter_mut().skip(column);
+        cells.zip(text.chars()).filter(|(cell, _)| **cell == ' ').for_each(|(cell, c)| *cell = c);
+    }
+    let lines = floor.into_iter().map(|line| line.into_iter().collect::<String>().trim_end().to_owned());
+    lines.collect::<Vec<_>>().join("\n") + "\n"
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::site::{DEMO, grid, text};
+
+    #[test]
+    fn the_demo_is_shown_with_every_name_that_a_person_may_use() {
+        let site = text::parse(DEMO).expect("reads");
+        let shown = show(&site);
+        for place in site.places() {
+            assert!(shown.contains(place.place_id.as_str()), "{} is not in:\n{shown}", place.place_id);
+        }
+        let sketch = sketch(&site);
+        for at in site.stations() {
+            assert!(sketch.contains(site.name_of(at).as_str()), "{} is not in:\n{sketch}", site.name_of(at));
+        }
+    }
+
+    #[test]
+    fn a_grid_says_that_collisions_are_not_modelled() {
+        let site = grid::parse_map("g", "type octile\nheight 1\nwidth 2\nmap\n.S\n").expect("reads");
+        assert!(show(&site).contains("collisions: not modelled"));
+    }
+}
