@@ -1,1 +1,15 @@
-//! Under construction.
+//! A simulated robot: a body with kinematics, battery, faults and a world of items, for one robot a process or thousands in one.
+//!
+//! Invariant: a body is synchronous, reads no clock and starts no task; where it is follows from its path and the time it
+//! set out. What bodies did is judged from their own journals ([`oracle`]), never from what a server believes.
+
+pub mod body;
+pub mod energy;
+pub mod faults;
+pub mod handle;
+pub mod journal;
+pub mod motion;
+pub mod oracle;
+pub mod person;
+pub mod workload;
+pub mod world;

@@ -1,0 +1,606 @@
+//! The simulated body: poses, battery, joints, faults and hands, advanced from event to event by whoever asks.
+//!
+//! Called by the agent through `trait Body`, and by the simulated person through [`crate::handle::SimHandle`]. Invariant: where
+//! a body is changes only by driving, also across faults, new paths, new speeds and a restart.
+
+mod acts;
+mod kept;
+mod orders;
+
+use crate::energy::{Effort, Stores};
+use crate::faults::{self, FaultRates, Injected, draw_next, draw_secs};
+use crate::journal::Work;
+use crate::motion::Leg;
+use crate::world::{SharedWorld, lock};
+use acts::Act;
+use kept::Keeper;
+pub use kept::{Error, JOURNAL_FILE};
+use midshift_agent::body::{BodyNews, PathPoint};
+use midshift_core::ids::{PlaceId, RobotId, TaskId, WaypointId};
+use midshift_core::robot::{Fault, HardwareStop, Load, Mode};
+use midshift_core::site::{Site, WaypointIx};
+use midshift_core::time::{SiteDuration, SiteTime};
+use nalgebra::{Isometry2, Vector2};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeSet, VecDeque};
+use std::sync::Arc;
+use tokio::sync::watch;
+
+/// The fastest a simulated body goes, millimetres per second.
+pub const SPEED_MAX_MM_S: u32 = 1_500;
+/// The slowest it is asked to go, millimetres per second; also its speed at the stop level SLOW.
+pub const SPEED_FLOOR_MM_S: u32 = 300;
+/// A body stands on a waypoint while its middle is nearer than this, millimetres.
+pub const CONTOUR_MM: f64 = 300.0;
+/// Effects a body remembers, to say whether a step was done.
+const RECENT_MAX: usize = 32;
+
+/// What one body is like.
+#[derive(Clone, Debug)]
+pub struct BodyConfig {
+    /// Its name.
+    pub robot_id: RobotId,
+    /// Decides all that is drawn, together with its name.
+    pub seed: u64,
+    /// Where it stands when it is made.
+    pub start: WaypointId,
+    /// What the maker allows, millimetres per second; at most [`SPEED_MAX_MM_S`].
+    pub speed_mm_s: u32,
+    /// How fast it really goes of what it is asked for, thousandths, 100..=1000.
+    pub pace_permille: u32,
+    /// How often things go wrong.
+    pub faults: FaultRates,
+    /// State of charge when it is made; none: 600..=1000, drawn.
+    pub battery_permille: Option<u16>,
+    /// The battery empties by work.
+    pub drains: bool,
+}
+
+impl BodyConfig {
+    /// A body at its best, with the default faults.
+    pub fn new(robot_id: RobotId, seed: u64, start: WaypointId) -> Self {
+        Self {
+            robot_id,
+            seed,
+            start,
+            speed_mm_s: SPEED_MAX_MM_S,
+            pace_permille: 1000,
+            faults: FaultRates::default(),
+            battery_permille: None,
+            drains: true,
+        }
+    }
+    fn rng(&self, life: u32) -> ChaCha8Rng {
+        let name = self
+            .robot_id
+            .as_str()
+            .bytes()
+            .fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3));
+        ChaCha8Rng::seed_from_u64(self.seed ^ name.rotate_left(life % 64))
+    }
+}
+
+/// What a body did and suffered since this process made it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Counts {
+    /// Milliseconds driving or turning.
+    pub driving_ms: u64,
+    /// Milliseconds acting or waiting as a step asks.
+    pub acting_ms: u64,
+    /// Milliseconds standing before an obstacle.
+    pub blocked_ms: u64,
+    /// Milliseconds standing with an order: paused, broken or driven by a person.
+    pub halted_ms: u64,
+    /// Milliseconds without an order.
+    pub idle_ms: u64,
+    /// Obstacles met.
+    pub obstacles: u64,
+    /// Picks that closed on nothing.
+    pub misses: u64,
+    /// Jams.
+    pub jams: u64,
+    /// Losses of the network.
+    pub silences: u64,
+    /// Times a person took over.
+    pub manuals: u64,
+}
+
+#[derive(Clone, Debug)]
+enum Order {
+    Drive(VecDeque<PathPoint>),
+    Act(Act),
+}
+
+#[derive(Clone, Debug)]
+enum Phase {
+    Still,
+    Leg { leg: Leg, out_mm: Option<f64>, in_mm: Option<f64> },
+    Blocked { until: SiteTime, gives_up: bool },
+    Acting { until: SiteTime },
+}
+
+/// Something in the way on the lane at hand.
+#[derive(Clone, Copy, Debug)]
+struct Block {
+    after_mm: f64,
+    lasts: SiteDuration,
+}
+
+/// One simulated robot.
+#[derive(Debug)]
+pub struct SimBody {
+    config: BodyConfig,
+    site: Arc<Site>,
+    world: SharedWorld,
+    rng: ChaCha8Rng,
+    /// Everything below is as it was at this moment.
+    at: SiteTime,
+    frame: Isometry2<f64>,
+    /// Last waypoint reached.
+    last: Option<WaypointId>,
+    /// Waypoint under its contour.
+    touching: Option<WaypointId>,
+    /// Lane it is on, while it is between two waypoints.
+    lane: Option<(WaypointId, WaypointId)>,
+    inside: BTreeSet<PlaceId>,
+    order: Option<Order>,
+    phase: Phase,
+    paused: bool,
+    slow: bool,
+    parked: bool,
+    charging: bool,
+    mode: Mode,
+    hardware_stop: HardwareStop,
+    broken: Option<Fault>,
+    stores: Stores,
+    odometer_mm: f64,
+    loaded_mm: f64,
+    load: Option<Load>,
+    news: VecDeque<BodyNews>,
+    work: Option<Work>,
+    recent: VecDeque<(TaskId, String)>,
+    block: Option<Block>,
+    pending_block: Option<SiteDuration>,
+    miss_next: bool,
+    network: watch::Sender<bool>,
+    silence_at: Option<SiteTime>,
+    silent_until: Option<SiteTime>,
+    manual_at: Option<SiteTime>,
+    manual_until: Option<SiteTime>,
+    idle_since: SiteTime,
+    counts: Counts,
+    keeper: Option<Keeper>,
+}
+
+impl SimBody {
+    /// A new body that stands at its start. Its start must be a waypoint of the site.
+    pub fn new(config: BodyConfig, site: Arc<Site>, world: SharedWorld, now: SiteTime) -> Result<Self, Error> {
+        let mut body = Self::at_rest(config, site, world, now)?;
+        body.occupy(now);
+        Ok(body)
+    }
+    /// As [`SimBody::new`], but it has not told the journal yet where it stands.
+    fn at_rest(config: BodyConfig, site: Arc<Site>, world: SharedWorld, now: SiteTime) -> Result<Self, Error> {
+        let start = site.find(&config.start).ok_or_else(|| Error::UnknownStart(config.start.clone()))?;
+        let point = site.waypoint(start);
+        let mut rng = config.rng(0);
+        let charge = config.battery_permille.unwrap_or_else(|| rng.random_range(600..=1000));
+        let frame = Isometry2::translation(point.x_mm as f64 / 1000.0, point.y_mm as f64 / 1000.0);
+        Ok(Self {
+            at: now,
+            frame,
+            last: Some(config.start.clone()),
+            touching: Some(config.start.clone()),
+            lane: None,
+            inside: BTreeSet::new(),
+            order: None,
+            phase: Phase::Still,
+            paused: false,
+            slow: false,
+            parked: false,
+            charging: false,
+            mode: Mode::Automatic,
+            hardware_stop: HardwareStop::None,
+            broken: None,
+            stores: Stores::new(charge, config.drains),
+            odometer_mm: 0.0,
+            loaded_mm: 0.0,
+            load: None,
+            news: VecDeque::new(),
+            work: None,
+            recent: VecDeque::new(),
+            block: None,
+            pending_block: None,
+            miss_next: false,
+            network: watch::Sender::new(true),
+            silence_at: draw_next(&mut rng, now, config.faults.silence_per_hour),
+            silent_until: None,
+            manual_at: draw_next(&mut rng, now, config.faults.manual_per_hour),
+            manual_until: None,
+            idle_since: now,
+            counts: Counts::default(),
+            keeper: None,
+            config,
+            site,
+            world,
+            rng,
+        })
+    }
+    /// Its name.
+    pub fn robot_id(&self) -> &RobotId {
+        &self.config.robot_id
+    }
+    /// Whether its network is up, now and whenever it changes.
+    pub fn network(&self) -> watch::Receiver<bool> {
+        self.network.subscribe()
+    }
+    /// What it did so far.
+    pub fn counts(&self) -> Counts {
+        self.counts
+    }
+    /// Millimetres driven, and of these with a load.
+    pub fn odometers_mm(&self) -> (u64, u64) {
+        (self.odometer_mm as u64, self.loaded_mm as u64)
+    }
+    /// The fault that keeps it standing.
+    pub fn broken(&self) -> Option<&Fault> {
+        self.broken.as_ref()
+    }
+    /// Since when it has no order; none while it has one.
+    pub fn idle_since(&self) -> Option<SiteTime> {
+        self.order.is_none().then_some(self.idle_since)
+    }
+    /// Places its contour reaches into.
+    pub fn inside(&self) -> &BTreeSet<PlaceId> {
+        &self.inside
+    }
+    /// The last waypoint it reached.
+    pub fn last_waypoint(&self) -> Option<&WaypointId> {
+        self.last.as_ref()
+    }
+    /// Waits from now on for what was injected, or suffers it at once.
+    pub fn inject(&mut self, now: SiteTime, what: Injected) {
+        self.advance(now);
+        match what {
+            Injected::Obstacle(lasts) if matches!(self.phase, Phase::Leg { .. }) => self.meet_obstacle(now, lasts),
+            Injected::Obstacle(lasts) => self.pending_block = Some(lasts),
+            Injected::GripperMissed => self.miss_next = true,
+            Injected::Jam => self.jam(now),
+            Injected::Silence(lasts) => self.fall_silent(now, lasts),
+            Injected::Manual(lasts) => self.take_over(now, lasts),
+        }
+    }
+    /// A person mends what is broken; an empty battery is changed for a half-full one.
+    pub fn clear(&mut self, now: SiteTime) {
+        self.advance(now);
+        if let Some(fault) = self.broken.take() {
+            if fault.code == faults::FAULT_BATTERY_EMPTY {
+                let spent_mwh = self.stores.spent_mwh;
+                self.stores =
+                    Stores { spent_mwh, joint_c: self.stores.joint_c, ..Stores::new(500, self.config.drains) };
+            }
+            self.news.push_back(BodyNews::Fault(fault, false));
+            self.go(now);
+        }
+    }
+    /// A person takes its load and carries it back to where it was picked.
+    pub fn take_load(&mut self, now: SiteTime) -> bool {
+        self.advance(now);
+        let taken = lock(&self.world).put_back(now, &self.config.robot_id).is_some();
+        if taken {
+            self.load = None;
+            self.news.push_back(BodyNews::Load(None));
+        }
+        taken
+    }
+    /// A person who drives hands it back.
+    pub fn hand_back(&mut self, now: SiteTime) {
+        self.advance(now);
+        if std::mem::take(&mut self.mode) != Mode::Automatic {
+            self.manual_until = None;
+            self.news.push_back(BodyNews::Mode(Mode::Automatic));
+            self.go(now);
+        }
+    }
+    /// Lets all happen that happens until `now`.
+    pub fn advance(&mut self, now: SiteTime) {
+        while let Some(at) = self.next_event().filter(|at| *at <= now) {
+            self.settle(at.max(self.at));
+            self.happen(at.max(self.at));
+        }
+        self.settle(now);
+    }
+
+    /// The next moment at which something happens by itself.
+    fn next_event(&self) -> Option<SiteTime> {
+        let phase = match &self.phase {
+            Phase::Still => None,
+            Phase::Leg { leg, out_mm, in_mm } => {
+                let block_mm = self.block.map(|b| b.after_mm).filter(|mm| *mm <= leg.length_mm());
+                let marks = [*out_mm, *in_mm, block_mm].into_iter().flatten().map(|mm| leg.when_driven(mm));
+                Some(marks.fold(leg.end(), SiteTime::min))
+            }
+            Phase::Blocked { until, .. } | Phase::Acting { until } => Some(*until),
+        };
+        let empties = self.stores.lasts(&self.effort(self.speed_mm_s(self.at))).map(|lasts| self.at + lasts);
+        let dead = (self.is_empty() && self.broken.is_none()).then_some(self.at);
+        let timers = [self.silence_at, self.silent_until, self.manual_at, self.manual_until];
+        [phase, empties, dead].into_iter().chain(timers).flatten().min()
+    }
+    /// What happens at `now`, to which everything is settled.
+    fn happen(&mut self, now: SiteTime) {
+        let due = |at: Option<SiteTime>| at.is_some_and(|at| at <= now);
+        if due(self.silent_until) {
+            self.silent_until = None;
+            self.network.send_replace(true);
+        } else if due(self.silence_at) {
+            self.silence_at = draw_next(&mut self.rng, now, self.config.faults.silence_per_hour);
+            let lasts = draw_secs(&mut self.rng, 2..=20);
+            self.fall_silent(now, lasts);
+        } else if due(self.manual_until) {
+            self.hand_back(now);
+        } else if due(self.manual_at) {
+            self.manual_at = draw_next(&mut self.rng, now, self.config.faults.manual_per_hour);
+            let lasts = draw_secs(&mut self.rng, 30..=120);
+            self.take_over(now, lasts);
+        } else if self.is_empty() && self.broken.is_none() {
+            self.break_down(now, faults::battery_empty());
+        } else {
+            self.happen_in_phase(now);
+        }
+    }
+    fn happen_in_phase(&mut self, now: SiteTime) {
+        match &mut self.phase {
+            Phase::Still => {}
+            Phase::Leg { leg, out_mm, in_mm } => {
+                let due = |mm: Option<f64>| mm.is_some_and(|mm| leg.when_driven(mm) <= now);
+                if due(*out_mm) {
+                    *out_mm = None;
+                    self.touching = None;
+                    self.occupy(now);
+                } else if due(*in_mm) {
+                    *in_mm = None;
+                    self.touching = self.target().map(|p| p.waypoint.clone());
+                    self.occupy(now);
+                } else if let Some(block) = self.block.filter(|b| due(Some(b.after_mm))) {
+                    self.meet_obstacle(now, block.lasts);
+                } else if leg.end() <= now {
+                    self.arrive(now);
+                }
+            }
+            Phase::Blocked { until, gives_up } if *until <= now => {
+                let gives_up = *gives_up;
+                self.phase = Phase::Still;
+                if gives_up {
+                    self.fail(now, faults::obstacle());
+                } else {
+                    self.go(now);
+                }
+            }
+            Phase::Acting { until } if *until <= now => self.finish_act(now),
+            Phase::Blocked { .. } | Phase::Acting { .. } => {}
+        }
+    }
+    /// Brings frame, odometers, battery and heat to `now`; nothing happens on the way.
+    fn settle(&mut self, now: SiteTime) {
+        let time = now.since(self.at);
+        if time.as_ms() == 0 {
+            return;
+        }
+        let (frame, driven_mm, stores) = self.glance(now);
+        self.frame = frame;
+        self.odometer_mm += driven_mm;
+        self.loaded_mm += if self.load.is_some() { driven_mm } else { 0.0 };
+        self.stores = stores;
+        let counts = &mut self.counts;
+        *match (&self.phase, &self.order) {
+            (Phase::Leg { .. }, _) => &mut counts.driving_ms,
+            (Phase::Acting { .. }, _) => &mut counts.acting_ms,
+            (Phase::Blocked { .. }, _) => &mut counts.blocked_ms,
+            (Phase::Still, Some(_)) => &mut counts.halted_ms,
+            (Phase::Still, None) => &mut counts.idle_ms,
+        } += time.as_ms();
+        self.at = now;
+    }
+    /// Frame, millimetres driven since it was settled, battery and heat at `now`, if nothing happens until then.
+    fn glance(&self, now: SiteTime) -> (Isometry2<f64>, f64, Stores) {
+        let time = now.since(self.at);
+        let (frame, driven_mm) = match &self.phase {
+            Phase::Leg { leg, .. } => (leg.frame(now), leg.driven_mm(now) - leg.driven_mm(self.at)),
+            _ => (self.frame, 0.0),
+        };
+        let speed_mm_s = if time.as_ms() == 0 { 0.0 } else { driven_mm / time.as_secs_f64() };
+        (frame, driven_mm, self.stores.after(time, &self.effort(speed_mm_s as u32)))
+    }
+    fn effort(&self, speed_mm_s: u32) -> Effort {
+        Effort {
+            speed_m_s: f64::from(speed_mm_s) / 1000.0,
+            loaded: self.load.is_some(),
+            acting: matches!((&self.phase, &self.order), (Phase::Acting { .. }, Some(Order::Act(act))) if act.works()),
+            parked: self.parked,
+            charging: self.charging,
+        }
+    }
+    fn speed_mm_s(&self, now: SiteTime) -> u32 {
+        match &self.phase {
+            Phase::Leg { leg, .. } => leg.speed_mm_s(now),
+            _ => 0,
+        }
+    }
+    fn is_empty(&self) -> bool {
+        self.config.drains && !self.charging && self.stores.charge_mwh <= 0.0
+    }
+    fn target(&self) -> Option<&PathPoint> {
+        match &self.order {
+            Some(Order::Drive(path)) => path.front(),
+            _ => None,
+        }
+    }
+    fn fall_silent(&mut self, now: SiteTime, lasts: SiteDuration) {
+        self.counts.silences += 1;
+        self.silent_until = Some(now + lasts);
+        self.network.send_replace(false);
+    }
+    /// A person drives: the order stays and goes on when the robot is handed back, unless the agent drops it.
+    fn take_over(&mut self, now: SiteTime, lasts: SiteDuration) {
+        self.counts.manuals += 1;
+        self.manual_until = Some(now + lasts);
+        if self.mode == Mode::Automatic {
+            self.halt(now);
+            self.mode = Mode::Manual;
+            self.news.push_back(BodyNews::Mode(Mode::Manual));
+        }
+    }
+    fn jam(&mut self, now: SiteTime) {
+        self.counts.jams += 1;
+        self.break_down(now, faults::jam());
+    }
+    /// A fault that stands until a person clears it.
+    fn break_down(&mut self, now: SiteTime, fault: Fault) {
+        if self.broken.is_none() {
+            self.halt(now);
+            if self.order.is_some() {
+                self.fail(now, fault.clone());
+            }
+            self.broken = Some(fault.clone());
+            self.news.push_back(BodyNews::Fault(fault, true));
+        }
+    }
+    fn fail(&mut self, now: SiteTime, fault: Fault) {
+        self.drop_order(now);
+        self.news.push_back(BodyNews::Failed(fault));
+    }
+    fn drop_order(&mut self, now: SiteTime) {
+        self.order = None;
+        self.paused = false;
+        self.phase = Phase::Still;
+        self.idle_since = now;
+    }
+    fn meet_obstacle(&mut self, now: SiteTime, lasts: SiteDuration) {
+        self.halt(now);
+        self.block = None;
+        self.counts.obstacles += 1;
+        let patience = lasts.min(faults::OBSTACLE_PATIENCE);
+        self.phase = Phase::Blocked { until: now + patience, gives_up: lasts > faults::OBSTACLE_PATIENCE };
+    }
+    /// Stands still where it is and keeps what is left of its order.
+    fn halt(&mut self, now: SiteTime) {
+        self.settle(now);
+        match std::mem::replace(&mut self.phase, Phase::Still) {
+            Phase::Still => {}
+            Phase::Leg { leg, .. } => {
+                if let Some(block) = &mut self.block {
+                    block.after_mm -= leg.driven_mm(now);
+                }
+            }
+            Phase::Blocked { until, gives_up } => {
+                let longer = if gives_up { SiteDuration(1) } else { SiteDuration(0) };
+                self.block =
+                    Some(Block { after_mm: 0.0, lasts: SiteDuration(until.since(now).as_ms() + longer.as_ms()) });
+            }
+            Phase::Acting { until } => {
+                if let Some(Order::Act(act)) = &mut self.order {
+                    act.left = until.since(now);
+                }
+            }
+        }
+    }
+    /// Goes on with its order if nothing keeps it.
+    fn go(&mut self, now: SiteTime) {
+        let kept = self.paused || self.mode != Mode::Automatic || self.broken.is_some();
+        if kept || !matches!(self.phase, Phase::Still) {
+            return;
+        }
+        match &self.order {
+            None => {}
+            Some(Order::Act(act)) => self.phase = Phase::Acting { until: now + act.left },
+            Some(Order::Drive(_)) => self.begin_leg(now),
+        }
+    }
+    fn begin_leg(&mut self, now: SiteTime) {
+        let Some(point) = self.target().cloned() else { return };
+        self.charging = false;
+        self.parked = false;
+        let asked = point.speed_mm_s.min(self.config.speed_mm_s).min(SPEED_MAX_MM_S);
+        let asked = if self.slow { asked.min(SPEED_FLOOR_MM_S) } else { asked };
+        let leg = Leg::new(self.frame, (point.x_mm, point.y_mm), asked * self.config.pace_permille / 1000, now);
+        if self.lane.is_none() && leg.length_mm() >= 1.0 {
+            self.lane = self.last.clone().map(|last| (last, point.waypoint.clone()));
+            self.block = self.draw_block(leg.length_mm());
+        }
+        let from_touched_mm = self.touching.as_ref().and_then(|t| self.distance_mm(t)).unwrap_or(0.0);
+        let returns = self.touching.as_ref() == Some(&point.waypoint);
+        let contour_mm = CONTOUR_MM.min(leg.length_mm() / 2.0);
+        let out_mm = (self.touching.is_some() && !returns).then(|| (contour_mm - from_touched_mm).max(0.0));
+        let in_mm = (!returns).then(|| leg.length_mm() - contour_mm);
+        self.phase = Phase::Leg { leg, out_mm, in_mm };
+        self.occupy(now);
+    }
+    fn draw_block(&mut self, length_mm: f64) -> Option<Block> {
+        if let Some(lasts) = self.pending_block.take() {
+            return Some(Block { after_mm: length_mm / 2.0, lasts });
+        }
+        let chance = 1.0 - (-self.config.faults.obstacle_per_km * length_mm / 1e6).exp();
+        let meets = chance > 0.0 && self.rng.random_bool(chance);
+        meets.then(|| Block { after_mm: length_mm * self.rng.random::<f64>(), lasts: draw_secs(&mut self.rng, 2..=14) })
+    }
+    fn arrive(&mut self, now: SiteTime) {
+        self.phase = Phase::Still;
+        let Some(Order::Drive(path)) = &mut self.order else { return };
+        let Some(point) = path.pop_front() else { return };
+        let goes_on = !path.is_empty();
+        self.touching = Some(point.waypoint.clone());
+        self.last = Some(point.waypoint.clone());
+        self.lane = None;
+        self.block = None;
+        self.news.push_back(BodyNews::Reached(point.waypoint));
+        if goes_on {
+            self.begin_leg(now);
+        } else {
+            self.occupy(now);
+            self.drop_order(now);
+            self.news.push_back(BodyNews::Done);
+        }
+    }
+    fn distance_mm(&self, waypoint: &WaypointId) -> Option<f64> {
+        let at = self.site.waypoint(self.site.find(waypoint)?);
+        let there = Vector2::new(at.x_mm as f64, at.y_mm as f64) / 1000.0;
+        Some((self.frame.translation.vector - there).norm() * 1000.0)
+    }
+    /// Notes in the journal which places the contour entered and left by what it touches now.
+    fn occupy(&mut self, now: SiteTime) {
+        let site = &self.site;
+        let find = |name: &WaypointId| site.find(name);
+        let mut places = Vec::new();
+        match &self.lane {
+            Some((from, to)) => {
+                if let (Some(from), Some(to)) = (find(from), find(to)) {
+                    places.extend_from_slice(site.passages_of_lane(from, to));
+                }
+            }
+            None => places.extend(self.last.as_ref().and_then(find).into_iter().flat_map(|at| passages_at(site, at))),
+        }
+        places.extend(self.touching.as_ref().and_then(find).and_then(|at| site.standing_at(at)));
+        let inside: BTreeSet<PlaceId> = places.into_iter().map(|p| site.place(p).place_id.clone()).collect();
+        if inside != self.inside {
+            let mut world = lock(&self.world);
+            for left in self.inside.difference(&inside) {
+                world.leave(now, &self.config.robot_id, left.clone());
+            }
+            for entered in inside.difference(&self.inside) {
+                world.enter(now, &self.config.robot_id, entered.clone());
+            }
+            drop(world);
+            self.inside = inside;
+        }
+    }
+}
+
+/// The passages that a waypoint lies inside of.
+fn passages_at(site: &Site, at: WaypointIx) -> Vec<midshift_core::site::PlaceIx> {
+    let passages = site.places().iter().enumerate().take_while(|(_, p)| p.waypoint().is_none());
+    let around = passages.filter(|(_, p)| p.inside().is_some_and(|i| i.waypoints.binary_search(&at).is_ok()));
+    around.map(|(i, _)| midshift_core::site::PlaceIx(i as u32)).collect()
+}
