@@ -432,7 +432,7 @@ mod tests {
         let site = text::parse(DEMO).expect("reads");
         assert_eq!((site.waypoints().len(), site.stations().count(), site.chargers().count()), (56, 17, 5));
         let seats = [Kind::Station, Kind::Hold, Kind::Park].map(|k| site.standing_capacity(k));
-        assert_eq!(seats, [32, 31, 12]);
+        assert_eq!(seats, [49, 31, 12]);
         for name in ["A01", "B03", "D01", "L1-in", "P01", "Q01"] {
             assert!(site.can_handle(at(&site, name)), "{name}");
         }
@@ -453,7 +453,7 @@ mod tests {
                 count += 1;
             }
         }
-        assert!((24_000..28_000).contains(&(sum / count)), "mean way is {} mm", sum / count);
+        assert!((21_000..23_000).contains(&(sum / count)), "mean way is {} mm", sum / count);
     }
 
     #[test]
