@@ -88,6 +88,12 @@ impl SentHeartbeats {
     pub fn lease_from(&self) -> Option<LinkTime> {
         self.lease_from
     }
+    /// When `authority` ends for the robot; none if its anchor gives nothing.
+    pub fn ends(&self, authority: &Authority) -> Option<LinkTime> {
+        let (_, at) =
+            self.sent.iter().find(|(n, _)| *n == authority.hb && authority.session_epoch == self.session_epoch)?;
+        Some(*at + LinkDuration(authority.valid_ms))
+    }
     /// Whether `authority` still lets the robot act at `now`.
     pub fn check(&self, authority: &Authority, now: LinkTime) -> Result<(), Stale> {
         if authority.session_epoch != self.session_epoch {

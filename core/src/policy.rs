@@ -54,7 +54,10 @@ impl AreaPolicy {
         ];
         for (name, least, value) in order {
             if value < least || value > 1_000 {
-                violations.add(format!("{field}.{name}"), format!("must be {least}..1000 permille (mandatory <= preemptible <= opportunistic <= stop)"));
+                violations.add(
+                    format!("{field}.{name}"),
+                    format!("must be {least}..1000 permille (mandatory <= preemptible <= opportunistic <= stop)"),
+                );
             }
         }
     }

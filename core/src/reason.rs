@@ -237,7 +237,6 @@ pub struct Refusal {
     kind: Kind,
 }
 
-
 impl Refusal {
     /// A refusal of `kind` for `reason`.
     pub fn new(kind: Kind, reason: impl Into<Reason>) -> Self {

@@ -1,10 +1,271 @@
 //! The law of the fleet: who gets which task, who may enter which place, what a heartbeat repairs, and why not now.
 //!
-//! `Fleet::cycle` takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
-//! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair` are what happens; `tasks` moves tasks by
-//! the table; `screen` and `assign` give work; `errands`, `places`, `desired` bring robots where they belong; `explain` says why not.
+//! [`cycle`] takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
+//! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `commands` are what happens; `tasks` moves tasks by
+//! the table; `screen` and `assign` give work; `errands`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
+pub mod assign;
+pub mod commands;
+pub mod desired;
+pub mod errands;
+pub mod explain;
+pub mod inbox;
+pub mod places;
+pub mod repair;
+pub mod requests;
 pub mod rows;
+pub mod screen;
+pub mod tasks;
+pub mod timers;
 pub mod tx;
 pub mod view;
+pub mod way;
+
+use crate::ids::RobotId;
+use crate::reason::Code;
+use crate::rows::{Entry, Item, Log, Table};
+use crate::task::{Event, Phase, TaskRequest};
+use crate::time::Now;
+use crate::work::{InboxEntry, Live};
+use rows::{FleetMark, RobotAuthority, RobotControl, RobotHolder, ServiceClock, SiteRow};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use tx::Tx;
+use view::View;
+
+/// The newest heartbeat of every robot.
+pub type Board = BTreeMap<RobotId, Arc<Live>>;
+
+/// What was counted while rows were compared and events taken.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Tally {
+    /// Reports of an epoch that had passed, or of nothing that is known.
+    pub fenced: u64,
+    /// Messages that robots refused for their authority.
+    pub stale_authority: u64,
+    /// Differences between a heartbeat and the rows that were repaired.
+    pub repaired: u64,
+    /// Robots whose differences do not count yet.
+    pub pending: u64,
+    /// Robots that wait for a place.
+    pub waiting_for_place: u64,
+}
+
+/// What a cycle did and why the rest was not done.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Report {
+    /// Tasks offered.
+    pub offers: u64,
+    /// Errands offered.
+    pub errands: u64,
+    /// Waiting tasks by reason.
+    pub waiting: BTreeMap<Code, u64>,
+    /// Counts.
+    pub tally: Tally,
+    /// Rows or entries that could not be read; each was passed over and is logged.
+    pub unreadable: Vec<String>,
+}
+
+impl Report {
+    fn wait(&mut self, code: Code) {
+        *self.waiting.entry(code).or_default() += 1;
+    }
+}
+
+/// Items to commit, in order, and the report.
+#[derive(Debug, Default)]
+pub struct Plan {
+    /// Each atomic by itself; later ones expect the revisions that earlier ones write.
+    pub items: Vec<Item>,
+    /// What was done and why not.
+    pub report: Report,
+}
+
+impl Plan {
+    /// Makes one decision; nothing is added if it changed nothing.
+    pub fn decide(&mut self, view: &mut View, now: Now, actor: &str, decision: impl FnOnce(&mut Tx)) {
+        let mut tx = Tx::new(view, now, actor);
+        decision(&mut tx);
+        self.items.extend(tx.finish());
+    }
+}
+
+/// Logs that fleet reads.
+pub const LOGS: &[Log] = &[Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox];
+
+/// Takes entries of the feed, in commit order: rows into the view, requests and robots' events into decisions.
+pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
+    let consumed = view.marks.get("fleet").map_or(crate::rows::Seq(0), |m| m.row.seq);
+    for entry in entries {
+        if let Some(table) = entry.table {
+            let key = crate::rows::Key { table, id: entry.subject.clone() };
+            if let Err(error) = view.absorb(&key, entry.revision, tx::row_of(entry, table).as_ref()) {
+                plan.report.unreadable.push(error.to_string());
+            }
+        }
+        if entry.seq <= consumed {
+            continue;
+        }
+        match (entry.log, entry.table, &entry.body) {
+            (Log::RobotInbox, None, Some(body)) => match serde_json::from_str::<InboxEntry>(body) {
+                Ok(said) => {
+                    let mut tally = plan.report.tally;
+                    plan.decide(view, now, said.robot_id.as_str(), |tx| {
+                        inbox::take(tx, &said, &mut tally);
+                        mark(tx, entry.seq);
+                    });
+                    plan.report.tally = tally;
+                }
+                Err(error) => plan.report.unreadable.push(format!("inbox {}: {error}", entry.seq.0)),
+            },
+            (Log::Task, Some(Table::TaskRequest), Some(body)) => match serde_json::from_str::<TaskRequest>(body) {
+                Ok(request) => {
+                    let actor = request.actor.clone();
+                    let mut tx = Tx::new(view, now, &actor).on_request(entry.request_id.as_deref());
+                    requests::take(&mut tx, &request);
+                    mark(&mut tx, entry.seq);
+                    plan.items.extend(tx.finish());
+                }
+                Err(error) => plan.report.unreadable.push(format!("request {}: {error}", entry.seq.0)),
+            },
+            _ => {}
+        }
+    }
+}
+
+fn mark(tx: &mut Tx, seq: crate::rows::Seq) {
+    tx.put(FleetMark { seq }, "fleet.consumed");
+}
+
+/// Rows every start makes sure of: the site, its places, and serving time.
+pub fn found(view: &mut View, now: Now, site_text: &str, plan: &mut Plan) {
+    let site = view.site.clone();
+    plan.decide(view, now, "fleet", |tx| {
+        let row = SiteRow {
+            site_id: site.site_id().clone(),
+            map_version: site.map_version().to_owned(),
+            text: site_text.to_owned(),
+        };
+        if tx.view.sites.get(site.site_id().as_str()).is_none_or(|s| s.row != row) {
+            tx.put(row, "site.loaded");
+        }
+    });
+    for chunk in site.places().chunks(128) {
+        plan.decide(view, now, "fleet", |tx| {
+            for place in chunk {
+                if site_has(tx.view, place) {
+                    continue;
+                }
+                let known = tx.view.places.get(place.place_id.as_str()).map(|p| p.row.clone());
+                let fresh = places::fresh(place);
+                let row = known.map_or(fresh.clone(), |k| rows::Place {
+                    capacity: fresh.capacity,
+                    standing: fresh.standing,
+                    ..k
+                });
+                tx.put(row, "place.founded");
+            }
+        });
+    }
+    let all: Vec<RobotId> = view.sessions.values().map(|s| s.row.robot_id.clone()).collect();
+    view.dirty.extend(all.iter().cloned());
+    view.policy_dirty.extend(all);
+}
+
+fn site_has(view: &View, place: &crate::site::Place) -> bool {
+    let standing = place.waypoint().is_some();
+    view.places
+        .get(place.place_id.as_str())
+        .is_some_and(|p| p.row.capacity == place.capacity && p.row.standing == standing)
+}
+
+/// How much of a cycle is due.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pace {
+    /// Something happened: plan with what is known.
+    Wake,
+    /// The period is over: timers and every heartbeat too.
+    Sweep,
+}
+
+/// One cycle over a view that has absorbed the whole feed. Items of earlier decisions of the cycle are already in `plan`.
+pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Plan) {
+    welcome(view, now, board, plan);
+    if pace == Pace::Sweep {
+        sweep(view, now, board, plan);
+    }
+    assign::plan(view, board, now, plan);
+    errands::plan(view, board, now, plan);
+    write_down(view, now, board, &places::Releases::default(), plan);
+    let releases = places::advance(view, board, now, plan);
+    write_down(view, now, board, &releases, plan);
+    if !plan.items.is_empty() {
+        tell_time(view, now, plan);
+    }
+    view.forget_ended();
+}
+
+/// Robots that are new get their rows.
+fn welcome(view: &mut View, now: Now, board: &Board, plan: &mut Plan) {
+    let new: Vec<RobotId> = board
+        .keys()
+        .filter(|r| view.sessions.contains_key(r.as_str()) && !view.authority.contains_key(r.as_str()))
+        .cloned()
+        .collect();
+    for robot_id in new {
+        plan.decide(view, now, "fleet", |tx| {
+            tx.put(RobotAuthority { robot_id: robot_id.clone(), holder: RobotHolder::None }, "robot.known");
+            if !tx.view.control.contains_key(robot_id.as_str()) {
+                tx.put(RobotControl::new(robot_id.clone()), "robot.known");
+            }
+            desired::compose_policy(tx, &robot_id);
+        });
+        view.dirty.insert(robot_id);
+    }
+}
+
+fn sweep(view: &mut View, now: Now, board: &Board, plan: &mut Plan) {
+    let (timers, late) = timers::due(view, &now);
+    for timer in timers {
+        plan.decide(view, now, "fleet", |tx| timers::fire(tx, &timer, board));
+    }
+    for task_id in late {
+        plan.decide(view, now, "fleet", |tx| timers::deadline(tx, &task_id));
+    }
+    let robots: Vec<RobotId> = view.authority.values().map(|a| a.row.robot_id.clone()).collect();
+    let mut tally = plan.report.tally;
+    for robot_id in robots {
+        plan.decide(view, now, "fleet", |tx| repair::robot(tx, &robot_id, board, &mut tally));
+    }
+    plan.report.tally = tally;
+    let suspended: Vec<_> =
+        view.tasks.values().filter(|t| t.row.phase == Phase::Suspended).map(|t| t.row.task_id.clone()).collect();
+    for task_id in suspended {
+        plan.decide(view, now, "fleet", |tx| {
+            tasks::happen(tx, &task_id, tasks::News::of(Event::RetryDue, None));
+        });
+    }
+    let worn = desired::wearing(view, board);
+    view.dirty.extend(worn);
+}
+
+/// Composes the desired state of every robot that something changed for.
+fn write_down(view: &mut View, now: Now, board: &Board, releases: &places::Releases, plan: &mut Plan) {
+    for robot_id in std::mem::take(&mut view.dirty) {
+        plan.decide(view, now, "fleet", |tx| desired::compose(tx, &robot_id, board, releases));
+    }
+    view.dirty.clear();
+    for robot_id in std::mem::take(&mut view.policy_dirty) {
+        plan.decide(view, now, "fleet", |tx| desired::compose_policy(tx, &robot_id));
+    }
+}
+
+/// Writes serving time with the items of this cycle, at most once a second.
+fn tell_time(view: &mut View, now: Now, plan: &mut Plan) {
+    let served = view.serving(&now);
+    let written = view.clocks.get("fleet").map(|c| c.row).unwrap_or_default();
+    if served.link_ms >= written.link_ms + 1_000 || written == ServiceClock::default() {
+        plan.decide(view, now, "fleet", |tx| tx.put(served, "fleet.served"));
+    }
+}

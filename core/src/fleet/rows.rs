@@ -1,6 +1,5 @@
 //! Rows that fleet alone writes, apart from tasks and attempts: places, the robot's mutex, control, timers, holds, counters, marks.
 
-use crate::authority::Authority;
 use crate::ids::{AreaId, AttemptId, PlaceId, RobotId, SiteId, TaskId};
 use crate::reason::Reason;
 use crate::robot::Duty;
@@ -31,8 +30,6 @@ pub struct PlaceHolder {
     pub grant_id: u64,
     /// How far.
     pub state: HolderState,
-    /// Anchor of the permission to enter.
-    pub entry: Option<Authority>,
     /// UTC, site clock.
     pub since: Utc,
 }

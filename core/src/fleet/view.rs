@@ -3,7 +3,9 @@
 //! Called by every room of `fleet`. Invariant: a row here is at the revision it has in the store, or one that an item of the
 //! running cycle will write; after a conflict the whole view is built again, never patched.
 
-use super::rows::{FleetMark, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotCounter, ServiceClock, SiteRow, Timer};
+use super::rows::{
+    FleetMark, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotCounter, ServiceClock, SiteRow, Timer,
+};
 use crate::ids::{AttemptId, RobotId, TaskId};
 use crate::policy::AreaPolicy;
 use crate::rows::{BadRow, Key, Record, Revision, Row, Table};
@@ -74,6 +76,8 @@ pub struct View {
     pub held_places: BTreeMap<RobotId, BTreeSet<String>>,
     /// Robots whose desired work must be composed again in this cycle.
     pub dirty: BTreeSet<RobotId>,
+    /// Robots whose rules of areas must be composed again in this cycle.
+    pub policy_dirty: BTreeSet<RobotId>,
     /// Reading of the clocks when this view was first built.
     pub started: Now,
     /// Serving time at that moment.
@@ -81,7 +85,7 @@ pub struct View {
     /// Since when a robot waits for a place it cannot have, site clock. Volatile.
     pub waits: BTreeMap<RobotId, super::places::Waiting>,
     /// Distances and routes, remembered.
-    pub router: crate::site::Router,
+    pub router: crate::site::route::Router,
 }
 
 /// A record that fleet's picture keeps.
@@ -179,7 +183,8 @@ impl Viewed for Place {
                 places.remove(id);
             }
         }
-        let now: Vec<RobotId> = view.places.get(id).into_iter().flat_map(|p| &p.row.holders).map(|h| h.robot_id.clone()).collect();
+        let now: Vec<RobotId> =
+            view.places.get(id).into_iter().flat_map(|p| &p.row.holders).map(|h| h.robot_id.clone()).collect();
         for robot in now {
             view.held_places.entry(robot.clone()).or_default().insert(id.to_owned());
             view.dirty.insert(robot);
@@ -214,7 +219,7 @@ impl View {
     /// An empty picture of `site`.
     pub fn new(site: Arc<Site>, started: Now) -> Self {
         Self {
-            router: crate::site::Router::new(site.clone()),
+            router: crate::site::route::Router::new(site.clone()),
             site,
             intakes: Slot::new(),
             tasks: Slot::new(),
@@ -238,6 +243,7 @@ impl View {
             lane_marks: Slot::new(),
             held_places: BTreeMap::new(),
             dirty: BTreeSet::new(),
+            policy_dirty: BTreeSet::new(),
             started,
             served: ServiceClock::default(),
             waits: BTreeMap::new(),
@@ -296,9 +302,7 @@ impl View {
     /// A row that this picture has let go on purpose: of an ended task, or an attempt that no task names any more.
     fn is_past(&self, key: &Key) -> bool {
         match key.table {
-            Table::TaskIntake | Table::TaskState => {
-                TaskId::parse(&key.id).is_ok_and(|id| self.ended.contains_key(&id))
-            }
+            Table::TaskIntake | Table::TaskState => TaskId::parse(&key.id).is_ok_and(|id| self.ended.contains_key(&id)),
             _ => false,
         }
     }
@@ -318,9 +322,11 @@ impl View {
             let holds = authority
                 .get(a.robot_id.as_str())
                 .is_some_and(|r| matches!(&r.row.holder, super::rows::RobotHolder::Attempt(id) if *id == a.attempt));
-            let newest = a.attempt.subject.task_id().is_some_and(|t| {
-                tasks.get(t.as_str()).is_some_and(|t| t.row.epoch == a.attempt.epoch)
-            });
+            let newest = a
+                .attempt
+                .subject
+                .task_id()
+                .is_some_and(|t| tasks.get(t.as_str()).is_some_and(|t| t.row.epoch == a.attempt.epoch));
             holds || newest || !a.phase.is_terminal()
         });
     }
@@ -361,4 +367,17 @@ impl View {
     pub fn policy(&self, area: &crate::ids::AreaId) -> AreaPolicy {
         self.policies.get(area.as_str()).map_or_else(|| AreaPolicy::default_of(area.clone()), |p| p.row.clone())
     }
+}
+
+/// Places that a robot holds, with its entry in each.
+pub fn held<'a>(
+    view: &'a View,
+    robot_id: &RobotId,
+) -> impl Iterator<Item = (&'a super::rows::Place, &'a super::rows::PlaceHolder)> {
+    let robot_id = robot_id.clone();
+    let ids = view.held_places.get(&robot_id).into_iter().flatten();
+    ids.filter_map(move |id| {
+        let place = &view.places.get(id)?.row;
+        Some((place, place.holder(&robot_id)?))
+    })
 }

@@ -34,7 +34,10 @@ impl Transport {
             params.insert("item".to_owned(), Value::from(self.item_sku.as_str()));
         }
         let goto = |name: &str| RawStep { kind: Some(RawStepKind::Goto(name.to_owned())), ..RawStep::default() };
-        let act = |name: &str| RawStep { kind: Some(RawStepKind::Action(name.to_owned(), params.clone())), ..RawStep::default() };
+        let act = |name: &str| RawStep {
+            kind: Some(RawStepKind::Action(name.to_owned(), params.clone())),
+            ..RawStep::default()
+        };
         let steps = if self.from_waypoint.is_empty() {
             vec![goto(&self.to_waypoint)]
         } else {

@@ -399,7 +399,12 @@ fn stopping(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
         Event::CancelForce => go(Phase::Canceled, Fate::Abandon),
         Event::StopConfirmTimeout => go(Phase::NeedsOperator, Fate::Abandon),
         Event::LeaseOver | Event::StepUnknown => Some(Next { fate: Fate::Uncertain, ..stay(at)? }),
-        Event::Accepted | Event::Progress | Event::SeenRunning | Event::Hold | Event::LastHoldGone | Event::Deadline => stay(at),
+        Event::Accepted
+        | Event::Progress
+        | Event::SeenRunning
+        | Event::Hold
+        | Event::LastHoldGone
+        | Event::Deadline => stay(at),
         _ => None,
     }
 }
@@ -415,7 +420,9 @@ fn uncertain(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
             (None, false) => known(Phase::Running),
         },
         Event::Succeeded => go(Phase::Succeeded, Fate::End),
-        Event::FailedRecoverable => go(at.then.map_or_else(|| after_recoverable(facts), |t| after_stop(t, facts)), Fate::End),
+        Event::FailedRecoverable => {
+            go(at.then.map_or_else(|| after_recoverable(facts), |t| after_stop(t, facts)), Fate::End)
+        }
         Event::FailedFinal => go(after_final(facts), Fate::End),
         Event::Refused => go(at.then.map_or(Phase::Queued, |t| after_stop(t, facts)), Fate::End),
         Event::StopConfirmed => match at.then {

@@ -12,4 +12,4 @@ pub mod state;
 pub use machine::{Event, Phase, Then};
 pub use raw::RawTask;
 pub use spec::TaskSpec;
-pub use state::{Attempt, AttemptPhase, Ask, Resolution, TaskIntake, TaskRequest, TaskState};
+pub use state::{Ask, Attempt, AttemptPhase, Resolution, TaskIntake, TaskRequest, TaskState};

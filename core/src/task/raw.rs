@@ -105,7 +105,8 @@ pub struct RawRetry {
 }
 
 fn name_ok(text: &str) -> bool {
-    (1..=64).contains(&text.len()) && text.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || matches!(c, '-' | '_'))
+    (1..=64).contains(&text.len())
+        && text.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || matches!(c, '-' | '_'))
 }
 
 fn version_ok(text: &str) -> bool {
@@ -147,7 +148,11 @@ impl RawTask {
         if self.speed_limit_mm_s.is_some_and(|v| !(50..=5_000).contains(&v)) {
             bad.add(format!("{field}.speed_limit_mm_s"), "must be 50..5000 mm/s");
         }
-        for (name, text) in [("requester", &self.requester), ("external_ref", &self.external_ref), ("trace_context", &self.trace_context)] {
+        for (name, text) in [
+            ("requester", &self.requester),
+            ("external_ref", &self.external_ref),
+            ("trace_context", &self.trace_context),
+        ] {
             if text.len() > 128 {
                 bad.add(format!("{field}.{name}"), "must be at most 128 bytes");
             }
@@ -160,7 +165,9 @@ impl RawTask {
             selector,
             steps,
             timeout_ms,
-            schedule_to_start_ms: self.schedule_to_start_ms.map_or(limits::SCHEDULE_TO_START_DEFAULT.as_ms(), |v| v as u64),
+            schedule_to_start_ms: self
+                .schedule_to_start_ms
+                .map_or(limits::SCHEDULE_TO_START_DEFAULT.as_ms(), |v| v as u64),
             stall_ms: self.stall_ms.map_or(limits::STALL_DEFAULT.as_ms(), |v| v as u64),
             not_before: self.not_before,
             deadline: self.deadline,
@@ -182,7 +189,9 @@ impl RawTask {
             Some(v) if !in_range(v) => bad.add(format!("{field}.timeout"), "must be 1 s .. 24 h"),
             Some(_) => {}
         }
-        for (name, value) in [("schedule_to_start_timeout", self.schedule_to_start_ms), ("stall_timeout", self.stall_ms)] {
+        for (name, value) in
+            [("schedule_to_start_timeout", self.schedule_to_start_ms), ("stall_timeout", self.stall_ms)]
+        {
             if value.is_some_and(|v| !in_range(v)) {
                 bad.add(format!("{field}.{name}"), "must be 1 s .. 24 h");
             }
@@ -246,11 +255,19 @@ fn check_labels(labels: &BTreeMap<String, String>, field: &str, bad: &mut Violat
     }
 }
 
-fn check_steps(raw: &[RawStep], field: &str, knows: &dyn Fn(&WaypointId) -> bool, bad: &mut Violations) -> Vec<WorkStep> {
+fn check_steps(
+    raw: &[RawStep],
+    field: &str,
+    knows: &dyn Fn(&WaypointId) -> bool,
+    bad: &mut Violations,
+) -> Vec<WorkStep> {
     if !(1..=limits::STEPS_MAX).contains(&raw.len()) {
         bad.add(format!("{field}.steps"), "must be 1..64 steps");
     }
-    raw.iter().enumerate().filter_map(|(i, step)| check_step(step, &format!("{field}.steps[{i}]"), knows, bad)).collect()
+    raw.iter()
+        .enumerate()
+        .filter_map(|(i, step)| check_step(step, &format!("{field}.steps[{i}]"), knows, bad))
+        .collect()
 }
 
 fn check_step(step: &RawStep, at: &str, knows: &dyn Fn(&WaypointId) -> bool, bad: &mut Violations) -> Option<WorkStep> {
@@ -282,7 +299,8 @@ fn check_step(step: &RawStep, at: &str, knows: &dyn Fn(&WaypointId) -> bool, bad
             if serde_json::to_string(params).map_or(usize::MAX, |s| s.len()) > limits::PARAMS_BYTES_MAX {
                 bad.add(format!("{at}.action.params"), "must be at most 8 KiB");
             }
-            let effect = if matches!(name.as_str(), "pick" | "place") { Effect::AtMostOnce } else { Effect::CheckFirst };
+            let effect =
+                if matches!(name.as_str(), "pick" | "place") { Effect::AtMostOnce } else { Effect::CheckFirst };
             (StepKind::Action { name: name.clone(), params: params.clone() }, effect)
         }
         Some(RawStepKind::Wait(ms)) => {
@@ -365,7 +383,10 @@ mod tests {
             priority: Some(10),
             timeout_ms: None,
             coalesce_key: "k".into(),
-            steps: vec![RawStep::default(), RawStep { kind: Some(RawStepKind::Goto("nowhere".into())), effect: Some(None), ..RawStep::default() }],
+            steps: vec![
+                RawStep::default(),
+                RawStep { kind: Some(RawStepKind::Goto("nowhere".into())), effect: Some(None), ..RawStep::default() },
+            ],
             retry: Some(RawRetry { max_retry_times: 101, jitter: Some(2.0), ..RawRetry::default() }),
             ..RawTask::default()
         };
@@ -374,8 +395,15 @@ mod tests {
         assert_eq!(
             fields,
             [
-                "spec.type", "spec.priority", "spec.timeout", "spec.steps[0]", "spec.steps[1].effect", "spec.steps[1].goto.waypoint",
-                "spec.retry.max_retry_times", "spec.retry.jitter", "spec.coalesce_key"
+                "spec.type",
+                "spec.priority",
+                "spec.timeout",
+                "spec.steps[0]",
+                "spec.steps[1].effect",
+                "spec.steps[1].goto.waypoint",
+                "spec.retry.max_retry_times",
+                "spec.retry.jitter",
+                "spec.coalesce_key"
             ]
         );
     }

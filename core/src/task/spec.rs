@@ -80,7 +80,14 @@ pub struct Retry {
 
 impl Default for Retry {
     fn default() -> Self {
-        Self { max_retry_times: 0, interval_ms: 5_000, factor: 2.0, max_interval_ms: 300_000, jitter: 0.2, exclude_failed_robot: false }
+        Self {
+            max_retry_times: 0,
+            interval_ms: 5_000,
+            factor: 2.0,
+            max_interval_ms: 300_000,
+            jitter: 0.2,
+            exclude_failed_robot: false,
+        }
     }
 }
 

@@ -3,7 +3,7 @@
 use super::machine::{Phase, Then};
 use super::spec::TaskSpec;
 use crate::authority::Authority;
-use crate::ids::{AttemptId, RobotId, Subject, TaskId};
+use crate::ids::{AttemptId, RobotId, Subject, TaskId, WaypointId};
 use crate::reason::Reason;
 use crate::robot::Fault;
 use crate::rows::{Index, Record, Table};
@@ -173,9 +173,24 @@ impl AttemptPhase {
     }
     /// Where a live attempt may go. LOST may still turn into the truth (a late report) while no newer epoch was granted.
     pub const fn transitions(self) -> &'static [AttemptPhase] {
-        use AttemptPhase::{Aborted, Accepted, Executing, Failed, Lost, Navigating, OfferExpired, Offered, Paused, Refused, Stopping, Succeeded};
+        use AttemptPhase::{
+            Aborted, Accepted, Executing, Failed, Lost, Navigating, OfferExpired, Offered, Paused, Refused, Stopping,
+            Succeeded,
+        };
         match self {
-            Offered => &[Accepted, Navigating, Executing, Paused, Refused, OfferExpired, Stopping, Succeeded, Failed, Aborted, Lost],
+            Offered => &[
+                Accepted,
+                Navigating,
+                Executing,
+                Paused,
+                Refused,
+                OfferExpired,
+                Stopping,
+                Succeeded,
+                Failed,
+                Aborted,
+                Lost,
+            ],
             Accepted => &[Navigating, Executing, Paused, Stopping, Succeeded, Failed, Aborted, Lost],
             Navigating => &[Executing, Paused, Stopping, Succeeded, Failed, Aborted, Lost],
             Executing => &[Navigating, Paused, Stopping, Succeeded, Failed, Aborted, Lost],
@@ -215,6 +230,8 @@ pub struct Attempt {
     pub robot_id: RobotId,
     /// What kind of errand; none for a task.
     pub errand: Option<Errand>,
+    /// Where an errand goes; none for a task, whose steps say it.
+    pub goal: Option<WaypointId>,
     /// Where it is.
     pub phase: AttemptPhase,
     /// None: known.

@@ -1,0 +1,117 @@
+//! What people ask of fleet directly: cordon and uncordon, rules of an area, clearing a place. Each is one item, answered after its commit.
+
+use super::rows::{Cordon, HolderState, Place, RobotControl};
+use super::tx::Tx;
+use super::view::View;
+use super::{Board, repair};
+use crate::ids::{PlaceId, RobotId};
+use crate::policy::AreaPolicy;
+use crate::reason::{Code, Kind, Reason, Refusal, Violations};
+use crate::robot::Presence;
+use crate::rows::Revision;
+
+/// One request.
+#[derive(Clone, Debug)]
+pub enum Command {
+    /// No new work; what it does now, it finishes.
+    Cordon {
+        /// Whom.
+        robot_id: RobotId,
+        /// Why.
+        reason: String,
+    },
+    /// Back to work; also resets the breaker.
+    Uncordon {
+        /// Whom.
+        robot_id: RobotId,
+    },
+    /// New rules of an area, pushed to every robot.
+    PutPolicy(AreaPolicy),
+    /// A person has looked: nobody and nothing is inside.
+    ClearPlace {
+        /// Which.
+        place_id: PlaceId,
+        /// What the person saw.
+        reason: String,
+    },
+}
+
+/// Checks a command against what is known; an error changes nothing.
+pub fn check(
+    view: &View,
+    board: &Board,
+    now: &crate::time::Now,
+    command: &Command,
+    seen: Option<Revision>,
+) -> Result<(), Refusal> {
+    let current = match command {
+        Command::Cordon { robot_id, .. } | Command::Uncordon { robot_id } => {
+            if !view.sessions.contains_key(robot_id.as_str()) {
+                return Err(Refusal::new(Kind::NotFound, Reason::from(Code::RobotNotFound).with("robot_id", robot_id)));
+            }
+            view.control.get(robot_id.as_str()).map_or(Revision(0), |c| c.revision)
+        }
+        Command::PutPolicy(policy) => {
+            if view.site.find_area(&policy.area_id).is_none() {
+                return Err(Refusal::new(
+                    Kind::NotFound,
+                    Reason::from(Code::AreaNotFound).with("area_id", &policy.area_id),
+                ));
+            }
+            let mut bad = Violations::default();
+            policy.check("policy", &mut bad);
+            bad.finish()?;
+            view.policies.get(policy.area_id.as_str()).map_or(Revision(0), |p| p.revision)
+        }
+        Command::ClearPlace { place_id, .. } => {
+            let Some(row) = view.places.get(place_id.as_str()) else {
+                return Err(Refusal::new(Kind::NotFound, Reason::from(Code::PlaceNotFound).with("place_id", place_id)));
+            };
+            let heard = |r: &RobotId| repair::presence(board, r, now) == Presence::Online;
+            if let Some(h) = row.row.holders.iter().find(|h| h.state == HolderState::Inside && heard(&h.robot_id)) {
+                return Err(Refusal::new(
+                    Kind::Precondition,
+                    Reason::from(Code::PlaceNotClear).with("robot_id", &h.robot_id),
+                ));
+            }
+            row.revision
+        }
+    };
+    match seen {
+        Some(seen) if seen != current => {
+            Err(Refusal::new(Kind::Conflict, Reason::from(Code::EtagMismatch).with("etag", current.0)))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Carries out a command that passed its check.
+pub fn apply(tx: &mut Tx, command: &Command, actor: &str) {
+    match command {
+        Command::Cordon { robot_id, reason } => {
+            let mut control = control(tx, robot_id);
+            control.cordon = Some(Cordon { reason: reason.clone(), actor: actor.to_owned(), since: tx.now.utc });
+            tx.put(control, "robot.cordoned");
+        }
+        Command::Uncordon { robot_id } => {
+            let mut control = control(tx, robot_id);
+            control.cordon = None;
+            control.breaker = None;
+            control.failures.clear();
+            tx.put(control, "robot.uncordoned");
+        }
+        Command::PutPolicy(policy) => {
+            tx.put(policy.clone(), "area.policy_put");
+            let robots: Vec<RobotId> = tx.view.sessions.values().map(|s| s.row.robot_id.clone()).collect();
+            tx.view.policy_dirty.extend(robots);
+        }
+        Command::ClearPlace { place_id, .. } => {
+            let Some(place) = tx.view.places.get(place_id.as_str()).map(|p| p.row.clone()) else { return };
+            tx.put(Place { holders: Vec::new(), quarantine: None, ..place }, "place.cleared");
+        }
+    }
+}
+
+fn control(tx: &Tx, robot_id: &RobotId) -> RobotControl {
+    tx.view.control.get(robot_id.as_str()).map_or_else(|| RobotControl::new(robot_id.clone()), |c| c.row.clone())
+}

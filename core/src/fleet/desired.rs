@@ -1,0 +1,211 @@
+//! Composes what each robot should have now and writes it if it differs: desired state is level-triggered, "sent or not" is never stored.
+//!
+//! Invariant: generations only rise. An offer is anchored once and never again; an unentered grant or a resume that should still stand is
+//! anchored anew to the newest heartbeat.
+
+use super::places::Releases;
+use super::rows::HolderState;
+use super::tx::Tx;
+use super::view::{View, held};
+use super::{Board, errands, way};
+use crate::authority::Authority;
+use crate::ids::{AttemptId, RobotId};
+use crate::limits;
+use crate::task::{Attempt, AttemptPhase, Then};
+use crate::time::{LinkDuration, Now};
+use crate::work::{Assignment, DesiredPolicy, DesiredWork, GrantedPlace, Live, WorkState};
+
+/// The generation that the next write of a robot's work will have.
+pub fn next_generation(view: &View, robot_id: &RobotId, now: &Now) -> u64 {
+    let last = view.desired_work.get(robot_id.as_str()).map_or(0, |d| d.row.generation);
+    (last + 1).max(now.wall.0.max(0) as u64)
+}
+
+/// Permission anchored to the newest heartbeat of the robot's current session; none if it is not heard.
+pub fn anchor(view: &View, robot_id: &RobotId, board: &Board, valid: LinkDuration) -> Option<Authority> {
+    let live = board.get(robot_id)?;
+    let session = view.sessions.get(robot_id.as_str())?;
+    let current = session.row.session_epoch == live.report.session_epoch && !live.observed;
+    current.then(|| Authority { session_epoch: live.report.session_epoch, hb: live.report.hb, valid_ms: valid.as_ms() })
+}
+
+/// Less than half of its life is left, or it belongs to another session.
+fn is_worn(authority: &Authority, live: Option<&Live>) -> bool {
+    let Some(live) = live else { return false };
+    let age_ms = live.report.hb.saturating_sub(authority.hb) * limits::HEARTBEAT.as_ms();
+    authority.session_epoch != live.report.session_epoch || age_ms * 2 >= authority.valid_ms
+}
+
+/// Writes what `robot_id` should have, if it differs from what stands.
+pub fn compose(tx: &mut Tx, robot_id: &RobotId, board: &Board, releases: &Releases) {
+    let Some(session) = tx.view.sessions.get(robot_id.as_str()).map(|s| s.row.clone()) else { return };
+    let stands = tx.view.desired_work.get(robot_id.as_str()).map(|d| d.row.clone());
+    let old = stands.clone().unwrap_or_else(|| empty(robot_id));
+    let live = board.get(robot_id).map(|l| &**l);
+    let attempt = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned();
+    let live_attempt = attempt.filter(|a| !a.phase.is_terminal());
+    let is_held =
+        tx.view.robot_holds(robot_id).next().is_some() || live_attempt.as_ref().is_some_and(|a| task_held(tx.view, a));
+    let new = DesiredWork {
+        robot_id: robot_id.clone(),
+        generation: old.generation,
+        assignment: live_attempt.as_ref().and_then(|a| assign(tx.view, a, old.assignment.as_ref(), live, releases)),
+        grants: grants(tx.view, robot_id, &old, board),
+        held: is_held,
+        resume: resume(tx.view, robot_id, &old, is_held, board),
+        closed: closed(&old, live, live_attempt.as_ref().map(|a| &a.attempt)),
+    };
+    let behind = session.applied_work > old.generation;
+    if stands.is_some() && new == old && !behind {
+        return;
+    }
+    let generation = next_generation(tx.view, robot_id, &tx.now).max(session.applied_work + 1);
+    tx.put(DesiredWork { generation, ..new }, "work.desired");
+    if behind {
+        let reason = crate::reason::Reason::from(crate::reason::Code::StoreBehindRobot)
+            .with("applied_work", session.applied_work);
+        super::tasks::open_incident(tx, reason, Some(robot_id), None);
+    }
+}
+
+/// A robot nobody has asked anything of.
+pub fn empty(robot_id: &RobotId) -> DesiredWork {
+    DesiredWork {
+        robot_id: robot_id.clone(),
+        generation: 0,
+        assignment: None,
+        grants: Vec::new(),
+        held: false,
+        resume: None,
+        closed: Vec::new(),
+    }
+}
+
+fn task_held(view: &View, a: &Attempt) -> bool {
+    a.attempt.subject.task_id().and_then(|t| view.task(t)).is_some_and(|t| !t.holds.is_empty())
+}
+
+fn assign(
+    view: &View,
+    a: &Attempt,
+    old: Option<&Assignment>,
+    live: Option<&Live>,
+    releases: &Releases,
+) -> Option<Assignment> {
+    let then = a.attempt.subject.task_id().and_then(|t| view.task(t)).and_then(|t| t.then);
+    let stopping = a.phase == AttemptPhase::Stopping || then.is_some();
+    let mut work = match old.filter(|o| o.attempt == a.attempt) {
+        Some(old) => old.clone(),
+        None => begin(view, a, live)?,
+    };
+    work.suspend = stopping && then == Some(Then::Suspended);
+    work.stop = stopping && !work.suspend;
+    if let Some(release) = releases.0.get(&a.robot_id) {
+        if let Some(route) = &release.route {
+            work.route = route.clone();
+            work.route_number += 1;
+        }
+        work.released_index = Some(release.released_index);
+    }
+    Some(work)
+}
+
+/// A new attempt, with the whole way through all its goals from where the robot is.
+fn begin(view: &View, a: &Attempt, live: Option<&Live>) -> Option<Assignment> {
+    let here = way::find(view, live.and_then(|l| l.report.vitals.waypoint.as_ref()));
+    let (steps, timeout_ms, resume_step, speed) = match a.attempt.subject.task_id() {
+        Some(task_id) => {
+            let spec = &view.intake(task_id)?.spec;
+            (spec.steps.clone(), spec.timeout_ms, view.task(task_id)?.next_step, spec.speed_limit_mm_s)
+        }
+        None => (errands::steps(view, a), errands::TIMEOUT.as_ms(), 0, None),
+    };
+    let from_step = way::from_step(&steps, resume_step);
+    let goals = way::goals(&view.site, &steps, from_step)?;
+    let route = match here {
+        Some(here) => way::route(view, here, None, &goals)?,
+        None => return None,
+    };
+    Some(Assignment {
+        attempt: a.attempt.clone(),
+        offer: a.offer,
+        timeout_ms: timeout_ms - timeout_ms * limits::AGENT_TIMEOUT_EARLIER_PERMILLE / 1000,
+        steps,
+        from_step,
+        resume_step: resume_step.max(from_step),
+        route_number: 1,
+        route,
+        released_index: Some(0),
+        stop: false,
+        suspend: false,
+        speed_limit_mm_s: speed,
+    })
+}
+
+fn grants(view: &View, robot_id: &RobotId, old: &DesiredWork, board: &Board) -> Vec<GrantedPlace> {
+    let live = board.get(robot_id).map(|l| &**l);
+    let listed = held(view, robot_id).filter(|(_, h)| h.state != HolderState::Revoking);
+    listed
+        .map(|(place, holder)| {
+            let known = old.grants.iter().find(|g| g.place_id == place.place_id && g.grant_id == holder.grant_id);
+            let known = known.and_then(|g| g.entry).filter(|e| !is_worn(e, live));
+            let entry = match holder.state {
+                HolderState::Inside | HolderState::Revoking => None,
+                HolderState::Granted => known
+                    .or_else(|| anchor(view, robot_id, board, limits::PLACE_ENTRY_VALID))
+                    .or(Some(Authority { session_epoch: 0, hb: 0, valid_ms: 0 })),
+            };
+            GrantedPlace { place_id: place.place_id.clone(), grant_id: holder.grant_id, entry }
+        })
+        .collect()
+}
+
+fn resume(view: &View, robot_id: &RobotId, old: &DesiredWork, is_held: bool, board: &Board) -> Option<Authority> {
+    if is_held {
+        return None;
+    }
+    let live = board.get(robot_id);
+    let paused = live.is_some_and(|l| l.report.attempts.iter().any(|a| a.state == WorkState::Paused));
+    match old.resume {
+        None if old.held => anchor(view, robot_id, board, limits::RESUME_VALID),
+        Some(known) if paused && is_worn(&known, live.map(|l| &**l)) => {
+            anchor(view, robot_id, board, limits::RESUME_VALID).or(Some(known))
+        }
+        known => known,
+    }
+}
+
+fn closed(old: &DesiredWork, live: Option<&Live>, current: Option<&AttemptId>) -> Vec<AttemptId> {
+    let Some(live) = live else { return old.closed.clone() };
+    let over = live.report.attempts.iter().filter(|r| r.state.is_over() || r.state == WorkState::StepUnknown);
+    let mut closed: Vec<AttemptId> = over.map(|r| r.attempt.clone()).filter(|id| Some(id) != current).collect();
+    closed.sort();
+    closed
+}
+
+/// Robots whose permissions wear out while they stand unused.
+pub fn wearing(view: &View, board: &Board) -> Vec<RobotId> {
+    let worn = |d: &DesiredWork| {
+        let live = board.get(&d.robot_id).map(|l| &**l);
+        let entries = d.grants.iter().filter_map(|g| g.entry.as_ref()).chain(d.resume.as_ref());
+        entries.into_iter().any(|a| is_worn(a, live))
+    };
+    view.desired_work.values().filter(|d| worn(&d.row)).map(|d| d.row.robot_id.clone()).collect()
+}
+
+/// Writes the rules of all areas for a robot, if they differ from what stands.
+pub fn compose_policy(tx: &mut Tx, robot_id: &RobotId) {
+    let areas: Vec<_> = tx
+        .view
+        .site
+        .areas()
+        .iter()
+        .map(|a| tx.view.policies.get(a.area_id.as_str()).map_or_else(|| a.policy(), |p| p.row.clone()))
+        .collect();
+    let old = tx.view.desired_policy.get(robot_id.as_str()).map(|d| d.row.clone());
+    if old.as_ref().is_some_and(|o| o.areas == areas) {
+        return;
+    }
+    let generation = (old.map_or(0, |o| o.generation) + 1).max(tx.now.wall.0.max(0) as u64);
+    tx.put(DesiredPolicy { robot_id: robot_id.clone(), generation, areas }, "policy.desired");
+}

@@ -1,0 +1,207 @@
+//! Fleet's own wishes of idle robots: charge, and park, since an idle robot left in a station would block it for ever.
+//!
+//! An errand is an attempt with no task row and a single epoch; its number is never used again. Its end has no consequence but a free robot.
+
+use super::rows::{RobotControl, Timer, TimerKind};
+use super::tasks::{arm, disarm, end_attempt};
+use super::tx::Tx;
+use super::view::View;
+use super::{Board, Plan, assign, desired, screen, way};
+use crate::ids::{AttemptId, RobotId, Subject};
+use crate::limits;
+use crate::reason::Reason;
+use crate::site::{Kind, WaypointIx};
+use crate::task::state::{Errand, Uncertain};
+use crate::task::{Attempt, AttemptPhase};
+use crate::time::{Now, SiteDuration};
+use crate::work::{AttemptReport, Effect, StepKind, WorkState, WorkStep};
+
+/// Longest errand; a charge ends long before. Site clock.
+pub const TIMEOUT: SiteDuration = SiteDuration::from_secs(4 * 3600);
+
+/// Steps of an errand: drive to its goal, then charge or park.
+pub fn steps(view: &View, a: &Attempt) -> Vec<WorkStep> {
+    let Some(goal) = &a.goal else { return Vec::new() };
+    let mut params = serde_json::Map::new();
+    let name = match a.errand {
+        Some(Errand::Charge) => {
+            let area = view.site.find(goal).map(|at| view.site.area_of(at).area_id.clone());
+            let stop = area.map_or(900, |area| view.policy(&area).charge_stop_permille);
+            params.insert("stop_permille".to_owned(), stop.into());
+            "charge"
+        }
+        _ => "park",
+    };
+    let step = |kind| WorkStep {
+        kind,
+        effect: Effect::Repeatable,
+        pause_allowed: true,
+        cancel_allowed: true,
+        timeout_ms: None,
+        continue_on_fail: false,
+    };
+    vec![step(StepKind::Goto { waypoint: goal.clone() }), step(StepKind::Action { name: name.to_owned(), params })]
+}
+
+/// Errands that are on their way to a stop.
+pub fn stopping(view: &View) -> usize {
+    view.attempts.values().filter(|a| a.row.errand.is_some() && a.row.phase == AttemptPhase::Stopping).count()
+}
+
+/// Sends idle robots to charge or park.
+pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
+    let waiting = plan.report.waiting.values().sum::<u64>() > 0;
+    let robots: Vec<RobotId> = board.keys().filter(|r| screen::robot(view, board, r, &now).is_ok()).cloned().collect();
+    for robot_id in robots {
+        let Some(live) = board.get(&robot_id) else { continue };
+        let Some(here) = way::find(view, live.report.vitals.waypoint.as_ref()) else { continue };
+        let Some((errand, goal)) = wish(view, &robot_id, here, live.report.vitals.battery_permille, waiting) else {
+            continue;
+        };
+        plan.decide(view, now, "fleet", |tx| begin(tx, &robot_id, errand, goal, board));
+        plan.report.errands += 1;
+    }
+}
+
+fn wish(
+    view: &View,
+    robot_id: &RobotId,
+    here: WaypointIx,
+    battery_permille: u16,
+    waiting: bool,
+) -> Option<(Errand, WaypointIx)> {
+    let policy = view.policy(&view.site.area_of(here).area_id);
+    let kind = view.site.waypoint(here).kind;
+    let must = battery_permille < policy.charge_mandatory_permille;
+    let may = battery_permille < policy.charge_opportunistic_permille && !waiting;
+    if (must || may)
+        && let Some(charger) = free(view, robot_id, here, view.site.chargers())
+    {
+        return Some((Errand::Charge, charger));
+    }
+    let settled = matches!(kind, Kind::Park) || (matches!(kind, Kind::Charger | Kind::Hold) && !waiting);
+    if settled || view.site.standing_at(here).is_none() || (kind == Kind::Hold && !has_free_park(view, robot_id, here))
+    {
+        return None;
+    }
+    let goal = free(view, robot_id, here, view.site.parks())
+        .or_else(|| free(view, robot_id, here, view.site.hold_points()))?;
+    (goal != here).then_some((Errand::Park, goal))
+}
+
+fn has_free_park(view: &View, robot_id: &RobotId, here: WaypointIx) -> bool {
+    free(view, robot_id, here, view.site.parks()).is_some()
+}
+
+/// The nearest of `goals` with room that no other errand is on its way to.
+fn free(
+    view: &View,
+    robot_id: &RobotId,
+    here: WaypointIx,
+    goals: impl Iterator<Item = WaypointIx>,
+) -> Option<WaypointIx> {
+    let open = goals.filter(|at| {
+        let Some(ix) = view.site.standing_at(*at) else { return false };
+        let place = view.site.place(ix);
+        let Some(row) = view.places.get(place.place_id.as_str()).map(|p| &p.row) else { return false };
+        let name = view.site.name_of(*at);
+        let coming = view.attempts.values().map(|a| &a.row);
+        let coming = coming
+            .filter(|a| !a.phase.is_terminal() && a.goal.as_ref() == Some(name) && row.holder(&a.robot_id).is_none())
+            .count();
+        row.holder(robot_id).is_some()
+            || (row.quarantine.is_none() && row.holders.len() + coming < row.capacity as usize)
+    });
+    view.router.nearest(here, open.collect::<Vec<_>>()).map(|(at, _)| at)
+}
+
+fn begin(tx: &mut Tx, robot_id: &RobotId, errand: Errand, goal: WaypointIx, board: &Board) {
+    let Some(anchor) = desired::anchor(tx.view, robot_id, board, limits::OFFER_VALID) else { return };
+    let known = tx.view.control.get(robot_id.as_str()).map(|c| c.row.clone());
+    let mut control = known.unwrap_or_else(|| RobotControl::new(robot_id.clone()));
+    control.errands += 1;
+    let subject = Subject::Errand { robot_id: robot_id.clone(), number: control.errands };
+    tx.put(control, "robot.given");
+    let mut a = assign::fresh_attempt(tx, AttemptId { subject, epoch: 1 }, robot_id, anchor);
+    a.errand = Some(errand);
+    a.goal = Some(tx.view.site.name_of(goal).clone());
+    assign::take_robot(tx, &a);
+    arm(tx, TimerKind::OfferAck, &a.attempt, limits::OFFER_VALID.as_ms());
+    tx.put(a, "errand.offered");
+}
+
+/// Takes the robot's report of its errand.
+pub fn report(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
+    if tx.view.held_by(robot_id) != Some(&report.attempt) {
+        return;
+    }
+    let Some(mut a) = tx.view.attempt(&report.attempt).cloned() else { return };
+    a.step_index = a.step_index.max(report.step_index);
+    a.stats = report.stats;
+    a.fault = report.fault.clone().or(a.fault);
+    a.refusal = report.refusal.clone().or(a.refusal);
+    if a.accepted.is_none() && report.state != WorkState::Refused {
+        a.accepted = Some(tx.now.utc);
+        disarm(tx, TimerKind::OfferAck, &a.attempt);
+    }
+    if a.uncertain.take().is_some() {
+        disarm(tx, TimerKind::Uncertain, &a.attempt);
+    }
+    let live = match report.state {
+        WorkState::Accepted => AttemptPhase::Accepted,
+        WorkState::Navigating => AttemptPhase::Navigating,
+        WorkState::Executing => AttemptPhase::Executing,
+        WorkState::Paused | WorkState::Stopping | WorkState::StepUnknown => AttemptPhase::Paused,
+        WorkState::Refused => AttemptPhase::Refused,
+        WorkState::Succeeded => AttemptPhase::Succeeded,
+        WorkState::Failed => AttemptPhase::Failed,
+        WorkState::Aborted | WorkState::Suspended => AttemptPhase::Aborted,
+    };
+    if live.is_terminal() {
+        a.phase = live;
+        end_attempt(tx, &mut a);
+    } else if a.phase != AttemptPhase::Stopping {
+        a.phase = live;
+    }
+    tx.put(a, "errand.changed");
+}
+
+/// Asks the robot to break its errand off.
+pub fn stop(tx: &mut Tx, robot_id: &RobotId) {
+    let Some(mut a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
+    if a.errand.is_none() || a.phase.is_terminal() || a.phase == AttemptPhase::Stopping {
+        return;
+    }
+    a.phase = AttemptPhase::Stopping;
+    disarm(tx, TimerKind::OfferAck, &a.attempt);
+    tx.put(a, "errand.stopping");
+}
+
+/// A timer of an errand fired: an unanswered offer is taken back; everything else waits for the robot's report.
+pub fn fire(tx: &mut Tx, timer: &Timer) {
+    disarm(tx, timer.kind, &timer.attempt);
+    if timer.kind == TimerKind::OfferAck
+        && let Some(robot_id) = tx.view.attempt(&timer.attempt).map(|a| a.robot_id.clone())
+    {
+        stop(tx, &robot_id);
+    }
+}
+
+/// The robot was not heard for longer than its authority.
+pub fn lease_over(tx: &mut Tx, robot_id: &RobotId, cause: Reason) {
+    let Some(mut a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
+    a.uncertain = Some(Uncertain { since: tx.now.utc, cause });
+    tx.put(a, "errand.uncertain");
+}
+
+/// The robot is heard again and still lists its errand.
+pub fn seen(tx: &mut Tx, robot_id: &RobotId) {
+    let Some(mut a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
+    a.uncertain = None;
+    if a.accepted.is_none() {
+        a.accepted = Some(tx.now.utc);
+        a.phase = AttemptPhase::Accepted;
+        disarm(tx, TimerKind::OfferAck, &a.attempt);
+    }
+    tx.put(a, "errand.seen");
+}

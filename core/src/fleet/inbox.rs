@@ -1,0 +1,133 @@
+//! Takes what robots said, in commit order: news of attempts and places, modes, stops.
+//!
+//! Invariant: a report counts only for the newest epoch of its task; older ones are fenced and counted, never obeyed.
+
+use super::rows::{HoldToken, HolderState};
+use super::tasks::{News, event_of, happen};
+use super::tx::Tx;
+use super::{Tally, errands, tasks};
+use crate::ids::{PlaceId, RobotId};
+use crate::reason::{Code, Reason};
+use crate::robot::{HardwareStop, Mode};
+use crate::task::{AttemptPhase, Event};
+use crate::work::{AttemptReport, InboxEntry, InboxItem, PlaceNews, RobotEvent, SampleBody};
+
+/// Obeys one entry of the robot inbox.
+pub fn take(tx: &mut Tx, entry: &InboxEntry, tally: &mut Tally) {
+    let InboxItem::Sample(sample) = &entry.what else { return };
+    let SampleBody::Event(event) = &sample.body else { return };
+    let robot_id = &entry.robot_id;
+    match event {
+        RobotEvent::Attempt(report) => attempt(tx, robot_id, report, tally),
+        RobotEvent::Place { place_id, grant_id, news } => place(tx, robot_id, place_id, *grant_id, *news),
+        RobotEvent::Mode(mode) => mode_changed(tx, robot_id, *mode),
+        RobotEvent::HardwareStop(stop) => hardware_stop(tx, robot_id, *stop),
+        RobotEvent::StaleAuthority { .. } => tally.stale_authority += 1,
+        RobotEvent::Fault { .. } | RobotEvent::Load(_) | RobotEvent::BatteryCritical { .. } => {}
+    }
+}
+
+/// Obeys news of an attempt, from the inbox or from an inventory.
+pub fn attempt(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, tally: &mut Tally) {
+    let id = &report.attempt;
+    let Some(task_id) = id.subject.task_id() else {
+        errands::report(tx, robot_id, report);
+        return;
+    };
+    let newest = tx.view.task(task_id).and_then(|t| t.attempt_id());
+    let ours =
+        newest.as_ref() == Some(id) && tx.view.task(task_id).is_some_and(|t| t.robot_id.as_ref() == Some(robot_id));
+    let moved = ours
+        && happen(tx, task_id, News { event: event_of(report), why: report.refusal.as_ref(), report: Some(report) });
+    if !moved {
+        tally.fenced += 1;
+    }
+    if report.state.is_over() {
+        release(tx, robot_id, report);
+    }
+}
+
+/// A robot that was kept for an attempt the record had let go reports its end: it is free again.
+fn release(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
+    if tx.view.held_by(robot_id) != Some(&report.attempt) {
+        return;
+    }
+    let Some(mut a) = tx.view.attempt(&report.attempt).cloned() else { return };
+    a.stats = report.stats;
+    a.phase = if a.phase == AttemptPhase::Lost { AttemptPhase::Aborted } else { a.phase };
+    tasks::end_attempt(tx, &mut a);
+    tx.put(a, "attempt.released");
+}
+
+/// Obeys news of a place.
+pub fn place(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: u64, news: PlaceNews) {
+    let Some(mut place) = tx.view.places.get(place_id.as_str()).map(|p| p.row.clone()) else { return };
+    let Some(at) = place.holders.iter().position(|h| h.robot_id == *robot_id && h.grant_id == grant_id) else { return };
+    let kind = match news {
+        PlaceNews::Entered => {
+            place.holders[at].state = HolderState::Inside;
+            "place.entered"
+        }
+        PlaceNews::Left | PlaceNews::NotEntered => {
+            place.holders.remove(at);
+            let ours = place
+                .quarantine
+                .as_ref()
+                .is_some_and(|q| q.metadata.get("robot_id").is_some_and(|r| r == robot_id.as_str()));
+            if ours {
+                place.quarantine = None;
+            }
+            if news == PlaceNews::Left { "place.left" } else { "place.not_entered" }
+        }
+    };
+    tx.put(place, kind);
+}
+
+/// A person took the robot over: what it has becomes UNCERTAIN. Back in automatic mode, its heartbeat says what it still has.
+fn mode_changed(tx: &mut Tx, robot_id: &RobotId, mode: Mode) {
+    tx.view.dirty.insert(robot_id.clone());
+    if mode == Mode::Automatic {
+        return;
+    }
+    let task_id = tx.view.held_by(robot_id).and_then(|a| a.subject.task_id().cloned());
+    if let Some(task_id) = task_id {
+        let why = Reason::from(Code::ManualMode).with("robot_id", robot_id);
+        happen(tx, &task_id, News::of(Event::LeaseOver, Some(&why)));
+    }
+}
+
+/// Token while the body's own safety system stops it.
+pub fn stop_token(robot_id: &RobotId) -> String {
+    format!("stop:body:{robot_id}")
+}
+
+/// Token after that, until a person resumes.
+pub fn resume_token(robot_id: &RobotId) -> String {
+    format!("resume:body:{robot_id}")
+}
+
+/// The maker's stop makes a hold token of the robot; its release turns that into one that only a person takes away.
+pub fn hardware_stop(tx: &mut Tx, robot_id: &RobotId, stop: HardwareStop) {
+    let (stopped, resume) = (stop_token(robot_id), resume_token(robot_id));
+    let stands = tx.view.holds.contains_key(&HoldToken::id_of(robot_id, &stopped));
+    let since = tx.now.utc;
+    if stop != HardwareStop::None && !stands {
+        tx.delete::<HoldToken>(&HoldToken::id_of(robot_id, &resume), "hold.replaced");
+        tx.put(HoldToken { robot_id: robot_id.clone(), token: stopped, since }, "hold.stopped");
+        holds_changed(tx, robot_id);
+    } else if stop == HardwareStop::None && stands {
+        tx.delete::<HoldToken>(&HoldToken::id_of(robot_id, &stopped), "hold.released");
+        tx.put(HoldToken { robot_id: robot_id.clone(), token: resume, since }, "hold.awaits_resume");
+    }
+}
+
+/// Tells the robot's task that a token came or that the last one went.
+pub fn holds_changed(tx: &mut Tx, robot_id: &RobotId) {
+    tx.view.dirty.insert(robot_id.clone());
+    let Some(task_id) = tx.view.held_by(robot_id).and_then(|a| a.subject.task_id().cloned()) else { return };
+    let Some(task) = tx.view.task(&task_id).cloned() else { return };
+    let why: Reason = Code::HoldByBody.into();
+    let event = if tasks::is_held(tx, &task) { Event::Hold } else { Event::LastHoldGone };
+    let why = (event == Event::Hold).then_some(&why);
+    happen(tx, &task_id, News::of(event, why));
+}

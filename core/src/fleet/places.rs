@@ -1,0 +1,293 @@
+//! Grants places along routes: all passages up to the next standing place together with it, or nothing.
+//!
+//! Invariant: a place is given on only by the robot's own report or by a person, never by time. Queue order is class, then age;
+//! a request that cannot be served blocks later ones on its places. Grants are traffic, never a safety function.
+
+use super::rows::{HolderState, Place, PlaceHolder};
+use super::tx::Tx;
+use super::view::View;
+use super::{Board, Plan, desired, inbox, way};
+use crate::ids::{AreaId, PlaceId, RobotId};
+use crate::robot::Presence;
+use crate::site::route::{Segment, segments};
+use crate::site::{Kind, PlaceIx};
+use crate::task::spec::Class;
+use crate::task::{Attempt, AttemptPhase};
+use crate::time::{Now, SiteDuration, SiteTime};
+use crate::work::{Assignment, Live, PlaceNews, RoutePoint};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// A robot that blocks a place others need steps aside after this long, at once if somebody waits for it.
+const STEP_ASIDE_AFTER: SiteDuration = SiteDuration::from_secs(3);
+
+/// What a robot waits for. Volatile: waiting reasons never go through the store.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Waiting {
+    /// Places it asked for and did not get.
+    pub places: Vec<PlaceId>,
+    /// Since when.
+    pub since: SiteTime,
+}
+
+/// What a robot may do from this cycle on; `desired` writes it down.
+#[derive(Clone, Debug, Default)]
+pub struct Releases(pub BTreeMap<RobotId, Release>);
+
+/// A newly released stretch.
+#[derive(Clone, Debug)]
+pub struct Release {
+    /// Another route, if the server chose one.
+    pub route: Option<Vec<RoutePoint>>,
+    /// Index into the route up to which the robot may drive.
+    pub released_index: u32,
+}
+
+/// Whether the robot stands because it waits for a place.
+pub fn waits(view: &View, robot_id: &RobotId) -> bool {
+    view.waits.contains_key(robot_id)
+}
+
+/// Robots that hold a standing place in the area.
+pub fn robots_in_area(view: &View, area: &AreaId) -> BTreeSet<RobotId> {
+    let inside = |id: &str| {
+        let place = PlaceId::parse(id).ok().and_then(|p| view.site.find_place(&p)).map(|p| view.site.place(p));
+        place.and_then(|p| p.waypoint()).is_some_and(|w| view.site.area_of(w).area_id == *area)
+    };
+    view.held_places.iter().filter(|(_, ids)| ids.iter().any(|id| inside(id))).map(|(r, _)| r.clone()).collect()
+}
+
+/// Brings place rows to what a settled robot reports: entered, gone, or standing somewhere nobody knew of.
+pub fn repair(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
+    let standing_on = live.report.vitals.waypoint.as_ref().filter(|_| live.report.vitals.speed_mm_s == 0);
+    for id in super::tasks::places_of(tx, robot_id) {
+        let Some(holder) = tx.view.places.get(&id).and_then(|p| p.row.holder(robot_id).cloned()) else { continue };
+        let Ok(place_id) = PlaceId::parse(&id) else { continue };
+        match live.report.places.iter().find(|p| p.place_id == place_id) {
+            None if standing_on.is_none_or(|w| w.as_str() != id) => {
+                inbox::place(tx, robot_id, &place_id, holder.grant_id, PlaceNews::NotEntered);
+            }
+            Some(p) if p.inside && holder.state != HolderState::Inside => {
+                inbox::place(tx, robot_id, &place_id, holder.grant_id, PlaceNews::Entered);
+            }
+            _ => {}
+        }
+    }
+    let mut inside: BTreeMap<&str, u64> =
+        live.report.places.iter().filter(|p| p.inside).map(|p| (p.place_id.as_str(), p.grant_id)).collect();
+    if let Some(waypoint) = standing_on {
+        inside.entry(waypoint.as_str()).or_insert(0);
+    }
+    for (id, grant_id) in inside {
+        adopt(tx, robot_id, id, grant_id);
+    }
+}
+
+/// A robot stands where the rows do not know of it: the truth is taken, whatever the capacity.
+fn adopt(tx: &mut Tx, robot_id: &RobotId, id: &str, grant_id: u64) {
+    let Some(mut place) = tx.view.places.get(id).map(|p| p.row.clone()) else { return };
+    if place.holder(robot_id).is_some() {
+        return;
+    }
+    place.holders.push(PlaceHolder {
+        robot_id: robot_id.clone(),
+        grant_id,
+        state: HolderState::Inside,
+        since: tx.now.utc,
+    });
+    tx.put(place, "place.adopted");
+}
+
+struct Wish {
+    class: Class,
+    since: SiteTime,
+    robot_id: RobotId,
+}
+
+/// Serves every robot that needs more of its route, in queue order. Each grant is an item of its own.
+pub fn advance(view: &mut View, board: &Board, now: Now, plan: &mut Plan) -> Releases {
+    let mut wishes: Vec<Wish> = Vec::new();
+    for (robot_id, live) in board {
+        let Some(id) = view.held_by(robot_id) else { continue };
+        let Some(a) = view.attempt(id) else { continue };
+        if may_drive(view, a, live, board, &now) && !is_released(view, robot_id, a) {
+            let since = view.waits.get(robot_id).map_or(now.site, |w| w.since);
+            wishes.push(Wish { class: class_of(view, a), since, robot_id: robot_id.clone() });
+        }
+    }
+    let wanting: BTreeSet<RobotId> = wishes.iter().map(|w| w.robot_id.clone()).collect();
+    view.waits.retain(|r, _| wanting.contains(r));
+    wishes.sort_by(|a, b| (a.class, a.since, &a.robot_id).cmp(&(b.class, b.since, &b.robot_id)));
+    let mut releases = Releases::default();
+    let mut blocked = BTreeSet::new();
+    for wish in &wishes {
+        plan.decide(view, now, "fleet", |tx| serve(tx, &wish.robot_id, &mut releases, &mut blocked));
+    }
+    plan.report.tally.waiting_for_place = view.waits.len() as u64;
+    releases
+}
+
+fn class_of(view: &View, a: &Attempt) -> Class {
+    let priority = a.attempt.subject.task_id().and_then(|t| view.intake(t)).map_or(9, |i| i.spec.priority);
+    Class::of(priority, false)
+}
+
+/// An accepted attempt of a robot that is heard, not held and not told to stop.
+fn may_drive(view: &View, a: &Attempt, live: &Live, board: &Board, now: &Now) -> bool {
+    let working = matches!(
+        a.phase,
+        AttemptPhase::Accepted | AttemptPhase::Navigating | AttemptPhase::Executing | AttemptPhase::Paused
+    );
+    let robot_id = &a.robot_id;
+    let session =
+        view.sessions.get(robot_id.as_str()).is_some_and(|s| s.row.session_epoch == live.report.session_epoch);
+    let held = view.desired_work.get(robot_id.as_str()).is_some_and(|d| d.row.held);
+    working
+        && session
+        && !live.observed
+        && !held
+        && a.uncertain.is_none()
+        && super::repair::presence(board, robot_id, now) == Presence::Online
+}
+
+fn assignment<'a>(view: &'a View, robot_id: &RobotId, a: &Attempt) -> Option<&'a Assignment> {
+    let desired = &view.desired_work.get(robot_id.as_str())?.row;
+    desired.assignment.as_ref().filter(|x| x.attempt == a.attempt)
+}
+
+fn is_released(view: &View, robot_id: &RobotId, a: &Attempt) -> bool {
+    let Some(work) = assignment(view, robot_id, a) else { return true };
+    let end = work.route.len().saturating_sub(1) as u32;
+    work.released_index.is_some_and(|r| r >= end) || next_segment(view, robot_id, a, work).is_none()
+}
+
+/// The next stretch to release, if it is time for it: not before the step behind the last one is done, and at most one ahead.
+fn next_segment(view: &View, robot_id: &RobotId, a: &Attempt, work: &Assignment) -> Option<Segment> {
+    let route = way::indices(&view.site, &work.route)?;
+    let released = work.released_index.unwrap_or(0) as usize;
+    let segment = segments(&view.site, &route).into_iter().find(|s| s.end > released)?;
+    let leads_to = work.route.iter().skip(segment.start + 1).find_map(|p| p.ends_step);
+    if !segment.places().is_empty()
+        && work.route[segment.start].ends_step.is_some()
+        && leads_to.is_some_and(|step| a.step_index < step)
+    {
+        return None;
+    }
+    let unentered =
+        super::view::held(view, robot_id).filter(|(p, h)| p.standing && h.state == HolderState::Granted).count();
+    (unentered <= 1).then_some(segment)
+}
+
+fn serve(tx: &mut Tx, robot_id: &RobotId, releases: &mut Releases, blocked: &mut BTreeSet<PlaceIx>) {
+    let Some(a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
+    let Some(work) = assignment(tx.view, robot_id, &a).cloned() else { return };
+    let Some(segment) = next_segment(tx.view, robot_id, &a, &work) else { return };
+    let needed = segment.places();
+    if grantable(tx.view, robot_id, &needed, blocked) {
+        grant(tx, robot_id, &needed);
+        tx.view.waits.remove(robot_id);
+        tx.view.dirty.insert(robot_id.clone());
+        releases.0.insert(robot_id.clone(), Release { route: None, released_index: segment.end as u32 });
+        return;
+    }
+    let names = needed.iter().map(|p| tx.view.site.place(*p).place_id.clone()).collect();
+    let now = tx.now.site;
+    let since = tx.view.waits.entry(robot_id.clone()).or_insert(Waiting { places: Vec::new(), since: now }).since;
+    tx.view.waits.insert(robot_id.clone(), Waiting { places: names, since });
+    if !step_aside(tx, &a, &work, since, releases, blocked) {
+        blocked.extend(needed);
+    }
+}
+
+fn grantable(view: &View, robot_id: &RobotId, needed: &[PlaceIx], blocked: &BTreeSet<PlaceIx>) -> bool {
+    needed.iter().all(|ix| {
+        let place = view.places.get(view.site.place(*ix).place_id.as_str()).map(|p| &p.row);
+        place.is_some_and(|p| match p.holder(robot_id) {
+            Some(holder) => holder.state != HolderState::Revoking,
+            None => p.has_room() && !blocked.contains(ix),
+        })
+    })
+}
+
+fn grant(tx: &mut Tx, robot_id: &RobotId, needed: &[PlaceIx]) {
+    let grant_id = desired::next_generation(tx.view, robot_id, &tx.now);
+    for ix in needed {
+        let id = tx.view.site.place(*ix).place_id.clone();
+        let Some(mut place) = tx.view.places.get(id.as_str()).map(|p| p.row.clone()) else { continue };
+        if place.holder(robot_id).is_none() {
+            place.holders.push(PlaceHolder {
+                robot_id: robot_id.clone(),
+                grant_id,
+                state: HolderState::Granted,
+                since: tx.now.utc,
+            });
+            tx.put(place, "place.granted");
+        }
+    }
+}
+
+/// The robot stands in a place that others need while its own goal is taken: it goes to a free bay on the way.
+fn step_aside(
+    tx: &mut Tx,
+    a: &Attempt,
+    work: &Assignment,
+    since: SiteTime,
+    releases: &mut Releases,
+    blocked: &BTreeSet<PlaceIx>,
+) -> bool {
+    let robot_id = &a.robot_id;
+    let released = work.released_index.unwrap_or(0) as usize;
+    let Some(here) = work.route.get(released).and_then(|p| tx.view.site.find(&p.waypoint)) else { return false };
+    let Some(place) = tx.view.site.standing_at(here) else { return false };
+    let kind = tx.view.site.waypoint(here).kind;
+    if matches!(kind, Kind::Hold | Kind::Park) || !stands_in(tx.view, robot_id, place) {
+        return false;
+    }
+    let here_id = tx.view.site.place(place).place_id.clone();
+    let contested = tx.view.waits.iter().any(|(r, w)| r != robot_id && w.places.contains(&here_id));
+    if !contested && tx.now.site.since(since) < STEP_ASIDE_AFTER {
+        return false;
+    }
+    let left: Vec<_> =
+        work.route.iter().skip(released + 1).filter_map(|p| p.ends_step.zip(tx.view.site.find(&p.waypoint))).collect();
+    let Some((_, goal)) = left.first().copied() else { return false };
+    let site = tx.view.site.clone();
+    let mut bays: Vec<_> = site
+        .hold_points()
+        .chain(site.parks())
+        .filter_map(|bay| {
+            let there = tx.view.router.distance_mm(here, bay)?;
+            Some((there + tx.view.router.distance_mm(bay, goal)?, bay))
+        })
+        .collect();
+    bays.sort_unstable();
+    for (_, bay) in bays {
+        let Some(mut route) = way::route(tx.view, here, Some(bay), &left) else { continue };
+        route[0].ends_step = None;
+        let Some(ixs) = way::indices(&site, &route) else { continue };
+        let Some(first) = segments(&site, &ixs).into_iter().next() else { continue };
+        if first.standing == Some(place) || !grantable(tx.view, robot_id, &first.places(), blocked) {
+            continue;
+        }
+        grant(tx, robot_id, &first.places());
+        tx.view.dirty.insert(a.robot_id.clone());
+        releases.0.insert(robot_id.clone(), Release { route: Some(route), released_index: first.end as u32 });
+        return true;
+    }
+    false
+}
+
+fn stands_in(view: &View, robot_id: &RobotId, place: PlaceIx) -> bool {
+    let id = &view.site.place(place).place_id;
+    view.places.get(id.as_str()).and_then(|p| p.row.holder(robot_id)).is_some_and(|h| h.state == HolderState::Inside)
+}
+
+/// Row of a place that nobody has ever held.
+pub fn fresh(place: &crate::site::Place) -> Place {
+    Place {
+        place_id: place.place_id.clone(),
+        capacity: place.capacity,
+        standing: place.waypoint().is_some(),
+        holders: Vec::new(),
+        quarantine: None,
+    }
+}

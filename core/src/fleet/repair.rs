@@ -1,0 +1,145 @@
+//! Compares what each heartbeat says with what the rows say, and repairs the difference both ways.
+//!
+//! Invariant: repair never overtakes events. A difference counts only if the robot has applied the newest desired work and every
+//! EVENT and CRITICAL number it had produced has been consumed. The end of a lease frees authority, never a load or a place.
+
+use super::tasks::{News, happen};
+use super::tx::Tx;
+use super::view::View;
+use super::{Board, Tally, errands, inbox, places};
+use crate::ids::RobotId;
+use crate::limits;
+use crate::reason::{Code, Reason};
+use crate::robot::{HardwareStop, Lane, Mode, Presence};
+use crate::task::{Attempt, AttemptPhase, Event, Phase};
+use crate::time::Now;
+use crate::work::{AttemptReport, Live, WorkState};
+
+/// Whether a robot is heard, from the board alone. After a start of fleet every lease counts as renewed at that moment.
+pub fn presence(board: &Board, robot_id: &RobotId, now: &Now) -> Presence {
+    match board.get(robot_id) {
+        Some(live) if now.link.since(live.processed_at) <= limits::SUSPECT_AFTER => Presence::Online,
+        Some(live) if now.link.since(live.processed_at) <= limits::OFFLINE_AFTER => Presence::Suspect,
+        _ => Presence::Offline,
+    }
+}
+
+/// Whether the robot may still have authority to go on.
+fn lease_stands(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> bool {
+    let renewed = board.get(robot_id).map_or(view.started.link, |l| l.processed_at.max(view.started.link));
+    now.link.since(renewed) <= limits::LEASE
+}
+
+/// The robot's differences count: it has applied everything and everything it said has been consumed.
+pub fn is_settled(view: &View, live: &Live) -> bool {
+    let id = live.robot_id.as_str();
+    let Some(session) = view.sessions.get(id) else { return false };
+    let current = session.row.session_epoch == live.report.session_epoch;
+    let applied = view.desired_work.get(id).is_none_or(|d| live.report.applied_work >= d.row.generation);
+    let mark = view.lane_marks.get(&format!("{id}/{}", session.row.ring)).map(|m| &m.row);
+    let done = |lane: Lane, have: u64| live.report.produced.get(&lane).is_none_or(|p| *p <= have);
+    current
+        && applied
+        && done(Lane::Event, mark.map_or(0, |m| m.event))
+        && done(Lane::Critical, mark.map_or(0, |m| m.critical))
+}
+
+/// Repairs one robot.
+pub fn robot(tx: &mut Tx, robot_id: &RobotId, board: &Board, tally: &mut Tally) {
+    if !lease_stands(tx.view, board, robot_id, &tx.now) {
+        lease_over(tx, robot_id);
+        return;
+    }
+    let Some(live) = board.get(robot_id).cloned() else { return };
+    if live.observed {
+        return;
+    }
+    stalled(tx, robot_id, &live);
+    if !is_settled(tx.view, &live) {
+        tally.pending += 1;
+        return;
+    }
+    inbox::hardware_stop(tx, robot_id, live.report.hardware_stop);
+    places::repair(tx, robot_id, &live);
+    attempt(tx, robot_id, &live, tally);
+    forget_reported(tx, robot_id, &live);
+}
+
+fn lease_over(tx: &mut Tx, robot_id: &RobotId) {
+    let Some(id) = tx.view.held_by(robot_id).cloned() else { return };
+    let Some(a) = tx.view.attempt(&id) else { return };
+    if a.uncertain.is_some() || a.phase.is_terminal() {
+        return;
+    }
+    let why = Reason::from(Code::LeaseOver).with("robot_id", robot_id);
+    match id.subject.task_id() {
+        Some(task_id) => {
+            happen(tx, task_id, News::of(Event::LeaseOver, Some(&why)));
+        }
+        None => errands::lease_over(tx, robot_id, why),
+    }
+}
+
+/// The attempt that holds the robot, against what the robot lists.
+fn attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
+    let Some(id) = tx.view.held_by(robot_id).cloned() else { return };
+    let Some(a) = tx.view.attempt(&id).cloned() else { return };
+    let listed = live.report.attempts.iter().find(|r| r.attempt == id);
+    let report = |state| AttemptReport {
+        attempt: id.clone(),
+        state,
+        step_index: listed.map_or(a.step_index, |l| l.step_index),
+        opened: a.opened || listed.is_some_and(|l| l.opened),
+        refusal: None,
+        fault: None,
+        stats: a.stats,
+    };
+    match listed {
+        None => {
+            tally.repaired += 1;
+            inbox::attempt(tx, robot_id, &report(WorkState::Aborted), tally);
+        }
+        Some(l) if l.state.is_over() && l.state != WorkState::Failed => {
+            tally.repaired += 1;
+            inbox::attempt(tx, robot_id, &report(l.state), tally);
+        }
+        Some(l) if needs_sight(&a, live) && l.state != WorkState::StepUnknown => {
+            let Some(task_id) = id.subject.task_id() else { return errands::seen(tx, robot_id) };
+            tally.repaired += 1;
+            let report = report(l.state);
+            happen(tx, task_id, News { event: Event::SeenRunning, why: None, report: Some(&report) });
+        }
+        Some(_) => {}
+    }
+}
+
+/// A robot in automatic mode lists an attempt that the record has as unanswered or UNCERTAIN.
+fn needs_sight(a: &Attempt, live: &Live) -> bool {
+    live.report.mode == Mode::Automatic && (a.uncertain.is_some() || a.phase == AttemptPhase::Offered)
+}
+
+/// Attempts that are over for both may leave the robot's list.
+fn forget_reported(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
+    let over = live.report.attempts.iter().filter(|r| r.state.is_over() || r.state == WorkState::StepUnknown);
+    let closed = tx.view.desired_work.get(robot_id.as_str()).map(|d| d.row.closed.clone()).unwrap_or_default();
+    let holder = tx.view.held_by(robot_id);
+    if over.into_iter().any(|r| holder != Some(&r.attempt) && !closed.contains(&r.attempt)) {
+        tx.view.dirty.insert(robot_id.clone());
+    }
+}
+
+fn stalled(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
+    let Some(task_id) = tx.view.held_by(robot_id).and_then(|a| a.subject.task_id().cloned()) else { return };
+    let Some(task) = tx.view.task(&task_id) else { return };
+    let Some(intake) = tx.view.intake(&task_id) else { return };
+    let quiet = tx.now.site.since(live.progress_at.max(tx.view.started.site)).as_ms();
+    let accepted = tx.view.held_by(robot_id).and_then(|a| tx.view.attempt(a)).and_then(|a| a.accepted);
+    let young = accepted.is_none_or(|at| tx.now.utc.ms_since(at) <= intake.spec.stall_ms);
+    let excused = places::waits(tx.view, robot_id)
+        || live.report.mode != Mode::Automatic
+        || live.report.hardware_stop != HardwareStop::None;
+    if task.phase == Phase::Running && quiet > intake.spec.stall_ms && !young && !excused {
+        let why = Reason::from(Code::Stalled).with("quiet_ms", quiet);
+        happen(tx, &task_id, News::of(Event::Stall, Some(&why)));
+    }
+}

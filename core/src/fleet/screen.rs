@@ -1,0 +1,201 @@
+//! Filters: why a robot gets no work, and why it does not get this task. The same functions serve the planner and the explanations.
+//!
+//! Invariant: a filter gives a reason; nothing is ever "just not chosen".
+
+use super::rows::RobotHolder;
+use super::view::View;
+use super::{Board, repair, way};
+use crate::ids::{RobotId, Subject};
+use crate::reason::{Code, Reason};
+use crate::robot::{Duty, FaultClass, HardwareStop, Mode, Presence, StopLevel};
+use crate::site::WaypointIx;
+use crate::task::raw::parse_version;
+use crate::task::{AttemptPhase, Phase, TaskIntake, TaskState};
+use crate::time::Now;
+use crate::work::{Live, Session};
+
+/// Charge spent on a metre, thousandths of a permille: a planning figure with its margin in [`RESERVE_PERMILLE`].
+pub const ENERGY_MICRO_PER_MM: u64 = 60;
+/// Charge that must be left at the charger, permille.
+pub const RESERVE_PERMILLE: u64 = 100;
+
+/// Whether the robot can be given any work at all now.
+pub fn robot(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> Result<(), Reason> {
+    let Some(session) = view.sessions.get(robot_id.as_str()).map(|s| &s.row) else {
+        return Err(Code::RobotOffline.into());
+    };
+    match repair::presence(board, robot_id, now) {
+        Presence::Online => {}
+        Presence::Suspect => return Err(Code::RobotSuspect.into()),
+        Presence::Offline | Presence::Updating => return Err(Code::RobotOffline.into()),
+    }
+    let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
+    if live.observed || session.observed {
+        return Err(Code::RobotObserved.into());
+    }
+    decided_by_people(view, robot_id)?;
+    reported(live)?;
+    match view.authority.get(robot_id.as_str()).map(|a| &a.row.holder) {
+        None | Some(RobotHolder::None) => {}
+        Some(RobotHolder::Attempt(id)) => return Err(Reason::from(Code::RobotBusy).with("attempt", id)),
+        Some(RobotHolder::Maintenance(id)) => return Err(Reason::from(Code::RobotBusy).with("maintenance", id)),
+    }
+    if live.report.attempts.iter().any(|a| !a.state.is_over()) || session.session_epoch != live.report.session_epoch {
+        return Err(Code::RobotReconciling.into());
+    }
+    if way::find(view, live.report.vitals.waypoint.as_ref()).is_none() {
+        return Err(Code::RobotUnlocated.into());
+    }
+    Ok(())
+}
+
+fn decided_by_people(view: &View, robot_id: &RobotId) -> Result<(), Reason> {
+    if let Some(control) = view.control.get(robot_id.as_str()).map(|c| &c.row) {
+        match control.duty() {
+            Duty::InWork => {}
+            Duty::Cordoned => {
+                let why = control.cordon.as_ref().map(|c| c.reason.clone()).unwrap_or_default();
+                return Err(Reason::from(Code::RobotCordoned).with("cordon", why));
+            }
+            Duty::BrokenOff | Duty::Retired => return Err(Code::RobotBrokenOff.into()),
+        }
+    }
+    match view.robot_holds(robot_id).next() {
+        Some(hold) => Err(Reason::from(Code::RobotHeld).with("token", &hold.token)),
+        None => Ok(()),
+    }
+}
+
+fn reported(live: &Live) -> Result<(), Reason> {
+    let r = &live.report;
+    if r.mode != Mode::Automatic {
+        return Err(Code::RobotManual.into());
+    }
+    if r.hardware_stop != HardwareStop::None || r.stop_level >= StopLevel::Halt {
+        return Err(Code::RobotStopped.into());
+    }
+    match &r.fault {
+        Some(fault) if fault.class != FaultClass::Recoverable => {
+            Err(Reason::from(Code::RobotFault).with("fault_code", fault.code))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Whether this robot, apart from being busy, may be given this task.
+pub fn pair(
+    view: &View,
+    board: &Board,
+    robot_id: &RobotId,
+    task: &TaskState,
+    intake: &TaskIntake,
+) -> Result<(), Reason> {
+    let spec = &intake.spec;
+    let Some(session) = view.sessions.get(robot_id.as_str()).map(|s| &s.row) else {
+        return Err(Code::RobotOffline.into());
+    };
+    if spec.robot_id.as_ref().is_some_and(|r| r != robot_id) {
+        return Err(Code::RobotPinnedElsewhere.into());
+    }
+    if task.opened.as_ref().is_some_and(|r| r != robot_id) {
+        return Err(Code::BoundElsewhere.into());
+    }
+    if task.semantic_refusers.contains(robot_id) {
+        return Err(Code::UnsupportedAction.into());
+    }
+    if spec.retry.exclude_failed_robot && task.opened.is_none() && task.failed_robots.contains(robot_id) {
+        return Err(Code::ExcludedAfterFailure.into());
+    }
+    able(session, intake)?;
+    let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
+    if let Some(load) = &live.report.load
+        && load.task_id.as_ref() != Some(&task.task_id)
+    {
+        return Err(Reason::from(Code::RobotLoaded).with("item", &load.item));
+    }
+    energy(view, live, task, intake)
+}
+
+fn able(session: &Session, intake: &TaskIntake) -> Result<(), Reason> {
+    let spec = &intake.spec;
+    let has = |c: &str| session.inventory.capabilities.iter().any(|h| h == c);
+    let wanted = spec.actions().into_iter().chain(spec.selector.capabilities.iter().map(String::as_str));
+    if let Some(missing) = wanted.into_iter().find(|c| !has(c)) {
+        return Err(Reason::from(Code::MissingCapability).with("capability", missing));
+    }
+    if spec.selector.labels.iter().any(|(k, v)| session.inventory.labels.get(k) != Some(v)) {
+        return Err(Code::LabelMismatch.into());
+    }
+    if spec.selector.payload_g > session.inventory.payload_g {
+        return Err(Reason::from(Code::PayloadTooHeavy).with("payload_g", session.inventory.payload_g));
+    }
+    let least = spec.selector.minimum_software.as_deref().and_then(parse_version);
+    if least.is_some_and(|least| parse_version(&session.inventory.software).is_none_or(|has| has < least)) {
+        return Err(Reason::from(Code::SoftwareTooOld).with("software", &session.inventory.software));
+    }
+    Ok(())
+}
+
+/// The charge must reach pickup, every other goal and the nearest charger, with its reserve.
+fn energy(view: &View, live: &Live, task: &TaskState, intake: &TaskIntake) -> Result<(), Reason> {
+    let Some(here) = way::find(view, live.report.vitals.waypoint.as_ref()) else {
+        return Err(Code::RobotUnlocated.into());
+    };
+    let from = way::from_step(&intake.spec.steps, task.next_step);
+    let goals: Option<Vec<WaypointIx>> = intake.spec.goals(from as usize).map(|g| view.site.find(g)).collect();
+    let Some(goals) = goals else { return Err(Code::NoRoute.into()) };
+    let Some(work_mm) = way::length_mm(view, here, &goals) else { return Err(Code::NoRoute.into()) };
+    let last = goals.last().copied().unwrap_or(here);
+    let home_mm = match view.site.chargers().next() {
+        Some(_) => view.site.chargers().filter_map(|c| view.router.distance_mm(last, c)).min().unwrap_or(0),
+        None => return Ok(()),
+    };
+    let needed = (work_mm + home_mm) * ENERGY_MICRO_PER_MM / 1_000_000 + RESERVE_PERMILLE;
+    let has = u64::from(live.report.vitals.battery_permille);
+    let mandatory = u64::from(view.policy(&view.site.area_of(here).area_id).charge_mandatory_permille);
+    if has < needed.max(mandatory) {
+        return Err(Reason::from(Code::BatteryLow)
+            .with("battery_permille", has)
+            .with("needed_permille", needed.max(mandatory)));
+    }
+    Ok(())
+}
+
+/// Whether the task may be offered now, whatever the robots.
+pub fn task(view: &View, task: &TaskState, intake: &TaskIntake, now: &Now) -> Result<(), Reason> {
+    match task.phase {
+        Phase::Queued => {}
+        Phase::RetryWait => return Err(Code::WaitingForRetry.into()),
+        _ => return Err(Code::NotAllowedNow.into()),
+    }
+    if intake.spec.not_before.is_some_and(|t| t > now.utc) {
+        return Err(Code::WaitingForTime.into());
+    }
+    if let Some(token) = task.holds.iter().next() {
+        return Err(Reason::from(Code::WaitingForHold).with("token", token));
+    }
+    for id in &intake.spec.depends_on {
+        match view.ended.get(id) {
+            Some(Phase::Succeeded) => {}
+            Some(_) => return Err(Reason::from(Code::DependencyFailed).with("task_id", id)),
+            None => return Err(Reason::from(Code::WaitingForDependency).with("task_id", id)),
+        }
+    }
+    Ok(())
+}
+
+/// An idle-looking errand that may be broken off for a task: parking, or charging above the area's threshold.
+pub fn recallable(view: &View, board: &Board, robot_id: &RobotId) -> bool {
+    let Some(id) = view.held_by(robot_id) else { return false };
+    let Some(a) = view.attempt(id) else { return false };
+    let Subject::Errand { .. } = id.subject else { return false };
+    let working = matches!(
+        a.phase,
+        AttemptPhase::Accepted | AttemptPhase::Navigating | AttemptPhase::Executing | AttemptPhase::Paused
+    );
+    let Some(live) = board.get(robot_id) else { return false };
+    let enough = way::find(view, live.report.vitals.waypoint.as_ref()).is_some_and(|at| {
+        live.report.vitals.battery_permille > view.policy(&view.site.area_of(at).area_id).charge_preemptible_permille
+    });
+    working && a.uncertain.is_none() && (a.errand == Some(crate::task::state::Errand::Park) || enough)
+}

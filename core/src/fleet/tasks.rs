@@ -1,0 +1,444 @@
+//! Moves one task by the table and writes all that goes with it: attempt, robot's mutex, timers, counters, breaker.
+//!
+//! Called by `inbox`, `requests`, `timers`, `repair` and `assign`. Invariant: only here does a task change its phase, and only by
+//! `task::machine::next`.
+
+use super::rows::{HolderState, Incident, RobotAuthority, RobotControl, RobotCounter, RobotHolder, Timer, TimerKind};
+use super::tx::Tx;
+use crate::ids::{AttemptId, RobotId, Subject, TaskId};
+use crate::limits;
+use crate::reason::{Code, Reason};
+use crate::robot::FaultClass;
+use crate::task::machine::{Facts, Fate, Next, Standing, next};
+use crate::task::state::Uncertain;
+use crate::task::{Attempt, AttemptPhase, Event, Phase, TaskIntake, TaskState, Then};
+use crate::work::{AttemptReport, Effect, WorkState};
+
+/// What happened to a task, with what is known about it.
+#[derive(Clone, Copy, Debug)]
+pub struct News<'a> {
+    /// The event of the table.
+    pub event: Event,
+    /// Why, for the task's reason.
+    pub why: Option<&'a Reason>,
+    /// The robot's report behind it.
+    pub report: Option<&'a AttemptReport>,
+}
+
+impl<'a> News<'a> {
+    /// An event without a report.
+    pub fn of(event: Event, why: Option<&'a Reason>) -> Self {
+        Self { event, why, report: None }
+    }
+}
+
+/// Moves `task_id` by the table. False: the event means nothing there and is only counted.
+pub fn happen(tx: &mut Tx, task_id: &TaskId, news: News) -> bool {
+    let Some(task) = tx.view.task(task_id).cloned() else { return false };
+    let Some(intake) = tx.view.intake(task_id).cloned() else { return false };
+    let attempt = task.attempt_id().and_then(|id| tx.view.attempt(&id).cloned());
+    let facts = facts(tx, &task, &intake, attempt.as_ref(), &news);
+    let uncertain = attempt.as_ref().is_some_and(|a| a.uncertain.is_some());
+    let at = Standing { phase: task.phase, uncertain, then: task.then };
+    let Some(step) = next(at, news.event, &facts) else { return false };
+    let attempt = attempt.filter(|a| !a.phase.is_terminal() || a.phase == AttemptPhase::Lost);
+    let attempt = attempt.map(|a| move_attempt(tx, a, step, &news, &intake));
+    move_task(tx, task, attempt.as_ref(), step, &news, &intake);
+    true
+}
+
+fn facts(tx: &Tx, task: &TaskState, intake: &TaskIntake, attempt: Option<&Attempt>, news: &News) -> Facts {
+    let opened = task.opened.is_some() || attempt.is_some_and(|a| a.opened) || news.report.is_some_and(|r| r.opened);
+    let step = news.report.map(|r| r.step_index).or(attempt.map(|a| a.step_index)).unwrap_or(0) as usize;
+    let begun = intake.spec.steps.iter().take(step + 1).skip(task.next_step as usize);
+    let refusal = news.report.and_then(|r| r.refusal.as_ref()).map(|r| r.code);
+    let semantic_refusal = matches!(refusal, Some(Code::UnsupportedAction | Code::UnknownWaypoint));
+    let refusers = task.semantic_refusers.len() + usize::from(semantic_refusal);
+    Facts {
+        retries_left: task.failures < intake.spec.retry.max_retry_times,
+        retry_wanted: intake.spec.retry.max_retry_times > 0,
+        opened,
+        begun_repeatable: begun.into_iter().all(|s| s.effect == Effect::Repeatable),
+        refusals_spent: task.refusals_in_row + 1 >= limits::REFUSALS_IN_ROW,
+        refused_by_all: semantic_refusal && refusers >= tx.view.sessions.len(),
+        semantic: news.report.and_then(|r| r.fault.as_ref()).is_some_and(|f| f.class == FaultClass::Semantic),
+        held: is_held(tx, task),
+        accepted: attempt.is_some_and(|a| a.accepted.is_some()),
+    }
+}
+
+/// Whether a token of the task or of its robot stands.
+pub fn is_held(tx: &Tx, task: &TaskState) -> bool {
+    !task.holds.is_empty() || task.robot_id.as_ref().is_some_and(|r| tx.view.robot_holds(r).next().is_some())
+}
+
+/// The attempt's new phase after `event`, if the event says one.
+fn phase_of(event: Event, report: Option<&AttemptReport>) -> Option<AttemptPhase> {
+    Some(match (event, report.map(|r| r.state)) {
+        (Event::Succeeded, _) => AttemptPhase::Succeeded,
+        (Event::FailedRecoverable | Event::FailedFinal, _) => AttemptPhase::Failed,
+        (Event::Refused, _) => AttemptPhase::Refused,
+        (_, Some(WorkState::Accepted)) => AttemptPhase::Accepted,
+        (_, Some(WorkState::Navigating)) => AttemptPhase::Navigating,
+        (_, Some(WorkState::Executing)) => AttemptPhase::Executing,
+        (_, Some(WorkState::Paused)) => AttemptPhase::Paused,
+        _ => return None,
+    })
+}
+
+fn move_attempt(tx: &mut Tx, mut a: Attempt, step: Next, news: &News, intake: &TaskIntake) -> Attempt {
+    if let Some(report) = news.report {
+        a.step_index = a.step_index.max(report.step_index);
+        a.opened |= report.opened;
+        a.stats = report.stats;
+        a.fault = report.fault.clone().or(a.fault);
+        a.refusal = report.refusal.clone().or(a.refusal);
+    }
+    let live = matches!(news.event, Event::Accepted | Event::Progress | Event::SeenRunning);
+    if live && a.accepted.is_none() {
+        a.accepted = Some(tx.now.utc);
+        disarm(tx, TimerKind::OfferAck, &a.attempt);
+        arm(tx, TimerKind::StartToClose, &a.attempt, intake.spec.timeout_ms);
+        if a.phase == AttemptPhase::Offered {
+            a.phase = AttemptPhase::Accepted;
+        }
+    }
+    match step.fate {
+        Fate::Keep => {}
+        Fate::Stop => {
+            a.phase = AttemptPhase::Stopping;
+            disarm(tx, TimerKind::OfferAck, &a.attempt);
+            disarm(tx, TimerKind::StartToClose, &a.attempt);
+            if !tx.view.timers.contains_key(&Timer::id_of(TimerKind::StopConfirm, &a.attempt)) {
+                arm(tx, TimerKind::StopConfirm, &a.attempt, limits::STOP_CONFIRM.as_ms());
+            }
+        }
+        Fate::Uncertain => {
+            let cause = news.why.cloned().unwrap_or_else(|| Code::LeaseOver.into());
+            a.uncertain = Some(Uncertain { since: tx.now.utc, cause });
+            arm(tx, TimerKind::Uncertain, &a.attempt, limits::UNCERTAIN_LIMIT.as_ms());
+        }
+        Fate::Known => {
+            a.uncertain = None;
+            disarm(tx, TimerKind::Uncertain, &a.attempt);
+        }
+        Fate::End => {
+            let confirmed = if a.accepted.is_some() { AttemptPhase::Aborted } else { AttemptPhase::OfferExpired };
+            a.phase = phase_of(news.event, None).unwrap_or(confirmed);
+            end_attempt(tx, &mut a);
+        }
+        Fate::Abandon => {
+            a.phase = AttemptPhase::Lost;
+            a.uncertain = None;
+            a.ended = Some(tx.now.utc);
+            disarm_all(tx, &a.attempt);
+            quarantine(tx, &a.robot_id, news.why);
+        }
+    }
+    if a.phase != AttemptPhase::Stopping
+        && !a.phase.is_terminal()
+        && let Some(phase) = phase_of(news.event, news.report)
+    {
+        a.phase = phase;
+    }
+    tx.put(a.clone(), "attempt.changed");
+    a
+}
+
+/// The attempt is over and the robot is free: its mutex, timers, unentered grants, counters and breaker.
+pub fn end_attempt(tx: &mut Tx, a: &mut Attempt) {
+    a.ended = Some(tx.now.utc);
+    a.uncertain = None;
+    disarm_all(tx, &a.attempt);
+    if tx.view.held_by(&a.robot_id) == Some(&a.attempt) {
+        tx.put(RobotAuthority { robot_id: a.robot_id.clone(), holder: RobotHolder::None }, "robot.freed");
+    }
+    revoke_unentered(tx, &a.robot_id);
+    lift_quarantine(tx, &a.robot_id);
+    if matches!(a.phase, AttemptPhase::Refused | AttemptPhase::OfferExpired) {
+        return;
+    }
+    count(tx, a);
+    let robots_fault = a.fault.as_ref().is_some_and(|f| f.class != FaultClass::Semantic);
+    if a.phase == AttemptPhase::Failed && robots_fault {
+        trip(tx, &a.robot_id);
+    }
+}
+
+fn count(tx: &mut Tx, a: &Attempt) {
+    let id = format!("{}@{}", a.robot_id, a.software);
+    let mut counter = tx.view.counters.get(&id).map(|c| c.row.clone()).unwrap_or_else(|| RobotCounter {
+        robot_id: a.robot_id.clone(),
+        software: a.software.clone(),
+        succeeded: 0,
+        failures: std::collections::BTreeMap::new(),
+        stats: crate::work::WorkStats::default(),
+    });
+    counter.stats += a.stats;
+    if a.errand.is_none() {
+        match (a.phase, &a.fault) {
+            (AttemptPhase::Succeeded, _) => counter.succeeded += 1,
+            (AttemptPhase::Failed, Some(fault)) => *counter.failures.entry(fault.code).or_default() += 1,
+            _ => {}
+        }
+    }
+    tx.put(counter, "robot.counted");
+}
+
+/// Notes a failure of the robot; three within the window take it out of dispatch until a person says so.
+fn trip(tx: &mut Tx, robot_id: &RobotId) {
+    let known = tx.view.control.get(robot_id.as_str()).map(|c| c.row.clone());
+    let mut control = known.unwrap_or_else(|| RobotControl::new(robot_id.clone()));
+    let now = tx.now.utc;
+    control.failures.retain(|at| now.ms_since(*at) <= limits::BREAKER_WINDOW.as_ms());
+    control.failures.push(now);
+    if control.failures.len() >= limits::BREAKER_FAILURES && control.breaker.is_none() {
+        control.breaker = Some(now);
+        let reason = Reason::from(Code::RobotBreakerOpened).with("failures", control.failures.len());
+        open_incident(tx, reason, Some(robot_id), None);
+    }
+    tx.put(control, "robot.failed");
+}
+
+/// Opens an incident, once per code, subject and moment.
+pub fn open_incident(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, task_id: Option<&TaskId>) {
+    let about = robot_id.map(ToString::to_string).or(task_id.map(ToString::to_string)).unwrap_or_default();
+    let incident = Incident {
+        id: format!("{}:{about}:{}", reason.code, tx.now.wall.0),
+        reason,
+        robot_id: robot_id.cloned(),
+        task_id: task_id.cloned(),
+        area_id: None,
+        opened: tx.now.utc,
+    };
+    tx.put(incident, "incident.opened");
+}
+
+/// Takes back every grant the robot has not entered: it stays taken until the robot says so.
+pub fn revoke_unentered(tx: &mut Tx, robot_id: &RobotId) {
+    for id in places_of(tx, robot_id) {
+        let Some(mut place) = tx.view.places.get(&id).map(|p| p.row.clone()) else { continue };
+        let Some(holder) =
+            place.holders.iter_mut().find(|h| h.robot_id == *robot_id && h.state == HolderState::Granted)
+        else {
+            continue;
+        };
+        holder.state = HolderState::Revoking;
+        tx.put(place, "place.revoked");
+    }
+}
+
+fn quarantine(tx: &mut Tx, robot_id: &RobotId, why: Option<&Reason>) {
+    for id in places_of(tx, robot_id) {
+        let Some(mut place) = tx.view.places.get(&id).map(|p| p.row.clone()) else { continue };
+        if place.quarantine.is_none() {
+            let cause = why.map_or(Code::Forced, |r| r.code);
+            place.quarantine =
+                Some(Reason::from(Code::PlaceQuarantined).with("robot_id", robot_id).with("cause", cause));
+            tx.put(place, "place.quarantined");
+        }
+    }
+}
+
+/// The robot reported: what was closed because nobody knew about it opens again.
+pub fn lift_quarantine(tx: &mut Tx, robot_id: &RobotId) {
+    for id in places_of(tx, robot_id) {
+        let Some(mut place) = tx.view.places.get(&id).map(|p| p.row.clone()) else { continue };
+        let ours = place
+            .quarantine
+            .as_ref()
+            .is_some_and(|q| q.metadata.get("robot_id").is_some_and(|r| r == robot_id.as_str()));
+        if ours {
+            place.quarantine = None;
+            tx.put(place, "place.quarantine_lifted");
+        }
+    }
+}
+
+/// Ids of the places a robot holds.
+pub fn places_of(tx: &Tx, robot_id: &RobotId) -> Vec<String> {
+    tx.view.held_places.get(robot_id).map(|p| p.iter().cloned().collect()).unwrap_or_default()
+}
+
+fn move_task(tx: &mut Tx, mut t: TaskState, a: Option<&Attempt>, step: Next, news: &News, intake: &TaskIntake) {
+    let was = t.phase;
+    t.phase = step.phase;
+    t.then = step.then;
+    t.changed = tx.now.utc;
+    if let Some(report) = news.report {
+        t.next_step = t.next_step.max(report.step_index);
+        if report.opened {
+            t.opened = t.robot_id.clone();
+        }
+    }
+    if a.is_some_and(|a| a.accepted.is_some()) && t.started.is_none() {
+        t.started = Some(tx.now.utc);
+    }
+    if step.fate == Fate::End
+        && let Some(a) = a
+    {
+        t.stats += a.stats;
+        count_end(&mut t, a, news, step);
+    }
+    if t.phase != was {
+        entered(tx, &mut t, was, news, intake);
+    }
+    hold_timer(tx, &t, was);
+    tx.put(t, kind_of(step.phase));
+}
+
+fn count_end(t: &mut TaskState, a: &Attempt, news: &News, step: Next) {
+    if a.phase == AttemptPhase::Refused {
+        t.refusals_in_row += 1;
+        let code = a.refusal.as_ref().map(|r| r.code);
+        if matches!(code, Some(Code::UnsupportedAction | Code::UnknownWaypoint)) {
+            t.semantic_refusers.insert(a.robot_id.clone());
+        }
+        return;
+    }
+    t.refusals_in_row = 0;
+    let failed = matches!(news.event, Event::FailedRecoverable | Event::FailedFinal) || step.phase == Phase::RetryWait;
+    if failed && a.accepted.is_some() {
+        t.failures += 1;
+        t.failed_robots.insert(a.robot_id.clone());
+    }
+}
+
+fn kind_of(phase: Phase) -> &'static str {
+    match phase {
+        Phase::Queued => "task.queued",
+        Phase::Assigned => "task.assigned",
+        Phase::Running => "task.running",
+        Phase::Held => "task.held",
+        Phase::Suspended => "task.suspended",
+        Phase::Stopping => "task.stopping",
+        Phase::RetryWait => "task.retry_wait",
+        Phase::NeedsOperator => "task.needs_operator",
+        Phase::Succeeded => "task.succeeded",
+        Phase::Failed => "task.failed",
+        Phase::Canceled => "task.canceled",
+        Phase::Expired => "task.expired",
+    }
+}
+
+/// What goes with entering a phase.
+fn entered(tx: &mut Tx, t: &mut TaskState, was: Phase, news: &News, intake: &TaskIntake) {
+    t.retry_at = None;
+    t.reason = news.why.cloned().or_else(|| default_reason(t, news));
+    let waiting = AttemptId { subject: Subject::Task(t.task_id.clone()), epoch: 0 };
+    if matches!(was, Phase::Queued | Phase::RetryWait) {
+        disarm(tx, TimerKind::RetryDue, &waiting);
+    }
+    match t.phase {
+        Phase::Queued => {
+            t.queued_since = tx.now.utc;
+            t.reason = None;
+            if was == Phase::NeedsOperator {
+                t.failures = 0;
+                t.refusals_in_row = 0;
+                t.semantic_refusers.clear();
+                t.failed_robots.clear();
+            }
+        }
+        Phase::RetryWait => {
+            let wait_ms = intake.spec.retry.back_off_ms(t.failures, draw(&t.task_id, t.epoch));
+            t.retry_at = Some(tx.now.utc.plus_ms(wait_ms));
+            arm(tx, TimerKind::RetryDue, &waiting, wait_ms);
+        }
+        Phase::Running | Phase::Held => disarm(tx, TimerKind::ScheduleToStart, &waiting),
+        phase if phase.is_terminal() => {
+            t.ended = Some(tx.now.utc);
+            disarm_all(tx, &waiting);
+        }
+        Phase::NeedsOperator => disarm_all(tx, &waiting),
+        _ => {}
+    }
+}
+
+fn default_reason(t: &TaskState, news: &News) -> Option<Reason> {
+    let fault = news.report.and_then(|r| r.fault.as_ref());
+    let code = match (t.phase, news.event) {
+        (Phase::NeedsOperator, Event::FailedFinal) => Code::FaultNotRecoverable,
+        (Phase::NeedsOperator, Event::FailedRecoverable) => Code::AttemptsSpent,
+        (Phase::NeedsOperator, Event::Refused) => Code::NoRobotAccepts,
+        (Phase::NeedsOperator, Event::StopConfirmed) => Code::RobotDroppedIt,
+        (Phase::Failed, Event::Refused) => Code::NoRobotCan,
+        (Phase::Failed, _) => Code::TaskFailed,
+        (Phase::RetryWait, _) => Code::WaitingForRetry,
+        (Phase::Queued | Phase::Assigned | Phase::Running | Phase::Succeeded, _) => return None,
+        _ => return t.reason.clone(),
+    };
+    let mut reason = Reason::from(code);
+    if let Some(fault) = fault {
+        reason = reason.with("fault_code", fault.code).with("fault", &fault.message);
+    }
+    Some(reason)
+}
+
+/// A number in 0..1 from the task and its epoch: spreads back-offs, the same in every replay.
+fn draw(task_id: &TaskId, epoch: u64) -> f64 {
+    let mut hash = 0xcbf2_9ce4_8422_2325_u64 ^ epoch;
+    for byte in task_id.as_str().bytes() {
+        hash = (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
+    }
+    (hash >> 11) as f64 / (1_u64 << 53) as f64
+}
+
+/// start_to_close stands still while held.
+fn hold_timer(tx: &mut Tx, t: &TaskState, was: Phase) {
+    let Some(id) = t.attempt_id() else { return };
+    let Some(mut timer) = tx.view.timers.get(&Timer::id_of(TimerKind::StartToClose, &id)).map(|t| t.row.clone()) else {
+        return;
+    };
+    let served = tx.view.serving(&tx.now).site_ms;
+    match (was, t.phase, timer.fires_at_service_ms) {
+        (_, Phase::Held, Some(at)) => {
+            timer.remaining_ms = at.saturating_sub(served);
+            timer.fires_at_service_ms = None;
+        }
+        (Phase::Held, Phase::Running, None) => timer.fires_at_service_ms = Some(served + timer.remaining_ms),
+        _ => return,
+    }
+    tx.put(timer, "timer.changed");
+}
+
+/// Sets a deadline `after_ms` of its own clock from now.
+pub fn arm(tx: &mut Tx, kind: TimerKind, attempt: &AttemptId, after_ms: u64) {
+    let served = tx.view.serving(&tx.now);
+    let base = if kind.is_site() { served.site_ms } else { served.link_ms };
+    let timer = Timer { kind, attempt: attempt.clone(), fires_at_service_ms: Some(base + after_ms), remaining_ms: 0 };
+    tx.put(timer, "timer.armed");
+}
+
+/// Takes a deadline away, if there is one.
+pub fn disarm(tx: &mut Tx, kind: TimerKind, attempt: &AttemptId) {
+    tx.delete::<Timer>(&Timer::id_of(kind, attempt), "timer.disarmed");
+}
+
+fn disarm_all(tx: &mut Tx, attempt: &AttemptId) {
+    use TimerKind::{OfferAck, RetryDue, ScheduleToStart, StartToClose, StopConfirm, Uncertain};
+    for kind in [OfferAck, StopConfirm, Uncertain, StartToClose, ScheduleToStart, RetryDue] {
+        disarm(tx, kind, attempt);
+    }
+}
+
+/// What the robot reported, as the table's event. None: it changes nothing but the report itself.
+pub fn event_of(report: &AttemptReport) -> Event {
+    match report.state {
+        WorkState::Accepted => Event::Accepted,
+        WorkState::Refused => Event::Refused,
+        WorkState::Navigating | WorkState::Executing | WorkState::Paused | WorkState::Stopping => Event::Progress,
+        WorkState::Succeeded => Event::Succeeded,
+        WorkState::Failed => match report.fault.as_ref().map(|f| f.class) {
+            Some(FaultClass::Recoverable) => Event::FailedRecoverable,
+            _ => Event::FailedFinal,
+        },
+        WorkState::Aborted | WorkState::Suspended => Event::StopConfirmed,
+        WorkState::StepUnknown => Event::StepUnknown,
+    }
+}
+
+/// Where `then` of a finished cancel is shown while the robot still stops.
+pub fn wants_cancel(task: &TaskState) -> bool {
+    task.then == Some(Then::Canceled)
+}
