@@ -3,6 +3,13 @@
 //! Invariant: no rule is decided here. Conversions parse into core types, listing every violation, or write core types out; rules live in core.
 //! Called by every service, the agent, the simulator and the CLI.
 
+pub mod convert;
+pub mod json;
+pub mod session;
+pub mod status;
+
+pub use convert::{Parse, parse};
+
 /// Descriptors of all packages with their comments, for reflection and JSON.
 pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptor_set.bin"));
 

@@ -1,0 +1,211 @@
+//! Poses, reasons, faults, authority, sums, times and JSON objects.
+
+use super::{At, Parse, WireEnum, from_one, need, word};
+use crate::common::v1;
+use midshift_core::authority::Authority;
+use midshift_core::reason::{Reason, Violation, Violations};
+use midshift_core::robot::{Fault, Pose};
+use midshift_core::time::Utc;
+use midshift_core::work::WorkStats;
+use prost_types::value::Kind;
+use prost_types::{Duration, ListValue, Struct, Timestamp};
+use serde_json::{Map, Value};
+
+/// Longest text of a fault, bytes.
+const FAULT_MESSAGE_BYTES: usize = 200;
+/// Facts behind one reason.
+const METADATA_MAX: usize = 16;
+/// Integers beyond this lose digits in a double.
+const EXACT: f64 = 9_007_199_254_740_992.0;
+
+impl From<&Pose> for v1::Pose {
+    fn from(pose: &Pose) -> Self {
+        Self { x_mm: pose.x_mm, y_mm: pose.y_mm, theta_mrad: pose.theta_mrad }
+    }
+}
+
+impl Parse<Pose> for v1::Pose {
+    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<Pose> {
+        if !(-3142..=3142).contains(&self.theta_mrad) {
+            bad.add(at.field("theta_mrad").to_string(), "must be -3142..3142");
+            return None;
+        }
+        Some(Pose { x_mm: self.x_mm, y_mm: self.y_mm, theta_mrad: self.theta_mrad })
+    }
+}
+
+impl From<&Reason> for v1::Reason {
+    fn from(reason: &Reason) -> Self {
+        Self {
+            code: reason.code.as_str().to_owned(),
+            message: reason.message.clone(),
+            metadata: reason.metadata.clone(),
+        }
+    }
+}
+
+/// A reason for people: the code's own sentence where it has no other.
+pub fn shown(reason: &Reason) -> v1::Reason {
+    v1::Reason { message: reason.text().to_owned(), ..v1::Reason::from(reason) }
+}
+
+impl Parse<Reason> for v1::Reason {
+    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<Reason> {
+        if self.metadata.len() > METADATA_MAX {
+            bad.add(at.field("metadata").to_string(), "must be at most 16 entries");
+            return None;
+        }
+        let Ok(code) = self.code.parse() else {
+            bad.add(at.field("code").to_string(), format!("{:?} is not a known code", self.code));
+            return None;
+        };
+        Some(Reason { code, message: self.message, metadata: self.metadata })
+    }
+}
+
+impl From<&Fault> for v1::Fault {
+    fn from(fault: &Fault) -> Self {
+        Self { code: fault.code, fault_class: fault.class.to_wire(), message: fault.message.clone() }
+    }
+}
+
+impl Parse<Fault> for v1::Fault {
+    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<Fault> {
+        let code = from_one(u64::from(self.code), at.field("code"), bad);
+        let class = word(self.fault_class, at.field("fault_class"), bad);
+        if self.message.len() > FAULT_MESSAGE_BYTES {
+            bad.add(at.field("message").to_string(), "must be at most 200 bytes");
+            return None;
+        }
+        Some(Fault { code: code? as u32, class: class?, message: self.message })
+    }
+}
+
+impl From<&Authority> for v1::Authority {
+    fn from(authority: &Authority) -> Self {
+        Self { session_epoch: authority.session_epoch, hb: authority.hb, valid_ms: authority.valid_ms }
+    }
+}
+
+impl Parse<Authority> for v1::Authority {
+    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<Authority> {
+        let session_epoch = from_one(self.session_epoch, at.field("session_epoch"), bad);
+        let valid_ms = from_one(self.valid_ms, at.field("valid_ms"), bad);
+        // 0 is no heartbeat that anybody sent: it is refused by the authority rule, not by the shape of the message.
+        Some(Authority { session_epoch: session_epoch?, hb: self.hb, valid_ms: valid_ms? })
+    }
+}
+
+impl From<&WorkStats> for v1::WorkStats {
+    fn from(stats: &WorkStats) -> Self {
+        Self {
+            path_mm: stats.path_mm,
+            loaded_path_mm: stats.loaded_path_mm,
+            duration_ms: stats.duration_ms,
+            energy_mwh: stats.energy_mwh,
+            hottest_joint_decidegrees: stats.hottest_joint_decidegrees,
+        }
+    }
+}
+
+impl From<v1::WorkStats> for WorkStats {
+    fn from(stats: v1::WorkStats) -> Self {
+        Self {
+            path_mm: stats.path_mm,
+            loaded_path_mm: stats.loaded_path_mm,
+            duration_ms: stats.duration_ms,
+            energy_mwh: stats.energy_mwh,
+            hottest_joint_decidegrees: stats.hottest_joint_decidegrees,
+        }
+    }
+}
+
+impl From<&Violation> for v1::FieldViolation {
+    fn from(violation: &Violation) -> Self {
+        Self { field: violation.field.clone(), description: violation.description.clone() }
+    }
+}
+
+/// UTC as the well-known type.
+pub fn timestamp(utc: Utc) -> Timestamp {
+    Timestamp { seconds: utc.0.div_euclid(1000), nanos: (utc.0.rem_euclid(1000) * 1_000_000) as i32 }
+}
+
+/// UTC from the well-known type; what is below a millisecond is cut off.
+pub fn time_of(timestamp: &Timestamp) -> Utc {
+    Utc(timestamp.seconds.saturating_mul(1000).saturating_add(i64::from(timestamp.nanos.div_euclid(1_000_000))))
+}
+
+/// Milliseconds of a duration; what is below one is cut off, what does not fit is the largest.
+pub fn ms_of(duration: &Duration) -> i64 {
+    duration.seconds.saturating_mul(1000).saturating_add(i64::from(duration.nanos / 1_000_000))
+}
+
+/// A duration of milliseconds.
+pub fn duration(ms: u64) -> Duration {
+    Duration { seconds: (ms / 1000) as i64, nanos: ((ms % 1000) * 1_000_000) as i32 }
+}
+
+/// A JSON object as the well-known type. Numbers become doubles, as JSON readers elsewhere have them.
+pub fn to_struct(map: &Map<String, Value>) -> Struct {
+    Struct { fields: map.iter().map(|(k, v)| (k.clone(), to_value(v))).collect() }
+}
+
+fn to_value(value: &Value) -> prost_types::Value {
+    let kind = match value {
+        Value::Null => Kind::NullValue(0),
+        Value::Bool(b) => Kind::BoolValue(*b),
+        Value::Number(n) => Kind::NumberValue(n.as_f64().unwrap_or(f64::NAN)),
+        Value::String(s) => Kind::StringValue(s.clone()),
+        Value::Array(items) => Kind::ListValue(ListValue { values: items.iter().map(to_value).collect() }),
+        Value::Object(map) => Kind::StructValue(to_struct(map)),
+    };
+    prost_types::Value { kind: Some(kind) }
+}
+
+/// A JSON object from the well-known type. A double without a fraction becomes an integer; one that JSON cannot say becomes null.
+pub fn from_struct(value: Struct) -> Map<String, Value> {
+    value.fields.into_iter().map(|(k, v)| (k, from_value(v))).collect()
+}
+
+fn from_value(value: prost_types::Value) -> Value {
+    match value.kind {
+        None | Some(Kind::NullValue(_)) => Value::Null,
+        Some(Kind::BoolValue(b)) => Value::Bool(b),
+        Some(Kind::NumberValue(n)) if n.fract() == 0.0 && n.abs() < EXACT => Value::from(n as i64),
+        Some(Kind::NumberValue(n)) => Value::from(n),
+        Some(Kind::StringValue(s)) => Value::String(s),
+        Some(Kind::ListValue(list)) => Value::Array(list.values.into_iter().map(from_value).collect()),
+        Some(Kind::StructValue(map)) => Value::Object(from_struct(map)),
+    }
+}
+
+/// Reads an authority that must be there.
+pub(crate) fn authority(wire: Option<v1::Authority>, at: At<'_>, bad: &mut Violations) -> Option<Authority> {
+    need(wire, at, bad)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn a_time_reads_back(ms in -62_000_000_000_000i64..250_000_000_000_000) {
+            prop_assert_eq!(time_of(&timestamp(Utc(ms))), Utc(ms));
+        }
+
+        #[test]
+        fn a_duration_reads_back(ms in 0u64..1_000_000_000_000) {
+            prop_assert_eq!(ms_of(&duration(ms)), ms as i64);
+        }
+    }
+
+    #[test]
+    fn a_json_object_reads_back() {
+        let text = r#"{"a":[1,-2.5,null,true,{"b":"c"}],"item":"SKU-1","n":9007199254740991}"#;
+        let Value::Object(map) = serde_json::from_str(text).expect("json") else { panic!("not an object") };
+        assert_eq!(from_struct(to_struct(&map)), map);
+    }
+}

@@ -1,0 +1,98 @@
+//! Enums of core and their numbers on the wire.
+
+use crate::{common, fleet, link, task, telemetry};
+use midshift_core::robot::{Duty, FaultClass, HardwareStop, Lane, Mode, Presence, StopLevel};
+use midshift_core::task::state::Errand;
+use midshift_core::task::{AttemptPhase, Phase, Resolution, Then};
+use midshift_core::work::{Effect, PlaceNews, WorkState};
+
+/// A core enum with its twin on the wire.
+pub trait WireEnum: Sized {
+    /// Its number.
+    fn to_wire(self) -> i32;
+    /// None for UNSPECIFIED (unless the .proto gives it a meaning) and for numbers this build does not know.
+    fn from_wire(number: i32) -> Option<Self>;
+}
+
+macro_rules! wire_enums {
+    ($($core:ident = $wire:path { $($a:ident = $b:ident),* $(,)? })*) => {
+        $(impl WireEnum for $core {
+            fn to_wire(self) -> i32 {
+                use $wire as W;
+                match self { $(Self::$a => W::$b as i32),* }
+            }
+            fn from_wire(number: i32) -> Option<Self> {
+                use $wire as W;
+                $(if number == W::$b as i32 { return Some(Self::$a); })*
+                None
+            }
+        })*
+        #[cfg(test)]
+        mod tests {
+            use super::*;
+
+            #[test]
+            fn every_enum_reads_back_and_every_number_but_zero_has_a_meaning() {
+                $(
+                    $(assert_eq!($core::from_wire($core::$a.to_wire()), Some($core::$a));)*
+                    for number in 1..32 {
+                        use $wire as W;
+                        assert_eq!(W::try_from(number).is_ok(), $core::from_wire(number).is_some(), "{} {number}", stringify!($core));
+                    }
+                )*
+            }
+        }
+    };
+}
+
+wire_enums! {
+    FaultClass = common::v1::FaultClass { Recoverable = Recoverable, Mechanical = Mechanical, Stop = Stop, Semantic = Semantic }
+    Lane = link::v1::Lane { Critical = Critical, Event = Event, Status = Status }
+    Mode = link::v1::Mode { Automatic = Automatic, Manual = Manual, Service = Service }
+    StopLevel = link::v1::StopLevel { None = Unspecified, Slow = Slow, Halt = Halt, ControlledStopPosture = ControlledStopPosture }
+    HardwareStop = link::v1::HardwareStop { None = Unspecified, Manual = Manual, AutoAck = AutoAck, Remote = Remote }
+    WorkState = link::v1::WorkState {
+        Accepted = Accepted, Refused = Refused, Navigating = Navigating, Executing = Executing, Paused = Paused, Stopping = Stopping,
+        Succeeded = Succeeded, Failed = Failed, Aborted = Aborted, Suspended = Suspended, StepUnknown = StepUnknown,
+    }
+    PlaceNews = link::v1::PlaceNews { Entered = Entered, Left = Left, NotEntered = NotEntered }
+    Effect = link::v1::WorkEffect { Repeatable = Repeatable, CheckFirst = CheckFirst, AtMostOnce = AtMostOnce }
+    Presence = telemetry::v1::Presence { Online = Online, Suspect = Suspect, Offline = Offline, Updating = Updating }
+    Duty = fleet::v1::Duty { InWork = InWork, Cordoned = Cordoned, BrokenOff = BrokenOff, Retired = Retired }
+    Errand = fleet::v1::Errand { Charge = Charge, Park = Park }
+    Phase = task::v1::TaskState {
+        Queued = Queued, Assigned = Assigned, Running = Running, Held = Held, Suspended = Suspended, Stopping = Stopping,
+        RetryWait = RetryWait, NeedsOperator = NeedsOperator, Succeeded = Succeeded, Failed = Failed, Canceled = Canceled, Expired = Expired,
+    }
+    Then = task::v1::StopThen {
+        Canceled = Canceled, Failed = Failed, Retry = Retry, Suspended = Suspended, Requeue = Requeue, Expired = Expired,
+        NeedsOperator = NeedsOperator,
+    }
+    AttemptPhase = task::v1::AttemptState {
+        Offered = Offered, Accepted = Accepted, Navigating = Navigating, Executing = Executing, Paused = Paused, Stopping = Stopping,
+        Refused = Refused, OfferExpired = OfferExpired, Succeeded = Succeeded, Failed = Failed, Aborted = Aborted, Lost = Lost,
+    }
+    Resolution = task::v1::Resolution {
+        Requeue = Requeue, RequeueHandedOver = RequeueHandedOver, RequeuePutBack = RequeuePutBack, Succeeded = Succeeded, Failed = Failed,
+        FailedItemLost = FailedItemLost, Canceled = Canceled,
+    }
+}
+
+/// `TaskSpec`'s effects have the numbers of `WorkEffect`; a test holds them together.
+pub(crate) fn step_effect(effect: Effect) -> i32 {
+    effect.to_wire()
+}
+
+#[cfg(test)]
+mod step_tests {
+    use super::*;
+
+    #[test]
+    fn the_effects_of_a_spec_and_of_work_have_the_same_numbers() {
+        for number in 0..=3 {
+            let spec = task::v1::StepEffect::try_from(number).expect("known").as_str_name();
+            let work = link::v1::WorkEffect::try_from(number).expect("known").as_str_name();
+            assert_eq!(spec.strip_prefix("STEP_EFFECT_"), work.strip_prefix("WORK_EFFECT_"));
+        }
+    }
+}
