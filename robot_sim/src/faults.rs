@@ -70,14 +70,20 @@ impl FaultRates {
 pub enum Injected {
     /// Something stands in the way for this long, from now on if it drives, else on its next leg.
     Obstacle(SiteDuration),
-    /// The next pick closes on nothing.
-    GripperMissed,
+    /// The next picks, this many, close on nothing.
+    GripperMissed(u32),
     /// A jam, now.
     Jam,
     /// No network for this long.
+    DropNetwork(SiteDuration),
+    /// The agent runs, and its heartbeats do not leave for this long.
     Silence(SiteDuration),
     /// A person drives for this long.
     Manual(SiteDuration),
+    /// The maker's own safety system stops it for this long and ends that by itself.
+    HardwareStop(SiteDuration),
+    /// The state of charge falls to this, permille.
+    LowBattery(u16),
 }
 
 /// A body waits this long for an obstacle to go away before it gives up.

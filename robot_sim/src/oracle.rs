@@ -32,6 +32,8 @@ pub struct Verdict {
     pub items_broken: u64,
     /// Entries into a place that was full at that moment.
     pub exclusion_violations: u64,
+    /// Of these, by the robot that entered. Robots without one are left out.
+    pub violations_by_robot: BTreeMap<RobotId, u64>,
     /// Picks and drops of a task's step that had been done before.
     pub steps_done_twice: u64,
     /// Findings in words, at most 100 of each kind.
@@ -67,7 +69,7 @@ struct Stay {
 struct Room {
     capacity: u32,
     stays: Vec<Stay>,
-    violations: u64,
+    violations: BTreeMap<RobotId, u64>,
     words: Vec<String>,
 }
 
@@ -90,7 +92,7 @@ pub struct Oracle {
 impl Oracle {
     /// For a site whose places have these capacities. Places not named are not judged.
     pub fn new(capacities: impl IntoIterator<Item = (PlaceId, u32)>) -> Self {
-        let room = |capacity| Room { capacity, stays: Vec::new(), violations: 0, words: Vec::new() };
+        let room = |capacity| Room { capacity, stays: Vec::new(), violations: BTreeMap::new(), words: Vec::new() };
         Self { rooms: capacities.into_iter().map(|(id, n)| (id, room(n))).collect(), ..Self::default() }
     }
     /// For the places of a site; none are judged where the site says that bodies may drive through each other.
@@ -141,11 +143,13 @@ impl Oracle {
     /// What was found so far.
     pub fn verdict(&self) -> Verdict {
         let mut findings = self.words.clone();
-        let mut violations = 0;
+        let mut by_robot = BTreeMap::new();
         for (place_id, room) in &self.rooms {
             let mut open = room.clone();
             open.judge(place_id, |_| true);
-            violations += open.violations;
+            for (robot, times) in open.violations {
+                *by_robot.entry(robot).or_insert(0) += times;
+            }
             findings.extend(open.words);
         }
         let on_robots = self.items.values().filter(|s| matches!(s, Spot::On(_))).count() as u64;
@@ -156,7 +160,8 @@ impl Oracle {
             items_on_robots: on_robots,
             items_shipped: self.shipped,
             items_broken: self.broken,
-            exclusion_violations: violations,
+            exclusion_violations: by_robot.values().sum(),
+            violations_by_robot: by_robot,
             steps_done_twice: self.twice,
             findings,
         }
@@ -244,7 +249,7 @@ impl Room {
             let others = self.stays.iter().enumerate().filter(|(j, s)| *j != i && before(*j, s) && lasts(s));
             let others: Vec<&RobotId> = others.map(|(_, s)| &s.robot_id).collect();
             if lasts(stay) && others.len() >= self.capacity as usize {
-                self.violations += 1;
+                *self.violations.entry(stay.robot_id.clone()).or_insert(0) += 1;
                 if self.words.len() < WORDS_MAX {
                     let robot = &stay.robot_id;
                     self.words.push(format!("{robot} entered {place_id} at {at} while {others:?} were inside"));

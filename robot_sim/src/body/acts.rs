@@ -76,7 +76,9 @@ impl SimBody {
         let left = SiteDuration(self.rng.random_range(usual_ms * 4 / 5..=usual_ms * 6 / 5));
         let jams = self.rng.random_bool(rates.jam_per_action.clamp(0.0, 1.0));
         let missed = self.rng.random_bool(rates.gripper_per_pick.clamp(0.0, 1.0));
-        let misses = deed == Deed::Pick && (std::mem::take(&mut self.miss_next) || missed);
+        let made_to = deed == Deed::Pick && self.misses_next > 0;
+        self.misses_next -= u32::from(made_to);
+        let misses = deed == Deed::Pick && (made_to || missed);
         Ok(Act { deed, item, left, jams, misses })
     }
     /// The end of an action: the one moment at which the world changes by it.
@@ -110,6 +112,7 @@ impl SimBody {
         };
         let named = if act.item.is_empty() { sku_of(&found).to_owned() } else { act.item.clone() };
         self.load = Some(Load { task_id: self.work.as_ref().map(|w| w.task_id.clone()), item: named });
+        self.counts.picks += 1;
         self.remember("pick");
         self.news.push_back(BodyNews::Load(self.load.clone()));
         Ok(())
@@ -120,6 +123,7 @@ impl SimBody {
         let placed = at.and_then(|at| lock(&self.world).place(now, robot, &at, self.work.clone()));
         placed.ok_or_else(faults::load_lost)?;
         self.load = None;
+        self.counts.places += 1;
         self.remember("place");
         self.news.push_back(BodyNews::Load(None));
         Ok(())

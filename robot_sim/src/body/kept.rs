@@ -112,7 +112,7 @@ impl SimBody {
         self.odometer_mm = kept.odometer_mm;
         self.loaded_mm = kept.loaded_mm;
         self.rng = self.config.rng(life);
-        self.silence_at = draw_next(&mut self.rng, now, self.config.faults.silence_per_hour);
+        self.drop_at = draw_next(&mut self.rng, now, self.config.faults.silence_per_hour);
         self.manual_at = draw_next(&mut self.rng, now, self.config.faults.manual_per_hour);
     }
     /// Writes the body's file, if it has one. A failure is logged: the body goes on.

@@ -24,7 +24,7 @@ use nalgebra::{Isometry2, Vector2};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use tokio::sync::watch;
 
@@ -97,6 +97,10 @@ pub struct Counts {
     pub idle_ms: u64,
     /// Obstacles met.
     pub obstacles: u64,
+    /// Picks done.
+    pub picks: u64,
+    /// Places done.
+    pub places: u64,
     /// Picks that closed on nothing.
     pub misses: u64,
     /// Jams.
@@ -163,14 +167,18 @@ pub struct SimBody {
     recent: VecDeque<(TaskId, String)>,
     block: Option<Block>,
     pending_block: Option<SiteDuration>,
-    miss_next: bool,
+    misses_next: u32,
     network: watch::Sender<bool>,
-    silence_at: Option<SiteTime>,
-    silent_until: Option<SiteTime>,
+    heartbeats: watch::Sender<bool>,
+    drop_at: Option<SiteTime>,
+    dropped_until: Option<SiteTime>,
+    muted_until: Option<SiteTime>,
+    stopped_until: Option<SiteTime>,
     manual_at: Option<SiteTime>,
     manual_until: Option<SiteTime>,
     idle_since: SiteTime,
     counts: Counts,
+    faults_by_code: BTreeMap<u32, u64>,
     keeper: Option<Keeper>,
 }
 
@@ -213,14 +221,18 @@ impl SimBody {
             recent: VecDeque::new(),
             block: None,
             pending_block: None,
-            miss_next: false,
+            misses_next: 0,
             network: watch::Sender::new(true),
-            silence_at: draw_next(&mut rng, now, config.faults.silence_per_hour),
-            silent_until: None,
+            heartbeats: watch::Sender::new(true),
+            drop_at: draw_next(&mut rng, now, config.faults.silence_per_hour),
+            dropped_until: None,
+            muted_until: None,
+            stopped_until: None,
             manual_at: draw_next(&mut rng, now, config.faults.manual_per_hour),
             manual_until: None,
             idle_since: now,
             counts: Counts::default(),
+            faults_by_code: BTreeMap::new(),
             keeper: None,
             config,
             site,
@@ -235,6 +247,14 @@ impl SimBody {
     /// Whether its network is up, now and whenever it changes.
     pub fn network(&self) -> watch::Receiver<bool> {
         self.network.subscribe()
+    }
+    /// Whether its heartbeats leave, now and whenever that changes.
+    pub fn heartbeats(&self) -> watch::Receiver<bool> {
+        self.heartbeats.subscribe()
+    }
+    /// Faults so far by the maker's code.
+    pub fn faults_by_code(&self) -> &BTreeMap<u32, u64> {
+        &self.faults_by_code
     }
     /// What it did so far.
     pub fn counts(&self) -> Counts {
@@ -266,10 +286,16 @@ impl SimBody {
         match what {
             Injected::Obstacle(lasts) if matches!(self.phase, Phase::Leg { .. }) => self.meet_obstacle(now, lasts),
             Injected::Obstacle(lasts) => self.pending_block = Some(lasts),
-            Injected::GripperMissed => self.miss_next = true,
+            Injected::GripperMissed(times) => self.misses_next = times.max(1),
             Injected::Jam => self.jam(now),
-            Injected::Silence(lasts) => self.fall_silent(now, lasts),
+            Injected::DropNetwork(lasts) => self.lose_network(now, lasts),
+            Injected::Silence(lasts) => self.mute(now, lasts),
             Injected::Manual(lasts) => self.take_over(now, lasts),
+            Injected::HardwareStop(lasts) => self.stop_hard(now, lasts),
+            Injected::LowBattery(permille) => {
+                let Stores { spent_mwh, joint_c, .. } = self.stores;
+                self.stores = Stores { spent_mwh, joint_c, ..Stores::new(permille, self.config.drains) };
+            }
         }
     }
     /// A person mends what is broken; an empty battery is changed for a half-full one.
@@ -298,8 +324,11 @@ impl SimBody {
     /// A person who drives hands it back.
     pub fn hand_back(&mut self, now: SiteTime) {
         self.advance(now);
+        self.end_manual(now);
+    }
+    fn end_manual(&mut self, now: SiteTime) {
+        self.manual_until = None;
         if std::mem::take(&mut self.mode) != Mode::Automatic {
-            self.manual_until = None;
             self.news.push_back(BodyNews::Mode(Mode::Automatic));
             self.go(now);
         }
@@ -324,23 +353,32 @@ impl SimBody {
             }
             Phase::Blocked { until, .. } | Phase::Acting { until } => Some(*until),
         };
-        let empties = self.stores.lasts(&self.effort(self.speed_mm_s(self.at))).map(|lasts| self.at + lasts);
+        let empties = self.stores.lasts(&self.effort(f64::from(self.speed_mm_s(self.at)))).map(|lasts| self.at + lasts);
         let dead = (self.is_empty() && self.broken.is_none()).then_some(self.at);
-        let timers = [self.silence_at, self.silent_until, self.manual_at, self.manual_until];
-        [phase, empties, dead].into_iter().chain(timers).flatten().min()
+        let drops = [self.drop_at, self.dropped_until, self.muted_until];
+        let stands = [self.stopped_until, self.manual_at, self.manual_until];
+        [phase, empties, dead].into_iter().chain(drops).chain(stands).flatten().min()
     }
     /// What happens at `now`, to which everything is settled.
     fn happen(&mut self, now: SiteTime) {
         let due = |at: Option<SiteTime>| at.is_some_and(|at| at <= now);
-        if due(self.silent_until) {
-            self.silent_until = None;
+        if due(self.dropped_until) {
+            self.dropped_until = None;
             self.network.send_replace(true);
-        } else if due(self.silence_at) {
-            self.silence_at = draw_next(&mut self.rng, now, self.config.faults.silence_per_hour);
+        } else if due(self.drop_at) {
+            self.drop_at = draw_next(&mut self.rng, now, self.config.faults.silence_per_hour);
             let lasts = draw_secs(&mut self.rng, 2..=20);
-            self.fall_silent(now, lasts);
+            self.lose_network(now, lasts);
+        } else if due(self.muted_until) {
+            self.muted_until = None;
+            self.heartbeats.send_replace(true);
+        } else if due(self.stopped_until) {
+            self.stopped_until = None;
+            self.hardware_stop = HardwareStop::None;
+            self.news.push_back(BodyNews::HardwareStop(HardwareStop::None));
+            self.go(now);
         } else if due(self.manual_until) {
-            self.hand_back(now);
+            self.end_manual(now);
         } else if due(self.manual_at) {
             self.manual_at = draw_next(&mut self.rng, now, self.config.faults.manual_per_hour);
             let lasts = draw_secs(&mut self.rng, 30..=120);
@@ -406,17 +444,25 @@ impl SimBody {
     }
     /// Frame, millimetres driven since it was settled, battery and heat at `now`, if nothing happens until then.
     fn glance(&self, now: SiteTime) -> (Isometry2<f64>, f64, Stores) {
-        let time = now.since(self.at);
+        let ends = match &self.phase {
+            Phase::Still => now,
+            Phase::Leg { leg, .. } => leg.end(),
+            Phase::Blocked { until, .. } | Phase::Acting { until } => *until,
+        };
+        let ends = ends.clamp(self.at, now.max(self.at));
+        let busy = ends.since(self.at);
         let (frame, driven_mm) = match &self.phase {
             Phase::Leg { leg, .. } => (leg.frame(now), leg.driven_mm(now) - leg.driven_mm(self.at)),
             _ => (self.frame, 0.0),
         };
-        let speed_mm_s = if time.as_ms() == 0 { 0.0 } else { driven_mm / time.as_secs_f64() };
-        (frame, driven_mm, self.stores.after(time, &self.effort(speed_mm_s as u32)))
+        let speed_mm_s = if busy.as_ms() == 0 { 0.0 } else { driven_mm / busy.as_secs_f64() };
+        let effort = self.effort(speed_mm_s);
+        let rest = Effort { speed_m_s: 0.0, acting: false, ..effort };
+        (frame, driven_mm, self.stores.after(busy, &effort).after(now.since(ends), &rest))
     }
-    fn effort(&self, speed_mm_s: u32) -> Effort {
+    fn effort(&self, speed_mm_s: f64) -> Effort {
         Effort {
-            speed_m_s: f64::from(speed_mm_s) / 1000.0,
+            speed_m_s: speed_mm_s / 1000.0,
             loaded: self.load.is_some(),
             acting: matches!((&self.phase, &self.order), (Phase::Acting { .. }, Some(Order::Act(act))) if act.works()),
             parked: self.parked,
@@ -438,10 +484,31 @@ impl SimBody {
             _ => None,
         }
     }
-    fn fall_silent(&mut self, now: SiteTime, lasts: SiteDuration) {
+    fn lose_network(&mut self, now: SiteTime, lasts: SiteDuration) {
         self.counts.silences += 1;
-        self.silent_until = Some(now + lasts);
+        self.dropped_until = Some(now + lasts);
         self.network.send_replace(false);
+    }
+    fn mute(&mut self, now: SiteTime, lasts: SiteDuration) {
+        self.counts.silences += 1;
+        self.muted_until = Some(now + lasts);
+        self.heartbeats.send_replace(false);
+    }
+    fn stop_hard(&mut self, now: SiteTime, lasts: SiteDuration) {
+        self.stopped_until = Some(now + lasts);
+        if self.hardware_stop == HardwareStop::None {
+            self.halt(now);
+            self.hardware_stop = HardwareStop::AutoAck;
+            self.news.push_back(BodyNews::HardwareStop(HardwareStop::AutoAck));
+        }
+    }
+    /// Whether something other than the world keeps it standing.
+    fn is_kept(&self) -> bool {
+        let stopped = self.hardware_stop != HardwareStop::None;
+        self.paused || stopped || self.mode != Mode::Automatic || self.broken.is_some()
+    }
+    fn count_fault(&mut self, code: u32) {
+        *self.faults_by_code.entry(code).or_insert(0) += 1;
     }
     /// A person drives: the order stays and goes on when the robot is handed back, unless the agent drops it.
     fn take_over(&mut self, now: SiteTime, lasts: SiteDuration) {
@@ -460,15 +527,18 @@ impl SimBody {
     /// A fault that stands until a person clears it.
     fn break_down(&mut self, now: SiteTime, fault: Fault) {
         if self.broken.is_none() {
+            self.count_fault(fault.code);
             self.halt(now);
             if self.order.is_some() {
-                self.fail(now, fault.clone());
+                self.drop_order(now);
+                self.news.push_back(BodyNews::Failed(fault.clone()));
             }
             self.broken = Some(fault.clone());
             self.news.push_back(BodyNews::Fault(fault, true));
         }
     }
     fn fail(&mut self, now: SiteTime, fault: Fault) {
+        self.count_fault(fault.code);
         self.drop_order(now);
         self.news.push_back(BodyNews::Failed(fault));
     }
@@ -509,8 +579,7 @@ impl SimBody {
     }
     /// Goes on with its order if nothing keeps it.
     fn go(&mut self, now: SiteTime) {
-        let kept = self.paused || self.mode != Mode::Automatic || self.broken.is_some();
-        if kept || !matches!(self.phase, Phase::Still) {
+        if self.is_kept() || !matches!(self.phase, Phase::Still) {
             return;
         }
         match &self.order {

@@ -95,8 +95,7 @@ impl Body for SimBody {
         }
     }
     fn standstill(&self, _now: SiteTime) -> bool {
-        let kept = self.paused || self.mode != Mode::Automatic || self.broken.is_some();
-        matches!(self.phase, Phase::Still) && (self.order.is_none() || kept)
+        matches!(self.phase, Phase::Still) && (self.order.is_none() || self.is_kept())
     }
     fn park(&mut self, now: SiteTime) {
         self.advance(now);
