@@ -3,3 +3,16 @@
 //! Invariant: a buffered message never starts the body, and a finished task is never done again.
 
 pub mod body;
+pub mod bugs;
+pub mod core;
+mod drive;
+pub mod governor;
+pub mod lanes;
+pub mod ledger;
+pub mod memory;
+mod offer;
+pub mod places;
+pub mod ring;
+pub mod store;
+pub mod throttle;
+pub mod work;

@@ -1,0 +1,617 @@
+//! The agent without IO: `step(now, input)` decides, drives the body, and says what to keep and what to send.
+//!
+//! Invariant: no clock, no randomness, no waiting. Nothing that depends on a write leaves before [`Input::Persisted`] said that the
+//! write is durable: no message of it, no movement on it. Called by the shell ([`crate::session`]) and by simulations.
+
+use crate::body::{Body, BodyLimits};
+use crate::bugs::Bugs;
+use crate::lanes::{LaneAck, LaneBatch, Sender};
+use crate::ledger::SessionMemory;
+use crate::places::Places;
+use crate::store::{Kept, Op};
+use crate::throttle::Throttle;
+use crate::work::{Doing, Work};
+use midshift_core::authority::SentHeartbeats;
+use midshift_core::ids::{AttemptId, PlaceId, RobotId, WaypointId};
+use midshift_core::limits;
+use midshift_core::robot::{Fault, HardwareStop, Inventory, Lane, Mode, ReportedState, StopLevel, Vitals};
+use midshift_core::time::{LinkDuration, LinkTime, Now, SiteDuration, SiteTime};
+use midshift_core::work::{DesiredPolicy, DesiredWork, RobotEvent, SampleBody};
+use std::collections::{BTreeSet, VecDeque};
+
+/// What does not change while the agent runs.
+#[derive(Clone, Debug)]
+pub struct CoreConfig {
+    /// Who.
+    pub robot_id: RobotId,
+    /// Naive rules for twins of tests; none outside them.
+    pub bugs: Bugs,
+}
+
+/// The server's answer to a Hello.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Welcome {
+    /// max(old + 1, unix ms).
+    pub session_epoch: u64,
+    /// Proves succession in the next Hello.
+    pub secret: String,
+    /// Which store serves.
+    pub store_id: String,
+    /// What it has of this ring.
+    pub acks: Vec<LaneAck>,
+    /// Milliseconds of link time between heartbeats.
+    pub heartbeat_period_ms: u64,
+    /// Milliseconds of site time between STATUS samples.
+    pub status_period_ms: u64,
+    /// Bytes of STATUS that may be under way.
+    pub status_credit_bytes: usize,
+    /// Attached, but no work: two robots claim this id.
+    pub observed: bool,
+}
+
+/// Four timestamps, unix microseconds: robot sent, server received, server answered, robot received (0 in an echo).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ClockSample {
+    /// Robot: heartbeat sent.
+    pub t1_us: i64,
+    /// Server: heartbeat received.
+    pub t2_us: i64,
+    /// Server: echo sent.
+    pub t3_us: i64,
+    /// Robot: echo received.
+    pub t4_us: i64,
+}
+
+/// One message from the server after Welcome.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Downlink {
+    /// Newest heartbeat the server has processed, and its clock sample.
+    pub echo: Option<(u64, ClockSample)>,
+    /// What it has stored.
+    pub acks: Vec<LaneAck>,
+    /// Section work.
+    pub work: Option<DesiredWork>,
+    /// Section policy.
+    pub policy: Option<DesiredPolicy>,
+    /// Bytes of STATUS that may be under way.
+    pub status_credit_bytes: Option<usize>,
+}
+
+/// What happened outside.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Input {
+    /// The process began. Once, first.
+    Start,
+    /// Time went on; see [`AgentCore::next_wake`].
+    Tick,
+    /// A session began.
+    Connected(Welcome),
+    /// The server says something.
+    Down(Box<Downlink>),
+    /// The session ended.
+    Disconnected,
+    /// The server said that a newer session of this robot proved its succession.
+    Fenced,
+    /// This batch and all before it are durable.
+    Persisted(u64),
+}
+
+/// One message to the server.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Uplink {
+    /// Newest wins, never stored.
+    pub heartbeat: Option<Heartbeat>,
+    /// At most 256 samples in all.
+    pub batches: Vec<LaneBatch>,
+}
+
+/// The heartbeat, which is the status.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Heartbeat {
+    /// What the robot believes of itself.
+    pub reported: ReportedState,
+    /// Robot's wall clock, unix microseconds.
+    pub sent_unix_us: i64,
+    /// Newest complete clock sample since the heartbeat before.
+    pub clock: Option<ClockSample>,
+}
+
+/// Why the agent ends by itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ExitReason {
+    /// Asked to.
+    Shutdown,
+    /// Fenced for the second time: another machine has this robot's id and proof.
+    FencedTwice,
+}
+
+/// What to do, in this order.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Output {
+    /// Make these operations durable and say [`Input::Persisted`] with this number. At most one is under way.
+    Persist(u64, Vec<Op>),
+    /// Send this in the session at hand; drop it if there is none.
+    Send(Box<Uplink>),
+    /// End the process.
+    Exit(ExitReason),
+}
+
+/// When to call again if nothing happens before.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Wake {
+    /// On the link clock.
+    pub link: LinkTime,
+    /// On the site clock.
+    pub site: Option<SiteTime>,
+}
+
+/// The session at hand.
+#[derive(Debug)]
+struct Session {
+    epoch: u64,
+    hb: u64,
+    observed: bool,
+}
+
+/// Writes under way and waiting.
+#[derive(Debug, Default)]
+struct Writes {
+    ops: Vec<Op>,
+    urgent: bool,
+    given: u64,
+    durable: u64,
+    batch: u64,
+    /// Batch, number of its last operation, lane numbers at its end.
+    in_flight: Option<(u64, u64, [u64; 3])>,
+    barrier: u64,
+}
+
+/// What the robot runs.
+pub struct AgentCore {
+    pub(crate) config: CoreConfig,
+    pub(crate) body: Box<dyn Body>,
+    pub(crate) limits: BodyLimits,
+    pub(crate) inventory: Inventory,
+    pub(crate) kept: Kept,
+    pub(crate) places: Places,
+    pub(crate) work: Option<Work>,
+    pub(crate) desired: Option<DesiredWork>,
+    pub(crate) sent: SentHeartbeats,
+    pub(crate) mode: Mode,
+    pub(crate) hardware_stop: HardwareStop,
+    pub(crate) heading: Option<WaypointId>,
+    pub(crate) echo_after: Option<LinkTime>,
+    pub(crate) resume_needed: bool,
+    pub(crate) refused: VecDeque<AttemptId>,
+    pub(crate) answered: BTreeSet<AttemptId>,
+    pub(crate) stale_told: BTreeSet<(u64, u64, u64)>,
+    pub(crate) last_site: SiteTime,
+    pub(crate) wake_link: Option<LinkTime>,
+    session: Option<Session>,
+    sender: Sender,
+    throttle: Throttle,
+    writes: Writes,
+    standing_fault: Option<Fault>,
+    battery_critical: bool,
+    odometer_mm: u64,
+    progress: u64,
+    period: LinkDuration,
+    next_beat: LinkTime,
+    status_period: SiteDuration,
+    next_status: SiteTime,
+    clock: Option<ClockSample>,
+    fences: u32,
+}
+
+const STATUS_PERIOD: SiteDuration = SiteDuration(2_000);
+/// Above the critical threshold by this much the battery may become critical again, permille.
+const BATTERY_HYSTERESIS: u16 = 20;
+
+impl AgentCore {
+    /// A robot that remembers `kept`. Call with [`Input::Start`] first.
+    pub fn new(config: CoreConfig, body: Box<dyn Body>, kept: Kept, now: Now) -> Self {
+        let bugs = config.bugs;
+        let (places, restored) = Places::restored(kept.ledger.places.clone(), bugs.grant_from_receipt());
+        let mut throttle = Throttle::new(now.link);
+        restored.into_iter().for_each(|event| throttle.push(Lane::Event, event));
+        Self {
+            limits: body.limits(),
+            inventory: body.capabilities(),
+            mode: body.mode(),
+            hardware_stop: body.hardware_stop(),
+            work: kept.ledger.holder.clone().map(Work::restored),
+            sender: Sender::new(&kept.ring),
+            config,
+            body,
+            kept,
+            places,
+            throttle,
+            desired: None,
+            sent: SentHeartbeats::new(0, None),
+            heading: None,
+            echo_after: None,
+            resume_needed: false,
+            refused: VecDeque::new(),
+            answered: BTreeSet::new(),
+            stale_told: BTreeSet::new(),
+            last_site: now.site,
+            wake_link: None,
+            session: None,
+            writes: Writes::default(),
+            standing_fault: None,
+            battery_critical: false,
+            odometer_mm: 0,
+            progress: 0,
+            period: limits::HEARTBEAT,
+            next_beat: now.link,
+            status_period: STATUS_PERIOD,
+            next_status: now.site,
+            clock: None,
+            fences: 0,
+        }
+    }
+
+    /// Takes one input at one moment and says what to do about it.
+    pub fn step(&mut self, now: Now, input: Input) -> Vec<Output> {
+        let mut out = Vec::new();
+        self.wake_link = None;
+        if let Input::Persisted(batch) = input {
+            self.persisted(batch);
+        }
+        self.elapse(&now);
+        self.take_news(&now);
+        match input {
+            Input::Start => self.start(&now),
+            Input::Tick | Input::Persisted(_) => {}
+            Input::Connected(welcome) => self.connected(&now, welcome),
+            Input::Down(down) => self.down(&now, *down),
+            Input::Disconnected => self.session = None,
+            Input::Fenced => {
+                self.fences += 1;
+                self.session = None;
+                if self.fences >= 2 {
+                    out.push(Output::Exit(ExitReason::FencedTwice));
+                }
+            }
+        }
+        self.advance(&now);
+        let beat = self.beat(&now);
+        self.write_events(&now);
+        self.persist(&now, beat, &mut out);
+        self.send(&now, beat, &mut out);
+        out
+    }
+
+    /// When to call again.
+    pub fn next_wake(&self, now: &Now) -> Wake {
+        let link = [Some(self.next_beat), self.wake_link, self.throttle.next_at()];
+        let body = self.body.next_change(now.site);
+        let site = [Some(self.next_status), body, self.times_out_at(now)];
+        Wake {
+            link: link.into_iter().flatten().min().unwrap_or(self.next_beat),
+            site: site.into_iter().flatten().min(),
+        }
+    }
+
+    /// What the robot believes of itself now, as Hello and heartbeat say it.
+    pub fn reported(&self, now: &Now) -> ReportedState {
+        let session = self.session.as_ref();
+        ReportedState {
+            hb: session.map_or(0, |s| s.hb),
+            session_epoch: session.map_or(0, |s| s.epoch),
+            applied_work: self.kept.ledger.applied.work,
+            applied_policy: self.kept.ledger.applied.policy,
+            produced: Lane::ALL.into_iter().map(|lane| (lane, self.kept.ring.lane(lane).produced)).collect(),
+            mode: self.mode,
+            vitals: self.vitals(now),
+            load: self.body.load(),
+            attempts: self.reported_attempts(now),
+            places: self.places.held(),
+            stop_level: StopLevel::None,
+            hardware_stop: self.hardware_stop,
+            field_violation: self.body.state(now.site).field_violation,
+            fault: self.standing_fault.clone(),
+        }
+    }
+
+    /// What it remembers.
+    pub fn kept(&self) -> &Kept {
+        &self.kept
+    }
+
+    /// Who.
+    pub fn robot_id(&self) -> &RobotId {
+        &self.config.robot_id
+    }
+
+    /// What it says of itself in Hello.
+    pub fn inventory(&self) -> &Inventory {
+        &self.inventory
+    }
+
+    /// The body, for a simulation that looks at it.
+    pub fn body(&self) -> &dyn Body {
+        self.body.as_ref()
+    }
+
+    /// Gives the body back, for a simulation that crashes the agent around it.
+    pub fn into_body(self) -> Box<dyn Body> {
+        self.body
+    }
+
+    fn vitals(&self, now: &Now) -> Vitals {
+        let state = self.body.state(now.site);
+        Vitals {
+            pose: Some(state.pose),
+            waypoint: state.waypoint,
+            speed_mm_s: state.speed_mm_s,
+            battery_permille: state.battery_permille,
+            charging: state.charging,
+            hottest_joint_decidegrees: state.hottest_joint_decidegrees,
+            odometer_mm: state.odometer_mm,
+            loaded_odometer_mm: state.loaded_odometer_mm,
+            energy_mwh: state.energy_mwh,
+        }
+    }
+
+    fn start(&mut self, now: &Now) {
+        if !self.body.standstill(now.site) {
+            self.body.stop(now.site, StopLevel::Halt);
+        }
+        self.note_where_it_stands();
+        self.write_places();
+        self.judge_intent();
+    }
+
+    /// Standing places are called like their waypoints.
+    pub(crate) fn note_where_it_stands(&mut self) {
+        for waypoint in self.body.stands_on() {
+            if let Ok(place_id) = PlaceId::parse(waypoint.as_str()) {
+                let event = self.places.stands_on(place_id);
+                event.into_iter().for_each(|e| self.emit(Lane::Event, e));
+            }
+        }
+    }
+
+    fn connected(&mut self, now: &Now, welcome: Welcome) {
+        self.sent = SentHeartbeats::new(welcome.session_epoch, self.sent.lease_from());
+        self.session = Some(Session { epoch: welcome.session_epoch, hb: 0, observed: welcome.observed });
+        let old = &self.kept.ledger.session;
+        if old.store_id != welcome.store_id {
+            self.answered.clear();
+            if !old.store_id.is_empty() {
+                self.write(Op::Applied(crate::ledger::Applied::default()), true);
+            }
+        }
+        let memory =
+            SessionMemory { session_epoch: welcome.session_epoch, secret: welcome.secret, store_id: welcome.store_id };
+        self.write(Op::Session(memory), true);
+        for ack in &welcome.acks {
+            for op in self.kept.ring.jump(ack.lane, ack.seq) {
+                tracing::error!(lane = ack.lane.as_str(), watermark = ack.seq, "ring behind server, numbers moved on");
+                self.write(op, true);
+            }
+        }
+        welcome.acks.iter().for_each(|ack| self.acked(ack));
+        self.sender.connected(&self.kept.ring, welcome.status_credit_bytes);
+        welcome.acks.iter().for_each(|ack| self.expected(ack));
+        self.period = LinkDuration(welcome.heartbeat_period_ms.clamp(100, limits::AUTHORITY.as_ms() / 3));
+        self.status_period = SiteDuration(welcome.status_period_ms.max(100));
+        self.next_beat = now.link;
+        self.clock = None;
+    }
+
+    fn down(&mut self, now: &Now, down: Downlink) {
+        let observed = self.is_observed();
+        if let Some((hb, sample)) = down.echo {
+            if !observed {
+                self.sent.echoed(hb);
+            }
+            self.clock = Some(ClockSample { t4_us: now.wall.0 * 1000, ..sample });
+        }
+        for ack in &down.acks {
+            self.acked(ack);
+            self.expected(ack);
+        }
+        if let Some(bytes) = down.status_credit_bytes {
+            self.sender.credit(bytes);
+        }
+        if let Some(policy) = down.policy {
+            self.on_policy(policy);
+        }
+        if let Some(work) = down.work {
+            self.on_work(now, work);
+        }
+    }
+
+    fn on_policy(&mut self, policy: DesiredPolicy) {
+        let mut applied = self.kept.ledger.applied;
+        if policy.generation < applied.policy {
+            tracing::warn!(generation = policy.generation, applied = applied.policy, "older policy refused");
+            return;
+        }
+        if policy.areas != self.kept.ledger.policy {
+            self.write(Op::Policy(policy.areas), true);
+        }
+        applied.policy = policy.generation;
+        self.write(Op::Applied(applied), false);
+    }
+
+    fn acked(&mut self, ack: &LaneAck) {
+        if let Some(op) = self.kept.ring.ack(ack.lane, ack.seq) {
+            self.write(op, false);
+        }
+    }
+
+    fn expected(&mut self, ack: &LaneAck) {
+        let Some(expect) = ack.expect else { return };
+        if let Some(op) = self.kept.ring.expected(ack.lane, expect) {
+            self.write(op, true);
+        }
+        self.sender.rewind(ack.lane, expect);
+    }
+
+    pub(crate) fn is_observed(&self) -> bool {
+        self.session.as_ref().is_some_and(|s| s.observed)
+    }
+
+    /// Applies an operation and queues it for the store. Not urgent: it may wait for the next second's group.
+    pub(crate) fn write(&mut self, op: Op, urgent: bool) {
+        self.kept.apply(&op);
+        self.writes.ops.push(op);
+        self.writes.given += 1;
+        self.writes.urgent |= urgent;
+    }
+
+    /// Work goes on only after everything written so far is durable.
+    pub(crate) fn wait_until_durable(&mut self) {
+        self.writes.barrier = self.writes.given;
+    }
+
+    pub(crate) fn is_durable(&self) -> bool {
+        self.writes.durable >= self.writes.barrier
+    }
+
+    /// Writes places down if they changed.
+    pub(crate) fn write_places(&mut self) {
+        if self.places.row != self.kept.ledger.places {
+            self.write(Op::Places(self.places.row.clone()), true);
+        }
+    }
+
+    /// Says a fact in its lane.
+    pub(crate) fn emit(&mut self, lane: Lane, event: RobotEvent) {
+        self.throttle.push(lane, event);
+    }
+
+    pub(crate) fn progressed(&mut self) {
+        self.progress += 1;
+    }
+
+    pub(crate) fn progress(&self) -> u64 {
+        self.progress
+    }
+
+    pub(crate) fn fault_changed(&mut self, fault: Fault, stands: bool) {
+        let same = self.standing_fault.as_ref().is_some_and(|f| f.code == fault.code);
+        self.emit(Lane::Critical, RobotEvent::Fault { fault: fault.clone(), cleared: !stands });
+        if stands {
+            self.standing_fault = Some(fault);
+        } else if same {
+            self.standing_fault = None;
+        }
+    }
+
+    /// What falls due by time alone. True: a heartbeat is due.
+    fn beat(&mut self, now: &Now) -> bool {
+        let beat = now.link >= self.next_beat;
+        let early = if beat { SiteDuration(self.status_period.as_ms() / 4) } else { SiteDuration(0) };
+        if now.site + early >= self.next_status {
+            self.next_status = now.site + self.status_period;
+            let vitals = self.vitals(now);
+            self.check_battery(vitals.battery_permille);
+            for op in self.kept.ring.append(Lane::Status, now.wall.0, SampleBody::Status(vitals)) {
+                self.write(op, false);
+            }
+        }
+        if beat {
+            self.next_beat = (self.next_beat + self.period).max(now.link + LinkDuration(self.period.as_ms() / 2));
+            self.note_progress(now);
+        }
+        beat
+    }
+
+    fn note_progress(&mut self, now: &Now) {
+        let odometer_mm = self.body.state(now.site).odometer_mm;
+        if odometer_mm != self.odometer_mm || self.work.as_ref().is_some_and(Work::goes_on_by_itself) {
+            self.progress += 1;
+        }
+        self.odometer_mm = odometer_mm;
+    }
+
+    fn check_battery(&mut self, battery_permille: u16) {
+        let critical = self.limits.battery_critical_permille;
+        if battery_permille < critical && !self.battery_critical {
+            self.battery_critical = true;
+            self.emit(Lane::Critical, RobotEvent::BatteryCritical { battery_permille });
+        } else if battery_permille >= critical + BATTERY_HYSTERESIS {
+            self.battery_critical = false;
+        }
+    }
+
+    fn write_events(&mut self, now: &Now) {
+        self.write_places();
+        while let Some((lane, event)) = self.throttle.ready(now.link) {
+            for op in self.kept.ring.append(lane, now.wall.0, SampleBody::Event(event)) {
+                self.write(op, true);
+            }
+        }
+    }
+
+    fn persist(&mut self, now: &Now, beat: bool, out: &mut Vec<Output>) {
+        let due = self.writes.urgent || beat || self.writes.ops.len() >= limits::SAMPLES_PER_MESSAGE;
+        if self.writes.in_flight.is_some() || self.writes.ops.is_empty() || !due {
+            return;
+        }
+        let forget = self.kept.ledger.forgettable(now.wall.0);
+        forget.into_iter().for_each(|op| self.write(op, false));
+        self.writes.batch += 1;
+        self.writes.urgent = false;
+        let lanes = Lane::ALL.map(|lane| self.kept.ring.lane(lane).produced);
+        self.writes.in_flight = Some((self.writes.batch, self.writes.given, lanes));
+        out.push(Output::Persist(self.writes.batch, std::mem::take(&mut self.writes.ops)));
+    }
+
+    fn persisted(&mut self, batch: u64) {
+        if let Some((number, given, lanes)) = self.writes.in_flight
+            && number == batch
+        {
+            self.writes.in_flight = None;
+            self.writes.durable = given;
+            self.sender.durable(lanes);
+        }
+    }
+
+    /// Critical, event, the live heartbeat, then STATUS, which travels with heartbeats.
+    fn send(&mut self, now: &Now, beat: bool, out: &mut Vec<Output>) {
+        if self.session.is_none() {
+            return;
+        }
+        let mut message = Uplink::default();
+        self.send_lane(Lane::Critical, &mut message, out);
+        self.send_lane(Lane::Event, &mut message, out);
+        if beat {
+            message.heartbeat = self.heartbeat(now);
+        }
+        let waiting = self.kept.ring.lane(Lane::Status).samples.len();
+        if beat || waiting > limits::SAMPLES_PER_MESSAGE / 8 {
+            self.send_lane(Lane::Status, &mut message, out);
+        }
+        if message != Uplink::default() {
+            out.push(Output::Send(Box::new(message)));
+        }
+    }
+
+    fn send_lane(&mut self, lane: Lane, message: &mut Uplink, out: &mut Vec<Output>) {
+        let size = |b: &LaneBatch| b.samples.len() + b.gaps.len();
+        while let Some(batch) = self.sender.next_batch(&self.kept.ring, lane) {
+            let have: usize = message.batches.iter().map(size).sum();
+            if have + size(&batch) > limits::SAMPLES_PER_MESSAGE {
+                out.push(Output::Send(Box::new(std::mem::take(message))));
+            }
+            message.batches.push(batch);
+        }
+    }
+
+    fn heartbeat(&mut self, now: &Now) -> Option<Heartbeat> {
+        let session = self.session.as_mut()?;
+        session.hb += 1;
+        self.sent.sent(session.hb, now.link);
+        Some(Heartbeat { reported: self.reported(now), sent_unix_us: now.wall.0 * 1000, clock: self.clock.take() })
+    }
+
+    /// Whether the body is under way for this work.
+    pub(crate) fn is_driving(&self) -> bool {
+        self.work.as_ref().is_some_and(|w| w.doing == Doing::Driving)
+    }
+}

@@ -1,0 +1,221 @@
+//! Takes desired work in: what is older is refused, what is stale moves nobody, what is taken is on the ledger first.
+//!
+//! Invariant: an attempt is accepted at most once in the life of the ledger, and a refused one never later. Called by the core.
+
+use crate::core::AgentCore;
+use crate::ledger::Holder;
+use crate::store::Op;
+use crate::work::{CHARGE, Ending, PARK, Work};
+use midshift_core::authority::Authority;
+use midshift_core::reason::{Code, Reason};
+use midshift_core::robot::{Lane, Mode, StopLevel};
+use midshift_core::time::Now;
+use midshift_core::work::{Assignment, AttemptReport, DesiredWork, RobotEvent, StepKind, WorkState, WorkStats};
+use std::sync::Arc;
+
+/// Refused attempts remembered beside the ledger, so that a repeat of the same desired state is not answered twice.
+const REFUSED_REMEMBERED: usize = 32;
+
+impl AgentCore {
+    /// Obeys section work.
+    pub(crate) fn on_work(&mut self, now: &Now, desired: DesiredWork) {
+        let mut applied = self.kept.ledger.applied;
+        if desired.generation < applied.work {
+            tracing::warn!(generation = desired.generation, applied = applied.work, "older work refused");
+            return;
+        }
+        applied.work = desired.generation;
+        self.write(Op::Applied(applied), false);
+        for attempt in &desired.closed {
+            if self.kept.ledger.unclosed.contains_key(attempt) {
+                self.write(Op::Closed(attempt.clone()), false);
+            }
+        }
+        let given_back = self.places.desired(&desired.grants, now.link);
+        given_back.into_iter().for_each(|e| self.emit(Lane::Event, e));
+        self.mind_hold(now, &desired);
+        let assignment = desired.assignment.clone();
+        self.desired = Some(desired);
+        self.on_assignment(now, assignment);
+    }
+
+    fn mind_hold(&mut self, now: &Now, desired: &DesiredWork) {
+        if self.work.is_none() {
+            self.resume_needed = false;
+        } else if desired.held {
+            self.resume_needed = true;
+        } else if let Some(resume) = desired.resume.filter(|_| self.resume_needed)
+            && self.may_act(now, &resume, "resume").is_ok()
+        {
+            self.resume_needed = false;
+        }
+    }
+
+    /// Whether `authority` lets the robot act now; a refusal is said as an event.
+    fn may_act(&mut self, now: &Now, authority: &Authority, what: &str) -> Result<(), String> {
+        if self.config.bugs.authority_from_receipt() {
+            return Ok(());
+        }
+        let checked = self.sent.check(authority, now.link).map_err(|stale| stale.to_string());
+        if let Err(detail) = &checked {
+            let told = self.stale_told.contains(&(0, authority.session_epoch, authority.hb)) && what == "resume";
+            if !told {
+                let event = RobotEvent::StaleAuthority { what: what.to_owned(), detail: detail.clone() };
+                self.emit(Lane::Event, event);
+                self.stale_told.insert((0, authority.session_epoch, authority.hb));
+            }
+        }
+        checked
+    }
+
+    fn on_assignment(&mut self, now: &Now, assignment: Option<Assignment>) {
+        let Some(assignment) = assignment else {
+            if let Some(work) = &mut self.work {
+                work.ending.get_or_insert(Ending::Abort);
+            }
+            return;
+        };
+        match &mut self.work {
+            Some(work) if work.holder.attempt == assignment.attempt => {
+                if assignment.stop {
+                    work.ending.get_or_insert(Ending::Abort);
+                }
+                let same_way = work
+                    .order
+                    .as_ref()
+                    .is_some_and(|o| o.route_number == assignment.route_number && o.route == assignment.route);
+                if !same_way {
+                    work.located = false;
+                }
+                work.order = Some(Arc::new(assignment));
+            }
+            Some(work) => {
+                if self.config.bugs.ignore_holder() {
+                    self.body.stop(now.site, StopLevel::Halt);
+                    self.work = None;
+                } else {
+                    work.ending.get_or_insert(Ending::Abort);
+                }
+                self.consider(now, assignment);
+            }
+            None => self.consider(now, assignment),
+        }
+    }
+
+    /// An offer: takes it or says why not.
+    fn consider(&mut self, now: &Now, assignment: Assignment) {
+        let attempt = assignment.attempt.clone();
+        let fenced = !self.config.bugs.no_epoch_fence();
+        if fenced && (self.refused.contains(&attempt) || self.answer_from_ledger(&assignment)) {
+            return;
+        }
+        if fenced && self.kept.ledger.highest_epoch(&attempt.subject) >= attempt.epoch {
+            let passed = self.kept.ledger.highest_epoch(&attempt.subject);
+            return self.refuse(now, &assignment, Reason::from(Code::StaleEpoch).with("passed", passed));
+        }
+        if assignment.stop {
+            // The server takes back what was never taken: it must not be taken later.
+            return self.write(Op::Epoch(attempt.subject, attempt.epoch, now.wall.0), true);
+        }
+        if self.is_observed() {
+            return self.refuse(now, &assignment, Code::RobotObserved.into());
+        }
+        if let Err(detail) = self.may_act(now, &assignment.offer, "offer") {
+            return self.refuse(now, &assignment, Reason::new(Code::StaleAuthority, detail));
+        }
+        if self.mode != Mode::Automatic {
+            return self.refuse(now, &assignment, Code::NotAutomatic.into());
+        }
+        if let Some(work) = &self.work {
+            let holder = work.holder.attempt.to_string();
+            return self.refuse(now, &assignment, Reason::from(Code::AnotherHolder).with("holder", holder));
+        }
+        if let Some(action) = self.unsupported(&assignment) {
+            return self.refuse(now, &assignment, Reason::from(Code::UnsupportedAction).with("action", action));
+        }
+        if self.place_on_route(now, &assignment, assignment.from_step).is_none() {
+            let at = self.last_waypoint(now).map_or_else(String::new, |w| w.to_string());
+            return self.refuse(now, &assignment, Reason::from(Code::UnknownWaypoint).with("robot_at", at));
+        }
+        self.accept(now, assignment);
+    }
+
+    /// What ended here is answered from memory, once in a process. True: answered or already said.
+    fn answer_from_ledger(&mut self, assignment: &Assignment) -> bool {
+        let attempt = &assignment.attempt;
+        let Some(report) = self.kept.ledger.ended(&attempt.subject).cloned() else { return false };
+        let same = report.attempt == *attempt;
+        if !same && report.state != WorkState::Succeeded {
+            return false;
+        }
+        let listed = self.kept.ledger.unclosed.contains_key(attempt);
+        if !(same && listed) && self.answered.insert(attempt.clone()) {
+            self.emit(Lane::Event, RobotEvent::Attempt(AttemptReport::clone(&report)));
+            if !same {
+                let why = Reason::from(Code::AlreadyFinished).with("epoch", report.attempt.epoch);
+                self.tell_refusal(assignment, why);
+            }
+        }
+        true
+    }
+
+    fn unsupported(&self, assignment: &Assignment) -> Option<String> {
+        let names = assignment.steps.iter().skip(assignment.from_step as usize).filter_map(|s| match &s.kind {
+            StepKind::Action { name, .. } => Some(name),
+            StepKind::Goto { .. } | StepKind::Wait { .. } => None,
+        });
+        let known =
+            |name: &&String| [CHARGE, PARK].contains(&name.as_str()) || self.inventory.capabilities.contains(name);
+        names.filter(|n| !known(n)).map(String::clone).next()
+    }
+
+    fn refuse(&mut self, now: &Now, assignment: &Assignment, why: Reason) {
+        let attempt = assignment.attempt.clone();
+        self.write(Op::Epoch(attempt.subject, attempt.epoch, now.wall.0), true);
+        self.tell_refusal(assignment, why);
+    }
+
+    fn tell_refusal(&mut self, assignment: &Assignment, why: Reason) {
+        let attempt = assignment.attempt.clone();
+        tracing::info!(robot_id = %self.config.robot_id, %attempt, reason = why.code.as_str(), "refused");
+        if self.refused.len() == REFUSED_REMEMBERED {
+            self.refused.pop_front();
+        }
+        self.refused.push_back(attempt.clone());
+        let report = AttemptReport {
+            attempt,
+            state: WorkState::Refused,
+            step_index: assignment.from_step,
+            opened: false,
+            refusal: Some(why),
+            fault: None,
+            stats: WorkStats::default(),
+        };
+        self.emit(Lane::Event, RobotEvent::Attempt(report));
+    }
+
+    /// The holder and the epoch are durable before anybody hears of it and before the body moves.
+    fn accept(&mut self, now: &Now, assignment: Assignment) {
+        let body = self.body.state(now.site);
+        let attempt = assignment.attempt.clone();
+        let holder = Holder {
+            attempt: attempt.clone(),
+            step: assignment.from_step,
+            opened: false,
+            intent: None,
+            unknown: false,
+            elapsed_ms: 0,
+            duration_ms: 0,
+            base_odometer_mm: body.odometer_mm,
+            base_loaded_mm: body.loaded_odometer_mm,
+            base_energy_mwh: body.energy_mwh,
+            hottest_joint_decidegrees: body.hottest_joint_decidegrees,
+        };
+        tracing::info!(robot_id = %self.config.robot_id, %attempt, "accepted");
+        self.resume_needed = self.desired.as_ref().is_some_and(|d| d.held);
+        self.work = Some(Work { order: Some(Arc::new(assignment)), ..Work::new(holder) });
+        self.write(Op::Epoch(attempt.subject, attempt.epoch, now.wall.0), true);
+        self.write_holder(true);
+        self.wait_until_durable();
+    }
+}
