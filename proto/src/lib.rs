@@ -8,7 +8,8 @@ pub mod json;
 pub mod session;
 pub mod status;
 
-pub use convert::{Parse, parse};
+pub use convert::{Parse, parse, parse_field, parse_word};
+pub use status::{refusal_of, status};
 
 /// Descriptors of all packages with their comments, for reflection and JSON.
 pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptor_set.bin"));

@@ -15,7 +15,7 @@ pub mod work;
 use midshift_core::reason::{Refusal, Violations};
 use std::fmt;
 
-pub use common::{from_struct, ms_of, shown, time_of, timestamp, to_struct};
+pub use common::{duration, from_struct, ms_of, shown, time_of, timestamp, to_struct};
 pub use enums::WireEnum;
 
 /// Where in a message a reader stands. Costs nothing until a violation is written.
@@ -72,6 +72,22 @@ pub fn parse<T, W: Parse<T>>(wire: W) -> Result<T, Refusal> {
     let value = wire.parse_at(At::top(""), &mut bad);
     bad.finish()?;
     value.ok_or_else(|| Refusal::field("", "cannot be read"))
+}
+
+/// Reads one field of a request that must be there, or says everything that is wrong with it.
+pub fn parse_field<T, W: Parse<T>>(wire: Option<W>, name: &'static str) -> Result<T, Refusal> {
+    let mut bad = Violations::default();
+    let value = need(wire, At::top(name), &mut bad);
+    bad.finish()?;
+    value.ok_or_else(|| Refusal::field(name, "cannot be read"))
+}
+
+/// Reads one enum field of a request that must be there.
+pub fn parse_word<T: WireEnum>(number: i32, name: &'static str) -> Result<T, Refusal> {
+    let mut bad = Violations::default();
+    let value = word(number, At::top(name), &mut bad);
+    bad.finish()?;
+    value.ok_or_else(|| Refusal::field(name, "cannot be read"))
 }
 
 /// Reads a sub-message that must be there.

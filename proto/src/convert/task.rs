@@ -1,1 +1,454 @@
-//! Under way.
+//! Tasks: what callers send becomes a raw task, what the rows say becomes a `Task`.
+
+use super::{At, WireEnum, duration, from_struct, id, maybe_id, ms_of, shown, time_of, timestamp, to_struct, word};
+use crate::task::v1;
+use midshift_core::ids::{RequestId, RobotId, TaskId, WaypointId};
+use midshift_core::limits;
+use midshift_core::reason::{Refusal, Violations};
+use midshift_core::rows::Revision;
+use midshift_core::task::forms::Transport;
+use midshift_core::task::raw::{RawRetry, RawStep, RawStepKind};
+use midshift_core::task::spec::{Retry, Selector};
+use midshift_core::task::{Attempt, Phase, RawTask, Resolution, TaskIntake, TaskSpec, TaskState};
+use midshift_core::time::Utc;
+use midshift_core::work::{Effect, StepKind, WorkStep};
+use prost::Message;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// The label that keeps a short form's `created_at`.
+const CREATED_AT: &str = "created_at";
+
+/// A task that a caller submits, before its rules were checked.
+#[derive(Debug)]
+pub struct Submission {
+    /// Protection against a double call.
+    pub request_id: Option<RequestId>,
+    /// Chosen by the caller.
+    pub task_id: Option<TaskId>,
+    /// Check only.
+    pub validate_only: bool,
+    /// What is to be done.
+    pub raw: RawTask,
+    form: Form,
+    bad: Violations,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Form {
+    Spec,
+    Flat,
+    Nested,
+    Missing,
+}
+
+impl Submission {
+    /// Reads a request; what is wrong with it is kept for [`Submission::check`], so that the caller hears everything at once.
+    pub fn read(request: v1::SubmitTaskRequest) -> Self {
+        use v1::submit_task_request::Body;
+        let mut bad = Violations::default();
+        let top = At::top("");
+        let request_id = maybe_id(&request.request_id, RequestId::parse, top.field("request_id"), &mut bad).flatten();
+        let (form, own_id, raw) = match request.body {
+            Some(Body::Spec(spec)) => (Form::Spec, String::new(), raw_task(spec)),
+            Some(Body::Flat(flat)) => (Form::Flat, flat.task_id.clone(), raw_flat(flat)),
+            Some(Body::Nested(nested)) => (Form::Nested, nested.task_id.clone(), raw_nested(nested)),
+            None => (Form::Missing, String::new(), RawTask::default()),
+        };
+        let (chosen, at) = if request.task_id.is_empty() { (&own_id, "body.task_id") } else { (&request.task_id, "task_id") };
+        let task_id = maybe_id(chosen, TaskId::parse, At::top(at), &mut bad).flatten();
+        if !own_id.is_empty() && !request.task_id.is_empty() && own_id != request.task_id {
+            bad.add("task_id", "differs from the task_id of the body");
+        }
+        Self { request_id, task_id, validate_only: request.validate_only, raw, form, bad }
+    }
+
+    /// Checks every rule. `knows` answers whether the site has a waypoint.
+    pub fn check(self, knows: &dyn Fn(&WaypointId) -> bool) -> Result<TaskSpec, Refusal> {
+        let mut bad = self.bad;
+        let (form, has_from) = (self.form, self.raw.steps.len() > 1);
+        if form == Form::Missing {
+            bad.add("body", "is required: one of spec, flat, nested");
+            return Err(Refusal::invalid(bad.0));
+        }
+        let checked = self.raw.check("spec", knows);
+        if let Err(refusal) = &checked {
+            for violation in &refusal.violations {
+                let field = form.name_of(violation.field.strip_prefix("spec.").unwrap_or(&violation.field), has_from);
+                // Both legs of a short form break the rules of one parameter: said once.
+                if !bad.0.iter().any(|v| v.field == field) || form == Form::Spec {
+                    bad.add(field, violation.description.clone());
+                }
+            }
+        }
+        bad.finish()?;
+        checked
+    }
+}
+
+impl Form {
+    /// What the caller calls the field that the full form calls `field`.
+    fn name_of(self, field: &str, has_from: bool) -> String {
+        let nested = self == Self::Nested;
+        let name = match field {
+            _ if self == Self::Spec => return format!("spec.{field}"),
+            "type" if !nested => "task_type",
+            "timeout" => "timeout_seconds",
+            "retry.max_retry_times" if nested => "retry_strategy.max_retry_times",
+            "retry.max_retry_times" => "max_retry_times",
+            "retry.interval" if nested => "retry_strategy.retry_interval_seconds",
+            "retry.interval" => "retry_interval_seconds",
+            "steps[0].goto.waypoint" if has_from && nested => "content.from_waypoint",
+            "steps[0].goto.waypoint" if has_from => "from_waypoint",
+            "steps[0].goto.waypoint" | "steps[2].goto.waypoint" if nested => "content.to_waypoint",
+            "steps[0].goto.waypoint" | "steps[2].goto.waypoint" => "to_waypoint",
+            "steps[1].action.params" | "steps[3].action.params" if nested => "content.item_sku",
+            "steps[1].action.params" | "steps[3].action.params" => "item_sku",
+            "labels[created_at]" => CREATED_AT,
+            other => other,
+        };
+        format!("{}.{name}", if nested { "nested" } else { "flat" })
+    }
+}
+
+/// The bytes that make two requests the same: all of it but what does not change what is asked for.
+pub fn canonical(request: &v1::SubmitTaskRequest) -> Vec<u8> {
+    v1::SubmitTaskRequest { request_id: String::new(), validate_only: false, ..request.clone() }.encode_to_vec()
+}
+
+fn ms(value: Option<prost_types::Duration>) -> Option<i64> {
+    value.as_ref().map(ms_of)
+}
+
+/// A spec as it was sent.
+pub fn raw_task(spec: v1::TaskSpec) -> RawTask {
+    let selector = spec.selector.unwrap_or_default();
+    RawTask {
+        kind: spec.r#type,
+        priority: spec.priority.map(i64::from),
+        robot_id: spec.robot_id,
+        selector_labels: selector.labels,
+        capabilities: selector.capabilities,
+        minimum_software: selector.minimum_software,
+        payload_g: selector.payload_g,
+        steps: spec.steps.into_iter().map(raw_step).collect(),
+        timeout_ms: ms(spec.timeout),
+        schedule_to_start_ms: ms(spec.schedule_to_start_timeout),
+        stall_ms: ms(spec.stall_timeout),
+        not_before: spec.not_before.as_ref().map(time_of),
+        deadline: spec.deadline.as_ref().map(time_of),
+        retry: spec.retry.map(raw_retry),
+        preemptible: spec.preemptible,
+        depends_on: spec.depends_on,
+        coalesce_key: spec.coalesce_key,
+        speed_limit_mm_s: spec.speed_limit_mm_s,
+        labels: spec.labels,
+        requester: spec.requester,
+        external_ref: spec.external_ref,
+        trace_context: spec.trace_context,
+    }
+}
+
+fn raw_step(step: v1::Step) -> RawStep {
+    use v1::step::Kind;
+    let kind = step.kind.map(|kind| match kind {
+        Kind::Goto(goto) => RawStepKind::Goto(goto.waypoint),
+        Kind::Action(action) => RawStepKind::Action(action.name, action.params.map(from_struct).unwrap_or_default()),
+        Kind::Wait(wait) => RawStepKind::Wait(ms(wait.duration).unwrap_or(0)),
+    });
+    let on_fail = |number| match v1::OnFail::try_from(number) {
+        Ok(v1::OnFail::Stop) => Some(false),
+        Ok(v1::OnFail::Continue) => Some(true),
+        Ok(v1::OnFail::Unspecified) | Err(_) => None,
+    };
+    RawStep {
+        kind,
+        effect: step.effect.map(Effect::from_wire),
+        pause_allowed: step.pause_allowed,
+        cancel_allowed: step.cancel_allowed,
+        timeout_ms: ms(step.timeout),
+        continue_on_fail: step.on_fail.map(on_fail),
+    }
+}
+
+fn raw_retry(retry: v1::RetryPolicy) -> RawRetry {
+    RawRetry {
+        max_retry_times: i64::from(retry.max_retry_times),
+        interval_ms: ms(retry.interval),
+        factor: retry.factor,
+        max_interval_ms: ms(retry.max_interval),
+        jitter: retry.jitter,
+        exclude_failed_robot: retry.exclude_failed_robot,
+    }
+}
+
+fn seconds(value: Option<i32>) -> Option<i64> {
+    value.map(|s| i64::from(s) * 1000)
+}
+
+fn with_created_at(mut raw: RawTask, created_at: String) -> RawTask {
+    if !created_at.is_empty() {
+        raw.labels.insert(CREATED_AT.to_owned(), created_at);
+    }
+    raw
+}
+
+/// A flat task as it was sent.
+pub fn raw_flat(flat: v1::FlatTask) -> RawTask {
+    let transport = Transport {
+        kind: flat.task_type,
+        priority: flat.priority.map(i64::from),
+        robot_id: flat.robot_id,
+        from_waypoint: flat.from_waypoint,
+        to_waypoint: flat.to_waypoint,
+        item_sku: flat.item_sku,
+        timeout_ms: seconds(flat.timeout_seconds),
+        max_retry_times: flat.max_retry_times.map(i64::from),
+        retry_interval_ms: seconds(flat.retry_interval_seconds),
+    };
+    with_created_at(transport.into_raw(), flat.created_at)
+}
+
+/// A nested task as it was sent.
+pub fn raw_nested(nested: v1::NestedTask) -> RawTask {
+    let content = nested.content.unwrap_or_default();
+    let retry = nested.retry_strategy.unwrap_or_default();
+    let transport = Transport {
+        kind: nested.r#type,
+        priority: nested.priority.map(i64::from),
+        robot_id: nested.robot_id,
+        from_waypoint: content.from_waypoint,
+        to_waypoint: content.to_waypoint,
+        item_sku: content.item_sku,
+        timeout_ms: seconds(nested.timeout_seconds),
+        max_retry_times: retry.max_retry_times.map(i64::from),
+        retry_interval_ms: seconds(retry.retry_interval_seconds),
+    };
+    with_created_at(transport.into_raw(), nested.created_at)
+}
+
+impl From<&WorkStep> for v1::Step {
+    fn from(step: &WorkStep) -> Self {
+        use v1::step::Kind;
+        let kind = match &step.kind {
+            StepKind::Goto { waypoint } => Kind::Goto(v1::Goto { waypoint: waypoint.to_string() }),
+            StepKind::Action { name, params } => {
+                let params = (!params.is_empty()).then(|| to_struct(params));
+                Kind::Action(v1::Action { name: name.clone(), params })
+            }
+            StepKind::Wait { duration_ms } => Kind::Wait(v1::Wait { duration: Some(duration(*duration_ms)) }),
+        };
+        let on_fail = if step.continue_on_fail { v1::OnFail::Continue } else { v1::OnFail::Stop };
+        Self {
+            kind: Some(kind),
+            effect: Some(super::enums::step_effect(step.effect)),
+            pause_allowed: Some(step.pause_allowed),
+            cancel_allowed: Some(step.cancel_allowed),
+            timeout: step.timeout_ms.map(duration),
+            on_fail: Some(on_fail.into()),
+        }
+    }
+}
+
+impl From<&Selector> for v1::RobotSelector {
+    fn from(selector: &Selector) -> Self {
+        Self {
+            labels: selector.labels.clone(),
+            capabilities: selector.capabilities.clone(),
+            minimum_software: selector.minimum_software.clone().unwrap_or_default(),
+            payload_g: selector.payload_g,
+        }
+    }
+}
+
+impl From<&Retry> for v1::RetryPolicy {
+    fn from(retry: &Retry) -> Self {
+        Self {
+            max_retry_times: i32::try_from(retry.max_retry_times).unwrap_or(i32::MAX),
+            interval: Some(duration(retry.interval_ms)),
+            factor: Some(retry.factor),
+            max_interval: Some(duration(retry.max_interval_ms)),
+            jitter: Some(retry.jitter),
+            exclude_failed_robot: retry.exclude_failed_robot,
+        }
+    }
+}
+
+impl From<&TaskSpec> for v1::TaskSpec {
+    fn from(spec: &TaskSpec) -> Self {
+        Self {
+            r#type: spec.kind.clone(),
+            priority: Some(i32::from(spec.priority)),
+            robot_id: spec.robot_id.as_ref().map(ToString::to_string).unwrap_or_default(),
+            selector: (spec.selector != Selector::default()).then(|| (&spec.selector).into()),
+            steps: spec.steps.iter().map(Into::into).collect(),
+            timeout: Some(duration(spec.timeout_ms)),
+            schedule_to_start_timeout: Some(duration(spec.schedule_to_start_ms)),
+            stall_timeout: Some(duration(spec.stall_ms)),
+            not_before: spec.not_before.map(timestamp),
+            deadline: spec.deadline.map(timestamp),
+            retry: Some((&spec.retry).into()),
+            preemptible: spec.preemptible,
+            depends_on: spec.depends_on.iter().map(ToString::to_string).collect(),
+            coalesce_key: String::new(),
+            speed_limit_mm_s: spec.speed_limit_mm_s,
+            labels: spec.labels.clone(),
+            requester: spec.requester.clone(),
+            external_ref: spec.external_ref.clone(),
+            trace_context: spec.trace_context.clone(),
+        }
+    }
+}
+
+/// The rows behind one `Task`.
+#[derive(Clone, Copy, Debug)]
+pub struct TaskView<'a> {
+    /// What was asked for.
+    pub intake: &'a TaskIntake,
+    /// Where it is.
+    pub state: &'a TaskState,
+    /// Of the state: its text is the etag.
+    pub revision: Revision,
+    /// The live or last attempt.
+    pub attempt: Option<&'a Attempt>,
+    /// What a person may answer.
+    pub allowed: &'a [Resolution],
+}
+
+/// A task as callers see it.
+pub fn encode_task(view: TaskView<'_>) -> v1::Task {
+    let TaskView { intake, state, revision, attempt, allowed } = view;
+    let id_text = |id: &Option<RobotId>| id.as_ref().map(ToString::to_string).unwrap_or_default();
+    v1::Task {
+        task_id: intake.task_id.to_string(),
+        spec: Some((&intake.spec).into()),
+        state: state.phase.to_wire(),
+        etag: etag(revision),
+        create_time: Some(timestamp(intake.created)),
+        update_time: Some(timestamp(state.changed)),
+        reason: state.reason.as_ref().map(shown),
+        then: state.then.map(WireEnum::to_wire).unwrap_or_default(),
+        hold_tokens: state.holds.iter().cloned().collect(),
+        allowed_resolutions: allowed.iter().map(|r| r.to_wire()).collect(),
+        robot_id: id_text(&state.robot_id),
+        opened_robot_id: id_text(&state.opened),
+        next_step: state.next_step,
+        failures: state.failures,
+        epoch: state.epoch,
+        attempt: attempt.map(Into::into),
+        queued_time: Some(timestamp(state.queued_since)),
+        retry_time: state.retry_at.map(timestamp),
+        cancel_request_time: state.cancel_requested.map(timestamp),
+        start_time: state.started.map(timestamp),
+        end_time: state.ended.map(timestamp),
+        stats: Some((&state.stats).into()),
+        failed_robot_ids: state.failed_robots.iter().map(ToString::to_string).collect(),
+        actor: intake.actor.clone(),
+        number: intake.number,
+    }
+}
+
+/// The answer to validate_only: what the task would be, without id, etag and times.
+pub fn encode_checked(spec: &TaskSpec) -> v1::Task {
+    v1::Task { spec: Some(spec.into()), state: Phase::Queued.to_wire(), ..v1::Task::default() }
+}
+
+/// A revision as an etag.
+pub fn etag(revision: Revision) -> String {
+    revision.0.to_string()
+}
+
+/// An etag as the revision it names. Empty: whatever it is. One that was never given out names no revision and so matches none.
+pub fn revision_of(etag: &str) -> Option<Revision> {
+    (!etag.is_empty()).then(|| Revision(etag.parse().unwrap_or(0)))
+}
+
+impl From<&Attempt> for v1::Attempt {
+    fn from(attempt: &Attempt) -> Self {
+        let uncertain = attempt
+            .uncertain
+            .as_ref()
+            .map(|u| v1::AttemptUncertain { since: Some(timestamp(u.since)), cause: Some(shown(&u.cause)) });
+        Self {
+            epoch: attempt.attempt.epoch,
+            robot_id: attempt.robot_id.to_string(),
+            state: attempt.phase.to_wire(),
+            uncertain,
+            step_index: attempt.step_index,
+            opened: attempt.opened,
+            offer_time: Some(timestamp(attempt.offered)),
+            accept_time: attempt.accepted.map(timestamp),
+            end_time: attempt.ended.map(timestamp),
+            fault: attempt.fault.as_ref().map(Into::into),
+            refusal: attempt.refusal.as_ref().map(shown),
+            stats: Some((&attempt.stats).into()),
+            software: attempt.software.clone(),
+        }
+    }
+}
+
+/// Which tasks a list or a watch is about. All must hold.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct TaskFilter {
+    /// Any of these; empty: all.
+    pub phases: BTreeSet<Phase>,
+    /// Any of these; empty: all.
+    pub robot_ids: BTreeSet<RobotId>,
+    /// Any of these; empty: all.
+    pub kinds: BTreeSet<String>,
+    /// All must match.
+    pub labels: BTreeMap<String, String>,
+    /// Exact; empty: all.
+    pub external_ref: String,
+    /// At or after.
+    pub created_after: Option<Utc>,
+    /// Before.
+    pub created_before: Option<Utc>,
+    /// Any of these; empty: all.
+    pub task_ids: BTreeSet<TaskId>,
+    /// Beginning of the id; empty: all.
+    pub task_id_prefix: String,
+}
+
+impl TaskFilter {
+    /// Whether a task is meant.
+    pub fn admits(&self, intake: &TaskIntake, state: &TaskState) -> bool {
+        let spec = &intake.spec;
+        (self.phases.is_empty() || self.phases.contains(&state.phase))
+            && (self.robot_ids.is_empty() || state.robot_id.as_ref().is_some_and(|r| self.robot_ids.contains(r)))
+            && (self.kinds.is_empty() || self.kinds.contains(&spec.kind))
+            && self.labels.iter().all(|(k, v)| spec.labels.get(k) == Some(v))
+            && (self.external_ref.is_empty() || self.external_ref == spec.external_ref)
+            && self.created_after.is_none_or(|t| intake.created >= t)
+            && self.created_before.is_none_or(|t| intake.created < t)
+            && (self.task_ids.is_empty() || self.task_ids.contains(&intake.task_id))
+            && intake.task_id.as_str().starts_with(&self.task_id_prefix)
+    }
+}
+
+impl super::Parse<TaskFilter> for v1::TaskFilter {
+    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<TaskFilter> {
+        let before = bad.0.len();
+        for (name, length) in [("robot_ids", self.robot_ids.len()), ("types", self.types.len()), ("task_ids", self.task_ids.len())] {
+            if length > limits::PAGE_MAX {
+                bad.add(at.field(name).to_string(), "must be at most 1000");
+            }
+        }
+        let states = self.states.iter().enumerate();
+        let phases = states.filter_map(|(i, s)| word(*s, at.field("states").index(i), bad)).collect();
+        let robots = self.robot_ids.iter().enumerate();
+        let robot_ids = robots.filter_map(|(i, r)| id(r, RobotId::parse, at.field("robot_ids").index(i), bad)).collect();
+        let tasks = self.task_ids.iter().enumerate();
+        let task_ids = tasks.filter_map(|(i, t)| id(t, TaskId::parse, at.field("task_ids").index(i), bad)).collect();
+        (bad.0.len() == before).then_some(TaskFilter {
+            phases,
+            robot_ids,
+            kinds: self.types.into_iter().collect(),
+            labels: self.labels,
+            external_ref: self.external_ref,
+            created_after: self.created_after.as_ref().map(time_of),
+            created_before: self.created_before.as_ref().map(time_of),
+            task_ids,
+            task_id_prefix: self.task_id_prefix,
+        })
+    }
+}
