@@ -1,0 +1,158 @@
+//! The .proto files say what they mean: every field, every enum value, and the same rules as core.
+
+use midshift_core::task::RawTask;
+use midshift_core::task::raw::{RawRetry, RawStep, RawStepKind};
+use midshift_core::time::Utc;
+use midshift_proto::json::pool;
+use midshift_proto::FILE_DESCRIPTOR_SET;
+use prost::Message;
+use prost_types::FileDescriptorSet;
+use std::collections::BTreeMap;
+
+fn ours() -> FileDescriptorSet {
+    let mut set = FileDescriptorSet::decode(FILE_DESCRIPTOR_SET).expect("descriptors");
+    set.file.retain(|f| f.package().starts_with("midshift."));
+    set
+}
+
+/// Comment by path, for one file.
+fn comments(file: &prost_types::FileDescriptorProto) -> BTreeMap<Vec<i32>, String> {
+    let locations = file.source_code_info.as_ref().expect("source info").location.iter();
+    locations.map(|l| (l.path.clone(), l.leading_comments().trim().to_owned())).collect()
+}
+
+#[test]
+fn every_message_field_enum_value_and_call_has_a_comment() {
+    let mut silent = Vec::new();
+    let mut said = 0;
+    for file in &ours().file {
+        let comments = comments(file);
+        let mut look = |path: Vec<i32>, name: String| match comments.get(&path) {
+            Some(text) if text.ends_with('.') => said += 1,
+            _ => silent.push(name),
+        };
+        for (m, message) in file.message_type.iter().enumerate() {
+            look(vec![4, m as i32], message.name().to_owned());
+            for (f, field) in message.field.iter().enumerate() {
+                look(vec![4, m as i32, 2, f as i32], format!("{}.{}", message.name(), field.name()));
+            }
+        }
+        for (e, kind) in file.enum_type.iter().enumerate() {
+            look(vec![5, e as i32], kind.name().to_owned());
+            for (v, value) in kind.value.iter().enumerate() {
+                look(vec![5, e as i32, 2, v as i32], value.name().to_owned());
+            }
+        }
+        for (s, service) in file.service.iter().enumerate() {
+            for (m, method) in service.method.iter().enumerate() {
+                look(vec![6, s as i32, 2, m as i32], method.name().to_owned());
+            }
+        }
+    }
+    assert!(silent.is_empty(), "no whole sentence about {silent:?}");
+    assert!(said > 500, "only {said} were looked at");
+}
+
+#[test]
+fn every_file_says_how_to_try_it() {
+    for file in &ours().file {
+        let path = format!("{}/{}", env!("CARGO_MANIFEST_DIR"), file.name());
+        let text = std::fs::read_to_string(&path).expect("the file");
+        let header: Vec<_> = text.lines().take_while(|l| l.starts_with("//")).collect();
+        assert!(header.iter().any(|l| l.starts_with("// Try: grpcurl -plaintext")), "{path}");
+    }
+}
+
+/// The comment of a field, by message and field name.
+fn comment(message: &str, field: &str) -> String {
+    for file in &ours().file {
+        for (m, descriptor) in file.message_type.iter().enumerate() {
+            let Some(f) = descriptor.field.iter().position(|f| f.name() == field) else { continue };
+            if descriptor.name() == message {
+                return comments(file)[&vec![4, m as i32, 2, f as i32]].replace('\n', " ").replace("  ", " ");
+            }
+        }
+    }
+    panic!("no field {message}.{field}");
+}
+
+/// A task that breaks every rule that core knows of one.
+fn broken() -> RawTask {
+    let long = "x".repeat(129);
+    let goto = |name: &str| RawStep { kind: Some(RawStepKind::Goto(name.into())), ..RawStep::default() };
+    let params = serde_json::json!({ "big": "x".repeat(9_000) });
+    let big = params.as_object().expect("object").clone();
+    let bad_labels: BTreeMap<String, String> = (0..33).map(|i| (format!("k{i}"), String::new())).collect();
+    RawTask {
+        kind: "No".into(),
+        priority: Some(10),
+        robot_id: "No".into(),
+        selector_labels: bad_labels.clone(),
+        capabilities: vec!["No".into(); 33],
+        minimum_software: "new".into(),
+        steps: vec![
+            RawStep::default(),
+            RawStep { effect: Some(None), continue_on_fail: Some(None), timeout_ms: Some(0), ..goto("no way") },
+            RawStep { kind: Some(RawStepKind::Action("No".into(), big)), ..RawStep::default() },
+            RawStep { kind: Some(RawStepKind::Wait(0)), ..RawStep::default() },
+        ],
+        timeout_ms: Some(0),
+        schedule_to_start_ms: Some(0),
+        stall_ms: Some(0),
+        not_before: Some(Utc(1)),
+        deadline: Some(Utc(1)),
+        retry: Some(RawRetry { max_retry_times: -1, interval_ms: Some(-1), factor: Some(0.0), max_interval_ms: Some(-1), jitter: Some(2.0), ..RawRetry::default() }),
+        depends_on: vec!["TASK-1".into(); 33],
+        coalesce_key: "k".into(),
+        speed_limit_mm_s: Some(1),
+        labels: bad_labels,
+        requester: long.clone(),
+        external_ref: long.clone(),
+        trace_context: long,
+        ..RawTask::default()
+    }
+}
+
+/// Message and field that a violation's path ends in.
+fn owner(path: &str) -> (&'static str, String) {
+    let plain: String = path.split('.').map(|part| part.split('[').next().unwrap_or(part)).collect::<Vec<_>>().join(".");
+    let last = plain.rsplit('.').next().unwrap_or_default().to_owned();
+    let message = match plain.as_str() {
+        p if p.starts_with("spec.selector.") => "RobotSelector",
+        p if p.starts_with("spec.retry.") => "RetryPolicy",
+        p if p.ends_with(".goto.waypoint") => "Goto",
+        p if p.contains(".action.") => "Action",
+        p if p.contains(".wait.") => "Wait",
+        p if p.starts_with("spec.steps.") => "Step",
+        _ => "TaskSpec",
+    };
+    (message, last)
+}
+
+#[test]
+fn every_rule_that_core_checks_stands_in_the_comment_of_its_field() {
+    let refusal = broken().check("spec", &|_| false).expect_err("invalid");
+    let mut checked = 0;
+    for violation in &refusal.violations {
+        let (message, field) = owner(&violation.field);
+        // A step without a kind and a list that is too short are said by the message and by the list.
+        if field == "steps" && violation.field.ends_with(']') {
+            continue;
+        }
+        let said = comment(message, &field);
+        let rule = violation.description.trim_start_matches("must be ").trim_start_matches("key and value must be ").trim_start_matches("is required, ");
+        let rule = rule.trim_start_matches("at most ").trim_end_matches(" entries");
+        let same = said.contains(rule) || (rule == "stands there twice" && said.contains("each once"));
+        assert!(same, "{}: core says {:?}, the comment of {message}.{field} says {said:?}", violation.field, violation.description);
+        checked += 1;
+    }
+    assert!(checked >= 25, "only {checked} rules were looked at");
+}
+
+#[test]
+fn every_service_is_in_the_descriptor_set() {
+    let mut services: Vec<_> = pool().services().map(|s| s.full_name().to_owned()).collect();
+    services.sort();
+    let wanted = ["fleet.v1.FleetService", "link.v1.LinkService", "sim.v1.SimService", "task.v1.TaskService", "telemetry.v1.TelemetryService"];
+    assert_eq!(services, wanted.map(|s| format!("midshift.{s}")));
+}
