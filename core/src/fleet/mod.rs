@@ -104,6 +104,7 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
                 plan.report.unreadable.push(error.to_string());
             }
         }
+        view.absorbed = view.absorbed.max(entry.seq);
         if entry.seq <= consumed {
             continue;
         }
@@ -261,11 +262,14 @@ fn write_down(view: &mut View, now: Now, board: &Board, releases: &places::Relea
     }
 }
 
-/// Writes serving time with the items of this cycle, at most once a second.
+/// Writes serving time and the consumed position with the items of this cycle, at most once a second.
 fn tell_time(view: &mut View, now: Now, plan: &mut Plan) {
     let served = view.serving(&now);
     let written = view.clocks.get("fleet").map(|c| c.row).unwrap_or_default();
     if served.link_ms >= written.link_ms + 1_000 || written == ServiceClock::default() {
-        plan.decide(view, now, "fleet", |tx| tx.put(served, "fleet.served"));
+        plan.decide(view, now, "fleet", |tx| {
+            tx.put(served, "fleet.served");
+            mark(tx, tx.view.absorbed);
+        });
     }
 }

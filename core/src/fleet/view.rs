@@ -78,8 +78,12 @@ pub struct View {
     pub dirty: BTreeSet<RobotId>,
     /// Robots whose rules of areas must be composed again in this cycle.
     pub policy_dirty: BTreeSet<RobotId>,
-    /// Reading of the clocks when this view was first built.
+    /// Last entry of the feed that was taken.
+    pub absorbed: crate::rows::Seq,
+    /// Reading of the clocks when fleet started: every lease counts as renewed then, and no timer fires soon after.
     pub started: Now,
+    /// Reading of the clocks when the rows were read: serving time goes on from there.
+    pub read: Now,
     /// Serving time at that moment.
     pub served: ServiceClock,
     /// Since when a robot waits for a place it cannot have, site clock. Volatile.
@@ -217,7 +221,7 @@ pub const TABLES: &[Table] = &[
 
 impl View {
     /// An empty picture of `site`.
-    pub fn new(site: Arc<Site>, started: Now) -> Self {
+    pub fn new(site: Arc<Site>, started: Now, read: Now) -> Self {
         Self {
             router: crate::site::route::Router::new(site.clone()),
             site,
@@ -244,7 +248,9 @@ impl View {
             held_places: BTreeMap::new(),
             dirty: BTreeSet::new(),
             policy_dirty: BTreeSet::new(),
+            absorbed: crate::rows::Seq(0),
             started,
+            read,
             served: ServiceClock::default(),
             waits: BTreeMap::new(),
         }
@@ -334,8 +340,8 @@ impl View {
     /// Serving time at `now`.
     pub fn serving(&self, now: &Now) -> ServiceClock {
         ServiceClock {
-            site_ms: self.served.site_ms + now.site.since(self.started.site).as_ms(),
-            link_ms: self.served.link_ms + now.link.since(self.started.link).as_ms(),
+            site_ms: self.served.site_ms + now.site.since(self.read.site).as_ms(),
+            link_ms: self.served.link_ms + now.link.since(self.read.link).as_ms(),
         }
     }
 

@@ -1,1 +1,119 @@
-//! Under construction.
+//! Fleet scheduling as a service: reads the feed and the heartbeats, lets `core::fleet` decide, commits, answers questions.
+//!
+//! Called by the binary: [`FleetService::new`], its gRPC face, and [`FleetService::run`]. Invariant: nothing is decided here; a lost wake
+//! costs one sweep; no promise is kept in memory.
+
+mod encode;
+mod grpc;
+mod reconcile;
+
+use midshift_core::fleet::Board;
+use midshift_core::fleet::commands::Command;
+use midshift_core::fleet::view::View;
+use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::rows::Revision;
+use midshift_core::site::Site;
+use midshift_core::time::{Clock, Now};
+use midshift_core::work::Live;
+use midshift_proto::fleet::v1::fleet_service_server::FleetServiceServer;
+use midshift_store::{LiveBoard, Store};
+use std::sync::Arc;
+use tokio::sync::{mpsc, oneshot};
+use tokio_util::sync::CancellationToken;
+
+/// Requests that may wait for the reconciler; one more is told to come back.
+const REQUESTS_MAX: usize = 256;
+
+/// What the service is built from.
+pub struct Parts {
+    /// The memory that services share.
+    pub store: Arc<dyn Store>,
+    /// Newest heartbeats, written by telemetry.
+    pub board: Arc<LiveBoard<Live>>,
+    /// The site.
+    pub site: Arc<Site>,
+    /// Its text, kept in the store.
+    pub site_text: String,
+    /// Clocks.
+    pub clock: Arc<dyn Clock>,
+}
+
+/// A question about the picture as it is now.
+type Look = Box<dyn FnOnce(&View, &Board, &Now) + Send>;
+
+/// Something a person asks of the reconciler.
+enum Request {
+    /// Change something; answered after the commit.
+    Do {
+        command: Box<Command>,
+        seen: Option<Revision>,
+        validate_only: bool,
+        actor: String,
+        request_id: Option<String>,
+        reply: oneshot::Sender<Result<(), Refusal>>,
+    },
+    /// Look at something.
+    Look(Look),
+}
+
+/// The service. Cheap to clone: all clones talk to one reconciler.
+#[derive(Clone)]
+pub struct FleetService {
+    requests: mpsc::Sender<Request>,
+}
+
+/// The part that runs.
+pub struct Reconciler {
+    parts: Parts,
+    requests: mpsc::Receiver<Request>,
+}
+
+impl FleetService {
+    /// The face and the part that runs behind it.
+    pub fn new(parts: Parts) -> (Self, Reconciler) {
+        let (sender, requests) = mpsc::channel(REQUESTS_MAX);
+        (Self { requests: sender }, Reconciler { parts, requests })
+    }
+    /// The gRPC face.
+    pub fn grpc(&self) -> FleetServiceServer<Self> {
+        FleetServiceServer::new(self.clone())
+    }
+
+    async fn send(&self, request: Request) -> Result<(), Refusal> {
+        self.requests.try_send(request).map_err(|e| match e {
+            mpsc::error::TrySendError::Full(_) => Refusal::new(Kind::Exhausted, Code::Overloaded),
+            mpsc::error::TrySendError::Closed(_) => Refusal::new(Kind::Unavailable, Code::ShuttingDown),
+        })
+    }
+    /// Runs `look` on the picture and gives its answer.
+    async fn look<T: Send + 'static>(
+        &self,
+        look: impl FnOnce(&View, &Board, &Now) -> T + Send + 'static,
+    ) -> Result<T, Refusal> {
+        let (reply, answer) = oneshot::channel();
+        let look = move |view: &View, board: &Board, now: &Now| drop(reply.send(look(view, board, now)));
+        self.send(Request::Look(Box::new(look))).await?;
+        answer.await.map_err(|_| Refusal::new(Kind::Unavailable, Code::ShuttingDown))
+    }
+    /// Carries out a command and waits for its commit.
+    async fn act(
+        &self,
+        command: Command,
+        seen: Option<Revision>,
+        validate_only: bool,
+        request_id: Option<String>,
+    ) -> Result<(), Refusal> {
+        let (reply, answer) = oneshot::channel();
+        // Until login exists nobody is known by name.
+        let actor = "anonymous".to_owned();
+        self.send(Request::Do { command: Box::new(command), seen, validate_only, actor, request_id, reply }).await?;
+        answer.await.map_err(|_| Refusal::new(Kind::Unavailable, Code::CommitUnknown))?
+    }
+}
+
+impl Reconciler {
+    /// Runs until `shutdown`. Ends early only if the store's rows cannot be read at all.
+    pub async fn run(self, shutdown: CancellationToken) -> Result<(), midshift_store::Error> {
+        reconcile::run(self.parts, self.requests, shutdown).await
+    }
+}

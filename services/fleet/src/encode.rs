@@ -1,0 +1,154 @@
+//! Rows and explanations as their messages. Nothing is decided here.
+
+use midshift_core::fleet::explain::{RobotExplanation, TaskExplanation};
+use midshift_core::fleet::rows::{HolderState, Place, RobotControl, RobotCounter, RobotHolder};
+use midshift_core::fleet::view::View;
+use midshift_core::ids::{RobotId, TaskId};
+use midshift_core::reason::{Code, Reason};
+use midshift_core::robot::Duty;
+use midshift_core::rows::Revision;
+use midshift_core::site::PlaceKind;
+use midshift_core::task::state::Errand;
+use midshift_core::time::{Now, Utc};
+use midshift_proto::convert::task::etag;
+use midshift_proto::convert::{shown, timestamp};
+use midshift_proto::fleet::v1;
+
+/// What people and the breaker decided about a robot, and what it is taken by.
+pub fn control(view: &View, robot_id: &RobotId) -> v1::RobotControl {
+    let rowed = view.control.get(robot_id.as_str());
+    let row = rowed.map_or_else(|| RobotControl::new(robot_id.clone()), |c| c.row.clone());
+    let holder = match view.authority.get(robot_id.as_str()).map(|a| &a.row.holder) {
+        Some(RobotHolder::Attempt(id)) => id.to_string(),
+        Some(RobotHolder::Maintenance(id)) => format!("maintenance:{id}"),
+        _ => String::new(),
+    };
+    let errand = view.held_by(robot_id).and_then(|id| view.attempt(id)).and_then(|a| a.errand);
+    v1::RobotControl {
+        robot_id: robot_id.to_string(),
+        duty: match row.duty() {
+            Duty::InWork => v1::Duty::InWork,
+            Duty::Cordoned => v1::Duty::Cordoned,
+            Duty::BrokenOff => v1::Duty::BrokenOff,
+            Duty::Retired => v1::Duty::Retired,
+        } as i32,
+        cordon: row.cordon.map(|c| v1::Cordon { reason: c.reason, since: Some(timestamp(c.since)), actor: c.actor }),
+        breaker_open_time: row.breaker.map(timestamp),
+        failure_times: row.failures.iter().copied().map(timestamp).collect(),
+        holder,
+        errand: match errand {
+            None => v1::Errand::Unspecified,
+            Some(Errand::Charge) => v1::Errand::Charge,
+            Some(Errand::Park) => v1::Errand::Park,
+        } as i32,
+        hold_tokens: view.robot_holds(robot_id).map(|h| h.token.clone()).collect(),
+        etag: etag(rowed.map_or(Revision(0), |c| c.revision)),
+        work_generation: view.desired_work.get(robot_id.as_str()).map_or(0, |d| d.row.generation),
+    }
+}
+
+/// A place with its holders and who waits for it.
+pub fn place(view: &View, row: &Place, revision: Revision) -> v1::Place {
+    let site = view.site.find_place(&row.place_id).map(|ix| view.site.place(ix));
+    let kind = match site.map(|p| &p.kind) {
+        Some(PlaceKind::Exclusive(_)) => v1::PlaceKind::Exclusive,
+        Some(PlaceKind::Capacity(_)) => v1::PlaceKind::Capacity,
+        Some(PlaceKind::Standing(_)) => v1::PlaceKind::Standing,
+        None => v1::PlaceKind::Unspecified,
+    };
+    let mut waiting: Vec<_> = view
+        .waits
+        .iter()
+        .filter(|(_, w)| w.places.contains(&row.place_id))
+        .map(|(r, w)| (w.since, r.to_string()))
+        .collect();
+    waiting.sort();
+    let area = site.and_then(|p| p.waypoint()).map(|w| view.site.area_of(w).area_id.to_string());
+    v1::Place {
+        place_id: row.place_id.to_string(),
+        kind: kind as i32,
+        capacity: row.capacity,
+        holders: row
+            .holders
+            .iter()
+            .map(|h| v1::PlaceHolder {
+                robot_id: h.robot_id.to_string(),
+                state: match h.state {
+                    HolderState::Granted => v1::PlaceHolderState::Granted,
+                    HolderState::Inside => v1::PlaceHolderState::Inside,
+                    HolderState::Revoking => v1::PlaceHolderState::Revoking,
+                } as i32,
+                since: Some(timestamp(h.since)),
+                grant_id: h.grant_id,
+            })
+            .collect(),
+        waiting_robot_ids: waiting.into_iter().map(|(_, r)| r).collect(),
+        quarantine: row.quarantine.as_ref().map(shown),
+        etag: etag(revision),
+        area_id: area.unwrap_or_default(),
+    }
+}
+
+/// Why a task is where it is.
+pub fn task_explanation(task_id: &TaskId, e: &TaskExplanation, now: Utc) -> v1::TaskExplanation {
+    v1::TaskExplanation {
+        task_id: task_id.to_string(),
+        position: e.position.map(|p| p as u32),
+        verdict: e.verdict.as_ref().map(shown),
+        candidates: e
+            .candidates
+            .iter()
+            .map(|c| v1::RobotCandidate {
+                robot_id: c.robot_id.to_string(),
+                reason: c.reason.as_ref().map(shown),
+                distance_mm: c.distance_mm,
+            })
+            .collect(),
+        filtered: e
+            .filtered
+            .iter()
+            .map(|(code, n)| v1::FilterCount { code: code.as_str().to_owned(), robots: *n as u32 })
+            .collect(),
+        expected_start_time: None,
+        explain_time: Some(timestamp(now)),
+    }
+}
+
+/// Why a robot has no work, or what it does.
+pub fn robot_explanation(view: &View, now: &Now, robot_id: &RobotId, e: &RobotExplanation) -> v1::RobotExplanation {
+    let waits = (!e.waits_for.is_empty()).then(|| {
+        let places = e.waits_for.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ");
+        Reason::new(Code::PlaceBlocked, "waits for a place that another robot holds").with("places", places)
+    });
+    v1::RobotExplanation {
+        robot_id: robot_id.to_string(),
+        verdict: waits.as_ref().or(e.verdict.as_ref()).map(shown),
+        candidates: e
+            .candidates
+            .iter()
+            .map(|c| v1::TaskCandidate {
+                task_id: c.task_id.to_string(),
+                reason: c.reason.as_ref().map(shown),
+                distance_mm: c.distance_mm,
+            })
+            .collect(),
+        explain_time: Some(timestamp(now.utc)),
+        control: Some(control(view, robot_id)),
+    }
+}
+
+/// Work done by one robot on one version.
+pub fn counter(row: &RobotCounter) -> v1::RobotCounter {
+    v1::RobotCounter {
+        robot_id: row.robot_id.to_string(),
+        software: row.software.clone(),
+        tasks_succeeded: row.succeeded,
+        failures: row.failures.iter().map(|(k, v)| (*k, *v)).collect(),
+        task_duration_ms: row.stats.duration_ms,
+        path_mm: row.stats.path_mm,
+        loaded_path_mm: row.stats.loaded_path_mm,
+        attached_ms: row.stats.duration_ms,
+        hottest_joint_decidegrees: row.stats.hottest_joint_decidegrees,
+        energy_mwh: row.stats.energy_mwh,
+    }
+}

@@ -1,0 +1,269 @@
+//! The gRPC face of fleet: decode, call, encode.
+
+use crate::{FleetService, encode};
+use midshift_core::fleet::commands::Command;
+use midshift_core::fleet::{explain, view::View};
+use midshift_core::ids::{AreaId, PlaceId, RobotId, TaskId};
+use midshift_core::limits;
+use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
+use midshift_core::rows::Revision;
+use midshift_proto::convert::fleet::encode_policy;
+use midshift_proto::convert::task::revision_of;
+use midshift_proto::fleet::v1;
+use midshift_proto::fleet::v1::fleet_service_server::FleetService as Face;
+use tonic::{Request, Response, Status};
+
+fn request_id(text: &str, bad: &mut Violations) -> Option<String> {
+    if !text.is_empty() {
+        bad.take("request_id", midshift_core::ids::RequestId::parse(text));
+    }
+    (!text.is_empty()).then(|| text.to_owned())
+}
+
+fn reason_text(text: &str, bad: &mut Violations) {
+    if text.is_empty() || text.len() > limits::REASON_BYTES_MAX {
+        bad.add("reason", "is required, 1-256 bytes");
+    }
+}
+
+fn page_size(asked: u32, bad: &mut Violations) -> usize {
+    match asked as usize {
+        0 => limits::PAGE_DEFAULT,
+        n if n <= limits::PAGE_MAX => n,
+        _ => {
+            bad.add("page_size", "must be 1..1000; 0: 100");
+            limits::PAGE_DEFAULT
+        }
+    }
+}
+
+fn not_found(code: Code, id: impl std::fmt::Display) -> Refusal {
+    Refusal::new(Kind::NotFound, Reason::from(code).with("id", id))
+}
+
+fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {
+    result.map(Response::new).map_err(|refusal| midshift_proto::status(&refusal, None))
+}
+
+/// One page of rows sorted by id, and the id to go on after.
+fn page<T>(rows: impl Iterator<Item = (String, T)>, after: &str, size: usize) -> (Vec<T>, String) {
+    let mut rows = rows.skip_while(|(id, _)| !after.is_empty() && id.as_str() <= after);
+    let mut last = String::new();
+    let mut out = Vec::new();
+    for (id, row) in rows.by_ref().take(size) {
+        last = id;
+        out.push(row);
+    }
+    let next = if rows.next().is_some() { last } else { String::new() };
+    (out, next)
+}
+
+impl FleetService {
+    async fn cordon(&self, r: v1::CordonRobotRequest) -> Result<v1::CordonRobotResponse, Refusal> {
+        let mut bad = Violations::default();
+        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        let request_id = request_id(&r.request_id, &mut bad);
+        reason_text(&r.reason, &mut bad);
+        bad.finish()?;
+        let robot_id = robot_id.ok_or_else(internal)?;
+        let command = Command::Cordon { robot_id: robot_id.clone(), reason: r.reason };
+        self.act(command, revision_of(&r.etag), r.validate_only, request_id).await?;
+        let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
+        Ok(v1::CordonRobotResponse { control: Some(control) })
+    }
+
+    async fn uncordon(&self, r: v1::UncordonRobotRequest) -> Result<v1::UncordonRobotResponse, Refusal> {
+        let mut bad = Violations::default();
+        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        let request_id = request_id(&r.request_id, &mut bad);
+        bad.finish()?;
+        let robot_id = robot_id.ok_or_else(internal)?;
+        self.act(Command::Uncordon { robot_id: robot_id.clone() }, revision_of(&r.etag), r.validate_only, request_id)
+            .await?;
+        let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
+        Ok(v1::UncordonRobotResponse { control: Some(control) })
+    }
+
+    async fn control(&self, r: v1::GetRobotControlRequest) -> Result<v1::GetRobotControlResponse, Refusal> {
+        let robot_id = RobotId::parse(&r.robot_id).map_err(|e| Refusal::field("robot_id", e.to_string()))?;
+        let found = self
+            .look(move |view, _, _| {
+                view.sessions.contains_key(robot_id.as_str()).then(|| encode::control(view, &robot_id))
+            })
+            .await?;
+        let control = found.ok_or_else(|| not_found(Code::RobotNotFound, &r.robot_id))?;
+        Ok(v1::GetRobotControlResponse { control: Some(control) })
+    }
+
+    async fn policy(&self, area_id: AreaId) -> Result<v1::AreaPolicy, Refusal> {
+        let id = area_id.clone();
+        let found = self
+            .look(move |view, _, _| {
+                let area = view.site.find_area(&id)?;
+                let row = view.policies.get(id.as_str());
+                let policy = row.map_or_else(|| view.site.area(area).policy(), |p| p.row.clone());
+                Some(encode_policy(&policy, row.map(|p| p.revision)))
+            })
+            .await?;
+        found.ok_or_else(|| not_found(Code::AreaNotFound, area_id))
+    }
+
+    async fn put_policy(&self, r: v1::PutAreaPolicyRequest) -> Result<v1::PutAreaPolicyResponse, Refusal> {
+        let mut bad = Violations::default();
+        let request_id = request_id(&r.request_id, &mut bad);
+        let wire = r.policy.unwrap_or_default();
+        let seen = revision_of(&wire.etag);
+        let policy: Option<midshift_core::policy::AreaPolicy> =
+            midshift_proto::Parse::parse_at(wire, midshift_proto::convert::At::top("policy"), &mut bad);
+        bad.finish()?;
+        let policy = policy.ok_or_else(|| Refusal::field("policy", "is required"))?;
+        let area_id = policy.area_id.clone();
+        self.act(Command::PutPolicy(policy), seen, r.validate_only, request_id).await?;
+        let robots = self.look(|view, _, _| view.sessions.len() as u32).await?;
+        Ok(v1::PutAreaPolicyResponse { policy: Some(self.policy(area_id).await?), robots })
+    }
+
+    async fn places(&self, r: v1::ListPlacesRequest) -> Result<v1::ListPlacesResponse, Refusal> {
+        let mut bad = Violations::default();
+        let size = page_size(r.page_size, &mut bad);
+        bad.finish()?;
+        let (places, next_page_token) = self
+            .look(move |view: &View, _, _| {
+                let in_use = |p: &midshift_core::fleet::rows::Place| {
+                    !p.holders.is_empty()
+                        || p.quarantine.is_some()
+                        || view.waits.values().any(|w| w.places.contains(&p.place_id))
+                };
+                let rows = view.places.iter().filter(|(_, p)| !r.in_use || in_use(&p.row));
+                page(rows.map(|(id, p)| (id.clone(), encode::place(view, &p.row, p.revision))), &r.page_token, size)
+            })
+            .await?;
+        Ok(v1::ListPlacesResponse { places, next_page_token })
+    }
+
+    async fn clear(&self, r: v1::ClearPlaceRequest) -> Result<v1::ClearPlaceResponse, Refusal> {
+        let mut bad = Violations::default();
+        let place_id = bad.take("place_id", PlaceId::parse(&r.place_id));
+        let request_id = request_id(&r.request_id, &mut bad);
+        reason_text(&r.reason, &mut bad);
+        let seen: Option<Revision> = revision_of(&r.etag);
+        if seen.is_none() {
+            bad.add("etag", "is required: a person clears what the person saw");
+        }
+        bad.finish()?;
+        let place_id = place_id.ok_or_else(internal)?;
+        let command = Command::ClearPlace { place_id: place_id.clone(), reason: r.reason };
+        self.act(command, seen, r.validate_only, request_id).await?;
+        let place = self
+            .look(move |view, _, _| view.places.get(place_id.as_str()).map(|p| encode::place(view, &p.row, p.revision)))
+            .await?;
+        Ok(v1::ClearPlaceResponse { place })
+    }
+
+    async fn why_task(&self, r: v1::ExplainTaskRequest) -> Result<v1::ExplainTaskResponse, Refusal> {
+        let task_id = TaskId::parse(&r.task_id).map_err(|e| Refusal::field("task_id", e.to_string()))?;
+        let found = self
+            .look(move |view, board, now| {
+                explain::task(view, board, now, &task_id).map(|e| encode::task_explanation(&task_id, &e, now.utc))
+            })
+            .await?;
+        let explanation = found.ok_or_else(|| not_found(Code::TaskNotFound, &r.task_id))?;
+        Ok(v1::ExplainTaskResponse { explanation: Some(explanation) })
+    }
+
+    async fn why_robot(&self, r: v1::ExplainRobotRequest) -> Result<v1::ExplainRobotResponse, Refusal> {
+        let robot_id = RobotId::parse(&r.robot_id).map_err(|e| Refusal::field("robot_id", e.to_string()))?;
+        let found = self
+            .look(move |view, board, now| {
+                explain::robot(view, board, now, &robot_id).map(|e| encode::robot_explanation(view, now, &robot_id, &e))
+            })
+            .await?;
+        let explanation = found.ok_or_else(|| not_found(Code::RobotNotFound, &r.robot_id))?;
+        Ok(v1::ExplainRobotResponse { explanation: Some(explanation) })
+    }
+
+    async fn counters(&self, r: v1::ListCountersRequest) -> Result<v1::ListCountersResponse, Refusal> {
+        let mut bad = Violations::default();
+        let size = page_size(r.page_size, &mut bad);
+        bad.finish()?;
+        let (counters, next_page_token) = self
+            .look(move |view, _, _| {
+                let wanted = |c: &midshift_core::fleet::rows::RobotCounter| {
+                    (r.robot_ids.is_empty() || r.robot_ids.iter().any(|id| id == c.robot_id.as_str()))
+                        && (r.software.is_empty() || r.software == c.software)
+                };
+                let rows = view.counters.iter().filter(|(_, c)| wanted(&c.row));
+                page(rows.map(|(id, c)| (id.clone(), encode::counter(&c.row))), &r.page_token, size)
+            })
+            .await?;
+        Ok(v1::ListCountersResponse { counters, next_page_token })
+    }
+}
+
+/// An id that could not be read without a violation: cannot happen.
+fn internal() -> Refusal {
+    Refusal::new(Kind::Internal, Code::Internal)
+}
+
+#[tonic::async_trait]
+impl Face for FleetService {
+    async fn cordon_robot(
+        &self,
+        r: Request<v1::CordonRobotRequest>,
+    ) -> Result<Response<v1::CordonRobotResponse>, Status> {
+        answer(self.cordon(r.into_inner()).await)
+    }
+    async fn uncordon_robot(
+        &self,
+        r: Request<v1::UncordonRobotRequest>,
+    ) -> Result<Response<v1::UncordonRobotResponse>, Status> {
+        answer(self.uncordon(r.into_inner()).await)
+    }
+    async fn get_robot_control(
+        &self,
+        r: Request<v1::GetRobotControlRequest>,
+    ) -> Result<Response<v1::GetRobotControlResponse>, Status> {
+        answer(self.control(r.into_inner()).await)
+    }
+    async fn get_area_policy(
+        &self,
+        r: Request<v1::GetAreaPolicyRequest>,
+    ) -> Result<Response<v1::GetAreaPolicyResponse>, Status> {
+        let area_id = AreaId::parse(&r.into_inner().area_id).map_err(|e| Refusal::field("area_id", e.to_string()));
+        let policy = match area_id {
+            Ok(area_id) => self.policy(area_id).await,
+            Err(refusal) => Err(refusal),
+        };
+        answer(policy.map(|policy| v1::GetAreaPolicyResponse { policy: Some(policy) }))
+    }
+    async fn put_area_policy(
+        &self,
+        r: Request<v1::PutAreaPolicyRequest>,
+    ) -> Result<Response<v1::PutAreaPolicyResponse>, Status> {
+        answer(self.put_policy(r.into_inner()).await)
+    }
+    async fn list_places(&self, r: Request<v1::ListPlacesRequest>) -> Result<Response<v1::ListPlacesResponse>, Status> {
+        answer(self.places(r.into_inner()).await)
+    }
+    async fn clear_place(&self, r: Request<v1::ClearPlaceRequest>) -> Result<Response<v1::ClearPlaceResponse>, Status> {
+        answer(self.clear(r.into_inner()).await)
+    }
+    async fn explain_task(
+        &self,
+        r: Request<v1::ExplainTaskRequest>,
+    ) -> Result<Response<v1::ExplainTaskResponse>, Status> {
+        answer(self.why_task(r.into_inner()).await)
+    }
+    async fn explain_robot(
+        &self,
+        r: Request<v1::ExplainRobotRequest>,
+    ) -> Result<Response<v1::ExplainRobotResponse>, Status> {
+        answer(self.why_robot(r.into_inner()).await)
+    }
+    async fn list_counters(
+        &self,
+        r: Request<v1::ListCountersRequest>,
+    ) -> Result<Response<v1::ListCountersResponse>, Status> {
+        answer(self.counters(r.into_inner()).await)
+    }
+}

@@ -1,0 +1,206 @@
+//! The loop: take what is new, decide, commit, publish. A conflict means that somebody else decided too: the picture is built again.
+//!
+//! Invariant: the view has absorbed the whole feed before anything is decided on it.
+
+use crate::{Parts, Request};
+use midshift_core::fleet::view::{TABLES, View};
+use midshift_core::fleet::{Board, LOGS, Pace, Plan, absorb, commands, cycle, found};
+use midshift_core::limits;
+use midshift_core::reason::{Code, Kind, Reason, Refusal};
+use midshift_core::rows::{Item, Log, Seq};
+use midshift_core::time::Now;
+use midshift_core::work::Live;
+use midshift_store::{CommitError, Dirty, Error, FEED_PAGE_MAX};
+use std::time::Duration;
+use tokio::sync::{mpsc, oneshot};
+use tokio::time::Instant;
+use tokio_util::sync::CancellationToken;
+
+/// Pause after the store failed, before everything is read again.
+const STORE_RETRY: Duration = Duration::from_millis(200);
+/// Requests taken into one cycle.
+const REQUESTS_PER_CYCLE: usize = 64;
+
+struct Loop {
+    parts: Parts,
+    view: View,
+    seq: Seq,
+    board: Board,
+    dirty: Dirty<Live>,
+    started: Now,
+}
+
+type Replies = Vec<(oneshot::Sender<Result<(), Refusal>>, usize)>;
+
+/// Runs until `shutdown`.
+pub async fn run(
+    parts: Parts,
+    mut requests: mpsc::Receiver<Request>,
+    shutdown: CancellationToken,
+) -> Result<(), Error> {
+    let mut wake = parts.store.wake();
+    let started = parts.clock.now();
+    let dirty = parts.board.watch();
+    let view = View::new(parts.site.clone(), started, started);
+    let mut this = Loop { parts, view, seq: Seq(0), board: Board::new(), dirty, started };
+    this.rebuild_until_read(&shutdown).await;
+    let mut sweep = tokio::time::interval(Duration::from_millis(limits::SWEEP.as_ms()));
+    sweep.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    let mut batch = Vec::new();
+    loop {
+        let pace = tokio::select! {
+            biased;
+            () = shutdown.cancelled() => return Ok(()),
+            _ = sweep.tick() => Pace::Sweep,
+            n = requests.recv_many(&mut batch, REQUESTS_PER_CYCLE) => if n == 0 { return Ok(()) } else { Pace::Wake },
+            changed = wake.changed() => if changed.is_err() { return Ok(()) } else { Pace::Wake },
+        };
+        if this.turn(pace, std::mem::take(&mut batch)).await.is_err() {
+            tokio::time::sleep(STORE_RETRY).await;
+            this.rebuild_until_read(&shutdown).await;
+        }
+    }
+}
+
+impl Loop {
+    async fn rebuild_until_read(&mut self, shutdown: &CancellationToken) {
+        while let Err(error) = self.rebuild().await {
+            tracing::warn!(%error, "fleet cannot read the store, trying again");
+            tokio::select! {
+                () = shutdown.cancelled() => return,
+                () = tokio::time::sleep(STORE_RETRY) => {}
+            }
+        }
+    }
+
+    /// Builds the picture from nothing and takes what was not consumed yet.
+    async fn rebuild(&mut self) -> Result<(), Error> {
+        let snapshot = self.parts.store.snapshot(TABLES).await?;
+        let waits = std::mem::take(&mut self.view.waits);
+        self.view = View::new(self.parts.site.clone(), self.started, self.parts.clock.now());
+        self.view.load(&snapshot.rows)?;
+        self.view.waits = waits;
+        self.seq = self.view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq).min(snapshot.seq);
+        let mut plan = Plan::default();
+        found(&mut self.view, self.parts.clock.now(), &self.parts.site_text, &mut plan);
+        for result in self.parts.store.commit(plan.items).await {
+            result.map_err(|error| Error::Unavailable(std::sync::Arc::new(error)))?;
+        }
+        metrics::counter!("midshift_fleet_rebuilds_total").increment(1);
+        Ok(())
+    }
+
+    /// One turn. An error: the picture can no longer be trusted.
+    async fn turn(&mut self, pace: Pace, requests: Vec<Request>) -> Result<(), ()> {
+        for (robot_id, live) in self.dirty.take() {
+            match live {
+                Some(live) => self.board.insert(robot_id, live),
+                None => self.board.remove(&robot_id),
+            };
+        }
+        let begun = Instant::now();
+        let now = self.parts.clock.now();
+        let mut plan = Plan::default();
+        let foreign = self
+            .take_feed(now, &mut plan)
+            .await
+            .map_err(|error| tracing::warn!(%error, "fleet cannot read the feed"))?;
+        let replies = self.take_requests(requests, now, &mut plan);
+        if foreign || !replies.is_empty() || pace == Pace::Sweep {
+            cycle(&mut self.view, now, &self.board, pace, &mut plan);
+        }
+        metrics::histogram!("midshift_fleet_cycle_seconds").record(begun.elapsed().as_secs_f64());
+        publish(&plan, &self.view, pace);
+        self.commit(plan, replies).await
+    }
+
+    /// Absorbs the feed to its head; true if something came from others.
+    async fn take_feed(&mut self, now: Now, plan: &mut Plan) -> Result<bool, Error> {
+        let mut foreign = false;
+        loop {
+            let page = match self.parts.store.feed(self.seq, LOGS, FEED_PAGE_MAX).await {
+                Err(Error::CursorExpired { asked, oldest }) if asked < oldest && self.seq == Seq(0) => {
+                    self.seq = oldest;
+                    continue;
+                }
+                page => page?,
+            };
+            foreign |= page.entries.iter().any(|e| e.log != Log::Fleet);
+            absorb(&mut self.view, now, &page.entries, plan);
+            self.seq = page.next;
+            if page.next >= page.head {
+                return Ok(foreign);
+            }
+        }
+    }
+
+    fn take_requests(&mut self, requests: Vec<Request>, now: Now, plan: &mut Plan) -> Replies {
+        let mut replies = Vec::new();
+        for request in requests {
+            match request {
+                Request::Look(look) => look(&self.view, &self.board, &now),
+                Request::Do { command, seen, validate_only, actor, request_id, reply } => {
+                    let checked = commands::check(&self.view, &self.board, &now, &command, seen);
+                    if checked.is_err() || validate_only {
+                        drop(reply.send(checked));
+                        continue;
+                    }
+                    let mut tx = midshift_core::fleet::tx::Tx::new(&mut self.view, now, &actor)
+                        .on_request(request_id.as_deref());
+                    commands::apply(&mut tx, &command, &actor);
+                    plan.items.extend(tx.finish());
+                    replies.push((reply, plan.items.len()));
+                }
+            }
+        }
+        replies
+    }
+
+    async fn commit(&mut self, plan: Plan, replies: Replies) -> Result<(), ()> {
+        if plan.items.is_empty() {
+            return Ok(());
+        }
+        let kinds: Vec<&'static str> = plan.items.iter().map(kind_of).collect();
+        let results = self.parts.store.commit(plan.items).await;
+        let mut trusted = Ok(());
+        for (result, kind) in results.iter().zip(kinds) {
+            if let Err(error) = result {
+                let conflict = matches!(error, CommitError::Conflict { .. });
+                metrics::counter!("midshift_fleet_items_lost_total", "conflict" => conflict.to_string()).increment(1);
+                tracing::warn!(%error, kind, "fleet's item was not applied; planning again");
+                trusted = Err(());
+            }
+        }
+        for (reply, upto) in replies {
+            let lost = results.iter().take(upto).any(Result::is_err);
+            let answer =
+                if lost { Err(Refusal::new(Kind::Unavailable, Reason::from(Code::CommitUnknown))) } else { Ok(()) };
+            drop(reply.send(answer));
+        }
+        trusted
+    }
+}
+
+fn kind_of(item: &Item) -> &'static str {
+    item.rows.first().map_or("", |r| r.kind)
+}
+
+/// Counts and waiting reasons as metrics; nothing of it goes through the store.
+fn publish(plan: &Plan, view: &View, pace: Pace) {
+    let report = &plan.report;
+    metrics::counter!("midshift_fleet_offers_total").increment(report.offers);
+    metrics::counter!("midshift_fleet_errands_total").increment(report.errands);
+    metrics::counter!("midshift_fleet_fenced_reports_total").increment(report.tally.fenced);
+    metrics::counter!("midshift_fleet_stale_authority_total").increment(report.tally.stale_authority);
+    metrics::counter!("midshift_fleet_repairs_total").increment(report.tally.repaired);
+    for text in &report.unreadable {
+        tracing::error!(text, "fleet passed over something it cannot read");
+    }
+    if pace == Pace::Sweep {
+        metrics::gauge!("midshift_fleet_robots_waiting_for_place").set(report.tally.waiting_for_place as f64);
+        metrics::gauge!("midshift_fleet_tasks_open").set(view.tasks.len() as f64);
+        for (code, tasks) in &report.waiting {
+            metrics::gauge!("midshift_fleet_tasks_waiting", "reason" => code.as_str()).set(*tasks as f64);
+        }
+    }
+}
