@@ -5,7 +5,7 @@
 
 use crate::body::{Body, BodyLimits};
 use crate::bugs::Bugs;
-use crate::lanes::{LaneAck, LaneBatch, Sender};
+use crate::lanes::Sender;
 use crate::ledger::SessionMemory;
 use crate::places::Places;
 use crate::store::{Kept, Op};
@@ -17,6 +17,7 @@ use midshift_core::limits;
 use midshift_core::robot::{Fault, HardwareStop, Inventory, Lane, Mode, ReportedState, StopLevel, Vitals};
 use midshift_core::time::{LinkDuration, LinkTime, Now, SiteDuration, SiteTime};
 use midshift_core::work::{DesiredPolicy, DesiredWork, RobotEvent, SampleBody};
+use midshift_proto::session::{ClockSample, Downlink, Heartbeat, LaneAck, LaneBatch, Uplink, Welcome};
 use std::collections::{BTreeSet, VecDeque};
 
 /// What does not change while the agent runs.
@@ -26,55 +27,6 @@ pub struct CoreConfig {
     pub robot_id: RobotId,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: Bugs,
-}
-
-/// The server's answer to a Hello.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Welcome {
-    /// max(old + 1, unix ms).
-    pub session_epoch: u64,
-    /// Proves succession in the next Hello.
-    pub secret: String,
-    /// Which store serves.
-    pub store_id: String,
-    /// What it has of this ring.
-    pub acks: Vec<LaneAck>,
-    /// Milliseconds of link time between heartbeats.
-    pub heartbeat_period_ms: u64,
-    /// Milliseconds of site time between STATUS samples.
-    pub status_period_ms: u64,
-    /// Bytes of STATUS that may be under way.
-    pub status_credit_bytes: usize,
-    /// Attached, but no work: two robots claim this id.
-    pub observed: bool,
-}
-
-/// Four timestamps, unix microseconds: robot sent, server received, server answered, robot received (0 in an echo).
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ClockSample {
-    /// Robot: heartbeat sent.
-    pub t1_us: i64,
-    /// Server: heartbeat received.
-    pub t2_us: i64,
-    /// Server: echo sent.
-    pub t3_us: i64,
-    /// Robot: echo received.
-    pub t4_us: i64,
-}
-
-/// One message from the server after Welcome.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Downlink {
-    /// Newest heartbeat the server has processed, and its clock sample.
-    pub echo: Option<(u64, ClockSample)>,
-    /// What it has stored.
-    pub acks: Vec<LaneAck>,
-    /// Section work.
-    pub work: Option<DesiredWork>,
-    /// Section policy.
-    pub policy: Option<DesiredPolicy>,
-    /// Bytes of STATUS that may be under way.
-    pub status_credit_bytes: Option<usize>,
 }
 
 /// What happened outside.
@@ -94,26 +46,6 @@ pub enum Input {
     Fenced,
     /// This batch and all before it are durable.
     Persisted(u64),
-}
-
-/// One message to the server.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Uplink {
-    /// Newest wins, never stored.
-    pub heartbeat: Option<Heartbeat>,
-    /// At most 256 samples in all.
-    pub batches: Vec<LaneBatch>,
-}
-
-/// The heartbeat, which is the status.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Heartbeat {
-    /// What the robot believes of itself.
-    pub reported: ReportedState,
-    /// Robot's wall clock, unix microseconds.
-    pub sent_unix_us: i64,
-    /// Newest complete clock sample since the heartbeat before.
-    pub clock: Option<ClockSample>,
 }
 
 /// Why the agent ends by itself.
@@ -384,7 +316,7 @@ impl AgentCore {
             }
         }
         let memory =
-            SessionMemory { session_epoch: welcome.session_epoch, secret: welcome.secret, store_id: welcome.store_id };
+            SessionMemory { session_epoch: welcome.session_epoch, secret: welcome.session_secret, store_id: welcome.store_id };
         self.write(Op::Session(memory), true);
         for ack in &welcome.acks {
             for op in self.kept.ring.jump(ack.lane, ack.seq) {
@@ -393,28 +325,28 @@ impl AgentCore {
             }
         }
         welcome.acks.iter().for_each(|ack| self.acked(ack));
-        self.sender.connected(&self.kept.ring, welcome.status_credit_bytes);
+        self.sender.connected(&self.kept.ring, welcome.status_credit_bytes as usize);
         welcome.acks.iter().for_each(|ack| self.expected(ack));
-        self.period = LinkDuration(welcome.heartbeat_period_ms.clamp(100, limits::AUTHORITY.as_ms() / 3));
-        self.status_period = SiteDuration(welcome.status_period_ms.max(100));
+        self.period = LinkDuration(u64::from(welcome.heartbeat_period_ms).clamp(100, limits::AUTHORITY.as_ms() / 3));
+        self.status_period = SiteDuration(u64::from(welcome.status_period_ms).max(100));
         self.next_beat = now.link;
         self.clock = None;
     }
 
     fn down(&mut self, now: &Now, down: Downlink) {
         let observed = self.is_observed();
-        if let Some((hb, sample)) = down.echo {
+        if let Some(echo) = down.echo {
             if !observed {
-                self.sent.echoed(hb);
+                self.sent.echoed(echo.hb);
             }
-            self.clock = Some(ClockSample { t4_us: now.wall.0 * 1000, ..sample });
+            self.clock = Some(ClockSample { t4_us: now.wall.0 * 1000, ..echo.clock });
         }
         for ack in &down.acks {
             self.acked(ack);
             self.expected(ack);
         }
         if let Some(bytes) = down.status_credit_bytes {
-            self.sender.credit(bytes);
+            self.sender.credit(bytes as usize);
         }
         if let Some(policy) = down.policy {
             self.on_policy(policy);
@@ -593,7 +525,7 @@ impl AgentCore {
     }
 
     fn send_lane(&mut self, lane: Lane, message: &mut Uplink, out: &mut Vec<Output>) {
-        let size = |b: &LaneBatch| b.samples.len() + b.gaps.len();
+        let size = |b: &LaneBatch| b.items.len();
         while let Some(batch) = self.sender.next_batch(&self.kept.ring, lane) {
             let have: usize = message.batches.iter().map(size).sum();
             if have + size(&batch) > limits::SAMPLES_PER_MESSAGE {

@@ -6,30 +6,8 @@
 use crate::ring::{Item, Ring};
 use midshift_core::limits;
 use midshift_core::robot::Lane;
-use midshift_core::work::{Gap, Sample};
-use std::sync::Arc;
-
-/// What the server says of one lane.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct LaneAck {
-    /// Which.
-    pub lane: Lane,
-    /// All up to and with this one are stored.
-    pub seq: u64,
-    /// It saw a hole: send again from here, or say a gap.
-    pub expect: Option<u64>,
-}
-
-/// Numbered samples, or gaps, of one lane. Never both: their order is then the order of the message.
-#[derive(Clone, Debug, PartialEq)]
-pub struct LaneBatch {
-    /// Which.
-    pub lane: Lane,
-    /// Rising, each the one before + 1.
-    pub samples: Vec<Arc<Sample>>,
-    /// Rising.
-    pub gaps: Vec<Gap>,
-}
+use midshift_core::work::{InboxItem, Sample};
+use midshift_proto::session::LaneBatch;
 
 /// Unacknowledged samples of CRITICAL or EVENT under way at most. They need no credit; the queue to the wire needs a bound.
 const URGENT_IN_FLIGHT: u64 = 1_024;
@@ -78,21 +56,21 @@ impl Sender {
     pub fn next_batch(&mut self, ring: &Ring, lane: Lane) -> Option<LaneBatch> {
         let at = lane as usize;
         let may_reach = (ring.lane(lane).acked + self.window(lane)).min(self.durable[at]);
-        let mut batch = LaneBatch { lane, samples: Vec::new(), gaps: Vec::new() };
-        while batch.samples.len() + batch.gaps.len() < limits::SAMPLES_PER_MESSAGE {
+        let mut items = Vec::new();
+        while items.len() < limits::SAMPLES_PER_MESSAGE {
             match ring.after(lane, self.cursor[at]) {
-                Some(Item::Gap(gap)) if batch.samples.is_empty() && gap.to_seq <= self.durable[at] => {
+                Some(Item::Gap(gap)) if gap.to_seq <= self.durable[at] => {
                     self.cursor[at] = gap.to_seq;
-                    batch.gaps.push(gap);
+                    items.push(InboxItem::Gap(gap));
                 }
-                Some(Item::Sample(sample)) if batch.gaps.is_empty() && sample.seq <= may_reach => {
+                Some(Item::Sample(sample)) if sample.seq <= may_reach => {
                     self.cursor[at] = sample.seq;
-                    batch.samples.push(sample);
+                    items.push(InboxItem::Sample(Sample::clone(&sample)));
                 }
                 _ => break,
             }
         }
-        (!batch.samples.is_empty() || !batch.gaps.is_empty()).then_some(batch)
+        (!items.is_empty()).then_some(LaneBatch { lane, items })
     }
 
     /// Samples of a lane that may be unacknowledged.

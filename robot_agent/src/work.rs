@@ -130,8 +130,12 @@ impl AgentCore {
         if self.mode != Mode::Automatic || self.hardware_stop != HardwareStop::None {
             return Pause::Now;
         }
-        let held = self.resume_needed || self.desired.as_ref().is_some_and(|d| d.held);
-        if held || !self.has_lease(now) { Pause::WindDown } else { Pause::No }
+        if self.is_held() || !self.has_lease(now) { Pause::WindDown } else { Pause::No }
+    }
+
+    /// Hold tokens stand, or the last was taken away and nobody has let the robot go on yet.
+    fn is_held(&self) -> bool {
+        self.resume_needed || self.desired.as_ref().is_some_and(|d| d.held)
     }
 
     fn has_lease(&self, now: &Now) -> bool {
@@ -147,7 +151,7 @@ impl AgentCore {
     pub(crate) fn elapse(&mut self, now: &Now) {
         let passed = now.site.since(self.last_site).as_ms();
         self.last_site = now.site;
-        let held = self.resume_needed || self.desired.as_ref().is_some_and(|d| d.held);
+        let held = self.is_held();
         let Some(work) = &mut self.work else { return };
         work.holder.duration_ms += passed;
         if !held && !work.holder.unknown {
@@ -508,7 +512,9 @@ impl AgentCore {
 
     fn next_step(&mut self) {
         let Some(work) = &mut self.work else { return };
-        work.holder.step += 1;
+        let next = work.holder.step + 1;
+        let resume = work.order.as_ref().filter(|o| o.from_step == work.holder.step).map(|o| o.resume_step);
+        work.holder.step = next.max(resume.unwrap_or(0));
         work.holder.intent = None;
         (work.recheck, work.intent_fresh, work.step_elapsed_ms) = (false, false, 0);
         let more = work.order.as_ref().is_some_and(|o| (work.holder.step as usize) < o.steps.len());
@@ -602,11 +608,12 @@ impl AgentCore {
         if work.ending.is_some() {
             return WorkState::Stopping;
         }
-        if !work.started && pause != Pause::Now {
-            return WorkState::Accepted;
-        }
-        if stands && (pause != Pause::No || work.order.is_none()) {
+        let held = self.is_held() || pause == Pause::Now;
+        if stands && (held || (work.started && (pause != Pause::No || work.order.is_none()))) {
             return WorkState::Paused;
+        }
+        if !work.started {
+            return WorkState::Accepted;
         }
         match work.step().map(|s| &s.kind) {
             Some(StepKind::Goto { .. }) => WorkState::Navigating,
