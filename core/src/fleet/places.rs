@@ -20,6 +20,9 @@ use std::collections::{BTreeMap, BTreeSet};
 /// A robot that blocks a place others need steps aside after this long, at once if somebody waits for it.
 const STEP_ASIDE_AFTER: SiteDuration = SiteDuration::from_secs(3);
 
+/// Grant ids of one generation: more than the places of any one stretch.
+const GRANTS_PER_GENERATION: u64 = 1024;
+
 /// What a robot waits for. Volatile: waiting reasons never go through the store.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Waiting {
@@ -209,8 +212,8 @@ fn grantable(view: &View, robot_id: &RobotId, needed: &[PlaceIx], blocked: &BTre
 }
 
 fn grant(tx: &mut Tx, robot_id: &RobotId, needed: &[PlaceIx]) {
-    let grant_id = desired::next_generation(tx.view, robot_id, &tx.now);
-    for ix in needed {
+    let first = desired::next_generation(tx.view, robot_id, &tx.now) * GRANTS_PER_GENERATION;
+    for (grant_id, ix) in (first..).zip(needed) {
         let id = tx.view.site.place(*ix).place_id.clone();
         let Some(mut place) = tx.view.places.get(id.as_str()).map(|p| p.row.clone()) else { continue };
         if place.holder(robot_id).is_none() {
