@@ -477,6 +477,7 @@ impl AgentCore {
             self.wait_until_durable();
             return true;
         }
+        self.body.work_for(work.holder.attempt.subject.task_id(), work.holder.step);
         match self.body.start(now.site, BodyOrder::Act(step.kind.clone())) {
             Ok(()) => self.mark_started(Doing::Acting),
             Err(fault) => self.step_failed(now, fault),

@@ -6,10 +6,12 @@
 pub mod body;
 pub mod energy;
 pub mod faults;
+pub mod hall;
 pub mod handle;
 pub mod journal;
 pub mod motion;
 pub mod oracle;
 pub mod person;
+pub mod service;
 pub mod workload;
 pub mod world;

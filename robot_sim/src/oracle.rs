@@ -3,10 +3,11 @@
 //! Invariant: it knows no row and no grant; the only thing taken from the site is how many a place holds.
 //! Fed entry by entry by a [`crate::world::World`], or from files of several processes after a run.
 
-use crate::journal::{Effect, Entry, Work};
+use crate::journal::{self, Effect, Entry, Work};
 use midshift_core::ids::{PlaceId, RobotId, TaskId, WaypointId};
 use midshift_core::site::Site;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::path::Path;
 
 /// Steps of tasks that are remembered to find one done twice; the oldest are forgotten first.
 const STEPS_REMEMBERED: usize = 200_000;
@@ -99,6 +100,14 @@ impl Oracle {
     pub fn of_site(site: &Site) -> Self {
         let judged = site.places().iter().filter(|_| site.collisions_modelled());
         Self::new(judged.map(|p| (p.place_id.clone(), p.capacity)))
+    }
+    /// Judges the journals of several bodies together: each file in its order, places by the times in the entries.
+    pub fn read<'a>(site: &Site, journals: impl IntoIterator<Item = &'a Path>) -> Result<Self, journal::Error> {
+        let mut oracle = Self::of_site(site);
+        for path in journals {
+            journal::read(path)?.iter().for_each(|entry| oracle.take(entry));
+        }
+        Ok(oracle)
     }
     /// Entries taken so far.
     pub fn entries(&self) -> u64 {

@@ -241,7 +241,7 @@ fn a_body_notes_the_passage_it_drives_through_and_the_standing_place_it_leaves()
 fn a_killed_body_comes_back_where_it_was_with_its_load_its_battery_and_its_places() {
     let dir = tempfile::tempdir().expect("a directory");
     let site = site();
-    let stock = WorldConfig { auto_stock: true, tag: "rbt-01".to_owned(), utc_base_ms: 1_000 };
+    let stock = WorldConfig { auto_stock: true, tag: "rbt-01".to_owned(), utc_base_ms: 1_000, crowded: false };
     let restore =
         |now| SimBody::restore(config("rbt-01", "A"), site.clone(), stock.clone(), dir.path(), now).expect("back");
     let (mut body, world) = restore(SiteTime(0));

@@ -111,6 +111,23 @@ pub struct Counts {
     pub manuals: u64,
 }
 
+impl std::ops::AddAssign for Counts {
+    fn add_assign(&mut self, other: Self) {
+        self.driving_ms += other.driving_ms;
+        self.acting_ms += other.acting_ms;
+        self.blocked_ms += other.blocked_ms;
+        self.halted_ms += other.halted_ms;
+        self.idle_ms += other.idle_ms;
+        self.obstacles += other.obstacles;
+        self.picks += other.picks;
+        self.places += other.places;
+        self.misses += other.misses;
+        self.jams += other.jams;
+        self.silences += other.silences;
+        self.manuals += other.manuals;
+    }
+}
+
 #[derive(Clone, Debug)]
 enum Order {
     Drive(VecDeque<PathPoint>),
@@ -263,6 +280,10 @@ impl SimBody {
     /// Millimetres driven, and of these with a load.
     pub fn odometers_mm(&self) -> (u64, u64) {
         (self.odometer_mm as u64, self.loaded_mm as u64)
+    }
+    /// Milliwatt-hours spent since it was made.
+    pub fn energy_mwh(&self) -> u64 {
+        self.stores.spent_mwh as u64
     }
     /// The fault that keeps it standing.
     pub fn broken(&self) -> Option<&Fault> {
