@@ -44,6 +44,14 @@ pub fn is_settled(view: &View, live: &Live) -> bool {
         && done(Lane::Critical, mark.map_or(0, |m| m.critical))
 }
 
+/// The heartbeat is not older than the robot's events that were consumed: an older one lists what has ended since.
+pub fn is_fresh(view: &View, live: &Live) -> bool {
+    let id = live.robot_id.as_str();
+    let Some(session) = view.sessions.get(id) else { return false };
+    let mark = view.lane_marks.get(&format!("{id}/{}", session.row.ring)).map_or(0, |m| m.row.event);
+    live.report.produced.get(&Lane::Event).copied().unwrap_or(0) >= mark
+}
+
 /// Repairs one robot.
 pub fn robot(tx: &mut Tx, robot_id: &RobotId, board: &Board, tally: &mut Tally) {
     if !lease_stands(tx.view, board, robot_id, &tx.now) {
@@ -55,7 +63,7 @@ pub fn robot(tx: &mut Tx, robot_id: &RobotId, board: &Board, tally: &mut Tally) 
         return;
     }
     stalled(tx, robot_id, &live);
-    if !is_settled(tx.view, &live) {
+    if !is_settled(tx.view, &live) || !is_fresh(tx.view, &live) {
         tally.pending += 1;
         return;
     }

@@ -40,7 +40,10 @@ pub fn robot(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> Resul
         Some(RobotHolder::Attempt(id)) => return Err(Reason::from(Code::RobotBusy).with("attempt", id)),
         Some(RobotHolder::Maintenance(id)) => return Err(Reason::from(Code::RobotBusy).with("maintenance", id)),
     }
-    if live.report.attempts.iter().any(|a| !a.state.is_over()) || session.session_epoch != live.report.session_epoch {
+    if repair::is_fresh(view, live) && live.report.attempts.iter().any(|a| !a.state.is_over()) {
+        return Err(Code::RobotReconciling.into());
+    }
+    if session.session_epoch != live.report.session_epoch {
         return Err(Code::RobotReconciling.into());
     }
     if way::find(view, live.report.vitals.waypoint.as_ref()).is_none() {

@@ -52,7 +52,7 @@ fn facts(tx: &Tx, task: &TaskState, intake: &TaskIntake, attempt: Option<&Attemp
     let step = news.report.map(|r| r.step_index).or(attempt.map(|a| a.step_index)).unwrap_or(0) as usize;
     let begun = intake.spec.steps.iter().take(step + 1).skip(task.next_step as usize);
     let refusal = news.report.and_then(|r| r.refusal.as_ref()).map(|r| r.code);
-    let semantic_refusal = matches!(refusal, Some(Code::UnsupportedAction | Code::UnknownWaypoint));
+    let semantic_refusal = refusal == Some(Code::UnsupportedAction);
     let refusers = task.semantic_refusers.len() + usize::from(semantic_refusal);
     Facts {
         retries_left: task.failures < intake.spec.retry.max_retry_times,
@@ -291,7 +291,7 @@ fn count_end(t: &mut TaskState, a: &Attempt, news: &News, step: Next) {
     if a.phase == AttemptPhase::Refused {
         t.refusals_in_row += 1;
         let code = a.refusal.as_ref().map(|r| r.code);
-        if matches!(code, Some(Code::UnsupportedAction | Code::UnknownWaypoint)) {
+        if code == Some(Code::UnsupportedAction) {
             t.semantic_refusers.insert(a.robot_id.clone());
         }
         return;
