@@ -133,7 +133,10 @@ pub fn refusal_of(status: &Status) -> Answer {
         reason,
         message: status.message().to_owned(),
         metadata: info.map(|info| info.metadata.clone().into_iter().collect()).unwrap_or_default(),
-        violations: violations.iter().map(|v| Violation { field: v.field.clone(), description: v.description.clone() }).collect(),
+        violations: violations
+            .iter()
+            .map(|v| Violation { field: v.field.clone(), description: v.description.clone() })
+            .collect(),
         request_id: details.request_info().map(|r| r.request_id.clone()).unwrap_or_default(),
         retry_after: details.retry_info().and_then(|r| r.retry_delay),
     }
@@ -154,7 +157,10 @@ mod tests {
         assert_eq!(answer.metadata.get("robot_id").map(String::as_str), Some("rbt-01"));
         let details = status.get_error_details();
         let failure = details.precondition_failure().expect("a precondition failure");
-        assert_eq!((failure.violations[0].r#type.as_str(), failure.violations[0].subject.as_str()), ("ROBOT_CORDONED", "rbt-01"));
+        assert_eq!(
+            (failure.violations[0].r#type.as_str(), failure.violations[0].subject.as_str()),
+            ("ROBOT_CORDONED", "rbt-01")
+        );
     }
 
     #[test]
@@ -170,8 +176,9 @@ mod tests {
     #[test]
     fn a_flood_of_violations_still_fits_into_a_header_and_says_how_many_are_left_out() {
         let rule = "must be 1-64 of [A-Za-z0-9-_.]";
-        let violations: Vec<_> =
-            (0..1000).map(|i| Violation { field: format!("spec.steps[{i}].goto.waypoint"), description: rule.into() }).collect();
+        let violations: Vec<_> = (0..1000)
+            .map(|i| Violation { field: format!("spec.steps[{i}].goto.waypoint"), description: rule.into() })
+            .collect();
         let status = status(&Refusal::invalid(violations), Some("r1"));
         assert!(status.details().len() < 6 * 1024 && status.message().len() < 2 * 1024);
         let answer = refusal_of(&status);
@@ -198,6 +205,9 @@ mod tests {
     #[test]
     fn a_status_of_another_program_reads_as_its_code_and_text() {
         let answer = refusal_of(&Status::unavailable("connection refused"));
-        assert_eq!((answer.grpc, answer.code, answer.message.as_str()), (tonic::Code::Unavailable, None, "connection refused"));
+        assert_eq!(
+            (answer.grpc, answer.code, answer.message.as_str()),
+            (tonic::Code::Unavailable, None, "connection refused")
+        );
     }
 }

@@ -1,4 +1,4 @@
-//! Areas' rules and the parts of fleet's answers that have core types.
+//! The rules of areas. What else fleet answers is composed from its view, in its service.
 
 use super::{At, Parse, id, permille, task::etag};
 use crate::fleet::v1;
@@ -30,11 +30,16 @@ impl Parse<AreaPolicy> for v1::AreaPolicy {
             None => Some(default),
             Some(value) => permille(value, at.field(name), bad),
         };
-        let mandatory = share(self.charge_mandatory_permille, default.charge_mandatory_permille, "charge_mandatory_permille");
-        let opportunistic =
-            share(self.charge_opportunistic_permille, default.charge_opportunistic_permille, "charge_opportunistic_permille");
+        let mandatory =
+            share(self.charge_mandatory_permille, default.charge_mandatory_permille, "charge_mandatory_permille");
+        let opportunistic = share(
+            self.charge_opportunistic_permille,
+            default.charge_opportunistic_permille,
+            "charge_opportunistic_permille",
+        );
         let stop = share(self.charge_stop_permille, default.charge_stop_permille, "charge_stop_permille");
-        let preemptible = share(self.charge_preemptible_permille, default.charge_preemptible_permille, "charge_preemptible_permille");
+        let preemptible =
+            share(self.charge_preemptible_permille, default.charge_preemptible_permille, "charge_preemptible_permille");
         let policy = AreaPolicy {
             speed_limit_mm_s: self.speed_limit_mm_s,
             avoidance_distance_mm: self.avoidance_distance_mm,

@@ -54,7 +54,8 @@ impl Submission {
             Some(Body::Nested(nested)) => (Form::Nested, nested.task_id.clone(), raw_nested(nested)),
             None => (Form::Missing, String::new(), RawTask::default()),
         };
-        let (chosen, at) = if request.task_id.is_empty() { (&own_id, "body.task_id") } else { (&request.task_id, "task_id") };
+        let (chosen, at) =
+            if request.task_id.is_empty() { (&own_id, "body.task_id") } else { (&request.task_id, "task_id") };
         let task_id = maybe_id(chosen, TaskId::parse, At::top(at), &mut bad).flatten();
         if !own_id.is_empty() && !request.task_id.is_empty() && own_id != request.task_id {
             bad.add("task_id", "differs from the task_id of the body");
@@ -428,7 +429,9 @@ impl TaskFilter {
 impl super::Parse<TaskFilter> for v1::TaskFilter {
     fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<TaskFilter> {
         let before = bad.0.len();
-        for (name, length) in [("robot_ids", self.robot_ids.len()), ("types", self.types.len()), ("task_ids", self.task_ids.len())] {
+        for (name, length) in
+            [("robot_ids", self.robot_ids.len()), ("types", self.types.len()), ("task_ids", self.task_ids.len())]
+        {
             if length > limits::PAGE_MAX {
                 bad.add(at.field(name).to_string(), "must be at most 1000");
             }
@@ -436,7 +439,8 @@ impl super::Parse<TaskFilter> for v1::TaskFilter {
         let states = self.states.iter().enumerate();
         let phases = states.filter_map(|(i, s)| word(*s, at.field("states").index(i), bad)).collect();
         let robots = self.robot_ids.iter().enumerate();
-        let robot_ids = robots.filter_map(|(i, r)| id(r, RobotId::parse, at.field("robot_ids").index(i), bad)).collect();
+        let robot_ids =
+            robots.filter_map(|(i, r)| id(r, RobotId::parse, at.field("robot_ids").index(i), bad)).collect();
         let tasks = self.task_ids.iter().enumerate();
         let task_ids = tasks.filter_map(|(i, t)| id(t, TaskId::parse, at.field("task_ids").index(i), bad)).collect();
         (bad.0.len() == before).then_some(TaskFilter {

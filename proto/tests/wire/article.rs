@@ -37,7 +37,10 @@ fn both_forms_of_the_article_are_one_task_of_goto_pick_goto_place() {
     let (go, act) = (Effect::Repeatable, Effect::AtMostOnce);
     let wanted = [("goto A01", go), ("pick \"SKU-88231\"", act), ("goto B03", go), ("place \"SKU-88231\"", act)];
     assert_eq!(steps, wanted.map(|(text, effect)| (text.to_owned(), effect)));
-    assert_eq!((flat_spec.timeout_ms, flat_spec.retry.max_retry_times, flat_spec.retry.interval_ms), (300_000, 3, 10_000));
+    assert_eq!(
+        (flat_spec.timeout_ms, flat_spec.retry.max_retry_times, flat_spec.retry.interval_ms),
+        (300_000, 3, 10_000)
+    );
     assert_eq!((flat_spec.priority, flat_spec.kind.as_str()), (2, "transport"));
     assert_eq!(flat_spec.robot_id.as_ref().map(ToString::to_string).as_deref(), Some("rbt-01"));
     assert_eq!(flat_spec.labels.get("created_at").map(String::as_str), Some("2026-06-01T08:00:00Z"));
@@ -48,11 +51,23 @@ fn a_short_form_hears_its_violations_by_its_own_names() {
     let cases = [
         (
             json!({"flat": {"task_type": "No", "from_waypoint": "X", "to_waypoint": "", "max_retry_times": -1}}),
-            ["flat.from_waypoint", "flat.max_retry_times", "flat.task_type", "flat.timeout_seconds", "flat.to_waypoint"],
+            [
+                "flat.from_waypoint",
+                "flat.max_retry_times",
+                "flat.task_type",
+                "flat.timeout_seconds",
+                "flat.to_waypoint",
+            ],
         ),
         (
             json!({"nested": {"type": "No", "content": {"from_waypoint": "X"}, "retry_strategy": {"max_retry_times": 101}}}),
-            ["nested.content.from_waypoint", "nested.content.to_waypoint", "nested.retry_strategy.max_retry_times", "nested.timeout_seconds", "nested.type"],
+            [
+                "nested.content.from_waypoint",
+                "nested.content.to_waypoint",
+                "nested.retry_strategy.max_retry_times",
+                "nested.timeout_seconds",
+                "nested.type",
+            ],
         ),
     ];
     for (request, wanted) in cases {

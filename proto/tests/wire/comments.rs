@@ -3,8 +3,8 @@
 use midshift_core::task::RawTask;
 use midshift_core::task::raw::{RawRetry, RawStep, RawStepKind};
 use midshift_core::time::Utc;
-use midshift_proto::json::pool;
 use midshift_proto::FILE_DESCRIPTOR_SET;
+use midshift_proto::json::pool;
 use prost::Message;
 use prost_types::FileDescriptorSet;
 use std::collections::BTreeMap;
@@ -101,7 +101,14 @@ fn broken() -> RawTask {
         stall_ms: Some(0),
         not_before: Some(Utc(1)),
         deadline: Some(Utc(1)),
-        retry: Some(RawRetry { max_retry_times: -1, interval_ms: Some(-1), factor: Some(0.0), max_interval_ms: Some(-1), jitter: Some(2.0), ..RawRetry::default() }),
+        retry: Some(RawRetry {
+            max_retry_times: -1,
+            interval_ms: Some(-1),
+            factor: Some(0.0),
+            max_interval_ms: Some(-1),
+            jitter: Some(2.0),
+            ..RawRetry::default()
+        }),
         depends_on: vec!["TASK-1".into(); 33],
         coalesce_key: "k".into(),
         speed_limit_mm_s: Some(1),
@@ -115,7 +122,8 @@ fn broken() -> RawTask {
 
 /// Message and field that a violation's path ends in.
 fn owner(path: &str) -> (&'static str, String) {
-    let plain: String = path.split('.').map(|part| part.split('[').next().unwrap_or(part)).collect::<Vec<_>>().join(".");
+    let plain: String =
+        path.split('.').map(|part| part.split('[').next().unwrap_or(part)).collect::<Vec<_>>().join(".");
     let last = plain.rsplit('.').next().unwrap_or_default().to_owned();
     let message = match plain.as_str() {
         p if p.starts_with("spec.selector.") => "RobotSelector",
@@ -140,10 +148,13 @@ fn every_rule_that_core_checks_stands_in_the_comment_of_its_field() {
             continue;
         }
         let said = comment(message, &field);
-        let rule = violation.description.trim_start_matches("must be ").trim_start_matches("key and value must be ").trim_start_matches("is required, ");
-        let rule = rule.trim_start_matches("at most ").trim_end_matches(" entries");
+        let rule = violation.description.rsplit("must be ").next().unwrap_or_default();
         let same = said.contains(rule) || (rule == "stands there twice" && said.contains("each once"));
-        assert!(same, "{}: core says {:?}, the comment of {message}.{field} says {said:?}", violation.field, violation.description);
+        assert!(
+            same,
+            "{}: core says {:?}, the comment of {message}.{field} says {said:?}",
+            violation.field, violation.description
+        );
         checked += 1;
     }
     assert!(checked >= 25, "only {checked} rules were looked at");
@@ -153,6 +164,12 @@ fn every_rule_that_core_checks_stands_in_the_comment_of_its_field() {
 fn every_service_is_in_the_descriptor_set() {
     let mut services: Vec<_> = pool().services().map(|s| s.full_name().to_owned()).collect();
     services.sort();
-    let wanted = ["fleet.v1.FleetService", "link.v1.LinkService", "sim.v1.SimService", "task.v1.TaskService", "telemetry.v1.TelemetryService"];
+    let wanted = [
+        "fleet.v1.FleetService",
+        "link.v1.LinkService",
+        "sim.v1.SimService",
+        "task.v1.TaskService",
+        "telemetry.v1.TelemetryService",
+    ];
     assert_eq!(services, wanted.map(|s| format!("midshift.{s}")));
 }

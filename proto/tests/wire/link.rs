@@ -5,17 +5,18 @@ use midshift_core::ids::{AreaId, AttemptId, PlaceId, RobotId, Subject, TaskId, W
 use midshift_core::policy::AreaPolicy;
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{
-    Fault, FaultClass, HardwareStop, HeldPlace, Inventory, Lane, Load, Mode, Pose, ReportedAttempt, ReportedState, StopLevel, Vitals,
+    Fault, FaultClass, HardwareStop, HeldPlace, Inventory, Lane, Load, Mode, Pose, ReportedAttempt, ReportedState,
+    StopLevel, Vitals,
 };
 use midshift_core::work::{
-    Assignment, AttemptReport, DesiredPolicy, DesiredWork, Effect, Gap, GrantedPlace, InboxItem, PlaceNews, RobotEvent, RoutePoint, Sample,
-    SampleBody, StepKind, WorkState, WorkStats, WorkStep,
+    Assignment, AttemptReport, DesiredPolicy, DesiredWork, Effect, Gap, GrantedPlace, InboxItem, PlaceNews, RobotEvent,
+    RoutePoint, Sample, SampleBody, StepKind, WorkState, WorkStats, WorkStep,
 };
 use midshift_proto::link::v1;
 use midshift_proto::parse;
 use midshift_proto::session::{
-    ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, LanePosition, Previous, ToRobot, Uplink,
-    Welcome,
+    ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, LanePosition,
+    Previous, ToRobot, Uplink, Welcome,
 };
 use proptest::prelude::*;
 use prost::Message;
@@ -67,7 +68,14 @@ fn at_work() -> ReportedState {
         mode: Mode::Automatic,
         vitals: vitals(),
         load: Some(Load { task_id: attempt().subject.task_id().cloned(), item: "SKU-88231".into() }),
-        attempts: vec![ReportedAttempt { attempt: attempt(), state: WorkState::Navigating, step_index: 2, progress: 99, route_index: 4, opened: true }],
+        attempts: vec![ReportedAttempt {
+            attempt: attempt(),
+            state: WorkState::Navigating,
+            step_index: 2,
+            progress: 99,
+            route_index: 4,
+            opened: true,
+        }],
         places: vec![HeldPlace { place_id: place("hold-7"), grant_id: 1_234, inside: true }],
         ..ReportedState::default()
     }
@@ -93,7 +101,13 @@ fn events() -> Vec<RobotEvent> {
         opened: true,
         refusal: Some(Reason::new(Code::StaleAuthority, "12 s too late").with("late_ms", 12_000)),
         fault: Some(fault()),
-        stats: WorkStats { path_mm: 1, loaded_path_mm: 2, duration_ms: 3, energy_mwh: 4, hottest_joint_decidegrees: -5 },
+        stats: WorkStats {
+            path_mm: 1,
+            loaded_path_mm: 2,
+            duration_ms: 3,
+            energy_mwh: 4,
+            hottest_joint_decidegrees: -5,
+        },
     };
     vec![
         RobotEvent::Attempt(report),
@@ -110,7 +124,14 @@ fn events() -> Vec<RobotEvent> {
 
 fn work() -> DesiredWork {
     let params = serde_json::json!({"item": "SKU-1", "n": 3, "weight": 1.25, "tags": ["a", null, true]});
-    let step = |kind, effect| WorkStep { kind, effect, pause_allowed: true, cancel_allowed: false, timeout_ms: Some(30_000), continue_on_fail: true };
+    let step = |kind, effect| WorkStep {
+        kind,
+        effect,
+        pause_allowed: true,
+        cancel_allowed: false,
+        timeout_ms: Some(30_000),
+        continue_on_fail: true,
+    };
     let point = |name: &str, ends_step, standing: Option<&str>| RoutePoint {
         waypoint: waypoint(name),
         x_mm: -5,
@@ -130,7 +151,10 @@ fn work() -> DesiredWork {
             timeout_ms: 285_000,
             steps: vec![
                 step(StepKind::Goto { waypoint: waypoint("A01") }, Effect::Repeatable),
-                step(StepKind::Action { name: "pick".into(), params: params.as_object().expect("object").clone() }, Effect::AtMostOnce),
+                step(
+                    StepKind::Action { name: "pick".into(), params: params.as_object().expect("object").clone() },
+                    Effect::AtMostOnce,
+                ),
                 step(StepKind::Wait { duration_ms: 0 }, Effect::CheckFirst),
             ],
             from_step: 1,
@@ -153,8 +177,16 @@ fn work() -> DesiredWork {
 }
 
 fn policy() -> DesiredPolicy {
-    let hall = AreaPolicy { speed_limit_mm_s: Some(800), avoidance_distance_mm: Some(1_200), ..AreaPolicy::default_of(AreaId::parse("hall").expect("id")) };
-    DesiredPolicy { robot_id: robot(), generation: 12, areas: vec![hall, AreaPolicy::default_of(AreaId::parse("yard").expect("id"))] }
+    let hall = AreaPolicy {
+        speed_limit_mm_s: Some(800),
+        avoidance_distance_mm: Some(1_200),
+        ..AreaPolicy::default_of(AreaId::parse("hall").expect("id"))
+    };
+    DesiredPolicy {
+        robot_id: robot(),
+        generation: 12,
+        areas: vec![hall, AreaPolicy::default_of(AreaId::parse("yard").expect("id"))],
+    }
 }
 
 fn hello() -> Hello {
@@ -172,7 +204,10 @@ fn hello() -> Hello {
         },
         reported: ReportedState { hb: 0, session_epoch: 0, ..reported() },
         ring: "ring-a".into(),
-        lanes: BTreeMap::from([(Lane::Event, LanePosition { first_seq: 4, next_seq: 4 }), (Lane::Status, LanePosition { first_seq: 1, next_seq: 90 })]),
+        lanes: BTreeMap::from([
+            (Lane::Event, LanePosition { first_seq: 4, next_seq: 4 }),
+            (Lane::Status, LanePosition { first_seq: 1, next_seq: 90 }),
+        ]),
         store_id: "store-1".into(),
         sent_unix_ms: 1_780_300_000_123,
         clock_rate_permille: 20_000,
@@ -181,7 +216,12 @@ fn hello() -> Hello {
 }
 
 fn clock() -> ClockSample {
-    ClockSample { t1_us: 1_780_300_000_000_001, t2_us: 1_780_300_000_000_400, t3_us: 1_780_300_000_000_500, t4_us: 1_780_300_000_000_900 }
+    ClockSample {
+        t1_us: 1_780_300_000_000_001,
+        t2_us: 1_780_300_000_000_400,
+        t3_us: 1_780_300_000_000_500,
+        t4_us: 1_780_300_000_000_900,
+    }
 }
 
 /// Through bytes, as on the wire.
@@ -202,14 +242,23 @@ fn uplink(lane: Lane, items: Vec<InboxItem>) -> FromRobot {
 #[test]
 fn what_a_robot_says_is_what_the_server_hears() {
     let items = events().into_iter().zip(1..);
-    let mut items: Vec<_> =
-        items.map(|(e, seq)| InboxItem::Sample(Sample { seq, robot_unix_ms: -1, body: SampleBody::Event(e) })).collect();
+    let mut items: Vec<_> = items
+        .map(|(e, seq)| InboxItem::Sample(Sample { seq, robot_unix_ms: -1, body: SampleBody::Event(e) }))
+        .collect();
     items.push(InboxItem::Gap(Gap { lane: Lane::Event, from_seq: 10, to_seq: 12, reason: Code::Overflow.into() }));
     let status = Sample { seq: 13, robot_unix_ms: 1_780_300_000_000, body: SampleBody::Status(vitals()) };
     let messages = [
         FromRobot::Hello(Box::new(hello())),
-        FromRobot::Hello(Box::new(Hello { previous: None, reported: ReportedState::default(), lanes: BTreeMap::new(), ..hello() })),
-        FromRobot::Uplink(Uplink { heartbeat: Some(Heartbeat { reported: reported(), sent_unix_us: 5, clock: Some(clock()) }), batches: vec![] }),
+        FromRobot::Hello(Box::new(Hello {
+            previous: None,
+            reported: ReportedState::default(),
+            lanes: BTreeMap::new(),
+            ..hello()
+        })),
+        FromRobot::Uplink(Uplink {
+            heartbeat: Some(Heartbeat { reported: reported(), sent_unix_us: 5, clock: Some(clock()) }),
+            batches: vec![],
+        }),
         FromRobot::Uplink(Uplink::default()),
         uplink(Lane::Event, items),
         uplink(Lane::Status, vec![InboxItem::Sample(status)]),
@@ -242,7 +291,11 @@ fn what_the_server_says_is_what_a_robot_hears() {
         status_credit_bytes: Some(0),
     };
     let idle = DesiredWork { assignment: None, grants: vec![], held: false, resume: None, closed: vec![], ..work() };
-    let close = Close { code: CloseCode::TooSlow, reason: Reason::new(Code::Overloaded, "reads nothing"), retry_after_ms: 60_000 };
+    let close = Close {
+        code: CloseCode::TooSlow,
+        reason: Reason::new(Code::Overloaded, "reads nothing"),
+        retry_after_ms: 60_000,
+    };
     let messages = [
         ToRobot::Welcome(welcome),
         ToRobot::Downlink(Box::new(full)),
@@ -265,12 +318,21 @@ fn a_heartbeat_with_nothing_new_takes_at_most_256_bytes() {
 
 #[test]
 fn a_sample_nobody_can_read_becomes_poison_and_its_neighbours_stay() {
-    let good = v1::Sample::from(&Sample { seq: 1, robot_unix_ms: 0, body: SampleBody::Event(RobotEvent::Mode(Mode::Manual)) });
+    let good =
+        v1::Sample::from(&Sample { seq: 1, robot_unix_ms: 0, body: SampleBody::Event(RobotEvent::Mode(Mode::Manual)) });
     let unknown = v1::Sample { seq: 2, robot_unix_ms: 0, body: None };
     let mode = v1::robot_event::Event::Mode(v1::ModeReport { mode: 0 });
-    let unspecified = v1::Sample { seq: 3, robot_unix_ms: 0, body: Some(v1::sample::Body::Event(v1::RobotEvent { event: Some(mode) })) };
+    let unspecified = v1::Sample {
+        seq: 3,
+        robot_unix_ms: 0,
+        body: Some(v1::sample::Body::Event(v1::RobotEvent { event: Some(mode) })),
+    };
     let wrong_lane = v1::Sample { seq: 4, robot_unix_ms: 0, body: Some(v1::sample::Body::Status((&vitals()).into())) };
-    let batch = v1::LaneBatch { lane: v1::Lane::Event.into(), samples: vec![good, unknown, unspecified, wrong_lane], gaps: vec![] };
+    let batch = v1::LaneBatch {
+        lane: v1::Lane::Event.into(),
+        samples: vec![good, unknown, unspecified, wrong_lane],
+        gaps: vec![],
+    };
     let read: LaneBatch = parse(batch).expect("readable");
     let poison: Vec<_> = read
         .items
@@ -291,18 +353,30 @@ fn a_sample_nobody_can_read_becomes_poison_and_its_neighbours_stay() {
 #[test]
 fn samples_and_gaps_of_a_batch_are_read_in_the_order_of_their_numbers() {
     let sample = |seq| InboxItem::Sample(Sample { seq, robot_unix_ms: 0, body: SampleBody::Status(Vitals::default()) });
-    let gap = |from_seq, to_seq| InboxItem::Gap(Gap { lane: Lane::Status, from_seq, to_seq, reason: Code::Overflow.into() });
+    let gap =
+        |from_seq, to_seq| InboxItem::Gap(Gap { lane: Lane::Status, from_seq, to_seq, reason: Code::Overflow.into() });
     let message = uplink(Lane::Status, vec![gap(1, 4), sample(5), gap(6, 6), sample(7)]);
     assert_eq!(up(&message), Ok(message));
 }
 
 #[test]
 fn a_session_that_breaks_the_shape_hears_every_field() {
-    let wrong = v1::Hello { inventory: Some(v1::Inventory { capabilities: vec!["Pick up".into()], ..Default::default() }), ..Default::default() };
+    let wrong = v1::Hello {
+        inventory: Some(v1::Inventory { capabilities: vec!["Pick up".into()], ..Default::default() }),
+        ..Default::default()
+    };
     let request = v1::SessionRequest { message: Some(v1::session_request::Message::Hello(wrong)) };
     let refusal = parse::<FromRobot, _>(request).expect_err("invalid");
     let fields: Vec<_> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
-    let wanted = ["robot_id", "boot_id", "inventory.capabilities", "reported", "ring", "clock_rate_permille", "protocol_versions"];
+    let wanted = [
+        "robot_id",
+        "boot_id",
+        "inventory.capabilities",
+        "reported",
+        "ring",
+        "clock_rate_permille",
+        "protocol_versions",
+    ];
     assert_eq!(fields, wanted.map(|f| format!("hello.{f}")));
     let zero = Heartbeat { reported: ReportedState { hb: 0, ..at_work() }, sent_unix_us: 0, clock: None };
     assert!(up(&FromRobot::Uplink(Uplink { heartbeat: Some(zero), batches: vec![] })).is_err());

@@ -2,5 +2,7 @@
 
 mod article;
 mod comments;
+mod fleet;
 mod link;
 mod task;
+mod telemetry;

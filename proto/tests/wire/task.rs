@@ -37,11 +37,10 @@ fn a_spec_comes_back_as_it_was_understood() {
     let spec = spec_of(full_spec());
     let again = raw_task(v1::TaskSpec::from(&spec)).check("spec", &|_: &WaypointId| true).expect("valid");
     assert_eq!(again, spec);
-    assert_eq!((spec.steps[2].effect, spec.steps[1].timeout_ms, spec.not_before), (
-        midshift_core::work::Effect::Repeatable,
-        Some(30_000),
-        Some(Utc(1_780_300_800_000))
-    ));
+    assert_eq!(
+        (spec.steps[2].effect, spec.steps[1].timeout_ms, spec.not_before),
+        (midshift_core::work::Effect::Repeatable, Some(30_000), Some(Utc(1_780_300_800_000)))
+    );
 }
 
 #[test]
@@ -95,7 +94,13 @@ fn a_task_shows_its_state_its_reason_in_words_and_its_revision_as_etag() {
     state.reason = Some(Reason::from(Code::AttemptsSpent));
     state.holds.insert("resume:s1".into());
     let allowed = [Resolution::Requeue, Resolution::Canceled];
-    let task = encode_task(TaskView { intake: &intake, state: &state, revision: Revision(9), attempt: None, allowed: &allowed });
+    let task = encode_task(TaskView {
+        intake: &intake,
+        state: &state,
+        revision: Revision(9),
+        attempt: None,
+        allowed: &allowed,
+    });
     assert_eq!(task.state(), v1::TaskState::NeedsOperator);
     assert_eq!(task.reason.expect("reason").message, Code::AttemptsSpent.help());
     assert_eq!(revision_of(&task.etag), Some(Revision(9)));
@@ -112,7 +117,10 @@ fn a_filter_admits_only_what_meets_all_its_fields() {
     };
     let cases = [
         (json!({}), true),
-        (json!({"states": ["TASK_STATE_QUEUED", "TASK_STATE_RUNNING"], "types": ["transport"], "labels": {"shift": "late"}}), true),
+        (
+            json!({"states": ["TASK_STATE_QUEUED", "TASK_STATE_RUNNING"], "types": ["transport"], "labels": {"shift": "late"}}),
+            true,
+        ),
         (json!({"states": ["TASK_STATE_RUNNING"]}), false),
         (json!({"robotIds": ["rbt-01"]}), false),
         (json!({"externalRef": "WO-7", "taskIdPrefix": "TASK-2026"}), true),

@@ -1,0 +1,81 @@
+//! Robots and their events as callers see them.
+
+use midshift_core::ids::RobotId;
+use midshift_core::reason::Code;
+use midshift_core::robot::{Inventory, Lane, Mode, Presence, ReportedState};
+use midshift_core::time::{LinkTime, SiteTime, Utc};
+use midshift_core::work::{Gap, InboxEntry, InboxItem, Live, PresenceRow, Session};
+use midshift_proto::convert::telemetry::{RobotView, encode_event, encode_robot};
+use midshift_proto::convert::{ms_of, time_of};
+use midshift_proto::{link, telemetry::v1};
+use std::collections::BTreeMap;
+
+fn robot() -> RobotId {
+    RobotId::parse("rbt-01").expect("id")
+}
+
+#[test]
+fn a_robot_shows_how_old_its_report_is_and_the_measured_clock_before_the_remembered_one() {
+    let session = Session {
+        robot_id: robot(),
+        session_epoch: 7,
+        secret: "s3cret".into(),
+        boot_id: "b".into(),
+        ring: "ring-a".into(),
+        inventory: Inventory::default(),
+        observed: false,
+        applied_work: 0,
+        places: vec![],
+        clock_offset_ms: Some(-3),
+    };
+    let presence = PresenceRow { robot_id: robot(), presence: Presence::Suspect, since_unix_ms: 4_000 };
+    let live = Live {
+        robot_id: robot(),
+        report: ReportedState { hb: 9, mode: Mode::Manual, ..ReportedState::default() },
+        processed_at: LinkTime(1_000),
+        processed_site: SiteTime(1_000),
+        received_unix_ms: 3_500,
+        progress_at: SiteTime(0),
+        clock_offset_ms: Some((12, 2)),
+        observed: true,
+    };
+    let durable = BTreeMap::from([(Lane::Event, 5)]);
+    let id = robot();
+    let view = RobotView {
+        robot_id: &id,
+        presence: Some(&presence),
+        session: Some(&session),
+        live: Some(&live),
+        durable: &durable,
+    };
+    let wire = encode_robot(view, LinkTime(5_250));
+    assert_eq!((wire.presence(), wire.session_epoch, wire.observed), (v1::Presence::Suspect, 7, true));
+    assert_eq!(wire.age.as_ref().map(ms_of), Some(4_250));
+    assert_eq!((wire.clock_offset_ms, wire.clock_error_ms), (Some(12), Some(2)));
+    assert_eq!(wire.reported.as_ref().expect("report").mode(), link::v1::Mode::Manual);
+    assert!(!format!("{wire:?}").contains("s3cret"), "the secret of a session is shown to nobody");
+
+    let wire = encode_robot(RobotView { live: None, presence: None, ..view }, LinkTime(5_250));
+    assert_eq!((wire.presence(), wire.clock_offset_ms, wire.observed), (v1::Presence::Offline, Some(-3), false));
+    assert!(wire.reported.is_none() && wire.age.is_none());
+}
+
+#[test]
+fn an_event_keeps_its_name_of_ring_lane_and_number() {
+    let entry = |what| InboxEntry {
+        robot_id: robot(),
+        session_epoch: 7,
+        ring: "ring-a".into(),
+        lane: Lane::Event,
+        what,
+        stamp_in_future: true,
+    };
+    let gap = Gap { lane: Lane::Event, from_seq: 3, to_seq: 5, reason: Code::Overflow.into() };
+    let wire = encode_event(&entry(InboxItem::Gap(gap)), Utc(1_234), "store-1:9".into());
+    assert_eq!((wire.ring.as_str(), wire.lane(), wire.cursor.as_str()), ("ring-a", link::v1::Lane::Event, "store-1:9"));
+    assert_eq!((wire.receive_time.as_ref().map(time_of), wire.stamp_in_future), (Some(Utc(1_234)), true));
+    let wire = encode_event(&entry(InboxItem::Poison { seq: 8, detail: "no body".into() }), Utc(0), String::new());
+    let Some(v1::event::Item::Poison(poison)) = wire.item else { panic!("not poison") };
+    let reason = poison.reason.expect("reason");
+    assert_eq!((poison.seq, reason.code.as_str(), reason.message.as_str()), (8, "POISON", "no body"));
+}
