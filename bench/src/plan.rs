@@ -1,0 +1,140 @@
+//! P6: how long one planning cycle of the fleet takes, beside a fixed reference loop of the same run.
+
+use crate::figure::{Figure, percentile};
+use midshift_core::fleet::view::{Rowed, View};
+use midshift_core::fleet::{Board, Pace, Plan, cycle, found};
+use midshift_core::ids::{RobotId, TaskId};
+use midshift_core::robot::{Inventory, ReportedState, Vitals};
+use midshift_core::rows::{Record, Revision};
+use midshift_core::site::{Site, grid};
+use midshift_core::task::forms::Transport;
+use midshift_core::task::{TaskIntake, TaskState};
+use midshift_core::time::{LinkTime, Now, SiteTime, Utc};
+use midshift_core::work::{Live, Session};
+use std::sync::Arc;
+use std::time::Instant;
+
+/// Cells of a side of the free grid that robots and tasks are spread over.
+const SIDE: usize = 120;
+/// Cycles measured per size.
+const CYCLES: usize = 15;
+/// Steps of the reference loop.
+const REFERENCE_STEPS: u64 = 20_000_000;
+
+/// Plans at three sizes of fleet, each with half as many tasks again as robots.
+pub fn run() -> anyhow::Result<Vec<Figure>> {
+    let map = format!("type octile\nheight {SIDE}\nwidth {SIDE}\nmap\n{}", format!("{}\n", ".".repeat(SIDE)).repeat(SIDE));
+    let site = Arc::new(grid::parse_map("bench", &map)?);
+    let mut figures = Vec::new();
+    for robots in [100, 1_000, 10_000] {
+        let mut ours = Vec::new();
+        let mut reference = Vec::new();
+        for round in 0..CYCLES {
+            reference.push(reference_ms());
+            ours.push(cycle_ms(&site, robots, robots * 3 / 2, round as u64));
+        }
+        let name = format!("whole cycle, {robots} idle robots, {} tasks, p50", robots * 3 / 2);
+        figures.push(Figure::of("P6", name, "ms", &ours, Some(("fixed reference loop", &reference))));
+        let p99 = percentile(&ours, 0.99);
+        figures.push(Figure::of("P6", format!("whole cycle, {robots} idle robots, p99"), "ms", &[p99], Some(("fixed reference loop", &reference))));
+    }
+    Ok(figures)
+}
+
+/// A fixed amount of dependent integer work: what this machine is worth at this moment.
+fn reference_ms() -> f64 {
+    let begun = instant();
+    let mut x = 0x9e37_79b9_7f4a_7c15_u64;
+    for _ in 0..REFERENCE_STEPS {
+        x ^= x << 13;
+        x ^= x >> 7;
+        x ^= x << 17;
+    }
+    std::hint::black_box(x);
+    begun.elapsed().as_secs_f64() * 1e3
+}
+
+#[expect(clippy::disallowed_methods, reason = "a benchmark measures real time")]
+fn instant() -> Instant {
+    Instant::now()
+}
+
+fn cycle_ms(site: &Arc<Site>, robots: usize, tasks: usize, seed: u64) -> f64 {
+    let now = Now { site: SiteTime(60_000), link: LinkTime(60_000), utc: Utc(1_800_000_000_000), wall: Utc(1_800_000_000_000) };
+    let (mut view, board) = fleet(site, robots, tasks, seed, now);
+    let mut plan = Plan::default();
+    found(&mut view, now, "", &mut plan);
+    let begun = instant();
+    cycle(&mut view, now, &board, Pace::Wake, &mut plan);
+    let took = begun.elapsed().as_secs_f64() * 1e3;
+    assert!(plan.report.offers as usize >= robots * 9 / 10, "a benchmark of a planner that assigned nothing");
+    took
+}
+
+fn fleet(site: &Arc<Site>, robots: usize, tasks: usize, seed: u64, now: Now) -> (View, Board) {
+    let mut view = View::new(site.clone(), Now::default(), Now::default());
+    let mut board = Board::new();
+    let mut x = seed.wrapping_mul(0x2545_f491_4f6c_dd1d) | 1;
+    let mut draw = |below: usize| {
+        x ^= x << 13;
+        x ^= x >> 7;
+        x ^= x << 17;
+        (x % below as u64) as usize
+    };
+    let cells = site.waypoints().len();
+    // Goals repeat, as stations do.
+    let goals: Vec<usize> = (0..400).map(|_| draw(cells)).collect();
+    for i in 0..robots {
+        let robot_id = RobotId::parse(&format!("rbt-{i:05}")).expect("a valid id");
+        let inventory = Inventory { capabilities: vec!["pick".into(), "place".into()], payload_g: 10_000, ..Inventory::default() };
+        let session = Session {
+            robot_id: robot_id.clone(),
+            session_epoch: 1,
+            secret: String::new(),
+            boot_id: String::new(),
+            ring: String::new(),
+            inventory,
+            observed: false,
+            applied_work: 0,
+            places: Vec::new(),
+            clock_offset_ms: None,
+        };
+        view.sessions.insert(session.id(), Rowed { revision: Revision(1), row: session });
+        let waypoint = Some(site.waypoints()[draw(cells)].waypoint_id.clone());
+        let vitals = Vitals { waypoint, battery_permille: 900, ..Vitals::default() };
+        let live = Live {
+            robot_id: robot_id.clone(),
+            report: ReportedState { hb: 60, session_epoch: 1, vitals, ..ReportedState::default() },
+            processed_at: now.link,
+            processed_site: now.site,
+            received_unix_ms: now.wall.0,
+            progress_at: now.site,
+            clock_offset_ms: None,
+            observed: false,
+        };
+        board.insert(robot_id, Arc::new(live));
+    }
+    for i in 0..tasks {
+        let name = |at: usize| site.waypoints()[at].waypoint_id.to_string();
+        let form = Transport {
+            kind: "transport".into(),
+            from_waypoint: name(goals[draw(goals.len())]),
+            to_waypoint: name(goals[draw(goals.len())]),
+            timeout_ms: Some(600_000),
+            ..Transport::default()
+        };
+        let intake = TaskIntake {
+            task_id: TaskId::parse(&format!("TASK-{i:06}")).expect("a valid id"),
+            spec: form.into_raw().check("task", &|_| true).expect("a valid task"),
+            actor: String::new(),
+            request_id: String::new(),
+            payload_hash: String::new(),
+            created: now.utc,
+            number: i as u64 + 1,
+        };
+        let state = TaskState::born(&intake);
+        view.tasks.insert(state.id(), Rowed { revision: Revision(1), row: state });
+        view.intakes.insert(intake.id(), Rowed { revision: Revision(1), row: intake });
+    }
+    (view, board)
+}
