@@ -52,8 +52,20 @@ pub fn is_fresh(view: &View, live: &Live) -> bool {
     live.report.produced.get(&Lane::Event).copied().unwrap_or(0) >= mark
 }
 
+/// Counts the time in which the robot is heard.
+fn attached(view: &mut View, robot_id: &RobotId, board: &Board, now: &Now) {
+    let heard = presence(board, robot_id, now) == Presence::Online;
+    let time = view.attached.entry(robot_id.clone()).or_insert(super::view::Attached { ms: 0, until: now.site });
+    if heard {
+        time.ms += now.site.since(time.until).as_ms();
+    }
+    time.until = now.site;
+}
+
 /// Repairs one robot.
 pub fn robot(tx: &mut Tx, robot_id: &RobotId, board: &Board, tally: &mut Tally) {
+    let now = tx.now;
+    attached(tx.view, robot_id, board, &now);
     if !lease_stands(tx.view, board, robot_id, &tx.now) {
         lease_over(tx, robot_id);
         return;

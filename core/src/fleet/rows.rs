@@ -253,6 +253,8 @@ pub struct RobotCounter {
     pub failures: BTreeMap<u32, u64>,
     /// Sums over all attempts, errands included.
     pub stats: WorkStats,
+    /// Milliseconds of site time in which it was heard, counted at the end of each attempt.
+    pub attached_ms: u64,
 }
 
 impl Record for RobotCounter {

@@ -173,8 +173,10 @@ fn count(tx: &mut Tx, a: &Attempt) {
         succeeded: 0,
         failures: std::collections::BTreeMap::new(),
         stats: crate::work::WorkStats::default(),
+        attached_ms: 0,
     });
     counter.stats += a.stats;
+    counter.attached_ms += tx.view.attached.get_mut(&a.robot_id).map_or(0, |h| std::mem::take(&mut h.ms));
     if a.errand.is_none() {
         match (a.phase, &a.fault) {
             (AttemptPhase::Succeeded, _) => counter.succeeded += 1,

@@ -25,6 +25,15 @@ pub struct Rowed<R> {
     pub row: R,
 }
 
+/// Time in which a robot was heard and that no counter has yet.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Attached {
+    /// Milliseconds of site time.
+    pub ms: u64,
+    /// Up to when, site clock.
+    pub until: crate::time::SiteTime,
+}
+
 /// Rows of one table by id.
 pub type Slot<R> = BTreeMap<String, Rowed<R>>;
 
@@ -88,6 +97,8 @@ pub struct View {
     pub served: ServiceClock,
     /// Since when a robot waits for a place it cannot have, site clock. Volatile.
     pub waits: BTreeMap<RobotId, super::places::Waiting>,
+    /// Time in which robots were heard since it was last counted. Volatile.
+    pub attached: BTreeMap<RobotId, Attached>,
     /// Distances and routes, remembered.
     pub router: crate::site::route::Router,
 }
@@ -253,6 +264,7 @@ impl View {
             read,
             served: ServiceClock::default(),
             waits: BTreeMap::new(),
+            attached: BTreeMap::new(),
         }
     }
 

@@ -91,6 +91,8 @@ pub fn place(view: &View, row: &Place, revision: Revision) -> v1::Place {
 
 /// Why a task is where it is.
 pub fn task_explanation(task_id: &TaskId, e: &TaskExplanation, now: Utc) -> v1::TaskExplanation {
+    let eligible = e.candidates.iter().filter(|c| c.reason.is_none()).count();
+    let soon = e.position.is_some_and(|p| p <= eligible);
     v1::TaskExplanation {
         task_id: task_id.to_string(),
         position: e.position.map(|p| p as u32),
@@ -109,7 +111,7 @@ pub fn task_explanation(task_id: &TaskId, e: &TaskExplanation, now: Utc) -> v1::
             .iter()
             .map(|(code, n)| v1::FilterCount { code: code.as_str().to_owned(), robots: *n as u32 })
             .collect(),
-        expected_start_time: None,
+        expected_start_time: soon.then(|| timestamp(now)),
         explain_time: Some(timestamp(now)),
     }
 }
@@ -147,7 +149,7 @@ pub fn counter(row: &RobotCounter) -> v1::RobotCounter {
         task_duration_ms: row.stats.duration_ms,
         path_mm: row.stats.path_mm,
         loaded_path_mm: row.stats.loaded_path_mm,
-        attached_ms: row.stats.duration_ms,
+        attached_ms: row.attached_ms,
         hottest_joint_decidegrees: row.stats.hottest_joint_decidegrees,
         energy_mwh: row.stats.energy_mwh,
     }

@@ -76,10 +76,11 @@ impl Loop {
     /// Builds the picture from nothing and takes what was not consumed yet.
     async fn rebuild(&mut self) -> Result<(), Error> {
         let snapshot = self.parts.store.snapshot(TABLES).await?;
-        let waits = std::mem::take(&mut self.view.waits);
+        let (waits, attached) = (std::mem::take(&mut self.view.waits), std::mem::take(&mut self.view.attached));
         self.view = View::new(self.parts.site.clone(), self.started, self.parts.clock.now());
         self.view.load(&snapshot.rows)?;
         self.view.waits = waits;
+        self.view.attached = attached;
         self.seq = self.view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq).min(snapshot.seq);
         let mut plan = Plan::default();
         found(&mut self.view, self.parts.clock.now(), &self.parts.site_text, &mut plan);
