@@ -74,10 +74,8 @@ pub enum Injected {
     GripperMissed(u32),
     /// A jam, now.
     Jam,
-    /// No network for this long.
+    /// No network for this long: the agent goes on, and nothing it says is heard.
     DropNetwork(SiteDuration),
-    /// The agent runs, and its heartbeats do not leave for this long.
-    Silence(SiteDuration),
     /// A person drives for this long.
     Manual(SiteDuration),
     /// The maker's own safety system stops it for this long and ends that by itself.

@@ -40,10 +40,6 @@ impl SimHandle {
     pub fn network(&self) -> watch::Receiver<bool> {
         self.lock().network()
     }
-    /// See [`SimBody::heartbeats`].
-    pub fn heartbeats(&self) -> watch::Receiver<bool> {
-        self.lock().heartbeats()
-    }
     /// See [`SimBody::counts`].
     pub fn counts(&self) -> Counts {
         self.lock().counts()

@@ -13,5 +13,6 @@ pub mod motion;
 pub mod oracle;
 pub mod person;
 pub mod service;
+pub mod swarm;
 pub mod workload;
 pub mod world;

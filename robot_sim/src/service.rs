@@ -123,7 +123,7 @@ fn read(fault: Fault, rate_permille: u32) -> Result<Option<Injected>, Refusal> {
     };
     Ok(Some(match fault {
         Fault::DropNetwork(f) => Injected::DropNetwork(link("drop_network.duration", f.duration)?),
-        Fault::Silence(f) => Injected::Silence(link("silence.duration", f.duration)?),
+        Fault::Silence(f) => Injected::DropNetwork(link("silence.duration", f.duration)?),
         Fault::Obstacle(v1::ObstacleFault { duration: None }) => Injected::Obstacle(FOR_LONG),
         Fault::Obstacle(f) => Injected::Obstacle(site("obstacle.duration", f.duration)?),
         Fault::GripperMiss(f) => Injected::GripperMissed(f.count),

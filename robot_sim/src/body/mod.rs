@@ -187,10 +187,8 @@ pub struct SimBody {
     pending_block: Option<SiteDuration>,
     misses_next: u32,
     network: watch::Sender<bool>,
-    heartbeats: watch::Sender<bool>,
     drop_at: Option<SiteTime>,
     dropped_until: Option<SiteTime>,
-    muted_until: Option<SiteTime>,
     stopped_until: Option<SiteTime>,
     manual_at: Option<SiteTime>,
     manual_until: Option<SiteTime>,
@@ -241,10 +239,8 @@ impl SimBody {
             pending_block: None,
             misses_next: 0,
             network: watch::Sender::new(true),
-            heartbeats: watch::Sender::new(true),
             drop_at: draw_next(&mut rng, now, config.faults.silence_per_hour),
             dropped_until: None,
-            muted_until: None,
             stopped_until: None,
             manual_at: draw_next(&mut rng, now, config.faults.manual_per_hour),
             manual_until: None,
@@ -265,10 +261,6 @@ impl SimBody {
     /// Whether its network is up, now and whenever it changes.
     pub fn network(&self) -> watch::Receiver<bool> {
         self.network.subscribe()
-    }
-    /// Whether its heartbeats leave, now and whenever that changes.
-    pub fn heartbeats(&self) -> watch::Receiver<bool> {
-        self.heartbeats.subscribe()
     }
     /// Faults so far by the maker's code.
     pub fn faults_by_code(&self) -> &BTreeMap<u32, u64> {
@@ -311,7 +303,6 @@ impl SimBody {
             Injected::GripperMissed(times) => self.misses_next = times.max(1),
             Injected::Jam => self.jam(now),
             Injected::DropNetwork(lasts) => self.lose_network(now, lasts),
-            Injected::Silence(lasts) => self.mute(now, lasts),
             Injected::Manual(lasts) => self.take_over(now, lasts),
             Injected::HardwareStop(lasts) => self.stop_hard(now, lasts),
             Injected::LowBattery(permille) => {
@@ -377,7 +368,7 @@ impl SimBody {
         };
         let empties = self.stores.lasts(&self.effort(f64::from(self.speed_mm_s(self.at)))).map(|lasts| self.at + lasts);
         let dead = (self.is_empty() && self.broken.is_none()).then_some(self.at);
-        let drops = [self.drop_at, self.dropped_until, self.muted_until];
+        let drops = [self.drop_at, self.dropped_until];
         let stands = [self.stopped_until, self.manual_at, self.manual_until];
         [phase, empties, dead].into_iter().chain(drops).chain(stands).flatten().min()
     }
@@ -391,9 +382,6 @@ impl SimBody {
             self.drop_at = draw_next(&mut self.rng, now, self.config.faults.silence_per_hour);
             let lasts = draw_secs(&mut self.rng, 2..=20);
             self.lose_network(now, lasts);
-        } else if due(self.muted_until) {
-            self.muted_until = None;
-            self.heartbeats.send_replace(true);
         } else if due(self.stopped_until) {
             self.stopped_until = None;
             self.hardware_stop = HardwareStop::None;
@@ -510,11 +498,6 @@ impl SimBody {
         self.counts.silences += 1;
         self.dropped_until = Some(now + lasts);
         self.network.send_replace(false);
-    }
-    fn mute(&mut self, now: SiteTime, lasts: SiteDuration) {
-        self.counts.silences += 1;
-        self.muted_until = Some(now + lasts);
-        self.heartbeats.send_replace(false);
     }
     fn stop_hard(&mut self, now: SiteTime, lasts: SiteDuration) {
         self.stopped_until = Some(now + lasts);

@@ -1,0 +1,254 @@
+//! A swarm: one agent for each body of a hall, in one process, with the person who walks among them.
+//!
+//! Invariant: each agent is the one a real robot runs, unchanged; only its body, its network and its crashes are simulated.
+//! Called by `dev`, `sim run`, the bench and the tests.
+
+use crate::hall::{Hall, Persistence};
+use crate::handle::SimHandle;
+use crate::service::Crash;
+use midshift_agent::body::Body;
+use midshift_agent::bugs::Bugs;
+use midshift_agent::core::ExitReason;
+use midshift_agent::dial::{self, Dial, TcpDial};
+use midshift_agent::memory::MemoryStore;
+use midshift_agent::session::{self, AgentConfig};
+use midshift_agent::sqlite::SqliteStore;
+use midshift_agent::store::{self, Store};
+use midshift_core::ids::{RobotId, TaskId};
+use midshift_core::robot::StopLevel;
+use midshift_core::time::Clock;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use std::collections::BTreeMap;
+use std::convert::Infallible;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::{Notify, watch};
+use tokio::task::JoinSet;
+use tokio_util::sync::CancellationToken;
+
+/// Name of an agent's ledger and ring in its directory.
+pub const AGENT_FILE: &str = "agent.db";
+/// The person goes round this often, milliseconds of site time.
+const ROUND_MS: u64 = 5_000;
+/// A crashed agent is started again after this, real time.
+const RESTART: Duration = Duration::from_millis(500);
+
+/// Makes the way to the server for one robot; nothing may pass while its network says false.
+pub type DialFor = Arc<dyn Fn(&RobotId, watch::Receiver<bool>) -> Result<Arc<dyn Dial>, dial::Error> + Send + Sync>;
+/// Whether a task still wants its item from the robot that carries it.
+pub type Live = Arc<dyn Fn(&TaskId) -> bool + Send + Sync>;
+
+/// A swarm that could not start or go on.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The server's address is not usable.
+    #[error(transparent)]
+    Dial(#[from] dial::Error),
+    /// A directory could not be made.
+    #[error("making {path}: {source}")]
+    Dir {
+        /// Which.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// An agent's ledger could not be kept.
+    #[error("agent of {robot_id}: {source}")]
+    Store {
+        /// Whose.
+        robot_id: RobotId,
+        /// Why.
+        source: store::Error,
+    },
+}
+
+/// What a swarm needs.
+#[derive(Clone)]
+pub struct SwarmConfig {
+    /// Its bodies.
+    pub hall: Arc<Hall>,
+    /// Both clocks.
+    pub clock: Arc<dyn Clock>,
+    /// The way to the server.
+    pub dial: DialFor,
+    /// Where ledgers and rings are kept: in memory, or in `<dir>/<robot_id>/agent.db`.
+    pub persistence: Persistence,
+    /// Decides the spread of starts and of attempts to connect.
+    pub seed: u64,
+    /// Starts are spread over this, real time.
+    pub spread: Duration,
+    /// Naive rules for twins of tests; none outside them.
+    pub bugs: Bugs,
+    /// Which tasks a person leaves to their robots; none: nobody walks the hall.
+    pub person: Option<Live>,
+}
+
+impl SwarmConfig {
+    /// Over TCP to `http://host:port`, all in memory, with a person to whom no load is dear.
+    pub fn tcp(hall: Arc<Hall>, clock: Arc<dyn Clock>, uri: &str, seed: u64) -> Self {
+        let uri = uri.to_owned();
+        let dial: DialFor = Arc::new(move |_, network| Ok(Arc::new(TcpDial::new(&uri, Some(network))?)));
+        Self {
+            hall,
+            clock,
+            dial,
+            persistence: Persistence::Memory,
+            seed,
+            spread: Duration::from_millis(500),
+            bugs: Bugs::default(),
+            person: Some(Arc::new(|_| false)),
+        }
+    }
+}
+
+/// How a swarm ended.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct SwarmEnd {
+    /// Robots whose agent gave up because another machine has its name.
+    pub fenced: Vec<RobotId>,
+    /// Crashes that were asked for.
+    pub crashes: u64,
+}
+
+/// Agents that can be crashed one by one while they run.
+pub struct Swarm {
+    config: SwarmConfig,
+    crashes: Arc<BTreeMap<RobotId, Notify>>,
+}
+
+impl Swarm {
+    /// Ready to run.
+    pub fn new(config: SwarmConfig) -> Self {
+        let crashes = config.hall.robots().iter().map(|r| (r.robot_id().clone(), Notify::new()));
+        Self { crashes: Arc::new(crashes.collect()), config }
+    }
+    /// Crashes one agent: its task is dropped where it is, its body stands, and it is started again from what it had kept.
+    pub fn crash(&self) -> Crash {
+        let crashes = self.crashes.clone();
+        Arc::new(move |robot_id| crashes.get(robot_id).inspect(|c| c.notify_one()).is_some())
+    }
+    /// Runs every agent until `shutdown`. Errors: the first agent that cannot go on ends all.
+    pub async fn run(self, shutdown: CancellationToken) -> Result<SwarmEnd, Error> {
+        let ending = shutdown.child_token();
+        let _ends_all = ending.clone().drop_guard();
+        let mut agents = JoinSet::new();
+        let mut rng = ChaCha8Rng::seed_from_u64(self.config.seed ^ 0x7377_6172);
+        let spread_us = self.config.spread.as_micros() as u64;
+        for robot in self.config.hall.robots() {
+            let life = Life {
+                config: self.config.clone(),
+                robot: robot.clone(),
+                crashes: self.crashes.clone(),
+                rng: ChaCha8Rng::seed_from_u64(rng.random()),
+                memory: MemoryStore::new(),
+                starts_after: Duration::from_micros(rng.random_range(0..=spread_us)),
+            };
+            agents.spawn(life.run(ending.clone()));
+        }
+        let person = walk(self.config.clone());
+        tokio::pin!(person);
+        let mut end = SwarmEnd::default();
+        loop {
+            let ended = tokio::select! {
+                ended = agents.join_next() => ended,
+                never = &mut person => match never {},
+            };
+            match ended {
+                None => return Ok(end),
+                Some(Ok(one)) => {
+                    let (fenced, crashes) = one?;
+                    end.fenced.extend(fenced);
+                    end.crashes += crashes;
+                }
+                Some(Err(panicked)) => std::panic::resume_unwind(panicked.into_panic()),
+            }
+        }
+    }
+}
+
+/// The person's rounds; ends only by being dropped.
+async fn walk(config: SwarmConfig) -> Infallible {
+    let Some(live) = config.person else { return std::future::pending().await };
+    let rate = u64::from(config.clock.rate_permille()).max(1);
+    loop {
+        tokio::time::sleep(Duration::from_millis((ROUND_MS * 1000 / rate).max(1))).await;
+        for deed in config.hall.person_round(config.clock.now().site, &*live) {
+            tracing::info!(?deed, "a person helped");
+        }
+    }
+}
+
+/// One robot's agent, from start to start.
+struct Life {
+    config: SwarmConfig,
+    robot: SimHandle,
+    crashes: Arc<BTreeMap<RobotId, Notify>>,
+    rng: ChaCha8Rng,
+    memory: MemoryStore,
+    starts_after: Duration,
+}
+
+impl Life {
+    /// Until the end; says whether it was fenced, and how often it crashed.
+    async fn run(mut self, shutdown: CancellationToken) -> Result<(Option<RobotId>, u64), Error> {
+        let robot_id = self.robot.robot_id().clone();
+        let failed = |source| Error::Store { robot_id: robot_id.clone(), source };
+        let mut crashes = 0;
+        let mut pause = self.starts_after;
+        loop {
+            tokio::select! {
+                () = shutdown.cancelled() => return Ok((None, crashes)),
+                () = tokio::time::sleep(pause) => {}
+            }
+            let dial = (self.config.dial)(&robot_id, self.robot.network())?;
+            let store = self.store().await?;
+            let (body, clock) = (Box::new(self.robot.clone()), self.config.clock.clone());
+            let agent = session::run(self.agent_config(), body, store, clock, dial, shutdown.clone());
+            let crash = async {
+                match self.crashes.get(&robot_id) {
+                    Some(crash) => crash.notified().await,
+                    None => std::future::pending().await,
+                }
+            };
+            tokio::select! {
+                ended = agent => match ended {
+                    Ok(ExitReason::Shutdown) => return Ok((None, crashes)),
+                    Ok(ExitReason::FencedTwice) => return Ok((Some(robot_id.clone()), crashes)),
+                    Err(session::Error::Store(source)) => return Err(failed(source)),
+                },
+                () = crash => {
+                    crashes += 1;
+                    tracing::info!(%robot_id, "agent crashed");
+                }
+            }
+            self.robot.stop(self.config.clock.now().site, StopLevel::Halt);
+            self.robot.poll(self.config.clock.now().site);
+            pause = RESTART;
+        }
+    }
+    fn agent_config(&mut self) -> AgentConfig {
+        // What must differ between two processes comes from the wall's clock too; the seed alone would repeat.
+        let wall = self.config.clock.now().wall.0;
+        AgentConfig {
+            robot_id: self.robot.robot_id().clone(),
+            boot_id: format!("{wall:x}-{:016x}", self.rng.random::<u64>()),
+            new_ring_id: format!("{wall:x}-{:016x}", self.rng.random::<u64>()),
+            seed: self.rng.random(),
+            bugs: self.config.bugs,
+            pulse: None,
+        }
+    }
+    async fn store(&self) -> Result<Box<dyn Store>, Error> {
+        let Persistence::Dir(dir) = &self.config.persistence else { return Ok(Box::new(self.memory.clone())) };
+        let dir = dir.join(self.robot.robot_id().as_str());
+        let failed = |source| Error::Store { robot_id: self.robot.robot_id().clone(), source };
+        make_dir(&dir)?;
+        Ok(Box::new(SqliteStore::open(&dir.join(AGENT_FILE)).await.map_err(failed)?))
+    }
+}
+
+fn make_dir(path: &Path) -> Result<(), Error> {
+    std::fs::create_dir_all(path).map_err(|source| Error::Dir { path: path.to_owned(), source })
+}
