@@ -40,6 +40,8 @@ pub const BREAKER_FAILURES: usize = 3;
 pub const BREAKER_WINDOW: SiteDuration = SiteDuration::from_secs(600);
 /// Refusals in a row before a person is asked: NO_ROBOT_ACCEPTS.
 pub const REFUSALS_IN_ROW: u32 = 5;
+/// Attempts of a task that robots may drop before a person is asked, whatever retries it asked for: a restarted agent is not its fault.
+pub const DROPS_TOLERATED: u32 = 3;
 /// Steps of one task.
 pub const STEPS_MAX: usize = 64;
 /// Labels of one task or robot.

@@ -57,6 +57,7 @@ fn facts(tx: &Tx, task: &TaskState, intake: &TaskIntake, attempt: Option<&Attemp
     Facts {
         retries_left: task.failures < intake.spec.retry.max_retry_times,
         retry_wanted: intake.spec.retry.max_retry_times > 0,
+        drops_left: task.failures < intake.spec.retry.max_retry_times.max(limits::DROPS_TOLERATED),
         opened,
         begun_repeatable: begun.into_iter().all(|s| s.effect == Effect::Repeatable),
         refusals_spent: task.refusals_in_row + 1 >= limits::REFUSALS_IN_ROW,

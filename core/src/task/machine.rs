@@ -88,7 +88,7 @@ impl Phase {
 pub enum Then {
     /// CANCELED.
     Canceled,
-    /// FAILED.
+    /// FAILED, or NEEDS_OPERATOR if it is opened: a person must look where the item is.
     Failed,
     /// RETRY_WAIT, or NEEDS_OPERATOR if it is opened or its attempts are spent.
     Retry,
@@ -147,7 +147,7 @@ pub enum Event {
     SeenRunning,
     /// The robot restarted inside a step that must not be done twice.
     StepUnknown,
-    /// Hand it back at the next boundary.
+    /// Hand it back at the next boundary. No producer until charging or more urgent work pre-empts.
     Suspend,
     /// No confirmation of the stop.
     StopConfirmTimeout,
@@ -218,6 +218,8 @@ pub struct Facts {
     pub retries_left: bool,
     /// Any retry was asked for at all.
     pub retry_wanted: bool,
+    /// One more drop by a robot is tried again, whatever the task asked for: a drop is not a fault of the work.
+    pub drops_left: bool,
     /// First irreversible step done or unknown.
     pub opened: bool,
     /// Every step begun in this attempt may be repeated.
@@ -266,6 +268,7 @@ pub struct Next {
 fn after_stop(then: Then, facts: &Facts) -> Phase {
     match then {
         Then::Canceled => Phase::Canceled,
+        Then::Failed if facts.opened => Phase::NeedsOperator,
         Then::Failed => Phase::Failed,
         Then::Retry if facts.opened || !facts.retries_left => Phase::NeedsOperator,
         Then::Retry => Phase::RetryWait,
@@ -294,10 +297,8 @@ fn after_final(facts: &Facts) -> Phase {
 
 /// Where a robot's drop of a running task leads: it stands without anybody having asked for it.
 fn after_drop(facts: &Facts) -> Phase {
-    if facts.begun_repeatable && !facts.opened && facts.retries_left {
+    if facts.begun_repeatable && !facts.opened && facts.drops_left {
         Phase::RetryWait
-    } else if facts.begun_repeatable && !facts.opened {
-        Phase::Queued
     } else {
         Phase::NeedsOperator
     }
@@ -423,7 +424,10 @@ fn uncertain(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
         Event::FailedRecoverable => {
             go(at.then.map_or_else(|| after_recoverable(facts), |t| after_stop(t, facts)), Fate::End)
         }
-        Event::FailedFinal => go(after_final(facts), Fate::End),
+        Event::FailedFinal => match at.then {
+            Some(then) if then != Then::Retry => go(after_stop(then, facts), Fate::End),
+            _ => go(after_final(facts), Fate::End),
+        },
         Event::Refused => go(at.then.map_or(Phase::Queued, |t| after_stop(t, facts)), Fate::End),
         Event::StopConfirmed => match at.then {
             Some(then) => go(after_stop(then, facts), Fate::End),
@@ -452,3 +456,6 @@ fn needs_operator(at: Standing, event: Event) -> Option<Next> {
         _ => None,
     }
 }
+
+#[cfg(test)]
+mod tests;
