@@ -1,1 +1,79 @@
-//! Under construction.
+//! Telemetry ingest as a service: holds the robots' links, keeps their events, serves their live state.
+//!
+//! Called by the binary: [`TelemetryService::new`], its two gRPC faces, and [`TelemetryService::run`]. Invariant: an acknowledgement leaves only
+//! after the commit that holds the data; a session and its way down never wait for the store; every stream is drained into bounded queues.
+
+mod bugs;
+mod events;
+mod grpc;
+mod link;
+mod offset;
+mod picture;
+mod presence;
+mod registry;
+mod session;
+mod welcome;
+
+pub use bugs::Bugs;
+
+use midshift_core::time::Clock;
+use midshift_core::work::Live;
+use midshift_proto::link::v1::link_service_server::LinkServiceServer;
+use midshift_proto::telemetry::v1::telemetry_service_server::TelemetryServiceServer;
+use midshift_store::{Error, FrameLog, LiveBoard, Store};
+use picture::Picture;
+use registry::Registry;
+use std::sync::Arc;
+use tokio_util::sync::CancellationToken;
+
+/// What the service is built from.
+pub struct Parts {
+    /// The memory that services share.
+    pub store: Arc<dyn Store>,
+    /// Where STATUS is kept.
+    pub frames: Arc<dyn FrameLog>,
+    /// Newest heartbeats, read by fleet.
+    pub board: Arc<LiveBoard<Live>>,
+    /// Clocks.
+    pub clock: Arc<dyn Clock>,
+    /// Naive rules for twins of tests; none outside them.
+    pub bugs: Bugs,
+}
+
+pub(crate) struct Inner {
+    pub parts: Parts,
+    pub picture: Picture,
+    pub registry: Registry,
+    pub shutdown: CancellationToken,
+}
+
+/// The service. Cheap to clone.
+#[derive(Clone)]
+pub struct TelemetryService {
+    inner: Arc<Inner>,
+}
+
+impl TelemetryService {
+    /// A service that ends its sessions at `shutdown`. Sessions wait until [`TelemetryService::run`] has read the store once.
+    pub fn new(parts: Parts, shutdown: CancellationToken) -> Self {
+        let inner = Inner { parts, picture: Picture::default(), registry: Registry::default(), shutdown };
+        Self { inner: Arc::new(inner) }
+    }
+    /// The robots' face.
+    pub fn link(&self) -> LinkServiceServer<Self> {
+        LinkServiceServer::new(self.clone()).max_decoding_message_size(midshift_core::limits::TELEMETRY_BATCH_BYTES)
+    }
+    /// The people's and programs' face.
+    pub fn grpc(&self) -> TelemetryServiceServer<Self> {
+        TelemetryServiceServer::new(self.clone())
+    }
+    /// Keeps the picture of rows and the presence of robots until shutdown.
+    pub async fn run(self) -> Result<(), Error> {
+        let inner = self.inner;
+        tokio::select! {
+            () = inner.shutdown.cancelled() => Ok(()),
+            result = picture::keep(&inner) => result,
+            () = presence::keep(&inner) => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,179 @@
+//! EVENT and CRITICAL of one session: numbers are checked on arrival, kept in one item with their mark, acknowledged after its commit.
+//!
+//! Laws: a batch is taken iff its first number is at most one past the last; a known prefix is dropped; a hole is answered with `expect`; an
+//! acknowledgement leaves only after the commit; a poison sample is recorded, acknowledged and skipped.
+
+use crate::Inner;
+use midshift_core::ids::RobotId;
+use midshift_core::robot::Lane;
+use midshift_core::rows::{Expect, Fact, Item, Log, Revision, Writer};
+use midshift_core::work::{InboxEntry, InboxItem, LaneMark};
+use midshift_proto::session::{LaneAck, LaneBatch};
+use midshift_store::{CommitError, load};
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+/// Facts that wait for the commit under way; one more is asked for again.
+const WAITING_MAX: usize = 1_024;
+/// Facts of one item.
+const FACTS_PER_ITEM: usize = 200;
+
+/// What came of one batch on arrival.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub struct Arrived {
+    /// Tell the robot to send again from here.
+    pub expect: Option<LaneAck>,
+    /// Everything was known already: say again what is durable.
+    pub known: bool,
+}
+
+/// The two lanes of one ring.
+#[derive(Debug)]
+pub struct Events {
+    durable: LaneMark,
+    revision: Revision,
+    /// Highest numbers taken, durable or not.
+    taken: [u64; 2],
+    waiting: VecDeque<InboxEntry>,
+}
+
+fn index(lane: Lane) -> Option<usize> {
+    match lane {
+        Lane::Critical => Some(0),
+        Lane::Event => Some(1),
+        Lane::Status => None,
+    }
+}
+
+fn numbers(item: &InboxItem) -> (u64, u64) {
+    match item {
+        InboxItem::Sample(sample) => (sample.seq, sample.seq),
+        InboxItem::Poison { seq, .. } => (*seq, *seq),
+        InboxItem::Gap(gap) => (gap.from_seq, gap.to_seq),
+    }
+}
+
+/// One item on its way to the store.
+pub struct Batch {
+    mark: LaneMark,
+    item: Item,
+}
+
+impl Events {
+    /// From what is durable.
+    pub fn new(durable: LaneMark, revision: Revision) -> Self {
+        Self { taken: [durable.critical, durable.event], durable, revision, waiting: VecDeque::new() }
+    }
+    /// Durable numbers as acknowledgements.
+    pub fn acks(&self) -> [LaneAck; 2] {
+        [(Lane::Critical, self.durable.critical), (Lane::Event, self.durable.event)].map(|(lane, seq)| LaneAck {
+            lane,
+            seq,
+            expect: None,
+        })
+    }
+    /// Numbers taken, as a naive server would acknowledge them.
+    pub fn taken(&self) -> [LaneAck; 2] {
+        [(Lane::Critical, self.taken[0]), (Lane::Event, self.taken[1])].map(|(lane, seq)| LaneAck {
+            lane,
+            seq,
+            expect: None,
+        })
+    }
+    /// Takes a batch of one lane.
+    pub fn arrive(&mut self, batch: LaneBatch, entry: impl Fn(InboxItem) -> InboxEntry) -> Arrived {
+        let Some(at) = index(batch.lane) else { return Arrived::default() };
+        let mut known = true;
+        for item in batch.items {
+            let (first, last) = numbers(&item);
+            if last <= self.taken[at] {
+                continue;
+            }
+            known = false;
+            if first > self.taken[at] + 1 || self.waiting.len() >= WAITING_MAX {
+                metrics::counter!("midshift_telemetry_expects_total").increment(1);
+                let seq = if at == 0 { self.durable.critical } else { self.durable.event };
+                return Arrived {
+                    expect: Some(LaneAck { lane: batch.lane, seq, expect: Some(self.taken[at] + 1) }),
+                    known,
+                };
+            }
+            self.taken[at] = last;
+            self.waiting.push_back(entry(item));
+        }
+        Arrived { expect: None, known }
+    }
+    /// The next item to commit; none if nothing waits.
+    pub fn next_batch(&mut self, robot_id: &RobotId) -> Option<Batch> {
+        if self.waiting.is_empty() {
+            return None;
+        }
+        let mut mark = self.durable.clone();
+        let mut item = Item::new(Writer::Telemetry, robot_id.as_str());
+        for entry in self.waiting.drain(..self.waiting.len().min(FACTS_PER_ITEM)) {
+            let (_, last) = numbers(&entry.what);
+            match entry.lane {
+                Lane::Critical => mark.critical = last,
+                _ => mark.event = last,
+            }
+            item.facts.push(fact(robot_id, &entry));
+        }
+        let expect = if self.revision == Revision(0) { Expect::Absent } else { Expect::At(self.revision) };
+        item.put(&mark, expect, "lane.durable");
+        Some(Batch { mark, item })
+    }
+    /// The batch is durable.
+    pub fn done(&mut self, mark: LaneMark) {
+        self.durable = mark;
+        self.revision = self.revision.next();
+    }
+    /// Nobody can say what became of the batch: everything since the durable numbers must come again.
+    pub fn forget_taken(&mut self) {
+        self.taken = [self.durable.critical, self.durable.event];
+        self.waiting.clear();
+    }
+    /// The batch is not: go on from what the store has, and ask for the rest again.
+    pub fn reset(&mut self, durable: LaneMark, revision: Revision) -> [LaneAck; 2] {
+        *self = Self::new(durable, revision);
+        self.acks().map(|ack| LaneAck { expect: Some(ack.seq + 1), ..ack })
+    }
+}
+
+fn fact(robot_id: &RobotId, entry: &InboxEntry) -> Fact {
+    let kind = match (&entry.what, entry.lane) {
+        (InboxItem::Gap(_), _) => "robot.gap",
+        (InboxItem::Poison { .. }, _) => "robot.poison",
+        (InboxItem::Sample(_), Lane::Critical) => "robot.critical",
+        (InboxItem::Sample(_), _) => "robot.event",
+    };
+    metrics::counter!("midshift_telemetry_facts_total", "kind" => kind).increment(1);
+    // An inbox entry holds only plain data, which serde_json cannot fail to write.
+    let body = serde_json::to_string(entry).map_or_else(|e| unreachable!("entry is not JSON: {e}"), Arc::from);
+    Fact { log: Log::RobotInbox, subject: Arc::from(robot_id.as_str()), kind, body }
+}
+
+/// What came of a commit.
+pub enum Outcome {
+    /// Durable.
+    Done(LaneMark),
+    /// Not, or nobody knows: this is what the store has.
+    Again(LaneMark, Revision),
+    /// The store does not answer.
+    Lost,
+}
+
+/// Commits a batch; after any failure reads what the store has, since every error is an unknown outcome.
+pub async fn commit(inner: Arc<Inner>, batch: Batch) -> Outcome {
+    let id = midshift_core::rows::Record::id(&batch.mark);
+    match inner.parts.store.commit(vec![batch.item]).await.pop() {
+        Some(Ok(_)) => return Outcome::Done(batch.mark),
+        Some(Err(CommitError::Conflict { .. })) => {}
+        Some(Err(error)) => tracing::warn!(%error, "robot events were not stored"),
+        None => {}
+    }
+    match load::<LaneMark>(inner.parts.store.as_ref(), &id).await {
+        Ok(Some((mark, revision))) => Outcome::Again(mark, revision),
+        Ok(None) => Outcome::Again(LaneMark { critical: 0, event: 0, ..batch.mark }, Revision(0)),
+        Err(_) => Outcome::Lost,
+    }
+}

@@ -1,0 +1,268 @@
+//! Robots and their events for people and programs: decode, look at the picture and the board, encode.
+
+use crate::{Inner, TelemetryService};
+use midshift_core::ids::RobotId;
+use midshift_core::limits;
+use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
+use midshift_core::robot::{Lane, Presence};
+use midshift_core::rows::{Log, Seq};
+use midshift_core::time::Utc;
+use midshift_core::work::{InboxEntry, InboxItem, Live, RobotEvent, SampleBody};
+use midshift_proto::convert::WireEnum;
+use midshift_proto::convert::telemetry::{RobotView, encode_event, encode_robot};
+use midshift_proto::telemetry::v1::{self, telemetry_service_server::TelemetryService as Face};
+use midshift_store::Error;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Request, Response, Status};
+
+/// Robots of one message of a watch.
+const ROBOTS_PER_MESSAGE: usize = 256;
+/// Messages on their way to one watcher.
+const WATCH_MAX: usize = 4;
+/// Milliseconds between two messages of a watch, by default and allowed.
+const PERIOD_DEFAULT_MS: u32 = 1_000;
+const PERIOD_MS: std::ops::RangeInclusive<u32> = 50..=60_000;
+
+#[derive(Clone, Default)]
+struct Filter {
+    robot_ids: BTreeSet<String>,
+    presences: BTreeSet<Presence>,
+    labels: BTreeMap<String, String>,
+}
+
+fn filter(wire: Option<v1::RobotFilter>, bad: &mut Violations) -> Filter {
+    let wire = wire.unwrap_or_default();
+    let mut presences = BTreeSet::new();
+    for (i, number) in wire.presences.iter().enumerate() {
+        match Presence::from_wire(*number) {
+            Some(presence) => drop(presences.insert(presence)),
+            None => bad.add(format!("filter.presences[{i}]"), "UNSPECIFIED is not a value"),
+        }
+    }
+    if wire.robot_ids.len() > limits::PAGE_MAX {
+        bad.add("filter.robot_ids", "must be at most 1000");
+    }
+    Filter { robot_ids: wire.robot_ids.into_iter().collect(), presences, labels: wire.labels.into_iter().collect() }
+}
+
+fn page_size(asked: u32, bad: &mut Violations) -> usize {
+    match asked as usize {
+        0 => limits::PAGE_DEFAULT,
+        n if n <= limits::PAGE_MAX => n,
+        _ => {
+            bad.add("page_size", "must be 1..1000; 0: 100");
+            limits::PAGE_DEFAULT
+        }
+    }
+}
+
+fn encode(inner: &Inner, robot_id: &RobotId, live: Option<&Live>) -> Option<v1::Robot> {
+    let rows = inner.picture.rows();
+    let session = rows.sessions.get(robot_id);
+    if session.is_none() && live.is_none() {
+        return None;
+    }
+    let mut durable = BTreeMap::new();
+    if let Some(session) = session {
+        if let Some(mark) = rows.marks.get(&format!("{robot_id}/{}", session.ring)) {
+            durable.insert(Lane::Critical, mark.critical);
+            durable.insert(Lane::Event, mark.event);
+        }
+        if let Some(seq) = rows.status.get(&(robot_id.clone(), Arc::from(session.ring.as_str()))) {
+            durable.insert(Lane::Status, *seq);
+        }
+    }
+    let view = RobotView { robot_id, presence: rows.presence.get(robot_id), session, live, durable: &durable };
+    Some(encode_robot(view, inner.parts.clock.now().link))
+}
+
+fn admits(inner: &Inner, filter: &Filter, robot_id: &RobotId) -> bool {
+    let rows = inner.picture.rows();
+    let presence = rows.presence.get(robot_id).map_or(Presence::Offline, |p| p.presence);
+    let labels = rows.sessions.get(robot_id).map(|s| &s.inventory.labels);
+    (filter.robot_ids.is_empty() || filter.robot_ids.contains(robot_id.as_str()))
+        && (filter.presences.is_empty() || filter.presences.contains(&presence))
+        && filter.labels.iter().all(|(k, v)| labels.is_some_and(|l| l.get(k) == Some(v)))
+}
+
+impl TelemetryService {
+    fn list(&self, r: v1::ListRobotsRequest) -> Result<v1::ListRobotsResponse, Refusal> {
+        let mut bad = Violations::default();
+        let size = page_size(r.page_size, &mut bad);
+        let filter = filter(r.filter, &mut bad);
+        bad.finish()?;
+        let inner = &self.inner;
+        let ids: Vec<RobotId> = inner.picture.rows().sessions.keys().cloned().collect();
+        let mut found =
+            ids.iter().filter(|id| id.as_str() > r.page_token.as_str()).filter(|id| admits(inner, &filter, id));
+        let robots: Vec<v1::Robot> = found
+            .by_ref()
+            .take(size)
+            .filter_map(|id| encode(inner, id, inner.parts.board.get(id).as_deref()))
+            .collect();
+        let more = found.next().is_some();
+        let next_page_token = robots.last().filter(|_| more).map(|r| r.robot_id.clone()).unwrap_or_default();
+        Ok(v1::ListRobotsResponse { robots, next_page_token })
+    }
+
+    fn get(&self, r: &v1::GetRobotRequest) -> Result<v1::GetRobotResponse, Refusal> {
+        let robot_id = RobotId::parse(&r.robot_id).map_err(|e| Refusal::field("robot_id", e.to_string()))?;
+        let robot = encode(&self.inner, &robot_id, self.inner.parts.board.get(&robot_id).as_deref());
+        match robot {
+            Some(robot) => Ok(v1::GetRobotResponse { robot: Some(robot) }),
+            None => Err(Refusal::new(Kind::NotFound, Reason::from(Code::RobotNotFound).with("robot_id", &r.robot_id))),
+        }
+    }
+
+    async fn events(&self, r: v1::ListEventsRequest) -> Result<v1::ListEventsResponse, Refusal> {
+        let mut bad = Violations::default();
+        let size = page_size(r.page_size, &mut bad);
+        if r.robot_ids.len() > limits::PAGE_MAX {
+            bad.add("robot_ids", "must be at most 1000");
+        }
+        bad.finish()?;
+        let store = &self.inner.parts.store;
+        let after = self.position(&r.cursor)?;
+        let subjects: Vec<Arc<str>> = r.robot_ids.iter().map(|id| Arc::from(id.as_str())).collect();
+        let page = if subjects.is_empty() {
+            store.feed(after, &[Log::RobotInbox], size).await
+        } else {
+            store.feed_of(Log::RobotInbox, &subjects, after, size).await
+        };
+        let page = match page {
+            Err(Error::CursorExpired { oldest, .. }) if r.cursor.is_empty() => {
+                return Box::pin(self.events(v1::ListEventsRequest { cursor: self.cursor(oldest), ..r })).await;
+            }
+            Err(Error::CursorExpired { .. }) => return Err(Refusal::new(Kind::Precondition, Code::CursorExpired)),
+            Err(error) => {
+                return Err(Refusal::new(Kind::Unavailable, Reason::new(Code::StoreUnavailable, error.to_string())));
+            }
+            Ok(page) => page,
+        };
+        let events = page
+            .entries
+            .iter()
+            .filter_map(|entry| {
+                let said: InboxEntry = serde_json::from_str(entry.body.as_ref()?).ok()?;
+                let about = r.subject.is_empty() || subject(&said).is_some_and(|s| s == r.subject);
+                about.then(|| encode_event(&said, Utc(entry.at_unix_ms), self.cursor(entry.seq)))
+            })
+            .collect();
+        Ok(v1::ListEventsResponse { events, cursor: self.cursor(page.next), caught_up: page.next >= page.head })
+    }
+
+    fn cursor(&self, seq: Seq) -> String {
+        format!("{}:{}", self.inner.parts.store.id(), seq.0)
+    }
+
+    fn position(&self, cursor: &str) -> Result<Seq, Refusal> {
+        if cursor.is_empty() {
+            return Ok(Seq(0));
+        }
+        let (store, seq) = cursor.rsplit_once(':').ok_or_else(|| Refusal::field("cursor", "is not a cursor"))?;
+        let seq = seq.parse().map_err(|_| Refusal::field("cursor", "is not a cursor"))?;
+        if store != self.inner.parts.store.id().to_string() {
+            return Err(Refusal::new(Kind::Precondition, Code::CursorOfOtherStore));
+        }
+        Ok(Seq(seq))
+    }
+}
+
+/// The task or errand that an event is about.
+fn subject(entry: &InboxEntry) -> Option<String> {
+    match &entry.what {
+        InboxItem::Sample(sample) => match &sample.body {
+            SampleBody::Event(RobotEvent::Attempt(report)) => Some(report.attempt.subject.to_string()),
+            _ => None,
+        },
+        _ => None,
+    }
+}
+
+fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {
+    result.map(Response::new).map_err(|refusal| midshift_proto::status(&refusal, None))
+}
+
+#[tonic::async_trait]
+impl Face for TelemetryService {
+    type WatchRobotsStream = ReceiverStream<Result<v1::WatchRobotsResponse, Status>>;
+
+    async fn list_robots(&self, r: Request<v1::ListRobotsRequest>) -> Result<Response<v1::ListRobotsResponse>, Status> {
+        answer(self.list(r.into_inner()))
+    }
+    async fn get_robot(&self, r: Request<v1::GetRobotRequest>) -> Result<Response<v1::GetRobotResponse>, Status> {
+        answer(self.get(&r.into_inner()))
+    }
+    async fn list_events(&self, r: Request<v1::ListEventsRequest>) -> Result<Response<v1::ListEventsResponse>, Status> {
+        answer(self.events(r.into_inner()).await)
+    }
+    async fn watch_robots(
+        &self,
+        r: Request<v1::WatchRobotsRequest>,
+    ) -> Result<Response<Self::WatchRobotsStream>, Status> {
+        let r = r.into_inner();
+        let mut bad = Violations::default();
+        let filter = filter(r.filter, &mut bad);
+        let period_ms = if r.period_ms == 0 { PERIOD_DEFAULT_MS } else { r.period_ms };
+        if !PERIOD_MS.contains(&period_ms) {
+            bad.add("period_ms", "must be 50..60000; 0: 1000");
+        }
+        if let Err(refusal) = bad.finish() {
+            return Err(midshift_proto::status(&refusal, None));
+        }
+        let (sender, stream) = mpsc::channel(WATCH_MAX);
+        let inner = self.inner.clone();
+        tokio::spawn(async move {
+            let shutdown = inner.shutdown.clone();
+            tokio::select! {
+                () = shutdown.cancelled() => {}
+                () = watch(&inner, filter, Duration::from_millis(u64::from(period_ms)), sender) => {}
+            }
+        });
+        Ok(Response::new(ReceiverStream::new(stream)))
+    }
+}
+
+/// The whole, then what changed, newest only, at the watcher's pace; a slow watcher lowers only its own rate.
+async fn watch(
+    inner: &Inner,
+    filter: Filter,
+    period: Duration,
+    sender: mpsc::Sender<Result<v1::WatchRobotsResponse, Status>>,
+) {
+    let mut dirty = inner.parts.board.watch();
+    dirty.take();
+    let known: Vec<RobotId> = inner.picture.rows().sessions.keys().cloned().collect();
+    let mut robots: Vec<v1::Robot> = known
+        .iter()
+        .filter(|id| admits(inner, &filter, id))
+        .filter_map(|id| encode(inner, id, inner.parts.board.get(id).as_deref()))
+        .collect();
+    let mut snapshot_complete = false;
+    loop {
+        let rest = robots.split_off(robots.len().min(ROBOTS_PER_MESSAGE));
+        let last = rest.is_empty();
+        let message = v1::WatchRobotsResponse { robots, snapshot_complete: !snapshot_complete && last };
+        snapshot_complete |= last;
+        if sender.send(Ok(message)).await.is_err() {
+            return;
+        }
+        robots = rest;
+        while robots.is_empty() {
+            tokio::time::sleep(period).await;
+            if sender.is_closed() {
+                return;
+            }
+            let changed = dirty.take();
+            robots = changed
+                .into_iter()
+                .filter(|(id, _)| admits(inner, &filter, id))
+                .filter_map(|(id, live)| encode(inner, &id, live.as_deref()))
+                .collect();
+        }
+    }
+}

@@ -1,0 +1,57 @@
+//! Estimates a robot's clock against ours from four timestamps: the sample with the smallest delay of the last eight wins.
+//!
+//! Only shown, and used to flag stamps from the future; nothing is ordered by it.
+
+use midshift_proto::session::ClockSample;
+use std::collections::VecDeque;
+
+/// Samples remembered.
+const SAMPLES: usize = 8;
+
+/// The newest samples of one session.
+#[derive(Debug, Default)]
+pub struct Offset {
+    samples: VecDeque<ClockSample>,
+}
+
+impl Offset {
+    /// Takes a complete sample; one that says that time ran backwards on the wire is passed over.
+    pub fn take(&mut self, sample: ClockSample) {
+        if sample.delay_us() < 0 || sample.t4_us == 0 {
+            return;
+        }
+        if self.samples.len() == SAMPLES {
+            self.samples.pop_front();
+        }
+        self.samples.push_back(sample);
+    }
+    /// Robot clock minus server clock, and the bound of its error; milliseconds.
+    pub fn estimate(&self) -> Option<(i64, u64)> {
+        let best = self.samples.iter().min_by_key(|s| s.delay_us())?;
+        Some((best.offset_us() / 1000, best.delay_us().unsigned_abs() / 2000 + 1))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_quickest_exchange_is_believed() {
+        let mut offset = Offset::default();
+        offset.take(ClockSample { t1_us: 0, t2_us: 900_000, t3_us: 900_000, t4_us: 1_000_000 });
+        offset.take(ClockSample { t1_us: 5_000_000, t2_us: 4_801_000, t3_us: 4_801_000, t4_us: 5_002_000 });
+        assert_eq!(offset.estimate(), Some((200, 2)));
+        for _ in 0..SAMPLES {
+            offset.take(ClockSample { t1_us: 0, t2_us: 10_000, t3_us: 10_000, t4_us: 20_000 });
+        }
+        assert_eq!(offset.estimate(), Some((0, 11)));
+    }
+
+    #[test]
+    fn an_exchange_that_took_less_than_no_time_is_passed_over() {
+        let mut offset = Offset::default();
+        offset.take(ClockSample { t1_us: 100, t2_us: 0, t3_us: 500, t4_us: 101 });
+        assert_eq!(offset.estimate(), None);
+    }
+}

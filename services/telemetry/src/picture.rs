@@ -1,0 +1,164 @@
+//! What telemetry needs of the rows: desired state to push, sessions and presence to show. Built from a snapshot, kept by the feed.
+//!
+//! Invariant: telemetry only composes and sends desired state; it never changes or re-dates it.
+
+use crate::Inner;
+use midshift_core::ids::RobotId;
+use midshift_core::rows::{BadRow, Table};
+use midshift_core::work::{DesiredPolicy, DesiredWork, LaneMark, PresenceRow, Session};
+use midshift_store::{Change, Error, Fold, Projection};
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
+use std::time::Duration;
+use tokio::sync::watch;
+
+/// Pause before a store that failed is read again.
+const STORE_RETRY: Duration = Duration::from_millis(200);
+
+/// Desired state of one robot, section by section.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Sections {
+    /// Section work.
+    pub work: Option<Arc<DesiredWork>>,
+    /// Section policy.
+    pub policy: Option<Arc<DesiredPolicy>>,
+}
+
+/// Rows by robot.
+#[derive(Debug, Default)]
+pub struct Rows {
+    /// Newest sessions.
+    pub sessions: BTreeMap<RobotId, Session>,
+    /// Presence.
+    pub presence: BTreeMap<RobotId, PresenceRow>,
+    /// Durable numbers, by row id.
+    pub marks: BTreeMap<String, LaneMark>,
+    /// Highest durable STATUS number by (robot, ring).
+    pub status: BTreeMap<(RobotId, Arc<str>), u64>,
+    desired: BTreeMap<RobotId, Sections>,
+}
+
+/// The picture, shared between sessions and RPCs.
+#[derive(Default)]
+pub struct Picture {
+    rows: RwLock<Rows>,
+    watchers: Mutex<BTreeMap<RobotId, watch::Sender<Sections>>>,
+    ready: watch::Sender<bool>,
+}
+
+impl Picture {
+    /// Rows as they are now.
+    pub fn rows(&self) -> RwLockReadGuard<'_, Rows> {
+        self.rows.read().unwrap_or_else(PoisonError::into_inner)
+    }
+    fn rows_mut(&self) -> RwLockWriteGuard<'_, Rows> {
+        self.rows.write().unwrap_or_else(PoisonError::into_inner)
+    }
+    /// Notes durable STATUS.
+    pub fn status_durable(&self, robot_id: &RobotId, ring: &Arc<str>, seq: u64) {
+        let mut rows = self.rows_mut();
+        let mark = rows.status.entry((robot_id.clone(), ring.clone())).or_default();
+        *mark = (*mark).max(seq);
+    }
+    /// A watch on a robot's desired state, with what stands now.
+    pub fn watch(&self, robot_id: &RobotId) -> watch::Receiver<Sections> {
+        let mut watchers = self.watchers.lock().unwrap_or_else(PoisonError::into_inner);
+        let sections = self.rows().desired.get(robot_id).cloned().unwrap_or_default();
+        let sender = watchers.entry(robot_id.clone()).or_insert_with(|| watch::Sender::new(sections));
+        sender.subscribe()
+    }
+    /// Waits until the store was read once.
+    pub async fn ready(&self) {
+        // The sender lives as long as this picture.
+        let _ = self.ready.subscribe().wait_for(|ready| *ready).await;
+    }
+    fn publish(&self, robot_id: &RobotId) {
+        let watchers = self.watchers.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(sender) = watchers.get(robot_id) else { return };
+        let sections = self.rows().desired.get(robot_id).cloned().unwrap_or_default();
+        sender.send_if_modified(|old| {
+            let changed = *old != sections;
+            *old = sections;
+            changed
+        });
+    }
+}
+
+struct Keeper(Arc<Inner>);
+
+fn sections<'a>(rows: &'a mut Rows, robot_id: &RobotId) -> &'a mut Sections {
+    rows.desired.entry(robot_id.clone()).or_default()
+}
+
+impl Fold for Keeper {
+    fn tables() -> &'static [Table] {
+        &[Table::DesiredWork, Table::DesiredPolicy, Table::Session, Table::Presence, Table::LaneMark]
+    }
+    fn reset(&mut self) {
+        let mut rows = self.0.picture.rows_mut();
+        let status = std::mem::take(&mut rows.status);
+        *rows = Rows { status, ..Rows::default() };
+    }
+    fn apply(&mut self, change: Change) -> Result<(), BadRow> {
+        let id = change.key.id.to_string();
+        let Ok(robot_id) = RobotId::parse(id.split('/').next().unwrap_or_default()) else { return Ok(()) };
+        let mut rows = self.0.picture.rows_mut();
+        match change.key.table {
+            Table::DesiredWork => sections(&mut rows, &robot_id).work = change.decode()?.map(Arc::new),
+            Table::DesiredPolicy => sections(&mut rows, &robot_id).policy = change.decode()?.map(Arc::new),
+            Table::Session => put(&mut rows.sessions, robot_id.clone(), change.decode()?),
+            Table::Presence => put(&mut rows.presence, robot_id.clone(), change.decode()?),
+            Table::LaneMark => put(&mut rows.marks, id, change.decode()?),
+            _ => {}
+        }
+        drop(rows);
+        if matches!(change.key.table, Table::DesiredWork | Table::DesiredPolicy) {
+            self.0.picture.publish(&robot_id);
+        }
+        Ok(())
+    }
+}
+
+fn put<K: Ord, V>(map: &mut BTreeMap<K, V>, key: K, value: Option<V>) {
+    match value {
+        Some(value) => map.insert(key, value),
+        None => map.remove(&key),
+    };
+}
+
+/// Keeps the picture until the store's wakes end.
+pub async fn keep(inner: &Arc<Inner>) -> Result<(), Error> {
+    let mut wake = inner.parts.store.wake();
+    load_status(inner).await;
+    let mut projection = Projection::new(Keeper(inner.clone()));
+    loop {
+        wake.mark_unchanged();
+        match projection.advance(inner.parts.store.as_ref()).await {
+            Ok(_) => {
+                inner.picture.ready.send_if_modified(|ready| !std::mem::replace(ready, true));
+            }
+            Err(error) => {
+                tracing::warn!(%error, "telemetry cannot read the store, trying again");
+                tokio::time::sleep(STORE_RETRY).await;
+                continue;
+            }
+        }
+        if wake.changed().await.is_err() {
+            return Ok(());
+        }
+    }
+}
+
+async fn load_status(inner: &Inner) {
+    match inner.parts.frames.marks().await {
+        Ok(marks) => {
+            let mut rows = inner.picture.rows_mut();
+            for mark in marks {
+                rows.status.insert((mark.robot_id, mark.ring), mark.seq);
+            }
+        }
+        Err(error) => {
+            tracing::warn!(%error, "status marks cannot be read: robots will send from where they think best")
+        }
+    }
+}

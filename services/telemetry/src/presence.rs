@@ -1,0 +1,121 @@
+//! Decides ONLINE, SUSPECT and OFFLINE from heartbeats alone, and writes what changed.
+//!
+//! Invariant: nobody's clock but ours takes part; a store that fails costs one period.
+
+use crate::Inner;
+use midshift_core::ids::RobotId;
+use midshift_core::limits;
+use midshift_core::robot::Presence;
+use midshift_core::rows::{Expect, Item, Record, Revision, Writer};
+use midshift_core::time::LinkTime;
+use midshift_core::work::PresenceRow;
+use midshift_store::{Query, Store};
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+/// How often presence is looked at.
+const PERIOD: Duration = Duration::from_millis(500);
+/// Rows of one item.
+const ROWS_PER_ITEM: usize = 200;
+
+/// Presence by the age of the newest heartbeat.
+pub fn of(heard: Option<LinkTime>, now: LinkTime) -> Presence {
+    match heard.map(|at| now.since(at)) {
+        Some(age) if age <= limits::SUSPECT_AFTER => Presence::Online,
+        Some(age) if age <= limits::OFFLINE_AFTER => Presence::Suspect,
+        _ => Presence::Offline,
+    }
+}
+
+type Known = BTreeMap<RobotId, (PresenceRow, Revision)>;
+
+async fn read(store: &dyn Store) -> Option<Known> {
+    let mut known = Known::new();
+    let mut query = Query::all(PresenceRow::TABLE);
+    loop {
+        let rows = store.list(query.clone()).await.ok()?;
+        let Some(last) = rows.last() else { return Some(known) };
+        query.after = Some(midshift_store::Cursor::of(last));
+        for row in &rows {
+            if let Ok(presence) = row.decode::<PresenceRow>() {
+                known.insert(presence.robot_id.clone(), (presence, row.revision));
+            }
+        }
+    }
+}
+
+/// Keeps presence until it is dropped.
+pub async fn keep(inner: &Inner) {
+    let mut known: Option<Known> = None;
+    let started = inner.parts.clock.now().link;
+    let mut tick = tokio::time::interval(PERIOD);
+    tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    loop {
+        tick.tick().await;
+        if known.is_none() {
+            known = read(inner.parts.store.as_ref()).await;
+        }
+        let Some(rows) = &mut known else { continue };
+        if !write(inner, rows, started).await {
+            known = None;
+        }
+    }
+}
+
+/// Writes what changed; false: the rows must be read again.
+async fn write(inner: &Inner, known: &mut Known, started: LinkTime) -> bool {
+    let now = inner.parts.clock.now();
+    let heard: BTreeMap<RobotId, LinkTime> =
+        inner.parts.board.all().into_iter().map(|(id, live)| (id, live.processed_at)).collect();
+    // After a start nobody is called offline before the time that it takes to come back.
+    let young = now.link.since(started) <= limits::OFFLINE_AFTER;
+    let robots: Vec<RobotId> =
+        known.keys().chain(heard.keys()).cloned().collect::<std::collections::BTreeSet<_>>().into_iter().collect();
+    let changed: Vec<(PresenceRow, Revision)> = robots
+        .into_iter()
+        .filter_map(|robot_id| {
+            let presence = of(heard.get(&robot_id).copied(), now.link);
+            let old = known.get(&robot_id);
+            let same = old.is_some_and(|(row, _)| row.presence == presence);
+            let too_early = young && !heard.contains_key(&robot_id);
+            if same || too_early {
+                return None;
+            }
+            let row = PresenceRow { robot_id, presence, since_unix_ms: now.wall.0 };
+            Some((row, old.map_or(Revision(0), |(_, revision)| *revision)))
+        })
+        .collect();
+    let mut items = Vec::new();
+    for rows in changed.chunks(ROWS_PER_ITEM) {
+        let mut item = Item::new(Writer::Telemetry, "telemetry");
+        for (row, revision) in rows {
+            let expect = if *revision == Revision(0) { Expect::Absent } else { Expect::At(*revision) };
+            item.put(row, expect, "presence.changed");
+        }
+        items.push(item);
+    }
+    if items.is_empty() {
+        return true;
+    }
+    let applied = inner.parts.store.commit(items).await.iter().all(Result::is_ok);
+    for (row, revision) in changed {
+        known.insert(row.robot_id.clone(), (row, revision.next()));
+    }
+    applied
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn presence_follows_the_age_of_the_newest_heartbeat() {
+        let now = LinkTime(100_000);
+        let at = |age_ms: u64| of(Some(LinkTime(100_000 - age_ms)), now);
+        assert_eq!(
+            [at(3_000), at(3_001), at(31_000), at(31_001)],
+            [Presence::Online, Presence::Suspect, Presence::Suspect, Presence::Offline]
+        );
+        assert_eq!(of(None, now), Presence::Offline);
+    }
+}

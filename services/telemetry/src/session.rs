@@ -1,0 +1,438 @@
+//! One session after its Welcome: heartbeats to the board and back as echoes, lanes to the store and back as acknowledgements,
+//! desired state down as it changes.
+//!
+//! Invariant: the stream is always drained; what is on its way to the store never holds up an echo.
+
+use crate::Inner;
+use crate::events::{Batch, Events, Outcome, commit};
+use crate::offset::Offset;
+use crate::picture::Sections;
+use crate::registry::InCharge;
+use crate::welcome::Begun;
+use midshift_core::ids::RobotId;
+use midshift_core::limits;
+use midshift_core::reason::{Code, Reason};
+use midshift_core::robot::Lane;
+use midshift_core::time::{LinkDuration, SiteTime};
+use midshift_core::work::{InboxEntry, InboxItem, Live};
+use midshift_proto::link::v1;
+use midshift_proto::session::{
+    ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, ToRobot, Uplink,
+};
+use midshift_store::Frame;
+use prost::Message;
+use std::future::Future;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::Ordering::Relaxed;
+use std::time::Duration;
+use tokio::sync::mpsc;
+use tokio::time::Instant;
+use tonic::{Status, Streaming};
+
+/// A robot that does not read what is sent is let go after this.
+const UNREAD_MAX: Duration = Duration::from_secs(10);
+/// STATUS is acknowledged at most this often, or at half of its credit.
+const STATUS_ACK_EVERY: Duration = Duration::from_secs(2);
+/// A session lives at most this long ...
+const SESSION_LIFE: Duration = Duration::from_secs(55 * 60);
+/// ... and up to this much longer, drawn at random, so that not all move at once.
+const SESSION_LIFE_JITTER_S: u64 = 300;
+/// Time to open the next session.
+const MOVE_OVER_WITHIN: Duration = Duration::from_secs(30);
+/// After a failed commit the robot is asked again not sooner than this.
+const COMMIT_RETRY: Duration = Duration::from_millis(200);
+
+type Boxed<T> = Pin<Box<dyn Future<Output = T> + Send>>;
+
+/// Sends one message; false if the robot is gone.
+pub type Down = mpsc::Sender<Result<v1::SessionResponse, Status>>;
+
+struct Session {
+    inner: Arc<Inner>,
+    robot_id: RobotId,
+    ring: Arc<str>,
+    epoch: u64,
+    in_charge: Option<InCharge>,
+    events: Events,
+    committing: Option<Boxed<Outcome>>,
+    status: StatusLane,
+    keeping: Option<Boxed<Option<u64>>>,
+    offset: Offset,
+    progress: (u64, SiteTime),
+    out: Downlink,
+    out_since: Option<Instant>,
+}
+
+/// The STATUS lane of this session.
+struct StatusLane {
+    taken: u64,
+    durable: u64,
+    acked: u64,
+    unacked_bytes: usize,
+    waiting: Vec<Frame>,
+    ack_due: Instant,
+}
+
+/// Why the loop ends.
+enum End {
+    Gone,
+    Close(Close),
+}
+
+fn close(code: CloseCode, reason: Code, retry_after: LinkDuration) -> End {
+    End::Close(Close { code, reason: Reason::from(reason), retry_after_ms: retry_after.as_ms() as u32 })
+}
+
+/// Runs a session to its end. The Welcome has been sent.
+pub async fn run(inner: Arc<Inner>, hello: &Hello, begun: Begun, mut up: Streaming<v1::SessionRequest>, down: Down) {
+    let robot_id = hello.robot_id.clone();
+    let epoch = begun.welcome.session_epoch;
+    let mut desired = inner.picture.watch(&robot_id);
+    desired.mark_changed();
+    let now = inner.parts.clock.now();
+    let mut session = Session {
+        ring: Arc::from(hello.ring.as_str()),
+        epoch,
+        in_charge: begun.in_charge,
+        events: Events::new(begun.mark.0, begun.mark.1),
+        committing: None,
+        status: StatusLane {
+            taken: begun.status,
+            durable: begun.status,
+            acked: begun.status,
+            unacked_bytes: 0,
+            waiting: Vec::new(),
+            ack_due: Instant::now() + STATUS_ACK_EVERY,
+        },
+        keeping: None,
+        offset: Offset::default(),
+        progress: (0, now.site),
+        out: Downlink::default(),
+        out_since: None,
+        robot_id: robot_id.clone(),
+        inner: inner.clone(),
+    };
+    let end = session.run(&mut up, &down, &mut desired).await;
+    if let End::Close(close) = end {
+        let _ = down.try_send(Ok((&ToRobot::Close(close)).into()));
+    }
+}
+
+impl Session {
+    async fn run(
+        &mut self,
+        up: &mut Streaming<v1::SessionRequest>,
+        down: &Down,
+        desired: &mut tokio::sync::watch::Receiver<Sections>,
+    ) -> End {
+        let fenced = self.in_charge.as_ref().map(|c| c.fenced.clone()).unwrap_or_default();
+        let shutdown = self.inner.shutdown.clone();
+        let jitter = Duration::from_secs(rand::random_range(0..=SESSION_LIFE_JITTER_S));
+        let life = tokio::time::sleep(SESSION_LIFE + jitter);
+        tokio::pin!(life);
+        let observed = self.in_charge.is_none();
+        let older = older_is_silent(self.inner.clone(), self.robot_id.clone());
+        tokio::pin!(older);
+        let mut moving = false;
+        loop {
+            self.start_writes();
+            let waits = self.out != Downlink::default();
+            let unread_at = self.out_since.map(|since| since + UNREAD_MAX);
+            let ack_at = (self.status.durable > self.status.acked).then_some(self.status.ack_due);
+            tokio::select! {
+                biased;
+                () = shutdown.cancelled() => return close(CloseCode::Shutdown, Code::ShuttingDown, LinkDuration(500)),
+                () = fenced.cancelled() => {
+                    let moved = self.in_charge.as_ref().is_some_and(|c| c.moving.load(Relaxed));
+                    let (code, why) = if moved { (CloseCode::MoveOver, Code::MoveOver) } else { (CloseCode::Fenced, Code::Fenced) };
+                    return close(code, why, limits::FENCED_RETRY);
+                }
+                permit = down.reserve(), if waits => match permit {
+                    Ok(permit) => {
+                        permit.send(Ok((&ToRobot::Downlink(Box::new(self.stamp()))).into()));
+                        self.out_since = None;
+                    }
+                    Err(_) => return End::Gone,
+                },
+                outcome = poll(&mut self.committing), if self.committing.is_some() => self.committed(outcome),
+                kept = poll(&mut self.keeping), if self.keeping.is_some() => self.status_kept(kept),
+                message = up.message() => match message {
+                    Ok(Some(message)) => {
+                        if let Some(end) = self.take(message) {
+                            return end;
+                        }
+                    }
+                    Ok(None) | Err(_) => return End::Gone,
+                },
+                changed = desired.changed(), if self.in_charge.is_some() => {
+                    if changed.is_err() {
+                        return End::Gone;
+                    }
+                    let sections = desired.borrow_and_update().clone();
+                    self.say(|out| {
+                        out.work = sections.work.as_deref().cloned();
+                        out.policy = sections.policy.as_deref().cloned();
+                    });
+                }
+                () = at(unread_at) => return close(CloseCode::TooSlow, Code::Overloaded, LinkDuration(1_000)),
+                () = at(ack_at) => self.ack_status(),
+                () = &mut life => {
+                    if moving {
+                        return close(CloseCode::MoveOver, Code::MoveOver, LinkDuration(0));
+                    }
+                    moving = true;
+                    if let Some(in_charge) = &self.in_charge {
+                        in_charge.moving.store(true, Relaxed);
+                    }
+                    let message = ToRobot::MoveOver { within_ms: MOVE_OVER_WITHIN.as_millis() as u32 };
+                    let _ = down.try_send(Ok((&message).into()));
+                    life.as_mut().reset(Instant::now() + MOVE_OVER_WITHIN);
+                }
+                () = &mut older, if observed => {
+                    return close(CloseCode::MoveOver, Code::MoveOver, LinkDuration(0));
+                }
+            }
+        }
+    }
+
+    fn say(&mut self, change: impl FnOnce(&mut Downlink)) {
+        change(&mut self.out);
+        self.out_since.get_or_insert_with(Instant::now);
+    }
+
+    /// What is to be sent, with the moment of sending in its clock sample.
+    fn stamp(&mut self) -> Downlink {
+        let mut out = std::mem::take(&mut self.out);
+        if let Some(echo) = &mut out.echo {
+            echo.clock.t3_us = self.inner.parts.clock.now().wall.0 * 1000;
+        }
+        out
+    }
+
+    fn take(&mut self, message: v1::SessionRequest) -> Option<End> {
+        let read = midshift_proto::parse::<FromRobot, _>(message);
+        let Ok(FromRobot::Uplink(Uplink { heartbeat, batches })) = read else {
+            let detail = read.err().map(|e| e.to_string()).unwrap_or_else(|| "a second hello".to_owned());
+            tracing::warn!(robot_id = %self.robot_id, detail, "session ended by a message that breaks its rules");
+            let reason = Reason::new(Code::ProtocolError, detail);
+            return Some(End::Close(Close { code: CloseCode::Protocol, reason, retry_after_ms: 1_000 }));
+        };
+        if let Some(heartbeat) = heartbeat {
+            self.heartbeat(heartbeat);
+        }
+        for batch in batches {
+            match batch.lane {
+                Lane::Status => self.status(batch),
+                Lane::Critical | Lane::Event => self.events(batch),
+            }
+        }
+        None
+    }
+
+    fn heartbeat(&mut self, heartbeat: Heartbeat) {
+        let now = self.inner.parts.clock.now();
+        let t2_us = now.wall.0 * 1000;
+        if let Some(sample) = heartbeat.clock {
+            self.offset.take(sample);
+        }
+        let mut report = heartbeat.reported;
+        report.session_epoch = self.epoch;
+        let hb = report.hb;
+        let progress = report.vitals.odometer_mm
+            + report.attempts.iter().map(|a| a.progress + u64::from(a.step_index)).sum::<u64>();
+        if progress != self.progress.0 {
+            self.progress = (progress, now.site);
+        }
+        metrics::counter!("midshift_telemetry_heartbeats_total").increment(1);
+        let Some(in_charge) = &self.in_charge else { return };
+        in_charge.hear(now.link);
+        let live = Live {
+            robot_id: self.robot_id.clone(),
+            report,
+            processed_at: now.link,
+            processed_site: now.site,
+            received_unix_ms: now.wall.0,
+            progress_at: self.progress.1,
+            clock_offset_ms: self.offset.estimate(),
+            observed: false,
+        };
+        self.inner.parts.board.put(&self.robot_id, Arc::new(live));
+        let clock = ClockSample { t1_us: heartbeat.sent_unix_us, t2_us, t3_us: t2_us, t4_us: 0 };
+        self.say(|out| out.echo = Some(Echo { hb, clock }));
+    }
+
+    fn events(&mut self, batch: LaneBatch) {
+        if self.in_charge.is_none() {
+            return;
+        }
+        let (robot_id, ring, lane, epoch) = (&self.robot_id, &self.ring, batch.lane, self.epoch);
+        let ahead_ms = self.offset.estimate().map_or(2_000, |(offset, error)| offset + error as i64 + 2_000);
+        let wall = self.inner.parts.clock.now().wall.0;
+        let arrived = self.events.arrive(batch, |what| InboxEntry {
+            robot_id: robot_id.clone(),
+            session_epoch: epoch,
+            ring: ring.to_string(),
+            lane,
+            stamp_in_future: matches!(&what, InboxItem::Sample(s) if s.robot_unix_ms > wall + ahead_ms),
+            what,
+        });
+        let naive = self.inner.parts.bugs.ack_before_commit().then(|| self.events.taken());
+        let known = arrived.known.then(|| self.events.acks());
+        let acks: Vec<LaneAck> =
+            arrived.expect.into_iter().chain(naive.into_iter().flatten()).chain(known.into_iter().flatten()).collect();
+        if !acks.is_empty() {
+            self.say(|out| out.acks.extend(acks));
+        }
+    }
+
+    fn status(&mut self, batch: LaneBatch) {
+        if self.in_charge.is_none() {
+            return;
+        }
+        let mut first = None;
+        for item in &batch.items {
+            let (from, to) = match item {
+                InboxItem::Sample(s) => (s.seq, s.seq),
+                InboxItem::Poison { seq, .. } => (*seq, *seq),
+                InboxItem::Gap(g) => (g.from_seq, g.to_seq),
+            };
+            if to <= self.status.taken {
+                continue;
+            }
+            if from > self.status.taken + 1 {
+                let ack = LaneAck { lane: Lane::Status, seq: self.status.durable, expect: Some(self.status.taken + 1) };
+                return self.say(|out| out.acks.push(ack));
+            }
+            first.get_or_insert(from.max(self.status.taken + 1));
+            self.status.taken = to;
+        }
+        let Some(first_seq) = first else { return };
+        let bytes = v1::LaneBatch::from(&batch).encode_to_vec();
+        self.status.unacked_bytes += bytes.len();
+        self.status.waiting.push(Frame {
+            robot_id: self.robot_id.clone(),
+            ring: self.ring.clone(),
+            first_seq,
+            last_seq: self.status.taken,
+            bytes: Arc::from(bytes),
+        });
+    }
+
+    /// Begins the writes that wait, at most one of each kind at a time.
+    fn start_writes(&mut self) {
+        if self.committing.is_none()
+            && let Some(batch) = self.events.next_batch(&self.robot_id)
+        {
+            self.committing = Some(self.commit(batch));
+        }
+        if self.keeping.is_none() && !self.status.waiting.is_empty() {
+            let frames = std::mem::take(&mut self.status.waiting);
+            let last = frames.last().map_or(0, |f| f.last_seq);
+            let log = self.inner.parts.frames.clone();
+            self.keeping = Some(Box::pin(async move {
+                match log.append(frames).await {
+                    Ok(()) => Some(last),
+                    Err(error) => {
+                        tracing::warn!(%error, "status was not stored");
+                        None
+                    }
+                }
+            }));
+        }
+    }
+
+    fn commit(&self, batch: Batch) -> Boxed<Outcome> {
+        let inner = self.inner.clone();
+        Box::pin(async move {
+            let begun = Instant::now();
+            let outcome = commit(inner, batch).await;
+            if !matches!(outcome, Outcome::Done(_)) {
+                tokio::time::sleep(COMMIT_RETRY).await;
+            }
+            metrics::histogram!("midshift_telemetry_event_commit_seconds").record(begun.elapsed().as_secs_f64());
+            outcome
+        })
+    }
+
+    fn committed(&mut self, outcome: Outcome) {
+        match outcome {
+            Outcome::Done(mark) => {
+                self.events.done(mark);
+                let acks = self.events.acks();
+                self.say(|out| out.acks.extend(acks));
+            }
+            Outcome::Again(mark, revision) => {
+                let acks = self.events.reset(mark, revision);
+                self.say(|out| out.acks.extend(acks));
+            }
+            // Nothing is acknowledged; what arrives next finds the store again or not.
+            Outcome::Lost => {
+                let acks = self.events.acks();
+                let again = acks.map(|ack| LaneAck { expect: Some(ack.seq + 1), ..ack });
+                self.events.forget_taken();
+                self.say(|out| out.acks.extend(again));
+            }
+        }
+    }
+
+    fn status_kept(&mut self, kept: Option<u64>) {
+        match kept {
+            Some(seq) => {
+                self.status.durable = seq;
+                self.inner.picture.status_durable(&self.robot_id, &self.ring, seq);
+                if self.status.unacked_bytes * 2 >= limits::STATUS_IN_FLIGHT_BYTES {
+                    self.ack_status();
+                }
+            }
+            None => {
+                self.status.taken = self.status.durable;
+                self.status.waiting.clear();
+                let ack =
+                    LaneAck { lane: Lane::Status, seq: self.status.durable, expect: Some(self.status.durable + 1) };
+                self.say(|out| out.acks.push(ack));
+            }
+        }
+    }
+
+    fn ack_status(&mut self) {
+        self.status.acked = self.status.durable;
+        self.status.unacked_bytes = 0;
+        self.status.ack_due = Instant::now() + STATUS_ACK_EVERY;
+        let ack = LaneAck { lane: Lane::Status, seq: self.status.durable, expect: None };
+        self.say(|out| out.acks.push(ack));
+    }
+}
+
+/// An observed session waits until the session in charge is gone or silent; then its robot may come back and take charge.
+async fn older_is_silent(inner: Arc<Inner>, robot_id: RobotId) {
+    loop {
+        tokio::time::sleep(Duration::from_millis(limits::HEARTBEAT.as_ms())).await;
+        let Some(older) = inner.registry.get(&robot_id) else { return };
+        let now = inner.parts.clock.now().link;
+        if now.since(older.heard()) > limits::SUSPECT_AFTER {
+            older.fenced.cancel();
+            inner.registry.leave(&robot_id, older.session_epoch);
+            return;
+        }
+    }
+}
+
+async fn at(moment: Option<Instant>) {
+    match moment {
+        Some(moment) => tokio::time::sleep_until(moment).await,
+        None => std::future::pending().await,
+    }
+}
+
+/// Waits for a write under way and takes it away.
+async fn poll<T>(slot: &mut Option<Boxed<T>>) -> T {
+    match slot {
+        Some(write) => {
+            let done = write.await;
+            *slot = None;
+            done
+        }
+        None => std::future::pending().await,
+    }
+}

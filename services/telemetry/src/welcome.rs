@@ -1,0 +1,160 @@
+//! The beginning of a session: checks the Hello, tells a succession from a clone, and makes the new epoch durable before the Welcome.
+
+use crate::Inner;
+use crate::registry::InCharge;
+use midshift_core::limits;
+use midshift_core::reason::{Code, Kind, Reason, Refusal};
+use midshift_core::robot::Lane;
+use midshift_core::rows::{Expect, Fact, Item, Log, Record, Revision, Writer};
+use midshift_core::work::{LaneMark, Session};
+use midshift_proto::session::{Hello, LaneAck, PROTOCOL_VERSION, Welcome};
+use midshift_store::{CommitError, load};
+use std::sync::Arc;
+
+/// Tries to write the session row against other writers of it.
+const TRIES: usize = 3;
+/// Milliseconds of site time between STATUS samples.
+const STATUS_PERIOD_MS: u32 = 2_000;
+
+/// What a session begins with.
+pub struct Begun {
+    /// Its place in the registry; none: observed only.
+    pub in_charge: Option<InCharge>,
+    /// What the robot is told.
+    pub welcome: Welcome,
+    /// Durable numbers of its ring, with the revision of their row.
+    pub mark: (LaneMark, Revision),
+    /// Durable STATUS of its ring.
+    pub status: u64,
+}
+
+/// Checks what needs no row.
+pub fn check(inner: &Inner, hello: &Hello) -> Result<(), Refusal> {
+    if !hello.protocol_versions.contains(&PROTOCOL_VERSION) {
+        let reason = Reason::from(Code::ProtocolError).with("spoken", PROTOCOL_VERSION);
+        return Err(Refusal::new(Kind::Precondition, reason));
+    }
+    let rate = inner.parts.clock.rate_permille();
+    if hello.clock_rate_permille != rate {
+        let reason = Reason::from(Code::ClockRateMismatch)
+            .with("server_permille", rate)
+            .with("robot_permille", hello.clock_rate_permille);
+        return Err(Refusal::new(Kind::Precondition, reason));
+    }
+    Ok(())
+}
+
+fn unavailable(error: impl std::fmt::Display) -> Refusal {
+    Refusal::new(Kind::Unavailable, Reason::new(Code::StoreUnavailable, error.to_string()))
+}
+
+/// Admits the session, in charge or observed.
+pub async fn begin(inner: &Inner, hello: &Hello) -> Result<Begun, Refusal> {
+    let store = inner.parts.store.as_ref();
+    for _ in 0..TRIES {
+        let row = load::<Session>(store, hello.robot_id.as_str()).await.map_err(unavailable)?;
+        let mark = mark_of(inner, hello).await?;
+        let status = inner
+            .picture
+            .rows()
+            .status
+            .get(&(hello.robot_id.clone(), Arc::from(hello.ring.as_str())))
+            .copied()
+            .unwrap_or(0);
+        let proven = row.as_ref().is_some_and(|(row, _)| {
+            hello.previous.as_ref().is_some_and(|p| p.session_epoch == row.session_epoch && p.secret == row.secret)
+        });
+        let older = inner.registry.get(&hello.robot_id);
+        if older.is_some() && !proven && !inner.parts.bugs.no_clone_fence() {
+            note_clone(inner, hello).await;
+            return Ok(Begun {
+                in_charge: None,
+                welcome: welcome(inner, 0, String::new(), &mark.0, status, true),
+                mark,
+                status,
+            });
+        }
+        let now = inner.parts.clock.now();
+        let session_epoch = row.as_ref().map_or(0, |(r, _)| r.session_epoch + 1).max(now.wall.0.max(0) as u64);
+        let session = session_row(hello, session_epoch);
+        let mut item = Item::new(Writer::Telemetry, hello.robot_id.as_str());
+        item.put(&session, row.map_or(Expect::Absent, |(_, revision)| Expect::At(revision)), "session.begun");
+        match store.commit(vec![item]).await.pop() {
+            Some(Ok(_)) => {}
+            Some(Err(CommitError::Conflict { .. })) => continue,
+            Some(Err(error)) => return Err(unavailable(error)),
+            None => return Err(unavailable("the store gave no answer")),
+        }
+        let in_charge = InCharge::new(session_epoch, now.link);
+        if !inner.registry.take_charge(&hello.robot_id, in_charge.clone()) {
+            continue;
+        }
+        let welcome = welcome(inner, session_epoch, session.secret, &mark.0, status, false);
+        return Ok(Begun { in_charge: Some(in_charge), welcome, mark, status });
+    }
+    Err(Refusal::new(Kind::Conflict, Code::CloneSeen))
+}
+
+async fn mark_of(inner: &Inner, hello: &Hello) -> Result<(LaneMark, Revision), Refusal> {
+    let fresh = LaneMark { robot_id: hello.robot_id.clone(), ring: hello.ring.clone(), critical: 0, event: 0 };
+    let found = load::<LaneMark>(inner.parts.store.as_ref(), &fresh.id()).await.map_err(unavailable)?;
+    Ok(found.unwrap_or((fresh, Revision(0))))
+}
+
+fn session_row(hello: &Hello, session_epoch: u64) -> Session {
+    Session {
+        robot_id: hello.robot_id.clone(),
+        session_epoch,
+        secret: format!("{:032x}", rand::random::<u128>()),
+        boot_id: hello.boot_id.clone(),
+        ring: hello.ring.clone(),
+        inventory: hello.inventory.clone(),
+        observed: false,
+        applied_work: hello.reported.applied_work,
+        places: hello.reported.places.clone(),
+        clock_offset_ms: None,
+    }
+}
+
+fn welcome(
+    inner: &Inner,
+    session_epoch: u64,
+    session_secret: String,
+    mark: &LaneMark,
+    status: u64,
+    observed: bool,
+) -> Welcome {
+    let ack = |lane, seq| LaneAck { lane, seq, expect: None };
+    Welcome {
+        session_epoch,
+        session_secret,
+        store_id: inner.parts.store.id().to_string(),
+        acks: vec![ack(Lane::Critical, mark.critical), ack(Lane::Event, mark.event), ack(Lane::Status, status)],
+        heartbeat_period_ms: limits::HEARTBEAT.as_ms() as u32,
+        status_period_ms: STATUS_PERIOD_MS,
+        authority_ms: limits::AUTHORITY.as_ms() as u32,
+        status_credit_bytes: limits::STATUS_IN_FLIGHT_BYTES as u32,
+        protocol_version: PROTOCOL_VERSION,
+        clock_rate_permille: inner.parts.clock.rate_permille(),
+        observed,
+    }
+}
+
+/// Two machines with one id: a fact for people, once per Hello.
+async fn note_clone(inner: &Inner, hello: &Hello) {
+    metrics::counter!("midshift_telemetry_clones_total").increment(1);
+    tracing::warn!(robot_id = %hello.robot_id, boot_id = %hello.boot_id, "second session without proof of succession, observed only");
+    let mut item = Item::new(Writer::Telemetry, hello.robot_id.as_str());
+    let body =
+        serde_json::json!({"robot_id": hello.robot_id, "boot_id": hello.boot_id, "code": Code::CloneSeen.as_str()});
+    let subject = Arc::from(hello.robot_id.as_str());
+    item.facts.push(Fact {
+        log: Log::Telemetry,
+        subject,
+        kind: "session.clone_seen",
+        body: Arc::from(body.to_string()),
+    });
+    if let Some(Err(error)) = inner.parts.store.commit(vec![item]).await.pop() {
+        tracing::warn!(%error, "clone could not be recorded");
+    }
+}
