@@ -1,1 +1,67 @@
-//! Under construction.
+//! Task intake as a service: admits, shows, cancels, resolves and watches tasks. It decides nothing about robots.
+//!
+//! Called by the binary. Invariant: an answer leaves only after its commit; a task is stored whole or not at all; what happens to an
+//! admitted task is fleet's.
+
+mod admit;
+mod ask;
+mod grpc;
+mod list;
+mod rows;
+mod watch;
+
+use midshift_core::rows::Table;
+use midshift_core::site::Site;
+use midshift_core::task::TaskIntake;
+use midshift_core::time::Clock;
+use midshift_proto::task::v1::task_service_server::TaskServiceServer;
+use midshift_store::{Error, Query, Store};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use tokio_util::sync::CancellationToken;
+
+/// What the service is built from.
+pub struct Parts {
+    /// The memory that services share.
+    pub store: Arc<dyn Store>,
+    /// The site, whose waypoints tasks may name.
+    pub site: Arc<Site>,
+    /// Clocks.
+    pub clock: Arc<dyn Clock>,
+}
+
+struct Inner {
+    parts: Parts,
+    number: AtomicU64,
+    shutdown: CancellationToken,
+}
+
+/// The service. Cheap to clone.
+#[derive(Clone)]
+pub struct TaskService {
+    inner: Arc<Inner>,
+}
+
+impl TaskService {
+    /// Reads the highest admission number and is ready. Streams end at `shutdown`.
+    ///
+    /// # Errors
+    /// If the store cannot be read.
+    pub async fn open(parts: Parts, shutdown: CancellationToken) -> Result<Self, Error> {
+        let query = Query { newest_first: true, limit: 1, ..Query::all(Table::TaskIntake) };
+        let newest = parts.store.list(query).await?.pop();
+        let number = match newest {
+            Some(row) => row.decode::<TaskIntake>()?.number,
+            None => 0,
+        };
+        Ok(Self { inner: Arc::new(Inner { parts, number: AtomicU64::new(number), shutdown }) })
+    }
+    /// The gRPC face.
+    pub fn grpc(&self) -> TaskServiceServer<Self> {
+        TaskServiceServer::new(self.clone())
+    }
+    /// The next admission number.
+    fn next_number(&self) -> u64 {
+        self.inner.number.fetch_add(1, Relaxed) + 1
+    }
+}

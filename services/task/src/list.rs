@@ -1,0 +1,99 @@
+//! One page of tasks, newest first. A page token is bound to its filter.
+
+use crate::TaskService;
+use crate::rows::{read_many, unavailable};
+use midshift_core::ids::TaskId;
+use midshift_core::limits;
+use midshift_core::reason::{Refusal, Violations};
+use midshift_core::rows::Table;
+use midshift_proto::convert::task::TaskFilter;
+use midshift_proto::task::v1;
+use midshift_store::{Cursor, Query};
+use prost::Message;
+use sha2::{Digest, Sha256};
+use std::sync::Arc;
+
+/// Rows one call looks at; a rarer filter continues with the next page.
+const SCAN_MAX: usize = 10_000;
+
+fn print_of(filter: &Option<v1::TaskFilter>) -> String {
+    let bytes = filter.as_ref().map(Message::encode_to_vec).unwrap_or_default();
+    Sha256::digest(bytes).iter().take(6).map(|b| format!("{b:02x}")).collect()
+}
+
+fn token(print: &str, cursor: &Cursor) -> String {
+    format!("{print}:{}:{}", cursor.order, cursor.id)
+}
+
+fn cursor_of(text: &str, print: &str) -> Result<Cursor, Refusal> {
+    let bad = || Refusal::field("page_token", "is not a page token of this filter");
+    let mut parts = text.splitn(3, ':');
+    let (of, order, id) = (parts.next(), parts.next(), parts.next());
+    if of != Some(print) {
+        return Err(bad());
+    }
+    let order = order.and_then(|o| o.parse().ok()).ok_or_else(bad)?;
+    Ok(Cursor { order, id: Arc::from(id.ok_or_else(bad)?) })
+}
+
+impl TaskService {
+    /// One page.
+    pub async fn list(&self, r: v1::ListTasksRequest) -> Result<v1::ListTasksResponse, Refusal> {
+        let print = print_of(&r.filter);
+        let filter: TaskFilter = midshift_proto::parse_field(Some(r.filter.unwrap_or_default()), "filter")?;
+        let mut bad = Violations::default();
+        let size = match r.page_size as usize {
+            0 => limits::PAGE_DEFAULT,
+            n => n,
+        };
+        if size > limits::PAGE_MAX {
+            bad.add("page_size", "must be 1..1000; 0: 100");
+        }
+        bad.finish()?;
+        let after = if r.page_token.is_empty() { None } else { Some(cursor_of(&r.page_token, &print)?) };
+        self.page(&filter, &print, size, after).await
+    }
+
+    async fn page(
+        &self,
+        filter: &TaskFilter,
+        print: &str,
+        size: usize,
+        mut after: Option<Cursor>,
+    ) -> Result<v1::ListTasksResponse, Refusal> {
+        let store = self.inner.parts.store.as_ref();
+        let mut tasks = Vec::new();
+        let mut scanned = 0;
+        loop {
+            let query = Query {
+                after: after.clone(),
+                newest_first: true,
+                limit: limits::PAGE_MAX.min(size.max(100)),
+                ..Query::all(Table::TaskState).in_states(filter.phases.iter().map(|p| p.number()))
+            };
+            let rows = store.list(query).await.map_err(unavailable)?;
+            if rows.is_empty() {
+                return Ok(v1::ListTasksResponse { tasks, next_page_token: String::new() });
+            }
+            scanned += rows.len();
+            let ids: Vec<TaskId> = rows.iter().filter_map(|row| TaskId::parse(&row.key.id).ok()).collect();
+            let found = read_many(store, &ids).await?;
+            let mut found =
+                found.into_iter().map(|t| (t.intake.task_id.clone(), t)).collect::<std::collections::BTreeMap<_, _>>();
+            for row in &rows {
+                after = Some(Cursor::of(row));
+                let task = TaskId::parse(&row.key.id).ok().and_then(|id| found.remove(&id));
+                if let Some(task) = task.filter(|t| filter.admits(&t.intake, &t.state)) {
+                    tasks.push(task.encode());
+                }
+                if tasks.len() == size {
+                    break;
+                }
+            }
+            if tasks.len() == size || scanned >= SCAN_MAX {
+                let next_page_token = after.as_ref().map(|c| token(print, c)).unwrap_or_default();
+                return Ok(v1::ListTasksResponse { tasks, next_page_token });
+            }
+        }
+    }
+}

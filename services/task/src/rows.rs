@@ -1,0 +1,112 @@
+//! Reads a task's rows and shows them as one message.
+
+use midshift_core::fleet::requests::allowed_resolutions;
+use midshift_core::fleet::rows::{RobotAuthority, RobotHolder};
+use midshift_core::ids::TaskId;
+use midshift_core::reason::{Code, Kind, Reason, Refusal};
+use midshift_core::rows::{Key, Record, Revision, Row, Table};
+use midshift_core::task::{Attempt, Resolution, TaskIntake, TaskState};
+use midshift_proto::convert::task::{TaskView, encode_task};
+use midshift_proto::task::v1;
+use midshift_store::{Error, Store};
+use std::collections::BTreeMap;
+
+/// A task with all that is shown of it.
+pub struct TaskRows {
+    /// What was asked for.
+    pub intake: TaskIntake,
+    /// Where it is.
+    pub state: TaskState,
+    /// Of the state.
+    pub revision: Revision,
+    /// The live or last attempt.
+    pub attempt: Option<Attempt>,
+    /// What a person may answer.
+    pub allowed: Vec<Resolution>,
+}
+
+impl TaskRows {
+    /// As a message.
+    pub fn encode(&self) -> v1::Task {
+        encode_task(TaskView {
+            intake: &self.intake,
+            state: &self.state,
+            revision: self.revision,
+            attempt: self.attempt.as_ref(),
+            allowed: &self.allowed,
+        })
+    }
+}
+
+/// A store that did not answer.
+pub fn unavailable(error: impl std::fmt::Display) -> Refusal {
+    Refusal::new(Kind::Unavailable, Reason::new(Code::StoreUnavailable, error.to_string()))
+}
+
+/// No such task.
+pub fn not_found(task_id: &TaskId) -> Refusal {
+    Refusal::new(Kind::NotFound, Reason::from(Code::TaskNotFound).with("task_id", task_id))
+}
+
+/// One task.
+pub async fn read(store: &dyn Store, task_id: &TaskId) -> Result<TaskRows, Refusal> {
+    read_many(store, std::slice::from_ref(task_id)).await?.pop().ok_or_else(|| not_found(task_id))
+}
+
+/// These tasks, in this order; those that do not exist are left out.
+pub async fn read_many(store: &dyn Store, ids: &[TaskId]) -> Result<Vec<TaskRows>, Refusal> {
+    join(store, ids).await.map_err(unavailable)
+}
+
+async fn by_id(store: &dyn Store, keys: Vec<Key>) -> Result<BTreeMap<String, Row>, Error> {
+    if keys.is_empty() {
+        return Ok(BTreeMap::new());
+    }
+    Ok(store.get(keys).await?.into_iter().map(|row| (row.key.id.to_string(), row)).collect())
+}
+
+async fn join(store: &dyn Store, ids: &[TaskId]) -> Result<Vec<TaskRows>, Error> {
+    let keys = |table| ids.iter().map(move |id| Key::new(table, id.as_str())).collect();
+    let intakes = by_id(store, keys(Table::TaskIntake)).await?;
+    let mut states = BTreeMap::new();
+    for (id, row) in by_id(store, keys(Table::TaskState)).await? {
+        states.insert(id, (row.decode::<TaskState>()?, row.revision));
+    }
+    let wanted = states.values().filter_map(|(s, _)| s.attempt_id()).map(|a| Key::new(Table::Attempt, a.to_string()));
+    let attempts = by_id(store, wanted.collect()).await?;
+    let robots =
+        states.values().filter_map(|(s, _)| s.robot_id.as_ref()).map(|r| Key::new(Table::RobotAuthority, r.as_str()));
+    let robots: std::collections::BTreeSet<Key> = robots.collect();
+    let authority = by_id(store, robots.into_iter().collect()).await?;
+    let mut tasks = Vec::new();
+    for id in ids {
+        let (Some(intake), Some((state, revision))) = (intakes.get(id.as_str()), states.remove(id.as_str())) else {
+            continue;
+        };
+        let attempt = state
+            .attempt_id()
+            .and_then(|a| attempts.get(&a.to_string()))
+            .map(|row| row.decode::<Attempt>())
+            .transpose()?;
+        let holder = state
+            .robot_id
+            .as_ref()
+            .and_then(|r| authority.get(r.as_str()))
+            .map(|row| row.decode::<RobotAuthority>())
+            .transpose()?;
+        let kept = holder.is_some_and(|h| match h.holder {
+            RobotHolder::Attempt(held) => Some(held) == state.attempt_id(),
+            _ => false,
+        });
+        let allowed = allowed_resolutions(state.phase, state.opened.is_some(), kept);
+        tasks.push(TaskRows { intake: intake.decode()?, state, revision, attempt, allowed });
+    }
+    Ok(tasks)
+}
+
+/// Whether a record of this id exists.
+pub async fn exist<R: Record>(store: &dyn Store, ids: &[TaskId]) -> Result<Vec<bool>, Refusal> {
+    let keys = ids.iter().map(|id| Key::new(R::TABLE, id.as_str())).collect();
+    let found = by_id(store, keys).await.map_err(unavailable)?;
+    Ok(ids.iter().map(|id| found.contains_key(id.as_str())).collect())
+}
