@@ -196,7 +196,11 @@ impl AgentCore {
             Input::Start => self.start(&now),
             Input::Tick | Input::Persisted(_) => {}
             Input::Connected(welcome) => self.connected(&now, welcome),
-            Input::Down(down) => self.down(&now, *down),
+            Input::Down(down) => {
+                // What the body has just ended is over before the server's word about it is heard.
+                self.advance(&now);
+                self.down(&now, *down);
+            }
             Input::Disconnected => self.session = None,
             Input::Fenced => {
                 self.fences += 1;
@@ -243,6 +247,13 @@ impl AgentCore {
             hardware_stop: self.hardware_stop,
             field_violation: self.body.state(now.site).field_violation,
             fault: self.standing_fault.clone(),
+        }
+    }
+
+    /// The process ends: nobody drives the body any more, so it stands.
+    pub fn halt(&mut self, now: Now) {
+        if self.work.is_some() || !self.body.standstill(now.site) {
+            self.body.stop(now.site, StopLevel::Halt);
         }
     }
 
@@ -315,8 +326,11 @@ impl AgentCore {
                 self.write(Op::Applied(crate::ledger::Applied::default()), true);
             }
         }
-        let memory =
-            SessionMemory { session_epoch: welcome.session_epoch, secret: welcome.session_secret, store_id: welcome.store_id };
+        let memory = SessionMemory {
+            session_epoch: welcome.session_epoch,
+            secret: welcome.session_secret,
+            store_id: welcome.store_id,
+        };
         self.write(Op::Session(memory), true);
         for ack in &welcome.acks {
             for op in self.kept.ring.jump(ack.lane, ack.seq) {

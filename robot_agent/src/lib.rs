@@ -5,6 +5,7 @@
 pub mod body;
 pub mod bugs;
 pub mod core;
+pub mod dial;
 mod drive;
 pub mod governor;
 pub mod lanes;
@@ -12,7 +13,10 @@ pub mod ledger;
 pub mod memory;
 mod offer;
 pub mod places;
+pub mod pulse;
 pub mod ring;
+pub mod session;
+pub mod sqlite;
 pub mod store;
 pub mod throttle;
 pub mod work;

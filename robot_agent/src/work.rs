@@ -87,7 +87,7 @@ const ORDERS_AT_ONCE: usize = 64;
 impl Work {
     /// As it stands on the ledger after a restart.
     pub(crate) fn restored(holder: Holder) -> Self {
-        Self { recheck: true, started: holder.duration_ms > 0, ..Self::new(holder) }
+        Self { recheck: true, started: true, ..Self::new(holder) }
     }
 
     pub(crate) fn new(holder: Holder) -> Self {

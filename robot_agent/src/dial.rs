@@ -1,0 +1,188 @@
+//! How a session reaches the server: one connection each, small buffers, and a network that a simulation can cut.
+//!
+//! Invariant: keep-alive of HTTP/2 is not liveness and is off; the agent itself gives a silent session up. Called by the shell.
+
+use async_trait::async_trait;
+use hyper_util::rt::TokioIo;
+use std::io;
+use std::pin::Pin;
+use std::task::{Context, Poll};
+use std::time::Duration;
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::net::TcpStream;
+use tokio::sync::watch;
+use tonic::codec::BufferSettings;
+use tonic::transport::{Channel, Endpoint};
+
+/// Stream window of one robot, bytes: enough for the largest control message.
+const STREAM_WINDOW: u32 = 128 * 1024;
+/// First size of the codec's buffers, bytes; they grow when they must.
+const CODEC_BYTES: usize = 512;
+/// A connection that is not there by then is tried again, real time.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// A connection that could not be made.
+#[derive(Debug, thiserror::Error)]
+#[error("dialing the server: {0}")]
+pub struct Error(pub Box<dyn std::error::Error + Send + Sync>);
+
+/// Makes connections to the server. Implemented here over TCP, and by simulations over their own network.
+#[async_trait]
+pub trait Dial: Send + Sync {
+    /// A new connection.
+    async fn dial(&self) -> Result<Channel, Error>;
+}
+
+/// The settings every robot's connection has, whatever carries it.
+pub fn endpoint(uri: &str) -> Result<Endpoint, Error> {
+    let endpoint = Endpoint::from_shared(uri.to_owned()).map_err(|e| Error(e.into()))?;
+    Ok(endpoint
+        .connect_timeout(CONNECT_TIMEOUT)
+        .initial_stream_window_size(STREAM_WINDOW)
+        .initial_connection_window_size(STREAM_WINDOW)
+        .buffer_size(Some(8))
+        .tcp_nodelay(true))
+}
+
+/// Buffers of a session's messages.
+pub(crate) fn buffers() -> BufferSettings {
+    BufferSettings::new(CODEC_BYTES, 32 * 1024)
+}
+
+/// TCP, with a network that may be cut.
+#[derive(Clone, Debug)]
+pub struct TcpDial {
+    endpoint: Endpoint,
+    address: String,
+    network: Option<watch::Receiver<bool>>,
+}
+
+impl TcpDial {
+    /// To `uri`, `http://host:port`. While `network` says false nothing passes and nothing is dialed.
+    pub fn new(uri: &str, network: Option<watch::Receiver<bool>>) -> Result<Self, Error> {
+        let endpoint = endpoint(uri)?;
+        let authority = endpoint.uri().authority().map(ToString::to_string);
+        let address = authority.ok_or_else(|| Error("the address needs a host and a port".into()))?;
+        Ok(Self { endpoint, address, network })
+    }
+}
+
+#[async_trait]
+impl Dial for TcpDial {
+    async fn dial(&self) -> Result<Channel, Error> {
+        let (address, network) = (self.address.clone(), self.network.clone());
+        let connect = tower::service_fn(move |_: tonic::transport::Uri| {
+            let (address, network) = (address.clone(), network.clone());
+            async move {
+                if let Some(network) = &network {
+                    let mut network = network.clone();
+                    network.wait_for(|up| *up).await.map_err(io::Error::other)?;
+                }
+                let stream = TcpStream::connect(&address).await?;
+                stream.set_nodelay(true)?;
+                Ok::<_, io::Error>(TokioIo::new(Cut::new(stream, network)))
+            }
+        });
+        self.endpoint.connect_with_connector(connect).await.map_err(|e| Error(e.into()))
+    }
+}
+
+/// A stream whose bytes vanish once its network was cut: writes go nowhere, nothing arrives, nobody is told. When the network is
+/// back the stream is dead, since bytes are missing in it.
+#[derive(Debug)]
+pub struct Cut<S: Send + 'static> {
+    stream: Option<S>,
+    network: Option<watch::Receiver<bool>>,
+    back: Option<Pin<Box<tokio::time::Sleep>>>,
+    was_cut: bool,
+}
+
+/// How often a cut stream looks whether the network is back, real time.
+const LOOK: Duration = Duration::from_millis(200);
+
+impl<S: Send + 'static> Cut<S> {
+    /// Over `stream`. Without a network it is only the stream.
+    pub fn new(stream: S, network: Option<watch::Receiver<bool>>) -> Self {
+        Self { stream: Some(stream), network, back: None, was_cut: false }
+    }
+
+    fn is_up(&self) -> bool {
+        self.network.as_ref().is_none_or(|n| *n.borrow())
+    }
+
+    /// The stream if it is whole; an error if it was cut and the network is back; none while bytes vanish.
+    fn whole(&mut self) -> io::Result<Option<&mut S>> {
+        self.was_cut |= !self.is_up();
+        match (self.was_cut, self.is_up()) {
+            (false, _) => Ok(self.stream.as_mut()),
+            (true, true) => Err(io::ErrorKind::ConnectionReset.into()),
+            (true, false) => Ok(None),
+        }
+    }
+
+    fn look_again(&mut self, cx: &mut Context<'_>) {
+        loop {
+            let back = self.back.get_or_insert_with(|| Box::pin(tokio::time::sleep(LOOK)));
+            if back.as_mut().poll(cx).is_pending() {
+                return;
+            }
+            self.back = None;
+            if self.is_up() {
+                cx.waker().wake_by_ref();
+                return;
+            }
+        }
+    }
+}
+
+impl<S: AsyncRead + Unpin + Send + 'static> AsyncRead for Cut<S> {
+    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+        let before = buf.filled().len();
+        let watched = self.network.is_some();
+        if let Some(stream) = self.whole()? {
+            let read = Pin::new(stream).poll_read(cx, buf);
+            if !watched || self.is_up() {
+                return read;
+            }
+            buf.set_filled(before);
+        }
+        self.look_again(cx);
+        Poll::Pending
+    }
+}
+
+impl<S: AsyncWrite + Unpin + Send + 'static> AsyncWrite for Cut<S> {
+    fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
+        match self.whole()? {
+            Some(stream) => Pin::new(stream).poll_write(cx, buf),
+            None => Poll::Ready(Ok(buf.len())),
+        }
+    }
+    fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        match self.whole()? {
+            Some(stream) => Pin::new(stream).poll_flush(cx),
+            None => Poll::Ready(Ok(())),
+        }
+    }
+    fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        match self.whole() {
+            Ok(Some(stream)) => Pin::new(stream).poll_shutdown(cx),
+            _ => Poll::Ready(Ok(())),
+        }
+    }
+}
+
+impl<S: Send + 'static> Drop for Cut<S> {
+    /// A socket that is closed says goodbye; over a cut network nobody may hear it, so it is kept until the network is back.
+    fn drop(&mut self) {
+        let cut = !self.is_up();
+        if let (true, Some(stream), Some(mut network)) = (cut, self.stream.take(), self.network.take())
+            && let Ok(runtime) = tokio::runtime::Handle::try_current()
+        {
+            runtime.spawn(async move {
+                let _ = network.wait_for(|up| *up).await;
+                drop(stream);
+            });
+        }
+    }
+}

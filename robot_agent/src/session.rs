@@ -1,0 +1,457 @@
+//! The shell around the core: dials, says hello, carries messages both ways, keeps what must be kept, and waits.
+//!
+//! Invariant: it decides nothing about work. What comes in is always taken in, whatever the way up does; every queue is bounded; a
+//! session that is silent for ten seconds is given up. One task a robot, whose only timer is the next thing that is due.
+//! Called by the binary (one robot a process) and by swarms (thousands in one).
+
+use crate::body::Body;
+use crate::bugs::Bugs;
+use crate::core::{AgentCore, CoreConfig, ExitReason, Input, Output};
+use crate::dial::{self, Dial};
+use crate::store::{self, Op, Store};
+use backon::{BackoffBuilder, ExponentialBackoff, ExponentialBuilder};
+use midshift_core::ids::RobotId;
+use midshift_core::limits;
+use midshift_core::robot::{Lane, ReportedState};
+use midshift_core::time::{Clock, LinkDuration, LinkTime, Now};
+use midshift_proto::convert::parse;
+use midshift_proto::link::v1;
+use midshift_proto::session::{
+    Close, CloseCode, FromRobot, Hello, LanePosition, PROTOCOL_VERSION, Previous, ToRobot, Uplink, Welcome,
+};
+use rand::{RngExt, SeedableRng};
+use std::future::{Future, pending};
+use std::pin::Pin;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::sync::CancellationToken;
+use tonic::Streaming;
+use tonic::transport::Channel;
+use tonic_prost::{ProstDecoder, ProstEncoder};
+
+/// What one agent is told at its start.
+pub struct AgentConfig {
+    /// Who.
+    pub robot_id: RobotId,
+    /// New for each start of the process.
+    pub boot_id: String,
+    /// Random; used if the store has no ring yet.
+    pub new_ring_id: String,
+    /// Seed of the jitter between attempts to connect. Different for each robot.
+    pub seed: u64,
+    /// Naive rules for twins of tests; none outside them.
+    pub bugs: Bugs,
+    /// Called with each heartbeat's period, whether or not there is a session: tells a launcher that the agent lives.
+    pub pulse: Option<Box<dyn FnMut() + Send>>,
+}
+
+/// An agent that could not go on.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// Ledger and ring cannot be kept: a robot without a memory must not move.
+    #[error(transparent)]
+    Store(#[from] store::Error),
+}
+
+/// No word from the server for this long: the session is given up. A heartbeat is answered each second.
+const SILENCE: LinkDuration = LinkDuration::from_secs(10);
+/// Messages that may wait for the wire; a robot whose network is stuck this long gives the session up.
+const OUTBOUND: usize = 64;
+/// Shortest and longest pause between attempts to connect, real time.
+const RETRY: std::ops::Range<Duration> = Duration::from_millis(200)..Duration::from_secs(10);
+/// A server that moves its robots over or restarts is asked again within this, milliseconds of real time.
+const SOON_MS: std::ops::Range<u64> = 50..1_000;
+/// The way the session takes.
+const PATH: &str = "/midshift.link.v1.LinkService/Session";
+
+type Boxed<T> = Pin<Box<dyn Future<Output = T> + Send>>;
+
+/// An open session.
+struct Open {
+    up: mpsc::Sender<v1::SessionRequest>,
+    down: Streaming<v1::SessionResponse>,
+    heard: LinkTime,
+}
+
+/// On the way to a session.
+enum Way {
+    /// Nothing under way.
+    Idle,
+    /// Not yet.
+    Waiting(Pin<Box<tokio::time::Sleep>>),
+    /// A connection is being made.
+    Dialing(Boxed<Result<Channel, String>>),
+    /// Hello was said.
+    Greeting(Boxed<Greeted>),
+}
+
+enum Greeted {
+    Welcome(Box<(Open, Welcome)>),
+    Closed(Close),
+    Failed(String),
+}
+
+/// What ended a wait.
+enum Woken {
+    Due,
+    Shutdown,
+    Committed(Box<dyn Store>, Result<(), store::Error>),
+    Channel(Result<Channel, String>),
+    DialNow,
+    Greeted(Greeted),
+    Down(Option<v1::SessionResponse>),
+}
+
+/// One agent.
+pub struct Agent {
+    config: AgentConfig,
+    core: AgentCore,
+    clock: Arc<dyn Clock>,
+    dial: Arc<dyn Dial>,
+    open: Option<Open>,
+    way: Way,
+    retry: ExponentialBackoff,
+    rng: rand::rngs::StdRng,
+    store: Option<Box<dyn Store>>,
+    batch: u64,
+    committing: Option<Boxed<(Box<dyn Store>, Result<(), store::Error>)>>,
+    pulsed: LinkTime,
+    exit: Option<ExitReason>,
+}
+
+/// Runs one agent until `shutdown`, or until the agent ends by itself.
+pub async fn run(
+    config: AgentConfig,
+    body: Box<dyn Body>,
+    mut store: Box<dyn Store>,
+    clock: Arc<dyn Clock>,
+    dial: Arc<dyn Dial>,
+    shutdown: CancellationToken,
+) -> Result<ExitReason, Error> {
+    let kept = store.load(&config.new_ring_id).await?;
+    let core = CoreConfig { robot_id: config.robot_id.clone(), bugs: config.bugs };
+    let core = AgentCore::new(core, body, kept, clock.now());
+    let agent = Agent {
+        retry: retries(config.seed),
+        rng: rand::rngs::StdRng::seed_from_u64(config.seed),
+        core,
+        clock,
+        dial,
+        open: None,
+        way: Way::Idle,
+        store: Some(store),
+        batch: 0,
+        committing: None,
+        pulsed: LinkTime(0),
+        exit: None,
+        config,
+    };
+    agent.run(shutdown).await
+}
+
+fn retries(seed: u64) -> ExponentialBackoff {
+    ExponentialBuilder::default()
+        .with_min_delay(RETRY.start)
+        .with_max_delay(RETRY.end)
+        .with_factor(2.0)
+        .without_max_times()
+        .with_jitter()
+        .with_jitter_seed(seed)
+        .build()
+}
+
+impl Agent {
+    async fn run(mut self, shutdown: CancellationToken) -> Result<ExitReason, Error> {
+        self.dial_now();
+        self.step(Input::Start);
+        loop {
+            if let Some(reason) = self.exit {
+                return self.end(reason).await;
+            }
+            match self.wait(&shutdown).await {
+                Woken::Due => self.due(),
+                Woken::Shutdown => self.exit = Some(ExitReason::Shutdown),
+                Woken::Committed(store, done) => {
+                    done?;
+                    self.store = Some(store);
+                    self.step(Input::Persisted(self.batch));
+                }
+                Woken::DialNow => self.dial_now(),
+                Woken::Channel(Ok(channel)) => self.greet(channel),
+                Woken::Channel(Err(why)) => self.failed(&why),
+                Woken::Greeted(greeted) => self.greeted(greeted),
+                Woken::Down(message) => self.heard(message),
+            }
+        }
+    }
+
+    /// The body is told to stand: nobody drives it any more. What was being written is finished.
+    async fn end(mut self, reason: ExitReason) -> Result<ExitReason, Error> {
+        self.core.halt(self.clock.now());
+        if let Some(committing) = self.committing.take() {
+            committing.await.1?;
+        }
+        Ok(reason)
+    }
+
+    async fn wait(&mut self, shutdown: &CancellationToken) -> Woken {
+        let now = self.clock.now();
+        let due = tokio::time::sleep(self.until_due(&now));
+        let Self { committing, way, open, .. } = self;
+        tokio::select! {
+            biased;
+            (store, done) = ready(committing) => { *committing = None; Woken::Committed(store, done) }
+            () = shutdown.cancelled() => Woken::Shutdown,
+            woken = progress(way) => { *way = Way::Idle; woken }
+            message = next(open) => Woken::Down(message),
+            () = due => Woken::Due,
+        }
+    }
+
+    /// Real time until the core wants to be called. Never zero, so that nothing spins.
+    fn until_due(&self, now: &Now) -> Duration {
+        let wake = self.core.next_wake(now);
+        let link_ms = wake.link.since(now.link).as_ms();
+        let rate = u64::from(self.clock.rate_permille()).max(1);
+        let site_ms = wake.site.map_or(u64::MAX, |at| (at.since(now.site).as_ms().saturating_mul(1000)).div_ceil(rate));
+        Duration::from_millis(link_ms.min(site_ms).max(1))
+    }
+
+    fn due(&mut self) {
+        let now = self.clock.now();
+        if self.open.as_ref().is_some_and(|o| now.link.since(o.heard) > SILENCE) {
+            self.lost("the server is silent");
+        }
+        if now.link.since(self.pulsed) >= limits::HEARTBEAT {
+            self.pulsed = now.link;
+            if let Some(pulse) = &mut self.config.pulse {
+                pulse();
+            }
+        }
+        self.step(Input::Tick);
+    }
+
+    fn step(&mut self, input: Input) {
+        let now = self.clock.now();
+        for output in self.core.step(now, input) {
+            match output {
+                Output::Persist(batch, ops) => self.persist(batch, ops),
+                Output::Send(message) => self.send(*message),
+                Output::Exit(reason) => self.exit = Some(reason),
+            }
+        }
+    }
+
+    fn persist(&mut self, batch: u64, ops: Vec<Op>) {
+        let Some(mut store) = self.store.take() else { return };
+        self.batch = batch;
+        self.committing = Some(Box::pin(async move {
+            let done = store.commit(&ops).await;
+            (store, done)
+        }));
+    }
+
+    fn send(&mut self, message: Uplink) {
+        let Some(open) = &self.open else { return };
+        let only_heartbeat = message.batches.is_empty();
+        let wire = v1::SessionRequest::from(&FromRobot::Uplink(message));
+        if open.up.try_send(wire).is_err() && !only_heartbeat {
+            self.lost("the way up is stuck");
+        }
+    }
+
+    fn lost(&mut self, why: &str) {
+        tracing::info!(robot_id = %self.config.robot_id, why, "session lost");
+        self.open = None;
+        self.step(Input::Disconnected);
+        if matches!(self.way, Way::Idle) {
+            self.wait_to_dial(None);
+        }
+    }
+
+    fn failed(&mut self, why: &str) {
+        tracing::debug!(robot_id = %self.config.robot_id, why, "no session");
+        self.wait_to_dial(None);
+    }
+
+    fn wait_to_dial(&mut self, at_least: Option<Duration>) {
+        let pause = at_least.or_else(|| self.retry.next()).unwrap_or(RETRY.end);
+        self.way = Way::Waiting(Box::pin(tokio::time::sleep(pause)));
+    }
+
+    fn soon(&mut self) -> Duration {
+        Duration::from_millis(self.rng.random_range(SOON_MS))
+    }
+
+    fn dial_now(&mut self) {
+        let dial = self.dial.clone();
+        self.way = Way::Dialing(Box::pin(async move { dial.dial().await.map_err(|e| e.to_string()) }));
+    }
+
+    fn greet(&mut self, channel: Channel) {
+        let now = self.clock.now();
+        let hello = FromRobot::Hello(Box::new(self.hello(&now)));
+        let greeting = greet(channel, v1::SessionRequest::from(&hello), self.clock.clone());
+        let limit = Duration::from_millis(SILENCE.as_ms());
+        self.way = Way::Greeting(Box::pin(async move {
+            tokio::time::timeout(limit, greeting).await.unwrap_or_else(|_| Greeted::Failed("no welcome".to_owned()))
+        }));
+    }
+
+    fn hello(&self, now: &Now) -> Hello {
+        let kept = self.core.kept();
+        let memory = &kept.ledger.session;
+        let position = |lane: Lane| {
+            let kept = kept.ring.lane(lane);
+            (lane, LanePosition { first_seq: kept.first(), next_seq: kept.produced + 1 })
+        };
+        Hello {
+            robot_id: self.config.robot_id.clone(),
+            boot_id: self.config.boot_id.clone(),
+            previous: (memory.session_epoch > 0)
+                .then(|| Previous { session_epoch: memory.session_epoch, secret: memory.secret.clone() }),
+            inventory: self.core.inventory().clone(),
+            reported: ReportedState { hb: 0, session_epoch: 0, ..self.core.reported(now) },
+            ring: kept.ring.id.clone(),
+            lanes: Lane::ALL.into_iter().map(position).collect(),
+            store_id: memory.store_id.clone(),
+            sent_unix_ms: now.wall.0,
+            clock_rate_permille: self.clock.rate_permille(),
+            protocol_versions: vec![PROTOCOL_VERSION],
+        }
+    }
+
+    fn greeted(&mut self, greeted: Greeted) {
+        match greeted {
+            Greeted::Welcome(welcome) => {
+                let (open, welcome) = *welcome;
+                tracing::info!(robot_id = %self.config.robot_id, session_epoch = welcome.session_epoch, "session open");
+                self.open = Some(open);
+                self.retry = retries(self.rng.random());
+                self.step(Input::Connected(welcome));
+            }
+            Greeted::Closed(close) => self.closed(&close),
+            Greeted::Failed(why) => self.failed(&why),
+        }
+    }
+
+    fn heard(&mut self, message: Option<v1::SessionResponse>) {
+        let Some(message) = message else { return self.lost("the stream ended") };
+        let now = self.clock.now().link;
+        if let Some(open) = &mut self.open {
+            open.heard = now;
+        }
+        match parse(message) {
+            Ok(ToRobot::Downlink(down)) => self.step(Input::Down(down)),
+            Ok(ToRobot::Close(close)) => self.closed(&close),
+            Ok(ToRobot::MoveOver { .. }) => {
+                if matches!(self.way, Way::Idle) {
+                    let pause = self.soon();
+                    self.wait_to_dial(Some(pause));
+                }
+            }
+            Ok(ToRobot::Welcome(_)) => self.lost("a second welcome"),
+            Err(refusal) => {
+                tracing::error!(robot_id = %self.config.robot_id, %refusal, "message cannot be read");
+                self.lost("a message cannot be read");
+            }
+        }
+    }
+
+    fn closed(&mut self, close: &Close) {
+        tracing::info!(robot_id = %self.config.robot_id, code = ?close.code, reason = close.reason.text(), "closed by server");
+        let had_next = !matches!(self.way, Way::Idle);
+        self.open = None;
+        if close.code == CloseCode::Fenced && had_next {
+            // Its own next session proved the succession: nobody else has this robot's id.
+            return self.step(Input::Disconnected);
+        }
+        self.step(if close.code == CloseCode::Fenced { Input::Fenced } else { Input::Disconnected });
+        let asked = Duration::from_millis(u64::from(close.retry_after_ms));
+        let pause = match close.code {
+            CloseCode::Fenced => Some(asked.max(Duration::from_millis(limits::FENCED_RETRY.as_ms()))),
+            CloseCode::Shutdown | CloseCode::MoveOver if had_next => return,
+            CloseCode::Shutdown | CloseCode::MoveOver => Some(asked + self.soon()),
+            CloseCode::Protocol | CloseCode::TooSlow => self.retry.next().map(|pause| pause.max(asked)),
+        };
+        self.wait_to_dial(pause);
+    }
+}
+
+/// Opens the stream, says hello, and waits for the first answer.
+async fn greet(channel: Channel, hello: v1::SessionRequest, clock: Arc<dyn Clock>) -> Greeted {
+    let (up, queue) = mpsc::channel(OUTBOUND);
+    let failed = |what: &str, detail: &dyn std::fmt::Display| Greeted::Failed(format!("{what}: {detail}"));
+    if up.try_send(hello).is_err() {
+        return Greeted::Failed("the way up is closed".to_owned());
+    }
+    let mut client = tonic::client::Grpc::new(channel);
+    if let Err(error) = client.ready().await {
+        return failed("connection", &error);
+    }
+    let path = tonic::codegen::http::uri::PathAndQuery::from_static(PATH);
+    let request = tonic::Request::new(ReceiverStream::new(queue));
+    let mut down = match client.streaming(request, path, SmallCodec).await {
+        Ok(response) => response.into_inner(),
+        Err(status) => return failed("session", &status),
+    };
+    match down.message().await {
+        Ok(Some(first)) => match parse(first) {
+            Ok(ToRobot::Welcome(welcome)) => {
+                let heard = clock.now().link;
+                Greeted::Welcome(Box::new((Open { up, down, heard }, welcome)))
+            }
+            Ok(ToRobot::Close(close)) => Greeted::Closed(close),
+            Ok(_) => Greeted::Failed("the first message was no welcome".to_owned()),
+            Err(refusal) => failed("welcome", &refusal),
+        },
+        Ok(None) => Greeted::Failed("the stream ended before a welcome".to_owned()),
+        Err(status) => failed("welcome", &status),
+    }
+}
+
+/// Messages of a session with small first buffers: thousands of robots may live in one process.
+#[derive(Clone, Copy, Debug, Default)]
+struct SmallCodec;
+
+impl tonic::codec::Codec for SmallCodec {
+    type Encode = v1::SessionRequest;
+    type Decode = v1::SessionResponse;
+    type Encoder = ProstEncoder<v1::SessionRequest>;
+    type Decoder = ProstDecoder<v1::SessionResponse>;
+
+    fn encoder(&mut self) -> Self::Encoder {
+        ProstEncoder::new(dial::buffers())
+    }
+    fn decoder(&mut self) -> Self::Decoder {
+        ProstDecoder::new(dial::buffers())
+    }
+}
+
+async fn ready<T>(future: &mut Option<Boxed<T>>) -> T {
+    match future {
+        Some(future) => future.await,
+        None => pending().await,
+    }
+}
+
+async fn next(open: &mut Option<Open>) -> Option<v1::SessionResponse> {
+    match open {
+        Some(open) => open.down.message().await.ok().flatten(),
+        None => pending().await,
+    }
+}
+
+async fn progress(way: &mut Way) -> Woken {
+    match way {
+        Way::Idle => pending().await,
+        Way::Waiting(sleep) => {
+            sleep.await;
+            Woken::DialNow
+        }
+        Way::Dialing(dialing) => Woken::Channel(dialing.await),
+        Way::Greeting(greeting) => Woken::Greeted(greeting.await),
+    }
+}

@@ -1,0 +1,9 @@
+//! What a robot does with what it is told, on a bench: no network, no clock, no disk but those of the test.
+
+mod drives;
+mod lanes;
+mod offers;
+mod restarts;
+mod rig;
+mod session;
+mod steps;

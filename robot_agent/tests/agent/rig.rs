@@ -1,0 +1,439 @@
+//! A robot on a bench: the core with a body that does what the test says, a store that keeps, and a server that is the test.
+
+use midshift_agent::body::{Body, BodyLimits, BodyNews, BodyOrder, BodyState, Checked, PathPoint};
+use midshift_agent::bugs::Bugs;
+use midshift_agent::core::{AgentCore, CoreConfig, ExitReason, Input, Output};
+use midshift_agent::memory::MemoryStore;
+use midshift_core::authority::Authority;
+use midshift_core::ids::{AreaId, AttemptId, PlaceId, RobotId, Subject, TaskId, WaypointId};
+use midshift_core::robot::{Fault, HardwareStop, Inventory, Lane, Load, Mode, Pose, ReportedState, StopLevel};
+use midshift_core::time::{LinkTime, Now, SiteTime, Utc};
+use midshift_core::work::{
+    Assignment, AttemptReport, DesiredWork, Effect, GrantedPlace, InboxItem, PlaceNews, RobotEvent, RoutePoint,
+    SampleBody, StepKind, WorkState, WorkStep,
+};
+use midshift_proto::session::{ClockSample, Downlink, Echo, LaneAck, LaneBatch, Uplink, Welcome};
+use std::sync::{Arc, Mutex, MutexGuard};
+
+/// What the body was told and how it is.
+#[derive(Clone)]
+pub struct BodyLog {
+    pub path: Vec<PathPoint>,
+    pub acting: Option<StepKind>,
+    pub acts: u32,
+    pub paused: bool,
+    pub stops: u32,
+    pub parks: u32,
+    pub charging: bool,
+    pub battery_permille: u16,
+    pub waypoint: Option<WaypointId>,
+    pub pose: Pose,
+    pub load: Option<Load>,
+    pub mode: Mode,
+    pub hardware_stop: HardwareStop,
+    pub checked: Checked,
+    news: Vec<BodyNews>,
+}
+
+#[derive(Clone)]
+pub struct TestBody(pub Arc<Mutex<BodyLog>>);
+
+impl TestBody {
+    pub fn at(name: &str) -> Self {
+        Self(Arc::new(Mutex::new(BodyLog {
+            path: Vec::new(),
+            acting: None,
+            acts: 0,
+            paused: false,
+            stops: 0,
+            parks: 0,
+            charging: false,
+            battery_permille: 700,
+            waypoint: Some(waypoint(name)),
+            pose: Pose { x_mm: x_of(name), ..Pose::default() },
+            load: None,
+            mode: Mode::Automatic,
+            hardware_stop: HardwareStop::None,
+            checked: Checked::Unknown,
+            news: Vec::new(),
+        })))
+    }
+    fn lock(&self) -> MutexGuard<'_, BodyLog> {
+        self.0.lock().expect("not poisoned")
+    }
+    /// What it was told so far and how it is.
+    pub fn log(&self) -> BodyLog {
+        self.lock().clone()
+    }
+    /// Makes it otherwise, without a word.
+    pub fn set(&self, change: impl FnOnce(&mut BodyLog)) {
+        change(&mut self.lock());
+    }
+    /// Reaches the next point of its path, and is done if it was the last.
+    pub fn reach(&self) -> String {
+        let mut log = self.lock();
+        let point = log.path.remove(0);
+        log.waypoint = Some(point.waypoint.clone());
+        log.pose = Pose { x_mm: point.x_mm, ..Pose::default() };
+        log.news.push(BodyNews::Reached(point.waypoint.clone()));
+        if log.path.is_empty() {
+            log.news.push(BodyNews::Done);
+        }
+        point.waypoint.to_string()
+    }
+    pub fn done(&self) {
+        let mut log = self.lock();
+        log.acting = None;
+        log.news.push(BodyNews::Done);
+    }
+    pub fn says(&self, news: BodyNews) {
+        let mut log = self.lock();
+        match &news {
+            BodyNews::Mode(mode) => log.mode = *mode,
+            BodyNews::HardwareStop(stop) => log.hardware_stop = *stop,
+            BodyNews::Load(load) => log.load = load.clone(),
+            BodyNews::Failed(_) => log.acting = None,
+            _ => {}
+        }
+        log.news.push(news);
+    }
+    pub fn goes_to(&self) -> Vec<String> {
+        self.lock().path.iter().map(|p| p.waypoint.to_string()).collect()
+    }
+}
+
+impl Body for TestBody {
+    fn capabilities(&self) -> Inventory {
+        Inventory { capabilities: vec!["pick".into(), "place".into()], ..Inventory::default() }
+    }
+    fn limits(&self) -> BodyLimits {
+        BodyLimits { speed_mm_s: 1_500, floor_speed_mm_s: 50, battery_critical_permille: 100 }
+    }
+    fn start(&mut self, _: SiteTime, order: BodyOrder) -> Result<(), Fault> {
+        let mut log = self.lock();
+        log.paused = false;
+        match order {
+            BodyOrder::Drive(path) => log.path = path,
+            BodyOrder::Act(kind) => {
+                log.acts += 1;
+                log.acting = Some(kind);
+            }
+        }
+        Ok(())
+    }
+    fn pause(&mut self, _: SiteTime) {
+        self.lock().paused = true;
+    }
+    fn resume(&mut self, _: SiteTime) {
+        self.lock().paused = false;
+    }
+    fn stop(&mut self, _: SiteTime, _: StopLevel) {
+        let mut log = self.lock();
+        log.stops += 1;
+        log.path.clear();
+        log.acting = None;
+    }
+    fn standstill(&self, _: SiteTime) -> bool {
+        let log = self.lock();
+        log.path.is_empty() && log.acting.is_none()
+    }
+    fn park(&mut self, _: SiteTime) {
+        self.lock().parks += 1;
+    }
+    fn charge(&mut self, _: SiteTime, on: bool) {
+        self.lock().charging = on;
+    }
+    fn poll(&mut self, _: SiteTime) -> Vec<BodyNews> {
+        std::mem::take(&mut self.lock().news)
+    }
+    fn next_change(&self, _: SiteTime) -> Option<SiteTime> {
+        None
+    }
+    fn state(&self, _: SiteTime) -> BodyState {
+        let log = self.lock();
+        BodyState {
+            pose: log.pose,
+            waypoint: log.waypoint.clone(),
+            speed_mm_s: 0,
+            battery_permille: log.battery_permille,
+            charging: log.charging,
+            hottest_joint_decidegrees: 300,
+            odometer_mm: 0,
+            loaded_odometer_mm: 0,
+            energy_mwh: 0,
+            field_violation: false,
+        }
+    }
+    fn load(&self) -> Option<Load> {
+        self.lock().load.clone()
+    }
+    fn check(&self, _: &StepKind, _: Option<&TaskId>) -> Checked {
+        self.lock().checked
+    }
+    fn self_test(&mut self, _: SiteTime) -> Result<(), Fault> {
+        Ok(())
+    }
+    fn hardware_stop(&self) -> HardwareStop {
+        self.lock().hardware_stop
+    }
+    fn mode(&self) -> Mode {
+        self.lock().mode
+    }
+    fn stands_on(&self) -> Vec<WaypointId> {
+        Vec::new()
+    }
+}
+
+/// The bench.
+pub struct Rig {
+    pub core: AgentCore,
+    pub body: TestBody,
+    pub store: MemoryStore,
+    pub ms: u64,
+    pub hb: u64,
+    pub epoch: u64,
+    /// Writes do not become durable while this is set.
+    pub slow_disk: bool,
+    pub unwritten: Option<(u64, Vec<midshift_agent::store::Op>)>,
+    pub events: Vec<RobotEvent>,
+    pub messages: Vec<Uplink>,
+    pub reported: Option<ReportedState>,
+    pub exit: Option<ExitReason>,
+    generation: u64,
+}
+
+pub const START_MS: u64 = 1_000;
+
+impl Rig {
+    /// A robot that stands at `name` and has never worked.
+    pub fn at(name: &str) -> Self {
+        Self::with(TestBody::at(name), MemoryStore::new(), Bugs::default())
+    }
+    pub fn with(body: TestBody, store: MemoryStore, bugs: Bugs) -> Self {
+        let kept = store.load_now("ring-1");
+        let config = CoreConfig { robot_id: RobotId::parse("rbt-01").expect("a name"), bugs };
+        let core = AgentCore::new(config, Box::new(body.clone()), kept, now_at(START_MS));
+        let mut rig = Self {
+            core,
+            body,
+            store,
+            ms: START_MS,
+            hb: 0,
+            epoch: 0,
+            slow_disk: false,
+            unwritten: None,
+            events: Vec::new(),
+            messages: Vec::new(),
+            reported: None,
+            exit: None,
+            generation: 100,
+        };
+        rig.put(Input::Start);
+        rig
+    }
+    /// The process is killed and started again: what was not durable is gone.
+    pub fn restart(self) -> Self {
+        let mut next = Self::with(self.body, self.store, Bugs::default());
+        next.generation = self.generation;
+        next.epoch = self.epoch;
+        next
+    }
+    pub fn put(&mut self, input: Input) {
+        let mut inputs = vec![input];
+        while let Some(input) = inputs.pop() {
+            for output in self.core.step(now_at(self.ms), input) {
+                match output {
+                    Output::Persist(batch, ops) if self.slow_disk => self.unwritten = Some((batch, ops)),
+                    Output::Persist(batch, ops) => {
+                        self.store.commit_now(&ops);
+                        inputs.push(Input::Persisted(batch));
+                    }
+                    Output::Send(message) => self.sent(*message),
+                    Output::Exit(reason) => self.exit = Some(reason),
+                }
+            }
+        }
+    }
+    /// The disk catches up.
+    pub fn flush(&mut self) {
+        self.slow_disk = false;
+        while let Some((batch, ops)) = self.unwritten.take() {
+            self.store.commit_now(&ops);
+            self.put(Input::Persisted(batch));
+        }
+    }
+    fn sent(&mut self, message: Uplink) {
+        if let Some(heartbeat) = &message.heartbeat {
+            self.hb = heartbeat.reported.hb;
+            self.reported = Some(heartbeat.reported.clone());
+        }
+        for item in message.batches.iter().flat_map(|b| &b.items) {
+            if let InboxItem::Sample(sample) = item
+                && let SampleBody::Event(event) = &sample.body
+            {
+                self.events.push(event.clone());
+            }
+        }
+        self.messages.push(message);
+    }
+    pub fn connect(&mut self) {
+        self.epoch += 1;
+        self.connect_as(Welcome { session_epoch: self.epoch, ..welcome() });
+    }
+    pub fn connect_as(&mut self, welcome: Welcome) {
+        self.epoch = welcome.session_epoch;
+        self.put(Input::Connected(welcome));
+        self.echo();
+    }
+    pub fn down(&mut self, down: Downlink) {
+        self.put(Input::Down(Box::new(down)));
+    }
+    /// The server has processed the newest heartbeat.
+    pub fn echo(&mut self) {
+        let echo = Some(Echo { hb: self.hb, clock: ClockSample::default() });
+        self.down(Downlink { echo, ..Downlink::default() });
+    }
+    /// Time passes without a word from the server.
+    pub fn silence(&mut self, ms: u64) {
+        for _ in 0..ms / 500 {
+            self.ms += 500;
+            self.put(Input::Tick);
+        }
+    }
+    /// Time passes; each heartbeat is answered.
+    pub fn pass(&mut self, ms: u64) {
+        for _ in 0..ms / 500 {
+            self.silence(500);
+            self.echo();
+        }
+    }
+    /// Permission anchored to the newest heartbeat.
+    pub fn authority(&self, valid_ms: u64) -> Authority {
+        Authority { session_epoch: self.epoch, hb: self.hb, valid_ms }
+    }
+    pub fn desired(&self, assignment: Option<Assignment>) -> DesiredWork {
+        DesiredWork {
+            robot_id: RobotId::parse("rbt-01").expect("a name"),
+            generation: 0,
+            assignment,
+            grants: Vec::new(),
+            held: false,
+            resume: None,
+            closed: Vec::new(),
+        }
+    }
+    /// Sends desired work with the next generation.
+    pub fn work(&mut self, work: DesiredWork) {
+        self.generation += 1;
+        let work = DesiredWork { generation: self.generation, ..work };
+        self.down(Downlink { work: Some(work), ..Downlink::default() });
+    }
+    pub fn offer(&self, name: &str, epoch: u64, steps: Vec<WorkStep>, route: Vec<RoutePoint>) -> Assignment {
+        Assignment {
+            attempt: attempt(name, epoch),
+            offer: self.authority(5_000),
+            timeout_ms: 600_000,
+            steps,
+            from_step: 0,
+            resume_step: 0,
+            route_number: 1,
+            released_index: Some(route.len().saturating_sub(1) as u32),
+            route,
+            stop: false,
+            suspend: false,
+            speed_limit_mm_s: None,
+        }
+    }
+    pub fn grant(&self, place: &str, grant_id: u64) -> GrantedPlace {
+        GrantedPlace { place_id: place_id(place), grant_id, entry: Some(self.authority(10_000)) }
+    }
+    /// Reports of attempts since the last call.
+    pub fn reports(&mut self) -> Vec<AttemptReport> {
+        let events = std::mem::take(&mut self.events);
+        let (reports, rest): (Vec<_>, Vec<_>) = events.into_iter().partition(|e| matches!(e, RobotEvent::Attempt(_)));
+        self.events = rest;
+        reports.into_iter().filter_map(|e| if let RobotEvent::Attempt(r) = e { Some(r) } else { None }).collect()
+    }
+    pub fn states(&mut self) -> Vec<(WorkState, u32)> {
+        self.reports().into_iter().map(|r| (r.state, r.step_index)).collect()
+    }
+    /// Reason codes of refusals since the last call.
+    pub fn refusals(&mut self) -> Vec<String> {
+        self.reports().into_iter().filter_map(|r| r.refusal).map(|r| r.code.to_string()).collect()
+    }
+    /// News of places since the last call.
+    pub fn places(&mut self) -> Vec<(String, u64, PlaceNews)> {
+        let events = std::mem::take(&mut self.events);
+        let place = |e: &RobotEvent| match e {
+            RobotEvent::Place { place_id, grant_id, news } => Some((place_id.to_string(), *grant_id, *news)),
+            _ => None,
+        };
+        let found = events.iter().filter_map(place).collect();
+        self.events = events.into_iter().filter(|e| place(e).is_none()).collect();
+        found
+    }
+    pub fn stale(&self) -> usize {
+        self.events.iter().filter(|e| matches!(e, RobotEvent::StaleAuthority { .. })).count()
+    }
+}
+
+pub fn welcome() -> Welcome {
+    Welcome {
+        session_epoch: 1,
+        session_secret: "secret".into(),
+        store_id: "store-1".into(),
+        acks: Vec::new(),
+        heartbeat_period_ms: 1_000,
+        status_period_ms: 2_000,
+        authority_ms: 30_000,
+        status_credit_bytes: 64 * 1024,
+        protocol_version: 1,
+        clock_rate_permille: 1_000,
+        observed: false,
+    }
+}
+
+pub fn now_at(ms: u64) -> Now {
+    Now { site: SiteTime(ms), link: LinkTime(ms), utc: Utc(ms as i64), wall: Utc(1_700_000_000_000 + ms as i64) }
+}
+pub fn ack(lane: Lane, seq: u64) -> LaneAck {
+    LaneAck { lane, seq, expect: None }
+}
+pub fn items(messages: &[Uplink], lane: Lane) -> Vec<InboxItem> {
+    let of = |b: &LaneBatch| if b.lane == lane { b.items.clone() } else { Vec::new() };
+    messages.iter().flat_map(|m| m.batches.iter().flat_map(of)).collect()
+}
+pub fn waypoint(name: &str) -> WaypointId {
+    WaypointId::parse(name).expect("a name")
+}
+pub fn place_id(name: &str) -> PlaceId {
+    PlaceId::parse(name).expect("a name")
+}
+pub fn attempt(name: &str, epoch: u64) -> AttemptId {
+    AttemptId { subject: Subject::Task(TaskId::parse(name).expect("a name")), epoch }
+}
+/// Waypoints lie on a line, by their first letter.
+pub fn x_of(name: &str) -> i32 {
+    i32::from(name.as_bytes()[0] - b'A') * 5_000
+}
+pub fn point(name: &str, ends_step: Option<u32>, standing: bool, passages: &[&str]) -> RoutePoint {
+    RoutePoint {
+        waypoint: waypoint(name),
+        x_mm: x_of(name),
+        y_mm: 0,
+        ends_step,
+        standing: standing.then(|| place_id(name)),
+        passages: passages.iter().map(|p| place_id(p)).collect(),
+        speed_limit_mm_s: None,
+        area_id: AreaId::parse("hall").expect("a name"),
+    }
+}
+pub fn step(kind: StepKind, effect: Effect) -> WorkStep {
+    WorkStep { kind, effect, pause_allowed: true, cancel_allowed: true, timeout_ms: None, continue_on_fail: false }
+}
+pub fn goto(name: &str) -> WorkStep {
+    step(StepKind::Goto { waypoint: waypoint(name) }, Effect::Repeatable)
+}
+pub fn action(name: &str, effect: Effect) -> WorkStep {
+    step(StepKind::Action { name: name.into(), params: serde_json::Map::new() }, effect)
+}
