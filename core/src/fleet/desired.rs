@@ -44,15 +44,16 @@ pub fn compose(tx: &mut Tx, robot_id: &RobotId, board: &Board, releases: &Releas
     let live = board.get(robot_id).map(|l| &**l);
     let attempt = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned();
     let live_attempt = attempt.filter(|a| !a.phase.is_terminal());
-    let is_held =
-        tx.view.robot_holds(robot_id).next().is_some() || live_attempt.as_ref().is_some_and(|a| task_held(tx.view, a));
+    let is_held = is_held(tx.view, robot_id);
+    // A robot is let go only with a permission to move, and that needs a heartbeat to be anchored to.
+    let resume = resume(tx.view, robot_id, &old, is_held, board);
     let new = DesiredWork {
         robot_id: robot_id.clone(),
         generation: old.generation,
         assignment: live_attempt.as_ref().and_then(|a| assign(tx.view, a, old.assignment.as_ref(), live, releases)),
         grants: grants(tx.view, robot_id, &old, board),
-        held: is_held,
-        resume: resume(tx.view, robot_id, &old, is_held, board),
+        held: is_held || (old.held && resume.is_none()),
+        resume,
         closed: closed(&old, live, live_attempt.as_ref().map(|a| &a.attempt)),
     };
     let behind = session.applied_work > old.generation;
@@ -81,8 +82,11 @@ pub fn empty(robot_id: &RobotId) -> DesiredWork {
     }
 }
 
-fn task_held(view: &View, a: &Attempt) -> bool {
-    a.attempt.subject.task_id().and_then(|t| view.task(t)).is_some_and(|t| !t.holds.is_empty())
+/// A token of the robot, or of the task of its live attempt, stands.
+fn is_held(view: &View, robot_id: &RobotId) -> bool {
+    let live = view.held_by(robot_id).and_then(|id| view.attempt(id)).filter(|a| !a.phase.is_terminal());
+    let task = live.and_then(|a| a.attempt.subject.task_id()).and_then(|t| view.task(t));
+    view.robot_holds(robot_id).next().is_some() || task.is_some_and(|t| !t.holds.is_empty())
 }
 
 fn assign(
@@ -187,6 +191,9 @@ fn closed(old: &DesiredWork, live: Option<&Live>, current: Option<&AttemptId>) -
 pub fn wearing(view: &View, board: &Board) -> Vec<RobotId> {
     let worn = |d: &DesiredWork| {
         let live = board.get(&d.robot_id).map(|l| &**l);
+        if d.held && live.is_some() && !is_held(view, &d.robot_id) {
+            return true;
+        }
         let entries = d.grants.iter().filter_map(|g| g.entry.as_ref()).chain(d.resume.as_ref());
         entries.into_iter().any(|a| is_worn(a, live))
     };

@@ -98,7 +98,7 @@ pub const LOGS: &[Log] = &[Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbo
 pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
     let consumed = view.marks.get("fleet").map_or(crate::rows::Seq(0), |m| m.row.seq);
     for entry in entries {
-        if let Some(table) = entry.table {
+        if let Some(table) = entry.table.filter(|_| entry.seq > view.read_at) {
             let key = crate::rows::Key { table, id: entry.subject.clone() };
             if let Err(error) = view.absorb(&key, entry.revision, tx::row_of(entry, table).as_ref()) {
                 plan.report.unreadable.push(error.to_string());

@@ -123,7 +123,13 @@ fn attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
             tally.repaired += 1;
             inbox::attempt(tx, robot_id, &report(l.state), tally);
         }
-        Some(l) if needs_sight(&a, live) && l.state != WorkState::StepUnknown => {
+        Some(l) if l.state == WorkState::StepUnknown => {
+            let Some(task_id) = id.subject.task_id() else { return };
+            tally.repaired += 1;
+            let report = report(l.state);
+            happen(tx, task_id, News { event: Event::StepUnknown, why: None, report: Some(&report) });
+        }
+        Some(l) if needs_sight(&a, live) => {
             let Some(task_id) = id.subject.task_id() else { return errands::seen(tx, robot_id) };
             tally.repaired += 1;
             let report = report(l.state);

@@ -106,22 +106,19 @@ fn move_attempt(tx: &mut Tx, mut a: Attempt, step: Next, news: &News, intake: &T
     }
     match step.fate {
         Fate::Keep => {}
-        Fate::Stop => {
-            a.phase = AttemptPhase::Stopping;
-            disarm(tx, TimerKind::OfferAck, &a.attempt);
-            disarm(tx, TimerKind::StartToClose, &a.attempt);
-            if !tx.view.timers.contains_key(&Timer::id_of(TimerKind::StopConfirm, &a.attempt)) {
-                arm(tx, TimerKind::StopConfirm, &a.attempt, limits::STOP_CONFIRM.as_ms());
-            }
-        }
+        Fate::Stop => stop_attempt(tx, &mut a),
         Fate::Uncertain => {
-            let cause = news.why.cloned().unwrap_or_else(|| Code::LeaseOver.into());
+            let unsaid = if news.event == Event::StepUnknown { Code::StepUnknown } else { Code::LeaseOver };
+            let cause = news.why.cloned().unwrap_or_else(|| unsaid.into());
             a.uncertain = Some(Uncertain { since: tx.now.utc, cause });
             arm(tx, TimerKind::Uncertain, &a.attempt, limits::UNCERTAIN_LIMIT.as_ms());
         }
         Fate::Known => {
             a.uncertain = None;
             disarm(tx, TimerKind::Uncertain, &a.attempt);
+            if step.phase == Phase::Stopping {
+                stop_attempt(tx, &mut a);
+            }
         }
         Fate::End => {
             let confirmed = if a.accepted.is_some() { AttemptPhase::Aborted } else { AttemptPhase::OfferExpired };
@@ -144,6 +141,16 @@ fn move_attempt(tx: &mut Tx, mut a: Attempt, step: Next, news: &News, intake: &T
     }
     tx.put(a.clone(), "attempt.changed");
     a
+}
+
+/// The robot is told to stop, and has a limited time to confirm it.
+fn stop_attempt(tx: &mut Tx, a: &mut Attempt) {
+    a.phase = AttemptPhase::Stopping;
+    disarm(tx, TimerKind::OfferAck, &a.attempt);
+    disarm(tx, TimerKind::StartToClose, &a.attempt);
+    if !tx.view.timers.contains_key(&Timer::id_of(TimerKind::StopConfirm, &a.attempt)) {
+        arm(tx, TimerKind::StopConfirm, &a.attempt, limits::STOP_CONFIRM.as_ms());
+    }
 }
 
 /// The attempt is over and the robot is free: its mutex, timers, unentered grants, counters and breaker.
@@ -364,6 +371,7 @@ fn default_reason(t: &TaskState, news: &News) -> Option<Reason> {
         (Phase::NeedsOperator, Event::FailedFinal) => Code::FaultNotRecoverable,
         (Phase::NeedsOperator, Event::FailedRecoverable) => Code::AttemptsSpent,
         (Phase::NeedsOperator, Event::Refused) => Code::NoRobotAccepts,
+        (Phase::NeedsOperator, Event::StepUnknown) => Code::StepUnknown,
         (Phase::NeedsOperator, Event::StopConfirmed) => Code::RobotDroppedIt,
         (Phase::Failed, Event::Refused) => Code::NoRobotCan,
         (Phase::Failed, _) => Code::TaskFailed,

@@ -36,8 +36,10 @@ impl<'a> Tx<'a> {
         let key = record.key();
         let known = R::slot(self.view).get(&*key.id).map_or(Revision(0), |r| r.revision);
         let write = Write::Put { index: record.index(), body: record.body() };
-        let first = self.note(key.clone(), known, write, kind);
-        let revision = if first { known.next() } else { known };
+        let revision = match self.note(key.clone(), known, write, kind) {
+            Expect::Absent => Revision(1),
+            Expect::At(known) => known.next(),
+        };
         let old = R::slot(self.view).insert(key.id.to_string(), Rowed { revision, row: record });
         R::changed(self.view, &key.id, old.as_ref().map(|r| &r.row));
     }
@@ -47,8 +49,8 @@ impl<'a> Tx<'a> {
         self.note(Key::new(R::TABLE, id), old.revision, Write::Delete, kind);
         R::changed(self.view, id, Some(&old.row));
     }
-    /// Writes `write`; true if this decision had not written the row before.
-    fn note(&mut self, key: Key, known: Revision, write: Write, kind: &'static str) -> bool {
+    /// Writes `write`, and says what the row is expected to be before this decision.
+    fn note(&mut self, key: Key, known: Revision, write: Write, kind: &'static str) -> Expect {
         if let Some(&i) = self.at.get(&key) {
             let row = &mut self.item.rows[i];
             row.write = match (row.expect, write) {
@@ -56,12 +58,12 @@ impl<'a> Tx<'a> {
                 (_, write) => write,
             };
             row.kind = kind;
-            return false;
+            return row.expect;
         }
         let expect = if known == Revision(0) { Expect::Absent } else { Expect::At(known) };
         self.at.insert(key.clone(), self.item.rows.len());
         self.item.rows.push(RowChange { key, expect, write, kind });
-        true
+        expect
     }
     /// The item, if the decision changed anything.
     pub fn finish(self) -> Option<Item> {

@@ -89,6 +89,8 @@ pub struct View {
     pub policy_dirty: BTreeSet<RobotId>,
     /// Last entry of the feed that was taken.
     pub absorbed: crate::rows::Seq,
+    /// Rows were read at this entry: what older entries say of rows is in the picture already, also that a row is gone.
+    pub read_at: crate::rows::Seq,
     /// Reading of the clocks when fleet started: every lease counts as renewed then, and no timer fires soon after.
     pub started: Now,
     /// Reading of the clocks when the rows were read: serving time goes on from there.
@@ -260,6 +262,7 @@ impl View {
             dirty: BTreeSet::new(),
             policy_dirty: BTreeSet::new(),
             absorbed: crate::rows::Seq(0),
+            read_at: crate::rows::Seq(0),
             started,
             read,
             served: ServiceClock::default(),
@@ -268,11 +271,13 @@ impl View {
         }
     }
 
-    /// Takes every row of a snapshot. Ended tasks keep only how they ended.
-    pub fn load(&mut self, rows: &[Row]) -> Result<(), BadRow> {
+    /// Takes every row of a snapshot read at `seq`. Ended tasks keep only how they ended.
+    pub fn load(&mut self, rows: &[Row], seq: crate::rows::Seq) -> Result<(), BadRow> {
         for row in rows {
             self.absorb(&row.key, row.revision, Some(row))?;
         }
+        self.read_at = seq;
+        self.absorbed = self.marks.get("fleet").map_or(crate::rows::Seq(0), |m| m.row.seq);
         self.served = self.clocks.get("fleet").map(|c| c.row).unwrap_or_default();
         self.forget_ended();
         Ok(())
@@ -383,7 +388,9 @@ impl View {
     }
     /// Rules of an area.
     pub fn policy(&self, area: &crate::ids::AreaId) -> AreaPolicy {
-        self.policies.get(area.as_str()).map_or_else(|| AreaPolicy::default_of(area.clone()), |p| p.row.clone())
+        let of_site = || self.site.find_area(area).map(|at| self.site.area(at).policy());
+        let put = self.policies.get(area.as_str()).map(|p| p.row.clone());
+        put.or_else(of_site).unwrap_or_else(|| AreaPolicy::default_of(area.clone()))
     }
 }
 

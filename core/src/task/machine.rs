@@ -297,11 +297,7 @@ fn after_final(facts: &Facts) -> Phase {
 
 /// Where a robot's drop of a running task leads: it stands without anybody having asked for it.
 fn after_drop(facts: &Facts) -> Phase {
-    if facts.begun_repeatable && !facts.opened && facts.drops_left {
-        Phase::RetryWait
-    } else {
-        Phase::NeedsOperator
-    }
+    if facts.begun_repeatable && !facts.opened && facts.drops_left { Phase::RetryWait } else { Phase::NeedsOperator }
 }
 
 /// The table. `None`: the event means nothing there (fenced, duplicate, too late) and is counted, not obeyed.

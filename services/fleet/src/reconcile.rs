@@ -77,8 +77,13 @@ impl Loop {
     async fn rebuild(&mut self) -> Result<(), Error> {
         let snapshot = self.parts.store.snapshot(TABLES).await?;
         let (waits, attached) = (std::mem::take(&mut self.view.waits), std::mem::take(&mut self.view.attached));
-        self.view = View::new(self.parts.site.clone(), self.started, self.parts.clock.now());
-        self.view.load(&snapshot.rows)?;
+        let now = self.parts.clock.now();
+        let served = self.view.serving(&now);
+        self.view = View::new(self.parts.site.clone(), self.started, now);
+        self.view.load(&snapshot.rows, snapshot.seq)?;
+        // The row is as old as the last commit; this process has served on since.
+        self.view.served.site_ms = self.view.served.site_ms.max(served.site_ms);
+        self.view.served.link_ms = self.view.served.link_ms.max(served.link_ms);
         self.view.waits = waits;
         self.view.attached = attached;
         self.seq = self.view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq).min(snapshot.seq);
