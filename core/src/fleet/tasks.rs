@@ -334,7 +334,11 @@ fn kind_of(phase: Phase) -> &'static str {
 /// What goes with entering a phase.
 fn entered(tx: &mut Tx, t: &mut TaskState, was: Phase, news: &News, intake: &TaskIntake) {
     t.retry_at = None;
-    t.reason = news.why.cloned().or_else(|| default_reason(t, news));
+    t.reason = match (t.phase, news.event) {
+        // One robot's refusal is not why nobody does it.
+        (Phase::NeedsOperator | Phase::Failed, Event::Refused) => default_reason(t, news),
+        _ => news.why.cloned().or_else(|| default_reason(t, news)),
+    };
     let waiting = AttemptId { subject: Subject::Task(t.task_id.clone()), epoch: 0 };
     if matches!(was, Phase::Queued | Phase::RetryWait) {
         disarm(tx, TimerKind::RetryDue, &waiting);
@@ -380,6 +384,9 @@ fn default_reason(t: &TaskState, news: &News) -> Option<Reason> {
         _ => return t.reason.clone(),
     };
     let mut reason = Reason::from(code);
+    if let Some(refusal) = news.report.and_then(|r| r.refusal.as_ref()) {
+        reason = reason.with("refusal", refusal.code);
+    }
     if let Some(fault) = fault {
         reason = reason.with("fault_code", fault.code).with("fault", &fault.message);
     }

@@ -86,7 +86,7 @@ impl FleetService {
         })
     }
     /// Runs `look` on the picture and gives its answer.
-    async fn look<T: Send + 'static>(
+    pub async fn look<T: Send + 'static>(
         &self,
         look: impl FnOnce(&View, &Board, &Now) -> T + Send + 'static,
     ) -> Result<T, Refusal> {
