@@ -67,6 +67,8 @@ const SOON_MS: std::ops::Range<u64> = 50..1_000;
 const PATH: &str = "/midshift.link.v1.LinkService/Session";
 
 type Boxed<T> = Pin<Box<dyn Future<Output = T> + Send>>;
+/// The store comes back from each commit.
+type Commit = (Box<dyn Store>, Result<(), store::Error>);
 
 /// An open session.
 struct Open {
@@ -101,7 +103,7 @@ enum Woken {
     Channel(Result<Channel, String>),
     DialNow,
     Greeted(Greeted),
-    Down(Option<v1::SessionResponse>),
+    Down(Option<Box<v1::SessionResponse>>),
 }
 
 /// One agent.
@@ -116,7 +118,7 @@ pub struct Agent {
     rng: rand::rngs::StdRng,
     store: Option<Box<dyn Store>>,
     batch: u64,
-    committing: Option<Boxed<(Box<dyn Store>, Result<(), store::Error>)>>,
+    committing: Option<Boxed<Commit>>,
     pulsed: LinkTime,
     exit: Option<ExitReason>,
 }
@@ -205,7 +207,7 @@ impl Agent {
             (store, done) = ready(committing) => { *committing = None; Woken::Committed(store, done) }
             () = shutdown.cancelled() => Woken::Shutdown,
             woken = progress(way) => { *way = Way::Idle; woken }
-            message = next(open) => Woken::Down(message),
+            message = next(open) => Woken::Down(message.map(Box::new)),
             () = due => Woken::Due,
         }
     }
@@ -337,13 +339,13 @@ impl Agent {
         }
     }
 
-    fn heard(&mut self, message: Option<v1::SessionResponse>) {
+    fn heard(&mut self, message: Option<Box<v1::SessionResponse>>) {
         let Some(message) = message else { return self.lost("the stream ended") };
         let now = self.clock.now().link;
         if let Some(open) = &mut self.open {
             open.heard = now;
         }
-        match parse(message) {
+        match parse(*message) {
             Ok(ToRobot::Downlink(down)) => self.step(Input::Down(down)),
             Ok(ToRobot::Close(close)) => self.closed(&close),
             Ok(ToRobot::MoveOver { .. }) => {

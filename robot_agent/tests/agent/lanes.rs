@@ -81,7 +81,7 @@ async fn an_overflow_thins_old_status_with_a_gap_and_nothing_else(open: impl Asy
     let status = bench.ring().lane(Lane::Status);
     assert!(status.samples.len() <= limits::RING_STATUS_MAX);
     let gap = Gap { lane: Lane::Status, from_seq: 1, to_seq: status.samples[0].seq - 1, reason: Code::Overflow.into() };
-    assert_eq!(status.gaps, [gap.clone()]);
+    assert_eq!(status.gaps, std::slice::from_ref(&gap));
     assert_eq!(bench.ring().after(Lane::Status, 0), Some(Item::Gap(gap)));
     assert_eq!(bench.ring().lane(Lane::Critical).samples.len(), 1);
     assert_eq!(status.produced, 2 * limits::RING_STATUS_MAX as u64);

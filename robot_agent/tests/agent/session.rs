@@ -1,1 +1,326 @@
+//! The shell against a server that the test plays, over pipes in memory and on tokio's paused clock.
 
+use crate::rig::{TestBody, attempt, goto, point, waypoint, welcome};
+use async_trait::async_trait;
+use hyper_util::rt::TokioIo;
+use midshift_agent::body::BodyNews;
+use midshift_agent::bugs::Bugs;
+use midshift_agent::core::ExitReason;
+use midshift_agent::dial::{self, Cut, Dial};
+use midshift_agent::memory::MemoryStore;
+use midshift_agent::session::{AgentConfig, Error, run};
+use midshift_agent::sqlite::SqliteStore;
+use midshift_agent::store::Store;
+use midshift_core::authority::Authority;
+use midshift_core::ids::RobotId;
+use midshift_core::reason::Code;
+use midshift_core::robot::{Lane, Mode};
+use midshift_core::time::{Clock, ScaledClock, Utc};
+use midshift_core::work::{Assignment, DesiredWork, InboxItem, RobotEvent, SampleBody, WorkState};
+use midshift_proto::convert::parse;
+use midshift_proto::link::v1;
+use midshift_proto::link::v1::link_service_server::{LinkService, LinkServiceServer};
+use midshift_proto::session::{
+    ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Hello, ToRobot, Uplink, Welcome,
+};
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::io::DuplexStream;
+use tokio::sync::{mpsc, watch};
+use tokio::task::JoinHandle;
+use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::sync::CancellationToken;
+use tonic::transport::{Channel, Server, Uri};
+use tonic::{Request, Response, Status, Streaming};
+
+type Down = mpsc::Sender<Result<v1::SessionResponse, Status>>;
+
+/// One session as the server has it.
+struct Seen {
+    up: Streaming<v1::SessionRequest>,
+    down: Down,
+}
+
+impl Seen {
+    async fn next(&mut self) -> Option<FromRobot> {
+        let message = self.up.message().await.ok()??;
+        Some(parse(message).expect("what a robot says can be read"))
+    }
+    async fn hello(&mut self) -> Hello {
+        match self.next().await {
+            Some(FromRobot::Hello(hello)) => *hello,
+            other => panic!("no hello: {other:?}"),
+        }
+    }
+    async fn uplink(&mut self) -> Uplink {
+        match self.next().await {
+            Some(FromRobot::Uplink(uplink)) => uplink,
+            other => panic!("no uplink: {other:?}"),
+        }
+    }
+    /// The next heartbeat, answered.
+    async fn beat(&mut self) -> u64 {
+        loop {
+            if let Some(heartbeat) = self.uplink().await.heartbeat {
+                let hb = heartbeat.reported.hb;
+                let echo = Some(Echo { hb, clock: ClockSample::default() });
+                self.say(ToRobot::Downlink(Box::new(Downlink { echo, ..Downlink::default() }))).await;
+                return hb;
+            }
+        }
+    }
+    /// The next event.
+    async fn event(&mut self) -> RobotEvent {
+        loop {
+            for item in self.uplink().await.batches.into_iter().filter(|b| b.lane == Lane::Event).flat_map(|b| b.items)
+            {
+                if let InboxItem::Sample(sample) = item
+                    && let SampleBody::Event(event) = sample.body
+                {
+                    return event;
+                }
+            }
+        }
+    }
+    async fn say(&self, message: ToRobot) {
+        self.down.send(Ok(v1::SessionResponse::from(&message))).await.expect("the robot listens");
+    }
+    async fn welcome(&self, session_epoch: u64) {
+        self.say(ToRobot::Welcome(Welcome { session_epoch, session_secret: format!("s{session_epoch}"), ..welcome() }))
+            .await;
+    }
+    async fn close(&self, code: CloseCode) {
+        self.say(ToRobot::Close(Close { code, reason: Code::Fenced.into(), retry_after_ms: 0 })).await;
+    }
+}
+
+struct Desk(mpsc::Sender<Seen>);
+
+#[async_trait]
+impl LinkService for Desk {
+    type SessionStream = ReceiverStream<Result<v1::SessionResponse, Status>>;
+    async fn session(
+        &self,
+        request: Request<Streaming<v1::SessionRequest>>,
+    ) -> Result<Response<Self::SessionStream>, Status> {
+        let (down, queue) = mpsc::channel(16);
+        let seen = Seen { up: request.into_inner(), down };
+        self.0.send(seen).await.map_err(|_| Status::unavailable("the test is over"))?;
+        Ok(Response::new(ReceiverStream::new(queue)))
+    }
+}
+
+/// Pipes instead of a network.
+struct Pipes {
+    ends: mpsc::Sender<Result<DuplexStream, std::io::Error>>,
+    network: watch::Receiver<bool>,
+}
+
+#[async_trait]
+impl Dial for Pipes {
+    async fn dial(&self) -> Result<Channel, dial::Error> {
+        let (ends, network) = (self.ends.clone(), self.network.clone());
+        let connect = tower::service_fn(move |_: Uri| {
+            let (ends, network) = (ends.clone(), network.clone());
+            async move {
+                let mut up = network.clone();
+                up.wait_for(|up| *up).await.map_err(std::io::Error::other)?;
+                let (near, far) = tokio::io::duplex(64 * 1024);
+                ends.send(Ok(far)).await.map_err(std::io::Error::other)?;
+                Ok::<_, std::io::Error>(TokioIo::new(Cut::new(near, Some(network))))
+            }
+        });
+        let endpoint = dial::endpoint("http://server")?;
+        endpoint.connect_with_connector(connect).await.map_err(|e| dial::Error(e.into()))
+    }
+}
+
+/// A robot at work and the desk of its server.
+struct Bench {
+    sessions: mpsc::Receiver<Seen>,
+    network: watch::Sender<bool>,
+    body: TestBody,
+    shutdown: CancellationToken,
+    agent: JoinHandle<Result<ExitReason, Error>>,
+}
+
+impl Bench {
+    fn new(store: Box<dyn Store>) -> Self {
+        let (ends, incoming) = mpsc::channel(4);
+        let (seen, sessions) = mpsc::channel(4);
+        let (network, up) = watch::channel(true);
+        let incoming = ReceiverStream::new(incoming);
+        tokio::spawn(Server::builder().add_service(LinkServiceServer::new(Desk(seen))).serve_with_incoming(incoming));
+        let config = AgentConfig {
+            robot_id: RobotId::parse("rbt-01").expect("a name"),
+            boot_id: "boot-1".into(),
+            new_ring_id: "ring-1".into(),
+            seed: 7,
+            bugs: Bugs::default(),
+            pulse: None,
+        };
+        let start = tokio::time::Instant::now();
+        let micros = move || start.elapsed().as_micros() as u64;
+        let clock: Arc<dyn Clock> = Arc::new(ScaledClock::new(micros, Utc(1_700_000_000_000), 1_000));
+        let (body, shutdown) = (TestBody::at("A"), CancellationToken::new());
+        let dial = Arc::new(Pipes { ends, network: up });
+        let agent = tokio::spawn(run(config, Box::new(body.clone()), store, clock, dial, shutdown.clone()));
+        Self { sessions, network, body, shutdown, agent }
+    }
+    async fn session(&mut self) -> Seen {
+        self.sessions.recv().await.expect("the robot dials")
+    }
+    async fn end(self) -> ExitReason {
+        self.shutdown.cancel();
+        self.agent.await.expect("no panic").expect("no error")
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_says_hello_beats_each_second_and_proves_its_succession_after_a_break() {
+    let mut bench = Bench::new(Box::new(MemoryStore::new()));
+    let mut first = bench.session().await;
+    let hello = first.hello().await;
+    assert_eq!((hello.robot_id.as_str(), hello.ring.as_str(), hello.previous), ("rbt-01", "ring-1", None));
+    first.welcome(5).await;
+    let begin = tokio::time::Instant::now();
+    for hb in 1..=4 {
+        assert_eq!(first.beat().await, hb);
+    }
+    let seconds = begin.elapsed().as_secs_f64();
+    assert!((2.5..3.5).contains(&seconds), "four beats take three seconds of the clock, not {seconds}");
+    drop(first);
+    let mut second = bench.session().await;
+    let previous = second.hello().await.previous.expect("a proof");
+    assert_eq!((previous.session_epoch, previous.secret.as_str()), (5, "s5"));
+    second.welcome(6).await;
+    assert_eq!(second.beat().await, 1);
+    assert_eq!(bench.end().await, ExitReason::Shutdown);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_is_fenced_twice_ends() {
+    let mut bench = Bench::new(Box::new(MemoryStore::new()));
+    let begin = tokio::time::Instant::now();
+    for epoch in [5, 6] {
+        let mut session = bench.session().await;
+        session.hello().await;
+        session.welcome(epoch).await;
+        session.beat().await;
+        session.close(CloseCode::Fenced).await;
+    }
+    assert_eq!(bench.agent.await.expect("no panic").expect("no error"), ExitReason::FencedTwice);
+    assert!(begin.elapsed() >= Duration::from_secs(60), "it came back at once");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_server_that_falls_silent_is_given_up_and_dialed_again() {
+    let mut bench = Bench::new(Box::new(MemoryStore::new()));
+    let mut first = bench.session().await;
+    first.hello().await;
+    first.welcome(5).await;
+    first.beat().await;
+    let begin = tokio::time::Instant::now();
+    let mut second = bench.session().await;
+    let waited = begin.elapsed().as_secs();
+    assert!((10..25).contains(&waited), "{waited} s");
+    assert!(second.hello().await.previous.is_some());
+    bench.end().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn asked_to_move_over_it_opens_the_next_session_before_the_old_one_closes() {
+    let mut bench = Bench::new(Box::new(MemoryStore::new()));
+    let mut old = bench.session().await;
+    old.hello().await;
+    old.welcome(5).await;
+    old.beat().await;
+    old.say(ToRobot::MoveOver { within_ms: 30_000 }).await;
+    let mut next = bench.session().await;
+    next.hello().await;
+    // Meanwhile the old one lives.
+    old.beat().await;
+    // The server closes the old one as fenced before it welcomes the new one: that is no clone.
+    old.close(CloseCode::Fenced).await;
+    next.welcome(6).await;
+    assert_eq!(next.beat().await, 1);
+    assert!(!bench.agent.is_finished());
+    bench.end().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn over_a_cut_network_nothing_passes_and_afterwards_what_happened_is_told() {
+    let mut bench = Bench::new(Box::new(MemoryStore::new()));
+    let mut first = bench.session().await;
+    first.hello().await;
+    first.welcome(5).await;
+    first.beat().await;
+    bench.network.send(false).expect("the robot looks");
+    bench.body.says(BodyNews::Mode(Mode::Manual));
+    let nothing = tokio::time::timeout(Duration::from_secs(20), async {
+        loop {
+            if let Some(FromRobot::Uplink(uplink)) = first.next().await {
+                assert_eq!(uplink.batches, [], "nothing of the cut arrives");
+            } else {
+                std::future::pending::<()>().await;
+            }
+        }
+    });
+    assert!(nothing.await.is_err());
+    assert!(bench.sessions.try_recv().is_err(), "nobody dials over a cut network");
+    bench.network.send(true).expect("the robot looks");
+    let mut second = bench.session().await;
+    second.hello().await;
+    second.welcome(6).await;
+    assert_eq!(second.event().await, RobotEvent::Mode(Mode::Manual));
+    bench.end().await;
+}
+
+#[tokio::test]
+async fn a_robot_on_its_file_takes_work_over_the_wire_and_does_it() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let path = dir.path().join("robot.db");
+    let mut bench = Bench::new(Box::new(SqliteStore::open(&path).await.expect("opens")));
+    let mut session = bench.session().await;
+    session.hello().await;
+    session.welcome(5).await;
+    let hb = session.beat().await;
+    let route = vec![point("A", None, false, &[]), point("B", Some(0), false, &[])];
+    let assignment = Assignment {
+        attempt: attempt("T1", 1),
+        offer: Authority { session_epoch: 5, hb, valid_ms: 5_000 },
+        timeout_ms: 60_000,
+        steps: vec![goto("B")],
+        from_step: 0,
+        resume_step: 0,
+        route_number: 1,
+        route,
+        released_index: Some(1),
+        stop: false,
+        suspend: false,
+        speed_limit_mm_s: None,
+    };
+    let work = DesiredWork {
+        robot_id: RobotId::parse("rbt-01").expect("a name"),
+        generation: 1,
+        assignment: Some(assignment),
+        grants: Vec::new(),
+        held: false,
+        resume: None,
+        closed: Vec::new(),
+    };
+    session.say(ToRobot::Downlink(Box::new(Downlink { work: Some(work), ..Downlink::default() }))).await;
+    let mut states = Vec::new();
+    while states.last() != Some(&WorkState::Succeeded) {
+        let RobotEvent::Attempt(report) = session.event().await else { continue };
+        states.push(report.state);
+        if report.state == WorkState::Navigating {
+            bench.body.reach();
+        }
+    }
+    assert_eq!(states, [WorkState::Accepted, WorkState::Navigating, WorkState::Succeeded]);
+    assert_eq!(bench.body.log().waypoint, Some(waypoint("B")));
+    bench.end().await;
+    let kept = SqliteStore::open(&path).await.expect("opens").load("other").await.expect("loads");
+    assert!(kept.ledger.finished(&attempt("T1", 1).subject).is_some());
+}
