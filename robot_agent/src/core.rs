@@ -119,6 +119,7 @@ pub struct AgentCore {
     pub(crate) stale_told: BTreeSet<(u64, u64, u64)>,
     pub(crate) last_site: SiteTime,
     pub(crate) wake_link: Option<LinkTime>,
+    pub(crate) authority: LinkDuration,
     session: Option<Session>,
     sender: Sender,
     throttle: Throttle,
@@ -168,6 +169,7 @@ impl AgentCore {
             stale_told: BTreeSet::new(),
             last_site: now.site,
             wake_link: None,
+            authority: limits::AUTHORITY,
             session: None,
             writes: Writes::default(),
             standing_fault: None,
@@ -342,6 +344,8 @@ impl AgentCore {
         self.sender.connected(&self.kept.ring, welcome.status_credit_bytes as usize);
         welcome.acks.iter().for_each(|ack| self.expected(ack));
         self.period = LinkDuration(u64::from(welcome.heartbeat_period_ms).clamp(100, limits::AUTHORITY.as_ms() / 3));
+        // The server may give less; more than both ends were built for it cannot give.
+        self.authority = LinkDuration(u64::from(welcome.authority_ms).min(limits::AUTHORITY.as_ms()));
         self.status_period = SiteDuration(u64::from(welcome.status_period_ms).max(100));
         self.next_beat = now.link;
         self.clock = None;

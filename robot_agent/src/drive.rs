@@ -166,14 +166,20 @@ impl AgentCore {
         let events = self.places.reached(point, next);
         events.into_iter().for_each(|e| self.emit(Lane::Event, e));
         let Some(next) = next.filter(|_| drives_on) else { return };
-        if let Some(blocked) = self.blocked_at(now, next) {
-            self.tell_stale_grant(blocked);
+        let late = self.blocked_at(now, next);
+        if late == Some(Entry::Missing) {
             self.body.stop(now.site, StopLevel::Halt);
             if let Some(work) = &mut self.work {
                 work.doing = Doing::Nothing;
                 work.path.clear();
             }
             return;
+        }
+        if let Some(stale) = late {
+            // It passed the point in the very moment in which its permission ended: it is in, and says so.
+            self.tell_stale_grant(stale);
+            let events = self.places.entered_late(next);
+            events.into_iter().for_each(|e| self.emit(Lane::Event, e));
         }
         let events = self.places.enter(next, &self.sent, now.link);
         events.into_iter().for_each(|e| self.emit(Lane::Event, e));

@@ -163,6 +163,20 @@ impl Places {
         events
     }
 
+    /// The robot is on the lane to `point` although a permission for it has just ended: what it was sent into, it is in.
+    pub fn entered_late(&mut self, point: &RoutePoint) -> Vec<RobotEvent> {
+        let mut events = Vec::new();
+        for place_id in needs(point) {
+            if let Some(grant_id) = self.row.committed.remove(place_id)
+                && !self.row.inside.contains_key(place_id)
+            {
+                self.row.inside.insert(place_id.clone(), grant_id);
+                events.push(event(place_id, grant_id, PlaceNews::Entered));
+            }
+        }
+        events
+    }
+
     /// The robot reached `point`; `next` is the one behind it on the route. It is out of everything else.
     pub fn reached(&mut self, point: &RoutePoint, next: Option<&RoutePoint>) -> Vec<RobotEvent> {
         let stays = |place: &PlaceId| {

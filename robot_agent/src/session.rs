@@ -176,7 +176,10 @@ impl Agent {
                 Woken::Due => self.due(),
                 Woken::Shutdown => self.exit = Some(ExitReason::Shutdown),
                 Woken::Committed(store, done) => {
-                    done?;
+                    if let Err(error) = done {
+                        self.core.halt(self.clock.now());
+                        return Err(error.into());
+                    }
                     self.store = Some(store);
                     self.step(Input::Persisted(self.batch));
                 }

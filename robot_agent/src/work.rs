@@ -138,9 +138,14 @@ impl AgentCore {
         self.resume_needed || self.desired.as_ref().is_some_and(|d| d.held)
     }
 
+    /// Until when it may go on with an attempt: from the sending of the newest heartbeat that was echoed.
+    fn lease_until(&self) -> Option<LinkTime> {
+        self.sent.lease_from().map(|from| from + self.authority)
+    }
+
     fn has_lease(&self, now: &Now) -> bool {
         let echoed = self.echo_after.is_none_or(|after| self.sent.lease_from().is_some_and(|from| from >= after));
-        echoed && !self.is_observed() && self.sent.lease_until().is_some_and(|until| now.link <= until)
+        echoed && !self.is_observed() && self.lease_until().is_some_and(|until| now.link <= until)
     }
 
     pub(crate) fn wake_at(&mut self, link: LinkTime) {
@@ -263,7 +268,7 @@ impl AgentCore {
             self.take_news(now);
         }
         if self.work.is_some()
-            && let Some(until) = self.sent.lease_until().filter(|until| *until >= now.link)
+            && let Some(until) = self.lease_until().filter(|until| *until >= now.link)
         {
             self.wake_at(until + midshift_core::time::LinkDuration(1));
         }
