@@ -63,7 +63,7 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
     let mut recalled = errands::stopping(view);
     for task_id in queue.into_iter().take(TASKS_PER_CYCLE) {
         let Some((task, intake)) = view.task(&task_id).cloned().zip(view.intake(&task_id).cloned()) else { continue };
-        match screen::task(view, &task, &intake, &now) {
+        match screen::task(view, board, &task, &intake, &now) {
             Err(reason) if reason.code == Code::DependencyFailed => {
                 plan.decide(view, now, "fleet", |tx| {
                     happen(tx, &task_id, News::of(Event::ScheduleToStart, Some(&reason)));

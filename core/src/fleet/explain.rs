@@ -67,7 +67,7 @@ pub fn task(view: &View, board: &Board, now: &Now, task_id: &TaskId) -> Option<T
     });
     let eligible = candidates.iter().any(|c| c.reason.is_none());
     candidates.truncate(CANDIDATES_MAX);
-    let own = screen::task(view, task, intake, now).err().filter(|_| waits);
+    let own = screen::task(view, board, task, intake, now).err().filter(|_| waits);
     let verdict = match (own, waits, eligible, task.phase) {
         (Some(reason), ..) => Some(reason),
         (None, true, false, _) => Some(Code::WaitingForRobot.into()),
@@ -113,7 +113,7 @@ pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Optio
     let candidates = assign::queue(view, now).into_iter().take(CANDIDATES_MAX).filter_map(|task_id| {
         let task = view.task(&task_id)?;
         let intake = view.intake(&task_id)?;
-        let reason = screen::task(view, task, intake, now)
+        let reason = screen::task(view, board, task, intake, now)
             .and_then(|()| screen::pair(view, board, robot_id, task, intake))
             .err();
         let goal = intake

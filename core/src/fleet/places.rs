@@ -194,6 +194,7 @@ fn serve(tx: &mut Tx, robot_id: &RobotId, releases: &mut Releases, blocked: &mut
     }
     let names = needed.iter().map(|p| tx.view.site.place(*p).place_id.clone()).collect();
     let now = tx.now.site;
+    tx.view.place_waits += u64::from(!tx.view.waits.contains_key(robot_id));
     let since = tx.view.waits.entry(robot_id.clone()).or_insert(Waiting { places: Vec::new(), since: now }).since;
     tx.view.waits.insert(robot_id.clone(), Waiting { places: names, since });
     if !step_aside(tx, &a, &work, since, releases, blocked) {

@@ -25,7 +25,7 @@ pub fn presence(board: &Board, robot_id: &RobotId, now: &Now) -> Presence {
 }
 
 /// Whether the robot may still have authority to go on.
-fn lease_stands(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> bool {
+pub fn lease_stands(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> bool {
     let renewed = board.get(robot_id).map_or(view.started.link, |l| l.processed_at.max(view.started.link));
     now.link.since(renewed) <= limits::LEASE
 }
@@ -158,13 +158,22 @@ fn stalled(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
     let Some(task_id) = tx.view.held_by(robot_id).and_then(|a| a.subject.task_id().cloned()) else { return };
     let Some(task) = tx.view.task(&task_id) else { return };
     let Some(intake) = tx.view.intake(&task_id) else { return };
-    let quiet = tx.now.site.since(live.progress_at.max(tx.view.started.site)).as_ms();
+    let uncertain = tx.view.held_by(robot_id).and_then(|a| tx.view.attempt(a)).is_some_and(|a| a.uncertain.is_some());
     let accepted = tx.view.held_by(robot_id).and_then(|a| tx.view.attempt(a)).and_then(|a| a.accepted);
     let young = accepted.is_none_or(|at| tx.now.utc.ms_since(at) <= intake.spec.stall_ms);
     let excused = places::waits(tx.view, robot_id)
         || live.report.mode != Mode::Automatic
-        || live.report.hardware_stop != HardwareStop::None;
-    if task.phase == Phase::Running && quiet > intake.spec.stall_ms && !young && !excused {
+        || live.report.hardware_stop != HardwareStop::None
+        || task.phase != Phase::Running
+        || uncertain;
+    let stall_ms = intake.spec.stall_ms;
+    if excused {
+        tx.view.excused.insert(robot_id.clone(), tx.now.site);
+        return;
+    }
+    let excused_at = tx.view.excused.get(robot_id).copied().unwrap_or_default();
+    let quiet = tx.now.site.since(live.progress_at.max(tx.view.started.site).max(excused_at)).as_ms();
+    if quiet > stall_ms && !young {
         let why = Reason::from(Code::Stalled).with("quiet_ms", quiet);
         happen(tx, &task_id, News::of(Event::Stall, Some(&why)));
     }

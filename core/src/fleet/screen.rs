@@ -165,11 +165,18 @@ fn energy(view: &View, live: &Live, task: &TaskState, intake: &TaskIntake) -> Re
 }
 
 /// Whether the task may be offered now, whatever the robots.
-pub fn task(view: &View, task: &TaskState, intake: &TaskIntake, now: &Now) -> Result<(), Reason> {
+pub fn task(view: &View, board: &Board, task: &TaskState, intake: &TaskIntake, now: &Now) -> Result<(), Reason> {
     match task.phase {
         Phase::Queued => {}
         Phase::RetryWait => return Err(Code::WaitingForRetry.into()),
         _ => return Err(Code::NotAllowedNow.into()),
+    }
+    if let Some(robot_id) = &task.robot_id
+        && view.held_by(robot_id) == task.attempt_id().as_ref()
+        && task.epoch > 0
+        && repair::lease_stands(view, board, robot_id, now)
+    {
+        return Err(Reason::from(Code::RobotReconciling).with("robot_id", robot_id));
     }
     if intake.spec.not_before.is_some_and(|t| t > now.utc) {
         return Err(Code::WaitingForTime.into());

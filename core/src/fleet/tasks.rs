@@ -271,9 +271,12 @@ pub fn places_of(tx: &Tx, robot_id: &RobotId) -> Vec<String> {
 }
 
 fn move_task(tx: &mut Tx, mut t: TaskState, a: Option<&Attempt>, step: Next, news: &News, intake: &TaskIntake) {
-    let was = t.phase;
+    let (was, wished, wanted) = (t.phase, t.then, t.reason.clone());
     t.phase = step.phase;
     t.then = step.then;
+    if t.then.is_some() && t.then != wished && t.phase == was {
+        t.reason = news.why.cloned().or(t.reason);
+    }
     t.changed = tx.now.utc;
     if let Some(report) = news.report {
         t.next_step = t.next_step.max(report.step_index);
@@ -292,6 +295,11 @@ fn move_task(tx: &mut Tx, mut t: TaskState, a: Option<&Attempt>, step: Next, new
     }
     if t.phase != was {
         entered(tx, &mut t, was, news, intake);
+    }
+    let confirmed = matches!(news.event, Event::StopConfirmed | Event::Refused | Event::FailedRecoverable);
+    if wished.is_some() && confirmed && (t.phase.is_terminal() || t.phase == Phase::NeedsOperator) {
+        // Why it was to stop, not that it did.
+        t.reason = wanted.or(t.reason);
     }
     hold_timer(tx, &t, was);
     tx.put(t, kind_of(step.phase));
@@ -347,6 +355,9 @@ fn entered(tx: &mut Tx, t: &mut TaskState, was: Phase, news: &News, intake: &Tas
         Phase::Queued => {
             t.queued_since = tx.now.utc;
             t.reason = None;
+            if !tx.view.timers.contains_key(&Timer::id_of(TimerKind::ScheduleToStart, &waiting)) {
+                arm(tx, TimerKind::ScheduleToStart, &waiting, intake.spec.schedule_to_start_ms);
+            }
             if was == Phase::NeedsOperator {
                 t.failures = 0;
                 t.refusals_in_row = 0;

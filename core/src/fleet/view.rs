@@ -99,6 +99,10 @@ pub struct View {
     pub served: ServiceClock,
     /// Since when a robot waits for a place it cannot have, site clock. Volatile.
     pub waits: BTreeMap<RobotId, super::places::Waiting>,
+    /// How often a robot began to wait for a place. Volatile.
+    pub place_waits: u64,
+    /// When a robot last had a reason to stand still (held, waiting for a place, not known), site clock: a stall counts from then. Volatile.
+    pub excused: BTreeMap<RobotId, crate::time::SiteTime>,
     /// Time in which robots were heard since it was last counted. Volatile.
     pub attached: BTreeMap<RobotId, Attached>,
     /// Distances and routes, remembered.
@@ -267,7 +271,9 @@ impl View {
             read,
             served: ServiceClock::default(),
             waits: BTreeMap::new(),
+            excused: BTreeMap::new(),
             attached: BTreeMap::new(),
+            place_waits: 0,
         }
     }
 

@@ -79,6 +79,14 @@ impl FleetService {
         FleetServiceServer::new(self.clone())
     }
 
+    /// How often a robot began to wait for a place since the start.
+    ///
+    /// # Errors
+    /// If the reconciler does not run.
+    pub async fn place_waits(&self) -> Result<u64, Refusal> {
+        self.look(|view, _, _| view.place_waits).await
+    }
+
     async fn send(&self, request: Request) -> Result<(), Refusal> {
         self.requests.try_send(request).map_err(|e| match e {
             mpsc::error::TrySendError::Full(_) => Refusal::new(Kind::Exhausted, Code::Overloaded),

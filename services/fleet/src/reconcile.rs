@@ -76,7 +76,9 @@ impl Loop {
     /// Builds the picture from nothing and takes what was not consumed yet.
     async fn rebuild(&mut self) -> Result<(), Error> {
         let snapshot = self.parts.store.snapshot(TABLES).await?;
+        let place_waits = self.view.place_waits;
         let (waits, attached) = (std::mem::take(&mut self.view.waits), std::mem::take(&mut self.view.attached));
+        let excused = std::mem::take(&mut self.view.excused);
         let now = self.parts.clock.now();
         let served = self.view.serving(&now);
         self.view = View::new(self.parts.site.clone(), self.started, now);
@@ -86,6 +88,8 @@ impl Loop {
         self.view.served.link_ms = self.view.served.link_ms.max(served.link_ms);
         self.view.waits = waits;
         self.view.attached = attached;
+        self.view.excused = excused;
+        self.view.place_waits = place_waits;
         self.seq = self.view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq).min(snapshot.seq);
         let mut plan = Plan::default();
         found(&mut self.view, self.parts.clock.now(), &self.parts.site_text, &mut plan);

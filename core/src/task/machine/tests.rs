@@ -196,7 +196,11 @@ fn what_the_golden_list_does_not_name_is_no_transition() {
         for event in Event::ALL {
             let key = (listed_as(at), snake(&format!("{event:?}")));
             let moves = all_facts().any(|facts| next(at, event, &facts).is_some());
-            assert_eq!(moves, listed.get(&key).copied().unwrap_or(false), "{} {}", shown(at), key.1);
+            // A stop ends the wait for a start only if it is there because nobody took the offer.
+            let other_stop = (at.uncertain || at.phase == Phase::Stopping) && at.then != Some(Then::Requeue);
+            let named = listed.get(&key).copied().unwrap_or(false);
+            let named = named && !(event == Event::ScheduleToStart && other_stop);
+            assert_eq!(moves, named, "{} {}", shown(at), key.1);
         }
     }
 }

@@ -1,1 +1,137 @@
-//! Scenarios.
+//! Places: who waits, who goes, and what a reconnect does to a permission.
+
+use crate::harness::World;
+use midshift_core::fleet::rows::HolderState;
+use midshift_core::site::{CORRIDOR, DEMO};
+use midshift_core::task::Phase;
+use midshift_proto::fleet::v1;
+use midshift_proto::fleet::v1::fleet_service_server::FleetService;
+use tonic::Request;
+
+#[tokio::test(start_paused = true)]
+async fn the_second_robot_waits_before_an_exclusive_passage_and_goes_when_the_first_has_left() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.robot("r2", "park-b").await;
+    w.submit_with("T1", "A", "B", |raw| {
+        raw.robot_id = "r1".to_owned();
+        raw.stall_ms = Some(3_600_000);
+    })
+    .await;
+    w.until("r1 has the corridor", |s| s.has("r1", "corridor")).await;
+    w.r("r1").drives = false;
+    w.submit_with("T2", "B", "A", |raw| raw.robot_id = "r2".to_owned()).await;
+    w.until("r2 stands before it", |s| s.has("r2", "wait-b") || s.has("r2", "B")).await;
+    w.pass_while(100, "one robot at a time", |s| s.has("r1", "corridor") && !s.has("r2", "corridor")).await;
+    let waits = v1::ListPlacesRequest { in_use: true, ..Default::default() };
+    let listed = w.fleet.list_places(Request::new(waits)).await.expect("places").into_inner().places;
+    let corridor = listed.iter().find(|p| p.place_id == "corridor").expect("the corridor");
+    assert!(!corridor.holders.is_empty() && format!("{corridor:?}").contains("r2"), "{corridor:?}");
+    w.r("r1").drives = true;
+    w.until("r1 has left", |s| !s.has("r1", "corridor")).await;
+    w.until("r2 has it", |s| s.has("r2", "corridor")).await;
+    w.until_phase("T2", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_permission_to_enter_is_anchored_again_after_a_reconnect() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").drives = false;
+    w.submit("T1", "A", "B").await;
+    let seen = w.until("A is granted", |s| s.has("r1", "A")).await;
+    let entry = |s: &crate::harness::Seen| {
+        s.work("r1").grants.into_iter().find(|g| g.place_id.as_str() == "A").and_then(|g| g.entry)
+    };
+    let first = entry(&seen).expect("an entry");
+    let grant_id = seen.place("A").holders[0].grant_id;
+    w.r("r1").cut();
+    w.pass(5).await;
+    w.r("r1").mend();
+    w.connect("r1").await;
+    let session = w.r("r1").session_epoch();
+    assert!(session > first.session_epoch);
+    let seen = w.until("anchored anew", |s| entry(s).is_some_and(|e| e.session_epoch == session)).await;
+    assert_eq!(seen.place("A").holders[0].grant_id, grant_id, "the same grant");
+    w.r("r1").drives = true;
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_permission_that_is_not_used_stays_fresh() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").drives = false;
+    w.submit_with("T1", "A", "B", |raw| raw.stall_ms = Some(3_600_000)).await;
+    let entry = |s: &crate::harness::Seen| {
+        s.work("r1").grants.into_iter().find(|g| g.place_id.as_str() == "A").and_then(|g| g.entry)
+    };
+    let first = entry(&w.until("A is granted", |s| s.has("r1", "A")).await).expect("an entry");
+    w.pass(60).await;
+    let now = entry(&w.seen().await).expect("an entry");
+    assert!(now.hb > first.hb + 40, "{first:?} {now:?}");
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_place_nobody_reports_is_cleared_by_a_person_and_not_while_a_heard_robot_stands_in_it() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").works = false;
+    w.submit("T1", "A", "B").await;
+    w.until("it stands in A", |s| s.holders("A") == [("r1".to_owned(), HolderState::Inside)]).await;
+    let clear = |etag: String| v1::ClearPlaceRequest {
+        place_id: "A".to_owned(),
+        reason: "I looked".to_owned(),
+        etag,
+        ..Default::default()
+    };
+    let etag = |w: &World| {
+        let fleet = w.fleet.clone();
+        async move {
+            let listed = fleet.list_places(Request::new(v1::ListPlacesRequest::default())).await.expect("places");
+            listed.into_inner().places.into_iter().find(|p| p.place_id == "A").expect("A").etag
+        }
+    };
+    let seen = etag(&w).await;
+    let refused = w.fleet.clear_place(Request::new(clear(seen))).await.expect_err("a robot stands in it");
+    assert_eq!(refused.code(), tonic::Code::FailedPrecondition);
+    w.r("r1").cut();
+    w.until("nobody knows", |s| s.is_uncertain("T1")).await;
+    let seen = etag(&w).await;
+    w.fleet.clear_place(Request::new(clear(seen))).await.expect("a person may");
+    assert!(w.seen().await.holders("A").is_empty());
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn robots_that_stand_in_each_others_goals_step_aside_and_both_arrive() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "A").await;
+    w.robot("r2", "B").await;
+    w.pass(2).await;
+    w.submit_with("T1", "A", "B", |raw| raw.robot_id = "r1".to_owned()).await;
+    w.submit_with("T2", "B", "A", |raw| raw.robot_id = "r2".to_owned()).await;
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.until_phase("T2", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn ten_robots_on_the_demo_floor_all_get_their_work_done() {
+    let mut w = World::on(DEMO).await;
+    let stands = ["park-1", "park-1", "park-2", "park-2", "park-3", "park-3", "park-4", "park-4", "hold-a", "hold-b"];
+    for (n, at) in stands.iter().enumerate() {
+        w.robot(&format!("r{n}"), at).await;
+    }
+    let goals = ["D01", "A01", "L1-in", "C01", "B03", "Q01", "P02", "D03", "L2-out", "A02"];
+    for n in 0..40 {
+        w.submit(&format!("T{n}"), goals[n % 10], goals[(n * 3 + 1) % 10]).await;
+    }
+    for n in 0..40 {
+        w.until_phase(&format!("T{n}"), Phase::Succeeded).await;
+    }
+    w.lawful().await;
+}
