@@ -46,6 +46,21 @@ impl AgentCore {
         self.set_out(now, &order.route[next], path)
     }
 
+    /// Cuts the path under way to what may still be driven; never lengthens it.
+    pub(crate) fn shorten(&mut self, now: &Now, pause: Pause) {
+        let Some(work) = self.work.as_ref().filter(|w| w.located) else { return };
+        let Some(order) = work.order.clone() else { return };
+        let (next, length) = (work.reached.map_or(0, |i| i + 1), work.path.len());
+        let Some(limit) = self.drive_limit(now, &order, next, order.route.len() - 1, pause) else { return };
+        let keep = limit + 1 - next;
+        let Some(work) = self.work.as_mut().filter(|_| keep < length) else { return };
+        work.path.truncate(keep);
+        let path = BodyOrder::Drive(work.path.clone());
+        if let Err(fault) = self.body.start(now.site, path) {
+            self.step_failed(now, fault);
+        }
+    }
+
     fn at_goal(&self, now: &Now, order: &Assignment, goal: Option<usize>, reached: Option<usize>) -> bool {
         if goal.is_some() {
             return goal == reached;

@@ -177,15 +177,15 @@ impl Places {
         events
     }
 
-    /// The robot reached `point`; `next` is the one behind it on the route. It is out of everything else.
+    /// The robot reached `point`; `next` is the one behind it on the route. It is out of everything that neither of
+    /// them needs.
     pub fn reached(&mut self, point: &RoutePoint, next: Option<&RoutePoint>) -> Vec<RobotEvent> {
         let stays = |place: &PlaceId| {
-            let standing = point.standing.as_ref() == Some(place);
             let goes_on = match next {
-                Some(next) => next.passages.contains(place),
-                None => point.standing.is_none(),
+                Some(next) => needs(next).any(|p| p == place),
+                None => point.standing.is_none() && point.passages.contains(place),
             };
-            standing || (goes_on && point.passages.contains(place))
+            goes_on || point.standing.as_ref() == Some(place)
         };
         let left: Vec<_> =
             self.row.inside.iter().filter(|(p, _)| !stays(p)).map(|(p, grant)| (p.clone(), *grant)).collect();

@@ -262,7 +262,11 @@ impl AgentCore {
     /// Gives orders until the body is busy, the work waits, or something must be durable first.
     pub(crate) fn advance(&mut self, now: &Now) {
         for _ in 0..ORDERS_AT_ONCE {
-            if !self.is_durable() || !self.advance_once(now) {
+            if !self.is_durable() {
+                self.restrain(now);
+                break;
+            }
+            if !self.advance_once(now) {
                 break;
             }
             self.take_news(now);
@@ -273,6 +277,16 @@ impl AgentCore {
             self.wake_at(until + midshift_core::time::LinkDuration(1));
         }
         self.tell_state(now);
+    }
+
+    /// While something must be durable first, nothing new begins; but what must end or stand does not wait for a disk.
+    fn restrain(&mut self, now: &Now) {
+        let pause = self.pause(now);
+        let Some(work) = self.work.as_ref().filter(|w| w.doing == Doing::Driving && !w.paused) else { return };
+        let pause = if work.ending.is_some() && pause == Pause::No { Pause::WindDown } else { pause };
+        if !self.mind_pause(now, pause == Pause::Now, true) {
+            self.shorten(now, pause);
+        }
     }
 
     fn advance_once(&mut self, now: &Now) -> bool {

@@ -200,6 +200,7 @@ pub struct Rig {
     pub reported: Option<ReportedState>,
     pub exit: Option<ExitReason>,
     generation: u64,
+    heard: [u64; 3],
 }
 
 pub const START_MS: u64 = 1_000;
@@ -227,6 +228,7 @@ impl Rig {
             reported: None,
             exit: None,
             generation: 100,
+            heard: [0; 3],
         };
         rig.put(Input::Start);
         rig
@@ -235,6 +237,7 @@ impl Rig {
     pub fn restart(self) -> Self {
         let mut next = Self::with(self.body, self.store, Bugs::default());
         next.generation = self.generation;
+        next.heard = self.heard;
         next.epoch = self.epoch;
         next
     }
@@ -254,6 +257,10 @@ impl Rig {
             }
         }
     }
+    /// Highest number of a lane that was sent.
+    pub fn heard(&self, lane: Lane) -> u64 {
+        self.heard[lane as usize]
+    }
     /// The disk catches up.
     pub fn flush(&mut self) {
         self.slow_disk = false;
@@ -267,11 +274,18 @@ impl Rig {
             self.hb = heartbeat.reported.hb;
             self.reported = Some(heartbeat.reported.clone());
         }
-        for item in message.batches.iter().flat_map(|b| &b.items) {
-            if let InboxItem::Sample(sample) = item
-                && let SampleBody::Event(event) = &sample.body
-            {
-                self.events.push(event.clone());
+        for batch in &message.batches {
+            let heard = &mut self.heard[batch.lane as usize];
+            for item in &batch.items {
+                // As the server: what is known already is dropped.
+                if let InboxItem::Sample(sample) = item
+                    && sample.seq > *heard
+                {
+                    *heard = sample.seq;
+                    if let SampleBody::Event(event) = &sample.body {
+                        self.events.push(event.clone());
+                    }
+                }
             }
         }
         self.messages.push(message);
