@@ -1,1 +1,14 @@
-//! lib
+//! The midshift binary as a library: wiring of services, `dev`, `serve`, robots in processes, and the operator's command line.
+//!
+//! Called by `main.rs`, by the tests and by the benchmarks. Only here are configuration, environment and the machine's clock read.
+
+pub mod background;
+pub mod cli;
+pub mod clock;
+pub mod dev;
+pub mod logs;
+pub mod report;
+pub mod robots;
+pub mod serve;
+pub mod server;
+pub mod site_file;

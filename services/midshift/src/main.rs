@@ -1,2 +1,7 @@
-//! Under construction.
-fn main() {}
+//! The midshift program: see `midshift --help`.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    midshift::cli::main()
+}

@@ -1,0 +1,217 @@
+//! The work that `dev` gives itself over gRPC, like any other client: a steady backlog, a Poisson stream, or a task list.
+//!
+//! Invariant: background work has priority 7, so that a user's own task goes first, and it stops when asked to.
+
+use anyhow::{Context, bail};
+use midshift_core::site::{Site, grid, task_list};
+use midshift_core::task::forms::Transport;
+use midshift_core::time::Clock;
+use midshift_proto::task::v1::task_service_client::TaskServiceClient;
+use midshift_proto::task::v1::{self, SubmitTaskRequest, SubmitTasksRequest, submit_task_request::Body};
+use midshift_sim::workload::{Workload, WorkloadConfig};
+use std::collections::VecDeque;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::time::Duration;
+use tokio_util::sync::CancellationToken;
+use tonic::transport::Channel;
+
+/// How much work there is to be.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Pressure {
+    /// So many open tasks, refilled as they end.
+    KeepOpen(usize),
+    /// So many an hour of site time, never more than the backlog.
+    Rate {
+        /// Tasks an hour of site time.
+        per_hour: f64,
+        /// Open tasks at most.
+        backlog: usize,
+    },
+}
+
+/// Where the tasks come from.
+pub enum Source {
+    /// Drawn for the site.
+    Drawn(Workload),
+    /// Read from a list, which may end.
+    Listed(VecDeque<SubmitTaskRequest>),
+}
+
+impl Source {
+    /// Drawn transports between the stations of a site.
+    pub fn drawn(site: &Site, seed: u64) -> anyhow::Result<Self> {
+        let workload = Workload::new(WorkloadConfig::background(seed), site)
+            .context("the site has no two stations to carry between")?;
+        Ok(Self::Drawn(workload))
+    }
+    fn next(&mut self) -> Option<SubmitTaskRequest> {
+        match self {
+            Self::Drawn(workload) => Some(request(&workload.next_transport())),
+            Self::Listed(list) => list.pop_front(),
+        }
+    }
+}
+
+/// A transport as the flat form.
+pub fn request(t: &Transport) -> SubmitTaskRequest {
+    let small = |v: Option<i64>| v.and_then(|v| i32::try_from(v).ok());
+    let flat = v1::FlatTask {
+        task_type: t.kind.clone(),
+        priority: small(t.priority),
+        robot_id: t.robot_id.clone(),
+        from_waypoint: t.from_waypoint.clone(),
+        to_waypoint: t.to_waypoint.clone(),
+        item_sku: t.item_sku.clone(),
+        timeout_seconds: small(t.timeout_ms.map(|ms| ms / 1000)),
+        max_retry_times: small(t.max_retry_times),
+        retry_interval_seconds: small(t.retry_interval_ms.map(|ms| ms / 1000)),
+        ..v1::FlatTask::default()
+    };
+    SubmitTaskRequest { body: Some(Body::Flat(flat)), ..SubmitTaskRequest::default() }
+}
+
+/// Reads a task list by its ending: `.tasks` (grid), `.csv`, or JSON lines.
+pub fn read_list(path: &Path, site: &Site) -> anyhow::Result<Vec<SubmitTaskRequest>> {
+    let text = std::fs::read_to_string(path).with_context(|| format!("reading {}", path.display()))?;
+    let listed = match path.extension().and_then(|e| e.to_str()) {
+        Some("tasks") => return Ok(grid::parse_tasks(site, &text)?.iter().map(grid_request).collect()),
+        Some("csv") => task_list::parse_csv(&text)?,
+        _ => task_list::parse_jsonl(&text)?,
+    };
+    listed
+        .into_iter()
+        .map(|task| json_request(task.task).with_context(|| format!("{}:{}", path.display(), task.line)))
+        .collect()
+}
+
+/// One JSON object of a list: either short form of a transport, by its fields.
+fn json_request(task: serde_json::Value) -> anyhow::Result<SubmitTaskRequest> {
+    let body = if task.get("content").is_some() {
+        Body::Nested(midshift_proto::json::from_json(task)?)
+    } else if task.get("steps").is_some() {
+        Body::Spec(midshift_proto::json::from_json(task)?)
+    } else {
+        Body::Flat(midshift_proto::json::from_json(task)?)
+    };
+    Ok(SubmitTaskRequest { body: Some(body), ..SubmitTaskRequest::default() })
+}
+
+fn grid_request(task: &grid::GridTask) -> SubmitTaskRequest {
+    let names: Vec<String> = task.cells.iter().map(ToString::to_string).collect();
+    let base =
+        Transport { priority: Some(7), timeout_ms: Some(1_800_000), max_retry_times: Some(3), ..Transport::default() };
+    match (task.work, names.as_slice()) {
+        (grid::GridWork::Transport, [from, to]) => request(&Transport {
+            kind: "transport".to_owned(),
+            from_waypoint: from.clone(),
+            to_waypoint: to.clone(),
+            item_sku: format!("row-{}", task.line),
+            ..base
+        }),
+        _ => {
+            let goto = |waypoint: &String| v1::Step {
+                kind: Some(v1::step::Kind::Goto(v1::Goto { waypoint: waypoint.clone() })),
+                ..v1::Step::default()
+            };
+            let spec = v1::TaskSpec {
+                r#type: "patrol".to_owned(),
+                priority: Some(7),
+                steps: names.iter().map(goto).collect(),
+                timeout: Some(prost_types::Duration { seconds: 1_800, nanos: 0 }),
+                ..v1::TaskSpec::default()
+            };
+            SubmitTaskRequest { body: Some(Body::Spec(spec)), ..SubmitTaskRequest::default() }
+        }
+    }
+}
+
+/// A client that keeps up the pressure.
+pub struct Background {
+    /// How much.
+    pub pressure: Pressure,
+    /// What.
+    pub source: Source,
+    /// Makes request ids of this run unique.
+    pub seed: u64,
+    /// Both clocks.
+    pub clock: Arc<dyn Clock>,
+    /// Tasks admitted so far, for whoever reports.
+    pub submitted: Arc<AtomicU64>,
+    /// Open tasks now, counted by whoever looks at the rows.
+    pub open: Arc<dyn Fn() -> usize + Send + Sync>,
+}
+
+/// How often the client looks, real time.
+const LOOK_EVERY: Duration = Duration::from_millis(50);
+/// Tasks of one call.
+const BURST: usize = 500;
+
+impl Background {
+    /// Submits until `stop`, or until its list is over.
+    pub async fn run(mut self, channel: Channel, stop: CancellationToken) -> anyhow::Result<()> {
+        let mut client = TaskServiceClient::new(channel);
+        let run = format!("dev-{}-{}", self.seed, self.clock.now().wall.0);
+        let mut number = 0_u64;
+        let mut due = self.clock.now().site;
+        loop {
+            let open = (self.open)();
+            let mut wanted = match self.pressure {
+                Pressure::KeepOpen(target) => target.saturating_sub(open),
+                Pressure::Rate { backlog, .. } => {
+                    let late = self.clock.now().site >= due && open < backlog;
+                    usize::from(late)
+                }
+            };
+            if let (Pressure::Rate { per_hour, .. }, true) = (self.pressure, wanted > 0 || self.clock.now().site >= due)
+            {
+                due = self.clock.now().site + self.gap(per_hour);
+            }
+            wanted = wanted.min(BURST);
+            let mut items = Vec::with_capacity(wanted);
+            for _ in 0..wanted {
+                let Some(mut request) = self.source.next() else { break };
+                number += 1;
+                request.request_id = format!("{run}-{number}");
+                items.push(SubmitTasksRequest { item: Some(request) });
+            }
+            if !items.is_empty() {
+                let sent = items.len();
+                let answer = tokio::select! {
+                    () = stop.cancelled() => return Ok(()),
+                    answer = client.submit_tasks(tokio_stream::iter(items)) => answer?.into_inner(),
+                };
+                self.count(&answer, sent)?;
+            }
+            tokio::select! {
+                () = stop.cancelled() => return Ok(()),
+                () = tokio::time::sleep(LOOK_EVERY) => {}
+            }
+        }
+    }
+
+    fn gap(&mut self, per_hour: f64) -> midshift_core::time::SiteDuration {
+        match &mut self.source {
+            Source::Drawn(workload) => workload.next_gap(per_hour),
+            Source::Listed(_) => midshift_core::time::SiteDuration((3_600_000.0 / per_hour.max(1e-6)) as u64),
+        }
+    }
+
+    fn count(&self, answer: &v1::SubmitTasksResponse, sent: usize) -> anyhow::Result<()> {
+        use v1::submit_task_result::Outcome;
+        let mut admitted = 0;
+        for result in &answer.results {
+            match &result.outcome {
+                Some(Outcome::TaskId(_)) => admitted += 1,
+                Some(Outcome::Refusal(refusal)) => bail!("background task refused: {refusal:?}"),
+                None => bail!("background task got no outcome"),
+            }
+        }
+        self.submitted.fetch_add(admitted, Relaxed);
+        if admitted as usize != sent {
+            bail!("sent {sent} tasks, {admitted} admitted");
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,90 @@
+//! `midshift area …`: live rules of areas.
+
+use super::client::{Call, Change, Exit, unary};
+use super::out::Out;
+use clap::Subcommand;
+use midshift_proto::fleet::v1;
+
+/// Verbs of areas.
+#[derive(Subcommand)]
+pub enum Verb {
+    /// Show the rules of an area.
+    Get {
+        #[command(flatten)]
+        call: Call,
+        /// Which.
+        area_id: String,
+    },
+    /// Change rules of an area; what is not named stays. Pushed to every robot.
+    Put {
+        #[command(flatten)]
+        call: Call,
+        /// Which.
+        area_id: String,
+        /// Millimetres per second.
+        #[arg(long)]
+        speed_limit: Option<u32>,
+        /// Millimetres kept to people and things.
+        #[arg(long)]
+        avoidance_distance: Option<u32>,
+        /// Below this a robot must charge, percent.
+        #[arg(long)]
+        charge_below: Option<u32>,
+        /// Charging ends here, percent.
+        #[arg(long)]
+        charge_to: Option<u32>,
+        #[command(flatten)]
+        change: Change,
+    },
+}
+
+/// Runs one verb.
+pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
+    match verb {
+        Verb::Get { call, area_id } => {
+            let request = v1::GetAreaPolicyRequest { area_id };
+            let policy =
+                call.fleet().await?.get_area_policy(unary(request)).await?.into_inner().policy.unwrap_or_default();
+            show(&policy, out)
+        }
+        Verb::Put { call, area_id, speed_limit, avoidance_distance, charge_below, charge_to, change } => {
+            let mut client = call.fleet().await?;
+            let request = v1::GetAreaPolicyRequest { area_id };
+            let old = client.get_area_policy(unary(request)).await?.into_inner().policy.unwrap_or_default();
+            let policy = v1::AreaPolicy {
+                speed_limit_mm_s: speed_limit.or(old.speed_limit_mm_s),
+                avoidance_distance_mm: avoidance_distance.or(old.avoidance_distance_mm),
+                charge_mandatory_permille: charge_below.map(|p| p * 10).or(old.charge_mandatory_permille),
+                charge_stop_permille: charge_to.map(|p| p * 10).or(old.charge_stop_permille),
+                ..old
+            };
+            let request = v1::PutAreaPolicyRequest {
+                policy: Some(policy),
+                request_id: change.request_id,
+                validate_only: change.dry_run,
+            };
+            let answer = client.put_area_policy(unary(request)).await?.into_inner();
+            show(&answer.policy.unwrap_or_default(), out)?;
+            out.say(&format!("pushed to {} robots", answer.robots));
+            Ok(())
+        }
+    }
+}
+
+fn show(policy: &v1::AreaPolicy, out: &Out) -> Result<(), Exit> {
+    let or_none = |v: Option<u32>, unit: &str| v.map_or_else(|| "none".to_owned(), |v| format!("{v} {unit}"));
+    let percent = |v: Option<u32>| v.map_or_else(|| "default".to_owned(), |v| format!("{} %", f64::from(v) / 10.0));
+    out.one(policy, &policy.area_id, || {
+        format!(
+            "{}  speed limit {}  avoidance {}  charge: must below {}, may below {}, to {}, may be called above {}",
+            policy.area_id,
+            or_none(policy.speed_limit_mm_s, "mm/s"),
+            or_none(policy.avoidance_distance_mm, "mm"),
+            percent(policy.charge_mandatory_permille),
+            percent(policy.charge_opportunistic_permille),
+            percent(policy.charge_stop_permille),
+            percent(policy.charge_preemptible_permille)
+        )
+    })?;
+    Ok(())
+}

@@ -1,0 +1,131 @@
+//! Calls of the command line: which server, what an error means for a person and for the exit code.
+
+use crate::cli::out::Out;
+use crate::robots::uri;
+use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
+use midshift_proto::sim::v1::sim_service_client::SimServiceClient;
+use midshift_proto::task::v1::task_service_client::TaskServiceClient;
+use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
+use std::process::ExitCode;
+use std::time::Duration;
+use tonic::transport::{Channel, Endpoint};
+use tonic::{Code, Request, Status};
+
+/// A server that does not answer a connection within this is not there.
+const CONNECT_WITHIN: Duration = Duration::from_secs(3);
+/// Longest unary call.
+const CALL_WITHIN: Duration = Duration::from_secs(30);
+
+/// Which server.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Call {
+    /// The server, host:port.
+    #[arg(long, env = "MIDSHIFT_SERVER", default_value = "127.0.0.1:7420")]
+    pub server: String,
+}
+
+/// An end that is not success.
+#[derive(Debug)]
+pub struct Exit {
+    code: u8,
+    text: String,
+}
+
+impl Exit {
+    /// With a code of the list in the README.
+    pub fn new(code: u8, text: impl Into<String>) -> Self {
+        Self { code, text: text.into() }
+    }
+    /// Bad arguments.
+    pub fn usage(text: impl Into<String>) -> Self {
+        Self::new(2, text)
+    }
+    /// Says why and gives the code.
+    pub fn report(&self, out: &Out) -> ExitCode {
+        out.say(&format!("error: {}", self.text));
+        ExitCode::from(self.code)
+    }
+}
+
+impl From<anyhow::Error> for Exit {
+    fn from(error: anyhow::Error) -> Self {
+        match error.downcast::<Status>() {
+            Ok(status) => status.into(),
+            Err(error) => Self::new(1, format!("{error:#}")),
+        }
+    }
+}
+
+impl From<Status> for Exit {
+    fn from(status: Status) -> Self {
+        let answer = midshift_proto::refusal_of(&status);
+        let code = match status.code() {
+            Code::InvalidArgument | Code::OutOfRange => 2,
+            Code::NotFound => 4,
+            Code::Unavailable => 5,
+            Code::PermissionDenied | Code::Unauthenticated => 6,
+            Code::Aborted | Code::AlreadyExists | Code::FailedPrecondition => 9,
+            Code::DeadlineExceeded => 10,
+            _ => 1,
+        };
+        let mut text =
+            if status.message().is_empty() { status.code().to_string() } else { status.message().to_owned() };
+        for violation in &answer.violations {
+            text += &format!("\n  {}: {}", violation.field, violation.description);
+        }
+        if let Some(help) = answer.help() {
+            text += &format!("\n  try: {help}");
+        }
+        Self::new(code, text)
+    }
+}
+
+impl Call {
+    async fn channel(&self) -> Result<Channel, Exit> {
+        let endpoint = Endpoint::from_shared(uri(&self.server))
+            .map_err(|e| Exit::usage(format!("--server {}: {e}", self.server)))?;
+        endpoint.connect_timeout(CONNECT_WITHIN).connect().await.map_err(|_| {
+            Exit::new(
+                5,
+                format!(
+                    "no server at {}\n  try: start one with `midshift dev`, or name another with --server",
+                    self.server
+                ),
+            )
+        })
+    }
+    /// Task intake.
+    pub async fn task(&self) -> Result<TaskServiceClient<Channel>, Exit> {
+        Ok(TaskServiceClient::new(self.channel().await?).max_decoding_message_size(64 * 1024 * 1024))
+    }
+    /// Fleet.
+    pub async fn fleet(&self) -> Result<FleetServiceClient<Channel>, Exit> {
+        Ok(FleetServiceClient::new(self.channel().await?).max_decoding_message_size(64 * 1024 * 1024))
+    }
+    /// Telemetry.
+    pub async fn telemetry(&self) -> Result<TelemetryServiceClient<Channel>, Exit> {
+        Ok(TelemetryServiceClient::new(self.channel().await?).max_decoding_message_size(64 * 1024 * 1024))
+    }
+    /// Faults of the simulator.
+    pub async fn sim(&self) -> Result<SimServiceClient<Channel>, Exit> {
+        Ok(SimServiceClient::new(self.channel().await?))
+    }
+}
+
+/// A unary request with its deadline on the wire.
+pub fn unary<T>(message: T) -> Request<T> {
+    let mut request = Request::new(message);
+    request.set_timeout(CALL_WITHIN);
+    request
+}
+
+/// What every verb that changes something takes.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Change {
+    /// Check only; nothing changes.
+    #[arg(long)]
+    pub dry_run: bool,
+    /// Protects against a double call: the same id and content are one request.
+    #[arg(long, default_value = "")]
+    pub request_id: String,
+}

@@ -1,0 +1,209 @@
+//! The command line: one binary, noun then verb. Data to stdout, talk to stderr, `-o json` is the contract.
+
+mod area;
+mod client;
+mod doctor;
+mod explain;
+mod map;
+mod out;
+mod robot;
+mod sim;
+mod task;
+mod zone;
+
+use crate::dev::Dev;
+use crate::robots::AgentRun;
+use crate::serve::Serve;
+use crate::{dev, logs, robots, serve};
+use clap::{Parser, Subcommand};
+use client::{Call, Exit};
+use out::{Format, Out};
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::Duration;
+use tokio_util::sync::CancellationToken;
+
+/// A control plane for fleets of working robots. Not a safety function.
+#[derive(Parser)]
+#[command(name = "midshift", version, arg_required_else_help = true)]
+struct Args {
+    /// How results are printed.
+    #[arg(short, long, global = true, value_enum, default_value_t = Format::Table)]
+    output: Format,
+    /// How log lines look (stderr); their level by MIDSHIFT_LOG.
+    #[arg(long, global = true, value_enum, default_value_t = logs::Format::Text)]
+    log: logs::Format,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// A whole factory in one process, to try things: simulated robots, in memory, loopback. Not for production.
+    Dev(Box<Dev>),
+    /// Serve a site: everything persistent, one process.
+    Serve(Serve),
+    /// Bring a data directory to this version's schema, without serving.
+    Migrate {
+        /// The data directory.
+        #[arg(long)]
+        data: PathBuf,
+    },
+    /// A robot's agent.
+    #[command(subcommand)]
+    Agent(AgentVerb),
+    /// Simulated robots, and faults in them.
+    #[command(subcommand)]
+    Sim(sim::Verb),
+    /// Tasks.
+    #[command(subcommand)]
+    Task(task::Verb),
+    /// Robots.
+    #[command(subcommand)]
+    Robot(robot::Verb),
+    /// Passages and standing places.
+    #[command(subcommand)]
+    Zone(zone::Verb),
+    /// Live rules of areas.
+    #[command(subcommand)]
+    Area(area::Verb),
+    /// Site files.
+    #[command(subcommand)]
+    Map(map::Verb),
+    /// Look for what may be wrong: server, store, robots, this machine.
+    Doctor(Call),
+    /// What a reason means and what to try.
+    ExplainError {
+        /// The code, e.g. BATTERY_LOW. Without it: all.
+        code: Option<String>,
+    },
+}
+
+#[derive(Subcommand)]
+enum AgentVerb {
+    /// Run one agent with a simulated body, as a real robot would run its own.
+    Run(AgentRun),
+}
+
+/// Reads `10m`, `90s`, `500ms`, `2h`.
+pub fn duration(text: &str) -> Result<Duration, String> {
+    let bad = || "must be a number with ms, s, m or h, e.g. 90s".to_owned();
+    let at = text.find(|c: char| !c.is_ascii_digit() && c != '.').ok_or_else(bad)?;
+    let number: f64 = text[..at].parse().map_err(|_| bad())?;
+    let seconds = match &text[at..] {
+        "ms" => 0.001,
+        "s" => 1.0,
+        "m" => 60.0,
+        "h" => 3600.0,
+        _ => return Err(bad()),
+    };
+    Duration::try_from_secs_f64(number * seconds).map_err(|_| bad())
+}
+
+/// Reads the arguments, runs the command, gives the exit code.
+pub fn main() -> ExitCode {
+    let args = Args::parse();
+    let serves = matches!(args.command, Command::Serve(_) | Command::Agent(_) | Command::Sim(sim::Verb::Run(_)));
+    logs::start(args.log, if serves { "info" } else { "warn" });
+    let out = Out::new(args.output);
+    let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
+        Ok(runtime) => runtime,
+        Err(error) => return Exit::from(anyhow::anyhow!("starting the runtime: {error}")).report(&out),
+    };
+    let result = runtime.block_on(run(args.command, &out));
+    runtime.shutdown_timeout(Duration::from_secs(2));
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(exit) => exit.report(&out),
+    }
+}
+
+/// A token that Ctrl-C and SIGTERM cancel.
+fn interrupts() -> CancellationToken {
+    let stop = CancellationToken::new();
+    let cancel = stop.clone();
+    tokio::spawn(async move {
+        let mut term = match tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate()) {
+            Ok(term) => term,
+            Err(error) => return tracing::warn!(%error, "SIGTERM is not heard"),
+        };
+        tokio::select! {
+            _ = tokio::signal::ctrl_c() => {}
+            _ = term.recv() => {}
+        }
+        cancel.cancel();
+    });
+    stop
+}
+
+async fn run(command: Command, out: &Out) -> Result<(), Exit> {
+    match command {
+        Command::Dev(args) => develop(*args, out).await,
+        Command::Serve(args) => Ok(serve::run(args, interrupts()).await?),
+        Command::Migrate { data } => migrate(&data, out).await,
+        Command::Agent(AgentVerb::Run(args)) => Ok(robots::agent(args, interrupts()).await?),
+        Command::Sim(verb) => sim::run(verb, out, interrupts()).await,
+        Command::Task(verb) => task::run(verb, out).await,
+        Command::Robot(verb) => robot::run(verb, out).await,
+        Command::Zone(verb) => zone::run(verb, out).await,
+        Command::Area(verb) => area::run(verb, out).await,
+        Command::Map(verb) => map::run(verb, out),
+        Command::Doctor(call) => doctor::run(&call, out).await,
+        Command::ExplainError { code } => explain::error(code.as_deref(), out),
+    }
+}
+
+async fn develop(args: Dev, out: &Out) -> Result<(), Exit> {
+    let bounded = args.run_for.is_some();
+    let report = dev::run(args, interrupts(), &|text| out.say(text)).await?;
+    let objections = report.objections();
+    if bounded {
+        out.say(&format!(
+            "{:.0} s of site time in {:.0} s: {} submitted, {} succeeded, {} failed, {} canceled, {} expired, {} to operator, {} open; \
+             {:.0} tasks/h, completion p50 {:.0} s p95 {:.0} s, empty {:.0} %, {} exclusion violations (collisions: {})",
+            report.site_s,
+            report.wall_s,
+            report.submitted,
+            report.succeeded,
+            report.failed,
+            report.canceled,
+            report.expired,
+            report.to_operator,
+            report.open,
+            report.tasks_per_site_hour,
+            report.completion_s.p50,
+            report.completion_s.p95,
+            report.empty_run_rate * 100.0,
+            report.exclusion_violations,
+            report.collisions
+        ));
+    }
+    if bounded && !objections.is_empty() {
+        return Err(anyhow::anyhow!("the run is not good: {}", objections.join("; ")).into());
+    }
+    Ok(())
+}
+
+async fn migrate(data: &std::path::Path, out: &Out) -> Result<(), Exit> {
+    for file in midshift_store::migrate(data).await.map_err(anyhow::Error::from)? {
+        out.line(&format!("{}  {} -> {}  {} migrations applied", file.file, file.from, file.to, file.applied.len()));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_arguments_hang_together() {
+        <Args as clap::CommandFactory>::command().debug_assert();
+    }
+
+    #[test]
+    fn durations_read_as_people_write_them() {
+        assert_eq!(duration("10m"), Ok(Duration::from_secs(600)));
+        assert_eq!(duration("1.5s"), Ok(Duration::from_millis(1500)));
+        assert!(duration("10").is_err() && duration("x").is_err());
+    }
+}

@@ -1,0 +1,212 @@
+//! `midshift robot …`
+
+use super::client::{Call, Change, Exit, unary};
+use super::out::{Format, Out};
+use clap::Subcommand;
+use midshift_proto::fleet::v1 as fleet;
+use midshift_proto::link::v1 as link;
+use midshift_proto::telemetry::v1;
+use std::time::Duration;
+
+/// Verbs of robots.
+#[derive(Subcommand)]
+pub enum Verb {
+    /// List robots.
+    Ls {
+        #[command(flatten)]
+        call: Call,
+    },
+    /// Show one robot: live state and what was decided about it.
+    Get(One),
+    /// Follow the live state of robots.
+    Watch {
+        #[command(flatten)]
+        call: Call,
+        /// Only these robots.
+        ids: Vec<String>,
+        /// Time between two pictures.
+        #[arg(long, value_parser = super::duration, default_value = "1s")]
+        period: Duration,
+    },
+    /// Why a robot has no work.
+    Explain(One),
+    /// No new work; what it does now, it finishes.
+    Cordon {
+        #[command(flatten)]
+        one: One,
+        /// Why.
+        #[arg(long)]
+        reason: String,
+        /// Only if it is still as this etag says.
+        #[arg(long, default_value = "")]
+        if_match: String,
+        #[command(flatten)]
+        change: Change,
+    },
+    /// Back to work; also resets the breaker.
+    Uncordon {
+        #[command(flatten)]
+        one: One,
+        /// Only if it is still as this etag says.
+        #[arg(long, default_value = "")]
+        if_match: String,
+        #[command(flatten)]
+        change: Change,
+    },
+}
+
+/// One robot.
+#[derive(clap::Args)]
+pub struct One {
+    #[command(flatten)]
+    call: Call,
+    /// Its id.
+    robot_id: String,
+}
+
+/// Runs one verb.
+pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
+    match verb {
+        Verb::Ls { call } => list(&call, out).await,
+        Verb::Get(one) => get(&one, out).await,
+        Verb::Watch { call, ids, period } => watch(&call, ids, period, out).await,
+        Verb::Explain(one) => explain(&one, out).await,
+        Verb::Cordon { one, reason, if_match, change } => {
+            let request = fleet::CordonRobotRequest {
+                robot_id: one.robot_id.clone(),
+                request_id: change.request_id,
+                etag: if_match,
+                reason,
+                validate_only: change.dry_run,
+            };
+            let answer = one.call.fleet().await?.cordon_robot(unary(request)).await?.into_inner();
+            control(&answer.control.unwrap_or_default(), out)?;
+            out.next(&format!("midshift robot uncordon {}", one.robot_id));
+            Ok(())
+        }
+        Verb::Uncordon { one, if_match, change } => {
+            let request = fleet::UncordonRobotRequest {
+                robot_id: one.robot_id,
+                request_id: change.request_id,
+                etag: if_match,
+                validate_only: change.dry_run,
+            };
+            let answer = one.call.fleet().await?.uncordon_robot(unary(request)).await?.into_inner();
+            control(&answer.control.unwrap_or_default(), out)?;
+            Ok(())
+        }
+    }
+}
+
+fn control(control: &fleet::RobotControl, out: &Out) -> anyhow::Result<()> {
+    out.one(control, &control.robot_id, || control_line(control))
+}
+
+fn control_line(control: &fleet::RobotControl) -> String {
+    let duty = control.duty().as_str_name().trim_start_matches("DUTY_");
+    let why = control.cordon.as_ref().map(|c| format!(" ({})", c.reason)).unwrap_or_default();
+    let holder = if control.holder.is_empty() { "no work" } else { &control.holder };
+    let holds = if control.hold_tokens.is_empty() {
+        String::new()
+    } else {
+        format!("  held by {}", control.hold_tokens.join(" "))
+    };
+    format!("{}  {duty}{why}  {holder}{holds}", control.robot_id)
+}
+
+/// Columns of a robot.
+const HEADER: [&str; 8] = ["ROBOT", "PRESENCE", "AT", "BATTERY", "LOAD", "WORK", "SPEED", "AGE"];
+
+fn row(robot: &v1::Robot) -> Vec<String> {
+    let reported = robot.reported.clone().unwrap_or_default();
+    let vitals = reported.vitals.clone().unwrap_or_default();
+    let work = reported.attempts.iter().find(|a| a.state() < link::WorkState::Succeeded).map(|a| {
+        let id = a.attempt.as_ref().map(|i| i.subject.clone()).unwrap_or_default();
+        format!("{id} {}", a.state().as_str_name().trim_start_matches("WORK_STATE_"))
+    });
+    let age = robot
+        .age
+        .as_ref()
+        .map_or_else(|| "-".to_owned(), |a| format!("{:.1} s", a.seconds as f64 + f64::from(a.nanos) / 1e9));
+    vec![
+        robot.robot_id.clone(),
+        robot.presence().as_str_name().trim_start_matches("PRESENCE_").to_owned(),
+        vitals.waypoint.clone(),
+        format!("{:.0} %{}", f64::from(vitals.battery_permille) / 10.0, if vitals.charging { " +" } else { "" }),
+        reported.load.as_ref().map(|l| l.item.clone()).unwrap_or_default(),
+        work.unwrap_or_default(),
+        format!("{:.1} m/s", f64::from(vitals.speed_mm_s) / 1000.0),
+        age,
+    ]
+}
+
+async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
+    let mut client = call.telemetry().await?;
+    let mut whole = v1::ListRobotsResponse::default();
+    loop {
+        let request =
+            v1::ListRobotsRequest { filter: None, page_size: 1_000, page_token: whole.next_page_token.clone() };
+        let page = client.list_robots(unary(request)).await?.into_inner();
+        whole.robots.extend(page.robots);
+        whole.next_page_token = page.next_page_token;
+        if whole.next_page_token.is_empty() {
+            break;
+        }
+    }
+    out.many(&whole, &whole.robots, |r| r.robot_id.clone(), &HEADER, row)?;
+    Ok(())
+}
+
+async fn get(one: &One, out: &Out) -> Result<(), Exit> {
+    let request = v1::GetRobotRequest { robot_id: one.robot_id.clone() };
+    let answer = one.call.telemetry().await?.get_robot(unary(request)).await?.into_inner();
+    let robot = answer.robot.clone().unwrap_or_default();
+    let request = fleet::GetRobotControlRequest { robot_id: one.robot_id.clone() };
+    let control =
+        one.call.fleet().await?.get_robot_control(unary(request)).await?.into_inner().control.unwrap_or_default();
+    out.one(&answer, &robot.robot_id, || {
+        format!("{}\n{}", super::out::columns(&HEADER, &[row(&robot)]), control_line(&control))
+    })?;
+    Ok(())
+}
+
+async fn watch(call: &Call, robot_ids: Vec<String>, period: Duration, out: &Out) -> Result<(), Exit> {
+    let filter = v1::RobotFilter { robot_ids, ..v1::RobotFilter::default() };
+    let period_ms = u32::try_from(period.as_millis()).unwrap_or(u32::MAX);
+    let request = v1::WatchRobotsRequest { filter: Some(filter), period_ms };
+    let mut stream = call.telemetry().await?.watch_robots(request).await?.into_inner();
+    while let Some(message) = stream.message().await? {
+        match out.format {
+            Format::Json | Format::Jsonl => out.json(&message)?,
+            Format::Table | Format::Name => message.robots.iter().for_each(|r| out.line(row(r).join("  ").trim_end())),
+        }
+    }
+    Ok(())
+}
+
+async fn explain(one: &One, out: &Out) -> Result<(), Exit> {
+    let request = fleet::ExplainRobotRequest { robot_id: one.robot_id.clone() };
+    let answer = one.call.fleet().await?.explain_robot(unary(request)).await?.into_inner();
+    let e = answer.explanation.clone().unwrap_or_default();
+    out.one(&answer, &one.robot_id, || {
+        let mut text = control_line(&e.control.clone().unwrap_or_default());
+        match &e.verdict {
+            Some(reason) => text += &format!("\n  {}: {}\n", reason.code, reason.message),
+            None => text += "\n  nothing keeps it from work\n",
+        }
+        let rows: Vec<Vec<String>> = e
+            .candidates
+            .iter()
+            .map(|c| {
+                let why =
+                    c.reason.as_ref().map_or_else(|| "eligible".to_owned(), |r| format!("{}: {}", r.code, r.message));
+                vec![c.task_id.clone(), why]
+            })
+            .collect();
+        if !rows.is_empty() {
+            text += &super::out::columns(&["WAITING TASK", "WHY NOT"], &rows);
+        }
+        text
+    })?;
+    Ok(())
+}

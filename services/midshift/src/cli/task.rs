@@ -1,0 +1,590 @@
+//! `midshift task …`
+
+use super::client::{Call, Change, Exit, unary};
+use super::out::{Format, Out};
+use crate::background::{read_list, request};
+use crate::site_file;
+use clap::{Subcommand, ValueEnum};
+use indicatif::{ProgressBar, ProgressStyle};
+use midshift_core::task::forms::Transport;
+use midshift_proto::task::v1::{self, watch_tasks_response::Item};
+use std::io::IsTerminal;
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// Verbs of tasks.
+#[derive(Subcommand)]
+pub enum Verb {
+    /// Submit a transport, or a whole list.
+    Submit(Box<Submit>),
+    /// List tasks, newest first.
+    Ls(List),
+    /// Show one task with its attempts.
+    Get(One),
+    /// Follow changes of tasks.
+    Watch {
+        #[command(flatten)]
+        call: Call,
+        /// Only these tasks.
+        ids: Vec<String>,
+        /// Resume after this cursor.
+        #[arg(long, default_value = "")]
+        cursor: String,
+    },
+    /// Wait until a task is over.
+    Wait {
+        #[command(flatten)]
+        one: One,
+        /// Give up after this (exit code 10).
+        #[arg(long, value_parser = super::duration, default_value = "1h")]
+        timeout: Duration,
+    },
+    /// Why a task is not running.
+    Explain(One),
+    /// End a task.
+    Cancel {
+        #[command(flatten)]
+        one: One,
+        /// Why.
+        #[arg(long)]
+        reason: String,
+        /// End the record at once; the robot stays kept until it reports.
+        #[arg(long)]
+        force: bool,
+        /// Only if the task is still as this etag says.
+        #[arg(long, default_value = "")]
+        if_match: String,
+        #[command(flatten)]
+        change: Change,
+    },
+    /// Answer a task that needs an operator.
+    Resolve {
+        #[command(flatten)]
+        one: One,
+        /// How.
+        #[arg(long = "as", value_enum)]
+        resolution: As,
+        /// Why.
+        #[arg(long)]
+        reason: String,
+        /// The etag you saw; without it the task is read first.
+        #[arg(long, default_value = "")]
+        if_match: String,
+        #[command(flatten)]
+        change: Change,
+    },
+    /// Let held tasks and robots go on.
+    Resume {
+        #[command(flatten)]
+        call: Call,
+        /// The stop whose tokens go.
+        #[arg(long, default_value = "")]
+        stop_id: String,
+        /// Everything in this area.
+        #[arg(long, default_value = "")]
+        area: String,
+        /// These robots.
+        #[arg(long)]
+        robot: Vec<String>,
+        /// These tasks.
+        task_ids: Vec<String>,
+        /// Why.
+        #[arg(long, default_value = "")]
+        reason: String,
+        #[command(flatten)]
+        change: Change,
+    },
+}
+
+/// One task.
+#[derive(clap::Args)]
+pub struct One {
+    #[command(flatten)]
+    call: Call,
+    /// Its id, or a prefix that only one task has.
+    task_id: String,
+}
+
+/// What to submit.
+#[derive(clap::Args)]
+pub struct Submit {
+    #[command(flatten)]
+    call: Call,
+    /// Waypoint to pick up at. Without it the robot only drives to --to.
+    #[arg(long, default_value = "")]
+    from: String,
+    /// Waypoint to bring it to.
+    #[arg(long, required_unless_present = "file")]
+    to: Option<String>,
+    /// The item.
+    #[arg(long, default_value = "")]
+    sku: String,
+    /// 0 most urgent .. 9.
+    #[arg(long)]
+    priority: Option<i64>,
+    /// Only this robot.
+    #[arg(long, default_value = "")]
+    robot: String,
+    /// How long one attempt may take.
+    #[arg(long, value_parser = super::duration, default_value = "10m")]
+    timeout: Duration,
+    /// Attempts after the first.
+    #[arg(long, default_value_t = 3)]
+    retries: i64,
+    /// Your own id for it.
+    #[arg(long, default_value = "")]
+    task_id: String,
+    /// A list instead: .jsonl, .csv, or .tasks of a grid (then with --map).
+    #[arg(long, conflicts_with_all = ["from", "to", "sku", "wait"])]
+    file: Option<PathBuf>,
+    /// The grid map a .tasks list belongs to.
+    #[arg(long)]
+    map: Option<PathBuf>,
+    /// Follow it to its end.
+    #[arg(long)]
+    wait: bool,
+    #[command(flatten)]
+    change: Change,
+}
+
+/// What to list.
+#[derive(clap::Args)]
+pub struct List {
+    #[command(flatten)]
+    call: Call,
+    /// Only these states, e.g. needs-operator.
+    #[arg(long)]
+    state: Vec<String>,
+    /// Only of these robots.
+    #[arg(long)]
+    robot: Vec<String>,
+    /// Only these types.
+    #[arg(long = "type")]
+    kind: Vec<String>,
+    /// Only of this work order.
+    #[arg(long, default_value = "")]
+    external_ref: String,
+    /// At most so many, 1..1000.
+    #[arg(long, default_value_t = 100)]
+    limit: u32,
+    /// Continue after this page.
+    #[arg(long, default_value = "")]
+    page_token: String,
+}
+
+/// Answers to NEEDS_OPERATOR.
+#[derive(Clone, Copy, ValueEnum)]
+pub enum As {
+    /// Try again.
+    Requeue,
+    /// Try again; the item was handed to another robot.
+    HandedOver,
+    /// Try again from the start; the item was put back.
+    PutBack,
+    /// Done by hand.
+    Succeeded,
+    /// Give up.
+    Failed,
+    /// Give up; the item is lost.
+    ItemLost,
+    /// Not wanted any more.
+    Canceled,
+}
+
+impl As {
+    fn wire(self) -> v1::Resolution {
+        match self {
+            Self::Requeue => v1::Resolution::Requeue,
+            Self::HandedOver => v1::Resolution::RequeueHandedOver,
+            Self::PutBack => v1::Resolution::RequeuePutBack,
+            Self::Succeeded => v1::Resolution::Succeeded,
+            Self::Failed => v1::Resolution::Failed,
+            Self::ItemLost => v1::Resolution::FailedItemLost,
+            Self::Canceled => v1::Resolution::Canceled,
+        }
+    }
+}
+
+/// Runs one verb.
+pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
+    match verb {
+        Verb::Submit(args) => submit(*args, out).await,
+        Verb::Ls(args) => list(args, out).await,
+        Verb::Get(one) => get(&one, out).await,
+        Verb::Watch { call, ids, cursor } => watch(&call, ids, cursor, out).await,
+        Verb::Wait { one, timeout } => {
+            let id = one.find().await?;
+            follow(&one.call, &id, timeout, out).await
+        }
+        Verb::Explain(one) => explain(&one, out).await,
+        Verb::Cancel { one, reason, force, if_match, change } => {
+            let task_id = one.find().await?;
+            let request = v1::CancelTaskRequest {
+                task_id: task_id.clone(),
+                request_id: change.request_id,
+                etag: if_match,
+                reason,
+                force,
+                validate_only: change.dry_run,
+            };
+            let answer = one.call.task().await?.cancel_task(unary(request)).await?.into_inner();
+            show(&answer.task.clone().unwrap_or_default(), out)?;
+            if answer.pending {
+                out.next(&format!("the cancel is durable and waits for fleet; midshift task wait {task_id}"));
+            }
+            Ok(())
+        }
+        Verb::Resolve { one, resolution, reason, if_match, change } => {
+            resolve(one, resolution, reason, if_match, change, out).await
+        }
+        Verb::Resume { call, stop_id, area, robot, task_ids, reason, change } => {
+            let request = v1::ResumeHeldRequest {
+                stop_id,
+                area_id: area,
+                task_ids,
+                robot_ids: robot,
+                request_id: change.request_id,
+                reason,
+                validate_only: change.dry_run,
+            };
+            let answer = call.task().await?.resume_held(unary(request)).await?.into_inner();
+            out.one(&answer, "", || "resume asked for".to_owned())?;
+            out.next("midshift task ls --state held");
+            Ok(())
+        }
+    }
+}
+
+async fn resolve(
+    one: One,
+    resolution: As,
+    reason: String,
+    if_match: String,
+    change: Change,
+    out: &Out,
+) -> Result<(), Exit> {
+    let task = one.read().await?.task.unwrap_or_default();
+    let request = v1::ResolveTaskRequest {
+        task_id: task.task_id,
+        request_id: change.request_id,
+        etag: if if_match.is_empty() { task.etag } else { if_match },
+        resolution: resolution.wire() as i32,
+        reason,
+        validate_only: change.dry_run,
+    };
+    let answer = one.call.task().await?.resolve_task(unary(request)).await?.into_inner();
+    show(&answer.task.unwrap_or_default(), out)?;
+    Ok(())
+}
+
+impl One {
+    /// The whole id behind a prefix.
+    async fn find(&self) -> Result<String, Exit> {
+        let filter = v1::TaskFilter { task_id_prefix: self.task_id.clone(), ..v1::TaskFilter::default() };
+        let request = v1::ListTasksRequest { filter: Some(filter), page_size: 2, page_token: String::new() };
+        let tasks = self.call.task().await?.list_tasks(unary(request)).await?.into_inner().tasks;
+        match tasks.as_slice() {
+            [] => Err(Exit::new(4, format!("no task begins with {}\n  try: midshift task ls", self.task_id))),
+            [task] => Ok(task.task_id.clone()),
+            several if several.iter().any(|t| t.task_id == self.task_id) => Ok(self.task_id.clone()),
+            _ => Err(Exit::usage(format!("more than one task begins with {}; give more of its id", self.task_id))),
+        }
+    }
+    async fn read(&self) -> Result<v1::GetTaskResponse, Exit> {
+        let task_id = self.find().await?;
+        Ok(self.call.task().await?.get_task(unary(v1::GetTaskRequest { task_id })).await?.into_inner())
+    }
+}
+
+fn state(task: &v1::Task) -> String {
+    task.state().as_str_name().trim_start_matches("TASK_STATE_").to_owned()
+}
+
+fn reason(task: &v1::Task) -> String {
+    task.reason.as_ref().map(|r| r.code.clone()).unwrap_or_default()
+}
+
+fn way(task: &v1::Task) -> String {
+    let goals = task.spec.iter().flat_map(|s| &s.steps).filter_map(|s| match &s.kind {
+        Some(v1::step::Kind::Goto(goto)) => Some(goto.waypoint.as_str()),
+        _ => None,
+    });
+    goals.collect::<Vec<_>>().join(" > ")
+}
+
+fn priority(task: &v1::Task) -> String {
+    task.spec.as_ref().and_then(|s| s.priority).map_or_else(|| "5".to_owned(), |p| p.to_string())
+}
+
+fn show(task: &v1::Task, out: &Out) -> anyhow::Result<()> {
+    out.one(task, &task.task_id, || {
+        let why = task.reason.as_ref().map(|r| format!("\n  {}: {}", r.code, r.message)).unwrap_or_default();
+        format!("{}  {}  {}  {}{why}", task.task_id, state(task), task.robot_id, way(task))
+    })
+}
+
+async fn submit(args: Submit, out: &Out) -> Result<(), Exit> {
+    if let Some(path) = &args.file {
+        return submit_list(&args, path, out).await;
+    }
+    let transport = Transport {
+        kind: if args.from.is_empty() { "patrol" } else { "transport" }.to_owned(),
+        priority: args.priority,
+        robot_id: args.robot.clone(),
+        from_waypoint: args.from.clone(),
+        to_waypoint: args.to.clone().unwrap_or_default(),
+        item_sku: args.sku.clone(),
+        timeout_ms: i64::try_from(args.timeout.as_millis()).ok(),
+        max_retry_times: Some(args.retries),
+        retry_interval_ms: None,
+    };
+    let mut message = request(&transport);
+    message.request_id = args.change.request_id.clone();
+    message.task_id = args.task_id.clone();
+    message.validate_only = args.change.dry_run;
+    let task = args.call.task().await?.submit_task(unary(message)).await?.into_inner().task.unwrap_or_default();
+    if args.wait && !args.change.dry_run {
+        return follow(&args.call, &task.task_id, Duration::from_secs(86_400), out).await;
+    }
+    if args.change.dry_run {
+        out.say("valid; nothing was stored");
+    }
+    show(&task, out)?;
+    if !args.change.dry_run {
+        out.next(&format!("midshift task wait {}", task.task_id));
+    }
+    Ok(())
+}
+
+/// Tasks of one call.
+const BURST: usize = 1_000;
+
+async fn submit_list(args: &Submit, path: &std::path::Path, out: &Out) -> Result<(), Exit> {
+    let site = site_file::load(None, args.map.as_deref(), None)?.site;
+    let mut list = read_list(path, &site)?;
+    let run = if args.change.request_id.is_empty() {
+        format!("cli-{:016x}", rand::random::<u64>())
+    } else {
+        args.change.request_id.clone()
+    };
+    for (i, item) in list.iter_mut().enumerate() {
+        item.request_id = format!("{run}-{}", i + 1);
+    }
+    if args.change.dry_run {
+        out.say(&format!("{} tasks read; nothing was sent", list.len()));
+        return Ok(());
+    }
+    let bar = if std::io::stderr().is_terminal() { ProgressBar::new(list.len() as u64) } else { ProgressBar::hidden() };
+    if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} submitted") {
+        bar.set_style(style);
+    }
+    let mut client = args.call.task().await?;
+    let mut whole = v1::SubmitTasksResponse::default();
+    while !list.is_empty() {
+        let rest = list.split_off(list.len().min(BURST));
+        let items: Vec<_> = std::mem::replace(&mut list, rest)
+            .into_iter()
+            .map(|item| v1::SubmitTasksRequest { item: Some(item) })
+            .collect();
+        let sent = items.len() as u64;
+        whole.results.extend(client.submit_tasks(tokio_stream::iter(items)).await?.into_inner().results);
+        bar.inc(sent);
+    }
+    bar.finish_and_clear();
+    use v1::submit_task_result::Outcome;
+    let refused = whole.results.iter().filter(|r| matches!(r.outcome, Some(Outcome::Refusal(_)))).count();
+    let rows = |r: &v1::SubmitTaskResult| match &r.outcome {
+        Some(Outcome::TaskId(id)) => vec![r.request_id.clone(), id.clone(), String::new()],
+        Some(Outcome::Refusal(refusal)) => {
+            let why = refusal
+                .violations
+                .iter()
+                .map(|v| format!("{}: {}", v.field, v.description))
+                .collect::<Vec<_>>()
+                .join("; ");
+            vec![r.request_id.clone(), "refused".to_owned(), why]
+        }
+        None => vec![r.request_id.clone(), "unknown".to_owned(), String::new()],
+    };
+    out.many(&whole, &whole.results, |r| r.request_id.clone(), &["REQUEST", "TASK", "WHY"], rows)?;
+    out.say(&format!("{} submitted, {refused} refused", whole.results.len() - refused));
+    if refused > 0 {
+        Err(Exit::new(
+            2,
+            format!("{refused} tasks were refused; mend them and send the list again with --request-id {run}"),
+        ))
+    } else {
+        Ok(())
+    }
+}
+
+async fn list(args: List, out: &Out) -> Result<(), Exit> {
+    let mut states = Vec::new();
+    for text in &args.state {
+        let name = format!("TASK_STATE_{}", text.to_uppercase().replace('-', "_"));
+        let state =
+            v1::TaskState::from_str_name(&name).ok_or_else(|| Exit::usage(format!("there is no task state {text}")))?;
+        states.push(state as i32);
+    }
+    let filter = v1::TaskFilter {
+        states,
+        robot_ids: args.robot,
+        types: args.kind,
+        external_ref: args.external_ref,
+        ..v1::TaskFilter::default()
+    };
+    let request = v1::ListTasksRequest { filter: Some(filter), page_size: args.limit, page_token: args.page_token };
+    let page = args.call.task().await?.list_tasks(unary(request)).await?.into_inner();
+    let row = |t: &v1::Task| vec![t.task_id.clone(), state(t), priority(t), t.robot_id.clone(), way(t), reason(t)];
+    out.many(&page, &page.tasks, |t| t.task_id.clone(), &["TASK", "STATE", "PRIO", "ROBOT", "WAY", "WHY"], row)?;
+    if !page.next_page_token.is_empty() {
+        out.next(&format!("more with --page-token {}", page.next_page_token));
+    }
+    Ok(())
+}
+
+async fn get(one: &One, out: &Out) -> Result<(), Exit> {
+    let answer = one.read().await?;
+    let task = answer.task.clone().unwrap_or_default();
+    out.one(&answer, &task.task_id, || {
+        let mut text = format!("{}  {}  priority {}  {}\n", task.task_id, state(&task), priority(&task), way(&task));
+        if let Some(reason) = &task.reason {
+            text += &format!("  {}: {}\n", reason.code, reason.message);
+        }
+        let done = task
+            .allowed_resolutions()
+            .map(|r| r.as_str_name().trim_start_matches("RESOLUTION_").to_lowercase().replace('_', "-"));
+        let allowed = done.collect::<Vec<_>>().join(", ");
+        if !allowed.is_empty() {
+            text += &format!("  a person may answer: {allowed}\n");
+        }
+        for attempt in &answer.attempts {
+            let name = attempt.state().as_str_name().trim_start_matches("ATTEMPT_STATE_");
+            let fault = attempt.fault.as_ref().map(|f| format!("  fault {} {}", f.code, f.message)).unwrap_or_default();
+            let refusal = attempt.refusal.as_ref().map(|r| format!("  {}", r.code)).unwrap_or_default();
+            text += &format!(
+                "  attempt {}  {}  {name}  step {}{fault}{refusal}\n",
+                attempt.epoch, attempt.robot_id, attempt.step_index
+            );
+        }
+        text
+    })?;
+    Ok(())
+}
+
+async fn explain(one: &One, out: &Out) -> Result<(), Exit> {
+    let task_id = one.find().await?;
+    let request = midshift_proto::fleet::v1::ExplainTaskRequest { task_id: task_id.clone() };
+    let answer = match one.call.fleet().await?.explain_task(unary(request)).await {
+        // Fleet knows tasks that are not over; of one that is, the record says why.
+        Err(status) if status.code() == tonic::Code::NotFound => return get(one, out).await,
+        answer => answer?.into_inner(),
+    };
+    let e = answer.explanation.clone().unwrap_or_default();
+    out.one(&answer, &task_id, || {
+        let mut text = format!("{task_id}");
+        if let Some(position) = e.position {
+            text += &format!("  number {position} in the queue");
+        }
+        match &e.verdict {
+            Some(reason) => text += &format!("\n  {}: {}\n", reason.code, reason.message),
+            None => text += "\n  nothing holds it\n",
+        }
+        let rows: Vec<Vec<String>> = e
+            .candidates
+            .iter()
+            .map(|c| {
+                let why =
+                    c.reason.as_ref().map_or_else(|| "eligible".to_owned(), |r| format!("{}: {}", r.code, r.message));
+                let distance = c.distance_mm.map_or_else(|| "-".to_owned(), |d| format!("{:.1} m", d as f64 / 1000.0));
+                vec![c.robot_id.clone(), distance, why]
+            })
+            .collect();
+        if !rows.is_empty() {
+            text += &super::out::columns(&["ROBOT", "DISTANCE", "WHY NOT"], &rows);
+        }
+        text
+    })?;
+    Ok(())
+}
+
+async fn watch(call: &Call, task_ids: Vec<String>, cursor: String, out: &Out) -> Result<(), Exit> {
+    let filter = v1::TaskFilter { task_ids, ..v1::TaskFilter::default() };
+    let mut stream =
+        call.task().await?.watch_tasks(v1::WatchTasksRequest { filter: Some(filter), cursor }).await?.into_inner();
+    while let Some(message) = stream.message().await? {
+        match out.format {
+            Format::Json | Format::Jsonl => out.json(&message)?,
+            Format::Table | Format::Name => {
+                let task = match &message.item {
+                    Some(Item::Existing(task)) => task,
+                    Some(Item::Change(change)) => match &change.task {
+                        Some(task) => task,
+                        None => continue,
+                    },
+                    _ => continue,
+                };
+                out.line(&format!(
+                    "{}  {:<14}  {:<8}  {}  {}",
+                    task.task_id,
+                    state(task),
+                    task.robot_id,
+                    way(task),
+                    reason(task)
+                ));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Follows one task to its end; exit code by how it ended.
+async fn follow(call: &Call, task_id: &str, timeout: Duration, out: &Out) -> Result<(), Exit> {
+    let end = tokio::time::timeout(timeout, until_over(call, task_id, out)).await;
+    let task = end.map_err(|_| {
+        Exit::new(10, format!("{task_id} is not over after {timeout:?}\n  try: midshift task explain {task_id}"))
+    })??;
+    let took = match (&task.create_time, &task.end_time) {
+        (Some(from), Some(to)) => (to.seconds - from.seconds) as f64 + f64::from(to.nanos - from.nanos) / 1e9,
+        _ => 0.0,
+    };
+    let path_m = task.stats.as_ref().map_or(0.0, |s| s.path_mm as f64 / 1000.0);
+    out.one(&task, &task.task_id, || format!("  {took:.1} s, {path_m:.1} m, attempt {}", task.epoch))?;
+    match task.state() {
+        v1::TaskState::Succeeded => Ok(()),
+        v1::TaskState::NeedsOperator => Err(Exit::new(
+            1,
+            format!("{task_id} needs an operator: {}\n  try: midshift task get {task_id}", reason(&task)),
+        )),
+        _ => Err(Exit::new(1, format!("{task_id} ended {}: {}", state(&task), reason(&task)))),
+    }
+}
+
+async fn until_over(call: &Call, task_id: &str, out: &Out) -> Result<v1::Task, Exit> {
+    let filter = v1::TaskFilter { task_ids: vec![task_id.to_owned()], ..v1::TaskFilter::default() };
+    let mut stream = call
+        .task()
+        .await?
+        .watch_tasks(v1::WatchTasksRequest { filter: Some(filter), cursor: String::new() })
+        .await?
+        .into_inner();
+    let mut told = String::new();
+    while let Some(message) = stream.message().await? {
+        let task = match message.item {
+            Some(Item::Existing(task)) => task,
+            Some(Item::Change(change)) => change.task.unwrap_or_default(),
+            _ => continue,
+        };
+        let now = format!("{} {}", state(&task), task.robot_id).trim().to_owned();
+        if now != told && out.format == Format::Table {
+            let begin = if told.is_empty() { task_id.to_owned() } else { "  >".to_owned() };
+            out.say(&format!("{begin} {now}"));
+        }
+        told = now;
+        use v1::TaskState::{Canceled, Expired, Failed, NeedsOperator, Succeeded};
+        if matches!(task.state(), Succeeded | Failed | Canceled | Expired | NeedsOperator) {
+            return Ok(task);
+        }
+    }
+    Err(Exit::new(5, "the server ended the watch\n  try: again"))
+}

@@ -1,0 +1,291 @@
+//! `midshift dev`: a whole factory in one process, in memory, on loopback, with simulated robots and work of its own. Not for production.
+
+use crate::background::{Background, Pressure, Source, read_list};
+use crate::report::{self, Inputs, Report, SharedTasks};
+use crate::server::{Parts, Server};
+use crate::{clock, serve, site_file};
+use anyhow::{Context, bail};
+use midshift_core::site::{Site, grid};
+use midshift_core::time::Clock;
+use midshift_sim::hall::{Hall, HallConfig};
+use midshift_sim::service::SimFace;
+use midshift_sim::swarm::{Swarm, SwarmConfig};
+use midshift_store::{
+    FRAME_BYTES_DEFAULT, FrameLog, MemoryFrames, MemoryStore, SqliteFrames, SqliteStore, Store, StoreId,
+};
+use std::collections::VecDeque;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::time::Duration;
+use tokio::net::TcpListener;
+use tokio_util::sync::CancellationToken;
+
+/// What `dev` was asked for.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Dev {
+    /// Simulated robots.
+    #[arg(long, default_value_t = 12)]
+    pub robots: usize,
+    /// A site file instead of the built-in demo factory.
+    #[arg(long, conflicts_with = "map")]
+    pub site: Option<PathBuf>,
+    /// A grid map (.map) or LIF layout (.json) instead of a site.
+    #[arg(long)]
+    pub map: Option<PathBuf>,
+    /// Start cells of a grid map (.agents).
+    #[arg(long, requires = "map")]
+    pub agents: Option<PathBuf>,
+    /// A task list: .tasks (grid), .csv or .jsonl. Without it transports are drawn.
+    #[arg(long)]
+    pub tasks: Option<PathBuf>,
+    /// How many times as fast as real time the site runs.
+    #[arg(long, default_value_t = 1.0)]
+    pub speedup: f64,
+    /// Seed of robots, faults and work. The run is seeded, not reproducible: threads and sockets have their own mind.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Stop after so much site time (e.g. 10m) instead of at Ctrl-C.
+    #[arg(long = "for", value_parser = crate::cli::duration)]
+    pub run_for: Option<Duration>,
+    /// Keep everything in this directory instead of in memory.
+    #[arg(long)]
+    pub data: Option<PathBuf>,
+    /// Write a JSON report at the end.
+    #[arg(long)]
+    pub report: Option<PathBuf>,
+    /// Address to listen on, loopback only. Port 0 takes a free one.
+    #[arg(long, default_value = "127.0.0.1:7420")]
+    pub listen: SocketAddr,
+    /// Keep so many tasks open. The default with --for is twice the robots.
+    #[arg(long, conflicts_with = "rate")]
+    pub keep_open: Option<usize>,
+    /// Submit so many tasks an hour of site time, e.g. 300/h.
+    #[arg(long, value_parser = rate)]
+    pub rate: Option<f64>,
+}
+
+fn rate(text: &str) -> Result<f64, String> {
+    let number = text.strip_suffix("/h").unwrap_or(text);
+    number
+        .parse::<f64>()
+        .ok()
+        .filter(|n| *n > 0.0 && n.is_finite())
+        .ok_or_else(|| "must be a number above 0 with /h, e.g. 300/h".to_owned())
+}
+
+/// Tasks an hour that one robot can do on a small site: what `dev` takes 60 % of.
+const TASKS_PER_ROBOT_HOUR: f64 = 45.0;
+const LOAD: f64 = 0.6;
+/// Open tasks a robot of the Poisson client at most.
+const BACKLOG_PER_ROBOT: usize = 3;
+
+/// Where `dev` talks to a person.
+pub type Say<'a> = &'a (dyn Fn(&str) + Sync);
+
+/// Runs until `stop`, Ctrl-C's token, or the end of `--for`. The report is of the whole run.
+pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Result<Report> {
+    if !args.listen.ip().is_loopback() {
+        bail!("dev listens on loopback only; use `midshift serve`");
+    }
+    if !(0.01..=200.0).contains(&args.speedup) {
+        bail!("--speedup must be 0.01 to 200");
+    }
+    let loaded = site_file::load(args.site.as_deref(), args.map.as_deref(), Some(args.robots as u64))?;
+    for warning in &loaded.warnings {
+        tracing::warn!(warning, "site");
+    }
+    let site = loaded.site.clone();
+    let clock = clock::clock((args.speedup * 1000.0) as u32);
+    crate::server::metrics_handle();
+    let hall = Arc::new(Hall::open(&hall_config(&args, &site)?, &clock.now())?);
+    let listener = TcpListener::bind(args.listen)
+        .await
+        .with_context(|| format!("listening on {}; is another midshift running?", args.listen))?;
+    let address = listener.local_addr()?;
+    let tasks = SharedTasks::default();
+    let mut swarm = SwarmConfig::tcp(hall.clone(), clock.clone(), &format!("http://{address}"), args.seed);
+    let live = tasks.clone();
+    swarm.person = Some(Arc::new(move |id| report::look(&live, |t| t.is_live(id))));
+    let swarm = Swarm::new(swarm);
+    let (store, frames) = stores(&args, &site, &clock).await?;
+    let parts = Parts {
+        store: store.clone(),
+        frames,
+        site: site.clone(),
+        site_text: loaded.text,
+        clock: clock.clone(),
+        sim: Some(SimFace::new(hall.clone(), clock.clone(), swarm.crash())),
+        telemetry_bugs: midshift_telemetry::Bugs::default(),
+    };
+    let server = Server::new(parts, stop.clone()).await?;
+    say(&greeting(&args, &site, address));
+    let run = Run { args, site, clock, hall, tasks, store, stop };
+    run.together(server, swarm, listener, address).await
+}
+
+fn hall_config(args: &Dev, site: &Arc<Site>) -> anyhow::Result<HallConfig> {
+    let mut config = HallConfig::new(site.clone(), args.robots, args.seed);
+    config.drains = site.chargers().next().is_some();
+    if let Some(path) = &args.agents {
+        let text = std::fs::read_to_string(path).with_context(|| format!("reading {}", path.display()))?;
+        config.starts = Some(grid::parse_starts(site, &text)?);
+    }
+    Ok(config)
+}
+
+async fn stores(
+    args: &Dev,
+    site: &Site,
+    clock: &Arc<dyn Clock>,
+) -> anyhow::Result<(Arc<dyn Store>, Arc<dyn FrameLog>)> {
+    let site_id = site.site_id().clone();
+    if let Some(dir) = &args.data {
+        let store = SqliteStore::open(dir, site_id.clone(), clock.clone()).await?;
+        let frames = SqliteFrames::open(dir, site_id, clock.clone(), FRAME_BYTES_DEFAULT).await?;
+        return Ok((Arc::new(store), Arc::new(frames)));
+    }
+    let id = StoreId(Arc::from(format!("{:016x}", rand::random::<u64>())));
+    let frames = MemoryFrames::new(clock.clone(), 64 * 1024 * 1024);
+    Ok((Arc::new(MemoryStore::new(site_id, id, clock.clone())), Arc::new(frames)))
+}
+
+fn greeting(args: &Dev, site: &Site, address: SocketAddr) -> String {
+    let program = std::env::args().next().unwrap_or_else(|| "midshift".to_owned());
+    let kept = args
+        .data
+        .as_ref()
+        .map_or("data in memory (--data DIR keeps it)".to_owned(), |d| format!("data in {}", d.display()));
+    let server = if address.port() == 7420 { String::new() } else { format!(" --server {address}") };
+    let mut stations =
+        site.stations().chain(site.of_kind(midshift_core::site::Kind::Junction)).map(|w| site.name_of(w).to_string());
+    let (from, to) = if site.source() == midshift_core::site::Source::Authored && site.site_id().as_str() == "demo" {
+        ("A01".to_owned(), "B03".to_owned())
+    } else {
+        (stations.next().unwrap_or_default(), stations.next().unwrap_or_default())
+    };
+    let clock = if args.speedup == 1.0 {
+        String::new()
+    } else {
+        format!(", site clock x{} (task times run ahead of the wall)", args.speedup)
+    };
+    format!(
+        "midshift dev  {} simulated robots, site \"{}\", {kept}{clock}\n\
+         gRPC http://{address} (reflection on)   metrics http://{address}/metrics   no login, no TLS: NOT for production\n\
+         Try:  {program} task submit{server} --from {from} --to {to} --sku SKU-88231 --wait\n\
+         \x20     {program} robot ls{server}\n\
+         \x20     {program} sim fault{server} rbt-04 --drop-network 20s\n\
+         \x20     grpcurl -plaintext {address} list\n\
+         Ctrl-C ends it.",
+        args.robots,
+        site.site_id()
+    )
+}
+
+struct Run {
+    args: Dev,
+    site: Arc<Site>,
+    clock: Arc<dyn Clock>,
+    hall: Arc<Hall>,
+    tasks: SharedTasks,
+    store: Arc<dyn Store>,
+    stop: CancellationToken,
+}
+
+impl Run {
+    fn pressure(&self) -> Pressure {
+        let robots = self.args.robots;
+        match (self.args.keep_open, self.args.rate) {
+            (Some(open), _) => Pressure::KeepOpen(open),
+            (None, Some(per_hour)) => Pressure::Rate { per_hour, backlog: usize::MAX },
+            (None, None) if self.args.run_for.is_some() || self.args.tasks.is_some() => Pressure::KeepOpen(2 * robots),
+            (None, None) => {
+                let per_hour = robots as f64 * TASKS_PER_ROBOT_HOUR * LOAD;
+                Pressure::Rate { per_hour, backlog: robots * BACKLOG_PER_ROBOT }
+            }
+        }
+    }
+
+    fn background(&self, submitted: &Arc<AtomicU64>) -> anyhow::Result<Background> {
+        let source = match &self.args.tasks {
+            Some(path) => Source::Listed(VecDeque::from(read_list(path, &self.site)?)),
+            None => Source::drawn(&self.site, self.args.seed)?,
+        };
+        let (tasks, counted) = (self.tasks.clone(), submitted.clone());
+        // What was admitted and is not in the picture yet is open too.
+        let open =
+            move || report::look(&tasks, |t| t.open() + (counted.load(Relaxed) as usize).saturating_sub(t.total()));
+        Ok(Background {
+            pressure: self.pressure(),
+            source,
+            seed: self.args.seed,
+            clock: self.clock.clone(),
+            submitted: submitted.clone(),
+            open: Arc::new(open),
+        })
+    }
+
+    async fn together(
+        self,
+        server: Server,
+        swarm: Swarm,
+        listener: TcpListener,
+        address: SocketAddr,
+    ) -> anyhow::Result<Report> {
+        let submitted = Arc::new(AtomicU64::new(0));
+        let no_progress_ms = Arc::new(AtomicU64::new(0));
+        let background = self.background(&submitted)?;
+        let (fleet, board) = (server.fleet(), server.board());
+        let robots_stop = CancellationToken::new();
+        let begun = self.clock.now();
+        let serving = tokio::spawn(server.serve(serve::nodelay(listener)));
+        let following = tokio::spawn(report::follow(self.store.clone(), self.tasks.clone(), self.stop.clone()));
+        let robots = tokio::spawn(swarm.run(robots_stop.clone()));
+        let progress = tokio::spawn(report::watch_progress(board, self.clock.clone(), no_progress_ms.clone()));
+        let channel = tonic::transport::Endpoint::from_shared(format!("http://{address}"))?.connect_lazy();
+        let work_stop = CancellationToken::new();
+        let working = tokio::spawn(background.run(channel, work_stop.clone()));
+        self.wait(begun.site).await;
+        // No more work, then the count, then the end: what is open stays open and is counted so.
+        work_stop.cancel();
+        working.await??;
+        let place_waits = fleet.place_waits().await.unwrap_or(0);
+        robots_stop.cancel();
+        robots.await??;
+        let ended = self.clock.now();
+        let bodies = self.hall.report(ended.site)?;
+        self.stop.cancel();
+        progress.abort();
+        following.await??;
+        serving.await??;
+        let tasks = report::settle(self.store.clone()).await?;
+        let report = Report::of(Inputs {
+            seed: self.args.seed,
+            submitted: submitted.load(Relaxed).max(tasks.total() as u64),
+            tasks,
+            bodies,
+            place_waits,
+            no_progress_ms: no_progress_ms.load(Relaxed),
+            site_ms: ended.site.since(begun.site).as_ms(),
+            wall_ms: ended.link.since(begun.link).as_ms(),
+        });
+        if let Some(path) = &self.args.report {
+            std::fs::write(path, serde_json::to_string_pretty(&report)?)
+                .with_context(|| format!("writing {}", path.display()))?;
+        }
+        Ok(report)
+    }
+
+    /// Until the site time of `--for` is over, or Ctrl-C.
+    async fn wait(&self, begun: midshift_core::time::SiteTime) {
+        let Some(run_for) = self.args.run_for else { return self.stop.cancelled().await };
+        let wanted_ms = u64::try_from(run_for.as_millis()).unwrap_or(u64::MAX);
+        while self.clock.now().site.since(begun).as_ms() < wanted_ms {
+            tokio::select! {
+                () = self.stop.cancelled() => return,
+                () = tokio::time::sleep(Duration::from_millis(20)) => {}
+            }
+        }
+    }
+}

@@ -1,0 +1,279 @@
+//! What a run came to, counted from rows and from the bodies' own journals, never from what was planned.
+
+use midshift_core::ids::TaskId;
+use midshift_core::rows::{BadRow, Table};
+use midshift_core::task::{Phase, TaskIntake, TaskState};
+use midshift_core::time::{Clock, Utc};
+use midshift_core::work::Live;
+use midshift_sim::hall::HallReport;
+use midshift_store::{Change, Error, Fold, LiveBoard, Projection, Store};
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+use tokio_util::sync::CancellationToken;
+
+/// A robot with work that does not get on for longer than this makes no progress. Site clock.
+const NO_PROGRESS_MS: u64 = 60_000;
+/// How often robots are looked at, real time.
+const LOOK_EVERY: Duration = Duration::from_millis(500);
+
+/// Tasks as their rows say it.
+#[derive(Debug, Default)]
+pub struct Tasks {
+    created: BTreeMap<TaskId, Utc>,
+    states: BTreeMap<TaskId, (Phase, Option<Utc>)>,
+}
+
+impl Tasks {
+    /// How many are in one of these phases.
+    pub fn count(&self, wanted: impl Fn(Phase) -> bool) -> usize {
+        self.states.values().filter(|(phase, _)| wanted(*phase)).count()
+    }
+    /// Tasks admitted.
+    pub fn total(&self) -> usize {
+        self.states.len()
+    }
+    /// Neither over nor waiting for a person.
+    pub fn open(&self) -> usize {
+        self.count(|p| !p.is_terminal() && p != Phase::NeedsOperator)
+    }
+    /// Whether a task is not over.
+    pub fn is_live(&self, id: &TaskId) -> bool {
+        self.states.get(id).is_some_and(|(phase, _)| !phase.is_terminal())
+    }
+    fn completions_s(&self) -> Vec<f64> {
+        let done = self.states.iter().filter(|(_, (phase, _))| *phase == Phase::Succeeded);
+        let took = done.filter_map(|(id, (_, ended))| Some((*ended)?.ms_since(*self.created.get(id)?) as f64 / 1000.0));
+        let mut took: Vec<f64> = took.collect();
+        took.sort_by(f64::total_cmp);
+        took
+    }
+}
+
+/// The tasks, shared with whoever looks.
+pub type SharedTasks = Arc<Mutex<Tasks>>;
+
+/// Looks at the tasks.
+pub fn look<T>(tasks: &SharedTasks, f: impl FnOnce(&Tasks) -> T) -> T {
+    f(&tasks.lock().unwrap_or_else(PoisonError::into_inner))
+}
+
+struct Keeper(SharedTasks);
+
+impl Fold for Keeper {
+    fn tables() -> &'static [Table] {
+        &[Table::TaskIntake, Table::TaskState]
+    }
+    fn reset(&mut self) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Tasks::default();
+    }
+    fn apply(&mut self, change: Change) -> Result<(), BadRow> {
+        let mut tasks = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if change.key.table == Table::TaskIntake {
+            if let Some(intake) = change.decode::<TaskIntake>()? {
+                tasks.created.insert(intake.task_id, intake.created);
+            }
+        } else if let Some(state) = change.decode::<TaskState>()? {
+            tasks.states.insert(state.task_id, (state.phase, state.ended));
+        }
+        Ok(())
+    }
+}
+
+/// Keeps `tasks` as the rows are, until `stop`.
+pub async fn follow(store: Arc<dyn Store>, tasks: SharedTasks, stop: CancellationToken) -> Result<(), Error> {
+    let mut projection = Projection::new(Keeper(tasks));
+    let mut wake = store.wake();
+    loop {
+        wake.mark_unchanged();
+        projection.advance(store.as_ref()).await?;
+        tokio::select! {
+            () = stop.cancelled() => return Ok(()),
+            changed = wake.changed() => if changed.is_err() { return Ok(()) },
+        }
+    }
+}
+
+/// Reads the rows once more, to the end.
+pub async fn settle(store: Arc<dyn Store>) -> Result<Tasks, Error> {
+    let tasks = SharedTasks::default();
+    Projection::new(Keeper(tasks.clone())).advance(store.as_ref()).await?;
+    let mut tasks = tasks.lock().unwrap_or_else(PoisonError::into_inner);
+    Ok(std::mem::take(&mut *tasks))
+}
+
+/// Milliseconds of site time in which robots had work and made no progress, summed over robots.
+pub async fn watch_progress(
+    board: Arc<LiveBoard<Live>>,
+    clock: Arc<dyn Clock>,
+    sum_ms: Arc<std::sync::atomic::AtomicU64>,
+) {
+    let mut last = clock.now().site;
+    loop {
+        tokio::time::sleep(LOOK_EVERY).await;
+        let now = clock.now().site;
+        let passed = now.since(last).as_ms();
+        last = now;
+        let stuck = board.all().iter().filter(|(_, live)| is_stuck(live, now)).count() as u64;
+        sum_ms.fetch_add(stuck * passed, std::sync::atomic::Ordering::Relaxed);
+    }
+}
+
+fn is_stuck(live: &Live, now: midshift_core::time::SiteTime) -> bool {
+    let working = live.report.attempts.iter().any(|a| !a.state.is_over());
+    working && now.since(live.progress_at).as_ms() > NO_PROGRESS_MS
+}
+
+/// The report of a run.
+#[derive(Clone, Debug, Serialize)]
+pub struct Report {
+    /// Robots.
+    pub robots: usize,
+    /// Seed of the run.
+    pub seed: u64,
+    /// Tasks admitted, as the client counted them.
+    pub submitted: u64,
+    /// Tasks by state, each counted from its row.
+    pub succeeded: usize,
+    /// See above.
+    pub failed: usize,
+    /// See above.
+    pub canceled: usize,
+    /// See above.
+    pub expired: usize,
+    /// NEEDS_OPERATOR.
+    pub to_operator: usize,
+    /// Neither over nor with a person.
+    pub open: usize,
+    /// The six add up to `submitted`.
+    pub states_add_up: bool,
+    /// From the bodies' own journals.
+    pub exclusion_violations: u64,
+    /// `modelled` or `not modelled`.
+    pub collisions: &'static str,
+    /// Every item that came into the world is somewhere in it, once.
+    pub items_conserved: bool,
+    /// Steps of one task that two bodies, or one body twice, really did.
+    pub steps_done_twice: u64,
+    /// Succeeded an hour of site time.
+    pub tasks_per_site_hour: f64,
+    /// Seconds of site time from admission to success.
+    pub completion_s: Spread,
+    /// Share of the way driven without a load.
+    pub empty_run_rate: f64,
+    /// Metres driven by all.
+    pub path_m: f64,
+    /// How often a robot began to wait for a place.
+    pub place_waits: u64,
+    /// Minutes of site time, summed over robots, with work and without progress for over a minute.
+    pub no_progress_robot_minutes: f64,
+    /// Seconds of site time.
+    pub site_s: f64,
+    /// Seconds of real time.
+    pub wall_s: f64,
+    /// Site time over real time, as reached.
+    pub achieved_speedup: f64,
+    /// What the bodies say.
+    pub bodies: HallReport,
+}
+
+/// Mean and percentiles.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct Spread {
+    /// Mean.
+    pub mean: f64,
+    /// Median.
+    pub p50: f64,
+    /// 95th percentile.
+    pub p95: f64,
+}
+
+fn spread(sorted: &[f64]) -> Spread {
+    if sorted.is_empty() {
+        return Spread::default();
+    }
+    let at = |share: f64| sorted[((sorted.len() - 1) as f64 * share).round() as usize];
+    Spread { mean: sorted.iter().sum::<f64>() / sorted.len() as f64, p50: at(0.5), p95: at(0.95) }
+}
+
+/// What a run is reported from.
+pub struct Inputs {
+    /// Seed of the run.
+    pub seed: u64,
+    /// As the client counted.
+    pub submitted: u64,
+    /// Rows.
+    pub tasks: Tasks,
+    /// Bodies.
+    pub bodies: HallReport,
+    /// Waits for places.
+    pub place_waits: u64,
+    /// See [`watch_progress`].
+    pub no_progress_ms: u64,
+    /// Milliseconds of site and real time.
+    pub site_ms: u64,
+    /// See above.
+    pub wall_ms: u64,
+}
+
+impl Report {
+    /// Adds everything up.
+    pub fn of(i: Inputs) -> Self {
+        let is = |wanted: Phase| i.tasks.count(|p| p == wanted);
+        let six = [
+            is(Phase::Succeeded),
+            is(Phase::Failed),
+            is(Phase::Canceled),
+            is(Phase::Expired),
+            is(Phase::NeedsOperator),
+            i.tasks.open(),
+        ];
+        let site_s = i.site_ms as f64 / 1000.0;
+        let wall_s = i.wall_ms as f64 / 1000.0;
+        let path = i.bodies.path_mm as f64;
+        Self {
+            robots: i.bodies.robots,
+            seed: i.seed,
+            submitted: i.submitted,
+            succeeded: six[0],
+            failed: six[1],
+            canceled: six[2],
+            expired: six[3],
+            to_operator: six[4],
+            open: six[5],
+            states_add_up: six.iter().sum::<usize>() as u64 == i.submitted,
+            exclusion_violations: i.bodies.verdict.exclusion_violations,
+            collisions: if i.bodies.collisions_modelled { "modelled" } else { "not modelled" },
+            items_conserved: i.bodies.verdict.items_conserved(),
+            steps_done_twice: i.bodies.verdict.steps_done_twice,
+            tasks_per_site_hour: six[0] as f64 * 3600.0 / site_s.max(1e-9),
+            completion_s: spread(&i.tasks.completions_s()),
+            empty_run_rate: if path > 0.0 { (path - i.bodies.loaded_path_mm as f64) / path } else { 0.0 },
+            path_m: path / 1000.0,
+            place_waits: i.place_waits,
+            no_progress_robot_minutes: i.no_progress_ms as f64 / 60_000.0,
+            site_s,
+            wall_s,
+            achieved_speedup: site_s / wall_s.max(1e-9),
+            bodies: i.bodies,
+        }
+    }
+    /// Why the run cannot be called good; empty if it can.
+    pub fn objections(&self) -> Vec<String> {
+        let mut why = Vec::new();
+        if self.exclusion_violations > 0 {
+            why.push(format!("{} exclusion violations in the bodies' journals", self.exclusion_violations));
+        }
+        if !self.states_add_up {
+            why.push(format!("the six states do not add up to {} submitted", self.submitted));
+        }
+        if !self.items_conserved {
+            why.push("items were lost or doubled".to_owned());
+        }
+        if self.steps_done_twice > 0 {
+            why.push(format!("{} steps were done twice", self.steps_done_twice));
+        }
+        why
+    }
+}

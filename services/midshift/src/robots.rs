@@ -1,0 +1,175 @@
+//! Robots in processes of their own: one agent with a simulated body that survives its process, or a swarm against a server elsewhere.
+
+use crate::{clock, site_file};
+use anyhow::{Context, bail};
+use midshift_agent::core::ExitReason;
+use midshift_core::ids::{RobotId, WaypointId};
+use midshift_core::time::Clock;
+use midshift_sim::body::{BodyConfig, SimBody};
+use midshift_sim::faults::FaultRates;
+use midshift_sim::hall::{Hall, HallConfig, Persistence};
+use midshift_sim::handle::SimHandle;
+use midshift_sim::service::SimFace;
+use midshift_sim::swarm::{AGENT_FILE, Swarm, SwarmConfig};
+use midshift_sim::world::WorldConfig;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use tokio::net::TcpListener;
+use tokio_util::sync::CancellationToken;
+
+/// One agent with a simulated body.
+#[derive(Clone, Debug, clap::Args)]
+pub struct AgentRun {
+    /// Who.
+    #[arg(long)]
+    pub robot_id: String,
+    /// The server, host:port.
+    #[arg(long, env = "MIDSHIFT_SERVER", default_value = "127.0.0.1:7420")]
+    pub server: String,
+    /// Where the ledger, the body and its journal are kept: a killed agent does not teleport its body or lose its load.
+    #[arg(long)]
+    pub data: PathBuf,
+    /// The site file the body lives on. Without it the built-in demo site.
+    #[arg(long)]
+    pub site: Option<PathBuf>,
+    /// Where a new body stands. Required at its first start.
+    #[arg(long)]
+    pub start: Option<String>,
+    /// Seed of the body.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// How many times as fast as real a body works; clocks are not touched.
+    #[arg(long, default_value_t = 1.0)]
+    pub body_speed: f64,
+    /// Nothing goes wrong by itself.
+    #[arg(long)]
+    pub no_faults: bool,
+}
+
+/// Robots of one process against a server elsewhere.
+#[derive(Clone, Debug, clap::Args)]
+pub struct SimRun {
+    /// How many robots the whole site has.
+    #[arg(long, default_value_t = 12)]
+    pub robots: usize,
+    /// Only these of them, from 1, e.g. 1..5000 (the end is not included): several processes take a part each.
+    #[arg(long, value_parser = part)]
+    pub only: Option<(usize, usize)>,
+    /// The server, host:port.
+    #[arg(long, env = "MIDSHIFT_SERVER", default_value = "127.0.0.1:7420")]
+    pub server: String,
+    /// The site. Without it the built-in demo site.
+    #[arg(long)]
+    pub site: Option<PathBuf>,
+    /// Seed of bodies and faults.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Begin of each robot's name.
+    #[arg(long, default_value = "rbt-")]
+    pub prefix: String,
+    /// More robots than the site has seats: they stand in each other, and places are not judged.
+    #[arg(long)]
+    pub crowded: bool,
+    /// Keep ledgers, bodies and journals here instead of in memory.
+    #[arg(long)]
+    pub data: Option<PathBuf>,
+    /// Nothing goes wrong by itself.
+    #[arg(long)]
+    pub no_faults: bool,
+    /// Also answer `sim.v1` (faults) here.
+    #[arg(long)]
+    pub listen: Option<SocketAddr>,
+}
+
+fn part(text: &str) -> Result<(usize, usize), String> {
+    let bad = || "must be FROM..TO, from 1, TO not included".to_owned();
+    let (from, to) = text.split_once("..").ok_or_else(bad)?;
+    let (from, to): (usize, usize) = (from.parse().map_err(|_| bad())?, to.parse().map_err(|_| bad())?);
+    if from == 0 || to <= from { Err(bad()) } else { Ok((from - 1, to - 1)) }
+}
+
+/// The address with its scheme.
+pub fn uri(server: &str) -> String {
+    if server.contains("://") { server.to_owned() } else { format!("http://{server}") }
+}
+
+/// Runs one agent until `stop`. Fenced twice is an error: another machine has this robot's name.
+pub async fn agent(args: AgentRun, stop: CancellationToken) -> anyhow::Result<()> {
+    let robot_id = RobotId::parse(&args.robot_id)?;
+    let site = site_file::load(args.site.as_deref(), None, None)?.site;
+    std::fs::create_dir_all(&args.data).with_context(|| format!("making {}", args.data.display()))?;
+    let clock = clock::clock(1000);
+    let start = match &args.start {
+        Some(name) => WaypointId::parse(name)?,
+        None => site
+            .starting_places(1)
+            .first()
+            .map(|at| site.name_of(*at).clone())
+            .context("the site has no place to start at; name one with --start")?,
+    };
+    if site.find(&start).is_none() {
+        bail!("the site has no waypoint {start}");
+    }
+    let mut config = BodyConfig::new(robot_id.clone(), args.seed, start);
+    config.pace_permille = (args.body_speed.clamp(0.1, 100.0) * 1000.0) as u32;
+    if args.no_faults {
+        config.faults = FaultRates::none();
+    }
+    let world = WorldConfig { auto_stock: true, ..WorldConfig::default() };
+    let (body, _world) = SimBody::restore(config, site, world, &args.data, clock.now().site)?;
+    let handle = SimHandle::new(body);
+    let network = handle.network();
+    let dial = midshift_agent::dial::TcpDial::new(&uri(&args.server), Some(network))?;
+    let store = midshift_agent::sqlite::SqliteStore::open(&args.data.join(AGENT_FILE)).await?;
+    let agent = midshift_agent::session::AgentConfig {
+        robot_id,
+        boot_id: format!("{:032x}", rand::random::<u128>()),
+        new_ring_id: format!("{:032x}", rand::random::<u128>()),
+        seed: rand::random(),
+        bugs: midshift_agent::bugs::Bugs::default(),
+        pulse: midshift_agent::pulse::for_launcher(),
+    };
+    match midshift_agent::session::run(agent, Box::new(handle), Box::new(store), clock, Arc::new(dial), stop).await? {
+        ExitReason::Shutdown => Ok(()),
+        ExitReason::FencedTwice => {
+            bail!("fenced twice: another machine runs as this robot. Find it, then start this one again")
+        }
+    }
+}
+
+/// Runs a swarm until `stop`.
+pub async fn swarm(args: SimRun, stop: CancellationToken) -> anyhow::Result<()> {
+    let site = site_file::load(args.site.as_deref(), None, None)?.site;
+    let clock: Arc<dyn Clock> = clock::clock(1000);
+    let mut config = HallConfig::new(site, args.robots, args.seed);
+    config.only = args.only.map(|(from, to)| from..to);
+    config.prefix.clone_from(&args.prefix);
+    config.crowded = args.crowded;
+    if args.no_faults {
+        config.faults = FaultRates::none();
+    }
+    if let Some(dir) = &args.data {
+        config.persistence = Persistence::Dir(dir.clone());
+    }
+    let hall = Arc::new(Hall::open(&config, &clock.now())?);
+    let mut swarm = SwarmConfig::tcp(hall.clone(), clock.clone(), &uri(&args.server), args.seed);
+    swarm.persistence = config.persistence.clone();
+    let swarm = Swarm::new(swarm);
+    let face = SimFace::new(hall, clock, swarm.crash());
+    let robots = swarm.run(stop.clone());
+    match args.listen {
+        None => drop(robots.await?),
+        Some(address) => {
+            let listener = TcpListener::bind(address).await.with_context(|| format!("listening on {address}"))?;
+            let incoming = crate::serve::nodelay(listener);
+            let served = tonic::transport::Server::builder()
+                .add_service(face.server())
+                .serve_with_incoming_shutdown(incoming, stop.cancelled_owned());
+            let (robots, served) = tokio::join!(robots, served);
+            robots?;
+            served?;
+        }
+    }
+    Ok(())
+}

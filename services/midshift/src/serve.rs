@@ -1,0 +1,72 @@
+//! `midshift serve`: everything persistent in one process, for a real site.
+
+use crate::server::{Parts, Server};
+use crate::{clock, site_file};
+use anyhow::{Context, bail};
+use midshift_store::{FRAME_BYTES_DEFAULT, SqliteFrames, SqliteStore};
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use tokio::net::TcpListener;
+use tokio_stream::wrappers::TcpListenerStream;
+use tokio_util::sync::CancellationToken;
+
+/// What `serve` was asked for.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Serve {
+    /// The site file (or a .map grid, or an LIF .json). Without it the built-in demo site.
+    #[arg(long)]
+    pub site: Option<PathBuf>,
+    /// Where the databases are; made with mode 0700.
+    #[arg(long, default_value = "midshift-data")]
+    pub data: PathBuf,
+    /// Address to listen on. Anything but loopback needs --insecure.
+    #[arg(long, default_value = "127.0.0.1:7420")]
+    pub listen: SocketAddr,
+    /// There is no login and no TLS yet: say that you know, and listen off loopback all the same.
+    #[arg(long)]
+    pub insecure: bool,
+}
+
+/// Runs until `shutdown`.
+pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()> {
+    if !args.listen.ip().is_loopback() && !args.insecure {
+        bail!(
+            "{} is not loopback and midshift has no login yet: whoever reaches it can move robots. Add --insecure if you mean it",
+            args.listen
+        );
+    }
+    let loaded = site_file::load(args.site.as_deref(), None, None)?;
+    for warning in &loaded.warnings {
+        tracing::warn!(warning, "site");
+    }
+    let clock = clock::clock(1000);
+    crate::server::metrics_handle();
+    let site_id = loaded.site.site_id().clone();
+    let store = Arc::new(SqliteStore::open(&args.data, site_id.clone(), clock.clone()).await?);
+    let frames = Arc::new(SqliteFrames::open(&args.data, site_id, clock.clone(), FRAME_BYTES_DEFAULT).await?);
+    let listener = TcpListener::bind(args.listen).await.with_context(|| format!("listening on {}", args.listen))?;
+    tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), "midshift serves");
+    let parts = Parts {
+        store: store.clone(),
+        frames: frames.clone(),
+        site: loaded.site,
+        site_text: loaded.text,
+        clock,
+        sim: None,
+        telemetry_bugs: midshift_telemetry::Bugs::default(),
+    };
+    let server = Server::new(parts, shutdown).await?;
+    let served = server.serve(nodelay(listener)).await;
+    store.close().await;
+    frames.close().await;
+    served
+}
+
+/// Connections without Nagle's delay: a grant must not wait for an acknowledgement.
+pub fn nodelay(
+    listener: TcpListener,
+) -> impl tokio_stream::Stream<Item = std::io::Result<tokio::net::TcpStream>> + Send + 'static {
+    use tokio_stream::StreamExt;
+    TcpListenerStream::new(listener).map(|stream| stream.and_then(|s| s.set_nodelay(true).map(|()| s)))
+}

@@ -1,0 +1,199 @@
+//! One server out of the services: gRPC, gRPC-Web, reflection, health and metrics on one port, over whatever connections it is given.
+//!
+//! Invariant: every stream ends at shutdown; what does not end by itself is cut after a hard drain.
+
+use anyhow::Context;
+use axum::routing::get;
+use metrics_exporter_prometheus::{PrometheusBuilder, PrometheusHandle};
+use midshift_core::limits;
+use midshift_core::site::Site;
+use midshift_core::time::Clock;
+use midshift_core::work::Live;
+use midshift_fleet::{FleetService, Reconciler};
+use midshift_proto::sim::v1::sim_service_server::SimServiceServer;
+use midshift_sim::service::SimFace;
+use midshift_store::{FrameLog, LiveBoard, Retention, Store};
+use midshift_task::TaskService;
+use midshift_telemetry::TelemetryService;
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio_stream::Stream;
+use tokio_util::sync::CancellationToken;
+use tonic::service::Routes;
+use tonic::transport::Server as Transport;
+use tonic::transport::server::Connected;
+
+/// Pings of the server on a quiet connection, and how long it waits for their answer.
+const KEEPALIVE: (Duration, Duration) = (Duration::from_secs(20), Duration::from_secs(10));
+/// How often old log entries are taken away.
+const PRUNE_EVERY: Duration = Duration::from_secs(60);
+/// Log entries kept at most, beside the days of [`limits::REMEMBER_DAYS`].
+const ENTRIES_MAX: u64 = 20_000_000;
+
+/// What a server is built from.
+pub struct Parts {
+    /// The memory that services share.
+    pub store: Arc<dyn Store>,
+    /// Where STATUS is kept.
+    pub frames: Arc<dyn FrameLog>,
+    /// The site.
+    pub site: Arc<Site>,
+    /// Its text.
+    pub site_text: String,
+    /// Clocks.
+    pub clock: Arc<dyn Clock>,
+    /// The simulator's face, if bodies live in this process.
+    pub sim: Option<SimFace>,
+    /// Naive rules for twins of tests; none outside them.
+    pub telemetry_bugs: midshift_telemetry::Bugs,
+}
+
+/// All services of one process, ready to be served.
+pub struct Server {
+    parts: Parts,
+    task: TaskService,
+    fleet: FleetService,
+    reconciler: Reconciler,
+    telemetry: TelemetryService,
+    board: Arc<LiveBoard<Live>>,
+    shutdown: CancellationToken,
+}
+
+/// The one recorder of metrics of this process.
+pub fn metrics_handle() -> Option<PrometheusHandle> {
+    static HANDLE: OnceLock<Option<PrometheusHandle>> = OnceLock::new();
+    HANDLE.get_or_init(|| PrometheusBuilder::new().install_recorder().ok()).clone()
+}
+
+impl Server {
+    /// Builds the services; nothing runs yet.
+    pub async fn new(parts: Parts, shutdown: CancellationToken) -> anyhow::Result<Self> {
+        let board: Arc<LiveBoard<Live>> = LiveBoard::new();
+        let task =
+            midshift_task::Parts { store: parts.store.clone(), site: parts.site.clone(), clock: parts.clock.clone() };
+        let task = TaskService::open(task, shutdown.clone()).await.context("opening task intake")?;
+        let (fleet, reconciler) = FleetService::new(midshift_fleet::Parts {
+            store: parts.store.clone(),
+            board: board.clone(),
+            site: parts.site.clone(),
+            site_text: parts.site_text.clone(),
+            clock: parts.clock.clone(),
+        });
+        let telemetry = TelemetryService::new(
+            midshift_telemetry::Parts {
+                store: parts.store.clone(),
+                frames: parts.frames.clone(),
+                board: board.clone(),
+                clock: parts.clock.clone(),
+                bugs: parts.telemetry_bugs,
+            },
+            shutdown.clone(),
+        );
+        Ok(Self { parts, task, fleet, reconciler, telemetry, board, shutdown })
+    }
+
+    /// Fleet, for whoever reports in this process.
+    pub fn fleet(&self) -> FleetService {
+        self.fleet.clone()
+    }
+    /// Newest heartbeats, for whoever reports in this process.
+    pub fn board(&self) -> Arc<LiveBoard<Live>> {
+        self.board.clone()
+    }
+
+    async fn routes(&self) -> anyhow::Result<Routes> {
+        let control = limits::CONTROL_MESSAGE_BYTES;
+        let reflection = || {
+            tonic_reflection::server::Builder::configure()
+                .register_encoded_file_descriptor_set(midshift_proto::FILE_DESCRIPTOR_SET)
+        };
+        let (health, health_service) = tonic_health::server::health_reporter();
+        for name in [
+            "midshift.task.v1.TaskService",
+            "midshift.fleet.v1.FleetService",
+            "midshift.telemetry.v1.TelemetryService",
+            "midshift.link.v1.LinkService",
+        ] {
+            health.set_service_status(name, tonic_health::ServingStatus::Serving).await;
+        }
+        let mut routes = Routes::builder();
+        routes
+            .add_service(self.task.grpc().max_decoding_message_size(control))
+            .add_service(self.fleet.grpc().max_decoding_message_size(control))
+            .add_service(self.telemetry.grpc().max_decoding_message_size(control))
+            .add_service(self.telemetry.link())
+            .add_service(health_service)
+            .add_service(reflection().build_v1()?)
+            .add_service(reflection().build_v1alpha()?);
+        if let Some(sim) = self.parts.sim.clone() {
+            let face: SimServiceServer<SimFace> = sim.server();
+            routes.add_service(face);
+        }
+        let handle = metrics_handle();
+        let metrics = move || {
+            let handle = handle.clone();
+            async move { handle.map(|h| h.render()).unwrap_or_default() }
+        };
+        Ok(Routes::from(routes.routes().into_axum_router().route("/metrics", get(metrics))))
+    }
+
+    /// Serves connections until shutdown, then drains and cuts.
+    pub async fn serve<I, IO, E>(self, incoming: I) -> anyhow::Result<()>
+    where
+        I: Stream<Item = Result<IO, E>> + Send + 'static,
+        IO: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+        E: Into<Box<dyn std::error::Error + Send + Sync>>,
+    {
+        let routes = self.routes().await?;
+        let shutdown = self.shutdown.clone();
+        let stopped = shutdown.clone();
+        let transport = Transport::builder()
+            .accept_http1(true)
+            .http2_keepalive_interval(Some(KEEPALIVE.0))
+            .http2_keepalive_timeout(Some(KEEPALIVE.1))
+            .max_concurrent_streams(limits::STREAMS_PER_CONNECTION)
+            .timeout(Duration::from_millis(limits::UNARY_DEADLINE.as_ms()))
+            .layer(tonic_web::GrpcWebLayer::new())
+            .add_routes(routes)
+            .serve_with_incoming_shutdown(incoming, async move { stopped.cancelled().await });
+        let keeper = prune(self.parts.store.clone(), self.parts.frames.clone(), self.parts.clock.clone());
+        let fleet = self.reconciler.run(shutdown.clone());
+        let telemetry = self.telemetry.clone().run();
+        let hard = async {
+            shutdown.cancelled().await;
+            tokio::time::sleep(Duration::from_millis(limits::HARD_DRAIN.as_ms())).await;
+        };
+        let services = async {
+            tokio::try_join!(async { fleet.await.context("fleet") }, async { telemetry.await.context("telemetry") })
+        };
+        tokio::select! {
+            served = async { tokio::join!(transport, services) } => {
+                served.0.context("serving")?;
+                served.1?;
+            }
+            () = keeper => {}
+            () = hard => tracing::info!("open streams were cut"),
+        }
+        Ok(())
+    }
+}
+
+/// Takes old entries and frames away, never past what fleet has not consumed.
+async fn prune(store: Arc<dyn Store>, frames: Arc<dyn FrameLog>, clock: Arc<dyn Clock>) {
+    use midshift_core::fleet::rows::FleetMark;
+    loop {
+        tokio::time::sleep(PRUNE_EVERY).await;
+        let mark = midshift_store::load::<FleetMark>(store.as_ref(), "fleet").await;
+        let Ok(Some((mark, _))) = mark else { continue };
+        let days_ms = (limits::REMEMBER_DAYS * 86_400_000) as i64;
+        let keep =
+            Retention { before_unix_ms: clock.now().wall.0 - days_ms, entries_max: ENTRIES_MAX, floor: mark.seq };
+        if let Err(error) = store.prune(keep).await {
+            tracing::warn!(%error, "old log entries could not be taken away");
+        }
+        if let Err(error) = frames.prune().await {
+            tracing::warn!(%error, "old status could not be taken away");
+        }
+    }
+}
