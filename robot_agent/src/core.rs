@@ -452,6 +452,11 @@ impl AgentCore {
         }
     }
 
+    /// The next heartbeat goes with this step.
+    pub(crate) fn beat_at_once(&mut self, now: &Now) {
+        self.next_beat = self.next_beat.min(now.link);
+    }
+
     /// What falls due by time alone. True: a heartbeat is due.
     fn beat(&mut self, now: &Now) -> bool {
         let beat = now.link >= self.next_beat;

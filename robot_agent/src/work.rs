@@ -581,6 +581,8 @@ impl AgentCore {
         self.write(Op::Finish(Arc::new(report.clone()), listed, now.wall.0), true);
         self.places.give_back_all().into_iter().for_each(|e| self.emit(Lane::Event, e));
         self.emit(Lane::Event, RobotEvent::Attempt(report));
+        // Fleet gives the next work by where the robot stands now, not by where it was a heartbeat ago.
+        self.beat_at_once(now);
     }
 
     fn listed(&self, work: &Work, state: WorkState) -> ReportedAttempt {

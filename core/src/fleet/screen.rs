@@ -40,10 +40,9 @@ pub fn robot(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> Resul
         Some(RobotHolder::Attempt(id)) => return Err(Reason::from(Code::RobotBusy).with("attempt", id)),
         Some(RobotHolder::Maintenance(id)) => return Err(Reason::from(Code::RobotBusy).with("maintenance", id)),
     }
-    if repair::is_fresh(view, live) && live.report.attempts.iter().any(|a| !a.state.is_over()) {
-        return Err(Code::RobotReconciling.into());
-    }
-    if session.session_epoch != live.report.session_epoch {
+    // An older heartbeat knows neither what has ended since nor where the robot stands now.
+    let current = session.session_epoch == live.report.session_epoch && repair::is_fresh(view, live);
+    if !current || live.report.attempts.iter().any(|a| !a.state.is_over()) {
         return Err(Code::RobotReconciling.into());
     }
     if way::find(view, live.report.vitals.waypoint.as_ref()).is_none() {
@@ -111,12 +110,28 @@ pub fn pair(
     }
     able(session, intake)?;
     let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
+    just_refused(view, live, task)?;
     if let Some(load) = &live.report.load
         && load.task_id.as_ref() != Some(&task.task_id)
     {
         return Err(Reason::from(Code::RobotLoaded).with("item", &load.item));
     }
     energy(view, live, task, intake)
+}
+
+/// A robot that refused this task is asked again only once it has said something newer.
+fn just_refused(view: &View, live: &Live, task: &TaskState) -> Result<(), Reason> {
+    let last = task.attempt_id().and_then(|id| view.attempt(&id)).filter(|a| a.robot_id == live.robot_id);
+    match last {
+        Some(a)
+            if a.phase == AttemptPhase::Refused
+                && a.offer.session_epoch == live.report.session_epoch
+                && live.report.hb <= a.offer.hb =>
+        {
+            Err(a.refusal.clone().unwrap_or_else(|| Code::RobotReconciling.into()))
+        }
+        _ => Ok(()),
+    }
 }
 
 fn able(session: &Session, intake: &TaskIntake) -> Result<(), Reason> {
