@@ -38,6 +38,8 @@ pub const AGENT_TIMEOUT_EARLIER_PERMILLE: u64 = 50;
 pub const BREAKER_FAILURES: usize = 3;
 /// ... within this time take the robot out of dispatch until a person says so.
 pub const BREAKER_WINDOW: SiteDuration = SiteDuration::from_secs(600);
+/// After an errand that a robot refused, failed or dropped it gets no other for this long.
+pub const ERRAND_PAUSE: LinkDuration = LinkDuration::from_secs(5);
 /// Refusals in a row before a person is asked: NO_ROBOT_ACCEPTS.
 pub const REFUSALS_IN_ROW: u32 = 5;
 /// Attempts of a task that robots may drop before a person is asked, whatever retries it asked for: a restarted agent is not its fault.

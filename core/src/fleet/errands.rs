@@ -54,6 +54,9 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
     let robots: Vec<RobotId> = board.keys().filter(|r| screen::robot(view, board, r, &now).is_ok()).cloned().collect();
     for robot_id in robots {
         let Some(live) = board.get(&robot_id) else { continue };
+        if view.unwilling.get(&robot_id).is_some_and(|until| now.link < *until) {
+            continue;
+        }
         let Some(here) = way::find(view, live.report.vitals.waypoint.as_ref()) else { continue };
         let Some((errand, goal)) = wish(view, &robot_id, here, live.report.vitals.battery_permille, waiting) else {
             continue;
@@ -158,6 +161,10 @@ pub fn report(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
         WorkState::Aborted | WorkState::Suspended => AttemptPhase::Aborted,
     };
     if live.is_terminal() {
+        if live != AttemptPhase::Succeeded && a.phase != AttemptPhase::Stopping {
+            let until = tx.now.link + limits::ERRAND_PAUSE;
+            tx.view.unwilling.insert(robot_id.clone(), until);
+        }
         a.phase = live;
         end_attempt(tx, &mut a);
     } else if a.phase != AttemptPhase::Stopping {

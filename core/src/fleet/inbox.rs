@@ -52,9 +52,11 @@ fn release(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
     if tx.view.held_by(robot_id) != Some(&report.attempt) {
         return;
     }
-    let Some(mut a) = tx.view.attempt(&report.attempt).cloned() else { return };
+    // An attempt that is still live in the record ends by the table or by repair, never beside its task.
+    let lost = tx.view.attempt(&report.attempt).filter(|a| a.phase == AttemptPhase::Lost);
+    let Some(mut a) = lost.cloned() else { return };
     a.stats = report.stats;
-    a.phase = if a.phase == AttemptPhase::Lost { AttemptPhase::Aborted } else { a.phase };
+    a.phase = AttemptPhase::Aborted;
     tasks::end_attempt(tx, &mut a);
     tx.put(a, "attempt.released");
 }

@@ -121,8 +121,10 @@ fn move_attempt(tx: &mut Tx, mut a: Attempt, step: Next, news: &News, intake: &T
             }
         }
         Fate::End => {
-            let confirmed = if a.accepted.is_some() { AttemptPhase::Aborted } else { AttemptPhase::OfferExpired };
-            a.phase = phase_of(news.event, None).unwrap_or(confirmed);
+            let taken = a.accepted.is_some() || a.phase == AttemptPhase::Lost;
+            let confirmed = if taken { AttemptPhase::Aborted } else { AttemptPhase::OfferExpired };
+            let said = phase_of(news.event, None).filter(|p| *p != AttemptPhase::Refused || a.accepted.is_none());
+            a.phase = said.unwrap_or(confirmed);
             end_attempt(tx, &mut a);
         }
         Fate::Abandon => {
@@ -133,9 +135,10 @@ fn move_attempt(tx: &mut Tx, mut a: Attempt, step: Next, news: &News, intake: &T
             quarantine(tx, &a.robot_id, news.why);
         }
     }
+    // What is no step of the attempt's own machine is an old or repeated report.
     if a.phase != AttemptPhase::Stopping
+        && let Some(phase) = phase_of(news.event, news.report).filter(|p| a.phase.transitions().contains(p))
         && !a.phase.is_terminal()
-        && let Some(phase) = phase_of(news.event, news.report)
     {
         a.phase = phase;
     }

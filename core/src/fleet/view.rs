@@ -103,6 +103,8 @@ pub struct View {
     pub place_waits: u64,
     /// When a robot last had a reason to stand still (held, waiting for a place, not known), site clock: a stall counts from then. Volatile.
     pub excused: BTreeMap<RobotId, crate::time::SiteTime>,
+    /// Robots that did not want their last errand, and until when they are left alone, link clock. Volatile.
+    pub unwilling: BTreeMap<RobotId, crate::time::LinkTime>,
     /// Time in which robots were heard since it was last counted. Volatile.
     pub attached: BTreeMap<RobotId, Attached>,
     /// Distances and routes, remembered.
@@ -272,6 +274,7 @@ impl View {
             served: ServiceClock::default(),
             waits: BTreeMap::new(),
             excused: BTreeMap::new(),
+            unwilling: BTreeMap::new(),
             attached: BTreeMap::new(),
             place_waits: 0,
         }

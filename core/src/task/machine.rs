@@ -425,8 +425,8 @@ fn uncertain(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
             Some(then) if then != Then::Retry => go(after_stop(then, facts), Fate::End),
             _ => go(after_final(facts), Fate::End),
         },
-        Event::Refused => go(at.then.map_or(Phase::Queued, |t| after_stop(t, facts)), Fate::End),
-        Event::StopConfirmed => match at.then {
+        // Refused after it was accepted: the robot lost its memory of it, and with that the work.
+        Event::Refused | Event::StopConfirmed => match at.then {
             Some(then) => go(after_stop(then, facts), Fate::End),
             None if !facts.accepted => go(Phase::Queued, Fate::End),
             None => go(after_drop(facts), Fate::End),

@@ -79,6 +79,7 @@ impl Loop {
         let place_waits = self.view.place_waits;
         let (waits, attached) = (std::mem::take(&mut self.view.waits), std::mem::take(&mut self.view.attached));
         let excused = std::mem::take(&mut self.view.excused);
+        let unwilling = std::mem::take(&mut self.view.unwilling);
         let now = self.parts.clock.now();
         let served = self.view.serving(&now);
         self.view = View::new(self.parts.site.clone(), self.started, now);
@@ -89,6 +90,7 @@ impl Loop {
         self.view.waits = waits;
         self.view.attached = attached;
         self.view.excused = excused;
+        self.view.unwilling = unwilling;
         self.view.place_waits = place_waits;
         self.seq = self.view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq).min(snapshot.seq);
         let mut plan = Plan::default();

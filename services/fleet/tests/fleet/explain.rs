@@ -1,1 +1,90 @@
-//! Scenarios.
+//! Why not: each case has a reason that names what is in the way.
+
+use crate::harness::World;
+use midshift_core::reason::Code;
+use midshift_core::robot::Load;
+use midshift_core::site::CORRIDOR;
+use midshift_proto::fleet::v1;
+use midshift_proto::fleet::v1::fleet_service_server::FleetService;
+use tonic::Request;
+
+/// The verdict's code, and the reason against `r1`.
+async fn why(w: &World, task_id: &str) -> (String, String) {
+    let ask = v1::ExplainTaskRequest { task_id: task_id.to_owned() };
+    let told = w.fleet.explain_task(Request::new(ask)).await.expect("an explanation").into_inner();
+    let told = told.explanation.expect("an explanation");
+    let of_robot = told.candidates.iter().find(|c| c.robot_id == "r1").and_then(|c| c.reason.clone());
+    (told.verdict.map(|r| r.code).unwrap_or_default(), of_robot.map(|r| r.code).unwrap_or_default())
+}
+
+fn codes(verdict: Code, robot: &str) -> (String, String) {
+    (verdict.as_str().to_owned(), robot.to_owned())
+}
+
+#[tokio::test(start_paused = true)]
+async fn no_robot_is_available() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").cut();
+    w.pass(40).await;
+    w.submit("T1", "A", "B").await;
+    w.pass(2).await;
+    assert_eq!(why(&w, "T1").await, codes(Code::WaitingForRobot, "ROBOT_OFFLINE"));
+}
+
+#[tokio::test(start_paused = true)]
+async fn no_robot_has_the_capability() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.submit_with("T1", "A", "B", |raw| raw.capabilities = vec!["weld".to_owned()]).await;
+    w.pass(2).await;
+    assert_eq!(why(&w, "T1").await, codes(Code::WaitingForRobot, "MISSING_CAPABILITY"));
+}
+
+#[tokio::test(start_paused = true)]
+async fn the_pinned_robot_is_cordoned() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.robot("r2", "park-b").await;
+    let cordon = v1::CordonRobotRequest { robot_id: "r1".to_owned(), reason: "wheel".to_owned(), ..Default::default() };
+    w.pass(1).await;
+    w.fleet.cordon_robot(Request::new(cordon)).await.expect("cordoned");
+    w.submit_with("T1", "A", "B", |raw| raw.robot_id = "r1".to_owned()).await;
+    w.pass(2).await;
+    assert_eq!(why(&w, "T1").await, codes(Code::WaitingForRobot, "ROBOT_CORDONED"));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_dependency_is_not_met() {
+    let mut w = World::on(CORRIDOR).await;
+    w.submit_with("T1", "A", "B", |raw| raw.depends_on = vec!["T0".to_owned()]).await;
+    w.pass(2).await;
+    assert_eq!(why(&w, "T1").await, codes(Code::WaitingForDependency, ""));
+}
+
+#[tokio::test(start_paused = true)]
+async fn the_robot_carries_something_else() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").load = Some(Load { task_id: None, item: "a box of somebody".to_owned() });
+    w.beat("r1");
+    w.submit("T1", "A", "B").await;
+    w.pass(2).await;
+    assert_eq!(why(&w, "T1").await, codes(Code::WaitingForRobot, "ROBOT_LOADED"));
+}
+
+#[tokio::test(start_paused = true)]
+async fn the_robot_has_too_little_charge_or_a_person_drives_it() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "charge").await;
+    w.r("r1").works = false;
+    w.r("r1").battery_permille = 150;
+    w.beat("r1");
+    w.submit("T1", "A", "B").await;
+    w.pass(3).await;
+    assert_eq!(why(&w, "T1").await, codes(Code::WaitingForRobot, "BATTERY_LOW"));
+    let ask = v1::ExplainRobotRequest { robot_id: "r1".to_owned() };
+    let told = w.fleet.explain_robot(Request::new(ask)).await.expect("an explanation").into_inner();
+    let verdict = told.explanation.expect("an explanation").verdict.expect("a verdict").code;
+    assert_eq!(verdict, "ROBOT_BUSY", "it charges");
+}

@@ -1,1 +1,112 @@
-//! Scenarios.
+//! What people ask of fleet: rules of areas, cordons, answers to NEEDS_OPERATOR.
+
+use crate::harness::{World, jam};
+use midshift_core::ids::TaskId;
+use midshift_core::site::{CORRIDOR, DEMO};
+use midshift_core::task::{Ask, Phase, Resolution};
+use midshift_proto::fleet::v1;
+use midshift_proto::fleet::v1::fleet_service_server::FleetService;
+use tonic::Request;
+
+#[tokio::test(start_paused = true)]
+async fn rules_put_for_an_area_reach_every_robot() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.robot("r2", "park-b").await;
+    w.until("both have the site's rules", |s| {
+        ["r1", "r2"].iter().all(|r| s.get::<midshift_core::work::DesiredPolicy>(r).is_some())
+    })
+    .await;
+    let get = v1::GetAreaPolicyRequest { area_id: "rooms".to_owned() };
+    let mut policy =
+        w.fleet.get_area_policy(Request::new(get)).await.expect("rules").into_inner().policy.expect("rules");
+    assert_eq!(policy.speed_limit_mm_s, Some(1_500));
+    policy.speed_limit_mm_s = Some(600);
+    let put = v1::PutAreaPolicyRequest { policy: Some(policy), ..Default::default() };
+    w.fleet.put_area_policy(Request::new(put)).await.expect("put");
+    let before = w.seen().await;
+    let limit = |s: &crate::harness::Seen, r: &str| s.policy(r).areas[0].speed_limit_mm_s;
+    w.until("both have the new rules", |s| ["r1", "r2"].iter().all(|r| limit(s, r) == Some(600))).await;
+    w.robot("r3", "A").await;
+    let seen = w.until("who comes later too", |s| s.get::<midshift_core::work::DesiredPolicy>("r3").is_some()).await;
+    assert_eq!(limit(&seen, "r3"), Some(600));
+    assert!(seen.policy("r1").generation >= before.policy("r1").generation);
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn charging_thresholds_of_the_site_file_hold_until_a_person_puts_others() {
+    let text: &'static str = Box::leak(
+        CORRIDOR
+            .replace("speed_limit_mm_s = 1500", "charge_mandatory_permille = 400, charge_preemptible_permille = 450")
+            .into_boxed_str(),
+    );
+    let mut w = World::on(text).await;
+    w.robot("r1", "park-b").await;
+    w.r("r1").battery_permille = 350;
+    w.r("r1").works = false;
+    w.beat("r1");
+    w.submit("T1", "A", "B").await;
+    w.until("the site's threshold sends it to charge", |s| s.errand("r1").is_some()).await;
+    w.pass_while(30, "and keeps it there", |s| s.phase("T1") == Phase::Queued).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_cordoned_robot_finishes_its_work_and_gets_no_more() {
+    let mut w = World::on(DEMO).await;
+    w.robot("r1", "park-1").await;
+    w.submit("T1", "A01", "D01").await;
+    w.until_phase("T1", Phase::Running).await;
+    let cordon = v1::CordonRobotRequest { robot_id: "r1".to_owned(), reason: "wheel".to_owned(), ..Default::default() };
+    w.fleet.cordon_robot(Request::new(cordon)).await.expect("cordoned");
+    w.submit("T2", "A01", "D01").await;
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.pass_while(60, "it is out of dispatch", |s| s.phase("T2") == Phase::Queued).await;
+    let uncordon = v1::UncordonRobotRequest { robot_id: "r1".to_owned(), ..Default::default() };
+    w.fleet.uncordon_robot(Request::new(uncordon)).await.expect("uncordoned");
+    w.until_phase("T2", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_person_who_answers_ends_the_question() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    let answers = [
+        (Resolution::Succeeded, Phase::Succeeded),
+        (Resolution::Failed, Phase::Failed),
+        (Resolution::Canceled, Phase::Canceled),
+        (Resolution::Requeue, Phase::Succeeded),
+    ];
+    for (n, (resolution, end)) in answers.into_iter().enumerate() {
+        let id = format!("T{n}");
+        w.r("r1").fails = Some((0, jam()));
+        w.submit(&id, "A", "B").await;
+        w.until_phase(&id, Phase::NeedsOperator).await;
+        w.ask(Ask::Resolve { task_id: TaskId::parse(&id).expect("an id"), resolution }).await;
+        let uncordon = v1::UncordonRobotRequest { robot_id: "r1".to_owned(), ..Default::default() };
+        w.fleet.uncordon_robot(Request::new(uncordon)).await.expect("uncordoned");
+        w.until_phase(&id, end).await;
+    }
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_item_handed_over_by_a_person_is_brought_on_by_another_robot_without_a_second_pick() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").fails = Some((2, jam()));
+    w.submit("T1", "A", "B").await;
+    w.until_phase("T1", Phase::NeedsOperator).await;
+    w.r("r1").load = None;
+    w.r("r1").cut();
+    w.robot("r2", "park-b").await;
+    let task_id = TaskId::parse("T1").expect("an id");
+    w.ask(Ask::Resolve { task_id, resolution: Resolution::RequeueHandedOver }).await;
+    let seen = w.until("r2 has it", |s| s.task("T1").epoch == 2).await;
+    assert_eq!(seen.robot_of("T1").as_deref(), Some("r2"));
+    let work = seen.work("r2").assignment.expect("an assignment");
+    assert_eq!(work.resume_step, 2, "after the pick");
+    w.lawful().await;
+}

@@ -1,1 +1,119 @@
-//! Scenarios.
+//! Fleet's picture of the rows: kept by the feed and built anew, it is the same.
+
+use crate::harness::{Answer, World, jam, obstacle};
+use midshift_core::fleet::view::{TABLES, View};
+use midshift_core::reason::Code;
+use midshift_core::robot::{HardwareStop, Mode};
+use midshift_core::site::{CORRIDOR, DEMO};
+use midshift_core::task::raw::RawRetry;
+use midshift_store::Store;
+use rand::rngs::StdRng;
+use rand::{RngExt, SeedableRng};
+use std::collections::BTreeMap;
+
+/// Every slot as text, a line a row.
+fn slots(view: &View) -> BTreeMap<&'static str, Vec<String>> {
+    macro_rules! told {
+        ($($slot:ident)*) => { BTreeMap::from([$((stringify!($slot), view.$slot.iter().map(|r| format!("{r:?}")).collect())),*]) };
+    }
+    told!(intakes tasks ended attempts timers holds places authority control counters sites policies desired_work
+        desired_policy clocks marks incidents sessions presence lane_marks held_places)
+}
+
+fn without_empty(mut slots: BTreeMap<&'static str, Vec<String>>) -> BTreeMap<&'static str, Vec<String>> {
+    if let Some(held) = slots.get_mut("held_places") {
+        held.retain(|line| !line.ends_with("{})"));
+    }
+    slots
+}
+
+/// The reconciler's own picture against one built from the rows, once it has absorbed what it committed last.
+async fn pictures_agree(w: &mut World) {
+    let mut last = None;
+    for _ in 0..8 {
+        let kept = w.fleet.look(|view, _, _| slots(view)).await.expect("the reconciler runs");
+        let snapshot = w.store.snapshot(TABLES).await.expect("a snapshot");
+        let now = w.clock.now();
+        let mut view = View::new(w.site.clone(), now, now);
+        view.load(&snapshot.rows, snapshot.seq).expect("readable rows");
+        let (kept, built) = (without_empty(kept), without_empty(slots(&view)));
+        if kept == built {
+            return;
+        }
+        last = Some((kept, built));
+        w.step().await;
+    }
+    let (kept, built) = last.expect("two pictures");
+    for (slot, rows) in kept {
+        assert_eq!(rows, built[slot], "{slot}: kept by the feed, and built anew");
+    }
+}
+
+/// Something happens to one robot.
+async fn mishap(w: &mut World, rng: &mut StdRng, id: &str) {
+    match rng.random_range(0..12) {
+        0 => w.r(id).cut(),
+        1 | 2 => {
+            w.r(id).mend();
+            w.connect(id).await;
+        }
+        3 => w.r(id).fails = Some((rng.random_range(0..3), if rng.random() { jam() } else { obstacle() })),
+        4 => w.r(id).answer = Answer::Refuse(Code::AnotherHolder),
+        5 => w.r(id).answer = Answer::Accept,
+        6 => w.r(id).tells = !w.r(id).tells,
+        7 => {
+            let stop = if rng.random() { HardwareStop::Manual } else { HardwareStop::None };
+            w.r(id).set_hardware_stop(stop);
+        }
+        8 => w.resume(id).await,
+        9 => {
+            let mode = if rng.random() { Mode::Manual } else { Mode::Automatic };
+            w.r(id).set_mode(mode);
+        }
+        10 => w.r(id).confirms = rng.random(),
+        _ => w.r(id).forgets_its_work(),
+    }
+}
+
+async fn random_shift(site: &'static str, stands: &[&str], goals: &[&str], seed: u64) {
+    let mut rng = StdRng::seed_from_u64(seed);
+    let mut w = World::on(site).await;
+    for (n, at) in stands.iter().enumerate() {
+        w.robot(&format!("r{n}"), at).await;
+    }
+    let mut tasks = 0;
+    for _ in 0..60 {
+        if rng.random_range(0..3) == 0 {
+            let (from, to) = (goals[rng.random_range(0..goals.len())], goals[rng.random_range(0..goals.len())]);
+            let retry = RawRetry { max_retry_times: rng.random_range(0..3), ..RawRetry::default() };
+            w.submit_with(&format!("T{tasks}"), from, to, |raw| raw.retry = Some(retry)).await;
+            tasks += 1;
+        }
+        if tasks > 0 && rng.random_range(0..6) == 0 {
+            w.cancel(&format!("T{}", rng.random_range(0..tasks)), rng.random_range(0..3) == 0).await;
+        }
+        let ids = w.robot_ids();
+        let id = ids[rng.random_range(0..ids.len())].clone();
+        mishap(&mut w, &mut rng, &id).await;
+        w.pass(rng.random_range(1..12)).await;
+        if rng.random_range(0..10) == 0 {
+            w.stop_fleet().await;
+            w.pass(rng.random_range(0..40)).await;
+            w.start_fleet();
+            w.step().await;
+        }
+        pictures_agree(&mut w).await;
+    }
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn the_picture_kept_by_the_feed_is_the_one_built_from_the_rows_after_any_shift() {
+    for seed in 0..12 {
+        random_shift(CORRIDOR, &["park-a", "park-b"], &["A", "B"], seed).await;
+    }
+    let goals = ["D01", "A01", "L1-in", "C01", "B03", "Q01", "P02"];
+    for seed in 100..104 {
+        random_shift(DEMO, &["park-1", "park-2", "park-3", "park-4", "hold-a"], &goals, seed).await;
+    }
+}

@@ -13,7 +13,7 @@ async fn the_second_robot_waits_before_an_exclusive_passage_and_goes_when_the_fi
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;
     w.robot("r2", "park-b").await;
-    w.submit_with("T1", "A", "B", |raw| {
+    w.submit_with("T1", "A", "charge", |raw| {
         raw.robot_id = "r1".to_owned();
         raw.stall_ms = Some(3_600_000);
     })
@@ -21,7 +21,7 @@ async fn the_second_robot_waits_before_an_exclusive_passage_and_goes_when_the_fi
     w.until("r1 has the corridor", |s| s.has("r1", "corridor")).await;
     w.r("r1").drives = false;
     w.submit_with("T2", "B", "A", |raw| raw.robot_id = "r2".to_owned()).await;
-    w.until("r2 stands before it", |s| s.has("r2", "wait-b") || s.has("r2", "B")).await;
+    w.until("r2 stands before it", |s| s.holders("wait-b") == [("r2".to_owned(), HolderState::Inside)]).await;
     w.pass_while(100, "one robot at a time", |s| s.has("r1", "corridor") && !s.has("r2", "corridor")).await;
     let waits = v1::ListPlacesRequest { in_use: true, ..Default::default() };
     let listed = w.fleet.list_places(Request::new(waits)).await.expect("places").into_inner().places;

@@ -1,1 +1,114 @@
-//! Scenarios.
+//! The reconciler ends and begins again on the same rows.
+
+use crate::harness::{Answer, World};
+use midshift_core::reason::Code;
+use midshift_core::site::CORRIDOR;
+use midshift_core::task::{Phase, Then};
+
+#[tokio::test(start_paused = true)]
+async fn a_restart_loses_nothing_and_repeats_nothing() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    for n in 0..6 {
+        w.submit(&format!("T{n}"), "A", "B").await;
+    }
+    for n in 0..6 {
+        w.pass(1 + n).await;
+        w.stop_fleet().await;
+        w.pass(2).await;
+        w.start_fleet();
+    }
+    for n in 0..6 {
+        let seen = w.until_phase(&format!("T{n}"), Phase::Succeeded).await;
+        assert_eq!(seen.task(&format!("T{n}")).epoch, 1, "nothing was redone");
+    }
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn no_timer_fires_in_the_first_ten_seconds_and_what_was_left_goes_on() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.pass(2).await;
+    w.r("r1").answer = Answer::Ignore;
+    w.r("r1").hears = false;
+    w.submit("T1", "A", "B").await;
+    w.until_phase("T1", Phase::Assigned).await;
+    w.pass(4).await;
+    w.stop_fleet().await;
+    w.pass(300).await;
+    w.start_fleet();
+    w.pass_while(9, "robots say hello first", |s| s.phase("T1") == Phase::Assigned).await;
+    w.pass(3).await;
+    let seen = w.seen().await;
+    assert_eq!((seen.phase("T1"), seen.task("T1").then), (Phase::Stopping, Some(Then::Requeue)));
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn every_lease_counts_as_renewed_at_the_start() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").works = false;
+    w.submit("T1", "A", "B").await;
+    w.until_phase("T1", Phase::Running).await;
+    w.r("r1").cut();
+    w.pass(20).await;
+    w.stop_fleet().await;
+    w.pass(20).await;
+    w.start_fleet();
+    w.pass_while(30, "the lease began again", |s| !s.is_uncertain("T1")).await;
+    w.until("and ends", |s| s.is_uncertain("T1")).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn events_and_requests_that_came_while_fleet_was_down_have_their_effect_once() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.submit("T1", "A", "B").await;
+    w.until("all is granted", |s| s.has("r1", "B")).await;
+    w.stop_fleet().await;
+    w.pass(30).await;
+    w.submit("T2", "A", "B").await;
+    w.cancel("T2", false).await;
+    w.start_fleet();
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.until_phase("T2", Phase::Canceled).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_restart_over_a_store_in_rest_does_not_repeat_what_was_consumed() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").set_hardware_stop(midshift_core::robot::HardwareStop::Manual);
+    w.pass(2).await;
+    w.r("r1").set_hardware_stop(midshift_core::robot::HardwareStop::None);
+    w.until("it waits for a person", |s| s.tokens("r1") == ["resume:body:r1"]).await;
+    w.resume("r1").await;
+    w.until("resumed", |s| s.tokens("r1").is_empty()).await;
+    for _ in 0..4 {
+        w.pass(30).await;
+        w.stop_fleet().await;
+        w.start_fleet();
+        w.pass_while(20, "the stop of long ago is over", |s| s.tokens("r1").is_empty()).await;
+    }
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_store_behind_the_robot_raises_its_generation_and_says_so() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.pass(2).await;
+    let ahead = w.clock.now().wall.0 as u64 + 86_400_000;
+    w.r("r1").applied = ahead;
+    w.connect("r1").await;
+    let seen = w.until("the generation is raised", |s| s.work("r1").generation > ahead).await;
+    assert_eq!(seen.incidents(), [Code::StoreBehindRobot]);
+    w.submit("T1", "A", "B").await;
+    w.until_phase("T1", Phase::Succeeded).await;
+    assert_eq!(w.seen().await.incidents().len(), 1);
+    w.lawful().await;
+}

@@ -1,6 +1,6 @@
 //! A scripted robot: obeys its desired state by the rules of the link, one small act a step, unless a test tells it otherwise.
 
-use midshift_core::authority::Authority;
+use midshift_core::authority::{Authority, SentHeartbeats};
 use midshift_core::ids::{AttemptId, PlaceId, RobotId, WaypointId};
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{
@@ -65,6 +65,7 @@ pub struct Robot {
     progress: u64,
     progress_at: SiteTime,
     beaten: Option<LinkTime>,
+    sent: SentHeartbeats,
 }
 
 /// A fault that may be tried again.
@@ -130,6 +131,7 @@ impl Robot {
             progress: 0,
             progress_at: SiteTime(0),
             beaten: None,
+            sent: SentHeartbeats::new(0, None),
         }
     }
 
@@ -213,6 +215,7 @@ impl Robot {
         self.session_epoch = (self.session_epoch + 1).max(wall_ms);
         self.hb = 0;
         self.boots += 1;
+        self.sent = SentHeartbeats::new(self.session_epoch, None);
     }
     pub(super) fn session(&self) -> Session {
         Session {
@@ -240,6 +243,7 @@ impl Robot {
     pub(super) fn heartbeat(&mut self, now: &Now) -> Live {
         self.hb += 1;
         self.beaten = Some(now.link);
+        self.sent.sent(self.hb, now.link);
         let vitals =
             Vitals { waypoint: Some(self.here.clone()), battery_permille: self.battery_permille, ..Vitals::default() };
         let report = ReportedState {
@@ -272,7 +276,7 @@ impl Robot {
     pub(super) fn step(&mut self, desired: Option<DesiredWork>, now: &Now) {
         let before = self.progress;
         if let Some(desired) = desired.filter(|d| self.hears && d.generation > self.applied) {
-            self.apply(desired);
+            self.apply(desired, now);
         }
         if !self.paused && self.mode == Mode::Automatic {
             self.act();
@@ -282,10 +286,10 @@ impl Robot {
         }
     }
 
-    fn apply(&mut self, desired: DesiredWork) {
+    fn apply(&mut self, desired: DesiredWork, now: &Now) {
         self.applied = desired.generation;
-        self.obey_holds(&desired);
-        self.take_grants(&desired);
+        self.obey_holds(&desired, now);
+        self.take_grants(&desired, now);
         self.attempts.retain(|a| !desired.closed.contains(&a.attempt));
         let current = self.job.as_ref().map(|j| j.attempt.clone());
         match desired.assignment {
@@ -304,7 +308,7 @@ impl Robot {
                     self.end(WorkState::Aborted, None);
                 }
                 if self.job.is_none() && !new.stop && !self.finished.contains(&new.attempt) {
-                    self.offer(new);
+                    self.offer(new, now);
                 }
             }
             None if current.is_some() && self.confirms => self.end(WorkState::Aborted, None),
@@ -312,10 +316,10 @@ impl Robot {
         }
     }
 
-    fn obey_holds(&mut self, desired: &DesiredWork) {
+    fn obey_holds(&mut self, desired: &DesiredWork, now: &Now) {
         if desired.held {
             self.paused = true;
-        } else if let Some(resume) = desired.resume.filter(|r| self.paused && r.session_epoch == self.session_epoch) {
+        } else if let Some(resume) = desired.resume.filter(|r| self.paused && self.sent.check(r, now.link).is_ok()) {
             self.paused = false;
             self.resumed.push(resume);
         }
@@ -326,7 +330,7 @@ impl Robot {
         }
     }
 
-    fn take_grants(&mut self, desired: &DesiredWork) {
+    fn take_grants(&mut self, desired: &DesiredWork, now: &Now) {
         let granted =
             |p: &HeldPlace| desired.grants.iter().any(|g| g.place_id == p.place_id && g.grant_id == p.grant_id);
         let gone: Vec<HeldPlace> = self.places.iter().filter(|p| !p.inside && !granted(p)).cloned().collect();
@@ -336,7 +340,7 @@ impl Robot {
         }
         for grant in &desired.grants {
             let known = self.places.iter().any(|p| p.place_id == grant.place_id && p.grant_id == grant.grant_id);
-            let current = grant.entry.is_some_and(|e| e.session_epoch == self.session_epoch && e.hb <= self.hb);
+            let current = grant.entry.is_some_and(|e| self.sent.check(&e, now.link).is_ok());
             if current && !known {
                 let (place_id, grant_id) = (grant.place_id.clone(), grant.grant_id);
                 self.places.push(HeldPlace { place_id, grant_id, inside: false });
@@ -344,11 +348,11 @@ impl Robot {
         }
     }
 
-    fn offer(&mut self, new: Assignment) {
+    fn offer(&mut self, new: Assignment, now: &Now) {
         if !self.offered.iter().any(|(id, _)| *id == new.attempt) {
             self.offered.push((new.attempt.clone(), new.offer));
         }
-        let anchored = new.offer.session_epoch == self.session_epoch && new.offer.hb <= self.hb;
+        let anchored = self.sent.check(&new.offer, now.link).is_ok();
         match self.answer {
             Answer::Accept if anchored => {
                 self.at = 0;
