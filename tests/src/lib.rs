@@ -1,1 +1,1 @@
-//! Under construction.
+//! The one integration suite of midshift: its tests are in `tests/tests`, over real programs and real parts.

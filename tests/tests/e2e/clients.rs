@@ -1,0 +1,111 @@
+//! Foreign clients as users have them: grpcurl by reflection, and Python with stubs from stock tools.
+
+use crate::harness::{Running, channel, free_port, midshift, tool, until};
+use midshift_proto::telemetry::v1::ListRobotsRequest;
+use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
+use std::net::SocketAddr;
+use std::path::Path;
+use std::process::{Command, Output};
+use std::time::Duration;
+
+async fn dev(dir: &Path) -> anyhow::Result<(SocketAddr, Running)> {
+    let address = free_port()?;
+    let mut command = Command::new(midshift()?);
+    command.args(["dev", "--robots", "4", "--speedup", "10", "--seed", "3", "--listen", &address.to_string()]);
+    let running = Running::start(&mut command, &dir.join("dev.log"))?;
+    until("four robots", Duration::from_secs(30), || async {
+        let answer = TelemetryServiceClient::new(channel(address)?).list_robots(ListRobotsRequest::default()).await;
+        Ok(answer.ok().filter(|page| page.get_ref().robots.len() == 4).map(|_| ()))
+    })
+    .await?;
+    Ok((address, running))
+}
+
+fn grpcurl(args: &[&str]) -> anyhow::Result<Output> {
+    Ok(Command::new(tool("MIDSHIFT_TEST_GRPCURL")?).arg("-plaintext").args(["-max-time", "60"]).args(args).output()?)
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn grpcurl_lists_submits_watches_and_hears_every_violation() -> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let (address, _dev) = dev(dir.path()).await?;
+    let address = address.to_string();
+    let services = text(&grpcurl(&[&address, "list"])?.stdout);
+    for service in [
+        "midshift.task.v1.TaskService",
+        "midshift.fleet.v1.FleetService",
+        "midshift.sim.v1.SimService",
+        "grpc.health.v1.Health",
+    ] {
+        assert!(services.contains(service), "{services}");
+    }
+    let good = r#"{"request_id":"g1","task_id":"TASK-GRPCURL","flat":{"task_type":"transport","priority":0,"from_waypoint":"A01","to_waypoint":"B03","item_sku":"SKU-1","timeout_seconds":600}}"#;
+    let submitted = grpcurl(&["-d", good, &address, "midshift.task.v1.TaskService/SubmitTask"])?;
+    assert!(submitted.status.success(), "{}", text(&submitted.stderr));
+    assert!(text(&submitted.stdout).contains("TASK-GRPCURL"));
+    let bad = r#"{"flat":{"task_type":"Bad Type","priority":12,"to_waypoint":"nowhere"}}"#;
+    let refused = grpcurl(&["-d", bad, &address, "midshift.task.v1.TaskService/SubmitTask"])?;
+    let said = text(&refused.stderr);
+    assert!(!refused.status.success());
+    for field in ["InvalidArgument", "flat.task_type", "flat.priority", "flat.to_waypoint", "flat.timeout_seconds"] {
+        assert!(said.contains(field), "{field} is not in: {said}");
+    }
+    let watch = r#"{"filter":{"task_ids":["TASK-GRPCURL"]}}"#;
+    let watched = Command::new(tool("MIDSHIFT_TEST_GRPCURL")?)
+        .args(["-plaintext", "-max-time", "20", "-d", watch, &address, "midshift.task.v1.TaskService/WatchTasks"])
+        .output()?;
+    let seen = text(&watched.stdout);
+    assert!(seen.contains("TASK-GRPCURL") && seen.contains("TASK_STATE_SUCCEEDED"), "{seen} {}", text(&watched.stderr));
+    Ok(())
+}
+
+const CLIENT: &str = r#"
+import sys, grpc
+from midshift.task.v1 import task_pb2, task_service_pb2, task_service_pb2_grpc
+channel = grpc.insecure_channel(sys.argv[1])
+client = task_service_pb2_grpc.TaskServiceStub(channel)
+flat = task_pb2.FlatTask(task_type="transport", priority=0, from_waypoint="A02", to_waypoint="B01", item_sku="SKU-2", timeout_seconds=600)
+task = client.SubmitTask(task_service_pb2.SubmitTaskRequest(request_id="py-1", flat=flat), timeout=10).task
+again = client.SubmitTask(task_service_pb2.SubmitTaskRequest(request_id="py-1", flat=flat), timeout=10).task
+assert task.task_id == again.task_id, (task.task_id, again.task_id)
+watch = task_service_pb2.WatchTasksRequest(filter=task_service_pb2.TaskFilter(task_ids=[task.task_id]))
+seen = []
+for message in client.WatchTasks(watch, timeout=60):
+    shown = message.existing if message.HasField("existing") else message.change.task if message.HasField("change") else None
+    if shown is None:
+        continue
+    seen.append(task_pb2.TaskState.Name(shown.state))
+    if shown.state == task_pb2.TASK_STATE_SUCCEEDED:
+        print(task.task_id, " > ".join(seen))
+        sys.exit(0)
+sys.exit("the watch ended: " + " > ".join(seen))
+"#;
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_python_client_from_stock_tools_submits_and_watches() -> anyhow::Result<()> {
+    let python = tool("MIDSHIFT_TEST_PYTHON")?;
+    let dir = tempfile::tempdir()?;
+    let (address, _dev) = dev(dir.path()).await?;
+    let proto = Path::new(env!("CARGO_MANIFEST_DIR")).join("../proto");
+    let out = dir.path().to_string_lossy().into_owned();
+    let mut generate = Command::new(&python);
+    generate
+        .args(["-m", "grpc_tools.protoc", "-I"])
+        .arg(&proto)
+        .args([format!("--python_out={out}"), format!("--grpc_python_out={out}")]);
+    for file in ["common/v1/common.proto", "task/v1/task.proto", "task/v1/task_service.proto"] {
+        generate.arg(proto.join("midshift").join(file));
+    }
+    let generated = generate.output()?;
+    assert!(generated.status.success(), "{}", text(&generated.stderr));
+    let script = dir.path().join("client.py");
+    std::fs::write(&script, CLIENT)?;
+    let ran = Command::new(&python).arg(&script).arg(address.to_string()).env("PYTHONPATH", dir.path()).output()?;
+    assert!(ran.status.success(), "{} {}", text(&ran.stdout), text(&ran.stderr));
+    assert!(text(&ran.stdout).contains("TASK_STATE_SUCCEEDED"));
+    Ok(())
+}

@@ -1,0 +1,147 @@
+//! Starts real programs in folders of their own and ends exactly those; waits for conditions, with limits.
+
+use anyhow::{Context, bail};
+use midshift_proto::task::v1::task_service_client::TaskServiceClient;
+use midshift_proto::task::v1::{ListTasksRequest, Task, TaskFilter, TaskState};
+use std::future::Future;
+use std::net::{SocketAddr, TcpListener};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+use tokio::time::Instant;
+use tonic::transport::{Channel, Endpoint};
+
+/// How often a condition is looked at.
+const LOOK_EVERY: Duration = Duration::from_millis(50);
+
+/// A program named by the environment, or built beside this test.
+pub fn program(variable: &str, name: &str) -> anyhow::Result<PathBuf> {
+    if let Some(path) = std::env::var_os(variable) {
+        return Ok(path.into());
+    }
+    let test = std::env::current_exe()?;
+    let beside = test.parent().and_then(Path::parent).map(|dir| dir.join(name)).filter(|p| p.exists());
+    beside.with_context(|| {
+        format!("{variable} is not set and there is no {name} beside the tests: run `cargo xtask test`")
+    })
+}
+
+/// The midshift program.
+pub fn midshift() -> anyhow::Result<PathBuf> {
+    program("MIDSHIFT_TEST_BIN", "midshift")
+}
+
+/// A tool of `cargo xtask test --install`.
+pub fn tool(variable: &str) -> anyhow::Result<PathBuf> {
+    let path = std::env::var_os(variable)
+        .with_context(|| format!("{variable} is not set: run `cargo xtask test --install`"))?;
+    Ok(path.into())
+}
+
+/// A program that is killed when the test lets it go.
+pub struct Running(Child);
+
+impl Running {
+    /// Starts it; what it says goes to `log`.
+    pub fn start(command: &mut Command, log: &Path) -> anyhow::Result<Self> {
+        let file = std::fs::OpenOptions::new().create(true).append(true).open(log)?;
+        let child = command.stdin(Stdio::null()).stdout(file.try_clone()?).stderr(file).spawn();
+        Ok(Self(child.with_context(|| format!("starting {command:?}"))?))
+    }
+    /// SIGKILL, and waits until it is gone.
+    pub fn kill(&mut self) -> anyhow::Result<()> {
+        self.0.kill()?;
+        self.0.wait()?;
+        Ok(())
+    }
+    /// Whether it has ended by itself.
+    pub fn has_ended(&mut self) -> anyhow::Result<bool> {
+        Ok(self.0.try_wait()?.is_some())
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.kill();
+    }
+}
+
+/// A port nobody has at this moment.
+pub fn free_port() -> anyhow::Result<SocketAddr> {
+    Ok(TcpListener::bind("127.0.0.1:0")?.local_addr()?)
+}
+
+/// Looks until `condition` gives a value; an error names what was waited for.
+pub async fn until<T, F>(what: &str, limit: Duration, mut condition: impl FnMut() -> F) -> anyhow::Result<T>
+where
+    F: Future<Output = anyhow::Result<Option<T>>>,
+{
+    let end = Instant::now() + limit;
+    let mut look = tokio::time::interval(LOOK_EVERY);
+    loop {
+        look.tick().await;
+        if let Some(value) = condition().await? {
+            return Ok(value);
+        }
+        if Instant::now() > end {
+            bail!("waited {limit:?} in vain for: {what}");
+        }
+    }
+}
+
+/// A `midshift serve` on a data directory, which can be killed and started again.
+pub struct Server {
+    /// Where it listens.
+    pub address: SocketAddr,
+    dir: PathBuf,
+    running: Running,
+}
+
+impl Server {
+    /// Starts it and waits until it answers.
+    pub async fn start(dir: &Path) -> anyhow::Result<Self> {
+        let address = free_port()?;
+        let running = Self::run(dir, address)?;
+        let server = Self { address, dir: dir.to_owned(), running };
+        server.answers().await?;
+        Ok(server)
+    }
+    fn run(dir: &Path, address: SocketAddr) -> anyhow::Result<Running> {
+        let mut command = Command::new(midshift()?);
+        command.args(["serve", "--data"]).arg(dir.join("data")).args(["--listen", &address.to_string()]);
+        Running::start(&mut command, &dir.join("server.log"))
+    }
+    /// SIGKILL and a new start on the same data.
+    pub async fn kill_and_restart(&mut self) -> anyhow::Result<()> {
+        self.running.kill()?;
+        self.running = Self::run(&self.dir, self.address)?;
+        self.answers().await
+    }
+    async fn answers(&self) -> anyhow::Result<()> {
+        until("the server's first answer", Duration::from_secs(30), || async {
+            let mut client = TaskServiceClient::new(self.channel()?);
+            let request = ListTasksRequest { page_size: 1, ..ListTasksRequest::default() };
+            Ok(client.list_tasks(request).await.ok().map(|_| ()))
+        })
+        .await
+    }
+    /// A channel that connects when it is used.
+    pub fn channel(&self) -> anyhow::Result<Channel> {
+        channel(self.address)
+    }
+    /// Tasks.
+    pub fn tasks(&self) -> anyhow::Result<TaskServiceClient<Channel>> {
+        Ok(TaskServiceClient::new(self.channel()?))
+    }
+    /// Every task in one of these states; none while the server does not answer.
+    pub async fn in_states(&self, states: &[TaskState]) -> anyhow::Result<Option<Vec<Task>>> {
+        let filter = TaskFilter { states: states.iter().map(|s| *s as i32).collect(), ..TaskFilter::default() };
+        let request = ListTasksRequest { filter: Some(filter), page_size: 1_000, page_token: String::new() };
+        Ok(self.tasks()?.list_tasks(request).await.ok().map(|page| page.into_inner().tasks))
+    }
+}
+
+/// A channel that connects when it is used.
+pub fn channel(address: SocketAddr) -> anyhow::Result<Channel> {
+    Ok(Endpoint::from_shared(format!("http://{address}"))?.connect_lazy())
+}

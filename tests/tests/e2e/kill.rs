@@ -1,0 +1,172 @@
+//! Twenty agent processes survive `kill -9` of the server three times and of five agents once each, while they work.
+
+use crate::harness::{Running, Server, midshift, until};
+use midshift::background::request;
+use midshift_core::site::{DEMO, text};
+use midshift_proto::task::v1::{SubmitTasksRequest, Task, TaskState};
+use midshift_sim::oracle::Oracle;
+use midshift_sim::workload::{Workload, WorkloadConfig};
+use rand::rngs::StdRng;
+use rand::seq::IndexedRandom;
+use rand::{RngExt, SeedableRng};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::Duration;
+
+const ROBOTS: usize = 20;
+const TASKS: usize = 100;
+/// How many times as fast as real the bodies work; clocks are not touched.
+const BODY_SPEED: &str = "5";
+
+struct Robots {
+    dir: PathBuf,
+    server: String,
+    starts: Vec<String>,
+    running: BTreeMap<String, Running>,
+}
+
+impl Robots {
+    fn start(&mut self, number: usize) -> anyhow::Result<()> {
+        let id = format!("rbt-{:02}", number + 1);
+        let dir = self.dir.join(&id);
+        std::fs::create_dir_all(&dir)?;
+        let mut command = Command::new(midshift()?);
+        command.args([
+            "agent",
+            "run",
+            "--robot-id",
+            &id,
+            "--server",
+            &self.server,
+            "--body-speed",
+            BODY_SPEED,
+            "--no-faults",
+        ]);
+        command.args(["--start", &self.starts[number], "--seed", &number.to_string()]).arg("--data").arg(&dir);
+        let running = Running::start(&mut command, &dir.join("agent.log"))?;
+        self.running.insert(id, running);
+        Ok(())
+    }
+    fn kill_and_restart(&mut self, id: &str) -> anyhow::Result<()> {
+        if let Some(running) = self.running.get_mut(id) {
+            running.kill()?;
+        }
+        let number: usize = id.trim_start_matches("rbt-").parse()?;
+        self.start(number - 1)
+    }
+    fn journals(&self) -> Vec<PathBuf> {
+        self.running.keys().map(|id| self.dir.join(id).join("journal.jsonl")).collect()
+    }
+}
+
+async fn done_and_running(server: &Server) -> anyhow::Result<Option<(usize, Vec<Task>)>> {
+    let done = server.in_states(&[TaskState::Succeeded]).await?;
+    let running = server.in_states(&[TaskState::Running]).await?;
+    Ok(done.zip(running).map(|(done, running)| (done.len(), running)))
+}
+
+/// Waits until so many tasks are done and others are provably at work.
+async fn at_work(server: &Server, done: usize, limit: Duration) -> anyhow::Result<Vec<Task>> {
+    until(&format!("{done} tasks done and others at work"), limit, || async {
+        Ok(done_and_running(server)
+            .await?
+            .filter(|(n, running)| *n >= done && running.len() >= 3)
+            .map(|(_, running)| running))
+    })
+    .await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn nothing_is_lost_and_nothing_done_twice_when_server_and_agents_are_killed_at_work() -> anyhow::Result<()> {
+    let seed: u64 = std::env::var("MIDSHIFT_SEED").ok().and_then(|s| s.parse().ok()).unwrap_or(20_261_120);
+    let mut rng = StdRng::seed_from_u64(seed);
+    let dir = tempfile::tempdir()?;
+    let site = text::parse(DEMO)?;
+    let mut server = Server::start(dir.path()).await?;
+    let starts = site.starting_places(ROBOTS).into_iter().map(|at| site.name_of(at).to_string()).collect();
+    let mut robots =
+        Robots { dir: dir.path().to_owned(), server: server.address.to_string(), starts, running: BTreeMap::new() };
+    for number in 0..ROBOTS {
+        robots.start(number)?;
+    }
+    submit(&server, &site, seed).await?;
+    let limit = Duration::from_secs(120);
+    let mut kills: Vec<(usize, bool)> =
+        [(8, true), (16, false), (24, false), (32, true), (40, false), (48, false), (56, true), (62, false)]
+            .into_iter()
+            .map(|(at, of_server)| (at + rng.random_range(0..6), of_server))
+            .collect();
+    kills.sort_unstable();
+    let mut inside = Vec::new();
+    for (at, of_server) in kills {
+        let running = at_work(&server, at, limit).await?;
+        if of_server {
+            eprintln!("seed {seed}: kill -9 of the server with {at} done and {} at work", running.len());
+            server.kill_and_restart().await?;
+            continue;
+        }
+        let Some(task) = running.choose(&mut rng) else { anyhow::bail!("nothing is at work") };
+        eprintln!("seed {seed}: kill -9 of {} at work on {} with {at} done", task.robot_id, task.task_id);
+        inside.push(task.task_id.clone());
+        robots.kill_and_restart(&task.robot_id)?;
+    }
+    let over =
+        [TaskState::Succeeded, TaskState::Failed, TaskState::Canceled, TaskState::Expired, TaskState::NeedsOperator];
+    let ended = until("the end of every task", Duration::from_secs(240), || async {
+        Ok(server.in_states(&over).await?.filter(|tasks| tasks.len() == TASKS))
+    })
+    .await;
+    if ended.is_err() {
+        let open = server
+            .in_states(&[
+                TaskState::Queued,
+                TaskState::Assigned,
+                TaskState::Running,
+                TaskState::Stopping,
+                TaskState::RetryWait,
+            ])
+            .await?;
+        for task in open.unwrap_or_default() {
+            eprintln!("open: {} {:?} {} {:?}", task.task_id, task.state(), task.robot_id, task.attempt);
+        }
+    }
+    judge(&ended?, &inside, &site, &robots)
+}
+
+async fn submit(server: &Server, site: &midshift_core::site::Site, seed: u64) -> anyhow::Result<()> {
+    let mut workload =
+        Workload::new(WorkloadConfig::background(seed), site).ok_or_else(|| anyhow::anyhow!("no stations"))?;
+    let items: Vec<SubmitTasksRequest> = (0..TASKS)
+        .map(|i| {
+            let mut item = request(&workload.next_transport());
+            item.request_id = format!("kill-{i}");
+            SubmitTasksRequest { item: Some(item) }
+        })
+        .collect();
+    let answer = server.tasks()?.submit_tasks(tokio_stream::iter(items)).await?.into_inner();
+    anyhow::ensure!(answer.results.len() == TASKS, "{} of {TASKS} answered", answer.results.len());
+    Ok(())
+}
+
+fn judge(tasks: &[Task], inside: &[String], site: &midshift_core::site::Site, robots: &Robots) -> anyhow::Result<()> {
+    let succeeded = tasks.iter().filter(|t| t.state() == TaskState::Succeeded).count();
+    let others: Vec<_> = tasks.iter().filter(|t| t.state() != TaskState::Succeeded).collect();
+    for task in &others {
+        eprintln!("{} ended {:?}: {:?}", task.task_id, task.state(), task.reason);
+    }
+    assert!(succeeded * 100 >= TASKS * 95, "{succeeded} of {TASKS} succeeded");
+    for task in &others {
+        assert_eq!(task.state(), TaskState::NeedsOperator, "{}", task.task_id);
+        assert!(inside.contains(&task.task_id), "{} needs an operator and its agent was not killed", task.task_id);
+    }
+    let paths = robots.journals();
+    let paths: Vec<&Path> = paths.iter().map(PathBuf::as_path).collect();
+    let verdict = Oracle::read(site, paths)?.verdict();
+    eprintln!("{verdict:?}");
+    assert!(verdict.items_made >= succeeded as u64, "the journals show the work: {verdict:?}");
+    assert!(verdict.items_conserved(), "{verdict:?}");
+    assert_eq!(verdict.steps_done_twice, 0, "{verdict:?}");
+    assert_eq!(verdict.exclusion_violations, 0, "{verdict:?}");
+    Ok(())
+}

@@ -1,0 +1,8 @@
+//! Real programs as a user has them: the midshift binary, agents killed with SIGKILL, grpcurl, a Python client.
+//!
+//! `cargo xtask test` builds the programs once and says where they are.
+
+mod clients;
+mod cut;
+mod harness;
+mod kill;
