@@ -10,7 +10,7 @@ pub use robot::{Answer, Robot, jam, obstacle};
 pub use seen::Seen;
 
 use midshift_core::ids::{RobotId, TaskId};
-use midshift_core::rows::{Expect, Item, Revision, Seq, Writer};
+use midshift_core::rows::{Expect, Item, Seq, Writer};
 use midshift_core::site::{Site, text};
 use midshift_core::task::forms::Transport;
 use midshift_core::task::{Ask, Phase, RawTask, TaskIntake, TaskRequest, TaskState};
@@ -328,11 +328,6 @@ impl World {
     /// Every robot's id.
     pub fn robot_ids(&self) -> Vec<String> {
         self.robots.keys().cloned().collect()
-    }
-
-    /// Revision of a row, as a caller's etag says it.
-    pub fn etag(revision: Revision) -> String {
-        midshift_proto::convert::task::etag(revision)
     }
 }
 

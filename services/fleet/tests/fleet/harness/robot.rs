@@ -192,14 +192,8 @@ impl Robot {
         self.job = None;
         self.attempts.clear();
     }
-    pub fn steps_done(&self) -> u32 {
-        self.step
-    }
     pub fn is_idle(&self) -> bool {
         self.job.is_none()
-    }
-    pub fn listed(&self) -> Vec<AttemptId> {
-        self.attempts.iter().map(|a| a.attempt.clone()).collect()
     }
     pub fn session_epoch(&self) -> u64 {
         self.session_epoch
