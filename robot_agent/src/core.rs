@@ -562,7 +562,12 @@ impl AgentCore {
         let session = self.session.as_mut()?;
         session.hb += 1;
         self.sent.sent(session.hb, now.link);
-        Some(Heartbeat { reported: self.reported(now), sent_unix_us: now.wall.0 * 1000, clock: self.clock.take() })
+        let mut reported = self.reported(now);
+        if self.desired.is_none() {
+            // Grants are not on the ledger: until the server has said them again, what is not listed here proves nothing.
+            reported.applied_work = 0;
+        }
+        Some(Heartbeat { reported, sent_unix_us: now.wall.0 * 1000, clock: self.clock.take() })
     }
 
     /// Whether the body is under way for this work.

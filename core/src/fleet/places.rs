@@ -112,7 +112,9 @@ pub fn advance(view: &mut View, board: &Board, now: Now, plan: &mut Plan) -> Rel
     for (robot_id, live) in board {
         let Some(id) = view.held_by(robot_id) else { continue };
         let Some(a) = view.attempt(id) else { continue };
-        if may_drive(view, a, live, board, &now) && !is_released(view, robot_id, a) {
+        if may_drive(view, a, live, board, &now)
+            && !(is_released(view, robot_id, a) && missing(view, live, a).is_empty())
+        {
             let since = view.waits.get(robot_id).map_or(now.site, |w| w.since);
             wishes.push(Wish { class: class_of(view, a), since, robot_id: robot_id.clone() });
         }
@@ -123,7 +125,8 @@ pub fn advance(view: &mut View, board: &Board, now: Now, plan: &mut Plan) -> Rel
     let mut releases = Releases::default();
     let mut blocked = BTreeSet::new();
     for wish in &wishes {
-        plan.decide(view, now, "fleet", |tx| serve(tx, &wish.robot_id, &mut releases, &mut blocked));
+        let Some(live) = board.get(&wish.robot_id) else { continue };
+        plan.decide(view, now, "fleet", |tx| serve(tx, live, &mut releases, &mut blocked));
     }
     plan.report.tally.waiting_for_place = view.waits.len() as u64;
     releases
@@ -180,16 +183,23 @@ fn next_segment(view: &View, robot_id: &RobotId, a: &Attempt, work: &Assignment)
     (unentered <= 1).then_some(segment)
 }
 
-fn serve(tx: &mut Tx, robot_id: &RobotId, releases: &mut Releases, blocked: &mut BTreeSet<PlaceIx>) {
+fn serve(tx: &mut Tx, live: &Live, releases: &mut Releases, blocked: &mut BTreeSet<PlaceIx>) {
+    let robot_id = &live.robot_id;
     let Some(a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
     let Some(work) = assignment(tx.view, robot_id, &a).cloned() else { return };
-    let Some(segment) = next_segment(tx.view, robot_id, &a, &work) else { return };
-    let needed = segment.places();
+    let lost = missing(tx.view, live, &a);
+    let (needed, released) = match next_segment(tx.view, robot_id, &a, &work) {
+        _ if !lost.is_empty() => (lost, None),
+        Some(segment) => (segment.places(), Some(segment.end as u32)),
+        None => return,
+    };
     if grantable(tx.view, robot_id, &needed, blocked) {
         grant(tx, robot_id, &needed);
         tx.view.waits.remove(robot_id);
         tx.view.dirty.insert(robot_id.clone());
-        releases.0.insert(robot_id.clone(), Release { route: None, released_index: segment.end as u32 });
+        if let Some(released_index) = released {
+            releases.0.insert(robot_id.clone(), Release { route: None, released_index });
+        }
         return;
     }
     let names = needed.iter().map(|p| tx.view.site.place(*p).place_id.clone()).collect();
@@ -200,6 +210,23 @@ fn serve(tx: &mut Tx, robot_id: &RobotId, releases: &mut Releases, blocked: &mut
     if !step_aside(tx, &a, &work, since, releases, blocked) {
         blocked.extend(needed);
     }
+}
+
+/// Places on the released stretch ahead that a standing robot does not hold: a passage that its route crosses a second time, or grants that
+/// it lost with its memory. Only a settled, newest report tells.
+fn missing(view: &View, live: &Live, a: &Attempt) -> Vec<PlaceIx> {
+    let standing = live.report.vitals.speed_mm_s == 0;
+    let Some(reported) = live.report.attempts.iter().find(|r| r.attempt == a.attempt) else { return Vec::new() };
+    let Some(work) = assignment(view, &live.robot_id, a) else { return Vec::new() };
+    if !standing || !super::repair::is_settled(view, live) || !super::repair::is_fresh(view, live) {
+        return Vec::new();
+    }
+    let released = work.released_index.unwrap_or(0) as usize;
+    let ahead = work.route.iter().take(released + 1).skip(reported.route_index as usize + 1);
+    let needed = ahead.flat_map(|p| p.passages.iter().chain(&p.standing));
+    let held = |id: &PlaceId| view.places.get(id.as_str()).is_some_and(|p| p.row.holder(&live.robot_id).is_some());
+    let lost: BTreeSet<PlaceIx> = needed.filter(|id| !held(id)).filter_map(|id| view.site.find_place(id)).collect();
+    lost.into_iter().collect()
 }
 
 fn grantable(view: &View, robot_id: &RobotId, needed: &[PlaceIx], blocked: &BTreeSet<PlaceIx>) -> bool {
