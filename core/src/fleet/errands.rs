@@ -155,6 +155,8 @@ pub fn report(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
         WorkState::Navigating => AttemptPhase::Navigating,
         WorkState::Executing => AttemptPhase::Executing,
         WorkState::Paused | WorkState::Stopping | WorkState::StepUnknown => AttemptPhase::Paused,
+        // Refused after it was accepted: the robot has lost its memory of it.
+        WorkState::Refused if a.accepted.is_some() => AttemptPhase::Aborted,
         WorkState::Refused => AttemptPhase::Refused,
         WorkState::Succeeded => AttemptPhase::Succeeded,
         WorkState::Failed => AttemptPhase::Failed,
@@ -167,7 +169,7 @@ pub fn report(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
         }
         a.phase = live;
         end_attempt(tx, &mut a);
-    } else if a.phase != AttemptPhase::Stopping {
+    } else if a.phase.transitions().contains(&live) {
         a.phase = live;
     }
     tx.put(a, "errand.changed");

@@ -1,15 +1,20 @@
 //! Fleet's picture of the rows: kept by the feed and built anew, it is the same.
 
 use crate::harness::{Answer, World, jam, obstacle};
+use midshift_core::fleet::rows::{HolderState, Place, RobotAuthority, RobotHolder};
 use midshift_core::fleet::view::{TABLES, View};
 use midshift_core::reason::Code;
 use midshift_core::robot::{HardwareStop, Mode};
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::raw::RawRetry;
+use midshift_core::task::{Phase, TaskState};
+use midshift_proto::fleet::v1;
+use midshift_proto::fleet::v1::fleet_service_server::FleetService;
 use midshift_store::Store;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use std::collections::BTreeMap;
+use tonic::Request;
 
 /// Every slot as text, a line a row.
 fn slots(view: &View) -> BTreeMap<&'static str, Vec<String>> {
@@ -104,7 +109,40 @@ async fn random_shift(site: &'static str, stands: &[&str], goals: &[&str], seed:
         }
         pictures_agree(&mut w).await;
     }
+    all_is_well_again(&mut w).await;
+    pictures_agree(&mut w).await;
     w.lawful().await;
+}
+
+/// Every trouble ends; then every task must end, or be before a person, and no robot may be kept for nothing.
+async fn all_is_well_again(w: &mut World) {
+    for id in w.robot_ids() {
+        let robot = w.r(&id);
+        robot.mend();
+        robot.answer = Answer::Accept;
+        robot.confirms = true;
+        robot.fails = None;
+        robot.load = None;
+        robot.set_hardware_stop(HardwareStop::None);
+        robot.set_mode(Mode::Automatic);
+        w.connect(&id).await;
+        w.pass(3).await;
+        w.resume(&id).await;
+        let uncordon = v1::UncordonRobotRequest { robot_id: id, ..Default::default() };
+        w.fleet.uncordon_robot(Request::new(uncordon)).await.expect("uncordoned");
+    }
+    w.until("every task has ended or is before a person, and every robot is free", |s| {
+        let over = |p: Phase| p.is_terminal() || p == Phase::NeedsOperator;
+        let tasks = s.all::<TaskState>().iter().all(|t| over(t.phase));
+        tasks && s.all::<RobotAuthority>().iter().all(|a| a.holder == RobotHolder::None)
+    })
+    .await;
+    w.until("no place is closed or held by nobody", |s| {
+        s.all::<Place>()
+            .iter()
+            .all(|p| p.quarantine.is_none() && p.holders.iter().all(|h| h.state == HolderState::Inside))
+    })
+    .await;
 }
 
 #[tokio::test(start_paused = true)]
