@@ -51,7 +51,13 @@ pub fn percentile(values: &[f64], share: f64) -> f64 {
 
 impl Figure {
     /// From the values of several runs and those of its limit.
-    pub fn of(target: &'static str, name: impl Into<String>, unit: &'static str, values: &[f64], limit: Option<(&str, &[f64])>) -> Self {
+    pub fn of(
+        target: &'static str,
+        name: impl Into<String>,
+        unit: &'static str,
+        values: &[f64],
+        limit: Option<(&str, &[f64])>,
+    ) -> Self {
         let limit = limit.map(|(name, values)| Limit { name: name.to_owned(), median: median(values) });
         let middle = median(values);
         Self {
@@ -70,9 +76,13 @@ impl Figure {
 
 /// The figures as a table.
 pub fn table(figures: &[Figure]) -> String {
-    let mut text = format!("{:<4} {:<52} {:>12} {:>12} {:>12} {:<8} {:>4}  {:<38} {:>10} {:>7}\n", "", "figure", "median", "min", "max", "unit", "runs", "beside", "median", "ratio");
+    let mut text = format!(
+        "{:<4} {:<52} {:>12} {:>12} {:>12} {:<8} {:>4}  {:<38} {:>10} {:>7}\n",
+        "", "figure", "median", "min", "max", "unit", "runs", "beside", "median", "ratio"
+    );
     for f in figures {
-        let (name, limit) = f.limit.as_ref().map_or(("", String::new()), |l| (l.name.as_str(), format!("{:.3}", l.median)));
+        let (name, limit) =
+            f.limit.as_ref().map_or(("", String::new()), |l| (l.name.as_str(), format!("{:.3}", l.median)));
         let ratio = f.ratio.map(|r| format!("{r:.3}")).unwrap_or_default();
         text += &format!(
             "{:<4} {:<52} {:>12.3} {:>12.3} {:>12.3} {:<8} {:>4}  {:<38} {:>10} {:>7}\n",

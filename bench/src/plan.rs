@@ -23,7 +23,8 @@ const REFERENCE_STEPS: u64 = 20_000_000;
 
 /// Plans at three sizes of fleet, each with half as many tasks again as robots.
 pub fn run() -> anyhow::Result<Vec<Figure>> {
-    let map = format!("type octile\nheight {SIDE}\nwidth {SIDE}\nmap\n{}", format!("{}\n", ".".repeat(SIDE)).repeat(SIDE));
+    let map =
+        format!("type octile\nheight {SIDE}\nwidth {SIDE}\nmap\n{}", format!("{}\n", ".".repeat(SIDE)).repeat(SIDE));
     let site = Arc::new(grid::parse_map("bench", &map)?);
     let mut figures = Vec::new();
     for robots in [100, 1_000, 10_000] {
@@ -36,7 +37,13 @@ pub fn run() -> anyhow::Result<Vec<Figure>> {
         let name = format!("whole cycle, {robots} idle robots, {} tasks, p50", robots * 3 / 2);
         figures.push(Figure::of("P6", name, "ms", &ours, Some(("fixed reference loop", &reference))));
         let p99 = percentile(&ours, 0.99);
-        figures.push(Figure::of("P6", format!("whole cycle, {robots} idle robots, p99"), "ms", &[p99], Some(("fixed reference loop", &reference))));
+        figures.push(Figure::of(
+            "P6",
+            format!("whole cycle, {robots} idle robots, p99"),
+            "ms",
+            &[p99],
+            Some(("fixed reference loop", &reference)),
+        ));
     }
     Ok(figures)
 }
@@ -60,7 +67,12 @@ fn instant() -> Instant {
 }
 
 fn cycle_ms(site: &Arc<Site>, robots: usize, tasks: usize, seed: u64) -> f64 {
-    let now = Now { site: SiteTime(60_000), link: LinkTime(60_000), utc: Utc(1_800_000_000_000), wall: Utc(1_800_000_000_000) };
+    let now = Now {
+        site: SiteTime(60_000),
+        link: LinkTime(60_000),
+        utc: Utc(1_800_000_000_000),
+        wall: Utc(1_800_000_000_000),
+    };
     let (mut view, board) = fleet(site, robots, tasks, seed, now);
     let mut plan = Plan::default();
     found(&mut view, now, "", &mut plan);
@@ -86,7 +98,8 @@ fn fleet(site: &Arc<Site>, robots: usize, tasks: usize, seed: u64, now: Now) -> 
     let goals: Vec<usize> = (0..400).map(|_| draw(cells)).collect();
     for i in 0..robots {
         let robot_id = RobotId::parse(&format!("rbt-{i:05}")).expect("a valid id");
-        let inventory = Inventory { capabilities: vec!["pick".into(), "place".into()], payload_g: 10_000, ..Inventory::default() };
+        let inventory =
+            Inventory { capabilities: vec!["pick".into(), "place".into()], payload_g: 10_000, ..Inventory::default() };
         let session = Session {
             robot_id: robot_id.clone(),
             session_epoch: 1,
