@@ -34,7 +34,7 @@ pub enum Pressure {
 /// Where the tasks come from.
 pub enum Source {
     /// Drawn for the site.
-    Drawn(Workload),
+    Drawn(Box<Workload>),
     /// Read from a list, which may end.
     Listed(VecDeque<SubmitTaskRequest>),
 }
@@ -44,7 +44,7 @@ impl Source {
     pub fn drawn(site: &Site, seed: u64) -> anyhow::Result<Self> {
         let workload = Workload::new(WorkloadConfig::background(seed), site)
             .context("the site has no two stations to carry between")?;
-        Ok(Self::Drawn(workload))
+        Ok(Self::Drawn(Box::new(workload)))
     }
     fn next(&mut self) -> Option<SubmitTaskRequest> {
         match self {

@@ -19,6 +19,14 @@ const TASKS: usize = 100;
 /// How many times as fast as real the bodies work; clocks are not touched.
 const BODY_SPEED: &str = "5";
 
+/// Printed points make a failing run readable.
+macro_rules! say {
+    ($($text:tt)*) => {{
+        use std::io::Write;
+        let _ = writeln!(std::io::stderr(), $($text)*);
+    }};
+}
+
 struct Robots {
     dir: PathBuf,
     server: String,
@@ -102,12 +110,12 @@ async fn nothing_is_lost_and_nothing_done_twice_when_server_and_agents_are_kille
     for (at, of_server) in kills {
         let running = at_work(&server, at, limit).await?;
         if of_server {
-            eprintln!("seed {seed}: kill -9 of the server with {at} done and {} at work", running.len());
+            say!("seed {seed}: kill -9 of the server with {at} done and {} at work", running.len());
             server.kill_and_restart().await?;
             continue;
         }
         let Some(task) = running.choose(&mut rng) else { anyhow::bail!("nothing is at work") };
-        eprintln!("seed {seed}: kill -9 of {} at work on {} with {at} done", task.robot_id, task.task_id);
+        say!("seed {seed}: kill -9 of {} at work on {} with {at} done", task.robot_id, task.task_id);
         inside.push(task.task_id.clone());
         robots.kill_and_restart(&task.robot_id)?;
     }
@@ -128,7 +136,7 @@ async fn nothing_is_lost_and_nothing_done_twice_when_server_and_agents_are_kille
             ])
             .await?;
         for task in open.unwrap_or_default() {
-            eprintln!("open: {} {:?} {} {:?}", task.task_id, task.state(), task.robot_id, task.attempt);
+            say!("open: {} {:?} {} {:?}", task.task_id, task.state(), task.robot_id, task.attempt);
         }
     }
     judge(&ended?, &inside, &site, &robots)
@@ -153,7 +161,7 @@ fn judge(tasks: &[Task], inside: &[String], site: &midshift_core::site::Site, ro
     let succeeded = tasks.iter().filter(|t| t.state() == TaskState::Succeeded).count();
     let others: Vec<_> = tasks.iter().filter(|t| t.state() != TaskState::Succeeded).collect();
     for task in &others {
-        eprintln!("{} ended {:?}: {:?}", task.task_id, task.state(), task.reason);
+        say!("{} ended {:?}: {:?}", task.task_id, task.state(), task.reason);
     }
     assert!(succeeded * 100 >= TASKS * 95, "{succeeded} of {TASKS} succeeded");
     for task in &others {
@@ -163,7 +171,7 @@ fn judge(tasks: &[Task], inside: &[String], site: &midshift_core::site::Site, ro
     let paths = robots.journals();
     let paths: Vec<&Path> = paths.iter().map(PathBuf::as_path).collect();
     let verdict = Oracle::read(site, paths)?.verdict();
-    eprintln!("{verdict:?}");
+    say!("{verdict:?}");
     assert!(verdict.items_made >= succeeded as u64, "the journals show the work: {verdict:?}");
     assert!(verdict.items_conserved(), "{verdict:?}");
     assert_eq!(verdict.steps_done_twice, 0, "{verdict:?}");

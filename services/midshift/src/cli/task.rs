@@ -482,7 +482,7 @@ async fn explain(one: &One, out: &Out) -> Result<(), Exit> {
     };
     let e = answer.explanation.clone().unwrap_or_default();
     out.one(&answer, &task_id, || {
-        let mut text = format!("{task_id}");
+        let mut text = task_id.clone();
         if let Some(position) = e.position {
             text += &format!("  number {position} in the queue");
         }
