@@ -116,8 +116,11 @@ pub async fn agent(args: AgentRun, stop: CancellationToken) -> anyhow::Result<()
     if args.no_faults {
         config.faults = FaultRates::none();
     }
-    let world = WorldConfig { auto_stock: true, ..WorldConfig::default() };
-    let (body, _world) = SimBody::restore(config, site, world, &args.data, clock.now().site)?;
+    let now = clock.now();
+    // Journals of several processes are judged together: by UTC, and by names of items that differ.
+    let utc_base_ms = now.utc.0 - i64::try_from(now.site.0).unwrap_or(0);
+    let world = WorldConfig { tag: format!("{robot_id}-"), auto_stock: true, utc_base_ms, ..WorldConfig::default() };
+    let (body, _world) = SimBody::restore(config, site, world, &args.data, now.site)?;
     let handle = SimHandle::new(body);
     let network = handle.network();
     let dial = midshift_agent::dial::TcpDial::new(&uri(&args.server), Some(network))?;
