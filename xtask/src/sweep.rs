@@ -1,6 +1,6 @@
 //! Long sweeps and golden files: calls of `cargo test` with an environment variable that the tests read.
 //!
-//! Invariant: a sweep that ran no test fails. `MIDSHIFT_SEEDS` and `MIDSHIFT_SEED_FROM` are read by the simulation, `BLESS`
+//! Invariant: a sweep that ran no test fails. `MIDSHIFT_SEED` is read by the test that kills programs, `BLESS`
 //! by tests with `golden` in their name.
 
 use crate::parts::Count;
@@ -8,17 +8,20 @@ use crate::run;
 use crate::workspace::Workspace;
 use anyhow::{Result, ensure};
 
-/// Runs the simulation with seeds `from .. from + seeds`; whether all held.
+/// Kills servers and agents at work, once with each seed of `from .. from + seeds`; whether all held. Ends at the first that does not.
 pub fn torture(workspace: &Workspace, from: u64, seeds: u64) -> Result<bool> {
     ensure!(seeds > 0, "--seeds must be at least 1");
-    let mut command =
-        workspace.cargo(&["test", "--package", "midshift-tests", "--test", "*", "--", "simulation", "--nocapture"]);
-    command.env("MIDSHIFT_SEEDS", seeds.to_string()).env("MIDSHIFT_SEED_FROM", from.to_string());
-    let passed = counted(&mut command)?;
-    if !passed {
-        run::say("next: cargo xtask torture --from SEED --seeds 1, with the seed printed above");
+    ensure!(run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins"]))?, "the programs do not build");
+    for seed in from..from.saturating_add(seeds) {
+        let mut command =
+            workspace.cargo(&["test", "--package", "midshift-tests", "--test", "e2e", "--", "kill::", "--nocapture"]);
+        workspace.export_programs(&mut command)?;
+        if !counted(command.env("MIDSHIFT_SEED", seed.to_string()))? {
+            run::say(&format!("next: cargo xtask torture --from {seed} --seeds 1"));
+            return Ok(false);
+        }
     }
-    Ok(passed)
+    Ok(true)
 }
 
 /// Runs the tests that hold golden files and lets them write what they see.
