@@ -46,6 +46,7 @@ async fn a_robot_that_is_resumed_while_it_is_not_heard_moves_once_it_is() {
     w.r("r1").cut();
     w.until("nobody knows", |s| s.is_uncertain("T1")).await;
     w.r("r1").works = true;
+    w.board.remove(&midshift_core::ids::RobotId::parse("r1").expect("an id"));
     w.resume("r1").await;
     w.until("the token is gone", |s| s.tokens("r1").is_empty()).await;
     w.pass(30).await;

@@ -3,8 +3,10 @@
 use crate::harness::{Answer, World, jam, obstacle};
 use midshift_core::fleet::rows::{HolderState, Place, RobotAuthority, RobotHolder};
 use midshift_core::fleet::view::{TABLES, View};
+use midshift_core::fleet::{Plan, absorb};
 use midshift_core::reason::Code;
 use midshift_core::robot::{HardwareStop, Mode};
+use midshift_core::rows::{Log, Seq, Table};
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::raw::RawRetry;
 use midshift_core::task::{Phase, TaskState};
@@ -143,6 +145,30 @@ async fn all_is_well_again(w: &mut World) {
             .all(|p| p.quarantine.is_none() && p.holders.iter().all(|h| h.state == HolderState::Inside))
     })
     .await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_picture_built_from_rows_is_not_set_back_by_older_entries_and_goes_on_behind_its_mark() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.submit("T1", "A", "B").await;
+    w.until_phase("T1", Phase::Succeeded).await;
+    let snapshot = w.store.snapshot(TABLES).await.expect("a snapshot");
+    let now = w.clock.now();
+    let mut view = View::new(w.site.clone(), now, now);
+    view.load(&snapshot.rows, snapshot.seq).expect("readable rows");
+    let mark = view.marks["fleet"].row.seq;
+    assert!(mark > Seq(0) && view.absorbed == mark);
+    let before = slots(&view);
+    let entries = w.store.feed(Seq(0), &[Log::Fleet], 5_000).await.expect("the feed").entries;
+    let gone = entries.iter().filter(|e| e.table == Some(Table::Timer) && e.body.is_some()).count();
+    assert!(gone > 0, "there were timers that are gone now");
+    for entry in entries {
+        let mut plan = Plan::default();
+        absorb(&mut view, now, &[entry], &mut plan);
+        assert_eq!(slots(&view), before);
+    }
+    w.lawful().await;
 }
 
 #[tokio::test(start_paused = true)]

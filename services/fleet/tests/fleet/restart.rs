@@ -98,6 +98,35 @@ async fn a_restart_over_a_store_in_rest_does_not_repeat_what_was_consumed() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_store_that_fails_for_a_while_loses_no_work_and_no_time() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").works = false;
+    w.submit_with("T1", "A", "B", |raw| {
+        raw.timeout_ms = Some(200_000);
+        raw.stall_ms = Some(3_600_000);
+    })
+    .await;
+    let seen = w.until("it stands in A", |s| s.has("r1", "A") && !s.has("r1", "park-a")).await;
+    let accepted = seen.attempt("T1").accepted.expect("accepted");
+    w.pass(150).await;
+    w.shaky.fail(true);
+    w.submit("T2", "A", "B").await;
+    w.r("r1").works = true;
+    w.pass(1).await;
+    w.r("r1").drives = false;
+    w.pass(5).await;
+    assert!(w.shaky.failed() > 3, "the fault happened");
+    w.shaky.fail(false);
+    let seen = w.until_phase("T1", Phase::Stopping).await;
+    let took_ms = seen.task("T1").changed.ms_since(accepted);
+    assert!((200_000..202_000).contains(&took_ms), "its time went on: {took_ms} ms");
+    w.r("r1").drives = true;
+    w.until("both go on", |s| s.phase("T1") == Phase::NeedsOperator || s.phase("T1").is_terminal()).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_store_behind_the_robot_raises_its_generation_and_says_so() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;

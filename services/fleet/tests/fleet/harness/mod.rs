@@ -5,9 +5,11 @@
 mod laws;
 mod robot;
 mod seen;
+mod shaky;
 
 pub use robot::{Answer, Robot, jam, obstacle};
 pub use seen::Seen;
+pub use shaky::Shaky;
 
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::rows::{Expect, Item, Seq, Writer};
@@ -39,6 +41,8 @@ struct Running {
 
 pub struct World {
     pub store: Arc<MemoryStore>,
+    /// The store as fleet sees it.
+    pub shaky: Arc<Shaky>,
     pub board: Arc<LiveBoard<Live>>,
     pub clock: Arc<dyn Clock>,
     pub site: Arc<Site>,
@@ -66,8 +70,9 @@ impl World {
         let site = Arc::new(text::parse(site_text).expect("a site"));
         let store = MemoryStore::new(site.site_id().clone(), StoreId(Arc::from("world")), clock.clone());
         let (store, board) = (Arc::new(store), LiveBoard::new());
+        let shaky = Shaky::over(store.clone());
         let parts = Parts {
-            store: store.clone(),
+            store: shaky.clone(),
             board: board.clone(),
             site: site.clone(),
             site_text: site_text.to_owned(),
@@ -77,14 +82,14 @@ impl World {
         let robots = BTreeMap::new();
         let running = vec![running];
         let mut world =
-            Self { store, board, clock, site, fleet, text: site_text, robots, running, submitted: 0, asked: 0 };
+            Self { store, shaky, board, clock, site, fleet, text: site_text, robots, running, submitted: 0, asked: 0 };
         world.step().await;
         world
     }
 
     fn parts(&self) -> Parts {
         Parts {
-            store: self.store.clone(),
+            store: self.shaky.clone(),
             board: self.board.clone(),
             site: self.site.clone(),
             site_text: self.text.to_owned(),
