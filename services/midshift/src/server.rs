@@ -136,7 +136,9 @@ impl Server {
             let handle = handle.clone();
             async move { handle.map(|h| h.render()).unwrap_or_default() }
         };
-        Ok(Routes::from(routes.routes().into_axum_router().route("/metrics", get(metrics))))
+        // Browsers speak gRPC-Web to the services; Prometheus speaks plain HTTP/1.1 to the page beside them.
+        let services = routes.routes().into_axum_router().layer(tonic_web::GrpcWebLayer::new());
+        Ok(Routes::from(services.route("/metrics", get(metrics))))
     }
 
     /// Serves connections until shutdown, then drains and cuts.
@@ -155,7 +157,6 @@ impl Server {
             .http2_keepalive_timeout(Some(KEEPALIVE.1))
             .max_concurrent_streams(limits::STREAMS_PER_CONNECTION)
             .timeout(Duration::from_millis(limits::UNARY_DEADLINE.as_ms()))
-            .layer(tonic_web::GrpcWebLayer::new())
             .add_routes(routes)
             .serve_with_incoming_shutdown(incoming, async move { stopped.cancelled().await });
         let keeper = prune(self.parts.store.clone(), self.parts.frames.clone(), self.parts.clock.clone());

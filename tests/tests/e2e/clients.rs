@@ -29,6 +29,33 @@ fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
 }
 
+fn http1(address: SocketAddr, request: &str) -> anyhow::Result<String> {
+    use std::io::{Read, Write};
+    let mut stream = std::net::TcpStream::connect(address)?;
+    stream.set_read_timeout(Some(Duration::from_secs(10)))?;
+    stream.write_all(request.as_bytes())?;
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer)?;
+    Ok(text(&answer))
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn prometheus_and_browsers_reach_the_same_port_over_http_1() -> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let (address, _dev) = dev(dir.path()).await?;
+    let page = http1(address, "GET /metrics HTTP/1.1\r\nHost: midshift\r\nConnection: close\r\n\r\n")?;
+    assert!(page.starts_with("HTTP/1.1 200") && page.contains("midshift_telemetry_heartbeats_total"), "{page}");
+    assert!(!page.contains("rbt-"), "a metric has a label per robot");
+    let web = "POST /midshift.telemetry.v1.TelemetryService/ListRobots HTTP/1.1\r\nHost: midshift\r\nConnection: close\r\n\
+               Content-Type: application/grpc-web+proto\r\nContent-Length: 5\r\n\r\n\0\0\0\0\0";
+    let answer = http1(address, web)?;
+    assert!(
+        answer.starts_with("HTTP/1.1 200") && answer.contains("rbt-01") && answer.contains("grpc-status:0"),
+        "{answer}"
+    );
+    Ok(())
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn grpcurl_lists_submits_watches_and_hears_every_violation() -> anyhow::Result<()> {
     let dir = tempfile::tempdir()?;
