@@ -3,7 +3,6 @@
 //! Four independent facts, each with one owner: presence (telemetry), mode (the robot), duty (fleet), software (OTA, later).
 
 use crate::ids::{AttemptId, PlaceId, TaskId, WaypointId};
-use crate::work::WorkState;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -146,6 +145,41 @@ pub struct Load {
     pub task_id: Option<TaskId>,
     /// The item, as the step named it.
     pub item: String,
+}
+
+/// What a robot does with an attempt.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum WorkState {
+    /// It took it and has not moved yet.
+    Accepted,
+    /// It refused it.
+    Refused,
+    /// It drives.
+    Navigating,
+    /// It acts or waits.
+    Executing,
+    /// It stands and keeps it.
+    Paused,
+    /// It is on its way to a stop.
+    Stopping,
+    /// Done.
+    Succeeded,
+    /// Ended by a fault.
+    Failed,
+    /// Stopped on request, or dropped by a person at the robot.
+    Aborted,
+    /// Stopped at a step boundary on request; the rest is handed back.
+    Suspended,
+    /// Restarted inside a step that must not be done twice: nobody knows.
+    StepUnknown,
+}
+
+impl WorkState {
+    /// Whether the robot will do nothing more with it.
+    pub const fn is_over(self) -> bool {
+        matches!(self, Self::Refused | Self::Succeeded | Self::Failed | Self::Aborted | Self::Suspended)
+    }
 }
 
 /// An attempt as the robot reports it.

@@ -6,6 +6,7 @@
 use crate::authority::Authority;
 use crate::ids::{AreaId, AttemptId, PlaceId, RobotId, WaypointId};
 use crate::reason::Reason;
+pub use crate::robot::WorkState;
 use crate::robot::{Fault, HardwareStop, HeldPlace, Lane, Load, Mode, Vitals};
 use crate::rows::{Index, Record, Table};
 use serde::{Deserialize, Serialize};
@@ -168,41 +169,6 @@ impl Record for DesiredPolicy {
     const TABLE: Table = Table::DesiredPolicy;
     fn id(&self) -> String {
         self.robot_id.to_string()
-    }
-}
-
-/// What a robot does with an attempt.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum WorkState {
-    /// It took it and has not moved yet.
-    Accepted,
-    /// It refused it.
-    Refused,
-    /// It drives.
-    Navigating,
-    /// It acts or waits.
-    Executing,
-    /// It stands and keeps it.
-    Paused,
-    /// It is on its way to a stop.
-    Stopping,
-    /// Done.
-    Succeeded,
-    /// Ended by a fault.
-    Failed,
-    /// Stopped on request, or dropped by a person at the robot.
-    Aborted,
-    /// Stopped at a step boundary on request; the rest is handed back.
-    Suspended,
-    /// Restarted inside a step that must not be done twice: nobody knows.
-    StepUnknown,
-}
-
-impl WorkState {
-    /// Whether the robot will do nothing more with it.
-    pub const fn is_over(self) -> bool {
-        matches!(self, Self::Refused | Self::Succeeded | Self::Failed | Self::Aborted | Self::Suspended)
     }
 }
 

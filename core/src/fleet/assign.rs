@@ -3,19 +3,19 @@
 //! Called once a cycle. An assignment is one item: the robot's mutex, the task, the attempt and its timers; a stale row costs this
 //! assignment alone.
 
-use super::rows::{RobotAuthority, RobotControl, RobotHolder, TimerKind};
+use super::anchor::anchor;
+use super::rows::{RobotControl, TimerKind};
 use super::tasks::{News, arm, happen};
 use super::tx::Tx;
 use super::view::View;
-use super::{Board, Plan, desired, errands, screen, timers, way};
+use super::{Board, Plan, attempts, errands, screen, timers, way};
 use crate::ids::{AttemptId, RobotId, Subject, TaskId};
 use crate::limits;
 use crate::reason::Code;
 use crate::site::WaypointIx;
 use crate::task::spec::Class;
-use crate::task::{Attempt, AttemptPhase, Event, Phase, TaskIntake, TaskState};
+use crate::task::{Event, Phase, TaskIntake, TaskState};
 use crate::time::Now;
-use crate::work::WorkStats;
 use std::collections::BTreeMap;
 
 /// Waiting tasks looked at in one cycle at most; the rest keep their order and come next.
@@ -148,16 +148,16 @@ fn recall(view: &View, board: &Board, task: &TaskState, intake: &TaskIntake) -> 
 
 /// Writes one offer.
 fn offer(tx: &mut Tx, task: &TaskState, intake: &TaskIntake, robot_id: &RobotId, board: &Board) {
-    let Some(anchor) = desired::anchor(tx.view, robot_id, board, limits::OFFER_VALID) else { return };
+    let Some(anchor) = anchor(tx.view, robot_id, board, limits::OFFER_VALID) else { return };
     let attempt = AttemptId { subject: Subject::Task(task.task_id.clone()), epoch: task.epoch + 1 };
     let mut granted = task.clone();
     granted.epoch += 1;
     granted.robot_id = Some(robot_id.clone());
     tx.put(granted, "task.granted");
-    let mut record = fresh_attempt(tx, attempt, robot_id, anchor);
+    let mut record = attempts::fresh_attempt(tx, attempt, robot_id, anchor);
     record.step_index = task.next_step;
     record.opened = task.opened.is_some();
-    take_robot(tx, &record);
+    attempts::take_robot(tx, &record);
     tx.put(record.clone(), "attempt.offered");
     arm(tx, TimerKind::OfferAck, &record.attempt, limits::OFFER_VALID.as_ms());
     happen(tx, &intake.task_id, News::of(Event::PlanOffers, None));
@@ -165,36 +165,4 @@ fn offer(tx: &mut Tx, task: &TaskState, intake: &TaskIntake, robot_id: &RobotId,
     let mut control = known.unwrap_or_else(|| RobotControl::new(robot_id.clone()));
     control.tasks += 1;
     tx.put(control, "robot.given");
-}
-
-/// A new attempt of a robot, not yet written.
-pub fn fresh_attempt(tx: &Tx, attempt: AttemptId, robot_id: &RobotId, offer: crate::authority::Authority) -> Attempt {
-    let software =
-        tx.view.sessions.get(robot_id.as_str()).map(|s| s.row.inventory.software.clone()).unwrap_or_default();
-    Attempt {
-        attempt,
-        robot_id: robot_id.clone(),
-        errand: None,
-        goal: None,
-        phase: AttemptPhase::Offered,
-        uncertain: None,
-        offer,
-        step_index: 0,
-        opened: false,
-        offered: tx.now.utc,
-        accepted: None,
-        ended: None,
-        fault: None,
-        refusal: None,
-        stats: WorkStats::default(),
-        software,
-    }
-}
-
-/// Takes the robot's mutex for an attempt: the update of one row that two planners cannot both make.
-pub fn take_robot(tx: &mut Tx, a: &Attempt) {
-    tx.put(
-        RobotAuthority { robot_id: a.robot_id.clone(), holder: RobotHolder::Attempt(a.attempt.clone()) },
-        "robot.taken",
-    );
 }

@@ -3,7 +3,7 @@
 use super::rows::{Cordon, HolderState, Place, RobotControl};
 use super::tx::Tx;
 use super::view::View;
-use super::{Board, repair};
+use super::{Board, heard};
 use crate::ids::{PlaceId, RobotId};
 use crate::policy::AreaPolicy;
 use crate::reason::{Code, Kind, Reason, Refusal, Violations};
@@ -67,7 +67,7 @@ pub fn check(
             let Some(row) = view.places.get(place_id.as_str()) else {
                 return Err(Refusal::new(Kind::NotFound, Reason::from(Code::PlaceNotFound).with("place_id", place_id)));
             };
-            let heard = |r: &RobotId| repair::presence(board, r, now) == Presence::Online;
+            let heard = |r: &RobotId| heard::presence(board, r, now) == Presence::Online;
             if let Some(h) = row.row.holders.iter().find(|h| h.state == HolderState::Inside && heard(&h.robot_id)) {
                 return Err(Refusal::new(
                     Kind::Precondition,

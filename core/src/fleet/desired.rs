@@ -3,37 +3,31 @@
 //! Invariant: generations only rise. An offer is anchored once and never again; an unentered grant or a resume that should still stand is
 //! anchored anew to the newest heartbeat.
 
-use super::places::Releases;
+use super::anchor::{anchor, is_worn, next_generation};
+use super::attempts;
 use super::rows::HolderState;
 use super::tx::Tx;
 use super::view::{View, held};
-use super::{Board, errands, way};
+use super::{Board, way};
 use crate::authority::Authority;
 use crate::ids::{AttemptId, RobotId};
 use crate::limits;
 use crate::task::{Attempt, AttemptPhase, Then};
-use crate::time::{LinkDuration, Now};
-use crate::work::{Assignment, DesiredPolicy, DesiredWork, GrantedPlace, Live, WorkState};
 
-/// The generation that the next write of a robot's work will have.
-pub fn next_generation(view: &View, robot_id: &RobotId, now: &Now) -> u64 {
-    let last = view.desired_work.get(robot_id.as_str()).map_or(0, |d| d.row.generation);
-    (last + 1).max(now.wall.0.max(0) as u64)
-}
+use crate::work::{Assignment, DesiredPolicy, DesiredWork, GrantedPlace, Live, RoutePoint, WorkState};
+use std::collections::BTreeMap;
 
-/// Permission anchored to the newest heartbeat of the robot's current session; none if it is not heard.
-pub fn anchor(view: &View, robot_id: &RobotId, board: &Board, valid: LinkDuration) -> Option<Authority> {
-    let live = board.get(robot_id)?;
-    let session = view.sessions.get(robot_id.as_str())?;
-    let current = session.row.session_epoch == live.report.session_epoch && !live.observed;
-    current.then(|| Authority { session_epoch: live.report.session_epoch, hb: live.report.hb, valid_ms: valid.as_ms() })
-}
+/// What a robot may do from this cycle on; `desired` writes it down.
+#[derive(Clone, Debug, Default)]
+pub struct Releases(pub BTreeMap<RobotId, Release>);
 
-/// Less than half of its life is left, or it belongs to another session.
-fn is_worn(authority: &Authority, live: Option<&Live>) -> bool {
-    let Some(live) = live else { return false };
-    let age_ms = live.report.hb.saturating_sub(authority.hb) * limits::HEARTBEAT.as_ms();
-    authority.session_epoch != live.report.session_epoch || age_ms * 2 >= authority.valid_ms
+/// A newly released stretch.
+#[derive(Clone, Debug)]
+pub struct Release {
+    /// Another route, if the server chose one.
+    pub route: Option<Vec<RoutePoint>>,
+    /// Index into the route up to which the robot may drive.
+    pub released_index: u32,
 }
 
 /// Writes what `robot_id` should have, if it differs from what stands.
@@ -122,7 +116,7 @@ fn begin(view: &View, a: &Attempt, live: Option<&Live>) -> Option<Assignment> {
             let spec = &view.intake(task_id)?.spec;
             (spec.steps.clone(), spec.timeout_ms, view.task(task_id)?.next_step, spec.speed_limit_mm_s)
         }
-        None => (errands::steps(view, a), errands::TIMEOUT.as_ms(), 0, None),
+        None => (attempts::steps(view, a), attempts::ERRAND_TIMEOUT.as_ms(), 0, None),
     };
     let from_step = way::from_step(&steps, resume_step);
     let goals = way::goals(&view.site, &steps, from_step)?;

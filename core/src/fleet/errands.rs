@@ -2,46 +2,20 @@
 //!
 //! An errand is an attempt with no task row and a single epoch; its number is never used again. Its end has no consequence but a free robot.
 
+use super::anchor::anchor;
 use super::rows::{RobotControl, Timer, TimerKind};
 use super::tasks::{arm, disarm, end_attempt};
 use super::tx::Tx;
 use super::view::View;
-use super::{Board, Plan, assign, desired, screen, way};
+use super::{Board, Plan, attempts, screen, way};
 use crate::ids::{AttemptId, RobotId, Subject};
 use crate::limits;
 use crate::reason::Reason;
 use crate::site::{Kind, WaypointIx};
+use crate::task::AttemptPhase;
 use crate::task::state::{Errand, Uncertain};
-use crate::task::{Attempt, AttemptPhase};
-use crate::time::{Now, SiteDuration};
-use crate::work::{AttemptReport, Effect, StepKind, WorkState, WorkStep};
-
-/// Longest errand; a charge ends long before. Site clock.
-pub const TIMEOUT: SiteDuration = SiteDuration::from_secs(4 * 3600);
-
-/// Steps of an errand: drive to its goal, then charge or park.
-pub fn steps(view: &View, a: &Attempt) -> Vec<WorkStep> {
-    let Some(goal) = &a.goal else { return Vec::new() };
-    let mut params = serde_json::Map::new();
-    let name = match a.errand {
-        Some(Errand::Charge) => {
-            let area = view.site.find(goal).map(|at| view.site.area_of(at).area_id.clone());
-            let stop = area.map_or(900, |area| view.policy(&area).charge_stop_permille);
-            params.insert("stop_permille".to_owned(), stop.into());
-            "charge"
-        }
-        _ => "park",
-    };
-    let step = |kind| WorkStep {
-        kind,
-        effect: Effect::Repeatable,
-        pause_allowed: true,
-        cancel_allowed: true,
-        timeout_ms: None,
-        continue_on_fail: false,
-    };
-    vec![step(StepKind::Goto { waypoint: goal.clone() }), step(StepKind::Action { name: name.to_owned(), params })]
-}
+use crate::time::Now;
+use crate::work::{AttemptReport, WorkState};
 
 /// Errands that are on their way to a stop.
 pub fn stopping(view: &View) -> usize {
@@ -119,16 +93,16 @@ fn free(
 }
 
 fn begin(tx: &mut Tx, robot_id: &RobotId, errand: Errand, goal: WaypointIx, board: &Board) {
-    let Some(anchor) = desired::anchor(tx.view, robot_id, board, limits::OFFER_VALID) else { return };
+    let Some(anchor) = anchor(tx.view, robot_id, board, limits::OFFER_VALID) else { return };
     let known = tx.view.control.get(robot_id.as_str()).map(|c| c.row.clone());
     let mut control = known.unwrap_or_else(|| RobotControl::new(robot_id.clone()));
     control.errands += 1;
     let subject = Subject::Errand { robot_id: robot_id.clone(), number: control.errands };
     tx.put(control, "robot.given");
-    let mut a = assign::fresh_attempt(tx, AttemptId { subject, epoch: 1 }, robot_id, anchor);
+    let mut a = attempts::fresh_attempt(tx, AttemptId { subject, epoch: 1 }, robot_id, anchor);
     a.errand = Some(errand);
     a.goal = Some(tx.view.site.name_of(goal).clone());
-    assign::take_robot(tx, &a);
+    attempts::take_robot(tx, &a);
     arm(tx, TimerKind::OfferAck, &a.attempt, limits::OFFER_VALID.as_ms());
     tx.put(a, "errand.offered");
 }

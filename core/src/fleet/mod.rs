@@ -2,14 +2,17 @@
 //!
 //! [`cycle`] takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
 //! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `commands` are what happens; `tasks` moves tasks by
-//! the table; `screen` and `assign` give work; `errands`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
+//! the table; `heard`, `anchor` and `attempts` are what they share; `screen` and `assign` give work; `errands`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
+pub mod anchor;
 pub mod assign;
+pub mod attempts;
 pub mod commands;
 pub mod desired;
 pub mod errands;
 pub mod explain;
+pub mod heard;
 pub mod inbox;
 pub mod places;
 pub mod repair;
@@ -198,7 +201,7 @@ pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Pl
     }
     assign::plan(view, board, now, plan);
     errands::plan(view, board, now, plan);
-    write_down(view, now, board, &places::Releases::default(), plan);
+    write_down(view, now, board, &desired::Releases::default(), plan);
     let releases = places::advance(view, board, now, plan);
     write_down(view, now, board, &releases, plan);
     if !plan.items.is_empty() {
@@ -252,7 +255,7 @@ fn sweep(view: &mut View, now: Now, board: &Board, plan: &mut Plan) {
 }
 
 /// Composes the desired state of every robot that something changed for.
-fn write_down(view: &mut View, now: Now, board: &Board, releases: &places::Releases, plan: &mut Plan) {
+fn write_down(view: &mut View, now: Now, board: &Board, releases: &desired::Releases, plan: &mut Plan) {
     for robot_id in std::mem::take(&mut view.dirty) {
         plan.decide(view, now, "fleet", |tx| desired::compose(tx, &robot_id, board, releases));
     }

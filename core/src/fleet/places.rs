@@ -3,10 +3,12 @@
 //! Invariant: a place is given on only by the robot's own report or by a person, never by time. Queue order is class, then age;
 //! a request that cannot be served blocks later ones on its places. Grants are traffic, never a safety function.
 
+use super::anchor::next_generation;
+use super::desired::{Release, Releases};
 use super::rows::{HolderState, Place, PlaceHolder};
 use super::tx::Tx;
-use super::view::View;
-use super::{Board, Plan, desired, inbox, way};
+use super::view::{View, Waiting};
+use super::{Board, Plan, inbox, way};
 use crate::ids::{AreaId, PlaceId, RobotId};
 use crate::robot::Presence;
 use crate::site::route::{Segment, segments};
@@ -14,7 +16,7 @@ use crate::site::{Kind, PlaceIx};
 use crate::task::spec::Class;
 use crate::task::{Attempt, AttemptPhase};
 use crate::time::{Now, SiteDuration, SiteTime};
-use crate::work::{Assignment, Live, PlaceNews, RoutePoint};
+use crate::work::{Assignment, Live, PlaceNews};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// A robot that blocks a place others need steps aside after this long, at once if somebody waits for it.
@@ -22,28 +24,6 @@ const STEP_ASIDE_AFTER: SiteDuration = SiteDuration::from_secs(3);
 
 /// Grant ids of one generation: more than the places of any one stretch.
 const GRANTS_PER_GENERATION: u64 = 1024;
-
-/// What a robot waits for. Volatile: waiting reasons never go through the store.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Waiting {
-    /// Places it asked for and did not get.
-    pub places: Vec<PlaceId>,
-    /// Since when.
-    pub since: SiteTime,
-}
-
-/// What a robot may do from this cycle on; `desired` writes it down.
-#[derive(Clone, Debug, Default)]
-pub struct Releases(pub BTreeMap<RobotId, Release>);
-
-/// A newly released stretch.
-#[derive(Clone, Debug)]
-pub struct Release {
-    /// Another route, if the server chose one.
-    pub route: Option<Vec<RoutePoint>>,
-    /// Index into the route up to which the robot may drive.
-    pub released_index: u32,
-}
 
 /// Whether the robot stands because it waits for a place.
 pub fn waits(view: &View, robot_id: &RobotId) -> bool {
@@ -152,7 +132,7 @@ fn may_drive(view: &View, a: &Attempt, live: &Live, board: &Board, now: &Now) ->
         && !live.observed
         && !held
         && a.uncertain.is_none()
-        && super::repair::presence(board, robot_id, now) == Presence::Online
+        && super::heard::presence(board, robot_id, now) == Presence::Online
 }
 
 fn assignment<'a>(view: &'a View, robot_id: &RobotId, a: &Attempt) -> Option<&'a Assignment> {
@@ -218,7 +198,7 @@ fn missing(view: &View, live: &Live, a: &Attempt) -> Vec<PlaceIx> {
     let standing = live.report.vitals.speed_mm_s == 0;
     let Some(reported) = live.report.attempts.iter().find(|r| r.attempt == a.attempt) else { return Vec::new() };
     let Some(work) = assignment(view, &live.robot_id, a) else { return Vec::new() };
-    if !standing || !super::repair::is_settled(view, live) || !super::repair::is_fresh(view, live) {
+    if !standing || !super::heard::is_settled(view, live) || !super::heard::is_fresh(view, live) {
         return Vec::new();
     }
     let released = work.released_index.unwrap_or(0) as usize;
@@ -240,7 +220,7 @@ fn grantable(view: &View, robot_id: &RobotId, needed: &[PlaceIx], blocked: &BTre
 }
 
 fn grant(tx: &mut Tx, robot_id: &RobotId, needed: &[PlaceIx]) {
-    let first = desired::next_generation(tx.view, robot_id, &tx.now) * GRANTS_PER_GENERATION;
+    let first = next_generation(tx.view, robot_id, &tx.now) * GRANTS_PER_GENERATION;
     for (grant_id, ix) in (first..).zip(needed) {
         let id = tx.view.site.place(*ix).place_id.clone();
         let Some(mut place) = tx.view.places.get(id.as_str()).map(|p| p.row.clone()) else { continue };

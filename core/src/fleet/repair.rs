@@ -3,54 +3,17 @@
 //! Invariant: repair never overtakes events. A difference counts only if the robot has applied the newest desired work and every
 //! EVENT and CRITICAL number it had produced has been consumed. The end of a lease frees authority, never a load or a place.
 
+use super::heard::{is_fresh, is_settled, lease_stands, presence};
 use super::tasks::{News, happen};
 use super::tx::Tx;
 use super::view::View;
 use super::{Board, Tally, errands, inbox, places};
 use crate::ids::RobotId;
-use crate::limits;
 use crate::reason::{Code, Reason};
-use crate::robot::{HardwareStop, Lane, Mode, Presence};
+use crate::robot::{HardwareStop, Mode, Presence};
 use crate::task::{Attempt, AttemptPhase, Event, Phase};
 use crate::time::Now;
 use crate::work::{AttemptReport, Live, WorkState};
-
-/// Whether a robot is heard, from the board alone. After a start of fleet every lease counts as renewed at that moment.
-pub fn presence(board: &Board, robot_id: &RobotId, now: &Now) -> Presence {
-    match board.get(robot_id) {
-        Some(live) if now.link.since(live.processed_at) <= limits::SUSPECT_AFTER => Presence::Online,
-        Some(live) if now.link.since(live.processed_at) <= limits::OFFLINE_AFTER => Presence::Suspect,
-        _ => Presence::Offline,
-    }
-}
-
-/// Whether the robot may still have authority to go on.
-pub fn lease_stands(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> bool {
-    let renewed = board.get(robot_id).map_or(view.started.link, |l| l.processed_at.max(view.started.link));
-    now.link.since(renewed) <= limits::LEASE
-}
-
-/// The robot's differences count: it has applied everything and everything it said has been consumed.
-pub fn is_settled(view: &View, live: &Live) -> bool {
-    let id = live.robot_id.as_str();
-    let Some(session) = view.sessions.get(id) else { return false };
-    let current = session.row.session_epoch == live.report.session_epoch;
-    let applied = view.desired_work.get(id).is_none_or(|d| live.report.applied_work >= d.row.generation);
-    let mark = view.lane_marks.get(&format!("{id}/{}", session.row.ring)).map(|m| &m.row);
-    let done = |lane: Lane, have: u64| live.report.produced.get(&lane).is_none_or(|p| *p <= have);
-    current
-        && applied
-        && done(Lane::Event, mark.map_or(0, |m| m.event))
-        && done(Lane::Critical, mark.map_or(0, |m| m.critical))
-}
-
-/// The heartbeat is not older than the robot's events that were consumed: an older one lists what has ended since.
-pub fn is_fresh(view: &View, live: &Live) -> bool {
-    let id = live.robot_id.as_str();
-    let Some(session) = view.sessions.get(id) else { return false };
-    let mark = view.lane_marks.get(&format!("{id}/{}", session.row.ring)).map_or(0, |m| m.row.event);
-    live.report.produced.get(&Lane::Event).copied().unwrap_or(0) >= mark
-}
 
 /// Counts the time in which the robot is heard.
 fn attached(view: &mut View, robot_id: &RobotId, board: &Board, now: &Now) {

@@ -4,7 +4,7 @@
 
 use super::rows::RobotHolder;
 use super::view::View;
-use super::{Board, repair, way};
+use super::{Board, heard, way};
 use crate::ids::{RobotId, Subject};
 use crate::reason::{Code, Reason};
 use crate::robot::{Duty, FaultClass, HardwareStop, Mode, Presence, StopLevel};
@@ -24,7 +24,7 @@ pub fn robot(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> Resul
     let Some(session) = view.sessions.get(robot_id.as_str()).map(|s| &s.row) else {
         return Err(Code::RobotOffline.into());
     };
-    match repair::presence(board, robot_id, now) {
+    match heard::presence(board, robot_id, now) {
         Presence::Online => {}
         Presence::Suspect => return Err(Code::RobotSuspect.into()),
         Presence::Offline | Presence::Updating => return Err(Code::RobotOffline.into()),
@@ -41,7 +41,7 @@ pub fn robot(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> Resul
         Some(RobotHolder::Maintenance(id)) => return Err(Reason::from(Code::RobotBusy).with("maintenance", id)),
     }
     // An older heartbeat knows neither what has ended since nor where the robot stands now.
-    let current = session.session_epoch == live.report.session_epoch && repair::is_fresh(view, live);
+    let current = session.session_epoch == live.report.session_epoch && heard::is_fresh(view, live);
     if !current || live.report.attempts.iter().any(|a| !a.state.is_over()) {
         return Err(Code::RobotReconciling.into());
     }
@@ -189,7 +189,7 @@ pub fn task(view: &View, board: &Board, task: &TaskState, intake: &TaskIntake, n
     if let Some(robot_id) = &task.robot_id
         && view.held_by(robot_id) == task.attempt_id().as_ref()
         && task.epoch > 0
-        && repair::lease_stands(view, board, robot_id, now)
+        && heard::lease_stands(view, board, robot_id, now)
     {
         return Err(Reason::from(Code::RobotReconciling).with("robot_id", robot_id));
     }

@@ -68,7 +68,7 @@ pub fn fire(tx: &mut Tx, timer: &Timer, board: &Board) {
 fn waits_for_silent_robot(tx: &Tx, task_id: &TaskId, attempt: &AttemptId, board: &Board) -> bool {
     let Some(a) = tx.view.attempt(attempt) else { return false };
     let requeue = tx.view.task(task_id).is_some_and(|t| t.then == Some(Then::Requeue));
-    requeue && a.accepted.is_none() && super::repair::presence(board, &a.robot_id, &tx.now) != Presence::Online
+    requeue && a.accepted.is_none() && super::heard::presence(board, &a.robot_id, &tx.now) != Presence::Online
 }
 
 /// The deadline of a task passed.

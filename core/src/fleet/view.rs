@@ -34,6 +34,15 @@ pub struct Attached {
     pub until: crate::time::SiteTime,
 }
 
+/// What a robot waits for. Volatile: waiting reasons never go through the store.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Waiting {
+    /// Places it asked for and did not get.
+    pub places: Vec<crate::ids::PlaceId>,
+    /// Since when.
+    pub since: crate::time::SiteTime,
+}
+
 /// Rows of one table by id.
 pub type Slot<R> = BTreeMap<String, Rowed<R>>;
 
@@ -98,7 +107,7 @@ pub struct View {
     /// Serving time at that moment.
     pub served: ServiceClock,
     /// Since when a robot waits for a place it cannot have, site clock. Volatile.
-    pub waits: BTreeMap<RobotId, super::places::Waiting>,
+    pub waits: BTreeMap<RobotId, Waiting>,
     /// How often a robot began to wait for a place. Volatile.
     pub place_waits: u64,
     /// When a robot last had a reason to stand still (held, waiting for a place, not known), site clock: a stall counts from then. Volatile.

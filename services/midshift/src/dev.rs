@@ -47,7 +47,7 @@ pub struct Dev {
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
     /// Stop after so much site time (e.g. 10m) instead of at Ctrl-C.
-    #[arg(long = "for", value_parser = crate::cli::duration)]
+    #[arg(long = "for", value_parser = crate::duration::duration)]
     pub run_for: Option<Duration>,
     /// Keep everything in this directory instead of in memory.
     #[arg(long)]

@@ -6,6 +6,7 @@ pub mod background;
 pub mod cli;
 pub mod clock;
 pub mod dev;
+pub mod duration;
 pub mod logs;
 pub mod report;
 pub mod robots;

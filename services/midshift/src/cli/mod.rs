@@ -12,6 +12,7 @@ mod task;
 mod zone;
 
 use crate::dev::Dev;
+use crate::duration::duration;
 use crate::robots::AgentRun;
 use crate::serve::Serve;
 use crate::{dev, logs, robots, serve};
@@ -83,21 +84,6 @@ enum Command {
 enum AgentVerb {
     /// Run one agent with a simulated body, as a real robot would run its own.
     Run(AgentRun),
-}
-
-/// Reads `10m`, `90s`, `500ms`, `2h`.
-pub fn duration(text: &str) -> Result<Duration, String> {
-    let bad = || "must be a number with ms, s, m or h, e.g. 90s".to_owned();
-    let at = text.find(|c: char| !c.is_ascii_digit() && c != '.').ok_or_else(bad)?;
-    let number: f64 = text[..at].parse().map_err(|_| bad())?;
-    let seconds = match &text[at..] {
-        "ms" => 0.001,
-        "s" => 1.0,
-        "m" => 60.0,
-        "h" => 3600.0,
-        _ => return Err(bad()),
-    };
-    Duration::try_from_secs_f64(number * seconds).map_err(|_| bad())
 }
 
 /// Reads the arguments, runs the command, gives the exit code.
@@ -198,12 +184,5 @@ mod tests {
     #[test]
     fn the_arguments_hang_together() {
         <Args as clap::CommandFactory>::command().debug_assert();
-    }
-
-    #[test]
-    fn durations_read_as_people_write_them() {
-        assert_eq!(duration("10m"), Ok(Duration::from_secs(600)));
-        assert_eq!(duration("1.5s"), Ok(Duration::from_millis(1500)));
-        assert!(duration("10").is_err() && duration("x").is_err());
     }
 }
