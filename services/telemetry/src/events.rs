@@ -177,3 +177,89 @@ pub async fn commit(inner: Arc<Inner>, batch: Batch) -> Outcome {
         Err(_) => Outcome::Lost,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use midshift_core::reason::Code;
+    use midshift_core::robot::Mode;
+    use midshift_core::work::{Gap, RobotEvent, Sample, SampleBody};
+
+    fn robot() -> RobotId {
+        RobotId::parse("r1").expect("a valid id")
+    }
+    fn fresh() -> Events {
+        let mark = LaneMark { robot_id: robot(), ring: "ring".into(), critical: 0, event: 0 };
+        Events::new(mark, Revision(0))
+    }
+    fn sample(seq: u64) -> InboxItem {
+        let body = SampleBody::Event(RobotEvent::Mode(Mode::Automatic));
+        InboxItem::Sample(Sample { seq, robot_unix_ms: 0, body })
+    }
+    fn gap(from_seq: u64, to_seq: u64) -> InboxItem {
+        InboxItem::Gap(Gap { lane: Lane::Event, from_seq, to_seq, reason: Code::Overflow.into() })
+    }
+    fn arrive(events: &mut Events, items: Vec<InboxItem>) -> Arrived {
+        let entry = |what| InboxEntry {
+            robot_id: robot(),
+            session_epoch: 1,
+            ring: "ring".into(),
+            lane: Lane::Event,
+            what,
+            stamp_in_future: false,
+        };
+        events.arrive(LaneBatch { lane: Lane::Event, items }, entry)
+    }
+    fn stored(events: &mut Events) -> usize {
+        events.next_batch(&robot()).map_or(0, |batch| {
+            let facts = batch.item.facts.len();
+            events.done(batch.mark);
+            facts
+        })
+    }
+
+    #[test]
+    fn a_known_prefix_is_dropped_and_nothing_is_stored_twice() {
+        let mut events = fresh();
+        assert_eq!(arrive(&mut events, vec![sample(1), sample(2)]), Arrived::default());
+        assert_eq!(arrive(&mut events, vec![sample(1), sample(2), sample(3)]), Arrived::default());
+        assert_eq!(stored(&mut events), 3);
+        assert_eq!(events.acks()[1].seq, 3);
+        assert!(arrive(&mut events, vec![sample(2), sample(3)]).known);
+        assert_eq!(stored(&mut events), 0);
+    }
+
+    #[test]
+    fn a_hole_is_asked_for_and_what_lies_behind_it_is_not_taken() {
+        let mut events = fresh();
+        let arrived = arrive(&mut events, vec![sample(1), sample(3)]);
+        assert_eq!(arrived.expect, Some(LaneAck { lane: Lane::Event, seq: 0, expect: Some(2) }));
+        assert_eq!(stored(&mut events), 1);
+        assert_eq!(arrive(&mut events, vec![gap(2, 5), sample(6)]).expect, None);
+        assert_eq!(stored(&mut events), 2);
+        assert_eq!(events.acks()[1].seq, 6);
+    }
+
+    #[test]
+    fn nothing_is_acknowledged_before_its_commit_and_a_lost_one_is_asked_for_again() {
+        let mut events = fresh();
+        arrive(&mut events, vec![sample(1), sample(2)]);
+        let batch = events.next_batch(&robot()).expect("two samples wait");
+        assert_eq!(events.acks()[1].seq, 0);
+        drop(batch);
+        events.forget_taken();
+        assert_eq!(arrive(&mut events, vec![sample(1), sample(2)]).expect, None);
+        assert_eq!(stored(&mut events), 2);
+        let asked =
+            events.reset(LaneMark { robot_id: robot(), ring: "ring".into(), critical: 0, event: 1 }, Revision(1));
+        assert_eq!(asked[1], LaneAck { lane: Lane::Event, seq: 1, expect: Some(2) });
+    }
+
+    #[test]
+    fn a_flood_is_bounded_and_asked_for_again() {
+        let mut events = fresh();
+        let many = (1..=WAITING_MAX as u64 + 1).map(sample).collect();
+        assert_eq!(arrive(&mut events, many).expect.and_then(|ack| ack.expect), Some(WAITING_MAX as u64 + 1));
+        assert_eq!(stored(&mut events), FACTS_PER_ITEM);
+    }
+}
