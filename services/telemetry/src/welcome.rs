@@ -65,17 +65,15 @@ pub async fn begin(inner: &Inner, hello: &Hello) -> Result<Begun, Refusal> {
             hello.previous.as_ref().is_some_and(|p| p.session_epoch == row.session_epoch && p.secret == row.secret)
         });
         let older = inner.registry.get(&hello.robot_id);
+        let now = inner.parts.clock.now();
+        let last = row.as_ref().map_or(0, |(r, _)| r.session_epoch);
+        let session_epoch = (last + 1).max(now.wall.0.max(0) as u64);
         if older.is_some() && !proven && !inner.parts.bugs.no_clone_fence() {
             note_clone(inner, hello).await;
-            return Ok(Begun {
-                in_charge: None,
-                welcome: welcome(inner, 0, String::new(), &mark.0, status, true),
-                mark,
-                status,
-            });
+            // Its epoch and secret are in no row: they prove nothing later.
+            let welcome = welcome(inner, session_epoch, draw_secret(), &mark.0, status, true);
+            return Ok(Begun { in_charge: None, welcome, mark, status });
         }
-        let now = inner.parts.clock.now();
-        let session_epoch = row.as_ref().map_or(0, |(r, _)| r.session_epoch + 1).max(now.wall.0.max(0) as u64);
         let session = session_row(hello, session_epoch);
         let mut item = Item::new(Writer::Telemetry, hello.robot_id.as_str());
         item.put(&session, row.map_or(Expect::Absent, |(_, revision)| Expect::At(revision)), "session.begun");
@@ -101,11 +99,15 @@ async fn mark_of(inner: &Inner, hello: &Hello) -> Result<(LaneMark, Revision), R
     Ok(found.unwrap_or((fresh, Revision(0))))
 }
 
+fn draw_secret() -> String {
+    format!("{:032x}", rand::random::<u128>())
+}
+
 fn session_row(hello: &Hello, session_epoch: u64) -> Session {
     Session {
         robot_id: hello.robot_id.clone(),
         session_epoch,
-        secret: format!("{:032x}", rand::random::<u128>()),
+        secret: draw_secret(),
         boot_id: hello.boot_id.clone(),
         ring: hello.ring.clone(),
         inventory: hello.inventory.clone(),
