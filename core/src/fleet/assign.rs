@@ -19,7 +19,7 @@ use crate::time::Now;
 use std::collections::BTreeMap;
 
 /// Waiting tasks looked at in one cycle at most; the rest keep their order and come next.
-const TASKS_PER_CYCLE: usize = 4_096;
+pub const TASKS_PER_CYCLE: usize = 4_096;
 
 /// Waiting tasks in the order in which they are served.
 pub fn queue(view: &View, now: &Now) -> Vec<TaskId> {
