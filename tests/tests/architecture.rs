@@ -19,7 +19,10 @@ const SPAWNS: &[(&str, &str)] = &[
 
 /// Words that say nothing, and the names that may have them.
 const EMPTY_WORDS: [&str; 6] = ["Manager", "Helper", "Util", "Common", "Data", "Info"];
-const NAMES_KEPT: &[(&str, &str)] = &[("DataFile", "a file of the data directory, beside its lock file")];
+const NAMES_KEPT: &[(&str, &str)] = &[
+    ("ConnectInfo", "tonic's name in `Connected`"),
+    ("DataFile", "a file of the data directory, beside its lock file"),
+];
 
 const LINES_MAX: usize = 800;
 

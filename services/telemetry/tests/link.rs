@@ -20,12 +20,14 @@ use tokio_util::sync::CancellationToken;
 use tonic::Streaming;
 use tonic::transport::{Channel, Endpoint, Server};
 
+type Result<T> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>>;
+
 struct World {
     store: Arc<dyn Store>,
     channel: Channel,
 }
 
-async fn world() -> anyhow::Result<World> {
+async fn world() -> Result<World> {
     let started = tokio::time::Instant::now();
     let micros = move || started.elapsed().as_micros() as u64;
     let clock: Arc<dyn Clock> = Arc::new(ScaledClock::new(micros, Utc(1_800_000_000_000), 1000));
@@ -61,7 +63,7 @@ struct Robot {
     hb: u64,
 }
 
-fn hello(previous: Option<Previous>) -> anyhow::Result<Hello> {
+fn hello(previous: Option<Previous>) -> Result<Hello> {
     Ok(Hello {
         robot_id: RobotId::parse("r1")?,
         boot_id: "boot".into(),
@@ -78,35 +80,35 @@ fn hello(previous: Option<Previous>) -> anyhow::Result<Hello> {
 }
 
 impl Robot {
-    async fn attach(world: &World, previous: Option<Previous>) -> anyhow::Result<Self> {
+    async fn attach(world: &World, previous: Option<Previous>) -> Result<Self> {
         let (up, outbound) = mpsc::channel(16);
         up.send((&FromRobot::Hello(Box::new(hello(previous)?))).into()).await?;
         let mut down =
             LinkServiceClient::new(world.channel.clone()).session(ReceiverStream::new(outbound)).await?.into_inner();
-        let first = down.message().await?.ok_or_else(|| anyhow::anyhow!("no welcome"))?;
-        let ToRobot::Welcome(welcome) = midshift_proto::parse(first)? else { anyhow::bail!("not a welcome") };
+        let first = down.message().await?.ok_or("no welcome")?;
+        let ToRobot::Welcome(welcome) = midshift_proto::parse(first)? else { return Err("not a welcome".into()) };
         Ok(Self { up, down, welcome, hb: 0 })
     }
     fn proof(&self) -> Previous {
         Previous { session_epoch: self.welcome.session_epoch, secret: self.welcome.session_secret.clone() }
     }
-    async fn say(&self, uplink: Uplink) -> anyhow::Result<()> {
+    async fn say(&self, uplink: Uplink) -> Result<()> {
         Ok(self.up.send((&FromRobot::Uplink(uplink)).into()).await?)
     }
-    async fn beat(&mut self) -> anyhow::Result<()> {
+    async fn beat(&mut self) -> Result<()> {
         self.hb += 1;
         let reported =
             ReportedState { hb: self.hb, session_epoch: self.welcome.session_epoch, ..ReportedState::default() };
         self.say(Uplink { heartbeat: Some(Heartbeat { reported, sent_unix_us: 0, clock: None }), batches: Vec::new() })
             .await
     }
-    async fn events(&self, seqs: std::ops::RangeInclusive<u64>) -> anyhow::Result<()> {
+    async fn events(&self, seqs: std::ops::RangeInclusive<u64>) -> Result<()> {
         let body = SampleBody::Event(RobotEvent::Mode(Mode::Automatic));
         let items = seqs.map(|seq| InboxItem::Sample(Sample { seq, robot_unix_ms: 0, body: body.clone() })).collect();
         self.say(Uplink { heartbeat: None, batches: vec![LaneBatch { lane: Lane::Event, items }] }).await
     }
     /// The next downlink that says something of what is looked for.
-    async fn hears<T>(&mut self, look: impl Fn(&Downlink) -> Option<T>) -> anyhow::Result<T> {
+    async fn hears<T>(&mut self, look: impl Fn(&Downlink) -> Option<T>) -> Result<T> {
         while let Some(message) = self.down.message().await? {
             if let ToRobot::Downlink(down) = midshift_proto::parse(message)?
                 && let Some(found) = look(&down)
@@ -114,24 +116,24 @@ impl Robot {
                 return Ok(found);
             }
         }
-        anyhow::bail!("the session ended")
+        Err("the session ended".into())
     }
-    async fn closes(&mut self) -> anyhow::Result<Close> {
+    async fn closes(&mut self) -> Result<Close> {
         while let Some(message) = self.down.message().await? {
             if let ToRobot::Close(close) = midshift_proto::parse(message)? {
                 return Ok(close);
             }
         }
-        anyhow::bail!("the session ended without a word")
+        Err("the session ended without a word".into())
     }
 }
 
-async fn inbox(world: &World) -> anyhow::Result<usize> {
+async fn inbox(world: &World) -> Result<usize> {
     Ok(world.store.feed(Seq(0), &[Log::RobotInbox], 1_000).await?.entries.len())
 }
 
 #[tokio::test(start_paused = true)]
-async fn events_are_durable_when_they_are_acknowledged_and_stored_once() -> anyhow::Result<()> {
+async fn events_are_durable_when_they_are_acknowledged_and_stored_once() -> Result<()> {
     let world = world().await?;
     let mut robot = Robot::attach(&world, None).await?;
     robot.events(1..=3).await?;
@@ -149,7 +151,7 @@ async fn events_are_durable_when_they_are_acknowledged_and_stored_once() -> anyh
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_heartbeat_is_echoed_and_new_desired_work_is_pushed() -> anyhow::Result<()> {
+async fn a_heartbeat_is_echoed_and_new_desired_work_is_pushed() -> Result<()> {
     let world = world().await?;
     let mut robot = Robot::attach(&world, None).await?;
     robot.beat().await?;
@@ -165,13 +167,13 @@ async fn a_heartbeat_is_echoed_and_new_desired_work_is_pushed() -> anyhow::Resul
     };
     let mut item = Item::new(Writer::Fleet, "fleet");
     item.put(&work, Expect::Absent, "work.desired");
-    anyhow::ensure!(world.store.commit(vec![item]).await.iter().all(Result::is_ok));
+    assert!(world.store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
     assert_eq!(robot.hears(|down| down.work.clone()).await?, work);
     Ok(())
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_proven_succession_ends_the_older_session() -> anyhow::Result<()> {
+async fn a_proven_succession_ends_the_older_session() -> Result<()> {
     let world = world().await?;
     let mut old = Robot::attach(&world, None).await?;
     old.beat().await?;
@@ -183,7 +185,7 @@ async fn a_proven_succession_ends_the_older_session() -> anyhow::Result<()> {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_session_without_proof_is_only_observed_while_the_older_one_is_heard() -> anyhow::Result<()> {
+async fn a_session_without_proof_is_only_observed_while_the_older_one_is_heard() -> Result<()> {
     let world = world().await?;
     let mut first = Robot::attach(&world, None).await?;
     first.beat().await?;

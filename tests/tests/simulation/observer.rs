@@ -210,7 +210,7 @@ impl Observer {
         let body = entry.body.as_deref().filter(|_| !secret).unwrap_or_default();
         let line = format!("{} {subject} {} {} {body}", self.time.us(), entry.kind, entry.seq.0);
         if self.trace {
-            eprintln!("{line}");
+            crate::say(&line);
         }
         self.digest(&line);
         match entry.table {
@@ -358,7 +358,7 @@ impl Observer {
         let kinds: String = ops.iter().map(kind).collect::<Vec<_>>().join(",");
         let line = format!("{} {robot_id} {kinds}", self.time.us());
         if self.trace {
-            eprintln!("{line}");
+            crate::say(&line);
         }
         self.digest(&line);
         for op in ops {
