@@ -140,18 +140,23 @@ fn begin(view: &View, a: &Attempt, live: Option<&Live>) -> Option<Assignment> {
     })
 }
 
+/// Listed, and may not be entered: no session has this epoch. It is renewed with the robot's next heartbeat.
+const NOT_YET: Authority = Authority { session_epoch: 1, hb: 0, valid_ms: 1 };
+
 fn grants(view: &View, robot_id: &RobotId, old: &DesiredWork, board: &Board) -> Vec<GrantedPlace> {
     let live = board.get(robot_id).map(|l| &**l);
     let listed = held(view, robot_id).filter(|(_, h)| h.state != HolderState::Revoking);
     listed
         .map(|(place, holder)| {
             let known = old.grants.iter().find(|g| g.place_id == place.place_id && g.grant_id == holder.grant_id);
-            let known = known.and_then(|g| g.entry).filter(|e| !is_worn(e, live));
+            let known = known.and_then(|g| g.entry);
             let entry = match holder.state {
                 HolderState::Inside | HolderState::Revoking => None,
                 HolderState::Granted => known
+                    .filter(|e| !is_worn(e, live))
                     .or_else(|| anchor(view, robot_id, board, limits::PLACE_ENTRY_VALID))
-                    .or(Some(Authority { session_epoch: 0, hb: 0, valid_ms: 0 })),
+                    .or(known)
+                    .or(Some(NOT_YET)),
             };
             GrantedPlace { place_id: place.place_id.clone(), grant_id: holder.grant_id, entry }
         })

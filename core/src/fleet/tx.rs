@@ -65,8 +65,10 @@ impl<'a> Tx<'a> {
         self.item.rows.push(RowChange { key, expect, write, kind });
         expect
     }
-    /// The item, if the decision changed anything.
-    pub fn finish(self) -> Option<Item> {
+    /// The item, if the decision changed anything. Attempts stand before all else in it: whoever follows the feed knows the attempt
+    /// when the change of its task comes.
+    pub fn finish(mut self) -> Option<Item> {
+        self.item.rows.sort_by_key(|row| row.key.table != Table::Attempt);
         (!self.item.is_empty()).then_some(self.item)
     }
 }
