@@ -170,9 +170,15 @@ fn judge(tasks: &[Task], inside: &[String], site: &midshift_core::site::Site, ro
     }
     let paths = robots.journals();
     let paths: Vec<&Path> = paths.iter().map(PathBuf::as_path).collect();
-    let verdict = Oracle::read(site, paths)?.verdict();
+    let oracle = Oracle::read(site, paths)?;
+    let verdict = oracle.verdict();
     say!("{verdict:?}");
-    assert!(verdict.items_made >= succeeded as u64, "the journals show the work: {verdict:?}");
+    // A task may carry what an earlier one put down, so items are fewer than tasks; drops are not.
+    let drops = oracle.drops_by_task();
+    for task in tasks.iter().filter(|t| t.state() == TaskState::Succeeded) {
+        let dropped = drops.iter().find(|(id, _)| id.as_str() == task.task_id).map(|(_, times)| *times);
+        assert_eq!(dropped, Some(1), "the journals show how often {} was put down", task.task_id);
+    }
     assert!(verdict.items_conserved(), "{verdict:?}");
     assert_eq!(verdict.steps_done_twice, 0, "{verdict:?}");
     assert_eq!(verdict.exclusion_violations, 0, "{verdict:?}");
