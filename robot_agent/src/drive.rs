@@ -234,9 +234,12 @@ impl AgentCore {
         if route.is_empty() {
             return Some(None);
         }
-        // It may skip points of the route, but not the end of a drive that is still to be done.
+        // It may skip points of the route, but not the end of a drive that is still to be done, nor go back behind one that is:
+        // the way to the drop may pass where the way to the pick-up passed.
+        let done = route.iter().rposition(|p| p.ends_step.is_some_and(|s| s < step)).unwrap_or(0);
         let open = route.iter().position(|p| p.ends_step.is_some_and(|s| s >= step)).unwrap_or(route.len() - 1);
-        let find = |name: &WaypointId| route[..=open].iter().position(|p| p.waypoint == *name);
+        let leg = done.min(open)..=open;
+        let find = |name: &WaypointId| Some(leg.start() + route[leg.clone()].iter().position(|p| p.waypoint == *name)?);
         if let Some(i) = self.heading.as_ref().and_then(find) {
             return Some(i.checked_sub(1));
         }
