@@ -1,11 +1,11 @@
 //! Admission: from a request to rows, all violations at once, idempotent by request_id and by task_id.
 //!
-//! Invariant: the request's key, the task and its state are one item; nothing is half-stored.
+//! Invariant: the request's key, the task and its state are one item; nothing is half-stored. A request that was admitted once is
+//! answered with its task for as long as its key is kept, even if its rules would no longer hold.
 
 use crate::TaskService;
 use crate::rows::{exist, read, unavailable};
 use midshift_core::ids::{RequestId, TaskId};
-use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violation};
 use midshift_core::rows::{Item, Table, Writer};
 use midshift_core::task::state::RequestKey;
@@ -13,7 +13,7 @@ use midshift_core::task::{TaskIntake, TaskSpec, TaskState};
 use midshift_core::time::Utc;
 use midshift_proto::convert::task::{Submission, canonical, encode_checked};
 use midshift_proto::task::v1;
-use midshift_store::{CommitError, load};
+use midshift_store::{Applied, CommitError, load};
 use sha2::{Digest, Sha256};
 
 /// Draws of a task id before the store is suspected.
@@ -38,6 +38,14 @@ pub struct Admission {
     pub item: Item,
 }
 
+/// A request that may be answered.
+pub enum Prepared {
+    /// It is to be committed.
+    New(Box<Admission>),
+    /// It was admitted by an earlier call.
+    Known(TaskId),
+}
+
 /// What the store said about an admission.
 pub enum Admitted {
     /// The task is durable, now or by an earlier call.
@@ -48,6 +56,11 @@ pub enum Admitted {
 
 fn hash(request: &v1::SubmitTaskRequest) -> String {
     Sha256::digest(canonical(request)).iter().map(|b| format!("{b:02x}")).collect()
+}
+
+/// A store that answered for fewer items than it was given.
+pub fn no_result() -> Refusal {
+    Refusal::new(Kind::Unavailable, Code::CommitUnknown)
 }
 
 fn draw_id(utc: Utc) -> TaskId {
@@ -67,7 +80,7 @@ impl TaskService {
         let site = &self.inner.parts.site;
         let spec = submission.check(&|waypoint| site.find(waypoint).is_some())?;
         if !spec.depends_on.is_empty() {
-            let found = exist::<TaskIntake>(self.inner.parts.store.as_ref(), &spec.depends_on).await?;
+            let found = exist::<TaskIntake>(self.store(), &spec.depends_on).await?;
             let unknown = spec.depends_on.iter().zip(found).enumerate().filter(|(_, (_, found))| !found);
             let violations: Vec<Violation> = unknown
                 .map(|(i, (id, _))| Violation {
@@ -110,20 +123,47 @@ impl TaskService {
         Admission { wanted, task_id, item }
     }
 
-    /// Checks a request and composes its admission; none if it was only to be checked, then with the checked spec.
-    pub async fn prepare(&self, request: v1::SubmitTaskRequest, actor: &str) -> Result<Admission, Refusal> {
-        Ok(self.compose(self.check(request).await?, actor))
+    /// Checks a request and composes its admission, or finds the one it repeats: the site and the tasks it was checked against
+    /// may have changed since.
+    pub async fn prepare(&self, request: v1::SubmitTaskRequest, actor: &str) -> Result<Prepared, Refusal> {
+        let hash = hash(&request);
+        let named = Submission::read(request.clone());
+        match self.check(request).await {
+            Ok(wanted) => Ok(Prepared::New(Box::new(self.compose(wanted, actor)))),
+            Err(refusal) if refusal.kind() == Kind::Invalid => {
+                let known = self.known(named.request_id.as_ref(), named.task_id.as_ref(), &hash).await?;
+                known.map(Prepared::Known).ok_or(refusal)
+            }
+            Err(refusal) => Err(refusal),
+        }
+    }
+
+    /// The task of an earlier request with this id and body, or of this chosen id and body.
+    async fn known(
+        &self,
+        request_id: Option<&RequestId>,
+        task_id: Option<&TaskId>,
+        hash: &str,
+    ) -> Result<Option<TaskId>, Refusal> {
+        if let Some(id) = request_id
+            && let Some((key, _)) = load::<RequestKey>(self.store(), id.as_str()).await.map_err(unavailable)?
+        {
+            return Ok(key.task_id.filter(|_| key.payload_hash == hash));
+        }
+        let Some(id) = task_id else { return Ok(None) };
+        let found = load::<TaskIntake>(self.store(), id.as_str()).await.map_err(unavailable)?;
+        Ok(found.filter(|(intake, _)| intake.payload_hash == hash).map(|(intake, _)| intake.task_id))
     }
 
     /// What became of a committed admission.
     pub async fn settle(
         &self,
         admission: Admission,
-        result: Result<(), CommitError>,
+        result: Result<Applied, CommitError>,
         actor: &str,
     ) -> Result<Admitted, Refusal> {
         match result {
-            Ok(()) => {
+            Ok(_) => {
                 metrics::counter!("midshift_task_admitted_total").increment(1);
                 Ok(Admitted::Task(admission.task_id))
             }
@@ -143,7 +183,7 @@ impl TaskService {
     /// The request_id was used: the same body gets the same task.
     async fn repeated(&self, admission: Admission) -> Result<Admitted, Refusal> {
         let id = admission.wanted.request_id.as_ref().map(ToString::to_string).unwrap_or_default();
-        let found = load::<RequestKey>(self.inner.parts.store.as_ref(), &id).await.map_err(unavailable)?;
+        let found = load::<RequestKey>(self.store(), &id).await.map_err(unavailable)?;
         match found {
             Some((key, _)) if key.payload_hash == admission.wanted.hash => match key.task_id {
                 Some(task_id) => Ok(Admitted::Task(task_id)),
@@ -160,9 +200,7 @@ impl TaskService {
 
     /// The chosen task_id exists: the same body is the same task.
     async fn same_id(&self, admission: Admission) -> Result<Admitted, Refusal> {
-        let found = load::<TaskIntake>(self.inner.parts.store.as_ref(), admission.task_id.as_str())
-            .await
-            .map_err(unavailable)?;
+        let found = load::<TaskIntake>(self.store(), admission.task_id.as_str()).await.map_err(unavailable)?;
         match found {
             Some((intake, _)) if intake.payload_hash == admission.wanted.hash => Ok(Admitted::Task(admission.task_id)),
             Some(_) => Err(Refusal::new(
@@ -178,16 +216,18 @@ impl TaskService {
         if request.validate_only {
             return Ok(encode_checked(&self.check(request).await?.spec));
         }
-        let admission = self.prepare(request, actor).await?;
-        let task_id = self.admit(admission, actor).await?;
-        Ok(read(self.inner.parts.store.as_ref(), &task_id).await?.encode())
+        let task_id = match self.prepare(request, actor).await? {
+            Prepared::New(admission) => self.admit(*admission, actor).await?,
+            Prepared::Known(task_id) => task_id,
+        };
+        Ok(read(self.store(), &task_id).await?.encode())
     }
 
-    async fn admit(&self, mut admission: Admission, actor: &str) -> Result<TaskId, Refusal> {
+    /// Commits an admission, with another id each time the drawn one was taken.
+    pub async fn admit(&self, mut admission: Admission, actor: &str) -> Result<TaskId, Refusal> {
         for _ in 0..DRAWS {
             let item = admission.item.clone();
-            let result = self.inner.parts.store.commit(vec![item]).await.pop();
-            let result = result.map_or_else(|| Err(CommitError::TooLarge), |r| r.map(|_| ()));
+            let result = self.commit(vec![item]).await.pop().ok_or_else(no_result)?;
             match self.settle(admission, result, actor).await? {
                 Admitted::Task(task_id) => return Ok(task_id),
                 Admitted::Again(next) => admission = *next,
@@ -195,60 +235,4 @@ impl TaskService {
         }
         Err(Refusal::new(Kind::Internal, Code::Internal))
     }
-
-    /// Admits one slice of a batch; each item stands for itself.
-    pub async fn submit_slice(&self, requests: Vec<v1::SubmitTaskRequest>, actor: &str) -> Vec<v1::SubmitTaskResult> {
-        let ids: Vec<String> = requests.iter().map(|r| r.request_id.clone()).collect();
-        let mut prepared = Vec::with_capacity(requests.len());
-        for request in requests {
-            prepared.push(self.prepare_batched(request, actor).await);
-        }
-        let items = prepared.iter().filter_map(|p| p.as_ref().ok()).map(|a| a.item.clone()).collect();
-        let mut committed = self.inner.parts.store.commit(items).await.into_iter();
-        let mut results = Vec::with_capacity(ids.len());
-        for (request_id, admission) in ids.into_iter().zip(prepared) {
-            let outcome = match admission {
-                Err(refusal) => Err(refusal),
-                Ok(admission) => {
-                    let result = committed.next().map_or_else(|| Err(CommitError::TooLarge), |r| r.map(|_| ()));
-                    match self.settle(admission, result, actor).await {
-                        Ok(Admitted::Task(task_id)) => Ok(task_id),
-                        Ok(Admitted::Again(next)) => self.admit(*next, actor).await,
-                        Err(refusal) => Err(refusal),
-                    }
-                }
-            };
-            results.push(result_of(request_id, outcome));
-        }
-        results
-    }
-
-    async fn prepare_batched(&self, request: v1::SubmitTaskRequest, actor: &str) -> Result<Admission, Refusal> {
-        if request.request_id.is_empty() {
-            return Err(Refusal::field("request_id", "is required in a batch, so that it can be sent again"));
-        }
-        if request.validate_only {
-            return Err(Refusal::field("validate_only", "is not for a batch"));
-        }
-        self.prepare(request, actor).await
-    }
 }
-
-fn result_of(request_id: String, outcome: Result<TaskId, Refusal>) -> v1::SubmitTaskResult {
-    use v1::submit_task_result::Outcome;
-    let outcome = match outcome {
-        Ok(task_id) => Outcome::TaskId(task_id.to_string()),
-        Err(refusal) => Outcome::Refusal(v1::SubmitTaskRefusal {
-            reason: Some(midshift_proto::convert::shown(&refusal.reason)),
-            violations: refusal
-                .violations
-                .into_iter()
-                .map(|v| midshift_proto::common::v1::FieldViolation { field: v.field, description: v.description })
-                .collect(),
-        }),
-    };
-    v1::SubmitTaskResult { request_id, outcome: Some(outcome) }
-}
-
-/// Whole slices of a batch.
-pub const SLICE: usize = limits::SUBMIT_SLICE;

@@ -1,22 +1,30 @@
 //! What people ask of admitted tasks: cancel, resolve, resume. The request is made durable; fleet obeys it; we wait a little and show the task.
+//!
+//! Invariant: whether fleet has looked at a request is read from fleet's own mark, never guessed from how a task looks. A repeat of a
+//! request_id with the same body is the same request: it writes nothing and its etag is not asked for again.
 
-use crate::TaskService;
+use crate::admit::no_result;
 use crate::rows::{TaskRows, read, unavailable};
+use crate::{ACTOR, TaskService};
+use midshift_core::fleet::rows::FleetMark;
 use midshift_core::ids::{AreaId, RequestId, RobotId, TaskId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
-use midshift_core::rows::{Item, Revision, Writer};
+use midshift_core::rows::{Item, Log, Revision, Seq, Table, Writer};
 use midshift_core::task::state::RequestKey;
 use midshift_core::task::{Ask, Phase, Resolution, TaskRequest};
 use midshift_proto::convert::WireEnum;
 use midshift_proto::convert::task::revision_of;
 use midshift_proto::task::v1;
-use midshift_store::{CommitError, load};
+use midshift_store::{CommitError, Error, load};
 use prost::Message;
 use sha2::{Digest, Sha256};
 use std::time::Duration;
 
-/// A request made durable.
+/// Entries about one request_id read at a time; there are one or two.
+const ENTRIES: usize = 16;
+
+/// A request to be made durable.
 struct Asked {
     ask: Ask,
     reason: String,
@@ -24,9 +32,9 @@ struct Asked {
     hash: String,
 }
 
-fn reason_text(text: &str, required: bool, bad: &mut Violations) {
-    if (required && text.is_empty()) || text.len() > limits::REASON_BYTES_MAX {
-        bad.add("reason", if required { "is required, 1-256 bytes" } else { "must be at most 256 bytes" });
+fn reason_text(text: &str, bad: &mut Violations) {
+    if text.is_empty() || text.len() > limits::REASON_BYTES_MAX {
+        bad.add("reason", "is required, 1-256 bytes");
     }
 }
 
@@ -39,6 +47,19 @@ fn hash(verb: &str, message: &impl Message) -> String {
     digest.update(verb);
     digest.update(message.encode_to_vec());
     digest.finalize().iter().map(|b| format!("{b:02x}")).collect()
+}
+
+fn reused(id: &RequestId) -> Refusal {
+    Refusal::new(Kind::AlreadyExists, Reason::from(Code::RequestIdReused).with("request_id", id))
+}
+
+fn internal() -> Refusal {
+    Refusal::new(Kind::Internal, Code::Internal)
+}
+
+fn ended(task: &TaskRows) -> Refusal {
+    let reason = Reason::from(Code::TaskEnded).with("state", task.state.phase.as_str());
+    Refusal::new(Kind::Precondition, reason.with("task_id", &task.state.task_id))
 }
 
 fn same_etag(seen: Option<Revision>, task: &TaskRows) -> Result<(), Refusal> {
@@ -55,27 +76,29 @@ impl TaskService {
     pub async fn cancel(&self, r: v1::CancelTaskRequest) -> Result<v1::CancelTaskResponse, Refusal> {
         let mut bad = Violations::default();
         let task_id = bad.take("task_id", TaskId::parse(&r.task_id));
-        reason_text(&r.reason, true, &mut bad);
+        reason_text(&r.reason, &mut bad);
         let request_id = request_id(&r.request_id, &mut bad);
         bad.finish()?;
-        let Some(task_id) = task_id else { return Err(Refusal::new(Kind::Internal, Code::Internal)) };
-        let task = read(self.inner.parts.store.as_ref(), &task_id).await?;
-        if task.state.phase == Phase::Canceled {
-            return Ok(v1::CancelTaskResponse { task: Some(task.encode()), pending: false });
+        let task_id = task_id.ok_or_else(internal)?;
+        let same = v1::CancelTaskRequest { request_id: String::new(), validate_only: false, ..r.clone() };
+        let hash = hash("cancel", &same);
+        let task = read(self.store(), &task_id).await?;
+        let earlier = self.asked_before(request_id.as_ref(), &hash).await?;
+        if earlier.is_none() {
+            if task.state.phase == Phase::Canceled {
+                return Ok(v1::CancelTaskResponse { task: Some(task.encode()), pending: false });
+            }
+            if task.state.phase.is_terminal() {
+                return Err(ended(&task));
+            }
+            same_etag(revision_of(&r.etag), &task)?;
         }
-        if task.state.phase.is_terminal() {
-            let reason = Reason::from(Code::TaskEnded).with("state", task.state.phase.as_str());
-            return Err(Refusal::new(Kind::Precondition, reason));
-        }
-        same_etag(revision_of(&r.etag), &task)?;
         if r.validate_only {
             return Ok(v1::CancelTaskResponse { task: Some(task.encode()), pending: false });
         }
-        let hash = hash("cancel", &v1::CancelTaskRequest { request_id: String::new(), ..r.clone() });
         let ask = Ask::Cancel { task_id: task_id.clone(), force: r.force };
-        self.ask(Asked { ask, reason: r.reason, request_id, hash }).await?;
-        let seen = task.revision;
-        let (task, pending) = self.wait(&task_id, |t| t.revision != seen && t.state.cancel_requested.is_some()).await?;
+        let pending = self.ask(earlier, Asked { ask, reason: r.reason, request_id, hash }).await?;
+        let task = read(self.store(), &task_id).await?;
         Ok(v1::CancelTaskResponse { task: Some(task.encode()), pending })
     }
 
@@ -83,7 +106,7 @@ impl TaskService {
     pub async fn resolve(&self, r: v1::ResolveTaskRequest) -> Result<v1::ResolveTaskResponse, Refusal> {
         let mut bad = Violations::default();
         let task_id = bad.take("task_id", TaskId::parse(&r.task_id));
-        reason_text(&r.reason, true, &mut bad);
+        reason_text(&r.reason, &mut bad);
         let request_id = request_id(&r.request_id, &mut bad);
         let resolution = Resolution::from_wire(r.resolution);
         if resolution.is_none() {
@@ -94,35 +117,34 @@ impl TaskService {
             bad.add("etag", "is required: a person answers what the person saw");
         }
         bad.finish()?;
-        let (Some(task_id), Some(resolution)) = (task_id, resolution) else {
-            return Err(Refusal::new(Kind::Internal, Code::Internal));
-        };
-        let task = read(self.inner.parts.store.as_ref(), &task_id).await?;
-        if task.state.phase.is_terminal() {
-            return Err(Refusal::new(
-                Kind::Precondition,
-                Reason::from(Code::TaskEnded).with("state", task.state.phase.as_str()),
-            ));
-        }
-        same_etag(seen, &task)?;
-        if !task.allowed.contains(&resolution) {
-            let reason = Reason::from(Code::ResolutionNotAllowed).with("state", task.state.phase.as_str());
-            return Err(Refusal::new(Kind::Precondition, reason));
+        let (Some(task_id), Some(resolution)) = (task_id, resolution) else { return Err(internal()) };
+        let same = v1::ResolveTaskRequest { request_id: String::new(), validate_only: false, ..r.clone() };
+        let hash = hash("resolve", &same);
+        let task = read(self.store(), &task_id).await?;
+        let earlier = self.asked_before(request_id.as_ref(), &hash).await?;
+        if earlier.is_none() {
+            if task.state.phase.is_terminal() {
+                return Err(ended(&task));
+            }
+            same_etag(seen, &task)?;
+            if !task.allowed.contains(&resolution) {
+                let reason = Reason::from(Code::ResolutionNotAllowed).with("state", task.state.phase.as_str());
+                return Err(Refusal::new(Kind::Precondition, reason.with("task_id", &task_id)));
+            }
         }
         if r.validate_only {
             return Ok(v1::ResolveTaskResponse { task: Some(task.encode()), pending: false });
         }
-        let hash = hash("resolve", &v1::ResolveTaskRequest { request_id: String::new(), ..r.clone() });
         let ask = Ask::Resolve { task_id: task_id.clone(), resolution };
-        self.ask(Asked { ask, reason: r.reason, request_id, hash }).await?;
-        let (task, pending) = self.wait(&task_id, |t| t.state.phase != Phase::NeedsOperator).await?;
+        let pending = self.ask(earlier, Asked { ask, reason: r.reason, request_id, hash }).await?;
+        let task = read(self.store(), &task_id).await?;
         Ok(v1::ResolveTaskResponse { task: Some(task.encode()), pending })
     }
 
     /// Takes `resume:` tokens away.
     pub async fn resume(&self, r: v1::ResumeHeldRequest) -> Result<v1::ResumeHeldResponse, Refusal> {
         let mut bad = Violations::default();
-        reason_text(&r.reason, false, &mut bad);
+        reason_text(&r.reason, &mut bad);
         let request_id = request_id(&r.request_id, &mut bad);
         let area_id = if r.area_id.is_empty() { None } else { bad.take("area_id", AreaId::parse(&r.area_id)) };
         if area_id.as_ref().is_some_and(|area| self.inner.parts.site.find_area(area).is_none()) {
@@ -149,26 +171,64 @@ impl TaskService {
             bad.add("stop_id", "name a stop_id, an area_id, task_ids or robot_ids: nothing is resumed by accident");
         }
         bad.finish()?;
+        let same = v1::ResumeHeldRequest { request_id: String::new(), validate_only: false, ..r.clone() };
+        let hash = hash("resume", &same);
+        let earlier = self.asked_before(request_id.as_ref(), &hash).await?;
         if r.validate_only {
             return Ok(v1::ResumeHeldResponse { pending: false });
         }
-        let hash = hash("resume", &v1::ResumeHeldRequest { request_id: String::new(), ..r.clone() });
         let ask = Ask::ResumeHeld { stop_id, area_id, task_ids, robot_ids };
-        self.ask(Asked { ask, reason: r.reason, request_id, hash }).await?;
-        Ok(v1::ResumeHeldResponse { pending: true })
+        let pending = self.ask(earlier, Asked { ask, reason: r.reason, request_id, hash }).await?;
+        Ok(v1::ResumeHeldResponse { pending })
     }
 
-    /// Makes a request durable; a repeat of the same request_id and body is the same request.
-    async fn ask(&self, asked: Asked) -> Result<(), Refusal> {
+    /// Where the request stands that this one repeats; none: it is new.
+    async fn asked_before(&self, request_id: Option<&RequestId>, hash: &str) -> Result<Option<Seq>, Refusal> {
+        let Some(id) = request_id else { return Ok(None) };
+        match load::<RequestKey>(self.store(), id.as_str()).await.map_err(unavailable)? {
+            Some((key, _)) if key.payload_hash == hash => self.place_of(id).await.map(Some).map_err(unavailable),
+            Some(_) => Err(reused(id)),
+            None => Ok(None),
+        }
+    }
+
+    /// Number of the entry of the request that used this request_id. The log is never cut before fleet has looked: what is no
+    /// longer in it has been looked at, and stands at 0.
+    async fn place_of(&self, request_id: &RequestId) -> Result<Seq, Error> {
+        let subject = [request_id.as_str().into()];
+        let mut after = Seq(0);
+        loop {
+            let page = match self.store().feed_of(Log::Task, &subject, after, ENTRIES).await {
+                Err(Error::CursorExpired { asked, oldest }) if asked < oldest => {
+                    after = oldest;
+                    continue;
+                }
+                page => page?,
+            };
+            if let Some(key) = page.entries.iter().find(|e| e.table == Some(Table::RequestKey)) {
+                return Ok(Seq(key.seq.0 + 1));
+            }
+            if page.next >= page.head {
+                return Ok(Seq(0));
+            }
+            after = page.next;
+        }
+    }
+
+    /// Makes a request durable unless it is a repeat, and waits a little for fleet. True: fleet has not looked at it yet.
+    async fn ask(&self, earlier: Option<Seq>, asked: Asked) -> Result<bool, Refusal> {
+        let place = match earlier {
+            Some(place) => place,
+            None => self.write(asked).await?,
+        };
+        Ok(!self.looked_at(place).await?)
+    }
+
+    /// Commits a request. The key goes first, so that the number of the item is that of the request itself.
+    async fn write(&self, asked: Asked) -> Result<Seq, Refusal> {
         let now = self.inner.parts.clock.now();
-        // Until login exists nobody is known by name.
-        let actor = "anonymous";
-        let id = format!("{:013}-{:016x}", now.wall.0, rand::random::<u64>());
-        let row =
-            TaskRequest { id, ask: asked.ask, reason: asked.reason, actor: actor.to_owned(), at_unix_ms: now.wall.0 };
-        let mut item = Item::new(Writer::Task, actor);
+        let mut item = Item::new(Writer::Task, ACTOR);
         item.request_id = asked.request_id.as_ref().map(|r| r.as_str().into());
-        item.create(&row, "task.asked");
         if let Some(request_id) = &asked.request_id {
             let key = RequestKey {
                 id: request_id.to_string(),
@@ -178,35 +238,33 @@ impl TaskService {
             };
             item.create(&key, "request.used");
         }
-        match self.inner.parts.store.commit(vec![item]).await.pop() {
-            Some(Ok(_)) => Ok(()),
-            Some(Err(CommitError::Conflict { .. })) => {
-                let id = asked.request_id.map(|r| r.to_string()).unwrap_or_default();
-                let found = load::<RequestKey>(self.inner.parts.store.as_ref(), &id).await.map_err(unavailable)?;
-                if found.is_some_and(|(key, _)| key.payload_hash == asked.hash) {
-                    return Ok(());
-                }
-                Err(Refusal::new(Kind::AlreadyExists, Reason::from(Code::RequestIdReused).with("request_id", id)))
+        let id = format!("{:013}-{:016x}", now.wall.0, rand::random::<u64>());
+        let (ask, reason, actor) = (asked.ask, asked.reason, ACTOR.to_owned());
+        item.create(&TaskRequest { id, ask, reason, actor, at_unix_ms: now.wall.0 }, "task.asked");
+        match self.commit(vec![item]).await.pop().ok_or_else(no_result)? {
+            Ok(applied) => Ok(applied.seq),
+            // The same call came in twice at once, or the id was used in between.
+            Err(CommitError::Conflict { .. }) => {
+                self.asked_before(asked.request_id.as_ref(), &asked.hash).await?.ok_or_else(no_result)
             }
-            Some(Err(CommitError::Unknown(_))) | None => Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)),
-            Some(Err(error)) => Err(unavailable(error)),
+            Err(CommitError::Unknown(_)) => Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)),
+            Err(error) => Err(unavailable(error)),
         }
     }
 
-    /// Waits a little for fleet; answers with the task as it is and whether the request is still to be obeyed.
-    async fn wait(&self, task_id: &TaskId, obeyed: impl Fn(&TaskRows) -> bool) -> Result<(TaskRows, bool), Refusal> {
-        let store = self.inner.parts.store.as_ref();
-        let mut wake = store.wake();
+    /// Waits a little until fleet has consumed the log up to `place`; what it did about it is in the same commit as its mark.
+    async fn looked_at(&self, place: Seq) -> Result<bool, Refusal> {
+        let mut wake = self.store().wake();
         let deadline = tokio::time::Instant::now() + Duration::from_millis(limits::CANCEL_WAIT.as_ms());
         loop {
             wake.mark_unchanged();
-            let task = read(store, task_id).await?;
-            if obeyed(&task) || task.state.phase.is_terminal() {
-                return Ok((task, false));
+            let mark = load::<FleetMark>(self.store(), "fleet").await.map_err(unavailable)?;
+            if place == Seq(0) || mark.is_some_and(|(mark, _)| mark.seq >= place) {
+                return Ok(true);
             }
             let woken = tokio::time::timeout_at(deadline, wake.changed()).await;
             if !matches!(woken, Ok(Ok(()))) {
-                return Ok((task, true));
+                return Ok(false);
             }
         }
     }

@@ -1,34 +1,56 @@
 //! The gRPC face of task intake: decode, call, encode.
 
-use crate::admit::SLICE;
-use crate::{TaskService, rows};
-use midshift_core::ids::{Subject, TaskId};
+use crate::batch::Batch;
+use crate::{ACTOR, TaskService, rows};
+use midshift_core::ids::{RequestId, Subject, TaskId};
 use midshift_core::limits;
-use midshift_core::reason::Refusal;
+use midshift_core::reason::{Kind, Refusal};
 use midshift_core::rows::Table;
 use midshift_core::task::Attempt;
 use midshift_proto::task::v1::{self, task_service_server::TaskService as Face};
 use midshift_store::Query;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
+use tonic::metadata::MetadataMap;
 use tonic::{Request, Response, Status, Streaming};
 
 /// Messages on their way to one watcher.
 const WATCH_MAX: usize = 64;
-/// Until login exists nobody is known by name.
-const ACTOR: &str = "anonymous";
+/// Where a caller may name its call, for errors; a request_id in the body goes before it.
+const REQUEST_ID_HEADER: &str = "x-request-id";
 
-fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {
-    result.map(Response::new).map_err(|refusal| {
-        metrics::counter!("midshift_task_refused_total", "code" => refusal.reason.code.as_str()).increment(1);
-        midshift_proto::status(&refusal, None)
-    })
+/// What a call is called in an error: by its body, by its header, or by a number drawn here.
+pub struct CallId(String);
+
+impl CallId {
+    fn of<T>(request: &Request<T>, own: &str) -> Self {
+        let named = |text: &str| RequestId::parse(text).is_ok().then(|| text.to_owned());
+        let header = |map: &MetadataMap| map.get(REQUEST_ID_HEADER).and_then(|v| named(v.to_str().ok()?));
+        let id = named(own).or_else(|| header(request.metadata()));
+        Self(id.unwrap_or_else(|| format!("{:016x}", rand::random::<u64>())))
+    }
+    /// A refusal as a status, counted; our own faults are logged under the id that the caller sees.
+    pub fn status(&self, refusal: &Refusal) -> Status {
+        count(refusal);
+        if refusal.kind() == Kind::Internal {
+            tracing::error!(request_id = self.0, %refusal, "a call failed by our own fault");
+        }
+        midshift_proto::status(refusal, Some(&self.0))
+    }
+    fn answer<T>(&self, result: Result<T, Refusal>) -> Result<Response<T>, Status> {
+        result.map(Response::new).map_err(|refusal| self.status(&refusal))
+    }
+}
+
+/// Counts a refusal of a call or of one item of a batch.
+pub fn count(refusal: &Refusal) {
+    metrics::counter!("midshift_task_refused_total", "code" => refusal.reason.code.as_str()).increment(1);
 }
 
 impl TaskService {
     async fn get(&self, r: v1::GetTaskRequest) -> Result<v1::GetTaskResponse, Refusal> {
         let task_id = TaskId::parse(&r.task_id).map_err(|e| Refusal::field("task_id", e.to_string()))?;
-        let store = self.inner.parts.store.as_ref();
+        let store = self.store();
         let task = rows::read(store, &task_id).await?;
         let query = Query {
             limit: limits::PAGE_MAX,
@@ -46,53 +68,50 @@ impl Face for TaskService {
     type WatchTasksStream = ReceiverStream<Result<v1::WatchTasksResponse, Status>>;
 
     async fn submit_task(&self, r: Request<v1::SubmitTaskRequest>) -> Result<Response<v1::SubmitTaskResponse>, Status> {
+        let id = CallId::of(&r, &r.get_ref().request_id);
         let task = self.submit(r.into_inner(), ACTOR).await;
-        answer(task.map(|task| v1::SubmitTaskResponse { task: Some(task) }))
+        id.answer(task.map(|task| v1::SubmitTaskResponse { task: Some(task) }))
     }
     async fn submit_tasks(
         &self,
         r: Request<Streaming<v1::SubmitTasksRequest>>,
     ) -> Result<Response<v1::SubmitTasksResponse>, Status> {
+        let id = CallId::of(&r, "");
         let mut stream = r.into_inner();
-        let (mut results, mut slice) = (Vec::new(), Vec::new());
+        let mut batch = Batch::new(self);
         while let Some(message) = stream.message().await? {
-            if results.len() + slice.len() >= limits::SUBMIT_ITEMS_MAX {
-                return answer(Err(Refusal::field("item", "at most 10000 a call; what came before was admitted")));
-            }
-            slice.push(message.item.unwrap_or_default());
-            if slice.len() == SLICE {
-                results.extend(self.submit_slice(std::mem::take(&mut slice), ACTOR).await);
-            }
+            batch.take(message.item.unwrap_or_default()).await.map_err(|refusal| id.status(&refusal))?;
         }
-        results.extend(self.submit_slice(slice, ACTOR).await);
-        answer(Ok(v1::SubmitTasksResponse { results }))
+        Ok(Response::new(v1::SubmitTasksResponse { results: batch.finish().await }))
     }
     async fn get_task(&self, r: Request<v1::GetTaskRequest>) -> Result<Response<v1::GetTaskResponse>, Status> {
-        answer(self.get(r.into_inner()).await)
+        let id = CallId::of(&r, "");
+        id.answer(self.get(r.into_inner()).await)
     }
     async fn list_tasks(&self, r: Request<v1::ListTasksRequest>) -> Result<Response<v1::ListTasksResponse>, Status> {
-        answer(self.list(r.into_inner()).await)
+        let id = CallId::of(&r, "");
+        id.answer(self.list(r.into_inner()).await)
     }
     async fn cancel_task(&self, r: Request<v1::CancelTaskRequest>) -> Result<Response<v1::CancelTaskResponse>, Status> {
-        answer(self.cancel(r.into_inner()).await)
+        let id = CallId::of(&r, &r.get_ref().request_id);
+        id.answer(self.cancel(r.into_inner()).await)
     }
     async fn resolve_task(
         &self,
         r: Request<v1::ResolveTaskRequest>,
     ) -> Result<Response<v1::ResolveTaskResponse>, Status> {
-        answer(self.resolve(r.into_inner()).await)
+        let id = CallId::of(&r, &r.get_ref().request_id);
+        id.answer(self.resolve(r.into_inner()).await)
     }
     async fn resume_held(&self, r: Request<v1::ResumeHeldRequest>) -> Result<Response<v1::ResumeHeldResponse>, Status> {
-        answer(self.resume(r.into_inner()).await)
+        let id = CallId::of(&r, &r.get_ref().request_id);
+        id.answer(self.resume(r.into_inner()).await)
     }
     async fn watch_tasks(&self, r: Request<v1::WatchTasksRequest>) -> Result<Response<Self::WatchTasksStream>, Status> {
+        let id = CallId::of(&r, "");
         let (sender, stream) = mpsc::channel(WATCH_MAX);
-        match self.watcher(r.into_inner(), sender) {
-            Ok((watcher, from_now)) => {
-                tokio::spawn(watcher.run(from_now));
-                Ok(Response::new(ReceiverStream::new(stream)))
-            }
-            Err(refusal) => Err(midshift_proto::status(&refusal, None)),
-        }
+        let watcher = self.watcher(r.into_inner(), sender).map_err(|refusal| id.status(&refusal))?;
+        tokio::spawn(watcher.run(id));
+        Ok(Response::new(ReceiverStream::new(stream)))
     }
 }

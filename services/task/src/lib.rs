@@ -5,20 +5,29 @@
 
 mod admit;
 mod ask;
+mod batch;
 mod grpc;
+mod images;
 mod list;
 mod rows;
 mod watch;
 
-use midshift_core::rows::Table;
+use midshift_core::rows::{Item, Table};
 use midshift_core::site::Site;
 use midshift_core::task::TaskIntake;
 use midshift_core::time::Clock;
 use midshift_proto::task::v1::task_service_server::TaskServiceServer;
-use midshift_store::{Error, Query, Store};
+use midshift_store::{Applied, CommitError, Error, Query, Store};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use tokio::sync::Semaphore;
+use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
+
+/// Until login exists nobody is known by name.
+const ACTOR: &str = "anonymous";
+/// Watchers at a time. Each reads the feed for itself: about 100 KB and one read a commit.
+pub const WATCHERS_MAX: usize = 1_000;
 
 /// What the service is built from.
 pub struct Parts {
@@ -33,6 +42,7 @@ pub struct Parts {
 struct Inner {
     parts: Parts,
     number: AtomicU64,
+    watchers: Arc<Semaphore>,
     shutdown: CancellationToken,
 }
 
@@ -54,11 +64,22 @@ impl TaskService {
             Some(row) => row.decode::<TaskIntake>()?.number,
             None => 0,
         };
-        Ok(Self { inner: Arc::new(Inner { parts, number: AtomicU64::new(number), shutdown }) })
+        let (number, watchers) = (AtomicU64::new(number), Arc::new(Semaphore::new(WATCHERS_MAX)));
+        Ok(Self { inner: Arc::new(Inner { parts, number, watchers, shutdown }) })
     }
     /// The gRPC face.
     pub fn grpc(&self) -> TaskServiceServer<Self> {
         TaskServiceServer::new(self.clone())
+    }
+    fn store(&self) -> &dyn Store {
+        self.inner.parts.store.as_ref()
+    }
+    /// Commits items and notes how long it took; one result an item.
+    async fn commit(&self, items: Vec<Item>) -> Vec<Result<Applied, CommitError>> {
+        let begun = Instant::now();
+        let results = self.store().commit(items).await;
+        metrics::histogram!("midshift_task_commit_seconds").record(begun.elapsed().as_secs_f64());
+        results
     }
     /// The next admission number.
     fn next_number(&self) -> u64 {

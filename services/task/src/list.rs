@@ -1,7 +1,7 @@
 //! One page of tasks, newest first. A page token is bound to its filter.
 
 use crate::TaskService;
-use crate::rows::{read_many, unavailable};
+use crate::rows::{TaskRows, read_many, unavailable};
 use midshift_core::ids::TaskId;
 use midshift_core::limits;
 use midshift_core::reason::{Refusal, Violations};
@@ -51,7 +51,32 @@ impl TaskService {
         }
         bad.finish()?;
         let after = if r.page_token.is_empty() { None } else { Some(cursor_of(&r.page_token, &print)?) };
-        self.page(&filter, &print, size, after).await
+        if filter.task_ids.is_empty() {
+            self.page(&filter, &print, size, after).await
+        } else {
+            self.named(&filter, &print, size, after).await
+        }
+    }
+
+    /// Tasks that are named need no search.
+    async fn named(
+        &self,
+        filter: &TaskFilter,
+        print: &str,
+        size: usize,
+        after: Option<Cursor>,
+    ) -> Result<v1::ListTasksResponse, Refusal> {
+        let ids: Vec<TaskId> = filter.task_ids.iter().cloned().collect();
+        let place =
+            |task: &TaskRows| Cursor { order: task.state.number as i64, id: task.state.task_id.as_str().into() };
+        let mut found = read_many(self.store(), &ids).await?;
+        found.retain(|t| filter.admits(&t.intake, &t.state) && after.as_ref().is_none_or(|after| place(t) < *after));
+        found.sort_by_key(|task| std::cmp::Reverse(place(task)));
+        let more = found.len() > size;
+        found.truncate(size);
+        let last = found.last().filter(|_| more).map(|task| token(print, &place(task)));
+        let tasks = found.iter().map(TaskRows::encode).collect();
+        Ok(v1::ListTasksResponse { tasks, next_page_token: last.unwrap_or_default() })
     }
 
     async fn page(
@@ -61,7 +86,7 @@ impl TaskService {
         size: usize,
         mut after: Option<Cursor>,
     ) -> Result<v1::ListTasksResponse, Refusal> {
-        let store = self.inner.parts.store.as_ref();
+        let store = self.store();
         let mut tasks = Vec::new();
         let mut scanned = 0;
         loop {

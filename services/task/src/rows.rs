@@ -8,7 +8,7 @@ use midshift_core::rows::{Key, Record, Revision, Row, Table};
 use midshift_core::task::{Attempt, Resolution, TaskIntake, TaskState};
 use midshift_proto::convert::task::{TaskView, encode_task};
 use midshift_proto::task::v1;
-use midshift_store::{Error, Store};
+use midshift_store::{Error, Store, load};
 use std::collections::BTreeMap;
 
 /// A task with all that is shown of it.
@@ -94,14 +94,23 @@ async fn join(store: &dyn Store, ids: &[TaskId]) -> Result<Vec<TaskRows>, Error>
             .and_then(|r| authority.get(r.as_str()))
             .map(|row| row.decode::<RobotAuthority>())
             .transpose()?;
-        let kept = holder.is_some_and(|h| match h.holder {
-            RobotHolder::Attempt(held) => Some(held) == state.attempt_id(),
-            _ => false,
-        });
+        let kept = holder.is_some_and(|h| keeps(&h, &state));
         let allowed = allowed_resolutions(state.phase, state.opened.is_some(), kept);
         tasks.push(TaskRows { intake: intake.decode()?, state, revision, attempt, allowed });
     }
     Ok(tasks)
+}
+
+/// Whether a robot is kept for the newest attempt of a task.
+fn keeps(authority: &RobotAuthority, state: &TaskState) -> bool {
+    matches!(&authority.holder, RobotHolder::Attempt(held) if Some(held) == state.attempt_id().as_ref())
+}
+
+/// Whether the task's robot is kept for its newest attempt, as the rows are now.
+pub async fn robot_kept(store: &dyn Store, state: &TaskState) -> Result<bool, Error> {
+    let Some(robot_id) = &state.robot_id else { return Ok(false) };
+    let found = load::<RobotAuthority>(store, robot_id.as_str()).await?;
+    Ok(found.is_some_and(|(authority, _)| keeps(&authority, state)))
 }
 
 /// Whether a record of this id exists.

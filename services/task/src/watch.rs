@@ -1,14 +1,18 @@
 //! Every change of tasks in commit order, resumable by cursor without loss.
 //!
-//! Invariant: a change carries the task as it was right after it, not as it is now; a slow watcher holds up nobody.
+//! Invariant: a change carries the task as it was right after it, not as it is now, and no task goes backwards; a slow watcher holds up
+//! nobody: each reads the feed for itself, at its own pace.
 
 use crate::TaskService;
-use crate::rows::{read_many, unavailable};
+use crate::grpc::CallId;
+use crate::images::{Image, Images};
+use crate::rows::{read_many, robot_kept, unavailable};
+use midshift_core::fleet::requests::allowed_resolutions;
 use midshift_core::ids::TaskId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
-use midshift_core::rows::{Entry, Key, Log, Seq, Table};
-use midshift_core::task::{Attempt, TaskIntake, TaskState};
+use midshift_core::rows::{Entry, Log, Revision, Seq, Table};
+use midshift_core::task::Phase;
 use midshift_core::time::Utc;
 use midshift_proto::convert::task::{TaskFilter, TaskView, encode_task};
 use midshift_proto::convert::timestamp;
@@ -16,15 +20,14 @@ use midshift_proto::task::v1::{self, watch_tasks_response::Item};
 use midshift_store::{Cursor, Error, Query};
 use std::collections::BTreeMap;
 use std::time::Duration;
-use tokio::sync::mpsc;
+use tokio::sync::{OwnedSemaphorePermit, mpsc};
+use tokio::time::Instant;
 use tonic::Status;
 
 /// A watcher hears from us at least this often.
 const BOOKMARK_EVERY: Duration = Duration::from_secs(15);
 /// Entries read at a time.
-const PAGE: usize = 500;
-/// Intakes and attempts remembered by one watcher.
-const REMEMBERED: usize = 4_096;
+const PAGE: usize = 1_000;
 
 /// Where messages go.
 pub type Sender = mpsc::Sender<Result<v1::WatchTasksResponse, Status>>;
@@ -34,9 +37,15 @@ pub struct Watcher {
     service: TaskService,
     filter: TaskFilter,
     sender: Sender,
+    /// Begins with the tasks as they are.
+    from_now: bool,
     after: Seq,
-    intakes: BTreeMap<TaskId, TaskIntake>,
-    attempts: BTreeMap<TaskId, Attempt>,
+    images: Images,
+    /// Revisions in which existing tasks were shown, by number, until `after` has passed `shown_until`.
+    shown: BTreeMap<u64, Revision>,
+    shown_until: Seq,
+    said: Instant,
+    _place: OwnedSemaphorePermit,
 }
 
 enum Stop {
@@ -52,18 +61,22 @@ impl From<Refusal> for Stop {
 
 impl TaskService {
     /// A watcher at `cursor`, or at the beginning of now.
-    pub fn watcher(&self, r: v1::WatchTasksRequest, sender: Sender) -> Result<(Watcher, bool), Refusal> {
+    pub fn watcher(&self, r: v1::WatchTasksRequest, sender: Sender) -> Result<Watcher, Refusal> {
         let filter: TaskFilter = midshift_proto::parse_field(Some(r.filter.unwrap_or_default()), "filter")?;
         let after = self.position(&r.cursor)?;
-        let watcher = Watcher {
+        let place = self.inner.watchers.clone().try_acquire_owned();
+        Ok(Watcher {
             service: self.clone(),
             filter,
             sender,
+            from_now: r.cursor.is_empty(),
             after,
-            intakes: BTreeMap::new(),
-            attempts: BTreeMap::new(),
-        };
-        Ok((watcher, r.cursor.is_empty()))
+            images: Images::default(),
+            shown: BTreeMap::new(),
+            shown_until: Seq(0),
+            said: Instant::now(),
+            _place: place.map_err(|_| Refusal::new(Kind::Exhausted, Code::Overloaded))?,
+        })
     }
 
     fn position(&self, cursor: &str) -> Result<Seq, Refusal> {
@@ -82,57 +95,72 @@ impl TaskService {
 
 impl Watcher {
     /// Runs until the watcher is gone, the service stops, or the cursor cannot be served.
-    pub async fn run(mut self, from_now: bool) {
+    pub async fn run(mut self, id: CallId) {
         let shutdown = self.service.inner.shutdown.clone();
         let sender = self.sender.clone();
         tokio::select! {
             () = shutdown.cancelled() => {
                 let refusal = Refusal::new(Kind::Unavailable, Code::ShuttingDown);
-                let _ = sender.try_send(Err(midshift_proto::status(&refusal, None)));
+                // A watcher without room ends without the word.
+                drop(sender.try_send(Err(id.status(&refusal))));
             }
-            stop = self.follow(from_now) => {
+            // One that waits for changes which its filter keeps away would not notice that nobody listens.
+            () = sender.closed() => {}
+            stop = self.follow() => {
                 if let Err(Stop::Refused(refusal)) = stop {
-                    let _ = sender.send(Err(midshift_proto::status(&refusal, None))).await;
+                    drop(sender.send(Err(id.status(&refusal))).await);
                 }
             }
         }
     }
 
-    async fn follow(&mut self, from_now: bool) -> Result<(), Stop> {
-        let mut wake = self.service.inner.parts.store.wake();
-        if from_now {
+    async fn follow(&mut self) -> Result<(), Stop> {
+        let mut wake = self.service.store().wake();
+        if self.from_now {
             self.existing().await?;
             self.bookmark().await?;
         }
         loop {
             wake.mark_unchanged();
             self.changes().await?;
-            match tokio::time::timeout(BOOKMARK_EVERY, wake.changed()).await {
-                Ok(Ok(())) => {}
-                Ok(Err(_)) => return Ok(()),
-                Err(_) => self.bookmark().await?,
+            // A busy store wakes without end: the bookmark is due by what was said, not by how long it was quiet.
+            let due = self.said + BOOKMARK_EVERY;
+            if Instant::now() >= due {
+                self.bookmark().await?;
+                continue;
+            }
+            if let Ok(Err(_)) = tokio::time::timeout_at(due, wake.changed()).await {
+                return Ok(());
             }
         }
     }
 
-    /// The matching tasks as they are. The cursor is taken first, so that no change is lost between them.
+    async fn head(&self) -> Result<Seq, Refusal> {
+        Ok(self.service.store().snapshot(&[Table::FleetMark]).await.map_err(unavailable)?.seq)
+    }
+
+    /// The matching tasks as they are. The cursor is taken first, so that no change is lost between them; what a task already
+    /// showed of the changes after it is not said again.
     async fn existing(&mut self) -> Result<(), Stop> {
         let store = self.service.inner.parts.store.clone();
-        self.after = store.snapshot(&[Table::FleetMark]).await.map_err(unavailable)?.seq;
+        self.after = self.head().await?;
         let mut after: Option<Cursor> = None;
         loop {
             let states = self.filter.phases.iter().map(|p| p.number());
             let query = Query { after, limit: limits::PAGE_MAX, ..Query::all(Table::TaskState).in_states(states) };
             let rows = store.list(query).await.map_err(unavailable)?;
-            let Some(last) = rows.last() else { return Ok(()) };
+            let Some(last) = rows.last() else { break };
             after = Some(Cursor::of(last));
             let ids: Vec<TaskId> = rows.iter().filter_map(|r| TaskId::parse(&r.key.id).ok()).collect();
             for task in read_many(store.as_ref(), &ids).await? {
                 if self.filter.admits(&task.intake, &task.state) {
+                    self.shown.insert(task.state.number, task.revision);
                     self.send(Item::Existing(task.encode()), None).await?;
                 }
             }
         }
+        self.shown_until = self.head().await?;
+        Ok(())
     }
 
     async fn changes(&mut self) -> Result<(), Stop> {
@@ -144,62 +172,41 @@ impl Watcher {
                 }
                 page => page.map_err(unavailable)?,
             };
-            self.learn(&page.entries).await?;
+            self.images.learn(store.as_ref(), &page.entries, self.after).await.map_err(unavailable)?;
             for entry in &page.entries {
                 self.change(entry).await?;
             }
             self.after = page.next;
             if page.next >= page.head {
+                if self.after >= self.shown_until {
+                    self.shown.clear();
+                }
                 return Ok(());
             }
         }
     }
 
-    /// Reads what was asked for of the tasks on this page that are not known yet.
-    async fn learn(&mut self, entries: &[Entry]) -> Result<(), Stop> {
-        if self.intakes.len() > REMEMBERED || self.attempts.len() > REMEMBERED {
-            self.intakes.clear();
-            self.attempts.clear();
-        }
-        let states = entries.iter().filter(|e| e.table == Some(Table::TaskState));
-        let ids: std::collections::BTreeSet<TaskId> = states.filter_map(|e| TaskId::parse(&e.subject).ok()).collect();
-        let unknown: Vec<Key> = ids
-            .iter()
-            .filter(|id| !self.intakes.contains_key(id))
-            .map(|id| Key::new(Table::TaskIntake, id.as_str()))
-            .collect();
-        if unknown.is_empty() {
-            return Ok(());
-        }
-        for row in self.service.inner.parts.store.get(unknown).await.map_err(unavailable)? {
-            let intake: TaskIntake = row.decode().map_err(unavailable)?;
-            self.intakes.insert(intake.task_id.clone(), intake);
-        }
-        Ok(())
-    }
-
     async fn change(&mut self, entry: &Entry) -> Result<(), Stop> {
-        let Some(body) = &entry.body else { return Ok(()) };
-        if entry.table == Some(Table::Attempt)
-            && let Ok(attempt) = serde_json::from_str::<Attempt>(body)
-            && let Some(task_id) = attempt.attempt.subject.task_id()
-        {
-            self.attempts.insert(task_id.clone(), attempt);
+        let Image { intake, state, attempt } = match self.images.take(entry) {
+            Ok(Some(image)) => image,
+            Ok(None) => return Ok(()),
+            Err(error) => {
+                tracing::error!(%error, seq = entry.seq.0, "a watcher passed over a row it cannot read");
+                return Ok(());
+            }
+        };
+        let said = self.shown.get(&state.number).is_some_and(|shown| entry.revision <= *shown);
+        if said || !self.filter.admits(intake, &state) {
             return Ok(());
         }
-        if entry.table != Some(Table::TaskState) {
-            return Ok(());
-        }
-        let Ok(state) = serde_json::from_str::<TaskState>(body) else { return Ok(()) };
-        let Some(intake) = self.intakes.get(&state.task_id) else { return Ok(()) };
-        if !self.filter.admits(intake, &state) {
-            return Ok(());
-        }
-        let attempt = self.attempts.get(&state.task_id).filter(|a| Some(&a.attempt) == state.attempt_id().as_ref());
-        let allowed = midshift_core::fleet::requests::allowed_resolutions(state.phase, state.opened.is_some(), false);
-        let view = TaskView { intake, state: &state, revision: entry.revision, attempt, allowed: &allowed };
+        // What may be answered is about now: the robot's row as it is.
+        let asks = state.phase == Phase::NeedsOperator && state.opened.is_some();
+        let kept = asks && robot_kept(self.service.store(), &state).await.map_err(unavailable)?;
+        let allowed = allowed_resolutions(state.phase, state.opened.is_some(), kept);
+        let task =
+            encode_task(TaskView { intake, state: &state, revision: entry.revision, attempt, allowed: &allowed });
         let change = v1::TaskChange {
-            task: Some(encode_task(view)),
+            task: Some(task),
             kind: entry.kind.to_string(),
             actor: entry.actor.to_string(),
             change_time: Some(timestamp(Utc(entry.at_unix_ms))),
@@ -211,9 +218,11 @@ impl Watcher {
         self.send(Item::Bookmark(v1::Bookmark {}), Some(self.after)).await
     }
 
-    async fn send(&self, item: Item, seq: Option<Seq>) -> Result<(), Stop> {
-        let cursor = seq.map(|seq| format!("{}:{}", self.service.inner.parts.store.id(), seq.0)).unwrap_or_default();
+    async fn send(&mut self, item: Item, seq: Option<Seq>) -> Result<(), Stop> {
+        let cursor = seq.map(|seq| format!("{}:{}", self.service.store().id(), seq.0)).unwrap_or_default();
         let message = v1::WatchTasksResponse { item: Some(item), cursor };
-        self.sender.send(Ok(message)).await.map_err(|_| Stop::Gone)
+        self.sender.send(Ok(message)).await.map_err(|_| Stop::Gone)?;
+        self.said = Instant::now();
+        Ok(())
     }
 }

@@ -1,63 +1,15 @@
 //! Task intake over the in-memory store: every violation at once, idempotency, batches, pages, cancels, watches that resume.
 
-use midshift_core::ids::SiteId;
-use midshift_core::site::{DEMO, text};
-use midshift_core::time::{Clock, Now, SiteTime, Utc};
+use crate::world::{World, count, submit, transport};
 use midshift_proto::task::v1::task_service_server::TaskService as _;
 use midshift_proto::task::v1::watch_tasks_response::Item;
 use midshift_proto::task::v1::{self, SubmitTaskRequest, submit_task_request::Body};
-use midshift_store::{MemoryStore, StoreId};
-use midshift_task::{Parts, TaskService};
-use std::sync::Arc;
 use tokio_stream::StreamExt;
-use tokio_util::sync::CancellationToken;
 use tonic::{Code, Request};
-
-struct Noon;
-
-impl Clock for Noon {
-    fn now(&self) -> Now {
-        Now { site: SiteTime(1_000), utc: Utc(1_800_000_000_000), wall: Utc(1_800_000_000_000), ..Now::default() }
-    }
-    fn rate_permille(&self) -> u32 {
-        1000
-    }
-}
-
-async fn service() -> TaskService {
-    let site = Arc::new(text::parse(DEMO).expect("the demo parses"));
-    let site_id = SiteId::parse("demo").expect("a valid id");
-    let store = Arc::new(MemoryStore::new(site_id, StoreId(Arc::from("store-1")), Arc::new(Noon)));
-    TaskService::open(Parts { store, site, clock: Arc::new(Noon) }, CancellationToken::new())
-        .await
-        .expect("an empty store opens")
-}
-
-fn transport(request_id: &str, to: &str) -> SubmitTaskRequest {
-    let flat = v1::FlatTask {
-        task_type: "transport".into(),
-        from_waypoint: "A01".into(),
-        to_waypoint: to.into(),
-        item_sku: "SKU-1".into(),
-        timeout_seconds: Some(300),
-        ..v1::FlatTask::default()
-    };
-    SubmitTaskRequest { request_id: request_id.into(), body: Some(Body::Flat(flat)), ..SubmitTaskRequest::default() }
-}
-
-async fn submit(service: &TaskService, request: SubmitTaskRequest) -> Result<v1::Task, tonic::Status> {
-    let answer = service.submit_task(Request::new(request)).await?;
-    Ok(answer.into_inner().task.expect("an admitted task"))
-}
-
-async fn count(service: &TaskService) -> usize {
-    let page = service.list_tasks(Request::new(v1::ListTasksRequest::default())).await.expect("a page");
-    page.into_inner().tasks.len()
-}
 
 #[tokio::test]
 async fn every_violation_is_heard_at_once_and_nothing_is_stored() {
-    let service = service().await;
+    let service = World::new().await.service;
     let flat = v1::FlatTask {
         task_type: "Bad".into(),
         priority: Some(11),
@@ -74,7 +26,7 @@ async fn every_violation_is_heard_at_once_and_nothing_is_stored() {
 
 #[tokio::test]
 async fn the_same_request_is_one_task_and_another_body_is_refused() {
-    let service = service().await;
+    let service = World::new().await.service;
     let first = submit(&service, transport("r1", "B03")).await.expect("admitted");
     let again = submit(&service, transport("r1", "B03")).await.expect("answered again");
     assert_eq!(first.task_id, again.task_id);
@@ -89,7 +41,7 @@ async fn the_same_request_is_one_task_and_another_body_is_refused() {
 
 #[tokio::test]
 async fn a_drawn_id_carries_the_day_and_a_dry_run_stores_nothing() {
-    let service = service().await;
+    let service = World::new().await.service;
     let dry = SubmitTaskRequest { validate_only: true, ..transport("", "B03") };
     assert!(submit(&service, dry).await.expect("valid").task_id.is_empty());
     assert_eq!(count(&service).await, 0);
@@ -99,7 +51,7 @@ async fn a_drawn_id_carries_the_day_and_a_dry_run_stores_nothing() {
 
 #[tokio::test]
 async fn a_task_that_depends_on_nothing_known_is_refused() {
-    let service = service().await;
+    let service = World::new().await.service;
     let step =
         v1::Step { kind: Some(v1::step::Kind::Goto(v1::Goto { waypoint: "A01".into() })), ..v1::Step::default() };
     let spec = v1::TaskSpec {
@@ -116,7 +68,7 @@ async fn a_task_that_depends_on_nothing_known_is_refused() {
 
 #[tokio::test]
 async fn pages_are_newest_first_and_a_token_is_bound_to_its_filter() {
-    let service = service().await;
+    let service = World::new().await.service;
     for i in 0..5 {
         submit(&service, transport(&format!("r{i}"), "B03")).await.expect("admitted");
     }
@@ -142,7 +94,7 @@ async fn pages_are_newest_first_and_a_token_is_bound_to_its_filter() {
 
 #[tokio::test(start_paused = true)]
 async fn a_cancel_is_durable_and_says_so_while_fleet_is_down() {
-    let service = service().await;
+    let service = World::new().await.service;
     let task = submit(&service, transport("r1", "B03")).await.expect("admitted");
     let request = v1::CancelTaskRequest {
         task_id: task.task_id.clone(),
@@ -159,7 +111,7 @@ async fn a_cancel_is_durable_and_says_so_while_fleet_is_down() {
 
 #[tokio::test(start_paused = true)]
 async fn a_watch_shows_what_is_there_and_resumes_behind_its_cursor_without_loss() {
-    let service = service().await;
+    let service = World::new().await.service;
     let first = submit(&service, transport("r1", "B03")).await.expect("admitted");
     let mut watch =
         service.watch_tasks(Request::new(v1::WatchTasksRequest::default())).await.expect("a watch").into_inner();

@@ -1,0 +1,117 @@
+//! Batches: items are committed in slices, each item stands for itself, answers keep the order.
+//!
+//! Invariant: an item is checked after everything sent before it that it depends on was committed, wherever slices end.
+
+use crate::admit::{Admitted, Prepared, no_result};
+use crate::{ACTOR, TaskService};
+use midshift_core::ids::TaskId;
+use midshift_core::limits;
+use midshift_core::reason::Refusal;
+use midshift_proto::common::v1::FieldViolation;
+use midshift_proto::task::v1::{self, submit_task_request::Body, submit_task_result::Outcome};
+use std::collections::BTreeSet;
+
+/// A batch under way.
+pub struct Batch<'a> {
+    service: &'a TaskService,
+    slice: Vec<v1::SubmitTaskRequest>,
+    /// Ids that items of the slice chose.
+    chosen: BTreeSet<String>,
+    results: Vec<v1::SubmitTaskResult>,
+}
+
+impl<'a> Batch<'a> {
+    /// An empty one.
+    pub fn new(service: &'a TaskService) -> Self {
+        Self { service, slice: Vec::new(), chosen: BTreeSet::new(), results: Vec::new() }
+    }
+
+    /// Takes the next item; what came before is committed first if the slice is full or the item depends on it.
+    pub async fn take(&mut self, request: v1::SubmitTaskRequest) -> Result<(), Refusal> {
+        if self.results.len() + self.slice.len() >= limits::SUBMIT_ITEMS_MAX {
+            self.flush().await;
+            return Err(Refusal::field("item", "at most 10000 a call; what came before was admitted"));
+        }
+        let depends =
+            matches!(&request.body, Some(Body::Spec(s)) if s.depends_on.iter().any(|id| self.chosen.contains(id)));
+        if depends || self.slice.len() == limits::SUBMIT_SLICE {
+            self.flush().await;
+        }
+        self.chosen.insert(chosen_id(&request).to_owned());
+        self.slice.push(request);
+        Ok(())
+    }
+
+    /// Commits what is left; one result an item.
+    pub async fn finish(mut self) -> Vec<v1::SubmitTaskResult> {
+        self.flush().await;
+        self.results
+    }
+
+    async fn flush(&mut self) {
+        self.chosen.clear();
+        let slice = std::mem::take(&mut self.slice);
+        let ids: Vec<String> = slice.iter().map(|r| r.request_id.clone()).collect();
+        let mut prepared = Vec::with_capacity(slice.len());
+        for request in slice {
+            prepared.push(self.prepare(request).await);
+        }
+        let items = prepared.iter().filter_map(|p| match p {
+            Ok(Prepared::New(admission)) => Some(admission.item.clone()),
+            _ => None,
+        });
+        let items: Vec<_> = items.collect();
+        let committed = if items.is_empty() { Vec::new() } else { self.service.commit(items).await };
+        let mut committed = committed.into_iter();
+        for (request_id, prepared) in ids.into_iter().zip(prepared) {
+            let outcome = match prepared {
+                Err(refusal) => Err(refusal),
+                Ok(Prepared::Known(task_id)) => Ok(task_id),
+                Ok(Prepared::New(admission)) => match committed.next() {
+                    None => Err(no_result()),
+                    Some(result) => match self.service.settle(*admission, result, ACTOR).await {
+                        Ok(Admitted::Task(task_id)) => Ok(task_id),
+                        Ok(Admitted::Again(next)) => self.service.admit(*next, ACTOR).await,
+                        Err(refusal) => Err(refusal),
+                    },
+                },
+            };
+            self.results.push(result_of(request_id, outcome));
+        }
+    }
+
+    async fn prepare(&self, request: v1::SubmitTaskRequest) -> Result<Prepared, Refusal> {
+        if request.request_id.is_empty() {
+            return Err(Refusal::field("request_id", "is required in a batch, so that it can be sent again"));
+        }
+        if request.validate_only {
+            return Err(Refusal::field("validate_only", "is not for a batch"));
+        }
+        self.service.prepare(request, ACTOR).await
+    }
+}
+
+/// The id a request asks for; empty: none.
+fn chosen_id(request: &v1::SubmitTaskRequest) -> &str {
+    match &request.body {
+        _ if !request.task_id.is_empty() => &request.task_id,
+        Some(Body::Flat(flat)) => &flat.task_id,
+        Some(Body::Nested(nested)) => &nested.task_id,
+        Some(Body::Spec(_)) | None => "",
+    }
+}
+
+fn result_of(request_id: String, outcome: Result<TaskId, Refusal>) -> v1::SubmitTaskResult {
+    let outcome = match outcome {
+        Ok(task_id) => Outcome::TaskId(task_id.to_string()),
+        Err(refusal) => {
+            crate::grpc::count(&refusal);
+            let violations = refusal.violations.into_iter();
+            Outcome::Refusal(v1::SubmitTaskRefusal {
+                reason: Some(midshift_proto::convert::shown(&refusal.reason)),
+                violations: violations.map(|v| FieldViolation { field: v.field, description: v.description }).collect(),
+            })
+        }
+    };
+    v1::SubmitTaskResult { request_id, outcome: Some(outcome) }
+}

@@ -1,0 +1,10 @@
+//! Task intake over the in-memory store, through its gRPC face, with fleet played by `core::fleet` where it must answer.
+
+mod asks;
+mod batch;
+mod errors;
+mod forms;
+mod intake;
+mod lists;
+mod watches;
+mod world;
