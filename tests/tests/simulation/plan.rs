@@ -114,9 +114,11 @@ impl Plan {
             (0..rng.random_range(0..3)).map(|_| (rng.random_range(10_000..90_000), rng.random_range(0..TASKS)));
         Ok(Self { cancels: cancels.collect(), windows, skews, tasks, latency_ms: rng.random_range(5..60) })
     }
-    /// No fault begins or lasts after this, milliseconds.
+    /// No fault lasts and nothing is asked for after this, milliseconds.
     pub fn quiet_from_ms(&self) -> u64 {
-        self.windows.iter().map(|w| w.to_ms).max().unwrap_or(0)
+        let faults = self.windows.iter().map(|w| w.to_ms);
+        let wishes = self.tasks.iter().map(|(at, _)| *at).chain(self.cancels.iter().map(|(at, _)| *at));
+        faults.chain(wishes).max().unwrap_or(0)
     }
 }
 
