@@ -1,7 +1,8 @@
 //! Grants places along routes: all passages up to the next standing place together with it, or nothing.
 //!
 //! Invariant: a place is given on only by the robot's own report or by a person, never by time. Queue order is class, then age;
-//! a request that cannot be served blocks later ones on its places. Grants are traffic, never a safety function.
+//! a request that cannot be served blocks later ones on its places. First of all comes who lost a place of its released stretch:
+//! it may stand in a passage for which the others wait. Grants are traffic, never a safety function.
 
 use super::anchor::next_generation;
 use super::desired::{Release, Releases};
@@ -81,6 +82,8 @@ fn adopt(tx: &mut Tx, robot_id: &RobotId, id: &str, grant_id: u64) {
 }
 
 struct Wish {
+    /// Nothing of its released stretch is missing.
+    whole: bool,
     class: Class,
     since: SiteTime,
     robot_id: RobotId,
@@ -92,16 +95,18 @@ pub fn advance(view: &mut View, board: &Board, now: Now, plan: &mut Plan) -> Rel
     for (robot_id, live) in board {
         let Some(id) = view.held_by(robot_id) else { continue };
         let Some(a) = view.attempt(id) else { continue };
-        if may_drive(view, a, live, board, &now)
-            && !(is_released(view, robot_id, a) && missing(view, live, a).is_empty())
-        {
+        if !may_drive(view, a, live, board, &now) {
+            continue;
+        }
+        let whole = missing(view, live, a).is_empty();
+        if !whole || !is_released(view, robot_id, a) {
             let since = view.waits.get(robot_id).map_or(now.site, |w| w.since);
-            wishes.push(Wish { class: class_of(view, a), since, robot_id: robot_id.clone() });
+            wishes.push(Wish { whole, class: class_of(view, a), since, robot_id: robot_id.clone() });
         }
     }
     let wanting: BTreeSet<RobotId> = wishes.iter().map(|w| w.robot_id.clone()).collect();
     view.waits.retain(|r, _| wanting.contains(r));
-    wishes.sort_by(|a, b| (a.class, a.since, &a.robot_id).cmp(&(b.class, b.since, &b.robot_id)));
+    wishes.sort_by(|a, b| (a.whole, a.class, a.since, &a.robot_id).cmp(&(b.whole, b.class, b.since, &b.robot_id)));
     let mut releases = Releases::default();
     let mut blocked = BTreeSet::new();
     for wish in &wishes {

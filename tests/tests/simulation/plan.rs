@@ -28,6 +28,8 @@ pub enum Fault {
     Mute(usize),
     /// Everything between the server and this robot waits, and then comes at once.
     Hold(usize),
+    /// What the server says to these robots waits, and then comes at once; the server hears them all the while.
+    HoldDown(BTreeSet<usize>),
     /// The server's process dies. Without power nobody hears that its connections are gone.
     ServerCrash {
         /// With the network.
@@ -58,6 +60,7 @@ impl Fault {
             Self::Deaf(_) => "partition one way down",
             Self::Mute(_) => "partition one way up",
             Self::Hold(_) => "messages held back",
+            Self::HoldDown(_) => "messages to robots held back",
             Self::ServerCrash { power: false } => "server crash",
             Self::ServerCrash { power: true } => "server power cut",
             Self::AgentCrash { power: false, .. } => "agent crash",
@@ -143,13 +146,16 @@ fn crash(rng: &mut StdRng) -> Window {
     Window { fault, from_ms, to_ms: from_ms + rng.random_range(300..9_000) }
 }
 
+/// One to five robots.
+fn some(rng: &mut StdRng) -> BTreeSet<usize> {
+    let many = rng.random_range(1..=5);
+    (0..ROBOTS).sample(rng, many).into_iter().collect()
+}
+
 fn window(rng: &mut StdRng) -> Window {
     let robot = rng.random_range(0..ROBOTS);
-    let (fault, lasts_ms) = match rng.random_range(0..13) {
-        0 | 1 => {
-            let many = rng.random_range(1..=5);
-            (Fault::Partition((0..ROBOTS).sample(rng, many).into_iter().collect()), 1_000..45_000)
-        }
+    let (fault, lasts_ms) = match rng.random_range(0..15) {
+        0 | 1 => (Fault::Partition(some(rng)), 1_000..45_000),
         2 => (Fault::Deaf(robot), 1_000..40_000),
         3 => (Fault::Mute(robot), 1_000..40_000),
         4 | 5 => (Fault::Hold(robot), 1_000..14_000),
@@ -158,7 +164,8 @@ fn window(rng: &mut StdRng) -> Window {
         9 => (Fault::AgentCrash { robot, power: true }, 200..40_000),
         10 => (Fault::DiskUnknown, 1_000..15_000),
         11 => ([Fault::DiskGone, Fault::DiskSlow][rng.random_range(0..2)].clone(), 500..6_000),
-        _ => (Fault::ClientCut, 1_000..20_000),
+        12 => (Fault::ClientCut, 1_000..20_000),
+        _ => (Fault::HoldDown(some(rng)), 1_000..14_000),
     };
     let from_ms = rng.random_range(FAULTS_MS);
     Window { fault, from_ms, to_ms: from_ms + rng.random_range(lasts_ms) }

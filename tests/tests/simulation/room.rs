@@ -7,7 +7,7 @@ use crate::body::WatchedBody;
 use crate::client;
 use crate::clock::{MachineClock, Skew, TrueTime};
 use crate::disk::{RobotDisk, ServerDisk};
-use crate::net::{self, SERVER, SimDial};
+use crate::net::{self, Ear, SERVER, SimDial};
 use crate::observer::Shared;
 use crate::plan::ROBOTS;
 use midshift::server::{Parts, Server};
@@ -75,6 +75,8 @@ pub struct Room {
     pub disk: Arc<ServerDisk>,
     /// What clients ask for.
     pub desk: Rc<client::Desk>,
+    /// What each robot hears.
+    pub ears: Vec<Ear>,
     steps: u64,
 }
 
@@ -114,15 +116,16 @@ impl Room {
         let hall = Arc::new(Hall::open(&of_hall, &clock.now())?);
         observer.look().watch_world(hall.worlds()[0].clone());
         serve(&mut sim, &time, &site, disk.clone(), frames, config.naive);
-        for robot in 0..ROBOTS {
+        let ears: Vec<Ear> = (0..ROBOTS).map(|_| Ear::default()).collect();
+        for (robot, ear) in ears.iter().enumerate() {
             let skew = config.skews.get(robot).copied().unwrap_or_default();
-            let agent = Agent::new(robot, &hall, &time, &observer, skew, config);
+            let agent = Agent::new(robot, &hall, &time, &observer, skew, ear, config);
             run_agent(&mut sim, machine(robot), agent);
         }
         let desk = Rc::new(client::Desk::default());
         let of_client = desk.clone();
         sim.host(CLIENT, move || client::run(of_client.clone()));
-        Ok(Self { sim, time, observer, hall, disk, desk, steps: 0 })
+        Ok(Self { sim, time, observer, hall, disk, desk, ears, steps: 0 })
     }
     /// True time so far, milliseconds.
     pub fn now_ms(&self) -> u64 {
@@ -225,6 +228,7 @@ struct Agent {
     time: TrueTime,
     observer: Shared,
     skew: Skew,
+    ear: Ear,
     memory: RobotMemory,
     bugs: Bugs,
     lives: Arc<AtomicU64>,
@@ -237,6 +241,7 @@ impl Agent {
         time: &TrueTime,
         observer: &Shared,
         skew: Skew,
+        ear: &Ear,
         config: &RoomConfig,
     ) -> Self {
         Self {
@@ -246,6 +251,7 @@ impl Agent {
             time: time.clone(),
             observer: observer.clone(),
             skew,
+            ear: ear.clone(),
             memory: RobotMemory::new(),
             bugs: config.naive.agent,
             lives: Arc::default(),
@@ -271,7 +277,8 @@ impl Agent {
         let disk = RobotDisk::open(self.memory.clone(), robot_id.clone(), self.observer.clone(), number);
         let clock: Arc<dyn Clock> = MachineClock::boot(&self.time, self.skew);
         let never = CancellationToken::new();
-        let end = session::run(config, Box::new(witness), Box::new(disk), clock, Arc::new(SimDial), never).await?;
+        let dial = Arc::new(SimDial(self.ear.clone()));
+        let end = session::run(config, Box::new(witness), Box::new(disk), clock, dial, never).await?;
         self.observer.look().find(format!("the agent of {robot_id} ended: {end:?}"));
         std::future::pending().await
     }

@@ -35,6 +35,27 @@ async fn the_second_robot_waits_before_an_exclusive_passage_and_goes_when_the_fi
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_robot_that_lost_its_way_out_of_a_passage_gets_it_before_those_who_wait_to_get_in() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "A").await;
+    w.robot("r2", "park-a").await;
+    w.submit_with("T1", "A", "B", |raw| (raw.robot_id, raw.stall_ms) = ("r1".to_owned(), Some(3_600_000))).await;
+    w.until("r1 is in the corridor", |s| s.holders("corridor") == [("r1".to_owned(), HolderState::Inside)]).await;
+    w.r("r1").drives = false;
+    w.submit_with("T2", "A", "B", |raw| (raw.robot_id, raw.priority) = ("r2".to_owned(), Some(0))).await;
+    let r2_inside = ("r2".to_owned(), HolderState::Inside);
+    let before = w.until("r2 stands before it", |s| s.holders("wait-a").contains(&r2_inside)).await;
+    let grant_of = |s: &crate::harness::Seen| s.place("B").holders.first().map(|h| h.grant_id);
+    let first = grant_of(&before).expect("B is granted with the corridor");
+    w.r("r1").gives_back("B", first);
+    w.until("r1 has it again", |s| s.has("r1", "B") && grant_of(s) != Some(first)).await;
+    w.r("r1").drives = true;
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.until_phase("T2", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_permission_to_enter_is_anchored_again_after_a_reconnect() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;

@@ -192,6 +192,12 @@ impl Robot {
         self.job = None;
         self.attempts.clear();
     }
+    /// It gives back a place that it has not entered.
+    pub fn gives_back(&mut self, place: &str, grant_id: u64) {
+        let place_id = PlaceId::parse(place).expect("a place");
+        self.places.retain(|p| p.place_id != place_id);
+        self.says(RobotEvent::Place { place_id, grant_id, news: PlaceNews::NotEntered });
+    }
     pub fn is_idle(&self) -> bool {
         self.job.is_none()
     }
