@@ -33,12 +33,15 @@ enum Verb {
         #[arg(value_enum)]
         parts: Vec<parts::Part>,
     },
-    /// Kill servers and agents at work with many seeds; CI does it with one. About two minutes a seed.
+    /// Long fault sweeps, of which CI runs a sample: programs that are killed at work, and simulated shifts.
     Torture {
-        /// How many seeds.
-        #[arg(long, default_value_t = 20)]
-        seeds: u64,
-        /// The first seed. A failing seed alone: `--from SEED --seeds 1`.
+        /// Sweeps to run; none: all.
+        #[arg(value_enum)]
+        sweeps: Vec<sweep::Sweep>,
+        /// How many seeds each; unless told, 20 kills (about two minutes a seed) and 2000 simulated shifts (about a quarter of a second).
+        #[arg(long)]
+        seeds: Option<u64>,
+        /// The first seed. A failing seed alone: `torture SWEEP --from SEED --seeds 1`.
         #[arg(long, default_value_t = 1)]
         from: u64,
     },
@@ -51,7 +54,7 @@ enum Verb {
 fn main() -> ExitCode {
     let outcome = workspace::Workspace::find().and_then(|workspace| match Cli::parse().verb {
         Verb::Test { install, parts } => suite::test(&workspace, install, &parts),
-        Verb::Torture { seeds, from } => sweep::torture(&workspace, from, seeds),
+        Verb::Torture { sweeps, seeds, from } => sweep::torture(&workspace, &sweeps, from, seeds),
         Verb::Golden => sweep::golden(&workspace),
         Verb::Tidy => sweep::tidy(&workspace),
     });

@@ -1,23 +1,68 @@
 //! Long sweeps and golden files: calls of `cargo test` with an environment variable that the tests read.
 //!
-//! Invariant: a sweep that ran no test fails. `MIDSHIFT_SEED` is read by the test that kills programs, `BLESS`
-//! by tests with `golden` in their name.
+//! Invariant: a sweep that ran no test fails. `MIDSHIFT_SEED` is read by the test that kills programs, `MIDSHIFT_SEEDS` and
+//! `MIDSHIFT_SEED_FROM` by the simulation, `BLESS` by tests with `golden` in their name.
 
 use crate::parts::Count;
 use crate::run;
 use crate::workspace::Workspace;
 use anyhow::{Result, ensure};
+use clap::ValueEnum;
+use std::process::Command;
 
-/// Kills servers and agents at work, once with each seed of `from .. from + seeds`; whether all held. Ends at the first that does not.
-pub fn torture(workspace: &Workspace, from: u64, seeds: u64) -> Result<bool> {
-    ensure!(seeds > 0, "--seeds must be at least 1");
+/// One kind of fault sweep.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Sweep {
+    /// Servers and agents killed at work.
+    Kills,
+    /// Shifts of the deterministic simulation.
+    Simulation,
+}
+
+impl Sweep {
+    const ALL: [Self; 2] = [Self::Kills, Self::Simulation];
+
+    fn seeds(self) -> u64 {
+        match self {
+            Self::Kills => 20,
+            Self::Simulation => 2_000,
+        }
+    }
+
+    fn run(self, workspace: &Workspace, from: u64, seeds: u64) -> Result<bool> {
+        match self {
+            Self::Kills => kills(workspace, from, seeds),
+            Self::Simulation => {
+                let mut command = test(workspace, "simulation", "many_seeds_keep_every_law");
+                command.env("MIDSHIFT_SEED_FROM", from.to_string()).env("MIDSHIFT_SEEDS", seeds.to_string());
+                counted(&mut command)
+            }
+        }
+    }
+}
+
+/// Runs these sweeps, or all; whether all laws held.
+pub fn torture(workspace: &Workspace, sweeps: &[Sweep], from: u64, seeds: Option<u64>) -> Result<bool> {
+    ensure!(seeds != Some(0), "--seeds must be at least 1");
+    let mut held = true;
+    for sweep in Sweep::ALL.into_iter().filter(|s| sweeps.is_empty() || sweeps.contains(s)) {
+        held &= sweep.run(workspace, from, seeds.unwrap_or(sweep.seeds()))?;
+    }
+    Ok(held)
+}
+
+fn test(workspace: &Workspace, target: &str, filter: &str) -> Command {
+    workspace.cargo(&["test", "--package", "midshift-tests", "--test", target, "--", filter, "--nocapture"])
+}
+
+/// Kills programs at work, once with each seed of `from .. from + seeds`. Ends at the first that loses something.
+fn kills(workspace: &Workspace, from: u64, seeds: u64) -> Result<bool> {
     ensure!(run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins"]))?, "the programs do not build");
     for seed in from..from.saturating_add(seeds) {
-        let mut command =
-            workspace.cargo(&["test", "--package", "midshift-tests", "--test", "e2e", "--", "kill::", "--nocapture"]);
+        let mut command = test(workspace, "e2e", "kill::");
         workspace.export_programs(&mut command)?;
         if !counted(command.env("MIDSHIFT_SEED", seed.to_string()))? {
-            run::say(&format!("next: cargo xtask torture --from {seed} --seeds 1"));
+            run::say(&format!("next: cargo xtask torture kills --from {seed} --seeds 1"));
             return Ok(false);
         }
     }
@@ -39,7 +84,7 @@ pub fn tidy(workspace: &Workspace) -> Result<bool> {
     Ok(run::succeeds(&mut workspace.cargo(&["fmt", "--all"]))? && golden(workspace)?)
 }
 
-fn counted(command: &mut std::process::Command) -> Result<bool> {
+fn counted(command: &mut Command) -> Result<bool> {
     let mut count = Count::default();
     let succeeded = run::reading(command, |line| count.add(line))?;
     run::print(&format!("{} passed, {} failed", count.passed, count.failed));
