@@ -130,7 +130,15 @@ impl AgentCore {
         if self.mode != Mode::Automatic || self.hardware_stop != HardwareStop::None {
             return Pause::Now;
         }
-        if self.is_held() || !self.has_lease(now) { Pause::WindDown } else { Pause::No }
+        if self.is_held() || self.suspends() || !self.has_lease(now) { Pause::WindDown } else { Pause::No }
+    }
+
+    /// It is asked to hand its attempt back at a step boundary, and it may: it carries nothing and is not inside an action.
+    fn suspends(&self) -> bool {
+        let asked = |w: &Work| {
+            w.order.as_ref().is_some_and(|o| o.suspend) && w.holder.intent.is_none() && w.doing != Doing::Acting
+        };
+        self.work.as_ref().is_some_and(asked) && self.body.load().is_none()
     }
 
     /// Hold tokens stand, or the last was taken away and nobody has let the robot go on yet.
@@ -433,7 +441,7 @@ impl AgentCore {
             self.finish(now, WorkState::Succeeded, None);
             return true;
         };
-        if order.suspend && self.body.load().is_none() && work.holder.intent.is_none() && self.at_boundary(work) {
+        if self.suspends() && self.at_boundary(work) {
             self.finish(now, WorkState::Suspended, None);
             return true;
         }

@@ -45,7 +45,29 @@ pub fn robot(tx: &mut Tx, robot_id: &RobotId, board: &Board, tally: &mut Tally) 
     inbox::hardware_stop(tx, robot_id, live.report.hardware_stop);
     places::repair(tx, robot_id, &live);
     attempt(tx, robot_id, &live, tally);
+    recharge(tx, robot_id, &live);
     forget_reported(tx, robot_id, &live);
+}
+
+/// A robot at work must charge: a preemptible task that it has not opened waits, at a step boundary.
+fn recharge(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
+    let Some(task_id) = tx.view.held_by(robot_id).and_then(|id| id.subject.task_id()).cloned() else { return };
+    let Some(task) = tx.view.task(&task_id).filter(|t| t.phase == Phase::Running && t.opened.is_none()) else { return };
+    let opened = task.attempt_id().and_then(|id| tx.view.attempt(&id)).is_none_or(|a| a.opened);
+    let preemptible = tx.view.intake(&task_id).is_some_and(|i| i.spec.preemptible);
+    let vitals = &live.report.vitals;
+    if opened || !preemptible || live.report.load.is_some() || tx.view.site.chargers().next().is_none() {
+        return;
+    }
+    let Some(here) = super::way::find(tx.view, vitals.waypoint.as_ref()) else { return };
+    let least = tx.view.policy(&tx.view.site.area_of(here).area_id).charge_mandatory_permille;
+    if vitals.battery_permille < least {
+        let why = Reason::from(Code::BatterySuspend)
+            .with("robot_id", robot_id)
+            .with("battery_permille", vitals.battery_permille)
+            .with("mandatory_permille", least);
+        happen(tx, &task_id, News::of(Event::Suspend, Some(&why)));
+    }
 }
 
 fn lease_over(tx: &mut Tx, robot_id: &RobotId) {

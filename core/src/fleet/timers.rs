@@ -45,7 +45,9 @@ pub fn fire(tx: &mut Tx, timer: &Timer, board: &Board) {
     let (event, code) = match timer.kind {
         TimerKind::OfferAck => (Event::OfferAckTimeout, Code::OfferNotAnswered),
         TimerKind::StopConfirm => {
-            if waits_for_silent_robot(tx, &task_id, &timer.attempt, board) {
+            if waits_for_silent_robot(tx, &task_id, &timer.attempt, board)
+                || winds_down(tx, &task_id, &timer.attempt, board)
+            {
                 arm(tx, TimerKind::StopConfirm, &timer.attempt, limits::STOP_CONFIRM.as_ms());
                 return;
             }
@@ -69,6 +71,13 @@ fn waits_for_silent_robot(tx: &Tx, task_id: &TaskId, attempt: &AttemptId, board:
     let Some(a) = tx.view.attempt(attempt) else { return false };
     let requeue = tx.view.task(task_id).is_some_and(|t| t.then == Some(Then::Requeue));
     requeue && a.accepted.is_none() && super::heard::presence(board, &a.robot_id, &tx.now) != Presence::Online
+}
+
+/// A heard robot that was asked to hand its attempt back at a step boundary may take as long as its attempt may last: it ends that itself.
+fn winds_down(tx: &Tx, task_id: &TaskId, attempt: &AttemptId, board: &Board) -> bool {
+    let suspending = tx.view.task(task_id).is_some_and(|t| t.then == Some(Then::Suspended));
+    let Some(a) = tx.view.attempt(attempt).filter(|a| suspending && a.uncertain.is_none()) else { return false };
+    super::heard::presence(board, &a.robot_id, &tx.now) == Presence::Online
 }
 
 /// The deadline of a task passed.

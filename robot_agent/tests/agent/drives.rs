@@ -65,6 +65,20 @@ fn a_robot_drives_as_far_as_it_is_released_and_granted() {
 }
 
 #[test]
+fn a_robot_asked_to_hand_back_stops_at_the_next_standing_place_and_says_so() {
+    let mut rig = under_way(Rig::at("A"));
+    let suspend = Assignment { suspend: true, ..offer(&rig, 4) };
+    rig.work(DesiredWork { grants: grants(&rig), ..rig.desired(Some(suspend)) });
+    assert_eq!(rig.body.goes_to(), ["B", "C", "D"]);
+    assert!(rig.states().is_empty());
+    (0..3).for_each(|_| {
+        rig.body.reach();
+        rig.pass(500);
+    });
+    assert_eq!(rig.states().last(), Some(&(WorkState::Suspended, 0)));
+}
+
+#[test]
 fn places_are_said_as_they_are_entered_and_left_and_a_grant_is_used_once() {
     let mut rig = under_way(Rig::at("A"));
     rig.body.reach();

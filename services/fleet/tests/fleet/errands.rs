@@ -22,6 +22,37 @@ async fn a_robot_with_little_charge_is_sent_to_a_charger_before_any_task() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_preemptible_task_is_suspended_when_its_robot_must_charge_and_done_afterwards() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-b").await;
+    w.submit_with("T1", "A", "B", |raw| raw.preemptible = true).await;
+    w.until("it is on its way", |s| s.phase("T1") == Phase::Running && s.has("r1", "corridor")).await;
+    w.r("r1").battery_permille = 150;
+    let seen = w.until("it is suspended", |s| s.phase("T1") != Phase::Running).await;
+    assert_eq!(seen.reason("T1"), Some(Code::BatterySuspend));
+    w.until("it charges", |s| s.errand("r1").is_some_and(|(e, _)| e == Errand::Charge)).await;
+    let seen = w.until_phase("T1", Phase::Succeeded).await;
+    assert_eq!((seen.task("T1").failures, seen.task("T1").epoch), (0, 2), "no failure, and a second grant");
+    assert!(w.r("r1").battery_permille >= 350, "it was charged first");
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_task_that_is_not_preemptible_or_is_opened_goes_on_with_little_charge() {
+    for preemptible in [false, true] {
+        let mut w = World::on(CORRIDOR).await;
+        w.robot("r1", "A").await;
+        w.submit_with("T1", "A", "B", |raw| raw.preemptible = preemptible).await;
+        let on_its_way = |s: &crate::harness::Seen| s.phase("T1") == Phase::Running && s.has("r1", "corridor");
+        w.until("it carries its item", on_its_way).await;
+        w.r("r1").battery_permille = 150;
+        let seen = w.until_phase("T1", Phase::Succeeded).await;
+        assert_eq!(seen.task("T1").epoch, 1);
+        w.lawful().await;
+    }
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_robot_left_idle_in_a_station_is_sent_to_park() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;
