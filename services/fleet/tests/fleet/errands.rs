@@ -39,13 +39,15 @@ async fn a_preemptible_task_is_suspended_when_its_robot_must_charge_and_done_aft
 
 #[tokio::test(start_paused = true)]
 async fn a_task_that_is_not_preemptible_or_is_opened_goes_on_with_little_charge() {
-    for preemptible in [false, true] {
+    for (preemptible, stands) in [(false, "park-b"), (true, "A")] {
         let mut w = World::on(CORRIDOR).await;
-        w.robot("r1", "A").await;
+        w.robot("r1", stands).await;
         w.submit_with("T1", "A", "B", |raw| raw.preemptible = preemptible).await;
         let on_its_way = |s: &crate::harness::Seen| s.phase("T1") == Phase::Running && s.has("r1", "corridor");
-        w.until("it carries its item", on_its_way).await;
-        w.r("r1").battery_permille = 150;
+        w.until("it is on its way, in the second case with its item", on_its_way).await;
+        (w.r("r1").battery_permille, w.r("r1").drives) = (150, false);
+        w.pass_while(10, "it goes on", |s| s.phase("T1") == Phase::Running).await;
+        w.r("r1").drives = true;
         let seen = w.until_phase("T1", Phase::Succeeded).await;
         assert_eq!(seen.task("T1").epoch, 1);
         w.lawful().await;
