@@ -1,6 +1,7 @@
 //! `midshift dev`: a whole factory in one process, in memory, on loopback, with simulated robots and work of its own. Not for production.
 
 use crate::background::{Background, Pressure, Source, read_list};
+use crate::planning::Planning;
 use crate::report::{self, Inputs, Report, SharedTasks};
 use crate::server::{Parts, Server};
 use crate::{clock, serve, site_file};
@@ -110,6 +111,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     swarm.person = Some(Arc::new(move |id| report::look(&live, |t| t.is_live(id))));
     let swarm = Swarm::new(swarm);
     let (store, frames) = stores(&args, &site, &clock).await?;
+    let planning = Planning::start()?;
     let parts = Parts {
         store: store.clone(),
         frames,
@@ -118,6 +120,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         clock: clock.clone(),
         sim: Some(SimFace::new(hall.clone(), clock.clone(), swarm.crash())),
         telemetry_bugs: midshift_telemetry::Bugs::default(),
+        planning: planning.handle(),
     };
     let server = Server::new(parts, stop.clone()).await?;
     say(&greeting(&args, &site, address));

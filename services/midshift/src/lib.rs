@@ -8,6 +8,7 @@ pub mod clock;
 pub mod dev;
 pub mod duration;
 pub mod logs;
+pub mod planning;
 pub mod report;
 pub mod robots;
 pub mod serve;

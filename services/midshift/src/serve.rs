@@ -1,5 +1,6 @@
 //! `midshift serve`: everything persistent in one process, for a real site.
 
+use crate::planning::Planning;
 use crate::server::{Parts, Server};
 use crate::{clock, site_file};
 use anyhow::{Context, bail};
@@ -47,6 +48,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
     let frames = Arc::new(SqliteFrames::open(&args.data, site_id, clock.clone(), FRAME_BYTES_DEFAULT).await?);
     let listener = TcpListener::bind(args.listen).await.with_context(|| format!("listening on {}", args.listen))?;
     tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), "midshift serves");
+    let planning = Planning::start()?;
     let parts = Parts {
         store: store.clone(),
         frames: frames.clone(),
@@ -55,6 +57,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
         clock,
         sim: None,
         telemetry_bugs: midshift_telemetry::Bugs::default(),
+        planning: planning.handle(),
     };
     let server = Server::new(parts, shutdown).await?;
     let served = server.serve(nodelay(listener)).await;

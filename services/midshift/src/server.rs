@@ -20,6 +20,7 @@ use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio_stream::Stream;
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::AbortOnDropHandle;
 use tonic::service::Routes;
 use tonic::transport::Server as Transport;
 use tonic::transport::server::Connected;
@@ -47,6 +48,8 @@ pub struct Parts {
     pub sim: Option<SimFace>,
     /// Naive rules for twins of tests; none outside them.
     pub telemetry_bugs: midshift_telemetry::Bugs,
+    /// Where fleet plans; see [`crate::planning`].
+    pub planning: tokio::runtime::Handle,
 }
 
 /// All services of one process, ready to be served.
@@ -160,14 +163,16 @@ impl Server {
             .add_routes(routes)
             .serve_with_incoming_shutdown(incoming, async move { stopped.cancelled().await });
         let keeper = prune(self.parts.store.clone(), self.parts.frames.clone(), self.parts.clock.clone());
-        let fleet = self.reconciler.run(shutdown.clone());
+        let fleet = AbortOnDropHandle::new(self.parts.planning.spawn(self.reconciler.run(shutdown.clone())));
         let telemetry = self.telemetry.clone().run();
         let hard = async {
             shutdown.cancelled().await;
             tokio::time::sleep(Duration::from_millis(limits::HARD_DRAIN.as_ms())).await;
         };
         let services = async {
-            tokio::try_join!(async { fleet.await.context("fleet") }, async { telemetry.await.context("telemetry") })
+            tokio::try_join!(async { fleet.await.context("fleet")?.context("fleet") }, async {
+                telemetry.await.context("telemetry")
+            })
         };
         tokio::select! {
             served = async { tokio::join!(transport, services) } => {

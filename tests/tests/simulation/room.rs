@@ -208,6 +208,7 @@ fn serve(
                     clock: MachineClock::boot(&time, Skew::default()),
                     sim: None,
                     telemetry_bugs: naive.telemetry,
+                    planning: tokio::runtime::Handle::current(),
                 };
                 // A service manager starts a server again that could not read its disk.
                 if let Ok(server) = Server::new(parts, CancellationToken::new()).await {
