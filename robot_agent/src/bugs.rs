@@ -14,6 +14,8 @@ pub enum SeededBug {
     NoEpochFence,
     /// A second attempt is taken while another holds the robot.
     IgnoreHolder,
+    /// A session is kept however long the server is silent.
+    PatientSession,
 }
 
 /// Which naive rules are on. None by default.
@@ -52,4 +54,5 @@ questions! {
     grant_from_receipt GrantFromReceipt;
     no_epoch_fence NoEpochFence;
     ignore_holder IgnoreHolder;
+    patient_session PatientSession;
 }

@@ -226,7 +226,8 @@ impl Agent {
 
     fn due(&mut self) {
         let now = self.clock.now();
-        if self.open.as_ref().is_some_and(|o| now.link.since(o.heard) > SILENCE) {
+        let patient = self.config.bugs.patient_session();
+        if !patient && self.open.as_ref().is_some_and(|o| now.link.since(o.heard) > SILENCE) {
             self.lost("the server is silent");
         }
         if now.link.since(self.pulsed) >= limits::HEARTBEAT {

@@ -1,6 +1,7 @@
 //! Starts real programs in folders of their own and ends exactly those; waits for conditions, with limits.
 
 use anyhow::{Context, bail};
+use midshift_core::site::DEMO;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::task::v1::{ListTasksRequest, Task, TaskFilter, TaskState};
 use std::future::Future;
@@ -11,6 +12,8 @@ use std::time::Duration;
 use tokio::time::Instant;
 use tonic::transport::{Channel, Endpoint};
 
+/// The site of a server, in its folder.
+const SITE_FILE: &str = "site.toml";
 /// How often a condition is looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 
@@ -100,6 +103,11 @@ pub struct Server {
 impl Server {
     /// Starts it and waits until it answers.
     pub async fn start(dir: &Path) -> anyhow::Result<Self> {
+        Self::start_on(dir, DEMO).await
+    }
+    /// On another site than the demo.
+    pub async fn start_on(dir: &Path, site: &str) -> anyhow::Result<Self> {
+        std::fs::write(dir.join(SITE_FILE), site)?;
         let address = free_port()?;
         let running = Self::run(dir, address)?;
         let server = Self { address, dir: dir.to_owned(), running };
@@ -109,6 +117,7 @@ impl Server {
     fn run(dir: &Path, address: SocketAddr) -> anyhow::Result<Running> {
         let mut command = Command::new(midshift()?);
         command.args(["serve", "--data"]).arg(dir.join("data")).args(["--listen", &address.to_string()]);
+        command.arg("--site").arg(dir.join(SITE_FILE));
         Running::start(&mut command, &dir.join("server.log"))
     }
     /// SIGKILL and a new start on the same data.

@@ -5,4 +5,6 @@
 mod clients;
 mod cut;
 mod harness;
+mod held;
 mod kill;
+mod proxy;

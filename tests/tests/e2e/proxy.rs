@@ -1,0 +1,78 @@
+//! A proxy in the way of robots, which can hold back what the server says, byte for byte, or cut every connection.
+//!
+//! Invariant: bytes are delayed, never changed and never reordered; what robots say always passes.
+
+use std::net::SocketAddr;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+
+/// Bytes taken from one side at a time.
+const CHUNK: usize = 16 * 1024;
+
+/// The proxy; its connections end with it.
+pub struct Proxy {
+    /// Where robots dial.
+    pub address: SocketAddr,
+    held: watch::Sender<bool>,
+    cuts: watch::Sender<u64>,
+    _accepting: JoinSet<()>,
+}
+
+impl Proxy {
+    /// In front of `server`.
+    pub async fn before(server: SocketAddr) -> anyhow::Result<Self> {
+        let listener = TcpListener::bind("127.0.0.1:0").await?;
+        let address = listener.local_addr()?;
+        let (held, cuts) = (watch::Sender::new(false), watch::Sender::new(0));
+        let (hold, cut) = (held.subscribe(), cuts.subscribe());
+        let mut accepting = JoinSet::new();
+        accepting.spawn(async move {
+            let mut connections = JoinSet::new();
+            while let Ok((robot, _)) = listener.accept().await {
+                let (hold, mut cut) = (hold.clone(), cut.clone());
+                cut.mark_unchanged();
+                connections.spawn(async move {
+                    tokio::select! {
+                        _ = carry(robot, server, hold) => {}
+                        _ = cut.changed() => {}
+                    }
+                });
+            }
+        });
+        Ok(Self { address, held, cuts, _accepting: accepting })
+    }
+    /// From now on nothing the server says arrives; or all of it at once.
+    pub fn hold(&self, held: bool) {
+        self.held.send_replace(held);
+    }
+    /// Ends every connection there is; what was held back on them is lost.
+    pub fn cut(&self) {
+        self.cuts.send_modify(|n| *n += 1);
+    }
+}
+
+async fn carry(robot: TcpStream, server: SocketAddr, mut hold: watch::Receiver<bool>) -> std::io::Result<()> {
+    let server = TcpStream::connect(server).await?;
+    robot.set_nodelay(true)?;
+    server.set_nodelay(true)?;
+    let (mut from_robot, mut to_robot) = robot.into_split();
+    let (mut from_server, mut to_server) = server.into_split();
+    let down = async {
+        let mut bytes = vec![0; CHUNK];
+        loop {
+            let read = from_server.read(&mut bytes).await?;
+            if read == 0 {
+                return Ok::<(), std::io::Error>(());
+            }
+            hold.wait_for(|held| !held).await.map_err(std::io::Error::other)?;
+            to_robot.write_all(&bytes[..read]).await?;
+        }
+    };
+    let up = async { tokio::io::copy(&mut from_robot, &mut to_server).await.map(|_| ()) };
+    tokio::select! {
+        end = down => end,
+        end = up => end,
+    }
+}
