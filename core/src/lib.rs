@@ -4,6 +4,7 @@
 //! `now` and values and return values; services act on what is returned.
 
 pub mod authority;
+pub mod bugs;
 pub mod fleet;
 pub mod ids;
 pub mod limits;

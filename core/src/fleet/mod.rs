@@ -8,6 +8,7 @@
 pub mod anchor;
 pub mod assign;
 pub mod attempts;
+pub mod bugs;
 pub mod commands;
 pub mod desired;
 pub mod errands;

@@ -13,7 +13,7 @@ use crate::reason::{Code, Reason};
 use crate::robot::{HardwareStop, Mode, Presence};
 use crate::task::{Attempt, AttemptPhase, Event, Phase};
 use crate::time::Now;
-use crate::work::{AttemptReport, Live, WorkState};
+use crate::work::{AttemptReport, Live, PlaceNews, WorkState};
 
 /// Counts the time in which the robot is heard.
 fn attached(view: &mut View, robot_id: &RobotId, board: &Board, now: &Now) {
@@ -30,7 +30,7 @@ pub fn robot(tx: &mut Tx, robot_id: &RobotId, board: &Board, tally: &mut Tally) 
     let now = tx.now;
     attached(tx.view, robot_id, board, &now);
     if !lease_stands(tx.view, board, robot_id, &tx.now) {
-        lease_over(tx, robot_id);
+        lease_over(tx, robot_id, tally);
         return;
     }
     let Some(live) = board.get(robot_id).cloned() else { return };
@@ -70,11 +70,32 @@ fn recharge(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
     }
 }
 
-fn lease_over(tx: &mut Tx, robot_id: &RobotId) {
+fn lease_over(tx: &mut Tx, robot_id: &RobotId, tally: &mut Tally) {
+    if tx.view.bugs.timeout_frees_place() {
+        for id in super::tasks::places_of(tx, robot_id) {
+            let holder = tx.view.places.get(&id).and_then(|p| p.row.holder(robot_id).cloned());
+            if let (Some(holder), Ok(place_id)) = (holder, crate::ids::PlaceId::parse(&id)) {
+                inbox::place(tx, robot_id, &place_id, holder.grant_id, PlaceNews::Left);
+            }
+        }
+    }
     let Some(id) = tx.view.held_by(robot_id).cloned() else { return };
     let Some(a) = tx.view.attempt(&id) else { return };
     if a.uncertain.is_some() || a.phase.is_terminal() {
         return;
+    }
+    if tx.view.bugs.silence_frees_task() {
+        let stats = a.stats;
+        let gone = AttemptReport {
+            attempt: id,
+            state: WorkState::Aborted,
+            step_index: a.step_index,
+            opened: a.opened,
+            refusal: None,
+            fault: None,
+            stats,
+        };
+        return inbox::attempt(tx, robot_id, &gone, tally);
     }
     let why = Reason::from(Code::LeaseOver).with("robot_id", robot_id);
     match id.subject.task_id() {

@@ -116,6 +116,8 @@ pub struct View {
     pub unwilling: BTreeMap<RobotId, crate::time::LinkTime>,
     /// Time in which robots were heard since it was last counted. Volatile.
     pub attached: BTreeMap<RobotId, Attached>,
+    /// Naive rules for twins of tests; none outside them.
+    pub bugs: super::bugs::Bugs,
     /// Distances and routes, remembered.
     pub router: crate::site::route::Router,
 }
@@ -286,6 +288,7 @@ impl View {
             unwilling: BTreeMap::new(),
             attached: BTreeMap::new(),
             place_waits: 0,
+            bugs: super::bugs::Bugs::default(),
         }
     }
 

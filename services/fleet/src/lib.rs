@@ -36,6 +36,8 @@ pub struct Parts {
     pub site_text: String,
     /// Clocks.
     pub clock: Arc<dyn Clock>,
+    /// Naive rules for twins of tests; none outside them.
+    pub bugs: midshift_core::fleet::bugs::Bugs,
 }
 
 /// A question about the picture as it is now.

@@ -83,6 +83,7 @@ impl Loop {
         let now = self.parts.clock.now();
         let served = self.view.serving(&now);
         self.view = View::new(self.parts.site.clone(), self.started, now);
+        self.view.bugs = self.parts.bugs;
         self.view.load(&snapshot.rows, snapshot.seq)?;
         // The row is as old as the last commit; this process has served on since.
         self.view.served.site_ms = self.view.served.site_ms.max(served.site_ms);

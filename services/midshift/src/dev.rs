@@ -3,7 +3,7 @@
 use crate::background::{Background, Pressure, Source, read_list};
 use crate::planning::Planning;
 use crate::report::{self, Inputs, Report, SharedTasks};
-use crate::server::{Parts, Server};
+use crate::server::{Naive, Parts, Server};
 use crate::{clock, serve, site_file};
 use anyhow::{Context, bail};
 use midshift_core::site::{Site, grid};
@@ -119,7 +119,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         site_text: loaded.text,
         clock: clock.clone(),
         sim: Some(SimFace::new(hall.clone(), clock.clone(), swarm.crash())),
-        telemetry_bugs: midshift_telemetry::Bugs::default(),
+        naive: Naive::default(),
         planning: planning.handle(),
     };
     let server = Server::new(parts, stop.clone()).await?;

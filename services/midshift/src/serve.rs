@@ -1,7 +1,7 @@
 //! `midshift serve`: everything persistent in one process, for a real site.
 
 use crate::planning::Planning;
-use crate::server::{Parts, Server};
+use crate::server::{Naive, Parts, Server};
 use crate::{clock, site_file};
 use anyhow::{Context, bail};
 use midshift_store::{FRAME_BYTES_DEFAULT, SqliteFrames, SqliteStore};
@@ -56,7 +56,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
         site_text: loaded.text,
         clock,
         sim: None,
-        telemetry_bugs: midshift_telemetry::Bugs::default(),
+        naive: Naive::default(),
         planning: planning.handle(),
     };
     let server = Server::new(parts, shutdown).await?;

@@ -32,6 +32,15 @@ const PRUNE_EVERY: Duration = Duration::from_secs(60);
 /// Log entries kept at most, beside the days of [`limits::REMEMBER_DAYS`].
 const ENTRIES_MAX: u64 = 20_000_000;
 
+/// Naive rules of the services, for twins of tests. None by default.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Naive {
+    /// Of the link.
+    pub telemetry: midshift_telemetry::Bugs,
+    /// Of fleet.
+    pub fleet: midshift_core::fleet::bugs::Bugs,
+}
+
 /// What a server is built from.
 pub struct Parts {
     /// The memory that services share.
@@ -47,7 +56,7 @@ pub struct Parts {
     /// The simulator's face, if bodies live in this process.
     pub sim: Option<SimFace>,
     /// Naive rules for twins of tests; none outside them.
-    pub telemetry_bugs: midshift_telemetry::Bugs,
+    pub naive: Naive,
     /// Where fleet plans; see [`crate::planning`].
     pub planning: tokio::runtime::Handle,
 }
@@ -82,6 +91,7 @@ impl Server {
             site: parts.site.clone(),
             site_text: parts.site_text.clone(),
             clock: parts.clock.clone(),
+            bugs: parts.naive.fleet,
         });
         let telemetry = TelemetryService::new(
             midshift_telemetry::Parts {
@@ -89,7 +99,7 @@ impl Server {
                 frames: parts.frames.clone(),
                 board: board.clone(),
                 clock: parts.clock.clone(),
-                bugs: parts.telemetry_bugs,
+                bugs: parts.naive.telemetry,
             },
             shutdown.clone(),
         );

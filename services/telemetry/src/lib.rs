@@ -15,6 +15,8 @@ mod session;
 mod welcome;
 
 pub use bugs::Bugs;
+#[cfg(feature = "seeded-bugs")]
+pub use bugs::SeededBug;
 
 use midshift_core::time::Clock;
 use midshift_core::work::Live;

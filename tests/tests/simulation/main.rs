@@ -12,7 +12,9 @@ mod plan;
 mod room;
 mod run;
 
+use midshift::server::Naive as Server;
 use midshift_agent::bugs::{Bugs, SeededBug};
+use midshift_core::fleet::bugs::SeededBug as Fleet;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 
@@ -29,13 +31,18 @@ const TWINS: [(&str, &str); 3] = [
 
 fn naive(name: &str) -> room::Naive {
     let agent = |bug| room::Naive { agent: Bugs::of(&[bug]), ..room::Naive::default() };
+    let server = |server| room::Naive { server, ..room::Naive::default() };
+    let fleet = |bug| server(Server { fleet: midshift_core::fleet::bugs::Bugs::of(&[bug]), ..Server::default() });
     match name {
         "" => room::Naive::default(),
+        "silence_frees_task" => fleet(Fleet::SilenceFreesTask),
+        "timeout_frees_place" => fleet(Fleet::TimeoutFreesPlace),
+        "heartbeat_overtakes_events" => fleet(Fleet::HeartbeatOvertakesEvents),
         "authority_from_receipt" => agent(SeededBug::AuthorityFromReceipt),
         "grant_from_receipt" => agent(SeededBug::GrantFromReceipt),
         "ack_before_commit" => {
-            let telemetry = midshift_telemetry::Bugs { ack_before_commit: true, ..midshift_telemetry::Bugs::default() };
-            room::Naive { telemetry, ..room::Naive::default() }
+            let telemetry = midshift_telemetry::Bugs::of(&[midshift_telemetry::SeededBug::AckBeforeCommit]);
+            server(Server { telemetry, ..Server::default() })
         }
         other => panic!("no naive rule is called {other}"),
     }

@@ -43,8 +43,8 @@ const LONGEST: Duration = Duration::from_secs(3_600);
 pub struct Naive {
     /// Of every agent.
     pub agent: Bugs,
-    /// Of the server's link.
-    pub telemetry: midshift_telemetry::Bugs,
+    /// Of the server.
+    pub server: midshift::server::Naive,
 }
 
 /// What a room is opened with.
@@ -207,7 +207,7 @@ fn serve(
                     site_text: DEMO.to_owned(),
                     clock: MachineClock::boot(&time, Skew::default()),
                     sim: None,
-                    telemetry_bugs: naive.telemetry,
+                    naive: naive.server,
                     planning: tokio::runtime::Handle::current(),
                 };
                 // A service manager starts a server again that could not read its disk.

@@ -14,5 +14,6 @@ mod races;
 mod restart;
 mod retries;
 mod stopping;
+mod twins;
 mod uncertain;
 mod waiting;

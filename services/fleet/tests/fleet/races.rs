@@ -20,6 +20,7 @@ async fn two_reconcilers_at_saturation_give_no_robot_two_holders_and_every_task_
     for n in 0..32 {
         w.until_phase(&format!("T{n}"), Phase::Succeeded).await;
     }
+    assert!(w.shaky.conflicts() > 10, "they raced: {}", w.shaky.conflicts());
     w.lawful().await;
 }
 

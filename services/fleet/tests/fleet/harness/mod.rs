@@ -7,12 +7,14 @@ mod robot;
 mod seen;
 mod shaky;
 
+pub use laws::hold;
 pub use robot::{Answer, Robot, jam, obstacle};
 pub use seen::Seen;
 pub use shaky::Shaky;
 
+use midshift_core::fleet::bugs::Bugs;
 use midshift_core::ids::{RobotId, TaskId};
-use midshift_core::rows::{Expect, Item, Seq, Writer};
+use midshift_core::rows::{Entry, Expect, Item, Seq, Writer};
 use midshift_core::site::{Site, text};
 use midshift_core::task::forms::Transport;
 use midshift_core::task::{Ask, Phase, RawTask, TaskIntake, TaskRequest, TaskState};
@@ -35,6 +37,8 @@ const STEPS_MAX: usize = 4 * 3600;
 
 /// One reconciler at work.
 struct Running {
+    /// A reconciler whose face is gone ends.
+    _face: FleetService,
     shutdown: CancellationToken,
     task: JoinHandle<()>,
 }
@@ -48,6 +52,7 @@ pub struct World {
     pub site: Arc<Site>,
     pub fleet: FleetService,
     text: &'static str,
+    bugs: Bugs,
     robots: BTreeMap<String, Robot>,
     running: Vec<Running>,
     submitted: u64,
@@ -64,6 +69,11 @@ impl World {
 
     /// A world whose reconciler has just started.
     pub async fn at_start(site_text: &'static str) -> Self {
+        Self::with(site_text, Bugs::default()).await
+    }
+
+    /// As [`World::at_start`], with naive rules.
+    pub async fn with(site_text: &'static str, bugs: Bugs) -> Self {
         let begun = Instant::now();
         let monotonic = move || begun.elapsed().as_micros() as u64;
         let clock: Arc<dyn Clock> = Arc::new(ScaledClock::new(monotonic, BEGIN, 1000));
@@ -77,12 +87,13 @@ impl World {
             site: site.clone(),
             site_text: site_text.to_owned(),
             clock: clock.clone(),
+            bugs,
         };
         let (fleet, running) = start(parts);
         let robots = BTreeMap::new();
         let running = vec![running];
-        let mut world =
-            Self { store, shaky, board, clock, site, fleet, text: site_text, robots, running, submitted: 0, asked: 0 };
+        let (text, submitted, asked) = (site_text, 0, 0);
+        let mut world = Self { store, shaky, board, clock, site, fleet, text, bugs, robots, running, submitted, asked };
         world.step().await;
         world
     }
@@ -94,6 +105,7 @@ impl World {
             site: self.site.clone(),
             site_text: self.text.to_owned(),
             clock: self.clock.clone(),
+            bugs: self.bugs,
         }
     }
 
@@ -317,6 +329,11 @@ impl World {
 
     /// The end of a test: what was written from the beginning keeps the laws.
     pub async fn lawful(self) {
+        laws::hold(&self.written().await);
+    }
+
+    /// All that was ever written.
+    pub async fn written(&self) -> Vec<Entry> {
         let mut after = Seq(0);
         let mut entries = Vec::new();
         loop {
@@ -327,7 +344,7 @@ impl World {
                 break;
             }
         }
-        laws::hold(&entries);
+        entries
     }
 
     /// Every robot's id.
@@ -343,5 +360,5 @@ fn start(parts: Parts) -> (FleetService, Running) {
     let task = tokio::spawn(async move {
         reconciler.run(token).await.expect("readable rows");
     });
-    (fleet, Running { shutdown, task })
+    (fleet.clone(), Running { _face: fleet, shutdown, task })
 }

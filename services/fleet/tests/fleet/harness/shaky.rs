@@ -1,26 +1,67 @@
-//! A store that can be told to fail: what fleet sees when the disk is full or the connection is gone.
+//! A store that can be told to fail: what fleet sees when the disk is full or the connection is gone. It can also be told to be naive:
+//! then the last writer wins.
 
 use async_trait::async_trait;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Item, Key, Log, Row, Seq, Table};
+use midshift_core::rows::{Expect, Item, Key, Log, Row, Seq, Table};
 use midshift_store::{Applied, CommitError, Error, FeedPage, MemoryStore, Query, Retention, Snapshot, Store, StoreId};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use tokio::sync::watch;
 
+/// Items written over another's before the store is itself again.
+const OVERWRITTEN_MAX: u64 = 40;
+
 pub struct Shaky {
     inner: Arc<MemoryStore>,
     failing: AtomicBool,
     failed: AtomicU64,
+    blind: AtomicBool,
+    overwritten: AtomicU64,
+    conflicts: AtomicU64,
 }
 
 impl Shaky {
     pub fn over(inner: Arc<MemoryStore>) -> Arc<Self> {
-        Arc::new(Self { inner, failing: AtomicBool::new(false), failed: AtomicU64::new(0) })
+        Arc::new(Self {
+            conflicts: AtomicU64::new(0),
+            inner,
+            failing: AtomicBool::new(false),
+            failed: AtomicU64::new(0),
+            blind: AtomicBool::new(false),
+            overwritten: AtomicU64::new(0),
+        })
     }
     /// From now on every commit through this handle fails, or none does.
     pub fn fail(&self, failing: bool) {
         self.failing.store(failing, Ordering::Relaxed);
+    }
+    /// From now on what an item expects of its rows is not asked.
+    pub fn be_blind(&self) {
+        self.blind.store(true, Ordering::Relaxed);
+    }
+    /// Items that were written over what somebody else had written.
+    pub fn overwritten(&self) -> u64 {
+        self.overwritten.load(Ordering::Relaxed)
+    }
+    /// Items that somebody else was faster than.
+    pub fn conflicts(&self) -> u64 {
+        self.conflicts.load(Ordering::Relaxed)
+    }
+    /// Commits an item over whatever is there.
+    async fn overwrite(&self, mut item: Item) -> Result<Applied, CommitError> {
+        loop {
+            let result = self.inner.commit(vec![item.clone()]).await.pop();
+            match result {
+                Some(Err(CommitError::Conflict { key, found })) => {
+                    self.overwritten.fetch_add(1, Ordering::Relaxed);
+                    let row = item.rows.iter_mut().find(|r| r.key == key).expect("a row of the item");
+                    row.expect = found.map_or(Expect::Absent, Expect::At);
+                }
+                Some(result) => return result,
+                None => unreachable!("one result an item"),
+            }
+        }
     }
     /// Commits that failed.
     pub fn failed(&self) -> u64 {
@@ -37,12 +78,25 @@ impl Store for Shaky {
         self.inner.site_id()
     }
     async fn commit(&self, items: Vec<Item>) -> Vec<Result<Applied, CommitError>> {
+        // A disk takes time, in which somebody else may plan on the same picture.
+        tokio::task::yield_now().await;
         if self.failing.load(Ordering::Relaxed) && !items.is_empty() {
             self.failed.fetch_add(1, Ordering::Relaxed);
             let cause = || Arc::new(std::io::Error::other("the disk is full"));
             return items.iter().map(|_| Err(CommitError::Unavailable(cause()))).collect();
         }
-        self.inner.commit(items).await
+        // Two writers that never lose go on for ever; some dozen wrong rows are enough.
+        if self.blind.load(Ordering::Relaxed) && self.overwritten() < OVERWRITTEN_MAX {
+            let mut results = Vec::new();
+            for item in items {
+                results.push(self.overwrite(item).await);
+            }
+            return results;
+        }
+        let results = self.inner.commit(items).await;
+        let lost = results.iter().filter(|r| matches!(r, Err(CommitError::Conflict { .. }))).count();
+        self.conflicts.fetch_add(lost as u64, Ordering::Relaxed);
+        results
     }
     async fn get(&self, keys: Vec<Key>) -> Result<Vec<Row>, Error> {
         self.inner.get(keys).await
