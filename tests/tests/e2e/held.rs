@@ -2,138 +2,19 @@
 //!
 //! The server is a real process with a real disk; the agents run in this process, so that a naive rule can be switched on in them.
 
-use crate::harness::{Server, until};
+use crate::harness::until;
 use crate::proxy::Proxy;
-use anyhow::Context;
-use midshift_agent::bugs::{Bugs, SeededBug};
-use midshift_agent::dial::TcpDial;
-use midshift_agent::memory::MemoryStore;
-use midshift_agent::session::{self, AgentConfig};
-use midshift_core::ids::{RobotId, WaypointId};
-use midshift_core::site::{CORRIDOR, text};
-use midshift_core::time::{Clock, SiteDuration};
-use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
-use midshift_proto::fleet::v1::{ListPlacesRequest, Place};
+use crate::room::{LIMIT, Room};
+use midshift_agent::bugs::SeededBug;
+use midshift_core::time::SiteDuration;
 use midshift_proto::link::v1::robot_event::Event as Said;
-use midshift_proto::link::v1::{PlaceNews, WorkState, sample};
-use midshift_proto::task::v1::submit_task_request::Body;
-use midshift_proto::task::v1::{FlatTask, SubmitTaskRequest, TaskState};
-use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
-use midshift_proto::telemetry::v1::{ListEventsRequest, event::Item};
-use midshift_sim::body::{BodyConfig, SimBody};
-use midshift_sim::faults::{FaultRates, Injected};
-use midshift_sim::handle::SimHandle;
-use midshift_sim::world::{SharedWorld, World, WorldConfig};
-use std::net::SocketAddr;
-use std::sync::Arc;
+use midshift_proto::link::v1::{PlaceNews, WorkState};
+use midshift_proto::task::v1::TaskState;
+use midshift_sim::faults::Injected;
 use std::time::Duration;
-use tokio_util::sync::CancellationToken;
-use tokio_util::task::AbortOnDropHandle;
 
 /// How long the proxy holds bytes back. An offer is valid for 5 s, the entry of a place for 10 s.
 const HELD: Duration = Duration::from_secs(12);
-/// Longest wait for anything that must happen.
-const LIMIT: Duration = Duration::from_secs(90);
-
-struct Room {
-    server: Server,
-    clock: Arc<dyn Clock>,
-    world: SharedWorld,
-    _dir: tempfile::TempDir,
-}
-
-struct Robot {
-    body: SimHandle,
-    _agent: AbortOnDropHandle<()>,
-}
-
-impl Room {
-    async fn open() -> anyhow::Result<Self> {
-        let dir = tempfile::tempdir()?;
-        let server = Server::start_on(dir.path(), CORRIDOR).await?;
-        let world = WorldConfig { auto_stock: true, ..WorldConfig::default() };
-        let world = World::new(world, &text::parse(CORRIDOR)?).shared();
-        Ok(Self { server, clock: midshift::clock::clock(1000), world, _dir: dir })
-    }
-
-    /// A robot whose body stands at `start` and whose agent dials `address`.
-    fn robot(&self, name: &str, start: &str, address: SocketAddr, bugs: &[SeededBug]) -> anyhow::Result<Robot> {
-        let robot_id = RobotId::parse(name)?;
-        let mut config = BodyConfig::new(robot_id.clone(), 1, WaypointId::parse(start)?);
-        (config.faults, config.battery_permille, config.drains) = (FaultRates::none(), Some(1_000), false);
-        config.pace_permille = 5_000;
-        let site = Arc::new(text::parse(CORRIDOR)?);
-        let body = SimHandle::new(SimBody::new(config, site, self.world.clone(), self.clock.now().site)?);
-        let agent = AgentConfig {
-            robot_id,
-            boot_id: format!("boot-{name}"),
-            new_ring_id: format!("ring-{name}"),
-            seed: 1,
-            bugs: Bugs::of(bugs),
-            pulse: None,
-        };
-        let dial = Arc::new(TcpDial::new(&format!("http://{address}"), None)?);
-        let (store, clock, witness) = (Box::new(MemoryStore::new()), self.clock.clone(), Box::new(body.clone()));
-        let running = async move {
-            // Ends with the test.
-            let _ = session::run(agent, witness, store, clock, dial, CancellationToken::new()).await;
-        };
-        Ok(Robot { body, _agent: AbortOnDropHandle::new(tokio::spawn(running)) })
-    }
-
-    async fn submit(&self, task: &str, robot: &str) -> anyhow::Result<()> {
-        let work = FlatTask {
-            task_id: task.to_owned(),
-            robot_id: robot.to_owned(),
-            task_type: "transport".to_owned(),
-            from_waypoint: "A".to_owned(),
-            to_waypoint: "B".to_owned(),
-            timeout_seconds: Some(600),
-            ..FlatTask::default()
-        };
-        let request = SubmitTaskRequest { body: Some(Body::Flat(work)), ..SubmitTaskRequest::default() };
-        self.server.tasks()?.submit_task(request).await?;
-        Ok(())
-    }
-
-    async fn until_state(&self, task: &str, state: TaskState) -> anyhow::Result<()> {
-        until(&format!("{task} {state:?}"), LIMIT, || async {
-            let there = self.server.in_states(&[state]).await?.unwrap_or_default();
-            Ok(there.iter().any(|t| t.task_id == task).then_some(()))
-        })
-        .await
-    }
-
-    /// What a robot said in its events, oldest first.
-    async fn said(&self, robot: &str) -> anyhow::Result<Vec<Said>> {
-        let mut client = TelemetryServiceClient::new(self.server.channel()?);
-        let request =
-            ListEventsRequest { robot_ids: vec![robot.to_owned()], page_size: 1_000, ..ListEventsRequest::default() };
-        let page = client.list_events(request).await?.into_inner();
-        let event = |item| match item {
-            Some(Item::Sample(s)) => match s.body {
-                Some(sample::Body::Event(e)) => e.event,
-                _ => None,
-            },
-            _ => None,
-        };
-        Ok(page.events.into_iter().filter_map(|e| event(e.item)).collect())
-    }
-
-    async fn place(&self, id: &str) -> anyhow::Result<Place> {
-        let mut client = FleetServiceClient::new(self.server.channel()?);
-        let places = client.list_places(ListPlacesRequest::default()).await?.into_inner().places;
-        places.into_iter().find(|p| p.place_id == id).with_context(|| format!("no place {id}"))
-    }
-
-    async fn until_held(&self, place: &str, robot: &str, held: bool) -> anyhow::Result<()> {
-        until(&format!("{place} held by {robot}: {held}"), LIMIT, || async {
-            let found = self.place(place).await?.holders.iter().any(|h| h.robot_id == robot);
-            Ok((found == held).then_some(()))
-        })
-        .await
-    }
-}
 
 fn stale(said: &[Said], what: &str) -> usize {
     said.iter().filter(|s| matches!(s, Said::StaleAuthority(r) if r.what == what)).count()

@@ -4,7 +4,9 @@
 
 mod clients;
 mod cut;
+mod golden_cli;
 mod harness;
 mod held;
 mod kill;
 mod proxy;
+mod room;

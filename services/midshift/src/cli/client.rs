@@ -68,12 +68,17 @@ impl From<Status> for Exit {
             Code::DeadlineExceeded => 10,
             _ => 1,
         };
-        let mut text =
-            if status.message().is_empty() { status.code().to_string() } else { status.message().to_owned() };
+        let mut text = match answer.violations.len() {
+            0 if status.message().is_empty() => status.code().to_string(),
+            0 => status.message().to_owned(),
+            1 => "the request breaks a rule".to_owned(),
+            rules => format!("the request breaks {rules} rules"),
+        };
         for violation in &answer.violations {
             text += &format!("\n  {}: {}", violation.field, violation.description);
         }
-        if let Some(help) = answer.help() {
+        // What to try next, unless the message said it already.
+        if let Some(help) = answer.help().filter(|help| answer.violations.is_empty() && !text.contains(*help)) {
             text += &format!("\n  try: {help}");
         }
         Self::new(code, text)

@@ -1,0 +1,182 @@
+//! The command line as programs see it: `-o json`, exit codes and messages, word for word in a golden transcript.
+//!
+//! What differs from run to run (times, etags, positions in a log) stands there as its kind.
+
+use crate::harness::{free_port, midshift, until};
+use crate::room::{LIMIT, Room};
+use anyhow::Context;
+use midshift_proto::task::v1::TaskState;
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// Keys whose values no program may read anything into.
+const OPAQUE: [&str; 12] = [
+    "age",
+    "workGeneration",
+    "seq",
+    "etag",
+    "cursor",
+    "nextPageToken",
+    "sessionEpoch",
+    "generation",
+    "grantId",
+    "hb",
+    "appliedWork",
+    "appliedPolicy",
+];
+/// Keys of measurements.
+const MEASURED: [&str; 9] = [
+    "heartbeat",
+    "energyMwh",
+    "hottestJointDecidegrees",
+    "durationMs",
+    "attachedMs",
+    "clockOffsetMs",
+    "clockErrorMs",
+    "pathMm",
+    "loadedPathMm",
+];
+
+struct Transcript {
+    program: PathBuf,
+    server: String,
+    text: String,
+}
+
+impl Transcript {
+    fn run(&self, arguments: &[&str]) -> anyhow::Result<Output> {
+        let mut command = Command::new(&self.program);
+        command.args(arguments).env("MIDSHIFT_SERVER", &self.server).env_remove("NO_COLOR");
+        command.output().with_context(|| format!("running {arguments:?}"))
+    }
+
+    /// Runs a command and writes down what it printed and how it ended; its standard output.
+    fn note(&mut self, arguments: &[&str]) -> anyhow::Result<Value> {
+        let output = self.run(arguments)?;
+        let said = String::from_utf8(output.stderr)?.replace(&self.server, "<server>");
+        let out = String::from_utf8(output.stdout)?.replace(&self.server, "<server>");
+        assert!(!said.contains('\u{1b}') && !out.contains('\u{1b}'), "{arguments:?}: colours in a pipe");
+        let code = output.status.code().context("it was killed")?;
+        self.text += &format!("$ midshift {}\n", arguments.join(" ").replace(&self.server, "<server>"));
+        let value: Value = serde_json::from_str(&out).unwrap_or(Value::Null);
+        match &value {
+            Value::Null => self.text += &out,
+            value => self.text += &format!("{}\n", serde_json::to_string_pretty(&plain("", value))?),
+        }
+        self.text += &said;
+        self.text += &format!("exit {code}\n\n");
+        Ok(value)
+    }
+}
+
+fn is_time(text: &str) -> bool {
+    text.len() >= 20 && text.ends_with('Z') && text.as_bytes().get(10) == Some(&b'T')
+}
+
+/// The same document with what is different in every run replaced by its kind.
+fn plain(key: &str, value: &Value) -> Value {
+    match value {
+        Value::Object(fields) => {
+            fields.iter().map(|(k, v)| (k.clone(), plain(k, v))).collect::<serde_json::Map<_, _>>().into()
+        }
+        Value::Array(items) => items.iter().map(|v| plain(key, v)).collect(),
+        _ if OPAQUE.contains(&key) => "<opaque>".into(),
+        _ if MEASURED.contains(&key) => "<measured>".into(),
+        Value::String(text) if is_time(text) => "<time>".into(),
+        other => other.clone(),
+    }
+}
+
+fn golden() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("golden/cli.txt")
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
+    let room = Room::open().await?;
+    let mut t = Transcript { program: midshift()?, server: room.server.address.to_string(), text: String::new() };
+    let robot = room.robot("r1", "park-a", room.server.address, &[])?;
+    room.until_held("park-a", "r1", true).await?;
+
+    // Robots, places, areas.
+    t.note(&["robot", "ls", "-o", "json"])?;
+    t.note(&["robot", "get", "r1", "-o", "json"])?;
+    t.note(&["robot", "explain", "r1", "-o", "json"])?;
+    t.note(&["robot", "get", "r9", "-o", "json"])?;
+    t.note(&["robot", "cordon", "r1", "--reason", "a wheel squeaks", "-o", "json"])?;
+    t.note(&["robot", "ls", "-o", "name"])?;
+    t.note(&["zone", "ls", "-o", "json"])?;
+    t.note(&["area", "get", "rooms", "-o", "json"])?;
+    t.note(&["area", "put", "rooms", "--speed-limit", "1000", "-o", "json"])?;
+    t.note(&["area", "put", "rooms", "--speed-limit", "0", "-o", "json"])?;
+
+    // Tasks, while the robot is out of dispatch.
+    let submit = ["task", "submit", "--from", "A", "--to", "B", "--sku", "SKU-1", "--task-id", "TASK-1"];
+    t.note(&[&submit[..], &["--dry-run", "-o", "json"]].concat())?;
+    t.note(&[&submit[..], &["--request-id", "req-1", "-o", "json"]].concat())?;
+    t.note(&[&submit[..], &["--request-id", "req-1", "-o", "name"]].concat())?;
+    t.note(&[
+        "task",
+        "submit",
+        "--from",
+        "nowhere",
+        "--to",
+        "B",
+        "--priority",
+        "12",
+        "--request-id",
+        "req-1",
+        "-o",
+        "json",
+    ])?;
+    t.note(&[
+        "task",
+        "submit",
+        "--from",
+        "A",
+        "--to",
+        "park-b",
+        "--task-id",
+        "TASK-1",
+        "--request-id",
+        "req-2",
+        "-o",
+        "json",
+    ])?;
+    t.note(&["task", "submit", "--from", "A", "--to", "B", "--task-id", "TASK-2", "-o", "name"])?;
+    t.note(&["task", "ls", "-o", "json"])?;
+    t.note(&["task", "ls", "-o", "name"])?;
+    t.note(&["task", "get", "TASK-1", "-o", "json"])?;
+    t.note(&["task", "get", "TASK-9", "-o", "json"])?;
+    t.note(&["task", "explain", "TASK-1", "-o", "json"])?;
+    t.note(&["task", "cancel", "TASK-2", "--reason", "not wanted", "-o", "json"])?;
+    t.note(&["task", "wait", "TASK-2", "-o", "json"])?;
+    t.note(&["task", "resolve", "TASK-1", "--as", "succeeded", "--reason", "by hand", "-o", "json"])?;
+    t.note(&["task", "resume", "--robot", "r1", "--reason", "all clear", "-o", "json"])?;
+
+    // Done.
+    t.note(&["robot", "uncordon", "r1", "-o", "json"])?;
+    room.until_state("TASK-1", TaskState::Succeeded).await?;
+    until("the robot stands", LIMIT, || async { Ok(robot.body.lock().idle_since().map(|_| ())) }).await?;
+    t.note(&["task", "wait", "TASK-1", "-o", "json"])?;
+
+    // Without a server.
+    t.note(&["explain-error", "STALE_AUTHORITY", "-o", "json"])?;
+    t.note(&["explain-error", "NO_SUCH_CODE"])?;
+    t.note(&["task", "submit", "--from", "A"])?;
+    let nobody = free_port()?.to_string();
+    t.server = nobody;
+    t.note(&["robot", "ls", "-o", "json"])?;
+
+    if std::env::var_os("BLESS").is_some() {
+        std::fs::create_dir_all(golden().parent().context("a folder")?)?;
+        std::fs::write(golden(), &t.text)?;
+    }
+    let expected = std::fs::read_to_string(golden()).unwrap_or_default();
+    for (n, (was, is)) in expected.lines().zip(t.text.lines()).enumerate() {
+        assert_eq!(is, was, "line {} of tests/golden/cli.txt; `cargo xtask golden` if the change is meant", n + 1);
+    }
+    assert_eq!(t.text.lines().count(), expected.lines().count(), "`cargo xtask golden` if the change is meant");
+    Ok(())
+}
