@@ -130,6 +130,8 @@ pub struct AgentCore {
     progress: u64,
     period: LinkDuration,
     next_beat: LinkTime,
+    /// No heartbeat before this, whatever happens: a quarter of the period after the last one.
+    beat_floor: LinkTime,
     status_period: SiteDuration,
     next_status: SiteTime,
     clock: Option<ClockSample>,
@@ -178,6 +180,7 @@ impl AgentCore {
             progress: 0,
             period: limits::HEARTBEAT,
             next_beat: now.link,
+            beat_floor: now.link,
             status_period: STATUS_PERIOD,
             next_status: now.site,
             clock: None,
@@ -452,9 +455,9 @@ impl AgentCore {
         }
     }
 
-    /// The next heartbeat goes with this step.
+    /// The next heartbeat goes with this step, or as soon as one may go.
     pub(crate) fn beat_at_once(&mut self, now: &Now) {
-        self.next_beat = self.next_beat.min(now.link);
+        self.next_beat = self.next_beat.min(now.link.max(self.beat_floor));
     }
 
     /// What falls due by time alone. True: a heartbeat is due.
@@ -470,6 +473,7 @@ impl AgentCore {
             }
         }
         if beat {
+            self.beat_floor = now.link + LinkDuration(self.period.as_ms() / 4);
             self.next_beat = (self.next_beat + self.period).max(now.link + LinkDuration(self.period.as_ms() / 2));
             self.note_progress(now);
         }

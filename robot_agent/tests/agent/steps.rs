@@ -2,6 +2,7 @@
 
 use crate::rig::{Rig, action, goto, point, step};
 use midshift_agent::body::{BodyNews, Checked};
+use midshift_agent::core::Input;
 use midshift_core::robot::{FAULT_TIMEOUT, Fault, FaultClass, Load};
 use midshift_core::work::{Assignment, DesiredWork, Effect, RobotEvent, StepKind, WorkState, WorkStep};
 
@@ -14,6 +15,21 @@ fn accepted(steps: Vec<WorkStep>) -> Rig {
     rig.connect();
     rig.work(rig.desired(Some(rig.offer("T1", 1, steps, vec![]))));
     rig
+}
+
+#[test]
+fn work_that_ends_at_once_again_and_again_makes_no_flood_of_heartbeats() {
+    let mut rig = Rig::at("A");
+    rig.connect();
+    let before = rig.hb;
+    for n in 0..50 {
+        rig.work(rig.desired(Some(rig.offer(&format!("T{n}"), 1, vec![], vec![]))));
+        rig.ms += 20;
+        rig.put(Input::Tick);
+    }
+    let ended = rig.states().iter().filter(|(s, _)| *s == WorkState::Succeeded).count();
+    assert!(ended > 20, "{ended} ended");
+    assert!((2..=5).contains(&(rig.hb - before)), "{} heartbeats in a second", rig.hb - before);
 }
 
 #[test]
