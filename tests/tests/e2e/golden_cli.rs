@@ -38,8 +38,16 @@ const MEASURED: [&str; 9] = [
     "loadedPathMm",
 ];
 
+/// The two forms of the source article as they stand, one a line.
+const LIST: &str = r#"{"task_id":"TASK-3","robot_id":"","type":"transport","priority":3,"content":{"from_waypoint":"A","to_waypoint":"B","item_sku":"SKU-3"},"timeout_seconds":300,"retry_strategy":{"max_retry_times":2,"retry_interval_seconds":10},"created_at":"2026-11-20T08:00:00Z"}
+{"task_id":"TASK-4","robot_id":"r1","task_type":"transport","priority":3,"from_waypoint":"A","to_waypoint":"B","item_sku":"SKU-4","timeout_seconds":300,"max_retry_times":2,"retry_interval_seconds":10,"created_at":"2026-11-20T08:00:00Z"}
+"#;
+/// Good and bad lines of a table.
+const TABLE: &str = "task_type,from_waypoint,to_waypoint,timeout_seconds\ntransport,A,B,300\ntransport,A,B,soon\n";
+
 struct Transcript {
     program: PathBuf,
+    dir: PathBuf,
     server: String,
     text: String,
 }
@@ -47,7 +55,7 @@ struct Transcript {
 impl Transcript {
     fn run(&self, arguments: &[&str]) -> anyhow::Result<Output> {
         let mut command = Command::new(&self.program);
-        command.args(arguments).env("MIDSHIFT_SERVER", &self.server).env_remove("NO_COLOR");
+        command.args(arguments).env("MIDSHIFT_SERVER", &self.server).env_remove("NO_COLOR").current_dir(&self.dir);
         command.output().with_context(|| format!("running {arguments:?}"))
     }
 
@@ -95,7 +103,12 @@ fn golden() -> PathBuf {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     let room = Room::open().await?;
-    let mut t = Transcript { program: midshift()?, server: room.server.address.to_string(), text: String::new() };
+    let mut t = Transcript {
+        program: midshift()?,
+        dir: room.dir.path().to_owned(),
+        server: room.server.address.to_string(),
+        text: String::new(),
+    };
     let robot = room.robot("r1", "park-a", room.server.address, &[])?;
     room.until_held("park-a", "r1", true).await?;
 
@@ -155,13 +168,30 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     t.note(&["task", "resolve", "TASK-1", "--as", "succeeded", "--reason", "by hand", "-o", "json"])?;
     t.note(&["task", "resume", "--robot", "r1", "--reason", "all clear", "-o", "json"])?;
 
+    // Lists.
+    std::fs::write(t.dir.join("list.jsonl"), LIST)?;
+    std::fs::write(t.dir.join("table.csv"), TABLE)?;
+    t.note(&["task", "submit", "--file", "list.jsonl", "--request-id", "list", "-o", "json"])?;
+    t.note(&["task", "submit", "--file", "table.csv", "-o", "json"])?;
+    t.note(&["task", "get", "TASK-3", "-o", "json"])?;
+    t.note(&["task", "get", "TASK-4", "-o", "json"])?;
+    for task in ["TASK-3", "TASK-4"] {
+        t.note(&["task", "cancel", task, "--reason", "not wanted", "-o", "name"])?;
+    }
+
     // Done.
     t.note(&["robot", "uncordon", "r1", "-o", "json"])?;
     room.until_state("TASK-1", TaskState::Succeeded).await?;
     until("the robot stands", LIMIT, || async { Ok(robot.body.lock().idle_since().map(|_| ())) }).await?;
     t.note(&["task", "wait", "TASK-1", "-o", "json"])?;
 
+    t.note(&["zone", "ls", "-o", "name"])?;
+
     // Without a server.
+    t.note(&["map", "lint", "site.toml", "-o", "json"])?;
+    t.note(&["map", "show", "site.toml", "-o", "json"])?;
+    t.note(&["map", "show", "site.toml"])?;
+    t.note(&["migrate", "--data", "elsewhere"])?;
     t.note(&["explain-error", "STALE_AUTHORITY", "-o", "json"])?;
     t.note(&["explain-error", "NO_SUCH_CODE"])?;
     t.note(&["task", "submit", "--from", "A"])?;

@@ -35,7 +35,8 @@ pub struct Room {
     pub server: Server,
     pub clock: Arc<dyn Clock>,
     world: SharedWorld,
-    _dir: tempfile::TempDir,
+    /// A folder that goes with the room.
+    pub dir: tempfile::TempDir,
 }
 
 /// A body and its agent, which ends with it.
@@ -50,7 +51,7 @@ impl Room {
         let server = Server::start_on(dir.path(), CORRIDOR).await?;
         let world = WorldConfig { auto_stock: true, ..WorldConfig::default() };
         let world = World::new(world, &text::parse(CORRIDOR)?).shared();
-        Ok(Self { server, clock: midshift::clock::clock(1000), world, _dir: dir })
+        Ok(Self { server, clock: midshift::clock::clock(1000), world, dir })
     }
 
     /// A robot whose body stands at `start` and whose agent dials `address`.

@@ -2,6 +2,7 @@
 
 use crate::cli::out::Out;
 use crate::robots::uri;
+use midshift_core::reason::{Kind, Refusal};
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::sim::v1::sim_service_client::SimServiceClient;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
@@ -49,11 +50,25 @@ impl Exit {
 
 impl From<anyhow::Error> for Exit {
     fn from(error: anyhow::Error) -> Self {
+        if let Some(refusal) = error.downcast_ref::<Refusal>().filter(|r| r.kind() == Kind::Invalid) {
+            let violations = refusal.violations.iter().map(|v| (v.field.as_str(), v.description.as_str()));
+            return Self::new(2, broken_rules(violations).unwrap_or_else(|| refusal.to_string()));
+        }
         match error.downcast::<Status>() {
             Ok(status) => status.into(),
             Err(error) => Self::new(1, format!("{error:#}")),
         }
     }
+}
+
+/// Each rule that a request breaks, on a line of its own; none of none.
+fn broken_rules<'a>(violations: impl ExactSizeIterator<Item = (&'a str, &'a str)>) -> Option<String> {
+    let headline = match violations.len() {
+        0 => return None,
+        1 => "the request breaks a rule".to_owned(),
+        rules => format!("the request breaks {rules} rules"),
+    };
+    Some(violations.fold(headline, |text, (field, description)| format!("{text}\n  {field}: {description}")))
 }
 
 impl From<Status> for Exit {
@@ -68,15 +83,11 @@ impl From<Status> for Exit {
             Code::DeadlineExceeded => 10,
             _ => 1,
         };
-        let mut text = match answer.violations.len() {
-            0 if status.message().is_empty() => status.code().to_string(),
-            0 => status.message().to_owned(),
-            1 => "the request breaks a rule".to_owned(),
-            rules => format!("the request breaks {rules} rules"),
-        };
-        for violation in &answer.violations {
-            text += &format!("\n  {}: {}", violation.field, violation.description);
-        }
+        let violations = answer.violations.iter().map(|v| (v.field.as_str(), v.description.as_str()));
+        let mut text = broken_rules(violations).unwrap_or_else(|| match status.message() {
+            "" => status.code().to_string(),
+            message => message.to_owned(),
+        });
         // What to try next, unless the message said it already.
         if let Some(help) = answer.help().filter(|help| answer.violations.is_empty() && !text.contains(*help)) {
             text += &format!("\n  try: {help}");
