@@ -4,7 +4,10 @@ mod bare;
 mod child;
 mod figure;
 mod fsync;
+mod hall;
+mod offer;
 mod plan;
+mod robot;
 mod submit;
 
 use clap::{Parser, Subcommand};
@@ -18,6 +21,8 @@ enum Name {
     Plan,
     /// Durable submits, many at once.
     Submit(submit::SubmitArgs),
+    /// From a submit to the offer at an idle robot.
+    Offer(offer::OfferArgs),
     /// What the other names start: this program in one role.
     #[command(hide = true)]
     Child(child::ChildArgs),
@@ -41,6 +46,7 @@ fn main() -> anyhow::Result<()> {
     let figures = match args.name {
         Name::Plan => plan::run()?,
         Name::Submit(args) => wait(submit::run(args))?,
+        Name::Offer(args) => wait(offer::run(args))?,
         Name::Child(args) => return child::play(args),
     };
     print!("{}", figure::table(&figures));
