@@ -2,11 +2,15 @@
 //!
 //! Invariant: a child lives no longer than its parent: it ends when its stdin does. Called by every measurement but `plan`.
 
+use crate::sink::Seen;
 use anyhow::{Context, bail, ensure};
+use midshift::robots::SimRun;
 use std::io::{BufRead, BufReader, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::Duration;
 use tokio::net::TcpStream;
 use tokio::time::Instant;
@@ -16,6 +20,11 @@ use tokio_util::sync::CancellationToken;
 const UP_WITHIN: Duration = Duration::from_secs(30);
 /// How often that is looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(10);
+
+/// Sessions a server has now.
+pub const SESSIONS: &str = "midshift_telemetry_sessions";
+/// Messages with a heartbeat that a server has taken.
+pub const MESSAGES: &str = "midshift_telemetry_heartbeats_total";
 
 /// What a child is.
 #[derive(Clone, Debug, clap::Subcommand)]
@@ -35,12 +44,44 @@ pub enum Role {
         #[arg(long)]
         answer: PathBuf,
     },
+    /// A bare tonic session that takes every message and keeps none.
+    Sink {
+        /// Answers each message, as an echo would.
+        #[arg(long)]
+        answers: bool,
+    },
+    /// Real agents with simulated bodies that stand, some of all robots of the site.
+    Robots {
+        #[arg(long)]
+        server: String,
+        #[arg(long)]
+        site: PathBuf,
+        /// Robots of the whole site.
+        #[arg(long)]
+        robots: usize,
+        /// First of this process, from 0.
+        #[arg(long)]
+        from: usize,
+        /// One past the last.
+        #[arg(long)]
+        to: usize,
+    },
+    /// Robots that send as fast as they may.
+    Flood {
+        #[arg(long)]
+        server: String,
+        #[arg(long)]
+        robots: usize,
+        /// Nobody acknowledges, so nothing is waited for.
+        #[arg(long)]
+        unacknowledged: bool,
+    },
 }
 
 /// A child's arguments.
 #[derive(Clone, Debug, clap::Args)]
 pub struct ChildArgs {
-    /// Only on this core.
+    /// Only on this one of the cores there are, counted round.
     #[arg(long)]
     core: Option<usize>,
     #[command(subcommand)]
@@ -51,9 +92,7 @@ pub struct ChildArgs {
 pub fn play(args: ChildArgs) -> anyhow::Result<()> {
     midshift::logs::start(midshift::logs::Format::Text, "error");
     if let Some(core) = args.core {
-        let mut cores = rustix::thread::CpuSet::new();
-        cores.set(core);
-        rustix::thread::sched_setaffinity(None, &cores).context("taking a core")?;
+        take_core(core)?;
     }
     files_max()?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
@@ -75,7 +114,52 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
             answer_questions(address, stop.clone(), |_| 0)?;
             crate::bare::unary(&answer, address, stop).await
         }
+        Role::Sink { answers } => {
+            let seen = Arc::new(Seen::default());
+            let counted = seen.clone();
+            let count = move |name: &str| match name {
+                SESSIONS => counted.sessions.load(Relaxed),
+                _ => counted.messages.load(Relaxed),
+            };
+            answer_questions(address, stop.clone(), count)?;
+            crate::sink::serve(seen, answers, address, stop).await
+        }
+        Role::Robots { server, site, robots, from, to } => {
+            answer_questions(address, stop.clone(), |_| 0)?;
+            let swarm = SimRun {
+                robots,
+                only: Some((from, to)),
+                server,
+                site: Some(site),
+                seed: 1,
+                prefix: "rbt-".to_owned(),
+                crowded: false,
+                data: None,
+                no_faults: true,
+                listen: None,
+            };
+            midshift::robots::swarm(swarm, stop).await
+        }
+        Role::Flood { server, robots, unacknowledged } => {
+            let acked = Arc::new(AtomicU64::new(0));
+            let counted = acked.clone();
+            answer_questions(address, stop.clone(), move |_| counted.load(Relaxed))?;
+            tokio::select! {
+                flooded = crate::flood::run(&server, robots, !unacknowledged, acked) => flooded,
+                () = stop.cancelled() => Ok(()),
+            }
+        }
     }
+}
+
+/// Keeps this process on one of the cores it may use.
+fn take_core(number: usize) -> anyhow::Result<()> {
+    use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+    let may = sched_getaffinity(None).context("asking for the cores")?;
+    let cores: Vec<usize> = (0..CpuSet::MAX_CPU).filter(|core| may.is_set(*core)).collect();
+    let mut mine = CpuSet::new();
+    mine.set(*cores.get(number % cores.len().max(1)).context("no core")?);
+    sched_setaffinity(None, &mine).context("taking a core")
 }
 
 /// Sum of the lines of a counter in this process' metrics.
@@ -115,6 +199,11 @@ pub fn files_max() -> anyhow::Result<u64> {
     Ok(limit.maximum.unwrap_or(u64::MAX))
 }
 
+/// What the kernel counts CPU in, seconds.
+fn tick_s() -> f64 {
+    1.0 / rustix::param::clock_ticks_per_second() as f64
+}
+
 /// A child from its parent's side. Killed when it is let go.
 pub struct Child {
     process: std::process::Child,
@@ -124,11 +213,11 @@ pub struct Child {
 }
 
 impl Child {
-    /// Starts this program in a role, on one core if there is a second one for the parent.
+    /// Starts this program in a role, on one core or on all.
     pub fn start(role: &[&str], core: Option<usize>) -> anyhow::Result<Self> {
         let mut command = Command::new(std::env::current_exe()?);
         command.arg("child");
-        if let Some(core) = core.filter(|_| std::thread::available_parallelism().is_ok_and(|n| n.get() > 1)) {
+        if let Some(core) = core {
             command.args(["--core", &core.to_string()]);
         }
         let mut process = command.args(role).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?;
@@ -159,6 +248,12 @@ impl Child {
         }
         Ok(self)
     }
+    /// What a counter of the child stands at.
+    pub fn ask(&mut self, counter: &str) -> anyhow::Result<u64> {
+        let stdin = self.process.stdin.as_mut().context("a child without a stdin")?;
+        writeln!(stdin, "{counter}").context("asking a child")?;
+        Ok(self.line()?.parse()?)
+    }
     fn line(&mut self) -> anyhow::Result<String> {
         let mut line = String::new();
         ensure!(self.stdout.read_line(&mut line)? > 0, "a child ended");
@@ -175,7 +270,18 @@ impl Child {
         // The name of the program stands in brackets and may hold anything; utime and stime are fields 14 and 15.
         let (_, fields) = stat.rsplit_once(')').context("/proc/PID/stat without a name")?;
         let ticks: u64 = fields.split_whitespace().skip(11).take(2).filter_map(|f| f.parse::<u64>().ok()).sum();
-        Ok(ticks as f64 / rustix::param::clock_ticks_per_second() as f64)
+        Ok(ticks as f64 * tick_s())
+    }
+    /// CPU spent since then, seconds; less than a clock tick counts as one.
+    pub fn cpu_since_s(&self, then_s: f64) -> anyhow::Result<f64> {
+        Ok((self.cpu_s()? - then_s).max(tick_s()))
+    }
+
+    /// Memory in RAM, KiB.
+    pub fn rss_kib(&self) -> anyhow::Result<f64> {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.process.id()))?;
+        let line = status.lines().find_map(|l| l.strip_prefix("VmRSS:")).context("no VmRSS")?;
+        Ok(line.trim().trim_end_matches(" kB").trim().parse()?)
     }
 }
 

@@ -3,11 +3,14 @@
 mod bare;
 mod child;
 mod figure;
+mod flood;
 mod fsync;
 mod hall;
+mod link;
 mod offer;
 mod plan;
 mod robot;
+mod sink;
 mod submit;
 
 use clap::{Parser, Subcommand};
@@ -23,6 +26,8 @@ enum Name {
     Submit(submit::SubmitArgs),
     /// From a submit to the offer at an idle robot.
     Offer(offer::OfferArgs),
+    /// Many robots on the link once a second, and few at the knee.
+    Link(link::LinkArgs),
     /// What the other names start: this program in one role.
     #[command(hide = true)]
     Child(child::ChildArgs),
@@ -47,6 +52,7 @@ fn main() -> anyhow::Result<()> {
         Name::Plan => plan::run()?,
         Name::Submit(args) => wait(submit::run(args))?,
         Name::Offer(args) => wait(offer::run(args))?,
+        Name::Link(args) => wait(link::run(args, &note))?,
         Name::Child(args) => return child::play(args),
     };
     print!("{}", figure::table(&figures));
@@ -58,4 +64,10 @@ fn main() -> anyhow::Result<()> {
 
 fn wait<T>(work: impl Future<Output = anyhow::Result<T>>) -> anyhow::Result<T> {
     tokio::runtime::Builder::new_multi_thread().enable_all().build()?.block_on(work)
+}
+
+/// Says something beside the figures.
+#[expect(clippy::print_stderr, reason = "stdout is the table's")]
+fn note(text: &str) {
+    eprintln!("{text}");
 }

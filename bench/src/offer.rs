@@ -2,9 +2,10 @@
 
 use crate::child::Child;
 use crate::figure::{Figure, percentile};
+use crate::fsync::Disk;
+use crate::hall;
 use crate::robot::{self, Ear, Voice};
 use crate::submit::{place, transports};
-use crate::{fsync, hall};
 use anyhow::{Context, ensure};
 use midshift_core::limits;
 use midshift_core::site::grid;
@@ -29,18 +30,15 @@ pub struct OfferArgs {
     /// Submits of one round, one at a time, each to an idle robot.
     #[arg(long, default_value_t = 200)]
     submits: usize,
-    /// Rounds of each: offers, disk.
+    /// Rounds; in each, every submit is followed by one append to the disk.
     #[arg(long, default_value_t = 5)]
     rounds: usize,
-    /// Appends to the disk of one round.
-    #[arg(long, default_value_t = 300)]
-    fsyncs: usize,
     /// Where the databases are made and taken away again. Without it the temporary directory; it should be a real disk.
     #[arg(long)]
     dir: Option<PathBuf>,
 }
 
-/// Runs rounds of offers and disk, in turn, against one server.
+/// Runs rounds of submits and appends, in turn, against one server.
 pub async fn run(args: OfferArgs) -> anyhow::Result<Vec<Figure>> {
     let dir = place(args.dir.as_ref())?;
     let map = hall::map(dir.path(), SIDE)?;
@@ -53,17 +51,19 @@ pub async fn run(args: OfferArgs) -> anyhow::Result<Vec<Figure>> {
     robot.known_idle().await?;
     let mut client = TaskServiceClient::new(server.channel().await?);
     let (mut offered, mut durable, mut syncs) = (Vec::new(), Vec::new(), Vec::new());
+    let mut disk = Disk::beside(dir.path())?;
     for (round, requests) in requests.chunks(args.submits.max(1)).enumerate() {
-        let (mut to_robot, mut to_client) = (Vec::new(), Vec::new());
+        let (mut to_robot, mut to_client, mut to_disk) = (Vec::new(), Vec::new(), Vec::new());
         for (number, request) in requests.iter().enumerate() {
             let request = SubmitTaskRequest { request_id: format!("bench-{round}-{number}"), ..request.clone() };
             let (robot_ms, client_ms) = one(&mut client, &mut robot, request).await?;
             to_robot.push(robot_ms);
             to_client.push(client_ms);
+            to_disk.push(disk.append_ms()?);
         }
         offered.push(to_robot);
         durable.push(to_client);
-        syncs.push(fsync::appends_ms(dir.path(), args.fsyncs)?);
+        syncs.push(to_disk);
     }
     let each = |rounds: &[Vec<f64>], share: f64| rounds.iter().map(|r| percentile(r, share)).collect::<Vec<_>>();
     let sync = each(&syncs, 0.5);

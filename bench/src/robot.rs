@@ -8,8 +8,9 @@ use midshift_core::ids::{RobotId, WaypointId};
 use midshift_core::robot::{Inventory, Lane, Mode, ReportedState, Vitals};
 use midshift_core::work::{InboxItem, RobotEvent, Sample, SampleBody};
 use midshift_proto::link::v1::link_service_client::LinkServiceClient;
-use midshift_proto::link::v1::{SessionRequest, SessionResponse};
+use midshift_proto::link::v1::{self, SessionRequest, SessionResponse};
 use midshift_proto::session::{Downlink, FromRobot, Heartbeat, Hello, LaneBatch, ToRobot, Uplink, Welcome};
+use prost::Message;
 use std::collections::BTreeMap;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -80,6 +81,12 @@ impl Voice {
     /// A small event that changes nothing.
     pub async fn tell_mode(&mut self) -> anyhow::Result<()> {
         self.tell(vec![RobotEvent::Mode(Mode::Automatic)]).await
+    }
+    /// What one STATUS message takes of the credit, bytes.
+    pub fn status_bytes(&self) -> usize {
+        let body = SampleBody::Status(self.reported.vitals.clone());
+        let sample = Sample { seq: u64::from(u32::MAX), robot_unix_ms: midshift::clock::wall().0, body };
+        v1::LaneBatch::from(&LaneBatch { lane: Lane::Status, items: vec![InboxItem::Sample(sample)] }).encoded_len()
     }
     /// Highest number written in a lane.
     pub fn produced(&self, lane: Lane) -> u64 {

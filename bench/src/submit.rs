@@ -2,7 +2,7 @@
 
 use crate::child::Child;
 use crate::figure::{Figure, percentile};
-use crate::fsync;
+use crate::fsync::Disk;
 use anyhow::Context;
 use midshift_core::site::{DEMO, Site, text};
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
@@ -33,7 +33,7 @@ pub struct SubmitArgs {
     /// Rounds of each: midshift, bare tonic, disk.
     #[arg(long, default_value_t = 5)]
     rounds: usize,
-    /// Appends to the disk of one round.
+    /// Appends to the disk of one round, half of them before midshift and half after.
     #[arg(long, default_value_t = 300)]
     fsyncs: usize,
     /// Where the databases are made and taken away again. Without it the temporary directory; it should be a real disk.
@@ -69,15 +69,17 @@ pub async fn run(args: SubmitArgs) -> anyhow::Result<Vec<Figure>> {
         let dir = place(args.dir.as_ref())?;
         let server = Child::serve(&dir.path().join("data"), None, None).await?;
         let answer = one(server.channel().await?, &requests, round).await?;
+        let mut disk = Disk::beside(dir.path())?;
+        let mut sync_ms = disk.appends_ms(args.fsyncs / 2)?;
         ours.push(load(&server, &requests, args.requests, args.in_flight).await?);
+        sync_ms.extend(disk.appends_ms(args.fsyncs / 2)?);
+        syncs.push(sync_ms);
         drop(server);
         let path = dir.path().join("answer");
         std::fs::write(&path, answer.encode_to_vec())?;
         let path = path.to_str().context("a path that is no text")?;
         let server = Child::start(&["unary", "--answer", path], None)?.listening().await?;
         bare.push(load(&server, &requests, args.requests * BARE_TIMES, args.in_flight).await?);
-        drop(server);
-        syncs.push(fsync::appends_ms(dir.path(), args.fsyncs)?);
     }
     let sync = |share: f64| syncs.iter().map(|s| percentile(s, share)).collect::<Vec<_>>();
     let (sync_p50, sync_p99) = (sync(0.5), sync(0.99));
@@ -117,7 +119,7 @@ async fn load(
     calls(&client, requests, "warm", count / 10 + 1, in_flight).await?;
     let (cpu_s, begun) = (server.cpu_s()?, Instant::now());
     let took_ms = calls(&client, requests, "bench", count, in_flight).await?;
-    let (wall_s, cpu_s) = (begun.elapsed().as_secs_f64(), server.cpu_s()? - cpu_s);
+    let (wall_s, cpu_s) = (begun.elapsed().as_secs_f64(), server.cpu_since_s(cpu_s)?);
     Ok(Load {
         cpu_us: cpu_s * 1e6 / count as f64,
         per_s: count as f64 / wall_s,
