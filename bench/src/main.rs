@@ -1,16 +1,36 @@
 //! Figures of midshift beside the raw limits of the same machine in the same run: `cargo run --release -p midshift-bench -- NAME --json FILE`.
 
+mod bare;
+mod child;
 mod figure;
+mod flood;
+mod fsync;
+mod hall;
+mod link;
+mod offer;
 mod plan;
+mod robot;
+mod sink;
+mod submit;
 
-use clap::{Parser, ValueEnum};
+use clap::{Parser, Subcommand};
+use std::future::Future;
 use std::path::PathBuf;
 
 /// What can be measured.
-#[derive(Clone, Copy, Debug, ValueEnum)]
+#[derive(Clone, Debug, Subcommand)]
 enum Name {
     /// One planning cycle at three sizes of fleet.
     Plan,
+    /// Durable submits, many at once.
+    Submit(submit::SubmitArgs),
+    /// From a submit to the offer at an idle robot.
+    Offer(offer::OfferArgs),
+    /// Many robots on the link once a second, and few at the knee.
+    Link(link::LinkArgs),
+    /// What the other names start: this program in one role.
+    #[command(hide = true)]
+    Child(child::ChildArgs),
 }
 
 /// Measures one part of midshift. Prints the truth; there are no thresholds.
@@ -18,9 +38,10 @@ enum Name {
 #[command(name = "midshift-bench", version)]
 struct Args {
     /// What to measure.
+    #[command(subcommand)]
     name: Name,
     /// Also write the figures as a JSON array.
-    #[arg(long)]
+    #[arg(long, global = true)]
     json: Option<PathBuf>,
 }
 
@@ -29,10 +50,24 @@ fn main() -> anyhow::Result<()> {
     let args = Args::parse();
     let figures = match args.name {
         Name::Plan => plan::run()?,
+        Name::Submit(args) => wait(submit::run(args))?,
+        Name::Offer(args) => wait(offer::run(args))?,
+        Name::Link(args) => wait(link::run(args, &note))?,
+        Name::Child(args) => return child::play(args),
     };
     print!("{}", figure::table(&figures));
     if let Some(path) = args.json {
         std::fs::write(path, serde_json::to_string_pretty(&figures)?)?;
     }
     Ok(())
+}
+
+fn wait<T>(work: impl Future<Output = anyhow::Result<T>>) -> anyhow::Result<T> {
+    tokio::runtime::Builder::new_multi_thread().enable_all().build()?.block_on(work)
+}
+
+/// Says something beside the figures.
+#[expect(clippy::print_stderr, reason = "stdout is the table's")]
+fn note(text: &str) {
+    eprintln!("{text}");
 }

@@ -1,0 +1,171 @@
+//! P5: from a submit to the offer in the hands of an idle robot, beside the disk of the same run.
+
+use crate::child::Child;
+use crate::figure::{Figure, percentile};
+use crate::fsync::Disk;
+use crate::hall;
+use crate::robot::{self, Ear, Voice};
+use crate::submit::{place, transports};
+use anyhow::{Context, ensure};
+use midshift_core::limits;
+use midshift_core::site::grid;
+use midshift_core::work::{Assignment, AttemptReport, RobotEvent, WorkState, WorkStats};
+use midshift_proto::task::v1::SubmitTaskRequest;
+use midshift_proto::task::v1::task_service_client::TaskServiceClient;
+use std::path::PathBuf;
+use std::time::Duration;
+use tokio::time::{Instant, interval};
+use tonic::transport::Channel;
+
+/// Commits on the way of an offer: the task, the grant, and one that may be under way before either.
+const COMMITS: f64 = 3.0;
+/// What everything but the disk may take, milliseconds.
+const REST_MS: f64 = 5.0;
+/// Side of the free grid the robot stands on.
+const SIDE: usize = 20;
+
+/// What to measure.
+#[derive(Clone, Debug, clap::Args)]
+pub struct OfferArgs {
+    /// Submits of one round, one at a time, each to an idle robot.
+    #[arg(long, default_value_t = 200)]
+    submits: usize,
+    /// Rounds; in each, every submit is followed by one append to the disk.
+    #[arg(long, default_value_t = 5)]
+    rounds: usize,
+    /// Where the databases are made and taken away again. Without it the temporary directory; it should be a real disk.
+    #[arg(long)]
+    dir: Option<PathBuf>,
+}
+
+/// Runs rounds of submits and appends, in turn, against one server.
+pub async fn run(args: OfferArgs) -> anyhow::Result<Vec<Figure>> {
+    let dir = place(args.dir.as_ref())?;
+    let map = hall::map(dir.path(), SIDE)?;
+    let site = grid::parse_map("bench", &std::fs::read_to_string(&map)?)?;
+    let requests = transports(&site, args.submits * args.rounds)?;
+    let server = Child::serve(&dir.path().join("data"), Some(&map), None).await?;
+    let here = site.waypoints().first().context("an empty site")?.waypoint_id.clone();
+    let (voice, ear, _) = robot::attach(&server.address.to_string(), "rbt-1", Some(here)).await?;
+    let mut robot = Idle { voice, ear };
+    robot.known_idle().await?;
+    let mut client = TaskServiceClient::new(server.channel().await?);
+    let (mut offered, mut durable, mut syncs) = (Vec::new(), Vec::new(), Vec::new());
+    let mut disk = Disk::beside(dir.path())?;
+    for (round, requests) in requests.chunks(args.submits.max(1)).enumerate() {
+        let (mut to_robot, mut to_client, mut to_disk) = (Vec::new(), Vec::new(), Vec::new());
+        for (number, request) in requests.iter().enumerate() {
+            let request = SubmitTaskRequest { request_id: format!("bench-{round}-{number}"), ..request.clone() };
+            let (robot_ms, client_ms) = one(&mut client, &mut robot, request).await?;
+            to_robot.push(robot_ms);
+            to_client.push(client_ms);
+            to_disk.push(disk.append_ms()?);
+        }
+        offered.push(to_robot);
+        durable.push(to_client);
+        syncs.push(to_disk);
+    }
+    let each = |rounds: &[Vec<f64>], share: f64| rounds.iter().map(|r| percentile(r, share)).collect::<Vec<_>>();
+    let sync = each(&syncs, 0.5);
+    let allowed: Vec<f64> = sync.iter().map(|ms| COMMITS * ms + REST_MS).collect();
+    let name = |what: &str| format!("submit to offer at an idle robot, {what}");
+    let disk = "fdatasync of 4 KiB, p50";
+    Ok(vec![
+        Figure::of("P5", name("p50"), "ms", &each(&offered, 0.5), Some(("3 x fdatasync p50 + 5 ms", &allowed))),
+        Figure::of("P5", name("p50, by the disk"), "ms", &each(&offered, 0.5), Some((disk, &sync))),
+        Figure::of(
+            "P5",
+            name("p99, by the disk"),
+            "ms",
+            &each(&offered, 0.99),
+            Some(("fdatasync of 4 KiB, p99", &each(&syncs, 0.99))),
+        ),
+        Figure::of("P5", "submit to its durable answer, p50", "ms", &each(&durable, 0.5), Some((disk, &sync))),
+    ])
+}
+
+/// Submits one task and lets the robot do it: milliseconds until the robot had its offer, and until the client had its answer.
+async fn one(
+    client: &mut TaskServiceClient<Channel>,
+    robot: &mut Idle,
+    request: SubmitTaskRequest,
+) -> anyhow::Result<(f64, f64)> {
+    let begun = Instant::now();
+    let since = || begun.elapsed().as_secs_f64() * 1e3;
+    let answered = async {
+        let answer = client.submit_task(request).await?.into_inner();
+        anyhow::Ok((answer.task.context("an answer without a task")?.task_id, since()))
+    };
+    let offered = async {
+        let assignment = robot.offered().await?;
+        anyhow::Ok((assignment, since()))
+    };
+    let ((task_id, client_ms), (assignment, robot_ms)) = tokio::try_join!(answered, offered)?;
+    let subject = assignment.attempt.subject.to_string();
+    ensure!(subject == task_id, "submitted {task_id}, offered {subject}");
+    robot.finish(assignment).await?;
+    Ok((robot_ms, client_ms))
+}
+
+/// A robot that does everything in no time.
+struct Idle {
+    voice: Voice,
+    ear: Ear,
+}
+
+impl Idle {
+    /// Waits for work, beating; says when it came.
+    async fn offered(&mut self) -> anyhow::Result<Assignment> {
+        let mut beat = interval(Duration::from_millis(limits::HEARTBEAT.as_ms()));
+        beat.reset();
+        loop {
+            tokio::select! {
+                down = self.ear.hear() => {
+                    let Some(work) = down?.work else { continue };
+                    self.voice.reported.applied_work = work.generation;
+                    if let Some(assignment) = work.assignment {
+                        return Ok(assignment);
+                    }
+                }
+                _ = beat.tick() => self.voice.beat(false).await?,
+            }
+        }
+    }
+    /// Accepts and is done with it, then waits until the server knows that it is idle again.
+    async fn finish(&mut self, assignment: Assignment) -> anyhow::Result<()> {
+        let report = |state, step_index| {
+            RobotEvent::Attempt(AttemptReport {
+                attempt: assignment.attempt.clone(),
+                state,
+                step_index,
+                opened: step_index > 0,
+                refusal: None,
+                fault: None,
+                stats: WorkStats::default(),
+            })
+        };
+        let steps = assignment.steps.len() as u32;
+        self.voice.tell(vec![report(WorkState::Accepted, 0), report(WorkState::Succeeded, steps)]).await?;
+        loop {
+            let Some(work) = self.ear.hear().await?.work else { continue };
+            self.voice.reported.applied_work = work.generation;
+            if work.assignment.is_none_or(|still| still.attempt != assignment.attempt) {
+                return self.known_idle().await;
+            }
+        }
+    }
+    /// Beats, and waits until that beat is processed.
+    async fn known_idle(&mut self) -> anyhow::Result<()> {
+        self.voice.beat(false).await?;
+        let hb = self.voice.reported.hb;
+        loop {
+            let down = self.ear.hear().await?;
+            if let Some(work) = &down.work {
+                self.voice.reported.applied_work = work.generation;
+            }
+            if down.echo.is_some_and(|echo| echo.hb == hb) {
+                return Ok(());
+            }
+        }
+    }
+}

@@ -1,0 +1,55 @@
+//! Each measurement runs at a tiny size, with real servers, and tells figures beside limits of the same run.
+
+use std::process::Command;
+
+/// Runs one measurement and gives its records.
+fn records(name: &str, sizes: &[&str]) -> Vec<serde_json::Value> {
+    let dir = tempfile::tempdir().expect("a directory");
+    let file = dir.path().join("figures.json");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_midshift-bench"));
+    command.arg(name).args(sizes).arg("--dir").arg(dir.path()).arg("--json").arg(&file);
+    let output = command.output().expect("it starts");
+    assert!(output.status.success(), "{name}: {}", String::from_utf8_lossy(&output.stderr));
+    let text = std::fs::read_to_string(file).expect("it wrote its figures");
+    serde_json::from_str(&text).expect("an array of records")
+}
+
+/// Holds every record against the form: numbers that are numbers, in order, and a limit with its ratio.
+fn assert_told(records: &[serde_json::Value], targets: &[&str], runs: u64) {
+    for target in targets {
+        assert!(records.iter().any(|r| r["target"] == *target), "no figure for {target}: {records:?}");
+    }
+    for record in records {
+        let number = |value: &serde_json::Value| value.as_f64().unwrap_or_else(|| panic!("{value} in {record}"));
+        let (min, median, max) = (number(&record["min"]), number(&record["median"]), number(&record["max"]));
+        assert!(min <= median && median <= max, "{record}");
+        assert_eq!(record["runs"], runs, "{record}");
+        assert!(record["unit"].as_str().is_some_and(|unit| !unit.is_empty()), "{record}");
+        let limit = number(&record["limit"]["median"]);
+        assert!(record["limit"]["name"].as_str().is_some_and(|name| !name.is_empty()), "{record}");
+        assert!((number(&record["ratio"]) - median / limit).abs() < 1e-9, "{record}");
+    }
+    let mut names: Vec<_> = records.iter().map(|r| (r["name"].to_string(), r["unit"].to_string())).collect();
+    let all = names.len();
+    names.sort();
+    names.dedup();
+    assert_eq!(names.len(), all, "two figures with one name: {names:?}");
+}
+
+#[test]
+fn submits_are_told_beside_bare_calls_and_the_disk() {
+    let sizes = ["--requests", "40", "--in-flight", "8", "--rounds", "2", "--fsyncs", "4"];
+    assert_told(&records("submit", &sizes), &["P5"], 2);
+}
+
+#[test]
+fn offers_are_told_beside_the_disk() {
+    assert_told(&records("offer", &["--submits", "4", "--rounds", "2"]), &["P5"], 2);
+}
+
+#[test]
+fn the_link_is_told_beside_a_bare_session_and_the_disk() {
+    let sizes = ["--robots", "4", "--knee-robots", "2", "--rounds", "1", "--seconds", "2", "--knee-seconds", "3"];
+    let sizes: Vec<&str> = sizes.into_iter().chain(["--settle-seconds", "0", "--ask-seconds", "1"]).collect();
+    assert_told(&records("link", &sizes), &["P1", "P4"], 1);
+}
