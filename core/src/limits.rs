@@ -114,3 +114,5 @@ pub const SITE_AREAS_MAX: usize = 1_000;
 pub const ROUTE_FIELDS_BYTES: usize = 64 * 1024 * 1024;
 /// Tasks of one list file.
 pub const TASK_LIST_MAX: usize = 1_000_000;
+/// A robot's clock further off than this is shown as skewed; before an offset is known, a stamp further ahead is flagged. Milliseconds.
+pub const SKEW_ALERT_MS: i64 = 2_000;

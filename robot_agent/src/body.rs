@@ -31,6 +31,9 @@ pub struct PathPoint {
     pub y_mm: i32,
     /// Speed on the way to this point, millimetres per second: already the lowest of all layers.
     pub speed_mm_s: u32,
+    /// Distance to keep from people and things on the way to this point, millimetres. None: the body's own. A body that cannot
+    /// measure distances drives as it does.
+    pub keep_off_mm: Option<u32>,
 }
 
 /// One order to the body.

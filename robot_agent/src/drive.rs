@@ -95,6 +95,7 @@ impl AgentCore {
             x_mm: p.x_mm,
             y_mm: p.y_mm,
             speed_mm_s: governor::speed_mm_s(&self.limits, policy, order.speed_limit_mm_s, p),
+            keep_off_mm: governor::keep_off_mm(policy, p),
         };
         order.route[next..=limit].iter().map(point).collect()
     }

@@ -1,4 +1,4 @@
-//! The governor: how fast the body may drive at each point. The lowest of all layers wins, whatever came last.
+//! The governor: how fast the body may drive at each point, and which distance it keeps. The lowest of all layers wins, whatever came last.
 //!
 //! Invariant: a pure function of the newest values of each layer; no order of messages can raise a limit. Called by the core
 //! for every path, and again when a policy changes.
@@ -16,6 +16,11 @@ pub fn speed_mm_s(body: &BodyLimits, areas: &[AreaPolicy], task_mm_s: Option<u32
     let layers = [area, point.speed_limit_mm_s, task_mm_s];
     let lowest = layers.into_iter().flatten().fold(body.speed_mm_s, u32::min);
     lowest.max(body.floor_speed_mm_s.min(body.speed_mm_s))
+}
+
+/// Distance to keep on the way to `point`, millimetres, as its area asks for; none: the body's own.
+pub fn keep_off_mm(areas: &[AreaPolicy], point: &RoutePoint) -> Option<u32> {
+    policy_of(areas, &point.area_id).and_then(|p| p.avoidance_distance_mm)
 }
 
 /// The rules of one area, if any were pushed.

@@ -35,7 +35,7 @@ fn body(start: &str) -> SimBody {
 }
 fn point(site: &Site, name: &str, speed_mm_s: u32) -> PathPoint {
     let at = site.waypoint(site.find(&waypoint(name)).expect("on the map"));
-    PathPoint { waypoint: waypoint(name), x_mm: at.x_mm as i32, y_mm: at.y_mm as i32, speed_mm_s }
+    PathPoint { waypoint: waypoint(name), x_mm: at.x_mm as i32, y_mm: at.y_mm as i32, speed_mm_s, keep_off_mm: None }
 }
 fn drive(names: &[&str]) -> BodyOrder {
     drive_at(names, 1_000)

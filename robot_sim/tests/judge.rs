@@ -53,7 +53,13 @@ fn handle(site: &Arc<Site>, world: &SharedWorld, name: &str, start: &str) -> Sim
 fn path(site: &Site, names: &[&str]) -> BodyOrder {
     let point = |name: &&str| {
         let at = site.waypoint(site.find(&waypoint(name)).expect("on the map"));
-        PathPoint { waypoint: waypoint(name), x_mm: at.x_mm as i32, y_mm: at.y_mm as i32, speed_mm_s: 1_000 }
+        PathPoint {
+            waypoint: waypoint(name),
+            x_mm: at.x_mm as i32,
+            y_mm: at.y_mm as i32,
+            speed_mm_s: 1_000,
+            keep_off_mm: None,
+        }
     };
     BodyOrder::Drive(names.iter().map(point).collect())
 }

@@ -13,7 +13,7 @@ use super::{Board, Plan, inbox, way};
 use crate::ids::{AreaId, PlaceId, RobotId};
 use crate::robot::Presence;
 use crate::site::route::{Segment, segments};
-use crate::site::{Kind, PlaceIx};
+use crate::site::{AreaIx, Kind, PlaceIx};
 use crate::task::spec::Class;
 use crate::task::{Attempt, AttemptPhase};
 use crate::time::{Now, SiteDuration, SiteTime};
@@ -108,10 +108,10 @@ pub fn advance(view: &mut View, board: &Board, now: Now, plan: &mut Plan) -> Rel
     view.waits.retain(|r, _| wanting.contains(r));
     wishes.sort_by(|a, b| (a.whole, a.class, a.since, &a.robot_id).cmp(&(b.whole, b.class, b.since, &b.robot_id)));
     let mut releases = Releases::default();
-    let mut blocked = BTreeSet::new();
+    let mut traffic = if wishes.is_empty() { Traffic::default() } else { Traffic::of(view) };
     for wish in &wishes {
         let Some(live) = board.get(&wish.robot_id) else { continue };
-        plan.decide(view, now, "fleet", |tx| serve(tx, live, &mut releases, &mut blocked));
+        plan.decide(view, now, "fleet", |tx| serve(tx, live, &mut releases, &mut traffic));
     }
     plan.report.tally.waiting_for_place = view.waits.len() as u64;
     releases
@@ -168,7 +168,40 @@ fn next_segment(view: &View, robot_id: &RobotId, a: &Attempt, work: &Assignment)
     (unentered <= 1).then_some(segment)
 }
 
-fn serve(tx: &mut Tx, live: &Live, releases: &mut Releases, blocked: &mut BTreeSet<PlaceIx>) {
+/// What one round of grants knows beside the rows.
+#[derive(Default)]
+struct Traffic {
+    /// Places that an earlier wish waits for.
+    blocked: BTreeSet<PlaceIx>,
+    /// Robots that hold a standing place of an area.
+    inside: BTreeMap<AreaIx, BTreeSet<RobotId>>,
+}
+
+impl Traffic {
+    fn of(view: &View) -> Self {
+        let mut traffic = Self::default();
+        let standing = view.site.places().iter().filter(|p| p.waypoint().is_some());
+        for place in standing {
+            let Some(row) = view.places.get(place.place_id.as_str()).map(|p| &p.row) else { continue };
+            for holder in &row.holders {
+                traffic.enter(view, &holder.robot_id, place);
+            }
+        }
+        traffic
+    }
+    fn enter(&mut self, view: &View, robot_id: &RobotId, place: &crate::site::Place) {
+        let Some(area) = place.waypoint().map(|w| view.site.waypoint(w).area) else { return };
+        self.inside.entry(area).or_default().insert(robot_id.clone());
+    }
+    /// An area admits one robot less than it has seats, so that those inside can move.
+    fn admits(&self, view: &View, robot_id: &RobotId, place: &crate::site::Place) -> bool {
+        let Some(area) = place.waypoint().map(|w| view.site.waypoint(w).area) else { return true };
+        let Some(inside) = self.inside.get(&area).filter(|inside| !inside.contains(robot_id)) else { return true };
+        (inside.len() as u64) < view.site.area_capacity(area).saturating_sub(1).max(1)
+    }
+}
+
+fn serve(tx: &mut Tx, live: &Live, releases: &mut Releases, traffic: &mut Traffic) {
     let robot_id = &live.robot_id;
     let Some(a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
     let Some(work) = assignment(tx.view, robot_id, &a).cloned() else { return };
@@ -178,8 +211,8 @@ fn serve(tx: &mut Tx, live: &Live, releases: &mut Releases, blocked: &mut BTreeS
         Some(segment) => (segment.places(), Some(segment.end as u32)),
         None => return,
     };
-    if grantable(tx.view, robot_id, &needed, blocked) {
-        grant(tx, robot_id, &needed);
+    if grantable(tx.view, robot_id, &needed, traffic) {
+        grant(tx, robot_id, &needed, traffic);
         tx.view.waits.remove(robot_id);
         tx.view.dirty.insert(robot_id.clone());
         if let Some(released_index) = released {
@@ -192,8 +225,8 @@ fn serve(tx: &mut Tx, live: &Live, releases: &mut Releases, blocked: &mut BTreeS
     tx.view.place_waits += u64::from(!tx.view.waits.contains_key(robot_id));
     let since = tx.view.waits.entry(robot_id.clone()).or_insert(Waiting { places: Vec::new(), since: now }).since;
     tx.view.waits.insert(robot_id.clone(), Waiting { places: names, since });
-    if !step_aside(tx, &a, &work, since, releases, blocked) {
-        blocked.extend(needed);
+    if !step_aside(tx, &a, &work, since, releases, traffic) {
+        traffic.blocked.extend(needed);
     }
 }
 
@@ -214,19 +247,23 @@ fn missing(view: &View, live: &Live, a: &Attempt) -> Vec<PlaceIx> {
     lost.into_iter().collect()
 }
 
-fn grantable(view: &View, robot_id: &RobotId, needed: &[PlaceIx], blocked: &BTreeSet<PlaceIx>) -> bool {
+fn grantable(view: &View, robot_id: &RobotId, needed: &[PlaceIx], traffic: &Traffic) -> bool {
     needed.iter().all(|ix| {
+        if !traffic.admits(view, robot_id, view.site.place(*ix)) {
+            return false;
+        }
         let place = view.places.get(view.site.place(*ix).place_id.as_str()).map(|p| &p.row);
         place.is_some_and(|p| match p.holder(robot_id) {
             Some(holder) => holder.state != HolderState::Revoking,
-            None => p.has_room() && !blocked.contains(ix),
+            None => p.has_room() && !traffic.blocked.contains(ix),
         })
     })
 }
 
-fn grant(tx: &mut Tx, robot_id: &RobotId, needed: &[PlaceIx]) {
+fn grant(tx: &mut Tx, robot_id: &RobotId, needed: &[PlaceIx], traffic: &mut Traffic) {
     let first = next_generation(tx.view, robot_id, &tx.now) * GRANTS_PER_GENERATION;
     for (grant_id, ix) in (first..).zip(needed) {
+        traffic.enter(tx.view, robot_id, tx.view.site.place(*ix));
         let id = tx.view.site.place(*ix).place_id.clone();
         let Some(mut place) = tx.view.places.get(id.as_str()).map(|p| p.row.clone()) else { continue };
         if place.holder(robot_id).is_none() {
@@ -248,7 +285,7 @@ fn step_aside(
     work: &Assignment,
     since: SiteTime,
     releases: &mut Releases,
-    blocked: &BTreeSet<PlaceIx>,
+    traffic: &mut Traffic,
 ) -> bool {
     let robot_id = &a.robot_id;
     let released = work.released_index.unwrap_or(0) as usize;
@@ -281,10 +318,10 @@ fn step_aside(
         route[0].ends_step = None;
         let Some(ixs) = way::indices(&site, &route) else { continue };
         let Some(first) = segments(&site, &ixs).into_iter().next() else { continue };
-        if first.standing == Some(place) || !grantable(tx.view, robot_id, &first.places(), blocked) {
+        if first.standing == Some(place) || !grantable(tx.view, robot_id, &first.places(), traffic) {
             continue;
         }
-        grant(tx, robot_id, &first.places());
+        grant(tx, robot_id, &first.places(), traffic);
         tx.view.dirty.insert(a.robot_id.clone());
         releases.0.insert(robot_id.clone(), Release { route: Some(route), released_index: first.end as u32 });
         return true;

@@ -4,7 +4,7 @@ use crate::rig::{Rig, TestBody, goto, point};
 use midshift_agent::body::BodyNews;
 use midshift_agent::bugs::{Bugs, SeededBug};
 use midshift_agent::memory::MemoryStore;
-use midshift_core::ids::AreaId;
+use midshift_core::ids::{AreaId, RobotId};
 use midshift_core::policy::AreaPolicy;
 use midshift_core::robot::{HardwareStop, Mode};
 use midshift_core::work::PlaceNews::{Entered, Left, NotEntered};
@@ -259,10 +259,23 @@ fn a_new_route_is_taken_from_where_the_robot_is_heading() {
 }
 
 #[test]
+fn the_distance_an_area_asks_for_reaches_the_body_under_way() {
+    let mut rig = under_way(Rig::at("A"));
+    let asked = |rig: &Rig| rig.body.log().path.iter().map(|p| p.keep_off_mm).collect::<Vec<_>>();
+    assert_eq!(asked(&rig), [None; 4]);
+    let area_id = AreaId::parse("hall").expect("a name");
+    let area = AreaPolicy { avoidance_distance_mm: Some(800), ..AreaPolicy::default_of(area_id) };
+    let policy =
+        DesiredPolicy { robot_id: RobotId::parse("rbt-01").expect("a name"), generation: 5, areas: vec![area] };
+    rig.down(Downlink { policy: Some(policy), ..Downlink::default() });
+    assert_eq!(asked(&rig), [Some(800); 4]);
+}
+
+#[test]
 fn a_policy_slows_a_drive_under_way_and_an_older_one_never_speeds_it_up() {
     let mut rig = under_way(Rig::at("A"));
     let policy = |generation, limit| DesiredPolicy {
-        robot_id: midshift_core::ids::RobotId::parse("rbt-01").expect("a name"),
+        robot_id: RobotId::parse("rbt-01").expect("a name"),
         generation,
         areas: vec![AreaPolicy {
             speed_limit_mm_s: Some(limit),

@@ -267,7 +267,7 @@ impl Session {
             return;
         }
         let (robot_id, ring, lane, epoch) = (&self.robot_id, &self.ring, batch.lane, self.epoch);
-        let ahead_ms = self.offset.estimate().map_or(2_000, |(offset, error)| offset + error as i64 + 2_000);
+        let ahead_ms = self.offset.estimate().map_or(limits::SKEW_ALERT_MS, |(offset, error)| offset + error as i64);
         let wall = self.inner.parts.clock.now().wall.0;
         let arrived = self.events.arrive(batch, |what| InboxEntry {
             robot_id: robot_id.clone(),

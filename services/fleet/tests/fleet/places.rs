@@ -35,6 +35,26 @@ async fn the_second_robot_waits_before_an_exclusive_passage_and_goes_when_the_fi
 }
 
 #[tokio::test(start_paused = true)]
+async fn an_area_admits_one_robot_less_than_it_has_seats() {
+    // The room at B: three seats, so two robots.
+    let room = ["b-in", "b-out", "b-far", "B", "park-b", "charge"];
+    let mut site = CORRIDOR.replacen("]\n\nwaypoint", "  { id = \"room\" },\n]\n\nwaypoint", 1);
+    for id in room {
+        site = site.replace(&format!("{{ id = \"{id}\", at"), &format!("{{ id = \"{id}\", area = \"room\", at"));
+    }
+    let mut w = World::on(site.leak()).await;
+    w.robot("r1", "park-b").await;
+    w.robot("r2", "charge").await;
+    w.robot("r3", "park-a").await;
+    w.submit_with("T1", "A", "B", |raw| (raw.robot_id, raw.stall_ms) = ("r3".to_owned(), Some(3_600_000))).await;
+    w.until("r3 stands before the room", |s| s.holders("wait-a") == [("r3".to_owned(), HolderState::Inside)]).await;
+    w.pass_while(60, "there is a seat and it stays free", |s| !s.has("r3", "B") && s.holders("B").is_empty()).await;
+    w.submit_with("T2", "A", "park-a", |raw| raw.robot_id = "r1".to_owned()).await;
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_robot_that_lost_its_way_out_of_a_passage_gets_it_before_those_who_wait_to_get_in() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "A").await;
