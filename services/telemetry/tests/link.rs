@@ -11,7 +11,7 @@ use midshift_proto::session::{
     Close, CloseCode, Downlink, FromRobot, Heartbeat, Hello, LaneBatch, Previous, ToRobot, Uplink, Welcome,
 };
 use midshift_store::{LiveBoard, MemoryFrames, MemoryStore, Store, StoreId};
-use midshift_telemetry::{Bugs, Parts, TelemetryService};
+use midshift_telemetry::{Bugs, Parts, SeededBug, TelemetryService};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use tokio::sync::mpsc;
@@ -28,6 +28,10 @@ struct World {
 }
 
 async fn world() -> Result<World> {
+    world_with(Bugs::default()).await
+}
+
+async fn world_with(bugs: Bugs) -> Result<World> {
     let started = tokio::time::Instant::now();
     let micros = move || started.elapsed().as_micros() as u64;
     let clock: Arc<dyn Clock> = Arc::new(ScaledClock::new(micros, Utc(1_800_000_000_000), 1000));
@@ -38,7 +42,7 @@ async fn world() -> Result<World> {
         frames: Arc::new(MemoryFrames::new(clock.clone(), 1 << 20)),
         board: LiveBoard::new(),
         clock,
-        bugs: Bugs::default(),
+        bugs,
     };
     let service = TelemetryService::new(parts, CancellationToken::new());
     tokio::spawn(service.clone().run());
@@ -181,6 +185,16 @@ async fn a_proven_succession_ends_the_older_session() -> Result<()> {
     assert!(new.welcome.session_epoch > old.welcome.session_epoch && !new.welcome.observed);
     let close = old.closes().await?;
     assert_eq!((close.code, close.retry_after_ms), (CloseCode::Fenced, 60_000));
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn without_the_fence_a_clone_takes_over_a_robot_that_is_heard() -> Result<()> {
+    let world = world_with(Bugs::of(&[SeededBug::NoCloneFence])).await?;
+    let mut first = Robot::attach(&world, None).await?;
+    first.beat().await?;
+    let clone = Robot::attach(&world, None).await?;
+    assert!(!clone.welcome.observed, "two machines of one name, and the second has its work");
     Ok(())
 }
 
