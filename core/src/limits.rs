@@ -76,6 +76,10 @@ pub const STREAMS_PER_CONNECTION: u32 = 64;
 pub const GROUP_COMMIT_ITEMS: usize = 2_000;
 /// Bytes of row bodies one group commit takes at most.
 pub const GROUP_COMMIT_BYTES: usize = 1024 * 1024;
+/// Items of one caller that one group commit takes at most, so that a long plan does not keep others waiting.
+pub const COMMIT_SLICE_ITEMS: usize = 256;
+/// Bytes of row bodies of one caller that one group commit takes at most, but for a single item.
+pub const COMMIT_SLICE_BYTES: usize = GROUP_COMMIT_BYTES / 4;
 /// Rows one item may touch, and facts it may state.
 pub const ITEM_ROWS_MAX: usize = 256;
 /// Samples in one uplink message.

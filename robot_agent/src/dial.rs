@@ -21,6 +21,10 @@ const CODEC_BYTES: usize = 512;
 /// A connection that is not there by then is tried again, real time.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 
+/// Bytes the kernel takes before it has sent what it holds; the rest waits in the lanes, where CRITICAL overtakes STATUS.
+#[cfg(any(target_os = "linux", target_os = "android"))]
+const UNSENT_BYTES: u32 = 16 * 1024;
+
 /// A connection that could not be made.
 #[derive(Debug, thiserror::Error)]
 #[error("dialing the server: {0}")]
@@ -79,12 +83,20 @@ impl Dial for TcpDial {
                     network.wait_for(|up| *up).await.map_err(io::Error::other)?;
                 }
                 let stream = TcpStream::connect(&address).await?;
-                stream.set_nodelay(true)?;
+                tune(&stream)?;
                 Ok::<_, io::Error>(TokioIo::new(Cut::new(stream, network)))
             }
         });
         self.endpoint.connect_with_connector(connect).await.map_err(|e| Error(e.into()))
     }
+}
+
+/// Settings of the socket of a session: nothing waits to be sent with something else, and little waits in the kernel.
+fn tune(stream: &TcpStream) -> io::Result<()> {
+    stream.set_nodelay(true)?;
+    #[cfg(any(target_os = "linux", target_os = "android"))]
+    socket2::SockRef::from(stream).set_tcp_notsent_lowat(UNSENT_BYTES)?;
+    Ok(())
 }
 
 /// A stream whose bytes vanish once its network was cut: writes go nowhere, nothing arrives, nobody is told. When the network is
@@ -184,5 +196,20 @@ impl<S: Send + 'static> Drop for Cut<S> {
                 drop(stream);
             });
         }
+    }
+}
+
+#[cfg(all(test, target_os = "linux"))]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn the_kernel_holds_little_of_a_session_back() -> io::Result<()> {
+        let server = tokio::net::TcpListener::bind("127.0.0.1:0").await?;
+        let stream = TcpStream::connect(server.local_addr()?).await?;
+        tune(&stream)?;
+        assert!(stream.nodelay()?);
+        assert_eq!(socket2::SockRef::from(&stream).tcp_notsent_lowat()?, UNSENT_BYTES);
+        Ok(())
     }
 }

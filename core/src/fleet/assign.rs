@@ -8,62 +8,113 @@ use super::rows::{RobotControl, TimerKind};
 use super::tasks::{News, arm, happen};
 use super::tx::Tx;
 use super::view::View;
-use super::{Board, Plan, attempts, errands, screen, timers, way};
+use super::{Board, Pace, Plan, attempts, errands, screen, timers, way};
 use crate::ids::{AttemptId, RobotId, Subject, TaskId};
 use crate::limits;
 use crate::reason::Code;
 use crate::site::WaypointIx;
 use crate::task::spec::Class;
 use crate::task::{Event, Phase, TaskIntake, TaskState};
-use crate::time::Now;
-use std::collections::BTreeMap;
+use crate::time::{Now, Utc};
+use std::collections::BTreeSet;
 
 /// Waiting tasks looked at in one cycle at most; the rest keep their order and come next.
 pub const TASKS_PER_CYCLE: usize = 4_096;
 
-/// Waiting tasks in the order in which they are served.
-pub fn queue(view: &View, now: &Now) -> Vec<TaskId> {
-    let waiting = view.tasks.values().map(|t| &t.row).filter(|t| t.phase == Phase::Queued);
-    let mut keyed: Vec<_> = waiting
-        .filter_map(|t| {
-            let priority = view.intake(&t.task_id)?.spec.priority;
-            let promoted = now.utc.ms_since(t.queued_since) > limits::MAX_WAIT.as_ms();
-            Some((Class::of(priority, promoted), priority, t.number, &t.task_id))
-        })
-        .collect();
-    keyed.sort_unstable();
-    keyed.into_iter().map(|(.., id)| id.clone()).collect()
+/// Waiting tasks in the order in which they are served: by class, priority and age.
+pub fn queue<'a>(view: &'a View, now: &Now) -> impl Iterator<Item = &'a TaskId> + use<'a> {
+    let class = |priority: u8, since: Utc| Class::of(priority, now.utc.ms_since(since) > limits::MAX_WAIT.as_ms());
+    let waiting = view.queued.iter().map(|((priority, _), (id, since))| (class(*priority, *since), id));
+    let mut waiting: Vec<_> = waiting.collect();
+    waiting.sort_by_key(|(class, _)| *class);
+    waiting.into_iter().map(|(_, id)| id)
 }
 
-/// One idle robot.
-#[derive(Clone, Copy)]
-struct Idle {
-    at: WaypointIx,
+/// A robot that a task may go to.
+pub struct Candidate {
+    /// Who.
+    pub robot_id: RobotId,
+    /// Where it stands.
+    pub at: WaypointIx,
     tasks: u64,
 }
 
-/// Robots that can be given work now.
-fn idle(view: &View, board: &Board, now: &Now) -> BTreeMap<RobotId, Idle> {
-    let can = board.keys().filter(|r| screen::robot(view, board, r, now).is_ok());
-    can.filter_map(|r| {
-        let at = way::find(view, board.get(r)?.report.vitals.waypoint.as_ref())?;
-        let tasks = view.control.get(r.as_str()).map_or(0, |c| c.row.tasks);
-        Some((r.clone(), Idle { at, tasks }))
-    })
-    .collect()
+/// Robots that tasks are given to one after the other.
+struct Pool {
+    /// By id.
+    all: Vec<Candidate>,
+    /// Who is left, as indices into `all` with what the choice looks at; in any order.
+    left: Vec<(usize, WaypointIx, u64)>,
 }
 
-/// Gives waiting tasks to idle robots. Each assignment is an item of its own.
-pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
-    let queue = queue(view, &now);
-    if queue.is_empty() {
-        return;
+impl Pool {
+    /// Robots of the board for which `can` holds.
+    fn of(view: &View, board: &Board, can: impl Fn(&RobotId) -> bool) -> Self {
+        let known = board.iter().filter(|(id, _)| can(id));
+        let all: Vec<_> = known
+            .filter_map(|(id, live)| {
+                let at = way::find(view, live.report.vitals.waypoint.as_ref())?;
+                let tasks = view.control.get(id.as_str()).map_or(0, |c| c.row.tasks);
+                Some(Candidate { robot_id: id.clone(), at, tasks })
+            })
+            .collect();
+        Self { left: all.iter().enumerate().map(|(ix, c)| (ix, c.at, c.tasks)).collect(), all }
     }
-    let mut idle = idle(view, board, &now);
+
+    /// Takes the nearest that passes every filter: another than one that failed the task, if there is one; then by distance, tasks so
+    /// far, id.
+    fn take(&mut self, view: &View, board: &Board, task: &TaskState, intake: &TaskIntake) -> Option<RobotId> {
+        if self.left.is_empty() {
+            return None;
+        }
+        let field = first_goal(view, task, intake).map(|g| view.router.field(g));
+        let failed = |ix: usize| !task.failed_robots.is_empty() && task.failed_robots.contains(&self.all[ix].robot_id);
+        let cost = |nth: usize| {
+            let (ix, at, tasks) = self.left[nth];
+            let distance = field.as_ref().map_or(Some(0), |f| f.distance_mm(at))?;
+            Some((failed(ix), distance, tasks, ix))
+        };
+        let passes =
+            |nth: &usize| screen::pair(view, board, &self.all[self.left[*nth].0].robot_id, task, intake).is_ok();
+        // Nearly always the first one passes; only else are all put in order.
+        let mut first = None;
+        for nth in 0..self.left.len() {
+            if let Some(cost) = cost(nth).filter(|c| first.is_none_or(|(best, _)| *c < best)) {
+                first = Some((cost, nth));
+            }
+        }
+        let nth = first.map(|(_, nth)| nth).filter(passes).or_else(|| {
+            let mut by_cost: Vec<_> = (0..self.left.len()).filter_map(|nth| Some((cost(nth)?, nth))).collect();
+            by_cost.sort_unstable();
+            by_cost.into_iter().map(|(_, nth)| nth).find(passes)
+        })?;
+        let (ix, ..) = self.left.swap_remove(nth);
+        Some(self.all[ix].robot_id.clone())
+    }
+
+    /// Who was not taken, by id.
+    fn rest(self) -> impl Iterator<Item = Candidate> {
+        let left: BTreeSet<usize> = self.left.into_iter().map(|(ix, ..)| ix).collect();
+        self.all.into_iter().enumerate().filter(move |(ix, _)| left.contains(ix)).map(|(_, c)| c)
+    }
+}
+
+/// Gives waiting tasks to idle robots, each assignment an item of its own, and gives back who is still idle. While there is nobody to
+/// give to, only a sweep looks at every waiting task.
+pub fn plan(view: &mut View, board: &Board, now: Now, pace: Pace, plan: &mut Plan) -> Vec<Candidate> {
+    let mut idle = Pool::of(view, board, |r| screen::robot(view, board, r, &now).is_ok());
+    let mut errands = Pool::of(view, board, |r| screen::recallable(view, board, r));
     let mut recalled = errands::stopping(view);
-    for task_id in queue.into_iter().take(TASKS_PER_CYCLE) {
-        let Some((task, intake)) = view.task(&task_id).cloned().zip(view.intake(&task_id).cloned()) else { continue };
-        match screen::task(view, board, &task, &intake, &now) {
+    let later = view.fresh.iter().nth(TASKS_PER_CYCLE).cloned().map(|id| view.fresh.split_off(&id));
+    let fresh = std::mem::replace(&mut view.fresh, later.unwrap_or_default());
+    let all = pace == Pace::Sweep || !idle.left.is_empty() || !errands.left.is_empty();
+    let queue: Vec<TaskId> = if all { queue(view, &now).take(TASKS_PER_CYCLE).cloned().collect() } else { Vec::new() };
+    for task_id in queue {
+        if pace == Pace::Wake && idle.left.is_empty() && errands.left.is_empty() {
+            break;
+        }
+        let Some((task, intake)) = view.task(&task_id).zip(view.intake(&task_id)) else { continue };
+        match screen::task(view, board, task, intake, &now) {
             Err(reason) if reason.code == Code::DependencyFailed => {
                 plan.decide(view, now, "fleet", |tx| {
                     happen(tx, &task_id, News::of(Event::ScheduleToStart, Some(&reason)));
@@ -72,33 +123,34 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
             }
             Err(reason) => {
                 plan.report.wait(reason.code);
-                arm_once(view, now, plan, &task_id);
                 continue;
             }
             Ok(()) => {}
         }
-        match nearest(view, board, &idle, &task, &intake) {
-            Some(robot_id) => {
-                idle.remove(&robot_id);
-                plan.decide(view, now, "fleet", |tx| offer(tx, &task, &intake, &robot_id, board));
-                plan.report.offers += 1;
-            }
-            None => {
-                plan.report.wait(Code::WaitingForRobot);
-                arm_once(view, now, plan, &task_id);
-                if recalled > 0 {
-                    recalled -= 1;
-                } else if let Some(robot_id) = recall(view, board, &task, &intake) {
-                    plan.decide(view, now, "fleet", |tx| errands::stop(tx, &robot_id));
-                }
-            }
+        if let Some(robot_id) = idle.take(view, board, task, intake) {
+            let (task, intake) = (task.clone(), intake.clone());
+            plan.decide(view, now, "fleet", |tx| offer(tx, &task, &intake, &robot_id, board));
+            plan.report.offers += 1;
+            continue;
+        }
+        plan.report.wait(Code::WaitingForRobot);
+        if recalled > 0 {
+            recalled -= 1;
+        } else if let Some(robot_id) = errands.take(view, board, task, intake) {
+            plan.decide(view, now, "fleet", |tx| errands::stop(tx, &robot_id));
         }
     }
+    for task_id in fresh {
+        arm_once(view, now, plan, &task_id);
+    }
+    idle.rest().collect()
 }
 
 fn arm_once(view: &mut View, now: Now, plan: &mut Plan, task_id: &TaskId) {
     let waiting = AttemptId { subject: Subject::Task(task_id.clone()), epoch: 0 };
-    if !view.timers.contains_key(&super::rows::Timer::id_of(TimerKind::ScheduleToStart, &waiting)) {
+    if view.task(task_id).is_some_and(|t| t.phase == Phase::Queued)
+        && !view.timers.contains_key(&super::rows::Timer::id_of(TimerKind::ScheduleToStart, &waiting))
+    {
         plan.decide(view, now, "fleet", |tx| timers::arm_waiting(tx, task_id));
     }
 }
@@ -107,43 +159,6 @@ fn arm_once(view: &mut View, now: Now, plan: &mut Plan, task_id: &TaskId) {
 fn first_goal(view: &View, task: &TaskState, intake: &TaskIntake) -> Option<WaypointIx> {
     let from = way::from_step(&intake.spec.steps, task.next_step);
     intake.spec.next_goal(from as usize).and_then(|g| view.site.find(g))
-}
-
-/// The nearest idle robot that passes every filter: another than one that failed it, if there is one; then by distance, tasks so far, id.
-fn nearest(
-    view: &View,
-    board: &Board,
-    idle: &BTreeMap<RobotId, Idle>,
-    task: &TaskState,
-    intake: &TaskIntake,
-) -> Option<RobotId> {
-    let goal = first_goal(view, task, intake);
-    let field = goal.map(|g| view.router.field(g));
-    let mut by_cost: Vec<_> = idle
-        .iter()
-        .filter_map(|(id, robot)| {
-            let distance = match &field {
-                Some(field) => field.distance_mm(robot.at)?,
-                None => 0,
-            };
-            Some((task.failed_robots.contains(id), distance, robot.tasks, id))
-        })
-        .collect();
-    by_cost.sort_unstable();
-    by_cost.into_iter().map(|(.., id)| id).find(|id| screen::pair(view, board, id, task, intake).is_ok()).cloned()
-}
-
-/// The nearest robot that could be called back from an errand for this task.
-fn recall(view: &View, board: &Board, task: &TaskState, intake: &TaskIntake) -> Option<RobotId> {
-    let goal = first_goal(view, task, intake)?;
-    let field = view.router.field(goal);
-    let candidates = board.iter().filter(|(id, _)| screen::recallable(view, board, id));
-    let near = candidates.filter_map(|(id, live)| {
-        let at = way::find(view, live.report.vitals.waypoint.as_ref())?;
-        screen::pair(view, board, id, task, intake).ok()?;
-        Some((field.distance_mm(at)?, id))
-    });
-    near.min().map(|(_, id)| id.clone())
 }
 
 /// Writes one offer.

@@ -3,12 +3,13 @@
 //! An errand is an attempt with no task row and a single epoch; its number is never used again. Its end has no consequence but a free robot.
 
 use super::anchor::anchor;
+use super::assign::Candidate;
 use super::rows::{RobotControl, Timer, TimerKind};
 use super::tasks::{arm, disarm, end_attempt};
 use super::tx::Tx;
 use super::view::View;
-use super::{Board, Plan, attempts, screen, way};
-use crate::ids::{AttemptId, RobotId, Subject};
+use super::{Board, Plan, attempts};
+use crate::ids::{AttemptId, RobotId, Subject, WaypointId};
 use crate::limits;
 use crate::reason::Reason;
 use crate::site::{Kind, WaypointIx};
@@ -16,80 +17,98 @@ use crate::task::AttemptPhase;
 use crate::task::state::{Errand, Uncertain};
 use crate::time::Now;
 use crate::work::{AttemptReport, WorkState};
+use std::collections::BTreeMap;
 
 /// Errands that are on their way to a stop.
 pub fn stopping(view: &View) -> usize {
     view.attempts.values().filter(|a| a.row.errand.is_some() && a.row.phase == AttemptPhase::Stopping).count()
 }
 
-/// Sends idle robots to charge or park.
-pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
+/// Sends robots that are still idle to charge or park.
+pub fn plan(view: &mut View, board: &Board, now: Now, idle: Vec<Candidate>, plan: &mut Plan) {
     let waiting = plan.report.waiting.values().sum::<u64>() > 0;
-    let robots: Vec<RobotId> = board.keys().filter(|r| screen::robot(view, board, r, &now).is_ok()).cloned().collect();
-    for robot_id in robots {
+    let mut coming = Coming::of(view);
+    for Candidate { robot_id, at: here, .. } in idle {
         let Some(live) = board.get(&robot_id) else { continue };
         if view.unwilling.get(&robot_id).is_some_and(|until| now.link < *until) {
             continue;
         }
-        let Some(here) = way::find(view, live.report.vitals.waypoint.as_ref()) else { continue };
-        let Some((errand, goal)) = wish(view, &robot_id, here, live.report.vitals.battery_permille, waiting) else {
-            continue;
-        };
+        let battery_permille = live.report.vitals.battery_permille;
+        let Some((errand, goal)) = wish(view, &coming, &robot_id, here, battery_permille, waiting) else { continue };
         plan.decide(view, now, "fleet", |tx| begin(tx, &robot_id, errand, goal, board));
+        coming.add(view, &robot_id, view.site.name_of(goal));
         plan.report.errands += 1;
+    }
+}
+
+/// How many robots are on an errand to a waypoint without holding its place yet.
+struct Coming(BTreeMap<WaypointId, usize>);
+
+impl Coming {
+    fn of(view: &View) -> Self {
+        let mut coming = Self(BTreeMap::new());
+        for a in view.attempts.values().map(|a| &a.row).filter(|a| !a.phase.is_terminal()) {
+            if let Some(goal) = &a.goal {
+                coming.add(view, &a.robot_id, goal);
+            }
+        }
+        coming
+    }
+    fn add(&mut self, view: &View, robot_id: &RobotId, goal: &WaypointId) {
+        let place = view.places.get(goal.as_str()).map(|p| &p.row);
+        if place.is_none_or(|p| p.holder(robot_id).is_none()) {
+            *self.0.entry(goal.clone()).or_default() += 1;
+        }
     }
 }
 
 fn wish(
     view: &View,
+    coming: &Coming,
     robot_id: &RobotId,
     here: WaypointIx,
     battery_permille: u16,
     waiting: bool,
 ) -> Option<(Errand, WaypointIx)> {
+    let free = |goals: &mut dyn Iterator<Item = WaypointIx>| free(view, coming, robot_id, here, goals);
     let policy = view.policy(&view.site.area_of(here).area_id);
     let kind = view.site.waypoint(here).kind;
     let must = battery_permille < policy.charge_mandatory_permille;
     let may = battery_permille < policy.charge_opportunistic_permille && !waiting;
     if (must || may)
-        && let Some(charger) = free(view, robot_id, here, view.site.chargers())
+        && let Some(charger) = free(&mut view.site.chargers())
     {
         return Some((Errand::Charge, charger));
     }
     let settled = matches!(kind, Kind::Park) || (matches!(kind, Kind::Charger | Kind::Hold) && !waiting);
-    if settled || view.site.standing_at(here).is_none() || (kind == Kind::Hold && !has_free_park(view, robot_id, here))
-    {
+    if settled || view.site.standing_at(here).is_none() {
         return None;
     }
-    let goal = free(view, robot_id, here, view.site.parks())
-        .or_else(|| free(view, robot_id, here, view.site.hold_points()))?;
+    let goal = match free(&mut view.site.parks()) {
+        None if kind == Kind::Hold => None,
+        None => free(&mut view.site.hold_points()),
+        park => park,
+    }?;
     (goal != here).then_some((Errand::Park, goal))
-}
-
-fn has_free_park(view: &View, robot_id: &RobotId, here: WaypointIx) -> bool {
-    free(view, robot_id, here, view.site.parks()).is_some()
 }
 
 /// The nearest of `goals` with room that no other errand is on its way to.
 fn free(
     view: &View,
+    coming: &Coming,
     robot_id: &RobotId,
     here: WaypointIx,
-    goals: impl Iterator<Item = WaypointIx>,
+    goals: &mut dyn Iterator<Item = WaypointIx>,
 ) -> Option<WaypointIx> {
     let open = goals.filter(|at| {
         let Some(ix) = view.site.standing_at(*at) else { return false };
         let place = view.site.place(ix);
         let Some(row) = view.places.get(place.place_id.as_str()).map(|p| &p.row) else { return false };
-        let name = view.site.name_of(*at);
-        let coming = view.attempts.values().map(|a| &a.row);
-        let coming = coming
-            .filter(|a| !a.phase.is_terminal() && a.goal.as_ref() == Some(name) && row.holder(&a.robot_id).is_none())
-            .count();
+        let coming = coming.0.get(view.site.name_of(*at)).copied().unwrap_or_default();
         row.holder(robot_id).is_some()
             || (row.quarantine.is_none() && row.holders.len() + coming < row.capacity as usize)
     });
-    view.router.nearest(here, open.collect::<Vec<_>>()).map(|(at, _)| at)
+    view.router.nearest(here, open).map(|(at, _)| at)
 }
 
 fn begin(tx: &mut Tx, robot_id: &RobotId, errand: Errand, goal: WaypointIx, board: &Board) {

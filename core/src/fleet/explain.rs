@@ -40,7 +40,7 @@ pub fn task(view: &View, board: &Board, now: &Now, task_id: &TaskId) -> Option<T
     let task = view.task(task_id)?;
     let intake = view.intake(task_id)?;
     let waits = matches!(task.phase, Phase::Queued | Phase::RetryWait | Phase::Suspended);
-    let position = assign::queue(view, now).iter().position(|t| t == task_id).map(|p| p + 1);
+    let position = assign::queue(view, now).position(|t| t == task_id).map(|p| p + 1);
     let goal = intake
         .spec
         .next_goal(way::from_step(&intake.spec.steps, task.next_step) as usize)
@@ -110,9 +110,9 @@ pub struct RobotExplanation {
 pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Option<RobotExplanation> {
     view.sessions.get(robot_id.as_str())?;
     let at = board.get(robot_id).and_then(|l| way::find(view, l.report.vitals.waypoint.as_ref()));
-    let candidates = assign::queue(view, now).into_iter().take(CANDIDATES_MAX).filter_map(|task_id| {
-        let task = view.task(&task_id)?;
-        let intake = view.intake(&task_id)?;
+    let candidates = assign::queue(view, now).take(CANDIDATES_MAX).filter_map(|task_id| {
+        let task = view.task(task_id)?;
+        let intake = view.intake(task_id)?;
         let reason = screen::task(view, board, task, intake, now)
             .and_then(|()| screen::pair(view, board, robot_id, task, intake))
             .err();
@@ -121,7 +121,7 @@ pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Optio
             .next_goal(way::from_step(&intake.spec.steps, task.next_step) as usize)
             .and_then(|g| view.site.find(g));
         let distance_mm = at.zip(goal).and_then(|(at, goal)| view.router.distance_mm(at, goal));
-        Some(TaskCandidate { task_id, reason, distance_mm })
+        Some(TaskCandidate { task_id: task_id.clone(), reason, distance_mm })
     });
     Some(RobotExplanation {
         verdict: screen::robot(view, board, robot_id, now).err(),

@@ -200,8 +200,8 @@ pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Pl
     if pace == Pace::Sweep {
         sweep(view, now, board, plan);
     }
-    assign::plan(view, board, now, plan);
-    errands::plan(view, board, now, plan);
+    let idle = assign::plan(view, board, now, pace, plan);
+    errands::plan(view, board, now, idle, plan);
     write_down(view, now, board, &desired::Releases::default(), plan);
     let releases = places::advance(view, board, now, plan);
     write_down(view, now, board, &releases, plan);

@@ -10,8 +10,9 @@ use crate::ids::{AttemptId, RobotId, TaskId};
 use crate::policy::AreaPolicy;
 use crate::rows::{BadRow, Key, Record, Revision, Row, Table};
 use crate::site::Site;
+use crate::site::route::Router;
 use crate::task::{Attempt, Phase, TaskIntake, TaskState};
-use crate::time::Now;
+use crate::time::{Now, Utc};
 use crate::work::{DesiredPolicy, DesiredWork, LaneMark, PresenceRow, Session};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -54,6 +55,10 @@ pub struct View {
     pub intakes: Slot<TaskIntake>,
     /// Where tasks are that have not ended.
     pub tasks: Slot<TaskState>,
+    /// Tasks that wait for a robot, by priority and admission number, and since when.
+    pub queued: BTreeMap<(u8, u64), (TaskId, Utc)>,
+    /// Tasks that began to wait since the planner last looked.
+    pub fresh: BTreeSet<TaskId>,
     /// How ended tasks ended: what `depends_on` looks at.
     pub ended: BTreeMap<TaskId, Phase>,
     /// Attempts that are live or still hold a robot, and the last one of each task that has not ended.
@@ -119,7 +124,7 @@ pub struct View {
     /// Naive rules for twins of tests; none outside them.
     pub bugs: super::bugs::Bugs,
     /// Distances and routes, remembered.
-    pub router: crate::site::route::Router,
+    pub router: Arc<Router>,
 }
 
 /// A record that fleet's picture keeps.
@@ -163,6 +168,14 @@ impl Viewed for TaskState {
         }
         if task.phase.is_terminal() {
             view.ended.insert(task.task_id.clone(), task.phase);
+        }
+        let Some(intake) = view.intakes.get(id).map(|t| &t.row) else { return };
+        let place = (intake.spec.priority, task.number);
+        if task.phase == Phase::Queued {
+            view.queued.insert(place, (task.task_id.clone(), task.queued_since));
+            view.fresh.insert(task.task_id.clone());
+        } else {
+            view.queued.remove(&place);
         }
     }
 }
@@ -253,10 +266,12 @@ impl View {
     /// An empty picture of `site`.
     pub fn new(site: Arc<Site>, started: Now, read: Now) -> Self {
         Self {
-            router: crate::site::route::Router::new(site.clone()),
+            router: Arc::new(Router::new(site.clone())),
             site,
             intakes: Slot::new(),
             tasks: Slot::new(),
+            queued: BTreeMap::new(),
+            fresh: BTreeSet::new(),
             ended: BTreeMap::new(),
             attempts: Slot::new(),
             timers: Slot::new(),

@@ -12,12 +12,14 @@ use midshift_core::time::Now;
 use midshift_core::work::Live;
 use midshift_store::{CommitError, Dirty, Error, FEED_PAGE_MAX};
 use std::time::Duration;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 /// Pause after the store failed, before everything is read again.
 const STORE_RETRY: Duration = Duration::from_millis(200);
+/// Timers are no finer than this, so a shorter turn needs no rest.
+const TIMER_GRAIN: Duration = Duration::from_millis(1);
 /// Requests taken into one cycle.
 const REQUESTS_PER_CYCLE: usize = 64;
 
@@ -28,6 +30,8 @@ struct Loop {
     board: Board,
     dirty: Dirty<Live>,
     started: Now,
+    /// Until then what others write gathers: thinking takes half of the time at most.
+    rested: Instant,
 }
 
 type Replies = Vec<(oneshot::Sender<Result<(), Refusal>>, usize)>;
@@ -42,7 +46,7 @@ pub async fn run(
     let started = parts.clock.now();
     let dirty = parts.board.watch();
     let view = View::new(parts.site.clone(), started, started);
-    let mut this = Loop { parts, view, seq: Seq(0), board: Board::new(), dirty, started };
+    let mut this = Loop { parts, view, seq: Seq(0), board: Board::new(), dirty, started, rested: Instant::now() };
     this.rebuild_until_read(&shutdown).await;
     let mut sweep = tokio::time::interval(Duration::from_millis(limits::SWEEP.as_ms()));
     sweep.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -53,13 +57,19 @@ pub async fn run(
             () = shutdown.cancelled() => return Ok(()),
             _ = sweep.tick() => Pace::Sweep,
             n = requests.recv_many(&mut batch, REQUESTS_PER_CYCLE) => if n == 0 { return Ok(()) } else { Pace::Wake },
-            changed = wake.changed() => if changed.is_err() { return Ok(()) } else { Pace::Wake },
+            changed = news(&mut wake, this.rested) => if changed.is_err() { return Ok(()) } else { Pace::Wake },
         };
         if this.turn(pace, std::mem::take(&mut batch)).await.is_err() {
             tokio::time::sleep(STORE_RETRY).await;
             this.rebuild_until_read(&shutdown).await;
         }
     }
+}
+
+/// Something was written, and it is time to look.
+async fn news(wake: &mut watch::Receiver<Seq>, rested: Instant) -> Result<(), watch::error::RecvError> {
+    tokio::time::sleep_until(rested).await;
+    wake.changed().await
 }
 
 impl Loop {
@@ -82,7 +92,8 @@ impl Loop {
         let unwilling = std::mem::take(&mut self.view.unwilling);
         let now = self.parts.clock.now();
         let served = self.view.serving(&now);
-        self.view = View::new(self.parts.site.clone(), self.started, now);
+        let router = self.view.router.clone();
+        self.view = View { router, ..View::new(self.parts.site.clone(), self.started, now) };
         self.view.bugs = self.parts.bugs;
         self.view.load(&snapshot.rows, snapshot.seq)?;
         // The row is as old as the last commit; this process has served on since.
@@ -122,7 +133,11 @@ impl Loop {
         if foreign || !replies.is_empty() || pace == Pace::Sweep {
             cycle(&mut self.view, now, &self.board, pace, &mut plan);
         }
-        metrics::histogram!("midshift_fleet_cycle_seconds").record(begun.elapsed().as_secs_f64());
+        let took = begun.elapsed();
+        if took >= TIMER_GRAIN {
+            self.rested = Instant::now() + took;
+        }
+        metrics::histogram!("midshift_fleet_cycle_seconds").record(took.as_secs_f64());
         publish(&plan, &self.view, pace);
         self.commit(plan, replies).await
     }

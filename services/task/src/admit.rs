@@ -4,7 +4,7 @@
 //! answered with its task for as long as its key is kept, even if its rules would no longer hold.
 
 use crate::TaskService;
-use crate::rows::{exist, read, unavailable};
+use crate::rows::{TaskRows, exist, read, unavailable};
 use midshift_core::ids::{RequestId, TaskId};
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violation};
 use midshift_core::rows::{Item, Table, Writer};
@@ -32,8 +32,7 @@ struct Wanted {
 /// One admission on its way to the store.
 pub struct Admission {
     wanted: Wanted,
-    /// The id it will have.
-    pub task_id: TaskId,
+    intake: TaskIntake,
     /// What to commit.
     pub item: Item,
 }
@@ -48,10 +47,28 @@ pub enum Prepared {
 
 /// What the store said about an admission.
 pub enum Admitted {
-    /// The task is durable, now or by an earlier call.
-    Task(TaskId),
+    /// The task is durable.
+    Durable(Durable),
     /// The drawn id was taken: again with another.
     Again(Box<Admission>),
+}
+
+/// A task that is in the store.
+pub enum Durable {
+    /// By this call; the answer shows it as it was born.
+    New(Box<TaskIntake>),
+    /// By an earlier call; the answer shows it as it is now.
+    Known(TaskId),
+}
+
+impl Durable {
+    /// Its id.
+    pub fn task_id(&self) -> &TaskId {
+        match self {
+            Self::New(intake) => &intake.task_id,
+            Self::Known(task_id) => task_id,
+        }
+    }
 }
 
 fn hash(request: &v1::SubmitTaskRequest) -> String {
@@ -63,10 +80,15 @@ pub fn no_result() -> Refusal {
     Refusal::new(Kind::Unavailable, Code::CommitUnknown)
 }
 
-fn draw_id(utc: Utc) -> TaskId {
+/// A new task's id: the day, its milliseconds, and a number that no other task of this process has in that millisecond. Ids rise
+/// with time, so that new rows lie beside each other in every index.
+fn draw_id(utc: Utc, number: u64) -> TaskId {
+    const DAY_MS: i64 = 86_400_000;
+    const NUMBER_BITS: u32 = 23;
     let day = utc.rfc3339().get(..10).unwrap_or_default().replace('-', "");
-    let random: u64 = rand::random();
-    let tail: String = (0..10).map(|i| char::from(BASE32[(random >> (i * 5)) as usize & 31])).collect();
+    let of_day = utc.0.rem_euclid(DAY_MS).cast_unsigned();
+    let drawn = of_day << NUMBER_BITS | (number & ((1 << NUMBER_BITS) - 1));
+    let tail: String = (0..10).rev().map(|i| char::from(BASE32[(drawn >> (i * 5)) as usize & 31])).collect();
     // Letters, digits and hyphens only, 24 of them.
     TaskId::parse(&format!("TASK-{day}-{tail}")).unwrap_or_else(|e| unreachable!("drawn id: {e}"))
 }
@@ -98,7 +120,9 @@ impl TaskService {
     /// The item of an admission, with the id asked for or a drawn one.
     fn compose(&self, wanted: Wanted, actor: &str) -> Admission {
         let now = self.inner.parts.clock.now();
-        let task_id = wanted.task_id.clone().unwrap_or_else(|| draw_id(now.utc));
+        let number = self.next_number();
+        let drawn = || draw_id(now.utc, self.inner.salt.wrapping_add(number));
+        let task_id = wanted.task_id.clone().unwrap_or_else(drawn);
         let intake = TaskIntake {
             task_id: task_id.clone(),
             spec: wanted.spec.clone(),
@@ -106,7 +130,7 @@ impl TaskService {
             request_id: wanted.request_id.as_ref().map(ToString::to_string).unwrap_or_default(),
             payload_hash: wanted.hash.clone(),
             created: now.utc,
-            number: self.next_number(),
+            number,
         };
         let mut item = Item::new(Writer::Task, actor);
         item.request_id = wanted.request_id.as_ref().map(|id| id.as_str().into());
@@ -120,7 +144,7 @@ impl TaskService {
             item.create(&key, "request.used");
         }
         item.create(&intake, "task.admitted").create(&TaskState::born(&intake), "task.born");
-        Admission { wanted, task_id, item }
+        Admission { wanted, intake, item }
     }
 
     /// Checks a request and composes its admission, or finds the one it repeats: the site and the tasks it was checked against
@@ -165,7 +189,7 @@ impl TaskService {
         match result {
             Ok(_) => {
                 metrics::counter!("midshift_task_admitted_total").increment(1);
-                Ok(Admitted::Task(admission.task_id))
+                Ok(Admitted::Durable(Durable::New(Box::new(admission.intake))))
             }
             Err(CommitError::Conflict { key, .. }) if key.table == Table::RequestKey => self.repeated(admission).await,
             Err(CommitError::Conflict { .. }) if admission.wanted.task_id.is_some() => self.same_id(admission).await,
@@ -186,7 +210,7 @@ impl TaskService {
         let found = load::<RequestKey>(self.store(), &id).await.map_err(unavailable)?;
         match found {
             Some((key, _)) if key.payload_hash == admission.wanted.hash => match key.task_id {
-                Some(task_id) => Ok(Admitted::Task(task_id)),
+                Some(task_id) => Ok(Admitted::Durable(Durable::Known(task_id))),
                 None => {
                     Err(Refusal::new(Kind::AlreadyExists, Reason::from(Code::RequestIdReused).with("request_id", id)))
                 }
@@ -200,13 +224,15 @@ impl TaskService {
 
     /// The chosen task_id exists: the same body is the same task.
     async fn same_id(&self, admission: Admission) -> Result<Admitted, Refusal> {
-        let found = load::<TaskIntake>(self.store(), admission.task_id.as_str()).await.map_err(unavailable)?;
+        let task_id = admission.intake.task_id;
+        let found = load::<TaskIntake>(self.store(), task_id.as_str()).await.map_err(unavailable)?;
         match found {
-            Some((intake, _)) if intake.payload_hash == admission.wanted.hash => Ok(Admitted::Task(admission.task_id)),
-            Some(_) => Err(Refusal::new(
-                Kind::AlreadyExists,
-                Reason::from(Code::TaskIdTaken).with("task_id", &admission.task_id),
-            )),
+            Some((intake, _)) if intake.payload_hash == admission.wanted.hash => {
+                Ok(Admitted::Durable(Durable::Known(task_id)))
+            }
+            Some(_) => {
+                Err(Refusal::new(Kind::AlreadyExists, Reason::from(Code::TaskIdTaken).with("task_id", &task_id)))
+            }
             None => Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)),
         }
     }
@@ -216,23 +242,41 @@ impl TaskService {
         if request.validate_only {
             return Ok(encode_checked(&self.check(request).await?.spec));
         }
-        let task_id = match self.prepare(request, actor).await? {
+        let durable = match self.prepare(request, actor).await? {
             Prepared::New(admission) => self.admit(*admission, actor).await?,
-            Prepared::Known(task_id) => task_id,
+            Prepared::Known(task_id) => Durable::Known(task_id),
         };
-        Ok(read(self.store(), &task_id).await?.encode())
+        match durable {
+            Durable::New(intake) => Ok(TaskRows::born(*intake).encode()),
+            Durable::Known(task_id) => Ok(read(self.store(), &task_id).await?.encode()),
+        }
     }
 
     /// Commits an admission, with another id each time the drawn one was taken.
-    pub async fn admit(&self, mut admission: Admission, actor: &str) -> Result<TaskId, Refusal> {
+    pub async fn admit(&self, mut admission: Admission, actor: &str) -> Result<Durable, Refusal> {
         for _ in 0..DRAWS {
             let item = admission.item.clone();
             let result = self.commit(vec![item]).await.pop().ok_or_else(no_result)?;
             match self.settle(admission, result, actor).await? {
-                Admitted::Task(task_id) => return Ok(task_id),
+                Admitted::Durable(durable) => return Ok(durable),
                 Admitted::Again(next) => admission = *next,
             }
         }
         Err(Refusal::new(Kind::Internal, Code::Internal))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn drawn_ids_differ_within_a_millisecond_and_rise_with_time() {
+        let noon = Utc(1_800_000_000_000);
+        let ids: std::collections::BTreeSet<_> = (0..100_000).map(|n| draw_id(noon, n)).collect();
+        assert_eq!(ids.len(), 100_000);
+        let late = draw_id(Utc(noon.0 + 1), 0);
+        assert!(ids.iter().all(|id| *id < late));
+        assert!(draw_id(Utc(noon.0 + 86_400_000), 0) > late, "the next day is later");
     }
 }

@@ -2,9 +2,8 @@
 //!
 //! Invariant: an item is checked after everything sent before it that it depends on was committed, wherever slices end.
 
-use crate::admit::{Admitted, Prepared, no_result};
+use crate::admit::{Admitted, Durable, Prepared, no_result};
 use crate::{ACTOR, TaskService};
-use midshift_core::ids::TaskId;
 use midshift_core::limits;
 use midshift_core::reason::Refusal;
 use midshift_proto::common::v1::FieldViolation;
@@ -66,11 +65,11 @@ impl<'a> Batch<'a> {
         for (request_id, prepared) in ids.into_iter().zip(prepared) {
             let outcome = match prepared {
                 Err(refusal) => Err(refusal),
-                Ok(Prepared::Known(task_id)) => Ok(task_id),
+                Ok(Prepared::Known(task_id)) => Ok(Durable::Known(task_id)),
                 Ok(Prepared::New(admission)) => match committed.next() {
                     None => Err(no_result()),
                     Some(result) => match self.service.settle(*admission, result, ACTOR).await {
-                        Ok(Admitted::Task(task_id)) => Ok(task_id),
+                        Ok(Admitted::Durable(durable)) => Ok(durable),
                         Ok(Admitted::Again(next)) => self.service.admit(*next, ACTOR).await,
                         Err(refusal) => Err(refusal),
                     },
@@ -101,9 +100,9 @@ fn chosen_id(request: &v1::SubmitTaskRequest) -> &str {
     }
 }
 
-fn result_of(request_id: String, outcome: Result<TaskId, Refusal>) -> v1::SubmitTaskResult {
+fn result_of(request_id: String, outcome: Result<Durable, Refusal>) -> v1::SubmitTaskResult {
     let outcome = match outcome {
-        Ok(task_id) => Outcome::TaskId(task_id.to_string()),
+        Ok(durable) => Outcome::TaskId(durable.task_id().to_string()),
         Err(refusal) => {
             crate::grpc::count(&refusal);
             let violations = refusal.violations.into_iter();

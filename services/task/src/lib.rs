@@ -42,6 +42,8 @@ pub struct Parts {
 struct Inner {
     parts: Parts,
     number: AtomicU64,
+    /// Drawn at the start, so that two processes do not draw the same ids.
+    salt: u64,
     watchers: Arc<Semaphore>,
     shutdown: CancellationToken,
 }
@@ -65,7 +67,7 @@ impl TaskService {
             None => 0,
         };
         let (number, watchers) = (AtomicU64::new(number), Arc::new(Semaphore::new(WATCHERS_MAX)));
-        Ok(Self { inner: Arc::new(Inner { parts, number, watchers, shutdown }) })
+        Ok(Self { inner: Arc::new(Inner { parts, number, salt: rand::random(), watchers, shutdown }) })
     }
     /// The gRPC face.
     pub fn grpc(&self) -> TaskServiceServer<Self> {

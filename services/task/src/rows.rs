@@ -26,6 +26,13 @@ pub struct TaskRows {
 }
 
 impl TaskRows {
+    /// A task as its admission writes it.
+    pub fn born(intake: TaskIntake) -> Self {
+        let state = TaskState::born(&intake);
+        let allowed = allowed_resolutions(state.phase, false, false);
+        Self { intake, state, revision: Revision(1), attempt: None, allowed }
+    }
+
     /// As a message.
     pub fn encode(&self) -> v1::Task {
         encode_task(TaskView {
@@ -66,11 +73,14 @@ async fn by_id(store: &dyn Store, keys: Vec<Key>) -> Result<BTreeMap<String, Row
 }
 
 async fn join(store: &dyn Store, ids: &[TaskId]) -> Result<Vec<TaskRows>, Error> {
-    let keys = |table| ids.iter().map(move |id| Key::new(table, id.as_str())).collect();
-    let intakes = by_id(store, keys(Table::TaskIntake)).await?;
+    let keys = |table| ids.iter().map(move |id| Key::new(table, id.as_str()));
+    let mut intakes = BTreeMap::new();
     let mut states = BTreeMap::new();
-    for (id, row) in by_id(store, keys(Table::TaskState)).await? {
-        states.insert(id, (row.decode::<TaskState>()?, row.revision));
+    for row in store.get(keys(Table::TaskIntake).chain(keys(Table::TaskState)).collect()).await? {
+        match row.key.table {
+            Table::TaskIntake => drop(intakes.insert(row.key.id.to_string(), row.decode::<TaskIntake>()?)),
+            _ => drop(states.insert(row.key.id.to_string(), (row.decode::<TaskState>()?, row.revision))),
+        }
     }
     let wanted = states.values().filter_map(|(s, _)| s.attempt_id()).map(|a| Key::new(Table::Attempt, a.to_string()));
     let attempts = by_id(store, wanted.collect()).await?;
@@ -80,7 +90,7 @@ async fn join(store: &dyn Store, ids: &[TaskId]) -> Result<Vec<TaskRows>, Error>
     let authority = by_id(store, robots.into_iter().collect()).await?;
     let mut tasks = Vec::new();
     for id in ids {
-        let (Some(intake), Some((state, revision))) = (intakes.get(id.as_str()), states.remove(id.as_str())) else {
+        let (Some(intake), Some((state, revision))) = (intakes.remove(id.as_str()), states.remove(id.as_str())) else {
             continue;
         };
         let attempt = state
@@ -96,7 +106,7 @@ async fn join(store: &dyn Store, ids: &[TaskId]) -> Result<Vec<TaskRows>, Error>
             .transpose()?;
         let kept = holder.is_some_and(|h| keeps(&h, &state));
         let allowed = allowed_resolutions(state.phase, state.opened.is_some(), kept);
-        tasks.push(TaskRows { intake: intake.decode()?, state, revision, attempt, allowed });
+        tasks.push(TaskRows { intake, state, revision, attempt, allowed });
     }
     Ok(tasks)
 }

@@ -182,14 +182,14 @@ impl SqliteStore {
     }
 }
 
-/// Commands of at most one group's worth of items each, in order.
+/// Commands of a caller, in order: each a part of a group at most, and the next is sent when the one before is answered.
 fn slices(items: Vec<Item>) -> Vec<(Vec<Item>, usize)> {
     let mut slices: Vec<(Vec<Item>, usize)> = Vec::new();
     for item in items {
         let bytes = item_bytes(&item);
         match slices.last_mut() {
             Some((slice, sum))
-                if slice.len() < limits::GROUP_COMMIT_ITEMS && *sum + bytes <= limits::GROUP_COMMIT_BYTES =>
+                if slice.len() < limits::COMMIT_SLICE_ITEMS && *sum + bytes <= limits::COMMIT_SLICE_BYTES =>
             {
                 slice.push(item);
                 *sum += bytes;
@@ -219,16 +219,12 @@ impl Store for SqliteStore {
     }
 
     async fn commit(&self, items: Vec<Item>) -> Vec<Result<Applied, CommitError>> {
-        let mut waiting = Vec::new();
+        let mut results = Vec::with_capacity(items.len());
         for (items, bytes) in slices(items) {
             let (reply, answer) = oneshot::channel();
             let count = items.len();
             // A refused send drops the reply, which is heard below.
             let sent = self.commands.send(Command::Commit(Commit { items, bytes, reply })).await.is_ok();
-            waiting.push((count, sent, answer));
-        }
-        let mut results = Vec::new();
-        for (count, sent, answer) in waiting {
             match answer.await {
                 Ok(answers) => results.extend(answers),
                 Err(_) if sent => results.extend((0..count).map(|_| Err(CommitError::Unknown(closed())))),

@@ -45,23 +45,35 @@ pub(super) async fn get(readers: &SqlitePool, site_id: &SiteId, keys: &[Key]) ->
     for key in keys {
         ids.entry(key.table).or_default().push(&key.id);
     }
+    let slices: Vec<_> =
+        ids.iter().flat_map(|(table, ids)| ids.chunks(IDS_PER_STATEMENT).map(|ids| (*table, ids))).collect();
     let mut found: BTreeMap<Key, Row> = BTreeMap::new();
-    let mut transaction = readers.begin().await?;
-    for (table, ids) in ids {
-        for slice in ids.chunks(IDS_PER_STATEMENT) {
-            let list = placeholders(1, slice.len());
-            let sql = format!("SELECT {ROW_COLUMNS} FROM {} WHERE site_id = ? AND id IN {list}", table.name());
-            let mut select = prepared(sql).bind(site_id.as_str());
-            for id in slice {
-                select = select.bind(Arc::clone(id));
-            }
-            for found_row in select.fetch_all(&mut *transaction).await? {
-                let found_row = row(table, &found_row)?;
-                found.insert(found_row.key.clone(), found_row);
-            }
+    if let [(table, ids)] = slices[..] {
+        // One statement needs no transaction to be of one moment.
+        let rows = select(site_id, table, ids).fetch_all(readers).await?;
+        take(&mut found, table, &rows)?;
+    } else {
+        let mut transaction = readers.begin().await?;
+        for (table, ids) in slices {
+            let rows = select(site_id, table, ids).fetch_all(&mut *transaction).await?;
+            take(&mut found, table, &rows)?;
         }
     }
     Ok(keys.iter().filter_map(|key| found.get(key).cloned()).collect())
+}
+
+fn select<'q>(site_id: &'q SiteId, table: Table, ids: &[&Arc<str>]) -> Statement<'q> {
+    let list = placeholders(1, ids.len());
+    let sql = format!("SELECT {ROW_COLUMNS} FROM {} WHERE site_id = ? AND id IN {list}", table.name());
+    ids.iter().fold(prepared(sql).bind(site_id.as_str()), |select, id| select.bind(Arc::clone(id)))
+}
+
+fn take(found: &mut BTreeMap<Key, Row>, table: Table, rows: &[SqliteRow]) -> Result<(), sqlx::Error> {
+    for one in rows {
+        let one = row(table, one)?;
+        found.insert(one.key.clone(), one);
+    }
+    Ok(())
 }
 
 /// Each state is read from its own stretch of the index and the stretches are merged: with a list of states SQLite would walk the

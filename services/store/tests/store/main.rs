@@ -6,3 +6,4 @@ mod failure;
 mod projection;
 mod reopen;
 mod support;
+mod turns;
