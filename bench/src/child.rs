@@ -81,7 +81,7 @@ pub enum Role {
 /// A child's arguments.
 #[derive(Clone, Debug, clap::Args)]
 pub struct ChildArgs {
-    /// Only on this one of the cores there are, counted round.
+    /// Only on this one of the cores there are: 0 is the first, the others are counted round the rest.
     #[arg(long)]
     core: Option<usize>,
     #[command(subcommand)]
@@ -152,13 +152,14 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
     }
 }
 
-/// Keeps this process on one of the cores it may use.
+/// Keeps this process on one of the cores it may use: number 0 on the first alone, the others share the rest.
 fn take_core(number: usize) -> anyhow::Result<()> {
     use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
     let may = sched_getaffinity(None).context("asking for the cores")?;
     let cores: Vec<usize> = (0..CpuSet::MAX_CPU).filter(|core| may.is_set(*core)).collect();
     let mut mine = CpuSet::new();
-    mine.set(*cores.get(number % cores.len().max(1)).context("no core")?);
+    let at = if number == 0 || cores.len() < 2 { 0 } else { 1 + (number - 1) % (cores.len() - 1) };
+    mine.set(*cores.get(at).context("no core")?);
     sched_setaffinity(None, &mine).context("taking a core")
 }
 

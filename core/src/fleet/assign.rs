@@ -99,11 +99,20 @@ impl Pool {
     }
 }
 
-/// Gives waiting tasks to idle robots, each assignment an item of its own, and gives back who is still idle. While there is nobody to
-/// give to, only a sweep looks at every waiting task.
-pub fn plan(view: &mut View, board: &Board, now: Now, pace: Pace, plan: &mut Plan) -> Vec<Candidate> {
-    let mut idle = Pool::of(view, board, |r| screen::robot(view, board, r, &now).is_ok());
-    let mut errands = Pool::of(view, board, |r| screen::recallable(view, board, r));
+/// Gives waiting tasks to idle robots, each assignment an item of its own, and gives back who is still idle: of those that were `heard`
+/// if no task waits. While there is nobody to give to, only a sweep looks at every waiting task.
+pub fn plan(
+    view: &mut View,
+    board: &Board,
+    now: Now,
+    pace: Pace,
+    heard: &BTreeSet<RobotId>,
+    plan: &mut Plan,
+) -> Vec<Candidate> {
+    let wanted = !view.queued.is_empty();
+    let mut idle =
+        Pool::of(view, board, |r| (wanted || heard.contains(r)) && screen::robot(view, board, r, &now).is_ok());
+    let mut errands = Pool::of(view, board, |r| wanted && screen::recallable(view, board, r));
     let mut recalled = errands::stopping(view);
     let later = view.fresh.iter().nth(TASKS_PER_CYCLE).cloned().map(|id| view.fresh.split_off(&id));
     let fresh = std::mem::replace(&mut view.fresh, later.unwrap_or_default());

@@ -33,7 +33,7 @@ use crate::task::{Event, Phase, TaskRequest};
 use crate::time::Now;
 use crate::work::{InboxEntry, Live};
 use rows::{FleetMark, RobotAuthority, RobotControl, RobotHolder, ServiceClock, SiteRow};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use tx::Tx;
 use view::View;
@@ -197,10 +197,8 @@ pub enum Pace {
 /// One cycle over a view that has absorbed the whole feed. Items of earlier decisions of the cycle are already in `plan`.
 pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Plan) {
     welcome(view, now, board, plan);
-    if pace == Pace::Sweep {
-        sweep(view, now, board, plan);
-    }
-    let idle = assign::plan(view, board, now, pace, plan);
+    let heard = if pace == Pace::Sweep { sweep(view, now, board, plan) } else { BTreeSet::new() };
+    let idle = assign::plan(view, board, now, pace, &heard, plan);
     errands::plan(view, board, now, idle, plan);
     write_down(view, now, board, &desired::Releases::default(), plan);
     let releases = places::advance(view, board, now, plan);
@@ -230,7 +228,8 @@ fn welcome(view: &mut View, now: Now, board: &Board, plan: &mut Plan) {
     }
 }
 
-fn sweep(view: &mut View, now: Now, board: &Board, plan: &mut Plan) {
+/// Timers, and every robot that was heard or fell silent since the last one; gives back those robots.
+fn sweep(view: &mut View, now: Now, board: &Board, plan: &mut Plan) -> BTreeSet<RobotId> {
     let (timers, late) = timers::due(view, &now);
     for timer in timers {
         plan.decide(view, now, "fleet", |tx| timers::fire(tx, &timer, board));
@@ -238,10 +237,11 @@ fn sweep(view: &mut View, now: Now, board: &Board, plan: &mut Plan) {
     for task_id in late {
         plan.decide(view, now, "fleet", |tx| timers::deadline(tx, &task_id));
     }
-    let robots: Vec<RobotId> = view.authority.values().map(|a| a.row.robot_id.clone()).collect();
+    let known = view.authority.values().map(|a| &a.row.robot_id);
+    let heard: BTreeSet<RobotId> = known.filter(|r| repair::is_due(view, r, board, &now)).cloned().collect();
     let mut tally = plan.report.tally;
-    for robot_id in robots {
-        plan.decide(view, now, "fleet", |tx| repair::robot(tx, &robot_id, board, &mut tally));
+    for robot_id in &heard {
+        plan.decide(view, now, "fleet", |tx| repair::robot(tx, robot_id, board, &mut tally));
     }
     plan.report.tally = tally;
     let suspended: Vec<_> =
@@ -253,6 +253,7 @@ fn sweep(view: &mut View, now: Now, board: &Board, plan: &mut Plan) {
     }
     let worn = desired::wearing(view, board);
     view.dirty.extend(worn);
+    heard
 }
 
 /// Composes the desired state of every robot that something changed for.

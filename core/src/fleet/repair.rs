@@ -25,6 +25,13 @@ fn attached(view: &mut View, robot_id: &RobotId, board: &Board, now: &Now) {
     time.until = now.site;
 }
 
+/// Whether there is something to compare: a newer heartbeat, one that could not count yet, or none for too long.
+pub fn is_due(view: &View, robot_id: &RobotId, board: &Board, now: &Now) -> bool {
+    let online = presence(board, robot_id, now) == Presence::Online;
+    let newest = board.get(robot_id).map(|l| (l.report.session_epoch, l.report.hb));
+    !online || newest.is_none() || view.compared.get(robot_id) != newest.as_ref()
+}
+
 /// Repairs one robot.
 pub fn robot(tx: &mut Tx, robot_id: &RobotId, board: &Board, tally: &mut Tally) {
     let now = tx.now;
@@ -42,6 +49,7 @@ pub fn robot(tx: &mut Tx, robot_id: &RobotId, board: &Board, tally: &mut Tally) 
         tally.pending += 1;
         return;
     }
+    tx.view.compared.insert(robot_id.clone(), (live.report.session_epoch, live.report.hb));
     inbox::hardware_stop(tx, robot_id, live.report.hardware_stop);
     places::repair(tx, robot_id, &live);
     attempt(tx, robot_id, &live, tally);

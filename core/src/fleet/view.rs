@@ -121,6 +121,8 @@ pub struct View {
     pub unwilling: BTreeMap<RobotId, crate::time::LinkTime>,
     /// Time in which robots were heard since it was last counted. Volatile.
     pub attached: BTreeMap<RobotId, Attached>,
+    /// The newest heartbeat of each robot, as (session epoch, number), that was compared with the rows and needs no second look. Volatile.
+    pub compared: BTreeMap<RobotId, (u64, u64)>,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: super::bugs::Bugs,
     /// Distances and routes, remembered.
@@ -303,6 +305,7 @@ impl View {
             unwilling: BTreeMap::new(),
             attached: BTreeMap::new(),
             place_waits: 0,
+            compared: BTreeMap::new(),
             bugs: super::bugs::Bugs::default(),
         }
     }

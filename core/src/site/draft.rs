@@ -82,6 +82,10 @@ impl Draft {
         let (waypoints, waypoint_names, capacities) = build_waypoints(v, self.waypoints, &areas);
         let lanes = build_lanes(v, self.lanes, &waypoints, &waypoint_names);
         let passages = build_passages(v, self.passages, &waypoint_names, &lanes);
+        let mut kinds: BTreeMap<Kind, Vec<WaypointIx>> = BTreeMap::new();
+        for (at, waypoint) in waypoints.iter().enumerate() {
+            kinds.entry(waypoint.kind).or_default().push(WaypointIx(at as u32));
+        }
         let mut site = Site {
             site_id: site_id.unwrap_or_else(nowhere),
             name: self.name,
@@ -94,6 +98,7 @@ impl Draft {
             arriving: Vec::new(),
             arriving_at: Vec::new(),
             waypoints,
+            kinds,
             lanes,
             places: passages,
             waypoint_names,

@@ -239,6 +239,8 @@ pub struct Site {
     collisions_modelled: bool,
     areas: Vec<Area>,
     waypoints: Vec<Waypoint>,
+    /// Waypoints of each kind, ascending.
+    kinds: BTreeMap<Kind, Vec<WaypointIx>>,
     lanes: Vec<Lane>,
     places: Vec<Place>,
     waypoint_names: BTreeMap<WaypointId, WaypointIx>,
@@ -371,9 +373,8 @@ impl Site {
         self.source == Source::Grid || self.waypoint(at).kind == Kind::Station
     }
     /// Every waypoint of a kind, ascending.
-    pub fn of_kind(&self, kind: Kind) -> impl Iterator<Item = WaypointIx> {
-        let all = self.waypoints.iter().enumerate();
-        all.filter(move |(_, w)| w.kind == kind).map(|(i, _)| WaypointIx(i as u32))
+    pub fn of_kind(&self, kind: Kind) -> impl Iterator<Item = WaypointIx> + use<'_> {
+        self.kinds.get(&kind).into_iter().flatten().copied()
     }
     /// Every station.
     pub fn stations(&self) -> impl Iterator<Item = WaypointIx> {
