@@ -81,6 +81,7 @@ async fn grpcurl_lists_submits_watches_and_hears_every_violation() -> anyhow::Re
     for field in ["InvalidArgument", "flat.task_type", "flat.priority", "flat.to_waypoint", "flat.timeout_seconds"] {
         assert!(said.contains(field), "{field} is not in: {said}");
     }
+    assert!(said.contains(r#""fieldViolations""#), "its details cannot be read: {said}");
     let watch = r#"{"filter":{"task_ids":["TASK-GRPCURL"]}}"#;
     let watched = Command::new(tool("MIDSHIFT_TEST_GRPCURL")?)
         .args(["-plaintext", "-max-time", "20", "-d", watch, &address, "midshift.task.v1.TaskService/WatchTasks"])

@@ -214,7 +214,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Watch { call, ids, cursor } => watch(&call, ids, cursor, out).await,
         Verb::Wait { one, timeout } => {
             let id = one.find().await?;
-            follow(&one.call, &id, timeout, out).await
+            follow(&one.call, &id, String::new(), timeout, out).await
         }
         Verb::Explain(one) => explain(&one, out).await,
         Verb::Cancel { one, reason, force, if_match, change } => {
@@ -344,7 +344,8 @@ async fn submit(args: Submit, out: &Out) -> Result<(), Exit> {
     message.validate_only = args.change.dry_run;
     let task = args.call.task().await?.submit_task(unary(message)).await?.into_inner().task.unwrap_or_default();
     if args.wait && !args.change.dry_run {
-        return follow(&args.call, &task.task_id, Duration::from_secs(86_400), out).await;
+        let told = tell(&task.task_id, "", &task, out);
+        return follow(&args.call, &task.task_id, told, Duration::from_secs(86_400), out).await;
     }
     if args.change.dry_run {
         out.say("valid; nothing was stored");
@@ -539,8 +540,9 @@ async fn watch(call: &Call, task_ids: Vec<String>, cursor: String, out: &Out) ->
 }
 
 /// Follows one task to its end; exit code by how it ended.
-async fn follow(call: &Call, task_id: &str, timeout: Duration, out: &Out) -> Result<(), Exit> {
-    let end = tokio::time::timeout(timeout, until_over(call, task_id, out)).await;
+/// Follows a task to its end; `told` is what was last said of it.
+async fn follow(call: &Call, task_id: &str, told: String, timeout: Duration, out: &Out) -> Result<(), Exit> {
+    let end = tokio::time::timeout(timeout, until_over(call, task_id, told, out)).await;
     let task = end.map_err(|_| {
         Exit::new(10, format!("{task_id} is not over after {timeout:?}\n  try: midshift task explain {task_id}"))
     })??;
@@ -560,7 +562,17 @@ async fn follow(call: &Call, task_id: &str, timeout: Duration, out: &Out) -> Res
     }
 }
 
-async fn until_over(call: &Call, task_id: &str, out: &Out) -> Result<v1::Task, Exit> {
+/// Says where a task is, if that is news, and gives it back.
+fn tell(task_id: &str, told: &str, task: &v1::Task, out: &Out) -> String {
+    let now = format!("{} {}", state(task), task.robot_id).trim().to_owned();
+    if now != told && out.format == Format::Table {
+        let begin = if told.is_empty() { task_id } else { "  >" };
+        out.say(&format!("{begin} {now}"));
+    }
+    now
+}
+
+async fn until_over(call: &Call, task_id: &str, mut told: String, out: &Out) -> Result<v1::Task, Exit> {
     let filter = v1::TaskFilter { task_ids: vec![task_id.to_owned()], ..v1::TaskFilter::default() };
     let mut stream = call
         .task()
@@ -568,19 +580,13 @@ async fn until_over(call: &Call, task_id: &str, out: &Out) -> Result<v1::Task, E
         .watch_tasks(v1::WatchTasksRequest { filter: Some(filter), cursor: String::new() })
         .await?
         .into_inner();
-    let mut told = String::new();
     while let Some(message) = stream.message().await? {
         let task = match message.item {
             Some(Item::Existing(task)) => task,
             Some(Item::Change(change)) => change.task.unwrap_or_default(),
             _ => continue,
         };
-        let now = format!("{} {}", state(&task), task.robot_id).trim().to_owned();
-        if now != told && out.format == Format::Table {
-            let begin = if told.is_empty() { task_id.to_owned() } else { "  >".to_owned() };
-            out.say(&format!("{begin} {now}"));
-        }
-        told = now;
+        told = tell(task_id, &told, &task, out);
         use v1::TaskState::{Canceled, Expired, Failed, NeedsOperator, Succeeded};
         if matches!(task.state(), Succeeded | Failed | Canceled | Expired | NeedsOperator) {
             return Ok(task);
