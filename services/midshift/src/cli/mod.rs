@@ -1,6 +1,7 @@
 //! The command line: one binary, noun then verb. Data to stdout, talk to stderr, `-o json` is the contract.
 
 mod area;
+mod bundle;
 mod client;
 mod doctor;
 mod explain;
@@ -71,6 +72,9 @@ enum Command {
     /// Site files.
     #[command(subcommand)]
     Map(map::Verb),
+    /// Signed software for robots: keys, building, signing, checking.
+    #[command(subcommand)]
+    Bundle(bundle::Verb),
     /// Look for what may be wrong: server, store, robots, this machine.
     Doctor(Call),
     /// What a reason means and what to try.
@@ -134,6 +138,7 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Zone(verb) => zone::run(verb, out).await,
         Command::Area(verb) => area::run(verb, out).await,
         Command::Map(verb) => map::run(verb, out),
+        Command::Bundle(verb) => bundle::run(verb, out),
         Command::Doctor(call) => doctor::run(&call, out).await,
         Command::ExplainError { code } => explain::error(code.as_deref(), out),
     }

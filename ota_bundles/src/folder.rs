@@ -1,0 +1,275 @@
+//! A repository as release people keep it: a folder with `metadata/` and `targets/` that they sign into and push from.
+//!
+//! Invariant: a targets document gets its number only once enough people have signed it; until then it is `pending.targets.json` and
+//! nobody believes it. Files are in place before the document that names them.
+
+use crate::build::{self, inspect};
+use crate::digest::Digest;
+use crate::keys::{self, SecretKey};
+use crate::manifest::Manifest;
+use crate::repository::{
+    self, FileTarget, PEOPLE_LIFE_MS, Profile, RootDraft, Signers, add_signatures, check_root, check_targets, listed,
+    sign_root, sign_targets, version_of,
+};
+use midshift_core::reason::{Refusal, Violations};
+use midshift_core::time::Utc;
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+/// A targets document that is not signed by enough people yet.
+const PENDING: &str = "pending.targets.json";
+
+/// Why the folder stays as it was.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A file or folder.
+    #[error("{doing} {path}: {source}")]
+    Io {
+        /// What was being done.
+        doing: &'static str,
+        /// With what.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
+    /// A key file.
+    #[error(transparent)]
+    Key(#[from] keys::Error),
+    /// A bundle.
+    #[error(transparent)]
+    Bundle(#[from] build::Error),
+    /// A document.
+    #[error(transparent)]
+    Document(#[from] repository::Error),
+    /// What was asked breaks a rule.
+    #[error("{0}")]
+    Refused(#[from] Refusal),
+}
+
+fn io(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
+    let path = path.to_owned();
+    move |source| Error::Io { doing, path, source }
+}
+
+/// What signing came to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Signed {
+    /// The document has its number.
+    Published(u64),
+    /// More people must sign it.
+    Pending,
+}
+
+/// What a check of the folder found.
+#[derive(Clone, Debug)]
+pub struct Checked {
+    /// Newest root.
+    pub root_version: u64,
+    /// Newest targets document; none: nothing was ever signed.
+    pub targets_version: Option<u64>,
+    /// Bundles, by name in the repository.
+    pub bundles: Vec<Manifest>,
+}
+
+/// A folder of release people.
+pub struct Folder {
+    path: PathBuf,
+}
+
+impl Folder {
+    /// Makes keys and the first root: secret keys into `keys`, documents into `path`. The root is signed by all its keys.
+    ///
+    /// # Errors
+    /// If one of the two folders is there already: keys are never written over.
+    pub fn create(path: &Path, keys: &Path, profile: Profile, now: Utc) -> Result<Self, Error> {
+        for folder in [path, keys] {
+            if folder.exists() {
+                return Err(io("making", folder)(io::ErrorKind::AlreadyExists.into()));
+            }
+        }
+        fs::create_dir_all(keys).map_err(io("making", keys))?;
+        let draw = |role: &str, count: usize| -> Result<Vec<SecretKey>, Error> {
+            (1..=count)
+                .map(|number| {
+                    let key = SecretKey::draw();
+                    key.write(&keys.join(format!("{role}-{number}.pem")))?;
+                    Ok(key)
+                })
+                .collect()
+        };
+        let (root, targets) = (draw("root", profile.keys())?, draw("targets", profile.keys())?);
+        let (snapshot, timestamp) = (draw("snapshot", 1)?, draw("timestamp", 1)?);
+        draw("directive", 1)?;
+        let signers =
+            |keys: &[SecretKey], threshold| Signers { keys: keys.iter().map(SecretKey::public).collect(), threshold };
+        let draft = RootDraft {
+            version: 1,
+            expires: now.plus_ms(PEOPLE_LIFE_MS),
+            root: signers(&root, profile.threshold()),
+            targets: signers(&targets, profile.threshold()),
+            snapshot: signers(&snapshot, 1),
+            timestamp: signers(&timestamp, 1),
+        };
+        let document = sign_root(&draft, &root.iter().collect::<Vec<_>>())?;
+        let this = Self { path: path.to_owned() };
+        for folder in [this.metadata(), this.targets()] {
+            fs::create_dir_all(&folder).map_err(io("making", &folder))?;
+        }
+        this.write("1.root.json", &document)?;
+        Ok(this)
+    }
+    /// The folder that is there.
+    ///
+    /// # Errors
+    /// If it has no root.
+    pub fn open(path: &Path) -> Result<Self, Error> {
+        let this = Self { path: path.to_owned() };
+        this.newest("root")?.map(|_| this).ok_or_else(|| {
+            Refusal::field("repository", format!("{} has no metadata/1.root.json", path.display())).into()
+        })
+    }
+
+    fn metadata(&self) -> PathBuf {
+        self.path.join("metadata")
+    }
+    fn targets(&self) -> PathBuf {
+        self.path.join("targets")
+    }
+    fn file(&self, name: &str, digest: Digest) -> PathBuf {
+        self.targets().join(format!("{digest}.{name}"))
+    }
+    fn read(&self, name: &str) -> Result<Vec<u8>, Error> {
+        let path = self.metadata().join(name);
+        fs::read(&path).map_err(io("reading", &path))
+    }
+    /// A document, whole or not at all.
+    fn write(&self, name: &str, document: &[u8]) -> Result<(), Error> {
+        let (path, beside) = (self.metadata().join(name), self.metadata().join(format!("{name}.new")));
+        let write = || {
+            let mut file = File::create(&beside)?;
+            file.write_all(document)?;
+            file.sync_all()?;
+            fs::rename(&beside, &path)?;
+            File::open(self.metadata())?.sync_all()
+        };
+        write().map_err(io("writing", &path))
+    }
+    /// Newest document of a role that has numbers.
+    fn newest(&self, role: &str) -> Result<Option<(u64, Vec<u8>)>, Error> {
+        let folder = self.metadata();
+        let suffix = format!(".{role}.json");
+        let mut newest = None;
+        for entry in fs::read_dir(&folder).map_err(io("reading", &folder))? {
+            let name = entry.map_err(io("reading", &folder))?.file_name();
+            let number = name.to_str().and_then(|n| n.strip_suffix(&suffix)).and_then(|n| n.parse::<u64>().ok());
+            newest = newest.max(number);
+        }
+        newest.map(|number| Ok((number, self.read(&format!("{number}{suffix}"))?))).transpose()
+    }
+    fn root(&self) -> Result<Vec<u8>, Error> {
+        let root = self.newest("root")?.map(|(_, document)| document);
+        root.ok_or_else(|| Refusal::field("repository", "has no root").into())
+    }
+
+    /// Adds a built bundle and signs the targets document that lists it.
+    ///
+    /// # Errors
+    /// A bundle that is not what its manifest says, a name that stands for other bytes, a document that waits for signatures.
+    pub fn add(&self, bundle: &Path, keys: &[&SecretKey], now: Utc) -> Result<(Manifest, Signed), Error> {
+        if self.metadata().join(PENDING).exists() {
+            let text = "a document waits for signatures: sign that first, or remove metadata/pending.targets.json";
+            return Err(Refusal::field("repository", text).into());
+        }
+        let manifest = inspect(bundle)?;
+        let document = manifest.to_bytes();
+        let mut files =
+            vec![FileTarget { name: manifest.target(), digest: Digest::of(&document), length: document.len() as u64 }];
+        files.extend(manifest.components.iter().map(|c| FileTarget {
+            name: c.target(),
+            digest: c.digest,
+            length: c.length,
+        }));
+        let previous = self.newest("targets")?.map(|(_, document)| document);
+        let signed = sign_targets(previous.as_deref(), &files, &[], now.plus_ms(PEOPLE_LIFE_MS), keys)?;
+        for file in &files {
+            self.copy(&bundle.join(&file.name), &self.file(&file.name, file.digest))?;
+        }
+        Ok((manifest, self.put(&signed)?))
+    }
+
+    /// Adds signatures to the document that waits for them.
+    ///
+    /// # Errors
+    /// If none waits.
+    pub fn cosign(&self, keys: &[&SecretKey]) -> Result<Signed, Error> {
+        let signed = add_signatures(&self.read(PENDING)?, keys)?;
+        self.put(&signed)
+    }
+
+    fn put(&self, document: &[u8]) -> Result<Signed, Error> {
+        if check_targets(&self.root()?, document).is_err() {
+            self.write(PENDING, document)?;
+            return Ok(Signed::Pending);
+        }
+        let version = version_of(document)?;
+        self.write(&format!("{version}.targets.json"), document)?;
+        let pending = self.metadata().join(PENDING);
+        if pending.exists() {
+            fs::remove_file(&pending).map_err(io("removing", &pending))?;
+        }
+        Ok(Signed::Published(version))
+    }
+
+    fn copy(&self, from: &Path, to: &Path) -> Result<(), Error> {
+        if to.exists() {
+            return Ok(());
+        }
+        let beside = to.with_extension("new");
+        let copy = || {
+            fs::copy(from, &beside)?;
+            File::open(&beside)?.sync_all()?;
+            fs::rename(&beside, to)?;
+            File::open(self.targets())?.sync_all()
+        };
+        copy().map_err(io("writing", to))
+    }
+
+    /// Holds everything against everything: each root against the one before, targets against the root, every file against its digest.
+    ///
+    /// # Errors
+    /// A chain that is broken; or all files that are missing or are not what was signed.
+    pub fn check(&self) -> Result<Checked, Error> {
+        let Some((root_version, root)) = self.newest("root")? else {
+            return Err(Refusal::field("repository", "has no root").into());
+        };
+        let mut before = self.read("1.root.json")?;
+        check_root(&before, &before)?;
+        for version in 2..=root_version {
+            let next = self.read(&format!("{version}.root.json"))?;
+            check_root(&before, &next)?;
+            before = next;
+        }
+        let Some((targets_version, targets)) = self.newest("targets")? else {
+            return Ok(Checked { root_version, targets_version: None, bundles: Vec::new() });
+        };
+        check_targets(&root, &targets)?;
+        let mut bad = Violations::default();
+        let mut bundles = Vec::new();
+        for target in listed(&targets)? {
+            let path = self.file(&target.name, target.digest);
+            let found = File::open(&path).and_then(|mut file| Digest::of_reader(&mut file, target.length));
+            match found {
+                Ok(found) if found == (target.digest, target.length) => {}
+                Ok(_) => bad.add(&target.name, "is not what was signed"),
+                Err(e) => bad.add(&target.name, e.to_string()),
+            }
+            if target.name.ends_with(".manifest") && path.exists() {
+                let bytes = fs::read(&path).map_err(io("reading", &path))?;
+                bundles.extend(bad.take(&target.name, Manifest::from_bytes(&bytes)));
+            }
+        }
+        bad.finish()?;
+        Ok(Checked { root_version, targets_version: Some(targets_version), bundles })
+    }
+}

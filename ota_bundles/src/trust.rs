@@ -1,0 +1,292 @@
+//! A robot's side of TUF: what it believes of the repository, and how that may change.
+//!
+//! `tough` checks signatures and the chain; its disk, clock and downloads are not used. What was believed goes in as one value and comes
+//! out as one value, so that it is on the disk whole or not at all.
+//! Invariant: versions never go back unless a new root has changed the keys of that role; expiry is judged by a time that never runs
+//! backwards and rises from signed documents only.
+
+use crate::digest::Digest;
+use crate::repository::{ISSUED_AT, role_keys};
+use async_trait::async_trait;
+use midshift_core::time::Utc;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
+use tough::schema::{RoleType, Root, Signed};
+use tough::{
+    Bytes, ExpirationEnforcement, Limits, RepositoryLoader, TransportError, TransportErrorKind, TransportStream,
+};
+use url::Url;
+
+/// Bytes of one metadata document.
+pub const METADATA_BYTES_MAX: u64 = 4 * 1024 * 1024;
+/// New roots taken in one refresh.
+const ROOTS_MAX: u64 = 64;
+/// Nothing is fetched from here: it gives documents their names.
+const NOWHERE: &str = "https://metadata.invalid/";
+
+/// Where metadata documents come from.
+#[async_trait]
+pub trait Source: std::fmt::Debug + Send + Sync {
+    /// The document of this name, `timestamp.json` or `N.role.json`; none: there is none. Longer than [`METADATA_BYTES_MAX`] is an error.
+    async fn fetch(&self, name: &str) -> io::Result<Option<Vec<u8>>>;
+}
+
+/// What a robot believes.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Trusted {
+    /// The newest root, as it was signed.
+    root: String,
+    timestamp: Option<String>,
+    snapshot: Option<String>,
+    targets: Option<String>,
+    /// Lowest version of each role that may be believed.
+    versions: BTreeMap<Kept, u64>,
+    /// It is at least this late, UTC ms.
+    time_floor: Utc,
+}
+
+/// Roles whose versions are kept.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Kept {
+    Root,
+    Timestamp,
+    Snapshot,
+    Targets,
+}
+
+/// Why nothing new is believed.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The repository's documents do not hold.
+    #[error("checking the repository: {0}")]
+    Metadata(#[source] Box<tough::error::Error>),
+    /// A document is older than one that was believed.
+    #[error("{role} {offered} is older than {believed}, which was believed")]
+    Older {
+        /// Which.
+        role: &'static str,
+        /// Version that was offered.
+        offered: u64,
+        /// Version that was believed.
+        believed: u64,
+    },
+    /// A document is past its time.
+    #[error("{role} expired at {expires}; it is {now} at least")]
+    Expired {
+        /// Which.
+        role: &'static str,
+        /// When.
+        expires: String,
+        /// The time it was held against.
+        now: String,
+    },
+    /// What is believed cannot be read: nothing is believed until a person has looked.
+    #[error("{doing} what is believed: {source}")]
+    Store {
+        /// What was being done.
+        doing: &'static str,
+        /// Why not.
+        source: io::Error,
+    },
+    /// The first root is none.
+    #[error("the root that came with the robot cannot be read: {0}")]
+    NoRoot(serde_json::Error),
+}
+
+/// A clock as a robot has it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Reading {
+    /// What it says, UTC ms.
+    pub utc: Utc,
+    /// Whether it was set from the network: only then it counts.
+    pub is_synced: bool,
+}
+
+/// A file that release people have signed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Listed {
+    /// Of its bytes.
+    pub digest: Digest,
+    /// Bytes.
+    pub length: u64,
+}
+
+/// What a refresh came to.
+#[derive(Clone, Debug)]
+pub struct Refreshed {
+    /// To be written down before anything is done with the rest.
+    pub trusted: Trusted,
+    /// Files by name.
+    pub targets: BTreeMap<String, Listed>,
+}
+
+impl Trusted {
+    /// A robot that has only the root it came with.
+    ///
+    /// # Errors
+    /// If it is none.
+    pub fn new(root: &[u8]) -> Result<Self, Error> {
+        let parsed: Signed<Root> = serde_json::from_slice(root).map_err(Error::NoRoot)?;
+        Ok(Self {
+            root: String::from_utf8_lossy(root).into_owned(),
+            timestamp: None,
+            snapshot: None,
+            targets: None,
+            versions: BTreeMap::from([(Kept::Root, parsed.signed.version.get())]),
+            time_floor: Utc(0),
+        })
+    }
+    /// It is at least this late.
+    pub fn time_floor(&self) -> Utc {
+        self.time_floor
+    }
+    /// The moment that expiry is held against.
+    pub fn now(&self, clock: Reading) -> Utc {
+        if clock.is_synced { clock.utc.max(self.time_floor) } else { self.time_floor }
+    }
+    /// Reads what was believed; none: nothing was ever written there.
+    ///
+    /// # Errors
+    /// A file that is there and cannot be read: it is not taken for none.
+    pub fn load(path: &Path) -> Result<Option<Self>, Error> {
+        let store = |source| Error::Store { doing: "reading", source };
+        match fs::read(path) {
+            Ok(bytes) => serde_json::from_slice(&bytes)
+                .map(Some)
+                .map_err(|e| store(io::Error::new(io::ErrorKind::InvalidData, e))),
+            Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(e) => Err(store(e)),
+        }
+    }
+    /// Writes it whole or not at all: a new file beside, synced, put in place, and its folder synced.
+    ///
+    /// # Errors
+    /// If it could not be written; what was there is there still, or this is.
+    pub fn save(&self, path: &Path) -> Result<(), Error> {
+        let write = || {
+            let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+            let beside = path.with_extension("new");
+            let mut file = File::create(&beside)?;
+            file.write_all(&serde_json::to_vec(self)?)?;
+            file.sync_all()?;
+            fs::rename(&beside, path)?;
+            File::open(folder)?.sync_all()
+        };
+        write().map_err(|source| Error::Store { doing: "writing", source })
+    }
+
+    /// Asks the repository what there is. `self` stays as it is; what comes out replaces it once it is written down.
+    ///
+    /// # Errors
+    /// Why nothing new is believed.
+    pub async fn refresh(&self, source: Arc<dyn Source>, clock: Reading) -> Result<Refreshed, Error> {
+        let store = |source| Error::Store { doing: "unpacking", source };
+        let folder = tempfile::tempdir().map_err(store)?;
+        for (name, document) in
+            [("timestamp.json", &self.timestamp), ("snapshot.json", &self.snapshot), ("targets.json", &self.targets)]
+        {
+            if let Some(document) = document {
+                fs::write(folder.path().join(name), document).map_err(store)?;
+            }
+        }
+        let heard = Arc::new(Mutex::new(BTreeMap::new()));
+        let nowhere = || Url::parse(NOWHERE).unwrap_or_else(|e| unreachable!("a constant: {e}"));
+        let repository = RepositoryLoader::new(&self.root, nowhere(), nowhere())
+            .transport(Recorder { source, heard: heard.clone() })
+            .limits(Limits {
+                max_root_size: METADATA_BYTES_MAX,
+                max_targets_size: METADATA_BYTES_MAX,
+                max_timestamp_size: METADATA_BYTES_MAX,
+                max_snapshot_size: METADATA_BYTES_MAX,
+                max_root_updates: ROOTS_MAX,
+            })
+            .datastore(folder.path())
+            // Judged below, by a time that a wrong clock cannot move.
+            .expiration_enforcement(ExpirationEnforcement::Unsafe)
+            .load()
+            .await
+            .map_err(|e| Error::Metadata(Box::new(e)))?;
+        let heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
+        self.believe(&repository, &heard, clock)
+    }
+
+    fn believe(
+        &self,
+        repository: &tough::Repository,
+        heard: &BTreeMap<String, Vec<u8>>,
+        clock: Reading,
+    ) -> Result<Refreshed, Error> {
+        let old: Signed<Root> = serde_json::from_str(&self.root).map_err(Error::NoRoot)?;
+        let (root, timestamp) = (repository.root(), repository.timestamp());
+        let (snapshot, targets) = (repository.snapshot(), repository.targets());
+        let same = |role| role_keys(&old.signed, role) == role_keys(&root.signed, role);
+        let keeps = BTreeMap::from([
+            (Kept::Root, true),
+            (Kept::Timestamp, same(RoleType::Timestamp)),
+            (Kept::Snapshot, same(RoleType::Snapshot) && same(RoleType::Timestamp)),
+            (Kept::Targets, same(RoleType::Targets)),
+        ]);
+        let offered = [
+            (Kept::Root, "root", root.signed.version.get(), root.signed.expires),
+            (Kept::Timestamp, "timestamp", timestamp.signed.version.get(), timestamp.signed.expires),
+            (Kept::Snapshot, "snapshot", snapshot.signed.version.get(), snapshot.signed.expires),
+            (Kept::Targets, "targets", targets.signed.version.get(), targets.signed.expires),
+        ];
+        let issued = timestamp.signed._extra.get(ISSUED_AT).and_then(serde_json::Value::as_i64).map_or(Utc(0), Utc);
+        let time_floor = self.time_floor.max(issued);
+        let now = Self { time_floor, ..self.clone() }.now(clock);
+        let mut versions = BTreeMap::new();
+        for (kept, role, version, expires) in offered {
+            let believed = self.versions.get(&kept).copied().filter(|_| keeps[&kept]).unwrap_or(0);
+            if version < believed {
+                return Err(Error::Older { role, offered: version, believed });
+            }
+            if expires.as_millisecond() <= now.0 {
+                return Err(Error::Expired { role, expires: expires.to_string(), now: now.rfc3339() });
+            }
+            versions.insert(kept, version);
+        }
+        let text = |name: String| heard.get(&name).map(|bytes| String::from_utf8_lossy(bytes).into_owned());
+        let trusted = Self {
+            root: text(format!("{}.root.json", root.signed.version)).unwrap_or_else(|| self.root.clone()),
+            timestamp: text("timestamp.json".to_owned()),
+            snapshot: text(format!("{}.snapshot.json", snapshot.signed.version)),
+            targets: text(format!("{}.targets.json", targets.signed.version)),
+            versions,
+            time_floor,
+        };
+        let listed = targets.signed.targets.iter().filter_map(|(name, target)| {
+            let digest = crate::keys::hex(&target.hashes.sha256).parse().ok()?;
+            Some((name.raw().to_owned(), Listed { digest, length: target.length }))
+        });
+        Ok(Refreshed { trusted, targets: listed.collect() })
+    }
+}
+
+/// Gives `tough` documents of a source and keeps them as they came.
+#[derive(Clone, Debug)]
+struct Recorder {
+    source: Arc<dyn Source>,
+    heard: Arc<Mutex<BTreeMap<String, Vec<u8>>>>,
+}
+
+#[async_trait]
+impl tough::Transport for Recorder {
+    async fn fetch(&self, url: Url) -> Result<TransportStream, TransportError> {
+        let name = url.path().trim_start_matches('/').to_owned();
+        let found = self.source.fetch(&name).await;
+        let bytes = found.map_err(|e| TransportError::new_with_cause(TransportErrorKind::Other, &url, e))?;
+        let bytes = bytes.ok_or_else(|| TransportError::new(TransportErrorKind::FileNotFound, &url))?;
+        if bytes.len() as u64 > METADATA_BYTES_MAX {
+            return Err(TransportError::new(TransportErrorKind::Other, &url));
+        }
+        self.heard.lock().unwrap_or_else(PoisonError::into_inner).insert(name, bytes.clone());
+        Ok(Box::pin(tokio_stream::once(Ok(Bytes::from(bytes)))))
+    }
+}

@@ -1,0 +1,8 @@
+//! Bundles as release people make them and as attackers would like them.
+
+mod building;
+mod directives;
+mod keyring;
+mod metadata;
+mod releasing;
+mod shelf;

@@ -1,0 +1,220 @@
+//! What a robot believes of a repository, and what it does not. Each test is named by the attack or mishap.
+
+use crate::shelf::{Documents, START, Seeds, Shelf, key, signers, target};
+use midshift_bundle::repository::{
+    DAY_MS, PEOPLE_LIFE_MS, RootDraft, add_signatures, check_targets, sign_root, sign_targets,
+};
+use midshift_bundle::trust::{Error, METADATA_BYTES_MAX, Reading, Trusted};
+use midshift_core::time::Utc;
+use std::sync::Arc;
+
+/// The name of the rule of the library that refused.
+fn rule(error: &Error) -> String {
+    match error {
+        Error::Metadata(e) => format!("{e:?}").split([' ', '{', '(']).next().unwrap_or_default().to_owned(),
+        other => format!("{other:?}").split([' ', '{', '(']).next().unwrap_or_default().to_owned(),
+    }
+}
+
+#[tokio::test]
+async fn a_good_release_is_believed_and_listed() {
+    let mut shelf = Shelf::new();
+    let robot = shelf.shown_to(&shelf.robot()).await.expect("the first");
+    assert_eq!(robot.targets.keys().collect::<Vec<_>>(), ["walk-1.0.0.manifest"]);
+    shelf.release(&[target("walk-1.1.0.manifest", b"two")]);
+    let robot = shelf.shown_to(&robot.trusted).await.expect("the second");
+    assert_eq!(robot.targets.len(), 2);
+    assert_eq!(robot.targets["walk-1.1.0.manifest"].length, 3);
+    let again = shelf.shown_to(&robot.trusted).await.expect("nothing new");
+    assert_eq!(again.trusted, robot.trusted);
+}
+
+#[tokio::test]
+async fn tampered_documents_are_refused() {
+    let shelf = Shelf::new();
+    for name in ["timestamp.json", "1.snapshot.json", "1.targets.json"] {
+        let mut tampered = shelf.clone();
+        let text = String::from_utf8(tampered.documents.0[name].clone()).expect("text");
+        let changed = text.replacen("\"version\": 1", "\"version\": 9", 1);
+        assert_ne!(changed, text, "{name}");
+        tampered.documents.0.insert(name.to_owned(), changed.into_bytes());
+        assert!(tampered.shown_to(&shelf.robot()).await.is_err(), "{name}");
+    }
+}
+
+#[tokio::test]
+async fn a_stolen_online_key_adds_no_target() {
+    let mut shelf = Shelf::new();
+    let stolen = key(shelf.seeds.timestamp);
+    let expires = shelf.now.plus_ms(PEOPLE_LIFE_MS);
+    let evil = [target("walk-6.6.6.manifest", b"evil")];
+    shelf.targets = sign_targets(Some(&shelf.targets), &evil, &[], expires, &[&stolen]).expect("signed by the thief");
+    shelf.documents.0.insert("2.targets.json".to_owned(), shelf.targets.clone());
+    shelf.freshen();
+    let error = shelf.shown_to(&shelf.robot()).await.expect_err("refused");
+    assert_eq!(rule(&error), "VerifyMetadata");
+}
+
+#[tokio::test]
+async fn rolled_back_documents_are_refused() {
+    let mut shelf = Shelf::new();
+    let old = shelf.clone();
+    shelf.release(&[target("walk-1.1.0.manifest", b"two")]);
+    let robot = shelf.shown_to(&shelf.robot()).await.expect("the newest").trusted;
+    let error = old.shown_to(&robot).await.expect_err("yesterday's repository");
+    assert_eq!(rule(&error), "OlderMetadata");
+}
+
+#[tokio::test]
+async fn a_mix_of_two_releases_is_refused() {
+    let mut shelf = Shelf::new();
+    let old = shelf.clone();
+    shelf.release(&[target("walk-1.1.0.manifest", b"two")]);
+    let mut mixed = shelf.clone();
+    mixed.documents.0.insert("2.targets.json".to_owned(), old.documents.0["1.targets.json"].clone());
+    assert!(mixed.shown_to(&shelf.robot()).await.is_err());
+    let mut mixed = shelf.clone();
+    mixed.documents.0.insert("2.snapshot.json".to_owned(), old.documents.0["1.snapshot.json"].clone());
+    assert!(mixed.shown_to(&shelf.robot()).await.is_err());
+}
+
+#[tokio::test]
+async fn a_frozen_repository_is_noticed() {
+    let shelf = Shelf::new();
+    let late = Reading { utc: shelf.now.plus_ms(2 * DAY_MS), is_synced: true };
+    let error = shelf.robot().refresh(Arc::new(shelf.documents.clone()), late).await.expect_err("two days old");
+    assert!(matches!(error, Error::Expired { role: "timestamp", .. }), "{error}");
+}
+
+#[tokio::test]
+async fn endless_documents_are_refused() {
+    let mut shelf = Shelf::new();
+    let mut long = shelf.documents.0["timestamp.json"].clone();
+    long.resize(METADATA_BYTES_MAX as usize + 1, b' ');
+    shelf.documents.0.insert("timestamp.json".to_owned(), long);
+    assert!(shelf.shown_to(&shelf.robot()).await.is_err());
+}
+
+#[tokio::test]
+async fn an_empty_or_vanished_repository_takes_nothing_away() {
+    let shelf = Shelf::new();
+    let robot = shelf.shown_to(&shelf.robot()).await.expect("believed").trusted;
+    let gone = robot.refresh(Arc::new(Documents::default()), shelf.clock()).await;
+    assert!(gone.is_err());
+    assert!(shelf.shown_to(&robot).await.is_ok(), "what was believed is believed still");
+}
+
+#[tokio::test]
+async fn a_new_root_needs_the_old_key() {
+    let mut shelf = Shelf::new();
+    let robot = shelf.robot();
+    let thief = 66;
+    let draft = RootDraft {
+        version: 2,
+        expires: shelf.now.plus_ms(PEOPLE_LIFE_MS),
+        root: signers(&[thief], 1),
+        targets: signers(&[thief], 1),
+        snapshot: signers(&[thief], 1),
+        timestamp: signers(&[thief], 1),
+    };
+    let root = sign_root(&draft, &[&key(thief)]).expect("a root of the thief");
+    shelf.documents.0.insert("2.root.json".to_owned(), root);
+    let error = shelf.shown_to(&robot).await.expect_err("refused");
+    assert_eq!(rule(&error), "VerifyMetadata");
+}
+
+#[tokio::test]
+async fn after_a_fast_forward_a_rotated_key_begins_again() {
+    let mut shelf = Shelf::new();
+    let robot = shelf.shown_to(&shelf.robot()).await.expect("believed").trusted;
+    // A thief of the online keys drives the versions up, so that nothing newer could follow.
+    let mut forward = shelf.clone();
+    forward.publish(u64::MAX / 2);
+    let robot = forward.shown_to(&robot).await.expect("signed with good keys").trusted;
+    shelf.freshen();
+    assert!(shelf.shown_to(&robot).await.is_err(), "without a new root there is no way on");
+    shelf.rotate(Seeds { snapshot: 13, timestamp: 14, ..shelf.seeds });
+    shelf.release(&[target("walk-1.1.0.manifest", b"two")]);
+    let after = shelf.shown_to(&robot).await.expect("the new keys count from their own beginning");
+    assert_eq!(after.targets.len(), 2);
+}
+
+#[tokio::test]
+async fn no_clock_makes_an_older_repository_good_or_a_good_one_bad() {
+    let mut shelf = Shelf::new();
+    let old = shelf.clone();
+    shelf.now = START.plus_ms(20 * DAY_MS);
+    shelf.release(&[target("walk-1.1.0.manifest", b"two")]);
+    let robot = shelf.shown_to(&shelf.robot()).await.expect("believed").trusted;
+    assert_eq!(robot.time_floor(), shelf.now);
+    let wrong = [
+        ("a day back", Reading { utc: Utc(shelf.now.0 - DAY_MS as i64), is_synced: true }),
+        ("1970", Reading { utc: Utc(0), is_synced: true }),
+        ("not synced", Reading { utc: shelf.now.plus_ms(3_650 * DAY_MS), is_synced: false }),
+    ];
+    for (name, clock) in wrong {
+        assert!(robot.refresh(Arc::new(old.documents.clone()), clock).await.is_err(), "{name}: an older one");
+        let good = robot.refresh(Arc::new(shelf.documents.clone()), clock).await;
+        assert_eq!(good.expect(name).trusted.time_floor(), shelf.now, "{name}: the floor is the signed time");
+    }
+    // Ten years ahead and back: nothing is accepted while it lasts, everything afterwards.
+    let ahead = Reading { utc: shelf.now.plus_ms(3_650 * DAY_MS), is_synced: true };
+    assert!(matches!(robot.refresh(Arc::new(shelf.documents.clone()), ahead).await, Err(Error::Expired { .. })));
+    assert!(shelf.shown_to(&robot).await.is_ok());
+}
+
+#[tokio::test]
+async fn two_of_three_must_sign_and_hand_the_document_on() {
+    let expires = START.plus_ms(PEOPLE_LIFE_MS);
+    let people = signers(&[21, 22, 23], 2);
+    let draft = RootDraft {
+        version: 1,
+        expires,
+        root: people.clone(),
+        targets: people,
+        snapshot: signers(&[3], 1),
+        timestamp: signers(&[4], 1),
+    };
+    let root = sign_root(&draft, &[&key(21), &key(22)]).expect("a root");
+    let first = sign_targets(None, &[target("a.manifest", b"a")], &[], expires, &[&key(22)]).expect("one signature");
+    assert!(check_targets(&root, &first).is_err(), "one is not enough");
+    assert!(
+        check_targets(&root, &add_signatures(&first, &[&key(22)]).expect("again")).is_err(),
+        "twice the same is one"
+    );
+    assert!(check_targets(&root, &add_signatures(&first, &[&key(99)]).expect("a stranger")).is_err());
+    let both = add_signatures(&first, &[&key(23)]).expect("the second");
+    check_targets(&root, &both).expect("two of three");
+}
+
+#[test]
+fn what_a_name_stands_for_never_changes() {
+    let expires = START.plus_ms(PEOPLE_LIFE_MS);
+    let first = sign_targets(None, &[target("a-1.0.0.manifest", b"a")], &[], expires, &[&key(2)]).expect("signed");
+    let same = sign_targets(Some(&first), &[target("a-1.0.0.manifest", b"a")], &[], expires, &[&key(2)]);
+    assert!(same.is_ok());
+    let other = sign_targets(Some(&first), &[target("a-1.0.0.manifest", b"b")], &[], expires, &[&key(2)]);
+    assert!(other.expect_err("other bytes").to_string().contains("raise its version"));
+    for name in ["", "a/b", "..", "../a", "a\\b", ".hidden"] {
+        assert!(sign_targets(None, &[target(name, b"a")], &[], expires, &[&key(2)]).is_err(), "{name:?}");
+    }
+}
+
+#[test]
+fn what_is_believed_is_on_the_disk_whole_or_refused() {
+    let shelf = Shelf::new();
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("trusted.json");
+    assert_eq!(Trusted::load(&path).expect("nothing yet"), None);
+    let robot = shelf.robot();
+    robot.save(&path).expect("written");
+    assert_eq!(Trusted::load(&path).expect("read"), Some(robot.clone()));
+    // Power went while the next one was written beside it.
+    std::fs::write(path.with_extension("new"), b"{\"root\":").expect("torn");
+    assert_eq!(Trusted::load(&path).expect("read"), Some(robot));
+    let whole = std::fs::read(&path).expect("bytes");
+    for length in [0, 1, whole.len() / 2, whole.len() - 1] {
+        std::fs::write(&path, &whole[..length]).expect("torn");
+        assert!(matches!(Trusted::load(&path), Err(Error::Store { .. })), "{length} bytes are not taken for none");
+    }
+}

@@ -1,0 +1,222 @@
+//! `midshift bundle …`: what release people do with keys and bundles. Needs no server.
+
+use super::client::Exit;
+use super::out::{Format, Out};
+use crate::clock;
+use clap::{Subcommand, ValueEnum};
+use indicatif::{ProgressBar, ProgressStyle};
+use midshift_bundle::build;
+use midshift_bundle::folder::{Error, Folder, Signed};
+use midshift_bundle::keys::SecretKey;
+use midshift_bundle::manifest::Manifest;
+use midshift_bundle::repository::Profile;
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
+
+/// Verbs of bundles.
+#[derive(Subcommand)]
+pub enum Verb {
+    /// Make the keys and the repository of a project. Secret keys are files that only you can read: keep copies of them elsewhere.
+    Keygen {
+        /// Who signs releases.
+        #[arg(long, value_enum, default_value_t = Who::Solo)]
+        profile: Who,
+        /// A new folder for the secret keys.
+        #[arg(long)]
+        keys: PathBuf,
+        /// A new folder for the repository.
+        #[arg(long)]
+        repository: PathBuf,
+    },
+    /// Build a bundle of a folder with a bundle.toml and the files it names.
+    Build {
+        /// The folder.
+        folder: PathBuf,
+        /// A new folder for the bundle.
+        #[arg(long)]
+        out: PathBuf,
+    },
+    /// Add a bundle to the repository and sign it; or sign what waits for one more signature.
+    Sign {
+        /// The built bundle.
+        #[arg(required_unless_present = "pending")]
+        bundle: Option<PathBuf>,
+        /// Sign what waits for signatures instead.
+        #[arg(long, conflicts_with = "bundle")]
+        pending: bool,
+        /// The repository.
+        #[arg(long)]
+        repository: PathBuf,
+        /// A secret key of targets; more than one if you hold more.
+        #[arg(long, required = true)]
+        key: Vec<PathBuf>,
+    },
+    /// Show a built bundle, and hold its files against its manifest.
+    Inspect {
+        /// The bundle.
+        bundle: PathBuf,
+    },
+    /// Hold a repository against itself: signatures, chain of roots, every file.
+    Verify {
+        /// The repository.
+        repository: PathBuf,
+    },
+}
+
+/// Who signs.
+#[derive(Clone, Copy, ValueEnum)]
+pub enum Who {
+    /// One person with one key.
+    Solo,
+    /// One of two keys, and a spare in a safe.
+    Team,
+    /// Two of three people.
+    Release,
+}
+
+impl From<Who> for Profile {
+    fn from(who: Who) -> Self {
+        match who {
+            Who::Solo => Self::Solo,
+            Who::Team => Self::Team,
+            Who::Release => Self::Release,
+        }
+    }
+}
+
+/// What was asked breaks rules, or could not be done.
+impl From<Error> for Exit {
+    fn from(error: Error) -> Self {
+        match error {
+            Error::Refused(refusal) | Error::Bundle(build::Error::Refused(refusal)) => {
+                anyhow::Error::from(refusal).into()
+            }
+            other => Self::new(1, other.to_string()),
+        }
+    }
+}
+
+/// What was looked at does not hold: a finding, not a mistake of the caller.
+fn does_not_hold(error: Error) -> Exit {
+    match error {
+        Error::Refused(refusal) | Error::Bundle(build::Error::Refused(refusal)) => {
+            let lines = refusal.violations.iter().map(|v| format!("\n  {}: {}", v.field, v.description));
+            Exit::new(1, format!("it does not hold:{}", lines.collect::<String>()))
+        }
+        other => other.into(),
+    }
+}
+
+/// Runs one verb.
+pub fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
+    match verb {
+        Verb::Keygen { profile, keys, repository } => keygen(profile, &keys, &repository, out),
+        Verb::Build { folder, out: into } => build_one(&folder, &into, out),
+        Verb::Sign { bundle, pending: _, repository, key } => sign(bundle.as_deref(), &repository, &key, out),
+        Verb::Inspect { bundle } => show(&build::inspect(&bundle).map_err(|e| does_not_hold(e.into()))?, out),
+        Verb::Verify { repository } => verify(&repository, out),
+    }
+}
+
+fn keygen(profile: Who, keys: &Path, repository: &Path, out: &Out) -> Result<(), Exit> {
+    Folder::create(repository, keys, profile.into(), clock::wall())?;
+    let who = match profile {
+        Who::Solo => "one key signs",
+        Who::Team => "one of three keys signs; put the third into a safe",
+        Who::Release => "two of three keys must sign; give each to another person",
+    };
+    told(&serde_json::json!({"keys": keys, "repository": repository, "rootVersion": 1}), out);
+    out.say(&format!("keys in {}, repository in {}: {who}", keys.display(), repository.display()));
+    out.say("root-*.pem change who may sign: take them off this machine. snapshot, timestamp and directive belong to the server");
+    out.next("midshift bundle build FOLDER --out BUNDLE");
+    Ok(())
+}
+
+/// What was done, for programs; people are told in words.
+fn told(what: &serde_json::Value, out: &Out) {
+    if matches!(out.format, Format::Json | Format::Jsonl) {
+        out.line(&what.to_string());
+    }
+}
+
+fn build_one(folder: &Path, into: &Path, out: &Out) -> Result<(), Exit> {
+    let bar = if std::io::stderr().is_terminal() { ProgressBar::new_spinner() } else { ProgressBar::hidden() };
+    if let Ok(style) = ProgressStyle::with_template("{spinner} {binary_bytes} {binary_bytes_per_sec}") {
+        bar.set_style(style);
+    }
+    let manifest = build::build(folder, into, &mut |bytes| bar.inc(bytes)).map_err(Error::from)?;
+    bar.finish_and_clear();
+    show(&manifest, out)?;
+    out.next(&format!("midshift bundle sign {} --repository REPOSITORY --key targets-1.pem", into.display()));
+    Ok(())
+}
+
+fn sign(bundle: Option<&Path>, repository: &Path, keys: &[PathBuf], out: &Out) -> Result<(), Exit> {
+    let folder = Folder::open(repository)?;
+    let keys = keys.iter().map(|path| SecretKey::read(path)).collect::<Result<Vec<_>, _>>().map_err(Error::from)?;
+    let keys: Vec<&SecretKey> = keys.iter().collect();
+    let signed = match bundle {
+        Some(bundle) => folder.add(bundle, &keys, clock::wall())?.1,
+        None => folder.cosign(&keys)?,
+    };
+    match signed {
+        Signed::Published(version) => {
+            told(&serde_json::json!({"targetsVersion": version}), out);
+            out.say(&format!("signed: metadata/{version}.targets.json"));
+            out.next(&format!("midshift bundle verify {}", repository.display()));
+        }
+        Signed::Pending => {
+            told(&serde_json::json!({"pending": true}), out);
+            out.say("not enough signatures yet: metadata/pending.targets.json waits for another person");
+            out.next(&format!("midshift bundle sign --pending --repository {} --key KEY", repository.display()));
+        }
+    }
+    Ok(())
+}
+
+fn verify(repository: &Path, out: &Out) -> Result<(), Exit> {
+    let checked = Folder::open(repository)?.check().map_err(does_not_hold)?;
+    match out.format {
+        Format::Json | Format::Jsonl => {
+            let bundles: Vec<_> = checked.bundles.iter().map(Manifest::target).collect();
+            let found = serde_json::json!({"rootVersion": checked.root_version, "targetsVersion": checked.targets_version, "bundles": bundles});
+            out.line(&found.to_string());
+        }
+        Format::Name => checked.bundles.iter().for_each(|bundle| out.line(&bundle.target())),
+        Format::Table => {
+            let rows: Vec<Vec<String>> = checked.bundles.iter().map(row).collect();
+            out.line(super::out::columns(&["BUNDLE", "VERSION", "COMPONENTS", "BYTES", "HARDWARE"], &rows).trim_end());
+            let targets = checked.targets_version.map_or("none".to_owned(), |v| v.to_string());
+            out.say(&format!("root {}, targets {targets}: every signature and every file holds", checked.root_version));
+        }
+    }
+    Ok(())
+}
+
+fn row(bundle: &Manifest) -> Vec<String> {
+    let hardware: Vec<_> = bundle.hardware().into_iter().collect();
+    let count = bundle.components.len().to_string();
+    vec![bundle.name.clone(), bundle.version.clone(), count, bundle.length().to_string(), hardware.join(" ")]
+}
+
+fn show(manifest: &Manifest, out: &Out) -> Result<(), Exit> {
+    match out.format {
+        Format::Json | Format::Jsonl => out.line(&serde_json::to_string(manifest).map_err(anyhow::Error::from)?),
+        Format::Name => out.line(&manifest.target()),
+        Format::Table => {
+            let rows: Vec<Vec<String>> = manifest
+                .components
+                .iter()
+                .map(|c| {
+                    let cells = [&c.name, &c.version, c.kind.as_str(), c.needs.as_str()].map(str::to_owned);
+                    cells.into_iter().chain([c.length.to_string(), c.digest.to_string()]).collect()
+                })
+                .collect();
+            out.line(format!("{} {}  {}", manifest.name, manifest.version, manifest.description).trim_end());
+            out.line(
+                super::out::columns(&["COMPONENT", "VERSION", "KIND", "NEEDS", "BYTES", "SHA-256"], &rows).trim_end(),
+            );
+        }
+    }
+    Ok(())
+}
