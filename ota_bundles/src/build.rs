@@ -35,6 +35,11 @@ fn io(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
     move |source| Error::Io { doing, path, source }
 }
 
+/// Nothing is ever written over.
+pub(crate) fn taken() -> io::Error {
+    io::Error::new(io::ErrorKind::AlreadyExists, "it is there already; name a new folder")
+}
+
 /// Reads `bundle.toml` in `folder`.
 ///
 /// # Errors
@@ -58,7 +63,7 @@ pub fn build(folder: &Path, out: &Path, progress: &mut dyn FnMut(u64)) -> Result
     // The rules first, with lengths and digests that stand in: nobody waits for gigabytes to hear of a typing error.
     manifest(&draft, |_| (Digest::of(b""), 1)).check()?;
     if out.exists() {
-        return Err(Error::Io { doing: "making", path: out.to_owned(), source: io::ErrorKind::AlreadyExists.into() });
+        return Err(Error::Io { doing: "making", path: out.to_owned(), source: taken() });
     }
     let parent = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let staging =

@@ -85,7 +85,7 @@ impl Folder {
     pub fn create(path: &Path, keys: &Path, profile: Profile, now: Utc) -> Result<Self, Error> {
         for folder in [path, keys] {
             if folder.exists() {
-                return Err(io("making", folder)(io::ErrorKind::AlreadyExists.into()));
+                return Err(io("making", folder)(build::taken()));
             }
         }
         fs::create_dir_all(keys).map_err(io("making", keys))?;

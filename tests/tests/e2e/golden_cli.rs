@@ -45,6 +45,20 @@ const LIST: &str = r#"{"task_id":"TASK-3","robot_id":"","type":"transport","prio
 /// Good and bad lines of a table.
 const TABLE: &str = "task_type,from_waypoint,to_waypoint,timeout_seconds\ntransport,A,B,300\ntransport,A,B,soon\n";
 
+/// A release, and one that breaks rules.
+const RELEASE: &str = "name = \"walk\"\nversion = \"1.5.0\"\n[[component]]\nname = \"gait\"\nversion = \"1.5.0\"\nkind = \"process\"\nfile = \"gait\"\nhardware = [\"h1\"]\nneeds = \"restart\"\n";
+const BAD_RELEASE: &str = "name = \"Walk\"\nversion = \"1.5\"\n[[component]]\nname = \"gait\"\nversion = \"1.5.0\"\nkind = \"base\"\nfile = \"gait\"\nhardware = []\nneeds = \"park\"\n";
+
+fn bundles(dir: &Path) -> anyhow::Result<()> {
+    for (name, text) in [("walk", RELEASE), ("bad", BAD_RELEASE)] {
+        let folder = dir.join(name);
+        std::fs::create_dir(&folder)?;
+        std::fs::write(folder.join("bundle.toml"), text)?;
+        std::fs::write(folder.join("gait"), "walks")?;
+    }
+    Ok(())
+}
+
 struct Transcript {
     program: PathBuf,
     dir: PathBuf,
@@ -192,6 +206,30 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     t.note(&["map", "show", "site.toml", "-o", "json"])?;
     t.note(&["map", "show", "site.toml"])?;
     t.note(&["migrate", "--data", "elsewhere"])?;
+    bundles(&t.dir)?;
+    t.note(&[
+        "bundle",
+        "keygen",
+        "--profile",
+        "release",
+        "--keys",
+        "keys",
+        "--repository",
+        "repository",
+        "-o",
+        "json",
+    ])?;
+    t.note(&["bundle", "build", "walk", "--out", "walk-1.5.0", "-o", "json"])?;
+    t.note(&["bundle", "build", "walk", "--out", "walk-1.5.0"])?;
+    t.note(&["bundle", "build", "bad", "--out", "bad-1"])?;
+    t.note(&["bundle", "inspect", "walk-1.5.0"])?;
+    let repository = ["--repository", "repository", "-o", "json", "--key"];
+    t.note(&[&["bundle", "sign", "walk-1.5.0"][..], &repository, &["keys/targets-1.pem"]].concat())?;
+    t.note(&[&["bundle", "sign", "--pending"][..], &repository, &["keys/targets-2.pem"]].concat())?;
+    t.note(&["bundle", "verify", "repository", "-o", "json"])?;
+    std::fs::write(t.dir.join("walk-1.5.0/gait-1.5.0.component"), "flies")?;
+    t.note(&["bundle", "inspect", "walk-1.5.0"])?;
+    t.note(&["bundle", "verify", "nowhere"])?;
     t.note(&["explain-error", "STALE_AUTHORITY", "-o", "json"])?;
     t.note(&["explain-error", "NO_SUCH_CODE"])?;
     t.note(&["task", "submit", "--from", "A"])?;
