@@ -4,7 +4,7 @@
 //! A tool counts as there when its program exists and its stamp names the pinned version, so a second install is quick.
 
 use crate::workspace::Workspace;
-use crate::{go, run};
+use crate::{apt, go, run};
 use anyhow::{Context, Result, bail, ensure};
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -83,7 +83,7 @@ impl Tools {
 fn install_python(workspace: &Workspace, python: &Path) -> Result<()> {
     let can_make_venvs = || run::quietly(Command::new("python3").args(["-c", "import venv, ensurepip"]));
     if !can_make_venvs() {
-        apt_install(workspace, &["python3", "python3-venv"])?;
+        apt::install(workspace, &["python3", "python3-venv"])?;
         ensure!(can_make_venvs(), "python3 cannot make virtual environments");
     }
     let venv = workspace.tools().join("venv");
@@ -93,22 +93,6 @@ fn install_python(workspace: &Workspace, python: &Path) -> Result<()> {
     pip.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--only-binary", ":all:"]).args(PYTHON);
     run::install(&mut pip)?;
     stamp(python, &PYTHON.join(" "))
-}
-
-/// Installs packages of Debian or Ubuntu; as another user it says what to type.
-pub fn apt_install(workspace: &Workspace, packages: &[&str]) -> Result<()> {
-    let root = run::output(Command::new("id").arg("-u")).is_some_and(|id| id.trim() == "0");
-    let apt = run::quietly(Command::new("apt-get").arg("--version"));
-    if !root || !apt {
-        bail!(
-            "missing on this machine: {0}; next: sudo apt-get install {0} (or your system's own)",
-            packages.join(" ")
-        );
-    }
-    run::install(workspace.command("apt-get").args(["update", "-q"]))?;
-    let mut command = workspace.command("apt-get");
-    command.args(["install", "-y", "-q", "--no-install-recommends"]).args(packages);
-    run::install(command.env("DEBIAN_FRONTEND", "noninteractive"))
 }
 
 /// The stamp of the venv's Python lies in the venv, so that making it anew removes it.

@@ -2,7 +2,7 @@
 //!
 //! Invariant: a Go that is already there and new enough is used as it is. Called by [`crate::fetch_tools`] only.
 
-use crate::fetch_tools::apt_install;
+use crate::apt;
 use crate::run;
 use crate::workspace::Workspace;
 use anyhow::{Context, Result, ensure};
@@ -38,7 +38,7 @@ impl Go {
 pub fn find_or_install(workspace: &Workspace) -> Result<Go> {
     let mut found = find();
     if found.is_none() {
-        apt_install(workspace, &["golang-go", "ca-certificates"])?;
+        apt::install(workspace, &["golang-go", "ca-certificates"])?;
         found = find();
     }
     let (program, version) = found.context("no working go after installing golang-go")?;

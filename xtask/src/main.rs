@@ -3,6 +3,7 @@
 //! Invariant: nothing here decides what is right. It installs tools, builds once, calls cargo and counts; every
 //! judgement is a test. Called as `cargo xtask VERB` (an alias in `.cargo/config.toml`).
 
+mod apt;
 mod fetch_tools;
 mod go;
 mod parts;

@@ -4,15 +4,15 @@
 //! assignment alone.
 
 use super::anchor::anchor;
+use super::pool::{Candidate, Pool};
 use super::rows::{RobotControl, TimerKind};
 use super::tasks::{News, arm, happen};
 use super::tx::Tx;
 use super::view::View;
-use super::{Board, Pace, Plan, attempts, errands, screen, timers, way};
+use super::{Board, Pace, Plan, attempts, errands, screen, timers};
 use crate::ids::{AttemptId, RobotId, Subject, TaskId};
 use crate::limits;
 use crate::reason::Code;
-use crate::site::WaypointIx;
 use crate::task::spec::Class;
 use crate::task::{Event, Phase, TaskIntake, TaskState};
 use crate::time::{Now, Utc};
@@ -28,75 +28,6 @@ pub fn queue<'a>(view: &'a View, now: &Now) -> impl Iterator<Item = &'a TaskId> 
     let mut waiting: Vec<_> = waiting.collect();
     waiting.sort_by_key(|(class, _)| *class);
     waiting.into_iter().map(|(_, id)| id)
-}
-
-/// A robot that a task may go to.
-pub struct Candidate {
-    /// Who.
-    pub robot_id: RobotId,
-    /// Where it stands.
-    pub at: WaypointIx,
-    tasks: u64,
-}
-
-/// Robots that tasks are given to one after the other.
-struct Pool {
-    /// By id.
-    all: Vec<Candidate>,
-    /// Who is left, as indices into `all` with what the choice looks at; in any order.
-    left: Vec<(usize, WaypointIx, u64)>,
-}
-
-impl Pool {
-    /// Robots of the board for which `can` holds.
-    fn of(view: &View, board: &Board, can: impl Fn(&RobotId) -> bool) -> Self {
-        let known = board.iter().filter(|(id, _)| can(id));
-        let all: Vec<_> = known
-            .filter_map(|(id, live)| {
-                let at = way::find(view, live.report.vitals.waypoint.as_ref())?;
-                let tasks = view.control.get(id.as_str()).map_or(0, |c| c.row.tasks);
-                Some(Candidate { robot_id: id.clone(), at, tasks })
-            })
-            .collect();
-        Self { left: all.iter().enumerate().map(|(ix, c)| (ix, c.at, c.tasks)).collect(), all }
-    }
-
-    /// Takes the nearest that passes every filter: another than one that failed the task, if there is one; then by distance, tasks so
-    /// far, id.
-    fn take(&mut self, view: &View, board: &Board, task: &TaskState, intake: &TaskIntake) -> Option<RobotId> {
-        if self.left.is_empty() {
-            return None;
-        }
-        let field = first_goal(view, task, intake).map(|g| view.router.field(g));
-        let failed = |ix: usize| !task.failed_robots.is_empty() && task.failed_robots.contains(&self.all[ix].robot_id);
-        let cost = |nth: usize| {
-            let (ix, at, tasks) = self.left[nth];
-            let distance = field.as_ref().map_or(Some(0), |f| f.distance_mm(at))?;
-            Some((failed(ix), distance, tasks, ix))
-        };
-        let passes =
-            |nth: &usize| screen::pair(view, board, &self.all[self.left[*nth].0].robot_id, task, intake).is_ok();
-        // Nearly always the first one passes; only else are all put in order.
-        let mut first = None;
-        for nth in 0..self.left.len() {
-            if let Some(cost) = cost(nth).filter(|c| first.is_none_or(|(best, _)| *c < best)) {
-                first = Some((cost, nth));
-            }
-        }
-        let nth = first.map(|(_, nth)| nth).filter(passes).or_else(|| {
-            let mut by_cost: Vec<_> = (0..self.left.len()).filter_map(|nth| Some((cost(nth)?, nth))).collect();
-            by_cost.sort_unstable();
-            by_cost.into_iter().map(|(_, nth)| nth).find(passes)
-        })?;
-        let (ix, ..) = self.left.swap_remove(nth);
-        Some(self.all[ix].robot_id.clone())
-    }
-
-    /// Who was not taken, by id.
-    fn rest(self) -> impl Iterator<Item = Candidate> {
-        let left: BTreeSet<usize> = self.left.into_iter().map(|(ix, ..)| ix).collect();
-        self.all.into_iter().enumerate().filter(move |(ix, _)| left.contains(ix)).map(|(_, c)| c)
-    }
 }
 
 /// Gives waiting tasks to idle robots, each assignment an item of its own, and gives back who is still idle: of those that were `heard`
@@ -116,10 +47,10 @@ pub fn plan(
     let mut recalled = errands::stopping(view);
     let later = view.fresh.iter().nth(TASKS_PER_CYCLE).cloned().map(|id| view.fresh.split_off(&id));
     let fresh = std::mem::replace(&mut view.fresh, later.unwrap_or_default());
-    let all = pace == Pace::Sweep || !idle.left.is_empty() || !errands.left.is_empty();
+    let all = pace == Pace::Sweep || !idle.is_empty() || !errands.is_empty();
     let queue: Vec<TaskId> = if all { queue(view, &now).take(TASKS_PER_CYCLE).cloned().collect() } else { Vec::new() };
     for task_id in queue {
-        if pace == Pace::Wake && idle.left.is_empty() && errands.left.is_empty() {
+        if pace == Pace::Wake && idle.is_empty() && errands.is_empty() {
             break;
         }
         let Some((task, intake)) = view.task(&task_id).zip(view.intake(&task_id)) else { continue };
@@ -162,12 +93,6 @@ fn arm_once(view: &mut View, now: Now, plan: &mut Plan, task_id: &TaskId) {
     {
         plan.decide(view, now, "fleet", |tx| timers::arm_waiting(tx, task_id));
     }
-}
-
-/// First goal of what is left of the task.
-fn first_goal(view: &View, task: &TaskState, intake: &TaskIntake) -> Option<WaypointIx> {
-    let from = way::from_step(&intake.spec.steps, task.next_step);
-    intake.spec.next_goal(from as usize).and_then(|g| view.site.find(g))
 }
 
 /// Writes one offer.

@@ -3,7 +3,7 @@
 //! An errand is an attempt with no task row and a single epoch; its number is never used again. Its end has no consequence but a free robot.
 
 use super::anchor::anchor;
-use super::assign::Candidate;
+use super::pool::Candidate;
 use super::rows::{RobotControl, Timer, TimerKind};
 use super::tasks::{arm, disarm, end_attempt};
 use super::tx::Tx;

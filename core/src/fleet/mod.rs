@@ -2,7 +2,7 @@
 //!
 //! [`cycle`] takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
 //! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `commands` are what happens; `tasks` moves tasks by
-//! the table; `heard`, `anchor` and `attempts` are what they share; `screen` and `assign` give work; `errands`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
+//! the table; `heard`, `anchor` and `attempts` are what they share; `screen`, `pool` and `assign` give work; `errands`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod anchor;
@@ -16,6 +16,7 @@ pub mod explain;
 pub mod heard;
 pub mod inbox;
 pub mod places;
+pub mod pool;
 pub mod repair;
 pub mod requests;
 pub mod rows;

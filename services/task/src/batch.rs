@@ -104,7 +104,7 @@ fn result_of(request_id: String, outcome: Result<Durable, Refusal>) -> v1::Submi
     let outcome = match outcome {
         Ok(durable) => Outcome::TaskId(durable.task_id().to_string()),
         Err(refusal) => {
-            crate::grpc::count(&refusal);
+            crate::count(&refusal);
             let violations = refusal.violations.into_iter();
             Outcome::Refusal(v1::SubmitTaskRefusal {
                 reason: Some(midshift_proto::convert::shown(&refusal.reason)),

@@ -31,7 +31,7 @@ impl CallId {
     }
     /// A refusal as a status, counted; our own faults are logged under the id that the caller sees.
     pub fn status(&self, refusal: &Refusal) -> Status {
-        count(refusal);
+        crate::count(refusal);
         if refusal.kind() == Kind::Internal {
             tracing::error!(request_id = self.0, %refusal, "a call failed by our own fault");
         }
@@ -40,11 +40,6 @@ impl CallId {
     fn answer<T>(&self, result: Result<T, Refusal>) -> Result<Response<T>, Status> {
         result.map(Response::new).map_err(|refusal| self.status(&refusal))
     }
-}
-
-/// Counts a refusal of a call or of one item of a batch.
-pub fn count(refusal: &Refusal) {
-    metrics::counter!("midshift_task_refused_total", "code" => refusal.reason.code.as_str()).increment(1);
 }
 
 impl TaskService {

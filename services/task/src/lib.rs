@@ -12,6 +12,7 @@ mod list;
 mod rows;
 mod watch;
 
+use midshift_core::reason::Refusal;
 use midshift_core::rows::{Item, Table};
 use midshift_core::site::Site;
 use midshift_core::task::TaskIntake;
@@ -87,4 +88,9 @@ impl TaskService {
     fn next_number(&self) -> u64 {
         self.inner.number.fetch_add(1, Relaxed) + 1
     }
+}
+
+/// Counts a refusal of a call or of one item of a batch.
+fn count(refusal: &Refusal) {
+    metrics::counter!("midshift_task_refused_total", "code" => refusal.reason.code.as_str()).increment(1);
 }
