@@ -116,7 +116,9 @@ pub fn pair(
     {
         return Err(Reason::from(Code::RobotLoaded).with("item", &load.item));
     }
-    energy(view, live, task, intake)
+    let (here, goals) = journey(view, live, task, intake)?;
+    place(view, here, &goals)?;
+    energy(view, live, here, &goals)
 }
 
 /// A robot that refused this task is asked again only once it has said something newer.
@@ -154,15 +156,38 @@ fn able(session: &Session, intake: &TaskIntake) -> Result<(), Reason> {
     Ok(())
 }
 
-/// The charge must reach pickup, every other goal and the nearest charger, with its reserve.
-fn energy(view: &View, live: &Live, task: &TaskState, intake: &TaskIntake) -> Result<(), Reason> {
-    let Some(here) = way::find(view, live.report.vitals.waypoint.as_ref()) else {
-        return Err(Code::RobotUnlocated.into());
-    };
+/// Where the robot stands, and the goals that are left.
+fn journey(
+    view: &View,
+    live: &Live,
+    task: &TaskState,
+    intake: &TaskIntake,
+) -> Result<(WaypointIx, Vec<WaypointIx>), Reason> {
+    let here = way::find(view, live.report.vitals.waypoint.as_ref()).ok_or(Code::RobotUnlocated)?;
     let from = way::from_step(&intake.spec.steps, task.next_step);
     let goals: Option<Vec<WaypointIx>> = intake.spec.goals(from as usize).map(|g| view.site.find(g)).collect();
-    let Some(goals) = goals else { return Err(Code::NoRoute.into()) };
-    let Some(work_mm) = way::length_mm(view, here, &goals) else { return Err(Code::NoRoute.into()) };
+    Ok((here, goals.ok_or(Code::NoRoute)?))
+}
+
+/// No closed place may bar the way to a goal, nor be one.
+fn place(view: &View, here: WaypointIx, goals: &[WaypointIx]) -> Result<(), Reason> {
+    let closed = way::closed(view);
+    if closed.is_empty() {
+        return Ok(());
+    }
+    let mut at = here;
+    for goal in goals {
+        if view.router.field_around(*goal, &closed).distance_mm(at).is_none() {
+            return Err(Reason::from(Code::PlaceBlocked).with("goal", view.site.name_of(*goal)));
+        }
+        at = *goal;
+    }
+    Ok(())
+}
+
+/// The charge must reach pickup, every other goal and the nearest charger, with its reserve.
+fn energy(view: &View, live: &Live, here: WaypointIx, goals: &[WaypointIx]) -> Result<(), Reason> {
+    let Some(work_mm) = way::length_mm(view, here, goals) else { return Err(Code::NoRoute.into()) };
     let last = goals.last().copied().unwrap_or(here);
     let home_mm = match view.site.chargers().next() {
         Some(_) => view.site.chargers().filter_map(|c| view.router.distance_mm(last, c)).min().unwrap_or(0),

@@ -1,9 +1,11 @@
 //! Why not: each case has a reason that names what is in the way.
 
 use crate::harness::World;
+use midshift_core::fleet::rows::HolderState;
 use midshift_core::reason::Code;
 use midshift_core::robot::Load;
 use midshift_core::site::CORRIDOR;
+use midshift_core::task::Phase;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
 use tonic::Request;
@@ -87,4 +89,23 @@ async fn the_robot_has_too_little_charge_or_a_person_drives_it() {
     let told = w.fleet.explain_robot(Request::new(ask)).await.expect("an explanation").into_inner();
     let verdict = told.explanation.expect("an explanation").verdict.expect("a verdict").code;
     assert_eq!(verdict, "ROBOT_BUSY", "it charges");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_closed_place_is_the_goal_and_the_task_goes_on_when_it_opens() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r2", "park-a").await;
+    w.submit("T1", "A", "B").await;
+    w.until("it stands in A", |s| s.holders("A") == [("r2".to_owned(), HolderState::Inside)]).await;
+    w.r("r2").cut();
+    w.cancel("T1", false).await;
+    w.until("nobody knows where it is", |s| s.place("A").quarantine.is_some()).await;
+    w.robot("r1", "park-b").await;
+    w.submit("T2", "A", "B").await;
+    w.pass_while(60, "it is given to nobody", |s| s.phase("T2") == Phase::Queued).await;
+    assert_eq!(why(&w, "T2").await, codes(Code::WaitingForRobot, "PLACE_BLOCKED"));
+    w.r("r2").mend();
+    w.connect("r2").await;
+    w.until_phase("T2", Phase::Succeeded).await;
+    w.lawful().await;
 }
