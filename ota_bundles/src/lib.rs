@@ -10,4 +10,5 @@ pub mod folder;
 pub mod keys;
 pub mod manifest;
 pub mod repository;
+pub mod set;
 pub mod trust;

@@ -5,4 +5,5 @@ mod directives;
 mod keyring;
 mod metadata;
 mod releasing;
+mod sets;
 mod shelf;

@@ -1,0 +1,360 @@
+//! Starts the agent of one robot, listens whether it lives, kills it if it hangs, and starts it again; goes back to the kept set of
+//! software when a new one cannot live.
+//!
+//! `midshift-launcher --record FILE [--sets DIR] [--hang SECONDS] [--beacon HOST:PORT --robot-id ID] -- PROGRAM ARGS…`
+//!
+//! Standard library only: nothing that the agent's updates replace is needed to start the agent. The number of tries since the
+//! program last ran well stands in FILE and is on the disk before each start, so that a machine that loses its power while it
+//! starts still counts. The program's pulse is one marked line a second on its standard output; all other lines pass through.
+//! With `--sets` the program is the one of the set that the switch record names, and PROGRAM for a set that brings none.
+//! Invariant: at most one child at a time; the switch record is written only while no child runs. Ended by a signal, the launcher
+//! leaves the child to whoever sent it: a service manager signals the whole group.
+
+#![expect(clippy::disallowed_methods, reason = "a program of its own without a runtime and without simulated time")]
+
+use crate::switch::{self, Switch};
+use std::fs;
+use std::io::{self, BufRead, BufReader, Write};
+use std::net::UdpSocket;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitCode, ExitStatus, Stdio};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+/// Environment variable that names the set to the program that is started.
+pub const SET: &str = "MIDSHIFT_SET";
+/// File of a set that is its program.
+pub const PROGRAM: &str = "program";
+/// The switch record in the folder of the sets.
+pub const SWITCH: &str = "switch";
+/// The program ends with this to be started again at once: it has written the switch record.
+pub const SWITCHED: u8 = 75;
+/// A set on trial is put away after so many starts that did not run well.
+pub const TRIES_MAX: u32 = 2;
+/// Environment variable that asks the program for its pulse.
+pub const PULSE_ASKED: &str = "MIDSHIFT_PULSE";
+/// The pulse.
+pub const PULSE_LINE: &str = "\u{1}midshift-hb";
+/// Without a pulse for so many seconds the program hangs.
+const HANG_SECONDS: u64 = 15;
+/// After so many pulses the program runs well and its tries count from 0 again.
+const WELL_AFTER_PULSES: u32 = 30;
+/// First and longest pause before the next start, milliseconds.
+const PAUSE_MS: (u64, u64) = (250, 30_000);
+/// Time between two beacons.
+const BEACON_EVERY: Duration = Duration::from_secs(1);
+/// The end that no restart mends: wrong arguments.
+const USAGE: u8 = 2;
+/// How it is called.
+const USAGE_TEXT: &str = "usage: midshift-launcher --record FILE [--sets DIR] [--hang SECONDS] [--beacon HOST:PORT --robot-id ID] -- PROGRAM ARGS…";
+
+/// What the command line says.
+#[derive(Debug, PartialEq, Eq)]
+struct Orders {
+    record: PathBuf,
+    sets: Option<PathBuf>,
+    hang: Duration,
+    beacon: Option<(String, String)>,
+    program: String,
+    arguments: Vec<String>,
+}
+
+/// What the child's output says.
+enum Sign {
+    Pulse,
+    Ended,
+}
+
+/// How one run of the program ended.
+#[derive(Debug, PartialEq, Eq)]
+enum Ending {
+    /// By itself, with success: it was asked to end.
+    Finished,
+    /// By itself, to be started again from the switch record.
+    Switched,
+    /// By itself, otherwise.
+    Failed(String),
+    /// Killed: no pulse.
+    Hung,
+}
+
+/// The whole program: `arguments` without its name.
+pub fn main(arguments: impl Iterator<Item = String>) -> ExitCode {
+    let orders = match orders(arguments) {
+        Ok(orders) => orders,
+        Err(problem) => {
+            say(&format!("{problem}\n{USAGE_TEXT}"));
+            return ExitCode::from(USAGE);
+        }
+    };
+    match keep_running(&orders) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            say(&error.to_string());
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn orders(arguments: impl Iterator<Item = String>) -> Result<Orders, String> {
+    let mut arguments = arguments;
+    let (mut record, mut sets, mut hang, mut beacon, mut robot_id) = (None, None, HANG_SECONDS, None, None);
+    while let Some(argument) = arguments.next() {
+        let mut value = |what: &str| arguments.next().ok_or(format!("{argument} needs {what}"));
+        match argument.as_str() {
+            "--record" => record = Some(PathBuf::from(value("a file")?)),
+            "--sets" => sets = Some(PathBuf::from(value("a folder")?)),
+            "--beacon" => beacon = Some(value("HOST:PORT")?),
+            "--robot-id" => robot_id = Some(value("a name")?),
+            "--hang" => {
+                let seconds = value("seconds")?.parse().ok().filter(|s| *s > 0);
+                hang = seconds.ok_or("--hang needs whole seconds, at least 1")?;
+            }
+            "--" => {
+                let beacon = match (beacon, robot_id) {
+                    (None, None) => None,
+                    (Some(to), Some(robot_id)) => Some((to, robot_id)),
+                    _ => return Err("--beacon and --robot-id go together".to_owned()),
+                };
+                return Ok(Orders {
+                    record: record.ok_or("--record is required")?,
+                    sets,
+                    hang: Duration::from_secs(hang),
+                    beacon,
+                    program: arguments.next().ok_or("a program is required after --")?,
+                    arguments: arguments.collect(),
+                });
+            }
+            other => return Err(format!("unknown argument {other}")),
+        }
+    }
+    Err("a program is required after --".to_owned())
+}
+
+fn keep_running(orders: &Orders) -> io::Result<()> {
+    let mut beacon = Beacon::new(orders);
+    loop {
+        let start = choose(orders)?;
+        write_tries(&orders.record, start.tries, &start.set)?;
+        beacon.begins(&start);
+        match run_once(orders, &start, &mut beacon)? {
+            Ending::Finished => {
+                write_tries(&orders.record, 0, &start.set)?;
+                return Ok(());
+            }
+            Ending::Switched => {
+                write_tries(&orders.record, 0, &start.set)?;
+                continue;
+            }
+            Ending::Failed(how) => say(&format!("{} of set {} ended: {how}", start.program, start.set)),
+            Ending::Hung => {
+                say(&format!("{} gave no sign for {} s and was killed", start.program, orders.hang.as_secs()))
+            }
+        }
+        let tries = read_tries(&orders.record, &start.set);
+        let pause = pause_before(tries);
+        say(&format!("try {} in {} ms", tries.saturating_add(1), pause.as_millis()));
+        beacon.pause(pause);
+    }
+}
+
+/// What is started next.
+#[derive(Debug, PartialEq, Eq)]
+struct Start {
+    set: String,
+    program: String,
+    /// Counts this start.
+    tries: u32,
+}
+
+/// The set that the record names; one on trial that has had its tries is put away first.
+fn choose(orders: &Orders) -> io::Result<Start> {
+    let Some(sets) = &orders.sets else {
+        let set = switch::FACTORY.to_owned();
+        return Ok(Start { tries: read_tries(&orders.record, &set) + 1, program: orders.program.clone(), set });
+    };
+    let path = sets.join(SWITCH);
+    let named = |error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", path.display()));
+    let mut switch = Switch::read(&path).map_err(named)?;
+    let tries = read_tries(&orders.record, switch.running());
+    if switch.trial.is_some() && tries >= TRIES_MAX {
+        say(&format!("set {} did not live in {tries} tries; back to {}", switch.running(), switch.current));
+        switch.fall_back(tries);
+        switch.write(&path).map_err(named)?;
+    }
+    let set = switch.running().to_owned();
+    let own = sets.join(&set).join(PROGRAM);
+    let program = if own.exists() { own.to_string_lossy().into_owned() } else { orders.program.clone() };
+    Ok(Start { tries: read_tries(&orders.record, &set).saturating_add(1), program, set })
+}
+
+/// Whether a program that runs well clears its tries: a set on probation is not believed before it is proven.
+fn is_trusted(orders: &Orders) -> bool {
+    let Some(sets) = &orders.sets else { return true };
+    Switch::read(&sets.join(SWITCH)).is_ok_and(|switch| switch.trial.is_none_or(|trial| trial.is_proven))
+}
+
+fn pause_before(tries: u32) -> Duration {
+    let (first, longest) = PAUSE_MS;
+    Duration::from_millis(first.saturating_mul(1 << tries.saturating_sub(1).min(16)).min(longest))
+}
+
+/// Runs the program until it ends or hangs.
+fn run_once(orders: &Orders, start: &Start, beacon: &mut Beacon) -> io::Result<Ending> {
+    let started = Command::new(&start.program)
+        .args(&orders.arguments)
+        .env(PULSE_ASKED, "1")
+        .env(SET, &start.set)
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .spawn();
+    let mut child = match started {
+        Ok(child) => Kept(child),
+        Err(error) => return Ok(Ending::Failed(format!("cannot be started: {error}"))),
+    };
+    let Some(output) = child.0.stdout.take() else { return Ok(Ending::Failed("has no output".to_owned())) };
+    let (signs, heard) = sync_channel(16);
+    let listener = std::thread::spawn(move || {
+        for line in BufReader::new(output).split(b'\n') {
+            let Ok(line) = line else { break };
+            let is_pulse = line == PULSE_LINE.as_bytes();
+            let gone = if is_pulse { signs.send(Sign::Pulse).is_err() } else { pass_on(&line).is_err() };
+            if gone {
+                return;
+            }
+        }
+        // The other end is gone only if the program was already given up.
+        let _ = signs.send(Sign::Ended);
+    });
+    let ending = watch(&mut child.0, &heard, orders, start, beacon)?;
+    drop(heard);
+    drop(child);
+    // A grandchild may keep the pipe open; it is not waited for.
+    drop(listener);
+    Ok(ending)
+}
+
+fn watch(
+    child: &mut Child,
+    heard: &Receiver<Sign>,
+    orders: &Orders,
+    start: &Start,
+    beacon: &mut Beacon,
+) -> io::Result<Ending> {
+    let mut pulses = 0;
+    let mut sign_by = Instant::now() + orders.hang;
+    loop {
+        let left = sign_by.saturating_duration_since(Instant::now());
+        match heard.recv_timeout(if pulses == 0 { left.min(BEACON_EVERY) } else { left }) {
+            Ok(Sign::Pulse) => {
+                pulses += 1;
+                sign_by = Instant::now() + orders.hang;
+                if pulses % WELL_AFTER_PULSES == 0 && is_trusted(orders) {
+                    write_tries(&orders.record, 0, &start.set)?;
+                }
+            }
+            Ok(Sign::Ended) | Err(RecvTimeoutError::Disconnected) => return Ok(how_it_ended(child.wait()?)),
+            Err(RecvTimeoutError::Timeout) => {
+                if let Some(status) = child.try_wait()? {
+                    return Ok(how_it_ended(status));
+                }
+                if Instant::now() < sign_by {
+                    beacon.send();
+                    continue;
+                }
+                child.kill()?;
+                child.wait()?;
+                return Ok(Ending::Hung);
+            }
+        }
+    }
+}
+
+fn how_it_ended(status: ExitStatus) -> Ending {
+    match status.code() {
+        Some(0) => Ending::Finished,
+        Some(code) if code == i32::from(SWITCHED) => Ending::Switched,
+        _ => Ending::Failed(status.to_string()),
+    }
+}
+
+/// A child that never outlives this.
+struct Kept(Child);
+
+impl Drop for Kept {
+    fn drop(&mut self) {
+        // Already ended is what is wanted.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// Tells the server once a second that the robot is there while no agent runs. A hint for people: sent blind, believed by nobody.
+struct Beacon {
+    socket: Option<(UdpSocket, String)>,
+    robot_id: String,
+    /// What runs, and the second since which no agent is heard.
+    text: String,
+}
+
+impl Beacon {
+    fn new(orders: &Orders) -> Self {
+        let Some((to, robot_id)) = orders.beacon.clone() else {
+            return Self { socket: None, robot_id: String::new(), text: String::new() };
+        };
+        let socket = UdpSocket::bind("[::]:0").or_else(|_| UdpSocket::bind("0.0.0.0:0"));
+        Self { socket: socket.ok().map(|socket| (socket, to)), robot_id, text: String::new() }
+    }
+
+    fn begins(&mut self, start: &Start) {
+        let since = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs());
+        self.text = format!("midshift-beacon 1 {} {} {} {since}\n", self.robot_id, start.set, start.tries);
+    }
+
+    fn send(&self) {
+        if let Some((socket, to)) = &self.socket {
+            // Nobody has to hear it.
+            let _ = socket.send_to(self.text.as_bytes(), to.as_str());
+        }
+    }
+
+    fn pause(&self, pause: Duration) {
+        let mut left = pause;
+        loop {
+            self.send();
+            let part = left.min(BEACON_EVERY);
+            std::thread::sleep(part);
+            left -= part;
+            if left.is_zero() {
+                return;
+            }
+        }
+    }
+}
+
+/// Starts of `set` that did not run well; those of another set do not count.
+fn read_tries(record: &Path, set: &str) -> u32 {
+    let text = fs::read_to_string(record).unwrap_or_default();
+    let counted = text.trim().strip_prefix("tries ").and_then(|rest| rest.split_once(" of "));
+    counted.filter(|(_, of)| *of == set).and_then(|(tries, _)| tries.parse().ok()).unwrap_or(0)
+}
+
+/// On the disk when this returns.
+fn write_tries(record: &Path, tries: u32, set: &str) -> io::Result<()> {
+    switch::replace(record, format!("tries {tries} of {set}\n").as_bytes())
+}
+
+fn pass_on(line: &[u8]) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    out.write_all(line)?;
+    out.write_all(b"\n")?;
+    out.flush()
+}
+
+fn say(text: &str) {
+    // Nobody to tell is no reason to stop a robot.
+    let _ = writeln!(io::stderr().lock(), "midshift-launcher: {text}");
+}
+
+#[cfg(test)]
+mod tests;

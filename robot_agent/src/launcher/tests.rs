@@ -1,0 +1,195 @@
+//! The launcher with real children.
+
+use super::*;
+use tempfile::TempDir;
+
+fn given(text: &str) -> Result<Orders, String> {
+    orders(text.split(' ').map(str::to_owned))
+}
+
+/// A robot's folder, and what its launcher was told: PROGRAM is a shell with this script.
+fn robot(script: &str) -> (TempDir, Orders) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let arguments = vec!["-c".to_owned(), script.to_owned()];
+    let orders = Orders {
+        record: folder.path().join("tries"),
+        sets: None,
+        hang: Duration::from_secs(1),
+        beacon: None,
+        program: "sh".to_owned(),
+        arguments,
+    };
+    (folder, orders)
+}
+
+/// A robot whose sets hold these programs, each a script that writes its set into `ran` first; the factory's ends well.
+fn with_sets(programs: &[(&str, &str)]) -> (TempDir, Orders) {
+    let (folder, mut orders) = robot("echo $MIDSHIFT_SET >> $0; exit 0");
+    let sets = folder.path().join("sets");
+    let ran = folder.path().join("ran");
+    for (set, script) in programs {
+        let program = sets.join(set).join(PROGRAM);
+        fs::create_dir_all(program.parent().expect("a folder")).expect("makes");
+        write_program(&program, &format!("echo $MIDSHIFT_SET >> {}\n{script}", ran.display()));
+    }
+    fs::create_dir_all(&sets).expect("makes");
+    orders.arguments.push(ran.display().to_string());
+    orders.sets = Some(sets);
+    (folder, orders)
+}
+
+/// By a child: a file that this process has had open for writing may not be run while another test starts a child of its own.
+fn write_program(path: &Path, script: &str) {
+    let write = "printf '#!/bin/sh\\n%s\\n' \"$1\" > \"$2\" && chmod +x \"$2\"";
+    let status = Command::new("sh").args(["-c", write, "sh", script]).arg(path).status();
+    assert!(status.expect("runs").success());
+}
+
+fn on_trial(orders: &Orders, set: &str) {
+    let path = orders.sets.as_ref().expect("has sets").join(SWITCH);
+    let mut switch = Switch::read(&path).expect("reads");
+    switch.try_out(set);
+    switch.write(&path).expect("writes");
+}
+
+fn record(orders: &Orders) -> Switch {
+    Switch::read(&orders.sets.as_ref().expect("has sets").join(SWITCH)).expect("reads")
+}
+
+fn ran(folder: &TempDir) -> Vec<String> {
+    let text = fs::read_to_string(folder.path().join("ran")).unwrap_or_default();
+    text.lines().map(str::to_owned).collect()
+}
+
+#[test]
+fn the_command_line_is_read_whole_or_refused() {
+    let orders =
+        given("--record r --hang 3 --sets s --beacon h:7422 --robot-id x -- agent run --robot-id x").expect("reads");
+    assert_eq!((orders.hang, orders.program.as_str(), orders.arguments.len()), (Duration::from_secs(3), "agent", 3));
+    assert_eq!(orders.beacon, Some(("h:7422".to_owned(), "x".to_owned())));
+    let wrong = [
+        "--record r",
+        "-- agent",
+        "--record r --",
+        "--hang 0 --record r -- agent",
+        "--what",
+        "--record r --beacon h:1 -- a",
+    ];
+    for wrong in wrong {
+        assert!(given(wrong).is_err(), "{wrong}");
+    }
+}
+
+#[test]
+fn pauses_grow_to_a_limit() {
+    let pauses: Vec<_> = [1, 2, 3, 40].map(|tries| pause_before(tries).as_millis()).into();
+    assert_eq!(pauses, [250, 500, 1_000, 30_000]);
+}
+
+#[test]
+fn a_program_that_fails_is_started_again_until_it_ends_well_and_its_tries_are_on_the_disk_before_it_runs() {
+    let (folder, mut orders) = robot("");
+    let (record, seen) = (orders.record.display(), folder.path().join("seen"));
+    orders.arguments[1] = format!("cat {record} >> {0}; test $(wc -l < {0}) -ge 3", seen.display());
+    keep_running(&orders).expect("runs");
+    assert_eq!(
+        fs::read_to_string(&seen).expect("was written"),
+        "tries 1 of factory\ntries 2 of factory\ntries 3 of factory\n"
+    );
+    assert_eq!(read_tries(&orders.record, "factory"), 0);
+}
+
+#[test]
+fn a_program_without_a_pulse_is_killed() {
+    let (_folder, orders) = robot("echo a line is no pulse; exec sleep 600");
+    let start = choose(&orders).expect("chooses");
+    assert_eq!(run_once(&orders, &start, &mut Beacon::new(&orders)).expect("runs"), Ending::Hung);
+}
+
+#[test]
+fn a_set_on_trial_that_cannot_live_is_put_away_and_the_one_before_it_runs() {
+    let (folder, orders) = with_sets(&[("v1", "exit 1")]);
+    on_trial(&orders, "v1");
+    keep_running(&orders).expect("runs");
+    assert_eq!(ran(&folder), ["v1", "v1", "factory"]);
+    let after = record(&orders);
+    assert_eq!((after.running(), after.trial.as_ref()), ("factory", None));
+    assert_eq!(after.fallen, Some(switch::Fallen { set: "v1".to_owned(), tries: TRIES_MAX }));
+}
+
+#[test]
+fn a_set_on_trial_that_hangs_is_put_away_too() {
+    let (folder, orders) = with_sets(&[("v1", "exec sleep 600")]);
+    on_trial(&orders, "v1");
+    keep_running(&orders).expect("runs");
+    assert_eq!(ran(&folder), ["v1", "v1", "factory"]);
+}
+
+#[test]
+fn a_program_that_switched_is_followed_by_the_set_it_wrote_at_once_and_not_counted_as_failed() {
+    let (folder, orders) = with_sets(&[("v1", "exit 0"), ("v0", "")]);
+    let sets = orders.sets.clone().expect("has sets");
+    let mut next = Switch::default();
+    next.try_out("v1");
+    next.number = 9;
+    next.write(&folder.path().join("next")).expect("writes");
+    let script = format!("cp {}/next {}/{SWITCH}; exit {SWITCHED}", folder.path().display(), sets.display());
+    write_program(&sets.join("v0").join(PROGRAM), &script);
+    on_trial(&orders, "v0");
+    keep_running(&orders).expect("runs");
+    assert_eq!(ran(&folder), ["v1"]);
+    assert_eq!((read_tries(&orders.record, "v0"), read_tries(&orders.record, "v1")), (0, 0));
+}
+
+#[test]
+fn a_power_cut_counts_as_a_try_and_tries_of_another_set_do_not() {
+    let (_folder, orders) = with_sets(&[("v1", ""), ("v2", "")]);
+    on_trial(&orders, "v1");
+    for tries in [1, 2] {
+        let start = choose(&orders).expect("chooses");
+        assert_eq!((start.set.as_str(), start.tries), ("v1", tries));
+        write_tries(&orders.record, start.tries, &start.set).expect("writes");
+    }
+    assert_eq!(choose(&orders).expect("chooses").set, "factory", "twice the power went while it started");
+    on_trial(&orders, "v2");
+    assert_eq!(choose(&orders).expect("chooses").tries, 1);
+}
+
+#[test]
+fn a_committed_set_is_never_put_away_and_a_set_on_probation_does_not_clear_its_tries() {
+    let (_folder, orders) = with_sets(&[("v1", "")]);
+    let path = orders.sets.as_ref().expect("has sets").join(SWITCH);
+    on_trial(&orders, "v1");
+    assert!(!is_trusted(&orders));
+    let mut switch = record(&orders);
+    switch.prove();
+    switch.write(&path).expect("writes");
+    assert!(is_trusted(&orders));
+    switch.commit();
+    switch.write(&path).expect("writes");
+    write_tries(&orders.record, 7, "v1").expect("writes");
+    assert_eq!(choose(&orders).expect("chooses").set, "v1");
+}
+
+#[test]
+fn a_damaged_switch_record_starts_nothing() {
+    let (folder, orders) = with_sets(&[("v1", "")]);
+    fs::write(orders.sets.as_ref().expect("has sets").join(SWITCH), "midshift-switch 1\nnumber").expect("writes");
+    let error = keep_running(&orders).expect_err("is refused");
+    assert!(error.to_string().contains("damaged"), "{error}");
+    assert_eq!(ran(&folder), Vec::<String>::new());
+}
+
+#[test]
+fn while_no_agent_runs_a_beacon_says_which_set_is_tried() {
+    let ear = UdpSocket::bind("127.0.0.1:0").expect("binds");
+    let (_folder, mut orders) = with_sets(&[("v1", "exit 1")]);
+    orders.beacon = Some((ear.local_addr().expect("bound").to_string(), "r1".to_owned()));
+    on_trial(&orders, "v1");
+    keep_running(&orders).expect("runs");
+    let mut text = [0; 256];
+    let heard = ear.recv(&mut text).expect("heard");
+    let words: Vec<_> = str::from_utf8(&text[..heard]).expect("text").split_whitespace().collect();
+    assert_eq!(words[..5], ["midshift-beacon", "1", "r1", "v1", "1"]);
+    assert!(words[5].parse::<u64>().is_ok());
+}
