@@ -23,8 +23,8 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 /// Environment variable that names the set to the program that is started.
 pub const SET: &str = "MIDSHIFT_SET";
-/// File of a set that is its program.
-pub const PROGRAM: &str = "program";
+/// File of a set that is its program; no component has a name with a dot.
+pub const PROGRAM: &str = "set.program";
 /// The switch record in the folder of the sets.
 pub const SWITCH: &str = "switch";
 /// The program ends with this to be started again at once: it has written the switch record.

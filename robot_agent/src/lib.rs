@@ -17,6 +17,7 @@ pub mod places;
 pub mod pulse;
 pub mod ring;
 pub mod session;
+pub mod sets;
 pub mod sqlite;
 pub mod store;
 pub mod switch;

@@ -7,4 +7,5 @@ mod offers;
 mod restarts;
 mod rig;
 mod session;
+mod sets;
 mod steps;

@@ -1,0 +1,249 @@
+//! Sets of a robot in a folder.
+//!
+//! ```text
+//! switch            which set runs (crate::switch)
+//! content/DIGEST    bytes that were checked; DIGEST.part and DIGEST.map while they come
+//! SET/NAME          hard link to a component's content; SET is the set's id
+//! SET/set.program   hard link to the one of kind process
+//! SET/set.json      what is in it; written last
+//! ```
+//! Invariant: a folder has the name of a set only when it is whole: it is made beside and renamed.
+
+use super::content::{Part, remove};
+use super::{Error, Holdings, Sets, Wanted};
+use crate::launcher::{PROGRAM, SWITCH};
+use crate::switch::{self, Switch};
+use midshift_bundle::digest::Digest;
+use midshift_bundle::manifest::{COMPONENT_BYTES_MAX, MANIFEST_BYTES_MAX};
+use midshift_bundle::set::SetManifest;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::{self, File, Permissions};
+use std::io::{self, Read};
+use std::ops::Range;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+/// What is in a set, as a file of it.
+const SET_FILE: &str = "set.json";
+/// Bytes of that file: a manifest's worth for each bundle it may have come from.
+const SET_BYTES_MAX: u64 = 4 * MANIFEST_BYTES_MAX as u64;
+/// Where content lies.
+const CONTENT: &str = "content";
+
+/// The sets in one folder. One owner at a time: the agent that runs.
+#[derive(Debug)]
+pub struct DiskSets {
+    folder: PathBuf,
+    part: Option<Part>,
+}
+
+fn io_error(doing: &'static str) -> impl FnOnce(io::Error) -> Error {
+    move |source| Error::Io { doing, source }
+}
+
+/// None for what is not there.
+fn optional<T>(result: io::Result<T>) -> io::Result<Option<T>> {
+    match result {
+        Ok(value) => Ok(Some(value)),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
+impl DiskSets {
+    /// Opens a folder, or makes it.
+    ///
+    /// # Errors
+    /// The disk's.
+    pub fn open(folder: &Path) -> Result<Self, Error> {
+        fs::create_dir_all(folder.join(CONTENT)).map_err(io_error("making the folder of sets"))?;
+        Ok(Self { folder: folder.to_owned(), part: None })
+    }
+
+    fn content(&self, digest: &Digest) -> PathBuf {
+        self.folder.join(CONTENT).join(digest.to_string())
+    }
+
+    /// The file that a running program may read: settings of its own set.
+    pub fn component(&self, set: &str, name: &str) -> PathBuf {
+        self.folder.join(set).join(name)
+    }
+
+    fn has(&self, wanted: &Wanted) -> Result<bool, Error> {
+        let there = optional(fs::metadata(self.content(&wanted.digest))).map_err(io_error("looking for content"))?;
+        Ok(there.is_some_and(|file| file.len() == wanted.length))
+    }
+
+    fn part(&mut self, wanted: &Wanted) -> Result<&mut Part, Error> {
+        if self.part.as_ref().is_none_or(|part| part.wanted() != wanted) {
+            if let Some(mut other) = self.part.take() {
+                other.sync()?;
+            }
+            self.part = Some(Part::open(&self.folder.join(CONTENT), wanted)?);
+        }
+        match &mut self.part {
+            Some(part) => Ok(part),
+            None => unreachable!("was opened above"),
+        }
+    }
+
+    /// Whole sets: folders with a name of one and a page that is what the name says.
+    fn sets(&self) -> Result<BTreeMap<Digest, SetManifest>, Error> {
+        let list = || {
+            let mut sets = BTreeMap::new();
+            for entry in fs::read_dir(&self.folder)? {
+                let entry = entry?;
+                let Some(id) = entry.file_name().to_str().and_then(|name| name.parse::<Digest>().ok()) else {
+                    continue;
+                };
+                let Some(page) = optional(read_limited(&entry.path().join(SET_FILE), SET_BYTES_MAX))? else { continue };
+                if let Some(set) = serde_json::from_slice::<SetManifest>(&page).ok().filter(|set| set.id() == id) {
+                    sets.insert(id, set);
+                }
+            }
+            Ok(sets)
+        };
+        list().map_err(io_error("listing sets"))
+    }
+
+    /// Links all of a set into a folder beside and gives it its name.
+    fn assemble(&self, set: &SetManifest, folder: &Path) -> io::Result<()> {
+        let beside = folder.with_extension("new");
+        for half in [folder, &beside] {
+            optional(fs::remove_dir_all(half))?;
+        }
+        fs::create_dir(&beside)?;
+        for component in set.components.values() {
+            fs::hard_link(self.content(&component.digest), beside.join(&component.name))?;
+        }
+        if let Some(program) = set.program() {
+            let content = self.content(&program.digest);
+            fs::set_permissions(&content, Permissions::from_mode(0o755))?;
+            fs::hard_link(content, beside.join(PROGRAM))?;
+        }
+        let page = beside.join(SET_FILE);
+        fs::write(&page, set.to_bytes())?;
+        File::open(&page)?.sync_all()?;
+        File::open(&beside)?.sync_all()?;
+        fs::rename(&beside, folder)?;
+        switch::sync_folder_of(folder)
+    }
+}
+
+fn read_limited(path: &Path, most: u64) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    File::open(path)?.take(most + 1).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > most { Err(io::ErrorKind::FileTooLarge.into()) } else { Ok(bytes) }
+}
+
+impl Sets for DiskSets {
+    fn holdings(&mut self) -> Result<Holdings, Error> {
+        let switch = Switch::read(&self.folder.join(SWITCH)).map_err(io_error("reading the switch record"))?;
+        let room = rustix::fs::statvfs(&self.folder).map_err(io::Error::from).map_err(io_error("asking for room"))?;
+        let free_bytes = room.f_bavail.saturating_mul(room.f_frsize);
+        Ok(Holdings { switch, sets: self.sets()?, free_bytes })
+    }
+
+    fn missing(&mut self, wanted: &Wanted) -> Result<Vec<Range<u64>>, Error> {
+        if self.has(wanted)? { Ok(Vec::new()) } else { Ok(self.part(wanted)?.missing()) }
+    }
+
+    fn write(&mut self, wanted: &Wanted, offset: u64, bytes: &[u8]) -> Result<(), Error> {
+        self.part(wanted)?.write(offset, bytes)
+    }
+
+    fn sync(&mut self, wanted: &Wanted) -> Result<(), Error> {
+        if self.has(wanted)? { Ok(()) } else { self.part(wanted)?.sync() }
+    }
+
+    fn seal(&mut self, wanted: &Wanted) -> Result<(), Error> {
+        if self.has(wanted)? {
+            return Ok(());
+        }
+        self.part(wanted)?;
+        let to = self.content(&wanted.digest);
+        match self.part.take() {
+            Some(part) => part.seal(&to),
+            None => unreachable!("was opened above"),
+        }
+    }
+
+    fn read(&mut self, digest: &Digest, most: u64) -> Result<Vec<u8>, Error> {
+        let bytes = optional(read_limited(&self.content(digest), most)).map_err(io_error("reading content"))?;
+        let bytes = bytes.ok_or(Error::Missing(*digest))?;
+        if Digest::of(&bytes) == *digest { Ok(bytes) } else { Err(Error::Corrupt { digest: *digest }) }
+    }
+
+    fn stage(&mut self, set: &SetManifest) -> Result<(), Error> {
+        let id = set.id();
+        let folder = self.folder.join(id.to_string());
+        if !self.sets()?.contains_key(&id) {
+            for component in set.components.values() {
+                if !self.has(&Wanted { digest: component.digest, length: component.length })? {
+                    return Err(Error::Missing(component.digest));
+                }
+            }
+            self.assemble(set, &folder).map_err(io_error("making a set"))?;
+        }
+        let read_back = self.verify(&id);
+        if let Err(Error::Corrupt { digest }) = read_back {
+            // The disk has changed it since it was checked: it must come again.
+            let forget = || fs::remove_dir_all(&folder).and_then(|()| remove(&self.content(&digest)));
+            forget().map_err(io_error("throwing a set away"))?;
+        }
+        read_back
+    }
+
+    fn verify(&mut self, id: &Digest) -> Result<(), Error> {
+        let folder = self.folder.join(id.to_string());
+        let set = self.sets()?.remove(id).ok_or(Error::Missing(*id))?;
+        let program = set.program().map(|program| (PROGRAM.to_owned(), program));
+        for (name, component) in set.components.iter().map(|(name, c)| (name.clone(), c)).chain(program) {
+            let file = optional(File::open(folder.join(name))).map_err(io_error("reading a set"))?;
+            let mut file = file.ok_or(Error::Missing(component.digest))?;
+            let read = Digest::of_reader(&mut file, COMPONENT_BYTES_MAX).map_err(io_error("reading a set"))?;
+            if read != (component.digest, component.length) {
+                return Err(Error::Corrupt { digest: component.digest });
+            }
+        }
+        Ok(())
+    }
+
+    fn write_switch(&mut self, switch: &mut Switch) -> Result<(), Error> {
+        switch.write(&self.folder.join(SWITCH)).map_err(io_error("writing the switch record"))
+    }
+
+    fn collect(&mut self, keep: &BTreeSet<Digest>) -> Result<(), Error> {
+        let switch = Switch::read(&self.folder.join(SWITCH)).map_err(io_error("reading the switch record"))?;
+        let mut named: BTreeSet<Digest> = keep.clone();
+        for (id, set) in self.sets()? {
+            if switch.names(&id.to_string()) || keep.contains(&id) {
+                named.insert(id);
+                named.extend(set.components.values().map(|c| c.digest));
+            }
+        }
+        let collect = || {
+            for entry in fs::read_dir(&self.folder)? {
+                let entry = entry?;
+                let name = entry.file_name().to_string_lossy().into_owned();
+                let half = name.strip_suffix(".new").is_some_and(|name| name.parse::<Digest>().is_ok());
+                if half || name.parse::<Digest>().is_ok_and(|id| !named.contains(&id)) {
+                    // Without its page it is no set any more, whatever is left of it.
+                    remove(&entry.path().join(SET_FILE))?;
+                    fs::remove_dir_all(entry.path())?;
+                }
+            }
+            for entry in fs::read_dir(self.folder.join(CONTENT))? {
+                let entry = entry?;
+                let name = entry.file_name().to_string_lossy().into_owned();
+                let digest = name.split('.').next().and_then(|name| name.parse::<Digest>().ok());
+                if digest.is_none_or(|digest| !named.contains(&digest)) {
+                    remove(&entry.path())?;
+                }
+            }
+            Ok(())
+        };
+        self.part = None;
+        collect().map_err(io_error("deleting what nobody needs"))
+    }
+}

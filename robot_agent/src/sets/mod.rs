@@ -1,0 +1,134 @@
+//! The software of a robot as files: content by digest, whole sets made of it, and the switch between them.
+//!
+//! Invariant: a set that the switch record names is whole and was read back from where it lies; nothing it needs is deleted. Every verb
+//! may be cut off anywhere and be done again. Two of them: [`disk`] for robots, [`memory`] for swarms and simulations; one contract suite
+//! runs over both.
+
+mod content;
+pub mod disk;
+pub mod memory;
+
+use crate::switch::Switch;
+use midshift_bundle::digest::Digest;
+use midshift_bundle::set::SetManifest;
+use std::collections::{BTreeMap, BTreeSet};
+use std::io;
+use std::ops::Range;
+
+/// Bytes of one chunk: what a bitmap counts.
+pub const CHUNK_BYTES: u64 = 256 * 1024;
+/// Chunks after which a download is made durable.
+pub const CHUNKS_UNSYNCED_MAX: u64 = 16;
+
+/// Why the sets could not be used.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The disk refused.
+    #[error("{doing}: {source}")]
+    Io {
+        /// What was being done.
+        doing: &'static str,
+        /// Why not.
+        source: io::Error,
+    },
+    /// The bytes are not those that were asked for.
+    #[error("{digest} has other bytes than it should")]
+    Corrupt {
+        /// What it should be.
+        digest: Digest,
+    },
+    /// There is no such set or content.
+    #[error("{0} is not there")]
+    Missing(Digest),
+}
+
+impl Error {
+    /// Whether there is no room.
+    pub fn is_full(&self) -> bool {
+        matches!(self, Self::Io { source, .. } if source.kind() == io::ErrorKind::StorageFull)
+    }
+}
+
+/// A file by what is in it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Wanted {
+    /// Of its bytes.
+    pub digest: Digest,
+    /// Bytes.
+    pub length: u64,
+}
+
+/// What is there.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Holdings {
+    /// What runs and what is kept.
+    pub switch: Switch,
+    /// Whole sets by id.
+    pub sets: BTreeMap<Digest, SetManifest>,
+    /// Bytes of room.
+    pub free_bytes: u64,
+}
+
+impl Holdings {
+    /// What is in a set that the switch record names: the factory's has no components.
+    pub fn set(&self, name: &str) -> Option<SetManifest> {
+        if name == crate::switch::FACTORY {
+            return Some(SetManifest::default());
+        }
+        self.sets.get(&name.parse().ok()?).cloned()
+    }
+}
+
+/// Keeps the software of one robot. Calls block; the shell makes them where that does no harm.
+pub trait Sets: Send {
+    /// What is there.
+    ///
+    /// # Errors
+    /// A disk that cannot be read, or a damaged switch record.
+    fn holdings(&mut self) -> Result<Holdings, Error>;
+    /// Ranges of a file that are not durable here, whole chunks, ascending. Empty: all of it is.
+    ///
+    /// # Errors
+    /// The disk's.
+    fn missing(&mut self, wanted: &Wanted) -> Result<Vec<Range<u64>>, Error>;
+    /// Takes bytes that begin and end at chunks, or at the end of the file. Durable after [`Sets::sync`].
+    ///
+    /// # Errors
+    /// The disk's; `InvalidInput` for bytes that do not lie so.
+    fn write(&mut self, wanted: &Wanted, offset: u64, bytes: &[u8]) -> Result<(), Error>;
+    /// What was written is durable, and stays if the power goes.
+    ///
+    /// # Errors
+    /// The disk's.
+    fn sync(&mut self, wanted: &Wanted) -> Result<(), Error>;
+    /// Checks the whole file from the same handle that was written and makes it content. Nothing to do if it is that already.
+    ///
+    /// # Errors
+    /// [`Error::Corrupt`]: all of it is thrown away.
+    fn seal(&mut self, wanted: &Wanted) -> Result<(), Error>;
+    /// Content in memory, for small files.
+    ///
+    /// # Errors
+    /// If it is not there, or has more than `most` bytes.
+    fn read(&mut self, digest: &Digest, most: u64) -> Result<Vec<u8>, Error>;
+    /// Makes a set of content that is there and reads it back. Nothing to do if it is there already.
+    ///
+    /// # Errors
+    /// Content that is missing or not what it should be; the disk's.
+    fn stage(&mut self, set: &SetManifest) -> Result<(), Error>;
+    /// Reads every file of a set again.
+    ///
+    /// # Errors
+    /// What is missing or wrong.
+    fn verify(&mut self, id: &Digest) -> Result<(), Error>;
+    /// Replaces the switch record.
+    ///
+    /// # Errors
+    /// The disk's: the old one or this is there.
+    fn write_switch(&mut self, switch: &mut Switch) -> Result<(), Error>;
+    /// Deletes sets and content that neither the switch record nor `keep` names.
+    ///
+    /// # Errors
+    /// The disk's.
+    fn collect(&mut self, keep: &BTreeSet<Digest>) -> Result<(), Error>;
+}

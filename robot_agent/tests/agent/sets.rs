@@ -1,0 +1,308 @@
+//! The contract of a robot's sets, over the disk and over memory.
+
+use midshift_agent::launcher::{PROGRAM, SWITCH};
+use midshift_agent::sets::disk::DiskSets;
+use midshift_agent::sets::memory::MemorySets;
+use midshift_agent::sets::{CHUNK_BYTES, CHUNKS_UNSYNCED_MAX, Error, Sets, Wanted};
+use midshift_agent::switch::Switch;
+use midshift_bundle::digest::Digest;
+use midshift_bundle::manifest::{Component, ComponentKind, Migration, Needs, SafetyClass};
+use midshift_bundle::set::SetManifest;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::path::Path;
+use tempfile::TempDir;
+
+/// Sets that can be opened again after a crash.
+enum Place {
+    Disk(TempDir),
+    Memory(MemorySets),
+}
+
+impl Place {
+    fn both() -> [Self; 2] {
+        [Self::Disk(tempfile::tempdir().expect("a folder")), Self::Memory(MemorySets::new())]
+    }
+    fn open(&self) -> Box<dyn Sets> {
+        match self {
+            Self::Disk(folder) => Box::new(DiskSets::open(folder.path()).expect("opens")),
+            Self::Memory(sets) => Box::new(sets.clone()),
+        }
+    }
+    /// The power goes. A disk keeps what was written and not synced or not, as it likes; marks it keeps only if they were synced.
+    fn cut(&self, sets: Box<dyn Sets>) -> Box<dyn Sets> {
+        drop(sets);
+        if let Self::Memory(sets) = self {
+            sets.lose_power();
+        }
+        self.open()
+    }
+    /// One byte changes where it lies.
+    fn rot(&self, digest: &Digest) {
+        match self {
+            Self::Disk(folder) => {
+                let path = folder.path().join("content").join(digest.to_string());
+                let mut bytes = fs::read(&path).expect("is there");
+                bytes[0] ^= 1;
+                fs::write(&path, bytes).expect("writes");
+            }
+            Self::Memory(sets) => sets.rot(digest),
+        }
+    }
+}
+
+fn bytes(seed: u8, length: u64) -> Vec<u8> {
+    (0..length).map(|at| seed.wrapping_add((at % 251) as u8)).collect()
+}
+
+fn wanted(content: &[u8]) -> Wanted {
+    Wanted { digest: Digest::of(content), length: content.len() as u64 }
+}
+
+fn put(sets: &mut dyn Sets, content: &[u8]) -> Wanted {
+    let wanted = wanted(content);
+    for range in sets.missing(&wanted).expect("tells") {
+        let part = &content[range.start as usize..range.end as usize];
+        sets.write(&wanted, range.start, part).expect("writes");
+    }
+    sets.sync(&wanted).expect("syncs");
+    sets.seal(&wanted).expect("seals");
+    wanted
+}
+
+fn component(name: &str, kind: ComponentKind, content: &[u8]) -> Component {
+    Component {
+        name: name.to_owned(),
+        version: "1.0.0".to_owned(),
+        kind,
+        hardware: BTreeSet::new(),
+        capabilities: BTreeSet::new(),
+        requires: BTreeMap::new(),
+        conflicts: BTreeMap::new(),
+        task_schema: (1, 1),
+        rollback_index: 0,
+        safety_class: SafetyClass::None,
+        needs: Needs::Restart,
+        data_migration: Migration::None,
+        digest: Digest::of(content),
+        length: content.len() as u64,
+    }
+}
+
+fn set(version: &str, program: &[u8], settings: &[u8]) -> SetManifest {
+    let components =
+        [component("gait", ComponentKind::Process, program), component("behaviour", ComponentKind::Config, settings)];
+    SetManifest {
+        bundle: Some(Digest::of(version.as_bytes())),
+        version: version.to_owned(),
+        components: components.into_iter().map(|c| (c.name.clone(), c)).collect(),
+    }
+}
+
+fn staged(sets: &mut dyn Sets, version: &str, program: &[u8], settings: &[u8]) -> SetManifest {
+    let set = set(version, program, settings);
+    put(sets, program);
+    put(sets, settings);
+    sets.stage(&set).expect("stages");
+    set
+}
+
+#[test]
+fn a_download_goes_on_after_a_power_cut_where_it_was_durable() {
+    for place in Place::both() {
+        let content = bytes(1, 5 * CHUNK_BYTES + 77);
+        let (wanted, chunk) = (wanted(&content), CHUNK_BYTES as usize);
+        let mut sets = place.open();
+        assert_eq!(sets.missing(&wanted).expect("tells"), [0..wanted.length]);
+        sets.write(&wanted, 0, &content[..2 * chunk]).expect("writes");
+        sets.sync(&wanted).expect("syncs");
+        sets.write(&wanted, 3 * CHUNK_BYTES, &content[3 * chunk..4 * chunk]).expect("writes");
+        let mut sets = place.cut(sets);
+        assert_eq!(sets.missing(&wanted).expect("tells"), [2 * CHUNK_BYTES..wanted.length], "the last was not synced");
+        put(&mut *sets, &content);
+        assert_eq!(sets.missing(&wanted).expect("tells"), []);
+        assert_eq!(sets.read(&wanted.digest, wanted.length).expect("reads"), content);
+        assert!(sets.read(&wanted.digest, 10).is_err(), "longer than it may be");
+    }
+}
+
+#[test]
+fn a_long_download_is_durable_without_being_asked() {
+    let place = Place::Disk(tempfile::tempdir().expect("a folder"));
+    let content = bytes(1, (CHUNKS_UNSYNCED_MAX + 1) * CHUNK_BYTES);
+    let wanted = wanted(&content);
+    let mut sets = place.open();
+    for (at, chunk) in content.chunks(CHUNK_BYTES as usize).enumerate() {
+        sets.write(&wanted, at as u64 * CHUNK_BYTES, chunk).expect("writes");
+    }
+    let mut sets = place.cut(sets);
+    assert_eq!(sets.missing(&wanted).expect("tells"), [CHUNKS_UNSYNCED_MAX * CHUNK_BYTES..wanted.length]);
+}
+
+#[test]
+fn bytes_that_are_not_what_they_should_be_are_thrown_away_whole() {
+    for place in Place::both() {
+        let content = bytes(1, CHUNK_BYTES + 1);
+        let (mut sets, wanted) = (place.open(), wanted(&content));
+        sets.write(&wanted, 0, &bytes(2, wanted.length)).expect("writes");
+        sets.sync(&wanted).expect("syncs");
+        assert!(matches!(sets.seal(&wanted), Err(Error::Corrupt { .. })));
+        assert_eq!(sets.missing(&wanted).expect("tells"), [0..wanted.length]);
+        sets.write(&wanted, 0, &content[..CHUNK_BYTES as usize]).expect("writes");
+        assert!(matches!(sets.seal(&wanted), Err(Error::Corrupt { .. })), "its end is missing");
+        put(&mut *sets, &content);
+    }
+}
+
+#[test]
+fn bytes_beside_the_chunks_or_beyond_the_end_are_refused() {
+    for place in Place::both() {
+        let content = bytes(1, CHUNK_BYTES + 1);
+        let (mut sets, wanted) = (place.open(), wanted(&content));
+        for (offset, length) in [(1, CHUNK_BYTES), (0, 7), (CHUNK_BYTES, 2), (u64::MAX, 1)] {
+            assert!(sets.write(&wanted, offset, &bytes(1, length)).is_err(), "{offset}+{length}");
+        }
+        assert_eq!(sets.missing(&wanted).expect("tells"), [0..wanted.length]);
+    }
+}
+
+#[test]
+fn a_set_is_made_of_content_that_is_there_and_read_back() {
+    for place in Place::both() {
+        let mut sets = place.open();
+        let incomplete = set("v1", b"program", b"settings");
+        put(&mut *sets, b"program");
+        assert!(matches!(sets.stage(&incomplete), Err(Error::Missing(_))));
+        assert_eq!(sets.holdings().expect("tells").sets, BTreeMap::new());
+        let whole = staged(&mut *sets, "v1", b"program", b"settings");
+        sets.stage(&whole).expect("again does nothing");
+        sets.verify(&whole.id()).expect("is whole");
+        let holdings = place.cut(sets).holdings().expect("tells");
+        assert_eq!(holdings.sets, BTreeMap::from([(whole.id(), whole.clone())]));
+        assert_eq!(holdings.set(&whole.id().to_string()), Some(whole));
+        assert_eq!(holdings.set("factory"), Some(SetManifest::default()));
+    }
+}
+
+#[test]
+fn a_set_whose_bytes_changed_on_the_disk_is_found_out_and_can_come_again() {
+    for place in Place::both() {
+        let mut sets = place.open();
+        let set = staged(&mut *sets, "v1", b"program", b"settings");
+        place.rot(&Digest::of(b"settings"));
+        assert!(matches!(sets.verify(&set.id()), Err(Error::Corrupt { .. })));
+        assert!(matches!(sets.stage(&set), Err(Error::Corrupt { .. })));
+        put(&mut *sets, b"settings");
+        sets.stage(&set).expect("stages");
+    }
+}
+
+#[test]
+fn only_what_nobody_names_is_deleted() {
+    for place in Place::both() {
+        let mut sets = place.open();
+        let old = staged(&mut *sets, "v1", b"program", b"one");
+        let kept = staged(&mut *sets, "v2", b"program", b"two");
+        let running = staged(&mut *sets, "v3", b"program", b"three");
+        let incoming = staged(&mut *sets, "v4", b"program", b"four");
+        let mut switch = Switch::default();
+        for set in [&kept, &running] {
+            switch.try_out(&set.id().to_string());
+            switch.commit();
+        }
+        sets.write_switch(&mut switch).expect("writes");
+        let coming = wanted(&bytes(3, 10));
+        sets.write(&coming, 0, &bytes(3, 10)).expect("writes");
+        sets.sync(&coming).expect("syncs");
+        sets.collect(&BTreeSet::from([incoming.id(), coming.digest])).expect("collects");
+        let ids: Vec<Digest> = sets.holdings().expect("tells").sets.into_keys().collect();
+        let expected: BTreeSet<Digest> = [&kept, &running, &incoming].map(SetManifest::id).into();
+        assert_eq!(ids, expected.into_iter().collect::<Vec<_>>());
+        assert!(sets.read(&Digest::of(b"one"), 10).is_err(), "nobody else has it");
+        assert!(sets.read(&Digest::of(b"program"), 10).is_ok(), "others have it");
+        assert_eq!(sets.missing(&coming).expect("tells"), [], "a download is kept");
+        assert!(sets.verify(&old.id()).is_err());
+        for set in [&kept, &running, &incoming] {
+            sets.verify(&set.id()).expect("is whole");
+        }
+    }
+}
+
+#[test]
+fn the_switch_record_survives_and_counts_its_writes() {
+    for place in Place::both() {
+        let mut sets = place.open();
+        let mut switch = sets.holdings().expect("tells").switch;
+        switch.try_out("v1");
+        sets.write_switch(&mut switch).expect("writes");
+        switch.commit();
+        sets.write_switch(&mut switch).expect("writes");
+        let found = place.cut(sets).holdings().expect("tells").switch;
+        assert_eq!((found.number, found.running(), found.kept()), (2, "v1", Some("factory")));
+    }
+}
+
+#[test]
+fn a_program_can_be_run_where_the_launcher_looks_for_it_and_takes_no_second_room() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut sets = DiskSets::open(folder.path()).expect("opens");
+    let set = staged(&mut sets, "v1", b"#!/bin/sh\nexit 7\n", b"settings");
+    let program = folder.path().join(set.id().to_string()).join(PROGRAM);
+    let file = fs::metadata(&program).expect("is there");
+    assert_eq!(file.permissions().mode() & 0o777, 0o755);
+    assert_eq!(file.nlink(), 3, "content, component and program are one file");
+    assert_eq!(fs::read(sets.component(&set.id().to_string(), "behaviour")).expect("reads"), b"settings");
+}
+
+#[test]
+fn a_set_that_was_half_deleted_or_half_made_is_none_and_is_made_again() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut sets = DiskSets::open(folder.path()).expect("opens");
+    let set = staged(&mut sets, "v1", b"program", b"settings");
+    let lies = folder.path().join(set.id().to_string());
+    fs::remove_file(lies.join("set.json")).expect("removes");
+    fs::create_dir(lies.with_extension("new")).expect("makes");
+    assert_eq!(sets.holdings().expect("tells").sets, BTreeMap::new());
+    sets.stage(&set).expect("stages");
+    sets.collect(&BTreeSet::from([set.id()])).expect("collects");
+    assert!(!Path::new(&lies.with_extension("new")).exists());
+    sets.verify(&set.id()).expect("is whole");
+}
+
+#[test]
+fn a_damaged_switch_record_is_an_error_and_deletes_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut sets = DiskSets::open(folder.path()).expect("opens");
+    let set = staged(&mut sets, "v1", b"program", b"settings");
+    fs::write(folder.path().join(SWITCH), "midshift-switch 1\n").expect("writes");
+    assert!(sets.holdings().is_err());
+    assert!(sets.collect(&BTreeSet::new()).is_err());
+    sets.verify(&set.id()).expect("is whole");
+}
+
+#[test]
+fn no_room_is_told_from_other_errors() {
+    let sets = MemorySets::new();
+    sets.limit(100);
+    let error = sets.clone().missing(&wanted(&bytes(1, 101))).expect_err("does not fit");
+    assert!(error.is_full());
+    assert!(!Error::Missing(Digest::of(b"")).is_full());
+}
+
+#[test]
+fn sizes_around_2_31_and_2_32_are_files_like_others() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut sets = DiskSets::open(folder.path()).expect("opens");
+    for length in [(1_u64 << 31) - 1, 1 << 31, (1 << 31) + 1, (1 << 32) - 1, 1 << 32, (1 << 32) + 1] {
+        let wanted = Wanted { digest: Digest::of(&length.to_be_bytes()), length };
+        let last = (length - 1) / CHUNK_BYTES * CHUNK_BYTES;
+        sets.write(&wanted, last, &bytes(1, length - last)).expect("writes");
+        sets.sync(&wanted).expect("syncs");
+        assert_eq!(sets.missing(&wanted).expect("tells"), [0..last]);
+        let part = folder.path().join("content").join(format!("{}.part", wanted.digest));
+        assert_eq!(fs::metadata(part).expect("is there").len(), length);
+        let mut again = DiskSets::open(folder.path()).expect("opens");
+        assert_eq!(again.missing(&wanted).expect("tells"), [0..last], "{length}");
+    }
+}
