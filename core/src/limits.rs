@@ -80,6 +80,12 @@ pub const GROUP_COMMIT_BYTES: usize = 1024 * 1024;
 pub const COMMIT_SLICE_ITEMS: usize = 256;
 /// Bytes of row bodies of one caller that one group commit takes at most, but for a single item.
 pub const COMMIT_SLICE_BYTES: usize = GROUP_COMMIT_BYTES / 4;
+/// Largest generation, epoch or sequence number that is believed: 2^52 unix milliseconds are 142,000 years, and what is made of it fits 64 bits.
+pub const COUNTED_MAX: u64 = 1 << 52;
+/// Points of one route: with the steps of a task it fits an item and a message. A longer task is split by whoever asks for it.
+pub const ROUTE_POINTS_MAX: usize = 2_048;
+/// Robots or tasks let go by one item of a resume: each costs up to 8 rows.
+pub const RESUMES_PER_ITEM: usize = 16;
 /// Rows one item may touch, and facts it may state.
 pub const ITEM_ROWS_MAX: usize = 256;
 /// Samples in one uplink message.

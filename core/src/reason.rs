@@ -94,6 +94,8 @@ codes! {
     RobotUnlocated = "ROBOT_UNLOCATED", "The robot has not reported a waypoint of this site.";
     BatteryLow = "BATTERY_LOW", "The charge does not reach pickup, drop and a charger with its reserve.";
     NoRoute = "NO_ROUTE", "No lane leads there.";
+    EntryPassedOver = "ENTRY_PASSED_OVER", "An entry of the log could not be obeyed and was passed over; the server's log has the details.";
+    RouteTooLong = "ROUTE_TOO_LONG", "The way through all goals of the task has more points than a robot takes. Split the task.";
     PlaceBlocked = "PLACE_BLOCKED", "A place on the way is quarantined. A person must look and clear it.";
     ExcludedAfterFailure = "EXCLUDED_AFTER_FAILURE", "The robot failed this task and the task asks for another.";
     BoundElsewhere = "BOUND_ELSEWHERE", "The task is opened: its item is on another robot.";

@@ -189,10 +189,11 @@ pub struct WorkStats {
 
 impl std::ops::AddAssign for WorkStats {
     fn add_assign(&mut self, other: Self) {
-        self.path_mm += other.path_mm;
-        self.loaded_path_mm += other.loaded_path_mm;
-        self.duration_ms += other.duration_ms;
-        self.energy_mwh += other.energy_mwh;
+        // Robots say these numbers: absurd ones spoil a sum and nothing else.
+        self.path_mm = self.path_mm.saturating_add(other.path_mm);
+        self.loaded_path_mm = self.loaded_path_mm.saturating_add(other.loaded_path_mm);
+        self.duration_ms = self.duration_ms.saturating_add(other.duration_ms);
+        self.energy_mwh = self.energy_mwh.saturating_add(other.energy_mwh);
         self.hottest_joint_decidegrees = self.hottest_joint_decidegrees.max(other.hottest_joint_decidegrees);
     }
 }

@@ -25,6 +25,6 @@ pub fn anchor(view: &View, robot_id: &RobotId, board: &Board, valid: LinkDuratio
 /// Less than half of its life is left, or it belongs to another session.
 pub fn is_worn(authority: &Authority, live: Option<&Live>) -> bool {
     let Some(live) = live else { return false };
-    let age_ms = live.report.hb.saturating_sub(authority.hb) * limits::HEARTBEAT.as_ms();
-    authority.session_epoch != live.report.session_epoch || age_ms * 2 >= authority.valid_ms
+    let age_ms = live.report.hb.saturating_sub(authority.hb).saturating_mul(limits::HEARTBEAT.as_ms());
+    authority.session_epoch != live.report.session_epoch || age_ms >= authority.valid_ms / 2
 }

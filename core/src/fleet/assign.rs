@@ -16,6 +16,7 @@ use crate::reason::Code;
 use crate::task::spec::Class;
 use crate::task::{Event, Phase, TaskIntake, TaskState};
 use crate::time::{Now, Utc};
+use crate::work::Session;
 use std::collections::BTreeSet;
 
 /// Waiting tasks looked at in one cycle at most; the rest keep their order and come next.
@@ -98,6 +99,7 @@ fn arm_once(view: &mut View, now: Now, plan: &mut Plan, task_id: &TaskId) {
 /// Writes one offer.
 fn offer(tx: &mut Tx, task: &TaskState, intake: &TaskIntake, robot_id: &RobotId, board: &Board) {
     let Some(anchor) = anchor(tx.view, robot_id, board, limits::OFFER_VALID) else { return };
+    tx.rely::<Session>(robot_id.as_str());
     let attempt = AttemptId { subject: Subject::Task(task.task_id.clone()), epoch: task.epoch + 1 };
     let mut granted = task.clone();
     granted.epoch += 1;

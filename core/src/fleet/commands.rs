@@ -1,6 +1,6 @@
 //! What people ask of fleet directly: cordon and uncordon, rules of an area, clearing a place. Each is one item, answered after its commit.
 
-use super::rows::{Cordon, HolderState, Place, RobotControl};
+use super::rows::{Cordon, HolderState, Place, PlaceHolder, RobotControl};
 use super::tx::Tx;
 use super::view::View;
 use super::{Board, heard};
@@ -67,8 +67,13 @@ pub fn check(
             let Some(row) = view.places.get(place_id.as_str()) else {
                 return Err(Refusal::new(Kind::NotFound, Reason::from(Code::PlaceNotFound).with("place_id", place_id)));
             };
-            let heard = |r: &RobotId| heard::presence(board, r, now) == Presence::Online;
-            if let Some(h) = row.row.holders.iter().find(|h| h.state == HolderState::Inside && heard(&h.robot_id)) {
+            // One inside is believed while it is heard; one that may still enter is let go only when its permission must be over.
+            let may_be_there = |h: &&PlaceHolder| match heard::presence(board, &h.robot_id, now) {
+                Presence::Online => true,
+                Presence::Suspect | Presence::Updating => h.state != HolderState::Inside,
+                Presence::Offline => false,
+            };
+            if let Some(h) = row.row.holders.iter().find(may_be_there) {
                 return Err(Refusal::new(
                     Kind::Precondition,
                     Reason::from(Code::PlaceNotClear).with("robot_id", &h.robot_id),
@@ -105,7 +110,8 @@ pub fn apply(tx: &mut Tx, command: &Command, actor: &str) {
             let robots: Vec<RobotId> = tx.view.sessions.values().map(|s| s.row.robot_id.clone()).collect();
             tx.view.policy_dirty.extend(robots);
         }
-        Command::ClearPlace { place_id, .. } => {
+        Command::ClearPlace { place_id, reason } => {
+            tx.tell(place_id.as_str(), "place.judged_clear", &serde_json::json!({"actor": actor, "reason": reason}));
             let Some(place) = tx.view.places.get(place_id.as_str()).map(|p| p.row.clone()) else { return };
             tx.put(Place { holders: Vec::new(), quarantine: None, ..place }, "place.cleared");
         }

@@ -16,7 +16,7 @@ use crate::site::{Kind, WaypointIx};
 use crate::task::AttemptPhase;
 use crate::task::state::{Errand, Uncertain};
 use crate::time::Now;
-use crate::work::{AttemptReport, WorkState};
+use crate::work::{AttemptReport, Session, WorkState};
 use std::collections::BTreeMap;
 
 /// Errands that are on their way to a stop.
@@ -113,6 +113,7 @@ fn free(
 
 fn begin(tx: &mut Tx, robot_id: &RobotId, errand: Errand, goal: WaypointIx, board: &Board) {
     let Some(anchor) = anchor(tx.view, robot_id, board, limits::OFFER_VALID) else { return };
+    tx.rely::<Session>(robot_id.as_str());
     let known = tx.view.control.get(robot_id.as_str()).map(|c| c.row.clone());
     let mut control = known.unwrap_or_else(|| RobotControl::new(robot_id.clone()));
     control.errands += 1;

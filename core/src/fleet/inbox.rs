@@ -2,7 +2,7 @@
 //!
 //! Invariant: a report counts only for the newest epoch of its task; older ones are fenced and counted, never obeyed.
 
-use super::rows::{HoldToken, HolderState};
+use super::rows::{HoldToken, HolderState, RobotControl};
 use super::tasks::{News, event_of, happen};
 use super::tx::Tx;
 use super::{Tally, errands, tasks};
@@ -91,10 +91,13 @@ fn mode_changed(tx: &mut Tx, robot_id: &RobotId, mode: Mode) {
     if mode == Mode::Automatic {
         return;
     }
-    let task_id = tx.view.held_by(robot_id).and_then(|a| a.subject.task_id().cloned());
-    if let Some(task_id) = task_id {
-        let why = Reason::from(Code::ManualMode).with("robot_id", robot_id);
-        happen(tx, &task_id, News::of(Event::LeaseOver, Some(&why)));
+    let why = Reason::from(Code::ManualMode).with("robot_id", robot_id);
+    match tx.view.held_by(robot_id).map(|a| a.subject.task_id().cloned()) {
+        Some(Some(task_id)) => {
+            happen(tx, &task_id, News::of(Event::LeaseOver, Some(&why)));
+        }
+        Some(None) => errands::lease_over(tx, robot_id, why),
+        None => {}
     }
 }
 
@@ -116,11 +119,18 @@ pub fn hardware_stop(tx: &mut Tx, robot_id: &RobotId, stop: HardwareStop) {
     if stop != HardwareStop::None && !stands {
         tx.delete::<HoldToken>(&HoldToken::id_of(robot_id, &resume), "hold.replaced");
         tx.put(HoldToken { robot_id: robot_id.clone(), token: stopped, since }, "hold.stopped");
+        touch(tx, robot_id);
         holds_changed(tx, robot_id);
     } else if stop == HardwareStop::None && stands {
         tx.delete::<HoldToken>(&HoldToken::id_of(robot_id, &stopped), "hold.released");
         tx.put(HoldToken { robot_id: robot_id.clone(), token: resume, since }, "hold.awaits_resume");
     }
+}
+
+/// Every offer writes the robot's control row: one that was planned without the token that has just come is lost.
+fn touch(tx: &mut Tx, robot_id: &RobotId) {
+    let known = tx.view.control.get(robot_id.as_str()).map(|c| c.row.clone());
+    tx.put(known.unwrap_or_else(|| RobotControl::new(robot_id.clone())), "robot.held");
 }
 
 /// Tells the robot's task that a token came or that the last one went.

@@ -28,8 +28,8 @@ pub mod view;
 pub mod way;
 
 use crate::ids::RobotId;
-use crate::reason::Code;
-use crate::rows::{Entry, Item, Log, Table};
+use crate::reason::{Code, Reason};
+use crate::rows::{Entry, Item, Log, Seq, Table, Write};
 use crate::task::{Event, Phase, TaskRequest};
 use crate::time::Now;
 use crate::work::{InboxEntry, Live};
@@ -101,7 +101,7 @@ pub const LOGS: &[Log] = &[Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbo
 
 /// Takes entries of the feed, in commit order: rows into the view, requests and robots' events into decisions.
 pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
-    let consumed = view.marks.get("fleet").map_or(crate::rows::Seq(0), |m| m.row.seq);
+    let consumed = view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq);
     for entry in entries {
         if let Some(table) = entry.table.filter(|_| entry.seq > view.read_at) {
             let key = crate::rows::Key { table, id: entry.subject.clone() };
@@ -111,6 +111,10 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
         }
         view.absorbed = view.absorbed.max(entry.seq);
         if entry.seq <= consumed {
+            continue;
+        }
+        if view.unusable.contains(&entry.seq) {
+            plan.decide(view, now, "fleet", |tx| pass_over(tx, entry));
             continue;
         }
         match (entry.log, entry.table, &entry.body) {
@@ -126,21 +130,39 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
                 Err(error) => plan.report.unreadable.push(format!("inbox {}: {error}", entry.seq.0)),
             },
             (Log::Task, Some(Table::TaskRequest), Some(body)) => match serde_json::from_str::<TaskRequest>(body) {
-                Ok(request) => {
-                    let actor = request.actor.clone();
-                    let mut tx = Tx::new(view, now, &actor).on_request(entry.request_id.as_deref());
-                    requests::take(&mut tx, &request);
-                    mark(&mut tx, entry.seq);
-                    plan.items.extend(tx.finish());
-                }
+                Ok(request) => requests::take(view, now, &request, entry, plan),
                 Err(error) => plan.report.unreadable.push(format!("request {}: {error}", entry.seq.0)),
             },
+            (Log::Telemetry, None, _) if &*entry.kind == CLONE_SEEN => {
+                plan.decide(view, now, "fleet", |tx| {
+                    let robot_id = RobotId::parse(&entry.subject).ok();
+                    tasks::open_incident(tx, Code::CloneSeen.into(), robot_id.as_ref(), None);
+                    mark(tx, entry.seq);
+                });
+            }
             _ => {}
         }
     }
 }
 
-fn mark(tx: &mut Tx, seq: crate::rows::Seq) {
+/// What an entry asks for can never be written: a person is told, and the rest of the log goes on.
+fn pass_over(tx: &mut Tx, entry: &Entry) {
+    let reason = Reason::from(Code::EntryPassedOver).with("seq", entry.seq.0).with("kind", &entry.kind);
+    tasks::open_incident(tx, reason, None, None);
+    mark(tx, entry.seq);
+}
+
+/// The entry of the feed that an item obeys: the mark it writes.
+pub fn obeyed(item: &Item) -> Option<Seq> {
+    let mark = item.rows.iter().find(|row| row.key.table == Table::FleetMark)?;
+    let Write::Put { body, .. } = &mark.write else { return None };
+    serde_json::from_str::<FleetMark>(body).ok().map(|mark| mark.seq)
+}
+
+/// Kind of the fact that a second machine has attached with a robot's name, stated by telemetry.
+pub const CLONE_SEEN: &str = "session.clone_seen";
+
+fn mark(tx: &mut Tx, seq: Seq) {
     tx.put(FleetMark { seq }, "fleet.consumed");
 }
 

@@ -4,20 +4,44 @@ use super::inbox::holds_changed;
 use super::rows::HoldToken;
 use super::tasks::{News, happen};
 use super::tx::Tx;
+use super::view::View;
+use super::{Plan, mark};
 use crate::ids::{AreaId, RobotId, TaskId};
+use crate::limits;
 use crate::reason::{Code, Reason};
+use crate::rows::{Entry, Seq};
 use crate::task::{Ask, Event, Phase, Resolution, TaskRequest};
-use std::collections::BTreeSet;
+use crate::time::Now;
 
-/// Obeys one request.
-pub fn take(tx: &mut Tx, request: &TaskRequest) {
-    match &request.ask {
-        Ask::Cancel { task_id, force } => cancel(tx, task_id, *force, request),
-        Ask::Resolve { task_id, resolution } => resolve(tx, task_id, *resolution, request),
+/// Obeys one request. The mark that it was obeyed goes with the last item: what was lost on the way is done again.
+pub fn take(view: &mut View, now: Now, request: &TaskRequest, entry: &Entry, plan: &mut Plan) {
+    let resumes = match &request.ask {
         Ask::ResumeHeld { stop_id, area_id, task_ids, robot_ids } => {
-            resume(tx, stop_id.as_deref(), area_id.as_ref(), task_ids, robot_ids);
+            resumes(view, stop_id.as_deref(), area_id.as_ref(), task_ids, robot_ids)
         }
+        Ask::Cancel { .. } | Ask::Resolve { .. } => Vec::new(),
+    };
+    let mut decide = |decision: &mut dyn FnMut(&mut Tx)| {
+        let mut tx = Tx::new(view, now, &request.actor).on_request(entry.request_id.as_deref());
+        decision(&mut tx);
+        plan.items.extend(tx.finish());
+    };
+    for some in resumes.chunks(limits::RESUMES_PER_ITEM) {
+        decide(&mut |tx| {
+            some.iter().for_each(|one| resume(tx, one));
+            // The mark stays where it is and is written all the same: an item of this request that is lost takes the later ones with it.
+            let before = tx.view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq);
+            mark(tx, before);
+        });
     }
+    decide(&mut |tx| {
+        match &request.ask {
+            Ask::Cancel { task_id, force } => cancel(tx, task_id, *force, request),
+            Ask::Resolve { task_id, resolution } => resolve(tx, task_id, *resolution, request),
+            Ask::ResumeHeld { .. } => {}
+        }
+        mark(tx, entry.seq);
+    });
 }
 
 fn cancel(tx: &mut Tx, task_id: &TaskId, force: bool, request: &TaskRequest) {
@@ -71,44 +95,56 @@ fn resolve(tx: &mut Tx, task_id: &TaskId, resolution: Resolution, request: &Task
     happen(tx, task_id, News::of(event, Some(&why)));
 }
 
-/// Takes `resume:` tokens away. Nothing named: of all robots and tasks.
-fn resume(tx: &mut Tx, stop_id: Option<&str>, area_id: Option<&AreaId>, task_ids: &[TaskId], robot_ids: &[RobotId]) {
+/// One thing that is let go.
+enum Resume {
+    /// A token of a robot.
+    Robot(HoldToken),
+    /// Tokens of a task that this takes away.
+    Task(TaskId, Vec<String>),
+}
+
+/// What a resume lets go: `resume:` tokens of the robots and tasks that are named, or that stand in the area.
+fn resumes(
+    view: &View,
+    stop_id: Option<&str>,
+    area_id: Option<&AreaId>,
+    task_ids: &[TaskId],
+    robot_ids: &[RobotId],
+) -> Vec<Resume> {
     let wanted = |token: &str| match stop_id {
-        Some(stop) => token == format!("resume:{stop}"),
+        Some(stop) => token.strip_prefix("resume:") == Some(stop),
         None => token.starts_with("resume:"),
     };
+    // A stop that is named alone means everywhere; the service refuses a request that names nothing.
     let anywhere = area_id.is_none() && task_ids.is_empty() && robot_ids.is_empty();
-    let area_robots: BTreeSet<RobotId> = match area_id {
-        Some(area) => super::places::robots_in_area(tx.view, area),
-        None => BTreeSet::new(),
+    let area_robots = area_id.map(|area| super::places::robots_in_area(view, area)).unwrap_or_default();
+    let near = |robot: &RobotId| anywhere || robot_ids.contains(robot) || area_robots.contains(robot);
+    let works_on = |robot: &RobotId| {
+        view.held_by(robot).and_then(|a| a.subject.task_id()).is_some_and(|task| task_ids.contains(task))
     };
-    let of_task = |tx: &Tx, robot: &RobotId| {
-        tx.view.held_by(robot).and_then(|a| a.subject.task_id()).is_some_and(|t| task_ids.contains(t))
-    };
-    let tokens: Vec<HoldToken> = tx.view.holds.values().map(|h| h.row.clone()).filter(|h| wanted(&h.token)).collect();
-    for hold in tokens {
-        let robot = &hold.robot_id;
-        if anywhere || robot_ids.contains(robot) || area_robots.contains(robot) || of_task(tx, robot) {
-            tx.delete::<HoldToken>(&HoldToken::id_of(robot, &hold.token), "hold.resumed");
-            holds_changed(tx, robot);
+    let tokens = view.holds.values().map(|h| &h.row).filter(|h| wanted(&h.token));
+    let robots = tokens.filter(|h| near(&h.robot_id) || works_on(&h.robot_id)).cloned().map(Resume::Robot);
+    let tasks = view.tasks.values().map(|t| &t.row).filter_map(|t| {
+        let tokens: Vec<String> = t.holds.iter().filter(|h| wanted(h)).cloned().collect();
+        let named = task_ids.contains(&t.task_id) || t.robot_id.as_ref().map_or(anywhere, near);
+        (named && !tokens.is_empty()).then(|| Resume::Task(t.task_id.clone(), tokens))
+    });
+    robots.chain(tasks).collect()
+}
+
+fn resume(tx: &mut Tx, resume: &Resume) {
+    match resume {
+        Resume::Robot(hold) => {
+            tx.delete::<HoldToken>(&HoldToken::id_of(&hold.robot_id, &hold.token), "hold.resumed");
+            holds_changed(tx, &hold.robot_id);
         }
-    }
-    let held: Vec<TaskId> = tx
-        .view
-        .tasks
-        .values()
-        .filter(|t| t.row.holds.iter().any(|h| wanted(h)))
-        .map(|t| t.row.task_id.clone())
-        .collect();
-    for task_id in held {
-        let Some(mut task) = tx.view.task(&task_id).cloned() else { continue };
-        let near = task.robot_id.as_ref().is_some_and(|r| robot_ids.contains(r) || area_robots.contains(r));
-        if anywhere || near || task_ids.contains(&task_id) {
-            task.holds.retain(|h| !wanted(h));
+        Resume::Task(task_id, tokens) => {
+            let Some(mut task) = tx.view.task(task_id).cloned() else { return };
+            task.holds.retain(|h| !tokens.contains(h));
             let free = task.holds.is_empty();
             tx.put(task, "task.resumed");
             if free {
-                happen(tx, &task_id, News::of(Event::LastHoldGone, None));
+                happen(tx, task_id, News::of(Event::LastHoldGone, None));
             }
         }
     }

@@ -6,6 +6,7 @@ use super::rows::RobotHolder;
 use super::view::View;
 use super::{Board, heard, way};
 use crate::ids::{RobotId, Subject};
+use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::robot::{Duty, FaultClass, HardwareStop, Mode, Presence, StopLevel};
 use crate::site::WaypointIx;
@@ -118,7 +119,11 @@ pub fn pair(
     }
     let (here, goals) = journey(view, live, task, intake)?;
     place(view, here, &goals)?;
-    energy(view, live, here, &goals)
+    let work_mm = way::length_mm(view, here, &goals).ok_or(Code::NoRoute)?;
+    if way::is_too_long(view, here, &goals, work_mm) {
+        return Err(Reason::from(Code::RouteTooLong).with("points_max", limits::ROUTE_POINTS_MAX));
+    }
+    energy(view, live, here, goals.last().copied().unwrap_or(here), work_mm)
 }
 
 /// A robot that refused this task is asked again only once it has said something newer.
@@ -186,9 +191,7 @@ fn place(view: &View, here: WaypointIx, goals: &[WaypointIx]) -> Result<(), Reas
 }
 
 /// The charge must reach pickup, every other goal and the nearest charger, with its reserve.
-fn energy(view: &View, live: &Live, here: WaypointIx, goals: &[WaypointIx]) -> Result<(), Reason> {
-    let Some(work_mm) = way::length_mm(view, here, goals) else { return Err(Code::NoRoute.into()) };
-    let last = goals.last().copied().unwrap_or(here);
+fn energy(view: &View, live: &Live, here: WaypointIx, last: WaypointIx, work_mm: u64) -> Result<(), Reason> {
     let home_mm = match view.site.chargers().next() {
         Some(_) => view.site.chargers().filter_map(|c| view.router.distance_mm(last, c)).min().unwrap_or(0),
         None => return Ok(()),

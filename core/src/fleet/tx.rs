@@ -3,7 +3,7 @@
 //! Invariant: a row written twice in one decision stands in its item once, with the first expectation and the last body.
 
 use super::view::{Rowed, View, Viewed};
-use crate::rows::{Expect, Item, Key, Revision, Row, RowChange, Table, Write, Writer};
+use crate::rows::{Expect, Fact, Item, Key, Log, Revision, Row, RowChange, Table, Write, Writer};
 use crate::time::Now;
 use std::collections::BTreeMap;
 
@@ -42,6 +42,21 @@ impl<'a> Tx<'a> {
         };
         let old = R::slot(self.view).insert(key.id.to_string(), Rowed { revision, row: record });
         R::changed(self.view, &key.id, old.as_ref().map(|r| &r.row));
+    }
+    /// Guards a row that is only relied upon: if somebody else changes it first, this decision is not made.
+    pub fn rely<R: Viewed>(&mut self, id: &str) {
+        let key = Key::new(R::TABLE, id);
+        if self.at.contains_key(&key) {
+            return;
+        }
+        let known = R::slot(self.view).get(id).map(|r| r.revision);
+        self.at.insert(key.clone(), self.item.rows.len());
+        self.item.keep(key, known.map_or(Expect::Absent, Expect::At));
+    }
+    /// States a fact beside the rows.
+    pub fn tell(&mut self, subject: &str, kind: &'static str, body: &impl serde::Serialize) {
+        let body = serde_json::to_string(body).unwrap_or_else(|e| unreachable!("plain fields: {e}"));
+        self.item.facts.push(Fact { log: Log::Fleet, subject: subject.into(), kind, body: body.into() });
     }
     /// Deletes a row, if there is one.
     pub fn delete<R: Viewed>(&mut self, id: &str, kind: &'static str) {

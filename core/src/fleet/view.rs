@@ -123,6 +123,8 @@ pub struct View {
     pub attached: BTreeMap<RobotId, Attached>,
     /// The newest heartbeat of each robot, as (session epoch, number), that was compared with the rows and needs no second look. Volatile.
     pub compared: BTreeMap<RobotId, (u64, u64)>,
+    /// Entries of the feed whose items the store refused for good: passed over. Volatile.
+    pub unusable: BTreeSet<crate::rows::Seq>,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: super::bugs::Bugs,
     /// Distances and routes, remembered.
@@ -306,6 +308,7 @@ impl View {
             attached: BTreeMap::new(),
             place_waits: 0,
             compared: BTreeMap::new(),
+            unusable: BTreeSet::new(),
             bugs: super::bugs::Bugs::default(),
         }
     }

@@ -2,6 +2,7 @@
 
 use super::view::View;
 use crate::ids::WaypointId;
+use crate::limits;
 use crate::site::route::Blocked;
 use crate::site::{Site, WaypointIx};
 use crate::work::{RoutePoint, StepKind, WorkStep};
@@ -57,7 +58,15 @@ pub fn route(
         }
         at = goal;
     }
-    Some(points)
+    (points.len() <= limits::ROUTE_POINTS_MAX).then_some(points)
+}
+
+/// Whether a route of `work_mm` through all goals would have too many points. A bound decides for nearly all: only what might be too
+/// long is counted.
+pub fn is_too_long(view: &View, start: WaypointIx, goals: &[WaypointIx], work_mm: u64) -> bool {
+    let most = work_mm / u64::from(view.site.shortest_lane_mm()) + 2 * goals.len() as u64 + 1;
+    most > limits::ROUTE_POINTS_MAX as u64
+        && route(view, start, None, &goals.iter().map(|goal| (0, *goal)).collect::<Vec<_>>()).is_none()
 }
 
 fn point(site: &Site, from: Option<WaypointIx>, at: WaypointIx) -> RoutePoint {

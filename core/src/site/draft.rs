@@ -99,6 +99,7 @@ impl Draft {
             arriving_at: Vec::new(),
             waypoints,
             kinds,
+            shortest_lane_mm: lanes.iter().map(|lane| lane.length_mm).min().unwrap_or(1).max(1),
             lanes,
             places: passages,
             waypoint_names,

@@ -242,6 +242,7 @@ pub struct Site {
     /// Waypoints of each kind, ascending.
     kinds: BTreeMap<Kind, Vec<WaypointIx>>,
     lanes: Vec<Lane>,
+    shortest_lane_mm: u32,
     places: Vec<Place>,
     waypoint_names: BTreeMap<WaypointId, WaypointIx>,
     place_names: BTreeMap<PlaceId, PlaceIx>,
@@ -289,6 +290,10 @@ impl Site {
     /// Every lane, by [`LaneIx`], sorted by (from, to).
     pub fn lanes(&self) -> &[Lane] {
         &self.lanes
+    }
+    /// Millimetres of the shortest lane, at least 1.
+    pub fn shortest_lane_mm(&self) -> u32 {
+        self.shortest_lane_mm
     }
     /// Every place, by [`PlaceIx`]; passages first, then standing places in the order of their waypoints.
     pub fn places(&self) -> &[Place] {

@@ -12,6 +12,7 @@ pub mod task;
 pub mod telemetry;
 pub mod work;
 
+use midshift_core::limits;
 use midshift_core::reason::{Refusal, Violations};
 use std::fmt;
 
@@ -154,6 +155,15 @@ pub(crate) fn word<T: WireEnum>(number: i32, at: At<'_>, bad: &mut Violations) -
 pub(crate) fn from_one(number: u64, at: At<'_>, bad: &mut Violations) -> Option<u64> {
     if number == 0 {
         bad.add(at.to_string(), "is required, from 1");
+        return None;
+    }
+    counted(number, at, bad)
+}
+
+/// Reads a number that only ever counts up: one that leaves no room to count on is a defect or a lie.
+pub(crate) fn counted(number: u64, at: At<'_>, bad: &mut Violations) -> Option<u64> {
+    if number > limits::COUNTED_MAX {
+        bad.add(at.to_string(), format!("must be at most {}", limits::COUNTED_MAX));
         return None;
     }
     Some(number)

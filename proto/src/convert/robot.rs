@@ -1,6 +1,6 @@
 //! What a robot says of itself: inventory, heartbeat, vitals, attempts, places.
 
-use super::{At, Parse, WireEnum, from_one, id, list, maybe, maybe_id, need, permille, word};
+use super::{At, Parse, WireEnum, counted, from_one, id, list, maybe, maybe_id, need, permille, word};
 use crate::link::v1;
 use midshift_core::ids::{AttemptId, PlaceId, Subject, TaskId, WaypointId};
 use midshift_core::limits;
@@ -173,7 +173,10 @@ fn parse_marks(wire: Vec<v1::LaneMark>, at: At<'_>, bad: &mut Violations) -> Opt
     let marks: BTreeMap<Lane, u64> = wire
         .into_iter()
         .enumerate()
-        .filter_map(|(i, m)| Some((word(m.lane, at.index(i).field("lane"), bad)?, m.seq)))
+        .filter_map(|(i, m)| {
+            let seq = counted(m.seq, at.index(i).field("seq"), bad);
+            Some((word(m.lane, at.index(i).field("lane"), bad)?, seq?))
+        })
         .collect();
     if marks.len() != length {
         bad.add(at.to_string(), "must name each lane at most once");
@@ -214,11 +217,15 @@ impl Parse<ReportedState> for v1::ReportedState {
         let stop_level = word(self.stop_level, at.field("stop_level"), bad);
         let hardware_stop = word(self.hardware_stop, at.field("hardware_stop"), bad);
         let fault = maybe(self.fault, at.field("fault"), bad);
+        let hb = counted(self.hb, at.field("hb"), bad);
+        let session_epoch = counted(self.session_epoch, at.field("session_epoch"), bad);
+        let applied_work = counted(self.applied_work, at.field("applied_work"), bad);
+        let applied_policy = counted(self.applied_policy, at.field("applied_policy"), bad);
         Some(ReportedState {
-            hb: self.hb,
-            session_epoch: self.session_epoch,
-            applied_work: self.applied_work,
-            applied_policy: self.applied_policy,
+            hb: hb?,
+            session_epoch: session_epoch?,
+            applied_work: applied_work?,
+            applied_policy: applied_policy?,
             produced: produced?,
             mode: mode?,
             vitals: vitals?,

@@ -4,7 +4,7 @@
 
 use crate::{Parts, Request};
 use midshift_core::fleet::view::{TABLES, View};
-use midshift_core::fleet::{Board, LOGS, Pace, Plan, absorb, commands, cycle, found};
+use midshift_core::fleet::{Board, LOGS, Pace, Plan, absorb, commands, cycle, found, obeyed};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::rows::{Item, Log, Seq};
@@ -92,8 +92,8 @@ impl Loop {
         let unwilling = std::mem::take(&mut self.view.unwilling);
         let now = self.parts.clock.now();
         let served = self.view.serving(&now);
-        let router = self.view.router.clone();
-        self.view = View { router, ..View::new(self.parts.site.clone(), self.started, now) };
+        let (router, unusable) = (self.view.router.clone(), std::mem::take(&mut self.view.unusable));
+        self.view = View { router, unusable, ..View::new(self.parts.site.clone(), self.started, now) };
         self.view.bugs = self.parts.bugs;
         self.view.load(&snapshot.rows, snapshot.seq)?;
         // The row is as old as the last commit; this process has served on since.
@@ -188,11 +188,15 @@ impl Loop {
         if plan.items.is_empty() {
             return Ok(());
         }
-        let kinds: Vec<&'static str> = plan.items.iter().map(kind_of).collect();
+        let kinds: Vec<(&'static str, Option<Seq>)> = plan.items.iter().map(|i| (kind_of(i), obeyed(i))).collect();
         let results = self.parts.store.commit(plan.items).await;
         let mut trusted = Ok(());
-        for (result, kind) in results.iter().zip(kinds) {
+        for (result, (kind, entry)) in results.iter().zip(kinds) {
             if let Err(error) = result {
+                if let (true, Some(seq)) = (error.is_final(), entry) {
+                    tracing::error!(seq = seq.0, kind, "an entry of the log cannot be obeyed and is passed over");
+                    self.view.unusable.insert(seq);
+                }
                 let conflict = matches!(error, CommitError::Conflict { .. });
                 metrics::counter!("midshift_fleet_items_lost_total", "conflict" => conflict.to_string()).increment(1);
                 tracing::warn!(%error, kind, "fleet's item was not applied; planning again");

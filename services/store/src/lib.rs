@@ -119,6 +119,13 @@ pub enum CommitError {
     Unavailable(#[source] Cause),
 }
 
+impl CommitError {
+    /// The same item will be refused whenever it is committed.
+    pub const fn is_final(&self) -> bool {
+        matches!(self, Self::NotTheWriter { .. } | Self::TooLarge | Self::DuplicateKey { .. })
+    }
+}
+
 /// An item that was applied.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Applied {

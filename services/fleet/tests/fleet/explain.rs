@@ -109,3 +109,31 @@ async fn a_closed_place_is_the_goal_and_the_task_goes_on_when_it_opens() {
     w.until_phase("T2", Phase::Succeeded).await;
     w.lawful().await;
 }
+
+#[tokio::test(start_paused = true)]
+async fn the_way_through_its_goals_is_longer_than_a_robot_takes() {
+    let mut w = World::on(long_site()).await;
+    w.robot("r1", "w0").await;
+    // 30 times along 100 waypoints and back.
+    w.submit_with("T1", "w0", "w99", |raw| {
+        let (away, home) = (raw.steps[2].clone(), raw.steps[0].clone());
+        raw.steps = (0..30).flat_map(|_| [away.clone(), home.clone()]).collect();
+    })
+    .await;
+    w.submit("T2", "w0", "w99").await;
+    w.until_phase("T2", Phase::Succeeded).await;
+    assert_eq!(why(&w, "T1").await, codes(Code::WaitingForRobot, "ROUTE_TOO_LONG"));
+    w.lawful().await;
+}
+
+/// 100 waypoints in a row, with a station at either end.
+fn long_site() -> &'static str {
+    let kind = |n: u32| if n == 0 || n == 99 { ", kind = \"station\"" } else { "" };
+    let waypoints: String =
+        (0..100).map(|n| format!("{{ id = \"w{n}\", at = [{}, 0]{} }},\n", n * 1_000, kind(n))).collect();
+    let path = (0..100).map(|n| format!("\"w{n}\"")).collect::<Vec<_>>().join(", ");
+    let names =
+        "site_id = \"long\"\nname = \"A row\"\nmap_id = \"long\"\nmap_version = \"1\"\narea = [{ id = \"hall\" }]";
+    let site = format!("{names}\nwaypoint = [\n{waypoints}]\nlane = [{{ path = [{path}], ways = \"two\" }}]\n");
+    Box::leak(site.into_boxed_str())
+}

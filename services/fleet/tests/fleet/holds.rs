@@ -1,10 +1,13 @@
 //! Hold tokens: the maker's stop holds, its release does not resume, a person does.
 
 use crate::harness::World;
+use midshift_core::fleet::rows::HoldToken;
+use midshift_core::ids::RobotId;
 use midshift_core::reason::Code;
 use midshift_core::robot::HardwareStop;
+use midshift_core::rows::Table;
 use midshift_core::site::CORRIDOR;
-use midshift_core::task::Phase;
+use midshift_core::task::{Ask, Phase};
 
 async fn held_world() -> World {
     let mut w = World::on(CORRIDOR).await;
@@ -98,5 +101,49 @@ async fn a_task_accepted_by_a_robot_that_is_held_meanwhile_is_held() {
     w.r("r1").tells = true;
     let seen = w.until_phase("T1", Phase::Held).await;
     assert_eq!(seen.reason("T1").unwrap_or(Code::HoldByBody), Code::HoldByBody);
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_thousand_robots_are_let_go_by_one_request() {
+    let mut w = World::on(CORRIDOR).await;
+    w.stop_fleet().await;
+    let robots: Vec<RobotId> = (0..1_000).map(|n| RobotId::parse(&format!("x{n:04}")).expect("an id")).collect();
+    let token = |robot_id: &RobotId| HoldToken {
+        robot_id: robot_id.clone(),
+        token: format!("resume:body:{robot_id}"),
+        since: w.clock.now().utc,
+    };
+    let tokens: Vec<HoldToken> = robots.iter().map(token).collect();
+    w.left_behind(&tokens).await;
+    w.start_fleet();
+    w.ask(Ask::ResumeHeld { stop_id: None, area_id: None, task_ids: Vec::new(), robot_ids: robots }).await;
+    w.until("all are free", |s| s.tokens("x0000").is_empty() && s.tokens("x0999").is_empty()).await;
+    w.robot("r1", "park-a").await;
+    w.submit("T1", "A", "B").await;
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_a_robot_said_and_the_store_never_takes_is_passed_over_and_a_person_is_told() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.shaky.refuse(Some(Table::HoldToken));
+    w.r("r1").set_hardware_stop(HardwareStop::Remote);
+    w.until("a person is told", |s| s.incidents().contains(&Code::EntryPassedOver)).await;
+    w.shaky.refuse(None);
+    w.r("r1").set_hardware_stop(HardwareStop::None);
+    w.submit("T1", "A", "B").await;
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_second_machine_with_a_robots_name_is_an_incident() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.clone_seen("r1").await;
+    w.until("a person is told", |s| s.incidents() == [Code::CloneSeen]).await;
     w.lawful().await;
 }

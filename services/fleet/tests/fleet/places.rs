@@ -148,6 +148,37 @@ async fn a_place_nobody_reports_is_cleared_by_a_person_and_not_while_a_heard_rob
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_place_that_a_robot_may_still_enter_is_not_cleared_before_its_permission_is_over() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").drives = false;
+    w.submit("T1", "A", "B").await;
+    let granted = [("r1".to_owned(), HolderState::Granted)];
+    w.until("it may enter A", |s| s.holders("A") == granted).await;
+    let clear = |w: &World, etag: u64| {
+        let (fleet, etag) = (w.fleet.clone(), etag.to_string());
+        let (place_id, reason) = ("A".to_owned(), "I looked".to_owned());
+        async move {
+            let request = v1::ClearPlaceRequest { place_id, reason, etag, ..Default::default() };
+            fleet.clear_place(Request::new(request)).await.map_err(|status| status.code())
+        }
+    };
+    let etag = |s: &crate::harness::Seen| s.revision("place_grant", "A");
+    let seen = w.seen().await;
+    assert_eq!(clear(&w, etag(&seen)).await.err(), Some(tonic::Code::FailedPrecondition), "it is heard");
+    w.r("r1").cut();
+    w.pass(5).await;
+    let seen = w.seen().await;
+    assert_eq!(clear(&w, etag(&seen)).await.err(), Some(tonic::Code::FailedPrecondition), "it may be on its way");
+    w.until("nobody knows", |s| s.is_uncertain("T1")).await;
+    let seen = w.seen().await;
+    clear(&w, etag(&seen)).await.expect("its permission is over");
+    let told = w.written().await.into_iter().find(|e| &*e.kind == "place.judged_clear").expect("is written");
+    assert!(told.body.expect("a body").contains("I looked"), "with what the person saw");
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn robots_that_stand_in_each_others_goals_step_aside_and_both_arrive() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "A").await;

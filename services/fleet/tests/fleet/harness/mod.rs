@@ -161,6 +161,18 @@ impl World {
         self.robots.get_mut(id).expect("a robot")
     }
 
+    /// Telemetry has met a second machine with the robot's name.
+    pub async fn clone_seen(&self, id: &str) {
+        let mut item = Item::new(Writer::Telemetry, id);
+        item.facts.push(midshift_core::rows::Fact {
+            log: midshift_core::rows::Log::Telemetry,
+            subject: Arc::from(id),
+            kind: midshift_core::fleet::CLONE_SEEN,
+            body: "{}".into(),
+        });
+        self.commit(item).await;
+    }
+
     /// What the robot says now, beside its usual heartbeat.
     pub fn beat(&mut self, id: &str) {
         let now = self.clock.now();
@@ -248,6 +260,17 @@ impl World {
     pub async fn resume(&mut self, robot: &str) {
         let robot_ids = vec![RobotId::parse(robot).expect("an id")];
         self.ask(Ask::ResumeHeld { stop_id: None, area_id: None, task_ids: Vec::new(), robot_ids }).await;
+    }
+
+    /// Fleet's own rows, as an earlier fleet has left them.
+    pub async fn left_behind<R: midshift_core::rows::Record>(&self, rows: &[R]) {
+        for some in rows.chunks(100) {
+            let mut item = Item::new(Writer::Fleet, "tests");
+            some.iter().for_each(|row| {
+                item.create(row, "tests.left_behind");
+            });
+            self.commit(item).await;
+        }
     }
 
     async fn commit(&self, item: Item) {

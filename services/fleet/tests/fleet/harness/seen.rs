@@ -91,6 +91,11 @@ impl Seen {
     pub fn timer(&self, id: &str) -> Option<Timer> {
         self.get(id)
     }
+    /// Writes of a row so far.
+    pub fn revision(&self, table: &str, id: &str) -> u64 {
+        let row = self.rows.iter().find(|(key, _)| key.table.name() == table && &*key.id == id);
+        row.unwrap_or_else(|| panic!("no {table} {id}")).1.revision.0
+    }
     pub fn incidents(&self) -> Vec<Code> {
         self.all::<Incident>().into_iter().map(|i| i.reason.code).collect()
     }

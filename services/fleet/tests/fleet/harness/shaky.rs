@@ -5,8 +5,8 @@ use async_trait::async_trait;
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Expect, Item, Key, Log, Row, Seq, Table};
 use midshift_store::{Applied, CommitError, Error, FeedPage, MemoryStore, Query, Retention, Snapshot, Store, StoreId};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 use tokio::sync::watch;
 
 /// Items written over another's before the store is itself again.
@@ -19,12 +19,15 @@ pub struct Shaky {
     blind: AtomicBool,
     overwritten: AtomicU64,
     conflicts: AtomicU64,
+    /// Items that touch this table are too large.
+    narrow: Mutex<Option<Table>>,
 }
 
 impl Shaky {
     pub fn over(inner: Arc<MemoryStore>) -> Arc<Self> {
         Arc::new(Self {
             conflicts: AtomicU64::new(0),
+            narrow: Mutex::new(None),
             inner,
             failing: AtomicBool::new(false),
             failed: AtomicU64::new(0),
@@ -35,6 +38,10 @@ impl Shaky {
     /// From now on every commit through this handle fails, or none does.
     pub fn fail(&self, failing: bool) {
         self.failing.store(failing, Ordering::Relaxed);
+    }
+    /// From now on every item that touches `table` is too large for this store.
+    pub fn refuse(&self, table: Option<Table>) {
+        *self.narrow.lock().expect("not poisoned") = table;
     }
     /// From now on what an item expects of its rows is not asked.
     pub fn be_blind(&self) {
@@ -84,6 +91,20 @@ impl Store for Shaky {
             self.failed.fetch_add(1, Ordering::Relaxed);
             let cause = || Arc::new(std::io::Error::other("the disk is full"));
             return items.iter().map(|_| Err(CommitError::Unavailable(cause()))).collect();
+        }
+        let narrow = *self.narrow.lock().expect("not poisoned");
+        if let Some(table) = narrow.filter(|table| items.iter().any(|i| i.rows.iter().any(|r| r.key.table == *table))) {
+            // One by one: what does not touch the table is written.
+            let mut results = Vec::new();
+            for item in items {
+                let refused = item.rows.iter().any(|r| r.key.table == table);
+                results.extend(if refused {
+                    vec![Err(CommitError::TooLarge)]
+                } else {
+                    self.inner.commit(vec![item]).await
+                });
+            }
+            return results;
         }
         // Two writers that never lose go on for ever; some dozen wrong rows are enough.
         if self.blind.load(Ordering::Relaxed) && self.overwritten() < OVERWRITTEN_MAX {
