@@ -86,6 +86,10 @@ pub const COUNTED_MAX: u64 = 1 << 52;
 pub const ROUTE_POINTS_MAX: usize = 2_048;
 /// Robots or tasks let go by one item of a resume: each costs up to 8 rows.
 pub const RESUMES_PER_ITEM: usize = 16;
+/// Hours of a robot that ends no attempt are written this often: a restart forgets less than this.
+pub const HOURS_COUNTED_EVERY: SiteDuration = SiteDuration::from_secs(600);
+/// Incidents kept; the oldest go first, closed ones before open ones.
+pub const INCIDENTS_MAX: usize = 10_000;
 /// Rows one item may touch, and facts it may state.
 pub const ITEM_ROWS_MAX: usize = 256;
 /// Samples in one uplink message.

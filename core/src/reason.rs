@@ -57,6 +57,7 @@ codes! {
     TaskNotFound = "TASK_NOT_FOUND", "No task has this id. Check the id, or list tasks.";
     RobotNotFound = "ROBOT_NOT_FOUND", "No robot has this id. List robots to see who has ever connected.";
     PlaceNotFound = "PLACE_NOT_FOUND", "The site has no such place. List places.";
+    IncidentNotFound = "INCIDENT_NOT_FOUND", "No open incident has this id. List incidents.";
     AreaNotFound = "AREA_NOT_FOUND", "The site has no such area.";
     RequestIdReused = "REQUEST_ID_REUSED", "This request_id was used with another body. Use a new one for a new request.";
     TaskIdTaken = "TASK_ID_TAKEN", "A task with this id exists with another body. Choose another id or leave it empty.";

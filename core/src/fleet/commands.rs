@@ -1,17 +1,23 @@
-//! What people ask of fleet directly: cordon and uncordon, rules of an area, clearing a place. Each is one item, answered after its commit.
+//! What people ask of fleet directly: cordon and uncordon, rules of an area, clearing a place, closing an incident. Each is one item, answered after its commit.
 
-use super::rows::{Cordon, HolderState, Place, PlaceHolder, RobotControl};
+use super::rows::{CommandKey, Cordon, HolderState, Place, PlaceHolder, RobotControl};
 use super::tx::Tx;
 use super::view::View;
-use super::{Board, heard};
+use super::{Board, heard, incidents};
 use crate::ids::{PlaceId, RobotId};
+use crate::limits;
 use crate::policy::AreaPolicy;
 use crate::reason::{Code, Kind, Reason, Refusal, Violations};
 use crate::robot::Presence;
 use crate::rows::Revision;
+use serde::{Deserialize, Serialize};
+
+/// Used request_ids let go of with one command.
+const FORGOTTEN_AT_ONCE: usize = 4;
 
 /// One request.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Command {
     /// No new work; what it does now, it finishes.
     Cordon {
@@ -34,6 +40,39 @@ pub enum Command {
         /// What the person saw.
         reason: String,
     },
+    /// A person has looked into it.
+    CloseIncident {
+        /// Which.
+        incident_id: String,
+        /// What was found.
+        reason: String,
+    },
+}
+
+/// Whether this is a command that was carried out already: the same request_id, and the same in every part.
+///
+/// # Errors
+/// The request_id was used for something else.
+pub fn is_repeat(view: &View, request_id: &str, command: &Command, seen: Option<Revision>) -> Result<bool, Refusal> {
+    match view.command_keys.get(request_id).map(|k| &k.row) {
+        None => Ok(false),
+        Some(known) if known.command == *command && known.seen == seen => Ok(true),
+        Some(_) => {
+            let reason = Reason::from(Code::RequestIdReused).with("request_id", request_id);
+            Err(Refusal::new(Kind::AlreadyExists, reason))
+        }
+    }
+}
+
+/// Writes down that a command was carried out, and lets go of a few that are past their time.
+pub fn remember(tx: &mut Tx, request_id: &str, command: &Command, seen: Option<Revision>) {
+    let at_unix_ms = tx.now.wall.0;
+    let oldest_ms = at_unix_ms - (limits::REMEMBER_DAYS * 86_400_000) as i64;
+    let past = tx.view.command_keys.values().filter(|k| k.row.at_unix_ms < oldest_ms).take(FORGOTTEN_AT_ONCE);
+    let past: Vec<String> = past.map(|k| k.row.id.clone()).collect();
+    past.iter().for_each(|id| tx.delete::<CommandKey>(id, "command.forgotten"));
+    let key = CommandKey { id: request_id.to_owned(), command: command.clone(), seen, at_unix_ms };
+    tx.put(key, "command.done");
 }
 
 /// Checks a command against what is known; an error changes nothing.
@@ -81,6 +120,11 @@ pub fn check(
             }
             row.revision
         }
+        Command::CloseIncident { incident_id, .. } => {
+            let found = view.incidents.get(incident_id).filter(|i| i.row.closed.is_none());
+            let reason = || Reason::from(Code::IncidentNotFound).with("incident_id", incident_id);
+            found.ok_or_else(|| Refusal::new(Kind::NotFound, reason()))?.revision
+        }
     };
     match seen {
         Some(seen) if seen != current => {
@@ -115,6 +159,7 @@ pub fn apply(tx: &mut Tx, command: &Command, actor: &str) {
             let Some(place) = tx.view.places.get(place_id.as_str()).map(|p| p.row.clone()) else { return };
             tx.put(Place { holders: Vec::new(), quarantine: None, ..place }, "place.cleared");
         }
+        Command::CloseIncident { incident_id, reason } => incidents::close(tx, incident_id, reason, actor),
     }
 }
 

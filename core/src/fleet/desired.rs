@@ -57,9 +57,10 @@ pub fn compose(tx: &mut Tx, robot_id: &RobotId, board: &Board, releases: &Releas
     let generation = next_generation(tx.view, robot_id, &tx.now).max(session.applied_work + 1);
     tx.put(DesiredWork { generation, ..new }, "work.desired");
     if behind {
+        tx.view.behind = tx.view.behind.max(Some(session.applied_work));
         let reason = crate::reason::Reason::from(crate::reason::Code::StoreBehindRobot)
             .with("applied_work", session.applied_work);
-        super::tasks::open_incident(tx, reason, Some(robot_id), None);
+        super::incidents::open(tx, reason, Some(robot_id), None);
     }
 }
 

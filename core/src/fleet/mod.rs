@@ -2,7 +2,7 @@
 //!
 //! [`cycle`] takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
 //! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `commands` are what happens; `tasks` moves tasks by
-//! the table; `heard`, `anchor` and `attempts` are what they share; `screen`, `pool` and `assign` give work; `errands`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
+//! the table; `heard`, `anchor`, `attempts` and `incidents` are what they share; `screen`, `pool` and `assign` give work; `errands`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod anchor;
@@ -15,6 +15,7 @@ pub mod errands;
 pub mod explain;
 pub mod heard;
 pub mod inbox;
+pub mod incidents;
 pub mod places;
 pub mod pool;
 pub mod repair;
@@ -136,7 +137,7 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
             (Log::Telemetry, None, _) if &*entry.kind == CLONE_SEEN => {
                 plan.decide(view, now, "fleet", |tx| {
                     let robot_id = RobotId::parse(&entry.subject).ok();
-                    tasks::open_incident(tx, Code::CloneSeen.into(), robot_id.as_ref(), None);
+                    incidents::open(tx, Code::CloneSeen.into(), robot_id.as_ref(), None);
                     mark(tx, entry.seq);
                 });
             }
@@ -148,7 +149,7 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
 /// What an entry asks for can never be written: a person is told, and the rest of the log goes on.
 fn pass_over(tx: &mut Tx, entry: &Entry) {
     let reason = Reason::from(Code::EntryPassedOver).with("seq", entry.seq.0).with("kind", &entry.kind);
-    tasks::open_incident(tx, reason, None, None);
+    incidents::open(tx, reason, None, None);
     mark(tx, entry.seq);
 }
 

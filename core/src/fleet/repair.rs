@@ -7,7 +7,7 @@ use super::heard::{is_fresh, is_settled, lease_stands, presence};
 use super::tasks::{News, happen};
 use super::tx::Tx;
 use super::view::View;
-use super::{Board, Tally, errands, inbox, places};
+use super::{Board, Tally, errands, inbox, places, tasks};
 use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
 use crate::robot::{HardwareStop, Mode, Presence};
@@ -36,6 +36,7 @@ pub fn is_due(view: &View, robot_id: &RobotId, board: &Board, now: &Now) -> bool
 pub fn robot(tx: &mut Tx, robot_id: &RobotId, board: &Board, tally: &mut Tally) {
     let now = tx.now;
     attached(tx.view, robot_id, board, &now);
+    tasks::count_hours(tx, robot_id);
     if !lease_stands(tx.view, board, robot_id, &tx.now) {
         lease_over(tx, robot_id, tally);
         return;

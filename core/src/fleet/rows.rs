@@ -1,9 +1,10 @@
 //! Rows that fleet alone writes, apart from tasks and attempts: places, the robot's mutex, control, timers, holds, counters, marks.
 
+use super::commands::Command;
 use crate::ids::{AreaId, AttemptId, PlaceId, RobotId, SiteId, TaskId};
 use crate::reason::Reason;
 use crate::robot::Duty;
-use crate::rows::{Index, Record, Seq, Table};
+use crate::rows::{Index, Record, Revision, Seq, Table};
 use crate::time::Utc;
 use crate::work::WorkStats;
 use serde::{Deserialize, Serialize};
@@ -330,6 +331,20 @@ pub struct Incident {
     pub area_id: Option<AreaId>,
     /// UTC, site clock.
     pub opened: Utc,
+    /// A person has looked into it.
+    #[serde(default)]
+    pub closed: Option<Closed>,
+}
+
+/// A person has looked into an incident.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Closed {
+    /// Who.
+    pub actor: String,
+    /// What was found.
+    pub reason: String,
+    /// UTC, site clock.
+    pub at: Utc,
 }
 
 impl Record for Incident {
@@ -339,6 +354,29 @@ impl Record for Incident {
     }
     fn index(&self) -> Index {
         let parent = self.robot_id.as_ref().map(|r| r.as_str().into());
-        Index { state: Some(1), parent, order: Some(self.opened.0) }
+        Index { state: Some(i64::from(self.closed.is_none())), parent, order: Some(self.opened.0) }
+    }
+}
+
+/// A used request_id of a command: the same command again is the same command, and is not carried out twice. Kept 7 days.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CommandKey {
+    /// The client's request_id.
+    pub id: String,
+    /// What it asked for.
+    pub command: Command,
+    /// The etag it gave.
+    pub seen: Option<Revision>,
+    /// UTC of the wall, unix ms.
+    pub at_unix_ms: i64,
+}
+
+impl Record for CommandKey {
+    const TABLE: Table = Table::CommandKey;
+    fn id(&self) -> String {
+        self.id.clone()
+    }
+    fn index(&self) -> Index {
+        Index { order: Some(self.at_unix_ms), ..Index::default() }
     }
 }

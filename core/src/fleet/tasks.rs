@@ -3,7 +3,8 @@
 //! Called by `inbox`, `requests`, `timers`, `repair` and `assign`. Invariant: only here does a task change its phase, and only by
 //! `task::machine::next`.
 
-use super::rows::{HolderState, Incident, RobotAuthority, RobotControl, RobotCounter, RobotHolder, Timer, TimerKind};
+use super::incidents;
+use super::rows::{HolderState, RobotAuthority, RobotControl, RobotCounter, RobotHolder, Timer, TimerKind};
 use super::tx::Tx;
 use crate::ids::{AttemptId, RobotId, Subject, TaskId};
 use crate::limits;
@@ -177,17 +178,8 @@ pub fn end_attempt(tx: &mut Tx, a: &mut Attempt) {
 }
 
 fn count(tx: &mut Tx, a: &Attempt) {
-    let id = format!("{}@{}", a.robot_id, a.software);
-    let mut counter = tx.view.counters.get(&id).map(|c| c.row.clone()).unwrap_or_else(|| RobotCounter {
-        robot_id: a.robot_id.clone(),
-        software: a.software.clone(),
-        succeeded: 0,
-        failures: std::collections::BTreeMap::new(),
-        stats: crate::work::WorkStats::default(),
-        attached_ms: 0,
-    });
+    let mut counter = counter(tx, &a.robot_id, &a.software);
     counter.stats += a.stats;
-    counter.attached_ms += tx.view.attached.get_mut(&a.robot_id).map_or(0, |h| std::mem::take(&mut h.ms));
     if a.errand.is_none() {
         match (a.phase, &a.fault) {
             (AttemptPhase::Succeeded, _) => counter.succeeded += 1,
@@ -196,6 +188,31 @@ fn count(tx: &mut Tx, a: &Attempt) {
         }
     }
     tx.put(counter, "robot.counted");
+}
+
+/// Counts the hours of a robot that ends no attempt.
+pub fn count_hours(tx: &mut Tx, robot_id: &RobotId) {
+    let due = tx.view.attached.get(robot_id).is_some_and(|heard| heard.ms >= limits::HOURS_COUNTED_EVERY.as_ms());
+    if let Some(session) = tx.view.sessions.get(robot_id.as_str()).filter(|_| due) {
+        let software = session.row.inventory.software.clone();
+        let counter = counter(tx, robot_id, &software);
+        tx.put(counter, "robot.counted");
+    }
+}
+
+/// What the robot has done under this software, with the time in which it was heard since that was last counted.
+fn counter(tx: &mut Tx, robot_id: &RobotId, software: &str) -> RobotCounter {
+    let known = tx.view.counters.get(&format!("{robot_id}@{software}")).map(|c| c.row.clone());
+    let mut counter = known.unwrap_or_else(|| RobotCounter {
+        robot_id: robot_id.clone(),
+        software: software.to_owned(),
+        succeeded: 0,
+        failures: std::collections::BTreeMap::new(),
+        stats: crate::work::WorkStats::default(),
+        attached_ms: 0,
+    });
+    counter.attached_ms += tx.view.attached.get_mut(robot_id).map_or(0, |heard| std::mem::take(&mut heard.ms));
+    counter
 }
 
 /// Notes a failure of the robot; three within the window take it out of dispatch until a person says so.
@@ -208,23 +225,9 @@ fn trip(tx: &mut Tx, robot_id: &RobotId) {
     if control.failures.len() >= limits::BREAKER_FAILURES && control.breaker.is_none() {
         control.breaker = Some(now);
         let reason = Reason::from(Code::RobotBreakerOpened).with("failures", control.failures.len());
-        open_incident(tx, reason, Some(robot_id), None);
+        incidents::open(tx, reason, Some(robot_id), None);
     }
     tx.put(control, "robot.failed");
-}
-
-/// Opens an incident, once per code, subject and moment.
-pub fn open_incident(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, task_id: Option<&TaskId>) {
-    let about = robot_id.map(ToString::to_string).or(task_id.map(ToString::to_string)).unwrap_or_default();
-    let incident = Incident {
-        id: format!("{}:{about}:{}", reason.code, tx.now.wall.0),
-        reason,
-        robot_id: robot_id.cloned(),
-        task_id: task_id.cloned(),
-        area_id: None,
-        opened: tx.now.utc,
-    };
-    tx.put(incident, "incident.opened");
 }
 
 /// Takes back every grant the robot has not entered: it stays taken until the robot says so.

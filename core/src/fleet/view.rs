@@ -4,7 +4,8 @@
 //! running cycle will write; after a conflict the whole view is built again, never patched.
 
 use super::rows::{
-    FleetMark, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotCounter, ServiceClock, SiteRow, Timer,
+    CommandKey, FleetMark, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotCounter, ServiceClock,
+    SiteRow, Timer,
 };
 use crate::ids::{AttemptId, RobotId, TaskId};
 use crate::policy::AreaPolicy;
@@ -89,6 +90,8 @@ pub struct View {
     pub marks: Slot<FleetMark>,
     /// What people should look into.
     pub incidents: Slot<Incident>,
+    /// Used request_ids of commands.
+    pub command_keys: Slot<CommandKey>,
     /// Newest sessions (telemetry's).
     pub sessions: Slot<Session>,
     /// Presence (telemetry's).
@@ -123,6 +126,8 @@ pub struct View {
     pub attached: BTreeMap<RobotId, Attached>,
     /// The newest heartbeat of each robot, as (session epoch, number), that was compared with the rows and needs no second look. Volatile.
     pub compared: BTreeMap<RobotId, (u64, u64)>,
+    /// Highest generation that a robot has applied and this store had not given: it is older than the robots. Volatile.
+    pub behind: Option<u64>,
     /// Entries of the feed whose items the store refused for good: passed over. Volatile.
     pub unusable: BTreeSet<crate::rows::Seq>,
     /// Naive rules for twins of tests; none outside them.
@@ -157,6 +162,7 @@ viewed! {
     ServiceClock => clocks;
     FleetMark => marks;
     Incident => incidents;
+    CommandKey => command_keys;
     PresenceRow => presence;
     LaneMark => lane_marks;
 }
@@ -261,6 +267,7 @@ pub const TABLES: &[Table] = &[
     Table::ServiceClock,
     Table::FleetMark,
     Table::Incident,
+    Table::CommandKey,
     Table::Session,
     Table::Presence,
     Table::LaneMark,
@@ -291,6 +298,7 @@ impl View {
             clocks: Slot::new(),
             marks: Slot::new(),
             incidents: Slot::new(),
+            command_keys: Slot::new(),
             sessions: Slot::new(),
             presence: Slot::new(),
             lane_marks: Slot::new(),
@@ -308,6 +316,7 @@ impl View {
             attached: BTreeMap::new(),
             place_waits: 0,
             compared: BTreeMap::new(),
+            behind: None,
             unusable: BTreeSet::new(),
             bugs: super::bugs::Bugs::default(),
         }
@@ -344,6 +353,7 @@ impl View {
             Table::ServiceClock => self.take::<ServiceClock>(key, revision, row),
             Table::FleetMark => self.take::<FleetMark>(key, revision, row),
             Table::Incident => self.take::<Incident>(key, revision, row),
+            Table::CommandKey => self.take::<CommandKey>(key, revision, row),
             Table::Session => self.take::<Session>(key, revision, row),
             Table::Presence => self.take::<PresenceRow>(key, revision, row),
             Table::LaneMark => self.take::<LaneMark>(key, revision, row),

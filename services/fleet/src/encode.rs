@@ -1,7 +1,7 @@
 //! Rows and explanations as their messages. Nothing is decided here.
 
 use midshift_core::fleet::explain::{RobotExplanation, TaskExplanation};
-use midshift_core::fleet::rows::{HolderState, Place, RobotControl, RobotCounter, RobotHolder};
+use midshift_core::fleet::rows::{HolderState, Incident, Place, RobotControl, RobotCounter, RobotHolder};
 use midshift_core::fleet::view::View;
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::reason::{Code, Reason};
@@ -44,6 +44,25 @@ pub fn control(view: &View, robot_id: &RobotId) -> v1::RobotControl {
         hold_tokens: view.robot_holds(robot_id).map(|h| h.token.clone()).collect(),
         etag: etag(rowed.map_or(Revision(0), |c| c.revision)),
         work_generation: view.desired_work.get(robot_id.as_str()).map_or(0, |d| d.row.generation),
+    }
+}
+
+/// An incident.
+pub fn incident(row: &Incident, revision: Revision) -> v1::Incident {
+    let text = |id: Option<String>| id.unwrap_or_default();
+    v1::Incident {
+        incident_id: row.id.clone(),
+        reason: Some(shown(&row.reason)),
+        robot_id: text(row.robot_id.as_ref().map(ToString::to_string)),
+        task_id: text(row.task_id.as_ref().map(ToString::to_string)),
+        area_id: text(row.area_id.as_ref().map(ToString::to_string)),
+        open_time: Some(timestamp(row.opened)),
+        closed: row.closed.as_ref().map(|closed| v1::IncidentClosed {
+            actor: closed.actor.clone(),
+            reason: closed.reason.clone(),
+            close_time: Some(timestamp(closed.at)),
+        }),
+        etag: etag(revision),
     }
 }
 

@@ -2,6 +2,7 @@
 
 use crate::{FleetService, encode};
 use midshift_core::fleet::commands::Command;
+use midshift_core::fleet::rows::Incident;
 use midshift_core::fleet::{explain, view::View};
 use midshift_core::ids::{AreaId, PlaceId, RobotId, TaskId};
 use midshift_core::limits;
@@ -182,6 +183,40 @@ impl FleetService {
         Ok(v1::ExplainRobotResponse { explanation: Some(explanation) })
     }
 
+    async fn incidents(&self, r: v1::ListIncidentsRequest) -> Result<v1::ListIncidentsResponse, Refusal> {
+        let mut bad = Violations::default();
+        let size = page_size(r.page_size, &mut bad);
+        let robot_id = if r.robot_id.is_empty() { None } else { bad.take("robot_id", RobotId::parse(&r.robot_id)) };
+        bad.finish()?;
+        let (incidents, next_page_token) = self
+            .look(move |view: &View, _, _| {
+                let wanted = |i: &Incident| {
+                    (r.include_closed || i.closed.is_none()) && (robot_id.is_none() || i.robot_id == robot_id)
+                };
+                let rows = view.incidents.iter().filter(|(_, i)| wanted(&i.row));
+                page(rows.map(|(id, i)| (id.clone(), encode::incident(&i.row, i.revision))), &r.page_token, size)
+            })
+            .await?;
+        Ok(v1::ListIncidentsResponse { incidents, next_page_token })
+    }
+
+    async fn incident(&self, incident_id: String) -> Result<v1::Incident, Refusal> {
+        let id = incident_id.clone();
+        let look = |view: &View, id: &str| view.incidents.get(id).map(|i| encode::incident(&i.row, i.revision));
+        let found = self.look(move |view, _, _| look(view, &id)).await?;
+        found.ok_or_else(|| not_found(Code::IncidentNotFound, incident_id))
+    }
+
+    async fn close_one(&self, r: v1::CloseIncidentRequest) -> Result<v1::CloseIncidentResponse, Refusal> {
+        let mut bad = Violations::default();
+        let request_id = request_id(&r.request_id, &mut bad);
+        reason_text(&r.reason, &mut bad);
+        bad.finish()?;
+        let command = Command::CloseIncident { incident_id: r.incident_id.clone(), reason: r.reason };
+        self.act(command, revision_of(&r.etag), r.validate_only, request_id).await?;
+        Ok(v1::CloseIncidentResponse { incident: Some(self.incident(r.incident_id).await?) })
+    }
+
     async fn counters(&self, r: v1::ListCountersRequest) -> Result<v1::ListCountersResponse, Refusal> {
         let mut bad = Violations::default();
         let size = page_size(r.page_size, &mut bad);
@@ -259,6 +294,25 @@ impl Face for FleetService {
         r: Request<v1::ExplainRobotRequest>,
     ) -> Result<Response<v1::ExplainRobotResponse>, Status> {
         answer(self.why_robot(r.into_inner()).await)
+    }
+    async fn list_incidents(
+        &self,
+        r: Request<v1::ListIncidentsRequest>,
+    ) -> Result<Response<v1::ListIncidentsResponse>, Status> {
+        answer(self.incidents(r.into_inner()).await)
+    }
+    async fn get_incident(
+        &self,
+        r: Request<v1::GetIncidentRequest>,
+    ) -> Result<Response<v1::GetIncidentResponse>, Status> {
+        let incident = self.incident(r.into_inner().incident_id).await;
+        answer(incident.map(|incident| v1::GetIncidentResponse { incident: Some(incident) }))
+    }
+    async fn close_incident(
+        &self,
+        r: Request<v1::CloseIncidentRequest>,
+    ) -> Result<Response<v1::CloseIncidentResponse>, Status> {
+        answer(self.close_one(r.into_inner()).await)
     }
     async fn list_counters(
         &self,

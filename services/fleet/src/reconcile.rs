@@ -139,6 +139,17 @@ impl Loop {
         }
         metrics::histogram!("midshift_fleet_cycle_seconds").record(took.as_secs_f64());
         publish(&plan, &self.view, pace);
+        if let Some(generation) = self.view.behind.take() {
+            // Restored from a copy: its numbers go on above everything a robot may have seen of it.
+            match self.parts.store.raise_head(Seq(generation)).await {
+                Ok(head) => tracing::warn!(
+                    generation,
+                    head = head.0,
+                    "the store is older than a robot; its numbers go on higher"
+                ),
+                Err(error) => tracing::error!(%error, generation, "the store's numbers could not be raised"),
+            }
+        }
         self.commit(plan, replies).await
     }
 
@@ -168,14 +179,24 @@ impl Loop {
             match request {
                 Request::Look(look) => look(&self.view, &self.board, &now),
                 Request::Do { command, seen, validate_only, actor, request_id, reply } => {
-                    let checked = commands::check(&self.view, &self.board, &now, &command, seen);
-                    if checked.is_err() || validate_only {
+                    let repeat = match &request_id {
+                        Some(id) => commands::is_repeat(&self.view, id, &command, seen),
+                        None => Ok(false),
+                    };
+                    let is_repeat = matches!(repeat, Ok(true));
+                    let check = || commands::check(&self.view, &self.board, &now, &command, seen);
+                    let checked = repeat.and_then(|known| if known { Ok(()) } else { check() });
+                    // What was asked before is in the store: nothing is written, and nothing has to be waited for.
+                    if checked.is_err() || validate_only || is_repeat {
                         drop(reply.send(checked));
                         continue;
                     }
                     let mut tx = midshift_core::fleet::tx::Tx::new(&mut self.view, now, &actor)
                         .on_request(request_id.as_deref());
                     commands::apply(&mut tx, &command, &actor);
+                    if let Some(id) = &request_id {
+                        commands::remember(&mut tx, id, &command, seen);
+                    }
                     plan.items.extend(tx.finish());
                     replies.push((reply, plan.items.len()));
                 }

@@ -20,6 +20,17 @@ CREATE TABLE attempt (
     UNIQUE (site_id, id)
 );
 
+CREATE TABLE command_key (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE TABLE desired_policy (
     site_id TEXT NOT NULL,
     id TEXT NOT NULL,

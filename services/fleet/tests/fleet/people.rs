@@ -110,3 +110,77 @@ async fn an_item_handed_over_by_a_person_is_brought_on_by_another_robot_without_
     assert_eq!(work.resume_step, 2, "after the pick");
     w.lawful().await;
 }
+
+#[tokio::test(start_paused = true)]
+async fn a_command_is_carried_out_once_whatever_is_lost_of_its_answer() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.pass(2).await;
+    let cordon = |reason: &str| v1::CordonRobotRequest {
+        robot_id: "r1".to_owned(),
+        request_id: "cordon-1".to_owned(),
+        reason: reason.to_owned(),
+        ..Default::default()
+    };
+    w.fleet.cordon_robot(Request::new(cordon("a wheel"))).await.expect("is done");
+    let uncordon = v1::UncordonRobotRequest { robot_id: "r1".to_owned(), ..Default::default() };
+    w.fleet.uncordon_robot(Request::new(uncordon)).await.expect("is done");
+    let again = w.fleet.cordon_robot(Request::new(cordon("a wheel"))).await.expect("was done").into_inner();
+    assert_eq!(again.control.expect("a control").duty, v1::Duty::InWork as i32, "and not done again");
+    w.stop_fleet().await;
+    w.start_fleet();
+    let again = w.fleet.cordon_robot(Request::new(cordon("a wheel"))).await.expect("was done").into_inner();
+    assert_eq!(again.control.expect("a control").duty, v1::Duty::InWork as i32, "nor after a restart");
+    let other = w.fleet.cordon_robot(Request::new(cordon("an arm"))).await.expect_err("says something else");
+    assert_eq!(other.code(), tonic::Code::AlreadyExists);
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_incident_is_listed_until_a_person_has_looked_into_it() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.clone_seen("r1").await;
+    w.until("a person is told", |s| !s.incidents().is_empty()).await;
+    let list = |include_closed: bool| {
+        let fleet = w.fleet.clone();
+        async move {
+            let request = v1::ListIncidentsRequest { include_closed, ..Default::default() };
+            fleet.list_incidents(Request::new(request)).await.expect("a list").into_inner().incidents
+        }
+    };
+    let open = list(false).await;
+    let [incident] = open.as_slice() else { panic!("{open:?}") };
+    assert_eq!((incident.robot_id.as_str(), incident.closed.as_ref()), ("r1", None));
+    let incident_id = incident.incident_id.clone();
+    let close = |reason: &str| v1::CloseIncidentRequest {
+        incident_id: incident_id.clone(),
+        reason: reason.to_owned(),
+        etag: incident.etag.clone(),
+        ..Default::default()
+    };
+    let refused = w.fleet.close_incident(Request::new(close(""))).await.expect_err("without a reason");
+    assert_eq!(refused.code(), tonic::Code::InvalidArgument);
+    w.fleet.close_incident(Request::new(close("a spare part"))).await.expect("is closed");
+    assert_eq!(list(false).await, []);
+    let all = list(true).await;
+    assert_eq!(all[0].closed.as_ref().map(|c| c.reason.as_str()), Some("a spare part"));
+    let again = w.fleet.close_incident(Request::new(close("twice"))).await.expect_err("is closed already");
+    assert_eq!(again.code(), tonic::Code::NotFound);
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn the_hours_of_a_robot_without_work_are_counted_and_not_forgotten_by_a_restart() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.pass(1_300).await;
+    w.stop_fleet().await;
+    w.start_fleet();
+    w.pass(1).await;
+    let request = v1::ListCountersRequest::default();
+    let counters = w.fleet.list_counters(Request::new(request)).await.expect("a list").into_inner().counters;
+    let heard_s = counters[0].attached_ms / 1_000;
+    assert!((1_190..=1_310).contains(&heard_s), "{heard_s} s");
+    w.lawful().await;
+}

@@ -136,6 +136,8 @@ async fn a_store_behind_the_robot_raises_its_generation_and_says_so() {
     w.connect("r1").await;
     let seen = w.until("the generation is raised", |s| s.work("r1").generation > ahead).await;
     assert_eq!(seen.incidents(), [Code::StoreBehindRobot]);
+    let head = w.written().await.last().expect("entries").seq.0;
+    assert!(head > ahead, "numbers of the store go on above what the robot has seen");
     w.submit("T1", "A", "B").await;
     w.until_phase("T1", Phase::Succeeded).await;
     assert_eq!(w.seen().await.incidents().len(), 1);

@@ -5,6 +5,7 @@ mod bundle;
 mod client;
 mod doctor;
 mod explain;
+mod incident;
 mod map;
 mod out;
 mod robot;
@@ -66,6 +67,9 @@ enum Command {
     /// Passages and standing places.
     #[command(subcommand)]
     Zone(zone::Verb),
+    /// What a person should look into.
+    #[command(subcommand)]
+    Incident(incident::Verb),
     /// Live rules of areas.
     #[command(subcommand)]
     Area(area::Verb),
@@ -136,6 +140,7 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Task(verb) => task::run(verb, out).await,
         Command::Robot(verb) => robot::run(verb, out).await,
         Command::Zone(verb) => zone::run(verb, out).await,
+        Command::Incident(verb) => incident::run(verb, out).await,
         Command::Area(verb) => area::run(verb, out).await,
         Command::Map(verb) => map::run(verb, out),
         Command::Bundle(verb) => bundle::run(verb, out),

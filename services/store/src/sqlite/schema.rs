@@ -65,6 +65,7 @@ pub(crate) const CONTROL: &[Migration] = migrations!["control":
     "0041_timer_by_ord",
     "0042_incident_by_state",
     "0043_incident_by_ord",
+    "0044_command_key",
 ];
 
 /// Of `telemetry.db`.

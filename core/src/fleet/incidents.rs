@@ -1,0 +1,36 @@
+//! What people should look into: opened by whoever meets it, closed by a person who has looked.
+//!
+//! Invariant: there are at most [`limits::INCIDENTS_MAX`]; the oldest goes for a new one, a closed one before an open one.
+
+use super::rows::{Closed, Incident};
+use super::tx::Tx;
+use crate::ids::{RobotId, TaskId};
+use crate::limits;
+use crate::reason::Reason;
+
+/// Opens an incident, once per code, subject and moment.
+pub fn open(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, task_id: Option<&TaskId>) {
+    let about = robot_id.map(ToString::to_string).or(task_id.map(ToString::to_string)).unwrap_or_default();
+    if tx.view.incidents.len() >= limits::INCIDENTS_MAX {
+        let age = |i: &Incident| (i.closed.is_none(), i.opened);
+        let oldest = tx.view.incidents.values().map(|i| &i.row).min_by_key(|i| age(i)).map(|i| i.id.clone());
+        oldest.iter().for_each(|id| tx.delete::<Incident>(id, "incident.forgotten"));
+    }
+    let incident = Incident {
+        id: format!("{}:{about}:{}", reason.code, tx.now.wall.0),
+        reason,
+        robot_id: robot_id.cloned(),
+        task_id: task_id.cloned(),
+        area_id: None,
+        opened: tx.now.utc,
+        closed: None,
+    };
+    tx.put(incident, "incident.opened");
+}
+
+/// A person has looked into it.
+pub fn close(tx: &mut Tx, incident_id: &str, reason: &str, actor: &str) {
+    let Some(mut incident) = tx.view.incidents.get(incident_id).map(|i| i.row.clone()) else { return };
+    incident.closed = Some(Closed { actor: actor.to_owned(), reason: reason.to_owned(), at: tx.now.utc });
+    tx.put(incident, "incident.closed");
+}

@@ -1,0 +1,109 @@
+//! `midshift incident …`: what a person should look into.
+
+use super::client::{Call, Change, Exit, unary};
+use super::out::Out;
+use clap::Subcommand;
+use midshift_proto::convert::time_of;
+use midshift_proto::fleet::v1;
+
+/// Verbs of incidents.
+#[derive(Subcommand)]
+pub enum Verb {
+    /// List incidents.
+    Ls {
+        #[command(flatten)]
+        call: Call,
+        /// Also those that a person has closed.
+        #[arg(long)]
+        all: bool,
+        /// Only about this robot.
+        #[arg(long, default_value = "")]
+        robot: String,
+    },
+    /// Show one.
+    Get {
+        #[command(flatten)]
+        call: Call,
+        /// Which.
+        incident_id: String,
+    },
+    /// You have looked into it.
+    Close {
+        #[command(flatten)]
+        call: Call,
+        /// Which.
+        incident_id: String,
+        /// What you found.
+        #[arg(long)]
+        reason: String,
+        /// Only if it is as you saw it, from `incident get -o json`.
+        #[arg(long, default_value = "")]
+        if_match: String,
+        #[command(flatten)]
+        change: Change,
+    },
+}
+
+/// Runs one verb.
+pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
+    match verb {
+        Verb::Ls { call, all, robot } => {
+            let mut client = call.fleet().await?;
+            let mut whole = v1::ListIncidentsResponse::default();
+            loop {
+                let request = v1::ListIncidentsRequest {
+                    include_closed: all,
+                    robot_id: robot.clone(),
+                    page_size: 1_000,
+                    page_token: whole.next_page_token.clone(),
+                };
+                let page = client.list_incidents(unary(request)).await?.into_inner();
+                whole.incidents.extend(page.incidents);
+                whole.next_page_token = page.next_page_token;
+                if whole.next_page_token.is_empty() {
+                    break;
+                }
+            }
+            let header = ["OPENED", "CODE", "ABOUT", "CLOSED BY", "INCIDENT"];
+            out.many(&whole, &whole.incidents, |i| i.incident_id.clone(), &header, row)?;
+            Ok(())
+        }
+        Verb::Get { call, incident_id } => {
+            let request = v1::GetIncidentRequest { incident_id };
+            let incident = call.fleet().await?.get_incident(unary(request)).await?.into_inner().incident;
+            show(&incident.unwrap_or_default(), out)
+        }
+        Verb::Close { call, incident_id, reason, if_match, change } => {
+            let request = v1::CloseIncidentRequest {
+                incident_id,
+                request_id: change.request_id,
+                etag: if_match,
+                reason,
+                validate_only: change.dry_run,
+            };
+            let incident = call.fleet().await?.close_incident(unary(request)).await?.into_inner().incident;
+            show(&incident.unwrap_or_default(), out)
+        }
+    }
+}
+
+fn show(incident: &v1::Incident, out: &Out) -> Result<(), Exit> {
+    let text = || {
+        let reason = incident.reason.as_ref().map(|r| format!("{}  {}", r.code, r.message)).unwrap_or_default();
+        let closed = incident.closed.as_ref().map(|c| format!("\nclosed by {}: {}", c.actor, c.reason));
+        format!("{}\n{reason}{}", row(incident).join("  "), closed.unwrap_or_default())
+    };
+    out.one(incident, &incident.incident_id, text)?;
+    Ok(())
+}
+
+fn row(incident: &v1::Incident) -> Vec<String> {
+    let about = [&incident.robot_id, &incident.task_id, &incident.area_id];
+    vec![
+        incident.open_time.as_ref().map(|t| time_of(t).rfc3339()).unwrap_or_default(),
+        incident.reason.as_ref().map(|r| r.code.clone()).unwrap_or_default(),
+        about.into_iter().filter(|id| !id.is_empty()).cloned().collect::<Vec<_>>().join(" "),
+        incident.closed.as_ref().map(|c| c.actor.clone()).unwrap_or_default(),
+        incident.incident_id.clone(),
+    ]
+}
