@@ -3,13 +3,14 @@
 use prost::Message;
 use std::path::PathBuf;
 
-const FILES: [&str; 9] = [
+const FILES: [&str; 10] = [
     "midshift/common/v1/common.proto",
     "midshift/task/v1/task.proto",
     "midshift/task/v1/task_service.proto",
     "midshift/fleet/v1/fleet.proto",
     "midshift/fleet/v1/fleet_service.proto",
     "midshift/link/v1/link.proto",
+    "midshift/link/v1/update.proto",
     "midshift/telemetry/v1/telemetry.proto",
     "midshift/telemetry/v1/telemetry_service.proto",
     "midshift/sim/v1/sim_service.proto",

@@ -82,6 +82,12 @@ text_id!(/// A waypoint of a site.
     WaypointId, "waypoint", 64, mixed, "must be 1-64 of [A-Za-z0-9-_.]");
 text_id!(/// A passage or a standing place of a site.
     PlaceId, "place_id", 64, mixed, "must be 1-64 of [A-Za-z0-9-_.]");
+text_id!(/// A drain: one taking of a robot out of work, `op:` before it if a person asked for it. Never used again.
+    DrainId, "drain_id", 64, |c| lower(c) || matches!(c, ':' | '.'), "must be 1-64 of [a-z0-9-:.]");
+text_id!(/// A set of software by its digest, or `factory`.
+    SetId, "set", 64, |c| c.is_ascii_lowercase() || c.is_ascii_digit(), "must be 1-64 of [a-z0-9]");
+text_id!(/// A bundle by the digest of its manifest.
+    BundleId, "bundle", 64, |c| matches!(c, '0'..='9' | 'a'..='f'), "must be 64 lower-case hexadecimal digits");
 text_id!(/// A client's protection against a double call.
     RequestId, "request_id", 128, |c| c.is_ascii_graphic(), "must be 1-128 printable characters without spaces");
 

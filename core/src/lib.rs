@@ -15,4 +15,5 @@ pub mod rows;
 pub mod site;
 pub mod task;
 pub mod time;
+pub mod update;
 pub mod work;

@@ -88,6 +88,10 @@ pub const ROUTE_POINTS_MAX: usize = 2_048;
 pub const RESUMES_PER_ITEM: usize = 16;
 /// Hours of a robot that ends no attempt are written this often: a restart forgets less than this.
 pub const HOURS_COUNTED_EVERY: SiteDuration = SiteDuration::from_secs(600);
+/// A robot with less charge does not change its software, permille: a switch that goes wrong needs time.
+pub const ACTIVATE_BATTERY_PERMILLE: u16 = 200;
+/// A robot with a hotter joint does not change its software, tenths of a degree Celsius.
+pub const ACTIVATE_JOINT_DECIDEGREES: i32 = 700;
 /// Incidents kept; the oldest go first, closed ones before open ones.
 pub const INCIDENTS_MAX: usize = 10_000;
 /// Rows one item may touch, and facts it may state.

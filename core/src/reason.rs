@@ -132,6 +132,21 @@ codes! {
     StaleAuthority = "STALE_AUTHORITY", "The message reached the robot after its authority had ended, or was anchored to another session.";
     StaleEpoch = "STALE_EPOCH", "The robot has passed this epoch.";
     AlreadyFinished = "ALREADY_FINISHED", "The robot's ledger says the task is finished; the stored answer was sent.";
+    InMaintenance = "IN_MAINTENANCE", "The robot is drained, changes its software or is on probation with it.";
+    // --- software of a robot
+    MetadataRefused = "METADATA_REFUSED", "What the repository says of its releases does not hold. Nothing was installed; look at the repository and its keys.";
+    DirectiveRefused = "DIRECTIVE_REFUSED", "The robot did not take the order to change its software. Nothing was installed.";
+    BundleUnfit = "BUNDLE_UNFIT", "The bundle does not fit the robot: hardware, floor, what it needs or what it excludes.";
+    BundleCorrupt = "BUNDLE_CORRUPT", "What was downloaded is not what was signed.";
+    NoRoom = "NO_ROOM", "The robot has too little room on its disk for one more set.";
+    ActivationBlocked = "ACTIVATION_BLOCKED", "The robot waits with its new software: it has work, a load, a stop, is in a passage, too hot or too low on charge.";
+    ProgramCrashed = "PROGRAM_CRASHED", "The new program did not live; the launcher went back to the kept set.";
+    SetPutAway = "SET_PUT_AWAY", "The set on trial no longer runs; the kept set does.";
+    SelfTestFailed = "SELF_TEST_FAILED", "The body's own test failed with the new software.";
+    LostServer = "LOST_SERVER", "With the new software the robot did not reach its server for ten minutes.";
+    RevertAsked = "REVERT_ASKED", "The server asked the robot to go back.";
+    NothingKept = "NOTHING_KEPT", "There is no set to go back to. A person must look.";
+    KeptSetBad = "KEPT_SET_BAD", "The kept set is not whole. A person must look.";
     UnknownWaypoint = "UNKNOWN_WAYPOINT", "The robot's map has no such waypoint.";
     UnsupportedAction = "UNSUPPORTED_ACTION", "The robot's body cannot do this action.";
     NotAutomatic = "NOT_AUTOMATIC", "The robot is not in automatic mode.";

@@ -3,6 +3,7 @@
 //! Four independent facts, each with one owner: presence (telemetry), mode (the robot), duty (fleet), software (OTA, later).
 
 use crate::ids::{AttemptId, PlaceId, TaskId, WaypointId};
+use crate::update::UpdateReport;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -269,6 +270,9 @@ pub struct ReportedState {
     pub applied_work: u64,
     /// Highest desired generation applied, section policy.
     pub applied_policy: u64,
+    /// Highest desired generation applied, section update. 0: none.
+    #[serde(default)]
+    pub applied_update: u64,
     /// Highest number written per lane: what is still to come before differences count.
     pub produced: BTreeMap<Lane, u64>,
     /// Who drives.
@@ -289,6 +293,9 @@ pub struct ReportedState {
     pub field_violation: bool,
     /// A standing fault.
     pub fault: Option<Fault>,
+    /// Its newest update, as long as that is of interest.
+    #[serde(default)]
+    pub update: Option<UpdateReport>,
 }
 
 /// What a robot says of itself that does not change within a session.

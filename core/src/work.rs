@@ -4,11 +4,12 @@
 //! Written by fleet, composed and sent by telemetry, obeyed by the agent.
 
 use crate::authority::Authority;
-use crate::ids::{AreaId, AttemptId, PlaceId, RobotId, WaypointId};
+use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, WaypointId};
 use crate::reason::Reason;
 pub use crate::robot::WorkState;
 use crate::robot::{Fault, HardwareStop, HeldPlace, Lane, Load, Mode, Vitals};
 use crate::rows::{Index, Record, Table};
+use crate::update::UpdateEvent;
 use serde::{Deserialize, Serialize};
 
 /// Section `work` of a robot's desired state: whole, newest wins.
@@ -28,6 +29,9 @@ pub struct DesiredWork {
     pub resume: Option<Authority>,
     /// Attempts whose end the server has stored: the robot may forget them from its report.
     pub closed: Vec<AttemptId>,
+    /// The drain that holds the robot: no work, and its software may change.
+    #[serde(default)]
+    pub maintenance: Option<DrainId>,
 }
 
 impl Record for DesiredWork {
@@ -264,6 +268,8 @@ pub enum RobotEvent {
         /// Why, for a person.
         detail: String,
     },
+    /// News of its software.
+    Update(UpdateEvent),
     /// The state of charge fell below the critical threshold.
     BatteryCritical {
         /// Permille.

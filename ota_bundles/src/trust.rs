@@ -99,6 +99,13 @@ pub enum Error {
     NoRoot(serde_json::Error),
 }
 
+impl Error {
+    /// The documents could not be had: nothing was wrong with them.
+    pub fn is_unreachable(&self) -> bool {
+        matches!(self, Self::Metadata(error) if matches!(**error, tough::error::Error::Transport { .. }))
+    }
+}
+
 /// A clock as a robot has it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Reading {

@@ -5,6 +5,7 @@
 use midshift_core::ids::RobotId;
 use midshift_core::reason::Reason;
 use midshift_core::robot::{Inventory, Lane, ReportedState};
+use midshift_core::update::DesiredUpdate;
 use midshift_core::work::{DesiredPolicy, DesiredWork, InboxItem};
 use std::collections::BTreeMap;
 
@@ -184,6 +185,8 @@ pub struct Downlink {
     pub work: Option<DesiredWork>,
     /// None: unchanged.
     pub policy: Option<DesiredPolicy>,
+    /// None: unchanged.
+    pub update: Option<DesiredUpdate>,
     /// None: unchanged.
     pub status_credit_bytes: Option<u32>,
 }

@@ -10,6 +10,7 @@ use crate::ledger::SessionMemory;
 use crate::places::Places;
 use crate::store::{Kept, Op};
 use crate::throttle::Throttle;
+use crate::update::{Done, Job, UpdateConfig, Updater};
 use crate::work::{Doing, Work};
 use midshift_core::authority::SentHeartbeats;
 use midshift_core::ids::{AttemptId, PlaceId, RobotId, WaypointId};
@@ -27,10 +28,12 @@ pub struct CoreConfig {
     pub robot_id: RobotId,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: Bugs,
+    /// What it believes of software; none: its software is not changed.
+    pub update: Option<UpdateConfig>,
 }
 
 /// What happened outside.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug)]
 pub enum Input {
     /// The process began. Once, first.
     Start,
@@ -46,6 +49,8 @@ pub enum Input {
     Fenced,
     /// This batch and all before it are durable.
     Persisted(u64),
+    /// What came of the job under way.
+    Done(Box<Done>),
 }
 
 /// Why the agent ends by itself.
@@ -55,6 +60,8 @@ pub enum ExitReason {
     Shutdown,
     /// Fenced for the second time: another machine has this robot's id and proof.
     FencedTwice,
+    /// The switch record names another set: whoever started the program starts it again.
+    Switched,
 }
 
 /// What to do, in this order.
@@ -64,6 +71,10 @@ pub enum Output {
     Persist(u64, Vec<Op>),
     /// Send this in the session at hand; drop it if there is none.
     Send(Box<Uplink>),
+    /// Do this beside everything else and say [`Input::Done`]. At most one is under way.
+    Job(Box<Job>),
+    /// Leave the job under way: what it has so far is kept.
+    DropJob,
     /// End the process.
     Exit(ExitReason),
 }
@@ -119,6 +130,8 @@ pub struct AgentCore {
     pub(crate) stale_told: BTreeSet<(u64, u64, u64)>,
     pub(crate) last_site: SiteTime,
     pub(crate) wake_link: Option<LinkTime>,
+    pub(crate) wake_site: Option<SiteTime>,
+    pub(crate) update: Updater,
     pub(crate) authority: LinkDuration,
     session: Option<Session>,
     sender: Sender,
@@ -156,6 +169,7 @@ impl AgentCore {
             hardware_stop: body.hardware_stop(),
             work: kept.ledger.holder.clone().map(Work::restored),
             sender: Sender::new(&kept.ring),
+            update: Updater { config: config.update.clone(), ..Updater::default() },
             config,
             body,
             kept,
@@ -171,6 +185,7 @@ impl AgentCore {
             stale_told: BTreeSet::new(),
             last_site: now.site,
             wake_link: None,
+            wake_site: None,
             authority: limits::AUTHORITY,
             session: None,
             writes: Writes::default(),
@@ -191,7 +206,7 @@ impl AgentCore {
     /// Takes one input at one moment and says what to do about it.
     pub fn step(&mut self, now: Now, input: Input) -> Vec<Output> {
         let mut out = Vec::new();
-        self.wake_link = None;
+        (self.wake_link, self.wake_site) = (None, None);
         if let Input::Persisted(batch) = input {
             self.persisted(batch);
         }
@@ -207,6 +222,7 @@ impl AgentCore {
                 self.down(&now, *down);
             }
             Input::Disconnected => self.session = None,
+            Input::Done(done) => self.job_done(&now, *done),
             Input::Fenced => {
                 self.fences += 1;
                 self.session = None;
@@ -216,9 +232,11 @@ impl AgentCore {
             }
         }
         self.advance(&now);
+        out.extend(self.pursue_update(&now).map(Output::Exit));
         let beat = self.beat(&now);
         self.write_events(&now);
         self.persist(&now, beat, &mut out);
+        self.start_job(&mut out);
         self.send(&now, beat, &mut out);
         out
     }
@@ -227,7 +245,7 @@ impl AgentCore {
     pub fn next_wake(&self, now: &Now) -> Wake {
         let link = [Some(self.next_beat), self.wake_link, self.throttle.next_at()];
         let body = self.body.next_change(now.site);
-        let site = [Some(self.next_status), body, self.times_out_at(now)];
+        let site = [Some(self.next_status), body, self.times_out_at(now), self.wake_site];
         Wake {
             link: link.into_iter().flatten().min().unwrap_or(self.next_beat),
             site: site.into_iter().flatten().min(),
@@ -242,6 +260,7 @@ impl AgentCore {
             session_epoch: session.map_or(0, |s| s.epoch),
             applied_work: self.kept.ledger.applied.work,
             applied_policy: self.kept.ledger.applied.policy,
+            applied_update: self.kept.ledger.applied.update,
             produced: Lane::ALL.into_iter().map(|lane| (lane, self.kept.ring.lane(lane).produced)).collect(),
             mode: self.mode,
             vitals: self.vitals(now),
@@ -252,6 +271,7 @@ impl AgentCore {
             hardware_stop: self.hardware_stop,
             field_violation: self.body.state(now.site).field_violation,
             fault: self.standing_fault.clone(),
+            update: self.update_report().filter(|u| session.is_none() || !u.state.is_over()),
         }
     }
 
@@ -359,6 +379,7 @@ impl AgentCore {
         if let Some(echo) = down.echo {
             if !observed {
                 self.sent.echoed(echo.hb);
+                self.update.server_reached = true;
             }
             self.clock = Some(ClockSample { t4_us: now.wall.0 * 1000, ..echo.clock });
         }
@@ -371,6 +392,9 @@ impl AgentCore {
         }
         if let Some(policy) = down.policy {
             self.on_policy(policy);
+        }
+        if let Some(update) = down.update {
+            self.on_update(update);
         }
         if let Some(work) = down.work {
             self.on_work(now, work);
@@ -419,6 +443,17 @@ impl AgentCore {
     /// Work goes on only after everything written so far is durable.
     pub(crate) fn wait_until_durable(&mut self) {
         self.writes.barrier = self.writes.given;
+    }
+
+    /// Count of everything written so far, for [`Self::durable_up_to`]; what of it still waits is made durable soon.
+    pub(crate) fn written(&mut self) -> u64 {
+        self.writes.urgent |= !self.writes.ops.is_empty();
+        self.writes.given
+    }
+
+    /// Whether so many writes are durable.
+    pub(crate) fn durable_up_to(&self, count: u64) -> bool {
+        self.writes.durable >= count
     }
 
     pub(crate) fn is_durable(&self) -> bool {

@@ -4,7 +4,9 @@
 //! [`Op`] is the only way to change a ledger. Called by the core, which decides, and by the stores, which keep.
 
 use crate::store::Op;
-use midshift_core::ids::{AttemptId, PlaceId, Subject};
+use crate::update::SoftwareRow;
+use midshift_bundle::trust::Trusted;
+use midshift_core::ids::{AttemptId, DrainId, PlaceId, Subject};
 use midshift_core::limits;
 use midshift_core::policy::AreaPolicy;
 use midshift_core::robot::ReportedAttempt;
@@ -31,6 +33,9 @@ pub struct Applied {
     pub work: u64,
     /// Section policy.
     pub policy: u64,
+    /// Section update.
+    #[serde(default)]
+    pub update: u64,
 }
 
 /// A step that must not be done twice, from before it began until its end was written.
@@ -104,6 +109,12 @@ pub struct Ledger {
     pub holder: Option<Holder>,
     /// Places.
     pub places: PlacesRow,
+    /// The drain that holds the robot: never beside `holder`.
+    pub maintenance: Option<DrainId>,
+    /// Software.
+    pub software: SoftwareRow,
+    /// What is believed of the repository.
+    pub trusted: Option<Arc<Trusted>>,
     /// Ended attempts that the server has not yet said it stored.
     pub unclosed: BTreeMap<AttemptId, ReportedAttempt>,
     subjects: BTreeMap<Subject, SubjectRow>,
@@ -158,6 +169,9 @@ impl Ledger {
             Op::Policy(areas) => self.policy.clone_from(areas),
             Op::Holder(holder) => self.holder = holder.as_deref().cloned(),
             Op::Places(places) => self.places = places.clone(),
+            Op::Maintenance(drain_id) => self.maintenance.clone_from(drain_id),
+            Op::Software(row) => self.software = SoftwareRow::clone(row),
+            Op::Trusted(trusted) => self.trusted = Some(trusted.clone()),
             Op::Epoch(subject, epoch, at_unix_ms) => {
                 let old = self.subjects.get(subject);
                 let epoch = (*epoch).max(old.map_or(0, |row| row.epoch));

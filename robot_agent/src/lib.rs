@@ -22,4 +22,5 @@ pub mod sqlite;
 pub mod store;
 pub mod switch;
 pub mod throttle;
+pub mod update;
 pub mod work;

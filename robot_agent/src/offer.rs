@@ -7,6 +7,7 @@ use crate::ledger::Holder;
 use crate::store::Op;
 use crate::work::{CHARGE, Ending, PARK, Work};
 use midshift_core::authority::Authority;
+use midshift_core::ids::DrainId;
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{Lane, Mode, StopLevel};
 use midshift_core::time::Now;
@@ -34,6 +35,7 @@ impl AgentCore {
         let given_back = self.places.desired(&desired.grants, now.link);
         given_back.into_iter().for_each(|e| self.emit(Lane::Event, e));
         self.mind_hold(now, &desired);
+        self.mind_maintenance(desired.maintenance.clone());
         let assignment = desired.assignment.clone();
         self.desired = Some(desired);
         self.on_assignment(now, assignment);
@@ -51,8 +53,16 @@ impl AgentCore {
         }
     }
 
+    /// The drain that holds the robot goes onto the ledger only when no attempt does.
+    fn mind_maintenance(&mut self, drain_id: Option<DrainId>) {
+        let taken = drain_id.filter(|_| self.work.is_none());
+        if taken != self.kept.ledger.maintenance {
+            self.write(Op::Maintenance(taken), true);
+        }
+    }
+
     /// Whether `authority` lets the robot act now; a refusal is said as an event.
-    fn may_act(&mut self, now: &Now, authority: &Authority, what: &str) -> Result<(), String> {
+    pub(crate) fn may_act(&mut self, now: &Now, authority: &Authority, what: &str) -> Result<(), String> {
         if self.config.bugs.authority_from_receipt() {
             return Ok(());
         }
@@ -125,6 +135,9 @@ impl AgentCore {
         }
         if self.mode != Mode::Automatic {
             return self.refuse(now, &assignment, Code::NotAutomatic.into());
+        }
+        if self.kept.ledger.maintenance.is_some() || self.changes_software() {
+            return self.refuse(now, &assignment, Code::InMaintenance.into());
         }
         if let Some(work) = &self.work {
             let holder = work.holder.attempt.to_string();

@@ -9,6 +9,8 @@ use crate::bugs::Bugs;
 use crate::core::{AgentCore, CoreConfig, ExitReason, Input, Output};
 use crate::dial::{self, Dial};
 use crate::store::{self, Op, Store};
+use crate::update::io::Worker;
+use crate::update::{Done, Job, UpdateConfig};
 use backon::{BackoffBuilder, ExponentialBackoff, ExponentialBuilder};
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
@@ -43,8 +45,18 @@ pub struct AgentConfig {
     pub seed: u64,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: Bugs,
+    /// How its software is changed; none: it is not.
+    pub update: Option<Updates>,
     /// Called with each heartbeat's period, whether or not there is a session: tells a launcher that the agent lives.
     pub pulse: Option<Box<dyn FnMut() + Send>>,
+}
+
+/// What an agent needs to change its software.
+pub struct Updates {
+    /// What it believes.
+    pub config: UpdateConfig,
+    /// Does the jobs.
+    pub worker: Box<dyn Worker>,
 }
 
 /// An agent that could not go on.
@@ -69,6 +81,8 @@ const PATH: &str = "/midshift.link.v1.LinkService/Session";
 type Boxed<T> = Pin<Box<dyn Future<Output = T> + Send>>;
 /// The store comes back from each commit.
 type Commit = (Box<dyn Store>, Result<(), store::Error>);
+/// The worker comes back from each job.
+type Worked = (Box<dyn Worker>, Done);
 
 /// An open session.
 struct Open {
@@ -100,6 +114,7 @@ enum Woken {
     Due,
     Shutdown,
     Committed(Box<dyn Store>, Result<(), store::Error>),
+    Worked(Box<dyn Worker>, Box<Done>),
     Channel(Result<Channel, String>),
     DialNow,
     Greeted(Greeted),
@@ -119,13 +134,16 @@ pub struct Agent {
     store: Option<Box<dyn Store>>,
     batch: u64,
     committing: Option<Boxed<Commit>>,
+    worker: Option<Box<dyn Worker>>,
+    working: Option<Boxed<Worked>>,
+    leave: CancellationToken,
     pulsed: LinkTime,
     exit: Option<ExitReason>,
 }
 
 /// Runs one agent until `shutdown`, or until the agent ends by itself.
 pub async fn run(
-    config: AgentConfig,
+    mut config: AgentConfig,
     body: Box<dyn Body>,
     mut store: Box<dyn Store>,
     clock: Arc<dyn Clock>,
@@ -133,7 +151,11 @@ pub async fn run(
     shutdown: CancellationToken,
 ) -> Result<ExitReason, Error> {
     let kept = store.load(&config.new_ring_id).await?;
-    let core = CoreConfig { robot_id: config.robot_id.clone(), bugs: config.bugs };
+    let core = CoreConfig {
+        robot_id: config.robot_id.clone(),
+        bugs: config.bugs,
+        update: config.update.as_ref().map(|u| u.config.clone()),
+    };
     let core = AgentCore::new(core, body, kept, clock.now());
     let agent = Agent {
         retry: retries(config.seed),
@@ -146,6 +168,9 @@ pub async fn run(
         store: Some(store),
         batch: 0,
         committing: None,
+        worker: config.update.take().map(|update| update.worker),
+        working: None,
+        leave: CancellationToken::new(),
         pulsed: LinkTime(0),
         exit: None,
         config,
@@ -183,6 +208,10 @@ impl Agent {
                     self.store = Some(store);
                     self.step(Input::Persisted(self.batch));
                 }
+                Woken::Worked(worker, done) => {
+                    self.worker = Some(worker);
+                    self.step(Input::Done(done));
+                }
                 Woken::DialNow => self.dial_now(),
                 Woken::Channel(Ok(channel)) => self.greet(channel),
                 Woken::Channel(Err(why)) => self.failed(&why),
@@ -204,11 +233,12 @@ impl Agent {
     async fn wait(&mut self, shutdown: &CancellationToken) -> Woken {
         let now = self.clock.now();
         let due = tokio::time::sleep(self.until_due(&now));
-        let Self { committing, way, open, .. } = self;
+        let Self { committing, working, way, open, .. } = self;
         tokio::select! {
             biased;
             (store, done) = ready(committing) => { *committing = None; Woken::Committed(store, done) }
             () = shutdown.cancelled() => Woken::Shutdown,
+            (worker, done) = ready(working) => { *working = None; Woken::Worked(worker, Box::new(done)) }
             woken = progress(way) => { *way = Way::Idle; woken }
             message = next(open) => Woken::Down(message.map(Box::new)),
             () = due => Woken::Due,
@@ -245,6 +275,8 @@ impl Agent {
             match output {
                 Output::Persist(batch, ops) => self.persist(batch, ops),
                 Output::Send(message) => self.send(*message),
+                Output::Job(job) => self.work_on(*job),
+                Output::DropJob => self.leave.cancel(),
                 Output::Exit(reason) => self.exit = Some(reason),
             }
         }
@@ -256,6 +288,16 @@ impl Agent {
         self.committing = Some(Box::pin(async move {
             let done = store.commit(&ops).await;
             (store, done)
+        }));
+    }
+
+    fn work_on(&mut self, job: Job) {
+        let Some(mut worker) = self.worker.take() else { return };
+        self.leave = CancellationToken::new();
+        let leave = self.leave.clone();
+        self.working = Some(Box::pin(async move {
+            let done = worker.work(job, leave).await;
+            (worker, done)
         }));
     }
 

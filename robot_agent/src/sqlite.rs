@@ -78,6 +78,9 @@ impl SqliteStore {
                 "policy" => ledger.policy = read(&key, &value)?,
                 "holder" => ledger.holder = read(&key, &value)?,
                 "places" => ledger.places = read(&key, &value)?,
+                "maintenance" => ledger.maintenance = read(&key, &value)?,
+                "software" => ledger.software = read(&key, &value)?,
+                "trusted" => ledger.trusted = Some(Arc::new(read(&key, &value)?)),
                 _ => return Err(unreadable(&key, "not a known fact")),
             }
         }
@@ -156,6 +159,9 @@ async fn write(on: &mut SqliteConnection, op: &Op) -> Result<(), Error> {
         Op::Policy(areas) => fact(on, "policy", areas).await,
         Op::Holder(holder) => fact(on, "holder", holder).await,
         Op::Places(places) => fact(on, "places", places).await,
+        Op::Maintenance(drain_id) => fact(on, "maintenance", drain_id).await,
+        Op::Software(row) => fact(on, "software", row).await,
+        Op::Trusted(trusted) => fact(on, "trusted", trusted.as_ref()).await,
         Op::Epoch(subject, epoch, at_unix_ms) => {
             let upsert = "INSERT INTO subject (subject, epoch, at_unix_ms) VALUES ($1, $2, $3)
                 ON CONFLICT (subject) DO UPDATE SET epoch = max(epoch, excluded.epoch), at_unix_ms = excluded.at_unix_ms";

@@ -6,8 +6,10 @@
 
 use crate::ledger::{Applied, Holder, Ledger, PlacesRow, SessionMemory};
 use crate::ring::Ring;
+use crate::update::SoftwareRow;
 use async_trait::async_trait;
-use midshift_core::ids::{AttemptId, Subject};
+use midshift_bundle::trust::Trusted;
+use midshift_core::ids::{AttemptId, DrainId, Subject};
 use midshift_core::policy::AreaPolicy;
 use midshift_core::robot::{Lane, ReportedAttempt};
 use midshift_core::work::{AttemptReport, Gap, Sample};
@@ -45,6 +47,12 @@ pub enum Op {
     Holder(Option<Box<Holder>>),
     /// Places and grants.
     Places(PlacesRow),
+    /// The drain that holds the robot.
+    Maintenance(Option<DrainId>),
+    /// Software.
+    Software(Box<SoftwareRow>),
+    /// What is believed of the repository.
+    Trusted(Arc<Trusted>),
     /// This epoch of the subject was seen, at this wall time (unix milliseconds): it is passed.
     Epoch(Subject, u64, i64),
     /// An attempt ended: its answer, how to list it until the server has it, and the wall time (unix milliseconds).

@@ -232,6 +232,7 @@ impl Life {
         // What must differ between two processes comes from the wall's clock too; the seed alone would repeat.
         let wall = self.config.clock.now().wall.0;
         AgentConfig {
+            update: None,
             robot_id: self.robot.robot_id().clone(),
             boot_id: format!("{wall:x}-{:016x}", self.rng.random::<u64>()),
             new_ring_id: format!("{wall:x}-{:016x}", self.rng.random::<u64>()),

@@ -5,7 +5,7 @@
 
 use super::anchor::{anchor, is_worn, next_generation};
 use super::attempts;
-use super::rows::HolderState;
+use super::rows::{HolderState, RobotHolder};
 use super::tx::Tx;
 use super::view::{View, held};
 use super::{Board, way};
@@ -49,6 +49,10 @@ pub fn compose(tx: &mut Tx, robot_id: &RobotId, board: &Board, releases: &Releas
         held: is_held || (old.held && resume.is_none()),
         resume,
         closed: closed(&old, live, live_attempt.as_ref().map(|a| &a.attempt)),
+        maintenance: match tx.view.authority.get(robot_id.as_str()).map(|a| &a.row.holder) {
+            Some(RobotHolder::Maintenance(drain_id)) => Some(drain_id.clone()),
+            _ => None,
+        },
     };
     let behind = session.applied_work > old.generation;
     if stands.is_some() && new == old && !behind {
@@ -74,6 +78,7 @@ pub fn empty(robot_id: &RobotId) -> DesiredWork {
         held: false,
         resume: None,
         closed: Vec::new(),
+        maintenance: None,
     }
 }
 

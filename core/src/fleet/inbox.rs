@@ -23,6 +23,8 @@ pub fn take(tx: &mut Tx, entry: &InboxEntry, tally: &mut Tally) {
         RobotEvent::Mode(mode) => mode_changed(tx, robot_id, *mode),
         RobotEvent::HardwareStop(stop) => hardware_stop(tx, robot_id, *stop),
         RobotEvent::StaleAuthority { .. } => tally.stale_authority += 1,
+        // The rollout service reads these itself.
+        RobotEvent::Update(_) => {}
         RobotEvent::Fault { .. } | RobotEvent::Load(_) | RobotEvent::BatteryCritical { .. } => {}
     }
 }

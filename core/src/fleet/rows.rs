@@ -1,7 +1,7 @@
 //! Rows that fleet alone writes, apart from tasks and attempts: places, the robot's mutex, control, timers, holds, counters, marks.
 
 use super::commands::Command;
-use crate::ids::{AreaId, AttemptId, PlaceId, RobotId, SiteId, TaskId};
+use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, SiteId, TaskId};
 use crate::reason::Reason;
 use crate::robot::Duty;
 use crate::rows::{Index, Record, Revision, Seq, Table};
@@ -77,8 +77,8 @@ pub enum RobotHolder {
     None,
     /// An attempt of a task or errand.
     Attempt(AttemptId),
-    /// Maintenance of a drain. No producer until OTA lands.
-    Maintenance(String),
+    /// Maintenance of a drain.
+    Maintenance(DrainId),
 }
 
 /// The robot's mutex: an assignment and a drain are both an update of this one row.

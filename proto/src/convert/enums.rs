@@ -5,6 +5,7 @@ use midshift_core::fleet::rows::HolderState;
 use midshift_core::robot::{Duty, FaultClass, HardwareStop, Lane, Mode, Presence, StopLevel};
 use midshift_core::task::state::Errand;
 use midshift_core::task::{AttemptPhase, Phase, Resolution, Then};
+use midshift_core::update::{Goal, UpdateState};
 use midshift_core::work::{Effect, PlaceNews, WorkState};
 
 /// A core enum with its twin on the wire.
@@ -58,6 +59,11 @@ wire_enums! {
     }
     PlaceNews = link::v1::PlaceNews { Entered = Entered, Left = Left, NotEntered = NotEntered }
     Effect = link::v1::WorkEffect { Repeatable = Repeatable, CheckFirst = CheckFirst, AtMostOnce = AtMostOnce }
+    Goal = link::v1::UpdateGoal { None = Unspecified, Stage = Stage, Activate = Activate, Commit = Commit, Revert = Revert }
+    UpdateState = link::v1::UpdateState {
+        Directed = Directed, Downloading = Downloading, Staged = Staged, Switching = Switching, Probation = Probation, Trial = Trial,
+        Committing = Committing, RollingBack = RollingBack, Committed = Committed, RolledBack = RolledBack, Refused = Refused, Stuck = Stuck,
+    }
     Presence = telemetry::v1::Presence { Online = Online, Suspect = Suspect, Offline = Offline, Updating = Updating }
     Duty = fleet::v1::Duty { InWork = InWork, Cordoned = Cordoned, BrokenOff = BrokenOff, Retired = Retired }
     Errand = fleet::v1::Errand { Charge = Charge, Park = Park }

@@ -10,6 +10,7 @@ pub mod sample;
 pub mod session;
 pub mod task;
 pub mod telemetry;
+pub mod update;
 pub mod work;
 
 use midshift_core::limits;

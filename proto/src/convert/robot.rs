@@ -202,6 +202,8 @@ impl From<&ReportedState> for v1::ReportedState {
             hardware_stop: state.hardware_stop.to_wire(),
             field_violation: state.field_violation,
             fault: state.fault.as_ref().map(Into::into),
+            applied_update: state.applied_update,
+            update: state.update.as_ref().map(Into::into),
         }
     }
 }
@@ -217,6 +219,8 @@ impl Parse<ReportedState> for v1::ReportedState {
         let stop_level = word(self.stop_level, at.field("stop_level"), bad);
         let hardware_stop = word(self.hardware_stop, at.field("hardware_stop"), bad);
         let fault = maybe(self.fault, at.field("fault"), bad);
+        let update = maybe(self.update, at.field("update"), bad);
+        let applied_update = counted(self.applied_update, at.field("applied_update"), bad);
         let hb = counted(self.hb, at.field("hb"), bad);
         let session_epoch = counted(self.session_epoch, at.field("session_epoch"), bad);
         let applied_work = counted(self.applied_work, at.field("applied_work"), bad);
@@ -226,6 +230,7 @@ impl Parse<ReportedState> for v1::ReportedState {
             session_epoch: session_epoch?,
             applied_work: applied_work?,
             applied_policy: applied_policy?,
+            applied_update: applied_update?,
             produced: produced?,
             mode: mode?,
             vitals: vitals?,
@@ -236,6 +241,7 @@ impl Parse<ReportedState> for v1::ReportedState {
             hardware_stop: hardware_stop?,
             field_violation: self.field_violation,
             fault: fault?,
+            update: update?,
         })
     }
 }

@@ -57,6 +57,7 @@ impl From<&RobotEvent> for v1::RobotEvent {
             RobotEvent::StaleAuthority { what, detail } => {
                 W::StaleAuthority(v1::StaleAuthorityReport { what: what.clone(), detail: detail.clone() })
             }
+            RobotEvent::Update(event) => W::Update(event.into()),
             RobotEvent::BatteryCritical { battery_permille } => {
                 W::BatteryCritical(v1::BatteryCriticalReport { battery_permille: u32::from(*battery_permille) })
             }
@@ -94,6 +95,7 @@ impl Parse<RobotEvent> for v1::RobotEvent {
                 let what = text(report.what, 64, at.field("stale_authority").field("what"), bad);
                 Some(RobotEvent::StaleAuthority { what: what?, detail: report.detail })
             }
+            W::Update(news) => news.parse_at(at.field("update"), bad).map(RobotEvent::Update),
             W::BatteryCritical(report) => {
                 let value =
                     permille(report.battery_permille, at.field("battery_critical").field("battery_permille"), bad);

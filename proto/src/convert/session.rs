@@ -233,6 +233,7 @@ impl From<&Downlink> for v1::Downlink {
             acks: downlink.acks.iter().map(Into::into).collect(),
             work: downlink.work.as_ref().map(Into::into),
             policy: downlink.policy.as_ref().map(Into::into),
+            update: downlink.update.as_ref().map(Into::into),
             status_credit_bytes: downlink.status_credit_bytes,
         }
     }
@@ -252,11 +253,13 @@ impl Parse<Downlink> for v1::Downlink {
         let acks = list(self.acks, at.field("acks"), bad);
         let work = maybe(self.work, at.field("work"), bad);
         let policy = maybe(self.policy, at.field("policy"), bad);
+        let update = maybe(self.update, at.field("update"), bad);
         Some(Downlink {
             echo: echo?,
             acks: acks?,
             work: work?,
             policy: policy?,
+            update: update?,
             status_credit_bytes: self.status_credit_bytes,
         })
     }

@@ -4,7 +4,7 @@ use super::{
     At, Parse, WireEnum, common, from_one, from_struct, id, list, maybe, maybe_id, need, permille, to_struct, word,
 };
 use crate::link::v1;
-use midshift_core::ids::{AreaId, PlaceId, RobotId, WaypointId};
+use midshift_core::ids::{AreaId, DrainId, PlaceId, RobotId, WaypointId};
 use midshift_core::policy::AreaPolicy;
 use midshift_core::reason::Violations;
 use midshift_core::work::{Assignment, DesiredPolicy, DesiredWork, GrantedPlace, RoutePoint, StepKind, WorkStep};
@@ -185,6 +185,7 @@ impl From<&DesiredWork> for v1::DesiredWork {
             held: work.held,
             resume: work.resume.as_ref().map(Into::into),
             closed: work.closed.iter().map(Into::into).collect(),
+            maintenance: work.maintenance.as_ref().map(ToString::to_string).unwrap_or_default(),
         }
     }
 }
@@ -197,6 +198,7 @@ impl Parse<DesiredWork> for v1::DesiredWork {
         let grants = list(self.grants, at.field("grants"), bad);
         let resume = maybe(self.resume, at.field("resume"), bad);
         let closed = list(self.closed, at.field("closed"), bad);
+        let maintenance = maybe_id(&self.maintenance, DrainId::parse, at.field("maintenance"), bad);
         Some(DesiredWork {
             robot_id: robot_id?,
             generation: generation?,
@@ -205,6 +207,7 @@ impl Parse<DesiredWork> for v1::DesiredWork {
             held: self.held,
             resume: resume?,
             closed: closed?,
+            maintenance: maintenance?,
         })
     }
 }

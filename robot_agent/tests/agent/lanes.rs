@@ -165,7 +165,7 @@ async fn the_ledger_is_read_back_as_it_was_written(open: impl AsyncFn() -> Box<d
     bench
         .write(vec![
             Op::Session(SessionMemory { session_epoch: 3, secret: "s".into(), store_id: "store".into() }),
-            Op::Applied(Applied { work: 4, policy: 5 }),
+            Op::Applied(Applied { work: 4, policy: 5, update: 6 }),
             Op::Holder(Some(Box::new(holder))),
             Op::Places(places),
             Op::Epoch(done.subject.clone(), 4, 1_000),

@@ -1,9 +1,13 @@
 //! A robot on a bench: the core with a body that does what the test says, a store that keeps, and a server that is the test.
 
+use crate::release::Releases;
 use midshift_agent::body::{Body, BodyLimits, BodyNews, BodyOrder, BodyState, Checked, PathPoint};
 use midshift_agent::bugs::Bugs;
 use midshift_agent::core::{AgentCore, CoreConfig, ExitReason, Input, Output};
 use midshift_agent::memory::MemoryStore;
+use midshift_agent::sets::memory::MemorySets;
+use midshift_agent::update::io::{UpdateWorker, Worker};
+use midshift_agent::update::{Done, Job};
 use midshift_core::authority::Authority;
 use midshift_core::ids::{AreaId, AttemptId, PlaceId, RobotId, Subject, TaskId, WaypointId};
 use midshift_core::robot::{Fault, HardwareStop, Inventory, Lane, Load, Mode, Pose, ReportedState, StopLevel};
@@ -14,6 +18,7 @@ use midshift_core::work::{
 };
 use midshift_proto::session::{ClockSample, Downlink, Echo, LaneAck, LaneBatch, Uplink, Welcome};
 use std::sync::{Arc, Mutex, MutexGuard};
+use tokio_util::sync::CancellationToken;
 
 /// What the body was told and how it is.
 #[derive(Clone)]
@@ -32,6 +37,8 @@ pub struct BodyLog {
     pub mode: Mode,
     pub hardware_stop: HardwareStop,
     pub checked: Checked,
+    /// What its own test finds.
+    pub broken: Option<Fault>,
     news: Vec<BodyNews>,
 }
 
@@ -55,6 +62,7 @@ impl TestBody {
             mode: Mode::Automatic,
             hardware_stop: HardwareStop::None,
             checked: Checked::Unknown,
+            broken: None,
             news: Vec::new(),
         })))
     }
@@ -104,7 +112,8 @@ impl TestBody {
 
 impl Body for TestBody {
     fn capabilities(&self) -> Inventory {
-        Inventory { capabilities: vec!["pick".into(), "place".into()], ..Inventory::default() }
+        let capabilities = vec!["pick".into(), "place".into()];
+        Inventory { capabilities, model: crate::release::MODEL.to_owned(), ..Inventory::default() }
     }
     fn limits(&self) -> BodyLimits {
         BodyLimits { speed_mm_s: 1_500, floor_speed_mm_s: 50, battery_critical_permille: 100 }
@@ -171,7 +180,7 @@ impl Body for TestBody {
         self.lock().checked
     }
     fn self_test(&mut self, _: SiteTime) -> Result<(), Fault> {
-        Ok(())
+        self.lock().broken.clone().map_or(Ok(()), Err)
     }
     fn hardware_stop(&self) -> HardwareStop {
         self.lock().hardware_stop
@@ -199,8 +208,51 @@ pub struct Rig {
     pub messages: Vec<Uplink>,
     pub reported: Option<ReportedState>,
     pub exit: Option<ExitReason>,
+    /// Software that can be changed, and the ends of its jobs.
+    pub updates: Option<Updates>,
     generation: u64,
     heard: [u64; 3],
+}
+
+/// What a robot needs to change its software, and what happens to it on the way.
+#[derive(Clone)]
+pub struct Updates {
+    pub releases: Releases,
+    pub sets: MemorySets,
+    /// Effects (commits and jobs) so far.
+    pub effects: usize,
+    /// The effect at which the power goes.
+    pub cut_at: Option<usize>,
+    /// The effect at which it goes was done; else it was not.
+    pub last_is_done: bool,
+    /// The power is gone: nothing has an effect any more.
+    pub dark: bool,
+    pub jobs: Vec<Job>,
+}
+
+impl Updates {
+    pub fn of(releases: &Releases) -> Self {
+        let (releases, sets) = (releases.clone(), MemorySets::new());
+        Self { releases, sets, effects: 0, cut_at: None, last_is_done: false, dark: false, jobs: Vec::new() }
+    }
+    fn work(&self, job: Job) -> Done {
+        let remote = Arc::new(self.releases.clone());
+        let mut worker = UpdateWorker::new(Box::new(self.sets.clone()), remote);
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+        runtime.block_on(worker.work(job, CancellationToken::new()))
+    }
+    /// Whether the next effect happens, and whether its doer hears of it.
+    fn effect(&mut self) -> (bool, bool) {
+        if self.dark {
+            return (false, false);
+        }
+        self.effects += 1;
+        if self.cut_at == Some(self.effects) {
+            self.dark = true;
+            return (self.last_is_done, false);
+        }
+        (true, true)
+    }
 }
 
 pub const START_MS: u64 = 1_000;
@@ -210,15 +262,23 @@ impl Rig {
     pub fn at(name: &str) -> Self {
         Self::with(TestBody::at(name), MemoryStore::new(), Bugs::default())
     }
+    /// One whose software can be changed.
+    pub fn updatable(releases: &Releases) -> Self {
+        Self::new(TestBody::at("A"), MemoryStore::new(), Bugs::default(), Some(Updates::of(releases)), START_MS)
+    }
     pub fn with(body: TestBody, store: MemoryStore, bugs: Bugs) -> Self {
+        Self::new(body, store, bugs, None, START_MS)
+    }
+    fn new(body: TestBody, store: MemoryStore, bugs: Bugs, updates: Option<Updates>, ms: u64) -> Self {
         let kept = store.load_now("ring-1");
-        let config = CoreConfig { robot_id: RobotId::parse("rbt-01").expect("a name"), bugs };
-        let core = AgentCore::new(config, Box::new(body.clone()), kept, now_at(START_MS));
+        let update = updates.as_ref().map(|u| u.releases.config());
+        let config = CoreConfig { robot_id: RobotId::parse("rbt-01").expect("a name"), bugs, update };
+        let core = AgentCore::new(config, Box::new(body.clone()), kept, now_at(ms));
         let mut rig = Self {
             core,
             body,
             store,
-            ms: START_MS,
+            ms,
             hb: 0,
             epoch: 0,
             slow_disk: false,
@@ -227,6 +287,7 @@ impl Rig {
             messages: Vec::new(),
             reported: None,
             exit: None,
+            updates,
             generation: 100,
             heard: [0; 3],
         };
@@ -235,7 +296,8 @@ impl Rig {
     }
     /// The process is killed and started again: what was not durable is gone.
     pub fn restart(self) -> Self {
-        let mut next = Self::with(self.body, self.store, Bugs::default());
+        let updates = self.updates.map(|u| Updates { dark: false, ..u });
+        let mut next = Self::new(self.body, self.store, Bugs::default(), updates, self.ms);
         next.generation = self.generation;
         next.heard = self.heard;
         next.epoch = self.epoch;
@@ -248,14 +310,27 @@ impl Rig {
                 match output {
                     Output::Persist(batch, ops) if self.slow_disk => self.unwritten = Some((batch, ops)),
                     Output::Persist(batch, ops) => {
-                        self.store.commit_now(&ops);
-                        inputs.push(Input::Persisted(batch));
+                        let (happens, is_heard) = self.effect();
+                        if happens {
+                            self.store.commit_now(&ops);
+                        }
+                        inputs.extend(is_heard.then_some(Input::Persisted(batch)));
                     }
+                    Output::Job(job) => {
+                        let (happens, is_heard) = self.effect();
+                        let done = self.updates.as_ref().filter(|_| happens).map(|u| u.work(Job::clone(&job)));
+                        self.updates.iter_mut().for_each(|u| u.jobs.push(Job::clone(&job)));
+                        inputs.extend(done.filter(|_| is_heard).map(|done| Input::Done(Box::new(done))));
+                    }
+                    Output::DropJob => {}
                     Output::Send(message) => self.sent(*message),
                     Output::Exit(reason) => self.exit = Some(reason),
                 }
             }
         }
+    }
+    fn effect(&mut self) -> (bool, bool) {
+        self.updates.as_mut().map_or((true, true), Updates::effect)
     }
     /// Highest number of a lane that was sent.
     pub fn heard(&self, lane: Lane) -> u64 {
@@ -334,6 +409,7 @@ impl Rig {
             held: false,
             resume: None,
             closed: Vec::new(),
+            maintenance: None,
         }
     }
     /// Sends desired work with the next generation.

@@ -152,6 +152,7 @@ impl Bench {
         let incoming = ReceiverStream::new(incoming);
         tokio::spawn(Server::builder().add_service(LinkServiceServer::new(Desk(seen))).serve_with_incoming(incoming));
         let config = AgentConfig {
+            update: None,
             robot_id: RobotId::parse("rbt-01").expect("a name"),
             boot_id: "boot-1".into(),
             new_ring_id: "ring-1".into(),
@@ -308,6 +309,7 @@ async fn a_robot_on_its_file_takes_work_over_the_wire_and_does_it() {
         held: false,
         resume: None,
         closed: Vec::new(),
+        maintenance: None,
     };
     session.say(ToRobot::Downlink(Box::new(Downlink { work: Some(work), ..Downlink::default() }))).await;
     let mut states = Vec::new();

@@ -126,6 +126,7 @@ pub async fn agent(args: AgentRun, stop: CancellationToken) -> anyhow::Result<()
     let dial = midshift_agent::dial::TcpDial::new(&uri(&args.server), Some(network))?;
     let store = midshift_agent::sqlite::SqliteStore::open(&args.data.join(AGENT_FILE)).await?;
     let agent = midshift_agent::session::AgentConfig {
+        update: None,
         robot_id,
         boot_id: format!("{:032x}", rand::random::<u128>()),
         new_ring_id: format!("{:032x}", rand::random::<u128>()),

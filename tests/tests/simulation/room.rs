@@ -267,6 +267,7 @@ impl Agent {
         let body = &self.hall.robots()[self.robot];
         let robot_id = body.robot_id().clone();
         let config = AgentConfig {
+            update: None,
             robot_id: robot_id.clone(),
             boot_id: format!("boot-{}-{life}", self.robot),
             new_ring_id: format!("ring-{}-{life}", self.robot),

@@ -1,0 +1,202 @@
+//! The robot's updater without IO: which bytes to fetch, when to switch, when to go back.
+//!
+//! Rooms: here what it knows and asks for; `pursue` is the machine; `io` does the jobs. Called by the core.
+//! Invariant: each side effect is a [`Job`], and a job begins only after the ledger row that explains it is durable; at most one job is
+//! under way. The switch record wins over the ledger.
+
+pub mod io;
+mod pursue;
+
+use crate::sets::{Holdings, Wanted};
+use crate::switch::Switch;
+use midshift_bundle::digest::Digest;
+use midshift_bundle::keys::{KeyId, PublicKey};
+use midshift_bundle::manifest::Manifest;
+use midshift_bundle::set::SetManifest;
+use midshift_bundle::trust::{Reading, Refreshed, Trusted};
+use midshift_core::ids::{BundleId, DrainId, SetId};
+use midshift_core::reason::Reason;
+use midshift_core::time::{LinkTime, SiteTime};
+use midshift_core::update::{DesiredUpdate, UpdateReport, UpdateState};
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+/// What a robot believes from the day it was set up.
+#[derive(Clone, Debug)]
+pub struct UpdateConfig {
+    /// First root of the repository.
+    pub root: Vec<u8>,
+    /// Keys whose directives it takes.
+    pub directive_keys: BTreeMap<KeyId, PublicKey>,
+    /// Its clock is set from the network.
+    pub clock_synced: bool,
+    /// The site lets components in that bear on a safety function.
+    pub allows_safety_related: bool,
+    /// Somebody starts the program again when it ends to switch.
+    pub is_launched: bool,
+}
+
+/// What the ledger remembers of software.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct SoftwareRow {
+    /// Generation of the newest directive that was taken.
+    pub directive: u64,
+    /// Highest grant that was used.
+    pub grant_id: u64,
+    /// Lowest `rollback_index` of each component that may be taken.
+    pub floors: BTreeMap<String, u64>,
+    /// The newest update.
+    pub update: Option<Update>,
+}
+
+/// One update.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Update {
+    /// Where it stands.
+    pub state: UpdateState,
+    /// Its manifest.
+    pub bundle: Digest,
+    /// Bytes of the manifest.
+    pub manifest_length: u64,
+    /// No component may have a lower `rollback_index`.
+    pub rollback_floor: u64,
+    /// What comes of it; none before it was planned.
+    pub set: Option<SetManifest>,
+    /// Floors rise when it is committed.
+    pub raises_floor: bool,
+    /// It cannot be gone back from once it is committed.
+    pub is_irreversible: bool,
+    /// The drain in which it was activated, or gone back from.
+    pub drain_id: Option<DrainId>,
+    /// Starts that the set was given before it was put away.
+    pub tries: u32,
+    /// Milliseconds of site time on probation.
+    pub probation_ms: u64,
+    /// Why it was refused or went back.
+    pub reason: Option<Reason>,
+}
+
+impl Update {
+    /// Name of its set in the switch record.
+    pub fn set_name(&self) -> Option<String> {
+        self.set.as_ref().map(|set| set.id().to_string())
+    }
+}
+
+/// Something that takes time, done outside the core.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Job {
+    /// What is on the disk?
+    Look,
+    /// Ask the repository what there is.
+    Refresh {
+        /// What is believed so far.
+        trusted: Box<Trusted>,
+        /// The robot's clock.
+        clock: Reading,
+    },
+    /// Have this content, whole and checked.
+    Fetch {
+        /// Which.
+        wanted: Wanted,
+        /// Bytes a second; 0: as fast as it goes.
+        rate_bytes_s: u32,
+    },
+    /// Fetch and read a manifest.
+    Manifest {
+        /// Which.
+        wanted: Wanted,
+    },
+    /// Make a set of what is there and read it back.
+    Stage(Box<SetManifest>),
+    /// Read a set again.
+    Verify(SetId),
+    /// Write the switch record.
+    Write(Switch),
+    /// Delete what nobody needs.
+    Collect(BTreeSet<Digest>),
+}
+
+/// What came of a job.
+#[derive(Clone, Debug)]
+pub enum Done {
+    /// What is there.
+    Holdings(Box<Holdings>),
+    /// What the repository lists.
+    Refreshed(Box<Refreshed>),
+    /// A manifest.
+    Manifest(Box<Manifest>),
+    /// Done as asked.
+    Ok,
+    /// Written, with its number.
+    Written(Switch),
+    /// Not done.
+    Failed(Failure),
+}
+
+/// Why a job was not done.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Failure {
+    /// The server or the disk does not answer: tried again.
+    Later(String),
+    /// It will not be otherwise next time.
+    Refused(Reason),
+}
+
+/// What the updater knows that is not on the ledger.
+#[derive(Debug, Default)]
+pub(crate) struct Updater {
+    pub(crate) config: Option<UpdateConfig>,
+    /// Newest section of desired state.
+    pub(crate) desired: Option<DesiredUpdate>,
+    pub(crate) holdings: Option<Holdings>,
+    /// What the repository lists, by name, since the last refresh.
+    pub(crate) listed: Option<Arc<Refreshed>>,
+    /// The job under way.
+    pub(crate) running: Option<Job>,
+    /// The next job, once everything written before this count is durable.
+    pub(crate) next: Option<(Job, u64)>,
+    /// Envelope that was looked at and needs no second look.
+    pub(crate) judged: Option<String>,
+    /// Content that is known to be there.
+    pub(crate) fetched: BTreeSet<Digest>,
+    /// Bytes that are there and those that are needed.
+    pub(crate) progress: (u64, u64),
+    /// No job before this, and how many failed in a row.
+    pub(crate) pause: Option<(LinkTime, u32)>,
+    /// When a grant was last asked for.
+    pub(crate) asked: Option<(DrainId, LinkTime)>,
+    /// Newest grant that came too late.
+    pub(crate) stale_grant: u64,
+    /// When this process began.
+    pub(crate) begun: Option<(LinkTime, SiteTime)>,
+    /// The server has answered a heartbeat of this process.
+    pub(crate) server_reached: bool,
+    /// The body's own test, made once in a process.
+    pub(crate) self_test: Option<Result<(), Reason>>,
+    /// The switch back was written by this process.
+    pub(crate) went_back: bool,
+    /// The download under way is to be left, and that was said.
+    pub(crate) drops: bool,
+    pub(crate) dropping: bool,
+    /// Garbage was collected since the last end of an update.
+    pub(crate) collected: bool,
+}
+
+impl SoftwareRow {
+    /// The newest update as it is reported.
+    pub fn report(&self, progress_permille: u16) -> Option<UpdateReport> {
+        let update = self.update.as_ref()?;
+        Some(UpdateReport {
+            state: update.state,
+            bundle: BundleId::parse(&update.bundle.to_string()).ok()?,
+            set: update.set_name().and_then(|name| SetId::parse(&name).ok()),
+            drain_id: update.drain_id.clone(),
+            grant_id: self.grant_id,
+            tries: update.tries,
+            progress_permille,
+            reason: update.reason.clone(),
+        })
+    }
+}

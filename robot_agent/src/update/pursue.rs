@@ -1,0 +1,691 @@
+//! The machine: from what is wanted, what the ledger says and what is on the disk to the next job.
+//!
+//! Invariant: level-triggered. It may be called at any moment and any number of times; what it decides is written down before it is done.
+
+use super::{Done, Failure, Job, SoftwareRow, Update};
+use crate::core::{AgentCore, ExitReason, Output};
+use crate::sets::{Holdings, Wanted};
+use crate::store::Op;
+use crate::switch::Switch;
+use midshift_bundle::digest::Digest;
+use midshift_bundle::directive::{Directive, Expected, Rejection};
+use midshift_bundle::manifest::{Manifest, Migration};
+use midshift_bundle::set::{Fit, SetManifest, raised};
+use midshift_bundle::trust::{Reading, Refreshed, Trusted};
+use midshift_core::ids::{DrainId, PlaceId, SetId};
+use midshift_core::limits;
+use midshift_core::reason::{Code, Reason};
+use midshift_core::robot::{Fault, HardwareStop, Lane, Mode};
+use midshift_core::time::{LinkDuration, Now, SiteDuration, Utc};
+use midshift_core::update::{DesiredUpdate, Goal, UpdateEvent, UpdateState};
+use midshift_core::work::RobotEvent;
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+/// First and longest pause after a job that may work the next time.
+const PAUSE: (LinkDuration, LinkDuration) = (LinkDuration(1_000), LinkDuration(60_000));
+/// A grant that did not come is asked for again after this.
+const ASK_AGAIN: LinkDuration = LinkDuration(10_000);
+/// A set on probation that does not reach its server for so long is gone back from.
+const LOST_SERVER: LinkDuration = LinkDuration(600_000);
+
+impl AgentCore {
+    /// Takes section `update` in.
+    pub(crate) fn on_update(&mut self, desired: DesiredUpdate) {
+        let mut applied = self.kept.ledger.applied;
+        if desired.generation < applied.update {
+            tracing::warn!(generation = desired.generation, applied = applied.update, "older update refused");
+            return;
+        }
+        if desired.generation > applied.update {
+            applied.update = desired.generation;
+            self.write(Op::Applied(applied), false);
+        }
+        self.update.desired = Some(desired);
+    }
+
+    /// Hands the next job out once what explains it is durable.
+    pub(crate) fn start_job(&mut self, out: &mut Vec<Output>) {
+        if self.update.drops && !self.update.dropping {
+            out.push(Output::DropJob);
+        }
+        self.update.dropping = self.update.drops;
+        if self.update.running.is_none()
+            && let Some((job, barrier)) = self.update.next.take()
+        {
+            if self.durable_up_to(barrier) {
+                self.update.running = Some(job.clone());
+                out.push(Output::Job(Box::new(job)));
+            } else {
+                self.update.next = Some((job, barrier));
+            }
+        }
+    }
+
+    /// Decides what is next, if nothing is under way.
+    pub(crate) fn pursue_update(&mut self, now: &Now) -> Option<ExitReason> {
+        if self.update.config.is_none() || self.update.next.is_some() {
+            return None;
+        }
+        if let Some(running) = &self.update.running {
+            self.update.drops |= self.is_stale(running);
+            return None;
+        }
+        if let Some((until, _)) = self.update.pause.filter(|(until, _)| now.link < *until) {
+            self.wake_at(until);
+            return None;
+        }
+        self.update.begun.get_or_insert((now.link, now.site));
+        let Some(holdings) = self.update.holdings.clone() else {
+            self.ask_for(Job::Look);
+            return None;
+        };
+        let Some(update) = self.kept.ledger.software.update.clone() else {
+            return self.without_update(now, &holdings);
+        };
+        match update.state {
+            UpdateState::Directed => self.directed(&update),
+            UpdateState::Downloading => self.downloading(&update),
+            UpdateState::Staged => self.staged(now, update),
+            UpdateState::Switching => return self.switching(&update, &holdings),
+            UpdateState::Probation => self.probation(now, update, &holdings),
+            UpdateState::Trial => self.trial(update, &holdings),
+            UpdateState::Committing => self.committing(update, &holdings),
+            UpdateState::RollingBack => return self.rolling_back(now, update, &holdings),
+            UpdateState::Committed if self.wants_back(&update) && holdings.switch.kept().is_some() => {
+                self.go_back(update, Reason::from(Code::RevertAsked));
+            }
+            _ => return self.without_update(now, &holdings),
+        }
+        None
+    }
+
+    /// A download that is wanted no more, or at another rate.
+    fn is_stale(&self, running: &Job) -> bool {
+        let Job::Fetch { rate_bytes_s, .. } = running else { return false };
+        let desired = self.update.desired.as_ref();
+        desired.is_some_and(|d| d.rate_bytes_s != *rate_bytes_s || (d.goal == Goal::Revert && self.names(d)))
+    }
+
+    /// Takes what came of the job under way.
+    pub(crate) fn job_done(&mut self, now: &Now, done: Done) {
+        let Some(job) = self.update.running.take() else { return };
+        if std::mem::take(&mut self.update.drops) && matches!(job, Job::Fetch { .. }) && !matches!(done, Done::Ok) {
+            return;
+        }
+        if !matches!(done, Done::Failed(_)) {
+            self.update.pause = None;
+        }
+        match (job, done) {
+            (_, Done::Holdings(holdings)) => self.look(*holdings),
+            (Job::Refresh { .. }, Done::Refreshed(refreshed)) => self.refreshed(now, *refreshed),
+            (Job::Manifest { wanted }, Done::Manifest(manifest)) => self.plan(&wanted, &manifest),
+            (Job::Fetch { wanted, .. }, Done::Ok) => {
+                self.update.fetched.insert(wanted.digest);
+            }
+            (Job::Stage(set), Done::Ok) => {
+                self.hold(|holdings| {
+                    holdings.sets.insert(set.id(), *set);
+                });
+                self.move_to(UpdateState::Staged, None);
+            }
+            (Job::Write(_), Done::Written(switch)) => self.hold(|holdings| holdings.switch = switch),
+            (Job::Verify(set), Done::Ok) => self.verified(&set),
+            (Job::Collect(_), Done::Ok) => self.update.collected = true,
+            (job, Done::Failed(Failure::Later(why))) => self.put_off(now, &job, &why),
+            (job, Done::Failed(Failure::Refused(reason))) => self.job_refused(now, job, reason),
+            (job, done) => tracing::error!(?job, ?done, "a job ended as another"),
+        }
+    }
+
+    fn hold(&mut self, change: impl FnOnce(&mut Holdings)) {
+        if let Some(holdings) = &mut self.update.holdings {
+            change(holdings);
+        }
+    }
+
+    fn ask_for(&mut self, job: Job) {
+        let barrier = self.written();
+        self.update.next = Some((job, barrier));
+    }
+
+    fn put_off(&mut self, now: &Now, job: &Job, why: &str) {
+        let failures = self.update.pause.map_or(0, |(_, failures)| failures) + 1;
+        let pause = PAUSE.0.as_ms().saturating_mul(1 << (failures - 1).min(6)).min(PAUSE.1.as_ms());
+        tracing::info!(robot_id = %self.config.robot_id, ?job, why, pause_ms = pause, "update is put off");
+        self.update.pause = Some((now.link + LinkDuration(pause), failures));
+        if matches!(job, Job::Stage(_)) {
+            // Content that was there has changed on the disk: look for all of it again.
+            self.update.fetched.clear();
+        }
+    }
+
+    fn job_refused(&mut self, now: &Now, job: Job, reason: Reason) {
+        match job {
+            Job::Verify(_) => self.move_to(UpdateState::Stuck, Some(reason)),
+            Job::Refresh { .. } => self.refuse_directive(reason),
+            Job::Manifest { .. } | Job::Fetch { .. } | Job::Stage(_) => {
+                self.move_to(UpdateState::Refused, Some(reason))
+            }
+            Job::Look | Job::Write(_) | Job::Collect(_) => self.put_off(now, &job, reason.text()),
+        }
+    }
+
+    // --- the row
+
+    fn put_software(&mut self, row: SoftwareRow) {
+        self.write(Op::Software(Box::new(row)), true);
+    }
+
+    /// Moves the update on, on the ledger and in a report.
+    fn move_to(&mut self, state: UpdateState, reason: Option<Reason>) {
+        let Some(update) = self.kept.ledger.software.update.clone() else { return };
+        let reason = reason.or(update.reason.clone());
+        self.put_update(Update { state, reason, ..update });
+    }
+
+    fn put_update(&mut self, update: Update) {
+        let from = self.kept.ledger.software.update.as_ref().filter(|u| u.bundle == update.bundle).map(|u| u.state);
+        if from.is_some_and(|from| from != update.state && !from.transitions().contains(&update.state)) {
+            tracing::error!(?from, to = ?update.state, "no step of an update");
+            return;
+        }
+        tracing::info!(robot_id = %self.config.robot_id, bundle = %update.bundle, state = ?update.state, reason = ?update.reason, "update");
+        self.update.collected = false;
+        self.put_software(SoftwareRow { update: Some(update), ..self.kept.ledger.software.clone() });
+        if let Some(report) = self.update_report() {
+            self.emit(Lane::Event, RobotEvent::Update(UpdateEvent::Changed(report)));
+        }
+    }
+
+    /// What the robot says of its update.
+    pub(crate) fn update_report(&self) -> Option<midshift_core::update::UpdateReport> {
+        let (there, needed) = self.update.progress;
+        let permille = if needed == 0 { 0 } else { there.saturating_mul(1000) / needed };
+        self.kept.ledger.software.report(permille.min(1000) as u16)
+    }
+
+    // --- nothing is on its way
+
+    /// No update, or one that is over: looks for a new directive, then tidies up.
+    fn without_update(&mut self, now: &Now, holdings: &Holdings) -> Option<ExitReason> {
+        let update = self.kept.ledger.software.update.as_ref();
+        let is_stuck = update.is_some_and(|u| u.state == UpdateState::Stuck);
+        if holdings.switch.trial.is_some() && !is_stuck {
+            // The ledger knows of no trial: the set that was committed is gone back to.
+            let mut switch = holdings.switch.clone();
+            switch.go_back();
+            self.update.went_back = true;
+            self.ask_for(Job::Write(switch));
+            return None;
+        }
+        if self.update.went_back {
+            return Some(ExitReason::Switched);
+        }
+        if self.begin_update(now) {
+            return None;
+        }
+        if !self.update.collected {
+            self.ask_for(Job::Collect(self.needed()));
+        }
+        None
+    }
+
+    /// Content and sets that are needed beside those that the switch record names.
+    fn needed(&self) -> BTreeSet<Digest> {
+        let update = self.kept.ledger.software.update.as_ref().filter(|u| !u.state.is_over());
+        let set = update.and_then(|u| u.set.as_ref());
+        let mut needed: BTreeSet<Digest> =
+            set.iter().flat_map(|set| set.components.values().map(|c| c.digest)).collect();
+        needed.extend(set.map(SetManifest::id));
+        needed.extend(update.map(|u| u.bundle));
+        needed
+    }
+
+    /// Looks at a directive that was not looked at yet. True: a job is on its way.
+    fn begin_update(&mut self, now: &Now) -> bool {
+        let Some(desired) = self.update.desired.as_ref() else { return false };
+        let wanted = matches!(desired.goal, Goal::Stage | Goal::Activate) && !self.is_observed();
+        if !wanted || self.names(desired) {
+            return false;
+        }
+        match self.trusted() {
+            Ok(trusted) => {
+                let clock = self.reading(now);
+                self.ask_for(Job::Refresh { trusted: Box::new(trusted), clock });
+                true
+            }
+            Err(reason) => {
+                self.refuse_directive(reason);
+                false
+            }
+        }
+    }
+
+    fn reading(&self, now: &Now) -> Reading {
+        let is_synced = self.update.config.as_ref().is_some_and(|c| c.clock_synced);
+        Reading { utc: now.wall, is_synced }
+    }
+
+    fn trusted(&self) -> Result<Trusted, Reason> {
+        if let Some(trusted) = &self.kept.ledger.trusted {
+            return Ok(Trusted::clone(trusted));
+        }
+        let root = self.update.config.as_ref().map(|c| c.root.as_slice()).unwrap_or_default();
+        Trusted::new(root).map_err(|e| Reason::new(Code::MetadataRefused, e.to_string()))
+    }
+
+    /// The newest directive is not taken; it is not looked at again.
+    fn refuse_directive(&mut self, reason: Reason) {
+        let Some(desired) = &self.update.desired else { return };
+        tracing::warn!(robot_id = %self.config.robot_id, reason = reason.text(), "directive refused");
+        self.update.judged = Some(desired.directive.clone());
+        let refused = UpdateEvent::DirectiveRefused { generation: desired.generation, reason };
+        self.emit(Lane::Event, RobotEvent::Update(refused));
+    }
+
+    /// The repository has answered: what it says is believed first, then the directive is held against it.
+    fn refreshed(&mut self, now: &Now, refreshed: Refreshed) {
+        self.write(Op::Trusted(Arc::new(refreshed.trusted.clone())), true);
+        let time = refreshed.trusted.now(self.reading(now));
+        self.update.listed = Some(Arc::new(refreshed));
+        let Some(desired) = self.update.desired.clone() else { return };
+        if self.is_the_newest(&desired) {
+            // What it asked for stands on the ledger, or is over.
+            self.update.judged = Some(desired.directive);
+            return;
+        }
+        match self.open(&desired, time) {
+            Ok(directive) => {
+                self.update.judged = Some(desired.directive.clone());
+                self.update.fetched.clear();
+                let update = Update {
+                    state: UpdateState::Directed,
+                    bundle: directive.manifest,
+                    manifest_length: directive.manifest_length,
+                    rollback_floor: directive.rollback_floor,
+                    set: None,
+                    raises_floor: false,
+                    is_irreversible: false,
+                    drain_id: None,
+                    tries: 0,
+                    probation_ms: desired.probation_ms,
+                    reason: None,
+                };
+                let software = &self.kept.ledger.software;
+                self.put_software(SoftwareRow { directive: directive.generation, update: None, ..software.clone() });
+                self.put_update(update);
+            }
+            Err(reason) => self.refuse_directive(reason),
+        }
+    }
+
+    fn open(&self, desired: &DesiredUpdate, now: Utc) -> Result<Directive, Reason> {
+        let refused = |text: String| Reason::new(Code::DirectiveRefused, text);
+        let opened = self.opened(desired, self.kept.ledger.software.directive, now);
+        let directive = opened.map_err(|rejection| refused(rejection.to_string()))?;
+        if self.lists(&directive.manifest, directive.manifest_length) {
+            Ok(directive)
+        } else {
+            Err(refused("no release lists its bundle".to_owned()))
+        }
+    }
+
+    fn opened(&self, desired: &DesiredUpdate, generation: u64, now: Utc) -> Result<Directive, Rejection> {
+        let config = self.update.config.as_ref().ok_or(Rejection::NotSigned)?;
+        let keys = &config.directive_keys;
+        Directive::open(
+            desired.directive.as_bytes(),
+            &Expected { robot_id: &self.config.robot_id, keys, generation, now },
+        )
+    }
+
+    /// Whether the envelope is the one that was taken last: after a restart it comes again. What was taken does not expire.
+    fn is_the_newest(&self, desired: &DesiredUpdate) -> bool {
+        let newest = self.kept.ledger.software.directive;
+        newest > 0 && self.opened(desired, newest - 1, Utc(0)).is_ok_and(|d| d.generation == newest)
+    }
+
+    fn lists(&self, digest: &Digest, length: u64) -> bool {
+        let listed = self.update.listed.as_ref();
+        listed.is_some_and(|l| l.targets.values().any(|t| t.digest == *digest && t.length == length))
+    }
+
+    // --- bytes
+
+    fn directed(&mut self, update: &Update) {
+        if self.update.listed.is_none() {
+            // After a restart: what the repository lists is asked for again, and the directive is not.
+            return self.refresh_again();
+        }
+        self.ask_for(Job::Manifest { wanted: Wanted { digest: update.bundle, length: update.manifest_length } });
+    }
+
+    fn refresh_again(&mut self) {
+        match self.trusted() {
+            Ok(trusted) => {
+                let is_synced = false;
+                let clock = Reading { utc: trusted.time_floor(), is_synced };
+                self.ask_for(Job::Refresh { trusted: Box::new(trusted), clock });
+            }
+            Err(reason) => self.move_to(UpdateState::Refused, Some(reason)),
+        }
+    }
+
+    /// What comes of the bundle on this robot, or why it does not fit.
+    fn plan(&mut self, wanted: &Wanted, manifest: &Manifest) {
+        let Some(update) = self.kept.ledger.software.update.clone() else { return };
+        let Some(holdings) = self.update.holdings.clone() else { return };
+        let current = holdings.set(&holdings.switch.current).unwrap_or_default();
+        let config = self.update.config.as_ref();
+        let fit = Fit {
+            model: self.inventory.model.clone(),
+            floors: self.kept.ledger.software.floors.clone(),
+            floor: update.rollback_floor,
+            allows_safety_related: config.is_some_and(|c| c.allows_safety_related),
+        };
+        let set = match current.with(wanted.digest, manifest, &fit) {
+            Ok(set) => set,
+            Err(unfit) => {
+                let text = unfit.iter().map(ToString::to_string).collect::<Vec<_>>().join("; ");
+                let codes = unfit.iter().map(|u| u.code()).collect::<Vec<_>>().join(",");
+                let reason = Reason::new(Code::BundleUnfit, text).with("codes", codes);
+                return self.move_to(UpdateState::Refused, Some(reason));
+            }
+        };
+        if let Some(component) = manifest.components.iter().find(|c| !self.lists(&c.digest, c.length)) {
+            let reason = Reason::from(Code::BundleUnfit).with("unlisted", &component.name);
+            return self.move_to(UpdateState::Refused, Some(reason));
+        }
+        let needed: u64 = manifest.components.iter().map(|c| c.length).sum();
+        if needed > holdings.free_bytes {
+            let reason =
+                Reason::from(Code::NoRoom).with("needed_bytes", needed).with("free_bytes", holdings.free_bytes);
+            return self.move_to(UpdateState::Refused, Some(reason));
+        }
+        let is_irreversible = manifest.components.iter().any(|c| c.data_migration == Migration::Irreversible);
+        let (raises_floor, state) = (manifest.raises_floor, UpdateState::Downloading);
+        self.put_update(Update { state, set: Some(set), raises_floor, is_irreversible, ..update });
+    }
+
+    fn downloading(&mut self, update: &Update) {
+        let Some(set) = &update.set else { return self.move_to(UpdateState::Refused, None) };
+        if self.is_dropped() {
+            return self.move_to(UpdateState::Refused, Some(Reason::from(Code::RevertAsked)));
+        }
+        let fetched = &self.update.fetched;
+        let there: u64 = set.components.values().filter(|c| fetched.contains(&c.digest)).map(|c| c.length).sum();
+        let missing = set.components.values().find(|c| !fetched.contains(&c.digest));
+        let job = match missing {
+            Some(c) => {
+                let rate_bytes_s = self.update.desired.as_ref().map_or(0, |d| d.rate_bytes_s);
+                Job::Fetch { wanted: Wanted { digest: c.digest, length: c.length }, rate_bytes_s }
+            }
+            None => Job::Stage(Box::new(set.clone())),
+        };
+        self.update.progress = (there, set.components.values().map(|c| c.length).sum());
+        self.ask_for(job);
+    }
+
+    /// The server wants the update no more, before it ran.
+    fn is_dropped(&self) -> bool {
+        self.update.desired.as_ref().is_some_and(|d| d.goal == Goal::Revert && self.names(d))
+    }
+
+    /// Whether the section speaks of the update on the ledger: its directive is the one that was taken last.
+    fn names(&self, desired: &DesiredUpdate) -> bool {
+        self.update.judged.as_ref() == Some(&desired.directive) || self.is_the_newest(desired)
+    }
+
+    // --- the switch
+
+    fn staged(&mut self, now: &Now, update: Update) {
+        if self.is_dropped() {
+            return self.move_to(UpdateState::Refused, Some(Reason::from(Code::RevertAsked)));
+        }
+        let Some(desired) = self.update.desired.clone() else { return };
+        if !self.names(&desired) {
+            // A newer directive replaces what has not run.
+            self.begin_update(now);
+            return;
+        }
+        let Some(drain_id) = desired.drain_id.clone().filter(|_| desired.goal == Goal::Activate) else { return };
+        if let Err(reason) = self.may_activate(now, &drain_id) {
+            self.note_blocked(reason);
+            return;
+        }
+        let passed = self.kept.ledger.software.grant_id.max(self.update.stale_grant);
+        let grant = desired.grant.filter(|g| g.drain_id == drain_id && g.grant_id > passed);
+        if let Some(grant) = &grant
+            && self.may_act(now, &grant.authority, "activation").is_err()
+        {
+            // Another is needed, and this one is not looked at again.
+            self.update.stale_grant = grant.grant_id;
+            self.update.asked = None;
+            return self.ask_for_grant(now, drain_id, &update);
+        }
+        match grant {
+            Some(grant) => {
+                let row = SoftwareRow { grant_id: grant.grant_id, ..self.kept.ledger.software.clone() };
+                self.put_software(row);
+                self.put_update(Update {
+                    state: UpdateState::Switching,
+                    drain_id: Some(drain_id),
+                    reason: None,
+                    ..update
+                });
+            }
+            None => self.ask_for_grant(now, drain_id, &update),
+        }
+    }
+
+    fn note_blocked(&mut self, reason: Reason) {
+        let Some(update) = self.kept.ledger.software.update.clone() else { return };
+        if update.reason.as_ref() != Some(&reason) {
+            self.put_update(Update { reason: Some(reason), ..update });
+        }
+    }
+
+    fn ask_for_grant(&mut self, now: &Now, drain_id: DrainId, update: &Update) {
+        let again = |(id, at): &(DrainId, _)| *id == drain_id && now.link.since(*at) < ASK_AGAIN;
+        if self.update.asked.as_ref().is_some_and(again) {
+            self.wake_at(now.link + ASK_AGAIN);
+            return;
+        }
+        let Some(set) = update.set_name().and_then(|name| SetId::parse(&name).ok()) else { return };
+        self.update.asked = Some((drain_id.clone(), now.link));
+        self.emit(Lane::Event, RobotEvent::Update(UpdateEvent::Ready { drain_id, set }));
+    }
+
+    /// Whether the robot may change its software forward now: without work, load, stop or passage, in this drain, charged and cool.
+    fn may_activate(&self, now: &Now, drain_id: &DrainId) -> Result<(), Reason> {
+        let no = |what: &str| Err(Reason::from(Code::ActivationBlocked).with("by", what));
+        let state = self.body.state(now.site);
+        let launched = self.update.config.as_ref().is_some_and(|c| c.is_launched);
+        match () {
+            () if self.kept.ledger.maintenance.as_ref() != Some(drain_id) => no("drain"),
+            () if self.work.is_some() => no("attempt"),
+            () if self.body.load().is_some() => no("load"),
+            () if self.is_in_passage(now) => no("passage"),
+            () if self.hardware_stop != HardwareStop::None => no("stop"),
+            () if self.mode != Mode::Automatic => no("mode"),
+            () if !self.body.standstill(now.site) => no("motion"),
+            () if state.battery_permille < limits::ACTIVATE_BATTERY_PERMILLE => no("battery"),
+            () if state.hottest_joint_decidegrees > limits::ACTIVATE_JOINT_DECIDEGREES => no("temperature"),
+            () if !launched => no("no launcher"),
+            () => Ok(()),
+        }
+    }
+
+    /// Whether the software changes, or is not yet believed: no work is taken.
+    pub(crate) fn changes_software(&self) -> bool {
+        let state = self.kept.ledger.software.update.as_ref().map(|u| u.state);
+        matches!(state, Some(UpdateState::Switching | UpdateState::Probation | UpdateState::RollingBack))
+    }
+
+    /// It holds a place beside the one it stands on.
+    fn is_in_passage(&self, now: &Now) -> bool {
+        let here = self.body.state(now.site).waypoint;
+        let standing = |place: &PlaceId| here.as_ref().is_some_and(|w| w.as_str() == place.as_str());
+        let row = &self.kept.ledger.places;
+        row.inside.keys().chain(row.committed.keys()).any(|place| !standing(place))
+    }
+
+    fn switching(&mut self, update: &Update, holdings: &Holdings) -> Option<ExitReason> {
+        let name = update.set_name()?;
+        if holdings.switch.running() == name {
+            return Some(ExitReason::Switched);
+        }
+        let mut switch = holdings.switch.clone();
+        switch.try_out(&name);
+        self.ask_for(Job::Write(switch));
+        None
+    }
+
+    /// What the disk says after a start, held against the ledger. The switch record wins.
+    fn look(&mut self, holdings: Holdings) {
+        let switch = holdings.switch.clone();
+        self.update.holdings = Some(holdings);
+        let Some(update) = self.kept.ledger.software.update.clone() else { return };
+        let Some(name) = update.set_name() else { return };
+        let runs = switch.trial.as_ref().is_some_and(|t| t.set == name);
+        let fallen = switch.fallen.as_ref().filter(|f| f.set == name);
+        let active = matches!(update.state, UpdateState::Switching | UpdateState::Probation | UpdateState::Trial);
+        if let Some(fallen) = fallen.filter(|_| active) {
+            let reason = Reason::from(Code::ProgramCrashed).with("tries", fallen.tries);
+            let (state, tries) = (UpdateState::RolledBack, fallen.tries);
+            return self.put_update(Update { state, tries, reason: Some(reason), ..update });
+        }
+        match update.state {
+            UpdateState::Switching if runs => self.move_to(UpdateState::Probation, None),
+            // The power went before the record was written: the grant was not used.
+            UpdateState::Switching => self.move_to(UpdateState::Staged, None),
+            UpdateState::Probation | UpdateState::Trial if !runs => {
+                self.move_to(UpdateState::RolledBack, Some(Reason::from(Code::SetPutAway)));
+            }
+            _ => {}
+        }
+    }
+
+    // --- on trial
+
+    fn probation(&mut self, now: &Now, update: Update, holdings: &Holdings) {
+        if let Err(reason) = self.self_test(now) {
+            return self.go_back(update, reason);
+        }
+        if self.wants_back(&update) {
+            return self.go_back(update, Reason::from(Code::RevertAsked));
+        }
+        let Some((link, site)) = self.update.begun else { return };
+        if !self.update.server_reached {
+            if now.link.since(link) >= LOST_SERVER {
+                return self.go_back(update, Reason::from(Code::LostServer));
+            }
+            return self.wake_at(link + LOST_SERVER);
+        }
+        if now.site.since(site) < SiteDuration(update.probation_ms) {
+            self.wake_site = Some(site + SiteDuration(update.probation_ms));
+            return;
+        }
+        self.move_to(UpdateState::Trial, None);
+        self.prove(holdings);
+    }
+
+    /// The body's own test, once in a process.
+    fn self_test(&mut self, now: &Now) -> Result<(), Reason> {
+        if let Some(tested) = &self.update.self_test {
+            return tested.clone();
+        }
+        let failed = |fault: Fault| Reason::new(Code::SelfTestFailed, fault.message).with("fault_code", fault.code);
+        let tested = self.body.self_test(now.site).map_err(failed);
+        self.update.self_test = Some(tested.clone());
+        tested
+    }
+
+    fn prove(&mut self, holdings: &Holdings) {
+        if holdings.switch.trial.as_ref().is_some_and(|t| !t.is_proven) {
+            let mut switch = holdings.switch.clone();
+            switch.prove();
+            self.ask_for(Job::Write(switch));
+        }
+    }
+
+    fn trial(&mut self, update: Update, holdings: &Holdings) {
+        if self.wants_back(&update) {
+            return self.go_back(update, Reason::from(Code::RevertAsked));
+        }
+        let commit = self.update.desired.as_ref().is_some_and(|d| d.goal == Goal::Commit && self.names(d));
+        if commit {
+            return self.put_update(Update { state: UpdateState::Committing, ..update });
+        }
+        self.prove(holdings);
+    }
+
+    fn committing(&mut self, update: Update, holdings: &Holdings) {
+        if holdings.switch.trial.is_some() {
+            let mut switch = holdings.switch.clone();
+            switch.commit();
+            return self.ask_for(Job::Write(switch));
+        }
+        let kept = holdings.switch.kept().and_then(|kept| holdings.set(kept)).unwrap_or_default();
+        let mut row = self.kept.ledger.software.clone();
+        if let Some(set) = update.set.as_ref().filter(|_| update.raises_floor) {
+            row.floors = raised(&row.floors, set, &kept);
+        }
+        self.put_software(row);
+        self.put_update(Update { state: UpdateState::Committed, reason: None, ..update });
+    }
+
+    // --- back
+
+    /// The server wants this update gone. A robot that stands goes back also while it is stopped or has a task.
+    fn wants_back(&self, update: &Update) -> bool {
+        let wanted = self.update.desired.as_ref().is_some_and(|d| d.goal == Goal::Revert && self.names(d));
+        wanted && !(update.state == UpdateState::Committed && update.is_irreversible)
+    }
+
+    fn go_back(&mut self, update: Update, reason: Reason) {
+        let drain_id = self.update.desired.as_ref().and_then(|d| d.drain_id.clone()).or(update.drain_id.clone());
+        self.put_update(Update { state: UpdateState::RollingBack, drain_id, reason: Some(reason), ..update });
+    }
+
+    fn rolling_back(&mut self, now: &Now, update: Update, holdings: &Holdings) -> Option<ExitReason> {
+        let name = update.set_name()?;
+        if holdings.switch.running() != name {
+            if self.update.went_back {
+                return Some(ExitReason::Switched);
+            }
+            match self.self_test(now) {
+                Ok(()) => self.put_update(Update { state: UpdateState::RolledBack, ..update }),
+                Err(reason) => self.move_to(UpdateState::Stuck, Some(reason)),
+            }
+            return None;
+        }
+        // A task that is held or stopped does not keep the robot from going back; one that goes on does, until it is drained.
+        let works = self.work.is_some() && self.hardware_stop == HardwareStop::None && !self.resume_needed;
+        if works || !self.body.standstill(now.site) {
+            return None;
+        }
+        let kept = holdings.switch.kept().and_then(|kept| SetId::parse(kept).ok());
+        match kept {
+            Some(kept) => self.ask_for(Job::Verify(kept)),
+            None => self.move_to(UpdateState::Stuck, Some(Reason::from(Code::NothingKept))),
+        }
+        None
+    }
+
+    /// The kept set was read again and is whole: it runs from the next start on.
+    fn verified(&mut self, set: &SetId) {
+        let Some(holdings) = &self.update.holdings else { return };
+        let mut switch: Switch = holdings.switch.clone();
+        if switch.trial.is_some() {
+            switch.go_back();
+        } else {
+            switch.undo_commit();
+        }
+        if switch.running() == set.as_str() {
+            self.update.went_back = true;
+            self.ask_for(Job::Write(switch));
+        }
+    }
+}

@@ -1,0 +1,200 @@
+//! Releases for a robot on the bench: a repository with throw-away keys, and the bytes of its bundles.
+
+use async_trait::async_trait;
+use midshift_agent::update::UpdateConfig;
+use midshift_agent::update::io::{Pieces, Remote};
+use midshift_bundle::digest::Digest;
+use midshift_bundle::directive::{Directive, LIFE_MS};
+use midshift_bundle::keys::SecretKey;
+use midshift_bundle::manifest::{Component, ComponentKind, FORMAT, Manifest, Migration, Needs, SafetyClass};
+use midshift_bundle::repository::{
+    FileTarget, PEOPLE_LIFE_MS, RootDraft, Signers, sign_online, sign_root, sign_targets,
+};
+use midshift_core::ids::RobotId;
+use midshift_core::time::Utc;
+use std::collections::{BTreeMap, BTreeSet};
+use std::io;
+use std::ops::Range;
+use std::sync::{Arc, Mutex, MutexGuard};
+
+/// When everything is signed.
+pub const SIGNED: Utc = Utc(1_700_000_000_000);
+/// The robot of the bench.
+pub const MODEL: &str = "bench-1";
+
+fn key(seed: u8) -> SecretKey {
+    SecretKey::of_seed([seed; 32])
+}
+
+#[derive(Debug, Default)]
+struct Shelf {
+    documents: BTreeMap<String, Vec<u8>>,
+    bytes: BTreeMap<Digest, Vec<u8>>,
+    targets: Vec<u8>,
+    version: u64,
+    /// Nothing answers.
+    cut: bool,
+    /// Every piece of content has a wrong byte.
+    corrupt: bool,
+    /// Bytes that went out.
+    served: u64,
+}
+
+/// A repository that robots reach.
+#[derive(Clone, Debug)]
+pub struct Releases(Arc<Mutex<Shelf>>);
+
+/// One bundle of it.
+#[derive(Clone, Debug)]
+pub struct Bundle {
+    pub digest: Digest,
+    pub length: u64,
+    pub manifest: Manifest,
+}
+
+pub fn component(name: &str, version: &str, kind: ComponentKind, content: &[u8]) -> Component {
+    Component {
+        name: name.to_owned(),
+        version: version.to_owned(),
+        kind,
+        hardware: [MODEL.to_owned()].into(),
+        capabilities: BTreeSet::new(),
+        requires: BTreeMap::new(),
+        conflicts: BTreeMap::new(),
+        task_schema: (1, 1),
+        rollback_index: 0,
+        safety_class: SafetyClass::None,
+        needs: Needs::Restart,
+        data_migration: Migration::None,
+        digest: Digest::of(content),
+        length: content.len() as u64,
+    }
+}
+
+impl Releases {
+    pub fn new() -> Self {
+        let one = |seed: u8| Signers { keys: vec![key(seed).public()], threshold: 1 };
+        let expires = SIGNED.plus_ms(PEOPLE_LIFE_MS);
+        let draft =
+            RootDraft { version: 1, expires, root: one(1), targets: one(2), snapshot: one(3), timestamp: one(4) };
+        let root = sign_root(&draft, &[&key(1)]).expect("a root");
+        let releases = Self(Arc::default());
+        releases.shelf().documents.insert("1.root.json".to_owned(), root);
+        releases.sign(&[]);
+        releases
+    }
+    fn shelf(&self) -> MutexGuard<'_, Shelf> {
+        self.0.lock().expect("not poisoned")
+    }
+    fn sign(&self, add: &[FileTarget]) {
+        let mut shelf = self.shelf();
+        let previous = Some(shelf.targets.clone()).filter(|t| !t.is_empty());
+        let expires = SIGNED.plus_ms(PEOPLE_LIFE_MS);
+        shelf.targets = sign_targets(previous.as_deref(), add, &[], expires, &[&key(2)]).expect("targets");
+        shelf.version += 1;
+        let version = shelf.version;
+        let online = sign_online(&shelf.targets, version, version, SIGNED, &key(3), &key(4)).expect("online");
+        let targets = shelf.targets.clone();
+        shelf.documents.insert(format!("{version}.targets.json"), targets);
+        shelf.documents.insert(format!("{version}.snapshot.json"), online.snapshot);
+        shelf.documents.insert("timestamp.json".to_owned(), online.timestamp);
+    }
+    /// Releases a bundle of a program and its settings.
+    pub fn release(&self, version: &str) -> Bundle {
+        self.release_as(version, |_| {})
+    }
+    /// As [`Releases::release`], after `change` of its manifest.
+    pub fn release_as(&self, version: &str, change: impl FnOnce(&mut Manifest)) -> Bundle {
+        let program = format!("program {version}").repeat(30_000).into_bytes();
+        let settings = format!("settings {version}").into_bytes();
+        let mut manifest = Manifest {
+            format: FORMAT,
+            name: "walk".to_owned(),
+            version: version.to_owned(),
+            description: String::new(),
+            hard_stop_codes: BTreeSet::new(),
+            raises_floor: true,
+            components: vec![
+                component("gait", version, ComponentKind::Process, &program),
+                component("behaviour", version, ComponentKind::Config, &settings),
+            ],
+        };
+        change(&mut manifest);
+        let bytes = manifest.to_bytes();
+        let file = |name: String, content: &[u8]| FileTarget {
+            name,
+            digest: Digest::of(content),
+            length: content.len() as u64,
+        };
+        let files = [
+            file(manifest.target(), &bytes),
+            file(manifest.components[0].target(), &program),
+            file(manifest.components[1].target(), &settings),
+        ];
+        self.sign(&files);
+        let bundle = Bundle { digest: Digest::of(&bytes), length: bytes.len() as u64, manifest };
+        self.shelf().bytes.extend([bytes, program, settings].map(|b| (Digest::of(&b), b)));
+        bundle
+    }
+    /// The order to take `bundle`, signed.
+    pub fn directive(&self, bundle: &Bundle, generation: u64) -> String {
+        self.directive_as(bundle, generation, |_| {})
+    }
+    pub fn directive_as(&self, bundle: &Bundle, generation: u64, change: impl FnOnce(&mut Directive)) -> String {
+        let mut directive = Directive {
+            robot_id: RobotId::parse("rbt-01").expect("a name"),
+            key_id: key(7).public().id(),
+            generation,
+            manifest: bundle.digest,
+            manifest_length: bundle.length,
+            rollback_floor: 0,
+            issued_at: SIGNED,
+            expires: SIGNED.plus_ms(LIFE_MS),
+            rollout: "walk".to_owned(),
+        };
+        change(&mut directive);
+        String::from_utf8(directive.sign(&key(7))).expect("text")
+    }
+    /// What a robot is set up with.
+    pub fn config(&self) -> UpdateConfig {
+        UpdateConfig {
+            root: self.shelf().documents["1.root.json"].clone(),
+            directive_keys: [key(7).public()].into_iter().map(|k| (k.id(), k)).collect(),
+            clock_synced: true,
+            allows_safety_related: false,
+            is_launched: true,
+        }
+    }
+    pub fn cut(&self, cut: bool) {
+        self.shelf().cut = cut;
+    }
+    pub fn corrupt(&self, corrupt: bool) {
+        self.shelf().corrupt = corrupt;
+    }
+    pub fn served(&self) -> u64 {
+        self.shelf().served
+    }
+}
+
+#[async_trait]
+impl Remote for Releases {
+    async fn metadata(&self, name: &str) -> io::Result<Option<Vec<u8>>> {
+        let shelf = self.shelf();
+        if shelf.cut { Err(io::ErrorKind::NotConnected.into()) } else { Ok(shelf.documents.get(name).cloned()) }
+    }
+    async fn range(&self, digest: &Digest, range: Range<u64>) -> io::Result<Pieces> {
+        let mut shelf = self.shelf();
+        if shelf.cut {
+            return Err(io::ErrorKind::NotConnected.into());
+        }
+        let content = shelf.bytes.get(digest).ok_or_else(|| io::Error::from(io::ErrorKind::NotFound))?;
+        let mut bytes = content[range.start as usize..range.end as usize].to_vec();
+        if shelf.corrupt {
+            bytes[0] ^= 1;
+        }
+        shelf.served += bytes.len() as u64;
+        // In pieces that do not lie on chunks.
+        let pieces: Vec<io::Result<Vec<u8>>> = bytes.chunks(100_000).map(|piece| Ok(piece.to_vec())).collect();
+        Ok(Box::pin(tokio_stream::iter(pieces)))
+    }
+}

@@ -1,0 +1,670 @@
+//! What a robot does with its software: take it, stage it, run it on trial, keep it or go back; and what it does not take.
+
+use crate::release::{Bundle, Releases};
+use crate::rig::{Rig, action, place_id};
+use midshift_agent::core::{ExitReason, Input};
+use midshift_agent::sets::Sets;
+use midshift_agent::switch::Switch;
+use midshift_agent::update::Job;
+use midshift_bundle::manifest::{Migration, SafetyClass};
+use midshift_core::ids::DrainId;
+use midshift_core::reason::Code;
+use midshift_core::robot::{Fault, FaultClass, HardwareStop, Load};
+use midshift_core::update::{ActivationGrant, DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState};
+use midshift_core::work::{Effect, RobotEvent};
+use midshift_proto::session::Downlink;
+
+/// Milliseconds of site time on probation.
+const PROBATION_MS: u64 = 10_000;
+
+fn drain(name: &str) -> DrainId {
+    DrainId::parse(name).expect("a name")
+}
+
+/// The server's side of one update.
+#[derive(Clone)]
+struct Order {
+    directive: String,
+    generation: u64,
+    drain_id: Option<DrainId>,
+    granted: u64,
+}
+
+impl Order {
+    fn new(directive: String) -> Self {
+        Self { directive, generation: 100, drain_id: None, granted: 0 }
+    }
+    fn to(&mut self, goal: Goal) -> DesiredUpdate {
+        self.generation += 1;
+        DesiredUpdate {
+            robot_id: midshift_core::ids::RobotId::parse("rbt-01").expect("a name"),
+            generation: self.generation,
+            goal,
+            directive: self.directive.clone(),
+            drain_id: self.drain_id.clone(),
+            grant: None,
+            rate_bytes_s: 0,
+            probation_ms: PROBATION_MS,
+        }
+    }
+}
+
+fn want(rig: &mut Rig, desired: DesiredUpdate) {
+    rig.down(Downlink { update: Some(desired), ..Downlink::default() });
+}
+
+/// The server takes the robot out of work, and gives it back.
+fn maintain(rig: &mut Rig, drain_id: Option<&DrainId>) {
+    let mut work = rig.desired(None);
+    work.maintenance = drain_id.cloned();
+    rig.work(work);
+}
+
+fn report(rig: &Rig) -> Option<UpdateReport> {
+    rig.store.kept().expect("loaded").ledger.software.report(0)
+}
+
+fn state(rig: &Rig) -> Option<UpdateState> {
+    report(rig).map(|r| r.state)
+}
+
+fn why(rig: &Rig) -> Option<Code> {
+    report(rig)?.reason.map(|r| r.code)
+}
+
+fn switch(rig: &Rig) -> Switch {
+    rig.updates.as_ref().expect("has them").sets.clone().holdings().expect("tells").switch
+}
+
+fn refused(rig: &Rig) -> Vec<Code> {
+    let code = |e: &RobotEvent| match e {
+        RobotEvent::Update(UpdateEvent::DirectiveRefused { reason, .. }) => Some(reason.code),
+        _ => None,
+    };
+    rig.events.iter().filter_map(code).collect()
+}
+
+fn asked(rig: &Rig) -> usize {
+    rig.events.iter().filter(|e| matches!(e, RobotEvent::Update(UpdateEvent::Ready { .. }))).count()
+}
+
+/// A robot that is connected, and a repository.
+fn connected() -> (Rig, Releases) {
+    let releases = Releases::new();
+    let mut rig = Rig::updatable(&releases);
+    rig.connect();
+    (rig, releases)
+}
+
+/// Brings a bundle onto the disk.
+fn stage(rig: &mut Rig, releases: &Releases, bundle: &Bundle, generation: u64) -> Order {
+    let mut order = Order::new(releases.directive(bundle, generation));
+    order.generation = generation * 100;
+    want(rig, order.to(Goal::Stage));
+    order
+}
+
+/// Drains the robot, lets it ask, and grants.
+fn activate(rig: &mut Rig, order: &mut Order, name: &str) {
+    order.drain_id = Some(drain(name));
+    maintain(rig, order.drain_id.clone().as_ref());
+    want(rig, order.to(Goal::Activate));
+    grant(rig, order, 5_000);
+}
+
+fn grant(rig: &mut Rig, order: &mut Order, valid_ms: u64) {
+    order.granted += 1;
+    let authority = rig.authority(valid_ms);
+    let grant_id = order.generation * 10 + order.granted;
+    let mut desired = order.to(Goal::Activate);
+    desired.grant = Some(ActivationGrant { grant_id, drain_id: desired.drain_id.clone().expect("a drain"), authority });
+    want(rig, desired);
+}
+
+/// The program ended to switch; the launcher starts the one of the record.
+fn relaunch(rig: Rig) -> Rig {
+    assert_eq!(rig.exit, Some(ExitReason::Switched), "{:?}", report(&rig));
+    let mut rig = rig.restart();
+    rig.connect();
+    rig
+}
+
+/// Runs a bundle to its trial.
+fn on_trial(rig: Rig, releases: &Releases, bundle: &Bundle, generation: u64) -> (Rig, Order) {
+    let mut rig = rig;
+    let mut order = stage(&mut rig, releases, bundle, generation);
+    assert_eq!(state(&rig), Some(UpdateState::Staged), "{:?}", report(&rig));
+    activate(&mut rig, &mut order, &format!("drain-{generation}"));
+    let mut rig = relaunch(rig);
+    assert_eq!(state(&rig), Some(UpdateState::Probation));
+    maintain(&mut rig, order.drain_id.as_ref());
+    rig.pass(PROBATION_MS + 1_000);
+    assert_eq!(state(&rig), Some(UpdateState::Trial), "{:?}", report(&rig));
+    (rig, order)
+}
+
+fn committed(rig: Rig, releases: &Releases, bundle: &Bundle, generation: u64) -> Rig {
+    let (mut rig, mut order) = on_trial(rig, releases, bundle, generation);
+    maintain(&mut rig, None);
+    want(&mut rig, order.to(Goal::Commit));
+    assert_eq!(state(&rig), Some(UpdateState::Committed));
+    rig
+}
+
+fn name_of(rig: &Rig) -> String {
+    report(rig).and_then(|r| r.set).expect("a set").to_string()
+}
+
+#[test]
+fn a_bundle_is_staged_while_the_robot_works_run_in_a_drain_and_kept() {
+    let (mut rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    rig.work(rig.desired(Some(rig.offer("T1", 1, vec![action("pick", Effect::Repeatable)], vec![]))));
+    let mut order = stage(&mut rig, &releases, &bundle, 1);
+    assert_eq!(state(&rig), Some(UpdateState::Staged));
+    assert!(rig.body.log().acting.is_some(), "it works on");
+    assert_eq!(switch(&rig), Switch::default(), "what runs is untouched");
+    want(&mut rig, order.to(Goal::Activate));
+    assert_eq!((state(&rig), rig.exit), (Some(UpdateState::Staged), None), "it has a task");
+    rig.body.done();
+    rig.pass(1_000);
+    let rig = {
+        activate(&mut rig, &mut order, "drain-1");
+        relaunch(rig)
+    };
+    let set = name_of(&rig);
+    assert_eq!((switch(&rig).running(), switch(&rig).kept()), (set.as_str(), Some("factory")));
+    let mut rig = rig;
+    maintain(&mut rig, order.drain_id.as_ref());
+    rig.pass(PROBATION_MS + 1_000);
+    assert!(switch(&rig).trial.is_some_and(|t| t.is_proven));
+    assert!(rig.reported.as_ref().is_some_and(|r| r.update.as_ref().is_some_and(|u| u.state == UpdateState::Trial)));
+    want(&mut rig, order.to(Goal::Commit));
+    assert_eq!(state(&rig), Some(UpdateState::Committed));
+    let committed = switch(&rig);
+    assert_eq!(
+        (committed.running(), committed.kept(), committed.trial.as_ref()),
+        (set.as_str(), Some("factory"), None)
+    );
+}
+
+#[test]
+fn work_is_refused_on_probation_and_taken_on_trial() {
+    let (rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let mut rig = rig;
+    let mut order = stage(&mut rig, &releases, &bundle, 1);
+    activate(&mut rig, &mut order, "drain-1");
+    let mut rig = relaunch(rig);
+    rig.work(rig.desired(Some(rig.offer("T1", 1, vec![action("pick", Effect::Repeatable)], vec![]))));
+    assert_eq!(rig.refusals(), ["IN_MAINTENANCE"]);
+    rig.pass(PROBATION_MS + 1_000);
+    rig.work(rig.desired(Some(rig.offer("T1", 2, vec![action("pick", Effect::Repeatable)], vec![]))));
+    assert_eq!(rig.refusals(), [] as [String; 0]);
+    assert!(rig.body.log().acting.is_some());
+}
+
+#[test]
+fn another_robots_directive_an_older_one_a_strangers_and_an_expired_one_install_nothing() {
+    let (mut rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let other = midshift_core::ids::RobotId::parse("rbt-02").expect("a name");
+    let expired = midshift_core::time::Utc(1);
+    for (n, bad) in [
+        releases.directive_as(&bundle, 5, |d| d.robot_id = other),
+        releases.directive_as(&bundle, 5, |d| d.expires = expired),
+        Releases::new().directive_as(&bundle, 5, |d| d.generation = 0),
+        "{}".to_owned(),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let mut order = Order::new(bad);
+        order.generation += n as u64;
+        want(&mut rig, order.to(Goal::Stage));
+        assert_eq!(refused(&rig).len(), n + 1);
+        assert_eq!((refused(&rig)[n], state(&rig)), (Code::DirectiveRefused, None));
+    }
+    let mut rig = committed(rig, &releases, &bundle, 7);
+    let before = refused(&rig).len();
+    let older = releases.release("1.2.0");
+    let mut order = Order::new(releases.directive(&older, 6));
+    order.generation = 10_000;
+    want(&mut rig, order.to(Goal::Stage));
+    assert_eq!((refused(&rig).len(), state(&rig)), (before + 1, Some(UpdateState::Committed)));
+    assert_eq!(releases.served(), bundle_bytes(&bundle));
+}
+
+fn bundle_bytes(bundle: &Bundle) -> u64 {
+    bundle.length + bundle.manifest.length()
+}
+
+#[test]
+fn a_bundle_that_no_release_lists_is_not_taken_whatever_the_directive_says() {
+    let (mut rig, releases) = connected();
+    let stranger = Releases::new().release("6.6.6");
+    let mut order = Order::new(releases.directive(&stranger, 1));
+    want(&mut rig, order.to(Goal::Stage));
+    assert_eq!((refused(&rig), state(&rig), releases.served()), (vec![Code::DirectiveRefused], None, 0));
+    let bundle = releases.release("1.1.0");
+    let mut order = Order::new(releases.directive_as(&bundle, 2, |d| d.manifest_length += 1));
+    order.generation += 10;
+    want(&mut rig, order.to(Goal::Stage));
+    assert_eq!((refused(&rig).len(), state(&rig), releases.served()), (2, None, 0), "a length that lies");
+}
+
+#[test]
+fn what_does_not_fit_the_robot_is_refused_before_its_bytes_come() {
+    let (mut rig, releases) = connected();
+    let wrong = releases.release_as("1.1.0", |m| m.components[0].hardware = ["other".to_owned()].into());
+    stage(&mut rig, &releases, &wrong, 1);
+    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::Refused), Some(Code::BundleUnfit)));
+    let safety = releases.release_as("1.2.0", |m| m.components[1].safety_class = SafetyClass::Related);
+    stage(&mut rig, &releases, &safety, 2);
+    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::Refused), Some(Code::BundleUnfit)));
+    let below = releases.release("1.3.0");
+    let mut order = Order::new(releases.directive_as(&below, 3, |d| d.rollback_floor = 1));
+    order.generation = 300;
+    want(&mut rig, order.to(Goal::Stage));
+    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::Refused), Some(Code::BundleUnfit)));
+    assert_eq!(releases.served(), wrong.length + safety.length + below.length, "only manifests came");
+    let good = releases.release("1.4.0");
+    committed(rig, &releases, &good, 4);
+}
+
+#[test]
+fn a_robot_without_room_says_so_and_keeps_what_it_has() {
+    let (mut rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    rig.updates.as_ref().expect("has them").sets.limit(bundle.length + 1_000);
+    stage(&mut rig, &releases, &bundle, 1);
+    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::Refused), Some(Code::NoRoom)));
+    assert_eq!(switch(&rig), Switch::default());
+}
+
+#[test]
+fn bytes_that_are_not_what_was_signed_are_refused_and_the_next_good_ones_taken() {
+    let (mut rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    releases.corrupt(true);
+    stage(&mut rig, &releases, &bundle, 1);
+    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::Refused), Some(Code::BundleCorrupt)));
+    releases.corrupt(false);
+    committed(rig, &releases, &bundle, 2);
+}
+
+#[test]
+fn a_cut_network_is_waited_out() {
+    let (mut rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    releases.cut(true);
+    stage(&mut rig, &releases, &bundle, 1);
+    rig.pass(5_000);
+    assert_eq!((state(&rig), refused(&rig)), (None, vec![]));
+    releases.cut(false);
+    rig.pass(60_000);
+    assert_eq!(state(&rig), Some(UpdateState::Staged));
+    let jobs = &rig.updates.as_ref().expect("has them").jobs;
+    let asked = jobs.iter().filter(|job| matches!(job, Job::Refresh { .. })).count();
+    assert!((2..10).contains(&asked), "{asked} times in 65 s");
+}
+
+#[test]
+fn nothing_is_activated_with_work_a_load_a_stop_or_out_of_its_drain() {
+    let (mut rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let mut order = stage(&mut rig, &releases, &bundle, 1);
+    let tried = |rig: &mut Rig, order: &mut Order| {
+        grant(rig, order, 5_000);
+        let by = report(rig).and_then(|r| r.reason).and_then(|r| r.metadata.get("by").cloned());
+        assert_eq!((state(rig), rig.exit), (Some(UpdateState::Staged), None), "{by:?}");
+        by
+    };
+    order.drain_id = Some(drain("drain-1"));
+    assert_eq!(tried(&mut rig, &mut order).as_deref(), Some("drain"), "nobody holds it");
+    maintain(&mut rig, Some(&drain("drain-0")));
+    assert_eq!(tried(&mut rig, &mut order).as_deref(), Some("drain"), "an older drain holds it");
+    rig.body.set(|b| b.load = Some(Load { task_id: None, item: "box".into() }));
+    maintain(&mut rig, Some(&drain("drain-1")));
+    assert_eq!(tried(&mut rig, &mut order).as_deref(), Some("load"));
+    rig.body.says(midshift_agent::body::BodyNews::HardwareStop(HardwareStop::Manual));
+    rig.body.set(|b| b.load = None);
+    assert_eq!(tried(&mut rig, &mut order).as_deref(), Some("stop"));
+    rig.body.set(|b| b.battery_permille = 150);
+    rig.body.says(midshift_agent::body::BodyNews::HardwareStop(HardwareStop::None));
+    assert_eq!(tried(&mut rig, &mut order).as_deref(), Some("battery"));
+    rig.body.set(|b| b.battery_permille = 700);
+    grant(&mut rig, &mut order, 5_000);
+    relaunch(rig);
+}
+
+#[test]
+fn a_robot_in_a_passage_does_not_change_its_software() {
+    let (mut rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let mut order = stage(&mut rig, &releases, &bundle, 1);
+    let mut work = rig.desired(None);
+    work.maintenance = Some(drain("drain-1"));
+    work.grants = vec![midshift_core::work::GrantedPlace { place_id: place_id("P1"), grant_id: 5, entry: None }];
+    order.drain_id = work.maintenance.clone();
+    let mut places = rig.store.kept().expect("loaded").ledger.places;
+    places.inside.insert(place_id("P1"), 5);
+    rig.store.commit_now(&[midshift_agent::store::Op::Places(places)]);
+    let mut rig = rig.restart();
+    rig.connect();
+    rig.work(work);
+    grant(&mut rig, &mut order, 5_000);
+    let by = report(&rig).and_then(|r| r.reason).and_then(|r| r.metadata.get("by").cloned());
+    assert_eq!((rig.exit, by.as_deref()), (None, Some("passage")));
+}
+
+#[test]
+fn a_grant_that_was_held_back_longer_than_it_lives_activates_nobody_and_another_is_asked_for() {
+    let (mut rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let mut order = stage(&mut rig, &releases, &bundle, 1);
+    order.drain_id = Some(drain("drain-1"));
+    maintain(&mut rig, Some(&drain("drain-1")));
+    want(&mut rig, order.to(Goal::Activate));
+    assert_eq!(asked(&rig), 1);
+    let mut late = order.to(Goal::Activate);
+    let authority = rig.authority(5_000);
+    late.grant = Some(ActivationGrant { grant_id: 9, drain_id: drain("drain-1"), authority });
+    rig.pass(12_000);
+    want(&mut rig, late);
+    assert_eq!((state(&rig), rig.exit, rig.stale()), (Some(UpdateState::Staged), None, 1));
+    rig.pass(10_000);
+    assert!(asked(&rig) >= 2);
+    grant(&mut rig, &mut order, 5_000);
+    relaunch(rig);
+}
+
+#[test]
+fn a_grant_is_used_once() {
+    let (rig, releases) = connected();
+    let first = releases.release("1.1.0");
+    let (mut rig, mut order) = on_trial(rig, &releases, &first, 1);
+    let used = rig.store.kept().expect("loaded").ledger.software.grant_id;
+    want(&mut rig, order.to(Goal::Revert));
+    let mut rig = relaunch(rig);
+    rig.pass(1_000);
+    assert_eq!(state(&rig), Some(UpdateState::RolledBack));
+    let second = releases.release("1.2.0");
+    let mut order = stage(&mut rig, &releases, &second, 2);
+    order.drain_id = Some(drain("drain-1"));
+    maintain(&mut rig, Some(&drain("drain-1")));
+    let mut again = order.to(Goal::Activate);
+    let authority = rig.authority(5_000);
+    again.grant = Some(ActivationGrant { grant_id: used, drain_id: drain("drain-1"), authority });
+    want(&mut rig, again);
+    assert_eq!((state(&rig), rig.exit), (Some(UpdateState::Staged), None));
+}
+
+#[test]
+fn a_body_that_fails_its_test_with_the_new_software_goes_back() {
+    let (mut rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let mut order = stage(&mut rig, &releases, &bundle, 1);
+    activate(&mut rig, &mut order, "drain-1");
+    let broken = Fault { code: 5_001, class: FaultClass::Mechanical, message: "the left knee".into() };
+    rig.body.set(|b| b.broken = Some(broken));
+    let rig = relaunch(rig);
+    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::RollingBack), Some(Code::SelfTestFailed)));
+    rig.body.set(|b| b.broken = None);
+    let rig = relaunch(rig);
+    assert_eq!((state(&rig), switch(&rig)), (Some(UpdateState::RolledBack), Switch { number: 2, ..Switch::default() }));
+}
+
+#[test]
+fn software_that_does_not_reach_its_server_goes_back_and_one_that_does_is_proven() {
+    let (mut rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let mut order = stage(&mut rig, &releases, &bundle, 1);
+    activate(&mut rig, &mut order, "drain-1");
+    assert_eq!(rig.exit, Some(ExitReason::Switched));
+    let mut rig = rig.restart();
+    rig.silence(599_000);
+    assert_eq!(state(&rig), Some(UpdateState::Probation));
+    rig.silence(2_000);
+    assert_eq!((rig.exit, why(&rig)), (Some(ExitReason::Switched), Some(Code::LostServer)));
+}
+
+#[test]
+fn what_the_launcher_put_away_is_told_and_not_tried_again() {
+    let (mut rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let mut order = stage(&mut rig, &releases, &bundle, 1);
+    activate(&mut rig, &mut order, "drain-1");
+    let sets = rig.updates.as_ref().expect("has them").sets.clone();
+    sets.fall_back(2);
+    let mut rig = relaunch(rig);
+    let told = report(&rig).expect("a report");
+    assert_eq!((told.state, told.tries), (UpdateState::RolledBack, 2));
+    assert_eq!(told.reason.map(|r| r.code), Some(Code::ProgramCrashed));
+    want(&mut rig, order.to(Goal::Stage));
+    rig.pass(60_000);
+    assert_eq!(state(&rig), Some(UpdateState::RolledBack), "the same directive is over");
+}
+
+#[test]
+fn a_stopped_robot_goes_back_where_it_stands_and_nothing_moves() {
+    let (rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let (mut rig, mut order) = on_trial(rig, &releases, &bundle, 1);
+    maintain(&mut rig, None);
+    rig.work(rig.desired(Some(rig.offer("T1", 1, vec![action("pick", Effect::Repeatable)], vec![]))));
+    assert!(rig.body.log().acting.is_some());
+    want(&mut rig, order.to(Goal::Revert));
+    assert_eq!((state(&rig), rig.exit), (Some(UpdateState::RollingBack), None), "it works");
+    rig.body.set(|b| b.acting = None);
+    rig.body.says(midshift_agent::body::BodyNews::HardwareStop(HardwareStop::Manual));
+    rig.pass(1_000);
+    let acts = rig.body.log().acts;
+    let mut rig = relaunch(rig);
+    rig.pass(5_000);
+    assert_eq!((state(&rig), rig.body.log().acts), (Some(UpdateState::RolledBack), acts));
+    assert_eq!(switch(&rig).running(), "factory");
+}
+
+#[test]
+fn a_kept_set_that_has_rotted_is_not_gone_back_to_and_a_person_is_asked() {
+    let (rig, releases) = connected();
+    let (first, second) = (releases.release("1.1.0"), releases.release("1.2.0"));
+    let rig = committed(rig, &releases, &first, 1);
+    let (mut rig, mut order) = on_trial(rig, &releases, &second, 2);
+    let sets = rig.updates.as_ref().expect("has them").sets.clone();
+    sets.rot(&first.manifest.components[0].digest);
+    let running = switch(&rig).running().to_owned();
+    want(&mut rig, order.to(Goal::Revert));
+    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::Stuck), Some(Code::KeptSetBad)));
+    assert_eq!((switch(&rig).running(), rig.exit), (running.as_str(), None));
+}
+
+#[test]
+fn a_committed_set_is_reverted_to_the_one_before_it_unless_its_data_cannot_go_back() {
+    let (rig, releases) = connected();
+    let (first, second) = (releases.release("1.1.0"), releases.release("1.2.0"));
+    let rig = committed(rig, &releases, &first, 1);
+    let kept = name_of(&rig);
+    let mut rig = committed(rig, &releases, &second, 2);
+    let mut order = Order::new(releases.directive(&second, 2));
+    order.generation = 100_000;
+    want(&mut rig, order.to(Goal::Revert));
+    let rig = relaunch(rig);
+    assert_eq!((state(&rig), switch(&rig).running()), (Some(UpdateState::RolledBack), kept.as_str()));
+    let third = releases.release_as("1.3.0", |m| m.components[1].data_migration = Migration::Irreversible);
+    let mut rig = committed(rig, &releases, &third, 2_000);
+    let mut order = Order::new(releases.directive(&third, 2_000));
+    order.generation = 300_000;
+    want(&mut rig, order.to(Goal::Revert));
+    assert_eq!((state(&rig), rig.exit), (Some(UpdateState::Committed), None));
+}
+
+#[test]
+fn a_floor_rises_with_a_commit_never_above_what_is_kept_and_never_on_trial() {
+    let (rig, releases) = connected();
+    let indexed = |version: &str, index: u64| releases.release_as(version, |m| m.components[0].rollback_index = index);
+    let floor = |rig: &Rig| rig.store.kept().expect("loaded").ledger.software.floors.get("gait").copied();
+    let rig = committed(rig, &releases, &indexed("1.1.0", 3), 1);
+    assert_eq!(floor(&rig), Some(3), "what the robot came with has no index");
+    let (rig, _) = on_trial(rig, &releases, &indexed("1.2.0", 5), 2);
+    assert_eq!(floor(&rig), Some(3));
+    let mut rig = rig;
+    let mut order = Order::new(releases.directive(&indexed("1.2.0", 5), 2));
+    order.generation = 290;
+    want(&mut rig, order.to(Goal::Commit));
+    assert_eq!((state(&rig), floor(&rig)), (Some(UpdateState::Committed), Some(3)), "1.1.0 is kept");
+    let mut rig = committed(rig, &releases, &indexed("1.3.0", 6), 3);
+    assert_eq!(floor(&rig), Some(5));
+    stage(&mut rig, &releases, &indexed("1.0.0", 4), 4);
+    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::Refused), Some(Code::BundleUnfit)));
+}
+
+#[test]
+fn a_newer_directive_replaces_what_was_only_staged_and_the_kept_set_stays() {
+    let (rig, releases) = connected();
+    let [one, two, three] = ["1.1.0", "1.2.0", "1.3.0"].map(|v| releases.release(v));
+    let mut rig = committed(rig, &releases, &one, 1);
+    let first = name_of(&rig);
+    stage(&mut rig, &releases, &two, 2);
+    assert_eq!(switch(&rig).kept(), Some("factory"));
+    let rig = committed(rig, &releases, &three, 3);
+    assert_eq!(switch(&rig).kept(), Some(first.as_str()), "not the one that never ran");
+    let held = rig.updates.as_ref().expect("has them").sets.clone().holdings().expect("tells").sets;
+    assert_eq!(held.len(), 2, "what is neither running nor kept is gone");
+}
+
+#[test]
+fn an_update_that_is_given_up_before_it_ran_leaves_everything_as_it_was() {
+    let (mut rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let mut order = stage(&mut rig, &releases, &bundle, 1);
+    want(&mut rig, order.to(Goal::Revert));
+    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::Refused), Some(Code::RevertAsked)));
+    let held = rig.updates.as_ref().expect("has them").sets.clone().holdings().expect("tells");
+    assert_eq!((held.switch, held.sets.len()), (Switch::default(), 0));
+}
+
+#[test]
+fn a_trial_that_the_ledger_knows_nothing_of_is_ended() {
+    let (rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let (rig, _) = on_trial(rig, &releases, &bundle, 1);
+    rig.store.commit_now(&[midshift_agent::store::Op::Software(Box::default())]);
+    let rig = rig.restart();
+    assert_eq!(switch(&rig).running(), "factory");
+    assert_eq!(rig.exit, Some(ExitReason::Switched), "the program that runs is not the one of the record");
+}
+
+#[test]
+fn a_robot_that_is_not_set_up_for_it_leaves_its_software_alone() {
+    let releases = Releases::new();
+    let bundle = releases.release("1.1.0");
+    let mut rig = Rig::at("A");
+    rig.connect();
+    let mut order = Order::new(releases.directive(&bundle, 1));
+    want(&mut rig, order.to(Goal::Stage));
+    rig.pass(5_000);
+    assert_eq!((state(&rig), releases.served()), (None, 0));
+}
+
+// --- the power
+
+/// What the server would say now, whatever was lost: level-triggered.
+fn server_says(rig: &mut Rig, order: &mut Order, grants: &mut u64, back: bool) {
+    let at = state(rig);
+    order.generation += 10;
+    let idle = matches!(at, Some(UpdateState::Trial | UpdateState::Committed | UpdateState::RolledBack));
+    order.drain_id = Some(drain("drain-1"));
+    maintain(rig, order.drain_id.as_ref().filter(|_| !idle));
+    let goal = match at {
+        Some(UpdateState::Trial) if back => Goal::Revert,
+        Some(UpdateState::RollingBack) => Goal::Revert,
+        Some(UpdateState::Trial | UpdateState::Committing) => Goal::Commit,
+        _ => Goal::Activate,
+    };
+    let mut desired = order.to(goal);
+    if at == Some(UpdateState::Staged) {
+        *grants += 1;
+        let (grant_id, authority) = (*grants, rig.authority(5_000));
+        desired.grant = Some(ActivationGrant { grant_id, drain_id: drain("drain-1"), authority });
+    }
+    want(rig, desired);
+}
+
+/// One update to its end, with the power going at one of its effects. Gives back how it ended and how many effects there were.
+fn with_power_cut(at: Option<usize>, last_is_done: bool, back: bool) -> (UpdateState, usize) {
+    let (rig, releases) = connected();
+    let first = releases.release("1.1.0");
+    let mut rig = committed(rig, &releases, &first, 1);
+    let second = releases.release("1.2.0");
+    let (good, mut grants) = (name_of(&rig), 1_000_000);
+    let mut order = Order::new(releases.directive(&second, 2));
+    order.generation = 10_000;
+    let updates = rig.updates.as_mut().expect("has them");
+    let before = updates.effects;
+    (updates.cut_at, updates.last_is_done) = (at.map(|at| before + at), last_is_done);
+    for _ in 0..200 {
+        server_says(&mut rig, &mut order, &mut grants, back);
+        rig.pass(2_000);
+        let updates = rig.updates.as_ref().expect("has them");
+        if updates.dark {
+            updates.sets.lose_power();
+        }
+        if updates.dark || rig.exit == Some(ExitReason::Switched) {
+            boots_something_whole(&rig, &good);
+            rig = rig.restart();
+            rig.connect();
+        }
+        let told = report(&rig).filter(|r| r.bundle.as_str() == second.digest.to_string());
+        let ended = |r: &UpdateReport| matches!(r.state, UpdateState::Committed | UpdateState::RolledBack);
+        if let Some(told) = told.filter(ended) {
+            boots_something_whole(&rig, &good);
+            return (told.state, rig.updates.as_ref().map_or(0, |u| u.effects) - before);
+        }
+    }
+    panic!("never ended: power went at {at:?}, {:?}", report(&rig));
+}
+
+/// Whatever the launcher would start now is whole.
+fn boots_something_whole(rig: &Rig, good: &str) {
+    let mut sets = rig.updates.as_ref().expect("has them").sets.clone();
+    let record = sets.holdings().expect("a record").switch;
+    let running = record.running().parse().expect("a set, not the factory's");
+    sets.verify(&running).expect("is whole");
+    if record.trial.is_some() {
+        assert_eq!(record.current, good, "what is gone back to is the set committed last");
+        sets.verify(&good.parse().expect("a set")).expect("is whole");
+    }
+}
+
+#[test]
+fn the_power_may_go_at_every_effect_of_an_update_and_it_still_ends() {
+    for (back, end) in [(false, UpdateState::Committed), (true, UpdateState::RolledBack)] {
+        let (undisturbed, effects) = with_power_cut(None, false, back);
+        assert_eq!(undisturbed, end);
+        assert!(effects > 20, "only {effects} effects");
+        for at in 1..=effects {
+            for last_is_done in [false, true] {
+                let (ended, _) = with_power_cut(Some(at), last_is_done, back);
+                assert_eq!(ended, end, "the power went at {at} of {effects}, done: {last_is_done}");
+            }
+        }
+    }
+}
+
+#[test]
+fn what_was_asked_of_the_disk_is_on_the_ledger_first() {
+    let (mut rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let mut order = stage(&mut rig, &releases, &bundle, 1);
+    order.drain_id = Some(drain("drain-1"));
+    maintain(&mut rig, Some(&drain("drain-1")));
+    rig.slow_disk = true;
+    grant(&mut rig, &mut order, 5_000);
+    assert_eq!((switch(&rig), rig.exit), (Switch::default(), None), "SWITCHING is not durable");
+    rig.flush();
+    rig.put(Input::Tick);
+    assert_eq!(rig.exit, Some(ExitReason::Switched));
+    assert!(switch(&rig).trial.is_some());
+}
