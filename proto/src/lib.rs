@@ -40,6 +40,9 @@ packages! {
     /// `midshift.link.v1`: the robot's session.
     #[expect(clippy::allow_attributes, clippy::large_enum_variant, reason = "generated code")]
     link "midshift.link.v1";
+    /// `midshift.ota.v1`: software of robots.
+    #[expect(clippy::allow_attributes, reason = "generated code")]
+    ota "midshift.ota.v1";
     /// `midshift.telemetry.v1`: what robots said.
     #[expect(clippy::allow_attributes, reason = "generated code")]
     telemetry "midshift.telemetry.v1";

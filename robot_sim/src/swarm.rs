@@ -215,6 +215,8 @@ impl Life {
             tokio::select! {
                 ended = agent => match ended {
                     Ok(ExitReason::Shutdown) => return Ok((None, crashes)),
+                    // Starts again with the set that the switch record names, as a launcher would do it.
+                    Ok(ExitReason::Switched) => {}
                     Ok(ExitReason::FencedTwice) => return Ok((Some(robot_id.clone()), crashes)),
                     Err(session::Error::Store(source)) => return Err(failed(source)),
                 },

@@ -95,7 +95,7 @@ pub fn uri(server: &str) -> String {
 }
 
 /// Runs one agent until `stop`. Fenced twice is an error: another machine has this robot's name.
-pub async fn agent(args: AgentRun, stop: CancellationToken) -> anyhow::Result<()> {
+pub async fn agent(args: AgentRun, stop: CancellationToken) -> anyhow::Result<ExitReason> {
     let robot_id = RobotId::parse(&args.robot_id)?;
     let site = site_file::load(args.site.as_deref(), None, None)?.site;
     std::fs::create_dir_all(&args.data).with_context(|| format!("making {}", args.data.display()))?;
@@ -135,7 +135,7 @@ pub async fn agent(args: AgentRun, stop: CancellationToken) -> anyhow::Result<()
         pulse: midshift_agent::pulse::for_launcher(),
     };
     match midshift_agent::session::run(agent, Box::new(handle), Box::new(store), clock, Arc::new(dial), stop).await? {
-        ExitReason::Shutdown => Ok(()),
+        reason @ (ExitReason::Shutdown | ExitReason::Switched) => Ok(reason),
         ExitReason::FencedTwice => {
             bail!("fenced twice: another machine runs as this robot. Find it, then start this one again")
         }

@@ -168,6 +168,7 @@ async fn a_heartbeat_is_echoed_and_new_desired_work_is_pushed() -> Result<()> {
         held: true,
         resume: None,
         closed: Vec::new(),
+        maintenance: None,
     };
     let mut item = Item::new(Writer::Fleet, "fleet");
     item.put(&work, Expect::Absent, "work.desired");

@@ -20,6 +20,8 @@ use crate::serve::Serve;
 use crate::{dev, logs, robots, serve};
 use clap::{Parser, Subcommand};
 use client::{Call, Exit};
+use midshift_agent::core::ExitReason;
+use midshift_agent::launcher::SWITCHED;
 use out::{Format, Out};
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -135,7 +137,10 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Dev(args) => develop(*args, out).await,
         Command::Serve(args) => Ok(serve::run(args, interrupts()).await?),
         Command::Migrate { data } => migrate(&data, out).await,
-        Command::Agent(AgentVerb::Run(args)) => Ok(robots::agent(args, interrupts()).await?),
+        Command::Agent(AgentVerb::Run(args)) => match robots::agent(args, interrupts()).await? {
+            ExitReason::Switched => Err(Exit::new(SWITCHED, "another set of software is to be started")),
+            ExitReason::Shutdown | ExitReason::FencedTwice => Ok(()),
+        },
         Command::Sim(verb) => sim::run(verb, out, interrupts()).await,
         Command::Task(verb) => task::run(verb, out).await,
         Command::Robot(verb) => robot::run(verb, out).await,
