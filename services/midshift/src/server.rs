@@ -1,8 +1,9 @@
 //! One server out of the services: gRPC, gRPC-Web, reflection, health and metrics on one port, over whatever connections it is given.
 //!
-//! Invariant: every stream ends at shutdown; what does not end by itself is cut after a hard drain.
+//! Invariant: every stream ends at shutdown; what does not end by itself is cut after a hard drain. A service that ends by itself takes the
+//! whole server with it: none is served without the others.
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use axum::routing::get;
 use metrics_exporter_prometheus::{PrometheusBuilder, PrometheusHandle};
 use midshift_core::limits;
@@ -24,9 +25,19 @@ use tokio_util::task::AbortOnDropHandle;
 use tonic::service::Routes;
 use tonic::transport::Server as Transport;
 use tonic::transport::server::Connected;
+use tonic_health::ServingStatus;
+use tonic_health::server::HealthReporter;
 
 /// Pings of the server on a quiet connection, and how long it waits for their answer.
 const KEEPALIVE: (Duration, Duration) = (Duration::from_secs(20), Duration::from_secs(10));
+/// Names under which the health service knows the server; the empty one is the whole.
+const HEALTH: [&str; 5] = [
+    "",
+    "midshift.task.v1.TaskService",
+    "midshift.fleet.v1.FleetService",
+    "midshift.telemetry.v1.TelemetryService",
+    "midshift.link.v1.LinkService",
+];
 /// How often old log entries are taken away.
 const PRUNE_EVERY: Duration = Duration::from_secs(60);
 /// Log entries kept at most, beside the days of [`limits::REMEMBER_DAYS`].
@@ -115,7 +126,7 @@ impl Server {
         self.board.clone()
     }
 
-    async fn routes(&self) -> anyhow::Result<Routes> {
+    async fn routes(&self) -> anyhow::Result<(Routes, HealthReporter)> {
         let control = limits::CONTROL_MESSAGE_BYTES;
         let reflection = || {
             tonic_reflection::server::Builder::configure()
@@ -125,14 +136,7 @@ impl Server {
                 .register_encoded_file_descriptor_set(tonic_types::pb::FILE_DESCRIPTOR_SET)
         };
         let (health, health_service) = tonic_health::server::health_reporter();
-        for name in [
-            "midshift.task.v1.TaskService",
-            "midshift.fleet.v1.FleetService",
-            "midshift.telemetry.v1.TelemetryService",
-            "midshift.link.v1.LinkService",
-        ] {
-            health.set_service_status(name, tonic_health::ServingStatus::Serving).await;
-        }
+        tell(&health, ServingStatus::Serving).await;
         let mut routes = Routes::builder();
         routes
             .add_service(self.task.grpc().max_decoding_message_size(control))
@@ -153,18 +157,23 @@ impl Server {
         };
         // Browsers speak gRPC-Web to the services; Prometheus speaks plain HTTP/1.1 to the page beside them.
         let services = routes.routes().into_axum_router().layer(tonic_web::GrpcWebLayer::new());
-        Ok(Routes::from(services.route("/metrics", get(metrics))))
+        Ok((Routes::from(services.route("/metrics", get(metrics))), health))
     }
 
     /// Serves connections until shutdown, then drains and cuts.
+    ///
+    /// # Errors
+    /// If a service ends before shutdown; everything else has been shut down then.
     pub async fn serve<I, IO, E>(self, incoming: I) -> anyhow::Result<()>
     where
         I: Stream<Item = Result<IO, E>> + Send + 'static,
         IO: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
         E: Into<Box<dyn std::error::Error + Send + Sync>>,
     {
-        let routes = self.routes().await?;
+        let (routes, health) = self.routes().await?;
         let shutdown = self.shutdown.clone();
+        // However this ends, also in a panic: nobody goes on without it.
+        let _end = shutdown.clone().drop_guard();
         let stopped = shutdown.clone();
         let transport = Transport::builder()
             .accept_http1(true)
@@ -177,24 +186,53 @@ impl Server {
         let keeper = prune(self.parts.store.clone(), self.parts.frames.clone(), self.parts.clock.clone());
         let fleet = AbortOnDropHandle::new(self.parts.planning.spawn(self.reconciler.run(shutdown.clone())));
         let telemetry = self.telemetry.clone().run();
+        let failure = OnceLock::new();
+        let services = async {
+            let fleet = until(&shutdown, "fleet", async { Ok(fleet.await??) });
+            let telemetry = until(&shutdown, "telemetry", async { Ok(telemetry.await?) });
+            if let Err(error) = tokio::try_join!(fleet, telemetry) {
+                tracing::error!(%error, "a service ended, and with it the server");
+                shutdown.cancel();
+                // Nothing else sets it.
+                let _ = failure.set(error);
+            }
+        };
         let hard = async {
             shutdown.cancelled().await;
+            tell(&health, ServingStatus::NotServing).await;
             tokio::time::sleep(Duration::from_millis(limits::HARD_DRAIN.as_ms())).await;
         };
-        let services = async {
-            tokio::try_join!(async { fleet.await.context("fleet")?.context("fleet") }, async {
-                telemetry.await.context("telemetry")
-            })
+        let transport = async {
+            let served = transport.await;
+            // Without a door there is nothing to serve.
+            shutdown.cancel();
+            served
         };
         tokio::select! {
-            served = async { tokio::join!(transport, services) } => {
-                served.0.context("serving")?;
-                served.1?;
-            }
+            (served, ()) = async { tokio::join!(transport, services) } => served.context("serving")?,
             () = keeper => {}
             () = hard => tracing::info!("open streams were cut"),
         }
-        Ok(())
+        failure.into_inner().map_or(Ok(()), Err)
+    }
+}
+
+/// A service that ends before `shutdown` is a failure, whatever it says.
+async fn until(
+    shutdown: &CancellationToken,
+    name: &'static str,
+    service: impl Future<Output = anyhow::Result<()>>,
+) -> anyhow::Result<()> {
+    service.await.context(name)?;
+    if !shutdown.is_cancelled() {
+        bail!("{name} ended while it was needed");
+    }
+    Ok(())
+}
+
+async fn tell(health: &HealthReporter, status: ServingStatus) {
+    for name in HEALTH {
+        health.set_service_status(name, status).await;
     }
 }
 
@@ -216,3 +254,6 @@ async fn prune(store: Arc<dyn Store>, frames: Arc<dyn FrameLog>, clock: Arc<dyn 
         }
     }
 }
+
+#[cfg(test)]
+mod tests;
