@@ -40,6 +40,8 @@ const HEALTH: [&str; 5] = [
 ];
 /// How often old log entries are taken away.
 const PRUNE_EVERY: Duration = Duration::from_secs(60);
+/// How often samples of histograms are folded: without a scrape they would gather for ever.
+const FOLD_EVERY: Duration = Duration::from_secs(5);
 /// Log entries kept at most, beside the days of [`limits::REMEMBER_DAYS`].
 const ENTRIES_MAX: u64 = 20_000_000;
 
@@ -211,6 +213,7 @@ impl Server {
         tokio::select! {
             (served, ()) = async { tokio::join!(transport, services) } => served.context("serving")?,
             () = keeper => {}
+            () = fold(metrics_handle()) => {}
             () = hard => tracing::info!("open streams were cut"),
         }
         failure.into_inner().map_or(Ok(()), Err)
@@ -233,6 +236,16 @@ async fn until(
 async fn tell(health: &HealthReporter, status: ServingStatus) {
     for name in HEALTH {
         health.set_service_status(name, status).await;
+    }
+}
+
+/// Folds samples of histograms, whether or not anybody scrapes.
+async fn fold(metrics: Option<PrometheusHandle>) {
+    loop {
+        tokio::time::sleep(FOLD_EVERY).await;
+        if let Some(metrics) = &metrics {
+            metrics.run_upkeep();
+        }
     }
 }
 

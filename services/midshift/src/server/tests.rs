@@ -1,4 +1,4 @@
-//! What holds for the server as a whole: its end.
+//! What holds for the server as a whole: its end, and that it does not grow while nobody looks.
 
 use super::*;
 use crate::planning::Planning;
@@ -79,4 +79,19 @@ async fn a_service_that_ends_at_shutdown_is_no_failure() -> anyhow::Result<()> {
     assert_eq!(next(&mut health).await?, Told::NotServing);
     drop(health);
     world.serving.await?
+}
+
+/// Whether the samples of a histogram were folded; only the text of the recorder tells without folding them itself.
+fn folded(metrics: &PrometheusHandle, name: &str) -> bool {
+    format!("{metrics:?}").split_once("distributions:").is_some_and(|(_, folded)| folded.contains(name))
+}
+
+#[tokio::test(start_paused = true)]
+async fn histograms_do_not_grow_while_nobody_scrapes() {
+    let recorder = PrometheusBuilder::new().build_recorder();
+    let metrics = recorder.handle();
+    metrics::with_local_recorder(&recorder, || metrics::histogram!("midshift_test_seconds").record(1.0));
+    assert!(!folded(&metrics, "midshift_test_seconds"));
+    let _ = tokio::time::timeout(FOLD_EVERY * 2, fold(Some(metrics.clone()))).await;
+    assert!(folded(&metrics, "midshift_test_seconds"));
 }
