@@ -1,0 +1,6 @@
+//! The robot's session and the picture of robots over real gRPC connections in memory.
+
+mod disk;
+mod sessions;
+mod status;
+mod world;
