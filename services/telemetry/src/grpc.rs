@@ -76,7 +76,9 @@ fn encode(inner: &Inner, robot_id: &RobotId, live: Option<&Live>) -> Option<v1::
             durable.insert(Lane::Status, *seq);
         }
     }
-    let view = RobotView { robot_id, presence: rows.presence.get(robot_id), session, live, durable: &durable };
+    let presence = rows.presence.get(robot_id);
+    let observed_since = inner.registry.observed_since(robot_id);
+    let view = RobotView { robot_id, presence, session, live, durable: &durable, observed_since };
     Some(encode_robot(view, inner.parts.clock.now().link))
 }
 

@@ -2,7 +2,9 @@
 
 use crate::world::{Result, Robot, World, world};
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
-use midshift_proto::telemetry::v1::{Presence, RobotFilter, WatchRobotsRequest, WatchRobotsResponse};
+use midshift_proto::telemetry::v1::{
+    self, GetRobotRequest, Presence, RobotFilter, WatchRobotsRequest, WatchRobotsResponse,
+};
 use tonic::Streaming;
 
 struct Watcher(Streaming<WatchRobotsResponse>);
@@ -78,5 +80,35 @@ async fn the_mark_of_the_whole_stays() -> Result<()> {
     robot.beat().await?;
     let later = watcher.next().await?;
     assert!(later.snapshot_complete && !later.robots.is_empty());
+    Ok(())
+}
+
+async fn get(world: &World) -> Result<v1::Robot> {
+    let request = GetRobotRequest { robot_id: "r1".to_owned() };
+    let answer = TelemetryServiceClient::new(world.channel.clone()).get_robot(request).await?.into_inner();
+    answer.robot.ok_or_else(|| "no robot".into())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_clone_is_seen_beside_its_robot_and_changes_nothing_of_it() -> Result<()> {
+    let world = world().await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.beat().await?;
+    robot.hears(|down| down.echo).await?;
+    assert!(!get(&world).await?.observed);
+    let mut watcher = Watcher::of(&world, &[]).await?;
+    let mut clone = Robot::attach(&world, None).await?;
+    for _ in 0..3 {
+        clone.beat().await?;
+    }
+    while !watcher.next().await?.robots.iter().any(|r| r.observed) {}
+    let seen = get(&world).await?;
+    assert!(seen.observed && seen.observed_since.is_some());
+    assert_eq!(seen.session_epoch, robot.welcome.session_epoch);
+    assert_eq!(seen.reported.map(|r| (r.hb, r.session_epoch)), Some((1, robot.welcome.session_epoch)));
+    drop(clone);
+    while watcher.next().await?.robots.iter().any(|r| r.observed) {}
+    let seen = get(&world).await?;
+    assert!(!seen.observed && seen.observed_since.is_none());
     Ok(())
 }
