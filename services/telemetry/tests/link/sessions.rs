@@ -4,8 +4,9 @@ use crate::world::{Otherwise, Result, Robot, World, world, world_with};
 use midshift_core::ids::RobotId;
 use midshift_core::robot::Lane;
 use midshift_core::rows::{Expect, Item, Log, Seq, Writer};
-use midshift_core::work::DesiredWork;
-use midshift_proto::session::{CloseCode, Downlink};
+use midshift_core::work::{DesiredWork, Session};
+use midshift_proto::session::{ClockSample, CloseCode, Downlink};
+use midshift_store::load;
 use midshift_telemetry::{Bugs, SeededBug};
 
 async fn inbox(world: &World) -> Result<usize> {
@@ -91,5 +92,26 @@ async fn a_session_without_proof_is_only_observed_while_the_older_one_is_heard()
     let close = clone.closes().await?;
     assert_eq!(close.code, CloseCode::MoveOver);
     assert!(!Robot::attach(&world, None).await?.welcome.observed);
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_new_session_remembers_the_clock_that_the_one_before_measured() -> Result<()> {
+    let world = world().await?;
+    let offset = async || -> Result<Option<i64>> {
+        let row = load::<Session>(world.store.as_ref(), "r1").await?;
+        Ok(row.ok_or("no session")?.0.clock_offset_ms)
+    };
+    let mut first = Robot::attach(&world, None).await?;
+    assert_eq!(offset().await?, None);
+    // Twelve milliseconds ahead, nothing lost on the wire.
+    first.beat_with(Some(ClockSample { t1_us: 12_000, t2_us: 0, t3_us: 0, t4_us: 12_000 })).await?;
+    first.hears(|down| down.echo).await?;
+    let mut second = Robot::attach(&world, Some(first.proof())).await?;
+    assert_eq!(offset().await?, Some(12));
+    second.beat().await?;
+    second.hears(|down| down.echo).await?;
+    let _third = Robot::attach(&world, Some(second.proof())).await?;
+    assert_eq!(offset().await?, Some(12), "a session that measured nothing forgets nothing");
     Ok(())
 }

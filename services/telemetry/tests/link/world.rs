@@ -7,7 +7,7 @@ use midshift_core::work::{InboxItem, RobotEvent, Sample, SampleBody};
 use midshift_proto::link::v1::link_service_client::LinkServiceClient;
 use midshift_proto::link::v1::{SessionRequest, SessionResponse};
 use midshift_proto::session::{
-    Close, Downlink, FromRobot, Heartbeat, Hello, LaneBatch, Previous, ToRobot, Uplink, Welcome,
+    ClockSample, Close, Downlink, FromRobot, Heartbeat, Hello, LaneBatch, Previous, ToRobot, Uplink, Welcome,
 };
 use midshift_store::{FrameLog, LiveBoard, MemoryFrames, MemoryStore, Store, StoreId};
 use midshift_telemetry::{Bugs, Parts, TelemetryService};
@@ -112,11 +112,13 @@ impl Robot {
         Ok(self.up.send((&FromRobot::Uplink(uplink)).into()).await?)
     }
     pub async fn beat(&mut self) -> Result<()> {
+        self.beat_with(None).await
+    }
+    pub async fn beat_with(&mut self, clock: Option<ClockSample>) -> Result<()> {
         self.hb += 1;
         let reported =
             ReportedState { hb: self.hb, session_epoch: self.welcome.session_epoch, ..ReportedState::default() };
-        self.say(Uplink { heartbeat: Some(Heartbeat { reported, sent_unix_us: 0, clock: None }), batches: Vec::new() })
-            .await
+        self.say(Uplink { heartbeat: Some(Heartbeat { reported, sent_unix_us: 0, clock }), batches: Vec::new() }).await
     }
     pub async fn events(&self, seqs: std::ops::RangeInclusive<u64>) -> Result<()> {
         let body = SampleBody::Event(RobotEvent::Mode(Mode::Automatic));
