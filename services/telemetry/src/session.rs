@@ -274,7 +274,7 @@ impl Session {
         if self.in_charge.is_none() {
             return None;
         }
-        match self.status.arrive(batch) {
+        match self.status.arrive(batch, self.inner.parts.clock.now().wall) {
             Arrived::Taken => {}
             Arrived::Expect(ack) => self.say(|out| out.acks.push(ack)),
             Arrived::OverCredit => {
@@ -293,9 +293,9 @@ impl Session {
             self.committing = Some(self.commit(batch));
         }
         if self.keeping.is_none()
-            && let Some(frames) = self.status.next_write()
+            && let Some(write) = self.status.next_write()
         {
-            self.keeping = Some(Box::pin(status::keep(self.inner.parts.frames.clone(), frames)));
+            self.keeping = Some(Box::pin(status::keep(self.inner.parts.frames.clone(), write)));
         }
     }
 

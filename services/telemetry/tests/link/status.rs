@@ -3,10 +3,11 @@
 use crate::disk::Disk;
 use crate::world::{Otherwise, Result, Robot, clock, world_with};
 use midshift_core::limits;
+use midshift_core::reason::Code;
 use midshift_core::robot::{Lane, Vitals};
-use midshift_core::work::{InboxItem, Sample, SampleBody};
+use midshift_core::work::{Gap, InboxItem, Sample, SampleBody};
 use midshift_proto::session::{CloseCode, Downlink};
-use midshift_store::MemoryFrames;
+use midshift_store::{FrameLog, MemoryFrames};
 use std::sync::Arc;
 
 fn disk() -> Arc<Disk> {
@@ -58,5 +59,33 @@ async fn a_robot_within_its_credit_is_acknowledged_when_the_disk_comes_back() ->
     assert_eq!(robot.hears(|down| down.echo.map(|e| e.hb)).await?, 1);
     disk.stick(false);
     while robot.hears(acked).await? < 300 {}
+    Ok(())
+}
+
+fn expected(down: &Downlink) -> Option<u64> {
+    down.acks.iter().find(|a| a.lane == Lane::Status).and_then(|a| a.expect)
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_was_lost_while_the_disk_refused_is_written_down_as_a_gap_before_it_is_acknowledged() -> Result<()> {
+    let disk = disk();
+    let world = world_with(otherwise(&disk)).await?;
+    disk.fill(true);
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.status(samples(1..=3)).await?;
+    assert_eq!(robot.hears(expected).await?, 1);
+    // The ring had to make room meanwhile, and the disk still refuses: the gap is not acknowledged either.
+    let reason = Code::Overflow.into();
+    let gap = InboxItem::Gap(Gap { lane: Lane::Status, from_seq: 1, to_seq: 2, reason });
+    let rest: Vec<InboxItem> = std::iter::once(gap).chain(samples(3..=4)).collect();
+    robot.status(rest.clone()).await?;
+    assert_eq!(robot.hears(expected).await?, 1);
+    assert!(disk.refused() >= 2 && disk.gaps(None, 10).await?.is_empty());
+    disk.fill(false);
+    robot.status(rest).await?;
+    assert_eq!(robot.hears(acked).await?, 4);
+    let gaps = disk.gaps(None, 10).await?;
+    let said: Vec<_> = gaps.iter().map(|g| (&*g.lane, g.from_seq, g.to_seq, &*g.reason)).collect();
+    assert_eq!(said, [("STATUS", 1, 2, "OVERFLOW")]);
     Ok(())
 }
