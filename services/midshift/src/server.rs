@@ -6,6 +6,7 @@
 use anyhow::{Context, bail};
 use axum::routing::get;
 use metrics_exporter_prometheus::{PrometheusBuilder, PrometheusHandle};
+use midshift_core::fleet::rows::FleetMark;
 use midshift_core::limits;
 use midshift_core::site::Site;
 use midshift_core::time::Clock;
@@ -185,7 +186,8 @@ impl Server {
             .timeout(Duration::from_millis(limits::UNARY_DEADLINE.as_ms()))
             .add_routes(routes)
             .serve_with_incoming_shutdown(incoming, async move { stopped.cancelled().await });
-        let keeper = prune(self.parts.store.clone(), self.parts.frames.clone(), self.parts.clock.clone());
+        let keeper =
+            prune(self.task.clone(), self.parts.store.clone(), self.parts.frames.clone(), self.parts.clock.clone());
         let fleet = AbortOnDropHandle::new(self.parts.planning.spawn(self.reconciler.run(shutdown.clone())));
         let telemetry = self.telemetry.clone().run();
         let failure = OnceLock::new();
@@ -249,23 +251,28 @@ async fn fold(metrics: Option<PrometheusHandle>) {
     }
 }
 
-/// Takes old entries and frames away, never past what fleet has not consumed.
-async fn prune(store: Arc<dyn Store>, frames: Arc<dyn FrameLog>, clock: Arc<dyn Clock>) {
-    use midshift_core::fleet::rows::FleetMark;
+/// Takes old rows, entries and frames away, entries never past what fleet has not consumed.
+async fn prune(task: TaskService, store: Arc<dyn Store>, frames: Arc<dyn FrameLog>, clock: Arc<dyn Clock>) {
     loop {
         tokio::time::sleep(PRUNE_EVERY).await;
-        let mark = midshift_store::load::<FleetMark>(store.as_ref(), "fleet").await;
-        let Ok(Some((mark, _))) = mark else { continue };
-        let days_ms = (limits::REMEMBER_DAYS * 86_400_000) as i64;
-        let keep =
-            Retention { before_unix_ms: clock.now().wall.0 - days_ms, entries_max: ENTRIES_MAX, floor: mark.seq };
-        if let Err(error) = store.prune(keep).await {
+        if let Err(error) = task.prune().await {
+            tracing::warn!(%error, "old requests could not be taken away");
+        }
+        if let Err(error) = prune_entries(store.as_ref(), clock.as_ref()).await {
             tracing::warn!(%error, "old log entries could not be taken away");
         }
         if let Err(error) = frames.prune().await {
             tracing::warn!(%error, "old status could not be taken away");
         }
     }
+}
+
+async fn prune_entries(store: &dyn Store, clock: &dyn Clock) -> Result<(), midshift_store::Error> {
+    // Until fleet has consumed something nothing may go.
+    let Some((mark, _)) = midshift_store::load::<FleetMark>(store, "fleet").await? else { return Ok(()) };
+    let days_ms = (limits::REMEMBER_DAYS * 86_400_000) as i64;
+    let keep = Retention { before_unix_ms: clock.now().wall.0 - days_ms, entries_max: ENTRIES_MAX, floor: mark.seq };
+    store.prune(keep).await.map(drop)
 }
 
 #[cfg(test)]
