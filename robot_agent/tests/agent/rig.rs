@@ -32,6 +32,8 @@ pub struct BodyLog {
     pub mode: Mode,
     pub hardware_stop: HardwareStop,
     pub checked: Checked,
+    /// What the maker's test finds broken.
+    pub broken: Option<Fault>,
     news: Vec<BodyNews>,
 }
 
@@ -55,6 +57,7 @@ impl TestBody {
             mode: Mode::Automatic,
             hardware_stop: HardwareStop::None,
             checked: Checked::Unknown,
+            broken: None,
             news: Vec::new(),
         })))
     }
@@ -171,7 +174,7 @@ impl Body for TestBody {
         self.lock().checked
     }
     fn self_test(&mut self, _: SiteTime) -> Result<(), Fault> {
-        Ok(())
+        self.lock().broken.clone().map_or(Ok(()), Err)
     }
     fn hardware_stop(&self) -> HardwareStop {
         self.lock().hardware_stop
