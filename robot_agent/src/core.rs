@@ -251,6 +251,7 @@ impl AgentCore {
             load: self.body.load(),
             attempts: self.reported_attempts(now),
             places: self.places.held(),
+            // Nothing carries a level of stop to a robot yet; a halt of the body here only ends a motion.
             stop_level: StopLevel::None,
             hardware_stop: self.hardware_stop,
             field_violation: self.body.state(now.site).field_violation,
