@@ -271,9 +271,7 @@ impl Session {
     }
 
     fn status(&mut self, batch: &LaneBatch) -> Option<End> {
-        if self.in_charge.is_none() {
-            return None;
-        }
+        self.in_charge.as_ref()?;
         match self.status.arrive(batch, self.inner.parts.clock.now().wall) {
             Arrived::Taken => {}
             Arrived::Expect(ack) => self.say(|out| out.acks.push(ack)),
