@@ -186,6 +186,8 @@ mod tests {
 
     const NOW: Utc = Utc(7);
 
+    type Ranges = Vec<(u64, u64)>;
+
     fn lane() -> StatusLane {
         StatusLane::new(RobotId::parse("r1").expect("an id"), Arc::from("ring"), 0)
     }
@@ -198,7 +200,7 @@ mod tests {
     fn arrive(lane: &mut StatusLane, items: Vec<InboxItem>) -> Arrived {
         lane.arrive(&LaneBatch { lane: Lane::Status, items }, NOW)
     }
-    fn ranges(write: &Write) -> (Vec<(u64, u64)>, Vec<(u64, u64)>) {
+    fn ranges(write: &Write) -> (Ranges, Ranges) {
         let frames = write.frames.iter().map(|f| (f.first_seq, f.last_seq));
         (frames.collect(), write.gaps.iter().map(|g| (g.from_seq, g.to_seq)).collect())
     }
