@@ -34,7 +34,7 @@ pub struct LinkArgs {
     /// Robots at the knee.
     #[arg(long, default_value_t = 32)]
     knee_robots: usize,
-    /// Seconds measured of each leg at one report a second.
+    /// Seconds measured of each leg at one report a second. Ten thousand robots want 60.
     #[arg(long, default_value_t = 30)]
     seconds: u64,
     /// Seconds measured of each leg at the knee.

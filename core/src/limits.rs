@@ -106,6 +106,8 @@ pub const STATUS_IN_FLIGHT_BYTES: usize = 64 * 1024;
 pub const RING_STATUS_MAX: usize = 4_096;
 /// Days a request_id, an event and a finished id on the robot's ledger are kept.
 pub const REMEMBER_DAYS: u64 = 7;
+/// Days that what people asked of tasks and robots is kept, to be looked up.
+pub const ASKED_DAYS: u64 = 30;
 /// Finished ids a ledger keeps whatever their age.
 pub const LEDGER_IDS_MIN: usize = 100_000;
 /// Longest unary call. L

@@ -367,7 +367,7 @@ pub struct Session {
     pub applied_work: u64,
     /// Places it said it holds, at Hello.
     pub places: Vec<HeldPlace>,
-    /// Robot clock minus server clock, milliseconds; none until measured.
+    /// Robot clock minus server clock, milliseconds, as the sessions before this one measured it last; none: they did not.
     pub clock_offset_ms: Option<i64>,
 }
 

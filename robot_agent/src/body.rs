@@ -134,7 +134,8 @@ pub trait Body: Send {
     fn load(&self) -> Option<Load>;
     /// Whether a step that may have been under way at a restart was done. `task_id` names whose step it was.
     fn check(&self, step: &StepKind, task_id: Option<&midshift_core::ids::TaskId>) -> Checked;
-    /// The maker's own test; an error says what is broken.
+    /// The maker's own test, asked for once when the agent starts and the body stands; an error says what is broken. Until the body says
+    /// that this fault is over ([`BodyNews::Fault`]) the robot accepts no work.
     fn self_test(&mut self, now: SiteTime) -> Result<(), Fault>;
     /// State of the maker's own safety system.
     fn hardware_stop(&self) -> HardwareStop;

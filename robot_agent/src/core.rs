@@ -15,7 +15,7 @@ use crate::work::{Doing, Work};
 use midshift_core::authority::SentHeartbeats;
 use midshift_core::ids::{AttemptId, PlaceId, RobotId, WaypointId};
 use midshift_core::limits;
-use midshift_core::robot::{Fault, HardwareStop, Inventory, Lane, Mode, ReportedState, StopLevel, Vitals};
+use midshift_core::robot::{Fault, FaultClass, HardwareStop, Inventory, Lane, Mode, ReportedState, StopLevel, Vitals};
 use midshift_core::time::{LinkDuration, LinkTime, Now, SiteDuration, SiteTime};
 use midshift_core::work::{DesiredPolicy, DesiredWork, RobotEvent, SampleBody};
 use midshift_proto::session::{ClockSample, Downlink, Heartbeat, LaneAck, LaneBatch, Uplink, Welcome};
@@ -138,6 +138,8 @@ pub struct AgentCore {
     throttle: Throttle,
     writes: Writes,
     standing_fault: Option<Fault>,
+    /// The body failed its maker's test when this process began.
+    pub(crate) unfit: Option<Fault>,
     battery_critical: bool,
     odometer_mm: u64,
     progress: u64,
@@ -190,6 +192,7 @@ impl AgentCore {
             session: None,
             writes: Writes::default(),
             standing_fault: None,
+            unfit: None,
             battery_critical: false,
             odometer_mm: 0,
             progress: 0,
@@ -267,10 +270,11 @@ impl AgentCore {
             load: self.body.load(),
             attempts: self.reported_attempts(now),
             places: self.places.held(),
+            // Nothing carries a level of stop to a robot yet; a halt of the body here only ends a motion.
             stop_level: StopLevel::None,
             hardware_stop: self.hardware_stop,
             field_violation: self.body.state(now.site).field_violation,
-            fault: self.standing_fault.clone(),
+            fault: self.unfit.as_ref().or(self.standing_fault.as_ref()).cloned(),
             update: self.update_report().filter(|u| session.is_none() || !u.state.is_over()),
         }
     }
@@ -325,6 +329,9 @@ impl AgentCore {
     fn start(&mut self, now: &Now) {
         if !self.body.standstill(now.site) {
             self.body.stop(now.site, StopLevel::Halt);
+        }
+        if let Err(fault) = self.body.self_test(now.site) {
+            self.failed_test(fault);
         }
         self.note_where_it_stands();
         self.write_places();
@@ -481,13 +488,27 @@ impl AgentCore {
     }
 
     pub(crate) fn fault_changed(&mut self, fault: Fault, stands: bool) {
-        let same = self.standing_fault.as_ref().is_some_and(|f| f.code == fault.code);
+        let is_this = |f: &Fault| f.code == fault.code;
+        let same = self.standing_fault.as_ref().is_some_and(is_this);
+        if !stands && self.unfit.as_ref().is_some_and(is_this) {
+            self.unfit = None;
+        }
         self.emit(Lane::Critical, RobotEvent::Fault { fault: fault.clone(), cleared: !stands });
         if stands {
             self.standing_fault = Some(fault);
         } else if same {
             self.standing_fault = None;
         }
+    }
+
+    /// No work is accepted until the body says that this fault is over, or a later process begins with a test that passes. It is told as
+    /// one that a person must look at: nobody may wait for it to pass by itself.
+    fn failed_test(&mut self, fault: Fault) {
+        tracing::error!(robot_id = %self.config.robot_id, code = fault.code, "the body failed its test");
+        let class = if fault.class == FaultClass::Recoverable { FaultClass::Mechanical } else { fault.class };
+        let fault = Fault { class, ..fault };
+        self.unfit = Some(fault.clone());
+        self.fault_changed(fault, true);
     }
 
     /// The next heartbeat goes with this step, or as soon as one may go.

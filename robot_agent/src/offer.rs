@@ -139,6 +139,10 @@ impl AgentCore {
         if self.kept.ledger.maintenance.is_some() || self.changes_software() {
             return self.refuse(now, &assignment, Code::InMaintenance.into());
         }
+        if let Some(fault) = &self.unfit {
+            let why = Reason::from(Code::RobotFault).with("fault_code", fault.code);
+            return self.refuse(now, &assignment, why);
+        }
         if let Some(work) = &self.work {
             let holder = work.holder.attempt.to_string();
             return self.refuse(now, &assignment, Reason::from(Code::AnotherHolder).with("holder", holder));

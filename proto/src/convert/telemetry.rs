@@ -23,11 +23,13 @@ pub struct RobotView<'a> {
     pub live: Option<&'a Live>,
     /// Highest durable number of each lane of its ring.
     pub durable: &'a BTreeMap<Lane, u64>,
+    /// Since when another machine is attached under its name and only observed; none: there is none.
+    pub observed_since: Option<Utc>,
 }
 
 /// A robot as callers see it at `now`.
 pub fn encode_robot(view: RobotView<'_>, now: LinkTime) -> v1::Robot {
-    let RobotView { robot_id, presence, session, live, durable } = view;
+    let RobotView { robot_id, presence, session, live, durable, observed_since } = view;
     // The live board measures; the row keeps what was known at Hello.
     let measured = live.and_then(|l| l.clock_offset_ms);
     let offset = measured.map(|(offset, _)| offset).or_else(|| session.and_then(|s| s.clock_offset_ms));
@@ -42,9 +44,10 @@ pub fn encode_robot(view: RobotView<'_>, now: LinkTime) -> v1::Robot {
         session_epoch: session.map(|s| s.session_epoch).unwrap_or_default(),
         clock_offset_ms: offset,
         clock_error_ms: measured.map(|(_, error)| error),
-        observed: live.map_or_else(|| session.is_some_and(|s| s.observed), |l| l.observed),
+        observed: observed_since.is_some(),
         ring: session.map(|s| s.ring.clone()).unwrap_or_default(),
         durable: lane_marks(durable),
+        observed_since: observed_since.map(timestamp),
     }
 }
 

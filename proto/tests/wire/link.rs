@@ -1,13 +1,14 @@
 //! The link there and back: what core says is what the other end hears.
 
 use midshift_core::authority::Authority;
-use midshift_core::ids::{AreaId, AttemptId, PlaceId, RobotId, Subject, TaskId, WaypointId};
+use midshift_core::ids::{AreaId, AttemptId, BundleId, DrainId, PlaceId, RobotId, SetId, Subject, TaskId, WaypointId};
 use midshift_core::policy::AreaPolicy;
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{
     Fault, FaultClass, HardwareStop, HeldPlace, Inventory, Lane, Load, Mode, Pose, ReportedAttempt, ReportedState,
     StopLevel, Vitals,
 };
+use midshift_core::update::{ActivationGrant, DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState};
 use midshift_core::work::{
     Assignment, AttemptReport, DesiredPolicy, DesiredWork, Effect, Gap, GrantedPlace, InboxItem, PlaceNews, RobotEvent,
     RoutePoint, Sample, SampleBody, StepKind, WorkState, WorkStats, WorkStep,
@@ -88,6 +89,8 @@ fn reported() -> ReportedState {
         stop_level: StopLevel::ControlledStopPosture,
         hardware_stop: HardwareStop::Remote,
         field_violation: true,
+        applied_update: 3,
+        update: Some(update_report()),
         fault: Some(fault()),
         ..at_work()
     }
@@ -119,7 +122,44 @@ fn events() -> Vec<RobotEvent> {
         RobotEvent::Load(Some(Load { task_id: None, item: "box".into() })),
         RobotEvent::StaleAuthority { what: "offer".into(), detail: "late".into() },
         RobotEvent::BatteryCritical { battery_permille: 49 },
+        RobotEvent::Update(UpdateEvent::Changed(update_report())),
+        RobotEvent::Update(UpdateEvent::DirectiveRefused { generation: 7, reason: Code::DirectiveRefused.into() }),
+        RobotEvent::Update(UpdateEvent::Ready { drain_id: drain(), set: set() }),
     ]
+}
+
+fn drain() -> DrainId {
+    DrainId::parse("op:drain-1").expect("id")
+}
+
+fn set() -> SetId {
+    SetId::parse("factory").expect("id")
+}
+
+fn update_report() -> UpdateReport {
+    UpdateReport {
+        state: UpdateState::RollingBack,
+        bundle: BundleId::parse(&"ab".repeat(32)).expect("id"),
+        set: Some(set()),
+        drain_id: Some(drain()),
+        grant_id: 12,
+        tries: 2,
+        progress_permille: 1_000,
+        reason: Some(Reason::new(Code::SelfTestFailed, "the left knee").with("fault_code", 5_001)),
+    }
+}
+
+fn desired_update() -> DesiredUpdate {
+    DesiredUpdate {
+        robot_id: robot(),
+        generation: 9,
+        goal: Goal::Activate,
+        directive: "{}".into(),
+        drain_id: Some(drain()),
+        grant: Some(ActivationGrant { grant_id: 13, drain_id: drain(), authority: authority() }),
+        rate_bytes_s: 250_000,
+        probation_ms: 180_000,
+    }
 }
 
 fn work() -> DesiredWork {
@@ -173,6 +213,7 @@ fn work() -> DesiredWork {
         held: true,
         resume: Some(authority()),
         closed: vec![attempt(), errand()],
+        maintenance: Some(drain()),
     }
 }
 
@@ -245,8 +286,8 @@ fn what_a_robot_says_is_what_the_server_hears() {
     let mut items: Vec<_> = items
         .map(|(e, seq)| InboxItem::Sample(Sample { seq, robot_unix_ms: -1, body: SampleBody::Event(e) }))
         .collect();
-    items.push(InboxItem::Gap(Gap { lane: Lane::Event, from_seq: 10, to_seq: 12, reason: Code::Overflow.into() }));
-    let status = Sample { seq: 13, robot_unix_ms: 1_780_300_000_000, body: SampleBody::Status(vitals()) };
+    items.push(InboxItem::Gap(Gap { lane: Lane::Event, from_seq: 13, to_seq: 14, reason: Code::Overflow.into() }));
+    let status = Sample { seq: 15, robot_unix_ms: 1_780_300_000_000, body: SampleBody::Status(vitals()) };
     let messages = [
         FromRobot::Hello(Box::new(hello())),
         FromRobot::Hello(Box::new(Hello {
@@ -289,6 +330,7 @@ fn what_the_server_says_is_what_a_robot_hears() {
         work: Some(work()),
         policy: Some(policy()),
         status_credit_bytes: Some(0),
+        update: Some(desired_update()),
     };
     let idle = DesiredWork { assignment: None, grants: vec![], held: false, resume: None, closed: vec![], ..work() };
     let close = Close {

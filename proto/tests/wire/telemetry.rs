@@ -37,7 +37,7 @@ fn a_robot_shows_how_old_its_report_is_and_the_measured_clock_before_the_remembe
         received_unix_ms: 3_500,
         progress_at: SiteTime(0),
         clock_offset_ms: Some((12, 2)),
-        observed: true,
+        observed: false,
     };
     let durable = BTreeMap::from([(Lane::Event, 5)]);
     let id = robot();
@@ -47,15 +47,17 @@ fn a_robot_shows_how_old_its_report_is_and_the_measured_clock_before_the_remembe
         session: Some(&session),
         live: Some(&live),
         durable: &durable,
+        observed_since: Some(Utc(2_000)),
     };
     let wire = encode_robot(view, LinkTime(5_250));
     assert_eq!((wire.presence(), wire.session_epoch, wire.observed), (v1::Presence::Suspect, 7, true));
+    assert_eq!(wire.observed_since.as_ref().map(|t| t.seconds), Some(2));
     assert_eq!(wire.age.as_ref().map(ms_of), Some(4_250));
     assert_eq!((wire.clock_offset_ms, wire.clock_error_ms), (Some(12), Some(2)));
     assert_eq!(wire.reported.as_ref().expect("report").mode(), link::v1::Mode::Manual);
     assert!(!format!("{wire:?}").contains("s3cret"), "the secret of a session is shown to nobody");
 
-    let wire = encode_robot(RobotView { live: None, presence: None, ..view }, LinkTime(5_250));
+    let wire = encode_robot(RobotView { live: None, presence: None, observed_since: None, ..view }, LinkTime(5_250));
     assert_eq!((wire.presence(), wire.clock_offset_ms, wire.observed), (v1::Presence::Offline, Some(-3), false));
     assert!(wire.reported.is_none() && wire.age.is_none());
 }

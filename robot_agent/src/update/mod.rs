@@ -173,8 +173,6 @@ pub(crate) struct Updater {
     pub(crate) begun: Option<(LinkTime, SiteTime)>,
     /// The server has answered a heartbeat of this process.
     pub(crate) server_reached: bool,
-    /// The body's own test, made once in a process.
-    pub(crate) self_test: Option<Result<(), Reason>>,
     /// The switch back was written by this process.
     pub(crate) went_back: bool,
     /// The download under way is to be left, and that was said.

@@ -201,7 +201,7 @@ impl AgentCore {
     /// What the robot says of its update.
     pub(crate) fn update_report(&self) -> Option<midshift_core::update::UpdateReport> {
         let (there, needed) = self.update.progress;
-        let permille = if needed == 0 { 0 } else { there.saturating_mul(1000) / needed };
+        let permille = there.saturating_mul(1000).checked_div(needed).unwrap_or(0);
         self.kept.ledger.software.report(permille.min(1000) as u16)
     }
 
@@ -570,7 +570,7 @@ impl AgentCore {
     // --- on trial
 
     fn probation(&mut self, now: &Now, update: Update, holdings: &Holdings) {
-        if let Err(reason) = self.self_test(now) {
+        if let Err(reason) = self.self_test() {
             return self.go_back(update, reason);
         }
         if self.wants_back(&update) {
@@ -591,15 +591,10 @@ impl AgentCore {
         self.prove(holdings);
     }
 
-    /// The body's own test, once in a process.
-    fn self_test(&mut self, now: &Now) -> Result<(), Reason> {
-        if let Some(tested) = &self.update.self_test {
-            return tested.clone();
-        }
+    /// What the maker's own test, made when the agent started, found broken.
+    fn self_test(&self) -> Result<(), Reason> {
         let failed = |fault: Fault| Reason::new(Code::SelfTestFailed, fault.message).with("fault_code", fault.code);
-        let tested = self.body.self_test(now.site).map_err(failed);
-        self.update.self_test = Some(tested.clone());
-        tested
+        self.unfit.clone().map_or(Ok(()), |fault| Err(failed(fault)))
     }
 
     fn prove(&mut self, holdings: &Holdings) {
@@ -655,7 +650,7 @@ impl AgentCore {
             if self.update.went_back {
                 return Some(ExitReason::Switched);
             }
-            match self.self_test(now) {
+            match self.self_test() {
                 Ok(()) => self.put_update(Update { state: UpdateState::RolledBack, ..update }),
                 Err(reason) => self.move_to(UpdateState::Stuck, Some(reason)),
             }

@@ -1,11 +1,12 @@
 //! Offers: what a robot takes, what it refuses and what it remembers.
 
 use crate::rig::{Rig, TestBody, action, attempt, goto, point, welcome};
+use midshift_agent::body::BodyNews;
 use midshift_agent::bugs::{Bugs, SeededBug};
 use midshift_agent::core::{ExitReason, Input};
 use midshift_agent::memory::MemoryStore;
-use midshift_core::robot::Mode;
-use midshift_core::work::{Assignment, Effect, WorkState};
+use midshift_core::robot::{Fault, FaultClass, Mode};
+use midshift_core::work::{Assignment, Effect, RobotEvent, WorkState};
 use midshift_proto::session::{Downlink, Welcome};
 
 fn drive(rig: &Rig, name: &str, epoch: u64) -> Assignment {
@@ -161,6 +162,26 @@ fn what_the_robot_cannot_do_now_is_refused_with_the_reason() {
     rig.connect_as(Welcome { observed: true, ..welcome() });
     rig.work(rig.desired(Some(drive(&rig, "T1", 1))));
     assert_eq!(rig.refusals(), ["ROBOT_OBSERVED"]);
+}
+
+#[test]
+fn a_body_that_failed_its_test_takes_no_work_until_it_says_that_the_fault_is_over() {
+    let fault = Fault { code: 77, class: FaultClass::Recoverable, message: "gripper does not close".into() };
+    let body = TestBody::at("A");
+    body.set(|b| b.broken = Some(fault.clone()));
+    let mut rig = Rig::with(body, MemoryStore::new(), Bugs::default());
+    rig.connect();
+    // Told as a fault that nobody waits for, whatever the maker calls it.
+    let told = Fault { class: FaultClass::Mechanical, ..fault.clone() };
+    assert!(rig.events.contains(&RobotEvent::Fault { fault: told.clone(), cleared: false }));
+    assert_eq!(rig.reported.as_ref().and_then(|r| r.fault.clone()), Some(told));
+    rig.work(rig.desired(Some(drive(&rig, "T1", 1))));
+    assert_eq!(rig.refusals(), ["ROBOT_FAULT"]);
+    rig.body.says(BodyNews::Fault(fault, false));
+    rig.pass(1_000);
+    assert_eq!(rig.reported.as_ref().and_then(|r| r.fault.clone()), None);
+    rig.work(rig.desired(Some(drive(&rig, "T1", 2))));
+    assert_eq!(rig.states().first(), Some(&(WorkState::Accepted, 0)));
 }
 
 #[test]

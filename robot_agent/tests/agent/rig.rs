@@ -37,7 +37,7 @@ pub struct BodyLog {
     pub mode: Mode,
     pub hardware_stop: HardwareStop,
     pub checked: Checked,
-    /// What its own test finds.
+    /// What the maker's test finds broken.
     pub broken: Option<Fault>,
     news: Vec<BodyNews>,
 }

@@ -68,7 +68,7 @@ pub struct Gap {
     pub from_seq: u64,
     /// Last missing number.
     pub to_seq: u64,
-    /// Why (`thinned`, `not durable`).
+    /// Code of the reason (`OVERFLOW`).
     pub reason: Arc<str>,
     /// When it was noticed, UTC unix ms.
     pub at_unix_ms: i64,

@@ -10,7 +10,7 @@ use midshift_core::fleet::rows::FleetMark;
 use midshift_core::ids::{AreaId, RequestId, RobotId, TaskId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
-use midshift_core::rows::{Item, Log, Revision, Seq, Table, Writer};
+use midshift_core::rows::{Entry, Item, Log, Revision, Seq, Table, Writer};
 use midshift_core::task::state::RequestKey;
 use midshift_core::task::{Ask, Phase, Resolution, TaskRequest};
 use midshift_proto::convert::WireEnum;
@@ -205,7 +205,9 @@ impl TaskService {
                 }
                 page => page?,
             };
-            if let Some(key) = page.entries.iter().find(|e| e.table == Some(Table::RequestKey)) {
+            // The newest: an older use of the id, and that it was forgotten, may still be in the log.
+            let used = |e: &&Entry| e.table == Some(Table::RequestKey) && e.body.is_some();
+            if let Some(key) = page.entries.iter().rev().find(used) {
                 return Ok(Seq(key.seq.0 + 1));
             }
             if page.next >= page.head {

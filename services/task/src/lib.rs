@@ -9,6 +9,7 @@ mod batch;
 mod grpc;
 mod images;
 mod list;
+mod prune;
 mod rows;
 mod watch;
 

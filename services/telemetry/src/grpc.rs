@@ -11,7 +11,7 @@ use midshift_core::work::{InboxEntry, InboxItem, Live, RobotEvent, SampleBody};
 use midshift_proto::convert::WireEnum;
 use midshift_proto::convert::telemetry::{RobotView, encode_event, encode_robot};
 use midshift_proto::telemetry::v1::{self, telemetry_service_server::TelemetryService as Face};
-use midshift_store::Error;
+use midshift_store::{Dirty, Error};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
@@ -76,7 +76,9 @@ fn encode(inner: &Inner, robot_id: &RobotId, live: Option<&Live>) -> Option<v1::
             durable.insert(Lane::Status, *seq);
         }
     }
-    let view = RobotView { robot_id, presence: rows.presence.get(robot_id), session, live, durable: &durable };
+    let presence = rows.presence.get(robot_id);
+    let observed_since = inner.registry.observed_since(robot_id);
+    let view = RobotView { robot_id, presence, session, live, durable: &durable, observed_since };
     Some(encode_robot(view, inner.parts.clock.now().link))
 }
 
@@ -227,6 +229,49 @@ impl Face for TelemetryService {
     }
 }
 
+/// One watcher: what it was told is what it is told the end of.
+struct Watching<'a> {
+    inner: &'a Inner,
+    filter: Filter,
+    beats: Dirty<Live>,
+    touched: Dirty<()>,
+    shown: BTreeSet<RobotId>,
+}
+
+impl Watching<'_> {
+    /// Robots to tell of `ids`: those that match, and once more those that did and no longer do.
+    fn news(&mut self, ids: BTreeSet<RobotId>) -> Vec<v1::Robot> {
+        let mut robots = Vec::new();
+        for id in ids {
+            let matches = admits(self.inner, &self.filter, &id);
+            let matched = self.shown.contains(&id);
+            let live = self.inner.parts.board.get(&id);
+            if let Some(robot) = encode(self.inner, &id, live.as_deref()).filter(|_| matches || matched) {
+                robots.push(robot);
+            }
+            if matches {
+                self.shown.insert(id);
+            } else {
+                self.shown.remove(&id);
+            }
+        }
+        robots
+    }
+    /// The whole.
+    fn first(&mut self) -> Vec<v1::Robot> {
+        self.beats.take();
+        self.touched.take();
+        let known = self.inner.picture.rows().sessions.keys().cloned().collect();
+        self.news(known)
+    }
+    /// What changed since the last call.
+    fn changed(&mut self) -> Vec<v1::Robot> {
+        let beats = self.beats.take().into_iter().map(|(id, _)| id);
+        let ids = beats.chain(self.touched.take().into_iter().map(|(id, _)| id)).collect();
+        self.news(ids)
+    }
+}
+
 /// The whole, then what changed, newest only, at the watcher's pace; a slow watcher lowers only its own rate.
 async fn watch(
     inner: &Inner,
@@ -234,20 +279,15 @@ async fn watch(
     period: Duration,
     sender: mpsc::Sender<Result<v1::WatchRobotsResponse, Status>>,
 ) {
-    let mut dirty = inner.parts.board.watch();
-    dirty.take();
-    let known: Vec<RobotId> = inner.picture.rows().sessions.keys().cloned().collect();
-    let mut robots: Vec<v1::Robot> = known
-        .iter()
-        .filter(|id| admits(inner, &filter, id))
-        .filter_map(|id| encode(inner, id, inner.parts.board.get(id).as_deref()))
-        .collect();
+    let (beats, touched) = (inner.parts.board.watch(), inner.picture.touched());
+    let mut watching = Watching { inner, filter, beats, touched, shown: BTreeSet::new() };
+    let mut robots = watching.first();
     let mut snapshot_complete = false;
     loop {
         let rest = robots.split_off(robots.len().min(ROBOTS_PER_MESSAGE));
         let last = rest.is_empty();
-        let message = v1::WatchRobotsResponse { robots, snapshot_complete: !snapshot_complete && last };
         snapshot_complete |= last;
+        let message = v1::WatchRobotsResponse { robots, snapshot_complete };
         if sender.send(Ok(message)).await.is_err() {
             return;
         }
@@ -257,12 +297,7 @@ async fn watch(
             if sender.is_closed() {
                 return;
             }
-            let changed = dirty.take();
-            robots = changed
-                .into_iter()
-                .filter(|(id, _)| admits(inner, &filter, id))
-                .filter_map(|(id, live)| encode(inner, &id, live.as_deref()))
-                .collect();
+            robots = watching.changed();
         }
     }
 }

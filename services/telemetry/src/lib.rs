@@ -12,6 +12,7 @@ mod picture;
 mod presence;
 mod registry;
 mod session;
+mod status;
 mod welcome;
 
 pub use bugs::Bugs;

@@ -3,6 +3,7 @@
 use crate::session::{self, Down};
 use crate::{TelemetryService, welcome};
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
+use midshift_core::time::Utc;
 use midshift_proto::link::v1::{self, link_service_server::LinkService};
 use midshift_proto::session::{FromRobot, Hello, ToRobot};
 use std::time::Duration;
@@ -50,14 +51,18 @@ impl TelemetryService {
         self.inner.picture.ready().await;
         let begun = welcome::begin(&self.inner, &hello).await?;
         tracing::info!(robot_id = %hello.robot_id, session_epoch = begun.welcome.session_epoch, observed = begun.welcome.observed, "session begun");
-        let message = ToRobot::Welcome(begun.welcome.clone());
-        if down.send(Ok((&message).into())).await.is_err() {
-            self.inner.registry.leave(&hello.robot_id, begun.welcome.session_epoch);
-            return Ok(());
-        }
         let (robot_id, epoch) = (hello.robot_id.clone(), begun.welcome.session_epoch);
         // Also if this future is dropped in the middle: the robot is no longer attached here.
-        let _leave = Leave { service: self, robot_id: &robot_id, epoch };
+        let observed = begun.in_charge.is_none().then(|| self.inner.parts.clock.now().wall);
+        let _leave = Leave { service: self, robot_id: &robot_id, epoch, observed };
+        if let Some(since) = observed {
+            self.inner.registry.observe(&robot_id, since);
+            self.inner.picture.touch(&robot_id);
+        }
+        let message = ToRobot::Welcome(begun.welcome.clone());
+        if down.send(Ok((&message).into())).await.is_err() {
+            return Ok(());
+        }
         session::run(self.inner.clone(), &hello, begun, up, down).await;
         tracing::info!(%robot_id, session_epoch = epoch, "session ended");
         Ok(())
@@ -68,11 +73,20 @@ struct Leave<'a> {
     service: &'a TelemetryService,
     robot_id: &'a midshift_core::ids::RobotId,
     epoch: u64,
+    /// Since when; none: in charge.
+    observed: Option<Utc>,
 }
 
 impl Drop for Leave<'_> {
     fn drop(&mut self) {
-        self.service.inner.registry.leave(self.robot_id, self.epoch);
+        let inner = &self.service.inner;
+        match self.observed {
+            Some(since) => {
+                inner.registry.lose_sight(self.robot_id, since);
+                inner.picture.touch(self.robot_id);
+            }
+            None => inner.registry.leave(self.robot_id, self.epoch),
+        }
     }
 }
 

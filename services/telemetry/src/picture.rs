@@ -6,7 +6,7 @@ use crate::Inner;
 use midshift_core::ids::RobotId;
 use midshift_core::rows::{BadRow, Table};
 use midshift_core::work::{DesiredPolicy, DesiredWork, LaneMark, PresenceRow, Session};
-use midshift_store::{Change, Error, Fold, Projection};
+use midshift_store::{Change, Dirty, Error, Fold, LiveBoard, Projection};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 use std::time::Duration;
@@ -44,6 +44,8 @@ pub struct Picture {
     rows: RwLock<Rows>,
     watchers: Mutex<BTreeMap<RobotId, watch::Sender<Sections>>>,
     ready: watch::Sender<bool>,
+    /// Robots that changed otherwise than by a heartbeat.
+    touched: Arc<LiveBoard<()>>,
 }
 
 impl Picture {
@@ -71,6 +73,14 @@ impl Picture {
     pub async fn ready(&self) {
         // The sender lives as long as this picture.
         let _ = self.ready.subscribe().wait_for(|ready| *ready).await;
+    }
+    /// Says that something other than its newest heartbeat changed about a robot.
+    pub fn touch(&self, robot_id: &RobotId) {
+        self.touched.put(robot_id, Arc::new(()));
+    }
+    /// A watcher of what changes otherwise than by heartbeats.
+    pub fn touched(&self) -> Dirty<()> {
+        self.touched.watch()
     }
     fn publish(&self, robot_id: &RobotId) {
         let watchers = self.watchers.lock().unwrap_or_else(PoisonError::into_inner);
@@ -112,8 +122,10 @@ impl Fold for Keeper {
             _ => {}
         }
         drop(rows);
-        if matches!(change.key.table, Table::DesiredWork | Table::DesiredPolicy) {
-            self.0.picture.publish(&robot_id);
+        match change.key.table {
+            Table::DesiredWork | Table::DesiredPolicy => self.0.picture.publish(&robot_id),
+            Table::Session | Table::Presence => self.0.picture.touch(&robot_id),
+            _ => {}
         }
         Ok(())
     }

@@ -1,9 +1,10 @@
-//! Which sessions are alive in this process, one in charge per robot. Succession ends the older one; a clone is only observed.
+//! Which sessions are alive in this process: one in charge per robot, and those that are only observed. Succession ends the older one; a
+//! clone is only observed.
 //!
 //! Invariant: a session that did not prove its succession is never in charge while the older one is heard.
 
 use midshift_core::ids::RobotId;
-use midshift_core::time::LinkTime;
+use midshift_core::time::{LinkTime, Utc};
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -42,10 +43,12 @@ impl InCharge {
     }
 }
 
-/// Sessions in charge, by robot.
+/// Sessions by robot.
 #[derive(Debug, Default)]
 pub struct Registry {
     sessions: Mutex<BTreeMap<RobotId, InCharge>>,
+    /// Since when each of the observed ones is attached.
+    observed: Mutex<BTreeMap<RobotId, Vec<Utc>>>,
 }
 
 impl Registry {
@@ -67,6 +70,28 @@ impl Registry {
         }
         metrics::gauge!("midshift_telemetry_sessions").set(sessions.len() as f64);
         true
+    }
+    fn observed(&self) -> std::sync::MutexGuard<'_, BTreeMap<RobotId, Vec<Utc>>> {
+        self.observed.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+    /// Notes a session that is only observed.
+    pub fn observe(&self, robot_id: &RobotId, since: Utc) {
+        self.observed().entry(robot_id.clone()).or_default().push(since);
+    }
+    /// Lets a session go that was observed since then.
+    pub fn lose_sight(&self, robot_id: &RobotId, since: Utc) {
+        let mut observed = self.observed();
+        let Some(sessions) = observed.get_mut(robot_id) else { return };
+        if let Some(at) = sessions.iter().position(|s| *s == since) {
+            sessions.swap_remove(at);
+        }
+        if sessions.is_empty() {
+            observed.remove(robot_id);
+        }
+    }
+    /// Since when another machine of this name is attached and observed.
+    pub fn observed_since(&self, robot_id: &RobotId) -> Option<Utc> {
+        self.observed().get(robot_id)?.iter().min().copied()
     }
     /// Lets a session go, if it is still the one in charge.
     pub fn leave(&self, robot_id: &RobotId, session_epoch: u64) {

@@ -8,6 +8,7 @@ use crate::events::{Batch, Events, Outcome, commit};
 use crate::offset::Offset;
 use crate::picture::Sections;
 use crate::registry::InCharge;
+use crate::status::{self, Arrived, StatusLane};
 use crate::welcome::Begun;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
@@ -19,8 +20,6 @@ use midshift_proto::link::v1;
 use midshift_proto::session::{
     ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, ToRobot, Uplink,
 };
-use midshift_store::Frame;
-use prost::Message;
 use std::future::Future;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -32,8 +31,6 @@ use tonic::{Status, Streaming};
 
 /// A robot that does not read what is sent is let go after this.
 const UNREAD_MAX: Duration = Duration::from_secs(10);
-/// STATUS is acknowledged at most this often, or at half of its credit.
-const STATUS_ACK_EVERY: Duration = Duration::from_secs(2);
 /// A session lives at most this long ...
 const SESSION_LIFE: Duration = Duration::from_secs(55 * 60);
 /// ... and up to this much longer, drawn at random, so that not all move at once.
@@ -64,16 +61,6 @@ struct Session {
     out_since: Option<Instant>,
 }
 
-/// The STATUS lane of this session.
-struct StatusLane {
-    taken: u64,
-    durable: u64,
-    acked: u64,
-    unacked_bytes: usize,
-    waiting: Vec<Frame>,
-    ack_due: Instant,
-}
-
 /// Why the loop ends.
 enum End {
     Gone,
@@ -97,14 +84,7 @@ pub async fn run(inner: Arc<Inner>, hello: &Hello, begun: Begun, mut up: Streami
         in_charge: begun.in_charge,
         events: Events::new(begun.mark.0, begun.mark.1),
         committing: None,
-        status: StatusLane {
-            taken: begun.status,
-            durable: begun.status,
-            acked: begun.status,
-            unacked_bytes: 0,
-            waiting: Vec::new(),
-            ack_due: Instant::now() + STATUS_ACK_EVERY,
-        },
+        status: StatusLane::new(robot_id.clone(), Arc::from(hello.ring.as_str()), begun.status),
         keeping: None,
         offset: Offset::default(),
         progress: (0, now.site),
@@ -139,7 +119,7 @@ impl Session {
             self.start_writes();
             let waits = self.out != Downlink::default();
             let unread_at = self.out_since.map(|since| since + UNREAD_MAX);
-            let ack_at = (self.status.durable > self.status.acked).then_some(self.status.ack_due);
+            let ack_at = self.status.ack_at();
             tokio::select! {
                 biased;
                 () = shutdown.cancelled() => return close(CloseCode::Shutdown, Code::ShuttingDown, LinkDuration(500)),
@@ -223,7 +203,11 @@ impl Session {
         }
         for batch in batches {
             match batch.lane {
-                Lane::Status => self.status(batch),
+                Lane::Status => {
+                    if let Some(end) = self.status(&batch) {
+                        return Some(end);
+                    }
+                }
                 Lane::Critical | Lane::Event => self.events(batch),
             }
         }
@@ -286,37 +270,17 @@ impl Session {
         }
     }
 
-    fn status(&mut self, batch: LaneBatch) {
-        if self.in_charge.is_none() {
-            return;
-        }
-        let mut first = None;
-        for item in &batch.items {
-            let (from, to) = match item {
-                InboxItem::Sample(s) => (s.seq, s.seq),
-                InboxItem::Poison { seq, .. } => (*seq, *seq),
-                InboxItem::Gap(g) => (g.from_seq, g.to_seq),
-            };
-            if to <= self.status.taken {
-                continue;
+    fn status(&mut self, batch: &LaneBatch) -> Option<End> {
+        self.in_charge.as_ref()?;
+        match self.status.arrive(batch, self.inner.parts.clock.now().wall) {
+            Arrived::Taken => {}
+            Arrived::Expect(ack) => self.say(|out| out.acks.push(ack)),
+            Arrived::OverCredit => {
+                tracing::warn!(robot_id = %self.robot_id, "session ended by status beyond its credit");
+                return Some(close(CloseCode::TooSlow, Code::Overloaded, LinkDuration(1_000)));
             }
-            if from > self.status.taken + 1 {
-                let ack = LaneAck { lane: Lane::Status, seq: self.status.durable, expect: Some(self.status.taken + 1) };
-                return self.say(|out| out.acks.push(ack));
-            }
-            first.get_or_insert(from.max(self.status.taken + 1));
-            self.status.taken = to;
         }
-        let Some(first_seq) = first else { return };
-        let bytes = v1::LaneBatch::from(&batch).encode_to_vec();
-        self.status.unacked_bytes += bytes.len();
-        self.status.waiting.push(Frame {
-            robot_id: self.robot_id.clone(),
-            ring: self.ring.clone(),
-            first_seq,
-            last_seq: self.status.taken,
-            bytes: Arc::from(bytes),
-        });
+        None
     }
 
     /// Begins the writes that wait, at most one of each kind at a time.
@@ -326,19 +290,10 @@ impl Session {
         {
             self.committing = Some(self.commit(batch));
         }
-        if self.keeping.is_none() && !self.status.waiting.is_empty() {
-            let frames = std::mem::take(&mut self.status.waiting);
-            let last = frames.last().map_or(0, |f| f.last_seq);
-            let log = self.inner.parts.frames.clone();
-            self.keeping = Some(Box::pin(async move {
-                match log.append(frames).await {
-                    Ok(()) => Some(last),
-                    Err(error) => {
-                        tracing::warn!(%error, "status was not stored");
-                        None
-                    }
-                }
-            }));
+        if self.keeping.is_none()
+            && let Some(write) = self.status.next_write()
+        {
+            self.keeping = Some(Box::pin(status::keep(self.inner.parts.frames.clone(), write)));
         }
     }
 
@@ -379,27 +334,20 @@ impl Session {
     fn status_kept(&mut self, kept: Option<u64>) {
         match kept {
             Some(seq) => {
-                self.status.durable = seq;
                 self.inner.picture.status_durable(&self.robot_id, &self.ring, seq);
-                if self.status.unacked_bytes * 2 >= limits::STATUS_IN_FLIGHT_BYTES {
+                if self.status.kept(seq) {
                     self.ack_status();
                 }
             }
             None => {
-                self.status.taken = self.status.durable;
-                self.status.waiting.clear();
-                let ack =
-                    LaneAck { lane: Lane::Status, seq: self.status.durable, expect: Some(self.status.durable + 1) };
+                let ack = self.status.lost();
                 self.say(|out| out.acks.push(ack));
             }
         }
     }
 
     fn ack_status(&mut self) {
-        self.status.acked = self.status.durable;
-        self.status.unacked_bytes = 0;
-        self.status.ack_due = Instant::now() + STATUS_ACK_EVERY;
-        let ack = LaneAck { lane: Lane::Status, seq: self.status.durable, expect: None };
+        let ack = self.status.ack();
         self.say(|out| out.acks.push(ack));
     }
 }

@@ -74,7 +74,10 @@ pub async fn begin(inner: &Inner, hello: &Hello) -> Result<Begun, Refusal> {
             let welcome = welcome(inner, session_epoch, draw_secret(), &mark.0, status, true);
             return Ok(Begun { in_charge: None, welcome, mark, status });
         }
-        let session = session_row(hello, session_epoch);
+        let live = inner.parts.board.get(&hello.robot_id);
+        let measured = live.and_then(|live| live.clock_offset_ms).map(|(offset, _)| offset);
+        let clock_offset_ms = measured.or(row.as_ref().and_then(|(row, _)| row.clock_offset_ms));
+        let session = Session { clock_offset_ms, ..session_row(hello, session_epoch) };
         let mut item = Item::new(Writer::Telemetry, hello.robot_id.as_str());
         item.put(&session, row.map_or(Expect::Absent, |(_, revision)| Expect::At(revision)), "session.begun");
         match store.commit(vec![item]).await.pop() {

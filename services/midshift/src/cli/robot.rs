@@ -165,7 +165,8 @@ async fn get(one: &One, out: &Out) -> Result<(), Exit> {
     let control =
         one.call.fleet().await?.get_robot_control(unary(request)).await?.into_inner().control.unwrap_or_default();
     out.one(&answer, &robot.robot_id, || {
-        format!("{}\n{}", super::out::columns(&HEADER, &[row(&robot)]), control_line(&control))
+        let clone = if robot.observed { "\nanother machine is attached under this name; it gets no work" } else { "" };
+        format!("{}\n{}{clone}", super::out::columns(&HEADER, &[row(&robot)]), control_line(&control))
     })?;
     Ok(())
 }

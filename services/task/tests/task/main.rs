@@ -6,5 +6,6 @@ mod errors;
 mod forms;
 mod intake;
 mod lists;
+mod prune;
 mod watches;
 mod world;

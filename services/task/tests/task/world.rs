@@ -19,11 +19,11 @@ use tonic::Request;
 /// 2027-01-15, 08:00 UTC.
 pub const NOON: Utc = Utc(1_800_000_000_000);
 
-struct Noon;
+struct At(Utc);
 
-impl Clock for Noon {
+impl Clock for At {
     fn now(&self) -> Now {
-        Now { site: SiteTime(1_000), utc: NOON, wall: NOON, ..Now::default() }
+        Now { site: SiteTime(1_000), utc: self.0, wall: self.0, ..Now::default() }
     }
     fn rate_permille(&self) -> u32 {
         1000
@@ -45,15 +45,21 @@ impl World {
     pub async fn keeping(entries: usize) -> Self {
         let site = Arc::new(text::parse(DEMO).expect("the demo parses"));
         let site_id = SiteId::parse("demo").expect("a valid id");
-        let store = MemoryStore::new(site_id, StoreId(Arc::from("store-1")), Arc::new(Noon));
+        let store = MemoryStore::new(site_id, StoreId(Arc::from("store-1")), Arc::new(At(NOON)));
         Self::over(Arc::new(store.with_log_entries_max(entries)), site).await
     }
     /// The service started anew over a store, with a site.
     pub async fn over(store: Arc<MemoryStore>, site: Arc<Site>) -> Self {
         let shutdown = CancellationToken::new();
-        let parts = Parts { store: store.clone(), site: site.clone(), clock: Arc::new(Noon) };
+        let parts = Parts { store: store.clone(), site: site.clone(), clock: Arc::new(At(NOON)) };
         let service = TaskService::open(parts, shutdown.clone()).await.expect("a store opens");
         Self { store, service, site, shutdown }
+    }
+    /// The service as it is so many milliseconds after noon.
+    pub async fn later(&self, ms: i64) -> TaskService {
+        let clock = Arc::new(At(Utc(NOON.0 + ms)));
+        let parts = Parts { store: self.store.clone(), site: self.site.clone(), clock };
+        TaskService::open(parts, self.shutdown.clone()).await.expect("a store opens")
     }
     /// A client that calls the service in this process, through its codec.
     pub fn client(&self) -> TaskServiceClient<TaskServiceServer<TaskService>> {
@@ -68,7 +74,7 @@ impl World {
     }
     /// Fleet obeys everything that is new, once.
     pub async fn fleet_turns(&self) {
-        let now = Noon.now();
+        let now = At(NOON).now();
         let mut view = View::new(self.site.clone(), now, now);
         let snapshot = self.store.snapshot(TABLES).await.expect("a snapshot");
         view.load(&snapshot.rows, snapshot.seq).expect("rows that can be read");

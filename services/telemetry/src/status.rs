@@ -1,0 +1,225 @@
+//! STATUS of one session: numbers are checked on arrival, samples are kept as they came in the frame log, and acknowledged in bulk after that.
+//!
+//! Laws: those of [`crate::events`]. A gap that the robot announces is written down before it is acknowledged; while nothing can be
+//! written, nothing is acknowledged, and what the robot's ring has to thin meanwhile is such a gap later. Invariant: what waits for the
+//! disk is bounded by the credit the robot was given; a robot that sends more is let go.
+
+use midshift_core::ids::RobotId;
+use midshift_core::limits;
+use midshift_core::reason::Reason;
+use midshift_core::robot::Lane;
+use midshift_core::time::Utc;
+use midshift_core::work::InboxItem;
+use midshift_proto::link::v1;
+use midshift_proto::session::{LaneAck, LaneBatch};
+use midshift_store::{Frame, FrameLog, Gap};
+use prost::Message;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::time::Instant;
+
+/// STATUS is acknowledged at most this often, or at half of its credit.
+const ACK_EVERY: Duration = Duration::from_secs(2);
+/// After a failed write the robot is asked again not sooner than this.
+const RETRY: Duration = Duration::from_millis(200);
+/// STATUS of one session that may wait for the disk, bytes: the credit, and as much again for what the two ends count differently.
+const WAITING_BYTES_MAX: usize = 2 * limits::STATUS_IN_FLIGHT_BYTES;
+
+/// What came of one batch on arrival.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Arrived {
+    /// What was new waits to be kept.
+    Taken,
+    /// Tell the robot to send again from here.
+    Expect(LaneAck),
+    /// More than its credit is under way.
+    OverCredit,
+}
+
+/// What is to be kept together. Written twice after a failure, it says the same twice.
+#[derive(Debug, Default)]
+pub struct Write {
+    frames: Vec<Frame>,
+    gaps: Vec<Gap>,
+}
+
+/// The STATUS lane of one ring.
+pub struct StatusLane {
+    robot_id: RobotId,
+    ring: Arc<str>,
+    taken: u64,
+    durable: u64,
+    acked: u64,
+    unacked_bytes: usize,
+    waiting: Write,
+    /// Of what waits and of what is being written.
+    unkept_bytes: usize,
+    ack_due: Instant,
+}
+
+fn numbers(item: &InboxItem) -> (u64, u64) {
+    match item {
+        InboxItem::Sample(s) => (s.seq, s.seq),
+        InboxItem::Poison { seq, .. } => (*seq, *seq),
+        InboxItem::Gap(g) => (g.from_seq, g.to_seq),
+    }
+}
+
+impl StatusLane {
+    /// From what is durable.
+    pub fn new(robot_id: RobotId, ring: Arc<str>, durable: u64) -> Self {
+        Self {
+            robot_id,
+            ring,
+            taken: durable,
+            durable,
+            acked: durable,
+            unacked_bytes: 0,
+            waiting: Write::default(),
+            unkept_bytes: 0,
+            ack_due: Instant::now() + ACK_EVERY,
+        }
+    }
+    /// Takes a batch that came at `now`, UTC of the wall.
+    pub fn arrive(&mut self, batch: &LaneBatch, now: Utc) -> Arrived {
+        let (mut first, mut taken, mut gaps) = (None, self.taken, Vec::new());
+        for item in &batch.items {
+            let (from, to) = numbers(item);
+            if to <= taken {
+                continue;
+            }
+            if from > taken + 1 {
+                let ack = LaneAck { lane: Lane::Status, seq: self.durable, expect: Some(self.taken + 1) };
+                return Arrived::Expect(ack);
+            }
+            let from = from.max(taken + 1);
+            first.get_or_insert(from);
+            taken = to;
+            if let InboxItem::Gap(gap) = item {
+                gaps.push(self.gap(from, to, &gap.reason, now));
+            }
+        }
+        let Some(first_seq) = first else { return Arrived::Taken };
+        let bytes = v1::LaneBatch::from(batch).encode_to_vec();
+        if self.unkept_bytes + bytes.len() > WAITING_BYTES_MAX {
+            return Arrived::OverCredit;
+        }
+        self.taken = taken;
+        self.unacked_bytes += bytes.len();
+        self.unkept_bytes += bytes.len();
+        let (robot_id, ring) = (self.robot_id.clone(), self.ring.clone());
+        self.waiting.frames.push(Frame { robot_id, ring, first_seq, last_seq: taken, bytes: Arc::from(bytes) });
+        self.waiting.gaps.extend(gaps);
+        Arrived::Taken
+    }
+    fn gap(&self, from_seq: u64, to_seq: u64, reason: &Reason, now: Utc) -> Gap {
+        Gap {
+            robot_id: self.robot_id.clone(),
+            ring: self.ring.clone(),
+            lane: Arc::from("STATUS"),
+            from_seq,
+            to_seq,
+            reason: Arc::from(reason.code.as_str()),
+            at_unix_ms: now.0,
+        }
+    }
+    /// What is to be kept next; none if nothing waits.
+    pub fn next_write(&mut self) -> Option<Write> {
+        (!self.waiting.frames.is_empty()).then(|| std::mem::take(&mut self.waiting))
+    }
+    /// What was written is durable up to here. True: it is time to acknowledge.
+    pub fn kept(&mut self, seq: u64) -> bool {
+        self.durable = seq;
+        self.unkept_bytes = self.waiting.frames.iter().map(|f| f.bytes.len()).sum();
+        self.unacked_bytes * 2 >= limits::STATUS_IN_FLIGHT_BYTES
+    }
+    /// It is not: everything since the durable number must come again.
+    pub fn lost(&mut self) -> LaneAck {
+        self.taken = self.durable;
+        self.waiting = Write::default();
+        self.unkept_bytes = 0;
+        LaneAck { lane: Lane::Status, seq: self.durable, expect: Some(self.durable + 1) }
+    }
+    /// When to acknowledge at the latest; none: there is nothing to.
+    pub fn ack_at(&self) -> Option<Instant> {
+        (self.durable > self.acked).then_some(self.ack_due)
+    }
+    /// What is durable, as it is acknowledged now.
+    pub fn ack(&mut self) -> LaneAck {
+        self.acked = self.durable;
+        self.unacked_bytes = 0;
+        self.ack_due = Instant::now() + ACK_EVERY;
+        LaneAck { lane: Lane::Status, seq: self.durable, expect: None }
+    }
+}
+
+/// Keeps gaps and frames, gaps first: frames move the mark that says what need not come again. The number up to which all is durable
+/// then, or none if it is not.
+pub async fn keep(log: Arc<dyn FrameLog>, write: Write) -> Option<u64> {
+    let last = write.frames.last().map_or(0, |f| f.last_seq);
+    let gaps = write.gaps.len() as u64;
+    let kept = async {
+        if gaps > 0 {
+            log.report_gaps(write.gaps).await?;
+        }
+        log.append(write.frames).await
+    };
+    match kept.await {
+        Ok(()) => {
+            metrics::counter!("midshift_telemetry_status_gaps_total").increment(gaps);
+            Some(last)
+        }
+        Err(error) => {
+            tracing::warn!(%error, "status was not stored");
+            tokio::time::sleep(RETRY).await;
+            None
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use midshift_core::reason::Code;
+    use midshift_core::robot::Vitals;
+    use midshift_core::work::{Gap as Announced, Sample, SampleBody};
+
+    const NOW: Utc = Utc(7);
+
+    type Ranges = Vec<(u64, u64)>;
+
+    fn lane() -> StatusLane {
+        StatusLane::new(RobotId::parse("r1").expect("an id"), Arc::from("ring"), 0)
+    }
+    fn sample(seq: u64) -> InboxItem {
+        InboxItem::Sample(Sample { seq, robot_unix_ms: 0, body: SampleBody::Status(Vitals::default()) })
+    }
+    fn gap(from_seq: u64, to_seq: u64) -> InboxItem {
+        InboxItem::Gap(Announced { lane: Lane::Status, from_seq, to_seq, reason: Code::Overflow.into() })
+    }
+    fn arrive(lane: &mut StatusLane, items: Vec<InboxItem>) -> Arrived {
+        lane.arrive(&LaneBatch { lane: Lane::Status, items }, NOW)
+    }
+    fn ranges(write: &Write) -> (Ranges, Ranges) {
+        let frames = write.frames.iter().map(|f| (f.first_seq, f.last_seq));
+        (frames.collect(), write.gaps.iter().map(|g| (g.from_seq, g.to_seq)).collect())
+    }
+
+    #[tokio::test]
+    async fn nothing_of_a_batch_with_a_hole_is_taken() {
+        let mut lane = lane();
+        let asked = LaneAck { lane: Lane::Status, seq: 0, expect: Some(1) };
+        assert_eq!(arrive(&mut lane, vec![sample(1), sample(3)]), Arrived::Expect(asked));
+        assert!(lane.next_write().is_none());
+        assert_eq!(arrive(&mut lane, vec![sample(1), sample(2), sample(3)]), Arrived::Taken);
+        assert_eq!(lane.next_write().as_ref().map(ranges), Some((vec![(1, 3)], vec![])));
+    }
+
+    #[tokio::test]
+    async fn a_gap_is_kept_from_where_nothing_was_taken() {
+        let mut lane = lane();
+        assert_eq!(arrive(&mut lane, vec![sample(1), sample(2)]), Arrived::Taken);
+        assert_eq!(arrive(&mut lane, vec![gap(1, 5), sample(6)]), Arrived::Taken);
+        assert_eq!(lane.next_write().as_ref().map(ranges), Some((vec![(1, 2), (3, 6)], vec![(3, 5)])));
+    }
+}

@@ -1,0 +1,7 @@
+//! The robot's session and the picture of robots over real gRPC connections in memory.
+
+mod disk;
+mod robots;
+mod sessions;
+mod status;
+mod world;

@@ -1,0 +1,114 @@
+//! The picture of robots that people and programs see.
+
+use crate::world::{Result, Robot, World, world};
+use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
+use midshift_proto::telemetry::v1::{
+    self, GetRobotRequest, Presence, RobotFilter, WatchRobotsRequest, WatchRobotsResponse,
+};
+use tonic::Streaming;
+
+struct Watcher(Streaming<WatchRobotsResponse>);
+
+impl Watcher {
+    async fn of(world: &World, presences: &[Presence]) -> Result<Self> {
+        let presences = presences.iter().map(|p| (*p).into()).collect();
+        let filter = Some(RobotFilter { presences, ..RobotFilter::default() });
+        let mut client = TelemetryServiceClient::new(world.channel.clone());
+        let request = WatchRobotsRequest { filter, period_ms: 50 };
+        Ok(Self(client.watch_robots(request).await?.into_inner()))
+    }
+    async fn next(&mut self) -> Result<WatchRobotsResponse> {
+        self.0.message().await?.ok_or_else(|| "the watch ended".into())
+    }
+    /// The next presence that is told of the one robot.
+    async fn presence(&mut self) -> Result<Presence> {
+        loop {
+            if let Some(robot) = self.next().await?.robots.first() {
+                return Ok(robot.presence());
+            }
+        }
+    }
+    /// The next that differs from `last`.
+    async fn after(&mut self, last: Presence) -> Result<Presence> {
+        loop {
+            let presence = self.presence().await?;
+            if presence != last {
+                return Ok(presence);
+            }
+        }
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_watcher_sees_a_robot_fall_silent() -> Result<()> {
+    let world = world().await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    let mut watcher = Watcher::of(&world, &[]).await?;
+    robot.beat().await?;
+    let mut seen = vec![watcher.after(Presence::Offline).await?];
+    for _ in 0..2 {
+        let last = seen.last().copied().unwrap_or_default();
+        seen.push(watcher.after(last).await?);
+    }
+    assert_eq!(seen, [Presence::Online, Presence::Suspect, Presence::Offline]);
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_leaves_the_filter_is_told_once_more_and_then_no_more_until_it_is_back() -> Result<()> {
+    let world = world().await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.beat().await?;
+    let mut watcher = Watcher::of(&world, &[Presence::Online]).await?;
+    let mut all = Watcher::of(&world, &[]).await?;
+    assert_eq!(watcher.after(Presence::Unspecified).await?, Presence::Online);
+    assert_eq!(watcher.after(Presence::Online).await?, Presence::Suspect);
+    // Offline is told to whoever asked for everything, and not to this watcher.
+    while all.presence().await? != Presence::Suspect {}
+    while all.presence().await? != Presence::Offline {}
+    robot.beat().await?;
+    assert_eq!(watcher.presence().await?, Presence::Online);
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn the_mark_of_the_whole_stays() -> Result<()> {
+    let world = world().await?;
+    let mut watcher = Watcher::of(&world, &[]).await?;
+    assert!(watcher.next().await?.snapshot_complete);
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.beat().await?;
+    let later = watcher.next().await?;
+    assert!(later.snapshot_complete && !later.robots.is_empty());
+    Ok(())
+}
+
+async fn get(world: &World) -> Result<v1::Robot> {
+    let request = GetRobotRequest { robot_id: "r1".to_owned() };
+    let answer = TelemetryServiceClient::new(world.channel.clone()).get_robot(request).await?.into_inner();
+    answer.robot.ok_or_else(|| "no robot".into())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_clone_is_seen_beside_its_robot_and_changes_nothing_of_it() -> Result<()> {
+    let world = world().await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.beat().await?;
+    robot.hears(|down| down.echo).await?;
+    assert!(!get(&world).await?.observed);
+    let mut watcher = Watcher::of(&world, &[]).await?;
+    let mut clone = Robot::attach(&world, None).await?;
+    for _ in 0..3 {
+        clone.beat().await?;
+    }
+    while !watcher.next().await?.robots.iter().any(|r| r.observed) {}
+    let seen = get(&world).await?;
+    assert!(seen.observed && seen.observed_since.is_some());
+    assert_eq!(seen.session_epoch, robot.welcome.session_epoch);
+    assert_eq!(seen.reported.map(|r| (r.hb, r.session_epoch)), Some((1, robot.welcome.session_epoch)));
+    drop(clone);
+    while watcher.next().await?.robots.iter().any(|r| r.observed) {}
+    let seen = get(&world).await?;
+    assert!(!seen.observed && seen.observed_since.is_none());
+    Ok(())
+}

@@ -1,0 +1,118 @@
+//! A robot's session: welcome, acknowledgements, desired state, succession, clones.
+
+use crate::world::{Otherwise, Result, Robot, World, world, world_with};
+use midshift_core::ids::RobotId;
+use midshift_core::robot::Lane;
+use midshift_core::rows::{Expect, Item, Log, Seq, Writer};
+use midshift_core::work::{DesiredWork, Session};
+use midshift_proto::session::{ClockSample, CloseCode, Downlink};
+use midshift_store::load;
+use midshift_telemetry::{Bugs, SeededBug};
+
+async fn inbox(world: &World) -> Result<usize> {
+    Ok(world.store.feed(Seq(0), &[Log::RobotInbox], 1_000).await?.entries.len())
+}
+
+#[tokio::test(start_paused = true)]
+async fn events_are_durable_when_they_are_acknowledged_and_stored_once() -> Result<()> {
+    let world = world().await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.events(1..=3).await?;
+    let acked = |down: &Downlink| {
+        down.acks.iter().find(|a| a.lane == Lane::Event && a.expect.is_none()).map(|a| a.seq).filter(|seq| *seq > 0)
+    };
+    assert_eq!(robot.hears(acked).await?, 3);
+    assert_eq!(inbox(&world).await?, 3);
+    robot.events(2..=4).await?;
+    assert_eq!(robot.hears(|down| acked(down).filter(|seq| *seq > 3)).await?, 4);
+    assert_eq!(inbox(&world).await?, 4);
+    robot.events(6..=6).await?;
+    assert_eq!(robot.hears(|down| down.acks.iter().find_map(|a| a.expect)).await?, 5);
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_heartbeat_is_echoed_and_new_desired_work_is_pushed() -> Result<()> {
+    let world = world().await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.beat().await?;
+    assert_eq!(robot.hears(|down| down.echo.map(|e| e.hb)).await?, 1);
+    let work = DesiredWork {
+        robot_id: RobotId::parse("r1")?,
+        generation: 7,
+        assignment: None,
+        grants: Vec::new(),
+        held: true,
+        resume: None,
+        closed: Vec::new(),
+        maintenance: None,
+    };
+    let mut item = Item::new(Writer::Fleet, "fleet");
+    item.put(&work, Expect::Absent, "work.desired");
+    assert!(world.store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
+    assert_eq!(robot.hears(|down| down.work.clone()).await?, work);
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_proven_succession_ends_the_older_session() -> Result<()> {
+    let world = world().await?;
+    let mut old = Robot::attach(&world, None).await?;
+    old.beat().await?;
+    let new = Robot::attach(&world, Some(old.proof())).await?;
+    assert!(new.welcome.session_epoch > old.welcome.session_epoch && !new.welcome.observed);
+    let close = old.closes().await?;
+    assert_eq!((close.code, close.retry_after_ms), (CloseCode::Fenced, 60_000));
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn without_the_fence_a_clone_takes_over_a_robot_that_is_heard() -> Result<()> {
+    let world = world_with(Otherwise { bugs: Bugs::of(&[SeededBug::NoCloneFence]), frames: None }).await?;
+    let mut first = Robot::attach(&world, None).await?;
+    first.beat().await?;
+    let clone = Robot::attach(&world, None).await?;
+    assert!(!clone.welcome.observed, "two machines of one name, and the second has its work");
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_session_without_proof_is_only_observed_while_the_older_one_is_heard() -> Result<()> {
+    let world = world().await?;
+    let mut first = Robot::attach(&world, None).await?;
+    first.beat().await?;
+    let mut clone = Robot::attach(&world, None).await?;
+    assert!(clone.welcome.observed);
+    clone.events(1..=1).await?;
+    first.beat().await?;
+    assert_eq!(first.hears(|down| down.echo.map(|e| e.hb)).await?, 1);
+    assert_eq!(inbox(&world).await?, 0, "an observed session writes nothing");
+    let facts = world.store.feed(Seq(0), &[Log::Telemetry], 100).await?.entries;
+    assert!(facts.iter().any(|f| &*f.kind == "session.clone_seen"));
+    // The older one falls silent: the clone is asked to come back, and then it is in charge.
+    let close = clone.closes().await?;
+    assert_eq!(close.code, CloseCode::MoveOver);
+    assert!(!Robot::attach(&world, None).await?.welcome.observed);
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_new_session_remembers_the_clock_that_the_one_before_measured() -> Result<()> {
+    let world = world().await?;
+    let offset = async || -> Result<Option<i64>> {
+        let row = load::<Session>(world.store.as_ref(), "r1").await?;
+        Ok(row.ok_or("no session")?.0.clock_offset_ms)
+    };
+    let mut first = Robot::attach(&world, None).await?;
+    assert_eq!(offset().await?, None);
+    // Twelve milliseconds ahead, nothing lost on the wire.
+    first.beat_with(Some(ClockSample { t1_us: 12_000, t2_us: 0, t3_us: 0, t4_us: 12_000 })).await?;
+    first.hears(|down| down.echo).await?;
+    let mut second = Robot::attach(&world, Some(first.proof())).await?;
+    assert_eq!(offset().await?, Some(12));
+    second.beat().await?;
+    second.hears(|down| down.echo).await?;
+    let _third = Robot::attach(&world, Some(second.proof())).await?;
+    assert_eq!(offset().await?, Some(12), "a session that measured nothing forgets nothing");
+    Ok(())
+}

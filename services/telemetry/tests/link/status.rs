@@ -1,0 +1,91 @@
+//! Lane STATUS: kept as it came, acknowledged in bulk, and never more of it under way than was allowed.
+
+use crate::disk::Disk;
+use crate::world::{Otherwise, Result, Robot, clock, world_with};
+use midshift_core::limits;
+use midshift_core::reason::Code;
+use midshift_core::robot::{Lane, Vitals};
+use midshift_core::work::{Gap, InboxItem, Sample, SampleBody};
+use midshift_proto::session::{CloseCode, Downlink};
+use midshift_store::{FrameLog, MemoryFrames};
+use std::sync::Arc;
+
+fn disk() -> Arc<Disk> {
+    Disk::over(MemoryFrames::new(clock(), 1 << 20))
+}
+
+fn otherwise(disk: &Arc<Disk>) -> Otherwise {
+    Otherwise { frames: Some(disk.clone()), ..Otherwise::default() }
+}
+
+fn samples(seqs: std::ops::RangeInclusive<u64>) -> Vec<InboxItem> {
+    let body = SampleBody::Status(Vitals { speed_mm_s: 1_500, battery_permille: 800, ..Vitals::default() });
+    seqs.map(|seq| InboxItem::Sample(Sample { seq, robot_unix_ms: 1_800_000_000_000, body: body.clone() })).collect()
+}
+
+fn acked(down: &Downlink) -> Option<u64> {
+    down.acks.iter().find(|a| a.lane == Lane::Status && a.expect.is_none()).map(|a| a.seq)
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_ignores_its_credit_while_the_disk_is_slow_is_let_go() -> Result<()> {
+    let disk = disk();
+    let world = world_with(otherwise(&disk)).await?;
+    disk.stick(true);
+    let mut robot = Robot::attach(&world, None).await?;
+    let credit = robot.welcome.status_credit_bytes as usize;
+    assert_eq!(credit, limits::STATUS_IN_FLIGHT_BYTES);
+    let batch = limits::SAMPLES_PER_MESSAGE as u64;
+    // A sample takes at least ten bytes: far beyond any slack. What is sent after the end is nobody's.
+    for first in (0..(credit as u64)).step_by(limits::SAMPLES_PER_MESSAGE) {
+        if robot.status(samples(first + 1..=first + batch)).await.is_err() {
+            break;
+        }
+    }
+    assert_eq!(robot.closes().await?.code, CloseCode::TooSlow);
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_within_its_credit_is_acknowledged_when_the_disk_comes_back() -> Result<()> {
+    let disk = disk();
+    let world = world_with(otherwise(&disk)).await?;
+    disk.stick(true);
+    let mut robot = Robot::attach(&world, None).await?;
+    for first in [1, 101, 201] {
+        robot.status(samples(first..=first + 99)).await?;
+    }
+    robot.beat().await?;
+    assert_eq!(robot.hears(|down| down.echo.map(|e| e.hb)).await?, 1);
+    disk.stick(false);
+    while robot.hears(acked).await? < 300 {}
+    Ok(())
+}
+
+fn expected(down: &Downlink) -> Option<u64> {
+    down.acks.iter().find(|a| a.lane == Lane::Status).and_then(|a| a.expect)
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_was_lost_while_the_disk_refused_is_written_down_as_a_gap_before_it_is_acknowledged() -> Result<()> {
+    let disk = disk();
+    let world = world_with(otherwise(&disk)).await?;
+    disk.fill(true);
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.status(samples(1..=3)).await?;
+    assert_eq!(robot.hears(expected).await?, 1);
+    // The ring had to make room meanwhile, and the disk still refuses: the gap is not acknowledged either.
+    let reason = Code::Overflow.into();
+    let gap = InboxItem::Gap(Gap { lane: Lane::Status, from_seq: 1, to_seq: 2, reason });
+    let rest: Vec<InboxItem> = std::iter::once(gap).chain(samples(3..=4)).collect();
+    robot.status(rest.clone()).await?;
+    assert_eq!(robot.hears(expected).await?, 1);
+    assert!(disk.refused() >= 2 && disk.gaps(None, 10).await?.is_empty());
+    disk.fill(false);
+    robot.status(rest).await?;
+    assert_eq!(robot.hears(acked).await?, 4);
+    let gaps = disk.gaps(None, 10).await?;
+    let said: Vec<_> = gaps.iter().map(|g| (&*g.lane, g.from_seq, g.to_seq, &*g.reason)).collect();
+    assert_eq!(said, [("STATUS", 1, 2, "OVERFLOW")]);
+    Ok(())
+}

@@ -1,0 +1,150 @@
+//! Telemetry over a real gRPC connection in memory, and a robot that says what a test wants.
+
+use midshift_core::ids::{RobotId, SiteId};
+use midshift_core::robot::{Inventory, Lane, Mode, ReportedState};
+use midshift_core::time::{Clock, ScaledClock, Utc};
+use midshift_core::work::{InboxItem, RobotEvent, Sample, SampleBody};
+use midshift_proto::link::v1::link_service_client::LinkServiceClient;
+use midshift_proto::link::v1::{SessionRequest, SessionResponse};
+use midshift_proto::session::{
+    ClockSample, Close, Downlink, FromRobot, Heartbeat, Hello, LaneBatch, Previous, ToRobot, Uplink, Welcome,
+};
+use midshift_store::{FrameLog, LiveBoard, MemoryFrames, MemoryStore, Store, StoreId};
+use midshift_telemetry::{Bugs, Parts, TelemetryService};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::sync::CancellationToken;
+use tonic::Streaming;
+use tonic::transport::{Channel, Endpoint, Server};
+
+pub type Result<T> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>>;
+
+pub struct World {
+    pub store: Arc<dyn Store>,
+    pub channel: Channel,
+}
+
+/// What a world may have otherwise.
+#[derive(Default)]
+pub struct Otherwise {
+    pub bugs: Bugs,
+    /// Instead of one in memory.
+    pub frames: Option<Arc<dyn FrameLog>>,
+}
+
+pub fn clock() -> Arc<dyn Clock> {
+    let started = tokio::time::Instant::now();
+    let micros = move || started.elapsed().as_micros() as u64;
+    Arc::new(ScaledClock::new(micros, Utc(1_800_000_000_000), 1000))
+}
+
+pub async fn world() -> Result<World> {
+    world_with(Otherwise::default()).await
+}
+
+pub async fn world_with(otherwise: Otherwise) -> Result<World> {
+    let clock = clock();
+    let store: Arc<dyn Store> =
+        Arc::new(MemoryStore::new(SiteId::parse("s")?, StoreId(Arc::from("store-1")), clock.clone()));
+    let parts = Parts {
+        store: store.clone(),
+        frames: otherwise.frames.unwrap_or_else(|| Arc::new(MemoryFrames::new(clock.clone(), 1 << 20))),
+        board: LiveBoard::new(),
+        clock,
+        bugs: otherwise.bugs,
+    };
+    let service = TelemetryService::new(parts, CancellationToken::new());
+    tokio::spawn(service.clone().run());
+    let (pipes, incoming) = mpsc::channel::<std::io::Result<tokio::io::DuplexStream>>(8);
+    let server = Server::builder().add_service(service.link()).add_service(service.grpc());
+    tokio::spawn(server.serve_with_incoming(ReceiverStream::new(incoming)));
+    let connector = tower::service_fn(move |_: tonic::transport::Uri| {
+        let pipes = pipes.clone();
+        async move {
+            let (ours, theirs) = tokio::io::duplex(1 << 16);
+            pipes.send(Ok(theirs)).await.map_err(std::io::Error::other)?;
+            Ok::<_, std::io::Error>(hyper_util::rt::TokioIo::new(ours))
+        }
+    });
+    let channel = Endpoint::from_static("http://memory").connect_with_connector(connector).await?;
+    Ok(World { store, channel })
+}
+
+pub struct Robot {
+    up: mpsc::Sender<SessionRequest>,
+    down: Streaming<SessionResponse>,
+    pub welcome: Welcome,
+    hb: u64,
+}
+
+fn hello(previous: Option<Previous>) -> Result<Hello> {
+    Ok(Hello {
+        robot_id: RobotId::parse("r1")?,
+        boot_id: "boot".into(),
+        previous,
+        inventory: Inventory::default(),
+        reported: ReportedState::default(),
+        ring: "ring".into(),
+        lanes: BTreeMap::new(),
+        store_id: String::new(),
+        sent_unix_ms: 0,
+        clock_rate_permille: 1000,
+        protocol_versions: vec![1],
+    })
+}
+
+impl Robot {
+    pub async fn attach(world: &World, previous: Option<Previous>) -> Result<Self> {
+        let (up, outbound) = mpsc::channel(16);
+        up.send((&FromRobot::Hello(Box::new(hello(previous)?))).into()).await?;
+        let mut down =
+            LinkServiceClient::new(world.channel.clone()).session(ReceiverStream::new(outbound)).await?.into_inner();
+        let first = down.message().await?.ok_or("no welcome")?;
+        let ToRobot::Welcome(welcome) = midshift_proto::parse(first)? else { return Err("not a welcome".into()) };
+        Ok(Self { up, down, welcome, hb: 0 })
+    }
+    pub fn proof(&self) -> Previous {
+        Previous { session_epoch: self.welcome.session_epoch, secret: self.welcome.session_secret.clone() }
+    }
+    pub async fn say(&self, uplink: Uplink) -> Result<()> {
+        Ok(self.up.send((&FromRobot::Uplink(uplink)).into()).await?)
+    }
+    pub async fn beat(&mut self) -> Result<()> {
+        self.beat_with(None).await
+    }
+    pub async fn beat_with(&mut self, clock: Option<ClockSample>) -> Result<()> {
+        self.hb += 1;
+        let reported =
+            ReportedState { hb: self.hb, session_epoch: self.welcome.session_epoch, ..ReportedState::default() };
+        self.say(Uplink { heartbeat: Some(Heartbeat { reported, sent_unix_us: 0, clock }), batches: Vec::new() }).await
+    }
+    pub async fn events(&self, seqs: std::ops::RangeInclusive<u64>) -> Result<()> {
+        let body = SampleBody::Event(RobotEvent::Mode(Mode::Automatic));
+        let items = seqs.map(|seq| InboxItem::Sample(Sample { seq, robot_unix_ms: 0, body: body.clone() })).collect();
+        self.say(Uplink { heartbeat: None, batches: vec![LaneBatch { lane: Lane::Event, items }] }).await
+    }
+    pub async fn status(&self, items: Vec<InboxItem>) -> Result<()> {
+        self.say(Uplink { heartbeat: None, batches: vec![LaneBatch { lane: Lane::Status, items }] }).await
+    }
+    /// The next downlink that says something of what is looked for.
+    pub async fn hears<T>(&mut self, look: impl Fn(&Downlink) -> Option<T>) -> Result<T> {
+        while let Some(message) = self.down.message().await? {
+            if let ToRobot::Downlink(down) = midshift_proto::parse(message)?
+                && let Some(found) = look(&down)
+            {
+                return Ok(found);
+            }
+        }
+        Err("the session ended".into())
+    }
+    pub async fn closes(&mut self) -> Result<Close> {
+        while let Some(message) = self.down.message().await? {
+            if let ToRobot::Close(close) = midshift_proto::parse(message)? {
+                return Ok(close);
+            }
+        }
+        Err("the session ended without a word".into())
+    }
+}
