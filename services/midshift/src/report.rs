@@ -15,6 +15,12 @@ use tokio_util::sync::CancellationToken;
 
 /// A robot with work that does not get on for longer than this makes no progress. Site clock.
 const NO_PROGRESS_MS: u64 = 60_000;
+/// A run shorter than this is not asked for amounts: its first tasks are still on their way. Milliseconds of site time.
+const AMOUNTS_FROM_MS: u64 = 300_000;
+/// What each robot of the built-in factory brings to its end in ten minutes of site time, at least.
+const SUCCEEDED_PER_ROBOT: u64 = 8;
+/// The built-in factory feeds so many robots; more of them wait for each other, and their number says nothing of the work done.
+const BUILT_IN_ROBOTS: u64 = 20;
 /// How often robots are looked at, real time.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
 
@@ -125,6 +131,39 @@ fn is_stuck(live: &Live, now: midshift_core::time::SiteTime) -> bool {
     working && now.since(live.progress_at).as_ms() > NO_PROGRESS_MS
 }
 
+/// What was run, as far as it decides which amounts a good run shows.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Kind {
+    /// Drawn work in the built-in factory: no site, map or task list of the user's own.
+    pub built_in: bool,
+    /// The backlog is twice the robots and not what the user asked for.
+    pub own_backlog: bool,
+}
+
+/// The amounts a run is held to; none: it is not asked.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Amounts {
+    /// 8 a robot in ten minutes of site time, of runs of 5 minutes and more with up to 20 robots in the built-in factory and its own
+    /// backlog.
+    pub succeeded_min: Option<u64>,
+    /// 2 % of what was submitted, or one task, of runs of 5 minutes and more.
+    pub to_operator_max: Option<u64>,
+    /// Twice the robots, of runs that keep their own backlog.
+    pub open_max: Option<u64>,
+}
+
+impl Amounts {
+    fn of(kind: Kind, robots: u64, submitted: u64, site_ms: u64) -> Self {
+        let long = site_ms >= AMOUNTS_FROM_MS;
+        let feeds = kind.built_in && kind.own_backlog && robots <= BUILT_IN_ROBOTS;
+        Self {
+            succeeded_min: (long && feeds).then_some(SUCCEEDED_PER_ROBOT * robots * site_ms / 600_000),
+            to_operator_max: long.then_some((submitted / 50).max(1)),
+            open_max: kind.own_backlog.then_some(2 * robots),
+        }
+    }
+}
+
 /// The report of a run.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
@@ -174,6 +213,8 @@ pub struct Report {
     pub wall_s: f64,
     /// Site time over real time, as reached.
     pub achieved_speedup: f64,
+    /// What the run is held to, beside the laws.
+    pub asked: Amounts,
     /// What the bodies say.
     pub bodies: HallReport,
 }
@@ -199,6 +240,8 @@ fn spread(sorted: &[f64]) -> Spread {
 
 /// What a run is reported from.
 pub struct Inputs {
+    /// What was run.
+    pub kind: Kind,
     /// Seed of the run.
     pub seed: u64,
     /// As the client counted.
@@ -256,6 +299,7 @@ impl Report {
             site_s,
             wall_s,
             achieved_speedup: site_s / wall_s.max(1e-9),
+            asked: Amounts::of(i.kind, i.bodies.robots as u64, i.submitted, i.site_ms),
             bodies: i.bodies,
         }
     }
@@ -274,6 +318,18 @@ impl Report {
         if self.steps_done_twice > 0 {
             why.push(format!("{} steps were done twice", self.steps_done_twice));
         }
+        if let Some(min) = self.asked.succeeded_min.filter(|min| (self.succeeded as u64) < *min) {
+            why.push(format!("{} tasks succeeded, {min} were to", self.succeeded));
+        }
+        if let Some(max) = self.asked.to_operator_max.filter(|max| self.to_operator as u64 > *max) {
+            why.push(format!("{} tasks wait for an operator, {max} may", self.to_operator));
+        }
+        if let Some(max) = self.asked.open_max.filter(|max| self.open as u64 > *max) {
+            why.push(format!("{} tasks are open, {max} may be", self.open));
+        }
         why
     }
 }
+
+#[cfg(test)]
+mod tests;

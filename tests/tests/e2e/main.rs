@@ -8,5 +8,6 @@ mod golden_cli;
 mod harness;
 mod held;
 mod kill;
+mod measured;
 mod proxy;
 mod room;
