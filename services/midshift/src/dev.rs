@@ -1,9 +1,10 @@
 //! `midshift dev`: a whole factory in one process, in memory, on loopback, with simulated robots and work of its own. Not for production.
 
-use crate::background::{Background, Pressure, Source, read_list};
+use crate::background::{Acknowledged, Background, Pressure, Source, read_list};
 use crate::planning::Planning;
-use crate::report::{self, Inputs, Kind, Report, SharedTasks};
+use crate::report::{self, Inputs, Kind, Report};
 use crate::server::{Naive, Parts, Server};
+use crate::tally::{self, SharedTasks, Tasks};
 use crate::{clock, serve, site_file};
 use anyhow::{Context, bail};
 use midshift_core::site::{Site, grid};
@@ -17,8 +18,8 @@ use midshift_store::{
 use std::collections::VecDeque;
 use std::net::SocketAddr;
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
@@ -118,10 +119,11 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         .await
         .with_context(|| format!("listening on {}; is another midshift running?", args.listen))?;
     let address = listener.local_addr()?;
-    let tasks = SharedTasks::default();
+    let run_id = format!("dev-{}-{}-", args.seed, clock.now().wall.0);
+    let tasks = Arc::new(Mutex::new(Tasks::of_run(&run_id)));
     let mut swarm = SwarmConfig::tcp(hall.clone(), clock.clone(), &format!("http://{address}"), args.seed);
     let live = tasks.clone();
-    swarm.person = Some(Arc::new(move |id| report::look(&live, |t| t.is_live(id))));
+    swarm.person = Some(Arc::new(move |id| tally::look(&live, |t| t.is_live(id))));
     let swarm = Swarm::new(swarm);
     let (store, frames) = stores(&args, &site, &clock).await?;
     let planning = Planning::start()?;
@@ -135,9 +137,11 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         naive: Naive::default(),
         planning: planning.handle(),
     };
-    let server = Server::new(parts, stop.clone()).await?;
+    // The server ends after its robots and its client, or the last of them would be cut off at Ctrl-C.
+    let served_until = CancellationToken::new();
+    let server = Server::new(parts, served_until.clone()).await?;
     say(&greeting(&args, &site, address));
-    let run = Run { args, site, clock, hall, tasks, store, stop };
+    let run = Run { args, site, clock, hall, run_id, tasks, store, stop, served_until };
     run.together(server, swarm, listener, address).await
 }
 
@@ -204,9 +208,11 @@ struct Run {
     site: Arc<Site>,
     clock: Arc<dyn Clock>,
     hall: Arc<Hall>,
+    run_id: String,
     tasks: SharedTasks,
     store: Arc<dyn Store>,
     stop: CancellationToken,
+    served_until: CancellationToken,
 }
 
 impl Run {
@@ -223,21 +229,23 @@ impl Run {
         }
     }
 
-    fn background(&self, submitted: &Arc<AtomicU64>) -> anyhow::Result<Background> {
+    fn background(&self, acknowledged: &Acknowledged) -> anyhow::Result<Background> {
         let source = match &self.args.tasks {
             Some(path) => Source::Listed(VecDeque::from(read_list(path, &self.site)?)),
             None => Source::drawn(&self.site, self.args.seed)?,
         };
-        let (tasks, counted) = (self.tasks.clone(), submitted.clone());
-        // What was admitted and is not in the picture yet is open too.
-        let open =
-            move || report::look(&tasks, |t| t.open() + (counted.load(Relaxed) as usize).saturating_sub(t.total()));
+        let (tasks, counted) = (self.tasks.clone(), acknowledged.clone());
+        // What was acknowledged and is not in the picture yet is open too.
+        let open = move || {
+            let acknowledged = counted.lock().unwrap_or_else(PoisonError::into_inner).len();
+            tally::look(&tasks, |t| t.open() + acknowledged.saturating_sub(t.own_count()))
+        };
         Ok(Background {
             pressure: self.pressure(),
             source,
-            seed: self.args.seed,
+            run_id: self.run_id.clone(),
             clock: self.clock.clone(),
-            submitted: submitted.clone(),
+            acknowledged: acknowledged.clone(),
             open: Arc::new(open),
         })
     }
@@ -249,14 +257,14 @@ impl Run {
         listener: TcpListener,
         address: SocketAddr,
     ) -> anyhow::Result<Report> {
-        let submitted = Arc::new(AtomicU64::new(0));
+        let acknowledged = Acknowledged::default();
         let no_progress_ms = Arc::new(AtomicU64::new(0));
-        let background = self.background(&submitted)?;
+        let background = self.background(&acknowledged)?;
         let (fleet, board) = (server.fleet(), server.board());
         let robots_stop = CancellationToken::new();
         let begun = self.clock.now();
         let serving = tokio::spawn(server.serve(serve::nodelay(listener)));
-        let following = tokio::spawn(report::follow(self.store.clone(), self.tasks.clone(), self.stop.clone()));
+        let following = tokio::spawn(tally::follow(self.store.clone(), self.tasks.clone(), self.served_until.clone()));
         let robots = tokio::spawn(swarm.run(robots_stop.clone()));
         let progress = tokio::spawn(report::watch_progress(board, self.clock.clone(), no_progress_ms.clone()));
         let channel = tonic::transport::Endpoint::from_shared(format!("http://{address}"))?.connect_lazy();
@@ -271,15 +279,16 @@ impl Run {
         robots.await??;
         let ended = self.clock.now();
         let bodies = self.hall.report(ended.site)?;
-        self.stop.cancel();
+        self.served_until.cancel();
         progress.abort();
         following.await??;
         serving.await??;
-        let tasks = report::settle(self.store.clone()).await?;
+        let acknowledged = std::mem::take(&mut *acknowledged.lock().unwrap_or_else(PoisonError::into_inner));
+        let tasks = tally::settle(self.store.clone(), &self.run_id).await?;
         let report = Report::of(Inputs {
             kind: self.args.kind(),
             seed: self.args.seed,
-            submitted: submitted.load(Relaxed).max(tasks.total() as u64),
+            acknowledged,
             tasks,
             bodies,
             place_waits,

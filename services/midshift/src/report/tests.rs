@@ -1,7 +1,8 @@
 //! What a run must have come to: rows in a real store, bodies of a real hall that stood still.
 
-use super::{Inputs, Kind, Report, settle};
+use super::{Inputs, Kind, Report};
 use crate::clock;
+use crate::tally::settle;
 use midshift_core::ids::TaskId;
 use midshift_core::rows::{Item, Writer};
 use midshift_core::site::{DEMO, text};
@@ -20,8 +21,11 @@ fn store() -> anyhow::Result<Arc<dyn Store>> {
     Ok(Arc::new(MemoryStore::new(text::parse(DEMO)?.site_id().clone(), id, clock::clock(1_000))))
 }
 
+/// How request ids of the run begin.
+const RUN: &str = "run-";
+
 /// Admits a task that is in this phase.
-async fn admit(store: &Arc<dyn Store>, number: usize, phase: Phase) -> anyhow::Result<()> {
+async fn admit(store: &Arc<dyn Store>, number: usize, request_id: &str, phase: Phase) -> anyhow::Result<TaskId> {
     let form = Transport {
         kind: "transport".into(),
         from_waypoint: "A01".into(),
@@ -33,7 +37,7 @@ async fn admit(store: &Arc<dyn Store>, number: usize, phase: Phase) -> anyhow::R
         task_id: TaskId::parse(&format!("TASK-{number:04}"))?,
         spec: form.into_raw().check("task", &|_| true)?,
         actor: String::new(),
-        request_id: format!("run-{number}"),
+        request_id: request_id.to_owned(),
         payload_hash: String::new(),
         created: clock::clock(1_000).now().utc,
         number: number as u64,
@@ -44,7 +48,7 @@ async fn admit(store: &Arc<dyn Store>, number: usize, phase: Phase) -> anyhow::R
     for committed in store.commit(vec![item]).await {
         committed?;
     }
-    Ok(())
+    Ok(intake.task_id)
 }
 
 fn bodies() -> anyhow::Result<HallReport> {
@@ -56,18 +60,22 @@ fn bodies() -> anyhow::Result<HallReport> {
 /// A run of four robots that came to so many tasks of each phase.
 async fn run(kind: Kind, site_ms: u64, phases: &[(Phase, usize)]) -> anyhow::Result<Report> {
     let store = store()?;
-    let mut submitted = 0;
+    let mut acknowledged = Vec::new();
     for (phase, count) in phases {
         for _ in 0..*count {
-            submitted += 1;
-            admit(&store, submitted, *phase).await?;
+            let number = acknowledged.len() + 1;
+            acknowledged.push(admit(&store, number, &format!("{RUN}{number}"), *phase).await?);
         }
     }
+    report(kind, site_ms, store, acknowledged).await
+}
+
+async fn report(kind: Kind, site_ms: u64, store: Arc<dyn Store>, acknowledged: Vec<TaskId>) -> anyhow::Result<Report> {
     Ok(Report::of(Inputs {
         kind,
         seed: 1,
-        submitted: submitted as u64,
-        tasks: settle(store).await?,
+        acknowledged,
+        tasks: settle(store, RUN).await?,
         bodies: bodies()?,
         place_waits: 0,
         no_progress_ms: 0,
@@ -147,5 +155,54 @@ async fn what_the_journals_say_is_held_against_every_run() -> anyhow::Result<()>
         report.objections(),
         ["1 exclusion violations in the bodies' journals", "items were lost or doubled", "2 steps were done twice"]
     );
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_request_that_was_admitted_twice_is_an_objection() -> anyhow::Result<()> {
+    let store = store()?;
+    let first = admit(&store, 1, "run-1", Phase::Succeeded).await?;
+    admit(&store, 2, "run-1", Phase::Queued).await?;
+    let report = report(Kind::default(), 1_000, store, vec![first]).await?;
+    assert_eq!((report.submitted, report.succeeded, report.open), (1, 1, 1));
+    assert_eq!(
+        report.objections(),
+        ["the six states do not add up to 1 submitted", "1 tasks were admitted without an acknowledgement, or twice"]
+    );
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_lost_task_is_an_objection_even_if_a_doubled_one_makes_up_the_sum() -> anyhow::Result<()> {
+    let store = store()?;
+    let first = admit(&store, 1, "run-1", Phase::Succeeded).await?;
+    admit(&store, 2, "run-1", Phase::Queued).await?;
+    let report = report(Kind::default(), 1_000, store, vec![first, TaskId::parse("TASK-lost")?]).await?;
+    assert!(report.states_add_up);
+    assert_eq!(
+        report.objections(),
+        ["1 acknowledged tasks have no row", "1 tasks were admitted without an acknowledgement, or twice"]
+    );
+    Ok(())
+}
+
+#[tokio::test]
+async fn one_task_for_two_requests_does_not_add_up() -> anyhow::Result<()> {
+    let store = store()?;
+    let first = admit(&store, 1, "run-1", Phase::Succeeded).await?;
+    let report = report(Kind::default(), 1_000, store, vec![first.clone(), first]).await?;
+    assert_eq!(report.objections(), ["the six states do not add up to 2 submitted"]);
+    Ok(())
+}
+
+#[tokio::test]
+async fn tasks_of_others_are_told_and_held_against_nobody() -> anyhow::Result<()> {
+    let store = store()?;
+    let own = admit(&store, 1, "run-1", Phase::Succeeded).await?;
+    admit(&store, 2, "somebody-1", Phase::NeedsOperator).await?;
+    admit(&store, 3, "", Phase::Queued).await?;
+    let report = report(OWN, 1_000, store, vec![own]).await?;
+    assert_eq!((report.submitted, report.to_operator, report.open, report.of_others), (1, 0, 0, 2));
+    assert_eq!(report.objections(), Vec::<String>::new());
     Ok(())
 }
