@@ -2,6 +2,7 @@
 //!
 //! `cargo xtask test` builds the programs once and says where they are.
 
+mod begin_and_end;
 mod clients;
 mod cut;
 mod golden_cli;
