@@ -5,10 +5,13 @@ use crate::planning::Planning;
 use crate::report::{self, Inputs, Kind, Report};
 use crate::server::{Naive, Parts, Server};
 use crate::tally::{self, SharedTasks, Tasks};
+use crate::under_way::{self, UnderWay};
 use crate::{clock, serve, site_file};
 use anyhow::{Context, bail};
+use indicatif::{ProgressBar, ProgressStyle};
 use midshift_core::site::{Site, grid};
-use midshift_core::time::Clock;
+use midshift_core::task::Phase;
+use midshift_core::time::{Clock, SiteTime};
 use midshift_sim::hall::{Hall, HallConfig};
 use midshift_sim::service::SimFace;
 use midshift_sim::swarm::{Swarm, SwarmConfig};
@@ -16,6 +19,7 @@ use midshift_store::{
     FRAME_BYTES_DEFAULT, FrameLog, MemoryFrames, MemoryStore, SqliteFrames, SqliteStore, Store, StoreId,
 };
 use std::collections::VecDeque;
+use std::io::IsTerminal;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -23,6 +27,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::AbortOnDropHandle;
 
 /// What `dev` was asked for.
 #[derive(Clone, Debug, clap::Args)]
@@ -261,28 +266,36 @@ impl Run {
         let no_progress_ms = Arc::new(AtomicU64::new(0));
         let background = self.background(&acknowledged)?;
         let (fleet, board) = (server.fleet(), server.board());
-        let robots_stop = CancellationToken::new();
+        let (robots_stop, work_stop) = (CancellationToken::new(), CancellationToken::new());
+        // Whatever happens here, nothing goes on without the rest.
+        let _ends = [&robots_stop, &work_stop, &self.served_until].map(|token| token.clone().drop_guard());
         let begun = self.clock.now();
-        let serving = tokio::spawn(server.serve(serve::nodelay(listener)));
-        let following = tokio::spawn(tally::follow(self.store.clone(), self.tasks.clone(), self.served_until.clone()));
-        let robots = tokio::spawn(swarm.run(robots_stop.clone()));
-        let progress = tokio::spawn(report::watch_progress(board, self.clock.clone(), no_progress_ms.clone()));
+        let following = tally::follow(self.store.clone(), self.tasks.clone(), self.served_until.clone());
+        let swarm = swarm.run(robots_stop.clone());
         let channel = tonic::transport::Endpoint::from_shared(format!("http://{address}"))?.connect_lazy();
-        let work_stop = CancellationToken::new();
-        let working = tokio::spawn(background.run(channel, work_stop.clone()));
-        self.wait(begun.site).await;
+        let mut parts = UnderWay {
+            serving: tokio::spawn(server.serve(serve::nodelay(listener))),
+            following: tokio::spawn(async { Ok(following.await?) }),
+            robots: tokio::spawn(async { Ok(swarm.await.map(drop)?) }),
+            working: tokio::spawn(background.run(channel, work_stop.clone())),
+        };
+        let progress = report::watch_progress(board, self.clock.clone(), no_progress_ms.clone());
+        let _progress = AbortOnDropHandle::new(tokio::spawn(progress));
+        tokio::select! {
+            () = self.until_over(begun.site) => {}
+            error = parts.first_end() => return Err(error),
+        }
         // No more work, then the count, then the end: what is open stays open and is counted so.
         work_stop.cancel();
-        working.await??;
-        let place_waits = fleet.place_waits().await.unwrap_or(0);
+        under_way::ended(parts.working).await?;
+        let place_waits = fleet.place_waits().await.context("asking fleet how often robots waited")?;
         robots_stop.cancel();
-        robots.await??;
+        under_way::ended(parts.robots).await?;
         let ended = self.clock.now();
         let bodies = self.hall.report(ended.site)?;
         self.served_until.cancel();
-        progress.abort();
-        following.await??;
-        serving.await??;
+        under_way::ended(parts.following).await?;
+        under_way::ended(parts.serving).await?;
         let acknowledged = std::mem::take(&mut *acknowledged.lock().unwrap_or_else(PoisonError::into_inner));
         let tasks = tally::settle(self.store.clone(), &self.run_id).await?;
         let report = Report::of(Inputs {
@@ -303,15 +316,37 @@ impl Run {
         Ok(report)
     }
 
-    /// Until the site time of `--for` is over, or Ctrl-C.
-    async fn wait(&self, begun: midshift_core::time::SiteTime) {
+    /// Until the site time of `--for` is over, or Ctrl-C; a person at a terminal sees how far it is.
+    async fn until_over(&self, begun: SiteTime) {
         let Some(run_for) = self.args.run_for else { return self.stop.cancelled().await };
         let wanted_ms = u64::try_from(run_for.as_millis()).unwrap_or(u64::MAX);
-        while self.clock.now().site.since(begun).as_ms() < wanted_ms {
+        let bar = bar(wanted_ms / 1_000);
+        loop {
+            let passed_ms = self.clock.now().site.since(begun).as_ms();
+            if passed_ms >= wanted_ms {
+                break;
+            }
+            if bar.position() != passed_ms / 1_000 {
+                bar.set_position(passed_ms / 1_000);
+                let succeeded = |p: Phase| p == Phase::Succeeded;
+                bar.set_message(tally::look(&self.tasks, |t| {
+                    format!("{} submitted, {} succeeded", t.own_count(), t.count(succeeded))
+                }));
+            }
             tokio::select! {
-                () = self.stop.cancelled() => return,
+                () = self.stop.cancelled() => break,
                 () = tokio::time::sleep(Duration::from_millis(20)) => {}
             }
         }
+        bar.finish_and_clear();
     }
+}
+
+/// Seconds of site time on stderr, if somebody sees it.
+fn bar(seconds: u64) -> ProgressBar {
+    let bar = if std::io::stderr().is_terminal() { ProgressBar::new(seconds) } else { ProgressBar::hidden() };
+    if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} s of site time, {msg}") {
+        bar.set_style(style);
+    }
+    bar
 }

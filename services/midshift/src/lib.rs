@@ -15,3 +15,4 @@ pub mod serve;
 pub mod server;
 pub mod site_file;
 pub mod tally;
+pub mod under_way;

@@ -93,3 +93,15 @@ async fn dev_prints_its_ports_and_ends_cleanly_at_a_signal_while_streams_are_ope
     }
     Ok(())
 }
+
+#[tokio::test]
+async fn dev_ends_at_once_with_an_error_when_its_own_work_is_refused() -> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let list = "task_type,from_waypoint,to_waypoint,timeout_seconds\ntransport,A01,nowhere,300\n";
+    std::fs::write(dir.path().join("list.csv"), list)?;
+    let asked = ["dev", "--robots", "2", "--tasks", "list.csv", "--listen", "127.0.0.1:0"];
+    let (code, said) = refused(dir.path(), &asked).await?;
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains("the client ended before the run was over: background task refused"), "{said}");
+    Ok(())
+}
