@@ -317,19 +317,21 @@ mod tests {
     }
 
     #[test]
-    fn the_public_warehouse_reads_if_it_is_there() {
-        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data/warehouse");
-        let read = |name: &str| std::fs::read_to_string(format!("{folder}/{name}"));
-        let (Ok(map), Ok(tasks), Ok(starts)) =
-            (read("warehouse_small.map"), read("warehouse_small.tasks"), read("warehouse_small_200.agents"))
-        else {
-            return;
-        };
-        let site = parse_map("warehouse_small", &map).expect("the map reads");
-        assert_eq!((site.waypoints().len(), site.stations().count()), (1277, 382));
-        assert_eq!(parse_tasks(&site, &tasks).map(|t| t.len()), Ok(10_000));
-        assert_eq!(parse_starts(&site, &starts).map(|s| s.len()), Ok(200));
-        let findings = lint::lint(&site, Some(50));
+    fn a_hall_with_its_task_list_and_start_cells_reads_from_files() {
+        let site = parse_map("hall.map", include_str!("../../tests/data/hall.map")).expect("the map reads");
+        assert_eq!((site.waypoints().len(), site.stations().count()), (87, 20));
+        let tasks = parse_tasks(&site, include_str!("../../tests/data/hall.tasks")).expect("the list reads");
+        let visits = tasks.iter().filter(|t| t.work == GridWork::Visit).count();
+        assert_eq!((tasks.len(), visits), (17, 1));
+        let starts = parse_starts(&site, include_str!("../../tests/data/hall.agents")).expect("the cells read");
+        assert_eq!(starts.len(), 8);
+        let findings = lint::lint(&site, Some(8));
         assert!(findings.iter().all(|f| f.rule != lint::Rule::NotConnected), "{findings:?}");
+        let router = Router::new(Arc::new(site));
+        for task in &tasks {
+            let at = |name| router.site().find(name).expect("a cell of the map");
+            let ways = task.cells.windows(2).map(|two| router.distance_mm(at(&two[0]), at(&two[1])));
+            assert!(ways.into_iter().all(|way| way.is_some()), "{task:?}");
+        }
     }
 }

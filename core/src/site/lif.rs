@@ -328,12 +328,24 @@ mod tests {
     }
 
     #[test]
-    fn the_public_example_reads_with_warnings_if_it_is_there() {
-        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data/lif/example.lif.json");
-        let Ok(text) = std::fs::read_to_string(path) else { return };
-        let Import { site, warnings } = parse("example", &text).expect("reads");
-        assert_eq!((site.waypoints().len(), site.lanes().len(), site.stations().count()), (3, 2, 2));
+    fn a_whole_file_reads_and_names_what_a_site_cannot_say() {
+        let text = include_str!("../../tests/data/cell.lif.json");
+        let Import { site, warnings } = parse("cell", text).expect("reads");
+        assert_eq!((site.name(), site.map_id(), site.map_version()), ("Press cell", "hall-2", "7"));
+        assert_eq!((site.waypoints().len(), site.lanes().len(), site.stations().count()), (4, 4, 2));
+        let at = |name: &str| site.find(&WaypointId::parse(name).expect("a name")).expect(name);
+        assert_eq!((site.waypoint(at("plug")).kind, site.waypoint(at("gate")).kind), (Kind::Charger, Kind::Junction));
+        let slow = site.lane(site.find_lane(at("press"), at("buffer")).expect("a lane"));
+        assert_eq!((slow.length_mm, slow.speed_limit_mm_s), (3_500, Some(300)), "the slowest vehicle's speed");
         let all = warnings.join("\n");
-        assert!(all.contains("theta is not within") && all.contains("node-002 belongs to several stations"), "{all}");
+        for part in [
+            "node press: theta is not within",
+            "node press belongs to several stations",
+            "edge press-buffer: its curve is taken as a straight line",
+            "edge buffer-plug: its load restriction is not kept",
+        ] {
+            assert!(all.contains(part), "{part} is not in:\n{all}");
+        }
+        assert_eq!(warnings.len(), 4, "{all}");
     }
 }

@@ -170,6 +170,8 @@ fn every_service_is_in_the_descriptor_set() {
     let wanted = [
         "fleet.v1.FleetService",
         "link.v1.LinkService",
+        "ota.v1.BundleService",
+        "ota.v1.ChunkService",
         "sim.v1.SimService",
         "task.v1.TaskService",
         "telemetry.v1.TelemetryService",

@@ -1,8 +1,10 @@
 //! The work that `dev` gives itself over gRPC, like any other client: a steady backlog, a Poisson stream, or a task list.
 //!
-//! Invariant: background work has priority 7, so that a user's own task goes first, and it stops when asked to.
+//! Invariant: background work has priority 7, so that a user's own task goes first. It stops when asked to, but never between a call and
+//! its answer: what was submitted is what was acknowledged.
 
 use anyhow::{Context, bail};
+use midshift_core::ids::TaskId;
 use midshift_core::site::{Site, grid, task_list};
 use midshift_core::task::forms::Transport;
 use midshift_core::time::Clock;
@@ -11,8 +13,7 @@ use midshift_proto::task::v1::{self, SubmitTaskRequest, SubmitTasksRequest, subm
 use midshift_sim::workload::{Workload, WorkloadConfig};
 use std::collections::VecDeque;
 use std::path::Path;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 use tonic::transport::Channel;
@@ -127,18 +128,21 @@ fn grid_request(task: &grid::GridTask) -> SubmitTaskRequest {
     }
 }
 
+/// Tasks that the client was acknowledged for, one entry a request.
+pub type Acknowledged = Arc<Mutex<Vec<TaskId>>>;
+
 /// A client that keeps up the pressure.
 pub struct Background {
     /// How much.
     pub pressure: Pressure,
     /// What.
     pub source: Source,
-    /// Makes request ids of this run unique.
-    pub seed: u64,
+    /// How the request ids of this run begin, and of no other.
+    pub run_id: String,
     /// Both clocks.
     pub clock: Arc<dyn Clock>,
-    /// Tasks admitted so far, for whoever reports.
-    pub submitted: Arc<AtomicU64>,
+    /// What was acknowledged so far, for whoever reports.
+    pub acknowledged: Acknowledged,
     /// Open tasks now, counted by whoever looks at the rows.
     pub open: Arc<dyn Fn() -> usize + Send + Sync>,
 }
@@ -152,7 +156,6 @@ impl Background {
     /// Submits until `stop`, or until its list is over.
     pub async fn run(mut self, channel: Channel, stop: CancellationToken) -> anyhow::Result<()> {
         let mut client = TaskServiceClient::new(channel);
-        let run = format!("dev-{}-{}", self.seed, self.clock.now().wall.0);
         let mut number = 0_u64;
         let mut due = self.clock.now().site;
         loop {
@@ -173,16 +176,14 @@ impl Background {
             for _ in 0..wanted {
                 let Some(mut request) = self.source.next() else { break };
                 number += 1;
-                request.request_id = format!("{run}-{number}");
+                request.request_id = format!("{}{number}", self.run_id);
                 items.push(SubmitTasksRequest { item: Some(request) });
             }
             if !items.is_empty() {
                 let sent = items.len();
-                let answer = tokio::select! {
-                    () = stop.cancelled() => return Ok(()),
-                    answer = client.submit_tasks(tokio_stream::iter(items)) => answer?.into_inner(),
-                };
-                self.count(&answer, sent)?;
+                let answer =
+                    client.submit_tasks(tokio_stream::iter(items)).await.context("submitting the run's own work")?;
+                self.note(&answer.into_inner(), sent)?;
             }
             tokio::select! {
                 () = stop.cancelled() => return Ok(()),
@@ -198,19 +199,18 @@ impl Background {
         }
     }
 
-    fn count(&self, answer: &v1::SubmitTasksResponse, sent: usize) -> anyhow::Result<()> {
+    fn note(&self, answer: &v1::SubmitTasksResponse, sent: usize) -> anyhow::Result<()> {
         use v1::submit_task_result::Outcome;
-        let mut admitted = 0;
+        let mut acknowledged = self.acknowledged.lock().unwrap_or_else(PoisonError::into_inner);
         for result in &answer.results {
             match &result.outcome {
-                Some(Outcome::TaskId(_)) => admitted += 1,
+                Some(Outcome::TaskId(id)) => acknowledged.push(TaskId::parse(id)?),
                 Some(Outcome::Refusal(refusal)) => bail!("background task refused: {refusal:?}"),
                 None => bail!("background task got no outcome"),
             }
         }
-        self.submitted.fetch_add(admitted, Relaxed);
-        if admitted as usize != sent {
-            bail!("sent {sent} tasks, {admitted} admitted");
+        if answer.results.len() != sent {
+            bail!("sent {sent} tasks, {} answered", answer.results.len());
         }
         Ok(())
     }

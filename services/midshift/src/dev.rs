@@ -1,13 +1,17 @@
 //! `midshift dev`: a whole factory in one process, in memory, on loopback, with simulated robots and work of its own. Not for production.
 
-use crate::background::{Background, Pressure, Source, read_list};
+use crate::background::{Acknowledged, Background, Pressure, Source, read_list};
 use crate::planning::Planning;
-use crate::report::{self, Inputs, Report, SharedTasks};
+use crate::report::{self, Inputs, Kind, Report};
 use crate::server::{Naive, Parts, Server};
+use crate::tally::{self, SharedTasks, Tasks};
+use crate::under_way::{self, UnderWay};
 use crate::{clock, serve, site_file};
 use anyhow::{Context, bail};
+use indicatif::{ProgressBar, ProgressStyle};
 use midshift_core::site::{Site, grid};
-use midshift_core::time::Clock;
+use midshift_core::task::Phase;
+use midshift_core::time::{Clock, SiteTime};
 use midshift_sim::hall::{Hall, HallConfig};
 use midshift_sim::service::SimFace;
 use midshift_sim::swarm::{Swarm, SwarmConfig};
@@ -15,13 +19,15 @@ use midshift_store::{
     FRAME_BYTES_DEFAULT, FrameLog, MemoryFrames, MemoryStore, SqliteFrames, SqliteStore, Store, StoreId,
 };
 use std::collections::VecDeque;
+use std::io::IsTerminal;
 use std::net::SocketAddr;
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::AbortOnDropHandle;
 
 /// What `dev` was asked for.
 #[derive(Clone, Debug, clap::Args)]
@@ -47,7 +53,11 @@ pub struct Dev {
     /// Seed of robots, faults and work. The run is seeded, not reproducible: threads and sockets have their own mind.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Stop after so much site time (e.g. 10m) instead of at Ctrl-C.
+    /// Stop after so much site time (e.g. 10m) instead of at Ctrl-C, and fail if the run was not good.
+    ///
+    /// Good is: no place ever too full, no item lost or doubled, no step done twice, every task accounted for, and at most twice the
+    /// robots' number of tasks open (unless --keep-open or --rate). From 5m on also: at most 2 % of the tasks, or one, with an operator;
+    /// and 8 tasks a robot succeeded in 10m, in the built-in factory with its own work and up to 20 robots.
     #[arg(long = "for", value_parser = crate::duration::duration)]
     pub run_for: Option<Duration>,
     /// Keep everything in this directory instead of in memory.
@@ -65,6 +75,15 @@ pub struct Dev {
     /// Submit so many tasks an hour of site time, e.g. 300/h.
     #[arg(long, value_parser = rate)]
     pub rate: Option<f64>,
+}
+
+impl Dev {
+    fn kind(&self) -> Kind {
+        Kind {
+            built_in: self.site.is_none() && self.map.is_none() && self.tasks.is_none(),
+            own_backlog: self.keep_open.is_none() && self.rate.is_none(),
+        }
+    }
 }
 
 fn rate(text: &str) -> Result<f64, String> {
@@ -105,10 +124,11 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         .await
         .with_context(|| format!("listening on {}; is another midshift running?", args.listen))?;
     let address = listener.local_addr()?;
-    let tasks = SharedTasks::default();
+    let run_id = format!("dev-{}-{}-", args.seed, clock.now().wall.0);
+    let tasks = Arc::new(Mutex::new(Tasks::of_run(&run_id)));
     let mut swarm = SwarmConfig::tcp(hall.clone(), clock.clone(), &format!("http://{address}"), args.seed);
     let live = tasks.clone();
-    swarm.person = Some(Arc::new(move |id| report::look(&live, |t| t.is_live(id))));
+    swarm.person = Some(Arc::new(move |id| tally::look(&live, |t| t.is_live(id))));
     let swarm = Swarm::new(swarm);
     let (store, frames) = stores(&args, &site, &clock).await?;
     let planning = Planning::start()?;
@@ -122,9 +142,11 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         naive: Naive::default(),
         planning: planning.handle(),
     };
-    let server = Server::new(parts, stop.clone()).await?;
+    // The server ends after its robots and its client, or the last of them would be cut off at Ctrl-C.
+    let served_until = CancellationToken::new();
+    let server = Server::new(parts, served_until.clone()).await?;
     say(&greeting(&args, &site, address));
-    let run = Run { args, site, clock, hall, tasks, store, stop };
+    let run = Run { args, site, clock, hall, run_id, tasks, store, stop, served_until };
     run.together(server, swarm, listener, address).await
 }
 
@@ -191,9 +213,11 @@ struct Run {
     site: Arc<Site>,
     clock: Arc<dyn Clock>,
     hall: Arc<Hall>,
+    run_id: String,
     tasks: SharedTasks,
     store: Arc<dyn Store>,
     stop: CancellationToken,
+    served_until: CancellationToken,
 }
 
 impl Run {
@@ -210,21 +234,23 @@ impl Run {
         }
     }
 
-    fn background(&self, submitted: &Arc<AtomicU64>) -> anyhow::Result<Background> {
+    fn background(&self, acknowledged: &Acknowledged) -> anyhow::Result<Background> {
         let source = match &self.args.tasks {
             Some(path) => Source::Listed(VecDeque::from(read_list(path, &self.site)?)),
             None => Source::drawn(&self.site, self.args.seed)?,
         };
-        let (tasks, counted) = (self.tasks.clone(), submitted.clone());
-        // What was admitted and is not in the picture yet is open too.
-        let open =
-            move || report::look(&tasks, |t| t.open() + (counted.load(Relaxed) as usize).saturating_sub(t.total()));
+        let (tasks, counted) = (self.tasks.clone(), acknowledged.clone());
+        // What was acknowledged and is not in the picture yet is open too.
+        let open = move || {
+            let acknowledged = counted.lock().unwrap_or_else(PoisonError::into_inner).len();
+            tally::look(&tasks, |t| t.open() + acknowledged.saturating_sub(t.own_count()))
+        };
         Ok(Background {
             pressure: self.pressure(),
             source,
-            seed: self.args.seed,
+            run_id: self.run_id.clone(),
             clock: self.clock.clone(),
-            submitted: submitted.clone(),
+            acknowledged: acknowledged.clone(),
             open: Arc::new(open),
         })
     }
@@ -236,36 +262,46 @@ impl Run {
         listener: TcpListener,
         address: SocketAddr,
     ) -> anyhow::Result<Report> {
-        let submitted = Arc::new(AtomicU64::new(0));
+        let acknowledged = Acknowledged::default();
         let no_progress_ms = Arc::new(AtomicU64::new(0));
-        let background = self.background(&submitted)?;
+        let background = self.background(&acknowledged)?;
         let (fleet, board) = (server.fleet(), server.board());
-        let robots_stop = CancellationToken::new();
+        let (robots_stop, work_stop) = (CancellationToken::new(), CancellationToken::new());
+        // Whatever happens here, nothing goes on without the rest.
+        let _ends = [&robots_stop, &work_stop, &self.served_until].map(|token| token.clone().drop_guard());
         let begun = self.clock.now();
-        let serving = tokio::spawn(server.serve(serve::nodelay(listener)));
-        let following = tokio::spawn(report::follow(self.store.clone(), self.tasks.clone(), self.stop.clone()));
-        let robots = tokio::spawn(swarm.run(robots_stop.clone()));
-        let progress = tokio::spawn(report::watch_progress(board, self.clock.clone(), no_progress_ms.clone()));
+        let following = tally::follow(self.store.clone(), self.tasks.clone(), self.served_until.clone());
+        let swarm = swarm.run(robots_stop.clone());
         let channel = tonic::transport::Endpoint::from_shared(format!("http://{address}"))?.connect_lazy();
-        let work_stop = CancellationToken::new();
-        let working = tokio::spawn(background.run(channel, work_stop.clone()));
-        self.wait(begun.site).await;
+        let mut parts = UnderWay {
+            serving: tokio::spawn(server.serve(serve::nodelay(listener))),
+            following: tokio::spawn(async { Ok(following.await?) }),
+            robots: tokio::spawn(async { Ok(swarm.await.map(drop)?) }),
+            working: tokio::spawn(background.run(channel, work_stop.clone())),
+        };
+        let progress = report::watch_progress(board, self.clock.clone(), no_progress_ms.clone());
+        let _progress = AbortOnDropHandle::new(tokio::spawn(progress));
+        tokio::select! {
+            () = self.until_over(begun.site) => {}
+            error = parts.first_end() => return Err(error),
+        }
         // No more work, then the count, then the end: what is open stays open and is counted so.
         work_stop.cancel();
-        working.await??;
-        let place_waits = fleet.place_waits().await.unwrap_or(0);
+        under_way::ended(parts.working).await?;
+        let place_waits = fleet.place_waits().await.context("asking fleet how often robots waited")?;
         robots_stop.cancel();
-        robots.await??;
+        under_way::ended(parts.robots).await?;
         let ended = self.clock.now();
         let bodies = self.hall.report(ended.site)?;
-        self.stop.cancel();
-        progress.abort();
-        following.await??;
-        serving.await??;
-        let tasks = report::settle(self.store.clone()).await?;
+        self.served_until.cancel();
+        under_way::ended(parts.following).await?;
+        under_way::ended(parts.serving).await?;
+        let acknowledged = std::mem::take(&mut *acknowledged.lock().unwrap_or_else(PoisonError::into_inner));
+        let tasks = tally::settle(self.store.clone(), &self.run_id).await?;
         let report = Report::of(Inputs {
+            kind: self.args.kind(),
             seed: self.args.seed,
-            submitted: submitted.load(Relaxed).max(tasks.total() as u64),
+            acknowledged,
             tasks,
             bodies,
             place_waits,
@@ -280,15 +316,37 @@ impl Run {
         Ok(report)
     }
 
-    /// Until the site time of `--for` is over, or Ctrl-C.
-    async fn wait(&self, begun: midshift_core::time::SiteTime) {
+    /// Until the site time of `--for` is over, or Ctrl-C; a person at a terminal sees how far it is.
+    async fn until_over(&self, begun: SiteTime) {
         let Some(run_for) = self.args.run_for else { return self.stop.cancelled().await };
         let wanted_ms = u64::try_from(run_for.as_millis()).unwrap_or(u64::MAX);
-        while self.clock.now().site.since(begun).as_ms() < wanted_ms {
+        let bar = bar(wanted_ms / 1_000);
+        loop {
+            let passed_ms = self.clock.now().site.since(begun).as_ms();
+            if passed_ms >= wanted_ms {
+                break;
+            }
+            if bar.position() != passed_ms / 1_000 {
+                bar.set_position(passed_ms / 1_000);
+                let succeeded = |p: Phase| p == Phase::Succeeded;
+                bar.set_message(tally::look(&self.tasks, |t| {
+                    format!("{} submitted, {} succeeded", t.own_count(), t.count(succeeded))
+                }));
+            }
             tokio::select! {
-                () = self.stop.cancelled() => return,
+                () = self.stop.cancelled() => break,
                 () = tokio::time::sleep(Duration::from_millis(20)) => {}
             }
         }
+        bar.finish_and_clear();
     }
+}
+
+/// Seconds of site time on stderr, if somebody sees it.
+fn bar(seconds: u64) -> ProgressBar {
+    let bar = if std::io::stderr().is_terminal() { ProgressBar::new(seconds) } else { ProgressBar::hidden() };
+    if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} s of site time, {msg}") {
+        bar.set_style(style);
+    }
+    bar
 }

@@ -14,3 +14,5 @@ pub mod robots;
 pub mod serve;
 pub mod server;
 pub mod site_file;
+pub mod tally;
+pub mod under_way;

@@ -1,107 +1,30 @@
 //! What a run came to, counted from rows and from the bodies' own journals, never from what was planned.
 
+use crate::tally::Tasks;
 use midshift_core::ids::TaskId;
-use midshift_core::rows::{BadRow, Table};
-use midshift_core::task::{Phase, TaskIntake, TaskState};
-use midshift_core::time::{Clock, Utc};
+use midshift_core::task::Phase;
+use midshift_core::time::Clock;
 use midshift_core::work::Live;
 use midshift_sim::hall::HallReport;
-use midshift_store::{Change, Error, Fold, LiveBoard, Projection, Store};
+use midshift_store::LiveBoard;
 use serde::Serialize;
-use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::collections::BTreeSet;
+use std::sync::Arc;
 use std::time::Duration;
-use tokio_util::sync::CancellationToken;
 
 /// A robot with work that does not get on for longer than this makes no progress. Site clock.
 const NO_PROGRESS_MS: u64 = 60_000;
+/// A run shorter than this is not asked for amounts: its first tasks are still on their way. Milliseconds of site time.
+const AMOUNTS_FROM_MS: u64 = 300_000;
+/// What each robot of the built-in factory brings to its end in ten minutes of site time, at least.
+const SUCCEEDED_PER_ROBOT: u64 = 8;
+/// The built-in factory feeds so many robots; more of them wait for each other, and their number says nothing of the work done.
+const BUILT_IN_ROBOTS: u64 = 20;
+/// The states that lead on.
+const OPEN: [Phase; 7] =
+    [Phase::Queued, Phase::Assigned, Phase::Running, Phase::Held, Phase::Suspended, Phase::Stopping, Phase::RetryWait];
 /// How often robots are looked at, real time.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
-
-/// Tasks as their rows say it.
-#[derive(Debug, Default)]
-pub struct Tasks {
-    created: BTreeMap<TaskId, Utc>,
-    states: BTreeMap<TaskId, (Phase, Option<Utc>)>,
-}
-
-impl Tasks {
-    /// How many are in one of these phases.
-    pub fn count(&self, wanted: impl Fn(Phase) -> bool) -> usize {
-        self.states.values().filter(|(phase, _)| wanted(*phase)).count()
-    }
-    /// Tasks admitted.
-    pub fn total(&self) -> usize {
-        self.states.len()
-    }
-    /// Neither over nor waiting for a person.
-    pub fn open(&self) -> usize {
-        self.count(|p| !p.is_terminal() && p != Phase::NeedsOperator)
-    }
-    /// Whether a task is not over.
-    pub fn is_live(&self, id: &TaskId) -> bool {
-        self.states.get(id).is_some_and(|(phase, _)| !phase.is_terminal())
-    }
-    fn completions_s(&self) -> Vec<f64> {
-        let done = self.states.iter().filter(|(_, (phase, _))| *phase == Phase::Succeeded);
-        let took = done.filter_map(|(id, (_, ended))| Some((*ended)?.ms_since(*self.created.get(id)?) as f64 / 1000.0));
-        let mut took: Vec<f64> = took.collect();
-        took.sort_by(f64::total_cmp);
-        took
-    }
-}
-
-/// The tasks, shared with whoever looks.
-pub type SharedTasks = Arc<Mutex<Tasks>>;
-
-/// Looks at the tasks.
-pub fn look<T>(tasks: &SharedTasks, f: impl FnOnce(&Tasks) -> T) -> T {
-    f(&tasks.lock().unwrap_or_else(PoisonError::into_inner))
-}
-
-struct Keeper(SharedTasks);
-
-impl Fold for Keeper {
-    fn tables() -> &'static [Table] {
-        &[Table::TaskIntake, Table::TaskState]
-    }
-    fn reset(&mut self) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Tasks::default();
-    }
-    fn apply(&mut self, change: Change) -> Result<(), BadRow> {
-        let mut tasks = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if change.key.table == Table::TaskIntake {
-            if let Some(intake) = change.decode::<TaskIntake>()? {
-                tasks.created.insert(intake.task_id, intake.created);
-            }
-        } else if let Some(state) = change.decode::<TaskState>()? {
-            tasks.states.insert(state.task_id, (state.phase, state.ended));
-        }
-        Ok(())
-    }
-}
-
-/// Keeps `tasks` as the rows are, until `stop`.
-pub async fn follow(store: Arc<dyn Store>, tasks: SharedTasks, stop: CancellationToken) -> Result<(), Error> {
-    let mut projection = Projection::new(Keeper(tasks));
-    let mut wake = store.wake();
-    loop {
-        wake.mark_unchanged();
-        projection.advance(store.as_ref()).await?;
-        tokio::select! {
-            () = stop.cancelled() => return Ok(()),
-            changed = wake.changed() => if changed.is_err() { return Ok(()) },
-        }
-    }
-}
-
-/// Reads the rows once more, to the end.
-pub async fn settle(store: Arc<dyn Store>) -> Result<Tasks, Error> {
-    let tasks = SharedTasks::default();
-    Projection::new(Keeper(tasks.clone())).advance(store.as_ref()).await?;
-    let mut tasks = tasks.lock().unwrap_or_else(PoisonError::into_inner);
-    Ok(std::mem::take(&mut *tasks))
-}
 
 /// Milliseconds of site time in which robots had work and made no progress, summed over robots.
 pub async fn watch_progress(
@@ -125,6 +48,39 @@ fn is_stuck(live: &Live, now: midshift_core::time::SiteTime) -> bool {
     working && now.since(live.progress_at).as_ms() > NO_PROGRESS_MS
 }
 
+/// What was run, as far as it decides which amounts a good run shows.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Kind {
+    /// Drawn work in the built-in factory: no site, map or task list of the user's own.
+    pub built_in: bool,
+    /// The backlog is twice the robots and not what the user asked for.
+    pub own_backlog: bool,
+}
+
+/// The amounts a run is held to; none: it is not asked.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Amounts {
+    /// 8 a robot in ten minutes of site time, of runs of 5 minutes and more with up to 20 robots in the built-in factory and its own
+    /// backlog.
+    pub succeeded_min: Option<u64>,
+    /// 2 % of what was submitted, or one task, of runs of 5 minutes and more.
+    pub to_operator_max: Option<u64>,
+    /// Twice the robots, of runs that keep their own backlog.
+    pub open_max: Option<u64>,
+}
+
+impl Amounts {
+    fn of(kind: Kind, robots: u64, submitted: u64, site_ms: u64) -> Self {
+        let long = site_ms >= AMOUNTS_FROM_MS;
+        let feeds = kind.built_in && kind.own_backlog && robots <= BUILT_IN_ROBOTS;
+        Self {
+            succeeded_min: (long && feeds).then_some(SUCCEEDED_PER_ROBOT * robots * site_ms / 600_000),
+            to_operator_max: long.then_some((submitted / 50).max(1)),
+            open_max: kind.own_backlog.then_some(2 * robots),
+        }
+    }
+}
+
 /// The report of a run.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
@@ -132,9 +88,15 @@ pub struct Report {
     pub robots: usize,
     /// Seed of the run.
     pub seed: u64,
-    /// Tasks admitted, as the client counted them.
+    /// Tasks that the client was acknowledged for.
     pub submitted: u64,
-    /// Tasks by state, each counted from its row.
+    /// Of these, without a row.
+    pub lost: u64,
+    /// Tasks of the client's requests that it was not acknowledged for.
+    pub unacknowledged: u64,
+    /// Tasks that somebody else submitted. They are in no other number here.
+    pub of_others: u64,
+    /// The client's tasks by state, each state counted by itself from the rows.
     pub succeeded: usize,
     /// See above.
     pub failed: usize,
@@ -144,7 +106,7 @@ pub struct Report {
     pub expired: usize,
     /// NEEDS_OPERATOR.
     pub to_operator: usize,
-    /// Neither over nor with a person.
+    /// In one of the states that lead on.
     pub open: usize,
     /// The six add up to `submitted`.
     pub states_add_up: bool,
@@ -174,6 +136,8 @@ pub struct Report {
     pub wall_s: f64,
     /// Site time over real time, as reached.
     pub achieved_speedup: f64,
+    /// What the run is held to, beside the laws.
+    pub asked: Amounts,
     /// What the bodies say.
     pub bodies: HallReport,
 }
@@ -199,10 +163,12 @@ fn spread(sorted: &[f64]) -> Spread {
 
 /// What a run is reported from.
 pub struct Inputs {
+    /// What was run.
+    pub kind: Kind,
     /// Seed of the run.
     pub seed: u64,
-    /// As the client counted.
-    pub submitted: u64,
+    /// What the client was acknowledged for.
+    pub acknowledged: Vec<TaskId>,
     /// Rows.
     pub tasks: Tasks,
     /// Bodies.
@@ -220,29 +186,34 @@ pub struct Inputs {
 impl Report {
     /// Adds everything up.
     pub fn of(i: Inputs) -> Self {
-        let is = |wanted: Phase| i.tasks.count(|p| p == wanted);
+        let is = |wanted: &[Phase]| i.tasks.count(|p| wanted.contains(&p));
         let six = [
-            is(Phase::Succeeded),
-            is(Phase::Failed),
-            is(Phase::Canceled),
-            is(Phase::Expired),
-            is(Phase::NeedsOperator),
-            i.tasks.open(),
+            is(&[Phase::Succeeded]),
+            is(&[Phase::Failed]),
+            is(&[Phase::Canceled]),
+            is(&[Phase::Expired]),
+            is(&[Phase::NeedsOperator]),
+            is(&OPEN),
         ];
+        let submitted = i.acknowledged.len() as u64;
+        let known: BTreeSet<&TaskId> = i.acknowledged.iter().collect();
         let site_s = i.site_ms as f64 / 1000.0;
         let wall_s = i.wall_ms as f64 / 1000.0;
         let path = i.bodies.path_mm as f64;
         Self {
             robots: i.bodies.robots,
             seed: i.seed,
-            submitted: i.submitted,
+            submitted,
+            lost: known.iter().filter(|id| !i.tasks.has(id)).count() as u64,
+            unacknowledged: i.tasks.own().filter(|id| !known.contains(id)).count() as u64,
+            of_others: i.tasks.of_others() as u64,
             succeeded: six[0],
             failed: six[1],
             canceled: six[2],
             expired: six[3],
             to_operator: six[4],
             open: six[5],
-            states_add_up: six.iter().sum::<usize>() as u64 == i.submitted,
+            states_add_up: six.iter().sum::<usize>() as u64 == submitted,
             exclusion_violations: i.bodies.verdict.exclusion_violations,
             collisions: if i.bodies.collisions_modelled { "modelled" } else { "not modelled" },
             items_conserved: i.bodies.verdict.items_conserved(),
@@ -256,6 +227,7 @@ impl Report {
             site_s,
             wall_s,
             achieved_speedup: site_s / wall_s.max(1e-9),
+            asked: Amounts::of(i.kind, i.bodies.robots as u64, submitted, i.site_ms),
             bodies: i.bodies,
         }
     }
@@ -268,12 +240,30 @@ impl Report {
         if !self.states_add_up {
             why.push(format!("the six states do not add up to {} submitted", self.submitted));
         }
+        if self.lost > 0 {
+            why.push(format!("{} acknowledged tasks have no row", self.lost));
+        }
+        if self.unacknowledged > 0 {
+            why.push(format!("{} tasks were admitted without an acknowledgement, or twice", self.unacknowledged));
+        }
         if !self.items_conserved {
             why.push("items were lost or doubled".to_owned());
         }
         if self.steps_done_twice > 0 {
             why.push(format!("{} steps were done twice", self.steps_done_twice));
         }
+        if let Some(min) = self.asked.succeeded_min.filter(|min| (self.succeeded as u64) < *min) {
+            why.push(format!("{} tasks succeeded, {min} were to", self.succeeded));
+        }
+        if let Some(max) = self.asked.to_operator_max.filter(|max| self.to_operator as u64 > *max) {
+            why.push(format!("{} tasks wait for an operator, {max} may", self.to_operator));
+        }
+        if let Some(max) = self.asked.open_max.filter(|max| self.open as u64 > *max) {
+            why.push(format!("{} tasks are open, {max} may be", self.open));
+        }
         why
     }
 }
+
+#[cfg(test)]
+mod tests;

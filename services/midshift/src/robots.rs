@@ -33,7 +33,8 @@ pub struct AgentRun {
     /// The site file the body lives on. Without it the built-in demo site.
     #[arg(long)]
     pub site: Option<PathBuf>,
-    /// Where a new body stands. Required at its first start.
+    /// Where a new body stands; later starts find the body where it was left. Without it the first starting place of the site, the same
+    /// for every robot: name one each when there are several.
     #[arg(long)]
     pub start: Option<String>,
     /// Seed of the body.

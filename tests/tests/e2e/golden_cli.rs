@@ -1,14 +1,16 @@
 //! The command line as programs see it: `-o json`, exit codes and messages, word for word in a golden transcript.
 //!
-//! What differs from run to run (times, etags, positions in a log) stands there as its kind.
+//! What differs from run to run (times, etags, positions in a log) stands there as its kind. Of a stream the first documents stand there.
 
-use crate::harness::{free_port, midshift, until};
+use crate::harness::{Running, channel, free_port, midshift, until};
 use crate::room::{LIMIT, Room};
 use anyhow::Context;
+use midshift_proto::sim::v1::GetWorldRequest;
+use midshift_proto::sim::v1::sim_service_client::SimServiceClient;
 use midshift_proto::task::v1::TaskState;
-use serde_json::Value;
+use serde_json::{Deserializer, Value};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 /// Keys whose values no program may read anything into.
 const OPAQUE: [&str; 12] = [
@@ -67,29 +69,72 @@ struct Transcript {
 }
 
 impl Transcript {
+    /// With a limit of open files that every machine has, since `doctor` looks at it.
+    fn command(&self, arguments: &[&str]) -> Command {
+        let mut command = Command::new("sh");
+        command.args(["-c", "ulimit -n 1024 && exec \"$0\" \"$@\""]).arg(&self.program).args(arguments);
+        command.env("MIDSHIFT_SERVER", &self.server).env_remove("NO_COLOR").current_dir(&self.dir);
+        command
+    }
+
     fn run(&self, arguments: &[&str]) -> anyhow::Result<Output> {
-        let mut command = Command::new(&self.program);
-        command.args(arguments).env("MIDSHIFT_SERVER", &self.server).env_remove("NO_COLOR").current_dir(&self.dir);
-        command.output().with_context(|| format!("running {arguments:?}"))
+        self.command(arguments).output().with_context(|| format!("running {arguments:?}"))
     }
 
     /// Runs a command and writes down what it printed and how it ended; its standard output.
     fn note(&mut self, arguments: &[&str]) -> anyhow::Result<Value> {
         let output = self.run(arguments)?;
-        let said = String::from_utf8(output.stderr)?.replace(&self.server, "<server>");
+        let said = hidden(&String::from_utf8(output.stderr)?.replace(&self.server, "<server>"));
         let out = String::from_utf8(output.stdout)?.replace(&self.server, "<server>");
         assert!(!said.contains('\u{1b}') && !out.contains('\u{1b}'), "{arguments:?}: colours in a pipe");
         let code = output.status.code().context("it was killed")?;
-        self.text += &format!("$ midshift {}\n", arguments.join(" ").replace(&self.server, "<server>"));
+        self.asked(arguments);
         let value: Value = serde_json::from_str(&out).unwrap_or(Value::Null);
         match &value {
             Value::Null => self.text += &out,
-            value => self.text += &format!("{}\n", serde_json::to_string_pretty(&plain("", value))?),
+            value => self.document(value)?,
         }
         self.text += &said;
         self.text += &format!("exit {code}\n\n");
         Ok(value)
     }
+
+    /// Runs a command that would go on for ever and writes down the first documents that it prints.
+    fn note_stream(&mut self, arguments: &[&str], documents: usize) -> anyhow::Result<()> {
+        let mut child = self.command(arguments).stdout(Stdio::piped()).stderr(Stdio::null()).spawn()?;
+        let printed = child.stdout.take().context("a pipe")?;
+        self.asked(arguments);
+        let values: Result<Vec<Value>, _> = Deserializer::from_reader(printed).into_iter().take(documents).collect();
+        child.kill()?;
+        child.wait()?;
+        let values = values?;
+        assert_eq!(values.len(), documents, "{arguments:?} ended");
+        values.iter().try_for_each(|value| self.document(value))?;
+        self.text += "goes on\n\n";
+        Ok(())
+    }
+
+    fn asked(&mut self, arguments: &[&str]) {
+        let line = arguments.join(" ").replace(&self.server, "<server>");
+        self.text += &format!("$ midshift {}\n", hidden(&line));
+    }
+
+    fn document(&mut self, value: &Value) -> anyhow::Result<()> {
+        self.text += &format!("{}\n", serde_json::to_string_pretty(&plain("", value))?);
+        Ok(())
+    }
+}
+
+/// The same text without the values of flags that nobody may read anything into.
+fn hidden(text: &str) -> String {
+    let mut plain = text.to_owned();
+    for flag in ["--if-match ", "--page-token "] {
+        if let Some(at) = plain.find(flag).map(|at| at + flag.len()) {
+            let end = plain[at..].find(char::is_whitespace).map_or(plain.len(), |n| at + n);
+            plain.replace_range(at..end, "<opaque>");
+        }
+    }
+    plain
 }
 
 fn is_time(text: &str) -> bool {
@@ -114,6 +159,49 @@ fn golden() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("golden/cli.txt")
 }
 
+/// A free place, and one under a robot.
+fn clear(t: &mut Transcript, places: &Value) -> anyhow::Result<()> {
+    for place in ["corridor", "park-a"] {
+        let of = places["places"].as_array().and_then(|all| all.iter().find(|p| p["placeId"] == place));
+        let etag = of.and_then(|p| p["etag"].as_str()).with_context(|| format!("no etag of {place}"))?;
+        let asked = ["zone", "clear", place, "--reason", "looked inside", "--if-match", etag, "-o", "json"];
+        t.note(&asked)?;
+    }
+    Ok(())
+}
+
+/// What a person sees: columns, and what to do next.
+fn for_people(t: &mut Transcript) -> anyhow::Result<()> {
+    t.note(&["robot", "cordon", "r1", "--reason", "a wheel squeaks"])?;
+    t.note(&["task", "submit", "--from", "A", "--to", "B", "--sku", "SKU-5", "--task-id", "TASK-5"])?;
+    t.note(&["task", "submit", "--from", "A", "--to", "B", "--dry-run"])?;
+    t.note(&["task", "ls", "--limit", "1"])?;
+    t.note(&["task", "resume", "--robot", "r1", "--reason", "all clear"])?;
+    t.note(&["task", "cancel", "TASK-5", "--reason", "not wanted", "-o", "name"])?;
+    Ok(())
+}
+
+/// Faults of simulated robots, which only their own process takes.
+async fn faults(t: &mut Transcript) -> anyhow::Result<()> {
+    let address = free_port()?;
+    let mut command = Command::new(&t.program);
+    command.args(["dev", "--robots", "2", "--seed", "7", "--keep-open", "0", "--listen", &address.to_string()]);
+    let _dev = Running::start(&mut command, &t.dir.join("dev.log"))?;
+    until("the simulator's first answer", LIMIT, || async {
+        let world = SimServiceClient::new(channel(address)?).get_world(GetWorldRequest::default()).await;
+        Ok(world.ok().map(|_| ()))
+    })
+    .await?;
+    let server = std::mem::replace(&mut t.server, address.to_string());
+    t.note(&["sim", "fault", "rbt-01", "--obstacle", "5s", "-o", "json"])?;
+    t.note(&["sim", "fault", "rbt-01", "--obstacle", "5s"])?;
+    t.note(&["sim", "fault", "rbt-99", "--jam", "-o", "json"])?;
+    t.note(&["sim", "fault", "rbt-01"])?;
+    t.note(&["sim", "world", "-o", "json"])?;
+    t.server = server;
+    Ok(())
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     let room = Room::open().await?;
@@ -133,10 +221,14 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     t.note(&["robot", "get", "r9", "-o", "json"])?;
     t.note(&["robot", "cordon", "r1", "--reason", "a wheel squeaks", "-o", "json"])?;
     t.note(&["robot", "ls", "-o", "name"])?;
-    t.note(&["zone", "ls", "-o", "json"])?;
+    let places = t.note(&["zone", "ls", "-o", "json"])?;
+    clear(&mut t, &places)?;
+    t.note_stream(&["robot", "watch", "r1", "-o", "json"], 1)?;
     t.note(&["area", "get", "rooms", "-o", "json"])?;
     t.note(&["area", "put", "rooms", "--speed-limit", "1000", "-o", "json"])?;
     t.note(&["area", "put", "rooms", "--speed-limit", "0", "-o", "json"])?;
+    let charging = ["--charge-below", "25", "--charge-callable-above", "40", "--charge-idle-below", "70"];
+    t.note(&[&["area", "put", "rooms", "--charge-to", "85", "-o", "json"][..], &charging].concat())?;
 
     // Tasks, while the robot is out of dispatch.
     let submit = ["task", "submit", "--from", "A", "--to", "B", "--sku", "SKU-1", "--task-id", "TASK-1"];
@@ -179,8 +271,11 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     t.note(&["task", "explain", "TASK-1", "-o", "json"])?;
     t.note(&["task", "cancel", "TASK-2", "--reason", "not wanted", "-o", "json"])?;
     t.note(&["task", "wait", "TASK-2", "-o", "json"])?;
+    t.note_stream(&["task", "watch", "TASK-2", "-o", "json"], 2)?;
     t.note(&["task", "resolve", "TASK-1", "--as", "succeeded", "--reason", "by hand", "-o", "json"])?;
     t.note(&["task", "resume", "--robot", "r1", "--reason", "all clear", "-o", "json"])?;
+    t.note(&["task", "resume", "--robot", "r1"])?;
+    for_people(&mut t)?;
 
     // Lists.
     std::fs::write(t.dir.join("list.jsonl"), LIST)?;
@@ -200,12 +295,17 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     t.note(&["task", "wait", "TASK-1", "-o", "json"])?;
 
     t.note(&["zone", "ls", "-o", "name"])?;
+    t.note(&["doctor", "-o", "json"])?;
+    t.note(&["doctor"])?;
+    t.note(&["sim", "world", "-o", "json"])?;
+    faults(&mut t).await?;
 
     // Without a server.
     t.note(&["map", "lint", "site.toml", "-o", "json"])?;
     t.note(&["map", "show", "site.toml", "-o", "json"])?;
     t.note(&["map", "show", "site.toml"])?;
     t.note(&["migrate", "--data", "elsewhere"])?;
+    t.note(&["migrate", "--data", "elsewhere", "-o", "json"])?;
     bundles(&t.dir)?;
     t.note(&[
         "bundle",

@@ -57,6 +57,24 @@ impl Running {
         self.0.wait()?;
         Ok(())
     }
+    /// Sends a signal by its name, e.g. `INT`.
+    pub fn signal(&self, name: &str) -> anyhow::Result<()> {
+        let sent = Command::new("kill").args(["-s", name, &self.0.id().to_string()]).status()?;
+        anyhow::ensure!(sent.success(), "kill -s {name}: {sent}");
+        Ok(())
+    }
+    /// Waits until it ends by itself; its exit code, none if a signal ended it.
+    pub async fn ends(&mut self) -> anyhow::Result<Option<i32>> {
+        let end = Instant::now() + Duration::from_secs(60);
+        let mut look = tokio::time::interval(LOOK_EVERY);
+        while Instant::now() < end {
+            look.tick().await;
+            if let Some(status) = self.0.try_wait()? {
+                return Ok(status.code());
+            }
+        }
+        bail!("it did not end")
+    }
     /// Whether it has ended by itself.
     pub fn has_ended(&mut self) -> anyhow::Result<bool> {
         Ok(self.0.try_wait()?.is_some())

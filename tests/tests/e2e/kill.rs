@@ -2,14 +2,18 @@
 
 use crate::harness::{Running, Server, midshift, until};
 use midshift::background::request;
+use midshift_agent::ledger::{Holder, Ledger};
+use midshift_agent::sqlite::SqliteStore;
+use midshift_agent::store::Store;
 use midshift_core::site::{DEMO, text};
 use midshift_proto::task::v1::{SubmitTasksRequest, Task, TaskState};
 use midshift_sim::oracle::Oracle;
+use midshift_sim::swarm::AGENT_FILE;
 use midshift_sim::workload::{Workload, WorkloadConfig};
 use rand::rngs::StdRng;
 use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
@@ -56,12 +60,16 @@ impl Robots {
         self.running.insert(id, running);
         Ok(())
     }
-    fn kill_and_restart(&mut self, id: &str) -> anyhow::Result<()> {
-        if let Some(running) = self.running.get_mut(id) {
-            running.kill()?;
-        }
+    fn kill(&mut self, id: &str) -> anyhow::Result<()> {
+        self.running.get_mut(id).map_or(Ok(()), Running::kill)
+    }
+    fn restart(&mut self, id: &str) -> anyhow::Result<()> {
         let number: usize = id.trim_start_matches("rbt-").parse()?;
         self.start(number - 1)
+    }
+    /// What a robot remembers; its agent must not run.
+    async fn ledger(&self, id: &str) -> anyhow::Result<Ledger> {
+        Ok(SqliteStore::open(&self.dir.join(id).join(AGENT_FILE)).await?.load("").await?.ledger)
     }
     fn journals(&self) -> Vec<PathBuf> {
         self.running.keys().map(|id| self.dir.join(id).join("journal.jsonl")).collect()
@@ -74,15 +82,38 @@ async fn done_and_running(server: &Server) -> anyhow::Result<Option<(usize, Vec<
     Ok(done.zip(running).map(|(done, running)| (done.len(), running)))
 }
 
-/// Waits until so many tasks are done and others are provably at work.
-async fn at_work(server: &Server, done: usize, limit: Duration) -> anyhow::Result<Vec<Task>> {
-    until(&format!("{done} tasks done and others at work"), limit, || async {
-        Ok(done_and_running(server)
-            .await?
-            .filter(|(n, running)| *n >= done && running.len() >= 3)
-            .map(|(_, running)| running))
+/// Waits until so many tasks are done and others are at work at robots that were not killed.
+async fn at_work(server: &Server, done: usize, killed: &BTreeSet<String>) -> anyhow::Result<Vec<Task>> {
+    until(&format!("{done} tasks done and others at work"), Duration::from_secs(120), || async {
+        let Some((n, mut running)) = done_and_running(server).await? else { return Ok(None) };
+        running.retain(|task| !killed.contains(&task.robot_id));
+        Ok((n >= done && running.len() >= 3).then_some(running))
     })
     .await
+}
+
+/// Kills an agent that was not killed before and starts it again; what it held, by its own ledger. Again with another one if it had
+/// just finished.
+async fn kill_one_at_work(
+    server: &Server,
+    robots: &mut Robots,
+    done: usize,
+    killed: &mut BTreeSet<String>,
+    rng: &mut StdRng,
+) -> anyhow::Result<Holder> {
+    loop {
+        let running = at_work(server, done, killed).await?;
+        let Some(task) = running.choose(rng) else { anyhow::bail!("nothing is at work") };
+        let id = task.robot_id.clone();
+        robots.kill(&id)?;
+        killed.insert(id.clone());
+        let holder = robots.ledger(&id).await?.holder;
+        robots.restart(&id)?;
+        if let Some(holder) = holder.filter(|h| h.attempt.subject.task_id().is_some()) {
+            return Ok(holder);
+        }
+        say!("{id} held no task when it was killed");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -99,26 +130,35 @@ async fn nothing_is_lost_and_nothing_done_twice_when_server_and_agents_are_kille
         robots.start(number)?;
     }
     submit(&server, &site, seed).await?;
-    let limit = Duration::from_secs(120);
     let mut kills: Vec<(usize, bool)> =
         [(8, true), (16, false), (24, false), (32, true), (40, false), (48, false), (56, true), (62, false)]
             .into_iter()
             .map(|(at, of_server)| (at + rng.random_range(0..6), of_server))
             .collect();
     kills.sort_unstable();
-    let mut inside = Vec::new();
+    // Tasks whose agent died inside a step that must not be done twice: for those a person may be asked.
+    let mut inside = BTreeSet::new();
+    let (mut killed, mut hits) = (BTreeSet::new(), 0);
     for (at, of_server) in kills {
-        let running = at_work(&server, at, limit).await?;
         if of_server {
+            let running = at_work(&server, at, &BTreeSet::new()).await?;
             say!("seed {seed}: kill -9 of the server with {at} done and {} at work", running.len());
             server.kill_and_restart().await?;
             continue;
         }
-        let Some(task) = running.choose(&mut rng) else { anyhow::bail!("nothing is at work") };
-        say!("seed {seed}: kill -9 of {} at work on {} with {at} done", task.robot_id, task.task_id);
-        inside.push(task.task_id.clone());
-        robots.kill_and_restart(&task.robot_id)?;
+        let held = kill_one_at_work(&server, &mut robots, at, &mut killed, &mut rng).await?;
+        hits += 1;
+        say!(
+            "seed {seed}: kill -9 of an agent with {at} done, {} at step {}, {:?}",
+            held.attempt,
+            held.step,
+            held.intent
+        );
+        if let Some(task_id) = held.attempt.subject.task_id().filter(|_| held.intent.is_some()) {
+            inside.insert(task_id.to_string());
+        }
     }
+    assert_eq!(hits, 5, "agents killed at work; {killed:?}");
     let over =
         [TaskState::Succeeded, TaskState::Failed, TaskState::Canceled, TaskState::Expired, TaskState::NeedsOperator];
     let ended = until("the end of every task", Duration::from_secs(240), || async {
@@ -139,7 +179,36 @@ async fn nothing_is_lost_and_nothing_done_twice_when_server_and_agents_are_kille
             say!("open: {} {:?} {} {:?}", task.task_id, task.state(), task.robot_id, task.attempt);
         }
     }
-    judge(&ended?, &inside, &site, &robots)
+    let ended = ended?;
+    judge(&ended, &inside, &site, &robots)?;
+    judge_ledgers(&ended, robots).await
+}
+
+/// Every robot's own memory: a task that succeeded was finished by one robot, once.
+async fn judge_ledgers(tasks: &[Task], mut robots: Robots) -> anyhow::Result<()> {
+    let mut finished: BTreeMap<String, Vec<String>> = BTreeMap::new();
+    let ids: Vec<String> = robots.running.keys().cloned().collect();
+    for id in ids {
+        robots.kill(&id)?;
+        let ledger = robots.ledger(&id).await?;
+        let done = ledger.subjects().keys().filter(|subject| ledger.finished(subject).is_some());
+        for task_id in done.filter_map(|subject| subject.task_id()) {
+            finished.entry(task_id.to_string()).or_default().push(id.clone());
+        }
+    }
+    for task in tasks {
+        let by = finished.get(&task.task_id).map_or(0, Vec::len);
+        let wanted = usize::from(task.state() == TaskState::Succeeded);
+        assert_eq!(
+            by,
+            wanted,
+            "{} ended {:?}, finished by {:?}",
+            task.task_id,
+            task.state(),
+            finished.get(&task.task_id)
+        );
+    }
+    Ok(())
 }
 
 async fn submit(server: &Server, site: &midshift_core::site::Site, seed: u64) -> anyhow::Result<()> {
@@ -157,7 +226,12 @@ async fn submit(server: &Server, site: &midshift_core::site::Site, seed: u64) ->
     Ok(())
 }
 
-fn judge(tasks: &[Task], inside: &[String], site: &midshift_core::site::Site, robots: &Robots) -> anyhow::Result<()> {
+fn judge(
+    tasks: &[Task],
+    inside: &BTreeSet<String>,
+    site: &midshift_core::site::Site,
+    robots: &Robots,
+) -> anyhow::Result<()> {
     let succeeded = tasks.iter().filter(|t| t.state() == TaskState::Succeeded).count();
     let others: Vec<_> = tasks.iter().filter(|t| t.state() != TaskState::Succeeded).collect();
     for task in &others {
@@ -166,7 +240,11 @@ fn judge(tasks: &[Task], inside: &[String], site: &midshift_core::site::Site, ro
     assert!(succeeded * 100 >= TASKS * 95, "{succeeded} of {TASKS} succeeded");
     for task in &others {
         assert_eq!(task.state(), TaskState::NeedsOperator, "{}", task.task_id);
-        assert!(inside.contains(&task.task_id), "{} needs an operator and its agent was not killed", task.task_id);
+        assert!(
+            inside.contains(&task.task_id),
+            "{} needs an operator and no agent was killed inside its step",
+            task.task_id
+        );
     }
     let paths = robots.journals();
     let paths: Vec<&Path> = paths.iter().map(PathBuf::as_path).collect();

@@ -2,11 +2,13 @@
 //!
 //! `cargo xtask test` builds the programs once and says where they are.
 
+mod begin_and_end;
 mod clients;
 mod cut;
 mod golden_cli;
 mod harness;
 mod held;
 mod kill;
+mod measured;
 mod proxy;
 mod room;

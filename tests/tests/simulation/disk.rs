@@ -37,6 +37,7 @@ struct State {
     rng: StdRng,
     unknown: u64,
     refused: u64,
+    slow: u64,
 }
 
 /// The server's disk.
@@ -54,7 +55,7 @@ impl ServerDisk {
     /// A healthy disk over `inner`, watched by `observer`.
     pub fn new(inner: Arc<MemoryStore>, observer: Shared, seed: u64) -> Self {
         let rng = StdRng::seed_from_u64(seed ^ 0x6469_736b);
-        Self { inner, observer, state: Mutex::new(State { mood: Mood::GOOD, rng, unknown: 0, refused: 0 }) }
+        Self { inner, observer, state: Mutex::new(State { mood: Mood::GOOD, rng, unknown: 0, refused: 0, slow: 0 }) }
     }
     fn state(&self) -> std::sync::MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
@@ -63,10 +64,14 @@ impl ServerDisk {
     pub fn set(&self, mood: Mood) {
         self.state().mood = mood;
     }
-    /// Commits with an unknown outcome and calls that were refused, so far.
-    pub fn faults(&self) -> (u64, u64) {
+    /// What it did wrong so far, by name.
+    pub fn hits(&self) -> [(&'static str, u64); 3] {
         let state = self.state();
-        (state.unknown, state.refused)
+        [
+            ("commit without an answer", state.unknown),
+            ("call a disk refused", state.refused),
+            ("commit on a slow disk", state.slow),
+        ]
     }
     fn readable(&self) -> Result<(), Error> {
         let mut state = self.state();
@@ -91,6 +96,7 @@ impl Store for ServerDisk {
         let (before, after) = {
             let mut state = self.state();
             let slow_ms = state.mood.slow_ms;
+            state.slow += u64::from(slow_ms > Mood::GOOD.slow_ms);
             (state.rng.random_range(0..=slow_ms), state.rng.random_range(0..=slow_ms / 2))
         };
         tokio::time::sleep(Duration::from_millis(before)).await;

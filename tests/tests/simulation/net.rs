@@ -1,7 +1,8 @@
-//! Connections over the simulated network, for tonic at both ends.
+//! Connections over the simulated network, for tonic at both ends, and what was written on them while their way was broken.
 
 use hyper_util::rt::TokioIo;
 use midshift_agent::dial::{self, Dial};
+use std::collections::BTreeMap;
 use std::io;
 use std::pin::Pin;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -17,8 +18,70 @@ use turmoil::net::{TcpListener, TcpStream};
 pub const SERVER: &str = "server";
 const PORT: u16 = 7420;
 
+/// How the way between the server and one machine is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Way {
+    /// Everything passes.
+    #[default]
+    Open,
+    /// Nothing passes.
+    Cut,
+    /// Nothing passes from the server.
+    CutDown,
+    /// Nothing passes to the server.
+    CutUp,
+    /// Everything waits.
+    Held,
+}
+
+/// Ways as they are now, and how often somebody wrote on a broken one: a message that was lost or kept waiting, not one that might
+/// have been. Machines by name; what the clients send is not counted.
+#[derive(Clone, Default)]
+pub struct Wire(Arc<Mutex<WireState>>);
+
+#[derive(Default)]
+struct WireState {
+    ways: BTreeMap<String, Way>,
+    deaf: BTreeMap<String, bool>,
+    hits: BTreeMap<&'static str, u64>,
+}
+
+impl Wire {
+    fn state(&self) -> std::sync::MutexGuard<'_, WireState> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+    /// The way to a machine is this from now on.
+    pub fn set_way(&self, machine: &str, way: Way) {
+        self.state().ways.insert(machine.to_owned(), way);
+    }
+    /// A machine hears nothing from now on, or hears again.
+    pub fn set_deaf(&self, machine: &str, deaf: bool) {
+        self.state().deaf.insert(machine.to_owned(), deaf);
+    }
+    /// Messages that were hit, by what became of them.
+    pub fn hits(&self) -> BTreeMap<&'static str, u64> {
+        self.state().hits.clone()
+    }
+    fn wrote(&self, machine: &str, up: bool) {
+        let mut state = self.state();
+        let way = state.ways.get(machine).copied().unwrap_or_default();
+        let hit = match (way, up) {
+            (Way::Cut | Way::CutUp, true) => "message of a robot lost",
+            (Way::Cut | Way::CutDown, false) => "message to a robot lost",
+            (Way::Held, _) => "message held on its way",
+            _ if !up && state.deaf.get(machine) == Some(&true) => "message kept from a robot's ear",
+            _ => return,
+        };
+        *state.hits.entry(hit).or_insert(0) += 1;
+    }
+}
+
 /// One accepted connection.
-pub struct Connection(TcpStream);
+pub struct Connection {
+    stream: TcpStream,
+    machine: String,
+    wire: Wire,
+}
 
 impl Connected for Connection {
     type ConnectInfo = ();
@@ -27,29 +90,34 @@ impl Connected for Connection {
 
 impl AsyncRead for Connection {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.0).poll_read(cx, buf)
+        Pin::new(&mut self.stream).poll_read(cx, buf)
     }
 }
 
 impl AsyncWrite for Connection {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.0).poll_write(cx, buf)
+        let written = Pin::new(&mut self.stream).poll_write(cx, buf);
+        if let Poll::Ready(Ok(1..)) = written {
+            self.wire.wrote(&self.machine, false);
+        }
+        written
     }
     fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.0).poll_flush(cx)
+        Pin::new(&mut self.stream).poll_flush(cx)
     }
     fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.0).poll_shutdown(cx)
+        Pin::new(&mut self.stream).poll_shutdown(cx)
     }
 }
 
 /// What the server accepts.
-pub async fn incoming() -> io::Result<ReceiverStream<io::Result<Connection>>> {
+pub async fn incoming(wire: Wire) -> io::Result<ReceiverStream<io::Result<Connection>>> {
     let listener = TcpListener::bind(("0.0.0.0", PORT)).await?;
     let (sender, accepted) = mpsc::channel(16);
     tokio::spawn(async move {
-        while let Ok((stream, _)) = listener.accept().await {
-            if sender.send(Ok(Connection(stream))).await.is_err() {
+        while let Ok((stream, from)) = listener.accept().await {
+            let machine = turmoil::reverse_lookup(from.ip()).unwrap_or_default();
+            if sender.send(Ok(Connection { stream, machine, wire: wire.clone() })).await.is_err() {
                 return;
             }
         }
@@ -96,6 +164,8 @@ impl Ear {
 struct Heard {
     stream: TcpStream,
     ear: Ear,
+    machine: String,
+    wire: Wire,
 }
 
 impl AsyncRead for Heard {
@@ -109,7 +179,11 @@ impl AsyncRead for Heard {
 
 impl AsyncWrite for Heard {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.stream).poll_write(cx, buf)
+        let written = Pin::new(&mut self.stream).poll_write(cx, buf);
+        if let Poll::Ready(Ok(1..)) = written {
+            self.wire.wrote(&self.machine, true);
+        }
+        written
     }
     fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
         Pin::new(&mut self.stream).poll_flush(cx)
@@ -120,17 +194,24 @@ impl AsyncWrite for Heard {
 }
 
 /// The way of a robot.
-pub struct SimDial(pub Ear);
+pub struct SimDial {
+    /// What it hears with.
+    pub ear: Ear,
+    /// Name of its machine.
+    pub machine: String,
+    /// Who counts what is lost.
+    pub wire: Wire,
+}
 
 #[async_trait::async_trait]
 impl Dial for SimDial {
     async fn dial(&self) -> Result<Channel, dial::Error> {
-        let ear = self.0.clone();
+        let (ear, machine, wire) = (self.ear.clone(), self.machine.clone(), self.wire.clone());
         let connect = move |_: Uri| {
-            let ear = ear.clone();
+            let (ear, machine, wire) = (ear.clone(), machine.clone(), wire.clone());
             async move {
                 let stream = TcpStream::connect((SERVER, PORT)).await?;
-                Ok::<_, io::Error>(TokioIo::new(Heard { stream, ear }))
+                Ok::<_, io::Error>(TokioIo::new(Heard { stream, ear, machine, wire }))
             }
         };
         let connected = dial::endpoint(&uri())?.connect_with_connector(tower::service_fn(connect)).await;

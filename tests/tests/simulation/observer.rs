@@ -168,7 +168,8 @@ impl Observer {
         *self.counts.entry(what.into()).or_insert(0) += 1;
     }
 
-    fn check(&mut self, law: &'static str, holds: bool, what: impl FnOnce() -> String) {
+    /// Looks at a law once.
+    pub fn check(&mut self, law: &'static str, holds: bool, what: impl FnOnce() -> String) {
         *self.checks.entry(law).or_insert(0) += 1;
         if !holds {
             self.find(format!("{law}: {}", what()));
@@ -268,7 +269,7 @@ impl Observer {
         }
         self.check("I2 epochs rise", epoch > highest, || format!("{subject}/{epoch} granted after {highest}"));
         let Some(task_id) = subject.task_id() else { return self.count("errand given") };
-        self.count("task given");
+        self.count(if epoch == 1 { "task given" } else { "task given again" });
         let elsewhere = self.world.clone().and_then(|world| {
             let world = lock(&world);
             let of_task = |work: &midshift_sim::journal::Work| work.task_id == *task_id;

@@ -7,7 +7,7 @@ use crate::body::WatchedBody;
 use crate::client;
 use crate::clock::{MachineClock, Skew, TrueTime};
 use crate::disk::{RobotDisk, ServerDisk};
-use crate::net::{self, Ear, SERVER, SimDial};
+use crate::net::{self, Ear, SERVER, SimDial, Wire};
 use crate::observer::Shared;
 use crate::plan::ROBOTS;
 use midshift::server::{Parts, Server};
@@ -77,6 +77,8 @@ pub struct Room {
     pub desk: Rc<client::Desk>,
     /// What each robot hears.
     pub ears: Vec<Ear>,
+    /// Ways to the robots, and what was written on broken ones.
+    pub wire: Wire,
     steps: u64,
 }
 
@@ -115,17 +117,18 @@ impl Room {
         let of_hall = HallConfig { faults: config.faults, ..HallConfig::new(site.clone(), ROBOTS, config.seed) };
         let hall = Arc::new(Hall::open(&of_hall, &clock.now())?);
         observer.look().watch_world(hall.worlds()[0].clone());
-        serve(&mut sim, &time, &site, disk.clone(), frames, config.naive);
+        let wire = Wire::default();
+        serve(&mut sim, &time, &site, disk.clone(), frames, config.naive, &wire);
         let ears: Vec<Ear> = (0..ROBOTS).map(|_| Ear::default()).collect();
         for (robot, ear) in ears.iter().enumerate() {
             let skew = config.skews.get(robot).copied().unwrap_or_default();
-            let agent = Agent::new(robot, &hall, &time, &observer, skew, ear, config);
+            let agent = Agent::new(robot, &hall, &time, &observer, skew, (ear, &wire), config);
             run_agent(&mut sim, machine(robot), agent);
         }
         let desk = Rc::new(client::Desk::default());
         let of_client = desk.clone();
         sim.host(CLIENT, move || client::run(of_client.clone()));
-        Ok(Self { sim, time, observer, hall, disk, desk, ears, steps: 0 })
+        Ok(Self { sim, time, observer, hall, disk, desk, ears, wire, steps: 0 })
     }
     /// True time so far, milliseconds.
     pub fn now_ms(&self) -> u64 {
@@ -194,10 +197,12 @@ fn serve(
     disk: Arc<ServerDisk>,
     frames: Arc<dyn FrameLog>,
     naive: Naive,
+    wire: &Wire,
 ) {
-    let (time, site) = (time.clone(), site.clone());
+    let (time, site, wire) = (time.clone(), site.clone(), wire.clone());
     sim.host(SERVER, move || {
         let (time, site, disk, frames) = (time.clone(), site.clone(), disk.clone(), frames.clone());
+        let wire = wire.clone();
         async move {
             loop {
                 let parts = Parts {
@@ -212,7 +217,7 @@ fn serve(
                 };
                 // A service manager starts a server again that could not read its disk.
                 if let Ok(server) = Server::new(parts, CancellationToken::new()).await {
-                    server.serve(net::incoming().await?).await?;
+                    server.serve(net::incoming(wire.clone()).await?).await?;
                 }
                 tokio::time::sleep(Duration::from_millis(500)).await;
             }
@@ -230,6 +235,7 @@ struct Agent {
     observer: Shared,
     skew: Skew,
     ear: Ear,
+    wire: Wire,
     memory: RobotMemory,
     bugs: Bugs,
     lives: Arc<AtomicU64>,
@@ -242,7 +248,7 @@ impl Agent {
         time: &TrueTime,
         observer: &Shared,
         skew: Skew,
-        ear: &Ear,
+        (ear, wire): (&Ear, &Wire),
         config: &RoomConfig,
     ) -> Self {
         Self {
@@ -253,6 +259,7 @@ impl Agent {
             observer: observer.clone(),
             skew,
             ear: ear.clone(),
+            wire: wire.clone(),
             memory: RobotMemory::new(),
             bugs: config.naive.agent,
             lives: Arc::default(),
@@ -279,7 +286,7 @@ impl Agent {
         let disk = RobotDisk::open(self.memory.clone(), robot_id.clone(), self.observer.clone(), number);
         let clock: Arc<dyn Clock> = MachineClock::boot(&self.time, self.skew);
         let never = CancellationToken::new();
-        let dial = Arc::new(SimDial(self.ear.clone()));
+        let dial = Arc::new(SimDial { ear: self.ear.clone(), machine: machine(self.robot), wire: self.wire.clone() });
         let end = session::run(config, Box::new(witness), Box::new(disk), clock, dial, never).await?;
         self.observer.look().find(format!("the agent of {robot_id} ended: {end:?}"));
         std::future::pending().await

@@ -30,9 +30,15 @@ pub enum Verb {
         /// Below this a robot must charge, percent.
         #[arg(long)]
         charge_below: Option<u32>,
+        /// Below this an idle robot charges when nothing waits, percent.
+        #[arg(long)]
+        charge_idle_below: Option<u32>,
         /// Charging ends here, percent.
         #[arg(long)]
         charge_to: Option<u32>,
+        /// Above this a charging robot may be called to work, percent.
+        #[arg(long)]
+        charge_callable_above: Option<u32>,
         #[command(flatten)]
         change: Change,
     },
@@ -47,15 +53,28 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
                 call.fleet().await?.get_area_policy(unary(request)).await?.into_inner().policy.unwrap_or_default();
             show(&policy, out)
         }
-        Verb::Put { call, area_id, speed_limit, avoidance_distance, charge_below, charge_to, change } => {
+        Verb::Put {
+            call,
+            area_id,
+            speed_limit,
+            avoidance_distance,
+            charge_below,
+            charge_idle_below,
+            charge_to,
+            charge_callable_above,
+            change,
+        } => {
+            let permille = |percent: Option<u32>| percent.map(|p| p.saturating_mul(10));
             let mut client = call.fleet().await?;
             let request = v1::GetAreaPolicyRequest { area_id };
             let old = client.get_area_policy(unary(request)).await?.into_inner().policy.unwrap_or_default();
             let policy = v1::AreaPolicy {
                 speed_limit_mm_s: speed_limit.or(old.speed_limit_mm_s),
                 avoidance_distance_mm: avoidance_distance.or(old.avoidance_distance_mm),
-                charge_mandatory_permille: charge_below.map(|p| p * 10).or(old.charge_mandatory_permille),
-                charge_stop_permille: charge_to.map(|p| p * 10).or(old.charge_stop_permille),
+                charge_mandatory_permille: permille(charge_below).or(old.charge_mandatory_permille),
+                charge_opportunistic_permille: permille(charge_idle_below).or(old.charge_opportunistic_permille),
+                charge_stop_permille: permille(charge_to).or(old.charge_stop_permille),
+                charge_preemptible_permille: permille(charge_callable_above).or(old.charge_preemptible_permille),
                 ..old
             };
             let request = v1::PutAreaPolicyRequest {

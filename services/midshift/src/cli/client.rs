@@ -17,6 +17,10 @@ const CONNECT_WITHIN: Duration = Duration::from_secs(3);
 /// Longest unary call.
 const CALL_WITHIN: Duration = Duration::from_secs(30);
 
+/// What a server says to a call that it does not know.
+const NOT_THERE: &str = "this server does not know the call\n  try: faults and worlds are with `midshift dev` or `midshift sim run --listen`; \
+     for anything else look at the server's version";
+
 /// Which server.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Call {
@@ -45,6 +49,12 @@ impl Exit {
     pub fn report(&self, out: &Out) -> ExitCode {
         out.say(&format!("error: {}", self.text));
         ExitCode::from(self.code)
+    }
+}
+
+impl std::fmt::Display for Exit {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.text)
     }
 }
 
@@ -85,6 +95,7 @@ impl From<Status> for Exit {
         };
         let violations = answer.violations.iter().map(|v| (v.field.as_str(), v.description.as_str()));
         let mut text = broken_rules(violations).unwrap_or_else(|| match status.message() {
+            _ if status.code() == Code::Unimplemented => NOT_THERE.to_owned(),
             "" => status.code().to_string(),
             message => message.to_owned(),
         });

@@ -2,6 +2,7 @@
 
 use super::client::{Call, Exit, unary};
 use super::out::{Format, Out, columns};
+use midshift_proto::task::v1::{ListTasksRequest, TaskFilter, TaskState};
 use midshift_proto::telemetry::v1;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
@@ -10,6 +11,14 @@ use tonic_health::pb::health_client::HealthClient;
 const SKEW_MAX_MS: i64 = 2_000;
 /// Descriptors a server for a thousand robots should have.
 const DESCRIPTORS_WANTED: u64 = 4_096;
+
+/// Every service of a server.
+const SERVICES: [&str; 4] = [
+    "midshift.task.v1.TaskService",
+    "midshift.fleet.v1.FleetService",
+    "midshift.telemetry.v1.TelemetryService",
+    "midshift.link.v1.LinkService",
+];
 
 struct Finding {
     what: &'static str,
@@ -33,7 +42,7 @@ pub async fn run(call: &Call, out: &Out) -> Result<(), Exit> {
         Format::Json | Format::Jsonl => {
             let list: Vec<_> =
                 found.iter().map(|f| serde_json::json!({"check": f.what, "good": f.good, "text": f.text})).collect();
-            out.line(&serde_json::Value::from(list).to_string());
+            out.value(&list.into())?;
         }
         Format::Name => found.iter().filter(|f| !f.good).for_each(|f| out.line(f.what)),
         Format::Table => {
@@ -69,9 +78,7 @@ async fn server(call: &Call, found: &mut Vec<Finding>) -> Result<(), Exit> {
     let endpoint = tonic::transport::Endpoint::from_shared(crate::robots::uri(&call.server))
         .map_err(|e| Exit::usage(e.to_string()))?;
     let channel = endpoint.connect().await.map_err(|e| Exit::new(5, e.to_string()))?;
-    for service in
-        ["midshift.task.v1.TaskService", "midshift.fleet.v1.FleetService", "midshift.telemetry.v1.TelemetryService"]
-    {
+    for service in SERVICES {
         let request = tonic_health::pb::HealthCheckRequest { service: service.to_owned() };
         let status = HealthClient::new(channel.clone()).check(unary(request)).await.map(|r| r.into_inner().status());
         let good = matches!(status, Ok(ServingStatus::Serving));
@@ -81,34 +88,47 @@ async fn server(call: &Call, found: &mut Vec<Finding>) -> Result<(), Exit> {
             text: format!("{service} {}", if good { "serves" } else { "does not serve" }),
         });
     }
+    found.push(store(call).await);
+    found.extend(robots(call).await?);
+    found.push(operator(call).await?);
+    Ok(())
+}
+
+/// Intake answers this from the store's rows, not from memory.
+async fn store(call: &Call) -> Finding {
+    let read = async {
+        let request = ListTasksRequest { page_size: 1, ..ListTasksRequest::default() };
+        Ok::<_, Exit>(call.task().await?.list_tasks(unary(request)).await?)
+    };
+    let (good, text) = match read.await {
+        Ok(_) => (true, "rows can be read".to_owned()),
+        Err(exit) => (false, format!("rows cannot be read: {exit}")),
+    };
+    Finding { what: "store", good, text }
+}
+
+async fn robots(call: &Call) -> Result<[Finding; 2], Exit> {
     let request = v1::ListRobotsRequest { page_size: 1_000, ..v1::ListRobotsRequest::default() };
     let robots = call.telemetry().await?.list_robots(unary(request)).await?.into_inner().robots;
     let online = robots.iter().filter(|r| r.presence() == v1::Presence::Online).count();
-    found.push(Finding {
-        what: "robots",
-        good: online == robots.len(),
-        text: format!("{online} of {} online", robots.len()),
-    });
     let skewed = robots.iter().filter(|r| r.clock_offset_ms.is_some_and(|o| o.abs() > SKEW_MAX_MS)).count();
-    found.push(Finding {
-        what: "clocks",
-        good: skewed == 0,
-        text: format!("{skewed} robots off by more than {SKEW_MAX_MS} ms"),
-    });
-    let waiting = midshift_proto::task::v1::TaskFilter {
-        states: vec![midshift_proto::task::v1::TaskState::NeedsOperator as i32],
-        ..Default::default()
-    };
-    let request = midshift_proto::task::v1::ListTasksRequest {
-        filter: Some(waiting),
-        page_size: 1_000,
-        page_token: String::new(),
-    };
+    Ok([
+        Finding { what: "robots", good: online == robots.len(), text: format!("{online} of {} online", robots.len()) },
+        Finding {
+            what: "clocks",
+            good: skewed == 0,
+            text: format!("{skewed} robots off by more than {SKEW_MAX_MS} ms"),
+        },
+    ])
+}
+
+async fn operator(call: &Call) -> Result<Finding, Exit> {
+    let waiting = TaskFilter { states: vec![TaskState::NeedsOperator as i32], ..TaskFilter::default() };
+    let request = ListTasksRequest { filter: Some(waiting), page_size: 1_000, page_token: String::new() };
     let tasks = call.task().await?.list_tasks(unary(request)).await?.into_inner().tasks.len();
-    found.push(Finding {
+    Ok(Finding {
         what: "operator",
         good: tasks == 0,
         text: format!("{tasks} tasks need an operator: midshift task ls --state needs-operator"),
-    });
-    Ok(())
+    })
 }

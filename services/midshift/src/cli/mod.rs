@@ -186,8 +186,15 @@ async fn develop(args: Dev, out: &Out) -> Result<(), Exit> {
 }
 
 async fn migrate(data: &std::path::Path, out: &Out) -> Result<(), Exit> {
-    for file in midshift_store::migrate(data).await.map_err(anyhow::Error::from)? {
-        out.line(&format!("{}  {} -> {}  {} migrations applied", file.file, file.from, file.to, file.applied.len()));
+    let files = midshift_store::migrate(data).await.map_err(anyhow::Error::from)?;
+    let json = |f: &midshift_store::Migrated| serde_json::json!({"file": f.file, "fromVersion": f.from, "toVersion": f.to, "applied": f.applied.len()});
+    match out.format {
+        Format::Table => files.iter().for_each(|f| {
+            out.line(&format!("{}  {} -> {}  {} migrations applied", f.file, f.from, f.to, f.applied.len()));
+        }),
+        Format::Name => files.iter().for_each(|f| out.line(f.file)),
+        Format::Json => out.value(&files.iter().map(json).collect())?,
+        Format::Jsonl => files.iter().map(json).try_for_each(|file| out.value(&file))?,
     }
     Ok(())
 }

@@ -45,8 +45,11 @@ impl Out {
     }
     /// A message as JSON.
     pub fn json<M: Message + Name>(&self, message: &M) -> anyhow::Result<()> {
-        let value = midshift_proto::json::to_json(message)?;
-        let text = if self.format == Format::Jsonl { value.to_string() } else { serde_json::to_string_pretty(&value)? };
+        self.value(&midshift_proto::json::to_json(message)?)
+    }
+    /// A JSON document.
+    pub fn value(&self, value: &serde_json::Value) -> anyhow::Result<()> {
+        let text = if self.format == Format::Jsonl { value.to_string() } else { serde_json::to_string_pretty(value)? };
         self.line(&text);
         Ok(())
     }

@@ -4,6 +4,7 @@ use super::client::{Call, Change, Exit, unary};
 use super::out::{Format, Out};
 use clap::Subcommand;
 use midshift_proto::fleet::v1 as fleet;
+use midshift_proto::json;
 use midshift_proto::link::v1 as link;
 use midshift_proto::telemetry::v1;
 use std::time::Duration;
@@ -160,15 +161,29 @@ async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
 async fn get(one: &One, out: &Out) -> Result<(), Exit> {
     let request = v1::GetRobotRequest { robot_id: one.robot_id.clone() };
     let answer = one.call.telemetry().await?.get_robot(unary(request)).await?.into_inner();
-    let robot = answer.robot.clone().unwrap_or_default();
+    let robot = answer.robot.unwrap_or_default();
     let request = fleet::GetRobotControlRequest { robot_id: one.robot_id.clone() };
     let control =
         one.call.fleet().await?.get_robot_control(unary(request)).await?.into_inner().control.unwrap_or_default();
-    out.one(&answer, &robot.robot_id, || {
-        let clone = if robot.observed { "\nanother machine is attached under this name; it gets no work" } else { "" };
-        format!("{}\n{}{clone}", super::out::columns(&HEADER, &[row(&robot)]), control_line(&control))
-    })?;
+    match out.format {
+        Format::Table => {
+            out.line(&super::out::columns(&HEADER, &[row(&robot)]));
+            if robot.observed {
+                out.line("another machine is attached under this name; it gets no work");
+            }
+            out.line(&control_line(&control));
+        }
+        Format::Name => out.line(&robot.robot_id),
+        Format::Json | Format::Jsonl => {
+            out.value(&both(&robot, &control)?)?;
+        }
+    }
     Ok(())
+}
+
+/// What the robot says and what was decided about it, in one document.
+fn both(robot: &v1::Robot, control: &fleet::RobotControl) -> anyhow::Result<serde_json::Value> {
+    Ok(serde_json::json!({"robot": json::to_json(robot)?, "control": json::to_json(control)?}))
 }
 
 async fn watch(call: &Call, robot_ids: Vec<String>, period: Duration, out: &Out) -> Result<(), Exit> {

@@ -89,7 +89,7 @@ pub enum Verb {
         /// These tasks.
         task_ids: Vec<String>,
         /// Why.
-        #[arg(long, default_value = "")]
+        #[arg(long)]
         reason: String,
         #[command(flatten)]
         change: Change,

@@ -1,0 +1,107 @@
+//! How the two servers begin and end: what they refuse to begin with, what they print, and that they leave when asked to.
+
+use crate::harness::{Running, Server, channel, midshift, until};
+use anyhow::Context;
+use midshift_proto::task::v1::WatchTasksRequest;
+use midshift_proto::task::v1::task_service_client::TaskServiceClient;
+use midshift_proto::telemetry::v1::WatchRobotsRequest;
+use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
+use std::net::SocketAddr;
+use std::path::Path;
+use std::process::Command;
+use std::time::Duration;
+
+const LIMIT: Duration = Duration::from_secs(60);
+
+/// The exit code of a command that must end by itself, and what it said.
+async fn refused(dir: &Path, arguments: &[&str]) -> anyhow::Result<(Option<i32>, String)> {
+    let log = dir.join("refused.log");
+    let mut running = Running::start(Command::new(midshift()?).current_dir(dir).args(arguments), &log)?;
+    let code = running.ends().await?;
+    Ok((code, std::fs::read_to_string(log)?))
+}
+
+/// Where a `dev` says that it listens.
+async fn printed_address(log: &Path) -> anyhow::Result<SocketAddr> {
+    until("dev to print where it listens", LIMIT, || async {
+        let said = std::fs::read_to_string(log).unwrap_or_default();
+        let address = said.split("gRPC http://").nth(1).and_then(|rest| rest.split_whitespace().next());
+        Ok(address.and_then(|a| a.parse().ok()))
+    })
+    .await
+}
+
+#[tokio::test]
+async fn serve_refuses_to_leave_loopback_unless_somebody_says_insecure() -> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let (code, said) = refused(dir.path(), &["serve", "--listen", "0.0.0.0:0"]).await?;
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains("0.0.0.0:0 is not loopback") && said.contains("Add --insecure if you mean it"), "{said}");
+    assert!(!dir.path().join("midshift-data").exists(), "it had begun");
+
+    let log = dir.path().join("open.log");
+    let mut command = Command::new(midshift()?);
+    command.current_dir(dir.path()).args(["serve", "--listen", "0.0.0.0:0", "--insecure"]);
+    let mut open = Running::start(&mut command, &log)?;
+    until("the server to say that it serves", LIMIT, || async {
+        Ok(std::fs::read_to_string(&log)?.contains("midshift serves").then_some(()))
+    })
+    .await?;
+    open.signal("TERM")?;
+    assert_eq!(open.ends().await?, Some(0));
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_second_server_on_the_same_data_is_refused_and_the_first_goes_on() -> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let first = Server::start(dir.path()).await?;
+    let data = dir.path().join("data");
+    let data = data.to_str().context("a plain path")?;
+    let (code, said) = refused(dir.path(), &["serve", "--data", data, "--listen", "127.0.0.1:0"]).await?;
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains("is in use by another server; stop it first, or choose another directory"), "{said}");
+    assert!(first.in_states(&[]).await?.is_some(), "the first one answers");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn dev_prints_its_ports_and_ends_cleanly_at_a_signal_while_streams_are_open() -> anyhow::Result<()> {
+    for signal in ["INT", "TERM"] {
+        let dir = tempfile::tempdir()?;
+        let log = dir.path().join("dev.log");
+        let mut command = Command::new(midshift()?);
+        command.args(["dev", "--robots", "2", "--keep-open", "4", "--listen", "127.0.0.1:0"]);
+        let mut dev = Running::start(&mut command, &log)?;
+        let address = printed_address(&log).await?;
+        let said = std::fs::read_to_string(&log)?;
+        for part in [&*format!("metrics http://{address}/metrics"), "task submit", "robot ls", "Ctrl-C ends it."] {
+            assert!(said.contains(part), "no {part} in {said}");
+        }
+        let mut robots = TelemetryServiceClient::new(channel(address)?);
+        let mut robots = robots.watch_robots(WatchRobotsRequest::default()).await?.into_inner();
+        let mut tasks = TaskServiceClient::new(channel(address)?);
+        let mut tasks = tasks.watch_tasks(WatchTasksRequest::default()).await?.into_inner();
+        assert!(robots.message().await?.is_some() && tasks.message().await?.is_some(), "the streams flow");
+        dev.signal(signal)?;
+        // Somebody who goes on reading must come to an end.
+        while let Ok(Some(_)) = tasks.message().await {}
+        while let Ok(Some(_)) = robots.message().await {}
+        assert_eq!(dev.ends().await?, Some(0), "{signal}: {}", std::fs::read_to_string(&log)?);
+        let said = std::fs::read_to_string(&log)?;
+        assert!(!said.contains("error") && !said.contains("panicked"), "{signal}: {said}");
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn dev_ends_at_once_with_an_error_when_its_own_work_is_refused() -> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let list = "task_type,from_waypoint,to_waypoint,timeout_seconds\ntransport,A01,nowhere,300\n";
+    std::fs::write(dir.path().join("list.csv"), list)?;
+    let asked = ["dev", "--robots", "2", "--tasks", "list.csv", "--listen", "127.0.0.1:0"];
+    let (code, said) = refused(dir.path(), &asked).await?;
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains("the client ended before the run was over: background task refused"), "{said}");
+    Ok(())
+}
