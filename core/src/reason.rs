@@ -85,6 +85,7 @@ codes! {
     RobotManual = "ROBOT_MANUAL", "The robot is in manual or service mode.";
     RobotCordoned = "ROBOT_CORDONED", "A person took the robot out of dispatch. Uncordon it.";
     RobotBrokenOff = "ROBOT_BROKEN_OFF", "Three failed attempts in ten minutes took the robot out of dispatch. Look at it, then uncordon it.";
+    RobotDraining = "ROBOT_DRAINING", "The robot is taken out of work for maintenance. It gets work again when its drain is released.";
     RobotHeld = "ROBOT_HELD", "A hold token stands on the robot. Resume it.";
     RobotStopped = "ROBOT_STOPPED", "The robot reports a stop of its own safety system.";
     RobotBusy = "ROBOT_BUSY", "The robot has other work.";
@@ -127,6 +128,8 @@ codes! {
     Forced = "FORCED", "A person ended it by force; robot and places stay kept until the robot reports.";
     CanceledByUser = "CANCELED_BY_USER", "A person or program canceled it.";
     ResolvedByUser = "RESOLVED_BY_USER", "A person resolved it.";
+    DrainSuspend = "DRAIN_SUSPEND", "The robot is taken out of work; the task goes on with another.";
+    SkippedBusy = "SKIPPED_BUSY", "The robot could not be had in time: a step that may not be interrupted, a load, or a task that may not wait. It works on.";
     BatterySuspend = "BATTERY_SUSPEND", "The robot goes to charge first.";
     // --- a robot's refusals and session answers
     StaleAuthority = "STALE_AUTHORITY", "The message reached the robot after its authority had ended, or was anchored to another session.";

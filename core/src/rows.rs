@@ -68,6 +68,7 @@ tables! {
     ServiceClock "service_clock" Fleet, "Serving time of fleet, written with any commit, at most once a second.";
     FleetMark "fleet_mark" Fleet, "Last position of each log that fleet has consumed.";
     Incident "incident" Fleet, "Something a person should look into.";
+    Drain "drain" Fleet, "One taking of a robot out of work for maintenance. id = drain_id.";
     CommandKey "command_key" Fleet, "request_id -> command carried out; kept 7 days.";
     Session "session" Telemetry, "A robot's newest session: epoch, secret, hello inventory. id = robot_id.";
     Presence "presence" Telemetry, "ONLINE, SUSPECT, OFFLINE of a robot. id = robot_id.";

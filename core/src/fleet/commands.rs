@@ -3,7 +3,7 @@
 use super::rows::{CommandKey, Cordon, HolderState, Place, PlaceHolder, RobotControl};
 use super::tx::Tx;
 use super::view::View;
-use super::{Board, heard, incidents};
+use super::{Board, drain, heard, incidents};
 use crate::ids::{PlaceId, RobotId};
 use crate::limits;
 use crate::policy::AreaPolicy;
@@ -28,6 +28,20 @@ pub enum Command {
     },
     /// Back to work; also resets the breaker.
     Uncordon {
+        /// Whom.
+        robot_id: RobotId,
+    },
+    /// Out of work for maintenance: what it does ends or waits, then it parks.
+    Drain {
+        /// Whom.
+        robot_id: RobotId,
+        /// What for.
+        reason: String,
+        /// Milliseconds of site time until it is given up.
+        within_ms: u64,
+    },
+    /// Ends the drains that people asked for.
+    Undrain {
         /// Whom.
         robot_id: RobotId,
     },
@@ -84,9 +98,16 @@ pub fn check(
     seen: Option<Revision>,
 ) -> Result<(), Refusal> {
     let current = match command {
-        Command::Cordon { robot_id, .. } | Command::Uncordon { robot_id } => {
+        Command::Cordon { robot_id, .. }
+        | Command::Uncordon { robot_id }
+        | Command::Drain { robot_id, .. }
+        | Command::Undrain { robot_id } => {
             if !view.sessions.contains_key(robot_id.as_str()) {
                 return Err(Refusal::new(Kind::NotFound, Reason::from(Code::RobotNotFound).with("robot_id", robot_id)));
+            }
+            if let (Command::Drain { .. }, Some(open)) = (command, drain::of(view, robot_id)) {
+                let reason = Reason::from(Code::RobotDraining).with("drain_id", &open.drain_id);
+                return Err(Refusal::new(Kind::Precondition, reason));
             }
             view.control.get(robot_id.as_str()).map_or(Revision(0), |c| c.revision)
         }
@@ -149,6 +170,8 @@ pub fn apply(tx: &mut Tx, command: &Command, actor: &str) {
             control.failures.clear();
             tx.put(control, "robot.uncordoned");
         }
+        Command::Drain { robot_id, reason, within_ms } => drain::ask(tx, robot_id, reason, actor, *within_ms),
+        Command::Undrain { robot_id } => drain::release(tx, robot_id),
         Command::PutPolicy(policy) => {
             tx.put(policy.clone(), "area.policy_put");
             let robots: Vec<RobotId> = tx.view.sessions.values().map(|s| s.row.robot_id.clone()).collect();

@@ -84,12 +84,23 @@ fn wish(
     if settled || view.site.standing_at(here).is_none() {
         return None;
     }
+    park_goal(view, coming, robot_id, here).map(|goal| (Errand::Park, goal))
+}
+
+/// Where a robot that stands at `here` would park; none if it parks already or everything is taken.
+pub(super) fn park_for(view: &View, robot_id: &RobotId, here: WaypointIx) -> Option<WaypointIx> {
+    let parks = view.site.waypoint(here).kind == Kind::Park || view.site.standing_at(here).is_none();
+    if parks { None } else { park_goal(view, &Coming::of(view), robot_id, here) }
+}
+
+fn park_goal(view: &View, coming: &Coming, robot_id: &RobotId, here: WaypointIx) -> Option<WaypointIx> {
+    let free = |goals: &mut dyn Iterator<Item = WaypointIx>| free(view, coming, robot_id, here, goals);
     let goal = match free(&mut view.site.parks()) {
-        None if kind == Kind::Hold => None,
+        None if view.site.waypoint(here).kind == Kind::Hold => None,
         None => free(&mut view.site.hold_points()),
         park => park,
     }?;
-    (goal != here).then_some((Errand::Park, goal))
+    (goal != here).then_some(goal)
 }
 
 /// The nearest of `goals` with room that no other errand is on its way to.
@@ -111,7 +122,8 @@ fn free(
     view.router.nearest(here, open).map(|(at, _)| at)
 }
 
-fn begin(tx: &mut Tx, robot_id: &RobotId, errand: Errand, goal: WaypointIx, board: &Board) {
+/// Begins an errand of a robot that nothing holds.
+pub(super) fn begin(tx: &mut Tx, robot_id: &RobotId, errand: Errand, goal: WaypointIx, board: &Board) {
     let Some(anchor) = anchor(tx.view, robot_id, board, limits::OFFER_VALID) else { return };
     tx.rely::<Session>(robot_id.as_str());
     let known = tx.view.control.get(robot_id.as_str()).map(|c| c.row.clone());

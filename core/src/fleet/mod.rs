@@ -2,7 +2,7 @@
 //!
 //! [`cycle`] takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
 //! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `commands` are what happens; `tasks` moves tasks by
-//! the table; `heard`, `anchor`, `attempts` and `incidents` are what they share; `screen`, `pool` and `assign` give work; `errands`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
+//! the table; `heard`, `anchor`, `attempts` and `incidents` are what they share; `screen`, `pool` and `assign` give work; `errands`, `drain`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod anchor;
@@ -11,6 +11,7 @@ pub mod attempts;
 pub mod bugs;
 pub mod commands;
 pub mod desired;
+pub mod drain;
 pub mod errands;
 pub mod explain;
 pub mod heard;
@@ -222,6 +223,7 @@ pub enum Pace {
 pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Plan) {
     welcome(view, now, board, plan);
     let heard = if pace == Pace::Sweep { sweep(view, now, board, plan) } else { BTreeSet::new() };
+    drain::plan(view, board, now, plan);
     let idle = assign::plan(view, board, now, pace, &heard, plan);
     errands::plan(view, board, now, idle, plan);
     write_down(view, now, board, &desired::Releases::default(), plan);

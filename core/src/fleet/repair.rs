@@ -8,7 +8,7 @@ use super::tasks::{News, happen};
 use super::tx::Tx;
 use super::view::View;
 use super::{Board, Tally, errands, inbox, places, tasks};
-use crate::ids::RobotId;
+use crate::ids::{RobotId, TaskId};
 use crate::reason::{Code, Reason};
 use crate::robot::{HardwareStop, Mode, Presence};
 use crate::task::{Attempt, AttemptPhase, Event, Phase};
@@ -58,14 +58,21 @@ pub fn robot(tx: &mut Tx, robot_id: &RobotId, board: &Board, tally: &mut Tally) 
     forget_reported(tx, robot_id, &live);
 }
 
+/// Whether the task may wait for another robot from its next step boundary on: it runs, lets others go first, and is not opened.
+pub fn may_suspend(view: &View, task_id: &TaskId, live: &Live) -> bool {
+    let Some(task) = view.task(task_id).filter(|t| t.phase == Phase::Running && t.opened.is_none()) else {
+        return false;
+    };
+    let opened = task.attempt_id().and_then(|id| view.attempt(&id)).is_none_or(|a| a.opened);
+    let preemptible = view.intake(task_id).is_some_and(|i| i.spec.preemptible);
+    !opened && preemptible && live.report.load.is_none()
+}
+
 /// A robot at work must charge: a preemptible task that it has not opened waits, at a step boundary.
 fn recharge(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
     let Some(task_id) = tx.view.held_by(robot_id).and_then(|id| id.subject.task_id()).cloned() else { return };
-    let Some(task) = tx.view.task(&task_id).filter(|t| t.phase == Phase::Running && t.opened.is_none()) else { return };
-    let opened = task.attempt_id().and_then(|id| tx.view.attempt(&id)).is_none_or(|a| a.opened);
-    let preemptible = tx.view.intake(&task_id).is_some_and(|i| i.spec.preemptible);
     let vitals = &live.report.vitals;
-    if opened || !preemptible || live.report.load.is_some() || tx.view.site.chargers().next().is_none() {
+    if !may_suspend(tx.view, &task_id, live) || tx.view.site.chargers().next().is_none() {
         return;
     }
     let Some(here) = super::way::find(tx.view, vitals.waypoint.as_ref()) else { return };

@@ -358,6 +358,56 @@ impl Record for Incident {
     }
 }
 
+/// How far a drain is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum DrainState {
+    /// The robot gets no new work; what it has ends or waits, then it parks.
+    Draining,
+    /// The drain holds the robot.
+    Held,
+    /// The robot could not be had in time; it works on.
+    Refused,
+}
+
+/// One taking of a robot out of work.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Drain {
+    /// Never used again.
+    pub drain_id: DrainId,
+    /// Whom.
+    pub robot_id: RobotId,
+    /// How far.
+    pub state: DrainState,
+    /// What for.
+    pub reason: String,
+    /// Who asked.
+    pub actor: String,
+    /// Milliseconds of site time from `since` until it is refused.
+    pub within_ms: u64,
+    /// UTC, site clock.
+    pub since: Utc,
+    /// Why it was refused.
+    pub why: Option<Reason>,
+}
+
+impl Drain {
+    /// A person asked for it, and a person ends it.
+    pub fn is_of_person(&self) -> bool {
+        self.drain_id.as_str().starts_with("op:")
+    }
+}
+
+impl Record for Drain {
+    const TABLE: Table = Table::Drain;
+    fn id(&self) -> String {
+        self.drain_id.to_string()
+    }
+    fn index(&self) -> Index {
+        Index { parent: Some(self.robot_id.as_str().into()), order: Some(self.since.0), ..Index::default() }
+    }
+}
+
 /// A used request_id of a command: the same command again is the same command, and is not carried out twice. Kept 7 days.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CommandKey {

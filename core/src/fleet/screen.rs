@@ -63,6 +63,9 @@ fn decided_by_people(view: &View, robot_id: &RobotId) -> Result<(), Reason> {
             Duty::BrokenOff | Duty::Retired => return Err(Code::RobotBrokenOff.into()),
         }
     }
+    if let Some(drain) = super::drain::of(view, robot_id) {
+        return Err(Reason::from(Code::RobotDraining).with("drain_id", &drain.drain_id));
+    }
     match view.robot_holds(robot_id).next() {
         Some(hold) => Err(Reason::from(Code::RobotHeld).with("token", &hold.token)),
         None => Ok(()),
@@ -242,6 +245,9 @@ pub fn recallable(view: &View, board: &Board, robot_id: &RobotId) -> bool {
     let Some(id) = view.held_by(robot_id) else { return false };
     let Some(a) = view.attempt(id) else { return false };
     let Subject::Errand { .. } = id.subject else { return false };
+    if decided_by_people(view, robot_id).is_err() {
+        return false;
+    }
     let working = matches!(
         a.phase,
         AttemptPhase::Accepted | AttemptPhase::Navigating | AttemptPhase::Executing | AttemptPhase::Paused

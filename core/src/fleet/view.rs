@@ -4,7 +4,7 @@
 //! running cycle will write; after a conflict the whole view is built again, never patched.
 
 use super::rows::{
-    CommandKey, FleetMark, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotCounter, ServiceClock,
+    CommandKey, Drain, FleetMark, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotCounter, ServiceClock,
     SiteRow, Timer,
 };
 use crate::ids::{AttemptId, RobotId, TaskId};
@@ -90,6 +90,8 @@ pub struct View {
     pub marks: Slot<FleetMark>,
     /// What people should look into.
     pub incidents: Slot<Incident>,
+    /// Drains that have not been released.
+    pub drains: Slot<Drain>,
     /// Used request_ids of commands.
     pub command_keys: Slot<CommandKey>,
     /// Newest sessions (telemetry's).
@@ -163,6 +165,7 @@ viewed! {
     FleetMark => marks;
     Incident => incidents;
     CommandKey => command_keys;
+    Drain => drains;
     PresenceRow => presence;
     LaneMark => lane_marks;
 }
@@ -268,6 +271,7 @@ pub const TABLES: &[Table] = &[
     Table::FleetMark,
     Table::Incident,
     Table::CommandKey,
+    Table::Drain,
     Table::Session,
     Table::Presence,
     Table::LaneMark,
@@ -299,6 +303,7 @@ impl View {
             marks: Slot::new(),
             incidents: Slot::new(),
             command_keys: Slot::new(),
+            drains: Slot::new(),
             sessions: Slot::new(),
             presence: Slot::new(),
             lane_marks: Slot::new(),
@@ -353,6 +358,7 @@ impl View {
             Table::ServiceClock => self.take::<ServiceClock>(key, revision, row),
             Table::FleetMark => self.take::<FleetMark>(key, revision, row),
             Table::Incident => self.take::<Incident>(key, revision, row),
+            Table::Drain => self.take::<Drain>(key, revision, row),
             Table::CommandKey => self.take::<CommandKey>(key, revision, row),
             Table::Session => self.take::<Session>(key, revision, row),
             Table::Presence => self.take::<PresenceRow>(key, revision, row),

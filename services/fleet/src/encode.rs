@@ -1,5 +1,6 @@
 //! Rows and explanations as their messages. Nothing is decided here.
 
+use midshift_core::fleet::drain::of as drain_of;
 use midshift_core::fleet::explain::{RobotExplanation, TaskExplanation};
 use midshift_core::fleet::rows::{HolderState, Incident, Place, RobotControl, RobotCounter, RobotHolder};
 use midshift_core::fleet::view::View;
@@ -10,6 +11,7 @@ use midshift_core::rows::Revision;
 use midshift_core::site::PlaceKind;
 use midshift_core::task::state::Errand;
 use midshift_core::time::{Now, Utc};
+use midshift_proto::convert::WireEnum;
 use midshift_proto::convert::task::etag;
 use midshift_proto::convert::{shown, timestamp};
 use midshift_proto::fleet::v1;
@@ -43,8 +45,25 @@ pub fn control(view: &View, robot_id: &RobotId) -> v1::RobotControl {
         } as i32,
         hold_tokens: view.robot_holds(robot_id).map(|h| h.token.clone()).collect(),
         etag: etag(rowed.map_or(Revision(0), |c| c.revision)),
+        drain: drain(view, robot_id),
         work_generation: view.desired_work.get(robot_id.as_str()).map_or(0, |d| d.row.generation),
     }
+}
+
+/// The drain a robot is in, or the last that was refused.
+fn drain(view: &View, robot_id: &RobotId) -> Option<v1::Drain> {
+    let refused = || view.drains.values().map(|d| &d.row).find(|d| d.robot_id == *robot_id);
+    let drain = drain_of(view, robot_id).or_else(refused)?;
+    let within_ms = i64::try_from(drain.within_ms).unwrap_or(i64::MAX);
+    Some(v1::Drain {
+        drain_id: drain.drain_id.to_string(),
+        state: drain.state.to_wire(),
+        reason: drain.reason.clone(),
+        actor: drain.actor.clone(),
+        since: Some(timestamp(drain.since)),
+        deadline: Some(timestamp(Utc(drain.since.0.saturating_add(within_ms)))),
+        why: drain.why.as_ref().map(shown),
+    })
 }
 
 /// An incident.

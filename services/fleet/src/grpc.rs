@@ -9,10 +9,16 @@ use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::rows::Revision;
 use midshift_proto::convert::fleet::encode_policy;
+use midshift_proto::convert::ms_of;
 use midshift_proto::convert::task::revision_of;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService as Face;
 use tonic::{Request, Response, Status};
+
+/// Site time after which a drain is given up, unless the caller says another.
+const DRAIN_WITHIN_MS: i64 = 30 * 60_000;
+/// What a caller may say.
+const DRAIN_MS: std::ops::RangeInclusive<i64> = 1_000..=24 * 3_600_000;
 
 fn request_id(text: &str, bad: &mut Violations) -> Option<String> {
     if !text.is_empty() {
@@ -83,6 +89,36 @@ impl FleetService {
             .await?;
         let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
         Ok(v1::UncordonRobotResponse { control: Some(control) })
+    }
+
+    async fn drain(&self, r: v1::DrainRobotRequest) -> Result<v1::DrainRobotResponse, Refusal> {
+        let mut bad = Violations::default();
+        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        let request_id = request_id(&r.request_id, &mut bad);
+        reason_text(&r.reason, &mut bad);
+        let within_ms = r.within.as_ref().map_or(DRAIN_WITHIN_MS, ms_of);
+        if !DRAIN_MS.contains(&within_ms) {
+            bad.add("within", "must be 1 s to 24 h");
+        }
+        bad.finish()?;
+        let robot_id = robot_id.ok_or_else(internal)?;
+        let (within_ms, reason) = (within_ms.unsigned_abs(), r.reason);
+        let command = Command::Drain { robot_id: robot_id.clone(), reason, within_ms };
+        self.act(command, revision_of(&r.etag), r.validate_only, request_id).await?;
+        let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
+        Ok(v1::DrainRobotResponse { control: Some(control) })
+    }
+
+    async fn undrain(&self, r: v1::UndrainRobotRequest) -> Result<v1::UndrainRobotResponse, Refusal> {
+        let mut bad = Violations::default();
+        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        let request_id = request_id(&r.request_id, &mut bad);
+        bad.finish()?;
+        let robot_id = robot_id.ok_or_else(internal)?;
+        let command = Command::Undrain { robot_id: robot_id.clone() };
+        self.act(command, revision_of(&r.etag), r.validate_only, request_id).await?;
+        let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
+        Ok(v1::UndrainRobotResponse { control: Some(control) })
     }
 
     async fn control(&self, r: v1::GetRobotControlRequest) -> Result<v1::GetRobotControlResponse, Refusal> {
@@ -253,6 +289,15 @@ impl Face for FleetService {
         r: Request<v1::UncordonRobotRequest>,
     ) -> Result<Response<v1::UncordonRobotResponse>, Status> {
         answer(self.uncordon(r.into_inner()).await)
+    }
+    async fn drain_robot(&self, r: Request<v1::DrainRobotRequest>) -> Result<Response<v1::DrainRobotResponse>, Status> {
+        answer(self.drain(r.into_inner()).await)
+    }
+    async fn undrain_robot(
+        &self,
+        r: Request<v1::UndrainRobotRequest>,
+    ) -> Result<Response<v1::UndrainRobotResponse>, Status> {
+        answer(self.undrain(r.into_inner()).await)
     }
     async fn get_robot_control(
         &self,

@@ -53,6 +53,17 @@ CREATE TABLE desired_work (
     UNIQUE (site_id, id)
 );
 
+CREATE TABLE drain (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE TABLE fleet_event (
     site_id TEXT NOT NULL,
     seq BIGINT NOT NULL,

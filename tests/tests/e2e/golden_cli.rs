@@ -294,6 +294,14 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     until("the robot stands", LIMIT, || async { Ok(robot.body.lock().idle_since().map(|_| ())) }).await?;
     t.note(&["task", "wait", "TASK-1", "-o", "json"])?;
 
+    // Maintenance, and what a person should look into.
+    t.note(&["robot", "drain", "r1", "--reason", "new wheels", "--within", "10s", "-o", "name"])?;
+    t.note(&["robot", "drain", "r1", "--reason", "new wheels"])?;
+    t.note(&["robot", "undrain", "r1", "-o", "name"])?;
+    t.note(&["incident", "ls", "-o", "json"])?;
+    t.note(&["incident", "ls"])?;
+    t.note(&["incident", "close", "nothing", "--reason", "I looked"])?;
+
     t.note(&["zone", "ls", "-o", "name"])?;
     t.note(&["doctor", "-o", "json"])?;
     t.note(&["doctor"])?;

@@ -5,6 +5,8 @@ use midshift_core::reason::Code;
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::Phase;
 use midshift_core::task::state::Errand;
+use midshift_proto::fleet::v1;
+use midshift_proto::fleet::v1::fleet_service_server::FleetService;
 
 #[tokio::test(start_paused = true)]
 async fn a_robot_with_little_charge_is_sent_to_a_charger_before_any_task() {
@@ -96,6 +98,23 @@ async fn a_robot_that_must_charge_is_not_called_back_before_it_may() {
     w.until_phase("T1", Phase::Running).await;
     w.r("r1").works = true;
     w.until_phase("T1", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_cordoned_robot_that_charges_is_not_called_back_for_work_it_may_not_have() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-b").await;
+    w.r("r1").battery_permille = 150;
+    w.r("r1").works = false;
+    w.beat("r1");
+    let charges = |s: &crate::harness::Seen| s.errand("r1").is_some_and(|(e, _)| e == Errand::Charge);
+    w.until("it charges", charges).await;
+    let request = v1::CordonRobotRequest { robot_id: "r1".into(), reason: "a look".into(), ..Default::default() };
+    w.fleet.cordon_robot(tonic::Request::new(request)).await.expect("is cordoned");
+    w.r("r1").battery_permille = 800;
+    w.submit("T1", "A", "B").await;
+    w.pass_while(60, "it goes on charging", charges).await;
     w.lawful().await;
 }
 

@@ -3,6 +3,7 @@
 
 mod harness;
 
+mod drains;
 mod errands;
 mod explain;
 mod holds;

@@ -54,6 +54,32 @@ pub enum Verb {
         #[command(flatten)]
         change: Change,
     },
+    /// Out of work for maintenance: its task ends or waits, it parks, and then nothing moves it.
+    Drain {
+        #[command(flatten)]
+        one: One,
+        /// What for.
+        #[arg(long)]
+        reason: String,
+        /// Site time after which it is given up and the robot works on.
+        #[arg(long, value_parser = super::duration, default_value = "30m")]
+        within: Duration,
+        /// Only if it is still as this etag says.
+        #[arg(long, default_value = "")]
+        if_match: String,
+        #[command(flatten)]
+        change: Change,
+    },
+    /// Back to work after a drain.
+    Undrain {
+        #[command(flatten)]
+        one: One,
+        /// Only if it is still as this etag says.
+        #[arg(long, default_value = "")]
+        if_match: String,
+        #[command(flatten)]
+        change: Change,
+    },
 }
 
 /// One robot.
@@ -93,6 +119,32 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
                 validate_only: change.dry_run,
             };
             let answer = one.call.fleet().await?.uncordon_robot(unary(request)).await?.into_inner();
+            control(&answer.control.unwrap_or_default(), out)?;
+            Ok(())
+        }
+        Verb::Drain { one, reason, within, if_match, change } => {
+            let within_ms = u64::try_from(within.as_millis()).unwrap_or(u64::MAX);
+            let request = fleet::DrainRobotRequest {
+                robot_id: one.robot_id.clone(),
+                request_id: change.request_id,
+                etag: if_match,
+                reason,
+                within: Some(midshift_proto::convert::duration(within_ms)),
+                validate_only: change.dry_run,
+            };
+            let answer = one.call.fleet().await?.drain_robot(unary(request)).await?.into_inner();
+            control(&answer.control.unwrap_or_default(), out)?;
+            out.next(&format!("midshift robot get {0}; midshift robot undrain {0}", one.robot_id));
+            Ok(())
+        }
+        Verb::Undrain { one, if_match, change } => {
+            let request = fleet::UndrainRobotRequest {
+                robot_id: one.robot_id,
+                request_id: change.request_id,
+                etag: if_match,
+                validate_only: change.dry_run,
+            };
+            let answer = one.call.fleet().await?.undrain_robot(unary(request)).await?.into_inner();
             control(&answer.control.unwrap_or_default(), out)?;
             Ok(())
         }

@@ -66,6 +66,7 @@ pub(crate) const CONTROL: &[Migration] = migrations!["control":
     "0042_incident_by_state",
     "0043_incident_by_ord",
     "0044_command_key",
+    "0045_drain",
 ];
 
 /// Of `telemetry.db`.

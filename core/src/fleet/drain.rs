@@ -1,0 +1,154 @@
+//! Takes robots out of work for maintenance and gives them back: the task at hand ends or waits at a step boundary, the robot parks, and
+//! only then the drain holds it.
+//!
+//! Invariant: a drain takes the robot's mutex only from none, and gives it back only from itself; it never cuts a grasp and never leaves a
+//! robot in a lane. A drain whose deadline passes is refused and the robot works on.
+
+use super::rows::{Drain, DrainState, RobotAuthority, RobotHolder};
+use super::tx::Tx;
+use super::view::View;
+use super::{Board, Plan, errands, heard, repair, way};
+use crate::ids::{DrainId, RobotId};
+use crate::reason::{Code, Reason};
+use crate::site::Kind;
+use crate::task::Event;
+use crate::task::state::Errand;
+use crate::time::Now;
+use crate::work::{Live, StepKind};
+
+/// Speed that an estimate of a task's rest counts with, millimetres per second.
+const PLANNED_MM_S: u64 = 600;
+/// Time of one action that an estimate counts with, milliseconds of site time.
+const PLANNED_ACTION_MS: u64 = 20_000;
+
+/// The drain that the robot is in: the oldest that has not ended.
+pub fn of<'a>(view: &'a View, robot_id: &RobotId) -> Option<&'a Drain> {
+    let drains =
+        view.drains.values().map(|d| &d.row).filter(|d| d.robot_id == *robot_id && d.state != DrainState::Refused);
+    drains.min_by_key(|d| (d.since, d.drain_id.clone()))
+}
+
+/// Asks for a drain on behalf of a person. Its id is never used again.
+pub fn ask(tx: &mut Tx, robot_id: &RobotId, reason: &str, actor: &str, within_ms: u64) {
+    let over =
+        tx.view.drains.values().map(|d| &d.row).filter(|d| d.robot_id == *robot_id && d.state == DrainState::Refused);
+    let over: Vec<DrainId> = over.map(|d| d.drain_id.clone()).collect();
+    over.iter().for_each(|id| tx.delete::<Drain>(id.as_str(), "drain.forgotten"));
+    let wall = tx.now.wall.0.max(0);
+    let free = (0..).map(|n| format!("op:{wall}.{n}")).find(|id| !tx.view.drains.contains_key(id));
+    let Some(drain_id) = free.and_then(|id| DrainId::parse(&id).ok()) else { return };
+    let drain = Drain {
+        drain_id,
+        robot_id: robot_id.clone(),
+        state: DrainState::Draining,
+        reason: reason.to_owned(),
+        actor: actor.to_owned(),
+        within_ms,
+        since: tx.now.utc,
+        why: None,
+    };
+    tx.put(drain, "drain.asked");
+}
+
+/// Ends every drain of the robot that a person asked for, and gives the robot back to work.
+pub fn release(tx: &mut Tx, robot_id: &RobotId) {
+    let asked = tx.view.drains.values().map(|d| &d.row).filter(|d| d.robot_id == *robot_id && d.is_of_person());
+    let asked: Vec<DrainId> = asked.map(|d| d.drain_id.clone()).collect();
+    for drain_id in asked {
+        let held = tx.view.authority.get(robot_id.as_str()).map(|a| a.row.holder.clone());
+        if held == Some(RobotHolder::Maintenance(drain_id.clone())) {
+            tx.put(RobotAuthority { robot_id: robot_id.clone(), holder: RobotHolder::None }, "robot.freed");
+        }
+        tx.delete::<Drain>(drain_id.as_str(), "drain.released");
+    }
+}
+
+/// Brings every drain a step further.
+pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
+    let open: Vec<Drain> =
+        view.drains.values().map(|d| &d.row).filter(|d| d.state == DrainState::Draining).cloned().collect();
+    for drain in open {
+        if of(view, &drain.robot_id).is_some_and(|first| first.drain_id != drain.drain_id) {
+            continue;
+        }
+        plan.decide(view, now, "fleet", |tx| further(tx, &drain, board));
+    }
+}
+
+fn further(tx: &mut Tx, drain: &Drain, board: &Board) {
+    let left_ms = drain.within_ms.saturating_sub(tx.now.utc.ms_since(drain.since));
+    let holder = tx.view.authority.get(drain.robot_id.as_str()).map(|a| a.row.holder.clone()).unwrap_or_default();
+    let live = board.get(&drain.robot_id).cloned();
+    match holder {
+        RobotHolder::Maintenance(_) => {}
+        RobotHolder::None if is_at_rest(tx.view, drain, live.as_deref()) => take(tx, drain),
+        _ if left_ms == 0 => refuse(tx, drain),
+        RobotHolder::None => {
+            if let Some(live) = live {
+                park(tx, drain, &live, board);
+            }
+        }
+        RobotHolder::Attempt(id) => match id.subject.task_id() {
+            Some(task_id) => {
+                let suspends = live.is_some_and(|live| {
+                    repair::may_suspend(tx.view, task_id, &live) && rest_ms(tx.view, task_id, &live) > left_ms
+                });
+                if suspends {
+                    let why = Reason::from(Code::DrainSuspend).with("drain_id", &drain.drain_id);
+                    super::tasks::happen(tx, task_id, super::tasks::News::of(Event::Suspend, Some(&why)));
+                }
+            }
+            // A charge ends as it is: the robot keeps its place. A way to a park goes on.
+            None => {
+                let charges = tx.view.attempt(&id).is_some_and(|a| a.errand == Some(Errand::Charge));
+                if charges {
+                    errands::stop(tx, &drain.robot_id);
+                }
+            }
+        },
+    }
+}
+
+/// Milliseconds of site time that the rest of a task will take, as far as one can tell.
+fn rest_ms(view: &View, task_id: &crate::ids::TaskId, live: &Live) -> u64 {
+    let Some((task, intake)) = view.task(task_id).zip(view.intake(task_id)) else { return 0 };
+    let done = live.report.attempts.iter().map(|a| a.step_index).max().unwrap_or(task.next_step) as usize;
+    let steps = &intake.spec.steps;
+    let actions = steps.iter().skip(done).filter(|s| !matches!(s.kind, StepKind::Goto { .. })).count() as u64;
+    let goals: Option<Vec<_>> = intake.spec.goals(done).map(|goal| view.site.find(goal)).collect();
+    let here = way::find(view, live.report.vitals.waypoint.as_ref());
+    let way_mm = here.zip(goals).and_then(|(here, goals)| way::length_mm(view, here, &goals)).unwrap_or(0);
+    way_mm * 1_000 / PLANNED_MM_S + actions * PLANNED_ACTION_MS
+}
+
+/// The robot stands where it may stand for long, and what it says is newer than what it last did. One that was never heard rests too.
+fn is_at_rest(view: &View, drain: &Drain, live: Option<&Live>) -> bool {
+    let Some(live) = live else { return true };
+    let Some(here) = way::find(view, live.report.vitals.waypoint.as_ref()) else { return false };
+    let idle = live.report.attempts.iter().all(|a| a.state.is_over()) && live.report.vitals.speed_mm_s == 0;
+    let resting = matches!(view.site.waypoint(here).kind, Kind::Park | Kind::Hold | Kind::Charger);
+    let nowhere_better = errands::park_for(view, &drain.robot_id, here).is_none();
+    idle && heard::is_settled(view, live) && heard::is_fresh(view, live) && (resting || nowhere_better)
+}
+
+fn park(tx: &mut Tx, drain: &Drain, live: &Live, board: &Board) {
+    let quiet = live.report.attempts.iter().all(|a| a.state.is_over()) && heard::is_settled(tx.view, live);
+    let unwilling = tx.view.unwilling.get(&drain.robot_id).is_some_and(|until| tx.now.link < *until);
+    let here = way::find(tx.view, live.report.vitals.waypoint.as_ref());
+    if let Some(goal) =
+        here.filter(|_| quiet && !unwilling).and_then(|h| errands::park_for(tx.view, &drain.robot_id, h))
+    {
+        errands::begin(tx, &drain.robot_id, Errand::Park, goal, board);
+    }
+}
+
+fn take(tx: &mut Tx, drain: &Drain) {
+    let holder = RobotHolder::Maintenance(drain.drain_id.clone());
+    tx.put(RobotAuthority { robot_id: drain.robot_id.clone(), holder }, "robot.drained");
+    tx.put(Drain { state: DrainState::Held, ..drain.clone() }, "drain.held");
+}
+
+fn refuse(tx: &mut Tx, drain: &Drain) {
+    let why = Some(Reason::from(Code::SkippedBusy).with("within_ms", drain.within_ms));
+    tx.put(Drain { state: DrainState::Refused, why, ..drain.clone() }, "drain.refused");
+}
