@@ -368,6 +368,9 @@ impl View {
     }
 
     fn take<R: Viewed>(&mut self, key: &Key, revision: Revision, row: Option<&Row>) -> Result<(), BadRow> {
+        if let (Table::TaskState, None, Ok(task_id)) = (key.table, row, TaskId::parse(&key.id)) {
+            self.ended.remove(&task_id);
+        }
         let known = R::slot(self).get(&*key.id).map(|r| r.revision);
         if known.is_some_and(|k| k >= revision) || (known.is_none() && self.is_past(key)) {
             return Ok(());

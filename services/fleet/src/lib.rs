@@ -6,6 +6,9 @@
 mod encode;
 mod grpc;
 mod reconcile;
+mod retention;
+
+pub use retention::prune;
 
 use midshift_core::fleet::Board;
 use midshift_core::fleet::commands::Command;

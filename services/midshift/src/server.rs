@@ -258,6 +258,9 @@ async fn prune(task: TaskService, store: Arc<dyn Store>, frames: Arc<dyn FrameLo
         if let Err(error) = task.prune().await {
             tracing::warn!(%error, "old requests could not be taken away");
         }
+        if let Err(error) = midshift_fleet::prune(store.as_ref(), clock.as_ref()).await {
+            tracing::warn!(%error, "tasks that ended long ago could not be taken away");
+        }
         if let Err(error) = prune_entries(store.as_ref(), clock.as_ref()).await {
             tracing::warn!(%error, "old log entries could not be taken away");
         }

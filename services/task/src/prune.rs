@@ -1,11 +1,12 @@
-//! Takes away rows that are kept for some days only: used request_ids, and what people asked.
+//! Takes away rows that are kept for some days only: used request_ids, what people asked, and intakes of tasks that are gone.
 //!
 //! Invariant: only rows that nobody looks at any more. Fleet hears requests from the log, which is never cut before it has. A request_id
 //! that is sent again after its row has gone is a new request.
 
 use crate::TaskService;
 use midshift_core::limits;
-use midshift_core::rows::{Item, Table, Writer};
+use midshift_core::rows::{Item, Key, Row, Table, Writer};
+use midshift_core::task::TaskIntake;
 use midshift_store::{CommitError, Error, Query};
 use std::sync::Arc;
 
@@ -31,7 +32,22 @@ impl TaskService {
                 gone += slice;
             }
         }
-        Ok(gone)
+        Ok(gone + self.prune_intakes().await?)
+    }
+
+    /// What was asked for goes after its task: fleet takes the state of a task away when it ended long ago.
+    async fn prune_intakes(&self) -> Result<u64, Error> {
+        let before = self.inner.parts.clock.now().utc.0 - limits::ASKED_DAYS as i64 * DAY_MS;
+        let rows = self.store().list(Query { limit: SLICE, ..Query::all(Table::TaskIntake) }).await?;
+        let old = |row: &Row| row.decode::<TaskIntake>().is_ok_and(|intake| intake.created.0 < before);
+        let rows: Vec<Row> = rows.into_iter().take_while(old).collect();
+        let states = self.store().get(rows.iter().map(|row| Key::new(Table::TaskState, &row.key.id)).collect()).await?;
+        let stays = |row: &Row| states.iter().any(|state| state.key.id == row.key.id);
+        let mut item = Item::new(Writer::Task, "task");
+        for row in rows.into_iter().filter(|row| !stays(row)) {
+            item.delete(row.key, row.revision, "task.intake_forgotten");
+        }
+        self.take_away(item).await
     }
 
     /// One slice of rows whose order is a moment before `before`, unix ms.
@@ -41,6 +57,10 @@ impl TaskService {
         for row in rows.into_iter().take_while(|row| row.index.order.is_some_and(|at| at < before)) {
             item.delete(row.key, row.revision, kind);
         }
+        self.take_away(item).await
+    }
+
+    async fn take_away(&self, item: Item) -> Result<u64, Error> {
         let slice = item.rows.len() as u64;
         if slice == 0 {
             return Ok(0);

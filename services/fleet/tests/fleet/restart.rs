@@ -1,9 +1,11 @@
 //! The reconciler ends and begins again on the same rows.
 
 use crate::harness::{Answer, World};
+use midshift_core::fleet::rows::RobotControl;
+use midshift_core::ids::{AttemptId, Subject};
 use midshift_core::reason::Code;
 use midshift_core::site::CORRIDOR;
-use midshift_core::task::{Phase, Then};
+use midshift_core::task::{Attempt, AttemptPhase, Phase, TaskState, Then};
 
 #[tokio::test(start_paused = true)]
 async fn a_restart_loses_nothing_and_repeats_nothing() {
@@ -142,4 +144,50 @@ async fn a_store_behind_the_robot_raises_its_generation_and_says_so() {
     w.until_phase("T1", Phase::Succeeded).await;
     assert_eq!(w.seen().await.incidents().len(), 1);
     w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_task_that_ended_a_month_ago_is_forgotten_with_its_attempts_and_one_that_has_not_ended_never() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.submit("T1", "A", "B").await;
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.r("r1").works = false;
+    w.submit("T2", "A", "B").await;
+    w.until_phase("T2", Phase::Running).await;
+    let day = std::time::Duration::from_secs(86_400);
+    tokio::time::advance(29 * day).await;
+    assert_eq!(midshift_fleet::prune(&*w.store, &*w.clock).await.expect("prunes"), 0);
+    tokio::time::advance(2 * day).await;
+    assert_eq!(midshift_fleet::prune(&*w.store, &*w.clock).await.expect("prunes"), 2, "the task and its attempt");
+    w.step().await;
+    let seen = w.seen().await;
+    let tasks: Vec<_> = seen.all::<TaskState>().into_iter().map(|t| t.task_id.to_string()).collect();
+    assert_eq!(tasks, ["T2"]);
+    assert!(seen.all::<Attempt>().iter().all(|a| a.attempt.subject.to_string() != "T1"));
+    w.stop_fleet().await;
+    w.start_fleet();
+    w.step().await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn only_the_newest_errands_of_a_robot_are_kept() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "B").await;
+    let done = |s: &crate::harness::Seen| s.all::<Attempt>().into_iter().find(|a| a.phase == AttemptPhase::Succeeded);
+    let errand = done(&w.until("it has parked", |s| done(s).is_some()).await).expect("an errand");
+    w.stop_fleet().await;
+    let robot_id = errand.robot_id.clone();
+    let older = |number: u64| {
+        let subject = Subject::Errand { robot_id: robot_id.clone(), number };
+        Attempt { attempt: AttemptId { subject, epoch: 1 }, ..errand.clone() }
+    };
+    w.left_behind(&(2..=150).map(older).collect::<Vec<_>>()).await;
+    let known = w.seen().await.get::<RobotControl>("r1").expect("known");
+    assert_eq!(known.errands, 1);
+    w.changed(&RobotControl { errands: 150, ..known }).await;
+    assert_eq!(midshift_fleet::prune(&*w.store, &*w.clock).await.expect("prunes"), 49);
+    let left = w.seen().await.all::<Attempt>().len();
+    assert_eq!(left, 101, "number 50 to 150");
 }

@@ -1,7 +1,7 @@
 //! What is kept for some days, and then no longer.
 
 use crate::world::{World, count, submit, transport};
-use midshift_core::rows::Table;
+use midshift_core::rows::{Item, Key, Table, Writer};
 use midshift_proto::task::v1::task_service_server::TaskService as _;
 use midshift_proto::task::v1::{CancelTaskRequest, CancelTaskResponse};
 use midshift_store::{Query, Store};
@@ -53,6 +53,23 @@ async fn what_people_asked_is_kept_for_thirty_days() {
     let after = world.later(30 * DAY_MS + 1).await;
     assert_eq!(after.prune().await.expect("pruned"), 1);
     assert_eq!(rows(&world, Table::TaskRequest).await, 0);
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_was_asked_for_is_kept_as_long_as_its_task_and_goes_with_it() {
+    let world = World::new().await;
+    let task = submit(&world.service, transport("", "B03")).await.expect("admitted");
+    let other = submit(&world.service, transport("", "B03")).await.expect("admitted");
+    let after = world.later(31 * DAY_MS).await;
+    after.prune().await.expect("pruned");
+    assert_eq!(rows(&world, Table::TaskIntake).await, 2, "both tasks are there");
+    let state = world.store.get(vec![Key::new(Table::TaskState, &task.task_id)]).await.expect("rows").remove(0);
+    let mut item = Item::new(Writer::Fleet, "fleet");
+    item.delete(state.key, state.revision, "task.forgotten");
+    world.store.commit(vec![item]).await.remove(0).expect("applied");
+    assert_eq!(after.prune().await.expect("pruned"), 1);
+    let left = world.store.list(Query::all(Table::TaskIntake)).await.expect("a list");
+    assert_eq!(left.iter().map(|row| &*row.key.id).collect::<Vec<_>>(), [other.task_id.as_str()]);
 }
 
 #[tokio::test(start_paused = true)]

@@ -19,7 +19,9 @@ struct Ledger {
 pub fn hold(entries: &[Entry]) {
     let mut ledger = Ledger::default();
     for entry in entries {
-        match entry.table {
+        // Deleted only for its age.
+        let is_forgotten = entry.body.is_none() && &*entry.kind == "task.forgotten";
+        match entry.table.filter(|_| !is_forgotten) {
             Some(Table::Attempt) => ledger.attempt(&row(entry)),
             Some(Table::TaskState) => ledger.task(row(entry)),
             Some(Table::RobotAuthority) => ledger.holder(row(entry)),
