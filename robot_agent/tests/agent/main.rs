@@ -5,6 +5,7 @@ mod drives;
 mod lanes;
 mod offers;
 mod release;
+mod remote;
 mod restarts;
 mod rig;
 mod session;
