@@ -11,4 +11,5 @@ mod rig;
 mod session;
 mod sets;
 mod steps;
+mod trusts;
 mod updates;
