@@ -62,6 +62,14 @@ impl PublicKey {
     pub fn tuf(&self) -> serde_json::Value {
         json!({"keytype": "ed25519", "scheme": "ed25519", "keyval": {"public": hex(self.0.as_bytes())}})
     }
+    /// From what [`PublicKey::tuf`] wrote, and nothing beside it.
+    pub fn from_tuf(value: &serde_json::Value) -> Option<Self> {
+        let text = value.get("keyval")?.get("public")?.as_str()?;
+        let digits: Option<Vec<u8>> = text.chars().map(|c| c.to_digit(16).map(|d| d as u8)).collect();
+        let bytes: Vec<u8> =
+            digits?.chunks(2).map(|pair| pair.iter().fold(0, |byte, digit| byte << 4 | digit)).collect();
+        Self::from_bytes(&bytes).filter(|key| key.tuf() == *value)
+    }
     /// Its id. The members are in canonical order: sorted, with no spaces.
     pub fn id(&self) -> KeyId {
         let public = hex(self.0.as_bytes());

@@ -3,6 +3,7 @@
 //! Invariant: no rule is decided here. Conversions parse into core types, listing every violation, or write core types out; rules live in core.
 //! Called by every service, the agent, the simulator and the CLI.
 
+pub mod chunk;
 pub mod convert;
 pub mod json;
 pub mod session;

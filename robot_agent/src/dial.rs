@@ -1,4 +1,4 @@
-//! How a session reaches the server: one connection each, small buffers, and a network that a simulation can cut.
+//! How sessions and downloads reach the server: one connection each, small buffers, and a network that a simulation can cut.
 //!
 //! Invariant: keep-alive of HTTP/2 is not liveness and is off; the agent itself gives a silent session up. Called by the shell.
 
@@ -16,6 +16,8 @@ use tonic::transport::{Channel, Endpoint};
 
 /// Stream window of one robot, bytes: enough for the largest control message.
 const STREAM_WINDOW: u32 = 128 * 1024;
+/// Stream window of a download, bytes: what of it may stand before a message of the session on a shared way.
+const BULK_WINDOW: u32 = 64 * 1024;
 /// First size of the codec's buffers, bytes; they grow when they must.
 const CODEC_BYTES: usize = 512;
 /// A connection that is not there by then is tried again, real time.
@@ -48,6 +50,11 @@ pub fn endpoint(uri: &str) -> Result<Endpoint, Error> {
         .tcp_nodelay(true))
 }
 
+/// The settings of a connection for downloads: as [`endpoint`], with smaller windows.
+pub fn bulk_endpoint(uri: &str) -> Result<Endpoint, Error> {
+    Ok(endpoint(uri)?.initial_stream_window_size(BULK_WINDOW).initial_connection_window_size(BULK_WINDOW))
+}
+
 /// Buffers of a session's messages.
 pub(crate) fn buffers() -> BufferSettings {
     BufferSettings::new(CODEC_BYTES, 32 * 1024)
@@ -64,7 +71,15 @@ pub struct TcpDial {
 impl TcpDial {
     /// To `uri`, `http://host:port`. While `network` says false nothing passes and nothing is dialed.
     pub fn new(uri: &str, network: Option<watch::Receiver<bool>>) -> Result<Self, Error> {
-        let endpoint = endpoint(uri)?;
+        Self::over(endpoint(uri)?, network)
+    }
+
+    /// As [`TcpDial::new`], for downloads: a connection beside the session's.
+    pub fn bulk(uri: &str, network: Option<watch::Receiver<bool>>) -> Result<Self, Error> {
+        Self::over(bulk_endpoint(uri)?, network)
+    }
+
+    fn over(endpoint: Endpoint, network: Option<watch::Receiver<bool>>) -> Result<Self, Error> {
         let authority = endpoint.uri().authority().map(ToString::to_string);
         let address = authority.ok_or_else(|| Error("the address needs a host and a port".into()))?;
         Ok(Self { endpoint, address, network })

@@ -22,5 +22,6 @@ pub mod sqlite;
 pub mod store;
 pub mod switch;
 pub mod throttle;
+pub mod trust;
 pub mod update;
 pub mod work;

@@ -25,7 +25,7 @@ const AIR_C: f64 = 24.0;
 const JOINT_TAU_S: f64 = 300.0;
 
 /// What a body does over a stretch of time, as far as energy is concerned.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Effort {
     /// Metres per second on average over the stretch.
     pub speed_m_s: f64,
@@ -37,6 +37,25 @@ pub struct Effort {
     pub parked: bool,
     /// It hangs on a charger.
     pub charging: bool,
+    /// What its software makes of the energy it needs, thousandths.
+    pub draw_permille: u32,
+    /// What its software adds to the heat of its hottest joint, degrees Celsius per second.
+    pub climb_c_s: f64,
+}
+
+impl Default for Effort {
+    /// Standing.
+    fn default() -> Self {
+        Self {
+            speed_m_s: 0.0,
+            loaded: false,
+            acting: false,
+            parked: false,
+            charging: false,
+            draw_permille: 1000,
+            climb_c_s: 0.0,
+        }
+    }
 }
 
 impl Effort {
@@ -45,7 +64,8 @@ impl Effort {
         let stand_w = if self.parked { PARKED_W } else { IDLE_W };
         let factor = if self.loaded { LOADED_FACTOR } else { 1.0 };
         let drive_w = self.speed_m_s * DRIVE_MWH_PER_M * factor * 3.6;
-        stand_w + drive_w + if self.acting { ACT_W } else { 0.0 }
+        let all_w = stand_w + drive_w + if self.acting { ACT_W } else { 0.0 };
+        all_w * (f64::from(self.draw_permille) / 1000.0)
     }
     /// Degrees Celsius where the hottest joint would come to rest.
     fn warms_to_c(&self) -> f64 {
@@ -61,8 +81,11 @@ pub struct Stores {
     pub charge_mwh: f64,
     /// Spent since the body was made.
     pub spent_mwh: f64,
-    /// Hottest joint, degrees Celsius.
+    /// Hottest joint by its work alone, degrees Celsius.
     pub joint_c: f64,
+    /// What software has added to that, degrees Celsius.
+    #[serde(default)]
+    pub climbed_c: f64,
     /// The battery empties by work; without it only `spent_mwh` counts.
     pub drains: bool,
 }
@@ -71,7 +94,7 @@ impl Stores {
     /// A body at rest with this much charge.
     pub fn new(charge_permille: u16, drains: bool) -> Self {
         let charge_mwh = CAPACITY_MWH * f64::from(charge_permille.min(1000)) / 1000.0;
-        Self { charge_mwh, spent_mwh: 0.0, joint_c: AIR_C + 4.0, drains }
+        Self { charge_mwh, spent_mwh: 0.0, joint_c: AIR_C + 4.0, climbed_c: 0.0, drains }
     }
     /// After `time` of the same effort.
     #[must_use]
@@ -84,8 +107,16 @@ impl Stores {
             self.charge_mwh = (self.charge_mwh - spent_mwh + in_mwh).clamp(0.0, CAPACITY_MWH);
         }
         let rest_c = effort.warms_to_c();
-        self.joint_c = rest_c + (self.joint_c - rest_c) * (-time.as_secs_f64() / JOINT_TAU_S).exp();
+        let cools = (-time.as_secs_f64() / JOINT_TAU_S).exp();
+        self.joint_c = rest_c + (self.joint_c - rest_c) * cools;
+        let climbs = effort.climb_c_s > 0.0;
+        self.climbed_c =
+            if climbs { self.climbed_c + effort.climb_c_s * time.as_secs_f64() } else { self.climbed_c * cools };
         self
+    }
+    /// Hottest joint, degrees Celsius.
+    pub fn hottest_c(&self) -> f64 {
+        self.joint_c + self.climbed_c
     }
     /// How long the charge lasts at this effort; none: for ever.
     pub fn lasts(&self, effort: &Effort) -> Option<SiteDuration> {

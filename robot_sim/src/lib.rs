@@ -3,6 +3,7 @@
 //! Invariant: a body is synchronous, reads no clock and starts no task; where it is follows from its path and the time it
 //! set out. What bodies did is judged from their own journals ([`oracle`]), never from what a server believes.
 
+pub mod behaviour;
 pub mod body;
 pub mod energy;
 pub mod faults;

@@ -6,6 +6,7 @@ use midshift_core::robot::{Mode, StopLevel};
 use midshift_core::site::{CORRIDOR, Site, text};
 use midshift_core::time::{SiteDuration, SiteTime};
 use midshift_core::work::StepKind;
+use midshift_sim::behaviour::Behaviour;
 use midshift_sim::body::{BodyConfig, SimBody};
 use midshift_sim::faults::{FaultRates, Injected};
 use midshift_sim::world::{SharedWorld, World, WorldConfig, lock};
@@ -235,6 +236,75 @@ fn a_body_notes_the_passage_it_drives_through_and_the_standing_place_it_leaves()
     assert_eq!(inside(&body), ["corridor"]);
     run(&mut body, SiteTime(3_000), SiteTime(60_000));
     assert_eq!(inside(&body), [] as [&str; 0]);
+}
+
+/// A body whose software behaves so.
+fn behaving(start: &str, faults: FaultRates, behaviour: Behaviour) -> SimBody {
+    let site = site();
+    let config = BodyConfig { behaviour, faults, software: "walk 1.5.0".to_owned(), ..config("rbt-01", start) };
+    SimBody::new(config, site.clone(), world(&site), SiteTime(0)).expect("a body")
+}
+
+#[test]
+fn software_makes_a_body_slower_hungrier_and_warmer() {
+    let behaviour = Behaviour {
+        speed_permille: 500,
+        energy_permille: 3_000,
+        joint_temperature_climb_millidegrees_per_s: 500,
+        ..Behaviour::default()
+    };
+    let (mut usual, mut other) = (body("c-1"), behaving("c-1", FaultRates::none(), behaviour));
+    assert_eq!((usual.capabilities().software, other.capabilities().software), ("1.0.0".into(), "walk 1.5.0".into()));
+    for body in [&mut usual, &mut other] {
+        body.start(SiteTime(0), drive(&["c-2"])).expect("starts");
+    }
+    let arrives = |body: &mut SimBody| run(body, SiteTime(0), SiteTime(60_000)).last().expect("arrives").0;
+    assert_eq!((arrives(&mut usual), arrives(&mut other)), (6_000, 12_000));
+    let rested = other.state(SiteTime(12_000));
+    let (one, three) = (usual.state(SiteTime(72_000)), other.state(SiteTime(72_000)));
+    let minute =
+        |of: &SimBody, from: u64| of.state(SiteTime(from + 60_000)).energy_mwh - of.state(SiteTime(from)).energy_mwh;
+    assert!(
+        minute(&other, 12_000).abs_diff(3 * minute(&usual, 12_000)) <= 3,
+        "a minute of standing costs three times as much"
+    );
+    assert!(three.hottest_joint_decidegrees > one.hottest_joint_decidegrees + 300, "36 degrees in 72 s");
+    assert!(three.hottest_joint_decidegrees > rested.hottest_joint_decidegrees, "it climbs at rest too");
+}
+
+#[test]
+fn joints_that_software_heated_cool_when_it_is_gone() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let site = site();
+    let open = |behaviour: Behaviour, at: u64| {
+        let config = BodyConfig { behaviour, ..config("rbt-01", "c-1") };
+        let (body, _) = SimBody::restore(config, site.clone(), WorldConfig::default(), folder.path(), SiteTime(at))
+            .expect("a body");
+        body
+    };
+    let hot = Behaviour { joint_temperature_climb_millidegrees_per_s: 1_000, ..Behaviour::default() };
+    let mut body = open(hot, 0);
+    body.poll(SiteTime(60_000));
+    let heated = body.state(SiteTime(60_000)).hottest_joint_decidegrees;
+    drop(body);
+    let body = open(Behaviour::default(), 60_000);
+    assert_eq!(body.state(SiteTime(60_000)).hottest_joint_decidegrees, heated);
+    assert!(body.state(SiteTime(360_000)).hottest_joint_decidegrees < heated - 300);
+}
+
+#[test]
+fn software_that_is_bad_under_load_jams_only_with_one() {
+    let own = FaultRates { jam_per_action: 0.001, ..FaultRates::none() };
+    let bad = Behaviour { fault_rate_permille: 1_000_000, faults_only_with_load: true, ..Behaviour::default() };
+    let mut body = behaving("a-out", own, bad.clone());
+    body.start(SiteTime(0), act("pick", "SKU-1")).expect("starts");
+    assert_eq!(ended(&run(&mut body, SiteTime(0), SiteTime(9_000))), [&BodyNews::Done]);
+    body.start(SiteTime(9_000), act("place", "SKU-1")).expect("starts");
+    assert!(matches!(ended(&run(&mut body, SiteTime(9_000), SiteTime(20_000)))[..], [BodyNews::Failed(_)]));
+    let always = Behaviour { faults_only_with_load: false, ..bad };
+    let mut body = behaving("a-out", own, always);
+    body.start(SiteTime(0), act("pick", "SKU-1")).expect("starts");
+    assert!(matches!(ended(&run(&mut body, SiteTime(0), SiteTime(9_000)))[..], [BodyNews::Failed(_)]));
 }
 
 #[test]

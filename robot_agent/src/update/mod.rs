@@ -1,11 +1,12 @@
 //! The robot's updater without IO: which bytes to fetch, when to switch, when to go back.
 //!
-//! Rooms: here what it knows and asks for; `pursue` is the machine; `io` does the jobs. Called by the core.
+//! Rooms: here what it knows and asks for; `pursue` is the machine; `io` does the jobs; `remote` asks the server. Called by the core.
 //! Invariant: each side effect is a [`Job`], and a job begins only after the ledger row that explains it is durable; at most one job is
 //! under way. The switch record wins over the ledger.
 
 pub mod io;
 mod pursue;
+pub mod remote;
 
 use crate::sets::{Holdings, Wanted};
 use crate::switch::Switch;

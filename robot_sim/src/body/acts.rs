@@ -71,7 +71,7 @@ impl SimBody {
             }
             _ => {}
         }
-        let rates = self.config.faults;
+        let rates = self.rates();
         let usual_ms = usual.as_ms();
         let left = SiteDuration(self.rng.random_range(usual_ms * 4 / 5..=usual_ms * 6 / 5));
         let jams = self.rng.random_bool(rates.jam_per_action.clamp(0.0, 1.0));

@@ -61,7 +61,8 @@ impl SimBody {
         self.parked = false;
         let asked = point.speed_mm_s.min(self.config.speed_mm_s).min(SPEED_MAX_MM_S);
         let asked = if self.slow { asked.min(SPEED_FLOOR_MM_S) } else { asked };
-        let leg = Leg::new(self.frame, (point.x_mm, point.y_mm), asked * self.config.pace_permille / 1000, now);
+        let driven = self.config.behaviour.speed_mm_s(asked);
+        let leg = Leg::new(self.frame, (point.x_mm, point.y_mm), driven * self.config.pace_permille / 1000, now);
         if self.lane.is_none() && leg.length_mm() >= 1.0 {
             self.lane = self.last.clone().map(|last| (last, point.waypoint.clone()));
             self.block = self.draw_block(leg.length_mm());
@@ -78,7 +79,7 @@ impl SimBody {
         if let Some(lasts) = self.pending_block.take() {
             return Some(Block { after_mm: length_mm / 2.0, lasts });
         }
-        let chance = 1.0 - (-self.config.faults.obstacle_per_km * length_mm / 1e6).exp();
+        let chance = 1.0 - (-self.rates().obstacle_per_km * length_mm / 1e6).exp();
         let meets = chance > 0.0 && self.rng.random_bool(chance);
         meets.then(|| Block { after_mm: length_mm * self.rng.random::<f64>(), lasts: draw_secs(&mut self.rng, 2..=14) })
     }

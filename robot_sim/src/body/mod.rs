@@ -8,6 +8,7 @@ mod kept;
 mod legs;
 mod orders;
 
+use crate::behaviour::Behaviour;
 use crate::energy::{Effort, Stores};
 use crate::faults::{self, FaultRates, Injected, draw_next, draw_secs};
 use crate::journal::Work;
@@ -57,6 +58,10 @@ pub struct BodyConfig {
     pub battery_permille: Option<u16>,
     /// The battery empties by work.
     pub drains: bool,
+    /// What its software makes of it.
+    pub behaviour: Behaviour,
+    /// Version of its software as it says it.
+    pub software: String,
 }
 
 impl BodyConfig {
@@ -71,6 +76,8 @@ impl BodyConfig {
             faults: FaultRates::default(),
             battery_permille: None,
             drains: true,
+            behaviour: Behaviour::default(),
+            software: "1.0.0".to_owned(),
         }
     }
     fn rng(&self, life: u32) -> ChaCha8Rng {
@@ -306,8 +313,8 @@ impl SimBody {
             Injected::Manual(lasts) => self.take_over(now, lasts),
             Injected::HardwareStop(lasts) => self.stop_hard(now, lasts),
             Injected::LowBattery(permille) => {
-                let Stores { spent_mwh, joint_c, .. } = self.stores;
-                self.stores = Stores { spent_mwh, joint_c, ..Stores::new(permille, self.config.drains) };
+                let Stores { spent_mwh, joint_c, climbed_c, .. } = self.stores;
+                self.stores = Stores { spent_mwh, joint_c, climbed_c, ..Stores::new(permille, self.config.drains) };
             }
         }
     }
@@ -316,9 +323,8 @@ impl SimBody {
         self.advance(now);
         if let Some(fault) = self.broken.take() {
             if fault.code == faults::FAULT_BATTERY_EMPTY {
-                let spent_mwh = self.stores.spent_mwh;
-                self.stores =
-                    Stores { spent_mwh, joint_c: self.stores.joint_c, ..Stores::new(500, self.config.drains) };
+                let Stores { spent_mwh, joint_c, climbed_c, .. } = self.stores;
+                self.stores = Stores { spent_mwh, joint_c, climbed_c, ..Stores::new(500, self.config.drains) };
             }
             self.news.push_back(BodyNews::Fault(fault, false));
             self.go(now);
@@ -477,6 +483,8 @@ impl SimBody {
             acting: matches!((&self.phase, &self.order), (Phase::Acting { .. }, Some(Order::Act(act))) if act.works()),
             parked: self.parked,
             charging: self.charging,
+            draw_permille: self.config.behaviour.energy_permille,
+            climb_c_s: f64::from(self.config.behaviour.joint_temperature_climb_millidegrees_per_s) / 1000.0,
         }
     }
     fn speed_mm_s(&self, now: SiteTime) -> u32 {
@@ -487,6 +495,10 @@ impl SimBody {
     }
     fn is_empty(&self) -> bool {
         self.config.drains && !self.charging && self.stores.charge_mwh <= 0.0
+    }
+    /// How often things go wrong now.
+    fn rates(&self) -> FaultRates {
+        self.config.behaviour.rates(&self.config.faults, self.load.as_ref())
     }
     fn target(&self) -> Option<&PathPoint> {
         match &self.order {

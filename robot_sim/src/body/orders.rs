@@ -21,7 +21,7 @@ impl Body for SimBody {
             capabilities: ["inspect", "pick", "place"].map(str::to_owned).to_vec(),
             labels: BTreeMap::from([("body".to_owned(), "simulated".to_owned())]),
             payload_g: 15_000,
-            software: "1.0.0".to_owned(),
+            software: self.config.software.clone(),
             agent_version: String::new(),
             model: "midshift-sim".to_owned(),
         }
@@ -128,7 +128,7 @@ impl Body for SimBody {
             speed_mm_s: self.speed_mm_s(now),
             battery_permille: stores.charge_permille(),
             charging: self.charging,
-            hottest_joint_decidegrees: (stores.joint_c * 10.0).round() as i32,
+            hottest_joint_decidegrees: (stores.hottest_c() * 10.0).round() as i32,
             odometer_mm: (self.odometer_mm + driven_mm) as u64,
             loaded_odometer_mm: (self.loaded_mm + loaded_mm) as u64,
             energy_mwh: stores.spent_mwh as u64,

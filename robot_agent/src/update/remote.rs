@@ -1,0 +1,236 @@
+//! The server's repository over gRPC, on a connection of its own: metadata and bytes never stand before a heartbeat.
+//!
+//! Invariant: a piece is handed on only if it follows the one before and arrived as it was sent; the connection is there only while it is
+//! used and [`IDLE`] longer. Called by [`super::io`].
+
+use super::io::{Pieces, Remote};
+use crate::dial::Dial;
+use async_trait::async_trait;
+use midshift_bundle::digest::Digest;
+use midshift_bundle::trust::METADATA_BYTES_MAX;
+use midshift_proto::chunk;
+use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
+use midshift_proto::ota::v1::chunk_service_client::ChunkServiceClient;
+use midshift_proto::ota::v1::{FetchChunksRequest, FetchChunksResponse, GetMetadataRequest};
+use std::fmt;
+use std::io;
+use std::ops::Range;
+use std::pin::Pin;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::task::{Context, Poll, ready};
+use std::time::Duration;
+use tokio::time::{Instant, Sleep};
+use tokio_stream::Stream;
+use tonic::transport::Channel;
+use tonic::{Code, Status, Streaming};
+
+/// A connection that nobody used for so long is closed.
+pub const IDLE: Duration = Duration::from_secs(10);
+/// A server that says nothing for so long is given up: one piece of 256 KiB over 40 kbit/s.
+pub const SILENCE: Duration = Duration::from_secs(60);
+/// What gRPC puts around a document, bytes.
+const AROUND_BYTES: usize = 1024;
+
+/// The repository of a server.
+pub struct GrpcRemote {
+    dial: Arc<dyn Dial>,
+    line: Arc<Mutex<Line>>,
+}
+
+/// The connection.
+#[derive(Default)]
+struct Line {
+    channel: Option<Channel>,
+    users: usize,
+    /// When the last of them left.
+    idle_since: Option<Instant>,
+    /// A task waits to close it.
+    is_watched: bool,
+}
+
+fn lock(line: &Mutex<Line>) -> MutexGuard<'_, Line> {
+    line.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl fmt::Debug for GrpcRemote {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("GrpcRemote").field("is_connected", &lock(&self.line).channel.is_some()).finish_non_exhaustive()
+    }
+}
+
+impl GrpcRemote {
+    /// Over connections made by `dial`; none is made before the first question.
+    pub fn new(dial: Arc<dyn Dial>) -> Self {
+        Self { dial, line: Arc::default() }
+    }
+
+    async fn lease(&self) -> io::Result<Lease> {
+        let open = lock(&self.line).channel.clone();
+        let channel = match open {
+            Some(channel) => channel,
+            None => {
+                let dialed = tokio::time::timeout(SILENCE, self.dial.dial()).await.map_err(|_| silent())?;
+                dialed.map_err(|error| io::Error::new(io::ErrorKind::NotConnected, error.to_string()))?
+            }
+        };
+        let mut line = lock(&self.line);
+        line.channel = Some(channel.clone());
+        line.users += 1;
+        if !line.is_watched {
+            line.is_watched = true;
+            tokio::spawn(close_when_idle(Arc::downgrade(&self.line)));
+        }
+        Ok(Lease { line: self.line.clone(), channel })
+    }
+}
+
+/// Lets the connection go once nobody used it for [`IDLE`].
+async fn close_when_idle(line: Weak<Mutex<Line>>) {
+    loop {
+        let until = {
+            let Some(line) = line.upgrade() else { return };
+            let (mut line, now) = (lock(&line), Instant::now());
+            match line.idle_since.filter(|_| line.users == 0).map(|since| since + IDLE) {
+                Some(until) if until <= now => {
+                    line.channel = None;
+                    line.is_watched = false;
+                    return;
+                }
+                until => until.unwrap_or(now + IDLE),
+            }
+        };
+        tokio::time::sleep_until(until).await;
+    }
+}
+
+/// One use of the connection.
+struct Lease {
+    line: Arc<Mutex<Line>>,
+    channel: Channel,
+}
+
+impl Lease {
+    /// Whoever comes next dials anew.
+    fn spoil(&self) {
+        lock(&self.line).channel = None;
+    }
+    /// The error of an answer that did not come as it should.
+    fn refused(&self, status: &Status) -> io::Error {
+        if status.code() == Code::NotFound {
+            return io::Error::new(io::ErrorKind::NotFound, status.message());
+        }
+        self.spoil();
+        io::Error::other(format!("{}: {}", status.code(), status.message()))
+    }
+}
+
+impl Drop for Lease {
+    fn drop(&mut self) {
+        let mut line = lock(&self.line);
+        line.users -= 1;
+        line.idle_since = Some(Instant::now());
+    }
+}
+
+fn silent() -> io::Error {
+    io::Error::new(io::ErrorKind::TimedOut, "the server is silent")
+}
+
+#[async_trait]
+impl Remote for GrpcRemote {
+    async fn metadata(&self, name: &str) -> io::Result<Option<Vec<u8>>> {
+        let lease = self.lease().await?;
+        let most = METADATA_BYTES_MAX as usize + AROUND_BYTES;
+        let mut client = BundleServiceClient::new(lease.channel.clone()).max_decoding_message_size(most);
+        let request = GetMetadataRequest { name: name.to_owned() };
+        match tokio::time::timeout(SILENCE, client.get_metadata(request)).await {
+            Ok(Ok(answer)) => Ok(Some(answer.into_inner().document)),
+            Ok(Err(status)) if status.code() == Code::NotFound => Ok(None),
+            Ok(Err(status)) => Err(lease.refused(&status)),
+            Err(_) => {
+                lease.spoil();
+                Err(silent())
+            }
+        }
+    }
+
+    async fn range(&self, digest: &Digest, range: Range<u64>) -> io::Result<Pieces> {
+        let lease = self.lease().await?;
+        let length = range.end.saturating_sub(range.start);
+        let request = FetchChunksRequest { digest: digest.to_string(), offset: range.start, length };
+        let mut client = ChunkServiceClient::new(lease.channel.clone());
+        match tokio::time::timeout(SILENCE, client.fetch_chunks(request)).await {
+            Ok(Ok(answers)) => Ok(Box::pin(Chunks {
+                answers: answers.into_inner(),
+                at: range.start,
+                end: range.end,
+                silence: None,
+                lease: Some(lease),
+            })),
+            Ok(Err(status)) => Err(lease.refused(&status)),
+            Err(_) => {
+                lease.spoil();
+                Err(silent())
+            }
+        }
+    }
+}
+
+/// Pieces of one range as they come.
+struct Chunks {
+    answers: Streaming<FetchChunksResponse>,
+    /// Where the next one begins.
+    at: u64,
+    end: u64,
+    /// Since the last one, while it is waited for: a reader that takes its time is not the server's silence.
+    silence: Option<Pin<Box<Sleep>>>,
+    /// None: it is over.
+    lease: Option<Lease>,
+}
+
+impl Stream for Chunks {
+    type Item = io::Result<Vec<u8>>;
+
+    fn poll_next(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        let this = self.get_mut();
+        let Some(lease) = &this.lease else { return Poll::Ready(None) };
+        let answer = match Pin::new(&mut this.answers).poll_next(cx) {
+            Poll::Ready(answer) => answer.map(|answer| answer.map_err(|status| lease.refused(&status))),
+            Poll::Pending => {
+                ready!(this.silence.get_or_insert_with(|| Box::pin(tokio::time::sleep(SILENCE))).as_mut().poll(cx));
+                Some(Err(silent()))
+            }
+        };
+        this.silence = None;
+        let piece = match answer {
+            Some(answer) => Some(answer.and_then(|piece| this.judge(piece))),
+            None if this.at == this.end => None,
+            None => Some(Err(io::Error::new(io::ErrorKind::UnexpectedEof, "the bytes ended early"))),
+        };
+        if let (Some(Err(_)), Some(lease)) = (&piece, &this.lease) {
+            lease.spoil();
+        }
+        if !matches!(piece, Some(Ok(_))) {
+            this.lease = None;
+        }
+        Poll::Ready(piece)
+    }
+}
+
+impl Chunks {
+    /// The bytes of a piece, if it is the next one and whole.
+    fn judge(&mut self, piece: FetchChunksResponse) -> io::Result<Vec<u8>> {
+        let wrong = |what: &str| Err(io::Error::new(io::ErrorKind::InvalidData, what));
+        if piece.offset != self.at || piece.data.is_empty() {
+            return wrong("a piece does not follow the one before");
+        }
+        if piece.data.len() as u64 > self.end - self.at {
+            return wrong("more bytes than were asked for");
+        }
+        if !chunk::is_whole(&piece) {
+            return wrong("a piece was broken on its way");
+        }
+        self.at += piece.data.len() as u64;
+        Ok(piece.data)
+    }
+}
