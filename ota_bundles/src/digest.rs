@@ -14,6 +14,21 @@ const READ_BYTES: usize = 256 * 1024;
 #[serde(try_from = "String", into = "String")]
 pub struct Digest([u8; 32]);
 
+/// A digest in the making, of content that comes in pieces.
+#[derive(Clone, Debug, Default)]
+pub struct Hashing(Sha256);
+
+impl Hashing {
+    /// The next piece.
+    pub fn update(&mut self, piece: &[u8]) {
+        self.0.update(piece);
+    }
+    /// Of all pieces so far.
+    pub fn digest(&self) -> Digest {
+        Digest(self.0.clone().finalize().into())
+    }
+}
+
 /// A text that is no digest.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("must be 64 lower-case hexadecimal digits")]
@@ -29,13 +44,13 @@ impl Digest {
     /// # Errors
     /// The reader's, or `InvalidData` for too much.
     pub fn of_reader(reader: &mut dyn Read, most: u64) -> std::io::Result<(Self, u64)> {
-        let mut hash = Sha256::new();
+        let mut hash = Hashing::default();
         let mut buffer = vec![0; READ_BYTES];
         let mut length = 0_u64;
         loop {
             let count = reader.read(&mut buffer)?;
             if count == 0 {
-                return Ok((Self(hash.finalize().into()), length));
+                return Ok((hash.digest(), length));
             }
             length += count as u64;
             if length > most {
