@@ -1,7 +1,9 @@
 //! What a server reads off signed documents, and when it must not call them the newest.
 
 use crate::shelf::{START, Seeds, Shelf, key, target};
-use midshift_bundle::freshness::{OnlineRole, check_online, names, newest_targets, root_edition, stamp, targets_edition};
+use midshift_bundle::freshness::{
+    OnlineRole, check_online, names, newest_targets, root_edition, stamp, targets_edition,
+};
 use midshift_bundle::repository::{Online, PEOPLE_LIFE_MS, TIMESTAMP_LIFE_MS};
 
 fn online(shelf: &Shelf) -> Online {
