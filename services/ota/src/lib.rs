@@ -1,8 +1,11 @@
-//! Software of robots on the server: keeps files of signed releases.
+//! Software of robots on the server: keeps files of signed releases and says which release is the newest.
 //!
 //! Called by the binary. Invariant: nothing is decided about robots here, and nothing is signed that says what software is good.
 
 pub mod content;
+#[cfg(test)]
+mod fixture;
+pub mod repository;
 
 use std::panic::resume_unwind;
 
