@@ -122,6 +122,18 @@ pub const HARD_DRAIN: LinkDuration = LinkDuration::from_secs(2);
 pub const FENCED_RETRY: LinkDuration = LinkDuration::from_secs(60);
 /// Bytes of one site, map or layout file.
 pub const SITE_FILE_BYTES: usize = 64 * 1024 * 1024;
+/// Bytes of one message that brings software to the server.
+pub const UPLOAD_PIECE_BYTES: usize = 1024 * 1024;
+/// Files that are being brought at a time; when there is one more, the one left alone longest is thrown away.
+pub const UPLOADS_MAX: usize = 64;
+/// Software that is brought is made durable this often, bytes: a cut costs less than this.
+pub const UPLOAD_SYNC_BYTES: u64 = 16 * 1024 * 1024;
+/// Bytes of all software that a server keeps, unless it was told otherwise.
+pub const SOFTWARE_BYTES_DEFAULT: u64 = 64 * 1024 * 1024 * 1024;
+/// Bytes of one range of software that a robot asks for.
+pub const CHUNK_RANGE_BYTES: u64 = 4 * 1024 * 1024;
+/// Bytes of one message of such a range.
+pub const CHUNK_BYTES: usize = 256 * 1024;
 /// Waypoints of one site; the largest public grid benchmark has about 55,000.
 pub const SITE_WAYPOINTS_MAX: usize = 250_000;
 /// Lanes of one site: four a waypoint.

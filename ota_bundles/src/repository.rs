@@ -48,7 +48,7 @@ pub enum Error {
     },
 }
 
-fn rule(role: &'static str, text: impl std::fmt::Display) -> Error {
+pub(crate) fn rule(role: &'static str, text: impl std::fmt::Display) -> Error {
     Error::Rule { role, text: text.to_string() }
 }
 
@@ -137,7 +137,7 @@ fn sign<T: Role + Serialize>(mut document: Signed<T>, keys: &[&SecretKey]) -> Re
     Ok(bytes)
 }
 
-fn read<T: DeserializeOwned>(role: &'static str, bytes: &[u8]) -> Result<Signed<T>, Error> {
+pub(crate) fn read<T: DeserializeOwned>(role: &'static str, bytes: &[u8]) -> Result<Signed<T>, Error> {
     serde_json::from_slice(bytes).map_err(|source| Error::Read { role, source })
 }
 

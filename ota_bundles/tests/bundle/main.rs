@@ -2,6 +2,7 @@
 
 mod building;
 mod directives;
+mod fresh;
 mod keyring;
 mod metadata;
 mod releasing;

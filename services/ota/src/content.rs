@@ -1,0 +1,471 @@
+//! Files of releases on the disk, each under its SHA-256. They come in pieces, over days and restarts if need be.
+//!
+//! Invariant: a file has its name only once all its bytes were checked and are durable; what is said to be durable survives a power cut;
+//! no more than the quota lies here. Whether a file may be handed out is not decided here.
+
+use crate::blocking;
+use async_trait::async_trait;
+use bytes::Bytes;
+use midshift_bundle::digest::{Digest, Hashing};
+use midshift_bundle::manifest::COMPONENT_BYTES_MAX;
+use midshift_core::limits;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use tokio::io::{AsyncRead, AsyncReadExt};
+
+/// Bytes of one read of what was there before a restart.
+const READ_BYTES: usize = 256 * 1024;
+
+/// Which file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Wanted {
+    /// Of the whole.
+    pub digest: Digest,
+    /// Bytes of the whole.
+    pub length: u64,
+}
+
+/// How much of a file is here.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Held {
+    /// All of it, and it is what its digest says.
+    Whole,
+    /// So many bytes from the beginning, durable.
+    Part(u64),
+}
+
+/// Bytes of a range, in order.
+pub type Reader = Box<dyn AsyncRead + Send + Unpin>;
+
+/// Why a file stays as it was.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The disk.
+    #[error("{doing} {path}: {source}")]
+    Io {
+        /// What was being done.
+        doing: &'static str,
+        /// With what.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
+    /// The piece does not begin where the file ends.
+    #[error("the file goes on at byte {at}, the piece begins at {offset}")]
+    Moved {
+        /// Where the next piece must begin.
+        at: u64,
+        /// Where this one begins.
+        offset: u64,
+    },
+    /// More bytes than the whole has.
+    #[error("the file has {length} bytes, the piece ends at {end}")]
+    TooLong {
+        /// Of the whole.
+        length: u64,
+        /// Of the piece.
+        end: u64,
+    },
+    /// No file has so many bytes.
+    #[error("a file has 1..{COMPONENT_BYTES_MAX} bytes")]
+    Size,
+    /// There is no room for the rest of it.
+    #[error("{missing} bytes are to come and {free} of {quota} are free")]
+    Full {
+        /// Bytes that are to come.
+        missing: u64,
+        /// Bytes that are free.
+        free: u64,
+        /// Bytes there may be.
+        quota: u64,
+    },
+    /// All bytes came, and they are others. They were thrown away.
+    #[error("its bytes have the digest {found}")]
+    WrongBytes {
+        /// What they are.
+        found: Digest,
+    },
+}
+
+fn at(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
+    let path = path.to_owned();
+    move |source| Error::Io { doing, path, source }
+}
+
+/// Where files of releases are kept.
+#[async_trait]
+pub trait Content: Send + Sync + 'static {
+    /// Bytes of a whole file; none: it is not here.
+    async fn length(&self, digest: Digest) -> Result<Option<u64>, Error>;
+    /// Adds a piece at `offset`, where what is here ends. It is durable once [`Content::settle`] says so. Another length than before
+    /// begins the file anew.
+    async fn append(&self, file: Wanted, offset: u64, piece: Bytes) -> Result<(), Error>;
+    /// Makes durable what is here of a file, checks it if it is all, and says how much it is.
+    async fn settle(&self, file: Wanted) -> Result<Held, Error>;
+    /// Bytes of a whole file, cut at its end; none: it is not here.
+    async fn read(&self, digest: Digest, range: Range<u64>) -> Result<Option<Reader>, Error>;
+}
+
+/// What is known for sure of a file that is not whole, beside it as `<digest>.mark`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Mark {
+    length: u64,
+    durable: u64,
+}
+
+/// A file that is being brought.
+struct Part {
+    mark: Mark,
+    written: u64,
+    /// None: not opened since the start, or a write failed. Only `mark.durable` bytes count then.
+    open: Option<(File, Hashing)>,
+}
+
+struct Entry {
+    part: Arc<Mutex<Part>>,
+    touched: u64,
+}
+
+#[derive(Default)]
+struct Shelf {
+    whole: BTreeMap<Digest, u64>,
+    parts: BTreeMap<Digest, Entry>,
+    /// Bytes of all files, whole or not.
+    used: u64,
+    /// Rises with each touch of a part.
+    turn: u64,
+}
+
+struct Inner {
+    path: PathBuf,
+    quota: u64,
+    shelf: Mutex<Shelf>,
+}
+
+/// Files in a folder. Cheap to clone.
+#[derive(Clone)]
+pub struct DiskContent {
+    inner: Arc<Inner>,
+}
+
+impl DiskContent {
+    /// Opens the folder, made if it is not there, and takes away what no cut should have left. Blocks.
+    ///
+    /// # Errors
+    /// If it cannot be read or mended.
+    pub fn open(path: &Path, quota: u64) -> Result<Self, Error> {
+        fs::create_dir_all(path).map_err(at("making", path))?;
+        let mut shelf = Shelf::default();
+        let mut names = Vec::new();
+        for entry in fs::read_dir(path).map_err(at("reading", path))? {
+            let entry = entry.map_err(at("reading", path))?;
+            let length = entry.metadata().map_err(at("reading", path))?.len();
+            names.extend(entry.file_name().into_string().ok().map(|name| (name, length)));
+        }
+        for (name, length) in names {
+            if let Ok(digest) = name.parse::<Digest>() {
+                shelf.whole.insert(digest, length);
+                shelf.used += length;
+            } else if let Some(digest) = name.strip_suffix(".part").and_then(|n| n.parse::<Digest>().ok())
+                && let Some(mark) = read_mark(path, digest, length)
+            {
+                let part = Part { mark, written: mark.durable, open: None };
+                shelf.parts.insert(digest, Entry { part: Arc::new(Mutex::new(part)), touched: 0 });
+                shelf.used += mark.durable;
+            } else if !name.ends_with(".mark") {
+                remove(&path.join(name))?;
+            }
+        }
+        let inner = Inner { path: path.to_owned(), quota, shelf: Mutex::new(shelf) };
+        Ok(Self { inner: Arc::new(inner) })
+    }
+
+    async fn in_background<T: Send + 'static>(&self, work: impl FnOnce(&Inner) -> T + Send + 'static) -> T {
+        let inner = self.inner.clone();
+        blocking(move || work(&inner)).await
+    }
+}
+
+#[async_trait]
+impl Content for DiskContent {
+    async fn length(&self, digest: Digest) -> Result<Option<u64>, Error> {
+        Ok(self.inner.shelf().whole.get(&digest).copied())
+    }
+    async fn append(&self, file: Wanted, offset: u64, piece: Bytes) -> Result<(), Error> {
+        self.in_background(move |inner| inner.append(file, offset, &piece)).await
+    }
+    async fn settle(&self, file: Wanted) -> Result<Held, Error> {
+        self.in_background(move |inner| inner.settle(file)).await
+    }
+    async fn read(&self, digest: Digest, range: Range<u64>) -> Result<Option<Reader>, Error> {
+        let opened = self.in_background(move |inner| inner.open_at(digest, range.start)).await?;
+        let length = range.end.saturating_sub(range.start);
+        Ok(opened.map(|file| -> Reader { Box::new(tokio::fs::File::from_std(file).take(length)) }))
+    }
+}
+
+impl Inner {
+    fn shelf(&self) -> MutexGuard<'_, Shelf> {
+        self.shelf.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+    fn whole(&self, digest: Digest) -> PathBuf {
+        self.path.join(digest.to_string())
+    }
+    fn part(&self, digest: Digest) -> PathBuf {
+        self.path.join(format!("{digest}.part"))
+    }
+    fn mark(&self, digest: Digest) -> PathBuf {
+        self.path.join(format!("{digest}.mark"))
+    }
+
+    fn open_at(&self, digest: Digest, offset: u64) -> Result<Option<File>, Error> {
+        if !self.shelf().whole.contains_key(&digest) {
+            return Ok(None);
+        }
+        let path = self.whole(digest);
+        let mut file = File::open(&path).map_err(at("opening", &path))?;
+        file.seek(SeekFrom::Start(offset)).map_err(at("reading", &path))?;
+        Ok(Some(file))
+    }
+
+    fn append(&self, file: Wanted, offset: u64, piece: &[u8]) -> Result<(), Error> {
+        if file.length == 0 || file.length > COMPONENT_BYTES_MAX {
+            return Err(Error::Size);
+        }
+        loop {
+            let entry = {
+                let mut shelf = self.shelf();
+                if let Some(length) = shelf.whole.get(&file.digest) {
+                    return Err(Error::Moved { at: *length, offset });
+                }
+                self.entry(&mut shelf, file)?
+            };
+            let mut part = entry.lock().unwrap_or_else(PoisonError::into_inner);
+            if self.is_current(file.digest, &entry) {
+                return self.add(&mut part, file, offset, piece);
+            }
+        }
+    }
+
+    /// The entry of a file, made if there is none. When there are too many, the one left alone longest goes.
+    fn entry(&self, shelf: &mut Shelf, file: Wanted) -> Result<Arc<Mutex<Part>>, Error> {
+        shelf.turn += 1;
+        let turn = shelf.turn;
+        if let Some(entry) = shelf.parts.get_mut(&file.digest) {
+            entry.touched = turn;
+            return Ok(entry.part.clone());
+        }
+        if shelf.parts.len() >= limits::UPLOADS_MAX {
+            // One that is being written now is not left alone.
+            let idle = |(digest, entry): (&Digest, &Entry)| {
+                entry.part.try_lock().ok().map(|part| (entry.touched, *digest, part.written))
+            };
+            if let Some((_, oldest, written)) = shelf.parts.iter().filter_map(idle).min() {
+                shelf.parts.remove(&oldest);
+                shelf.used = shelf.used.saturating_sub(written);
+                self.forget(oldest)?;
+            }
+        }
+        let mark = Mark { length: file.length, durable: 0 };
+        let part = Arc::new(Mutex::new(Part { mark, written: 0, open: None }));
+        shelf.parts.insert(file.digest, Entry { part: part.clone(), touched: turn });
+        Ok(part)
+    }
+
+    fn is_current(&self, digest: Digest, entry: &Arc<Mutex<Part>>) -> bool {
+        self.shelf().parts.get(&digest).is_some_and(|current| Arc::ptr_eq(&current.part, entry))
+    }
+
+    fn add(&self, part: &mut Part, file: Wanted, offset: u64, piece: &[u8]) -> Result<(), Error> {
+        if part.mark.length != file.length {
+            self.reset(part, file)?;
+        }
+        self.reopen(part, file.digest)?;
+        if offset != part.written {
+            return Err(Error::Moved { at: part.written, offset });
+        }
+        let end = offset + piece.len() as u64;
+        if end > file.length {
+            return Err(Error::TooLong { length: file.length, end });
+        }
+        self.reserve(file.length - part.written, piece.len() as u64)?;
+        let path = self.part(file.digest);
+        let Some((open, hash)) = part.open.as_mut() else { return Err(Error::Moved { at: part.written, offset }) };
+        let written = open.write_all(piece);
+        hash.update(piece);
+        part.written = end;
+        if let Err(source) = written {
+            self.fall_back(part);
+            return Err(at("writing", &path)(source));
+        }
+        if part.written - part.mark.durable >= limits::UPLOAD_SYNC_BYTES {
+            self.sync(part, file.digest)?;
+        }
+        Ok(())
+    }
+
+    /// Takes room for a piece if there is room for all that is missing.
+    fn reserve(&self, missing: u64, piece: u64) -> Result<(), Error> {
+        let mut shelf = self.shelf();
+        let free = self.quota.saturating_sub(shelf.used);
+        if missing > free {
+            return Err(Error::Full { missing, free, quota: self.quota });
+        }
+        shelf.used += piece;
+        Ok(())
+    }
+
+    /// Only what is durable counts from now on.
+    fn fall_back(&self, part: &mut Part) {
+        part.open = None;
+        let lost = part.written - part.mark.durable;
+        part.written = part.mark.durable;
+        let mut shelf = self.shelf();
+        shelf.used = shelf.used.saturating_sub(lost);
+    }
+
+    fn reset(&self, part: &mut Part, file: Wanted) -> Result<(), Error> {
+        part.mark.durable = 0;
+        self.fall_back(part);
+        part.mark.length = file.length;
+        self.forget(file.digest)
+    }
+
+    /// Opens a part at its durable end and reads what is before it, once after a start.
+    fn reopen(&self, part: &mut Part, digest: Digest) -> Result<(), Error> {
+        if part.open.is_some() {
+            return Ok(());
+        }
+        let path = self.part(digest);
+        let open = || {
+            let mut file = OpenOptions::new().create(true).truncate(false).read(true).write(true).open(&path)?;
+            file.set_len(part.mark.durable)?;
+            let mut hash = Hashing::default();
+            let mut buffer = vec![0; READ_BYTES];
+            loop {
+                let count = file.read(&mut buffer)?;
+                if count == 0 {
+                    return Ok((file, hash));
+                }
+                hash.update(&buffer[..count]);
+            }
+        };
+        part.open = Some(open().map_err(at("opening", &path))?);
+        Ok(())
+    }
+
+    /// The bytes first, then the word that they are there.
+    fn sync(&self, part: &mut Part, digest: Digest) -> Result<(), Error> {
+        let path = self.part(digest);
+        if let Some((file, _)) = &part.open
+            && let Err(source) = file.sync_data()
+        {
+            // After a failed sync nobody knows what is on the disk.
+            self.fall_back(part);
+            return Err(at("syncing", &path)(source));
+        }
+        let mark = Mark { durable: part.written, ..part.mark };
+        let text = serde_json::to_vec(&mark).unwrap_or_else(|e| unreachable!("plain fields: {e}"));
+        write_whole(&self.mark(digest), &text)?;
+        part.mark = mark;
+        Ok(())
+    }
+
+    fn settle(&self, file: Wanted) -> Result<Held, Error> {
+        loop {
+            let entry = {
+                let shelf = self.shelf();
+                if let Some(length) = shelf.whole.get(&file.digest) {
+                    return if *length == file.length { Ok(Held::Whole) } else { Err(Error::Size) };
+                }
+                shelf.parts.get(&file.digest).map(|entry| entry.part.clone())
+            };
+            let Some(entry) = entry else { return Ok(Held::Part(0)) };
+            let mut part = entry.lock().unwrap_or_else(PoisonError::into_inner);
+            if !self.is_current(file.digest, &entry) {
+                continue;
+            }
+            if part.mark.length != file.length {
+                return Ok(Held::Part(0));
+            }
+            if part.written > part.mark.durable {
+                self.sync(&mut part, file.digest)?;
+            }
+            if part.written < file.length {
+                return Ok(Held::Part(part.written));
+            }
+            return self.finish(&mut part, file.digest);
+        }
+    }
+
+    /// All bytes are here and durable: gives the file its name if they are the right ones.
+    fn finish(&self, part: &mut Part, digest: Digest) -> Result<Held, Error> {
+        self.reopen(part, digest)?;
+        let found = part.open.as_ref().map_or_else(|| Hashing::default().digest(), |(_, hash)| hash.digest());
+        if found != digest {
+            let mut shelf = self.shelf();
+            shelf.parts.remove(&digest);
+            shelf.used = shelf.used.saturating_sub(part.written);
+            self.forget(digest)?;
+            return Err(Error::WrongBytes { found });
+        }
+        let (path, whole) = (self.part(digest), self.whole(digest));
+        fs::rename(&path, &whole).map_err(at("naming", &whole))?;
+        sync_folder(&self.path)?;
+        let mut shelf = self.shelf();
+        shelf.parts.remove(&digest);
+        shelf.whole.insert(digest, part.written);
+        drop(shelf);
+        remove(&self.mark(digest))?;
+        Ok(Held::Whole)
+    }
+
+    /// Takes away what is here of a file that is not whole: first the word, then the bytes.
+    fn forget(&self, digest: Digest) -> Result<(), Error> {
+        remove(&self.mark(digest))?;
+        remove(&self.part(digest))
+    }
+}
+
+/// What is known of a part that has `length` bytes; none: nothing that counts.
+fn read_mark(folder: &Path, digest: Digest, length: u64) -> Option<Mark> {
+    let bytes = fs::read(folder.join(format!("{digest}.mark"))).ok()?;
+    let mark: Mark = serde_json::from_slice(&bytes).ok()?;
+    (mark.durable <= length && mark.durable <= mark.length).then_some(mark)
+}
+
+fn remove(path: &Path) -> Result<(), Error> {
+    match fs::remove_file(path) {
+        Err(source) if source.kind() != io::ErrorKind::NotFound => Err(at("removing", path)(source)),
+        _ => Ok(()),
+    }
+}
+
+fn sync_folder(path: &Path) -> Result<(), Error> {
+    File::open(path).and_then(|folder| folder.sync_all()).map_err(at("syncing", path))
+}
+
+/// Writes a small file whole or not at all, and durable.
+pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
+    let folder = path.parent().unwrap_or(Path::new("."));
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".new");
+    let beside = folder.join(name);
+    let write = || {
+        let mut file = File::create(&beside)?;
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        fs::rename(&beside, path)
+    };
+    write().map_err(at("writing", path))?;
+    sync_folder(folder)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,468 @@
+//! The repository that robots and foreign clients read: documents that people signed, and the word which of them are the newest.
+//!
+//! Invariant: a publication is checked as a robot would check it before anything of it is written; the timestamp is written last, and what
+//! is shown is what it leads to, so that a cut at any write leaves the older or the newer repository whole. Versions never go back.
+
+mod check;
+
+use crate::blocking;
+use crate::content::{self, Content, write_whole};
+use midshift_bundle::digest::Digest;
+use midshift_bundle::freshness::{
+    self, Edition, OnlineRole, Stamp, check_online, newest_targets, root_edition, stamp, targets_edition,
+};
+use midshift_bundle::keys::{self, SecretKey};
+use midshift_bundle::manifest::Manifest;
+use midshift_bundle::repository::{
+    self as documents, FileTarget, Online, TIMESTAMP_LIFE_MS, check_root, listed, sign_online,
+};
+use midshift_core::reason::Refusal;
+use midshift_core::time::Utc;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, PoisonError, RwLock};
+use tokio::sync::Mutex;
+
+/// A timestamp this old is signed anew: half its life.
+pub const FRESHEN_AFTER_MS: u64 = TIMESTAMP_LIFE_MS / 2;
+/// Snapshots kept for clients that read an older timestamp a moment ago.
+const SNAPSHOTS_KEPT: u64 = 16;
+/// What names the newest of everything.
+const TIMESTAMP: &str = "timestamp.json";
+/// When each bundle was seen first, by its digest. Not shown.
+const SEEN: &str = "seen.json";
+
+/// Why the repository stays as it was.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The disk.
+    #[error(transparent)]
+    Disk(#[from] content::Error),
+    /// A key file.
+    #[error(transparent)]
+    Key(#[from] keys::Error),
+    /// A document of this server.
+    #[error(transparent)]
+    Document(#[from] documents::Error),
+    /// The folder has no key of a role.
+    #[error("{folder} has no {role}-*.pem")]
+    NoKeyFile {
+        /// Where they should be.
+        folder: PathBuf,
+        /// Whose.
+        role: &'static str,
+    },
+    /// None of the server's keys may sign.
+    #[error("root {root_version} names none of the server's {role} keys")]
+    NotNamed {
+        /// The root.
+        root_version: u64,
+        /// Whose.
+        role: &'static str,
+    },
+    /// What is offered breaks rules.
+    #[error("{0}")]
+    Refused(#[from] Refusal),
+    /// Somebody else published.
+    #[error("the newest targets document is {newest}, not {expected}")]
+    Moved {
+        /// Version that is the newest; 0: none.
+        newest: u64,
+        /// Version that was expected.
+        expected: u64,
+    },
+    /// Files are listed that are not here.
+    #[error("{} listed files are not here, the first is {}", .0.len(), .0.first().map_or("", |f| f.name.as_str()))]
+    Missing(Vec<FileTarget>),
+    /// What lies on the disk does not hang together.
+    #[error("{folder}: {text}")]
+    Damaged {
+        /// The documents.
+        folder: PathBuf,
+        /// What does not hold.
+        text: String,
+    },
+}
+
+/// Keys that say which release is the newest. More than one of a role may lie ready; the root says which counts.
+pub struct OnlineKeys {
+    snapshot: Vec<SecretKey>,
+    timestamp: Vec<SecretKey>,
+}
+
+impl OnlineKeys {
+    /// Reads `snapshot-*.pem` and `timestamp-*.pem` of a folder. Blocks.
+    ///
+    /// # Errors
+    /// If one cannot be read, or a role has none.
+    pub fn read(folder: &Path) -> Result<Self, Error> {
+        let mut names = Vec::new();
+        for entry in fs::read_dir(folder).map_err(io("reading", folder))? {
+            names.extend(entry.map_err(io("reading", folder))?.file_name().into_string());
+        }
+        names.sort();
+        let of = |role: &'static str| -> Result<Vec<SecretKey>, Error> {
+            let prefix = format!("{role}-");
+            let files = names.iter().filter(|name| name.starts_with(&prefix) && name.ends_with(".pem"));
+            let keys: Vec<SecretKey> =
+                files.map(|name| SecretKey::read(&folder.join(name))).collect::<Result<_, _>>()?;
+            if keys.is_empty() {
+                return Err(Error::NoKeyFile { folder: folder.to_owned(), role });
+            }
+            Ok(keys)
+        };
+        Ok(Self { snapshot: of("snapshot")?, timestamp: of("timestamp")? })
+    }
+
+    /// Signs that `targets` is the newest, with the keys that `root` names, and holds the result against it.
+    fn sign(&self, root: &Kept, targets: &[u8], versions: (u64, u64), now: Utc) -> Result<Online, Error> {
+        let named = |keys: &'_ [SecretKey], role, name| -> Result<usize, Error> {
+            for (index, key) in keys.iter().enumerate() {
+                if freshness::names(&root.bytes, role, &key.public())? {
+                    return Ok(index);
+                }
+            }
+            Err(Error::NotNamed { root_version: root.edition.version, role: name })
+        };
+        let snapshot = &self.snapshot[named(&self.snapshot, OnlineRole::Snapshot, "snapshot")?];
+        let timestamp = &self.timestamp[named(&self.timestamp, OnlineRole::Timestamp, "timestamp")?];
+        let online = sign_online(targets, versions.0, versions.1, now, snapshot, timestamp)?;
+        check_online(&root.bytes, targets, &online)?;
+        Ok(online)
+    }
+}
+
+fn io(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
+    let path = path.to_owned();
+    move |source| content::Error::Io { doing, path, source }.into()
+}
+
+/// A document with its number and end.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Kept {
+    /// As it was signed.
+    pub bytes: Vec<u8>,
+    /// Its number and end.
+    pub edition: Edition,
+}
+
+/// A bundle of the newest targets document.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Release {
+    /// Of its manifest.
+    pub digest: Digest,
+    /// What it holds.
+    pub manifest: Manifest,
+    /// When the server saw it first.
+    pub seen: Utc,
+}
+
+/// What the repository says now.
+#[derive(Clone, Debug)]
+pub struct Newest {
+    /// Who may sign.
+    pub root: Kept,
+    /// Which files there are.
+    pub targets: Kept,
+    /// How fresh that is.
+    pub stamp: Stamp,
+    /// Files that may be handed out, by name.
+    pub files: BTreeMap<String, FileTarget>,
+    /// Bundles by name and version.
+    pub releases: Vec<Release>,
+    digests: BTreeSet<Digest>,
+    timestamp: Vec<u8>,
+}
+
+impl Newest {
+    /// Whether a signed release has this file.
+    pub fn lists(&self, digest: Digest) -> bool {
+        self.digests.contains(&digest)
+    }
+}
+
+/// Documents by name, in the order in which they are to be written, and what is shown after the last.
+struct Publication {
+    writes: Vec<(String, Vec<u8>)>,
+    newest: Newest,
+}
+
+/// The repository of one server.
+pub struct Repository {
+    folder: PathBuf,
+    keys: OnlineKeys,
+    content: Arc<dyn Content>,
+    newest: RwLock<Option<Arc<Newest>>>,
+    /// One publication or signature at a time.
+    writing: Mutex<()>,
+}
+
+impl Repository {
+    /// Opens the folder, made if it is not there, and finds what its timestamp leads to.
+    ///
+    /// # Errors
+    /// If it cannot be read, or what is there does not hang together.
+    pub async fn open(folder: &Path, keys: OnlineKeys, content: Arc<dyn Content>) -> Result<Self, Error> {
+        let path = folder.to_owned();
+        let found = blocking(move || find(&path)).await?;
+        let newest = match found {
+            Some(found) => Some(Arc::new(found.complete(content.as_ref()).await?)),
+            None => None,
+        };
+        let (newest, folder) = (RwLock::new(newest), folder.to_owned());
+        Ok(Self { folder, keys, content, newest, writing: Mutex::new(()) })
+    }
+
+    /// What it says now; none: nothing was ever published.
+    pub fn newest(&self) -> Option<Arc<Newest>> {
+        self.newest.read().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// A document by its name; none: there is none, or it was never made the newest.
+    ///
+    /// # Errors
+    /// The disk's.
+    pub async fn document(&self, name: &str) -> Result<Option<Vec<u8>>, Error> {
+        let Some(newest) = self.newest() else { return Ok(None) };
+        if name == TIMESTAMP {
+            return Ok(Some(newest.timestamp.clone()));
+        }
+        let shown = [
+            ("root", newest.root.edition.version),
+            ("targets", newest.targets.edition.version),
+            ("snapshot", newest.stamp.snapshot_version),
+        ];
+        let number = |role: &str| name.strip_suffix(&format!(".{role}.json"))?.parse::<u64>().ok();
+        let is_shown = |(role, most): (&str, u64)| number(role).is_some_and(|n| n <= most && name == file(n, role));
+        if !shown.into_iter().any(is_shown) {
+            return Ok(None);
+        }
+        let path = self.folder.join(name);
+        blocking(move || read(&path)).await
+    }
+
+    /// Makes documents the newest if `expected` is still the version of the newest targets document, 0 of none. A publication that is
+    /// the newest already is no error: somebody lost our answer.
+    ///
+    /// # Errors
+    /// Why not; nothing has changed then, or nobody knows and the next start does.
+    pub async fn publish(
+        &self,
+        roots: Vec<Vec<u8>>,
+        targets: Vec<u8>,
+        expected: u64,
+        now: Utc,
+    ) -> Result<Arc<Newest>, Error> {
+        let _writing = self.writing.lock().await;
+        let before = self.newest();
+        let newest = before.as_ref().map_or(0, |b| b.targets.edition.version);
+        if newest != expected {
+            return match before {
+                Some(before) if before.targets.bytes == targets && self.has_all(&before, &roots).await? => Ok(before),
+                _ => Err(Error::Moved { newest, expected }),
+            };
+        }
+        let publication = self.prepare(before.as_deref(), roots, targets, now).await?;
+        self.commit(publication).await
+    }
+
+    /// Signs anew that everything is as it was, if that was said long ago. How long until it is due, ms; none: there is nothing to say.
+    ///
+    /// # Errors
+    /// Why it was not signed.
+    pub async fn freshen(&self, now: Utc) -> Result<Option<u64>, Error> {
+        let _writing = self.writing.lock().await;
+        let Some(before) = self.newest() else { return Ok(None) };
+        let issued = before.stamp.issued;
+        let age_ms = now.ms_since(issued);
+        // A clock that went back says nothing of the age.
+        if now >= issued && age_ms < FRESHEN_AFTER_MS {
+            return Ok(Some(FRESHEN_AFTER_MS - age_ms));
+        }
+        let (online, stamp) = self.sign(Some(&before), &before.root, &before.targets.bytes, now)?;
+        let writes =
+            vec![(file(stamp.snapshot_version, "snapshot"), online.snapshot), (TIMESTAMP.to_owned(), online.timestamp)];
+        let timestamp = writes[1].1.clone();
+        self.commit(Publication { writes, newest: Newest { stamp, timestamp, ..(*before).clone() } }).await?;
+        Ok(Some(FRESHEN_AFTER_MS))
+    }
+
+    /// Whether the repository has these roots already.
+    async fn has_all(&self, newest: &Newest, roots: &[Vec<u8>]) -> Result<bool, Error> {
+        for root in roots {
+            let version = root_edition(root)?.version;
+            let known = version <= newest.root.edition.version;
+            if !known || self.document(&file(version, "root")).await?.as_ref() != Some(root) {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+
+    /// Checks everything and signs it; nothing is written yet.
+    async fn prepare(
+        &self,
+        before: Option<&Newest>,
+        roots: Vec<Vec<u8>>,
+        targets: Vec<u8>,
+        now: Utc,
+    ) -> Result<Publication, Error> {
+        let known = match before {
+            // A root that came before is no news.
+            Some(newest) => {
+                let mut known = Vec::new();
+                for root in &roots {
+                    known.push(self.has_all(newest, std::slice::from_ref(root)).await.unwrap_or(false));
+                }
+                known
+            }
+            None => vec![false; roots.len()],
+        };
+        let roots: Vec<Vec<u8>> = roots.into_iter().zip(known).filter(|(_, known)| !known).map(|(r, _)| r).collect();
+        let root = check::roots(before.map(|b| &b.root), &roots, now)?;
+        let targets = check::targets(&root, before.map(|b| &b.targets), targets, now)?;
+        let files = listed(&targets.bytes)?;
+        let mut seen = self.seen().await?;
+        let releases = check::releases(&files, self.content.as_ref(), &mut seen, now).await?;
+        let (online, stamp) = self.sign(before, &root, &targets.bytes, now)?;
+        let first_root = root.edition.version + 1 - roots.len() as u64;
+        let mut writes: Vec<(String, Vec<u8>)> =
+            (first_root..).map(|version| file(version, "root")).zip(roots).collect();
+        let seen = serde_json::to_vec(&seen).unwrap_or_else(|e| unreachable!("plain fields: {e}"));
+        writes.push((SEEN.to_owned(), seen));
+        writes.push((file(targets.edition.version, "targets"), targets.bytes.clone()));
+        writes.push((file(stamp.snapshot_version, "snapshot"), online.snapshot));
+        writes.push((TIMESTAMP.to_owned(), online.timestamp.clone()));
+        let newest = Newest::of(root, targets, stamp, files, releases, online.timestamp);
+        Ok(Publication { writes, newest })
+    }
+
+    fn sign(&self, before: Option<&Newest>, root: &Kept, targets: &[u8], now: Utc) -> Result<(Online, Stamp), Error> {
+        let versions = before.map_or((1, 1), |b| (b.stamp.snapshot_version + 1, b.stamp.version + 1));
+        let online = self.keys.sign(root, targets, versions, now)?;
+        let stamp = stamp(&online.timestamp)?;
+        Ok((online, stamp))
+    }
+
+    async fn seen(&self) -> Result<BTreeMap<Digest, Utc>, Error> {
+        let folder = self.folder.clone();
+        blocking(move || read_seen(&folder)).await
+    }
+
+    /// Writes one document after the other, each whole and durable, and shows the result.
+    async fn commit(&self, publication: Publication) -> Result<Arc<Newest>, Error> {
+        let (folder, newest) = (self.folder.clone(), Arc::new(publication.newest));
+        let stale = newest.stamp.snapshot_version.checked_sub(SNAPSHOTS_KEPT);
+        blocking(move || {
+            publication.writes.iter().try_for_each(|(name, bytes)| write_whole(&folder.join(name), bytes))?;
+            if let Some(stale) = stale {
+                // Whether it is gone matters to nobody.
+                let _ = fs::remove_file(folder.join(file(stale, "snapshot")));
+            }
+            Ok::<_, Error>(())
+        })
+        .await?;
+        *self.newest.write().unwrap_or_else(PoisonError::into_inner) = Some(newest.clone());
+        Ok(newest)
+    }
+}
+
+impl Newest {
+    fn of(
+        root: Kept,
+        targets: Kept,
+        stamp: Stamp,
+        files: Vec<FileTarget>,
+        releases: Vec<Release>,
+        timestamp: Vec<u8>,
+    ) -> Self {
+        let digests = files.iter().map(|file| file.digest).collect();
+        let files = files.into_iter().map(|file| (file.name.clone(), file)).collect();
+        Self { root, targets, stamp, files, releases, digests, timestamp }
+    }
+}
+
+/// Documents that the timestamp of a folder leads to.
+struct Found {
+    root: Kept,
+    targets: Kept,
+    timestamp: Vec<u8>,
+    stamp: Stamp,
+    seen: BTreeMap<Digest, Utc>,
+}
+
+impl Found {
+    /// With its bundles. A file that is gone is told and left out: the rest can be had still.
+    async fn complete(self, content: &dyn Content) -> Result<Newest, Error> {
+        let files = listed(&self.targets.bytes)?;
+        let mut releases = Vec::new();
+        for file in files.iter().filter(|file| check::is_manifest(file)) {
+            match check::manifest(file, content).await? {
+                Ok(manifest) => {
+                    let seen = self.seen.get(&file.digest).copied().unwrap_or_default();
+                    releases.push(Release { digest: file.digest, manifest, seen });
+                }
+                Err(problem) => tracing::error!(file = file.name, problem, "a signed bundle cannot be read"),
+            }
+        }
+        check::sort(&mut releases);
+        Ok(Newest::of(self.root, self.targets, self.stamp, files, releases, self.timestamp))
+    }
+}
+
+/// Reads a folder. Of the roots the newest counts under which everything else holds: a later one came with a publication that was cut.
+fn find(folder: &Path) -> Result<Option<Found>, Error> {
+    fs::create_dir_all(folder).map_err(io("making", folder))?;
+    let Some(timestamp) = read(&folder.join(TIMESTAMP))? else { return Ok(None) };
+    let damaged = |text: String| Error::Damaged { folder: folder.to_owned(), text };
+    let must = |name: String| read(&folder.join(&name))?.ok_or_else(|| damaged(format!("{name} is gone")));
+    let stamp = stamp(&timestamp)?;
+    let snapshot = must(file(stamp.snapshot_version, "snapshot"))?;
+    let targets = must(file(newest_targets(&snapshot)?, "targets"))?;
+    let online = Online { snapshot, timestamp };
+    let (mut before, mut root): (Option<Vec<u8>>, _) = (None, None);
+    let mut objection = "1.root.json is gone".to_owned();
+    for version in 1.. {
+        let Some(bytes) = read(&folder.join(file(version, "root")))? else { break };
+        if let Err(error) = check_root(before.as_ref().unwrap_or(&bytes), &bytes) {
+            objection = format!("{}: {error}", file(version, "root"));
+            break;
+        }
+        match check_online(&bytes, &targets, &online) {
+            Ok(()) => root = Some(bytes.clone()),
+            Err(error) => objection = error.to_string(),
+        }
+        before = Some(bytes);
+    }
+    let root = root.ok_or_else(|| damaged(objection))?;
+    Ok(Some(Found {
+        root: Kept { edition: root_edition(&root)?, bytes: root },
+        targets: Kept { edition: targets_edition(&targets)?, bytes: targets },
+        timestamp: online.timestamp,
+        stamp,
+        seen: read_seen(folder)?,
+    }))
+}
+
+fn read_seen(folder: &Path) -> Result<BTreeMap<Digest, Utc>, Error> {
+    let bytes = read(&folder.join(SEEN))?.unwrap_or_else(|| b"{}".to_vec());
+    serde_json::from_slice(&bytes)
+        .map_err(|e| Error::Damaged { folder: folder.to_owned(), text: format!("{SEEN}: {e}") })
+}
+
+fn file(version: u64, role: &str) -> String {
+    format!("{version}.{role}.json")
+}
+
+fn read(path: &Path) -> Result<Option<Vec<u8>>, Error> {
+    match fs::read(path) {
+        Ok(bytes) => Ok(Some(bytes)),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(io("reading", path)(error)),
+    }
+}
+
+#[cfg(test)]
+mod tests;
