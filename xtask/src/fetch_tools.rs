@@ -1,4 +1,4 @@
-//! The outside programs that tests of real components talk to, pinned, under `target/tools`.
+//! The outside programs that tests of real components talk to, pinned, under `target/tools`; and strace, which is the system's.
 //!
 //! Invariant: without `--install` nothing is fetched and nothing is skipped: what is missing is listed and the suite fails.
 //! A tool counts as there when its program exists and its stamp names the pinned version, so a second install is quick.
@@ -11,6 +11,8 @@ use std::process::Command;
 
 const GRPCURL: &str = "github.com/fullstorydev/grpcurl/cmd/grpcurl@v1.9.3";
 const BUF: &str = "github.com/bufbuild/buf/cmd/buf@v1.57.2";
+/// Its package and program of the system.
+const STRACE: &str = "strace";
 const PYTHON: &[&str] = &["grpcio==1.80.0", "grpcio-tools==1.80.0"];
 
 /// Paths of the tools.
@@ -21,13 +23,20 @@ pub struct Tools {
     pub buf: PathBuf,
     /// A Python that can import grpc and grpc_tools.
     pub python: PathBuf,
+    /// strace, of any version that can inject signals.
+    pub strace: PathBuf,
 }
 
 impl Tools {
     /// Where they are or will be.
     fn of(workspace: &Workspace) -> Self {
         let tools = workspace.tools();
-        Self { grpcurl: tools.join("bin/grpcurl"), buf: tools.join("bin/buf"), python: tools.join("venv/bin/python") }
+        Self {
+            grpcurl: tools.join("bin/grpcurl"),
+            buf: tools.join("bin/buf"),
+            python: tools.join("venv/bin/python"),
+            strace: STRACE.into(),
+        }
     }
 
     fn each(&self) -> [(&'static str, &PathBuf, String); 3] {
@@ -41,13 +50,16 @@ impl Tools {
     /// All tools, or an error that lists the missing ones.
     pub fn find(workspace: &Workspace) -> Result<Self> {
         let tools = Self::of(workspace);
-        let missing: Vec<_> =
+        let mut missing: Vec<_> =
             tools.each().into_iter().filter(|t| !present(t.1, &t.2)).map(|t| format!("  {}: {}", t.0, t.2)).collect();
+        if !tools.has_strace() {
+            missing.push(format!("  {STRACE}, a program of the system"));
+        }
         if missing.is_empty() {
             return Ok(tools);
         }
         bail!(
-            "missing under {}:\n{}\nnext: cargo xtask test --install",
+            "missing, in {} unless it says otherwise:\n{}\nnext: cargo xtask test --install",
             workspace.tools().display(),
             missing.join("\n")
         )
@@ -69,7 +81,14 @@ impl Tools {
         if !present(&tools.python, &PYTHON.join(" ")) {
             install_python(workspace, &tools.python)?;
         }
+        if !tools.has_strace() {
+            apt::install(workspace, &[STRACE])?;
+        }
         Self::find(workspace)
+    }
+
+    fn has_strace(&self) -> bool {
+        run::quietly(Command::new(&self.strace).arg("-V"))
     }
 
     /// Tells tests where the tools are.
@@ -77,6 +96,7 @@ impl Tools {
         command.env("MIDSHIFT_TEST_GRPCURL", &self.grpcurl);
         command.env("MIDSHIFT_TEST_BUF", &self.buf);
         command.env("MIDSHIFT_TEST_PYTHON", &self.python);
+        command.env("MIDSHIFT_TEST_STRACE", &self.strace);
     }
 }
 

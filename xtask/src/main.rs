@@ -27,14 +27,15 @@ struct Cli {
 enum Verb {
     /// Run the whole suite, or only the named parts, and print the minutes of each.
     Test {
-        /// First install what the tests of real components need (grpcurl, buf, a Python with gRPC) into target/tools.
+        /// First install what the tests of real components need (grpcurl, buf, a Python with gRPC) into target/tools,
+        /// and strace into the system.
         #[arg(long)]
         install: bool,
         /// Parts to run, in the suite's order whatever the order here; none: all.
         #[arg(value_enum)]
         parts: Vec<parts::Part>,
     },
-    /// Long fault sweeps, of which CI runs a sample: programs that are killed at work, and simulated shifts.
+    /// Long fault sweeps, of which CI runs a sample: programs that are killed at work, simulated shifts, and power cuts of updates.
     Torture {
         /// Sweeps to run; none: all.
         #[arg(value_enum)]

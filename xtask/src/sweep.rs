@@ -1,7 +1,7 @@
 //! Long sweeps and golden files: calls of `cargo test` with an environment variable that the tests read.
 //!
 //! Invariant: a sweep that ran no test fails. `MIDSHIFT_SEED` is read by the test that kills programs, `MIDSHIFT_SEEDS` and
-//! `MIDSHIFT_SEED_FROM` by the simulation, `BLESS` by tests with `golden` in their name.
+//! `MIDSHIFT_SEED_FROM` by the simulation, `MIDSHIFT_SITES` by the power cuts, `BLESS` by tests with `golden` in their name.
 
 use crate::parts::Count;
 use crate::run;
@@ -17,15 +17,18 @@ pub enum Sweep {
     Kills,
     /// Shifts of the deterministic simulation.
     Simulation,
+    /// The power goes at each call of an update that changes the disk: all of them, whatever the seeds.
+    Updates,
 }
 
 impl Sweep {
-    const ALL: [Self; 2] = [Self::Kills, Self::Simulation];
+    const ALL: [Self; 3] = [Self::Kills, Self::Simulation, Self::Updates];
 
     fn seeds(self) -> u64 {
         match self {
             Self::Kills => 20,
             Self::Simulation => 2_000,
+            Self::Updates => 1,
         }
     }
 
@@ -36,6 +39,11 @@ impl Sweep {
                 let mut command = test(workspace, "simulation", "many_seeds_keep_every_law");
                 command.env("MIDSHIFT_SEED_FROM", from.to_string()).env("MIDSHIFT_SEEDS", seeds.to_string());
                 counted(&mut command)
+            }
+            Self::Updates => {
+                let arguments =
+                    ["test", "--package", "midshift-agent", "--test", "agent", "--", "power::", "--nocapture"];
+                counted(workspace.cargo(&arguments).env("MIDSHIFT_SITES", "all"))
             }
         }
     }

@@ -222,6 +222,7 @@ impl Sets for DiskSets {
                 named.extend(set.components.values().map(|c| c.digest));
             }
         }
+        self.part = None;
         let collect = || {
             for entry in fs::read_dir(&self.folder)? {
                 let entry = entry?;
@@ -237,13 +238,14 @@ impl Sets for DiskSets {
                 let entry = entry?;
                 let name = entry.file_name().to_string_lossy().into_owned();
                 let digest = name.split('.').next().and_then(|name| name.parse::<Digest>().ok());
-                if digest.is_none_or(|digest| !named.contains(&digest)) {
+                // The power may have gone between giving content its name and removing its marks.
+                let is_left_over = |digest: &Digest| name.contains('.') && self.content(digest).exists();
+                if digest.is_none_or(|digest| !named.contains(&digest) || is_left_over(&digest)) {
                     remove(&entry.path())?;
                 }
             }
             Ok(())
         };
-        self.part = None;
         collect().map_err(io_error("deleting what nobody needs"))
     }
 }

@@ -4,6 +4,7 @@ mod chaos;
 mod drives;
 mod lanes;
 mod offers;
+mod power;
 mod release;
 mod remote;
 mod restarts;

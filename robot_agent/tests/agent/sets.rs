@@ -56,11 +56,11 @@ fn only(range: std::ops::Range<u64>) -> Vec<std::ops::Range<u64>> {
     std::iter::once(range).collect()
 }
 
-fn bytes(seed: u8, length: u64) -> Vec<u8> {
+pub fn bytes(seed: u8, length: u64) -> Vec<u8> {
     (0..length).map(|at| seed.wrapping_add((at % 251) as u8)).collect()
 }
 
-fn wanted(content: &[u8]) -> Wanted {
+pub fn wanted(content: &[u8]) -> Wanted {
     Wanted { digest: Digest::of(content), length: content.len() as u64 }
 }
 
@@ -94,7 +94,7 @@ fn component(name: &str, kind: ComponentKind, content: &[u8]) -> Component {
     }
 }
 
-fn set(version: &str, program: &[u8], settings: &[u8]) -> SetManifest {
+pub fn set(version: &str, program: &[u8], settings: &[u8]) -> SetManifest {
     let components =
         [component("gait", ComponentKind::Process, program), component("behaviour", ComponentKind::Config, settings)];
     SetManifest {
@@ -104,7 +104,7 @@ fn set(version: &str, program: &[u8], settings: &[u8]) -> SetManifest {
     }
 }
 
-fn staged(sets: &mut dyn Sets, version: &str, program: &[u8], settings: &[u8]) -> SetManifest {
+pub fn staged(sets: &mut dyn Sets, version: &str, program: &[u8], settings: &[u8]) -> SetManifest {
     let set = set(version, program, settings);
     put(sets, program);
     put(sets, settings);

@@ -14,5 +14,6 @@ pub mod robots;
 pub mod serve;
 pub mod server;
 pub mod site_file;
+mod software;
 pub mod tally;
 pub mod under_way;

@@ -1,8 +1,10 @@
 //! Robots in processes of their own: one agent with a simulated body that survives its process, or a swarm against a server elsewhere.
 
+use crate::software::Software;
 use crate::{clock, site_file};
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use midshift_agent::core::ExitReason;
+use midshift_agent::dial::TcpDial;
 use midshift_core::ids::{RobotId, WaypointId};
 use midshift_core::time::Clock;
 use midshift_sim::body::{BodyConfig, SimBody};
@@ -46,6 +48,15 @@ pub struct AgentRun {
     /// Nothing goes wrong by itself.
     #[arg(long)]
     pub no_faults: bool,
+    /// Where its sets of software are. With --trust it takes updates, and behaves as behaviour.toml of the set that runs says.
+    #[arg(long, requires = "trust")]
+    pub sets: Option<PathBuf>,
+    /// Its trust file: whose software it takes.
+    #[arg(long, requires = "sets")]
+    pub trust: Option<PathBuf>,
+    /// The machine's clock is not set from the network: the end of a signature is not judged by it.
+    #[arg(long, requires = "sets")]
+    pub clock_unsynced: bool,
 }
 
 /// Robots of one process against a server elsewhere.
@@ -112,7 +123,14 @@ pub async fn agent(args: AgentRun, stop: CancellationToken) -> anyhow::Result<Ex
     if site.find(&start).is_none() {
         bail!("the site has no waypoint {start}");
     }
+    let software = args.sets.as_deref().zip(args.trust.as_deref());
+    let software = software.map(|(sets, trust)| Software::open(sets, trust)).transpose()?;
     let mut config = BodyConfig::new(robot_id.clone(), args.seed, start);
+    if let Some(software) = &software {
+        let of = &software.trust.site;
+        ensure!(of == site.site_id(), "the trust file is for robots of site {of}; this is site {}", site.site_id());
+        software.shape(&mut config)?;
+    }
     config.pace_permille = (args.body_speed.clamp(0.1, 100.0) * 1000.0) as u32;
     if args.no_faults {
         config.faults = FaultRates::none();
@@ -124,16 +142,26 @@ pub async fn agent(args: AgentRun, stop: CancellationToken) -> anyhow::Result<Ex
     let (body, _world) = SimBody::restore(config, site, world, &args.data, now.site)?;
     let handle = SimHandle::new(body);
     let network = handle.network();
-    let dial = midshift_agent::dial::TcpDial::new(&uri(&args.server), Some(network))?;
+    let uri = uri(&args.server);
+    let dial = TcpDial::new(&uri, Some(network.clone()))?;
+    let bulk = TcpDial::bulk(&uri, Some(network))?;
+    let mut pulse = midshift_agent::pulse::for_launcher();
+    if let Some(software) = &software {
+        pulse = software.pulse(pulse, &clock);
+    }
+    let mut update = software.map(|software| software.updates(bulk));
+    if let Some(update) = &mut update {
+        update.config.clock_synced = !args.clock_unsynced;
+    }
     let store = midshift_agent::sqlite::SqliteStore::open(&args.data.join(AGENT_FILE)).await?;
     let agent = midshift_agent::session::AgentConfig {
-        update: None,
+        update,
         robot_id,
         boot_id: format!("{:032x}", rand::random::<u128>()),
         new_ring_id: format!("{:032x}", rand::random::<u128>()),
         seed: rand::random(),
         bugs: midshift_agent::bugs::Bugs::default(),
-        pulse: midshift_agent::pulse::for_launcher(),
+        pulse,
     };
     match midshift_agent::session::run(agent, Box::new(handle), Box::new(store), clock, Arc::new(dial), stop).await? {
         reason @ (ExitReason::Shutdown | ExitReason::Switched) => Ok(reason),

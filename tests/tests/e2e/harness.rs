@@ -63,6 +63,12 @@ impl Running {
         anyhow::ensure!(sent.success(), "kill -s {name}: {sent}");
         Ok(())
     }
+    /// The same to the whole group that it leads: it must have been started with `process_group(0)`.
+    pub fn signal_group(&self, name: &str) -> anyhow::Result<()> {
+        let sent = Command::new("kill").args(["-s", name, "--", &format!("-{}", self.0.id())]).output()?;
+        anyhow::ensure!(sent.status.success(), "kill -s {name}: {}", sent.status);
+        Ok(())
+    }
     /// Waits until it ends by itself; its exit code, none if a signal ended it.
     pub async fn ends(&mut self) -> anyhow::Result<Option<i32>> {
         let end = Instant::now() + Duration::from_secs(60);

@@ -9,6 +9,7 @@ mod golden_cli;
 mod harness;
 mod held;
 mod kill;
+mod launched;
 mod measured;
 mod proxy;
 mod room;

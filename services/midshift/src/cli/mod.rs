@@ -21,7 +21,7 @@ use crate::{dev, logs, robots, serve};
 use clap::{Parser, Subcommand};
 use client::{Call, Exit};
 use midshift_agent::core::ExitReason;
-use midshift_agent::launcher::SWITCHED;
+use midshift_agent::launcher::{self, SWITCHED};
 use out::{Format, Out};
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -57,6 +57,13 @@ enum Command {
     /// A robot's agent.
     #[command(subcommand)]
     Agent(AgentVerb),
+    /// Start a robot's agent and keep it running; go back to the kept set of software when a new one cannot live.
+    #[command(disable_help_flag = true)]
+    Launcher {
+        /// As for the program midshift-launcher: --record FILE [--sets DIR] [--hang SECONDS] [--beacon HOST:PORT --robot-id ID] -- PROGRAM ARGS…
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true, required = true)]
+        arguments: Vec<String>,
+    },
     /// Simulated robots, and faults in them.
     #[command(subcommand)]
     Sim(sim::Verb),
@@ -99,6 +106,10 @@ enum AgentVerb {
 /// Reads the arguments, runs the command, gives the exit code.
 pub fn main() -> ExitCode {
     let args = Args::parse();
+    if let Command::Launcher { arguments } = args.command {
+        // Before anything that a launcher must not need: no runtime, no threads.
+        return launcher::main(arguments.into_iter());
+    }
     let serves = matches!(args.command, Command::Serve(_) | Command::Agent(_) | Command::Sim(sim::Verb::Run(_)));
     logs::start(args.log, if serves { "info" } else { "warn" });
     let out = Out::new(args.output);
@@ -141,6 +152,7 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
             ExitReason::Switched => Err(Exit::new(SWITCHED, "another set of software is to be started")),
             ExitReason::Shutdown | ExitReason::FencedTwice => Ok(()),
         },
+        Command::Launcher { .. } => unreachable!("runs before the runtime"),
         Command::Sim(verb) => sim::run(verb, out, interrupts()).await,
         Command::Task(verb) => task::run(verb, out).await,
         Command::Robot(verb) => robot::run(verb, out).await,

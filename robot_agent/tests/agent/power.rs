@@ -1,0 +1,224 @@
+//! The power goes at any moment of an update: the process that makes it is killed at each of its calls that change the disk.
+//!
+//! `strace` kills it as it enters the call. Without being asked a seeded sample of the calls is cut; `MIDSHIFT_SITES=all` cuts every one.
+
+use crate::sets::{bytes, set, staged, wanted};
+use midshift_agent::launcher::SWITCH;
+use midshift_agent::sets::disk::DiskSets;
+use midshift_agent::sets::{CHUNK_BYTES, Sets};
+use midshift_agent::switch::Switch;
+use midshift_bundle::digest::Digest;
+use midshift_bundle::set::SetManifest;
+use rand::SeedableRng;
+use rand::rngs::StdRng;
+use rand::seq::SliceRandom;
+use std::collections::{BTreeMap, BTreeSet};
+use std::ffi::OsString;
+use std::fs;
+use std::os::unix::process::ExitStatusExt;
+use std::path::Path;
+use std::process::{Command, ExitStatus};
+
+/// Names the folder to the process that is to be killed.
+const UPDATE_IN: &str = "MIDSHIFT_TEST_UPDATE_IN";
+/// Calls that change what is on a disk. One that opens a new file leaves the same as the next one that writes to it finds.
+const CALLS: &str = "write,pwrite64,fsync,fdatasync,rename,renameat,renameat2,link,linkat,unlink,unlinkat,rmdir,mkdir,mkdirat,ftruncate,chmod,fchmodat";
+/// The test that makes an update.
+const UPDATE: &str = "an_update_ends_and_made_once_more_it_changes_nothing";
+/// Cuts of a sample.
+const SAMPLE: usize = 48;
+
+/// What is updated to: a program of three chunks.
+fn next() -> (SetManifest, [Vec<u8>; 2]) {
+    let contents = [bytes(3, 2 * CHUNK_BYTES + 1_000), b"settings of v2".to_vec()];
+    (set("v2", &contents[0], &contents[1]), contents)
+}
+
+/// A robot that runs v1 and keeps v0.
+fn robot(folder: &Path) -> [SetManifest; 2] {
+    let mut sets = DiskSets::open(folder).expect("opens");
+    let mut switch = Switch::default();
+    ["v0", "v1"].map(|version| {
+        let set = staged(&mut sets, version, format!("program {version}").as_bytes(), b"settings");
+        switch.try_out(&set.id().to_string());
+        switch.commit();
+        sets.write_switch(&mut switch).expect("writes");
+        set
+    })
+}
+
+/// The whole update, from wherever an earlier one was cut off.
+fn update(folder: &Path) {
+    let mut sets = DiskSets::open(folder).expect("opens");
+    let (next, contents) = next();
+    let name = next.id().to_string();
+    let mut switch = sets.holdings().expect("tells").switch;
+    if switch.running() != name {
+        for content in &contents {
+            let wanted = wanted(content);
+            for range in sets.missing(&wanted).expect("tells") {
+                for from in range.clone().step_by(CHUNK_BYTES as usize) {
+                    let to = range.end.min(from + CHUNK_BYTES);
+                    sets.write(&wanted, from, &content[from as usize..to as usize]).expect("writes");
+                    sets.sync(&wanted).expect("syncs");
+                }
+            }
+            sets.seal(&wanted).expect("seals");
+        }
+        sets.stage(&next).expect("stages");
+        switch.try_out(&name);
+        sets.write_switch(&mut switch).expect("writes");
+    }
+    if switch.trial.as_ref().is_some_and(|trial| !trial.is_proven) {
+        switch.prove();
+        sets.write_switch(&mut switch).expect("writes");
+    }
+    if switch.trial.is_some() {
+        switch.commit();
+        sets.write_switch(&mut switch).expect("writes");
+    }
+    sets.collect(&BTreeSet::new()).expect("collects");
+}
+
+/// What runs and what is kept can be started.
+fn assert_bootable(folder: &Path, when: &str) {
+    let mut sets = DiskSets::open(folder).expect("opens");
+    let switch = sets.holdings().unwrap_or_else(|e| panic!("{when}: {e}")).switch;
+    for name in [Some(switch.running()), switch.kept()].into_iter().flatten() {
+        let id: Digest = name.parse().unwrap_or_else(|e| panic!("{when}: {name}: {e:?}"));
+        sets.verify(&id).unwrap_or_else(|e| panic!("{when}: {e}"));
+    }
+}
+
+/// The update came to its end and left nothing behind.
+fn assert_ended(folder: &Path, kept: &SetManifest, when: &str) {
+    assert_bootable(folder, when);
+    let holdings = DiskSets::open(folder).expect("opens").holdings().expect("tells");
+    let (next, _) = next();
+    let (current, previous) = (next.id().to_string(), kept.id().to_string());
+    let switch = holdings.switch;
+    let stands = (switch.current.as_str(), switch.previous.as_deref(), switch.trial.as_ref());
+    assert_eq!(stands, (current.as_str(), Some(previous.as_str()), None), "{when}");
+    let names = |folder: &Path| -> BTreeSet<String> {
+        let entries = fs::read_dir(folder).expect("is there").map(|entry| entry.expect("an entry").file_name());
+        entries.map(|name| name.to_string_lossy().into_owned()).collect()
+    };
+    assert_eq!(names(folder), BTreeSet::from(["switch".to_owned(), "content".to_owned(), current, previous]), "{when}");
+    let components = next.components.values().chain(kept.components.values());
+    assert_eq!(names(&folder.join("content")), components.map(|c| c.digest.to_string()).collect(), "{when}");
+}
+
+#[test]
+fn an_update_ends_and_made_once_more_it_changes_nothing() {
+    if let Some(folder) = std::env::var_os(UPDATE_IN) {
+        // In the process that is to be killed.
+        return update(Path::new(&folder));
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let [_, kept] = robot(folder.path());
+    for _ in 0..2 {
+        update(folder.path());
+        assert_ended(folder.path(), &kept, "without a cut");
+    }
+}
+
+/// Calls that change a folder, as one whole run made them.
+struct Sites {
+    /// The name of each, and the how manieth of that name it is.
+    calls: Vec<(String, usize)>,
+    /// What they touched, below the folder.
+    paths: BTreeSet<String>,
+}
+
+/// One of these tests on a folder in a process of its own, under `strace` with these arguments; how it ended, and the trace.
+fn traced(test: &str, folder: &Path, arguments: &[String]) -> (ExitStatus, String) {
+    let log = tempfile::NamedTempFile::new().expect("a file");
+    let strace = std::env::var_os("MIDSHIFT_TEST_STRACE").unwrap_or_else(|| OsString::from("strace"));
+    let mut command = Command::new(&strace);
+    command.args(["-f", "-qq", "-y", "-o"]).arg(log.path()).args(arguments);
+    command.arg(std::env::current_exe().expect("this test")).args(["--exact", &format!("power::{test}")]);
+    let output = command.env(UPDATE_IN, folder).output();
+    let output = output.unwrap_or_else(|e| panic!("{}: {e}: run `cargo xtask test --install`", strace.display()));
+    (output.status, fs::read_to_string(log.path()).expect("a trace"))
+}
+
+/// Runs it to its end and finds the calls that touch its folder.
+fn sites(test: &str, folder: &Path) -> Sites {
+    let (status, trace) = traced(test, folder, &["-e".to_owned(), format!("trace={CALLS}")]);
+    assert!(status.success(), "{status}: {trace}");
+    let folder = folder.to_string_lossy();
+    let mut count: BTreeMap<&str, usize> = BTreeMap::new();
+    let mut sites = Sites { calls: Vec::new(), paths: BTreeSet::new() };
+    for line in trace.lines().filter(|line| line.contains(&*folder)) {
+        let name = line.split(['(', ' ']).nth(1).expect("a thread, then a call");
+        let number = count.entry(name).or_default();
+        *number += 1;
+        sites.calls.push((name.to_owned(), *number));
+        let below = line.match_indices(&*folder).map(|(at, _)| &line[at + folder.len()..]);
+        sites.paths.extend(below.filter_map(|rest| rest.split(['>', '"']).next()).map(str::to_owned));
+    }
+    sites
+}
+
+/// Kills it as it enters a call.
+fn killed_at(test: &str, folder: &Path, paths: &BTreeSet<String>, (name, number): &(String, usize)) {
+    let whole = folder.to_string_lossy();
+    let only = paths.iter().flat_map(|path| ["-P".to_owned(), format!("{whole}{path}")]);
+    let inject = format!("inject={name}:signal=SIGKILL:when={number}");
+    let arguments: Vec<String> =
+        only.chain(["-e".to_owned(), format!("trace={name}"), "-e".to_owned(), inject]).collect();
+    let (status, trace) = traced(test, folder, &arguments);
+    let last = trace.lines().rev().find(|line| line.contains('('));
+    let is_there = last.is_some_and(|call| call.contains(&*whole) && call.ends_with("= ?"));
+    assert!(is_there && status.signal() == Some(9), "not killed at {name} {number}: {status}: {trace}");
+}
+
+#[test]
+fn wherever_the_power_goes_a_whole_set_can_be_started_and_the_update_ends() {
+    let seed = std::env::var("MIDSHIFT_SEED").ok().and_then(|seed| seed.parse().ok()).unwrap_or(1);
+    let all = std::env::var("MIDSHIFT_SITES").is_ok_and(|sites| sites == "all");
+    let folder = tempfile::tempdir().expect("a folder");
+    let [_, kept] = robot(folder.path());
+    let Sites { calls: mut cuts, paths } = sites(UPDATE, folder.path());
+    assert_ended(folder.path(), &kept, "under strace");
+    let found = cuts.len();
+    assert!(found > SAMPLE, "{found} calls change the disk: {cuts:?}");
+    if !all {
+        cuts.shuffle(&mut StdRng::seed_from_u64(seed));
+        cuts.truncate(SAMPLE);
+    }
+    let mut unfinished = 0;
+    for site in &cuts {
+        let when = format!("killed at {site:?}, MIDSHIFT_SEED={seed}");
+        let folder = tempfile::tempdir().expect("a folder");
+        let [_, kept] = robot(folder.path());
+        killed_at(UPDATE, folder.path(), &paths, site);
+        assert_bootable(folder.path(), &when);
+        let switch = DiskSets::open(folder.path()).expect("opens").holdings().expect("tells").switch;
+        unfinished += usize::from(switch.current == kept.id().to_string());
+        update(folder.path());
+        assert_ended(folder.path(), &kept, &when);
+    }
+    assert!(unfinished > 0, "no cut came before the commit");
+    println!(
+        "{found} calls of an update change the disk; {} of them were cut, {unfinished} before its commit; MIDSHIFT_SEED={seed}",
+        cuts.len()
+    );
+}
+
+#[test]
+fn twin_a_switch_record_that_is_written_where_it_lies_is_lost_with_the_power() {
+    if let Some(folder) = std::env::var_os(UPDATE_IN) {
+        let path = Path::new(&folder).join(SWITCH);
+        let text = fs::read_to_string(&path).expect("is there");
+        return fs::write(&path, text.replace("number 2", "number 3")).expect("writes");
+    }
+    let twin = "twin_a_switch_record_that_is_written_where_it_lies_is_lost_with_the_power";
+    let folder = tempfile::tempdir().expect("a folder");
+    robot(folder.path());
+    let Sites { calls, paths } = sites(twin, folder.path());
+    let [write] = &calls[..] else { panic!("{calls:?}") };
+    assert_bootable(folder.path(), "without a cut");
+    killed_at(twin, folder.path(), &paths, write);
+    assert!(DiskSets::open(folder.path()).expect("opens").holdings().is_err(), "the naive way is good enough");
+}

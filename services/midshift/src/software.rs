@@ -1,0 +1,96 @@
+//! The software of one robot in a process of its own: its sets, whom it trusts, and how the set that runs makes it behave.
+//!
+//! Invariant: which set runs is what the launcher says, else what the switch record says; it is found out once, at the start.
+//! Called by [`crate::robots`].
+
+use anyhow::{Context, bail};
+use midshift_agent::dial::TcpDial;
+use midshift_agent::launcher;
+use midshift_agent::session::Updates;
+use midshift_agent::sets::Sets;
+use midshift_agent::sets::disk::DiskSets;
+use midshift_agent::trust::Trust;
+use midshift_agent::update::UpdateConfig;
+use midshift_agent::update::io::UpdateWorker;
+use midshift_agent::update::remote::GrpcRemote;
+use midshift_bundle::manifest::ComponentKind;
+use midshift_core::time::{Clock, LinkDuration};
+use midshift_sim::behaviour::{Behaviour, COMPONENT};
+use midshift_sim::body::BodyConfig;
+use std::path::Path;
+use std::sync::Arc;
+
+/// Called once a second while the agent lives.
+type Pulse = Box<dyn FnMut() + Send>;
+
+/// What a robot runs and may take.
+pub struct Software {
+    /// What it believes.
+    pub trust: Trust,
+    sets: DiskSets,
+    /// Name of the set that runs.
+    running: String,
+    is_launched: bool,
+    is_on_probation: bool,
+    /// Of the bundle taken last; none: what the robot came with.
+    version: Option<String>,
+    behaviour: Behaviour,
+}
+
+impl Software {
+    /// Reads the trust file and the set that runs.
+    pub fn open(sets: &Path, trust: &Path) -> anyhow::Result<Self> {
+        let trust = Trust::read(trust)?;
+        let mut sets = DiskSets::open(sets)?;
+        let holdings = sets.holdings()?;
+        let told = std::env::var(launcher::SET).ok();
+        let is_launched = told.is_some();
+        let running = told.unwrap_or_else(|| holdings.switch.running().to_owned());
+        let set = holdings.set(&running).with_context(|| format!("set {running} is not there"))?;
+        let behaviour = match set.components.get(COMPONENT).filter(|c| c.kind == ComponentKind::Config) {
+            Some(_) => Behaviour::read(&sets.component(&running, COMPONENT))?,
+            None => Behaviour::default(),
+        };
+        let is_on_probation = holdings.switch.trial.is_some_and(|t| t.set == running && !t.is_proven);
+        // A set calls itself by the name and the version of its bundle; robots report versions that can be compared.
+        let version = set.version.rsplit(' ').next().filter(|v| !v.is_empty()).map(str::to_owned);
+        Ok(Self { trust, sets, running, is_launched, is_on_probation, version, behaviour })
+    }
+
+    /// Makes a body behave and call itself as the set that runs says. An error is a crash at the start.
+    pub fn shape(&self, body: &mut BodyConfig) -> anyhow::Result<()> {
+        if self.behaviour.crash_on_start {
+            bail!("set {} crashes at its start, as its {COMPONENT} says", self.running);
+        }
+        body.behaviour = self.behaviour.clone();
+        if let Some(version) = &self.version {
+            body.software.clone_from(version);
+        }
+        Ok(())
+    }
+
+    /// The agent's pulse, which hangs the whole agent if the set that runs does so on probation.
+    pub fn pulse(&self, pulse: Option<Pulse>, clock: &Arc<dyn Clock>) -> Option<Pulse> {
+        let Some(after_ms) = self.behaviour.hang_in_probation_after_ms.filter(|_| self.is_on_probation) else {
+            return pulse;
+        };
+        let (mut pulse, clock) = (pulse, clock.clone());
+        let begun = clock.now().link;
+        Some(Box::new(move || {
+            while clock.now().link.since(begun) >= LinkDuration(after_ms) {
+                // Nobody wakes it: session, body and pulse stand still until the launcher kills the process.
+                std::thread::park();
+            }
+            if let Some(pulse) = &mut pulse {
+                pulse();
+            }
+        }))
+    }
+
+    /// What the agent changes its software with, over `bulk`; its clock is taken for set from the network.
+    pub fn updates(self, bulk: TcpDial) -> Updates {
+        let config = UpdateConfig { is_launched: self.is_launched, ..self.trust.config() };
+        let remote = Arc::new(GrpcRemote::new(Arc::new(bulk)));
+        Updates { config, worker: Box::new(UpdateWorker::new(Box::new(self.sets), remote)) }
+    }
+}

@@ -1,0 +1,220 @@
+//! A robot as it is started in earnest: `midshift launcher` keeps `midshift agent run` running from a folder of sets.
+
+use crate::harness::{Running, Server, midshift, until};
+use crate::room::LIMIT;
+use midshift_agent::sets::disk::DiskSets;
+use midshift_agent::sets::{Sets, Wanted};
+use midshift_agent::sqlite::SqliteStore;
+use midshift_agent::store::{Op, Store};
+use midshift_agent::switch::{FACTORY, Fallen, Switch};
+use midshift_agent::trust::Trust;
+use midshift_agent::update::{SoftwareRow, Update};
+use midshift_bundle::digest::Digest;
+use midshift_bundle::keys::SecretKey;
+use midshift_bundle::manifest::{Component, ComponentKind, Migration, Needs, SafetyClass};
+use midshift_bundle::repository::{RootDraft, Signers, sign_root};
+use midshift_bundle::set::SetManifest;
+use midshift_core::ids::SiteId;
+use midshift_core::site::{DEMO, text};
+use midshift_core::time::Utc;
+use midshift_core::update::UpdateState;
+use midshift_proto::telemetry::v1::GetRobotRequest;
+use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
+use midshift_sim::swarm::AGENT_FILE;
+use std::collections::{BTreeMap, BTreeSet};
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// Seconds without a pulse after which the launcher kills.
+const HANG_S: &str = "4";
+
+/// One robot's folder.
+struct Machine {
+    dir: tempfile::TempDir,
+    site: SiteId,
+}
+
+/// A launcher and what it started; all of it is gone when the test lets it go.
+struct Launched(Running);
+
+impl Drop for Launched {
+    fn drop(&mut self) {
+        // A launcher that has ended has no child; its number may be another's by now.
+        if self.0.has_ended().is_ok_and(|ended| !ended) {
+            let _ = self.0.signal_group("KILL");
+        }
+    }
+}
+
+impl Machine {
+    fn new() -> anyhow::Result<Self> {
+        let machine = Self { dir: tempfile::tempdir()?, site: text::parse(DEMO)?.site_id().clone() };
+        let key = SecretKey::of_seed([1; 32]);
+        let one = || Signers { keys: vec![key.public()], threshold: 1 };
+        let expires = Utc(4_000_000_000_000);
+        let draft = RootDraft { version: 1, expires, root: one(), targets: one(), snapshot: one(), timestamp: one() };
+        let root = sign_root(&draft, &[&key])?;
+        let directive_keys = [key.public()].into_iter().map(|k| (k.id(), k)).collect();
+        Trust { root, directive_keys, site: machine.site.clone() }.write(&machine.path("trust.json"))?;
+        Ok(machine)
+    }
+    fn path(&self, name: &str) -> PathBuf {
+        self.dir.path().join(name)
+    }
+    /// A set with these settings in the robot's folder.
+    fn stage(&self, version: &str, behaviour: &str) -> anyhow::Result<SetManifest> {
+        let mut sets = DiskSets::open(&self.path("sets"))?;
+        let wanted = Wanted { digest: Digest::of(behaviour.as_bytes()), length: behaviour.len() as u64 };
+        sets.write(&wanted, 0, behaviour.as_bytes())?;
+        sets.sync(&wanted)?;
+        sets.seal(&wanted)?;
+        let component = Component {
+            name: "behaviour".to_owned(),
+            version: version.to_owned(),
+            kind: ComponentKind::Config,
+            hardware: BTreeSet::new(),
+            capabilities: BTreeSet::new(),
+            requires: BTreeMap::new(),
+            conflicts: BTreeMap::new(),
+            task_schema: (1, 1),
+            rollback_index: 0,
+            safety_class: SafetyClass::None,
+            needs: Needs::Restart,
+            data_migration: Migration::None,
+            digest: wanted.digest,
+            length: wanted.length,
+        };
+        let set = SetManifest {
+            bundle: Some(Digest::of(version.as_bytes())),
+            version: format!("walk {version}"),
+            components: [(component.name.clone(), component)].into(),
+        };
+        sets.stage(&set)?;
+        Ok(set)
+    }
+    fn switch(&self, change: impl FnOnce(&mut Switch)) -> anyhow::Result<()> {
+        let mut sets = DiskSets::open(&self.path("sets"))?;
+        let mut switch = sets.holdings()?.switch;
+        change(&mut switch);
+        Ok(sets.write_switch(&mut switch)?)
+    }
+    /// The ledger of an agent that has just switched to this set.
+    async fn remember_probation(&self, set: &SetManifest) -> anyhow::Result<()> {
+        let update = Update {
+            state: UpdateState::Probation,
+            bundle: Digest::of(b"bundle"),
+            manifest_length: 1,
+            rollback_floor: 0,
+            set: Some(set.clone()),
+            raises_floor: false,
+            is_irreversible: false,
+            drain_id: None,
+            tries: 0,
+            probation_ms: 600_000,
+            reason: None,
+        };
+        std::fs::create_dir_all(self.path("data"))?;
+        let mut store = SqliteStore::open(&self.path("data").join(AGENT_FILE)).await?;
+        store.load("ring").await?;
+        let row = SoftwareRow { update: Some(update), ..SoftwareRow::default() };
+        Ok(store.commit(&[Op::Software(Box::new(row))]).await?)
+    }
+    /// The launcher with an agent that dials `server`; what the robot came with ends at once and well.
+    fn launch(&self, server: &str) -> anyhow::Result<Launched> {
+        let midshift = midshift()?;
+        let script = format!("test $MIDSHIFT_SET = {FACTORY} || exec \"$0\" \"$@\"");
+        let mut command = Command::new(&midshift);
+        command.arg("launcher").arg("--record").arg(self.path("tries")).arg("--sets").arg(self.path("sets"));
+        command.args(["--hang", HANG_S, "--", "sh", "-c", &script]).arg(&midshift);
+        command.args(["agent", "run", "--robot-id", "rbt-01", "--no-faults", "--server", server]);
+        command.arg("--data").arg(self.path("data")).arg("--sets").arg(self.path("sets"));
+        command.arg("--trust").arg(self.path("trust.json")).process_group(0);
+        Ok(Launched(Running::start(&mut command, &self.log())?))
+    }
+    fn log(&self) -> PathBuf {
+        self.path("log")
+    }
+}
+
+fn record(machine: &Machine) -> anyhow::Result<Switch> {
+    Ok(Switch::read(&machine.path("sets").join(midshift_agent::launcher::SWITCH))?)
+}
+
+fn text_of(path: &Path) -> String {
+    std::fs::read_to_string(path).unwrap_or_default()
+}
+
+/// Runs a set on probation until its launcher has put it away; what was said meanwhile.
+async fn put_away(behaviour: &str) -> anyhow::Result<String> {
+    let machine = Machine::new()?;
+    let set = machine.stage("1.5.0", behaviour)?;
+    let name = set.id().to_string();
+    machine.switch(|switch| switch.try_out(&name))?;
+    machine.remember_probation(&set).await?;
+    // Nobody listens there: what a set does to its program needs no server.
+    let mut launched = machine.launch("127.0.0.1:1")?;
+    let code = launched.0.ends().await?;
+    let (said, switch) = (text_of(&machine.log()), record(&machine)?);
+    anyhow::ensure!(code == Some(0), "the launcher ended with {code:?}: {said}");
+    anyhow::ensure!(switch.running() == FACTORY, "{switch:?}: {said}");
+    anyhow::ensure!(switch.fallen == Some(Fallen { set: name, tries: 2 }), "{switch:?}: {said}");
+    Ok(said)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_set_that_crashes_at_its_start_is_put_away() -> anyhow::Result<()> {
+    let said = put_away("crash_on_start = true\n").await?;
+    assert_eq!(said.matches("crashes at its start").count(), 2, "{said}");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_set_that_hangs_on_probation_is_killed_and_put_away() -> anyhow::Result<()> {
+    let said = put_away("hang_in_probation_after_ms = 1500\n").await?;
+    assert_eq!(said.matches("gave no sign").count(), 2, "{said}");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_launched_robot_says_the_version_of_the_set_it_runs() -> anyhow::Result<()> {
+    let machine = Machine::new()?;
+    let server_dir = tempfile::tempdir()?;
+    let server = Server::start(server_dir.path()).await?;
+    let set = machine.stage("1.5.0", "speed_permille = 900\n")?;
+    machine.switch(|switch| {
+        switch.try_out(&set.id().to_string());
+        switch.commit();
+    })?;
+    let _launched = machine.launch(&server.address.to_string())?;
+    let version = until("the robot's version", LIMIT, || async {
+        let mut client = TelemetryServiceClient::new(server.channel()?);
+        let asked = client.get_robot(GetRobotRequest { robot_id: "rbt-01".to_owned() }).await;
+        Ok(asked.ok().and_then(|robot| robot.into_inner().robot?.inventory).map(|inventory| inventory.software))
+    });
+    assert_eq!(version.await?, "1.5.0", "{}", text_of(&machine.log()));
+    Ok(())
+}
+
+#[test]
+fn sets_and_trust_go_together_and_a_trust_file_of_another_site_is_refused() -> anyhow::Result<()> {
+    let machine = Machine::new()?;
+    let run = |arguments: &[&str]| -> anyhow::Result<(Option<i32>, String)> {
+        let mut command = Command::new(midshift()?);
+        command.args(["agent", "run", "--robot-id", "rbt-01", "--server", "127.0.0.1:1", "--data"]);
+        let ended = command.arg(machine.path("data")).args(arguments).output()?;
+        Ok((ended.status.code(), String::from_utf8_lossy(&ended.stderr).into_owned()))
+    };
+    let (sets, trust) = (machine.path("sets"), machine.path("trust.json"));
+    let (sets, trust) = (sets.to_string_lossy(), trust.to_string_lossy());
+    for half in [vec!["--sets", &*sets], vec!["--trust", &*trust], vec!["--clock-unsynced"]] {
+        assert_eq!(run(&half)?.0, Some(2), "{half:?}");
+    }
+    let mut foreign = Trust::read(&machine.path("trust.json"))?;
+    foreign.site = SiteId::parse("elsewhere")?;
+    foreign.write(&machine.path("trust.json"))?;
+    let (code, said) = run(&["--sets", &sets, "--trust", &trust])?;
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains("elsewhere") && said.contains(machine.site.as_str()), "{said}");
+    Ok(())
+}
