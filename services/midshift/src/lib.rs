@@ -16,4 +16,5 @@ pub mod server;
 pub mod site_file;
 mod software;
 pub mod tally;
+pub mod throwaway;
 pub mod under_way;
