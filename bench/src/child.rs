@@ -5,6 +5,7 @@
 use crate::sink::Seen;
 use anyhow::{Context, bail, ensure};
 use midshift::robots::SimRun;
+use midshift::serve::Software;
 use std::io::{BufRead, BufReader, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -107,7 +108,13 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
     match role {
         Role::Serve { data, site } => {
             answer_questions(address, stop.clone(), metric)?;
-            let serve = midshift::serve::Serve { site, data, listen: address, insecure: false };
+            let serve = midshift::serve::Serve {
+                site,
+                data,
+                listen: address,
+                insecure: false,
+                software: Software { ota_keys: None, ota_quota_gib: 1 },
+            };
             midshift::serve::run(serve, stop).await
         }
         Role::Unary { answer } => {

@@ -30,8 +30,9 @@ pub struct Serve {
     /// There is no login and no TLS yet: say that you know, and listen off loopback all the same.
     #[arg(long)]
     pub insecure: bool,
+    /// Where software of robots comes from.
     #[command(flatten)]
-    software: Software,
+    pub software: Software,
 }
 
 /// Where software of robots comes from.

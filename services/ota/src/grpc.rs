@@ -3,10 +3,11 @@
 use crate::content::{Held, Wanted};
 use crate::{OtaService, pages, refusal};
 use bytes::Bytes;
-use midshift_bundle::digest::{Digest, crc32c};
+use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::COMPONENT_BYTES_MAX;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
+use midshift_proto::chunk;
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::bundle_service_server::BundleService as BundleFace;
 use midshift_proto::ota::v1::chunk_service_server::ChunkService as ChunkFace;
@@ -111,7 +112,7 @@ impl OtaService {
                 tracing::error!(%error, %digest, "a signed file cannot be read");
                 status(&Refusal::new(Kind::Internal, Code::Internal))
             })?;
-            let chunk = v1::FetchChunksResponse { offset, crc32c: crc32c(&piece), data: piece.to_vec() };
+            let chunk = chunk::piece(offset, piece.to_vec());
             offset += piece.len() as u64;
             Ok(chunk)
         });
