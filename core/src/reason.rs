@@ -74,6 +74,15 @@ codes! {
     Overloaded = "OVERLOADED", "A queue is full. Try again later.";
     DeadlineExceeded = "DEADLINE_EXCEEDED", "The call took longer than its deadline. The outcome is unknown; ask again with the same request_id.";
     Internal = "INTERNAL", "A fault of midshift. The request_id is in the log.";
+    // --- software on the server
+    SoftwareNotFound = "SOFTWARE_NOT_FOUND", "No signed release lists this file, or no document has this name. List bundles.";
+    NoOnlineKeys = "NO_ONLINE_KEYS", "The server has no keys that may say which release is the newest. Start it with --ota-keys and the folder that holds them.";
+    UploadTooLarge = "UPLOAD_TOO_LARGE", "A file of a release has at most 8 GiB. Split it into several components.";
+    UploadMoved = "UPLOAD_MOVED", "The file goes on at another byte than this piece. Ask GetUpload and go on from there.";
+    UploadCorrupt = "UPLOAD_CORRUPT", "What was brought is not what its digest says, and was thrown away. Bring it again.";
+    SoftwareFull = "SOFTWARE_FULL", "The room for software on the server is used up. Give it more with --ota-quota-gib, or a larger disk.";
+    ReleaseMoved = "RELEASE_MOVED", "Somebody else published. Take the server's newest documents, sign on top of them and push again.";
+    FilesMissing = "FILES_MISSING", "The release lists files that the server does not have. Bring them, then publish again.";
     // --- why a robot does not get a task
     RobotPinnedElsewhere = "ROBOT_PINNED_ELSEWHERE", "The task names another robot.";
     MissingCapability = "MISSING_CAPABILITY", "The robot cannot do one of the task's actions or lacks a required capability.";

@@ -2,6 +2,7 @@
 
 use crate::content::{Content, DiskContent, Held, Wanted};
 use crate::repository::{OnlineKeys, Repository};
+use crate::{OtaService, Parts};
 use async_trait::async_trait;
 use bytes::Bytes;
 use midshift_bundle::digest::Digest;
@@ -9,7 +10,7 @@ use midshift_bundle::keys::SecretKey;
 use midshift_bundle::manifest::{Component, ComponentKind, FORMAT, Manifest, Migration, Needs, SafetyClass};
 use midshift_bundle::repository::{FileTarget, PEOPLE_LIFE_MS, RootDraft, Signers, sign_root, sign_targets};
 use midshift_bundle::trust::{Error, Reading, Refreshed, Source, Trusted};
-use midshift_core::time::Utc;
+use midshift_core::time::{ScaledClock, Utc};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -172,4 +173,27 @@ impl Source for Shown {
     async fn fetch(&self, name: &str) -> std::io::Result<Option<Vec<u8>>> {
         self.0.document(name).await.map_err(std::io::Error::other)
     }
+}
+
+/// The service on a folder, by a clock that stands still at [`START`].
+pub async fn service(dir: &TempDir) -> OtaService {
+    let keys = dir.path().join("keys");
+    if !keys.exists() {
+        write_keys(&keys);
+    }
+    let clock = Arc::new(ScaledClock::new(|| 0, START, 1000));
+    let parts = Parts { folder: dir.path().join("ota"), keys, quota_bytes: 1 << 30, clock };
+    OtaService::open(parts).await.expect("a service")
+}
+
+/// Brings files and publishes the targets document that lists them as the first.
+pub async fn release(service: &OtaService, files: &[(String, Vec<u8>)]) {
+    let opened = service.opened().expect("keys");
+    for (_, content) in files {
+        let file = Wanted { digest: Digest::of(content), length: content.len() as u64 };
+        opened.content.append(file, 0, Bytes::copy_from_slice(content)).await.expect("room");
+        opened.content.settle(file).await.expect("whole");
+    }
+    let document = targets(None, files, SEEDS.targets);
+    opened.repository.publish(vec![first_root()], document, 0, START).await.expect("published");
 }

@@ -1,13 +1,151 @@
-//! Software of robots on the server: keeps files of signed releases and says which release is the newest.
+//! Software of robots on the server: keeps files of signed releases, says which release is the newest, hands out metadata and bytes.
 //!
-//! Called by the binary. Invariant: nothing is decided about robots here, and nothing is signed that says what software is good.
+//! Called by the binary: [`OtaService::open`], its two gRPC faces, its pages over HTTP/1.1 and [`OtaService::run`]. Invariant: nothing is signed
+//! here that says what software is good; only files that the newest signed release lists are handed out.
 
 pub mod content;
 #[cfg(test)]
 mod fixture;
+mod grpc;
+mod http1;
+mod pages;
+mod refusal;
 pub mod repository;
 
+use content::{Content, DiskContent, Wanted};
+use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::time::{Clock, Utc};
+use midshift_proto::ota::v1::bundle_service_server::BundleServiceServer;
+use midshift_proto::ota::v1::chunk_service_server::ChunkServiceServer;
+use repository::{Error, OnlineKeys, Repository};
 use std::panic::resume_unwind;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio_util::sync::CancellationToken;
+
+/// How often the age of what was signed is looked at. By the wall, which may jump: so not once in half a day.
+const LOOK_EVERY: Duration = Duration::from_secs(60);
+/// People hear this long before that a document of theirs ends.
+const WARN_BEFORE_MS: u64 = 60 * 24 * 3_600_000;
+/// Longest message of the service: all documents of a publication.
+const MESSAGE_BYTES: usize = 2 * midshift_bundle::trust::METADATA_BYTES_MAX as usize;
+
+/// What the service is built from.
+pub struct Parts {
+    /// Where files and documents are kept; made if it is not there.
+    pub folder: PathBuf,
+    /// Keys of snapshot and timestamp, as `bundle keygen` makes them.
+    pub keys: PathBuf,
+    /// Bytes of all files at most.
+    pub quota_bytes: u64,
+    /// Clocks. Documents are dated by the wall.
+    pub clock: Arc<dyn Clock>,
+}
+
+struct Opened {
+    content: Arc<dyn Content>,
+    repository: Repository,
+    clock: Arc<dyn Clock>,
+}
+
+/// The service. Cheap to clone.
+#[derive(Clone)]
+pub struct OtaService {
+    /// None: the server was given no keys, and every call says so.
+    opened: Option<Arc<Opened>>,
+}
+
+impl OtaService {
+    /// Opens what is kept.
+    ///
+    /// # Errors
+    /// If keys, files or documents cannot be read, or documents do not hang together.
+    pub async fn open(parts: Parts) -> Result<Self, Error> {
+        let files = parts.folder.join("content");
+        let (keys, content) = blocking(move || {
+            let keys = OnlineKeys::read(&parts.keys)?;
+            Ok::<_, Error>((keys, DiskContent::open(&files, parts.quota_bytes)?))
+        })
+        .await?;
+        let content: Arc<dyn Content> = Arc::new(content);
+        let repository = Repository::open(&parts.folder.join("metadata"), keys, content.clone()).await?;
+        Ok(Self { opened: Some(Arc::new(Opened { content, repository, clock: parts.clock })) })
+    }
+    /// A service of a server without keys: it touches no disk and answers every call with what to do.
+    pub fn without_keys() -> Self {
+        Self { opened: None }
+    }
+    /// Releases, for people and programs.
+    pub fn bundles(&self) -> BundleServiceServer<Self> {
+        BundleServiceServer::new(self.clone()).max_decoding_message_size(MESSAGE_BYTES)
+    }
+    /// Bytes, for robots.
+    pub fn chunks(&self) -> ChunkServiceServer<Self> {
+        ChunkServiceServer::new(self.clone())
+    }
+    /// `/metadata/…` and `/targets/…` over plain HTTP, for clients of TUF that are not ours.
+    pub fn pages(&self) -> axum::Router {
+        http1::router(self.clone())
+    }
+    /// Keeps what was signed fresh until shutdown.
+    pub async fn run(self, shutdown: CancellationToken) {
+        loop {
+            if let Some(opened) = &self.opened {
+                opened.look().await;
+            }
+            tokio::select! {
+                () = shutdown.cancelled() => return,
+                () = tokio::time::sleep(LOOK_EVERY) => {}
+            }
+        }
+    }
+    fn opened(&self) -> Result<&Opened, Refusal> {
+        self.opened.as_deref().ok_or_else(|| Refusal::new(Kind::Precondition, Code::NoOnlineKeys))
+    }
+}
+
+impl Opened {
+    fn now(&self) -> Utc {
+        self.clock.now().wall
+    }
+
+    async fn look(&self) {
+        let now = self.now();
+        let before = self.repository.newest().map(|newest| newest.stamp);
+        if let Err(error) = self.repository.freshen(now).await {
+            tracing::error!(%error, "freshness could not be signed: robots take no new software once it has expired");
+        }
+        let Some(newest) = self.repository.newest() else { return };
+        let ends = [
+            ("root", newest.root.edition.expires),
+            ("targets", newest.targets.edition.expires),
+            ("timestamp", newest.stamp.expires),
+        ];
+        for (role, expires) in ends {
+            let left_ms = expires.ms_since(now);
+            metrics::gauge!("midshift_ota_expires_in_seconds", "role" => role).set((left_ms / 1_000) as f64);
+            // Once for each signature, so twice a day.
+            if role != "timestamp" && left_ms < WARN_BEFORE_MS && before != Some(newest.stamp) {
+                tracing::warn!(
+                    role,
+                    expires = expires.rfc3339(),
+                    "a signed document ends soon: sign it anew and push it"
+                );
+            }
+        }
+    }
+
+    /// Which file is meant and how long it is, if a signed release lists it.
+    async fn listed(&self, digest: midshift_bundle::digest::Digest) -> Result<Wanted, Refusal> {
+        let not_found = || Refusal::new(Kind::NotFound, Code::SoftwareNotFound);
+        if !self.repository.newest().is_some_and(|newest| newest.lists(digest)) {
+            return Err(not_found());
+        }
+        let length = self.content.length(digest).await?.ok_or_else(not_found)?;
+        Ok(Wanted { digest, length })
+    }
+}
 
 /// Does what blocks away from the threads that serve.
 async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
@@ -16,5 +154,51 @@ async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) 
         Err(Ok(panic)) => resume_unwind(panic),
         // The process ends: whoever waits ends with it.
         Err(Err(_)) => std::future::pending().await,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fixture::{START, files, release, service, write_keys};
+    use crate::repository::FRESHEN_AFTER_MS;
+    use midshift_core::time::ScaledClock;
+    use tokio::time::Instant;
+
+    #[tokio::test(start_paused = true)]
+    async fn what_was_signed_is_signed_anew_before_it_ends_and_the_service_ends_when_asked() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let keys = dir.path().join("keys");
+        write_keys(&keys);
+        let begun = Instant::now();
+        let clock = ScaledClock::new(move || begun.elapsed().as_micros() as u64, START, 1000);
+        let parts = Parts { folder: dir.path().join("ota"), keys, quota_bytes: 1 << 20, clock: Arc::new(clock) };
+        let service = OtaService::open(parts).await.expect("a service");
+        release(&service, &files("walk", "1.0.0")).await;
+        let shutdown = CancellationToken::new();
+        let running = tokio::spawn(service.clone().run(shutdown.clone()));
+        let newest = || service.opened().expect("keys").repository.newest().expect("published").stamp;
+        tokio::time::sleep(Duration::from_millis(FRESHEN_AFTER_MS - 1_000)).await;
+        assert_eq!(newest().version, 1);
+        while newest().version == 1 {
+            tokio::time::sleep(LOOK_EVERY).await;
+        }
+        let late_ms = newest().issued.ms_since(START) - FRESHEN_AFTER_MS;
+        assert!(late_ms <= 2 * LOOK_EVERY.as_millis() as u64, "{late_ms} ms");
+        shutdown.cancel();
+        running.await.expect("it ends");
+    }
+
+    #[tokio::test]
+    async fn a_file_that_nobody_signed_is_not_handed_out() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let service = service(&dir).await;
+        let stray = b"brought and never signed";
+        let opened = service.opened().expect("keys");
+        let file = Wanted { digest: midshift_bundle::digest::Digest::of(stray), length: stray.len() as u64 };
+        opened.content.append(file, 0, bytes::Bytes::from_static(stray)).await.expect("room");
+        opened.content.settle(file).await.expect("whole");
+        let refusal = opened.listed(file.digest).await.expect_err("nobody signed it");
+        assert_eq!(refusal.reason.code, Code::SoftwareNotFound);
     }
 }

@@ -1,0 +1,182 @@
+//! The gRPC faces of releases and bytes: decode, call, encode.
+
+use crate::content::{Held, Wanted};
+use crate::{OtaService, pages, refusal};
+use bytes::Bytes;
+use midshift_bundle::digest::{Digest, crc32c};
+use midshift_bundle::manifest::COMPONENT_BYTES_MAX;
+use midshift_core::limits;
+use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
+use midshift_proto::ota::v1;
+use midshift_proto::ota::v1::bundle_service_server::BundleService as BundleFace;
+use midshift_proto::ota::v1::chunk_service_server::ChunkService as ChunkFace;
+use std::pin::Pin;
+use tokio_stream::{Stream, StreamExt};
+use tokio_util::io::ReaderStream;
+use tonic::{Request, Response, Status, Streaming};
+
+fn status(refusal: &Refusal) -> Status {
+    metrics::counter!("midshift_ota_refused_total", "code" => refusal.reason.code.as_str()).increment(1);
+    midshift_proto::status(refusal, None)
+}
+
+fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {
+    result.map(Response::new).map_err(|refusal| status(&refusal))
+}
+
+/// Which file a request means, and everything that is wrong with that.
+fn wanted(digest: &str, length: u64) -> Result<Wanted, Refusal> {
+    let mut bad = Violations::default();
+    let digest = bad.take("digest", digest.parse::<Digest>());
+    if length == 0 {
+        bad.add("length", format!("is required, 1..{COMPONENT_BYTES_MAX}"));
+    }
+    bad.finish()?;
+    if length > COMPONENT_BYTES_MAX {
+        return Err(refusal::too_large(length));
+    }
+    let digest = digest.ok_or_else(|| Refusal::field("digest", "is required"))?;
+    Ok(Wanted { digest, length })
+}
+
+impl OtaService {
+    async fn upload_state(&self, r: v1::GetUploadRequest) -> Result<v1::GetUploadResponse, Refusal> {
+        let opened = self.opened()?;
+        let file = wanted(&r.digest, r.length)?;
+        let held = opened.content.settle(file).await?;
+        Ok(v1::GetUploadResponse { durable_bytes: durable(held, file), is_complete: held == Held::Whole })
+    }
+
+    /// Takes one piece; the file is what the first one named.
+    async fn piece(&self, file: Wanted, message: v1::UploadTargetRequest) -> Result<(), Refusal> {
+        if message.data.len() > limits::UPLOAD_PIECE_BYTES {
+            let most = limits::UPLOAD_PIECE_BYTES;
+            return Err(Refusal::field("data", format!("has {} bytes, at most {most}", message.data.len())));
+        }
+        if message.data.is_empty() {
+            return Ok(());
+        }
+        Ok(self.opened()?.content.append(file, message.offset, Bytes::from(message.data)).await?)
+    }
+
+    async fn uploaded(&self, file: Wanted) -> Result<v1::UploadTargetResponse, Refusal> {
+        let held = self.opened()?.content.settle(file).await?;
+        Ok(v1::UploadTargetResponse { durable_bytes: durable(held, file), is_complete: held == Held::Whole })
+    }
+
+    async fn publish(&self, r: v1::PublishRepositoryRequest) -> Result<v1::PublishRepositoryResponse, Refusal> {
+        let opened = self.opened()?;
+        let newest = opened.repository.publish(r.roots, r.targets, r.expected_targets_version, opened.now()).await?;
+        let (root_version, targets_version) = (newest.root.edition.version, newest.targets.edition.version);
+        tracing::info!(root_version, targets_version, bundles = newest.releases.len(), "a release was published");
+        Ok(v1::PublishRepositoryResponse { root_version, targets_version })
+    }
+
+    async fn metadata(&self, r: v1::GetMetadataRequest) -> Result<v1::GetMetadataResponse, Refusal> {
+        let opened = self.opened()?;
+        if r.name.is_empty() {
+            return Err(Refusal::field("name", "is required, e.g. timestamp.json"));
+        }
+        let found = opened.repository.document(&r.name).await?;
+        let reason = || Reason::from(Code::SoftwareNotFound).with("name", r.name.chars().take(100).collect::<String>());
+        let document = found.ok_or_else(|| Refusal::new(Kind::NotFound, reason()))?;
+        Ok(v1::GetMetadataResponse { document })
+    }
+
+    fn list(&self, r: &v1::ListBundlesRequest) -> Result<v1::ListBundlesResponse, Refusal> {
+        let newest = self.opened()?.repository.newest();
+        let releases = newest.as_ref().map(|newest| newest.releases.as_slice()).unwrap_or_default();
+        pages::page(releases, r).map_err(|bad| Refusal::invalid(bad.0))
+    }
+
+    async fn fetch(&self, r: v1::FetchChunksRequest) -> Result<Chunks, Refusal> {
+        let opened = self.opened()?;
+        let mut bad = Violations::default();
+        let digest = bad.take("digest", r.digest.parse::<Digest>());
+        if !(1..=limits::CHUNK_RANGE_BYTES).contains(&r.length) {
+            bad.add("length", format!("is required, 1..{}", limits::CHUNK_RANGE_BYTES));
+        }
+        bad.finish()?;
+        let digest = digest.ok_or_else(|| Refusal::field("digest", "is required"))?;
+        let file = opened.listed(digest).await?;
+        if r.offset >= file.length {
+            return Err(Refusal::field("offset", format!("the file has {} bytes", file.length)));
+        }
+        let range = r.offset..(r.offset + r.length).min(file.length);
+        let reader = opened.content.read(digest, range).await?;
+        let reader = reader.ok_or_else(|| Refusal::new(Kind::NotFound, Code::SoftwareNotFound))?;
+        let mut offset = r.offset;
+        let stream = ReaderStream::with_capacity(reader, limits::CHUNK_BYTES).map(move |piece| {
+            let piece = piece.map_err(|error| {
+                tracing::error!(%error, %digest, "a signed file cannot be read");
+                status(&Refusal::new(Kind::Internal, Code::Internal))
+            })?;
+            let chunk = v1::FetchChunksResponse { offset, crc32c: crc32c(&piece), data: piece.to_vec() };
+            offset += piece.len() as u64;
+            Ok(chunk)
+        });
+        Ok(Box::pin(stream))
+    }
+}
+
+fn durable(held: Held, file: Wanted) -> u64 {
+    match held {
+        Held::Whole => file.length,
+        Held::Part(bytes) => bytes,
+    }
+}
+
+#[tonic::async_trait]
+impl BundleFace for OtaService {
+    async fn get_upload(&self, r: Request<v1::GetUploadRequest>) -> Result<Response<v1::GetUploadResponse>, Status> {
+        answer(self.upload_state(r.into_inner()).await)
+    }
+    async fn upload_target(
+        &self,
+        r: Request<Streaming<v1::UploadTargetRequest>>,
+    ) -> Result<Response<v1::UploadTargetResponse>, Status> {
+        let mut stream = r.into_inner();
+        self.opened().map_err(|refusal| status(&refusal))?;
+        let first = stream.message().await?.unwrap_or_default();
+        let file = wanted(&first.digest, first.length).map_err(|refusal| status(&refusal))?;
+        let mut next = Some(first);
+        while let Some(message) = next {
+            self.piece(file, message).await.map_err(|refusal| status(&refusal))?;
+            next = stream.message().await?;
+        }
+        answer(self.uploaded(file).await)
+    }
+    async fn publish_repository(
+        &self,
+        r: Request<v1::PublishRepositoryRequest>,
+    ) -> Result<Response<v1::PublishRepositoryResponse>, Status> {
+        answer(self.publish(r.into_inner()).await)
+    }
+    async fn get_metadata(
+        &self,
+        r: Request<v1::GetMetadataRequest>,
+    ) -> Result<Response<v1::GetMetadataResponse>, Status> {
+        answer(self.metadata(r.into_inner()).await)
+    }
+    async fn list_bundles(
+        &self,
+        r: Request<v1::ListBundlesRequest>,
+    ) -> Result<Response<v1::ListBundlesResponse>, Status> {
+        answer(self.list(&r.into_inner()))
+    }
+}
+
+/// Pieces of a range on their way to a robot.
+type Chunks = Pin<Box<dyn Stream<Item = Result<v1::FetchChunksResponse, Status>> + Send>>;
+
+#[tonic::async_trait]
+impl ChunkFace for OtaService {
+    type FetchChunksStream = Chunks;
+
+    async fn fetch_chunks(&self, r: Request<v1::FetchChunksRequest>) -> Result<Response<Chunks>, Status> {
+        answer(self.fetch(r.into_inner()).await)
+    }
+}
+
+#[cfg(test)]
+mod tests;
