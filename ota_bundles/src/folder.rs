@@ -136,8 +136,19 @@ impl Folder {
     fn targets(&self) -> PathBuf {
         self.path.join("targets")
     }
-    fn file(&self, name: &str, digest: Digest) -> PathBuf {
+    /// Where the bytes of a target are.
+    pub fn file(&self, name: &str, digest: Digest) -> PathBuf {
         self.targets().join(format!("{digest}.{name}"))
+    }
+    /// A document by its name, e.g. `2.targets.json`; none: there is none.
+    ///
+    /// # Errors
+    /// If it is there and cannot be read.
+    pub fn document(&self, name: &str) -> Result<Option<Vec<u8>>, Error> {
+        match self.read(name) {
+            Err(Error::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => Ok(None),
+            read => read.map(Some),
+        }
     }
     fn read(&self, name: &str) -> Result<Vec<u8>, Error> {
         let path = self.metadata().join(name);

@@ -1,7 +1,8 @@
-//! `midshift bundle …`: what release people do with keys and bundles. Needs no server.
+//! `midshift bundle …`: what release people do with keys and bundles. Only `push` and `ls` need a server.
 
-use super::client::Exit;
+use super::client::{Call, Exit, unary};
 use super::out::{Format, Out};
+use super::push;
 use crate::clock;
 use clap::{Subcommand, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -10,6 +11,7 @@ use midshift_bundle::folder::{Error, Folder, Signed};
 use midshift_bundle::keys::SecretKey;
 use midshift_bundle::manifest::Manifest;
 use midshift_bundle::repository::Profile;
+use midshift_proto::ota::v1;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 
@@ -61,6 +63,18 @@ pub enum Verb {
         /// The repository.
         repository: PathBuf,
     },
+    /// Bring what the server does not have yet and make it the newest. What was cut off goes on where it was.
+    Push {
+        /// The repository.
+        repository: PathBuf,
+        #[command(flatten)]
+        call: Call,
+    },
+    /// List the bundles that the server has.
+    Ls {
+        #[command(flatten)]
+        call: Call,
+    },
 }
 
 /// Who signs.
@@ -97,7 +111,7 @@ impl From<Error> for Exit {
 }
 
 /// What was looked at does not hold: a finding, not a mistake of the caller.
-fn does_not_hold(error: Error) -> Exit {
+pub fn does_not_hold(error: Error) -> Exit {
     match error {
         Error::Refused(refusal) | Error::Bundle(build::Error::Refused(refusal)) => {
             let lines = refusal.violations.iter().map(|v| format!("\n  {}: {}", v.field, v.description));
@@ -108,13 +122,15 @@ fn does_not_hold(error: Error) -> Exit {
 }
 
 /// Runs one verb.
-pub fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
+pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     match verb {
         Verb::Keygen { profile, keys, repository } => keygen(profile, &keys, &repository, out),
         Verb::Build { folder, out: into } => build_one(&folder, &into, out),
         Verb::Sign { bundle, pending: _, repository, key } => sign(bundle.as_deref(), &repository, &key, out),
         Verb::Inspect { bundle } => show(&build::inspect(&bundle).map_err(|e| does_not_hold(e.into()))?, out),
         Verb::Verify { repository } => verify(&repository, out),
+        Verb::Push { repository, call } => push::run(&repository, &call, out).await,
+        Verb::Ls { call } => list(&call, out).await,
     }
 }
 
@@ -188,9 +204,31 @@ fn verify(repository: &Path, out: &Out) -> Result<(), Exit> {
             out.line(super::out::columns(&["BUNDLE", "VERSION", "COMPONENTS", "BYTES", "HARDWARE"], &rows).trim_end());
             let targets = checked.targets_version.map_or("none".to_owned(), |v| v.to_string());
             out.say(&format!("root {}, targets {targets}: every signature and every file holds", checked.root_version));
+            out.next(&format!("midshift bundle push {}", repository.display()));
         }
     }
     Ok(())
+}
+
+async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
+    let mut client = call.bundles().await?;
+    let mut whole = v1::ListBundlesResponse::default();
+    loop {
+        let request = v1::ListBundlesRequest { page_size: 1_000, page_token: whole.next_page_token };
+        let page = client.list_bundles(unary(request)).await?.into_inner();
+        whole.bundles.extend(page.bundles);
+        whole.next_page_token = page.next_page_token;
+        if whole.next_page_token.is_empty() {
+            break;
+        }
+    }
+    let header = ["BUNDLE", "VERSION", "COMPONENTS", "BYTES", "PUBLISHED", "SHA-256"];
+    let row = |b: &v1::Bundle| {
+        let published = b.publish_time.map(|t| t.to_string()).unwrap_or_default();
+        let (count, length) = (b.components.len().to_string(), b.length.to_string());
+        vec![b.name.clone(), b.version.clone(), count, length, published, b.digest.clone()]
+    };
+    Ok(out.many(&whole, &whole.bundles, |b| b.digest.clone(), &header, row)?)
 }
 
 fn row(bundle: &Manifest) -> Vec<String> {

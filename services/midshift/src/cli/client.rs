@@ -4,6 +4,7 @@ use crate::cli::out::Out;
 use crate::robots::uri;
 use midshift_core::reason::{Kind, Refusal};
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
+use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
 use midshift_proto::sim::v1::sim_service_client::SimServiceClient;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
@@ -132,6 +133,10 @@ impl Call {
     /// Telemetry.
     pub async fn telemetry(&self) -> Result<TelemetryServiceClient<Channel>, Exit> {
         Ok(TelemetryServiceClient::new(self.channel().await?).max_decoding_message_size(64 * 1024 * 1024))
+    }
+    /// Releases of software.
+    pub async fn bundles(&self) -> Result<BundleServiceClient<Channel>, Exit> {
+        Ok(BundleServiceClient::new(self.channel().await?).max_decoding_message_size(64 * 1024 * 1024))
     }
     /// Faults of the simulator.
     pub async fn sim(&self) -> Result<SimServiceClient<Channel>, Exit> {

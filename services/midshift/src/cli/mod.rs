@@ -8,6 +8,7 @@ mod explain;
 mod incident;
 mod map;
 mod out;
+mod push;
 mod robot;
 mod sim;
 mod task;
@@ -78,7 +79,7 @@ enum Command {
     /// Site files.
     #[command(subcommand)]
     Map(map::Verb),
-    /// Signed software for robots: keys, building, signing, checking.
+    /// Signed software for robots: keys, building, signing, checking, bringing it to the server.
     #[command(subcommand)]
     Bundle(bundle::Verb),
     /// Look for what may be wrong: server, store, robots, this machine.
@@ -148,7 +149,7 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Incident(verb) => incident::run(verb, out).await,
         Command::Area(verb) => area::run(verb, out).await,
         Command::Map(verb) => map::run(verb, out),
-        Command::Bundle(verb) => bundle::run(verb, out),
+        Command::Bundle(verb) => bundle::run(verb, out).await,
         Command::Doctor(call) => doctor::run(&call, out).await,
         Command::ExplainError { code } => explain::error(code.as_deref(), out),
     }
