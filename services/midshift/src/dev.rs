@@ -5,6 +5,7 @@ use crate::planning::Planning;
 use crate::report::{self, Inputs, Kind, Report};
 use crate::server::{Naive, Parts, Server};
 use crate::tally::{self, SharedTasks, Tasks};
+use crate::throwaway::Throwaway;
 use crate::under_way::{self, UnderWay};
 use crate::{clock, serve, site_file};
 use anyhow::{Context, bail};
@@ -131,6 +132,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     swarm.person = Some(Arc::new(move |id| tally::look(&live, |t| t.is_live(id))));
     let swarm = Swarm::new(swarm);
     let (store, frames) = stores(&args, &site, &clock).await?;
+    let (software, ota) = Throwaway::make(clock.clone()).await?;
     let planning = Planning::start()?;
     let parts = Parts {
         store: store.clone(),
@@ -138,6 +140,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         site: site.clone(),
         site_text: loaded.text,
         clock: clock.clone(),
+        ota,
         sim: Some(SimFace::new(hall.clone(), clock.clone(), swarm.crash())),
         naive: Naive::default(),
         planning: planning.handle(),
@@ -145,8 +148,8 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     // The server ends after its robots and its client, or the last of them would be cut off at Ctrl-C.
     let served_until = CancellationToken::new();
     let server = Server::new(parts, served_until.clone()).await?;
-    say(&greeting(&args, &site, address));
-    let run = Run { args, site, clock, hall, run_id, tasks, store, stop, served_until };
+    say(&greeting(&args, &site, address, &software));
+    let run = Run { args, site, clock, hall, run_id, tasks, store, stop, served_until, _software: software };
     run.together(server, swarm, listener, address).await
 }
 
@@ -176,8 +179,10 @@ async fn stores(
     Ok((Arc::new(MemoryStore::new(site_id, id, clock.clone())), Arc::new(frames)))
 }
 
-fn greeting(args: &Dev, site: &Site, address: SocketAddr) -> String {
+fn greeting(args: &Dev, site: &Site, address: SocketAddr, software: &Throwaway) -> String {
     let program = std::env::args().next().unwrap_or_else(|| "midshift".to_owned());
+    let (keys, repository) = (software.keys(), software.repository());
+    let (keys, repository) = (keys.display(), repository.display());
     let kept = args
         .data
         .as_ref()
@@ -202,9 +207,11 @@ fn greeting(args: &Dev, site: &Site, address: SocketAddr) -> String {
          \x20     {program} robot ls{server}\n\
          \x20     {program} sim fault{server} rbt-04 --drop-network 20s\n\
          \x20     grpcurl -plaintext {address} list\n\
+         \x20     {program} bundle sign BUNDLE --repository {repository} --key {keys}/targets-1.pem\n\
+         \x20     {program} bundle push{server} {repository}\n\
          Ctrl-C ends it.",
         args.robots,
-        site.site_id()
+        site.site_id(),
     )
 }
 
@@ -218,6 +225,8 @@ struct Run {
     store: Arc<dyn Store>,
     stop: CancellationToken,
     served_until: CancellationToken,
+    /// Its folder goes with the run.
+    _software: Throwaway,
 }
 
 impl Run {

@@ -15,4 +15,5 @@ pub mod serve;
 pub mod server;
 pub mod site_file;
 pub mod tally;
+pub mod throwaway;
 pub mod under_way;

@@ -4,6 +4,9 @@ use crate::planning::Planning;
 use crate::server::{Naive, Parts, Server};
 use crate::{clock, site_file};
 use anyhow::{Context, bail};
+use midshift_core::limits;
+use midshift_core::time::Clock;
+use midshift_ota::OtaService;
 use midshift_store::{FRAME_BYTES_DEFAULT, SqliteFrames, SqliteStore};
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -27,6 +30,28 @@ pub struct Serve {
     /// There is no login and no TLS yet: say that you know, and listen off loopback all the same.
     #[arg(long)]
     pub insecure: bool,
+    #[command(flatten)]
+    software: Software,
+}
+
+/// Where software of robots comes from.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Software {
+    /// The folder with snapshot-*.pem and timestamp-*.pem of `bundle keygen`. Without it releases are neither taken nor given.
+    #[arg(long, value_name = "DIR")]
+    pub ota_keys: Option<PathBuf>,
+    /// Room for software, GiB.
+    #[arg(long, default_value_t = limits::SOFTWARE_BYTES_DEFAULT >> 30, value_parser = clap::value_parser!(u64).range(1..=1_048_576))]
+    pub ota_quota_gib: u64,
+}
+
+impl Software {
+    /// The service, with its files in `folder`.
+    pub async fn open(&self, folder: PathBuf, clock: Arc<dyn Clock>) -> anyhow::Result<OtaService> {
+        let Some(keys) = self.ota_keys.clone() else { return Ok(OtaService::without_keys()) };
+        let parts = midshift_ota::Parts { folder, keys, quota_bytes: self.ota_quota_gib << 30, clock };
+        OtaService::open(parts).await.context("opening software of robots")
+    }
 }
 
 /// Runs until `shutdown`.
@@ -46,6 +71,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
     let site_id = loaded.site.site_id().clone();
     let store = Arc::new(SqliteStore::open(&args.data, site_id.clone(), clock.clone()).await?);
     let frames = Arc::new(SqliteFrames::open(&args.data, site_id, clock.clone(), FRAME_BYTES_DEFAULT).await?);
+    let ota = args.software.open(args.data.join("ota"), clock.clone()).await?;
     let listener = TcpListener::bind(args.listen).await.with_context(|| format!("listening on {}", args.listen))?;
     tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), "midshift serves");
     let planning = Planning::start()?;
@@ -55,6 +81,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
         site: loaded.site,
         site_text: loaded.text,
         clock,
+        ota,
         sim: None,
         naive: Naive::default(),
         planning: planning.handle(),

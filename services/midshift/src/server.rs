@@ -12,6 +12,7 @@ use midshift_core::site::Site;
 use midshift_core::time::Clock;
 use midshift_core::work::Live;
 use midshift_fleet::{FleetService, Reconciler};
+use midshift_ota::OtaService;
 use midshift_proto::sim::v1::sim_service_server::SimServiceServer;
 use midshift_sim::service::SimFace;
 use midshift_store::{FrameLog, LiveBoard, Retention, Store};
@@ -32,12 +33,14 @@ use tonic_health::server::HealthReporter;
 /// Pings of the server on a quiet connection, and how long it waits for their answer.
 const KEEPALIVE: (Duration, Duration) = (Duration::from_secs(20), Duration::from_secs(10));
 /// Names under which the health service knows the server; the empty one is the whole.
-const HEALTH: [&str; 5] = [
+const HEALTH: [&str; 7] = [
     "",
     "midshift.task.v1.TaskService",
     "midshift.fleet.v1.FleetService",
     "midshift.telemetry.v1.TelemetryService",
     "midshift.link.v1.LinkService",
+    "midshift.ota.v1.BundleService",
+    "midshift.ota.v1.ChunkService",
 ];
 /// How often old log entries are taken away.
 const PRUNE_EVERY: Duration = Duration::from_secs(60);
@@ -67,6 +70,8 @@ pub struct Parts {
     pub site_text: String,
     /// Clocks.
     pub clock: Arc<dyn Clock>,
+    /// Software of robots.
+    pub ota: OtaService,
     /// The simulator's face, if bodies live in this process.
     pub sim: Option<SimFace>,
     /// Naive rules for twins of tests; none outside them.
@@ -146,6 +151,8 @@ impl Server {
             .add_service(self.fleet.grpc().max_decoding_message_size(control))
             .add_service(self.telemetry.grpc().max_decoding_message_size(control))
             .add_service(self.telemetry.link())
+            .add_service(self.parts.ota.bundles())
+            .add_service(self.parts.ota.chunks())
             .add_service(health_service)
             .add_service(reflection().build_v1()?)
             .add_service(reflection().build_v1alpha()?);
@@ -158,9 +165,10 @@ impl Server {
             let handle = handle.clone();
             async move { handle.map(|h| h.render()).unwrap_or_default() }
         };
-        // Browsers speak gRPC-Web to the services; Prometheus speaks plain HTTP/1.1 to the page beside them.
+        // Browsers speak gRPC-Web to the services; Prometheus and clients of TUF speak plain HTTP/1.1 to the pages beside them.
         let services = routes.routes().into_axum_router().layer(tonic_web::GrpcWebLayer::new());
-        Ok((Routes::from(services.route("/metrics", get(metrics))), health))
+        let pages = services.route("/metrics", get(metrics)).merge(self.parts.ota.pages());
+        Ok((Routes::from(pages), health))
     }
 
     /// Serves connections until shutdown, then drains and cuts.
@@ -190,11 +198,16 @@ impl Server {
             prune(self.task.clone(), self.parts.store.clone(), self.parts.frames.clone(), self.parts.clock.clone());
         let fleet = AbortOnDropHandle::new(self.parts.planning.spawn(self.reconciler.run(shutdown.clone())));
         let telemetry = self.telemetry.clone().run();
+        let ota = self.parts.ota.clone().run(shutdown.clone());
         let failure = OnceLock::new();
         let services = async {
             let fleet = until(&shutdown, "fleet", async { Ok(fleet.await??) });
             let telemetry = until(&shutdown, "telemetry", async { Ok(telemetry.await?) });
-            if let Err(error) = tokio::try_join!(fleet, telemetry) {
+            let ota = until(&shutdown, "ota", async {
+                ota.await;
+                Ok(())
+            });
+            if let Err(error) = tokio::try_join!(fleet, telemetry, ota) {
                 tracing::error!(%error, "a service ended, and with it the server");
                 shutdown.cancel();
                 // Nothing else sets it.
@@ -308,6 +321,7 @@ mod tests {
             site: loaded.site,
             site_text: loaded.text,
             clock,
+            ota: OtaService::without_keys(),
             sim: None,
             naive: Naive::default(),
             planning: planning.handle(),

@@ -20,6 +20,7 @@ use midshift_core::robot::StopLevel;
 use midshift_core::site::{DEMO, Site, text};
 use midshift_core::task::machine::Phase;
 use midshift_core::time::Clock;
+use midshift_ota::OtaService;
 use midshift_sim::faults::FaultRates;
 use midshift_sim::hall::{Hall, HallConfig};
 use midshift_store::{FRAME_BYTES_DEFAULT, FrameLog, MemoryFrames, MemoryStore, StoreId};
@@ -211,6 +212,7 @@ fn serve(
                     site: site.clone(),
                     site_text: DEMO.to_owned(),
                     clock: MachineClock::boot(&time, Skew::default()),
+                    ota: OtaService::without_keys(),
                     sim: None,
                     naive: naive.server,
                     planning: tokio::runtime::Handle::current(),

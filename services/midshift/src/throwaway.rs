@@ -1,0 +1,38 @@
+//! Release people for `dev` who vanish with it: keys and a repository in a temporary folder, so that a bundle can be signed and pushed at once.
+//!
+//! Invariant: nothing here is used by `serve`; a key of a real release never comes here.
+
+use anyhow::Context;
+use midshift_bundle::folder::Folder;
+use midshift_bundle::repository::Profile;
+use midshift_core::limits;
+use midshift_core::time::Clock;
+use midshift_ota::{OtaService, Parts};
+use std::path::PathBuf;
+use std::sync::Arc;
+use tempfile::TempDir;
+
+/// The folder, taken away when it is dropped.
+pub struct Throwaway {
+    dir: TempDir,
+}
+
+impl Throwaway {
+    /// Makes keys and the first root, and the service that has the online keys.
+    pub async fn make(clock: Arc<dyn Clock>) -> anyhow::Result<(Self, OtaService)> {
+        let this = Self { dir: tempfile::tempdir().context("making a folder for software")? };
+        Folder::create(&this.repository(), &this.keys(), Profile::Solo, clock.now().wall)?;
+        let quota_bytes = limits::SOFTWARE_BYTES_DEFAULT;
+        let parts = Parts { folder: this.dir.path().join("server"), keys: this.keys(), quota_bytes, clock };
+        let service = OtaService::open(parts).await.context("opening software of robots")?;
+        Ok((this, service))
+    }
+    /// Where bundles are signed into and pushed from.
+    pub fn repository(&self) -> PathBuf {
+        self.dir.path().join("repository")
+    }
+    /// All its keys.
+    pub fn keys(&self) -> PathBuf {
+        self.dir.path().join("keys")
+    }
+}
