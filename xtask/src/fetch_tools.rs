@@ -11,7 +11,13 @@ use std::process::Command;
 
 const GRPCURL: &str = "github.com/fullstorydev/grpcurl/cmd/grpcurl@v1.9.3";
 const BUF: &str = "github.com/bufbuild/buf/cmd/buf@v1.57.2";
-const PYTHON: &[&str] = &["grpcio==1.80.0", "grpcio-tools==1.80.0"];
+const PYTHON: &[&str] = &[
+    "grpcio==1.80.0",
+    "grpcio-tools==1.80.0",
+    "tuf==7.0.1",
+    "securesystemslib[crypto]==1.6.0",
+    "cryptography==50.0.2",
+];
 
 /// Paths of the tools.
 pub struct Tools {
@@ -19,7 +25,7 @@ pub struct Tools {
     pub grpcurl: PathBuf,
     /// buf.
     pub buf: PathBuf,
-    /// A Python that can import grpc and grpc_tools.
+    /// A Python that can import grpc, grpc_tools and tuf.
     pub python: PathBuf,
 }
 
@@ -34,7 +40,7 @@ impl Tools {
         [
             ("grpcurl", &self.grpcurl, GRPCURL.to_owned()),
             ("buf", &self.buf, BUF.to_owned()),
-            ("python with gRPC", &self.python, PYTHON.join(" ")),
+            ("python with gRPC and TUF", &self.python, PYTHON.join(" ")),
         ]
     }
 

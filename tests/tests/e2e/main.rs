@@ -12,3 +12,4 @@ mod kill;
 mod measured;
 mod proxy;
 mod room;
+mod tuf;
