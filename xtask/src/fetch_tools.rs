@@ -13,7 +13,13 @@ const GRPCURL: &str = "github.com/fullstorydev/grpcurl/cmd/grpcurl@v1.9.3";
 const BUF: &str = "github.com/bufbuild/buf/cmd/buf@v1.57.2";
 /// Its package and program of the system.
 const STRACE: &str = "strace";
-const PYTHON: &[&str] = &["grpcio==1.80.0", "grpcio-tools==1.80.0"];
+const PYTHON: &[&str] = &[
+    "grpcio==1.80.0",
+    "grpcio-tools==1.80.0",
+    "tuf==7.0.1",
+    "securesystemslib[crypto]==1.6.0",
+    "cryptography==50.0.2",
+];
 
 /// Paths of the tools.
 pub struct Tools {
@@ -21,7 +27,7 @@ pub struct Tools {
     pub grpcurl: PathBuf,
     /// buf.
     pub buf: PathBuf,
-    /// A Python that can import grpc and grpc_tools.
+    /// A Python that can import grpc, grpc_tools and tuf.
     pub python: PathBuf,
     /// strace, of any version that can inject signals.
     pub strace: PathBuf,
@@ -43,7 +49,7 @@ impl Tools {
         [
             ("grpcurl", &self.grpcurl, GRPCURL.to_owned()),
             ("buf", &self.buf, BUF.to_owned()),
-            ("python with gRPC", &self.python, PYTHON.join(" ")),
+            ("python with gRPC and TUF", &self.python, PYTHON.join(" ")),
         ]
     }
 

@@ -5,6 +5,8 @@
 use crate::harness::{Running, channel, free_port, midshift, until};
 use crate::room::{LIMIT, Room};
 use anyhow::Context;
+use midshift_proto::ota::v1::ListBundlesRequest;
+use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
 use midshift_proto::sim::v1::GetWorldRequest;
 use midshift_proto::sim::v1::sim_service_client::SimServiceClient;
 use midshift_proto::task::v1::TaskState;
@@ -181,6 +183,42 @@ fn for_people(t: &mut Transcript) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Software on a server without keys, and on one that has them.
+async fn releases(t: &mut Transcript) -> anyhow::Result<()> {
+    t.note(&["bundle", "ls"])?;
+    let address = free_port()?;
+    let mut command = Command::new(&t.program);
+    command.args(["serve", "--data", "served", "--ota-keys", "keys", "--listen", &address.to_string()]);
+    let _serve = Running::start(command.current_dir(&t.dir), &t.dir.join("serve.log"))?;
+    until("the server of software", LIMIT, || async {
+        let mut client = BundleServiceClient::new(channel(address)?);
+        Ok(client.list_bundles(ListBundlesRequest::default()).await.ok().map(|_| ()))
+    })
+    .await?;
+    let before = std::mem::replace(&mut t.server, address.to_string());
+    t.note(&["bundle", "ls", "-o", "json"])?;
+    t.note(&["bundle", "push", "repository", "-o", "json"])?;
+    t.note(&["bundle", "push", "repository"])?;
+    t.note(&["bundle", "ls", "-o", "json"])?;
+    t.note(&["bundle", "ls", "-o", "name"])?;
+    t.note(&["bundle", "keygen", "--keys", "other-keys", "--repository", "other", "-o", "json"])?;
+    t.note(&["bundle", "push", "other"])?;
+    t.note(&[
+        "bundle",
+        "sign",
+        "walk-1.5.0",
+        "--repository",
+        "other",
+        "--key",
+        "other-keys/targets-1.pem",
+        "-o",
+        "json",
+    ])?;
+    t.note(&["bundle", "push", "other"])?;
+    t.server = before;
+    Ok(())
+}
+
 /// Faults of simulated robots, which only their own process takes.
 async fn faults(t: &mut Transcript) -> anyhow::Result<()> {
     let address = free_port()?;
@@ -335,6 +373,7 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     t.note(&[&["bundle", "sign", "walk-1.5.0"][..], &repository, &["keys/targets-1.pem"]].concat())?;
     t.note(&[&["bundle", "sign", "--pending"][..], &repository, &["keys/targets-2.pem"]].concat())?;
     t.note(&["bundle", "verify", "repository", "-o", "json"])?;
+    releases(&mut t).await?;
     std::fs::write(t.dir.join("walk-1.5.0/gait-1.5.0.component"), "flies")?;
     t.note(&["bundle", "inspect", "walk-1.5.0"])?;
     t.note(&["bundle", "verify", "nowhere"])?;

@@ -121,6 +121,7 @@ pub struct Server {
     /// Where it listens.
     pub address: SocketAddr,
     dir: PathBuf,
+    flags: Vec<String>,
     running: Running,
 }
 
@@ -131,23 +132,28 @@ impl Server {
     }
     /// On another site than the demo.
     pub async fn start_on(dir: &Path, site: &str) -> anyhow::Result<Self> {
+        Self::start_with(dir, site, &[]).await
+    }
+    /// With more flags of `serve`.
+    pub async fn start_with(dir: &Path, site: &str, flags: &[&str]) -> anyhow::Result<Self> {
         std::fs::write(dir.join(SITE_FILE), site)?;
         let address = free_port()?;
-        let running = Self::run(dir, address)?;
-        let server = Self { address, dir: dir.to_owned(), running };
+        let flags: Vec<String> = flags.iter().map(|flag| (*flag).to_owned()).collect();
+        let running = Self::run(dir, address, &flags)?;
+        let server = Self { address, dir: dir.to_owned(), flags, running };
         server.answers().await?;
         Ok(server)
     }
-    fn run(dir: &Path, address: SocketAddr) -> anyhow::Result<Running> {
+    fn run(dir: &Path, address: SocketAddr, flags: &[String]) -> anyhow::Result<Running> {
         let mut command = Command::new(midshift()?);
         command.args(["serve", "--data"]).arg(dir.join("data")).args(["--listen", &address.to_string()]);
-        command.arg("--site").arg(dir.join(SITE_FILE));
+        command.arg("--site").arg(dir.join(SITE_FILE)).args(flags);
         Running::start(&mut command, &dir.join("server.log"))
     }
     /// SIGKILL and a new start on the same data.
     pub async fn kill_and_restart(&mut self) -> anyhow::Result<()> {
         self.running.kill()?;
-        self.running = Self::run(&self.dir, self.address)?;
+        self.running = Self::run(&self.dir, self.address, &self.flags)?;
         self.answers().await
     }
     async fn answers(&self) -> anyhow::Result<()> {

@@ -13,3 +13,4 @@ mod launched;
 mod measured;
 mod proxy;
 mod room;
+mod tuf;

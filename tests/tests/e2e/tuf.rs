@@ -1,0 +1,176 @@
+//! A client of TUF that is not ours, python-tuf, on a real server: it takes what people signed and nothing else.
+//!
+//! The lies are told by a small server between the two, and on the disk of ours; each is followed by the truth, which is taken.
+
+use crate::harness::{Server, midshift, tool};
+use midshift_core::site::DEMO;
+use std::path::Path;
+use std::process::Command;
+
+/// A robot that trusts python-tuf, and a liar: `python robot.py PART SERVER ROOT WORK`.
+const CLIENT: &str = r#"
+import datetime, os, shutil, sys, threading, urllib.error, urllib.request
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from tuf.api import exceptions
+from tuf.ngclient import Updater
+
+part, server, root, work = sys.argv[1:]
+lies = {}
+
+def get(name):
+    with urllib.request.urlopen(f"{server}/metadata/{name}") as answer:
+        return answer.read()
+
+class Between(BaseHTTPRequestHandler):
+    def do_GET(self):
+        name = self.path.rsplit("/", 1)[1]
+        code, body = 200, lies.get(name)
+        if body is None:
+            try:
+                with urllib.request.urlopen(server + self.path) as answer:
+                    body = answer.read()
+            except urllib.error.HTTPError as error:
+                code, body = error.code, b""
+        self.send_response(code)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_):
+        pass
+
+liar = ThreadingHTTPServer(("127.0.0.1", 0), Between)
+threading.Thread(target=liar.serve_forever, daemon=True).start()
+between = f"http://127.0.0.1:{liar.server_port}"
+
+def client(name, base=server):
+    folder = os.path.join(work, name)
+    for sub in ("metadata", "targets"):
+        os.makedirs(os.path.join(folder, sub), exist_ok=True)
+    with open(root, "rb") as file:
+        first = file.read()
+    return Updater(f"{folder}/metadata", f"{base}/metadata/", f"{folder}/targets", f"{base}/targets/", bootstrap=first)
+
+def download(updater, name):
+    found = updater.get_targetinfo(name)
+    assert found is not None, name
+    with open(updater.download_target(found), "rb") as file:
+        return file.read()
+
+def refused(attack, error, call):
+    try:
+        call()
+    except error:
+        print(f"refused: {attack}")
+    else:
+        sys.exit(f"{attack} was taken")
+
+def keep(name):
+    with open(os.path.join(work, name), "wb") as file:
+        file.write(get(name))
+
+def kept(name):
+    with open(os.path.join(work, name), "rb") as file:
+        return file.read()
+
+if part == "first":
+    robot = client("robot")
+    robot.refresh()
+    assert download(robot, "gait-1.5.0.component") == b"walks"
+    assert b'"name": "walk"' in download(robot, "walk-1.5.0.manifest")
+    assert robot.get_targetinfo("gait-6.6.6.component") is None
+    for name in ("timestamp.json", "1.snapshot.json", "1.targets.json"):
+        keep(name)
+elif part == "second":
+    robot = client("robot")
+    robot.refresh()
+    assert download(robot, "gait-1.6.0.component") == b"runs"
+    lies["timestamp.json"] = kept("timestamp.json")
+    refused("a timestamp that was rolled back", exceptions.BadVersionNumberError, client("robot", between).refresh)
+    lies.clear()
+    lies["2.snapshot.json"] = kept("1.snapshot.json")
+    refused("a snapshot of another release", exceptions.RepositoryError, client("mixed", between).refresh)
+    lies.clear()
+    lies["2.targets.json"] = kept("1.targets.json")
+    refused("targets of another release", exceptions.RepositoryError, client("mixed", between).refresh)
+    lies.clear()
+    lies["2.targets.json"] = get("2.targets.json").replace(b"1.6.0", b"6.6.6")
+    refused("targets that were tampered with", exceptions.RepositoryError, client("mixed", between).refresh)
+    lies.clear()
+    client("mixed", between).refresh()
+    frozen = client("frozen")
+    frozen._trusted_set.reference_time = datetime.datetime.now(datetime.timezone.utc) + datetime.timedelta(days=2)
+    refused("a timestamp that was frozen", exceptions.ExpiredMetadataError, frozen.refresh)
+    client("frozen").refresh()
+elif part == "tampered":
+    robot = client("late")
+    robot.refresh()
+    assert download(robot, "gait-1.5.0.component") == b"walks"
+    refused("a file that was tampered with", exceptions.RepositoryError, lambda: download(robot, "gait-1.6.0.component"))
+"#;
+
+/// Runs the program in `dir` and wants it to succeed.
+fn release(dir: &Path, arguments: &[&str]) -> anyhow::Result<()> {
+    let done = Command::new(midshift()?).args(arguments).current_dir(dir).output()?;
+    anyhow::ensure!(done.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&done.stderr));
+    Ok(())
+}
+
+/// Builds and signs a bundle of one component, and brings it to the server.
+fn push(dir: &Path, server: &Server, version: &str, content: &str) -> anyhow::Result<()> {
+    let draft = format!(
+        "name = \"walk\"\nversion = \"{version}\"\n[[component]]\nname = \"gait\"\nversion = \"{version}\"\nkind = \"process\"\n\
+         file = \"gait\"\nhardware = [\"h1\"]\nneeds = \"restart\"\n"
+    );
+    let (folder, bundle) = (format!("draft-{version}"), format!("walk-{version}"));
+    std::fs::create_dir(dir.join(&folder))?;
+    std::fs::write(dir.join(&folder).join("bundle.toml"), draft)?;
+    std::fs::write(dir.join(&folder).join("gait"), content)?;
+    release(dir, &["bundle", "build", &folder, "--out", &bundle])?;
+    release(dir, &["bundle", "sign", &bundle, "--repository", "repository", "--key", "keys/targets-1.pem"])?;
+    release(dir, &["bundle", "push", "repository", "--server", &server.address.to_string()])
+}
+
+fn python(dir: &Path, server: &Server, part: &str) -> anyhow::Result<Vec<String>> {
+    let script = dir.join("robot.py");
+    std::fs::write(&script, CLIENT)?;
+    let mut command = Command::new(tool("MIDSHIFT_TEST_PYTHON")?);
+    command.arg(&script).args([part, &format!("http://{}", server.address), "repository/metadata/1.root.json", "work"]);
+    let ran = command.current_dir(dir).output()?;
+    anyhow::ensure!(ran.status.success(), "{part}: {}", String::from_utf8_lossy(&ran.stderr));
+    Ok(String::from_utf8(ran.stdout)?.lines().map(str::to_owned).collect())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn python_tuf_takes_releases_and_refuses_lies() -> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let dir = dir.path();
+    release(dir, &["bundle", "keygen", "--keys", "keys", "--repository", "repository"])?;
+    let keys = dir.join("keys");
+    let mut server = Server::start_with(dir, DEMO, &["--ota-keys", &keys.to_string_lossy()]).await?;
+    push(dir, &server, "1.5.0", "walks")?;
+    std::fs::create_dir(dir.join("work"))?;
+    assert_eq!(python(dir, &server, "first")?, Vec::<String>::new());
+    server.kill_and_restart().await?;
+    push(dir, &server, "1.6.0", "runs")?;
+    let refused = [
+        "refused: a timestamp that was rolled back",
+        "refused: a snapshot of another release",
+        "refused: targets of another release",
+        "refused: targets that were tampered with",
+        "refused: a timestamp that was frozen",
+    ];
+    assert_eq!(python(dir, &server, "second")?, refused);
+    let content = dir.join("data/ota/content");
+    let mut tampered = 0;
+    for entry in std::fs::read_dir(content)? {
+        let path = entry?.path();
+        if std::fs::read(&path)? == b"runs" {
+            std::fs::write(path, "ruts")?;
+            tampered += 1;
+        }
+    }
+    assert_eq!(tampered, 1);
+    assert_eq!(python(dir, &server, "tampered")?, ["refused: a file that was tampered with"]);
+    Ok(())
+}
