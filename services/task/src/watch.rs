@@ -12,13 +12,13 @@ use midshift_core::ids::TaskId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Entry, Log, Revision, Seq, Table};
-use midshift_core::task::Phase;
+use midshift_core::task::{Phase, TaskState};
 use midshift_core::time::Utc;
 use midshift_proto::convert::task::{TaskFilter, TaskView, encode_task};
 use midshift_proto::convert::timestamp;
 use midshift_proto::task::v1::{self, watch_tasks_response::Item};
 use midshift_store::{Cursor, Error, Query};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 use tokio::sync::{OwnedSemaphorePermit, mpsc};
 use tokio::time::Instant;
@@ -44,6 +44,8 @@ pub struct Watcher {
     /// Revisions in which existing tasks were shown, by number, until `after` has passed `shown_until`.
     shown: BTreeMap<u64, Revision>,
     shown_until: Seq,
+    /// Numbers of tasks that were told and have not ended: one that leaves the filter is told once more.
+    near: BTreeSet<u64>,
     said: Instant,
     _place: OwnedSemaphorePermit,
 }
@@ -74,6 +76,7 @@ impl TaskService {
             images: Images::default(),
             shown: BTreeMap::new(),
             shown_until: Seq(0),
+            near: BTreeSet::new(),
             said: Instant::now(),
             _place: place.map_err(|_| Refusal::new(Kind::Exhausted, Code::Overloaded))?,
         })
@@ -155,6 +158,7 @@ impl Watcher {
             for task in read_many(store.as_ref(), &ids).await? {
                 if self.filter.admits(&task.intake, &task.state) {
                     self.shown.insert(task.state.number, task.revision);
+                    self.keep_near(&task.state, true);
                     self.send(Item::Existing(task.encode()), None).await?;
                 }
             }
@@ -196,7 +200,9 @@ impl Watcher {
             }
         };
         let said = self.shown.get(&state.number).is_some_and(|shown| entry.revision <= *shown);
-        if said || !self.filter.admits(intake, &state) {
+        let admitted = self.filter.admits(intake, &state);
+        let leaves = !admitted && self.near.contains(&state.number);
+        if said || !(admitted || leaves) {
             return Ok(());
         }
         // What may be answered is about now: the robot's row as it is.
@@ -205,6 +211,7 @@ impl Watcher {
         let allowed = allowed_resolutions(state.phase, state.opened.is_some(), kept);
         let task =
             encode_task(TaskView { intake, state: &state, revision: entry.revision, attempt, allowed: &allowed });
+        self.keep_near(&state, admitted);
         let change = v1::TaskChange {
             task: Some(task),
             kind: entry.kind.to_string(),
@@ -212,6 +219,14 @@ impl Watcher {
             change_time: Some(timestamp(Utc(entry.at_unix_ms))),
         };
         self.send(Item::Change(change), Some(entry.seq)).await
+    }
+
+    fn keep_near(&mut self, state: &TaskState, admitted: bool) {
+        if admitted && !state.phase.is_terminal() {
+            self.near.insert(state.number);
+        } else {
+            self.near.remove(&state.number);
+        }
     }
 
     async fn bookmark(&mut self) -> Result<(), Stop> {

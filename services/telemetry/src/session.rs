@@ -13,7 +13,7 @@ use crate::welcome::Begun;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Reason};
-use midshift_core::robot::Lane;
+use midshift_core::robot::{Lane, ReportedAttempt};
 use midshift_core::time::{LinkDuration, SiteTime};
 use midshift_core::work::{InboxEntry, InboxItem, Live};
 use midshift_proto::link::v1;
@@ -223,8 +223,9 @@ impl Session {
         let mut report = heartbeat.reported;
         report.session_epoch = self.epoch;
         let hb = report.hb;
-        let progress = report.vitals.odometer_mm
-            + report.attempts.iter().map(|a| a.progress + u64::from(a.step_index)).sum::<u64>();
+        // Only whether it changes counts, so that absurd numbers do no harm.
+        let moved = |sum: u64, a: &ReportedAttempt| sum.wrapping_add(a.progress).wrapping_add(u64::from(a.step_index));
+        let progress = report.attempts.iter().fold(report.vitals.odometer_mm, moved);
         if progress != self.progress.0 {
             self.progress = (progress, now.site);
         }

@@ -219,3 +219,19 @@ async fn there_is_a_limit_of_watchers_and_one_that_leaves_makes_room() {
         tokio::task::yield_now().await;
     }
 }
+
+#[tokio::test(start_paused = true)]
+async fn a_task_that_leaves_the_filter_is_told_once_more_and_then_no_longer() {
+    let world = World::new().await;
+    let running = v1::TaskFilter { states: vec![TaskState::Running as i32], ..v1::TaskFilter::default() };
+    let mut watch = world.watch(Some(running), "").await;
+    watch.bookmark().await;
+    life(&world, "r1").await;
+    let mut states = Vec::new();
+    for _ in 0..4 {
+        states.push(watch.changed().await.state());
+    }
+    assert_eq!(states, [TaskState::Running, TaskState::Running, TaskState::Running, TaskState::Stopping]);
+    life(&world, "r2").await;
+    assert_eq!(watch.changed().await.state(), TaskState::Running, "the end of the first is not told");
+}
