@@ -116,7 +116,6 @@ fn fleet(site: &Arc<Site>, robots: usize, tasks: usize, seed: u64, now: Now) -> 
             boot_id: String::new(),
             ring: String::new(),
             inventory,
-            observed: false,
             applied_work: 0,
             places: Vec::new(),
             clock_offset_ms: None,
@@ -132,7 +131,6 @@ fn fleet(site: &Arc<Site>, robots: usize, tasks: usize, seed: u64, now: Now) -> 
             received_unix_ms: now.wall.0,
             progress_at: now.site,
             clock_offset_ms: None,
-            observed: false,
         };
         board.insert(robot_id, Arc::new(live));
     }

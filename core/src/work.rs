@@ -361,8 +361,6 @@ pub struct Session {
     pub ring: String,
     /// What it said of itself.
     pub inventory: crate::robot::Inventory,
-    /// A clone is suspected: attached, no work.
-    pub observed: bool,
     /// Highest generation of section work the robot had applied.
     pub applied_work: u64,
     /// Places it said it holds, at Hello.
@@ -436,6 +434,4 @@ pub struct Live {
     pub progress_at: crate::time::SiteTime,
     /// Robot clock minus server clock, milliseconds, and its error.
     pub clock_offset_ms: Option<(i64, u64)>,
-    /// Attached without proof of succession: no work.
-    pub observed: bool,
 }

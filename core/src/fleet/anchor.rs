@@ -18,7 +18,7 @@ pub fn next_generation(view: &View, robot_id: &RobotId, now: &Now) -> u64 {
 pub fn anchor(view: &View, robot_id: &RobotId, board: &Board, valid: LinkDuration) -> Option<Authority> {
     let live = board.get(robot_id)?;
     let session = view.sessions.get(robot_id.as_str())?;
-    let current = session.row.session_epoch == live.report.session_epoch && !live.observed;
+    let current = session.row.session_epoch == live.report.session_epoch;
     current.then(|| Authority { session_epoch: live.report.session_epoch, hb: live.report.hb, valid_ms: valid.as_ms() })
 }
 

@@ -134,7 +134,6 @@ fn may_drive(view: &View, a: &Attempt, live: &Live, board: &Board, now: &Now) ->
     let held = view.desired_work.get(robot_id.as_str()).is_some_and(|d| d.row.held);
     working
         && session
-        && !live.observed
         && !held
         && a.uncertain.is_none()
         && super::heard::presence(board, robot_id, now) == Presence::Online

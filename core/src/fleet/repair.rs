@@ -42,9 +42,6 @@ pub fn robot(tx: &mut Tx, robot_id: &RobotId, board: &Board, tally: &mut Tally) 
         return;
     }
     let Some(live) = board.get(robot_id).cloned() else { return };
-    if live.observed {
-        return;
-    }
     stalled(tx, robot_id, &live);
     if !is_settled(tx.view, &live) || !is_fresh(tx.view, &live) {
         tally.pending += 1;

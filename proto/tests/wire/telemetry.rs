@@ -23,7 +23,6 @@ fn a_robot_shows_how_old_its_report_is_and_the_measured_clock_before_the_remembe
         boot_id: "b".into(),
         ring: "ring-a".into(),
         inventory: Inventory::default(),
-        observed: false,
         applied_work: 0,
         places: vec![],
         clock_offset_ms: Some(-3),
@@ -37,7 +36,6 @@ fn a_robot_shows_how_old_its_report_is_and_the_measured_clock_before_the_remembe
         received_unix_ms: 3_500,
         progress_at: SiteTime(0),
         clock_offset_ms: Some((12, 2)),
-        observed: false,
     };
     let durable = BTreeMap::from([(Lane::Event, 5)]);
     let id = robot();

@@ -240,7 +240,6 @@ impl Session {
             received_unix_ms: now.wall.0,
             progress_at: self.progress.1,
             clock_offset_ms: self.offset.estimate(),
-            observed: false,
         };
         self.inner.parts.board.put(&self.robot_id, Arc::new(live));
         let clock = ClockSample { t1_us: heartbeat.sent_unix_us, t2_us, t3_us: t2_us, t4_us: 0 };

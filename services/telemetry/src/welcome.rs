@@ -114,7 +114,6 @@ fn session_row(hello: &Hello, session_epoch: u64) -> Session {
         boot_id: hello.boot_id.clone(),
         ring: hello.ring.clone(),
         inventory: hello.inventory.clone(),
-        observed: false,
         applied_work: hello.reported.applied_work,
         places: hello.reported.places.clone(),
         clock_offset_ms: None,

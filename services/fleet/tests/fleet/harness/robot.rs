@@ -225,7 +225,6 @@ impl Robot {
             boot_id: format!("boot-{}", self.boots),
             ring: "ring".to_owned(),
             inventory: self.inventory.clone(),
-            observed: false,
             applied_work: self.applied,
             places: self.places.clone(),
             clock_offset_ms: None,
@@ -267,7 +266,6 @@ impl Robot {
             received_unix_ms: now.wall.0,
             progress_at: self.progress_at,
             clock_offset_ms: None,
-            observed: false,
         }
     }
 
