@@ -150,7 +150,9 @@ fn sites(test: &str, folder: &Path) -> Sites {
     let mut count: BTreeMap<&str, usize> = BTreeMap::new();
     let mut sites = Sites { calls: Vec::new(), paths: BTreeSet::new() };
     for line in trace.lines().filter(|line| line.contains(&*folder)) {
-        let name = line.split(['(', ' ']).nth(1).expect("a thread, then a call");
+        // strace fills a thread's number up to five places: of a small one more than one space follows.
+        let name =
+            line.split_whitespace().nth(1).and_then(|call| call.split('(').next()).expect("a thread, then a call");
         let number = count.entry(name).or_default();
         *number += 1;
         sites.calls.push((name.to_owned(), *number));
