@@ -8,6 +8,7 @@ pub mod bugs;
 pub mod fleet;
 pub mod ids;
 pub mod limits;
+pub mod picture;
 pub mod policy;
 pub mod reason;
 pub mod robot;

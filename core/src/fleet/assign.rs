@@ -3,11 +3,11 @@
 //! Called once a cycle. An assignment is one item: the robot's mutex, the task, the attempt and its timers; a stale row costs this
 //! assignment alone.
 
+use super::Tx;
 use super::anchor::anchor;
 use super::pool::{Candidate, Pool};
 use super::rows::{RobotControl, TimerKind};
 use super::tasks::{News, arm, happen};
-use super::tx::Tx;
 use super::view::View;
 use super::{Board, Pace, Plan, attempts, errands, screen, timers};
 use crate::ids::{AttemptId, RobotId, Subject, TaskId};

@@ -1,7 +1,7 @@
 //! Attempts as they begin: the record, the robot's mutex, and the steps that an errand stands for. Called by `assign`, `errands` and `desired`.
 
+use super::Tx;
 use super::rows::{RobotAuthority, RobotHolder};
-use super::tx::Tx;
 use super::view::View;
 use crate::ids::{AttemptId, RobotId};
 use crate::task::state::Errand;

@@ -1,7 +1,7 @@
 //! What people ask of fleet directly: cordon and uncordon, rules of an area, clearing a place, closing an incident. Each is one item, answered after its commit.
 
+use super::Tx;
 use super::rows::{CommandKey, Cordon, HolderState, Place, PlaceHolder, RobotControl};
-use super::tx::Tx;
 use super::view::View;
 use super::{Board, drain, heard, incidents};
 use crate::ids::{PlaceId, RobotId};

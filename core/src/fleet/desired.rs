@@ -3,10 +3,10 @@
 //! Invariant: generations only rise. An offer is anchored once and never again; an unentered grant or a resume that should still stand is
 //! anchored anew to the newest heartbeat.
 
+use super::Tx;
 use super::anchor::{anchor, is_worn, next_generation};
 use super::attempts;
 use super::rows::{HolderState, RobotHolder};
-use super::tx::Tx;
 use super::view::{View, held};
 use super::{Board, way};
 use crate::authority::Authority;

@@ -4,8 +4,8 @@
 //! Invariant: a drain takes the robot's mutex only from none, and gives it back only from itself; it never cuts a grasp and never leaves a
 //! robot in a lane. A drain whose deadline passes is refused and the robot works on.
 
+use super::Tx;
 use super::rows::{Drain, DrainState, RobotAuthority, RobotHolder};
-use super::tx::Tx;
 use super::view::View;
 use super::{Board, Plan, errands, heard, repair, way};
 use crate::ids::{DrainId, RobotId};

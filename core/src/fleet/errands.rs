@@ -2,11 +2,11 @@
 //!
 //! An errand is an attempt with no task row and a single epoch; its number is never used again. Its end has no consequence but a free robot.
 
+use super::Tx;
 use super::anchor::anchor;
 use super::pool::Candidate;
 use super::rows::{RobotControl, Timer, TimerKind};
 use super::tasks::{arm, disarm, end_attempt};
-use super::tx::Tx;
 use super::view::View;
 use super::{Board, Plan, attempts};
 use crate::ids::{AttemptId, RobotId, Subject, WaypointId};

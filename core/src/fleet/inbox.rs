@@ -2,9 +2,9 @@
 //!
 //! Invariant: a report counts only for the newest epoch of its task; older ones are fenced and counted, never obeyed.
 
+use super::Tx;
 use super::rows::{HoldToken, HolderState, RobotControl};
 use super::tasks::{News, event_of, happen};
-use super::tx::Tx;
 use super::{Tally, errands, tasks};
 use crate::ids::{PlaceId, RobotId};
 use crate::reason::{Code, Reason};

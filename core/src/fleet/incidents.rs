@@ -2,8 +2,8 @@
 //!
 //! Invariant: there are at most [`limits::INCIDENTS_MAX`]; the oldest goes for a new one, a closed one before an open one.
 
+use super::Tx;
 use super::rows::{Closed, Incident};
-use super::tx::Tx;
 use crate::ids::{RobotId, TaskId};
 use crate::limits;
 use crate::reason::Reason;

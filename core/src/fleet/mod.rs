@@ -25,7 +25,6 @@ pub mod rows;
 pub mod screen;
 pub mod tasks;
 pub mod timers;
-pub mod tx;
 pub mod view;
 pub mod way;
 
@@ -38,8 +37,10 @@ use crate::work::{InboxEntry, Live};
 use rows::{FleetMark, RobotAuthority, RobotControl, RobotHolder, ServiceClock, SiteRow};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-use tx::Tx;
 use view::View;
+
+/// A decision of fleet under way.
+pub type Tx<'a> = crate::picture::Tx<'a, View>;
 
 /// The newest heartbeat of every robot.
 pub type Board = BTreeMap<RobotId, Arc<Live>>;
@@ -107,7 +108,7 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
     for entry in entries {
         if let Some(table) = entry.table.filter(|_| entry.seq > view.read_at) {
             let key = crate::rows::Key { table, id: entry.subject.clone() };
-            if let Err(error) = view.absorb(&key, entry.revision, tx::row_of(entry, table).as_ref()) {
+            if let Err(error) = view.absorb(&key, entry.revision, crate::picture::row_of(entry, table).as_ref()) {
                 plan.report.unreadable.push(error.to_string());
             }
         }

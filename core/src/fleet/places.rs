@@ -4,10 +4,10 @@
 //! a request that cannot be served blocks later ones on its places. First of all comes who lost a place of its released stretch:
 //! it may stand in a passage for which the others wait. Grants are traffic, never a safety function.
 
+use super::Tx;
 use super::anchor::next_generation;
 use super::desired::{Release, Releases};
 use super::rows::{HolderState, Place, PlaceHolder};
-use super::tx::Tx;
 use super::view::{View, Waiting};
 use super::{Board, Plan, inbox, way};
 use crate::ids::{AreaId, PlaceId, RobotId};

@@ -3,9 +3,9 @@
 //! Invariant: repair never overtakes events. A difference counts only if the robot has applied the newest desired work and every
 //! EVENT and CRITICAL number it had produced has been consumed. The end of a lease frees authority, never a load or a place.
 
+use super::Tx;
 use super::heard::{is_fresh, is_settled, lease_stands, presence};
 use super::tasks::{News, happen};
-use super::tx::Tx;
 use super::view::View;
 use super::{Board, Tally, errands, inbox, places, tasks};
 use crate::ids::{RobotId, TaskId};

@@ -1,9 +1,9 @@
 //! Obeys what people asked of tasks and robots: cancel, resolve, resume. Requests are durable before they come here.
 
+use super::Tx;
 use super::inbox::holds_changed;
 use super::rows::HoldToken;
 use super::tasks::{News, happen};
-use super::tx::Tx;
 use super::view::View;
 use super::{Plan, mark};
 use crate::ids::{AreaId, RobotId, TaskId};

@@ -3,9 +3,9 @@
 //! Called by `inbox`, `requests`, `timers`, `repair` and `assign`. Invariant: only here does a task change its phase, and only by
 //! `task::machine::next`.
 
+use super::Tx;
 use super::incidents;
 use super::rows::{HolderState, RobotAuthority, RobotControl, RobotCounter, RobotHolder, Timer, TimerKind};
-use super::tx::Tx;
 use crate::ids::{AttemptId, RobotId, Subject, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};

@@ -3,9 +3,9 @@
 //! Invariant: nothing fires in the first 10 s of serving, so that robots say hello first; a timeout stops a robot and
 //! never frees it.
 
+use super::Tx;
 use super::rows::{Timer, TimerKind};
 use super::tasks::{News, arm, disarm, happen};
-use super::tx::Tx;
 use super::view::View;
 use super::{Board, errands};
 use crate::ids::{AttemptId, Subject, TaskId};

@@ -8,8 +8,10 @@ use super::rows::{
     SiteRow, Timer,
 };
 use crate::ids::{AttemptId, RobotId, TaskId};
+use crate::picture::{Picture, Viewed};
+pub use crate::picture::{Rowed, Slot};
 use crate::policy::AreaPolicy;
-use crate::rows::{BadRow, Key, Record, Revision, Row, Table};
+use crate::rows::{BadRow, Key, Revision, Row, Table, Writer};
 use crate::site::Site;
 use crate::site::route::Router;
 use crate::task::{Attempt, Phase, TaskIntake, TaskState};
@@ -17,15 +19,6 @@ use crate::time::{Now, Utc};
 use crate::work::{DesiredPolicy, DesiredWork, LaneMark, PresenceRow, Session};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-
-/// A row with its revision.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Rowed<R> {
-    /// Writes so far.
-    pub revision: Revision,
-    /// The row.
-    pub row: R,
-}
 
 /// Time in which a robot was heard and that no counter has yet.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -44,9 +37,6 @@ pub struct Waiting {
     /// Since when.
     pub since: crate::time::SiteTime,
 }
-
-/// Rows of one table by id.
-pub type Slot<R> = BTreeMap<String, Rowed<R>>;
 
 /// Fleet's picture.
 pub struct View {
@@ -138,16 +128,12 @@ pub struct View {
     pub router: Arc<Router>,
 }
 
-/// A record that fleet's picture keeps.
-pub trait Viewed: Record {
-    /// Where.
-    fn slot(view: &mut View) -> &mut Slot<Self>;
-    /// What else changes with it: indices and dirty robots. Called after the slot changed.
-    fn changed(_view: &mut View, _id: &str, _old: Option<&Self>) {}
+impl Picture for View {
+    const WRITER: Writer = Writer::Fleet;
 }
 
 macro_rules! viewed {
-    ($($record:ty => $slot:ident;)*) => { $(impl Viewed for $record {
+    ($($record:ty => $slot:ident;)*) => { $(impl Viewed<View> for $record {
         fn slot(view: &mut View) -> &mut Slot<Self> { &mut view.$slot }
     })* };
 }
@@ -170,7 +156,7 @@ viewed! {
     LaneMark => lane_marks;
 }
 
-impl Viewed for TaskState {
+impl Viewed<View> for TaskState {
     fn slot(view: &mut View) -> &mut Slot<Self> {
         &mut view.tasks
     }
@@ -193,7 +179,7 @@ impl Viewed for TaskState {
     }
 }
 
-impl Viewed for Attempt {
+impl Viewed<View> for Attempt {
     fn slot(view: &mut View) -> &mut Slot<Self> {
         &mut view.attempts
     }
@@ -204,7 +190,7 @@ impl Viewed for Attempt {
     }
 }
 
-impl Viewed for HoldToken {
+impl Viewed<View> for HoldToken {
     fn slot(view: &mut View) -> &mut Slot<Self> {
         &mut view.holds
     }
@@ -214,7 +200,7 @@ impl Viewed for HoldToken {
     }
 }
 
-impl Viewed for RobotAuthority {
+impl Viewed<View> for RobotAuthority {
     fn slot(view: &mut View) -> &mut Slot<Self> {
         &mut view.authority
     }
@@ -223,7 +209,7 @@ impl Viewed for RobotAuthority {
     }
 }
 
-impl Viewed for Session {
+impl Viewed<View> for Session {
     fn slot(view: &mut View) -> &mut Slot<Self> {
         &mut view.sessions
     }
@@ -232,7 +218,7 @@ impl Viewed for Session {
     }
 }
 
-impl Viewed for Place {
+impl Viewed<View> for Place {
     fn slot(view: &mut View) -> &mut Slot<Self> {
         &mut view.places
     }
@@ -367,20 +353,14 @@ impl View {
         }
     }
 
-    fn take<R: Viewed>(&mut self, key: &Key, revision: Revision, row: Option<&Row>) -> Result<(), BadRow> {
+    fn take<R: Viewed<View>>(&mut self, key: &Key, revision: Revision, row: Option<&Row>) -> Result<(), BadRow> {
         if let (Table::TaskState, None, Ok(task_id)) = (key.table, row, TaskId::parse(&key.id)) {
             self.ended.remove(&task_id);
         }
-        let known = R::slot(self).get(&*key.id).map(|r| r.revision);
-        if known.is_some_and(|k| k >= revision) || (known.is_none() && self.is_past(key)) {
+        if R::slot(self).get(&*key.id).is_none() && self.is_past(key) {
             return Ok(());
         }
-        let old = match row {
-            Some(row) => R::slot(self).insert(key.id.to_string(), Rowed { revision, row: row.decode()? }),
-            None => R::slot(self).remove(&*key.id),
-        };
-        R::changed(self, &key.id, old.as_ref().map(|r| &r.row));
-        Ok(())
+        crate::picture::take::<Self, R>(self, &key.id, revision, row)
     }
 
     /// A row that this picture has let go on purpose: of an ended task, or an attempt that no task names any more.

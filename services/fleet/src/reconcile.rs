@@ -191,8 +191,8 @@ impl Loop {
                         drop(reply.send(checked));
                         continue;
                     }
-                    let mut tx = midshift_core::fleet::tx::Tx::new(&mut self.view, now, &actor)
-                        .on_request(request_id.as_deref());
+                    let mut tx =
+                        midshift_core::fleet::Tx::new(&mut self.view, now, &actor).on_request(request_id.as_deref());
                     commands::apply(&mut tx, &command, &actor);
                     if let Some(id) = &request_id {
                         commands::remember(&mut tx, id, &command, seen);
