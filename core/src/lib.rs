@@ -6,6 +6,7 @@
 pub mod authority;
 pub mod bugs;
 pub mod fleet;
+pub mod gates;
 pub mod ids;
 pub mod limits;
 pub mod picture;
