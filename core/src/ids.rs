@@ -84,6 +84,8 @@ text_id!(/// A passage or a standing place of a site.
     PlaceId, "place_id", 64, mixed, "must be 1-64 of [A-Za-z0-9-_.]");
 text_id!(/// A drain: one taking of a robot out of work, `op:` before it if a person asked for it. Never used again.
     DrainId, "drain_id", 64, |c| lower(c) || matches!(c, ':' | '.'), "must be 1-64 of [a-z0-9-:.]");
+text_id!(/// A roll-out, chosen by whoever creates it. Never used again.
+    RolloutId, "rollout_id", 64, |c| lower(c) || c == '.', "must be 1-64 of [a-z0-9-.]");
 text_id!(/// A set of software by its digest, or `factory`.
     SetId, "set", 64, |c| c.is_ascii_lowercase() || c.is_ascii_digit(), "must be 1-64 of [a-z0-9]");
 text_id!(/// A bundle by the digest of its manifest.

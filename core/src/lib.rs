@@ -13,6 +13,7 @@ pub mod picture;
 pub mod policy;
 pub mod reason;
 pub mod robot;
+pub mod rollout;
 pub mod rows;
 pub mod site;
 pub mod task;

@@ -92,6 +92,30 @@ pub const HOURS_COUNTED_EVERY: SiteDuration = SiteDuration::from_secs(600);
 pub const ACTIVATE_BATTERY_PERMILLE: u16 = 200;
 /// A robot with a hotter joint does not change its software, tenths of a degree Celsius.
 pub const ACTIVATE_JOINT_DECIDEGREES: i32 = 700;
+/// Robots of one roll-out that one command may write, so that it stays within a group.
+pub const ROLLOUT_ROBOTS_MAX: usize = 100_000;
+/// Tasks on trial and beside it are counted for a gate so often.
+pub const TASKS_COUNTED_EVERY: SiteDuration = SiteDuration::from_secs(60);
+/// Permission to activate lives so long from the heartbeat it is anchored to.
+pub const ACTIVATION_VALID: LinkDuration = LinkDuration::from_secs(5);
+/// A robot that was given a bundle and is not heard for so long is lost. Longer than a restart of any body.
+pub const LOST_AFTER: LinkDuration = LinkDuration::from_secs(120);
+/// A robot that its drain holds, and that does not ask to activate for so long, works on without the bundle.
+pub const READY_WITHIN: SiteDuration = SiteDuration::from_secs(600);
+/// A robot whose turn has come and that has not fetched the bundle for so long is passed over.
+pub const STAGED_WITHIN: SiteDuration = SiteDuration::from_secs(3_600);
+/// A stop by the maker's safety system counts against a bundle for so long after the change to it.
+pub const HARDWARE_STOP_COUNTS: SiteDuration = SiteDuration::from_secs(600);
+/// Robots that are compared with those that are not heard: fewer tell nothing.
+pub const CONTROLS_MIN: usize = 3;
+/// Of these, so many must be heard, permille, for a robot to be lost by its bundle.
+pub const CONTROLS_HEARD_PERMILLE: usize = 800;
+/// A directive that was not taken is signed anew after so long: half its life.
+pub const DIRECTIVE_RENEWED_MS: u64 = 84 * 3_600_000;
+/// Roll-outs that have not ended.
+pub const ROLLOUTS_OPEN_MAX: usize = 64;
+/// Roll-outs kept; the oldest ended ones go first.
+pub const ROLLOUTS_MAX: usize = 1_000;
 /// Incidents kept; the oldest go first, closed ones before open ones.
 pub const INCIDENTS_MAX: usize = 10_000;
 /// Rows one item may touch, and facts it may state.

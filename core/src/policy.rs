@@ -3,7 +3,102 @@
 use crate::ids::AreaId;
 use crate::reason::Violations;
 use crate::rows::{Record, Table};
+use crate::time::Utc;
 use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Windows of one area.
+const WINDOWS_MAX: usize = 32;
+/// Capabilities of which an area keeps robots in work.
+const KEPT_MAX: usize = 32;
+/// Minutes of a day.
+const DAY_MINUTES: u16 = 24 * 60;
+
+/// A stretch of certain days of the week, by the wall clocks of one time zone.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Window {
+    /// Days on which it begins, 1 (Monday) to 7. Empty: every day.
+    pub days: BTreeSet<u8>,
+    /// Minute of the day at which it begins, 0..1439.
+    pub from_minute: u16,
+    /// Minute of the day at which it ends, 0..1439. Not later than its begin: it ends the day after.
+    pub to_minute: u16,
+    /// IANA time zone, `Europe/Berlin`.
+    pub zone: String,
+}
+
+impl Window {
+    /// Whether it is open. A zone that nobody knows is never open.
+    pub fn is_open(&self, at: Utc) -> bool {
+        let Ok(zone) = jiff::tz::TimeZone::get(&self.zone) else { return false };
+        let Ok(stamp) = jiff::Timestamp::from_millisecond(at.0) else { return false };
+        let local = stamp.to_zoned(zone);
+        let today = local.weekday().to_monday_one_offset() as u8;
+        let yesterday = if today == 1 { 7 } else { today - 1 };
+        let minute = u16::from(local.hour() as u8) * 60 + u16::from(local.minute() as u8);
+        let begins_on = |day: u8| self.days.is_empty() || self.days.contains(&day);
+        if self.from_minute < self.to_minute {
+            return begins_on(today) && (self.from_minute..self.to_minute).contains(&minute);
+        }
+        (begins_on(today) && minute >= self.from_minute) || (begins_on(yesterday) && minute < self.to_minute)
+    }
+}
+
+/// What roll-outs of software must keep to in an area.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SoftwareRules {
+    /// Of a thousand robots of the area, so many may be out of work at once for drains, cordons and breakers together; one always may.
+    pub off_work_permille: u16,
+    /// So many robots of the area with this capability stay in work.
+    pub keep_in_work: BTreeMap<String, u32>,
+    /// New drains begin only within one of these. Empty: at any time.
+    pub windows: Vec<Window>,
+    /// No new drain begins.
+    pub frozen: bool,
+}
+
+impl Default for SoftwareRules {
+    fn default() -> Self {
+        Self { off_work_permille: 100, keep_in_work: BTreeMap::new(), windows: Vec::new(), frozen: false }
+    }
+}
+
+impl SoftwareRules {
+    /// Whether drains may begin.
+    pub fn is_open(&self, at: Utc) -> bool {
+        !self.frozen && (self.windows.is_empty() || self.windows.iter().any(|w| w.is_open(at)))
+    }
+    /// Robots that may be out of work at once, of so many in the area.
+    pub fn off_work_max(&self, robots: usize) -> usize {
+        (robots * usize::from(self.off_work_permille) / 1_000).max(1)
+    }
+
+    fn check(&self, field: &str, violations: &mut Violations) {
+        if self.off_work_permille > 1_000 {
+            violations.add(format!("{field}.off_work_permille"), "must be 0..1000 permille");
+        }
+        if self.keep_in_work.len() > KEPT_MAX || self.keep_in_work.keys().any(|c| c.is_empty() || c.len() > 64) {
+            violations.add(format!("{field}.keep_in_work"), format!("must be at most {KEPT_MAX}, each of 1-64 characters"));
+        }
+        if self.windows.len() > WINDOWS_MAX {
+            violations.add(format!("{field}.windows"), format!("must be at most {WINDOWS_MAX}"));
+        }
+        for (ix, window) in self.windows.iter().enumerate() {
+            let field = |name: &str| format!("{field}.windows[{ix}].{name}");
+            if window.days.iter().any(|d| !(1..=7).contains(d)) {
+                violations.add(field("days"), "must be 1 (Monday) to 7");
+            }
+            for (name, minute) in [("from_minute", window.from_minute), ("to_minute", window.to_minute)] {
+                if minute >= DAY_MINUTES {
+                    violations.add(field(name), format!("must be 0..{}", DAY_MINUTES - 1));
+                }
+            }
+            if jiff::tz::TimeZone::get(&window.zone).is_err() {
+                violations.add(field("zone"), "must be an IANA time zone, such as Europe/Berlin");
+            }
+        }
+    }
+}
 
 /// Rules of one area. A missing value means that this layer sets none, except for charging, which has defaults.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -22,6 +117,9 @@ pub struct AreaPolicy {
     pub charge_stop_permille: u16,
     /// Above this a charging robot may be called to work, permille.
     pub charge_preemptible_permille: u16,
+    /// What roll-outs of software must keep to.
+    #[serde(default)]
+    pub software: SoftwareRules,
 }
 
 impl AreaPolicy {
@@ -35,6 +133,7 @@ impl AreaPolicy {
             charge_opportunistic_permille: 800,
             charge_stop_permille: 900,
             charge_preemptible_permille: 350,
+            software: SoftwareRules::default(),
         }
     }
 
@@ -60,6 +159,7 @@ impl AreaPolicy {
                 );
             }
         }
+        self.software.check(&format!("{field}.software"), violations);
     }
 }
 
@@ -67,5 +167,58 @@ impl Record for AreaPolicy {
     const TABLE: Table = Table::AreaPolicy;
     fn id(&self) -> String {
         self.area_id.to_string()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(text: &str) -> Utc {
+        Utc(text.parse::<jiff::Timestamp>().expect("a time").as_millisecond())
+    }
+
+    #[test]
+    fn a_window_over_midnight_belongs_to_the_day_it_begins_on_by_the_wall_clocks_of_its_zone() {
+        let zone = "Europe/Berlin".to_owned();
+        let friday_night = Window { days: BTreeSet::from([5]), from_minute: 22 * 60, to_minute: 5 * 60, zone };
+        // 2026-11-20 is a Friday; Berlin is an hour ahead then.
+        for (text, open) in [
+            ("2026-11-20T20:59:00Z", false),
+            ("2026-11-20T21:00:00Z", true),
+            ("2026-11-21T03:59:00Z", true),
+            ("2026-11-21T04:00:00Z", false),
+            ("2026-11-20T03:00:00Z", false),
+            ("2026-11-21T22:00:00Z", false),
+        ] {
+            assert_eq!(friday_night.is_open(at(text)), open, "{text}");
+        }
+        // In summer two hours.
+        assert!(friday_night.is_open(at("2026-07-03T20:00:00Z")));
+    }
+
+    #[test]
+    fn a_frozen_area_is_closed_and_one_without_windows_is_open() {
+        let rules = SoftwareRules::default();
+        assert!(rules.is_open(Utc(0)));
+        assert!(!SoftwareRules { frozen: true, ..rules.clone() }.is_open(Utc(0)));
+        assert_eq!([6, 20, 60].map(|n| rules.off_work_max(n)), [1, 2, 6]);
+    }
+
+    #[test]
+    fn every_broken_rule_for_software_is_told() {
+        let window = Window { days: BTreeSet::from([0, 8]), from_minute: 1440, to_minute: 2000, zone: "Berlin".to_owned() };
+        let software = SoftwareRules {
+            off_work_permille: 1001,
+            keep_in_work: BTreeMap::from([(String::new(), 1)]),
+            windows: vec![window],
+            frozen: false,
+        };
+        let area = AreaId::parse("hall").expect("an id");
+        let mut bad = Violations::default();
+        AreaPolicy { software, ..AreaPolicy::default_of(area) }.check("policy", &mut bad);
+        let fields: Vec<&str> = bad.0.iter().map(|v| v.field.as_str()).collect();
+        let expected = ["off_work_permille", "keep_in_work", "windows[0].days", "windows[0].from_minute", "windows[0].to_minute", "windows[0].zone"];
+        assert_eq!(fields, expected.map(|f| format!("policy.software.{f}")));
     }
 }

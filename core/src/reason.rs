@@ -83,6 +83,16 @@ codes! {
     SoftwareFull = "SOFTWARE_FULL", "The room for software on the server is used up. Give it more with --ota-quota-gib, or a larger disk.";
     ReleaseMoved = "RELEASE_MOVED", "Somebody else published. Take the server's newest documents, sign on top of them and push again.";
     FilesMissing = "FILES_MISSING", "The release lists files that the server does not have. Bring them, then publish again.";
+    BundleNotFound = "BUNDLE_NOT_FOUND", "No published release has this bundle. List bundles.";
+    BundleRevoked = "BUNDLE_REVOKED", "The bundle was taken back, or the newest release lists it no more. No robot gets it.";
+    RolloutNotFound = "ROLLOUT_NOT_FOUND", "No roll-out has this id. List roll-outs.";
+    RolloutIdTaken = "ROLLOUT_ID_TAKEN", "A roll-out with this id exists with another body. Choose another id.";
+    RolloutOverlap = "ROLLOUT_OVERLAP", "Another roll-out has some of these robots. Wait until it has ended, abort it, or start this one with supersede.";
+    RolloutMatchesNobody = "ROLLOUT_MATCHES_NOBODY", "No robot fits what was selected. The dry run tells the reasons, robot by robot.";
+    RolloutFullPush = "ROLLOUT_FULL_PUSH", "The first wave has more than one robot and more than a tenth of all. Make it smaller, or say allow_full_push.";
+    BudgetImpossible = "BUDGET_IMPOSSIBLE", "The area's rules keep so many robots in work that none can be taken out. Change the rules of the area.";
+    NothingToRevert = "NOTHING_TO_REVERT", "No robot keeps what this roll-out brought.";
+    QuarantineNotFound = "QUARANTINE_NOT_FOUND", "This robot has no such bundle in quarantine.";
     // --- why a robot does not get a task
     RobotPinnedElsewhere = "ROBOT_PINNED_ELSEWHERE", "The task names another robot.";
     MissingCapability = "MISSING_CAPABILITY", "The robot cannot do one of the task's actions or lacks a required capability.";
@@ -140,6 +150,52 @@ codes! {
     DrainSuspend = "DRAIN_SUSPEND", "The robot is taken out of work; the task goes on with another.";
     SkippedBusy = "SKIPPED_BUSY", "The robot could not be had in time: a step that may not be interrupted, a load, or a task that may not wait. It works on.";
     BatterySuspend = "BATTERY_SUSPEND", "The robot goes to charge first.";
+    // --- why a robot is left out of a roll-out
+    SkippedOffline = "SKIPPED_OFFLINE", "The robot was not heard when its turn came. It is tried once more at the end.";
+    SkippedStuck = "SKIPPED_STUCK", "The robot did not get as far as it should in time: its download, or what it needs to activate. It is tried once more at the end.";
+    SkippedIncompatible = "SKIPPED_INCOMPATIBLE", "The bundle does not fit the robot, or the robot refused it.";
+    SkippedPinned = "SKIPPED_PINNED", "A person keeps the robot at what it runs. Unpin it.";
+    SkippedExcluded = "SKIPPED_EXCLUDED", "A person left the robot out of this roll-out.";
+    SkippedQuarantined = "SKIPPED_QUARANTINED", "The robot went back from this bundle before. Lift the quarantine.";
+    SkippedRetired = "SKIPPED_RETIRED", "The robot was taken out of the fleet.";
+    SkippedCurrent = "SKIPPED_CURRENT", "The robot keeps this bundle already.";
+    RolloutEnded = "ROLLOUT_ENDED", "The roll-out ended before the robot's turn came.";
+    // --- what a robot of a roll-out waits for
+    BlockedByBudget = "BUDGET", "As many robots of the area as its rules allow are out of work.";
+    BlockedByWindow = "WINDOW_CLOSED", "The area's maintenance window is closed, or the area is frozen.";
+    BlockedByWave = "WAITING_FOR_WAVE", "Its wave has not begun.";
+    BlockedByPlaceInWave = "WAITING_FOR_PLACE_IN_WAVE", "As many robots as the roll-out allows are out of work for it.";
+    BlockedByPause = "ROLLOUT_PAUSED", "The roll-out stands still. Resume it.";
+    BlockedByRollout = "WAITING_FOR_ROLLOUT", "Another roll-out has the robot.";
+    BlockedByDownload = "WAITING_FOR_DOWNLOAD", "The robot fetches the bundle while it works.";
+    BlockedByDrain = "WAITING_FOR_DRAIN", "The robot ends its work and parks.";
+    BlockedByRobot = "WAITING_FOR_ROBOT_READY", "The robot is parked and has not asked to activate: its charge, its temperature, a stop or its link.";
+    BlockedBySwitch = "WAITING_FOR_SWITCH", "The robot changes its software.";
+    BlockedByProbation = "ON_PROBATION", "The robot runs the bundle and gets no work until its probation is over.";
+    BlockedByGate = "WAITING_FOR_GATE", "The robot works with the bundle; its wave has not been judged.";
+    BlockedByCommit = "WAITING_FOR_COMMIT", "The robot was told to keep the bundle and has not answered.";
+    BlockedByRevert = "REVERT_PENDING", "The robot is to go back, and does before it works again.";
+    // --- what counts against a bundle
+    RobotLost = "ROBOT_LOST", "The robot was not heard again after it was given the bundle, and most others were.";
+    RobotWentBack = "ROBOT_WENT_BACK", "The robot went back from the bundle by itself.";
+    RollbackFailed = "ROLLBACK_FAILED", "The robot could not go back. A person must look at it.";
+    BreakerOnTrial = "BREAKER_ON_TRIAL", "The robot failed three attempts in ten minutes with the bundle.";
+    HardStopCode = "HARD_STOP_CODE", "A robot with the bundle reported a fault that its manifest names as one that ends the roll-out.";
+    HardwareStopOnTrial = "HARDWARE_STOP_ON_TRIAL", "The maker's safety system stopped a robot within ten minutes of its change.";
+    // --- verdicts on a roll-out
+    GateProven = "GATE_PROVEN", "Enough robots did well to prove it.";
+    GateUnproven = "GATE_UNPROVEN", "No robot failed, and too few were seen to prove it; the bound says how bad it may still be.";
+    GateReverted = "GATE_REVERTED", "The robots of the wave are back.";
+    GateInconclusive = "GATE_INCONCLUSIVE", "What was seen proves neither. A person must judge it.";
+    GateAsksPerson = "GATE_ASKS_PERSON", "The roll-out asks a person at this gate.";
+    NoExposure = "NO_EXPOSURE", "The robots of the wave did not get enough work in time to be judged.";
+    FailureAmongFew = "FAILURE_AMONG_FEW", "A robot failed while fewer than ten were attempted.";
+    TooManyFailed = "TOO_MANY_FAILED", "More robots failed than a good bundle lets fail.";
+    RateTooHigh = "RATE_TOO_HIGH", "Robots with the bundle fail tasks at several times the rate of the others.";
+    PromotedByUser = "PROMOTED_BY_USER", "A person let it go on.";
+    AbortedByUser = "ABORTED_BY_USER", "A person ended it.";
+    SupersededBy = "SUPERSEDED_BY", "Another roll-out takes its place.";
+    RolloutAborted = "ROLLOUT_ABORTED", "A roll-out was aborted. Its verdict has the numbers.";
     // --- a robot's refusals and session answers
     StaleAuthority = "STALE_AUTHORITY", "The message reached the robot after its authority had ended, or was anchored to another session.";
     StaleEpoch = "STALE_EPOCH", "The robot has passed this epoch.";

@@ -18,17 +18,20 @@ pub enum Writer {
     Fleet,
     /// Telemetry ingest.
     Telemetry,
+    /// Software of robots.
+    Ota,
 }
 
 impl Writer {
     /// All writers.
-    pub const ALL: [Writer; 3] = [Writer::Task, Writer::Fleet, Writer::Telemetry];
+    pub const ALL: [Writer; 4] = [Writer::Task, Writer::Fleet, Writer::Telemetry, Writer::Ota];
     /// Name in tables and logs.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::Task => "task",
             Self::Fleet => "fleet",
             Self::Telemetry => "telemetry",
+            Self::Ota => "ota",
         }
     }
 }
@@ -69,10 +72,22 @@ tables! {
     FleetMark "fleet_mark" Fleet, "Last position of each log that fleet has consumed.";
     Incident "incident" Fleet, "Something a person should look into.";
     Drain "drain" Fleet, "One taking of a robot out of work for maintenance. id = drain_id.";
+    AreaBudget "area_budget" Fleet, "Robots of one area that are out of work, against how many may be. id = area_id.";
     CommandKey "command_key" Fleet, "request_id -> command carried out; kept 7 days.";
     Session "session" Telemetry, "A robot's newest session: epoch, secret, hello inventory. id = robot_id.";
     Presence "presence" Telemetry, "ONLINE, SUSPECT, OFFLINE of a robot. id = robot_id.";
     LaneMark "lane_mark" Telemetry, "Highest durable CRITICAL and EVENT number per ring. id = robot_id/ring.";
+    Bundle "bundle" Ota, "A bundle of a published release. id = digest of its manifest, order = when it was published.";
+    Rollout "rollout" Ota, "One roll-out: what was asked for, where it is, verdicts. state = phase, order = creation.";
+    RolloutRobot "rollout_robot" Ota, "One robot in one roll-out. id = rollout_id/robot_id, parent = rollout_id, order = wave.";
+    DrainRequest "drain_request" Ota, "Fleet is asked to take a robot out of work. id = drain_id.";
+    DrainRelease "drain_release" Ota, "Fleet may give a robot back. id = drain_id.";
+    DesiredUpdate "desired_update" Ota, "Section `update` of a robot's desired state, with its signed directive. id = robot_id.";
+    RobotSoftware "robot_software" Ota, "What a robot runs, as it said, and whether a person pinned it. id = robot_id.";
+    Quarantine "quarantine" Ota, "A bundle that a robot went back from. id = robot_id/bundle.";
+    AreaBundle "area_bundle" Ota, "What robots get that come to an area later. id = area_id.";
+    OtaMark "ota_mark" Ota, "Last position of the feed that ota has consumed.";
+    OtaClock "ota_clock" Ota, "Serving time of ota, and the last number it gave to a drain or permission.";
 }
 
 impl Table {
@@ -96,11 +111,13 @@ pub enum Log {
     Telemetry,
     /// `robot_inbox`: EVENT and CRITICAL of robots, acknowledged from here. Written by telemetry.
     RobotInbox,
+    /// `ota_event`.
+    Ota,
 }
 
 impl Log {
     /// All logs.
-    pub const ALL: [Log; 4] = [Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox];
+    pub const ALL: [Log; 5] = [Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox, Log::Ota];
     /// Its name in SQL.
     pub const fn name(self) -> &'static str {
         match self {
@@ -108,6 +125,7 @@ impl Log {
             Self::Fleet => "fleet_event",
             Self::Telemetry => "telemetry_event",
             Self::RobotInbox => "robot_inbox",
+            Self::Ota => "ota_event",
         }
     }
     /// The one service that writes it.
@@ -116,6 +134,7 @@ impl Log {
             Self::Task => Writer::Task,
             Self::Fleet => Writer::Fleet,
             Self::Telemetry | Self::RobotInbox => Writer::Telemetry,
+            Self::Ota => Writer::Ota,
         }
     }
     /// The log that row changes of `writer` go to.
@@ -124,6 +143,7 @@ impl Log {
             Writer::Task => Self::Task,
             Writer::Fleet => Self::Fleet,
             Writer::Telemetry => Self::Telemetry,
+            Writer::Ota => Self::Ota,
         }
     }
 }

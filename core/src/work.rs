@@ -363,6 +363,9 @@ pub struct Session {
     pub inventory: crate::robot::Inventory,
     /// Highest generation of section work the robot had applied.
     pub applied_work: u64,
+    /// Highest generation of section update the robot had applied.
+    #[serde(default)]
+    pub applied_update: u64,
     /// Places it said it holds, at Hello.
     pub places: Vec<HeldPlace>,
     /// Robot clock minus server clock, milliseconds, as the sessions before this one measured it last; none: they did not.
@@ -434,4 +437,12 @@ pub struct Live {
     pub progress_at: crate::time::SiteTime,
     /// Robot clock minus server clock, milliseconds, and its error.
     pub clock_offset_ms: Option<(i64, u64)>,
+}
+
+impl Live {
+    /// Everything that the robot had written down when it sent this is stored, if its ring stands at `mark`.
+    pub fn is_consumed(&self, mark: Option<&LaneMark>) -> bool {
+        let done = |lane: Lane, have: u64| self.report.produced.get(&lane).is_none_or(|p| *p <= have);
+        done(Lane::Event, mark.map_or(0, |m| m.event)) && done(Lane::Critical, mark.map_or(0, |m| m.critical))
+    }
 }

@@ -1,4 +1,4 @@
-//! What people ask of fleet directly: cordon and uncordon, rules of an area, clearing a place, closing an incident. Each is one item, answered after its commit.
+//! What people ask of fleet directly: cordon, uncordon and retire, rules of an area, clearing a place, closing an incident. Each is one item, answered after its commit.
 
 use super::Tx;
 use super::rows::{CommandKey, Cordon, HolderState, Place, PlaceHolder, RobotControl};
@@ -30,6 +30,13 @@ pub enum Command {
     Uncordon {
         /// Whom.
         robot_id: RobotId,
+    },
+    /// Out of the fleet: no work, and no roll-out or drain waits for it. Uncordon brings it back.
+    Retire {
+        /// Whom.
+        robot_id: RobotId,
+        /// Why.
+        reason: String,
     },
     /// Out of work for maintenance: what it does ends or waits, then it parks.
     Drain {
@@ -100,6 +107,7 @@ pub fn check(
     let current = match command {
         Command::Cordon { robot_id, .. }
         | Command::Uncordon { robot_id }
+        | Command::Retire { robot_id, .. }
         | Command::Drain { robot_id, .. }
         | Command::Undrain { robot_id } => {
             if !view.sessions.contains_key(robot_id.as_str()) {
@@ -166,9 +174,15 @@ pub fn apply(tx: &mut Tx, command: &Command, actor: &str) {
         Command::Uncordon { robot_id } => {
             let mut control = control(tx, robot_id);
             control.cordon = None;
+            control.retired = None;
             control.breaker = None;
             control.failures.clear();
             tx.put(control, "robot.uncordoned");
+        }
+        Command::Retire { robot_id, reason } => {
+            let mut control = control(tx, robot_id);
+            control.retired = Some(Cordon { reason: reason.clone(), actor: actor.to_owned(), since: tx.now.utc });
+            tx.put(control, "robot.retired");
         }
         Command::Drain { robot_id, reason, within_ms } => drain::ask(tx, robot_id, reason, actor, *within_ms),
         Command::Undrain { robot_id } => drain::release(tx, robot_id),

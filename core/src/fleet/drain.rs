@@ -1,15 +1,15 @@
 //! Takes robots out of work for maintenance and gives them back: the task at hand ends or waits at a step boundary, the robot parks, and
-//! only then the drain holds it.
+//! only then the drain holds it. People ask for it, and the rollout service does by its rows.
 //!
-//! Invariant: a drain takes the robot's mutex only from none, and gives it back only from itself; it never cuts a grasp and never leaves a
+//! Called by `mod`, with [`super::budget`] before it. Invariant: a drain takes the robot's mutex only from none, and gives it back only from itself; it never cuts a grasp and never leaves a
 //! robot in a lane. A drain whose deadline passes is refused and the robot works on.
 
-use super::Tx;
 use super::rows::{Drain, DrainState, RobotAuthority, RobotHolder};
 use super::view::View;
-use super::{Board, Plan, errands, heard, repair, way};
+use super::{Board, Plan, Tx, errands, heard, repair, way};
 use crate::ids::{DrainId, RobotId};
 use crate::reason::{Code, Reason};
+use crate::rollout::rows::{DrainRelease, DrainRequest};
 use crate::site::Kind;
 use crate::task::Event;
 use crate::task::state::Errand;
@@ -21,17 +21,20 @@ const PLANNED_MM_S: u64 = 600;
 /// Time of one action that an estimate counts with, milliseconds of site time.
 const PLANNED_ACTION_MS: u64 = 20_000;
 
-/// The drain that the robot is in: the oldest that has not ended.
+/// Drains of a robot, in whatever state.
+pub fn all_of<'a>(view: &'a View, robot_id: &RobotId) -> impl Iterator<Item = &'a Drain> {
+    let ids = view.drains_of.get(robot_id).into_iter().flatten();
+    ids.filter_map(|id| view.drains.get(id)).map(|d| &d.row)
+}
+
+/// The drain that the robot is in: the oldest that takes it out of work.
 pub fn of<'a>(view: &'a View, robot_id: &RobotId) -> Option<&'a Drain> {
-    let drains =
-        view.drains.values().map(|d| &d.row).filter(|d| d.robot_id == *robot_id && d.state != DrainState::Refused);
-    drains.min_by_key(|d| (d.since, d.drain_id.clone()))
+    all_of(view, robot_id).filter(|d| d.is_on()).min_by_key(|d| (d.since, d.drain_id.clone()))
 }
 
 /// Asks for a drain on behalf of a person. Its id is never used again.
 pub fn ask(tx: &mut Tx, robot_id: &RobotId, reason: &str, actor: &str, within_ms: u64) {
-    let over =
-        tx.view.drains.values().map(|d| &d.row).filter(|d| d.robot_id == *robot_id && d.state == DrainState::Refused);
+    let over = all_of(tx.view, robot_id).filter(|d| d.is_of_person() && d.state == DrainState::Refused);
     let over: Vec<DrainId> = over.map(|d| d.drain_id.clone()).collect();
     over.iter().for_each(|id| tx.delete::<Drain>(id.as_str(), "drain.forgotten"));
     let wall = tx.now.wall.0.max(0);
@@ -46,20 +49,64 @@ pub fn ask(tx: &mut Tx, robot_id: &RobotId, reason: &str, actor: &str, within_ms
         within_ms,
         since: tx.now.utc,
         why: None,
+        area_id: None,
+        rollout_id: None,
+        urgent: true,
     };
     tx.put(drain, "drain.asked");
 }
 
 /// Ends every drain of the robot that a person asked for, and gives the robot back to work.
 pub fn release(tx: &mut Tx, robot_id: &RobotId) {
-    let asked = tx.view.drains.values().map(|d| &d.row).filter(|d| d.robot_id == *robot_id && d.is_of_person());
-    let asked: Vec<DrainId> = asked.map(|d| d.drain_id.clone()).collect();
-    for drain_id in asked {
-        let held = tx.view.authority.get(robot_id.as_str()).map(|a| a.row.holder.clone());
-        if held == Some(RobotHolder::Maintenance(drain_id.clone())) {
-            tx.put(RobotAuthority { robot_id: robot_id.clone(), holder: RobotHolder::None }, "robot.freed");
-        }
-        tx.delete::<Drain>(drain_id.as_str(), "drain.released");
+    let asked: Vec<DrainId> =
+        all_of(tx.view, robot_id).filter(|d| d.is_of_person()).map(|d| d.drain_id.clone()).collect();
+    asked.iter().for_each(|drain_id| give_back(tx, robot_id, drain_id));
+}
+
+/// Ends a drain, and what it holds is free.
+fn give_back(tx: &mut Tx, robot_id: &RobotId, drain_id: &DrainId) {
+    let held = tx.view.authority.get(robot_id.as_str()).map(|a| a.row.holder.clone());
+    if held == Some(RobotHolder::Maintenance(drain_id.clone())) {
+        tx.put(RobotAuthority { robot_id: robot_id.clone(), holder: RobotHolder::None }, "robot.freed");
+    }
+    tx.delete::<Drain>(drain_id.as_str(), "drain.released");
+}
+
+/// Takes what the rollout service asks for and what it lets go. Both rows are relied upon: it takes a request away only while there is
+/// no drain, and a drain is made only while the request stands alone.
+pub fn obey(view: &mut View, now: Now, plan: &mut Plan) {
+    let released: Vec<(RobotId, DrainId)> = (view.drain_releases.keys())
+        .filter_map(|id| view.drains.get(id))
+        .map(|d| (d.row.robot_id.clone(), d.row.drain_id.clone()))
+        .collect();
+    for (robot_id, drain_id) in released {
+        plan.decide(view, now, "ota", |tx| {
+            tx.rely::<DrainRelease>(drain_id.as_str());
+            give_back(tx, &robot_id, &drain_id);
+        });
+    }
+    let is_new = |id: &&String| !view.drains.contains_key(*id) && !view.drain_releases.contains_key(*id);
+    let asked: Vec<DrainRequest> =
+        view.drain_requests.iter().filter(|(id, _)| is_new(id)).map(|(_, r)| r.row.clone()).collect();
+    for request in asked {
+        plan.decide(view, now, "ota", |tx| {
+            tx.rely::<DrainRequest>(request.drain_id.as_str());
+            tx.rely::<DrainRelease>(request.drain_id.as_str());
+            let drain = Drain {
+                drain_id: request.drain_id,
+                robot_id: request.robot_id,
+                state: DrainState::Waiting,
+                reason: request.reason,
+                actor: "ota".to_owned(),
+                within_ms: request.within_ms,
+                since: tx.now.utc,
+                why: None,
+                area_id: None,
+                rollout_id: Some(request.rollout_id),
+                urgent: request.urgent,
+            };
+            tx.put(drain, "drain.asked");
+        });
     }
 }
 

@@ -33,12 +33,7 @@ pub fn is_settled(view: &View, live: &Live) -> bool {
     let current = session.row.session_epoch == live.report.session_epoch;
     let applied = view.desired_work.get(id).is_none_or(|d| live.report.applied_work >= d.row.generation);
     let mark = view.lane_marks.get(&format!("{id}/{}", session.row.ring)).map(|m| &m.row);
-    let unheard = view.bugs.heartbeat_overtakes_events();
-    let done = |lane: Lane, have: u64| unheard || live.report.produced.get(&lane).is_none_or(|p| *p <= have);
-    current
-        && applied
-        && done(Lane::Event, mark.map_or(0, |m| m.event))
-        && done(Lane::Critical, mark.map_or(0, |m| m.critical))
+    current && applied && (view.bugs.heartbeat_overtakes_events() || live.is_consumed(mark))
 }
 
 /// The heartbeat is not older than the robot's events that were consumed: an older one lists what has ended since.

@@ -2,12 +2,13 @@
 //!
 //! [`cycle`] takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
 //! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `commands` are what happens; `tasks` moves tasks by
-//! the table; `heard`, `anchor`, `attempts` and `incidents` are what they share; `screen`, `pool` and `assign` give work; `errands`, `drain`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
+//! the table; `heard`, `anchor`, `attempts` and `incidents` are what they share; `screen`, `pool` and `assign` give work; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod anchor;
 pub mod assign;
 pub mod attempts;
+pub mod budget;
 pub mod bugs;
 pub mod commands;
 pub mod desired;
@@ -100,7 +101,7 @@ impl Plan {
 }
 
 /// Logs that fleet reads.
-pub const LOGS: &[Log] = &[Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox];
+pub const LOGS: &[Log] = &[Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox, Log::Ota];
 
 /// Takes entries of the feed, in commit order: rows into the view, requests and robots' events into decisions.
 pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
@@ -142,6 +143,15 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
                     incidents::open(tx, Code::CloneSeen.into(), robot_id.as_ref(), None);
                     mark(tx, entry.seq);
                 });
+            }
+            (Log::Ota, None, Some(body)) if &*entry.kind == crate::rollout::INCIDENT => {
+                match serde_json::from_str::<Reason>(body) {
+                    Ok(reason) => plan.decide(view, now, "ota", |tx| {
+                        incidents::open(tx, reason, RobotId::parse(&entry.subject).ok().as_ref(), None);
+                        mark(tx, entry.seq);
+                    }),
+                    Err(error) => plan.report.unreadable.push(format!("incident {}: {error}", entry.seq.0)),
+                }
             }
             _ => {}
         }
@@ -224,6 +234,8 @@ pub enum Pace {
 pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Plan) {
     welcome(view, now, board, plan);
     let heard = if pace == Pace::Sweep { sweep(view, now, board, plan) } else { BTreeSet::new() };
+    drain::obey(view, now, plan);
+    budget::plan(view, board, now, plan);
     drain::plan(view, board, now, plan);
     let idle = assign::plan(view, board, now, pace, &heard, plan);
     errands::plan(view, board, now, idle, plan);

@@ -1,14 +1,14 @@
 //! Rows that fleet alone writes, apart from tasks and attempts: places, the robot's mutex, control, timers, holds, counters, marks.
 
 use super::commands::Command;
-use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, SiteId, TaskId};
+use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, RolloutId, SiteId, TaskId};
 use crate::reason::Reason;
 use crate::robot::Duty;
 use crate::rows::{Index, Record, Revision, Seq, Table};
 use crate::time::Utc;
 use crate::work::WorkStats;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// How far a holder is with its grant.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -115,6 +115,9 @@ pub struct RobotControl {
     pub robot_id: RobotId,
     /// Out of dispatch by a person.
     pub cordon: Option<Cordon>,
+    /// Out of the fleet by a person: nothing waits for it any more.
+    #[serde(default)]
+    pub retired: Option<Cordon>,
     /// Out of dispatch by the breaker since, UTC, site clock.
     pub breaker: Option<Utc>,
     /// Failed attempts within the breaker's window, UTC, site clock.
@@ -128,11 +131,12 @@ pub struct RobotControl {
 impl RobotControl {
     /// A robot nobody has said anything about.
     pub fn new(robot_id: RobotId) -> Self {
-        Self { robot_id, cordon: None, breaker: None, failures: Vec::new(), errands: 0, tasks: 0 }
+        Self { robot_id, cordon: None, retired: None, breaker: None, failures: Vec::new(), errands: 0, tasks: 0 }
     }
     /// Whether it gets work.
     pub fn duty(&self) -> Duty {
         match (&self.cordon, self.breaker) {
+            _ if self.retired.is_some() => Duty::Retired,
             (Some(_), _) => Duty::Cordoned,
             (None, Some(_)) => Duty::BrokenOff,
             (None, None) => Duty::InWork,
@@ -362,6 +366,8 @@ impl Record for Incident {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum DrainState {
+    /// The robot works on: the area's budget lets nobody more out.
+    Waiting,
     /// The robot gets no new work; what it has ends or waits, then it parks.
     Draining,
     /// The drain holds the robot.
@@ -387,14 +393,45 @@ pub struct Drain {
     pub within_ms: u64,
     /// UTC, site clock.
     pub since: Utc,
-    /// Why it was refused.
+    /// Why it waits or was refused.
     pub why: Option<Reason>,
+    /// The area that it takes the robot from, once it does.
+    #[serde(default)]
+    pub area_id: Option<AreaId>,
+    /// The roll-out that asked for it.
+    #[serde(default)]
+    pub rollout_id: Option<RolloutId>,
+    /// It does not wait for the area's budget.
+    #[serde(default)]
+    pub urgent: bool,
 }
 
 impl Drain {
     /// A person asked for it, and a person ends it.
     pub fn is_of_person(&self) -> bool {
         self.drain_id.as_str().starts_with("op:")
+    }
+    /// It takes the robot out of work now, or has.
+    pub const fn is_on(&self) -> bool {
+        matches!(self.state, DrainState::Draining | DrainState::Held)
+    }
+}
+
+/// Robots of one area that are out of work: a row, so that two planners cannot both spend the last place.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct AreaBudget {
+    /// Which area.
+    pub area_id: AreaId,
+    /// Out of work for a drain, a cordon or the breaker; one that is out for several reasons stands here once.
+    pub off_work: BTreeSet<RobotId>,
+    /// As many may be.
+    pub most: u32,
+}
+
+impl Record for AreaBudget {
+    const TABLE: Table = Table::AreaBudget;
+    fn id(&self) -> String {
+        self.area_id.to_string()
     }
 }
 

@@ -57,7 +57,8 @@ fn decided_by_people(view: &View, robot_id: &RobotId) -> Result<(), Reason> {
                 let why = control.cordon.as_ref().map(|c| c.reason.clone()).unwrap_or_default();
                 return Err(Reason::from(Code::RobotCordoned).with("cordon", why));
             }
-            Duty::BrokenOff | Duty::Retired => return Err(Code::RobotBrokenOff.into()),
+            Duty::BrokenOff => return Err(Code::RobotBrokenOff.into()),
+            Duty::Retired => return Err(Code::SkippedRetired.into()),
         }
     }
     if let Some(drain) = super::drain::of(view, robot_id) {

@@ -4,13 +4,14 @@
 //! running cycle will write; after a conflict the whole view is built again, never patched.
 
 use super::rows::{
-    CommandKey, Drain, FleetMark, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotCounter, ServiceClock,
+    AreaBudget, CommandKey, Drain, FleetMark, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotCounter, ServiceClock,
     SiteRow, Timer,
 };
 use crate::ids::{AttemptId, RobotId, TaskId};
 use crate::picture::{Picture, Viewed};
 pub use crate::picture::{Rowed, Slot};
 use crate::policy::AreaPolicy;
+use crate::rollout::rows::{DrainRelease, DrainRequest};
 use crate::rows::{BadRow, Key, Revision, Row, Table, Writer};
 use crate::site::Site;
 use crate::site::route::Router;
@@ -82,6 +83,14 @@ pub struct View {
     pub incidents: Slot<Incident>,
     /// Drains that have not been released.
     pub drains: Slot<Drain>,
+    /// Drains of each robot.
+    pub drains_of: BTreeMap<RobotId, BTreeSet<String>>,
+    /// Drains that the rollout service asks for (ota's).
+    pub drain_requests: Slot<DrainRequest>,
+    /// Drains that may end (ota's).
+    pub drain_releases: Slot<DrainRelease>,
+    /// Robots of areas that are out of work.
+    pub budgets: Slot<AreaBudget>,
     /// Used request_ids of commands.
     pub command_keys: Slot<CommandKey>,
     /// Newest sessions (telemetry's).
@@ -151,7 +160,9 @@ viewed! {
     FleetMark => marks;
     Incident => incidents;
     CommandKey => command_keys;
-    Drain => drains;
+    DrainRequest => drain_requests;
+    DrainRelease => drain_releases;
+    AreaBudget => budgets;
     PresenceRow => presence;
     LaneMark => lane_marks;
 }
@@ -175,6 +186,25 @@ impl Viewed<View> for TaskState {
             view.fresh.insert(task.task_id.clone());
         } else {
             view.queued.remove(&place);
+        }
+    }
+}
+
+impl Viewed<View> for Drain {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.drains
+    }
+    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+        match (view.drains.get(id).map(|d| d.row.robot_id.clone()), old) {
+            (Some(robot_id), _) => {
+                view.drains_of.entry(robot_id).or_default().insert(id.to_owned());
+            }
+            (None, Some(old)) => {
+                if let Some(ids) = view.drains_of.get_mut(&old.robot_id) {
+                    ids.remove(id);
+                }
+            }
+            (None, None) => {}
         }
     }
 }
@@ -258,6 +288,9 @@ pub const TABLES: &[Table] = &[
     Table::Incident,
     Table::CommandKey,
     Table::Drain,
+    Table::DrainRequest,
+    Table::DrainRelease,
+    Table::AreaBudget,
     Table::Session,
     Table::Presence,
     Table::LaneMark,
@@ -290,6 +323,10 @@ impl View {
             incidents: Slot::new(),
             command_keys: Slot::new(),
             drains: Slot::new(),
+            drains_of: BTreeMap::new(),
+            drain_requests: Slot::new(),
+            drain_releases: Slot::new(),
+            budgets: Slot::new(),
             sessions: Slot::new(),
             presence: Slot::new(),
             lane_marks: Slot::new(),
@@ -349,7 +386,10 @@ impl View {
             Table::Session => self.take::<Session>(key, revision, row),
             Table::Presence => self.take::<PresenceRow>(key, revision, row),
             Table::LaneMark => self.take::<LaneMark>(key, revision, row),
-            Table::TaskRequest | Table::RequestKey => Ok(()),
+            Table::DrainRequest => self.take::<DrainRequest>(key, revision, row),
+            Table::DrainRelease => self.take::<DrainRelease>(key, revision, row),
+            Table::AreaBudget => self.take::<AreaBudget>(key, revision, row),
+            _ => Ok(()),
         }
     }
 

@@ -67,7 +67,7 @@ wire_enums! {
     Presence = telemetry::v1::Presence { Online = Online, Suspect = Suspect, Offline = Offline, Updating = Updating }
     Duty = fleet::v1::Duty { InWork = InWork, Cordoned = Cordoned, BrokenOff = BrokenOff, Retired = Retired }
     Errand = fleet::v1::Errand { Charge = Charge, Park = Park }
-    DrainState = fleet::v1::DrainState { Draining = Draining, Held = Held, Refused = Refused }
+    DrainState = fleet::v1::DrainState { Waiting = Waiting, Draining = Draining, Held = Held, Refused = Refused }
     HolderState = fleet::v1::PlaceHolderState { Granted = Granted, Inside = Inside, Revoking = Revoking }
     Phase = task::v1::TaskState {
         Queued = Queued, Assigned = Assigned, Running = Running, Held = Held, Suspended = Suspended, Stopping = Stopping,

@@ -69,6 +69,7 @@ impl From<&UpdateReport> for v1::UpdateReport {
     fn from(report: &UpdateReport) -> Self {
         Self {
             state: report.state.to_wire(),
+            directive: report.directive,
             bundle: report.bundle.to_string(),
             set: text(report.set.as_ref()),
             drain_id: text(report.drain_id.as_ref()),
@@ -89,9 +90,11 @@ impl Parse<UpdateReport> for v1::UpdateReport {
         let grant_id = counted(self.grant_id, at.field("grant_id"), bad);
         let progress_permille = permille(self.progress_permille, at.field("progress_permille"), bad);
         let reason = maybe(self.reason, at.field("reason"), bad);
+        let directive = counted(self.directive, at.field("directive"), bad);
         Some(UpdateReport {
             state: state?,
             bundle: bundle?,
+            directive: directive?,
             set: set?,
             drain_id: drain_id?,
             grant_id: grant_id?,

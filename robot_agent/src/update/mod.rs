@@ -190,6 +190,7 @@ impl SoftwareRow {
         Some(UpdateReport {
             state: update.state,
             bundle: BundleId::parse(&update.bundle.to_string()).ok()?,
+            directive: self.directive,
             set: update.set_name().and_then(|name| SetId::parse(&name).ok()),
             drain_id: update.drain_id.clone(),
             grant_id: self.grant_id,

@@ -153,5 +153,6 @@ pub(crate) fn log_index(log: Log) -> usize {
         Log::Fleet => 1,
         Log::Telemetry => 2,
         Log::RobotInbox => 3,
+        Log::Ota => 4,
     }
 }

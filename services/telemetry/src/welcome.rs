@@ -115,6 +115,7 @@ fn session_row(hello: &Hello, session_epoch: u64) -> Session {
         ring: hello.ring.clone(),
         inventory: hello.inventory.clone(),
         applied_work: hello.reported.applied_work,
+        applied_update: hello.reported.applied_update,
         places: hello.reported.places.clone(),
         clock_offset_ms: None,
     }

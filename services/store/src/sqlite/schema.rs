@@ -67,6 +67,23 @@ pub(crate) const CONTROL: &[Migration] = migrations!["control":
     "0043_incident_by_ord",
     "0044_command_key",
     "0045_drain",
+    "0046_bundle",
+    "0047_rollout",
+    "0048_rollout_robot",
+    "0049_drain_request",
+    "0050_drain_release",
+    "0051_desired_update",
+    "0052_robot_software",
+    "0053_quarantine",
+    "0054_area_bundle",
+    "0055_ota_mark",
+    "0056_ota_clock",
+    "0057_area_budget",
+    "0058_ota_event",
+    "0059_ota_event_by_subject",
+    "0060_rollout_robot_by_parent",
+    "0061_rollout_by_ord",
+    "0062_bundle_by_ord",
 ];
 
 /// Of `telemetry.db`.

@@ -1,0 +1,151 @@
+//! How many robots of an area may be out of work at once, and who is next.
+//!
+//! Called by `mod` before drains go on. Invariant: a drain that may wait begins only in an item that also writes its area's row, so two planners
+//! cannot both spend the last place; a robot that is out for several reasons counts once. Robots that charge or have no work are asked
+//! first. Drains of people and urgent ones count and do not wait.
+
+use super::rows::{AreaBudget, Drain, DrainState, RobotHolder};
+use super::view::View;
+use super::{Board, Plan, Tx, drain, heard, way};
+use crate::ids::{AreaId, RobotId};
+use crate::reason::{Code, Reason};
+use crate::robot::{Duty, Presence};
+use crate::task::state::Errand;
+use crate::time::Now;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Robots of one area.
+#[derive(Debug, Default)]
+struct Area {
+    /// All that are heard there.
+    robots: BTreeSet<RobotId>,
+    /// Of these, and of robots that were taken from there, those that are out of work.
+    off_work: BTreeSet<RobotId>,
+}
+
+/// Lets waiting drains begin as far as the areas' rules allow, and keeps the areas' rows.
+pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
+    let mut waiting: Vec<Drain> =
+        view.drains.values().map(|d| &d.row).filter(|d| d.state == DrainState::Waiting).cloned().collect();
+    if waiting.is_empty() && view.budgets.is_empty() {
+        return;
+    }
+    let mut areas = areas(view, board, &now);
+    keep_rows(view, now, &areas, plan);
+    waiting.sort_by_cached_key(|d| (!d.urgent, cost(view, &d.robot_id), d.since, d.drain_id.clone()));
+    for drain in waiting {
+        let here = area_of(view, board, &drain.robot_id);
+        let why = match (&here, drain::of(view, &drain.robot_id)) {
+            (_, Some(other)) => Some(Reason::from(Code::RobotDraining).with("drain_id", &other.drain_id)),
+            (Some(area), None) if !drain.urgent => {
+                areas.get(area).and_then(|a| refusal(view, board, &now, area, a, &drain.robot_id))
+            }
+            _ => None,
+        };
+        if why.is_none()
+            && let Some(area) = here.as_ref().and_then(|area| areas.get_mut(area))
+        {
+            area.off_work.insert(drain.robot_id.clone());
+        }
+        plan.decide(view, now, "fleet", |tx| match why {
+            Some(why) if drain.why.as_ref() == Some(&why) => {}
+            Some(why) => tx.put(Drain { why: Some(why), ..drain }, "drain.waits"),
+            None => begin(tx, drain, here, &areas),
+        });
+    }
+}
+
+fn begin(tx: &mut Tx, drain: Drain, area_id: Option<AreaId>, areas: &BTreeMap<AreaId, Area>) {
+    if let Some((id, area)) = area_id.as_ref().and_then(|id| areas.get_key_value(id)) {
+        put_row(tx, id, area);
+    }
+    let (state, since) = (DrainState::Draining, tx.now.utc);
+    tx.put(Drain { state, since, area_id, why: None, ..drain }, "drain.begun");
+}
+
+fn put_row(tx: &mut Tx, area_id: &AreaId, area: &Area) {
+    let row = row_of(tx.view, area_id, area);
+    tx.put(row, "area.off_work");
+}
+
+fn row_of(view: &View, area_id: &AreaId, area: &Area) -> AreaBudget {
+    let most = view.policy(area_id).software.off_work_max(area.robots.len()) as u32;
+    AreaBudget { area_id: area_id.clone(), off_work: area.off_work.clone(), most }
+}
+
+/// Rows of areas whose robots came back, or were taken out by a person or the breaker.
+fn keep_rows(view: &mut View, now: Now, areas: &BTreeMap<AreaId, Area>, plan: &mut Plan) {
+    let none = Area::default();
+    let known: Vec<AreaId> = view.budgets.values().map(|b| b.row.area_id.clone()).collect();
+    for area_id in known {
+        let area = areas.get(&area_id).unwrap_or(&none);
+        let row = row_of(view, &area_id, area);
+        if view.budgets.get(area_id.as_str()).is_some_and(|b| b.row != row) {
+            plan.decide(view, now, "fleet", |tx| put_row(tx, &area_id, area));
+        }
+    }
+}
+
+/// What it costs to take a robot out of work now: nothing while it charges, little while it has nothing to do.
+fn cost(view: &View, robot_id: &RobotId) -> u8 {
+    let holder = view.authority.get(robot_id.as_str()).map(|a| &a.row.holder);
+    match holder {
+        Some(RobotHolder::Attempt(id)) => match view.attempt(id).and_then(|a| a.errand) {
+            Some(Errand::Charge) => 0,
+            Some(Errand::Park) => 1,
+            None => 2,
+        },
+        _ => 1,
+    }
+}
+
+fn area_of(view: &View, board: &Board, robot_id: &RobotId) -> Option<AreaId> {
+    let at = way::find(view, board.get(robot_id)?.report.vitals.waypoint.as_ref())?;
+    Some(view.site.area_of(at).area_id.clone())
+}
+
+fn areas(view: &View, board: &Board, now: &Now) -> BTreeMap<AreaId, Area> {
+    let mut areas: BTreeMap<AreaId, Area> = BTreeMap::new();
+    for robot_id in board.keys().filter(|id| heard::presence(board, id, now) != Presence::Offline) {
+        let Some(area_id) = area_of(view, board, robot_id) else { continue };
+        let area = areas.entry(area_id).or_default();
+        area.robots.insert(robot_id.clone());
+        let duty = view.control.get(robot_id.as_str()).map_or(Duty::InWork, |c| c.row.duty());
+        let taken_here = drain::of(view, robot_id).is_some_and(|d| d.area_id.is_none());
+        if duty != Duty::InWork || taken_here {
+            area.off_work.insert(robot_id.clone());
+        }
+    }
+    for drain in view.drains.values().map(|d| &d.row).filter(|d| d.is_on()) {
+        if let Some(area_id) = &drain.area_id {
+            areas.entry(area_id.clone()).or_default().off_work.insert(drain.robot_id.clone());
+        }
+    }
+    areas
+}
+
+/// Why one more robot may not leave its work now.
+fn refusal(view: &View, board: &Board, now: &Now, area_id: &AreaId, area: &Area, robot_id: &RobotId) -> Option<Reason> {
+    if area.off_work.contains(robot_id) {
+        return None;
+    }
+    let rules = view.policy(area_id).software;
+    let (off, most) = (area.off_work.len(), rules.off_work_max(area.robots.len()));
+    let budget = || Reason::from(Code::BlockedByBudget).with("area_id", area_id);
+    if off >= most {
+        return Some(budget().with("off_work", off).with("most", most));
+    }
+    let can = |id: &RobotId, capability: &String| {
+        view.sessions.get(id.as_str()).is_some_and(|s| s.row.inventory.capabilities.contains(capability))
+    };
+    for (capability, least) in rules.keep_in_work.iter().filter(|(capability, _)| can(robot_id, capability)) {
+        let in_work = |id: &&RobotId| {
+            !area.off_work.contains(*id) && can(id, capability) && heard::presence(board, id, now) == Presence::Online
+        };
+        let left = area.robots.iter().filter(in_work).filter(|id| *id != robot_id).count();
+        if left < *least as usize {
+            return Some(budget().with("capability", capability).with("in_work", left).with("keep_in_work", least));
+        }
+    }
+    None
+}

@@ -1,0 +1,144 @@
+//! Rows as a service's picture of them, and one decision being written into both the picture and an item of a commit.
+//!
+//! Called by `fleet` and `rollout`. Invariants: a row in a picture is at the revision it has in the store, or one that an item of the
+//! running cycle will write; a row written twice in one decision stands in its item once, with the first expectation and the last body.
+
+use crate::rows::{
+    BadRow, Entry, Expect, Fact, Item, Key, Log, Record, Revision, Row, RowChange, Table, Write, Writer,
+};
+use crate::time::Now;
+use std::collections::BTreeMap;
+
+/// A row with its revision.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Rowed<R> {
+    /// Writes so far.
+    pub revision: Revision,
+    /// The row.
+    pub row: R,
+}
+
+/// Rows of one table by id.
+pub type Slot<R> = BTreeMap<String, Rowed<R>>;
+
+/// What one service knows of the rows.
+pub trait Picture {
+    /// Who decides on it.
+    const WRITER: Writer;
+}
+
+/// A record that a picture keeps.
+pub trait Viewed<P: Picture>: Record {
+    /// Where.
+    fn slot(picture: &mut P) -> &mut Slot<Self>;
+    /// What else changes with it: indices and what must be looked at again. Called after the slot changed.
+    fn changed(_picture: &mut P, _id: &str, _old: Option<&Self>) {}
+}
+
+/// Takes one row as the store has it; none: deleted. What the picture already has is passed over.
+///
+/// # Errors
+/// A body that is not what its table holds.
+pub fn take<P: Picture, R: Viewed<P>>(
+    picture: &mut P,
+    id: &str,
+    revision: Revision,
+    row: Option<&Row>,
+) -> Result<(), BadRow> {
+    if R::slot(picture).get(id).is_some_and(|known| known.revision >= revision) {
+        return Ok(());
+    }
+    let old = match row {
+        Some(row) => R::slot(picture).insert(id.to_owned(), Rowed { revision, row: row.decode()? }),
+        None => R::slot(picture).remove(id),
+    };
+    R::changed(picture, id, old.as_ref().map(|r| &r.row));
+    Ok(())
+}
+
+/// A decision under way.
+pub struct Tx<'a, P: Picture> {
+    /// The picture it is made on.
+    pub view: &'a mut P,
+    /// When it is made.
+    pub now: Now,
+    item: Item,
+    at: BTreeMap<Key, usize>,
+}
+
+impl<'a, P: Picture> Tx<'a, P> {
+    /// Begins a decision on behalf of `actor`.
+    pub fn new(view: &'a mut P, now: Now, actor: &str) -> Self {
+        Self { view, now, item: Item::new(P::WRITER, actor), at: BTreeMap::new() }
+    }
+    /// Notes the request behind it.
+    pub fn on_request(mut self, request_id: Option<&str>) -> Self {
+        self.item.request_id = request_id.map(Into::into);
+        self
+    }
+    /// Rows written so far.
+    pub fn rows(&self) -> usize {
+        self.item.rows.len()
+    }
+    /// Creates or changes a row.
+    pub fn put<R: Viewed<P>>(&mut self, record: R, kind: &'static str) {
+        let key = record.key();
+        let known = R::slot(self.view).get(&*key.id).map_or(Revision(0), |r| r.revision);
+        let write = Write::Put { index: record.index(), body: record.body() };
+        let revision = match self.note(key.clone(), known, write, kind) {
+            Expect::Absent => Revision(1),
+            Expect::At(known) => known.next(),
+        };
+        let old = R::slot(self.view).insert(key.id.to_string(), Rowed { revision, row: record });
+        R::changed(self.view, &key.id, old.as_ref().map(|r| &r.row));
+    }
+    /// Guards a row that is only relied upon: if somebody else changes it first, this decision is not made.
+    pub fn rely<R: Viewed<P>>(&mut self, id: &str) {
+        let key = Key::new(R::TABLE, id);
+        if self.at.contains_key(&key) {
+            return;
+        }
+        let known = R::slot(self.view).get(id).map(|r| r.revision);
+        self.at.insert(key.clone(), self.item.rows.len());
+        self.item.keep(key, known.map_or(Expect::Absent, Expect::At));
+    }
+    /// States a fact beside the rows.
+    pub fn tell(&mut self, subject: &str, kind: &'static str, body: &impl serde::Serialize) {
+        let body = serde_json::to_string(body).unwrap_or_else(|e| unreachable!("plain fields: {e}"));
+        self.item.facts.push(Fact { log: Log::of(P::WRITER), subject: subject.into(), kind, body: body.into() });
+    }
+    /// Deletes a row, if there is one.
+    pub fn delete<R: Viewed<P>>(&mut self, id: &str, kind: &'static str) {
+        let Some(old) = R::slot(self.view).remove(id) else { return };
+        self.note(Key::new(R::TABLE, id), old.revision, Write::Delete, kind);
+        R::changed(self.view, id, Some(&old.row));
+    }
+    /// Writes `write`, and says what the row is expected to be before this decision.
+    fn note(&mut self, key: Key, known: Revision, write: Write, kind: &'static str) -> Expect {
+        if let Some(&i) = self.at.get(&key) {
+            let row = &mut self.item.rows[i];
+            row.write = match (row.expect, write) {
+                (Expect::Absent, Write::Delete) => Write::Keep,
+                (_, write) => write,
+            };
+            row.kind = kind;
+            return row.expect;
+        }
+        let expect = if known == Revision(0) { Expect::Absent } else { Expect::At(known) };
+        self.at.insert(key.clone(), self.item.rows.len());
+        self.item.rows.push(RowChange { key, expect, write, kind });
+        expect
+    }
+    /// The item, if the decision changed anything. Attempts stand before all else in it: whoever follows the feed knows the attempt
+    /// when the change of its task comes.
+    pub fn finish(mut self) -> Option<Item> {
+        self.item.rows.sort_by_key(|row| row.key.table != Table::Attempt);
+        (!self.item.is_empty()).then_some(self.item)
+    }
+}
+
+/// A row as a picture takes it, from an entry of a log.
+pub fn row_of(entry: &Entry, table: Table) -> Option<Row> {
+    let key = Key { table, id: entry.subject.clone() };
+    entry.body.clone().map(|body| Row { key, revision: entry.revision, index: entry.index.clone(), body })
+}

@@ -1,0 +1,565 @@
+//! What people ask of roll-outs: write one down, check it, stand for it, begin, stand still, go on, judge, end, take back; and of robots: pin,
+//! leave out, lift a quarantine.
+//!
+//! Invariant: a command is checked against the whole picture before anything of it is written; asked twice it does the same once.
+
+use super::matching::{self, Matching};
+use super::rows::{Act, Bundle, Counted, Outcome, Pause, Phase, Quarantine, Rollout, RolloutRobot, RobotSoftware, Step, Verdict};
+use super::spec::{RolloutSpec, Wave};
+use super::view::View;
+use super::{Board, Plan, Tx, newcomers, phases, robots, verdict};
+use crate::gates::FailureEvidence;
+use crate::ids::{BundleId, RobotId, RolloutId};
+use crate::limits;
+use crate::reason::{Code, Kind, Reason, Refusal, Violations};
+use crate::rows::Revision;
+use crate::time::Now;
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+/// Milliseconds of site time for which an estimate takes a robot out of work, beside its probation: to end its task and to park.
+const PLANNED_OFF_WORK_MS: u64 = 120_000;
+/// A probation shorter than this is told to be short, milliseconds.
+const SHORT_PROBATION_MS: u64 = 60_000;
+
+/// One request about a roll-out.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Verb {
+    /// Check it, and go on to VALIDATED.
+    Submit,
+    /// Stand for it.
+    Approve,
+    /// Begin.
+    Start {
+        /// Roll-outs that have some of the robots are aborted first.
+        supersede: bool,
+    },
+    /// Stand still: no new drain, no new permission.
+    Pause,
+    /// Go on.
+    Resume,
+    /// Go on though the gate did not say so.
+    Promote,
+    /// End it; robots go back.
+    Abort,
+    /// Once more with the robots that failed or were skipped; their quarantine is lifted.
+    RetryFailed,
+    /// Leave a robot out.
+    Exclude(RobotId),
+}
+
+/// One request.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Command {
+    /// Write a roll-out down.
+    Create {
+        /// Its id.
+        rollout_id: RolloutId,
+        /// What it is asked to be.
+        spec: Arc<RolloutSpec>,
+    },
+    /// Take a completed roll-out back with another.
+    Rollback {
+        /// Which.
+        of: RolloutId,
+        /// Id of the other.
+        rollout_id: RolloutId,
+    },
+    /// Something about one.
+    Do {
+        /// Which.
+        rollout_id: RolloutId,
+        /// What.
+        verb: Verb,
+        /// Why; may be empty.
+        reason: String,
+    },
+    /// Take a bundle back: nobody gets it any more.
+    Revoke {
+        /// Which.
+        bundle: BundleId,
+        /// Why.
+        reason: String,
+    },
+    /// Keep a robot at what it runs.
+    Pin {
+        /// Whom.
+        robot_id: RobotId,
+        /// Why.
+        reason: String,
+    },
+    /// Let it take part again.
+    Unpin {
+        /// Whom.
+        robot_id: RobotId,
+    },
+    /// A person has looked: the robot may have the bundle again.
+    LiftQuarantine {
+        /// Whom.
+        robot_id: RobotId,
+        /// Which.
+        bundle: BundleId,
+    },
+}
+
+/// What a roll-out would do.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DryRun {
+    /// Whom it would reach.
+    pub matching: Matching,
+    /// Bytes of all components.
+    pub bytes: u64,
+    /// Milliseconds of site time that it takes at least, under the budgets.
+    pub least_ms: u64,
+    /// What a person should know, and what nothing forbids.
+    pub caveats: Vec<String>,
+}
+
+fn not_found(code: Code, key: &str, id: &impl ToString) -> Refusal {
+    Refusal::new(Kind::NotFound, Reason::from(code).with(key, id.to_string()))
+}
+
+fn bundle<'a>(view: &'a View, id: &BundleId) -> Result<&'a Bundle, Refusal> {
+    let bundle = view.bundles.get(id.as_str()).map(|b| &b.row);
+    let bundle = bundle.ok_or_else(|| not_found(Code::BundleNotFound, "bundle", id))?;
+    if bundle.revoked.is_some() || !bundle.listed {
+        return Err(Refusal::new(Kind::Precondition, Reason::from(Code::BundleRevoked).with("bundle", id)));
+    }
+    Ok(bundle)
+}
+
+/// What a roll-out would do, or everything that speaks against it.
+///
+/// # Errors
+/// A bundle that is not there; rules that are broken; nobody matched; a first wave that is too large; a budget that lets nobody out.
+pub fn dry_run(view: &View, board: &Board, id: &RolloutId, spec: &RolloutSpec) -> Result<DryRun, Refusal> {
+    let mut bad = Violations::default();
+    spec.check(&mut bad);
+    bad.finish()?;
+    let bundle = bundle(view, &spec.bundle)?;
+    let matching = matching::of(view, board, id, spec, bundle);
+    let robots = matching.robots.len();
+    if robots == 0 {
+        let mut reason = Reason::from(Code::RolloutMatchesNobody);
+        for (code, count) in matching.left_out_by_code().into_iter().take(8) {
+            reason = reason.with(code.as_str(), count);
+        }
+        return Err(Refusal::new(Kind::Precondition, reason));
+    }
+    let sizes = matching.sizes(spec.waves.len());
+    let first = sizes.first().copied().unwrap_or_default() as usize;
+    if !spec.allow_full_push && first > (robots / 10).max(1) {
+        let reason = Reason::from(Code::RolloutFullPush).with("first_wave", first).with("robots", robots);
+        return Err(Refusal::new(Kind::Precondition, reason));
+    }
+    budgets(view, &matching)?;
+    let caveats = caveats(spec, bundle, &matching);
+    Ok(DryRun { least_ms: least_ms(view, spec, &matching), bytes: bundle.length, matching, caveats })
+}
+
+/// Areas whose rules let nobody out are told now, not when everybody waits.
+fn budgets(view: &View, matching: &Matching) -> Result<(), Refusal> {
+    let areas: BTreeSet<_> = matching.robots.iter().filter_map(|r| r.stratum.area.as_ref()).collect();
+    for area in areas {
+        for (capability, least) in &view.policy(area).software.keep_in_work {
+            let able = |id: &RobotId| {
+                let session = view.sessions.get(id.as_str());
+                session.is_some_and(|s| s.row.inventory.capabilities.contains(capability))
+            };
+            let here = view.software.values().filter(|s| s.row.area.as_ref() == Some(area)).map(|s| &s.row.robot_id);
+            let there = here.filter(|id| able(id)).count() as u32;
+            if there > 0 && there <= *least {
+                let reason = Reason::from(Code::BudgetImpossible).with("area_id", area).with("capability", capability);
+                return Err(Refusal::new(Kind::Precondition, reason.with("robots", there).with("keep_in_work", least)));
+            }
+        }
+    }
+    Ok(())
+}
+
+fn least_ms(view: &View, spec: &RolloutSpec, matching: &Matching) -> u64 {
+    let each = PLANNED_OFF_WORK_MS + spec.probation_ms;
+    let areas: BTreeSet<_> = matching.robots.iter().map(|r| r.stratum.area.clone()).collect();
+    let wave = |wave: u32, size: u32| {
+        let rounds = areas.iter().map(|area| {
+            let here = matching.robots.iter().filter(|r| r.wave == wave && r.stratum.area == *area).count();
+            let most = area.as_ref().map_or(usize::MAX, |area| {
+                let all = view.software.values().filter(|s| s.row.area.as_ref() == Some(area)).count();
+                view.policy(area).software.off_work_max(all)
+            });
+            here.div_ceil(most.min(spec.max_in_flight.unwrap_or(size).max(1) as usize).max(1)) as u64
+        });
+        rounds.max().unwrap_or(0) * each + spec.soak_ms
+    };
+    (0..).zip(matching.sizes(spec.waves.len())).filter(|(_, size)| *size > 0).map(|(ix, size)| wave(ix, size)).sum()
+}
+
+fn caveats(spec: &RolloutSpec, bundle: &Bundle, matching: &Matching) -> Vec<String> {
+    let mut caveats = Vec::new();
+    if spec.probation_ms < SHORT_PROBATION_MS {
+        caveats.push(format!("probation of {} ms is short: a program that hangs later is met on trial", spec.probation_ms));
+    }
+    let uncovered = matching.strata().values().filter(|(_, first)| !first).count();
+    if uncovered > 0 {
+        caveats.push(format!("{uncovered} kinds of robots are not in the first wave"));
+    }
+    if bundle.has_base {
+        caveats.push("it replaces the base system: while it is staged a robot has nothing to go back to but what it runs".to_owned());
+    }
+    if bundle.is_irreversible {
+        caveats.push("once committed it cannot be gone back from".to_owned());
+    }
+    if spec.waves.contains(&Wave::Rest) && spec.waves.len() == 1 {
+        caveats.push("all robots in one wave: a bad bundle reaches every one of them".to_owned());
+    }
+    caveats
+}
+
+/// Checks a command against what is known; an error changes nothing. True: it was carried out before.
+///
+/// # Errors
+/// Why not.
+pub fn check(view: &View, board: &Board, command: &Command, seen: Option<Revision>) -> Result<bool, Refusal> {
+    match command {
+        Command::Create { rollout_id, spec } => {
+            if let Some(known) = view.rollout(rollout_id) {
+                let same = known.spec == *spec && known.revert_of.is_none();
+                let reason = || Reason::from(Code::RolloutIdTaken).with("rollout_id", rollout_id);
+                return if same { Ok(true) } else { Err(Refusal::new(Kind::AlreadyExists, reason())) };
+            }
+            let mut bad = Violations::default();
+            spec.check(&mut bad);
+            bad.finish()?;
+            bundle(view, &spec.bundle)?;
+            room(view)
+        }
+        Command::Rollback { of, rollout_id } => {
+            if let Some(known) = view.rollout(rollout_id) {
+                let same = known.revert_of.as_ref() == Some(of);
+                let reason = || Reason::from(Code::RolloutIdTaken).with("rollout_id", rollout_id);
+                return if same { Ok(true) } else { Err(Refusal::new(Kind::AlreadyExists, reason())) };
+            }
+            let known = view.rollout(of).ok_or_else(|| not_found(Code::RolloutNotFound, "rollout_id", of))?;
+            let keeps = view.robots_of(of).any(|r| keeps(view, known, r));
+            if known.phase != Phase::Completed || !keeps {
+                return Err(Refusal::new(Kind::Precondition, Reason::from(Code::NothingToRevert).with("rollout_id", of)));
+            }
+            room(view)
+        }
+        Command::Do { rollout_id, verb, .. } => {
+            let rowed = view.rollouts.get(rollout_id.as_str());
+            let rowed = rowed.ok_or_else(|| not_found(Code::RolloutNotFound, "rollout_id", rollout_id))?;
+            if seen.is_some_and(|seen| seen != rowed.revision) {
+                return Err(Refusal::new(Kind::Conflict, Reason::from(Code::EtagMismatch).with("etag", rowed.revision.0)));
+            }
+            verb_fits(view, board, &rowed.row, verb)
+        }
+        Command::Revoke { bundle, .. } => {
+            let known = view.bundles.get(bundle.as_str()).ok_or_else(|| not_found(Code::BundleNotFound, "bundle", bundle))?;
+            Ok(known.row.revoked.is_some())
+        }
+        Command::Pin { robot_id, .. } | Command::Unpin { robot_id } => {
+            if !view.sessions.contains_key(robot_id.as_str()) {
+                return Err(not_found(Code::RobotNotFound, "robot_id", robot_id));
+            }
+            let pinned = view.software_of(robot_id).pin.is_some();
+            Ok(pinned == matches!(command, Command::Pin { .. }))
+        }
+        Command::LiftQuarantine { robot_id, bundle } => {
+            let known = view.quarantines.contains_key(&Quarantine::id_of(robot_id, bundle));
+            if known { Ok(false) } else { Err(not_found(Code::QuarantineNotFound, "robot_id", robot_id)) }
+        }
+    }
+}
+
+fn room(view: &View) -> Result<bool, Refusal> {
+    let open = view.rollouts.values().filter(|r| !r.row.phase.is_over()).count();
+    if open >= limits::ROLLOUTS_OPEN_MAX {
+        return Err(Refusal::new(Kind::Exhausted, Reason::from(Code::Overloaded).with("rollouts_open", open)));
+    }
+    Ok(false)
+}
+
+/// A robot keeps what the roll-out brought.
+fn keeps(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
+    let software = view.software.get(r.robot_id.as_str()).map(|s| &s.row);
+    r.step == Step::Committed && software.and_then(|s| s.runs()) == Some(&rollout.spec.bundle)
+}
+
+/// True: it was done before.
+fn verb_fits(view: &View, board: &Board, rollout: &Rollout, verb: &Verb) -> Result<bool, Refusal> {
+    let phase = rollout.phase;
+    let now_is = |fits: bool, done: bool| {
+        let reason = || Reason::from(Code::NotAllowedNow).with("phase", format!("{phase:?}").to_uppercase());
+        match (fits, done) {
+            (true, _) => Ok(false),
+            (_, true) => Ok(true),
+            _ => Err(Refusal::new(Kind::Precondition, reason())),
+        }
+    };
+    match verb {
+        Verb::Submit => {
+            now_is(phase == Phase::Draft, phase != Phase::Draft).and_then(|done| {
+                if !done && rollout.revert_of.is_none() {
+                    dry_run(view, board, &rollout.rollout_id, &rollout.spec)?;
+                }
+                Ok(done)
+            })
+        }
+        Verb::Approve => now_is(phase == Phase::Validated, rollout.approved.is_some()),
+        Verb::Start { supersede } => {
+            let done = now_is(phase == Phase::Approved, rollout.started.is_some())?;
+            if !done {
+                may_start(view, board, rollout, *supersede)?;
+            }
+            Ok(done)
+        }
+        Verb::Pause => now_is(phase.runs() && !rollout.pauses.contains(&Pause::Operator), rollout.pauses.contains(&Pause::Operator)),
+        Verb::Resume => now_is(rollout.pauses.contains(&Pause::Operator), phase.runs() && rollout.pauses.is_empty()),
+        Verb::Promote => now_is(matches!(phase, Phase::Soaking | Phase::Gate | Phase::Review), false),
+        Verb::Abort => now_is(!phase.is_over() && !phase.goes_back(), phase.goes_back()),
+        Verb::RetryFailed => {
+            let some = view.robots_of(&rollout.rollout_id).any(is_to_retry);
+            now_is(phase == Phase::Completed && some, false)
+        }
+        Verb::Exclude(robot_id) => {
+            let known = view.robot_of(&rollout.rollout_id, robot_id);
+            let known = known.ok_or_else(|| not_found(Code::RobotNotFound, "robot_id", robot_id))?;
+            now_is(known.step < Step::Draining, known.step == Step::Skipped)
+        }
+    }
+}
+
+fn is_to_retry(r: &RolloutRobot) -> bool {
+    matches!(r.step, Step::RolledBack | Step::Skipped) && r.why.as_ref().is_none_or(|w| w.code != Code::SkippedExcluded)
+}
+
+fn may_start(view: &View, board: &Board, rollout: &Rollout, supersede: bool) -> Result<(), Refusal> {
+    let (robots, _) = members(view, board, rollout)?;
+    let others = overlapping(view, rollout, robots.iter().map(|(id, ..)| id));
+    match others.iter().next() {
+        Some(other) if !supersede => {
+            Err(Refusal::new(Kind::Precondition, Reason::from(Code::RolloutOverlap).with("rollout_id", other)))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Robots of a roll-out with wave, place and version they run, and how many each wave has.
+type Members = (Vec<(RobotId, u32, u64, String)>, Vec<u32>);
+
+fn members(view: &View, board: &Board, rollout: &Rollout) -> Result<Members, Refusal> {
+    if let Some(of) = &rollout.revert_of {
+        let original = view.rollout(of).ok_or_else(|| not_found(Code::RolloutNotFound, "rollout_id", of))?;
+        let mut kept: Vec<_> = view
+            .robots_of(of)
+            .filter(|r| keeps(view, original, r))
+            .map(|r| {
+                let place = matching::place_of(&rollout.rollout_id, &r.robot_id);
+                (r.robot_id.clone(), 0, place, view.software_of(&r.robot_id).version)
+            })
+            .collect();
+        kept.sort_by_key(|(_, _, place, _)| *place);
+        let count = kept.len() as u32;
+        return Ok((kept, vec![count]));
+    }
+    let run = dry_run(view, board, &rollout.rollout_id, &rollout.spec)?;
+    let sizes = run.matching.sizes(rollout.spec.waves.len());
+    let robots = run.matching.robots.into_iter();
+    Ok((robots.map(|m| (m.robot_id, m.wave, m.place, m.stratum.from_version)).collect(), sizes))
+}
+
+/// Roll-outs that run and have one of these robots.
+fn overlapping<'a>(view: &View, rollout: &Rollout, robots: impl Iterator<Item = &'a RobotId>) -> BTreeSet<RolloutId> {
+    let ids = robots.filter_map(|robot| view.of_robot.get(robot)).flatten().filter(|id| **id != rollout.rollout_id);
+    let open = ids.filter(|id| view.rollout(id).is_some_and(|r| !r.phase.is_over()));
+    open.cloned().collect()
+}
+
+/// Carries out a command that passed its check: one item for most, many for a start.
+pub fn apply(view: &mut View, board: &Board, now: Now, command: &Command, actor: &str, plan: &mut Plan) {
+    match command {
+        Command::Do { rollout_id, verb: Verb::Start { supersede }, .. } => {
+            start(view, board, now, rollout_id, *supersede, actor, plan);
+        }
+        Command::Do { rollout_id, verb: Verb::RetryFailed, reason } => {
+            retry_failed(view, now, rollout_id, actor, reason, plan);
+        }
+        command => plan.decide(view, now, actor, |tx| apply_one(tx, board, command, actor)),
+    }
+}
+
+fn act(tx: &Tx, actor: &str, reason: &str) -> Act {
+    Act { actor: actor.to_owned(), reason: reason.to_owned(), at: tx.now.utc }
+}
+
+fn apply_one(tx: &mut Tx, board: &Board, command: &Command, actor: &str) {
+    match command {
+        Command::Create { rollout_id, spec } => {
+            forget_oldest(tx);
+            let row = draft(tx, rollout_id, spec.clone(), actor);
+            tx.put(row, "rollout.created");
+        }
+        Command::Rollback { of, rollout_id } => {
+            let Some(original) = tx.view.rollout(of).cloned() else { return };
+            let spec = RolloutSpec {
+                waves: vec![Wave::Rest],
+                allow_full_push: true,
+                soak_ms: 0,
+                exposure_tasks: 0,
+                ..RolloutSpec::clone(&original.spec)
+            };
+            let row = draft(tx, rollout_id, Arc::new(spec), actor);
+            tx.put(Rollout { revert_of: Some(of.clone()), ..row }, "rollout.created");
+        }
+        Command::Do { rollout_id, verb, reason } => verb_one(tx, board, rollout_id, verb, actor, reason),
+        Command::Revoke { bundle, reason } => {
+            let Some(row) = tx.view.bundles.get(bundle.as_str()).map(|b| b.row.clone()) else { return };
+            let revoked = Some(act(tx, actor, reason));
+            tx.put(Bundle { revoked, ..row }, "bundle.revoked");
+        }
+        Command::Pin { robot_id, reason } => {
+            let pin = Some(act(tx, actor, reason));
+            let row = tx.view.software_of(robot_id);
+            tx.put(RobotSoftware { pin, ..row }, "robot.pinned");
+        }
+        Command::Unpin { robot_id } => {
+            let row = tx.view.software_of(robot_id);
+            tx.put(RobotSoftware { pin: None, ..row }, "robot.unpinned");
+            tx.view.arrived.insert(robot_id.clone());
+        }
+        Command::LiftQuarantine { robot_id, bundle } => {
+            tx.delete::<Quarantine>(&Quarantine::id_of(robot_id, bundle), "quarantine.lifted");
+        }
+    }
+}
+
+/// The oldest that has ended goes for a new one, with its robots, once there are too many.
+fn forget_oldest(tx: &mut Tx) {
+    if tx.view.rollouts.len() < limits::ROLLOUTS_MAX {
+        return;
+    }
+    let over = tx.view.rollouts.values().map(|r| &r.row).filter(|r| r.phase.is_over());
+    let named = |id: &RolloutId| tx.view.area_bundles.values().any(|a| a.row.rollouts.values().any(|r| r == id));
+    let oldest = over.filter(|r| !named(&r.rollout_id)).min_by_key(|r| r.since).map(|r| r.rollout_id.clone());
+    let Some(id) = oldest else { return };
+    let robots: Vec<String> =
+        tx.view.robots_of(&id).map(crate::rows::Record::id).take(limits::ITEM_ROWS_MAX / 2).collect();
+    robots.iter().for_each(|robot| tx.delete::<RolloutRobot>(robot, "robot.forgotten"));
+    if tx.view.robots_of(&id).next().is_none() {
+        tx.delete::<Rollout>(id.as_str(), "rollout.forgotten");
+    }
+}
+
+fn draft(tx: &Tx, rollout_id: &RolloutId, spec: Arc<RolloutSpec>, actor: &str) -> Rollout {
+    Rollout {
+        rollout_id: rollout_id.clone(),
+        spec,
+        phase: Phase::Draft,
+        wave: 0,
+        pauses: BTreeSet::new(),
+        generation: 1,
+        in_flight: 0,
+        soak: None,
+        exposure: None,
+        sizes: Vec::new(),
+        promoted: 0,
+        verdicts: Vec::new(),
+        abort: None,
+        second_pass: false,
+        revert_of: None,
+        supersedes: BTreeSet::new(),
+        superseded_by: None,
+        tasks: FailureEvidence::default(),
+        counted: Counted::default(),
+        created: act(tx, actor, ""),
+        approved: None,
+        started: None,
+        since: tx.now.utc,
+    }
+}
+
+fn verb_one(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor: &str, reason: &str) {
+    let Some(mut rollout) = tx.view.rollout(id).cloned() else { return };
+    let why = |code: Code| Reason::new(code, reason).with("actor", actor);
+    match verb {
+        Verb::Submit => phases::enter(tx, rollout, Phase::Validated, "rollout.validated"),
+        Verb::Approve => {
+            rollout.approved = Some(act(tx, actor, reason));
+            phases::enter(tx, rollout, Phase::Approved, "rollout.approved");
+        }
+        Verb::Pause | Verb::Resume => {
+            let mut pauses = rollout.pauses.clone();
+            if *verb == Verb::Pause { pauses.insert(Pause::Operator) } else { pauses.remove(&Pause::Operator) };
+            phases::set_pauses(tx, rollout, pauses, if *verb == Verb::Pause { "rollout.paused" } else { "rollout.resumed" });
+        }
+        Verb::Promote => {
+            let seen = verdict::see(tx.view, &rollout, Some(rollout.wave));
+            let verdict = verdict::of(tx.view, &rollout, &seen, Outcome::PromotedByPerson, why(Code::PromotedByUser), tx.now.utc);
+            phases::promote(tx, rollout, Verdict { actor: Some(actor.to_owned()), ..verdict });
+        }
+        Verb::Abort => phases::abort(tx, rollout, why(Code::AbortedByUser), false, None, Some(actor.to_owned())),
+        Verb::Exclude(robot_id) => {
+            let row = RolloutRobot::id_of(id, robot_id);
+            robots::make(tx, &super::NoSign, board, &row, robots::Move::Skip(why(Code::SkippedExcluded)));
+        }
+        Verb::Start { .. } | Verb::RetryFailed => {}
+    }
+}
+
+fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bool, actor: &str, plan: &mut Plan) {
+    let Some(rollout) = view.rollout(id).cloned() else { return };
+    let Ok((robots, sizes)) = members(view, board, &rollout) else { return };
+    let others = overlapping(view, &rollout, robots.iter().map(|(id, ..)| id));
+    let counted = Counted { at_ms: view.served_ms(&now), control: verdict::controls_of(view, &rollout), ..Counted::default() };
+    if supersede {
+        for other in &others {
+            plan.decide(view, now, actor, |tx| {
+                let Some(old) = tx.view.rollout(other).cloned() else { return };
+                let reason = Reason::from(Code::SupersededBy).with("rollout_id", id);
+                let old = Rollout { superseded_by: Some(id.clone()), ..old };
+                if old.phase.goes_back() {
+                    tx.put(old, "rollout.superseded");
+                } else {
+                    phases::abort(tx, old, reason, false, None, Some(actor.to_owned()));
+                }
+            });
+        }
+    }
+    // The row first: robots of a roll-out that did not begin are nobody's. Its robots come with it, a slice to each item.
+    let mut slices = robots.chunks(limits::ITEM_ROWS_MAX / 2);
+    let first = slices.next().unwrap_or_default();
+    plan.decide(view, now, actor, |tx| {
+        let (phase, started, since) = (Phase::Prefetching, Some(tx.now.utc), tx.now.utc);
+        let row = Rollout { phase, started, since, sizes: sizes.clone(), supersedes: others.clone(), counted, ..rollout.clone() };
+        tx.put(row, "rollout.started");
+        add(tx, &rollout, first);
+    });
+    for slice in slices {
+        plan.decide(view, now, actor, |tx| add(tx, &rollout, slice));
+    }
+}
+
+fn add(tx: &mut Tx, rollout: &Rollout, robots: &[(RobotId, u32, u64, String)]) {
+    for (robot_id, wave, place, from_version) in robots {
+        let now = tx.now;
+        tx.put(newcomers::fresh(&now, rollout, robot_id, *wave, *place, from_version.clone()), "robot.assigned");
+    }
+}
+
+fn retry_failed(view: &mut View, now: Now, id: &RolloutId, actor: &str, reason: &str, plan: &mut Plan) {
+    let Some(rollout) = view.rollout(id).cloned() else { return };
+    let wave = rollout.spec.waves.len() as u32 + 1;
+    let robots: Vec<RolloutRobot> = view.robots_of(id).filter(|r| is_to_retry(r)).cloned().collect();
+    for slice in robots.chunks(limits::ITEM_ROWS_MAX / 4) {
+        plan.decide(view, now, actor, |tx| {
+            for r in slice {
+                let key = Quarantine::id_of(&r.robot_id, &rollout.spec.bundle);
+                tx.delete::<Quarantine>(&key, "quarantine.lifted");
+                let fresh = newcomers::fresh(&tx.now.clone(), &rollout, &r.robot_id, wave, r.place, r.from_version.clone());
+                let why = (!reason.is_empty()).then(|| Reason::new(Code::PromotedByUser, reason).with("actor", actor));
+                tx.put(RolloutRobot { again: true, why, ..fresh }, "robot.retried");
+            }
+        });
+    }
+}

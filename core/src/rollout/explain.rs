@@ -1,0 +1,77 @@
+//! What one robot of a roll-out waits for, since when, and until when at most. Reads only; the planner's own questions.
+
+use super::rows::{Countdown, Phase, Rollout, RolloutRobot, Step};
+use super::view::View;
+use super::{Board, hear, robots};
+use crate::fleet::rows::DrainState;
+use crate::limits;
+use crate::reason::{Code, Reason};
+use crate::time::{Now, Utc};
+use crate::update::UpdateState;
+
+/// Why nothing happens to a robot at this moment.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Blocked {
+    /// Why.
+    pub by: Reason,
+    /// UTC, site clock.
+    pub since: Utc,
+    /// UTC, site clock, when it is given up; none: it waits as long as it takes.
+    pub deadline: Option<Utc>,
+}
+
+/// What `r` waits for; none: nothing is left to do.
+pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Blocked> {
+    let mut since = r.since;
+    let mut deadline = None;
+    let by = match r.step {
+        Step::Committed | Step::RolledBack | Step::Skipped => return None,
+        Step::Waiting if !(rollout.phase.runs() || rollout.phase == Phase::Completed) => Code::BlockedByWave.into(),
+        Step::Waiting | Step::Staged => {
+            robots::blocked(view, board, now, rollout, r).unwrap_or_else(|| Code::BlockedByWave.into())
+        }
+        Step::Staging => {
+            deadline = robots::is_on(rollout, r)
+                .then(|| rollout.since.max(r.since).plus_ms(limits::STAGED_WITHIN.as_ms()));
+            let progress = board.get(&r.robot_id).and_then(|l| l.report.update.as_ref()).map_or(0, |u| u.progress_permille);
+            Reason::from(Code::BlockedByDownload).with("progress_permille", progress)
+        }
+        Step::Draining => {
+            let drain = r.drain_id.as_ref().and_then(|id| view.drain(id));
+            if let Some(drain) = drain {
+                since = drain.since;
+                if drain.state == DrainState::Draining {
+                    deadline = Some(drain.since.plus_ms(drain.within_ms));
+                }
+            }
+            let waits = drain.filter(|d| d.state == DrainState::Waiting).and_then(|d| d.why.clone());
+            waits.unwrap_or_else(|| Code::BlockedByDrain.into())
+        }
+        Step::Activating => {
+            let state = hear::report_of(view, board, r).filter(|u| u.directive >= r.directive).map(|u| u.state);
+            match state {
+                Some(UpdateState::Probation) => {
+                    since = r.moments.switched.unwrap_or(r.since);
+                    deadline = Some(since.plus_ms(rollout.spec.probation_ms));
+                    Code::BlockedByProbation.into()
+                }
+                _ if r.grant.is_some() => Code::BlockedBySwitch.into(),
+                _ => {
+                    deadline = Some(r.since.plus_ms(limits::READY_WITHIN.as_ms()));
+                    let said = hear::report_of(view, board, r).and_then(|u| u.reason.as_ref());
+                    let because = said.and_then(|why| why.metadata.get("by")).cloned().unwrap_or_default();
+                    Reason::from(Code::BlockedByRobot).with("by", because)
+                }
+            }
+        }
+        Step::Trial => {
+            let left = [rollout.soak, rollout.exposure].into_iter().flatten().next();
+            deadline = left.map(|c: Countdown| now.utc.plus_ms(c.left(view.served_ms(now))));
+            Reason::from(Code::BlockedByGate).with("phase", format!("{:?}", rollout.phase).to_uppercase())
+        }
+        Step::Committing => Code::BlockedByCommit.into(),
+        Step::Reverting => Code::BlockedByRevert.into(),
+        Step::Stuck => Code::RollbackFailed.into(),
+    };
+    Some(Blocked { by, since, deadline })
+}

@@ -1,0 +1,177 @@
+//! Takes what robots say of their software, and what else of theirs counts for or against a bundle.
+//!
+//! Invariant: what a robot says changes rows only; what follows from it is decided in `robots` and `phases`. A heartbeat counts only once
+//! everything the robot had said before it was taken.
+
+use super::rows::{Quarantine, RobotSoftware, RolloutRobot, Step};
+use super::view::View;
+use super::{Board, Tx};
+use crate::ids::{DrainId, RobotId};
+use crate::limits;
+use crate::reason::{Code, Reason};
+use crate::robot::{Fault, HardwareStop};
+use crate::update::{UpdateEvent, UpdateReport, UpdateState};
+use crate::work::{InboxEntry, InboxItem, Live, RobotEvent, SampleBody};
+
+/// Obeys one entry of the robot inbox.
+pub fn take(tx: &mut Tx, entry: &InboxEntry) {
+    let InboxItem::Sample(sample) = &entry.what else { return };
+    let SampleBody::Event(event) = &sample.body else { return };
+    let robot_id = &entry.robot_id;
+    match event {
+        RobotEvent::Update(UpdateEvent::Changed(report)) => changed(tx, robot_id, report),
+        RobotEvent::Update(UpdateEvent::Ready { drain_id, .. }) => ready(tx, robot_id, drain_id),
+        RobotEvent::Update(UpdateEvent::DirectiveRefused { generation, reason }) => {
+            directive_refused(tx, robot_id, *generation, reason);
+        }
+        RobotEvent::Fault { fault, cleared: false } => fault_begun(tx, robot_id, fault),
+        RobotEvent::HardwareStop(stop) if *stop != HardwareStop::None => stopped(tx, robot_id),
+        _ => {}
+    }
+}
+
+/// Takes a report that says something new.
+fn changed(tx: &mut Tx, robot_id: &RobotId, report: &UpdateReport) {
+    let mut software = tx.view.software_of(robot_id);
+    let bundle = Some(report.bundle.clone());
+    match report.state {
+        UpdateState::Probation | UpdateState::Trial => software.on_trial = bundle,
+        UpdateState::Committed => {
+            if software.committed != bundle {
+                software.previous = std::mem::replace(&mut software.committed, bundle);
+            }
+            software.on_trial = None;
+        }
+        UpdateState::RolledBack => {
+            if software.committed == bundle {
+                software.committed = software.previous.take();
+            }
+            software.on_trial = None;
+        }
+        _ => {}
+    }
+    software.report = Some(report.clone());
+    software.since = tx.now.utc;
+    tx.put(software, "robot.software_changed");
+}
+
+fn ready(tx: &mut Tx, robot_id: &RobotId, drain_id: &DrainId) {
+    let Some(robot) = in_drain(tx.view, robot_id, drain_id).cloned() else { return };
+    tx.put(RolloutRobot { ready: true, ..robot }, "robot.ready");
+}
+
+/// The robot in the roll-out whose drain this is. A robot that speaks of a drain of before is not heard.
+fn in_drain<'a>(view: &'a View, robot_id: &'a RobotId, drain_id: &DrainId) -> Option<&'a RolloutRobot> {
+    let any = view.bugs.any_drain_will_do();
+    rows_of(view, robot_id).find(|r| r.drain_id.as_ref() == Some(drain_id) || (any && r.drain_id.is_some()))
+}
+
+/// A robot in all roll-outs that it is in.
+pub fn rows_of<'a>(view: &'a View, robot_id: &'a RobotId) -> impl Iterator<Item = &'a RolloutRobot> {
+    view.of_robot.get(robot_id).into_iter().flatten().filter_map(move |id| view.robot_of(id, robot_id))
+}
+
+fn directive_refused(tx: &mut Tx, robot_id: &RobotId, generation: u64, reason: &Reason) {
+    let newest = tx.view.desired.get(robot_id.as_str()).is_some_and(|d| d.row.generation <= generation);
+    let row = rows_of(tx.view, robot_id).find(|r| matches!(r.step, Step::Staging | Step::Staged)).cloned();
+    if let Some(row) = row.filter(|_| newest) {
+        let why = Reason::new(Code::SkippedIncompatible, reason.text()).with("because", reason.code);
+        tx.put(RolloutRobot { step: Step::Skipped, since: tx.now.utc, why: Some(why), ..row }, "robot.skipped");
+    }
+}
+
+/// The robot in the roll-out whose bundle it runs.
+fn on_trial(view: &View, robot_id: &RobotId) -> Option<RolloutRobot> {
+    rows_of(view, robot_id).find(|r| matches!(r.step, Step::Activating | Step::Trial | Step::Committing)).cloned()
+}
+
+/// Notes that a robot counts against its bundle, once.
+pub fn fail(tx: &mut Tx, robot: &RolloutRobot, reason: Reason) {
+    let Some(robot) = tx.view.robot_of(&robot.rollout_id, &robot.robot_id).cloned() else { return };
+    let is_worse = is_hard(&reason) && !robot.failure.as_ref().is_some_and(is_hard);
+    if robot.failure.is_none() || is_worse {
+        tx.put(RolloutRobot { failure: Some(reason), ..robot }, "robot.failed");
+    }
+}
+
+/// One such failure ends a roll-out at once.
+pub fn is_hard(reason: &Reason) -> bool {
+    matches!(
+        reason.code,
+        Code::HardStopCode | Code::HardwareStopOnTrial | Code::RollbackFailed | Code::SelfTestFailed
+    )
+}
+
+fn fault_begun(tx: &mut Tx, robot_id: &RobotId, fault: &Fault) {
+    let Some(robot) = on_trial(tx.view, robot_id) else { return };
+    let bundle = tx.view.rollout(&robot.rollout_id).and_then(|r| tx.view.bundles.get(r.spec.bundle.as_str()));
+    let runs = tx.view.software_of(robot_id).on_trial.is_some();
+    if runs && bundle.is_some_and(|b| b.row.hard_stop_codes.contains(&fault.code)) {
+        fail(tx, &robot, Reason::from(Code::HardStopCode).with("fault_code", fault.code));
+    }
+}
+
+fn stopped(tx: &mut Tx, robot_id: &RobotId) {
+    let Some(robot) = on_trial(tx.view, robot_id).filter(|r| r.step == Step::Trial) else { return };
+    let since_ms = robot.moments.switched.map(|at| tx.now.utc.ms_since(at));
+    if since_ms.is_some_and(|ms| ms <= limits::HARDWARE_STOP_COUNTS.as_ms()) {
+        fail(tx, &robot, Code::HardwareStopOnTrial.into());
+    }
+}
+
+/// A robot that went back by itself does not get this bundle again until a person says so.
+pub fn quarantine(tx: &mut Tx, robot: &RolloutRobot, reason: &Reason) {
+    let Some(bundle) = tx.view.rollout(&robot.rollout_id).map(|r| r.spec.bundle.clone()) else { return };
+    let row = Quarantine {
+        robot_id: robot.robot_id.clone(),
+        bundle,
+        rollout_id: robot.rollout_id.clone(),
+        reason: reason.clone(),
+        since: tx.now.utc,
+    };
+    tx.put(row, "robot.quarantined");
+}
+
+/// What a settled heartbeat says that the rows do not: the store is older than the robot, or a row was lost.
+pub fn repair(tx: &mut Tx, live: &Live) {
+    let robot_id = &live.robot_id;
+    let known = tx.view.software_of(robot_id);
+    if let Some(report) = &live.report.update
+        && known.report.as_ref().is_none_or(|k| differs(k, report))
+    {
+        changed(tx, robot_id, report);
+    }
+    let version = tx.view.sessions.get(robot_id.as_str()).map(|s| s.row.inventory.software.clone()).unwrap_or_default();
+    let area = tx.view.area_of(live).or_else(|| known.area.clone());
+    if known.version != version || known.area != area {
+        let known = tx.view.software_of(robot_id);
+        tx.put(RobotSoftware { version, area, ..known }, "robot.software_seen");
+    }
+}
+
+/// Whether repair would change something.
+pub fn is_due(view: &View, live: &Live) -> bool {
+    let Some(known) = view.software.get(live.robot_id.as_str()).map(|s| &s.row) else { return true };
+    let session = view.sessions.get(live.robot_id.as_str()).map(|s| s.row.inventory.software.as_str());
+    let reported = match (&known.report, &live.report.update) {
+        (_, None) => false,
+        (None, Some(_)) => true,
+        (Some(known), Some(said)) => differs(known, said),
+    };
+    let area = view.area_of(live);
+    reported || session != Some(known.version.as_str()) || (area.is_some() && area != known.area)
+}
+
+/// Everything but the progress, which is no row's matter.
+fn differs(known: &UpdateReport, said: &UpdateReport) -> bool {
+    let progress_permille = known.progress_permille;
+    *known != UpdateReport { progress_permille, ..said.clone() }
+}
+
+/// What a robot said of its update to this bundle, the newest that may be believed.
+pub fn report_of<'a>(view: &'a View, board: &'a Board, robot: &RolloutRobot) -> Option<&'a UpdateReport> {
+    let bundle = &view.rollout(&robot.rollout_id)?.spec.bundle;
+    let known = view.software.get(robot.robot_id.as_str()).and_then(|s| s.row.report.as_ref());
+    let settled = board.get(&robot.robot_id).filter(|live| view.is_settled(live));
+    settled.and_then(|live| live.report.update.as_ref()).or(known).filter(|r| r.bundle == *bundle)
+}

@@ -1,0 +1,47 @@
+//! Whether a robot that is not heard was lost by its bundle, or whether the network is.
+//!
+//! Invariant: a robot counts as lost only while at least [`limits::CONTROLS_MIN`] robots that have nothing to do with the change are there to
+//! compare it with, and most of them are heard.
+
+use super::Board;
+use super::rows::{Pause, Rollout, RolloutRobot, Step};
+use super::view::View;
+use crate::fleet::heard;
+use crate::ids::RobotId;
+use crate::limits;
+use crate::robot::Presence;
+use crate::time::Now;
+
+/// The robot was given permission and is not heard for too long. After a start everybody counts as heard at that moment.
+pub fn is_missing(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> bool {
+    let heard = board.get(&r.robot_id).map_or(view.started.link, |live| live.processed_at.max(view.started.link));
+    r.step == Step::Activating && r.grant.is_some() && now.link.since(heard) >= limits::LOST_AFTER
+}
+
+/// Whether robots beside this one are heard: those of its area, or of the site if those are too few.
+///
+/// # Errors
+/// Why the roll-out has to stand still instead.
+pub fn controls(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> Result<(), Pause> {
+    let area = view.software.get(r.robot_id.as_str()).and_then(|s| s.row.area.as_ref());
+    let all: Vec<&RobotId> = view.sessions.values().map(|s| &s.row.robot_id).filter(|id| is_control(view, id)).collect();
+    let here = |id: &&RobotId| view.software.get(id.as_str()).and_then(|s| s.row.area.as_ref()) == area;
+    let near: Vec<&RobotId> = all.iter().copied().filter(here).collect();
+    let controls = if near.len() < limits::CONTROLS_MIN { all } else { near };
+    if controls.len() < limits::CONTROLS_MIN {
+        return Err(Pause::InfrastructureUnknown);
+    }
+    let heard = controls.iter().filter(|id| heard::presence(board, id, now) != Presence::Offline).count();
+    if heard * 1_000 >= controls.len() * limits::CONTROLS_HEARD_PERMILLE { Ok(()) } else { Err(Pause::Infrastructure) }
+}
+
+/// It changes nothing now.
+fn is_control(view: &View, robot_id: &RobotId) -> bool {
+    super::hear::rows_of(view, robot_id).all(|r| r.step != Step::Activating)
+}
+
+/// Why a roll-out has to stand still: robots of it are missing, and so are others.
+pub fn pause(view: &View, board: &Board, now: &Now, rollout: &Rollout) -> Option<Pause> {
+    let missing = view.robots_of(&rollout.rollout_id).filter(|r| is_missing(view, board, now, r));
+    missing.filter_map(|r| controls(view, board, now, r).err()).next()
+}

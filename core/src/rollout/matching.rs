@@ -1,0 +1,194 @@
+//! Whom a roll-out would reach, who is left out and why, and in which wave each comes.
+//!
+//! Called by the dry run and by the start, which therefore never differ. Invariant: the place of a robot depends on the roll-out's id and its
+//! own, never on the order in which robots came.
+
+use super::rows::{Bundle, Quarantine, Step};
+use super::spec::{RolloutSpec, Wave};
+use super::view::View;
+use crate::fleet::Board;
+use crate::ids::{AreaId, RobotId, RolloutId};
+use crate::reason::{Code, Reason};
+use crate::robot::Duty;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// One robot that a roll-out would reach.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Matched {
+    /// Who.
+    pub robot_id: RobotId,
+    /// Its wave, from 0.
+    pub wave: u32,
+    /// Its place within the wave.
+    pub place: u64,
+    /// What is alike about it.
+    pub stratum: Stratum,
+}
+
+/// What is alike about robots as far as software is concerned.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Stratum {
+    /// Hardware model.
+    pub model: String,
+    /// Capabilities, ascending.
+    pub capabilities: Vec<String>,
+    /// Area it is in; none: not known.
+    pub area: Option<AreaId>,
+    /// Version it runs.
+    pub from_version: String,
+}
+
+/// Whom a roll-out would reach.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Matching {
+    /// By wave and place.
+    pub robots: Vec<Matched>,
+    /// Robots that were selected and are left out, and why.
+    pub left_out: BTreeMap<RobotId, Reason>,
+}
+
+impl Matching {
+    /// Robots of each wave.
+    pub fn sizes(&self, waves: usize) -> Vec<u32> {
+        let mut sizes = vec![0; waves];
+        for robot in &self.robots {
+            if let Some(size) = sizes.get_mut(robot.wave as usize) {
+                *size += 1;
+            }
+        }
+        sizes
+    }
+    /// Robots left out, by reason.
+    pub fn left_out_by_code(&self) -> BTreeMap<Code, u32> {
+        let mut counts = BTreeMap::new();
+        self.left_out.values().for_each(|r| *counts.entry(r.code).or_default() += 1);
+        counts
+    }
+    /// Robots alike, and whether the first wave has one of them.
+    pub fn strata(&self) -> BTreeMap<Stratum, (u32, bool)> {
+        let mut strata = BTreeMap::new();
+        for robot in &self.robots {
+            let (count, first) = strata.entry(robot.stratum.clone()).or_insert((0, false));
+            *count += 1;
+            *first |= robot.wave == 0;
+        }
+        strata
+    }
+}
+
+/// Matches every robot that ever attached.
+pub fn of(view: &View, board: &Board, id: &RolloutId, spec: &RolloutSpec, bundle: &Bundle) -> Matching {
+    let mut matching = Matching::default();
+    let mut found = Vec::new();
+    for robot_id in view.sessions.values().map(|s| &s.row.robot_id) {
+        let Some(stratum) = stratum(view, board, robot_id).filter(|s| is_selected(view, robot_id, s, spec)) else {
+            continue;
+        };
+        match may_have(view, robot_id, &stratum, bundle) {
+            Ok(()) => found.push((place_of(id, robot_id), robot_id.clone(), stratum)),
+            Err(reason) => {
+                matching.left_out.insert(robot_id.clone(), reason);
+            }
+        }
+    }
+    found.sort();
+    let all = found.len();
+    let mut left: Vec<_> = found.into_iter().map(Some).collect();
+    for (wave, what) in (0..).zip(&spec.waves) {
+        let mut room = match what {
+            Wave::Count(count) => *count as usize,
+            Wave::Percent(percent) => (all * *percent as usize).div_ceil(100),
+            _ => all,
+        };
+        for slot in &mut left {
+            let belongs = slot.as_ref().is_some_and(|(_, robot_id, stratum)| match what {
+                Wave::Label { key, value } => label(view, robot_id, key) == Some(value.as_str()),
+                Wave::Version(version) => stratum.from_version == *version,
+                _ => true,
+            });
+            if room > 0
+                && belongs
+                && let Some((place, robot_id, stratum)) = slot.take()
+            {
+                room -= 1;
+                matching.robots.push(Matched { robot_id, wave, place, stratum });
+            }
+        }
+    }
+    // Whom no wave takes, no wave reaches.
+    for (_, robot_id, _) in left.into_iter().flatten() {
+        matching.left_out.insert(robot_id, Code::SkippedExcluded.into());
+    }
+    matching
+}
+
+/// What is alike about this robot; none: it never attached.
+pub fn stratum(view: &View, board: &Board, robot_id: &RobotId) -> Option<Stratum> {
+    let inventory = &view.sessions.get(robot_id.as_str())?.row.inventory;
+    let here = board.get(robot_id).and_then(|live| view.area_of(live));
+    let mut capabilities = inventory.capabilities.clone();
+    capabilities.sort();
+    Some(Stratum {
+        model: inventory.model.clone(),
+        capabilities,
+        area: here.or_else(|| view.software.get(robot_id.as_str()).and_then(|s| s.row.area.clone())),
+        from_version: inventory.software.clone(),
+    })
+}
+
+fn label<'a>(view: &'a View, robot_id: &RobotId, key: &str) -> Option<&'a str> {
+    view.sessions.get(robot_id.as_str())?.row.inventory.labels.get(key).map(String::as_str)
+}
+
+fn is_selected(view: &View, robot_id: &RobotId, stratum: &Stratum, spec: &RolloutSpec) -> bool {
+    fn any<T: Ord>(named: &BTreeSet<T>, has: Option<&T>) -> bool {
+        named.is_empty() || has.is_some_and(|has| named.contains(has))
+    }
+    let s = &spec.selector;
+    any(&s.robots, Some(robot_id))
+        && any(&s.areas, stratum.area.as_ref())
+        && any(&s.models, Some(&stratum.model))
+        && any(&s.versions, Some(&stratum.from_version))
+        && s.labels.iter().all(|(key, value)| label(view, robot_id, key) == Some(value.as_str()))
+}
+
+/// Whether a robot may have a bundle at all.
+pub fn may_have(view: &View, robot_id: &RobotId, stratum: &Stratum, bundle: &Bundle) -> Result<(), Reason> {
+    if view.duty(robot_id) == Duty::Retired {
+        return Err(Code::SkippedRetired.into());
+    }
+    let software = view.software.get(robot_id.as_str()).map(|s| &s.row);
+    if let Some(pin) = software.and_then(|s| s.pin.as_ref()) {
+        return Err(Reason::from(Code::SkippedPinned).with("pinned_by", &pin.actor).with("why", &pin.reason));
+    }
+    if let Some(known) = view.quarantines.get(&Quarantine::id_of(robot_id, &bundle.bundle)) {
+        return Err(Reason::from(Code::SkippedQuarantined).with("because", known.row.reason.code));
+    }
+    if !bundle.hardware.contains(&stratum.model) {
+        return Err(Reason::from(Code::SkippedIncompatible).with("model", &stratum.model));
+    }
+    if software.is_some_and(|s| s.on_trial.is_none() && s.committed.as_ref() == Some(&bundle.bundle)) {
+        return Err(Code::SkippedCurrent.into());
+    }
+    Ok(())
+}
+
+/// Place of a robot in a roll-out: FNV-1a over both ids, so that each roll-out begins with other robots.
+pub fn place_of(rollout: &RolloutId, robot: &RobotId) -> u64 {
+    let bytes = rollout.as_str().bytes().chain([0]).chain(robot.as_str().bytes());
+    bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
+}
+
+/// The roll-out that has this robot now, other than `than`.
+pub fn claimed_by<'a>(view: &'a View, robot_id: &RobotId, than: &RolloutId) -> Option<&'a RolloutId> {
+    let others = view.of_robot.get(robot_id)?.iter().filter(|id| *id != than);
+    others.into_iter().find(|id| {
+        let (Some(rollout), Some(robot)) = (view.rollout(id), view.robot_of(id, robot_id)) else { return false };
+        let untouched = robot.step == Step::Waiting && !rollout.phase.goes_back();
+        // What has ended may still have to go back.
+        let returns = rollout.phase.goes_back() && !rollout.phase.is_over() && robot.step == Step::Committed;
+        // Of two that only wait, the one that began first goes first.
+        let waits_behind = untouched && view.rollout(than).is_some_and(|t| t.started < rollout.started);
+        (!robot.step.is_over() || returns) && !waits_behind
+    })
+}

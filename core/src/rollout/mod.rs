@@ -1,0 +1,198 @@
+//! The law of roll-outs: which robot gets which bundle when, what counts for and against it, and the way back.
+//!
+//! [`cycle`] takes what happened and gives items to commit; the service around it only reads, signs, commits and publishes.
+//! Rooms: `spec` is what is asked for, `rows` and `view` are what is known; `hear` and `commands` are what happens; `matching` says who, `robots`
+//! brings each further, `phases` the whole, `newcomers` who comes later; `verdict` and `infrastructure` judge; `explain` says what a robot waits for.
+//! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
+
+pub mod bugs;
+pub mod commands;
+pub mod explain;
+pub mod hear;
+pub mod infrastructure;
+pub mod matching;
+pub mod newcomers;
+pub mod phases;
+pub mod robots;
+pub mod rows;
+pub mod spec;
+pub mod verdict;
+pub mod view;
+
+pub use crate::fleet::Board;
+use crate::ids::{BundleId, RobotId, RolloutId};
+use crate::reason::Reason;
+use crate::rows::{Entry, Item, Log, Seq};
+use crate::time::{Now, Utc};
+use crate::work::InboxEntry;
+use rows::{OtaClock, OtaMark, Phase};
+use view::View;
+
+/// A decision of the rollout service under way.
+pub type Tx<'a> = crate::picture::Tx<'a, View>;
+
+/// Logs that the service reads.
+pub const LOGS: &[Log] = &[Log::Ota, Log::Fleet, Log::Telemetry, Log::RobotInbox];
+/// Kind of the fact that a person should look into something; fleet opens an incident for it.
+pub const INCIDENT: &str = "rollout.incident";
+
+/// What a directive says.
+#[derive(Clone, Copy, Debug)]
+pub struct Order<'a> {
+    /// To whom.
+    pub robot_id: &'a RobotId,
+    /// Rises with each directive of the robot.
+    pub generation: u64,
+    /// Which bundle.
+    pub bundle: &'a BundleId,
+    /// Bytes of its manifest.
+    pub manifest_length: u64,
+    /// For which roll-out.
+    pub rollout_id: &'a RolloutId,
+    /// UTC of the wall.
+    pub issued_at: Utc,
+}
+
+/// Signs directives. The same order gives the same envelope.
+pub trait Sign {
+    /// The envelope, as text.
+    fn directive(&self, order: &Order) -> String;
+}
+
+/// Where nothing has to be signed.
+struct NoSign;
+
+impl Sign for NoSign {
+    fn directive(&self, _order: &Order) -> String {
+        String::new()
+    }
+}
+
+/// Items to commit, in order, and what could not be read.
+#[derive(Debug, Default)]
+pub struct Plan {
+    /// Each atomic by itself; later ones expect the revisions that earlier ones write.
+    pub items: Vec<Item>,
+    /// Rows or entries that could not be read; each was passed over and is logged.
+    pub unreadable: Vec<String>,
+}
+
+impl Plan {
+    /// Makes one decision; nothing is added if it changed nothing.
+    pub fn decide(&mut self, view: &mut View, now: Now, actor: &str, decision: impl FnOnce(&mut Tx)) {
+        let mut tx = Tx::new(view, now, actor);
+        decision(&mut tx);
+        self.items.extend(tx.finish());
+    }
+}
+
+/// States that a person should look into something.
+fn incident(tx: &mut Tx, robot_id: Option<&RobotId>, reason: &Reason) {
+    tx.tell(robot_id.map_or("", RobotId::as_str), INCIDENT, reason);
+}
+
+/// Takes entries of the feed, in commit order: rows into the view, robots' events into decisions.
+pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
+    let consumed = view.marks.get("ota").map_or(Seq(0), |m| m.row.seq);
+    for entry in entries {
+        if let Some(table) = entry.table.filter(|_| entry.seq > view.read_at) {
+            let key = crate::rows::Key { table, id: entry.subject.clone() };
+            if let Err(error) = view.absorb(&key, entry.revision, crate::picture::row_of(entry, table).as_ref()) {
+                plan.unreadable.push(error.to_string());
+            }
+        }
+        view.absorbed = view.absorbed.max(entry.seq);
+        let (Log::RobotInbox, None, Some(body)) = (entry.log, entry.table, &entry.body) else { continue };
+        if entry.seq <= consumed {
+            continue;
+        }
+        match serde_json::from_str::<InboxEntry>(body) {
+            Ok(said) => {
+                let mut tx = Tx::new(view, now, said.robot_id.as_str());
+                hear::take(&mut tx, &said);
+                if tx.rows() > 0 {
+                    tx.put(OtaMark { seq: entry.seq }, "ota.consumed");
+                }
+                plan.items.extend(tx.finish());
+            }
+            Err(error) => plan.unreadable.push(format!("inbox {}: {error}", entry.seq.0)),
+        }
+    }
+}
+
+/// One cycle over a view that has absorbed the whole feed. Items of earlier decisions of the cycle are already in `plan`.
+pub fn cycle(view: &mut View, now: Now, board: &Board, sign: &dyn Sign, plan: &mut Plan) {
+    listen(view, now, board, plan);
+    welcome(view, now, board, plan);
+    for id in due(view) {
+        let Some(row) = view.robots.get(&id).map(|r| &r.row) else { continue };
+        let Some(rollout) = view.rollout(&row.rollout_id) else { continue };
+        if let Some(due) = robots::next(view, board, &now, rollout, row) {
+            plan.decide(view, now, "ota", |tx| robots::make(tx, sign, board, &id, due));
+        }
+    }
+    let open: Vec<RolloutId> =
+        view.rollouts.values().map(|r| &r.row).filter(|r| !r.phase.is_over()).map(|r| r.rollout_id.clone()).collect();
+    for id in open {
+        plan.decide(view, now, "ota", |tx| phases::further(tx, board, &id));
+    }
+    plan.decide(view, now, "ota", robots::forget_drains);
+    tell_time(view, now, plan);
+}
+
+/// Heartbeats that say what the rows do not.
+fn listen(view: &mut View, now: Now, board: &Board, plan: &mut Plan) {
+    for (robot_id, live) in board {
+        if robots::is_heard_anew(view, board, robot_id) {
+            plan.decide(view, now, robot_id.as_str(), |tx| hear::repair(tx, live));
+        }
+    }
+}
+
+/// Robots that came since: whoever should have had a part in a completed roll-out gets one.
+fn welcome(view: &mut View, now: Now, board: &Board, plan: &mut Plan) {
+    if view.area_bundles.is_empty() {
+        return;
+    }
+    let heard: Vec<RobotId> = view.arrived.iter().filter(|id| board.contains_key(*id)).cloned().collect();
+    for robot_id in heard {
+        let settled = board.get(&robot_id).is_some_and(|live| view.is_settled(live));
+        if !settled {
+            continue;
+        }
+        view.arrived.remove(&robot_id);
+        if let Some(rollout) = newcomers::due(view, board, &robot_id) {
+            plan.decide(view, now, "ota", |tx| newcomers::add(tx, board, &robot_id, &rollout));
+        }
+    }
+}
+
+/// Ids of robots' rows that something may be due for, by roll-out, wave and place.
+fn due(view: &View) -> Vec<String> {
+    let mut ids = view.open.clone();
+    let whole = |r: &&rows::Rollout| {
+        matches!(r.phase, Phase::Aborting | Phase::RollingBack) || (r.second_pass && r.phase == Phase::Applying)
+    };
+    for rollout in view.rollouts.values().map(|r| &r.row).filter(whole) {
+        ids.extend(view.robots_of(&rollout.rollout_id).map(crate::rows::Record::id));
+    }
+    let mut ids: Vec<String> = ids.into_iter().collect();
+    let order = |id: &String| view.robots.get(id).map(|r| (r.row.rollout_id.clone(), r.row.failure.is_none(), r.row.wave, r.row.place));
+    ids.sort_by_cached_key(order);
+    ids
+}
+
+/// Writes serving time and the consumed position, at most once a second and only with something else.
+fn tell_time(view: &mut View, now: Now, plan: &mut Plan) {
+    if plan.items.is_empty() {
+        return;
+    }
+    let clock = view.clocks.get("ota").map(|c| c.row).unwrap_or_default();
+    let site_ms = view.served_ms(&now);
+    if site_ms >= clock.site_ms + 1_000 || clock == OtaClock::default() {
+        plan.decide(view, now, "ota", |tx| {
+            tx.put(OtaClock { site_ms, ..clock }, "ota.served");
+            tx.put(OtaMark { seq: tx.view.absorbed }, "ota.consumed");
+        });
+    }
+}

@@ -1,0 +1,62 @@
+//! Robots that come to an area after a roll-out was completed there get its bundle too, one by one, under the same rules.
+
+use super::matching;
+use super::rows::{Moments, Phase, Rollout, RolloutRobot, Step};
+use super::view::View;
+use super::{Board, Tx};
+use crate::gates::TaskTally;
+use crate::ids::RobotId;
+use crate::time::{Now, Utc};
+
+/// The completed roll-out that a robot should have had a part in, if there is one.
+pub fn due(view: &View, board: &Board, robot_id: &RobotId) -> Option<Rollout> {
+    let stratum = matching::stratum(view, board, robot_id)?;
+    let area = view.area_bundles.get(stratum.area.as_ref()?.as_str())?;
+    let rollout = view.rollout(area.row.rollouts.get(&stratum.model)?)?;
+    let bundle = view.bundles.get(rollout.spec.bundle.as_str())?;
+    let good = bundle.row.listed && bundle.row.revoked.is_none() && rollout.phase == Phase::Completed;
+    let new = view.robot_of(&rollout.rollout_id, robot_id).is_none();
+    let free = matching::claimed_by(view, robot_id, &rollout.rollout_id).is_none();
+    let may = matching::may_have(view, robot_id, &stratum, &bundle.row).is_ok();
+    (good && new && free && may).then(|| rollout.clone())
+}
+
+/// Gives it a place behind the last wave.
+pub fn add(tx: &mut Tx, board: &Board, robot_id: &RobotId, rollout: &Rollout) {
+    let wave = rollout.spec.waves.len() as u32 + 1;
+    let place = matching::place_of(&rollout.rollout_id, robot_id);
+    let from_version = matching::stratum(tx.view, board, robot_id).map(|s| s.from_version).unwrap_or_default();
+    let row = fresh(&tx.now, rollout, robot_id, wave, place, from_version);
+    tx.put(row, "robot.newcomer");
+}
+
+/// A robot that nothing was asked of.
+pub fn fresh(
+    now: &Now,
+    rollout: &Rollout,
+    robot_id: &RobotId,
+    wave: u32,
+    place: u64,
+    from_version: String,
+) -> RolloutRobot {
+    RolloutRobot {
+        rollout_id: rollout.rollout_id.clone(),
+        robot_id: robot_id.clone(),
+        wave,
+        place,
+        step: Step::Waiting,
+        since: now.utc,
+        from_version,
+        directive: 0,
+        signed: Utc(0),
+        drain_id: None,
+        ready: false,
+        grant: None,
+        attempted: false,
+        failure: None,
+        why: None,
+        again: false,
+        before: TaskTally::default(),
+        moments: Moments::default(),
+    }
+}

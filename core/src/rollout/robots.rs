@@ -1,0 +1,678 @@
+//! Brings each robot of a roll-out a step further: fetch, drain, permission, trial, commit, and back.
+//!
+//! [`next`] says what is due and [`make`] writes it, so that the planner and an explanation see the same. Invariants: permission is given only
+//! while fleet's record says that this drain holds the robot and the roll-out runs; a drain is released only for one of [`ReleasedBy`]; robots
+//! out of work for a roll-out are counted in its row, in the item that takes one more.
+
+use super::hear::{self, fail, is_hard, quarantine, report_of};
+use super::rows::{
+    DrainRelease, DrainRequest, Given, Phase, ReleasedBy, Rollout, RolloutRobot, Step,
+};
+use super::view::View;
+use super::{Board, Order, Sign, Tx, infrastructure, matching, verdict};
+use crate::authority::Authority;
+use crate::fleet::heard;
+use crate::fleet::rows::DrainState;
+use crate::ids::{DrainId, RobotId};
+use crate::limits;
+use crate::reason::{Code, Reason};
+use crate::robot::{Duty, HardwareStop, Presence};
+use crate::time::Now;
+use crate::update::{ActivationGrant, DesiredUpdate, Goal, UpdateReport, UpdateState};
+
+/// What is due for a robot.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Move {
+    /// It is told to fetch the bundle.
+    Stage,
+    /// It was told so long ago that its directive must be signed anew.
+    SignAnew,
+    /// It has the bundle, or needs none.
+    IsStaged,
+    /// It is left out, or tried no more.
+    Skip(Reason),
+    /// It is tried once more.
+    Again,
+    /// It was skipped, and keeps the bundle for nothing.
+    Forget,
+    /// Fleet is asked to take it out of work.
+    AskDrain,
+    /// Its drain holds it: it may ask for permission.
+    Held,
+    /// It gets permission.
+    Grant,
+    /// Its permission was not used and can be used no more.
+    NotUsed,
+    /// Its drain was given up before it could do anything; the robot stands at this step then.
+    LeaveDrain(Step),
+    /// It was heard with the bundle.
+    Switched,
+    /// It works with the bundle.
+    OnTrial,
+    /// It counts against the bundle.
+    Fail(Reason),
+    /// It was not lost.
+    Found,
+    /// It is to keep the bundle.
+    Commit,
+    /// It keeps the bundle.
+    Committed,
+    /// It is to go back, and first out of work.
+    Revert,
+    /// It stands where it may go back.
+    GoBack,
+    /// It runs what it ran before.
+    RolledBack(Reason),
+    /// It could not go back.
+    Stuck(Reason),
+}
+
+/// What is due for `r` now, if anything.
+pub fn next(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
+    if view.duty(&r.robot_id) == Duty::Retired && !r.step.is_over() {
+        return Some(Move::Skip(Code::SkippedRetired.into()));
+    }
+    let report = report_of(view, board, r).filter(|report| report.directive >= r.directive);
+    match r.step {
+        Step::Waiting => waiting(view, board, now, rollout, r),
+        Step::Staging => staging(view, board, now, rollout, r, report),
+        Step::Staged => staged(view, board, now, rollout, r, report),
+        Step::Draining => draining(view, rollout, r),
+        Step::Activating => activating(view, board, now, rollout, r, report),
+        Step::Trial => trial(view, now, rollout, r, report),
+        Step::Committing => committing(rollout, r, report),
+        Step::Reverting => reverting(view, board, r, report),
+        Step::Committed => goes_back(view, rollout, r).then_some(Move::Revert),
+        Step::Skipped if rollout.second_pass && !r.again && is_retried(r) => Some(Move::Again),
+        Step::Skipped => keeps_for_nothing(view, rollout, r).then_some(Move::Forget),
+        Step::RolledBack => None,
+        // Somebody mended it.
+        Step::Stuck => {
+            report.filter(|r| r.state == UpdateState::RolledBack).map(|_| Move::RolledBack(Code::RollbackFailed.into()))
+        }
+    }
+}
+
+/// Whether a robot that was skipped is tried once more at the end.
+pub fn is_retried(r: &RolloutRobot) -> bool {
+    let codes = [Code::SkippedOffline, Code::SkippedBusy, Code::SkippedStuck];
+    r.why.as_ref().is_some_and(|why| codes.contains(&why.code))
+}
+
+/// It has the bundle for a second try that will not come.
+fn keeps_for_nothing(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
+    let staged = view.desired.get(r.robot_id.as_str()).is_some_and(|d| matches!(d.row.goal, Goal::Stage | Goal::Activate));
+    let ours = r.directive > 0 && !r.attempted && matching::claimed_by(view, &r.robot_id, &r.rollout_id).is_none();
+    staged && ours && rollout.phase.goes_back()
+}
+
+fn is_heard(board: &Board, now: &Now, robot_id: &RobotId) -> bool {
+    heard::presence(board, robot_id, now) != Presence::Offline
+}
+
+/// The robot's turn has come.
+pub fn is_on(rollout: &Rollout, r: &RolloutRobot) -> bool {
+    match rollout.phase {
+        Phase::Applying => r.wave <= rollout.wave,
+        // Newcomers of a completed roll-out come one by one.
+        Phase::Completed => is_newcomer(rollout, r),
+        _ => false,
+    }
+}
+
+/// It came after the roll-out was completed.
+pub fn is_newcomer(rollout: &Rollout, r: &RolloutRobot) -> bool {
+    r.wave > rollout.spec.waves.len() as u32
+}
+
+fn waiting(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
+    if rollout.phase.goes_back() {
+        return Some(Move::Skip(Code::RolloutEnded.into()));
+    }
+    if !(rollout.phase.runs() || is_newcomer(rollout, r)) || !rollout.pauses.is_empty() {
+        return None;
+    }
+    if let Some(stratum) = matching::stratum(view, board, &r.robot_id)
+        && let Some(bundle) = view.bundles.get(rollout.spec.bundle.as_str())
+        && rollout.revert_of.is_none()
+        && let Err(reason) = matching::may_have(view, &r.robot_id, &stratum, &bundle.row)
+    {
+        return Some(Move::Skip(reason));
+    }
+    if matching::claimed_by(view, &r.robot_id, &r.rollout_id).is_some() {
+        return None;
+    }
+    if rollout.revert_of.is_some() {
+        return Some(Move::IsStaged);
+    }
+    // A robot that has never been heard has no session to write to; its turn passes.
+    is_on(rollout, r)
+        .then(|| skips_offline(board, now, r))
+        .flatten()
+        .or_else(|| view.sessions.contains_key(r.robot_id.as_str()).then_some(Move::Stage))
+}
+
+fn skips_offline(board: &Board, now: &Now, r: &RolloutRobot) -> Option<Move> {
+    (!is_heard(board, now, &r.robot_id)).then(|| Move::Skip(Code::SkippedOffline.into()))
+}
+
+fn staging(
+    view: &View,
+    board: &Board,
+    now: &Now,
+    rollout: &Rollout,
+    r: &RolloutRobot,
+    report: Option<&UpdateReport>,
+) -> Option<Move> {
+    if rollout.phase.goes_back() {
+        return Some(Move::Skip(Code::RolloutEnded.into()));
+    }
+    match report.map(|report| report.state) {
+        Some(UpdateState::Directed | UpdateState::Downloading) => {}
+        Some(UpdateState::Refused) => {
+            let why = report.and_then(|r| r.reason.clone()).unwrap_or_else(|| Code::BundleUnfit.into());
+            let reason = Reason::new(Code::SkippedIncompatible, why.text()).with("because", why.code);
+            return Some(Move::Skip(reason));
+        }
+        Some(_) => return Some(Move::IsStaged),
+        None if now.wall.ms_since(r.signed) >= limits::DIRECTIVE_RENEWED_MS => return Some(Move::SignAnew),
+        None => {}
+    }
+    let waits_for_it = is_on(rollout, r);
+    let late = || now.utc.ms_since(rollout.since.max(r.since)) >= limits::STAGED_WITHIN.as_ms();
+    match () {
+        () if waits_for_it && !is_heard(board, now, &r.robot_id) => Some(Move::Skip(Code::SkippedOffline.into())),
+        () if waits_for_it && late() => Some(Move::Skip(Code::SkippedStuck.into())),
+        () if view.desired.get(r.robot_id.as_str()).is_none() => Some(Move::Stage),
+        () => None,
+    }
+}
+
+fn staged(
+    view: &View,
+    board: &Board,
+    now: &Now,
+    rollout: &Rollout,
+    r: &RolloutRobot,
+    report: Option<&UpdateReport>,
+) -> Option<Move> {
+    if rollout.phase.goes_back() {
+        return Some(Move::Skip(Code::RolloutEnded.into()));
+    }
+    match report.map(|report| report.state) {
+        Some(UpdateState::Refused) => {
+            let why = report.and_then(|r| r.reason.clone()).unwrap_or_else(|| Code::BundleUnfit.into());
+            return Some(Move::Skip(Reason::new(Code::SkippedIncompatible, why.text()).with("because", why.code)));
+        }
+        // What was staged is gone: its disk was changed, and it begins again.
+        Some(UpdateState::Directed | UpdateState::Downloading) if rollout.revert_of.is_none() => return None,
+        _ => {}
+    }
+    if blocked(view, board, now, rollout, r).is_some() {
+        return None;
+    }
+    Some(Move::AskDrain)
+}
+
+/// Why a robot that has the bundle is not taken out of work now.
+pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Reason> {
+    if !rollout.pauses.is_empty() {
+        return Some(Reason::from(Code::BlockedByPause).with("pauses", pauses(rollout)));
+    }
+    if !is_on(rollout, r) {
+        return Some(Reason::from(Code::BlockedByWave).with("wave", r.wave));
+    }
+    if let Some(other) = matching::claimed_by(view, &r.robot_id, &r.rollout_id) {
+        return Some(Reason::from(Code::BlockedByRollout).with("rollout_id", other));
+    }
+    let area = board.get(&r.robot_id).and_then(|live| view.area_of(live));
+    let area = area.or_else(|| view.software.get(r.robot_id.as_str()).and_then(|s| s.row.area.clone()));
+    if let Some(area) = area.filter(|area| !view.policy(area).software.is_open(now.utc)) {
+        return Some(Reason::from(Code::BlockedByWindow).with("area_id", area));
+    }
+    let most = in_flight_max(view, rollout);
+    (rollout.in_flight >= most).then(|| Reason::from(Code::BlockedByPlaceInWave).with("in_flight", rollout.in_flight))
+}
+
+/// Why a roll-out stands still, as words.
+pub fn pauses(rollout: &Rollout) -> String {
+    let word = |p: &super::rows::Pause| format!("{p:?}").to_uppercase();
+    rollout.pauses.iter().map(word).collect::<Vec<_>>().join(",")
+}
+
+/// Robots that may be out of work for a roll-out at once: never more than its wave has.
+pub fn in_flight_max(view: &View, rollout: &Rollout) -> u32 {
+    if rollout.phase == Phase::Completed {
+        return 1;
+    }
+    let wave = view.wave_sizes.get(&(rollout.rollout_id.clone(), rollout.wave)).copied().unwrap_or_default();
+    rollout.spec.max_in_flight.map_or(wave, |most| most.min(wave)).max(1)
+}
+
+fn draining(view: &View, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
+    let drain_id = r.drain_id.as_ref()?;
+    if view.is_held(&r.robot_id, drain_id) {
+        return Some(Move::Held);
+    }
+    if rollout.phase.goes_back() || !rollout.pauses.is_empty() {
+        return Some(Move::LeaveDrain(Step::Staged));
+    }
+    let refused = view.drain(drain_id).is_some_and(|d| d.state == DrainState::Refused);
+    refused.then(|| Move::Skip(Code::SkippedBusy.into()))
+}
+
+fn activating(
+    view: &View,
+    board: &Board,
+    now: &Now,
+    rollout: &Rollout,
+    r: &RolloutRobot,
+    report: Option<&UpdateReport>,
+) -> Option<Move> {
+    if rollout.revert_of.is_some() {
+        return Some(Move::Revert);
+    }
+    let state = report.map(|r| r.state);
+    if let Some(over) = ended(r, report) {
+        return Some(over);
+    }
+    match state {
+        Some(UpdateState::Trial | UpdateState::Committing | UpdateState::Committed) => return Some(Move::OnTrial),
+        Some(UpdateState::Refused) if r.grant.is_none() => {
+            return Some(Move::Skip(Code::SkippedIncompatible.into()));
+        }
+        Some(UpdateState::Probation | UpdateState::RollingBack) => {
+            if r.moments.switched.is_none() {
+                return Some(Move::Switched);
+            }
+            let back = rollout.phase.goes_back();
+            return (back && !wants(view, r, Goal::Revert)).then_some(Move::GoBack).or_else(|| lost(view, board, now, r));
+        }
+        _ => {}
+    }
+    match &r.grant {
+        Some(given) => unused(view, board, now, r, given, state).or_else(|| lost(view, board, now, r)),
+        None if rollout.phase.goes_back() || !rollout.pauses.is_empty() || !is_on(rollout, r) => {
+            if view.bugs.pause_is_forgotten() && r.ready {
+                return Some(Move::Grant);
+            }
+            Some(Move::LeaveDrain(Step::Staged))
+        }
+        None if r.ready && may_grant(view, board, r) => Some(Move::Grant),
+        None => {
+            let held = r.moments.held.map_or(0, |at| now.utc.ms_since(at));
+            let late = held >= limits::READY_WITHIN.as_ms();
+            late.then(|| {
+                let why = report.and_then(|r| r.reason.as_ref()).map(|why| why.text().to_owned());
+                Move::Skip(Reason::new(Code::SkippedStuck, why.unwrap_or_default()))
+            })
+        }
+    }
+}
+
+/// Fleet's record says that this drain holds the robot, and it is heard in its newest session.
+fn may_grant(view: &View, board: &Board, r: &RolloutRobot) -> bool {
+    let held = r.drain_id.as_ref().is_some_and(|id| view.is_held(&r.robot_id, id));
+    (held || view.bugs.any_drain_will_do()) && anchor(view, board, &r.robot_id).is_some()
+}
+
+fn anchor(view: &View, board: &Board, robot_id: &RobotId) -> Option<Authority> {
+    let live = board.get(robot_id)?;
+    let session = view.sessions.get(robot_id.as_str())?;
+    let (session_epoch, hb) = (live.report.session_epoch, live.report.hb);
+    let valid_ms = limits::ACTIVATION_VALID.as_ms();
+    (session.row.session_epoch == session_epoch).then_some(Authority { session_epoch, hb, valid_ms })
+}
+
+/// A permission that was seen unused: past its life a heartbeat of the current session says so, and nothing it said before is on its way.
+fn unused(
+    view: &View,
+    board: &Board,
+    now: &Now,
+    r: &RolloutRobot,
+    given: &Given,
+    state: Option<UpdateState>,
+) -> Option<Move> {
+    let life_ms = given.authority.valid_ms * 102 / 100 + 1;
+    if view.bugs.time_releases_drain() {
+        let over = r.moments.granted_wall.is_some_and(|at| now.wall.ms_since(at) > life_ms);
+        return over.then_some(Move::NotUsed);
+    }
+    let live = board.get(&r.robot_id).filter(|live| view.is_settled(live))?;
+    let other_session = live.report.session_epoch != given.authority.session_epoch;
+    let beats = life_ms.div_ceil(limits::HEARTBEAT.as_ms()) + 1;
+    let past = other_session || live.report.hb > given.authority.hb + beats;
+    let said = live.report.update.as_ref();
+    let not_used = said.is_some_and(|u| u.grant_id < given.grant_id && u.state == UpdateState::Staged);
+    (past && not_used && state == Some(UpdateState::Staged)).then_some(Move::NotUsed)
+}
+
+/// The robot is not heard, though most others are.
+fn lost(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> Option<Move> {
+    let is_lost = r.failure.as_ref().is_some_and(|f| f.code == Code::RobotLost);
+    match (infrastructure::is_missing(view, board, now, r), is_lost) {
+        (true, false) if infrastructure::controls(view, board, now, r).is_ok() => {
+            Some(Move::Fail(Code::RobotLost.into()))
+        }
+        (false, true) => Some(Move::Found),
+        _ => None,
+    }
+}
+
+/// The robot went back, or could not.
+fn ended(r: &RolloutRobot, report: Option<&UpdateReport>) -> Option<Move> {
+    let report = report?;
+    let why = || report.reason.clone().unwrap_or_else(|| Code::RobotWentBack.into());
+    match report.state {
+        UpdateState::RolledBack if r.attempted => Some(Move::RolledBack(why())),
+        UpdateState::Stuck => Some(Move::Stuck(why())),
+        _ => None,
+    }
+}
+
+/// It must leave what it runs.
+fn goes_back(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
+    let kept = matches!(r.step, Step::Committing | Step::Committed);
+    let irreversible =
+        kept && view.bundles.get(rollout.spec.bundle.as_str()).is_some_and(|b| b.row.is_irreversible);
+    let in_scope = rollout.spec.abort_scope == super::spec::AbortScope::All || !kept;
+    let aborts = matches!(rollout.phase, Phase::Aborting | Phase::RollingBack) || (rollout.phase.goes_back() && !kept);
+    aborts && in_scope && !irreversible && r.attempted
+}
+
+fn trial(view: &View, now: &Now, rollout: &Rollout, r: &RolloutRobot, report: Option<&UpdateReport>) -> Option<Move> {
+    if let Some(over) = ended(r, report) {
+        return Some(over);
+    }
+    if goes_back(view, rollout, r) {
+        return Some(Move::Revert);
+    }
+    if let Some(why) = &r.failure {
+        // The wave is not judged against it yet, or was judged without it: this robot goes back by itself.
+        let stays = rollout.phase.runs() && (is_hard(why) || rollout.phase == Phase::Review);
+        return (!stays).then_some(Move::Revert);
+    }
+    let broken = view.control.get(r.robot_id.as_str()).and_then(|c| c.row.breaker);
+    if broken.is_some_and(|since| r.moments.on_trial.is_some_and(|at| since >= at)) {
+        return Some(Move::Fail(Code::BreakerOnTrial.into()));
+    }
+    let promoted = if is_newcomer(rollout, r) {
+        let soaked = r.moments.on_trial.is_some_and(|at| now.utc.ms_since(at) >= rollout.spec.soak_ms);
+        soaked && verdict::exposure_of(view, rollout, r).ended() >= rollout.spec.exposure_tasks
+    } else {
+        r.wave < rollout.promoted
+    };
+    (promoted && rollout.pauses.is_empty()).then_some(Move::Commit)
+}
+
+fn committing(rollout: &Rollout, r: &RolloutRobot, report: Option<&UpdateReport>) -> Option<Move> {
+    match report.map(|r| r.state) {
+        Some(UpdateState::Committed) => Some(Move::Committed),
+        _ if rollout.phase.goes_back() && rollout.spec.abort_scope == super::spec::AbortScope::All => Some(Move::Revert),
+        _ => ended(r, report),
+    }
+}
+
+fn reverting(view: &View, board: &Board, r: &RolloutRobot, report: Option<&UpdateReport>) -> Option<Move> {
+    if let Some(over) = ended(r, report) {
+        return Some(over);
+    }
+    if wants(view, r, Goal::Revert) {
+        return None;
+    }
+    let Some(drain_id) = &r.drain_id else { return Some(Move::Revert) };
+    // A robot that its own safety system stopped goes back where it stands: to park would be motion.
+    let stopped = board.get(&r.robot_id).is_some_and(|live| live.report.hardware_stop != HardwareStop::None);
+    if stopped || view.is_held(&r.robot_id, drain_id) {
+        return Some(Move::GoBack);
+    }
+    let refused = view.drain(drain_id).is_some_and(|d| d.state == DrainState::Refused);
+    refused.then_some(Move::LeaveDrain(Step::Reverting))
+}
+
+/// Whether the robot was told so already.
+fn wants(view: &View, r: &RolloutRobot, goal: Goal) -> bool {
+    view.desired.get(r.robot_id.as_str()).is_some_and(|d| d.row.goal == goal)
+}
+
+/// Writes what is due.
+pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
+    let Some(mut r) = tx.view.robots.get(id).map(|r| r.row.clone()) else { return };
+    let Some(rollout) = tx.view.rollout(&r.rollout_id).cloned() else { return };
+    match due {
+        Move::Stage | Move::SignAnew => stage(tx, sign, &rollout, r),
+        Move::IsStaged => step(tx, r, Step::Staged, "robot.staged"),
+        Move::Skip(why) => {
+            r.why = Some(why);
+            if r.again || !is_retried(&r) {
+                drop_bundle(tx, &r);
+            }
+            let retired = tx.view.duty(&r.robot_id) == Duty::Retired;
+            leave_drain(tx, &mut r, if retired { ReleasedBy::Retired } else { ReleasedBy::NoGrant });
+            step(tx, r, Step::Skipped, "robot.skipped");
+        }
+        Move::Again => {
+            r.wave = rollout.spec.waves.len() as u32;
+            (r.again, r.why, r.ready) = (true, None, false);
+            step(tx, r, Step::Waiting, "robot.tried_again");
+        }
+        Move::Forget => drop_bundle(tx, &r),
+        Move::AskDrain => {
+            r.moments.asked = Some(tx.now.utc);
+            ask_drain(tx, &rollout, &mut r, false);
+            step(tx, r, Step::Draining, "robot.drain_asked");
+        }
+        Move::Held => {
+            r.moments.draining = r.drain_id.as_ref().and_then(|id| tx.view.drain(id)).map(|d| d.since);
+            (r.moments.held, r.moments.held_wall) = (Some(tx.now.utc), Some(tx.now.wall));
+            (r.ready, r.grant) = (false, None);
+            if rollout.revert_of.is_none() {
+                let drain_id = r.drain_id.clone();
+                desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Activate, drain_id, None));
+            }
+            step(tx, r, Step::Activating, "robot.held");
+        }
+        Move::Grant => grant(tx, board, &rollout, r),
+        Move::NotUsed => {
+            desire(tx, &r.robot_id, |d| d.grant = None);
+            (r.grant, r.ready) = (None, false);
+            r.moments.granted_wall = None;
+            tx.put(r, "robot.grant_not_used");
+        }
+        Move::LeaveDrain(to) => {
+            if to == Step::Staged {
+                desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Stage, None, None));
+            }
+            leave_drain(tx, &mut r, ReleasedBy::NoGrant);
+            step(tx, r, to, "robot.drain_left");
+        }
+        Move::Switched => {
+            (r.moments.switched, r.moments.switched_wall) = (Some(tx.now.utc), Some(tx.now.wall));
+            tx.put(r, "robot.switched");
+        }
+        Move::OnTrial => {
+            r.moments.switched.get_or_insert(tx.now.utc);
+            r.moments.switched_wall.get_or_insert(tx.now.wall);
+            r.moments.on_trial = Some(tx.now.utc);
+            r.before = verdict::work_of(tx.view, &rollout, &r.robot_id);
+            r.failure = r.failure.filter(|f| f.code != Code::RobotLost);
+            leave_drain(tx, &mut r, ReleasedBy::Reported);
+            step(tx, r, Step::Trial, "robot.on_trial");
+        }
+        Move::Fail(why) => fail(tx, &r, why),
+        Move::Found => tx.put(RolloutRobot { failure: None, ..r }, "robot.found"),
+        Move::Commit => {
+            desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Commit, None, None));
+            step(tx, r, Step::Committing, "robot.committing");
+        }
+        Move::Committed => step(tx, r, Step::Committed, "robot.committed"),
+        Move::Revert => {
+            let hard = rollout.abort.as_ref().is_some_and(|a| a.hard) || r.failure.is_some();
+            r.attempted |= rollout.revert_of.is_some();
+            if r.drain_id.is_none() {
+                ask_drain(tx, &rollout, &mut r, hard);
+            }
+            step(tx, r, Step::Reverting, "robot.reverting");
+        }
+        Move::GoBack => {
+            let drain_id = r.drain_id.clone();
+            desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Revert, drain_id, None));
+            step(tx, r, Step::Reverting, "robot.going_back");
+        }
+        Move::RolledBack(why) => rolled_back(tx, &rollout, r, why),
+        Move::Stuck(why) => {
+            let reason = Reason::new(Code::RollbackFailed, why.text()).with("because", why.code);
+            super::incident(tx, Some(&r.robot_id), &reason);
+            r.failure = Some(reason);
+            r.attempted = true;
+            step(tx, r, Step::Stuck, "robot.stuck");
+        }
+    }
+}
+
+fn step(tx: &mut Tx, r: RolloutRobot, to: Step, kind: &'static str) {
+    let since = if r.step == to { r.since } else { tx.now.utc };
+    tx.put(RolloutRobot { step: to, since, ..r }, kind);
+}
+
+fn rolled_back(tx: &mut Tx, rollout: &Rollout, mut r: RolloutRobot, why: Reason) {
+    let asked = r.step == Step::Reverting || wants(tx.view, &r, Goal::Revert);
+    if !asked {
+        // It went back by itself: that is what gates count.
+        let because = if is_hard(&why) { why.clone() } else { Reason::new(Code::RobotWentBack, why.text()).with("because", why.code) };
+        let lost = r.failure.as_ref().is_some_and(|f| f.code == Code::RobotLost);
+        if r.failure.is_none() || lost {
+            r.failure = Some(because);
+        }
+    }
+    if let Some(failure) = r.failure.clone() {
+        quarantine(tx, &r, &failure);
+    }
+    let back = if asked && r.failure.is_none() { Code::RevertAsked.into() } else { why };
+    r.why = Some(rollout.abort.as_ref().map_or(back, |a| a.reason.clone()));
+    leave_drain(tx, &mut r, ReleasedBy::Reported);
+    step(tx, r, Step::RolledBack, "robot.rolled_back");
+}
+
+fn stage(tx: &mut Tx, sign: &dyn Sign, rollout: &Rollout, mut r: RolloutRobot) {
+    let Some(bundle) = tx.view.bundles.get(rollout.spec.bundle.as_str()).map(|b| b.row.clone()) else { return };
+    let generation = next_generation(tx.view, &r.robot_id, &tx.now);
+    let order = Order {
+        robot_id: &r.robot_id,
+        generation,
+        bundle: &bundle.bundle,
+        manifest_length: bundle.manifest_length,
+        rollout_id: &rollout.rollout_id,
+        issued_at: tx.now.wall,
+    };
+    let row = DesiredUpdate {
+        robot_id: r.robot_id.clone(),
+        generation,
+        goal: Goal::Stage,
+        directive: sign.directive(&order),
+        drain_id: None,
+        grant: None,
+        rate_bytes_s: rollout.spec.rate_bytes_s,
+        probation_ms: rollout.spec.probation_ms,
+    };
+    tx.put(row, "update.desired");
+    if r.step == Step::Waiting {
+        r.directive = generation;
+    }
+    r.signed = tx.now.wall;
+    step(tx, r, Step::Staging, "robot.staging");
+}
+
+fn next_generation(view: &View, robot_id: &RobotId, now: &Now) -> u64 {
+    let last = view.desired.get(robot_id.as_str()).map_or(0, |d| d.row.generation);
+    let reported = view.sessions.get(robot_id.as_str()).map_or(0, |s| s.row.applied_update);
+    (last.max(reported) + 1).max(now.wall.0.max(0) as u64)
+}
+
+/// Changes what a robot should run, if it was told anything and this is news.
+fn desire(tx: &mut Tx, robot_id: &RobotId, change: impl FnOnce(&mut DesiredUpdate)) {
+    let Some(old) = tx.view.desired.get(robot_id.as_str()).map(|d| d.row.clone()) else { return };
+    let mut new = old.clone();
+    change(&mut new);
+    if new != old {
+        new.generation = next_generation(tx.view, robot_id, &tx.now);
+        tx.put(new, "update.desired");
+    }
+}
+
+/// A robot that has the bundle and never ran it forgets it.
+fn drop_bundle(tx: &mut Tx, r: &RolloutRobot) {
+    if r.directive > 0 && !r.attempted {
+        desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Revert, None, None));
+    }
+}
+
+/// Rising, and never used again also after the store was restored.
+fn number(tx: &mut Tx) -> u64 {
+    let clock = tx.view.clocks.get("ota").map(|c| c.row).unwrap_or_default();
+    let number = (clock.number + 1).max(tx.now.wall.0.max(0) as u64);
+    tx.put(super::rows::OtaClock { number, ..clock }, "ota.numbered");
+    number
+}
+
+fn ask_drain(tx: &mut Tx, rollout: &Rollout, r: &mut RolloutRobot, urgent: bool) {
+    let Ok(drain_id) = DrainId::parse(&format!("ota:{}", number(tx))) else { return };
+    let goal = if rollout.phase.goes_back() || rollout.revert_of.is_some() { "goes back from" } else { "changes to" };
+    let label = tx.view.bundles.get(rollout.spec.bundle.as_str()).map(|b| b.row.label()).unwrap_or_default();
+    let request = DrainRequest {
+        drain_id: drain_id.clone(),
+        robot_id: r.robot_id.clone(),
+        rollout_id: r.rollout_id.clone(),
+        reason: format!("{goal} {label}"),
+        within_ms: rollout.spec.drain_within_ms,
+        urgent,
+    };
+    tx.put(request, "drain.requested");
+    r.drain_id = Some(drain_id);
+    (r.ready, r.grant) = (false, None);
+    count(tx, &r.rollout_id, 1);
+}
+
+fn leave_drain(tx: &mut Tx, r: &mut RolloutRobot, why: ReleasedBy) {
+    let Some(drain_id) = r.drain_id.take() else { return };
+    (r.ready, r.grant) = (false, None);
+    tx.put(DrainRelease { drain_id, why }, "drain.release");
+    count(tx, &r.rollout_id, -1);
+}
+
+/// One more or less is out of work for a roll-out: the row that two planners fight over.
+fn count(tx: &mut Tx, rollout_id: &crate::ids::RolloutId, by: i32) {
+    let Some(rollout) = tx.view.rollout(rollout_id).cloned() else { return };
+    let in_flight = rollout.in_flight.saturating_add_signed(by);
+    tx.put(Rollout { in_flight, ..rollout }, "rollout.in_flight");
+}
+
+fn grant(tx: &mut Tx, board: &Board, rollout: &Rollout, mut r: RolloutRobot) {
+    let (Some(drain_id), Some(authority)) = (r.drain_id.clone(), anchor(tx.view, board, &r.robot_id)) else { return };
+    // Fleet's record must still say so when this is written.
+    tx.rely::<crate::fleet::rows::RobotAuthority>(r.robot_id.as_str());
+    tx.rely::<Rollout>(rollout.rollout_id.as_str());
+    let grant_id = number(tx);
+    let given = ActivationGrant { grant_id, drain_id, authority };
+    desire(tx, &r.robot_id, |d| d.grant = Some(given));
+    r.grant = Some(Given { grant_id, authority, generation: rollout.generation });
+    r.moments.granted_wall = Some(tx.now.wall);
+    r.attempted = true;
+    tx.put(r, "robot.granted");
+}
+
+/// Takes requests away that fleet has nothing left to do for.
+pub fn forget_drains(tx: &mut Tx) {
+    let over = tx.view.releases.values().map(|r| r.row.drain_id.clone());
+    let over: Vec<DrainId> = over.filter(|id| tx.view.drain(id).is_none()).take(limits::ITEM_ROWS_MAX / 4).collect();
+    for drain_id in over {
+        tx.rely::<crate::fleet::rows::Drain>(drain_id.as_str());
+        tx.delete::<DrainRequest>(drain_id.as_str(), "drain.forgotten");
+        tx.delete::<DrainRelease>(drain_id.as_str(), "drain.forgotten");
+    }
+}
+
+/// Whether a heartbeat says something that the rows do not.
+pub fn is_heard_anew(view: &View, board: &Board, robot_id: &RobotId) -> bool {
+    board.get(robot_id).is_some_and(|live| view.is_settled(live) && hear::is_due(view, live))
+}

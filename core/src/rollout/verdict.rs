@@ -1,0 +1,181 @@
+//! Gates: what was seen of a bundle, and what follows from it.
+//!
+//! Invariant: a verdict is made of stored numbers only, and stands in the row with them. Small n is honest n: what was not proven is never
+//! called so.
+
+use super::Tx;
+use super::hear::is_hard;
+use super::rows::{Abort, Counted, Outcome, Rollout, RolloutRobot, Step, Verdict};
+use super::spec::{SmallWave, SmallWaveFailure};
+use super::view::View;
+use crate::fleet::rows::RobotCounter;
+use crate::gates::{self, FEW_ROBOTS, RobotOutcomes, Suspicion, TaskTally};
+use crate::ids::{RobotId, RolloutId};
+use crate::limits;
+use crate::reason::{Code, Reason};
+use crate::time::Utc;
+
+/// Robots named in an abort.
+const NAMED_MAX: usize = 16;
+
+/// Robots of a roll-out as its gates count them.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Seen {
+    /// Robots that were given permission.
+    pub attempted: u32,
+    /// Of these, those that are decided.
+    pub outcomes: RobotOutcomes,
+}
+
+/// Tasks that a robot has ended with the roll-out's version, since ever.
+pub fn work_of(view: &View, rollout: &Rollout, robot_id: &RobotId) -> TaskTally {
+    let Some(bundle) = view.bundles.get(rollout.spec.bundle.as_str()) else { return TaskTally::default() };
+    let id = format!("{robot_id}@{}", bundle.row.version);
+    view.counters.get(&id).map_or_else(TaskTally::default, |c| ended(&c.row))
+}
+
+fn ended(counter: &RobotCounter) -> TaskTally {
+    TaskTally { succeeded: counter.succeeded, failed: counter.failures.values().sum() }
+}
+
+fn since(now: TaskTally, before: TaskTally) -> TaskTally {
+    TaskTally {
+        succeeded: now.succeeded.saturating_sub(before.succeeded),
+        failed: now.failed.saturating_sub(before.failed),
+    }
+}
+
+/// Tasks that a robot has ended on trial.
+pub fn exposure_of(view: &View, rollout: &Rollout, r: &RolloutRobot) -> TaskTally {
+    match r.moments.on_trial {
+        Some(_) => since(work_of(view, rollout, &r.robot_id), r.before),
+        None => TaskTally::default(),
+    }
+}
+
+/// Tasks that all robots have ended with any other version, since ever.
+pub fn controls_of(view: &View, rollout: &Rollout) -> TaskTally {
+    let version = view.bundles.get(rollout.spec.bundle.as_str()).map(|b| b.row.version.as_str());
+    let others = view.counters.values().map(|c| &c.row).filter(|c| Some(c.software.as_str()) != version);
+    others.map(ended).fold(TaskTally::default(), TaskTally::plus)
+}
+
+fn on_trial_so_far(view: &View, rollout: &Rollout) -> TaskTally {
+    let robots = view.robots_of(&rollout.rollout_id);
+    robots.map(|r| exposure_of(view, rollout, r)).fold(TaskTally::default(), TaskTally::plus)
+}
+
+/// Takes in what ended since it was counted last. By the clock, never because a task failed.
+pub fn count_tasks(tx: &mut Tx, rollout: &Rollout) {
+    let at_ms = tx.view.served_ms(&tx.now);
+    let waited_ms = at_ms.saturating_sub(rollout.counted.at_ms);
+    if rollout.revert_of.is_some() || waited_ms < limits::TASKS_COUNTED_EVERY.as_ms() {
+        return;
+    }
+    let counted = Counted { at_ms, trial: on_trial_so_far(tx.view, rollout), control: controls_of(tx.view, rollout) };
+    let mut tasks = rollout.tasks;
+    tasks.observe(since(counted.trial, rollout.counted.trial), since(counted.control, rollout.counted.control));
+    tx.put(Rollout { tasks, counted, ..rollout.clone() }, "rollout.tasks_counted");
+}
+
+/// Counts robots. Those on trial in wave `upto` or before count as having come through.
+pub fn see(view: &View, rollout: &Rollout, upto: Option<u32>) -> Seen {
+    let mut seen = Seen::default();
+    for r in view.robots_of(&rollout.rollout_id).filter(|r| r.attempted) {
+        seen.attempted += 1;
+        let kept = matches!(r.step, Step::Committing | Step::Committed);
+        let on_trial = r.step == Step::Trial && upto.is_some_and(|wave| r.wave <= wave);
+        match r.failure {
+            Some(_) => seen.outcomes.failed += 1,
+            None if kept || on_trial => seen.outcomes.clean += 1,
+            None => {}
+        }
+    }
+    seen
+}
+
+/// What tasks say of the bundle.
+pub fn suspicion(view: &View, rollout: &Rollout) -> Suspicion {
+    let on_trial = view.robots_of(&rollout.rollout_id).filter(|r| r.moments.on_trial.is_some());
+    rollout.tasks.suspicion(on_trial.map(|r| exposure_of(view, rollout, r)))
+}
+
+/// A verdict with the numbers behind it.
+pub fn of(view: &View, rollout: &Rollout, seen: &Seen, outcome: Outcome, reason: Reason, at: Utc) -> Verdict {
+    let mut robots = seen.outcomes.evidence();
+    if reason.code == Code::FailureAmongFew {
+        robots.false_abort_permille = Some(gates::false_abort_permille(u64::from(seen.attempted)));
+    }
+    Verdict {
+        wave: rollout.wave,
+        outcome,
+        reason,
+        attempted: seen.attempted,
+        robots,
+        tasks: rollout.tasks,
+        suspicion: suspicion(view, rollout),
+        at,
+        actor: None,
+    }
+}
+
+/// Why the roll-out must end now, if it must. Looked at in every phase, also while it stands still.
+pub fn against(view: &View, rollout: &Rollout) -> Option<(Reason, bool, Seen)> {
+    let seen = see(view, rollout, None);
+    let failed = seen.outcomes.failed;
+    let mut failures = view.robots_of(&rollout.rollout_id).filter_map(|r| r.failure.as_ref());
+    if let Some(hard) = failures.find(|f| is_hard(f)) {
+        return Some((hard.clone(), true, seen));
+    }
+    let numbers = |code: Code| Reason::from(code).with("failed", failed).with("attempted", seen.attempted);
+    let few = failed > 0 && seen.attempted < FEW_ROBOTS;
+    if few && rollout.spec.small_wave_failure == SmallWaveFailure::Abort {
+        return Some((numbers(Code::FailureAmongFew), false, seen));
+    }
+    if seen.outcomes.verdict() == gates::Verdict::Abort {
+        return Some((numbers(Code::TooManyFailed), false, seen));
+    }
+    if rollout.spec.acts_on_rates && suspicion(view, rollout) == Suspicion::Release {
+        let e_value = format!("{:.1}", rollout.tasks.e_value());
+        return Some((Reason::from(Code::RateTooHigh).with("e_value", e_value), false, seen));
+    }
+    None
+}
+
+/// What is latched when a roll-out ends early.
+pub fn abort(view: &View, rollout: &Rollout, reason: Reason, hard: bool, at: Utc, actor: Option<String>) -> Abort {
+    let failed = view.robots_of(&rollout.rollout_id).filter(|r| r.failure.is_some());
+    let robots = failed.map(|r| r.robot_id.clone()).take(NAMED_MAX).collect();
+    let touched = view.robots_of(&rollout.rollout_id).filter(|r| r.attempted).count() as u32;
+    Abort { reason, hard, robots, touched, at, actor }
+}
+
+/// Robots of the wave that have not worked enough to be judged.
+pub fn unexposed<'a>(view: &'a View, rollout: &'a Rollout) -> impl Iterator<Item = &'a RolloutRobot> {
+    let least = rollout.spec.exposure_tasks;
+    let wave = wave(view, &rollout.rollout_id, rollout.wave);
+    wave.filter(move |r| r.step == Step::Trial && exposure_of(view, rollout, r).ended() < least)
+}
+
+/// Robots of one wave.
+pub fn wave<'a>(view: &'a View, id: &RolloutId, wave: u32) -> impl Iterator<Item = &'a RolloutRobot> + use<'a> {
+    view.robots_of(id).filter(move |r| r.wave == wave)
+}
+
+/// What the gate after a wave says.
+pub fn gate(view: &View, rollout: &Rollout, at: Utc) -> Verdict {
+    let seen = see(view, rollout, Some(rollout.wave));
+    let give = |outcome, code: Code| of(view, rollout, &seen, outcome, code.into(), at);
+    if rollout.revert_of.is_some() {
+        return give(Outcome::Promoted, Code::GateReverted);
+    }
+    match seen.outcomes.verdict() {
+        gates::Verdict::Promote => give(Outcome::Promoted, Code::GateProven),
+        gates::Verdict::Abort => give(Outcome::Aborted, Code::TooManyFailed),
+        gates::Verdict::Inconclusive if seen.outcomes.failed > 0 => give(Outcome::Review, Code::GateInconclusive),
+        gates::Verdict::Inconclusive if rollout.spec.small_wave == SmallWave::Review => {
+            give(Outcome::Review, Code::GateAsksPerson)
+        }
+        gates::Verdict::Inconclusive => give(Outcome::PromotedUnproven, Code::GateUnproven),
+    }
+}

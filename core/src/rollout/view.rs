@@ -1,0 +1,317 @@
+//! The rollout service's picture of the rows: built from a snapshot, kept by the feed, and already holding what it is about to commit.
+//!
+//! Called by every room of `rollout`. Invariant: as [`crate::picture`] says; after a conflict the whole view is built again, never patched.
+
+use super::rows::{
+    AreaBundle, Bundle, DrainRelease, DrainRequest, OtaClock, OtaMark, Quarantine, RobotSoftware, Rollout,
+    RolloutRobot,
+};
+use crate::fleet::rows::{Drain, RobotAuthority, RobotControl, RobotCounter, RobotHolder};
+use crate::ids::{AreaId, DrainId, RobotId, RolloutId};
+pub use crate::picture::{Rowed, Slot};
+use crate::picture::{Picture, Viewed};
+use crate::policy::AreaPolicy;
+use crate::robot::Duty;
+use crate::rows::{BadRow, Key, Revision, Row, Seq, Table, Writer};
+use crate::site::Site;
+use crate::time::Now;
+use crate::update::DesiredUpdate;
+use crate::work::{LaneMark, Live, Session};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+/// The picture.
+pub struct View {
+    /// The site, which never changes while the service runs.
+    pub site: Arc<Site>,
+    /// Bundles of releases.
+    pub bundles: Slot<Bundle>,
+    /// Roll-outs.
+    pub rollouts: Slot<Rollout>,
+    /// Robots in them.
+    pub robots: Slot<RolloutRobot>,
+    /// Drains that were asked for.
+    pub requests: Slot<DrainRequest>,
+    /// Drains that may end.
+    pub releases: Slot<DrainRelease>,
+    /// Section `update` of each robot.
+    pub desired: Slot<DesiredUpdate>,
+    /// What robots run.
+    pub software: Slot<RobotSoftware>,
+    /// What they must not run.
+    pub quarantines: Slot<Quarantine>,
+    /// What newcomers get.
+    pub area_bundles: Slot<AreaBundle>,
+    /// Consumed position.
+    pub marks: Slot<OtaMark>,
+    /// Serving time and numbers.
+    pub clocks: Slot<OtaClock>,
+    /// Drains (fleet's).
+    pub drains: Slot<Drain>,
+    /// Robots' mutexes (fleet's).
+    pub authority: Slot<RobotAuthority>,
+    /// Cordons, breakers, retired robots (fleet's).
+    pub control: Slot<RobotControl>,
+    /// Work done (fleet's).
+    pub counters: Slot<RobotCounter>,
+    /// Rules of areas (fleet's).
+    pub policies: Slot<AreaPolicy>,
+    /// Newest sessions (telemetry's).
+    pub sessions: Slot<Session>,
+    /// Durable lane numbers (telemetry's).
+    pub lane_marks: Slot<LaneMark>,
+    /// Roll-outs that have a robot.
+    pub of_robot: BTreeMap<RobotId, BTreeSet<RolloutId>>,
+    /// Ids of robots' rows that something may still be due for.
+    pub open: BTreeSet<String>,
+    /// Robots of each wave.
+    pub wave_sizes: BTreeMap<(RolloutId, u32), u32>,
+    /// Robots that came or changed since they were last looked at as newcomers. Volatile.
+    pub arrived: BTreeSet<RobotId>,
+    /// Last entry of the feed that was taken.
+    pub absorbed: Seq,
+    /// Rows were read at this entry: what older entries say of rows is in the picture already.
+    pub read_at: Seq,
+    /// Reading of the clocks when the service started: everybody counts as heard then.
+    pub started: Now,
+    /// Reading of the clocks when the rows were read: serving time goes on from there.
+    pub read: Now,
+    /// Serving time at that moment.
+    pub served: OtaClock,
+    /// Naive rules for twins of tests; none outside them.
+    pub bugs: super::bugs::Bugs,
+}
+
+impl Picture for View {
+    const WRITER: Writer = Writer::Ota;
+}
+
+macro_rules! viewed {
+    ($($record:ty => $slot:ident;)*) => { $(impl Viewed<View> for $record {
+        fn slot(view: &mut View) -> &mut Slot<Self> { &mut view.$slot }
+    })* };
+}
+
+viewed! {
+    Bundle => bundles;
+    Rollout => rollouts;
+    DrainRequest => requests;
+    DrainRelease => releases;
+    DesiredUpdate => desired;
+    RobotSoftware => software;
+    Quarantine => quarantines;
+    AreaBundle => area_bundles;
+    OtaMark => marks;
+    OtaClock => clocks;
+    Drain => drains;
+    RobotAuthority => authority;
+    RobotControl => control;
+    RobotCounter => counters;
+    AreaPolicy => policies;
+    LaneMark => lane_marks;
+}
+
+impl Viewed<View> for RolloutRobot {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.robots
+    }
+    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+        let new = view.robots.get(id).map(|r| &r.row);
+        let size = |sizes: &mut BTreeMap<(RolloutId, u32), u32>, row: &Self, by: i32| {
+            let size = sizes.entry((row.rollout_id.clone(), row.wave)).or_default();
+            *size = size.saturating_add_signed(by);
+        };
+        if let Some(old) = old {
+            size(&mut view.wave_sizes, old, -1);
+        }
+        match new {
+            Some(row) => {
+                size(&mut view.wave_sizes, row, 1);
+                view.of_robot.entry(row.robot_id.clone()).or_default().insert(row.rollout_id.clone());
+                if row.step.is_over() {
+                    view.open.remove(id);
+                } else {
+                    view.open.insert(id.to_owned());
+                }
+            }
+            None => {
+                view.open.remove(id);
+                if let Some(old) = old
+                    && let Some(rollouts) = view.of_robot.get_mut(&old.robot_id)
+                {
+                    rollouts.remove(&old.rollout_id);
+                }
+            }
+        }
+    }
+}
+
+impl Viewed<View> for Session {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.sessions
+    }
+    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+        view.arrived.extend(view.sessions.get(id).map(|s| s.row.robot_id.clone()));
+    }
+}
+
+/// Tables that the picture is made of.
+pub const TABLES: &[Table] = &[
+    Table::Bundle,
+    Table::Rollout,
+    Table::RolloutRobot,
+    Table::DrainRequest,
+    Table::DrainRelease,
+    Table::DesiredUpdate,
+    Table::RobotSoftware,
+    Table::Quarantine,
+    Table::AreaBundle,
+    Table::OtaMark,
+    Table::OtaClock,
+    Table::Drain,
+    Table::RobotAuthority,
+    Table::RobotControl,
+    Table::RobotCounter,
+    Table::AreaPolicy,
+    Table::Session,
+    Table::LaneMark,
+];
+
+impl View {
+    /// An empty picture of `site`.
+    pub fn new(site: Arc<Site>, started: Now, read: Now) -> Self {
+        Self {
+            site,
+            bundles: Slot::new(),
+            rollouts: Slot::new(),
+            robots: Slot::new(),
+            requests: Slot::new(),
+            releases: Slot::new(),
+            desired: Slot::new(),
+            software: Slot::new(),
+            quarantines: Slot::new(),
+            area_bundles: Slot::new(),
+            marks: Slot::new(),
+            clocks: Slot::new(),
+            drains: Slot::new(),
+            authority: Slot::new(),
+            control: Slot::new(),
+            counters: Slot::new(),
+            policies: Slot::new(),
+            sessions: Slot::new(),
+            lane_marks: Slot::new(),
+            of_robot: BTreeMap::new(),
+            open: BTreeSet::new(),
+            wave_sizes: BTreeMap::new(),
+            arrived: BTreeSet::new(),
+            absorbed: Seq(0),
+            read_at: Seq(0),
+            started,
+            read,
+            served: OtaClock::default(),
+            bugs: super::bugs::Bugs::default(),
+        }
+    }
+
+    /// Takes every row of a snapshot read at `seq`.
+    ///
+    /// # Errors
+    /// A row that cannot be read.
+    pub fn load(&mut self, rows: &[Row], seq: Seq) -> Result<(), BadRow> {
+        for row in rows {
+            self.absorb(&row.key, row.revision, Some(row))?;
+        }
+        self.read_at = seq;
+        self.absorbed = self.marks.get("ota").map_or(Seq(0), |m| m.row.seq);
+        self.served = self.clocks.get("ota").map(|c| c.row).unwrap_or_default();
+        Ok(())
+    }
+
+    /// Takes one row as the store has it; none: deleted.
+    ///
+    /// # Errors
+    /// A body that is not what its table holds.
+    pub fn absorb(&mut self, key: &Key, revision: Revision, row: Option<&Row>) -> Result<(), BadRow> {
+        macro_rules! take {
+            ($($table:ident => $record:ty,)*) => {
+                match key.table {
+                    $(Table::$table => crate::picture::take::<Self, $record>(self, &key.id, revision, row),)*
+                    _ => Ok(()),
+                }
+            };
+        }
+        take! {
+            Bundle => Bundle,
+            Rollout => Rollout,
+            RolloutRobot => RolloutRobot,
+            DrainRequest => DrainRequest,
+            DrainRelease => DrainRelease,
+            DesiredUpdate => DesiredUpdate,
+            RobotSoftware => RobotSoftware,
+            Quarantine => Quarantine,
+            AreaBundle => AreaBundle,
+            OtaMark => OtaMark,
+            OtaClock => OtaClock,
+            Drain => Drain,
+            RobotAuthority => RobotAuthority,
+            RobotControl => RobotControl,
+            RobotCounter => RobotCounter,
+            AreaPolicy => AreaPolicy,
+            Session => Session,
+            LaneMark => LaneMark,
+        }
+    }
+
+    /// Milliseconds served on the site clock by `now`.
+    pub fn served_ms(&self, now: &Now) -> u64 {
+        self.served.site_ms + now.site.since(self.read.site).as_ms()
+    }
+    /// A roll-out.
+    pub fn rollout(&self, id: &RolloutId) -> Option<&Rollout> {
+        self.rollouts.get(id.as_str()).map(|r| &r.row)
+    }
+    /// Robots of a roll-out, by id.
+    pub fn robots_of<'a>(&'a self, id: &RolloutId) -> impl Iterator<Item = &'a RolloutRobot> + use<'a> {
+        let (from, to) = (format!("{id}/"), format!("{id}0"));
+        self.robots.range(from..to).map(|(_, r)| &r.row)
+    }
+    /// A robot in a roll-out.
+    pub fn robot_of(&self, rollout: &RolloutId, robot: &RobotId) -> Option<&RolloutRobot> {
+        self.robots.get(&RolloutRobot::id_of(rollout, robot)).map(|r| &r.row)
+    }
+    /// What a robot runs, as far as it said.
+    pub fn software_of(&self, robot: &RobotId) -> RobotSoftware {
+        self.software.get(robot.as_str()).map_or_else(|| RobotSoftware::new(robot.clone()), |s| s.row.clone())
+    }
+    /// How far the drain is, if fleet knows it.
+    pub fn drain(&self, id: &DrainId) -> Option<&Drain> {
+        self.drains.get(id.as_str()).map(|d| &d.row)
+    }
+    /// Whether the drain holds the robot.
+    pub fn is_held(&self, robot: &RobotId, drain: &DrainId) -> bool {
+        let holder = self.authority.get(robot.as_str()).map(|a| &a.row.holder);
+        matches!(holder, Some(RobotHolder::Maintenance(id)) if id == drain)
+    }
+    /// Whether a robot works as far as people and the breaker are concerned.
+    pub fn duty(&self, robot: &RobotId) -> Duty {
+        self.control.get(robot.as_str()).map_or(Duty::InWork, |c| c.row.duty())
+    }
+    /// Rules of an area.
+    pub fn policy(&self, area: &AreaId) -> AreaPolicy {
+        let file = || self.site.find_area(area).map(|at| self.site.area(at).policy());
+        let known = self.policies.get(area.as_str()).map(|p| p.row.clone());
+        known.or_else(file).unwrap_or_else(|| AreaPolicy::default_of(area.clone()))
+    }
+    /// The area in which a robot is.
+    pub fn area_of(&self, live: &Live) -> Option<AreaId> {
+        let at = live.report.vitals.waypoint.as_ref().and_then(|w| self.site.find(w))?;
+        Some(self.site.area_of(at).area_id.clone())
+    }
+    /// Everything that the robot had said when it sent this heartbeat was consumed, and it belongs to the newest session.
+    pub fn is_settled(&self, live: &Live) -> bool {
+        let id = live.robot_id.as_str();
+        let Some(session) = self.sessions.get(id) else { return false };
+        let mark = self.lane_marks.get(&format!("{id}/{}", session.row.ring)).map(|m| &m.row);
+        session.row.session_epoch == live.report.session_epoch && live.is_consumed(mark)
+    }
+}

@@ -1,0 +1,1 @@
+CREATE INDEX rollout_robot_by_parent ON rollout_robot (site_id, parent, ord, id)
