@@ -3,7 +3,7 @@
 use prost::Message;
 use std::path::PathBuf;
 
-const FILES: [&str; 11] = [
+const FILES: [&str; 13] = [
     "midshift/common/v1/common.proto",
     "midshift/task/v1/task.proto",
     "midshift/task/v1/task_service.proto",
@@ -12,6 +12,8 @@ const FILES: [&str; 11] = [
     "midshift/link/v1/link.proto",
     "midshift/link/v1/update.proto",
     "midshift/ota/v1/bundle_service.proto",
+    "midshift/ota/v1/rollout.proto",
+    "midshift/ota/v1/rollout_service.proto",
     "midshift/telemetry/v1/telemetry.proto",
     "midshift/telemetry/v1/telemetry_service.proto",
     "midshift/sim/v1/sim_service.proto",

@@ -78,7 +78,8 @@ impl SoftwareRules {
             violations.add(format!("{field}.off_work_permille"), "must be 0..1000 permille");
         }
         if self.keep_in_work.len() > KEPT_MAX || self.keep_in_work.keys().any(|c| c.is_empty() || c.len() > 64) {
-            violations.add(format!("{field}.keep_in_work"), format!("must be at most {KEPT_MAX}, each of 1-64 characters"));
+            violations
+                .add(format!("{field}.keep_in_work"), format!("must be at most {KEPT_MAX}, each of 1-64 characters"));
         }
         if self.windows.len() > WINDOWS_MAX {
             violations.add(format!("{field}.windows"), format!("must be at most {WINDOWS_MAX}"));
@@ -207,7 +208,8 @@ mod tests {
 
     #[test]
     fn every_broken_rule_for_software_is_told() {
-        let window = Window { days: BTreeSet::from([0, 8]), from_minute: 1440, to_minute: 2000, zone: "Berlin".to_owned() };
+        let window =
+            Window { days: BTreeSet::from([0, 8]), from_minute: 1440, to_minute: 2000, zone: "Berlin".to_owned() };
         let software = SoftwareRules {
             off_work_permille: 1001,
             keep_in_work: BTreeMap::from([(String::new(), 1)]),
@@ -218,7 +220,14 @@ mod tests {
         let mut bad = Violations::default();
         AreaPolicy { software, ..AreaPolicy::default_of(area) }.check("policy", &mut bad);
         let fields: Vec<&str> = bad.0.iter().map(|v| v.field.as_str()).collect();
-        let expected = ["off_work_permille", "keep_in_work", "windows[0].days", "windows[0].from_minute", "windows[0].to_minute", "windows[0].zone"];
+        let expected = [
+            "off_work_permille",
+            "keep_in_work",
+            "windows[0].days",
+            "windows[0].from_minute",
+            "windows[0].to_minute",
+            "windows[0].zone",
+        ];
         assert_eq!(fields, expected.map(|f| format!("policy.software.{f}")));
     }
 }

@@ -4,8 +4,8 @@
 //! running cycle will write; after a conflict the whole view is built again, never patched.
 
 use super::rows::{
-    AreaBudget, CommandKey, Drain, FleetMark, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotCounter, ServiceClock,
-    SiteRow, Timer,
+    AreaBudget, CommandKey, Drain, FleetMark, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotCounter,
+    ServiceClock, SiteRow, Timer,
 };
 use crate::ids::{AttemptId, RobotId, TaskId};
 use crate::picture::{Picture, Viewed};

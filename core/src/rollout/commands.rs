@@ -4,7 +4,9 @@
 //! Invariant: a command is checked against the whole picture before anything of it is written; asked twice it does the same once.
 
 use super::matching::{self, Matching};
-use super::rows::{Act, Bundle, Counted, Outcome, Pause, Phase, Quarantine, Rollout, RolloutRobot, RobotSoftware, Step, Verdict};
+use super::rows::{
+    Act, Bundle, Counted, Outcome, Pause, Phase, Quarantine, RobotSoftware, Rollout, RolloutRobot, Step, Verdict,
+};
 use super::spec::{RolloutSpec, Wave};
 use super::view::View;
 use super::{Board, Plan, Tx, newcomers, phases, robots, verdict};
@@ -197,14 +199,20 @@ fn least_ms(view: &View, spec: &RolloutSpec, matching: &Matching) -> u64 {
 fn caveats(spec: &RolloutSpec, bundle: &Bundle, matching: &Matching) -> Vec<String> {
     let mut caveats = Vec::new();
     if spec.probation_ms < SHORT_PROBATION_MS {
-        caveats.push(format!("probation of {} ms is short: a program that hangs later is met on trial", spec.probation_ms));
+        caveats.push(format!(
+            "probation of {} ms is short: a program that hangs later is met on trial",
+            spec.probation_ms
+        ));
     }
     let uncovered = matching.strata().values().filter(|(_, first)| !first).count();
     if uncovered > 0 {
         caveats.push(format!("{uncovered} kinds of robots are not in the first wave"));
     }
     if bundle.has_base {
-        caveats.push("it replaces the base system: while it is staged a robot has nothing to go back to but what it runs".to_owned());
+        caveats.push(
+            "it replaces the base system: while it is staged a robot has nothing to go back to but what it runs"
+                .to_owned(),
+        );
     }
     if bundle.is_irreversible {
         caveats.push("once committed it cannot be gone back from".to_owned());
@@ -242,7 +250,10 @@ pub fn check(view: &View, board: &Board, command: &Command, seen: Option<Revisio
             let known = view.rollout(of).ok_or_else(|| not_found(Code::RolloutNotFound, "rollout_id", of))?;
             let keeps = view.robots_of(of).any(|r| keeps(view, known, r));
             if known.phase != Phase::Completed || !keeps {
-                return Err(Refusal::new(Kind::Precondition, Reason::from(Code::NothingToRevert).with("rollout_id", of)));
+                return Err(Refusal::new(
+                    Kind::Precondition,
+                    Reason::from(Code::NothingToRevert).with("rollout_id", of),
+                ));
             }
             room(view)
         }
@@ -250,12 +261,16 @@ pub fn check(view: &View, board: &Board, command: &Command, seen: Option<Revisio
             let rowed = view.rollouts.get(rollout_id.as_str());
             let rowed = rowed.ok_or_else(|| not_found(Code::RolloutNotFound, "rollout_id", rollout_id))?;
             if seen.is_some_and(|seen| seen != rowed.revision) {
-                return Err(Refusal::new(Kind::Conflict, Reason::from(Code::EtagMismatch).with("etag", rowed.revision.0)));
+                return Err(Refusal::new(
+                    Kind::Conflict,
+                    Reason::from(Code::EtagMismatch).with("etag", rowed.revision.0),
+                ));
             }
             verb_fits(view, board, &rowed.row, verb)
         }
         Command::Revoke { bundle, .. } => {
-            let known = view.bundles.get(bundle.as_str()).ok_or_else(|| not_found(Code::BundleNotFound, "bundle", bundle))?;
+            let known =
+                view.bundles.get(bundle.as_str()).ok_or_else(|| not_found(Code::BundleNotFound, "bundle", bundle))?;
             Ok(known.row.revoked.is_some())
         }
         Command::Pin { robot_id, .. } | Command::Unpin { robot_id } => {
@@ -298,14 +313,12 @@ fn verb_fits(view: &View, board: &Board, rollout: &Rollout, verb: &Verb) -> Resu
         }
     };
     match verb {
-        Verb::Submit => {
-            now_is(phase == Phase::Draft, phase != Phase::Draft).and_then(|done| {
-                if !done && rollout.revert_of.is_none() {
-                    dry_run(view, board, &rollout.rollout_id, &rollout.spec)?;
-                }
-                Ok(done)
-            })
-        }
+        Verb::Submit => now_is(phase == Phase::Draft, phase != Phase::Draft).and_then(|done| {
+            if !done && rollout.revert_of.is_none() {
+                dry_run(view, board, &rollout.rollout_id, &rollout.spec)?;
+            }
+            Ok(done)
+        }),
         Verb::Approve => now_is(phase == Phase::Validated, rollout.approved.is_some()),
         Verb::Start { supersede } => {
             let done = now_is(phase == Phase::Approved, rollout.started.is_some())?;
@@ -314,7 +327,10 @@ fn verb_fits(view: &View, board: &Board, rollout: &Rollout, verb: &Verb) -> Resu
             }
             Ok(done)
         }
-        Verb::Pause => now_is(phase.runs() && !rollout.pauses.contains(&Pause::Operator), rollout.pauses.contains(&Pause::Operator)),
+        Verb::Pause => now_is(
+            phase.runs() && !rollout.pauses.contains(&Pause::Operator),
+            rollout.pauses.contains(&Pause::Operator),
+        ),
         Verb::Resume => now_is(rollout.pauses.contains(&Pause::Operator), phase.runs() && rollout.pauses.is_empty()),
         Verb::Promote => now_is(matches!(phase, Phase::Soaking | Phase::Gate | Phase::Review), false),
         Verb::Abort => now_is(!phase.is_over() && !phase.goes_back(), phase.goes_back()),
@@ -490,12 +506,22 @@ fn verb_one(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor: &str
         }
         Verb::Pause | Verb::Resume => {
             let mut pauses = rollout.pauses.clone();
-            if *verb == Verb::Pause { pauses.insert(Pause::Operator) } else { pauses.remove(&Pause::Operator) };
-            phases::set_pauses(tx, rollout, pauses, if *verb == Verb::Pause { "rollout.paused" } else { "rollout.resumed" });
+            if *verb == Verb::Pause {
+                pauses.insert(Pause::Operator)
+            } else {
+                pauses.remove(&Pause::Operator)
+            };
+            phases::set_pauses(
+                tx,
+                rollout,
+                pauses,
+                if *verb == Verb::Pause { "rollout.paused" } else { "rollout.resumed" },
+            );
         }
         Verb::Promote => {
             let seen = verdict::see(tx.view, &rollout, Some(rollout.wave));
-            let verdict = verdict::of(tx.view, &rollout, &seen, Outcome::PromotedByPerson, why(Code::PromotedByUser), tx.now.utc);
+            let verdict =
+                verdict::of(tx.view, &rollout, &seen, Outcome::PromotedByPerson, why(Code::PromotedByUser), tx.now.utc);
             phases::promote(tx, rollout, Verdict { actor: Some(actor.to_owned()), ..verdict });
         }
         Verb::Abort => phases::abort(tx, rollout, why(Code::AbortedByUser), false, None, Some(actor.to_owned())),
@@ -511,7 +537,8 @@ fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bo
     let Some(rollout) = view.rollout(id).cloned() else { return };
     let Ok((robots, sizes)) = members(view, board, &rollout) else { return };
     let others = overlapping(view, &rollout, robots.iter().map(|(id, ..)| id));
-    let counted = Counted { at_ms: view.served_ms(&now), control: verdict::controls_of(view, &rollout), ..Counted::default() };
+    let counted =
+        Counted { at_ms: view.served_ms(&now), control: verdict::controls_of(view, &rollout), ..Counted::default() };
     if supersede {
         for other in &others {
             plan.decide(view, now, actor, |tx| {
@@ -531,7 +558,15 @@ fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bo
     let first = slices.next().unwrap_or_default();
     plan.decide(view, now, actor, |tx| {
         let (phase, started, since) = (Phase::Prefetching, Some(tx.now.utc), tx.now.utc);
-        let row = Rollout { phase, started, since, sizes: sizes.clone(), supersedes: others.clone(), counted, ..rollout.clone() };
+        let row = Rollout {
+            phase,
+            started,
+            since,
+            sizes: sizes.clone(),
+            supersedes: others.clone(),
+            counted,
+            ..rollout.clone()
+        };
         tx.put(row, "rollout.started");
         add(tx, &rollout, first);
     });
@@ -556,7 +591,8 @@ fn retry_failed(view: &mut View, now: Now, id: &RolloutId, actor: &str, reason: 
             for r in slice {
                 let key = Quarantine::id_of(&r.robot_id, &rollout.spec.bundle);
                 tx.delete::<Quarantine>(&key, "quarantine.lifted");
-                let fresh = newcomers::fresh(&tx.now.clone(), &rollout, &r.robot_id, wave, r.place, r.from_version.clone());
+                let fresh =
+                    newcomers::fresh(&tx.now.clone(), &rollout, &r.robot_id, wave, r.place, r.from_version.clone());
                 let why = (!reason.is_empty()).then(|| Reason::new(Code::PromotedByUser, reason).with("actor", actor));
                 tx.put(RolloutRobot { again: true, why, ..fresh }, "robot.retried");
             }

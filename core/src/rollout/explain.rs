@@ -31,9 +31,10 @@ pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rol
             robots::blocked(view, board, now, rollout, r).unwrap_or_else(|| Code::BlockedByWave.into())
         }
         Step::Staging => {
-            deadline = robots::is_on(rollout, r)
-                .then(|| rollout.since.max(r.since).plus_ms(limits::STAGED_WITHIN.as_ms()));
-            let progress = board.get(&r.robot_id).and_then(|l| l.report.update.as_ref()).map_or(0, |u| u.progress_permille);
+            deadline =
+                robots::is_on(rollout, r).then(|| rollout.since.max(r.since).plus_ms(limits::STAGED_WITHIN.as_ms()));
+            let progress =
+                board.get(&r.robot_id).and_then(|l| l.report.update.as_ref()).map_or(0, |u| u.progress_permille);
             Reason::from(Code::BlockedByDownload).with("progress_permille", progress)
         }
         Step::Draining => {

@@ -96,10 +96,7 @@ pub fn fail(tx: &mut Tx, robot: &RolloutRobot, reason: Reason) {
 
 /// One such failure ends a roll-out at once.
 pub fn is_hard(reason: &Reason) -> bool {
-    matches!(
-        reason.code,
-        Code::HardStopCode | Code::HardwareStopOnTrial | Code::RollbackFailed | Code::SelfTestFailed
-    )
+    matches!(reason.code, Code::HardStopCode | Code::HardwareStopOnTrial | Code::RollbackFailed | Code::SelfTestFailed)
 }
 
 fn fault_begun(tx: &mut Tx, robot_id: &RobotId, fault: &Fault) {

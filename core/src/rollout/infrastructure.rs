@@ -24,7 +24,8 @@ pub fn is_missing(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> bo
 /// Why the roll-out has to stand still instead.
 pub fn controls(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> Result<(), Pause> {
     let area = view.software.get(r.robot_id.as_str()).and_then(|s| s.row.area.as_ref());
-    let all: Vec<&RobotId> = view.sessions.values().map(|s| &s.row.robot_id).filter(|id| is_control(view, id)).collect();
+    let all: Vec<&RobotId> =
+        view.sessions.values().map(|s| &s.row.robot_id).filter(|id| is_control(view, id)).collect();
     let here = |id: &&RobotId| view.software.get(id.as_str()).and_then(|s| s.row.area.as_ref()) == area;
     let near: Vec<&RobotId> = all.iter().copied().filter(here).collect();
     let controls = if near.len() < limits::CONTROLS_MIN { all } else { near };

@@ -26,6 +26,7 @@ use crate::rows::{Entry, Item, Log, Seq};
 use crate::time::{Now, Utc};
 use crate::work::InboxEntry;
 use rows::{OtaClock, OtaMark, Phase};
+use std::collections::BTreeSet;
 use view::View;
 
 /// A decision of the rollout service under way.
@@ -120,14 +121,30 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
     }
 }
 
-/// One cycle over a view that has absorbed the whole feed. Items of earlier decisions of the cycle are already in `plan`.
-pub fn cycle(view: &mut View, now: Now, board: &Board, sign: &dyn Sign, plan: &mut Plan) {
-    listen(view, now, board, plan);
+/// Robots brought further in one cycle; the next one follows at once.
+const MOVES_PER_CYCLE: usize = 1_024;
+
+/// One cycle over a view that has absorbed the whole feed. Items of earlier decisions of the cycle are already in `plan`. `heard`: robots with
+/// a new heartbeat. True: there is more to do at once.
+pub fn cycle(
+    view: &mut View,
+    now: Now,
+    board: &Board,
+    heard: &BTreeSet<RobotId>,
+    sign: &dyn Sign,
+    plan: &mut Plan,
+) -> bool {
+    listen(view, now, board, heard, plan);
     welcome(view, now, board, plan);
+    let mut moves = 0;
     for id in due(view) {
         let Some(row) = view.robots.get(&id).map(|r| &r.row) else { continue };
         let Some(rollout) = view.rollout(&row.rollout_id) else { continue };
         if let Some(due) = robots::next(view, board, &now, rollout, row) {
+            if moves == MOVES_PER_CYCLE {
+                return true;
+            }
+            moves += 1;
             plan.decide(view, now, "ota", |tx| robots::make(tx, sign, board, &id, due));
         }
     }
@@ -138,12 +155,16 @@ pub fn cycle(view: &mut View, now: Now, board: &Board, sign: &dyn Sign, plan: &m
     }
     plan.decide(view, now, "ota", robots::forget_drains);
     tell_time(view, now, plan);
+    false
 }
 
 /// Heartbeats that say what the rows do not.
-fn listen(view: &mut View, now: Now, board: &Board, plan: &mut Plan) {
-    for (robot_id, live) in board {
-        if robots::is_heard_anew(view, board, robot_id) {
+fn listen(view: &mut View, now: Now, board: &Board, heard: &BTreeSet<RobotId>, plan: &mut Plan) {
+    for robot_id in heard {
+        if let Some(live) = board.get(robot_id)
+            && view.is_settled(live)
+            && hear::is_due(view, live)
+        {
             plan.decide(view, now, robot_id.as_str(), |tx| hear::repair(tx, live));
         }
     }
@@ -177,17 +198,23 @@ fn due(view: &View) -> Vec<String> {
         ids.extend(view.robots_of(&rollout.rollout_id).map(crate::rows::Record::id));
     }
     let mut ids: Vec<String> = ids.into_iter().collect();
-    let order = |id: &String| view.robots.get(id).map(|r| (r.row.rollout_id.clone(), r.row.failure.is_none(), r.row.wave, r.row.place));
+    let order = |id: &String| {
+        view.robots.get(id).map(|r| (r.row.rollout_id.clone(), r.row.failure.is_none(), r.row.wave, r.row.place))
+    };
     ids.sort_by_cached_key(order);
     ids
 }
 
-/// Writes serving time and the consumed position, at most once a second and only with something else.
+/// Entries after which the consumed position is written though nothing else is: logs are never pruned past it.
+const CONSUMED_MAX: u64 = 10_000;
+
+/// Writes serving time and the consumed position, at most once a second, with something else or when there was much to consume.
 fn tell_time(view: &mut View, now: Now, plan: &mut Plan) {
-    if plan.items.is_empty() {
+    let clock = view.clocks.get("ota").map(|c| c.row).unwrap_or_default();
+    let consumed = view.marks.get("ota").map_or(Seq(0), |m| m.row.seq);
+    if plan.items.is_empty() && view.absorbed.0.saturating_sub(consumed.0) < CONSUMED_MAX {
         return;
     }
-    let clock = view.clocks.get("ota").map(|c| c.row).unwrap_or_default();
     let site_ms = view.served_ms(&now);
     if site_ms >= clock.site_ms + 1_000 || clock == OtaClock::default() {
         plan.decide(view, now, "ota", |tx| {

@@ -249,8 +249,14 @@ fn complete(tx: &mut Tx, rollout: Rollout) {
 
 /// Robots that come later do not get it any more.
 pub fn forget_area_bundles(tx: &mut Tx, id: &RolloutId) {
-    let named: Vec<AreaBundle> =
-        tx.view.area_bundles.values().map(|a| &a.row).filter(|a| a.rollouts.values().any(|r| r == id)).cloned().collect();
+    let named: Vec<AreaBundle> = tx
+        .view
+        .area_bundles
+        .values()
+        .map(|a| &a.row)
+        .filter(|a| a.rollouts.values().any(|r| r == id))
+        .cloned()
+        .collect();
     for mut row in named {
         row.rollouts.retain(|_, rollout| rollout != id);
         tx.put(row, "area.bundle_forgotten");

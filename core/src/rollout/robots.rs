@@ -4,10 +4,8 @@
 //! while fleet's record says that this drain holds the robot and the roll-out runs; a drain is released only for one of [`ReleasedBy`]; robots
 //! out of work for a roll-out are counted in its row, in the item that takes one more.
 
-use super::hear::{self, fail, is_hard, quarantine, report_of};
-use super::rows::{
-    DrainRelease, DrainRequest, Given, Phase, ReleasedBy, Rollout, RolloutRobot, Step,
-};
+use super::hear::{fail, is_hard, quarantine, report_of};
+use super::rows::{DrainRelease, DrainRequest, Given, Phase, ReleasedBy, Rollout, RolloutRobot, Step};
 use super::view::View;
 use super::{Board, Order, Sign, Tx, infrastructure, matching, verdict};
 use crate::authority::Authority;
@@ -101,7 +99,8 @@ pub fn is_retried(r: &RolloutRobot) -> bool {
 
 /// It has the bundle for a second try that will not come.
 fn keeps_for_nothing(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
-    let staged = view.desired.get(r.robot_id.as_str()).is_some_and(|d| matches!(d.row.goal, Goal::Stage | Goal::Activate));
+    let staged =
+        view.desired.get(r.robot_id.as_str()).is_some_and(|d| matches!(d.row.goal, Goal::Stage | Goal::Activate));
     let ours = r.directive > 0 && !r.attempted && matching::claimed_by(view, &r.robot_id, &r.rollout_id).is_none();
     staged && ours && rollout.phase.goes_back()
 }
@@ -286,7 +285,9 @@ fn activating(
                 return Some(Move::Switched);
             }
             let back = rollout.phase.goes_back();
-            return (back && !wants(view, r, Goal::Revert)).then_some(Move::GoBack).or_else(|| lost(view, board, now, r));
+            return (back && !wants(view, r, Goal::Revert))
+                .then_some(Move::GoBack)
+                .or_else(|| lost(view, board, now, r));
         }
         _ => {}
     }
@@ -373,8 +374,7 @@ fn ended(r: &RolloutRobot, report: Option<&UpdateReport>) -> Option<Move> {
 /// It must leave what it runs.
 fn goes_back(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
     let kept = matches!(r.step, Step::Committing | Step::Committed);
-    let irreversible =
-        kept && view.bundles.get(rollout.spec.bundle.as_str()).is_some_and(|b| b.row.is_irreversible);
+    let irreversible = kept && view.bundles.get(rollout.spec.bundle.as_str()).is_some_and(|b| b.row.is_irreversible);
     let in_scope = rollout.spec.abort_scope == super::spec::AbortScope::All || !kept;
     let aborts = matches!(rollout.phase, Phase::Aborting | Phase::RollingBack) || (rollout.phase.goes_back() && !kept);
     aborts && in_scope && !irreversible && r.attempted
@@ -408,7 +408,9 @@ fn trial(view: &View, now: &Now, rollout: &Rollout, r: &RolloutRobot, report: Op
 fn committing(rollout: &Rollout, r: &RolloutRobot, report: Option<&UpdateReport>) -> Option<Move> {
     match report.map(|r| r.state) {
         Some(UpdateState::Committed) => Some(Move::Committed),
-        _ if rollout.phase.goes_back() && rollout.spec.abort_scope == super::spec::AbortScope::All => Some(Move::Revert),
+        _ if rollout.phase.goes_back() && rollout.spec.abort_scope == super::spec::AbortScope::All => {
+            Some(Move::Revert)
+        }
         _ => ended(r, report),
     }
 }
@@ -539,7 +541,11 @@ fn rolled_back(tx: &mut Tx, rollout: &Rollout, mut r: RolloutRobot, why: Reason)
     let asked = r.step == Step::Reverting || wants(tx.view, &r, Goal::Revert);
     if !asked {
         // It went back by itself: that is what gates count.
-        let because = if is_hard(&why) { why.clone() } else { Reason::new(Code::RobotWentBack, why.text()).with("because", why.code) };
+        let because = if is_hard(&why) {
+            why.clone()
+        } else {
+            Reason::new(Code::RobotWentBack, why.text()).with("because", why.code)
+        };
         let lost = r.failure.as_ref().is_some_and(|f| f.code == Code::RobotLost);
         if r.failure.is_none() || lost {
             r.failure = Some(because);
@@ -670,9 +676,4 @@ pub fn forget_drains(tx: &mut Tx) {
         tx.delete::<DrainRequest>(drain_id.as_str(), "drain.forgotten");
         tx.delete::<DrainRelease>(drain_id.as_str(), "drain.forgotten");
     }
-}
-
-/// Whether a heartbeat says something that the rows do not.
-pub fn is_heard_anew(view: &View, board: &Board, robot_id: &RobotId) -> bool {
-    board.get(robot_id).is_some_and(|live| view.is_settled(live) && hear::is_due(view, live))
 }

@@ -205,7 +205,8 @@ mod tests {
     fn fields(spec: &RolloutSpec) -> Vec<String> {
         let mut bad = Violations::default();
         spec.check(&mut bad);
-        bad.finish().map_or_else(|Refusal { violations, .. }| violations.into_iter().map(|v| v.field).collect(), |()| vec![])
+        bad.finish()
+            .map_or_else(|Refusal { violations, .. }| violations.into_iter().map(|v| v.field).collect(), |()| vec![])
     }
 
     #[test]
@@ -236,6 +237,9 @@ mod tests {
         ];
         assert_eq!(fields(&bad), expected);
         assert_eq!(fields(&RolloutSpec { waves: vec![Wave::Rest], ..spec() }), ["waves"]);
-        assert_eq!(fields(&RolloutSpec { waves: vec![Wave::Rest], allow_full_push: true, ..spec() }), Vec::<String>::new());
+        assert_eq!(
+            fields(&RolloutSpec { waves: vec![Wave::Rest], allow_full_push: true, ..spec() }),
+            Vec::<String>::new()
+        );
     }
 }

@@ -3,13 +3,12 @@
 //! Called by every room of `rollout`. Invariant: as [`crate::picture`] says; after a conflict the whole view is built again, never patched.
 
 use super::rows::{
-    AreaBundle, Bundle, DrainRelease, DrainRequest, OtaClock, OtaMark, Quarantine, RobotSoftware, Rollout,
-    RolloutRobot,
+    AreaBundle, Bundle, DrainRelease, DrainRequest, OtaClock, OtaMark, Quarantine, RobotSoftware, Rollout, RolloutRobot,
 };
 use crate::fleet::rows::{Drain, RobotAuthority, RobotControl, RobotCounter, RobotHolder};
 use crate::ids::{AreaId, DrainId, RobotId, RolloutId};
-pub use crate::picture::{Rowed, Slot};
 use crate::picture::{Picture, Viewed};
+pub use crate::picture::{Rowed, Slot};
 use crate::policy::AreaPolicy;
 use crate::robot::Duty;
 use crate::rows::{BadRow, Key, Revision, Row, Seq, Table, Writer};

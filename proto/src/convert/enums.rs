@@ -1,8 +1,11 @@
 //! Enums of core and their numbers on the wire.
 
-use crate::{common, fleet, link, task, telemetry};
+use crate::{common, fleet, link, ota, task, telemetry};
 use midshift_core::fleet::rows::{DrainState, HolderState};
+use midshift_core::gates::Suspicion;
 use midshift_core::robot::{Duty, FaultClass, HardwareStop, Lane, Mode, Presence, StopLevel};
+use midshift_core::rollout::rows::{Outcome, Pause, Phase as RolloutPhase, Step as RolloutStep};
+use midshift_core::rollout::spec::{AbortScope, SmallWave, SmallWaveFailure};
 use midshift_core::task::state::Errand;
 use midshift_core::task::{AttemptPhase, Phase, Resolution, Then};
 use midshift_core::update::{Goal, UpdateState};
@@ -66,6 +69,24 @@ wire_enums! {
     }
     Presence = telemetry::v1::Presence { Online = Online, Suspect = Suspect, Offline = Offline, Updating = Updating }
     Duty = fleet::v1::Duty { InWork = InWork, Cordoned = Cordoned, BrokenOff = BrokenOff, Retired = Retired }
+    RolloutPhase = ota::v1::RolloutPhase {
+        Draft = Draft, Validated = Validated, Approved = Approved, Prefetching = Prefetching, Applying = Applying, Soaking = Soaking, Gate = Gate,
+        Review = Review, Aborting = Aborting, RollingBack = RollingBack, Completed = Completed, Aborted = Aborted, Superseded = Superseded,
+    }
+    Pause = ota::v1::RolloutPause {
+        Operator = Operator, Infrastructure = Infrastructure, InfrastructureUnknown = InfrastructureUnknown, Revoked = Revoked,
+    }
+    Outcome = ota::v1::RolloutOutcome {
+        Promoted = Promoted, PromotedUnproven = PromotedUnproven, PromotedByPerson = PromotedByPerson, Review = Review, Aborted = Aborted,
+    }
+    RolloutStep = ota::v1::RolloutStep {
+        Waiting = Waiting, Staging = Staging, Staged = Staged, Draining = Draining, Activating = Activating, Trial = Trial,
+        Committing = Committing, Reverting = Reverting, Committed = Committed, RolledBack = RolledBack, Skipped = Skipped, Stuck = Stuck,
+    }
+    Suspicion = ota::v1::Suspicion { None = Unspecified, OneSickRobot = OneSickRobot, Release = Release }
+    SmallWave = ota::v1::SmallWave { Auto = Auto, Review = Review }
+    SmallWaveFailure = ota::v1::SmallWaveFailure { Abort = Abort, Review = Review }
+    AbortScope = ota::v1::AbortScope { All = All, Trial = Trial }
     Errand = fleet::v1::Errand { Charge = Charge, Park = Park }
     DrainState = fleet::v1::DrainState { Waiting = Waiting, Draining = Draining, Held = Held, Refused = Refused }
     HolderState = fleet::v1::PlaceHolderState { Granted = Granted, Inside = Inside, Revoking = Revoking }

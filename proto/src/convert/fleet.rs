@@ -3,7 +3,7 @@
 use super::{At, Parse, id, permille, task::etag};
 use crate::fleet::v1;
 use midshift_core::ids::AreaId;
-use midshift_core::policy::AreaPolicy;
+use midshift_core::policy::{AreaPolicy, SoftwareRules, Window};
 use midshift_core::reason::Violations;
 use midshift_core::rows::Revision;
 
@@ -18,6 +18,56 @@ pub fn encode_policy(policy: &AreaPolicy, revision: Option<Revision>) -> v1::Are
         charge_opportunistic_permille: Some(u32::from(policy.charge_opportunistic_permille)),
         charge_stop_permille: Some(u32::from(policy.charge_stop_permille)),
         charge_preemptible_permille: Some(u32::from(policy.charge_preemptible_permille)),
+        software: Some(encode_rules(&policy.software)),
+    }
+}
+
+fn encode_rules(rules: &SoftwareRules) -> v1::SoftwareRules {
+    let window = |w: &Window| v1::MaintenanceWindow {
+        days: w.days.iter().map(|d| u32::from(*d)).collect(),
+        from_minute: u32::from(w.from_minute),
+        to_minute: u32::from(w.to_minute),
+        zone: w.zone.clone(),
+    };
+    v1::SoftwareRules {
+        off_work_permille: Some(u32::from(rules.off_work_permille)),
+        keep_in_work: rules.keep_in_work.clone(),
+        windows: rules.windows.iter().map(window).collect(),
+        frozen: rules.frozen,
+    }
+}
+
+/// A number that the rules of core then hold against their limits; one that is too large for them stays too large.
+fn narrow<T: TryFrom<u32> + Bounded>(value: u32) -> T {
+    T::try_from(value).unwrap_or(T::MAX)
+}
+
+/// The largest value of a small number.
+trait Bounded {
+    const MAX: Self;
+}
+
+impl Bounded for u8 {
+    const MAX: Self = u8::MAX;
+}
+
+impl Bounded for u16 {
+    const MAX: Self = u16::MAX;
+}
+
+fn parse_rules(rules: v1::SoftwareRules) -> SoftwareRules {
+    let default = SoftwareRules::default();
+    let window = |w: v1::MaintenanceWindow| Window {
+        days: w.days.into_iter().map(narrow).collect(),
+        from_minute: narrow(w.from_minute),
+        to_minute: narrow(w.to_minute),
+        zone: w.zone,
+    };
+    SoftwareRules {
+        off_work_permille: rules.off_work_permille.map_or(default.off_work_permille, narrow),
+        keep_in_work: rules.keep_in_work,
+        windows: rules.windows.into_iter().map(window).collect(),
+        frozen: rules.frozen,
     }
 }
 
@@ -47,6 +97,7 @@ impl Parse<AreaPolicy> for v1::AreaPolicy {
             charge_opportunistic_permille: opportunistic?,
             charge_stop_permille: stop?,
             charge_preemptible_permille: preemptible?,
+            software: self.software.map(parse_rules).unwrap_or_default(),
             ..default
         };
         policy.check(&at.to_string(), bad);

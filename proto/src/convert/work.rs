@@ -5,7 +5,7 @@ use super::{
 };
 use crate::link::v1;
 use midshift_core::ids::{AreaId, DrainId, PlaceId, RobotId, WaypointId};
-use midshift_core::policy::AreaPolicy;
+use midshift_core::policy::{AreaPolicy, SoftwareRules};
 use midshift_core::reason::Violations;
 use midshift_core::work::{Assignment, DesiredPolicy, DesiredWork, GrantedPlace, RoutePoint, StepKind, WorkStep};
 
@@ -242,6 +242,8 @@ impl Parse<AreaPolicy> for v1::AreaRules {
             charge_opportunistic_permille: opportunistic?,
             charge_stop_permille: stop?,
             charge_preemptible_permille: preemptible?,
+            // What roll-outs keep to is no robot's matter.
+            software: SoftwareRules::default(),
         })
     }
 }

@@ -171,6 +171,7 @@ fn every_service_is_in_the_descriptor_set() {
         "fleet.v1.FleetService",
         "link.v1.LinkService",
         "ota.v1.BundleService",
+        "ota.v1.RolloutService",
         "ota.v1.ChunkService",
         "sim.v1.SimService",
         "task.v1.TaskService",

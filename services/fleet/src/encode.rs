@@ -1,8 +1,8 @@
 //! Rows and explanations as their messages. Nothing is decided here.
 
-use midshift_core::fleet::drain::of as drain_of;
+use midshift_core::fleet::drain::{all_of, of as drain_of};
 use midshift_core::fleet::explain::{RobotExplanation, TaskExplanation};
-use midshift_core::fleet::rows::{HolderState, Incident, Place, RobotControl, RobotCounter, RobotHolder};
+use midshift_core::fleet::rows::{Cordon, HolderState, Incident, Place, RobotControl, RobotCounter, RobotHolder};
 use midshift_core::fleet::view::View;
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::reason::{Code, Reason};
@@ -34,7 +34,8 @@ pub fn control(view: &View, robot_id: &RobotId) -> v1::RobotControl {
             Duty::BrokenOff => v1::Duty::BrokenOff,
             Duty::Retired => v1::Duty::Retired,
         } as i32,
-        cordon: row.cordon.map(|c| v1::Cordon { reason: c.reason, since: Some(timestamp(c.since)), actor: c.actor }),
+        cordon: row.cordon.map(cordon),
+        retired: row.retired.map(cordon),
         breaker_open_time: row.breaker.map(timestamp),
         failure_times: row.failures.iter().copied().map(timestamp).collect(),
         holder,
@@ -50,10 +51,13 @@ pub fn control(view: &View, robot_id: &RobotId) -> v1::RobotControl {
     }
 }
 
-/// The drain a robot is in, or the last that was refused.
+fn cordon(cordon: Cordon) -> v1::Cordon {
+    v1::Cordon { reason: cordon.reason, since: Some(timestamp(cordon.since)), actor: cordon.actor }
+}
+
+/// The drain a robot is in, or the last that waits or was refused.
 fn drain(view: &View, robot_id: &RobotId) -> Option<v1::Drain> {
-    let refused = || view.drains.values().map(|d| &d.row).find(|d| d.robot_id == *robot_id);
-    let drain = drain_of(view, robot_id).or_else(refused)?;
+    let drain = drain_of(view, robot_id).or_else(|| all_of(view, robot_id).last())?;
     let within_ms = i64::try_from(drain.within_ms).unwrap_or(i64::MAX);
     Some(v1::Drain {
         drain_id: drain.drain_id.to_string(),
@@ -63,6 +67,7 @@ fn drain(view: &View, robot_id: &RobotId) -> Option<v1::Drain> {
         since: Some(timestamp(drain.since)),
         deadline: Some(timestamp(Utc(drain.since.0.saturating_add(within_ms)))),
         why: drain.why.as_ref().map(shown),
+        rollout_id: drain.rollout_id.as_ref().map(ToString::to_string).unwrap_or_default(),
     })
 }
 

@@ -91,6 +91,19 @@ impl FleetService {
         Ok(v1::UncordonRobotResponse { control: Some(control) })
     }
 
+    async fn retire(&self, r: v1::RetireRobotRequest) -> Result<v1::RetireRobotResponse, Refusal> {
+        let mut bad = Violations::default();
+        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        let request_id = request_id(&r.request_id, &mut bad);
+        reason_text(&r.reason, &mut bad);
+        bad.finish()?;
+        let robot_id = robot_id.ok_or_else(internal)?;
+        let command = Command::Retire { robot_id: robot_id.clone(), reason: r.reason };
+        self.act(command, revision_of(&r.etag), r.validate_only, request_id).await?;
+        let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
+        Ok(v1::RetireRobotResponse { control: Some(control) })
+    }
+
     async fn drain(&self, r: v1::DrainRobotRequest) -> Result<v1::DrainRobotResponse, Refusal> {
         let mut bad = Violations::default();
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
@@ -289,6 +302,12 @@ impl Face for FleetService {
         r: Request<v1::UncordonRobotRequest>,
     ) -> Result<Response<v1::UncordonRobotResponse>, Status> {
         answer(self.uncordon(r.into_inner()).await)
+    }
+    async fn retire_robot(
+        &self,
+        r: Request<v1::RetireRobotRequest>,
+    ) -> Result<Response<v1::RetireRobotResponse>, Status> {
+        answer(self.retire(r.into_inner()).await)
     }
     async fn drain_robot(&self, r: Request<v1::DrainRobotRequest>) -> Result<Response<v1::DrainRobotResponse>, Status> {
         answer(self.drain(r.into_inner()).await)

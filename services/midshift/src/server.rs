@@ -8,11 +8,13 @@ use axum::routing::get;
 use metrics_exporter_prometheus::{PrometheusBuilder, PrometheusHandle};
 use midshift_core::fleet::rows::FleetMark;
 use midshift_core::limits;
+use midshift_core::rollout::rows::OtaMark;
 use midshift_core::site::Site;
 use midshift_core::time::Clock;
 use midshift_core::work::Live;
 use midshift_fleet::{FleetService, Reconciler};
 use midshift_ota::OtaService;
+use midshift_ota::rollouts::{Planner, RolloutService};
 use midshift_proto::sim::v1::sim_service_server::SimServiceServer;
 use midshift_sim::service::SimFace;
 use midshift_store::{FrameLog, LiveBoard, Retention, Store};
@@ -33,7 +35,7 @@ use tonic_health::server::HealthReporter;
 /// Pings of the server on a quiet connection, and how long it waits for their answer.
 const KEEPALIVE: (Duration, Duration) = (Duration::from_secs(20), Duration::from_secs(10));
 /// Names under which the health service knows the server; the empty one is the whole.
-const HEALTH: [&str; 7] = [
+const HEALTH: [&str; 8] = [
     "",
     "midshift.task.v1.TaskService",
     "midshift.fleet.v1.FleetService",
@@ -41,6 +43,7 @@ const HEALTH: [&str; 7] = [
     "midshift.link.v1.LinkService",
     "midshift.ota.v1.BundleService",
     "midshift.ota.v1.ChunkService",
+    "midshift.ota.v1.RolloutService",
 ];
 /// How often old log entries are taken away.
 const PRUNE_EVERY: Duration = Duration::from_secs(60);
@@ -56,6 +59,8 @@ pub struct Naive {
     pub telemetry: midshift_telemetry::Bugs,
     /// Of fleet.
     pub fleet: midshift_core::fleet::bugs::Bugs,
+    /// Of roll-outs.
+    pub rollouts: midshift_core::rollout::bugs::Bugs,
 }
 
 /// What a server is built from.
@@ -87,6 +92,8 @@ pub struct Server {
     fleet: FleetService,
     reconciler: Reconciler,
     telemetry: TelemetryService,
+    rollouts: RolloutService,
+    planner: Planner,
     board: Arc<LiveBoard<Live>>,
     shutdown: CancellationToken,
 }
@@ -122,7 +129,16 @@ impl Server {
             },
             shutdown.clone(),
         );
-        Ok(Self { parts, task, fleet, reconciler, telemetry, board, shutdown })
+        let rollouts = midshift_ota::rollouts::Parts {
+            store: parts.store.clone(),
+            board: board.clone(),
+            site: parts.site.clone(),
+            clock: parts.clock.clone(),
+            ota: parts.ota.clone(),
+            bugs: parts.naive.rollouts,
+        };
+        let (rollouts, planner) = RolloutService::new(rollouts, shutdown.clone());
+        Ok(Self { parts, task, fleet, reconciler, telemetry, rollouts, planner, board, shutdown })
     }
 
     /// Fleet, for whoever reports in this process.
@@ -153,6 +169,7 @@ impl Server {
             .add_service(self.telemetry.link())
             .add_service(self.parts.ota.bundles())
             .add_service(self.parts.ota.chunks())
+            .add_service(self.rollouts.grpc().max_decoding_message_size(control))
             .add_service(health_service)
             .add_service(reflection().build_v1()?)
             .add_service(reflection().build_v1alpha()?);
@@ -199,6 +216,7 @@ impl Server {
         let fleet = AbortOnDropHandle::new(self.parts.planning.spawn(self.reconciler.run(shutdown.clone())));
         let telemetry = self.telemetry.clone().run();
         let ota = self.parts.ota.clone().run(shutdown.clone());
+        let planner = AbortOnDropHandle::new(self.parts.planning.spawn(self.planner.run(shutdown.clone())));
         let failure = OnceLock::new();
         let services = async {
             let fleet = until(&shutdown, "fleet", async { Ok(fleet.await??) });
@@ -207,7 +225,8 @@ impl Server {
                 ota.await;
                 Ok(())
             });
-            if let Err(error) = tokio::try_join!(fleet, telemetry, ota) {
+            let rollouts = until(&shutdown, "rollouts", async { Ok(planner.await??) });
+            if let Err(error) = tokio::try_join!(fleet, telemetry, ota, rollouts) {
                 tracing::error!(%error, "a service ended, and with it the server");
                 shutdown.cancel();
                 // Nothing else sets it.
@@ -287,7 +306,9 @@ async fn prune_entries(store: &dyn Store, clock: &dyn Clock) -> Result<(), midsh
     // Until fleet has consumed something nothing may go.
     let Some((mark, _)) = midshift_store::load::<FleetMark>(store, "fleet").await? else { return Ok(()) };
     let days_ms = (limits::REMEMBER_DAYS * 86_400_000) as i64;
-    let keep = Retention { before_unix_ms: clock.now().wall.0 - days_ms, entries_max: ENTRIES_MAX, floor: mark.seq };
+    let ota = midshift_store::load::<OtaMark>(store, "ota").await?.map_or(mark.seq, |(mark, _)| mark.seq);
+    let floor = mark.seq.min(ota);
+    let keep = Retention { before_unix_ms: clock.now().wall.0 - days_ms, entries_max: ENTRIES_MAX, floor };
     store.prune(keep).await.map(drop)
 }
 

@@ -105,7 +105,9 @@ pub fn targets(previous: Option<&[u8]>, add: &[(String, Vec<u8>)], seed: u8) -> 
 /// Writes the online keys of [`SEEDS`] and their successors, which a root may name later.
 pub fn write_keys(folder: &Path) {
     std::fs::create_dir_all(folder).expect("a folder");
-    for (name, seed) in [("snapshot-1", 3), ("snapshot-2", 13), ("timestamp-1", 4), ("timestamp-2", 14)] {
+    for (name, seed) in
+        [("snapshot-1", 3), ("snapshot-2", 13), ("timestamp-1", 4), ("timestamp-2", 14), ("directive-1", 5)]
+    {
         key(seed).write(&folder.join(format!("{name}.pem"))).expect("a key");
     }
 }

@@ -11,6 +11,7 @@ mod http1;
 mod pages;
 mod refusal;
 pub mod repository;
+pub mod rollouts;
 
 use content::{Content, DiskContent, Wanted};
 use midshift_core::reason::{Code, Kind, Refusal};

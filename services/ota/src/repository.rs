@@ -90,10 +90,11 @@ pub enum Error {
 pub struct OnlineKeys {
     snapshot: Vec<SecretKey>,
     timestamp: Vec<SecretKey>,
+    directive: Vec<SecretKey>,
 }
 
 impl OnlineKeys {
-    /// Reads `snapshot-*.pem` and `timestamp-*.pem` of a folder. Blocks.
+    /// Reads `snapshot-*.pem`, `timestamp-*.pem` and `directive-*.pem` of a folder. Blocks.
     ///
     /// # Errors
     /// If one cannot be read, or a role has none.
@@ -113,7 +114,13 @@ impl OnlineKeys {
             }
             Ok(keys)
         };
-        Ok(Self { snapshot: of("snapshot")?, timestamp: of("timestamp")? })
+        Ok(Self { snapshot: of("snapshot")?, timestamp: of("timestamp")?, directive: of("directive")? })
+    }
+
+    /// The key that orders to robots are signed with: the first by name.
+    pub fn directive(&self) -> &SecretKey {
+        // Read: every role has one.
+        &self.directive[0]
     }
 
     /// Signs that `targets` is the newest, with the keys that `root` names, and holds the result against it.
@@ -213,6 +220,11 @@ impl Repository {
         };
         let (newest, folder) = (RwLock::new(newest), folder.to_owned());
         Ok(Self { folder, keys, content, newest, writing: Mutex::new(()) })
+    }
+
+    /// Keys of this server.
+    pub fn keys(&self) -> &OnlineKeys {
+        &self.keys
     }
 
     /// What it says now; none: nothing was ever published.

@@ -5,6 +5,7 @@
 use crate::Inner;
 use midshift_core::ids::RobotId;
 use midshift_core::rows::{BadRow, Table};
+use midshift_core::update::DesiredUpdate;
 use midshift_core::work::{DesiredPolicy, DesiredWork, LaneMark, PresenceRow, Session};
 use midshift_store::{Change, Dirty, Error, Fold, LiveBoard, Projection};
 use std::collections::BTreeMap;
@@ -22,6 +23,8 @@ pub struct Sections {
     pub work: Option<Arc<DesiredWork>>,
     /// Section policy.
     pub policy: Option<Arc<DesiredPolicy>>,
+    /// Section update.
+    pub update: Option<Arc<DesiredUpdate>>,
 }
 
 /// Rows by robot.
@@ -102,7 +105,14 @@ fn sections<'a>(rows: &'a mut Rows, robot_id: &RobotId) -> &'a mut Sections {
 
 impl Fold for Keeper {
     fn tables() -> &'static [Table] {
-        &[Table::DesiredWork, Table::DesiredPolicy, Table::Session, Table::Presence, Table::LaneMark]
+        &[
+            Table::DesiredWork,
+            Table::DesiredPolicy,
+            Table::DesiredUpdate,
+            Table::Session,
+            Table::Presence,
+            Table::LaneMark,
+        ]
     }
     fn reset(&mut self) {
         let mut rows = self.0.picture.rows_mut();
@@ -116,6 +126,7 @@ impl Fold for Keeper {
         match change.key.table {
             Table::DesiredWork => sections(&mut rows, &robot_id).work = change.decode()?.map(Arc::new),
             Table::DesiredPolicy => sections(&mut rows, &robot_id).policy = change.decode()?.map(Arc::new),
+            Table::DesiredUpdate => sections(&mut rows, &robot_id).update = change.decode()?.map(Arc::new),
             Table::Session => put(&mut rows.sessions, robot_id.clone(), change.decode()?),
             Table::Presence => put(&mut rows.presence, robot_id.clone(), change.decode()?),
             Table::LaneMark => put(&mut rows.marks, id, change.decode()?),
@@ -123,7 +134,7 @@ impl Fold for Keeper {
         }
         drop(rows);
         match change.key.table {
-            Table::DesiredWork | Table::DesiredPolicy => self.0.picture.publish(&robot_id),
+            Table::DesiredWork | Table::DesiredPolicy | Table::DesiredUpdate => self.0.picture.publish(&robot_id),
             Table::Session | Table::Presence => self.0.picture.touch(&robot_id),
             _ => {}
         }

@@ -153,6 +153,7 @@ impl Session {
                     self.say(|out| {
                         out.work = sections.work.as_deref().cloned();
                         out.policy = sections.policy.as_deref().cloned();
+                        out.update = sections.update.as_deref().cloned();
                     });
                 }
                 () = at(unread_at) => return close(CloseCode::TooSlow, Code::Overloaded, LinkDuration(1_000)),

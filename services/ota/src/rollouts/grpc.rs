@@ -1,0 +1,451 @@
+//! The gRPC face of roll-outs: decode, call, encode.
+
+use super::{RolloutService, decode, encode, watch};
+use midshift_core::ids::{RobotId, RolloutId};
+use midshift_core::limits;
+use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
+use midshift_core::rollout::commands::{self, Command, Verb};
+use midshift_core::rollout::view::View;
+use midshift_proto::convert::task::revision_of;
+use midshift_proto::ota::v1;
+use midshift_proto::ota::v1::rollout_service_server::RolloutService as Face;
+use std::cmp::Reverse;
+use std::sync::Arc;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Request, Response, Status};
+
+/// Messages that wait for a watcher.
+const WATCH_MAX: usize = 4;
+
+fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {
+    result.map(Response::new).map_err(|refusal| {
+        metrics::counter!("midshift_ota_refused_total", "code" => refusal.reason.code.as_str()).increment(1);
+        midshift_proto::status(&refusal, None)
+    })
+}
+
+fn internal() -> Refusal {
+    Refusal::new(Kind::Internal, Code::Internal)
+}
+
+fn required_reason(text: &str, bad: &mut Violations) {
+    if text.is_empty() || text.len() > limits::REASON_BYTES_MAX {
+        bad.add("reason", "is required, 1-256 bytes");
+    }
+}
+
+fn page_size(asked: u32, bad: &mut Violations) -> usize {
+    match asked as usize {
+        0 => limits::PAGE_DEFAULT,
+        n if n <= limits::PAGE_MAX => n,
+        _ => {
+            bad.add("page_size", "must be 1..1000; 0: 100");
+            limits::PAGE_DEFAULT
+        }
+    }
+}
+
+/// One page of rows in order of a key, and the key to go on after.
+fn page<K: Ord + ToString, T>(rows: impl Iterator<Item = (K, T)>, after: &str, size: usize) -> (Vec<T>, String) {
+    let mut rows = rows.peekable();
+    let mut skipping = !after.is_empty();
+    let mut out = Vec::new();
+    let mut last = String::new();
+    for (key, row) in rows.by_ref() {
+        if skipping {
+            skipping = key.to_string() != after;
+            continue;
+        }
+        last = key.to_string();
+        out.push(row);
+        if out.len() == size {
+            break;
+        }
+    }
+    let next = if rows.peek().is_some() { last } else { String::new() };
+    (out, next)
+}
+
+/// What all verbs about one roll-out say.
+struct About<'a> {
+    rollout_id: &'a str,
+    etag: &'a str,
+    reason: &'a str,
+}
+
+impl RolloutService {
+    async fn shown(&self, rollout_id: RolloutId) -> Result<v1::Rollout, Refusal> {
+        self.look(move |view, _, now| {
+            let rowed = view.rollouts.get(rollout_id.as_str());
+            let reason = || Reason::from(Code::RolloutNotFound).with("rollout_id", &rollout_id);
+            let rowed = rowed.ok_or_else(|| Refusal::new(Kind::NotFound, reason()))?;
+            Ok(encode::rollout(view, now, &rowed.row, rowed.revision))
+        })
+        .await?
+    }
+
+    async fn verb(&self, about: About<'_>, verb: Verb, needs_etag: bool) -> Result<Option<v1::Rollout>, Refusal> {
+        let mut bad = Violations::default();
+        let rollout_id = bad.take("rollout_id", RolloutId::parse(about.rollout_id));
+        if about.reason.len() > limits::REASON_BYTES_MAX {
+            bad.add("reason", "must be at most 256 bytes");
+        }
+        let seen = revision_of(about.etag);
+        if needs_etag && seen.is_none() {
+            bad.add("etag", "is required: send back the one of the roll-out as you saw it");
+        }
+        bad.finish()?;
+        let rollout_id = rollout_id.ok_or_else(internal)?;
+        let command = Command::Do { rollout_id: rollout_id.clone(), verb, reason: about.reason.to_owned() };
+        self.act(command, seen).await?;
+        self.shown(rollout_id).await.map(Some)
+    }
+
+    async fn bundle(&self, text: &str) -> Result<midshift_core::ids::BundleId, Refusal> {
+        let text = text.to_owned();
+        self.look(move |view, _, _| decode::bundle(view, &text)).await?
+    }
+
+    async fn create(&self, r: v1::CreateRolloutRequest) -> Result<v1::CreateRolloutResponse, Refusal> {
+        let mut bad = Violations::default();
+        let rollout_id = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
+        let spec = r.spec.unwrap_or_default();
+        if spec.bundle.is_empty() {
+            bad.add("spec.bundle", "is required");
+        }
+        bad.finish()?;
+        let bundle = self.bundle(&spec.bundle).await?;
+        let mut bad = Violations::default();
+        let spec = decode::spec(&spec, bundle, &mut bad);
+        spec.check(&mut bad);
+        bad.finish()?;
+        let rollout_id = rollout_id.ok_or_else(internal)?;
+        self.act(Command::Create { rollout_id: rollout_id.clone(), spec: Arc::new(spec) }, None).await?;
+        Ok(v1::CreateRolloutResponse { rollout: Some(self.shown(rollout_id).await?) })
+    }
+
+    async fn plan(&self, r: v1::PlanRolloutRequest) -> Result<v1::PlanRolloutResponse, Refusal> {
+        let mut bad = Violations::default();
+        let rollout_id = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
+        bad.finish()?;
+        let rollout_id = rollout_id.ok_or_else(internal)?;
+        self.look(move |view, board, _| {
+            let spec = match r.spec {
+                Some(wire) => {
+                    let bundle = decode::bundle(view, &wire.bundle)?;
+                    let mut bad = Violations::default();
+                    let spec = decode::spec(&wire, bundle, &mut bad);
+                    bad.finish()?;
+                    Arc::new(spec)
+                }
+                None => view.rollout(&rollout_id).map(|r| r.spec.clone()).ok_or_else(|| {
+                    Refusal::new(Kind::NotFound, Reason::from(Code::RolloutNotFound).with("rollout_id", &rollout_id))
+                })?,
+            };
+            let run = commands::dry_run(view, board, &rollout_id, &spec)?;
+            Ok(encode::plan(&run, spec.waves.len()))
+        })
+        .await?
+    }
+
+    async fn exclude(&self, r: v1::ExcludeRobotRequest) -> Result<v1::ExcludeRobotResponse, Refusal> {
+        let mut bad = Violations::default();
+        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        bad.finish()?;
+        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let rollout = self.verb(about, Verb::Exclude(robot_id.ok_or_else(internal)?), false).await?;
+        Ok(v1::ExcludeRobotResponse { rollout })
+    }
+
+    async fn roll_back(&self, r: v1::RollBackRolloutRequest) -> Result<v1::RollBackRolloutResponse, Refusal> {
+        let mut bad = Violations::default();
+        let of = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
+        let rollout_id = bad.take("new_rollout_id", RolloutId::parse(&r.new_rollout_id));
+        bad.finish()?;
+        let (of, rollout_id) = of.zip(rollout_id).ok_or_else(internal)?;
+        self.act(Command::Rollback { of, rollout_id: rollout_id.clone() }, None).await?;
+        Ok(v1::RollBackRolloutResponse { rollout: Some(self.shown(rollout_id).await?) })
+    }
+
+    async fn list(&self, r: v1::ListRolloutsRequest) -> Result<v1::ListRolloutsResponse, Refusal> {
+        let mut bad = Violations::default();
+        let size = page_size(r.page_size, &mut bad);
+        bad.finish()?;
+        self.look(move |view, _, now| {
+            let mut all: Vec<_> = view.rollouts.values().collect();
+            all.sort_by_key(|r| (Reverse(r.row.created.at), r.row.rollout_id.clone()));
+            let rows = all.into_iter().map(|r| (r.row.rollout_id.to_string(), r));
+            let (rows, next_page_token) = page(rows, &r.page_token, size);
+            let rollouts = rows.into_iter().map(|r| encode::rollout(view, now, &r.row, r.revision)).collect();
+            v1::ListRolloutsResponse { rollouts, next_page_token }
+        })
+        .await
+    }
+
+    async fn robots(&self, r: v1::ListRolloutRobotsRequest) -> Result<v1::ListRolloutRobotsResponse, Refusal> {
+        let mut bad = Violations::default();
+        let size = page_size(r.page_size, &mut bad);
+        let rollout_id = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
+        bad.finish()?;
+        let rollout_id = rollout_id.ok_or_else(internal)?;
+        self.look(move |view, board, now| {
+            let row = view.rollout(&rollout_id).ok_or_else(|| {
+                Refusal::new(Kind::NotFound, Reason::from(Code::RolloutNotFound).with("rollout_id", &rollout_id))
+            })?;
+            let asked = |id: &RobotId| r.robot_id.is_empty() || id.as_str() == r.robot_id;
+            let rows = view.robots_of(&rollout_id).filter(|r| asked(&r.robot_id));
+            let (rows, next_page_token) = page(rows.map(|r| (r.robot_id.to_string(), r)), &r.page_token, size);
+            let robots = rows.into_iter().map(|r| encode::robot(view, board, now, row, r)).collect();
+            Ok(v1::ListRolloutRobotsResponse { robots, next_page_token })
+        })
+        .await?
+    }
+
+    async fn revoke(&self, r: v1::RevokeBundleRequest) -> Result<v1::RevokeBundleResponse, Refusal> {
+        let mut bad = Violations::default();
+        required_reason(&r.reason, &mut bad);
+        bad.finish()?;
+        let bundle = self.bundle(&r.bundle).await?;
+        self.act(Command::Revoke { bundle: bundle.clone(), reason: r.reason }, None).await?;
+        self.look(move |view, _, _| {
+            let of = view.rollouts.values().map(|r| &r.row).filter(|r| r.spec.bundle == bundle && !r.phase.is_over());
+            let rollout_ids = of.map(|r| r.rollout_id.to_string()).collect();
+            v1::RevokeBundleResponse { bundle: bundle.to_string(), rollout_ids }
+        })
+        .await
+    }
+
+    async fn software_of(&self, robot_id: RobotId) -> Result<Option<v1::RobotSoftware>, Refusal> {
+        self.look(move |view: &View, _, _| Some(encode::software(&view.software_of(&robot_id)))).await
+    }
+
+    async fn pin(&self, r: v1::PinRobotRequest) -> Result<v1::PinRobotResponse, Refusal> {
+        let mut bad = Violations::default();
+        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        required_reason(&r.reason, &mut bad);
+        bad.finish()?;
+        let robot_id = robot_id.ok_or_else(internal)?;
+        self.act(Command::Pin { robot_id: robot_id.clone(), reason: r.reason }, None).await?;
+        Ok(v1::PinRobotResponse { software: self.software_of(robot_id).await? })
+    }
+
+    async fn unpin(&self, r: v1::UnpinRobotRequest) -> Result<v1::UnpinRobotResponse, Refusal> {
+        let mut bad = Violations::default();
+        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        bad.finish()?;
+        let robot_id = robot_id.ok_or_else(internal)?;
+        self.act(Command::Unpin { robot_id: robot_id.clone() }, None).await?;
+        Ok(v1::UnpinRobotResponse { software: self.software_of(robot_id).await? })
+    }
+
+    async fn software(&self, r: v1::ListRobotSoftwareRequest) -> Result<v1::ListRobotSoftwareResponse, Refusal> {
+        let mut bad = Violations::default();
+        let size = page_size(r.page_size, &mut bad);
+        bad.finish()?;
+        self.look(move |view, _, _| {
+            let rows = view.software.iter().filter(|(id, _)| r.robot_id.is_empty() || **id == r.robot_id);
+            let (rows, next_page_token) = page(rows.map(|(id, s)| (id.clone(), s)), &r.page_token, size);
+            let software = rows.into_iter().map(|s| encode::software(&s.row)).collect();
+            v1::ListRobotSoftwareResponse { software, next_page_token }
+        })
+        .await
+    }
+
+    async fn quarantines(&self, r: v1::ListQuarantinesRequest) -> Result<v1::ListQuarantinesResponse, Refusal> {
+        let mut bad = Violations::default();
+        let size = page_size(r.page_size, &mut bad);
+        bad.finish()?;
+        self.look(move |view, _, _| {
+            let rows = view.quarantines.iter().map(|(id, q)| (id.clone(), q));
+            let (rows, next_page_token) = page(rows, &r.page_token, size);
+            let quarantines = rows.into_iter().map(|q| encode::quarantine(view, &q.row)).collect();
+            v1::ListQuarantinesResponse { quarantines, next_page_token }
+        })
+        .await
+    }
+
+    async fn lift(&self, r: v1::LiftQuarantineRequest) -> Result<v1::LiftQuarantineResponse, Refusal> {
+        let mut bad = Violations::default();
+        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        bad.finish()?;
+        let robot_id = robot_id.ok_or_else(internal)?;
+        let bundle = self.bundle(&r.bundle).await?;
+        self.act(Command::LiftQuarantine { robot_id, bundle }, None).await?;
+        Ok(v1::LiftQuarantineResponse {})
+    }
+}
+
+#[tonic::async_trait]
+impl Face for RolloutService {
+    type WatchRolloutStream = ReceiverStream<Result<v1::WatchRolloutResponse, Status>>;
+
+    async fn create_rollout(
+        &self,
+        r: Request<v1::CreateRolloutRequest>,
+    ) -> Result<Response<v1::CreateRolloutResponse>, Status> {
+        answer(self.create(r.into_inner()).await)
+    }
+    async fn plan_rollout(
+        &self,
+        r: Request<v1::PlanRolloutRequest>,
+    ) -> Result<Response<v1::PlanRolloutResponse>, Status> {
+        answer(self.plan(r.into_inner()).await)
+    }
+    async fn submit_rollout(
+        &self,
+        r: Request<v1::SubmitRolloutRequest>,
+    ) -> Result<Response<v1::SubmitRolloutResponse>, Status> {
+        let r = r.into_inner();
+        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let rollout = self.verb(about, Verb::Submit, false).await;
+        answer(rollout.map(|rollout| v1::SubmitRolloutResponse { rollout }))
+    }
+    async fn approve_rollout(
+        &self,
+        r: Request<v1::ApproveRolloutRequest>,
+    ) -> Result<Response<v1::ApproveRolloutResponse>, Status> {
+        let r = r.into_inner();
+        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let rollout = self.verb(about, Verb::Approve, false).await;
+        answer(rollout.map(|rollout| v1::ApproveRolloutResponse { rollout }))
+    }
+    async fn start_rollout(
+        &self,
+        r: Request<v1::StartRolloutRequest>,
+    ) -> Result<Response<v1::StartRolloutResponse>, Status> {
+        let r = r.into_inner();
+        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let rollout = self.verb(about, Verb::Start { supersede: r.supersede }, false).await;
+        answer(rollout.map(|rollout| v1::StartRolloutResponse { rollout }))
+    }
+    async fn pause_rollout(
+        &self,
+        r: Request<v1::PauseRolloutRequest>,
+    ) -> Result<Response<v1::PauseRolloutResponse>, Status> {
+        let r = r.into_inner();
+        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let rollout = self.verb(about, Verb::Pause, false).await;
+        answer(rollout.map(|rollout| v1::PauseRolloutResponse { rollout }))
+    }
+    async fn resume_rollout(
+        &self,
+        r: Request<v1::ResumeRolloutRequest>,
+    ) -> Result<Response<v1::ResumeRolloutResponse>, Status> {
+        let r = r.into_inner();
+        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let rollout = self.verb(about, Verb::Resume, true).await;
+        answer(rollout.map(|rollout| v1::ResumeRolloutResponse { rollout }))
+    }
+    async fn promote_rollout(
+        &self,
+        r: Request<v1::PromoteRolloutRequest>,
+    ) -> Result<Response<v1::PromoteRolloutResponse>, Status> {
+        let r = r.into_inner();
+        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let rollout = self.verb(about, Verb::Promote, true).await;
+        answer(rollout.map(|rollout| v1::PromoteRolloutResponse { rollout }))
+    }
+    async fn abort_rollout(
+        &self,
+        r: Request<v1::AbortRolloutRequest>,
+    ) -> Result<Response<v1::AbortRolloutResponse>, Status> {
+        let r = r.into_inner();
+        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let rollout = self.verb(about, Verb::Abort, true).await;
+        answer(rollout.map(|rollout| v1::AbortRolloutResponse { rollout }))
+    }
+    async fn retry_rollout(
+        &self,
+        r: Request<v1::RetryRolloutRequest>,
+    ) -> Result<Response<v1::RetryRolloutResponse>, Status> {
+        let r = r.into_inner();
+        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let rollout = self.verb(about, Verb::RetryFailed, false).await;
+        answer(rollout.map(|rollout| v1::RetryRolloutResponse { rollout }))
+    }
+    async fn exclude_robot(
+        &self,
+        r: Request<v1::ExcludeRobotRequest>,
+    ) -> Result<Response<v1::ExcludeRobotResponse>, Status> {
+        answer(self.exclude(r.into_inner()).await)
+    }
+    async fn roll_back_rollout(
+        &self,
+        r: Request<v1::RollBackRolloutRequest>,
+    ) -> Result<Response<v1::RollBackRolloutResponse>, Status> {
+        answer(self.roll_back(r.into_inner()).await)
+    }
+    async fn list_rollouts(
+        &self,
+        r: Request<v1::ListRolloutsRequest>,
+    ) -> Result<Response<v1::ListRolloutsResponse>, Status> {
+        answer(self.list(r.into_inner()).await)
+    }
+    async fn list_rollout_robots(
+        &self,
+        r: Request<v1::ListRolloutRobotsRequest>,
+    ) -> Result<Response<v1::ListRolloutRobotsResponse>, Status> {
+        answer(self.robots(r.into_inner()).await)
+    }
+    async fn revoke_bundle(
+        &self,
+        r: Request<v1::RevokeBundleRequest>,
+    ) -> Result<Response<v1::RevokeBundleResponse>, Status> {
+        answer(self.revoke(r.into_inner()).await)
+    }
+    async fn pin_robot(&self, r: Request<v1::PinRobotRequest>) -> Result<Response<v1::PinRobotResponse>, Status> {
+        answer(self.pin(r.into_inner()).await)
+    }
+    async fn unpin_robot(&self, r: Request<v1::UnpinRobotRequest>) -> Result<Response<v1::UnpinRobotResponse>, Status> {
+        answer(self.unpin(r.into_inner()).await)
+    }
+    async fn list_robot_software(
+        &self,
+        r: Request<v1::ListRobotSoftwareRequest>,
+    ) -> Result<Response<v1::ListRobotSoftwareResponse>, Status> {
+        answer(self.software(r.into_inner()).await)
+    }
+    async fn list_quarantines(
+        &self,
+        r: Request<v1::ListQuarantinesRequest>,
+    ) -> Result<Response<v1::ListQuarantinesResponse>, Status> {
+        answer(self.quarantines(r.into_inner()).await)
+    }
+    async fn lift_quarantine(
+        &self,
+        r: Request<v1::LiftQuarantineRequest>,
+    ) -> Result<Response<v1::LiftQuarantineResponse>, Status> {
+        answer(self.lift(r.into_inner()).await)
+    }
+    async fn get_rollout(&self, r: Request<v1::GetRolloutRequest>) -> Result<Response<v1::GetRolloutResponse>, Status> {
+        let rollout = match named(&r.into_inner().rollout_id) {
+            Ok(rollout_id) => self.shown(rollout_id).await,
+            Err(refusal) => Err(refusal),
+        };
+        answer(rollout.map(|rollout| v1::GetRolloutResponse { rollout: Some(rollout) }))
+    }
+    async fn watch_rollout(
+        &self,
+        r: Request<v1::WatchRolloutRequest>,
+    ) -> Result<Response<Self::WatchRolloutStream>, Status> {
+        let rollout_id = named(&r.into_inner().rollout_id).map_err(|refusal| midshift_proto::status(&refusal, None))?;
+        let (sender, stream) = mpsc::channel(WATCH_MAX);
+        let service = self.clone();
+        tokio::spawn(async move {
+            let shutdown = service.shutdown.clone();
+            tokio::select! {
+                () = shutdown.cancelled() => {}
+                () = watch::watch(service, rollout_id, sender) => {}
+            }
+        });
+        Ok(Response::new(ReceiverStream::new(stream)))
+    }
+}
+
+fn named(rollout_id: &str) -> Result<RolloutId, Refusal> {
+    let mut bad = Violations::default();
+    let rollout_id = bad.take("rollout_id", RolloutId::parse(rollout_id));
+    bad.finish()?;
+    rollout_id.ok_or_else(internal)
+}

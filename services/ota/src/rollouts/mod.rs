@@ -1,0 +1,130 @@
+//! Roll-outs as a service: reads the feed and the heartbeats, lets `core::rollout` decide, signs, commits, answers questions.
+//!
+//! Called by the binary: [`RolloutService::new`], its gRPC face, and [`Planner::run`]. Invariant: nothing is decided here; a lost wake costs one
+//! sweep; what is signed was decided by the planner and is committed with the row that explains it.
+
+mod decode;
+mod directives;
+mod encode;
+mod grpc;
+mod reconcile;
+mod releases;
+mod watch;
+
+use crate::OtaService;
+use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::rollout::Board;
+use midshift_core::rollout::bugs::Bugs;
+use midshift_core::rollout::commands::Command;
+use midshift_core::rollout::view::View;
+use midshift_core::rows::{Revision, Seq};
+use midshift_core::site::Site;
+use midshift_core::time::{Clock, Now};
+use midshift_core::work::Live;
+use midshift_proto::ota::v1::rollout_service_server::RolloutServiceServer;
+use midshift_store::{LiveBoard, Store};
+use std::sync::Arc;
+use tokio::sync::{mpsc, oneshot, watch as channel};
+use tokio_util::sync::CancellationToken;
+
+/// Requests that may wait for the planner; one more is told to come back.
+const REQUESTS_MAX: usize = 256;
+
+/// What the service is built from.
+pub struct Parts {
+    /// The memory that services share.
+    pub store: Arc<dyn Store>,
+    /// Newest heartbeats, written by telemetry.
+    pub board: Arc<LiveBoard<Live>>,
+    /// The site.
+    pub site: Arc<Site>,
+    /// Clocks.
+    pub clock: Arc<dyn Clock>,
+    /// Releases and keys.
+    pub ota: OtaService,
+    /// Naive rules for twins of tests; none outside them.
+    pub bugs: Bugs,
+}
+
+/// A question about the picture as it is now.
+type Look = Box<dyn FnOnce(&View, &Board, &Now) + Send>;
+
+/// Something a person asks of the planner.
+enum Request {
+    /// Change something; answered after the commit.
+    Do { command: Box<Command>, seen: Option<Revision>, actor: String, reply: oneshot::Sender<Result<(), Refusal>> },
+    /// Look at something.
+    Look(Look),
+}
+
+/// The service. Cheap to clone: all clones talk to one planner.
+#[derive(Clone)]
+pub struct RolloutService {
+    requests: mpsc::Sender<Request>,
+    /// Position up to which the picture is committed; changes with it.
+    changed: channel::Receiver<Seq>,
+    shutdown: CancellationToken,
+    has_keys: bool,
+}
+
+/// The part that runs.
+pub struct Planner {
+    parts: Parts,
+    requests: mpsc::Receiver<Request>,
+    changed: channel::Sender<Seq>,
+}
+
+impl RolloutService {
+    /// The face and the part that runs behind it. Streams end at `shutdown`.
+    pub fn new(parts: Parts, shutdown: CancellationToken) -> (Self, Planner) {
+        let (sender, requests) = mpsc::channel(REQUESTS_MAX);
+        let (changed, receiver) = channel::channel(Seq(0));
+        let has_keys = parts.ota.opened().is_ok();
+        let service = Self { requests: sender, changed: receiver, shutdown, has_keys };
+        (service, Planner { parts, requests, changed })
+    }
+    /// The gRPC face.
+    pub fn grpc(&self) -> RolloutServiceServer<Self> {
+        RolloutServiceServer::new(self.clone())
+    }
+    async fn send(&self, request: Request) -> Result<(), Refusal> {
+        if !self.has_keys {
+            return Err(Refusal::new(Kind::Precondition, Code::NoOnlineKeys));
+        }
+        self.requests.try_send(request).map_err(|e| match e {
+            mpsc::error::TrySendError::Full(_) => Refusal::new(Kind::Exhausted, Code::Overloaded),
+            mpsc::error::TrySendError::Closed(_) => Refusal::new(Kind::Unavailable, Code::ShuttingDown),
+        })
+    }
+    /// Runs `look` on the picture and gives its answer.
+    ///
+    /// # Errors
+    /// If the planner does not run.
+    pub async fn look<T: Send + 'static>(
+        &self,
+        look: impl FnOnce(&View, &Board, &Now) -> T + Send + 'static,
+    ) -> Result<T, Refusal> {
+        let (reply, answer) = oneshot::channel();
+        let look = move |view: &View, board: &Board, now: &Now| drop(reply.send(look(view, board, now)));
+        self.send(Request::Look(Box::new(look))).await?;
+        answer.await.map_err(|_| Refusal::new(Kind::Unavailable, Code::ShuttingDown))
+    }
+    /// Carries out a command and waits for its commit.
+    async fn act(&self, command: Command, seen: Option<Revision>) -> Result<(), Refusal> {
+        let (reply, answer) = oneshot::channel();
+        // Until login exists nobody is known by name.
+        let actor = "anonymous".to_owned();
+        self.send(Request::Do { command: Box::new(command), seen, actor, reply }).await?;
+        answer.await.map_err(|_| Refusal::new(Kind::Unavailable, Code::CommitUnknown))?
+    }
+}
+
+impl Planner {
+    /// Runs until `shutdown`. On a server without keys it only waits: nothing can be signed.
+    ///
+    /// # Errors
+    /// Never by itself; the caller's services end alike.
+    pub async fn run(self, shutdown: CancellationToken) -> Result<(), midshift_store::Error> {
+        reconcile::run(self, shutdown).await
+    }
+}

@@ -1,0 +1,195 @@
+//! The loop: take what is new, decide, sign, commit. A conflict means that somebody else decided too: the picture is built again.
+//!
+//! Invariant: the view has absorbed the whole feed before anything is decided on it.
+
+use super::directives::Signer;
+use super::{Parts, Planner, Request, releases};
+use midshift_core::limits;
+use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::rollout::view::{TABLES, View};
+use midshift_core::rollout::{Board, LOGS, Plan, absorb, commands, cycle};
+use midshift_core::rows::Seq;
+use midshift_core::time::Now;
+use midshift_core::work::Live;
+use midshift_store::{CommitError, Dirty, Error, FEED_PAGE_MAX};
+use std::collections::BTreeSet;
+use std::time::Duration;
+use tokio::sync::{oneshot, watch};
+use tokio_util::sync::CancellationToken;
+
+/// Pause after the store failed, before everything is read again.
+const STORE_RETRY: Duration = Duration::from_millis(200);
+/// Requests taken into one cycle.
+const REQUESTS_PER_CYCLE: usize = 64;
+
+struct Loop {
+    parts: Parts,
+    view: View,
+    seq: Seq,
+    board: Board,
+    dirty: Dirty<Live>,
+    started: Now,
+    changed: watch::Sender<Seq>,
+}
+
+type Replies = Vec<(oneshot::Sender<Result<(), Refusal>>, usize)>;
+
+/// Runs until `shutdown`.
+pub async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Error> {
+    let Planner { parts, mut requests, changed } = planner;
+    if parts.ota.opened().is_err() {
+        shutdown.cancelled().await;
+        return Ok(());
+    }
+    let started = parts.clock.now();
+    let dirty = parts.board.watch();
+    let view = View::new(parts.site.clone(), started, started);
+    let mut this = Loop { parts, view, seq: Seq(0), board: Board::new(), dirty, started, changed };
+    this.rebuild_until_read(&shutdown).await;
+    let mut sweep = tokio::time::interval(Duration::from_millis(limits::SWEEP.as_ms()));
+    sweep.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    let mut batch = Vec::new();
+    let mut more = false;
+    loop {
+        tokio::select! {
+            biased;
+            () = shutdown.cancelled() => return Ok(()),
+            n = requests.recv_many(&mut batch, REQUESTS_PER_CYCLE) => if n == 0 { return Ok(()) },
+            _ = sweep.tick(), if !more => {}
+            () = tokio::task::yield_now(), if more => {}
+        }
+        match this.turn(std::mem::take(&mut batch)).await {
+            Ok(unfinished) => more = unfinished,
+            Err(()) => {
+                tokio::time::sleep(STORE_RETRY).await;
+                this.rebuild_until_read(&shutdown).await;
+            }
+        }
+    }
+}
+
+impl Loop {
+    async fn rebuild_until_read(&mut self, shutdown: &CancellationToken) {
+        while let Err(error) = self.rebuild().await {
+            tracing::warn!(%error, "roll-outs cannot read the store, trying again");
+            tokio::select! {
+                () = shutdown.cancelled() => return,
+                () = tokio::time::sleep(STORE_RETRY) => {}
+            }
+        }
+    }
+
+    /// Builds the picture from nothing.
+    async fn rebuild(&mut self) -> Result<(), Error> {
+        let snapshot = self.parts.store.snapshot(TABLES).await?;
+        let now = self.parts.clock.now();
+        let served = self.view.served_ms(&now);
+        self.view = View::new(self.parts.site.clone(), self.started, now);
+        self.view.bugs = self.parts.bugs;
+        self.view.load(&snapshot.rows, snapshot.seq)?;
+        // The row is as old as the last commit; this process has served on since.
+        self.view.served.site_ms = self.view.served.site_ms.max(served);
+        self.seq = self.view.marks.get("ota").map_or(Seq(0), |m| m.row.seq).min(snapshot.seq);
+        metrics::counter!("midshift_ota_rebuilds_total").increment(1);
+        Ok(())
+    }
+
+    /// One turn; true: there is more to do at once. An error: the picture can no longer be trusted.
+    async fn turn(&mut self, requests: Vec<Request>) -> Result<bool, ()> {
+        let mut heard = BTreeSet::new();
+        for (robot_id, live) in self.dirty.take() {
+            match live {
+                Some(live) => {
+                    heard.insert(robot_id.clone());
+                    self.board.insert(robot_id, live);
+                }
+                None => {
+                    self.board.remove(&robot_id);
+                }
+            }
+        }
+        let now = self.parts.clock.now();
+        let mut plan = Plan::default();
+        self.take_feed(now, &mut plan)
+            .await
+            .map_err(|error| tracing::warn!(%error, "roll-outs cannot read the feed"))?;
+        let Ok(opened) = self.parts.ota.opened() else { return Ok(false) };
+        releases::take(&mut self.view, now, opened.repository.newest().as_deref(), &mut plan);
+        let replies = take_requests(&mut self.view, &self.board, requests, now, &mut plan);
+        let signer = Signer(opened.repository.keys().directive());
+        let more = cycle(&mut self.view, now, &self.board, &heard, &signer, &mut plan);
+        for text in &plan.unreadable {
+            tracing::error!(text, "roll-outs passed over something they cannot read");
+        }
+        self.commit(plan, replies).await?;
+        Ok(more)
+    }
+
+    /// Absorbs the feed to its head.
+    async fn take_feed(&mut self, now: Now, plan: &mut Plan) -> Result<(), Error> {
+        loop {
+            let page = match self.parts.store.feed(self.seq, LOGS, FEED_PAGE_MAX).await {
+                Err(Error::CursorExpired { asked, oldest }) if asked < oldest && self.seq == Seq(0) => {
+                    self.seq = oldest;
+                    continue;
+                }
+                page => page?,
+            };
+            absorb(&mut self.view, now, &page.entries, plan);
+            self.seq = page.next;
+            if page.next >= page.head {
+                return Ok(());
+            }
+        }
+    }
+
+    async fn commit(&mut self, plan: Plan, replies: Replies) -> Result<(), ()> {
+        if plan.items.is_empty() {
+            return Ok(());
+        }
+        let results = self.parts.store.commit(plan.items).await;
+        let mut trusted = Ok(());
+        let mut newest = None;
+        for result in &results {
+            match result {
+                Ok(applied) => newest = Some(applied.seq),
+                Err(error) => {
+                    let conflict = matches!(error, CommitError::Conflict { .. });
+                    let counted =
+                        metrics::counter!("midshift_ota_items_lost_total", "conflict" => conflict.to_string());
+                    counted.increment(1);
+                    tracing::warn!(%error, "an item of a roll-out was not applied; planning again");
+                    trusted = Err(());
+                }
+            }
+        }
+        for (reply, upto) in replies {
+            let lost = results.iter().take(upto).any(Result::is_err);
+            let answer = if lost { Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)) } else { Ok(()) };
+            drop(reply.send(answer));
+        }
+        if let Some(seq) = newest {
+            self.changed.send_replace(seq);
+        }
+        trusted
+    }
+}
+
+fn take_requests(view: &mut View, board: &Board, requests: Vec<Request>, now: Now, plan: &mut Plan) -> Replies {
+    let mut replies = Vec::new();
+    for request in requests {
+        match request {
+            Request::Look(look) => look(view, board, &now),
+            Request::Do { command, seen, actor, reply } => match commands::check(view, board, &command, seen) {
+                // What was asked before is in the store: nothing is written, and nothing has to be waited for.
+                Ok(true) => drop(reply.send(Ok(()))),
+                Err(refusal) => drop(reply.send(Err(refusal))),
+                Ok(false) => {
+                    commands::apply(view, board, now, &command, &actor, plan);
+                    replies.push((reply, plan.items.len()));
+                }
+            },
+        }
+    }
+    replies
+}

@@ -1,0 +1,57 @@
+//! Bundles of the newest release as rows: what the planner knows of them.
+//!
+//! Invariant: a row is never deleted, so that a roll-out always knows what it is of; a bundle that the release lists no more is unlisted.
+
+use crate::repository::Newest;
+use midshift_bundle::manifest::{ComponentKind, Manifest, Migration};
+use midshift_core::ids::BundleId;
+use midshift_core::limits;
+use midshift_core::rollout::Plan;
+use midshift_core::rollout::rows::Bundle;
+use midshift_core::rollout::view::View;
+use midshift_core::time::Now;
+use std::collections::BTreeSet;
+
+/// Makes the rows say what the release says.
+pub fn take(view: &mut View, now: Now, newest: Option<&Newest>, plan: &mut Plan) {
+    let releases = newest.map(|newest| newest.releases.as_slice()).unwrap_or_default();
+    let mut changed = Vec::new();
+    let mut listed = BTreeSet::new();
+    for release in releases {
+        let Ok(bundle) = BundleId::parse(&release.digest.to_string()) else { continue };
+        listed.insert(bundle.clone());
+        let known = view.bundles.get(bundle.as_str()).map(|b| &b.row);
+        if known.is_none_or(|known| !known.listed) {
+            let revoked = known.and_then(|k| k.revoked.clone());
+            let length = release.manifest.to_bytes().len() as u64;
+            changed.push(Bundle { revoked, ..fresh(bundle, &release.manifest, length, release.seen) });
+        }
+    }
+    let gone = view.bundles.values().map(|b| &b.row).filter(|b| b.listed && !listed.contains(&b.bundle));
+    changed.extend(gone.map(|b| Bundle { listed: false, ..b.clone() }));
+    for rows in changed.chunks(limits::ITEM_ROWS_MAX) {
+        plan.decide(view, now, "ota", |tx| {
+            for row in rows {
+                tx.put(row.clone(), if row.listed { "bundle.listed" } else { "bundle.unlisted" });
+            }
+        });
+    }
+}
+
+fn fresh(bundle: BundleId, manifest: &Manifest, manifest_length: u64, published: midshift_core::time::Utc) -> Bundle {
+    Bundle {
+        bundle,
+        name: manifest.name.clone(),
+        version: manifest.version.clone(),
+        manifest_length,
+        length: manifest.length(),
+        hardware: manifest.hardware().into_iter().map(str::to_owned).collect(),
+        needs: manifest.needs().as_str().to_owned(),
+        hard_stop_codes: manifest.hard_stop_codes.clone(),
+        is_irreversible: manifest.components.iter().any(|c| c.data_migration == Migration::Irreversible),
+        has_base: manifest.components.iter().any(|c| c.kind == ComponentKind::Base),
+        listed: true,
+        revoked: None,
+        published,
+    }
+}
