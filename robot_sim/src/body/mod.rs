@@ -30,6 +30,8 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use tokio::sync::watch;
 
+/// The hardware model of a simulated robot, as bundles name it.
+pub const MODEL: &str = "midshift-sim";
 /// The fastest a simulated body goes, millimetres per second.
 pub const SPEED_MAX_MM_S: u32 = 1_500;
 /// The slowest it is asked to go, millimetres per second; also its speed at the stop level SLOW.

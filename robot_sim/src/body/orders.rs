@@ -1,6 +1,6 @@
 //! `trait Body` for the simulated body.
 
-use super::{Order, Phase, SPEED_FLOOR_MM_S, SPEED_MAX_MM_S, SimBody};
+use super::{MODEL, Order, Phase, SPEED_FLOOR_MM_S, SPEED_MAX_MM_S, SimBody};
 use crate::faults;
 use crate::journal::Work;
 use midshift_agent::body::{Body, BodyLimits, BodyNews, BodyOrder, BodyState, Checked, PathPoint};
@@ -23,7 +23,7 @@ impl Body for SimBody {
             payload_g: 15_000,
             software: self.config.software.clone(),
             agent_version: String::new(),
-            model: "midshift-sim".to_owned(),
+            model: MODEL.to_owned(),
         }
     }
     fn limits(&self) -> BodyLimits {

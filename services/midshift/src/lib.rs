@@ -11,6 +11,7 @@ pub mod logs;
 pub mod planning;
 pub mod report;
 pub mod robots;
+pub mod samples;
 pub mod serve;
 pub mod server;
 pub mod site_file;

@@ -373,6 +373,8 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     t.note(&[&["bundle", "sign", "walk-1.5.0"][..], &repository, &["keys/targets-1.pem"]].concat())?;
     t.note(&[&["bundle", "sign", "--pending"][..], &repository, &["keys/targets-2.pem"]].concat())?;
     t.note(&["bundle", "verify", "repository", "-o", "json"])?;
+    t.note(&["bundle", "samples", "samples", "--config-only", "-o", "json"])?;
+    t.note(&["bundle", "samples", "samples", "--config-only"])?;
     releases(&mut t).await?;
     std::fs::write(t.dir.join("walk-1.5.0/gait-1.5.0.component"), "flies")?;
     t.note(&["bundle", "inspect", "walk-1.5.0"])?;

@@ -4,6 +4,7 @@ use super::client::{Call, Exit, unary};
 use super::out::{Format, Out};
 use super::push;
 use crate::clock;
+use crate::samples::{self, Signer};
 use clap::{Subcommand, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};
 use midshift_bundle::build;
@@ -52,6 +53,23 @@ pub enum Verb {
         /// A secret key of targets; more than one if you hold more.
         #[arg(long, required = true)]
         key: Vec<PathBuf>,
+    },
+    /// Make sample releases of the simulator's behaviour, two good and three bad ones, signed with throw-away keys: to try roll-outs with.
+    Samples {
+        /// A new folder for bundles, keys and repository.
+        dir: PathBuf,
+        /// The program that robots start. Without it this one.
+        #[arg(long, conflicts_with = "config_only")]
+        program: Option<PathBuf>,
+        /// Only behaviour.toml: all that robots simulated in one process read.
+        #[arg(long)]
+        config_only: bool,
+        /// Sign into this repository instead of a new one, e.g. that of a running dev.
+        #[arg(long, requires = "key")]
+        repository: Option<PathBuf>,
+        /// A secret key of targets of that repository.
+        #[arg(long, requires = "repository")]
+        key: Option<PathBuf>,
     },
     /// Show a built bundle, and hold its files against its manifest.
     Inspect {
@@ -127,6 +145,17 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Keygen { profile, keys, repository } => keygen(profile, &keys, &repository, out),
         Verb::Build { folder, out: into } => build_one(&folder, &into, out),
         Verb::Sign { bundle, pending: _, repository, key } => sign(bundle.as_deref(), &repository, &key, out),
+        Verb::Samples { dir, program, config_only, repository, key } => {
+            let program = match program {
+                None if !config_only => Some(std::env::current_exe().map_err(anyhow::Error::from)?),
+                named => named,
+            };
+            let signer = match (&repository, &key) {
+                (Some(repository), Some(key)) => Signer::Named { repository, key },
+                _ => Signer::Throwaway,
+            };
+            samples(&dir, program.as_deref(), signer, out)
+        }
         Verb::Inspect { bundle } => show(&build::inspect(&bundle).map_err(|e| does_not_hold(e.into()))?, out),
         Verb::Verify { repository } => verify(&repository, out),
         Verb::Push { repository, call } => push::run(&repository, &call, out).await,
@@ -185,6 +214,30 @@ fn sign(bundle: Option<&Path>, repository: &Path, keys: &[PathBuf], out: &Out) -
             told(&serde_json::json!({"pending": true}), out);
             out.say("not enough signatures yet: metadata/pending.targets.json waits for another person");
             out.next(&format!("midshift bundle sign --pending --repository {} --key KEY", repository.display()));
+        }
+    }
+    Ok(())
+}
+
+fn samples(dir: &Path, program: Option<&Path>, signer: Signer<'_>, out: &Out) -> Result<(), Exit> {
+    let made = samples::make(dir, program, signer, clock::wall())?;
+    match out.format {
+        Format::Json | Format::Jsonl => {
+            let bundles: Vec<_> = made.bundles.iter().map(|(path, _)| path).collect();
+            let all = serde_json::json!({"bundles": bundles, "keys": made.keys, "repository": made.repository, "targetsVersion": made.targets_version});
+            out.line(&all.to_string());
+        }
+        Format::Name => made.bundles.iter().for_each(|(path, _)| out.line(&path.display().to_string())),
+        Format::Table => {
+            let row = |(path, bundle): &(PathBuf, Manifest)| {
+                vec![path.display().to_string(), bundle.version.clone(), bundle.description.clone()]
+            };
+            let rows: Vec<_> = made.bundles.iter().map(row).collect();
+            out.line(super::out::columns(&["BUNDLE", "VERSION", "WHAT IT DOES"], &rows).trim_end());
+            if let Some(keys) = &made.keys {
+                out.say(&format!("throw-away keys in {}: never use them in earnest", keys.display()));
+            }
+            out.next(&format!("midshift bundle push {}", made.repository.display()));
         }
     }
     Ok(())
