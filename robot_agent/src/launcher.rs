@@ -12,6 +12,7 @@
 
 #![expect(clippy::disallowed_methods, reason = "a program of its own without a runtime and without simulated time")]
 
+use crate::starts::{self, HANG_SECONDS, Tries};
 use crate::switch::{self, Switch};
 use std::fs;
 use std::io::{self, BufRead, BufReader, Write};
@@ -29,18 +30,10 @@ pub const PROGRAM: &str = "set.program";
 pub const SWITCH: &str = "switch";
 /// The program ends with this to be started again at once: it has written the switch record.
 pub const SWITCHED: u8 = 75;
-/// A set on trial is put away after so many starts that did not run well.
-pub const TRIES_MAX: u32 = 2;
 /// Environment variable that asks the program for its pulse.
 pub const PULSE_ASKED: &str = "MIDSHIFT_PULSE";
 /// The pulse.
 pub const PULSE_LINE: &str = "\u{1}midshift-hb";
-/// Without a pulse for so many seconds the program hangs.
-const HANG_SECONDS: u64 = 15;
-/// After so many pulses the program runs well and its tries count from 0 again.
-const WELL_AFTER_PULSES: u32 = 30;
-/// First and longest pause before the next start, milliseconds.
-const PAUSE_MS: (u64, u64) = (250, 30_000);
 /// Time between two beacons.
 const BEACON_EVERY: Duration = Duration::from_secs(1);
 /// The end that no restart mends: wrong arguments.
@@ -135,15 +128,15 @@ fn keep_running(orders: &Orders) -> io::Result<()> {
     let mut beacon = Beacon::new(orders);
     loop {
         let start = choose(orders)?;
-        write_tries(&orders.record, start.tries, &start.set)?;
+        write_tries(&orders.record, &start.tries)?;
         beacon.begins(&start);
         match run_once(orders, &start, &mut beacon)? {
             Ending::Finished => {
-                write_tries(&orders.record, 0, &start.set)?;
+                write_tries(&orders.record, &Tries::new(&start.set, 0))?;
                 return Ok(());
             }
             Ending::Switched => {
-                write_tries(&orders.record, 0, &start.set)?;
+                write_tries(&orders.record, &Tries::new(&start.set, 0))?;
                 continue;
             }
             Ending::Failed(how) => say(&format!("{} of set {} ended: {how}", start.program, start.set)),
@@ -151,9 +144,9 @@ fn keep_running(orders: &Orders) -> io::Result<()> {
                 say(&format!("{} gave no sign for {} s and was killed", start.program, orders.hang.as_secs()))
             }
         }
-        let tries = read_tries(&orders.record, &start.set);
-        let pause = pause_before(tries);
-        say(&format!("try {} in {} ms", tries.saturating_add(1), pause.as_millis()));
+        let tries = read_tries(&orders.record);
+        let pause = tries.pause();
+        say(&format!("try {} in {} ms", tries.plus_one(&start.set).of(&start.set), pause.as_millis()));
         beacon.pause(pause);
     }
 }
@@ -164,39 +157,34 @@ struct Start {
     set: String,
     program: String,
     /// Counts this start.
-    tries: u32,
+    tries: Tries,
 }
 
 /// The set that the record names; one on trial that has had its tries is put away first.
 fn choose(orders: &Orders) -> io::Result<Start> {
+    let tries = read_tries(&orders.record);
     let Some(sets) = &orders.sets else {
         let set = switch::FACTORY.to_owned();
-        return Ok(Start { tries: read_tries(&orders.record, &set) + 1, program: orders.program.clone(), set });
+        return Ok(Start { tries: tries.plus_one(&set), program: orders.program.clone(), set });
     };
     let path = sets.join(SWITCH);
     let named = |error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", path.display()));
     let mut switch = Switch::read(&path).map_err(named)?;
-    let tries = read_tries(&orders.record, switch.running());
-    if switch.trial.is_some() && tries >= TRIES_MAX {
-        say(&format!("set {} did not live in {tries} tries; back to {}", switch.running(), switch.current));
-        switch.fall_back(tries);
+    let tried = switch.running().to_owned();
+    if let Some(had) = starts::put_away(&mut switch, &tries) {
+        say(&format!("set {tried} did not live in {had} tries; back to {}", switch.current));
         switch.write(&path).map_err(named)?;
     }
     let set = switch.running().to_owned();
     let own = sets.join(&set).join(PROGRAM);
     let program = if own.exists() { own.to_string_lossy().into_owned() } else { orders.program.clone() };
-    Ok(Start { tries: read_tries(&orders.record, &set).saturating_add(1), program, set })
+    Ok(Start { tries: tries.plus_one(&set), program, set })
 }
 
-/// Whether a program that runs well clears its tries: a set on probation is not believed before it is proven.
+/// Whether a program that runs well clears its tries.
 fn is_trusted(orders: &Orders) -> bool {
     let Some(sets) = &orders.sets else { return true };
-    Switch::read(&sets.join(SWITCH)).is_ok_and(|switch| switch.trial.is_none_or(|trial| trial.is_proven))
-}
-
-fn pause_before(tries: u32) -> Duration {
-    let (first, longest) = PAUSE_MS;
-    Duration::from_millis(first.saturating_mul(1 << tries.saturating_sub(1).min(16)).min(longest))
+    Switch::read(&sets.join(SWITCH)).is_ok_and(|switch| starts::is_trusted(&switch))
 }
 
 /// Runs the program until it ends or hangs.
@@ -249,8 +237,8 @@ fn watch(
             Ok(Sign::Pulse) => {
                 pulses += 1;
                 sign_by = Instant::now() + orders.hang;
-                if pulses % WELL_AFTER_PULSES == 0 && is_trusted(orders) {
-                    write_tries(&orders.record, 0, &start.set)?;
+                if starts::is_well(pulses) && is_trusted(orders) {
+                    write_tries(&orders.record, &Tries::new(&start.set, 0))?;
                 }
             }
             Ok(Sign::Ended) | Err(RecvTimeoutError::Disconnected) => return Ok(how_it_ended(child.wait()?)),
@@ -308,7 +296,8 @@ impl Beacon {
 
     fn begins(&mut self, start: &Start) {
         let since = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs());
-        self.text = format!("midshift-beacon 1 {} {} {} {since}\n", self.robot_id, start.set, start.tries);
+        self.text =
+            format!("midshift-beacon 1 {} {} {} {since}\n", self.robot_id, start.set, start.tries.of(&start.set));
     }
 
     fn send(&self) {
@@ -332,16 +321,14 @@ impl Beacon {
     }
 }
 
-/// Starts of `set` that did not run well; those of another set do not count.
-fn read_tries(record: &Path, set: &str) -> u32 {
-    let text = fs::read_to_string(record).unwrap_or_default();
-    let counted = text.trim().strip_prefix("tries ").and_then(|rest| rest.split_once(" of "));
-    counted.filter(|(_, of)| *of == set).and_then(|(tries, _)| tries.parse().ok()).unwrap_or(0)
+/// Starts that did not run well. A record that cannot be read counts none.
+fn read_tries(record: &Path) -> Tries {
+    Tries::parse(&fs::read_to_string(record).unwrap_or_default())
 }
 
 /// On the disk when this returns.
-fn write_tries(record: &Path, tries: u32, set: &str) -> io::Result<()> {
-    switch::replace(record, format!("tries {tries} of {set}\n").as_bytes())
+fn write_tries(record: &Path, tries: &Tries) -> io::Result<()> {
+    switch::replace(record, tries.text().as_bytes())
 }
 
 fn pass_on(line: &[u8]) -> io::Result<()> {

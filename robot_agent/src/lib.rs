@@ -19,6 +19,7 @@ pub mod ring;
 pub mod session;
 pub mod sets;
 pub mod sqlite;
+pub mod starts;
 pub mod store;
 pub mod switch;
 pub mod throttle;

@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 /// Name of the component, which is of kind config.
 pub const COMPONENT: &str = "behaviour";
 /// Bytes of the file.
-const FILE_BYTES_MAX: u64 = 64 * 1024;
+pub const FILE_BYTES_MAX: u64 = 64 * 1024;
 const SPEED_PERMILLE: RangeInclusive<u32> = 100..=1_000;
 const FAULT_RATE_PERMILLE: RangeInclusive<u32> = 0..=1_000_000;
 const ENERGY_PERMILLE: RangeInclusive<u32> = 100..=10_000;

@@ -5,6 +5,7 @@
 
 use crate::hall::{Hall, Persistence};
 use crate::handle::SimHandle;
+use crate::launched::{Launched, Start};
 use crate::service::Crash;
 use midshift_agent::body::Body;
 use midshift_agent::bugs::Bugs;
@@ -12,8 +13,11 @@ use midshift_agent::core::ExitReason;
 use midshift_agent::dial::{self, Dial, TcpDial};
 use midshift_agent::memory::MemoryStore;
 use midshift_agent::session::{self, AgentConfig};
+use midshift_agent::sets;
 use midshift_agent::sqlite::SqliteStore;
+use midshift_agent::starts::HANG_SECONDS;
 use midshift_agent::store::{self, Store};
+use midshift_agent::trust::Trust;
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::robot::StopLevel;
 use midshift_core::time::Clock;
@@ -30,6 +34,8 @@ use tokio_util::sync::CancellationToken;
 
 /// Name of an agent's ledger and ring in its directory.
 pub const AGENT_FILE: &str = "agent.db";
+/// Name of the folder of its sets of software there.
+const SETS: &str = "sets";
 /// The person goes round this often, milliseconds of site time.
 const ROUND_MS: u64 = 5_000;
 /// A crashed agent is started again after this, real time.
@@ -62,6 +68,32 @@ pub enum Error {
         /// Why.
         source: store::Error,
     },
+    /// An agent's software could not be kept.
+    #[error("software of {robot_id}: {source}")]
+    Sets {
+        /// Whose.
+        robot_id: RobotId,
+        /// Why.
+        source: sets::Error,
+    },
+}
+
+/// How the robots of a swarm change their software.
+#[derive(Clone)]
+pub struct SwarmSoftware {
+    /// What they believe.
+    pub trust: Trust,
+    /// The way to the repository for one robot, beside that of its session.
+    pub bulk: DialFor,
+}
+
+impl SwarmSoftware {
+    /// Over TCP from `http://host:port`.
+    pub fn tcp(trust: Trust, uri: &str) -> Self {
+        let uri = uri.to_owned();
+        let bulk: DialFor = Arc::new(move |_, network| Ok(Arc::new(TcpDial::bulk(&uri, Some(network))?)));
+        Self { trust, bulk }
+    }
 }
 
 /// What a swarm needs.
@@ -83,6 +115,8 @@ pub struct SwarmConfig {
     pub bugs: Bugs,
     /// Which tasks a person leaves to their robots; none: nobody walks the hall.
     pub person: Option<Live>,
+    /// How they change their software; none: they do not.
+    pub software: Option<SwarmSoftware>,
 }
 
 impl SwarmConfig {
@@ -99,6 +133,7 @@ impl SwarmConfig {
             spread: Duration::from_millis(500),
             bugs: Bugs::default(),
             person: Some(Arc::new(|_| false)),
+            software: None,
         }
     }
 }
@@ -190,11 +225,18 @@ struct Life {
     starts_after: Duration,
 }
 
+/// How one run of an agent ended.
+enum Ended {
+    Agent(ExitReason),
+    /// It was asked to, or what its software says.
+    Crashed,
+}
+
 impl Life {
     /// Until the end; says whether it was fenced, and how often it crashed.
     async fn run(mut self, shutdown: CancellationToken) -> Result<(Option<RobotId>, u64), Error> {
         let robot_id = self.robot.robot_id().clone();
-        let failed = |source| Error::Store { robot_id: robot_id.clone(), source };
+        let launched = self.config.software.as_ref().map(|_| self.launched());
         let mut crashes = 0;
         let mut pause = self.starts_after;
         loop {
@@ -202,46 +244,111 @@ impl Life {
                 () = shutdown.cancelled() => return Ok((None, crashes)),
                 () = tokio::time::sleep(pause) => {}
             }
-            let dial = (self.config.dial)(&robot_id, self.robot.network())?;
-            let store = self.store().await?;
-            let (body, clock) = (Box::new(self.robot.clone()), self.config.clock.clone());
-            let agent = session::run(self.agent_config(), body, store, clock, dial, shutdown.clone());
-            let crash = async {
-                match self.crashes.get(&robot_id) {
-                    Some(crash) => crash.notified().await,
-                    None => std::future::pending().await,
+            pause = RESTART;
+            let now = self.config.clock.now().site;
+            let failed = |source| Error::Sets { robot_id: robot_id.clone(), source };
+            let start = launched.as_ref().map(|l| l.start(&self.robot, now)).transpose().map_err(failed)?;
+            let hangs_after = match start {
+                Some(Start::Dead(why)) => {
+                    tracing::info!(%robot_id, why, "agent ended at its start");
+                    pause = launched.as_ref().map_or(RESTART, Launched::pause);
+                    continue;
                 }
+                Some(Start::Runs { hangs_after }) => hangs_after,
+                None => None,
             };
-            tokio::select! {
-                ended = agent => match ended {
-                    Ok(ExitReason::Shutdown) => return Ok((None, crashes)),
-                    // Starts again with the set that the switch record names, as a launcher would do it.
-                    Ok(ExitReason::Switched) => {}
-                    Ok(ExitReason::FencedTwice) => return Ok((Some(robot_id.clone()), crashes)),
-                    Err(session::Error::Store(source)) => return Err(failed(source)),
-                },
-                () = crash => {
-                    crashes += 1;
-                    tracing::info!(%robot_id, "agent crashed");
+            match self.run_once(launched.as_ref(), hangs_after, &shutdown, &mut crashes).await? {
+                Ended::Agent(ExitReason::Shutdown) => return Ok((None, crashes)),
+                Ended::Agent(ExitReason::FencedTwice) => return Ok((Some(robot_id), crashes)),
+                Ended::Agent(ExitReason::Switched) => {
+                    if let Some(launched) = &launched {
+                        launched.switched();
+                        pause = Duration::ZERO;
+                    }
                 }
+                Ended::Crashed => pause = launched.as_ref().map_or(RESTART, Launched::pause),
             }
             self.robot.stop(self.config.clock.now().site, StopLevel::Halt);
             self.robot.poll(self.config.clock.now().site);
-            pause = RESTART;
         }
     }
-    fn agent_config(&mut self) -> AgentConfig {
+
+    /// One run of the agent. One that hangs is left where it is, with its connection, until its launcher would kill it.
+    async fn run_once(
+        &mut self,
+        launched: Option<&Launched>,
+        hangs_after: Option<Duration>,
+        shutdown: &CancellationToken,
+        crashes: &mut u64,
+    ) -> Result<Ended, Error> {
+        let robot_id = self.robot.robot_id().clone();
+        let dial = (self.config.dial)(&robot_id, self.robot.network())?;
+        let store = self.store().await?;
+        let config = self.agent_config(launched)?;
+        let (body, clock) = (Box::new(self.robot.clone()), self.config.clock.clone());
+        let agent = session::run(config, body, store, clock, dial, shutdown.clone());
+        tokio::pin!(agent);
+        let crash = async {
+            match self.crashes.get(&robot_id) {
+                Some(crash) => crash.notified().await,
+                None => std::future::pending().await,
+            }
+        };
+        let hang = async {
+            match hangs_after {
+                Some(after) => tokio::time::sleep(after).await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            ended = &mut agent => match ended {
+                Ok(reason) => return Ok(Ended::Agent(reason)),
+                Err(session::Error::Store(source)) => return Err(Error::Store { robot_id, source }),
+            },
+            () = crash => {
+                *crashes += 1;
+                tracing::info!(%robot_id, "agent crashed");
+                return Ok(Ended::Crashed);
+            }
+            () = hang => {}
+        }
+        tokio::select! {
+            () = shutdown.cancelled() => return Ok(Ended::Agent(ExitReason::Shutdown)),
+            () = tokio::time::sleep(Duration::from_secs(HANG_SECONDS)) => {}
+        }
+        tracing::info!(%robot_id, "agent gave no sign and was killed");
+        Ok(Ended::Crashed)
+    }
+
+    fn launched(&self) -> Launched {
+        let dir = match &self.config.persistence {
+            Persistence::Memory => None,
+            Persistence::Dir(dir) => Some(dir.join(self.robot.robot_id().as_str()).join(SETS)),
+        };
+        Launched::new(dir.as_deref(), &self.robot)
+    }
+
+    fn agent_config(&mut self, launched: Option<&Launched>) -> Result<AgentConfig, Error> {
+        let robot_id = self.robot.robot_id().clone();
+        let update = match (&self.config.software, launched) {
+            (Some(software), Some(launched)) => {
+                let bulk = (software.bulk)(&robot_id, self.robot.network())?;
+                let failed = |source| Error::Sets { robot_id: robot_id.clone(), source };
+                Some(launched.updates(&software.trust, bulk).map_err(failed)?)
+            }
+            _ => None,
+        };
         // What must differ between two processes comes from the wall's clock too; the seed alone would repeat.
         let wall = self.config.clock.now().wall.0;
-        AgentConfig {
-            update: None,
-            robot_id: self.robot.robot_id().clone(),
+        Ok(AgentConfig {
+            update,
+            robot_id,
             boot_id: format!("{wall:x}-{:016x}", self.rng.random::<u64>()),
             new_ring_id: format!("{wall:x}-{:016x}", self.rng.random::<u64>()),
             seed: self.rng.random(),
             bugs: self.config.bugs,
-            pulse: None,
-        }
+            pulse: launched.map(Launched::pulse),
+        })
     }
     async fn store(&self) -> Result<Box<dyn Store>, Error> {
         let Persistence::Dir(dir) = &self.config.persistence else { return Ok(Box::new(self.memory.clone())) };

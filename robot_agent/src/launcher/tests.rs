@@ -1,6 +1,7 @@
 //! The launcher with real children.
 
 use super::*;
+use crate::starts::TRIES_MAX;
 use tempfile::TempDir;
 
 fn given(text: &str) -> Result<Orders, String> {
@@ -81,12 +82,6 @@ fn the_command_line_is_read_whole_or_refused() {
 }
 
 #[test]
-fn pauses_grow_to_a_limit() {
-    let pauses: Vec<_> = [1, 2, 3, 40].map(|tries| pause_before(tries).as_millis()).into();
-    assert_eq!(pauses, [250, 500, 1_000, 30_000]);
-}
-
-#[test]
 fn a_program_that_fails_is_started_again_until_it_ends_well_and_its_tries_are_on_the_disk_before_it_runs() {
     let (folder, mut orders) = robot("");
     let (record, seen) = (orders.record.display(), folder.path().join("seen"));
@@ -96,7 +91,7 @@ fn a_program_that_fails_is_started_again_until_it_ends_well_and_its_tries_are_on
         fs::read_to_string(&seen).expect("was written"),
         "tries 1 of factory\ntries 2 of factory\ntries 3 of factory\n"
     );
-    assert_eq!(read_tries(&orders.record, "factory"), 0);
+    assert_eq!(read_tries(&orders.record).of("factory"), 0);
 }
 
 #[test]
@@ -138,7 +133,7 @@ fn a_program_that_switched_is_followed_by_the_set_it_wrote_at_once_and_not_count
     on_trial(&orders, "v0");
     keep_running(&orders).expect("runs");
     assert_eq!(ran(&folder), ["v1"]);
-    assert_eq!((read_tries(&orders.record, "v0"), read_tries(&orders.record, "v1")), (0, 0));
+    assert_eq!((read_tries(&orders.record).of("v0"), read_tries(&orders.record).of("v1")), (0, 0));
 }
 
 #[test]
@@ -147,12 +142,12 @@ fn a_power_cut_counts_as_a_try_and_tries_of_another_set_do_not() {
     on_trial(&orders, "v1");
     for tries in [1, 2] {
         let start = choose(&orders).expect("chooses");
-        assert_eq!((start.set.as_str(), start.tries), ("v1", tries));
-        write_tries(&orders.record, start.tries, &start.set).expect("writes");
+        assert_eq!((start.set.as_str(), start.tries.of("v1")), ("v1", tries));
+        write_tries(&orders.record, &start.tries).expect("writes");
     }
     assert_eq!(choose(&orders).expect("chooses").set, "factory", "twice the power went while it started");
     on_trial(&orders, "v2");
-    assert_eq!(choose(&orders).expect("chooses").tries, 1);
+    assert_eq!(choose(&orders).expect("chooses").tries.of("v2"), 1);
 }
 
 #[test]
@@ -167,7 +162,7 @@ fn a_committed_set_is_never_put_away_and_a_set_on_probation_does_not_clear_its_t
     assert!(is_trusted(&orders));
     switch.commit();
     switch.write(&path).expect("writes");
-    write_tries(&orders.record, 7, "v1").expect("writes");
+    write_tries(&orders.record, &Tries::new("v1", 7)).expect("writes");
     assert_eq!(choose(&orders).expect("chooses").set, "v1");
 }
 

@@ -10,6 +10,7 @@ pub mod memory;
 
 use crate::switch::Switch;
 use midshift_bundle::digest::Digest;
+use midshift_bundle::manifest::ComponentKind;
 use midshift_bundle::set::SetManifest;
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
@@ -76,6 +77,18 @@ impl Holdings {
             return Some(SetManifest::default());
         }
         self.sets.get(&name.parse().ok()?).cloned()
+    }
+    /// Version of a set, of the bundle taken last; none: what the robot came with. A set calls itself by the name and the version of its
+    /// bundle; robots report versions that can be compared.
+    pub fn version(&self, name: &str) -> Option<String> {
+        let set = self.set(name)?;
+        set.version.rsplit(' ').next().filter(|v| !v.is_empty()).map(str::to_owned)
+    }
+    /// The content of a component of kind config in a set.
+    pub fn settings(&self, name: &str, component: &str) -> Option<Wanted> {
+        let set = self.set(name)?;
+        let component = set.components.get(component).filter(|c| c.kind == ComponentKind::Config)?;
+        Some(Wanted { digest: component.digest, length: component.length })
     }
 }
 

@@ -320,6 +320,16 @@ impl SimBody {
             }
         }
     }
+    /// What its software makes of it, and the version that it says.
+    pub fn software(&self) -> (&Behaviour, &str) {
+        (&self.config.behaviour, &self.config.software)
+    }
+    /// Other software drives it from now on.
+    pub fn run_software(&mut self, now: SiteTime, behaviour: Behaviour, version: String) {
+        self.advance(now);
+        self.config.behaviour = behaviour;
+        self.config.software = version;
+    }
     /// A person mends what is broken; an empty battery is changed for a half-full one.
     pub fn clear(&mut self, now: SiteTime) {
         self.advance(now);

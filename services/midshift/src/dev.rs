@@ -15,7 +15,7 @@ use midshift_core::task::Phase;
 use midshift_core::time::{Clock, SiteTime};
 use midshift_sim::hall::{Hall, HallConfig};
 use midshift_sim::service::SimFace;
-use midshift_sim::swarm::{Swarm, SwarmConfig};
+use midshift_sim::swarm::{Swarm, SwarmConfig, SwarmSoftware};
 use midshift_store::{
     FRAME_BYTES_DEFAULT, FrameLog, MemoryFrames, MemoryStore, SqliteFrames, SqliteStore, Store, StoreId,
 };
@@ -130,9 +130,11 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     let mut swarm = SwarmConfig::tcp(hall.clone(), clock.clone(), &format!("http://{address}"), args.seed);
     let live = tasks.clone();
     swarm.person = Some(Arc::new(move |id| tally::look(&live, |t| t.is_live(id))));
+    let (software, ota) = Throwaway::make(clock.clone()).await?;
+    let trust = software.trust(site.site_id().clone())?;
+    swarm.software = Some(SwarmSoftware::tcp(trust, &format!("http://{address}")));
     let swarm = Swarm::new(swarm);
     let (store, frames) = stores(&args, &site, &clock).await?;
-    let (software, ota) = Throwaway::make(clock.clone()).await?;
     let planning = Planning::start()?;
     let parts = Parts {
         store: store.clone(),
@@ -207,7 +209,7 @@ fn greeting(args: &Dev, site: &Site, address: SocketAddr, software: &Throwaway) 
          \x20     {program} robot ls{server}\n\
          \x20     {program} sim fault{server} rbt-04 --drop-network 20s\n\
          \x20     grpcurl -plaintext {address} list\n\
-         \x20     {program} bundle sign BUNDLE --repository {repository} --key {keys}/targets-1.pem\n\
+         \x20     {program} bundle samples SAMPLES --config-only --repository {repository} --key {keys}/targets-1.pem\n\
          \x20     {program} bundle push{server} {repository}\n\
          Ctrl-C ends it.",
         args.robots,

@@ -117,7 +117,7 @@ pub fn make(dir: &Path, program: Option<&Path>, signer: Signer<'_>, now: Utc) ->
         }
     };
     fs::create_dir(&bundles).map_err(io("making", &bundles))?;
-    let program = program.map(|path| Program::open(path)).transpose()?;
+    let program = program.map(Program::open).transpose()?;
     let mut made = Made { bundles: Vec::new(), repository, keys, targets_version: 0 };
     for sample in &SAMPLES {
         let path = bundles.join(format!("{NAME}-{}", sample.version));

@@ -3,7 +3,7 @@
 //! Invariant: which set runs is what the launcher says, else what the switch record says; it is found out once, at the start.
 //! Called by [`crate::robots`].
 
-use anyhow::{Context, bail};
+use anyhow::{bail, ensure};
 use midshift_agent::dial::TcpDial;
 use midshift_agent::launcher;
 use midshift_agent::session::Updates;
@@ -13,7 +13,6 @@ use midshift_agent::trust::Trust;
 use midshift_agent::update::UpdateConfig;
 use midshift_agent::update::io::UpdateWorker;
 use midshift_agent::update::remote::GrpcRemote;
-use midshift_bundle::manifest::ComponentKind;
 use midshift_core::time::{Clock, LinkDuration};
 use midshift_sim::behaviour::{Behaviour, COMPONENT};
 use midshift_sim::body::BodyConfig;
@@ -46,14 +45,13 @@ impl Software {
         let told = std::env::var(launcher::SET).ok();
         let is_launched = told.is_some();
         let running = told.unwrap_or_else(|| holdings.switch.running().to_owned());
-        let set = holdings.set(&running).with_context(|| format!("set {running} is not there"))?;
-        let behaviour = match set.components.get(COMPONENT).filter(|c| c.kind == ComponentKind::Config) {
+        ensure!(holdings.set(&running).is_some(), "set {running} is not there");
+        let behaviour = match holdings.settings(&running, COMPONENT) {
             Some(_) => Behaviour::read(&sets.component(&running, COMPONENT))?,
             None => Behaviour::default(),
         };
-        let is_on_probation = holdings.switch.trial.is_some_and(|t| t.set == running && !t.is_proven);
-        // A set calls itself by the name and the version of its bundle; robots report versions that can be compared.
-        let version = set.version.rsplit(' ').next().filter(|v| !v.is_empty()).map(str::to_owned);
+        let is_on_probation = holdings.switch.trial.as_ref().is_some_and(|t| t.set == running && !t.is_proven);
+        let version = holdings.version(&running);
         Ok(Self { trust, sets, running, is_launched, is_on_probation, version, behaviour })
     }
 

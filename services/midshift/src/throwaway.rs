@@ -3,8 +3,11 @@
 //! Invariant: nothing here is used by `serve`; a key of a real release never comes here.
 
 use anyhow::Context;
+use midshift_agent::trust::Trust;
 use midshift_bundle::folder::Folder;
+use midshift_bundle::keys::SecretKey;
 use midshift_bundle::repository::Profile;
+use midshift_core::ids::SiteId;
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use midshift_ota::{OtaService, Parts};
@@ -30,6 +33,12 @@ impl Throwaway {
     /// Where bundles are signed into and pushed from.
     pub fn repository(&self) -> PathBuf {
         self.dir.path().join("repository")
+    }
+    /// What robots of `site` believe of it.
+    pub fn trust(&self, site: SiteId) -> anyhow::Result<Trust> {
+        let root = Folder::open(&self.repository())?.document("1.root.json")?.context("the repository has no root")?;
+        let key = SecretKey::read(&self.keys().join("directive-1.pem"))?.public();
+        Ok(Trust { root, directive_keys: [(key.id(), key)].into(), site })
     }
     /// All its keys.
     pub fn keys(&self) -> PathBuf {

@@ -13,4 +13,5 @@ mod launched;
 mod measured;
 mod proxy;
 mod room;
+mod swarm_software;
 mod tuf;
