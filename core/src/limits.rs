@@ -154,6 +154,14 @@ pub const UPLOADS_MAX: usize = 64;
 pub const UPLOAD_SYNC_BYTES: u64 = 16 * 1024 * 1024;
 /// Bytes of all software that a server keeps, unless it was told otherwise.
 pub const SOFTWARE_BYTES_DEFAULT: u64 = 64 * 1024 * 1024 * 1024;
+/// Shorter ways to files of releases that wait to be made: each is one version to go from, and a fleet has few of them at a time.
+pub const ENCODINGS_QUEUED_MAX: usize = 64;
+/// Shorter ways that were found not to be worth it and are remembered.
+pub const ENCODINGS_WORTHLESS_MAX: usize = 4096;
+/// Files that a robot names as there when it asks for a shorter way to another.
+pub const ENCODING_BASES_MAX: usize = 8;
+/// A robot asks again after this while a shorter way is made, ms.
+pub const ENCODING_ASK_AGAIN_MS: u32 = 2_000;
 /// Bytes of one range of software that a robot asks for.
 pub const CHUNK_RANGE_BYTES: u64 = 4 * 1024 * 1024;
 /// Bytes of one message of such a range.

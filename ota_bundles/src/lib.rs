@@ -1,12 +1,13 @@
 //! What a signed bundle is: how release people build and sign one, and how a robot decides whether to believe it.
 //!
 //! Rooms: `manifest` and `build` make a bundle of a draft; `keys`, `repository` and `directive` sign; `folder` is where they keep it;
-//! `freshness` is what a server must know of documents that others signed; `trust` is what a robot believes.
+//! `encoding` makes files shorter on their way; `freshness` is what a server must know of documents that others signed; `trust` is what a robot believes.
 //! Called by the command line, by the rollout service and by agents. Invariant: nothing here runs, installs or downloads anything.
 
 pub mod build;
 pub mod digest;
 pub mod directive;
+pub mod encoding;
 pub mod folder;
 pub mod freshness;
 pub mod keys;

@@ -2,7 +2,8 @@
 //!
 //! ```text
 //! switch            which set runs (crate::switch)
-//! content/DIGEST    bytes that were checked; DIGEST.part and DIGEST.map while they come
+//! content/DIGEST    bytes that were checked; DIGEST.part and DIGEST.map while they come, DIGEST.made while they are made of a shorter
+//!                   way, DIGEST.plain if no such way is to be tried
 //! SET/NAME          hard link to a component's content; SET is the set's id
 //! SET/set.program   hard link to the one of kind process
 //! SET/set.json      what is in it; written last
@@ -10,15 +11,16 @@
 //! Invariant: a folder has the name of a set only when it is whole: it is made beside and renamed.
 
 use super::content::{Part, remove};
-use super::{Error, Holdings, Sets, Wanted};
+use super::{CHUNK_BYTES, Error, Holdings, Sets, Wanted};
 use crate::launcher::{PROGRAM, SWITCH};
 use crate::switch::{self, Switch};
 use midshift_bundle::digest::Digest;
+use midshift_bundle::encoding::{self, Base};
 use midshift_bundle::manifest::{COMPONENT_BYTES_MAX, MANIFEST_BYTES_MAX};
 use midshift_bundle::set::SetManifest;
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::{self, File, Permissions};
-use std::io::{self, Read};
+use std::fs::{self, File, OpenOptions, Permissions};
+use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
@@ -106,6 +108,45 @@ impl DiskSets {
         list().map_err(io_error("listing sets"))
     }
 
+    /// Makes content beside and gives it its name once it was read back by the handle it was written with.
+    fn make(&self, wanted: &Wanted, base: Option<&Digest>, way: &Path, to: &Path) -> Result<(), Error> {
+        let open = |digest: &Digest| {
+            let file = optional(File::open(self.content(digest))).map_err(io_error("opening content"))?;
+            file.ok_or(Error::Missing(*digest))
+        };
+        let mut base = base.map(open).transpose()?;
+        let mut way = File::open(way).map_err(io_error("opening a way"))?;
+        let beside = to.with_extension("made");
+        let mut options = OpenOptions::new();
+        let file = options.read(true).write(true).create(true).truncate(true).open(&beside);
+        let mut out = BufWriter::with_capacity(CHUNK_BYTES as usize, file.map_err(io_error("making content"))?);
+        let base = base.as_mut().map(|base| base as &mut dyn Base);
+        let written = encoding::decode(base, &mut way, wanted.length, &mut out).and_then(|()| out.flush());
+        match written {
+            Err(error) if error.kind() == io::ErrorKind::StorageFull => return Err(io_error("making content")(error)),
+            // Whatever else it is: this way does not lead there.
+            Err(_) => return Err(Error::Corrupt { digest: wanted.digest }),
+            Ok(()) => {}
+        }
+        let file = out.get_mut();
+        let mut read = || {
+            file.seek(SeekFrom::Start(0))?;
+            Digest::of_reader(file, wanted.length)
+        };
+        if read().map_err(io_error("reading what was made"))? != (wanted.digest, wanted.length) {
+            return Err(Error::Corrupt { digest: wanted.digest });
+        }
+        let name = || {
+            out.get_ref().sync_all()?;
+            fs::rename(&beside, to)?;
+            switch::sync_folder_of(to)?;
+            remove(&to.with_extension("map"))?;
+            remove(&to.with_extension("part"))?;
+            remove(&to.with_extension("plain"))
+        };
+        name().map_err(io_error("naming content"))
+    }
+
     /// Links all of a set into a folder beside and gives it its name.
     fn assemble(&self, set: &SetManifest, folder: &Path) -> io::Result<()> {
         let beside = folder.with_extension("new");
@@ -166,6 +207,23 @@ impl Sets for DiskSets {
             Some(part) => part.seal(&to),
             None => unreachable!("was opened above"),
         }
+    }
+
+    fn decode(&mut self, wanted: &Wanted, base: Option<&Digest>, encoded: &Wanted) -> Result<(), Error> {
+        self.part = None;
+        let (way, to) = (self.content(&encoded.digest), self.content(&wanted.digest));
+        let made = if self.has(wanted)? { Ok(()) } else { self.make(wanted, base, &way, &to) };
+        remove(&to.with_extension("made")).and_then(|()| remove(&way)).map_err(io_error("throwing a way away"))?;
+        made
+    }
+
+    fn fetch_as_it_is(&mut self, wanted: &Wanted) -> Result<(), Error> {
+        let note = self.content(&wanted.digest).with_extension("plain");
+        File::create(&note).and_then(|_| switch::sync_folder_of(&note)).map_err(io_error("noting a way"))
+    }
+
+    fn is_fetched_as_it_is(&mut self, wanted: &Wanted) -> Result<bool, Error> {
+        self.content(&wanted.digest).with_extension("plain").try_exists().map_err(io_error("looking for a note"))
     }
 
     fn read(&mut self, digest: &Digest, most: u64) -> Result<Vec<u8>, Error> {

@@ -6,9 +6,10 @@ use super::content::Bitmap;
 use super::{Error, Holdings, Sets, Wanted};
 use crate::switch::Switch;
 use midshift_bundle::digest::Digest;
+use midshift_bundle::encoding::{self, Base};
 use midshift_bundle::set::SetManifest;
 use std::collections::{BTreeMap, BTreeSet};
-use std::io;
+use std::io::{self, Cursor};
 use std::ops::Range;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -26,6 +27,7 @@ struct State {
     sets: BTreeMap<Digest, SetManifest>,
     content: BTreeMap<Digest, Vec<u8>>,
     parts: BTreeMap<Digest, Part>,
+    as_they_are: BTreeSet<Digest>,
     room: Option<u64>,
 }
 
@@ -150,6 +152,34 @@ impl Sets for MemorySets {
         Ok(())
     }
 
+    fn decode(&mut self, wanted: &Wanted, base: Option<&Digest>, encoded: &Wanted) -> Result<(), Error> {
+        let mut state = self.state();
+        let way = state.content.remove(&encoded.digest);
+        if state.has(wanted) {
+            return Ok(());
+        }
+        let way = way.ok_or(Error::Missing(encoded.digest))?;
+        let base = base.map(|base| state.content.get(base).ok_or(Error::Missing(*base))).transpose()?;
+        let (mut base, mut bytes) = (base.map(Cursor::new), Vec::new());
+        let base = base.as_mut().map(|base| base as &mut dyn Base);
+        let decoded = encoding::decode(base, &mut &*way, wanted.length, &mut bytes);
+        if decoded.is_err() || Digest::of(&bytes) != wanted.digest {
+            return Err(Error::Corrupt { digest: wanted.digest });
+        }
+        state.parts.remove(&wanted.digest);
+        state.content.insert(wanted.digest, bytes);
+        Ok(())
+    }
+
+    fn fetch_as_it_is(&mut self, wanted: &Wanted) -> Result<(), Error> {
+        self.state().as_they_are.insert(wanted.digest);
+        Ok(())
+    }
+
+    fn is_fetched_as_it_is(&mut self, wanted: &Wanted) -> Result<bool, Error> {
+        Ok(self.state().as_they_are.contains(&wanted.digest))
+    }
+
     fn read(&mut self, digest: &Digest, most: u64) -> Result<Vec<u8>, Error> {
         let state = self.state();
         let bytes = state.content.get(digest).ok_or(Error::Missing(*digest))?;
@@ -194,6 +224,8 @@ impl Sets for MemorySets {
         named.extend(state.sets.values().flat_map(|set| set.components.values().map(|c| c.digest)));
         state.content.retain(|digest, _| named.contains(digest));
         state.parts.retain(|digest, _| named.contains(digest));
+        let there: BTreeSet<Digest> = state.content.keys().copied().collect();
+        state.as_they_are.retain(|digest| named.contains(digest) && !there.contains(digest));
         Ok(())
     }
 }

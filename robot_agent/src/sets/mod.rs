@@ -10,7 +10,7 @@ pub mod memory;
 
 use crate::switch::Switch;
 use midshift_bundle::digest::Digest;
-use midshift_bundle::manifest::ComponentKind;
+use midshift_bundle::manifest::{Component, ComponentKind};
 use midshift_bundle::set::SetManifest;
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
@@ -90,6 +90,16 @@ impl Holdings {
         let component = set.components.get(component).filter(|c| c.kind == ComponentKind::Config)?;
         Some(Wanted { digest: component.digest, length: component.length })
     }
+    /// Other content of the same component, of the sets that run and are kept: what a patch may be from.
+    pub fn bases(&self, component: &Component) -> Vec<Digest> {
+        let mut bases: Vec<Digest> = Vec::new();
+        for name in [Some(self.switch.running()), self.switch.kept(), self.switch.previous.as_deref()] {
+            let there = name.and_then(|name| self.sets.get(&name.parse().ok()?));
+            let other = there.and_then(|set| set.components.get(&component.name)).map(|c| c.digest);
+            bases.extend(other.filter(|other| *other != component.digest && !bases.contains(other)));
+        }
+        bases
+    }
 }
 
 /// Keeps the software of one robot. Calls block; the shell makes them where that does no harm.
@@ -119,6 +129,22 @@ pub trait Sets: Send {
     /// # Errors
     /// [`Error::Corrupt`]: all of it is thrown away.
     fn seal(&mut self, wanted: &Wanted) -> Result<(), Error>;
+    /// Makes content of a shorter way to it that is there whole, from `base` if it is a patch, and checks it as [`Sets::seal`] does. The
+    /// shorter way goes, whatever comes of it. Nothing to do if the content is there already.
+    ///
+    /// # Errors
+    /// [`Error::Corrupt`] if it does not lead to what is wanted; a base that is not there; the disk's.
+    fn decode(&mut self, wanted: &Wanted, base: Option<&Digest>, encoded: &Wanted) -> Result<(), Error>;
+    /// No shorter way to this file is tried any more; durable, until the file is there.
+    ///
+    /// # Errors
+    /// The disk's.
+    fn fetch_as_it_is(&mut self, wanted: &Wanted) -> Result<(), Error>;
+    /// Whether [`Sets::fetch_as_it_is`] was said of it.
+    ///
+    /// # Errors
+    /// The disk's.
+    fn is_fetched_as_it_is(&mut self, wanted: &Wanted) -> Result<bool, Error>;
     /// Content in memory, for small files.
     ///
     /// # Errors

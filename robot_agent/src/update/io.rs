@@ -7,6 +7,7 @@ use super::{Done, Failure, Job};
 use crate::sets::{self, CHUNK_BYTES, Sets, Wanted};
 use async_trait::async_trait;
 use midshift_bundle::digest::Digest;
+use midshift_bundle::encoding::{ENCODED_BYTES_MAX, ENCODED_BYTES_MIN};
 use midshift_bundle::manifest::{MANIFEST_BYTES_MAX, Manifest};
 use midshift_bundle::trust::{self, Reading, Source, Trusted};
 use midshift_core::reason::{Code, Reason};
@@ -24,6 +25,11 @@ pub const RANGE_BYTES: u64 = 4 * 1024 * 1024;
 /// What came is made durable this often, if it does not become so by its amount.
 const SYNC_EVERY: Duration = Duration::from_secs(2);
 
+/// A shorter way that is not made within this is not waited for.
+const WAY_WITHIN: Duration = Duration::from_secs(600);
+/// Nobody is asked more often.
+const ASK_AGAIN_MIN: Duration = Duration::from_millis(500);
+
 /// Bytes of one range, in order, in pieces of any length.
 pub type Pieces = std::pin::Pin<Box<dyn tokio_stream::Stream<Item = io::Result<Vec<u8>>> + Send>>;
 
@@ -32,8 +38,28 @@ pub type Pieces = std::pin::Pin<Box<dyn tokio_stream::Stream<Item = io::Result<V
 pub trait Remote: fmt::Debug + Send + Sync {
     /// The metadata document of this name; none: there is none.
     async fn metadata(&self, name: &str) -> io::Result<Option<Vec<u8>>>;
-    /// A range of content.
+    /// A range of content, or of a shorter way to it. `NotFound`: there is none.
     async fn range(&self, digest: &Digest, range: Range<u64>) -> io::Result<Pieces>;
+    /// How content is best fetched by a robot that has `bases`. A repository without shorter ways says: as it is.
+    async fn way(&self, _wanted: &Wanted, _bases: &[Digest]) -> io::Result<Way> {
+        Ok(Way::AsItIs)
+    }
+}
+
+/// How content is best fetched.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Way {
+    /// As it is.
+    AsItIs,
+    /// Something shorter that it can be made of, from `base` if that is a patch.
+    Shorter {
+        /// What the robot has.
+        base: Option<Digest>,
+        /// What is fetched.
+        encoded: Wanted,
+    },
+    /// A shorter way is being made: ask again after this.
+    AskAgain(Duration),
 }
 
 /// Does jobs.
@@ -68,10 +94,34 @@ fn refused(reason: impl Into<Reason>) -> Done {
     Done::Failed(Failure::Refused(reason.into()))
 }
 
-fn disk(error: &sets::Error) -> Done {
+/// Why a download did not come to its end.
+enum Stop {
+    /// The server has no such content.
+    Gone(String),
+    /// Anything else.
+    Failed(Failure),
+}
+
+fn ended(result: Result<(), Stop>) -> Done {
+    match result {
+        Ok(()) => Done::Ok,
+        Err(Stop::Gone(why)) => later(why),
+        Err(Stop::Failed(failure)) => Done::Failed(failure),
+    }
+}
+
+fn unreached(why: impl fmt::Display) -> Stop {
+    Stop::Failed(Failure::Later(why.to_string()))
+}
+
+fn stopped(error: sets::Error) -> Stop {
+    Stop::Failed(of_disk(&error))
+}
+
+fn of_disk(error: &sets::Error) -> Failure {
     match error {
-        sets::Error::Io { .. } if error.is_full() => refused(Reason::new(Code::NoRoom, error.to_string())),
-        _ => later(error),
+        sets::Error::Io { .. } if error.is_full() => Failure::Refused(Reason::new(Code::NoRoom, error.to_string())),
+        _ => Failure::Later(error.to_string()),
     }
 }
 
@@ -84,10 +134,12 @@ impl Worker for UpdateWorker {
                 Err(error) => later(error),
             },
             Job::Refresh { trusted, clock } => self.refresh(&trusted, clock).await,
-            Job::Fetch { wanted, rate_bytes_s } => self.fetch(wanted, rate_bytes_s, &leave).await,
-            Job::Manifest { wanted } => match self.fetch(wanted, 0, &leave).await {
-                Done::Ok => self.manifest(wanted).await,
-                failed => failed,
+            Job::Fetch { wanted, bases, rate_bytes_s } => {
+                ended(self.fetch(wanted, &bases, &mut Pace::new(rate_bytes_s), &leave).await)
+            }
+            Job::Manifest { wanted } => match self.fetch_whole(wanted, &mut Pace::new(0), &leave).await {
+                Ok(()) => self.manifest(wanted).await,
+                Err(failed) => ended(Err(failed)),
             },
             Job::Stage(set) => self.done(move |sets| sets.stage(&set)).await,
             Job::Verify(set) => self.verify(set.as_str()).await,
@@ -115,7 +167,7 @@ impl UpdateWorker {
     }
 
     async fn done(&self, verb: impl FnOnce(&mut dyn Sets) -> Result<(), sets::Error> + Send + 'static) -> Done {
-        self.on_disk(verb).await.map_or_else(|error| disk(&error), |()| Done::Ok)
+        self.on_disk(verb).await.map_or_else(|error| Done::Failed(of_disk(&error)), |()| Done::Ok)
     }
 
     async fn refresh(&self, trusted: &Trusted, clock: Reading) -> Done {
@@ -147,40 +199,108 @@ impl UpdateWorker {
         }
     }
 
-    /// Fetches what is missing and checks the whole.
-    async fn fetch(&self, wanted: Wanted, rate_bytes_s: u32, leave: &CancellationToken) -> Done {
-        let missing = match self.on_disk(move |sets| sets.missing(&wanted)).await {
-            Ok(missing) => missing,
-            Err(error) => return disk(&error),
+    /// Has a file by the shortest way that leads to it. One that was begun as it is goes on so.
+    async fn fetch(
+        &self,
+        wanted: Wanted,
+        bases: &[Digest],
+        pace: &mut Pace,
+        leave: &CancellationToken,
+    ) -> Result<(), Stop> {
+        let missing = self.on_disk(move |sets| sets.missing(&wanted)).await.map_err(stopped)?;
+        let begun = missing.iter().map(|range| range.end - range.start).sum::<u64>() < wanted.length;
+        let noted = self.on_disk(move |sets| sets.is_fetched_as_it_is(&wanted)).await.map_err(stopped)?;
+        let worth = (ENCODED_BYTES_MIN..=ENCODED_BYTES_MAX).contains(&wanted.length);
+        if worth && !begun && !noted && self.fetch_shorter(wanted, bases, pace, leave).await? {
+            return Ok(());
+        }
+        self.fetch_whole(wanted, pace, leave).await
+    }
+
+    /// Whether a shorter way led to the file. One that did not is noted before anything else is tried, so that it is not tried again.
+    async fn fetch_shorter(
+        &self,
+        wanted: Wanted,
+        bases: &[Digest],
+        pace: &mut Pace,
+        leave: &CancellationToken,
+    ) -> Result<bool, Stop> {
+        let Some((base, encoded)) = self.shorter(wanted, bases, leave).await? else { return Ok(false) };
+        let failed = match self.fetch_whole(encoded, pace, leave).await {
+            Ok(()) => match self.on_disk(move |sets| sets.decode(&wanted, base.as_ref(), &encoded)).await {
+                Ok(()) => return Ok(true),
+                Err(error) => error.to_string(),
+            },
+            // The server needed its room: it may be made again one day, and the file comes as it is now.
+            Err(Stop::Gone(_)) => return Ok(false),
+            Err(Stop::Failed(Failure::Refused(reason))) => reason.text().to_owned(),
+            Err(later) => return Err(later),
         };
-        let mut pace = Pace::new(rate_bytes_s);
-        for gap in missing {
+        tracing::warn!(digest = %wanted.digest, ?base, failed, "a shorter way does not lead to the file: it comes as it is");
+        self.on_disk(move |sets| sets.fetch_as_it_is(&wanted)).await.map_err(stopped)?;
+        Ok(false)
+    }
+
+    /// A shorter way that the server names and that can lead there. While one is made it is waited for, up to [`WAY_WITHIN`].
+    async fn shorter(
+        &self,
+        wanted: Wanted,
+        bases: &[Digest],
+        leave: &CancellationToken,
+    ) -> Result<Option<(Option<Digest>, Wanted)>, Stop> {
+        let begun = Instant::now();
+        loop {
+            match self.remote.way(&wanted, bases).await.map_err(unreached)? {
+                Way::AsItIs => return Ok(None),
+                Way::Shorter { base, encoded } => {
+                    let is_one =
+                        encoded.length > 0 && encoded.length < wanted.length && encoded.digest != wanted.digest;
+                    let has_base = base.is_none_or(|base| bases.contains(&base));
+                    return Ok((is_one && has_base).then_some((base, encoded)));
+                }
+                Way::AskAgain(after) if begun.elapsed() < WAY_WITHIN => tokio::select! {
+                    biased;
+                    () = leave.cancelled() => return Err(unreached("left")),
+                    () = tokio::time::sleep(after.clamp(ASK_AGAIN_MIN, WAY_WITHIN)) => {}
+                },
+                Way::AskAgain(_) => return Ok(None),
+            }
+        }
+    }
+
+    /// Fetches what is missing and checks the whole.
+    async fn fetch_whole(&self, wanted: Wanted, pace: &mut Pace, leave: &CancellationToken) -> Result<(), Stop> {
+        for gap in self.on_disk(move |sets| sets.missing(&wanted)).await.map_err(stopped)? {
             let mut from = gap.start;
             while from < gap.end {
                 let range = from..gap.end.min(from + RANGE_BYTES);
                 tokio::select! {
                     biased;
                     () = leave.cancelled() => {
-                        let kept = self.on_disk(move |sets| sets.sync(&wanted)).await;
-                        return kept.map_or_else(|error| disk(&error), |()| later("left"));
+                        self.synced(wanted).await?;
+                        return Err(unreached("left"));
                     }
-                    ended = self.fetch_range(wanted, range.clone(), &mut pace) => if let Err(done) = ended {
-                        return done;
-                    },
+                    fetched = self.fetch_range(wanted, range.clone(), pace) => fetched?,
                 }
                 from = range.end;
             }
         }
         match self.on_disk(move |sets| sets.sync(&wanted).and_then(|()| sets.seal(&wanted))).await {
-            Ok(()) => Done::Ok,
-            Err(error @ sets::Error::Corrupt { .. }) => refused(Reason::new(Code::BundleCorrupt, error.to_string())),
-            Err(error) => disk(&error),
+            Ok(()) => Ok(()),
+            Err(error @ sets::Error::Corrupt { .. }) => {
+                Err(Stop::Failed(Failure::Refused(Reason::new(Code::BundleCorrupt, error.to_string()))))
+            }
+            Err(error) => Err(stopped(error)),
         }
     }
 
     /// Whole chunks go to the disk as they are complete; what is left of the last is dropped if the way breaks.
-    async fn fetch_range(&self, wanted: Wanted, range: Range<u64>, pace: &mut Pace) -> Result<(), Done> {
-        let mut pieces = self.remote.range(&wanted.digest, range.clone()).await.map_err(later)?;
+    async fn fetch_range(&self, wanted: Wanted, range: Range<u64>, pace: &mut Pace) -> Result<(), Stop> {
+        let mut pieces =
+            self.remote.range(&wanted.digest, range.clone()).await.map_err(|error| match error.kind() {
+                io::ErrorKind::NotFound => Stop::Gone(error.to_string()),
+                _ => unreached(error),
+            })?;
         let (mut at, mut gathered) = (range.start, Vec::new());
         let mut synced = Instant::now();
         while let Some(piece) = pieces.next().await {
@@ -188,21 +308,21 @@ impl UpdateWorker {
                 Ok(piece) => piece,
                 Err(error) => {
                     self.synced(wanted).await?;
-                    return Err(later(error));
+                    return Err(unreached(error));
                 }
             };
             pace.took(piece.len() as u64).await;
             gathered.extend_from_slice(&piece);
             let end = at + gathered.len() as u64;
             if end > range.end {
-                return Err(later("more bytes than were asked for"));
+                return Err(unreached("more bytes than were asked for"));
             }
             let rest = if end == range.end { 0 } else { gathered.len() % CHUNK_BYTES as usize };
             let whole = gathered.len() - rest;
             if whole > 0 {
                 let bytes: Vec<u8> = gathered.drain(..whole).collect();
                 let written = self.on_disk(move |sets| sets.write(&wanted, at, &bytes)).await;
-                written.map_err(|error| disk(&error))?;
+                written.map_err(stopped)?;
                 at += whole as u64;
             }
             if synced.elapsed() >= SYNC_EVERY {
@@ -210,11 +330,11 @@ impl UpdateWorker {
                 synced = Instant::now();
             }
         }
-        if at == range.end { Ok(()) } else { Err(later("the bytes ended early")) }
+        if at == range.end { Ok(()) } else { Err(unreached("the bytes ended early")) }
     }
 
-    async fn synced(&self, wanted: Wanted) -> Result<(), Done> {
-        self.on_disk(move |sets| sets.sync(&wanted)).await.map_err(|error| disk(&error))
+    async fn synced(&self, wanted: Wanted) -> Result<(), Stop> {
+        self.on_disk(move |sets| sets.sync(&wanted)).await.map_err(stopped)
     }
 }
 

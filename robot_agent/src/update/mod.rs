@@ -101,6 +101,8 @@ pub enum Job {
     Fetch {
         /// Which.
         wanted: Wanted,
+        /// Content that a patch may be from: the same component in other sets, the running one first.
+        bases: Vec<Digest>,
         /// Bytes a second; 0: as fast as it goes.
         rate_bytes_s: u32,
     },

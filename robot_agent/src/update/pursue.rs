@@ -419,7 +419,8 @@ impl AgentCore {
         let job = match missing {
             Some(c) => {
                 let rate_bytes_s = self.update.desired.as_ref().map_or(0, |d| d.rate_bytes_s);
-                Job::Fetch { wanted: Wanted { digest: c.digest, length: c.length }, rate_bytes_s }
+                let bases = self.update.holdings.as_ref().map(|holdings| holdings.bases(c)).unwrap_or_default();
+                Job::Fetch { wanted: Wanted { digest: c.digest, length: c.length }, bases, rate_bytes_s }
             }
             None => Job::Stage(Box::new(set.clone())),
         };

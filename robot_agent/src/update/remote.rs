@@ -3,15 +3,19 @@
 //! Invariant: a piece is handed on only if it follows the one before and arrived as it was sent; the connection is there only while it is
 //! used and [`IDLE`] longer. Called by [`super::io`].
 
-use super::io::{Pieces, Remote};
+use super::io::{Pieces, Remote, Way};
 use crate::dial::Dial;
+use crate::sets::Wanted;
 use async_trait::async_trait;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::trust::METADATA_BYTES_MAX;
+use midshift_core::limits;
 use midshift_proto::chunk;
 use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
 use midshift_proto::ota::v1::chunk_service_client::ChunkServiceClient;
-use midshift_proto::ota::v1::{FetchChunksRequest, FetchChunksResponse, GetMetadataRequest};
+use midshift_proto::ota::v1::{
+    Encoding, FetchChunksRequest, FetchChunksResponse, GetEncodingRequest, GetEncodingResponse, GetMetadataRequest,
+};
 use std::fmt;
 use std::io;
 use std::ops::Range;
@@ -154,6 +158,23 @@ impl Remote for GrpcRemote {
         }
     }
 
+    async fn way(&self, wanted: &Wanted, bases: &[Digest]) -> io::Result<Way> {
+        let lease = self.lease().await?;
+        let base_digests = bases.iter().take(limits::ENCODING_BASES_MAX).map(Digest::to_string).collect();
+        let request = GetEncodingRequest { digest: wanted.digest.to_string(), base_digests };
+        let mut client = ChunkServiceClient::new(lease.channel.clone());
+        match tokio::time::timeout(SILENCE, client.get_encoding(request)).await {
+            Ok(Ok(answer)) => Ok(way(&answer.into_inner())),
+            // A server from before, or one that cannot: the file says itself whether it is there.
+            Ok(Err(status)) if matches!(status.code(), Code::Unimplemented | Code::NotFound) => Ok(Way::AsItIs),
+            Ok(Err(status)) => Err(lease.refused(&status)),
+            Err(_) => {
+                lease.spoil();
+                Err(silent())
+            }
+        }
+    }
+
     async fn range(&self, digest: &Digest, range: Range<u64>) -> io::Result<Pieces> {
         let lease = self.lease().await?;
         let length = range.end.saturating_sub(range.start);
@@ -173,6 +194,23 @@ impl Remote for GrpcRemote {
                 Err(silent())
             }
         }
+    }
+}
+
+/// What an answer says; one that makes no sense is none.
+fn way(answer: &GetEncodingResponse) -> Way {
+    if answer.ask_again_ms > 0 {
+        return Way::AskAgain(Duration::from_millis(answer.ask_again_ms.into()));
+    }
+    let encoded = |digest: Digest| Wanted { digest, length: answer.encoded_length };
+    let base = match answer.encoding() {
+        Encoding::Zstd => Ok(None),
+        Encoding::ZstdPatch => answer.base_digest.parse().map(Some),
+        Encoding::Identity | Encoding::Unspecified => return Way::AsItIs,
+    };
+    match (base, answer.encoded_digest.parse().map(encoded)) {
+        (Ok(base), Ok(encoded)) => Way::Shorter { base, encoded },
+        _ => Way::AsItIs,
     }
 }
 

@@ -14,3 +14,4 @@ mod sets;
 mod steps;
 mod trusts;
 mod updates;
+mod ways;

@@ -2,12 +2,13 @@
 //!
 //! `strace` kills it as it enters the call. Without being asked a seeded sample of the calls is cut; `MIDSHIFT_SITES=all` cuts every one.
 
-use crate::sets::{bytes, set, staged, wanted};
+use crate::sets::{bytes, component, noise, patch, put, set, wanted};
 use midshift_agent::launcher::SWITCH;
 use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::sets::{CHUNK_BYTES, Sets};
 use midshift_agent::switch::Switch;
 use midshift_bundle::digest::Digest;
+use midshift_bundle::manifest::ComponentKind;
 use midshift_bundle::set::SetManifest;
 use rand::SeedableRng;
 use rand::rngs::StdRng;
@@ -28,23 +29,53 @@ const UPDATE: &str = "an_update_ends_and_made_once_more_it_changes_nothing";
 /// Cuts of a sample.
 const SAMPLE: usize = 48;
 
-/// What is updated to: a program of three chunks.
-fn next() -> (SetManifest, [Vec<u8>; 2]) {
-    let contents = [bytes(3, 2 * CHUNK_BYTES + 1_000), b"settings of v2".to_vec()];
-    (set("v2", &contents[0], &contents[1]), contents)
+/// Policy weights in every set; those of v2 come as a patch.
+fn weights(version: u64) -> Vec<u8> {
+    [noise(version, 1_000), noise(7, 400_000)].concat()
+}
+
+/// What is updated to: a program of three chunks, settings, and weights.
+fn next() -> (SetManifest, [Vec<u8>; 3]) {
+    let contents = [bytes(3, 2 * CHUNK_BYTES + 1_000), b"settings of v2".to_vec(), weights(2)];
+    (set_with("v2", &contents[0], &contents[1], &contents[2]), contents)
+}
+
+fn set_with(version: &str, program: &[u8], settings: &[u8], weights: &[u8]) -> SetManifest {
+    let mut set = set(version, program, settings);
+    let grip = component("grip", ComponentKind::Weights, weights);
+    set.components.insert(grip.name.clone(), grip);
+    set
 }
 
 /// A robot that runs v1 and keeps v0.
 fn robot(folder: &Path) -> [SetManifest; 2] {
     let mut sets = DiskSets::open(folder).expect("opens");
     let mut switch = Switch::default();
-    ["v0", "v1"].map(|version| {
-        let set = staged(&mut sets, version, format!("program {version}").as_bytes(), b"settings");
+    [(0, "v0"), (1, "v1")].map(|(number, version)| {
+        let (program, weights) = (format!("program {version}").into_bytes(), weights(number));
+        let set = set_with(version, &program, b"settings", &weights);
+        for content in [&program[..], b"settings", &weights] {
+            put(&mut sets, content);
+        }
+        sets.stage(&set).expect("stages");
         switch.try_out(&set.id().to_string());
         switch.commit();
         sets.write_switch(&mut switch).expect("writes");
         set
     })
+}
+
+/// Fetches what is missing of a file.
+fn fetch(sets: &mut DiskSets, content: &[u8]) {
+    let wanted = wanted(content);
+    for range in sets.missing(&wanted).expect("tells") {
+        for from in range.clone().step_by(CHUNK_BYTES as usize) {
+            let to = range.end.min(from + CHUNK_BYTES);
+            sets.write(&wanted, from, &content[from as usize..to as usize]).expect("writes");
+            sets.sync(&wanted).expect("syncs");
+        }
+    }
+    sets.seal(&wanted).expect("seals");
 }
 
 /// The whole update, from wherever an earlier one was cut off.
@@ -54,16 +85,14 @@ fn update(folder: &Path) {
     let name = next.id().to_string();
     let mut switch = sets.holdings().expect("tells").switch;
     if switch.running() != name {
-        for content in &contents {
-            let wanted = wanted(content);
-            for range in sets.missing(&wanted).expect("tells") {
-                for from in range.clone().step_by(CHUNK_BYTES as usize) {
-                    let to = range.end.min(from + CHUNK_BYTES);
-                    sets.write(&wanted, from, &content[from as usize..to as usize]).expect("writes");
-                    sets.sync(&wanted).expect("syncs");
-                }
-            }
-            sets.seal(&wanted).expect("seals");
+        let [program, settings, grip] = &contents;
+        for content in [program, settings] {
+            fetch(&mut sets, content);
+        }
+        if !sets.missing(&wanted(grip)).expect("tells").is_empty() {
+            let way = patch(&weights(1), grip);
+            fetch(&mut sets, &way);
+            sets.decode(&wanted(grip), Some(&Digest::of(&weights(1))), &wanted(&way)).expect("leads there");
         }
         sets.stage(&next).expect("stages");
         switch.try_out(&name);

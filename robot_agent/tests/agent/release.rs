@@ -1,8 +1,9 @@
 //! Releases for a robot on the bench: a repository with throw-away keys, and the bytes of its bundles.
 
 use async_trait::async_trait;
+use midshift_agent::sets::Wanted;
 use midshift_agent::update::UpdateConfig;
-use midshift_agent::update::io::{Pieces, Remote};
+use midshift_agent::update::io::{Pieces, Remote, Way};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::directive::{Directive, LIFE_MS};
 use midshift_bundle::keys::SecretKey;
@@ -38,6 +39,9 @@ struct Shelf {
     corrupt: bool,
     /// Bytes that went out.
     served: u64,
+    /// What is said of ways to a file, first one first; the last stays.
+    ways: BTreeMap<Digest, Vec<Way>>,
+    asked: Vec<Vec<Digest>>,
 }
 
 /// A repository that robots reach.
@@ -171,6 +175,23 @@ impl Releases {
     pub fn corrupt(&self, corrupt: bool) {
         self.shelf().corrupt = corrupt;
     }
+    /// Has bytes that no release lists.
+    pub fn hold(&self, bytes: &[u8]) -> Wanted {
+        self.shelf().bytes.insert(Digest::of(bytes), bytes.to_vec());
+        Wanted { digest: Digest::of(bytes), length: bytes.len() as u64 }
+    }
+    pub fn drop_bytes(&self, digest: &Digest) {
+        self.shelf().bytes.remove(digest);
+    }
+    /// Says this of ways to a file from now on, one after the other.
+    pub fn ways(&self, wanted: &Wanted, mut ways: Vec<Way>) {
+        ways.reverse();
+        self.shelf().ways.insert(wanted.digest, ways);
+    }
+    /// Bases of each question about ways so far.
+    pub fn asked(&self) -> Vec<Vec<Digest>> {
+        self.shelf().asked.clone()
+    }
     pub fn served(&self) -> u64 {
         self.shelf().served
     }
@@ -178,6 +199,15 @@ impl Releases {
 
 #[async_trait]
 impl Remote for Releases {
+    async fn way(&self, wanted: &Wanted, bases: &[Digest]) -> io::Result<Way> {
+        let mut shelf = self.shelf();
+        if shelf.cut {
+            return Err(io::ErrorKind::NotConnected.into());
+        }
+        shelf.asked.push(bases.to_vec());
+        let Some(ways) = shelf.ways.get_mut(&wanted.digest) else { return Ok(Way::AsItIs) };
+        Ok(if ways.len() > 1 { ways.pop() } else { ways.last().copied() }.unwrap_or(Way::AsItIs))
+    }
     async fn metadata(&self, name: &str) -> io::Result<Option<Vec<u8>>> {
         let shelf = self.shelf();
         if shelf.cut { Err(io::ErrorKind::NotConnected.into()) } else { Ok(shelf.documents.get(name).cloned()) }

@@ -6,7 +6,7 @@ use hyper_util::rt::TokioIo;
 use midshift_agent::dial::{self, Dial, TcpDial};
 use midshift_agent::sets::memory::MemorySets;
 use midshift_agent::sets::{CHUNK_BYTES, Sets, Wanted};
-use midshift_agent::update::io::{Remote, UpdateWorker, Worker};
+use midshift_agent::update::io::{Remote, UpdateWorker, Way, Worker};
 use midshift_agent::update::remote::{GrpcRemote, IDLE, SILENCE};
 use midshift_agent::update::{Done, Failure, Job};
 use midshift_bundle::digest::Digest;
@@ -14,9 +14,9 @@ use midshift_proto::chunk;
 use midshift_proto::ota::v1::bundle_service_server::{BundleService, BundleServiceServer};
 use midshift_proto::ota::v1::chunk_service_server::{ChunkService, ChunkServiceServer};
 use midshift_proto::ota::v1::{
-    FetchChunksRequest, FetchChunksResponse, GetMetadataRequest, GetMetadataResponse, GetUploadRequest,
-    GetUploadResponse, ListBundlesRequest, ListBundlesResponse, PublishRepositoryRequest, PublishRepositoryResponse,
-    UploadTargetRequest, UploadTargetResponse,
+    Encoding, FetchChunksRequest, FetchChunksResponse, GetEncodingRequest, GetEncodingResponse, GetMetadataRequest,
+    GetMetadataResponse, GetUploadRequest, GetUploadResponse, ListBundlesRequest, ListBundlesResponse,
+    PublishRepositoryRequest, PublishRepositoryResponse, UploadTargetRequest, UploadTargetResponse,
 };
 use std::io::ErrorKind;
 use std::pin::Pin;
@@ -57,6 +57,8 @@ enum Wrong {
     Silent,
     /// Every call is refused.
     Refuses,
+    /// It knows no shorter ways.
+    Old,
 }
 
 /// A server with the releases of the bench.
@@ -64,9 +66,15 @@ enum Wrong {
 struct Shop {
     releases: Releases,
     wrong: Arc<Mutex<Wrong>>,
+    /// What it says of ways, and what it was asked.
+    encoding: Arc<Mutex<GetEncodingResponse>>,
+    asked: Arc<Mutex<Vec<GetEncodingRequest>>>,
 }
 
 impl Shop {
+    fn new() -> Self {
+        Self { releases: Releases::new(), wrong: Arc::default(), encoding: Arc::default(), asked: Arc::default() }
+    }
     fn is(&self, wrong: Wrong) -> bool {
         *self.wrong.lock().expect("not poisoned") == wrong
     }
@@ -78,7 +86,7 @@ impl Shop {
     /// Pieces of a range as a server that is so wrong sends them.
     fn pieces(&self, mut pieces: Vec<FetchChunksResponse>) -> Vec<Result<FetchChunksResponse, Status>> {
         match *self.wrong.lock().expect("not poisoned") {
-            Wrong::Nothing | Wrong::Refuses => {}
+            Wrong::Nothing | Wrong::Refuses | Wrong::Old => {}
             Wrong::Broken => pieces[1].data[7] ^= 1,
             Wrong::Order => pieces.swap(0, 1),
             Wrong::Twice => pieces.insert(1, pieces[0].clone()),
@@ -123,6 +131,17 @@ impl BundleService for Shop {
 #[async_trait]
 impl ChunkService for Shop {
     type FetchChunksStream = Pin<Box<dyn tokio_stream::Stream<Item = Result<FetchChunksResponse, Status>> + Send>>;
+
+    async fn get_encoding(&self, request: Request<GetEncodingRequest>) -> Answer<GetEncodingResponse> {
+        match *self.wrong.lock().expect("not poisoned") {
+            Wrong::Refuses => Err(Status::permission_denied("not for you")),
+            Wrong::Old => Err(Status::unimplemented("a server from before")),
+            _ => {
+                self.asked.lock().expect("not poisoned").push(request.into_inner());
+                Ok(Response::new(self.encoding.lock().expect("not poisoned").clone()))
+            }
+        }
+    }
 
     async fn fetch_chunks(&self, request: Request<FetchChunksRequest>) -> Answer<Self::FetchChunksStream> {
         if self.is(Wrong::Refuses) {
@@ -203,7 +222,7 @@ impl Dial for Pipes {
 /// A robot and the server of its releases.
 struct Bench {
     releases: Releases,
-    wrong: Arc<Mutex<Wrong>>,
+    shop: Shop,
     remote: Arc<GrpcRemote>,
     open: watch::Receiver<usize>,
     dialed: watch::Receiver<usize>,
@@ -211,15 +230,21 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
-        let shop = Shop { releases: Releases::new(), wrong: Arc::default() };
+        let shop = Shop::new();
         let (ends, incoming) = mpsc::channel(4);
         tokio::spawn(shop.router().serve_with_incoming(ReceiverStream::new(incoming)));
         let ((open, is_open), (dialed, was_dialed)) = (watch::channel(0), watch::channel(0));
         let remote = Arc::new(GrpcRemote::new(Arc::new(Pipes { ends, open, dialed })));
-        Self { releases: shop.releases, wrong: shop.wrong, remote, open: is_open, dialed: was_dialed }
+        Self { releases: shop.releases.clone(), shop, remote, open: is_open, dialed: was_dialed }
     }
     fn server_is(&self, wrong: Wrong) {
-        *self.wrong.lock().expect("not poisoned") = wrong;
+        *self.shop.wrong.lock().expect("not poisoned") = wrong;
+    }
+    /// What the robot makes of an answer about ways.
+    async fn way(&self, answer: GetEncodingResponse) -> Way {
+        *self.shop.encoding.lock().expect("not poisoned") = answer;
+        let wanted = Wanted { digest: Digest::of(b"new"), length: 1_000 };
+        self.remote.way(&wanted, &[Digest::of(b"old")]).await.expect("answers")
     }
     fn connections(&self) -> (usize, usize) {
         (*self.open.borrow(), *self.dialed.borrow())
@@ -265,14 +290,14 @@ async fn a_release_comes_over_the_wire_whole() {
     };
     assert_eq!(*read, bundle.manifest);
     let wanted = program(&bundle);
-    assert!(matches!(work(&mut worker, Job::Fetch { wanted, rate_bytes_s: 0 }).await, Done::Ok));
+    assert!(matches!(work(&mut worker, Job::Fetch { wanted, bases: Vec::new(), rate_bytes_s: 0 }).await, Done::Ok));
     assert_eq!(sets.read(&wanted.digest, wanted.length).expect("is there").len() as u64, wanted.length);
     assert_eq!(bench.connections(), (1, 1), "one connection for all of it");
 }
 
 #[tokio::test]
 async fn it_comes_over_tcp_too() {
-    let shop = Shop { releases: Releases::new(), wrong: Arc::default() };
+    let shop = Shop::new();
     let bundle = shop.releases.release("1.0.0");
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("binds");
     let uri = format!("http://{}", listener.local_addr().expect("bound"));
@@ -336,14 +361,14 @@ async fn a_download_goes_on_from_what_is_durable() {
     let mut worker = UpdateWorker::new(Box::new(sets.clone()), bench.remote.clone());
     for wrong in [Wrong::Breaks, Wrong::Broken] {
         bench.server_is(wrong);
-        let done = work(&mut worker, Job::Fetch { wanted, rate_bytes_s: 0 }).await;
+        let done = work(&mut worker, Job::Fetch { wanted, bases: Vec::new(), rate_bytes_s: 0 }).await;
         assert!(matches!(done, Done::Failed(Failure::Later(_))), "{wrong:?}: {done:?}");
         sets.sync(&wanted).expect("syncs");
         assert_eq!(sets.missing(&wanted).expect("tells"), std::slice::from_ref(&(CHUNK_BYTES..wanted.length)));
     }
     bench.server_is(Wrong::Nothing);
     let before = bench.releases.served();
-    assert!(matches!(work(&mut worker, Job::Fetch { wanted, rate_bytes_s: 0 }).await, Done::Ok));
+    assert!(matches!(work(&mut worker, Job::Fetch { wanted, bases: Vec::new(), rate_bytes_s: 0 }).await, Done::Ok));
     assert_eq!(bench.releases.served() - before, wanted.length - CHUNK_BYTES, "what was there did not come again");
     assert!(sets.read(&wanted.digest, wanted.length).is_ok());
 }
@@ -370,4 +395,40 @@ async fn a_connection_that_nobody_uses_is_closed_and_one_in_use_is_not() {
     bench.open.wait_for(|open| *open == 0).await.expect("is closed");
     bench.remote.metadata("timestamp.json").await.expect("answers");
     assert_eq!(bench.connections(), (1, 2));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_shorter_way_is_asked_for_with_what_is_there_and_an_answer_without_sense_is_none() {
+    let bench = Bench::new();
+    let [old, way] = [b"old", b"way"].map(|content| Digest::of(content));
+    let answer = GetEncodingResponse {
+        encoding: Encoding::ZstdPatch.into(),
+        base_digest: old.to_string(),
+        encoded_digest: way.to_string(),
+        encoded_length: 7,
+        ask_again_ms: 0,
+    };
+    let encoded = Wanted { digest: way, length: 7 };
+    assert_eq!(bench.way(answer.clone()).await, Way::Shorter { base: Some(old), encoded });
+    let zstd = GetEncodingResponse { encoding: Encoding::Zstd.into(), ..answer.clone() };
+    assert_eq!(bench.way(zstd).await, Way::Shorter { base: None, encoded });
+    let soon = GetEncodingResponse { ask_again_ms: 2_000, ..answer.clone() };
+    assert_eq!(bench.way(soon).await, Way::AskAgain(std::time::Duration::from_secs(2)));
+    let senseless = [
+        GetEncodingResponse::default(),
+        GetEncodingResponse { encoding: 77, ..answer.clone() },
+        GetEncodingResponse { encoding: Encoding::Identity.into(), ..answer.clone() },
+        GetEncodingResponse { base_digest: String::new(), ..answer.clone() },
+        GetEncodingResponse { encoded_digest: "x".to_owned(), ..answer.clone() },
+    ];
+    for answer in senseless {
+        assert_eq!(bench.way(answer.clone()).await, Way::AsItIs, "{answer:?}");
+    }
+    let asked = bench.shop.asked.lock().expect("not poisoned")[0].clone();
+    let expected = GetEncodingRequest { digest: Digest::of(b"new").to_string(), base_digests: vec![old.to_string()] };
+    assert_eq!(asked, expected);
+    bench.server_is(Wrong::Old);
+    assert_eq!(bench.way(answer).await, Way::AsItIs);
+    bench.server_is(Wrong::Refuses);
+    assert!(bench.remote.way(&encoded, &[]).await.is_err());
 }

@@ -6,10 +6,12 @@ use midshift_agent::sets::memory::MemorySets;
 use midshift_agent::sets::{CHUNK_BYTES, CHUNKS_UNSYNCED_MAX, Error, Sets, Wanted};
 use midshift_agent::switch::Switch;
 use midshift_bundle::digest::Digest;
+use midshift_bundle::encoding;
 use midshift_bundle::manifest::{Component, ComponentKind, Migration, Needs, SafetyClass};
 use midshift_bundle::set::SetManifest;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
+use std::io::Read;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::Path;
 use tempfile::TempDir;
@@ -60,11 +62,34 @@ pub fn bytes(seed: u8, length: u64) -> Vec<u8> {
     (0..length).map(|at| seed.wrapping_add((at % 251) as u8)).collect()
 }
 
+/// Bytes that do not become shorter by themselves.
+pub fn noise(seed: u64, length: usize) -> Vec<u8> {
+    let mut state = seed;
+    let step = |_| {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 56) as u8
+    };
+    (0..length).map(step).collect()
+}
+
+pub fn patch(old: &[u8], new: &[u8]) -> Vec<u8> {
+    let (mut base, mut patch) = (std::io::Cursor::new(old), Vec::new());
+    encoding::encode(Some(&mut base), &mut &*new, new.len() as u64, &mut patch, u64::MAX).expect("a patch");
+    patch
+}
+
+/// Few bytes that become many.
+pub fn bomb() -> Vec<u8> {
+    let mut bomb = Vec::new();
+    encoding::encode(None, &mut std::io::repeat(0).take(1 << 26), 1 << 26, &mut bomb, u64::MAX).expect("a bomb");
+    bomb
+}
+
 pub fn wanted(content: &[u8]) -> Wanted {
     Wanted { digest: Digest::of(content), length: content.len() as u64 }
 }
 
-fn put(sets: &mut dyn Sets, content: &[u8]) -> Wanted {
+pub fn put(sets: &mut dyn Sets, content: &[u8]) -> Wanted {
     let wanted = wanted(content);
     for range in sets.missing(&wanted).expect("tells") {
         let part = &content[range.start as usize..range.end as usize];
@@ -75,7 +100,7 @@ fn put(sets: &mut dyn Sets, content: &[u8]) -> Wanted {
     wanted
 }
 
-fn component(name: &str, kind: ComponentKind, content: &[u8]) -> Component {
+pub fn component(name: &str, kind: ComponentKind, content: &[u8]) -> Component {
     Component {
         name: name.to_owned(),
         version: "1.0.0".to_owned(),
@@ -104,7 +129,7 @@ pub fn set(version: &str, program: &[u8], settings: &[u8]) -> SetManifest {
     }
 }
 
-pub fn staged(sets: &mut dyn Sets, version: &str, program: &[u8], settings: &[u8]) -> SetManifest {
+fn staged(sets: &mut dyn Sets, version: &str, program: &[u8], settings: &[u8]) -> SetManifest {
     let set = set(version, program, settings);
     put(sets, program);
     put(sets, settings);
@@ -312,5 +337,74 @@ fn sizes_around_2_31_and_2_32_are_files_like_others() {
         assert_eq!(fs::metadata(part).expect("is there").len(), length);
         let mut again = DiskSets::open(folder.path()).expect("opens");
         assert_eq!(again.missing(&wanted).expect("tells"), only(0..last), "{length}");
+    }
+}
+
+#[test]
+fn content_is_made_of_a_patch_and_what_is_there_and_stays_after_a_power_cut() {
+    for place in Place::both() {
+        let mut sets = place.open();
+        let (old, new) = (noise(1, 300_000), [noise(2, 77), noise(1, 300_000)].concat());
+        let base = put(&mut *sets, &old);
+        let encoded = put(&mut *sets, &patch(&old, &new));
+        let new_one = wanted(&new);
+        assert_eq!(sets.missing(&new_one).expect("tells"), only(0..new_one.length));
+        sets.decode(&new_one, Some(&base.digest), &encoded).expect("leads there");
+        let mut sets = place.cut(sets);
+        assert_eq!(sets.read(&new_one.digest, new_one.length).expect("reads"), new);
+        assert_eq!(sets.missing(&new_one).expect("tells"), []);
+        assert!(sets.read(&encoded.digest, encoded.length).is_err(), "the patch went");
+        sets.decode(&new_one, Some(&base.digest), &encoded).expect("again does nothing");
+    }
+}
+
+#[test]
+fn a_way_that_leads_elsewhere_makes_no_content_and_goes() {
+    for place in Place::both() {
+        let (old, new) = (noise(1, 300_000), [noise(2, 77), noise(1, 300_000)].concat());
+        let (right, new_one) = (patch(&old, &new), wanted(&new));
+        let mut tampered = right.clone();
+        tampered[100] ^= 4;
+        let mut sets = place.open();
+        let [base, other] = [&old, &noise(5, 300_000)].map(|content| put(&mut *sets, content).digest);
+        let cases = [
+            (tampered, Some(base), new_one),
+            (right.clone(), Some(other), new_one),
+            (right.clone(), None, new_one),
+            (right.clone(), Some(base), Wanted { length: new_one.length - 1, ..new_one }),
+            (right.clone(), Some(base), Wanted { length: new_one.length + 1, ..new_one }),
+            (right, Some(base), Wanted { digest: Digest::of(b"another"), ..new_one }),
+            (bomb(), None, new_one),
+        ];
+        for (way, base, wanted) in cases {
+            let encoded = put(&mut *sets, &way);
+            let made = sets.decode(&wanted, base.as_ref(), &encoded);
+            assert!(matches!(made, Err(Error::Corrupt { digest }) if digest == wanted.digest), "{made:?}");
+            assert_eq!(sets.missing(&wanted).expect("tells"), only(0..wanted.length));
+            assert!(sets.read(&encoded.digest, encoded.length).is_err(), "the way went");
+        }
+        let encoded = put(&mut *sets, &patch(&old, &new));
+        let nothing = Digest::of(b"of nobody");
+        assert!(
+            matches!(sets.decode(&new_one, Some(&nothing), &encoded), Err(Error::Missing(digest)) if digest == nothing)
+        );
+    }
+}
+
+#[test]
+fn that_a_file_comes_as_it_is_is_remembered_until_it_is_there() {
+    for place in Place::both() {
+        let mut sets = place.open();
+        let content = bytes(1, 1_000);
+        let file = wanted(&content);
+        assert!(!sets.is_fetched_as_it_is(&file).expect("tells"));
+        sets.fetch_as_it_is(&file).expect("notes");
+        let mut sets = place.cut(sets);
+        assert!(sets.is_fetched_as_it_is(&file).expect("tells"));
+        sets.collect(&BTreeSet::from([file.digest])).expect("collects");
+        assert!(sets.is_fetched_as_it_is(&file).expect("tells"), "it is still wanted");
+        put(&mut *sets, &content);
+        sets.collect(&BTreeSet::from([file.digest])).expect("collects");
+        assert!(!sets.is_fetched_as_it_is(&file).expect("tells"));
     }
 }

@@ -7,6 +7,7 @@ use crate::blocking;
 use async_trait::async_trait;
 use bytes::Bytes;
 use midshift_bundle::digest::{Digest, Hashing};
+use midshift_bundle::encoding::Base;
 use midshift_bundle::manifest::COMPONENT_BYTES_MAX;
 use midshift_core::limits;
 use serde::{Deserialize, Serialize};
@@ -109,6 +110,12 @@ pub trait Content: Send + Sync + 'static {
     async fn settle(&self, file: Wanted) -> Result<Held, Error>;
     /// Bytes of a whole file, cut at its end; none: it is not here.
     async fn read(&self, digest: Digest, range: Range<u64>) -> Result<Option<Reader>, Error>;
+    /// A whole file, to be read from any place; none: it is not here.
+    async fn open(&self, digest: Digest) -> Result<Option<Box<dyn Base>>, Error>;
+    /// Takes room for what is made of files, beside them.
+    fn claim(&self, bytes: u64) -> Result<(), Error>;
+    /// Gives such room back.
+    fn give_back(&self, bytes: u64);
 }
 
 /// What is known for sure of a file that is not whole, beside it as `<digest>.mark`.
@@ -136,7 +143,7 @@ struct Entry {
 struct Shelf {
     whole: BTreeMap<Digest, u64>,
     parts: BTreeMap<Digest, Entry>,
-    /// Bytes of all files, whole or not.
+    /// Bytes of all files, whole or not, and of what was made of them.
     used: u64,
     /// Rises with each touch of a part.
     turn: u64,
@@ -207,6 +214,17 @@ impl Content for DiskContent {
         let opened = self.in_background(move |inner| inner.open_at(digest, range.start)).await?;
         let length = range.end.saturating_sub(range.start);
         Ok(opened.map(|file| -> Reader { Box::new(tokio::fs::File::from_std(file).take(length)) }))
+    }
+    async fn open(&self, digest: Digest) -> Result<Option<Box<dyn Base>>, Error> {
+        let opened = self.in_background(move |inner| inner.open_at(digest, 0)).await?;
+        Ok(opened.map(|file| -> Box<dyn Base> { Box::new(file) }))
+    }
+    fn claim(&self, bytes: u64) -> Result<(), Error> {
+        self.inner.reserve(bytes, bytes)
+    }
+    fn give_back(&self, bytes: u64) {
+        let mut shelf = self.inner.shelf();
+        shelf.used = shelf.used.saturating_sub(bytes);
     }
 }
 
@@ -447,7 +465,7 @@ fn remove(path: &Path) -> Result<(), Error> {
     }
 }
 
-fn sync_folder(path: &Path) -> Result<(), Error> {
+pub(crate) fn sync_folder(path: &Path) -> Result<(), Error> {
     File::open(path).and_then(|folder| folder.sync_all()).map_err(at("syncing", path))
 }
 

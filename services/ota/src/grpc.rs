@@ -1,6 +1,7 @@
 //! The gRPC faces of releases and bytes: decode, call, encode.
 
-use crate::content::{Held, Wanted};
+use crate::content::{Error, Held, Wanted};
+use crate::encodings::Way;
 use crate::{OtaService, pages, refusal};
 use bytes::Bytes;
 use midshift_bundle::digest::Digest;
@@ -57,7 +58,16 @@ impl OtaService {
         if message.data.is_empty() {
             return Ok(());
         }
-        Ok(self.opened()?.content.append(file, message.offset, Bytes::from(message.data)).await?)
+        let (opened, data) = (self.opened()?, Bytes::from(message.data));
+        match opened.content.append(file, message.offset, data.clone()).await {
+            // What can be made again makes room.
+            Err(Error::Full { missing, free, .. })
+                if opened.encodings.make_room(missing.saturating_sub(free)).await? =>
+            {
+                Ok(opened.content.append(file, message.offset, data).await?)
+            }
+            appended => Ok(appended?),
+        }
     }
 
     async fn uploaded(&self, file: Wanted) -> Result<v1::UploadTargetResponse, Refusal> {
@@ -90,6 +100,33 @@ impl OtaService {
         pages::page(releases, r).map_err(|bad| Refusal::invalid(bad.0))
     }
 
+    async fn encoding(&self, r: v1::GetEncodingRequest) -> Result<v1::GetEncodingResponse, Refusal> {
+        let opened = self.opened()?;
+        let mut bad = Violations::default();
+        let digest = bad.take("digest", r.digest.parse::<Digest>());
+        if r.base_digests.len() > limits::ENCODING_BASES_MAX {
+            bad.add("base_digests", format!("at most {}", limits::ENCODING_BASES_MAX));
+        }
+        let bases = r.base_digests.iter().take(limits::ENCODING_BASES_MAX);
+        let bases: Vec<Digest> = bases.filter_map(|base| bad.take("base_digests", base.parse())).collect();
+        bad.finish()?;
+        let digest = digest.ok_or_else(|| Refusal::field("digest", "is required"))?;
+        let file = opened.listed(digest).await?;
+        let mut answer = v1::GetEncodingResponse { encoding: v1::Encoding::Identity.into(), ..Default::default() };
+        match opened.encodings.way(file, &bases).await? {
+            Way::Identity => {}
+            Way::Later => answer.ask_again_ms = limits::ENCODING_ASK_AGAIN_MS,
+            Way::Encoded(key, encoded) => {
+                let kind = if key.base.is_some() { v1::Encoding::ZstdPatch } else { v1::Encoding::Zstd };
+                answer.encoding = kind.into();
+                answer.base_digest = key.base.map(String::from).unwrap_or_default();
+                answer.encoded_digest = encoded.digest.to_string();
+                answer.encoded_length = encoded.length;
+            }
+        }
+        Ok(answer)
+    }
+
     async fn fetch(&self, r: v1::FetchChunksRequest) -> Result<Chunks, Refusal> {
         let opened = self.opened()?;
         let mut bad = Violations::default();
@@ -99,12 +136,19 @@ impl OtaService {
         }
         bad.finish()?;
         let digest = digest.ok_or_else(|| Refusal::field("digest", "is required"))?;
-        let file = opened.listed(digest).await?;
-        if r.offset >= file.length {
-            return Err(Refusal::field("offset", format!("the file has {} bytes", file.length)));
+        let encoded = opened.encodings.found(digest).filter(|(key, _)| opened.lists(key.target));
+        let length = match encoded {
+            Some((_, length)) => length,
+            None => opened.listed(digest).await?.length,
+        };
+        if r.offset >= length {
+            return Err(Refusal::field("offset", format!("the file has {length} bytes")));
         }
-        let range = r.offset..(r.offset + r.length).min(file.length);
-        let reader = opened.content.read(digest, range).await?;
+        let range = r.offset..(r.offset + r.length).min(length);
+        let reader = match encoded {
+            Some(_) => opened.encodings.read(digest, range).await?,
+            None => opened.content.read(digest, range).await?,
+        };
         let reader = reader.ok_or_else(|| Refusal::new(Kind::NotFound, Code::SoftwareNotFound))?;
         let mut offset = r.offset;
         let stream = ReaderStream::with_capacity(reader, limits::CHUNK_BYTES).map(move |piece| {
@@ -173,6 +217,13 @@ type Chunks = Pin<Box<dyn Stream<Item = Result<v1::FetchChunksResponse, Status>>
 #[tonic::async_trait]
 impl ChunkFace for OtaService {
     type FetchChunksStream = Chunks;
+
+    async fn get_encoding(
+        &self,
+        r: Request<v1::GetEncodingRequest>,
+    ) -> Result<Response<v1::GetEncodingResponse>, Status> {
+        answer(self.encoding(r.into_inner()).await)
+    }
 
     async fn fetch_chunks(&self, r: Request<v1::FetchChunksRequest>) -> Result<Response<Chunks>, Status> {
         answer(self.fetch(r.into_inner()).await)

@@ -1,9 +1,11 @@
 //! Software of robots on the server: keeps files of signed releases, says which release is the newest, hands out metadata and bytes.
 //!
 //! Called by the binary: [`OtaService::open`], its two gRPC faces, its pages over HTTP/1.1 and [`OtaService::run`]. Invariant: nothing is signed
-//! here that says what software is good; only files that the newest signed release lists are handed out.
+//! here that says what software is good; only files that the newest signed release lists are handed out, and
+//! what was made of them.
 
 pub mod content;
+pub mod encodings;
 #[cfg(test)]
 mod fixture;
 mod grpc;
@@ -14,6 +16,7 @@ pub mod repository;
 pub mod rollouts;
 
 use content::{Content, DiskContent, Wanted};
+use encodings::Encodings;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::time::{Clock, Utc};
 use midshift_proto::ota::v1::bundle_service_server::BundleServiceServer;
@@ -46,6 +49,7 @@ pub struct Parts {
 
 struct Opened {
     content: Arc<dyn Content>,
+    encodings: Encodings,
     repository: Repository,
     clock: Arc<dyn Clock>,
 }
@@ -63,15 +67,16 @@ impl OtaService {
     /// # Errors
     /// If keys, files or documents cannot be read, or documents do not hang together.
     pub async fn open(parts: Parts) -> Result<Self, Error> {
-        let files = parts.folder.join("content");
-        let (keys, content) = blocking(move || {
+        let (files, encoded) = (parts.folder.join("content"), parts.folder.join("encoded"));
+        let (keys, content, encodings) = blocking(move || {
             let keys = OnlineKeys::read(&parts.keys)?;
-            Ok::<_, Error>((keys, DiskContent::open(&files, parts.quota_bytes)?))
+            let content: Arc<dyn Content> = Arc::new(DiskContent::open(&files, parts.quota_bytes)?);
+            let encodings = Encodings::open(&encoded, content.clone())?;
+            Ok::<_, Error>((keys, content, encodings))
         })
         .await?;
-        let content: Arc<dyn Content> = Arc::new(content);
         let repository = Repository::open(&parts.folder.join("metadata"), keys, content.clone()).await?;
-        Ok(Self { opened: Some(Arc::new(Opened { content, repository, clock: parts.clock })) })
+        Ok(Self { opened: Some(Arc::new(Opened { content, encodings, repository, clock: parts.clock })) })
     }
     /// A service of a server without keys: it touches no disk and answers every call with what to do.
     pub fn without_keys() -> Self {
@@ -89,8 +94,16 @@ impl OtaService {
     pub fn pages(&self) -> axum::Router {
         http1::router(self.clone())
     }
-    /// Keeps what was signed fresh until shutdown.
+    /// Keeps what was signed fresh, and makes files shorter for robots, until shutdown.
     pub async fn run(self, shutdown: CancellationToken) {
+        let making = async {
+            if let Some(opened) = &self.opened {
+                opened.encodings.run(&shutdown).await;
+            }
+        };
+        tokio::join!(self.keep_fresh(&shutdown), making);
+    }
+    async fn keep_fresh(&self, shutdown: &CancellationToken) {
         loop {
             if let Some(opened) = &self.opened {
                 opened.look().await;
@@ -137,10 +150,15 @@ impl Opened {
         }
     }
 
+    /// Whether the newest signed release lists it.
+    fn lists(&self, digest: midshift_bundle::digest::Digest) -> bool {
+        self.repository.newest().is_some_and(|newest| newest.lists(digest))
+    }
+
     /// Which file is meant and how long it is, if a signed release lists it.
     async fn listed(&self, digest: midshift_bundle::digest::Digest) -> Result<Wanted, Refusal> {
         let not_found = || Refusal::new(Kind::NotFound, Code::SoftwareNotFound);
-        if !self.repository.newest().is_some_and(|newest| newest.lists(digest)) {
+        if !self.lists(digest) {
             return Err(not_found());
         }
         let length = self.content.length(digest).await?.ok_or_else(not_found)?;

@@ -1,6 +1,7 @@
 //! The two services as callers meet them, over a real connection.
 
 use crate::OtaService;
+use crate::encodings::tests::programs;
 use crate::fixture::{SEEDS, files, first_root, release, service, targets};
 use midshift_bundle::digest::Digest;
 use midshift_core::limits;
@@ -230,4 +231,58 @@ async fn a_server_without_keys_says_what_to_do() {
         assert_eq!((status.code(), code(&status)), (tonic::Code::FailedPrecondition, Some(Code::NoOnlineKeys)));
         assert!(status.message().contains("--ota-keys"), "{}", status.message());
     }
+}
+
+#[tokio::test]
+async fn a_robot_is_told_of_a_patch_and_fetches_it_in_ranges_and_uploads_push_it_out() {
+    let mut world = world().await;
+    let (old, new) = programs();
+    release(
+        &world.service,
+        &[("gait-1.component".to_owned(), old.clone()), ("gait-2.component".to_owned(), new.clone())],
+    )
+    .await;
+    let [base, digest] = [&old, &new].map(|content| Digest::of(content).to_string());
+    let request = v1::GetEncodingRequest { digest: digest.clone(), base_digests: vec![base.clone()] };
+    let told = world.chunks.get_encoding(request.clone()).await.expect("told").into_inner();
+    assert_eq!((told.encoding(), told.ask_again_ms), (v1::Encoding::Identity, limits::ENCODING_ASK_AGAIN_MS));
+    let encodings = &world.service.opened().expect("keys").encodings;
+    while encodings.make_next().await {}
+    let told = world.chunks.get_encoding(request).await.expect("told").into_inner();
+    assert_eq!((told.encoding(), told.ask_again_ms, told.base_digest), (v1::Encoding::ZstdPatch, 0, base));
+    let mut bytes = Vec::new();
+    while (bytes.len() as u64) < told.encoded_length {
+        let request = v1::FetchChunksRequest {
+            digest: told.encoded_digest.clone(),
+            offset: bytes.len() as u64,
+            length: 1_000.min(told.encoded_length - bytes.len() as u64),
+        };
+        let mut stream = world.chunks.fetch_chunks(request).await.expect("a range").into_inner();
+        while let Some(chunk) = stream.message().await.expect("a piece") {
+            bytes.extend(chunk.data);
+        }
+    }
+    assert_eq!(Digest::of(&bytes).to_string(), told.encoded_digest);
+    let opened = world.service.opened().expect("keys");
+    let free = (1 << 30) - (old.len() + new.len()) as u64;
+    opened.content.claim(free - 150_000).expect("leaves little");
+    let large = vec![7; 150_000];
+    world.upload(pieces(&large, 0, 1000)).await.expect("the ways made room for it");
+    let gone = v1::FetchChunksRequest { digest: told.encoded_digest, offset: 0, length: 1 };
+    assert_eq!(code(&world.chunks.fetch_chunks(gone).await.expect_err("it went")), Some(Code::SoftwareNotFound));
+}
+
+#[tokio::test]
+async fn only_a_listed_file_has_ways_and_every_wrong_digest_is_told() {
+    let mut world = world().await;
+    release(&world.service, &files("walk", "1.0.0")).await;
+    let mut ask = async |digest: String, base_digests: Vec<String>| {
+        world.chunks.get_encoding(v1::GetEncodingRequest { digest, base_digests }).await.expect_err("refused")
+    };
+    let unlisted = ask(Digest::of(b"of nobody").to_string(), Vec::new()).await;
+    assert_eq!(code(&unlisted), Some(Code::SoftwareNotFound));
+    let wrong = ask("x".to_owned(), vec!["y".to_owned()]).await;
+    assert_eq!(fields(&wrong), ["digest", "base_digests"]);
+    let many = ask(Digest::of(b"of nobody").to_string(), vec![Digest::of(b"x").to_string(); 9]).await;
+    assert_eq!(fields(&many), ["base_digests"]);
 }

@@ -1,0 +1,347 @@
+//! Shorter ways to files of releases: zstd, and patches from what robots have. Made once, kept in the room that files leave.
+//!
+//! Invariant: what is made here can be made again, so everything here may go whenever room is needed; one is made at a time; a way is
+//! kept only if it is worth it; what comes of it is judged by the robot, by the digest that people signed.
+
+use crate::blocking;
+use crate::content::{Content, Error, Reader, Wanted, sync_folder};
+use midshift_bundle::digest::Digest;
+use midshift_bundle::encoding::{self, Base, ENCODED_BYTES_MAX, ENCODED_BYTES_MIN, Encoded};
+use midshift_core::limits;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Seek, SeekFrom};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use tokio::io::AsyncReadExt;
+use tokio::sync::Notify;
+use tokio_util::sync::CancellationToken;
+
+/// In the name of a file that needs no other.
+const FULL: &str = "full";
+/// A way is worth it from this share of the file on, percent: below it asking and making cost more than they save.
+const WORTH_PERCENT: u64 = 95;
+
+/// Which file, and from which other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Key {
+    /// What comes out.
+    pub target: Digest,
+    /// What the robot must have; none: nothing.
+    pub base: Option<Digest>,
+}
+
+/// How a file is best fetched.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Way {
+    /// As it is.
+    Identity,
+    /// Like this.
+    Encoded(Key, Encoded),
+    /// A shorter way is being made.
+    Later,
+}
+
+struct Kept {
+    encoded: Encoded,
+    touched: u64,
+}
+
+#[derive(Default)]
+struct Shelf {
+    kept: BTreeMap<Key, Kept>,
+    by_digest: BTreeMap<Digest, Key>,
+    /// Tried, and not worth it or without room.
+    worthless: BTreeSet<Key>,
+    /// To be made, in order. The first is being made.
+    queue: VecDeque<Key>,
+    /// Rises with each use.
+    turn: u64,
+}
+
+struct Inner {
+    folder: PathBuf,
+    content: Arc<dyn Content>,
+    shelf: Mutex<Shelf>,
+    wake: Notify,
+}
+
+/// The shelf and its one maker. Cheap to clone.
+#[derive(Clone)]
+pub struct Encodings {
+    inner: Arc<Inner>,
+}
+
+fn at(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
+    let path = path.to_owned();
+    move |source| Error::Io { doing, path, source }
+}
+
+impl Shelf {
+    fn is_decided(&self, key: &Key) -> bool {
+        self.kept.contains_key(key) || self.worthless.contains(key)
+    }
+    fn touch(&mut self, key: Key) -> Option<Encoded> {
+        self.turn += 1;
+        let kept = self.kept.get_mut(&key)?;
+        kept.touched = self.turn;
+        Some(kept.encoded)
+    }
+    fn keep(&mut self, key: Key, encoded: Encoded) {
+        self.turn += 1;
+        self.kept.insert(key, Kept { encoded, touched: self.turn });
+        self.by_digest.insert(encoded.digest, key);
+    }
+    fn give_up(&mut self, key: Key) {
+        if self.worthless.len() >= limits::ENCODINGS_WORTHLESS_MAX {
+            self.worthless.pop_first();
+        }
+        self.worthless.insert(key);
+    }
+}
+
+impl Key {
+    fn name(&self, encoded: &Digest) -> String {
+        let base = self.base.map_or(FULL.to_owned(), |base| base.to_string());
+        format!("{}.{base}.{encoded}", self.target)
+    }
+    fn of_name(name: &str) -> Option<(Self, Digest)> {
+        let mut parts = name.split('.');
+        let (target, base, encoded) = (parts.next()?, parts.next()?, parts.next()?);
+        let base = if base == FULL { None } else { Some(base.parse().ok()?) };
+        let key = Self { target: target.parse().ok()?, base };
+        parts.next().is_none().then_some((key, encoded.parse().ok()?))
+    }
+}
+
+impl Encodings {
+    /// Opens the folder, made if it is not there. What was made stays if there is room for it. Blocks.
+    ///
+    /// # Errors
+    /// If it cannot be read or mended.
+    pub fn open(folder: &Path, content: Arc<dyn Content>) -> Result<Self, Error> {
+        fs::create_dir_all(folder).map_err(at("making", folder))?;
+        let mut shelf = Shelf::default();
+        for entry in fs::read_dir(folder).map_err(at("reading", folder))? {
+            let entry = entry.map_err(at("reading", folder))?;
+            let length = entry.metadata().map_err(at("reading", folder))?.len();
+            let found = entry.file_name().to_str().and_then(Key::of_name);
+            match found.filter(|_| content.claim(length).is_ok()) {
+                Some((key, digest)) => shelf.keep(key, Encoded { digest, length }),
+                None => fs::remove_file(entry.path()).map_err(at("removing", &entry.path()))?,
+            }
+        }
+        let inner = Inner { folder: folder.to_owned(), content, shelf: Mutex::new(shelf), wake: Notify::new() };
+        Ok(Self { inner: Arc::new(inner) })
+    }
+
+    /// How `target` is best fetched by a robot that has `bases`. Without an answer one is made, if not too many are asked for.
+    ///
+    /// # Errors
+    /// The disk's.
+    pub async fn way(&self, target: Wanted, bases: &[Digest]) -> Result<Way, Error> {
+        if !(ENCODED_BYTES_MIN..=ENCODED_BYTES_MAX).contains(&target.length) {
+            return Ok(Way::Identity);
+        }
+        let full = Key { target: target.digest, base: None };
+        let mut best = full;
+        for base in bases.iter().filter(|base| **base != target.digest) {
+            if self.inner.content.length(*base).await?.is_some() {
+                best = Key { base: Some(*base), ..full };
+                break;
+            }
+        }
+        let mut shelf = self.inner.shelf();
+        if shelf.is_decided(&full) && shelf.is_decided(&best) {
+            let found = [best, full].into_iter().find_map(|key| shelf.touch(key).map(|encoded| (key, encoded)));
+            return Ok(found.map_or(Way::Identity, |(key, encoded)| Way::Encoded(key, encoded)));
+        }
+        if !shelf.queue.contains(&best) {
+            if shelf.queue.len() >= limits::ENCODINGS_QUEUED_MAX {
+                return Ok(Way::Identity);
+            }
+            shelf.queue.push_back(best);
+            self.inner.wake.notify_one();
+        }
+        Ok(Way::Later)
+    }
+
+    /// What these bytes are a way to, and how many they are; none: they are not here.
+    pub fn found(&self, digest: Digest) -> Option<(Key, u64)> {
+        let shelf = self.inner.shelf();
+        let key = *shelf.by_digest.get(&digest)?;
+        shelf.kept.get(&key).map(|kept| (key, kept.encoded.length))
+    }
+
+    /// Bytes of a way, cut at its end; none: it is not here.
+    ///
+    /// # Errors
+    /// The disk's.
+    pub async fn read(&self, digest: Digest, range: Range<u64>) -> Result<Option<Reader>, Error> {
+        let inner = self.inner.clone();
+        let length = range.end.saturating_sub(range.start);
+        let opened = blocking(move || inner.open_at(digest, range.start)).await?;
+        Ok(opened.map(|file| -> Reader { Box::new(tokio::fs::File::from_std(file).take(length)) }))
+    }
+
+    /// Takes ways away, the one unused longest first, until `bytes` more are free. Whether so many became free.
+    ///
+    /// # Errors
+    /// The disk's.
+    pub async fn make_room(&self, bytes: u64) -> Result<bool, Error> {
+        let inner = self.inner.clone();
+        blocking(move || inner.evict(bytes)).await
+    }
+
+    /// Makes what is asked for until shutdown.
+    pub async fn run(&self, shutdown: &CancellationToken) {
+        loop {
+            while self.make_next().await {
+                if shutdown.is_cancelled() {
+                    return;
+                }
+            }
+            tokio::select! {
+                () = shutdown.cancelled() => return,
+                () = self.inner.wake.notified() => {}
+            }
+        }
+    }
+
+    /// Makes the next one. False: nothing is asked for.
+    pub async fn make_next(&self) -> bool {
+        let Some(key) = self.inner.shelf().queue.front().copied() else { return false };
+        for key in [Key { base: None, ..key }, key] {
+            if let Err(error) = self.inner.clone().make(key).await {
+                tracing::error!(%error, target = %key.target, "no shorter way could be made of a file");
+                self.inner.shelf().give_up(key);
+            }
+        }
+        self.inner.shelf().queue.pop_front();
+        true
+    }
+}
+
+impl Inner {
+    fn shelf(&self) -> MutexGuard<'_, Shelf> {
+        self.shelf.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn open_at(&self, digest: Digest, offset: u64) -> Result<Option<File>, Error> {
+        let key = {
+            let mut shelf = self.shelf();
+            let Some(key) = shelf.by_digest.get(&digest).copied() else { return Ok(None) };
+            shelf.touch(key);
+            key
+        };
+        let path = self.folder.join(key.name(&digest));
+        match File::open(&path) {
+            Ok(mut file) => {
+                file.seek(SeekFrom::Start(offset)).map_err(at("reading", &path))?;
+                Ok(Some(file))
+            }
+            // It went in between.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(at("opening", &path)(error)),
+        }
+    }
+
+    fn evict(&self, bytes: u64) -> Result<bool, Error> {
+        let mut freed = 0;
+        while freed < bytes {
+            let mut shelf = self.shelf();
+            let Some(oldest) = shelf.kept.iter().min_by_key(|(_, kept)| kept.touched).map(|(key, _)| *key) else {
+                return Ok(false);
+            };
+            let Some(kept) = shelf.kept.remove(&oldest) else { return Ok(false) };
+            shelf.by_digest.remove(&kept.encoded.digest);
+            drop(shelf);
+            let path = self.folder.join(oldest.name(&kept.encoded.digest));
+            fs::remove_file(&path).map_err(at("removing", &path))?;
+            self.content.give_back(kept.encoded.length);
+            freed += kept.encoded.length;
+        }
+        Ok(true)
+    }
+
+    /// Takes room, from older ways if there is no other.
+    fn claim(&self, bytes: u64) -> Result<bool, Error> {
+        loop {
+            match self.content.claim(bytes) {
+                Ok(()) => return Ok(true),
+                Err(Error::Full { missing, free, .. }) => {
+                    if !self.evict(missing.saturating_sub(free))? {
+                        return Ok(false);
+                    }
+                }
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
+    /// Makes one way, if that was not done before.
+    async fn make(self: Arc<Self>, key: Key) -> Result<(), Error> {
+        if self.shelf().is_decided(&key) {
+            return Ok(());
+        }
+        let Some(length) = self.content.length(key.target).await? else { return Ok(()) };
+        let Some(target) = self.content.open(key.target).await? else { return Ok(()) };
+        let base = match key.base {
+            Some(digest) => match self.content.open(digest).await? {
+                Some(base) => Some(base),
+                None => return Ok(()),
+            },
+            None => None,
+        };
+        // A patch is worth it if it is shorter than zstd alone.
+        let full = self.shelf().kept.get(&Key { base: None, ..key }).map(|full| full.encoded.length - 1);
+        let most = full.unwrap_or(u64::MAX).min(length / 100 * WORTH_PERCENT);
+        blocking(move || self.write(key, target, base, length, most)).await
+    }
+
+    fn write(
+        &self,
+        key: Key,
+        mut target: Box<dyn Base>,
+        mut base: Option<Box<dyn Base>>,
+        length: u64,
+        most: u64,
+    ) -> Result<(), Error> {
+        if !self.claim(most)? {
+            self.shelf().give_up(key);
+            return Ok(());
+        }
+        let beside = self.folder.join("next.new");
+        let written = self.encode(&beside, &mut target, base.as_mut().map(|b| b as &mut dyn Base), length, most);
+        let kept = written.as_ref().ok().copied().flatten().map_or(0, |encoded| encoded.length);
+        self.content.give_back(most - kept);
+        let Some(encoded) = written.map_err(at("writing", &beside))? else {
+            self.shelf().give_up(key);
+            return fs::remove_file(&beside).map_err(at("removing", &beside));
+        };
+        let path = self.folder.join(key.name(&encoded.digest));
+        fs::rename(&beside, &path).map_err(at("naming", &path))?;
+        sync_folder(&self.folder)?;
+        self.shelf().keep(key, encoded);
+        tracing::info!(target = %key.target, base = ?key.base, length, encoded = encoded.length, "a shorter way was made");
+        Ok(())
+    }
+
+    fn encode(
+        &self,
+        path: &Path,
+        target: &mut dyn Base,
+        base: Option<&mut dyn Base>,
+        length: u64,
+        most: u64,
+    ) -> io::Result<Option<Encoded>> {
+        let mut out = BufWriter::with_capacity(limits::CHUNK_BYTES, File::create(path)?);
+        let encoded = encoding::encode(base, target, length, &mut out, most)?;
+        out.into_inner()?.sync_all()?;
+        Ok(encoded)
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests;
