@@ -162,6 +162,8 @@ pub const ENCODINGS_WORTHLESS_MAX: usize = 4096;
 pub const ENCODING_BASES_MAX: usize = 8;
 /// A robot asks again after this while a shorter way is made, ms.
 pub const ENCODING_ASK_AGAIN_MS: u32 = 2_000;
+/// A set has been committed for so long before a new base takes the slot of the one before it, ms of UTC on the robot's site clock.
+pub const BASE_SETTLED_MS: u64 = 24 * 3_600_000;
 /// Bytes of one range of software that a robot asks for.
 pub const CHUNK_RANGE_BYTES: u64 = 4 * 1024 * 1024;
 /// Bytes of one message of such a range.

@@ -207,6 +207,7 @@ codes! {
     BundleUnfit = "BUNDLE_UNFIT", "The bundle does not fit the robot: hardware, floor, what it needs or what it excludes.";
     BundleCorrupt = "BUNDLE_CORRUPT", "What was downloaded is not what was signed.";
     NoRoom = "NO_ROOM", "The robot has too little room on its disk for one more set.";
+    BaseTooSoon = "BASE_TOO_SOON", "A new base takes the slot of the set before, which can then not be gone back to: the running set must have been kept for 24 hours first. Order it again later.";
     ActivationBlocked = "ACTIVATION_BLOCKED", "The robot waits with its new software: it has work, a load, a stop, is in a passage, too hot or too low on charge.";
     ProgramCrashed = "PROGRAM_CRASHED", "The new program did not live; the launcher went back to the kept set.";
     SetPutAway = "SET_PUT_AWAY", "The set on trial no longer runs; the kept set does.";

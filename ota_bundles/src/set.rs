@@ -137,6 +137,14 @@ impl SetManifest {
     pub fn program(&self) -> Option<&Component> {
         self.components.values().find(|c| c.kind == ComponentKind::Process)
     }
+    /// Its operating system; none: the one that the robot came with.
+    pub fn base(&self) -> Option<&Component> {
+        self.components.values().find(|c| c.kind == ComponentKind::Base)
+    }
+    /// Whether it runs on another operating system than `other`: it then takes the slot of the one that `other` does not run on.
+    pub fn changes_base(&self, other: &Self) -> bool {
+        self.base().map(|base| base.digest) != other.base().map(|base| base.digest)
+    }
     /// This set with a bundle over it.
     ///
     /// # Errors

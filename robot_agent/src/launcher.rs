@@ -6,12 +6,14 @@
 //! Standard library only: nothing that the agent's updates replace is needed to start the agent. The number of tries since the
 //! program last ran well stands in FILE and is on the disk before each start, so that a machine that loses its power while it
 //! starts still counts. The program's pulse is one marked line a second on its standard output; all other lines pass through.
-//! With `--sets` the program is the one of the set that the switch record names, and PROGRAM for a set that brings none.
+//! With `--sets` the program is the one of the set that the switch record names, and PROGRAM for a set that brings none. For a set with
+//! another base it starts the machine again, as far as there is one: the boot loader is simulated.
 //! Invariant: at most one child at a time; the switch record is written only while no child runs. Ended by a signal, the launcher
 //! leaves the child to whoever sent it: a service manager signals the whole group.
 
 #![expect(clippy::disallowed_methods, reason = "a program of its own without a runtime and without simulated time")]
 
+use crate::boot::{BASE, BOOT, Boot, Image, Slot};
 use crate::starts::{self, HANG_SECONDS, Tries};
 use crate::switch::{self, Switch};
 use std::fs;
@@ -126,6 +128,9 @@ fn orders(arguments: impl Iterator<Item = String>) -> Result<Orders, String> {
 
 fn keep_running(orders: &Orders) -> io::Result<()> {
     let mut beacon = Beacon::new(orders);
+    if let Some(sets) = &orders.sets {
+        machine_starts(sets)?;
+    }
     loop {
         let start = choose(orders)?;
         write_tries(&orders.record, &start.tries)?;
@@ -174,6 +179,22 @@ fn choose(orders: &Orders) -> io::Result<Start> {
     if let Some(had) = starts::put_away(&mut switch, &tries) {
         say(&format!("set {tried} did not live in {had} tries; back to {}", switch.current));
         switch.write(&path).map_err(named)?;
+    let mut switch = Switch::read(&path).map_err(|e| named(e, &path))?;
+    let tries = read_tries(&orders.record, switch.running());
+    if switch.trial.is_some() && tries >= TRIES_MAX {
+        say(&format!("set {} did not live in {tries} tries; back to {}", switch.running(), switch.current));
+        switch.fall_back(tries);
+        switch.write(&path).map_err(|e| named(e, &path))?;
+    }
+    if !boot_into(sets, &switch, read_tries(&orders.record, switch.running()))? {
+        if switch.trial.is_some() {
+            say(&format!("set {} has a base that does not start; back to {}", switch.running(), switch.current));
+            switch.fall_back(tries.max(1));
+            switch.write(&path).map_err(|e| named(e, &path))?;
+            boot_into(sets, &switch, tries)?;
+        } else {
+            say(&format!("set {} has no base that starts: it runs on the one that does", switch.running()));
+        }
     }
     let set = switch.running().to_owned();
     let own = sets.join(&set).join(PROGRAM);
@@ -182,6 +203,59 @@ fn choose(orders: &Orders) -> io::Result<Start> {
 }
 
 /// Whether a program that runs well clears its tries.
+fn named(error: io::Error, path: &Path) -> io::Error {
+    io::Error::new(error.kind(), format!("{}: {error}", path.display()))
+}
+
+/// Reads the boot record, changes it, and writes it if it became another.
+fn change_boot<T>(sets: &Path, change: impl FnOnce(&mut Boot) -> T) -> io::Result<T> {
+    let path = sets.join(BOOT);
+    let before = Boot::read(&path).map_err(|e| named(e, &path))?;
+    let mut boot = before.clone();
+    let changed = change(&mut boot);
+    boot.write_over(&before, &path).map_err(|e| named(e, &path))?;
+    Ok(changed)
+}
+
+/// Whether a slot has the bytes that the record says. The factory's base is the machine itself.
+fn starts(sets: &Path, slot: Slot, image: &Image) -> bool {
+    image.name == switch::FACTORY || fs::metadata(sets.join(slot.file())).is_ok_and(|file| file.len() == image.length)
+}
+
+/// The launcher stands for the machine: when it starts, so does the boot loader.
+fn machine_starts(sets: &Path) -> io::Result<()> {
+    change_boot(sets, |boot| boot.start(|slot, image| starts(sets, slot, image)))
+}
+
+/// Starts the machine again if it runs on another base than the set that is to run. Whether it runs on that base now.
+fn boot_into(sets: &Path, switch: &Switch, tries: u32) -> io::Result<bool> {
+    let named = fs::read_to_string(sets.join(switch.running()).join(BASE));
+    let base = match named {
+        Ok(name) => name.trim().to_owned(),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => switch::FACTORY.to_owned(),
+        Err(error) => return Err(error),
+    };
+    change_boot(sets, |boot| {
+        match &switch.trial {
+            None => boot.settle(&base),
+            Some(_) => boot.try_out(&base),
+        }
+        let slot = boot.slot_of(&base);
+        if slot == Some(boot.booted) {
+            if tries == 0 {
+                boot.ran_well();
+            }
+            return true;
+        }
+        if slot.is_some() {
+            say(&format!("the machine starts again, for the base {base}"));
+            boot.start(|slot, image| starts(sets, slot, image));
+        }
+        slot == Some(boot.booted)
+    })
+}
+
+/// Whether a program that runs well clears its tries: a set on probation is not believed before it is proven.
 fn is_trusted(orders: &Orders) -> bool {
     let Some(sets) = &orders.sets else { return true };
     Switch::read(&sets.join(SWITCH)).is_ok_and(|switch| starts::is_trusted(&switch))

@@ -3,6 +3,7 @@
 //! Invariant: a buffered message never starts the body, and a finished task is never done again.
 
 pub mod body;
+pub mod boot;
 pub mod bugs;
 pub mod core;
 pub mod dial;

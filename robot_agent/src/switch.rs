@@ -2,7 +2,7 @@
 //!
 //! Standard library only: the launcher reads it before anything that an update replaces has run. One small file, replaced whole.
 //! Invariant: `current` is the set committed last and `previous` the one before it; only [`Switch::commit`] changes either, so the way
-//! back from a trial always leads to a set that was good. Written by the agent, and by the launcher while no agent runs.
+//! back from a trial always leads to a set that was good; [`Switch::forget_previous`] may give up `previous`, never `current`. Written by the agent, and by the launcher while no agent runs.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -95,6 +95,10 @@ impl Switch {
         {
             self.current = previous;
         }
+    }
+    /// What `previous` needs goes: it is kept no more.
+    pub fn forget_previous(&mut self) {
+        self.previous = None;
     }
     /// The trial could not live: the launcher's [`Switch::go_back`].
     pub fn fall_back(&mut self, tries: u32) {

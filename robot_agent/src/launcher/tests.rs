@@ -188,3 +188,78 @@ fn while_no_agent_runs_a_beacon_says_which_set_is_tried() {
     assert_eq!(words[..5], ["midshift-beacon", "1", "r1", "v1", "1"]);
     assert!(words[5].parse::<u64>().is_ok());
 }
+
+/// Gives a set a base, in the spare slot, of which `lies` bytes are there of 4.
+fn with_base(orders: &Orders, set: &str, base: &str, lies: usize) {
+    let sets = orders.sets.as_ref().expect("has sets");
+    fs::write(sets.join(set).join(BASE), base).expect("writes");
+    change_boot(sets, |boot| {
+        fs::write(sets.join(boot.spare().file()), &b"base"[..lies]).expect("writes");
+        boot.put_spare(Some(Image { name: base.to_owned(), length: 4 }));
+    })
+    .expect("writes");
+}
+
+fn boot(orders: &Orders) -> Boot {
+    Boot::read(&orders.sets.as_ref().expect("has sets").join(BOOT)).expect("reads")
+}
+
+#[test]
+fn for_a_set_with_another_base_the_machine_starts_again_and_back_again_when_it_is_put_away() {
+    let (folder, orders) = with_sets(&[("v1", "cat ${0%/*}/../boot >> ${0%/*}/../seen; exit 1")]);
+    with_base(&orders, "v1", "b1", 4);
+    on_trial(&orders, "v1");
+    keep_running(&orders).expect("runs");
+    assert_eq!(ran(&folder), ["v1", "v1", "factory"]);
+    let seen = fs::read_to_string(folder.path().join("sets/seen")).expect("was written");
+    assert_eq!(seen.matches("booted b").count(), 2, "{seen}");
+    assert_eq!(seen.matches("trying b 1").count(), 2, "the machine started once: {seen}");
+    let after = boot(&orders);
+    assert_eq!((after.booted, after.good, after.trying), (Slot::A, Slot::A, None));
+}
+
+#[test]
+fn a_base_that_does_not_start_puts_its_set_away_without_a_start_of_the_program() {
+    let (folder, orders) = with_sets(&[("v1", "exit 0")]);
+    with_base(&orders, "v1", "b1", 3);
+    on_trial(&orders, "v1");
+    keep_running(&orders).expect("runs");
+    assert_eq!(ran(&folder), ["factory"]);
+    assert_eq!(record(&orders).fallen.map(|fallen| fallen.set), Some("v1".to_owned()));
+    assert_eq!((boot(&orders).booted, boot(&orders).trying), (Slot::A, None));
+}
+
+#[test]
+fn a_machine_that_keeps_dying_before_the_launcher_comes_leaves_the_new_base_for_good() {
+    let (folder, orders) = with_sets(&[("v1", "exit 0")]);
+    with_base(&orders, "v1", "b1", 4);
+    on_trial(&orders, "v1");
+    let sets = orders.sets.as_ref().expect("has sets");
+    // The launcher asked for the base, and the power goes at each start of the machine.
+    assert!(boot_into(sets, &record(&orders), 0).expect("starts"));
+    machine_starts(sets).expect("starts");
+    assert_eq!(boot(&orders).booted, Slot::B);
+    keep_running(&orders).expect("runs");
+    assert_eq!(ran(&folder), ["factory"]);
+}
+
+#[test]
+fn a_committed_base_is_good_at_the_next_start_and_the_one_before_it_is_gone_back_to() {
+    let (folder, orders) = with_sets(&[("v1", "exit 0")]);
+    with_base(&orders, "v1", "b1", 4);
+    on_trial(&orders, "v1");
+    let path = orders.sets.as_ref().expect("has sets").join(SWITCH);
+    let mut switch = record(&orders);
+    switch.commit();
+    switch.write(&path).expect("writes");
+    for _ in 0..4 {
+        keep_running(&orders).expect("runs");
+        let now = boot(&orders);
+        assert_eq!((now.booted, now.good, now.trying), (Slot::B, Slot::B, None));
+    }
+    switch.undo_commit();
+    switch.write(&path).expect("writes");
+    keep_running(&orders).expect("runs");
+    assert_eq!((boot(&orders).booted, boot(&orders).good), (Slot::A, Slot::A));
+    assert_eq!(ran(&folder), ["v1", "v1", "v1", "v1", "factory"]);
+}

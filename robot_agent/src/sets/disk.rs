@@ -2,16 +2,19 @@
 //!
 //! ```text
 //! switch            which set runs (crate::switch)
+//! boot              which base the machine starts from (crate::boot); base-a and base-b are its slots
 //! content/DIGEST    bytes that were checked; DIGEST.part and DIGEST.map while they come, DIGEST.made while they are made of a shorter
 //!                   way, DIGEST.plain if no such way is to be tried
 //! SET/NAME          hard link to a component's content; SET is the set's id
 //! SET/set.program   hard link to the one of kind process
+//! SET/set.base      name of its base, if it has one of its own
 //! SET/set.json      what is in it; written last
 //! ```
 //! Invariant: a folder has the name of a set only when it is whole: it is made beside and renamed.
 
 use super::content::{Part, remove};
-use super::{CHUNK_BYTES, Error, Holdings, Sets, Wanted};
+use super::{CHUNK_BYTES, Error, Holdings, Sets, Wanted, base_name};
+use crate::boot::BASE;
 use crate::launcher::{PROGRAM, SWITCH};
 use crate::switch::{self, Switch};
 use midshift_bundle::digest::Digest;
@@ -35,16 +38,16 @@ const CONTENT: &str = "content";
 /// The sets in one folder. One owner at a time: the agent that runs.
 #[derive(Debug)]
 pub struct DiskSets {
-    folder: PathBuf,
+    pub(super) folder: PathBuf,
     part: Option<Part>,
 }
 
-fn io_error(doing: &'static str) -> impl FnOnce(io::Error) -> Error {
+pub(super) fn io_error(doing: &'static str) -> impl FnOnce(io::Error) -> Error {
     move |source| Error::Io { doing, source }
 }
 
 /// None for what is not there.
-fn optional<T>(result: io::Result<T>) -> io::Result<Option<T>> {
+pub(super) fn optional<T>(result: io::Result<T>) -> io::Result<Option<T>> {
     match result {
         Ok(value) => Ok(Some(value)),
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
@@ -62,7 +65,7 @@ impl DiskSets {
         Ok(Self { folder: folder.to_owned(), part: None })
     }
 
-    fn content(&self, digest: &Digest) -> PathBuf {
+    pub(super) fn content(&self, digest: &Digest) -> PathBuf {
         self.folder.join(CONTENT).join(digest.to_string())
     }
 
@@ -90,7 +93,7 @@ impl DiskSets {
     }
 
     /// Whole sets: folders with a name of one and a page that is what the name says.
-    fn sets(&self) -> Result<BTreeMap<Digest, SetManifest>, Error> {
+    pub(super) fn sets(&self) -> Result<BTreeMap<Digest, SetManifest>, Error> {
         let list = || {
             let mut sets = BTreeMap::new();
             for entry in fs::read_dir(&self.folder)? {
@@ -147,6 +150,22 @@ impl DiskSets {
         name().map_err(io_error("naming content"))
     }
 
+    /// Reads every file of a set.
+    fn verify_files(&self, id: &Digest) -> Result<SetManifest, Error> {
+        let folder = self.folder.join(id.to_string());
+        let set = self.sets()?.remove(id).ok_or(Error::Missing(*id))?;
+        let program = set.program().map(|program| (PROGRAM.to_owned(), program));
+        for (name, component) in set.components.iter().map(|(name, c)| (name.clone(), c)).chain(program) {
+            let file = optional(File::open(folder.join(name))).map_err(io_error("reading a set"))?;
+            let mut file = file.ok_or(Error::Missing(component.digest))?;
+            let read = Digest::of_reader(&mut file, COMPONENT_BYTES_MAX).map_err(io_error("reading a set"))?;
+            if read != (component.digest, component.length) {
+                return Err(Error::Corrupt { digest: component.digest });
+            }
+        }
+        Ok(set)
+    }
+
     /// Links all of a set into a folder beside and gives it its name.
     fn assemble(&self, set: &SetManifest, folder: &Path) -> io::Result<()> {
         let beside = folder.with_extension("new");
@@ -161,6 +180,10 @@ impl DiskSets {
             let content = self.content(&program.digest);
             fs::set_permissions(&content, Permissions::from_mode(0o755))?;
             fs::hard_link(content, beside.join(PROGRAM))?;
+        }
+        if set.base().is_some() {
+            fs::write(beside.join(BASE), base_name(set))?;
+            File::open(beside.join(BASE))?.sync_all()?;
         }
         let page = beside.join(SET_FILE);
         fs::write(&page, set.to_bytes())?;
@@ -243,36 +266,28 @@ impl Sets for DiskSets {
             }
             self.assemble(set, &folder).map_err(io_error("making a set"))?;
         }
-        let read_back = self.verify(&id);
+        let read_back = self.verify_files(&id).map(|_| ());
         if let Err(Error::Corrupt { digest }) = read_back {
             // The disk has changed it since it was checked: it must come again.
             let forget = || fs::remove_dir_all(&folder).and_then(|()| remove(&self.content(&digest)));
             forget().map_err(io_error("throwing a set away"))?;
         }
-        read_back
+        read_back.and_then(|()| self.install_base(set)).and_then(|()| self.verify_base(set))
     }
 
     fn verify(&mut self, id: &Digest) -> Result<(), Error> {
-        let folder = self.folder.join(id.to_string());
-        let set = self.sets()?.remove(id).ok_or(Error::Missing(*id))?;
-        let program = set.program().map(|program| (PROGRAM.to_owned(), program));
-        for (name, component) in set.components.iter().map(|(name, c)| (name.clone(), c)).chain(program) {
-            let file = optional(File::open(folder.join(name))).map_err(io_error("reading a set"))?;
-            let mut file = file.ok_or(Error::Missing(component.digest))?;
-            let read = Digest::of_reader(&mut file, COMPONENT_BYTES_MAX).map_err(io_error("reading a set"))?;
-            if read != (component.digest, component.length) {
-                return Err(Error::Corrupt { digest: component.digest });
-            }
-        }
-        Ok(())
+        let set = self.verify_files(id)?;
+        self.verify_base(&set)
     }
 
     fn write_switch(&mut self, switch: &mut Switch) -> Result<(), Error> {
-        switch.write(&self.folder.join(SWITCH)).map_err(io_error("writing the switch record"))
+        switch.write(&self.folder.join(SWITCH)).map_err(io_error("writing the switch record"))?;
+        self.settle(switch)
     }
 
     fn collect(&mut self, keep: &BTreeSet<Digest>) -> Result<(), Error> {
         let switch = Switch::read(&self.folder.join(SWITCH)).map_err(io_error("reading the switch record"))?;
+        self.settle(&switch)?;
         let mut named: BTreeSet<Digest> = keep.clone();
         for (id, set) in self.sets()? {
             if switch.names(&id.to_string()) || keep.contains(&id) {

@@ -3,8 +3,9 @@
 //! Invariant: it holds what was synced, sealed, staged or switched as long as one handle lives. Called by swarms and simulations.
 
 use super::content::Bitmap;
-use super::{Error, Holdings, Sets, Wanted};
-use crate::switch::Switch;
+use super::{Error, Holdings, Sets, Wanted, base_name};
+use crate::boot::{Boot, Image};
+use crate::switch::{FACTORY, Switch};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding::{self, Base};
 use midshift_bundle::set::SetManifest;
@@ -28,6 +29,8 @@ struct State {
     content: BTreeMap<Digest, Vec<u8>>,
     parts: BTreeMap<Digest, Part>,
     as_they_are: BTreeSet<Digest>,
+    boot: Boot,
+    slots: [Vec<u8>; 2],
     room: Option<u64>,
 }
 
@@ -98,12 +101,50 @@ impl State {
         }
     }
     fn verify(&self, set: &SetManifest) -> Result<(), Error> {
+        self.verify_content(set)?;
+        self.verify_base(set)
+    }
+    fn verify_content(&self, set: &SetManifest) -> Result<(), Error> {
         for component in set.components.values() {
             let bytes = self.content.get(&component.digest).ok_or(Error::Missing(component.digest))?;
             if Digest::of(bytes) != component.digest {
                 return Err(Error::Corrupt { digest: component.digest });
             }
         }
+        Ok(())
+    }
+    fn verify_base(&self, set: &SetManifest) -> Result<(), Error> {
+        let Some(base) = set.base() else { return Ok(()) };
+        let slot = self.boot.slot_of(&base_name(set)).ok_or(Error::Missing(base.digest))?;
+        let is_whole = Digest::of(&self.slots[slot as usize]) == base.digest;
+        if is_whole { Ok(()) } else { Err(Error::Corrupt { digest: base.digest }) }
+    }
+    /// The base of a set that is in the switch record, or of the factory's.
+    fn base_of(&self, set: &str) -> Option<String> {
+        let set = if set == FACTORY { None } else { Some(self.sets.get(&set.parse().ok()?)?) };
+        Some(set.map_or(FACTORY.to_owned(), base_name))
+    }
+    fn settle(&mut self) {
+        if self.switch.trial.is_none()
+            && let Some(base) = self.base_of(&self.switch.current)
+        {
+            self.boot.settle(&base);
+        }
+    }
+    fn install_base(&mut self, set: &SetManifest) -> Result<(), Error> {
+        let Some(base) = set.base() else { return Ok(()) };
+        self.settle();
+        if self.boot.slot_of(&base_name(set)).is_some() {
+            return Ok(());
+        }
+        let spare = self.boot.spare();
+        let previous = self.switch.previous.as_ref().and_then(|set| self.base_of(set));
+        if previous.is_some_and(|base| self.boot.slot_of(&base) == Some(spare)) {
+            self.switch.forget_previous();
+            self.switch.number += 1;
+        }
+        self.slots[spare as usize] = self.content.get(&base.digest).ok_or(Error::Missing(base.digest))?.clone();
+        self.boot.put_spare(Some(Image { name: base_name(set), length: base.length }));
         Ok(())
     }
 }
@@ -191,7 +232,8 @@ impl Sets for MemorySets {
 
     fn stage(&mut self, set: &SetManifest) -> Result<(), Error> {
         let mut state = self.state();
-        let read_back = state.verify(set);
+        let read_back =
+            state.verify_content(set).and_then(|()| state.install_base(set)).and_then(|()| state.verify_base(set));
         match &read_back {
             Ok(()) => {
                 state.sets.insert(set.id(), set.clone());
@@ -212,7 +254,9 @@ impl Sets for MemorySets {
 
     fn write_switch(&mut self, switch: &mut Switch) -> Result<(), Error> {
         switch.number += 1;
-        self.state().switch = switch.clone();
+        let mut state = self.state();
+        state.switch = switch.clone();
+        state.settle();
         Ok(())
     }
 

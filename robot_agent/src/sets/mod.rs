@@ -7,8 +7,9 @@
 mod content;
 pub mod disk;
 pub mod memory;
+mod slots;
 
-use crate::switch::Switch;
+use crate::switch::{FACTORY, Switch};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::{Component, ComponentKind};
 use midshift_bundle::set::SetManifest;
@@ -73,7 +74,7 @@ pub struct Holdings {
 impl Holdings {
     /// What is in a set that the switch record names: the factory's has no components.
     pub fn set(&self, name: &str) -> Option<SetManifest> {
-        if name == crate::switch::FACTORY {
+        if name == FACTORY {
             return Some(SetManifest::default());
         }
         self.sets.get(&name.parse().ok()?).cloned()
@@ -100,6 +101,11 @@ impl Holdings {
         }
         bases
     }
+}
+
+/// The name of a set's base in the boot record.
+fn base_name(set: &SetManifest) -> String {
+    set.base().map_or(FACTORY.to_owned(), |base| base.digest.to_string())
 }
 
 /// Keeps the software of one robot. Calls block; the shell makes them where that does no harm.
@@ -150,17 +156,18 @@ pub trait Sets: Send {
     /// # Errors
     /// If it is not there, or has more than `most` bytes.
     fn read(&mut self, digest: &Digest, most: u64) -> Result<Vec<u8>, Error>;
-    /// Makes a set of content that is there and reads it back. Nothing to do if it is there already.
+    /// Makes a set of content that is there and reads it back. Nothing to do if it is there already. A base that lies in neither slot is
+    /// written over the spare one; if the set before needs what was there, the switch record forgets it first.
     ///
     /// # Errors
     /// Content that is missing or not what it should be; the disk's.
     fn stage(&mut self, set: &SetManifest) -> Result<(), Error>;
-    /// Reads every file of a set again.
+    /// Reads every file of a set again, and its base where the machine starts it from.
     ///
     /// # Errors
     /// What is missing or wrong.
     fn verify(&mut self, id: &Digest) -> Result<(), Error>;
-    /// Replaces the switch record.
+    /// Replaces the switch record. The base of a set that it makes current becomes good.
     ///
     /// # Errors
     /// The disk's: the old one or this is there.

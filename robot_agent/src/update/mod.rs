@@ -17,7 +17,7 @@ use midshift_bundle::set::SetManifest;
 use midshift_bundle::trust::{Reading, Refreshed, Trusted};
 use midshift_core::ids::{BundleId, DrainId, SetId};
 use midshift_core::reason::Reason;
-use midshift_core::time::{LinkTime, SiteTime};
+use midshift_core::time::{LinkTime, SiteTime, Utc};
 use midshift_core::update::{DesiredUpdate, UpdateReport, UpdateState};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
@@ -47,6 +47,9 @@ pub struct SoftwareRow {
     pub grant_id: u64,
     /// Lowest `rollback_index` of each component that may be taken.
     pub floors: BTreeMap<String, u64>,
+    /// When the set that runs was committed; none: the robot came with it, or nobody wrote it down.
+    #[serde(default)]
+    pub committed_at: Option<Utc>,
     /// The newest update.
     pub update: Option<Update>,
 }

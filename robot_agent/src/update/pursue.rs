@@ -90,7 +90,7 @@ impl AgentCore {
             UpdateState::Switching => return self.switching(&update, &holdings),
             UpdateState::Probation => self.probation(now, update, &holdings),
             UpdateState::Trial => self.trial(update, &holdings),
-            UpdateState::Committing => self.committing(update, &holdings),
+            UpdateState::Committing => self.committing(now, update, &holdings),
             UpdateState::RollingBack => return self.rolling_back(now, update, &holdings),
             UpdateState::Committed if self.wants_back(&update) && holdings.switch.kept().is_some() => {
                 self.go_back(update, Reason::from(Code::RevertAsked));
@@ -119,14 +119,19 @@ impl AgentCore {
         match (job, done) {
             (_, Done::Holdings(holdings)) => self.look(*holdings),
             (Job::Refresh { .. }, Done::Refreshed(refreshed)) => self.refreshed(now, *refreshed),
-            (Job::Manifest { wanted }, Done::Manifest(manifest)) => self.plan(&wanted, &manifest),
+            (Job::Manifest { wanted }, Done::Manifest(manifest)) => self.plan(now, &wanted, &manifest),
             (Job::Fetch { wanted, .. }, Done::Ok) => {
                 self.update.fetched.insert(wanted.digest);
             }
             (Job::Stage(set), Done::Ok) => {
+                let has_base = set.base().is_some();
                 self.hold(|holdings| {
                     holdings.sets.insert(set.id(), *set);
                 });
+                if has_base {
+                    // It may have cost the set before its place in the switch record.
+                    self.update.holdings = None;
+                }
                 self.move_to(UpdateState::Staged, None);
             }
             (Job::Write(_), Done::Written(switch)) => self.hold(|holdings| holdings.switch = switch),
@@ -373,7 +378,7 @@ impl AgentCore {
     }
 
     /// What comes of the bundle on this robot, or why it does not fit.
-    fn plan(&mut self, wanted: &Wanted, manifest: &Manifest) {
+    fn plan(&mut self, now: &Now, wanted: &Wanted, manifest: &Manifest) {
         let Some(update) = self.kept.ledger.software.update.clone() else { return };
         let Some(holdings) = self.update.holdings.clone() else { return };
         let current = holdings.set(&holdings.switch.current).unwrap_or_default();
@@ -397,7 +402,11 @@ impl AgentCore {
             let reason = Reason::from(Code::BundleUnfit).with("unlisted", &component.name);
             return self.move_to(UpdateState::Refused, Some(reason));
         }
-        let needed: u64 = manifest.components.iter().map(|c| c.length).sum();
+        if let Err(reason) = self.may_take_base(now, &current, &set) {
+            return self.move_to(UpdateState::Refused, Some(reason));
+        }
+        let base = set.base().filter(|_| set.changes_base(&current)).map_or(0, |base| base.length);
+        let needed: u64 = manifest.components.iter().map(|c| c.length).sum::<u64>() + base;
         if needed > holdings.free_bytes {
             let reason =
                 Reason::from(Code::NoRoom).with("needed_bytes", needed).with("free_bytes", holdings.free_bytes);
@@ -406,6 +415,18 @@ impl AgentCore {
         let is_irreversible = manifest.components.iter().any(|c| c.data_migration == Migration::Irreversible);
         let (raises_floor, state) = (manifest.raises_floor, UpdateState::Downloading);
         self.put_update(Update { state, set: Some(set), raises_floor, is_irreversible, ..update });
+    }
+
+    /// A new base takes the slot of the set before, so the one that runs must have proved itself.
+    fn may_take_base(&self, now: &Now, current: &SetManifest, set: &SetManifest) -> Result<(), Reason> {
+        let committed = self.kept.ledger.software.committed_at.filter(|_| set.changes_base(current));
+        let Some(committed) = committed else { return Ok(()) };
+        // A clock that went back says nothing of the time since.
+        let kept_ms = if now.utc >= committed { now.utc.ms_since(committed) } else { 0 };
+        if kept_ms >= limits::BASE_SETTLED_MS {
+            return Ok(());
+        }
+        Err(Reason::from(Code::BaseTooSoon).with("wait_ms", limits::BASE_SETTLED_MS - kept_ms))
     }
 
     fn downloading(&mut self, update: &Update) {
@@ -617,14 +638,14 @@ impl AgentCore {
         self.prove(holdings);
     }
 
-    fn committing(&mut self, update: Update, holdings: &Holdings) {
+    fn committing(&mut self, now: &Now, update: Update, holdings: &Holdings) {
         if holdings.switch.trial.is_some() {
             let mut switch = holdings.switch.clone();
             switch.commit();
             return self.ask_for(Job::Write(switch));
         }
         let kept = holdings.switch.kept().and_then(|kept| holdings.set(kept)).unwrap_or_default();
-        let mut row = self.kept.ledger.software.clone();
+        let mut row = SoftwareRow { committed_at: Some(now.utc), ..self.kept.ledger.software.clone() };
         if let Some(set) = update.set.as_ref().filter(|_| update.raises_floor) {
             row.floors = raised(&row.floors, set, &kept);
         }

@@ -34,16 +34,22 @@ fn weights(version: u64) -> Vec<u8> {
     [noise(version, 1_000), noise(7, 400_000)].concat()
 }
 
-/// What is updated to: a program of three chunks, settings, and weights.
-fn next() -> (SetManifest, [Vec<u8>; 3]) {
-    let contents = [bytes(3, 2 * CHUNK_BYTES + 1_000), b"settings of v2".to_vec(), weights(2)];
-    (set_with("v2", &contents[0], &contents[1], &contents[2]), contents)
+/// The operating system, another in every set.
+fn base(version: u64) -> Vec<u8> {
+    noise(70 + version, 3_000)
 }
 
-fn set_with(version: &str, program: &[u8], settings: &[u8], weights: &[u8]) -> SetManifest {
+/// What is updated to: a program of three chunks, settings, weights and an operating system.
+fn next() -> (SetManifest, [Vec<u8>; 4]) {
+    let contents = [bytes(3, 2 * CHUNK_BYTES + 1_000), b"settings of v2".to_vec(), weights(2), base(2)];
+    (set_with("v2", &contents), contents)
+}
+
+fn set_with(version: &str, [program, settings, weights, base]: &[Vec<u8>; 4]) -> SetManifest {
     let mut set = set(version, program, settings);
-    let grip = component("grip", ComponentKind::Weights, weights);
-    set.components.insert(grip.name.clone(), grip);
+    for (name, kind, content) in [("grip", ComponentKind::Weights, weights), ("os", ComponentKind::Base, base)] {
+        set.components.insert(name.to_owned(), component(name, kind, content));
+    }
     set
 }
 
@@ -52,12 +58,14 @@ fn robot(folder: &Path) -> [SetManifest; 2] {
     let mut sets = DiskSets::open(folder).expect("opens");
     let mut switch = Switch::default();
     [(0, "v0"), (1, "v1")].map(|(number, version)| {
-        let (program, weights) = (format!("program {version}").into_bytes(), weights(number));
-        let set = set_with(version, &program, b"settings", &weights);
-        for content in [&program[..], b"settings", &weights] {
+        let program = format!("program {version}").into_bytes();
+        let contents = [program, b"settings".to_vec(), weights(number), base(number)];
+        let set = set_with(version, &contents);
+        for content in &contents {
             put(&mut sets, content);
         }
         sets.stage(&set).expect("stages");
+        switch = sets.holdings().expect("tells").switch;
         switch.try_out(&set.id().to_string());
         switch.commit();
         sets.write_switch(&mut switch).expect("writes");
@@ -85,8 +93,8 @@ fn update(folder: &Path) {
     let name = next.id().to_string();
     let mut switch = sets.holdings().expect("tells").switch;
     if switch.running() != name {
-        let [program, settings, grip] = &contents;
-        for content in [program, settings] {
+        let [program, settings, grip, base] = &contents;
+        for content in [program, settings, base] {
             fetch(&mut sets, content);
         }
         if !sets.missing(&wanted(grip)).expect("tells").is_empty() {
@@ -95,6 +103,7 @@ fn update(folder: &Path) {
             sets.decode(&wanted(grip), Some(&Digest::of(&weights(1))), &wanted(&way)).expect("leads there");
         }
         sets.stage(&next).expect("stages");
+        switch = sets.holdings().expect("tells").switch;
         switch.try_out(&name);
         sets.write_switch(&mut switch).expect("writes");
     }
@@ -109,7 +118,7 @@ fn update(folder: &Path) {
     sets.collect(&BTreeSet::new()).expect("collects");
 }
 
-/// What runs and what is kept can be started.
+/// What runs and what is kept can be started, each on its own base.
 fn assert_bootable(folder: &Path, when: &str) {
     let mut sets = DiskSets::open(folder).expect("opens");
     let switch = sets.holdings().unwrap_or_else(|e| panic!("{when}: {e}")).switch;
@@ -132,7 +141,9 @@ fn assert_ended(folder: &Path, kept: &SetManifest, when: &str) {
         let entries = fs::read_dir(folder).expect("is there").map(|entry| entry.expect("an entry").file_name());
         entries.map(|name| name.to_string_lossy().into_owned()).collect()
     };
-    assert_eq!(names(folder), BTreeSet::from(["switch".to_owned(), "content".to_owned(), current, previous]), "{when}");
+    let mut there: BTreeSet<String> = ["switch", "content", "boot", "base-a", "base-b"].map(str::to_owned).into();
+    there.extend([current, previous]);
+    assert_eq!(names(folder), there, "{when}");
     let components = next.components.values().chain(kept.components.values());
     assert_eq!(names(&folder.join("content")), components.map(|c| c.digest.to_string()).collect(), "{when}");
 }

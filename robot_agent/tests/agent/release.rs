@@ -33,6 +33,8 @@ struct Shelf {
     bytes: BTreeMap<Digest, Vec<u8>>,
     targets: Vec<u8>,
     version: u64,
+    /// Milliseconds after [`SIGNED`] at which the server signs now.
+    later_ms: u64,
     /// Nothing answers.
     cut: bool,
     /// Every piece of content has a wrong byte.
@@ -97,17 +99,31 @@ impl Releases {
         shelf.targets = sign_targets(previous.as_deref(), add, &[], expires, &[&key(2)]).expect("targets");
         shelf.version += 1;
         let version = shelf.version;
-        let online = sign_online(&shelf.targets, version, version, SIGNED, &key(3), &key(4)).expect("online");
+        let now = SIGNED.plus_ms(shelf.later_ms);
+        let online = sign_online(&shelf.targets, version, version, now, &key(3), &key(4)).expect("online");
         let targets = shelf.targets.clone();
         shelf.documents.insert(format!("{version}.targets.json"), targets);
         shelf.documents.insert(format!("{version}.snapshot.json"), online.snapshot);
         shelf.documents.insert("timestamp.json".to_owned(), online.timestamp);
     }
+    /// Time passes, and everything is signed anew.
+    pub fn pass(&self, ms: u64) {
+        self.shelf().later_ms += ms;
+        self.sign(&[]);
+    }
     /// Releases a bundle of a program and its settings.
     pub fn release(&self, version: &str) -> Bundle {
         self.release_as(version, |_| {})
     }
-    /// As [`Releases::release`], after `change` of its manifest.
+    /// As [`Releases::release`], with an operating system.
+    pub fn release_base(&self, version: &str) -> Bundle {
+        let base = format!("base {version}").repeat(9_000).into_bytes();
+        let mut os = component("os", version, ComponentKind::Base, &base);
+        os.needs = Needs::Reboot;
+        self.hold(&base);
+        self.release_as(version, |manifest| manifest.components.push(os))
+    }
+    /// As [`Releases::release`], after `change` of its manifest. Bytes of a component that this adds are held already.
     pub fn release_as(&self, version: &str, change: impl FnOnce(&mut Manifest)) -> Bundle {
         let program = format!("program {version}").repeat(30_000).into_bytes();
         let settings = format!("settings {version}").into_bytes();
@@ -130,11 +146,13 @@ impl Releases {
             digest: Digest::of(content),
             length: content.len() as u64,
         };
-        let files = [
+        let mut files = vec![
             file(manifest.target(), &bytes),
             file(manifest.components[0].target(), &program),
             file(manifest.components[1].target(), &settings),
         ];
+        let held = |c: &Component| FileTarget { name: c.target(), digest: c.digest, length: c.length };
+        files.extend(manifest.components[2..].iter().map(held));
         self.sign(&files);
         let bundle = Bundle { digest: Digest::of(&bytes), length: bytes.len() as u64, manifest };
         self.shelf().bytes.extend([bytes, program, settings].map(|b| (Digest::of(&b), b)));

@@ -408,3 +408,65 @@ fn that_a_file_comes_as_it_is_is_remembered_until_it_is_there() {
         assert!(!sets.is_fetched_as_it_is(&file).expect("tells"));
     }
 }
+
+/// A set with a base of these bytes, on the disk.
+pub fn based(sets: &mut dyn Sets, version: &str, base: &[u8]) -> SetManifest {
+    let mut set = set(version, b"program", b"settings");
+    let os = component("os", ComponentKind::Base, base);
+    set.components.insert(os.name.clone(), os);
+    for content in [&b"program"[..], b"settings", base] {
+        put(sets, content);
+    }
+    sets.stage(&set).expect("stages");
+    set
+}
+
+fn commit(sets: &mut dyn Sets, set: &SetManifest) {
+    let mut switch = sets.holdings().expect("tells").switch;
+    switch.try_out(&set.id().to_string());
+    sets.write_switch(&mut switch).expect("writes");
+    switch.commit();
+    sets.write_switch(&mut switch).expect("writes");
+}
+
+#[test]
+fn a_base_takes_the_slot_that_does_not_run_and_the_set_that_needed_it_is_kept_no_more() {
+    for place in Place::both() {
+        let mut sets = place.open();
+        let kept = |sets: &mut dyn Sets| sets.holdings().expect("tells").switch.kept().map(str::to_owned);
+        let first = based(&mut *sets, "v1", b"base 1");
+        commit(&mut *sets, &first);
+        assert_eq!(kept(&mut *sets).as_deref(), Some("factory"), "its slot is the other one");
+        let same = based(&mut *sets, "v2", b"base 1");
+        commit(&mut *sets, &same);
+        assert_eq!(kept(&mut *sets), Some(first.id().to_string()));
+        let third = based(&mut *sets, "v3", b"base 3");
+        assert_eq!(kept(&mut *sets), Some(first.id().to_string()), "it runs on the base of v2, which stays");
+        commit(&mut *sets, &third);
+        let mut sets = place.cut(sets);
+        for set in [&first, &same, &third] {
+            sets.verify(&set.id()).expect("its base is in a slot");
+        }
+        based(&mut *sets, "v4", b"base 4");
+        assert_eq!(kept(&mut *sets), None, "v2 cannot be gone back to");
+        assert!(matches!(sets.verify(&same.id()), Err(Error::Missing(digest)) if digest == Digest::of(b"base 1")));
+        sets.verify(&third.id()).expect("what runs is untouched");
+    }
+}
+
+#[test]
+fn a_base_that_rotted_in_its_slot_is_found_out_and_only_the_spare_one_is_written_again() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut sets = DiskSets::open(folder.path()).expect("opens");
+    let first = based(&mut sets, "v1", b"base 1");
+    let slot = folder.path().join("base-b");
+    assert_eq!(fs::read(&slot).expect("is there"), b"base 1");
+    fs::write(&slot, b"base X").expect("writes");
+    assert!(matches!(sets.verify(&first.id()), Err(Error::Corrupt { .. })));
+    sets.stage(&first).expect("is written again");
+    sets.verify(&first.id()).expect("is whole");
+    commit(&mut sets, &first);
+    fs::write(&slot, b"base X").expect("writes");
+    assert!(matches!(sets.stage(&first), Err(Error::Corrupt { .. })), "the machine runs on it");
+    assert_eq!(fs::read(&slot).expect("is there"), b"base X");
+}

@@ -8,8 +8,10 @@ use midshift_agent::switch::Switch;
 use midshift_agent::update::Job;
 use midshift_bundle::manifest::{Migration, SafetyClass};
 use midshift_core::ids::DrainId;
+use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::robot::{Fault, FaultClass, HardwareStop, Load};
+use midshift_core::time::Utc;
 use midshift_core::update::{ActivationGrant, DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState};
 use midshift_core::work::{Effect, RobotEvent};
 use midshift_proto::session::Downlink;
@@ -568,6 +570,61 @@ fn a_robot_that_is_not_set_up_for_it_leaves_its_software_alone() {
     assert_eq!((state(&rig), releases.served()), (None, 0));
 }
 
+// --- the operating system
+
+/// A set that is current has been that for a day.
+fn a_day_passes(rig: &mut Rig, releases: &Releases) {
+    time_passes(rig, releases, limits::BASE_SETTLED_MS);
+}
+
+fn time_passes(rig: &mut Rig, releases: &Releases, ms: u64) {
+    rig.ms += ms;
+    releases.pass(ms);
+    rig.connect();
+}
+
+#[test]
+fn a_new_base_is_taken_only_by_a_robot_whose_set_was_kept_for_a_day_and_costs_the_set_before() {
+    let (rig, releases) = connected();
+    let first = releases.release_base("1.1.0");
+    let mut rig = committed(rig, &releases, &first, 1);
+    let current = name_of(&rig);
+    assert_eq!(switch(&rig).kept(), Some("factory"), "the base it came with is in the other slot");
+    time_passes(&mut rig, &releases, limits::BASE_SETTLED_MS - 60_000);
+    let second = releases.release_base("1.2.0");
+    let before = releases.served();
+    stage(&mut rig, &releases, &second, 2);
+    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::Refused), Some(Code::BaseTooSoon)));
+    assert_eq!(releases.served() - before, second.length, "its bytes did not come");
+    assert_eq!(switch(&rig).kept(), Some("factory"));
+    let process = releases.release("1.3.0");
+    stage(&mut rig, &releases, &process, 3);
+    assert_eq!(state(&rig), Some(UpdateState::Staged), "a bundle without a base need not wait");
+    assert_eq!(switch(&rig).kept(), Some("factory"));
+    a_day_passes(&mut rig, &releases);
+    let (mut rig, mut order) = on_trial(rig, &releases, &second, 4);
+    let trial = switch(&rig);
+    assert_eq!((trial.kept(), trial.previous.as_deref()), (Some(current.as_str()), None), "its slot was taken");
+    want(&mut rig, order.to(Goal::Revert));
+    let mut rig = relaunch(rig);
+    rig.pass(1_000);
+    assert_eq!((state(&rig), switch(&rig).running()), (Some(UpdateState::RolledBack), current.as_str()));
+}
+
+#[test]
+fn a_clock_that_went_back_does_not_count_as_a_day() {
+    let (rig, releases) = connected();
+    let first = releases.release_base("1.1.0");
+    let rig = committed(rig, &releases, &first, 1);
+    let mut row = rig.store.kept().expect("loaded").ledger.software;
+    row.committed_at = Some(Utc(i64::MAX));
+    rig.store.commit_now(&[midshift_agent::store::Op::Software(Box::new(row))]);
+    let mut rig = rig.restart();
+    rig.connect();
+    stage(&mut rig, &releases, &releases.release_base("1.2.0"), 2);
+    assert_eq!(why(&rig), Some(Code::BaseTooSoon));
+}
+
 // --- the power
 
 /// What the server would say now, whatever was lost: level-triggered.
@@ -593,11 +650,13 @@ fn server_says(rig: &mut Rig, order: &mut Order, grants: &mut u64, back: bool) {
 }
 
 /// One update to its end, with the power going at one of its effects. Gives back how it ended and how many effects there were.
-fn with_power_cut(at: Option<usize>, last_is_done: bool, back: bool) -> (UpdateState, usize) {
+fn with_power_cut(at: Option<usize>, last_is_done: bool, back: bool, bases: bool) -> (UpdateState, usize) {
     let (rig, releases) = connected();
-    let first = releases.release("1.1.0");
+    let release = |version| if bases { releases.release_base(version) } else { releases.release(version) };
+    let first = release("1.1.0");
     let mut rig = committed(rig, &releases, &first, 1);
-    let second = releases.release("1.2.0");
+    a_day_passes(&mut rig, &releases);
+    let second = release("1.2.0");
     let (good, mut grants) = (name_of(&rig), 1_000_000);
     let mut order = Order::new(releases.directive(&second, 2));
     order.generation = 10_000;
@@ -640,14 +699,15 @@ fn boots_something_whole(rig: &Rig, good: &str) {
 
 #[test]
 fn the_power_may_go_at_every_effect_of_an_update_and_it_still_ends() {
-    for (back, end) in [(false, UpdateState::Committed), (true, UpdateState::RolledBack)] {
-        let (undisturbed, effects) = with_power_cut(None, false, back);
+    let ends = [(false, UpdateState::Committed), (true, UpdateState::RolledBack)];
+    for (back, end, bases) in ends.into_iter().flat_map(|(back, end)| [(back, end, false), (back, end, true)]) {
+        let (undisturbed, effects) = with_power_cut(None, false, back, bases);
         assert_eq!(undisturbed, end);
         assert!(effects > 20, "only {effects} effects");
         for at in 1..=effects {
             for last_is_done in [false, true] {
-                let (ended, _) = with_power_cut(Some(at), last_is_done, back);
-                assert_eq!(ended, end, "the power went at {at} of {effects}, done: {last_is_done}");
+                let (ended, _) = with_power_cut(Some(at), last_is_done, back, bases);
+                assert_eq!(ended, end, "the power went at {at} of {effects}, done: {last_is_done}, bases: {bases}");
             }
         }
     }
