@@ -173,25 +173,19 @@ fn choose(orders: &Orders) -> io::Result<Start> {
         return Ok(Start { tries: tries.plus_one(&set), program: orders.program.clone(), set });
     };
     let path = sets.join(SWITCH);
-    let named = |error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", path.display()));
-    let mut switch = Switch::read(&path).map_err(named)?;
+    let mut switch = Switch::read(&path).map_err(|e| named(e, &path))?;
     let tried = switch.running().to_owned();
     if let Some(had) = starts::put_away(&mut switch, &tries) {
         say(&format!("set {tried} did not live in {had} tries; back to {}", switch.current));
-        switch.write(&path).map_err(named)?;
-    let mut switch = Switch::read(&path).map_err(|e| named(e, &path))?;
-    let tries = read_tries(&orders.record, switch.running());
-    if switch.trial.is_some() && tries >= TRIES_MAX {
-        say(&format!("set {} did not live in {tries} tries; back to {}", switch.running(), switch.current));
-        switch.fall_back(tries);
         switch.write(&path).map_err(|e| named(e, &path))?;
     }
-    if !boot_into(sets, &switch, read_tries(&orders.record, switch.running()))? {
+    let had = tries.of(switch.running());
+    if !boot_into(sets, &switch, had)? {
         if switch.trial.is_some() {
             say(&format!("set {} has a base that does not start; back to {}", switch.running(), switch.current));
-            switch.fall_back(tries.max(1));
+            switch.fall_back(had.max(1));
             switch.write(&path).map_err(|e| named(e, &path))?;
-            boot_into(sets, &switch, tries)?;
+            boot_into(sets, &switch, had)?;
         } else {
             say(&format!("set {} has no base that starts: it runs on the one that does", switch.running()));
         }
@@ -202,7 +196,6 @@ fn choose(orders: &Orders) -> io::Result<Start> {
     Ok(Start { tries: tries.plus_one(&set), program, set })
 }
 
-/// Whether a program that runs well clears its tries.
 fn named(error: io::Error, path: &Path) -> io::Error {
     io::Error::new(error.kind(), format!("{}: {error}", path.display()))
 }
@@ -218,13 +211,13 @@ fn change_boot<T>(sets: &Path, change: impl FnOnce(&mut Boot) -> T) -> io::Resul
 }
 
 /// Whether a slot has the bytes that the record says. The factory's base is the machine itself.
-fn starts(sets: &Path, slot: Slot, image: &Image) -> bool {
+fn starts_well(sets: &Path, slot: Slot, image: &Image) -> bool {
     image.name == switch::FACTORY || fs::metadata(sets.join(slot.file())).is_ok_and(|file| file.len() == image.length)
 }
 
 /// The launcher stands for the machine: when it starts, so does the boot loader.
 fn machine_starts(sets: &Path) -> io::Result<()> {
-    change_boot(sets, |boot| boot.start(|slot, image| starts(sets, slot, image)))
+    change_boot(sets, |boot| boot.start(|slot, image| starts_well(sets, slot, image)))
 }
 
 /// Starts the machine again if it runs on another base than the set that is to run. Whether it runs on that base now.
@@ -249,7 +242,7 @@ fn boot_into(sets: &Path, switch: &Switch, tries: u32) -> io::Result<bool> {
         }
         if slot.is_some() {
             say(&format!("the machine starts again, for the base {base}"));
-            boot.start(|slot, image| starts(sets, slot, image));
+            boot.start(|slot, image| starts_well(sets, slot, image));
         }
         slot == Some(boot.booted)
     })
