@@ -5,6 +5,7 @@ mod child;
 mod figure;
 mod flood;
 mod fsync;
+mod gates;
 mod hall;
 mod link;
 mod offer;
@@ -28,6 +29,8 @@ enum Name {
     Offer(offer::OfferArgs),
     /// Many robots on the link once a second, and few at the knee.
     Link(link::LinkArgs),
+    /// How often the gates of a roll-out are right and wrong, simulated from a seed.
+    Gates(gates::GatesArgs),
     /// What the other names start: this program in one role.
     #[command(hide = true)]
     Child(child::ChildArgs),
@@ -53,6 +56,7 @@ fn main() -> anyhow::Result<()> {
         Name::Submit(args) => wait(submit::run(args))?,
         Name::Offer(args) => wait(offer::run(args))?,
         Name::Link(args) => wait(link::run(args, &note))?,
+        Name::Gates(args) => gates::run(args)?,
         Name::Child(args) => return child::play(args),
     };
     print!("{}", figure::table(&figures));

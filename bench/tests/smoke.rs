@@ -53,3 +53,40 @@ fn the_link_is_told_beside_a_bare_session_and_the_disk() {
     let sizes: Vec<&str> = sizes.into_iter().chain(["--settle-seconds", "0", "--ask-seconds", "1"]).collect();
     assert_told(&records("link", &sizes), &["P1", "P4"], 1);
 }
+
+/// Runs the simulation of the gates and gives its records.
+fn gates(seed: &str) -> Vec<serde_json::Value> {
+    let dir = tempfile::tempdir().expect("a directory");
+    let file = dir.path().join("figures.json");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_midshift-bench"));
+    command.args(["gates", "--runs", "400", "--seed", seed, "--json"]).arg(&file);
+    let output = command.output().expect("it starts");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let text = std::fs::read_to_string(file).expect("it wrote its figures");
+    serde_json::from_str(&text).expect("an array of records")
+}
+
+#[test]
+fn the_gates_are_as_often_right_as_the_design_says_and_a_seed_says_it_again() {
+    let records = gates("7");
+    for target in ["G0", "G2", "G4"] {
+        assert!(records.iter().any(|r| r["target"] == target), "no figure for {target}");
+    }
+    let mut names: Vec<_> = records.iter().map(|r| r["name"].to_string()).collect();
+    names.sort();
+    names.dedup();
+    assert_eq!(names.len(), records.len(), "two figures with one name");
+    for record in &records {
+        let number = |name: &str| record[name].as_f64().unwrap_or_else(|| panic!("{name} in {record}"));
+        assert!(number("min") <= number("median") && number("median") <= number("max"), "{record}");
+        let Some(beside) = record["limit"]["median"].as_f64() else { continue };
+        let told = record["limit"]["name"].as_str().expect("a name");
+        // Ville's is a bound; the design rounds to a percent; chance may go twice as far as its 95 % interval.
+        let error = record["error"].as_f64().unwrap_or(0.0);
+        let near = if told.starts_with("at most") { 0.0 } else { (number("median") - beside).abs() };
+        assert!(near <= 2.0 * error + 0.6, "{record}");
+        assert!(!told.starts_with("at most") || number("min") <= beside, "{record}");
+    }
+    assert_eq!(gates("7"), records, "the same seed");
+    assert_ne!(gates("8"), records, "another seed");
+}

@@ -29,5 +29,3 @@ pub const FEW_ROBOTS: u32 = 10;
 pub const FAILURE_RATIO: u64 = 3;
 /// Evidence E at which task failures speak for an abort. By Ville's inequality a release that is no worse gets there in 1 of 20 roll-outs at most.
 pub const ABORT_EVIDENCE: u64 = 20;
-/// Robots on trial that must have failed more than the controls; with fewer it may be one sick robot.
-pub const SICK_ROBOTS_MIN: usize = 2;
