@@ -20,12 +20,14 @@ const CANARY: [(u32, usize); 1] = [(0, 6)];
 /// What Ville's inequality allows of roll-outs that are no worse, percent.
 const VILLE: (&str, f64) = ("at most, J. Ville 1939", 5.0);
 
+/// How many times as often tasks fail on a robot while it is on trial, by the robot's number.
+type Ratio = fn(usize) -> f64;
+
 /// One kind of roll-out.
 struct Shift<'a> {
     names: &'a [RobotId],
     waves: &'a [(u32, usize)],
-    /// How many times as often tasks fail on each robot while it is on trial.
-    ratio: fn(usize) -> f64,
+    ratio: Ratio,
 }
 
 /// How one ended.
@@ -88,29 +90,34 @@ pub fn figures(seed: u64, runs: usize) -> anyhow::Result<Vec<Figure>> {
     let names = &names.collect::<Result<Vec<_>, _>>()?;
     let told = |name: String, unit, estimate, limit| Figure::simulated("G4", name, unit, estimate, limit);
     let mut figures = Vec::new();
-    for (name, waves, kind) in [("in waves", &WAVES[..], 400), ("canary", &CANARY[..], 401)] {
+    for (name, waves, kind) in [("in waves", &WAVES[..], 400), ("canary of 6", &CANARY[..], 401)] {
         let ends = Shift { names, waves, ratio: |_| 1.0 }.many(seed, kind, runs);
-        let what = format!("E >= 20, no worse, {name}, {HORIZON} tasks a robot");
-        figures.push(told(format!("{what}: E"), "%", share(&ends, |e| e.reached), Some(VILLE)));
-        figures.push(told(format!("{what}: accused"), "%", share(&ends, |e| e.accused_after.is_some()), Some(VILLE)));
+        let what = format!("tasks, no worse, {name}, {HORIZON} a robot");
+        figures.push(told(format!("{what}: E reaches 20"), "%", share(&ends, |e| e.reached), Some(VILLE)));
+        figures.push(told(
+            format!("{what}: release accused"),
+            "%",
+            share(&ends, |e| e.accused_after.is_some()),
+            Some(VILLE),
+        ));
     }
     let sick = |robot| if robot == 0 { 20.0 } else { 1.0 };
     let ends = Shift { names, waves: &CANARY, ratio: sick }.many(seed, 402, runs);
     figures.push(told(
-        "E >= 20, one robot fails 20 times as often: told so".into(),
+        "tasks, one robot 20 times as often: told to be sick".into(),
         "%",
         share(&ends, |e| e.sick_robot),
         None,
     ));
     let accused = share(&ends, |e| e.accused_after.is_some());
-    figures.push(told("E >= 20, one robot fails 20 times as often: accused".into(), "%", accused, Some(VILLE)));
-    let worse: [(u32, fn(usize) -> f64); 3] = [(2, |_| 2.0), (3, |_| 3.0), (5, |_| 5.0)];
+    figures.push(told("tasks, one robot 20 times as often: release accused".into(), "%", accused, Some(VILLE)));
+    let worse: [(u32, Ratio); 3] = [(2, |_| 2.0), (3, |_| 3.0), (5, |_| 5.0)];
     for ((times, ratio), kind) in worse.into_iter().zip(403..) {
         let ends = Shift { names, waves: &CANARY, ratio }.many(seed, kind, runs);
         let delays: Vec<f64> = ends.iter().filter_map(|e| e.accused_after).map(|tasks| tasks as f64).collect();
-        let what = format!("E >= 20, {times} times as often, canary");
-        figures.push(told(format!("{what}: accused"), "%", share(&ends, |e| e.accused_after.is_some()), None));
-        figures.push(told(format!("{what}: after"), "tasks", Estimate::mean(&delays), None));
+        let what = format!("tasks, {times} times as often, canary of 6");
+        figures.push(told(format!("{what}: release accused"), "%", share(&ends, |e| e.accused_after.is_some()), None));
+        figures.push(told(format!("{what}: accused after"), "tasks", Estimate::mean(&delays), None));
     }
     Ok(figures)
 }

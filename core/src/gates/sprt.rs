@@ -3,8 +3,8 @@
 //! Each decided robot adds the logarithm of how much likelier its outcome is under a bad failure rate p1 than under a good one p0:
 //! ln(p1 / p0) for a failure, ln((1 - p1) / (1 - p0)) for a clean one. At ln((1 - β) / α) or above the release is aborted, at
 //! ln(β / (1 - α)) or below it is promoted, between them nothing is proven. Source: A. Wald, Sequential Tests of Statistical
-//! Hypotheses, Annals of Mathematical Statistics 16 (1945). Looked at after each robot it aborts at most α / (1 - β) of the good releases
-//! and promotes at most β / (1 - α) of the bad ones; looked at after each wave only, less often.
+//! Hypotheses, Annals of Mathematical Statistics 16 (1945). Looked at after each robot or after each wave, it aborts at most α / (1 - β) of
+//! the good releases and promotes at most β / (1 - α) of the bad ones.
 
 use super::fixed::{Rounding, ln_micronats};
 use super::{BAD_PERMILLE, FALSE_ABORT_PERMILLE, FALSE_PROMOTE_PERMILLE, FEW_ROBOTS, GOOD_PERMILLE};
