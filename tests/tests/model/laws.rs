@@ -1,6 +1,6 @@
 //! What must hold in every state, what must be able to happen, and that every drain can end from wherever things stand.
 
-use super::protocol::{Action, Asked, Holder, Phase, Protocol, State, in_flight};
+use super::protocol::{Action, Asked, Holder, Protocol, State, in_flight};
 use stateright::{Checker, HasDiscoveries, Model, Property};
 use std::collections::HashMap;
 
@@ -40,15 +40,14 @@ impl Model for Protocol {
             Property::always(NOT_LATE, |_, s: &State| !s.activated_late),
             Property::always(OWN_LEDGER, |_, s: &State| !s.activated_unheld),
             Property::sometimes("a robot switches", |_, s: &State| s.robots.iter().any(|r| r.switching == Some(0))),
+            Property::sometimes(
+                "a grant written before a pause or an abort is used after it, within its life",
+                |_, s: &State| s.robots.iter().any(|r| r.after_stop),
+            ),
             Property::sometimes("a drain is released after a grant that was not used", |_, s: &State| {
                 s.robots.iter().any(|r| r.drains[0].asked == Asked::Over && r.drains[0].grant.is_some() && !r.used[0])
             }),
         ];
-        if self.pauses > 0 {
-            properties.push(Property::sometimes("a grant written before a pause is used after it", |_, s: &State| {
-                s.phases[0] == Phase::Paused && s.robots.iter().any(|r| r.switching == Some(0))
-            }));
-        }
         if self.rollouts == 2 {
             properties.push(Property::sometimes(
                 "the next roll-out switches a robot that the first had drained",

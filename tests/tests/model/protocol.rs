@@ -142,6 +142,8 @@ pub struct Robot {
     pub used: [bool; ROLLOUTS],
     /// It switches, or proves itself after it: it can do nothing else, and nobody hears of it.
     pub switching: Option<usize>,
+    /// It switches by a grant within its life although the roll-out has stopped: the honest bound of a pause.
+    pub after_stop: bool,
     pub untold: [bool; ROLLOUTS],
 }
 
@@ -501,10 +503,13 @@ impl Protocol {
                 robot.switching = Some(order.rollout);
                 let over = robot.drains[order.rollout].grant.is_some_and(|g| g.life == Life::OverForServer);
                 next.activated_unheld |= robot.holder != Holder::Drain(order.drain_id);
-                next.activated_late |= over && next.phases[order.rollout] != Phase::Running;
+                let stopped = next.phases[order.rollout] != Phase::Running;
+                robot.after_stop = stopped && !over;
+                next.activated_late |= stopped && over;
             }
             Action::Settle(robot) => {
                 let robot = &mut next.robots[robot];
+                robot.after_stop = false;
                 if let Some(rollout) = robot.switching.take() {
                     robot.untold[rollout] = true;
                 }
