@@ -164,6 +164,8 @@ pub const ENCODING_BASES_MAX: usize = 8;
 pub const ENCODING_ASK_AGAIN_MS: u32 = 2_000;
 /// A set has been committed for so long before a new base takes the slot of the one before it, ms of UTC on the robot's site clock.
 pub const BASE_SETTLED_MS: u64 = 24 * 3_600_000;
+/// One call of a program that migrates data may take so long, ms; after that it is called again.
+pub const MIGRATION_MS: u64 = 600_000;
 /// Bytes of one range of software that a robot asks for.
 pub const CHUNK_RANGE_BYTES: u64 = 4 * 1024 * 1024;
 /// Bytes of one message of such a range.
@@ -182,3 +184,15 @@ pub const ROUTE_FIELDS_BYTES: usize = 64 * 1024 * 1024;
 pub const TASK_LIST_MAX: usize = 1_000_000;
 /// A robot's clock further off than this is shown as skewed; before an offset is known, a stamp further ahead is flagged. Milliseconds.
 pub const SKEW_ALERT_MS: i64 = 2_000;
+/// Bytes of a launcher's beacon.
+pub const BEACON_BYTES: usize = 256;
+/// Robots whose beacons are kept: more than a site has.
+pub const BEACONS_MAX: usize = 10_000;
+/// Beacons of one address that are looked at in a second: robots behind one router share it, and each sends one.
+pub const BEACONS_PER_SOURCE: u32 = 64;
+/// Addresses that are heard in a second.
+pub const BEACON_SOURCES_MAX: usize = 4_096;
+/// A beacon is shown so long; the next one comes after a second.
+pub const BEACON_SHOWN: LinkDuration = LinkDuration(5_000);
+/// A program that gives no sign within this is started again by its launcher: what is shown as the time by which a robot is back.
+pub const BEACON_BACK_WITHIN: LinkDuration = LinkDuration(15_000);

@@ -280,6 +280,10 @@ impl Sets for DiskSets {
         self.verify_base(&set)
     }
 
+    fn program(&mut self, set: &Digest) -> Option<PathBuf> {
+        Some(self.component(&set.to_string(), PROGRAM))
+    }
+
     fn write_switch(&mut self, switch: &mut Switch) -> Result<(), Error> {
         switch.write(&self.folder.join(SWITCH)).map_err(io_error("writing the switch record"))?;
         self.settle(switch)

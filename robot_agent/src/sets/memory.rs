@@ -12,6 +12,7 @@ use midshift_bundle::set::SetManifest;
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Cursor};
 use std::ops::Range;
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// A download.
@@ -250,6 +251,10 @@ impl Sets for MemorySets {
     fn verify(&mut self, id: &Digest) -> Result<(), Error> {
         let state = self.state();
         state.verify(state.sets.get(id).ok_or(Error::Missing(*id))?)
+    }
+
+    fn program(&mut self, _: &Digest) -> Option<PathBuf> {
+        None
     }
 
     fn write_switch(&mut self, switch: &mut Switch) -> Result<(), Error> {

@@ -16,6 +16,7 @@ use midshift_bundle::set::SetManifest;
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::ops::Range;
+use std::path::PathBuf;
 
 /// Bytes of one chunk: what a bitmap counts.
 pub const CHUNK_BYTES: u64 = 256 * 1024;
@@ -167,6 +168,8 @@ pub trait Sets: Send {
     /// # Errors
     /// What is missing or wrong.
     fn verify(&mut self, id: &Digest) -> Result<(), Error>;
+    /// The program of a set as it can be called; none: these sets are of robots in memory, which run no programs and have no data.
+    fn program(&mut self, set: &Digest) -> Option<PathBuf>;
     /// Replaces the switch record. The base of a set that it makes current becomes good.
     ///
     /// # Errors

@@ -3,7 +3,7 @@
 //! Invariant: it decides nothing. Bytes are believed only after the whole file was checked; what fails for a reason that may pass is
 //! [`Failure::Later`]. Called by the shell, one job at a time.
 
-use super::{Done, Failure, Job};
+use super::{Done, Failure, Job, migrate};
 use crate::sets::{self, CHUNK_BYTES, Sets, Wanted};
 use async_trait::async_trait;
 use midshift_bundle::digest::Digest;
@@ -147,6 +147,12 @@ impl Worker for UpdateWorker {
                 .on_disk(move |sets| sets.write_switch(&mut switch).map(|()| Done::Written(switch)))
                 .await
                 .unwrap_or_else(later),
+            Job::Migrate { set, due } => match self.on_disk(move |sets| sets.program(&set)).await {
+                Some(program) => {
+                    migrate::call(&program, &set.to_string(), &due).await.map_or_else(Done::Failed, |()| Done::Ok)
+                }
+                None => Done::Ok,
+            },
             Job::Collect(keep) => self.done(move |sets| sets.collect(&keep)).await,
         }
     }

@@ -1,10 +1,11 @@
 //! The robot's updater without IO: which bytes to fetch, when to switch, when to go back.
 //!
-//! Rooms: here what it knows and asks for; `pursue` is the machine; `io` does the jobs; `remote` asks the server. Called by the core.
+//! Rooms: here what it knows and asks for; `pursue` is the machine; `migrate` is what follows a commit; `io` does the jobs; `remote` asks the server. Called by the core.
 //! Invariant: each side effect is a [`Job`], and a job begins only after the ledger row that explains it is durable; at most one job is
 //! under way. The switch record wins over the ledger.
 
 pub mod io;
+pub mod migrate;
 mod pursue;
 pub mod remote;
 
@@ -19,6 +20,7 @@ use midshift_core::ids::{BundleId, DrainId, SetId};
 use midshift_core::reason::Reason;
 use midshift_core::time::{LinkTime, SiteTime, Utc};
 use midshift_core::update::{DesiredUpdate, UpdateReport, UpdateState};
+use migrate::DueMigration;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -50,6 +52,9 @@ pub struct SoftwareRow {
     /// When the set that runs was committed; none: the robot came with it, or nobody wrote it down.
     #[serde(default)]
     pub committed_at: Option<Utc>,
+    /// Migrations of the committed set that are not done yet.
+    #[serde(default)]
+    pub due: Vec<DueMigration>,
     /// The newest update.
     pub update: Option<Update>,
 }
@@ -120,6 +125,13 @@ pub enum Job {
     Verify(SetId),
     /// Write the switch record.
     Write(Switch),
+    /// Have a committed set do something to the robot's data.
+    Migrate {
+        /// The set.
+        set: Digest,
+        /// What.
+        due: DueMigration,
+    },
     /// Delete what nobody needs.
     Collect(BTreeSet<Digest>),
 }

@@ -2,7 +2,7 @@
 //!
 //! Invariant: level-triggered. It may be called at any moment and any number of times; what it decides is written down before it is done.
 
-use super::{Done, Failure, Job, SoftwareRow, Update};
+use super::{Done, Failure, Job, SoftwareRow, Update, migrate};
 use crate::core::{AgentCore, ExitReason, Output};
 use crate::sets::{Holdings, Wanted};
 use crate::store::Op;
@@ -136,6 +136,7 @@ impl AgentCore {
             }
             (Job::Write(_), Done::Written(switch)) => self.hold(|holdings| holdings.switch = switch),
             (Job::Verify(set), Done::Ok) => self.verified(&set),
+            (Job::Migrate { due, .. }, Done::Ok) => self.migrated(&due),
             (Job::Collect(_), Done::Ok) => self.update.collected = true,
             (job, Done::Failed(Failure::Later(why))) => self.put_off(now, &job, &why),
             (job, Done::Failed(Failure::Refused(reason))) => self.job_refused(now, job, reason),
@@ -149,7 +150,7 @@ impl AgentCore {
         }
     }
 
-    fn ask_for(&mut self, job: Job) {
+    pub(super) fn ask_for(&mut self, job: Job) {
         let barrier = self.written();
         self.update.next = Some((job, barrier));
     }
@@ -159,6 +160,9 @@ impl AgentCore {
         let pause = PAUSE.0.as_ms().saturating_mul(1 << (failures - 1).min(6)).min(PAUSE.1.as_ms());
         tracing::info!(robot_id = %self.config.robot_id, ?job, why, pause_ms = pause, "update is put off");
         self.update.pause = Some((now.link + LinkDuration(pause), failures));
+        if let Job::Migrate { due, .. } = job {
+            self.not_migrated(due, why);
+        }
         if matches!(job, Job::Stage(_)) {
             // Content that was there has changed on the disk: look for all of it again.
             self.update.fetched.clear();
@@ -172,13 +176,13 @@ impl AgentCore {
             Job::Manifest { .. } | Job::Fetch { .. } | Job::Stage(_) => {
                 self.move_to(UpdateState::Refused, Some(reason))
             }
-            Job::Look | Job::Write(_) | Job::Collect(_) => self.put_off(now, &job, reason.text()),
+            Job::Look | Job::Write(_) | Job::Migrate { .. } | Job::Collect(_) => self.put_off(now, &job, reason.text()),
         }
     }
 
     // --- the row
 
-    fn put_software(&mut self, row: SoftwareRow) {
+    pub(super) fn put_software(&mut self, row: SoftwareRow) {
         self.write(Op::Software(Box::new(row)), true);
     }
 
@@ -189,7 +193,7 @@ impl AgentCore {
         self.put_update(Update { state, reason, ..update });
     }
 
-    fn put_update(&mut self, update: Update) {
+    pub(super) fn put_update(&mut self, update: Update) {
         let from = self.kept.ledger.software.update.as_ref().filter(|u| u.bundle == update.bundle).map(|u| u.state);
         if from.is_some_and(|from| from != update.state && !from.transitions().contains(&update.state)) {
             tracing::error!(?from, to = ?update.state, "no step of an update");
@@ -227,7 +231,8 @@ impl AgentCore {
         if self.update.went_back {
             return Some(ExitReason::Switched);
         }
-        if self.begin_update(now) {
+        // A newer bundle comes before a migration that fails.
+        if self.begin_update(now) || (!is_stuck && self.migrate(holdings)) {
             return None;
         }
         if !self.update.collected {
@@ -400,6 +405,11 @@ impl AgentCore {
         };
         if let Some(component) = manifest.components.iter().find(|c| !self.lists(&c.digest, c.length)) {
             let reason = Reason::from(Code::BundleUnfit).with("unlisted", &component.name);
+            return self.move_to(UpdateState::Refused, Some(reason));
+        }
+        if !migrate::is_possible(&set) {
+            let reason =
+                Reason::new(Code::BundleUnfit, "a component migrates data, and no program of the set can do it");
             return self.move_to(UpdateState::Refused, Some(reason));
         }
         if let Err(reason) = self.may_take_base(now, &current, &set) {
@@ -649,8 +659,12 @@ impl AgentCore {
         if let Some(set) = update.set.as_ref().filter(|_| update.raises_floor) {
             row.floors = raised(&row.floors, set, &kept);
         }
+        if let Some(set) = &update.set {
+            row.due = migrate::due(set, &kept, &row.due);
+        }
+        let reason = row.due.first().map(Self::is_due);
         self.put_software(row);
-        self.put_update(Update { state: UpdateState::Committed, reason: None, ..update });
+        self.put_update(Update { state: UpdateState::Committed, reason, ..update });
     }
 
     // --- back
@@ -662,6 +676,9 @@ impl AgentCore {
     }
 
     fn go_back(&mut self, update: Update, reason: Reason) {
+        if update.state == UpdateState::Committed && !self.kept.ledger.software.due.is_empty() {
+            self.put_software(SoftwareRow { due: Vec::new(), ..self.kept.ledger.software.clone() });
+        }
         let drain_id = self.update.desired.as_ref().and_then(|d| d.drain_id.clone()).or(update.drain_id.clone());
         self.put_update(Update { state: UpdateState::RollingBack, drain_id, reason: Some(reason), ..update });
     }

@@ -1,5 +1,6 @@
 //! What a robot does with what it is told, on a bench: no network, no clock, no disk but those of the test.
 
+mod bases;
 mod chaos;
 mod drives;
 mod lanes;

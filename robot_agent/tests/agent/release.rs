@@ -115,13 +115,16 @@ impl Releases {
     pub fn release(&self, version: &str) -> Bundle {
         self.release_as(version, |_| {})
     }
-    /// As [`Releases::release`], with an operating system.
+    /// As [`Releases::release`], with an operating system, and a program that migrates data.
     pub fn release_base(&self, version: &str) -> Bundle {
         let base = format!("base {version}").repeat(9_000).into_bytes();
         let mut os = component("os", version, ComponentKind::Base, &base);
         os.needs = Needs::Reboot;
         self.hold(&base);
-        self.release_as(version, |manifest| manifest.components.push(os))
+        self.release_as(version, |manifest| {
+            manifest.components.push(os);
+            manifest.components[0].data_migration = Migration::Reversible;
+        })
     }
     /// As [`Releases::release`], after `change` of its manifest. Bytes of a component that this adds are held already.
     pub fn release_as(&self, version: &str, change: impl FnOnce(&mut Manifest)) -> Bundle {

@@ -7,11 +7,12 @@ use midshift_agent::core::{AgentCore, CoreConfig, ExitReason, Input, Output};
 use midshift_agent::memory::MemoryStore;
 use midshift_agent::sets::memory::MemorySets;
 use midshift_agent::update::io::{UpdateWorker, Worker};
-use midshift_agent::update::{Done, Job};
+use midshift_agent::update::{Done, Failure, Job};
 use midshift_core::authority::Authority;
 use midshift_core::ids::{AreaId, AttemptId, PlaceId, RobotId, Subject, TaskId, WaypointId};
 use midshift_core::robot::{Fault, HardwareStop, Inventory, Lane, Load, Mode, Pose, ReportedState, StopLevel};
 use midshift_core::time::{LinkTime, Now, SiteTime, Utc};
+use midshift_core::update::UpdateState;
 use midshift_core::work::{
     Assignment, AttemptReport, DesiredWork, Effect, GrantedPlace, InboxItem, PlaceNews, RobotEvent, RoutePoint,
     SampleBody, StepKind, WorkState, WorkStep,
@@ -228,14 +229,28 @@ pub struct Updates {
     /// The power is gone: nothing has an effect any more.
     pub dark: bool,
     pub jobs: Vec<Job>,
+    /// Calls of programs that migrate do not end well.
+    pub migration_fails: bool,
 }
 
 impl Updates {
     pub fn of(releases: &Releases) -> Self {
         let (releases, sets) = (releases.clone(), MemorySets::new());
-        Self { releases, sets, effects: 0, cut_at: None, last_is_done: false, dark: false, jobs: Vec::new() }
+        Self {
+            releases,
+            sets,
+            effects: 0,
+            cut_at: None,
+            last_is_done: false,
+            dark: false,
+            jobs: Vec::new(),
+            migration_fails: false,
+        }
     }
     fn work(&self, job: Job) -> Done {
+        if self.migration_fails && matches!(job, Job::Migrate { .. }) {
+            return Done::Failed(Failure::Later("exit status: 1".to_owned()));
+        }
         let remote = Arc::new(self.releases.clone());
         let mut worker = UpdateWorker::new(Box::new(self.sets.clone()), remote);
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
@@ -317,6 +332,10 @@ impl Rig {
                         inputs.extend(is_heard.then_some(Input::Persisted(batch)));
                     }
                     Output::Job(job) => {
+                        if matches!(*job, Job::Migrate { .. }) {
+                            let row = self.store.kept().expect("loaded").ledger.software.update;
+                            assert_eq!(row.map(|u| u.state), Some(UpdateState::Committed), "it is durable");
+                        }
                         let (happens, is_heard) = self.effect();
                         let done = self.updates.as_ref().filter(|_| happens).map(|u| u.work(Job::clone(&job)));
                         self.updates.iter_mut().for_each(|u| u.jobs.push(Job::clone(&job)));

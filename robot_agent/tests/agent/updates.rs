@@ -1,5 +1,6 @@
 //! What a robot does with its software: take it, stage it, run it on trial, keep it or go back; and what it does not take.
 
+use crate::bases::{a_day_passes, migrations};
 use crate::release::{Bundle, Releases};
 use crate::rig::{Rig, action, place_id};
 use midshift_agent::core::{ExitReason, Input};
@@ -8,10 +9,8 @@ use midshift_agent::switch::Switch;
 use midshift_agent::update::Job;
 use midshift_bundle::manifest::{Migration, SafetyClass};
 use midshift_core::ids::DrainId;
-use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::robot::{Fault, FaultClass, HardwareStop, Load};
-use midshift_core::time::Utc;
 use midshift_core::update::{ActivationGrant, DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState};
 use midshift_core::work::{Effect, RobotEvent};
 use midshift_proto::session::Downlink;
@@ -19,13 +18,13 @@ use midshift_proto::session::Downlink;
 /// Milliseconds of site time on probation.
 const PROBATION_MS: u64 = 10_000;
 
-fn drain(name: &str) -> DrainId {
+pub fn drain(name: &str) -> DrainId {
     DrainId::parse(name).expect("a name")
 }
 
 /// The server's side of one update.
 #[derive(Clone)]
-struct Order {
+pub struct Order {
     directive: String,
     generation: u64,
     drain_id: Option<DrainId>,
@@ -36,7 +35,7 @@ impl Order {
     fn new(directive: String) -> Self {
         Self { directive, generation: 100, drain_id: None, granted: 0 }
     }
-    fn to(&mut self, goal: Goal) -> DesiredUpdate {
+    pub fn to(&mut self, goal: Goal) -> DesiredUpdate {
         self.generation += 1;
         DesiredUpdate {
             robot_id: midshift_core::ids::RobotId::parse("rbt-01").expect("a name"),
@@ -51,30 +50,30 @@ impl Order {
     }
 }
 
-fn want(rig: &mut Rig, desired: DesiredUpdate) {
+pub fn want(rig: &mut Rig, desired: DesiredUpdate) {
     rig.down(Downlink { update: Some(desired), ..Downlink::default() });
 }
 
 /// The server takes the robot out of work, and gives it back.
-fn maintain(rig: &mut Rig, drain_id: Option<&DrainId>) {
+pub fn maintain(rig: &mut Rig, drain_id: Option<&DrainId>) {
     let mut work = rig.desired(None);
     work.maintenance = drain_id.cloned();
     rig.work(work);
 }
 
-fn report(rig: &Rig) -> Option<UpdateReport> {
+pub fn report(rig: &Rig) -> Option<UpdateReport> {
     rig.store.kept().expect("loaded").ledger.software.report(0)
 }
 
-fn state(rig: &Rig) -> Option<UpdateState> {
+pub fn state(rig: &Rig) -> Option<UpdateState> {
     report(rig).map(|r| r.state)
 }
 
-fn why(rig: &Rig) -> Option<Code> {
+pub fn why(rig: &Rig) -> Option<Code> {
     report(rig)?.reason.map(|r| r.code)
 }
 
-fn switch(rig: &Rig) -> Switch {
+pub fn switch(rig: &Rig) -> Switch {
     rig.updates.as_ref().expect("has them").sets.clone().holdings().expect("tells").switch
 }
 
@@ -91,7 +90,7 @@ fn asked(rig: &Rig) -> usize {
 }
 
 /// A robot that is connected, and a repository.
-fn connected() -> (Rig, Releases) {
+pub fn connected() -> (Rig, Releases) {
     let releases = Releases::new();
     let mut rig = Rig::updatable(&releases);
     rig.connect();
@@ -99,7 +98,7 @@ fn connected() -> (Rig, Releases) {
 }
 
 /// Brings a bundle onto the disk.
-fn stage(rig: &mut Rig, releases: &Releases, bundle: &Bundle, generation: u64) -> Order {
+pub fn stage(rig: &mut Rig, releases: &Releases, bundle: &Bundle, generation: u64) -> Order {
     let mut order = Order::new(releases.directive(bundle, generation));
     order.generation = generation * 100;
     want(rig, order.to(Goal::Stage));
@@ -124,7 +123,7 @@ fn grant(rig: &mut Rig, order: &mut Order, valid_ms: u64) {
 }
 
 /// The program ended to switch; the launcher starts the one of the record.
-fn relaunch(rig: Rig) -> Rig {
+pub fn relaunch(rig: Rig) -> Rig {
     assert_eq!(rig.exit, Some(ExitReason::Switched), "{:?}", report(&rig));
     let mut rig = rig.restart();
     rig.connect();
@@ -132,7 +131,7 @@ fn relaunch(rig: Rig) -> Rig {
 }
 
 /// Runs a bundle to its trial.
-fn on_trial(rig: Rig, releases: &Releases, bundle: &Bundle, generation: u64) -> (Rig, Order) {
+pub fn on_trial(rig: Rig, releases: &Releases, bundle: &Bundle, generation: u64) -> (Rig, Order) {
     let mut rig = rig;
     let mut order = stage(&mut rig, releases, bundle, generation);
     assert_eq!(state(&rig), Some(UpdateState::Staged), "{:?}", report(&rig));
@@ -145,7 +144,7 @@ fn on_trial(rig: Rig, releases: &Releases, bundle: &Bundle, generation: u64) -> 
     (rig, order)
 }
 
-fn committed(rig: Rig, releases: &Releases, bundle: &Bundle, generation: u64) -> Rig {
+pub fn committed(rig: Rig, releases: &Releases, bundle: &Bundle, generation: u64) -> Rig {
     let (mut rig, mut order) = on_trial(rig, releases, bundle, generation);
     maintain(&mut rig, None);
     want(&mut rig, order.to(Goal::Commit));
@@ -153,7 +152,7 @@ fn committed(rig: Rig, releases: &Releases, bundle: &Bundle, generation: u64) ->
     rig
 }
 
-fn name_of(rig: &Rig) -> String {
+pub fn name_of(rig: &Rig) -> String {
     report(rig).and_then(|r| r.set).expect("a set").to_string()
 }
 
@@ -570,61 +569,6 @@ fn a_robot_that_is_not_set_up_for_it_leaves_its_software_alone() {
     assert_eq!((state(&rig), releases.served()), (None, 0));
 }
 
-// --- the operating system
-
-/// A set that is current has been that for a day.
-fn a_day_passes(rig: &mut Rig, releases: &Releases) {
-    time_passes(rig, releases, limits::BASE_SETTLED_MS);
-}
-
-fn time_passes(rig: &mut Rig, releases: &Releases, ms: u64) {
-    rig.ms += ms;
-    releases.pass(ms);
-    rig.connect();
-}
-
-#[test]
-fn a_new_base_is_taken_only_by_a_robot_whose_set_was_kept_for_a_day_and_costs_the_set_before() {
-    let (rig, releases) = connected();
-    let first = releases.release_base("1.1.0");
-    let mut rig = committed(rig, &releases, &first, 1);
-    let current = name_of(&rig);
-    assert_eq!(switch(&rig).kept(), Some("factory"), "the base it came with is in the other slot");
-    time_passes(&mut rig, &releases, limits::BASE_SETTLED_MS - 60_000);
-    let second = releases.release_base("1.2.0");
-    let before = releases.served();
-    stage(&mut rig, &releases, &second, 2);
-    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::Refused), Some(Code::BaseTooSoon)));
-    assert_eq!(releases.served() - before, second.length, "its bytes did not come");
-    assert_eq!(switch(&rig).kept(), Some("factory"));
-    let process = releases.release("1.3.0");
-    stage(&mut rig, &releases, &process, 3);
-    assert_eq!(state(&rig), Some(UpdateState::Staged), "a bundle without a base need not wait");
-    assert_eq!(switch(&rig).kept(), Some("factory"));
-    a_day_passes(&mut rig, &releases);
-    let (mut rig, mut order) = on_trial(rig, &releases, &second, 4);
-    let trial = switch(&rig);
-    assert_eq!((trial.kept(), trial.previous.as_deref()), (Some(current.as_str()), None), "its slot was taken");
-    want(&mut rig, order.to(Goal::Revert));
-    let mut rig = relaunch(rig);
-    rig.pass(1_000);
-    assert_eq!((state(&rig), switch(&rig).running()), (Some(UpdateState::RolledBack), current.as_str()));
-}
-
-#[test]
-fn a_clock_that_went_back_does_not_count_as_a_day() {
-    let (rig, releases) = connected();
-    let first = releases.release_base("1.1.0");
-    let rig = committed(rig, &releases, &first, 1);
-    let mut row = rig.store.kept().expect("loaded").ledger.software;
-    row.committed_at = Some(Utc(i64::MAX));
-    rig.store.commit_now(&[midshift_agent::store::Op::Software(Box::new(row))]);
-    let mut rig = rig.restart();
-    rig.connect();
-    stage(&mut rig, &releases, &releases.release_base("1.2.0"), 2);
-    assert_eq!(why(&rig), Some(Code::BaseTooSoon));
-}
-
 // --- the power
 
 /// What the server would say now, whatever was lost: level-triggered.
@@ -677,7 +621,10 @@ fn with_power_cut(at: Option<usize>, last_is_done: bool, back: bool, bases: bool
         }
         let told = report(&rig).filter(|r| r.bundle.as_str() == second.digest.to_string());
         let ended = |r: &UpdateReport| matches!(r.state, UpdateState::Committed | UpdateState::RolledBack);
-        if let Some(told) = told.filter(ended) {
+        let migrates = !rig.store.kept().expect("loaded").ledger.software.due.is_empty();
+        if let Some(told) = told.filter(ended).filter(|_| !migrates) {
+            let migrated = migrations(&rig);
+            assert_eq!(migrated.contains(&"1.2.0".to_owned()), bases && !back, "{migrated:?}");
             boots_something_whole(&rig, &good);
             return (told.state, rig.updates.as_ref().map_or(0, |u| u.effects) - before);
         }

@@ -1,0 +1,194 @@
+//! What is done to a robot's data once a set is committed: the set's program is called for each component that asks for it.
+//!
+//! `PROGRAM midshift-migrate COMPONENT FROM TO`, with `-` for no version before; done when it ends with 0. Invariant: it is called only
+//! after COMMITTED is on the ledger, one call at a time, and again until it is done: it must bear being called twice, also while a call
+//! whose agent was killed still runs. A roll-back calls nothing.
+
+use super::{Failure, Job, Update};
+use crate::core::AgentCore;
+use crate::sets::Holdings;
+use midshift_bundle::manifest::Migration;
+use midshift_bundle::set::SetManifest;
+use midshift_core::limits;
+use midshift_core::reason::{Code, Reason};
+use midshift_core::update::UpdateState;
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+use std::process::Stdio;
+use std::time::Duration;
+use tokio::process::Command;
+
+/// First argument of the program when it is to migrate.
+pub const VERB: &str = "midshift-migrate";
+/// Where there was no version before.
+const NOTHING: &str = "-";
+
+/// A migration that is to be done.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DueMigration {
+    /// Whose data.
+    pub component: String,
+    /// Version before; none: the component is new.
+    pub from: Option<String>,
+    /// Version now.
+    pub to: String,
+}
+
+/// What is due once `set` is committed after `kept`, of which `due` was not done yet.
+pub(super) fn due(set: &SetManifest, kept: &SetManifest, due: &[DueMigration]) -> Vec<DueMigration> {
+    let asks = set.components.values().filter_map(|component| {
+        let begun = due.iter().find(|d| d.component == component.name);
+        let before = kept.components.get(&component.name);
+        let changes = component.data_migration != Migration::None && before.map(|b| b.digest) != Some(component.digest);
+        let from = match begun {
+            Some(begun) => begun.from.clone(),
+            None => before.map(|before| before.version.clone()),
+        };
+        let to = component.version.clone();
+        (changes || begun.is_some()).then(|| DueMigration { component: component.name.clone(), from, to })
+    });
+    asks.collect()
+}
+
+/// Whether the set could do what its components ask for.
+pub(super) fn is_possible(set: &SetManifest) -> bool {
+    set.program().is_some() || set.components.values().all(|c| c.data_migration == Migration::None)
+}
+
+/// Calls a program once, up to [`limits::MIGRATION_MS`].
+pub(super) async fn call(program: &Path, set: &str, due: &DueMigration) -> Result<(), Failure> {
+    let later = |why: String| Err(Failure::Later(why));
+    let mut command = Command::new(program);
+    command.args([VERB, &due.component, due.from.as_deref().unwrap_or(NOTHING), &due.to]);
+    // Its output is not the agent's, which the launcher listens to.
+    command.env(crate::launcher::SET, set).stdin(Stdio::null()).stdout(Stdio::null()).kill_on_drop(true);
+    match tokio::time::timeout(Duration::from_millis(limits::MIGRATION_MS), command.status()).await {
+        Ok(Ok(status)) if status.success() => Ok(()),
+        Ok(Ok(status)) => later(status.to_string()),
+        Ok(Err(error)) => later(format!("cannot be started: {error}")),
+        Err(_) => later(format!("did not end within {} s", limits::MIGRATION_MS / 1_000)),
+    }
+}
+
+impl AgentCore {
+    /// The next migration of a committed set. False: nothing is due.
+    pub(super) fn migrate(&mut self, holdings: &Holdings) -> bool {
+        let Some(due) = self.kept.ledger.software.due.first().cloned() else { return false };
+        let Ok(set) = holdings.switch.running().parse() else { return false };
+        self.ask_for(Job::Migrate { set, due });
+        true
+    }
+
+    pub(super) fn migrated(&mut self, done: &DueMigration) {
+        let mut row = self.kept.ledger.software.clone();
+        row.due.retain(|due| due != done);
+        let reason = row.due.first().map(Self::is_due);
+        let update = row.update.clone();
+        self.put_software(row);
+        self.tell_of_migration(update, reason);
+    }
+
+    pub(super) fn not_migrated(&mut self, due: &DueMigration, why: &str) {
+        let reason = Reason::from(Code::MigrationFailed).with("component", &due.component).with("why", why);
+        self.tell_of_migration(self.kept.ledger.software.update.clone(), Some(reason));
+    }
+
+    /// What a committed update waits for.
+    pub(super) fn is_due(due: &DueMigration) -> Reason {
+        Reason::from(Code::MigrationDue).with("component", &due.component)
+    }
+
+    fn tell_of_migration(&mut self, update: Option<Update>, reason: Option<Reason>) {
+        let is_committed = |update: &Update| update.state == UpdateState::Committed && update.reason != reason;
+        if let Some(update) = update.filter(is_committed) {
+            self.put_update(Update { reason, ..update });
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use midshift_bundle::digest::Digest;
+    use midshift_bundle::manifest::{Component, ComponentKind, Needs, SafetyClass};
+    use std::collections::{BTreeMap, BTreeSet};
+    use std::fs;
+    use std::path::PathBuf;
+    use tempfile::TempDir;
+
+    fn component(name: &str, version: &str, data_migration: Migration) -> Component {
+        Component {
+            name: name.to_owned(),
+            version: version.to_owned(),
+            kind: if name == "gait" { ComponentKind::Process } else { ComponentKind::Config },
+            hardware: BTreeSet::new(),
+            capabilities: BTreeSet::new(),
+            requires: BTreeMap::new(),
+            conflicts: BTreeMap::new(),
+            task_schema: (1, 1),
+            rollback_index: 0,
+            safety_class: SafetyClass::None,
+            needs: Needs::Restart,
+            data_migration,
+            digest: Digest::of(format!("{name} {version}").as_bytes()),
+            length: 1,
+        }
+    }
+
+    fn set(components: &[Component]) -> SetManifest {
+        let components = components.iter().map(|c| (c.name.clone(), c.clone())).collect();
+        SetManifest { components, ..SetManifest::default() }
+    }
+
+    fn migration(component: &str, from: Option<&str>, to: &str) -> DueMigration {
+        DueMigration { component: component.to_owned(), from: from.map(str::to_owned), to: to.to_owned() }
+    }
+
+    #[test]
+    fn what_changed_and_asks_for_it_is_due_and_what_was_never_done_begins_where_it_began() {
+        let [gait, map] =
+            [component("gait", "1.0.0", Migration::None), component("map", "1.0.0", Migration::Reversible)];
+        let kept = set(&[gait.clone(), map.clone()]);
+        let next = set(&[
+            component("gait", "1.1.0", Migration::Reversible),
+            map,
+            component("hands", "1.0.0", Migration::Irreversible),
+            component("tone", "1.0.0", Migration::None),
+        ]);
+        let expected = [migration("gait", Some("1.0.0"), "1.1.0"), migration("hands", None, "1.0.0")];
+        assert_eq!(due(&next, &kept, &[]), expected);
+        let later =
+            set(&[component("gait", "1.2.0", Migration::None), component("map", "1.0.0", Migration::Reversible)]);
+        assert_eq!(due(&later, &next, &expected), [migration("gait", Some("1.0.0"), "1.2.0")]);
+    }
+
+    #[test]
+    fn a_set_without_a_program_cannot_migrate() {
+        let asks = component("map", "1.0.0", Migration::Reversible);
+        assert!(!is_possible(&set(std::slice::from_ref(&asks))));
+        assert!(is_possible(&set(&[asks, component("gait", "1.0.0", Migration::None)])));
+        assert!(is_possible(&set(&[component("map", "1.0.0", Migration::None)])));
+    }
+
+    /// A program of this script.
+    fn program(script: &str) -> (TempDir, PathBuf) {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("program");
+        let write = "printf '#!/bin/sh\\n%s\\n' \"$1\" > \"$2\" && chmod +x \"$2\"";
+        let status = std::process::Command::new("sh").args(["-c", write, "sh", script]).arg(&path).status();
+        assert!(status.expect("runs").success());
+        (folder, path)
+    }
+
+    #[tokio::test]
+    async fn a_program_is_told_what_to_migrate_and_its_end_says_whether_it_did() {
+        let (folder, path) = program("echo \"$MIDSHIFT_SET $@\" >> ${0%/*}/called; test $4 = 1.1.0");
+        let new = migration("gait", None, "1.1.0");
+        assert_eq!(call(&path, "s1", &new).await, Ok(()));
+        let other = migration("gait", Some("1.1.0"), "1.2.0");
+        assert!(matches!(call(&path, "s1", &other).await, Err(Failure::Later(_))));
+        let called = fs::read_to_string(folder.path().join("called")).expect("was called");
+        assert_eq!(called, "s1 midshift-migrate gait - 1.1.0\ns1 midshift-migrate gait 1.1.0 1.2.0\n");
+        assert!(matches!(call(&folder.path().join("none"), "s1", &new).await, Err(Failure::Later(_))));
+    }
+}
