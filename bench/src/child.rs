@@ -113,6 +113,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 data,
                 listen: address,
                 insecure: false,
+                beacon_listen: None,
                 software: Software { ota_keys: None, ota_quota_gib: 1 },
             };
             midshift::serve::run(serve, stop).await

@@ -92,8 +92,6 @@ pub const HOURS_COUNTED_EVERY: SiteDuration = SiteDuration::from_secs(600);
 pub const ACTIVATE_BATTERY_PERMILLE: u16 = 200;
 /// A robot with a hotter joint does not change its software, tenths of a degree Celsius.
 pub const ACTIVATE_JOINT_DECIDEGREES: i32 = 700;
-/// Robots of one roll-out that one command may write, so that it stays within a group.
-pub const ROLLOUT_ROBOTS_MAX: usize = 100_000;
 /// Tasks on trial and beside it are counted for a gate so often.
 pub const TASKS_COUNTED_EVERY: SiteDuration = SiteDuration::from_secs(60);
 /// Permission to activate lives so long from the heartbeat it is anchored to.

@@ -521,7 +521,7 @@ fn verb_one(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor: &str
         Verb::Promote => {
             let seen = verdict::see(tx.view, &rollout, Some(rollout.wave));
             let verdict =
-                verdict::of(tx.view, &rollout, &seen, Outcome::PromotedByPerson, why(Code::PromotedByUser), tx.now.utc);
+                verdict::of(&rollout, &seen, Outcome::PromotedByPerson, why(Code::PromotedByUser), tx.now.utc);
             phases::promote(tx, rollout, Verdict { actor: Some(actor.to_owned()), ..verdict });
         }
         Verb::Abort => phases::abort(tx, rollout, why(Code::AbortedByUser), false, None, Some(actor.to_owned())),

@@ -81,7 +81,7 @@ fn ends_early(tx: &mut Tx, rollout: &Rollout) -> bool {
         return false;
     }
     let Some((reason, hard, seen)) = verdict::against(tx.view, rollout) else { return false };
-    let verdict = verdict::of(tx.view, rollout, &seen, Outcome::Aborted, reason.clone(), tx.now.utc);
+    let verdict = verdict::of(rollout, &seen, Outcome::Aborted, reason.clone(), tx.now.utc);
     abort(tx, rollout.clone(), reason, hard, Some(verdict), None);
     true
 }
@@ -183,7 +183,7 @@ fn gate(tx: &mut Tx, mut rollout: Rollout) {
         }
         let seen = verdict::see(tx.view, &rollout, Some(rollout.wave));
         let why = Reason::from(Code::NoExposure).with("robots", short);
-        let verdict = verdict::of(tx.view, &rollout, &seen, Outcome::Review, why, tx.now.utc);
+        let verdict = verdict::of(&rollout, &seen, Outcome::Review, why, tx.now.utc);
         rollout.verdicts.push(verdict);
         return enter(tx, rollout, Phase::Review, "rollout.review");
     }

@@ -249,12 +249,12 @@ pub struct Abort {
 }
 
 /// Up to where tasks were counted.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counted {
     /// Serving time of the last count, milliseconds of the site clock.
     pub at_ms: u64,
-    /// All that had ended on trial by then.
-    pub trial: TaskTally,
+    /// All that had ended on trial by then, by robot.
+    pub trial: BTreeMap<RobotId, TaskTally>,
     /// All that had ended with any other version by then, since ever.
     pub control: TaskTally,
 }

@@ -14,6 +14,7 @@ use crate::ids::{RobotId, RolloutId};
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::time::Utc;
+use std::collections::BTreeMap;
 
 /// Robots named in an abort.
 const NAMED_MAX: usize = 16;
@@ -60,11 +61,6 @@ pub fn controls_of(view: &View, rollout: &Rollout) -> TaskTally {
     others.map(ended).fold(TaskTally::default(), TaskTally::plus)
 }
 
-fn on_trial_so_far(view: &View, rollout: &Rollout) -> TaskTally {
-    let robots = view.robots_of(&rollout.rollout_id);
-    robots.map(|r| exposure_of(view, rollout, r)).fold(TaskTally::default(), TaskTally::plus)
-}
-
 /// Takes in what ended since it was counted last. By the clock, never because a task failed.
 pub fn count_tasks(tx: &mut Tx, rollout: &Rollout) {
     let at_ms = tx.view.served_ms(&tx.now);
@@ -72,9 +68,15 @@ pub fn count_tasks(tx: &mut Tx, rollout: &Rollout) {
     if rollout.revert_of.is_some() || waited_ms < limits::TASKS_COUNTED_EVERY.as_ms() {
         return;
     }
-    let counted = Counted { at_ms, trial: on_trial_so_far(tx.view, rollout), control: controls_of(tx.view, rollout) };
-    let mut tasks = rollout.tasks;
-    tasks.observe(since(counted.trial, rollout.counted.trial), since(counted.control, rollout.counted.control));
+    let on_trial = tx.view.robots_of(&rollout.rollout_id).filter(|r| r.moments.on_trial.is_some());
+    let trial: BTreeMap<RobotId, TaskTally> =
+        on_trial.map(|r| (r.robot_id.clone(), exposure_of(tx.view, rollout, r))).collect();
+    let control = controls_of(tx.view, rollout);
+    let before = |id: &RobotId| rollout.counted.trial.get(id).copied().unwrap_or_default();
+    let news = trial.iter().map(|(id, tally)| (id.clone(), since(*tally, before(id)))).collect();
+    let mut tasks = rollout.tasks.clone();
+    tasks.observe(&news, since(control, rollout.counted.control));
+    let counted = Counted { at_ms, trial, control };
     tx.put(Rollout { tasks, counted, ..rollout.clone() }, "rollout.tasks_counted");
 }
 
@@ -94,14 +96,8 @@ pub fn see(view: &View, rollout: &Rollout, upto: Option<u32>) -> Seen {
     seen
 }
 
-/// What tasks say of the bundle.
-pub fn suspicion(view: &View, rollout: &Rollout) -> Suspicion {
-    let on_trial = view.robots_of(&rollout.rollout_id).filter(|r| r.moments.on_trial.is_some());
-    rollout.tasks.suspicion(on_trial.map(|r| exposure_of(view, rollout, r)))
-}
-
 /// A verdict with the numbers behind it.
-pub fn of(view: &View, rollout: &Rollout, seen: &Seen, outcome: Outcome, reason: Reason, at: Utc) -> Verdict {
+pub fn of(rollout: &Rollout, seen: &Seen, outcome: Outcome, reason: Reason, at: Utc) -> Verdict {
     let mut robots = seen.outcomes.evidence();
     if reason.code == Code::FailureAmongFew {
         robots.false_abort_permille = Some(gates::false_abort_permille(u64::from(seen.attempted)));
@@ -112,8 +108,8 @@ pub fn of(view: &View, rollout: &Rollout, seen: &Seen, outcome: Outcome, reason:
         reason,
         attempted: seen.attempted,
         robots,
-        tasks: rollout.tasks,
-        suspicion: suspicion(view, rollout),
+        tasks: rollout.tasks.clone(),
+        suspicion: rollout.tasks.suspicion(),
         at,
         actor: None,
     }
@@ -135,7 +131,7 @@ pub fn against(view: &View, rollout: &Rollout) -> Option<(Reason, bool, Seen)> {
     if seen.outcomes.verdict() == gates::Verdict::Abort {
         return Some((numbers(Code::TooManyFailed), false, seen));
     }
-    if rollout.spec.acts_on_rates && suspicion(view, rollout) == Suspicion::Release {
+    if rollout.spec.acts_on_rates && rollout.tasks.suspicion() == Suspicion::Release {
         let e_value = format!("{:.1}", rollout.tasks.e_value());
         return Some((Reason::from(Code::RateTooHigh).with("e_value", e_value), false, seen));
     }
@@ -165,7 +161,7 @@ pub fn wave<'a>(view: &'a View, id: &RolloutId, wave: u32) -> impl Iterator<Item
 /// What the gate after a wave says.
 pub fn gate(view: &View, rollout: &Rollout, at: Utc) -> Verdict {
     let seen = see(view, rollout, Some(rollout.wave));
-    let give = |outcome, code: Code| of(view, rollout, &seen, outcome, code.into(), at);
+    let give = |outcome, code: Code| of(rollout, &seen, outcome, code.into(), at);
     if rollout.revert_of.is_some() {
         return give(Outcome::Promoted, Code::GateReverted);
     }

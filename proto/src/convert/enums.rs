@@ -2,7 +2,6 @@
 
 use crate::{common, fleet, link, ota, task, telemetry};
 use midshift_core::fleet::rows::{DrainState, HolderState};
-use midshift_core::gates::Suspicion;
 use midshift_core::robot::{Duty, FaultClass, HardwareStop, Lane, Mode, Presence, StopLevel};
 use midshift_core::rollout::rows::{Outcome, Pause, Phase as RolloutPhase, Step as RolloutStep};
 use midshift_core::rollout::spec::{AbortScope, SmallWave, SmallWaveFailure};
@@ -83,7 +82,6 @@ wire_enums! {
         Waiting = Waiting, Staging = Staging, Staged = Staged, Draining = Draining, Activating = Activating, Trial = Trial,
         Committing = Committing, Reverting = Reverting, Committed = Committed, RolledBack = RolledBack, Skipped = Skipped, Stuck = Stuck,
     }
-    Suspicion = ota::v1::Suspicion { None = Unspecified, OneSickRobot = OneSickRobot, Release = Release }
     SmallWave = ota::v1::SmallWave { Auto = Auto, Review = Review }
     SmallWaveFailure = ota::v1::SmallWaveFailure { Abort = Abort, Review = Review }
     AbortScope = ota::v1::AbortScope { All = All, Trial = Trial }

@@ -48,6 +48,8 @@ pub fn encode_robot(view: RobotView<'_>, now: LinkTime) -> v1::Robot {
         ring: session.map(|s| s.ring.clone()).unwrap_or_default(),
         durable: lane_marks(durable),
         observed_since: observed_since.map(timestamp),
+        // No part of what is known of it: whoever listens for beacons adds it.
+        beacon: None,
     }
 }
 

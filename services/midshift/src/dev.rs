@@ -70,6 +70,9 @@ pub struct Dev {
     /// Address to listen on, loopback only. Port 0 takes a free one.
     #[arg(long, default_value = "127.0.0.1:7420")]
     pub listen: SocketAddr,
+    /// UDP address to hear launchers of robots on whose agent does not run. By default 127.0.0.1:7422, if nobody else has it.
+    #[arg(long, value_name = "ADDR")]
+    pub beacon_listen: Option<SocketAddr>,
     /// Keep so many tasks open. The default with --for is twice the robots.
     #[arg(long, conflicts_with = "rate")]
     pub keep_open: Option<usize>,
@@ -102,6 +105,9 @@ const LOAD: f64 = 0.6;
 /// Open tasks a robot of the Poisson client at most.
 const BACKLOG_PER_ROBOT: usize = 3;
 
+/// Where `dev` hears beacons if nobody else does.
+const BEACONS: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 7422);
+
 /// Where `dev` talks to a person.
 pub type Say<'a> = &'a (dyn Fn(&str) + Sync);
 
@@ -125,6 +131,11 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         .await
         .with_context(|| format!("listening on {}; is another midshift running?", args.listen))?;
     let address = listener.local_addr()?;
+    let beacons = match args.beacon_listen {
+        Some(address) => Some(serve::hear(address).await?),
+        // Another midshift may have it: it is only for display.
+        None => serve::hear(BEACONS).await.ok(),
+    };
     let run_id = format!("dev-{}-{}-", args.seed, clock.now().wall.0);
     let tasks = Arc::new(Mutex::new(Tasks::of_run(&run_id)));
     let mut swarm = SwarmConfig::tcp(hall.clone(), clock.clone(), &format!("http://{address}"), args.seed);
@@ -149,7 +160,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     };
     // The server ends after its robots and its client, or the last of them would be cut off at Ctrl-C.
     let served_until = CancellationToken::new();
-    let server = Server::new(parts, served_until.clone()).await?;
+    let server = Server::new(parts, served_until.clone()).await?.hearing(beacons);
     say(&greeting(&args, &site, address, &software));
     let run = Run { args, site, clock, hall, run_id, tasks, store, stop, served_until, _software: software };
     run.together(server, swarm, listener, address).await

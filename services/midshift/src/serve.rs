@@ -11,7 +11,7 @@ use midshift_store::{FRAME_BYTES_DEFAULT, SqliteFrames, SqliteStore};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, UdpSocket};
 use tokio_stream::wrappers::TcpListenerStream;
 use tokio_util::sync::CancellationToken;
 
@@ -30,6 +30,10 @@ pub struct Serve {
     /// There is no login and no TLS yet: say that you know, and listen off loopback all the same.
     #[arg(long)]
     pub insecure: bool,
+    /// UDP address to hear launchers of robots on whose agent does not run, e.g. 0.0.0.0:7422. What is heard is a hint that anybody in the
+    /// network can send: it is shown and decides nothing. Without it nobody listens.
+    #[arg(long, value_name = "ADDR")]
+    pub beacon_listen: Option<SocketAddr>,
     /// Where software of robots comes from.
     #[command(flatten)]
     pub software: Software,
@@ -74,6 +78,10 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
     let frames = Arc::new(SqliteFrames::open(&args.data, site_id, clock.clone(), FRAME_BYTES_DEFAULT).await?);
     let ota = args.software.open(args.data.join("ota"), clock.clone()).await?;
     let listener = TcpListener::bind(args.listen).await.with_context(|| format!("listening on {}", args.listen))?;
+    let beacons = match args.beacon_listen {
+        Some(address) => Some(hear(address).await?),
+        None => None,
+    };
     tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), "midshift serves");
     let planning = Planning::start()?;
     let parts = Parts {
@@ -87,11 +95,16 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
         naive: Naive::default(),
         planning: planning.handle(),
     };
-    let server = Server::new(parts, shutdown).await?;
+    let server = Server::new(parts, shutdown).await?.hearing(beacons);
     let served = server.serve(nodelay(listener)).await;
     store.close().await;
     frames.close().await;
     served
+}
+
+/// The socket that beacons come to.
+pub async fn hear(address: SocketAddr) -> anyhow::Result<UdpSocket> {
+    UdpSocket::bind(address).await.with_context(|| format!("listening for beacons on {address}"))
 }
 
 /// Connections without Nagle's delay: a grant must not wait for an acknowledgement.

@@ -23,6 +23,7 @@ use midshift_telemetry::TelemetryService;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::UdpSocket;
 use tokio_stream::Stream;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
@@ -95,6 +96,7 @@ pub struct Server {
     rollouts: RolloutService,
     planner: Planner,
     board: Arc<LiveBoard<Live>>,
+    beacons: Option<UdpSocket>,
     shutdown: CancellationToken,
 }
 
@@ -138,7 +140,13 @@ impl Server {
             bugs: parts.naive.rollouts,
         };
         let (rollouts, planner) = RolloutService::new(rollouts, shutdown.clone());
-        Ok(Self { parts, task, fleet, reconciler, telemetry, rollouts, planner, board, shutdown })
+        let beacons = None;
+        Ok(Self { parts, task, fleet, reconciler, telemetry, rollouts, planner, board, beacons, shutdown })
+    }
+
+    /// Listens for the beacons of launchers on this socket too.
+    pub fn hearing(self, beacons: Option<UdpSocket>) -> Self {
+        Self { beacons, ..self }
     }
 
     /// Fleet, for whoever reports in this process.
@@ -217,6 +225,12 @@ impl Server {
         let telemetry = self.telemetry.clone().run();
         let ota = self.parts.ota.clone().run(shutdown.clone());
         let planner = AbortOnDropHandle::new(self.parts.planning.spawn(self.planner.run(shutdown.clone())));
+        let (telemetry_of_ear, beacons) = (self.telemetry.clone(), self.beacons);
+        let ear = async {
+            if let Some(socket) = beacons {
+                telemetry_of_ear.hear(socket).await;
+            }
+        };
         let failure = OnceLock::new();
         let services = async {
             let fleet = until(&shutdown, "fleet", async { Ok(fleet.await??) });
@@ -226,7 +240,11 @@ impl Server {
                 Ok(())
             });
             let rollouts = until(&shutdown, "rollouts", async { Ok(planner.await??) });
-            if let Err(error) = tokio::try_join!(fleet, telemetry, ota, rollouts) {
+            let ear = async {
+                ear.await;
+                Ok(())
+            };
+            if let Err(error) = tokio::try_join!(fleet, telemetry, ota, rollouts, ear) {
                 tracing::error!(%error, "a service ended, and with it the server");
                 shutdown.cancel();
                 // Nothing else sets it.

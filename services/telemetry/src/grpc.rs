@@ -79,7 +79,9 @@ fn encode(inner: &Inner, robot_id: &RobotId, live: Option<&Live>) -> Option<v1::
     let presence = rows.presence.get(robot_id);
     let observed_since = inner.registry.observed_since(robot_id);
     let view = RobotView { robot_id, presence, session, live, durable: &durable, observed_since };
-    Some(encode_robot(view, inner.parts.clock.now().link))
+    let now = inner.parts.clock.now();
+    let beacon = inner.ear.hint(robot_id, live.map(|live| live.processed_at), &now);
+    Some(v1::Robot { beacon, ..encode_robot(view, now.link) })
 }
 
 fn admits(inner: &Inner, filter: &Filter, robot_id: &RobotId) -> bool {

@@ -4,6 +4,7 @@
 //! after the commit that holds the data; a session and its way down never wait for the store; every stream is drained into bounded queues.
 
 mod bugs;
+mod ear;
 mod events;
 mod grpc;
 mod link;
@@ -47,6 +48,7 @@ pub(crate) struct Inner {
     pub parts: Parts,
     pub picture: Picture,
     pub registry: Registry,
+    pub ear: ear::Ear,
     pub shutdown: CancellationToken,
 }
 
@@ -59,7 +61,8 @@ pub struct TelemetryService {
 impl TelemetryService {
     /// A service that ends its sessions at `shutdown`. Sessions wait until [`TelemetryService::run`] has read the store once.
     pub fn new(parts: Parts, shutdown: CancellationToken) -> Self {
-        let inner = Inner { parts, picture: Picture::default(), registry: Registry::default(), shutdown };
+        let (picture, registry, ear) = (Picture::default(), Registry::default(), ear::Ear::default());
+        let inner = Inner { parts, picture, registry, ear, shutdown };
         Self { inner: Arc::new(inner) }
     }
     /// The robots' face.
@@ -69,6 +72,14 @@ impl TelemetryService {
     /// The people's and programs' face.
     pub fn grpc(&self) -> TelemetryServiceServer<Self> {
         TelemetryServiceServer::new(self.clone())
+    }
+    /// Listens for the beacons of launchers on `socket` until shutdown: hints for people, which nobody proves and nothing is decided by.
+    pub async fn hear(self, socket: tokio::net::UdpSocket) {
+        let inner = self.inner;
+        tokio::select! {
+            () = inner.shutdown.cancelled() => {}
+            () = ear::listen(&inner, &socket) => {}
+        }
     }
     /// Keeps the picture of rows and the presence of robots until shutdown.
     pub async fn run(self) -> Result<(), Error> {

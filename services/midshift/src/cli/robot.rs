@@ -3,6 +3,7 @@
 use super::client::{Call, Change, Exit, unary};
 use super::out::{Format, Out};
 use clap::Subcommand;
+use midshift_core::time::Utc;
 use midshift_proto::fleet::v1 as fleet;
 use midshift_proto::json;
 use midshift_proto::link::v1 as link;
@@ -183,7 +184,7 @@ fn row(robot: &v1::Robot) -> Vec<String> {
         .map_or_else(|| "-".to_owned(), |a| format!("{:.1} s", a.seconds as f64 + f64::from(a.nanos) / 1e9));
     vec![
         robot.robot_id.clone(),
-        robot.presence().as_str_name().trim_start_matches("PRESENCE_").to_owned(),
+        presence(robot),
         vitals.waypoint.clone(),
         format!("{:.0} %{}", f64::from(vitals.battery_permille) / 10.0, if vitals.charging { " +" } else { "" }),
         reported.load.as_ref().map(|l| l.item.clone()).unwrap_or_default(),
@@ -191,6 +192,24 @@ fn row(robot: &v1::Robot) -> Vec<String> {
         format!("{:.1} m/s", f64::from(vitals.speed_mm_s) / 1000.0),
         age,
     ]
+}
+
+/// Whether it is heard; with a star if only its launcher is, which nobody proves.
+fn presence(robot: &v1::Robot) -> String {
+    match robot.beacon {
+        Some(_) => "UPDATING*".to_owned(),
+        None => robot.presence().as_str_name().trim_start_matches("PRESENCE_").to_owned(),
+    }
+}
+
+/// What its launcher says.
+fn beacon_line(beacon: &v1::Beacon) -> String {
+    let set: String = beacon.set_id.chars().take(12).collect();
+    let back = beacon.expected_back.as_ref().map(|at| Utc(at.seconds * 1_000).rfc3339()).unwrap_or_default();
+    format!(
+        "* its launcher starts set {set}, try {}; expected back by {back}. A hint: beacons are not proven",
+        beacon.tries
+    )
 }
 
 async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
@@ -220,6 +239,7 @@ async fn get(one: &One, out: &Out) -> Result<(), Exit> {
     match out.format {
         Format::Table => {
             out.line(&super::out::columns(&HEADER, &[row(&robot)]));
+            robot.beacon.iter().for_each(|beacon| out.line(&beacon_line(beacon)));
             if robot.observed {
                 out.line("another machine is attached under this name; it gets no work");
             }

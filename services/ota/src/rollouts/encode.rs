@@ -1,6 +1,6 @@
 //! Rows as their messages. Nothing is decided here.
 
-use midshift_core::gates::TaskTally;
+use midshift_core::gates::{Suspicion, TaskTally};
 use midshift_core::rollout::Board;
 use midshift_core::rollout::commands::DryRun;
 use midshift_core::rollout::explain::blocked;
@@ -89,9 +89,17 @@ fn verdict_of(verdict: &Verdict) -> v1::RolloutVerdict {
         trial: Some(tally(verdict.tasks.trial)),
         control: Some(tally(verdict.tasks.control)),
         e_value_milli: (verdict.tasks.e_value() * 1000.0).min(1e15) as u64,
-        suspicion: verdict.suspicion.to_wire(),
+        suspicion: suspicion(&verdict.suspicion) as i32,
         time: Some(timestamp(verdict.at)),
         actor: verdict.actor.clone().unwrap_or_default(),
+    }
+}
+
+fn suspicion(suspicion: &Suspicion) -> v1::Suspicion {
+    match suspicion {
+        Suspicion::None => v1::Suspicion::Unspecified,
+        Suspicion::OneSickRobot(_) => v1::Suspicion::OneSickRobot,
+        Suspicion::Release => v1::Suspicion::Release,
     }
 }
 

@@ -112,3 +112,36 @@ async fn a_clone_is_seen_beside_its_robot_and_changes_nothing_of_it() -> Result<
     assert!(!seen.observed && seen.observed_since.is_none());
     Ok(())
 }
+
+#[tokio::test]
+async fn a_beacon_of_a_known_robot_is_shown_as_a_hint_beside_its_presence_and_goes_when_the_robot_speaks() -> Result<()>
+{
+    let world = world().await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.beat().await?;
+    robot.hears(|down| down.echo).await?;
+    let ear = tokio::net::UdpSocket::bind("127.0.0.1:0").await?;
+    let address = ear.local_addr()?;
+    tokio::spawn(world.service.clone().hear(ear));
+    let launcher = tokio::net::UdpSocket::bind("127.0.0.1:0").await?;
+    let before = get(&world).await?;
+    assert_eq!(before.beacon, None);
+    let seen = loop {
+        for text in ["midshift-beacon 1 stranger v1 1 7\n", "nonsense", "midshift-beacon 1 r1 v1 2 7\n"] {
+            launcher.send_to(text.as_bytes(), address).await?;
+        }
+        let seen = get(&world).await?;
+        if seen.beacon.is_some() {
+            break seen;
+        }
+        tokio::task::yield_now().await;
+    };
+    let beacon = seen.beacon.clone().ok_or("a beacon")?;
+    assert_eq!((beacon.set_id.as_str(), beacon.tries), ("v1", 2));
+    assert_eq!((seen.reported, seen.session_epoch), (before.reported, before.session_epoch), "nothing else changed");
+    while get(&world).await?.beacon.is_some() {
+        robot.beat().await?;
+        robot.hears(|down| down.echo).await?;
+    }
+    Ok(())
+}

@@ -24,6 +24,7 @@ pub type Result<T> = std::result::Result<T, Box<dyn std::error::Error + Send + S
 pub struct World {
     pub store: Arc<dyn Store>,
     pub channel: Channel,
+    pub service: TelemetryService,
 }
 
 /// What a world may have otherwise.
@@ -69,7 +70,7 @@ pub async fn world_with(otherwise: Otherwise) -> Result<World> {
         }
     });
     let channel = Endpoint::from_static("http://memory").connect_with_connector(connector).await?;
-    Ok(World { store, channel })
+    Ok(World { store, channel, service })
 }
 
 pub struct Robot {
