@@ -83,6 +83,8 @@ pub struct HallConfig {
     pub starts: Option<Vec<WaypointIx>>,
     /// Where bodies are kept.
     pub persistence: Persistence,
+    /// How fast bodies work, thousandths; clocks are not touched.
+    pub pace_permille: u32,
 }
 
 impl HallConfig {
@@ -100,6 +102,7 @@ impl HallConfig {
             crowded: false,
             starts: None,
             persistence: Persistence::Memory,
+            pace_permille: 1_000,
         }
     }
     /// The name of robot `index`, from 0: at least two digits, as many as the last one needs.
@@ -186,7 +189,9 @@ impl Hall {
         for (index, start) in starts.into_iter().enumerate().filter(|(i, _)| part.contains(i)) {
             let robot_id = config.robot_id(index)?;
             let (faults, drains) = (config.faults, config.drains);
-            let of_body = BodyConfig { faults, drains, ..BodyConfig::new(robot_id.clone(), config.seed, start) };
+            let pace_permille = config.pace_permille;
+            let of_body =
+                BodyConfig { faults, drains, pace_permille, ..BodyConfig::new(robot_id.clone(), config.seed, start) };
             let body = match &config.persistence {
                 Persistence::Memory => SimBody::new(of_body, config.site.clone(), shared.clone(), now.site)?,
                 Persistence::Dir(dir) => {
@@ -229,6 +234,14 @@ impl Hall {
     /// The person goes round once; see [`Person::round`].
     pub fn person_round(&self, now: SiteTime, live: &dyn Fn(&TaskId) -> bool) -> Vec<Deed> {
         self.person.lock().unwrap_or_else(PoisonError::into_inner).round(now, &self.robots, live)
+    }
+    /// What these journals of other processes say together with those of this hall, which must have its own in files.
+    ///
+    /// # Errors
+    /// A journal that cannot be read.
+    pub fn verdict_with(&self, others: &[PathBuf]) -> Result<Verdict, Error> {
+        let all = self.journals.iter().chain(others).map(PathBuf::as_path);
+        Ok(Oracle::read(&self.site, all)?.verdict())
     }
     /// What the journals say now. Several journals are read from their files.
     pub fn verdict(&self) -> Result<Verdict, Error> {

@@ -3,6 +3,7 @@
 use crate::background::{Acknowledged, Background, Pressure, Source, read_list};
 use crate::planning::Planning;
 use crate::report::{self, Inputs, Kind, Report};
+use crate::scenario::{self, Scenario, Stage, Story};
 use crate::server::{Naive, Parts, Server};
 use crate::tally::{self, SharedTasks, Tasks};
 use crate::throwaway::Throwaway;
@@ -10,14 +11,16 @@ use crate::under_way::{self, UnderWay};
 use crate::{clock, serve, site_file};
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
+use midshift_agent::trust::Trust;
 use midshift_core::site::{Site, grid};
 use midshift_core::task::Phase;
 use midshift_core::time::{Clock, SiteTime};
-use midshift_sim::hall::{Hall, HallConfig};
+use midshift_core::work::Live;
+use midshift_sim::hall::{Hall, HallConfig, Persistence};
 use midshift_sim::service::SimFace;
 use midshift_sim::swarm::{Swarm, SwarmConfig, SwarmSoftware};
 use midshift_store::{
-    FRAME_BYTES_DEFAULT, FrameLog, MemoryFrames, MemoryStore, SqliteFrames, SqliteStore, Store, StoreId,
+    FRAME_BYTES_DEFAULT, FrameLog, LiveBoard, MemoryFrames, MemoryStore, SqliteFrames, SqliteStore, Store, StoreId,
 };
 use std::collections::VecDeque;
 use std::io::IsTerminal;
@@ -26,6 +29,7 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
+use tempfile::TempDir;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
@@ -79,6 +83,9 @@ pub struct Dev {
     /// Submit so many tasks an hour of site time, e.g. 300/h.
     #[arg(long, value_parser = rate)]
     pub rate: Option<f64>,
+    /// Play a story and fail if it did not go as it should. Five of the robots are launcher and agent processes; --speedup is that of bodies.
+    #[arg(long, value_enum, conflicts_with_all = ["run_for", "map", "data", "rate"])]
+    pub scenario: Option<Scenario>,
 }
 
 impl Dev {
@@ -119,14 +126,17 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     if !(0.01..=200.0).contains(&args.speedup) {
         bail!("--speedup must be 0.01 to 200");
     }
+    let scene = args.scenario.map(|_| Scene::new(&args)).transpose()?;
     let loaded = site_file::load(args.site.as_deref(), args.map.as_deref(), Some(args.robots as u64))?;
     for warning in &loaded.warnings {
         tracing::warn!(warning, "site");
     }
     let site = loaded.site.clone();
-    let clock = clock::clock((args.speedup * 1000.0) as u32);
+    // Journals of several processes are judged by one clock, so a story's is real and its bodies are fast.
+    let clock = clock::clock(if scene.is_some() { 1000 } else { (args.speedup * 1000.0) as u32 });
     crate::server::metrics_handle();
-    let hall = Arc::new(Hall::open(&hall_config(&args, &site)?, &clock.now())?);
+    let hall_config = hall_config(&args, &site, scene.as_ref())?;
+    let hall = Arc::new(Hall::open(&hall_config, &clock.now())?);
     let listener = TcpListener::bind(args.listen)
         .await
         .with_context(|| format!("listening on {}; is another midshift running?", args.listen))?;
@@ -143,7 +153,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     swarm.person = Some(Arc::new(move |id| tally::look(&live, |t| t.is_live(id))));
     let (software, ota) = Throwaway::make(clock.clone()).await?;
     let trust = software.trust(site.site_id().clone())?;
-    swarm.software = Some(SwarmSoftware::tcp(trust, &format!("http://{address}")));
+    swarm.software = Some(SwarmSoftware::tcp(trust.clone(), &format!("http://{address}")));
     let swarm = Swarm::new(swarm);
     let (store, frames) = stores(&args, &site, &clock).await?;
     let planning = Planning::start()?;
@@ -162,13 +172,68 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     let served_until = CancellationToken::new();
     let server = Server::new(parts, served_until.clone()).await?.hearing(beacons);
     say(&greeting(&args, &site, address, &software));
-    let run = Run { args, site, clock, hall, run_id, tasks, store, stop, served_until, _software: software };
-    run.together(server, swarm, listener, address).await
+    let stage = match scene {
+        Some(scene) => {
+            Some(scene.stage(&args, &hall_config, server.board(), clock.clone(), address, trust, &software)?)
+        }
+        None => None,
+    };
+    let run = Run { args, site, clock, hall, run_id, tasks, store, stop, served_until, stage, _software: software };
+    run.together(server, swarm, listener, address, say).await
 }
 
-fn hall_config(args: &Dev, site: &Arc<Site>) -> anyhow::Result<HallConfig> {
+/// What a story needs from the beginning: a folder for what its robots keep.
+struct Scene {
+    folder: TempDir,
+    launched: usize,
+}
+
+impl Scene {
+    fn new(args: &Dev) -> anyhow::Result<Self> {
+        let folder = tempfile::tempdir().context("making a folder for robots")?;
+        Ok(Self { folder, launched: scenario::LAUNCHED.min(args.robots / 2) })
+    }
+
+    #[expect(clippy::too_many_arguments, reason = "everything of the run that a stage stands on, once")]
+    fn stage(
+        self,
+        args: &Dev,
+        hall: &HallConfig,
+        board: Arc<LiveBoard<Live>>,
+        clock: Arc<dyn Clock>,
+        address: SocketAddr,
+        trust: Trust,
+        software: &Throwaway,
+    ) -> anyhow::Result<(Stage, TempDir)> {
+        let in_process = args.robots - self.launched;
+        let starts = hall.starting_waypoints()?;
+        let launched = (in_process..args.robots).map(|ix| Ok((hall.robot_id(ix)?, starts[ix].clone())));
+        let stage = Stage {
+            server: address.to_string(),
+            channel: tonic::transport::Endpoint::from_shared(format!("http://{address}"))?.connect_lazy(),
+            board,
+            clock,
+            folder: self.folder.path().to_owned(),
+            in_process,
+            launched: launched.collect::<anyhow::Result<_>>()?,
+            trust,
+            repository: (software.repository(), software.keys().join("targets-1.pem")),
+            seed: args.seed,
+            body_speed: args.speedup,
+            site: args.site.clone(),
+        };
+        Ok((stage, self.folder))
+    }
+}
+
+fn hall_config(args: &Dev, site: &Arc<Site>, scene: Option<&Scene>) -> anyhow::Result<HallConfig> {
     let mut config = HallConfig::new(site.clone(), args.robots, args.seed);
     config.drains = site.chargers().next().is_some();
+    if let Some(scene) = scene {
+        config.only = Some(0..args.robots - scene.launched);
+        config.persistence = Persistence::Dir(scene.folder.path().to_owned());
+        config.pace_permille = (args.speedup * 1000.0) as u32;
+    }
     if let Some(path) = &args.agents {
         let text = std::fs::read_to_string(path).with_context(|| format!("reading {}", path.display()))?;
         config.starts = Some(grid::parse_starts(site, &text)?);
@@ -238,6 +303,8 @@ struct Run {
     store: Arc<dyn Store>,
     stop: CancellationToken,
     served_until: CancellationToken,
+    /// What is played, in the folder of its robots.
+    stage: Option<(Stage, TempDir)>,
     /// Its folder goes with the run.
     _software: Throwaway,
 }
@@ -248,7 +315,9 @@ impl Run {
         match (self.args.keep_open, self.args.rate) {
             (Some(open), _) => Pressure::KeepOpen(open),
             (None, Some(per_hour)) => Pressure::Rate { per_hour, backlog: usize::MAX },
-            (None, None) if self.args.run_for.is_some() || self.args.tasks.is_some() => Pressure::KeepOpen(2 * robots),
+            (None, None) if self.args.run_for.is_some() || self.args.tasks.is_some() || self.stage.is_some() => {
+                Pressure::KeepOpen(2 * robots)
+            }
             (None, None) => {
                 let per_hour = robots as f64 * TASKS_PER_ROBOT_HOUR * LOAD;
                 Pressure::Rate { per_hour, backlog: robots * BACKLOG_PER_ROBOT }
@@ -283,6 +352,7 @@ impl Run {
         swarm: Swarm,
         listener: TcpListener,
         address: SocketAddr,
+        say: Say<'_>,
     ) -> anyhow::Result<Report> {
         let acknowledged = Acknowledged::default();
         let no_progress_ms = Arc::new(AtomicU64::new(0));
@@ -303,10 +373,10 @@ impl Run {
         };
         let progress = report::watch_progress(board, self.clock.clone(), no_progress_ms.clone());
         let _progress = AbortOnDropHandle::new(tokio::spawn(progress));
-        tokio::select! {
-            () = self.until_over(begun.site) => {}
+        let story = tokio::select! {
+            story = self.until_over(begun.site, say) => story?,
             error = parts.first_end() => return Err(error),
-        }
+        };
         // No more work, then the count, then the end: what is open stays open and is counted so.
         work_stop.cancel();
         under_way::ended(parts.working).await?;
@@ -314,7 +384,11 @@ impl Run {
         robots_stop.cancel();
         under_way::ended(parts.robots).await?;
         let ended = self.clock.now();
-        let bodies = self.hall.report(ended.site)?;
+        let mut bodies = self.hall.report(ended.site)?;
+        if let Some((stage, folder)) = &self.stage {
+            bodies.robots += stage.launched.len();
+            bodies.verdict = self.hall.verdict_with(&scenario::journals(folder.path(), &stage.launched))?;
+        }
         self.served_until.cancel();
         under_way::ended(parts.following).await?;
         under_way::ended(parts.serving).await?;
@@ -330,6 +404,7 @@ impl Run {
             no_progress_ms: no_progress_ms.load(Relaxed),
             site_ms: ended.site.since(begun.site).as_ms(),
             wall_ms: ended.link.since(begun.link).as_ms(),
+            story,
         });
         if let Some(path) = &self.args.report {
             std::fs::write(path, serde_json::to_string_pretty(&report)?)
@@ -338,9 +413,15 @@ impl Run {
         Ok(report)
     }
 
-    /// Until the site time of `--for` is over, or Ctrl-C; a person at a terminal sees how far it is.
-    async fn until_over(&self, begun: SiteTime) {
-        let Some(run_for) = self.args.run_for else { return self.stop.cancelled().await };
+    /// Until the story or the site time of `--for` is over, or Ctrl-C; a person at a terminal sees how far it is.
+    async fn until_over(&self, begun: SiteTime, say: Say<'_>) -> anyhow::Result<Option<Story>> {
+        if let Some((stage, _)) = &self.stage {
+            return stage.play(self.stop.clone(), say).await.map(Some);
+        }
+        let Some(run_for) = self.args.run_for else {
+            self.stop.cancelled().await;
+            return Ok(None);
+        };
         let wanted_ms = u64::try_from(run_for.as_millis()).unwrap_or(u64::MAX);
         let bar = bar(wanted_ms / 1_000);
         loop {
@@ -361,6 +442,7 @@ impl Run {
             }
         }
         bar.finish_and_clear();
+        Ok(None)
     }
 }
 

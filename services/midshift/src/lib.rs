@@ -12,6 +12,7 @@ pub mod planning;
 pub mod report;
 pub mod robots;
 pub mod samples;
+pub mod scenario;
 pub mod serve;
 pub mod server;
 pub mod site_file;

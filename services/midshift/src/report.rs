@@ -1,5 +1,6 @@
 //! What a run came to, counted from rows and from the bodies' own journals, never from what was planned.
 
+use crate::scenario::Story;
 use crate::tally::Tasks;
 use midshift_core::ids::TaskId;
 use midshift_core::task::Phase;
@@ -140,6 +141,9 @@ pub struct Report {
     pub asked: Amounts,
     /// What the bodies say.
     pub bodies: HallReport,
+    /// What a story came to.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub story: Option<Story>,
 }
 
 /// Mean and percentiles.
@@ -181,6 +185,8 @@ pub struct Inputs {
     pub site_ms: u64,
     /// See above.
     pub wall_ms: u64,
+    /// What was played, if anything.
+    pub story: Option<Story>,
 }
 
 impl Report {
@@ -229,6 +235,7 @@ impl Report {
             achieved_speedup: site_s / wall_s.max(1e-9),
             asked: Amounts::of(i.kind, i.bodies.robots as u64, submitted, i.site_ms),
             bodies: i.bodies,
+            story: i.story,
         }
     }
     /// Why the run cannot be called good; empty if it can.
@@ -258,6 +265,7 @@ impl Report {
         if let Some(max) = self.asked.to_operator_max.filter(|max| self.to_operator as u64 > *max) {
             why.push(format!("{} tasks wait for an operator, {max} may", self.to_operator));
         }
+        why.extend(self.story.iter().flat_map(Story::objections));
         if let Some(max) = self.asked.open_max.filter(|max| self.open as u64 > *max) {
             why.push(format!("{} tasks are open, {max} may be", self.open));
         }

@@ -11,14 +11,20 @@ use midshift_sim::body::{BodyConfig, SimBody};
 use midshift_sim::faults::FaultRates;
 use midshift_sim::hall::{Hall, HallConfig, Persistence};
 use midshift_sim::handle::SimHandle;
+use midshift_sim::person::Person;
 use midshift_sim::service::SimFace;
 use midshift_sim::swarm::{AGENT_FILE, Swarm, SwarmConfig};
 use midshift_sim::world::WorldConfig;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::AbortOnDropHandle;
+
+/// How often a person looks, real time.
+const VISIT: Duration = Duration::from_secs(5);
 
 /// One agent with a simulated body.
 #[derive(Clone, Debug, clap::Args)]
@@ -48,6 +54,9 @@ pub struct AgentRun {
     /// Nothing goes wrong by itself.
     #[arg(long)]
     pub no_faults: bool,
+    /// A simulated person mends it and takes away what it was left with.
+    #[arg(long)]
+    pub person: bool,
     /// Where its sets of software are. With --trust it takes updates, and behaves as behaviour.toml of the set that runs says.
     #[arg(long, requires = "trust")]
     pub sets: Option<PathBuf>,
@@ -141,6 +150,8 @@ pub async fn agent(args: AgentRun, stop: CancellationToken) -> anyhow::Result<Ex
     let world = WorldConfig { tag: format!("{robot_id}-"), auto_stock: true, utc_base_ms, ..WorldConfig::default() };
     let (body, _world) = SimBody::restore(config, site, world, &args.data, now.site)?;
     let handle = SimHandle::new(body);
+    let _person =
+        args.person.then(|| AbortOnDropHandle::new(tokio::spawn(visit(handle.clone(), args.seed, clock.clone()))));
     let network = handle.network();
     let uri = uri(&args.server);
     let dial = TcpDial::new(&uri, Some(network.clone()))?;
@@ -167,6 +178,17 @@ pub async fn agent(args: AgentRun, stop: CancellationToken) -> anyhow::Result<Ex
         reason @ (ExitReason::Shutdown | ExitReason::Switched) => Ok(reason),
         ExitReason::FencedTwice => {
             bail!("fenced twice: another machine runs as this robot. Find it, then start this one again")
+        }
+    }
+}
+
+/// A person who looks after one robot.
+async fn visit(robot: SimHandle, seed: u64, clock: Arc<dyn Clock>) {
+    let mut person = Person::new(seed);
+    loop {
+        tokio::time::sleep(VISIT).await;
+        for deed in person.round(clock.now().site, std::slice::from_ref(&robot), &|_| false) {
+            tracing::info!(?deed, "a simulated person helped");
         }
     }
 }

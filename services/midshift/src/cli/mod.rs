@@ -168,7 +168,7 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
 }
 
 async fn develop(args: Dev, out: &Out) -> Result<(), Exit> {
-    let bounded = args.run_for.is_some();
+    let bounded = args.run_for.is_some() || args.scenario.is_some();
     let report = dev::run(args, interrupts(), &|text| out.say(text)).await?;
     let objections = report.objections();
     if bounded {

@@ -1,0 +1,609 @@
+//! `dev --scenario update-midshift`: a fleet at work gets a good release in waves, and then three bad ones that must not get past their canary.
+//!
+//! Some of the robots are real launcher and agent processes, the others live in this process. Bodies work `--speedup` times as fast as real; clocks
+//! are real in all processes, so their journals can be judged together. Invariant: what is judged comes from the robots themselves (heartbeats,
+//! journals, switch records) wherever they can tell it; the report says where each figure is from.
+
+use crate::samples::{self, Signer};
+use anyhow::{Context, bail, ensure};
+use midshift_agent::switch::Switch;
+use midshift_agent::trust::Trust;
+use midshift_core::ids::{RobotId, WaypointId};
+use midshift_core::time::Clock;
+use midshift_core::update::UpdateState;
+use midshift_core::work::Live;
+use midshift_proto::convert::ms_of;
+use midshift_proto::ota::v1;
+use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
+use midshift_proto::ota::v1::rollout_wave::Size;
+use midshift_store::LiveBoard;
+use serde::Serialize;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+use tokio::process::{Child, Command};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::AbortOnDropHandle;
+use tonic::transport::Channel;
+
+/// Robots that are processes of their own, unless the fleet is too small for it.
+pub const LAUNCHED: usize = 5;
+/// How often robots and roll-outs are looked at, real time.
+const LOOK_EVERY: Duration = Duration::from_millis(200);
+/// A roll-out that takes longer is given up, real time.
+const LONGEST: Duration = Duration::from_secs(1_200);
+/// All robots must be at work within this, real time.
+const READY_WITHIN: Duration = Duration::from_secs(120);
+/// Probation and soak of each roll-out, milliseconds of site time.
+const WATCHED_MS: u64 = 10_000;
+/// Tasks on trial that a wave is judged by: one more than the breaker needs.
+const EXPOSURE_TASKS: u64 = 4;
+
+/// A launched robot that gives no sign for so many seconds is killed by its launcher.
+const HANG_S: &str = "8";
+
+/// Which story `dev` plays.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Scenario {
+    /// A good release over the whole fleet, then one bad at its start, one that hangs on probation, one bad only with a load.
+    UpdateMidshift,
+}
+
+/// One roll-out of the story.
+struct Act {
+    version: &'static str,
+    is_good: bool,
+}
+
+const ACTS: [Act; 4] = [
+    Act { version: "1.5.0", is_good: true },
+    Act { version: "1.6.0-bad-at-start", is_good: false },
+    Act { version: "1.6.1-hangs", is_good: false },
+    Act { version: "1.6.2-bad-with-load", is_good: false },
+];
+
+/// Medians of the parts of the time that robots were out of work, milliseconds, each on its own clock.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct OffWork {
+    /// Site clock: asked until no new work.
+    pub drain_wait_ms: Option<u64>,
+    /// Site clock: from there until parked.
+    pub park_drive_ms: Option<u64>,
+    /// Link clock: parked until permitted.
+    pub parked_to_grant_ms: Option<u64>,
+    /// Link clock: permitted until heard with the bundle.
+    pub switch_ms: Option<u64>,
+    /// Site clock: from there until at work.
+    pub probation_ms: Option<u64>,
+}
+
+/// What one roll-out came to.
+#[derive(Clone, Debug, Serialize)]
+pub struct Played {
+    /// Which bundle.
+    pub bundle: String,
+    /// It was to be kept by all.
+    pub is_good: bool,
+    /// Its last phase (roll-out row).
+    pub phase: String,
+    /// Robots that were heard running it, or starting to (heartbeats).
+    pub robots_seen_with_it: usize,
+    /// Of these, after it had been aborted, beyond those that were permitted by then (heartbeats and rows).
+    pub activated_after_abort: usize,
+    /// Robots permitted when it was aborted, and in the end (rows).
+    pub touched_at_abort: Option<u32>,
+    /// See above.
+    pub touched: u32,
+    /// Robots of the canary wave (rows).
+    pub canary: u32,
+    /// Most robots off work for software at once (heartbeats).
+    pub off_work_most: usize,
+    /// As many may be (area's rules).
+    pub off_work_allowed: usize,
+    /// Robots that keep it in the end: launched ones by their switch record, the others by their heartbeats' versions.
+    pub kept_by: usize,
+    /// Robots that run something else than they should.
+    pub elsewhere: Vec<String>,
+    /// Verdicts with their numbers (roll-out row).
+    pub verdicts: Vec<String>,
+    /// Why it was aborted (roll-out row).
+    pub abort: Option<String>,
+    /// Medians (rows, stamped by the server).
+    pub off_work: OffWork,
+    /// Seconds of real time from start to end.
+    pub wall_s: f64,
+}
+
+/// What the story came to.
+#[derive(Clone, Debug, Serialize)]
+pub struct Story {
+    /// Robots in this process.
+    pub robots_in_process: usize,
+    /// Robots that were launcher and agent processes.
+    pub robots_launched: usize,
+    /// How many times as fast as real bodies worked.
+    pub body_speed: f64,
+    /// Its roll-outs.
+    pub acts: Vec<Played>,
+}
+
+impl Story {
+    /// Why it cannot be called good; empty if it can.
+    pub fn objections(&self) -> Vec<String> {
+        self.acts.iter().flat_map(|act| act.objections(self.robots_in_process + self.robots_launched)).collect()
+    }
+    /// The story in lines.
+    pub fn lines(&self) -> Vec<String> {
+        self.acts.iter().flat_map(Played::lines).collect()
+    }
+}
+
+impl Played {
+    fn objections(&self, robots: usize) -> Vec<String> {
+        let mut why = Vec::new();
+        let mut not = |holds: bool, text: String| {
+            if !holds {
+                why.push(format!("{}: {text}", self.bundle));
+            }
+        };
+        not(
+            self.off_work_most <= self.off_work_allowed,
+            format!("{} robots were off work at once, {} may", self.off_work_most, self.off_work_allowed),
+        );
+        not(self.elsewhere.is_empty(), format!("{} run something else", self.elsewhere.join(", ")));
+        if self.is_good {
+            not(self.phase == "COMPLETED", format!("it is {} and should be COMPLETED", self.phase));
+            not(self.kept_by == robots, format!("{} of {robots} robots keep it", self.kept_by));
+            let grant = self.off_work.parked_to_grant_ms.unwrap_or(u64::MAX);
+            not(grant <= 5_000, format!("parked to permitted took {grant} ms in the median, 5000 may"));
+        } else {
+            not(self.phase == "ABORTED", format!("it is {} and should be ABORTED", self.phase));
+            not(self.abort.is_some(), "it has no evidence".to_owned());
+            not(
+                self.touched <= self.canary,
+                format!("{} robots were touched, the canary has {}", self.touched, self.canary),
+            );
+            not(
+                self.activated_after_abort == 0,
+                format!("{} activated it after the abort", self.activated_after_abort),
+            );
+            not(self.kept_by == 0, format!("{} robots keep it", self.kept_by));
+        }
+        why
+    }
+
+    fn lines(&self) -> Vec<String> {
+        let ms = |ms: Option<u64>| ms.map_or("-".to_owned(), |ms| format!("{:.1}", ms as f64 / 1000.0));
+        let o = &self.off_work;
+        let mut lines = vec![format!(
+            "{}: {} in {:.0} s, touched {} (at the abort {}, after it {}), kept by {}, off work at once {} of {}",
+            self.bundle,
+            self.phase,
+            self.wall_s,
+            self.touched,
+            self.touched_at_abort.map_or("-".to_owned(), |n| n.to_string()),
+            self.activated_after_abort,
+            self.kept_by,
+            self.off_work_most,
+            self.off_work_allowed,
+        )];
+        lines.push(format!(
+            "  off work, medians in s: drain wait {} (site), park drive {} (site), parked to permitted {} (link), switch {} (link), probation {} (site)",
+            ms(o.drain_wait_ms),
+            ms(o.park_drive_ms),
+            ms(o.parked_to_grant_ms),
+            ms(o.switch_ms),
+            ms(o.probation_ms)
+        ));
+        lines.extend(self.verdicts.iter().map(|v| format!("  {v}")));
+        lines.extend(self.abort.iter().map(|a| format!("  aborted: {a}")));
+        lines
+    }
+}
+
+/// What the stage needs.
+pub struct Stage {
+    /// Host and port of the server.
+    pub server: String,
+    /// The way to it.
+    pub channel: Channel,
+    /// What robots say.
+    pub board: Arc<LiveBoard<Live>>,
+    /// Clocks.
+    pub clock: Arc<dyn Clock>,
+    /// Where everything lies that the launched robots keep.
+    pub folder: PathBuf,
+    /// Robots in this process.
+    pub in_process: usize,
+    /// Robots to launch, and where each starts.
+    pub launched: Vec<(RobotId, WaypointId)>,
+    /// Whom they believe.
+    pub trust: Trust,
+    /// The repository to sign in, and its targets key.
+    pub repository: (PathBuf, PathBuf),
+    /// Decides bodies.
+    pub seed: u64,
+    /// How many times as fast as real bodies work.
+    pub body_speed: f64,
+    /// The site's file, if it is not the built-in one.
+    pub site: Option<PathBuf>,
+}
+
+/// Launched robots; all end with this.
+struct Launched(Vec<Child>);
+
+impl Stage {
+    fn robots(&self) -> usize {
+        self.in_process + self.launched.len()
+    }
+
+    /// Plays all acts.
+    ///
+    /// # Errors
+    /// A step that could not be taken at all; what went wrong on stage is in the story.
+    pub async fn play(&self, stop: CancellationToken, say: &(dyn Fn(&str) + Sync)) -> anyhow::Result<Story> {
+        let mut launched = self.launch()?;
+        self.until_at_work().await?;
+        say(&format!("{} robots at work, {} of them processes of their own", self.robots(), self.launched.len()));
+        self.publish().await?;
+        let mut story = Story {
+            robots_in_process: self.in_process,
+            robots_launched: self.launched.len(),
+            body_speed: self.body_speed,
+            acts: Vec::new(),
+        };
+        for act in &ACTS {
+            say(&format!(
+                "rolling out {}-{}{}",
+                samples::NAME,
+                act.version,
+                if act.is_good { "" } else { ", which is bad" }
+            ));
+            let played = tokio::select! {
+                () = stop.cancelled() => bail!("ended before the story was over"),
+                played = self.act(act) => played?,
+            };
+            played.lines().iter().for_each(|line| say(line));
+            story.acts.push(played);
+        }
+        launched.end().await;
+        Ok(story)
+    }
+
+    fn launch(&self) -> anyhow::Result<Launched> {
+        let program = std::env::current_exe().context("finding this program")?;
+        let mut launched = Launched(Vec::new());
+        for (robot_id, start) in &self.launched {
+            let home = self.home(robot_id);
+            std::fs::create_dir_all(&home).with_context(|| format!("making {}", home.display()))?;
+            self.trust.write(&home.join("trust.json"))?;
+            let log = std::fs::File::create(home.join("log")).context("making a robot's log")?;
+            let mut command = Command::new(&program);
+            command.arg("launcher").arg("--record").arg(home.join("tries")).arg("--sets").arg(home.join("sets"));
+            command.args(["--hang", HANG_S, "--"]).arg(&program).args([
+                "agent",
+                "run",
+                "--robot-id",
+                robot_id.as_str(),
+            ]);
+            command.args(["--server", &self.server, "--start", start.as_str(), "--person"]);
+            command.args(["--seed", &self.seed.to_string(), "--body-speed", &self.body_speed.to_string()]);
+            command.arg("--data").arg(&home).arg("--sets").arg(home.join("sets"));
+            command.arg("--trust").arg(home.join("trust.json"));
+            if let Some(site) = &self.site {
+                command.arg("--site").arg(site);
+            }
+            let errors = log.try_clone().context("sharing a robot's log")?;
+            command.stdin(Stdio::null()).stdout(log).stderr(errors).process_group(0).kill_on_drop(true);
+            launched.0.push(command.spawn().with_context(|| format!("starting {}", program.display()))?);
+        }
+        Ok(launched)
+    }
+
+    /// Folder of a launched robot; its journal is in it, as one of this process would be.
+    fn home(&self, robot_id: &RobotId) -> PathBuf {
+        self.folder.join(robot_id.as_str())
+    }
+
+    async fn until_at_work(&self) -> anyhow::Result<()> {
+        let all = self.robots();
+        let ready = async {
+            loop {
+                let heard = self.board.all();
+                if heard.len() == all && heard.iter().filter(|(_, l)| l.report.vitals.odometer_mm > 0).count() * 2 > all
+                {
+                    return;
+                }
+                tokio::time::sleep(LOOK_EVERY).await;
+            }
+        };
+        let heard = || self.board.all().len();
+        let waited = tokio::time::timeout(READY_WITHIN, ready).await;
+        waited.map_err(|_| anyhow::anyhow!("only {} of {all} robots were heard at work", heard()))
+    }
+
+    /// Builds, signs and pushes the samples, the last with the program that a person would use.
+    async fn publish(&self) -> anyhow::Result<()> {
+        let (repository, key) = (self.repository.0.clone(), self.repository.1.clone());
+        let (folder, now) = (self.folder.join("samples"), self.clock.now().wall);
+        let signed = repository.clone();
+        let make =
+            move || samples::make(&folder, None, Signer::Named { repository: &signed, key: &key }, now).map(drop);
+        tokio::task::spawn_blocking(make).await.context("making the samples")??;
+        let program = std::env::current_exe().context("finding this program")?;
+        let mut push = Command::new(program);
+        push.args(["bundle", "push", "--server", &self.server]).arg(&repository).stdin(Stdio::null());
+        let pushed = push.output().await.context("pushing the samples")?;
+        ensure!(pushed.status.success(), "pushing the samples: {}", String::from_utf8_lossy(&pushed.stderr));
+        Ok(())
+    }
+
+    async fn act(&self, act: &Act) -> anyhow::Result<Played> {
+        let mut client = RolloutServiceClient::new(self.channel.clone());
+        let rollout_id = format!("{}-{}", samples::NAME, act.version);
+        let watched = duration(WATCHED_MS);
+        let wave = |size| v1::RolloutWave { size: Some(size) };
+        let spec = v1::RolloutSpec {
+            bundle: rollout_id.clone(),
+            waves: vec![wave(Size::Count(1)), wave(Size::Percent(25)), wave(Size::Rest(true))],
+            soak: Some(watched),
+            probation: Some(watched),
+            exposure_tasks: Some(EXPOSURE_TASKS),
+            ..v1::RolloutSpec::default()
+        };
+        let begun = tokio::time::Instant::now();
+        let watcher = Watcher::begin(self.board.clone());
+        let id = rollout_id.clone();
+        client.create_rollout(v1::CreateRolloutRequest { rollout_id: id.clone(), spec: Some(spec) }).await?;
+        let (etag, reason) = (String::new(), "the story".to_owned());
+        let submit = v1::SubmitRolloutRequest { rollout_id: id.clone(), etag: etag.clone(), reason: reason.clone() };
+        client.submit_rollout(submit).await?;
+        let approve = v1::ApproveRolloutRequest { rollout_id: id.clone(), etag: etag.clone(), reason: reason.clone() };
+        client.approve_rollout(approve).await?;
+        client
+            .start_rollout(v1::StartRolloutRequest { rollout_id: id.clone(), etag, reason, supersede: false })
+            .await?;
+        let mut aborted: Option<BTreeSet<RobotId>> = None;
+        let ended = tokio::time::timeout(LONGEST, async {
+            loop {
+                let request = v1::GetRolloutRequest { rollout_id: id.clone() };
+                let rollout = client.get_rollout(request).await?.into_inner().rollout.unwrap_or_default();
+                if rollout.abort.is_some() && aborted.is_none() {
+                    aborted = Some(watcher.seen());
+                }
+                let ended = matches!(
+                    rollout.phase(),
+                    v1::RolloutPhase::Completed
+                        | v1::RolloutPhase::Aborted
+                        | v1::RolloutPhase::Superseded
+                        | v1::RolloutPhase::Review
+                );
+                if ended {
+                    return Ok::<_, tonic::Status>(rollout);
+                }
+                tokio::time::sleep(LOOK_EVERY).await;
+            }
+        });
+        let rollout =
+            ended.await.with_context(|| format!("{rollout_id} did not end within {} s", LONGEST.as_secs()))??;
+        let wall_s = begun.elapsed().as_secs_f64();
+        let robots = self.robots_of(&rollout_id).await?;
+        self.judge(act, &rollout, &robots, watcher, aborted, wall_s).await
+    }
+
+    async fn robots_of(&self, rollout_id: &str) -> anyhow::Result<Vec<v1::RolloutRobot>> {
+        let mut client = RolloutServiceClient::new(self.channel.clone());
+        let request =
+            v1::ListRolloutRobotsRequest { rollout_id: rollout_id.to_owned(), page_size: 1_000, ..Default::default() };
+        Ok(client.list_rollout_robots(request).await?.into_inner().robots)
+    }
+
+    async fn judge(
+        &self,
+        act: &Act,
+        rollout: &v1::Rollout,
+        robots: &[v1::RolloutRobot],
+        watcher: Watcher,
+        aborted: Option<BTreeSet<RobotId>>,
+        wall_s: f64,
+    ) -> anyhow::Result<Played> {
+        let counts = rollout.counts.unwrap_or_default();
+        let abort = rollout.abort.as_ref();
+        let touched_at_abort = abort.map(|a| a.touched);
+        let seen = watcher.seen();
+        let late = aborted.map_or(0, |then| seen.difference(&then).count());
+        // Those permitted by then may still have come; whoever is beyond them should not.
+        let permitted = touched_at_abort.unwrap_or(0) as usize;
+        let activated_after_abort = late.saturating_sub(permitted.saturating_sub(seen.len().saturating_sub(late)));
+        let good = format!("{}-{}", samples::NAME, ACTS[0].version);
+        let should = if act.is_good { rollout.bundle_label.clone() } else { good };
+        let (kept_by, elsewhere) = self.who_runs(&rollout.bundle_label, &should).await?;
+        let canary = rollout.waves.first().and_then(|w| w.counts).map_or(0, |c| all(&c) - c.skipped);
+        Ok(Played {
+            bundle: rollout.bundle_label.clone(),
+            is_good: act.is_good,
+            phase: short(rollout.phase().as_str_name(), "ROLLOUT_PHASE_"),
+            robots_seen_with_it: seen.len(),
+            activated_after_abort,
+            touched_at_abort,
+            touched: counts.attempted,
+            canary: canary.max(1),
+            off_work_most: watcher.most(),
+            off_work_allowed: (self.robots() / 10).max(1),
+            kept_by,
+            elsewhere,
+            verdicts: rollout.verdicts.iter().map(verdict).collect(),
+            abort: abort.map(evidence),
+            off_work: medians(robots),
+            wall_s,
+        })
+    }
+
+    /// Robots that keep a bundle, and those that keep another one than they should. A launched robot is asked by its switch record, one
+    /// of this process by what it said.
+    async fn who_runs(&self, label: &str, should: &str) -> anyhow::Result<(usize, Vec<String>)> {
+        let mut client = RolloutServiceClient::new(self.channel.clone());
+        let request = v1::ListRobotSoftwareRequest { page_size: 1_000, ..Default::default() };
+        let software = client.list_robot_software(request).await?.into_inner().software;
+        let launched: BTreeSet<&str> = self.launched.iter().map(|(id, _)| id.as_str()).collect();
+        let (mut kept, mut elsewhere) = (0, Vec::new());
+        for row in software {
+            let version = if launched.contains(row.robot_id.as_str()) {
+                self.recorded(&row.robot_id)?
+            } else {
+                row.version.clone()
+            };
+            let runs = format!("{}-{version}", samples::NAME);
+            kept += usize::from(runs == label && row.on_trial.is_empty());
+            if runs != should {
+                elsewhere.push(format!("{} ({version})", row.robot_id));
+            }
+        }
+        Ok((kept, elsewhere))
+    }
+
+    /// Version of the set that a launched robot's switch record names, which must be committed.
+    fn recorded(&self, robot_id: &str) -> anyhow::Result<String> {
+        let sets = self.folder.join(robot_id).join("sets");
+        let switch = Switch::read(&sets.join(midshift_agent::launcher::SWITCH))?;
+        if switch.trial.is_some() {
+            return Ok("on trial".to_owned());
+        }
+        let holdings = midshift_agent::sets::Sets::holdings(&mut midshift_agent::sets::disk::DiskSets::open(&sets)?)?;
+        Ok(holdings.version(&switch.current).unwrap_or_else(|| switch.current.clone()))
+    }
+}
+
+impl Launched {
+    /// Asks every launcher's group to end, and waits.
+    async fn end(&mut self) {
+        for child in &mut self.0 {
+            if let Some(pid) = child.id() {
+                let mut kill = Command::new("kill");
+                kill.args(["-TERM", "--", &format!("-{pid}")]).stderr(Stdio::null());
+                let _ = kill.status().await;
+            }
+        }
+        for child in &mut self.0 {
+            let _ = tokio::time::timeout(Duration::from_secs(10), child.wait()).await;
+        }
+    }
+}
+
+/// Looks at what robots say all the time.
+struct Watcher {
+    seen: Arc<Mutex<BTreeSet<RobotId>>>,
+    most: Arc<Mutex<usize>>,
+    _looks: AbortOnDropHandle<()>,
+}
+
+impl Watcher {
+    fn begin(board: Arc<LiveBoard<Live>>) -> Self {
+        let (seen, most) = (Arc::new(Mutex::new(BTreeSet::new())), Arc::new(Mutex::new(0)));
+        let before: BTreeMap<RobotId, String> = board
+            .all()
+            .iter()
+            .filter_map(|(id, l)| Some((id.clone(), l.report.update.as_ref()?.bundle.to_string())))
+            .collect();
+        let (to_seen, to_most) = (seen.clone(), most.clone());
+        let looks = AbortOnDropHandle::new(tokio::spawn(async move {
+            loop {
+                let off = look(&board, &before, &to_seen);
+                {
+                    let mut most = to_most.lock().unwrap_or_else(PoisonError::into_inner);
+                    *most = (*most).max(off);
+                }
+                tokio::time::sleep(LOOK_EVERY).await;
+            }
+        }));
+        Self { seen, most, _looks: looks }
+    }
+    fn seen(&self) -> BTreeSet<RobotId> {
+        self.seen.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+    fn most(&self) -> usize {
+        *self.most.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Notes who runs another bundle than before, and counts who changes its software now.
+fn look(board: &LiveBoard<Live>, before: &BTreeMap<RobotId, String>, seen: &Mutex<BTreeSet<RobotId>>) -> usize {
+    let mut off = 0;
+    for (id, live) in board.all() {
+        let Some(update) = &live.report.update else { continue };
+        let changes =
+            matches!(update.state, UpdateState::Switching | UpdateState::Probation | UpdateState::RollingBack);
+        off += usize::from(changes);
+        let new = before.get(&id).is_none_or(|known| *known != update.bundle.as_str());
+        if new && (update.state.is_active() || update.state == UpdateState::RolledBack) {
+            seen.lock().unwrap_or_else(PoisonError::into_inner).insert(id);
+        }
+    }
+    off
+}
+
+fn duration(ms: u64) -> prost_types::Duration {
+    midshift_proto::convert::duration(ms)
+}
+
+fn short(name: &str, prefix: &str) -> String {
+    name.trim_start_matches(prefix).to_owned()
+}
+
+fn all(c: &v1::RolloutCounts) -> u32 {
+    c.waiting
+        + c.staging
+        + c.staged
+        + c.draining
+        + c.activating
+        + c.trial
+        + c.committing
+        + c.reverting
+        + c.committed
+        + c.rolled_back
+        + c.skipped
+        + c.stuck
+}
+
+fn verdict(v: &v1::RolloutVerdict) -> String {
+    let outcome = short(v.outcome().as_str_name(), "ROLLOUT_OUTCOME_");
+    let n = v.clean + v.failed;
+    let mut text = format!(
+        "wave {}: {outcome}, n {n}, failed {}, failure rate below {:.1} % with 95 % confidence",
+        v.wave,
+        v.failed,
+        f64::from(v.upper_bound_permille) / 10.0
+    );
+    if let Some(false_abort) = v.false_abort_permille {
+        text.push_str(&format!(", a good release fails so in {:.1} % of roll-outs", f64::from(false_abort) / 10.0));
+    }
+    text
+}
+
+fn evidence(a: &v1::RolloutAbort) -> String {
+    let reason = a.reason.clone().unwrap_or_default();
+    format!("{}: {} ({})", reason.code, reason.message, a.robot_ids.join(", "))
+}
+
+fn medians(robots: &[v1::RolloutRobot]) -> OffWork {
+    let median = |part: fn(&v1::OffWork) -> Option<&prost_types::Duration>| {
+        let parts = robots.iter().filter_map(|r| r.off_work.as_ref()).filter_map(part);
+        let mut all: Vec<u64> = parts.map(|d| ms_of(d).unsigned_abs()).collect();
+        all.sort_unstable();
+        all.get(all.len() / 2).copied()
+    };
+    OffWork {
+        drain_wait_ms: median(|o| o.drain_wait.as_ref()),
+        park_drive_ms: median(|o| o.park_drive.as_ref()),
+        parked_to_grant_ms: median(|o| o.parked_to_grant.as_ref()),
+        switch_ms: median(|o| o.switch.as_ref()),
+        probation_ms: median(|o| o.probation.as_ref()),
+    }
+}
+
+/// Journals of launched robots.
+pub fn journals(folder: &Path, launched: &[(RobotId, WaypointId)]) -> Vec<PathBuf> {
+    launched.iter().map(|(id, _)| folder.join(id.as_str()).join(midshift_sim::body::JOURNAL_FILE)).collect()
+}
