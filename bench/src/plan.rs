@@ -119,6 +119,9 @@ fn fleet(site: &Arc<Site>, robots: usize, tasks: usize, seed: u64, now: Now) -> 
             applied_work: 0,
             places: Vec::new(),
             clock_offset_ms: None,
+            installed: None,
+            device_key: None,
+            device_key_changed: false,
         };
         view.sessions.insert(session.id(), Rowed { revision: Revision(1), row: session });
         let waypoint = Some(site.waypoints()[draw(cells)].waypoint_id.clone());

@@ -48,6 +48,7 @@ pub async fn attach(server: &str, name: &str, waypoint: Option<WaypointId>) -> a
         sent_unix_ms: midshift::clock::wall().0,
         clock_rate_permille: 1000,
         protocol_versions: vec![midshift_proto::session::PROTOCOL_VERSION],
+        installed: String::new(),
         robot_id,
     };
     up.send((&FromRobot::Hello(Box::new(hello))).into()).await?;

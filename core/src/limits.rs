@@ -68,6 +68,12 @@ pub const PAGE_DEFAULT: usize = 100;
 pub const PAGE_MAX: usize = 1_000;
 /// A control message, bytes.
 pub const CONTROL_MESSAGE_BYTES: usize = 64 * 1024;
+/// Sets that a robot lists at Hello: those that its switch record names, what is staged, and room for as many again.
+pub const INSTALLED_SETS_MAX: usize = 8;
+/// Components that it lists of one set: those of one bundle. It says how many more there are.
+pub const INSTALLED_COMPONENTS_MAX: usize = 32;
+/// What it says of them, signed, bytes: that many with the longest names, as base64.
+pub const INSTALLED_BYTES_MAX: usize = 60 * 1024;
 /// A telemetry batch, bytes.
 pub const TELEMETRY_BATCH_BYTES: usize = 1024 * 1024;
 /// Concurrent streams of one connection.

@@ -5,8 +5,10 @@
 
 use crate::authority::Authority;
 use crate::ids::{BundleId, DrainId, RobotId, SetId};
-use crate::reason::Reason;
+use crate::limits;
+use crate::reason::{Reason, Refusal, Violations};
 use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
 
 /// What the server wants of a robot's software.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -177,6 +179,91 @@ pub enum UpdateEvent {
         /// To run this set.
         set: SetId,
     },
+}
+
+/// Letters of a version of a set: name and version of its bundle, and a space.
+const VERSION_LETTERS_MAX: usize = 129;
+/// Letters of a name or a version.
+const WORD_LETTERS_MAX: usize = 64;
+
+/// What a robot says at Hello that it has installed, signed with the key of its machine.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Installed {
+    /// Whose.
+    pub robot_id: RobotId,
+    /// The start of the agent that says it.
+    pub boot_id: String,
+    /// Public key of the machine, ed25519, 64 hexadecimal digits. It signed this.
+    pub device_key: String,
+    /// Maker's model name, as bundles name it; empty: not reported.
+    pub model: String,
+    /// Bytes of room for software when it last looked. `u64::MAX`: no end is known.
+    pub free_bytes: u64,
+    /// The set that runs: `current`, or one on trial.
+    pub running: SetId,
+    /// The set committed last.
+    pub current: SetId,
+    /// The set committed before it.
+    pub previous: Option<SetId>,
+    /// Whole sets on its disk that are named or staged. What it came with, `factory`, is in none.
+    pub sets: Vec<InstalledSet>,
+}
+
+/// One set on a robot's disk.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct InstalledSet {
+    /// Its digest.
+    pub set: SetId,
+    /// Digest of the manifest of the bundle taken last.
+    pub bundle: Option<BundleId>,
+    /// Name and version of that bundle, for people.
+    pub version: String,
+    /// Versions of its components by name, the first [`limits::INSTALLED_COMPONENTS_MAX`] of them.
+    pub components: BTreeMap<String, String>,
+    /// Components beyond those.
+    pub components_left_out: u32,
+}
+
+impl Installed {
+    /// Checks every rule: it comes from elsewhere.
+    ///
+    /// # Errors
+    /// Everything that is wrong with it.
+    pub fn check(&self) -> Result<(), Refusal> {
+        let mut bad = Violations::default();
+        let mut letters = |field: String, text: &str, most: usize| {
+            if text.len() > most {
+                bad.add(field, format!("at most {most} bytes"));
+            }
+        };
+        letters("boot_id".to_owned(), &self.boot_id, WORD_LETTERS_MAX);
+        letters("model".to_owned(), &self.model, WORD_LETTERS_MAX);
+        for (i, set) in self.sets.iter().take(limits::INSTALLED_SETS_MAX).enumerate() {
+            letters(format!("sets[{i}].version"), &set.version, VERSION_LETTERS_MAX);
+            for (name, version) in &set.components {
+                letters(format!("sets[{i}].components"), name, WORD_LETTERS_MAX);
+                letters(format!("sets[{i}].components"), version, WORD_LETTERS_MAX);
+            }
+        }
+        let mut ids = BTreeSet::new();
+        for (i, set) in self.sets.iter().enumerate() {
+            if set.components.len() > limits::INSTALLED_COMPONENTS_MAX {
+                bad.add(format!("sets[{i}].components"), format!("at most {}", limits::INSTALLED_COMPONENTS_MAX));
+            }
+            if !ids.insert(&set.set) {
+                bad.add(format!("sets[{i}].set"), "stands twice");
+            }
+        }
+        if self.sets.len() > limits::INSTALLED_SETS_MAX {
+            bad.add("sets", format!("at most {}", limits::INSTALLED_SETS_MAX));
+        }
+        bad.finish()
+    }
+
+    /// The set that runs, if it is listed: what the robot came with is not.
+    pub fn running_set(&self) -> Option<&InstalledSet> {
+        self.sets.iter().find(|set| set.set == self.running)
+    }
 }
 
 #[cfg(test)]

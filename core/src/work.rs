@@ -370,6 +370,15 @@ pub struct Session {
     pub places: Vec<HeldPlace>,
     /// Robot clock minus server clock, milliseconds, as the sessions before this one measured it last; none: they did not.
     pub clock_offset_ms: Option<i64>,
+    /// What it said it has installed, if the key of the robot's machine signed it; none: it said nothing that is believed.
+    #[serde(default)]
+    pub installed: Option<crate::update::Installed>,
+    /// The key of the robot's machine, taken when it was first seen, 64 hexadecimal digits; none: it never said one.
+    #[serde(default)]
+    pub device_key: Option<String>,
+    /// Another key signed what this session said of its software: it is another machine, or one that lost its memory.
+    #[serde(default)]
+    pub device_key_changed: bool,
 }
 
 impl Record for Session {

@@ -4,9 +4,8 @@
 //! of an envelope is believed before its signature was checked over exactly the bytes that are read.
 
 use crate::digest::Digest;
+use crate::dsse::{self, Unreadable};
 use crate::keys::{KeyId, PublicKey, SecretKey};
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
 use midshift_core::ids::RobotId;
 use midshift_core::time::Utc;
 use serde::{Deserialize, Serialize};
@@ -18,8 +17,6 @@ pub const PAYLOAD_TYPE: &str = "application/vnd.midshift.directive.v1+json";
 pub const ENVELOPE_BYTES_MAX: usize = 16 * 1024;
 /// How long a directive lives, unless it is signed again.
 pub const LIFE_MS: u64 = 7 * 24 * 3_600_000;
-/// Signatures of one envelope.
-const SIGNATURES_MAX: usize = 8;
 
 /// Which bundle which robot shall have.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -43,21 +40,6 @@ pub struct Directive {
     pub expires: Utc,
     /// The rollout behind it.
     pub rollout: String,
-}
-
-#[derive(Serialize, Deserialize)]
-#[serde(deny_unknown_fields, rename_all = "camelCase")]
-struct Envelope {
-    payload_type: String,
-    payload: String,
-    signatures: Vec<EnvelopeSignature>,
-}
-
-#[derive(Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct EnvelopeSignature {
-    keyid: String,
-    sig: String,
 }
 
 /// Why a robot does not take a directive.
@@ -101,11 +83,14 @@ pub struct Expected<'a> {
     pub now: Utc,
 }
 
-/// What is signed of a payload: DSSE's pre-authentication encoding.
-fn encoding(payload: &[u8]) -> Vec<u8> {
-    let mut bytes = format!("DSSEv1 {} {PAYLOAD_TYPE} {} ", PAYLOAD_TYPE.len(), payload.len()).into_bytes();
-    bytes.extend_from_slice(payload);
-    bytes
+impl From<Unreadable> for Rejection {
+    fn from(unreadable: Unreadable) -> Self {
+        match unreadable {
+            Unreadable::TooLong => Self::TooLong,
+            Unreadable::Malformed => Self::Malformed,
+            Unreadable::OtherType => Self::OtherType,
+        }
+    }
 }
 
 impl Directive {
@@ -113,13 +98,7 @@ impl Directive {
     pub fn sign(mut self, key: &SecretKey) -> Vec<u8> {
         self.key_id = key.public().id();
         let payload = serde_json::to_vec(&self).unwrap_or_else(|e| unreachable!("plain fields: {e}"));
-        let sig = key.sign(&encoding(&payload));
-        let envelope = Envelope {
-            payload_type: PAYLOAD_TYPE.to_owned(),
-            payload: STANDARD.encode(&payload),
-            signatures: vec![EnvelopeSignature { keyid: self.key_id.to_string(), sig: STANDARD.encode(sig) }],
-        };
-        serde_json::to_vec(&envelope).unwrap_or_else(|e| unreachable!("plain fields: {e}"))
+        dsse::seal(PAYLOAD_TYPE, &payload, key)
     }
 
     /// Reads and checks an envelope.
@@ -127,22 +106,12 @@ impl Directive {
     /// # Errors
     /// The first reason not to take it.
     pub fn open(envelope: &[u8], expected: &Expected) -> Result<Self, Rejection> {
-        if envelope.len() > ENVELOPE_BYTES_MAX {
-            return Err(Rejection::TooLong);
-        }
-        let envelope: Envelope = serde_json::from_slice(envelope).map_err(|_| Rejection::Malformed)?;
-        if envelope.payload_type != PAYLOAD_TYPE {
-            return Err(Rejection::OtherType);
-        }
-        let payload = STANDARD.decode(&envelope.payload).map_err(|_| Rejection::Malformed)?;
-        let signed = encoding(&payload);
-        let signer = envelope.signatures.iter().take(SIGNATURES_MAX).find_map(|signature| {
-            let id = KeyId(signature.keyid.parse().ok()?);
-            let sig = STANDARD.decode(&signature.sig).ok()?;
-            expected.keys.get(&id).filter(|key| key.id() == id && key.verifies(&signed, &sig)).map(|_| id)
-        });
+        let opened = dsse::open(envelope, ENVELOPE_BYTES_MAX, PAYLOAD_TYPE)?;
+        let signer = opened
+            .signers()
+            .find(|id| expected.keys.get(id).is_some_and(|key| key.id() == *id && opened.is_signed_by(key)));
         let signer = signer.ok_or(Rejection::NotSigned)?;
-        let directive: Self = serde_json::from_slice(&payload).map_err(|_| Rejection::Malformed)?;
+        let directive: Self = serde_json::from_slice(&opened.payload).map_err(|_| Rejection::Malformed)?;
         directive.check(signer, expected).map(|()| directive)
     }
 

@@ -65,10 +65,18 @@ impl PublicKey {
     /// From what [`PublicKey::tuf`] wrote, and nothing beside it.
     pub fn from_tuf(value: &serde_json::Value) -> Option<Self> {
         let text = value.get("keyval")?.get("public")?.as_str()?;
+        Self::from_hex(text).filter(|key| key.tuf() == *value)
+    }
+    /// Its 32 bytes as 64 lower-case hexadecimal digits.
+    pub fn hex(&self) -> String {
+        hex(self.0.as_bytes())
+    }
+    /// From what [`PublicKey::hex`] wrote.
+    pub fn from_hex(text: &str) -> Option<Self> {
         let digits: Option<Vec<u8>> = text.chars().map(|c| c.to_digit(16).map(|d| d as u8)).collect();
         let bytes: Vec<u8> =
             digits?.chunks(2).map(|pair| pair.iter().fold(0, |byte, digit| byte << 4 | digit)).collect();
-        Self::from_bytes(&bytes).filter(|key| key.tuf() == *value)
+        Self::from_bytes(&bytes).filter(|key| key.hex() == text)
     }
     /// Its id. The members are in canonical order: sorted, with no spaces.
     pub fn id(&self) -> KeyId {
@@ -122,6 +130,15 @@ impl SecretKey {
     /// The 64 bytes of a signature.
     pub fn sign(&self, message: &[u8]) -> [u8; 64] {
         self.0.sign(message).to_bytes()
+    }
+    /// As PEM, for whoever keeps it where nobody else reads.
+    pub fn to_pem(&self) -> String {
+        let pem = self.0.to_pkcs8_pem(LineEnding::LF).unwrap_or_else(|e| unreachable!("32 bytes: {e}"));
+        String::clone(&pem)
+    }
+    /// From what [`SecretKey::to_pem`] wrote.
+    pub fn from_pem(text: &str) -> Option<Self> {
+        SigningKey::from_pkcs8_pem(text).ok().map(Self)
     }
     /// Reads a PEM file.
     ///

@@ -7,9 +7,11 @@
 pub mod build;
 pub mod digest;
 pub mod directive;
+mod dsse;
 pub mod encoding;
 pub mod folder;
 pub mod freshness;
+pub mod installed;
 pub mod keys;
 pub mod manifest;
 pub mod repository;

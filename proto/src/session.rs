@@ -63,6 +63,8 @@ pub struct Hello {
     pub clock_rate_permille: u32,
     /// Wire versions spoken.
     pub protocol_versions: Vec<u32>,
+    /// Signed envelope of what it has installed, unchecked; empty: its software is not changed from here.
+    pub installed: String,
 }
 
 /// The session before this one.

@@ -3,6 +3,7 @@
 //! Invariant: an epoch that was passed is never taken again, and a finished task keeps its answer. Pure values: applying an
 //! [`Op`] is the only way to change a ledger. Called by the core, which decides, and by the stores, which keep.
 
+use crate::device::DeviceKey;
 use crate::store::Op;
 use crate::update::SoftwareRow;
 use midshift_bundle::trust::Trusted;
@@ -115,6 +116,8 @@ pub struct Ledger {
     pub software: SoftwareRow,
     /// What is believed of the repository.
     pub trusted: Option<Arc<Trusted>>,
+    /// The key of this machine; none before its first start.
+    pub device: Option<DeviceKey>,
     /// Ended attempts that the server has not yet said it stored.
     pub unclosed: BTreeMap<AttemptId, ReportedAttempt>,
     subjects: BTreeMap<Subject, SubjectRow>,
@@ -172,6 +175,7 @@ impl Ledger {
             Op::Maintenance(drain_id) => self.maintenance.clone_from(drain_id),
             Op::Software(row) => self.software = SoftwareRow::clone(row),
             Op::Trusted(trusted) => self.trusted = Some(trusted.clone()),
+            Op::Device(key) => self.device = Some(key.clone()),
             Op::Epoch(subject, epoch, at_unix_ms) => {
                 let old = self.subjects.get(subject);
                 let epoch = (*epoch).max(old.map_or(0, |row| row.epoch));

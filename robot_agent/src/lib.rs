@@ -6,6 +6,7 @@ pub mod body;
 pub mod boot;
 pub mod bugs;
 pub mod core;
+pub mod device;
 pub mod dial;
 mod drive;
 pub mod governor;

@@ -7,7 +7,9 @@
 use crate::body::Body;
 use crate::bugs::Bugs;
 use crate::core::{AgentCore, CoreConfig, ExitReason, Input, Output};
+use crate::device::DeviceKey;
 use crate::dial::{self, Dial};
+use crate::sets::Holdings;
 use crate::store::{self, Op, Store};
 use crate::update::io::Worker;
 use crate::update::{Done, Job, UpdateConfig};
@@ -150,13 +152,20 @@ pub async fn run(
     dial: Arc<dyn Dial>,
     shutdown: CancellationToken,
 ) -> Result<ExitReason, Error> {
-    let kept = store.load(&config.new_ring_id).await?;
+    let mut kept = store.load(&config.new_ring_id).await?;
+    if kept.ledger.device.is_none() {
+        let made = Op::Device(DeviceKey::draw());
+        store.commit(std::slice::from_ref(&made)).await?;
+        kept.apply(&made);
+    }
+    let holdings = look(config.update.as_mut()).await;
     let core = CoreConfig {
         robot_id: config.robot_id.clone(),
         bugs: config.bugs,
         update: config.update.as_ref().map(|u| u.config.clone()),
     };
-    let core = AgentCore::new(core, body, kept, clock.now());
+    let mut core = AgentCore::new(core, body, kept, clock.now());
+    core.saw(holdings);
     let agent = Agent {
         retry: retries(config.seed),
         rng: rand::rngs::StdRng::seed_from_u64(config.seed),
@@ -176,6 +185,14 @@ pub async fn run(
         config,
     };
     agent.run(shutdown).await
+}
+
+/// What is on the disk, for the first Hello: the core looks for itself, and that may come after it.
+async fn look(updates: Option<&mut Updates>) -> Option<Holdings> {
+    match updates?.worker.work(Job::Look, CancellationToken::new()).await {
+        Done::Holdings(holdings) => Some(*holdings),
+        _ => None,
+    }
 }
 
 fn retries(seed: u64) -> ExponentialBackoff {
@@ -368,6 +385,7 @@ impl Agent {
             sent_unix_ms: now.wall.0,
             clock_rate_permille: self.clock.rate_permille(),
             protocol_versions: vec![PROTOCOL_VERSION],
+            installed: self.core.installed(&self.config.boot_id).unwrap_or_default(),
         }
     }
 

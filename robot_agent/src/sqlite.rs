@@ -13,7 +13,9 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use sqlx::sqlite::{SqliteArguments, SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{ConnectOptions, Connection, Row};
-use std::fs::File;
+use std::fs::{File, OpenOptions, Permissions};
+use std::io;
+use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
@@ -22,6 +24,9 @@ use std::time::Duration;
 const BUSY: Duration = Duration::from_secs(5);
 /// Version of the tables below.
 const VERSION: i64 = 1;
+
+/// Mode of the file: its owner reads and writes, nobody else.
+const PRIVATE: u32 = 0o600;
 
 const TABLES: &str = "
 CREATE TABLE IF NOT EXISTS fact (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID, STRICT;
@@ -41,9 +46,10 @@ pub struct SqliteStore {
 }
 
 impl SqliteStore {
-    /// Opens or makes the file. Its folder must exist.
+    /// Opens or makes the file, which only its owner may read: it holds secrets. Its folder must exist.
     pub async fn open(path: &Path) -> Result<Self, Error> {
         let lock = lock(path)?;
+        keep_private(path).map_err(|e| Error::WrongMode(format!("keeping {} private: {e}", path.display())))?;
         let mut connection = SqliteConnectOptions::new()
             .filename(path)
             .create_if_missing(true)
@@ -81,6 +87,7 @@ impl SqliteStore {
                 "maintenance" => ledger.maintenance = read(&key, &value)?,
                 "software" => ledger.software = read(&key, &value)?,
                 "trusted" => ledger.trusted = Some(Arc::new(read(&key, &value)?)),
+                "device" => ledger.device = Some(read(&key, &value)?),
                 _ => return Err(unreadable(&key, "not a known fact")),
             }
         }
@@ -162,6 +169,7 @@ async fn write(on: &mut SqliteConnection, op: &Op) -> Result<(), Error> {
         Op::Maintenance(drain_id) => fact(on, "maintenance", drain_id).await,
         Op::Software(row) => fact(on, "software", row).await,
         Op::Trusted(trusted) => fact(on, "trusted", trusted.as_ref()).await,
+        Op::Device(key) => fact(on, "device", key).await,
         Op::Epoch(subject, epoch, at_unix_ms) => {
             let upsert = "INSERT INTO subject (subject, epoch, at_unix_ms) VALUES ($1, $2, $3)
                 ON CONFLICT (subject) DO UPDATE SET epoch = max(epoch, excluded.epoch), at_unix_ms = excluded.at_unix_ms";
@@ -246,6 +254,12 @@ fn lock(path: &Path) -> Result<File, Error> {
     let file = File::create(&name).map_err(|e| wrong(format!("making {}: {e}", name.display())))?;
     file.try_lock().map_err(|e| wrong(format!("another agent uses {}: {e}", path.display())))?;
     Ok(file)
+}
+
+/// An empty file is a new database; the files that SQLite makes beside it have the same mode.
+fn keep_private(path: &Path) -> io::Result<()> {
+    let file = OpenOptions::new().create(true).append(true).mode(PRIVATE).open(path)?;
+    file.set_permissions(Permissions::from_mode(PRIVATE))
 }
 
 fn lane_of(number: i64) -> Result<Lane, Error> {

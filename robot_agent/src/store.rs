@@ -4,6 +4,7 @@
 //! operation leaves the robot (a message, a movement) before the batch that holds it is durable. Two stores: [`crate::memory`]
 //! for swarms and [`crate::sqlite`] for robots; one contract suite runs over both.
 
+use crate::device::DeviceKey;
 use crate::ledger::{Applied, Holder, Ledger, PlacesRow, SessionMemory};
 use crate::ring::Ring;
 use crate::update::SoftwareRow;
@@ -53,6 +54,8 @@ pub enum Op {
     Software(Box<SoftwareRow>),
     /// What is believed of the repository.
     Trusted(Arc<Trusted>),
+    /// The key of this machine: once, at its first start.
+    Device(DeviceKey),
     /// This epoch of the subject was seen, at this wall time (unix milliseconds): it is passed.
     Epoch(Subject, u64, i64),
     /// An attempt ended: its answer, how to list it until the server has it, and the wall time (unix milliseconds).

@@ -6,5 +6,6 @@ mod fresh;
 mod keyring;
 mod metadata;
 mod releasing;
+mod says;
 mod sets;
 mod shelf;

@@ -94,6 +94,7 @@ impl From<&Hello> for v1::Hello {
             sent_unix_ms: hello.sent_unix_ms,
             clock_rate_permille: hello.clock_rate_permille,
             protocol_versions: hello.protocol_versions.clone(),
+            installed: hello.installed.clone(),
         }
     }
 }
@@ -121,6 +122,12 @@ impl Parse<Hello> for v1::Hello {
         if self.protocol_versions.is_empty() {
             bad.add(at.field("protocol_versions").to_string(), "is required");
         }
+        if self.installed.len() > limits::INSTALLED_BYTES_MAX {
+            bad.add(
+                at.field("installed").to_string(),
+                format!("must be at most {} bytes", limits::INSTALLED_BYTES_MAX),
+            );
+        }
         if lanes.as_ref().is_some_and(|l| l.len() != length) {
             bad.add(at.field("lanes").to_string(), "must name each lane at most once");
             return None;
@@ -137,6 +144,7 @@ impl Parse<Hello> for v1::Hello {
             sent_unix_ms: self.sent_unix_ms,
             clock_rate_permille: rate? as u32,
             protocol_versions: Some(self.protocol_versions).filter(|v| !v.is_empty())?,
+            installed: Some(self.installed).filter(|i| i.len() <= limits::INSTALLED_BYTES_MAX)?,
         })
     }
 }

@@ -7,6 +7,7 @@ use midshift_core::ids::RobotId;
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{Lane, Presence};
 use midshift_core::time::{LinkTime, Utc};
+use midshift_core::update::{Installed, InstalledSet};
 use midshift_core::work::{InboxEntry, InboxItem, Live, PresenceRow, Session};
 use std::collections::BTreeMap;
 
@@ -50,6 +51,34 @@ pub fn encode_robot(view: RobotView<'_>, now: LinkTime) -> v1::Robot {
         observed_since: observed_since.map(timestamp),
         // No part of what is known of it: whoever listens for beacons adds it.
         beacon: None,
+        installed: session.and_then(|s| s.installed.as_ref()).map(Into::into),
+        device_key: session.and_then(|s| s.device_key.clone()).unwrap_or_default(),
+        device_key_changed: session.is_some_and(|s| s.device_key_changed),
+    }
+}
+
+impl From<&Installed> for v1::InstalledSoftware {
+    fn from(installed: &Installed) -> Self {
+        Self {
+            running: installed.running.to_string(),
+            current: installed.current.to_string(),
+            previous: installed.previous.as_ref().map(ToString::to_string).unwrap_or_default(),
+            sets: installed.sets.iter().map(Into::into).collect(),
+            free_bytes: installed.free_bytes,
+            model: installed.model.clone(),
+        }
+    }
+}
+
+impl From<&InstalledSet> for v1::InstalledSet {
+    fn from(set: &InstalledSet) -> Self {
+        Self {
+            set: set.set.to_string(),
+            bundle: set.bundle.as_ref().map(ToString::to_string).unwrap_or_default(),
+            version: set.version.clone(),
+            components: set.components.clone().into_iter().collect(),
+            components_left_out: set.components_left_out,
+        }
     }
 }
 

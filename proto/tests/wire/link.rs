@@ -2,6 +2,7 @@
 
 use midshift_core::authority::Authority;
 use midshift_core::ids::{AreaId, AttemptId, BundleId, DrainId, PlaceId, RobotId, SetId, Subject, TaskId, WaypointId};
+use midshift_core::limits;
 use midshift_core::policy::AreaPolicy;
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{
@@ -254,6 +255,7 @@ fn hello() -> Hello {
         sent_unix_ms: 1_780_300_000_123,
         clock_rate_permille: 20_000,
         protocol_versions: vec![1],
+        installed: "{\"payloadType\":\"…\"}".into(),
     }
 }
 
@@ -295,6 +297,7 @@ fn what_a_robot_says_is_what_the_server_hears() {
             previous: None,
             reported: ReportedState::default(),
             lanes: BTreeMap::new(),
+            installed: String::new(),
             ..hello()
         })),
         FromRobot::Uplink(Uplink {
@@ -424,6 +427,14 @@ fn a_session_that_breaks_the_shape_hears_every_field() {
     let zero = Heartbeat { reported: ReportedState { hb: 0, ..at_work() }, sent_unix_us: 0, clock: None };
     assert!(up(&FromRobot::Uplink(Uplink { heartbeat: Some(zero), batches: vec![] })).is_err());
     assert!(parse::<FromRobot, _>(v1::SessionRequest { message: None }).is_err());
+}
+
+#[test]
+fn a_hello_with_more_of_what_is_installed_than_may_be_is_refused() {
+    let with = |installed: String| up(&FromRobot::Hello(Box::new(Hello { installed, ..hello() })));
+    assert!(with("x".repeat(limits::INSTALLED_BYTES_MAX)).is_ok());
+    let refusal = with("x".repeat(limits::INSTALLED_BYTES_MAX + 1)).expect_err("too much");
+    assert_eq!(refusal.violations[0].field, "hello.installed");
 }
 
 #[test]

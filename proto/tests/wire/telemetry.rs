@@ -1,9 +1,10 @@
 //! Robots and their events as callers see them.
 
-use midshift_core::ids::RobotId;
+use midshift_core::ids::{RobotId, SetId};
 use midshift_core::reason::Code;
 use midshift_core::robot::{Inventory, Lane, Mode, Presence, ReportedState};
 use midshift_core::time::{LinkTime, SiteTime, Utc};
+use midshift_core::update::{Installed, InstalledSet};
 use midshift_core::work::{Gap, InboxEntry, InboxItem, Live, PresenceRow, Session};
 use midshift_proto::convert::telemetry::{RobotView, encode_event, encode_robot};
 use midshift_proto::convert::{ms_of, time_of};
@@ -12,6 +13,28 @@ use std::collections::BTreeMap;
 
 fn robot() -> RobotId {
     RobotId::parse("rbt-01").expect("id")
+}
+
+fn installed() -> Installed {
+    let set = |name: &str| SetId::parse(name).expect("id");
+    let one = InstalledSet {
+        set: set("11"),
+        bundle: None,
+        version: "walk 1.5.0".into(),
+        components: BTreeMap::from([("gait".into(), "1.4.0".into())]),
+        components_left_out: 0,
+    };
+    Installed {
+        robot_id: robot(),
+        boot_id: "b".into(),
+        device_key: "ab".repeat(32),
+        model: "h-1".into(),
+        free_bytes: 7,
+        running: set("22"),
+        current: set("11"),
+        previous: Some(set("factory")),
+        sets: vec![one],
+    }
 }
 
 #[test]
@@ -26,6 +49,9 @@ fn a_robot_shows_how_old_its_report_is_and_the_measured_clock_before_the_remembe
         applied_work: 0,
         places: vec![],
         clock_offset_ms: Some(-3),
+        installed: Some(installed()),
+        device_key: Some("ab".repeat(32)),
+        device_key_changed: true,
     };
     let presence = PresenceRow { robot_id: robot(), presence: Presence::Suspect, since_unix_ms: 4_000 };
     let live = Live {
@@ -53,6 +79,11 @@ fn a_robot_shows_how_old_its_report_is_and_the_measured_clock_before_the_remembe
     assert_eq!(wire.age.as_ref().map(ms_of), Some(4_250));
     assert_eq!((wire.clock_offset_ms, wire.clock_error_ms), (Some(12), Some(2)));
     assert_eq!(wire.reported.as_ref().expect("report").mode(), link::v1::Mode::Manual);
+    let shown = wire.installed.as_ref().expect("installed");
+    assert_eq!((shown.running.as_str(), shown.previous.as_str(), shown.free_bytes), ("22", "factory", 7));
+    assert_eq!((shown.current.as_str(), shown.sets[0].version.as_str()), ("11", "walk 1.5.0"));
+    assert_eq!(shown.sets[0].components.get("gait").map(String::as_str), Some("1.4.0"));
+    assert_eq!((wire.device_key.len(), wire.device_key_changed), (64, true));
     assert!(!format!("{wire:?}").contains("s3cret"), "the secret of a session is shown to nobody");
 
     let wire = encode_robot(RobotView { live: None, presence: None, observed_since: None, ..view }, LinkTime(5_250));

@@ -9,6 +9,7 @@ pub mod migrate;
 mod pursue;
 pub mod remote;
 
+use crate::core::AgentCore;
 use crate::sets::{Holdings, Wanted};
 use crate::switch::Switch;
 use midshift_bundle::digest::Digest;
@@ -169,6 +170,8 @@ pub(crate) struct Updater {
     /// Newest section of desired state.
     pub(crate) desired: Option<DesiredUpdate>,
     pub(crate) holdings: Option<Holdings>,
+    /// As `holdings`, before the first look of its own.
+    pub(crate) seen: Option<Holdings>,
     /// What the repository lists, by name, since the last refresh.
     pub(crate) listed: Option<Arc<Refreshed>>,
     /// The job under way.
@@ -198,6 +201,17 @@ pub(crate) struct Updater {
     pub(crate) dropping: bool,
     /// Garbage was collected since the last end of an update.
     pub(crate) collected: bool,
+}
+
+impl AgentCore {
+    /// What the shell saw on the disk before the start: to be told, nothing is decided on it.
+    pub fn saw(&mut self, holdings: Option<Holdings>) {
+        self.update.seen = holdings;
+    }
+    /// What is on the disk, as it was seen last. None: its software is not changed, or the disk cannot be read.
+    pub(crate) fn holdings(&self) -> Option<&Holdings> {
+        self.update.holdings.as_ref().or(self.update.seen.as_ref())
+    }
 }
 
 impl SoftwareRow {

@@ -137,7 +137,11 @@ impl AgentCore {
             (Job::Write(_), Done::Written(switch)) => self.hold(|holdings| holdings.switch = switch),
             (Job::Verify(set), Done::Ok) => self.verified(&set),
             (Job::Migrate { due, .. }, Done::Ok) => self.migrated(&due),
-            (Job::Collect(_), Done::Ok) => self.update.collected = true,
+            (Job::Collect(_), Done::Ok) => {
+                self.update.collected = true;
+                // What is told of sets and room is true again.
+                self.ask_for(Job::Look);
+            }
             (job, Done::Failed(Failure::Later(why))) => self.put_off(now, &job, &why),
             (job, Done::Failed(Failure::Refused(reason))) => self.job_refused(now, job, reason),
             (job, done) => tracing::error!(?job, ?done, "a job ended as another"),

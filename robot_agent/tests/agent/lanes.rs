@@ -1,6 +1,7 @@
 //! Laws L1 to L6 on the robot's side, over each store.
 
 use crate::rig::{Rig, ack, attempt, items, place_id, welcome};
+use midshift_agent::device::DeviceKey;
 use midshift_agent::ledger::{Applied, Holder, PlacesRow, SessionMemory};
 use midshift_agent::memory::MemoryStore;
 use midshift_agent::ring::{Item, Ring};
@@ -172,12 +173,14 @@ async fn the_ledger_is_read_back_as_it_was_written(open: impl AsyncFn() -> Box<d
             Op::Finish(Arc::new(report), listed, 2_000),
             Op::Epoch(attempt("T3", 1).subject, 8, 3_000),
             Op::Epoch(attempt("T3", 1).subject, 2, 4_000),
+            Op::Device(DeviceKey::of_seed([9; 32])),
         ])
         .await;
     bench.restart().await;
     let ledger = &bench.kept.ledger;
     assert_eq!((ledger.highest_epoch(&done.subject), ledger.highest_epoch(&attempt("T3", 1).subject)), (4, 8));
     assert!(ledger.finished(&done.subject).is_some());
+    assert_eq!(ledger.device, Some(DeviceKey::of_seed([9; 32])));
     assert!(ledger.forgettable(i64::MAX / 2).is_empty(), "few subjects are kept whatever their age");
     bench.write(vec![Op::Closed(done.clone()), Op::Holder(None), Op::Forget(attempt("T3", 1).subject)]).await;
     bench.restart().await;

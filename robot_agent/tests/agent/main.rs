@@ -2,6 +2,7 @@
 
 mod bases;
 mod chaos;
+mod device;
 mod drives;
 mod lanes;
 mod offers;

@@ -1,5 +1,6 @@
 //! The shell against a server that the test plays, over pipes in memory and on tokio's paused clock.
 
+use crate::release::{Releases, component};
 use crate::rig::{TestBody, attempt, goto, point, waypoint, welcome};
 use async_trait::async_trait;
 use hyper_util::rt::TokioIo;
@@ -8,9 +9,16 @@ use midshift_agent::bugs::Bugs;
 use midshift_agent::core::ExitReason;
 use midshift_agent::dial::{self, Cut, Dial};
 use midshift_agent::memory::MemoryStore;
-use midshift_agent::session::{AgentConfig, Error, run};
+use midshift_agent::session::{AgentConfig, Error, Updates, run};
+use midshift_agent::sets::memory::MemorySets;
+use midshift_agent::sets::{Sets, Wanted};
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::store::Store;
+use midshift_agent::update::io::UpdateWorker;
+use midshift_bundle::digest::Digest;
+use midshift_bundle::installed;
+use midshift_bundle::manifest::ComponentKind;
+use midshift_bundle::set::SetManifest;
 use midshift_core::authority::Authority;
 use midshift_core::ids::RobotId;
 use midshift_core::reason::Code;
@@ -146,13 +154,16 @@ struct Bench {
 
 impl Bench {
     fn new(store: Box<dyn Store>) -> Self {
+        Self::with(store, None)
+    }
+    fn with(store: Box<dyn Store>, update: Option<Updates>) -> Self {
         let (ends, incoming) = mpsc::channel(4);
         let (seen, sessions) = mpsc::channel(4);
         let (network, up) = watch::channel(true);
         let incoming = ReceiverStream::new(incoming);
         tokio::spawn(Server::builder().add_service(LinkServiceServer::new(Desk(seen))).serve_with_incoming(incoming));
         let config = AgentConfig {
-            update: None,
+            update,
             robot_id: RobotId::parse("rbt-01").expect("a name"),
             boot_id: "boot-1".into(),
             new_ring_id: "ring-1".into(),
@@ -325,4 +336,54 @@ async fn a_robot_on_its_file_takes_work_over_the_wire_and_does_it() {
     bench.end().await;
     let kept = SqliteStore::open(&path).await.expect("opens").load("other").await.expect("loads");
     assert!(kept.ledger.finished(&attempt("T1", 1).subject).is_some());
+}
+
+/// Sets of a robot that committed one beside what it came with.
+fn one_set() -> MemorySets {
+    let mut sets = MemorySets::new();
+    let content = b"settings 1.1.0";
+    let wanted = Wanted { digest: Digest::of(content), length: content.len() as u64 };
+    sets.write(&wanted, 0, content).expect("writes");
+    sets.sync(&wanted).expect("syncs");
+    sets.seal(&wanted).expect("seals");
+    let part = component("behaviour", "1.1.0", ComponentKind::Config, content);
+    let set = SetManifest {
+        bundle: Some(Digest::of(b"bundle")),
+        version: "walk 1.1.0".to_owned(),
+        components: [(part.name.clone(), part)].into(),
+    };
+    sets.stage(&set).expect("stages");
+    let mut switch = sets.holdings().expect("tells").switch;
+    switch.try_out(&set.id().to_string());
+    switch.commit();
+    sets.write_switch(&mut switch).expect("switches");
+    sets
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_signs_what_it_has_installed_in_its_first_hello_with_a_key_that_it_keeps() {
+    let (store, releases) = (MemoryStore::new(), Releases::new());
+    let mut keys = Vec::new();
+    for _ in 0..2 {
+        let worker = UpdateWorker::new(Box::new(one_set()), Arc::new(releases.clone()));
+        let update = Updates { config: releases.config(), worker: Box::new(worker) };
+        let mut bench = Bench::with(Box::new(store.clone()), Some(update));
+        let hello = bench.session().await.hello().await;
+        let said = installed::open(&hello.installed, &hello.robot_id, &hello.boot_id).expect("is believed");
+        let running = said.running_set().expect("is listed");
+        assert_eq!((running.version.as_str(), said.running == said.current), ("walk 1.1.0", true));
+        assert_eq!(running.components.get("behaviour").map(String::as_str), Some("1.1.0"));
+        assert_eq!(said.previous.map(|set| set.to_string()).as_deref(), Some("factory"));
+        keys.push(said.device_key);
+        bench.end().await;
+    }
+    assert_eq!(keys[0], keys[1]);
+    assert_eq!(store.kept().and_then(|kept| kept.ledger.device).map(|key| key.public()), Some(keys.remove(0)));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_whose_software_is_not_changed_says_nothing_of_it() {
+    let mut bench = Bench::new(Box::new(MemoryStore::new()));
+    assert_eq!(bench.session().await.hello().await.installed, "");
+    bench.end().await;
 }

@@ -2,10 +2,12 @@
 
 use crate::Inner;
 use crate::registry::InCharge;
+use midshift_bundle::installed::{self, Rejection};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::robot::Lane;
 use midshift_core::rows::{Expect, Fact, Item, Log, Record, Revision, Writer};
+use midshift_core::update::Installed;
 use midshift_core::work::{LaneMark, Session};
 use midshift_proto::session::{Hello, LaneAck, PROTOCOL_VERSION, Welcome};
 use midshift_store::{CommitError, load};
@@ -77,7 +79,9 @@ pub async fn begin(inner: &Inner, hello: &Hello) -> Result<Begun, Refusal> {
         let live = inner.parts.board.get(&hello.robot_id);
         let measured = live.and_then(|live| live.clock_offset_ms).map(|(offset, _)| offset);
         let clock_offset_ms = measured.or(row.as_ref().and_then(|(row, _)| row.clock_offset_ms));
-        let session = Session { clock_offset_ms, ..session_row(hello, session_epoch) };
+        let known = row.as_ref().and_then(|(row, _)| row.device_key.clone());
+        let said = judge(hello, known);
+        let session = Session { clock_offset_ms, ..session_row(hello, session_epoch, &said) };
         let mut item = Item::new(Writer::Telemetry, hello.robot_id.as_str());
         item.put(&session, row.map_or(Expect::Absent, |(_, revision)| Expect::At(revision)), "session.begun");
         match store.commit(vec![item]).await.pop() {
@@ -86,6 +90,7 @@ pub async fn begin(inner: &Inner, hello: &Hello) -> Result<Begun, Refusal> {
             Some(Err(error)) => return Err(unavailable(error)),
             None => return Err(unavailable("the store gave no answer")),
         }
+        told(hello, &said);
         let in_charge = InCharge::new(session_epoch, now.link);
         if !inner.registry.take_charge(&hello.robot_id, in_charge.clone()) {
             continue;
@@ -106,7 +111,51 @@ fn draw_secret() -> String {
     format!("{:032x}", rand::random::<u128>())
 }
 
-fn session_row(hello: &Hello, session_epoch: u64) -> Session {
+/// What a Hello says of the robot's software, held against the key that its machine is known by.
+#[derive(Default)]
+struct Said {
+    installed: Option<Installed>,
+    device_key: Option<String>,
+    /// Another key signed it.
+    other_key: Option<String>,
+    /// It cannot be believed at all.
+    rejection: Option<Rejection>,
+}
+
+/// Believes what the known key signed, and the first key that is ever seen. The session goes on in any case: work is no matter of this key.
+fn judge(hello: &Hello, known: Option<String>) -> Said {
+    if hello.installed.is_empty() {
+        return Said { device_key: known, ..Said::default() };
+    }
+    match installed::open(&hello.installed, &hello.robot_id, &hello.boot_id) {
+        Err(rejection) => Said { device_key: known, rejection: Some(rejection), ..Said::default() },
+        Ok(installed) => {
+            let key = installed.device_key.clone();
+            match known {
+                Some(known) if known != key => {
+                    Said { device_key: Some(known), other_key: Some(key), ..Said::default() }
+                }
+                _ => Said { device_key: Some(key), installed: Some(installed), ..Said::default() },
+            }
+        }
+    }
+}
+
+/// What was not believed, for people.
+fn told(hello: &Hello, said: &Said) {
+    let robot_id = &hello.robot_id;
+    if let Some(other_key) = &said.other_key {
+        metrics::counter!("midshift_telemetry_device_keys_changed_total").increment(1);
+        let device_key = said.device_key.as_deref().unwrap_or_default();
+        tracing::warn!(%robot_id, device_key, other_key, "another machine's key signed what this robot says it has installed: not believed");
+    }
+    if let Some(rejection) = &said.rejection {
+        metrics::counter!("midshift_telemetry_installed_rejected_total").increment(1);
+        tracing::warn!(%robot_id, %rejection, "what this robot says it has installed is not believed");
+    }
+}
+
+fn session_row(hello: &Hello, session_epoch: u64, said: &Said) -> Session {
     Session {
         robot_id: hello.robot_id.clone(),
         session_epoch,
@@ -118,6 +167,9 @@ fn session_row(hello: &Hello, session_epoch: u64) -> Session {
         applied_update: hello.reported.applied_update,
         places: hello.reported.places.clone(),
         clock_offset_ms: None,
+        installed: said.installed.clone(),
+        device_key: said.device_key.clone(),
+        device_key_changed: said.other_key.is_some(),
     }
 }
 

@@ -10,15 +10,16 @@ use midshift_agent::trust::Trust;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::directive::{Directive, LIFE_MS};
 use midshift_bundle::folder::Folder;
+use midshift_bundle::installed;
 use midshift_bundle::keys::SecretKey;
 use midshift_bundle::repository::listed;
 use midshift_core::authority::Authority;
-use midshift_core::ids::DrainId;
+use midshift_core::ids::{DrainId, SetId};
 use midshift_core::reason::Code;
 use midshift_core::robot::Lane;
 use midshift_core::site::{CORRIDOR, text};
 use midshift_core::time::{Clock, ScaledClock, Utc};
-use midshift_core::update::{ActivationGrant, DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState};
+use midshift_core::update::{ActivationGrant, DesiredUpdate, Goal, Installed, UpdateEvent, UpdateReport, UpdateState};
 use midshift_core::work::{DesiredWork, InboxItem, RobotEvent, SampleBody};
 use midshift_ota::{OtaService, Parts};
 use midshift_proto::convert::parse;
@@ -112,6 +113,8 @@ struct Bench {
     /// What the robot said of its newest update, and the states it said since [`Bench::update`] began.
     newest: Option<UpdateReport>,
     states: Vec<UpdateState>,
+    /// What it said at its last Hello that it has installed.
+    installed: Option<Installed>,
     _server: AbortOnDropHandle<Result<(), tonic::transport::Error>>,
     _robots: DropGuard,
 }
@@ -186,6 +189,7 @@ impl Bench {
             directives: 0,
             newest: None,
             states: Vec::new(),
+            installed: None,
             _server: server,
             _robots: shutdown.drop_guard(),
         })
@@ -240,6 +244,7 @@ impl Bench {
                 None => self.session = None,
                 Some(FromRobot::Hello(hello)) => {
                     self.epoch += 1;
+                    self.installed = Some(installed::open(&hello.installed, &hello.robot_id, &hello.boot_id)?);
                     self.note(hello.reported.update);
                     self.say(ToRobot::Welcome(welcome(self.epoch))).await?;
                 }
@@ -359,6 +364,10 @@ async fn a_robot_of_a_swarm_takes_good_releases_and_behaves_as_they_say() -> any
         assert!(way.iter().all(|state| states.contains(state)), "{states:?}");
         assert_eq!(bench.software(), of_sample(version));
     }
+    // It said so when it was on trial, and that it keeps the one before.
+    let installed = bench.installed.context("was said")?;
+    let version = |set: &SetId| installed.sets.iter().find(|s| s.set == *set).map(|s| s.version.as_str());
+    assert_eq!((version(&installed.running), version(&installed.current)), (Some("walk 1.5.1"), Some("walk 1.5.0")));
     Ok(())
 }
 

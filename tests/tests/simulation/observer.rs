@@ -487,6 +487,7 @@ fn kind(op: &Op) -> &'static str {
         Op::Maintenance(_) => "maintenance",
         Op::Software(_) => "software",
         Op::Trusted(_) => "trusted",
+        Op::Device(_) => "device",
         Op::Epoch(..) => "epoch",
         Op::Finish(..) => "finish",
         Op::Closed(_) => "closed",

@@ -169,7 +169,7 @@ fn control_line(control: &fleet::RobotControl) -> String {
 }
 
 /// Columns of a robot.
-const HEADER: [&str; 8] = ["ROBOT", "PRESENCE", "AT", "BATTERY", "LOAD", "WORK", "SPEED", "AGE"];
+const HEADER: [&str; 9] = ["ROBOT", "PRESENCE", "SOFTWARE", "AT", "BATTERY", "LOAD", "WORK", "SPEED", "AGE"];
 
 fn row(robot: &v1::Robot) -> Vec<String> {
     let reported = robot.reported.clone().unwrap_or_default();
@@ -185,6 +185,7 @@ fn row(robot: &v1::Robot) -> Vec<String> {
     vec![
         robot.robot_id.clone(),
         presence(robot),
+        robot.inventory.as_ref().map(|inventory| inventory.software.clone()).unwrap_or_default(),
         vitals.waypoint.clone(),
         format!("{:.0} %{}", f64::from(vitals.battery_permille) / 10.0, if vitals.charging { " +" } else { "" }),
         reported.load.as_ref().map(|l| l.item.clone()).unwrap_or_default(),
@@ -244,6 +245,7 @@ async fn get(one: &One, out: &Out) -> Result<(), Exit> {
                 out.line("another machine is attached under this name; it gets no work");
             }
             out.line(&control_line(&control));
+            software_lines(&robot).iter().for_each(|line| out.line(line));
         }
         Format::Name => out.line(&robot.robot_id),
         Format::Json | Format::Jsonl => {
@@ -251,6 +253,33 @@ async fn get(one: &One, out: &Out) -> Result<(), Exit> {
         }
     }
     Ok(())
+}
+
+/// The sets of software on a robot, and what speaks against believing it.
+fn software_lines(robot: &v1::Robot) -> Vec<String> {
+    let mut lines = Vec::new();
+    if robot.device_key_changed {
+        lines.push("another machine's key signed what it says it has installed: not believed".to_owned());
+    }
+    let Some(installed) = &robot.installed else { return lines };
+    let role = |set: &str| match set {
+        _ if set == installed.running && set != installed.current => "on trial",
+        _ if set == installed.running => "runs",
+        _ if set == installed.current || set == installed.previous => "kept",
+        _ => "staged",
+    };
+    let words = |set: &str, version: &str| {
+        let name = if version.is_empty() { "what it came with" } else { version };
+        format!("software  {:<8}  {name}  {}", role(set), set.get(..12).unwrap_or(set))
+    };
+    for named in [&installed.running, &installed.current, &installed.previous] {
+        if !named.is_empty() && !installed.sets.iter().any(|s| s.set == *named) {
+            let line = words(named, "");
+            lines.extend((!lines.contains(&line)).then_some(line));
+        }
+    }
+    lines.extend(installed.sets.iter().map(|s| words(&s.set, &s.version)));
+    lines
 }
 
 /// What the robot says and what was decided about it, in one document.

@@ -80,7 +80,7 @@ pub struct Robot {
     hb: u64,
 }
 
-fn hello(previous: Option<Previous>) -> Result<Hello> {
+pub fn hello(previous: Option<Previous>) -> Result<Hello> {
     Ok(Hello {
         robot_id: RobotId::parse("r1")?,
         boot_id: "boot".into(),
@@ -93,13 +93,17 @@ fn hello(previous: Option<Previous>) -> Result<Hello> {
         sent_unix_ms: 0,
         clock_rate_permille: 1000,
         protocol_versions: vec![1],
+        installed: String::new(),
     })
 }
 
 impl Robot {
     pub async fn attach(world: &World, previous: Option<Previous>) -> Result<Self> {
+        Self::attach_saying(world, hello(previous)?).await
+    }
+    pub async fn attach_saying(world: &World, hello: Hello) -> Result<Self> {
         let (up, outbound) = mpsc::channel(16);
-        up.send((&FromRobot::Hello(Box::new(hello(previous)?))).into()).await?;
+        up.send((&FromRobot::Hello(Box::new(hello))).into()).await?;
         let mut down =
             LinkServiceClient::new(world.channel.clone()).session(ReceiverStream::new(outbound)).await?.into_inner();
         let first = down.message().await?.ok_or("no welcome")?;

@@ -228,6 +228,9 @@ impl Robot {
             applied_work: self.applied,
             places: self.places.clone(),
             clock_offset_ms: None,
+            installed: None,
+            device_key: None,
+            device_key_changed: false,
         }
     }
     pub(super) fn lane_mark(&self) -> LaneMark {
