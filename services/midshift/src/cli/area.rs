@@ -1,5 +1,7 @@
 //! `midshift area …`: live rules of areas.
 
+mod software;
+
 use super::client::{Call, Change, Exit, unary};
 use super::out::Out;
 use clap::Subcommand;
@@ -40,6 +42,8 @@ pub enum Verb {
         #[arg(long)]
         charge_callable_above: Option<u32>,
         #[command(flatten)]
+        software: software::Rules,
+        #[command(flatten)]
         change: Change,
     },
 }
@@ -62,6 +66,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             charge_idle_below,
             charge_to,
             charge_callable_above,
+            software,
             change,
         } => {
             let permille = |percent: Option<u32>| percent.map(|p| p.saturating_mul(10));
@@ -75,6 +80,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
                 charge_opportunistic_permille: permille(charge_idle_below).or(old.charge_opportunistic_permille),
                 charge_stop_permille: permille(charge_to).or(old.charge_stop_permille),
                 charge_preemptible_permille: permille(charge_callable_above).or(old.charge_preemptible_permille),
+                software: Some(software.over(old.software.unwrap_or_default())),
                 ..old
             };
             let request = v1::PutAreaPolicyRequest {
@@ -103,7 +109,7 @@ fn show(policy: &v1::AreaPolicy, out: &Out) -> Result<(), Exit> {
             percent(policy.charge_opportunistic_permille),
             percent(policy.charge_stop_permille),
             percent(policy.charge_preemptible_permille)
-        )
+        ) + &software::shown(&policy.software.clone().unwrap_or_default())
     })?;
     Ok(())
 }

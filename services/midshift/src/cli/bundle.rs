@@ -1,8 +1,8 @@
-//! `midshift bundle …`: what release people do with keys and bundles. Only `push` and `ls` need a server.
+//! `midshift bundle …`: what release people do with keys and bundles. Only `push`, `ls` and `revoke` need a server.
 
-use super::client::{Call, Exit, unary};
+use super::client::{Call, Exit};
 use super::out::{Format, Out};
-use super::push;
+use super::{push, released};
 use crate::clock;
 use crate::samples::{self, Signer};
 use clap::{Subcommand, ValueEnum};
@@ -12,7 +12,6 @@ use midshift_bundle::folder::{Error, Folder, Signed};
 use midshift_bundle::keys::SecretKey;
 use midshift_bundle::manifest::Manifest;
 use midshift_bundle::repository::Profile;
-use midshift_proto::ota::v1;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 
@@ -88,10 +87,20 @@ pub enum Verb {
         #[command(flatten)]
         call: Call,
     },
-    /// List the bundles that the server has.
+    /// List the bundles that the server has, with the robots that keep or try each.
     Ls {
         #[command(flatten)]
         call: Call,
+    },
+    /// Take a bundle back: its roll-outs stand still and nobody gets it any more. Robots that run it go on.
+    Revoke {
+        #[command(flatten)]
+        call: Call,
+        /// As NAME-VERSION or by its SHA-256.
+        bundle: String,
+        /// Why.
+        #[arg(long)]
+        reason: String,
     },
 }
 
@@ -159,7 +168,8 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Inspect { bundle } => show(&build::inspect(&bundle).map_err(|e| does_not_hold(e.into()))?, out),
         Verb::Verify { repository } => verify(&repository, out),
         Verb::Push { repository, call } => push::run(&repository, &call, out).await,
-        Verb::Ls { call } => list(&call, out).await,
+        Verb::Ls { call } => released::list(&call, out).await,
+        Verb::Revoke { call, bundle, reason } => released::revoke(&call, bundle, reason, out).await,
     }
 }
 
@@ -261,27 +271,6 @@ fn verify(repository: &Path, out: &Out) -> Result<(), Exit> {
         }
     }
     Ok(())
-}
-
-async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
-    let mut client = call.bundles().await?;
-    let mut whole = v1::ListBundlesResponse::default();
-    loop {
-        let request = v1::ListBundlesRequest { page_size: 1_000, page_token: whole.next_page_token };
-        let page = client.list_bundles(unary(request)).await?.into_inner();
-        whole.bundles.extend(page.bundles);
-        whole.next_page_token = page.next_page_token;
-        if whole.next_page_token.is_empty() {
-            break;
-        }
-    }
-    let header = ["BUNDLE", "VERSION", "COMPONENTS", "BYTES", "PUBLISHED", "SHA-256"];
-    let row = |b: &v1::Bundle| {
-        let published = b.publish_time.map(|t| t.to_string()).unwrap_or_default();
-        let (count, length) = (b.components.len().to_string(), b.length.to_string());
-        vec![b.name.clone(), b.version.clone(), count, length, published, b.digest.clone()]
-    };
-    Ok(out.many(&whole, &whole.bundles, |b| b.digest.clone(), &header, row)?)
 }
 
 fn row(bundle: &Manifest) -> Vec<String> {

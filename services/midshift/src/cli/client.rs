@@ -5,6 +5,7 @@ use crate::robots::uri;
 use midshift_core::reason::{Kind, Refusal};
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
+use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::sim::v1::sim_service_client::SimServiceClient;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
@@ -45,6 +46,24 @@ impl Exit {
     /// Bad arguments.
     pub fn usage(text: impl Into<String>) -> Self {
         Self::new(2, text)
+    }
+    /// The code.
+    pub fn code(&self) -> u8 {
+        self.code
+    }
+    /// The same end with the facts that the server sent beside its sentence: which roll-out, how many robots for which reason.
+    pub fn with_facts(status: Status) -> Self {
+        let facts = midshift_proto::refusal_of(&status).metadata;
+        let mut exit = Self::from(status);
+        let told: String = facts.iter().map(|(key, value)| format!("\n  {key}: {value}")).collect();
+        let at = exit.text.find("\n  try: ").unwrap_or(exit.text.len());
+        exit.text.insert_str(at, &told);
+        exit
+    }
+    /// The same end with one more thing to try.
+    pub fn or_try(mut self, what: &str) -> Self {
+        self.text += &format!("\n  try: {what}");
+        self
     }
     /// Says why and gives the code.
     pub fn report(&self, out: &Out) -> ExitCode {
@@ -137,6 +156,10 @@ impl Call {
     /// Releases of software.
     pub async fn bundles(&self) -> Result<BundleServiceClient<Channel>, Exit> {
         Ok(BundleServiceClient::new(self.channel().await?).max_decoding_message_size(64 * 1024 * 1024))
+    }
+    /// Roll-outs of software.
+    pub async fn rollouts(&self) -> Result<RolloutServiceClient<Channel>, Exit> {
+        Ok(RolloutServiceClient::new(self.channel().await?).max_decoding_message_size(64 * 1024 * 1024))
     }
     /// Faults of the simulator.
     pub async fn sim(&self) -> Result<SimServiceClient<Channel>, Exit> {

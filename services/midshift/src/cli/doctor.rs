@@ -2,8 +2,14 @@
 
 use super::client::{Call, Exit, unary};
 use super::out::{Format, Out, columns};
+use crate::clock;
+use midshift_bundle::freshness::{newest_targets, root_edition, stamp, targets_edition};
+use midshift_bundle::repository::TIMESTAMP_LIFE_MS;
+use midshift_core::time::Utc;
+use midshift_proto::ota::v1::GetMetadataRequest;
 use midshift_proto::task::v1::{ListTasksRequest, TaskFilter, TaskState};
 use midshift_proto::telemetry::v1;
+use tonic::Code;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
@@ -12,12 +18,23 @@ const SKEW_MAX_MS: i64 = 2_000;
 /// Descriptors a server for a thousand robots should have.
 const DESCRIPTORS_WANTED: u64 = 4_096;
 
+/// People are told so long before a document that they sign ends, milliseconds: 60 days.
+const PEOPLE_TOLD_MS: u64 = 60 * DAY_MS;
+/// The server signs a timestamp anew at half its life; with less than a quarter left it does not.
+const TIMESTAMP_LEFT_MS: u64 = TIMESTAMP_LIFE_MS / 4;
+/// Root documents that are followed, one after the other, as robots do.
+const ROOTS_MAX: u64 = 1_024;
+/// Milliseconds of a day.
+const DAY_MS: u64 = 24 * 3_600_000;
+
 /// Every service of a server.
-const SERVICES: [&str; 4] = [
+const SERVICES: [&str; 6] = [
     "midshift.task.v1.TaskService",
     "midshift.fleet.v1.FleetService",
     "midshift.telemetry.v1.TelemetryService",
     "midshift.link.v1.LinkService",
+    "midshift.ota.v1.BundleService",
+    "midshift.ota.v1.RolloutService",
 ];
 
 struct Finding {
@@ -91,7 +108,87 @@ async fn server(call: &Call, found: &mut Vec<Finding>) -> Result<(), Exit> {
     found.push(store(call).await);
     found.extend(robots(call).await?);
     found.push(operator(call).await?);
+    found.extend(releases(call).await);
     Ok(())
+}
+
+/// When what was signed ends: root and targets, which people sign, and the timestamp, which the server signs.
+async fn releases(call: &Call) -> Vec<Finding> {
+    match documents(call).await {
+        Ok(ends) => ends.into_iter().map(|end| end.finding(clock::wall())).collect(),
+        Err(finding) => vec![finding],
+    }
+}
+
+/// A document that ends.
+struct End {
+    role: &'static str,
+    version: u64,
+    expires: Utc,
+    /// It wants a look with less than this left, milliseconds.
+    told_ms: u64,
+    /// What to do then.
+    then: &'static str,
+}
+
+impl End {
+    fn finding(&self, now: Utc) -> Finding {
+        let left_ms = self.expires.ms_since(now);
+        let good = left_ms > self.told_ms;
+        let left = match left_ms {
+            0 => "it has EXPIRED".to_owned(),
+            ms if ms < 2 * DAY_MS => format!("{} h are left", ms / 3_600_000),
+            ms => format!("{} days are left", ms / DAY_MS),
+        };
+        let then = if good { String::new() } else { format!("; {}", self.then) };
+        let text = format!("{} {} ends {}: {left}{then}", self.role, self.version, self.expires.rfc3339());
+        Finding { what: "keys", good, text }
+    }
+}
+
+/// What the server shows, newest of each; an error is what there is to say instead.
+async fn documents(call: &Call) -> Result<Vec<End>, Finding> {
+    let bad = |text: String| Finding { what: "keys", good: false, text };
+    let mut client = call.bundles().await.map_err(|e| bad(e.to_string()))?;
+    let mut get = async |name: String| match client.get_metadata(unary(GetMetadataRequest { name: name.clone() })).await
+    {
+        Ok(answer) => Ok(Some(answer.into_inner().document)),
+        Err(status) if status.code() == Code::NotFound => Ok(None),
+        Err(status) if status.code() == Code::FailedPrecondition => Err(Finding {
+            what: "keys",
+            good: true,
+            text: "this server keeps no software: it has no online keys".to_owned(),
+        }),
+        Err(status) => Err(bad(format!("{name} cannot be read: {}", status.message()))),
+    };
+    let Some(timestamp) = get("timestamp.json".to_owned()).await? else {
+        return Err(Finding { what: "keys", good: true, text: "no release was published yet".to_owned() });
+    };
+    let unread = |e: midshift_bundle::repository::Error| bad(e.to_string());
+    let lost = |name: &str| bad(format!("the server lost its {name}"));
+    let mut root = None;
+    for version in 1..=ROOTS_MAX {
+        let Some(document) = get(format!("{version}.root.json")).await? else { break };
+        root = Some(document);
+    }
+    let root = root_edition(&root.ok_or_else(|| lost("root"))?).map_err(unread)?;
+    let stamp = stamp(&timestamp).map_err(unread)?;
+    let snapshot = get(format!("{}.snapshot.json", stamp.snapshot_version)).await?.ok_or_else(|| lost("snapshot"))?;
+    let version = newest_targets(&snapshot).map_err(unread)?;
+    let targets = get(format!("{version}.targets.json")).await?.ok_or_else(|| lost("targets"))?;
+    let targets = targets_edition(&targets).map_err(unread)?;
+    let people = |role, version, expires, then| End { role, version, expires, told_ms: PEOPLE_TOLD_MS, then };
+    Ok(vec![
+        people("root", root.version, root.expires, "sign a new root, see docs/runbooks"),
+        people("targets", targets.version, targets.expires, "sign a release: midshift bundle sign"),
+        End {
+            role: "timestamp",
+            version: stamp.version,
+            expires: stamp.expires,
+            told_ms: TIMESTAMP_LEFT_MS,
+            then: "the server does not sign it anew: look at its log and its clock",
+        },
+    ])
 }
 
 /// Intake answers this from the store's rows, not from memory.
@@ -131,4 +228,23 @@ async fn operator(call: &Call) -> Result<Finding, Exit> {
         good: tasks == 0,
         text: format!("{tasks} tasks need an operator: midshift task ls --state needs-operator"),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn people_are_told_sixty_days_before_what_they_sign_ends() {
+        let found = |days: u64| {
+            let expires = Utc(0).plus_ms(100 * DAY_MS);
+            let end = End { role: "root", version: 3, expires, told_ms: PEOPLE_TOLD_MS, then: "sign a new root" };
+            end.finding(Utc(0).plus_ms((100 - days) * DAY_MS))
+        };
+        let (early, late, over) = (found(61), found(60), found(0));
+        assert_eq!([early.good, late.good, over.good], [true, false, false]);
+        assert_eq!(early.text, "root 3 ends 1970-04-11T00:00:00.000Z: 61 days are left");
+        assert_eq!(late.text, "root 3 ends 1970-04-11T00:00:00.000Z: 60 days are left; sign a new root");
+        assert!(over.text.contains("it has EXPIRED; sign a new root"), "{}", over.text);
+    }
 }

@@ -9,7 +9,10 @@ mod incident;
 mod map;
 mod out;
 mod push;
+mod quarantine;
+mod released;
 mod robot;
+mod rollout;
 mod sim;
 mod task;
 mod zone;
@@ -89,6 +92,12 @@ enum Command {
     /// Signed software for robots: keys, building, signing, checking, bringing it to the server.
     #[command(subcommand)]
     Bundle(bundle::Verb),
+    /// Roll-outs of software over robots at work, in waves: write one down, check, begin, watch, judge, take back.
+    #[command(subcommand)]
+    Rollout(Box<rollout::Verb>),
+    /// Bundles that robots went back from and do not get again.
+    #[command(subcommand)]
+    Quarantine(quarantine::Verb),
     /// Look for what may be wrong: server, store, robots, this machine.
     Doctor(Call),
     /// What a reason means and what to try.
@@ -162,6 +171,8 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Area(verb) => area::run(verb, out).await,
         Command::Map(verb) => map::run(verb, out),
         Command::Bundle(verb) => bundle::run(verb, out).await,
+        Command::Rollout(verb) => rollout::run(*verb, out).await,
+        Command::Quarantine(verb) => quarantine::run(verb, out).await,
         Command::Doctor(call) => doctor::run(&call, out).await,
         Command::ExplainError { code } => explain::error(code.as_deref(), out),
     }

@@ -2,11 +2,13 @@
 
 use super::client::{Call, Change, Exit, unary};
 use super::out::{Format, Out};
+use super::rollout;
 use clap::Subcommand;
 use midshift_core::time::Utc;
 use midshift_proto::fleet::v1 as fleet;
 use midshift_proto::json;
 use midshift_proto::link::v1 as link;
+use midshift_proto::ota::v1 as ota;
 use midshift_proto::telemetry::v1;
 use std::time::Duration;
 
@@ -81,6 +83,40 @@ pub enum Verb {
         #[command(flatten)]
         change: Change,
     },
+    /// Out of the fleet for good: no work, and no roll-out or drain waits for it any more.
+    Retire {
+        #[command(flatten)]
+        one: One,
+        /// Why.
+        #[arg(long)]
+        reason: String,
+        /// Only if it is still as this etag says.
+        #[arg(long, default_value = "")]
+        if_match: String,
+        #[command(flatten)]
+        change: Change,
+    },
+    /// Keep it at the software that it runs.
+    Pin {
+        #[command(flatten)]
+        one: One,
+        /// Why.
+        #[arg(long)]
+        reason: String,
+    },
+    /// Let it take part in roll-outs again.
+    Unpin(One),
+    /// Leave it out of a roll-out that did not take it out of work yet.
+    Exclude {
+        #[command(flatten)]
+        one: One,
+        /// Of which roll-out.
+        #[arg(long, value_name = "ROLLOUT_ID")]
+        from: String,
+        /// Why.
+        #[arg(long, default_value = "")]
+        reason: String,
+    },
 }
 
 /// One robot.
@@ -149,7 +185,52 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             control(&answer.control.unwrap_or_default(), out)?;
             Ok(())
         }
+        Verb::Retire { one, reason, if_match, change } => {
+            let request = fleet::RetireRobotRequest {
+                robot_id: one.robot_id.clone(),
+                request_id: change.request_id,
+                etag: if_match,
+                reason,
+                validate_only: change.dry_run,
+            };
+            let answer = one.call.fleet().await?.retire_robot(unary(request)).await?.into_inner();
+            control(&answer.control.unwrap_or_default(), out)?;
+            out.next(&format!("midshift robot uncordon {} brings it back", one.robot_id));
+            Ok(())
+        }
+        Verb::Pin { one, reason } => {
+            let request = ota::PinRobotRequest { robot_id: one.robot_id.clone(), reason };
+            let answer = one.call.rollouts().await?.pin_robot(unary(request)).await.map_err(Exit::with_facts)?;
+            software(&answer.into_inner().software.unwrap_or_default(), out)?;
+            out.next(&format!("midshift robot unpin {}", one.robot_id));
+            Ok(())
+        }
+        Verb::Unpin(one) => {
+            let request = ota::UnpinRobotRequest { robot_id: one.robot_id.clone() };
+            let answer = one.call.rollouts().await?.unpin_robot(unary(request)).await.map_err(Exit::with_facts)?;
+            software(&answer.into_inner().software.unwrap_or_default(), out)
+        }
+        Verb::Exclude { one, from, reason } => rollout::exclude(&one.call, from, one.robot_id, reason, out).await,
     }
+}
+
+/// What a robot runs, in words.
+fn software(software: &ota::RobotSoftware, out: &Out) -> Result<(), Exit> {
+    let short = |bundle: &str| bundle.chars().take(12).collect::<String>();
+    out.one(software, &software.robot_id, || {
+        let or = |text: &str, none: &str| if text.is_empty() { none.to_owned() } else { short(text) };
+        let version = if software.version.is_empty() { "no version reported" } else { &software.version };
+        let keeps = or(&software.committed, "what it came with");
+        let mut text = format!("{}  runs {version}, keeps {keeps}", software.robot_id);
+        if !software.on_trial.is_empty() {
+            text += &format!(", tries {}", short(&software.on_trial));
+        }
+        match &software.pin {
+            Some(pin) => text + &format!("  pinned by {} ({})", pin.actor, pin.reason),
+            None => text + "  not pinned",
+        }
+    })?;
+    Ok(())
 }
 
 fn control(control: &fleet::RobotControl, out: &Out) -> anyhow::Result<()> {

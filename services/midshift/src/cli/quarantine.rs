@@ -1,0 +1,87 @@
+//! `midshift quarantine …`: bundles that robots went back from.
+
+use super::client::{Call, Exit, unary};
+use super::out::Out;
+use clap::Subcommand;
+use midshift_proto::convert::time_of;
+use midshift_proto::ota::v1;
+
+/// Verbs of quarantines.
+#[derive(Subcommand)]
+pub enum Verb {
+    /// List which robots went back from which bundles, and why.
+    Ls {
+        #[command(flatten)]
+        call: Call,
+    },
+    /// You have looked: the robot may have the bundle again.
+    Lift {
+        #[command(flatten)]
+        call: Call,
+        /// Whose.
+        robot_id: String,
+        /// As NAME-VERSION or by its SHA-256.
+        bundle: String,
+    },
+}
+
+/// Runs one verb.
+pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
+    match verb {
+        Verb::Ls { call } => {
+            let mut client = call.rollouts().await?;
+            let mut whole = v1::ListQuarantinesResponse::default();
+            loop {
+                let request = v1::ListQuarantinesRequest { page_size: 1_000, page_token: whole.next_page_token };
+                let page = client.list_quarantines(unary(request)).await?.into_inner();
+                whole.quarantines.extend(page.quarantines);
+                whole.next_page_token = page.next_page_token;
+                if whole.next_page_token.is_empty() {
+                    break;
+                }
+            }
+            let header = ["ROBOT", "BUNDLE", "WHY", "SINCE", "ROLLOUT"];
+            out.many(&whole, &whole.quarantines, |q| format!("{} {}", q.robot_id, q.bundle), &header, row)?;
+            if let Some(first) = whole.quarantines.first() {
+                out.next(&format!("midshift quarantine lift {} {}", first.robot_id, named(first)));
+            }
+            Ok(())
+        }
+        Verb::Lift { call, robot_id, bundle } => {
+            let request = v1::LiftQuarantineRequest { robot_id: robot_id.clone(), bundle: bundle.clone() };
+            let answer = call.rollouts().await?.lift_quarantine(unary(request)).await.map_err(Exit::with_facts)?;
+            out.one(&answer.into_inner(), &robot_id, || format!("{robot_id} may have {bundle} again"))?;
+            out.next(
+                "midshift rollout ls; a completed roll-out tries it again with: midshift rollout retry ID --failed",
+            );
+            Ok(())
+        }
+    }
+}
+
+/// By name and version, else by digest.
+fn named(quarantine: &v1::Quarantine) -> &str {
+    if quarantine.bundle_label.is_empty() { &quarantine.bundle } else { &quarantine.bundle_label }
+}
+
+fn row(quarantine: &v1::Quarantine) -> Vec<String> {
+    vec![
+        quarantine.robot_id.clone(),
+        named(quarantine).to_owned(),
+        quarantine.reason.as_ref().map(|r| r.code.clone()).unwrap_or_default(),
+        quarantine.since.as_ref().map(|t| time_of(t).rfc3339()).unwrap_or_default(),
+        quarantine.rollout_id.clone(),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bundle_that_no_release_lists_any_more_is_called_by_its_digest() {
+        let listed = v1::Quarantine { bundle: "ab".into(), bundle_label: "walk-1.5.0".into(), ..Default::default() };
+        let unlisted = v1::Quarantine { bundle: "ab".into(), ..Default::default() };
+        assert_eq!([&listed, &unlisted].map(|q| row(q)[1].clone()), ["walk-1.5.0", "ab"]);
+    }
+}

@@ -1,0 +1,108 @@
+//! `midshift bundle ls` and `revoke`: bundles as the server has them, and who runs them.
+
+use super::client::{Call, Exit, unary};
+use super::out::{Format, Out};
+use midshift_proto::ota::v1;
+use std::collections::BTreeMap;
+
+/// Robots that keep a bundle, and robots that try it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Runs {
+    /// They keep it.
+    pub committed: u32,
+    /// They try it.
+    pub on_trial: u32,
+}
+
+/// Counts robots by the digest of what they run. One that tries a bundle is counted there and not at what it would go back to.
+pub fn runs(software: &[v1::RobotSoftware]) -> BTreeMap<&str, Runs> {
+    let mut runs: BTreeMap<&str, Runs> = BTreeMap::new();
+    for robot in software {
+        if !robot.on_trial.is_empty() {
+            runs.entry(&robot.on_trial).or_default().on_trial += 1;
+        } else if !robot.committed.is_empty() {
+            runs.entry(&robot.committed).or_default().committed += 1;
+        }
+    }
+    runs
+}
+
+/// Lists bundles.
+pub async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
+    let mut client = call.bundles().await?;
+    let mut whole = v1::ListBundlesResponse::default();
+    loop {
+        let request = v1::ListBundlesRequest { page_size: 1_000, page_token: whole.next_page_token };
+        let page = client.list_bundles(unary(request)).await?.into_inner();
+        whole.bundles.extend(page.bundles);
+        whole.next_page_token = page.next_page_token;
+        if whole.next_page_token.is_empty() {
+            break;
+        }
+    }
+    // Programs ask ListRobotSoftware themselves: the JSON is the answer about bundles and no more.
+    let software = if out.format == Format::Table { software(call).await? } else { Vec::new() };
+    let runs = runs(&software);
+    let header = ["BUNDLE", "VERSION", "COMPONENTS", "BYTES", "ROBOTS", "PUBLISHED", "SHA-256"];
+    let row = |b: &v1::Bundle| {
+        let published = b.publish_time.map(|t| t.to_string()).unwrap_or_default();
+        let (count, length) = (b.components.len().to_string(), b.length.to_string());
+        let robots = robots(runs.get(b.digest.as_str()).copied().unwrap_or_default());
+        vec![b.name.clone(), b.version.clone(), count, length, robots, published, b.digest.clone()]
+    };
+    Ok(out.many(&whole, &whole.bundles, |b| b.digest.clone(), &header, row)?)
+}
+
+fn robots(runs: Runs) -> String {
+    let all = runs.committed + runs.on_trial;
+    if runs.on_trial == 0 { all.to_string() } else { format!("{all} ({} on trial)", runs.on_trial) }
+}
+
+async fn software(call: &Call) -> Result<Vec<v1::RobotSoftware>, Exit> {
+    let mut client = call.rollouts().await?;
+    let (mut all, mut page_token) = (Vec::new(), String::new());
+    loop {
+        let request = v1::ListRobotSoftwareRequest { robot_id: String::new(), page_size: 1_000, page_token };
+        let page = client.list_robot_software(unary(request)).await?.into_inner();
+        all.extend(page.software);
+        page_token = page.next_page_token;
+        if page_token.is_empty() {
+            return Ok(all);
+        }
+    }
+}
+
+/// Takes a bundle back.
+pub async fn revoke(call: &Call, bundle: String, reason: String, out: &Out) -> Result<(), Exit> {
+    let request = v1::RevokeBundleRequest { bundle: bundle.clone(), reason };
+    let answer = call.rollouts().await?.revoke_bundle(unary(request)).await.map_err(Exit::with_facts)?.into_inner();
+    out.one(&answer, &answer.bundle, || {
+        let stand = match answer.rollout_ids.as_slice() {
+            [] => "no roll-out of it is open".to_owned(),
+            ids => format!("these roll-outs stand still: {}", ids.join(" ")),
+        };
+        format!("{bundle} is taken back: nobody gets it any more; {stand}")
+    })?;
+    match answer.rollout_ids.first() {
+        Some(id) => out.next(&format!("midshift rollout abort {id}; then sign a release without it")),
+        None => out.next("sign a release without it"),
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_robot_is_counted_at_the_bundle_that_it_runs_and_at_no_other() {
+        let robot = |committed: &str, on_trial: &str| v1::RobotSoftware {
+            committed: committed.to_owned(),
+            on_trial: on_trial.to_owned(),
+            ..v1::RobotSoftware::default()
+        };
+        let software = [robot("a", ""), robot("a", "b"), robot("b", ""), robot("", "b"), robot("", "")];
+        let counted: Vec<_> = runs(&software).into_iter().map(|(id, runs)| (id, robots(runs))).collect();
+        assert_eq!(counted, [("a", "1".to_owned()), ("b", "3 (2 on trial)".to_owned())]);
+    }
+}
