@@ -5,12 +5,14 @@
 use crate::harness::{Running, channel, free_port, midshift, until};
 use crate::room::{LIMIT, Room};
 use anyhow::Context;
-use midshift_proto::ota::v1::ListBundlesRequest;
 use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
+use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
+use midshift_proto::ota::v1::{ListBundlesRequest, ListRobotSoftwareRequest, ListRolloutRobotsRequest, RolloutStep};
 use midshift_proto::sim::v1::GetWorldRequest;
 use midshift_proto::sim::v1::sim_service_client::SimServiceClient;
 use midshift_proto::task::v1::TaskState;
 use serde_json::{Deserializer, Value};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
@@ -50,7 +52,7 @@ const LIST: &str = r#"{"task_id":"TASK-3","robot_id":"","type":"transport","prio
 const TABLE: &str = "task_type,from_waypoint,to_waypoint,timeout_seconds\ntransport,A,B,300\ntransport,A,B,soon\n";
 
 /// A release, and one that breaks rules.
-const RELEASE: &str = "name = \"walk\"\nversion = \"1.5.0\"\n[[component]]\nname = \"gait\"\nversion = \"1.5.0\"\nkind = \"process\"\nfile = \"gait\"\nhardware = [\"h1\"]\nneeds = \"restart\"\n";
+const RELEASE: &str = "name = \"walk\"\nversion = \"1.5.0\"\n[[component]]\nname = \"gait\"\nversion = \"1.5.0\"\nkind = \"process\"\nfile = \"gait\"\nhardware = [\"h1\", \"midshift-sim\"]\nneeds = \"restart\"\n";
 const BAD_RELEASE: &str = "name = \"Walk\"\nversion = \"1.5\"\n[[component]]\nname = \"gait\"\nversion = \"1.5.0\"\nkind = \"base\"\nfile = \"gait\"\nhardware = []\nneeds = \"park\"\n";
 
 fn bundles(dir: &Path) -> anyhow::Result<()> {
@@ -93,7 +95,7 @@ impl Transcript {
         self.asked(arguments);
         let value: Value = serde_json::from_str(&out).unwrap_or(Value::Null);
         match &value {
-            Value::Null => self.text += &out,
+            Value::Null => self.text += &timeless(&out),
             value => self.document(value)?,
         }
         self.text += &said;
@@ -127,14 +129,27 @@ impl Transcript {
     }
 }
 
-/// The same text without the values of flags that nobody may read anything into.
+/// The same text without times and without the values of flags that nobody may read anything into.
 fn hidden(text: &str) -> String {
-    let mut plain = text.to_owned();
-    for flag in ["--if-match ", "--page-token "] {
+    let mut plain = timeless(text);
+    for flag in ["--if-match ", "--page-token ", "  etag: "] {
         if let Some(at) = plain.find(flag).map(|at| at + flag.len()) {
             let end = plain[at..].find(char::is_whitespace).map_or(plain.len(), |n| at + n);
             plain.replace_range(at..end, "<opaque>");
         }
+    }
+    plain
+}
+
+/// The same text with each moment of RFC 3339 in milliseconds, all of which are as long, replaced by its kind.
+fn timeless(text: &str) -> String {
+    const LENGTH: usize = "2026-01-01T00:00:00.000Z".len();
+    let (mut plain, mut rest) = (String::new(), text);
+    while let Some(first) = rest.chars().next() {
+        let moment =
+            rest.get(..LENGTH).filter(|m| is_time(m) && m.bytes().all(|b| b.is_ascii_digit() || b"-:.TZ".contains(&b)));
+        plain += moment.map_or(first.to_string().as_str(), |_| "<time>");
+        rest = &rest[moment.map_or(first.len_utf8(), str::len)..];
     }
     plain
 }
@@ -153,6 +168,7 @@ fn plain(key: &str, value: &Value) -> Value {
         _ if OPAQUE.contains(&key) => "<opaque>".into(),
         _ if MEASURED.contains(&key) => "<measured>".into(),
         Value::String(text) if is_time(text) => "<time>".into(),
+        Value::String(text) => timeless(text).into(),
         other => other.clone(),
     }
 }
@@ -184,11 +200,13 @@ fn for_people(t: &mut Transcript) -> anyhow::Result<()> {
 }
 
 /// Software on a server without keys, and on one that has them.
-async fn releases(t: &mut Transcript) -> anyhow::Result<()> {
+async fn releases(room: &Room, t: &mut Transcript) -> anyhow::Result<()> {
     t.note(&["bundle", "ls"])?;
+    t.note(&["rollout", "ls"])?;
     let address = free_port()?;
     let mut command = Command::new(&t.program);
     command.args(["serve", "--data", "served", "--ota-keys", "keys", "--listen", &address.to_string()]);
+    command.args(["--site", "site.toml"]);
     let _serve = Running::start(command.current_dir(&t.dir), &t.dir.join("serve.log"))?;
     until("the server of software", LIMIT, || async {
         let mut client = BundleServiceClient::new(channel(address)?);
@@ -201,6 +219,7 @@ async fn releases(t: &mut Transcript) -> anyhow::Result<()> {
     t.note(&["bundle", "push", "repository"])?;
     t.note(&["bundle", "ls", "-o", "json"])?;
     t.note(&["bundle", "ls", "-o", "name"])?;
+    rollouts(room, t, address).await?;
     t.note(&["bundle", "keygen", "--keys", "other-keys", "--repository", "other", "-o", "json"])?;
     t.note(&["bundle", "push", "other"])?;
     t.note(&[
@@ -216,6 +235,80 @@ async fn releases(t: &mut Transcript) -> anyhow::Result<()> {
     ])?;
     t.note(&["bundle", "push", "other"])?;
     t.server = before;
+    Ok(())
+}
+
+/// Roll-outs of the pushed bundle over one robot whose agent takes no software.
+async fn rollouts(room: &Room, t: &mut Transcript, address: SocketAddr) -> anyhow::Result<()> {
+    let create = ["rollout", "create", "walk-1.5.0", "--waves", "1,25%,rest", "--soak", "10s"];
+    let said = ["--reason", "looked at it"];
+    t.note(&["rollout", "ls"])?;
+    t.note(&[&create[..], &["--dry-run"]].concat())?;
+    let _robot = room.robot("r2", "park-b", address, &[])?;
+    let mut client = RolloutServiceClient::new(channel(address)?);
+    until("a robot whose software is known", LIMIT, || async {
+        let software = client.clone().list_robot_software(ListRobotSoftwareRequest::default()).await?.into_inner();
+        Ok((!software.software.is_empty()).then_some(()))
+    })
+    .await?;
+
+    // What it would do, and what is refused.
+    t.note(&[&create[..], &["--dry-run"]].concat())?;
+    t.note(&[&create[..], &["--dry-run", "-o", "json"]].concat())?;
+    t.note(&[&create[..], &["--model", "h9", "--dry-run"]].concat())?;
+    t.note(&["rollout", "create", "walk-9", "--dry-run"])?;
+    t.note(&["rollout", "create", "walk-1.5.0", "--waves", "101%,rest,0", "--probation", "10ms", "--dry-run"])?;
+    t.note(&["rollout", "create", "walk-1.5.0", "--waves", "1,many", "--dry-run"])?;
+    t.note(&["robot", "pin", "r2", "--reason", "it is being measured"])?;
+    t.note(&["robot", "pin", "r9", "--reason", "it is being measured"])?;
+    t.note(&[&create[..], &["--dry-run"]].concat())?;
+    t.note(&["robot", "unpin", "r2", "-o", "json"])?;
+
+    // Written down.
+    t.note(&create)?;
+    t.note(&[&create[..], &["--max-in-flight", "2"]].concat())?;
+    t.note(&["rollout", "ls"])?;
+    t.note(&["rollout", "get", "walk-1.5.0"])?;
+    t.note(&["rollout", "get", "walk-9"])?;
+    t.note(&["rollout", "explain", "walk-1.5.0", "r2"])?;
+    t.note(&["rollout", "start", "walk-1.5.0"])?;
+    t.note(&["rollout", "wait", "walk-1.5.0", "--timeout", "10ms"])?;
+
+    // Begun.
+    t.note(&[&create[..], &["--start"]].concat())?;
+    until("the robot fetches", LIMIT, || async {
+        let request = ListRolloutRobotsRequest { rollout_id: "walk-1.5.0".to_owned(), ..Default::default() };
+        let robots = client.clone().list_rollout_robots(request).await?.into_inner().robots;
+        Ok(robots.iter().any(|r| r.step() == RolloutStep::Staging).then_some(()))
+    })
+    .await?;
+    t.note(&[&["rollout", "pause", "walk-1.5.0"][..], &said].concat())?;
+    t.note(&["rollout", "ls", "-o", "json"])?;
+    t.note(&["rollout", "get", "walk-1.5.0"])?;
+    t.note(&["rollout", "robots", "walk-1.5.0", "-o", "json"])?;
+    t.note(&["rollout", "get", "walk-1.5.0", "--robots", "-o", "json"])?;
+    t.note(&["rollout", "explain", "walk-1.5.0", "r2"])?;
+    t.note(&["rollout", "explain", "walk-1.5.0", "r9"])?;
+    t.note_stream(&["rollout", "watch", "walk-1.5.0", "-o", "json"], 1)?;
+    t.note(&[&["rollout", "resume", "walk-1.5.0", "-o", "name"][..], &said].concat())?;
+    t.note(&[&["rollout", "promote", "walk-1.5.0"][..], &said].concat())?;
+    t.note(&["rollout", "retry", "walk-1.5.0"])?;
+    t.note(&["robot", "exclude", "r9", "--from", "walk-1.5.0"])?;
+
+    // Ended.
+    t.note(&[&["rollout", "abort", "walk-1.5.0", "--if-match", "7"][..], &said].concat())?;
+    t.note(&[&["rollout", "abort", "walk-1.5.0", "-o", "name"][..], &said].concat())?;
+    t.note(&["rollout", "wait", "walk-1.5.0", "--for", "ended"])?;
+    t.note(&["rollout", "watch", "walk-1.5.0"])?;
+    t.note(&["rollout", "history", "walk-1.5.0", "-o", "json"])?;
+    t.note(&["rollout", "rollback", "walk-1.5.0", "--as", "back"])?;
+    t.note(&["quarantine", "ls"])?;
+    t.note(&["quarantine", "ls", "-o", "json"])?;
+    t.note(&["quarantine", "lift", "r2", "walk-1.5.0"])?;
+    t.note(&["bundle", "revoke", "walk-1.5.0", "--reason", "it limps"])?;
+    t.note(&["rollout", "create", "again", "--bundle", "walk-1.5.0"])?;
+    t.note(&["robot", "retire", "r2", "--reason", "sold", "-o", "name"])?;
+    t.note(&["doctor", "-o", "json"])?;
     Ok(())
 }
 
@@ -265,6 +358,23 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     t.note(&["area", "get", "rooms", "-o", "json"])?;
     t.note(&["area", "put", "rooms", "--speed-limit", "1000", "-o", "json"])?;
     t.note(&["area", "put", "rooms", "--speed-limit", "0", "-o", "json"])?;
+    let window = "mon-fri 22:00-05:00 Europe/Berlin";
+    t.note(&[
+        "area",
+        "put",
+        "rooms",
+        "--off-work",
+        "20",
+        "--keep-in-work",
+        "pick=3",
+        "--window",
+        window,
+        "-o",
+        "json",
+    ])?;
+    t.note(&["area", "put", "rooms", "--off-work", "101", "--window", "daily 01:00-04:00 Berlin", "-o", "json"])?;
+    t.note(&["area", "put", "rooms", "--keep-in-work", "pick=0", "--window", "always", "--frozen", "true"])?;
+    t.note(&["area", "put", "rooms", "--frozen", "false", "--window", window])?;
     let charging = ["--charge-below", "25", "--charge-callable-above", "40", "--charge-idle-below", "70"];
     t.note(&[&["area", "put", "rooms", "--charge-to", "85", "-o", "json"][..], &charging].concat())?;
 
@@ -375,7 +485,7 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     t.note(&["bundle", "verify", "repository", "-o", "json"])?;
     t.note(&["bundle", "samples", "samples", "--config-only", "-o", "json"])?;
     t.note(&["bundle", "samples", "samples", "--config-only"])?;
-    releases(&mut t).await?;
+    releases(&room, &mut t).await?;
     std::fs::write(t.dir.join("walk-1.5.0/gait-1.5.0.component"), "flies")?;
     t.note(&["bundle", "inspect", "walk-1.5.0"])?;
     t.note(&["bundle", "verify", "nowhere"])?;
