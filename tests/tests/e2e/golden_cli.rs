@@ -296,7 +296,7 @@ async fn rollouts(room: &Room, t: &mut Transcript, address: SocketAddr) -> anyho
     t.note(&["robot", "exclude", "r9", "--from", "walk-1.5.0"])?;
 
     // Ended.
-    t.note(&[&["rollout", "abort", "walk-1.5.0", "--if-match", "7"][..], &said].concat())?;
+    t.note(&[&["rollout", "abort", "walk-1.5.0", "--if-match", "1"][..], &said].concat())?;
     t.note(&[&["rollout", "abort", "walk-1.5.0", "-o", "name"][..], &said].concat())?;
     t.note(&["rollout", "wait", "walk-1.5.0", "--for", "ended"])?;
     t.note(&["rollout", "watch", "walk-1.5.0"])?;

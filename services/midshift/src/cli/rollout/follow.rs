@@ -43,24 +43,31 @@ impl Picture {
         let verdicts = rollout.verdicts.iter().skip(before.verdicts.len());
         news.extend(verdicts.map(|v| line(v.time.as_ref(), &text::verdict(v, waves))));
         if let Some(abort) = rollout.abort.as_ref().filter(|_| before.abort.is_none()) {
-            news.push(text::abort(abort));
+            news.push(line(abort.time.as_ref(), &text::abort(abort)));
         }
         let moved = (before.phase, before.wave, &before.pauses) != (rollout.phase, rollout.wave, &rollout.pauses);
         if moved || before.rollout_id.is_empty() {
             let counts = text::counts(&rollout.counts.unwrap_or_default());
-            let wave = text::wave(rollout.wave, waves);
+            let begun = rollout.start_time.is_some();
+            let wave = if begun { text::wave(rollout.wave, waves) } else { String::new() };
             let told = format!("{}  {}  {wave}  {counts}", rollout.rollout_id, text::state(rollout));
-            news.push(line(rollout.since.as_ref(), &told));
+            // Of a pause nobody says when it began.
+            let is_new = before.phase != rollout.phase;
+            news.push(if is_new { line(rollout.since.as_ref(), &told) } else { told.trim_end().to_owned() });
         }
         news
     }
 
-    /// The whole of it as it is now, with what the last verdict leaves unproven.
+    /// The whole of it as it is now, with what the last verdict leaves unproven, and what to do if it waits for a person.
     pub fn lines(&self) -> Vec<String> {
-        let mut lines = text::header(&self.rollout);
-        lines.extend(text::tree(&self.rollout, self.robots.values()));
-        let last = self.rollout.verdicts.last();
-        lines.extend(last.map(|v| format!("last verdict: {}", text::verdict(v, text::waves_of(&self.rollout)))));
+        let rollout = &self.rollout;
+        let mut lines = text::header(rollout);
+        lines.extend(text::tree(rollout, self.robots.values()));
+        let last = rollout.verdicts.last();
+        lines.extend(last.map(|v| format!("last verdict: {}", text::verdict(v, text::waves_of(rollout)))));
+        if rollout.phase() == RolloutPhase::Review {
+            lines.push(format!("next: {}", text::next(rollout)));
+        }
         lines
     }
 }
@@ -116,7 +123,6 @@ pub async fn watch(one: &One, out: &Out) -> Result<(), Exit> {
         let news = picture.take(message);
         if is_live {
             bar.set_message(picture.lines().join("\n"));
-            bar.tick();
         } else {
             news.iter().for_each(|line| out.line(line));
         }

@@ -263,9 +263,7 @@ pub fn events(rollout: &v1::Rollout, robots: &[v1::RolloutRobot]) -> Vec<Event> 
         add(verdict.time, "verdict", text::verdict(verdict, waves));
     }
     if let Some(abort) = &rollout.abort {
-        let why = abort.reason.as_ref().map(text::reason).unwrap_or_default();
-        let kind = if abort.hard { "aborted at once" } else { "aborted" };
-        add(abort.time, "aborted", format!("{kind}: {why}, {} had permission by then", text::robots(abort.touched)));
+        add(abort.time, "aborted", text::abort(abort));
     }
     for robot in robots {
         let why = robot.failure.as_ref().or(robot.why.as_ref()).map(|r| format!("  {}", text::reason(r)));

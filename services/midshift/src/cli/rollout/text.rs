@@ -161,7 +161,7 @@ pub fn header(rollout: &v1::Rollout) -> Vec<String> {
     lines.push(format!("  {}", facts.join(", ")));
     let of = [("takes back", &rollout.revert_of), ("its place took", &rollout.superseded_by)];
     lines.extend(of.iter().filter(|(_, id)| !id.is_empty()).map(|(what, id)| format!("  {what} {id}")));
-    lines.extend(rollout.abort.as_ref().map(|a| format!("  {}", abort(a))));
+    lines.extend(rollout.abort.as_ref().map(|a| format!("  {}  {}", time(a.time.as_ref()), abort(a))));
     if !rollout.skipped_by_reason.is_empty() {
         let skipped: Vec<String> = rollout.skipped_by_reason.iter().map(|(code, n)| format!("{n} {code}")).collect();
         lines.push(format!("  skipped: {}", skipped.join(", ")));
@@ -172,7 +172,7 @@ pub fn header(rollout: &v1::Rollout) -> Vec<String> {
 /// The end of a roll-out that ended early.
 pub fn abort(abort: &v1::RolloutAbort) -> String {
     let kind = if abort.hard { "aborted at once" } else { "aborted" };
-    let mut text = format!("{kind} {}: {}", time(abort.time.as_ref()), because(abort.reason.as_ref()));
+    let mut text = format!("{kind}: {}", because(abort.reason.as_ref()));
     if !abort.actor.is_empty() {
         text += &format!(", by {}", abort.actor);
     }
