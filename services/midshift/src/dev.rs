@@ -220,6 +220,7 @@ impl Scene {
             repository: (software.repository(), software.keys().join("targets-1.pem")),
             seed: args.seed,
             body_speed: args.speedup,
+            floor: hall.site.clone(),
             site: args.site.clone(),
         };
         Ok((stage, self.folder))

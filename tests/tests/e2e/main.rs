@@ -12,6 +12,7 @@ mod kill;
 mod launched;
 mod measured;
 mod proxy;
+mod rolled_out;
 mod room;
 mod swarm_software;
 mod tuf;

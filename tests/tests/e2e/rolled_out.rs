@@ -1,0 +1,132 @@
+//! Software from the release people to a robot, with nothing but what they have: the command line, a server, a launcher and its agent. The server is
+//! killed on the way.
+
+use crate::harness::{Running, Server, midshift, until};
+use crate::room::LIMIT;
+use anyhow::{Context, ensure};
+use midshift_agent::launcher::SWITCH;
+use midshift_agent::sets::Sets;
+use midshift_agent::sets::disk::DiskSets;
+use midshift_agent::switch::{FACTORY, Switch};
+use midshift_agent::trust::Trust;
+use midshift_bundle::keys::SecretKey;
+use midshift_core::site::{DEMO, text};
+use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
+use midshift_proto::ota::v1::{GetRolloutRequest, ListQuarantinesRequest};
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// A launcher with what it started; all of it goes with this.
+struct Robot {
+    running: Running,
+    sets: PathBuf,
+}
+
+impl Drop for Robot {
+    fn drop(&mut self) {
+        if self.running.has_ended().is_ok_and(|ended| !ended) {
+            let _ = self.running.signal_group("KILL");
+        }
+    }
+}
+
+impl Robot {
+    /// A robot in `home` that believes the release people of `samples`.
+    fn launch(home: &Path, samples: &Path, server: &str) -> anyhow::Result<Self> {
+        std::fs::create_dir_all(home)?;
+        let key = SecretKey::read(&samples.join("keys/directive-1.pem"))?.public();
+        let root = std::fs::read(samples.join("repository/1.root.json"))?;
+        let site = text::parse(DEMO)?.site_id().clone();
+        Trust { root, directive_keys: [(key.id(), key)].into(), site }.write(&home.join("trust.json"))?;
+        let (program, sets) = (midshift()?, home.join("sets"));
+        let mut command = Command::new(&program);
+        command.arg("launcher").arg("--record").arg(home.join("tries")).arg("--sets").arg(&sets).arg("--");
+        command.arg(&program).args(["agent", "run", "--robot-id", "rbt-01", "--no-faults", "--server", server]);
+        command.arg("--data").arg(home.join("data")).arg("--sets").arg(&sets);
+        command.arg("--trust").arg(home.join("trust.json")).process_group(0);
+        Ok(Self { running: Running::start(&mut command, &home.join("log"))?, sets })
+    }
+    fn switch(&self) -> anyhow::Result<Switch> {
+        Ok(Switch::read(&self.sets.join(SWITCH))?)
+    }
+    /// Version of the set that is committed.
+    fn committed(&self) -> anyhow::Result<Option<String>> {
+        let switch = self.switch()?;
+        Ok(DiskSets::open(&self.sets)?.holdings()?.version(&switch.current))
+    }
+}
+
+fn call(arguments: &[&str]) -> anyhow::Result<Output> {
+    Command::new(midshift()?).args(arguments).output().context("calling midshift")
+}
+
+fn done(arguments: &[&str]) -> anyhow::Result<()> {
+    let output = call(arguments)?;
+    ensure!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_release_reaches_a_robot_and_a_bad_one_goes_back_though_the_server_is_killed_on_the_way() -> anyhow::Result<()>
+{
+    let dir = tempfile::tempdir()?;
+    let samples = dir.path().join("samples");
+    let (folder, keys) = (samples.display().to_string(), samples.join("keys").display().to_string());
+    done(&["bundle", "samples", &folder])?;
+    let mut server = Server::start_with(dir.path(), DEMO, &["--ota-keys", &keys]).await?;
+    let address = server.address.to_string();
+    let robot = Robot::launch(&dir.path().join("robot"), &samples, &address)?;
+    done(&["bundle", "push", "--server", &address, &samples.join("repository").display().to_string()])?;
+    until("the robot is known", LIMIT, async || {
+        Ok(call(&["robot", "get", "--server", &address, "rbt-01"])?.status.success().then_some(()))
+    })
+    .await?;
+    let begin = |id: &str| {
+        let all = [
+            "--waves",
+            "rest",
+            "--allow-full-push",
+            "--soak",
+            "0s",
+            "--probation",
+            "1s",
+            "--exposure-tasks",
+            "0",
+            "--start",
+        ];
+        done(&[&["rollout", "create", "--server", &address, id][..], &all].concat())
+    };
+    begin("walk-1.5.0")?;
+    let wait = |id: &str| call(&["rollout", "wait", "--server", &address, id, "--timeout", "120s"]);
+    let waited = wait("walk-1.5.0")?;
+    assert_eq!(waited.status.code(), Some(0), "{}", String::from_utf8_lossy(&waited.stderr));
+    assert_eq!(robot.committed()?.as_deref(), Some("1.5.0"));
+    assert_eq!(robot.switch()?.previous.as_deref(), Some(FACTORY));
+
+    begin("walk-1.6.0-bad-at-start")?;
+    let mut client = RolloutServiceClient::new(server.channel()?);
+    let request = GetRolloutRequest { rollout_id: "walk-1.6.0-bad-at-start".to_owned() };
+    until("it was permitted to activate", LIMIT, async || {
+        let rollout = client.clone().get_rollout(request.clone()).await?.into_inner().rollout.unwrap_or_default();
+        Ok((rollout.counts.unwrap_or_default().attempted > 0).then_some(()))
+    })
+    .await?;
+    server.kill_and_restart().await?;
+    let waited = wait("walk-1.6.0-bad-at-start")?;
+    assert_eq!(waited.status.code(), Some(12), "{}", String::from_utf8_lossy(&waited.stderr));
+    assert_eq!(robot.committed()?.as_deref(), Some("1.5.0"), "it is back on what it kept");
+    assert!(robot.switch()?.trial.is_none());
+    client = RolloutServiceClient::new(server.channel()?);
+    let rollout = client.get_rollout(request).await?.into_inner().rollout.unwrap_or_default();
+    let evidence = rollout.abort.unwrap_or_default();
+    assert_eq!(evidence.reason.map(|r| r.code).as_deref(), Some("FAILURE_AMONG_FEW"));
+    let quarantines = client.list_quarantines(ListQuarantinesRequest::default()).await?.into_inner().quarantines;
+    assert_eq!(quarantines.len(), 1, "the robot does not get it again");
+    // The same robot takes the next good one.
+    begin("walk-1.5.1")?;
+    let waited = wait("walk-1.5.1")?;
+    assert_eq!(waited.status.code(), Some(0), "{}", String::from_utf8_lossy(&waited.stderr));
+    assert_eq!(robot.committed()?.as_deref(), Some("1.5.1"));
+    Ok(())
+}
