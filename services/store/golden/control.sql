@@ -1,3 +1,25 @@
+CREATE TABLE area_budget (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE area_bundle (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE TABLE area_policy (
     site_id TEXT NOT NULL,
     id TEXT NOT NULL,
@@ -10,6 +32,17 @@ CREATE TABLE area_policy (
 );
 
 CREATE TABLE attempt (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE bundle (
     site_id TEXT NOT NULL,
     id TEXT NOT NULL,
     revision BIGINT NOT NULL,
@@ -42,6 +75,17 @@ CREATE TABLE desired_policy (
     UNIQUE (site_id, id)
 );
 
+CREATE TABLE desired_update (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE TABLE desired_work (
     site_id TEXT NOT NULL,
     id TEXT NOT NULL,
@@ -54,6 +98,28 @@ CREATE TABLE desired_work (
 );
 
 CREATE TABLE drain (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE drain_release (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE drain_request (
     site_id TEXT NOT NULL,
     id TEXT NOT NULL,
     revision BIGINT NOT NULL,
@@ -132,6 +198,45 @@ CREATE TABLE log_mark (
     UNIQUE (site_id, log)
 );
 
+CREATE TABLE ota_clock (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE ota_event (
+    site_id TEXT NOT NULL,
+    seq BIGINT NOT NULL,
+    tbl TEXT,
+    subject TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT,
+    body TEXT,
+    kind TEXT NOT NULL,
+    actor TEXT NOT NULL,
+    request_id TEXT,
+    at_unix_ms BIGINT NOT NULL,
+    UNIQUE (site_id, seq)
+);
+
+CREATE TABLE ota_mark (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE TABLE place_grant (
     site_id TEXT NOT NULL,
     id TEXT NOT NULL,
@@ -144,6 +249,17 @@ CREATE TABLE place_grant (
 );
 
 CREATE TABLE presence (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE quarantine (
     site_id TEXT NOT NULL,
     id TEXT NOT NULL,
     revision BIGINT NOT NULL,
@@ -213,6 +329,39 @@ CREATE TABLE robot_inbox (
     request_id TEXT,
     at_unix_ms BIGINT NOT NULL,
     UNIQUE (site_id, seq)
+);
+
+CREATE TABLE robot_software (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE rollout (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE rollout_robot (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
 );
 
 CREATE TABLE schema_version (version BIGINT NOT NULL, name TEXT NOT NULL, UNIQUE (version));
@@ -339,15 +488,23 @@ CREATE INDEX attempt_by_parent ON attempt (site_id, parent, ord, id);
 
 CREATE INDEX attempt_by_state ON attempt (site_id, state, ord, id);
 
+CREATE INDEX bundle_by_ord ON bundle (site_id, ord, id);
+
 CREATE INDEX fleet_event_by_subject ON fleet_event (site_id, subject, seq);
 
 CREATE INDEX incident_by_ord ON incident (site_id, ord, id);
 
 CREATE INDEX incident_by_state ON incident (site_id, state, ord, id);
 
+CREATE INDEX ota_event_by_subject ON ota_event (site_id, subject, seq);
+
 CREATE INDEX request_key_by_ord ON request_key (site_id, ord, id);
 
 CREATE INDEX robot_inbox_by_subject ON robot_inbox (site_id, subject, seq);
+
+CREATE INDEX rollout_by_ord ON rollout (site_id, ord, id);
+
+CREATE INDEX rollout_robot_by_parent ON rollout_robot (site_id, parent, ord, id);
 
 CREATE INDEX task_event_by_subject ON task_event (site_id, subject, seq);
 
