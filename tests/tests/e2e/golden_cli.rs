@@ -245,7 +245,7 @@ async fn rollouts(room: &Room, t: &mut Transcript, address: SocketAddr) -> anyho
     t.note(&["rollout", "ls"])?;
     t.note(&[&create[..], &["--dry-run"]].concat())?;
     let _robot = room.robot("r2", "park-b", address, &[])?;
-    let mut client = RolloutServiceClient::new(channel(address)?);
+    let client = RolloutServiceClient::new(channel(address)?);
     until("a robot whose software is known", LIMIT, || async {
         let software = client.clone().list_robot_software(ListRobotSoftwareRequest::default()).await?.into_inner();
         Ok((!software.software.is_empty()).then_some(()))
