@@ -195,6 +195,7 @@ codes! {
     PromotedByUser = "PROMOTED_BY_USER", "A person let it go on.";
     AbortedByUser = "ABORTED_BY_USER", "A person ended it.";
     SupersededBy = "SUPERSEDED_BY", "Another roll-out takes its place.";
+    NewcomerFailed = "NEWCOMER_FAILED", "A robot that came after the roll-out was completed went back from its bundle. Robots that come later do not get it; roll it out anew, or retry the robot.";
     RolloutAborted = "ROLLOUT_ABORTED", "A roll-out was aborted. Its verdict has the numbers.";
     // --- a robot's refusals and session answers
     StaleAuthority = "STALE_AUTHORITY", "The message reached the robot after its authority had ended, or was anchored to another session.";

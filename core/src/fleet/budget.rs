@@ -21,6 +21,45 @@ struct Area {
     robots: BTreeSet<RobotId>,
     /// Of these, and of robots that were taken from there, those that are out of work.
     off_work: BTreeSet<RobotId>,
+    /// Robots in work that are heard and have a capability, as far as somebody asked.
+    able: BTreeMap<String, usize>,
+}
+
+impl Area {
+    /// Robots in work that are heard and have the capability. Counted once for all drains that wait.
+    fn able(&mut self, view: &View, board: &Board, now: &Now, capability: &str) -> usize {
+        if let Some(count) = self.able.get(capability) {
+            return *count;
+        }
+        let works = |id: &&RobotId| !self.off_work.contains(*id) && is_able(view, board, now, id, capability);
+        let count = self.robots.iter().filter(works).count();
+        self.able.insert(capability.to_owned(), count);
+        count
+    }
+
+    /// One more is out of work.
+    fn take(&mut self, view: &View, board: &Board, now: &Now, robot_id: &RobotId) {
+        if self.off_work.insert(robot_id.clone()) && self.robots.contains(robot_id) {
+            for (capability, count) in &mut self.able {
+                *count -= usize::from(is_able(view, board, now, robot_id, capability)).min(*count);
+            }
+        }
+    }
+}
+
+fn has(view: &View, robot_id: &RobotId, capability: &str) -> bool {
+    let session = view.sessions.get(robot_id.as_str());
+    session.is_some_and(|s| s.row.inventory.capabilities.iter().any(|c| c == capability))
+}
+
+fn is_able(view: &View, board: &Board, now: &Now, robot_id: &RobotId, capability: &str) -> bool {
+    has(view, robot_id, capability) && heard::presence(board, robot_id, now) == Presence::Online
+}
+
+/// The drain waits for the same thing: numbers that change with every robot that comes and goes are no news.
+fn is_same(known: &Reason, why: &Reason) -> bool {
+    let same = |key: &str| known.metadata.get(key) == why.metadata.get(key);
+    known.code == why.code && ["area_id", "capability", "drain_id"].into_iter().all(same)
 }
 
 /// Lets waiting drains begin as far as the areas' rules allow, and keeps the areas' rows.
@@ -38,17 +77,17 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
         let why = match (&here, drain::of(view, &drain.robot_id)) {
             (_, Some(other)) => Some(Reason::from(Code::RobotDraining).with("drain_id", &other.drain_id)),
             (Some(area), None) if !drain.urgent => {
-                areas.get(area).and_then(|a| refusal(view, board, &now, area, a, &drain.robot_id))
+                areas.get_mut(area).and_then(|a| refusal(view, board, &now, area, a, &drain.robot_id))
             }
             _ => None,
         };
         if why.is_none()
             && let Some(area) = here.as_ref().and_then(|area| areas.get_mut(area))
         {
-            area.off_work.insert(drain.robot_id.clone());
+            area.take(view, board, &now, &drain.robot_id);
         }
         plan.decide(view, now, "fleet", |tx| match why {
-            Some(why) if drain.why.as_ref() == Some(&why) => {}
+            Some(why) if drain.why.as_ref().is_some_and(|known| is_same(known, &why)) => {}
             Some(why) => tx.put(Drain { why: Some(why), ..drain }, "drain.waits"),
             None => begin(tx, drain, here, &areas),
         });
@@ -125,7 +164,14 @@ fn areas(view: &View, board: &Board, now: &Now) -> BTreeMap<AreaId, Area> {
 }
 
 /// Why one more robot may not leave its work now.
-fn refusal(view: &View, board: &Board, now: &Now, area_id: &AreaId, area: &Area, robot_id: &RobotId) -> Option<Reason> {
+fn refusal(
+    view: &View,
+    board: &Board,
+    now: &Now,
+    area_id: &AreaId,
+    area: &mut Area,
+    robot_id: &RobotId,
+) -> Option<Reason> {
     if area.off_work.contains(robot_id) {
         return None;
     }
@@ -135,14 +181,9 @@ fn refusal(view: &View, board: &Board, now: &Now, area_id: &AreaId, area: &Area,
     if off >= most {
         return Some(budget().with("off_work", off).with("most", most));
     }
-    let can = |id: &RobotId, capability: &String| {
-        view.sessions.get(id.as_str()).is_some_and(|s| s.row.inventory.capabilities.contains(capability))
-    };
-    for (capability, least) in rules.keep_in_work.iter().filter(|(capability, _)| can(robot_id, capability)) {
-        let in_work = |id: &&RobotId| {
-            !area.off_work.contains(*id) && can(id, capability) && heard::presence(board, id, now) == Presence::Online
-        };
-        let left = area.robots.iter().filter(in_work).filter(|id| *id != robot_id).count();
+    for (capability, least) in rules.keep_in_work.iter().filter(|(capability, _)| has(view, robot_id, capability)) {
+        let counts = area.robots.contains(robot_id) && is_able(view, board, now, robot_id, capability);
+        let left = area.able(view, board, now, capability).saturating_sub(usize::from(counts));
         if left < *least as usize {
             return Some(budget().with("capability", capability).with("in_work", left).with("keep_in_work", least));
         }

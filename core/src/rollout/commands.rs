@@ -3,7 +3,7 @@
 //!
 //! Invariant: a command is checked against the whole picture before anything of it is written; asked twice it does the same once.
 
-use super::matching::{self, Matching};
+use super::matching::{self, Matching, Members, keeps};
 use super::rows::{
     Act, Bundle, Counted, Outcome, Pause, Phase, Quarantine, RobotSoftware, Rollout, RolloutRobot, Step, Verdict,
 };
@@ -149,7 +149,8 @@ pub fn dry_run(view: &View, board: &Board, id: &RolloutId, spec: &RolloutSpec) -
         return Err(Refusal::new(Kind::Precondition, reason));
     }
     let sizes = matching.sizes(spec.waves.len());
-    let first = sizes.first().copied().unwrap_or_default() as usize;
+    // A wave that takes nobody proves nothing: the first is the first with a robot in it.
+    let first = sizes.iter().copied().find(|size| *size > 0).unwrap_or_default() as usize;
     if !spec.allow_full_push && first > (robots / 10).max(1) {
         let reason = Reason::from(Code::RolloutFullPush).with("first_wave", first).with("robots", robots);
         return Err(Refusal::new(Kind::Precondition, reason));
@@ -170,7 +171,8 @@ fn budgets(view: &View, matching: &Matching) -> Result<(), Refusal> {
             };
             let here = view.software.values().filter(|s| s.row.area.as_ref() == Some(area)).map(|s| &s.row.robot_id);
             let there = here.filter(|id| able(id)).count() as u32;
-            if there > 0 && there <= *least {
+            let reached = matching.robots.iter().any(|r| r.stratum.area.as_ref() == Some(area) && able(&r.robot_id));
+            if reached && there <= *least {
                 let reason = Reason::from(Code::BudgetImpossible).with("area_id", area).with("capability", capability);
                 return Err(Refusal::new(Kind::Precondition, reason.with("robots", there).with("keep_in_work", least)));
             }
@@ -249,7 +251,7 @@ pub fn check(view: &View, board: &Board, command: &Command, seen: Option<Revisio
             }
             let known = view.rollout(of).ok_or_else(|| not_found(Code::RolloutNotFound, "rollout_id", of))?;
             let keeps = view.robots_of(of).any(|r| keeps(view, known, r));
-            if known.phase != Phase::Completed || !keeps {
+            if known.phase != Phase::Completed || !keeps || robots::is_irreversible(view, known) {
                 return Err(Refusal::new(
                     Kind::Precondition,
                     Reason::from(Code::NothingToRevert).with("rollout_id", of),
@@ -295,17 +297,14 @@ fn room(view: &View) -> Result<bool, Refusal> {
     Ok(false)
 }
 
-/// A robot keeps what the roll-out brought.
-fn keeps(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
-    let software = view.software.get(r.robot_id.as_str()).map(|s| &s.row);
-    r.step == Step::Committed && software.and_then(|s| s.runs()) == Some(&rollout.spec.bundle)
-}
-
 /// True: it was done before.
 fn verb_fits(view: &View, board: &Board, rollout: &Rollout, verb: &Verb) -> Result<bool, Refusal> {
     let phase = rollout.phase;
     let now_is = |fits: bool, done: bool| {
-        let reason = || Reason::from(Code::NotAllowedNow).with("phase", format!("{phase:?}").to_uppercase());
+        let reason = || {
+            let reason = Reason::from(Code::NotAllowedNow).with("phase", format!("{phase:?}").to_uppercase());
+            if rollout.pauses.is_empty() { reason } else { reason.with("pauses", robots::pauses(rollout)) }
+        };
         match (fits, done) {
             (true, _) => Ok(false),
             (_, true) => Ok(true),
@@ -332,7 +331,10 @@ fn verb_fits(view: &View, board: &Board, rollout: &Rollout, verb: &Verb) -> Resu
             rollout.pauses.contains(&Pause::Operator),
         ),
         Verb::Resume => now_is(rollout.pauses.contains(&Pause::Operator), phase.runs() && rollout.pauses.is_empty()),
-        Verb::Promote => now_is(matches!(phase, Phase::Soaking | Phase::Gate | Phase::Review), false),
+        // What stands still is resumed first: a wave is not kept while nobody may be told so.
+        Verb::Promote => {
+            now_is(matches!(phase, Phase::Soaking | Phase::Gate | Phase::Review) && rollout.pauses.is_empty(), false)
+        }
         Verb::Abort => now_is(!phase.is_over() && !phase.goes_back(), phase.goes_back()),
         Verb::RetryFailed => {
             let some = view.robots_of(&rollout.rollout_id).any(is_to_retry);
@@ -361,28 +363,16 @@ fn may_start(view: &View, board: &Board, rollout: &Rollout, supersede: bool) -> 
     }
 }
 
-/// Robots of a roll-out with wave, place and version they run, and how many each wave has.
-type Members = (Vec<(RobotId, u32, u64, String)>, Vec<u32>);
-
 fn members(view: &View, board: &Board, rollout: &Rollout) -> Result<Members, Refusal> {
-    if let Some(of) = &rollout.revert_of {
-        let original = view.rollout(of).ok_or_else(|| not_found(Code::RolloutNotFound, "rollout_id", of))?;
-        let mut kept: Vec<_> = view
-            .robots_of(of)
-            .filter(|r| keeps(view, original, r))
-            .map(|r| {
-                let place = matching::place_of(&rollout.rollout_id, &r.robot_id);
-                (r.robot_id.clone(), 0, place, view.software_of(&r.robot_id).version)
-            })
-            .collect();
-        kept.sort_by_key(|(_, _, place, _)| *place);
-        let count = kept.len() as u32;
-        return Ok((kept, vec![count]));
+    match &rollout.revert_of {
+        Some(of) => {
+            view.rollout(of).ok_or_else(|| not_found(Code::RolloutNotFound, "rollout_id", of))?;
+        }
+        None => {
+            dry_run(view, board, &rollout.rollout_id, &rollout.spec)?;
+        }
     }
-    let run = dry_run(view, board, &rollout.rollout_id, &rollout.spec)?;
-    let sizes = run.matching.sizes(rollout.spec.waves.len());
-    let robots = run.matching.robots.into_iter();
-    Ok((robots.map(|m| (m.robot_id, m.wave, m.place, m.stratum.from_version)).collect(), sizes))
+    Ok(matching::members(view, board, rollout))
 }
 
 /// Roll-outs that run and have one of these robots.
@@ -412,7 +402,6 @@ fn act(tx: &Tx, actor: &str, reason: &str) -> Act {
 fn apply_one(tx: &mut Tx, board: &Board, command: &Command, actor: &str) {
     match command {
         Command::Create { rollout_id, spec } => {
-            forget_oldest(tx);
             let row = draft(tx, rollout_id, spec.clone(), actor);
             tx.put(row, "rollout.created");
         }
@@ -421,6 +410,8 @@ fn apply_one(tx: &mut Tx, board: &Board, command: &Command, actor: &str) {
             let spec = RolloutSpec {
                 waves: vec![Wave::Rest],
                 allow_full_push: true,
+                // A robot that is not heard keeps its place in the count: it must not keep the others from going back.
+                max_in_flight: None,
                 soak_ms: 0,
                 exposure_tasks: 0,
                 ..RolloutSpec::clone(&original.spec)
@@ -450,23 +441,6 @@ fn apply_one(tx: &mut Tx, board: &Board, command: &Command, actor: &str) {
     }
 }
 
-/// The oldest that has ended goes for a new one, with its robots, once there are too many.
-fn forget_oldest(tx: &mut Tx) {
-    if tx.view.rollouts.len() < limits::ROLLOUTS_MAX {
-        return;
-    }
-    let over = tx.view.rollouts.values().map(|r| &r.row).filter(|r| r.phase.is_over());
-    let named = |id: &RolloutId| tx.view.area_bundles.values().any(|a| a.row.rollouts.values().any(|r| r == id));
-    let oldest = over.filter(|r| !named(&r.rollout_id)).min_by_key(|r| r.since).map(|r| r.rollout_id.clone());
-    let Some(id) = oldest else { return };
-    let robots: Vec<String> =
-        tx.view.robots_of(&id).map(crate::rows::Record::id).take(limits::ITEM_ROWS_MAX / 2).collect();
-    robots.iter().for_each(|robot| tx.delete::<RolloutRobot>(robot, "robot.forgotten"));
-    if tx.view.robots_of(&id).next().is_none() {
-        tx.delete::<Rollout>(id.as_str(), "rollout.forgotten");
-    }
-}
-
 fn draft(tx: &Tx, rollout_id: &RolloutId, spec: Arc<RolloutSpec>, actor: &str) -> Rollout {
     Rollout {
         rollout_id: rollout_id.clone(),
@@ -487,10 +461,11 @@ fn draft(tx: &Tx, rollout_id: &RolloutId, spec: Arc<RolloutSpec>, actor: &str) -
         supersedes: BTreeSet::new(),
         superseded_by: None,
         tasks: FailureEvidence::default(),
-        counted: Counted::default(),
+        counted: Arc::default(),
         created: act(tx, actor, ""),
         approved: None,
         started: None,
+        resumed: None,
         since: tx.now.utc,
     }
 }
@@ -537,8 +512,8 @@ fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bo
     let Some(rollout) = view.rollout(id).cloned() else { return };
     let Ok((robots, sizes)) = members(view, board, &rollout) else { return };
     let others = overlapping(view, &rollout, robots.iter().map(|(id, ..)| id));
-    let counted =
-        Counted { at_ms: view.served_ms(&now), control: verdict::controls_of(view, &rollout), ..Counted::default() };
+    let control = verdict::controls_of(view, &rollout);
+    let counted = Arc::new(Counted { at_ms: view.served_ms(&now), control, ..Counted::default() });
     if supersede {
         for other in &others {
             plan.decide(view, now, actor, |tx| {
@@ -575,7 +550,8 @@ fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bo
     }
 }
 
-fn add(tx: &mut Tx, rollout: &Rollout, robots: &[(RobotId, u32, u64, String)]) {
+/// Gives robots their rows.
+pub fn add(tx: &mut Tx, rollout: &Rollout, robots: &[(RobotId, u32, u64, String)]) {
     for (robot_id, wave, place, from_version) in robots {
         let now = tx.now;
         tx.put(newcomers::fresh(&now, rollout, robot_id, *wave, *place, from_version.clone()), "robot.assigned");

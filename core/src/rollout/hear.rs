@@ -109,11 +109,23 @@ fn fault_begun(tx: &mut Tx, robot_id: &RobotId, fault: &Fault) {
 }
 
 fn stopped(tx: &mut Tx, robot_id: &RobotId) {
-    let Some(robot) = on_trial(tx.view, robot_id).filter(|r| r.step == Step::Trial) else { return };
-    let since_ms = robot.moments.switched.map(|at| tx.now.utc.ms_since(at));
-    if since_ms.is_some_and(|ms| ms <= limits::HARDWARE_STOP_COUNTS.as_ms()) {
+    // What it said just before this may not have been acted upon yet.
+    let says_so = says_trial(tx.view, robot_id);
+    let Some(robot) = on_trial(tx.view, robot_id).filter(|r| r.step == Step::Trial || says_so) else { return };
+    let since_ms = robot.moments.switched.map_or(0, |at| tx.now.utc.ms_since(at));
+    if since_ms <= limits::HARDWARE_STOP_COUNTS.as_ms() {
         fail(tx, &robot, Code::HardwareStopOnTrial.into());
     }
+}
+
+/// Its newest report says that it works with what is on trial.
+fn says_trial(view: &View, robot_id: &RobotId) -> bool {
+    let report = view.software.get(robot_id.as_str()).and_then(|s| s.row.report.as_ref());
+    let row = on_trial(view, robot_id);
+    report.zip(row).is_some_and(|(report, r)| {
+        let ours = view.rollout(&r.rollout_id).is_some_and(|rollout| rollout.spec.bundle == report.bundle);
+        ours && r.attempted && report.state == UpdateState::Trial
+    })
 }
 
 /// A robot that went back by itself does not get this bundle again until a person says so.

@@ -11,6 +11,7 @@ use crate::ids::RobotId;
 use crate::limits;
 use crate::robot::Presence;
 use crate::time::Now;
+use std::collections::BTreeMap;
 
 /// The robot was given permission and is not heard for too long. After a start everybody counts as heard at that moment.
 pub fn is_missing(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> bool {
@@ -44,5 +45,8 @@ fn is_control(view: &View, robot_id: &RobotId) -> bool {
 /// Why a roll-out has to stand still: robots of it are missing, and so are others.
 pub fn pause(view: &View, board: &Board, now: &Now, rollout: &Rollout) -> Option<Pause> {
     let missing = view.robots_of(&rollout.rollout_id).filter(|r| is_missing(view, board, now, r));
-    missing.filter_map(|r| controls(view, board, now, r).err()).next()
+    // One of each area stands for all that are missing there.
+    let area = |r: &RolloutRobot| view.software.get(r.robot_id.as_str()).and_then(|s| s.row.area.clone());
+    let by_area: BTreeMap<_, _> = missing.map(|r| (area(r), r)).collect();
+    by_area.values().find_map(|r| controls(view, board, now, r).err())
 }

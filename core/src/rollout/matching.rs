@@ -3,7 +3,7 @@
 //! Called by the dry run and by the start, which therefore never differ. Invariant: the place of a robot depends on the roll-out's id and its
 //! own, never on the order in which robots came.
 
-use super::rows::{Bundle, Quarantine, Step};
+use super::rows::{Act, Bundle, Quarantine, Rollout, RolloutRobot, Step};
 use super::spec::{RolloutSpec, Wave};
 use super::view::View;
 use crate::fleet::Board;
@@ -152,6 +152,51 @@ fn is_selected(view: &View, robot_id: &RobotId, stratum: &Stratum, spec: &Rollou
         && s.labels.iter().all(|(key, value)| label(view, robot_id, key) == Some(value.as_str()))
 }
 
+/// Whether a roll-out would have reached this robot had it been there: it is selected, and some wave takes all that are like it.
+pub fn is_meant_for(view: &View, robot_id: &RobotId, stratum: &Stratum, spec: &RolloutSpec) -> bool {
+    let takes = |wave: &Wave| match wave {
+        Wave::Rest | Wave::Percent(100..) => true,
+        Wave::Label { key, value } => label(view, robot_id, key) == Some(value.as_str()),
+        Wave::Version(version) => stratum.from_version == *version,
+        Wave::Count(_) | Wave::Percent(_) => false,
+    };
+    is_selected(view, robot_id, stratum, spec) && spec.waves.iter().any(takes)
+}
+
+/// A person keeps the robot at what it runs.
+pub fn pinned(pin: &Act) -> Reason {
+    Reason::from(Code::SkippedPinned).with("pinned_by", &pin.actor).with("why", &pin.reason)
+}
+
+/// Robots of a roll-out with wave, place and version they run, and how many each wave has.
+pub type Members = (Vec<(RobotId, u32, u64, String)>, Vec<u32>);
+
+/// Whom a roll-out reaches.
+pub fn members(view: &View, board: &Board, rollout: &Rollout) -> Members {
+    if let Some(original) = rollout.revert_of.as_ref().and_then(|of| view.rollout(of)) {
+        let kept = view.robots_of(&original.rollout_id).filter(|r| keeps(view, original, r));
+        let member = |r: &RolloutRobot| {
+            let place = place_of(&rollout.rollout_id, &r.robot_id);
+            (r.robot_id.clone(), 0, place, view.software_of(&r.robot_id).version)
+        };
+        let mut kept: Vec<_> = kept.map(member).collect();
+        kept.sort_by_key(|(_, _, place, _)| *place);
+        let count = kept.len() as u32;
+        return (kept, vec![count]);
+    }
+    let Some(bundle) = view.bundles.get(rollout.spec.bundle.as_str()) else { return Members::default() };
+    let matching = of(view, board, &rollout.rollout_id, &rollout.spec, &bundle.row);
+    let sizes = matching.sizes(rollout.spec.waves.len());
+    let robots = matching.robots.into_iter();
+    (robots.map(|m| (m.robot_id, m.wave, m.place, m.stratum.from_version)).collect(), sizes)
+}
+
+/// A robot keeps what the roll-out brought.
+pub fn keeps(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
+    let software = view.software.get(r.robot_id.as_str()).map(|s| &s.row);
+    r.step == Step::Committed && software.and_then(|s| s.runs()) == Some(&rollout.spec.bundle)
+}
+
 /// Whether a robot may have a bundle at all.
 pub fn may_have(view: &View, robot_id: &RobotId, stratum: &Stratum, bundle: &Bundle) -> Result<(), Reason> {
     if view.duty(robot_id) == Duty::Retired {
@@ -159,7 +204,7 @@ pub fn may_have(view: &View, robot_id: &RobotId, stratum: &Stratum, bundle: &Bun
     }
     let software = view.software.get(robot_id.as_str()).map(|s| &s.row);
     if let Some(pin) = software.and_then(|s| s.pin.as_ref()) {
-        return Err(Reason::from(Code::SkippedPinned).with("pinned_by", &pin.actor).with("why", &pin.reason));
+        return Err(pinned(pin));
     }
     if let Some(known) = view.quarantines.get(&Quarantine::id_of(robot_id, &bundle.bundle)) {
         return Err(Reason::from(Code::SkippedQuarantined).with("because", known.row.reason.code));

@@ -113,6 +113,8 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
                 hear::take(&mut tx, &said);
                 if tx.rows() > 0 {
                     tx.put(OtaMark { seq: entry.seq }, "ota.consumed");
+                } else {
+                    tx.view.passed = entry.seq;
                 }
                 plan.items.extend(tx.finish());
             }
@@ -134,8 +136,46 @@ pub fn cycle(
     sign: &dyn Sign,
     plan: &mut Plan,
 ) -> bool {
+    let first = plan.items.len();
+    let more = plan_all(view, now, board, heard, sign, plan);
+    if plan.items.len() > first {
+        pass(view, now, first, plan);
+    }
+    if !more {
+        tell_time(view, now, plan);
+    }
+    more
+}
+
+/// What changed nothing when it was said is not heard again after a restart: by then it might change something. Written before the first
+/// decision that it came before.
+fn pass(view: &mut View, now: Now, first: usize, plan: &mut Plan) {
+    let passed = view.passed;
+    if view.marks.get("ota").is_none_or(|m| m.row.seq < passed) {
+        let mut tx = Tx::new(view, now, "ota");
+        tx.put(OtaMark { seq: passed }, "ota.passed");
+        if let Some(item) = tx.finish() {
+            plan.items.insert(first, item);
+        }
+    }
+}
+
+/// Everything but the service's own rows. True: there is more to do at once.
+fn plan_all(
+    view: &mut View,
+    now: Now,
+    board: &Board,
+    heard: &BTreeSet<RobotId>,
+    sign: &dyn Sign,
+    plan: &mut Plan,
+) -> bool {
     listen(view, now, board, heard, plan);
     welcome(view, now, board, plan);
+    let open: Vec<RolloutId> =
+        view.rollouts.values().map(|r| &r.row).filter(|r| !r.phase.is_over()).map(|r| r.rollout_id.clone()).collect();
+    for id in &open {
+        plan.decide(view, now, "ota", |tx| phases::guard(tx, board, id));
+    }
     let mut moves = 0;
     for id in due(view) {
         let Some(row) = view.robots.get(&id).map(|r| &r.row) else { continue };
@@ -148,13 +188,13 @@ pub fn cycle(
             plan.decide(view, now, "ota", |tx| robots::make(tx, sign, board, &id, due));
         }
     }
-    let open: Vec<RolloutId> =
-        view.rollouts.values().map(|r| &r.row).filter(|r| !r.phase.is_over()).map(|r| r.rollout_id.clone()).collect();
     for id in open {
         plan.decide(view, now, "ota", |tx| phases::further(tx, board, &id));
     }
     plan.decide(view, now, "ota", robots::forget_drains);
-    tell_time(view, now, plan);
+    if view.rollouts.len() > crate::limits::ROLLOUTS_MAX {
+        plan.decide(view, now, "ota", phases::forget_oldest);
+    }
     false
 }
 

@@ -1,11 +1,14 @@
 //! Robots that come to an area after a roll-out was completed there get its bundle too, one by one, under the same rules.
 
 use super::matching;
+use super::phases::forget_area_bundles;
+use super::robots::{is_newcomer, is_retried};
 use super::rows::{Moments, Phase, Rollout, RolloutRobot, Step};
 use super::view::View;
-use super::{Board, Tx};
+use super::{Board, Tx, incident};
 use crate::gates::TaskTally;
-use crate::ids::RobotId;
+use crate::ids::{RobotId, RolloutId};
+use crate::reason::{Code, Reason};
 use crate::time::{Now, Utc};
 
 /// The completed roll-out that a robot should have had a part in, if there is one.
@@ -15,10 +18,30 @@ pub fn due(view: &View, board: &Board, robot_id: &RobotId) -> Option<Rollout> {
     let rollout = view.rollout(area.row.rollouts.get(&stratum.model)?)?;
     let bundle = view.bundles.get(rollout.spec.bundle.as_str())?;
     let good = bundle.row.listed && bundle.row.revoked.is_none() && rollout.phase == Phase::Completed;
-    let new = view.robot_of(&rollout.rollout_id, robot_id).is_none();
+    // Whom the roll-out was not for does not get it for having come again.
+    let meant = matching::is_meant_for(view, robot_id, &stratum, &rollout.spec);
+    // One that could not be had when it came is tried when it can.
+    let passed = |r: &RolloutRobot| r.step == Step::Skipped && is_newcomer(rollout, r) && is_retried(r);
+    let new = meant && view.robot_of(&rollout.rollout_id, robot_id).is_none_or(passed);
     let free = matching::claimed_by(view, robot_id, &rollout.rollout_id).is_none();
     let may = matching::may_have(view, robot_id, &stratum, &bundle.row).is_ok();
     (good && new && free && may).then(|| rollout.clone())
+}
+
+/// Robots that come get this roll-out's bundle somewhere.
+pub fn is_served(view: &View, id: &RolloutId) -> bool {
+    view.area_bundles.values().any(|a| a.row.rollouts.values().any(|r| r == id))
+}
+
+/// A robot that came later failed: they come one by one, so each is a wave of one, and nobody comes behind it. A robot that a person tried
+/// again says nothing of the others.
+pub fn failed(tx: &mut Tx, rollout: &Rollout, r: &RolloutRobot) {
+    if rollout.phase != Phase::Completed || !is_newcomer(rollout, r) || r.again || !is_served(tx.view, &r.rollout_id) {
+        return;
+    }
+    let told = Reason::from(Code::NewcomerFailed).with("rollout_id", &r.rollout_id);
+    incident(tx, Some(&r.robot_id), &told);
+    forget_area_bundles(tx, &r.rollout_id);
 }
 
 /// Gives it a place behind the last wave.

@@ -3,11 +3,11 @@
 //! Invariant: an abort is latched in the item that ends the roll-out, and nothing takes it back; a soak stands still while the roll-out does;
 //! stuck and unreachable robots never keep a fleet waiting.
 
-use super::robots::{is_newcomer, is_retried};
+use super::robots::{is_gone, is_irreversible, is_newcomer, is_retried};
 use super::rows::{AreaBundle, Countdown, Outcome, Pause, Phase, Rollout, RolloutRobot, Step, Verdict};
 use super::verdict;
 use super::view::View;
-use super::{Board, Tx, incident, infrastructure};
+use super::{Board, Tx, commands, incident, infrastructure, matching, newcomers};
 use crate::fleet::heard;
 use crate::ids::{AreaId, RolloutId};
 use crate::limits;
@@ -16,17 +16,23 @@ use crate::robot::Presence;
 use crate::time::Now;
 use std::collections::BTreeMap;
 
+/// Stops a roll-out that must not go on as it is, before any robot is brought further.
+pub fn guard(tx: &mut Tx, board: &Board, id: &RolloutId) {
+    let Some(rollout) = tx.view.rollout(id).filter(|r| r.phase.runs()).cloned() else { return };
+    if !ends_early(tx, &rollout) {
+        pauses(tx, board, &rollout);
+    }
+}
+
 /// Brings one roll-out further.
 pub fn further(tx: &mut Tx, board: &Board, id: &RolloutId) {
-    let Some(rollout) = tx.view.rollout(id).cloned() else { return };
+    guard(tx, board, id);
+    let Some(rollout) = tx.view.rollout(id) else { return };
     if rollout.phase.runs() {
-        if pauses(tx, board, &rollout) || ends_early(tx, &rollout) {
-            return;
-        }
         if !rollout.pauses.is_empty() {
             return;
         }
-        verdict::count_tasks(tx, &rollout);
+        verdict::count_tasks(tx, id);
     }
     let Some(rollout) = tx.view.rollout(id).cloned() else { return };
     match rollout.phase {
@@ -45,22 +51,15 @@ pub fn enter(tx: &mut Tx, rollout: Rollout, phase: Phase, kind: &'static str) {
     tx.put(Rollout { phase, since: tx.now.utc, ..rollout }, kind);
 }
 
-/// Sets and lifts the pauses that nobody has to ask for. True: something changed.
-fn pauses(tx: &mut Tx, board: &Board, rollout: &Rollout) -> bool {
-    let mut pauses = rollout.pauses.clone();
-    let bundle = tx.view.bundles.get(rollout.spec.bundle.as_str()).map(|b| &b.row);
-    let gone = rollout.revert_of.is_none() && bundle.is_none_or(|b| b.revoked.is_some() || !b.listed);
-    if gone {
-        pauses.insert(Pause::Revoked);
-    }
+/// Sets and lifts the pauses that nobody has to ask for. A bundle that a later release lists again may go on.
+fn pauses(tx: &mut Tx, board: &Board, rollout: &Rollout) {
+    let asked = rollout.pauses.contains(&Pause::Operator).then_some(Pause::Operator);
+    let gone = is_gone(tx.view, rollout).then_some(Pause::Revoked);
     let network = infrastructure::pause(tx.view, board, &tx.now, rollout);
-    pauses.retain(|p| !matches!(p, Pause::Infrastructure | Pause::InfrastructureUnknown));
-    pauses.extend(network);
-    if pauses == rollout.pauses {
-        return false;
+    let pauses = asked.into_iter().chain(gone).chain(network).collect();
+    if pauses != rollout.pauses {
+        set_pauses(tx, rollout.clone(), pauses, "rollout.pauses_changed");
     }
-    set_pauses(tx, rollout.clone(), pauses, "rollout.pauses_changed");
-    true
 }
 
 /// Stands still for these reasons, or goes on if there is none. Permissions of before are not given any more.
@@ -72,6 +71,7 @@ pub fn set_pauses(tx: &mut Tx, mut rollout: Rollout, pauses: std::collections::B
     }
     rollout.generation += 1;
     rollout.pauses = pauses;
+    rollout.resumed = runs.then_some(tx.now.utc).or(rollout.resumed);
     tx.put(rollout, kind);
 }
 
@@ -111,7 +111,7 @@ fn is_offline(board: &Board, now: &Now, r: &RolloutRobot) -> bool {
 /// Begins with the first wave once each of its robots has the bundle, or will not have it soon.
 fn prefetching(tx: &mut Tx, board: &Board, mut rollout: Rollout) {
     let waits_for = |id: &RolloutId| tx.view.rollout(id).is_some_and(|r| !r.phase.is_over());
-    if rollout.supersedes.iter().any(waits_for) {
+    if rollout.supersedes.iter().any(waits_for) || assigns_missing(tx, board, &rollout) {
         return;
     }
     let late = tx.now.utc.ms_since(rollout.since) >= limits::STAGED_WITHIN.as_ms();
@@ -123,46 +123,83 @@ fn prefetching(tx: &mut Tx, board: &Board, mut rollout: Rollout) {
     }
 }
 
+/// A start that was cut short has left robots without a row: they get it now. True: some did.
+fn assigns_missing(tx: &mut Tx, board: &Board, rollout: &Rollout) -> bool {
+    let id = &rollout.rollout_id;
+    let waves = (id.clone(), 0)..=(id.clone(), u32::MAX);
+    let there: u32 = tx.view.wave_sizes.range(waves).map(|(_, size)| *size).sum();
+    if there >= rollout.sizes.iter().sum() {
+        return false;
+    }
+    let (mut members, _) = matching::members(tx.view, board, rollout);
+    members.retain(|(robot_id, ..)| tx.view.robot_of(id, robot_id).is_none());
+    members.truncate(limits::ITEM_ROWS_MAX / 2);
+    if members.is_empty() {
+        // The others do not fit any more.
+        let size = |wave| tx.view.wave_sizes.get(&(id.clone(), wave)).copied().unwrap_or_default();
+        let sizes = (0..rollout.sizes.len() as u32).map(size).collect();
+        tx.put(Rollout { sizes, ..rollout.clone() }, "rollout.sized");
+    }
+    commands::add(tx, rollout, &members);
+    true
+}
+
+/// The wave does not wait for a robot that counts against it already, or that was given permission and has said for long that it is under
+/// way. It keeps its drain, and nobody is told that it came through.
+fn is_given_up(now: &Now, rollout: &Rollout, r: &RolloutRobot) -> bool {
+    let longest = rollout.spec.probation_ms + limits::STAGED_WITHIN.as_ms();
+    r.failure.is_some() || (r.grant.is_some() && now.utc.ms_since(r.since) >= longest)
+}
+
 fn applying(tx: &mut Tx, board: &Board, rollout: Rollout) {
     let wave = rollout.wave;
     // A place in a wave that a robot leaves is taken by the next one, or a canary of one would prove nothing.
-    if !rollout.second_pass
-        && let Some(next) = stand_in(tx.view, board, &tx.now, &rollout)
-    {
-        tx.put(RolloutRobot { wave, ..next }, "robot.stands_in");
-        return;
+    if wave < rollout.spec.waves.len() as u32 {
+        let next = stand_ins(tx.view, board, &tx.now, &rollout);
+        if !next.is_empty() {
+            next.into_iter().for_each(|next| tx.put(RolloutRobot { wave, ..next }, "robot.stands_in"));
+            return;
+        }
     }
-    let open = |r: &RolloutRobot| {
-        matches!(r.step, Step::Waiting | Step::Staging | Step::Staged | Step::Draining | Step::Activating)
-            || (rollout.revert_of.is_some() && r.step == Step::Reverting && !is_offline(board, &tx.now, r))
+    let open = |r: &RolloutRobot| match r.step {
+        Step::Waiting | Step::Staging | Step::Staged | Step::Draining => true,
+        Step::Activating => !is_given_up(&tx.now, &rollout, r),
+        Step::Reverting => rollout.revert_of.is_some() && !is_offline(board, &tx.now, r),
+        _ => false,
     };
     if verdict::wave(tx.view, &rollout.rollout_id, wave).any(open) {
         return;
     }
     let on_trial = verdict::wave(tx.view, &rollout.rollout_id, wave).any(|r| r.step == Step::Trial);
+    let attempted = |r: &RolloutRobot| r.attempted && r.step != Step::Skipped;
     if on_trial {
         let soak = Countdown::new(tx.view.served_ms(&tx.now), rollout.spec.soak_ms);
         enter(tx, Rollout { soak: Some(soak), ..rollout }, Phase::Soaking, "rollout.soaking");
     } else if rollout.revert_of.is_some() {
         let verdict = verdict::gate(tx.view, &rollout, tx.now.utc);
         promote(tx, rollout, verdict);
+    } else if verdict::wave(tx.view, &rollout.rollout_id, wave).any(attempted) {
+        // None of those that were given it works with it: there is nothing to watch, and much to judge.
+        gate(tx, rollout);
     } else {
         // Nobody of this wave could be had: there is nothing to judge.
         next_wave(tx, rollout);
     }
 }
 
-/// The next robot of a later wave, if one of this wave was skipped and nobody stood in for it yet.
-fn stand_in(view: &View, board: &Board, now: &Now, rollout: &Rollout) -> Option<RolloutRobot> {
+/// The next robots of later waves, for those of this wave that were skipped and for whom nobody stood in yet.
+fn stand_ins(view: &View, board: &Board, now: &Now, rollout: &Rollout) -> Vec<RolloutRobot> {
     let id = &rollout.rollout_id;
     let planned = rollout.sizes.get(rollout.wave as usize).copied().unwrap_or_default();
     let there = verdict::wave(view, id, rollout.wave).filter(|r| r.step != Step::Skipped).count() as u32;
-    if there >= planned {
-        return None;
+    let missing = planned.saturating_sub(there) as usize;
+    if missing == 0 {
+        return Vec::new();
     }
     let later = view.robots_of(id).filter(|r| r.wave > rollout.wave && !is_newcomer(rollout, r));
-    let ready = later.filter(|r| r.step < Step::Draining && !is_offline(board, now, r));
-    ready.min_by_key(|r| (r.wave, r.place)).cloned()
+    let mut ready: Vec<_> = later.filter(|r| r.step < Step::Draining && !is_offline(board, now, r)).collect();
+    ready.sort_by_key(|r| (r.wave, r.place));
+    ready.into_iter().take(missing.min(limits::ITEM_ROWS_MAX / 2)).cloned().collect()
 }
 
 fn soaking(tx: &mut Tx, rollout: Rollout) {
@@ -217,8 +254,9 @@ fn next_wave(tx: &mut Tx, mut rollout: Rollout) {
         rollout.wave += 1;
         enter(tx, rollout, Phase::Applying, "rollout.wave_begun");
     } else if !rollout.second_pass && tx.view.robots_of(&id).any(skipped) {
-        // The skipped move to the wave behind the last one; see `robots`.
-        (rollout.second_pass, rollout.wave) = (true, waves);
+        // The skipped move to the wave behind the last one; see `robots`. If nothing was judged yet that would be everybody at once,
+        // without a canary: then the waves begin anew.
+        (rollout.second_pass, rollout.wave) = (true, if rollout.promoted == 0 { 0 } else { waves });
         enter(tx, rollout, Phase::Applying, "rollout.second_pass");
     } else {
         complete(tx, rollout);
@@ -263,6 +301,20 @@ pub fn forget_area_bundles(tx: &mut Tx, id: &RolloutId) {
     }
 }
 
+/// The oldest that has ended goes, with its robots, while there are too many. One that robots still have to come back from stays.
+pub fn forget_oldest(tx: &mut Tx) {
+    let named = |id: &RolloutId| newcomers::is_served(tx.view, id);
+    let over = tx.view.rollouts.values().map(|r| &r.row).filter(|r| r.phase.is_over());
+    let free = over.filter(|r| !named(&r.rollout_id) && tx.view.robots_of(&r.rollout_id).all(|r| r.step.is_over()));
+    let Some(id) = free.min_by_key(|r| (r.since, r.rollout_id.clone())).map(|r| r.rollout_id.clone()) else { return };
+    let robots: Vec<String> =
+        tx.view.robots_of(&id).map(crate::rows::Record::id).take(limits::ITEM_ROWS_MAX / 2).collect();
+    robots.iter().for_each(|robot| tx.delete::<RolloutRobot>(robot, "robot.forgotten"));
+    if tx.view.robots_of(&id).next().is_none() {
+        tx.delete::<Rollout>(id.as_str(), "rollout.forgotten");
+    }
+}
+
 /// Waits until nobody can activate it any more.
 fn aborting(tx: &mut Tx, rollout: Rollout) {
     let alive = |r: &RolloutRobot| r.grant.is_some() && r.moments.switched.is_none() && r.step == Step::Activating;
@@ -278,7 +330,7 @@ const ABORT_WAITS_MS: u64 = 60_000;
 /// Waits until every robot is back, or will be before it works again.
 fn rolling_back(tx: &mut Tx, board: &Board, rollout: Rollout) {
     let scope_all = rollout.spec.abort_scope == super::spec::AbortScope::All;
-    let irreversible = tx.view.bundles.get(rollout.spec.bundle.as_str()).is_some_and(|b| b.row.is_irreversible);
+    let irreversible = is_irreversible(tx.view, &rollout);
     let now = tx.now;
     let open = |r: &RolloutRobot| match r.step {
         Step::RolledBack | Step::Skipped | Step::Stuck => false,

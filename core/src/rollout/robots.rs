@@ -5,17 +5,17 @@
 //! out of work for a roll-out are counted in its row, in the item that takes one more.
 
 use super::hear::{fail, is_hard, quarantine, report_of};
-use super::rows::{DrainRelease, DrainRequest, Given, Phase, ReleasedBy, Rollout, RolloutRobot, Step};
+use super::rows::{DrainRelease, DrainRequest, Given, Pause, Phase, ReleasedBy, Rollout, RolloutRobot, Step};
 use super::view::View;
-use super::{Board, Order, Sign, Tx, infrastructure, matching, verdict};
+use super::{Board, Order, Sign, Tx, infrastructure, matching, newcomers, verdict};
 use crate::authority::Authority;
 use crate::fleet::heard;
 use crate::fleet::rows::DrainState;
-use crate::ids::{DrainId, RobotId};
+use crate::ids::{DrainId, RobotId, RolloutId};
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::robot::{Duty, HardwareStop, Presence};
-use crate::time::Now;
+use crate::time::{Now, Utc};
 use crate::update::{ActivationGrant, DesiredUpdate, Goal, UpdateReport, UpdateState};
 
 /// What is due for a robot.
@@ -75,13 +75,13 @@ pub fn next(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollou
         Step::Waiting => waiting(view, board, now, rollout, r),
         Step::Staging => staging(view, board, now, rollout, r, report),
         Step::Staged => staged(view, board, now, rollout, r, report),
-        Step::Draining => draining(view, rollout, r),
+        Step::Draining => draining(view, now, rollout, r),
         Step::Activating => activating(view, board, now, rollout, r, report),
         Step::Trial => trial(view, now, rollout, r, report),
-        Step::Committing => committing(rollout, r, report),
+        Step::Committing => committing(view, rollout, r, report),
         Step::Reverting => reverting(view, board, r, report),
         Step::Committed => goes_back(view, rollout, r).then_some(Move::Revert),
-        Step::Skipped if rollout.second_pass && !r.again && is_retried(r) => Some(Move::Again),
+        Step::Skipped if is_tried_again(rollout, r) => Some(Move::Again),
         Step::Skipped => keeps_for_nothing(view, rollout, r).then_some(Move::Forget),
         Step::RolledBack => None,
         // Somebody mended it.
@@ -95,6 +95,10 @@ pub fn next(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollou
 pub fn is_retried(r: &RolloutRobot) -> bool {
     let codes = [Code::SkippedOffline, Code::SkippedBusy, Code::SkippedStuck];
     r.why.as_ref().is_some_and(|why| codes.contains(&why.code))
+}
+
+fn is_tried_again(rollout: &Rollout, r: &RolloutRobot) -> bool {
+    rollout.second_pass && rollout.phase == Phase::Applying && !r.again && is_retried(r)
 }
 
 /// It has the bundle for a second try that will not come.
@@ -124,9 +128,42 @@ pub fn is_newcomer(rollout: &Rollout, r: &RolloutRobot) -> bool {
     r.wave > rollout.spec.waves.len() as u32
 }
 
+/// Why a robot that does not run the bundle yet will not get it; none: it may.
+fn left_out(view: &View, rollout: &Rollout, r: &RolloutRobot) -> Option<Reason> {
+    let comes_later = is_newcomer(rollout, r);
+    if rollout.phase.goes_back() || (rollout.phase == Phase::Completed && !comes_later) {
+        return Some(Code::RolloutEnded.into());
+    }
+    if comes_later && is_gone(view, rollout) {
+        return Some(Code::BundleRevoked.into());
+    }
+    // Another has come since, or this one served a newcomer badly. Who is tried again was asked for by a person.
+    if comes_later && !r.again && !newcomers::is_served(view, &rollout.rollout_id) {
+        return Some(Code::RolloutEnded.into());
+    }
+    let pin = view.software.get(r.robot_id.as_str()).and_then(|s| s.row.pin.as_ref());
+    pin.filter(|_| rollout.revert_of.is_none()).map(matching::pinned)
+}
+
+/// Nobody may be given its bundle any more: a person took it back, or no release lists it.
+pub fn is_gone(view: &View, rollout: &Rollout) -> bool {
+    let bundle = view.bundles.get(rollout.spec.bundle.as_str()).map(|b| &b.row);
+    rollout.revert_of.is_none() && bundle.is_none_or(|b| b.revoked.is_some() || !b.listed)
+}
+
+/// The robot's turn came long ago. The time in which the roll-out stood still does not count.
+fn is_late(now: &Now, rollout: &Rollout, r: &RolloutRobot) -> bool {
+    now.utc.ms_since(turn_came(rollout, r)) >= limits::STAGED_WITHIN.as_ms()
+}
+
+/// When the robot's turn came, or the roll-out went on after that.
+pub fn turn_came(rollout: &Rollout, r: &RolloutRobot) -> Utc {
+    rollout.since.max(r.since).max(rollout.resumed.unwrap_or_default())
+}
+
 fn waiting(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
-    if rollout.phase.goes_back() {
-        return Some(Move::Skip(Code::RolloutEnded.into()));
+    if let Some(why) = left_out(view, rollout, r) {
+        return Some(Move::Skip(why));
     }
     if !(rollout.phase.runs() || is_newcomer(rollout, r)) || !rollout.pauses.is_empty() {
         return None;
@@ -138,21 +175,33 @@ fn waiting(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollout
     {
         return Some(Move::Skip(reason));
     }
-    if matching::claimed_by(view, &r.robot_id, &r.rollout_id).is_some() {
-        return None;
+    // What is not heard keeps nobody waiting, whoever has it.
+    if let Some(skip) = skips_offline(board, now, rollout, r) {
+        return Some(skip);
+    }
+    if let Some(other) = matching::claimed_by(view, &r.robot_id, &r.rollout_id) {
+        return busy_elsewhere(now, rollout, r, other);
     }
     if rollout.revert_of.is_some() {
         return Some(Move::IsStaged);
     }
-    // A robot that has never been heard has no session to write to; its turn passes.
-    is_on(rollout, r)
-        .then(|| skips_offline(board, now, r))
-        .flatten()
-        .or_else(|| view.sessions.contains_key(r.robot_id.as_str()).then_some(Move::Stage))
+    // A robot that has never been heard has no session to write to.
+    view.sessions.contains_key(r.robot_id.as_str()).then_some(Move::Stage)
 }
 
-fn skips_offline(board: &Board, now: &Now, r: &RolloutRobot) -> Option<Move> {
-    (!is_heard(board, now, &r.robot_id)).then(|| Move::Skip(Code::SkippedOffline.into()))
+/// Its turn has come, the roll-out does not stand still, and the robot is not heard. A robot that is to go back is waited for by nobody, and
+/// goes back when it comes; one that came later is in nobody's way.
+fn skips_offline(board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
+    let planned = rollout.revert_of.is_none() && !is_newcomer(rollout, r);
+    let turn = is_on(rollout, r) && rollout.pauses.is_empty() && planned;
+    (turn && !is_heard(board, now, &r.robot_id)).then(|| Move::Skip(Code::SkippedOffline.into()))
+}
+
+/// Another roll-out has the robot and does not let it go: its turn passes.
+fn busy_elsewhere(now: &Now, rollout: &Rollout, r: &RolloutRobot, other: &RolloutId) -> Option<Move> {
+    let turn = is_on(rollout, r) && rollout.pauses.is_empty() && !is_newcomer(rollout, r);
+    let late = turn && is_late(now, rollout, r);
+    late.then(|| Move::Skip(Reason::from(Code::SkippedBusy).with("rollout_id", other)))
 }
 
 fn staging(
@@ -163,8 +212,8 @@ fn staging(
     r: &RolloutRobot,
     report: Option<&UpdateReport>,
 ) -> Option<Move> {
-    if rollout.phase.goes_back() {
-        return Some(Move::Skip(Code::RolloutEnded.into()));
+    if let Some(why) = left_out(view, rollout, r) {
+        return Some(Move::Skip(why));
     }
     match report.map(|report| report.state) {
         Some(UpdateState::Directed | UpdateState::Downloading) => {}
@@ -177,14 +226,16 @@ fn staging(
         None if now.wall.ms_since(r.signed) >= limits::DIRECTIVE_RENEWED_MS => return Some(Move::SignAnew),
         None => {}
     }
-    let waits_for_it = is_on(rollout, r);
-    let late = || now.utc.ms_since(rollout.since.max(r.since)) >= limits::STAGED_WITHIN.as_ms();
-    match () {
-        () if waits_for_it && !is_heard(board, now, &r.robot_id) => Some(Move::Skip(Code::SkippedOffline.into())),
-        () if waits_for_it && late() => Some(Move::Skip(Code::SkippedStuck.into())),
-        () if view.desired.get(r.robot_id.as_str()).is_none() => Some(Move::Stage),
-        () => None,
-    }
+    skips_offline(board, now, rollout, r).or_else(|| skips_stuck(now, rollout, r)).or_else(|| {
+        // What it was told is gone: it is told again.
+        (!view.desired.contains_key(r.robot_id.as_str())).then_some(Move::Stage)
+    })
+}
+
+/// Its turn came long ago, and it has not fetched the bundle.
+fn skips_stuck(now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
+    let late = is_on(rollout, r) && rollout.pauses.is_empty() && is_late(now, rollout, r);
+    late.then(|| Move::Skip(Code::SkippedStuck.into()))
 }
 
 fn staged(
@@ -195,8 +246,8 @@ fn staged(
     r: &RolloutRobot,
     report: Option<&UpdateReport>,
 ) -> Option<Move> {
-    if rollout.phase.goes_back() {
-        return Some(Move::Skip(Code::RolloutEnded.into()));
+    if let Some(why) = left_out(view, rollout, r) {
+        return Some(Move::Skip(why));
     }
     match report.map(|report| report.state) {
         Some(UpdateState::Refused) => {
@@ -204,13 +255,22 @@ fn staged(
             return Some(Move::Skip(Reason::new(Code::SkippedIncompatible, why.text()).with("because", why.code)));
         }
         // What was staged is gone: its disk was changed, and it begins again.
-        Some(UpdateState::Directed | UpdateState::Downloading) if rollout.revert_of.is_none() => return None,
+        Some(UpdateState::Directed | UpdateState::Downloading) if rollout.revert_of.is_none() => {
+            return skips_offline(board, now, rollout, r).or_else(|| skips_stuck(now, rollout, r));
+        }
         _ => {}
     }
-    if blocked(view, board, now, rollout, r).is_some() {
-        return None;
+    match blocked(view, board, now, rollout, r) {
+        None => skips_offline(board, now, rollout, r).or_else(|| {
+            let comes = rollout.revert_of.is_some() || is_heard(board, now, &r.robot_id);
+            comes.then_some(Move::AskDrain)
+        }),
+        Some(why) if why.code == Code::BlockedByRollout => {
+            let other = matching::claimed_by(view, &r.robot_id, &r.rollout_id)?;
+            busy_elsewhere(now, rollout, r, other)
+        }
+        Some(_) => None,
     }
-    Some(Move::AskDrain)
 }
 
 /// Why a robot that has the bundle is not taken out of work now.
@@ -248,16 +308,26 @@ pub fn in_flight_max(view: &View, rollout: &Rollout) -> u32 {
     rollout.spec.max_in_flight.map_or(wave, |most| most.min(wave)).max(1)
 }
 
-fn draining(view: &View, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
+fn draining(view: &View, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
     let drain_id = r.drain_id.as_ref()?;
     if view.is_held(&r.robot_id, drain_id) {
         return Some(Move::Held);
     }
-    if rollout.phase.goes_back() || !rollout.pauses.is_empty() {
+    if left_out(view, rollout, r).is_some() || !rollout.pauses.is_empty() {
         return Some(Move::LeaveDrain(Step::Staged));
     }
-    let refused = view.drain(drain_id).is_some_and(|d| d.state == DrainState::Refused);
-    refused.then(|| Move::Skip(Code::SkippedBusy.into()))
+    let drain = view.drain(drain_id)?;
+    // To wait for the budget costs nothing. A person may keep a robot out of work for weeks.
+    let behind_person = drain.state == DrainState::Waiting
+        && drain.why.as_ref().is_some_and(|why| why.code == Code::RobotDraining)
+        && is_late(now, rollout, r);
+    match drain.state {
+        DrainState::Refused => Some(Move::Skip(Code::SkippedBusy.into())),
+        _ if behind_person => Some(Move::Skip(drain.why.clone().map_or(Code::SkippedBusy.into(), |why| {
+            Reason::new(Code::SkippedBusy, why.text()).with("because", why.code)
+        }))),
+        _ => None,
+    }
 }
 
 fn activating(
@@ -277,9 +347,8 @@ fn activating(
     }
     match state {
         Some(UpdateState::Trial | UpdateState::Committing | UpdateState::Committed) => return Some(Move::OnTrial),
-        Some(UpdateState::Refused) if r.grant.is_none() => {
-            return Some(Move::Skip(Code::SkippedIncompatible.into()));
-        }
+        // It is over for this directive: a permission that was given cannot be used any more.
+        Some(UpdateState::Refused) => return Some(Move::Skip(Code::SkippedIncompatible.into())),
         Some(UpdateState::Probation | UpdateState::RollingBack) => {
             if r.moments.switched.is_none() {
                 return Some(Move::Switched);
@@ -287,19 +356,19 @@ fn activating(
             let back = rollout.phase.goes_back();
             return (back && !wants(view, r, Goal::Revert))
                 .then_some(Move::GoBack)
-                .or_else(|| lost(view, board, now, r));
+                .or_else(|| lost(view, board, now, rollout, r));
         }
         _ => {}
     }
     match &r.grant {
-        Some(given) => unused(view, board, now, r, given, state).or_else(|| lost(view, board, now, r)),
-        None if rollout.phase.goes_back() || !rollout.pauses.is_empty() || !is_on(rollout, r) => {
+        Some(given) => unused(view, board, now, r, given, state).or_else(|| lost(view, board, now, rollout, r)),
+        None if left_out(view, rollout, r).is_some() || !rollout.pauses.is_empty() || !is_on(rollout, r) => {
             if view.bugs.pause_is_forgotten() && r.ready {
                 return Some(Move::Grant);
             }
             Some(Move::LeaveDrain(Step::Staged))
         }
-        None if r.ready && may_grant(view, board, r) => Some(Move::Grant),
+        None if r.ready && may_grant(view, board, now, r) => Some(Move::Grant),
         None => {
             let held = r.moments.held.map_or(0, |at| now.utc.ms_since(at));
             let late = held >= limits::READY_WITHIN.as_ms();
@@ -312,9 +381,10 @@ fn activating(
 }
 
 /// Fleet's record says that this drain holds the robot, and it is heard in its newest session.
-fn may_grant(view: &View, board: &Board, r: &RolloutRobot) -> bool {
+fn may_grant(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> bool {
     let held = r.drain_id.as_ref().is_some_and(|id| view.is_held(&r.robot_id, id));
-    (held || view.bugs.any_drain_will_do()) && anchor(view, board, &r.robot_id).is_some()
+    let heard = is_heard(board, now, &r.robot_id) && anchor(view, board, &r.robot_id).is_some();
+    (held || view.bugs.any_drain_will_do()) && heard
 }
 
 fn anchor(view: &View, board: &Board, robot_id: &RobotId) -> Option<Authority> {
@@ -348,16 +418,28 @@ fn unused(
     (past && not_used && state == Some(UpdateState::Staged)).then_some(Move::NotUsed)
 }
 
-/// The robot is not heard, though most others are.
-fn lost(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> Option<Move> {
-    let is_lost = r.failure.as_ref().is_some_and(|f| f.code == Code::RobotLost);
-    match (infrastructure::is_missing(view, board, now, r), is_lost) {
+/// The robot is not heard, though most others are. It is taken back until the gate of its wave closes.
+fn lost(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
+    let network = [Pause::Infrastructure, Pause::InfrastructureUnknown];
+    match (infrastructure::is_missing(view, board, now, r), is_lost(r)) {
+        // The roll-out stands still for it: nothing is anybody's fault yet.
+        (true, false) if network.iter().any(|p| rollout.pauses.contains(p)) => None,
         (true, false) if infrastructure::controls(view, board, now, r).is_ok() => {
             Some(Move::Fail(Code::RobotLost.into()))
         }
-        (false, true) => Some(Move::Found),
+        (false, true) if is_open_to(rollout, r) => Some(Move::Found),
         _ => None,
     }
+}
+
+/// It counts as lost.
+fn is_lost(r: &RolloutRobot) -> bool {
+    r.failure.as_ref().is_some_and(|f| f.code == Code::RobotLost)
+}
+
+/// The gate of its wave has not closed.
+fn is_open_to(rollout: &Rollout, r: &RolloutRobot) -> bool {
+    r.wave >= rollout.promoted
 }
 
 /// The robot went back, or could not.
@@ -374,10 +456,15 @@ fn ended(r: &RolloutRobot, report: Option<&UpdateReport>) -> Option<Move> {
 /// It must leave what it runs.
 fn goes_back(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
     let kept = matches!(r.step, Step::Committing | Step::Committed);
-    let irreversible = kept && view.bundles.get(rollout.spec.bundle.as_str()).is_some_and(|b| b.row.is_irreversible);
+    let irreversible = kept && is_irreversible(view, rollout);
     let in_scope = rollout.spec.abort_scope == super::spec::AbortScope::All || !kept;
     let aborts = matches!(rollout.phase, Phase::Aborting | Phase::RollingBack) || (rollout.phase.goes_back() && !kept);
     aborts && in_scope && !irreversible && r.attempted
+}
+
+/// What was told to be kept cannot be gone back from.
+pub fn is_irreversible(view: &View, rollout: &Rollout) -> bool {
+    view.bundles.get(rollout.spec.bundle.as_str()).is_some_and(|b| b.row.is_irreversible)
 }
 
 fn trial(view: &View, now: &Now, rollout: &Rollout, r: &RolloutRobot, report: Option<&UpdateReport>) -> Option<Move> {
@@ -392,6 +479,9 @@ fn trial(view: &View, now: &Now, rollout: &Rollout, r: &RolloutRobot, report: Op
         let stays = rollout.phase.runs() && (is_hard(why) || rollout.phase == Phase::Review);
         return (!stays).then_some(Move::Revert);
     }
+    if is_newcomer(rollout, r) && is_gone(view, rollout) {
+        return Some(Move::Revert);
+    }
     let broken = view.control.get(r.robot_id.as_str()).and_then(|c| c.row.breaker);
     if broken.is_some_and(|since| r.moments.on_trial.is_some_and(|at| since >= at)) {
         return Some(Move::Fail(Code::BreakerOnTrial.into()));
@@ -405,12 +495,11 @@ fn trial(view: &View, now: &Now, rollout: &Rollout, r: &RolloutRobot, report: Op
     (promoted && rollout.pauses.is_empty()).then_some(Move::Commit)
 }
 
-fn committing(rollout: &Rollout, r: &RolloutRobot, report: Option<&UpdateReport>) -> Option<Move> {
+fn committing(view: &View, rollout: &Rollout, r: &RolloutRobot, report: Option<&UpdateReport>) -> Option<Move> {
+    let all = rollout.spec.abort_scope == super::spec::AbortScope::All;
     match report.map(|r| r.state) {
         Some(UpdateState::Committed) => Some(Move::Committed),
-        _ if rollout.phase.goes_back() && rollout.spec.abort_scope == super::spec::AbortScope::All => {
-            Some(Move::Revert)
-        }
+        _ if rollout.phase.goes_back() && all && !is_irreversible(view, rollout) => Some(Move::Revert),
         _ => ended(r, report),
     }
 }
@@ -449,12 +538,18 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             if r.again || !is_retried(&r) {
                 drop_bundle(tx, &r);
             }
-            let retired = tx.view.duty(&r.robot_id) == Duty::Retired;
-            leave_drain(tx, &mut r, if retired { ReleasedBy::Retired } else { ReleasedBy::NoGrant });
+            let released_by = match tx.view.duty(&r.robot_id) {
+                Duty::Retired => ReleasedBy::Retired,
+                // It said that it never will.
+                _ if r.grant.is_some() => ReleasedBy::Reported,
+                _ => ReleasedBy::NoGrant,
+            };
+            leave_drain(tx, &mut r, released_by);
             step(tx, r, Step::Skipped, "robot.skipped");
         }
         Move::Again => {
-            r.wave = rollout.spec.waves.len() as u32;
+            // If no wave was judged the waves begin anew, and each robot keeps its own.
+            r.wave = if rollout.wave < rollout.spec.waves.len() as u32 { r.wave } else { rollout.wave };
             (r.again, r.why, r.ready) = (true, None, false);
             step(tx, r, Step::Waiting, "robot.tried_again");
         }
@@ -479,6 +574,8 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             desire(tx, &r.robot_id, |d| d.grant = None);
             (r.grant, r.ready) = (None, false);
             r.moments.granted_wall = None;
+            // It never ran the bundle, so the bundle has not lost it.
+            r.failure = r.failure.filter(|f| f.code != Code::RobotLost);
             tx.put(r, "robot.grant_not_used");
         }
         Move::LeaveDrain(to) => {
@@ -490,6 +587,8 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
         }
         Move::Switched => {
             (r.moments.switched, r.moments.switched_wall) = (Some(tx.now.utc), Some(tx.now.wall));
+            // It runs, whatever the rows know of a permission: a store that was restored has forgotten some.
+            r.attempted = true;
             tx.put(r, "robot.switched");
         }
         Move::OnTrial => {
@@ -497,7 +596,10 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             r.moments.switched_wall.get_or_insert(tx.now.wall);
             r.moments.on_trial = Some(tx.now.utc);
             r.before = verdict::work_of(tx.view, &rollout, &r.robot_id);
-            r.failure = r.failure.filter(|f| f.code != Code::RobotLost);
+            if is_open_to(&rollout, &r) {
+                r.failure = r.failure.filter(|f| f.code != Code::RobotLost);
+            }
+            r.attempted = true;
             leave_drain(tx, &mut r, ReleasedBy::Reported);
             step(tx, r, Step::Trial, "robot.on_trial");
         }
@@ -510,9 +612,11 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
         Move::Committed => step(tx, r, Step::Committed, "robot.committed"),
         Move::Revert => {
             let hard = rollout.abort.as_ref().is_some_and(|a| a.hard) || r.failure.is_some();
+            // A robot that is not heard goes back before it works again.
+            let urgent = hard || !is_heard(board, &tx.now, &r.robot_id);
             r.attempted |= rollout.revert_of.is_some();
             if r.drain_id.is_none() {
-                ask_drain(tx, &rollout, &mut r, hard);
+                ask_drain(tx, &rollout, &mut r, urgent);
             }
             step(tx, r, Step::Reverting, "robot.reverting");
         }
@@ -527,6 +631,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             super::incident(tx, Some(&r.robot_id), &reason);
             r.failure = Some(reason);
             r.attempted = true;
+            newcomers::failed(tx, &rollout, &r);
             step(tx, r, Step::Stuck, "robot.stuck");
         }
     }
@@ -553,6 +658,7 @@ fn rolled_back(tx: &mut Tx, rollout: &Rollout, mut r: RolloutRobot, why: Reason)
     }
     if let Some(failure) = r.failure.clone() {
         quarantine(tx, &r, &failure);
+        newcomers::failed(tx, rollout, &r);
     }
     let back = if asked && r.failure.is_none() { Code::RevertAsked.into() } else { why };
     r.why = Some(rollout.abort.as_ref().map_or(back, |a| a.reason.clone()));
@@ -647,7 +753,7 @@ fn leave_drain(tx: &mut Tx, r: &mut RolloutRobot, why: ReleasedBy) {
 }
 
 /// One more or less is out of work for a roll-out: the row that two planners fight over.
-fn count(tx: &mut Tx, rollout_id: &crate::ids::RolloutId, by: i32) {
+fn count(tx: &mut Tx, rollout_id: &RolloutId, by: i32) {
     let Some(rollout) = tx.view.rollout(rollout_id).cloned() else { return };
     let in_flight = rollout.in_flight.saturating_add_signed(by);
     tx.put(Rollout { in_flight, ..rollout }, "rollout.in_flight");

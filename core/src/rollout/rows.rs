@@ -299,13 +299,16 @@ pub struct Rollout {
     /// What tasks say of the bundle so far.
     pub tasks: FailureEvidence,
     /// Up to where tasks were counted for that.
-    pub counted: Counted,
+    pub counted: Arc<Counted>,
     /// Who wrote it down.
     pub created: Act,
     /// Who stands for it.
     pub approved: Option<Act>,
     /// UTC, site clock, when it began.
     pub started: Option<Utc>,
+    /// UTC, site clock, when it went on after it stood still. None: it never stood still.
+    #[serde(default)]
+    pub resumed: Option<Utc>,
     /// UTC, site clock, when it came to its phase.
     pub since: Utc,
 }

@@ -15,6 +15,7 @@ use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::time::Utc;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// Robots named in an abort.
 const NAMED_MAX: usize = 16;
@@ -62,7 +63,8 @@ pub fn controls_of(view: &View, rollout: &Rollout) -> TaskTally {
 }
 
 /// Takes in what ended since it was counted last. By the clock, never because a task failed.
-pub fn count_tasks(tx: &mut Tx, rollout: &Rollout) {
+pub fn count_tasks(tx: &mut Tx, id: &RolloutId) {
+    let Some(rollout) = tx.view.rollout(id) else { return };
     let at_ms = tx.view.served_ms(&tx.now);
     let waited_ms = at_ms.saturating_sub(rollout.counted.at_ms);
     if rollout.revert_of.is_some() || waited_ms < limits::TASKS_COUNTED_EVERY.as_ms() {
@@ -76,8 +78,9 @@ pub fn count_tasks(tx: &mut Tx, rollout: &Rollout) {
     let news = trial.iter().map(|(id, tally)| (id.clone(), since(*tally, before(id)))).collect();
     let mut tasks = rollout.tasks.clone();
     tasks.observe(&news, since(control, rollout.counted.control));
-    let counted = Counted { at_ms, trial, control };
-    tx.put(Rollout { tasks, counted, ..rollout.clone() }, "rollout.tasks_counted");
+    let counted = Arc::new(Counted { at_ms, trial, control });
+    let row = Rollout { tasks, counted, ..rollout.clone() };
+    tx.put(row, "rollout.tasks_counted");
 }
 
 /// Counts robots. Those on trial in wave `upto` or before count as having come through.
@@ -172,6 +175,8 @@ pub fn gate(view: &View, rollout: &Rollout, at: Utc) -> Verdict {
         gates::Verdict::Inconclusive if rollout.spec.small_wave == SmallWave::Review => {
             give(Outcome::Review, Code::GateAsksPerson)
         }
+        // Nobody came through: what was not seen is not called unproven, a person looks.
+        gates::Verdict::Inconclusive if seen.outcomes.clean == 0 => give(Outcome::Review, Code::GateInconclusive),
         gates::Verdict::Inconclusive => give(Outcome::PromotedUnproven, Code::GateUnproven),
     }
 }

@@ -10,7 +10,7 @@ use crate::ids::{AreaId, DrainId, RobotId, RolloutId};
 use crate::picture::{Picture, Viewed};
 pub use crate::picture::{Rowed, Slot};
 use crate::policy::AreaPolicy;
-use crate::robot::Duty;
+use crate::robot::{Duty, Lane};
 use crate::rows::{BadRow, Key, Revision, Row, Seq, Table, Writer};
 use crate::site::Site;
 use crate::time::Now;
@@ -69,6 +69,8 @@ pub struct View {
     pub arrived: BTreeSet<RobotId>,
     /// Last entry of the feed that was taken.
     pub absorbed: Seq,
+    /// Last entry of the robot inbox that changed nothing. It must not be taken again once something else was decided. Volatile.
+    pub passed: Seq,
     /// Rows were read at this entry: what older entries say of rows is in the picture already.
     pub read_at: Seq,
     /// Reading of the clocks when the service started: everybody counts as heard then.
@@ -97,14 +99,10 @@ viewed! {
     DrainRequest => requests;
     DrainRelease => releases;
     DesiredUpdate => desired;
-    RobotSoftware => software;
-    Quarantine => quarantines;
-    AreaBundle => area_bundles;
     OtaMark => marks;
     OtaClock => clocks;
     Drain => drains;
     RobotAuthority => authority;
-    RobotControl => control;
     RobotCounter => counters;
     AreaPolicy => policies;
     LaneMark => lane_marks;
@@ -129,6 +127,8 @@ impl Viewed<View> for RolloutRobot {
                 view.of_robot.entry(row.robot_id.clone()).or_default().insert(row.rollout_id.clone());
                 if row.step.is_over() {
                     view.open.remove(id);
+                    // It is free for a roll-out that was completed meanwhile.
+                    view.arrived.insert(row.robot_id.clone());
                 } else {
                     view.open.insert(id.to_owned());
                 }
@@ -142,6 +142,52 @@ impl Viewed<View> for RolloutRobot {
                 }
             }
         }
+    }
+}
+
+impl Viewed<View> for RobotSoftware {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.software
+    }
+    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+        let Some(new) = view.software.get(id).map(|s| &s.row) else { return };
+        if old.is_none_or(|old| old.area != new.area || old.pin.is_some() != new.pin.is_some()) {
+            view.arrived.insert(new.robot_id.clone());
+        }
+    }
+}
+
+impl Viewed<View> for RobotControl {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.control
+    }
+    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+        let Some(new) = view.control.get(id).map(|c| &c.row) else { return };
+        if old.is_some_and(|old| old.retired.is_some()) && new.retired.is_none() {
+            view.arrived.insert(new.robot_id.clone());
+        }
+    }
+}
+
+impl Viewed<View> for Quarantine {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.quarantines
+    }
+    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+        if let Some(lifted) = old.filter(|_| !view.quarantines.contains_key(id)) {
+            view.arrived.insert(lifted.robot_id.clone());
+        }
+    }
+}
+
+impl Viewed<View> for AreaBundle {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.area_bundles
+    }
+    /// Robots that came while the roll-out ran had no part in it.
+    fn changed(view: &mut View, _id: &str, _old: Option<&Self>) {
+        let all: Vec<RobotId> = view.sessions.values().map(|s| s.row.robot_id.clone()).collect();
+        view.arrived.extend(all);
     }
 }
 
@@ -204,6 +250,7 @@ impl View {
             wave_sizes: BTreeMap::new(),
             arrived: BTreeSet::new(),
             absorbed: Seq(0),
+            passed: Seq(0),
             read_at: Seq(0),
             started,
             read,
@@ -306,11 +353,14 @@ impl View {
         let at = live.report.vitals.waypoint.as_ref().and_then(|w| self.site.find(w))?;
         Some(self.site.area_of(at).area_id.clone())
     }
-    /// Everything that the robot had said when it sent this heartbeat was consumed, and it belongs to the newest session.
+    /// Everything that the robot had said when it sent this heartbeat was consumed, nothing that it said since, and it belongs to the newest
+    /// session.
     pub fn is_settled(&self, live: &Live) -> bool {
         let id = live.robot_id.as_str();
         let Some(session) = self.sessions.get(id) else { return false };
         let mark = self.lane_marks.get(&format!("{id}/{}", session.row.ring)).map(|m| &m.row);
-        session.row.session_epoch == live.report.session_epoch && live.is_consumed(mark)
+        let said = live.report.produced.get(&Lane::Event).copied().unwrap_or(0);
+        let is_fresh = said >= mark.map_or(0, |m| m.event);
+        session.row.session_epoch == live.report.session_epoch && live.is_consumed(mark) && is_fresh
     }
 }
