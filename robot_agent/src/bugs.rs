@@ -11,4 +11,8 @@ midshift_core::seeded_bugs! {
     IgnoreHolder ignore_holder;
     /// A session is kept however long the server is silent.
     PatientSession patient_session;
+    /// A robot that any drain holds may change its software.
+    AnyDrainWillDo any_drain_will_do;
+    /// A robot changes its software whatever it does, and stopped or not.
+    ActivatesAnyway activates_anyway;
 }

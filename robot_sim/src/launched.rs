@@ -1,7 +1,7 @@
 //! Stands in for the launcher of each robot of a swarm, and for what a robot's program does with the set that it is started from.
 //!
 //! Which set starts, its tries and its end on trial are decided as for a real robot ([`midshift_agent::starts`]); of the set only
-//! `behaviour.toml` is read. Invariant: the switch record is written here only while no agent of that robot runs. Called by [`crate::swarm`].
+//! `behaviour.toml` is read. Invariant: the switch record is written here only while no agent of that robot runs. Called by [`crate::swarm`] and by simulations.
 
 use crate::behaviour::{Behaviour, COMPONENT, FILE_BYTES_MAX};
 use crate::handle::SimHandle;
@@ -31,7 +31,7 @@ enum Kept {
 }
 
 /// The launcher of one robot.
-pub(crate) struct Launched {
+pub struct Launched {
     kept: Kept,
     tries: Arc<Mutex<Tries>>,
     /// What it does and says with what it came with.
@@ -40,7 +40,7 @@ pub(crate) struct Launched {
 
 /// How a start went.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Start {
+pub enum Start {
     /// The program ended at once.
     Dead(String),
     /// It runs, and hangs after so long, real time.
@@ -65,7 +65,7 @@ impl Kept {
 
 impl Launched {
     /// For a robot whose sets are in the folder `dir`, or in memory; its body is as it came.
-    pub(crate) fn new(dir: Option<&Path>, robot: &SimHandle) -> Self {
+    pub fn new(dir: Option<&Path>, robot: &SimHandle) -> Self {
         let kept = match dir {
             Some(dir) => Kept::Dir(dir.to_owned()),
             None => {
@@ -83,7 +83,7 @@ impl Launched {
     ///
     /// # Errors
     /// Sets that cannot be read: nothing is started.
-    pub(crate) fn start(&self, robot: &SimHandle, now: SiteTime) -> Result<Start, sets::Error> {
+    pub fn start(&self, robot: &SimHandle, now: SiteTime) -> Result<Start, sets::Error> {
         let mut sets = self.kept.open()?;
         let mut holdings = sets.holdings()?;
         let mut tries = lock(&self.tries);
@@ -127,14 +127,29 @@ impl Launched {
     ///
     /// # Errors
     /// Sets that cannot be opened.
-    pub(crate) fn updates(&self, trust: &Trust, bulk: Arc<dyn Dial>) -> Result<Updates, sets::Error> {
+    pub fn updates(&self, trust: &Trust, bulk: Arc<dyn Dial>) -> Result<Updates, sets::Error> {
         let config = UpdateConfig { is_launched: true, ..trust.config() };
         let worker = UpdateWorker::new(self.kept.open()?, Arc::new(GrpcRemote::new(bulk)));
         Ok(Updates { config, worker: Box::new(worker) })
     }
 
+    /// What lies on its disk.
+    ///
+    /// # Errors
+    /// Sets that cannot be read.
+    pub fn holdings(&self) -> Result<Holdings, sets::Error> {
+        self.kept.open()?.holdings()
+    }
+
+    /// The power goes: what was not synced is gone. A folder on a real disk knows no such thing.
+    pub fn lose_power(&self) {
+        if let Kept::Memory(sets) = &self.kept {
+            sets.lose_power();
+        }
+    }
+
     /// Hears the agent's pulse: one that runs well clears its tries.
-    pub(crate) fn pulse(&self) -> Box<dyn FnMut() + Send> {
+    pub fn pulse(&self) -> Box<dyn FnMut() + Send> {
         let (kept, tries) = (self.kept.clone(), self.tries.clone());
         let mut pulses = 0_u32;
         Box::new(move || {
@@ -149,12 +164,12 @@ impl Launched {
     }
 
     /// The agent ended to be started again from the switch record.
-    pub(crate) fn switched(&self) {
+    pub fn switched(&self) {
         *lock(&self.tries) = Tries::default();
     }
 
     /// Time before the next start of a program that did not end well.
-    pub(crate) fn pause(&self) -> Duration {
+    pub fn pause(&self) -> Duration {
         lock(&self.tries).pause()
     }
 }

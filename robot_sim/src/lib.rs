@@ -10,7 +10,7 @@ pub mod faults;
 pub mod hall;
 pub mod handle;
 pub mod journal;
-mod launched;
+pub mod launched;
 pub mod motion;
 pub mod oracle;
 pub mod person;

@@ -172,7 +172,7 @@ fn refusal(
     area: &mut Area,
     robot_id: &RobotId,
 ) -> Option<Reason> {
-    if area.off_work.contains(robot_id) {
+    if area.off_work.contains(robot_id) || view.bugs.budget_is_forgotten() {
         return None;
     }
     let rules = view.policy(area_id).software;

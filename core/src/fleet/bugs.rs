@@ -7,4 +7,6 @@ crate::seeded_bugs! {
     TimeoutFreesPlace timeout_frees_place;
     /// What a heartbeat does not list is gone, whatever events are still on their way.
     HeartbeatOvertakesEvents heartbeat_overtakes_events;
+    /// Robots leave their work for a roll-out however many of the area have left it.
+    BudgetIsForgotten budget_is_forgotten;
 }

@@ -5,6 +5,8 @@ crate::seeded_bugs! {
     TimeReleasesDrain time_releases_drain;
     /// A robot that waits in another drain is given permission too.
     AnyDrainWillDo any_drain_will_do;
-    /// A roll-out that is paused or aborted goes on giving permissions.
+    /// A roll-out that is paused or aborted goes on with the drains that it asked for, and giving permissions.
     PauseIsForgotten pause_is_forgotten;
+    /// Robots are taken out of work for a roll-out however many are.
+    InFlightIsForgotten in_flight_is_forgotten;
 }

@@ -301,6 +301,9 @@ pub fn pauses(rollout: &Rollout) -> String {
 
 /// Robots that may be out of work for a roll-out at once: never more than its wave has.
 pub fn in_flight_max(view: &View, rollout: &Rollout) -> u32 {
+    if view.bugs.in_flight_is_forgotten() {
+        return u32::MAX;
+    }
     if rollout.phase == Phase::Completed {
         return 1;
     }
@@ -310,10 +313,10 @@ pub fn in_flight_max(view: &View, rollout: &Rollout) -> u32 {
 
 fn draining(view: &View, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
     let drain_id = r.drain_id.as_ref()?;
-    if view.is_held(&r.robot_id, drain_id) {
+    if view.is_held(&r.robot_id, drain_id) || (view.bugs.any_drain_will_do() && view.is_held_by_any(&r.robot_id)) {
         return Some(Move::Held);
     }
-    if left_out(view, rollout, r).is_some() || !rollout.pauses.is_empty() {
+    if stands_still(view, rollout, r) {
         return Some(Move::LeaveDrain(Step::Staged));
     }
     let drain = view.drain(drain_id)?;
@@ -328,6 +331,11 @@ fn draining(view: &View, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Opti
         }))),
         _ => None,
     }
+}
+
+/// No robot of it gets permission now.
+fn stands_still(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
+    (left_out(view, rollout, r).is_some() || !rollout.pauses.is_empty()) && !view.bugs.pause_is_forgotten()
 }
 
 fn activating(
@@ -362,10 +370,7 @@ fn activating(
     }
     match &r.grant {
         Some(given) => unused(view, board, now, r, given, state).or_else(|| lost(view, board, now, rollout, r)),
-        None if left_out(view, rollout, r).is_some() || !rollout.pauses.is_empty() || !is_on(rollout, r) => {
-            if view.bugs.pause_is_forgotten() && r.ready {
-                return Some(Move::Grant);
-            }
+        None if stands_still(view, rollout, r) || (!is_on(rollout, r) && !view.bugs.pause_is_forgotten()) => {
             Some(Move::LeaveDrain(Step::Staged))
         }
         None if r.ready && may_grant(view, board, now, r) => Some(Move::Grant),

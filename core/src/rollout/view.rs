@@ -338,6 +338,11 @@ impl View {
         let holder = self.authority.get(robot.as_str()).map(|a| &a.row.holder);
         matches!(holder, Some(RobotHolder::Maintenance(id)) if id == drain)
     }
+    /// Whether some drain holds the robot.
+    pub fn is_held_by_any(&self, robot: &RobotId) -> bool {
+        let holder = self.authority.get(robot.as_str()).map(|a| &a.row.holder);
+        matches!(holder, Some(RobotHolder::Maintenance(_)))
+    }
     /// Whether a robot works as far as people and the breaker are concerned.
     pub fn duty(&self, robot: &RobotId) -> Duty {
         self.control.get(robot.as_str()).map_or(Duty::InWork, |c| c.row.duty())

@@ -539,7 +539,8 @@ impl AgentCore {
         let state = self.body.state(now.site);
         let launched = self.update.config.as_ref().is_some_and(|c| c.is_launched);
         match () {
-            () if self.kept.ledger.maintenance.as_ref() != Some(drain_id) => no("drain"),
+            () if !self.is_held_by(drain_id) => no("drain"),
+            () if self.config.bugs.activates_anyway() => Ok(()),
             () if self.work.is_some() => no("attempt"),
             () if self.body.load().is_some() => no("load"),
             () if self.is_in_passage(now) => no("passage"),
@@ -551,6 +552,12 @@ impl AgentCore {
             () if !launched => no("no launcher"),
             () => Ok(()),
         }
+    }
+
+    /// Whether this drain holds the robot.
+    fn is_held_by(&self, drain_id: &DrainId) -> bool {
+        let held = self.kept.ledger.maintenance.as_ref();
+        held == Some(drain_id) || (self.config.bugs.any_drain_will_do() && held.is_some())
     }
 
     /// Whether the software changes, or is not yet believed: no work is taken.

@@ -26,6 +26,7 @@ use std::panic::resume_unwind;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
+use tokio::runtime::RuntimeFlavor;
 use tokio_util::sync::CancellationToken;
 
 /// How often the age of what was signed is looked at. By the wall, which may jump: so not once in half a day.
@@ -166,14 +167,22 @@ impl Opened {
     }
 }
 
-/// Does what blocks away from the threads that serve.
+/// Does what blocks away from the threads that serve. A runtime of one thread is a simulation's or a test's: there it is done in place,
+/// so that the order of everything follows from what was asked and not from how fast a disk was.
 async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
+    if is_of_one_thread() {
+        return work();
+    }
     match tokio::task::spawn_blocking(work).await.map_err(tokio::task::JoinError::try_into_panic) {
         Ok(done) => done,
         Err(Ok(panic)) => resume_unwind(panic),
         // The process ends: whoever waits ends with it.
         Err(Err(_)) => std::future::pending().await,
     }
+}
+
+fn is_of_one_thread() -> bool {
+    tokio::runtime::Handle::current().runtime_flavor() == RuntimeFlavor::CurrentThread
 }
 
 #[cfg(test)]

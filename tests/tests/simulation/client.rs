@@ -3,6 +3,7 @@
 //! Invariant: an answer that did not come changes nothing: the request is the same, and so is its request_id.
 
 use crate::net;
+use crate::orders::{self, Order};
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::task::v1::{CancelTaskRequest, SubmitTaskRequest};
 use std::cell::{Cell, RefCell};
@@ -14,6 +15,8 @@ use tonic::transport::Channel;
 
 /// A program's patience.
 const ANSWER: Duration = Duration::from_millis(1_500);
+/// The same for an order, which is up to eight questions.
+const ORDER_ANSWER: Duration = Duration::from_millis(6_000);
 /// Between two tries.
 const PAUSE: Duration = Duration::from_millis(300);
 
@@ -24,6 +27,8 @@ pub enum Wish {
     Submit(Box<SubmitTaskRequest>),
     /// The end of one.
     Cancel(CancelTaskRequest),
+    /// Something about software.
+    Order(Box<Order>),
 }
 
 /// What is wished, in order, and what came of it. It outlives the clients.
@@ -34,6 +39,8 @@ pub struct Desk {
     pub unanswered: Cell<u64>,
     /// Tasks that were said to be admitted.
     pub admitted: Cell<u64>,
+    /// Orders about software that were carried out whole.
+    pub obeyed: Cell<u64>,
     /// Refusals nobody should get.
     pub refused: RefCell<Vec<String>>,
 }
@@ -63,6 +70,19 @@ pub async fn run(desk: Rc<Desk>) -> turmoil::Result {
             tokio::time::sleep(PAUSE).await;
             continue;
         };
+        if let Wish::Order(order) = &wish {
+            match tokio::time::timeout(ORDER_ANSWER, orders::carry_out(order)).await {
+                Ok(Ok(whole)) => {
+                    desk.obeyed.set(desk.obeyed.get() + u64::from(whole));
+                    desk.done();
+                }
+                Ok(Err(_)) | Err(_) => {
+                    desk.unanswered.set(desk.unanswered.get() + 1);
+                    tokio::time::sleep(PAUSE).await;
+                }
+            }
+            continue;
+        }
         match tokio::time::timeout(ANSWER, ask(client.clone(), &wish)).await {
             Ok(Ok(())) => {
                 if matches!(wish, Wish::Submit(_)) {
@@ -99,5 +119,6 @@ async fn ask(mut client: TaskServiceClient<Channel>, wish: &Wish) -> Result<(), 
     match wish.clone() {
         Wish::Submit(request) => client.submit_task(*request).await.map(|_| ()),
         Wish::Cancel(request) => client.cancel_task(request).await.map(|_| ()),
+        Wish::Order(_) => Ok(()),
     }
 }

@@ -50,9 +50,9 @@ impl Wire {
     fn state(&self) -> std::sync::MutexGuard<'_, WireState> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
-    /// The way to a machine is this from now on.
-    pub fn set_way(&self, machine: &str, way: Way) {
-        self.state().ways.insert(machine.to_owned(), way);
+    /// The way to a machine is this from now on; what it was.
+    pub fn set_way(&self, machine: &str, way: Way) -> Way {
+        self.state().ways.insert(machine.to_owned(), way).unwrap_or_default()
     }
     /// A machine hears nothing from now on, or hears again.
     pub fn set_deaf(&self, machine: &str, deaf: bool) {

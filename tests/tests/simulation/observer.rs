@@ -4,16 +4,21 @@
 //! Invariant: it takes part in nothing. What it says is broken is broken at that moment, by what was done, not by what somebody
 //! believes. Called by the disks, by the bodies and by the loop of a run.
 
+use crate::changes::{Changes, Look};
 use crate::clock::TrueTime;
 use crate::laws::{Grants, Offers};
 use midshift_agent::store::Op;
+use midshift_agent::switch::Switch;
+use midshift_bundle::set::SetManifest;
 use midshift_core::fleet::rows::Place;
 use midshift_core::ids::{PlaceId, RobotId, Subject, TaskId};
 use midshift_core::reason::Code;
 use midshift_core::robot::Lane;
+use midshift_core::rollout::rows::Rollout;
 use midshift_core::rows::{Entry, Log, Record, Seq, Table};
 use midshift_core::task::machine::Phase;
 use midshift_core::task::{Attempt, TaskIntake, TaskState};
+use midshift_core::update::{DesiredUpdate, UpdateEvent};
 use midshift_core::work::{DesiredWork, InboxEntry, InboxItem, RobotEvent, SampleBody, StepKind, WorkState};
 use midshift_sim::handle::SimHandle;
 use midshift_sim::world::{SharedWorld, lock};
@@ -68,6 +73,7 @@ pub struct Observer {
     offers: Offers,
     grants: Grants,
     within: BTreeMap<RobotId, BTreeSet<PlaceId>>,
+    changes: Changes,
     trace: bool,
 }
 
@@ -91,6 +97,14 @@ impl Shared {
     /// A robot's ledger was written.
     pub fn ledger(&self, robot_id: &RobotId, ops: &[Op]) {
         self.look().ledger(robot_id, ops);
+    }
+    /// A robot's switch record was written.
+    pub fn switched(&self, robot_id: &RobotId, switch: &Switch, set: Option<&SetManifest>) {
+        self.look().switched(robot_id, switch, set, "switch record written");
+    }
+    /// A robot is started from its switch record.
+    pub fn starts(&self, robot_id: &RobotId, switch: &Switch, set: Option<&SetManifest>) {
+        self.look().switched(robot_id, switch, set, "program started");
     }
     /// A body begins an action of a task.
     pub fn acts(&self, robot_id: &RobotId, task_id: &TaskId, step: &StepKind) {
@@ -118,6 +132,7 @@ impl Observer {
             offers: Offers::default(),
             grants: Grants::default(),
             within: BTreeMap::new(),
+            changes: Changes::default(),
             trace: std::env::var_os("MIDSHIFT_SIM_TRACE").is_some(),
         }
     }
@@ -175,6 +190,31 @@ impl Observer {
             self.find(format!("{law}: {}", what()));
         }
     }
+    fn looks(&mut self, looks: Vec<Look>) {
+        for (law, holds, what) in looks {
+            self.check(law, holds, || what);
+        }
+    }
+    /// What was seen of software.
+    pub fn changes(&mut self) -> &mut Changes {
+        &mut self.changes
+    }
+    /// Looks at what must hold of software at the end.
+    pub fn changes_ended(&mut self) {
+        let looks = self.changes.ended();
+        self.looks(looks);
+    }
+    fn switched(&mut self, robot_id: &RobotId, switch: &Switch, set: Option<&SetManifest>, what: &str) {
+        let us = self.time.us();
+        let line = format!("{us} {robot_id} {what} {switch:?}");
+        if self.trace {
+            crate::say(&line);
+        }
+        self.digest(&line);
+        self.count(what);
+        let looks = self.changes.switched(robot_id, switch, set, us);
+        self.looks(looks);
+    }
     fn digest(&mut self, text: &str) {
         for byte in text.bytes() {
             self.hash = (self.hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
@@ -220,6 +260,13 @@ impl Observer {
             Some(Table::Attempt) => self.decoded(entry, Self::attempt),
             Some(Table::PlaceGrant) => self.decoded(entry, Self::place),
             Some(Table::DesiredWork) => self.decoded(entry, Self::desired),
+            Some(Table::Rollout) => self.decoded(entry, Self::rollout),
+            Some(Table::DrainRequest) => self.decoded(entry, |this, row| this.changes.put_request(row)),
+            Some(Table::Drain) => self.decoded(entry, |this, row| this.changes.put_drain(row)),
+            Some(Table::DesiredUpdate) => self.decoded(entry, |this, row: DesiredUpdate| {
+                let looks = this.changes.put_desired(&row);
+                this.looks(looks);
+            }),
             None if entry.log == Log::RobotInbox => self.heard(entry),
             _ => {}
         }
@@ -268,6 +315,8 @@ impl Observer {
             return;
         }
         self.check("I2 epochs rise", epoch > highest, || format!("{subject}/{epoch} granted after {highest}"));
+        let looks = self.changes.given(&robot_id);
+        self.looks(looks);
         let Some(task_id) = subject.task_id() else { return self.count("errand given") };
         self.count(if epoch == 1 { "task given" } else { "task given again" });
         let elsewhere = self.world.clone().and_then(|world| {
@@ -318,6 +367,17 @@ impl Observer {
         }
     }
 
+    fn rollout(&mut self, row: Rollout) {
+        let us = self.time.us();
+        let before = self.changes.rollout(row.rollout_id.as_str()).map(|old| (old.phase, old.pauses.clone()));
+        if before.as_ref().is_none_or(|(phase, _)| *phase != row.phase) {
+            self.count(format!("rollout {:?}", row.phase));
+        }
+        let known = before.map(|(_, pauses)| pauses).unwrap_or_default();
+        row.pauses.difference(&known).for_each(|pause| self.count(format!("rollout paused {pause:?}")));
+        self.changes.put_rollout(row, us);
+    }
+
     fn heard(&mut self, entry: &Entry) {
         let Some(Ok(said)) = entry.body.as_deref().map(serde_json::from_str::<InboxEntry>) else {
             return self.find(format!("an event of {} cannot be read", entry.subject));
@@ -337,12 +397,17 @@ impl Observer {
         if let InboxItem::Sample(sample) = said.what
             && let SampleBody::Event(event) = sample.body
         {
-            self.event(event);
+            self.event(&said.robot_id, event);
         }
     }
 
-    fn event(&mut self, event: RobotEvent) {
+    fn event(&mut self, robot_id: &RobotId, event: RobotEvent) {
         match event {
+            RobotEvent::Update(UpdateEvent::Ready { drain_id, .. }) => self.changes.ready(robot_id, drain_id),
+            RobotEvent::Update(UpdateEvent::Changed(report)) => {
+                let code = report.reason.map(|r| format!(" {}", r.code)).unwrap_or_default();
+                self.count(format!("robot {:?}{code}", report.state));
+            }
             RobotEvent::StaleAuthority { what, .. } => self.count(format!("robot refused a stale {what}")),
             RobotEvent::Attempt(report) if report.state == WorkState::Refused => {
                 let code = report.refusal.map_or(Code::Internal, |r| r.code);
@@ -369,6 +434,7 @@ impl Observer {
 
     fn op(&mut self, robot_id: &RobotId, op: &Op) {
         let us = self.time.us();
+        self.change(robot_id, op, us);
         let ledger = self.ledgers.entry(robot_id.clone()).or_default();
         match op {
             Op::Session(session) => {
@@ -430,7 +496,26 @@ impl Observer {
         }
     }
 
+    fn change(&mut self, robot_id: &RobotId, op: &Op, us: u64) {
+        let looks = match op {
+            Op::Holder(holder) => self.changes.holder(robot_id, holder.as_deref()),
+            Op::Maintenance(drain_id) => {
+                self.changes.maintenance(robot_id, drain_id.clone());
+                return;
+            }
+            Op::Places(row) => {
+                self.changes.places(robot_id, row.inside.keys().chain(row.committed.keys()).cloned());
+                return;
+            }
+            Op::Software(row) => self.changes.software(robot_id, row, us),
+            _ => return,
+        };
+        self.looks(looks);
+    }
+
     fn acts(&mut self, robot_id: &RobotId, task_id: &TaskId, step: &StepKind) {
+        let looks = self.changes.acts(robot_id);
+        self.looks(looks);
         let holder = self.ledgers.get(robot_id).and_then(|l| l.holder.clone());
         let subject = Subject::Task(task_id.clone());
         let newest = self.attempts.get(&subject).and_then(|a| a.keys().next_back().copied()).unwrap_or(0);

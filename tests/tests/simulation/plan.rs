@@ -1,6 +1,7 @@
 //! What goes wrong in one run and what is asked for, drawn from its seed alone.
 
 use crate::clock::Skew;
+use crate::software::{BAD_AT_START, BAD_WITH_LOAD, GOOD, HANGS};
 use midshift::background::request;
 use midshift_core::site::Site;
 use midshift_proto::task::v1::SubmitTaskRequest;
@@ -50,6 +51,8 @@ pub enum Fault {
     DiskSlow,
     /// The clients are cut off.
     ClientCut,
+    /// The maker's own safety system stops this robot.
+    HardwareStop(usize),
 }
 
 impl Fault {
@@ -69,6 +72,7 @@ impl Fault {
             Self::DiskGone => "disk gone",
             Self::DiskSlow => "disk slow",
             Self::ClientCut => "client cut off",
+            Self::HardwareStop(_) => "hardware stop",
         }
     }
 }
@@ -84,6 +88,34 @@ pub struct Window {
     pub to_ms: u64,
 }
 
+/// Something that people do about software.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Deed {
+    /// Begin a roll-out. Its number is its place among those of the run.
+    Begin {
+        /// Release.
+        version: &'static str,
+        /// For these.
+        robots: BTreeSet<usize>,
+        /// In the place of others.
+        supersede: bool,
+    },
+    /// Take the first one back with one more.
+    Rollback,
+    /// Stand still.
+    Pause(usize),
+    /// Go on.
+    Resume(usize),
+    /// End it.
+    Abort(usize),
+    /// Leave a robot out.
+    Exclude(usize, usize),
+    /// Keep a robot at what it runs.
+    Pin(usize),
+    /// Let it take part again.
+    Unpin(usize),
+}
+
 /// A whole run.
 #[derive(Clone, Debug)]
 pub struct Plan {
@@ -95,6 +127,8 @@ pub struct Plan {
     pub tasks: Vec<(u64, SubmitTaskRequest)>,
     /// What is canceled, and when: indices in `tasks`.
     pub cancels: Vec<(u64, usize)>,
+    /// What is done about software, and when.
+    pub deeds: Vec<(u64, Deed)>,
     /// Longest way of a message, milliseconds.
     pub latency_ms: u64,
 }
@@ -115,14 +149,31 @@ impl Plan {
         let tasks = tasks(seed, site, &mut rng)?;
         let cancels =
             (0..rng.random_range(0..3)).map(|_| (rng.random_range(10_000..90_000), rng.random_range(0..TASKS)));
-        Ok(Self { cancels: cancels.collect(), windows, skews, tasks, latency_ms: rng.random_range(5..60) })
+        let cancels = cancels.collect();
+        let latency_ms = rng.random_range(5..60);
+        // From a stream of its own: faults and tasks of a seed stay what they were.
+        let deeds = deeds(&mut StdRng::seed_from_u64(seed ^ 0x0072_656c_6561_7365));
+        Ok(Self { cancels, windows, skews, tasks, deeds, latency_ms })
     }
     /// No fault lasts and nothing is asked for after this, milliseconds.
     pub fn quiet_from_ms(&self) -> u64 {
         let faults = self.windows.iter().map(|w| w.to_ms);
-        let wishes = self.tasks.iter().map(|(at, _)| *at).chain(self.cancels.iter().map(|(at, _)| *at));
+        let deeds = self.deeds.iter().map(|(at, _)| *at);
+        let wishes = self.tasks.iter().map(|(at, _)| *at).chain(self.cancels.iter().map(|(at, _)| *at)).chain(deeds);
         faults.chain(wishes).max().unwrap_or(0)
     }
+}
+
+/// So many tasks at once, named after the moment.
+pub fn background(now_ms: u64, many: usize, site: &Site) -> anyhow::Result<Vec<SubmitTaskRequest>> {
+    let config = WorkloadConfig { timeout_ms: 400_000, ..WorkloadConfig::background(now_ms) };
+    let mut workload = Workload::new(config, site).ok_or_else(|| anyhow::anyhow!("no stations"))?;
+    let named = |i: usize, mut task: SubmitTaskRequest| {
+        task.request_id = format!("request-{now_ms}-{i}");
+        task.task_id = format!("TASK-{now_ms}-{i:03}");
+        task
+    };
+    Ok((0..many).map(|i| named(i, request(&workload.next_transport()))).collect())
 }
 
 fn tasks(seed: u64, site: &Site, rng: &mut StdRng) -> anyhow::Result<Vec<(u64, SubmitTaskRequest)>> {
@@ -140,6 +191,51 @@ fn tasks(seed: u64, site: &Site, rng: &mut StdRng) -> anyhow::Result<Vec<(u64, S
         .collect())
 }
 
+/// One to three roll-outs over some robots, with what people do about them.
+fn deeds(rng: &mut StdRng) -> Vec<(u64, Deed)> {
+    let mut deeds = Vec::new();
+    let rollouts = rng.random_range(1..=3_usize);
+    let mut at_ms = rng.random_range(4_000..25_000);
+    for number in 0..rollouts {
+        let version = match rng.random_range(0..10) {
+            0 | 1 => BAD_AT_START,
+            2 => HANGS,
+            3 => BAD_WITH_LOAD,
+            n => GOOD[n % GOOD.len()],
+        };
+        let many = rng.random_range(2..=4);
+        let robots = (0..ROBOTS).sample(rng, many).into_iter().collect();
+        deeds.push((at_ms, Deed::Begin { version, robots, supersede: rng.random_bool(0.6) }));
+        let mut then = |from: u64, to: u64, rng: &mut StdRng, deed: Deed| {
+            deeds.push((at_ms + rng.random_range(from..to), deed));
+        };
+        if rng.random_bool(0.5) {
+            then(3_000, 40_000, rng, Deed::Pause(number));
+            then(12_000, 70_000, rng, Deed::Resume(number));
+        }
+        match rng.random_range(0..8) {
+            0 | 1 => then(5_000, 60_000, rng, Deed::Abort(number)),
+            2 => then(2_000, 20_000, rng, Deed::Exclude(number, rng_robot(number))),
+            3 => {
+                then(0, 10_000, rng, Deed::Pin(rng_robot(number)));
+                then(10_000, 40_000, rng, Deed::Unpin(rng_robot(number)));
+            }
+            _ => {}
+        }
+        at_ms += rng.random_range(15_000..45_000);
+    }
+    if rng.random_bool(0.3) {
+        deeds.push((rng.random_range(80_000..110_000), Deed::Rollback));
+    }
+    deeds.sort_by_key(|(at, _)| *at);
+    deeds
+}
+
+/// Somebody, another for each roll-out.
+const fn rng_robot(number: usize) -> usize {
+    (number * 3 + 1) % ROBOTS
+}
+
 fn crash(rng: &mut StdRng) -> Window {
     let from_ms = rng.random_range(FAULTS_MS);
     let fault = Fault::ServerCrash { power: rng.random_bool(0.5) };
@@ -154,7 +250,7 @@ fn some(rng: &mut StdRng) -> BTreeSet<usize> {
 
 fn window(rng: &mut StdRng) -> Window {
     let robot = rng.random_range(0..ROBOTS);
-    let (fault, lasts_ms) = match rng.random_range(0..15) {
+    let (fault, lasts_ms) = match rng.random_range(0..16) {
         0 | 1 => (Fault::Partition(some(rng)), 1_000..45_000),
         2 => (Fault::Deaf(robot), 1_000..40_000),
         3 => (Fault::Mute(robot), 1_000..40_000),
@@ -165,6 +261,7 @@ fn window(rng: &mut StdRng) -> Window {
         10 => (Fault::DiskUnknown, 1_000..15_000),
         11 => ([Fault::DiskGone, Fault::DiskSlow][rng.random_range(0..2)].clone(), 500..6_000),
         12 => (Fault::ClientCut, 1_000..20_000),
+        15 => (Fault::HardwareStop(robot), 2_000..40_000),
         _ => (Fault::HoldDown(some(rng)), 1_000..14_000),
     };
     let from_ms = rng.random_range(FAULTS_MS);

@@ -3,30 +3,29 @@
 //! Invariant: bodies, disks and the world of items outlive the processes that use them; everything else dies with its process. One
 //! thread, one time, one seed: the same plan gives the same run.
 
-use crate::body::WatchedBody;
+use crate::agent::{Agent, machine};
 use crate::client;
 use crate::clock::{MachineClock, Skew, TrueTime};
-use crate::disk::{RobotDisk, ServerDisk};
-use crate::net::{self, Ear, SERVER, SimDial, Wire};
+use crate::disk::ServerDisk;
+use crate::net::{self, Ear, SERVER, Wire};
 use crate::observer::Shared;
-use crate::plan::ROBOTS;
+use crate::software::Software;
 use midshift::server::{Parts, Server};
 use midshift_agent::body::Body;
 use midshift_agent::bugs::Bugs;
 use midshift_agent::memory::MemoryStore as RobotMemory;
-use midshift_agent::session::{self, AgentConfig};
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::robot::StopLevel;
 use midshift_core::site::{DEMO, Site, text};
 use midshift_core::task::machine::Phase;
-use midshift_core::time::Clock;
-use midshift_ota::OtaService;
-use midshift_sim::faults::FaultRates;
+use midshift_core::time::{SiteDuration, SiteTime};
+use midshift_ota::rollouts::RolloutService;
+use midshift_sim::faults::{FaultRates, Injected};
 use midshift_sim::hall::{Hall, HallConfig};
+use midshift_sim::launched::Launched;
 use midshift_store::{FRAME_BYTES_DEFAULT, FrameLog, MemoryFrames, MemoryStore, StoreId};
 use std::rc::Rc;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 
@@ -52,6 +51,8 @@ pub struct Naive {
 pub struct RoomConfig {
     /// Decides everything.
     pub seed: u64,
+    /// How many.
+    pub robots: usize,
     /// Clocks of robots.
     pub skews: Vec<Skew>,
     /// Longest way of a message, milliseconds.
@@ -60,6 +61,8 @@ pub struct RoomConfig {
     pub faults: FaultRates,
     /// Naive rules.
     pub naive: Naive,
+    /// Planners of roll-outs on the one store; two race.
+    pub planners: usize,
 }
 
 /// The room.
@@ -80,17 +83,16 @@ pub struct Room {
     pub ears: Vec<Ear>,
     /// Ways to the robots, and what was written on broken ones.
     pub wire: Wire,
+    /// Releases.
+    pub software: Arc<Software>,
+    launched: Vec<Arc<Launched>>,
+    stops: Vec<Option<SiteTime>>,
     steps: u64,
 }
 
 /// The site of every run.
 pub fn site() -> anyhow::Result<Arc<Site>> {
     Ok(Arc::new(text::parse(DEMO)?))
-}
-
-/// Name of a robot's machine.
-pub fn machine(robot: usize) -> String {
-    format!("robot-{robot}")
 }
 
 /// Name of the clients' machine.
@@ -115,21 +117,39 @@ impl Room {
         let observer = Shared::new(time.clone(), store.clone());
         let disk = Arc::new(ServerDisk::new(store, observer.clone(), config.seed));
         let frames: Arc<dyn FrameLog> = Arc::new(MemoryFrames::new(clock.clone(), FRAME_BYTES_DEFAULT));
-        let of_hall = HallConfig { faults: config.faults, ..HallConfig::new(site.clone(), ROBOTS, config.seed) };
+        let of_hall = HallConfig { faults: config.faults, ..HallConfig::new(site.clone(), config.robots, config.seed) };
         let hall = Arc::new(Hall::open(&of_hall, &clock.now())?);
         observer.look().watch_world(hall.worlds()[0].clone());
         let wire = Wire::default();
-        serve(&mut sim, &time, &site, disk.clone(), frames, config.naive, &wire);
-        let ears: Vec<Ear> = (0..ROBOTS).map(|_| Ear::default()).collect();
+        let software = Arc::new(Software::make(clock.now().wall, site.site_id().clone())?);
+        let keys = software.trust.directive_keys.clone();
+        observer.look().changes().watch(keys, software.signed.clone(), hall.robots());
+        serve(&mut sim, &time, &site, disk.clone(), frames, config, &wire, &software);
+        let ears: Vec<Ear> = (0..config.robots).map(|_| Ear::default()).collect();
+        let launched: Vec<_> = hall.robots().iter().map(|body| Arc::new(Launched::new(None, body))).collect();
         for (robot, ear) in ears.iter().enumerate() {
-            let skew = config.skews.get(robot).copied().unwrap_or_default();
-            let agent = Agent::new(robot, &hall, &time, &observer, skew, (ear, &wire), config);
-            run_agent(&mut sim, machine(robot), agent);
+            let agent = Agent {
+                robot,
+                seed: config.seed,
+                body: hall.robots()[robot].clone(),
+                time: time.clone(),
+                observer: observer.clone(),
+                skew: config.skews.get(robot).copied().unwrap_or_default(),
+                ear: ear.clone(),
+                wire: wire.clone(),
+                memory: RobotMemory::new(),
+                launched: launched[robot].clone(),
+                trust: software.trust.clone(),
+                bugs: config.naive.agent,
+                lives: Arc::default(),
+            };
+            run_agent(&mut sim, agent);
         }
         let desk = Rc::new(client::Desk::default());
         let of_client = desk.clone();
         sim.host(CLIENT, move || client::run(of_client.clone()));
-        Ok(Self { sim, time, observer, hall, disk, desk, ears, wire, steps: 0 })
+        let stops = vec![None; config.robots];
+        Ok(Self { sim, time, observer, hall, disk, desk, ears, wire, software, launched, stops, steps: 0 })
     }
     /// True time so far, milliseconds.
     pub fn now_ms(&self) -> u64 {
@@ -144,6 +164,7 @@ impl Room {
         self.sim.step().map_err(|error| anyhow::anyhow!("a machine ended: {error}"))?;
         self.steps += 1;
         self.time.note(self.sim.elapsed());
+        self.let_go();
         if self.now_ms().is_multiple_of(BODIES_MS) {
             self.observer.look().bodies(self.hall.robots());
         }
@@ -167,9 +188,35 @@ impl Room {
         }
         Ok(())
     }
-    /// An agent's process dies: its body stands still where it is.
-    pub fn crash_agent(&mut self, robot: usize) {
+    /// The maker's own safety system stops a body for so long, milliseconds, and ends that by itself.
+    pub fn stop_body(&mut self, robot: usize, lasts_ms: u64) {
+        let now = self.time.site();
+        self.hall.robots()[robot].inject(now, Injected::HardwareStop(SiteDuration(lasts_ms)));
+        self.stops[robot] = Some(now + SiteDuration(lasts_ms));
+        let (robot_id, us) = (self.robot_id(robot), self.time.us());
+        self.observer.look().changes().stopped(&robot_id, Some(us));
+    }
+    /// Its own safety system stops it now.
+    pub fn is_stopped(&self, robot: usize) -> bool {
+        self.stops[robot].is_some()
+    }
+    /// Forgets stops that are over.
+    fn let_go(&mut self) {
+        let now = self.time.site();
+        for robot in 0..self.stops.len() {
+            if self.stops[robot].is_some_and(|until| until <= now) {
+                self.stops[robot] = None;
+                let robot_id = self.robot_id(robot);
+                self.observer.look().changes().stopped(&robot_id, None);
+            }
+        }
+    }
+    /// An agent's process dies: its body stands still where it is. With the power goes what its disk had not yet.
+    pub fn crash_agent(&mut self, robot: usize, power: bool) {
         self.sim.crash(machine(robot));
+        if power {
+            self.launched[robot].lose_power();
+        }
         let now = self.time.site();
         let mut body = self.hall.robots()[robot].clone();
         body.stop(now, StopLevel::Halt);
@@ -177,8 +224,6 @@ impl Room {
     }
     /// It is started again.
     pub fn restart_agent(&mut self, robot: usize) {
-        let robot_id = self.robot_id(robot);
-        self.observer.look().restarted(&robot_id);
         self.sim.bounce(machine(robot));
     }
     /// Ends the server's process.
@@ -197,28 +242,49 @@ fn serve(
     site: &Arc<Site>,
     disk: Arc<ServerDisk>,
     frames: Arc<dyn FrameLog>,
-    naive: Naive,
+    config: &RoomConfig,
     wire: &Wire,
+    software: &Arc<Software>,
 ) {
-    let (time, site, wire) = (time.clone(), site.clone(), wire.clone());
+    let (naive, planners) = (config.naive, config.planners);
+    let (time, site, wire, software) = (time.clone(), site.clone(), wire.clone(), software.clone());
     sim.host(SERVER, move || {
         let (time, site, disk, frames) = (time.clone(), site.clone(), disk.clone(), frames.clone());
-        let wire = wire.clone();
+        let (wire, software) = (wire.clone(), software.clone());
         async move {
             loop {
+                let clock = MachineClock::boot(&time, Skew::default());
+                let ota = software.open(clock.clone()).await?;
                 let parts = Parts {
                     store: disk.clone(),
                     frames: frames.clone(),
                     site: site.clone(),
                     site_text: DEMO.to_owned(),
-                    clock: MachineClock::boot(&time, Skew::default()),
-                    ota: OtaService::without_keys(),
+                    clock,
+                    ota,
                     sim: None,
                     naive: naive.server,
                     planning: tokio::runtime::Handle::current(),
                 };
                 // A service manager starts a server again that could not read its disk.
+                let (ota, clock) = (parts.ota.clone(), parts.clock.clone());
                 if let Ok(server) = Server::new(parts, CancellationToken::new()).await {
+                    for _ in 1..planners {
+                        let parts = midshift_ota::rollouts::Parts {
+                            store: disk.clone(),
+                            board: server.board(),
+                            site: site.clone(),
+                            clock: clock.clone(),
+                            ota: ota.clone(),
+                            bugs: naive.server.rollouts,
+                        };
+                        let (face, planner) = RolloutService::new(parts, CancellationToken::new());
+                        tokio::spawn(async move {
+                            // A planner whose face is gone would end.
+                            let _face = face;
+                            planner.run(CancellationToken::new()).await
+                        });
+                    }
                     server.serve(net::incoming(wire.clone()).await?).await?;
                 }
                 tokio::time::sleep(Duration::from_millis(500)).await;
@@ -227,76 +293,8 @@ fn serve(
     });
 }
 
-/// What one agent's process is made of, each time it starts.
-#[derive(Clone)]
-struct Agent {
-    robot: usize,
-    seed: u64,
-    hall: Arc<Hall>,
-    time: TrueTime,
-    observer: Shared,
-    skew: Skew,
-    ear: Ear,
-    wire: Wire,
-    memory: RobotMemory,
-    bugs: Bugs,
-    lives: Arc<AtomicU64>,
-}
-
-impl Agent {
-    fn new(
-        robot: usize,
-        hall: &Arc<Hall>,
-        time: &TrueTime,
-        observer: &Shared,
-        skew: Skew,
-        (ear, wire): (&Ear, &Wire),
-        config: &RoomConfig,
-    ) -> Self {
-        Self {
-            robot,
-            seed: config.seed,
-            hall: hall.clone(),
-            time: time.clone(),
-            observer: observer.clone(),
-            skew,
-            ear: ear.clone(),
-            wire: wire.clone(),
-            memory: RobotMemory::new(),
-            bugs: config.naive.agent,
-            lives: Arc::default(),
-        }
-    }
-
-    async fn live(self) -> anyhow::Result<()> {
-        let life = self.lives.fetch_add(1, Relaxed);
-        let number = self.seed.wrapping_mul(1_000_003) + self.robot as u64 * 1_009 + life;
-        // Machines are not switched on in the same moment.
-        tokio::time::sleep(Duration::from_millis(number % 700)).await;
-        let body = &self.hall.robots()[self.robot];
-        let robot_id = body.robot_id().clone();
-        let config = AgentConfig {
-            update: None,
-            robot_id: robot_id.clone(),
-            boot_id: format!("boot-{}-{life}", self.robot),
-            new_ring_id: format!("ring-{}-{life}", self.robot),
-            seed: number,
-            bugs: self.bugs,
-            pulse: None,
-        };
-        let witness = WatchedBody::new(body.clone(), self.observer.clone());
-        let disk = RobotDisk::open(self.memory.clone(), robot_id.clone(), self.observer.clone(), number);
-        let clock: Arc<dyn Clock> = MachineClock::boot(&self.time, self.skew);
-        let never = CancellationToken::new();
-        let dial = Arc::new(SimDial { ear: self.ear.clone(), machine: machine(self.robot), wire: self.wire.clone() });
-        let end = session::run(config, Box::new(witness), Box::new(disk), clock, dial, never).await?;
-        self.observer.look().find(format!("the agent of {robot_id} ended: {end:?}"));
-        std::future::pending().await
-    }
-}
-
-fn run_agent(sim: &mut turmoil::Sim<'static>, machine: String, agent: Agent) {
-    sim.host(machine, move || {
+fn run_agent(sim: &mut turmoil::Sim<'static>, agent: Agent) {
+    sim.host(machine(agent.robot), move || {
         let agent = agent.clone();
         async move { Ok(agent.live().await?) }
     });

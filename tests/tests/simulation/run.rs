@@ -1,19 +1,25 @@
 //! One seed from its first fault to the end of every task, and what came of it.
 
+use crate::agent::machine;
 use crate::client::Wish;
 use crate::disk::Mood;
 use crate::net::{SERVER, Way};
-use crate::plan::{Fault, Plan, ROBOTS};
-use crate::room::{CLIENT, Naive, Room, RoomConfig, machine, site};
+use crate::orders::Order;
+use crate::plan::{Deed, Fault, Plan, ROBOTS};
+use crate::room::{CLIENT, Naive, Room, RoomConfig, site};
 use midshift_core::task::machine::Phase;
+use midshift_proto::ota::v1::rollout_wave::Size;
+use midshift_proto::ota::v1::{RolloutSelector, RolloutSpec, RolloutWave};
 use midshift_proto::task::v1::CancelTaskRequest;
 use midshift_sim::faults::FaultRates;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// When the faults are over every task must end within this, milliseconds: longer than a task waits for the one robot that has its
 /// item and that the breaker took out of dispatch.
 const END_WITHIN_MS: u64 = 1_800_000;
+/// People look after what waits for them this often, milliseconds.
+const LOOK_AFTER_MS: u64 = 20_000;
 
 /// What came of one seed.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -52,12 +58,17 @@ pub fn run(seed: u64, naive: Naive) -> Outcome {
 struct Shift {
     room: Room,
     plan: Plan,
-    ways: Vec<Way>,
     server_down: bool,
     agents_down: Vec<bool>,
     mood: Mood,
     begun: usize,
     wished: usize,
+    /// Deeds done, and roll-outs among them.
+    done: usize,
+    rollouts: usize,
+    /// Robots that a person must let go on, and how often somebody did.
+    stopped: BTreeSet<usize>,
+    let_go: u64,
     planned: BTreeMap<&'static str, u64>,
     hits: BTreeMap<&'static str, u64>,
 }
@@ -66,16 +77,27 @@ impl Shift {
     fn open(seed: u64, naive: Naive) -> anyhow::Result<Self> {
         let plan = Plan::draw(seed, &*site()?)?;
         let faults = FaultRates { jam_per_action: 0.0, silence_per_hour: 0.0, ..FaultRates::default() };
-        let config = RoomConfig { seed, skews: plan.skews.clone(), latency_ms: plan.latency_ms, faults, naive };
+        let config = RoomConfig {
+            seed,
+            robots: ROBOTS,
+            skews: plan.skews.clone(),
+            latency_ms: plan.latency_ms,
+            faults,
+            naive,
+            planners: 1,
+        };
         Ok(Self {
             room: Room::open(&config)?,
             plan,
-            ways: vec![Way::Open; ROBOTS + 1],
             server_down: false,
             agents_down: vec![false; ROBOTS],
             mood: Mood::GOOD,
             begun: 0,
             wished: 0,
+            done: 0,
+            rollouts: 0,
+            stopped: BTreeSet::new(),
+            let_go: 0,
             planned: BTreeMap::new(),
             hits: BTreeMap::new(),
         })
@@ -111,12 +133,7 @@ impl Shift {
             anyhow::ensure!(self.room.observer.look().findings().is_empty(), "a law is broken");
         }
         self.suffer();
-        let tasks = self.plan.tasks.len();
-        let ended = self.room.until("the end of every task", END_WITHIN_MS, |room| {
-            let seen = room.observer.look();
-            let over = |p: Phase| p.is_terminal() || p == Phase::NeedsOperator;
-            room.desk.is_empty() && seen.tasks().len() == tasks && seen.tasks().values().all(|t| over(t.phase))
-        });
+        let ended = self.end();
         if ended.is_err() {
             self.say_open();
         }
@@ -124,11 +141,57 @@ impl Shift {
         self.judge()
     }
 
+    /// Waits for the end of everything; people look after what waits for them.
+    fn end(&mut self) -> anyhow::Result<()> {
+        let tasks = self.plan.tasks.len();
+        let end_ms = self.room.now_ms() + END_WITHIN_MS;
+        loop {
+            self.look_after();
+            let round_ms = self.room.now_ms() + LOOK_AFTER_MS;
+            let mut is_over = false;
+            self.room.until("one round", 2 * LOOK_AFTER_MS, |room| {
+                let mut seen = room.observer.look();
+                let over = |p: Phase| p.is_terminal() || p == Phase::NeedsOperator;
+                is_over = room.desk.is_empty()
+                    && seen.tasks().len() == tasks
+                    && seen.tasks().values().all(|t| over(t.phase))
+                    && seen.changes().ended().iter().all(|(_, holds, _)| *holds);
+                is_over || room.now_ms() >= round_ms
+            })?;
+            if is_over {
+                return Ok(());
+            }
+            anyhow::ensure!(
+                self.room.now_ms() < end_ms,
+                "{} s passed in vain for the end of everything",
+                END_WITHIN_MS / 1_000
+            );
+        }
+    }
+
+    /// A person lets robots go on that were stopped, and settles roll-outs that wait for one.
+    fn look_after(&mut self) {
+        self.let_go += 1;
+        for robot in self.stopped.clone() {
+            let robot_id = self.room.robot_id(robot).to_string();
+            self.order(Order::LetGo { robot_id, request_id: format!("go-{robot}-{}", self.let_go) });
+        }
+        let rollouts: Vec<String> =
+            self.room.observer.look().changes().rollouts().map(|r| r.rollout_id.to_string()).collect();
+        rollouts.into_iter().for_each(|id| self.order(Order::Settle(id)));
+    }
+    fn order(&self, order: Order) {
+        self.room.desk.wish(Wish::Order(Box::new(order)));
+    }
+
     /// I8: what is still open, in words.
     fn say_open(&self) {
         let mut seen = self.room.observer.look();
         let over = |p: Phase| p.is_terminal() || p == Phase::NeedsOperator;
         let open: Vec<String> = seen.tasks().values().filter(|t| !over(t.phase)).map(|t| format!("{t:?}")).collect();
+        if seen.findings().is_empty() && open.is_empty() {
+            seen.changes_ended();
+        }
         if seen.findings().is_empty() {
             seen.find(format!("I8 every task ends: {} are open: {}", open.len(), open.join("; ")));
         }
@@ -140,6 +203,7 @@ impl Shift {
         let drops = midshift_sim::world::lock(&self.room.hall.worlds()[0]).oracle().drops_by_task();
         let mut seen = self.room.observer.look();
         seen.check("I8 every task ends", true, String::new);
+        seen.changes_ended();
         seen.check("I3 items are conserved", verdict.items_conserved(), || format!("{verdict:?}"));
         seen.check("I4 no step is done twice", verdict.steps_done_twice == 0, || format!("{verdict:?}"));
         seen.check("I7 no place was too full", verdict.exclusion_violations == 0, || format!("{verdict:?}"));
@@ -160,9 +224,14 @@ impl Shift {
     fn suffer(&mut self) {
         let now_ms = self.room.now_ms();
         self.wish(now_ms);
+        self.do_deeds(now_ms);
         while let Some(window) = self.plan.windows.get(self.begun).filter(|w| w.from_ms <= now_ms).cloned() {
             self.begun += 1;
             self.count(&window.fault);
+            if let Fault::HardwareStop(robot) = window.fault {
+                self.room.stop_body(robot, window.to_ms - window.from_ms);
+                self.stopped.insert(robot);
+            }
         }
         let now: Vec<Fault> =
             self.plan.windows[..self.begun].iter().filter(|w| w.to_ms > now_ms).map(|w| w.fault.clone()).collect();
@@ -182,7 +251,8 @@ impl Shift {
             let down = now.iter().any(|f| matches!(f, Fault::AgentCrash { robot: r, .. } if *r == robot));
             if down != self.agents_down[robot] {
                 self.agents_down[robot] = down;
-                if down { self.room.crash_agent(robot) } else { self.room.restart_agent(robot) }
+                let power = now.iter().any(|f| *f == Fault::AgentCrash { robot, power: true });
+                if down { self.room.crash_agent(robot, power) } else { self.room.restart_agent(robot) }
             }
         }
         let mood = mood(&now);
@@ -212,46 +282,97 @@ impl Shift {
         }
     }
 
-    /// Counts a fault as planned, and as a hit if a process dies at work.
-    fn count(&mut self, fault: &Fault) {
-        let hit = {
-            let seen = self.room.observer.look();
-            match fault {
-                Fault::AgentCrash { robot, .. } => seen
-                    .is_held(self.room.hall.robots()[*robot].robot_id())
-                    .then_some("agent crash with work in progress"),
-                Fault::ServerCrash { .. } => seen.live().next().map(|_| "server crash with work in progress"),
-                _ => None,
-            }
-        };
-        *self.planned.entry(fault.name()).or_insert(0) += 1;
-        if let Some(hit) = hit {
-            *self.hits.entry(hit).or_insert(0) += 1;
+    fn do_deeds(&mut self, now_ms: u64) {
+        while let Some((_, deed)) = self.plan.deeds.get(self.done).filter(|(at, _)| *at <= now_ms).cloned() {
+            self.done += 1;
+            let id = |number: usize| format!("rollout-{number}");
+            let name = |robot: usize| self.room.robot_id(robot).to_string();
+            let order = match deed {
+                Deed::Begin { version, robots, supersede } => {
+                    self.rollouts += 1;
+                    let spec = Box::new(spec(&self.room, version, &robots));
+                    Order::Begin { id: id(self.rollouts - 1), spec, supersede }
+                }
+                Deed::Rollback => Order::Rollback { of: id(0), id: "rollback-0".to_owned() },
+                Deed::Pause(number) => Order::Pause(id(number)),
+                Deed::Resume(number) => Order::Resume(id(number)),
+                Deed::Abort(number) => Order::Abort(id(number)),
+                Deed::Exclude(number, robot) => Order::Exclude(id(number), name(robot)),
+                Deed::Pin(robot) => Order::Pin(name(robot)),
+                Deed::Unpin(robot) => Order::Unpin(name(robot)),
+            };
+            self.order(order);
         }
     }
 
+    /// Counts a fault as planned, and as a hit if a process dies at work.
+    fn count(&mut self, fault: &Fault) {
+        let mut hits = Vec::new();
+        {
+            let mut seen = self.room.observer.look();
+            let rolls = seen.changes().rollouts().any(|r| r.started.is_some() && !r.phase.is_over());
+            match fault {
+                Fault::AgentCrash { robot, .. } => {
+                    let robot_id = self.room.hall.robots()[*robot].robot_id();
+                    let works = seen.is_held(robot_id).then_some("agent crash with work in progress");
+                    let state = seen.changes().state(robot_id).filter(|state| !state.is_over());
+                    hits.extend(works.into_iter().chain(state.map(|_| "agent crash in a change of software")));
+                }
+                Fault::ServerCrash { .. } => {
+                    let works = seen.live().next().map(|_| "server crash with work in progress");
+                    hits.extend(works.into_iter().chain(rolls.then_some("server crash in a roll-out")));
+                }
+                Fault::HardwareStop(_) => hits.extend(rolls.then_some("hardware stop in a roll-out")),
+                _ => {}
+            }
+        }
+        *self.planned.entry(fault.name()).or_insert(0) += 1;
+        hits.into_iter().for_each(|hit| *self.hits.entry(hit).or_insert(0) += 1);
+    }
+
     fn set_way(&mut self, index: usize, way: Way) {
-        let old = std::mem::replace(&mut self.ways[index], way);
-        if old == way {
-            return;
-        }
-        let other = if index == ROBOTS { CLIENT.to_owned() } else { machine(index) };
-        let (sim, other) = (&self.room.sim, other.as_str());
-        self.room.wire.set_way(other, way);
-        match old {
-            Way::Open => {}
-            Way::Cut => sim.repair(SERVER, other),
-            Way::CutDown => sim.repair_oneway(SERVER, other),
-            Way::CutUp => sim.repair_oneway(other, SERVER),
-            Way::Held => sim.release(SERVER, other),
-        }
-        match way {
-            Way::Open => {}
-            Way::Cut => sim.partition(SERVER, other),
-            Way::CutDown => sim.partition_oneway(SERVER, other),
-            Way::CutUp => sim.partition_oneway(other, SERVER),
-            Way::Held => sim.hold(SERVER, other),
-        }
+        steer(&mut self.room, index, way);
+    }
+}
+
+/// Makes the way between the server and a machine so; the clients come after the robots.
+pub fn steer(room: &mut Room, index: usize, way: Way) {
+    let other = if index == room.ears.len() { CLIENT.to_owned() } else { machine(index) };
+    let (sim, other) = (&room.sim, other.as_str());
+    let old = room.wire.set_way(other, way);
+    if old == way {
+        return;
+    }
+    match old {
+        Way::Open => {}
+        Way::Cut => sim.repair(SERVER, other),
+        Way::CutDown => sim.repair_oneway(SERVER, other),
+        Way::CutUp => sim.repair_oneway(other, SERVER),
+        Way::Held => sim.release(SERVER, other),
+    }
+    match way {
+        Way::Open => {}
+        Way::Cut => sim.partition(SERVER, other),
+        Way::CutDown => sim.partition_oneway(SERVER, other),
+        Way::CutUp => sim.partition_oneway(other, SERVER),
+        Way::Held => sim.hold(SERVER, other),
+    }
+}
+
+/// A roll-out to these robots: one, then the others.
+pub fn spec(room: &Room, version: &str, robots: &BTreeSet<usize>) -> RolloutSpec {
+    let seconds = |s: i64| Some(prost_types::Duration { seconds: s, nanos: 0 });
+    let robot_ids = robots.iter().map(|robot| room.robot_id(*robot).to_string()).collect();
+    RolloutSpec {
+        bundle: room.software.bundle(version).to_string(),
+        selector: Some(RolloutSelector { robot_ids, ..RolloutSelector::default() }),
+        waves: [Size::Count(1), Size::Rest(true)].map(|size| RolloutWave { size: Some(size) }).into(),
+        drain_within: seconds(60),
+        probation: seconds(3),
+        soak: seconds(2),
+        exposure_tasks: Some(0),
+        exposure_within: seconds(30),
+        ..RolloutSpec::default()
     }
 }
 
