@@ -81,6 +81,7 @@ async fn report(kind: Kind, site_ms: u64, store: Arc<dyn Store>, acknowledged: V
         no_progress_ms: 0,
         site_ms,
         wall_ms: site_ms,
+        story: None,
     }))
 }
 
