@@ -117,6 +117,7 @@ fn fleet(site: &Arc<Site>, robots: usize, tasks: usize, seed: u64, now: Now) -> 
             ring: String::new(),
             inventory,
             applied_work: 0,
+            applied_update: 0,
             places: Vec::new(),
             clock_offset_ms: None,
             installed: None,
