@@ -218,10 +218,14 @@ pub fn may_have(view: &View, robot_id: &RobotId, stratum: &Stratum, bundle: &Bun
     Ok(())
 }
 
-/// Place of a robot in a roll-out: FNV-1a over both ids, so that each roll-out begins with other robots.
+/// Place of a robot in a roll-out: FNV-1a over both ids, so that each roll-out begins with other robots, and then stirred as the end of
+/// MurmurHash3 does: FNV alone leaves robots with neighbouring numbers, which often stand and work alike, side by side.
 pub fn place_of(rollout: &RolloutId, robot: &RobotId) -> u64 {
     let bytes = rollout.as_str().bytes().chain([0]).chain(robot.as_str().bytes());
-    bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
+    let fold = |hash: u64, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
+    let stir = |hash: u64, by: u64| (hash ^ (hash >> 33)).wrapping_mul(by);
+    let stirred = stir(stir(bytes.fold(0xcbf2_9ce4_8422_2325, fold), 0xff51_afd7_ed55_8ccd), 0xc4ce_b9fe_1a85_ec53);
+    stirred ^ (stirred >> 33)
 }
 
 /// The roll-out that has this robot now, other than `than`.

@@ -19,6 +19,9 @@ pub mod spec;
 pub mod verdict;
 pub mod view;
 
+#[cfg(test)]
+mod tests;
+
 pub use crate::fleet::Board;
 use crate::ids::{BundleId, RobotId, RolloutId};
 use crate::reason::Reason;

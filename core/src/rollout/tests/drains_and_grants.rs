@@ -1,0 +1,248 @@
+//! Drains with fleet's real law, and permissions that are given only inside them.
+
+use super::*;
+
+/// Drains of roll-out `ro` by state.
+fn drains(rig: &Rig, state: DrainState) -> usize {
+    rig.fleet.drains.values().filter(|d| d.row.state == state).count()
+}
+
+fn wide() -> RolloutSpec {
+    RolloutSpec { waves: vec![Wave::Rest], allow_full_push: true, ..spec() }
+}
+
+#[test]
+fn permission_is_given_only_while_the_drain_holds_the_robot_and_the_roll_out_runs() {
+    let mut rig = Rig::new(4);
+    rig.fleet_sleeps = true;
+    rig.start(spec());
+    let n = rig.order()[0];
+    rig.until(20, |r| r.step(n) == Step::Draining);
+    let drain_id = rig.of("ro", n).drain_id.expect("a drain");
+    let set = crate::ids::SetId::parse("factory").expect("an id");
+    rig.say(n, RobotEvent::Update(UpdateEvent::Ready { drain_id: drain_id.clone(), set: set.clone() }));
+    rig.ticks(3);
+    assert!(rig.of("ro", n).grant.is_none(), "the drain does not hold it");
+    rig.fleet_sleeps = false;
+    rig.until(20, |r| r.step(n) == Step::Activating);
+    rig.must("ro", Verb::Pause);
+    rig.say(n, RobotEvent::Update(UpdateEvent::Ready { drain_id, set }));
+    rig.ticks(3);
+    assert!(rig.of("ro", n).grant.is_none(), "the roll-out stands still");
+    assert_eq!(rig.step(n), Step::Staged, "it works on meanwhile");
+    assert_eq!(rig.rollout("ro").in_flight, 0);
+}
+
+#[test]
+fn a_word_of_an_older_drain_gets_no_permission() {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    let n = rig.order()[0];
+    rig.robots[n].fate = Fate::NeverReady;
+    rig.until(20, |r| r.step(n) == Step::Activating);
+    let old = rig.of("ro", n).drain_id.expect("a drain");
+    rig.must("ro", Verb::Pause);
+    rig.ticks(3);
+    rig.must("ro", Verb::Resume);
+    rig.until(20, |r| r.step(n) == Step::Activating);
+    assert_ne!(rig.of("ro", n).drain_id, Some(old.clone()), "ids are never used again");
+    let set = crate::ids::SetId::parse("factory").expect("an id");
+    rig.say(n, RobotEvent::Update(UpdateEvent::Ready { drain_id: old, set }));
+    rig.ticks(3);
+    assert!(rig.of("ro", n).grant.is_none());
+}
+
+#[test]
+fn an_unused_permission_is_taken_back_only_when_the_robot_says_so_past_its_life() {
+    let mut rig = Rig::new(5);
+    rig.start(spec());
+    let n = rig.order()[0];
+    rig.robots[n].fate = Fate::Dawdles;
+    rig.until(20, |r| r.of("ro", n).grant.is_some());
+    let given = rig.of("ro", n).grant.expect("given").grant_id;
+    rig.must("ro", Verb::Pause);
+    rig.robots[n].is_off = true;
+    rig.ticks(60);
+    assert!(rig.of("ro", n).drain_id.is_some(), "time alone releases nothing");
+    assert!(rig.releases().is_empty());
+    rig.robots[n].is_off = false;
+    rig.ticks(2);
+    assert!(rig.of("ro", n).grant.is_some(), "its heartbeats are not past its life yet");
+    rig.ticks(10);
+    assert_eq!(rig.of("ro", n).grant, None);
+    rig.ticks(2);
+    assert_eq!(rig.releases(), [ReleasedBy::NoGrant]);
+    rig.robots[n].fate = Fate::Good;
+    rig.must("ro", Verb::Resume);
+    rig.until(60, |r| r.step(n) == Step::Trial);
+    assert!(rig.of("ro", n).moments.switched.is_some() && rig.robots[n].seen_grant > given);
+}
+
+#[test]
+fn in_flight_is_never_above_the_wave_nor_above_what_was_asked() {
+    let mut rig = Rig::new(12);
+    rig.start(RolloutSpec { max_in_flight: Some(3), ..wide() });
+    let mut most = 0;
+    for _ in 0..120 {
+        rig.tick();
+        most = most.max(rig.rollout("ro").in_flight);
+    }
+    assert_eq!(most, 3);
+    assert_eq!(rig.phase(), Phase::Completed);
+    assert!(rig.releases().iter().all(|why| *why == ReleasedBy::Reported));
+    assert!(rig.ota.requests.is_empty() && rig.ota.releases.is_empty() && rig.fleet.drains.is_empty());
+}
+
+#[test]
+fn drains_wait_until_the_area_lets_them_begin_and_the_row_is_in_the_same_item() {
+    let mut rig = Rig::new(12);
+    rig.rules(|s| s.off_work_permille = 200);
+    rig.fates(Fate::NeverReady);
+    rig.start(wide());
+    rig.ticks(8);
+    assert_eq!((drains(&rig, DrainState::Held), drains(&rig, DrainState::Waiting)), (2, 10));
+    let row: fleet::rows::AreaBudget = rig.row("hall").expect("a row");
+    assert_eq!((row.off_work.len(), row.most), (2, 2));
+    let waits = rig.fleet.drains.values().filter(|d| d.row.state == DrainState::Waiting);
+    assert!(waits.clone().all(|d| d.row.why.as_ref().is_some_and(|w| w.code == Code::BlockedByBudget)));
+    let begun = rig.feed.iter().filter(|e| &*e.kind == "drain.begun");
+    let counted = rig.feed.iter().filter(|e| &*e.kind == "area.off_work");
+    assert!(begun.count() <= counted.count(), "each drain that began wrote the area's row");
+}
+
+#[test]
+fn waiting_drains_are_not_written_again_for_every_number_that_changes() {
+    let mut rig = Rig::new(12);
+    rig.rules(|s| s.off_work_permille = 200);
+    rig.fates(Fate::NeverReady);
+    rig.start(wide());
+    rig.ticks(8);
+    let told = |rig: &Rig| rig.feed.iter().filter(|e| &*e.kind == "drain.waits").count();
+    let before = told(&rig);
+    (0..3).for_each(|_| rig.arrive());
+    rig.ticks(5);
+    assert_eq!(drains(&rig, DrainState::Held), 3, "one more may be out of work");
+    assert_eq!(told(&rig), before);
+}
+
+#[test]
+fn robots_with_a_capability_that_is_kept_stay_in_work() {
+    let mut rig = Rig::new(12);
+    for n in 0..4 {
+        rig.attach(n, |i| i.capabilities = vec!["tow".into()]);
+    }
+    rig.rules(|s| s.keep_in_work.extend([("tow".into(), 3)]));
+    rig.fates(Fate::NeverReady);
+    rig.start(wide());
+    rig.ticks(8);
+    let held = (0..4).filter(|n| rig.step(*n) == Step::Activating).count();
+    assert_eq!((held, rig.count(Step::Activating)), (1, 9));
+}
+
+#[test]
+fn robots_that_charge_are_asked_first_and_urgent_drains_do_not_wait() {
+    use crate::ids::{AttemptId, Subject};
+    use crate::task::state::Errand;
+    let mut rig = Rig::new(3);
+    rig.rules(|s| s.off_work_permille = 0);
+    // The last of them charges: its mutex is with an errand that ends only when it is asked to.
+    let id = AttemptId { subject: Subject::Errand { robot_id: robot_id(2), number: 1 }, epoch: 1 };
+    rig.put(charge(&id, Errand::Charge));
+    rig.put(RobotAuthority { robot_id: robot_id(2), holder: RobotHolder::Attempt(id) });
+    for n in 0..3 {
+        rig.put(request(n, false));
+    }
+    rig.fleet_turn();
+    let state = |rig: &Rig, n: usize| rig.fleet.drains[&format!("ota:{n}")].row.state;
+    assert_eq!([0, 1, 2].map(|n| state(&rig, n)), [DrainState::Waiting, DrainState::Waiting, DrainState::Draining]);
+    rig.put(super::super::rows::DrainRequest { drain_id: DrainId::parse("ota:9").expect("an id"), ..request(0, true) });
+    rig.fleet_turn();
+    let urgent = &rig.fleet.drains["ota:9"].row;
+    assert!(urgent.is_on(), "{urgent:?}");
+}
+
+fn request(n: usize, urgent: bool) -> super::super::rows::DrainRequest {
+    super::super::rows::DrainRequest {
+        drain_id: DrainId::parse(&format!("ota:{n}")).expect("an id"),
+        robot_id: robot_id(n),
+        rollout_id: rollout_id("ro"),
+        reason: String::new(),
+        within_ms: 60_000,
+        urgent,
+    }
+}
+
+fn charge(id: &crate::ids::AttemptId, errand: crate::task::state::Errand) -> crate::task::Attempt {
+    crate::task::Attempt {
+        attempt: id.clone(),
+        robot_id: robot_id(2),
+        errand: Some(errand),
+        goal: Some(WaypointId::parse("charge-1").expect("an id")),
+        phase: crate::task::AttemptPhase::Executing,
+        uncertain: None,
+        offer: crate::authority::Authority { session_epoch: 2, hb: 1, valid_ms: 5_000 },
+        step_index: 0,
+        opened: false,
+        offered: Utc(BEGIN),
+        accepted: None,
+        ended: None,
+        fault: None,
+        refusal: None,
+        stats: WorkStats::default(),
+        software: String::new(),
+    }
+}
+
+#[test]
+fn a_request_and_its_release_together_make_no_drain_and_both_go_when_none_stands() {
+    let mut rig = Rig::new(2);
+    rig.put(request(0, false));
+    rig.put(super::super::rows::DrainRelease { drain_id: request(0, false).drain_id, why: ReleasedBy::NoGrant });
+    rig.fleet_turn();
+    assert!(rig.fleet.drains.is_empty());
+    rig.ota_turn();
+    assert!(rig.ota.requests.is_empty() && rig.ota.releases.is_empty());
+    rig.put(request(1, false));
+    rig.fleet_turn();
+    rig.put(super::super::rows::DrainRelease { drain_id: request(1, false).drain_id, why: ReleasedBy::NoGrant });
+    rig.ota_turn();
+    assert_eq!(rig.ota.requests.len(), 1, "the drain stands");
+    rig.fleet_turn();
+    rig.ota_turn();
+    assert!(rig.ota.requests.is_empty() && rig.ota.releases.is_empty());
+    assert_eq!(rig.row::<RobotAuthority>(robot_id(1).as_str()).expect("a row").holder, RobotHolder::None);
+}
+
+#[test]
+fn a_window_that_closes_in_mid_wave_stops_new_drains_and_lets_running_ones_end() {
+    let mut rig = Rig::new(8);
+    rig.start(RolloutSpec { max_in_flight: Some(2), ..wide() });
+    rig.until(20, |r| r.count(Step::Activating) == 2);
+    rig.rules(|s| s.frozen = true);
+    rig.ticks(30);
+    assert_eq!((rig.count(Step::Trial), rig.count(Step::Staged)), (2, 6));
+    assert_eq!((rig.phase(), rig.rollout("ro").in_flight), (Phase::Applying, 0));
+    let n = (0..8).find(|n| rig.step(*n) == Step::Staged).expect("one waits");
+    let blocked = super::super::explain::blocked(&rig.ota, &rig.board, &rig.now, &rig.rollout("ro"), &rig.of("ro", n));
+    assert_eq!(blocked.expect("a reason").by.code, Code::BlockedByWindow);
+    rig.rules(|s| s.frozen = false);
+    rig.until(200, |r| r.phase() == Phase::Completed);
+}
+
+#[test]
+fn a_drain_behind_one_of_a_person_is_given_up_after_an_hour() {
+    let mut rig = Rig::new(4);
+    rig.checks_rebuild = false;
+    rig.start(spec());
+    let n = rig.order()[0];
+    let mut plan = fleet::Plan::default();
+    plan.decide(&mut rig.fleet, rig.now, "ana", |tx| drain::ask(tx, &robot_id(n), "oil", "ana", 60_000));
+    rig.commit(plan.items);
+    rig.ticks(10);
+    assert_eq!(rig.step(n), Step::Draining);
+    rig.pass(crate::limits::STAGED_WITHIN.as_ms());
+    rig.turn();
+    let r = rig.of("ro", n);
+    assert_eq!((r.step, r.why.expect("a reason").code), (Step::Skipped, Code::SkippedBusy));
+    assert_eq!(rig.releases(), [ReleasedBy::NoGrant]);
+}

@@ -1,0 +1,594 @@
+//! Roll-outs over rows in memory: the real planner of roll-outs, fleet's real drains and budgets, and robots that obey their section
+//! `update` as agents do, one second at a time.
+//!
+//! Invariant: every item finds its rows as it expects them, and after each turn a picture built from the rows equals the one that was kept.
+
+mod aborts;
+mod agents;
+mod drains_and_grants;
+mod newcomers_and_pins;
+mod people;
+mod recovery;
+mod reverts_and_second_pass;
+mod sequences;
+mod staging;
+mod steps;
+mod trial_and_gates;
+mod waves_and_matching;
+
+use super::commands::{self, Command, Verb};
+use super::rows::{AreaBundle, Bundle, Outcome, Phase, ReleasedBy, RobotSoftware, Rollout, RolloutRobot, Step};
+use super::spec::{RolloutSpec, Wave};
+use super::view::{Slot, TABLES, View};
+use super::{Board, Order, Plan, Sign, absorb, cycle};
+use crate::fleet::rows::{DrainState, RobotAuthority, RobotControl, RobotCounter, RobotHolder};
+use crate::fleet::{self, budget, drain};
+use crate::ids::{AreaId, BundleId, DrainId, RobotId, RolloutId, WaypointId};
+use crate::policy::AreaPolicy;
+use crate::reason::{Code, Reason, Refusal};
+use crate::robot::{Fault, HardwareStop, Inventory, Lane, ReportedState, Vitals};
+use crate::rows::{Entry, Expect, Item, Key, Log, Record, Revision, Row, Seq, Write};
+use crate::site::{DEMO, Site};
+use crate::time::{LinkTime, Now, SiteTime, Utc};
+use crate::update::{DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState};
+use crate::work::{InboxEntry, InboxItem, LaneMark, Live, RobotEvent, Sample, SampleBody, Session, WorkStats};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+/// Milliseconds since 1970 at which each test begins: a Friday morning.
+const BEGIN: i64 = 1_795_000_000_000;
+
+/// What a robot does with a bundle that it is given.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+enum Fate {
+    /// It comes through.
+    #[default]
+    Good,
+    /// It goes back by itself, still on probation.
+    BadAtStart,
+    /// Nothing is heard of it after the switch.
+    Silent,
+    /// It stays on probation.
+    Probation,
+    /// It never asks to activate.
+    NeverReady,
+    /// It does not get any bytes.
+    NoBytes,
+    /// It does not take the bundle.
+    Unfit,
+    /// It takes permissions and does not use them.
+    Dawdles,
+}
+
+/// One robot as the server meets it.
+#[derive(Clone, Debug)]
+struct Robot {
+    id: RobotId,
+    epoch: u64,
+    hb: u64,
+    events: u64,
+    version: String,
+    kept: String,
+    report: Option<UpdateReport>,
+    seen_grant: u64,
+    fate: Fate,
+    is_off: bool,
+    stop: HardwareStop,
+    at: &'static str,
+}
+
+/// Envelopes of tests: the generation as text.
+struct Plain;
+
+impl Sign for Plain {
+    fn directive(&self, order: &Order) -> String {
+        format!("{} {}", order.generation, order.bundle)
+    }
+}
+
+fn rollout_id(text: &str) -> RolloutId {
+    RolloutId::parse(text).expect("an id")
+}
+
+fn robot_id(n: usize) -> RobotId {
+    RobotId::parse(&format!("r{n:03}")).expect("an id")
+}
+
+fn bundle_id(n: u32) -> BundleId {
+    BundleId::parse(&format!("{n:064x}")).expect("an id")
+}
+
+fn hall() -> AreaId {
+    AreaId::parse("hall").expect("an id")
+}
+
+/// A factory in which a roll-out runs.
+struct Rig {
+    now: Now,
+    seq: u64,
+    rows: BTreeMap<Key, Row>,
+    feed: Vec<Entry>,
+    ota: View,
+    ota_at: usize,
+    fleet: fleet::view::View,
+    fleet_at: usize,
+    board: Board,
+    heard: BTreeSet<RobotId>,
+    robots: Vec<Robot>,
+    /// Robots on trial end a task each second.
+    works: bool,
+    /// Fleet does nothing.
+    fleet_sleeps: bool,
+    checks_rebuild: bool,
+}
+
+impl Rig {
+    /// So many robots, parked in the hall, of which all may be out of work at once, and bundles 1, 2 and 3.
+    fn new(count: usize) -> Self {
+        let site: Arc<Site> = Arc::new(crate::site::text::parse(DEMO).expect("the demo reads"));
+        let now = Now { site: SiteTime(0), link: LinkTime(1_000_000), utc: Utc(BEGIN), wall: Utc(BEGIN) };
+        let mut rig = Self {
+            now,
+            seq: 0,
+            rows: BTreeMap::new(),
+            feed: Vec::new(),
+            ota: View::new(site.clone(), now, now),
+            ota_at: 0,
+            fleet: fleet::view::View::new(site, now, now),
+            fleet_at: 0,
+            board: Board::new(),
+            heard: BTreeSet::new(),
+            robots: Vec::new(),
+            works: true,
+            fleet_sleeps: false,
+            checks_rebuild: true,
+        };
+        rig.rules(|s| s.off_work_permille = 1_000);
+        for n in 1..=3 {
+            rig.put(bundle(n));
+        }
+        (0..count).for_each(|_| rig.arrive());
+        rig.tick();
+        rig
+    }
+
+    /// One more robot comes.
+    fn arrive(&mut self) {
+        let id = robot_id(self.robots.len());
+        self.robots.push(Robot {
+            id: id.clone(),
+            epoch: 1,
+            hb: 0,
+            events: 0,
+            version: "0.9.0".into(),
+            kept: "0.9.0".into(),
+            report: None,
+            seen_grant: 0,
+            fate: Fate::Good,
+            is_off: false,
+            stop: HardwareStop::None,
+            at: "park-1",
+        });
+        self.put(RobotAuthority { robot_id: id.clone(), holder: RobotHolder::None });
+        self.put(RobotControl::new(id));
+        self.attach(self.robots.len() - 1, |_| {});
+    }
+
+    /// A robot begins a new session, with a changed inventory.
+    fn attach(&mut self, n: usize, change: impl FnOnce(&mut Inventory)) {
+        let key = Key::new(Session::TABLE, self.robots[n].id.as_str());
+        let known = self.rows.get(&key).map(|row| row.decode::<Session>().expect("a session").inventory);
+        let mut inventory = known.unwrap_or_else(|| Inventory {
+            model: "m1".into(),
+            capabilities: vec!["lift".into()],
+            labels: BTreeMap::from([("line".into(), if n.is_multiple_of(2) { "even" } else { "odd" }.into())]),
+            ..Inventory::default()
+        });
+        let robot = &mut self.robots[n];
+        robot.epoch += 1;
+        robot.hb = 0;
+        inventory.software.clone_from(&robot.version);
+        change(&mut inventory);
+        let row = Session {
+            robot_id: robot.id.clone(),
+            session_epoch: robot.epoch,
+            secret: String::new(),
+            boot_id: String::new(),
+            ring: "ring".into(),
+            inventory,
+            applied_work: 0,
+            applied_update: 0,
+            places: Vec::new(),
+            clock_offset_ms: None,
+        };
+        self.put(row);
+    }
+
+    // --- the store
+
+    fn entry(
+        &mut self,
+        log: Log,
+        row: Option<(&Key, Revision)>,
+        subject: Arc<str>,
+        body: Option<Arc<str>>,
+        kind: &str,
+    ) {
+        self.seq += 1;
+        self.feed.push(Entry {
+            seq: Seq(self.seq),
+            log,
+            table: row.map(|(key, _)| key.table),
+            subject,
+            revision: row.map_or(Revision(0), |(_, revision)| revision),
+            index: crate::rows::Index::default(),
+            body,
+            kind: kind.into(),
+            actor: "test".into(),
+            request_id: None,
+            at_unix_ms: self.now.wall.0,
+        });
+    }
+
+    fn write(&mut self, key: Key, body: Option<Arc<str>>, kind: &str) {
+        let revision = self.rows.get(&key).map_or(Revision(1), |row| row.revision.next());
+        match &body {
+            Some(body) => {
+                let index = crate::rows::Index::default();
+                self.rows.insert(key.clone(), Row { key: key.clone(), revision, index, body: body.clone() });
+            }
+            None => drop(self.rows.remove(&key)),
+        }
+        self.entry(Log::Telemetry, Some((&key, revision)), key.id.clone(), body, kind);
+    }
+
+    /// Somebody else's row.
+    fn put<R: Record>(&mut self, record: R) {
+        self.write(record.key(), Some(record.body()), "test.put");
+    }
+
+    fn commit(&mut self, items: Vec<Item>) {
+        for item in items {
+            assert!(item.rows.len() <= crate::limits::ITEM_ROWS_MAX, "an item of {} rows", item.rows.len());
+            for change in &item.rows {
+                let found = self.rows.get(&change.key).map_or(Expect::Absent, |row| Expect::At(row.revision));
+                assert_eq!(change.expect, found, "{:?} of {:?} by {}", change.key, change.kind, item.actor);
+            }
+            for change in item.rows {
+                match change.write {
+                    Write::Put { body, .. } => self.write(change.key, Some(body), change.kind),
+                    Write::Delete => self.write(change.key, None, change.kind),
+                    Write::Keep => {}
+                }
+            }
+            for fact in item.facts {
+                self.entry(fact.log, None, fact.subject, Some(fact.body), fact.kind);
+            }
+        }
+    }
+
+    // --- time
+
+    /// One second of everything.
+    fn tick(&mut self) {
+        self.pass(1_000);
+        self.robots_act();
+        self.turn();
+    }
+
+    fn ticks(&mut self, count: usize) {
+        (0..count).for_each(|_| self.tick());
+    }
+
+    /// Ticks until it holds; fails after `most` of them.
+    fn until(&mut self, most: usize, holds: impl Fn(&Self) -> bool) {
+        for _ in 0..most {
+            if holds(self) {
+                return;
+            }
+            self.tick();
+        }
+        panic!("{:#?}", self.ota.robots.values().map(|r| (&r.row.robot_id, r.row.step)).collect::<Vec<_>>());
+    }
+
+    /// All clocks go on, and whoever is there sends a heartbeat.
+    fn pass(&mut self, ms: u64) {
+        self.now.site.0 += ms;
+        self.now.link.0 += ms;
+        self.now.utc = self.now.utc.plus_ms(ms);
+        self.now.wall = self.now.wall.plus_ms(ms);
+        for n in 0..self.robots.len() {
+            self.beat(n);
+        }
+    }
+
+    /// One heartbeat of a robot that is there.
+    fn beat(&mut self, n: usize) {
+        let robot = &mut self.robots[n];
+        if robot.is_off {
+            return;
+        }
+        robot.hb += 1;
+        let report = ReportedState {
+            hb: robot.hb,
+            session_epoch: robot.epoch,
+            produced: BTreeMap::from([(Lane::Event, robot.events)]),
+            vitals: Vitals {
+                waypoint: Some(WaypointId::parse(robot.at).expect("an id")),
+                battery_permille: 950,
+                ..Vitals::default()
+            },
+            hardware_stop: robot.stop,
+            update: robot.report.clone(),
+            ..ReportedState::default()
+        };
+        let live = Live {
+            robot_id: robot.id.clone(),
+            report,
+            processed_at: self.now.link,
+            processed_site: self.now.site,
+            received_unix_ms: self.now.wall.0,
+            progress_at: self.now.site,
+            clock_offset_ms: None,
+        };
+        self.heard.insert(robot.id.clone());
+        self.board.insert(robot.id.clone(), Arc::new(live));
+    }
+
+    /// A turn of the roll-outs, then one of fleet.
+    fn turn(&mut self) {
+        self.ota_turn();
+        if !self.fleet_sleeps {
+            self.fleet_turn();
+        }
+    }
+
+    fn ota_turn(&mut self) {
+        self.ota_plan(|_, _| {});
+    }
+
+    fn ota_plan(&mut self, ask: impl FnOnce(&mut Self, &mut Plan)) {
+        let mut plan = Plan::default();
+        let entries = self.feed[self.ota_at..].to_vec();
+        self.ota_at = self.feed.len();
+        absorb(&mut self.ota, self.now, &entries, &mut plan);
+        ask(self, &mut plan);
+        let heard = std::mem::take(&mut self.heard);
+        cycle(&mut self.ota, self.now, &self.board, &heard, &Plain, &mut plan);
+        assert_eq!(plan.unreadable, Vec::<String>::new());
+        self.commit(plan.items);
+        if self.checks_rebuild {
+            self.assert_rebuilt();
+        }
+        self.assert_laws();
+    }
+
+    fn fleet_turn(&mut self) {
+        let mut plan = fleet::Plan::default();
+        let entries = self.feed[self.fleet_at..].to_vec();
+        self.fleet_at = self.feed.len();
+        for entry in &entries {
+            let Some(table) = entry.table else { continue };
+            let key = Key { table, id: entry.subject.clone() };
+            let row = crate::picture::row_of(entry, table);
+            self.fleet.absorb(&key, entry.revision, row.as_ref()).expect("a row");
+        }
+        drain::obey(&mut self.fleet, self.now, &mut plan);
+        budget::plan(&mut self.fleet, &self.board, self.now, &mut plan);
+        drain::plan(&mut self.fleet, &self.board, self.now, &mut plan);
+        self.commit(plan.items);
+    }
+
+    /// The service dies and reads everything again.
+    fn restart(&mut self) {
+        let mut fresh = self.rebuilt();
+        fresh.started = self.now;
+        // As the service does: the row is as old as the last commit.
+        fresh.served.site_ms = self.ota.served_ms(&self.now);
+        self.ota_at = self.feed.partition_point(|entry| entry.seq <= fresh.absorbed);
+        self.ota = fresh;
+    }
+
+    fn rebuilt(&self) -> View {
+        let mut view = View::new(self.ota.site.clone(), self.ota.started, self.now);
+        let rows: Vec<Row> = self.rows.values().filter(|row| TABLES.contains(&row.key.table)).cloned().collect();
+        view.load(&rows, Seq(self.seq)).expect("rows read");
+        view
+    }
+
+    fn assert_rebuilt(&self) {
+        let fresh = self.rebuilt();
+        let old = &self.ota;
+        // What others wrote since is not in it yet: compared is what is its own.
+        same(&old.rollouts, &fresh.rollouts);
+        same(&old.robots, &fresh.robots);
+        same(&old.requests, &fresh.requests);
+        same(&old.releases, &fresh.releases);
+        same(&old.desired, &fresh.desired);
+        same(&old.software, &fresh.software);
+        same(&old.quarantines, &fresh.quarantines);
+        same(&old.area_bundles, &fresh.area_bundles);
+        same(&old.marks, &fresh.marks);
+        same(&old.clocks, &fresh.clocks);
+        same(&old.bundles, &fresh.bundles);
+        same(&old.drains, &fresh.drains);
+        same(&old.authority, &fresh.authority);
+        assert_eq!(old.open, fresh.open);
+        let sizes = |view: &View| view.wave_sizes.clone().into_iter().filter(|(_, n)| *n > 0).collect::<Vec<_>>();
+        assert_eq!(sizes(old), sizes(&fresh));
+    }
+
+    /// What holds after every turn.
+    fn assert_laws(&self) {
+        for rollout in self.ota.rollouts.values().map(|r| &r.row) {
+            let drains: Vec<&DrainId> =
+                self.ota.robots_of(&rollout.rollout_id).filter_map(|r| r.drain_id.as_ref()).collect();
+            assert_eq!(rollout.in_flight as usize, drains.len(), "in flight");
+            for drain_id in drains {
+                assert!(self.ota.requests.contains_key(drain_id.as_str()), "a drain without a request");
+                assert!(!self.ota.releases.contains_key(drain_id.as_str()), "a drain that was released");
+            }
+            assert_eq!(rollout.abort.is_some(), rollout.phase.goes_back(), "an abort is latched");
+        }
+        for desired in self.ota.desired.values().map(|d| &d.row) {
+            if let Some(grant) = &desired.grant {
+                assert_eq!(Some(&grant.drain_id), desired.drain_id.as_ref(), "a permission of another drain");
+                assert_eq!(desired.goal, Goal::Activate);
+            }
+        }
+    }
+
+    // --- what there is
+
+    fn row<R: Record>(&self, id: &str) -> Option<R> {
+        self.rows.get(&Key::new(R::TABLE, id)).map(|row| row.decode().expect("a row"))
+    }
+
+    fn rollout(&self, id: &str) -> Rollout {
+        self.row(id).expect("a roll-out")
+    }
+
+    fn of(&self, id: &str, n: usize) -> RolloutRobot {
+        self.row(&RolloutRobot::id_of(&rollout_id(id), &robot_id(n))).expect("a robot of it")
+    }
+
+    fn step(&self, n: usize) -> Step {
+        self.of("ro", n).step
+    }
+
+    fn phase(&self) -> Phase {
+        self.rollout("ro").phase
+    }
+
+    fn count(&self, step: Step) -> usize {
+        self.ota.robots.values().filter(|r| r.row.step == step).count()
+    }
+
+    /// Robots of roll-out `ro` in order of wave and place.
+    fn order(&self) -> Vec<usize> {
+        let mut all: Vec<RolloutRobot> = self.ota.robots_of(&rollout_id("ro")).cloned().collect();
+        all.sort_by_key(|r| (r.wave, r.place));
+        all.iter().map(|r| r.robot_id.as_str()[1..].parse().expect("a number")).collect()
+    }
+
+    fn fates(&mut self, fate: Fate) {
+        self.robots.iter_mut().for_each(|r| r.fate = fate);
+    }
+
+    fn rules(&mut self, change: impl FnOnce(&mut crate::policy::SoftwareRules)) {
+        let mut row = self.row("hall").unwrap_or_else(|| AreaPolicy::default_of(hall()));
+        change(&mut row.software);
+        self.put(row);
+    }
+
+    /// A session's inventory is changed, and the robot attaches anew with it.
+    fn label(&mut self, n: usize, key: &str, value: &str) {
+        self.attach(n, |i| drop(i.labels.insert(key.into(), value.into())));
+    }
+
+    fn control(&mut self, n: usize, change: impl FnOnce(&mut RobotControl)) {
+        let mut row = self.row::<RobotControl>(robot_id(n).as_str()).expect("a row");
+        change(&mut row);
+        self.put(row);
+    }
+
+    fn retire(&mut self, n: usize) {
+        let act = fleet::rows::Cordon { reason: String::new(), actor: "ana".into(), since: self.now.utc };
+        self.control(n, |c| c.retired = Some(act));
+    }
+
+    // --- people
+
+    fn ask(&mut self, command: &Command) -> Result<bool, Refusal> {
+        self.ota_turn();
+        let done = commands::check(&self.ota, &self.board, command, None)?;
+        if !done {
+            self.ota_plan(|rig, plan| commands::apply(&mut rig.ota, &rig.board, rig.now, command, "ana", plan));
+        }
+        Ok(done)
+    }
+
+    fn verb(&mut self, id: &str, verb: Verb) -> Result<bool, Refusal> {
+        self.ask(&Command::Do { rollout_id: rollout_id(id), verb, reason: "because".into() })
+    }
+
+    fn must(&mut self, id: &str, verb: Verb) {
+        assert!(!self.verb(id, verb).expect("it is allowed"), "it was done before");
+    }
+
+    fn create(&mut self, id: &str, spec: RolloutSpec) {
+        self.ask(&Command::Create { rollout_id: rollout_id(id), spec: Arc::new(spec) }).expect("it is allowed");
+    }
+
+    /// Creates, submits, approves and starts one.
+    fn start_as(&mut self, id: &str, spec: RolloutSpec, supersede: bool) {
+        self.create(id, spec);
+        for verb in [Verb::Submit, Verb::Approve, Verb::Start { supersede }] {
+            self.must(id, verb);
+        }
+    }
+
+    fn start(&mut self, spec: RolloutSpec) {
+        self.start_as("ro", spec, false);
+    }
+
+    /// All release rows that were ever written, by why.
+    fn releases(&self) -> Vec<ReleasedBy> {
+        let table = super::rows::DrainRelease::TABLE;
+        let bodies = self.feed.iter().filter(|e| e.table == Some(table)).filter_map(|e| e.body.as_ref());
+        bodies.map(|b| serde_json::from_str::<super::rows::DrainRelease>(b).expect("a row").why).collect()
+    }
+
+    /// Codes of the incidents that were asked for.
+    fn incidents(&self) -> Vec<Code> {
+        let told = self.feed.iter().filter(|e| &*e.kind == super::INCIDENT).filter_map(|e| e.body.as_ref());
+        told.map(|b| serde_json::from_str::<Reason>(b).expect("a reason").code).collect()
+    }
+}
+
+fn same<R: PartialEq + std::fmt::Debug>(kept: &Slot<R>, fresh: &Slot<R>) {
+    assert_eq!(kept, fresh, "the picture that was kept, and one built anew");
+}
+
+fn fresh_report(state: UpdateState, bundle: &BundleId, directive: u64) -> UpdateReport {
+    UpdateReport {
+        state,
+        bundle: bundle.clone(),
+        directive,
+        set: None,
+        drain_id: None,
+        grant_id: 0,
+        tries: 0,
+        progress_permille: 0,
+        reason: None,
+    }
+}
+
+fn bundle(n: u32) -> Bundle {
+    Bundle {
+        bundle: bundle_id(n),
+        name: "base".into(),
+        version: format!("{n}.0.0"),
+        manifest_length: 100,
+        length: 1_000,
+        hardware: BTreeSet::from(["m1".to_owned()]),
+        needs: "restart".into(),
+        hard_stop_codes: BTreeSet::from([66]),
+        is_irreversible: false,
+        has_base: false,
+        listed: true,
+        revoked: None,
+        published: Utc(BEGIN),
+    }
+}
+
+/// Bundle 2 in two waves, judged quickly.
+fn spec() -> RolloutSpec {
+    RolloutSpec {
+        waves: vec![Wave::Count(1), Wave::Rest],
+        probation_ms: 10_000,
+        soak_ms: 10_000,
+        exposure_within_ms: 60_000,
+        ..RolloutSpec::new(bundle_id(2))
+    }
+}

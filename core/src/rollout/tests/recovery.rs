@@ -1,0 +1,110 @@
+//! The service dies, hears twice, or hears late.
+
+use super::*;
+
+#[test]
+fn what_meant_nothing_when_it_was_said_means_nothing_after_a_restart() {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    let n = rig.order()[0];
+    rig.robots[n].fate = Fate::Dawdles;
+    rig.until(20, |r| r.of("ro", n).grant.is_some());
+    // The old software has a fault that the new one must not have.
+    let fault = Fault { code: 66, class: crate::robot::FaultClass::Recoverable, message: String::new() };
+    rig.say(n, RobotEvent::Fault { fault, cleared: false });
+    // Within the same second a heartbeat says that the new one runs.
+    let report = rig.robots[n].report.clone().expect("an update");
+    rig.robots[n].report = Some(UpdateReport { state: UpdateState::Trial, ..report });
+    rig.ota_turn();
+    rig.beat(n);
+    rig.ota_turn();
+    assert_eq!(rig.step(n), Step::Trial);
+    rig.restart();
+    rig.ota_turn();
+    assert_eq!(rig.of("ro", n).failure, None);
+    assert_eq!(rig.rollout("ro").abort, None);
+}
+
+#[test]
+fn a_heartbeat_that_is_older_than_what_the_robot_said_since_changes_nothing() {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    let n = rig.order()[0];
+    rig.until(60, |r| r.step(n) == Step::Trial);
+    rig.beat(n);
+    rig.report(n, UpdateState::RolledBack);
+    rig.ota_turn();
+    let software: RobotSoftware = rig.row(robot_id(n).as_str()).expect("a row");
+    assert_eq!(software.report.expect("a report").state, UpdateState::RolledBack);
+    assert_eq!(software.on_trial, None);
+}
+
+#[test]
+fn a_restart_after_every_turn_changes_nothing_of_the_end() {
+    let mut rig = Rig::new(6);
+    rig.start(spec());
+    for _ in 0..300 {
+        rig.tick();
+        rig.restart();
+        if rig.phase() == Phase::Completed {
+            break;
+        }
+    }
+    rig.ticks(3);
+    assert_eq!(rig.phase(), Phase::Completed);
+    assert!(rig.robots.iter().all(|r| r.version == "2.0.0"));
+    assert_eq!(rig.count(Step::Committed), 6);
+}
+
+#[test]
+fn a_start_that_was_cut_short_reaches_all_robots_all_the_same() {
+    let mut rig = Rig::new(200);
+    rig.checks_rebuild = false;
+    rig.create("ro", RolloutSpec { waves: vec![Wave::Count(1), Wave::Rest], ..spec() });
+    rig.must("ro", Verb::Submit);
+    rig.must("ro", Verb::Approve);
+    let command =
+        Command::Do { rollout_id: rollout_id("ro"), verb: Verb::Start { supersede: false }, reason: String::new() };
+    let mut plan = Plan::default();
+    commands::apply(&mut rig.ota, &rig.board, rig.now, &command, "ana", &mut plan);
+    assert_eq!(plan.items.len(), 2, "the second was never written");
+    plan.items.truncate(1);
+    rig.commit(plan.items);
+    rig.restart();
+    rig.ticks(4);
+    assert_eq!(rig.ota.robots_of(&rollout_id("ro")).count(), 200);
+}
+
+#[test]
+fn roll_outs_beyond_the_limit_are_forgotten_and_none_that_robots_still_come_back_from() {
+    let mut rig = Rig::new(2);
+    rig.checks_rebuild = false;
+    rig.start(spec());
+    rig.until(400, |r| r.phase() == Phase::Completed);
+    let over = rig.rollout("ro");
+    let mut open = rig.of("ro", 0);
+    for n in 0..=crate::limits::ROLLOUTS_MAX {
+        let id = rollout_id(&format!("old-{n}"));
+        rig.put(Rollout {
+            rollout_id: id.clone(),
+            since: Utc(n as i64),
+            phase: Phase::Superseded,
+            abort: over.abort.clone(),
+            ..over.clone()
+        });
+        if n == 0 {
+            open = RolloutRobot { rollout_id: id, step: Step::Stuck, drain_id: None, ..open.clone() };
+            rig.put(open.clone());
+        }
+    }
+    let mut plan = Plan::default();
+    let entries = rig.feed[rig.ota_at..].to_vec();
+    rig.ota_at = rig.feed.len();
+    absorb(&mut rig.ota, rig.now, &entries, &mut plan);
+    for _ in 0..10 {
+        cycle(&mut rig.ota, rig.now, &rig.board, &BTreeSet::new(), &Plain, &mut plan);
+    }
+    assert_eq!(rig.ota.rollouts.len(), crate::limits::ROLLOUTS_MAX);
+    assert!(rig.ota.rollouts.contains_key("ro") && rig.ota.rollouts.contains_key("old-0"));
+    assert!(!rig.ota.rollouts.contains_key("old-1"));
+}

@@ -1,0 +1,156 @@
+//! Every step of a robot beside every state that it may report: what follows, and that each has a way to an end.
+
+use super::super::robots::{self, Move};
+use super::*;
+
+/// A rig with roll-out `ro` applying wave 0 and robot 0 made to stand at `step` in it.
+fn at(rig: &mut Rig, step: Step) -> RolloutRobot {
+    let n = rig.order()[0];
+    let mut r = rig.of("ro", n);
+    r.step = step;
+    r.since = rig.now.utc;
+    r.attempted = step.is_active() || matches!(step, Step::Committed | Step::RolledBack);
+    r.grant = None;
+    r
+}
+
+fn applying() -> (Rig, Rollout) {
+    let mut rig = Rig::new(6);
+    rig.fleet_sleeps = true;
+    rig.start(spec());
+    rig.until(5, |r| r.phase() == Phase::Applying);
+    rig.pass(0);
+    let rollout = rig.rollout("ro");
+    (rig, rollout)
+}
+
+fn reported(rig: &Rig, r: &RolloutRobot, state: Option<UpdateState>) -> Board {
+    let mut board = rig.board.clone();
+    let live = board.get_mut(&r.robot_id).expect("it is heard");
+    let report = state.map(|state| fresh_report(state, &bundle_id(2), r.directive));
+    Arc::make_mut(live).report.update = report;
+    board
+}
+
+const STEPS: [Step; 12] = [
+    Step::Waiting,
+    Step::Staging,
+    Step::Staged,
+    Step::Draining,
+    Step::Activating,
+    Step::Trial,
+    Step::Committing,
+    Step::Reverting,
+    Step::Committed,
+    Step::RolledBack,
+    Step::Skipped,
+    Step::Stuck,
+];
+
+/// What follows in short.
+fn name(due: Option<&Move>) -> String {
+    due.map_or("-".into(), |due| format!("{due:?}").split(['(', ' ', '{']).next().unwrap_or_default().to_owned())
+}
+
+#[test]
+fn every_step_and_every_report_has_the_move_that_the_table_says() {
+    let (mut rig, rollout) = applying();
+    let mut table = String::new();
+    for step in STEPS {
+        let r = at(&mut rig, step);
+        let states = UpdateState::ALL.into_iter().map(Some).chain([None]);
+        let moves: Vec<String> = states
+            .map(|state| {
+                let board = reported(&rig, &r, state);
+                name(robots::next(&rig.ota, &board, &rig.now, &rollout, &r).as_ref())
+            })
+            .collect();
+        table += &format!("{step:?}: {}\n", moves.join(" "));
+    }
+    // Directed Downloading Staged Switching Probation Trial Committing RollingBack Committed RolledBack Refused Stuck none
+    let expected = "\
+Waiting: Stage Stage Stage Stage Stage Stage Stage Stage Stage Stage Stage Stage Stage
+Staging: - - IsStaged IsStaged IsStaged IsStaged IsStaged IsStaged IsStaged IsStaged Skip IsStaged IsStaged
+Staged: - - AskDrain AskDrain AskDrain AskDrain AskDrain AskDrain AskDrain AskDrain Skip AskDrain AskDrain
+Draining: - - - - - - - - - - - - -
+Activating: - - - - Switched OnTrial OnTrial Switched OnTrial RolledBack Skip Stuck -
+Trial: - - - - - - - - - RolledBack - Stuck -
+Committing: - - - - - - - - Committed RolledBack - Stuck -
+Reverting: Revert Revert Revert Revert Revert Revert Revert Revert Revert RolledBack Revert Stuck Revert
+Committed: - - - - - - - - - - - - -
+RolledBack: - - - - - - - - - - - - -
+Skipped: - - - - - - - - - - - - -
+Stuck: - - - - - - - - - RolledBack - - -
+";
+    assert_eq!(table, expected);
+}
+
+#[test]
+fn a_robot_that_refuses_after_it_was_given_permission_is_over_and_its_drain_is_released_as_reported() {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    let n = rig.order()[0];
+    rig.robots[n].fate = Fate::Dawdles;
+    rig.until(20, |r| r.of("ro", n).grant.is_some());
+    rig.report(n, UpdateState::Refused);
+    rig.tick();
+    assert_eq!(rig.step(n), Step::Skipped);
+    assert_eq!(rig.releases(), [ReleasedBy::Reported]);
+}
+
+#[test]
+fn whoever_is_retired_is_waited_for_at_no_step() {
+    let (mut rig, rollout) = applying();
+    let n = rig.order()[0];
+    rig.retire(n);
+    rig.ota_turn();
+    for step in STEPS {
+        let r = at(&mut rig, step);
+        for state in UpdateState::ALL.into_iter().map(Some).chain([None]) {
+            let due = robots::next(&rig.ota, &reported(&rig, &r, state), &rig.now, &rollout, &r);
+            assert_eq!(name(due.as_ref()) == "Skip", !step.is_over(), "{step:?} {state:?}");
+        }
+    }
+}
+
+#[test]
+fn after_an_abort_no_step_but_a_stuck_one_keeps_the_bundle_whatever_is_reported() {
+    let (mut rig, _) = applying();
+    rig.must("ro", Verb::Abort);
+    let rollout = rig.rollout("ro");
+    for step in STEPS {
+        let mut r = at(&mut rig, step);
+        r.drain_id = None;
+        for state in UpdateState::ALL.into_iter().map(Some).chain([None]) {
+            let due = name(robots::next(&rig.ota, &reported(&rig, &r, state), &rig.now, &rollout, &r).as_ref());
+            let ok = match step {
+                Step::Waiting | Step::Staging | Step::Staged => due == "Skip",
+                Step::Draining => due == "-",
+                Step::Activating => {
+                    ["LeaveDrain", "Switched", "OnTrial", "RolledBack", "Stuck", "Skip"].contains(&due.as_str())
+                }
+                Step::Trial | Step::Reverting | Step::Committed => {
+                    ["Revert", "RolledBack", "Stuck"].contains(&due.as_str())
+                }
+                Step::Committing => ["Revert", "Committed"].contains(&due.as_str()),
+                Step::RolledBack | Step::Skipped => ["-", "Forget"].contains(&due.as_str()),
+                Step::Stuck => ["-", "RolledBack"].contains(&due.as_str()),
+            };
+            assert!(ok, "{step:?} {state:?}: {due}");
+        }
+    }
+}
+
+#[test]
+fn each_waiting_robot_has_one_reason_and_who_is_done_has_none() {
+    let (mut rig, rollout) = applying();
+    for step in STEPS {
+        let r = at(&mut rig, step);
+        let board = reported(&rig, &r, None);
+        let blocked = super::super::explain::blocked(&rig.ota, &board, &rig.now, &rollout, &r);
+        assert_eq!(blocked.is_none(), step.is_over(), "{step:?}");
+        if let Some(blocked) = blocked {
+            assert!(!blocked.by.code.help().is_empty());
+        }
+    }
+}

@@ -1,0 +1,234 @@
+//! What is counted for and against a bundle, and what the gate behind each wave says with which numbers.
+
+use super::super::rows::Verdict;
+use super::*;
+
+fn verdicts(rig: &Rig) -> Vec<(Outcome, Code, u32)> {
+    let all = rig.rollout("ro").verdicts;
+    all.iter().map(|v: &Verdict| (v.outcome, v.reason.code, v.attempted)).collect()
+}
+
+#[test]
+fn a_good_bundle_comes_to_all_and_each_verdict_says_what_was_not_proven() {
+    let mut rig = Rig::new(13);
+    rig.start(RolloutSpec { waves: vec![Wave::Count(1), Wave::Count(3), Wave::Rest], ..spec() });
+    rig.until(400, |r| r.phase() == Phase::Completed);
+    rig.ticks(4);
+    let unproven = (Outcome::PromotedUnproven, Code::GateUnproven);
+    let proven = (Outcome::Promoted, Code::GateProven, 13);
+    assert_eq!(verdicts(&rig), [(unproven.0, unproven.1, 1), (unproven.0, unproven.1, 4), proven]);
+    let bounds: Vec<u16> = rig.rollout("ro").verdicts.iter().map(|v| v.robots.upper_bound_permille).collect();
+    assert_eq!(bounds[0], 950, "one clean robot says next to nothing");
+    assert!(bounds.is_sorted_by(|a, b| a > b));
+    assert_eq!(rig.count(Step::Committed), 13);
+    assert!(rig.robots.iter().all(|r| r.version == "2.0.0" && r.kept == "2.0.0"));
+}
+
+#[test]
+fn a_wave_that_proves_nothing_is_asked_about_if_the_spec_says_so() {
+    let mut rig = Rig::new(4);
+    rig.start(RolloutSpec { small_wave: super::super::spec::SmallWave::Review, ..spec() });
+    rig.until(100, |r| r.phase() == Phase::Review);
+    assert_eq!(verdicts(&rig), [(Outcome::Review, Code::GateAsksPerson, 1)]);
+    rig.must("ro", Verb::Promote);
+    rig.until(100, |r| r.phase() == Phase::Review);
+    rig.must("ro", Verb::Promote);
+    rig.until(100, |r| r.phase() == Phase::Completed);
+    let promoted = rig.rollout("ro").verdicts.into_iter().filter(|v| v.outcome == Outcome::PromotedByPerson);
+    assert!(promoted.inspect(|v| assert_eq!(v.actor.as_deref(), Some("ana"))).count() == 2);
+}
+
+#[test]
+fn a_wave_without_work_is_a_persons_to_judge_after_its_time() {
+    let mut rig = Rig::new(4);
+    rig.works = false;
+    rig.start(spec());
+    rig.until(60, |r| r.phase() == Phase::Gate);
+    rig.ticks(30);
+    assert_eq!(rig.phase(), Phase::Gate, "work is waited for");
+    rig.until(60, |r| r.phase() == Phase::Review);
+    assert_eq!(verdicts(&rig), [(Outcome::Review, Code::NoExposure, 1)]);
+}
+
+#[test]
+fn one_failure_among_few_aborts_and_says_how_often_that_happens_to_good_bundles() {
+    let mut rig = Rig::new(6);
+    rig.start(RolloutSpec { waves: vec![Wave::Count(1), Wave::Rest], ..spec() });
+    let n = rig.order()[0];
+    rig.until(60, |r| r.step(n) == Step::Trial);
+    rig.goes_back(n, Some(Code::BreakerOnTrial));
+    rig.tick();
+    assert!(rig.phase().goes_back());
+    assert_eq!(verdicts(&rig), [(Outcome::Aborted, Code::FailureAmongFew, 1)]);
+    assert_eq!(rig.rollout("ro").verdicts[0].robots.false_abort_permille, Some(20));
+    rig.until(60, |r| r.phase() == Phase::Aborted);
+    assert!(rig.ota.quarantines.contains_key(&format!("{}/{}", robot_id(n), bundle_id(2))));
+}
+
+#[test]
+fn a_wave_of_which_all_failed_is_reviewed_and_never_followed_by_the_next() {
+    let mut rig = Rig::new(6);
+    rig.fates(Fate::Probation);
+    rig.start(RolloutSpec { small_wave_failure: super::super::spec::SmallWaveFailure::Review, ..spec() });
+    let n = rig.order()[0];
+    rig.until(60, |r| r.of("ro", n).moments.switched.is_some());
+    rig.goes_back(n, Some(Code::BreakerOnTrial));
+    rig.until(5, |r| r.phase() == Phase::Review);
+    assert_eq!(verdicts(&rig), [(Outcome::Review, Code::GateInconclusive, 1)]);
+    rig.ticks(20);
+    assert_eq!(rig.rollout("ro").wave, 0);
+    assert_eq!(rig.count(Step::Staged), 5);
+}
+
+#[test]
+fn a_canary_that_was_retired_on_trial_proves_nothing() {
+    let mut rig = Rig::new(4);
+    rig.start(RolloutSpec { waves: vec![Wave::Count(1), Wave::Rest], ..spec() });
+    let n = rig.order()[0];
+    rig.until(60, |r| r.step(n) == Step::Trial);
+    rig.retire(n);
+    rig.until(60, |r| r.phase() == Phase::Review);
+    assert_eq!(verdicts(&rig), [(Outcome::Review, Code::GateInconclusive, 1)]);
+}
+
+#[test]
+fn a_robot_that_stays_on_probation_keeps_no_wave_waiting_for_ever() {
+    let mut rig = Rig::new(5);
+    rig.checks_rebuild = false;
+    rig.start(RolloutSpec { waves: vec![Wave::Count(1), Wave::Rest], ..spec() });
+    rig.until(60, |r| r.rollout("ro").wave == 1);
+    let n = rig.order()[1];
+    rig.robots[n].fate = Fate::Probation;
+    rig.ticks(30);
+    assert_eq!(rig.phase(), Phase::Applying);
+    rig.pass(crate::limits::STAGED_WITHIN.as_ms());
+    rig.turn();
+    rig.until(60, |r| r.phase() == Phase::Completed);
+    assert!(rig.of("ro", n).drain_id.is_some(), "it is not given work");
+    assert_eq!(rig.rollout("ro").verdicts.last().expect("one").robots.outcomes.clean, 4);
+}
+
+#[test]
+fn soak_and_exposure_stand_still_while_the_roll_out_does() {
+    let mut rig = Rig::new(4);
+    rig.works = false;
+    rig.start(RolloutSpec { soak_ms: 60_000, ..spec() });
+    rig.until(60, |r| r.phase() == Phase::Soaking);
+    let left = |rig: &Rig| rig.rollout("ro").soak.expect("it soaks").left(rig.ota.served_ms(&rig.now));
+    rig.must("ro", Verb::Pause);
+    let before = left(&rig);
+    rig.ticks(100);
+    assert_eq!(left(&rig), before);
+    rig.must("ro", Verb::Resume);
+    rig.ticks(10);
+    assert_eq!(left(&rig), before - 10_000);
+}
+
+fn fault(code: u32) -> RobotEvent {
+    let fault = Fault { code, class: crate::robot::FaultClass::Recoverable, message: String::new() };
+    RobotEvent::Fault { fault, cleared: false }
+}
+
+#[test]
+fn a_code_of_the_manifest_ends_it_at_once_and_others_do_not() {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    let n = rig.order()[0];
+    rig.until(60, |r| r.step(n) == Step::Trial);
+    rig.say(n, fault(7));
+    rig.tick();
+    assert!(rig.rollout("ro").abort.is_none());
+    rig.say(n, fault(66));
+    rig.ota_turn();
+    let abort = rig.rollout("ro").abort.expect("it ends");
+    assert_eq!((abort.reason.code, abort.hard, abort.robots), (Code::HardStopCode, true, vec![robot_id(n)]));
+}
+
+#[test]
+fn hard_stops_act_also_while_the_roll_out_stands_still() {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    let n = rig.order()[0];
+    rig.until(60, |r| r.step(n) == Step::Trial);
+    rig.must("ro", Verb::Pause);
+    rig.say(n, fault(66));
+    rig.ota_turn();
+    assert!(rig.phase().goes_back());
+}
+
+#[test]
+fn a_stop_counts_within_ten_minutes_of_the_switch_also_in_the_breath_in_which_the_trial_began() {
+    for (later_ms, counts) in [(0, true), (590_000, true), (700_000, false)] {
+        let mut rig = Rig::new(4);
+        rig.checks_rebuild = false;
+        rig.start(RolloutSpec { soak_ms: 3_000_000, ..spec() });
+        let n = rig.order()[0];
+        rig.robots[n].fate = Fate::Probation;
+        rig.until(60, |r| r.of("ro", n).moments.switched.is_some());
+        rig.report(n, UpdateState::Trial);
+        if later_ms > 0 {
+            rig.ota_turn();
+            rig.pass(later_ms);
+        }
+        rig.say(n, RobotEvent::HardwareStop(HardwareStop::Manual));
+        rig.ota_turn();
+        assert_eq!(rig.rollout("ro").abort.is_some(), counts, "{later_ms}");
+    }
+}
+
+#[test]
+fn no_permission_is_given_in_the_breath_in_which_a_hard_stop_is_heard() {
+    let mut rig = Rig::new(6);
+    rig.start(RolloutSpec { waves: vec![Wave::Count(2), Wave::Rest], allow_full_push: true, ..spec() });
+    let (a, b) = (rig.order()[0], rig.order()[1]);
+    rig.robots[b].fate = Fate::NeverReady;
+    rig.until(60, |r| r.step(a) == Step::Trial && r.step(b) == Step::Activating);
+    let drain_id = rig.of("ro", b).drain_id.expect("a drain");
+    let set = crate::ids::SetId::parse("factory").expect("an id");
+    rig.say(b, RobotEvent::Update(UpdateEvent::Ready { drain_id, set }));
+    rig.say(a, fault(66));
+    rig.ota_turn();
+    assert!(rig.phase().goes_back());
+    assert!(!rig.of("ro", b).attempted);
+}
+
+#[test]
+fn the_breaker_on_trial_counts_and_one_of_before_does_not() {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    let n = rig.order()[0];
+    let before = rig.now.utc;
+    rig.until(60, |r| r.step(n) == Step::Trial);
+    rig.control(n, |c| c.breaker = Some(before));
+    rig.tick();
+    assert_eq!(rig.of("ro", n).failure, None);
+    let at = rig.now.utc;
+    rig.control(n, |c| c.breaker = Some(at));
+    rig.ota_turn();
+    assert_eq!(rig.of("ro", n).failure.expect("it failed").code, Code::BreakerOnTrial);
+    assert!(rig.phase().goes_back());
+}
+
+#[test]
+fn a_rate_of_task_failures_is_shown_and_ends_it_only_if_that_was_asked_for() {
+    for acts in [false, true] {
+        let mut rig = Rig::new(8);
+        rig.checks_rebuild = false;
+        rig.works = false;
+        let waves = vec![Wave::Count(3), Wave::Rest];
+        rig.start(RolloutSpec { waves, allow_full_push: true, soak_ms: 3_000_000, acts_on_rates: acts, ..spec() });
+        rig.until(60, |r| r.phase() == Phase::Soaking);
+        for _ in 0..10 {
+            for n in 0..8 {
+                let trial = rig.step(n) == Step::Trial;
+                (0..4).for_each(|_| rig.ends_task(n, !trial));
+                (0..4).for_each(|_| rig.ends_task(n, true));
+            }
+            rig.pass(60_000);
+            rig.ota_turn();
+        }
+        let rollout = rig.rollout("ro");
+        assert_eq!(rollout.tasks.suspicion(), crate::gates::Suspicion::Release);
+        assert_eq!(rollout.abort.map(|a| (a.reason.code, a.hard)), acts.then_some((Code::RateTooHigh, false)));
+    }
+}

@@ -1,0 +1,112 @@
+//! Whom a roll-out reaches, in which wave, and what is refused before it begins.
+
+use super::super::commands::dry_run;
+use super::super::matching;
+use super::*;
+
+fn sizes(rig: &Rig, waves: Vec<Wave>) -> Vec<u32> {
+    let spec = RolloutSpec { waves, allow_full_push: true, ..spec() };
+    let run = dry_run(&rig.ota, &rig.board, &rollout_id("ro"), &spec).expect("it may run");
+    run.matching.sizes(spec.waves.len())
+}
+
+fn refusal(rig: &Rig, spec: &RolloutSpec) -> Code {
+    dry_run(&rig.ota, &rig.board, &rollout_id("ro"), spec).expect_err("it is refused").reason.code
+}
+
+#[test]
+fn waves_take_by_count_percent_label_version_and_rest_each_robot_once() {
+    let mut rig = Rig::new(10);
+    rig.robots[3].version = "0.8.0".into();
+    rig.attach(3, |_| {});
+    rig.tick();
+    let label = Wave::Label { key: "line".into(), value: "even".into() };
+    assert_eq!(sizes(&rig, vec![Wave::Count(1), Wave::Percent(25), Wave::Rest]), [1, 3, 6]);
+    assert_eq!(sizes(&rig, vec![Wave::Version("0.8.0".into()), label, Wave::Rest]), [1, 5, 4]);
+    assert_eq!(sizes(&rig, vec![Wave::Count(20), Wave::Rest]), [10, 0]);
+}
+
+#[test]
+fn the_order_comes_of_both_ids_and_not_of_who_came_first() {
+    let rig = Rig::new(10);
+    let order = |id: &str| {
+        let run = dry_run(&rig.ota, &rig.board, &rollout_id(id), &spec()).expect("it may run");
+        run.matching.robots.iter().map(|r| r.robot_id.clone()).collect::<Vec<_>>()
+    };
+    assert_eq!(order("ro"), order("ro"));
+    assert_ne!(order("ro"), order("other"));
+    let mut by_hash: Vec<RobotId> = (0..10).map(robot_id).collect();
+    by_hash.sort_by_key(|r| matching::place_of(&rollout_id("ro"), r));
+    assert_eq!(order("ro"), by_hash);
+}
+
+#[test]
+fn robots_with_neighbouring_numbers_do_not_stand_side_by_side() {
+    for rollout in ["ro", "base-2.0.0", "x"] {
+        let mut by_place: Vec<usize> = (0..100).collect();
+        by_place.sort_by_key(|n| matching::place_of(&rollout_id(rollout), &robot_id(*n)));
+        let side_by_side = by_place.windows(2).filter(|pair| pair[0].abs_diff(pair[1]) == 1).count();
+        assert!(side_by_side < 10, "{rollout}: {side_by_side} pairs, chance has 2");
+        assert!(by_place[..10].iter().map(|n| n / 10).collect::<BTreeSet<_>>().len() > 3, "{rollout}");
+    }
+}
+
+#[test]
+fn a_full_push_is_refused_also_behind_a_wave_that_takes_nobody() {
+    let rig = Rig::new(20);
+    let with = |waves| RolloutSpec { waves, ..spec() };
+    assert_eq!(refusal(&rig, &with(vec![Wave::Count(3), Wave::Rest])), Code::RolloutFullPush);
+    assert!(dry_run(&rig.ota, &rig.board, &rollout_id("ro"), &with(vec![Wave::Count(2), Wave::Rest])).is_ok());
+    let nobody = Wave::Label { key: "line".into(), value: "none".into() };
+    assert_eq!(refusal(&rig, &with(vec![nobody, Wave::Rest])), Code::RolloutFullPush);
+    let one = RolloutSpec { waves: vec![Wave::Rest], ..spec() };
+    assert_eq!(refusal(&rig, &one), Code::InvalidRequest);
+}
+
+#[test]
+fn a_budget_that_lets_nobody_out_is_told_at_once_and_only_to_whom_it_concerns() {
+    let mut rig = Rig::new(10);
+    rig.attach(0, |i| i.capabilities = vec!["tow".into()]);
+    rig.rules(|s| s.keep_in_work.extend([("lift".into(), 9)]));
+    rig.tick();
+    assert_eq!(refusal(&rig, &spec()), Code::BudgetImpossible);
+    let mut tow = spec();
+    tow.selector.robots.insert(robot_id(0));
+    assert!(dry_run(&rig.ota, &rig.board, &rollout_id("ro"), &tow).is_ok(), "no robot that lifts is reached");
+}
+
+#[test]
+fn who_is_left_out_is_told_with_the_reason() {
+    let mut rig = Rig::new(6);
+    rig.attach(0, |i| i.model = "m9".into());
+    rig.retire(1);
+    rig.ask(&Command::Pin { robot_id: robot_id(2), reason: "trial".into() }).expect("allowed");
+    rig.tick();
+    let run = dry_run(&rig.ota, &rig.board, &rollout_id("ro"), &spec()).expect("it may run");
+    let codes: Vec<(Code, u32)> = run.matching.left_out_by_code().into_iter().collect();
+    let expected = [Code::SkippedIncompatible, Code::SkippedPinned, Code::SkippedRetired];
+    assert_eq!(codes, expected.map(|code| (code, 1)));
+    let mut nobody = spec();
+    nobody.selector.models.insert("m9".into());
+    assert_eq!(refusal(&rig, &nobody), Code::RolloutMatchesNobody);
+}
+
+#[test]
+fn a_second_roll_out_of_the_same_robots_is_refused_or_takes_the_place_of_the_first() {
+    let mut rig = Rig::new(6);
+    rig.start(spec());
+    rig.until(60, |r| r.phase() == Phase::Soaking);
+    let other = RolloutSpec { bundle: bundle_id(3), ..spec() };
+    rig.create("next", other);
+    rig.must("next", Verb::Submit);
+    rig.must("next", Verb::Approve);
+    let refused = rig.verb("next", Verb::Start { supersede: false }).expect_err("it overlaps");
+    assert_eq!(refused.reason.code, Code::RolloutOverlap);
+    rig.must("next", Verb::Start { supersede: true });
+    assert!(rig.phase().goes_back());
+    let begun = |r: &Rig| r.rollout("next").phase == Phase::Applying;
+    rig.until(60, |r| begun(r) || r.phase() == Phase::Superseded);
+    assert!(!begun(&rig), "the older one goes back first");
+    rig.until(300, |r| r.rollout("next").phase == Phase::Completed);
+    assert!(rig.robots.iter().all(|r| r.version == "3.0.0"));
+}
