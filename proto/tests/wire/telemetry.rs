@@ -47,6 +47,7 @@ fn a_robot_shows_how_old_its_report_is_and_the_measured_clock_before_the_remembe
         ring: "ring-a".into(),
         inventory: Inventory::default(),
         applied_work: 0,
+        applied_update: 0,
         places: vec![],
         clock_offset_ms: Some(-3),
         installed: Some(installed()),

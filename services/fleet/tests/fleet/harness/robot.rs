@@ -226,6 +226,7 @@ impl Robot {
             ring: "ring".to_owned(),
             inventory: self.inventory.clone(),
             applied_work: self.applied,
+            applied_update: 0,
             places: self.places.clone(),
             clock_offset_ms: None,
             installed: None,
