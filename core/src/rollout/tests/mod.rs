@@ -201,6 +201,9 @@ impl Rig {
             applied_update: 0,
             places: Vec::new(),
             clock_offset_ms: None,
+            installed: None,
+            device_key: None,
+            device_key_changed: false,
         };
         self.put(row);
     }
