@@ -9,7 +9,7 @@ use super::rows::{
 };
 use super::spec::{RolloutSpec, Wave};
 use super::view::View;
-use super::{Board, Plan, Tx, newcomers, phases, robots, verdict};
+use super::{Board, Plan, Tx, moves, newcomers, phases, robots, verdict};
 use crate::gates::FailureEvidence;
 use crate::ids::{BundleId, RobotId, RolloutId};
 use crate::limits;
@@ -502,7 +502,7 @@ fn verb_one(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor: &str
         Verb::Abort => phases::abort(tx, rollout, why(Code::AbortedByUser), false, None, Some(actor.to_owned())),
         Verb::Exclude(robot_id) => {
             let row = RolloutRobot::id_of(id, robot_id);
-            robots::make(tx, &super::NoSign, board, &row, robots::Move::Skip(why(Code::SkippedExcluded)));
+            moves::make(tx, &super::NoSign, board, &row, robots::Move::Skip(why(Code::SkippedExcluded)));
         }
         Verb::Start { .. } | Verb::RetryFailed => {}
     }

@@ -140,7 +140,8 @@ fn label<'a>(view: &'a View, robot_id: &RobotId, key: &str) -> Option<&'a str> {
     view.sessions.get(robot_id.as_str())?.row.inventory.labels.get(key).map(String::as_str)
 }
 
-fn is_selected(view: &View, robot_id: &RobotId, stratum: &Stratum, spec: &RolloutSpec) -> bool {
+/// Whether a roll-out is for a robot, as far as its selector goes.
+pub fn is_selected(view: &View, robot_id: &RobotId, stratum: &Stratum, spec: &RolloutSpec) -> bool {
     fn any<T: Ord>(named: &BTreeSet<T>, has: Option<&T>) -> bool {
         named.is_empty() || has.is_some_and(|has| named.contains(has))
     }
@@ -191,10 +192,11 @@ pub fn members(view: &View, board: &Board, rollout: &Rollout) -> Members {
     (robots.map(|m| (m.robot_id, m.wave, m.place, m.stratum.from_version)).collect(), sizes)
 }
 
-/// A robot keeps what the roll-out brought.
+/// A robot keeps what the roll-out brought, or is about to: a roll-out is completed before the last of its robots has said so.
 pub fn keeps(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
     let software = view.software.get(r.robot_id.as_str()).map(|s| &s.row);
-    r.step == Step::Committed && software.and_then(|s| s.runs()) == Some(&rollout.spec.bundle)
+    let kept = matches!(r.step, Step::Trial | Step::Committing | Step::Committed);
+    kept && software.and_then(|s| s.runs()) == Some(&rollout.spec.bundle)
 }
 
 /// Whether a robot may have a bundle at all.

@@ -2,7 +2,7 @@
 //!
 //! [`cycle`] takes what happened and gives items to commit; the service around it only reads, signs, commits and publishes.
 //! Rooms: `spec` is what is asked for, `rows` and `view` are what is known; `hear` and `commands` are what happens; `matching` says who, `robots`
-//! brings each further, `phases` the whole, `newcomers` who comes later; `verdict` and `infrastructure` judge; `explain` says what a robot waits for.
+//! says what is due for each and `moves` writes it, `phases` the whole, `newcomers` who comes later; `verdict` and `infrastructure` judge; `explain` says what a robot waits for.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod bugs;
@@ -11,6 +11,7 @@ pub mod explain;
 pub mod hear;
 pub mod infrastructure;
 pub mod matching;
+pub mod moves;
 pub mod newcomers;
 pub mod phases;
 pub mod robots;
@@ -188,13 +189,13 @@ fn plan_all(
                 return true;
             }
             moves += 1;
-            plan.decide(view, now, "ota", |tx| robots::make(tx, sign, board, &id, due));
+            plan.decide(view, now, "ota", |tx| moves::make(tx, sign, board, &id, due));
         }
     }
     for id in open {
         plan.decide(view, now, "ota", |tx| phases::further(tx, board, &id));
     }
-    plan.decide(view, now, "ota", robots::forget_drains);
+    plan.decide(view, now, "ota", moves::forget_drains);
     if view.rollouts.len() > crate::limits::ROLLOUTS_MAX {
         plan.decide(view, now, "ota", phases::forget_oldest);
     }

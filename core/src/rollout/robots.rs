@@ -1,22 +1,22 @@
 //! Brings each robot of a roll-out a step further: fetch, drain, permission, trial, commit, and back.
 //!
-//! [`next`] says what is due and [`make`] writes it, so that the planner and an explanation see the same. Invariants: permission is given only
+//! [`next`] says what is due and [`super::moves`] writes it, so that the planner and an explanation see the same. Invariants: permission is given only
 //! while fleet's record says that this drain holds the robot and the roll-out runs; a drain is released only for one of [`ReleasedBy`]; robots
 //! out of work for a roll-out are counted in its row, in the item that takes one more.
 
-use super::hear::{fail, is_hard, quarantine, report_of};
-use super::rows::{DrainRelease, DrainRequest, Given, Pause, Phase, ReleasedBy, Rollout, RolloutRobot, Step};
+use super::hear::{is_hard, report_of};
+use super::rows::{Given, Pause, Phase, Rollout, RolloutRobot, Step};
 use super::view::View;
-use super::{Board, Order, Sign, Tx, infrastructure, matching, newcomers, verdict};
+use super::{Board, infrastructure, matching, newcomers, verdict};
 use crate::authority::Authority;
 use crate::fleet::heard;
 use crate::fleet::rows::DrainState;
-use crate::ids::{DrainId, RobotId, RolloutId};
+use crate::ids::{RobotId, RolloutId};
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::robot::{Duty, HardwareStop, Presence};
 use crate::time::{Now, Utc};
-use crate::update::{ActivationGrant, DesiredUpdate, Goal, UpdateReport, UpdateState};
+use crate::update::{Goal, UpdateReport, UpdateState};
 
 /// What is due for a robot.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -109,7 +109,7 @@ fn keeps_for_nothing(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
     staged && ours && rollout.phase.goes_back()
 }
 
-fn is_heard(board: &Board, now: &Now, robot_id: &RobotId) -> bool {
+pub(super) fn is_heard(board: &Board, now: &Now, robot_id: &RobotId) -> bool {
     heard::presence(board, robot_id, now) != Presence::Offline
 }
 
@@ -392,7 +392,7 @@ fn may_grant(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> bool {
     (held || view.bugs.any_drain_will_do()) && heard
 }
 
-fn anchor(view: &View, board: &Board, robot_id: &RobotId) -> Option<Authority> {
+pub(super) fn anchor(view: &View, board: &Board, robot_id: &RobotId) -> Option<Authority> {
     let live = board.get(robot_id)?;
     let session = view.sessions.get(robot_id.as_str())?;
     let (session_epoch, hb) = (live.report.session_epoch, live.report.hb);
@@ -443,7 +443,7 @@ fn is_lost(r: &RolloutRobot) -> bool {
 }
 
 /// The gate of its wave has not closed.
-fn is_open_to(rollout: &Rollout, r: &RolloutRobot) -> bool {
+pub(super) fn is_open_to(rollout: &Rollout, r: &RolloutRobot) -> bool {
     r.wave >= rollout.promoted
 }
 
@@ -513,10 +513,12 @@ fn reverting(view: &View, board: &Board, r: &RolloutRobot, report: Option<&Updat
     if let Some(over) = ended(r, report) {
         return Some(over);
     }
-    if wants(view, r, Goal::Revert) {
+    let Some(drain_id) = &r.drain_id else { return Some(Move::Revert) };
+    // In this drain: in another it was told to go back from something else.
+    let told = view.desired.get(r.robot_id.as_str()).and_then(|d| d.row.drain_id.as_ref());
+    if wants(view, r, Goal::Revert) && told == Some(drain_id) {
         return None;
     }
-    let Some(drain_id) = &r.drain_id else { return Some(Move::Revert) };
     // A robot that its own safety system stopped goes back where it stands: to park would be motion.
     let stopped = board.get(&r.robot_id).is_some_and(|live| live.report.hardware_stop != HardwareStop::None);
     if stopped || view.is_held(&r.robot_id, drain_id) {
@@ -527,264 +529,6 @@ fn reverting(view: &View, board: &Board, r: &RolloutRobot, report: Option<&Updat
 }
 
 /// Whether the robot was told so already.
-fn wants(view: &View, r: &RolloutRobot, goal: Goal) -> bool {
+pub(super) fn wants(view: &View, r: &RolloutRobot, goal: Goal) -> bool {
     view.desired.get(r.robot_id.as_str()).is_some_and(|d| d.row.goal == goal)
-}
-
-/// Writes what is due.
-pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
-    let Some(mut r) = tx.view.robots.get(id).map(|r| r.row.clone()) else { return };
-    let Some(rollout) = tx.view.rollout(&r.rollout_id).cloned() else { return };
-    match due {
-        Move::Stage | Move::SignAnew => stage(tx, sign, &rollout, r),
-        Move::IsStaged => step(tx, r, Step::Staged, "robot.staged"),
-        Move::Skip(why) => {
-            r.why = Some(why);
-            if r.again || !is_retried(&r) {
-                drop_bundle(tx, &r);
-            }
-            let released_by = match tx.view.duty(&r.robot_id) {
-                Duty::Retired => ReleasedBy::Retired,
-                // It said that it never will.
-                _ if r.grant.is_some() => ReleasedBy::Reported,
-                _ => ReleasedBy::NoGrant,
-            };
-            leave_drain(tx, &mut r, released_by);
-            step(tx, r, Step::Skipped, "robot.skipped");
-        }
-        Move::Again => {
-            // If no wave was judged the waves begin anew, and each robot keeps its own.
-            r.wave = if rollout.wave < rollout.spec.waves.len() as u32 { r.wave } else { rollout.wave };
-            (r.again, r.why, r.ready) = (true, None, false);
-            step(tx, r, Step::Waiting, "robot.tried_again");
-        }
-        Move::Forget => drop_bundle(tx, &r),
-        Move::AskDrain => {
-            r.moments.asked = Some(tx.now.utc);
-            ask_drain(tx, &rollout, &mut r, false);
-            step(tx, r, Step::Draining, "robot.drain_asked");
-        }
-        Move::Held => {
-            r.moments.draining = r.drain_id.as_ref().and_then(|id| tx.view.drain(id)).map(|d| d.since);
-            (r.moments.held, r.moments.held_wall) = (Some(tx.now.utc), Some(tx.now.wall));
-            (r.ready, r.grant) = (false, None);
-            if rollout.revert_of.is_none() {
-                let drain_id = r.drain_id.clone();
-                desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Activate, drain_id, None));
-            }
-            step(tx, r, Step::Activating, "robot.held");
-        }
-        Move::Grant => grant(tx, board, &rollout, r),
-        Move::NotUsed => {
-            desire(tx, &r.robot_id, |d| d.grant = None);
-            (r.grant, r.ready) = (None, false);
-            r.moments.granted_wall = None;
-            // It never ran the bundle, so the bundle has not lost it.
-            r.failure = r.failure.filter(|f| f.code != Code::RobotLost);
-            tx.put(r, "robot.grant_not_used");
-        }
-        Move::LeaveDrain(to) => {
-            if to == Step::Staged {
-                desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Stage, None, None));
-            }
-            leave_drain(tx, &mut r, ReleasedBy::NoGrant);
-            step(tx, r, to, "robot.drain_left");
-        }
-        Move::Switched => {
-            (r.moments.switched, r.moments.switched_wall) = (Some(tx.now.utc), Some(tx.now.wall));
-            // It runs, whatever the rows know of a permission: a store that was restored has forgotten some.
-            r.attempted = true;
-            tx.put(r, "robot.switched");
-        }
-        Move::OnTrial => {
-            r.moments.switched.get_or_insert(tx.now.utc);
-            r.moments.switched_wall.get_or_insert(tx.now.wall);
-            r.moments.on_trial = Some(tx.now.utc);
-            r.before = verdict::work_of(tx.view, &rollout, &r.robot_id);
-            if is_open_to(&rollout, &r) {
-                r.failure = r.failure.filter(|f| f.code != Code::RobotLost);
-            }
-            r.attempted = true;
-            leave_drain(tx, &mut r, ReleasedBy::Reported);
-            step(tx, r, Step::Trial, "robot.on_trial");
-        }
-        Move::Fail(why) => fail(tx, &r, why),
-        Move::Found => tx.put(RolloutRobot { failure: None, ..r }, "robot.found"),
-        Move::Commit => {
-            desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Commit, None, None));
-            step(tx, r, Step::Committing, "robot.committing");
-        }
-        Move::Committed => step(tx, r, Step::Committed, "robot.committed"),
-        Move::Revert => {
-            let hard = rollout.abort.as_ref().is_some_and(|a| a.hard) || r.failure.is_some();
-            // A robot that is not heard goes back before it works again.
-            let urgent = hard || !is_heard(board, &tx.now, &r.robot_id);
-            r.attempted |= rollout.revert_of.is_some();
-            if r.drain_id.is_none() {
-                ask_drain(tx, &rollout, &mut r, urgent);
-            }
-            step(tx, r, Step::Reverting, "robot.reverting");
-        }
-        Move::GoBack => {
-            let drain_id = r.drain_id.clone();
-            desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Revert, drain_id, None));
-            step(tx, r, Step::Reverting, "robot.going_back");
-        }
-        Move::RolledBack(why) => rolled_back(tx, &rollout, r, why),
-        Move::Stuck(why) => {
-            let reason = Reason::new(Code::RollbackFailed, why.text()).with("because", why.code);
-            super::incident(tx, Some(&r.robot_id), &reason);
-            r.failure = Some(reason);
-            r.attempted = true;
-            newcomers::failed(tx, &rollout, &r);
-            step(tx, r, Step::Stuck, "robot.stuck");
-        }
-    }
-}
-
-fn step(tx: &mut Tx, r: RolloutRobot, to: Step, kind: &'static str) {
-    let since = if r.step == to { r.since } else { tx.now.utc };
-    tx.put(RolloutRobot { step: to, since, ..r }, kind);
-}
-
-fn rolled_back(tx: &mut Tx, rollout: &Rollout, mut r: RolloutRobot, why: Reason) {
-    let asked = r.step == Step::Reverting || wants(tx.view, &r, Goal::Revert);
-    if !asked {
-        // It went back by itself: that is what gates count.
-        let because = if is_hard(&why) {
-            why.clone()
-        } else {
-            Reason::new(Code::RobotWentBack, why.text()).with("because", why.code)
-        };
-        let lost = r.failure.as_ref().is_some_and(|f| f.code == Code::RobotLost);
-        if r.failure.is_none() || lost {
-            r.failure = Some(because);
-        }
-    }
-    if let Some(failure) = r.failure.clone() {
-        quarantine(tx, &r, &failure);
-        newcomers::failed(tx, rollout, &r);
-    }
-    let back = if asked && r.failure.is_none() { Code::RevertAsked.into() } else { why };
-    r.why = Some(rollout.abort.as_ref().map_or(back, |a| a.reason.clone()));
-    leave_drain(tx, &mut r, ReleasedBy::Reported);
-    step(tx, r, Step::RolledBack, "robot.rolled_back");
-}
-
-fn stage(tx: &mut Tx, sign: &dyn Sign, rollout: &Rollout, mut r: RolloutRobot) {
-    let Some(bundle) = tx.view.bundles.get(rollout.spec.bundle.as_str()).map(|b| b.row.clone()) else { return };
-    let generation = next_generation(tx.view, &r.robot_id, &tx.now);
-    let order = Order {
-        robot_id: &r.robot_id,
-        generation,
-        bundle: &bundle.bundle,
-        manifest_length: bundle.manifest_length,
-        rollout_id: &rollout.rollout_id,
-        issued_at: tx.now.wall,
-    };
-    let row = DesiredUpdate {
-        robot_id: r.robot_id.clone(),
-        generation,
-        goal: Goal::Stage,
-        directive: sign.directive(&order),
-        drain_id: None,
-        grant: None,
-        rate_bytes_s: rollout.spec.rate_bytes_s,
-        probation_ms: rollout.spec.probation_ms,
-    };
-    tx.put(row, "update.desired");
-    if r.step == Step::Waiting {
-        r.directive = generation;
-    }
-    r.signed = tx.now.wall;
-    step(tx, r, Step::Staging, "robot.staging");
-}
-
-fn next_generation(view: &View, robot_id: &RobotId, now: &Now) -> u64 {
-    let last = view.desired.get(robot_id.as_str()).map_or(0, |d| d.row.generation);
-    let reported = view.sessions.get(robot_id.as_str()).map_or(0, |s| s.row.applied_update);
-    (last.max(reported) + 1).max(now.wall.0.max(0) as u64)
-}
-
-/// Changes what a robot should run, if it was told anything and this is news.
-fn desire(tx: &mut Tx, robot_id: &RobotId, change: impl FnOnce(&mut DesiredUpdate)) {
-    let Some(old) = tx.view.desired.get(robot_id.as_str()).map(|d| d.row.clone()) else { return };
-    let mut new = old.clone();
-    change(&mut new);
-    if new != old {
-        new.generation = next_generation(tx.view, robot_id, &tx.now);
-        tx.put(new, "update.desired");
-    }
-}
-
-/// A robot that has the bundle and never ran it forgets it.
-fn drop_bundle(tx: &mut Tx, r: &RolloutRobot) {
-    if r.directive > 0 && !r.attempted {
-        desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Revert, None, None));
-    }
-}
-
-/// Rising, and never used again also after the store was restored.
-fn number(tx: &mut Tx) -> u64 {
-    let clock = tx.view.clocks.get("ota").map(|c| c.row).unwrap_or_default();
-    let number = (clock.number + 1).max(tx.now.wall.0.max(0) as u64);
-    tx.put(super::rows::OtaClock { number, ..clock }, "ota.numbered");
-    number
-}
-
-fn ask_drain(tx: &mut Tx, rollout: &Rollout, r: &mut RolloutRobot, urgent: bool) {
-    let Ok(drain_id) = DrainId::parse(&format!("ota:{}", number(tx))) else { return };
-    let goal = if rollout.phase.goes_back() || rollout.revert_of.is_some() { "goes back from" } else { "changes to" };
-    let label = tx.view.bundles.get(rollout.spec.bundle.as_str()).map(|b| b.row.label()).unwrap_or_default();
-    let request = DrainRequest {
-        drain_id: drain_id.clone(),
-        robot_id: r.robot_id.clone(),
-        rollout_id: r.rollout_id.clone(),
-        reason: format!("{goal} {label}"),
-        within_ms: rollout.spec.drain_within_ms,
-        urgent,
-    };
-    tx.put(request, "drain.requested");
-    r.drain_id = Some(drain_id);
-    (r.ready, r.grant) = (false, None);
-    count(tx, &r.rollout_id, 1);
-}
-
-fn leave_drain(tx: &mut Tx, r: &mut RolloutRobot, why: ReleasedBy) {
-    let Some(drain_id) = r.drain_id.take() else { return };
-    (r.ready, r.grant) = (false, None);
-    tx.put(DrainRelease { drain_id, why }, "drain.release");
-    count(tx, &r.rollout_id, -1);
-}
-
-/// One more or less is out of work for a roll-out: the row that two planners fight over.
-fn count(tx: &mut Tx, rollout_id: &RolloutId, by: i32) {
-    let Some(rollout) = tx.view.rollout(rollout_id).cloned() else { return };
-    let in_flight = rollout.in_flight.saturating_add_signed(by);
-    tx.put(Rollout { in_flight, ..rollout }, "rollout.in_flight");
-}
-
-fn grant(tx: &mut Tx, board: &Board, rollout: &Rollout, mut r: RolloutRobot) {
-    let (Some(drain_id), Some(authority)) = (r.drain_id.clone(), anchor(tx.view, board, &r.robot_id)) else { return };
-    // Fleet's record must still say so when this is written.
-    tx.rely::<crate::fleet::rows::RobotAuthority>(r.robot_id.as_str());
-    tx.rely::<Rollout>(rollout.rollout_id.as_str());
-    let grant_id = number(tx);
-    let given = ActivationGrant { grant_id, drain_id, authority };
-    desire(tx, &r.robot_id, |d| d.grant = Some(given));
-    r.grant = Some(Given { grant_id, authority, generation: rollout.generation });
-    r.moments.granted_wall = Some(tx.now.wall);
-    r.attempted = true;
-    tx.put(r, "robot.granted");
-}
-
-/// Takes requests away that fleet has nothing left to do for.
-pub fn forget_drains(tx: &mut Tx) {
-    let over = tx.view.releases.values().map(|r| r.row.drain_id.clone());
-    let over: Vec<DrainId> = over.filter(|id| tx.view.drain(id).is_none()).take(limits::ITEM_ROWS_MAX / 4).collect();
-    for drain_id in over {
-        tx.rely::<crate::fleet::rows::Drain>(drain_id.as_str());
-        tx.delete::<DrainRequest>(drain_id.as_str(), "drain.forgotten");
-        tx.delete::<DrainRelease>(drain_id.as_str(), "drain.forgotten");
-    }
 }

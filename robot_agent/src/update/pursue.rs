@@ -236,7 +236,7 @@ impl AgentCore {
             return Some(ExitReason::Switched);
         }
         // A newer bundle comes before a migration that fails.
-        if self.begin_update(now) || (!is_stuck && self.migrate(holdings)) {
+        if self.begin_way_back(now, holdings) || self.begin_update(now) || (!is_stuck && self.migrate(holdings)) {
             return None;
         }
         if !self.update.collected {
@@ -274,6 +274,49 @@ impl AgentCore {
                 false
             }
         }
+    }
+
+    /// Looks at a directive that leads back from the committed set though something else was tried and left since. True: it was taken.
+    fn begin_way_back(&mut self, now: &Now, holdings: &Holdings) -> bool {
+        let Some(desired) = self.update.desired.clone().filter(|d| d.goal == Goal::Revert) else { return false };
+        if self.is_observed() || self.names(&desired) || holdings.switch.kept().is_none() {
+            return false;
+        }
+        let software = self.kept.ledger.software.clone();
+        let opened = self.trusted().and_then(|trusted| {
+            let opened = self.opened(&desired, software.directive, trusted.now(self.reading(now)));
+            opened.map_err(|rejection| Reason::new(Code::DirectiveRefused, rejection.to_string()))
+        });
+        let directive = match opened {
+            Ok(directive) => directive,
+            Err(reason) => {
+                self.refuse_directive(reason);
+                return false;
+            }
+        };
+        let set = holdings.set(&holdings.switch.current).filter(|set| set.bundle == Some(directive.manifest));
+        let Some(set) = set else {
+            self.refuse_directive(Reason::new(Code::DirectiveRefused, "another bundle is the committed one"));
+            return false;
+        };
+        self.update.judged = Some(desired.directive);
+        let is_irreversible = set.components.values().any(|c| c.data_migration == Migration::Irreversible);
+        let update = Update {
+            state: UpdateState::Committed,
+            bundle: directive.manifest,
+            manifest_length: directive.manifest_length,
+            rollback_floor: directive.rollback_floor,
+            set: Some(set),
+            raises_floor: false,
+            is_irreversible,
+            drain_id: desired.drain_id,
+            tries: 0,
+            probation_ms: desired.probation_ms,
+            reason: None,
+        };
+        self.put_software(SoftwareRow { directive: directive.generation, update: None, ..software });
+        self.put_update(update);
+        true
     }
 
     fn reading(&self, now: &Now) -> Reading {
@@ -465,10 +508,10 @@ impl AgentCore {
 
     /// The server wants the update no more, before it ran.
     fn is_dropped(&self) -> bool {
-        self.update.desired.as_ref().is_some_and(|d| d.goal == Goal::Revert && self.names(d))
+        self.update.desired.as_ref().is_some_and(|d| d.goal == Goal::Revert && self.is_the_newest(d))
     }
 
-    /// Whether the section speaks of the update on the ledger: its directive is the one that was taken last.
+    /// Whether the section's directive needs no look: it was looked at, or is the one that was taken last.
     fn names(&self, desired: &DesiredUpdate) -> bool {
         self.update.judged.as_ref() == Some(&desired.directive) || self.is_the_newest(desired)
     }
@@ -652,7 +695,7 @@ impl AgentCore {
         if self.wants_back(&update) {
             return self.go_back(update, Reason::from(Code::RevertAsked));
         }
-        let commit = self.update.desired.as_ref().is_some_and(|d| d.goal == Goal::Commit && self.names(d));
+        let commit = self.update.desired.as_ref().is_some_and(|d| d.goal == Goal::Commit && self.is_the_newest(d));
         if commit {
             return self.put_update(Update { state: UpdateState::Committing, ..update });
         }
@@ -682,7 +725,8 @@ impl AgentCore {
 
     /// The server wants this update gone. A robot that stands goes back also while it is stopped or has a task.
     fn wants_back(&self, update: &Update) -> bool {
-        let wanted = self.update.desired.as_ref().is_some_and(|d| d.goal == Goal::Revert && self.names(d));
+        // Not what was only looked at and refused: that is about another bundle.
+        let wanted = self.update.desired.as_ref().is_some_and(|d| d.goal == Goal::Revert && self.is_the_newest(d));
         wanted && !(update.state == UpdateState::Committed && update.is_irreversible)
     }
 

@@ -502,6 +502,45 @@ fn a_committed_set_is_reverted_to_the_one_before_it_unless_its_data_cannot_go_ba
 }
 
 #[test]
+fn a_committed_set_is_left_by_a_directive_of_its_own_after_something_else_was_tried_and_left() {
+    let (rig, releases) = connected();
+    let (first, second) = (releases.release("1.1.0"), releases.release("1.2.0"));
+    let rig = committed(rig, &releases, &first, 1);
+    let kept = name_of(&rig);
+    let (mut rig, mut order) = on_trial(rig, &releases, &second, 2);
+    want(&mut rig, order.to(Goal::Revert));
+    let mut rig = relaunch(rig);
+    assert_eq!((state(&rig), switch(&rig).running()), (Some(UpdateState::RolledBack), kept.as_str()));
+    let mut order = Order::new(releases.directive(&first, 3));
+    order.generation = 100_000;
+    want(&mut rig, order.to(Goal::Revert));
+    let rig = relaunch(rig);
+    assert_eq!((state(&rig), switch(&rig).running()), (Some(UpdateState::RolledBack), "factory"));
+    let told = report(&rig).map(|r| (r.bundle.to_string(), r.directive));
+    assert_eq!(told, Some((first.digest.to_string(), 3)));
+}
+
+#[test]
+fn a_directive_that_was_refused_or_is_about_another_bundle_leads_nobody_back_from_a_good_set() {
+    let (rig, releases) = connected();
+    let (first, second) = (releases.release("1.1.0"), releases.release("1.2.0"));
+    let mut rig = committed(rig, &releases, &first, 1);
+    let kept = name_of(&rig);
+    let stranger = Releases::new().release("6.6.6");
+    let mut order = Order::new(releases.directive(&stranger, 2));
+    order.generation = 100_000;
+    want(&mut rig, order.to(Goal::Stage));
+    assert_eq!(refused(&rig).len(), 1);
+    want(&mut rig, order.to(Goal::Revert));
+    let mut order = Order::new(releases.directive(&second, 3));
+    order.generation = 200_000;
+    want(&mut rig, order.to(Goal::Revert));
+    rig.pass(5_000);
+    assert_eq!((state(&rig), rig.exit), (Some(UpdateState::Committed), None));
+    assert_eq!((switch(&rig).running(), switch(&rig).kept()), (kept.as_str(), Some("factory")));
+}
+
+#[test]
 fn a_floor_rises_with_a_commit_never_above_what_is_kept_and_never_on_trial() {
     let (rig, releases) = connected();
     let indexed = |version: &str, index: u64| releases.release_as(version, |m| m.components[0].rollback_index = index);

@@ -120,11 +120,6 @@ impl Changes {
     pub fn record(&self, robot_id: &RobotId) -> Option<&Switch> {
         self.robots.get(robot_id).map(|robot| &robot.switch)
     }
-    /// Robots that ever activated this roll-out and nothing since.
-    pub fn touched(&self, id: &str) -> Vec<RobotId> {
-        let of = |robot: &Robot| robot.touched.as_ref().is_some_and(|(rollout, _)| rollout.as_str() == id);
-        self.robots.iter().filter(|(_, robot)| of(robot)).map(|(robot_id, _)| robot_id.clone()).collect()
-    }
 
     // --- rows that order and permit
 

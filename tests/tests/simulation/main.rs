@@ -28,7 +28,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 
 /// Seeds of a plain run. Each has a process of its own, so that nothing of one run reaches another.
-const SEEDS: u64 = 200;
+const SEEDS: u64 = 120;
 /// Runs with so many seeds or more must have met every fault and looked at every law; a few seeds cannot.
 const ENOUGH: u64 = 40;
 /// What must have been hit, each by evidence and not by plan.

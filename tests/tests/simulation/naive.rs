@@ -117,7 +117,11 @@ fn an_area_whose_budget_is_forgotten_spares_too_many() {
 #[test]
 fn a_limit_of_the_wave_that_is_forgotten_changes_too_many() {
     let law = "I17 no more change than the wave has";
-    breaks(65, 10, rollouts(Rollouts::InFlightIsForgotten), law, |scene| {
+    // All robots are of one area, whose budget would hold them back.
+    let fleet = FleetBugs::of(&[Fleet::BudgetIsForgotten]);
+    let rollouts = RolloutBugs::of(&[Rollouts::InFlightIsForgotten]);
+    let naive = Naive { server: Server { fleet, rollouts, ..Server::default() }, ..Naive::default() };
+    breaks(65, 10, naive, law, |scene| {
         scene.begin("r", GOOD[0], |spec| {
             at_once(spec);
             spec.max_in_flight = Some(1);

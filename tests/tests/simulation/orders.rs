@@ -3,8 +3,8 @@
 //! Invariant: asked twice it does the same once; "not now" is an answer like any other.
 
 use crate::net;
+use midshift_proto::fleet::v1::DrainRobotRequest;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
-use midshift_proto::fleet::v1::{DrainRobotRequest, UndrainRobotRequest};
 use midshift_proto::ota::v1 as ota;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::task::v1::ResumeHeldRequest;
@@ -47,8 +47,6 @@ pub enum Order {
     Unpin(String),
     /// A person takes a robot out of work.
     Drain(String),
-    /// And gives it back.
-    Undrain(String),
     /// A person lets a robot go on that its own safety system had stopped.
     LetGo {
         /// Whom.
@@ -132,10 +130,6 @@ async fn ask(order: &Order) -> Result<(), Status> {
         Order::Drain(robot_id) => {
             let request = DrainRobotRequest { robot_id, reason: "to look at it".to_owned(), ..Default::default() };
             FleetServiceClient::new(channel).drain_robot(request).await.map(drop)
-        }
-        Order::Undrain(robot_id) => {
-            let request = UndrainRobotRequest { robot_id, ..Default::default() };
-            FleetServiceClient::new(channel).undrain_robot(request).await.map(drop)
         }
         Order::LetGo { robot_id, request_id } => {
             let request = ResumeHeldRequest {

@@ -63,6 +63,8 @@ pub struct RoomConfig {
     pub naive: Naive,
     /// Planners of roll-outs on the one store; two race.
     pub planners: usize,
+    /// Text of the site.
+    pub site: String,
 }
 
 /// The room.
@@ -110,7 +112,7 @@ impl Room {
             .tcp_capacity(4_096)
             .enable_random_order()
             .build();
-        let (time, site) = (TrueTime::default(), site()?);
+        let (time, site) = (TrueTime::default(), Arc::new(text::parse(&config.site)?));
         let clock = MachineClock::boot(&time, Skew::default());
         let store_id = StoreId(Arc::from(format!("store-{}", config.seed)));
         let store = Arc::new(MemoryStore::new(site.site_id().clone(), store_id, clock.clone()));
@@ -246,11 +248,11 @@ fn serve(
     wire: &Wire,
     software: &Arc<Software>,
 ) {
-    let (naive, planners) = (config.naive, config.planners);
+    let (naive, planners, site_text) = (config.naive, config.planners, config.site.clone());
     let (time, site, wire, software) = (time.clone(), site.clone(), wire.clone(), software.clone());
     sim.host(SERVER, move || {
         let (time, site, disk, frames) = (time.clone(), site.clone(), disk.clone(), frames.clone());
-        let (wire, software) = (wire.clone(), software.clone());
+        let (wire, software, site_text) = (wire.clone(), software.clone(), site_text.clone());
         async move {
             loop {
                 let clock = MachineClock::boot(&time, Skew::default());
@@ -259,7 +261,7 @@ fn serve(
                     store: disk.clone(),
                     frames: frames.clone(),
                     site: site.clone(),
-                    site_text: DEMO.to_owned(),
+                    site_text: site_text.clone(),
                     clock,
                     ota,
                     sim: None,

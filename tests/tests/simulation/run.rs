@@ -7,6 +7,7 @@ use crate::net::{SERVER, Way};
 use crate::orders::Order;
 use crate::plan::{Deed, Fault, Plan, ROBOTS};
 use crate::room::{CLIENT, Naive, Room, RoomConfig, site};
+use midshift_core::site::DEMO;
 use midshift_core::task::machine::Phase;
 use midshift_proto::ota::v1::rollout_wave::Size;
 use midshift_proto::ota::v1::{RolloutSelector, RolloutSpec, RolloutWave};
@@ -85,6 +86,7 @@ impl Shift {
             faults,
             naive,
             planners: 1,
+            site: DEMO.to_owned(),
         };
         Ok(Self {
             room: Room::open(&config)?,
