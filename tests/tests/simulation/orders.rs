@@ -88,7 +88,7 @@ macro_rules! verb {
     ($client:ident, $method:ident, $request:ident, $id:expr) => {{
         let rollout_id: String = $id;
         let etag = seen(&mut $client, &rollout_id).await?.etag;
-        let request = ota::$request { rollout_id, etag, reason: "drawn".to_owned(), ..Default::default() };
+        let request = ota::$request { rollout_id, etag, reason: "drawn".to_owned() };
         $client.$method(request).await.map(drop)
     }};
 }
@@ -105,8 +105,7 @@ async fn ask(order: &Order) -> Result<(), Status> {
             start(&mut client, id, supersede).await
         }
         Order::Rollback { of, id } => {
-            let request =
-                ota::RollBackRolloutRequest { rollout_id: of, new_rollout_id: id.clone(), ..Default::default() };
+            let request = ota::RollBackRolloutRequest { rollout_id: of, new_rollout_id: id.clone() };
             client.roll_back_rollout(request).await?;
             verb!(client, submit_rollout, SubmitRolloutRequest, id.clone())?;
             verb!(client, approve_rollout, ApproveRolloutRequest, id.clone())?;
@@ -124,9 +123,7 @@ async fn ask(order: &Order) -> Result<(), Status> {
         Order::Pin(robot_id) => {
             client.pin_robot(ota::PinRobotRequest { robot_id, reason: "drawn".to_owned() }).await.map(drop)
         }
-        Order::Unpin(robot_id) => {
-            client.unpin_robot(ota::UnpinRobotRequest { robot_id, ..Default::default() }).await.map(drop)
-        }
+        Order::Unpin(robot_id) => client.unpin_robot(ota::UnpinRobotRequest { robot_id }).await.map(drop),
         Order::Drain(robot_id) => {
             let request = DrainRobotRequest { robot_id, reason: "to look at it".to_owned(), ..Default::default() };
             FleetServiceClient::new(channel).drain_robot(request).await.map(drop)
