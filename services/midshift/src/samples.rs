@@ -61,8 +61,8 @@ pub const SAMPLES: [Sample; 5] = [
     },
     Sample {
         version: "1.6.2-bad-with-load",
-        description: "Bad on purpose: obstacles and jams, a hundred times as many, while it carries something.",
-        behaviour: "faults_only_with_load = true\nfault_rate_permille = 100000\n",
+        description: "Bad on purpose: obstacles and jams, a thousand times as many, while it carries something.",
+        behaviour: "faults_only_with_load = true\nfault_rate_permille = 1000000\n",
     },
 ];
 

@@ -238,6 +238,7 @@ impl Room {
     }
 }
 
+#[expect(clippy::too_many_arguments, reason = "everything that a server stands on in this room, once")]
 fn serve(
     sim: &mut turmoil::Sim<'static>,
     time: &TrueTime,

@@ -253,7 +253,7 @@ impl Shift {
             let down = now.iter().any(|f| matches!(f, Fault::AgentCrash { robot: r, .. } if *r == robot));
             if down != self.agents_down[robot] {
                 self.agents_down[robot] = down;
-                let power = now.iter().any(|f| *f == Fault::AgentCrash { robot, power: true });
+                let power = now.contains(&Fault::AgentCrash { robot, power: true });
                 if down { self.room.crash_agent(robot, power) } else { self.room.restart_agent(robot) }
             }
         }
