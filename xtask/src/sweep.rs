@@ -15,7 +15,7 @@ use std::process::Command;
 pub enum Sweep {
     /// Servers and agents killed at work.
     Kills,
-    /// Shifts of the deterministic simulation.
+    /// Shifts of the deterministic simulation, with roll-outs of software.
     Simulation,
     /// The power goes at each call of an update that changes the disk: all of them, whatever the seeds.
     Updates,

@@ -276,6 +276,9 @@ impl Changes {
         let robot = self.robot(robot_id);
         let before = std::mem::replace(&mut robot.switch, switch.clone());
         robot.runs = set.and_then(|set| set.bundle);
+        // It was back already, and what it was back on is gone back from in its turn.
+        let undone = before.current != switch.current && before.previous.as_ref() == Some(&switch.current);
+        robot.touched.take_if(|(_, kept)| undone && *kept == before.current);
         let robot = &self.robots[robot_id];
         let mut looks = vec![(
             "I15 the kept set is the one committed last",
