@@ -1,7 +1,7 @@
 //! Brings each robot of a roll-out a step further: fetch, drain, permission, trial, commit, and back.
 //!
 //! [`next`] says what is due and [`super::moves`] writes it, so that the planner and an explanation see the same. Invariants: permission is given only
-//! while fleet's record says that this drain holds the robot and the roll-out runs; a drain is released only for one of [`ReleasedBy`]; robots
+//! while fleet's record says that this drain holds the robot and the roll-out runs; a drain is released only for one of [`super::rows::ReleasedBy`]; robots
 //! out of work for a roll-out are counted in its row, in the item that takes one more.
 
 use super::hear::{is_hard, report_of};
