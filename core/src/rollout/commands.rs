@@ -262,11 +262,10 @@ pub fn check(view: &View, board: &Board, command: &Command, seen: Option<Revisio
         Command::Do { rollout_id, verb, .. } => {
             let rowed = view.rollouts.get(rollout_id.as_str());
             let rowed = rowed.ok_or_else(|| not_found(Code::RolloutNotFound, "rollout_id", rollout_id))?;
-            if seen.is_some_and(|seen| seen != rowed.revision) {
-                return Err(Refusal::new(
-                    Kind::Conflict,
-                    Reason::from(Code::EtagMismatch).with("etag", rowed.revision.0),
-                ));
+            let current = Revision(rowed.row.version);
+            if seen.is_some_and(|seen| seen != current) {
+                let reason = Reason::from(Code::EtagMismatch).with("etag", current.0);
+                return Err(Refusal::new(Kind::Conflict, reason));
             }
             verb_fits(view, board, &rowed.row, verb)
         }
@@ -448,6 +447,7 @@ fn draft(tx: &Tx, rollout_id: &RolloutId, spec: Arc<RolloutSpec>, actor: &str) -
         phase: Phase::Draft,
         wave: 0,
         pauses: BTreeSet::new(),
+        version: 1,
         generation: 1,
         in_flight: 0,
         soak: None,

@@ -48,7 +48,7 @@ pub fn further(tx: &mut Tx, board: &Board, id: &RolloutId) {
 
 /// Comes to a phase.
 pub fn enter(tx: &mut Tx, rollout: Rollout, phase: Phase, kind: &'static str) {
-    tx.put(Rollout { phase, since: tx.now.utc, ..rollout }, kind);
+    tx.put(Rollout { phase, since: tx.now.utc, version: rollout.version + 1, ..rollout }, kind);
 }
 
 /// Sets and lifts the pauses that nobody has to ask for. A bundle that a later release lists again may go on.
@@ -70,6 +70,7 @@ pub fn set_pauses(tx: &mut Tx, mut rollout: Rollout, pauses: std::collections::B
         *countdown = countdown.map(|c| c.set_running(served, runs));
     }
     rollout.generation += 1;
+    rollout.version += 1;
     rollout.pauses = pauses;
     rollout.resumed = runs.then_some(tx.now.utc).or(rollout.resumed);
     tx.put(rollout, kind);

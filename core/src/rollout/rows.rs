@@ -272,6 +272,9 @@ pub struct Rollout {
     pub wave: u32,
     /// Why it stands still.
     pub pauses: BTreeSet<Pause>,
+    /// Rises with each change of phase, wave or pauses: what people must have seen to judge it. Robots that come and go do not change it.
+    #[serde(default)]
+    pub version: u64,
     /// Rises with each pause, resume and abort: permissions of an older one are not given any more.
     pub generation: u64,
     /// Robots that are out of work for it: drains that were not released.

@@ -586,7 +586,7 @@ impl AgentCore {
             () if self.config.bugs.activates_anyway() => Ok(()),
             () if self.work.is_some() => no("attempt"),
             () if self.body.load().is_some() => no("load"),
-            () if self.is_in_passage(now) => no("passage"),
+            () if self.is_in_passage() => no("passage"),
             () if self.hardware_stop != HardwareStop::None => no("stop"),
             () if self.mode != Mode::Automatic => no("mode"),
             () if !self.body.standstill(now.site) => no("motion"),
@@ -610,9 +610,10 @@ impl AgentCore {
     }
 
     /// It holds a place beside the one it stands on.
-    fn is_in_passage(&self, now: &Now) -> bool {
-        let here = self.body.state(now.site).waypoint;
-        let standing = |place: &PlaceId| here.as_ref().is_some_and(|w| w.as_str() == place.as_str());
+    fn is_in_passage(&self) -> bool {
+        // Not the waypoint that it passed last: it may have left it since.
+        let here = self.body.stands_on();
+        let standing = |place: &PlaceId| here.iter().any(|w| w.as_str() == place.as_str());
         let row = &self.kept.ledger.places;
         row.inside.keys().chain(row.committed.keys()).any(|place| !standing(place))
     }

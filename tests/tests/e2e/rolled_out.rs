@@ -36,7 +36,7 @@ impl Robot {
     fn launch(home: &Path, samples: &Path, server: &str) -> anyhow::Result<Self> {
         std::fs::create_dir_all(home)?;
         let key = SecretKey::read(&samples.join("keys/directive-1.pem"))?.public();
-        let root = std::fs::read(samples.join("repository/1.root.json"))?;
+        let root = std::fs::read(samples.join("repository/metadata/1.root.json"))?;
         let site = text::parse(DEMO)?.site_id().clone();
         Trust { root, directive_keys: [(key.id(), key)].into(), site }.write(&home.join("trust.json"))?;
         let (program, sets) = (midshift()?, home.join("sets"));

@@ -50,7 +50,7 @@ fn a_stale_etag_is_refused_and_the_newest_is_not() {
     let mut rig = Rig::new(4);
     rig.start(spec());
     rig.until(60, |r| r.phase() == Phase::Soaking);
-    let revision = rig.ota.rollouts["ro"].revision;
+    let revision = Revision(rig.ota.rollouts["ro"].row.version);
     let abort = Command::Do { rollout_id: rollout_id("ro"), verb: Verb::Abort, reason: String::new() };
     let ask = |rig: &Rig, seen| commands::check(&rig.ota, &rig.board, &abort, Some(seen));
     assert!(ask(&rig, Revision(revision.0 - 1)).is_err());

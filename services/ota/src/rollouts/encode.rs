@@ -135,7 +135,7 @@ fn count(counts: &mut v1::RolloutCounts, r: &RolloutRobot) {
 }
 
 /// A roll-out with its counts.
-pub fn rollout(view: &View, now: &Now, row: &Rollout, revision: Revision) -> v1::Rollout {
+pub fn rollout(view: &View, now: &Now, row: &Rollout) -> v1::Rollout {
     let mut counts = v1::RolloutCounts::default();
     let mut waves: BTreeMap<u32, v1::RolloutCounts> = BTreeMap::new();
     let mut skipped: BTreeMap<String, u32> = BTreeMap::new();
@@ -173,7 +173,7 @@ pub fn rollout(view: &View, now: &Now, row: &Rollout, revision: Revision) -> v1:
         approved: row.approved.as_ref().map(act),
         start_time: row.started.map(timestamp),
         since: Some(timestamp(row.since)),
-        etag: etag(revision),
+        etag: etag(Revision(row.version)),
     }
 }
 

@@ -80,7 +80,7 @@ impl RolloutService {
             let rowed = view.rollouts.get(rollout_id.as_str());
             let reason = || Reason::from(Code::RolloutNotFound).with("rollout_id", &rollout_id);
             let rowed = rowed.ok_or_else(|| Refusal::new(Kind::NotFound, reason()))?;
-            Ok(encode::rollout(view, now, &rowed.row, rowed.revision))
+            Ok(encode::rollout(view, now, &rowed.row))
         })
         .await?
     }
@@ -177,7 +177,7 @@ impl RolloutService {
             all.sort_by_key(|r| (Reverse(r.row.created.at), r.row.rollout_id.clone()));
             let rows = all.into_iter().map(|r| (r.row.rollout_id.to_string(), r));
             let (rows, next_page_token) = page(rows, &r.page_token, size);
-            let rollouts = rows.into_iter().map(|r| encode::rollout(view, now, &r.row, r.revision)).collect();
+            let rollouts = rows.into_iter().map(|r| encode::rollout(view, now, &r.row)).collect();
             v1::ListRolloutsResponse { rollouts, next_page_token }
         })
         .await

@@ -51,8 +51,7 @@ impl Told {
         }
         let is_new = self.rollout != Some(rowed.revision) || !robots.is_empty();
         self.rollout = Some(rowed.revision);
-        let message =
-            v1::WatchRolloutResponse { rollout: Some(encode::rollout(view, now, &rowed.row, rowed.revision)), robots };
+        let message = v1::WatchRolloutResponse { rollout: Some(encode::rollout(view, now, &rowed.row)), robots };
         Ok((is_new.then_some(message), rowed.row.phase.is_over()))
     }
 }
