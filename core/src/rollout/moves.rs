@@ -4,7 +4,7 @@
 //! roll-out's row, and robots out of work are counted in that row.
 
 use super::hear::{fail, is_hard, quarantine};
-use super::robots::{Move, anchor, is_heard, is_open_to, is_retried, wants};
+use super::robots::{Move, anchor, is_open_to, is_retried, wants};
 use super::rows::{DrainRelease, DrainRequest, Given, ReleasedBy, Rollout, RolloutRobot, Step};
 use super::view::View;
 use super::{Board, Order, Sign, Tx, newcomers, verdict};
@@ -102,7 +102,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
         Move::Revert => {
             let hard = rollout.abort.as_ref().is_some_and(|a| a.hard) || r.failure.is_some();
             // A robot that is not heard goes back before it works again.
-            let urgent = hard || !is_heard(board, &tx.now, &r.robot_id);
+            let urgent = hard || !tx.view.is_heard(board, &tx.now, &r.robot_id);
             r.attempted |= rollout.revert_of.is_some();
             if r.drain_id.is_none() {
                 ask_drain(tx, &rollout, &mut r, urgent);

@@ -8,11 +8,9 @@ use super::rows::{AreaBundle, Countdown, Outcome, Pause, Phase, Rollout, Rollout
 use super::verdict;
 use super::view::View;
 use super::{Board, Tx, commands, incident, infrastructure, matching, newcomers};
-use crate::fleet::heard;
 use crate::ids::{AreaId, RolloutId};
 use crate::limits;
 use crate::reason::{Code, Reason};
-use crate::robot::Presence;
 use crate::time::Now;
 use std::collections::BTreeMap;
 
@@ -105,8 +103,8 @@ pub fn abort(
     enter(tx, rollout, Phase::Aborting, "rollout.aborting");
 }
 
-fn is_offline(board: &Board, now: &Now, r: &RolloutRobot) -> bool {
-    heard::presence(board, &r.robot_id, now) == Presence::Offline
+fn is_offline(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> bool {
+    !view.is_heard(board, now, &r.robot_id)
 }
 
 /// Begins with the first wave once each of its robots has the bundle, or will not have it soon.
@@ -117,7 +115,7 @@ fn prefetching(tx: &mut Tx, board: &Board, mut rollout: Rollout) {
     }
     let late = tx.now.utc.ms_since(rollout.since) >= limits::STAGED_WITHIN.as_ms();
     let now = tx.now;
-    let has_it = |r: &RolloutRobot| r.step >= Step::Staged || is_offline(board, &now, r);
+    let has_it = |r: &RolloutRobot| r.step >= Step::Staged || is_offline(tx.view, board, &now, r);
     if late || verdict::wave(tx.view, &rollout.rollout_id, 0).all(has_it) {
         rollout.wave = 0;
         enter(tx, rollout, Phase::Applying, "rollout.wave_begun");
@@ -165,7 +163,7 @@ fn applying(tx: &mut Tx, board: &Board, rollout: Rollout) {
     let open = |r: &RolloutRobot| match r.step {
         Step::Waiting | Step::Staging | Step::Staged | Step::Draining => true,
         Step::Activating => !is_given_up(&tx.now, &rollout, r),
-        Step::Reverting => rollout.revert_of.is_some() && !is_offline(board, &tx.now, r),
+        Step::Reverting => rollout.revert_of.is_some() && !is_offline(tx.view, board, &tx.now, r),
         _ => false,
     };
     if verdict::wave(tx.view, &rollout.rollout_id, wave).any(open) {
@@ -198,7 +196,7 @@ fn stand_ins(view: &View, board: &Board, now: &Now, rollout: &Rollout) -> Vec<Ro
         return Vec::new();
     }
     let later = view.robots_of(id).filter(|r| r.wave > rollout.wave && !is_newcomer(rollout, r));
-    let mut ready: Vec<_> = later.filter(|r| r.step < Step::Draining && !is_offline(board, now, r)).collect();
+    let mut ready: Vec<_> = later.filter(|r| r.step < Step::Draining && !is_offline(view, board, now, r)).collect();
     ready.sort_by_key(|r| (r.wave, r.place));
     ready.into_iter().take(missing.min(limits::ITEM_ROWS_MAX / 2)).cloned().collect()
 }
@@ -337,7 +335,7 @@ fn rolling_back(tx: &mut Tx, board: &Board, rollout: Rollout) {
         Step::RolledBack | Step::Skipped | Step::Stuck => false,
         Step::Committed | Step::Committing => scope_all && !irreversible,
         Step::Waiting | Step::Staging | Step::Staged => true,
-        _ => !is_offline(board, &now, r),
+        _ => !is_offline(tx.view, board, &now, r),
     };
     if tx.view.robots_of(&rollout.rollout_id).any(open) {
         return;

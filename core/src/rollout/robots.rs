@@ -9,12 +9,11 @@ use super::rows::{Given, Pause, Phase, Rollout, RolloutRobot, Step};
 use super::view::View;
 use super::{Board, infrastructure, matching, newcomers, verdict};
 use crate::authority::Authority;
-use crate::fleet::heard;
 use crate::fleet::rows::DrainState;
 use crate::ids::{RobotId, RolloutId};
 use crate::limits;
 use crate::reason::{Code, Reason};
-use crate::robot::{Duty, HardwareStop, Presence};
+use crate::robot::{Duty, HardwareStop};
 use crate::time::{Now, Utc};
 use crate::update::{Goal, UpdateReport, UpdateState};
 
@@ -109,10 +108,6 @@ fn keeps_for_nothing(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
     staged && ours && rollout.phase.goes_back()
 }
 
-pub(super) fn is_heard(board: &Board, now: &Now, robot_id: &RobotId) -> bool {
-    heard::presence(board, robot_id, now) != Presence::Offline
-}
-
 /// The robot's turn has come.
 pub fn is_on(rollout: &Rollout, r: &RolloutRobot) -> bool {
     match rollout.phase {
@@ -176,7 +171,7 @@ fn waiting(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollout
         return Some(Move::Skip(reason));
     }
     // What is not heard keeps nobody waiting, whoever has it.
-    if let Some(skip) = skips_offline(board, now, rollout, r) {
+    if let Some(skip) = skips_offline(view, board, now, rollout, r) {
         return Some(skip);
     }
     if let Some(other) = matching::claimed_by(view, &r.robot_id, &r.rollout_id) {
@@ -191,10 +186,10 @@ fn waiting(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollout
 
 /// Its turn has come, the roll-out does not stand still, and the robot is not heard. A robot that is to go back is waited for by nobody, and
 /// goes back when it comes; one that came later is in nobody's way.
-fn skips_offline(board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
+fn skips_offline(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
     let planned = rollout.revert_of.is_none() && !is_newcomer(rollout, r);
     let turn = is_on(rollout, r) && rollout.pauses.is_empty() && planned;
-    (turn && !is_heard(board, now, &r.robot_id)).then(|| Move::Skip(Code::SkippedOffline.into()))
+    (turn && !view.is_heard(board, now, &r.robot_id)).then(|| Move::Skip(Code::SkippedOffline.into()))
 }
 
 /// Another roll-out has the robot and does not let it go: its turn passes.
@@ -226,7 +221,7 @@ fn staging(
         None if now.wall.ms_since(r.signed) >= limits::DIRECTIVE_RENEWED_MS => return Some(Move::SignAnew),
         None => {}
     }
-    skips_offline(board, now, rollout, r).or_else(|| skips_stuck(now, rollout, r)).or_else(|| {
+    skips_offline(view, board, now, rollout, r).or_else(|| skips_stuck(now, rollout, r)).or_else(|| {
         // What it was told is gone: it is told again.
         (!view.desired.contains_key(r.robot_id.as_str())).then_some(Move::Stage)
     })
@@ -256,13 +251,13 @@ fn staged(
         }
         // What was staged is gone: its disk was changed, and it begins again.
         Some(UpdateState::Directed | UpdateState::Downloading) if rollout.revert_of.is_none() => {
-            return skips_offline(board, now, rollout, r).or_else(|| skips_stuck(now, rollout, r));
+            return skips_offline(view, board, now, rollout, r).or_else(|| skips_stuck(now, rollout, r));
         }
         _ => {}
     }
     match blocked(view, board, now, rollout, r) {
-        None => skips_offline(board, now, rollout, r).or_else(|| {
-            let comes = rollout.revert_of.is_some() || is_heard(board, now, &r.robot_id);
+        None => skips_offline(view, board, now, rollout, r).or_else(|| {
+            let comes = rollout.revert_of.is_some() || view.is_heard(board, now, &r.robot_id);
             comes.then_some(Move::AskDrain)
         }),
         Some(why) if why.code == Code::BlockedByRollout => {
@@ -388,7 +383,7 @@ fn activating(
 /// Fleet's record says that this drain holds the robot, and it is heard in its newest session.
 fn may_grant(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> bool {
     let held = r.drain_id.as_ref().is_some_and(|id| view.is_held(&r.robot_id, id));
-    let heard = is_heard(board, now, &r.robot_id) && anchor(view, board, &r.robot_id).is_some();
+    let heard = view.is_heard(board, now, &r.robot_id) && anchor(view, board, &r.robot_id).is_some();
     (held || view.bugs.any_drain_will_do()) && heard
 }
 

@@ -5,12 +5,15 @@
 use super::rows::{
     AreaBundle, Bundle, DrainRelease, DrainRequest, OtaClock, OtaMark, Quarantine, RobotSoftware, Rollout, RolloutRobot,
 };
+use crate::fleet::Board;
+use crate::fleet::heard;
 use crate::fleet::rows::{Drain, RobotAuthority, RobotControl, RobotCounter, RobotHolder};
 use crate::ids::{AreaId, DrainId, RobotId, RolloutId};
+use crate::limits;
 use crate::picture::{Picture, Viewed};
 pub use crate::picture::{Rowed, Slot};
 use crate::policy::AreaPolicy;
-use crate::robot::{Duty, Lane};
+use crate::robot::{Duty, Lane, Presence};
 use crate::rows::{BadRow, Key, Revision, Row, Seq, Table, Writer};
 use crate::site::Site;
 use crate::time::Now;
@@ -352,6 +355,11 @@ impl View {
         let file = || self.site.find_area(area).map(|at| self.site.area(at).policy());
         let known = self.policies.get(area.as_str()).map(|p| p.row.clone());
         known.or_else(file).unwrap_or_else(|| AreaPolicy::default_of(area.clone()))
+    }
+    /// Whether a robot is heard. After a start of the service everybody counts as heard for as long as a robot may take to come back.
+    pub fn is_heard(&self, board: &Board, now: &Now, robot: &RobotId) -> bool {
+        let begun = now.link.since(self.started.link) <= limits::OFFLINE_AFTER;
+        begun || heard::presence(board, robot, now) != Presence::Offline
     }
     /// The area in which a robot is.
     pub fn area_of(&self, live: &Live) -> Option<AreaId> {
