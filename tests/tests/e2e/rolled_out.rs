@@ -50,6 +50,11 @@ impl Robot {
     fn switch(&self) -> anyhow::Result<Switch> {
         Ok(Switch::read(&self.sets.join(SWITCH))?)
     }
+    /// Waits until it has committed this version.
+    async fn keeps(&self, version: &str) -> anyhow::Result<()> {
+        until("the robot to keep it", LIMIT, async || Ok((self.committed()?.as_deref() == Some(version)).then_some(())))
+            .await
+    }
     /// Version of the set that is committed.
     fn committed(&self) -> anyhow::Result<Option<String>> {
         let switch = self.switch()?;
@@ -101,7 +106,8 @@ async fn a_release_reaches_a_robot_and_a_bad_one_goes_back_though_the_server_is_
     let wait = |id: &str| call(&["rollout", "wait", "--server", &address, id, "--timeout", "120s"]);
     let waited = wait("walk-1.5.0")?;
     assert_eq!(waited.status.code(), Some(0), "{}", String::from_utf8_lossy(&waited.stderr));
-    assert_eq!(robot.committed()?.as_deref(), Some("1.5.0"));
+    // It is told to keep it when the roll-out is completed, and does so at once.
+    robot.keeps("1.5.0").await?;
     assert_eq!(robot.switch()?.previous.as_deref(), Some(FACTORY));
 
     begin("walk-1.6.0-bad-at-start")?;
@@ -127,6 +133,6 @@ async fn a_release_reaches_a_robot_and_a_bad_one_goes_back_though_the_server_is_
     begin("walk-1.5.1")?;
     let waited = wait("walk-1.5.1")?;
     assert_eq!(waited.status.code(), Some(0), "{}", String::from_utf8_lossy(&waited.stderr));
-    assert_eq!(robot.committed()?.as_deref(), Some("1.5.1"));
+    robot.keeps("1.5.1").await?;
     Ok(())
 }
