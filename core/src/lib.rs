@@ -9,6 +9,7 @@ pub mod fleet;
 pub mod gates;
 pub mod ids;
 pub mod limits;
+pub mod maintenance;
 pub mod picture;
 pub mod policy;
 pub mod reason;

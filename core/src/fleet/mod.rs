@@ -144,7 +144,7 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
                     mark(tx, entry.seq);
                 });
             }
-            (Log::Ota, None, Some(body)) if &*entry.kind == crate::rollout::INCIDENT => {
+            (Log::Ota, None, Some(body)) if &*entry.kind == crate::maintenance::INCIDENT => {
                 match serde_json::from_str::<Reason>(body) {
                     Ok(reason) => plan.decide(view, now, "ota", |tx| {
                         incidents::open(tx, reason, RobotId::parse(&entry.subject).ok().as_ref(), None);

@@ -8,10 +8,10 @@ use super::rows::{
     ServiceClock, SiteRow, Timer,
 };
 use crate::ids::{AttemptId, RobotId, TaskId};
+use crate::maintenance::{DrainRelease, DrainRequest};
 use crate::picture::{Picture, Viewed};
 pub use crate::picture::{Rowed, Slot};
 use crate::policy::AreaPolicy;
-use crate::rollout::rows::{DrainRelease, DrainRequest};
 use crate::rows::{BadRow, Key, Revision, Row, Table, Writer};
 use crate::site::Site;
 use crate::site::route::Router;

@@ -38,8 +38,6 @@ pub type Tx<'a> = crate::picture::Tx<'a, View>;
 
 /// Logs that the service reads.
 pub const LOGS: &[Log] = &[Log::Ota, Log::Fleet, Log::Telemetry, Log::RobotInbox];
-/// Kind of the fact that a person should look into something; fleet opens an incident for it.
-pub const INCIDENT: &str = "rollout.incident";
 
 /// What a directive says.
 #[derive(Clone, Copy, Debug)]
@@ -93,7 +91,7 @@ impl Plan {
 
 /// States that a person should look into something.
 fn incident(tx: &mut Tx, robot_id: Option<&RobotId>, reason: &Reason) {
-    tx.tell(robot_id.map_or("", RobotId::as_str), INCIDENT, reason);
+    tx.tell(robot_id.map_or("", RobotId::as_str), crate::maintenance::INCIDENT, reason);
 }
 
 /// Takes entries of the feed, in commit order: rows into the view, robots' events into decisions.

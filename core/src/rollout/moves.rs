@@ -5,11 +5,12 @@
 
 use super::hear::{fail, is_hard, quarantine};
 use super::robots::{Move, anchor, is_open_to, is_retried, wants};
-use super::rows::{DrainRelease, DrainRequest, Given, ReleasedBy, Rollout, RolloutRobot, Step};
+use super::rows::{Given, Rollout, RolloutRobot, Step};
 use super::view::View;
 use super::{Board, Order, Sign, Tx, newcomers, verdict};
 use crate::ids::{DrainId, RobotId, RolloutId};
 use crate::limits;
+use crate::maintenance::{DrainRelease, DrainRequest, ReleasedBy};
 use crate::reason::{Code, Reason};
 use crate::robot::Duty;
 use crate::time::Now;
@@ -31,7 +32,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
                 Duty::Retired => ReleasedBy::Retired,
                 // It said that it never will.
                 _ if r.grant.is_some() => ReleasedBy::Reported,
-                _ => ReleasedBy::NoGrant,
+                _ => unpermitted(&r),
             };
             leave_drain(tx, &mut r, released_by);
             step(tx, r, Step::Skipped, "robot.skipped");
@@ -61,7 +62,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
         Move::Grant => grant(tx, board, &rollout, r),
         Move::NotUsed => {
             desire(tx, &r.robot_id, |d| d.grant = None);
-            (r.grant, r.ready) = (None, false);
+            (r.grant, r.ready, r.not_used) = (None, false, true);
             r.moments.granted_wall = None;
             // It never ran the bundle, so the bundle has not lost it.
             r.failure = r.failure.filter(|f| f.code != Code::RobotLost);
@@ -71,7 +72,8 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             if to == Step::Staged {
                 desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Stage, None, None));
             }
-            leave_drain(tx, &mut r, ReleasedBy::NoGrant);
+            let released_by = unpermitted(&r);
+            leave_drain(tx, &mut r, released_by);
             step(tx, r, to, "robot.drain_left");
         }
         Move::Switched => {
@@ -130,6 +132,11 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             step(tx, r, Step::Stuck, "robot.stuck");
         }
     }
+}
+
+/// Why a drain without a permission that may be alive may end.
+fn unpermitted(r: &RolloutRobot) -> ReleasedBy {
+    if r.not_used { ReleasedBy::NotUsed } else { ReleasedBy::NoGrant }
 }
 
 fn step(tx: &mut Tx, r: RolloutRobot, to: Step, kind: &'static str) {
@@ -222,7 +229,7 @@ fn desire(tx: &mut Tx, robot_id: &RobotId, change: impl FnOnce(&mut DesiredUpdat
 
 /// A robot that has the bundle and never ran it forgets it.
 fn drop_bundle(tx: &mut Tx, r: &RolloutRobot) {
-    if r.directive > 0 && !r.attempted {
+    if r.directive > 0 && r.never_ran() {
         desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Revert, None, None));
     }
 }
@@ -249,7 +256,7 @@ fn ask_drain(tx: &mut Tx, rollout: &Rollout, r: &mut RolloutRobot, urgent: bool)
     };
     tx.put(request, "drain.requested");
     r.drain_id = Some(drain_id);
-    (r.ready, r.grant) = (false, None);
+    (r.ready, r.grant, r.not_used) = (false, None, false);
     count(tx, &r.rollout_id, 1);
 }
 

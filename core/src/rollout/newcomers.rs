@@ -76,6 +76,7 @@ pub fn fresh(
         drain_id: None,
         ready: false,
         grant: None,
+        not_used: false,
         attempted: false,
         failure: None,
         why: None,

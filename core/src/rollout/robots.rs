@@ -1,7 +1,7 @@
 //! Brings each robot of a roll-out a step further: fetch, drain, permission, trial, commit, and back.
 //!
 //! [`next`] says what is due and [`super::moves`] writes it, so that the planner and an explanation see the same. Invariants: permission is given only
-//! while fleet's record says that this drain holds the robot and the roll-out runs; a drain is released only for one of [`super::rows::ReleasedBy`]; robots
+//! while fleet's record says that this drain holds the robot and the roll-out runs; a drain is released only for one of [`crate::maintenance::ReleasedBy`]; robots
 //! out of work for a roll-out are counted in its row, in the item that takes one more.
 
 use super::hear::{is_hard, report_of};
@@ -104,7 +104,7 @@ fn is_tried_again(rollout: &Rollout, r: &RolloutRobot) -> bool {
 fn keeps_for_nothing(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
     let staged =
         view.desired.get(r.robot_id.as_str()).is_some_and(|d| matches!(d.row.goal, Goal::Stage | Goal::Activate));
-    let ours = r.directive > 0 && !r.attempted && matching::claimed_by(view, &r.robot_id, &r.rollout_id).is_none();
+    let ours = r.directive > 0 && r.never_ran() && matching::claimed_by(view, &r.robot_id, &r.rollout_id).is_none();
     staged && ours && rollout.phase.goes_back()
 }
 

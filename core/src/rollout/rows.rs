@@ -1,5 +1,5 @@
-//! Rows that the rollout service alone writes, apart from what each robot should run: releases, roll-outs, robots in them, drains it asks
-//! for, what robots run, and what they must not run.
+//! Rows that the rollout service alone writes, apart from drains ([`crate::maintenance`]) and from what each robot should run: releases,
+//! roll-outs, robots in them, what robots run, and what they must not run.
 
 use super::spec::RolloutSpec;
 use crate::authority::Authority;
@@ -437,6 +437,9 @@ pub struct RolloutRobot {
     pub ready: bool,
     /// Newest permission that was not seen unused.
     pub grant: Option<Given>,
+    /// The last permission of its drain was seen unused.
+    #[serde(default)]
+    pub not_used: bool,
     /// It was given permission at least once.
     pub attempted: bool,
     /// It counts against the bundle.
@@ -452,6 +455,10 @@ pub struct RolloutRobot {
 }
 
 impl RolloutRobot {
+    /// It was given no permission, or was seen to have left the last one unused.
+    pub const fn never_ran(&self) -> bool {
+        !self.attempted || (self.not_used && self.moments.switched.is_none())
+    }
     /// Its row id.
     pub fn id_of(rollout_id: &RolloutId, robot_id: &RobotId) -> String {
         format!("{rollout_id}/{robot_id}")
@@ -466,63 +473,6 @@ impl Record for RolloutRobot {
     fn index(&self) -> Index {
         let parent = Some(self.rollout_id.as_str().into());
         Index { state: Some(self.step.number()), parent, order: Some(i64::from(self.wave)) }
-    }
-}
-
-/// Fleet is asked to take a robot out of work.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct DrainRequest {
-    /// Never used again.
-    pub drain_id: DrainId,
-    /// Whom.
-    pub robot_id: RobotId,
-    /// For which roll-out.
-    pub rollout_id: RolloutId,
-    /// What for, for people.
-    pub reason: String,
-    /// Milliseconds of site time that it may take, from its begin.
-    pub within_ms: u64,
-    /// The robot gets no work from now on, whatever the area's budget.
-    pub urgent: bool,
-}
-
-impl Record for DrainRequest {
-    const TABLE: Table = Table::DrainRequest;
-    fn id(&self) -> String {
-        self.drain_id.to_string()
-    }
-    fn index(&self) -> Index {
-        Index { parent: Some(self.robot_id.as_str().into()), ..Index::default() }
-    }
-}
-
-/// Fleet may give a robot back: nothing that was permitted in the drain can still happen.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct DrainRelease {
-    /// Which drain.
-    pub drain_id: DrainId,
-    /// Why nothing can happen any more.
-    pub why: ReleasedBy,
-}
-
-/// Why a drain may be released. Time alone is none of it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ReleasedBy {
-    /// No permission was given in it.
-    NoGrant,
-    /// The robot reported how it ended.
-    Reported,
-    /// Past the life of the permission, the robot's ledger says that it was not used.
-    NotUsed,
-    /// A person took the robot out of the fleet.
-    Retired,
-}
-
-impl Record for DrainRelease {
-    const TABLE: Table = Table::DrainRelease;
-    fn id(&self) -> String {
-        self.drain_id.to_string()
     }
 }
 

@@ -2,14 +2,13 @@
 //!
 //! Called by every room of `rollout`. Invariant: as [`crate::picture`] says; after a conflict the whole view is built again, never patched.
 
-use super::rows::{
-    AreaBundle, Bundle, DrainRelease, DrainRequest, OtaClock, OtaMark, Quarantine, RobotSoftware, Rollout, RolloutRobot,
-};
+use super::rows::{AreaBundle, Bundle, OtaClock, OtaMark, Quarantine, RobotSoftware, Rollout, RolloutRobot};
 use crate::fleet::Board;
 use crate::fleet::heard;
 use crate::fleet::rows::{Drain, RobotAuthority, RobotControl, RobotCounter, RobotHolder};
 use crate::ids::{AreaId, DrainId, RobotId, RolloutId};
 use crate::limits;
+use crate::maintenance::{DrainRelease, DrainRequest};
 use crate::picture::{Picture, Viewed};
 pub use crate::picture::{Rowed, Slot};
 use crate::policy::AreaPolicy;

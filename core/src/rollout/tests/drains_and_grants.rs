@@ -71,7 +71,7 @@ fn an_unused_permission_is_taken_back_only_when_the_robot_says_so_past_its_life(
     rig.ticks(10);
     assert_eq!(rig.of("ro", n).grant, None);
     rig.ticks(2);
-    assert_eq!(rig.releases(), [ReleasedBy::NoGrant]);
+    assert_eq!(rig.releases(), [ReleasedBy::NotUsed]);
     rig.robots[n].fate = Fate::Good;
     rig.must("ro", Verb::Resume);
     rig.until(60, |r| r.step(n) == Step::Trial);
@@ -155,14 +155,14 @@ fn robots_that_charge_are_asked_first_and_urgent_drains_do_not_wait() {
     rig.fleet_turn();
     let state = |rig: &Rig, n: usize| rig.fleet.drains[&format!("ota:{n}")].row.state;
     assert_eq!([0, 1, 2].map(|n| state(&rig, n)), [DrainState::Waiting, DrainState::Waiting, DrainState::Draining]);
-    rig.put(super::super::rows::DrainRequest { drain_id: DrainId::parse("ota:9").expect("an id"), ..request(0, true) });
+    rig.put(crate::maintenance::DrainRequest { drain_id: DrainId::parse("ota:9").expect("an id"), ..request(0, true) });
     rig.fleet_turn();
     let urgent = &rig.fleet.drains["ota:9"].row;
     assert!(urgent.is_on(), "{urgent:?}");
 }
 
-fn request(n: usize, urgent: bool) -> super::super::rows::DrainRequest {
-    super::super::rows::DrainRequest {
+fn request(n: usize, urgent: bool) -> crate::maintenance::DrainRequest {
+    crate::maintenance::DrainRequest {
         drain_id: DrainId::parse(&format!("ota:{n}")).expect("an id"),
         robot_id: robot_id(n),
         rollout_id: rollout_id("ro"),
@@ -197,14 +197,14 @@ fn charge(id: &crate::ids::AttemptId, errand: crate::task::state::Errand) -> cra
 fn a_request_and_its_release_together_make_no_drain_and_both_go_when_none_stands() {
     let mut rig = Rig::new(2);
     rig.put(request(0, false));
-    rig.put(super::super::rows::DrainRelease { drain_id: request(0, false).drain_id, why: ReleasedBy::NoGrant });
+    rig.put(crate::maintenance::DrainRelease { drain_id: request(0, false).drain_id, why: ReleasedBy::NoGrant });
     rig.fleet_turn();
     assert!(rig.fleet.drains.is_empty());
     rig.ota_turn();
     assert!(rig.ota.requests.is_empty() && rig.ota.releases.is_empty());
     rig.put(request(1, false));
     rig.fleet_turn();
-    rig.put(super::super::rows::DrainRelease { drain_id: request(1, false).drain_id, why: ReleasedBy::NoGrant });
+    rig.put(crate::maintenance::DrainRelease { drain_id: request(1, false).drain_id, why: ReleasedBy::NoGrant });
     rig.ota_turn();
     assert_eq!(rig.ota.requests.len(), 1, "the drain stands");
     rig.fleet_turn();

@@ -18,13 +18,14 @@ mod trial_and_gates;
 mod waves_and_matching;
 
 use super::commands::{self, Command, Verb};
-use super::rows::{AreaBundle, Bundle, Outcome, Phase, ReleasedBy, RobotSoftware, Rollout, RolloutRobot, Step};
+use super::rows::{AreaBundle, Bundle, Outcome, Phase, RobotSoftware, Rollout, RolloutRobot, Step};
 use super::spec::{RolloutSpec, Wave};
 use super::view::{Slot, TABLES, View};
 use super::{Board, Order, Plan, Sign, absorb, cycle};
 use crate::fleet::rows::{DrainState, RobotAuthority, RobotControl, RobotCounter, RobotHolder};
 use crate::fleet::{self, budget, drain};
 use crate::ids::{AreaId, BundleId, DrainId, RobotId, RolloutId, WaypointId};
+use crate::maintenance::ReleasedBy;
 use crate::policy::AreaPolicy;
 use crate::reason::{Code, Reason, Refusal};
 use crate::robot::{Fault, HardwareStop, Inventory, Lane, ReportedState, Vitals};

@@ -1,0 +1,68 @@
+//! What the rollout service says to fleet: take this robot out of work, give it back, a person should look into this.
+//!
+//! Written by the rollout service, read by fleet, which answers with its own drain and the robot's mutex. Invariant: fleet holds a robot only for a
+//! request that stands without a release, and a release says why nothing that was permitted can still happen.
+
+use crate::ids::{DrainId, RobotId, RolloutId};
+use crate::rows::{Index, Record, Table};
+use serde::{Deserialize, Serialize};
+
+/// Kind of the fact that a person should look into something; its body is the reason. Fleet opens an incident for it.
+pub const INCIDENT: &str = "rollout.incident";
+
+/// Fleet is asked to take a robot out of work.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DrainRequest {
+    /// Never used again.
+    pub drain_id: DrainId,
+    /// Whom.
+    pub robot_id: RobotId,
+    /// For which roll-out.
+    pub rollout_id: RolloutId,
+    /// What for, for people.
+    pub reason: String,
+    /// Milliseconds of site time that it may take, from its begin.
+    pub within_ms: u64,
+    /// The robot gets no work from now on, whatever the area's budget.
+    pub urgent: bool,
+}
+
+impl Record for DrainRequest {
+    const TABLE: Table = Table::DrainRequest;
+    fn id(&self) -> String {
+        self.drain_id.to_string()
+    }
+    fn index(&self) -> Index {
+        Index { parent: Some(self.robot_id.as_str().into()), ..Index::default() }
+    }
+}
+
+/// Fleet may give a robot back: nothing that was permitted in the drain can still happen.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DrainRelease {
+    /// Which drain.
+    pub drain_id: DrainId,
+    /// Why nothing can happen any more.
+    pub why: ReleasedBy,
+}
+
+/// Why a drain may be released. Time alone is none of it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ReleasedBy {
+    /// No permission was given in it.
+    NoGrant,
+    /// The robot reported how it ended.
+    Reported,
+    /// Past the life of the permission, the robot's ledger says that it was not used.
+    NotUsed,
+    /// A person took the robot out of the fleet.
+    Retired,
+}
+
+impl Record for DrainRelease {
+    const TABLE: Table = Table::DrainRelease;
+    fn id(&self) -> String {
+        self.drain_id.to_string()
+    }
+}
