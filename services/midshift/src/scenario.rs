@@ -5,7 +5,7 @@
 //! journals, switch records) wherever they can tell it; the report says where each figure is from.
 
 use crate::samples::{self, Signer};
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, ensure};
 use midshift_agent::switch::Switch;
 use midshift_agent::trust::Trust;
 use midshift_core::ids::{AreaId, RobotId, WaypointId};
@@ -19,6 +19,7 @@ use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::ota::v1::rollout_wave::Size;
 use midshift_store::LiveBoard;
+use rustix::process::{Pid, Signal, kill_process_group};
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -40,7 +41,8 @@ const LONGEST: Duration = Duration::from_secs(1_200);
 const READY_WITHIN: Duration = Duration::from_secs(120);
 /// Probation and soak of each roll-out, milliseconds of site time.
 const WATCHED_MS: u64 = 10_000;
-
+/// A launched robot that was asked to end has so long, real time.
+const ENDS_WITHIN: Duration = Duration::from_secs(10);
 /// A launched robot that gives no sign for so many seconds is killed by its launcher.
 const HANG_S: &str = "8";
 
@@ -248,6 +250,15 @@ impl Stage {
     /// A step that could not be taken at all; what went wrong on stage is in the story.
     pub async fn play(&self, stop: CancellationToken, say: &(dyn Fn(&str) + Sync)) -> anyhow::Result<Story> {
         let mut launched = self.launch()?;
+        let story = tokio::select! {
+            () = stop.cancelled() => Err(anyhow::anyhow!("ended before the story was over")),
+            story = self.acts(say) => story,
+        };
+        launched.end().await;
+        story
+    }
+
+    async fn acts(&self, say: &(dyn Fn(&str) + Sync)) -> anyhow::Result<Story> {
         self.until_at_work().await?;
         say(&format!("{} robots at work, {} of them processes of their own", self.robots(), self.launched.len()));
         self.publish().await?;
@@ -258,20 +269,12 @@ impl Stage {
             acts: Vec::new(),
         };
         for act in &ACTS {
-            say(&format!(
-                "rolling out {}-{}{}",
-                samples::NAME,
-                act.version,
-                if act.is_good { "" } else { ", which is bad" }
-            ));
-            let played = tokio::select! {
-                () = stop.cancelled() => bail!("ended before the story was over"),
-                played = self.act(act) => played?,
-            };
+            let bad = if act.is_good { "" } else { ", which is bad" };
+            say(&format!("rolling out {}-{}{bad}", samples::NAME, act.version));
+            let played = self.act(act).await?;
             played.lines().iter().for_each(|line| say(line));
             story.acts.push(played);
         }
-        launched.end().await;
         Ok(story)
     }
 
@@ -299,7 +302,7 @@ impl Stage {
                 command.arg("--site").arg(site);
             }
             let errors = log.try_clone().context("sharing a robot's log")?;
-            command.stdin(Stdio::null()).stdout(log).stderr(errors).process_group(0).kill_on_drop(true);
+            command.stdin(Stdio::null()).stdout(log).stderr(errors).process_group(0);
             launched.0.push(command.spawn().with_context(|| format!("starting {}", program.display()))?);
         }
         Ok(launched)
@@ -482,18 +485,27 @@ impl Stage {
 }
 
 impl Launched {
-    /// Asks every launcher's group to end, and waits.
+    /// Asks every launcher and what it started to end, and waits.
     async fn end(&mut self) {
+        self.signal(Signal::TERM);
         for child in &mut self.0 {
-            if let Some(pid) = child.id() {
-                let mut kill = Command::new("kill");
-                kill.args(["-TERM", "--", &format!("-{pid}")]).stderr(Stdio::null());
-                let _ = kill.status().await;
-            }
+            let _ = tokio::time::timeout(ENDS_WITHIN, child.wait()).await;
         }
-        for child in &mut self.0 {
-            let _ = tokio::time::timeout(Duration::from_secs(10), child.wait()).await;
+    }
+    fn signal(&self, signal: Signal) {
+        // A child that was not waited for keeps its number, so nobody else's group can be meant.
+        let running = self.0.iter().filter_map(Child::id).filter_map(|id| i32::try_from(id).ok());
+        for group in running.filter_map(Pid::from_raw) {
+            // One that has just ended cannot be told anything, and need not be.
+            let _ = kill_process_group(group, signal);
         }
+    }
+}
+
+/// However the story ends, no robot goes on without it.
+impl Drop for Launched {
+    fn drop(&mut self) {
+        self.signal(Signal::KILL);
     }
 }
 
@@ -625,4 +637,24 @@ fn medians(robots: &[v1::RolloutRobot]) -> OffWork {
 /// Journals of launched robots.
 pub fn journals(folder: &Path, launched: &[(RobotId, WaypointId)]) -> Vec<PathBuf> {
     launched.iter().map(|(id, _)| folder.join(id.as_str()).join(midshift_sim::body::JOURNAL_FILE)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tokio::io::AsyncReadExt;
+
+    #[tokio::test]
+    async fn whatever_a_launcher_started_ends_with_the_story() -> anyhow::Result<()> {
+        let mut command = Command::new("sh");
+        command.args(["-c", "sleep 1000 & echo started; wait"]).stdout(Stdio::piped()).process_group(0);
+        let mut child = command.spawn()?;
+        let mut said = child.stdout.take().context("no pipe")?;
+        let mut started = [0; 8];
+        said.read_exact(&mut started).await?;
+        drop(Launched(vec![child]));
+        // Both processes hold the pipe: it ends when the last of them does.
+        assert_eq!(said.read_to_end(&mut Vec::new()).await?, 0);
+        Ok(())
+    }
 }
