@@ -56,6 +56,13 @@ pub fn take<P: Picture, R: Viewed<P>>(
     Ok(())
 }
 
+/// The one row of a table that an item puts; none if it puts none.
+pub fn written<R: Record>(item: &Item) -> Option<R> {
+    let row = item.rows.iter().find(|row| row.key.table == R::TABLE)?;
+    let Write::Put { body, .. } = &row.write else { return None };
+    serde_json::from_str(body).ok()
+}
+
 /// A decision under way.
 pub struct Tx<'a, P: Picture> {
     /// The picture it is made on.

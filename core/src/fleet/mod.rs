@@ -31,7 +31,7 @@ pub mod way;
 
 use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
-use crate::rows::{Entry, Item, Log, Seq, Table, Write};
+use crate::rows::{Entry, Item, Log, Seq, Table};
 use crate::task::{Event, Phase, TaskRequest};
 use crate::time::Now;
 use crate::work::{InboxEntry, Live};
@@ -167,9 +167,7 @@ fn pass_over(tx: &mut Tx, entry: &Entry) {
 
 /// The entry of the feed that an item obeys: the mark it writes.
 pub fn obeyed(item: &Item) -> Option<Seq> {
-    let mark = item.rows.iter().find(|row| row.key.table == Table::FleetMark)?;
-    let Write::Put { body, .. } = &mark.write else { return None };
-    serde_json::from_str::<FleetMark>(body).ok().map(|mark| mark.seq)
+    crate::picture::written::<FleetMark>(item).map(|mark| mark.seq)
 }
 
 /// Kind of the fact that a second machine has attached with a robot's name, stated by telemetry.

@@ -25,7 +25,7 @@ mod tests;
 
 pub use crate::fleet::Board;
 use crate::ids::{BundleId, RobotId, RolloutId};
-use crate::reason::Reason;
+use crate::reason::{Code, Reason};
 use crate::rows::{Entry, Item, Log, Seq};
 use crate::time::{Now, Utc};
 use crate::work::InboxEntry;
@@ -94,6 +94,11 @@ fn incident(tx: &mut Tx, robot_id: Option<&RobotId>, reason: &Reason) {
     tx.tell(robot_id.map_or("", RobotId::as_str), crate::maintenance::INCIDENT, reason);
 }
 
+/// Entry of the log that an item obeys, if it obeys one.
+pub fn obeyed(item: &Item) -> Option<Seq> {
+    crate::picture::written::<OtaMark>(item).map(|mark| mark.seq)
+}
+
 /// Takes entries of the feed, in commit order: rows into the view, robots' events into decisions.
 pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
     let consumed = view.marks.get("ota").map_or(Seq(0), |m| m.row.seq);
@@ -107,6 +112,14 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
         view.absorbed = view.absorbed.max(entry.seq);
         let (Log::RobotInbox, None, Some(body)) = (entry.log, entry.table, &entry.body) else { continue };
         if entry.seq <= consumed {
+            continue;
+        }
+        if view.unusable.contains(&entry.seq) {
+            let mut tx = Tx::new(view, now, "ota");
+            let reason = Reason::from(Code::EntryPassedOver).with("seq", entry.seq.0).with("kind", &entry.kind);
+            incident(&mut tx, None, &reason);
+            tx.put(OtaMark { seq: entry.seq }, "ota.consumed");
+            plan.items.extend(tx.finish());
             continue;
         }
         match serde_json::from_str::<InboxEntry>(body) {

@@ -73,6 +73,8 @@ pub struct View {
     pub absorbed: Seq,
     /// Last entry of the robot inbox that changed nothing. It must not be taken again once something else was decided. Volatile.
     pub passed: Seq,
+    /// Entries that the store refuses to have obeyed, whatever is tried. Volatile: found again after a start.
+    pub unusable: BTreeSet<Seq>,
     /// Rows were read at this entry: what older entries say of rows is in the picture already.
     pub read_at: Seq,
     /// Reading of the clocks when the service started: everybody counts as heard then.
@@ -253,6 +255,7 @@ impl View {
             arrived: BTreeSet::new(),
             absorbed: Seq(0),
             passed: Seq(0),
+            unusable: BTreeSet::new(),
             read_at: Seq(0),
             started,
             read,

@@ -7,10 +7,10 @@ use midshift_core::fleet::view::{TABLES, View};
 use midshift_core::fleet::{Board, LOGS, Pace, Plan, absorb, commands, cycle, found, obeyed};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
-use midshift_core::rows::{Item, Log, Seq};
+use midshift_core::rows::{Entry, Item, Log, Seq};
 use midshift_core::time::Now;
 use midshift_core::work::Live;
-use midshift_store::{CommitError, Dirty, Error, FEED_PAGE_MAX};
+use midshift_store::{CommitError, Dirty, Error, follow};
 use std::time::Duration;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
@@ -156,21 +156,13 @@ impl Loop {
     /// Absorbs the feed to its head; true if something came from others.
     async fn take_feed(&mut self, now: Now, plan: &mut Plan) -> Result<bool, Error> {
         let mut foreign = false;
-        loop {
-            let page = match self.parts.store.feed(self.seq, LOGS, FEED_PAGE_MAX).await {
-                Err(Error::CursorExpired { asked, oldest }) if asked < oldest && self.seq == Seq(0) => {
-                    self.seq = oldest;
-                    continue;
-                }
-                page => page?,
-            };
-            foreign |= page.entries.iter().any(|e| e.log != Log::Fleet);
-            absorb(&mut self.view, now, &page.entries, plan);
-            self.seq = page.next;
-            if page.next >= page.head {
-                return Ok(foreign);
-            }
-        }
+        let view = &mut self.view;
+        let take = |entries: &[Entry]| {
+            foreign |= entries.iter().any(|e| e.log != Log::Fleet);
+            absorb(view, now, entries, plan);
+        };
+        follow(self.parts.store.as_ref(), &mut self.seq, LOGS, take).await?;
+        Ok(foreign)
     }
 
     fn take_requests(&mut self, requests: Vec<Request>, now: Now, plan: &mut Plan) -> Replies {

@@ -263,3 +263,30 @@ pub async fn load<R: Record>(store: &dyn Store, id: &str) -> Result<Option<(R, R
         None => Ok(None),
     }
 }
+
+/// Hands over what `logs` hold after `cursor`, page by page to their head, and moves the cursor with each page. A cursor that never read
+/// anything begins at the oldest entry that is kept.
+///
+/// # Errors
+/// As [`Store::feed`].
+pub async fn follow(
+    store: &dyn Store,
+    cursor: &mut Seq,
+    logs: &[Log],
+    mut take: impl FnMut(&[Entry]),
+) -> Result<(), Error> {
+    loop {
+        let page = match store.feed(*cursor, logs, FEED_PAGE_MAX).await {
+            Err(Error::CursorExpired { asked, oldest }) if asked < oldest && *cursor == Seq(0) => {
+                *cursor = oldest;
+                continue;
+            }
+            page => page?,
+        };
+        take(&page.entries);
+        *cursor = page.next;
+        if page.next >= page.head {
+            return Ok(());
+        }
+    }
+}

@@ -108,3 +108,21 @@ fn roll_outs_beyond_the_limit_are_forgotten_and_none_that_robots_still_come_back
     assert!(rig.ota.rollouts.contains_key("ro") && rig.ota.rollouts.contains_key("old-0"));
     assert!(!rig.ota.rollouts.contains_key("old-1"));
 }
+
+#[test]
+fn an_entry_that_the_store_never_takes_is_passed_over_once_and_a_person_is_told() {
+    let mut rig = Rig::new(3);
+    rig.start(RolloutSpec { waves: vec![Wave::Count(1), Wave::Rest], ..spec() });
+    let n = rig.order()[0];
+    rig.until(60, |r| r.step(n) == Step::Trial);
+    rig.goes_back(n, Some(Code::BreakerOnTrial));
+    let seq = Seq(rig.seq);
+    rig.feed.iter().rfind(|e| e.log == Log::RobotInbox && e.seq <= seq).inspect(|e| {
+        rig.ota.unusable.insert(e.seq);
+    });
+    rig.ota_turn();
+    assert_eq!(rig.incidents(), [Code::EntryPassedOver]);
+    rig.restart();
+    rig.ota_turn();
+    assert_eq!(rig.incidents(), [Code::EntryPassedOver], "it is behind the mark");
+}

@@ -7,11 +7,11 @@ use super::{Parts, Planner, Request, releases};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::view::{TABLES, View};
-use midshift_core::rollout::{Board, LOGS, Plan, absorb, commands, cycle};
+use midshift_core::rollout::{Board, LOGS, Plan, absorb, commands, cycle, obeyed};
 use midshift_core::rows::Seq;
 use midshift_core::time::Now;
 use midshift_core::work::Live;
-use midshift_store::{CommitError, Dirty, Error, FEED_PAGE_MAX};
+use midshift_store::{CommitError, Dirty, Error, follow};
 use std::collections::BTreeSet;
 use std::time::Duration;
 use tokio::sync::{oneshot, watch};
@@ -84,7 +84,8 @@ impl Loop {
         let snapshot = self.parts.store.snapshot(TABLES).await?;
         let now = self.parts.clock.now();
         let served = self.view.served_ms(&now);
-        self.view = View::new(self.parts.site.clone(), self.started, now);
+        let unusable = std::mem::take(&mut self.view.unusable);
+        self.view = View { unusable, ..View::new(self.parts.site.clone(), self.started, now) };
         self.view.bugs = self.parts.bugs;
         self.view.load(&snapshot.rows, snapshot.seq)?;
         // The row is as old as the last commit; this process has served on since.
@@ -110,7 +111,8 @@ impl Loop {
         }
         let now = self.parts.clock.now();
         let mut plan = Plan::default();
-        self.take_feed(now, &mut plan)
+        let view = &mut self.view;
+        follow(self.parts.store.as_ref(), &mut self.seq, LOGS, |entries| absorb(view, now, entries, &mut plan))
             .await
             .map_err(|error| tracing::warn!(%error, "roll-outs cannot read the feed"))?;
         let Ok(opened) = self.parts.ota.opened() else { return Ok(false) };
@@ -125,35 +127,22 @@ impl Loop {
         Ok(more)
     }
 
-    /// Absorbs the feed to its head.
-    async fn take_feed(&mut self, now: Now, plan: &mut Plan) -> Result<(), Error> {
-        loop {
-            let page = match self.parts.store.feed(self.seq, LOGS, FEED_PAGE_MAX).await {
-                Err(Error::CursorExpired { asked, oldest }) if asked < oldest && self.seq == Seq(0) => {
-                    self.seq = oldest;
-                    continue;
-                }
-                page => page?,
-            };
-            absorb(&mut self.view, now, &page.entries, plan);
-            self.seq = page.next;
-            if page.next >= page.head {
-                return Ok(());
-            }
-        }
-    }
-
     async fn commit(&mut self, plan: Plan, replies: Replies) -> Result<(), ()> {
         if plan.items.is_empty() {
             return Ok(());
         }
+        let entries: Vec<Option<Seq>> = plan.items.iter().map(obeyed).collect();
         let results = self.parts.store.commit(plan.items).await;
         let mut trusted = Ok(());
         let mut newest = None;
-        for result in &results {
+        for (result, entry) in results.iter().zip(entries) {
             match result {
                 Ok(applied) => newest = Some(applied.seq),
                 Err(error) => {
+                    if let (true, Some(seq)) = (error.is_final(), entry) {
+                        tracing::error!(seq = seq.0, "an entry of the log cannot be obeyed and is passed over");
+                        self.view.unusable.insert(seq);
+                    }
                     let conflict = matches!(error, CommitError::Conflict { .. });
                     let counted =
                         metrics::counter!("midshift_ota_items_lost_total", "conflict" => conflict.to_string());
