@@ -6,6 +6,7 @@
 pub mod chunk;
 pub mod convert;
 pub mod json;
+pub mod pages;
 pub mod session;
 pub mod status;
 

@@ -13,6 +13,7 @@ use midshift_proto::convert::ms_of;
 use midshift_proto::convert::task::revision_of;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService as Face;
+use midshift_proto::pages;
 use tonic::{Request, Response, Status};
 
 /// Site time after which a drain is given up, unless the caller says another.
@@ -33,36 +34,12 @@ fn reason_text(text: &str, bad: &mut Violations) {
     }
 }
 
-fn page_size(asked: u32, bad: &mut Violations) -> usize {
-    match asked as usize {
-        0 => limits::PAGE_DEFAULT,
-        n if n <= limits::PAGE_MAX => n,
-        _ => {
-            bad.add("page_size", "must be 1..1000; 0: 100");
-            limits::PAGE_DEFAULT
-        }
-    }
-}
-
 fn not_found(code: Code, id: impl std::fmt::Display) -> Refusal {
     Refusal::new(Kind::NotFound, Reason::from(code).with("id", id))
 }
 
 fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {
     result.map(Response::new).map_err(|refusal| midshift_proto::status(&refusal, None))
-}
-
-/// One page of rows sorted by id, and the id to go on after.
-fn page<T>(rows: impl Iterator<Item = (String, T)>, after: &str, size: usize) -> (Vec<T>, String) {
-    let mut rows = rows.skip_while(|(id, _)| !after.is_empty() && id.as_str() <= after);
-    let mut last = String::new();
-    let mut out = Vec::new();
-    for (id, row) in rows.by_ref().take(size) {
-        last = id;
-        out.push(row);
-    }
-    let next = if rows.next().is_some() { last } else { String::new() };
-    (out, next)
 }
 
 impl FleetService {
@@ -175,7 +152,7 @@ impl FleetService {
 
     async fn places(&self, r: v1::ListPlacesRequest) -> Result<v1::ListPlacesResponse, Refusal> {
         let mut bad = Violations::default();
-        let size = page_size(r.page_size, &mut bad);
+        let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
         let (places, next_page_token) = self
             .look(move |view: &View, _, _| {
@@ -185,7 +162,11 @@ impl FleetService {
                         || view.waits.values().any(|w| w.places.contains(&p.place_id))
                 };
                 let rows = view.places.iter().filter(|(_, p)| !r.in_use || in_use(&p.row));
-                page(rows.map(|(id, p)| (id.clone(), encode::place(view, &p.row, p.revision))), &r.page_token, size)
+                pages::page(
+                    rows.map(|(id, p)| (id.clone(), encode::place(view, &p.row, p.revision))),
+                    &r.page_token,
+                    size,
+                )
             })
             .await?;
         Ok(v1::ListPlacesResponse { places, next_page_token })
@@ -234,7 +215,7 @@ impl FleetService {
 
     async fn incidents(&self, r: v1::ListIncidentsRequest) -> Result<v1::ListIncidentsResponse, Refusal> {
         let mut bad = Violations::default();
-        let size = page_size(r.page_size, &mut bad);
+        let size = pages::size(r.page_size, &mut bad);
         let robot_id = if r.robot_id.is_empty() { None } else { bad.take("robot_id", RobotId::parse(&r.robot_id)) };
         bad.finish()?;
         let (incidents, next_page_token) = self
@@ -243,7 +224,7 @@ impl FleetService {
                     (r.include_closed || i.closed.is_none()) && (robot_id.is_none() || i.robot_id == robot_id)
                 };
                 let rows = view.incidents.iter().filter(|(_, i)| wanted(&i.row));
-                page(rows.map(|(id, i)| (id.clone(), encode::incident(&i.row, i.revision))), &r.page_token, size)
+                pages::page(rows.map(|(id, i)| (id.clone(), encode::incident(&i.row, i.revision))), &r.page_token, size)
             })
             .await?;
         Ok(v1::ListIncidentsResponse { incidents, next_page_token })
@@ -268,7 +249,7 @@ impl FleetService {
 
     async fn counters(&self, r: v1::ListCountersRequest) -> Result<v1::ListCountersResponse, Refusal> {
         let mut bad = Violations::default();
-        let size = page_size(r.page_size, &mut bad);
+        let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
         let (counters, next_page_token) = self
             .look(move |view, _, _| {
@@ -277,7 +258,7 @@ impl FleetService {
                         && (r.software.is_empty() || r.software == c.software)
                 };
                 let rows = view.counters.iter().filter(|(_, c)| wanted(&c.row));
-                page(rows.map(|(id, c)| (id.clone(), encode::counter(&c.row))), &r.page_token, size)
+                pages::page(rows.map(|(id, c)| (id.clone(), encode::counter(&c.row))), &r.page_token, size)
             })
             .await?;
         Ok(v1::ListCountersResponse { counters, next_page_token })

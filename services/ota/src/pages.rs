@@ -1,10 +1,10 @@
 //! Pages of bundles, by name and version. A page token names the last bundle of the page before, so that a release in between moves nothing.
 
 use crate::repository::Release;
-use midshift_core::limits;
 use midshift_core::reason::Violations;
 use midshift_core::task::raw::parse_version;
 use midshift_proto::ota::v1;
+use midshift_proto::pages;
 
 /// Where a bundle stands: by name, then by version as numbers, then as text.
 type Place<'a> = (&'a str, Option<(u64, u64, u64)>, &'a str);
@@ -16,13 +16,7 @@ fn place<'a>(name: &'a str, version: &'a str) -> Place<'a> {
 /// One page out of all, which are sorted.
 pub fn page(releases: &[Release], request: &v1::ListBundlesRequest) -> Result<v1::ListBundlesResponse, Violations> {
     let mut bad = Violations::default();
-    let size = match request.page_size as usize {
-        0 => limits::PAGE_DEFAULT,
-        n => n,
-    };
-    if size > limits::PAGE_MAX {
-        bad.add("page_size", "must be 1..1000; 0: 100");
-    }
+    let size = pages::size(request.page_size, &mut bad);
     let after = request.page_token.split_once('/').map(|(name, version)| place(name, version));
     if !request.page_token.is_empty() && after.is_none_or(|(_, version, _)| version.is_none()) {
         bad.add("page_token", "is no page token of this list");

@@ -7,6 +7,7 @@ use midshift_core::limits;
 use midshift_core::reason::{Refusal, Violations};
 use midshift_core::rows::Table;
 use midshift_proto::convert::task::TaskFilter;
+use midshift_proto::pages;
 use midshift_proto::task::v1;
 use midshift_store::{Cursor, Query};
 use prost::Message;
@@ -42,13 +43,7 @@ impl TaskService {
         let print = print_of(&r.filter);
         let filter: TaskFilter = midshift_proto::parse_field(Some(r.filter.unwrap_or_default()), "filter")?;
         let mut bad = Violations::default();
-        let size = match r.page_size as usize {
-            0 => limits::PAGE_DEFAULT,
-            n => n,
-        };
-        if size > limits::PAGE_MAX {
-            bad.add("page_size", "must be 1..1000; 0: 100");
-        }
+        let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
         let after = if r.page_token.is_empty() { None } else { Some(cursor_of(&r.page_token, &print)?) };
         if filter.task_ids.is_empty() {

@@ -10,6 +10,7 @@ use midshift_core::time::Utc;
 use midshift_core::work::{InboxEntry, InboxItem, Live, RobotEvent, SampleBody};
 use midshift_proto::convert::WireEnum;
 use midshift_proto::convert::telemetry::{RobotView, encode_event, encode_robot};
+use midshift_proto::pages;
 use midshift_proto::telemetry::v1::{self, telemetry_service_server::TelemetryService as Face};
 use midshift_store::{Dirty, Error};
 use std::collections::{BTreeMap, BTreeSet};
@@ -49,17 +50,6 @@ fn filter(wire: Option<v1::RobotFilter>, bad: &mut Violations) -> Filter {
     Filter { robot_ids: wire.robot_ids.into_iter().collect(), presences, labels: wire.labels.into_iter().collect() }
 }
 
-fn page_size(asked: u32, bad: &mut Violations) -> usize {
-    match asked as usize {
-        0 => limits::PAGE_DEFAULT,
-        n if n <= limits::PAGE_MAX => n,
-        _ => {
-            bad.add("page_size", "must be 1..1000; 0: 100");
-            limits::PAGE_DEFAULT
-        }
-    }
-}
-
 fn encode(inner: &Inner, robot_id: &RobotId, live: Option<&Live>) -> Option<v1::Robot> {
     let rows = inner.picture.rows();
     let session = rows.sessions.get(robot_id);
@@ -96,20 +86,15 @@ fn admits(inner: &Inner, filter: &Filter, robot_id: &RobotId) -> bool {
 impl TelemetryService {
     fn list(&self, r: v1::ListRobotsRequest) -> Result<v1::ListRobotsResponse, Refusal> {
         let mut bad = Violations::default();
-        let size = page_size(r.page_size, &mut bad);
+        let size = pages::size(r.page_size, &mut bad);
         let filter = filter(r.filter, &mut bad);
         bad.finish()?;
         let inner = &self.inner;
         let ids: Vec<RobotId> = inner.picture.rows().sessions.keys().cloned().collect();
-        let mut found =
-            ids.iter().filter(|id| id.as_str() > r.page_token.as_str()).filter(|id| admits(inner, &filter, id));
-        let robots: Vec<v1::Robot> = found
-            .by_ref()
-            .take(size)
-            .filter_map(|id| encode(inner, id, inner.parts.board.get(id).as_deref()))
-            .collect();
-        let more = found.next().is_some();
-        let next_page_token = robots.last().filter(|_| more).map(|r| r.robot_id.clone()).unwrap_or_default();
+        let found = ids.iter().filter(|id| admits(inner, &filter, id)).map(|id| (id.to_string(), id));
+        let (found, next_page_token) = pages::page(found, &r.page_token, size);
+        let robots =
+            found.into_iter().filter_map(|id| encode(inner, id, inner.parts.board.get(id).as_deref())).collect();
         Ok(v1::ListRobotsResponse { robots, next_page_token })
     }
 
@@ -124,7 +109,7 @@ impl TelemetryService {
 
     async fn events(&self, r: v1::ListEventsRequest) -> Result<v1::ListEventsResponse, Refusal> {
         let mut bad = Violations::default();
-        let size = page_size(r.page_size, &mut bad);
+        let size = pages::size(r.page_size, &mut bad);
         if r.robot_ids.len() > limits::PAGE_MAX {
             bad.add("robot_ids", "must be at most 1000");
         }

@@ -5,11 +5,12 @@ use midshift_core::ids::{RobotId, RolloutId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::rollout::commands::{self, Command, Verb};
+use midshift_core::rollout::rows::Rollout;
 use midshift_core::rollout::view::View;
 use midshift_proto::convert::task::revision_of;
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::rollout_service_server::RolloutService as Face;
-use std::cmp::Reverse;
+use midshift_proto::pages;
 use std::sync::Arc;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -33,38 +34,6 @@ fn required_reason(text: &str, bad: &mut Violations) {
     if text.is_empty() || text.len() > limits::REASON_BYTES_MAX {
         bad.add("reason", "is required, 1-256 bytes");
     }
-}
-
-fn page_size(asked: u32, bad: &mut Violations) -> usize {
-    match asked as usize {
-        0 => limits::PAGE_DEFAULT,
-        n if n <= limits::PAGE_MAX => n,
-        _ => {
-            bad.add("page_size", "must be 1..1000; 0: 100");
-            limits::PAGE_DEFAULT
-        }
-    }
-}
-
-/// One page of rows in order of a key, and the key to go on after.
-fn page<K: Ord + ToString, T>(rows: impl Iterator<Item = (K, T)>, after: &str, size: usize) -> (Vec<T>, String) {
-    let mut rows = rows.peekable();
-    let mut skipping = !after.is_empty();
-    let mut out = Vec::new();
-    let mut last = String::new();
-    for (key, row) in rows.by_ref() {
-        if skipping {
-            skipping = key.to_string() != after;
-            continue;
-        }
-        last = key.to_string();
-        out.push(row);
-        if out.len() == size {
-            break;
-        }
-    }
-    let next = if rows.peek().is_some() { last } else { String::new() };
-    (out, next)
 }
 
 /// What all verbs about one roll-out say.
@@ -170,13 +139,14 @@ impl RolloutService {
 
     async fn list(&self, r: v1::ListRolloutsRequest) -> Result<v1::ListRolloutsResponse, Refusal> {
         let mut bad = Violations::default();
-        let size = page_size(r.page_size, &mut bad);
+        let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
         self.look(move |view, _, now| {
-            let mut all: Vec<_> = view.rollouts.values().collect();
-            all.sort_by_key(|r| (Reverse(r.row.created.at), r.row.rollout_id.clone()));
-            let rows = all.into_iter().map(|r| (r.row.rollout_id.to_string(), r));
-            let (rows, next_page_token) = page(rows, &r.page_token, size);
+            // The newest first.
+            let key = |r: &Rollout| format!("{:020}/{}", i64::MAX - r.created.at.0, r.rollout_id);
+            let mut all: Vec<_> = view.rollouts.values().map(|r| (key(&r.row), r)).collect();
+            all.sort_by(|a, b| a.0.cmp(&b.0));
+            let (rows, next_page_token) = pages::page(all.into_iter(), &r.page_token, size);
             let rollouts = rows.into_iter().map(|r| encode::rollout(view, now, &r.row)).collect();
             v1::ListRolloutsResponse { rollouts, next_page_token }
         })
@@ -185,7 +155,7 @@ impl RolloutService {
 
     async fn robots(&self, r: v1::ListRolloutRobotsRequest) -> Result<v1::ListRolloutRobotsResponse, Refusal> {
         let mut bad = Violations::default();
-        let size = page_size(r.page_size, &mut bad);
+        let size = pages::size(r.page_size, &mut bad);
         let rollout_id = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
         bad.finish()?;
         let rollout_id = rollout_id.ok_or_else(internal)?;
@@ -195,7 +165,7 @@ impl RolloutService {
             })?;
             let asked = |id: &RobotId| r.robot_id.is_empty() || id.as_str() == r.robot_id;
             let rows = view.robots_of(&rollout_id).filter(|r| asked(&r.robot_id));
-            let (rows, next_page_token) = page(rows.map(|r| (r.robot_id.to_string(), r)), &r.page_token, size);
+            let (rows, next_page_token) = pages::page(rows.map(|r| (r.robot_id.to_string(), r)), &r.page_token, size);
             let robots = rows.into_iter().map(|r| encode::robot(view, board, now, row, r)).collect();
             Ok(v1::ListRolloutRobotsResponse { robots, next_page_token })
         })
@@ -241,11 +211,11 @@ impl RolloutService {
 
     async fn software(&self, r: v1::ListRobotSoftwareRequest) -> Result<v1::ListRobotSoftwareResponse, Refusal> {
         let mut bad = Violations::default();
-        let size = page_size(r.page_size, &mut bad);
+        let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
         self.look(move |view, _, _| {
             let rows = view.software.iter().filter(|(id, _)| r.robot_id.is_empty() || **id == r.robot_id);
-            let (rows, next_page_token) = page(rows.map(|(id, s)| (id.clone(), s)), &r.page_token, size);
+            let (rows, next_page_token) = pages::page(rows.map(|(id, s)| (id.clone(), s)), &r.page_token, size);
             let software = rows.into_iter().map(|s| encode::software(&s.row)).collect();
             v1::ListRobotSoftwareResponse { software, next_page_token }
         })
@@ -254,11 +224,11 @@ impl RolloutService {
 
     async fn quarantines(&self, r: v1::ListQuarantinesRequest) -> Result<v1::ListQuarantinesResponse, Refusal> {
         let mut bad = Violations::default();
-        let size = page_size(r.page_size, &mut bad);
+        let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
         self.look(move |view, _, _| {
             let rows = view.quarantines.iter().map(|(id, q)| (id.clone(), q));
-            let (rows, next_page_token) = page(rows, &r.page_token, size);
+            let (rows, next_page_token) = pages::page(rows, &r.page_token, size);
             let quarantines = rows.into_iter().map(|q| encode::quarantine(view, &q.row)).collect();
             v1::ListQuarantinesResponse { quarantines, next_page_token }
         })
