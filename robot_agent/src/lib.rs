@@ -10,6 +10,7 @@ pub mod device;
 pub mod dial;
 mod drive;
 pub mod governor;
+mod installed;
 pub mod lanes;
 pub mod launcher;
 pub mod ledger;

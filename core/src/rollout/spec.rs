@@ -14,6 +14,8 @@ pub const WAVES_MAX: usize = 32;
 const NAMED_MAX: usize = 1_000;
 /// Time limits, milliseconds of site time.
 const LIMIT_MS: RangeInclusive<u64> = 1_000..=30 * 24 * 3_600_000;
+/// Probation of a roll-out that names none, milliseconds of site time.
+pub const PROBATION_DEFAULT_MS: u64 = 180_000;
 /// Probation, milliseconds of site time.
 const PROBATION_MS: RangeInclusive<u64> = 1_000..=24 * 3_600_000;
 
@@ -130,7 +132,7 @@ impl RolloutSpec {
             waves: vec![Wave::Count(1), Wave::Percent(25), Wave::Rest],
             max_in_flight: None,
             drain_within_ms: 600_000,
-            probation_ms: 180_000,
+            probation_ms: PROBATION_DEFAULT_MS,
             soak_ms: 600_000,
             exposure_tasks: 2,
             exposure_within_ms: 3_600_000,

@@ -111,7 +111,8 @@ const TASKS_PER_ROBOT_HOUR: f64 = 45.0;
 const LOAD: f64 = 0.6;
 /// Open tasks a robot of the Poisson client at most.
 const BACKLOG_PER_ROBOT: usize = 3;
-
+/// Probation of roll-outs that name none, milliseconds of site time: nobody waits minutes for each simulated robot.
+const PROBATION_MS: u64 = 10_000;
 /// Where `dev` hears beacons if nobody else does.
 const BEACONS: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 7422);
 
@@ -170,7 +171,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     };
     // The server ends after its robots and its client, or the last of them would be cut off at Ctrl-C.
     let served_until = CancellationToken::new();
-    let server = Server::new(parts, served_until.clone()).await?.hearing(beacons);
+    let server = Server::new(parts, served_until.clone()).await?.hearing(beacons).with_probation(PROBATION_MS);
     say(&greeting(&args, &site, address, &software));
     let stage = match scene {
         Some(scene) => {

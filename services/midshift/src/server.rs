@@ -149,6 +149,11 @@ impl Server {
         Self { beacons, ..self }
     }
 
+    /// Roll-outs that name no probation have this one, milliseconds of site time.
+    pub fn with_probation(self, probation_ms: u64) -> Self {
+        Self { rollouts: self.rollouts.with_probation(probation_ms), ..self }
+    }
+
     /// Fleet, for whoever reports in this process.
     pub fn fleet(&self) -> FleetService {
         self.fleet.clone()

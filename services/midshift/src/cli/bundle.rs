@@ -125,29 +125,6 @@ impl From<Who> for Profile {
     }
 }
 
-/// What was asked breaks rules, or could not be done.
-impl From<Error> for Exit {
-    fn from(error: Error) -> Self {
-        match error {
-            Error::Refused(refusal) | Error::Bundle(build::Error::Refused(refusal)) => {
-                anyhow::Error::from(refusal).into()
-            }
-            other => Self::new(1, other.to_string()),
-        }
-    }
-}
-
-/// What was looked at does not hold: a finding, not a mistake of the caller.
-pub fn does_not_hold(error: Error) -> Exit {
-    match error {
-        Error::Refused(refusal) | Error::Bundle(build::Error::Refused(refusal)) => {
-            let lines = refusal.violations.iter().map(|v| format!("\n  {}: {}", v.field, v.description));
-            Exit::new(1, format!("it does not hold:{}", lines.collect::<String>()))
-        }
-        other => other.into(),
-    }
-}
-
 /// Runs one verb.
 pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     match verb {
@@ -165,7 +142,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             };
             samples(&dir, program.as_deref(), signer, out)
         }
-        Verb::Inspect { bundle } => show(&build::inspect(&bundle).map_err(|e| does_not_hold(e.into()))?, out),
+        Verb::Inspect { bundle } => show(&build::inspect(&bundle).map_err(|e| Exit::of_finding(e.into()))?, out),
         Verb::Verify { repository } => verify(&repository, out),
         Verb::Push { repository, call } => push::run(&repository, &call, out).await,
         Verb::Ls { call } => released::list(&call, out).await,
@@ -254,7 +231,7 @@ fn samples(dir: &Path, program: Option<&Path>, signer: Signer<'_>, out: &Out) ->
 }
 
 fn verify(repository: &Path, out: &Out) -> Result<(), Exit> {
-    let checked = Folder::open(repository)?.check().map_err(does_not_hold)?;
+    let checked = Folder::open(repository)?.check().map_err(Exit::of_finding)?;
     match out.format {
         Format::Json | Format::Jsonl => {
             let bundles: Vec<_> = checked.bundles.iter().map(Manifest::target).collect();

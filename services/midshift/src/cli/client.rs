@@ -2,6 +2,8 @@
 
 use crate::cli::out::Out;
 use crate::robots::uri;
+use midshift_bundle::build;
+use midshift_bundle::folder::Error;
 use midshift_core::reason::{Kind, Refusal};
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
@@ -65,10 +67,32 @@ impl Exit {
         self.text += &format!("\n  try: {what}");
         self
     }
+    /// What was looked at does not hold: a finding, not a mistake of the caller.
+    pub fn of_finding(error: Error) -> Self {
+        match error {
+            Error::Refused(refusal) | Error::Bundle(build::Error::Refused(refusal)) => {
+                let lines = refusal.violations.iter().map(|v| format!("\n  {}: {}", v.field, v.description));
+                Self::new(1, format!("it does not hold:{}", lines.collect::<String>()))
+            }
+            other => other.into(),
+        }
+    }
     /// Says why and gives the code.
     pub fn report(&self, out: &Out) -> ExitCode {
         out.say(&format!("error: {}", self.text));
         ExitCode::from(self.code)
+    }
+}
+
+/// What was asked breaks rules, or could not be done.
+impl From<Error> for Exit {
+    fn from(error: Error) -> Self {
+        match error {
+            Error::Refused(refusal) | Error::Bundle(build::Error::Refused(refusal)) => {
+                anyhow::Error::from(refusal).into()
+            }
+            other => Self::new(1, other.to_string()),
+        }
     }
 }
 

@@ -3,7 +3,6 @@
 //! Invariant: nothing is pushed over what somebody else published: what the server has must be in the folder, byte for byte. Files go
 //! before the document that lists them.
 
-use super::bundle::does_not_hold;
 use super::client::{Call, Exit, unary};
 use super::out::Out;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -37,7 +36,7 @@ impl From<documents::Error> for Exit {
 /// Brings what is missing, file by file, then publishes.
 pub async fn run(path: &Path, call: &Call, out: &Out) -> Result<(), Exit> {
     let folder = Folder::open(path)?;
-    let checked = folder.check().map_err(does_not_hold)?;
+    let checked = folder.check().map_err(Exit::of_finding)?;
     let Some(newest) = checked.targets_version else {
         let next = format!("midshift bundle sign BUNDLE --repository {} --key targets-1.pem", path.display());
         return Err(Exit::usage(format!("nothing is signed in {}\n  try: {next}", path.display())));

@@ -25,9 +25,9 @@ pub fn bundle(view: &View, text: &str) -> Result<BundleId, Refusal> {
     newest.ok_or_else(|| Refusal::new(Kind::NotFound, reason()))
 }
 
-/// A spec as a caller wrote it, with every default in its place.
-pub fn spec(wire: &v1::RolloutSpec, bundle: BundleId, bad: &mut Violations) -> RolloutSpec {
-    let default = RolloutSpec::new(bundle);
+/// A spec as a caller wrote it, with every default in its place; that of the probation is the server's, in milliseconds of site time.
+pub fn spec(wire: &v1::RolloutSpec, bundle: BundleId, probation_ms: u64, bad: &mut Violations) -> RolloutSpec {
+    let default = RolloutSpec { probation_ms, ..RolloutSpec::new(bundle) };
     let mut ms = |field: &str, duration: &Option<Duration>, default: u64| match duration.as_ref().map(ms_of) {
         None => default,
         Some(ms) => u64::try_from(ms).unwrap_or_else(|_| {

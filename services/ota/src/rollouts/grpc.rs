@@ -86,7 +86,7 @@ impl RolloutService {
         bad.finish()?;
         let bundle = self.bundle(&spec.bundle).await?;
         let mut bad = Violations::default();
-        let spec = decode::spec(&spec, bundle, &mut bad);
+        let spec = decode::spec(&spec, bundle, self.probation_ms, &mut bad);
         spec.check(&mut bad);
         bad.finish()?;
         let rollout_id = rollout_id.ok_or_else(internal)?;
@@ -99,12 +99,13 @@ impl RolloutService {
         let rollout_id = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
         bad.finish()?;
         let rollout_id = rollout_id.ok_or_else(internal)?;
+        let probation_ms = self.probation_ms;
         self.look(move |view, board, _| {
             let spec = match r.spec {
                 Some(wire) => {
                     let bundle = decode::bundle(view, &wire.bundle)?;
                     let mut bad = Violations::default();
-                    let spec = decode::spec(&wire, bundle, &mut bad);
+                    let spec = decode::spec(&wire, bundle, probation_ms, &mut bad);
                     bad.finish()?;
                     Arc::new(spec)
                 }

@@ -16,6 +16,7 @@ use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::Board;
 use midshift_core::rollout::bugs::Bugs;
 use midshift_core::rollout::commands::Command;
+use midshift_core::rollout::spec::PROBATION_DEFAULT_MS;
 use midshift_core::rollout::view::View;
 use midshift_core::rows::{Revision, Seq};
 use midshift_core::site::Site;
@@ -65,6 +66,8 @@ pub struct RolloutService {
     changed: channel::Receiver<Seq>,
     shutdown: CancellationToken,
     has_keys: bool,
+    /// Probation of roll-outs that name none, milliseconds of site time.
+    probation_ms: u64,
 }
 
 /// The part that runs.
@@ -80,8 +83,13 @@ impl RolloutService {
         let (sender, requests) = mpsc::channel(REQUESTS_MAX);
         let (changed, receiver) = channel::channel(Seq(0));
         let has_keys = parts.ota.opened().is_ok();
-        let service = Self { requests: sender, changed: receiver, shutdown, has_keys };
+        let probation_ms = PROBATION_DEFAULT_MS;
+        let service = Self { requests: sender, changed: receiver, shutdown, has_keys, probation_ms };
         (service, Planner { parts, requests, changed })
+    }
+    /// Roll-outs that name no probation have this one instead of [`PROBATION_DEFAULT_MS`], milliseconds of site time.
+    pub fn with_probation(self, probation_ms: u64) -> Self {
+        Self { probation_ms, ..self }
     }
     /// The gRPC face.
     pub fn grpc(&self) -> RolloutServiceServer<Self> {

@@ -29,7 +29,7 @@ pub struct Create {
     /// Site time for which a wave is only watched. Without it 10m.
     #[arg(long, value_parser = crate::cli::duration)]
     soak: Option<Duration>,
-    /// Site time on probation, without work, after the switch. Without it 3m.
+    /// Site time on probation, without work, after the switch. Without it 3m, or 10s on a server of `dev`.
     #[arg(long, value_parser = crate::cli::duration)]
     probation: Option<Duration>,
     /// Site time that a robot may take to end its work. Without it 10m.
