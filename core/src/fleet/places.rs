@@ -1,7 +1,7 @@
 //! Grants places along routes: all passages up to the next standing place together with it, or nothing.
 //!
 //! Invariant: a place is given on only by the robot's own report or by a person, never by time. Queue order is class, then age;
-//! a request that cannot be served blocks later ones on its places. First of all comes who lost a place of its released stretch:
+//! a request that cannot be served keeps the place it goes to from later ones, and once that has a seat the passages on the way too. First of all comes who lost a place of its released stretch:
 //! it may stand in a passage for which the others wait. Grants are traffic, never a safety function.
 
 use super::Tx;
@@ -205,8 +205,9 @@ fn serve(tx: &mut Tx, live: &Live, releases: &mut Releases, traffic: &mut Traffi
     let Some(a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
     let Some(work) = assignment(tx.view, robot_id, &a).cloned() else { return };
     let lost = missing(tx.view, live, &a);
+    let is_whole = lost.is_empty();
     let (needed, released) = match next_segment(tx.view, robot_id, &a, &work) {
-        _ if !lost.is_empty() => (lost, None),
+        _ if !is_whole => (lost, None),
         Some(segment) => (segment.places(), Some(segment.end as u32)),
         None => return,
     };
@@ -224,9 +225,29 @@ fn serve(tx: &mut Tx, live: &Live, releases: &mut Releases, traffic: &mut Traffi
     tx.view.place_waits += u64::from(!tx.view.waits.contains_key(robot_id));
     let since = tx.view.waits.entry(robot_id.clone()).or_insert(Waiting { places: Vec::new(), since: now }).since;
     tx.view.waits.insert(robot_id.clone(), Waiting { places: names, since });
-    if !step_aside(tx, &a, &work, since, releases, traffic) {
-        traffic.blocked.extend(needed);
+    if step_aside(tx, &a, &work, since, releases, traffic) {
+        return;
     }
+    // Who lost places may stand in them.
+    let kept = if is_whole { kept_free(tx.view, robot_id, &needed, traffic) } else { needed };
+    traffic.blocked.extend(kept);
+}
+
+/// Places that a wish keeps free for itself. While there is no seat where it goes to, only that seat: who leaves the seat may need the same
+/// passage. While the area there admits nobody, nothing: who is inside may need the seat.
+fn kept_free(view: &View, robot_id: &RobotId, needed: &[PlaceIx], traffic: &Traffic) -> Vec<PlaceIx> {
+    let place = |ix: &PlaceIx| view.site.place(*ix);
+    if !needed.iter().all(|ix| traffic.admits(view, robot_id, place(ix))) {
+        return Vec::new();
+    }
+    let (seats, passages): (Vec<_>, Vec<_>) = needed.iter().partition(|ix| place(ix).waypoint().is_some());
+    let is_free = |ix: &PlaceIx| has_seat(view, robot_id, *ix) && !traffic.blocked.contains(ix);
+    if seats.iter().all(is_free) { [seats, passages].concat() } else { seats }
+}
+
+fn has_seat(view: &View, robot_id: &RobotId, ix: PlaceIx) -> bool {
+    let place = view.places.get(view.site.place(ix).place_id.as_str()).map(|p| &p.row);
+    place.is_some_and(|p| p.holder(robot_id).is_some() || p.has_room())
 }
 
 /// Places on the released stretch ahead that a standing robot does not hold: a passage that its route crosses a second time, or grants that

@@ -13,9 +13,10 @@ use midshift_bundle::keys::SecretKey;
 use midshift_core::site::{DEMO, text};
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::ota::v1::{GetRolloutRequest, ListQuarantinesRequest};
+use std::io::{BufRead, BufReader};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 /// A launcher with what it started; all of it goes with this.
 struct Robot {
@@ -118,8 +119,14 @@ async fn a_release_reaches_a_robot_and_a_bad_one_goes_back_though_the_server_is_
         Ok((rollout.counts.unwrap_or_default().attempted > 0).then_some(()))
     })
     .await?;
+    // Who watches is told that the server is gone, and goes on when it is back.
+    let watch = ["rollout", "watch", "--server", &address, "walk-1.6.0-bad-at-start"];
+    let mut watching = Command::new(midshift()?).args(watch).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
+    let mut said = BufReader::new(watching.stdout.take().context("no pipe")?).lines();
+    ensure!(said.next().is_some(), "nothing was said of the roll-out");
     server.kill_and_restart().await?;
-    let waited = wait("walk-1.6.0-bad-at-start")?;
+    ensure!(said.all(|line| line.is_ok()), "what it said cannot be read");
+    let waited = watching.wait_with_output()?;
     assert_eq!(waited.status.code(), Some(12), "{}", String::from_utf8_lossy(&waited.stderr));
     assert_eq!(robot.committed()?.as_deref(), Some("1.5.0"), "it is back on what it kept");
     assert!(robot.switch()?.trial.is_none());

@@ -513,3 +513,23 @@ fn a_fleet_of_twelve_takes_a_good_bundle_without_a_person() {
     scene.comes_to_rest();
     scene.all_run(Some(GOOD[0]));
 }
+
+#[test]
+fn a_fleet_of_sixty_takes_a_good_bundle_without_a_person() {
+    // The demo floor parks twelve robots, two in each of its six parks.
+    let site = DEMO.replace(r#"kind = "park", capacity = 2"#, r#"kind = "park", capacity = 12"#);
+    let mut scene = Scene::with(RoomConfig { site, ..config(39, 60, Naive::default()) });
+    scene.begin("crowd", GOOD[0], |spec| waves(spec, &[Size::Count(1), Size::Percent(25), Size::Rest(true)]));
+    let row = scene.ends("crowd");
+    assert_eq!(row.phase, Phase::Completed);
+    let proved: Vec<_> = row.verdicts.iter().map(|v| (v.outcome, v.attempted)).collect();
+    assert_eq!(
+        proved,
+        [(Outcome::PromotedUnproven, 1), (Outcome::Promoted, 16), (Outcome::Promoted, 60)],
+        "one clean robot proves nothing"
+    );
+    let bounds: Vec<u16> = row.verdicts.iter().map(|v| v.robots.upper_bound_permille).collect();
+    assert!(bounds.is_sorted_by(|a, b| a > b), "{bounds:?}");
+    scene.comes_to_rest();
+    scene.all_run(Some(GOOD[0]));
+}

@@ -192,6 +192,36 @@ async fn robots_that_stand_in_each_others_goals_step_aside_and_both_arrive() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn robots_that_wait_for_a_full_station_do_not_keep_those_inside_from_leaving_it() {
+    let mut w = World::on(DEMO).await;
+    // Three seats, and one way in and out: the crossing. Those inside end their tasks there and are given the next; the others wait in bays.
+    for (n, at) in ["park-2", "park-2", "park-4", "park-4", "park-6", "park-6"].iter().enumerate() {
+        w.robot(&format!("r{n}"), at).await;
+    }
+    for n in 0..3 {
+        let robot_id = format!("r{n}");
+        w.submit_with(&format!("T{n}"), "A03", "P01", |raw| raw.robot_id = robot_id.clone()).await;
+        w.submit_with(&format!("U{n}"), "B03", "L2-out", |raw| raw.robot_id = robot_id).await;
+        w.until("it loads", |s| s.has(&format!("r{n}"), "A03")).await;
+    }
+    w.until("they are inside", |s| s.holders("P01").iter().filter(|h| h.1 == HolderState::Inside).count() == 3).await;
+    for n in 0..3 {
+        w.r(&format!("r{n}")).works = false;
+    }
+    for n in 3..6 {
+        w.submit_with(&format!("T{n}"), "P01", "B02", |raw| raw.robot_id = format!("r{n}")).await;
+    }
+    w.pass(2).await;
+    for n in 0..3 {
+        w.r(&format!("r{n}")).works = true;
+    }
+    for id in ["T3", "T4", "T5", "U0", "U1", "U2"] {
+        w.until_phase(id, Phase::Succeeded).await;
+    }
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn ten_robots_on_the_demo_floor_all_get_their_work_done() {
     let mut w = World::on(DEMO).await;
     let stands = ["park-1", "park-1", "park-2", "park-2", "park-3", "park-3", "park-4", "park-4", "hold-a", "hold-b"];

@@ -11,15 +11,22 @@ use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::sim::v1::sim_service_client::SimServiceClient;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
+use std::ops::ControlFlow;
 use std::process::ExitCode;
 use std::time::Duration;
+use tokio::time::Instant;
 use tonic::transport::{Channel, Endpoint};
-use tonic::{Code, Request, Status};
+use tonic::{Code, Request, Status, Streaming};
 
 /// A server that does not answer a connection within this is not there.
 const CONNECT_WITHIN: Duration = Duration::from_secs(3);
 /// Longest unary call.
 const CALL_WITHIN: Duration = Duration::from_secs(30);
+/// A server that is gone while something is followed may stay away so long.
+const AWAY_MAX: Duration = Duration::from_secs(600);
+/// Pauses between looks for it.
+const PAUSE_MIN: Duration = Duration::from_millis(250);
+const PAUSE_MAX: Duration = Duration::from_secs(5);
 
 /// What a server says to a call that it does not know.
 const NOT_THERE: &str = "this server does not know the call\n  try: faults and worlds are with `midshift dev` or `midshift sim run --listen`; \
@@ -148,6 +155,53 @@ impl From<Status> for Exit {
             text += &format!("\n  try: {help}");
         }
         Self::new(code, text)
+    }
+}
+
+/// Takes the messages of a stream until `take` breaks, through restarts of the server: a stream that was cut is opened again, and says
+/// again what is known then. `take` is given nothing when the server ended the stream in order.
+///
+/// # Errors
+/// What `open` says the first time; what `take` says; a refusal; a server that stays away longer than [`AWAY_MAX`].
+pub async fn follow<T, B>(
+    out: &Out,
+    open: impl AsyncFn() -> Result<Streaming<T>, Exit>,
+    mut take: impl FnMut(Option<T>) -> Result<ControlFlow<B>, Exit>,
+) -> Result<B, Exit> {
+    let mut stream = open().await?;
+    loop {
+        let message = match stream.message().await {
+            Ok(message) => message,
+            Err(status) if was_cut(&status) => None,
+            Err(status) => return Err(Exit::with_facts(status)),
+        };
+        let is_cut = message.is_none();
+        if let ControlFlow::Break(end) = take(message)? {
+            return Ok(end);
+        }
+        if is_cut {
+            out.say("the server ended the stream; waiting until it is back");
+            stream = again(&open).await?;
+        }
+    }
+}
+
+/// The connection is gone, and with it what the answer would have been.
+fn was_cut(status: &Status) -> bool {
+    matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled | Code::Internal)
+}
+
+/// Opens a stream as soon as there is a server for it.
+async fn again<T>(open: &impl AsyncFn() -> Result<Streaming<T>, Exit>) -> Result<Streaming<T>, Exit> {
+    let begun = Instant::now();
+    let mut pause = PAUSE_MIN;
+    loop {
+        tokio::time::sleep(pause).await;
+        pause = (pause * 2).min(PAUSE_MAX);
+        match open().await {
+            Err(exit) if exit.code == 5 && begun.elapsed() < AWAY_MAX => {}
+            opened => return opened,
+        }
     }
 }
 

@@ -9,6 +9,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use midshift_core::task::forms::Transport;
 use midshift_proto::task::v1::{self, watch_tasks_response::Item};
 use std::io::IsTerminal;
+use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -539,8 +540,7 @@ async fn watch(call: &Call, task_ids: Vec<String>, cursor: String, out: &Out) ->
     Ok(())
 }
 
-/// Follows one task to its end; exit code by how it ended.
-/// Follows a task to its end; `told` is what was last said of it.
+/// Follows a task to its end; exit code by how it ended; `told` is what was last said of it.
 async fn follow(call: &Call, task_id: &str, told: String, timeout: Duration, out: &Out) -> Result<(), Exit> {
     let end = tokio::time::timeout(timeout, until_over(call, task_id, told, out)).await;
     let task = end.map_err(|_| {
@@ -573,24 +573,30 @@ fn tell(task_id: &str, told: &str, task: &v1::Task, out: &Out) -> String {
 }
 
 async fn until_over(call: &Call, task_id: &str, mut told: String, out: &Out) -> Result<v1::Task, Exit> {
-    let filter = v1::TaskFilter { task_ids: vec![task_id.to_owned()], ..v1::TaskFilter::default() };
-    let mut stream = call
-        .task()
-        .await?
-        .watch_tasks(v1::WatchTasksRequest { filter: Some(filter), cursor: String::new() })
-        .await?
-        .into_inner();
-    while let Some(message) = stream.message().await? {
-        let task = match message.item {
+    let open = async || {
+        let filter = v1::TaskFilter { task_ids: vec![task_id.to_owned()], ..v1::TaskFilter::default() };
+        let request = v1::WatchTasksRequest { filter: Some(filter), cursor: String::new() };
+        Ok(call.task().await?.watch_tasks(request).await?.into_inner())
+    };
+    let mut is_known = false;
+    let take = |message: Option<v1::WatchTasksResponse>| {
+        let task = match message.and_then(|m| m.item) {
             Some(Item::Existing(task)) => task,
             Some(Item::Change(change)) => change.task.unwrap_or_default(),
-            _ => continue,
+            Some(Item::Bookmark(_)) if !is_known => {
+                return Err(Exit::new(4, format!("the server knows no task {task_id}\n  try: midshift task ls")));
+            }
+            Some(Item::Bookmark(_)) => return Ok(ControlFlow::Continue(())),
+            None => {
+                is_known = false;
+                return Ok(ControlFlow::Continue(()));
+            }
         };
+        is_known = true;
         told = tell(task_id, &told, &task, out);
         use v1::TaskState::{Canceled, Expired, Failed, NeedsOperator, Succeeded};
-        if matches!(task.state(), Succeeded | Failed | Canceled | Expired | NeedsOperator) {
-            return Ok(task);
-        }
-    }
-    Err(Exit::new(5, "the server ended the watch\n  try: again"))
+        let is_over = matches!(task.state(), Succeeded | Failed | Canceled | Expired | NeedsOperator);
+        Ok(if is_over { ControlFlow::Break(task) } else { ControlFlow::Continue(()) })
+    };
+    super::client::follow(out, open, take).await
 }

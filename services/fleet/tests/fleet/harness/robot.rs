@@ -455,6 +455,12 @@ impl Robot {
             return;
         }
         self.move_to(point, &needed);
+        if next + 1 == job.route.len()
+            && let Some(seat) = &point.standing
+        {
+            // At its goal it is out of the passages that led there.
+            self.move_to(point, std::slice::from_ref(seat));
+        }
         self.at = next;
         self.progress += 1;
     }

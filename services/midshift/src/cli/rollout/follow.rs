@@ -3,14 +3,16 @@
 //! Invariant: nothing is asked again and again; the server sends each change.
 
 use super::{One, Until, text};
-use crate::cli::client::Exit;
+use crate::cli::client::{Exit, follow};
 use crate::cli::out::{Format, Out};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use midshift_proto::ota::v1::{self, RolloutPhase};
 use prost_types::Timestamp;
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
+use std::ops::ControlFlow;
 use std::time::Duration;
+use tonic::Streaming;
 
 /// Exit code: a person must judge.
 const REVIEW: u8 = 11;
@@ -98,15 +100,13 @@ pub fn end(rollout: &v1::Rollout, until: Until) -> Option<Result<(), Exit>> {
     }
 }
 
-fn cut() -> Exit {
-    Exit::new(5, "the server ended the watch\n  try: again")
+async fn messages(one: &One) -> Result<Streaming<v1::WatchRolloutResponse>, Exit> {
+    let request = v1::WatchRolloutRequest { rollout_id: one.rollout_id.clone() };
+    Ok(one.call.rollouts().await?.watch_rollout(request).await.map_err(Exit::with_facts)?.into_inner())
 }
 
 /// Follows to the end.
 pub async fn watch(one: &One, out: &Out) -> Result<(), Exit> {
-    let request = v1::WatchRolloutRequest { rollout_id: one.rollout_id.clone() };
-    let answer = one.call.rollouts().await?.watch_rollout(request).await.map_err(Exit::with_facts)?;
-    let mut stream = answer.into_inner();
     let mut picture = Picture::default();
     let is_live = out.format == Format::Table && std::io::stdout().is_terminal();
     let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::hidden());
@@ -114,46 +114,50 @@ pub async fn watch(one: &One, out: &Out) -> Result<(), Exit> {
         bar.set_draw_target(ProgressDrawTarget::stdout());
         bar.set_style(ProgressStyle::with_template("{msg}").unwrap_or_else(|_| ProgressStyle::default_spinner()));
     }
-    while let Some(message) = stream.message().await.map_err(Exit::with_facts)? {
-        if matches!(out.format, Format::Json | Format::Jsonl) {
-            out.json(&message)?;
-            picture.take(message);
-            continue;
-        }
-        let news = picture.take(message);
-        if is_live {
-            bar.set_message(picture.lines().join("\n"));
-        } else {
-            news.iter().for_each(|line| out.line(line));
-        }
-    }
+    let end = follow(
+        out,
+        async || messages(one).await,
+        |message| {
+            let Some(message) = message else {
+                return Ok(end(&picture.rollout, Until::Ended).map_or(ControlFlow::Continue(()), ControlFlow::Break));
+            };
+            if matches!(out.format, Format::Json | Format::Jsonl) {
+                out.json(&message)?;
+                picture.take(message);
+                return Ok(ControlFlow::Continue(()));
+            }
+            let news = picture.take(message);
+            if is_live {
+                bar.set_message(picture.lines().join("\n"));
+            } else {
+                news.iter().for_each(|line| out.line(line));
+            }
+            Ok(ControlFlow::Continue(()))
+        },
+    );
+    let end = end.await?;
     if is_live {
         bar.finish_and_clear();
         picture.lines().iter().for_each(|line| out.line(line));
     }
     out.next(&text::next(&picture.rollout));
-    end(&picture.rollout, Until::Ended).unwrap_or_else(|| Err(cut()))
+    end
 }
 
 /// Waits for an end.
 pub async fn wait(one: &One, until: Until, timeout: Duration, out: &Out) -> Result<(), Exit> {
     let id = &one.rollout_id;
-    let (rollout, end) = tokio::time::timeout(timeout, until_end(one, until)).await.map_err(|_| {
+    let (rollout, end) = tokio::time::timeout(timeout, until_end(one, until, out)).await.map_err(|_| {
         Exit::new(10, format!("{id} has not ended after {timeout:?}\n  try: midshift rollout get {id} --robots"))
     })??;
     out.one(&rollout, id, || text::header(&rollout).join("\n"))?;
     end
 }
 
-async fn until_end(one: &One, until: Until) -> Result<(v1::Rollout, Result<(), Exit>), Exit> {
-    let request = v1::WatchRolloutRequest { rollout_id: one.rollout_id.clone() };
-    let answer = one.call.rollouts().await?.watch_rollout(request).await.map_err(Exit::with_facts)?;
-    let mut stream = answer.into_inner();
-    while let Some(message) = stream.message().await.map_err(Exit::with_facts)? {
-        let rollout = message.rollout.unwrap_or_default();
-        if let Some(end) = end(&rollout, until) {
-            return Ok((rollout, end));
-        }
-    }
-    Err(cut())
+async fn until_end(one: &One, until: Until, out: &Out) -> Result<(v1::Rollout, Result<(), Exit>), Exit> {
+    let take = |message: Option<v1::WatchRolloutResponse>| {
+        let rollout = message.and_then(|m| m.rollout).unwrap_or_default();
+        Ok(end(&rollout, until).map_or(ControlFlow::Continue(()), |end| ControlFlow::Break((rollout, end))))
+    };
+    follow(out, async || messages(one).await, take).await
 }
