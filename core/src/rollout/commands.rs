@@ -3,7 +3,8 @@
 //!
 //! Invariant: a command is checked against the whole picture before anything of it is written; asked twice it does the same once.
 
-use super::matching::{self, Matching, Members, keeps};
+use super::dry_run::{bundle, dry_run};
+use super::matching::{self, Members, keeps};
 use super::rows::{
     Act, Bundle, Counted, Outcome, Pause, Phase, Quarantine, RobotSoftware, Rollout, RolloutRobot, Step, Verdict,
 };
@@ -18,11 +19,6 @@ use crate::rows::Revision;
 use crate::time::Now;
 use std::collections::BTreeSet;
 use std::sync::Arc;
-
-/// Milliseconds of site time for which an estimate takes a robot out of work, beside its probation: to end its task and to park.
-const PLANNED_OFF_WORK_MS: u64 = 120_000;
-/// A probation shorter than this is told to be short, milliseconds.
-const SHORT_PROBATION_MS: u64 = 60_000;
 
 /// One request about a roll-out.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -104,125 +100,8 @@ pub enum Command {
     },
 }
 
-/// What a roll-out would do.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct DryRun {
-    /// Whom it would reach.
-    pub matching: Matching,
-    /// Bytes of all components.
-    pub bytes: u64,
-    /// Milliseconds of site time that it takes at least, under the budgets.
-    pub least_ms: u64,
-    /// What a person should know, and what nothing forbids.
-    pub caveats: Vec<String>,
-}
-
 fn not_found(code: Code, key: &str, id: &impl ToString) -> Refusal {
     Refusal::new(Kind::NotFound, Reason::from(code).with(key, id.to_string()))
-}
-
-fn bundle<'a>(view: &'a View, id: &BundleId) -> Result<&'a Bundle, Refusal> {
-    let bundle = view.bundles.get(id.as_str()).map(|b| &b.row);
-    let bundle = bundle.ok_or_else(|| not_found(Code::BundleNotFound, "bundle", id))?;
-    if bundle.revoked.is_some() || !bundle.listed {
-        return Err(Refusal::new(Kind::Precondition, Reason::from(Code::BundleRevoked).with("bundle", id)));
-    }
-    Ok(bundle)
-}
-
-/// What a roll-out would do, or everything that speaks against it.
-///
-/// # Errors
-/// A bundle that is not there; rules that are broken; nobody matched; a first wave that is too large; a budget that lets nobody out.
-pub fn dry_run(view: &View, board: &Board, id: &RolloutId, spec: &RolloutSpec) -> Result<DryRun, Refusal> {
-    let mut bad = Violations::default();
-    spec.check(&mut bad);
-    bad.finish()?;
-    let bundle = bundle(view, &spec.bundle)?;
-    let matching = matching::of(view, board, id, spec, bundle);
-    let robots = matching.robots.len();
-    if robots == 0 {
-        let mut reason = Reason::from(Code::RolloutMatchesNobody);
-        for (code, count) in matching.left_out_by_code().into_iter().take(8) {
-            reason = reason.with(code.as_str(), count);
-        }
-        return Err(Refusal::new(Kind::Precondition, reason));
-    }
-    let sizes = matching.sizes(spec.waves.len());
-    // A wave that takes nobody proves nothing: the first is the first with a robot in it.
-    let first = sizes.iter().copied().find(|size| *size > 0).unwrap_or_default() as usize;
-    if !spec.allow_full_push && first > (robots / 10).max(1) {
-        let reason = Reason::from(Code::RolloutFullPush).with("first_wave", first).with("robots", robots);
-        return Err(Refusal::new(Kind::Precondition, reason));
-    }
-    budgets(view, &matching)?;
-    let caveats = caveats(spec, bundle, &matching);
-    Ok(DryRun { least_ms: least_ms(view, spec, &matching), bytes: bundle.length, matching, caveats })
-}
-
-/// Areas whose rules let nobody out are told now, not when everybody waits.
-fn budgets(view: &View, matching: &Matching) -> Result<(), Refusal> {
-    let areas: BTreeSet<_> = matching.robots.iter().filter_map(|r| r.stratum.area.as_ref()).collect();
-    for area in areas {
-        for (capability, least) in &view.policy(area).software.keep_in_work {
-            let able = |id: &RobotId| {
-                let session = view.sessions.get(id.as_str());
-                session.is_some_and(|s| s.row.inventory.capabilities.contains(capability))
-            };
-            let here = view.software.values().filter(|s| s.row.area.as_ref() == Some(area)).map(|s| &s.row.robot_id);
-            let there = here.filter(|id| able(id)).count() as u32;
-            let reached = matching.robots.iter().any(|r| r.stratum.area.as_ref() == Some(area) && able(&r.robot_id));
-            if reached && there <= *least {
-                let reason = Reason::from(Code::BudgetImpossible).with("area_id", area).with("capability", capability);
-                return Err(Refusal::new(Kind::Precondition, reason.with("robots", there).with("keep_in_work", least)));
-            }
-        }
-    }
-    Ok(())
-}
-
-fn least_ms(view: &View, spec: &RolloutSpec, matching: &Matching) -> u64 {
-    let each = PLANNED_OFF_WORK_MS + spec.probation_ms;
-    let areas: BTreeSet<_> = matching.robots.iter().map(|r| r.stratum.area.clone()).collect();
-    let wave = |wave: u32, size: u32| {
-        let rounds = areas.iter().map(|area| {
-            let here = matching.robots.iter().filter(|r| r.wave == wave && r.stratum.area == *area).count();
-            let most = area.as_ref().map_or(usize::MAX, |area| {
-                let all = view.software.values().filter(|s| s.row.area.as_ref() == Some(area)).count();
-                view.policy(area).software.off_work_max(all)
-            });
-            here.div_ceil(most.min(spec.max_in_flight.unwrap_or(size).max(1) as usize).max(1)) as u64
-        });
-        rounds.max().unwrap_or(0) * each + spec.soak_ms
-    };
-    (0..).zip(matching.sizes(spec.waves.len())).filter(|(_, size)| *size > 0).map(|(ix, size)| wave(ix, size)).sum()
-}
-
-fn caveats(spec: &RolloutSpec, bundle: &Bundle, matching: &Matching) -> Vec<String> {
-    let mut caveats = Vec::new();
-    if spec.probation_ms < SHORT_PROBATION_MS {
-        caveats.push(format!(
-            "probation of {} ms is short: a program that hangs later is met on trial",
-            spec.probation_ms
-        ));
-    }
-    let uncovered = matching.strata().values().filter(|(_, first)| !first).count();
-    if uncovered > 0 {
-        caveats.push(format!("{uncovered} kinds of robots are not in the first wave"));
-    }
-    if bundle.has_base {
-        caveats.push(
-            "it replaces the base system: while it is staged a robot has nothing to go back to but what it runs"
-                .to_owned(),
-        );
-    }
-    if bundle.is_irreversible {
-        caveats.push("once committed it cannot be gone back from".to_owned());
-    }
-    if spec.waves.contains(&Wave::Rest) && spec.waves.len() == 1 {
-        caveats.push("all robots in one wave: a bad bundle reaches every one of them".to_owned());
-    }
-    caveats
 }
 
 /// Checks a command against what is known; an error changes nothing. True: it was carried out before.

@@ -1,12 +1,13 @@
 //! The law of roll-outs: which robot gets which bundle when, what counts for and against it, and the way back.
 //!
 //! [`cycle`] takes what happened and gives items to commit; the service around it only reads, signs, commits and publishes.
-//! Rooms: `spec` is what is asked for, `rows` and `view` are what is known; `hear` and `commands` are what happens; `matching` says who, `robots`
+//! Rooms: `spec` is what is asked for, `rows` and `view` are what is known; `hear` and `commands` are what happens; `matching` says who and `dry_run` what it would come to, `robots`
 //! says what is due for each and `moves` writes it, `phases` the whole, `newcomers` who comes later; `verdict` and `infrastructure` judge; `explain` says what a robot waits for.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod bugs;
 pub mod commands;
+pub mod dry_run;
 pub mod explain;
 pub mod hear;
 pub mod infrastructure;

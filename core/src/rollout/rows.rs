@@ -57,6 +57,9 @@ pub struct Bundle {
     pub is_irreversible: bool,
     /// It replaces the base system: staging it destroys what was kept.
     pub has_base: bool,
+    /// Components that its own need beside them, and their lowest versions.
+    #[serde(default)]
+    pub requires: BTreeMap<String, String>,
     /// The newest release lists it.
     pub listed: bool,
     /// A person took it back.

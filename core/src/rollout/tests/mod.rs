@@ -474,6 +474,7 @@ fn bundle(n: u32) -> Bundle {
         hard_stop_codes: BTreeSet::from([66]),
         is_irreversible: false,
         has_base: false,
+        requires: BTreeMap::new(),
         listed: true,
         revoked: None,
         published: Utc(BEGIN),

@@ -1,8 +1,10 @@
 //! Whom a roll-out reaches, in which wave, and what is refused before it begins.
 
-use super::super::commands::dry_run;
+use super::super::dry_run::dry_run;
 use super::super::matching;
 use super::*;
+use crate::ids::SetId;
+use crate::update::{Installed, InstalledSet};
 
 fn sizes(rig: &Rig, waves: Vec<Wave>) -> Vec<u32> {
     let spec = RolloutSpec { waves, allow_full_push: true, ..spec() };
@@ -89,6 +91,44 @@ fn who_is_left_out_is_told_with_the_reason() {
     let mut nobody = spec();
     nobody.selector.models.insert("m9".into());
     assert_eq!(refusal(&rig, &nobody), Code::RolloutMatchesNobody);
+}
+
+#[test]
+fn a_dry_run_tells_who_has_too_little_room_and_who_lacks_what_the_bundle_needs() {
+    let mut rig = Rig::new(4);
+    rig.put(Bundle { requires: [("map".to_owned(), "1.2.0".to_owned())].into(), ..bundle(2) });
+    for (n, free_bytes, map) in [(0, 999, Some("1.2.0")), (1, 1_000, Some("1.1.9")), (2, u64::MAX, None)] {
+        let session = rig.row::<Session>(robot_id(n).as_str()).expect("it attached");
+        rig.put(Session { installed: Some(installed(n, free_bytes, map)), ..session });
+    }
+    rig.tick();
+    let run = dry_run(&rig.ota, &rig.board, &rollout_id("ro"), &spec()).expect("it may run");
+    // The fourth robot said nothing: nothing is held against it.
+    let (room, needs) =
+        (run.caveats.iter().find(|c| c.contains("room")), run.caveats.iter().find(|c| c.contains("map")));
+    assert!(room.is_some_and(|c| c.ends_with("attached: r000")), "{:?}", run.caveats);
+    assert!(needs.is_some_and(|c| c.ends_with("seen on: r001, r002")), "{:?}", run.caveats);
+}
+
+fn installed(n: usize, free_bytes: u64, map: Option<&str>) -> Installed {
+    let set = SetId::parse(&"ab".repeat(32)).expect("an id");
+    Installed {
+        robot_id: robot_id(n),
+        boot_id: String::new(),
+        device_key: String::new(),
+        model: "m1".to_owned(),
+        free_bytes,
+        running: set.clone(),
+        current: set.clone(),
+        previous: None,
+        sets: vec![InstalledSet {
+            set,
+            bundle: None,
+            version: "walk 1.0.0".to_owned(),
+            components: map.map(|version| ("map".to_owned(), version.to_owned())).into_iter().collect(),
+            components_left_out: 0,
+        }],
+    }
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use midshift_core::gates::{Suspicion, TaskTally};
 use midshift_core::rollout::Board;
-use midshift_core::rollout::commands::DryRun;
+use midshift_core::rollout::dry_run::DryRun;
 use midshift_core::rollout::explain::blocked;
 use midshift_core::rollout::rows::{Abort, Act, Quarantine, RobotSoftware, Rollout, RolloutRobot, Step, Verdict};
 use midshift_core::rollout::spec::{RolloutSpec, Wave};

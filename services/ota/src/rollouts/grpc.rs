@@ -4,7 +4,8 @@ use super::{RolloutService, decode, encode, watch};
 use midshift_core::ids::{RobotId, RolloutId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
-use midshift_core::rollout::commands::{self, Command, Verb};
+use midshift_core::rollout::commands::{Command, Verb};
+use midshift_core::rollout::dry_run::dry_run;
 use midshift_core::rollout::rows::Rollout;
 use midshift_core::rollout::view::View;
 use midshift_proto::convert::task::revision_of;
@@ -113,7 +114,7 @@ impl RolloutService {
                     Refusal::new(Kind::NotFound, Reason::from(Code::RolloutNotFound).with("rollout_id", &rollout_id))
                 })?,
             };
-            let run = commands::dry_run(view, board, &rollout_id, &spec)?;
+            let run = dry_run(view, board, &rollout_id, &spec)?;
             Ok(encode::plan(&run, spec.waves.len()))
         })
         .await?

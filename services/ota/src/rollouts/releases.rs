@@ -9,8 +9,9 @@ use midshift_core::limits;
 use midshift_core::rollout::Plan;
 use midshift_core::rollout::rows::Bundle;
 use midshift_core::rollout::view::View;
+use midshift_core::task::raw::parse_version;
 use midshift_core::time::Now;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Makes the rows say what the release says.
 pub fn take(view: &mut View, now: Now, newest: Option<&Newest>, plan: &mut Plan) {
@@ -50,8 +51,22 @@ fn fresh(bundle: BundleId, manifest: &Manifest, manifest_length: u64, published:
         hard_stop_codes: manifest.hard_stop_codes.clone(),
         is_irreversible: manifest.components.iter().any(|c| c.data_migration == Migration::Irreversible),
         has_base: manifest.components.iter().any(|c| c.kind == ComponentKind::Base),
+        requires: required(manifest),
         listed: true,
         revoked: None,
         published,
     }
+}
+
+/// What its components need that is not among them. Of two lowest versions the higher counts.
+fn required(manifest: &Manifest) -> BTreeMap<String, String> {
+    let mut required: BTreeMap<String, String> = BTreeMap::new();
+    let own = |name: &String| manifest.components.iter().any(|c| c.name == *name);
+    for (name, version) in manifest.components.iter().flat_map(|c| &c.requires).filter(|(name, _)| !own(name)) {
+        let lowest = required.entry(name.clone()).or_insert_with(|| version.clone());
+        if parse_version(lowest) < parse_version(version) {
+            lowest.clone_from(version);
+        }
+    }
+    required
 }
