@@ -70,3 +70,21 @@ fn required(manifest: &Manifest) -> BTreeMap<String, String> {
     }
     required
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fixture;
+
+    #[test]
+    fn a_bundle_requires_what_its_components_need_and_none_of_them_is() {
+        let (mut manifest, _) = fixture::bundle("walk", "1.0.0");
+        let own = manifest.components[0].name.clone();
+        let mut second = manifest.components[0].clone();
+        second.name = "walk-arms".to_owned();
+        second.requires = [(own, "1.0.0"), ("map".to_owned(), "1.10.0")].map(|(n, v)| (n, v.to_owned())).into();
+        manifest.components[0].requires = [("map".to_owned(), "1.9.0".to_owned())].into();
+        manifest.components.push(second);
+        assert_eq!(required(&manifest), BTreeMap::from([("map".to_owned(), "1.10.0".to_owned())]));
+    }
+}
