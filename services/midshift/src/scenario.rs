@@ -104,7 +104,8 @@ pub struct Played {
     pub canary: u32,
     /// Most robots that changed their software at once (heartbeats).
     pub off_work_most: usize,
-    /// As many might have, at that moment: one of ten in each area where robots were, at least one (heartbeats and the areas' rules).
+    /// As many might have, by then: of each area one of ten of the robots that were ever there together in this roll-out, at least one. A robot
+    /// counts for the area that it was taken from, wherever it and the others are afterwards (heartbeats and the areas' rules).
     pub off_work_allowed: usize,
     /// Looks at which more did than might.
     pub budget_broken: usize,
@@ -512,7 +513,7 @@ impl Drop for Launched {
 /// Looks at what robots say all the time.
 struct Watcher {
     seen: Arc<Mutex<BTreeSet<RobotId>>>,
-    /// Most at once, as many as might have then, and how often more did.
+    /// Most at once, as many as might have by then, and how often more did.
     most: Arc<Mutex<(usize, usize, usize)>>,
     _looks: AbortOnDropHandle<()>,
 }
@@ -527,8 +528,14 @@ impl Watcher {
             .collect();
         let (to_seen, to_most) = (seen.clone(), most.clone());
         let looks = AbortOnDropHandle::new(tokio::spawn(async move {
+            let mut allowed: BTreeMap<AreaId, usize> = BTreeMap::new();
             loop {
-                let (off, may) = look(&board, &site, &before, &to_seen);
+                let off = look(&board, &before, &to_seen);
+                for (area, may) in allowances(&board, &site) {
+                    let most = allowed.entry(area).or_default();
+                    *most = may.max(*most);
+                }
+                let may = allowed.values().sum();
                 {
                     let mut most = to_most.lock().unwrap_or_else(PoisonError::into_inner);
                     if off > most.0 {
@@ -549,19 +556,10 @@ impl Watcher {
     }
 }
 
-/// Notes who runs another bundle than before, and counts who changes its software now, and how many might.
-fn look(
-    board: &LiveBoard<Live>,
-    site: &Site,
-    before: &BTreeMap<RobotId, String>,
-    seen: &Mutex<BTreeSet<RobotId>>,
-) -> (usize, usize) {
+/// Notes who runs another bundle than before, and counts who changes its software now.
+fn look(board: &LiveBoard<Live>, before: &BTreeMap<RobotId, String>, seen: &Mutex<BTreeSet<RobotId>>) -> usize {
     let mut off = 0;
-    let mut areas: BTreeMap<&AreaId, usize> = BTreeMap::new();
     for (id, live) in board.all() {
-        if let Some(at) = live.report.vitals.waypoint.as_ref().and_then(|w| site.find(w)) {
-            *areas.entry(&site.area_of(at).area_id).or_default() += 1;
-        }
         let Some(update) = &live.report.update else { continue };
         let changes =
             matches!(update.state, UpdateState::Switching | UpdateState::Probation | UpdateState::RollingBack);
@@ -571,8 +569,19 @@ fn look(
             seen.lock().unwrap_or_else(PoisonError::into_inner).insert(id);
         }
     }
+    off
+}
+
+/// How many robots of each area may be taken out of work, with as many there as are now.
+fn allowances(board: &LiveBoard<Live>, site: &Site) -> BTreeMap<AreaId, usize> {
+    let mut areas: BTreeMap<AreaId, usize> = BTreeMap::new();
+    for (_, live) in board.all() {
+        if let Some(at) = live.report.vitals.waypoint.as_ref().and_then(|w| site.find(w)) {
+            *areas.entry(site.area_of(at).area_id.clone()).or_default() += 1;
+        }
+    }
     let rules = SoftwareRules::default();
-    (off, areas.values().map(|robots| rules.off_work_max(*robots)).sum())
+    areas.into_iter().map(|(area, robots)| (area, rules.off_work_max(robots))).collect()
 }
 
 fn duration(ms: u64) -> prost_types::Duration {
