@@ -25,8 +25,7 @@ pub fn due(view: &View, board: &Board, robot_id: &RobotId) -> Option<Rollout> {
     let new = meant && view.robot_of(&rollout.rollout_id, robot_id).is_none_or(passed);
     let free = matching::claimed_by(view, robot_id, &rollout.rollout_id).is_none();
     let may = matching::may_have(view, robot_id, &stratum, &bundle.row).is_ok();
-    let meant = matching::is_selected(view, robot_id, &stratum, &rollout.spec);
-    (good && new && free && may && meant).then(|| rollout.clone())
+    (good && new && free && may).then(|| rollout.clone())
 }
 
 /// Robots that come get this roll-out's bundle somewhere.

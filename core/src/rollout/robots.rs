@@ -212,11 +212,7 @@ fn staging(
     }
     match report.map(|report| report.state) {
         Some(UpdateState::Directed | UpdateState::Downloading) => {}
-        Some(UpdateState::Refused) => {
-            let why = report.and_then(|r| r.reason.clone()).unwrap_or_else(|| Code::BundleUnfit.into());
-            let reason = Reason::new(Code::SkippedIncompatible, why.text()).with("because", why.code);
-            return Some(Move::Skip(reason));
-        }
+        Some(UpdateState::Refused) => return Some(Move::Skip(refused(report))),
         Some(_) => return Some(Move::IsStaged),
         None if now.wall.ms_since(r.signed) >= limits::DIRECTIVE_RENEWED_MS => return Some(Move::SignAnew),
         None => {}
@@ -225,6 +221,12 @@ fn staging(
         // What it was told is gone: it is told again.
         (!view.desired.contains_key(r.robot_id.as_str())).then_some(Move::Stage)
     })
+}
+
+/// Why the robot refused what it was told.
+fn refused(report: Option<&UpdateReport>) -> Reason {
+    let why = report.and_then(|r| r.reason.clone()).unwrap_or_else(|| Code::BundleUnfit.into());
+    Reason::new(Code::SkippedIncompatible, why.text()).with("because", why.code)
 }
 
 /// Its turn came long ago, and it has not fetched the bundle.
@@ -245,10 +247,7 @@ fn staged(
         return Some(Move::Skip(why));
     }
     match report.map(|report| report.state) {
-        Some(UpdateState::Refused) => {
-            let why = report.and_then(|r| r.reason.clone()).unwrap_or_else(|| Code::BundleUnfit.into());
-            return Some(Move::Skip(Reason::new(Code::SkippedIncompatible, why.text()).with("because", why.code)));
-        }
+        Some(UpdateState::Refused) => return Some(Move::Skip(refused(report))),
         // What was staged is gone: its disk was changed, and it begins again.
         Some(UpdateState::Directed | UpdateState::Downloading) if rollout.revert_of.is_none() => {
             return skips_offline(view, board, now, rollout, r).or_else(|| skips_stuck(now, rollout, r));
@@ -351,7 +350,7 @@ fn activating(
     match state {
         Some(UpdateState::Trial | UpdateState::Committing | UpdateState::Committed) => return Some(Move::OnTrial),
         // It is over for this directive: a permission that was given cannot be used any more.
-        Some(UpdateState::Refused) => return Some(Move::Skip(Code::SkippedIncompatible.into())),
+        Some(UpdateState::Refused) => return Some(Move::Skip(refused(report))),
         Some(UpdateState::Probation | UpdateState::RollingBack) => {
             if r.moments.switched.is_none() {
                 return Some(Move::Switched);
