@@ -6,7 +6,7 @@
 
 use super::rows::{Drain, DrainState, RobotAuthority, RobotHolder};
 use super::view::View;
-use super::{Board, Plan, Tx, errands, heard, repair, way};
+use super::{Board, Plan, Tx, errands, heard, repair, screen, way};
 use crate::ids::{DrainId, RobotId};
 use crate::maintenance::{DrainRelease, DrainRequest};
 use crate::reason::{Code, Reason};
@@ -180,7 +180,9 @@ fn is_at_rest(view: &View, drain: &Drain, live: Option<&Live>) -> bool {
 
 fn park(tx: &mut Tx, drain: &Drain, live: &Live, board: &Board) {
     let quiet = live.report.attempts.iter().all(|a| a.state.is_over()) && heard::is_settled(tx.view, live);
-    let unwilling = tx.view.unwilling.get(&drain.robot_id).is_some_and(|until| tx.now.link < *until);
+    // With a standing fault, stopped or driven by hand it would only fail: the deadline goes on.
+    let unwilling = tx.view.unwilling.get(&drain.robot_id).is_some_and(|until| tx.now.link < *until)
+        || screen::reported(live).is_err();
     let here = way::find(tx.view, live.report.vitals.waypoint.as_ref());
     if let Some(goal) =
         here.filter(|_| quiet && !unwilling).and_then(|h| errands::park_for(tx.view, &drain.robot_id, h))

@@ -70,7 +70,8 @@ fn decided_by_people(view: &View, robot_id: &RobotId) -> Result<(), Reason> {
     }
 }
 
-fn reported(live: &Live) -> Result<(), Reason> {
+/// What a robot says of itself that keeps it from work.
+pub(super) fn reported(live: &Live) -> Result<(), Reason> {
     let r = &live.report;
     if r.mode != Mode::Automatic {
         return Err(Code::RobotManual.into());

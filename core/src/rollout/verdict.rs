@@ -13,6 +13,7 @@ use crate::gates::{self, FEW_ROBOTS, RobotOutcomes, Suspicion, TaskTally};
 use crate::ids::{RobotId, RolloutId};
 use crate::limits;
 use crate::reason::{Code, Reason};
+use crate::robot::Duty;
 use crate::time::Utc;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -92,7 +93,10 @@ pub fn see(view: &View, rollout: &Rollout, upto: Option<u32>) -> Seen {
         let on_trial = r.step == Step::Trial && upto.is_some_and(|wave| r.wave <= wave);
         match r.failure {
             Some(_) => seen.outcomes.failed += 1,
-            None if kept || on_trial => seen.outcomes.clean += 1,
+            // One that was kept out of work says nothing for the bundle.
+            None if (kept || on_trial) && (is_in_work(view, r) || has_worked(view, rollout, r)) => {
+                seen.outcomes.clean += 1;
+            }
             None => {}
         }
     }
@@ -149,11 +153,21 @@ pub fn abort(view: &View, rollout: &Rollout, reason: Reason, hard: bool, at: Utc
     Abort { reason, hard, robots, touched, at, actor }
 }
 
-/// Robots of the wave that have not worked enough to be judged.
+/// Robots of the wave that have not worked enough to be judged, and may yet. Whom people or the breaker keep out of work is not waited for,
+/// unless nobody else of the wave has worked enough.
 pub fn unexposed<'a>(view: &'a View, rollout: &'a Rollout) -> impl Iterator<Item = &'a RolloutRobot> {
-    let least = rollout.spec.exposure_tasks;
-    let wave = wave(view, &rollout.rollout_id, rollout.wave);
-    wave.filter(move |r| r.step == Step::Trial && exposure_of(view, rollout, r).ended() < least)
+    let on_trial = || wave(view, &rollout.rollout_id, rollout.wave).filter(|r| r.step == Step::Trial);
+    let nobody = !on_trial().any(|r| has_worked(view, rollout, r));
+    on_trial().filter(move |r| !has_worked(view, rollout, r) && (nobody || is_in_work(view, r)))
+}
+
+/// It has ended as many tasks on trial as it is judged by.
+fn has_worked(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
+    exposure_of(view, rollout, r).ended() >= rollout.spec.exposure_tasks
+}
+
+fn is_in_work(view: &View, r: &RolloutRobot) -> bool {
+    view.duty(&r.robot_id) == Duty::InWork
 }
 
 /// Robots of one wave.

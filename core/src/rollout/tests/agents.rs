@@ -47,6 +47,7 @@ impl Rig {
         if let Some(report) = &robot.report
             && report.state == UpdateState::Trial
             && self.works
+            && !robot.idles
         {
             self.ends_task(n, true);
         }

@@ -75,6 +75,8 @@ struct Robot {
     seen_grant: u64,
     fate: Fate,
     is_off: bool,
+    /// It gets no tasks.
+    idles: bool,
     stop: HardwareStop,
     at: &'static str,
 }
@@ -168,6 +170,7 @@ impl Rig {
             seen_grant: 0,
             fate: Fate::Good,
             is_off: false,
+            idles: false,
             stop: HardwareStop::None,
             at: "park-1",
         });

@@ -51,6 +51,33 @@ fn a_wave_without_work_is_a_persons_to_judge_after_its_time() {
 }
 
 #[test]
+fn a_robot_that_is_kept_out_of_work_is_not_waited_for_and_proves_nothing() {
+    let mut rig = Rig::new(5);
+    rig.start(spec());
+    let n = rig.order()[1];
+    let since = rig.now.utc;
+    rig.control(n, |c| c.breaker = Some(since));
+    rig.robots[n].idles = true;
+    rig.until(200, |r| r.phase() == Phase::Completed);
+    rig.ticks(4);
+    assert_eq!(rig.of("ro", n).step, Step::Committed, "it has the bundle as all others");
+    let last = rig.rollout("ro").verdicts.pop().expect("a verdict");
+    assert_eq!((last.attempted, last.robots.outcomes.clean), (5, 4));
+}
+
+#[test]
+fn if_nobody_of_a_wave_may_work_a_person_is_asked() {
+    let mut rig = Rig::new(2);
+    rig.start(spec());
+    let n = rig.order()[0];
+    let since = rig.now.utc;
+    rig.control(n, |c| c.breaker = Some(since));
+    rig.robots[n].idles = true;
+    rig.until(200, |r| r.phase() == Phase::Review);
+    assert_eq!(verdicts(&rig), [(Outcome::Review, Code::NoExposure, 1)]);
+}
+
+#[test]
 fn one_failure_among_few_aborts_and_says_how_often_that_happens_to_good_bundles() {
     let mut rig = Rig::new(6);
     rig.start(RolloutSpec { waves: vec![Wave::Count(1), Wave::Rest], ..spec() });

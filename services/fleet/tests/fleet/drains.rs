@@ -1,7 +1,7 @@
 //! Drains: a robot leaves work without a task being lost or a grasp cut, stands parked, and comes back.
 
-use crate::harness::{Seen, World};
-use midshift_core::fleet::rows::{Drain, DrainState, RobotAuthority, RobotHolder};
+use crate::harness::{Seen, World, jam};
+use midshift_core::fleet::rows::{Drain, DrainState, HolderState, RobotAuthority, RobotControl, RobotHolder};
 use midshift_core::reason::Code;
 use midshift_core::robot::Load;
 use midshift_core::site::CORRIDOR;
@@ -117,6 +117,25 @@ async fn a_robot_with_a_load_keeps_its_task_to_the_end() {
     w.robot("r2", "park-b").await;
     let seen = w.until("T1 ends", |s| s.phase("T1").is_terminal()).await;
     assert_eq!((seen.phase("T1"), seen.robot_of("T1").as_deref()), (Phase::Succeeded, Some("r1")));
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_with_a_standing_fault_is_not_sent_to_park_until_somebody_has_seen_to_it() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").works = false;
+    w.submit("T1", "A", "B").await;
+    w.until("it stands at A", |s| s.holders("A") == [("r1".to_owned(), HolderState::Inside)]).await;
+    let r1 = w.r("r1");
+    (r1.works, r1.fails, r1.fault) = (true, Some((1, jam())), Some(jam()));
+    w.until("it has failed", |s| s.phase("T1") != Phase::Running).await;
+    drain(&w, "r1", 600).await.expect("is asked");
+    let idle = |s: &Seen| s.get::<RobotControl>("r1").is_none_or(|c| c.errands == 0);
+    w.pass_while(60, "it would only fail", |s| state(s) == Some(DrainState::Draining) && idle(s)).await;
+    w.r("r1").fault = None;
+    w.until("it is held", |s| is_held(s, "r1")).await;
+    assert_eq!(w.r("r1").here.to_string(), "park-a");
     w.lawful().await;
 }
 

@@ -43,6 +43,8 @@ pub struct Robot {
     pub battery_permille: u16,
     pub mode: Mode,
     pub hardware_stop: HardwareStop,
+    /// A fault that stands.
+    pub fault: Option<Fault>,
     pub load: Option<Load>,
     pub inventory: Inventory,
     /// Resume orders it obeyed.
@@ -106,6 +108,7 @@ impl Robot {
             battery_permille: 1_000,
             mode: Mode::Automatic,
             hardware_stop: HardwareStop::None,
+            fault: None,
             load: None,
             inventory: Inventory {
                 capabilities: ["pick", "place", "charge", "park"].map(str::to_owned).to_vec(),
@@ -260,6 +263,7 @@ impl Robot {
             attempts: self.attempts.clone(),
             places: self.places.clone(),
             hardware_stop: self.hardware_stop,
+            fault: self.fault.clone(),
             ..ReportedState::default()
         };
         Live {
