@@ -131,25 +131,32 @@ fn keep_running(orders: &Orders) -> io::Result<()> {
     if let Some(sets) = &orders.sets {
         machine_starts(sets)?;
     }
+    let mut tries = read_tries(&orders.record);
     loop {
-        let start = choose(orders)?;
-        write_tries(&orders.record, &start.tries)?;
+        let start = choose(orders, &tries)?;
+        tries = start.tries.clone();
+        keep_tries(&orders.record, &tries);
         beacon.begins(&start);
-        match run_once(orders, &start, &mut beacon)? {
+        match run_once(orders, &start, &mut tries, &mut beacon)? {
             Ending::Finished => {
-                write_tries(&orders.record, &Tries::new(&start.set, 0))?;
+                // A set on probation has proven nothing by ending.
+                if is_trusted(orders) {
+                    tries.clear();
+                    keep_tries(&orders.record, &tries);
+                }
                 return Ok(());
             }
-            Ending::Switched => {
-                write_tries(&orders.record, &Tries::new(&start.set, 0))?;
+            Ending::Switched if number(orders)? != start.number => {
+                tries.clear();
+                keep_tries(&orders.record, &tries);
                 continue;
             }
+            Ending::Switched => say(&format!("{} of set {} ended to switch and did not", start.program, start.set)),
             Ending::Failed(how) => say(&format!("{} of set {} ended: {how}", start.program, start.set)),
             Ending::Hung => {
                 say(&format!("{} gave no sign for {} s and was killed", start.program, orders.hang.as_secs()))
             }
         }
-        let tries = read_tries(&orders.record);
         let pause = tries.pause();
         say(&format!("try {} in {} ms", tries.plus_one(&start.set).of(&start.set), pause.as_millis()));
         beacon.pause(pause);
@@ -163,19 +170,20 @@ struct Start {
     program: String,
     /// Counts this start.
     tries: Tries,
+    /// Of the switch record that names it.
+    number: u64,
 }
 
 /// The set that the record names; one on trial that has had its tries is put away first.
-fn choose(orders: &Orders) -> io::Result<Start> {
-    let tries = read_tries(&orders.record);
+fn choose(orders: &Orders, tries: &Tries) -> io::Result<Start> {
     let Some(sets) = &orders.sets else {
         let set = switch::FACTORY.to_owned();
-        return Ok(Start { tries: tries.plus_one(&set), program: orders.program.clone(), set });
+        return Ok(Start { tries: tries.plus_one(&set), program: orders.program.clone(), set, number: 0 });
     };
     let path = sets.join(SWITCH);
     let mut switch = Switch::read(&path).map_err(|e| named(e, &path))?;
     let tried = switch.running().to_owned();
-    if let Some(had) = starts::put_away(&mut switch, &tries) {
+    if let Some(had) = starts::put_away(&mut switch, tries) {
         say(&format!("set {tried} did not live in {had} tries; back to {}", switch.current));
         switch.write(&path).map_err(|e| named(e, &path))?;
     }
@@ -193,7 +201,14 @@ fn choose(orders: &Orders) -> io::Result<Start> {
     let set = switch.running().to_owned();
     let own = sets.join(&set).join(PROGRAM);
     let program = if own.exists() { own.to_string_lossy().into_owned() } else { orders.program.clone() };
-    Ok(Start { tries: tries.plus_one(&set), program, set })
+    Ok(Start { tries: tries.plus_one(&set), program, set, number: switch.number })
+}
+
+/// Number of the switch record; it rises with each change.
+fn number(orders: &Orders) -> io::Result<u64> {
+    let Some(sets) = &orders.sets else { return Ok(0) };
+    let path = sets.join(SWITCH);
+    Ok(Switch::read(&path).map_err(|e| named(e, &path))?.number)
 }
 
 fn named(error: io::Error, path: &Path) -> io::Error {
@@ -255,7 +270,7 @@ fn is_trusted(orders: &Orders) -> bool {
 }
 
 /// Runs the program until it ends or hangs.
-fn run_once(orders: &Orders, start: &Start, beacon: &mut Beacon) -> io::Result<Ending> {
+fn run_once(orders: &Orders, start: &Start, tries: &mut Tries, beacon: &mut Beacon) -> io::Result<Ending> {
     let started = Command::new(&start.program)
         .args(&orders.arguments)
         .env(PULSE_ASKED, "1")
@@ -281,7 +296,7 @@ fn run_once(orders: &Orders, start: &Start, beacon: &mut Beacon) -> io::Result<E
         // The other end is gone only if the program was already given up.
         let _ = signs.send(Sign::Ended);
     });
-    let ending = watch(&mut child.0, &heard, orders, start, beacon)?;
+    let ending = watch(&mut child.0, &heard, orders, tries, beacon)?;
     drop(heard);
     drop(child);
     // A grandchild may keep the pipe open; it is not waited for.
@@ -293,7 +308,7 @@ fn watch(
     child: &mut Child,
     heard: &Receiver<Sign>,
     orders: &Orders,
-    start: &Start,
+    tries: &mut Tries,
     beacon: &mut Beacon,
 ) -> io::Result<Ending> {
     let mut pulses = 0;
@@ -305,7 +320,8 @@ fn watch(
                 pulses += 1;
                 sign_by = Instant::now() + orders.hang;
                 if starts::is_well(pulses) && is_trusted(orders) {
-                    write_tries(&orders.record, &Tries::new(&start.set, 0))?;
+                    tries.clear();
+                    keep_tries(&orders.record, tries);
                 }
             }
             Ok(Sign::Ended) | Err(RecvTimeoutError::Disconnected) => return Ok(how_it_ended(child.wait()?)),
@@ -391,6 +407,13 @@ impl Beacon {
 /// Starts that did not run well. A record that cannot be read counts none.
 fn read_tries(record: &Path) -> Tries {
     Tries::parse(&fs::read_to_string(record).unwrap_or_default())
+}
+
+/// A record that cannot be written is no reason to stop a robot, or not to start it: this launcher counts on without it.
+fn keep_tries(record: &Path, tries: &Tries) {
+    if let Err(error) = write_tries(record, tries) {
+        say(&format!("{} cannot be written: {error}", record.display()));
+    }
 }
 
 /// On the disk when this returns.

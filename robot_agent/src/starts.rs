@@ -47,6 +47,10 @@ impl Tries {
     pub fn plus_one(&self, set: &str) -> Self {
         Self::new(set, self.of(set).saturating_add(1))
     }
+    /// The set ran well: none of them counts any more.
+    pub fn clear(&mut self) {
+        self.count = 0;
+    }
     /// Time before the next start.
     pub fn pause(&self) -> Duration {
         let (first, longest) = PAUSE_MS;
