@@ -9,14 +9,28 @@ use super::view::View;
 use crate::fleet::heard;
 use crate::ids::RobotId;
 use crate::limits;
-use crate::robot::Presence;
-use crate::time::Now;
+use crate::robot::{Duty, Presence};
+use crate::time::{LinkTime, Now};
 use std::collections::BTreeMap;
 
-/// The robot was given permission and is not heard for too long. After a start everybody counts as heard at that moment.
-pub fn is_missing(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> bool {
-    let heard = board.get(&r.robot_id).map_or(view.started.link, |live| live.processed_at.max(view.started.link));
-    r.step == Step::Activating && r.grant.is_some() && now.link.since(heard) >= limits::LOST_AFTER
+/// The robot runs the bundle, or may, and is not heard for too long. After the gate of its wave that is not the bundle's matter.
+pub fn is_missing(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> bool {
+    let watched = match r.step {
+        Step::Activating => r.grant.is_some(),
+        Step::Trial => is_open_to(rollout, r),
+        _ => false,
+    };
+    watched && now.link.since(heard(view, board, &r.robot_id)) >= limits::LOST_AFTER
+}
+
+/// When a robot was heard last. After a start everybody counts as heard at that moment.
+fn heard(view: &View, board: &Board, robot_id: &RobotId) -> LinkTime {
+    board.get(robot_id).map_or(view.started.link, |live| live.processed_at.max(view.started.link))
+}
+
+/// The gate of its wave has not closed.
+pub fn is_open_to(rollout: &Rollout, r: &RolloutRobot) -> bool {
+    r.wave >= rollout.promoted
 }
 
 /// Whether robots beside this one are heard: those of its area, or of the site if those are too few.
@@ -26,7 +40,7 @@ pub fn is_missing(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> bo
 pub fn controls(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> Result<(), Pause> {
     let area = view.software.get(r.robot_id.as_str()).and_then(|s| s.row.area.as_ref());
     let all: Vec<&RobotId> =
-        view.sessions.values().map(|s| &s.row.robot_id).filter(|id| is_control(view, id)).collect();
+        view.sessions.values().map(|s| &s.row.robot_id).filter(|id| is_control(view, board, r, id)).collect();
     let here = |id: &&RobotId| view.software.get(id.as_str()).and_then(|s| s.row.area.as_ref()) == area;
     let near: Vec<&RobotId> = all.iter().copied().filter(here).collect();
     let controls = if near.len() < limits::CONTROLS_MIN { all } else { near };
@@ -37,14 +51,17 @@ pub fn controls(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> Resu
     if heard * 1_000 >= controls.len() * limits::CONTROLS_HEARD_PERMILLE { Ok(()) } else { Err(Pause::Infrastructure) }
 }
 
-/// It changes nothing now.
-fn is_control(view: &View, robot_id: &RobotId) -> bool {
-    super::hear::rows_of(view, robot_id).all(|r| r.step != Step::Activating)
+/// It changes nothing now, and was in contact when the robot was heard last: one in a store room says nothing of the network.
+fn is_control(view: &View, board: &Board, missing: &RolloutRobot, robot_id: &RobotId) -> bool {
+    let since = heard(view, board, &missing.robot_id);
+    let kept = board.get(robot_id).is_some_and(|live| since.since(live.processed_at) < limits::OFFLINE_AFTER);
+    let changes = super::hear::rows_of(view, robot_id).any(|r| r.step == Step::Activating);
+    kept && !changes && *robot_id != missing.robot_id && view.duty(robot_id) != Duty::Retired
 }
 
 /// Why a roll-out has to stand still: robots of it are missing, and so are others.
 pub fn pause(view: &View, board: &Board, now: &Now, rollout: &Rollout) -> Option<Pause> {
-    let missing = view.robots_of(&rollout.rollout_id).filter(|r| is_missing(view, board, now, r));
+    let missing = view.robots_of(&rollout.rollout_id).filter(|r| is_missing(view, board, now, rollout, r));
     // One of each area stands for all that are missing there.
     let area = |r: &RolloutRobot| view.software.get(r.robot_id.as_str()).and_then(|s| s.row.area.clone());
     let by_area: BTreeMap<_, _> = missing.map(|r| (area(r), r)).collect();

@@ -4,7 +4,8 @@
 //! roll-out's row, and robots out of work are counted in that row.
 
 use super::hear::{fail, is_hard, quarantine};
-use super::robots::{Move, anchor, is_open_to, is_retried, wants};
+use super::infrastructure::is_open_to;
+use super::robots::{Move, anchor, is_retried, wants};
 use super::rows::{Given, Rollout, RolloutRobot, Step};
 use super::view::View;
 use super::{Board, Order, Sign, Tx, newcomers, verdict};
@@ -146,7 +147,9 @@ fn step(tx: &mut Tx, r: RolloutRobot, to: Step, kind: &'static str) {
 
 fn rolled_back(tx: &mut Tx, rollout: &Rollout, mut r: RolloutRobot, why: Reason) {
     let asked = r.step == Step::Reverting || wants(tx.view, &r, Goal::Revert);
-    if !asked {
+    // Whether its bundle or the network kept it from its server is known only if others were heard meanwhile: then it was lost.
+    let unreached = why.code == Code::LostServer && r.failure.is_none();
+    if !asked && !unreached {
         // It went back by itself: that is what gates count.
         let because = if is_hard(&why) {
             why.clone()

@@ -8,9 +8,11 @@ use super::rows::{AreaBundle, Countdown, Outcome, Pause, Phase, Rollout, Rollout
 use super::verdict;
 use super::view::View;
 use super::{Board, Tx, commands, incident, infrastructure, matching, newcomers};
+use crate::fleet::heard;
 use crate::ids::{AreaId, RolloutId};
 use crate::limits;
 use crate::reason::{Code, Reason};
+use crate::robot::Presence;
 use crate::time::Now;
 use std::collections::BTreeMap;
 
@@ -37,7 +39,7 @@ pub fn further(tx: &mut Tx, board: &Board, id: &RolloutId) {
         Phase::Prefetching => prefetching(tx, board, rollout),
         Phase::Applying => applying(tx, board, rollout),
         Phase::Soaking => soaking(tx, rollout),
-        Phase::Gate => gate(tx, rollout),
+        Phase::Gate => gate(tx, board, rollout),
         Phase::Aborting => aborting(tx, rollout),
         Phase::RollingBack => rolling_back(tx, board, rollout),
         _ => {}
@@ -179,7 +181,7 @@ fn applying(tx: &mut Tx, board: &Board, rollout: Rollout) {
         promote(tx, rollout, verdict);
     } else if verdict::wave(tx.view, &rollout.rollout_id, wave).any(attempted) {
         // None of those that were given it works with it: there is nothing to watch, and much to judge.
-        gate(tx, rollout);
+        gate(tx, board, rollout);
     } else {
         // Nobody of this wave could be had: there is nothing to judge.
         next_wave(tx, rollout);
@@ -209,7 +211,13 @@ fn soaking(tx: &mut Tx, rollout: Rollout) {
     }
 }
 
-fn gate(tx: &mut Tx, mut rollout: Rollout) {
+fn gate(tx: &mut Tx, board: &Board, mut rollout: Rollout) {
+    let silent =
+        |r: &RolloutRobot| r.step == Step::Trial && heard::presence(board, &r.robot_id, &tx.now) != Presence::Online;
+    if rollout.revert_of.is_none() && verdict::wave(tx.view, &rollout.rollout_id, rollout.wave).any(silent) {
+        // It says nothing for the bundle: it comes back, or is lost, or the network is.
+        return;
+    }
     let on_trial = verdict::wave(tx.view, &rollout.rollout_id, rollout.wave).any(|r| r.step == Step::Trial);
     let short = verdict::unexposed(tx.view, &rollout).count();
     if short > 0 && on_trial {

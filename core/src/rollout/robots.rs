@@ -76,7 +76,7 @@ pub fn next(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollou
         Step::Staged => staged(view, board, now, rollout, r, report),
         Step::Draining => draining(view, now, rollout, r),
         Step::Activating => activating(view, board, now, rollout, r, report),
-        Step::Trial => trial(view, now, rollout, r, report),
+        Step::Trial => trial(view, board, now, rollout, r, report),
         Step::Committing => committing(view, rollout, r, report),
         Step::Reverting => reverting(view, board, r, report),
         Step::Committed => goes_back(view, rollout, r).then_some(Move::Revert),
@@ -420,13 +420,13 @@ fn unused(
 /// The robot is not heard, though most others are. It is taken back until the gate of its wave closes.
 fn lost(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
     let network = [Pause::Infrastructure, Pause::InfrastructureUnknown];
-    match (infrastructure::is_missing(view, board, now, r), is_lost(r)) {
+    match (infrastructure::is_missing(view, board, now, rollout, r), is_lost(r)) {
         // The roll-out stands still for it: nothing is anybody's fault yet.
         (true, false) if network.iter().any(|p| rollout.pauses.contains(p)) => None,
         (true, false) if infrastructure::controls(view, board, now, r).is_ok() => {
             Some(Move::Fail(Code::RobotLost.into()))
         }
-        (false, true) if is_open_to(rollout, r) => Some(Move::Found),
+        (false, true) if infrastructure::is_open_to(rollout, r) => Some(Move::Found),
         _ => None,
     }
 }
@@ -434,11 +434,6 @@ fn lost(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRob
 /// It counts as lost.
 fn is_lost(r: &RolloutRobot) -> bool {
     r.failure.as_ref().is_some_and(|f| f.code == Code::RobotLost)
-}
-
-/// The gate of its wave has not closed.
-pub(super) fn is_open_to(rollout: &Rollout, r: &RolloutRobot) -> bool {
-    r.wave >= rollout.promoted
 }
 
 /// The robot went back, or could not.
@@ -466,8 +461,15 @@ pub fn is_irreversible(view: &View, rollout: &Rollout) -> bool {
     view.bundles.get(rollout.spec.bundle.as_str()).is_some_and(|b| b.row.is_irreversible)
 }
 
-fn trial(view: &View, now: &Now, rollout: &Rollout, r: &RolloutRobot, report: Option<&UpdateReport>) -> Option<Move> {
-    if let Some(over) = ended(r, report) {
+fn trial(
+    view: &View,
+    board: &Board,
+    now: &Now,
+    rollout: &Rollout,
+    r: &RolloutRobot,
+    report: Option<&UpdateReport>,
+) -> Option<Move> {
+    if let Some(over) = ended(r, report).or_else(|| lost(view, board, now, rollout, r)) {
         return Some(over);
     }
     if goes_back(view, rollout, r) {

@@ -191,3 +191,68 @@ fn a_lost_robot_is_taken_back_until_the_gate_of_its_wave_closes() {
         }
     }
 }
+
+#[test]
+fn a_robot_that_goes_dark_on_trial_is_never_called_clean_and_counts_as_lost_if_others_are_heard() {
+    let mut rig = Rig::new(6);
+    rig.start(RolloutSpec { exposure_tasks: 0, ..spec() });
+    let n = rig.order()[0];
+    rig.until(60, |r| r.step(n) == Step::Trial);
+    rig.robots[n].is_off = true;
+    rig.until(300, |r| r.phase().goes_back());
+    let row = rig.rollout("ro");
+    assert_eq!((row.promoted, row.abort.map(|a| a.robots)), (0, Some(vec![robot_id(n)])));
+    assert_eq!(rig.of("ro", n).failure.expect("lost").code, Code::RobotLost);
+    assert!(rig.order()[1..].iter().all(|other| !rig.of("ro", *other).attempted), "nobody came behind it");
+}
+
+#[test]
+fn a_robot_that_was_dark_for_a_while_on_trial_is_waited_for_at_the_gate() {
+    let mut rig = Rig::new(6);
+    rig.start(RolloutSpec { exposure_tasks: 0, ..spec() });
+    let n = rig.order()[0];
+    rig.until(60, |r| r.step(n) == Step::Trial);
+    rig.robots[n].is_off = true;
+    rig.until(60, |r| r.phase() == Phase::Gate);
+    rig.ticks(20);
+    assert_eq!(rig.phase(), Phase::Gate);
+    rig.robots[n].is_off = false;
+    rig.until(300, |r| r.phase() == Phase::Completed);
+}
+
+#[test]
+fn robots_that_were_off_before_say_nothing_of_the_network() {
+    let mut rig = Rig::new(8);
+    rig.retire(7);
+    for off in [4, 5, 6, 7] {
+        rig.robots[off].is_off = true;
+    }
+    rig.ticks(60);
+    let mut four = spec();
+    four.selector.robots.extend((0..4).map(robot_id));
+    rig.start(four);
+    let n = rig.order()[0];
+    rig.robots[n].fate = Fate::Silent;
+    rig.until(300, |r| r.phase().goes_back());
+    assert_eq!(rig.of("ro", n).failure.expect("lost").code, Code::RobotLost);
+}
+
+#[test]
+fn a_robot_that_did_not_reach_its_server_burns_no_bundle_unless_it_was_lost_alone() {
+    for alone in [false, true] {
+        let mut rig = Rig::new(6);
+        rig.start(spec());
+        let n = rig.order()[0];
+        rig.robots[n].fate = Fate::Silent;
+        if alone {
+            rig.until(300, |r| r.of("ro", n).failure.is_some());
+        } else {
+            rig.until(60, |r| r.step(n) == Step::Activating && r.of("ro", n).grant.is_some());
+            rig.ticks(20);
+        }
+        rig.robots[n].is_off = false;
+        rig.goes_back(n, Some(Code::LostServer));
+        rig.until(60, |r| r.step(n) == Step::RolledBack);
+        assert_eq!((rig.of("ro", n).failure.is_some(), !rig.ota.quarantines.is_empty()), (alone, alone));
+    }
+}
