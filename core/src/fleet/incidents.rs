@@ -10,7 +10,8 @@ use crate::reason::Reason;
 
 /// Opens an incident, once per code, subject and moment.
 pub fn open(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, task_id: Option<&TaskId>) {
-    let about = robot_id.map(ToString::to_string).or(task_id.map(ToString::to_string)).unwrap_or_default();
+    let of = |id: Option<String>| id.or_else(|| reason.metadata.get("rollout_id").cloned()).unwrap_or_default();
+    let about = of(robot_id.map(ToString::to_string).or(task_id.map(ToString::to_string)));
     if tx.view.incidents.len() >= limits::INCIDENTS_MAX {
         let age = |i: &Incident| (i.closed.is_none(), i.opened);
         let oldest = tx.view.incidents.values().map(|i| &i.row).min_by_key(|i| age(i)).map(|i| i.id.clone());

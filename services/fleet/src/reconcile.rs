@@ -2,7 +2,7 @@
 //!
 //! Invariant: the view has absorbed the whole feed before anything is decided on it.
 
-use crate::{Parts, Request};
+use crate::{Look, Parts, Request};
 use midshift_core::fleet::view::{TABLES, View};
 use midshift_core::fleet::{Board, LOGS, Pace, Plan, absorb, commands, cycle, found, obeyed};
 use midshift_core::limits;
@@ -32,6 +32,8 @@ struct Loop {
     started: Now,
     /// Until then what others write gathers: thinking takes half of the time at most.
     rested: Instant,
+    /// Questions that are answered once what they would see is committed.
+    looks: Vec<Look>,
 }
 
 type Replies = Vec<(oneshot::Sender<Result<(), Refusal>>, usize)>;
@@ -46,7 +48,16 @@ pub async fn run(
     let started = parts.clock.now();
     let dirty = parts.board.watch();
     let view = View::new(parts.site.clone(), started, started);
-    let mut this = Loop { parts, view, seq: Seq(0), board: Board::new(), dirty, started, rested: Instant::now() };
+    let mut this = Loop {
+        parts,
+        view,
+        seq: Seq(0),
+        board: Board::new(),
+        dirty,
+        started,
+        rested: Instant::now(),
+        looks: Vec::new(),
+    };
     this.rebuild_until_read(&shutdown).await;
     let mut sweep = tokio::time::interval(Duration::from_millis(limits::SWEEP.as_ms()));
     sweep.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -150,7 +161,11 @@ impl Loop {
                 Err(error) => tracing::error!(%error, generation, "the store's numbers could not be raised"),
             }
         }
-        self.commit(plan, replies).await
+        self.commit(plan, replies).await?;
+        for look in std::mem::take(&mut self.looks) {
+            look(&self.view, &self.board, &now);
+        }
+        Ok(())
     }
 
     /// Absorbs the feed to its head; true if something came from others.
@@ -169,7 +184,7 @@ impl Loop {
         let mut replies = Vec::new();
         for request in requests {
             match request {
-                Request::Look(look) => look(&self.view, &self.board, &now),
+                Request::Look(look) => self.looks.push(look),
                 Request::Do { command, seen, validate_only, actor, request_id, reply } => {
                     let repeat = match &request_id {
                         Some(id) => commands::is_repeat(&self.view, id, &command, seen),
@@ -178,9 +193,13 @@ impl Loop {
                     let is_repeat = matches!(repeat, Ok(true));
                     let check = || commands::check(&self.view, &self.board, &now, &command, seen);
                     let checked = repeat.and_then(|known| if known { Ok(()) } else { check() });
-                    // What was asked before is in the store: nothing is written, and nothing has to be waited for.
-                    if checked.is_err() || validate_only || is_repeat {
+                    if checked.is_err() || validate_only {
                         drop(reply.send(checked));
+                        continue;
+                    }
+                    // What was asked before is in the store, or in an item before this one.
+                    if is_repeat {
+                        replies.push((reply, plan.items.len()));
                         continue;
                     }
                     let mut tx =
@@ -198,11 +217,8 @@ impl Loop {
     }
 
     async fn commit(&mut self, plan: Plan, replies: Replies) -> Result<(), ()> {
-        if plan.items.is_empty() {
-            return Ok(());
-        }
         let kinds: Vec<(&'static str, Option<Seq>)> = plan.items.iter().map(|i| (kind_of(i), obeyed(i))).collect();
-        let results = self.parts.store.commit(plan.items).await;
+        let results = if plan.items.is_empty() { Vec::new() } else { self.parts.store.commit(plan.items).await };
         let mut trusted = Ok(());
         for (result, (kind, entry)) in results.iter().zip(kinds) {
             if let Err(error) = result {

@@ -137,6 +137,30 @@ async fn a_command_is_carried_out_once_whatever_is_lost_of_its_answer() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn of_two_that_ask_the_same_at_once_neither_is_told_that_it_is_done_before_it_is() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.pass(2).await;
+    let cordon = || {
+        let request_id = "cordon-1".to_owned();
+        w.fleet.cordon_robot(Request::new(v1::CordonRobotRequest {
+            robot_id: "r1".to_owned(),
+            request_id,
+            reason: "a wheel".to_owned(),
+            ..Default::default()
+        }))
+    };
+    w.shaky.fail(true);
+    let (first, second) = tokio::join!(cordon(), cordon());
+    for answer in [first, second] {
+        assert_eq!(answer.expect_err("nothing was stored").code(), tonic::Code::Unavailable);
+    }
+    w.shaky.fail(false);
+    cordon().await.expect("is done");
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn an_incident_is_listed_until_a_person_has_looked_into_it() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;

@@ -90,15 +90,18 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
 fn show(incident: &v1::Incident, out: &Out) -> Result<(), Exit> {
     let text = || {
         let reason = incident.reason.as_ref().map(|r| format!("{}  {}", r.code, r.message)).unwrap_or_default();
+        let facts = incident.reason.iter().flat_map(|r| &r.metadata).collect::<std::collections::BTreeMap<_, _>>();
+        let facts: String = facts.into_iter().map(|(key, value)| format!("\n  {key}: {value}")).collect();
         let closed = incident.closed.as_ref().map(|c| format!("\nclosed by {}: {}", c.actor, c.reason));
-        format!("{}\n{reason}{}", row(incident).join("  "), closed.unwrap_or_default())
+        format!("{}\n{reason}{facts}{}", row(incident).join("  "), closed.unwrap_or_default())
     };
     out.one(incident, &incident.incident_id, text)?;
     Ok(())
 }
 
 fn row(incident: &v1::Incident) -> Vec<String> {
-    let about = [&incident.robot_id, &incident.task_id, &incident.area_id];
+    let rollout_id = incident.reason.as_ref().and_then(|r| r.metadata.get("rollout_id")).cloned().unwrap_or_default();
+    let about = [&incident.robot_id, &incident.task_id, &incident.area_id, &rollout_id];
     vec![
         incident.open_time.as_ref().map(|t| time_of(t).rfc3339()).unwrap_or_default(),
         incident.reason.as_ref().map(|r| r.code.clone()).unwrap_or_default(),

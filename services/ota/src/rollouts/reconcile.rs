@@ -3,7 +3,7 @@
 //! Invariant: the view has absorbed the whole feed before anything is decided on it.
 
 use super::directives::Signer;
-use super::{Parts, Planner, Request, releases};
+use super::{Look, Parts, Planner, Request, releases};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::view::{TABLES, View};
@@ -30,6 +30,8 @@ struct Loop {
     dirty: Dirty<Live>,
     started: Now,
     changed: watch::Sender<Seq>,
+    /// Questions that are answered once what they would see is committed.
+    looks: Vec<Look>,
 }
 
 type Replies = Vec<(oneshot::Sender<Result<(), Refusal>>, usize)>;
@@ -44,7 +46,7 @@ pub async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Er
     let started = parts.clock.now();
     let dirty = parts.board.watch();
     let view = View::new(parts.site.clone(), started, started);
-    let mut this = Loop { parts, view, seq: Seq(0), board: Board::new(), dirty, started, changed };
+    let mut this = Loop { parts, view, seq: Seq(0), board: Board::new(), dirty, started, changed, looks: Vec::new() };
     this.rebuild_until_read(&shutdown).await;
     let mut sweep = tokio::time::interval(Duration::from_millis(limits::SWEEP.as_ms()));
     sweep.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -115,24 +117,47 @@ impl Loop {
         follow(self.parts.store.as_ref(), &mut self.seq, LOGS, |entries| absorb(view, now, entries, &mut plan))
             .await
             .map_err(|error| tracing::warn!(%error, "roll-outs cannot read the feed"))?;
-        let Ok(opened) = self.parts.ota.opened() else { return Ok(false) };
+        let ota = self.parts.ota.clone();
+        let Ok(opened) = ota.opened() else { return Ok(false) };
         releases::take(&mut self.view, now, opened.repository.newest().as_deref(), &mut plan);
-        let replies = take_requests(&mut self.view, &self.board, requests, now, &mut plan);
+        let replies = self.take_requests(requests, now, &mut plan);
         let signer = Signer(opened.repository.keys().directive());
         let more = cycle(&mut self.view, now, &self.board, &heard, &signer, &mut plan);
         for text in &plan.unreadable {
             tracing::error!(text, "roll-outs passed over something they cannot read");
         }
         self.commit(plan, replies).await?;
+        for look in std::mem::take(&mut self.looks) {
+            look(&self.view, &self.board, &now);
+        }
         Ok(more)
     }
 
-    async fn commit(&mut self, plan: Plan, replies: Replies) -> Result<(), ()> {
-        if plan.items.is_empty() {
-            return Ok(());
+    fn take_requests(&mut self, requests: Vec<Request>, now: Now, plan: &mut Plan) -> Replies {
+        let mut replies = Vec::new();
+        for request in requests {
+            match request {
+                Request::Look(look) => self.looks.push(look),
+                Request::Do { command, seen, actor, reply } => {
+                    match commands::check(&self.view, &self.board, &command, seen) {
+                        Err(refusal) => {
+                            drop(reply.send(Err(refusal)));
+                            continue;
+                        }
+                        // What was asked before is in the store, or in an item before this one.
+                        Ok(true) => {}
+                        Ok(false) => commands::apply(&mut self.view, &self.board, now, &command, &actor, plan),
+                    }
+                    replies.push((reply, plan.items.len()));
+                }
+            }
         }
+        replies
+    }
+
+    async fn commit(&mut self, plan: Plan, replies: Replies) -> Result<(), ()> {
         let entries: Vec<Option<Seq>> = plan.items.iter().map(obeyed).collect();
-        let results = self.parts.store.commit(plan.items).await;
+        let results = if plan.items.is_empty() { Vec::new() } else { self.parts.store.commit(plan.items).await };
         let mut trusted = Ok(());
         let mut newest = None;
         for (result, entry) in results.iter().zip(entries) {
@@ -162,23 +187,4 @@ impl Loop {
         }
         trusted
     }
-}
-
-fn take_requests(view: &mut View, board: &Board, requests: Vec<Request>, now: Now, plan: &mut Plan) -> Replies {
-    let mut replies = Vec::new();
-    for request in requests {
-        match request {
-            Request::Look(look) => look(view, board, &now),
-            Request::Do { command, seen, actor, reply } => match commands::check(view, board, &command, seen) {
-                // What was asked before is in the store: nothing is written, and nothing has to be waited for.
-                Ok(true) => drop(reply.send(Ok(()))),
-                Err(refusal) => drop(reply.send(Err(refusal))),
-                Ok(false) => {
-                    commands::apply(view, board, now, &command, &actor, plan);
-                    replies.push((reply, plan.items.len()));
-                }
-            },
-        }
-    }
-    replies
 }
