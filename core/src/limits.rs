@@ -130,6 +130,13 @@ pub const SAMPLES_PER_MESSAGE: usize = 256;
 pub const EVENTS_PER_SECOND: u32 = 50;
 /// Unacknowledged STATUS a robot may have under way, bytes.
 pub const STATUS_IN_FLIGHT_BYTES: usize = 64 * 1024;
+/// Old STATUS samples that a robot sends on its session; more go over its bulk connection: a server that was away for a moment is not
+/// dialed twice by everybody.
+pub const REPLAY_ON_LINK_MAX: usize = 16;
+/// Old STATUS that a robot sends over bulk, bytes a second: a twentieth of a link of 10 Mbit/s.
+pub const REPLAY_BYTES_S: u64 = 64 * 1024;
+/// Calls of a session to replay over bulk that may come to nothing in a row; then the session itself takes what is left.
+pub const REPLAY_TRIES: u32 = 3;
 /// STATUS samples a ring keeps per robot before it thins.
 pub const RING_STATUS_MAX: usize = 4_096;
 /// Days a request_id, an event and a finished id on the robot's ledger are kept.

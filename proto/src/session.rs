@@ -152,6 +152,19 @@ pub struct LaneBatch {
     pub items: Vec<InboxItem>,
 }
 
+/// A batch of old STATUS beside the session: on the bulk connection, with the proof of the session that it is for.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StatusReplay {
+    /// Who.
+    pub robot_id: RobotId,
+    /// The session that this robot has now.
+    pub session_epoch: u64,
+    /// The secret of its Welcome.
+    pub session_secret: String,
+    /// Lane STATUS.
+    pub batch: LaneBatch,
+}
+
 /// Four timestamps, unix microseconds UTC, each on its own machine's clock.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ClockSample {

@@ -5,9 +5,10 @@
 
 use crate::body::{Body, BodyLimits};
 use crate::bugs::Bugs;
-use crate::lanes::Sender;
+use crate::lanes::{STATUS_SAMPLE_BYTES, Sender};
 use crate::ledger::SessionMemory;
 use crate::places::Places;
+use crate::replay::{Pace, Replayed};
 use crate::store::{Kept, Op};
 use crate::throttle::Throttle;
 use crate::update::{Done, Job, UpdateConfig, Updater};
@@ -18,7 +19,7 @@ use midshift_core::limits;
 use midshift_core::robot::{Fault, FaultClass, HardwareStop, Inventory, Lane, Mode, ReportedState, StopLevel, Vitals};
 use midshift_core::time::{LinkDuration, LinkTime, Now, SiteDuration, SiteTime};
 use midshift_core::work::{DesiredPolicy, DesiredWork, RobotEvent, SampleBody};
-use midshift_proto::session::{ClockSample, Downlink, Heartbeat, LaneAck, LaneBatch, Uplink, Welcome};
+use midshift_proto::session::{ClockSample, Downlink, Heartbeat, LaneAck, LaneBatch, StatusReplay, Uplink, Welcome};
 use std::collections::{BTreeSet, VecDeque};
 
 /// What does not change while the agent runs.
@@ -51,6 +52,8 @@ pub enum Input {
     Persisted(u64),
     /// What came of the job under way.
     Done(Box<Done>),
+    /// What came of the old STATUS under way, in the session of this epoch.
+    Replayed(u64, Replayed),
 }
 
 /// Why the agent ends by itself.
@@ -71,6 +74,8 @@ pub enum Output {
     Persist(u64, Vec<Op>),
     /// Send this in the session at hand; drop it if there is none.
     Send(Box<Uplink>),
+    /// Send this over bulk and say [`Input::Replayed`]; drop it with its session. At most one is under way.
+    Replay(Box<StatusReplay>),
     /// Do this beside everything else and say [`Input::Done`]. At most one is under way.
     Job(Box<Job>),
     /// Leave the job under way: what it has so far is kept.
@@ -135,6 +140,7 @@ pub struct AgentCore {
     pub(crate) authority: LinkDuration,
     session: Option<Session>,
     sender: Sender,
+    pace: Pace,
     throttle: Throttle,
     writes: Writes,
     standing_fault: Option<Fault>,
@@ -190,6 +196,7 @@ impl AgentCore {
             wake_site: None,
             authority: limits::AUTHORITY,
             session: None,
+            pace: Pace::default(),
             writes: Writes::default(),
             standing_fault: None,
             unfit: None,
@@ -226,6 +233,7 @@ impl AgentCore {
             }
             Input::Disconnected => self.session = None,
             Input::Done(done) => self.job_done(&now, *done),
+            Input::Replayed(session_epoch, replayed) => self.replayed(&now, session_epoch, replayed),
             Input::Fenced => {
                 self.fences += 1;
                 self.session = None;
@@ -246,7 +254,8 @@ impl AgentCore {
 
     /// When to call again.
     pub fn next_wake(&self, now: &Now) -> Wake {
-        let link = [Some(self.next_beat), self.wake_link, self.throttle.next_at()];
+        let replay = self.pace.next_at(now.link).filter(|_| self.session.is_some() && self.sender.replays_apart());
+        let link = [Some(self.next_beat), self.wake_link, self.throttle.next_at(), replay];
         let body = self.body.next_change(now.site);
         let site = [Some(self.next_status), body, self.times_out_at(now), self.wake_site];
         Wake {
@@ -372,6 +381,11 @@ impl AgentCore {
         }
         welcome.acks.iter().for_each(|ack| self.acked(ack));
         self.sender.connected(&self.kept.ring, welcome.status_credit_bytes as usize);
+        self.pace = Pace::default();
+        if welcome.observed {
+            // Nothing of it is stored, whichever way it goes.
+            self.sender.replay_on_link();
+        }
         welcome.acks.iter().for_each(|ack| self.expected(ack));
         self.period = LinkDuration(u64::from(welcome.heartbeat_period_ms).clamp(100, limits::AUTHORITY.as_ms() / 3));
         // The server may give less; more than both ends were built for it cannot give.
@@ -587,7 +601,7 @@ impl AgentCore {
         }
     }
 
-    /// Critical, event, the live heartbeat, then STATUS, which travels with heartbeats.
+    /// Critical, event, the live heartbeat, then STATUS, which travels with heartbeats, or what is old of it beside them.
     fn send(&mut self, now: &Now, beat: bool, out: &mut Vec<Output>) {
         if self.session.is_none() {
             return;
@@ -605,6 +619,7 @@ impl AgentCore {
         if message != Uplink::default() {
             out.push(Output::Send(Box::new(message)));
         }
+        self.send_replay(now, out);
     }
 
     fn send_lane(&mut self, lane: Lane, message: &mut Uplink, out: &mut Vec<Output>) {
@@ -615,6 +630,50 @@ impl AgentCore {
                 out.push(Output::Send(Box::new(std::mem::take(message))));
             }
             message.batches.push(batch);
+        }
+    }
+
+    /// Old STATUS goes beside the session, at its own pace.
+    fn send_replay(&mut self, now: &Now, out: &mut Vec<Output>) {
+        if self.session.is_none() || !self.pace.is_due(now.link) {
+            return;
+        }
+        let Some(batch) = self.sender.next_replay(&self.kept.ring) else { return };
+        let cap_bytes_s = self.update.desired.as_ref().map_or(0, |d| d.rate_bytes_s);
+        self.pace.sent(now.link, batch.items.len() * STATUS_SAMPLE_BYTES, cap_bytes_s);
+        let memory = &self.kept.ledger.session;
+        out.push(Output::Replay(Box::new(StatusReplay {
+            robot_id: self.config.robot_id.clone(),
+            session_epoch: memory.session_epoch,
+            session_secret: memory.secret.clone(),
+            batch,
+        })));
+    }
+
+    /// The server's word on a batch counts as on the session; what brought nothing is tried again, and then left to the session.
+    fn replayed(&mut self, now: &Now, session_epoch: u64, replayed: Replayed) {
+        if self.session.as_ref().is_none_or(|s| s.epoch != session_epoch) {
+            return;
+        }
+        let before = self.kept.ring.lane(Lane::Status).acked;
+        if let Replayed::Stored(ack) = &replayed {
+            self.acked(ack);
+        }
+        self.sender.replayed(&self.kept.ring);
+        if let Replayed::Stored(ack) = &replayed {
+            self.expected(ack);
+        }
+        let goes_on = match &replayed {
+            Replayed::Stored(_) if self.kept.ring.lane(Lane::Status).acked > before => {
+                self.pace.went_well();
+                true
+            }
+            Replayed::NotServed => false,
+            Replayed::Stored(_) | Replayed::Failed(_) => self.pace.came_to_nothing(now.link),
+        };
+        if !goes_on {
+            tracing::info!(robot_id = %self.config.robot_id, ?replayed, "old status goes on the session");
+            self.sender.replay_on_link();
         }
     }
 

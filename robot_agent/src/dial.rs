@@ -1,4 +1,4 @@
-//! How sessions and downloads reach the server: one connection each, small buffers, and a network that a simulation can cut.
+//! How sessions and bulk reach the server: one connection each, small buffers, and a network that a simulation can cut.
 //!
 //! Invariant: keep-alive of HTTP/2 is not liveness and is off; the agent itself gives a silent session up. Called by the shell.
 

@@ -5,6 +5,7 @@
 pub mod body;
 pub mod boot;
 pub mod bugs;
+pub mod bulk;
 pub mod core;
 pub mod device;
 pub mod dial;
@@ -18,6 +19,7 @@ pub mod memory;
 mod offer;
 pub mod places;
 pub mod pulse;
+pub mod replay;
 pub mod ring;
 pub mod session;
 pub mod sets;

@@ -6,9 +6,11 @@
 
 use crate::body::Body;
 use crate::bugs::Bugs;
+use crate::bulk::Bulk;
 use crate::core::{AgentCore, CoreConfig, ExitReason, Input, Output};
 use crate::device::DeviceKey;
 use crate::dial::{self, Dial};
+use crate::replay::Replayed;
 use crate::sets::Holdings;
 use crate::store::{self, Op, Store};
 use crate::update::io::Worker;
@@ -21,7 +23,8 @@ use midshift_core::time::{Clock, LinkDuration, LinkTime, Now};
 use midshift_proto::convert::parse;
 use midshift_proto::link::v1;
 use midshift_proto::session::{
-    Close, CloseCode, FromRobot, Hello, LanePosition, PROTOCOL_VERSION, Previous, ToRobot, Uplink, Welcome,
+    Close, CloseCode, FromRobot, Hello, LanePosition, PROTOCOL_VERSION, Previous, StatusReplay, ToRobot, Uplink,
+    Welcome,
 };
 use rand::{RngExt, SeedableRng};
 use std::future::{Future, pending};
@@ -61,6 +64,15 @@ pub struct Updates {
     pub worker: Box<dyn Worker>,
 }
 
+/// An agent's ways to the server.
+#[derive(Clone)]
+pub struct Lines {
+    /// Makes the connection of each session.
+    pub link: Arc<dyn Dial>,
+    /// The one for bulk, which its worker uses too.
+    pub bulk: Bulk,
+}
+
 /// An agent that could not go on.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
@@ -83,6 +95,8 @@ const PATH: &str = "/midshift.link.v1.LinkService/Session";
 type Boxed<T> = Pin<Box<dyn Future<Output = T> + Send>>;
 /// The store comes back from each commit.
 type Commit = (Box<dyn Store>, Result<(), store::Error>);
+/// What came of old STATUS, with the session that it was for.
+type Replaying = (u64, Replayed);
 /// The worker comes back from each job.
 type Worked = (Box<dyn Worker>, Done);
 
@@ -117,6 +131,7 @@ enum Woken {
     Shutdown,
     Committed(Box<dyn Store>, Result<(), store::Error>),
     Worked(Box<dyn Worker>, Box<Done>),
+    Replayed(u64, Replayed),
     Channel(Result<Channel, String>),
     DialNow,
     Greeted(Greeted),
@@ -128,7 +143,7 @@ pub struct Agent {
     config: AgentConfig,
     core: AgentCore,
     clock: Arc<dyn Clock>,
-    dial: Arc<dyn Dial>,
+    lines: Lines,
     open: Option<Open>,
     way: Way,
     retry: ExponentialBackoff,
@@ -138,6 +153,8 @@ pub struct Agent {
     committing: Option<Boxed<Commit>>,
     worker: Option<Box<dyn Worker>>,
     working: Option<Boxed<Worked>>,
+    /// Ends with the session that it is for.
+    replaying: Option<Boxed<Replaying>>,
     leave: CancellationToken,
     pulsed: LinkTime,
     exit: Option<ExitReason>,
@@ -149,7 +166,7 @@ pub async fn run(
     body: Box<dyn Body>,
     mut store: Box<dyn Store>,
     clock: Arc<dyn Clock>,
-    dial: Arc<dyn Dial>,
+    lines: Lines,
     shutdown: CancellationToken,
 ) -> Result<ExitReason, Error> {
     let mut kept = store.load(&config.new_ring_id).await?;
@@ -171,7 +188,7 @@ pub async fn run(
         rng: rand::rngs::StdRng::seed_from_u64(config.seed),
         core,
         clock,
-        dial,
+        lines,
         open: None,
         way: Way::Idle,
         store: Some(store),
@@ -179,6 +196,7 @@ pub async fn run(
         committing: None,
         worker: config.update.take().map(|update| update.worker),
         working: None,
+        replaying: None,
         leave: CancellationToken::new(),
         pulsed: LinkTime(0),
         exit: None,
@@ -229,6 +247,7 @@ impl Agent {
                     self.worker = Some(worker);
                     self.step(Input::Done(done));
                 }
+                Woken::Replayed(session_epoch, replayed) => self.step(Input::Replayed(session_epoch, replayed)),
                 Woken::DialNow => self.dial_now(),
                 Woken::Channel(Ok(channel)) => self.greet(channel),
                 Woken::Channel(Err(why)) => self.failed(&why),
@@ -250,7 +269,7 @@ impl Agent {
     async fn wait(&mut self, shutdown: &CancellationToken) -> Woken {
         let now = self.clock.now();
         let due = tokio::time::sleep(self.until_due(&now));
-        let Self { committing, working, way, open, .. } = self;
+        let Self { committing, working, replaying, way, open, .. } = self;
         tokio::select! {
             biased;
             (store, done) = ready(committing) => { *committing = None; Woken::Committed(store, done) }
@@ -258,6 +277,7 @@ impl Agent {
             (worker, done) = ready(working) => { *working = None; Woken::Worked(worker, Box::new(done)) }
             woken = progress(way) => { *way = Way::Idle; woken }
             message = next(open) => Woken::Down(message.map(Box::new)),
+            (epoch, replayed) = ready(replaying) => { *replaying = None; Woken::Replayed(epoch, replayed) }
             () = due => Woken::Due,
         }
     }
@@ -292,6 +312,7 @@ impl Agent {
             match output {
                 Output::Persist(batch, ops) => self.persist(batch, ops),
                 Output::Send(message) => self.send(*message),
+                Output::Replay(replay) => self.replay(*replay),
                 Output::Job(job) => self.work_on(*job),
                 Output::DropJob => self.leave.cancel(),
                 Output::Exit(reason) => self.exit = Some(reason),
@@ -318,6 +339,16 @@ impl Agent {
         }));
     }
 
+    fn replay(&mut self, replay: StatusReplay) {
+        let bulk = self.lines.bulk.clone();
+        self.replaying = Some(Box::pin(async move { (replay.session_epoch, bulk.replay(&replay).await) }));
+    }
+
+    /// The session is over, and what was sent beside it.
+    fn leave_session(&mut self) {
+        (self.open, self.replaying) = (None, None);
+    }
+
     fn send(&mut self, message: Uplink) {
         let Some(open) = &self.open else { return };
         let only_heartbeat = message.batches.is_empty();
@@ -329,7 +360,7 @@ impl Agent {
 
     fn lost(&mut self, why: &str) {
         tracing::info!(robot_id = %self.config.robot_id, why, "session lost");
-        self.open = None;
+        self.leave_session();
         self.step(Input::Disconnected);
         if matches!(self.way, Way::Idle) {
             self.wait_to_dial(None);
@@ -351,7 +382,7 @@ impl Agent {
     }
 
     fn dial_now(&mut self) {
-        let dial = self.dial.clone();
+        let dial = self.lines.link.clone();
         self.way = Way::Dialing(Box::pin(async move { dial.dial().await.map_err(|e| e.to_string()) }));
     }
 
@@ -394,6 +425,7 @@ impl Agent {
             Greeted::Welcome(welcome) => {
                 let (open, welcome) = *welcome;
                 tracing::info!(robot_id = %self.config.robot_id, session_epoch = welcome.session_epoch, "session open");
+                self.leave_session();
                 self.open = Some(open);
                 self.retry = retries(self.rng.random());
                 self.step(Input::Connected(welcome));
@@ -429,7 +461,7 @@ impl Agent {
     fn closed(&mut self, close: &Close) {
         tracing::info!(robot_id = %self.config.robot_id, code = ?close.code, reason = close.reason.text(), "closed by server");
         let had_next = !matches!(self.way, Way::Idle);
-        self.open = None;
+        self.leave_session();
         if close.code == CloseCode::Fenced && had_next {
             // Its own next session proved the succession: nobody else has this robot's id.
             return self.step(Input::Disconnected);

@@ -5,7 +5,7 @@
 
 use crate::behaviour::{Behaviour, COMPONENT, FILE_BYTES_MAX};
 use crate::handle::SimHandle;
-use midshift_agent::dial::Dial;
+use midshift_agent::bulk::Bulk;
 use midshift_agent::session::Updates;
 use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::sets::memory::MemorySets;
@@ -127,7 +127,7 @@ impl Launched {
     ///
     /// # Errors
     /// Sets that cannot be opened.
-    pub fn updates(&self, trust: &Trust, bulk: Arc<dyn Dial>) -> Result<Updates, sets::Error> {
+    pub fn updates(&self, trust: &Trust, bulk: Bulk) -> Result<Updates, sets::Error> {
         let config = UpdateConfig { is_launched: true, ..trust.config() };
         let worker = UpdateWorker::new(self.kept.open()?, Arc::new(GrpcRemote::new(bulk)));
         Ok(Updates { config, worker: Box::new(worker) })

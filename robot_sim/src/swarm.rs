@@ -9,10 +9,11 @@ use crate::launched::{Launched, Start};
 use crate::service::Crash;
 use midshift_agent::body::Body;
 use midshift_agent::bugs::Bugs;
+use midshift_agent::bulk::Bulk;
 use midshift_agent::core::ExitReason;
 use midshift_agent::dial::{self, Dial, TcpDial};
 use midshift_agent::memory::MemoryStore;
-use midshift_agent::session::{self, AgentConfig};
+use midshift_agent::session::{self, AgentConfig, Lines};
 use midshift_agent::sets;
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::starts::HANG_SECONDS;
@@ -78,24 +79,6 @@ pub enum Error {
     },
 }
 
-/// How the robots of a swarm change their software.
-#[derive(Clone)]
-pub struct SwarmSoftware {
-    /// What they believe.
-    pub trust: Trust,
-    /// The way to the repository for one robot, beside that of its session.
-    pub bulk: DialFor,
-}
-
-impl SwarmSoftware {
-    /// Over TCP from `http://host:port`.
-    pub fn tcp(trust: Trust, uri: &str) -> Self {
-        let uri = uri.to_owned();
-        let bulk: DialFor = Arc::new(move |_, network| Ok(Arc::new(TcpDial::bulk(&uri, Some(network))?)));
-        Self { trust, bulk }
-    }
-}
-
 /// What a swarm needs.
 #[derive(Clone)]
 pub struct SwarmConfig {
@@ -105,6 +88,8 @@ pub struct SwarmConfig {
     pub clock: Arc<dyn Clock>,
     /// The way to the server.
     pub dial: DialFor,
+    /// The same beside the sessions: for software and old STATUS.
+    pub bulk: DialFor,
     /// Where ledgers and rings are kept: in memory, or in `<dir>/<robot_id>/agent.db`.
     pub persistence: Persistence,
     /// Decides the spread of starts and of attempts to connect.
@@ -115,19 +100,19 @@ pub struct SwarmConfig {
     pub bugs: Bugs,
     /// Which tasks a person leaves to their robots; none: nobody walks the hall.
     pub person: Option<Live>,
-    /// How they change their software; none: they do not.
-    pub software: Option<SwarmSoftware>,
+    /// What they believe of software; none: theirs is not changed.
+    pub software: Option<Trust>,
 }
 
 impl SwarmConfig {
     /// Over TCP to `http://host:port`, all in memory, with a person to whom no load is dear.
     pub fn tcp(hall: Arc<Hall>, clock: Arc<dyn Clock>, uri: &str, seed: u64) -> Self {
-        let uri = uri.to_owned();
-        let dial: DialFor = Arc::new(move |_, network| Ok(Arc::new(TcpDial::new(&uri, Some(network))?)));
+        let (link, bulk) = (uri.to_owned(), uri.to_owned());
         Self {
             hall,
             clock,
-            dial,
+            dial: Arc::new(move |_, network| Ok(Arc::new(TcpDial::new(&link, Some(network))?))),
+            bulk: Arc::new(move |_, network| Ok(Arc::new(TcpDial::bulk(&bulk, Some(network))?))),
             persistence: Persistence::Memory,
             seed,
             spread: Duration::from_millis(500),
@@ -282,11 +267,12 @@ impl Life {
         crashes: &mut u64,
     ) -> Result<Ended, Error> {
         let robot_id = self.robot.robot_id().clone();
-        let dial = (self.config.dial)(&robot_id, self.robot.network())?;
+        let link = (self.config.dial)(&robot_id, self.robot.network())?;
+        let bulk = Bulk::new((self.config.bulk)(&robot_id, self.robot.network())?);
         let store = self.store().await?;
-        let config = self.agent_config(launched)?;
+        let config = self.agent_config(launched, &bulk)?;
         let (body, clock) = (Box::new(self.robot.clone()), self.config.clock.clone());
-        let agent = session::run(config, body, store, clock, dial, shutdown.clone());
+        let agent = session::run(config, body, store, clock, Lines { link, bulk }, shutdown.clone());
         tokio::pin!(agent);
         let crash = async {
             match self.crashes.get(&robot_id) {
@@ -328,13 +314,12 @@ impl Life {
         Launched::new(dir.as_deref(), &self.robot)
     }
 
-    fn agent_config(&mut self, launched: Option<&Launched>) -> Result<AgentConfig, Error> {
+    fn agent_config(&mut self, launched: Option<&Launched>, bulk: &Bulk) -> Result<AgentConfig, Error> {
         let robot_id = self.robot.robot_id().clone();
         let update = match (&self.config.software, launched) {
-            (Some(software), Some(launched)) => {
-                let bulk = (software.bulk)(&robot_id, self.robot.network())?;
+            (Some(trust), Some(launched)) => {
                 let failed = |source| Error::Sets { robot_id: robot_id.clone(), source };
-                Some(launched.updates(&software.trust, bulk).map_err(failed)?)
+                Some(launched.updates(trust, bulk.clone()).map_err(failed)?)
             }
             _ => None,
         };

@@ -3,8 +3,8 @@
 use super::{At, Parse, WireEnum, from_one, id, list, maybe, need, text, word};
 use crate::link::v1;
 use crate::session::{
-    ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Heartbeat, Hello, LaneAck, LanePosition, Previous,
-    ToRobot, Uplink, Welcome,
+    ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, LanePosition,
+    Previous, StatusReplay, ToRobot, Uplink, Welcome,
 };
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
@@ -231,6 +231,58 @@ impl Parse<Uplink> for v1::Uplink {
         let heartbeat = maybe(self.heartbeat, at.field("heartbeat"), bad);
         let batches = list(self.batches, at.field("batches"), bad);
         Some(Uplink { heartbeat: heartbeat?, batches: batches? })
+    }
+}
+
+impl From<&StatusReplay> for v1::ReplayStatusRequest {
+    fn from(replay: &StatusReplay) -> Self {
+        Self {
+            robot_id: replay.robot_id.to_string(),
+            session_epoch: replay.session_epoch,
+            session_secret: replay.session_secret.clone(),
+            batch: Some((&replay.batch).into()),
+        }
+    }
+}
+
+impl Parse<StatusReplay> for v1::ReplayStatusRequest {
+    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<StatusReplay> {
+        let robot_id = id(&self.robot_id, RobotId::parse, at.field("robot_id"), bad);
+        let session_epoch = from_one(self.session_epoch, at.field("session_epoch"), bad);
+        let session_secret = text(self.session_secret, 128, at.field("session_secret"), bad);
+        let items = self.batch.as_ref().map(|b| b.samples.len() + b.gaps.len());
+        if items.is_some_and(|n| !(1..=limits::SAMPLES_PER_MESSAGE).contains(&n)) {
+            bad.add(at.field("batch").to_string(), "must be 1-256 samples and gaps in all");
+            return None;
+        }
+        let batch: Option<LaneBatch> = need(self.batch, at.field("batch"), bad);
+        if batch.as_ref().is_some_and(|b| b.lane != Lane::Status) {
+            bad.add(at.field("batch").field("lane").to_string(), "must be STATUS");
+            return None;
+        }
+        Some(StatusReplay {
+            robot_id: robot_id?,
+            session_epoch: session_epoch?,
+            session_secret: session_secret?,
+            batch: batch?,
+        })
+    }
+}
+
+impl From<&LaneAck> for v1::ReplayStatusResponse {
+    fn from(ack: &LaneAck) -> Self {
+        Self { ack: Some(ack.into()) }
+    }
+}
+
+impl Parse<LaneAck> for v1::ReplayStatusResponse {
+    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<LaneAck> {
+        let ack: LaneAck = need(self.ack, at.field("ack"), bad)?;
+        if ack.lane != Lane::Status {
+            bad.add(at.field("ack").field("lane").to_string(), "must be STATUS");
+            return None;
+        }
+        Some(ack)
     }
 }
 

@@ -170,6 +170,7 @@ fn every_service_is_in_the_descriptor_set() {
     let wanted = [
         "fleet.v1.FleetService",
         "link.v1.LinkService",
+        "link.v1.ReplayService",
         "ota.v1.BundleService",
         "ota.v1.ChunkService",
         "ota.v1.RolloutService",

@@ -18,7 +18,7 @@ use midshift_proto::link::v1;
 use midshift_proto::parse;
 use midshift_proto::session::{
     ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, LanePosition,
-    Previous, ToRobot, Uplink, Welcome,
+    Previous, StatusReplay, ToRobot, Uplink, Welcome,
 };
 use proptest::prelude::*;
 use prost::Message;
@@ -484,4 +484,39 @@ proptest! {
             let _ = parse::<ToRobot, _>(wire);
         }
     }
+}
+
+fn status_replay(seqs: std::ops::RangeInclusive<u64>) -> StatusReplay {
+    let sample = |seq| InboxItem::Sample(Sample { seq, robot_unix_ms: 7, body: SampleBody::Status(vitals()) });
+    let batch = LaneBatch { lane: Lane::Status, items: seqs.map(sample).collect() };
+    StatusReplay { robot_id: robot(), session_epoch: 1_780_300_000_000, session_secret: "secret".into(), batch }
+}
+
+#[test]
+fn old_status_and_its_answer_are_heard_as_they_were_said() {
+    let replay = status_replay(1..=256);
+    assert_eq!(parse(v1::ReplayStatusRequest::from(&replay)), Ok(replay));
+    for expect in [None, Some(8)] {
+        let ack = LaneAck { lane: Lane::Status, seq: 7, expect };
+        assert_eq!(parse(v1::ReplayStatusResponse::from(&ack)), Ok(ack));
+    }
+    let other_lane = LaneAck { lane: Lane::Event, seq: 7, expect: None };
+    assert!(parse::<LaneAck, _>(v1::ReplayStatusResponse::from(&other_lane)).is_err());
+    assert!(parse::<LaneAck, _>(v1::ReplayStatusResponse { ack: None }).is_err());
+}
+
+#[test]
+fn a_replay_that_breaks_the_shape_hears_every_field() {
+    let heard = |request: v1::ReplayStatusRequest| {
+        let refusal = parse::<StatusReplay, _>(request).expect_err("invalid");
+        refusal.violations.into_iter().map(|v| v.field).collect::<Vec<_>>()
+    };
+    let nothing = v1::ReplayStatusRequest::default();
+    assert_eq!(heard(nothing), ["robot_id", "session_epoch", "session_secret", "batch"]);
+    let good = v1::ReplayStatusRequest::from(&status_replay(1..=1));
+    for many in [0, 257] {
+        assert_eq!(heard((&status_replay(1..=many)).into()), ["batch"]);
+    }
+    let events = v1::LaneBatch { lane: v1::Lane::Event.into(), ..good.batch.clone().expect("is there") };
+    assert_eq!(heard(v1::ReplayStatusRequest { batch: Some(events), ..good }), ["batch.lane"]);
 }

@@ -1,10 +1,9 @@
-//! The server's repository over gRPC, on a connection of its own: metadata and bytes never stand before a heartbeat.
+//! The server's repository over gRPC, on the bulk connection: metadata and bytes never stand before a heartbeat.
 //!
-//! Invariant: a piece is handed on only if it follows the one before and arrived as it was sent; the connection is there only while it is
-//! used and [`IDLE`] longer. Called by [`super::io`].
+//! Invariant: a piece is handed on only if it follows the one before and arrived as it was sent. Called by [`super::io`].
 
 use super::io::{Pieces, Remote, Way};
-use crate::dial::Dial;
+use crate::bulk::{Bulk, Lease, SILENCE, silent};
 use crate::sets::Wanted;
 use async_trait::async_trait;
 use midshift_bundle::digest::Digest;
@@ -16,134 +15,35 @@ use midshift_proto::ota::v1::chunk_service_client::ChunkServiceClient;
 use midshift_proto::ota::v1::{
     Encoding, FetchChunksRequest, FetchChunksResponse, GetEncodingRequest, GetEncodingResponse, GetMetadataRequest,
 };
-use std::fmt;
 use std::io;
 use std::ops::Range;
 use std::pin::Pin;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::task::{Context, Poll, ready};
 use std::time::Duration;
-use tokio::time::{Instant, Sleep};
+use tokio::time::Sleep;
 use tokio_stream::Stream;
-use tonic::transport::Channel;
-use tonic::{Code, Status, Streaming};
+use tonic::{Code, Streaming};
 
-/// A connection that nobody used for so long is closed.
-pub const IDLE: Duration = Duration::from_secs(10);
-/// A server that says nothing for so long is given up: one piece of 256 KiB over 40 kbit/s.
-pub const SILENCE: Duration = Duration::from_secs(60);
 /// What gRPC puts around a document, bytes.
 const AROUND_BYTES: usize = 1024;
 
 /// The repository of a server.
+#[derive(Debug)]
 pub struct GrpcRemote {
-    dial: Arc<dyn Dial>,
-    line: Arc<Mutex<Line>>,
-}
-
-/// The connection.
-#[derive(Default)]
-struct Line {
-    channel: Option<Channel>,
-    users: usize,
-    /// When the last of them left.
-    idle_since: Option<Instant>,
-    /// A task waits to close it.
-    is_watched: bool,
-}
-
-fn lock(line: &Mutex<Line>) -> MutexGuard<'_, Line> {
-    line.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-impl fmt::Debug for GrpcRemote {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("GrpcRemote").field("is_connected", &lock(&self.line).channel.is_some()).finish_non_exhaustive()
-    }
+    bulk: Bulk,
 }
 
 impl GrpcRemote {
-    /// Over connections made by `dial`; none is made before the first question.
-    pub fn new(dial: Arc<dyn Dial>) -> Self {
-        Self { dial, line: Arc::default() }
+    /// Over this connection; it is not made before the first question.
+    pub fn new(bulk: Bulk) -> Self {
+        Self { bulk }
     }
-
-    async fn lease(&self) -> io::Result<Lease> {
-        let open = lock(&self.line).channel.clone();
-        let channel = match open {
-            Some(channel) => channel,
-            None => {
-                let dialed = tokio::time::timeout(SILENCE, self.dial.dial()).await.map_err(|_| silent())?;
-                dialed.map_err(|error| io::Error::new(io::ErrorKind::NotConnected, error.to_string()))?
-            }
-        };
-        let mut line = lock(&self.line);
-        line.channel = Some(channel.clone());
-        line.users += 1;
-        if !line.is_watched {
-            line.is_watched = true;
-            tokio::spawn(close_when_idle(Arc::downgrade(&self.line)));
-        }
-        Ok(Lease { line: self.line.clone(), channel })
-    }
-}
-
-/// Lets the connection go once nobody used it for [`IDLE`].
-async fn close_when_idle(line: Weak<Mutex<Line>>) {
-    loop {
-        let until = {
-            let Some(line) = line.upgrade() else { return };
-            let (mut line, now) = (lock(&line), Instant::now());
-            match line.idle_since.filter(|_| line.users == 0).map(|since| since + IDLE) {
-                Some(until) if until <= now => {
-                    line.channel = None;
-                    line.is_watched = false;
-                    return;
-                }
-                until => until.unwrap_or(now + IDLE),
-            }
-        };
-        tokio::time::sleep_until(until).await;
-    }
-}
-
-/// One use of the connection.
-struct Lease {
-    line: Arc<Mutex<Line>>,
-    channel: Channel,
-}
-
-impl Lease {
-    /// Whoever comes next dials anew.
-    fn spoil(&self) {
-        lock(&self.line).channel = None;
-    }
-    /// The error of an answer that did not come as it should.
-    fn refused(&self, status: &Status) -> io::Error {
-        if status.code() == Code::NotFound {
-            return io::Error::new(io::ErrorKind::NotFound, status.message());
-        }
-        self.spoil();
-        io::Error::other(format!("{}: {}", status.code(), status.message()))
-    }
-}
-
-impl Drop for Lease {
-    fn drop(&mut self) {
-        let mut line = lock(&self.line);
-        line.users -= 1;
-        line.idle_since = Some(Instant::now());
-    }
-}
-
-fn silent() -> io::Error {
-    io::Error::new(io::ErrorKind::TimedOut, "the server is silent")
 }
 
 #[async_trait]
 impl Remote for GrpcRemote {
     async fn metadata(&self, name: &str) -> io::Result<Option<Vec<u8>>> {
-        let lease = self.lease().await?;
+        let lease = self.bulk.lease().await?;
         let most = METADATA_BYTES_MAX as usize + AROUND_BYTES;
         let mut client = BundleServiceClient::new(lease.channel.clone()).max_decoding_message_size(most);
         let request = GetMetadataRequest { name: name.to_owned() };
@@ -159,7 +59,7 @@ impl Remote for GrpcRemote {
     }
 
     async fn way(&self, wanted: &Wanted, bases: &[Digest]) -> io::Result<Way> {
-        let lease = self.lease().await?;
+        let lease = self.bulk.lease().await?;
         let base_digests = bases.iter().take(limits::ENCODING_BASES_MAX).map(Digest::to_string).collect();
         let request = GetEncodingRequest { digest: wanted.digest.to_string(), base_digests };
         let mut client = ChunkServiceClient::new(lease.channel.clone());
@@ -176,7 +76,7 @@ impl Remote for GrpcRemote {
     }
 
     async fn range(&self, digest: &Digest, range: Range<u64>) -> io::Result<Pieces> {
-        let lease = self.lease().await?;
+        let lease = self.bulk.lease().await?;
         let length = range.end.saturating_sub(range.start);
         let request = FetchChunksRequest { digest: digest.to_string(), offset: range.start, length };
         let mut client = ChunkServiceClient::new(lease.channel.clone());

@@ -1,6 +1,6 @@
 //! Laws L1 to L6 on the robot's side, over each store.
 
-use crate::rig::{Rig, ack, attempt, items, place_id, welcome};
+use crate::rig::{Rig, ack, attempt, items, place_id};
 use midshift_agent::device::DeviceKey;
 use midshift_agent::ledger::{Applied, Holder, PlacesRow, SessionMemory};
 use midshift_agent::memory::MemoryStore;
@@ -11,7 +11,7 @@ use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::robot::{Lane, Mode, ReportedAttempt, Vitals};
 use midshift_core::work::{AttemptReport, Gap, InboxItem, RobotEvent, SampleBody, WorkState, WorkStats};
-use midshift_proto::session::{Downlink, LaneAck, Welcome};
+use midshift_proto::session::{Downlink, LaneAck};
 use std::sync::Arc;
 
 /// Writes through the core's copy into a store and reads the store again, as a restart does.
@@ -247,35 +247,6 @@ fn nothing_is_sent_before_it_is_durable() {
     assert_eq!((seqs(&rig, Lane::Event), rig.core.kept().ring.lane(Lane::Event).produced), (vec![], 1));
     rig.flush();
     assert_eq!(seqs(&rig, Lane::Event), [1]);
-}
-
-#[test]
-fn after_a_break_events_come_first_then_the_live_heartbeat_then_old_status_at_a_quarter_of_the_credit() {
-    let mut rig = Rig::at("A");
-    rig.connect();
-    rig.put(midshift_agent::core::Input::Disconnected);
-    rig.messages.clear();
-    rig.body.says(midshift_agent::body::BodyNews::Mode(Mode::Manual));
-    rig.silence(600_000);
-    assert_eq!(rig.messages.len(), 0);
-    let kept = rig.core.kept().ring.lane(Lane::Status).samples.len();
-    assert!((250..400).contains(&kept), "{kept}");
-    rig.epoch += 1;
-    rig.put(midshift_agent::core::Input::Connected(Welcome { session_epoch: rig.epoch, ..welcome() }));
-    assert_eq!(seqs(&rig, Lane::Event), [1]);
-    assert_eq!(rig.hb, 1);
-    let first = seqs(&rig, Lane::Status);
-    assert_eq!((first[0], first.len()), (1, 64 * 1024 / 4 / 192));
-    let order: Vec<_> = rig.messages.iter().flat_map(|m| m.batches.iter().map(|b| b.lane)).collect();
-    assert_eq!(order, [Lane::Event, Lane::Status]);
-    // Acknowledged in steps, everything comes, in order and once.
-    while rig.core.kept().ring.lane(Lane::Status).acked < kept as u64 {
-        let sent = *seqs(&rig, Lane::Status).last().expect("some");
-        rig.down(Downlink { acks: vec![ack(Lane::Status, sent), ack(Lane::Event, 1)], ..Downlink::default() });
-        rig.pass(1_000);
-    }
-    let all = seqs(&rig, Lane::Status);
-    assert_eq!(all, (1..=all.len() as u64).collect::<Vec<_>>());
 }
 
 #[test]

@@ -9,6 +9,7 @@ mod offers;
 mod power;
 mod release;
 mod remote;
+mod replays;
 mod restarts;
 mod rig;
 mod session;

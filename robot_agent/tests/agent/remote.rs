@@ -3,11 +3,12 @@
 use crate::release::{Bundle, Releases};
 use async_trait::async_trait;
 use hyper_util::rt::TokioIo;
+use midshift_agent::bulk::{Bulk, IDLE, SILENCE};
 use midshift_agent::dial::{self, Dial, TcpDial};
 use midshift_agent::sets::memory::MemorySets;
 use midshift_agent::sets::{CHUNK_BYTES, Sets, Wanted};
 use midshift_agent::update::io::{Remote, UpdateWorker, Way, Worker};
-use midshift_agent::update::remote::{GrpcRemote, IDLE, SILENCE};
+use midshift_agent::update::remote::GrpcRemote;
 use midshift_agent::update::{Done, Failure, Job};
 use midshift_bundle::digest::Digest;
 use midshift_proto::chunk;
@@ -234,7 +235,7 @@ impl Bench {
         let (ends, incoming) = mpsc::channel(4);
         tokio::spawn(shop.router().serve_with_incoming(ReceiverStream::new(incoming)));
         let ((open, is_open), (dialed, was_dialed)) = (watch::channel(0), watch::channel(0));
-        let remote = Arc::new(GrpcRemote::new(Arc::new(Pipes { ends, open, dialed })));
+        let remote = Arc::new(GrpcRemote::new(Bulk::new(Arc::new(Pipes { ends, open, dialed }))));
         Self { releases: shop.releases.clone(), shop, remote, open: is_open, dialed: was_dialed }
     }
     fn server_is(&self, wrong: Wrong) {
@@ -302,7 +303,7 @@ async fn it_comes_over_tcp_too() {
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("binds");
     let uri = format!("http://{}", listener.local_addr().expect("bound"));
     tokio::spawn(shop.router().serve_with_incoming(TcpListenerStream::new(listener)));
-    let remote = GrpcRemote::new(Arc::new(TcpDial::bulk(&uri, None).expect("an address")));
+    let remote = GrpcRemote::new(Bulk::new(Arc::new(TcpDial::bulk(&uri, None).expect("an address"))));
     let root = remote.metadata("1.root.json").await.expect("answers");
     assert_eq!(root, Some(shop.releases.config().root));
     let wanted = program(&bundle);

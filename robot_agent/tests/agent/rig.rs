@@ -17,7 +17,7 @@ use midshift_core::work::{
     Assignment, AttemptReport, DesiredWork, Effect, GrantedPlace, InboxItem, PlaceNews, RobotEvent, RoutePoint,
     SampleBody, StepKind, WorkState, WorkStep,
 };
-use midshift_proto::session::{ClockSample, Downlink, Echo, LaneAck, LaneBatch, Uplink, Welcome};
+use midshift_proto::session::{ClockSample, Downlink, Echo, LaneAck, LaneBatch, StatusReplay, Uplink, Welcome};
 use std::sync::{Arc, Mutex, MutexGuard};
 use tokio_util::sync::CancellationToken;
 
@@ -207,6 +207,8 @@ pub struct Rig {
     pub unwritten: Option<(u64, Vec<midshift_agent::store::Op>)>,
     pub events: Vec<RobotEvent>,
     pub messages: Vec<Uplink>,
+    /// Old STATUS given to the bulk connection; a test answers.
+    pub replays: Vec<StatusReplay>,
     pub reported: Option<ReportedState>,
     pub exit: Option<ExitReason>,
     /// Software that can be changed, and the ends of its jobs.
@@ -300,6 +302,7 @@ impl Rig {
             unwritten: None,
             events: Vec::new(),
             messages: Vec::new(),
+            replays: Vec::new(),
             reported: None,
             exit: None,
             updates,
@@ -343,6 +346,7 @@ impl Rig {
                     }
                     Output::DropJob => {}
                     Output::Send(message) => self.sent(*message),
+                    Output::Replay(replay) => self.replays.push(*replay),
                     Output::Exit(reason) => self.exit = Some(reason),
                 }
             }

@@ -6,10 +6,11 @@ use async_trait::async_trait;
 use hyper_util::rt::TokioIo;
 use midshift_agent::body::BodyNews;
 use midshift_agent::bugs::Bugs;
+use midshift_agent::bulk::Bulk;
 use midshift_agent::core::ExitReason;
 use midshift_agent::dial::{self, Cut, Dial};
 use midshift_agent::memory::MemoryStore;
-use midshift_agent::session::{AgentConfig, Error, Updates, run};
+use midshift_agent::session::{AgentConfig, Error, Lines, Updates, run};
 use midshift_agent::sets::memory::MemorySets;
 use midshift_agent::sets::{Sets, Wanted};
 use midshift_agent::sqlite::SqliteStore;
@@ -22,19 +23,20 @@ use midshift_bundle::set::SetManifest;
 use midshift_core::authority::Authority;
 use midshift_core::ids::RobotId;
 use midshift_core::reason::Code;
-use midshift_core::robot::{Lane, Mode};
+use midshift_core::robot::{Lane, Mode, Vitals};
 use midshift_core::time::{Clock, ScaledClock, Utc};
 use midshift_core::work::{Assignment, DesiredWork, InboxItem, RobotEvent, SampleBody, WorkState};
 use midshift_proto::convert::parse;
 use midshift_proto::link::v1;
 use midshift_proto::link::v1::link_service_server::{LinkService, LinkServiceServer};
+use midshift_proto::link::v1::replay_service_server::{ReplayService, ReplayServiceServer};
 use midshift_proto::session::{
-    ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Hello, ToRobot, Uplink, Welcome,
+    ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Hello, LaneAck, StatusReplay, ToRobot, Uplink, Welcome,
 };
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::io::DuplexStream;
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
@@ -118,6 +120,29 @@ impl LinkService for Desk {
     }
 }
 
+/// Old STATUS that a robot wants to have stored; the test answers.
+struct Asked {
+    replay: StatusReplay,
+    answer: oneshot::Sender<LaneAck>,
+}
+
+struct Shelf(mpsc::Sender<Asked>);
+
+#[async_trait]
+impl ReplayService for Shelf {
+    async fn replay_status(
+        &self,
+        request: Request<v1::ReplayStatusRequest>,
+    ) -> Result<Response<v1::ReplayStatusResponse>, Status> {
+        let replay = parse(request.into_inner()).expect("what a robot says can be read");
+        let (answer, answered) = oneshot::channel();
+        let over = || Status::unavailable("the test is over");
+        self.0.send(Asked { replay, answer }).await.map_err(|_| over())?;
+        let ack = answered.await.map_err(|_| over())?;
+        Ok(Response::new((&ack).into()))
+    }
+}
+
 /// Pipes instead of a network.
 struct Pipes {
     ends: mpsc::Sender<Result<DuplexStream, std::io::Error>>,
@@ -146,6 +171,7 @@ impl Dial for Pipes {
 /// A robot at work and the desk of its server.
 struct Bench {
     sessions: mpsc::Receiver<Seen>,
+    replays: mpsc::Receiver<Asked>,
     network: watch::Sender<bool>,
     body: TestBody,
     shutdown: CancellationToken,
@@ -159,9 +185,11 @@ impl Bench {
     fn with(store: Box<dyn Store>, update: Option<Updates>) -> Self {
         let (ends, incoming) = mpsc::channel(4);
         let (seen, sessions) = mpsc::channel(4);
+        let (asked, replays) = mpsc::channel(4);
         let (network, up) = watch::channel(true);
-        let incoming = ReceiverStream::new(incoming);
-        tokio::spawn(Server::builder().add_service(LinkServiceServer::new(Desk(seen))).serve_with_incoming(incoming));
+        let (desk, shelf) = (LinkServiceServer::new(Desk(seen)), ReplayServiceServer::new(Shelf(asked)));
+        let server = Server::builder().add_service(desk).add_service(shelf);
+        tokio::spawn(server.serve_with_incoming(ReceiverStream::new(incoming)));
         let config = AgentConfig {
             update,
             robot_id: RobotId::parse("rbt-01").expect("a name"),
@@ -175,9 +203,10 @@ impl Bench {
         let micros = move || start.elapsed().as_micros() as u64;
         let clock: Arc<dyn Clock> = Arc::new(ScaledClock::new(micros, Utc(1_700_000_000_000), 1_000));
         let (body, shutdown) = (TestBody::at("A"), CancellationToken::new());
-        let dial = Arc::new(Pipes { ends, network: up });
-        let agent = tokio::spawn(run(config, Box::new(body.clone()), store, clock, dial, shutdown.clone()));
-        Self { sessions, network, body, shutdown, agent }
+        let link = Arc::new(Pipes { ends, network: up });
+        let lines = Lines { bulk: Bulk::new(link.clone()), link };
+        let agent = tokio::spawn(run(config, Box::new(body.clone()), store, clock, lines, shutdown.clone()));
+        Self { sessions, replays, network, body, shutdown, agent }
     }
     async fn session(&mut self) -> Seen {
         self.sessions.recv().await.expect("the robot dials")
@@ -385,5 +414,54 @@ async fn a_robot_signs_what_it_has_installed_in_its_first_hello_with_a_key_that_
 async fn a_robot_whose_software_is_not_changed_says_nothing_of_it() {
     let mut bench = Bench::new(Box::new(MemoryStore::new()));
     assert_eq!(bench.session().await.hello().await.installed, "");
+    bench.end().await;
+}
+
+/// A robot that has so many samples of STATUS from before.
+fn with_old_status(many: u64) -> MemoryStore {
+    let store = MemoryStore::new();
+    let mut kept = store.load_now("ring-1");
+    for _ in 0..many {
+        let ops = kept.ring.append(Lane::Status, 7, SampleBody::Status(Vitals::default()));
+        ops.iter().for_each(|op| kept.apply(op));
+        store.commit_now(&ops);
+    }
+    store
+}
+
+fn seqs(items: &[InboxItem]) -> Vec<u64> {
+    items.iter().filter_map(|item| if let InboxItem::Sample(s) = item { Some(s.seq) } else { None }).collect()
+}
+
+#[tokio::test(start_paused = true)]
+async fn old_status_goes_over_bulk_ends_with_its_session_and_begins_again_in_the_next() {
+    let mut bench = Bench::new(Box::new(with_old_status(40)));
+    let mut first = bench.session().await;
+    first.hello().await;
+    first.welcome(5).await;
+    let asked = bench.replays.recv().await.expect("old status");
+    assert_eq!((asked.replay.session_epoch, asked.replay.session_secret.as_str()), (5, "s5"));
+    assert_eq!(seqs(&asked.replay.batch.items)[..40], (1..=40).collect::<Vec<_>>());
+    for hb in 1..=4 {
+        assert_eq!(first.beat().await, hb, "it holds no heartbeat up");
+    }
+    drop(first);
+    let mut answer = asked.answer;
+    answer.closed().await;
+    let mut second = bench.session().await;
+    second.hello().await;
+    second.welcome(6).await;
+    let asked = bench.replays.recv().await.expect("old status again");
+    let went = seqs(&asked.replay.batch.items);
+    assert_eq!((asked.replay.session_epoch, went[0]), (6, 1));
+    let last = went[went.len() - 1];
+    asked.answer.send(LaneAck { lane: Lane::Status, seq: last, expect: None }).expect("the robot waits");
+    let live = loop {
+        let uplink = second.uplink().await;
+        if let Some(batch) = uplink.batches.iter().find(|b| b.lane == Lane::Status) {
+            break seqs(&batch.items);
+        }
+    };
+    assert_eq!(live[0], last + 1, "and then it is live");
     bench.end().await;
 }

@@ -18,7 +18,7 @@ use midshift_core::time::{Clock, SiteTime};
 use midshift_core::work::Live;
 use midshift_sim::hall::{Hall, HallConfig, Persistence};
 use midshift_sim::service::SimFace;
-use midshift_sim::swarm::{Swarm, SwarmConfig, SwarmSoftware};
+use midshift_sim::swarm::{Swarm, SwarmConfig};
 use midshift_store::{
     FRAME_BYTES_DEFAULT, FrameLog, LiveBoard, MemoryFrames, MemoryStore, SqliteFrames, SqliteStore, Store, StoreId,
 };
@@ -154,7 +154,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     swarm.person = Some(Arc::new(move |id| tally::look(&live, |t| t.is_live(id))));
     let (software, ota) = Throwaway::make(clock.clone()).await?;
     let trust = software.trust(site.site_id().clone())?;
-    swarm.software = Some(SwarmSoftware::tcp(trust.clone(), &format!("http://{address}")));
+    swarm.software = Some(trust.clone());
     let swarm = Swarm::new(swarm);
     let (store, frames) = stores(&args, &site, &clock).await?;
     let planning = Planning::start()?;

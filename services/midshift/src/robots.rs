@@ -3,6 +3,7 @@
 use crate::software::Software;
 use crate::{clock, site_file};
 use anyhow::{Context, bail, ensure};
+use midshift_agent::bulk::Bulk;
 use midshift_agent::core::ExitReason;
 use midshift_agent::dial::TcpDial;
 use midshift_core::ids::{RobotId, WaypointId};
@@ -154,13 +155,13 @@ pub async fn agent(args: AgentRun, stop: CancellationToken) -> anyhow::Result<Ex
         args.person.then(|| AbortOnDropHandle::new(tokio::spawn(visit(handle.clone(), args.seed, clock.clone()))));
     let network = handle.network();
     let uri = uri(&args.server);
-    let dial = TcpDial::new(&uri, Some(network.clone()))?;
-    let bulk = TcpDial::bulk(&uri, Some(network))?;
+    let link = Arc::new(TcpDial::new(&uri, Some(network.clone()))?);
+    let bulk = Bulk::new(Arc::new(TcpDial::bulk(&uri, Some(network))?));
     let mut pulse = midshift_agent::pulse::for_launcher();
     if let Some(software) = &software {
         pulse = software.pulse(pulse, &clock);
     }
-    let mut update = software.map(|software| software.updates(bulk));
+    let mut update = software.map(|software| software.updates(bulk.clone()));
     if let Some(update) = &mut update {
         update.config.clock_synced = !args.clock_unsynced;
     }
@@ -174,7 +175,8 @@ pub async fn agent(args: AgentRun, stop: CancellationToken) -> anyhow::Result<Ex
         bugs: midshift_agent::bugs::Bugs::default(),
         pulse,
     };
-    match midshift_agent::session::run(agent, Box::new(handle), Box::new(store), clock, Arc::new(dial), stop).await? {
+    let lines = midshift_agent::session::Lines { link, bulk };
+    match midshift_agent::session::run(agent, Box::new(handle), Box::new(store), clock, lines, stop).await? {
         reason @ (ExitReason::Shutdown | ExitReason::Switched) => Ok(reason),
         ExitReason::FencedTwice => {
             bail!("fenced twice: another machine runs as this robot. Find it, then start this one again")

@@ -180,6 +180,7 @@ impl Server {
             .add_service(self.fleet.grpc().max_decoding_message_size(control))
             .add_service(self.telemetry.grpc().max_decoding_message_size(control))
             .add_service(self.telemetry.link())
+            .add_service(self.telemetry.replay())
             .add_service(self.parts.ota.bundles())
             .add_service(self.parts.ota.chunks())
             .add_service(self.rollouts.grpc().max_decoding_message_size(control))

@@ -4,7 +4,7 @@
 //! Called by [`crate::robots`].
 
 use anyhow::{bail, ensure};
-use midshift_agent::dial::TcpDial;
+use midshift_agent::bulk::Bulk;
 use midshift_agent::launcher;
 use midshift_agent::session::Updates;
 use midshift_agent::sets::Sets;
@@ -86,9 +86,9 @@ impl Software {
     }
 
     /// What the agent changes its software with, over `bulk`; its clock is taken for set from the network.
-    pub fn updates(self, bulk: TcpDial) -> Updates {
+    pub fn updates(self, bulk: Bulk) -> Updates {
         let config = UpdateConfig { is_launched: self.is_launched, ..self.trust.config() };
-        let remote = Arc::new(GrpcRemote::new(Arc::new(bulk)));
+        let remote = Arc::new(GrpcRemote::new(bulk));
         Updates { config, worker: Box::new(UpdateWorker::new(Box::new(self.sets), remote)) }
     }
 }

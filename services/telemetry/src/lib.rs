@@ -1,6 +1,6 @@
 //! Telemetry ingest as a service: holds the robots' links, keeps their events, serves their live state.
 //!
-//! Called by the binary: [`TelemetryService::new`], its two gRPC faces, and [`TelemetryService::run`]. Invariant: an acknowledgement leaves only
+//! Called by the binary: [`TelemetryService::new`], its gRPC faces, and [`TelemetryService::run`]. Invariant: an acknowledgement leaves only
 //! after the commit that holds the data; a session and its way down never wait for the store; every stream is drained into bounded queues.
 
 mod bugs;
@@ -12,6 +12,7 @@ mod offset;
 mod picture;
 mod presence;
 mod registry;
+mod replay;
 mod session;
 mod status;
 mod welcome;
@@ -23,6 +24,7 @@ pub use bugs::SeededBug;
 use midshift_core::time::Clock;
 use midshift_core::work::Live;
 use midshift_proto::link::v1::link_service_server::LinkServiceServer;
+use midshift_proto::link::v1::replay_service_server::ReplayServiceServer;
 use midshift_proto::telemetry::v1::telemetry_service_server::TelemetryServiceServer;
 use midshift_store::{Error, FrameLog, LiveBoard, Store};
 use picture::Picture;
@@ -68,6 +70,10 @@ impl TelemetryService {
     /// The robots' face.
     pub fn link(&self) -> LinkServiceServer<Self> {
         LinkServiceServer::new(self.clone()).max_decoding_message_size(midshift_core::limits::TELEMETRY_BATCH_BYTES)
+    }
+    /// The robots' face beside their sessions, for old STATUS.
+    pub fn replay(&self) -> ReplayServiceServer<Self> {
+        ReplayServiceServer::new(self.clone()).max_decoding_message_size(midshift_core::limits::TELEMETRY_BATCH_BYTES)
     }
     /// The people's and programs' face.
     pub fn grpc(&self) -> TelemetryServiceServer<Self> {

@@ -65,6 +65,10 @@ impl Picture {
         let mark = rows.status.entry((robot_id.clone(), ring.clone())).or_default();
         *mark = (*mark).max(seq);
     }
+    /// Highest durable STATUS number of a ring, 0 if none.
+    pub fn durable_status(&self, robot_id: &RobotId, ring: &Arc<str>) -> u64 {
+        self.rows().status.get(&(robot_id.clone(), ring.clone())).copied().unwrap_or(0)
+    }
     /// A watch on a robot's desired state, with what stands now.
     pub fn watch(&self, robot_id: &RobotId) -> watch::Receiver<Sections> {
         let mut watchers = self.watchers.lock().unwrap_or_else(PoisonError::into_inner);

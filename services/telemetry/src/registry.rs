@@ -3,11 +3,13 @@
 //!
 //! Invariant: a session that did not prove its succession is never in charge while the older one is heard.
 
+use crate::replay::{self, Replay};
 use midshift_core::ids::RobotId;
 use midshift_core::time::{LinkTime, Utc};
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
+use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
 /// One session in charge.
@@ -15,6 +17,10 @@ use tokio_util::sync::CancellationToken;
 pub struct InCharge {
     /// Its epoch.
     pub session_epoch: u64,
+    /// The secret of its Welcome: with the epoch, what proves that a replay is for it.
+    pub secret: Arc<str>,
+    /// To its task.
+    pub replays: mpsc::Sender<Replay>,
     /// When its newest heartbeat was processed, milliseconds of link time.
     heard: Arc<AtomicU64>,
     /// Cancelled when a newer session proved its succession.
@@ -24,14 +30,18 @@ pub struct InCharge {
 }
 
 impl InCharge {
-    /// Begins at `now`.
-    pub fn new(session_epoch: u64, now: LinkTime) -> Self {
-        Self {
+    /// Begins at `now`; and where its task finds replays.
+    pub fn new(session_epoch: u64, secret: &str, now: LinkTime) -> (Self, mpsc::Receiver<Replay>) {
+        let (replays, waiting) = mpsc::channel(replay::WAITING_MAX);
+        let this = Self {
             session_epoch,
+            secret: Arc::from(secret),
+            replays,
             heard: Arc::new(AtomicU64::new(now.0)),
             fenced: CancellationToken::new(),
             moving: Arc::default(),
-        }
+        };
+        (this, waiting)
     }
     /// Notes a heartbeat.
     pub fn hear(&self, now: LinkTime) {

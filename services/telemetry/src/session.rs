@@ -8,11 +8,12 @@ use crate::events::{Batch, Events, Outcome, commit};
 use crate::offset::Offset;
 use crate::picture::Sections;
 use crate::registry::InCharge;
+use crate::replay::{Replay, overloaded};
 use crate::status::{self, Arrived, StatusLane};
 use crate::welcome::Begun;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
-use midshift_core::reason::{Code, Reason};
+use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::robot::{Lane, ReportedAttempt};
 use midshift_core::time::{LinkDuration, SiteTime};
 use midshift_core::work::{InboxEntry, InboxItem, Live};
@@ -25,7 +26,7 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
 use tonic::{Status, Streaming};
 
@@ -55,6 +56,10 @@ struct Session {
     committing: Option<Boxed<Outcome>>,
     status: StatusLane,
     keeping: Option<Boxed<Option<u64>>>,
+    /// Old STATUS from bulk; none: observed only.
+    replays: Option<mpsc::Receiver<Replay>>,
+    /// The last number of the batch from there that is being kept, and who waits for it.
+    replaying: Option<(u64, oneshot::Sender<Result<LaneAck, Refusal>>)>,
     offset: Offset,
     progress: (u64, SiteTime),
     out: Downlink,
@@ -78,14 +83,17 @@ pub async fn run(inner: Arc<Inner>, hello: &Hello, begun: Begun, mut up: Streami
     let mut desired = inner.picture.watch(&robot_id);
     desired.mark_changed();
     let now = inner.parts.clock.now();
+    let (in_charge, replays) = begun.in_charge.unzip();
     let mut session = Session {
         ring: Arc::from(hello.ring.as_str()),
         epoch,
-        in_charge: begun.in_charge,
+        in_charge,
         events: Events::new(begun.mark.0, begun.mark.1),
         committing: None,
         status: StatusLane::new(robot_id.clone(), Arc::from(hello.ring.as_str()), begun.status),
         keeping: None,
+        replays,
+        replaying: None,
         offset: Offset::default(),
         progress: (0, now.site),
         out: Downlink::default(),
@@ -145,6 +153,7 @@ impl Session {
                     }
                     Ok(None) | Err(_) => return End::Gone,
                 },
+                replay = next(&mut self.replays), if self.replaying.is_none() => self.replay(replay),
                 changed = desired.changed(), if self.in_charge.is_some() => {
                     if changed.is_err() {
                         return End::Gone;
@@ -273,8 +282,9 @@ impl Session {
 
     fn status(&mut self, batch: &LaneBatch) -> Option<End> {
         self.in_charge.as_ref()?;
-        match self.status.arrive(batch, self.inner.parts.clock.now().wall) {
+        match self.arrive(batch) {
             Arrived::Taken => {}
+            Arrived::Known => self.ack_status(),
             Arrived::Expect(ack) => self.say(|out| out.acks.push(ack)),
             Arrived::OverCredit => {
                 tracing::warn!(robot_id = %self.robot_id, "session ended by status beyond its credit");
@@ -282,6 +292,31 @@ impl Session {
             }
         }
         None
+    }
+
+    fn arrive(&mut self, batch: &LaneBatch) -> Arrived {
+        let wall = self.inner.parts.clock.now().wall;
+        let arrived = self.status.arrive(batch, wall);
+        // The session before this one may have kept more, and told its robot so, since the Welcome was made: that is no hole.
+        let durable = || self.inner.picture.durable_status(&self.robot_id, &self.ring);
+        if matches!(arrived, Arrived::Expect(_)) && self.status.learn(durable()) {
+            return self.status.arrive(batch, wall);
+        }
+        arrived
+    }
+
+    /// Old STATUS that came over bulk: the same lane, the same rules, and another way for the answer.
+    fn replay(&mut self, replay: Replay) {
+        let last = replay.batch.items.iter().map(|item| status::numbers(item).1).max().unwrap_or(0);
+        // Whoever asked may have stopped waiting; what was taken is kept all the same.
+        match self.arrive(&replay.batch) {
+            Arrived::Taken | Arrived::Known if !self.status.is_kept(last) => {
+                self.replaying = Some((last, replay.answer));
+            }
+            Arrived::Taken | Arrived::Known => drop(replay.answer.send(Ok(self.status.ack()))),
+            Arrived::Expect(ack) => drop(replay.answer.send(Ok(ack))),
+            Arrived::OverCredit => drop(replay.answer.send(Err(overloaded()))),
+        }
     }
 
     /// Begins the writes that wait, at most one of each kind at a time.
@@ -336,12 +371,18 @@ impl Session {
         match kept {
             Some(seq) => {
                 self.inner.picture.status_durable(&self.robot_id, &self.ring, seq);
-                if self.status.kept(seq) {
+                let is_time = self.status.kept(seq);
+                if let Some((_, answer)) = self.replaying.take_if(|(last, _)| self.status.is_kept(*last)) {
+                    drop(answer.send(Ok(self.status.ack())));
+                } else if is_time {
                     self.ack_status();
                 }
             }
             None => {
                 let ack = self.status.lost();
+                if let Some((_, answer)) = self.replaying.take() {
+                    drop(answer.send(Err(Refusal::new(Kind::Unavailable, Code::StoreUnavailable))));
+                }
                 self.say(|out| out.acks.push(ack));
             }
         }
@@ -370,6 +411,17 @@ async fn older_is_silent(inner: Arc<Inner>, robot_id: RobotId) {
 async fn at(moment: Option<Instant>) {
     match moment {
         Some(moment) => tokio::time::sleep_until(moment).await,
+        None => std::future::pending().await,
+    }
+}
+
+/// The next replay; never, if there can be none. The session holds a sender itself, so there is always another.
+async fn next(replays: &mut Option<mpsc::Receiver<Replay>>) -> Replay {
+    match replays {
+        Some(replays) => match replays.recv().await {
+            Some(replay) => replay,
+            None => std::future::pending().await,
+        },
         None => std::future::pending().await,
     }
 }

@@ -1,7 +1,8 @@
 //! STATUS of one session: numbers are checked on arrival, samples are kept as they came in the frame log, and acknowledged in bulk after that.
 //!
 //! Laws: those of [`crate::events`]. A gap that the robot announces is written down before it is acknowledged; while nothing can be
-//! written, nothing is acknowledged, and what the robot's ring has to thin meanwhile is such a gap later. Invariant: what waits for the
+//! written, nothing is acknowledged, and what the robot's ring has to thin meanwhile is such a gap later. Old samples come over bulk, new ones
+//! on the session, by one numbering: whichever way a batch took, what is known of it is dropped. Invariant: what waits for the
 //! disk is bounded by the credit the robot was given; a robot that sends more is let go.
 
 use midshift_core::ids::RobotId;
@@ -30,6 +31,8 @@ const WAITING_BYTES_MAX: usize = 2 * limits::STATUS_IN_FLIGHT_BYTES;
 pub enum Arrived {
     /// What was new waits to be kept.
     Taken,
+    /// Nothing in it was new: say again what is durable, or the robot sends it for ever.
+    Known,
     /// Tell the robot to send again from here.
     Expect(LaneAck),
     /// More than its credit is under way.
@@ -57,7 +60,8 @@ pub struct StatusLane {
     ack_due: Instant,
 }
 
-fn numbers(item: &InboxItem) -> (u64, u64) {
+/// First and last number of an item.
+pub fn numbers(item: &InboxItem) -> (u64, u64) {
     match item {
         InboxItem::Sample(s) => (s.seq, s.seq),
         InboxItem::Poison { seq, .. } => (*seq, *seq),
@@ -99,7 +103,7 @@ impl StatusLane {
                 gaps.push(self.gap(from, to, &gap.reason, now));
             }
         }
-        let Some(first_seq) = first else { return Arrived::Taken };
+        let Some(first_seq) = first else { return Arrived::Known };
         let bytes = v1::LaneBatch::from(batch).encode_to_vec();
         if self.unkept_bytes + bytes.len() > WAITING_BYTES_MAX {
             return Arrived::OverCredit;
@@ -111,6 +115,18 @@ impl StatusLane {
         self.waiting.frames.push(Frame { robot_id, ring, first_seq, last_seq: taken, bytes: Arc::from(bytes) });
         self.waiting.gaps.extend(gaps);
         Arrived::Taken
+    }
+    /// The session before this one kept samples up to here, some of them after this one had begun. True: that is news.
+    pub fn learn(&mut self, durable: u64) -> bool {
+        let news = durable > self.taken;
+        if news {
+            (self.taken, self.durable) = (durable, durable);
+        }
+        news
+    }
+    /// Whether all up to this number is durable.
+    pub fn is_kept(&self, seq: u64) -> bool {
+        self.durable >= seq
     }
     fn gap(&self, from_seq: u64, to_seq: u64, reason: &Reason, now: Utc) -> Gap {
         Gap {
@@ -129,7 +145,7 @@ impl StatusLane {
     }
     /// What was written is durable up to here. True: it is time to acknowledge.
     pub fn kept(&mut self, seq: u64) -> bool {
-        self.durable = seq;
+        self.durable = self.durable.max(seq);
         self.unkept_bytes = self.waiting.frames.iter().map(|f| f.bytes.len()).sum();
         self.unacked_bytes * 2 >= limits::STATUS_IN_FLIGHT_BYTES
     }
@@ -213,6 +229,20 @@ mod tests {
         assert!(lane.next_write().is_none());
         assert_eq!(arrive(&mut lane, vec![sample(1), sample(2), sample(3)]), Arrived::Taken);
         assert_eq!(lane.next_write().as_ref().map(ranges), Some((vec![(1, 3)], vec![])));
+    }
+
+    #[tokio::test]
+    async fn what_the_session_before_kept_after_this_one_began_is_no_hole() {
+        let mut lane = lane();
+        assert!(matches!(arrive(&mut lane, vec![sample(6)]), Arrived::Expect(_)));
+        assert!(lane.learn(5) && !lane.learn(4));
+        assert_eq!(arrive(&mut lane, vec![sample(4), sample(5), sample(6)]), Arrived::Taken);
+        assert_eq!(lane.next_write().as_ref().map(ranges), Some((vec![(6, 6)], vec![])));
+        assert!(lane.is_kept(5) && !lane.is_kept(6));
+        assert_eq!(arrive(&mut lane, vec![sample(5)]), Arrived::Known);
+        // It was not told of an older write that ended late.
+        lane.kept(3);
+        assert_eq!(lane.ack().seq, 5);
     }
 
     #[tokio::test]

@@ -2,6 +2,7 @@
 
 use crate::Inner;
 use crate::registry::InCharge;
+use crate::replay::Replay;
 use midshift_bundle::installed::{self, Rejection};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
@@ -12,6 +13,7 @@ use midshift_core::work::{LaneMark, Session};
 use midshift_proto::session::{Hello, LaneAck, PROTOCOL_VERSION, Welcome};
 use midshift_store::{CommitError, load};
 use std::sync::Arc;
+use tokio::sync::mpsc;
 
 /// Tries to write the session row against other writers of it.
 const TRIES: usize = 3;
@@ -20,8 +22,8 @@ const STATUS_PERIOD_MS: u32 = 2_000;
 
 /// What a session begins with.
 pub struct Begun {
-    /// Its place in the registry; none: observed only.
-    pub in_charge: Option<InCharge>,
+    /// Its place in the registry, and replays for it; none: observed only.
+    pub in_charge: Option<(InCharge, mpsc::Receiver<Replay>)>,
     /// What the robot is told.
     pub welcome: Welcome,
     /// Durable numbers of its ring, with the revision of their row.
@@ -56,13 +58,7 @@ pub async fn begin(inner: &Inner, hello: &Hello) -> Result<Begun, Refusal> {
     for _ in 0..TRIES {
         let row = load::<Session>(store, hello.robot_id.as_str()).await.map_err(unavailable)?;
         let mark = mark_of(inner, hello).await?;
-        let status = inner
-            .picture
-            .rows()
-            .status
-            .get(&(hello.robot_id.clone(), Arc::from(hello.ring.as_str())))
-            .copied()
-            .unwrap_or(0);
+        let status = inner.picture.durable_status(&hello.robot_id, &Arc::from(hello.ring.as_str()));
         let proven = row.as_ref().is_some_and(|(row, _)| {
             hello.previous.as_ref().is_some_and(|p| p.session_epoch == row.session_epoch && p.secret == row.secret)
         });
@@ -91,12 +87,12 @@ pub async fn begin(inner: &Inner, hello: &Hello) -> Result<Begun, Refusal> {
             None => return Err(unavailable("the store gave no answer")),
         }
         told(hello, &said);
-        let in_charge = InCharge::new(session_epoch, now.link);
+        let (in_charge, replays) = InCharge::new(session_epoch, &session.secret, now.link);
         if !inner.registry.take_charge(&hello.robot_id, in_charge.clone()) {
             continue;
         }
         let welcome = welcome(inner, session_epoch, session.secret, &mark.0, status, false);
-        return Ok(Begun { in_charge: Some(in_charge), welcome, mark, status });
+        return Ok(Begun { in_charge: Some((in_charge, replays)), welcome, mark, status });
     }
     Err(Refusal::new(Kind::Conflict, Code::CloneSeen))
 }

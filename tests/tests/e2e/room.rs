@@ -3,9 +3,10 @@
 use crate::harness::{Server, until};
 use anyhow::Context;
 use midshift_agent::bugs::{Bugs, SeededBug};
+use midshift_agent::bulk::Bulk;
 use midshift_agent::dial::TcpDial;
 use midshift_agent::memory::MemoryStore;
-use midshift_agent::session::{self, AgentConfig};
+use midshift_agent::session::{self, AgentConfig, Lines};
 use midshift_core::ids::{RobotId, WaypointId};
 use midshift_core::site::{CORRIDOR, text};
 use midshift_core::time::Clock;
@@ -71,11 +72,13 @@ impl Room {
             bugs: Bugs::of(bugs),
             pulse: None,
         };
-        let dial = Arc::new(TcpDial::new(&format!("http://{address}"), None)?);
+        let uri = format!("http://{address}");
+        let bulk = Bulk::new(Arc::new(TcpDial::bulk(&uri, None)?));
+        let lines = Lines { link: Arc::new(TcpDial::new(&uri, None)?), bulk };
         let (store, clock, witness) = (Box::new(MemoryStore::new()), self.clock.clone(), Box::new(body.clone()));
         let running = async move {
             // Ends with the test.
-            let _ = session::run(agent, witness, store, clock, dial, CancellationToken::new()).await;
+            let _ = session::run(agent, witness, store, clock, lines, CancellationToken::new()).await;
         };
         Ok(Robot { body, _agent: AbortOnDropHandle::new(tokio::spawn(running)) })
     }

@@ -33,7 +33,7 @@ use midshift_proto::session::{
 use midshift_sim::behaviour::Behaviour;
 use midshift_sim::faults::FaultRates;
 use midshift_sim::hall::{Hall, HallConfig};
-use midshift_sim::swarm::{DialFor, Swarm, SwarmConfig, SwarmSoftware};
+use midshift_sim::swarm::{DialFor, Swarm, SwarmConfig};
 use std::io;
 use std::path::Path;
 use std::sync::Arc;
@@ -175,7 +175,8 @@ impl Bench {
         };
         let mut config = SwarmConfig::tcp(hall.clone(), clock, "http://server", 7);
         config.dial = to(dial::endpoint);
-        config.software = Some(SwarmSoftware { trust: trust(&made, &keys, &quiet)?, bulk: to(dial::bulk_endpoint) });
+        config.bulk = to(dial::bulk_endpoint);
+        config.software = Some(trust(&made, &keys, &quiet)?);
         let shutdown = CancellationToken::new();
         tokio::spawn(Swarm::new(config).run(shutdown.clone()));
         Ok(Self {

@@ -10,9 +10,10 @@ use crate::observer::Shared;
 use crate::worker::SlowWorker;
 use midshift_agent::body::Body;
 use midshift_agent::bugs::Bugs;
+use midshift_agent::bulk::Bulk;
 use midshift_agent::core::ExitReason;
 use midshift_agent::memory::MemoryStore as RobotMemory;
-use midshift_agent::session::{self, AgentConfig, Updates};
+use midshift_agent::session::{self, AgentConfig, Lines, Updates};
 use midshift_agent::starts::HANG_SECONDS;
 use midshift_agent::trust::Trust;
 use midshift_core::robot::StopLevel;
@@ -112,8 +113,8 @@ impl Agent {
 
     async fn run(&self, life: u64, hangs_after: Option<Duration>) -> anyhow::Result<Ended> {
         let (robot_id, number) = (self.body.robot_id().clone(), self.number(life));
-        let bulk = Arc::new(self.dial());
-        let updates = self.launched.updates(&self.trust, bulk)?;
+        let bulk = Bulk::new(Arc::new(self.dial()));
+        let updates = self.launched.updates(&self.trust, bulk.clone())?;
         let worker = SlowWorker::new(updates.worker, self.launched.clone(), &robot_id, &self.observer, number);
         let config = AgentConfig {
             update: Some(Updates { worker: Box::new(worker), ..updates }),
@@ -128,7 +129,8 @@ impl Agent {
         let disk = RobotDisk::open(self.memory.clone(), robot_id.clone(), self.observer.clone(), number);
         let clock: Arc<dyn Clock> = MachineClock::boot(&self.time, self.skew);
         let never = CancellationToken::new();
-        let agent = session::run(config, Box::new(witness), Box::new(disk), clock, Arc::new(self.dial()), never);
+        let lines = Lines { link: Arc::new(self.dial()), bulk };
+        let agent = session::run(config, Box::new(witness), Box::new(disk), clock, lines, never);
         tokio::pin!(agent);
         let hang = async {
             match hangs_after {

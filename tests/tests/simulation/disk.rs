@@ -8,7 +8,8 @@ use midshift_agent::store::{Error as RobotError, Kept, Op, Store as RobotStore};
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::rows::{Item, Key, Log, Row, Seq, Table};
 use midshift_store::{
-    Applied, Cause, CommitError, Error, FeedPage, MemoryStore, Query, Retention, Snapshot, Store, StoreId,
+    Applied, Cause, CommitError, Error, FeedPage, Frame, FrameLog, FrameMark, Gap, MemoryFrames, MemoryStore, Query,
+    Retention, Snapshot, Store, StoreId, StoredFrame,
 };
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
@@ -148,6 +149,50 @@ impl Store for ServerDisk {
     }
     async fn prune(&self, keep: Retention) -> Result<u64, Error> {
         self.inner.prune(keep).await
+    }
+}
+
+/// Where the same disk keeps STATUS.
+pub struct ServerFrames {
+    inner: MemoryFrames,
+    disk: Arc<ServerDisk>,
+}
+
+impl ServerFrames {
+    /// Over `inner`, as healthy as `disk` is.
+    pub fn new(inner: MemoryFrames, disk: Arc<ServerDisk>) -> Self {
+        Self { inner, disk }
+    }
+    async fn write(&self) -> Result<(), Error> {
+        let slow_ms = self.disk.state().mood.slow_ms;
+        tokio::time::sleep(Duration::from_millis(slow_ms / 2)).await;
+        self.disk.readable()
+    }
+}
+
+#[async_trait::async_trait]
+impl FrameLog for ServerFrames {
+    async fn append(&self, frames: Vec<Frame>) -> Result<(), Error> {
+        self.write().await?;
+        self.inner.append(frames.clone()).await?;
+        self.disk.observer.stored(&frames);
+        Ok(())
+    }
+    async fn marks(&self) -> Result<Vec<FrameMark>, Error> {
+        self.inner.marks().await
+    }
+    async fn read(&self, after: u64, bytes_max: usize) -> Result<Vec<StoredFrame>, Error> {
+        self.inner.read(after, bytes_max).await
+    }
+    async fn report_gaps(&self, gaps: Vec<Gap>) -> Result<(), Error> {
+        self.disk.observer.look().find(format!("I9 status in order, once, without gaps: {gaps:?}"));
+        self.inner.report_gaps(gaps).await
+    }
+    async fn gaps(&self, robot_id: Option<&RobotId>, limit: usize) -> Result<Vec<Gap>, Error> {
+        self.inner.gaps(robot_id, limit).await
+    }
+    async fn prune(&self) -> Result<u64, Error> {
+        self.inner.prune().await
     }
 }
 

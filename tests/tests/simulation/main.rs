@@ -13,6 +13,7 @@ mod laws;
 mod naive;
 mod net;
 mod observer;
+mod old_status;
 mod orders;
 mod plan;
 mod room;
@@ -32,7 +33,7 @@ const SEEDS: u64 = 120;
 /// Runs with so many seeds or more must have met every fault and looked at every law; a few seeds cannot.
 const ENOUGH: u64 = 40;
 /// What must have been hit, each by evidence and not by plan.
-const HITS: [&str; 13] = [
+const HITS: [&str; 14] = [
     "agent crash in a change of software",
     "agent crash with work in progress",
     "hardware stop in a roll-out",
@@ -46,6 +47,7 @@ const HITS: [&str; 13] = [
     "call a disk refused",
     "commit on a slow disk",
     "answer a client never got",
+    "status sent beside a session",
 ];
 /// What the system must have come to by them.
 const COUNTS: [&str; 12] = [
@@ -63,7 +65,7 @@ const COUNTS: [&str; 12] = [
     "program hung",
 ];
 /// Every law, by the name under which it is looked at.
-const LAWS: [&str; 33] = [
+const LAWS: [&str; 34] = [
     "I1 no client is refused",
     "I1 one task a request",
     "I2 epochs rise",
@@ -85,6 +87,7 @@ const LAWS: [&str; 33] = [
     "I8 every roll-out ends",
     "I8 every task ends",
     "I9 events in order, once, without gaps",
+    "I9 status in order, once, without gaps",
     "I9 what is acknowledged is kept",
     "I15 the kept set is the one committed last",
     "I15 who was touched by what was aborted is back on what it kept",

@@ -22,7 +22,7 @@ use midshift_core::update::{DesiredUpdate, UpdateEvent};
 use midshift_core::work::{DesiredWork, InboxEntry, InboxItem, RobotEvent, SampleBody, StepKind, WorkState};
 use midshift_sim::handle::SimHandle;
 use midshift_sim::world::{SharedWorld, lock};
-use midshift_store::{MemoryStore, Store};
+use midshift_store::{Frame, MemoryStore, Store};
 use std::collections::{BTreeMap, BTreeSet};
 use std::future::Future;
 use std::pin::pin;
@@ -54,6 +54,14 @@ struct Ledger {
     session_epoch: u64,
 }
 
+/// STATUS of one robot.
+#[derive(Default)]
+struct Status {
+    ring: Arc<str>,
+    stored: u64,
+    produced: u64,
+}
+
 /// All that was seen.
 pub struct Observer {
     time: TrueTime,
@@ -69,6 +77,7 @@ pub struct Observer {
     attempts: BTreeMap<Subject, BTreeMap<u64, Attempt>>,
     places: BTreeMap<PlaceId, Place>,
     inbox: BTreeMap<(RobotId, Lane), (String, u64)>,
+    status: BTreeMap<RobotId, Status>,
     ledgers: BTreeMap<RobotId, Ledger>,
     offers: Offers,
     grants: Grants,
@@ -97,6 +106,10 @@ impl Shared {
     /// A robot's ledger was written.
     pub fn ledger(&self, robot_id: &RobotId, ops: &[Op]) {
         self.look().ledger(robot_id, ops);
+    }
+    /// STATUS was stored.
+    pub fn stored(&self, frames: &[Frame]) {
+        self.look().stored(frames);
     }
     /// A robot's switch record was written.
     pub fn switched(&self, robot_id: &RobotId, switch: &Switch, set: Option<&SetManifest>) {
@@ -128,6 +141,7 @@ impl Observer {
             attempts: BTreeMap::new(),
             places: BTreeMap::new(),
             inbox: BTreeMap::new(),
+            status: BTreeMap::new(),
             ledgers: BTreeMap::new(),
             offers: Offers::default(),
             grants: Grants::default(),
@@ -167,6 +181,10 @@ impl Observer {
     /// Whether this robot's ledger has a holder.
     pub fn is_held(&self, robot_id: &RobotId) -> bool {
         self.ledgers.get(robot_id).is_some_and(|l| l.holder.is_some())
+    }
+    /// The highest number of STATUS that the server has of this robot, and that the robot has on its disk.
+    pub fn status(&self, robot_id: &RobotId) -> (u64, u64) {
+        self.status.get(robot_id).map_or((0, 0), |s| (s.stored, s.produced))
     }
     /// The agent of this robot was started again.
     pub fn restarted(&mut self, robot_id: &RobotId) {
@@ -418,6 +436,21 @@ impl Observer {
         }
     }
 
+    // --- what the server keeps of STATUS
+
+    fn stored(&mut self, frames: &[Frame]) {
+        for frame in frames {
+            let status = self.status.entry(frame.robot_id.clone()).or_default();
+            if status.ring != frame.ring {
+                (status.ring, status.stored) = (frame.ring.clone(), 0);
+            }
+            let before = std::mem::replace(&mut status.stored, frame.last_seq);
+            self.check("I9 status in order, once, without gaps", frame.first_seq == before + 1, || {
+                format!("{} {}-{} after {before}", frame.robot_id, frame.first_seq, frame.last_seq)
+            });
+        }
+    }
+
     // --- what robots write
 
     fn ledger(&mut self, robot_id: &RobotId, ops: &[Op]) {
@@ -486,8 +519,14 @@ impl Observer {
                     });
                 }
             }
-            Op::Free(lane @ (Lane::Critical | Lane::Event), seq) => {
-                let kept = self.inbox.get(&(robot_id.clone(), *lane)).map_or(0, |(_, last)| *last);
+            Op::Append(Lane::Status, sample) => {
+                self.status.entry(robot_id.clone()).or_default().produced = sample.seq;
+            }
+            Op::Free(lane, seq) => {
+                let kept = match lane {
+                    Lane::Status => self.status.get(robot_id).map_or(0, |s| s.stored),
+                    _ => self.inbox.get(&(robot_id.clone(), *lane)).map_or(0, |(_, last)| *last),
+                };
                 self.check("I9 what is acknowledged is kept", *seq <= kept, || {
                     format!("{robot_id} freed {} {seq}, the server has {kept}", lane.as_str())
                 });

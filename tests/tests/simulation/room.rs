@@ -6,7 +6,7 @@
 use crate::agent::{Agent, machine};
 use crate::client;
 use crate::clock::{MachineClock, Skew, TrueTime};
-use crate::disk::ServerDisk;
+use crate::disk::{ServerDisk, ServerFrames};
 use crate::net::{self, Ear, SERVER, Wire};
 use crate::observer::Shared;
 use crate::software::Software;
@@ -118,7 +118,8 @@ impl Room {
         let store = Arc::new(MemoryStore::new(site.site_id().clone(), store_id, clock.clone()));
         let observer = Shared::new(time.clone(), store.clone());
         let disk = Arc::new(ServerDisk::new(store, observer.clone(), config.seed));
-        let frames: Arc<dyn FrameLog> = Arc::new(MemoryFrames::new(clock.clone(), FRAME_BYTES_DEFAULT));
+        let frames = MemoryFrames::new(clock.clone(), FRAME_BYTES_DEFAULT);
+        let frames: Arc<dyn FrameLog> = Arc::new(ServerFrames::new(frames, disk.clone()));
         let of_hall = HallConfig { faults: config.faults, ..HallConfig::new(site.clone(), config.robots, config.seed) };
         let hall = Arc::new(Hall::open(&of_hall, &clock.now())?);
         observer.look().watch_world(hall.worlds()[0].clone());

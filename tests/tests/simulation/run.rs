@@ -115,6 +115,7 @@ impl Shift {
         self.hits.extend(self.room.disk.hits());
         self.hits.extend(self.room.wire.hits());
         self.hits.insert("answer a client never got", self.room.desk.unanswered.get());
+        self.hits.insert("status sent beside a session", replayed());
         let seen = self.room.observer.look();
         Outcome {
             findings: seen.findings().to_vec(),
@@ -335,6 +336,13 @@ impl Shift {
     fn set_way(&mut self, index: usize, way: Way) {
         steer(&mut self.room, index, way);
     }
+}
+
+/// STATUS that the servers of this process took beside sessions, samples.
+fn replayed() -> u64 {
+    let metrics = midshift::server::metrics_handle().map(|handle| handle.render()).unwrap_or_default();
+    let line = metrics.lines().find_map(|line| line.strip_prefix("midshift_telemetry_status_replayed_total "));
+    line.and_then(|number| number.parse().ok()).unwrap_or(0)
 }
 
 /// Makes the way between the server and a machine so; the clients come after the robots.

@@ -2,6 +2,7 @@
 
 mod disk;
 mod machines;
+mod replay;
 mod robots;
 mod sessions;
 mod status;

@@ -1,11 +1,11 @@
 //! Lane STATUS: kept as it came, acknowledged in bulk, and never more of it under way than was allowed.
 
 use crate::disk::Disk;
-use crate::world::{Otherwise, Result, Robot, clock, world_with};
+use crate::world::{Otherwise, Result, Robot, clock, status_samples as samples, world_with};
 use midshift_core::limits;
 use midshift_core::reason::Code;
-use midshift_core::robot::{Lane, Vitals};
-use midshift_core::work::{Gap, InboxItem, Sample, SampleBody};
+use midshift_core::robot::Lane;
+use midshift_core::work::{Gap, InboxItem};
 use midshift_proto::session::{CloseCode, Downlink};
 use midshift_store::{FrameLog, MemoryFrames};
 use std::sync::Arc;
@@ -16,11 +16,6 @@ fn disk() -> Arc<Disk> {
 
 fn otherwise(disk: &Arc<Disk>) -> Otherwise {
     Otherwise { frames: Some(disk.clone()), ..Otherwise::default() }
-}
-
-fn samples(seqs: std::ops::RangeInclusive<u64>) -> Vec<InboxItem> {
-    let body = SampleBody::Status(Vitals { speed_mm_s: 1_500, battery_permille: 800, ..Vitals::default() });
-    seqs.map(|seq| InboxItem::Sample(Sample { seq, robot_unix_ms: 1_800_000_000_000, body: body.clone() })).collect()
 }
 
 fn acked(down: &Downlink) -> Option<u64> {

@@ -1,7 +1,7 @@
 //! Telemetry over a real gRPC connection in memory, and a robot that says what a test wants.
 
 use midshift_core::ids::{RobotId, SiteId};
-use midshift_core::robot::{Inventory, Lane, Mode, ReportedState};
+use midshift_core::robot::{Inventory, Lane, Mode, ReportedState, Vitals};
 use midshift_core::time::{Clock, ScaledClock, Utc};
 use midshift_core::work::{InboxItem, RobotEvent, Sample, SampleBody};
 use midshift_proto::link::v1::link_service_client::LinkServiceClient;
@@ -59,7 +59,8 @@ pub async fn world_with(otherwise: Otherwise) -> Result<World> {
     let service = TelemetryService::new(parts, CancellationToken::new());
     tokio::spawn(service.clone().run());
     let (pipes, incoming) = mpsc::channel::<std::io::Result<tokio::io::DuplexStream>>(8);
-    let server = Server::builder().add_service(service.link()).add_service(service.grpc());
+    let server =
+        Server::builder().add_service(service.link()).add_service(service.replay()).add_service(service.grpc());
     tokio::spawn(server.serve_with_incoming(ReceiverStream::new(incoming)));
     let connector = tower::service_fn(move |_: tonic::transport::Uri| {
         let pipes = pipes.clone();
@@ -71,6 +72,12 @@ pub async fn world_with(otherwise: Otherwise) -> Result<World> {
     });
     let channel = Endpoint::from_static("http://memory").connect_with_connector(connector).await?;
     Ok(World { store, channel, service })
+}
+
+/// STATUS of these numbers.
+pub fn status_samples(seqs: std::ops::RangeInclusive<u64>) -> Vec<InboxItem> {
+    let body = SampleBody::Status(Vitals { speed_mm_s: 1_500, battery_permille: 800, ..Vitals::default() });
+    seqs.map(|seq| InboxItem::Sample(Sample { seq, robot_unix_ms: 1_800_000_000_000, body: body.clone() })).collect()
 }
 
 pub struct Robot {
