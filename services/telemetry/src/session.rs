@@ -295,14 +295,9 @@ impl Session {
     }
 
     fn arrive(&mut self, batch: &LaneBatch) -> Arrived {
-        let wall = self.inner.parts.clock.now().wall;
-        let arrived = self.status.arrive(batch, wall);
-        // The session before this one may have kept more, and told its robot so, since the Welcome was made: that is no hole.
-        let durable = || self.inner.picture.durable_status(&self.robot_id, &self.ring);
-        if matches!(arrived, Arrived::Expect(_)) && self.status.learn(durable()) {
-            return self.status.arrive(batch, wall);
-        }
-        arrived
+        // The session before this one may have kept more since the Welcome was made: neither a hole nor to be kept again.
+        self.status.learn(self.inner.picture.durable_status(&self.robot_id, &self.ring));
+        self.status.arrive(batch, self.inner.parts.clock.now().wall)
     }
 
     /// Old STATUS that came over bulk: the same lane, the same rules, and another way for the answer.

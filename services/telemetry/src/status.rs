@@ -116,13 +116,11 @@ impl StatusLane {
         self.waiting.gaps.extend(gaps);
         Arrived::Taken
     }
-    /// The session before this one kept samples up to here, some of them after this one had begun. True: that is news.
-    pub fn learn(&mut self, durable: u64) -> bool {
-        let news = durable > self.taken;
-        if news {
+    /// Samples are kept up to here, some of them perhaps by the session before this one after this one had begun.
+    pub fn learn(&mut self, durable: u64) {
+        if durable > self.taken {
             (self.taken, self.durable) = (durable, durable);
         }
-        news
     }
     /// Whether all up to this number is durable.
     pub fn is_kept(&self, seq: u64) -> bool {
@@ -235,7 +233,8 @@ mod tests {
     async fn what_the_session_before_kept_after_this_one_began_is_no_hole() {
         let mut lane = lane();
         assert!(matches!(arrive(&mut lane, vec![sample(6)]), Arrived::Expect(_)));
-        assert!(lane.learn(5) && !lane.learn(4));
+        lane.learn(5);
+        lane.learn(4);
         assert_eq!(arrive(&mut lane, vec![sample(4), sample(5), sample(6)]), Arrived::Taken);
         assert_eq!(lane.next_write().as_ref().map(ranges), Some((vec![(6, 6)], vec![])));
         assert!(lane.is_kept(5) && !lane.is_kept(6));
