@@ -15,7 +15,8 @@ fn robot(script: &str) -> (TempDir, Orders) {
     let orders = Orders {
         record: folder.path().join("tries"),
         sets: None,
-        hang: Duration::from_secs(1),
+        // Longer than a shell may take to begin on a machine that is busy.
+        hang: Duration::from_secs(60),
         beacon: None,
         program: "sh".to_owned(),
         arguments,
@@ -96,7 +97,8 @@ fn a_program_that_fails_is_started_again_until_it_ends_well_and_its_tries_are_on
 
 #[test]
 fn a_program_without_a_pulse_is_killed() {
-    let (_folder, orders) = robot("echo a line is no pulse; exec sleep 600");
+    let (_folder, mut orders) = robot("echo a line is no pulse; exec sleep 600");
+    orders.hang = Duration::from_secs(1);
     let start = choose(&orders, &read_tries(&orders.record)).expect("chooses");
     assert_eq!(
         run_once(&orders, &start, &mut start.tries.clone(), &mut Beacon::new(&orders)).expect("runs"),
@@ -117,7 +119,8 @@ fn a_set_on_trial_that_cannot_live_is_put_away_and_the_one_before_it_runs() {
 
 #[test]
 fn a_set_on_trial_that_hangs_is_put_away_too() {
-    let (folder, orders) = with_sets(&[("v1", "exec sleep 600")]);
+    let (folder, mut orders) = with_sets(&[("v1", "exec sleep 600")]);
+    orders.hang = Duration::from_secs(3);
     on_trial(&orders, "v1");
     keep_running(&orders).expect("runs");
     assert_eq!(ran(&folder), ["v1", "v1", "factory"]);
