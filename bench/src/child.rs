@@ -38,6 +38,12 @@ pub enum Role {
         /// The site file; without it the demo site.
         #[arg(long)]
         site: Option<PathBuf>,
+        /// Where it listens; without it on a free port.
+        #[arg(long)]
+        listen: Option<SocketAddr>,
+        /// Its online keys; without them it takes no software.
+        #[arg(long)]
+        ota_keys: Option<PathBuf>,
     },
     /// A bare tonic unary service that answers each SubmitTask with the same bytes.
     Unary {
@@ -67,6 +73,10 @@ pub enum Role {
         #[arg(long)]
         to: usize,
     },
+    /// Robots that hear what software they should have, and fetch none.
+    Hearers(crate::ota::hearers::HearersArgs),
+    /// Real agents with simulated bodies that take software.
+    Swarm(crate::ota::swarm::SwarmArgs),
     /// Robots that send as fast as they may.
     Flood {
         #[arg(long)]
@@ -106,15 +116,16 @@ pub fn play(args: ChildArgs) -> anyhow::Result<()> {
 async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
     let address = std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?;
     match role {
-        Role::Serve { data, site } => {
-            answer_questions(address, stop.clone(), metric)?;
+        Role::Serve { data, site, listen, ota_keys } => {
+            let listen = listen.unwrap_or(address);
+            answer_questions(listen, stop.clone(), metric)?;
             let serve = midshift::serve::Serve {
                 site,
                 data,
-                listen: address,
+                listen,
                 insecure: false,
                 beacon_listen: None,
-                software: Software { ota_keys: None, ota_quota_gib: 1 },
+                software: Software { ota_keys, ota_quota_gib: 1 },
             };
             midshift::serve::run(serve, stop).await
         }
@@ -147,6 +158,16 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 listen: None,
             };
             midshift::robots::swarm(swarm, stop).await
+        }
+        Role::Hearers(args) => {
+            let heard = Arc::new(crate::ota::hearers::Heard::of(args.robots));
+            let asked = heard.clone();
+            answer_questions(address, stop.clone(), move |question| asked.answer(question))?;
+            crate::ota::hearers::run(args, heard, stop).await
+        }
+        Role::Swarm(args) => {
+            answer_questions(address, stop.clone(), |_| 0)?;
+            crate::ota::swarm::run(args, stop).await
         }
         Role::Flood { server, robots, unacknowledged } => {
             let acked = Arc::new(AtomicU64::new(0));
@@ -213,6 +234,15 @@ fn tick_s() -> f64 {
     1.0 / rustix::param::clock_ticks_per_second() as f64
 }
 
+/// CPU spent so far by all threads of a process, seconds, in whole clock ticks.
+pub fn cpu_of_s(pid: u32) -> anyhow::Result<f64> {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat"))?;
+    // The name of the program stands in brackets and may hold anything; utime and stime are fields 14 and 15.
+    let (_, fields) = stat.rsplit_once(')').context("/proc/PID/stat without a name")?;
+    let ticks: u64 = fields.split_whitespace().skip(11).take(2).filter_map(|f| f.parse::<u64>().ok()).sum();
+    Ok(ticks as f64 * tick_s())
+}
+
 /// A child from its parent's side. Killed when it is let go.
 pub struct Child {
     process: std::process::Child,
@@ -273,13 +303,13 @@ impl Child {
         let endpoint = tonic::transport::Endpoint::from_shared(format!("http://{}", self.address))?;
         Ok(endpoint.tcp_nodelay(true).connect().await?)
     }
+    /// Its number.
+    pub fn pid(&self) -> u32 {
+        self.process.id()
+    }
     /// CPU spent so far by all its threads, seconds, in whole clock ticks.
     pub fn cpu_s(&self) -> anyhow::Result<f64> {
-        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.process.id()))?;
-        // The name of the program stands in brackets and may hold anything; utime and stime are fields 14 and 15.
-        let (_, fields) = stat.rsplit_once(')').context("/proc/PID/stat without a name")?;
-        let ticks: u64 = fields.split_whitespace().skip(11).take(2).filter_map(|f| f.parse::<u64>().ok()).sum();
-        Ok(ticks as f64 * tick_s())
+        cpu_of_s(self.pid())
     }
     /// CPU spent since then, seconds; less than a clock tick counts as one.
     pub fn cpu_since_s(&self, then_s: f64) -> anyhow::Result<f64> {

@@ -76,7 +76,7 @@ struct Leg {
 type Legs = Vec<Leg>;
 
 /// How many robots this machine's limits allow, and which limit it is if it is fewer than were wanted.
-fn allowed(wanted: Option<usize>) -> anyhow::Result<(usize, Option<String>)> {
+pub fn allowed(wanted: Option<usize>) -> anyhow::Result<(usize, Option<String>)> {
     let (wanted, files) = (wanted.unwrap_or(ROBOTS), files_max()?);
     let robots = wanted.min(usize::try_from(files.saturating_sub(OTHER_FILES))?);
     let note = format!(

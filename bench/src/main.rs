@@ -9,6 +9,7 @@ mod gates;
 mod hall;
 mod link;
 mod offer;
+mod ota;
 mod plan;
 mod robot;
 mod sink;
@@ -31,6 +32,8 @@ enum Name {
     Link(link::LinkArgs),
     /// How often the gates of a roll-out are right and wrong, simulated from a seed.
     Gates(gates::GatesArgs),
+    /// Software of robots: directives, ten thousand robots assigned, a kill in the middle of it, and the way back.
+    Ota(ota::OtaArgs),
     /// What the other names start: this program in one role.
     #[command(hide = true)]
     Child(child::ChildArgs),
@@ -57,6 +60,7 @@ fn main() -> anyhow::Result<()> {
         Name::Offer(args) => wait(offer::run(args))?,
         Name::Link(args) => wait(link::run(args, &note))?,
         Name::Gates(args) => gates::run(args)?,
+        Name::Ota(args) => wait(ota::run(args, &note))?,
         Name::Child(args) => return child::play(args),
     };
     print!("{}", figure::table(&figures));

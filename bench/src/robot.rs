@@ -1,6 +1,6 @@
 //! The smallest robot that keeps its session: says hello, beats, numbers its samples, and hears. It has no body and no memory.
 //!
-//! Invariant: its connection has the settings of a real agent's. Called by `offer`, and by `link` where agents would not be fast enough.
+//! Invariant: its connection has the settings of a real agent's. Called by `offer`, and by `link` and `ota` where agents would be too slow or too many.
 
 use anyhow::{Context, bail};
 use midshift_agent::dial::{Dial, TcpDial};
@@ -29,19 +29,15 @@ pub struct Voice {
 /// The way down of one robot.
 pub struct Ear(Streaming<SessionResponse>);
 
-/// Opens a session for a new robot at a waypoint.
-pub async fn attach(server: &str, name: &str, waypoint: Option<WaypointId>) -> anyhow::Result<(Voice, Ear, Welcome)> {
-    let channel = TcpDial::new(&midshift::robots::uri(server), None)?.dial().await?;
-    let (up, outbound) = mpsc::channel(OUTBOUND);
+/// What a new robot at a waypoint says first.
+pub fn hello(name: &str, waypoint: Option<WaypointId>) -> anyhow::Result<Hello> {
     let vitals = Vitals { waypoint, battery_permille: 1_000, ..Vitals::default() };
-    let reported = ReportedState { vitals, ..ReportedState::default() };
-    let robot_id = RobotId::parse(name)?;
     let capabilities = ["pick", "place", "charge", "park"].map(str::to_owned).to_vec();
-    let hello = Hello {
+    Ok(Hello {
         boot_id: format!("{name}-boot"),
         previous: None,
         inventory: Inventory { capabilities, payload_g: 10_000, ..Inventory::default() },
-        reported: reported.clone(),
+        reported: ReportedState { vitals, ..ReportedState::default() },
         ring: format!("{name}-ring"),
         lanes: BTreeMap::new(),
         store_id: String::new(),
@@ -49,8 +45,20 @@ pub async fn attach(server: &str, name: &str, waypoint: Option<WaypointId>) -> a
         clock_rate_permille: 1000,
         protocol_versions: vec![midshift_proto::session::PROTOCOL_VERSION],
         installed: String::new(),
-        robot_id,
-    };
+        robot_id: RobotId::parse(name)?,
+    })
+}
+
+/// Opens a session for a new robot at a waypoint.
+pub async fn attach(server: &str, name: &str, waypoint: Option<WaypointId>) -> anyhow::Result<(Voice, Ear, Welcome)> {
+    open(server, hello(name, waypoint)?).await
+}
+
+/// Opens a session.
+pub async fn open(server: &str, hello: Hello) -> anyhow::Result<(Voice, Ear, Welcome)> {
+    let channel = TcpDial::new(&midshift::robots::uri(server), None)?.dial().await?;
+    let (up, outbound) = mpsc::channel(OUTBOUND);
+    let reported = hello.reported.clone();
     up.send((&FromRobot::Hello(Box::new(hello))).into()).await?;
     let mut down = LinkServiceClient::new(channel).session(ReceiverStream::new(outbound)).await?.into_inner();
     let first = down.message().await?.context("no welcome")?;

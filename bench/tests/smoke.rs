@@ -54,6 +54,13 @@ fn the_link_is_told_beside_a_bare_session_and_the_disk() {
     assert_told(&records("link", &sizes), &["P1", "P4"], 1);
 }
 
+#[test]
+fn software_of_robots_is_told_beside_idle_robots_and_the_disk() {
+    let sizes = ["--part", "server", "--robots", "20", "--back-robots", "3", "--rounds", "1"];
+    let sizes: Vec<&str> = sizes.into_iter().chain(["--idle-seconds", "1", "--directives", "20"]).collect();
+    assert_told(&records("ota", &sizes), &["P9"], 1);
+}
+
 /// Runs the simulation of the gates and gives its records.
 fn gates(seed: &str) -> Vec<serde_json::Value> {
     let dir = tempfile::tempdir().expect("a directory");

@@ -11,6 +11,8 @@ mod reconcile;
 mod releases;
 mod watch;
 
+pub use directives::Signer;
+
 use crate::OtaService;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::Board;

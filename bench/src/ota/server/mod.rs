@@ -1,0 +1,143 @@
+//! The server's half: directives signed, robots assigned, a kill in the middle of that, and the way back.
+//!
+//! Robots are told to fetch as soon as a roll-out has started, whatever their wave: waves, budgets and windows pace only who changes to it. So
+//! one roll-out with a small first wave answers both when that wave was offered it and when everybody was.
+
+mod assign;
+mod back;
+mod cut;
+mod hall;
+mod rollouts;
+mod sign;
+mod trace;
+
+use super::OtaArgs;
+use crate::figure::{Figure, median};
+use crate::fsync::Disk;
+use crate::link::allowed;
+use crate::submit::place;
+use assign::Assigned;
+use back::WentBack;
+use cut::Cut;
+
+/// Appends to the disk in each round, for the figures that end with a commit.
+const APPENDS: usize = 200;
+
+/// What to measure of the server.
+#[derive(Clone, Debug, clap::Args)]
+pub struct ServerArgs {
+    /// Robots that are assigned a roll-out. Without it 10,000, or as many as the limit of open files allows.
+    #[arg(long)]
+    robots: Option<usize>,
+    /// Robots of its first wave, at most a tenth of all.
+    #[arg(long, default_value_t = 100)]
+    canary: u32,
+    /// Seconds before each start in which what idle robots cost is measured.
+    #[arg(long, default_value_t = 10)]
+    idle_seconds: u64,
+    /// Simulated robots that go back from a release.
+    #[arg(long, default_value_t = 100)]
+    back_robots: usize,
+    /// Directives signed in each round.
+    #[arg(long, default_value_t = 5_000)]
+    directives: usize,
+}
+
+/// Runs rounds of everything and the disk, in turn.
+pub async fn run(args: &OtaArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figure>> {
+    let (robots, note) = allowed(args.server.robots)?;
+    if let Some(note) = note {
+        say(&note);
+    }
+    let mut figures = sign::run(args.server.directives, args.rounds)?;
+    let (mut hear, mut take, mut cuts, mut ways, mut syncs_ms) =
+        (Vec::new(), Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    for _ in 0..args.rounds {
+        hear.push(assign::measure(args, robots, assign::Robots::Hear).await?);
+        take.push(assign::measure(args, robots, assign::Robots::Take).await?);
+        match cut::measure(args, robots).await? {
+            Some(cut) => cuts.push(cut),
+            None => say("every robot was assigned before the server could be killed: nothing is told of it"),
+        }
+        ways.push(back::measure(args).await?);
+        let dir = place(args.dir.as_ref())?;
+        syncs_ms.push(median(&Disk::beside(dir.path())?.appends_ms(APPENDS)?));
+    }
+    figures.extend(of_assigned(&format!("{robots} robots that hear"), &hear, &syncs_ms));
+    figures.extend(of_assigned(&format!("{robots} robots that answer"), &take, &syncs_ms));
+    figures.extend(of_cuts(robots, &cuts, &hear));
+    figures.extend(of_ways(args.server.back_robots, &ways, &syncs_ms));
+    Ok(figures)
+}
+
+fn each<T>(runs: &[T], what: impl Fn(&T) -> f64) -> Vec<f64> {
+    runs.iter().map(what).collect()
+}
+
+/// What so many waits for the disk take, one after the other, in seconds.
+fn waits_s(groups: Vec<f64>, syncs_ms: &[f64]) -> Vec<f64> {
+    groups.iter().zip(syncs_ms).map(|(groups, ms)| groups * ms / 1e3).collect()
+}
+
+fn of_assigned(who: &str, runs: &[Assigned], syncs_ms: &[f64]) -> Vec<Figure> {
+    let name = |what: &str| format!("{who}: {what}");
+    let idle = "the same robots as long, no roll-out";
+    let waits = ("an fdatasync for each group commit", waits_s(each(runs, |r| r.groups), syncs_ms));
+    let sync_s = ("fdatasync of 4 KiB, p50", each(syncs_ms, |ms| ms / 1e3));
+    let mut figures = Vec::new();
+    let mut add = |what: &str, values: Vec<f64>, (limit, of_limit): (&str, Vec<f64>)| {
+        figures.push(Figure::of("P9", name(what), "s", &values, Some((limit, &of_limit))));
+    };
+    add(
+        "CPU of create, submit, approve",
+        each(runs, |r| r.written_cpu_s),
+        (idle, each(runs, |r| r.idle_cores * r.written_s)),
+    );
+    add("start to its answer", each(runs, |r| r.answered_s), sync_s.clone());
+    add("start to first wave offered", each(runs, |r| r.first_s), sync_s);
+    add("CPU to first wave offered", each(runs, |r| r.first_cpu_s), (idle, each(runs, |r| r.idle_cores * r.first_s)));
+    add("start to all assigned and offered", each(runs, |r| r.all_s), (waits.0, waits.1));
+    add("CPU to all assigned and offered", each(runs, |r| r.all_cpu_s), (idle, each(runs, |r| r.idle_cores * r.all_s)));
+    let cores = ("the same robots, no roll-out", each(runs, |r| r.idle_cores));
+    let after = each(runs, |r| r.after_cores);
+    figures.push(Figure::of("P9", name("server while they fetch"), "cores", &after, Some((cores.0, &cores.1))));
+    figures
+}
+
+fn of_cuts(robots: usize, cuts: &[Cut], whole: &[Assigned]) -> Vec<Figure> {
+    if cuts.is_empty() {
+        return Vec::new();
+    }
+    let name = |what: &str| format!("{robots} robots, killed at work: {what}");
+    let first = ("undisturbed: start to first wave offered", each(whole, |r| r.first_s));
+    let all = ("undisturbed: start to all offered", each(whole, |r| r.all_s));
+    let all_cpu = ("undisturbed: CPU to all offered", each(whole, |r| r.all_cpu_s));
+    let count = vec![robots as f64; whole.len()];
+    let mut figures =
+        vec![Figure::of("P9", name("assigned by then"), "robots", &each(cuts, |c| c.before), Some(("all", &count)))];
+    let mut add = |what: &str, values: Vec<f64>, limit: &(&str, Vec<f64>)| {
+        figures.push(Figure::of("P9", name(what), "s", &values, Some((limit.0, &limit.1))));
+    };
+    add("start to ready", each(cuts, |c| c.ready_s), &first);
+    add("ready to first new assignment", each(cuts, |c| c.first_s), &first);
+    add("ready to all assigned", each(cuts, |c| c.all_s), &all);
+    add("CPU from start to all assigned", each(cuts, |c| c.cpu_s), &all_cpu);
+    add("ready to all attached and offered", each(cuts, |c| c.offered_s), &all);
+    figures
+}
+
+fn of_ways(robots: usize, ways: &[WentBack], syncs_ms: &[f64]) -> Vec<Figure> {
+    let name = |what: &str| format!("{robots} idle robots, no budget: {what}");
+    let of = |way: fn(&WentBack) -> &back::Way, what: &str| {
+        let disk = waits_s(each(ways, |w| way(w).groups), syncs_ms);
+        let (took, half) = (each(ways, |w| way(w).all_s), each(ways, |w| way(w).half_s));
+        let disk = Some(("an fdatasync for each group commit", disk.as_slice()));
+        [
+            Figure::of("P9", name(&format!("{what}, half of them")), "s", &half, disk),
+            Figure::of("P9", name(&format!("{what}, all")), "s", &took, disk),
+        ]
+    };
+    let mut figures = Vec::from(of(|w| &w.on_trial, "abort to kept version, on trial"));
+    figures.extend(of(|w| &w.committed, "roll-back to kept version, committed"));
+    figures
+}

@@ -1,0 +1,43 @@
+//! Real agents with simulated bodies that take software: what `sim run` starts, and what each needs to change its set.
+
+use midshift_agent::trust::Trust;
+use midshift_core::time::Clock;
+use midshift_sim::faults::FaultRates;
+use midshift_sim::hall::{Hall, HallConfig};
+use midshift_sim::swarm::{Swarm, SwarmConfig, SwarmSoftware};
+use std::path::PathBuf;
+use std::sync::Arc;
+use tokio_util::sync::CancellationToken;
+
+/// What to be.
+#[derive(Clone, Debug, clap::Args)]
+pub struct SwarmArgs {
+    /// The server, host:port.
+    #[arg(long)]
+    pub server: String,
+    /// The site.
+    #[arg(long)]
+    pub site: PathBuf,
+    /// How many.
+    #[arg(long)]
+    pub robots: usize,
+    /// Whose software they take.
+    #[arg(long)]
+    pub trust: PathBuf,
+}
+
+/// Runs all of them until `stop`: nothing goes wrong by itself, and no battery empties.
+pub async fn run(args: SwarmArgs, stop: CancellationToken) -> anyhow::Result<()> {
+    let site = midshift::site_file::load(Some(&args.site), None, None)?.site;
+    let clock: Arc<dyn Clock> = midshift::clock::clock(1000);
+    let config = HallConfig { faults: FaultRates::none(), drains: false, ..HallConfig::new(site, args.robots, SEED) };
+    let hall = Arc::new(Hall::open(&config, &clock.now())?);
+    let uri = midshift::robots::uri(&args.server);
+    let mut swarm = SwarmConfig::tcp(hall, clock, &uri, SEED);
+    swarm.software = Some(SwarmSoftware::tcp(Trust::read(&args.trust)?, &uri));
+    Swarm::new(swarm).run(stop).await?;
+    Ok(())
+}
+
+/// Where they stand, and how they spread.
+const SEED: u64 = 1;
