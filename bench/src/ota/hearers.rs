@@ -18,13 +18,15 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
-use tokio::time::{Instant, interval_at, sleep};
+use tokio::time::{Instant, interval_at, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 
 /// Sessions that are being opened at once.
 const OPENING: usize = 64;
 /// A robot whose session ended comes back after this, and up to twice as long.
 const BACK_AFTER: Duration = Duration::from_millis(200);
+/// A server that does not answer for so long is given up, as a real agent does.
+const SILENT_AFTER: Duration = Duration::from_secs(10);
 /// What nobody was told yet, as an answer.
 pub const NEVER: u64 = u64::MAX;
 
@@ -133,9 +135,9 @@ impl Hearer {
     async fn live(&self, mut hello: Hello) -> anyhow::Result<()> {
         loop {
             let permit = self.opening.acquire().await?;
-            let opened = robot::open(&self.server, hello.clone()).await;
+            let opened = timeout(SILENT_AFTER, robot::open(&self.server, hello.clone())).await;
             drop(permit);
-            if let Ok((mut voice, mut ear, welcome)) = opened {
+            if let Ok(Ok((mut voice, mut ear, welcome))) = opened {
                 // How it ended does not matter: it comes back.
                 let _ = self.attend(&mut voice, &mut ear).await;
                 let said = &voice.reported;
@@ -157,8 +159,8 @@ impl Hearer {
         let mut beat = interval_at(Instant::now() + period.mul_f64((self.index % 1_000) as f64 / 1_000.0), period);
         loop {
             tokio::select! {
-                down = ear.hear() => {
-                    let down = down?;
+                down = timeout(SILENT_AFTER, ear.hear()) => {
+                    let down = down??;
                     if let Some(work) = &down.work {
                         voice.reported.applied_work = work.generation;
                     }

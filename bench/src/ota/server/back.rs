@@ -55,6 +55,7 @@ pub async fn measure(args: &OtaArgs) -> anyhow::Result<WentBack> {
     attached(&mut server, &mut rollouts, robots).await?;
     let all = [Size::Rest(true)];
     let kept = versions(&mut rollouts).await?;
+    ensure!(kept.values().all(|version| !version.is_empty()), "a robot has not said what it runs");
 
     let (id, count) = ("trial-1", robots as u32);
     begin(&mut rollouts, id, Some(spec(release::label(0), &all, LONG_MS))).await?;
@@ -62,9 +63,8 @@ pub async fn measure(args: &OtaArgs) -> anyhow::Result<WentBack> {
     let groups = server.ask(GROUPS)?;
     let begun = Instant::now();
     rollouts.abort(id).await?;
-    let on_trial = back(&mut server, &mut rollouts, id, count, begun, groups).await?;
+    let on_trial = back(&mut server, &mut rollouts, id, &kept, begun, groups).await?;
     rollouts.until(id, LOOK_EVERY, WITHIN, |r| r.phase() == RolloutPhase::Aborted).await?;
-    ensure!(versions(&mut rollouts).await? == kept, "a robot runs something else than before the abort");
 
     let (id, back_id) = ("kept-1", "kept-1-back");
     begin(&mut rollouts, id, Some(spec(release::label(1), &all, 0))).await?;
@@ -73,8 +73,7 @@ pub async fn measure(args: &OtaArgs) -> anyhow::Result<WentBack> {
     let (groups, begun) = (server.ask(GROUPS)?, Instant::now());
     rollouts.take_back(id, back_id).await?;
     begin(&mut rollouts, back_id, None).await?;
-    let committed = back(&mut server, &mut rollouts, back_id, count, begun, groups).await?;
-    ensure!(versions(&mut rollouts).await? == kept, "a robot runs something else than before the roll-out");
+    let committed = back(&mut server, &mut rollouts, back_id, &kept, begun, groups).await?;
     Ok(WentBack { on_trial, committed })
 }
 
@@ -91,19 +90,23 @@ async fn begin(
     rollouts.start(id).await
 }
 
-/// Waits until all robots of a roll-out went back.
+/// Waits until all robots of a roll-out have said that they went back, and have come with the version they had before.
 async fn back(
     server: &mut Child,
     rollouts: &mut Rollouts,
     id: &str,
-    count: u32,
+    kept: &BTreeMap<String, String>,
     begun: Instant,
     groups: u64,
 ) -> anyhow::Result<Way> {
-    let back = |r: &Rollout| r.counts.map_or(0, |c| c.rolled_back);
+    let (back, count) = (|r: &Rollout| r.counts.map_or(0, |c| c.rolled_back), kept.len() as u32);
     rollouts.until(id, LOOK_EVERY, WITHIN, |r| back(r) * 2 >= count).await?;
     let half_s = begun.elapsed().as_secs_f64();
     rollouts.until(id, LOOK_EVERY, WITHIN, |r| back(r) == count).await?;
+    while versions(rollouts).await? != *kept {
+        ensure!(begun.elapsed() < WITHIN, "a robot runs something else than before");
+        tokio::time::sleep(LOOK_EVERY).await;
+    }
     let all_s = begun.elapsed().as_secs_f64();
     Ok(Way { half_s, all_s, groups: (server.ask(GROUPS)? - groups) as f64 })
 }

@@ -26,7 +26,7 @@ const APPENDS: usize = 200;
 /// What to measure of the server.
 #[derive(Clone, Debug, clap::Args)]
 pub struct ServerArgs {
-    /// Robots that are assigned a roll-out. Without it 10,000, or as many as the limit of open files allows.
+    /// Robots that are assigned a roll-out. Without it 10,000, or as many as the limit of open files allows. 0: none is assigned.
     #[arg(long)]
     robots: Option<usize>,
     /// Robots of its first wave, at most a tenth of all.
@@ -35,7 +35,7 @@ pub struct ServerArgs {
     /// Seconds before each start in which what idle robots cost is measured.
     #[arg(long, default_value_t = 10)]
     idle_seconds: u64,
-    /// Simulated robots that go back from a release.
+    /// Simulated robots that go back from a release. 0: none does.
     #[arg(long, default_value_t = 100)]
     back_robots: usize,
     /// Directives signed in each round.
@@ -53,21 +53,32 @@ pub async fn run(args: &OtaArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figur
     let (mut hear, mut take, mut cuts, mut ways, mut syncs_ms) =
         (Vec::new(), Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for _ in 0..args.rounds {
-        hear.push(assign::measure(args, robots, assign::Robots::Hear).await?);
-        take.push(assign::measure(args, robots, assign::Robots::Take).await?);
-        match cut::measure(args, robots).await? {
-            Some(cut) => cuts.push(cut),
-            None => say("every robot was assigned before the server could be killed: nothing is told of it"),
+        if robots > 0 {
+            hear.push(told(assign::measure(args, robots, assign::Robots::Hear).await?, say));
+            take.push(told(assign::measure(args, robots, assign::Robots::Take).await?, say));
+            match cut::measure(args, robots).await? {
+                Some(cut) => cuts.push(told(cut, say)),
+                None => say("every robot was assigned before the server could be killed: nothing is told of it"),
+            }
         }
-        ways.push(back::measure(args).await?);
+        if args.server.back_robots > 0 {
+            ways.push(told(back::measure(args).await?, say));
+        }
         let dir = place(args.dir.as_ref())?;
         syncs_ms.push(median(&Disk::beside(dir.path())?.appends_ms(APPENDS)?));
     }
-    figures.extend(of_assigned(&format!("{robots} robots that hear"), &hear, &syncs_ms));
-    figures.extend(of_assigned(&format!("{robots} robots that answer"), &take, &syncs_ms));
+    let bare_s = figures.iter().find_map(|f| f.limit.as_ref()).map_or(0.0, |bare| 1.0 / bare.median);
+    figures.extend(of_assigned(robots, "hear", &hear, &syncs_ms, bare_s));
+    figures.extend(of_assigned(robots, "answer", &take, &syncs_ms, bare_s));
     figures.extend(of_cuts(robots, &cuts, &hear));
     figures.extend(of_ways(args.server.back_robots, &ways, &syncs_ms));
     Ok(figures)
+}
+
+/// Says what one run came to: all of them together take minutes.
+fn told<T: std::fmt::Debug>(run: T, say: &dyn Fn(&str)) -> T {
+    say(&format!("{run:?}"));
+    run
 }
 
 fn each<T>(runs: &[T], what: impl Fn(&T) -> f64) -> Vec<f64> {
@@ -79,8 +90,11 @@ fn waits_s(groups: Vec<f64>, syncs_ms: &[f64]) -> Vec<f64> {
     groups.iter().zip(syncs_ms).map(|(groups, ms)| groups * ms / 1e3).collect()
 }
 
-fn of_assigned(who: &str, runs: &[Assigned], syncs_ms: &[f64]) -> Vec<Figure> {
-    let name = |what: &str| format!("{who}: {what}");
+fn of_assigned(robots: usize, do_what: &str, runs: &[Assigned], syncs_ms: &[f64], bare_s: f64) -> Vec<Figure> {
+    if runs.is_empty() {
+        return Vec::new();
+    }
+    let name = |what: &str| format!("{robots} robots that {do_what}: {what}");
     let idle = "the same robots as long, no roll-out";
     let waits = ("an fdatasync for each group commit", waits_s(each(runs, |r| r.groups), syncs_ms));
     let sync_s = ("fdatasync of 4 KiB, p50", each(syncs_ms, |ms| ms / 1e3));
@@ -98,6 +112,10 @@ fn of_assigned(who: &str, runs: &[Assigned], syncs_ms: &[f64]) -> Vec<Figure> {
     add("CPU to first wave offered", each(runs, |r| r.first_cpu_s), (idle, each(runs, |r| r.idle_cores * r.first_s)));
     add("start to all assigned and offered", each(runs, |r| r.all_s), (waits.0, waits.1));
     add("CPU to all assigned and offered", each(runs, |r| r.all_cpu_s), (idle, each(runs, |r| r.idle_cores * r.all_s)));
+    // Robots that beat cost the longer the slower the machine is: this is what the roll-out itself took.
+    let beyond = each(runs, |r| (r.all_cpu_s - r.idle_cores * r.all_s).max(0.0));
+    let signed = ("as many bare ed25519 signatures", each(runs, |_| robots as f64 * bare_s));
+    add("CPU to all, beyond that of idle robots", beyond, signed);
     let cores = ("the same robots, no roll-out", each(runs, |r| r.idle_cores));
     let after = each(runs, |r| r.after_cores);
     figures.push(Figure::of("P9", name("server while they fetch"), "cores", &after, Some((cores.0, &cores.1))));
@@ -127,6 +145,9 @@ fn of_cuts(robots: usize, cuts: &[Cut], whole: &[Assigned]) -> Vec<Figure> {
 }
 
 fn of_ways(robots: usize, ways: &[WentBack], syncs_ms: &[f64]) -> Vec<Figure> {
+    if ways.is_empty() {
+        return Vec::new();
+    }
     let name = |what: &str| format!("{robots} idle robots, no budget: {what}");
     let of = |way: fn(&WentBack) -> &back::Way, what: &str| {
         let disk = waits_s(each(ways, |w| way(w).groups), syncs_ms);
