@@ -87,6 +87,9 @@ pub enum Role {
         #[arg(long)]
         unacknowledged: bool,
     },
+    /// One of the measurements of software.
+    #[command(flatten)]
+    Ota(crate::ota::parts::Part),
 }
 
 /// A child's arguments.
@@ -178,6 +181,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 () = stop.cancelled() => Ok(()),
             }
         }
+        Role::Ota(part) => crate::ota::parts::play(part, address, stop).await,
     }
 }
 
@@ -200,7 +204,7 @@ fn metric(name: &str) -> u64 {
 }
 
 /// Says the address, then answers each line of stdin with a number; the end of stdin is the end of all.
-fn answer_questions(
+pub fn answer_questions(
     address: SocketAddr,
     stop: CancellationToken,
     answer: impl Fn(&str) -> u64 + Send + 'static,
@@ -254,7 +258,19 @@ pub struct Child {
 impl Child {
     /// Starts this program in a role, on one core or on all.
     pub fn start(role: &[&str], core: Option<usize>) -> anyhow::Result<Self> {
-        let mut command = Command::new(std::env::current_exe()?);
+        Self::start_in(&[], role, core)
+    }
+    /// As [`Child::start`], by a command that becomes this program somewhere else.
+    pub fn start_in(entry: &[&str], role: &[&str], core: Option<usize>) -> anyhow::Result<Self> {
+        let this = std::env::current_exe()?;
+        let mut command = match entry.split_first() {
+            None => Command::new(this),
+            Some((first, rest)) => {
+                let mut command = Command::new(first);
+                command.args(rest).arg(this);
+                command
+            }
+        };
         command.arg("child");
         if let Some(core) = core {
             command.args(["--core", &core.to_string()]);

@@ -32,7 +32,7 @@ enum Name {
     Link(link::LinkArgs),
     /// How often the gates of a roll-out are right and wrong, simulated from a seed.
     Gates(gates::GatesArgs),
-    /// Software of robots: directives, ten thousand robots assigned, a kill in the middle of it, and the way back.
+    /// Software of robots: directives, ten thousand robots assigned, the way back; a download at line rate, patches, downloads that are cut off.
     Ota(ota::OtaArgs),
     /// What the other names start: this program in one role.
     #[command(hide = true)]
@@ -54,19 +54,25 @@ struct Args {
 #[expect(clippy::print_stdout, reason = "the table is what this program is for")]
 fn main() -> anyhow::Result<()> {
     let args = Args::parse();
+    let mut failed = Vec::new();
     let figures = match args.name {
         Name::Plan => plan::run()?,
         Name::Submit(args) => wait(submit::run(args))?,
         Name::Offer(args) => wait(offer::run(args))?,
         Name::Link(args) => wait(link::run(args, &note))?,
         Name::Gates(args) => gates::run(args)?,
-        Name::Ota(args) => wait(ota::run(args, &note))?,
+        Name::Ota(args) => {
+            let told = wait(async { Ok(ota::run(args, &note).await) })?;
+            failed = told.failed;
+            told.figures
+        }
         Name::Child(args) => return child::play(args),
     };
     print!("{}", figure::table(&figures));
     if let Some(path) = args.json {
         std::fs::write(path, serde_json::to_string_pretty(&figures)?)?;
     }
+    anyhow::ensure!(failed.is_empty(), "not measured: {}", failed.join("; "));
     Ok(())
 }
 

@@ -61,6 +61,55 @@ fn software_of_robots_is_told_beside_idle_robots_and_the_disk() {
     assert_told(&records("ota", &sizes), &["P9"], 1);
 }
 
+#[test]
+fn ways_to_a_release_and_cut_downloads_are_told_and_a_line_that_cannot_be_made_is_named() {
+    let dir = tempfile::tempdir().expect("a directory");
+    let [file, nothing, old, new] = ["figures.json", "nothing", "old", "new"].map(|name| dir.path().join(name));
+    std::fs::create_dir(&nothing).expect("made");
+    let program: Vec<u8> = (0..200_000u32).flat_map(|n| n.wrapping_mul(2_654_435_761).to_le_bytes()).collect();
+    std::fs::write(&old, &program).expect("written");
+    std::fs::write(&new, [&program[..4_000], b"a patch release", &program[4_000..]].concat()).expect("written");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_midshift-bench"));
+    command
+        .args([
+            "ota",
+            "--robots",
+            "0",
+            "--back-robots",
+            "0",
+            "--rounds",
+            "1",
+            "--directives",
+            "20",
+            "--resume-mib",
+            "12",
+            "--cuts",
+            "2",
+            "--device-rounds",
+            "1",
+            "--pair",
+        ])
+        .args([&old, &new]);
+    // Nobody finds ip and tc there.
+    let output = command.arg("--dir").arg(dir.path()).arg("--json").arg(&file).env("PATH", &nothing).output();
+    let output = output.expect("it starts");
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success() && said.contains("not measured: line") && said.contains("ip, tc"), "{said}");
+    let text = std::fs::read_to_string(file).expect("it wrote what it could measure");
+    let records: Vec<serde_json::Value> = serde_json::from_str(&text).expect("an array of records");
+    let median = |name: &str| {
+        let found = records.iter().find(|record| record["name"] == name).unwrap_or_else(|| panic!("no {name}: {text}"));
+        found["median"].as_f64().expect("a number")
+    };
+    assert!(median("given pair: patch, share") < 1.0, "{text}");
+    assert!(median("made pair, 10 of 1000 changed: patch") < median("made pair, 10 of 1000 changed: zstd"));
+    for kind in ["lost connections", "killed processes"] {
+        let again = median(&format!("12 MiB download, 2 {kind}: again, share"));
+        // Less than all of it: a download goes on.
+        assert!((-1.0..90.0).contains(&again), "{kind}: {again}");
+    }
+}
+
 /// Runs the simulation of the gates and gives its records.
 fn gates(seed: &str) -> Vec<serde_json::Value> {
     let dir = tempfile::tempdir().expect("a directory");

@@ -4,7 +4,7 @@ use midshift_agent::trust::Trust;
 use midshift_core::time::Clock;
 use midshift_sim::faults::FaultRates;
 use midshift_sim::hall::{Hall, HallConfig};
-use midshift_sim::swarm::{Swarm, SwarmConfig, SwarmSoftware};
+use midshift_sim::swarm::{Swarm, SwarmConfig};
 use std::path::PathBuf;
 use std::sync::Arc;
 use tokio_util::sync::CancellationToken;
@@ -34,7 +34,7 @@ pub async fn run(args: SwarmArgs, stop: CancellationToken) -> anyhow::Result<()>
     let hall = Arc::new(Hall::open(&config, &clock.now())?);
     let uri = midshift::robots::uri(&args.server);
     let mut swarm = SwarmConfig::tcp(hall, clock, &uri, SEED);
-    swarm.software = Some(SwarmSoftware::tcp(Trust::read(&args.trust)?, &uri));
+    swarm.software = Some(Trust::read(&args.trust)?);
     Swarm::new(swarm).run(stop).await?;
     Ok(())
 }

@@ -64,8 +64,8 @@ enum Wrong {
 
 /// A server with the releases of the bench.
 #[derive(Clone)]
-struct Shop {
-    releases: Releases,
+pub struct Shop {
+    pub releases: Releases,
     wrong: Arc<Mutex<Wrong>>,
     /// What it says of ways, and what it was asked.
     encoding: Arc<Mutex<GetEncodingResponse>>,
@@ -73,13 +73,13 @@ struct Shop {
 }
 
 impl Shop {
-    fn new() -> Self {
+    pub fn new() -> Self {
         Self { releases: Releases::new(), wrong: Arc::default(), encoding: Arc::default(), asked: Arc::default() }
     }
     fn is(&self, wrong: Wrong) -> bool {
         *self.wrong.lock().expect("not poisoned") == wrong
     }
-    fn router(&self) -> Router {
+    pub fn router(&self) -> Router {
         Server::builder()
             .add_service(BundleServiceServer::new(self.clone()))
             .add_service(ChunkServiceServer::new(self.clone()))

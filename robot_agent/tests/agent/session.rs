@@ -46,17 +46,18 @@ use tonic::{Request, Response, Status, Streaming};
 type Down = mpsc::Sender<Result<v1::SessionResponse, Status>>;
 
 /// One session as the server has it.
-struct Seen {
+pub struct Seen {
     up: Streaming<v1::SessionRequest>,
     down: Down,
 }
 
 impl Seen {
-    async fn next(&mut self) -> Option<FromRobot> {
+    /// None: it is over.
+    pub async fn next(&mut self) -> Option<FromRobot> {
         let message = self.up.message().await.ok()??;
         Some(parse(message).expect("what a robot says can be read"))
     }
-    async fn hello(&mut self) -> Hello {
+    pub async fn hello(&mut self) -> Hello {
         match self.next().await {
             Some(FromRobot::Hello(hello)) => *hello,
             other => panic!("no hello: {other:?}"),
@@ -92,10 +93,10 @@ impl Seen {
             }
         }
     }
-    async fn say(&self, message: ToRobot) {
+    pub async fn say(&self, message: ToRobot) {
         self.down.send(Ok(v1::SessionResponse::from(&message))).await.expect("the robot listens");
     }
-    async fn welcome(&self, session_epoch: u64) {
+    pub async fn welcome(&self, session_epoch: u64) {
         self.say(ToRobot::Welcome(Welcome { session_epoch, session_secret: format!("s{session_epoch}"), ..welcome() }))
             .await;
     }
@@ -104,7 +105,8 @@ impl Seen {
     }
 }
 
-struct Desk(mpsc::Sender<Seen>);
+/// A server's end of sessions.
+pub struct Desk(pub mpsc::Sender<Seen>);
 
 #[async_trait]
 impl LinkService for Desk {
@@ -144,9 +146,9 @@ impl ReplayService for Shelf {
 }
 
 /// Pipes instead of a network.
-struct Pipes {
-    ends: mpsc::Sender<Result<DuplexStream, std::io::Error>>,
-    network: watch::Receiver<bool>,
+pub struct Pipes {
+    pub ends: mpsc::Sender<Result<DuplexStream, std::io::Error>>,
+    pub network: watch::Receiver<bool>,
 }
 
 #[async_trait]

@@ -64,6 +64,20 @@ async fn a_patch_from_what_is_installed_brings_a_file_with_few_bytes_and_leaves_
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_download_keeps_to_its_rate_whatever_the_line_carries() {
+    let bench = Bench::new();
+    let length = bench.new.len() as u64;
+    for (rate_bytes_s, at_least_ms) in [(0, 0), (CHUNK_BYTES as u32 / 2, 2_000 * length / CHUNK_BYTES)] {
+        let mut worker = UpdateWorker::new(Box::new(MemorySets::new()), Arc::new(bench.releases.clone()));
+        let begun = tokio::time::Instant::now();
+        let job = Job::Fetch { wanted: wanted(&bench.new), bases: Vec::new(), rate_bytes_s };
+        assert!(matches!(worker.work(job, CancellationToken::new()).await, Done::Ok));
+        let virtual_ms = begun.elapsed().as_millis() as u64;
+        assert!((at_least_ms..=at_least_ms + 1).contains(&virtual_ms), "{virtual_ms} of {at_least_ms} ms");
+    }
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_way_that_does_not_lead_there_is_left_for_good_and_the_file_comes_as_it_is() {
     let bench = Bench::new();
     let mut tampered = bench.patch.clone();

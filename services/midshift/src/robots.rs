@@ -118,6 +118,15 @@ pub fn uri(server: &str) -> String {
 
 /// Runs one agent until `stop`. Fenced twice is an error: another machine has this robot's name.
 pub async fn agent(args: AgentRun, stop: CancellationToken) -> anyhow::Result<ExitReason> {
+    agent_in_hand(args, |_, _| (), stop).await
+}
+
+/// As [`agent`]; `hand` is given its body before it starts, and the clocks of the process, to do something to it later.
+pub async fn agent_in_hand(
+    args: AgentRun,
+    hand: impl FnOnce(&SimHandle, &Arc<dyn Clock>),
+    stop: CancellationToken,
+) -> anyhow::Result<ExitReason> {
     let robot_id = RobotId::parse(&args.robot_id)?;
     let site = site_file::load(args.site.as_deref(), None, None)?.site;
     std::fs::create_dir_all(&args.data).with_context(|| format!("making {}", args.data.display()))?;
@@ -151,6 +160,7 @@ pub async fn agent(args: AgentRun, stop: CancellationToken) -> anyhow::Result<Ex
     let world = WorldConfig { tag: format!("{robot_id}-"), auto_stock: true, utc_base_ms, ..WorldConfig::default() };
     let (body, _world) = SimBody::restore(config, site, world, &args.data, now.site)?;
     let handle = SimHandle::new(body);
+    hand(&handle, &clock);
     let _person =
         args.person.then(|| AbortOnDropHandle::new(tokio::spawn(visit(handle.clone(), args.seed, clock.clone()))));
     let network = handle.network();
