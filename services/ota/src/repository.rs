@@ -23,7 +23,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, PoisonError, RwLock};
-use tokio::sync::Mutex;
+use tokio::sync::{Mutex, OwnedMutexGuard};
 
 /// A timestamp this old is signed anew: half its life.
 pub const FRESHEN_AFTER_MS: u64 = TIMESTAMP_LIFE_MS / 2;
@@ -201,9 +201,9 @@ pub struct Repository {
     folder: PathBuf,
     keys: OnlineKeys,
     content: Arc<dyn Content>,
-    newest: RwLock<Option<Arc<Newest>>>,
-    /// One publication or signature at a time.
-    writing: Mutex<()>,
+    newest: Arc<RwLock<Option<Arc<Newest>>>>,
+    /// One publication or signature at a time. Held to the end of its writes, whoever still waits for them.
+    writing: Arc<Mutex<()>>,
 }
 
 impl Repository {
@@ -218,8 +218,8 @@ impl Repository {
             Some(found) => Some(Arc::new(found.complete(content.as_ref()).await?)),
             None => None,
         };
-        let (newest, folder) = (RwLock::new(newest), folder.to_owned());
-        Ok(Self { folder, keys, content, newest, writing: Mutex::new(()) })
+        let (newest, folder) = (Arc::new(RwLock::new(newest)), folder.to_owned());
+        Ok(Self { folder, keys, content, newest, writing: Arc::default() })
     }
 
     /// Keys of this server.
@@ -267,7 +267,7 @@ impl Repository {
         expected: u64,
         now: Utc,
     ) -> Result<Arc<Newest>, Error> {
-        let _writing = self.writing.lock().await;
+        let writing = self.writing.clone().lock_owned().await;
         let before = self.newest();
         let newest = before.as_ref().map_or(0, |b| b.targets.edition.version);
         if newest != expected {
@@ -277,7 +277,7 @@ impl Repository {
             };
         }
         let publication = self.prepare(before.as_deref(), roots, targets, now).await?;
-        self.commit(publication).await
+        self.commit(writing, publication).await
     }
 
     /// Signs anew that everything is as it was, if that was said long ago. How long until it is due, ms; none: there is nothing to say.
@@ -285,7 +285,7 @@ impl Repository {
     /// # Errors
     /// Why it was not signed.
     pub async fn freshen(&self, now: Utc) -> Result<Option<u64>, Error> {
-        let _writing = self.writing.lock().await;
+        let writing = self.writing.clone().lock_owned().await;
         let Some(before) = self.newest() else { return Ok(None) };
         let issued = before.stamp.issued;
         let age_ms = now.ms_since(issued);
@@ -297,7 +297,8 @@ impl Repository {
         let writes =
             vec![(file(stamp.snapshot_version, "snapshot"), online.snapshot), (TIMESTAMP.to_owned(), online.timestamp)];
         let timestamp = writes[1].1.clone();
-        self.commit(Publication { writes, newest: Newest { stamp, timestamp, ..(*before).clone() } }).await?;
+        let newest = Newest { stamp, timestamp, ..(*before).clone() };
+        self.commit(writing, Publication { writes, newest }).await?;
         Ok(Some(FRESHEN_AFTER_MS))
     }
 
@@ -363,20 +364,22 @@ impl Repository {
         blocking(move || read_seen(&folder)).await
     }
 
-    /// Writes one document after the other, each whole and durable, and shows the result.
-    async fn commit(&self, publication: Publication) -> Result<Arc<Newest>, Error> {
+    /// Writes one document after the other, each whole and durable, and shows the result: also if nobody waits for it any more.
+    async fn commit(&self, writing: OwnedMutexGuard<()>, publication: Publication) -> Result<Arc<Newest>, Error> {
         let (folder, newest) = (self.folder.clone(), Arc::new(publication.newest));
         let stale = newest.stamp.snapshot_version.checked_sub(SNAPSHOTS_KEPT);
+        let (place, shown) = (self.newest.clone(), newest.clone());
         blocking(move || {
             publication.writes.iter().try_for_each(|(name, bytes)| write_whole(&folder.join(name), bytes))?;
             if let Some(stale) = stale {
                 // Whether it is gone matters to nobody.
                 let _ = fs::remove_file(folder.join(file(stale, "snapshot")));
             }
+            *place.write().unwrap_or_else(PoisonError::into_inner) = Some(shown);
+            drop(writing);
             Ok::<_, Error>(())
         })
         .await?;
-        *self.newest.write().unwrap_or_else(PoisonError::into_inner) = Some(newest.clone());
         Ok(newest)
     }
 }

@@ -302,3 +302,31 @@ async fn documents_that_were_tampered_with_on_the_disk_are_not_opened() {
         assert!(opened.is_err(), "{name}");
     }
 }
+
+#[tokio::test]
+async fn what_is_shown_is_what_was_written_though_nobody_waits_for_a_publication_any_more() {
+    // Given up after ever more of its steps.
+    for steps in 0..60 {
+        let room = Room::new().await;
+        let files = files("walk", "1.0.0");
+        room.bring(&files).await;
+        let document = targets(None, &files, SEEDS.targets);
+        let mut publishing = Box::pin(room.repository.publish(vec![first_root()], document, 0, START));
+        for _ in 0..steps {
+            tokio::select! {
+                biased;
+                published = &mut publishing => {
+                    published.expect("published");
+                    return;
+                }
+                () = tokio::task::yield_now() => {}
+            }
+        }
+        drop(publishing);
+        // It writes until this has its turn.
+        room.repository.freshen(START).await.expect("nothing is due");
+        let shown = room.repository.newest().map(|newest| newest.timestamp.clone());
+        let room = room.restarted().await;
+        assert_eq!(room.repository.newest().map(|newest| newest.timestamp.clone()), shown, "after {steps} steps");
+    }
+}
