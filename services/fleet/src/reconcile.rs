@@ -73,6 +73,8 @@ pub async fn run(
         if this.turn(pace, std::mem::take(&mut batch)).await.is_err() {
             tokio::time::sleep(STORE_RETRY).await;
             this.rebuild_until_read(&shutdown).await;
+            // What was read is committed, so whoever asked needs not wait until the store takes something again.
+            this.answer(this.parts.clock.now());
         }
     }
 }
@@ -162,10 +164,15 @@ impl Loop {
             }
         }
         self.commit(plan, replies).await?;
+        self.answer(now);
+        Ok(())
+    }
+
+    /// Answers every question from the picture, which holds only what is committed at this moment.
+    fn answer(&mut self, now: Now) {
         for look in std::mem::take(&mut self.looks) {
             look(&self.view, &self.board, &now);
         }
-        Ok(())
     }
 
     /// Absorbs the feed to its head; true if something came from others.

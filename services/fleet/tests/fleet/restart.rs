@@ -6,6 +6,10 @@ use midshift_core::ids::{AttemptId, Subject};
 use midshift_core::reason::Code;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::{Attempt, AttemptPhase, Phase, TaskState, Then};
+use midshift_proto::fleet::v1;
+use midshift_proto::fleet::v1::fleet_service_server::FleetService;
+use std::time::Duration;
+use tonic::Request;
 
 #[tokio::test(start_paused = true)]
 async fn a_restart_loses_nothing_and_repeats_nothing() {
@@ -190,4 +194,21 @@ async fn only_the_newest_errands_of_a_robot_are_kept() {
     assert_eq!(midshift_fleet::prune(&*w.store, &*w.clock).await.expect("prunes"), 49);
     let left = w.seen().await.all::<Attempt>().len();
     assert_eq!(left, 101, "number 50 to 150");
+}
+
+#[tokio::test(start_paused = true)]
+async fn questions_are_answered_though_the_store_takes_nothing() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.pass(2).await;
+    w.shaky.fail(true);
+    w.submit("T1", "A", "B").await;
+    w.pass(2).await;
+    assert!(w.shaky.failed() > 0, "the fault happened");
+    let asked = w.fleet.list_places(Request::new(v1::ListPlacesRequest::default()));
+    let listed = tokio::time::timeout(Duration::from_secs(30), asked).await.expect("in time").expect("places");
+    assert!(!listed.into_inner().places.is_empty());
+    w.shaky.fail(false);
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.lawful().await;
 }

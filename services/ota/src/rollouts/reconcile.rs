@@ -65,6 +65,8 @@ pub async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Er
             Err(()) => {
                 tokio::time::sleep(STORE_RETRY).await;
                 this.rebuild_until_read(&shutdown).await;
+                // What was read is committed, so whoever asked needs not wait until the store takes something again.
+                this.answer(this.parts.clock.now());
             }
         }
     }
@@ -127,10 +129,15 @@ impl Loop {
             tracing::error!(text, "roll-outs passed over something they cannot read");
         }
         self.commit(plan, replies).await?;
+        self.answer(now);
+        Ok(more)
+    }
+
+    /// Answers every question from the picture, which holds only what is committed at this moment.
+    fn answer(&mut self, now: Now) {
         for look in std::mem::take(&mut self.looks) {
             look(&self.view, &self.board, &now);
         }
-        Ok(more)
     }
 
     fn take_requests(&mut self, requests: Vec<Request>, now: Now, plan: &mut Plan) -> Replies {
