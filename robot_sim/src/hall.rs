@@ -235,6 +235,10 @@ impl Hall {
     pub fn person_round(&self, now: SiteTime, live: &dyn Fn(&TaskId) -> bool) -> Vec<Deed> {
         self.person.lock().unwrap_or_else(PoisonError::into_inner).round(now, &self.robots, live)
     }
+    /// Files of the bodies' journals; empty while everything stays in memory.
+    pub fn journals(&self) -> &[PathBuf] {
+        &self.journals
+    }
     /// What these journals of other processes say together with those of this hall, which must have its own in files.
     ///
     /// # Errors

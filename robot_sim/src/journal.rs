@@ -100,6 +100,11 @@ pub enum Effect {
         /// Which.
         place_id: PlaceId,
     },
+    /// Software began to run on the robot, however short it lived.
+    Ran {
+        /// What it calls itself.
+        version: String,
+    },
 }
 
 /// One line of a journal.

@@ -98,13 +98,14 @@ impl Launched {
             Ok(behaviour) => behaviour,
             Err(why) => return Ok(Start::Dead(why)),
         };
-        if behaviour.crash_on_start {
-            return Ok(Start::Dead(format!("set {running} crashes at its start, as its {COMPONENT} says")));
-        }
         let on_probation = holdings.switch.trial.as_ref().is_some_and(|trial| !trial.is_proven);
         let hangs_after = behaviour.hang_in_probation_after_ms.filter(|_| on_probation).map(Duration::from_millis);
+        let crashes = behaviour.crash_on_start;
         let version = holdings.version(running).unwrap_or_else(|| self.factory.1.clone());
         robot.lock().run_software(now, behaviour, version);
+        if crashes {
+            return Ok(Start::Dead(format!("set {running} crashes at its start, as its {COMPONENT} says")));
+        }
         Ok(Start::Runs { hangs_after })
     }
 

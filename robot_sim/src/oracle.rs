@@ -146,6 +146,7 @@ impl Oracle {
             }
             (Effect::Entered { place_id }, Some(robot)) => self.entered(place_id, robot, entry.utc_ms),
             (Effect::Left { place_id }, Some(robot)) => self.left(place_id, robot, entry.utc_ms),
+            (Effect::Ran { .. }, Some(_)) => {}
             (_, None) => self.broke(entry, "done by nobody"),
         }
     }

@@ -140,6 +140,10 @@ impl World {
     pub fn leave(&mut self, at: SiteTime, robot: &RobotId, place_id: PlaceId) {
         self.record(at, Some(robot), Effect::Left { place_id });
     }
+    /// Software began to run on a robot.
+    pub fn run(&mut self, at: SiteTime, robot: &RobotId, version: String) {
+        self.record(at, Some(robot), Effect::Ran { version });
+    }
     /// What a robot carries.
     pub fn carried_by(&self, robot: &RobotId) -> Option<&Carried> {
         self.carried.get(robot)
@@ -209,7 +213,7 @@ impl World {
                 self.lying.entry(waypoint.clone()).or_default().push_back(item.clone());
             }
             Effect::Shipped { item, waypoint } => take(&mut self.lying, waypoint, item),
-            Effect::Entered { .. } | Effect::Left { .. } => {}
+            Effect::Entered { .. } | Effect::Left { .. } | Effect::Ran { .. } => {}
         }
     }
 }

@@ -5,6 +5,7 @@ use midshift_core::ids::{PlaceId, RobotId, TaskId, WaypointId};
 use midshift_core::site::{CORRIDOR, Site, text};
 use midshift_core::time::{SiteDuration, SiteTime};
 use midshift_core::work::StepKind;
+use midshift_sim::behaviour::Behaviour;
 use midshift_sim::body::{BodyConfig, SimBody};
 use midshift_sim::faults::{FaultRates, Injected};
 use midshift_sim::handle::SimHandle;
@@ -216,4 +217,20 @@ fn the_same_seed_draws_the_same_work_between_different_stations() {
     assert!(draw(5).iter().all(|(t, _)| t.from_waypoint != t.to_waypoint && t.priority == Some(7)));
     let mean_s = draw(9).iter().map(|(_, gap)| gap.as_secs_f64()).sum::<f64>() / 50.0;
     assert!((30.0..100.0).contains(&mean_s), "{mean_s}");
+}
+
+#[test]
+fn a_journal_names_each_software_that_began_on_a_body_also_one_that_dies_at_its_start() {
+    let site = corridor();
+    let world = World::new(WorldConfig::default(), &site).shared();
+    let body = handle(&site, &world, "rbt-01", "wait-a");
+    let came_with = body.lock().software().1.to_owned();
+    let dies = Behaviour { crash_on_start: true, ..Behaviour::default() };
+    body.lock().run_software(SiteTime(1_000), dies, "2.0.0".to_owned());
+    let world = lock(&world);
+    let ran = world.journal().tail().filter_map(|entry| match &entry.effect {
+        Effect::Ran { version } => Some((entry.site_ms, version.as_str())),
+        _ => None,
+    });
+    assert_eq!(ran.collect::<Vec<_>>(), [(0, came_with.as_str()), (1_000, "2.0.0")]);
 }

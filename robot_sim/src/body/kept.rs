@@ -97,6 +97,7 @@ impl SimBody {
         }
         body.keeper = Some(Keeper { dir: dir.to_owned(), life });
         body.occupy(now);
+        body.note_software(now);
         body.keep();
         Ok((body, world))
     }

@@ -212,6 +212,7 @@ impl SimBody {
     pub fn new(config: BodyConfig, site: Arc<Site>, world: SharedWorld, now: SiteTime) -> Result<Self, Error> {
         let mut body = Self::at_rest(config, site, world, now)?;
         body.occupy(now);
+        body.note_software(now);
         Ok(body)
     }
     /// As [`SimBody::new`], but it has not told the journal yet where it stands.
@@ -324,11 +325,16 @@ impl SimBody {
     pub fn software(&self) -> (&Behaviour, &str) {
         (&self.config.behaviour, &self.config.software)
     }
-    /// Other software drives it from now on.
+    /// Other software drives it from now on, or dies at its start if it behaves so.
     pub fn run_software(&mut self, now: SiteTime, behaviour: Behaviour, version: String) {
         self.advance(now);
         self.config.behaviour = behaviour;
         self.config.software = version;
+        self.note_software(now);
+    }
+    /// Its journal says which software begins to run.
+    fn note_software(&self, now: SiteTime) {
+        lock(&self.world).run(now, &self.config.robot_id, self.config.software.clone());
     }
     /// A person mends what is broken; an empty battery is changed for a half-full one.
     pub fn clear(&mut self, now: SiteTime) {

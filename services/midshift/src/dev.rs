@@ -175,7 +175,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     say(&greeting(&args, &site, address, &software));
     let stage = match scene {
         Some(scene) => {
-            Some(scene.stage(&args, &hall_config, server.board(), clock.clone(), address, trust, &software)?)
+            Some(scene.stage(&args, &hall_config, &hall, server.board(), clock.clone(), address, trust, &software)?)
         }
         None => None,
     };
@@ -199,7 +199,8 @@ impl Scene {
     fn stage(
         self,
         args: &Dev,
-        hall: &HallConfig,
+        config: &HallConfig,
+        hall: &Hall,
         board: Arc<LiveBoard<Live>>,
         clock: Arc<dyn Clock>,
         address: SocketAddr,
@@ -207,8 +208,10 @@ impl Scene {
         software: &Throwaway,
     ) -> anyhow::Result<(Stage, TempDir)> {
         let in_process = args.robots - self.launched;
-        let starts = hall.starting_waypoints()?;
-        let launched = (in_process..args.robots).map(|ix| Ok((hall.robot_id(ix)?, starts[ix].clone())));
+        let starts = config.starting_waypoints()?;
+        let launched = (in_process..args.robots).map(|ix| Ok((config.robot_id(ix)?, starts[ix].clone())));
+        let launched = launched.collect::<anyhow::Result<Vec<_>>>()?;
+        let theirs = scenario::journals(self.folder.path(), &launched);
         let stage = Stage {
             server: address.to_string(),
             channel: tonic::transport::Endpoint::from_shared(format!("http://{address}"))?.connect_lazy(),
@@ -216,12 +219,13 @@ impl Scene {
             clock,
             folder: self.folder.path().to_owned(),
             in_process,
-            launched: launched.collect::<anyhow::Result<_>>()?,
+            launched,
+            journals: hall.journals().iter().cloned().chain(theirs).collect(),
             trust,
             repository: (software.repository(), software.keys().join("targets-1.pem")),
             seed: args.seed,
             body_speed: args.speedup,
-            floor: hall.site.clone(),
+            floor: config.site.clone(),
             site: args.site.clone(),
         };
         Ok((stage, self.folder))

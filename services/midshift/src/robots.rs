@@ -148,7 +148,7 @@ pub async fn agent_in_hand(
     if let Some(software) = &software {
         let of = &software.trust.site;
         ensure!(of == site.site_id(), "the trust file is for robots of site {of}; this is site {}", site.site_id());
-        software.shape(&mut config)?;
+        software.shape(&mut config);
     }
     config.pace_permille = (args.body_speed.clamp(0.1, 100.0) * 1000.0) as u32;
     if args.no_faults {
@@ -159,6 +159,7 @@ pub async fn agent_in_hand(
     let utc_base_ms = now.utc.0 - i64::try_from(now.site.0).unwrap_or(0);
     let world = WorldConfig { tag: format!("{robot_id}-"), auto_stock: true, utc_base_ms, ..WorldConfig::default() };
     let (body, _world) = SimBody::restore(config, site, world, &args.data, now.site)?;
+    software.as_ref().map_or(Ok(()), Software::live)?;
     let handle = SimHandle::new(body);
     hand(&handle, &clock);
     let _person =

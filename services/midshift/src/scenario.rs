@@ -4,32 +4,34 @@
 //! are real in all processes, so their journals can be judged together. Invariant: what is judged comes from the robots themselves (heartbeats,
 //! journals, switch records) wherever they can tell it; the report says where each figure is from.
 
+mod played;
+mod watch;
+
+pub use played::Story;
+
 use crate::samples::{self, Signer};
 use anyhow::{Context, ensure};
 use midshift_agent::switch::Switch;
 use midshift_agent::trust::Trust;
-use midshift_core::ids::{AreaId, RobotId, WaypointId};
-use midshift_core::policy::SoftwareRules;
+use midshift_core::ids::{RobotId, WaypointId};
 use midshift_core::site::Site;
 use midshift_core::time::Clock;
-use midshift_core::update::UpdateState;
 use midshift_core::work::Live;
-use midshift_proto::convert::ms_of;
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::ota::v1::rollout_wave::Size;
 use midshift_store::LiveBoard;
+use played::{Played, all, evidence, medians, short, verdict};
 use rustix::process::{Pid, Signal, kill_process_group};
-use serde::Serialize;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 use tokio::process::{Child, Command};
 use tokio_util::sync::CancellationToken;
-use tokio_util::task::AbortOnDropHandle;
 use tonic::transport::Channel;
+use watch::{Crowd, FirstRuns, Watcher};
 
 /// Robots that are processes of their own, unless the fleet is too small for it.
 pub const LAUNCHED: usize = 5;
@@ -41,6 +43,8 @@ const LONGEST: Duration = Duration::from_secs(1_200);
 const READY_WITHIN: Duration = Duration::from_secs(120);
 /// Probation and soak of each roll-out, milliseconds of site time.
 const WATCHED_MS: u64 = 10_000;
+/// Software that was permitted within a permission's life begins to run so much later at most, milliseconds.
+const START_TAKES_MS: i64 = 2_000;
 /// A launched robot that was asked to end has so long, real time.
 const ENDS_WITHIN: Duration = Duration::from_secs(10);
 /// A launched robot that gives no sign for so many seconds is killed by its launcher.
@@ -68,145 +72,6 @@ const ACTS: [Act; 4] = [
     Act { version: "1.6.2-bad-with-load", is_good: false, exposure_tasks: 12 },
 ];
 
-/// Medians of the parts of the time that robots were out of work, milliseconds, each on its own clock.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct OffWork {
-    /// Site clock: asked until no new work.
-    pub drain_wait_ms: Option<u64>,
-    /// Site clock: from there until parked.
-    pub park_drive_ms: Option<u64>,
-    /// Link clock: parked until permitted.
-    pub parked_to_grant_ms: Option<u64>,
-    /// Link clock: permitted until heard with the bundle.
-    pub switch_ms: Option<u64>,
-    /// Site clock: from there until at work.
-    pub probation_ms: Option<u64>,
-}
-
-/// What one roll-out came to.
-#[derive(Clone, Debug, Serialize)]
-pub struct Played {
-    /// Which bundle.
-    pub bundle: String,
-    /// It was to be kept by all.
-    pub is_good: bool,
-    /// Its last phase (roll-out row).
-    pub phase: String,
-    /// Robots that were heard running it, or starting to (heartbeats).
-    pub robots_seen_with_it: usize,
-    /// Of these, after it had been aborted, beyond those that were permitted by then (heartbeats and rows).
-    pub activated_after_abort: usize,
-    /// Robots permitted when it was aborted, and in the end (rows).
-    pub touched_at_abort: Option<u32>,
-    /// See above.
-    pub touched: u32,
-    /// Robots of the canary wave (rows).
-    pub canary: u32,
-    /// Most robots that changed their software at once (heartbeats).
-    pub off_work_most: usize,
-    /// As many might have, by then: of each area one of ten of the robots that were ever there together in this roll-out, at least one. A robot
-    /// counts for the area that it was taken from, wherever it and the others are afterwards (heartbeats and the areas' rules).
-    pub off_work_allowed: usize,
-    /// Looks at which more did than might.
-    pub budget_broken: usize,
-    /// Robots that keep it in the end: launched ones by their switch record, the others by their heartbeats' versions.
-    pub kept_by: usize,
-    /// Robots that run something else than they should.
-    pub elsewhere: Vec<String>,
-    /// Verdicts with their numbers (roll-out row).
-    pub verdicts: Vec<String>,
-    /// Why it was aborted (roll-out row).
-    pub abort: Option<String>,
-    /// Medians (rows, stamped by the server).
-    pub off_work: OffWork,
-    /// Seconds of real time from start to end.
-    pub wall_s: f64,
-}
-
-/// What the story came to.
-#[derive(Clone, Debug, Serialize)]
-pub struct Story {
-    /// Robots in this process.
-    pub robots_in_process: usize,
-    /// Robots that were launcher and agent processes.
-    pub robots_launched: usize,
-    /// How many times as fast as real bodies worked.
-    pub body_speed: f64,
-    /// Its roll-outs.
-    pub acts: Vec<Played>,
-}
-
-impl Story {
-    /// Why it cannot be called good; empty if it can.
-    pub fn objections(&self) -> Vec<String> {
-        self.acts.iter().flat_map(|act| act.objections(self.robots_in_process + self.robots_launched)).collect()
-    }
-    /// The story in lines.
-    pub fn lines(&self) -> Vec<String> {
-        self.acts.iter().flat_map(Played::lines).collect()
-    }
-}
-
-impl Played {
-    fn objections(&self, robots: usize) -> Vec<String> {
-        let mut why = Vec::new();
-        let mut not = |holds: bool, text: String| {
-            if !holds {
-                why.push(format!("{}: {text}", self.bundle));
-            }
-        };
-        not(self.budget_broken == 0, format!("more robots changed at once than may, {} times", self.budget_broken));
-        not(self.elsewhere.is_empty(), format!("{} run something else", self.elsewhere.join(", ")));
-        if self.is_good {
-            not(self.phase == "COMPLETED", format!("it is {} and should be COMPLETED", self.phase));
-            not(self.kept_by == robots, format!("{} of {robots} robots keep it", self.kept_by));
-            let grant = self.off_work.parked_to_grant_ms.unwrap_or(u64::MAX);
-            not(grant <= 5_000, format!("parked to permitted took {grant} ms in the median, 5000 may"));
-        } else {
-            not(self.phase == "ABORTED", format!("it is {} and should be ABORTED", self.phase));
-            not(self.abort.is_some(), "it has no evidence".to_owned());
-            not(
-                self.touched <= self.canary,
-                format!("{} robots were touched, the canary has {}", self.touched, self.canary),
-            );
-            not(
-                self.activated_after_abort == 0,
-                format!("{} activated it after the abort", self.activated_after_abort),
-            );
-            not(self.kept_by == 0, format!("{} robots keep it", self.kept_by));
-        }
-        why
-    }
-
-    fn lines(&self) -> Vec<String> {
-        let ms = |ms: Option<u64>| ms.map_or("-".to_owned(), |ms| format!("{:.1}", ms as f64 / 1000.0));
-        let o = &self.off_work;
-        let mut lines = vec![format!(
-            "{}: {} in {:.0} s, touched {} (at the abort {}, after it {}), kept by {}, changed at once {} of {}",
-            self.bundle,
-            self.phase,
-            self.wall_s,
-            self.touched,
-            self.touched_at_abort.map_or("-".to_owned(), |n| n.to_string()),
-            self.activated_after_abort,
-            self.kept_by,
-            self.off_work_most,
-            self.off_work_allowed,
-        )];
-        lines.push(format!(
-            "  off work, medians in s: drain wait {} (site), park drive {} (site), parked to permitted {} (link), switch {} (link), probation {} (site)",
-            ms(o.drain_wait_ms),
-            ms(o.park_drive_ms),
-            ms(o.parked_to_grant_ms),
-            ms(o.switch_ms),
-            ms(o.probation_ms)
-        ));
-        lines.extend(self.verdicts.iter().map(|v| format!("  {v}")));
-        lines.extend(self.abort.iter().map(|a| format!("  aborted: {a}")));
-        lines
-    }
-}
-
 /// What the stage needs.
 pub struct Stage {
     /// Host and port of the server.
@@ -231,6 +96,8 @@ pub struct Stage {
     pub seed: u64,
     /// How many times as fast as real bodies work.
     pub body_speed: f64,
+    /// Journals of all its bodies.
+    pub journals: Vec<PathBuf>,
     /// The site.
     pub floor: Arc<Site>,
     /// Its file, if it is not the built-in one.
@@ -372,14 +239,10 @@ impl Stage {
         client
             .start_rollout(v1::StartRolloutRequest { rollout_id: id.clone(), etag, reason, supersede: false })
             .await?;
-        let mut aborted: Option<BTreeSet<RobotId>> = None;
         let ended = tokio::time::timeout(LONGEST, async {
             loop {
                 let request = v1::GetRolloutRequest { rollout_id: id.clone() };
                 let rollout = client.get_rollout(request).await?.into_inner().rollout.unwrap_or_default();
-                if rollout.abort.is_some() && aborted.is_none() {
-                    aborted = Some(watcher.seen());
-                }
                 let ended = matches!(
                     rollout.phase(),
                     v1::RolloutPhase::Completed
@@ -397,7 +260,7 @@ impl Stage {
             ended.await.with_context(|| format!("{rollout_id} did not end within {} s", LONGEST.as_secs()))??;
         let wall_s = begun.elapsed().as_secs_f64();
         let robots = self.robots_of(&rollout_id).await?;
-        self.judge(act, &rollout, &robots, watcher, aborted, wall_s).await
+        self.judge(act, &rollout, &robots, watcher.crowd(), wall_s).await
     }
 
     async fn robots_of(&self, rollout_id: &str) -> anyhow::Result<Vec<v1::RolloutRobot>> {
@@ -412,19 +275,14 @@ impl Stage {
         act: &Act,
         rollout: &v1::Rollout,
         robots: &[v1::RolloutRobot],
-        watcher: Watcher,
-        aborted: Option<BTreeSet<RobotId>>,
+        crowd: Crowd,
         wall_s: f64,
     ) -> anyhow::Result<Played> {
         let counts = rollout.counts.unwrap_or_default();
         let abort = rollout.abort.as_ref();
-        let touched_at_abort = abort.map(|a| a.touched);
-        let seen = watcher.seen();
-        let most = watcher.most();
-        let late = aborted.map_or(0, |then| seen.difference(&then).count());
-        // Those permitted by then may still have come; whoever is beyond them should not.
-        let permitted = touched_at_abort.unwrap_or(0) as usize;
-        let activated_after_abort = late.saturating_sub(permitted.saturating_sub(seen.len().saturating_sub(late)));
+        let runs = FirstRuns::read(self.journals.iter().map(PathBuf::as_path), act.version)?;
+        let late_ms = midshift_core::limits::ACTIVATION_VALID.as_ms() as i64 + START_TAKES_MS;
+        let aborted = abort.and_then(|a| a.time).map(|t| t.seconds * 1_000 + i64::from(t.nanos / 1_000_000));
         let good = format!("{}-{}", samples::NAME, ACTS[0].version);
         let should = if act.is_good { rollout.bundle_label.clone() } else { good };
         let (kept_by, elsewhere) = self.who_runs(&rollout.bundle_label, &should).await?;
@@ -433,14 +291,15 @@ impl Stage {
             bundle: rollout.bundle_label.clone(),
             is_good: act.is_good,
             phase: short(rollout.phase().as_str_name(), "ROLLOUT_PHASE_"),
-            robots_seen_with_it: seen.len(),
-            activated_after_abort,
-            touched_at_abort,
+            robots_that_ran_it: runs.robots(),
+            activated_after_abort: aborted.map_or(0, |at| runs.after(at + late_ms)),
+            begun_at_once_most: runs.most_within(WATCHED_MS as i64),
+            touched_at_abort: abort.map(|a| a.touched),
             touched: counts.attempted,
             canary: canary.max(1),
-            off_work_most: most.0,
-            off_work_allowed: most.1,
-            budget_broken: most.2,
+            off_work_most: crowd.most,
+            off_work_allowed: crowd.allowed,
+            budget_broken: crowd.broken,
             kept_by,
             elsewhere,
             verdicts: rollout.verdicts.iter().map(verdict).collect(),
@@ -510,137 +369,8 @@ impl Drop for Launched {
     }
 }
 
-/// Looks at what robots say all the time.
-struct Watcher {
-    seen: Arc<Mutex<BTreeSet<RobotId>>>,
-    /// Most at once, as many as might have by then, and how often more did.
-    most: Arc<Mutex<(usize, usize, usize)>>,
-    _looks: AbortOnDropHandle<()>,
-}
-
-impl Watcher {
-    fn begin(board: Arc<LiveBoard<Live>>, site: Arc<Site>) -> Self {
-        let (seen, most) = (Arc::new(Mutex::new(BTreeSet::new())), Arc::new(Mutex::new((0, 0, 0))));
-        let before: BTreeMap<RobotId, String> = board
-            .all()
-            .iter()
-            .filter_map(|(id, l)| Some((id.clone(), l.report.update.as_ref()?.bundle.to_string())))
-            .collect();
-        let (to_seen, to_most) = (seen.clone(), most.clone());
-        let looks = AbortOnDropHandle::new(tokio::spawn(async move {
-            let mut allowed: BTreeMap<AreaId, usize> = BTreeMap::new();
-            loop {
-                let off = look(&board, &before, &to_seen);
-                for (area, may) in allowances(&board, &site) {
-                    let most = allowed.entry(area).or_default();
-                    *most = may.max(*most);
-                }
-                let may = allowed.values().sum();
-                {
-                    let mut most = to_most.lock().unwrap_or_else(PoisonError::into_inner);
-                    if off > most.0 {
-                        (most.0, most.1) = (off, may);
-                    }
-                    most.2 += usize::from(off > may);
-                }
-                tokio::time::sleep(LOOK_EVERY).await;
-            }
-        }));
-        Self { seen, most, _looks: looks }
-    }
-    fn seen(&self) -> BTreeSet<RobotId> {
-        self.seen.lock().unwrap_or_else(PoisonError::into_inner).clone()
-    }
-    fn most(&self) -> (usize, usize, usize) {
-        *self.most.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-/// Notes who runs another bundle than before, and counts who changes its software now.
-fn look(board: &LiveBoard<Live>, before: &BTreeMap<RobotId, String>, seen: &Mutex<BTreeSet<RobotId>>) -> usize {
-    let mut off = 0;
-    for (id, live) in board.all() {
-        let Some(update) = &live.report.update else { continue };
-        let changes =
-            matches!(update.state, UpdateState::Switching | UpdateState::Probation | UpdateState::RollingBack);
-        off += usize::from(changes);
-        let new = before.get(&id).is_none_or(|known| *known != update.bundle.as_str());
-        if new && (update.state.is_active() || update.state == UpdateState::RolledBack) {
-            seen.lock().unwrap_or_else(PoisonError::into_inner).insert(id);
-        }
-    }
-    off
-}
-
-/// How many robots of each area may be taken out of work, with as many there as are now.
-fn allowances(board: &LiveBoard<Live>, site: &Site) -> BTreeMap<AreaId, usize> {
-    let mut areas: BTreeMap<AreaId, usize> = BTreeMap::new();
-    for (_, live) in board.all() {
-        if let Some(at) = live.report.vitals.waypoint.as_ref().and_then(|w| site.find(w)) {
-            *areas.entry(site.area_of(at).area_id.clone()).or_default() += 1;
-        }
-    }
-    let rules = SoftwareRules::default();
-    areas.into_iter().map(|(area, robots)| (area, rules.off_work_max(robots))).collect()
-}
-
 fn duration(ms: u64) -> prost_types::Duration {
     midshift_proto::convert::duration(ms)
-}
-
-fn short(name: &str, prefix: &str) -> String {
-    name.trim_start_matches(prefix).to_owned()
-}
-
-fn all(c: &v1::RolloutCounts) -> u32 {
-    c.waiting
-        + c.staging
-        + c.staged
-        + c.draining
-        + c.activating
-        + c.trial
-        + c.committing
-        + c.reverting
-        + c.committed
-        + c.rolled_back
-        + c.skipped
-        + c.stuck
-}
-
-fn verdict(v: &v1::RolloutVerdict) -> String {
-    let outcome = short(v.outcome().as_str_name(), "ROLLOUT_OUTCOME_");
-    let n = v.clean + v.failed;
-    let mut text = format!(
-        "wave {}: {outcome}, n {n}, failed {}, failure rate below {:.1} % with 95 % confidence",
-        v.wave,
-        v.failed,
-        f64::from(v.upper_bound_permille) / 10.0
-    );
-    if let Some(false_abort) = v.false_abort_permille {
-        text.push_str(&format!(", a good release fails so in {:.1} % of roll-outs", f64::from(false_abort) / 10.0));
-    }
-    text
-}
-
-fn evidence(a: &v1::RolloutAbort) -> String {
-    let reason = a.reason.clone().unwrap_or_default();
-    format!("{}: {} ({})", reason.code, reason.message, a.robot_ids.join(", "))
-}
-
-fn medians(robots: &[v1::RolloutRobot]) -> OffWork {
-    let median = |part: fn(&v1::OffWork) -> Option<&prost_types::Duration>| {
-        let parts = robots.iter().filter_map(|r| r.off_work.as_ref()).filter_map(part);
-        let mut all: Vec<u64> = parts.map(|d| ms_of(d).unsigned_abs()).collect();
-        all.sort_unstable();
-        all.get(all.len() / 2).copied()
-    };
-    OffWork {
-        drain_wait_ms: median(|o| o.drain_wait.as_ref()),
-        park_drive_ms: median(|o| o.park_drive.as_ref()),
-        parked_to_grant_ms: median(|o| o.parked_to_grant.as_ref()),
-        switch_ms: median(|o| o.switch.as_ref()),
-        probation_ms: median(|o| o.probation.as_ref()),
-    }
 }
 
 /// Journals of launched robots.

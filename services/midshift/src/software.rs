@@ -3,7 +3,7 @@
 //! Invariant: which set runs is what the launcher says, else what the switch record says; it is found out once, at the start.
 //! Called by [`crate::robots`].
 
-use anyhow::{bail, ensure};
+use anyhow::ensure;
 use midshift_agent::bulk::Bulk;
 use midshift_agent::launcher;
 use midshift_agent::session::Updates;
@@ -55,15 +55,17 @@ impl Software {
         Ok(Self { trust, sets, running, is_launched, is_on_probation, version, behaviour })
     }
 
-    /// Makes a body behave and call itself as the set that runs says. An error is a crash at the start.
-    pub fn shape(&self, body: &mut BodyConfig) -> anyhow::Result<()> {
-        if self.behaviour.crash_on_start {
-            bail!("set {} crashes at its start, as its {COMPONENT} says", self.running);
-        }
+    /// Makes a body behave and call itself as the set that runs says.
+    pub fn shape(&self, body: &mut BodyConfig) {
         body.behaviour = self.behaviour.clone();
         if let Some(version) = &self.version {
             body.software.clone_from(version);
         }
+    }
+
+    /// An error if the set that runs crashes at its start. To be asked when the body's journal has the start.
+    pub fn live(&self) -> anyhow::Result<()> {
+        ensure!(!self.behaviour.crash_on_start, "set {} crashes at its start, as its {COMPONENT} says", self.running);
         Ok(())
     }
 
