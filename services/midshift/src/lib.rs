@@ -3,6 +3,7 @@
 //! Called by `main.rs`, by the tests and by the benchmarks. Only here are configuration, environment and the machine's clock read.
 
 pub mod background;
+pub mod backup;
 pub mod cli;
 pub mod clock;
 pub mod dev;

@@ -33,6 +33,8 @@ const SNAPSHOTS_KEPT: u64 = 16;
 const TIMESTAMP: &str = "timestamp.json";
 /// When each bundle was seen first, by its digest. Not shown.
 const SEEN: &str = "seen.json";
+/// Lowest version of what is signed here from now on, as a number. Only a restored repository has it. Not shown.
+const FLOOR: &str = "floor.json";
 
 /// Why the repository stays as it was.
 #[derive(Debug, thiserror::Error)]
@@ -204,6 +206,8 @@ pub struct Repository {
     newest: Arc<RwLock<Option<Arc<Newest>>>>,
     /// One publication or signature at a time. Held to the end of its writes, whoever still waits for them.
     writing: Arc<Mutex<()>>,
+    /// Lowest version of a snapshot or timestamp that is signed.
+    floor: u64,
 }
 
 impl Repository {
@@ -213,13 +217,13 @@ impl Repository {
     /// If it cannot be read, or what is there does not hang together.
     pub async fn open(folder: &Path, keys: OnlineKeys, content: Arc<dyn Content>) -> Result<Self, Error> {
         let path = folder.to_owned();
-        let found = blocking(move || find(&path)).await?;
+        let (found, floor) = blocking(move || Ok::<_, Error>((find(&path)?, read_floor(&path)?))).await?;
         let newest = match found {
             Some(found) => Some(Arc::new(found.complete(content.as_ref()).await?)),
             None => None,
         };
         let (newest, folder) = (Arc::new(RwLock::new(newest)), folder.to_owned());
-        Ok(Self { folder, keys, content, newest, writing: Arc::default() })
+        Ok(Self { folder, keys, content, newest, writing: Arc::default(), floor })
     }
 
     /// Keys of this server.
@@ -290,7 +294,7 @@ impl Repository {
         let issued = before.stamp.issued;
         let age_ms = now.ms_since(issued);
         // A clock that went back says nothing of the age.
-        if now >= issued && age_ms < FRESHEN_AFTER_MS {
+        if now >= issued && age_ms < FRESHEN_AFTER_MS && before.stamp.version >= self.floor {
             return Ok(Some(FRESHEN_AFTER_MS - age_ms));
         }
         let (online, stamp) = self.sign(Some(&before), &before.root, &before.targets.bytes, now)?;
@@ -353,7 +357,8 @@ impl Repository {
     }
 
     fn sign(&self, before: Option<&Newest>, root: &Kept, targets: &[u8], now: Utc) -> Result<(Online, Stamp), Error> {
-        let versions = before.map_or((1, 1), |b| (b.stamp.snapshot_version + 1, b.stamp.version + 1));
+        let (snapshot, timestamp) = before.map_or((1, 1), |b| (b.stamp.snapshot_version + 1, b.stamp.version + 1));
+        let versions = (snapshot.max(self.floor), timestamp.max(self.floor));
         let online = self.keys.sign(root, targets, versions, now)?;
         let stamp = stamp(&online.timestamp)?;
         Ok((online, stamp))
@@ -459,6 +464,21 @@ fn find(folder: &Path) -> Result<Option<Found>, Error> {
         stamp,
         seen: read_seen(folder)?,
     }))
+}
+
+/// Makes what is signed in `folder` from now on have at least this version: robots have seen versions that a restored repository does not
+/// know of, and take nothing older. Nobody may serve from it.
+///
+/// # Errors
+/// If it cannot be written.
+pub fn raise_floor(folder: &Path, version: u64) -> Result<(), Error> {
+    Ok(write_whole(&folder.join(FLOOR), version.to_string().as_bytes())?)
+}
+
+fn read_floor(folder: &Path) -> Result<u64, Error> {
+    let bytes = read(&folder.join(FLOOR))?.unwrap_or_else(|| b"1".to_vec());
+    serde_json::from_slice(&bytes)
+        .map_err(|e| Error::Damaged { folder: folder.to_owned(), text: format!("{FLOOR}: {e}") })
 }
 
 fn read_seen(folder: &Path) -> Result<BTreeMap<Digest, Utc>, Error> {

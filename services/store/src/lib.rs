@@ -18,7 +18,7 @@ pub use board::{Dirty, LiveBoard};
 pub use frames::{FRAME_BYTES_DEFAULT, Frame, FrameLog, FrameMark, GAPS_MAX, Gap, MemoryFrames, StoredFrame};
 pub use model::MemoryStore;
 pub use projection::{Change, Fold, Projection};
-pub use sqlite::{Migrated, OpenError, SqliteFrames, SqliteStore, migrate};
+pub use sqlite::{Database, Described, Migrated, OpenError, SqliteFrames, SqliteStore, migrate, renew_identity};
 
 use async_trait::async_trait;
 use midshift_core::ids::SiteId;

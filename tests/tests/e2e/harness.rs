@@ -152,7 +152,19 @@ impl Server {
     }
     /// SIGKILL and a new start on the same data.
     pub async fn kill_and_restart(&mut self) -> anyhow::Result<()> {
-        self.running.kill()?;
+        self.kill()?;
+        self.restart().await
+    }
+    /// SIGKILL.
+    pub fn kill(&mut self) -> anyhow::Result<()> {
+        self.running.kill()
+    }
+    /// Its data directory.
+    pub fn data(&self) -> PathBuf {
+        self.dir.join("data")
+    }
+    /// A new start after a kill, with whatever lies in the data directory now.
+    pub async fn restart(&mut self) -> anyhow::Result<()> {
         self.running = Self::run(&self.dir, self.address, &self.flags)?;
         self.answers().await
     }

@@ -1,27 +1,22 @@
 //! Twenty agent processes survive `kill -9` of the server three times and of five agents once each, while they work.
 
-use crate::harness::{Running, Server, midshift, until};
+use crate::harness::{Server, until};
+use crate::robots::Robots;
 use midshift::background::request;
-use midshift_agent::ledger::{Holder, Ledger};
-use midshift_agent::sqlite::SqliteStore;
-use midshift_agent::store::Store;
+use midshift_agent::ledger::Holder;
 use midshift_core::site::{DEMO, text};
 use midshift_proto::task::v1::{SubmitTasksRequest, Task, TaskState};
 use midshift_sim::oracle::Oracle;
-use midshift_sim::swarm::AGENT_FILE;
 use midshift_sim::workload::{Workload, WorkloadConfig};
 use rand::rngs::StdRng;
 use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::time::Duration;
 
 const ROBOTS: usize = 20;
 const TASKS: usize = 100;
-/// How many times as fast as real the bodies work; clocks are not touched.
-const BODY_SPEED: &str = "5";
 
 /// Printed points make a failing run readable.
 macro_rules! say {
@@ -29,51 +24,6 @@ macro_rules! say {
         use std::io::Write;
         let _ = writeln!(std::io::stderr(), $($text)*);
     }};
-}
-
-struct Robots {
-    dir: PathBuf,
-    server: String,
-    starts: Vec<String>,
-    running: BTreeMap<String, Running>,
-}
-
-impl Robots {
-    fn start(&mut self, number: usize) -> anyhow::Result<()> {
-        let id = format!("rbt-{:02}", number + 1);
-        let dir = self.dir.join(&id);
-        std::fs::create_dir_all(&dir)?;
-        let mut command = Command::new(midshift()?);
-        command.args([
-            "agent",
-            "run",
-            "--robot-id",
-            &id,
-            "--server",
-            &self.server,
-            "--body-speed",
-            BODY_SPEED,
-            "--no-faults",
-        ]);
-        command.args(["--start", &self.starts[number], "--seed", &number.to_string()]).arg("--data").arg(&dir);
-        let running = Running::start(&mut command, &dir.join("agent.log"))?;
-        self.running.insert(id, running);
-        Ok(())
-    }
-    fn kill(&mut self, id: &str) -> anyhow::Result<()> {
-        self.running.get_mut(id).map_or(Ok(()), Running::kill)
-    }
-    fn restart(&mut self, id: &str) -> anyhow::Result<()> {
-        let number: usize = id.trim_start_matches("rbt-").parse()?;
-        self.start(number - 1)
-    }
-    /// What a robot remembers; its agent must not run.
-    async fn ledger(&self, id: &str) -> anyhow::Result<Ledger> {
-        Ok(SqliteStore::open(&self.dir.join(id).join(AGENT_FILE)).await?.load("").await?.ledger)
-    }
-    fn journals(&self) -> Vec<PathBuf> {
-        self.running.keys().map(|id| self.dir.join(id).join("journal.jsonl")).collect()
-    }
 }
 
 async fn done_and_running(server: &Server) -> anyhow::Result<Option<(usize, Vec<Task>)>> {
@@ -123,12 +73,7 @@ async fn nothing_is_lost_and_nothing_done_twice_when_server_and_agents_are_kille
     let dir = tempfile::tempdir()?;
     let site = text::parse(DEMO)?;
     let mut server = Server::start(dir.path()).await?;
-    let starts = site.starting_places(ROBOTS).into_iter().map(|at| site.name_of(at).to_string()).collect();
-    let mut robots =
-        Robots { dir: dir.path().to_owned(), server: server.address.to_string(), starts, running: BTreeMap::new() };
-    for number in 0..ROBOTS {
-        robots.start(number)?;
-    }
+    let mut robots = Robots::start(dir.path(), &server, &site, ROBOTS)?;
     submit(&server, &site, seed).await?;
     let mut kills: Vec<(usize, bool)> =
         [(8, true), (16, false), (24, false), (32, true), (40, false), (48, false), (56, true), (62, false)]
@@ -187,7 +132,7 @@ async fn nothing_is_lost_and_nothing_done_twice_when_server_and_agents_are_kille
 /// Every robot's own memory: a task that succeeded was finished by one robot, once.
 async fn judge_ledgers(tasks: &[Task], mut robots: Robots) -> anyhow::Result<()> {
     let mut finished: BTreeMap<String, Vec<String>> = BTreeMap::new();
-    let ids: Vec<String> = robots.running.keys().cloned().collect();
+    let ids: Vec<String> = robots.ids();
     for id in ids {
         robots.kill(&id)?;
         let ledger = robots.ledger(&id).await?;

@@ -12,6 +12,8 @@ mod kill;
 mod launched;
 mod measured;
 mod proxy;
+mod restored;
+mod robots;
 mod rolled_out;
 mod room;
 mod swarm_software;

@@ -1,6 +1,7 @@
 //! The command line: one binary, noun then verb. Data to stdout, talk to stderr, `-o json` is the contract.
 
 mod area;
+mod backup;
 mod bundle;
 mod client;
 mod doctor;
@@ -58,6 +59,10 @@ enum Command {
         #[arg(long)]
         data: PathBuf,
     },
+    /// Copy everything durable of a server into a folder, while it serves or not.
+    Backup(backup::Take),
+    /// Make a data directory of a backup, or only look whether the backup is good.
+    Restore(backup::Restore),
     /// A robot's agent.
     #[command(subcommand)]
     Agent(AgentVerb),
@@ -158,6 +163,8 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Dev(args) => develop(*args, out).await,
         Command::Serve(args) => Ok(serve::run(args, interrupts()).await?),
         Command::Migrate { data } => migrate(&data, out).await,
+        Command::Backup(args) => backup::take(&args, out).await,
+        Command::Restore(args) => backup::restore(&args, out).await,
         Command::Agent(AgentVerb::Run(args)) => match robots::agent(args, interrupts()).await? {
             ExitReason::Switched => Err(Exit::new(SWITCHED, "another set of software is to be started")),
             ExitReason::Shutdown | ExitReason::FencedTwice => Ok(()),

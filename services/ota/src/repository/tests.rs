@@ -331,3 +331,18 @@ async fn a_publication_that_nobody_waits_for_any_more_is_written_to_its_end_and_
     }
     panic!("no publication took long enough to turn away from");
 }
+
+#[tokio::test]
+async fn a_restored_repository_is_signed_anew_at_once_with_versions_above_all_that_robots_saw() {
+    let (room, _) = published().await;
+    let before = room.repository.newest().expect("published").stamp;
+    // Robots saw later versions, which the copy does not know.
+    super::raise_floor(&room.metadata(), 1_000).expect("written");
+    let room = room.restarted().await;
+    room.repository.freshen(START).await.expect("signed");
+    let stamp = room.repository.newest().expect("kept").stamp;
+    assert_eq!((before.version, stamp.version, stamp.snapshot_version), (1, 1_000, 1_000));
+    room.repository.freshen(START).await.expect("it is fresh");
+    assert_eq!(room.repository.newest().expect("kept").stamp.version, 1_000);
+    room.shown_to(&robot(), START).await.expect("believed");
+}

@@ -4,6 +4,7 @@
 //! writer task is the only writer of the file, which is why it may judge items by what it remembers.
 //! SQL stays within what PostgreSQL also has: numbered binds, `ON CONFLICT … DO UPDATE`, BIGINT and TEXT.
 
+mod copy;
 mod file;
 mod frames;
 mod frames_pack;
@@ -16,6 +17,7 @@ mod tail;
 mod write_sql;
 mod writer;
 
+pub use copy::{Database, Described, renew_identity};
 pub use frames::SqliteFrames;
 pub use schema::Migrated;
 

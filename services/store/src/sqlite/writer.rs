@@ -288,6 +288,11 @@ pub(super) async fn head(connection: &mut SqliteConnection, site_id: &SiteId) ->
     Ok(Seq(row.fetch_one(connection).await?.try_get::<i64, _>(0)?.cast_unsigned()))
 }
 
+/// A name for a store that no other store has.
+pub(super) fn fresh_id() -> String {
+    format!("{:032x}", rand::random::<u128>())
+}
+
 /// Reads the store's identity, or makes one: a new store gets a random id and numbers from `created` on.
 pub(super) async fn identify(
     connection: &mut SqliteConnection,
@@ -299,7 +304,7 @@ pub(super) async fn identify(
     if sqlx::query(select).fetch_optional(&mut *connection).await.map_err(sql)?.is_none() {
         sqlx::query("INSERT INTO store_head (site_id, store_id, seq) VALUES ($1, $2, $3)")
             .bind(site_id.as_str())
-            .bind(format!("{:032x}", rand::random::<u128>()))
+            .bind(fresh_id())
             .bind(created.0.max(0))
             .execute(&mut *connection)
             .await

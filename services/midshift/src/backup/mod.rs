@@ -1,0 +1,251 @@
+//! Backups of a server: everything durable that it has, as a list of parts, each copied while the server works.
+//!
+//! Invariant: a backup is whole or it is not there: its folder gets its name when all of it is durable, and its list names each file with its
+//! digest. Restoring changes nothing but a data directory that was not there. Rows are copied before what they name, so that what a
+//! copied row names was there when it was copied. A thing that is durable and in no part is a defect: who adds one adds its part.
+
+mod parts;
+
+use anyhow::{Context, bail, ensure};
+use midshift_bundle::digest::Digest;
+use midshift_core::time::Utc;
+use parts::PARTS;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+
+/// The list of a backup.
+const LIST: &str = "backup.json";
+/// How backups are laid out. Another number is another layout.
+const FORMAT: u32 = 1;
+/// A file of a backup has at most so many bytes.
+const FILE_BYTES_MAX: u64 = 1 << 42;
+
+/// Where a server keeps what is durable.
+#[derive(Clone, Debug)]
+pub struct Places {
+    /// Its data directory.
+    pub data: PathBuf,
+    /// The folder of its online keys, if it has any.
+    pub ota_keys: Option<PathBuf>,
+}
+
+/// One file of a backup.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Kept {
+    bytes: u64,
+    sha256: String,
+}
+
+/// What a backup is.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct List {
+    format: u32,
+    /// Which release wrote it.
+    midshift: String,
+    /// Whose.
+    site_id: String,
+    /// When it was begun, unix milliseconds.
+    begun_unix_ms: i64,
+    /// Parts that are in it.
+    parts: Vec<String>,
+    /// Files by path.
+    files: BTreeMap<String, Kept>,
+}
+
+/// What a backup holds, for people.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Summary {
+    /// Whose.
+    pub site_id: String,
+    /// When it was begun.
+    pub begun: Utc,
+    /// Each part: its name, its files and their bytes.
+    pub parts: Vec<(String, u64, u64)>,
+}
+
+/// Copies everything durable of `from` into the folder `to`, which must not be there. A server may be using it.
+///
+/// # Errors
+/// If something cannot be read or written. Nothing is left at `to` then.
+pub async fn back_up(from: &Places, to: &Path, now: Utc) -> anyhow::Result<Summary> {
+    let place = Place::new(to)?;
+    let mut names = Vec::new();
+    let mut site_id = None;
+    for part in PARTS {
+        let folder = place.path().join(part.name());
+        let is_there = part.copy(from, &folder).await.with_context(|| format!("copying {}", part.name()))?;
+        if is_there {
+            site_id = site_id.or(part.site_id(&folder).await?);
+            names.push(part.name().to_owned());
+        }
+    }
+    let site_id = site_id.with_context(|| format!("no server ever served from {}", from.data.display()))?;
+    let root = place.path().to_owned();
+    let files = blocking(move || listed(&root)).await?;
+    let midshift = env!("CARGO_PKG_VERSION").to_owned();
+    let list = List { format: FORMAT, midshift, site_id, begun_unix_ms: now.0, parts: names, files };
+    write(&place.path().join(LIST), &serde_json::to_vec_pretty(&list)?)?;
+    place.name(to).await?;
+    Ok(list.summary())
+}
+
+/// Whether everything of a backup is there, is what its list says, and hangs together. Changes nothing.
+///
+/// # Errors
+/// With everything that is wrong with it.
+pub async fn verify(backup: &Path) -> anyhow::Result<Summary> {
+    let path = backup.join(LIST);
+    let bytes = fs::read(&path).with_context(|| format!("{} is no backup: reading {LIST}", backup.display()))?;
+    let list: List = serde_json::from_slice(&bytes).with_context(|| format!("{} is not readable", path.display()))?;
+    ensure!(list.format == FORMAT, "the backup has format {}, this release knows {FORMAT}", list.format);
+    let root = backup.to_owned();
+    let found = blocking(move || listed(&root)).await?;
+    let mut wrong = differences(&list.files, &found);
+    for name in &list.parts {
+        let Some(part) = PARTS.iter().find(|part| part.name() == name) else {
+            wrong.push(format!("this release knows no part {name}"));
+            continue;
+        };
+        let folder = backup.join(name);
+        match part.check(&folder).await {
+            Ok(found) => wrong.extend(found.into_iter().map(|text| format!("{name}: {text}"))),
+            Err(error) => wrong.push(format!("{name}: {error:#}")),
+        }
+    }
+    if !wrong.is_empty() {
+        bail!("the backup is not good: {}", wrong.join("; "));
+    }
+    Ok(list.summary())
+}
+
+/// Makes a data directory of a backup, which is verified first. `to.data` must not be there, or be empty.
+///
+/// # Errors
+/// If the backup is not good, or something cannot be written. Nothing is left at `to` then.
+pub async fn restore(backup: &Path, to: &Places, now: Utc) -> anyhow::Result<Summary> {
+    let summary = verify(backup).await?;
+    let place = Place::new(&to.data)?;
+    if let Some(keys) = &to.ota_keys {
+        ensure!(is_free(keys)?, "{} is not empty", keys.display());
+    }
+    let within = Places { data: place.path().to_owned(), ota_keys: to.ota_keys.clone() };
+    for (name, ..) in &summary.parts {
+        if let Some(part) = PARTS.iter().find(|part| part.name() == name) {
+            part.put_back(&backup.join(name), &within, now).await.with_context(|| format!("restoring {name}"))?;
+        }
+    }
+    place.name(&to.data).await?;
+    Ok(summary)
+}
+
+impl List {
+    fn summary(&self) -> Summary {
+        let of = |name: &String| {
+            let inside = self.files.iter().filter(|(path, _)| path.split('/').next() == Some(name));
+            let (files, bytes) = inside.fold((0, 0), |(files, bytes), (_, kept)| (files + 1, bytes + kept.bytes));
+            (name.clone(), files, bytes)
+        };
+        Summary {
+            site_id: self.site_id.clone(),
+            begun: Utc(self.begun_unix_ms),
+            parts: self.parts.iter().map(of).collect(),
+        }
+    }
+}
+
+/// A folder under a name of its own until it is whole.
+struct Place(tempfile::TempDir);
+
+impl Place {
+    fn new(to: &Path) -> anyhow::Result<Self> {
+        ensure!(is_free(to)?, "{} is not empty; name a folder that is not there", to.display());
+        let beside = to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        fs::create_dir_all(beside).with_context(|| format!("making {}", beside.display()))?;
+        let place = tempfile::Builder::new().prefix(".midshift-").tempdir_in(beside);
+        Ok(Self(place.with_context(|| format!("making a folder in {}", beside.display()))?))
+    }
+    fn path(&self) -> &Path {
+        self.0.path()
+    }
+    /// Makes all of it durable and gives it its name.
+    async fn name(self, to: &Path) -> anyhow::Result<()> {
+        let (from, to) = (self.0.path().to_owned(), to.to_owned());
+        blocking(move || {
+            sync_tree(&from)?;
+            if to.exists() {
+                fs::remove_dir(&to).with_context(|| format!("replacing {}", to.display()))?;
+            }
+            fs::rename(&from, &to).with_context(|| format!("naming {}", to.display()))?;
+            let beside = to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+            File::open(beside)?.sync_all().with_context(|| format!("syncing {}", beside.display()))
+        })
+        .await?;
+        // Its old name is nobody's now.
+        let _ = self.0.keep();
+        Ok(())
+    }
+}
+
+fn is_free(path: &Path) -> anyhow::Result<bool> {
+    match fs::read_dir(path) {
+        Ok(mut entries) => Ok(entries.next().is_none()),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(true),
+        Err(error) => Err(error).with_context(|| format!("reading {}", path.display())),
+    }
+}
+
+/// Files of a folder by their path in it, all but the list.
+fn listed(root: &Path) -> anyhow::Result<BTreeMap<String, Kept>> {
+    let mut found = BTreeMap::new();
+    let mut folders = vec![root.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(&folder).with_context(|| format!("reading {}", folder.display()))? {
+            let path = entry?.path();
+            if path.is_dir() {
+                folders.push(path);
+                continue;
+            }
+            let inside = path.strip_prefix(root)?.to_string_lossy().into_owned();
+            if inside != LIST {
+                let mut file = File::open(&path).with_context(|| format!("reading {}", path.display()))?;
+                let (digest, bytes) = Digest::of_reader(&mut file, FILE_BYTES_MAX)?;
+                found.insert(inside, Kept { bytes, sha256: digest.to_string() });
+            }
+        }
+    }
+    Ok(found)
+}
+
+fn differences(list: &BTreeMap<String, Kept>, found: &BTreeMap<String, Kept>) -> Vec<String> {
+    let missing = list.keys().filter(|path| !found.contains_key(*path)).map(|path| format!("{path} is missing"));
+    let strange = found.keys().filter(|path| !list.contains_key(*path)).map(|path| format!("{path} is not listed"));
+    let other = list.iter().filter(|(path, kept)| found.get(*path).is_some_and(|f| f != *kept));
+    missing.chain(strange).chain(other.map(|(path, _)| format!("{path} is not what was copied"))).collect()
+}
+
+fn sync_tree(folder: &Path) -> anyhow::Result<()> {
+    for entry in fs::read_dir(folder)? {
+        let path = entry?.path();
+        if path.is_dir() {
+            sync_tree(&path)?;
+        } else {
+            File::open(&path)?.sync_all().with_context(|| format!("syncing {}", path.display()))?;
+        }
+    }
+    File::open(folder)?.sync_all().with_context(|| format!("syncing {}", folder.display()))
+}
+
+fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    fs::write(path, bytes).with_context(|| format!("writing {}", path.display()))
+}
+
+async fn blocking<T: Send + 'static>(work: impl FnOnce() -> anyhow::Result<T> + Send + 'static) -> anyhow::Result<T> {
+    tokio::task::spawn_blocking(work).await.context("work with files ended")?
+}
+
+#[cfg(test)]
+mod tests;

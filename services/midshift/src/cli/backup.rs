@@ -1,0 +1,85 @@
+//! `midshift backup` and `midshift restore`.
+
+use super::client::Exit;
+use super::out::{Format, Out, columns};
+use crate::backup::{self, Places, Summary};
+use crate::clock;
+use midshift_proto::convert::timestamp;
+use std::path::PathBuf;
+
+/// What to copy.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Take {
+    /// The data directory of the server.
+    #[arg(long, default_value = "midshift-data")]
+    data: PathBuf,
+    /// The folder of its online keys, if it was given one. Whoever has the backup has these keys.
+    #[arg(long, value_name = "DIR")]
+    ota_keys: Option<PathBuf>,
+    /// The folder to make. It must not be there, or be empty.
+    #[arg(long)]
+    to: PathBuf,
+}
+
+/// What to make of a backup.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Restore {
+    /// The backup.
+    #[arg(long)]
+    from: PathBuf,
+    /// The data directory to make. It must not be there, or be empty.
+    #[arg(long, required_unless_present = "verify")]
+    data: Option<PathBuf>,
+    /// Where online keys go; without it into the folder ota-keys of the data directory.
+    #[arg(long, value_name = "DIR")]
+    ota_keys: Option<PathBuf>,
+    /// Only look whether everything is there and as it was copied; write nothing.
+    #[arg(long, conflicts_with_all = ["data", "ota_keys"])]
+    verify: bool,
+}
+
+/// Copies.
+pub async fn take(args: &Take, out: &Out) -> Result<(), Exit> {
+    let from = Places { data: args.data.clone(), ota_keys: args.ota_keys.clone() };
+    let summary = backup::back_up(&from, &args.to, clock::clock(1000).now().wall).await?;
+    show(&summary, out)?;
+    out.next(&format!("midshift restore --verify --from {}", args.to.display()));
+    Ok(())
+}
+
+/// Verifies, and restores if asked to.
+pub async fn restore(args: &Restore, out: &Out) -> Result<(), Exit> {
+    let Some(data) = args.data.clone() else {
+        return show(&backup::verify(&args.from).await?, out);
+    };
+    let to = Places { data, ota_keys: args.ota_keys.clone() };
+    let summary = backup::restore(&args.from, &to, clock::clock(1000).now().wall).await?;
+    show(&summary, out)?;
+    out.next(&format!("midshift serve --data {}", to.data.display()));
+    Ok(())
+}
+
+fn show(summary: &Summary, out: &Out) -> Result<(), Exit> {
+    let begun = timestamp(summary.begun).to_string();
+    match out.format {
+        Format::Table => {
+            let rows: Vec<Vec<String>> = summary
+                .parts
+                .iter()
+                .map(|(name, files, bytes)| vec![name.clone(), files.to_string(), bytes.to_string()])
+                .collect();
+            out.line(&columns(&["PART", "FILES", "BYTES"], &rows));
+            out.say(&format!("site {}, begun {begun}", summary.site_id));
+        }
+        Format::Name => summary.parts.iter().for_each(|(name, ..)| out.line(name)),
+        Format::Json | Format::Jsonl => {
+            let part = |(name, files, bytes): &(String, u64, u64)| serde_json::json!({"name": name, "files": files, "bytes": bytes.to_string()});
+            out.value(&serde_json::json!({
+                "siteId": summary.site_id,
+                "begun": begun,
+                "parts": summary.parts.iter().map(part).collect::<Vec<_>>(),
+            }))?;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,121 @@
+//! Copies of a data directory's files while a server uses them, and what a copy must be before it is used again.
+//!
+//! Invariant: a copy is one moment of its file, whole and durable, or it is not there. A store that was restored is another store: it gets an
+//! id of its own, so that nobody goes on from a number that the copy never gave.
+
+use super::schema::{self, Migration};
+use super::{CONTROL_DB, OpenError, TELEMETRY_DB};
+use midshift_core::rows::Seq;
+use sqlx::sqlite::SqliteConnectOptions;
+use sqlx::{ConnectOptions, Connection, Row, SqliteConnection};
+use std::path::Path;
+use std::time::Duration;
+
+/// The writer may hold the file up for so long.
+const BUSY_TIMEOUT: Duration = Duration::from_secs(30);
+/// Findings of one check that are told.
+const FINDINGS_MAX: u32 = 20;
+
+/// One of the two files of a data directory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Database {
+    /// Rows and their logs.
+    Control,
+    /// Samples of robots.
+    Telemetry,
+}
+
+/// What a file says of itself.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Described {
+    /// Whose rows these are; none: a file that no server ever served from, or one of samples.
+    pub site_id: Option<String>,
+    /// Its newest number; none as above.
+    pub head: Option<Seq>,
+    /// Its schema.
+    pub schema: u32,
+}
+
+impl Database {
+    /// Its name in a data directory.
+    pub const fn file(self) -> &'static str {
+        match self {
+            Self::Control => CONTROL_DB,
+            Self::Telemetry => TELEMETRY_DB,
+        }
+    }
+    const fn migrations(self) -> &'static [Migration] {
+        match self {
+            Self::Control => schema::CONTROL,
+            Self::Telemetry => schema::TELEMETRY,
+        }
+    }
+
+    /// Copies it out of a data directory, which a server may be using, to `to`, which must not be there.
+    ///
+    /// # Errors
+    /// If the file cannot be read, was written by a newer release, or the copy cannot be written.
+    pub async fn copy(self, dir: &Path, to: &Path) -> Result<(), OpenError> {
+        let mut connection = read_only(&dir.join(self.file())).await?;
+        self.schema(&mut connection).await?;
+        let sql = |source| OpenError::Sql { doing: "copying", source };
+        sqlx::query("VACUUM INTO $1").bind(to.to_string_lossy()).execute(&mut connection).await.map_err(sql)?;
+        connection.close().await.map_err(sql)?;
+        let durable = async { tokio::fs::File::open(to).await?.sync_all().await };
+        durable.await.map_err(|source| OpenError::Io { doing: "making the copy durable", source })
+    }
+
+    /// Reads a file that nobody serves from, and whether SQLite finds it whole: what is wrong with it comes second.
+    ///
+    /// # Errors
+    /// If it cannot be read at all, or was written by a newer release.
+    pub async fn inspect(self, path: &Path) -> Result<(Described, Vec<String>), OpenError> {
+        let mut connection = read_only(path).await?;
+        let sql = |source| OpenError::Sql { doing: "checking", source };
+        let schema = self.schema(&mut connection).await?;
+        let rows = sqlx::query("SELECT integrity_check FROM pragma_integrity_check LIMIT $1").bind(FINDINGS_MAX);
+        let rows = rows.fetch_all(&mut connection).await.map_err(sql)?;
+        let found: Result<Vec<String>, _> = rows.iter().map(|row| row.try_get(0)).collect();
+        let found = found.map_err(sql)?.into_iter().filter(|text| text != "ok").collect();
+        let mut described = Described { site_id: None, head: None, schema };
+        if self == Self::Control {
+            let head = sqlx::query("SELECT site_id, seq FROM store_head").fetch_optional(&mut connection).await;
+            if let Some(head) = head.map_err(sql)? {
+                described.site_id = Some(head.try_get(0).map_err(sql)?);
+                described.head = Some(Seq(head.try_get::<i64, _>(1).map_err(sql)?.cast_unsigned()));
+            }
+        }
+        connection.close().await.map_err(sql)?;
+        Ok((described, found))
+    }
+
+    async fn schema(self, connection: &mut SqliteConnection) -> Result<u32, OpenError> {
+        let sql = |source| OpenError::Sql { doing: "reading the schema version", source };
+        let row = sqlx::query("SELECT COALESCE(MAX(version), 0) FROM schema_version").fetch_one(connection).await;
+        let found = row.and_then(|row| row.try_get::<i64, _>(0)).map_err(sql)? as u32;
+        let known = self.migrations().len() as u32;
+        if found > known {
+            return Err(OpenError::NewerSchema { file: self.file(), found, known });
+        }
+        Ok(found)
+    }
+}
+
+/// Makes a restored `control.db` another store than the one that it is a copy of.
+///
+/// # Errors
+/// If the file cannot be written.
+pub async fn renew_identity(dir: &Path) -> Result<(), OpenError> {
+    let sql = |source| OpenError::Sql { doing: "giving the restored store an id of its own", source };
+    let options = SqliteConnectOptions::new().filename(dir.join(CONTROL_DB)).busy_timeout(BUSY_TIMEOUT);
+    let mut connection = options.connect().await.map_err(sql)?;
+    sqlx::query("PRAGMA synchronous = FULL").execute(&mut connection).await.map_err(sql)?;
+    let id = super::writer::fresh_id();
+    sqlx::query("UPDATE store_head SET store_id = $1").bind(id).execute(&mut connection).await.map_err(sql)?;
+    connection.close().await.map_err(sql)
+}
+
+async fn read_only(path: &Path) -> Result<SqliteConnection, OpenError> {
+    let options = SqliteConnectOptions::new().filename(path).busy_timeout(BUSY_TIMEOUT).read_only(true);
+    options.connect().await.map_err(|source| OpenError::Sql { doing: "opening for reading", source })
+}

@@ -1,0 +1,117 @@
+//! A backup is taken while robots work, the server is lost, and the robots carry on from what was restored.
+
+use crate::harness::{Server, midshift, until};
+use crate::robots::Robots;
+use midshift::background::request;
+use midshift_core::site::{DEMO, Site, text};
+use midshift_proto::task::v1::submit_task_result::Outcome;
+use midshift_proto::task::v1::{SubmitTasksRequest, TaskState};
+use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
+use midshift_proto::telemetry::v1::{ListEventsRequest, event::Item};
+use midshift_sim::oracle::Oracle;
+use midshift_sim::workload::{Workload, WorkloadConfig};
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::process::Command;
+use std::time::Duration;
+
+const ROBOTS: usize = 6;
+const TASKS: usize = 12;
+
+fn run(arguments: &[&str]) -> anyhow::Result<String> {
+    let output = Command::new(midshift()?).args(arguments).output()?;
+    anyhow::ensure!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    Ok(String::from_utf8(output.stdout)?)
+}
+
+async fn submit(server: &Server, site: &Site, seed: u64, prefix: &str) -> anyhow::Result<Vec<String>> {
+    let mut workload =
+        Workload::new(WorkloadConfig::background(seed), site).ok_or_else(|| anyhow::anyhow!("no stations"))?;
+    let items: Vec<SubmitTasksRequest> = (0..TASKS)
+        .map(|i| {
+            let mut item = request(&workload.next_transport());
+            item.request_id = format!("{prefix}-{i}");
+            SubmitTasksRequest { item: Some(item) }
+        })
+        .collect();
+    let answer = server.tasks()?.submit_tasks(tokio_stream::iter(items)).await?.into_inner();
+    let admitted = answer.results.into_iter().filter_map(|result| match result.outcome? {
+        Outcome::TaskId(id) => Some(id),
+        Outcome::Refusal(_) => None,
+    });
+    Ok(admitted.collect())
+}
+
+async fn until_done(server: &Server, count: usize) -> anyhow::Result<()> {
+    until(&format!("{count} tasks done"), Duration::from_secs(180), || async {
+        let done = server.in_states(&[TaskState::Succeeded]).await?;
+        Ok(done.filter(|done| done.len() >= count).map(drop))
+    })
+    .await
+}
+
+/// Numbers of each lane without a hole: what was taken by a server that is gone is a gap. Returns the reasons of all gaps.
+async fn reasons_of_gaps(server: &Server) -> anyhow::Result<Vec<String>> {
+    let mut client = TelemetryServiceClient::new(server.channel()?);
+    let (mut next, mut reasons): (BTreeMap<_, u64>, Vec<String>) = Default::default();
+    let mut cursor = String::new();
+    loop {
+        let request = ListEventsRequest { page_size: 1_000, cursor, ..ListEventsRequest::default() };
+        let page = client.list_events(request).await?.into_inner();
+        for event in page.events {
+            let expected = next.entry((event.robot_id.clone(), event.ring.clone(), event.lane)).or_insert(1);
+            let (first, last) = match &event.item {
+                Some(Item::Sample(sample)) => (sample.seq, sample.seq),
+                Some(Item::Gap(gap)) => {
+                    reasons.push(gap.reason.clone().unwrap_or_default().code);
+                    (gap.from_seq, gap.to_seq)
+                }
+                other => anyhow::bail!("{other:?}"),
+            };
+            anyhow::ensure!(first == *expected, "{} goes on with {first}, not {expected}", event.robot_id);
+            *expected = last + 1;
+        }
+        if page.caught_up {
+            return Ok(reasons);
+        }
+        cursor = page.cursor;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn robots_carry_on_from_a_backup_that_was_taken_while_they_worked() -> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let site = text::parse(DEMO)?;
+    let mut server = Server::start(dir.path()).await?;
+    let robots = Robots::start(dir.path(), &server, &site, ROBOTS)?;
+    let before = submit(&server, &site, 1, "before").await?;
+    until_done(&server, 2).await?;
+    let (data, backup) = (server.data(), dir.path().join("backup"));
+    let (data, backup) = (data.to_string_lossy(), backup.to_string_lossy());
+    run(&["backup", "--data", &data, "--to", &backup])?;
+    let parts = run(&["restore", "--verify", "--from", &backup, "-o", "name"])?;
+    assert_eq!(parts, "control\ntelemetry\n");
+    // What is done from here on nobody but the robots will know of.
+    until_done(&server, 6).await?;
+    server.kill()?;
+    std::fs::remove_dir_all(server.data())?;
+    run(&["restore", "--from", &backup, "--data", &data])?;
+    server.restart().await?;
+    let after = submit(&server, &site, 2, "after").await?;
+    let ended = until("every task to be over or with a person", Duration::from_secs(240), || async {
+        let over = [TaskState::Succeeded, TaskState::NeedsOperator, TaskState::Failed];
+        let Some(over) = server.in_states(&over).await? else { return Ok(None) };
+        Ok((over.len() == 2 * TASKS).then_some(over))
+    })
+    .await?;
+    let done: Vec<&str> =
+        ended.iter().filter(|t| t.state() == TaskState::Succeeded).map(|t| t.task_id.as_str()).collect();
+    assert!(after.iter().all(|id| done.contains(&id.as_str())), "{after:?} were to be done, {done:?} are");
+    assert!(before.iter().filter(|id| done.contains(&id.as_str())).count() >= TASKS - ROBOTS, "{done:?}");
+    let reasons = reasons_of_gaps(&server).await?;
+    assert!(!reasons.is_empty() && reasons.iter().all(|code| code == "FREED_AFTER_ACK"), "{reasons:?}");
+    let journals = robots.journals();
+    let verdict = Oracle::read(&site, journals.iter().map(PathBuf::as_path))?.verdict();
+    assert!(verdict.items_conserved() && verdict.exclusion_violations == 0, "{verdict:?}");
+    Ok(())
+}
