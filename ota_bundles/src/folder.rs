@@ -6,13 +6,14 @@
 use crate::build::{self, inspect};
 use crate::digest::Digest;
 use crate::keys::{self, SecretKey};
-use crate::manifest::Manifest;
+use crate::manifest::{Component, Manifest};
 use crate::repository::{
     self, FileTarget, PEOPLE_LIFE_MS, Profile, RootDraft, Signers, add_signatures, check_root, check_targets, listed,
     sign_root, sign_targets, version_of,
 };
 use midshift_core::reason::{Refusal, Violations};
 use midshift_core::time::Utc;
+use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -188,10 +189,7 @@ impl Folder {
     /// # Errors
     /// A bundle that is not what its manifest says, a name that stands for other bytes, a document that waits for signatures.
     pub fn add(&self, bundle: &Path, keys: &[&SecretKey], now: Utc) -> Result<(Manifest, Signed), Error> {
-        if self.metadata().join(PENDING).exists() {
-            let text = "a document waits for signatures: sign that first, or remove metadata/pending.targets.json";
-            return Err(Refusal::field("repository", text).into());
-        }
+        self.must_not_wait()?;
         let manifest = inspect(bundle)?;
         let document = manifest.to_bytes();
         let mut files =
@@ -207,6 +205,37 @@ impl Folder {
             self.copy(&bundle.join(&file.name), &self.file(&file.name, file.digest))?;
         }
         Ok((manifest, self.put(&signed)?))
+    }
+
+    /// Signs a targets document that lists a bundle no more, nor files that only it has. The files stay in this folder: the document
+    /// before, which may still have to be pushed, lists them. Which bundle that was.
+    ///
+    /// # Errors
+    /// A bundle that the newest document does not list, a document that waits for signatures, a folder that does not hold together.
+    pub fn withdraw(&self, bundle: &str, keys: &[&SecretKey], now: Utc) -> Result<(Manifest, Signed), Error> {
+        self.must_not_wait()?;
+        let is_meant = |m: &Manifest| {
+            format!("{}-{}", m.name, m.version) == bundle || Digest::of(&m.to_bytes()).to_string() == bundle
+        };
+        let (meant, others): (Vec<Manifest>, Vec<Manifest>) = self.check()?.bundles.into_iter().partition(is_meant);
+        let Some(withdrawn) = meant.into_iter().next() else {
+            let text = format!("the newest targets document lists no {bundle}; bundle verify lists those it has");
+            return Err(Refusal::field("bundle", text).into());
+        };
+        let needed: BTreeSet<String> = others.iter().flat_map(|m| m.components.iter().map(Component::target)).collect();
+        let own = withdrawn.components.iter().map(Component::target).filter(|name| !needed.contains(name));
+        let gone: Vec<String> = own.chain([withdrawn.target()]).collect();
+        let previous = self.newest("targets")?.map(|(_, document)| document);
+        let signed = sign_targets(previous.as_deref(), &[], &gone, now.plus_ms(PEOPLE_LIFE_MS), keys)?;
+        Ok((withdrawn, self.put(&signed)?))
+    }
+
+    fn must_not_wait(&self) -> Result<(), Error> {
+        if self.metadata().join(PENDING).exists() {
+            let text = "a document waits for signatures: sign that first, or remove metadata/pending.targets.json";
+            return Err(Refusal::field("repository", text).into());
+        }
+        Ok(())
     }
 
     /// Adds signatures to the document that waits for them.

@@ -2,9 +2,10 @@
 
 use crate::shelf::{Documents, START};
 use midshift_bundle::build::build;
+use midshift_bundle::digest::Digest;
 use midshift_bundle::folder::{Error, Folder, Signed};
 use midshift_bundle::keys::SecretKey;
-use midshift_bundle::repository::{Profile, sign_online};
+use midshift_bundle::repository::{Profile, listed, sign_online};
 use midshift_bundle::trust::{Reading, Trusted};
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -71,6 +72,40 @@ fn a_release_of_two_people_waits_for_the_second() {
     assert_eq!(folder.cosign(&[&key(place.path(), "targets-3.pem")]).expect("the second"), Signed::Published(1));
     assert_eq!(folder.check().expect("whole").bundles.len(), 1);
     assert!(folder.cosign(&[&key(place.path(), "targets-2.pem")]).is_err(), "none waits any more");
+}
+
+#[test]
+fn a_bundle_that_is_withdrawn_takes_along_only_what_no_other_has() {
+    let place = tempfile::tempdir().expect("a folder");
+    let folder = folder(place.path(), Profile::Team);
+    let key = key(place.path(), "targets-1.pem");
+    for (version, bytes) in [("1.0.0", b"one"), ("1.1.0", b"two")] {
+        folder.add(&bundle(place.path(), version, bytes), &[&key], START).expect("signed");
+    }
+    // It has the same gait as the first.
+    let text = "name = \"walk\"\nversion = \"1.2.0\"\n[[component]]\nname = \"gait\"\nversion = \"1.0.0\"\nkind = \"process\"\nfile = \"gait\"\nhardware = [\"h1\"]\nneeds = \"restart\"\n";
+    let draft = place.path().join("draft-again");
+    fs::create_dir_all(&draft).expect("a folder");
+    fs::write(draft.join("bundle.toml"), text).expect("written");
+    fs::write(draft.join("gait"), b"one").expect("written");
+    build(&draft, &place.path().join("again"), &mut |_| {}).expect("built");
+    folder.add(&place.path().join("again"), &[&key], START).expect("signed");
+    let names = || {
+        let checked = folder.check().expect("whole");
+        let version = checked.targets_version.expect("signed");
+        let document = folder.document(&format!("{version}.targets.json")).expect("readable").expect("there");
+        listed(&document).expect("a document").into_iter().map(|file| file.name).collect::<Vec<_>>()
+    };
+    let (withdrawn, signed) = folder.withdraw("walk-1.0.0", &[&key], START).expect("signed");
+    assert_eq!((withdrawn.version.as_str(), signed), ("1.0.0", Signed::Published(4)));
+    let left = ["gait-1.0.0.component", "gait-1.1.0.component", "walk-1.1.0.manifest", "walk-1.2.0.manifest"];
+    assert_eq!(names(), left, "another bundle has the same gait");
+    let digest = Digest::of(&folder.check().expect("whole").bundles[0].to_bytes()).to_string();
+    folder.withdraw(&digest, &[&key], START).expect("by its digest");
+    assert_eq!(names(), ["gait-1.0.0.component", "walk-1.2.0.manifest"]);
+    assert!(matches!(folder.withdraw("walk-1.0.0", &[&key], START), Err(Error::Refused(_))), "it is in no release");
+    folder.add(&bundle(place.path(), "1.1.0", b"two"), &[&key], START).expect("it may come again");
+    assert_eq!(names().len(), 4);
 }
 
 #[test]

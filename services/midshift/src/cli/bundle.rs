@@ -53,6 +53,18 @@ pub enum Verb {
         #[arg(long, required = true)]
         key: Vec<PathBuf>,
     },
+    /// Sign a release without a bundle, for good: robots that run it go on, and the server takes its files away some days after no roll-out and
+    /// no robot names it any more. Push it afterwards.
+    Withdraw {
+        /// As NAME-VERSION or by its SHA-256.
+        bundle: String,
+        /// The repository.
+        #[arg(long)]
+        repository: PathBuf,
+        /// A secret key of targets; more than one if you hold more.
+        #[arg(long, required = true)]
+        key: Vec<PathBuf>,
+    },
     /// Make sample releases of the simulator's behaviour, two good and three bad ones, signed with throw-away keys: to try roll-outs with.
     Samples {
         /// A new folder for bundles, keys and repository.
@@ -131,6 +143,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Keygen { profile, keys, repository } => keygen(profile, &keys, &repository, out),
         Verb::Build { folder, out: into } => build_one(&folder, &into, out),
         Verb::Sign { bundle, pending: _, repository, key } => sign(bundle.as_deref(), &repository, &key, out),
+        Verb::Withdraw { bundle, repository, key } => withdraw(&bundle, &repository, &key, out),
         Verb::Samples { dir, program, config_only, repository, key } => {
             let program = match program {
                 None if !config_only => Some(std::env::current_exe().map_err(anyhow::Error::from)?),
@@ -183,14 +196,32 @@ fn build_one(folder: &Path, into: &Path, out: &Out) -> Result<(), Exit> {
     Ok(())
 }
 
+fn read_keys(paths: &[PathBuf]) -> Result<Vec<SecretKey>, Exit> {
+    Ok(paths.iter().map(|path| SecretKey::read(path)).collect::<Result<Vec<_>, _>>().map_err(Error::from)?)
+}
+
 fn sign(bundle: Option<&Path>, repository: &Path, keys: &[PathBuf], out: &Out) -> Result<(), Exit> {
     let folder = Folder::open(repository)?;
-    let keys = keys.iter().map(|path| SecretKey::read(path)).collect::<Result<Vec<_>, _>>().map_err(Error::from)?;
+    let keys = read_keys(keys)?;
     let keys: Vec<&SecretKey> = keys.iter().collect();
     let signed = match bundle {
         Some(bundle) => folder.add(bundle, &keys, clock::wall())?.1,
         None => folder.cosign(&keys)?,
     };
+    tell_signed(signed, repository, out);
+    Ok(())
+}
+
+fn withdraw(bundle: &str, repository: &Path, keys: &[PathBuf], out: &Out) -> Result<(), Exit> {
+    let keys = read_keys(keys)?;
+    let keys: Vec<&SecretKey> = keys.iter().collect();
+    let (withdrawn, signed) = Folder::open(repository)?.withdraw(bundle, &keys, clock::wall())?;
+    tell_signed(signed, repository, out);
+    out.say(&format!("{} {} is in no release any more once that is pushed", withdrawn.name, withdrawn.version));
+    Ok(())
+}
+
+fn tell_signed(signed: Signed, repository: &Path, out: &Out) {
     match signed {
         Signed::Published(version) => {
             told(&serde_json::json!({"targetsVersion": version}), out);
@@ -203,7 +234,6 @@ fn sign(bundle: Option<&Path>, repository: &Path, keys: &[PathBuf], out: &Out) -
             out.next(&format!("midshift bundle sign --pending --repository {} --key KEY", repository.display()));
         }
     }
-    Ok(())
 }
 
 fn samples(dir: &Path, program: Option<&Path>, signer: Signer<'_>, out: &Out) -> Result<(), Exit> {
