@@ -128,7 +128,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 listen,
                 insecure: false,
                 beacon_listen: None,
-                software: Software { ota_keys, ota_quota_gib: 1 },
+                software: Software { ota_keys, ota_quota_gib: 1, ota_spare_gib: 0, ota_keep_days: 7 },
             };
             midshift::serve::run(serve, stop).await
         }

@@ -165,6 +165,15 @@ pub const UPLOADS_MAX: usize = 64;
 pub const UPLOAD_SYNC_BYTES: u64 = 16 * 1024 * 1024;
 /// Bytes of all software that a server keeps, unless it was told otherwise.
 pub const SOFTWARE_BYTES_DEFAULT: u64 = 64 * 1024 * 1024 * 1024;
+/// Bytes that a server leaves free on the disk when it takes software, unless it was told otherwise: the databases lie there too.
+pub const SOFTWARE_SPARE_BYTES_DEFAULT: u64 = 1024 * 1024 * 1024;
+/// Days of serving that software is kept which nothing names, unless the server was told otherwise: a release may be brought over a
+/// week, and one that was withdrawn by mistake is published again without being brought again.
+pub const SOFTWARE_UNNAMED_DAYS_DEFAULT: u64 = 7;
+/// Days after its end that a roll-out still names its bundle, site clock: so long it may be tried again or gone back from.
+pub const ROLLOUT_NAMES_DAYS: u64 = 30;
+/// Serving time between two looks at which software is still named, ms. The first is so long after a start.
+pub const COLLECT_EVERY_MS: u64 = 600_000;
 /// Shorter ways to files of releases that wait to be made: each is one version to go from, and a fleet has few of them at a time.
 pub const ENCODINGS_QUEUED_MAX: usize = 64;
 /// Shorter ways that were found not to be worth it and are remembered.

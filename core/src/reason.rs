@@ -80,7 +80,7 @@ codes! {
     UploadTooLarge = "UPLOAD_TOO_LARGE", "A file of a release has at most 8 GiB. Split it into several components.";
     UploadMoved = "UPLOAD_MOVED", "The file goes on at another byte than this piece. Ask GetUpload and go on from there.";
     UploadCorrupt = "UPLOAD_CORRUPT", "What was brought is not what its digest says, and was thrown away. Bring it again.";
-    SoftwareFull = "SOFTWARE_FULL", "The room for software on the server is used up. Give it more with --ota-quota-gib, or a larger disk.";
+    SoftwareFull = "SOFTWARE_FULL", "The room for software on the server is used up. Withdraw bundles that nobody needs with bundle withdraw and push that, give it more with --ota-quota-gib, or a larger disk.";
     ReleaseMoved = "RELEASE_MOVED", "Somebody else published. Take the server's newest documents, sign on top of them and push again.";
     FilesMissing = "FILES_MISSING", "The release lists files that the server does not have. Bring them, then publish again.";
     BundleNotFound = "BUNDLE_NOT_FOUND", "No published release has this bundle. List bundles.";

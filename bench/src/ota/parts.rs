@@ -160,7 +160,7 @@ async fn serve(data: PathBuf, keys: PathBuf, listen: SocketAddr, stop: Cancellat
         listen,
         insecure: true,
         beacon_listen: None,
-        software: Software { ota_keys: Some(keys), ota_quota_gib: 64 },
+        software: Software { ota_keys: Some(keys), ota_quota_gib: 64, ota_spare_gib: 0, ota_keep_days: 7 },
     };
     midshift::serve::run(serve, stop).await
 }

@@ -2,7 +2,7 @@
 //!
 //! [`cycle`] takes what happened and gives items to commit; the service around it only reads, signs, commits and publishes.
 //! Rooms: `spec` is what is asked for, `rows` and `view` are what is known; `hear` and `commands` are what happens; `matching` says who and `dry_run` what it would come to, `robots`
-//! says what is due for each and `moves` writes it, `phases` the whole, `newcomers` who comes later; `verdict` and `infrastructure` judge; `explain` says what a robot waits for.
+//! says what is due for each and `moves` writes it, `phases` the whole, `newcomers` who comes later, `named` which bundles are still needed; `verdict` and `infrastructure` judge; `explain` says what a robot waits for.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod bugs;
@@ -13,6 +13,7 @@ pub mod hear;
 pub mod infrastructure;
 pub mod matching;
 pub mod moves;
+pub mod named;
 pub mod newcomers;
 pub mod phases;
 pub mod robots;

@@ -7,6 +7,7 @@ use anyhow::{Context, bail};
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use midshift_ota::OtaService;
+use midshift_ota::content::Room;
 use midshift_store::{FRAME_BYTES_DEFAULT, SqliteFrames, SqliteStore};
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -48,13 +49,24 @@ pub struct Software {
     /// Room for software, GiB.
     #[arg(long, default_value_t = limits::SOFTWARE_BYTES_DEFAULT >> 30, value_parser = clap::value_parser!(u64).range(1..=1_048_576))]
     pub ota_quota_gib: u64,
+    /// Free space of the disk that software must leave alone, GiB. 0: none.
+    #[arg(long, default_value_t = limits::SOFTWARE_SPARE_BYTES_DEFAULT >> 30, value_parser = clap::value_parser!(u64).range(0..=1_048_576))]
+    pub ota_spare_gib: u64,
+    /// Days of serving that software is kept which no release lists, and no roll-out, rule for newcomers or robot names.
+    #[arg(long, default_value_t = limits::SOFTWARE_UNNAMED_DAYS_DEFAULT, value_parser = clap::value_parser!(u64).range(1..=3_650))]
+    pub ota_keep_days: u64,
 }
 
 impl Software {
     /// The service, with its files in `folder`.
     pub async fn open(&self, folder: PathBuf, clock: Arc<dyn Clock>) -> anyhow::Result<OtaService> {
         let Some(keys) = self.ota_keys.clone() else { return Ok(OtaService::without_keys()) };
-        let parts = midshift_ota::Parts { folder, keys, quota_bytes: self.ota_quota_gib << 30, clock };
+        let room = Room {
+            quota_bytes: self.ota_quota_gib << 30,
+            spare_bytes: self.ota_spare_gib << 30,
+            unnamed_ms: self.ota_keep_days * 24 * 3_600_000,
+        };
+        let parts = midshift_ota::Parts { folder, keys, room, clock };
         OtaService::open(parts).await.context("opening software of robots")
     }
 }

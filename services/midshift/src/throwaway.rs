@@ -10,6 +10,7 @@ use midshift_bundle::repository::Profile;
 use midshift_core::ids::SiteId;
 use midshift_core::limits;
 use midshift_core::time::Clock;
+use midshift_ota::content::Room;
 use midshift_ota::{OtaService, Parts};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -25,8 +26,9 @@ impl Throwaway {
     pub async fn make(clock: Arc<dyn Clock>) -> anyhow::Result<(Self, OtaService)> {
         let this = Self { dir: tempfile::tempdir().context("making a folder for software")? };
         Folder::create(&this.repository(), &this.keys(), Profile::Solo, clock.now().wall)?;
-        let quota_bytes = limits::SOFTWARE_BYTES_DEFAULT;
-        let parts = Parts { folder: this.dir.path().join("server"), keys: this.keys(), quota_bytes, clock };
+        // No databases lie beside it that would need the rest of the disk.
+        let room = Room::of(limits::SOFTWARE_BYTES_DEFAULT);
+        let parts = Parts { folder: this.dir.path().join("server"), keys: this.keys(), room, clock };
         let service = OtaService::open(parts).await.context("opening software of robots")?;
         Ok((this, service))
     }

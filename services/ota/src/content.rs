@@ -1,7 +1,8 @@
 //! Files of releases on the disk, each under its SHA-256. They come in pieces, over days and restarts if need be.
 //!
 //! Invariant: a file has its name only once all its bytes were checked and are durable; what is said to be durable survives a power cut;
-//! no more than the quota lies here. Whether a file may be handed out is not decided here.
+//! no more than the quota lies here, and the disk keeps its spare bytes. Whether a file may be handed out, and when one is needed no
+//! more, is not decided here.
 
 use crate::{blocking, is_of_one_thread};
 use async_trait::async_trait;
@@ -21,6 +22,45 @@ use tokio::io::{AsyncRead, AsyncReadExt};
 
 /// Bytes of one read of what was there before a restart.
 const READ_BYTES: usize = 256 * 1024;
+
+/// How much room files have, and how long they have it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Room {
+    /// Bytes of all files, and of what is made of them, at most.
+    pub quota_bytes: u64,
+    /// Bytes that stay free on the disk.
+    pub spare_bytes: u64,
+    /// Milliseconds of serving time that a file is kept which nothing names.
+    pub unnamed_ms: u64,
+}
+
+impl Room {
+    /// So many bytes, all of the disk, and files that nothing names for as long as servers keep them that were told nothing else.
+    pub const fn of(quota_bytes: u64) -> Self {
+        let unnamed_ms = limits::SOFTWARE_UNNAMED_DAYS_DEFAULT * 24 * 3_600_000;
+        Self { quota_bytes, spare_bytes: 0, unnamed_ms }
+    }
+}
+
+/// Bytes that are used of those there may be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Fill {
+    /// Of all files, and of what was made of them.
+    pub used_bytes: u64,
+    /// There may be.
+    pub quota_bytes: u64,
+}
+
+/// A file that is here, whole or not.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stored {
+    /// Of the whole.
+    pub digest: Digest,
+    /// That are here.
+    pub bytes: u64,
+    /// Rises with each touch of any file by somebody who brings it. 0: not touched since the start.
+    pub touched: u64,
+}
 
 /// Which file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -76,14 +116,26 @@ pub enum Error {
     #[error("a file has 1..{COMPONENT_BYTES_MAX} bytes")]
     Size,
     /// There is no room for the rest of it.
-    #[error("{missing} bytes are to come and {free} of {quota} are free")]
+    #[error("{missing} bytes are to come, {used} of {quota} are used and {free} are free")]
     Full {
         /// Bytes that are to come.
         missing: u64,
+        /// Bytes that are used.
+        used: u64,
         /// Bytes that are free.
         free: u64,
         /// Bytes there may be.
         quota: u64,
+    },
+    /// The disk would not keep its spare bytes.
+    #[error("{missing} bytes are to come, the disk has {free} left and {spare} of them stay free")]
+    DiskFull {
+        /// Bytes that are to come.
+        missing: u64,
+        /// Bytes that the disk has left.
+        free: u64,
+        /// Bytes that stay free on it.
+        spare: u64,
     },
     /// All bytes came, and they are others. They were thrown away.
     #[error("its bytes have the digest {found}")]
@@ -91,6 +143,17 @@ pub enum Error {
         /// What they are.
         found: Digest,
     },
+}
+
+impl Error {
+    /// Bytes that would have to become free first; none: room is not what is missing.
+    pub const fn lacking(&self) -> Option<u64> {
+        match self {
+            Self::Full { missing, free, .. } => Some(missing.saturating_sub(*free)),
+            Self::DiskFull { missing, free, spare } => Some(missing.saturating_sub(free.saturating_sub(*spare))),
+            _ => None,
+        }
+    }
 }
 
 fn at(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
@@ -112,6 +175,13 @@ pub trait Content: Send + Sync + 'static {
     async fn read(&self, digest: Digest, range: Range<u64>) -> Result<Option<Reader>, Error>;
     /// A whole file, to be read from any place; none: it is not here.
     async fn open(&self, digest: Digest) -> Result<Option<Box<dyn Base>>, Error>;
+    /// Every file that is here, whole or not, by digest.
+    async fn list(&self) -> Result<Vec<Stored>, Error>;
+    /// Takes a file away, whole or not, and says how many bytes that were. 0: it is not here, or a piece is being added to it. Whoever has
+    /// begun to read it reads on.
+    async fn remove(&self, digest: Digest) -> Result<u64, Error>;
+    /// How full it is.
+    fn fill(&self) -> Fill;
     /// Takes room for what is made of files, beside them.
     fn claim(&self, bytes: u64) -> Result<(), Error>;
     /// Gives such room back.
@@ -139,19 +209,34 @@ struct Entry {
     touched: u64,
 }
 
+struct Whole {
+    length: u64,
+    touched: u64,
+}
+
 #[derive(Default)]
 struct Shelf {
-    whole: BTreeMap<Digest, u64>,
+    whole: BTreeMap<Digest, Whole>,
     parts: BTreeMap<Digest, Entry>,
     /// Bytes of all files, whole or not, and of what was made of them.
     used: u64,
-    /// Rises with each touch of a part.
+    /// Rises with each touch of a file by whoever brings it.
     turn: u64,
+}
+
+impl Shelf {
+    /// How long a whole file is, for somebody who brings it.
+    fn touch(&mut self, digest: Digest) -> Option<u64> {
+        let whole = self.whole.get_mut(&digest)?;
+        self.turn += 1;
+        whole.touched = self.turn;
+        Some(whole.length)
+    }
 }
 
 struct Inner {
     path: PathBuf,
-    quota: u64,
+    room: Room,
     shelf: Mutex<Shelf>,
 }
 
@@ -166,7 +251,7 @@ impl DiskContent {
     ///
     /// # Errors
     /// If it cannot be read or mended.
-    pub fn open(path: &Path, quota: u64) -> Result<Self, Error> {
+    pub fn open(path: &Path, room: Room) -> Result<Self, Error> {
         fs::create_dir_all(path).map_err(at("making", path))?;
         let mut shelf = Shelf::default();
         let mut names = Vec::new();
@@ -175,9 +260,10 @@ impl DiskContent {
             let length = entry.metadata().map_err(at("reading", path))?.len();
             names.extend(entry.file_name().into_string().ok().map(|name| (name, length)));
         }
+        let marks: Vec<String> = names.iter().map(|(name, _)| name).filter(|n| n.ends_with(".mark")).cloned().collect();
         for (name, length) in names {
             if let Ok(digest) = name.parse::<Digest>() {
-                shelf.whole.insert(digest, length);
+                shelf.whole.insert(digest, Whole { length, touched: 0 });
                 shelf.used += length;
             } else if let Some(digest) = name.strip_suffix(".part").and_then(|n| n.parse::<Digest>().ok())
                 && let Some(mark) = read_mark(path, digest, length)
@@ -189,7 +275,13 @@ impl DiskContent {
                 remove(&path.join(name))?;
             }
         }
-        let inner = Inner { path: path.to_owned(), quota, shelf: Mutex::new(shelf) };
+        for name in marks {
+            let digest = name.strip_suffix(".mark").and_then(|n| n.parse::<Digest>().ok());
+            if digest.is_none_or(|digest| !shelf.parts.contains_key(&digest)) {
+                remove(&path.join(name))?;
+            }
+        }
+        let inner = Inner { path: path.to_owned(), room, shelf: Mutex::new(shelf) };
         Ok(Self { inner: Arc::new(inner) })
     }
 
@@ -202,7 +294,7 @@ impl DiskContent {
 #[async_trait]
 impl Content for DiskContent {
     async fn length(&self, digest: Digest) -> Result<Option<u64>, Error> {
-        Ok(self.inner.shelf().whole.get(&digest).copied())
+        Ok(self.inner.shelf().whole.get(&digest).map(|whole| whole.length))
     }
     async fn append(&self, file: Wanted, offset: u64, piece: Bytes) -> Result<(), Error> {
         self.in_background(move |inner| inner.append(file, offset, &piece)).await
@@ -225,6 +317,15 @@ impl Content for DiskContent {
     async fn open(&self, digest: Digest) -> Result<Option<Box<dyn Base>>, Error> {
         let opened = self.in_background(move |inner| inner.open_at(digest, 0)).await?;
         Ok(opened.map(|file| -> Box<dyn Base> { Box::new(file) }))
+    }
+    async fn list(&self) -> Result<Vec<Stored>, Error> {
+        Ok(self.inner.list())
+    }
+    async fn remove(&self, digest: Digest) -> Result<u64, Error> {
+        self.in_background(move |inner| inner.take_away(digest)).await
+    }
+    fn fill(&self) -> Fill {
+        Fill { used_bytes: self.inner.shelf().used, quota_bytes: self.inner.room.quota_bytes }
     }
     fn claim(&self, bytes: u64) -> Result<(), Error> {
         self.inner.reserve(bytes, bytes)
@@ -254,7 +355,12 @@ impl Inner {
             return Ok(None);
         }
         let path = self.whole(digest);
-        let mut file = File::open(&path).map_err(at("opening", &path))?;
+        let mut file = match File::open(&path) {
+            Ok(file) => file,
+            // It was taken away in between.
+            Err(_) if !self.shelf().whole.contains_key(&digest) => return Ok(None),
+            Err(error) => return Err(at("opening", &path)(error)),
+        };
         file.seek(SeekFrom::Start(offset)).map_err(at("reading", &path))?;
         Ok(Some(file))
     }
@@ -266,16 +372,54 @@ impl Inner {
         loop {
             let entry = {
                 let mut shelf = self.shelf();
-                if let Some(length) = shelf.whole.get(&file.digest) {
-                    return Err(Error::Moved { at: *length, offset });
+                if let Some(length) = shelf.touch(file.digest) {
+                    return Err(Error::Moved { at: length, offset });
                 }
                 self.entry(&mut shelf, file)?
             };
             let mut part = entry.lock().unwrap_or_else(PoisonError::into_inner);
             if self.is_current(file.digest, &entry) {
-                return self.add(&mut part, file, offset, piece);
+                let added = self.add(&mut part, file, offset, piece);
+                if added.is_err() && part.written == 0 {
+                    // Nothing of it came: nothing is to be seen of it.
+                    let mut shelf = self.shelf();
+                    shelf.parts.remove(&file.digest);
+                    self.forget(file.digest)?;
+                }
+                return added;
             }
         }
+    }
+
+    fn list(&self) -> Vec<Stored> {
+        let shelf = self.shelf();
+        let whole =
+            shelf.whole.iter().map(|(digest, w)| Stored { digest: *digest, bytes: w.length, touched: w.touched });
+        let part = |(digest, entry): (&Digest, &Entry)| {
+            // One that is being written now was touched just now.
+            let (bytes, touched) = entry.part.try_lock().map_or((0, shelf.turn), |p| (p.written, entry.touched));
+            Stored { digest: *digest, bytes, touched }
+        };
+        let mut all: Vec<Stored> = whole.chain(shelf.parts.iter().map(part)).collect();
+        all.sort_by_key(|stored| stored.digest);
+        all
+    }
+
+    /// The shelf is held until the file is gone: so nobody brings it anew meanwhile.
+    fn take_away(&self, digest: Digest) -> Result<u64, Error> {
+        let mut shelf = self.shelf();
+        if let Some(length) = shelf.whole.get(&digest).map(|whole| whole.length) {
+            remove(&self.whole(digest))?;
+            shelf.whole.remove(&digest);
+            shelf.used = shelf.used.saturating_sub(length);
+            return Ok(length);
+        }
+        let Some(entry) = shelf.parts.get(&digest) else { return Ok(0) };
+        let Ok(written) = entry.part.try_lock().map(|part| part.written) else { return Ok(0) };
+        self.forget(digest)?;
+        shelf.parts.remove(&digest);
+        shelf.used = shelf.used.saturating_sub(written);
+        Ok(written)
     }
 
     /// The entry of a file, made if there is none. When there are too many, the one left alone longest goes.
@@ -337,13 +481,26 @@ impl Inner {
 
     /// Takes room for a piece if there is room for all that is missing.
     fn reserve(&self, missing: u64, piece: u64) -> Result<(), Error> {
+        if self.room.spare_bytes > 0 {
+            let (disk, spare) = (self.disk_free()?, self.room.spare_bytes);
+            if disk.saturating_sub(spare) < missing {
+                return Err(Error::DiskFull { missing, free: disk, spare });
+            }
+        }
         let mut shelf = self.shelf();
-        let free = self.quota.saturating_sub(shelf.used);
+        let (used, quota) = (shelf.used, self.room.quota_bytes);
+        let free = quota.saturating_sub(used);
         if missing > free {
-            return Err(Error::Full { missing, free, quota: self.quota });
+            return Err(Error::Full { missing, used, free, quota });
         }
         shelf.used += piece;
         Ok(())
+    }
+
+    /// Bytes that the disk has left for us.
+    fn disk_free(&self) -> Result<u64, Error> {
+        let found = rustix::fs::statvfs(&self.path).map_err(|e| at("looking at the disk of", &self.path)(e.into()))?;
+        Ok(found.f_bavail.saturating_mul(found.f_frsize))
     }
 
     /// Only what is durable counts from now on.
@@ -405,11 +562,16 @@ impl Inner {
     fn settle(&self, file: Wanted) -> Result<Held, Error> {
         loop {
             let entry = {
-                let shelf = self.shelf();
-                if let Some(length) = shelf.whole.get(&file.digest) {
-                    return if *length == file.length { Ok(Held::Whole) } else { Err(Error::Size) };
+                let mut shelf = self.shelf();
+                if let Some(length) = shelf.touch(file.digest) {
+                    return if length == file.length { Ok(Held::Whole) } else { Err(Error::Size) };
                 }
-                shelf.parts.get(&file.digest).map(|entry| entry.part.clone())
+                shelf.turn += 1;
+                let turn = shelf.turn;
+                shelf.parts.get_mut(&file.digest).map(|entry| {
+                    entry.touched = turn;
+                    entry.part.clone()
+                })
             };
             let Some(entry) = entry else { return Ok(Held::Part(0)) };
             let mut part = entry.lock().unwrap_or_else(PoisonError::into_inner);
@@ -444,8 +606,10 @@ impl Inner {
         fs::rename(&path, &whole).map_err(at("naming", &whole))?;
         sync_folder(&self.path)?;
         let mut shelf = self.shelf();
+        shelf.turn += 1;
+        let touched = shelf.turn;
         shelf.parts.remove(&digest);
-        shelf.whole.insert(digest, part.written);
+        shelf.whole.insert(digest, Whole { length: part.written, touched });
         drop(shelf);
         remove(&self.mark(digest))?;
         Ok(Held::Whole)

@@ -46,6 +46,8 @@ pub enum Way {
 struct Kept {
     encoded: Encoded,
     touched: u64,
+    /// Serving time of the first sweep after it was last used. None: it was not looked at since it was made or found.
+    used_ms: Option<u64>,
 }
 
 #[derive(Default)]
@@ -58,6 +60,8 @@ struct Shelf {
     queue: VecDeque<Key>,
     /// Rises with each use.
     turn: u64,
+    /// Where it stood at the last sweep.
+    swept: u64,
 }
 
 struct Inner {
@@ -90,7 +94,7 @@ impl Shelf {
     }
     fn keep(&mut self, key: Key, encoded: Encoded) {
         self.turn += 1;
-        self.kept.insert(key, Kept { encoded, touched: self.turn });
+        self.kept.insert(key, Kept { encoded, touched: self.turn, used_ms: None });
         self.by_digest.insert(encoded.digest, key);
     }
     fn give_up(&mut self, key: Key) {
@@ -194,6 +198,29 @@ impl Encodings {
         blocking(move || inner.evict(bytes)).await
     }
 
+    /// Bytes of all of them.
+    pub fn bytes(&self) -> u64 {
+        self.inner.shelf().kept.values().map(|kept| kept.encoded.length).sum()
+    }
+
+    /// Takes away ways that lead to a file that is not among `listed`, lead from a file that is not among `kept`, or that nobody
+    /// has used for `unused_ms` of serving time. How many that were, and their bytes.
+    ///
+    /// # Errors
+    /// The disk's.
+    pub async fn sweep(
+        &self,
+        listed: BTreeSet<Digest>,
+        kept: BTreeSet<Digest>,
+        served_ms: u64,
+        unused_ms: u64,
+    ) -> Result<(u64, u64), Error> {
+        let inner = self.inner.clone();
+        let is_of_use =
+            move |key: &Key| listed.contains(&key.target) && key.base.is_none_or(|base| kept.contains(&base));
+        blocking(move || inner.sweep(is_of_use, served_ms, unused_ms)).await
+    }
+
     /// Makes what is asked for until shutdown.
     pub async fn run(&self, shutdown: &CancellationToken) {
         loop {
@@ -250,32 +277,52 @@ impl Inner {
     fn evict(&self, bytes: u64) -> Result<bool, Error> {
         let mut freed = 0;
         while freed < bytes {
-            let mut shelf = self.shelf();
-            let Some(oldest) = shelf.kept.iter().min_by_key(|(_, kept)| kept.touched).map(|(key, _)| *key) else {
-                return Ok(false);
-            };
-            let Some(kept) = shelf.kept.remove(&oldest) else { return Ok(false) };
-            shelf.by_digest.remove(&kept.encoded.digest);
-            drop(shelf);
-            let path = self.folder.join(oldest.name(&kept.encoded.digest));
-            fs::remove_file(&path).map_err(at("removing", &path))?;
-            self.content.give_back(kept.encoded.length);
-            freed += kept.encoded.length;
+            let oldest = self.shelf().kept.iter().min_by_key(|(_, kept)| kept.touched).map(|(key, _)| *key);
+            let Some(oldest) = oldest else { return Ok(false) };
+            freed += self.take_away(oldest)?;
         }
         Ok(true)
+    }
+
+    /// Bytes that were taken away. A file that stays though it is known no more is found at the next start.
+    fn take_away(&self, key: Key) -> Result<u64, Error> {
+        let kept = {
+            let mut shelf = self.shelf();
+            let Some(kept) = shelf.kept.remove(&key) else { return Ok(0) };
+            shelf.by_digest.remove(&kept.encoded.digest);
+            kept
+        };
+        let path = self.folder.join(key.name(&kept.encoded.digest));
+        fs::remove_file(&path).map_err(at("removing", &path))?;
+        self.content.give_back(kept.encoded.length);
+        Ok(kept.encoded.length)
+    }
+
+    fn sweep(&self, is_of_use: impl Fn(&Key) -> bool, served_ms: u64, unused_ms: u64) -> Result<(u64, u64), Error> {
+        let due: Vec<Key> = {
+            let mut shelf = self.shelf();
+            let (turn, now) = (shelf.swept, shelf.turn);
+            shelf.swept = now;
+            shelf.worthless.retain(&is_of_use);
+            let overdue = |(key, kept): (&Key, &mut Kept)| {
+                if kept.touched > turn || kept.used_ms.is_none_or(|used_ms| used_ms > served_ms) {
+                    kept.used_ms = Some(served_ms);
+                }
+                let idle_ms = served_ms - kept.used_ms.unwrap_or(served_ms);
+                (!is_of_use(key) || idle_ms >= unused_ms).then_some(*key)
+            };
+            shelf.kept.iter_mut().filter_map(overdue).collect()
+        };
+        due.iter().try_fold((0, 0), |(count, bytes), key| Ok((count + 1, bytes + self.take_away(*key)?)))
     }
 
     /// Takes room, from older ways if there is no other.
     fn claim(&self, bytes: u64) -> Result<bool, Error> {
         loop {
-            match self.content.claim(bytes) {
-                Ok(()) => return Ok(true),
-                Err(Error::Full { missing, free, .. }) => {
-                    if !self.evict(missing.saturating_sub(free))? {
-                        return Ok(false);
-                    }
-                }
-                Err(error) => return Err(error),
+            let Err(error) = self.content.claim(bytes) else { return Ok(true) };
+            let Some(lacking) = error.lacking() else { return Err(error) };
+            if !self.evict(lacking)? {
+                return Ok(false);
             }
         }
     }

@@ -1,6 +1,6 @@
 //! Release people in a test: their keys, bundles, documents, and a robot that looks at what the server shows.
 
-use crate::content::{Content, DiskContent, Held, Wanted};
+use crate::content::{Content, DiskContent, Held, Room as Space, Wanted};
 use crate::repository::{OnlineKeys, Repository};
 use crate::{OtaService, Parts};
 use async_trait::async_trait;
@@ -127,7 +127,7 @@ impl Room {
     }
     async fn open(dir: TempDir) -> Self {
         let keys = OnlineKeys::read(&dir.path().join("keys")).expect("keys");
-        let content = DiskContent::open(&dir.path().join("content"), 1 << 30).expect("a store");
+        let content = DiskContent::open(&dir.path().join("content"), Space::of(1 << 30)).expect("a store");
         let content = Arc::new(content);
         let repository = Repository::open(&dir.path().join("metadata"), keys, content.clone()).await;
         Self { content, repository: Arc::new(repository.expect("a repository")), dir }
@@ -184,7 +184,7 @@ pub async fn service(dir: &TempDir) -> OtaService {
         write_keys(&keys);
     }
     let clock = Arc::new(ScaledClock::new(|| 0, START, 1000));
-    let parts = Parts { folder: dir.path().join("ota"), keys, quota_bytes: 1 << 30, clock };
+    let parts = Parts { folder: dir.path().join("ota"), keys, room: Space::of(1 << 30), clock };
     OtaService::open(parts).await.expect("a service")
 }
 

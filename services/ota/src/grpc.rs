@@ -59,15 +59,15 @@ impl OtaService {
             return Ok(());
         }
         let (opened, data) = (self.opened()?, Bytes::from(message.data));
-        match opened.content.append(file, message.offset, data.clone()).await {
-            // What can be made again makes room.
-            Err(Error::Full { missing, free, .. })
-                if opened.encodings.make_room(missing.saturating_sub(free)).await? =>
-            {
-                Ok(opened.content.append(file, message.offset, data).await?)
-            }
-            appended => Ok(appended?),
+        let appended = opened.content.append(file, message.offset, data.clone()).await;
+        let lacking = appended.as_ref().err().and_then(Error::lacking);
+        // What can be made again makes room.
+        if let Some(lacking) = lacking
+            && opened.encodings.make_room(lacking).await?
+        {
+            return Ok(opened.content.append(file, message.offset, data).await?);
         }
+        Ok(appended?)
     }
 
     async fn uploaded(&self, file: Wanted) -> Result<v1::UploadTargetResponse, Refusal> {
@@ -95,9 +95,11 @@ impl OtaService {
     }
 
     fn list(&self, r: &v1::ListBundlesRequest) -> Result<v1::ListBundlesResponse, Refusal> {
-        let newest = self.opened()?.repository.newest();
+        let opened = self.opened()?;
+        let newest = opened.repository.newest();
         let releases = newest.as_ref().map(|newest| newest.releases.as_slice()).unwrap_or_default();
-        pages::page(releases, r).map_err(|bad| Refusal::invalid(bad.0))
+        let room = pages::room(opened.content.fill(), opened.encodings.bytes(), opened.collector.newest());
+        pages::page(releases, room, r).map_err(|bad| Refusal::invalid(bad.0))
     }
 
     async fn encoding(&self, r: v1::GetEncodingRequest) -> Result<v1::GetEncodingResponse, Refusal> {

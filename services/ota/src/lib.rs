@@ -2,8 +2,9 @@
 //!
 //! Called by the binary: [`OtaService::open`], its two gRPC faces, its pages over HTTP/1.1 and [`OtaService::run`]. Invariant: nothing is signed
 //! here that says what software is good; only files that the newest signed release lists are handed out, and
-//! what was made of them.
+//! what was made of them; none of those is ever taken away.
 
+mod collect;
 pub mod content;
 pub mod encodings;
 #[cfg(test)]
@@ -15,7 +16,8 @@ mod refusal;
 pub mod repository;
 pub mod rollouts;
 
-use content::{Content, DiskContent, Wanted};
+use collect::{Collector, Named};
+use content::{Content, DiskContent, Room, Wanted};
 use encodings::Encodings;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::time::{Clock, Utc};
@@ -27,6 +29,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::runtime::RuntimeFlavor;
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 /// How often the age of what was signed is looked at. By the wall, which may jump: so not once in half a day.
@@ -42,8 +45,8 @@ pub struct Parts {
     pub folder: PathBuf,
     /// Keys of snapshot and timestamp, as `bundle keygen` makes them.
     pub keys: PathBuf,
-    /// Bytes of all files at most.
-    pub quota_bytes: u64,
+    /// How much room files have, and how long.
+    pub room: Room,
     /// Clocks. Documents are dated by the wall.
     pub clock: Arc<dyn Clock>,
 }
@@ -52,6 +55,9 @@ struct Opened {
     content: Arc<dyn Content>,
     encodings: Encodings,
     repository: Repository,
+    collector: Collector,
+    /// What the planner said last of what is needed. None: it said nothing since the start.
+    named: watch::Sender<Option<Named>>,
     clock: Arc<dyn Clock>,
 }
 
@@ -69,15 +75,18 @@ impl OtaService {
     /// If keys, files or documents cannot be read, or documents do not hang together.
     pub async fn open(parts: Parts) -> Result<Self, Error> {
         let (files, encoded) = (parts.folder.join("content"), parts.folder.join("encoded"));
-        let (keys, content, encodings) = blocking(move || {
-            let keys = OnlineKeys::read(&parts.keys)?;
-            let content: Arc<dyn Content> = Arc::new(DiskContent::open(&files, parts.quota_bytes)?);
+        let Parts { folder, keys, room, clock } = parts;
+        let metadata = folder.join("metadata");
+        let (keys, content, encodings, collector) = blocking(move || {
+            let keys = OnlineKeys::read(&keys)?;
+            let content: Arc<dyn Content> = Arc::new(DiskContent::open(&files, room)?);
             let encodings = Encodings::open(&encoded, content.clone())?;
-            Ok::<_, Error>((keys, content, encodings))
+            Ok::<_, Error>((keys, content, encodings, Collector::open(&folder, room)?))
         })
         .await?;
-        let repository = Repository::open(&parts.folder.join("metadata"), keys, content.clone()).await?;
-        Ok(Self { opened: Some(Arc::new(Opened { content, encodings, repository, clock: parts.clock })) })
+        let repository = Repository::open(&metadata, keys, content.clone()).await?;
+        let named = watch::Sender::new(None);
+        Ok(Self { opened: Some(Arc::new(Opened { content, encodings, repository, collector, named, clock })) })
     }
     /// A service of a server without keys: it touches no disk and answers every call with what to do.
     pub fn without_keys() -> Self {
@@ -95,14 +104,19 @@ impl OtaService {
     pub fn pages(&self) -> axum::Router {
         http1::router(self.clone())
     }
-    /// Keeps what was signed fresh, and makes files shorter for robots, until shutdown.
+    /// Keeps what was signed fresh, makes files shorter for robots, and takes away what nobody needs, until shutdown.
     pub async fn run(self, shutdown: CancellationToken) {
         let making = async {
             if let Some(opened) = &self.opened {
                 opened.encodings.run(&shutdown).await;
             }
         };
-        tokio::join!(self.keep_fresh(&shutdown), making);
+        let collecting = async {
+            if let Some(opened) = &self.opened {
+                opened.keep_room(&shutdown).await;
+            }
+        };
+        tokio::join!(self.keep_fresh(&shutdown), making, collecting);
     }
     async fn keep_fresh(&self, shutdown: &CancellationToken) {
         loop {
@@ -125,8 +139,34 @@ impl Opened {
         self.clock.now().wall
     }
 
+    /// One pass each time the planner says what is named.
+    async fn keep_room(&self, shutdown: &CancellationToken) {
+        let mut said = self.named.subscribe();
+        loop {
+            tokio::select! {
+                () = shutdown.cancelled() => return,
+                changed = said.changed() => if changed.is_err() { return },
+            }
+            let named = said.borrow_and_update().clone();
+            if let Some(named) = named {
+                self.collect(&named).await;
+            }
+        }
+    }
+
+    async fn collect(&self, named: &Named) {
+        let at = self.now();
+        match self.collector.collect(self.content.as_ref(), &self.encodings, &self.repository, named, at).await {
+            Ok(collected) => collected.tell(at),
+            Err(error) => tracing::error!(%error, "nobody knows which software is needed, so all of it is kept"),
+        }
+    }
+
     async fn look(&self) {
         let now = self.now();
+        let fill = self.content.fill();
+        metrics::gauge!("midshift_ota_used_bytes").set(fill.used_bytes as f64);
+        metrics::gauge!("midshift_ota_quota_bytes").set(fill.quota_bytes as f64);
         let before = self.repository.newest().map(|newest| newest.stamp);
         if let Err(error) = self.repository.freshen(now).await {
             tracing::error!(%error, "freshness could not be signed: robots take no new software once it has expired");
@@ -200,7 +240,7 @@ mod tests {
         write_keys(&keys);
         let begun = Instant::now();
         let clock = ScaledClock::new(move || begun.elapsed().as_micros() as u64, START, 1000);
-        let parts = Parts { folder: dir.path().join("ota"), keys, quota_bytes: 1 << 20, clock: Arc::new(clock) };
+        let parts = Parts { folder: dir.path().join("ota"), keys, room: Room::of(1 << 20), clock: Arc::new(clock) };
         let service = OtaService::open(parts).await.expect("a service");
         release(&service, &files("walk", "1.0.0")).await;
         let shutdown = CancellationToken::new();

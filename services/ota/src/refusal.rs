@@ -31,9 +31,14 @@ impl From<content::Error> for Refusal {
             }
             Error::TooLong { .. } => Self::field("data", text),
             Error::Size => Self::field("length", text),
-            Error::Full { missing, free, quota } => {
-                let reason = Reason::new(Code::SoftwareFull, text);
+            Error::Full { missing, used, free, quota } => {
+                let reason = Reason::new(Code::SoftwareFull, text).with("used", used);
                 let reason = reason.with("missing", missing).with("free", free).with("quota", quota);
+                Self::new(Kind::Exhausted, reason)
+            }
+            Error::DiskFull { missing, free, spare } => {
+                let reason = Reason::new(Code::SoftwareFull, text);
+                let reason = reason.with("missing", missing).with("free", free).with("spare", spare);
                 Self::new(Kind::Exhausted, reason)
             }
             Error::WrongBytes { found } => {

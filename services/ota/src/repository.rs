@@ -186,6 +186,10 @@ pub struct Newest {
 }
 
 impl Newest {
+    /// Every file of the newest targets document.
+    pub const fn digests(&self) -> &BTreeSet<Digest> {
+        &self.digests
+    }
     /// Whether a signed release has this file.
     pub fn lists(&self, digest: Digest) -> bool {
         self.digests.contains(&digest)
@@ -306,6 +310,31 @@ impl Repository {
         Ok(Some(FRESHEN_AFTER_MS))
     }
 
+    /// What it says now, and that it says nothing else as long as the guard is held.
+    pub async fn still(&self) -> (Option<Arc<Newest>>, OwnedMutexGuard<()>) {
+        let guard = self.writing.clone().lock_owned().await;
+        (self.newest(), guard)
+    }
+
+    /// Files that a bundle consists of: its manifest and its components. None: the manifest is not here.
+    ///
+    /// # Errors
+    /// The disk's, and a file of that digest that is no manifest.
+    pub async fn files_of(&self, bundle: Digest) -> Result<Option<Vec<Digest>>, Error> {
+        if let Some(newest) = self.newest()
+            && let Some(release) = newest.releases.iter().find(|release| release.digest == bundle)
+        {
+            return Ok(Some(files_of(bundle, &release.manifest)));
+        }
+        if self.content.length(bundle).await?.is_none() {
+            return Ok(None);
+        }
+        let manifest = check::read_manifest(bundle, self.content.as_ref()).await?;
+        let damaged =
+            |text| Error::Damaged { folder: self.folder.clone(), text: format!("the manifest {bundle}: {text}") };
+        Ok(Some(files_of(bundle, &manifest.map_err(damaged)?)))
+    }
+
     /// Whether the repository has these roots already.
     async fn has_all(&self, newest: &Newest, roots: &[Vec<u8>]) -> Result<bool, Error> {
         for root in roots {
@@ -402,6 +431,10 @@ impl Newest {
         let files = files.into_iter().map(|file| (file.name.clone(), file)).collect();
         Self { root, targets, stamp, files, releases, digests, timestamp }
     }
+}
+
+fn files_of(bundle: Digest, manifest: &Manifest) -> Vec<Digest> {
+    std::iter::once(bundle).chain(manifest.components.iter().map(|component| component.digest)).collect()
 }
 
 /// Documents that the timestamp of a folder leads to.

@@ -21,6 +21,7 @@ use midshift_core::site::{CORRIDOR, text};
 use midshift_core::time::{Clock, ScaledClock, Utc};
 use midshift_core::update::{ActivationGrant, DesiredUpdate, Goal, Installed, UpdateEvent, UpdateReport, UpdateState};
 use midshift_core::work::{DesiredWork, InboxItem, RobotEvent, SampleBody};
+use midshift_ota::content::Room;
 use midshift_ota::{OtaService, Parts};
 use midshift_proto::convert::parse;
 use midshift_proto::link::v1;
@@ -151,7 +152,7 @@ impl Bench {
         let made = samples::make(&dir.path().join("samples"), None, Signer::Throwaway, BEGIN)?;
         let keys = made.keys.clone().context("has keys")?;
         let folder = dir.path().join("server");
-        let parts = Parts { folder, keys: keys.clone(), quota_bytes: 1 << 20, clock: clock.clone() };
+        let parts = Parts { folder, keys: keys.clone(), room: Room::of(1 << 20), clock: clock.clone() };
         let ota = OtaService::open(parts).await?;
         let (ends, incoming) = mpsc::channel(4);
         let (seen, sessions) = mpsc::channel(4);

@@ -12,7 +12,7 @@ use midshift_bundle::repository::{FileTarget, PEOPLE_LIFE_MS, RootDraft, Signers
 use midshift_core::ids::{BundleId, SiteId};
 use midshift_core::limits;
 use midshift_core::time::{Clock, Utc};
-use midshift_ota::content::{Content, DiskContent, Wanted};
+use midshift_ota::content::{Content, DiskContent, Room, Wanted};
 use midshift_ota::repository::{OnlineKeys, Repository};
 use midshift_ota::{OtaService, Parts};
 use midshift_sim::behaviour::COMPONENT;
@@ -125,7 +125,7 @@ impl Software {
         files: Vec<(String, Vec<u8>)>,
         now: Utc,
     ) -> anyhow::Result<()> {
-        let content = DiskContent::open(&self.folder().join("content"), limits::SOFTWARE_BYTES_DEFAULT)?;
+        let content = DiskContent::open(&self.folder().join("content"), Room::of(limits::SOFTWARE_BYTES_DEFAULT))?;
         for (_, bytes) in files {
             let file = Wanted { digest: Digest::of(&bytes), length: bytes.len() as u64 };
             content.append(file, 0, bytes.into()).await?;
@@ -144,8 +144,8 @@ impl Software {
     }
     /// The service of a server that starts now.
     pub async fn open(&self, clock: Arc<dyn Clock>) -> anyhow::Result<OtaService> {
-        let quota_bytes = limits::SOFTWARE_BYTES_DEFAULT;
-        Ok(OtaService::open(Parts { folder: self.folder(), keys: self.keys(), quota_bytes, clock }).await?)
+        let room = Room::of(limits::SOFTWARE_BYTES_DEFAULT);
+        Ok(OtaService::open(Parts { folder: self.folder(), keys: self.keys(), room, clock }).await?)
     }
     /// The bundle of a version.
     pub fn bundle(&self, version: &str) -> &BundleId {

@@ -7,6 +7,7 @@ mod aborts;
 mod agents;
 mod asks;
 mod drains_and_grants;
+mod named;
 mod newcomers_and_pins;
 mod people;
 mod recovery;

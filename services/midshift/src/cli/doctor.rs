@@ -2,11 +2,12 @@
 
 use super::client::{Call, Exit, unary};
 use super::out::{Format, Out, columns};
+use super::released;
 use crate::clock;
 use midshift_bundle::freshness::{newest_targets, root_edition, stamp, targets_edition};
 use midshift_bundle::repository::TIMESTAMP_LIFE_MS;
 use midshift_core::time::Utc;
-use midshift_proto::ota::v1::GetMetadataRequest;
+use midshift_proto::ota::v1::{GetMetadataRequest, ListBundlesRequest, SoftwareRoom};
 use midshift_proto::task::v1::{ListTasksRequest, TaskFilter, TaskState};
 use midshift_proto::telemetry::v1;
 use tonic::Code;
@@ -22,6 +23,8 @@ const DESCRIPTORS_WANTED: u64 = 4_096;
 const PEOPLE_TOLD_MS: u64 = 60 * DAY_MS;
 /// The server signs a timestamp anew at half its life; with less than a quarter left it does not.
 const TIMESTAMP_LEFT_MS: u64 = TIMESTAMP_LIFE_MS / 4;
+/// From here on the room for software wants a look, percent.
+const FULL_PERCENT: u64 = 90;
 /// Root documents that are followed, one after the other, as robots do.
 const ROOTS_MAX: u64 = 1_024;
 /// Milliseconds of a day.
@@ -114,10 +117,26 @@ async fn server(call: &Call, found: &mut Vec<Finding>) -> Result<(), Exit> {
 
 /// When what was signed ends: root and targets, which people sign, and the timestamp, which the server signs.
 async fn releases(call: &Call) -> Vec<Finding> {
-    match documents(call).await {
+    let mut found = match documents(call).await {
         Ok(ends) => ends.into_iter().map(|end| end.finding(clock::wall())).collect(),
         Err(finding) => vec![finding],
-    }
+    };
+    found.extend(room(call).await);
+    found
+}
+
+/// How full the server is with software; none: it keeps none, or cannot be asked, which others say.
+async fn room(call: &Call) -> Option<Finding> {
+    let request = ListBundlesRequest { page_size: 1, ..ListBundlesRequest::default() };
+    let room = call.bundles().await.ok()?.list_bundles(unary(request)).await.ok()?.into_inner().room?;
+    Some(fullness(&room))
+}
+
+fn fullness(room: &SoftwareRoom) -> Finding {
+    let good = room.used_bytes.saturating_mul(100) < room.quota_bytes.saturating_mul(FULL_PERCENT);
+    let then = "; midshift bundle withdraw what nobody needs, or give the server more with --ota-quota-gib";
+    let text = format!("{}{}", released::room(room), if good { "" } else { then });
+    Finding { what: "software", good, text }
 }
 
 /// A document that ends.
@@ -246,5 +265,17 @@ mod tests {
         assert_eq!(early.text, "root 3 ends 1970-04-11T00:00:00.000Z: 61 days are left");
         assert_eq!(late.text, "root 3 ends 1970-04-11T00:00:00.000Z: 60 days are left; sign a new root");
         assert!(over.text.contains("it has EXPIRED; sign a new root"), "{}", over.text);
+    }
+
+    #[test]
+    fn people_are_told_before_the_room_for_software_is_used_up() {
+        let found = |used_bytes| fullness(&SoftwareRoom { used_bytes, quota_bytes: 1_000, ..SoftwareRoom::default() });
+        assert_eq!([found(0).good, found(899).good, found(900).good], [true, true, false]);
+        assert_eq!(found(899).text, "899 of 1000 bytes are used");
+        assert!(found(900).text.contains("bundle withdraw"), "{}", found(900).text);
+        let room = SoftwareRoom { encoded_bytes: 3, unnamed_bytes: 4, used_bytes: 9, quota_bytes: 10, look_time: None };
+        let text =
+            "9 of 10 bytes are used, 3 of them by shorter ways to files; nothing names 4 of them, and they will go";
+        assert_eq!(released::room(&room), text);
     }
 }

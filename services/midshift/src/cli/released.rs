@@ -50,7 +50,24 @@ pub async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
         let robots = robots(runs.get(b.digest.as_str()).copied().unwrap_or_default());
         vec![b.name.clone(), b.version.clone(), count, length, robots, published, b.digest.clone()]
     };
-    Ok(out.many(&whole, &whole.bundles, |b| b.digest.clone(), &header, row)?)
+    out.many(&whole, &whole.bundles, |b| b.digest.clone(), &header, row)?;
+    if out.format == Format::Table {
+        out.say(&room(&whole.room.unwrap_or_default()));
+    }
+    Ok(())
+}
+
+/// How full the server is, in words.
+pub fn room(room: &v1::SoftwareRoom) -> String {
+    let v1::SoftwareRoom { used_bytes, quota_bytes, encoded_bytes, unnamed_bytes, .. } = room;
+    let mut text = format!("{used_bytes} of {quota_bytes} bytes are used");
+    if *encoded_bytes > 0 {
+        text += &format!(", {encoded_bytes} of them by shorter ways to files");
+    }
+    if *unnamed_bytes > 0 {
+        text += &format!("; nothing names {unnamed_bytes} of them, and they will go");
+    }
+    text
 }
 
 fn robots(runs: Runs) -> String {
@@ -84,8 +101,8 @@ pub async fn revoke(call: &Call, bundle: String, reason: String, out: &Out) -> R
         format!("{bundle} is taken back: nobody gets it any more; {stand}")
     })?;
     match answer.rollout_ids.first() {
-        Some(id) => out.next(&format!("midshift rollout abort {id}; then sign a release without it")),
-        None => out.next("sign a release without it"),
+        Some(id) => out.next(&format!("midshift rollout abort {id}; then midshift bundle withdraw {bundle}")),
+        None => out.next(&format!("midshift bundle withdraw {bundle} --repository REPOSITORY --key targets-1.pem")),
     }
     Ok(())
 }

@@ -1,6 +1,6 @@
 //! Files in pieces, over restarts, under a quota.
 
-use super::{Content, DiskContent, Error, Held, Wanted};
+use super::{Content, DiskContent, Error, Held, Room, Wanted};
 use bytes::Bytes;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::COMPONENT_BYTES_MAX;
@@ -13,7 +13,7 @@ use tokio::io::AsyncReadExt;
 const QUOTA: u64 = 1024 * 1024;
 
 fn store(dir: &TempDir) -> DiskContent {
-    DiskContent::open(dir.path(), QUOTA).expect("a store")
+    DiskContent::open(dir.path(), Room::of(QUOTA)).expect("a store")
 }
 
 fn wanted(content: &[u8]) -> Wanted {
@@ -154,8 +154,8 @@ async fn the_quota_counts_whole_files_and_parts_over_restarts() {
     let first = store(&dir);
     bring(&first, &half).await.expect("half of it");
     let error = bring(&first, &other).await.expect_err("a byte too many");
-    let Error::Full { missing, free, quota } = error else { panic!("{error}") };
-    assert_eq!((missing, free, quota), (QUOTA / 2 + 1, QUOTA / 2, QUOTA));
+    let Error::Full { missing, used, free, quota } = error else { panic!("{error}") };
+    assert_eq!((missing, used, free, quota), (QUOTA / 2 + 1, QUOTA / 2, QUOTA / 2, QUOTA));
     drop(first);
     let again = store(&dir);
     assert!(matches!(bring(&again, &other).await, Err(Error::Full { .. })));
@@ -169,7 +169,7 @@ async fn the_quota_counts_whole_files_and_parts_over_restarts() {
 #[tokio::test]
 async fn sizes_beyond_the_cap_and_bytes_beyond_the_whole_are_refused() {
     let dir = TempDir::new().expect("a folder");
-    let store = DiskContent::open(dir.path(), u64::MAX).expect("a store");
+    let store = DiskContent::open(dir.path(), Room::of(u64::MAX)).expect("a store");
     let digest = Digest::of(b"any");
     for length in [0, COMPONENT_BYTES_MAX + 1, u64::MAX] {
         let error = store.append(Wanted { digest, length }, 0, Bytes::from_static(b"x")).await.expect_err("refused");
@@ -206,7 +206,7 @@ async fn ranges_around_two_and_four_gib_are_where_they_should_be() {
         std::os::unix::fs::FileExt::write_all_at(&file, b"edge", edge - 2).expect("sparse");
     }
     file.set_len((1 << 32) + 10).expect("sparse");
-    let store = DiskContent::open(dir.path(), u64::MAX).expect("a store");
+    let store = DiskContent::open(dir.path(), Room::of(u64::MAX)).expect("a store");
     assert_eq!(store.length(digest).await.expect("asked"), Some((1 << 32) + 10));
     for edge in [1_u64 << 31, 1 << 32] {
         assert_eq!(read(&store, digest, edge - 2..edge + 2).await, b"edge");
@@ -229,4 +229,72 @@ async fn of_too_many_unfinished_files_the_one_left_alone_longest_goes() {
     assert_eq!(store.settle(wanted(&files[0])).await.expect("asked"), Held::Part(5));
     assert_eq!(store.settle(wanted(&files[1])).await.expect("asked"), Held::Part(0));
     assert_eq!(store.settle(wanted(last)).await.expect("asked"), Held::Part(4));
+}
+
+#[tokio::test]
+async fn what_is_refused_for_want_of_room_leaves_nothing_behind_and_what_began_can_go_on() {
+    let dir = TempDir::new().expect("a folder");
+    let store = store(&dir);
+    let (first, second) = (bytes(QUOTA as usize / 2, 13), bytes(QUOTA as usize / 2 + 2, 14));
+    bring(&store, &first).await.expect("half of it");
+    let before = names(dir.path());
+    let error = bring(&store, &second).await.expect_err("two bytes too many");
+    assert_eq!(error.lacking(), Some(2));
+    assert_eq!(names(dir.path()), before);
+    assert_eq!(store.fill().used_bytes, QUOTA / 2);
+    // What was begun while there was room is refused in the middle, and stays.
+    let file = Wanted { length: QUOTA / 2, ..wanted(&bytes(QUOTA as usize / 2, 15)) };
+    let piece = bytes(QUOTA as usize / 2, 15);
+    store.append(file, 0, Bytes::copy_from_slice(&piece[..100])).await.expect("it fits");
+    store.claim(1).expect("a byte");
+    let rest = || Bytes::copy_from_slice(&piece[100..]);
+    assert!(matches!(store.append(file, 100, rest()).await, Err(Error::Full { .. })));
+    assert_eq!(store.settle(file).await.expect("asked"), Held::Part(100));
+    assert_eq!(store.remove(wanted(&first).digest).await.expect("removable"), QUOTA / 2);
+    store.append(file, 100, rest()).await.expect("there is room now");
+    assert_eq!(store.settle(file).await.expect("whole"), Held::Whole);
+}
+
+#[tokio::test]
+async fn the_disk_keeps_its_spare_bytes() {
+    let dir = TempDir::new().expect("a folder");
+    let spare_bytes = 1 << 62;
+    let store = DiskContent::open(dir.path(), Room { spare_bytes, ..Room::of(QUOTA) }).expect("a store");
+    let error = bring(&store, b"abc").await.expect_err("no disk has so much");
+    let Error::DiskFull { missing: 3, free, spare } = error else { panic!("{error}") };
+    assert_eq!((spare, free > 0, error.lacking()), (spare_bytes, true, Some(3)));
+    assert!(matches!(store.claim(1), Err(Error::DiskFull { .. })));
+    assert_eq!(names(dir.path()), Vec::<String>::new());
+    drop(store);
+    let modest = DiskContent::open(dir.path(), Room { spare_bytes: 1, ..Room::of(QUOTA) }).expect("a store");
+    assert_eq!(bring(&modest, b"abc").await.expect("whole"), Held::Whole);
+}
+
+#[tokio::test]
+async fn a_file_that_is_taken_away_is_gone_over_a_restart_and_its_room_is_free() {
+    let dir = TempDir::new().expect("a folder");
+    let first = store(&dir);
+    let (whole, half) = (bytes(1000, 16), bytes(1000, 17));
+    bring(&first, &whole).await.expect("whole");
+    first.append(wanted(&half), 0, Bytes::copy_from_slice(&half[..300])).await.expect("a piece");
+    first.settle(wanted(&half)).await.expect("durable");
+    let listed: Vec<_> = first.list().await.expect("listed").iter().map(|s| (s.digest, s.bytes)).collect();
+    let mut expected = [(Digest::of(&whole), 1000), (Digest::of(&half), 300)];
+    expected.sort();
+    assert_eq!(listed, expected);
+    assert_eq!(first.remove(Digest::of(b"nobody")).await.expect("asked"), 0);
+    assert_eq!(first.remove(Digest::of(&whole)).await.expect("removable"), 1000);
+    assert_eq!(first.remove(Digest::of(&half)).await.expect("removable"), 300);
+    assert_eq!((first.fill().used_bytes, names(dir.path())), (0, Vec::new()));
+    drop(first);
+    let again = store(&dir);
+    assert_eq!(again.list().await.expect("listed"), []);
+    assert_eq!(bring(&again, &whole).await.expect("brought anew"), Held::Whole);
+    // A cut between the name and the mark of a file leaves the mark.
+    fs::write(dir.path().join(format!("{}.mark", Digest::of(&whole))), "{\"length\":1000,\"durable\":1000}")
+        .expect("a mark");
+    drop(again);
+    let third = store(&dir);
+    assert_eq!(names(dir.path()), [Digest::of(&whole).to_string()]);
+    assert_eq!(third.fill().used_bytes, 1000);
 }

@@ -1,7 +1,7 @@
 //! Shorter ways to files: which one, when, and how much room they take.
 
 use super::{Encodings, Key, Way};
-use crate::content::{Content, DiskContent, Wanted};
+use crate::content::{Content, DiskContent, Room as Space, Wanted};
 use bytes::Bytes;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding::{self, Base, ENCODED_BYTES_MIN};
@@ -43,7 +43,7 @@ impl Room {
         Self::open(TempDir::new().expect("a folder"))
     }
     fn open(dir: TempDir) -> Self {
-        let content = Arc::new(DiskContent::open(&dir.path().join("content"), QUOTA).expect("a store"));
+        let content = Arc::new(DiskContent::open(&dir.path().join("content"), Space::of(QUOTA)).expect("a store"));
         let encodings = Encodings::open(&dir.path().join("encoded"), content.clone()).expect("a shelf");
         Self { dir, content, encodings }
     }

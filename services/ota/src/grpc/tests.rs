@@ -192,6 +192,13 @@ async fn pieces_that_are_too_large_or_in_the_wrong_place_are_refused() {
     full[0].length = 8 << 30;
     let status = world.upload(full).await.expect_err("over the quota");
     assert_eq!((status.code(), code(&status)), (tonic::Code::ResourceExhausted, Some(Code::SoftwareFull)));
+    let told = refusal_of(&status).metadata;
+    let fact = |name: &str| told.get(name).map(|fact| fact.parse::<u64>().expect("a number"));
+    let used = limits::UPLOAD_PIECE_BYTES as u64 + 1;
+    let facts = [fact("used"), fact("free"), fact("quota"), fact("missing")];
+    assert_eq!(facts, [Some(used), Some((1 << 30) - used), Some(1 << 30), Some(8 << 30)]);
+    let room = world.bundles.list_bundles(v1::ListBundlesRequest::default()).await.expect("listed").into_inner().room;
+    assert_eq!(room, Some(v1::SoftwareRoom { used_bytes: used, quota_bytes: 1 << 30, ..Default::default() }));
     let mut wrong = pieces(b"bytes", 0, 5);
     wrong[0].digest = Digest::of(b"other").to_string();
     assert_eq!(code(&world.upload(wrong).await.expect_err("wrong bytes")), Some(Code::UploadCorrupt));

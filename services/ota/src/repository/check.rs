@@ -111,20 +111,23 @@ pub fn is_manifest(file: &FileTarget) -> bool {
 
 /// Reads the manifest of a bundle; the inner error is what is wrong with it.
 pub async fn manifest(file: &FileTarget, content: &dyn Content) -> Result<Result<Manifest, String>, Error> {
-    let Some(reader) = content.read(file.digest, 0..file.length).await? else { return Ok(Err("is gone".to_owned())) };
-    let mut bytes = Vec::new();
+    let read = read_manifest(file.digest, content).await?;
+    Ok(read.and_then(|manifest| {
+        let target = manifest.target();
+        if target == file.name { Ok(manifest) } else { Err(format!("is the manifest {target}")) }
+    }))
+}
+
+/// Reads the manifest of a bundle, whatever its name; the inner error is what is wrong with it.
+pub async fn read_manifest(digest: Digest, content: &dyn Content) -> Result<Result<Manifest, String>, Error> {
     // One byte too many is enough to know that it is too long.
-    if let Err(error) = reader.take(MANIFEST_BYTES_MAX as u64 + 1).read_to_end(&mut bytes).await {
+    let range = 0..MANIFEST_BYTES_MAX as u64 + 1;
+    let Some(mut reader) = content.read(digest, range).await? else { return Ok(Err("is gone".to_owned())) };
+    let mut bytes = Vec::new();
+    if let Err(error) = reader.read_to_end(&mut bytes).await {
         return Ok(Err(error.to_string()));
     }
-    let manifest = match Manifest::from_bytes(&bytes) {
-        Ok(manifest) => manifest,
-        Err(refusal) => return Ok(Err(refusal.to_string())),
-    };
-    if manifest.target() != file.name {
-        return Ok(Err(format!("is the manifest {}", manifest.target())));
-    }
-    Ok(Ok(manifest))
+    Ok(Manifest::from_bytes(&bytes).map_err(|refusal| refusal.to_string()))
 }
 
 /// By name, then by version as numbers, then as text.

@@ -4,8 +4,10 @@
 
 use super::directives::Signer;
 use super::{Look, Parts, Planner, Request, releases};
+use crate::collect::Named;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::rollout::named::named;
 use midshift_core::rollout::view::{TABLES, View};
 use midshift_core::rollout::{Board, LOGS, Plan, absorb, commands, cycle, obeyed};
 use midshift_core::rows::Seq;
@@ -30,6 +32,8 @@ struct Loop {
     dirty: Dirty<Live>,
     started: Now,
     changed: watch::Sender<Seq>,
+    /// Serving time at which it is said next which bundles are needed, milliseconds.
+    say_at_ms: u64,
     /// Questions that are answered once what they would see is committed.
     looks: Vec<Look>,
 }
@@ -46,8 +50,11 @@ pub async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Er
     let started = parts.clock.now();
     let dirty = parts.board.watch();
     let view = View::new(parts.site.clone(), started, started);
-    let mut this = Loop { parts, view, seq: Seq(0), board: Board::new(), dirty, started, changed, looks: Vec::new() };
+    let board = Board::new();
+    let mut this = Loop { parts, view, seq: Seq(0), board, dirty, started, changed, say_at_ms: 0, looks: Vec::new() };
     this.rebuild_until_read(&shutdown).await;
+    // Not before robots could say what they run.
+    this.say_at_ms = this.view.served_ms(&started) + limits::COLLECT_EVERY_MS;
     let mut sweep = tokio::time::interval(Duration::from_millis(limits::SWEEP.as_ms()));
     sweep.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     let mut batch = Vec::new();
@@ -130,6 +137,12 @@ impl Loop {
         }
         self.commit(plan, replies).await?;
         self.answer(now);
+        let served_ms = self.view.served_ms(&now);
+        if served_ms >= self.say_at_ms {
+            self.say_at_ms = served_ms + limits::COLLECT_EVERY_MS;
+            // From rows that are committed, as answers are.
+            opened.named.send_replace(Some(Named { bundles: named(&self.view, &now), served_ms }));
+        }
         Ok(more)
     }
 
