@@ -158,7 +158,9 @@ impl Encodings {
         }
         let mut shelf = self.inner.shelf();
         if shelf.is_decided(&full) && shelf.is_decided(&best) {
-            let found = [best, full].into_iter().find_map(|key| shelf.touch(key).map(|encoded| (key, encoded)));
+            // The full one is of use beside a patch: without it the answer would have to be found anew.
+            let full_way = shelf.touch(full).map(|encoded| (full, encoded));
+            let found = shelf.touch(best).map(|encoded| (best, encoded)).or(full_way);
             return Ok(found.map_or(Way::Identity, |(key, encoded)| Way::Encoded(key, encoded)));
         }
         if !shelf.queue.contains(&best) {

@@ -303,8 +303,9 @@ async fn shorter_ways_go_first_and_are_made_again() {
     made(&shop).await;
     assert_eq!(shop.after(TIME).await, Collected::default(), "both lead from and to what is listed");
     shop.encodings.way(new, &[old.digest]).await.expect("asked");
-    assert_eq!(shop.after(TIME - 1).await.encodings, 1, "the full one was not used meanwhile, the patch was");
-    assert_eq!(shop.after(TIME).await.encodings, 1);
+    assert_eq!(shop.after(TIME).await.encodings, 0, "they were used meanwhile");
+    assert_eq!(shop.after(TIME - 1).await.encodings, 0);
+    assert_eq!(shop.after(1).await.encodings, 2, "and now for a while they were not");
     made(&shop).await;
     // The base of the patch is withdrawn: no robot has it any more, and nobody may fetch it.
     shop.publish(&[&two]).await.expect("withdrawn");

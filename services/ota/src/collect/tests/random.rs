@@ -3,7 +3,7 @@
 
 use super::*;
 
-const QUOTA: u64 = 12_000;
+const QUOTA: u64 = 16_000;
 
 /// Numbers from a seed.
 struct Dice(u64);
@@ -46,7 +46,7 @@ impl<'a> Run<'a> {
     async fn bring(&mut self, content: &[u8]) {
         let file = wanted(content);
         let Held::Part(from) = self.shop.content.settle(file).await.expect("asked") else { return };
-        let end = if self.dice.below(4) == 0 { content.len() / 2 } else { content.len() };
+        let end = if self.dice.below(8) == 0 { content.len() / 2 } else { content.len() };
         let piece = Bytes::copy_from_slice(&content[(from as usize).min(end)..end]);
         match self.shop.content.append(file, from, piece).await {
             Ok(()) => drop(self.shop.content.settle(file).await.expect("its bytes")),
@@ -58,6 +58,15 @@ impl<'a> Run<'a> {
             }
             Err(error) => panic!("{error}"),
         }
+    }
+
+    async fn is_whole(&self, bundle: &Bundle) -> bool {
+        for (_, content) in &bundle.1 {
+            if !self.shop.has(content).await {
+                return false;
+            }
+        }
+        true
     }
 
     async fn act(mut self) -> Self {
@@ -74,11 +83,15 @@ impl<'a> Run<'a> {
                 self.bring(&stray).await;
             }
             4 | 5 => {
-                let listed = self.dice.some(&all);
-                let mut whole = true;
-                for (_, content) in listed.iter().flat_map(|(_, files)| files) {
-                    whole &= self.shop.has(content).await;
+                let mut here = Vec::new();
+                for bundle in &all {
+                    if self.is_whole(bundle).await {
+                        here.push(*bundle);
+                    }
                 }
+                // Now and then somebody forgets to bring what is listed.
+                let listed = if self.dice.below(4) == 0 { self.dice.some(&all) } else { self.dice.some(&here) };
+                let whole = listed.iter().all(|bundle| here.iter().any(|known| std::ptr::eq(*known, *bundle)));
                 let published = self.shop.publish(&listed).await;
                 assert_eq!(published.is_ok(), whole, "exactly what is here can be published");
                 if whole {
@@ -136,5 +149,5 @@ async fn what_is_needed_can_be_had_the_quota_holds_and_nothing_else_stays() {
         refused += run.refused;
     }
     // It was not proven of nothing.
-    assert!(refused > 20 && withdrawn > 50 && collected > 50, "{refused} {withdrawn} {collected}");
+    assert!(refused > 10 && withdrawn > 20 && collected > 20, "{refused} {withdrawn} {collected}");
 }
