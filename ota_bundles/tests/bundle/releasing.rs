@@ -104,7 +104,7 @@ fn a_bundle_that_is_withdrawn_takes_along_only_what_no_other_has() {
     folder.withdraw(&digest, &[&key], START).expect("by its digest");
     assert_eq!(names(), ["gait-1.0.0.component", "walk-1.2.0.manifest"]);
     assert!(matches!(folder.withdraw("walk-1.0.0", &[&key], START), Err(Error::Refused(_))), "it is in no release");
-    folder.add(&bundle(place.path(), "1.1.0", b"two"), &[&key], START).expect("it may come again");
+    folder.add(&place.path().join("walk-1.1.0-3"), &[&key], START).expect("it may come again");
     assert_eq!(names().len(), 4);
 }
 
