@@ -2,6 +2,7 @@
 //!
 //! Invariant: a child lives no longer than its parent: it ends when its stdin does. Called by every measurement but `plan`.
 
+use crate::questions::answer_questions;
 use crate::sink::Seen;
 use anyhow::{Context, bail, ensure};
 use midshift::robots::SimRun;
@@ -201,27 +202,6 @@ fn metric(name: &str) -> u64 {
     let text = midshift::server::metrics_handle().map(|m| m.render()).unwrap_or_default();
     let lines = text.lines().filter(|l| l.starts_with(name));
     lines.filter_map(|l| l.rsplit(' ').next()?.parse::<f64>().ok()).sum::<f64>() as u64
-}
-
-/// Says the address, then answers each line of stdin with a number; the end of stdin is the end of all.
-pub fn answer_questions(
-    address: SocketAddr,
-    stop: CancellationToken,
-    answer: impl Fn(&str) -> u64 + Send + 'static,
-) -> anyhow::Result<()> {
-    say(&address.to_string())?;
-    tokio::task::spawn_blocking(move || {
-        let told = std::io::stdin().lines().map_while(Result::ok).try_for_each(|line| say(&answer(&line).to_string()));
-        stop.cancel();
-        told
-    });
-    Ok(())
-}
-
-fn say(line: &str) -> std::io::Result<()> {
-    let mut out = std::io::stdout().lock();
-    writeln!(out, "{line}")?;
-    out.flush()
 }
 
 /// Raises this process' limit of open files as far as it may go, and says how far that is.

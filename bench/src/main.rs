@@ -11,6 +11,7 @@ mod link;
 mod offer;
 mod ota;
 mod plan;
+mod questions;
 mod robot;
 mod sink;
 mod submit;

@@ -3,6 +3,7 @@
 //! Encoding is what the server calls, [`midshift_bundle::encoding`]; decoding is what a robot calls, [`DiskSets`], with all it checks.
 
 use super::programs;
+use super::resume::{self, ResumeArgs};
 use crate::figure::{Figure, median};
 use crate::submit::place;
 use anyhow::{Context, ensure};
@@ -28,21 +29,9 @@ pub struct DeviceArgs {
     /// Decides the made-up pair, and where downloads are cut off.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Size of a download that is cut off, MiB.
-    #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u64).range(2..=4_096))]
-    pub(super) resume_mib: u64,
-    /// How many times it is cut off.
-    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=100))]
-    pub(super) cuts: u64,
-    /// Downloads of each kind: uncut, connections lost, processes killed.
-    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
-    pub(super) device_rounds: u64,
-}
-
-impl DeviceArgs {
-    pub(super) const fn seed(&self) -> u64 {
-        self.seed
-    }
+    /// Downloads that are cut off.
+    #[command(flatten)]
+    resume: ResumeArgs,
 }
 
 /// Ways between the releases of each pair, then downloads that are cut off.
@@ -56,7 +45,7 @@ pub async fn run(args: &DeviceArgs, dir: Option<&PathBuf>) -> anyhow::Result<Vec
     let (old, new) = programs::pair(args.seed);
     let name = format!("made pair, {} of 1000 changed", programs::CHANGED_PERMILLE);
     figures.extend(ways(&name, &old, &new, room.path())?);
-    figures.extend(super::resume::run(args, room.path()).await?);
+    figures.extend(resume::run(&args.resume, args.seed, room.path()).await?);
     Ok(figures)
 }
 

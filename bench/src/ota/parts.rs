@@ -3,7 +3,7 @@
 //!
 //! Invariant: clocks of all of them are this machine's, so moments can be compared. Called by [`crate::child`].
 
-use crate::child::answer_questions;
+use crate::questions::answer_questions;
 use crate::robot;
 use anyhow::Context;
 use midshift::robots::AgentRun;

@@ -3,7 +3,6 @@
 //!
 //! A connection is lost by closing it; a process is killed by SIGKILL and started again. Called by [`super::device`].
 
-use super::device::DeviceArgs;
 use super::noise::{Release, Releases};
 use super::parts::OVER;
 use crate::child::Child;
@@ -27,6 +26,20 @@ use tokio_util::task::AbortOnDropHandle;
 const WITHIN: Duration = Duration::from_secs(300);
 /// How often that is looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(2);
+
+/// Downloads that are cut off.
+#[derive(Clone, Debug, clap::Args)]
+pub struct ResumeArgs {
+    /// Size of a download that is cut off, MiB.
+    #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u64).range(2..=4_096))]
+    resume_mib: u64,
+    /// How many times it is cut off.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=100))]
+    cuts: u64,
+    /// Downloads of each kind: uncut, connections lost, processes killed.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
+    device_rounds: u64,
+}
 
 /// How a download is cut off.
 #[derive(Clone, Copy, PartialEq)]
@@ -93,7 +106,7 @@ impl Relay {
 }
 
 /// Downloads of each kind in turn.
-pub async fn run(args: &DeviceArgs, room: &Path) -> anyhow::Result<Vec<Figure>> {
+pub async fn run(args: &ResumeArgs, seed: u64, room: &Path) -> anyhow::Result<Vec<Figure>> {
     let mut releases = Releases::make(&room.join("releases"))?;
     let release = releases.add(1, args.resume_mib << 20)?;
     let (data, keys) = (room.join("data"), releases.keys());
@@ -101,7 +114,7 @@ pub async fn run(args: &DeviceArgs, room: &Path) -> anyhow::Result<Vec<Figure>> 
     let role = ["server", "--data", &text(&data)?, "--keys", &text(&keys)?, "--listen", "127.0.0.1:0"];
     let server = Child::start(&role, None)?.listening().await?;
     releases.push(&server).await?;
-    let mut rng = ChaCha8Rng::seed_from_u64(args.seed());
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let [mut uncut, mut lost, mut killed]: [Vec<f64>; 3] = Default::default();
     // The first one waits until the server has found that there is no shorter way.
     download(&server, &release, room, Cut::Never, &[]).await?;
