@@ -6,7 +6,7 @@
 
 use super::rows::{AreaBudget, Drain, DrainState, RobotHolder};
 use super::view::View;
-use super::{Board, Plan, Tx, drain, heard, way};
+use super::{Board, Plan, Tx, heard, way};
 use crate::ids::{AreaId, RobotId};
 use crate::reason::{Code, Reason};
 use crate::robot::{Duty, Presence};
@@ -74,7 +74,7 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
     waiting.sort_by_cached_key(|d| (!d.urgent, cost(view, &d.robot_id), d.since, d.drain_id.clone()));
     for drain in waiting {
         let here = area_of(view, board, &drain.robot_id);
-        let why = match (&here, drain::of(view, &drain.robot_id)) {
+        let why = match (&here, view.drain_of(&drain.robot_id)) {
             (_, Some(other)) => Some(Reason::from(Code::RobotDraining).with("drain_id", &other.drain_id)),
             (Some(area), None) if !drain.urgent => {
                 areas.get_mut(area).and_then(|a| refusal(view, board, &now, area, a, &drain.robot_id))
@@ -150,7 +150,7 @@ fn areas(view: &View, board: &Board, now: &Now) -> BTreeMap<AreaId, Area> {
         let area = areas.entry(area_id).or_default();
         area.robots.insert(robot_id.clone());
         let duty = view.control.get(robot_id.as_str()).map_or(Duty::InWork, |c| c.row.duty());
-        let taken_here = drain::of(view, robot_id).is_some_and(|d| d.area_id.is_none());
+        let taken_here = view.drain_of(robot_id).is_some_and(|d| d.area_id.is_none());
         if duty != Duty::InWork || taken_here {
             area.off_work.insert(robot_id.clone());
         }

@@ -1,74 +1,18 @@
 //! What people ask of fleet directly: cordon, uncordon and retire, rules of an area, clearing a place, closing an incident. Each is one item, answered after its commit.
 
 use super::Tx;
+pub use super::asked::Command;
 use super::rows::{CommandKey, Cordon, HolderState, Place, PlaceHolder, RobotControl};
 use super::view::View;
 use super::{Board, drain, heard, incidents};
-use crate::ids::{PlaceId, RobotId};
+use crate::ids::RobotId;
 use crate::limits;
-use crate::policy::AreaPolicy;
 use crate::reason::{Code, Kind, Reason, Refusal, Violations};
 use crate::robot::Presence;
 use crate::rows::Revision;
-use serde::{Deserialize, Serialize};
 
 /// Used request_ids let go of with one command.
 const FORGOTTEN_AT_ONCE: usize = 4;
-
-/// One request.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Command {
-    /// No new work; what it does now, it finishes.
-    Cordon {
-        /// Whom.
-        robot_id: RobotId,
-        /// Why.
-        reason: String,
-    },
-    /// Back to work; also resets the breaker.
-    Uncordon {
-        /// Whom.
-        robot_id: RobotId,
-    },
-    /// Out of the fleet: no work, and no roll-out or drain waits for it. Uncordon brings it back.
-    Retire {
-        /// Whom.
-        robot_id: RobotId,
-        /// Why.
-        reason: String,
-    },
-    /// Out of work for maintenance: what it does ends or waits, then it parks.
-    Drain {
-        /// Whom.
-        robot_id: RobotId,
-        /// What for.
-        reason: String,
-        /// Milliseconds of site time until it is given up.
-        within_ms: u64,
-    },
-    /// Ends the drains that people asked for.
-    Undrain {
-        /// Whom.
-        robot_id: RobotId,
-    },
-    /// New rules of an area, pushed to every robot.
-    PutPolicy(AreaPolicy),
-    /// A person has looked: nobody and nothing is inside.
-    ClearPlace {
-        /// Which.
-        place_id: PlaceId,
-        /// What the person saw.
-        reason: String,
-    },
-    /// A person has looked into it.
-    CloseIncident {
-        /// Which.
-        incident_id: String,
-        /// What was found.
-        reason: String,
-    },
-}
 
 /// Whether this is a command that was carried out already: the same request_id, and the same in every part.
 ///
@@ -113,7 +57,7 @@ pub fn check(
             if !view.sessions.contains_key(robot_id.as_str()) {
                 return Err(Refusal::new(Kind::NotFound, Reason::from(Code::RobotNotFound).with("robot_id", robot_id)));
             }
-            if let (Command::Drain { .. }, Some(open)) = (command, drain::of(view, robot_id)) {
+            if let (Command::Drain { .. }, Some(open)) = (command, view.drain_of(robot_id)) {
                 let reason = Reason::from(Code::RobotDraining).with("drain_id", &open.drain_id);
                 return Err(Refusal::new(Kind::Precondition, reason));
             }

@@ -21,20 +21,9 @@ const PLANNED_MM_S: u64 = 600;
 /// Time of one action that an estimate counts with, milliseconds of site time.
 const PLANNED_ACTION_MS: u64 = 20_000;
 
-/// Drains of a robot, in whatever state.
-pub fn all_of<'a>(view: &'a View, robot_id: &RobotId) -> impl Iterator<Item = &'a Drain> {
-    let ids = view.drains_of.get(robot_id).into_iter().flatten();
-    ids.filter_map(|id| view.drains.get(id)).map(|d| &d.row)
-}
-
-/// The drain that the robot is in: the oldest that takes it out of work.
-pub fn of<'a>(view: &'a View, robot_id: &RobotId) -> Option<&'a Drain> {
-    all_of(view, robot_id).filter(|d| d.is_on()).min_by_key(|d| (d.since, d.drain_id.clone()))
-}
-
 /// Asks for a drain on behalf of a person. Its id is never used again.
 pub fn ask(tx: &mut Tx, robot_id: &RobotId, reason: &str, actor: &str, within_ms: u64) {
-    let over = all_of(tx.view, robot_id).filter(|d| d.is_of_person() && d.state == DrainState::Refused);
+    let over = tx.view.all_drains_of(robot_id).filter(|d| d.is_of_person() && d.state == DrainState::Refused);
     let over: Vec<DrainId> = over.map(|d| d.drain_id.clone()).collect();
     over.iter().for_each(|id| tx.delete::<Drain>(id.as_str(), "drain.forgotten"));
     let wall = tx.now.wall.0.max(0);
@@ -59,7 +48,7 @@ pub fn ask(tx: &mut Tx, robot_id: &RobotId, reason: &str, actor: &str, within_ms
 /// Ends every drain of the robot that a person asked for, and gives the robot back to work.
 pub fn release(tx: &mut Tx, robot_id: &RobotId) {
     let asked: Vec<DrainId> =
-        all_of(tx.view, robot_id).filter(|d| d.is_of_person()).map(|d| d.drain_id.clone()).collect();
+        tx.view.all_drains_of(robot_id).filter(|d| d.is_of_person()).map(|d| d.drain_id.clone()).collect();
     asked.iter().for_each(|drain_id| give_back(tx, robot_id, drain_id));
 }
 
@@ -115,7 +104,7 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
     let open: Vec<Drain> =
         view.drains.values().map(|d| &d.row).filter(|d| d.state == DrainState::Draining).cloned().collect();
     for drain in open {
-        if of(view, &drain.robot_id).is_some_and(|first| first.drain_id != drain.drain_id) {
+        if view.drain_of(&drain.robot_id).is_some_and(|first| first.drain_id != drain.drain_id) {
             continue;
         }
         plan.decide(view, now, "fleet", |tx| further(tx, &drain, board));

@@ -1,11 +1,12 @@
 //! The law of the fleet: who gets which task, who may enter which place, what a heartbeat repairs, and why not now.
 //!
 //! [`cycle`] takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
-//! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `commands` are what happens; `tasks` moves tasks by
+//! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `commands` (`asked`: which there are) are what happens; `tasks` moves tasks by
 //! the table; `heard`, `anchor`, `attempts` and `incidents` are what they share; `screen`, `pool` and `assign` give work; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod anchor;
+pub mod asked;
 pub mod assign;
 pub mod attempts;
 pub mod budget;

@@ -1,6 +1,6 @@
 //! Rows that fleet alone writes, apart from tasks and attempts: places, the robot's mutex, control, timers, holds, counters, marks.
 
-use super::commands::Command;
+use super::asked::Command;
 use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, RolloutId, SiteId, TaskId};
 use crate::reason::Reason;
 use crate::robot::Duty;

@@ -61,7 +61,7 @@ fn decided_by_people(view: &View, robot_id: &RobotId) -> Result<(), Reason> {
             Duty::Retired => return Err(Code::SkippedRetired.into()),
         }
     }
-    if let Some(drain) = super::drain::of(view, robot_id) {
+    if let Some(drain) = view.drain_of(robot_id) {
         return Err(Reason::from(Code::RobotDraining).with("drain_id", &drain.drain_id));
     }
     match view.robot_holds(robot_id).next() {

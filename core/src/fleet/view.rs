@@ -462,6 +462,15 @@ impl View {
             _ => None,
         }
     }
+    /// Drains of the robot, in whatever state.
+    pub fn all_drains_of(&self, robot: &RobotId) -> impl Iterator<Item = &Drain> {
+        let ids = self.drains_of.get(robot).into_iter().flatten();
+        ids.filter_map(|id| self.drains.get(id)).map(|d| &d.row)
+    }
+    /// The drain that the robot is in: the oldest that takes it out of work.
+    pub fn drain_of(&self, robot: &RobotId) -> Option<&Drain> {
+        self.all_drains_of(robot).filter(|d| d.is_on()).min_by_key(|d| (d.since, d.drain_id.clone()))
+    }
     /// Hold tokens of the robot.
     pub fn robot_holds(&self, robot: &RobotId) -> impl Iterator<Item = &HoldToken> {
         let from = format!("robot:{robot}:");

@@ -1,6 +1,5 @@
 //! Rows and explanations as their messages. Nothing is decided here.
 
-use midshift_core::fleet::drain::{all_of, of as drain_of};
 use midshift_core::fleet::explain::{RobotExplanation, TaskExplanation};
 use midshift_core::fleet::rows::{Cordon, HolderState, Incident, Place, RobotControl, RobotCounter, RobotHolder};
 use midshift_core::fleet::view::View;
@@ -57,7 +56,7 @@ fn cordon(cordon: Cordon) -> v1::Cordon {
 
 /// The drain a robot is in, or the last that waits or was refused.
 fn drain(view: &View, robot_id: &RobotId) -> Option<v1::Drain> {
-    let drain = drain_of(view, robot_id).or_else(|| all_of(view, robot_id).last())?;
+    let drain = view.drain_of(robot_id).or_else(|| view.all_drains_of(robot_id).last())?;
     let within_ms = i64::try_from(drain.within_ms).unwrap_or(i64::MAX);
     Some(v1::Drain {
         drain_id: drain.drain_id.to_string(),

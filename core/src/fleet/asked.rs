@@ -1,0 +1,60 @@
+//! What people ask of fleet directly, as it is kept with its request_id. What comes of it is in `commands`.
+
+use crate::ids::{PlaceId, RobotId};
+use crate::policy::AreaPolicy;
+use serde::{Deserialize, Serialize};
+
+/// One request.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Command {
+    /// No new work; what it does now, it finishes.
+    Cordon {
+        /// Whom.
+        robot_id: RobotId,
+        /// Why.
+        reason: String,
+    },
+    /// Back to work; also resets the breaker.
+    Uncordon {
+        /// Whom.
+        robot_id: RobotId,
+    },
+    /// Out of the fleet: no work, and no roll-out or drain waits for it. Uncordon brings it back.
+    Retire {
+        /// Whom.
+        robot_id: RobotId,
+        /// Why.
+        reason: String,
+    },
+    /// Out of work for maintenance: what it does ends or waits, then it parks.
+    Drain {
+        /// Whom.
+        robot_id: RobotId,
+        /// What for.
+        reason: String,
+        /// Milliseconds of site time until it is given up.
+        within_ms: u64,
+    },
+    /// Ends the drains that people asked for.
+    Undrain {
+        /// Whom.
+        robot_id: RobotId,
+    },
+    /// New rules of an area, pushed to every robot.
+    PutPolicy(AreaPolicy),
+    /// A person has looked: nobody and nothing is inside.
+    ClearPlace {
+        /// Which.
+        place_id: PlaceId,
+        /// What the person saw.
+        reason: String,
+    },
+    /// A person has looked into it.
+    CloseIncident {
+        /// Which.
+        incident_id: String,
+        /// What was found.
+        reason: String,
+    },
+}
