@@ -178,7 +178,7 @@ codes! {
     // --- what counts against a bundle
     RobotLost = "ROBOT_LOST", "The robot was not heard again after it was given the bundle, and most others were.";
     RobotWentBack = "ROBOT_WENT_BACK", "The robot went back from the bundle by itself.";
-    RollbackFailed = "ROLLBACK_FAILED", "The robot could not go back. A person must look at it.";
+    RollbackFailed = "ROLLBACK_FAILED", "The robot could not go back, and stays out of work. Mend its software by hand; if it does not say by itself then that it is back, retire it and uncordon it.";
     BreakerOnTrial = "BREAKER_ON_TRIAL", "The robot failed three attempts in ten minutes with the bundle.";
     HardStopCode = "HARD_STOP_CODE", "A robot with the bundle reported a fault that its manifest names as one that ends the roll-out.";
     HardwareStopOnTrial = "HARDWARE_STOP_ON_TRIAL", "The maker's safety system stopped a robot within ten minutes of its change.";
@@ -193,6 +193,7 @@ codes! {
     TooManyFailed = "TOO_MANY_FAILED", "More robots failed than a good bundle lets fail.";
     RateTooHigh = "RATE_TOO_HIGH", "Robots with the bundle fail tasks at several times the rate of the others.";
     PromotedByUser = "PROMOTED_BY_USER", "A person let it go on.";
+    RetriedByUser = "RETRIED_BY_USER", "A person tries the robot again.";
     AbortedByUser = "ABORTED_BY_USER", "A person ended it.";
     SupersededBy = "SUPERSEDED_BY", "Another roll-out takes its place.";
     NewcomerFailed = "NEWCOMER_FAILED", "A robot that came after the roll-out was completed went back from its bundle. Robots that come later do not get it; roll it out anew, or retry the robot.";

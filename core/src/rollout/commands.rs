@@ -10,7 +10,7 @@ use super::rows::{
 };
 use super::spec::{RolloutSpec, Wave};
 use super::view::View;
-use super::{Board, Plan, Tx, moves, newcomers, phases, robots, verdict};
+use super::{Board, Plan, Tx, assign, moves, phases, robots, verdict};
 use crate::gates::FailureEvidence;
 use crate::ids::{BundleId, RobotId, RolloutId};
 use crate::limits;
@@ -373,7 +373,7 @@ fn verb_one(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor: &str
             );
         }
         Verb::Promote => {
-            let seen = verdict::see(tx.view, &rollout, Some(rollout.wave));
+            let seen = verdict::see_wave(tx.view, board, &tx.now, &rollout);
             let verdict =
                 verdict::of(&rollout, &seen, Outcome::PromotedByPerson, why(Code::PromotedByUser), tx.now.utc);
             phases::promote(tx, rollout, Verdict { actor: Some(actor.to_owned()), ..verdict });
@@ -422,18 +422,10 @@ fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bo
             ..rollout.clone()
         };
         tx.put(row, "rollout.started");
-        add(tx, &rollout, first);
+        assign::add(tx, &rollout, first);
     });
     for slice in slices {
-        plan.decide(view, now, actor, |tx| add(tx, &rollout, slice));
-    }
-}
-
-/// Gives robots their rows.
-pub fn add(tx: &mut Tx, rollout: &Rollout, robots: &[(RobotId, u32, u64, String)]) {
-    for (robot_id, wave, place, from_version) in robots {
-        let now = tx.now;
-        tx.put(newcomers::fresh(&now, rollout, robot_id, *wave, *place, from_version.clone()), "robot.assigned");
+        plan.decide(view, now, actor, |tx| assign::add(tx, &rollout, slice));
     }
 }
 
@@ -447,8 +439,8 @@ fn retry_failed(view: &mut View, now: Now, id: &RolloutId, actor: &str, reason: 
                 let key = Quarantine::id_of(&r.robot_id, &rollout.spec.bundle);
                 tx.delete::<Quarantine>(&key, "quarantine.lifted");
                 let fresh =
-                    newcomers::fresh(&tx.now.clone(), &rollout, &r.robot_id, wave, r.place, r.from_version.clone());
-                let why = (!reason.is_empty()).then(|| Reason::new(Code::PromotedByUser, reason).with("actor", actor));
+                    assign::fresh(&tx.now.clone(), &rollout, &r.robot_id, wave, r.place, r.from_version.clone());
+                let why = (!reason.is_empty()).then(|| Reason::new(Code::RetriedByUser, reason).with("actor", actor));
                 tx.put(RolloutRobot { again: true, why, ..fresh }, "robot.retried");
             }
         });

@@ -2,7 +2,7 @@
 
 use super::rows::{Countdown, Phase, Rollout, RolloutRobot, Step};
 use super::view::View;
-use super::{Board, hear, robots};
+use super::{Board, hear, robots, turns};
 use crate::fleet::rows::DrainState;
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -32,7 +32,7 @@ pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rol
         }
         Step::Staging => {
             deadline =
-                robots::is_on(rollout, r).then(|| robots::turn_came(rollout, r).plus_ms(limits::STAGED_WITHIN.as_ms()));
+                turns::is_on(rollout, r).then(|| turns::turn_came(rollout, r).plus_ms(limits::STAGED_WITHIN.as_ms()));
             let progress =
                 board.get(&r.robot_id).and_then(|l| l.report.update.as_ref()).map_or(0, |u| u.progress_permille);
             Reason::from(Code::BlockedByDownload).with("progress_permille", progress)

@@ -10,6 +10,7 @@ use crate::ids::{DrainId, RobotId};
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::robot::{Fault, HardwareStop};
+use crate::time::{Now, Utc};
 use crate::update::{UpdateEvent, UpdateReport, UpdateState};
 use crate::work::{InboxEntry, InboxItem, Live, RobotEvent, SampleBody};
 
@@ -72,11 +73,31 @@ pub fn rows_of<'a>(view: &'a View, robot_id: &'a RobotId) -> impl Iterator<Item 
 }
 
 fn directive_refused(tx: &mut Tx, robot_id: &RobotId, generation: u64, reason: &Reason) {
+    way_back_refused(tx, robot_id, generation, reason);
     let newest = tx.view.desired.get(robot_id.as_str()).is_some_and(|d| d.row.generation <= generation);
     let row = rows_of(tx.view, robot_id).find(|r| matches!(r.step, Step::Staging | Step::Staged)).cloned();
-    if let Some(row) = row.filter(|_| newest) {
+    // One that lay too long says nothing against the robot: it is signed anew.
+    let old = |r: &RolloutRobot| r.step == Step::Staging && is_old(&tx.now, r.signed);
+    if let Some(row) = row.filter(|r| newest && !old(r)) {
         let why = Reason::new(Code::SkippedIncompatible, reason.text()).with("because", reason.code);
         tx.put(RolloutRobot { step: Step::Skipped, since: tx.now.utc, why: Some(why), ..row }, "robot.skipped");
+    }
+}
+
+/// A directive that was signed then is signed anew if it was not taken.
+pub fn is_old(now: &Now, signed: Utc) -> bool {
+    now.wall.ms_since(signed) >= limits::DIRECTIVE_RENEWED_MS
+}
+
+/// Notes that the robot did not take the order to go back. What it says of an order of before is not heard.
+fn way_back_refused(tx: &mut Tx, robot_id: &RobotId, generation: u64, reason: &Reason) {
+    let told = |r: &&RolloutRobot| (1..=generation).contains(&r.way_back.generation);
+    let Some(mut row) = rows_of(tx.view, robot_id).filter(|r| r.step == Step::Reverting).find(told).cloned() else {
+        return;
+    };
+    if row.way_back.refused.is_none() {
+        row.way_back.refused = Some(reason.clone());
+        tx.put(row, "robot.way_back_refused");
     }
 }
 

@@ -10,7 +10,7 @@ use crate::fleet::heard;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::robot::{Duty, Presence};
-use crate::time::{LinkTime, Now};
+use crate::time::{LinkTime, Now, Utc};
 use std::collections::BTreeMap;
 
 /// The robot runs the bundle, or may, and is not heard for too long. After the gate of its wave that is not the bundle's matter.
@@ -26,6 +26,12 @@ pub fn is_missing(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &
 /// When a robot was heard last. After a start everybody counts as heard at that moment.
 fn heard(view: &View, board: &Board, robot_id: &RobotId) -> LinkTime {
     board.get(robot_id).map_or(view.started.link, |live| live.processed_at.max(view.started.link))
+}
+
+/// Whether a heartbeat of the robot came since then, UTC on the site clock.
+pub fn is_heard_since(board: &Board, now: &Now, robot_id: &RobotId, since: Utc) -> bool {
+    let silent = board.get(robot_id).map(|live| now.site.since(live.processed_site));
+    silent.is_some_and(|silent| silent.as_ms() <= now.utc.ms_since(since))
 }
 
 /// The gate of its wave has not closed.

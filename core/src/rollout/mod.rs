@@ -2,9 +2,12 @@
 //!
 //! [`cycle`] takes what happened and gives items to commit; the service around it only reads, signs, commits and publishes.
 //! Rooms: `spec` is what is asked for, `rows` and `view` are what is known; `hear` and `commands` are what happens; `matching` says who and `dry_run` what it would come to, `robots`
-//! says what is due for each and `moves` writes it, `phases` the whole, `newcomers` who comes later, `named` which bundles are still needed; `verdict` and `infrastructure` judge; `explain` says what a robot waits for.
+//! says what is due for each (`turns`: whose turn it is) and `moves` writes it, `phases` the whole, `newcomers` who comes later (`served`: what they get; `assign`: how
+//! anybody comes in), `named` which bundles are still needed; `verdict` and `infrastructure` judge; `explain` says what a robot waits for. Rooms name each
+//! other in one direction only.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
+pub mod assign;
 pub mod bugs;
 pub mod commands;
 pub mod dry_run;
@@ -18,7 +21,10 @@ pub mod newcomers;
 pub mod phases;
 pub mod robots;
 pub mod rows;
+pub mod served;
 pub mod spec;
+pub mod stamp;
+pub mod turns;
 pub mod verdict;
 pub mod view;
 

@@ -3,10 +3,12 @@
 //! Called with what [`super::robots::next`] said. Invariant: one move is one item; a permission relies on fleet's record of the robot and on the
 //! roll-out's row, and robots out of work are counted in that row.
 
-use super::hear::{fail, is_hard, quarantine};
+use super::hear::{fail, is_hard, is_old, quarantine};
 use super::infrastructure::is_open_to;
-use super::robots::{Move, anchor, is_retried, wants};
-use super::rows::{Given, Rollout, RolloutRobot, Step};
+use super::robots::{Move, anchor, wants};
+use super::rows::{Given, Rollout, RolloutRobot, Step, WayBack};
+use super::stamp::Stamp;
+use super::turns::is_retried;
 use super::view::View;
 use super::{Board, Order, Sign, Tx, newcomers, verdict};
 use crate::ids::{DrainId, RobotId, RolloutId};
@@ -52,7 +54,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
         }
         Move::Held => {
             r.moments.draining = r.drain_id.as_ref().and_then(|id| tx.view.drain(id)).map(|d| d.since);
-            (r.moments.held, r.moments.held_wall) = (Some(tx.now.utc), Some(tx.now.wall));
+            (r.moments.held, r.moments.held_link) = (Some(tx.now.utc), Some(stamp(tx)));
             (r.ready, r.grant) = (false, None);
             if rollout.revert_of.is_none() {
                 let drain_id = r.drain_id.clone();
@@ -64,7 +66,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
         Move::NotUsed => {
             desire(tx, &r.robot_id, |d| d.grant = None);
             (r.grant, r.ready, r.not_used) = (None, false, true);
-            r.moments.granted_wall = None;
+            r.moments.granted_link = None;
             // It never ran the bundle, so the bundle has not lost it.
             r.failure = r.failure.filter(|f| f.code != Code::RobotLost);
             tx.put(r, "robot.grant_not_used");
@@ -78,14 +80,14 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             step(tx, r, to, "robot.drain_left");
         }
         Move::Switched => {
-            (r.moments.switched, r.moments.switched_wall) = (Some(tx.now.utc), Some(tx.now.wall));
+            (r.moments.switched, r.moments.switched_link) = (Some(tx.now.utc), Some(stamp(tx)));
             // It runs, whatever the rows know of a permission: a store that was restored has forgotten some.
             r.attempted = true;
             tx.put(r, "robot.switched");
         }
         Move::OnTrial => {
             r.moments.switched.get_or_insert(tx.now.utc);
-            r.moments.switched_wall.get_or_insert(tx.now.wall);
+            r.moments.switched_link.get_or_insert(stamp(tx));
             r.moments.on_trial = Some(tx.now.utc);
             r.before = verdict::work_of(tx.view, &rollout, &r.robot_id);
             if is_open_to(&rollout, &r) {
@@ -107,6 +109,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             // A robot that is not heard goes back before it works again.
             let urgent = hard || !tx.view.is_heard(board, &tx.now, &r.robot_id);
             r.attempted |= rollout.revert_of.is_some();
+            r.way_back = WayBack::default();
             if r.drain_id.is_none() {
                 ask_drain(tx, &rollout, &mut r, urgent);
             }
@@ -115,17 +118,25 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
         Move::GoBack => {
             let drain_id = r.drain_id.clone();
             let said = tx.view.software_of(&r.robot_id).report.map(|report| report.bundle);
-            if rollout.revert_of.is_some() && said.as_ref() != Some(&rollout.spec.bundle) {
+            let left = rollout.revert_of.is_some() && said.as_ref() != Some(&rollout.spec.bundle);
+            if left || !tx.view.desired.contains_key(r.robot_id.as_str()) {
                 // It was told something else since, and has left it: only a directive of its own leads back from what it kept.
-                direct(tx, sign, &rollout, &r.robot_id, Goal::Revert, drain_id);
+                order_back(tx, sign, &rollout, &mut r);
             } else {
                 desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Revert, drain_id, None));
+                let generation = tx.view.desired.get(r.robot_id.as_str()).map_or(0, |d| d.row.generation);
+                r.way_back = WayBack { generation, ..WayBack::default() };
             }
             step(tx, r, Step::Reverting, "robot.going_back");
         }
+        Move::OrderBackAnew => {
+            order_back(tx, sign, &rollout, &mut r);
+            step(tx, r, Step::Reverting, "robot.ordered_back_anew");
+        }
         Move::RolledBack(why) => rolled_back(tx, &rollout, r, why),
         Move::Stuck(why) => {
-            let reason = Reason::new(Code::RollbackFailed, why.text()).with("because", why.code);
+            let reason = Reason::from(Code::RollbackFailed).with("because", why.code).with("said", why.text());
+            let reason = reason.with("rollout_id", &r.rollout_id);
             super::incident(tx, Some(&r.robot_id), &reason);
             r.failure = Some(reason);
             r.attempted = true;
@@ -138,6 +149,10 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
 /// Why a drain without a permission that may be alive may end.
 fn unpermitted(r: &RolloutRobot) -> ReleasedBy {
     if r.not_used { ReleasedBy::NotUsed } else { ReleasedBy::NoGrant }
+}
+
+fn stamp(tx: &Tx) -> Stamp {
+    Stamp::new(&tx.now, &tx.view.started)
 }
 
 fn step(tx: &mut Tx, r: RolloutRobot, to: Step, kind: &'static str) {
@@ -213,6 +228,14 @@ fn direct(
     Some(generation)
 }
 
+/// Tells a robot to go back with a directive of its own, which it takes once nothing of another bundle is under way on it.
+fn order_back(tx: &mut Tx, sign: &dyn Sign, rollout: &Rollout, r: &mut RolloutRobot) {
+    let Some(generation) = direct(tx, sign, rollout, &r.robot_id, Goal::Revert, r.drain_id.clone()) else { return };
+    let old = r.way_back.signed.is_some_and(|signed| is_old(&tx.now, signed));
+    let again = r.way_back.refused.is_some() && !old;
+    r.way_back = WayBack { generation, signed: Some(tx.now.wall), refused: None, again };
+}
+
 fn next_generation(view: &View, robot_id: &RobotId, now: &Now) -> u64 {
     let last = view.desired.get(robot_id.as_str()).map_or(0, |d| d.row.generation);
     let reported = view.sessions.get(robot_id.as_str()).map_or(0, |s| s.row.applied_update);
@@ -286,7 +309,7 @@ fn grant(tx: &mut Tx, board: &Board, rollout: &Rollout, mut r: RolloutRobot) {
     let given = ActivationGrant { grant_id, drain_id, authority };
     desire(tx, &r.robot_id, |d| d.grant = Some(given));
     r.grant = Some(Given { grant_id, authority, generation: rollout.generation });
-    r.moments.granted_wall = Some(tx.now.wall);
+    r.moments.granted_link = Some(stamp(tx));
     r.attempted = true;
     tx.put(r, "robot.granted");
 }

@@ -1,15 +1,14 @@
 //! Robots that come to an area after a roll-out was completed there get its bundle too, one by one, under the same rules.
 
+use super::assign::fresh;
 use super::matching;
-use super::phases::forget_area_bundles;
-use super::robots::{is_newcomer, is_retried};
-use super::rows::{Moments, Phase, Rollout, RolloutRobot, Step};
+use super::rows::{Phase, Rollout, RolloutRobot, Step};
+use super::served::{forget_area_bundles, is_served};
+use super::turns::{is_newcomer, is_retried};
 use super::view::View;
 use super::{Board, Tx, incident};
-use crate::gates::TaskTally;
-use crate::ids::{RobotId, RolloutId};
+use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
-use crate::time::{Now, Utc};
 
 /// The completed roll-out that a robot should have had a part in, if there is one.
 pub fn due(view: &View, board: &Board, robot_id: &RobotId) -> Option<Rollout> {
@@ -26,11 +25,6 @@ pub fn due(view: &View, board: &Board, robot_id: &RobotId) -> Option<Rollout> {
     let free = matching::claimed_by(view, robot_id, &rollout.rollout_id).is_none();
     let may = matching::may_have(view, robot_id, &stratum, &bundle.row).is_ok();
     (good && new && free && may).then(|| rollout.clone())
-}
-
-/// Robots that come get this roll-out's bundle somewhere.
-pub fn is_served(view: &View, id: &RolloutId) -> bool {
-    view.area_bundles.values().any(|a| a.row.rollouts.values().any(|r| r == id))
 }
 
 /// A robot that came later failed: they come one by one, so each is a wave of one, and nobody comes behind it. A robot that a person tried
@@ -51,36 +45,4 @@ pub fn add(tx: &mut Tx, board: &Board, robot_id: &RobotId, rollout: &Rollout) {
     let from_version = matching::stratum(tx.view, board, robot_id).map(|s| s.from_version).unwrap_or_default();
     let row = fresh(&tx.now, rollout, robot_id, wave, place, from_version);
     tx.put(row, "robot.newcomer");
-}
-
-/// A robot that nothing was asked of.
-pub fn fresh(
-    now: &Now,
-    rollout: &Rollout,
-    robot_id: &RobotId,
-    wave: u32,
-    place: u64,
-    from_version: String,
-) -> RolloutRobot {
-    RolloutRobot {
-        rollout_id: rollout.rollout_id.clone(),
-        robot_id: robot_id.clone(),
-        wave,
-        place,
-        step: Step::Waiting,
-        since: now.utc,
-        from_version,
-        directive: 0,
-        signed: Utc(0),
-        drain_id: None,
-        ready: false,
-        grant: None,
-        not_used: false,
-        attempted: false,
-        failure: None,
-        why: None,
-        again: false,
-        before: TaskTally::default(),
-        moments: Moments::default(),
-    }
 }

@@ -3,16 +3,16 @@
 //! Invariant: an abort is latched in the item that ends the roll-out, and nothing takes it back; a soak stands still while the roll-out does;
 //! stuck and unreachable robots never keep a fleet waiting.
 
-use super::robots::{is_gone, is_irreversible, is_newcomer, is_retried};
+use super::robots::{is_gone, is_irreversible};
 use super::rows::{AreaBundle, Countdown, Outcome, Pause, Phase, Rollout, RolloutRobot, Step, Verdict};
+use super::served::{forget_area_bundles, is_served};
+use super::turns::{is_newcomer, is_retried};
 use super::verdict;
 use super::view::View;
-use super::{Board, Tx, commands, incident, infrastructure, matching, newcomers};
-use crate::fleet::heard;
+use super::{Board, Tx, assign, incident, infrastructure, matching};
 use crate::ids::{AreaId, RolloutId};
 use crate::limits;
 use crate::reason::{Code, Reason};
-use crate::robot::Presence;
 use crate::time::Now;
 use std::collections::BTreeMap;
 
@@ -141,7 +141,7 @@ fn assigns_missing(tx: &mut Tx, board: &Board, rollout: &Rollout) -> bool {
         let sizes = (0..rollout.sizes.len() as u32).map(size).collect();
         tx.put(Rollout { sizes, ..rollout.clone() }, "rollout.sized");
     }
-    commands::add(tx, rollout, &members);
+    assign::add(tx, rollout, &members);
     true
 }
 
@@ -177,7 +177,7 @@ fn applying(tx: &mut Tx, board: &Board, rollout: Rollout) {
         let soak = Countdown::new(tx.view.served_ms(&tx.now), rollout.spec.soak_ms);
         enter(tx, Rollout { soak: Some(soak), ..rollout }, Phase::Soaking, "rollout.soaking");
     } else if rollout.revert_of.is_some() {
-        let verdict = verdict::gate(tx.view, &rollout, tx.now.utc);
+        let verdict = verdict::gate(tx.view, board, &tx.now, &rollout);
         promote(tx, rollout, verdict);
     } else if verdict::wave(tx.view, &rollout.rollout_id, wave).any(attempted) {
         // None of those that were given it works with it: there is nothing to watch, and much to judge.
@@ -211,11 +211,19 @@ fn soaking(tx: &mut Tx, rollout: Rollout) {
     }
 }
 
+/// A robot of the wave was not heard since its gate began: it says nothing for the bundle until it comes back, or is lost, or the network is.
+/// Robots that come and go are not waited for until all are there at once, only until one is.
+fn waits_for_word(tx: &Tx, board: &Board, rollout: &Rollout) -> bool {
+    let began = rollout.since.max(rollout.resumed.unwrap_or_default());
+    let on_trial: Vec<&RolloutRobot> =
+        verdict::wave(tx.view, &rollout.rollout_id, rollout.wave).filter(|r| r.step == Step::Trial).collect();
+    let unheard = |r: &&RolloutRobot| !infrastructure::is_heard_since(board, &tx.now, &r.robot_id, began);
+    let dark = |r: &&RolloutRobot| verdict::is_dark(board, &tx.now, r);
+    !on_trial.is_empty() && (on_trial.iter().any(unheard) || on_trial.iter().all(dark))
+}
+
 fn gate(tx: &mut Tx, board: &Board, mut rollout: Rollout) {
-    let silent =
-        |r: &RolloutRobot| r.step == Step::Trial && heard::presence(board, &r.robot_id, &tx.now) != Presence::Online;
-    if rollout.revert_of.is_none() && verdict::wave(tx.view, &rollout.rollout_id, rollout.wave).any(silent) {
-        // It says nothing for the bundle: it comes back, or is lost, or the network is.
+    if rollout.revert_of.is_none() && waits_for_word(tx, board, &rollout) {
         return;
     }
     let on_trial = verdict::wave(tx.view, &rollout.rollout_id, rollout.wave).any(|r| r.step == Step::Trial);
@@ -225,13 +233,13 @@ fn gate(tx: &mut Tx, board: &Board, mut rollout: Rollout) {
         if rollout.exposure.is_none_or(|left| left.left(served) > 0) {
             return;
         }
-        let seen = verdict::see(tx.view, &rollout, Some(rollout.wave));
+        let seen = verdict::see_wave(tx.view, board, &tx.now, &rollout);
         let why = Reason::from(Code::NoExposure).with("robots", short);
         let verdict = verdict::of(&rollout, &seen, Outcome::Review, why, tx.now.utc);
         rollout.verdicts.push(verdict);
         return enter(tx, rollout, Phase::Review, "rollout.review");
     }
-    let verdict = verdict::gate(tx.view, &rollout, tx.now.utc);
+    let verdict = verdict::gate(tx.view, board, &tx.now, &rollout);
     match verdict.outcome {
         Outcome::Promoted | Outcome::PromotedUnproven | Outcome::PromotedByPerson => promote(tx, rollout, verdict),
         Outcome::Review => {
@@ -292,25 +300,9 @@ fn complete(tx: &mut Tx, rollout: Rollout) {
     enter(tx, rollout, Phase::Completed, "rollout.completed");
 }
 
-/// Robots that come later do not get it any more.
-pub fn forget_area_bundles(tx: &mut Tx, id: &RolloutId) {
-    let named: Vec<AreaBundle> = tx
-        .view
-        .area_bundles
-        .values()
-        .map(|a| &a.row)
-        .filter(|a| a.rollouts.values().any(|r| r == id))
-        .cloned()
-        .collect();
-    for mut row in named {
-        row.rollouts.retain(|_, rollout| rollout != id);
-        tx.put(row, "area.bundle_forgotten");
-    }
-}
-
 /// The oldest that has ended goes, with its robots, while there are too many. One that robots still have to come back from stays.
 pub fn forget_oldest(tx: &mut Tx) {
-    let named = |id: &RolloutId| newcomers::is_served(tx.view, id);
+    let named = |id: &RolloutId| is_served(tx.view, id);
     let over = tx.view.rollouts.values().map(|r| &r.row).filter(|r| r.phase.is_over());
     let free = over.filter(|r| !named(&r.rollout_id) && tx.view.robots_of(&r.rollout_id).all(|r| r.step.is_over()));
     let Some(id) = free.min_by_key(|r| (r.since, r.rollout_id.clone())).map(|r| r.rollout_id.clone()) else { return };

@@ -4,17 +4,18 @@
 //! while fleet's record says that this drain holds the robot and the roll-out runs; a drain is released only for one of [`crate::maintenance::ReleasedBy`]; robots
 //! out of work for a roll-out are counted in its row, in the item that takes one more.
 
-use super::hear::{is_hard, report_of};
+use super::hear::{is_hard, is_old, report_of};
 use super::rows::{Given, Pause, Phase, Rollout, RolloutRobot, Step};
+use super::turns::{is_late, is_newcomer, is_on, is_retried};
 use super::view::View;
-use super::{Board, infrastructure, matching, newcomers, verdict};
+use super::{Board, infrastructure, matching, served, verdict};
 use crate::authority::Authority;
 use crate::fleet::rows::DrainState;
 use crate::ids::{RobotId, RolloutId};
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::robot::{Duty, HardwareStop};
-use crate::time::{Now, Utc};
+use crate::time::Now;
 use crate::update::{Goal, UpdateReport, UpdateState};
 
 /// What is due for a robot.
@@ -58,6 +59,8 @@ pub enum Move {
     Revert,
     /// It stands where it may go back.
     GoBack,
+    /// It did not take the order to go back, or has not for so long that it must be signed anew.
+    OrderBackAnew,
     /// It runs what it ran before.
     RolledBack(Reason),
     /// It could not go back.
@@ -78,7 +81,7 @@ pub fn next(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollou
         Step::Activating => activating(view, board, now, rollout, r, report),
         Step::Trial => trial(view, board, now, rollout, r, report),
         Step::Committing => committing(view, rollout, r, report),
-        Step::Reverting => reverting(view, board, r, report),
+        Step::Reverting => reverting(view, board, now, r, report),
         Step::Committed => goes_back(view, rollout, r).then_some(Move::Revert),
         Step::Skipped if is_tried_again(rollout, r) => Some(Move::Again),
         Step::Skipped => keeps_for_nothing(view, rollout, r).then_some(Move::Forget),
@@ -88,12 +91,6 @@ pub fn next(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollou
             report.filter(|r| r.state == UpdateState::RolledBack).map(|_| Move::RolledBack(Code::RollbackFailed.into()))
         }
     }
-}
-
-/// Whether a robot that was skipped is tried once more at the end.
-pub fn is_retried(r: &RolloutRobot) -> bool {
-    let codes = [Code::SkippedOffline, Code::SkippedBusy, Code::SkippedStuck];
-    r.why.as_ref().is_some_and(|why| codes.contains(&why.code))
 }
 
 fn is_tried_again(rollout: &Rollout, r: &RolloutRobot) -> bool {
@@ -108,21 +105,6 @@ fn keeps_for_nothing(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
     staged && ours && rollout.phase.goes_back()
 }
 
-/// The robot's turn has come.
-pub fn is_on(rollout: &Rollout, r: &RolloutRobot) -> bool {
-    match rollout.phase {
-        Phase::Applying => r.wave <= rollout.wave,
-        // Newcomers of a completed roll-out come one by one.
-        Phase::Completed => is_newcomer(rollout, r),
-        _ => false,
-    }
-}
-
-/// It came after the roll-out was completed.
-pub fn is_newcomer(rollout: &Rollout, r: &RolloutRobot) -> bool {
-    r.wave > rollout.spec.waves.len() as u32
-}
-
 /// Why a robot that does not run the bundle yet will not get it; none: it may.
 fn left_out(view: &View, rollout: &Rollout, r: &RolloutRobot) -> Option<Reason> {
     let comes_later = is_newcomer(rollout, r);
@@ -133,7 +115,7 @@ fn left_out(view: &View, rollout: &Rollout, r: &RolloutRobot) -> Option<Reason> 
         return Some(Code::BundleRevoked.into());
     }
     // Another has come since, or this one served a newcomer badly. Who is tried again was asked for by a person.
-    if comes_later && !r.again && !newcomers::is_served(view, &rollout.rollout_id) {
+    if comes_later && !r.again && !served::is_served(view, &rollout.rollout_id) {
         return Some(Code::RolloutEnded.into());
     }
     let pin = view.software.get(r.robot_id.as_str()).and_then(|s| s.row.pin.as_ref());
@@ -144,16 +126,6 @@ fn left_out(view: &View, rollout: &Rollout, r: &RolloutRobot) -> Option<Reason> 
 pub fn is_gone(view: &View, rollout: &Rollout) -> bool {
     let bundle = view.bundles.get(rollout.spec.bundle.as_str()).map(|b| &b.row);
     rollout.revert_of.is_none() && bundle.is_none_or(|b| b.revoked.is_some() || !b.listed)
-}
-
-/// The robot's turn came long ago. The time in which the roll-out stood still does not count.
-fn is_late(now: &Now, rollout: &Rollout, r: &RolloutRobot) -> bool {
-    now.utc.ms_since(turn_came(rollout, r)) >= limits::STAGED_WITHIN.as_ms()
-}
-
-/// When the robot's turn came, or the roll-out went on after that.
-pub fn turn_came(rollout: &Rollout, r: &RolloutRobot) -> Utc {
-    rollout.since.max(r.since).max(rollout.resumed.unwrap_or_default())
 }
 
 fn waiting(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
@@ -214,7 +186,7 @@ fn staging(
         Some(UpdateState::Directed | UpdateState::Downloading) => {}
         Some(UpdateState::Refused) => return Some(Move::Skip(refused(report))),
         Some(_) => return Some(Move::IsStaged),
-        None if now.wall.ms_since(r.signed) >= limits::DIRECTIVE_RENEWED_MS => return Some(Move::SignAnew),
+        None if is_old(now, r.signed) => return Some(Move::SignAnew),
         None => {}
     }
     skips_offline(view, board, now, rollout, r).or_else(|| skips_stuck(now, rollout, r)).or_else(|| {
@@ -405,7 +377,7 @@ fn unused(
 ) -> Option<Move> {
     let life_ms = given.authority.valid_ms * 102 / 100 + 1;
     if view.bugs.time_releases_drain() {
-        let over = r.moments.granted_wall.is_some_and(|at| now.wall.ms_since(at) > life_ms);
+        let over = r.moments.granted_link.is_some_and(|at| now.wall.ms_since(at.wall) > life_ms);
         return over.then_some(Move::NotUsed);
     }
     let live = board.get(&r.robot_id).filter(|live| view.is_settled(live))?;
@@ -505,15 +477,24 @@ fn committing(view: &View, rollout: &Rollout, r: &RolloutRobot, report: Option<&
     }
 }
 
-fn reverting(view: &View, board: &Board, r: &RolloutRobot, report: Option<&UpdateReport>) -> Option<Move> {
+fn reverting(view: &View, board: &Board, now: &Now, r: &RolloutRobot, report: Option<&UpdateReport>) -> Option<Move> {
     if let Some(over) = ended(r, report) {
         return Some(over);
+    }
+    if let Some(why) = &r.way_back.refused {
+        let old = r.way_back.signed.is_some_and(|signed| is_old(now, signed));
+        // Nothing is kept, or two good orders were not taken: to ask again changes nothing.
+        let is_final = why.code == Code::NothingKept || (r.way_back.again && !old);
+        return Some(if is_final { Move::Stuck(why.clone()) } else { Move::OrderBackAnew });
     }
     let Some(drain_id) = &r.drain_id else { return Some(Move::Revert) };
     // In this drain: in another it was told to go back from something else.
     let told = view.desired.get(r.robot_id.as_str()).and_then(|d| d.row.drain_id.as_ref());
     if wants(view, r, Goal::Revert) && told == Some(drain_id) {
-        return None;
+        // What it took does not end; what it did not take yet does.
+        let taken = report.is_some_and(|report| report.directive >= r.way_back.generation);
+        let old = r.way_back.signed.is_some_and(|signed| is_old(now, signed));
+        return (old && !taken).then_some(Move::OrderBackAnew);
     }
     // A robot that its own safety system stopped goes back where it stands: to park would be motion.
     let stopped = board.get(&r.robot_id).is_some_and(|live| live.report.hardware_stop != HardwareStop::None);

@@ -2,6 +2,7 @@
 //! roll-outs, robots in them, what robots run, and what they must not run.
 
 use super::spec::RolloutSpec;
+use super::stamp::Stamp;
 use crate::authority::Authority;
 use crate::gates::{FailureEvidence, OutcomeEvidence, Suspicion, TaskTally};
 use crate::ids::{AreaId, BundleId, DrainId, RobotId, RolloutId};
@@ -401,16 +402,29 @@ pub struct Moments {
     pub draining: Option<Utc>,
     /// The drain held it, UTC of the site clock.
     pub held: Option<Utc>,
-    /// The drain held it, UTC of the wall.
-    pub held_wall: Option<Utc>,
-    /// It was given permission, UTC of the wall.
-    pub granted_wall: Option<Utc>,
-    /// It was heard with the bundle, UTC of the wall.
-    pub switched_wall: Option<Utc>,
+    /// The drain held it, link clock.
+    pub held_link: Option<Stamp>,
+    /// It was given permission, link clock.
+    pub granted_link: Option<Stamp>,
+    /// It was heard with the bundle, link clock.
+    pub switched_link: Option<Stamp>,
     /// It was heard with the bundle, UTC of the site clock.
     pub switched: Option<Utc>,
     /// Its probation was over, UTC of the site clock.
     pub on_trial: Option<Utc>,
+}
+
+/// The order to go back that a robot was given.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WayBack {
+    /// Generation of the section it came in first. 0: none was given.
+    pub generation: u64,
+    /// When a directive of its own was signed for it, UTC of the wall. None: it goes by the one that the robot took.
+    pub signed: Option<Utc>,
+    /// Why the robot did not take it.
+    pub refused: Option<Reason>,
+    /// The robot did not take the one before it either, though that one was not too old to be taken.
+    pub again: bool,
 }
 
 /// One robot in one roll-out.
@@ -434,6 +448,9 @@ pub struct RolloutRobot {
     pub directive: u64,
     /// When the newest was signed, UTC of the wall.
     pub signed: Utc,
+    /// The order to go back that it was given last.
+    #[serde(default)]
+    pub way_back: WayBack,
     /// The drain that was not released yet.
     pub drain_id: Option<DrainId>,
     /// The robot asked for permission in its drain.

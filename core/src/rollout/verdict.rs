@@ -3,18 +3,19 @@
 //! Invariant: a verdict is made of stored numbers only, and stands in the row with them. Small n is honest n: what was not proven is never
 //! called so.
 
-use super::Tx;
 use super::hear::is_hard;
 use super::rows::{Abort, Counted, Outcome, Rollout, RolloutRobot, Step, Verdict};
 use super::spec::{SmallWave, SmallWaveFailure};
 use super::view::View;
+use super::{Board, Tx};
+use crate::fleet::heard;
 use crate::fleet::rows::RobotCounter;
 use crate::gates::{self, FEW_ROBOTS, RobotOutcomes, Suspicion, TaskTally};
 use crate::ids::{RobotId, RolloutId};
 use crate::limits;
 use crate::reason::{Code, Reason};
-use crate::robot::Duty;
-use crate::time::Utc;
+use crate::robot::{Duty, Presence};
+use crate::time::{Now, Utc};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -84,13 +85,23 @@ pub fn count_tasks(tx: &mut Tx, id: &RolloutId) {
     tx.put(row, "rollout.tasks_counted");
 }
 
-/// Counts robots. Those on trial in wave `upto` or before count as having come through.
-pub fn see(view: &View, rollout: &Rollout, upto: Option<u32>) -> Seen {
+/// Counts robots at the gate of its wave. Those on trial in this wave or before that are not dark count as having come through.
+pub fn see_wave(view: &View, board: &Board, now: &Now, rollout: &Rollout) -> Seen {
+    see(view, rollout, |r| r.wave <= rollout.wave && !is_dark(board, now, r))
+}
+
+/// It is not heard at this moment: as long as it is on trial it is not called clean.
+pub fn is_dark(board: &Board, now: &Now, r: &RolloutRobot) -> bool {
+    heard::presence(board, &r.robot_id, now) == Presence::Offline
+}
+
+/// Counts robots. `came_through`: whether one on trial counts for the bundle.
+fn see(view: &View, rollout: &Rollout, came_through: impl Fn(&RolloutRobot) -> bool) -> Seen {
     let mut seen = Seen::default();
     for r in view.robots_of(&rollout.rollout_id).filter(|r| r.attempted) {
         seen.attempted += 1;
         let kept = matches!(r.step, Step::Committing | Step::Committed);
-        let on_trial = r.step == Step::Trial && upto.is_some_and(|wave| r.wave <= wave);
+        let on_trial = r.step == Step::Trial && came_through(r);
         match r.failure {
             Some(_) => seen.outcomes.failed += 1,
             // One that was kept out of work says nothing for the bundle.
@@ -124,7 +135,7 @@ pub fn of(rollout: &Rollout, seen: &Seen, outcome: Outcome, reason: Reason, at: 
 
 /// Why the roll-out must end now, if it must. Looked at in every phase, also while it stands still.
 pub fn against(view: &View, rollout: &Rollout) -> Option<(Reason, bool, Seen)> {
-    let seen = see(view, rollout, None);
+    let seen = see(view, rollout, |_| false);
     let failed = seen.outcomes.failed;
     let mut failures = view.robots_of(&rollout.rollout_id).filter_map(|r| r.failure.as_ref());
     if let Some(hard) = failures.find(|f| is_hard(f)) {
@@ -176,9 +187,9 @@ pub fn wave<'a>(view: &'a View, id: &RolloutId, wave: u32) -> impl Iterator<Item
 }
 
 /// What the gate after a wave says.
-pub fn gate(view: &View, rollout: &Rollout, at: Utc) -> Verdict {
-    let seen = see(view, rollout, Some(rollout.wave));
-    let give = |outcome, code: Code| of(rollout, &seen, outcome, code.into(), at);
+pub fn gate(view: &View, board: &Board, now: &Now, rollout: &Rollout) -> Verdict {
+    let seen = see_wave(view, board, now, rollout);
+    let give = |outcome, code: Code| of(rollout, &seen, outcome, code.into(), now.utc);
     if rollout.revert_of.is_some() {
         return give(Outcome::Promoted, Code::GateReverted);
     }

@@ -180,6 +180,8 @@ pub(crate) struct Updater {
     pub(crate) next: Option<(Job, u64)>,
     /// Envelope that was looked at and needs no second look.
     pub(crate) judged: Option<String>,
+    /// Generation of the section whose order to go back was refused because nothing is kept.
+    pub(crate) no_way_back: Option<u64>,
     /// Content that is known to be there.
     pub(crate) fetched: BTreeSet<Digest>,
     /// Bytes that are there and those that are needed.

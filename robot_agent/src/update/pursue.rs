@@ -92,7 +92,11 @@ impl AgentCore {
             UpdateState::Trial => self.trial(update, &holdings),
             UpdateState::Committing => self.committing(now, update, &holdings),
             UpdateState::RollingBack => return self.rolling_back(now, update, &holdings),
-            UpdateState::Committed if self.wants_back(&update) && holdings.switch.kept().is_some() => {
+            UpdateState::Committed if self.wants_back(&update) => {
+                if holdings.switch.kept().is_none() {
+                    self.refuse_way_back();
+                    return self.without_update(now, &holdings);
+                }
                 self.go_back(update, Reason::from(Code::RevertAsked));
             }
             _ => return self.without_update(now, &holdings),
@@ -279,7 +283,11 @@ impl AgentCore {
     /// Looks at a directive that leads back from the committed set though something else was tried and left since. True: it was taken.
     fn begin_way_back(&mut self, now: &Now, holdings: &Holdings) -> bool {
         let Some(desired) = self.update.desired.clone().filter(|d| d.goal == Goal::Revert) else { return false };
-        if self.is_observed() || self.names(&desired) || holdings.switch.kept().is_none() {
+        if self.is_observed() || self.names(&desired) {
+            return false;
+        }
+        if holdings.switch.kept().is_none() {
+            self.refuse_way_back();
             return false;
         }
         let software = self.kept.ledger.software.clone();
@@ -339,6 +347,15 @@ impl AgentCore {
         self.update.judged = Some(desired.directive.clone());
         let refused = UpdateEvent::DirectiveRefused { generation: desired.generation, reason };
         self.emit(Lane::Event, RobotEvent::Update(refused));
+    }
+
+    /// There is nothing to go back to, which the server cannot know; it is told once.
+    fn refuse_way_back(&mut self) {
+        let asked = self.update.desired.as_ref().map(|d| d.generation);
+        if self.update.no_way_back != asked {
+            self.update.no_way_back = asked;
+            self.refuse_directive(Reason::from(Code::NothingKept));
+        }
     }
 
     /// The repository has answered: what it says is believed first, then the directive is held against it.

@@ -714,3 +714,23 @@ fn what_was_asked_of_the_disk_is_on_the_ledger_first() {
     assert_eq!(rig.exit, Some(ExitReason::Switched));
     assert!(switch(&rig).trial.is_some());
 }
+
+#[test]
+fn a_robot_that_gave_up_the_set_before_says_once_that_there_is_no_way_back() {
+    let (rig, releases) = connected();
+    let first = releases.release_base("1.1.0");
+    let mut rig = committed(rig, &releases, &first, 1);
+    a_day_passes(&mut rig, &releases);
+    let (mut rig, mut order) = on_trial(rig, &releases, &releases.release_base("1.2.0"), 2);
+    want(&mut rig, order.to(Goal::Revert));
+    let mut rig = relaunch(rig);
+    rig.pass(1_000);
+    assert_eq!((state(&rig), switch(&rig).kept()), (Some(UpdateState::RolledBack), None), "its slot was taken");
+    let before = refused(&rig).len();
+    let mut back = Order::new(releases.directive(&first, 3));
+    back.generation = 10_000;
+    want(&mut rig, back.to(Goal::Revert));
+    rig.pass(10_000);
+    assert_eq!(refused(&rig)[before..], [Code::NothingKept]);
+    assert_eq!(state(&rig), Some(UpdateState::RolledBack), "it runs what it ran");
+}

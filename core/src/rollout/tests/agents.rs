@@ -52,10 +52,32 @@ impl Rig {
             self.ends_task(n, true);
         }
         let Some(desired) = self.row::<DesiredUpdate>(robot.id.as_str()) else { return };
-        let Some((generation, bundle)) = desired.directive.split_once(' ') else { return };
+        let words: Vec<&str> = desired.directive.split(' ').collect();
+        let [generation, bundle, issued] = words[..] else { return };
         let (generation, bundle) = (generation.parse().expect("a number"), BundleId::parse(bundle).expect("an id"));
         let named = robot.report.as_ref().is_some_and(|r| r.directive == generation);
+        let over = robot.report.as_ref().is_some_and(|r| r.state == UpdateState::Committed);
+        if robot.judged != desired.directive && desired.goal == Goal::Revert && (!named || over) {
+            let why = match robot.fate {
+                Fate::KeepsNothing => Some(Code::NothingKept),
+                Fate::Stubborn => Some(Code::DirectiveRefused),
+                _ => None,
+            };
+            if let Some(why) = why {
+                return self.refuses(n, &desired, why);
+            }
+        }
         if !named {
+            let issued = Utc(issued.parse().expect("a moment"));
+            if robot.judged == desired.directive {
+                return;
+            }
+            if self.now.wall.ms_since(issued) >= DIRECTIVE_LIVES_MS {
+                return self.refuses(n, &desired, Code::DirectiveRefused);
+            }
+            if desired.goal == Goal::Revert && robot.version != "0.9.0" {
+                self.tell(n, fresh_report(UpdateState::Committed, &bundle, generation));
+            }
             if matches!(desired.goal, Goal::Stage | Goal::Activate) {
                 let state = match robot.fate {
                     Fate::NoBytes => UpdateState::Downloading,
@@ -82,11 +104,19 @@ impl Rig {
                 self.robots[n].kept.clone_from(&robot.version);
                 self.report(n, UpdateState::Committed);
             }
+            (UpdateState::Committed, Goal::Revert) if matches!(robot.fate, Fate::KeepsNothing | Fate::Stubborn) => {}
             (UpdateState::Probation | UpdateState::Trial | UpdateState::Committed, Goal::Revert) if stands => {
                 self.goes_back(n, None);
             }
             _ => {}
         }
+    }
+
+    /// It says once that it does not take the directive.
+    fn refuses(&mut self, n: usize, desired: &DesiredUpdate, why: Code) {
+        self.robots[n].judged.clone_from(&desired.directive);
+        let (generation, reason) = (desired.generation, why.into());
+        self.say(n, RobotEvent::Update(UpdateEvent::DirectiveRefused { generation, reason }));
     }
 
     pub(super) fn activates(

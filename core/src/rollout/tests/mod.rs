@@ -17,6 +17,7 @@ mod staging;
 mod steps;
 mod trial_and_gates;
 mod waves_and_matching;
+mod ways_back;
 
 use super::commands::{self, Command, Verb};
 use super::rows::{AreaBundle, Bundle, Outcome, Phase, RobotSoftware, Rollout, RolloutRobot, Step};
@@ -37,6 +38,9 @@ use crate::update::{DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState}
 use crate::work::{InboxEntry, InboxItem, LaneMark, Live, RobotEvent, Sample, SampleBody, Session, WorkStats};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
+
+/// A directive may be taken for so long, milliseconds.
+const DIRECTIVE_LIVES_MS: u64 = 7 * 24 * 3_600_000;
 
 /// Milliseconds since 1970 at which each test begins: a Friday morning.
 const BEGIN: i64 = 1_795_000_000_000;
@@ -61,6 +65,10 @@ enum Fate {
     Unfit,
     /// It takes permissions and does not use them.
     Dawdles,
+    /// It gave up what it kept.
+    KeepsNothing,
+    /// It takes no order to go back, whatever it says.
+    Stubborn,
 }
 
 /// One robot as the server meets it.
@@ -74,6 +82,8 @@ struct Robot {
     kept: String,
     report: Option<UpdateReport>,
     seen_grant: u64,
+    /// The directive that it looked at last and did not take.
+    judged: String,
     fate: Fate,
     is_off: bool,
     /// It gets no tasks.
@@ -82,12 +92,12 @@ struct Robot {
     at: &'static str,
 }
 
-/// Envelopes of tests: the generation as text.
+/// Envelopes of tests: generation, bundle, and when it was signed, as text.
 struct Plain;
 
 impl Sign for Plain {
     fn directive(&self, order: &Order) -> String {
-        format!("{} {}", order.generation, order.bundle)
+        format!("{} {} {}", order.generation, order.bundle, order.issued_at.0)
     }
 }
 
@@ -169,6 +179,7 @@ impl Rig {
             kept: "0.9.0".into(),
             report: None,
             seen_grant: 0,
+            judged: String::new(),
             fate: Fate::Good,
             is_off: false,
             idles: false,

@@ -259,3 +259,40 @@ fn a_rate_of_task_failures_is_shown_and_ends_it_only_if_that_was_asked_for() {
         assert_eq!(rollout.abort.map(|a| (a.reason.code, a.hard)), acts.then_some((Code::RateTooHigh, false)));
     }
 }
+
+#[test]
+fn robots_that_come_and_go_keep_no_gate_waiting_and_who_is_dark_then_is_not_called_clean() {
+    let mut rig = Rig::new(12);
+    let waves = vec![Wave::Count(11), Wave::Rest];
+    let rules = RolloutSpec { waves, allow_full_push: true, exposure_tasks: 0, ..spec() };
+    rig.start(rules);
+    rig.until(100, |r| r.phase() == Phase::Soaking);
+    let wave: Vec<usize> = rig.order()[..11].to_vec();
+    // One second in 44 each, four seconds apart: less than a quarter is there at any moment, and all were heard in 44 seconds.
+    for t in 0..120 {
+        wave.iter().enumerate().for_each(|(i, n)| rig.robots[*n].is_off = t % 44 != i * 4);
+        rig.tick();
+        if rig.rollout("ro").promoted == 1 {
+            break;
+        }
+    }
+    let verdict = rig.rollout("ro").verdicts.pop().expect("a verdict");
+    assert_eq!((verdict.outcome, verdict.attempted), (Outcome::PromotedUnproven, 11));
+    let clean = verdict.robots.outcomes.clean;
+    assert!((1..11).contains(&clean), "{clean} of 11: not those that are dark");
+}
+
+#[test]
+fn a_wave_that_is_dark_whole_is_waited_for_though_it_was_heard_at_its_gate() {
+    let mut rig = Rig::new(6);
+    rig.start(RolloutSpec { exposure_tasks: 1_000, exposure_within_ms: 60_000, ..spec() });
+    let n = rig.order()[0];
+    rig.until(60, |r| r.phase() == Phase::Gate);
+    rig.ticks(25);
+    rig.robots[n].is_off = true;
+    rig.ticks(60);
+    assert_eq!(rig.phase(), Phase::Gate, "its time is over, and nobody is there to be judged");
+    rig.robots[n].is_off = false;
+    rig.ticks(2);
+    assert_eq!((rig.phase(), verdicts(&rig)[0].1), (Phase::Review, Code::NoExposure));
+}

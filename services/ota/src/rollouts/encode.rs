@@ -6,6 +6,7 @@ use midshift_core::rollout::dry_run::DryRun;
 use midshift_core::rollout::explain::blocked;
 use midshift_core::rollout::rows::{Abort, Act, Quarantine, RobotSoftware, Rollout, RolloutRobot, Step, Verdict};
 use midshift_core::rollout::spec::{RolloutSpec, Wave};
+use midshift_core::rollout::stamp::Stamp;
 use midshift_core::rollout::verdict;
 use midshift_core::rollout::view::View;
 use midshift_core::rows::Revision;
@@ -182,6 +183,7 @@ pub fn robot(view: &View, board: &Board, now: &Now, row: &Rollout, r: &RolloutRo
     let waits = blocked(view, board, now, row, r);
     let m = &r.moments;
     let span = |from: Option<Utc>, to: Option<Utc>| from.zip(to).map(|(from, to)| duration(to.ms_since(from)));
+    let on_link = |from: Option<Stamp>, to: Option<Stamp>| from.zip(to).map(|(from, to)| duration(to.ms_since(&from)));
     let progress = board.get(&r.robot_id).and_then(|live| live.report.update.as_ref());
     v1::RolloutRobot {
         rollout_id: r.rollout_id.to_string(),
@@ -201,8 +203,8 @@ pub fn robot(view: &View, board: &Board, now: &Now, row: &Rollout, r: &RolloutRo
         off_work: Some(v1::OffWork {
             drain_wait: span(m.asked, m.draining),
             park_drive: span(m.draining, m.held),
-            parked_to_grant: span(m.held_wall, m.granted_wall),
-            switch: span(m.granted_wall, m.switched_wall),
+            parked_to_grant: on_link(m.held_link, m.granted_link),
+            switch: on_link(m.granted_link, m.switched_link),
             probation: span(m.switched, m.on_trial),
         }),
         drain_id: text(r.drain_id.as_ref()),

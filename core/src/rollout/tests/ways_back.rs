@@ -1,0 +1,164 @@
+//! Orders to go back that robots do not take, and directives that lay too long.
+
+use super::*;
+
+const DAY_MS: u64 = 24 * 3_600_000;
+
+/// A roll-out of which wave 0 has committed and wave 1 is on trial.
+fn half() -> Rig {
+    let mut rig = Rig::new(6);
+    rig.start(RolloutSpec { soak_ms: 20_000, ..spec() });
+    rig.until(200, |r| r.rollout("ro").wave == 1 && r.phase() == Phase::Soaking);
+    rig
+}
+
+/// Bundle 2 was kept by all, 3 was tried and left again by one: only a directive of its own leads that one back from 2.
+fn left_another(n: usize) -> Rig {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    rig.until(400, |r| r.phase() == Phase::Completed);
+    rig.ticks(4);
+    let mut next = RolloutSpec { bundle: bundle_id(3), waves: vec![Wave::Rest], allow_full_push: true, ..spec() };
+    next.selector.robots.insert(robot_id(n));
+    rig.start_as("next", next, false);
+    rig.until(60, |r| r.of("next", n).step == Step::Trial);
+    rig.must("next", Verb::Abort);
+    rig.until(60, |r| r.rollout("next").phase == Phase::Aborted);
+    assert_eq!(rig.robots[n].version, "2.0.0");
+    rig
+}
+
+/// Takes bundle 2 back from everybody.
+fn take_back(rig: &mut Rig) {
+    rig.ask(&Command::Rollback { of: rollout_id("ro"), rollout_id: rollout_id("back") }).expect("allowed");
+    for verb in [Verb::Submit, Verb::Approve, Verb::Start { supersede: false }] {
+        rig.must("back", verb);
+    }
+}
+
+fn section(rig: &Rig, n: usize) -> DesiredUpdate {
+    rig.row(robot_id(n).as_str()).expect("a section")
+}
+
+/// Robots, reasons and roll-outs of the incidents that say that one could not go back.
+fn stuck(rig: &Rig) -> Vec<(String, Option<String>, Option<String>)> {
+    let told = rig.feed.iter().filter(|e| &*e.kind == crate::maintenance::INCIDENT);
+    let read = |e: &Entry| {
+        let reason: Reason = serde_json::from_str(e.body.as_ref()?).expect("a reason");
+        let fact = |key: &str| reason.metadata.get(key).cloned();
+        (reason.code == Code::RollbackFailed).then(|| (e.subject.to_string(), fact("because"), fact("rollout_id")))
+    };
+    told.filter_map(read).collect()
+}
+
+#[test]
+fn a_robot_that_keeps_nothing_is_stuck_and_its_abort_comes_to_its_end() {
+    let mut rig = half();
+    let n = rig.order()[0];
+    assert_eq!(rig.step(n), Step::Committed);
+    rig.robots[n].fate = Fate::KeepsNothing;
+    rig.must("ro", Verb::Abort);
+    rig.until(100, |r| r.phase() == Phase::Aborted);
+    assert_eq!((rig.step(n), rig.count(Step::RolledBack)), (Step::Stuck, 5));
+    assert_eq!(rig.of("ro", n).failure.expect("counted").code, Code::RollbackFailed);
+    let told = (robot_id(n).to_string(), Some("NOTHING_KEPT".to_owned()), Some("ro".to_owned()));
+    assert_eq!(stuck(&rig), [told]);
+    assert_eq!(rig.rollout("ro").in_flight, 1, "it stays out of work");
+    rig.retire(n);
+    rig.ticks(2);
+    assert_eq!((rig.step(n), rig.rollout("ro").in_flight), (Step::Skipped, 0), "a person has looked");
+}
+
+#[test]
+fn an_order_to_go_back_that_is_refused_is_signed_anew_once() {
+    for stubborn in [false, true] {
+        let mut rig = half();
+        let n = rig.order()[0];
+        rig.robots[n].fate = Fate::Stubborn;
+        rig.must("ro", Verb::Abort);
+        let first = section(&rig, n).directive;
+        rig.until(60, |r| !r.robots[n].judged.is_empty());
+        if !stubborn {
+            rig.robots[n].fate = Fate::Good;
+        }
+        rig.until(60, |r| r.phase() == Phase::Aborted);
+        assert_ne!(section(&rig, n).directive, first, "signed anew");
+        let (end, incidents) = if stubborn { (Step::Stuck, 1) } else { (Step::RolledBack, 0) };
+        assert_eq!((rig.step(n), stuck(&rig).len()), (end, incidents));
+        let second = section(&rig, n).directive;
+        rig.ticks(20);
+        assert_eq!(section(&rig, n).directive, second, "and no third time");
+    }
+}
+
+#[test]
+fn what_a_robot_says_of_an_older_order_says_nothing_of_the_newest() {
+    let mut rig = half();
+    let n = rig.order()[0];
+    rig.robots[n].fate = Fate::Stubborn;
+    let before = section(&rig, n).generation;
+    rig.must("ro", Verb::Abort);
+    rig.until(60, |r| section(r, n).goal == Goal::Revert);
+    let reason = Code::NothingKept.into();
+    rig.say(n, RobotEvent::Update(UpdateEvent::DirectiveRefused { generation: before, reason }));
+    rig.ota_turn();
+    assert_eq!((rig.step(n), rig.of("ro", n).way_back.refused), (Step::Reverting, None));
+}
+
+#[test]
+fn an_order_to_go_back_that_lies_too_long_is_signed_anew_for_a_robot_that_is_away() {
+    let n = 2;
+    let mut rig = left_another(n);
+    take_back(&mut rig);
+    rig.until(60, |r| r.of("back", n).way_back.generation > 0);
+    // It is told so, and falls silent before it has read it.
+    rig.robots[n].is_off = true;
+    let first = section(&rig, n).directive;
+    for _ in 0..8 {
+        rig.pass(DAY_MS);
+        rig.turn();
+    }
+    assert_eq!(rig.of("back", n).step, Step::Reverting);
+    assert_ne!(section(&rig, n).directive, first);
+    rig.robots[n].is_off = false;
+    rig.until(20, |r| r.of("back", n).step == Step::RolledBack);
+    assert_eq!((rig.robots[n].version.as_str(), stuck(&rig).len()), ("0.9.0", 0));
+}
+
+#[test]
+fn an_order_that_was_taken_is_not_signed_anew_however_long_the_robot_takes() {
+    let n = 2;
+    let mut rig = left_another(n);
+    take_back(&mut rig);
+    rig.until(60, |r| r.of("back", n).way_back.generation > 0);
+    let generation = section(&rig, n).generation;
+    // It took it, and is switched off before it goes back.
+    rig.tell(n, fresh_report(UpdateState::Committed, &bundle_id(2), generation));
+    rig.ota_turn();
+    rig.robots[n].is_off = true;
+    for _ in 0..8 {
+        rig.pass(DAY_MS);
+        rig.turn();
+    }
+    assert_eq!(section(&rig, n).generation, generation);
+}
+
+#[test]
+fn an_order_to_fetch_that_lay_too_long_while_the_server_was_away_leaves_nobody_out() {
+    let mut rig = Rig::new(4);
+    rig.create("ro", spec());
+    rig.must("ro", Verb::Submit);
+    rig.must("ro", Verb::Approve);
+    rig.robots[1].is_off = true;
+    rig.must("ro", Verb::Start { supersede: false });
+    assert_eq!(rig.step(1), Step::Staging);
+    let first = section(&rig, 1).directive;
+    // Nobody plans for eight days. Then it comes back, and is told what was in the store.
+    rig.pass(8 * DAY_MS);
+    rig.robots[1].is_off = false;
+    rig.robot_acts(1);
+    assert_eq!(rig.robots[1].judged, first, "it is too old");
+    rig.ticks(3);
+    let r = rig.of("ro", 1);
+    assert!(r.why.is_none() && matches!(r.step, Step::Staged | Step::Draining), "{:?} {:?}", r.why, r.step);
+}

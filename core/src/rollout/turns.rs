@@ -1,0 +1,39 @@
+//! Whose turn it is in a roll-out, and since when. Reads rows only.
+//!
+//! Called by every room that waits for a robot or passes one over.
+
+use super::rows::{Phase, Rollout, RolloutRobot};
+use crate::limits;
+use crate::reason::Code;
+use crate::time::{Now, Utc};
+
+/// The robot's turn has come.
+pub fn is_on(rollout: &Rollout, r: &RolloutRobot) -> bool {
+    match rollout.phase {
+        Phase::Applying => r.wave <= rollout.wave,
+        // Newcomers of a completed roll-out come one by one.
+        Phase::Completed => is_newcomer(rollout, r),
+        _ => false,
+    }
+}
+
+/// It came after the roll-out was completed.
+pub fn is_newcomer(rollout: &Rollout, r: &RolloutRobot) -> bool {
+    r.wave > rollout.spec.waves.len() as u32
+}
+
+/// Whether a robot that was skipped is tried once more at the end.
+pub fn is_retried(r: &RolloutRobot) -> bool {
+    let codes = [Code::SkippedOffline, Code::SkippedBusy, Code::SkippedStuck];
+    r.why.as_ref().is_some_and(|why| codes.contains(&why.code))
+}
+
+/// The robot's turn came long ago. The time in which the roll-out stood still does not count.
+pub fn is_late(now: &Now, rollout: &Rollout, r: &RolloutRobot) -> bool {
+    now.utc.ms_since(turn_came(rollout, r)) >= limits::STAGED_WITHIN.as_ms()
+}
+
+/// When the robot's turn came, or the roll-out went on after that.
+pub fn turn_came(rollout: &Rollout, r: &RolloutRobot) -> Utc {
+    rollout.since.max(r.since).max(rollout.resumed.unwrap_or_default())
+}
