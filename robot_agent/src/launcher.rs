@@ -8,7 +8,8 @@
 //! starts still counts. The program's pulse is one marked line a second on its standard output; all other lines pass through.
 //! With `--sets` the program is the one of the set that the switch record names, and PROGRAM for a set that brings none. For a set with
 //! another base it starts the machine again, as far as there is one: the boot loader is simulated.
-//! Invariant: at most one child at a time; the switch record is written only while no child runs. Ended by a signal, the launcher
+//! Invariant: at most one child at a time; the switch record is written only while no child runs; a record that cannot be written, on a
+//! full disk, keeps no robot from being started: what would be in it holds for this launcher, which tries again. Ended by a signal, the launcher
 //! leaves the child to whoever sent it: a service manager signals the whole group.
 
 #![expect(clippy::disallowed_methods, reason = "a program of its own without a runtime and without simulated time")]
@@ -132,15 +133,16 @@ fn keep_running(orders: &Orders) -> io::Result<()> {
         machine_starts(sets)?;
     }
     let mut tries = read_tries(&orders.record);
+    let mut unwritten = Unwritten::default();
     loop {
-        let start = choose(orders, &tries)?;
+        let start = choose(orders, &tries, &mut unwritten)?;
         tries = start.tries.clone();
         keep_tries(&orders.record, &tries);
         beacon.begins(&start);
         match run_once(orders, &start, &mut tries, &mut beacon)? {
             Ending::Finished => {
                 // A set on probation has proven nothing by ending.
-                if is_trusted(orders) {
+                if is_trusted(orders, &start) {
                     tries.clear();
                     keep_tries(&orders.record, &tries);
                 }
@@ -170,29 +172,54 @@ struct Start {
     program: String,
     /// Counts this start.
     tries: Tries,
-    /// Of the switch record that names it.
+    /// Of the switch record that lies on the disk.
     number: u64,
 }
 
+/// A switch record that this launcher could not write: it holds as long as the one on the disk is the one that it was to follow.
+#[derive(Default)]
+struct Unwritten(Option<Switch>);
+
+impl Unwritten {
+    /// The record that holds, and the number of the one on the disk. One that could not be written is tried again.
+    fn read(&mut self, path: &Path) -> io::Result<(Switch, u64)> {
+        let on_disk = Switch::read(path).map_err(|e| named(e, path))?;
+        let follows = |ours: &Switch| ours.number == on_disk.number + 1;
+        let Some(mut ours) = self.0.take().filter(follows) else { return Ok((on_disk.clone(), on_disk.number)) };
+        ours.number = on_disk.number;
+        let number = self.write(&mut ours, path);
+        Ok((ours, number))
+    }
+    /// Writes a record that follows the one on the disk, or keeps it; the number of the one that lies there then.
+    fn write(&mut self, switch: &mut Switch, path: &Path) -> u64 {
+        let before = switch.number;
+        let Err(error) = switch.write(path) else { return switch.number };
+        say(&format!("{} cannot be written: {error}; set {} is started without it", path.display(), switch.running()));
+        self.0 = Some(switch.clone());
+        before
+    }
+}
+
 /// The set that the record names; one on trial that has had its tries is put away first.
-fn choose(orders: &Orders, tries: &Tries) -> io::Result<Start> {
+fn choose(orders: &Orders, tries: &Tries, unwritten: &mut Unwritten) -> io::Result<Start> {
     let Some(sets) = &orders.sets else {
         let set = switch::FACTORY.to_owned();
         return Ok(Start { tries: tries.plus_one(&set), program: orders.program.clone(), set, number: 0 });
     };
     let path = sets.join(SWITCH);
-    let mut switch = Switch::read(&path).map_err(|e| named(e, &path))?;
+    let (mut switch, mut number) = unwritten.read(&path)?;
     let tried = switch.running().to_owned();
     if let Some(had) = starts::put_away(&mut switch, tries) {
         say(&format!("set {tried} did not live in {had} tries; back to {}", switch.current));
-        switch.write(&path).map_err(|e| named(e, &path))?;
+        number = unwritten.write(&mut switch, &path);
     }
     let had = tries.of(switch.running());
     if !boot_into(sets, &switch, had)? {
         if switch.trial.is_some() {
             say(&format!("set {} has a base that does not start; back to {}", switch.running(), switch.current));
             switch.fall_back(had.max(1));
-            switch.write(&path).map_err(|e| named(e, &path))?;
+            switch.number = number;
+            number = unwritten.write(&mut switch, &path);
             boot_into(sets, &switch, had)?;
         } else {
             say(&format!("set {} has no base that starts: it runs on the one that does", switch.running()));
@@ -201,7 +228,7 @@ fn choose(orders: &Orders, tries: &Tries) -> io::Result<Start> {
     let set = switch.running().to_owned();
     let own = sets.join(&set).join(PROGRAM);
     let program = if own.exists() { own.to_string_lossy().into_owned() } else { orders.program.clone() };
-    Ok(Start { tries: tries.plus_one(&set), program, set, number: switch.number })
+    Ok(Start { tries: tries.plus_one(&set), program, set, number })
 }
 
 /// Number of the switch record; it rises with each change.
@@ -215,14 +242,16 @@ fn named(error: io::Error, path: &Path) -> io::Error {
     io::Error::new(error.kind(), format!("{}: {error}", path.display()))
 }
 
-/// Reads the boot record, changes it, and writes it if it became another.
-fn change_boot<T>(sets: &Path, change: impl FnOnce(&mut Boot) -> T) -> io::Result<T> {
+/// Reads the boot record, changes it, and writes it if it became another. The record that lies there then: the one before, if it could not
+/// be written.
+fn change_boot(sets: &Path, change: impl FnOnce(&mut Boot)) -> io::Result<Boot> {
     let path = sets.join(BOOT);
     let before = Boot::read(&path).map_err(|e| named(e, &path))?;
     let mut boot = before.clone();
-    let changed = change(&mut boot);
-    boot.write_over(&before, &path).map_err(|e| named(e, &path))?;
-    Ok(changed)
+    change(&mut boot);
+    let Err(error) = boot.write_over(&before, &path) else { return Ok(boot) };
+    say(&format!("{} cannot be written: {error}; the machine stays on the base that it runs on", path.display()));
+    Ok(before)
 }
 
 /// Whether a slot has the bytes that the record says. The factory's base is the machine itself.
@@ -232,7 +261,7 @@ fn starts_well(sets: &Path, slot: Slot, image: &Image) -> bool {
 
 /// The launcher stands for the machine: when it starts, so does the boot loader.
 fn machine_starts(sets: &Path) -> io::Result<()> {
-    change_boot(sets, |boot| boot.start(|slot, image| starts_well(sets, slot, image)))
+    change_boot(sets, |boot| boot.start(|slot, image| starts_well(sets, slot, image))).map(drop)
 }
 
 /// Starts the machine again if it runs on another base than the set that is to run. Whether it runs on that base now.
@@ -243,7 +272,7 @@ fn boot_into(sets: &Path, switch: &Switch, tries: u32) -> io::Result<bool> {
         Err(error) if error.kind() == io::ErrorKind::NotFound => switch::FACTORY.to_owned(),
         Err(error) => return Err(error),
     };
-    change_boot(sets, |boot| {
+    let boot = change_boot(sets, |boot| {
         match &switch.trial {
             None => boot.settle(&base),
             Some(_) => boot.try_out(&base),
@@ -253,20 +282,19 @@ fn boot_into(sets: &Path, switch: &Switch, tries: u32) -> io::Result<bool> {
             if tries == 0 {
                 boot.ran_well();
             }
-            return true;
-        }
-        if slot.is_some() {
+        } else if slot.is_some() {
             say(&format!("the machine starts again, for the base {base}"));
             boot.start(|slot, image| starts_well(sets, slot, image));
         }
-        slot == Some(boot.booted)
-    })
+    })?;
+    Ok(boot.slot_of(&base) == Some(boot.booted))
 }
 
 /// Whether a program that runs well clears its tries: a set on probation is not believed before it is proven.
-fn is_trusted(orders: &Orders) -> bool {
+fn is_trusted(orders: &Orders, start: &Start) -> bool {
     let Some(sets) = &orders.sets else { return true };
-    Switch::read(&sets.join(SWITCH)).is_ok_and(|switch| starts::is_trusted(&switch))
+    // The record may name one on trial that was put away and could not be written so.
+    Switch::read(&sets.join(SWITCH)).is_ok_and(|switch| starts::is_trusted(&switch) || switch.running() != start.set)
 }
 
 /// Runs the program until it ends or hangs.
@@ -296,7 +324,7 @@ fn run_once(orders: &Orders, start: &Start, tries: &mut Tries, beacon: &mut Beac
         // The other end is gone only if the program was already given up.
         let _ = signs.send(Sign::Ended);
     });
-    let ending = watch(&mut child.0, &heard, orders, tries, beacon)?;
+    let ending = watch(&mut child.0, &heard, orders, start, tries, beacon)?;
     drop(heard);
     drop(child);
     // A grandchild may keep the pipe open; it is not waited for.
@@ -308,6 +336,7 @@ fn watch(
     child: &mut Child,
     heard: &Receiver<Sign>,
     orders: &Orders,
+    start: &Start,
     tries: &mut Tries,
     beacon: &mut Beacon,
 ) -> io::Result<Ending> {
@@ -319,7 +348,7 @@ fn watch(
             Ok(Sign::Pulse) => {
                 pulses += 1;
                 sign_by = Instant::now() + orders.hang;
-                if starts::is_well(pulses) && is_trusted(orders) {
+                if starts::is_well(pulses) && is_trusted(orders, start) {
                     tries.clear();
                     keep_tries(&orders.record, tries);
                 }

@@ -54,6 +54,20 @@ fn on_trial(orders: &Orders, set: &str) {
     switch.write(&path).expect("writes");
 }
 
+/// As [`on_trial`] where the record cannot be written: by way of another folder.
+fn on_trial_by(set: &str, beside: &Path) {
+    let elsewhere = beside.join(SWITCH);
+    let mut switch = Switch::default();
+    switch.try_out(set);
+    switch.write(&elsewhere).expect("writes");
+    fs::rename(elsewhere, beside.with_extension("")).expect("moves");
+}
+
+/// What a launcher that has just begun starts.
+fn chosen(orders: &Orders) -> Start {
+    choose(orders, &read_tries(&orders.record), &mut Unwritten::default()).expect("chooses")
+}
+
 fn record(orders: &Orders) -> Switch {
     Switch::read(&orders.sets.as_ref().expect("has sets").join(SWITCH)).expect("reads")
 }
@@ -99,7 +113,7 @@ fn a_program_that_fails_is_started_again_until_it_ends_well_and_its_tries_are_on
 fn a_program_without_a_pulse_is_killed() {
     let (_folder, mut orders) = robot("echo a line is no pulse; exec sleep 600");
     orders.hang = Duration::from_secs(1);
-    let start = choose(&orders, &read_tries(&orders.record)).expect("chooses");
+    let start = chosen(&orders);
     assert_eq!(
         run_once(&orders, &start, &mut start.tries.clone(), &mut Beacon::new(&orders)).expect("runs"),
         Ending::Hung
@@ -168,22 +182,69 @@ fn a_record_that_cannot_be_written_stops_no_robot_and_its_tries_are_counted_all_
     assert_eq!(ran(&folder), ["v1", "v1", "factory"]);
 }
 
+/// Makes a record that is replaced whole unwritable, whoever asks: where its new text would be put lies a folder.
+fn block(orders: &Orders, record: &str) -> PathBuf {
+    let beside = orders.sets.as_ref().expect("has sets").join(record).with_extension("new");
+    fs::create_dir(&beside).expect("makes");
+    beside
+}
+
+#[test]
+fn a_set_is_put_away_though_the_switch_record_cannot_be_written_and_stays_so_while_the_launcher_lives() {
+    let (folder, mut orders) = with_sets(&[("v1", "exit 1")]);
+    // The factory's fails once; then the disk has room again.
+    let beside = block(&orders, SWITCH);
+    let script = format!("echo $MIDSHIFT_SET >> $0; rmdir {}", beside.display());
+    orders.arguments[1] = format!("{script} && exit 1; exit 0");
+    on_trial_by("v1", &beside);
+    keep_running(&orders).expect("runs");
+    assert_eq!(ran(&folder), ["v1", "v1", "factory", "factory"], "it is not tried once more");
+    let after = record(&orders);
+    assert_eq!((after.number, after.running()), (2, "factory"), "it was written when there was room");
+    assert_eq!(after.fallen, Some(switch::Fallen { set: "v1".to_owned(), tries: TRIES_MAX }));
+}
+
+#[test]
+fn what_could_not_be_written_does_not_hold_over_what_the_agent_has_written_since() {
+    let (folder, mut orders) = with_sets(&[("v1", "exit 1"), ("v2", "exit 0")]);
+    let beside = block(&orders, SWITCH);
+    let mut next = Switch { number: 1, ..Switch::default() };
+    next.try_out("v2");
+    next.write(&folder.path().join("next")).expect("writes");
+    let sets = orders.sets.clone().expect("has sets");
+    let copy = format!("cp {}/next {}/{SWITCH}", folder.path().display(), sets.display());
+    orders.arguments[1] = format!("echo $MIDSHIFT_SET >> $0; {copy}; exit {SWITCHED}");
+    on_trial_by("v1", &beside);
+    keep_running(&orders).expect("runs");
+    assert_eq!(ran(&folder), ["v1", "v1", "factory", "v2"]);
+    assert_eq!(record(&orders), next);
+}
+
+#[test]
+fn a_boot_record_that_cannot_be_written_leaves_the_machine_on_its_base_and_starts_a_set_that_runs_on_it() {
+    let (folder, orders) = with_sets(&[("v1", "exit 0")]);
+    with_base(&orders, "v1", "b1", 4);
+    on_trial(&orders, "v1");
+    let before = boot(&orders);
+    block(&orders, BOOT);
+    keep_running(&orders).expect("runs");
+    assert_eq!(ran(&folder), ["factory"], "v1 needs another base");
+    assert_eq!(boot(&orders), before);
+    assert_eq!(record(&orders).fallen.map(|fallen| fallen.set), Some("v1".to_owned()));
+}
+
 #[test]
 fn a_power_cut_counts_as_a_try_and_tries_of_another_set_do_not() {
     let (_folder, orders) = with_sets(&[("v1", ""), ("v2", "")]);
     on_trial(&orders, "v1");
     for tries in [1, 2] {
-        let start = choose(&orders, &read_tries(&orders.record)).expect("chooses");
+        let start = chosen(&orders);
         assert_eq!((start.set.as_str(), start.tries.of("v1")), ("v1", tries));
         write_tries(&orders.record, &start.tries).expect("writes");
     }
-    assert_eq!(
-        choose(&orders, &read_tries(&orders.record)).expect("chooses").set,
-        "factory",
-        "twice the power went while it started"
-    );
+    assert_eq!(chosen(&orders).set, "factory", "twice the power went while it started");
     on_trial(&orders, "v2");
-    assert_eq!(choose(&orders, &read_tries(&orders.record)).expect("chooses").tries.of("v2"), 1);
+    assert_eq!(chosen(&orders).tries.of("v2"), 1);
 }
 
 #[test]
@@ -191,15 +252,15 @@ fn a_committed_set_is_never_put_away_and_a_set_on_probation_does_not_clear_its_t
     let (_folder, orders) = with_sets(&[("v1", "")]);
     let path = orders.sets.as_ref().expect("has sets").join(SWITCH);
     on_trial(&orders, "v1");
-    assert!(!is_trusted(&orders));
+    assert!(!is_trusted(&orders, &chosen(&orders)));
     let mut switch = record(&orders);
     switch.prove();
     switch.write(&path).expect("writes");
-    assert!(is_trusted(&orders));
+    assert!(is_trusted(&orders, &chosen(&orders)));
     switch.commit();
     switch.write(&path).expect("writes");
     write_tries(&orders.record, &Tries::new("v1", 7)).expect("writes");
-    assert_eq!(choose(&orders, &read_tries(&orders.record)).expect("chooses").set, "v1");
+    assert_eq!(chosen(&orders).set, "v1");
 }
 
 #[test]

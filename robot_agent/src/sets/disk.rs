@@ -16,6 +16,7 @@ use super::content::{Part, remove};
 use super::{CHUNK_BYTES, Error, Holdings, Sets, Wanted, base_name};
 use crate::boot::BASE;
 use crate::launcher::{PROGRAM, SWITCH};
+use crate::starts::TRIES_MAX;
 use crate::switch::{self, Switch};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding::{self, Base};
@@ -40,6 +41,8 @@ const CONTENT: &str = "content";
 pub struct DiskSets {
     pub(super) folder: PathBuf,
     part: Option<Part>,
+    /// Number of a switch record whose trial the launcher has put away and could not write so.
+    overtaken: Option<u64>,
 }
 
 pub(super) fn io_error(doing: &'static str) -> impl FnOnce(io::Error) -> Error {
@@ -62,7 +65,29 @@ impl DiskSets {
     /// The disk's.
     pub fn open(folder: &Path) -> Result<Self, Error> {
         fs::create_dir_all(folder.join(CONTENT)).map_err(io_error("making the folder of sets"))?;
-        Ok(Self { folder: folder.to_owned(), part: None })
+        Ok(Self { folder: folder.to_owned(), part: None, overtaken: None })
+    }
+
+    /// Tells it which set the launcher has started. If the record names another one, which is on trial, the launcher has put that away and
+    /// could not write it down: it is taken as written, and written with whatever is written next.
+    ///
+    /// # Errors
+    /// A disk that cannot be read, or a damaged switch record.
+    pub fn started_from(&mut self, set: &str) -> Result<(), Error> {
+        let switch = self.switch()?;
+        let is_put_away = switch.trial.is_some() && switch.current == set;
+        self.overtaken = is_put_away.then_some(switch.number);
+        Ok(())
+    }
+
+    /// The switch record as it holds.
+    pub(super) fn switch(&self) -> Result<Switch, Error> {
+        let path = self.folder.join(SWITCH);
+        let mut switch = Switch::read(&path).map_err(io_error("reading the switch record"))?;
+        if self.overtaken == Some(switch.number) {
+            switch.fall_back(TRIES_MAX);
+        }
+        Ok(switch)
     }
 
     pub(super) fn content(&self, digest: &Digest) -> PathBuf {
@@ -202,7 +227,7 @@ fn read_limited(path: &Path, most: u64) -> io::Result<Vec<u8>> {
 
 impl Sets for DiskSets {
     fn holdings(&mut self) -> Result<Holdings, Error> {
-        let switch = Switch::read(&self.folder.join(SWITCH)).map_err(io_error("reading the switch record"))?;
+        let switch = self.switch()?;
         let room = rustix::fs::statvfs(&self.folder).map_err(io::Error::from).map_err(io_error("asking for room"))?;
         let free_bytes = room.f_bavail.saturating_mul(room.f_frsize);
         Ok(Holdings { switch, sets: self.sets()?, free_bytes })
@@ -290,11 +315,14 @@ impl Sets for DiskSets {
     }
 
     fn collect(&mut self, keep: &BTreeSet<Digest>) -> Result<(), Error> {
-        let switch = Switch::read(&self.folder.join(SWITCH)).map_err(io_error("reading the switch record"))?;
+        let switch = self.switch()?;
         self.settle(&switch)?;
         let mut named: BTreeSet<Digest> = keep.clone();
         for (id, set) in self.sets()? {
-            if switch.names(&id.to_string()) || keep.contains(&id) {
+            // The record on the disk names it still.
+            let is_put_away = self.overtaken == Some(switch.number)
+                && switch.fallen.as_ref().is_some_and(|fallen| fallen.set == id.to_string());
+            if switch.names(&id.to_string()) || is_put_away || keep.contains(&id) {
                 named.insert(id);
                 named.extend(set.components.values().map(|c| c.digest));
             }

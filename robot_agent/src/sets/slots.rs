@@ -48,7 +48,7 @@ impl DiskSets {
     pub(super) fn install_base(&self, set: &SetManifest) -> Result<(), Error> {
         let Some(base) = set.base() else { return Ok(()) };
         let path = self.folder.join(SWITCH);
-        let mut switch = Switch::read(&path).map_err(io_error("reading the switch record"))?;
+        let mut switch = self.switch()?;
         self.settle(&switch)?;
         let mut boot = self.boot()?;
         let spare = boot.spare();

@@ -5,6 +5,8 @@ mod beside;
 mod chaos;
 mod device;
 mod drives;
+mod forward;
+mod full;
 mod lanes;
 mod offers;
 mod power;

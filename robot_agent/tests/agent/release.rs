@@ -33,6 +33,9 @@ struct Shelf {
     bytes: BTreeMap<Digest, Vec<u8>>,
     targets: Vec<u8>,
     version: u64,
+    roots: u64,
+    /// Seeds of the keys of snapshot and timestamp.
+    online: (u8, u8),
     /// Milliseconds after [`SIGNED`] at which the server signs now.
     later_ms: u64,
     /// Nothing answers.
@@ -79,15 +82,49 @@ pub fn component(name: &str, version: &str, kind: ComponentKind, content: &[u8])
 
 impl Releases {
     pub fn new() -> Self {
-        let one = |seed: u8| Signers { keys: vec![key(seed).public()], threshold: 1 };
-        let expires = SIGNED.plus_ms(PEOPLE_LIFE_MS);
-        let draft =
-            RootDraft { version: 1, expires, root: one(1), targets: one(2), snapshot: one(3), timestamp: one(4) };
-        let root = sign_root(&draft, &[&key(1)]).expect("a root");
         let releases = Self(Arc::default());
-        releases.shelf().documents.insert("1.root.json".to_owned(), root);
+        releases.rotate((3, 4));
         releases.sign(&[]);
         releases
+    }
+    /// The next root, with these seeds of keys for snapshot and timestamp. What was signed with others holds no more.
+    pub fn rotate(&self, online: (u8, u8)) {
+        let mut shelf = self.shelf();
+        (shelf.online, shelf.roots) = (online, shelf.roots + 1);
+        let version = shelf.roots;
+        let one = |seed: u8| Signers { keys: vec![key(seed).public()], threshold: 1 };
+        let expires = SIGNED.plus_ms(PEOPLE_LIFE_MS);
+        let (snapshot, timestamp) = (one(online.0), one(online.1));
+        let draft = RootDraft { version, expires, root: one(1), targets: one(2), snapshot, timestamp };
+        let root = sign_root(&draft, &[&key(1)]).expect("a root");
+        shelf.documents.insert(format!("{version}.root.json"), root);
+    }
+    /// A thief of the keys of snapshot and timestamp signs what is released with a version of his own.
+    pub fn forward(&self, version: u64) {
+        self.put_online(&mut self.shelf(), version);
+    }
+    fn put_online(&self, shelf: &mut Shelf, version: u64) {
+        let (snapshot, timestamp) = (key(shelf.online.0), key(shelf.online.1));
+        let now = SIGNED.plus_ms(shelf.later_ms);
+        let online = sign_online(&shelf.targets, version, version, now, &snapshot, &timestamp).expect("online");
+        shelf.documents.insert(format!("{version}.snapshot.json"), online.snapshot);
+        shelf.documents.insert("timestamp.json".to_owned(), online.timestamp);
+    }
+    /// What a server without any key has kept: its newest documents are these again.
+    pub fn replay(&self, kept: &BTreeMap<String, Vec<u8>>) {
+        let mut shelf = self.shelf();
+        let roots: BTreeMap<_, _> = shelf
+            .documents
+            .iter()
+            .filter(|(name, _)| name.ends_with("root.json"))
+            .map(|(n, d)| (n.clone(), d.clone()))
+            .collect();
+        shelf.documents = kept.clone();
+        shelf.documents.extend(roots);
+    }
+    /// All documents as they are now.
+    pub fn documents(&self) -> BTreeMap<String, Vec<u8>> {
+        self.shelf().documents.clone()
     }
     fn shelf(&self) -> MutexGuard<'_, Shelf> {
         self.0.lock().expect("not poisoned")
@@ -99,12 +136,9 @@ impl Releases {
         shelf.targets = sign_targets(previous.as_deref(), add, &[], expires, &[&key(2)]).expect("targets");
         shelf.version += 1;
         let version = shelf.version;
-        let now = SIGNED.plus_ms(shelf.later_ms);
-        let online = sign_online(&shelf.targets, version, version, now, &key(3), &key(4)).expect("online");
         let targets = shelf.targets.clone();
         shelf.documents.insert(format!("{version}.targets.json"), targets);
-        shelf.documents.insert(format!("{version}.snapshot.json"), online.snapshot);
-        shelf.documents.insert("timestamp.json".to_owned(), online.timestamp);
+        self.put_online(&mut shelf, version);
     }
     /// Time passes, and everything is signed anew.
     pub fn pass(&self, ms: u64) {

@@ -32,7 +32,7 @@ pub struct Order {
 }
 
 impl Order {
-    fn new(directive: String) -> Self {
+    pub fn new(directive: String) -> Self {
         Self { directive, generation: 100, drain_id: None, granted: 0 }
     }
     pub fn to(&mut self, goal: Goal) -> DesiredUpdate {
@@ -77,7 +77,7 @@ pub fn switch(rig: &Rig) -> Switch {
     rig.updates.as_ref().expect("has them").sets.clone().holdings().expect("tells").switch
 }
 
-fn refused(rig: &Rig) -> Vec<Code> {
+pub fn refused(rig: &Rig) -> Vec<Code> {
     let code = |e: &RobotEvent| match e {
         RobotEvent::Update(UpdateEvent::DirectiveRefused { reason, .. }) => Some(reason.code),
         _ => None,

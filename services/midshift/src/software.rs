@@ -41,8 +41,11 @@ impl Software {
     pub fn open(sets: &Path, trust: &Path) -> anyhow::Result<Self> {
         let trust = Trust::read(trust)?;
         let mut sets = DiskSets::open(sets)?;
-        let holdings = sets.holdings()?;
         let told = std::env::var(launcher::SET).ok();
+        if let Some(set) = &told {
+            sets.started_from(set)?;
+        }
+        let holdings = sets.holdings()?;
         let is_launched = told.is_some();
         let running = told.unwrap_or_else(|| holdings.switch.running().to_owned());
         ensure!(holdings.set(&running).is_some(), "set {running} is not there");
