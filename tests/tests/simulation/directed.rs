@@ -174,7 +174,7 @@ fn robots_in(room: &Room, robots: usize, state: UpdateState) -> Vec<usize> {
     (0..robots).filter(|robot| seen.changes().state(&room.robot_id(*robot)) == Some(state)).collect()
 }
 
-fn waves(spec: &mut RolloutSpec, sizes: &[Size]) {
+pub fn waves(spec: &mut RolloutSpec, sizes: &[Size]) {
     let wave = |size: &Size| midshift_proto::ota::v1::RolloutWave { size: Some(size.clone()) };
     spec.waves = sizes.iter().map(wave).collect();
 }

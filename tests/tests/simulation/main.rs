@@ -3,6 +3,7 @@
 //! invariants looked at after each step. Directed runs of roll-outs and their twins are beside it.
 
 mod agent;
+mod astray;
 mod body;
 mod changes;
 mod client;
