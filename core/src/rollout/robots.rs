@@ -385,7 +385,8 @@ fn unused(
     let beats = life_ms.div_ceil(limits::HEARTBEAT.as_ms()) + 1;
     let past = other_session || live.report.hb > given.authority.hb + beats;
     let said = live.report.update.as_ref();
-    let not_used = said.is_some_and(|u| u.grant_id < given.grant_id && u.state == UpdateState::Staged);
+    // One that took it and was killed before its switch record was written is where it was, and does not take it again.
+    let not_used = said.is_some_and(|u| u.grant_id <= given.grant_id && u.state == UpdateState::Staged);
     (past && not_used && state == Some(UpdateState::Staged)).then_some(Move::NotUsed)
 }
 

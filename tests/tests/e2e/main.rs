@@ -10,6 +10,7 @@ mod harness;
 mod held;
 mod kill;
 mod launched;
+mod ledger_cuts;
 mod measured;
 mod proxy;
 mod restored;

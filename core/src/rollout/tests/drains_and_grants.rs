@@ -79,6 +79,23 @@ fn an_unused_permission_is_taken_back_only_when_the_robot_says_so_past_its_life(
 }
 
 #[test]
+fn a_robot_that_was_killed_between_its_ledger_and_its_switch_record_gets_another_permission() {
+    let mut rig = Rig::new(5);
+    rig.start(spec());
+    let n = rig.order()[0];
+    rig.robots[n].fate = Fate::Dawdles;
+    rig.until(20, |r| r.robots[n].seen_grant > 0);
+    let given = rig.robots[n].seen_grant;
+    let staged = rig.robots[n].report.clone().expect("has staged");
+    // Its ledger says that it took it; its record, that it did not switch.
+    rig.attach(n, |_| {});
+    rig.tell(n, UpdateReport { grant_id: given, ..staged });
+    rig.robots[n].fate = Fate::Good;
+    rig.until(60, |r| r.step(n) == Step::Trial);
+    assert!(rig.robots[n].seen_grant > given, "never the same twice");
+}
+
+#[test]
 fn in_flight_is_never_above_the_wave_nor_above_what_was_asked() {
     let mut rig = Rig::new(12);
     rig.start(RolloutSpec { max_in_flight: Some(3), ..wide() });
