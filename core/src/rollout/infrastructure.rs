@@ -39,7 +39,7 @@ pub fn is_open_to(rollout: &Rollout, r: &RolloutRobot) -> bool {
     r.wave >= rollout.promoted
 }
 
-/// Whether robots beside this one are heard: those of its area, or of the site if those are too few.
+/// Whether robots beside this one kept contact while it was missed: those of its area, or of the site if those are too few.
 ///
 /// # Errors
 /// Why the roll-out has to stand still instead.
@@ -53,8 +53,18 @@ pub fn controls(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> Resu
     if controls.len() < limits::CONTROLS_MIN {
         return Err(Pause::InfrastructureUnknown);
     }
-    let heard = controls.iter().filter(|id| heard::presence(board, id, now) != Presence::Offline).count();
+    let heard = controls.iter().filter(|id| keeps_contact(view, board, now, id)).count();
     if heard * 1_000 >= controls.len() * limits::CONTROLS_HEARD_PERMILLE { Ok(()) } else { Err(Pause::Infrastructure) }
+}
+
+/// It is heard, and has been in its session for as long as a robot has to be missed to be lost, but for the time that it may take to come
+/// back. Whoever came back a moment ago was missed too: the network is back, and the missing robot may be about to be. A session's
+/// epoch is when it was opened, by the wall.
+fn keeps_contact(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> bool {
+    let opened = view.sessions.get(robot_id.as_str()).map(|s| Utc(s.row.session_epoch as i64));
+    let long_ms = limits::LOST_AFTER.as_ms() - limits::OFFLINE_AFTER.as_ms();
+    heard::presence(board, robot_id, now) != Presence::Offline
+        && opened.is_some_and(|opened| now.wall.ms_since(opened) >= long_ms)
 }
 
 /// It changes nothing now, and was in contact when the robot was heard last: one in a store room says nothing of the network.

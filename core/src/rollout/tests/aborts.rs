@@ -147,6 +147,31 @@ fn a_silent_network_pauses_and_is_nobodys_failure() {
 }
 
 #[test]
+fn a_network_that_comes_back_for_the_others_first_burns_no_bundle() {
+    let mut rig = Rig::new(6);
+    rig.start(spec());
+    let n = rig.order()[0];
+    rig.robots[n].fate = Fate::Probation;
+    rig.until(60, |r| r.of("ro", n).moments.switched.is_some());
+    rig.robots.iter_mut().for_each(|r| r.is_off = true);
+    rig.ticks(130);
+    for other in (0..6).filter(|other| *other != n) {
+        rig.robots[other].is_off = false;
+        rig.robots[other].epoch = rig.now.wall.0 as u64;
+        rig.attach(other, |_| {});
+    }
+    rig.ticks(2);
+    assert!(rig.rollout("ro").pauses.contains(&super::super::rows::Pause::Infrastructure));
+    assert_eq!(rig.of("ro", n).failure, None, "they were missed as long as it was");
+    rig.until(200, |r| r.of("ro", n).failure.is_some());
+    assert_eq!(
+        rig.of("ro", n).failure.map(|f| f.code),
+        Some(Code::RobotLost),
+        "the others keep contact and it does not come"
+    );
+}
+
+#[test]
 fn too_few_others_to_compare_with_pause_it_too() {
     let mut rig = Rig::new(3);
     rig.fates(Fate::Silent);
