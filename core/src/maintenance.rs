@@ -25,6 +25,9 @@ pub struct DrainRequest {
     pub within_ms: u64,
     /// The robot gets no work from now on, whatever the area's budget.
     pub urgent: bool,
+    /// The robot goes back from what was aborted: it waits for others that change, and for nobody whom only a person brings back.
+    #[serde(default)]
+    pub returns: bool,
 }
 
 impl Record for DrainRequest {

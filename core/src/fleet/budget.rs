@@ -2,7 +2,8 @@
 //!
 //! Called by `mod` before drains go on. Invariant: a drain that may wait begins only in an item that also writes its area's row, so two planners
 //! cannot both spend the last place; a robot that is out for several reasons counts once. Robots that charge or have no work are asked
-//! first. Drains of people and urgent ones count and do not wait.
+//! first. Drains of people and urgent ones count and do not wait. Whoever goes back from what was aborted waits for drains alone: a robot that only
+//! a person brings back to work would otherwise keep it on bad software for as long.
 
 use super::rows::{AreaBudget, Drain, DrainState, RobotHolder};
 use super::view::View;
@@ -21,6 +22,8 @@ struct Area {
     robots: BTreeSet<RobotId>,
     /// Of these, and of robots that were taken from there, those that are out of work.
     off_work: BTreeSet<RobotId>,
+    /// Of those out of work, the ones in a drain.
+    draining: BTreeSet<RobotId>,
     /// Robots in work that are heard and have a capability, as far as somebody asked.
     able: BTreeMap<String, usize>,
 }
@@ -39,6 +42,7 @@ impl Area {
 
     /// One more is out of work.
     fn take(&mut self, view: &View, board: &Board, now: &Now, robot_id: &RobotId) {
+        self.draining.insert(robot_id.clone());
         if self.off_work.insert(robot_id.clone()) && self.robots.contains(robot_id) {
             for (capability, count) in &mut self.able {
                 *count -= usize::from(is_able(view, board, now, robot_id, capability)).min(*count);
@@ -77,7 +81,7 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
         let why = match (&here, view.drain_of(&drain.robot_id)) {
             (_, Some(other)) => Some(Reason::from(Code::RobotDraining).with("drain_id", &other.drain_id)),
             (Some(area), None) if !drain.urgent => {
-                areas.get_mut(area).and_then(|a| refusal(view, board, &now, area, a, &drain.robot_id))
+                areas.get_mut(area).and_then(|a| refusal(view, board, &now, area, a, &drain))
             }
             _ => None,
         };
@@ -154,36 +158,41 @@ fn areas(view: &View, board: &Board, now: &Now) -> BTreeMap<AreaId, Area> {
         if duty != Duty::InWork || taken_here {
             area.off_work.insert(robot_id.clone());
         }
+        if taken_here {
+            area.draining.insert(robot_id.clone());
+        }
     }
     for drain in view.drains.values().map(|d| &d.row).filter(|d| d.is_on()) {
         if let Some(area_id) = &drain.area_id {
-            areas.entry(area_id.clone()).or_default().off_work.insert(drain.robot_id.clone());
+            let area = areas.entry(area_id.clone()).or_default();
+            area.off_work.insert(drain.robot_id.clone());
+            area.draining.insert(drain.robot_id.clone());
         }
     }
     areas
 }
 
 /// Why one more robot may not leave its work now.
-fn refusal(
-    view: &View,
-    board: &Board,
-    now: &Now,
-    area_id: &AreaId,
-    area: &mut Area,
-    robot_id: &RobotId,
-) -> Option<Reason> {
+fn refusal(view: &View, board: &Board, now: &Now, area_id: &AreaId, area: &mut Area, drain: &Drain) -> Option<Reason> {
+    let robot_id = &drain.robot_id;
     if area.off_work.contains(robot_id) || view.bugs.budget_is_forgotten() {
         return None;
     }
     let rules = view.policy(area_id).software;
-    let (off, most) = (area.off_work.len(), rules.off_work_max(area.robots.len()));
+    let off = if drain.returns { area.draining.len() } else { area.off_work.len() };
+    let most = rules.off_work_max(area.robots.len());
     let budget = || Reason::from(Code::BlockedByBudget).with("area_id", area_id);
     if off >= most {
         return Some(budget().with("off_work", off).with("most", most));
     }
     for (capability, least) in rules.keep_in_work.iter().filter(|(capability, _)| has(view, robot_id, capability)) {
-        let counts = area.robots.contains(robot_id) && is_able(view, board, now, robot_id, capability);
-        let left = area.able(view, board, now, capability).saturating_sub(usize::from(counts));
+        let left = if drain.returns {
+            let stays = |id: &&RobotId| !area.draining.contains(*id) && *id != robot_id && has(view, id, capability);
+            area.robots.iter().filter(stays).count()
+        } else {
+            let counts = area.robots.contains(robot_id) && is_able(view, board, now, robot_id, capability);
+            area.able(view, board, now, capability).saturating_sub(usize::from(counts))
+        };
         if left < *least as usize {
             return Some(budget().with("capability", capability).with("in_work", left).with("keep_in_work", least));
         }

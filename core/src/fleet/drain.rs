@@ -41,6 +41,7 @@ pub fn ask(tx: &mut Tx, robot_id: &RobotId, reason: &str, actor: &str, within_ms
         area_id: None,
         rollout_id: None,
         urgent: true,
+        returns: false,
     };
     tx.put(drain, "drain.asked");
 }
@@ -93,6 +94,7 @@ pub fn obey(view: &mut View, now: Now, plan: &mut Plan) {
                 area_id: None,
                 rollout_id: Some(request.rollout_id),
                 urgent: request.urgent,
+                returns: request.returns,
             };
             tx.put(drain, "drain.asked");
         });

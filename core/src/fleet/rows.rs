@@ -404,6 +404,9 @@ pub struct Drain {
     /// It does not wait for the area's budget.
     #[serde(default)]
     pub urgent: bool,
+    /// The robot goes back from what was aborted: only drains that are on count against it.
+    #[serde(default)]
+    pub returns: bool,
 }
 
 impl Drain {

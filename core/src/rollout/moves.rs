@@ -270,7 +270,8 @@ fn number(tx: &mut Tx) -> u64 {
 
 fn ask_drain(tx: &mut Tx, rollout: &Rollout, r: &mut RolloutRobot, urgent: bool) {
     let Ok(drain_id) = DrainId::parse(&format!("ota:{}", number(tx))) else { return };
-    let goal = if rollout.phase.goes_back() || rollout.revert_of.is_some() { "goes back from" } else { "changes to" };
+    let returns = rollout.phase.goes_back();
+    let goal = if returns || rollout.revert_of.is_some() { "goes back from" } else { "changes to" };
     let label = tx.view.bundles.get(rollout.spec.bundle.as_str()).map(|b| b.row.label()).unwrap_or_default();
     let request = DrainRequest {
         drain_id: drain_id.clone(),
@@ -279,6 +280,7 @@ fn ask_drain(tx: &mut Tx, rollout: &Rollout, r: &mut RolloutRobot, urgent: bool)
         reason: format!("{goal} {label}"),
         within_ms: rollout.spec.drain_within_ms,
         urgent,
+        returns,
     };
     tx.put(request, "drain.requested");
     r.drain_id = Some(drain_id);

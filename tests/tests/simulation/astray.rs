@@ -1,17 +1,19 @@
 //! Roll-outs that go wrong, directed: a bad bundle whose robots are stopped, and robots that do not come back to their server. Every law of
 //! the witness holds in them too.
 
-use crate::directed::{Scene, waves};
+use crate::directed::{Scene, config, waves};
 use crate::net::Way;
 use crate::orders::Order;
+use crate::room::{Naive, RoomConfig};
 use crate::run::steer;
 use crate::software::{BAD_WITH_LOAD, GOOD, HANGS};
 use midshift_core::limits;
 use midshift_core::reason::Code;
-use midshift_core::rollout::rows::{Pause, Phase, Rollout};
+use midshift_core::rollout::rows::{Outcome, Pause, Phase, Rollout};
 use midshift_core::update::UpdateState;
 use midshift_proto::ota::v1::RolloutSpec;
 use midshift_proto::ota::v1::rollout_wave::Size;
+use midshift_sim::faults::FaultRates;
 
 /// Time that a stop lasts, longer than any way back, milliseconds.
 const STOP_MS: u64 = 400_000;
@@ -204,4 +206,42 @@ fn a_robot_that_alone_never_reached_its_server_is_back_by_itself_and_does_not_ge
         let wanted = scene.bundle(GOOD[0]).filter(|_| robot != canary);
         assert_eq!(scene.runs(robot), wanted, "robot {robot}");
     }
+}
+#[test]
+fn a_bundle_that_is_bad_only_with_a_load_touches_no_more_than_its_canaries_and_they_are_back() {
+    // Bodies as they are: obstacles now and then, a thousand times as many with this bundle and a load. Without jams, after which a
+    // person has to look for the load.
+    let faults = FaultRates { jam_per_action: 0.0, silence_per_hour: 0.0, ..FaultRates::default() };
+    let mut scene = Scene::with(RoomConfig { faults, ..config(74, 10, Naive::default()) });
+    scene.begin("bad", BAD_WITH_LOAD, |spec| {
+        two_first(spec);
+        spec.exposure_tasks = Some(12);
+        spec.exposure_within = seconds(1_800);
+    });
+    // Work never ends while it is judged.
+    let (mut goes_back, mut next_ms) = (false, 0);
+    while !goes_back {
+        scene.work(12);
+        next_ms = scene.room.now_ms().max(next_ms) + 60_000;
+        scene.until("the roll-out to go back, or a minute to pass", |room| {
+            let row = room.observer.look().changes().rollout("bad").map(|row| row.phase.goes_back());
+            goes_back = row == Some(true);
+            goes_back || room.now_ms() >= next_ms
+        });
+    }
+    let at_abort = scene.activations();
+    let row = scene.ends("bad");
+    assert_eq!(row.phase, Phase::Aborted);
+    let abort = row.abort.as_ref().expect("a reason");
+    assert_eq!((abort.reason.code, abort.hard), (Code::FailureAmongFew, false), "{row:?}");
+    assert!((1..=2).contains(&abort.touched), "{abort:?}");
+    let verdict = row.verdicts.last().expect("evidence");
+    assert_eq!((verdict.outcome, verdict.wave), (Outcome::Aborted, 0), "{verdict:?}");
+    assert!(verdict.robots.outcomes.failed >= 1 && verdict.attempted == abort.touched, "{verdict:?}");
+    assert!(verdict.tasks.trial.failed > verdict.tasks.trial.succeeded, "{verdict:?}");
+    scene.comes_to_rest();
+    scene.all_run(None);
+    // A permission that was alive at the abort may still be used: then its robot is among the touched.
+    let touched = u64::from(abort.touched);
+    assert!(at_abort <= scene.activations() && scene.activations() <= touched, "{at_abort} at the abort, {abort:?}");
 }

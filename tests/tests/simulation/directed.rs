@@ -19,7 +19,7 @@ use std::collections::BTreeSet;
 
 const PATIENCE_MS: u64 = 900_000;
 
-fn config(seed: u64, robots: usize, naive: Naive) -> RoomConfig {
+pub fn config(seed: u64, robots: usize, naive: Naive) -> RoomConfig {
     RoomConfig {
         seed,
         robots,

@@ -178,6 +178,37 @@ fn robots_that_charge_are_asked_first_and_urgent_drains_do_not_wait() {
     assert!(urgent.is_on(), "{urgent:?}");
 }
 
+#[test]
+fn whoever_goes_back_from_an_aborted_bundle_does_not_wait_for_robots_that_only_a_person_brings_back() {
+    let mut rig = Rig::new(6);
+    for n in 0..3 {
+        rig.attach(n, |i| i.capabilities = vec!["tow".into()]);
+    }
+    rig.rules(|s| {
+        s.off_work_permille = 200;
+        s.keep_in_work.extend([("tow".into(), 2)]);
+    });
+    let now = rig.now.utc;
+    rig.control(2, |c| c.breaker = Some(now));
+    for n in [0, 1] {
+        rig.put(request(n, false));
+    }
+    rig.fleet_turn();
+    let is_on = |rig: &Rig, n: usize| rig.fleet.drains[&format!("ota:{n}")].row.is_on();
+    assert_eq!([0, 1].map(|n| is_on(&rig, n)), [false, false], "one may be out of work, and one is");
+    for n in [3, 4] {
+        rig.put(crate::maintenance::DrainRequest { returns: true, ..request(n, false) });
+    }
+    rig.put(crate::maintenance::DrainRequest {
+        drain_id: DrainId::parse("ota:8").expect("an id"),
+        returns: true,
+        ..request(0, false)
+    });
+    rig.fleet_turn();
+    let on = [3, 4, 8].map(|n| is_on(&rig, n));
+    assert_eq!(on.iter().filter(|on| **on).count(), 1, "those that go back wait for each other: {on:?}");
+}
+
 fn request(n: usize, urgent: bool) -> crate::maintenance::DrainRequest {
     crate::maintenance::DrainRequest {
         drain_id: DrainId::parse(&format!("ota:{n}")).expect("an id"),
@@ -186,6 +217,7 @@ fn request(n: usize, urgent: bool) -> crate::maintenance::DrainRequest {
         reason: String::new(),
         within_ms: 60_000,
         urgent,
+        returns: false,
     }
 }
 
