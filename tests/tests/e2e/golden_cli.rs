@@ -32,17 +32,17 @@ const OPAQUE: [&str; 12] = [
     "appliedPolicy",
 ];
 /// Keys of measurements.
-const MEASURED: [&str; 9] = [
+const MEASURED: [&str; 7] = [
     "heartbeat",
     "energyMwh",
     "hottestJointDecidegrees",
     "durationMs",
     "attachedMs",
-    "clockOffsetMs",
-    "clockErrorMs",
     "pathMm",
     "loadedPathMm",
 ];
+/// Keys that are there once so many heartbeats have come.
+const LATE: [&str; 2] = ["clockErrorMs", "clockOffsetMs"];
 
 /// The two forms of the source article as they stand, one a line.
 const LIST: &str = r#"{"task_id":"TASK-3","robot_id":"","type":"transport","priority":3,"content":{"from_waypoint":"A","to_waypoint":"B","item_sku":"SKU-3"},"timeout_seconds":300,"retry_strategy":{"max_retry_times":2,"retry_interval_seconds":10},"created_at":"2026-11-20T08:00:00Z"}
@@ -162,7 +162,8 @@ fn is_time(text: &str) -> bool {
 fn plain(key: &str, value: &Value) -> Value {
     match value {
         Value::Object(fields) => {
-            fields.iter().map(|(k, v)| (k.clone(), plain(k, v))).collect::<serde_json::Map<_, _>>().into()
+            let kept = fields.iter().filter(|(k, _)| !LATE.contains(&k.as_str()));
+            kept.map(|(k, v)| (k.clone(), plain(k, v))).collect::<serde_json::Map<_, _>>().into()
         }
         Value::Array(items) => items.iter().map(|v| plain(key, v)).collect(),
         _ if OPAQUE.contains(&key) => "<opaque>".into(),
