@@ -4,7 +4,7 @@
 //! A tool counts as there when its program exists and its stamp names the pinned version, so a second install is quick.
 
 use crate::workspace::Workspace;
-use crate::{apt, go, run};
+use crate::{apt, clients, go, run};
 use anyhow::{Context, Result, bail, ensure};
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -13,13 +13,9 @@ const GRPCURL: &str = "github.com/fullstorydev/grpcurl/cmd/grpcurl@v1.9.3";
 const BUF: &str = "github.com/bufbuild/buf/cmd/buf@v1.57.2";
 /// Its package and program of the system.
 const STRACE: &str = "strace";
-const PYTHON: &[&str] = &[
-    "grpcio==1.80.0",
-    "grpcio-tools==1.80.0",
-    "tuf==7.0.1",
-    "securesystemslib[crypto]==1.6.0",
-    "cryptography==50.0.2",
-];
+/// What the Python client needs; it pins gRPC for all of Python here.
+const PYTHON_CLIENT: &str = include_str!("../../clients/python/requirements.txt");
+const PYTHON: &[&str] = &["tuf==7.0.1", "securesystemslib[crypto]==1.6.0", "cryptography==50.0.2"];
 
 /// Paths of the tools.
 pub struct Tools {
@@ -31,6 +27,8 @@ pub struct Tools {
     pub python: PathBuf,
     /// strace, of any version that can inject signals.
     pub strace: PathBuf,
+    /// Node.js, the system's.
+    pub node: PathBuf,
 }
 
 impl Tools {
@@ -42,6 +40,7 @@ impl Tools {
             buf: tools.join("bin/buf"),
             python: tools.join("venv/bin/python"),
             strace: STRACE.into(),
+            node: clients::NODE.into(),
         }
     }
 
@@ -49,7 +48,7 @@ impl Tools {
         [
             ("grpcurl", &self.grpcurl, GRPCURL.to_owned()),
             ("buf", &self.buf, BUF.to_owned()),
-            ("python with gRPC and TUF", &self.python, PYTHON.join(" ")),
+            ("python with gRPC and TUF", &self.python, python_packages().join(" ")),
         ]
     }
 
@@ -61,6 +60,7 @@ impl Tools {
         if !tools.has_strace() {
             missing.push(format!("  {STRACE}, a program of the system"));
         }
+        missing.extend(clients::missing(workspace).into_iter().map(|what| format!("  {what}")));
         if missing.is_empty() {
             return Ok(tools);
         }
@@ -84,12 +84,13 @@ impl Tools {
                 stamp(program, module)?;
             }
         }
-        if !present(&tools.python, &PYTHON.join(" ")) {
+        if !present(&tools.python, &python_packages().join(" ")) {
             install_python(workspace, &tools.python)?;
         }
         if !tools.has_strace() {
             apt::install(workspace, &[STRACE])?;
         }
+        clients::install(workspace)?;
         Self::find(workspace)
     }
 
@@ -103,7 +104,13 @@ impl Tools {
         command.env("MIDSHIFT_TEST_BUF", &self.buf);
         command.env("MIDSHIFT_TEST_PYTHON", &self.python);
         command.env("MIDSHIFT_TEST_STRACE", &self.strace);
+        command.env("MIDSHIFT_TEST_NODE", &self.node);
     }
+}
+
+fn python_packages() -> Vec<&'static str> {
+    let clients = PYTHON_CLIENT.lines().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with('#'));
+    clients.chain(PYTHON.iter().copied()).collect()
 }
 
 fn install_python(workspace: &Workspace, python: &Path) -> Result<()> {
@@ -116,9 +123,10 @@ fn install_python(workspace: &Workspace, python: &Path) -> Result<()> {
     let mut make = workspace.command("python3");
     ensure!(run::succeeds(make.args(["-m", "venv", "--clear"]).arg(&venv))?, "creating {}", venv.display());
     let mut pip = workspace.command(python);
-    pip.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--only-binary", ":all:"]).args(PYTHON);
+    pip.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--only-binary", ":all:"])
+        .args(python_packages());
     run::install(&mut pip)?;
-    stamp(python, &PYTHON.join(" "))
+    stamp(python, &python_packages().join(" "))
 }
 
 /// The stamp of the venv's Python lies in the venv, so that making it anew removes it.

@@ -4,6 +4,7 @@
 //! judgement is a test. Called as `cargo xtask VERB` (an alias in `.cargo/config.toml`).
 
 mod apt;
+mod clients;
 mod fetch_tools;
 mod go;
 mod parts;
@@ -27,8 +28,8 @@ struct Cli {
 enum Verb {
     /// Run the whole suite, or only the named parts, and print the minutes of each.
     Test {
-        /// First install what the tests of real components need (grpcurl, buf, a Python with gRPC) into target/tools,
-        /// and strace into the system.
+        /// First install what the tests of real components need (grpcurl, buf, a Python with gRPC, the modules of the clients) into
+        /// target/tools, and strace, Go and Node.js into the system.
         #[arg(long)]
         install: bool,
         /// Parts to run, in the suite's order whatever the order here; none: all.

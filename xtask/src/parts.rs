@@ -4,8 +4,8 @@
 //! are the same in each and nothing is compiled twice.
 
 use crate::fetch_tools::Tools;
-use crate::run;
 use crate::workspace::Workspace;
+use crate::{clients, run};
 use anyhow::Result;
 use clap::ValueEnum;
 
@@ -22,6 +22,8 @@ pub enum Part {
     Buf,
     /// The programs build; tests get their paths.
     Build,
+    /// The clients in other languages are generated from the .proto files and built.
+    Clients,
     /// Tests inside the crates.
     Unit,
     /// The integration suite.
@@ -50,6 +52,7 @@ impl Part {
             Self::Rustdoc => "rustdoc",
             Self::Buf => "buf",
             Self::Build => "build",
+            Self::Clients => "clients",
             Self::Unit => "unit",
             Self::Suite => "suite",
             Self::Doc => "doc",
@@ -58,7 +61,7 @@ impl Part {
 
     /// Whether outside tools take part.
     pub fn needs_tools(self) -> bool {
-        matches!(self, Self::Buf | Self::Unit | Self::Suite)
+        matches!(self, Self::Buf | Self::Clients | Self::Unit | Self::Suite)
     }
 
     /// Whether it runs tests, which need the built programs.
@@ -82,6 +85,10 @@ impl Part {
                 run::succeeds(workspace.command(&tools.buf).arg("lint").current_dir(workspace.root.join("proto")))
             }
             Self::Build => run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins"])),
+            Self::Clients => {
+                let Some(tools) = tools else { return Ok(false) };
+                clients::build(workspace, &tools.python)
+            }
             Self::Unit => Self::tests(workspace, tools, count, &["--lib", "--bins"]),
             Self::Suite => Self::tests(workspace, tools, count, &["--test", "*"]),
             Self::Doc => Self::tests(workspace, tools, count, &["--doc"]),
@@ -94,6 +101,7 @@ impl Part {
         workspace.export_programs(&mut command)?;
         if let Some(tools) = tools {
             tools.export(&mut command);
+            clients::export(workspace, &mut command);
         }
         run::reading(&mut command, |line| count.add(line))
     }

@@ -52,11 +52,14 @@ pub fn test(workspace: &Workspace, install: bool, asked: &[Part]) -> Result<bool
     Ok(passed)
 }
 
-/// The suite's order, each part once, and the programs before the tests that start them.
+/// The suite's order, each part once, and the programs and clients before the tests that start them.
 fn in_order(asked: &[Part]) -> Vec<Part> {
-    let wanted = |part: &Part| {
-        asked.is_empty() || asked.contains(part) || (*part == Part::Build && asked.iter().any(|p| p.runs_tests()))
+    let brought = |part: &Part| match part {
+        Part::Build => asked.iter().any(|p| p.runs_tests()),
+        Part::Clients => asked.contains(&Part::Suite),
+        _ => false,
     };
+    let wanted = |part: &Part| asked.is_empty() || asked.contains(part) || brought(part);
     Part::value_variants().iter().copied().filter(wanted).collect()
 }
 
@@ -86,8 +89,9 @@ mod tests {
 
     #[test]
     fn parts_run_in_the_suites_order_and_tests_bring_the_build() {
-        assert_eq!(in_order(&[Part::Suite, Part::Fmt]), [Part::Fmt, Part::Build, Part::Suite]);
+        assert_eq!(in_order(&[Part::Suite, Part::Fmt]), [Part::Fmt, Part::Build, Part::Clients, Part::Suite]);
+        assert_eq!(in_order(&[Part::Unit]), [Part::Build, Part::Unit]);
         assert_eq!(in_order(&[Part::Clippy]), [Part::Clippy]);
-        assert_eq!(in_order(&[]).len(), 8);
+        assert_eq!(in_order(&[]).len(), 9);
     }
 }

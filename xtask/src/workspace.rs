@@ -37,6 +37,13 @@ impl Workspace {
         self.target.join("tools")
     }
 
+    /// A PATH that begins with the pinned tools and `more`.
+    pub fn path_with(&self, more: Vec<PathBuf>) -> std::ffi::OsString {
+        let own = std::env::var_os("PATH").unwrap_or_default();
+        let first = [self.tools().join("bin")].into_iter().chain(more);
+        std::env::join_paths(first.chain(std::env::split_paths(&own))).unwrap_or(own)
+    }
+
     /// A command that runs in the root.
     pub fn command(&self, program: impl AsRef<std::ffi::OsStr>) -> Command {
         let mut command = Command::new(program);

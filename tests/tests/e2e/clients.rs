@@ -8,7 +8,8 @@ use std::path::Path;
 use std::process::{Command, Output};
 use std::time::Duration;
 
-async fn dev(dir: &Path) -> anyhow::Result<(SocketAddr, Running)> {
+/// A factory in memory with four robots, in `dir`; it says in `dev.log` how to go on.
+pub async fn dev(dir: &Path) -> anyhow::Result<(SocketAddr, Running)> {
     let address = free_port()?;
     let mut command = Command::new(midshift()?);
     command.args(["dev", "--robots", "4", "--speedup", "10", "--seed", "3", "--listen", &address.to_string()]);

@@ -7,7 +7,7 @@ use midshift_proto::task::v1::{ListTasksRequest, Task, TaskFilter, TaskState};
 use std::future::Future;
 use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, ChildStdin, Command, Stdio};
 use std::time::Duration;
 use tokio::time::Instant;
 use tonic::transport::{Channel, Endpoint};
@@ -50,6 +50,14 @@ impl Running {
         let file = std::fs::OpenOptions::new().create(true).append(true).open(log)?;
         let child = command.stdin(Stdio::null()).stdout(file.try_clone()?).stderr(file).spawn();
         Ok(Self(child.with_context(|| format!("starting {command:?}"))?))
+    }
+    /// The same for a program that is spoken to.
+    pub fn start_listening(command: &mut Command, log: &Path) -> anyhow::Result<(Self, ChildStdin)> {
+        let file = std::fs::OpenOptions::new().create(true).append(true).open(log)?;
+        let child = command.stdin(Stdio::piped()).stdout(file.try_clone()?).stderr(file).spawn();
+        let mut child = child.with_context(|| format!("starting {command:?}"))?;
+        let ear = child.stdin.take().context("stdin was piped")?;
+        Ok((Self(child), ear))
     }
     /// SIGKILL, and waits until it is gone.
     pub fn kill(&mut self) -> anyhow::Result<()> {

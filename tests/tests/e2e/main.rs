@@ -1,4 +1,4 @@
-//! Real programs as a user has them: the midshift binary, agents killed with SIGKILL, grpcurl, a Python client.
+//! Real programs as a user has them: the midshift binary, agents killed with SIGKILL, grpcurl, clients in three languages.
 //!
 //! `cargo xtask test` builds the programs once and says where they are.
 
@@ -9,6 +9,7 @@ mod golden_cli;
 mod harness;
 mod held;
 mod kill;
+mod languages;
 mod launched;
 mod ledger_cuts;
 mod measured;
