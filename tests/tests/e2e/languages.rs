@@ -57,7 +57,8 @@ impl Language {
         let mut command = match self {
             Self::Python => {
                 let mut command = Command::new(tool("MIDSHIFT_TEST_PYTHON")?);
-                command.env("PYTHONPATH", home.join("built")).env("PYTHONDONTWRITEBYTECODE", "1").arg(program);
+                command.env("PYTHONPATH", home.join("built")).env("PYTHONDONTWRITEBYTECODE", "1");
+                command.env("PYTHONUNBUFFERED", "1").arg(program);
                 command
             }
             Self::Go => Command::new(home.join(program)),
@@ -70,6 +71,15 @@ impl Language {
         command.args(arguments).current_dir(home);
         Ok(command)
     }
+}
+
+/// A robot in Python that knows nothing of midshift but the .proto files, and stands in `park-a` of the corridor.
+pub fn minimal_robot(name: &str, server: &str, dir: &Path) -> anyhow::Result<Command> {
+    let (memory, journal) = (dir.join("robot.json").display().to_string(), dir.join("effects").display().to_string());
+    let arguments = ["--server", server, "--robot-id", name, "--data", &memory, "--journal", &journal];
+    let mut command = Language::Python.run("examples/minimal_robot.py", &arguments)?;
+    command.args(["--at", "park-a", "0", "3000", "--speed-mm-s", "5000"]);
+    Ok(command)
 }
 
 fn said(log: &Path) -> anyhow::Result<String> {
@@ -127,7 +137,11 @@ async fn each_client_submits_watches_explains_hears_every_violation_and_watches_
         tours.push((Running::start(command.args([&server, robot, "walk-1.5.0"]), &log)?, log, robot));
     }
     for (mut tour, log, robot) in tours {
-        until("the end of a tour", LIMIT, async || Ok(tour.has_ended()?.then_some(()))).await?;
+        let mut ended = || {
+            let ended = tour.has_ended();
+            async { Ok(ended?.then_some(())) }
+        };
+        until("the end of a tour", LIMIT, &mut ended).await?;
         let text = said(&log)?;
         ensure!(tour.ends().await? == Some(0), "{}: {text}", log.display());
         for field in ["flat.task_type: ", "flat.priority: ", "flat.timeout_seconds: ", "flat.to_waypoint: "] {

@@ -13,6 +13,7 @@ mod languages;
 mod launched;
 mod ledger_cuts;
 mod measured;
+mod minimal_robot;
 mod proxy;
 mod restored;
 mod robots;

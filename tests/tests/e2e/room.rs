@@ -48,8 +48,13 @@ pub struct Robot {
 
 impl Room {
     pub async fn open() -> anyhow::Result<Self> {
+        Self::open_on(CORRIDOR).await
+    }
+
+    /// With other rules than the corridor site has.
+    pub async fn open_on(site: &str) -> anyhow::Result<Self> {
         let dir = tempfile::tempdir()?;
-        let server = Server::start_on(dir.path(), CORRIDOR).await?;
+        let server = Server::start_on(dir.path(), site).await?;
         let world = WorldConfig { auto_stock: true, ..WorldConfig::default() };
         let world = World::new(world, &text::parse(CORRIDOR)?).shared();
         Ok(Self { server, clock: midshift::clock::clock(1000), world, dir })
