@@ -180,3 +180,18 @@ fn every_service_is_in_the_descriptor_set() {
     ];
     assert_eq!(services, wanted.map(|s| format!("midshift.{s}")));
 }
+
+#[test]
+fn calls_that_clients_try_again_exist_and_none_streams() {
+    let text = include_str!("../../service_config.json");
+    let config: serde_json::Value = serde_json::from_str(text).expect("JSON");
+    let names = config["methodConfig"][0]["name"].as_array().expect("names");
+    assert!(names.len() > 20, "only {}", names.len());
+    for name in names {
+        let (service, method) = (name["service"].as_str().expect("a service"), name["method"].as_str());
+        let service = pool().get_service_by_name(service).unwrap_or_else(|| panic!("no {service}"));
+        let found = service.methods().find(|m| Some(m.name()) == method);
+        let found = found.unwrap_or_else(|| panic!("{} has no {method:?}", service.full_name()));
+        assert!(!found.is_client_streaming() && !found.is_server_streaming(), "{} streams", found.full_name());
+    }
+}

@@ -88,7 +88,7 @@ async fn a_robot_from_the_proto_files_alone_outlives_a_cut_and_a_kill_and_does_n
     assert_eq!(lines(&dir.join("effects")), effects);
     let sessions =
         lines(&log).iter().filter(|line| line.starts_with("session ") && line.ends_with("in charge")).count();
-    assert_eq!(sessions, 3, "{:?}", lines(&log));
+    assert!(sessions >= 3, "neither the cut nor the kill was noticed: {:?}", lines(&log));
     let said = room.said(NAME).await?;
     for task in ["T1", "T2", "T3"] {
         assert_eq!(attempts(&room, task).await?, 1, "{task} was granted again");
