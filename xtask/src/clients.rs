@@ -121,6 +121,7 @@ pub fn build(workspace: &Workspace, python: &Path) -> Result<bool> {
 fn build_python(workspace: &Workspace, python: &Path) -> Result<bool> {
     let home = copy_of(workspace, "python");
     remove(&home.join("built"))?;
+    remove(&home.join("build"))?;
     let mut pip = workspace.command(python);
     pip.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-index", "--no-deps"]);
     pip.args(["--no-build-isolation", "--target", "built", "."]).env("PYTHONDONTWRITEBYTECODE", "1");

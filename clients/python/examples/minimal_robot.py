@@ -29,7 +29,6 @@ SAMPLES_PER_MESSAGE = 256
 SILENCE_MS = 10_000
 HELLO_MS = 10_000
 FENCED_MS = 60_000
-ACT_MS = 500
 TICK_S = 0.02
 CAPABILITIES = ["pick", "place"]
 
@@ -579,7 +578,7 @@ class Robot:
         elif self.was_done(holder):
             self.step_done()
         else:
-            self.busy_until_ms = now_ms() + ACT_MS
+            self.busy_until_ms = now_ms() + self.args.act_ms
 
     def finish(self, state: int, **more) -> None:
         report, listed = self.report(state, **more), self.listed(state)
@@ -742,6 +741,7 @@ def main() -> None:
     parser.add_argument("--journal", required=True, type=pathlib.Path)
     parser.add_argument("--at", required=True, nargs=3, metavar=("WAYPOINT", "X_MM", "Y_MM"))
     parser.add_argument("--speed-mm-s", type=int, default=1500)
+    parser.add_argument("--act-ms", type=int, default=500, help="what one action takes")
     robot = Robot(parser.parse_args())
     while True:
         robot.tick()

@@ -78,7 +78,7 @@ pub fn minimal_robot(name: &str, server: &str, dir: &Path) -> anyhow::Result<Com
     let (memory, journal) = (dir.join("robot.json").display().to_string(), dir.join("effects").display().to_string());
     let arguments = ["--server", server, "--robot-id", name, "--data", &memory, "--journal", &journal];
     let mut command = Language::Python.run("examples/minimal_robot.py", &arguments)?;
-    command.args(["--at", "park-a", "0", "3000", "--speed-mm-s", "5000"]);
+    command.args(["--at", "park-a", "0", "3000", "--speed-mm-s", "5000", "--act-ms", "1500"]);
     Ok(command)
 }
 

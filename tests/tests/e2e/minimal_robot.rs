@@ -12,6 +12,7 @@ use midshift_proto::link::v1::{AttemptReport, Lane, WorkState};
 use midshift_proto::task::v1::{GetTaskRequest, TaskState};
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
 use midshift_proto::telemetry::v1::{ListEventsRequest, event::Item};
+use std::io::Write;
 use std::path::Path;
 use std::time::Duration;
 
@@ -23,9 +24,20 @@ fn lines(path: &Path) -> Vec<String> {
     std::fs::read_to_string(path).unwrap_or_default().lines().map(str::to_owned).collect()
 }
 
+/// What the robot has written down.
+fn memory(dir: &Path) -> anyhow::Result<serde_json::Value> {
+    Ok(serde_json::from_slice(&std::fs::read(dir.join("robot.json"))?)?)
+}
+
+/// Whether it has written down that it begins the pick of a task, and nothing of its end.
+fn is_picking(dir: &Path, task: &str) -> anyhow::Result<bool> {
+    let holder = &memory(dir)?["holder"];
+    Ok(holder["subject"] == task && holder["intent"] == 1)
+}
+
 /// Events that the robot has written and the server has not acknowledged to it.
 fn unacknowledged(dir: &Path) -> anyhow::Result<u64> {
-    let memory: serde_json::Value = serde_json::from_slice(&std::fs::read(dir.join("robot.json"))?)?;
+    let memory = memory(dir)?;
     let number = |key: &str| memory[key].as_u64().with_context(|| format!("no {key}"));
     Ok(number("produced")? - number("acked")?)
 }
@@ -73,10 +85,12 @@ async fn a_robot_from_the_proto_files_alone_outlives_a_cut_and_a_kill_and_does_n
     proxy.hold(false);
     room.until_state("T2", TaskState::Succeeded).await?;
 
-    // Killed in the middle of a task: what it must remember is in its file.
+    // Killed inside a pick, which the gripper ends without it: what it must remember is in its file, and what was done is in the journal.
     room.submit("T3", NAME).await?;
-    until_carried(dir, "T3").await?;
+    until("it picks", LIMIT, async || Ok(is_picking(dir, "T3")?.then_some(()))).await?;
     robot.kill()?;
+    ensure!(is_picking(dir, "T3")? && lines(&dir.join("effects")).len() == 4, "it was not killed inside its pick");
+    writeln!(std::fs::OpenOptions::new().append(true).open(dir.join("effects"))?, "pick T3 1 found")?;
     robot = Running::start(&mut command, &log)?;
     room.until_state("T3", TaskState::Succeeded).await?;
     ensure!(!robot.has_ended()?, "{:?}", lines(&log));
