@@ -7,6 +7,9 @@ use crate::clients::dev;
 use crate::harness::{Running, Server, midshift, tool, until};
 use crate::room::LIMIT;
 use anyhow::{Context, ensure};
+use midshift_core::site::DEMO;
+use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
+use midshift_proto::ota::v1::{AbortRolloutRequest, GetRolloutRequest};
 use midshift_proto::task::v1::CancelTaskRequest;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -117,10 +120,13 @@ fn bring_samples(dir: &Path, server: &str) -> anyhow::Result<()> {
     let (repository, key) = (flag("--repository")?, flag("--key")?);
     let samples = dir.join("samples").display().to_string();
     let make = ["bundle", "samples", &samples, "--config-only", "--repository", &repository, "--key", &key];
-    for arguments in [&make[..], &["bundle", "push", "--server", server, &repository]] {
-        let ran = Command::new(midshift()?).args(arguments).output()?;
-        ensure!(ran.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&ran.stderr));
-    }
+    midshift_does(&make)?;
+    midshift_does(&["bundle", "push", "--server", server, &repository])
+}
+
+fn midshift_does(arguments: &[&str]) -> anyhow::Result<()> {
+    let ran = Command::new(midshift()?).args(arguments).output()?;
+    ensure!(ran.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&ran.stderr));
     Ok(())
 }
 
@@ -173,12 +179,18 @@ async fn all_said(logs: &[PathBuf], beginning: &str) -> anyhow::Result<()> {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn each_client_gives_up_in_time_and_outlives_a_server_that_is_killed() -> anyhow::Result<()> {
     let dir = tempfile::tempdir()?;
-    let mut server = Server::start(dir.path()).await?;
+    let samples = dir.path().join("samples");
+    let (folder, keys) = (samples.display().to_string(), samples.join("keys").display().to_string());
+    midshift_does(&["bundle", "samples", &folder])?;
+    let mut server = Server::start_with(dir.path(), DEMO, &["--ota-keys", &keys]).await?;
     let address = server.address.to_string();
+    midshift_does(&["bundle", "push", "--server", &address, &samples.join("repository").display().to_string()])?;
+    let create = ["rollout", "create", "--server", &address, "walk-1.5.0", "--waves", "rest", "--allow-full-push"];
+    midshift_does(&create)?;
     let logs = ALL.map(|language| dir.path().join(format!("{language:?}.log")));
     let mut clients = Vec::new();
     for (language, log) in ALL.into_iter().zip(&logs) {
-        let (running, ear) = Running::start_listening(language.endure()?.arg(&address), log)?;
+        let (running, ear) = Running::start_listening(language.endure()?.args([&address, "walk-1.5.0"]), log)?;
         clients.push((running, ear, log));
     }
     all_said(&logs, "submitted ").await?;
@@ -189,6 +201,11 @@ async fn each_client_gives_up_in_time_and_outlives_a_server_that_is_killed() -> 
     all_said(&logs, "asking").await?;
     server.restart().await?;
     all_said(&logs, "again ").await?;
+    let mut rollouts = RolloutServiceClient::new(server.channel()?);
+    let request = GetRolloutRequest { rollout_id: "walk-1.5.0".to_owned() };
+    let rollout = rollouts.get_rollout(request).await?.into_inner().rollout.unwrap_or_default();
+    let request = AbortRolloutRequest { rollout_id: rollout.rollout_id, etag: rollout.etag, ..Default::default() };
+    rollouts.abort_rollout(request).await?;
     for (running, _, log) in &mut clients {
         let text = said(log)?;
         ensure!(after(&text, "gave up ").is_some(), "a deadline did not hold: {text}");
@@ -199,6 +216,7 @@ async fn each_client_gives_up_in_time_and_outlives_a_server_that_is_killed() -> 
         server.tasks()?.cancel_task(request).await?;
         ensure!(running.ends().await? == Some(0), "{}", said(log)?);
         ensure!(after(&said(log)?, "ended ").is_some_and(|state| state.ends_with("CANCELED")), "{}", said(log)?);
+        ensure!(after(&said(log)?, "rollout ").is_some_and(|phase| phase.ends_with("ABORTED")), "{}", said(log)?);
     }
     Ok(())
 }

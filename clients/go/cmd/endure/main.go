@@ -1,7 +1,7 @@
 // A client whose server is killed and started again under it. Whoever runs it kills the server at `submitted`, waits for `gave up`,
-// starts the server at `asking`, and cancels the task at `again`.
+// starts the server at `asking`, and at `again` cancels the task and aborts the roll-out.
 //
-//	endure 127.0.0.1:7420
+//	endure 127.0.0.1:7420 ROLLOUT
 package main
 
 import (
@@ -14,18 +14,19 @@ import (
 	"google.golang.org/grpc/codes"
 	"google.golang.org/protobuf/proto"
 
+	otav1 "midshift/clients/go/gen/midshift/ota/v1"
 	taskv1 "midshift/clients/go/gen/midshift/task/v1"
 	"midshift/clients/go/midshift"
 )
 
 func main() {
-	if err := endure(os.Args[1]); err != nil {
+	if err := endure(os.Args[1], os.Args[2]); err != nil {
 		fmt.Fprintln(os.Stderr, err)
 		os.Exit(1)
 	}
 }
 
-func endure(server string) error {
+func endure(server, rolloutID string) error {
 	client, err := midshift.New(server)
 	if err != nil {
 		return err
@@ -52,6 +53,18 @@ func endure(server string) error {
 		task, err := client.Wait(ctx, task.GetTaskId())
 		ended <- outcome{task, err}
 	}()
+	type phase struct {
+		phase otav1.RolloutPhase
+		err   error
+	}
+	followed := make(chan phase, 1)
+	go func() {
+		var last phase
+		for seen, err := range client.WatchRollout(ctx, rolloutID) {
+			last = phase{seen.GetRollout().GetPhase(), err}
+		}
+		followed <- last
+	}()
 	fmt.Println("submitted", task.GetTaskId())
 	if _, err := bufio.NewReader(os.Stdin).ReadString('\n'); err != nil {
 		return err
@@ -69,6 +82,11 @@ func endure(server string) error {
 	if last.err != nil {
 		return last.err
 	}
+	reached := <-followed
+	if reached.err != nil {
+		return reached.err
+	}
+	fmt.Println("rollout", reached.phase)
 	fmt.Println("ended", last.task.GetState())
 	return nil
 }
