@@ -163,6 +163,10 @@ impl Server {
         self.kill()?;
         self.restart().await
     }
+    /// SIGSTOP: it neither reads nor answers any more, until it is killed.
+    pub fn freeze(&self) -> anyhow::Result<()> {
+        self.running.signal("STOP")
+    }
     /// SIGKILL.
     pub fn kill(&mut self) -> anyhow::Result<()> {
         self.running.kill()

@@ -1,5 +1,5 @@
-//! A robot that was written from docs/robot-protocol.md: it works, is cut off in the middle of a task and killed in the middle of another, and
-//! takes no offer that lay in a buffer. Its own journal of effects is the judge.
+//! A robot that was written from docs/robot-protocol.md: its server is killed in the middle of a task, it is cut off in the middle of another
+//! and killed in the middle of a third, and it takes no offer that lay in a buffer. Its own journal of effects is the judge.
 
 use crate::harness::{Running, until};
 use crate::languages::minimal_robot;
@@ -35,11 +35,18 @@ fn is_picking(dir: &Path, task: &str) -> anyhow::Result<bool> {
     Ok(holder["subject"] == task && holder["intent"] == 1)
 }
 
+async fn until_it_picks(dir: &Path, task: &str) -> anyhow::Result<()> {
+    until("it picks", LIMIT, async || Ok(is_picking(dir, task)?.then_some(()))).await
+}
+
+/// A number that the robot has written down.
+fn number(dir: &Path, key: &str) -> anyhow::Result<u64> {
+    memory(dir)?[key].as_u64().with_context(|| format!("no {key}"))
+}
+
 /// Events that the robot has written and the server has not acknowledged to it.
 fn unacknowledged(dir: &Path) -> anyhow::Result<u64> {
-    let memory = memory(dir)?;
-    let number = |key: &str| memory[key].as_u64().with_context(|| format!("no {key}"));
-    Ok(number("produced")? - number("acked")?)
+    Ok(number(dir, "produced")?.saturating_sub(number(dir, "acked")?))
 }
 
 fn reports<'a>(said: &'a [Said], task: &str) -> Vec<&'a AttemptReport> {
@@ -65,15 +72,22 @@ async fn until_carried(dir: &Path, task: &str) -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_robot_from_the_proto_files_alone_outlives_a_cut_and_a_kill_and_does_nothing_twice() -> anyhow::Result<()> {
-    let room = Room::open_on(&CORRIDOR.replace("speed_limit_mm_s = 1500", "speed_limit_mm_s = 5000")).await?;
-    let (dir, proxy) = (room.dir.path(), Proxy::before(room.server.address).await?);
+async fn a_robot_from_the_proto_files_alone_outlives_kills_and_a_cut_and_does_nothing_twice() -> anyhow::Result<()> {
+    let mut room = Room::open_on(&CORRIDOR.replace("speed_limit_mm_s = 1500", "speed_limit_mm_s = 5000")).await?;
+    let (dir, proxy) = (&room.dir.path().to_owned(), Proxy::before(room.server.address).await?);
     let log = dir.join("robot.log");
     let mut command = minimal_robot(NAME, &proxy.address.to_string(), dir)?;
     let mut robot = Running::start(&mut command, &log)?;
     room.until_held("park-a", NAME, true).await?;
 
+    // What it says to a server that stands still is lost with that server: it must be said again.
     room.submit("T1", NAME).await?;
+    until_it_picks(dir, "T1").await?;
+    room.server.freeze()?;
+    let before = number(dir, "produced")?;
+    until("events that nobody hears", LIMIT, async || Ok((number(dir, "produced")? > before + 1).then_some(())))
+        .await?;
+    room.server.kill_and_restart().await?;
     room.until_state("T1", TaskState::Succeeded).await?;
 
     // Cut in the middle of a task, with events under way that the server may have and the robot does not know of.
@@ -87,7 +101,7 @@ async fn a_robot_from_the_proto_files_alone_outlives_a_cut_and_a_kill_and_does_n
 
     // Killed inside a pick, which the gripper ends without it: what it must remember is in its file, and what was done is in the journal.
     room.submit("T3", NAME).await?;
-    until("it picks", LIMIT, async || Ok(is_picking(dir, "T3")?.then_some(()))).await?;
+    until_it_picks(dir, "T3").await?;
     robot.kill()?;
     ensure!(is_picking(dir, "T3")? && lines(&dir.join("effects")).len() == 4, "it was not killed inside its pick");
     writeln!(std::fs::OpenOptions::new().append(true).open(dir.join("effects"))?, "pick T3 1 found")?;
@@ -102,7 +116,7 @@ async fn a_robot_from_the_proto_files_alone_outlives_a_cut_and_a_kill_and_does_n
     assert_eq!(lines(&dir.join("effects")), effects);
     let sessions =
         lines(&log).iter().filter(|line| line.starts_with("session ") && line.ends_with("in charge")).count();
-    assert!(sessions >= 3, "neither the cut nor the kill was noticed: {:?}", lines(&log));
+    assert!(sessions >= 4, "a break was not noticed: {:?}", lines(&log));
     let said = room.said(NAME).await?;
     for task in ["T1", "T2", "T3"] {
         assert_eq!(attempts(&room, task).await?, 1, "{task} was granted again");
