@@ -32,15 +32,8 @@ const OPAQUE: [&str; 12] = [
     "appliedPolicy",
 ];
 /// Keys of measurements.
-const MEASURED: [&str; 7] = [
-    "heartbeat",
-    "energyMwh",
-    "hottestJointDecidegrees",
-    "durationMs",
-    "attachedMs",
-    "pathMm",
-    "loadedPathMm",
-];
+const MEASURED: [&str; 7] =
+    ["heartbeat", "energyMwh", "hottestJointDecidegrees", "durationMs", "attachedMs", "pathMm", "loadedPathMm"];
 /// Keys that are there once so many heartbeats have come.
 const LATE: [&str; 2] = ["clockErrorMs", "clockOffsetMs"];
 

@@ -35,7 +35,7 @@ pub async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
         let request = v1::ListBundlesRequest { page_size: 1_000, page_token: whole.next_page_token };
         let page = client.list_bundles(unary(request)).await?.into_inner();
         whole.bundles.extend(page.bundles);
-        whole.next_page_token = page.next_page_token;
+        (whole.next_page_token, whole.room) = (page.next_page_token, page.room);
         if whole.next_page_token.is_empty() {
             break;
         }
