@@ -147,6 +147,8 @@ pub struct Agent {
     open: Option<Open>,
     way: Way,
     retry: ExponentialBackoff,
+    /// Why there is no session, as the log was told.
+    refused: String,
     rng: rand::rngs::StdRng,
     store: Option<Box<dyn Store>>,
     batch: u64,
@@ -185,6 +187,7 @@ pub async fn run(
     core.saw(holdings);
     let agent = Agent {
         retry: retries(config.seed),
+        refused: String::new(),
         rng: rand::rngs::StdRng::seed_from_u64(config.seed),
         core,
         clock,
@@ -426,12 +429,20 @@ impl Agent {
                 let (open, welcome) = *welcome;
                 tracing::info!(robot_id = %self.config.robot_id, session_epoch = welcome.session_epoch, "session open");
                 self.leave_session();
+                self.refused.clear();
                 self.open = Some(open);
                 self.retry = retries(self.rng.random());
                 self.step(Input::Connected(welcome));
             }
             Greeted::Closed(close) => self.closed(&close),
-            Greeted::Failed(why) => self.failed(&why),
+            Greeted::Failed(why) => {
+                // Once: it is tried again for as long as it takes.
+                if self.refused != why {
+                    tracing::warn!(robot_id = %self.config.robot_id, why, "no session");
+                    self.refused.clone_from(&why);
+                }
+                self.failed(&why);
+            }
         }
     }
 

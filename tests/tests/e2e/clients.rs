@@ -22,15 +22,18 @@ pub async fn dev(dir: &Path) -> anyhow::Result<(SocketAddr, Running)> {
     Ok((address, running))
 }
 
-fn grpcurl(args: &[&str]) -> anyhow::Result<Output> {
+/// Runs grpcurl.
+pub fn grpcurl(args: &[&str]) -> anyhow::Result<Output> {
     Ok(Command::new(tool("MIDSHIFT_TEST_GRPCURL")?).arg("-plaintext").args(["-max-time", "60"]).args(args).output()?)
 }
 
-fn text(bytes: &[u8]) -> String {
+/// What a program said.
+pub fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
 }
 
-fn http1(address: SocketAddr, request: &str) -> anyhow::Result<String> {
+/// One request over HTTP/1.1.
+pub fn http1(address: SocketAddr, request: &str) -> anyhow::Result<String> {
     use std::io::{Read, Write};
     let mut stream = std::net::TcpStream::connect(address)?;
     stream.set_read_timeout(Some(Duration::from_secs(10)))?;

@@ -15,6 +15,7 @@ mod ledger_cuts;
 mod measured;
 mod minimal_robot;
 mod proxy;
+mod public_address;
 mod restored;
 mod robots;
 mod rolled_out;
