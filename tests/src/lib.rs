@@ -1,1 +1,3 @@
 //! The one integration suite of midshift: its tests are in `tests/tests`, over real programs and real parts.
+
+pub mod postgres;

@@ -2,7 +2,7 @@
 //!
 //! Invariant: nothing here depends on the engine, so that all engines refuse the same items for the same reason.
 
-use crate::{Applied, CommitError};
+use crate::{Applied, CommitError, ID_BYTES_MAX};
 use midshift_core::limits;
 use midshift_core::rows::{Entry, Expect, Fact, Index, Item, Key, Log, Revision, Row, RowChange, Seq, Write};
 use std::collections::BTreeSet;
@@ -26,6 +26,7 @@ fn form(item: &Item) -> Result<(), CommitError> {
     if over {
         return Err(CommitError::TooLarge);
     }
+    texts(item)?;
     let mut keys = BTreeSet::new();
     for change in &item.rows {
         if !keys.insert(&change.key) {
@@ -34,6 +35,26 @@ fn form(item: &Item) -> Result<(), CommitError> {
         may_change(item, change)?;
     }
     item.facts.iter().try_for_each(|fact| may_state(item, fact))
+}
+
+/// Refuses text that one of the engines cannot hold: PostgreSQL has no NUL, and its indexes no long keys.
+fn texts(item: &Item) -> Result<(), CommitError> {
+    let bodies = item.facts.iter().map(|f| &f.body);
+    let bodies = bodies
+        .chain(item.rows.iter().filter_map(|r| if let Write::Put { body, .. } = &r.write { Some(body) } else { None }));
+    let keyed = item.rows.iter().map(|r| &r.key.id).chain(item.facts.iter().map(|f| &f.subject));
+    let parents = item
+        .rows
+        .iter()
+        .filter_map(|r| if let Write::Put { index, .. } = &r.write { index.parent.as_ref() } else { None });
+    let keyed = keyed.chain(parents).chain([&item.actor]).chain(&item.request_id);
+    if keyed.clone().any(|text| text.len() > ID_BYTES_MAX) {
+        return Err(CommitError::TooLarge);
+    }
+    if keyed.chain(bodies).any(|text| text.as_bytes().contains(&0)) {
+        return Err(CommitError::NulByte);
+    }
+    Ok(())
 }
 
 fn may_change(item: &Item, change: &RowChange) -> Result<(), CommitError> {

@@ -104,12 +104,17 @@ pub(crate) fn frames_well_formed(frames: &[Frame]) -> Result<(), Error> {
 
 /// As [`frames_well_formed`].
 pub(crate) fn gaps_well_formed(gaps: &[Gap]) -> Result<(), Error> {
-    gaps.iter().try_for_each(|gap| numbers_well_formed(&gap.ring, gap.from_seq, gap.to_seq))
+    gaps.iter().try_for_each(|gap| {
+        if [&gap.lane, &gap.reason].into_iter().any(|text| text.as_bytes().contains(&0)) {
+            return Err(Error::BadFrame("has a NUL byte in a text"));
+        }
+        numbers_well_formed(&gap.ring, gap.from_seq, gap.to_seq)
+    })
 }
 
 fn numbers_well_formed(ring: &str, first: u64, last: u64) -> Result<(), Error> {
-    if ring.is_empty() || ring.len() > RING_BYTES_MAX {
-        return Err(Error::BadFrame("ring must be 1-64 bytes"));
+    if ring.is_empty() || ring.len() > RING_BYTES_MAX || ring.as_bytes().contains(&0) {
+        return Err(Error::BadFrame("ring must be 1-64 bytes without NUL"));
     }
     if first > last || last > i64::MAX.cast_unsigned() {
         return Err(Error::BadFrame("numbers must rise and stay below 2^63"));

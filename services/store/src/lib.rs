@@ -2,23 +2,34 @@
 //!
 //! Invariant: an item is applied whole or not at all, by the one service that owns its tables ([`Table::writer`]), and is
 //! acknowledged only once it is as durable as the store can make it. No decision about the fleet is made here.
-//! Called by the services through [`Store`]; [`MemoryStore`] and [`SqliteStore`] pass one contract suite (`tests/store/contract.rs`).
+//! Called by the services through [`Store`]; [`MemoryStore`], [`SqliteStore`] and [`PostgresStore`] pass one contract suite (`tests/store/contract.rs`).
 //!
 //! What is volatile (heartbeats, poses) is on the [`LiveBoard`]; what is bulky (samples) is in the [`FrameLog`]; neither is a row.
 
 mod board;
 mod check;
 mod frames;
+mod frames_pack;
+mod frames_queue;
+mod group;
+mod migrations;
 mod model;
 mod model_table;
+mod open_error;
+mod postgres;
 mod projection;
+mod queue;
+mod sql;
 mod sqlite;
 
 pub use board::{Dirty, LiveBoard};
 pub use frames::{FRAME_BYTES_DEFAULT, Frame, FrameLog, FrameMark, GAPS_MAX, Gap, MemoryFrames, StoredFrame};
+pub use migrations::Migrated;
 pub use model::MemoryStore;
+pub use open_error::OpenError;
+pub use postgres::{PostgresConfig, PostgresFrames, PostgresStore, Wakes, migrate_postgres};
 pub use projection::{Change, Fold, Projection};
-pub use sqlite::{Database, Described, Migrated, OpenError, SqliteFrames, SqliteStore, migrate, renew_identity};
+pub use sqlite::{Database, Described, SqliteFrames, SqliteStore, migrate, renew_identity};
 
 use async_trait::async_trait;
 use midshift_core::ids::SiteId;
@@ -30,6 +41,8 @@ use tokio::sync::watch;
 
 /// Most entries one feed page holds, whatever the caller asks for.
 pub const FEED_PAGE_MAX: usize = 5_000;
+/// Bytes of an id, subject, parent, actor or request id. An index of PostgreSQL holds about 2,700 bytes of an id and its parent.
+pub const ID_BYTES_MAX: usize = 1_024;
 /// Most keys of one [`Store::get`].
 pub const GET_KEYS_MAX: usize = 10_000;
 /// Highest number [`Store::raise_head`] believes: as unix ms it is the year 287396. A number above it is a lie or a defect, and
@@ -102,9 +115,16 @@ pub enum CommitError {
         /// Name of the table or log.
         owned: &'static str,
     },
-    /// More rows, facts or bytes than one item may hold.
-    #[error("item over its limit of {} rows or {} bytes", limits::ITEM_ROWS_MAX, limits::GROUP_COMMIT_BYTES)]
+    /// More rows, facts or bytes than one item may hold, or an id over [`ID_BYTES_MAX`].
+    #[error(
+        "item over its limit of {} rows or {} bytes, or an id over {ID_BYTES_MAX}",
+        limits::ITEM_ROWS_MAX,
+        limits::GROUP_COMMIT_BYTES
+    )]
     TooLarge,
+    /// A NUL byte in a text. A defect of the caller: JSON writes it as an escape, and ids never have one.
+    #[error("item has a NUL byte in a text")]
+    NulByte,
     /// A row named twice in one item. A defect of the caller.
     #[error("row {key:?} is named twice in one item")]
     DuplicateKey {
@@ -122,7 +142,7 @@ pub enum CommitError {
 impl CommitError {
     /// The same item will be refused whenever it is committed.
     pub const fn is_final(&self) -> bool {
-        matches!(self, Self::NotTheWriter { .. } | Self::TooLarge | Self::DuplicateKey { .. })
+        matches!(self, Self::NotTheWriter { .. } | Self::TooLarge | Self::NulByte | Self::DuplicateKey { .. })
     }
 }
 
@@ -251,6 +271,16 @@ pub trait Store: Send + Sync + 'static {
     async fn raise_head(&self, at_least: Seq) -> Result<Seq, Error>;
     /// Takes old entries out of the logs, in small slices that let commits pass. Returns how many went.
     async fn prune(&self, keep: Retention) -> Result<u64, Error>;
+}
+
+/// A page of at most `limit` entries; a short one means that there are no more up to `head`.
+pub(crate) fn page_of(mut entries: Vec<Entry>, limit: usize, head: Seq) -> FeedPage {
+    entries.truncate(limit);
+    let next = match entries.last() {
+        Some(last) if entries.len() == limit => last.seq,
+        _ => head,
+    };
+    FeedPage { entries, next, head }
 }
 
 /// Reads one record with its revision.

@@ -196,7 +196,9 @@ impl TaskService {
             Err(CommitError::Conflict { .. }) => Ok(Admitted::Again(Box::new(self.compose(admission.wanted, actor)))),
             Err(CommitError::Unknown(_)) => Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)),
             Err(CommitError::TooLarge) => Err(Refusal::field("body", "is too large to be stored")),
-            Err(error @ (CommitError::NotTheWriter { .. } | CommitError::DuplicateKey { .. })) => {
+            Err(
+                error @ (CommitError::NotTheWriter { .. } | CommitError::NulByte | CommitError::DuplicateKey { .. }),
+            ) => {
                 tracing::error!(%error, "an admission was composed wrongly");
                 Err(Refusal::new(Kind::Internal, Code::Internal))
             }

@@ -3,8 +3,9 @@
 //! Invariant: no connection that writes is handed out before `journal_mode = wal` and `synchronous = FULL` have been read back
 //! from it. One process at a time has the file.
 
-use super::OpenError;
-use super::schema::{self, Migrated, Migration};
+use super::schema;
+use crate::OpenError;
+use crate::migrations::{Migrated, Migration};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{ConnectOptions, Row, SqliteConnection};
 use std::fs::{DirBuilder, File, OpenOptions, TryLockError};

@@ -4,39 +4,23 @@
 //! a start folded again from the log's tail: a keyed write per frame would cost more than the frame.
 
 use super::file::DataFile;
-use super::frames_pack::{pack, unpack};
 use super::write_sql::placeholders;
-use super::{OpenError, unavailable};
 use crate::frames::Marks;
-use crate::{Error, Frame, FrameMark, Gap};
-use midshift_core::ids::{RobotId, SiteId};
+use crate::frames_pack::unpack;
+use crate::frames_queue::{FramesEngine, GAPS_KEPT, Packed, mark};
+use crate::queue::unavailable;
+use crate::{Error, Frame, FrameMark, Gap, OpenError, sql};
+use midshift_core::ids::SiteId;
 use midshift_core::time::Clock;
 use sqlx::{AssertSqlSafe, Connection, Row, SqliteConnection};
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
 
-/// One `frame_log` row holds about so many bytes and samples; one transaction so many bytes.
-const ROW_BYTES: usize = 64 * 1024;
-const ROW_SAMPLES: u64 = 2_000;
-const GROUP_BYTES: usize = 1024 * 1024;
 /// Marks are written down this often while frames arrive.
 const MARKS_PERIOD: Duration = Duration::from_secs(5);
 /// Rows of one statement of marks or gaps, and rows one slice of pruning takes.
 const SLICE_ROWS: usize = 100;
-/// Gaps kept, newest first.
-const GAPS_KEPT: i64 = 1_000_000;
-
-type Reply<T> = oneshot::Sender<Result<T, Error>>;
-
-pub(super) enum Command {
-    Append { frames: Vec<Frame>, reply: Reply<()> },
-    Marks { reply: Reply<Vec<FrameMark>> },
-    Gaps { gaps: Vec<Gap>, reply: Reply<()> },
-    Prune { reply: Reply<u64> },
-    Close { reply: Reply<()> },
-}
 
 /// What is known of the open file; none of it outlives a failure.
 struct Open {
@@ -56,13 +40,6 @@ pub(super) struct FramesWriter {
     clock: Arc<dyn Clock>,
     bytes_max: u64,
     open: Option<Open>,
-}
-
-/// One `frame_log` row.
-#[derive(Default)]
-struct Packed {
-    body: Vec<u8>,
-    samples: u64,
 }
 
 impl FramesWriter {
@@ -95,43 +72,17 @@ impl FramesWriter {
         Ok(())
     }
 
-    pub(super) async fn run(mut self, mut queue: mpsc::Receiver<Command>) {
-        let mut put_back = None;
-        loop {
-            let command = match put_back.take() {
-                Some(command) => command,
-                None => match queue.recv().await {
-                    Some(command) => command,
-                    None => return,
-                },
-            };
-            // Who asked may have stopped waiting; the work is done all the same.
-            match command {
-                Command::Append { frames, reply } => {
-                    let (frames, replies) = gather(frames, reply, &mut queue, &mut put_back);
-                    let outcome = self.append(&frames).await;
-                    replies.into_iter().for_each(|reply| drop(reply.send(outcome.clone())));
-                }
-                Command::Marks { reply } => {
-                    let ready = self.ready().await;
-                    drop(reply.send(ready.map(|()| self.open.as_ref().map_or_else(Vec::new, |o| o.marks.list()))));
-                }
-                Command::Gaps { gaps, reply } => drop(reply.send(self.gaps(&gaps).await)),
-                Command::Prune { reply } => drop(reply.send(self.prune().await)),
-                Command::Close { reply } => {
-                    let outcome = self.write_marks().await;
-                    if let Some(open) = self.open.take() {
-                        drop(open.connection.close().await);
-                    }
-                    drop(reply.send(outcome));
-                    return;
-                }
-            }
-        }
+    async fn write_marks(&mut self) -> Result<(), Error> {
+        self.ready().await?;
+        let Some(mut open) = self.open.take() else { return Ok(()) };
+        write(&mut open, &self.site_id, &[], 0, true).await.map_err(unavailable)?;
+        self.open = Some(open);
+        Ok(())
     }
+}
 
-    async fn append(&mut self, frames: &[Frame]) -> Result<(), Error> {
-        let rows = packed(frames)?;
+impl FramesEngine for FramesWriter {
+    async fn append(&mut self, frames: &[Frame], rows: &[Packed]) -> Result<(), Error> {
         let at_unix_ms = self.clock.now().wall.0;
         let started = Instant::now();
         self.ready().await?;
@@ -141,7 +92,7 @@ impl FramesWriter {
             open.moved.raise(&frame.robot_id, &frame.ring, frame.last_seq);
         }
         let write_marks = open.marked_at.elapsed() >= MARKS_PERIOD;
-        write(&mut open, &self.site_id, &rows, at_unix_ms, write_marks).await.map_err(unavailable)?;
+        write(&mut open, &self.site_id, rows, at_unix_ms, write_marks).await.map_err(unavailable)?;
         for frame in frames {
             open.marks.raise(&frame.robot_id, &frame.ring, frame.last_seq);
         }
@@ -150,12 +101,17 @@ impl FramesWriter {
         Ok(())
     }
 
-    async fn write_marks(&mut self) -> Result<(), Error> {
+    async fn marks(&mut self) -> Result<Vec<FrameMark>, Error> {
         self.ready().await?;
-        let Some(mut open) = self.open.take() else { return Ok(()) };
-        write(&mut open, &self.site_id, &[], 0, true).await.map_err(unavailable)?;
-        self.open = Some(open);
-        Ok(())
+        Ok(self.open.as_ref().map_or_else(Vec::new, |open| open.marks.list()))
+    }
+
+    async fn close(mut self) -> Result<(), Error> {
+        let outcome = self.write_marks().await;
+        if let Some(open) = self.open.take() {
+            drop(open.connection.close().await);
+        }
+        outcome
     }
 
     async fn gaps(&mut self, gaps: &[Gap]) -> Result<(), Error> {
@@ -166,7 +122,6 @@ impl FramesWriter {
         Ok(())
     }
 
-    /// Takes the oldest rows out; returns the bytes freed, 0 when the kept ones are within their limit.
     async fn prune(&mut self) -> Result<u64, Error> {
         self.ready().await?;
         if self.open.as_ref().is_none_or(|open| open.bytes <= self.bytes_max) {
@@ -181,45 +136,6 @@ impl FramesWriter {
     }
 }
 
-fn gather(
-    mut frames: Vec<Frame>,
-    reply: Reply<()>,
-    queue: &mut mpsc::Receiver<Command>,
-    put_back: &mut Option<Command>,
-) -> (Vec<Frame>, Vec<Reply<()>>) {
-    let mut replies = vec![reply];
-    let mut bytes: usize = frames.iter().map(|f| f.bytes.len()).sum();
-    while bytes < GROUP_BYTES {
-        match queue.try_recv() {
-            Ok(Command::Append { frames: more, reply }) => {
-                bytes += more.iter().map(|f| f.bytes.len()).sum::<usize>();
-                frames.extend(more);
-                replies.push(reply);
-            }
-            Ok(other) => {
-                *put_back = Some(other);
-                break;
-            }
-            Err(_) => break,
-        }
-    }
-    (frames, replies)
-}
-
-fn packed(frames: &[Frame]) -> Result<Vec<Packed>, Error> {
-    let mut rows: Vec<Packed> = Vec::new();
-    for frame in frames {
-        if rows.last().is_none_or(|row| row.body.len() >= ROW_BYTES || row.samples >= ROW_SAMPLES) {
-            rows.push(Packed::default());
-        }
-        if let Some(row) = rows.last_mut() {
-            pack(frame, &mut row.body).map_err(|error| Error::Unavailable(Arc::new(error)))?;
-            row.samples += frame.last_seq.saturating_sub(frame.first_seq) + 1;
-        }
-    }
-    Ok(rows)
-}
-
 async fn write(
     open: &mut Open,
     site_id: &SiteId,
@@ -231,7 +147,7 @@ async fn write(
     for row in rows {
         open.position += 1;
         open.bytes += row.body.len() as u64;
-        sqlx::query("INSERT INTO frame_log (site_id, position, at_unix_ms, size, body) VALUES ($1, $2, $3, $4, $5)")
+        sqlx::query(sql::FRAME_INSERT)
             .bind(site_id.as_str())
             .bind(open.position)
             .bind(at_unix_ms)
@@ -305,7 +221,7 @@ async fn write_gaps(open: &mut Open, site_id: &SiteId, gaps: &[Gap]) -> Result<(
         }
         insert.execute(&mut *transaction).await?;
     }
-    sqlx::query("DELETE FROM gap WHERE site_id = $1 AND position <= $2")
+    sqlx::query(sql::GAPS_PRUNE)
         .bind(site_id.as_str())
         .bind(open.gap_position - GAPS_KEPT)
         .execute(&mut *transaction)
@@ -314,8 +230,9 @@ async fn write_gaps(open: &mut Open, site_id: &SiteId, gaps: &[Gap]) -> Result<(
 }
 
 async fn prune(open: &mut Open, site_id: &SiteId, bytes_max: u64) -> Result<u64, sqlx::Error> {
-    let oldest = sqlx::query("SELECT position, size FROM frame_log WHERE site_id = $1 ORDER BY position LIMIT $2")
+    let oldest = sqlx::query(sql::FRAME_SIZES)
         .bind(site_id.as_str())
+        .bind(0)
         .bind(SLICE_ROWS as i64)
         .fetch_all(&mut open.connection)
         .await?;
@@ -339,10 +256,9 @@ async fn prune(open: &mut Open, site_id: &SiteId, bytes_max: u64) -> Result<u64,
 /// Marks as written down and folded forward from the log's tail; the last position; the bytes kept; the last gap.
 async fn tail(connection: &mut SqliteConnection, site_id: &SiteId) -> Result<(Marks, i64, u64, i64), sqlx::Error> {
     let mut marks = Marks::default();
-    let saved = sqlx::query("SELECT robot_id, ring, seq FROM frame_mark WHERE site_id = $1").bind(site_id.as_str());
-    for row in saved.fetch_all(&mut *connection).await? {
-        let robot_id = RobotId::parse(row.try_get(0)?).map_err(|error| sqlx::Error::Decode(Box::new(error)))?;
-        marks.raise(&robot_id, &Arc::from(row.try_get::<&str, _>(1)?), row.try_get::<i64, _>(2)?.cast_unsigned());
+    for row in sqlx::query(sql::FRAME_MARKS).bind(site_id.as_str()).fetch_all(&mut *connection).await? {
+        let FrameMark { robot_id, ring, seq } = mark(&row)?;
+        marks.raise(&robot_id, &ring, seq);
     }
     let head = "SELECT COALESCE(MAX(marked_position), 0) FROM frame_head WHERE site_id = $1";
     let mut position: i64 = sqlx::query(head).bind(site_id.as_str()).fetch_one(&mut *connection).await?.try_get(0)?;

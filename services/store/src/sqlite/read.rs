@@ -3,18 +3,17 @@
 //! Invariant: what must hold together (rows and their number, entries and the head) is read in one transaction. Only names from
 //! closed lists are spliced into text.
 
-use super::tail::page_of;
-use super::unavailable;
-use super::write_sql::{ord, placeholders};
-use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, Query, Snapshot};
+use super::write_sql::placeholders;
+use crate::queue::unavailable;
+use crate::sql::{self, ENTRY_READ, ROW_READ, entry, row};
+use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, Query, Snapshot, page_of};
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Entry, Index, Key, Log, Revision, Row, Seq, Table};
+use midshift_core::rows::{Entry, Key, Log, Row, Seq, Table};
 use sqlx::sqlite::{SqliteArguments, SqliteRow};
 use sqlx::{AssertSqlSafe, Row as _, Sqlite, SqliteConnection, SqlitePool};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-const ROW_COLUMNS: &str = "id, revision, state, parent, ord, body";
 /// Ids of one statement.
 const IDS_PER_STATEMENT: usize = 500;
 /// Up to so many subjects are sought one by one through the index of subjects; for more it is cheaper to walk the log.
@@ -24,20 +23,6 @@ type Statement<'q> = sqlx::query::Query<'q, Sqlite, SqliteArguments>;
 
 fn prepared<'q>(sql: String) -> Statement<'q> {
     sqlx::query(AssertSqlSafe(sql))
-}
-
-fn row(table: Table, row: &SqliteRow) -> Result<Row, sqlx::Error> {
-    let order: i64 = row.try_get(4)?;
-    Ok(Row {
-        key: Key::new(table, row.try_get::<&str, _>(0)?),
-        revision: Revision(row.try_get::<i64, _>(1)?.cast_unsigned()),
-        index: Index {
-            state: row.try_get(2)?,
-            parent: row.try_get::<Option<&str>, _>(3)?.map(Arc::from),
-            order: (order != ord(None)).then_some(order),
-        },
-        body: Arc::from(row.try_get::<&str, _>(5)?),
-    })
 }
 
 pub(super) async fn get(readers: &SqlitePool, site_id: &SiteId, keys: &[Key]) -> Result<Vec<Row>, sqlx::Error> {
@@ -64,7 +49,7 @@ pub(super) async fn get(readers: &SqlitePool, site_id: &SiteId, keys: &[Key]) ->
 
 fn select<'q>(site_id: &'q SiteId, table: Table, ids: &[&Arc<str>]) -> Statement<'q> {
     let list = placeholders(1, ids.len());
-    let sql = format!("SELECT {ROW_COLUMNS} FROM {} WHERE site_id = ? AND id IN {list}", table.name());
+    let sql = format!("SELECT {ROW_READ} FROM {} WHERE site_id = ? AND id IN {list}", table.name());
     ids.iter().fold(prepared(sql).bind(site_id.as_str()), |select, id| select.bind(Arc::clone(id)))
 }
 
@@ -88,12 +73,7 @@ pub(super) async fn list(readers: &SqlitePool, site_id: &SiteId, query: &Query) 
     for state in states {
         rows.extend(list_one(&mut transaction, site_id, query, Some(state)).await?);
     }
-    rows.sort_by_cached_key(Cursor::of);
-    if query.newest_first {
-        rows.reverse();
-    }
-    rows.truncate(query.rows_max());
-    Ok(rows)
+    Ok(sql::merged(query, rows))
 }
 
 async fn list_one(
@@ -102,18 +82,7 @@ async fn list_one(
     query: &Query,
     state: Option<i64>,
 ) -> Result<Vec<Row>, sqlx::Error> {
-    let mut sql = format!("SELECT {ROW_COLUMNS} FROM {} WHERE site_id = ?", query.table.name());
-    if query.parent.is_some() {
-        sql += " AND parent = ?";
-    }
-    if state.is_some() {
-        sql += " AND state = ?";
-    }
-    if query.after.is_some() {
-        sql += if query.newest_first { " AND (ord, id) < (?, ?)" } else { " AND (ord, id) > (?, ?)" };
-    }
-    sql += if query.newest_first { " ORDER BY ord DESC, id DESC LIMIT ?" } else { " ORDER BY ord, id LIMIT ?" };
-    let mut select = prepared(sql).bind(site_id.as_str());
+    let mut select = prepared(sql::list(query, state)).bind(site_id.as_str());
     if let Some(parent) = &query.parent {
         select = select.bind(parent.clone());
     }
@@ -136,7 +105,7 @@ pub(super) async fn snapshot(
     let seq = super::writer::head(&mut transaction, site_id).await?;
     let mut rows = Vec::new();
     for table in tables {
-        let select = prepared(format!("SELECT {ROW_COLUMNS} FROM {} WHERE site_id = $1 ORDER BY id", table.name()));
+        let select = prepared(sql::whole(*table));
         for found in select.bind(site_id.as_str()).fetch_all(&mut *transaction).await? {
             rows.push(row(*table, &found)?);
         }
@@ -179,7 +148,7 @@ async fn oldest_cursor(
     site_id: &SiteId,
     logs: &BTreeSet<Log>,
 ) -> Result<Seq, sqlx::Error> {
-    let marks = sqlx::query("SELECT log, pruned_seq FROM log_mark WHERE site_id = $1");
+    let marks = sqlx::query(sql::LOG_MARKS);
     let mut oldest = Seq(0);
     for mark in marks.bind(site_id.as_str()).fetch_all(connection).await? {
         let name: &str = mark.try_get(0)?;
@@ -221,8 +190,7 @@ async fn log_page(
         format!(" AND subject IN {}", placeholders(1, subjects.len()))
     };
     let mut select = prepared(format!(
-        "SELECT seq, tbl, subject, revision, state, parent, ord, body, kind, actor, request_id, at_unix_ms \
-         FROM {} WHERE site_id = ? AND seq > ?{about} ORDER BY seq LIMIT ?",
+        "SELECT {ENTRY_READ} FROM {} WHERE site_id = ? AND seq > ?{about} ORDER BY seq LIMIT ?",
         log.name()
     ))
     .bind(site_id.as_str())
@@ -234,33 +202,9 @@ async fn log_page(
     rows.iter().map(|row| entry(log, row)).collect()
 }
 
-fn entry(log: Log, row: &SqliteRow) -> Result<Entry, sqlx::Error> {
-    let text = |column: usize| Ok::<_, sqlx::Error>(row.try_get::<Option<&str>, _>(column)?.map(Arc::from));
-    let table = match row.try_get::<Option<&str>, _>(1)? {
-        None => None,
-        Some(name) => {
-            let table = Table::ALL.iter().copied().find(|table| table.name() == name);
-            Some(table.ok_or_else(|| sqlx::Error::Decode(format!("no table is called {name}").into()))?)
-        }
-    };
-    Ok(Entry {
-        seq: Seq(row.try_get::<i64, _>(0)?.cast_unsigned()),
-        log,
-        table,
-        subject: Arc::from(row.try_get::<&str, _>(2)?),
-        revision: Revision(row.try_get::<i64, _>(3)?.cast_unsigned()),
-        index: Index { state: row.try_get(4)?, parent: text(5)?, order: row.try_get(6)? },
-        body: text(7)?,
-        kind: Arc::from(row.try_get::<&str, _>(8)?),
-        actor: Arc::from(row.try_get::<&str, _>(9)?),
-        request_id: text(10)?,
-        at_unix_ms: row.try_get(11)?,
-    })
-}
-
 /// How many entries a log holds.
 pub(super) async fn count(readers: &SqlitePool, site_id: &SiteId, log: Log) -> Result<u64, sqlx::Error> {
-    let select = prepared(format!("SELECT COUNT(*) FROM {} WHERE site_id = $1", log.name()));
+    let select = prepared(sql::count(log));
     Ok(select.bind(site_id.as_str()).fetch_one(readers).await?.try_get::<i64, _>(0)?.cast_unsigned())
 }
 
@@ -271,8 +215,7 @@ pub(super) async fn oldest(
     log: Log,
     limit: usize,
 ) -> Result<Vec<(Seq, i64)>, sqlx::Error> {
-    let select =
-        prepared(format!("SELECT seq, at_unix_ms FROM {} WHERE site_id = $1 ORDER BY seq LIMIT $2", log.name()));
+    let select = prepared(sql::oldest(log));
     let rows = select.bind(site_id.as_str()).bind(limit as i64).fetch_all(readers).await?;
-    rows.iter().map(|row| Ok((Seq(row.try_get::<i64, _>(0)?.cast_unsigned()), row.try_get(1)?))).collect()
+    rows.iter().map(|row| Ok((sql::seq(row, 0)?, row.try_get(1)?))).collect()
 }

@@ -3,14 +3,12 @@
 //! Invariant: what is known here is what the last commit left; after a commit of unknown outcome everything is forgotten.
 //! Bounded by two generations: a key that is not asked for during a whole generation is dropped.
 
-use midshift_core::rows::{Key, Revision};
+use crate::group::Standing;
+use midshift_core::rows::Key;
 use std::collections::HashMap;
 
 /// Keys of one generation. 100,000 keys are about 15 MB.
 const GENERATION_KEYS: usize = 100_000;
-
-/// A revision, or the knowledge that there is no such row.
-pub(super) type Standing = Option<Revision>;
 
 #[derive(Default)]
 pub(super) struct Revisions {
@@ -43,7 +41,7 @@ impl Revisions {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use midshift_core::rows::Table;
+    use midshift_core::rows::{Revision, Table};
 
     #[test]
     fn a_row_that_is_asked_for_stays_and_one_that_is_not_goes() {

@@ -2,7 +2,7 @@
 //!
 //! Invariant: every entry after `from` up to `head` is here, in commit order. Only the writer adds, after its commit.
 
-use crate::{FEED_PAGE_MAX, FeedPage};
+use crate::{FEED_PAGE_MAX, FeedPage, page_of};
 use midshift_core::rows::{Entry, Seq};
 use std::collections::VecDeque;
 use std::sync::{PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
@@ -63,16 +63,6 @@ impl Tail {
     fn write(&self) -> RwLockWriteGuard<'_, State> {
         self.0.write().unwrap_or_else(PoisonError::into_inner)
     }
-}
-
-/// A page of at most `limit` entries; a short one means that there are no more up to `head`.
-pub(super) fn page_of(mut entries: Vec<Entry>, limit: usize, head: Seq) -> FeedPage {
-    entries.truncate(limit);
-    let next = match entries.last() {
-        Some(last) if entries.len() == limit => last.seq,
-        _ => head,
-    };
-    FeedPage { entries, next, head }
 }
 
 fn bytes(entry: &Entry) -> usize {

@@ -5,7 +5,8 @@
 //! Multi-row statements use plain `?`: SQLite finds a numbered name by walking all names, so that thousands of `$n` would cost a
 //! square. An engine that needs numbers writes them in [`placeholders`].
 
-use super::revisions::Standing;
+use crate::group::Standing;
+use crate::sql::{self, ENTRY_COLUMNS, ROW_COLUMNS, ROW_CONFLICT, ord};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Entry, Key, Log, Revision, Row, Seq, Table};
 use sqlx::sqlite::SqliteArguments;
@@ -15,16 +16,8 @@ use std::sync::Arc;
 
 /// Rows of the largest statement. Sizes are powers of two up to this, so that the prepared ones are few and found again.
 const ROWS_PER_STATEMENT: usize = 128;
-const ROW_COLUMNS: &str = "site_id, id, revision, state, parent, ord, body";
-const ENTRY_COLUMNS: &str =
-    "site_id, seq, tbl, subject, revision, state, parent, ord, body, kind, actor, request_id, at_unix_ms";
 
 type Statement<'q> = Query<'q, Sqlite, SqliteArguments>;
-
-/// The column form of a sort key: a row without one sorts before all others, on every engine.
-pub(super) fn ord(order: Option<i64>) -> i64 {
-    order.unwrap_or(i64::MIN)
-}
 
 /// `rows` tuples of `columns` placeholders.
 pub(super) fn placeholders(rows: usize, columns: usize) -> String {
@@ -81,8 +74,7 @@ pub(super) async fn rows(
 
 fn upsert<'q>(table: Table, site_id: &'q SiteId, rows: &[&Row]) -> Statement<'q> {
     let mut statement = prepared(format!(
-        "INSERT INTO {} ({ROW_COLUMNS}) VALUES {} ON CONFLICT (site_id, id) DO UPDATE SET revision = excluded.revision, \
-         state = excluded.state, parent = excluded.parent, ord = excluded.ord, body = excluded.body",
+        "INSERT INTO {} ({ROW_COLUMNS}) VALUES {} {ROW_CONFLICT}",
         table.name(),
         placeholders(rows.len(), 7),
     ));
@@ -138,11 +130,7 @@ fn append<'q>(log: Log, site_id: &'q SiteId, entries: &[&Entry]) -> Statement<'q
 
 /// Moves the head row.
 pub(super) async fn head(connection: &mut SqliteConnection, site_id: &SiteId, head: Seq) -> Result<(), sqlx::Error> {
-    sqlx::query("UPDATE store_head SET seq = $1 WHERE site_id = $2")
-        .bind(head.0.cast_signed())
-        .bind(site_id.as_str())
-        .execute(connection)
-        .await?;
+    sqlx::query(sql::MOVE_HEAD).bind(head.0.cast_signed()).bind(site_id.as_str()).execute(connection).await?;
     Ok(())
 }
 
@@ -183,19 +171,7 @@ pub(super) async fn prune(
     up_to: Seq,
 ) -> Result<(), sqlx::Error> {
     let up_to = up_to.0.cast_signed();
-    prepared(format!("DELETE FROM {} WHERE site_id = $1 AND seq <= $2", log.name()))
-        .bind(site_id.as_str())
-        .bind(up_to)
-        .execute(&mut *connection)
-        .await?;
-    sqlx::query(
-        "INSERT INTO log_mark (site_id, log, pruned_seq) VALUES ($1, $2, $3) \
-         ON CONFLICT (site_id, log) DO UPDATE SET pruned_seq = excluded.pruned_seq",
-    )
-    .bind(site_id.as_str())
-    .bind(log.name())
-    .bind(up_to)
-    .execute(connection)
-    .await?;
+    prepared(sql::prune(log)).bind(site_id.as_str()).bind(up_to).execute(&mut *connection).await?;
+    sqlx::query(sql::MARK_LOG).bind(site_id.as_str()).bind(log.name()).bind(up_to).execute(connection).await?;
     Ok(())
 }

@@ -11,6 +11,7 @@ macro_rules! contract {
     ($($case:ident)*) => {
         mod memory { $(#[tokio::test] async fn $case() { let b = crate::support::memory(); super::$case(b.store.clone()).await; })* }
         mod sqlite { $(#[tokio::test] async fn $case() { let b = crate::support::sqlite().await; super::$case(b.store.clone()).await; })* }
+        mod postgres { $(#[tokio::test] async fn $case() { let b = crate::support::postgres().await; super::$case(b.store.clone()).await; })* }
     };
 }
 
@@ -38,6 +39,8 @@ contract! {
     pruning_takes_old_entries_but_never_past_the_slowest_consumer
     a_wake_shows_the_newest_number
     many_rows_of_one_call_are_all_there
+    ids_are_ordered_by_their_bytes
+    a_text_that_an_engine_cannot_hold_is_refused_by_all
 }
 
 async fn two_grants_of_one_place_from_one_snapshot_cannot_both_win(store: Arc<dyn Store>) {
@@ -383,4 +386,45 @@ async fn many_rows_of_one_call_are_all_there(store: Arc<dyn Store>) {
     let results = store.commit((0..1_300).map(removal).collect()).await;
     assert!(results.iter().all(Result::is_ok));
     assert_eq!(store.list(Query::all(Table::Attempt)).await.unwrap().len(), 1_000);
+}
+
+async fn ids_are_ordered_by_their_bytes(store: Arc<dyn Store>) {
+    let mut ids = ["a", "B", "b", "A", "_", "-", "ä", "a-1", "a1", "Z/9", "z"];
+    let rows = ids.iter().map(|id| put(Table::Incident, id, Expect::Absent, "{}"));
+    one(&*store, Writer::Fleet, rows.collect()).await.unwrap();
+    ids.sort_unstable();
+    let listed = store.list(Query::all(Table::Incident)).await.unwrap();
+    let snapshot = store.snapshot(&[Table::Incident]).await.unwrap();
+    for rows in [listed, snapshot.rows] {
+        let read: Vec<&str> = rows.iter().map(|row| &*row.key.id).collect();
+        assert_eq!(read, ids);
+    }
+    let after = Some(Cursor { order: i64::MIN, id: Arc::from("B") });
+    let rest = store.list(Query { after, ..Query::all(Table::Incident) }).await.unwrap();
+    assert_eq!(rest[0].key.id.as_ref(), "Z/9");
+}
+
+async fn a_text_that_an_engine_cannot_hold_is_refused_by_all(store: Arc<dyn Store>) {
+    let good = item(Writer::Fleet, vec![put(Table::Attempt, "good", Expect::Absent, "{}")]);
+    let mut bad: Vec<Item> = Vec::new();
+    bad.push(item(Writer::Fleet, vec![put(Table::Attempt, "a\0", Expect::Absent, "{}")]));
+    bad.push(item(Writer::Fleet, vec![put(Table::Attempt, "a", Expect::Absent, "{\0}")]));
+    let index = Index { parent: Some(Arc::from("\0")), ..Index::default() };
+    bad.push(item(Writer::Fleet, vec![indexed(Table::Attempt, "a", Expect::Absent, "{}", index)]));
+    bad.push(Item { actor: Arc::from("o\0"), ..good.clone() });
+    bad.push(Item { request_id: Some(Arc::from("\0r")), ..good.clone() });
+    let count = bad.len();
+    bad.push(good);
+    let results = store.commit(bad).await;
+    assert!(results[..count].iter().all(|r| matches!(r, Err(CommitError::NulByte))), "{results:?}");
+    assert!(results[count].is_ok(), "what it was committed with is not spoilt");
+    let long = put(Table::Attempt, &"x".repeat(1_025), Expect::Absent, "{}");
+    assert!(matches!(one(&*store, Writer::Fleet, vec![long]).await, Err(CommitError::TooLarge)));
+    let longest = "ö".repeat(512);
+    let index = Index { parent: Some(Arc::from(longest.as_str())), ..Index::default() };
+    one(&*store, Writer::Fleet, vec![indexed(Table::Attempt, &longest, Expect::Absent, "{}", index)]).await.unwrap();
+    let nul = Key::new(Table::Attempt, "\0");
+    assert!(store.get(vec![nul]).await.unwrap().is_empty(), "there is no such row, and to ask is no error");
+    assert!(store.list(Query::all(Table::Attempt).of_parent("\0")).await.unwrap().is_empty());
+    assert!(store.feed_of(Log::Fleet, &[Arc::from("\0")], Seq(0), 9).await.unwrap().entries.is_empty());
 }

@@ -3,7 +3,10 @@
 
 mod contract;
 mod failure;
+mod postgres;
 mod projection;
 mod reopen;
+#[path = "../../../../tests/src/postgres.rs"]
+mod server;
 mod support;
 mod turns;

@@ -1,9 +1,12 @@
-//! What the store's tests share: items without records, a clock that stands still, both engines.
+//! What the store's tests share: items without records, a clock that stands still, all engines.
 
+use crate::server::PostgresServer;
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Expect, Index, Item, Key, Revision, RowChange, Table, Write, Writer};
 use midshift_core::time::{Clock, Now, Utc};
-use midshift_store::{Applied, CommitError, MemoryStore, SqliteStore, Store, StoreId};
+use midshift_store::{
+    Applied, CommitError, MemoryStore, PostgresConfig, PostgresStore, SqliteStore, Store, StoreId, migrate_postgres,
+};
 use std::sync::Arc;
 
 /// Wall time of every test.
@@ -43,6 +46,28 @@ pub async fn sqlite() -> Bench {
     let dir = tempfile::tempdir().expect("a directory");
     let store = SqliteStore::open(dir.path(), site(), clock()).await.expect("a new store");
     Bench { store: Arc::new(store), _dir: Some(dir) }
+}
+
+/// The address of a database of its own on the shared server, with the schema in it and nothing else.
+pub async fn database() -> PostgresConfig {
+    static TEMPLATE: tokio::sync::OnceCell<()> = tokio::sync::OnceCell::const_new();
+    let server = PostgresServer::shared();
+    TEMPLATE
+        .get_or_init(async || {
+            // The first one that is made.
+            let template = PostgresConfig::new(server.database_named("template_midshift"));
+            migrate_postgres(&template).await.expect("migrations");
+        })
+        .await;
+    PostgresConfig::new(server.database_from("template_midshift"))
+}
+
+pub async fn postgres_at(config: &PostgresConfig) -> PostgresStore {
+    PostgresStore::open(config, site(), clock()).await.expect("a store")
+}
+
+pub async fn postgres() -> Bench {
+    Bench { store: Arc::new(postgres_at(&database().await).await), _dir: None }
 }
 
 pub fn put(table: Table, id: &str, expect: Expect, body: &str) -> RowChange {

@@ -10,9 +10,9 @@ use std::sync::Arc;
 /// A `frame_log` row that cannot be read, or a frame that cannot be written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("frame_log row: {0}")]
-pub(super) struct BadFrames(&'static str);
+pub(crate) struct BadFrames(&'static str);
 
-pub(super) fn pack(frame: &Frame, out: &mut Vec<u8>) -> Result<(), BadFrames> {
+pub(crate) fn pack(frame: &Frame, out: &mut Vec<u8>) -> Result<(), BadFrames> {
     for text in [frame.robot_id.as_str(), &frame.ring] {
         out.push(u8::try_from(text.len()).map_err(|_| BadFrames("ring is longer than 255 bytes"))?);
         out.extend(text.as_bytes());
@@ -25,7 +25,7 @@ pub(super) fn pack(frame: &Frame, out: &mut Vec<u8>) -> Result<(), BadFrames> {
     Ok(())
 }
 
-pub(super) fn unpack(mut rest: &[u8]) -> Result<Vec<Frame>, BadFrames> {
+pub(crate) fn unpack(mut rest: &[u8]) -> Result<Vec<Frame>, BadFrames> {
     let mut frames = Vec::new();
     while !rest.is_empty() {
         let robot_id = RobotId::parse(text(&mut rest)?).map_err(|_| BadFrames("not a robot_id"))?;

@@ -3,29 +3,31 @@
 //! Invariant: pure. Items are judged in order, each against what the ones before it in the group leave; a row that several items
 //! write is written once, as the last one leaves it.
 
-use super::revisions::Standing;
 use crate::check::{After, decide};
 use crate::{Applied, CommitError};
-use midshift_core::rows::{Entry, Item, Key, Row, Seq};
+use midshift_core::rows::{Entry, Item, Key, Revision, Row, Seq};
 use std::collections::{BTreeMap, HashMap};
 
-pub(super) struct Group {
+/// A revision, or the knowledge that there is no such row.
+pub(crate) type Standing = Option<Revision>;
+
+pub(crate) struct Group {
     /// Where the rows stood before the group.
-    pub(super) base: HashMap<Key, Standing>,
+    pub(crate) base: HashMap<Key, Standing>,
     /// What each written row becomes; none: it goes. Sorted, so that one table's rows are together.
-    pub(super) rows: BTreeMap<Key, Option<Row>>,
+    pub(crate) rows: BTreeMap<Key, Option<Row>>,
     /// All entries in order.
-    pub(super) entries: Vec<Entry>,
+    pub(crate) entries: Vec<Entry>,
     /// Newest number after the group.
-    pub(super) head: Seq,
+    pub(crate) head: Seq,
 }
 
 impl Group {
-    pub(super) fn new(head: Seq, base: HashMap<Key, Standing>) -> Self {
+    pub(crate) fn new(head: Seq, base: HashMap<Key, Standing>) -> Self {
         Self { base, rows: BTreeMap::new(), entries: Vec::new(), head }
     }
 
-    pub(super) fn add(&mut self, item: Item, at_unix_ms: i64) -> Result<Applied, CommitError> {
+    pub(crate) fn add(&mut self, item: Item, at_unix_ms: i64) -> Result<Applied, CommitError> {
         let decided = decide(item, self.head, at_unix_ms, |key| self.standing(key))?;
         for after in decided.rows {
             match after {

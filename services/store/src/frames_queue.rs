@@ -1,0 +1,217 @@
+//! The way to the one writer task of a frame log: appends queue while one commit runs, and the next transaction takes them all.
+//!
+//! Invariant: nobody is told "durable" before the commit of the engine ([`FramesEngine`]) has returned.
+
+use crate::frames_pack::{pack, unpack};
+use crate::queue::closed;
+use crate::{Error, Frame, FrameMark, Gap, StoredFrame};
+use midshift_core::ids::RobotId;
+use sqlx::{ColumnIndex, Decode, Type};
+use std::sync::Arc;
+use tokio::sync::{mpsc, oneshot};
+
+/// Appends that may wait for the writer.
+const QUEUE_COMMANDS: usize = 1_024;
+/// Rows of one page of [`crate::FrameLog::read`].
+pub(crate) const READ_ROWS: i64 = 64;
+/// One `frame_log` row holds about so many bytes and samples; one transaction so many bytes.
+const ROW_BYTES: usize = 64 * 1024;
+const ROW_SAMPLES: u64 = 2_000;
+const GROUP_BYTES: usize = 1024 * 1024;
+/// Gaps kept, newest first.
+pub(crate) const GAPS_KEPT: i64 = 1_000_000;
+
+type Reply<T> = oneshot::Sender<Result<T, Error>>;
+
+pub(crate) enum Command {
+    Append { frames: Vec<Frame>, reply: Reply<()> },
+    Marks { reply: Reply<Vec<FrameMark>> },
+    Gaps { gaps: Vec<Gap>, reply: Reply<()> },
+    Prune { reply: Reply<u64> },
+    Close { reply: Reply<()> },
+}
+
+/// What the writer task drives: one engine's side of the log.
+pub(crate) trait FramesEngine: Send + 'static {
+    /// Appends the frames of one group in one transaction.
+    fn append(&mut self, frames: &[Frame], rows: &[Packed]) -> impl Future<Output = Result<(), Error>> + Send;
+    /// As [`crate::FrameLog::marks`].
+    fn marks(&mut self) -> impl Future<Output = Result<Vec<FrameMark>, Error>> + Send;
+    /// As [`crate::FrameLog::report_gaps`].
+    fn gaps(&mut self, gaps: &[Gap]) -> impl Future<Output = Result<(), Error>> + Send;
+    /// Takes a slice of the oldest rows out; returns the bytes freed, 0 when the kept ones are within their limit.
+    fn prune(&mut self) -> impl Future<Output = Result<u64, Error>> + Send;
+    /// Writes down what is only in memory and lets go of what is open.
+    fn close(self) -> impl Future<Output = Result<(), Error>> + Send;
+}
+
+/// One `frame_log` row.
+#[derive(Default)]
+pub(crate) struct Packed {
+    pub(crate) body: Vec<u8>,
+    samples: u64,
+}
+
+/// Serves the queue until it is closed or nobody can ask any more.
+pub(crate) async fn run(mut engine: impl FramesEngine, mut queue: mpsc::Receiver<Command>) {
+    let mut put_back = None;
+    loop {
+        let command = match put_back.take() {
+            Some(command) => command,
+            None => match queue.recv().await {
+                Some(command) => command,
+                None => return,
+            },
+        };
+        // Who asked may have stopped waiting; the work is done all the same.
+        match command {
+            Command::Append { frames, reply } => {
+                let (frames, replies) = gather(frames, reply, &mut queue, &mut put_back);
+                let outcome = match packed(&frames) {
+                    Ok(rows) => engine.append(&frames, &rows).await,
+                    Err(error) => Err(error),
+                };
+                replies.into_iter().for_each(|reply| drop(reply.send(outcome.clone())));
+            }
+            Command::Marks { reply } => drop(reply.send(engine.marks().await)),
+            Command::Gaps { gaps, reply } => drop(reply.send(engine.gaps(&gaps).await)),
+            Command::Prune { reply } => drop(reply.send(engine.prune().await)),
+            Command::Close { reply } => {
+                drop(reply.send(engine.close().await));
+                return;
+            }
+        }
+    }
+}
+
+fn gather(
+    mut frames: Vec<Frame>,
+    reply: Reply<()>,
+    queue: &mut mpsc::Receiver<Command>,
+    put_back: &mut Option<Command>,
+) -> (Vec<Frame>, Vec<Reply<()>>) {
+    let mut replies = vec![reply];
+    let mut bytes: usize = frames.iter().map(|f| f.bytes.len()).sum();
+    while bytes < GROUP_BYTES {
+        match queue.try_recv() {
+            Ok(Command::Append { frames: more, reply }) => {
+                bytes += more.iter().map(|f| f.bytes.len()).sum::<usize>();
+                frames.extend(more);
+                replies.push(reply);
+            }
+            Ok(other) => {
+                *put_back = Some(other);
+                break;
+            }
+            Err(_) => break,
+        }
+    }
+    (frames, replies)
+}
+
+fn packed(frames: &[Frame]) -> Result<Vec<Packed>, Error> {
+    let mut rows: Vec<Packed> = Vec::new();
+    for frame in frames {
+        if rows.last().is_none_or(|row| row.body.len() >= ROW_BYTES || row.samples >= ROW_SAMPLES) {
+            rows.push(Packed::default());
+        }
+        if let Some(row) = rows.last_mut() {
+            pack(frame, &mut row.body).map_err(|error| Error::Unavailable(Arc::new(error)))?;
+            row.samples += frame.last_seq.saturating_sub(frame.first_seq) + 1;
+        }
+    }
+    Ok(rows)
+}
+
+/// The callers' end.
+pub(crate) struct FramesQueue(mpsc::Sender<Command>);
+
+impl FramesQueue {
+    /// Both ends.
+    pub(crate) fn new() -> (Self, mpsc::Receiver<Command>) {
+        let (commands, queue) = mpsc::channel(QUEUE_COMMANDS);
+        (Self(commands), queue)
+    }
+
+    pub(crate) async fn ask<T>(
+        &self,
+        command: impl FnOnce(oneshot::Sender<Result<T, Error>>) -> Command,
+    ) -> Result<T, Error> {
+        let (reply, answer) = oneshot::channel();
+        self.0.send(command(reply)).await.map_err(|_| Error::Unavailable(closed()))?;
+        answer.await.map_err(|_| Error::Unavailable(closed()))?
+    }
+
+    /// Prunes slice by slice.
+    pub(crate) async fn prune(&self) -> Result<u64, Error> {
+        let mut freed = 0;
+        loop {
+            match self.ask(|reply| Command::Prune { reply }).await? {
+                0 => return Ok(freed),
+                slice => freed += slice,
+            }
+        }
+    }
+}
+
+/// How many of the rows whose sizes these are belong to a page that holds `bytes` already: the position of the last one, and the
+/// bytes with them.
+pub(crate) fn page_end(sizes: &[(i64, i64)], mut bytes: usize, bytes_max: usize) -> Option<(i64, usize)> {
+    let mut last = None;
+    for (position, size) in sizes {
+        if bytes > bytes_max {
+            break;
+        }
+        bytes += *size as usize;
+        last = Some((*position, bytes));
+    }
+    last
+}
+
+/// The frames of one row of [`crate::sql::FRAME_BODIES`].
+pub(crate) fn stored<'r, R>(row: &'r R) -> Result<Vec<StoredFrame>, sqlx::Error>
+where
+    R: sqlx::Row,
+    usize: ColumnIndex<R>,
+    &'r [u8]: Decode<'r, R::Database> + Type<R::Database>,
+    i64: Decode<'r, R::Database> + Type<R::Database>,
+{
+    let position = row.try_get::<i64, _>(0)?.cast_unsigned();
+    let at_unix_ms = row.try_get(1)?;
+    let frames = unpack(row.try_get(2)?).map_err(|error| sqlx::Error::Decode(Box::new(error)))?;
+    Ok(frames.into_iter().map(|frame| StoredFrame { position, at_unix_ms, frame }).collect())
+}
+
+/// The mark of one row of [`crate::sql::FRAME_MARKS`].
+pub(crate) fn mark<'r, R>(row: &'r R) -> Result<FrameMark, sqlx::Error>
+where
+    R: sqlx::Row,
+    usize: ColumnIndex<R>,
+    &'r str: Decode<'r, R::Database> + Type<R::Database>,
+    i64: Decode<'r, R::Database> + Type<R::Database>,
+{
+    Ok(FrameMark {
+        robot_id: RobotId::parse(row.try_get(0)?).map_err(|error| sqlx::Error::Decode(Box::new(error)))?,
+        ring: Arc::from(row.try_get::<&str, _>(1)?),
+        seq: row.try_get::<i64, _>(2)?.cast_unsigned(),
+    })
+}
+
+/// One row of [`crate::sql::GAPS`].
+pub(crate) fn gap<'r, R>(row: &'r R) -> Result<Gap, sqlx::Error>
+where
+    R: sqlx::Row,
+    usize: ColumnIndex<R>,
+    &'r str: Decode<'r, R::Database> + Type<R::Database>,
+    i64: Decode<'r, R::Database> + Type<R::Database>,
+{
+    Ok(Gap {
+        robot_id: RobotId::parse(row.try_get(0)?).map_err(|error| sqlx::Error::Decode(Box::new(error)))?,
+        ring: Arc::from(row.try_get::<&str, _>(1)?),
+        lane: Arc::from(row.try_get::<&str, _>(2)?),
+        from_seq: row.try_get::<i64, _>(3)?.cast_unsigned(),
+        to_seq: row.try_get::<i64, _>(4)?.cast_unsigned(),
+        reason: Arc::from(row.try_get::<&str, _>(5)?),
+        at_unix_ms: row.try_get(6)?,
+    })
+}

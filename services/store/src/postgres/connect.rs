@@ -1,0 +1,182 @@
+//! Connections to PostgreSQL, each with the bounds that keep a broken process from holding others up.
+//!
+//! Invariant: every connection has a lock, statement and idle-in-transaction limit on the server's side, and every call one on
+//! ours. No connection that writes is handed out by a server that would lose what it acknowledged.
+
+use crate::{Cause, Error, OpenError};
+use sqlx::postgres::{PgConnectOptions, PgListener, PgPool, PgPoolOptions};
+use sqlx::{ConnectOptions, PgConnection, Row};
+use std::str::FromStr;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// Oldest server that is tried out, as `server_version_num`.
+const VERSION_MIN: u32 = 150_000;
+/// A writer waits for the site's head at most so long, ms; its callers hear `Unavailable` and try again.
+const LOCK_TIMEOUT_MS: u32 = 3_000;
+/// A process that went silent inside a transaction loses it after this, ms, and the head is free again.
+const IDLE_IN_TRANSACTION_MS: u32 = 3_000;
+/// Longest statement of a commit, ms.
+const WRITE_STATEMENT_MS: u32 = 5_000;
+/// Longest statement of a read, ms.
+const READ_STATEMENT_MS: u32 = 15_000;
+/// Longest step of a migration, ms.
+const MIGRATE_STATEMENT_MS: u32 = 600_000;
+/// Silence after which the server believes a peer gone, ms.
+const PEER_LOST_MS: u32 = 10_000;
+/// What one transaction of the writer may take up to its COMMIT, and the COMMIT itself, before we stop waiting for an answer.
+pub(super) const WRITE_PATIENCE: Duration = Duration::from_secs(6);
+/// The same for one read.
+const READ_PATIENCE: Duration = Duration::from_secs(20);
+/// Connecting, or waiting for a read connection.
+const CONNECT_PATIENCE: Duration = Duration::from_secs(5);
+/// Read connections of one store: a list, a snapshot and two feeds at once.
+const READERS: u32 = 4;
+/// A few statements for each table and log.
+const STATEMENTS_CACHED: usize = 512;
+
+/// How a process hears of what others commit.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+pub enum Wakes {
+    /// At once by LISTEN, and by looking at the head every 250 ms under it.
+    #[default]
+    Notified,
+    /// By looking only: for servers without LISTEN.
+    Swept,
+}
+
+/// Which database, and how to use it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PostgresConfig {
+    /// `postgres://user:password@host:port/database`, with the parameters that libpq has. Never logged.
+    pub url: String,
+    /// How others' commits are heard of.
+    pub wakes: Wakes,
+}
+
+impl PostgresConfig {
+    /// The database at `url`, with notifications.
+    pub fn new(url: impl Into<String>) -> Self {
+        Self { url: url.into(), wakes: Wakes::Notified }
+    }
+}
+
+/// One PostgreSQL schema of the database: `control` or `telemetry`.
+#[derive(Clone)]
+pub(super) struct Database {
+    options: PgConnectOptions,
+    pub(super) schema: &'static str,
+}
+
+/// What a connection is for.
+#[derive(Clone, Copy)]
+enum Purpose {
+    Write,
+    Read,
+    Migrate,
+}
+
+impl Database {
+    pub(super) fn new(config: &PostgresConfig, schema: &'static str) -> Result<Self, OpenError> {
+        let options = PgConnectOptions::from_str(&config.url)
+            .map_err(|source| OpenError::Sql { doing: "reading the address of PostgreSQL", source })?;
+        Ok(Self { options, schema })
+    }
+
+    fn options(&self, purpose: Purpose) -> PgConnectOptions {
+        let statement_ms = match purpose {
+            Purpose::Write => WRITE_STATEMENT_MS,
+            Purpose::Read => READ_STATEMENT_MS,
+            Purpose::Migrate => MIGRATE_STATEMENT_MS,
+        };
+        let lock_ms = if matches!(purpose, Purpose::Migrate) { MIGRATE_STATEMENT_MS } else { LOCK_TIMEOUT_MS };
+        let limits = [
+            ("lock_timeout", lock_ms),
+            ("statement_timeout", statement_ms),
+            ("idle_in_transaction_session_timeout", IDLE_IN_TRANSACTION_MS),
+            ("tcp_user_timeout", PEER_LOST_MS),
+            ("tcp_keepalives_idle", PEER_LOST_MS / 2_000),
+            ("tcp_keepalives_interval", 1),
+            ("tcp_keepalives_count", PEER_LOST_MS / 2_000),
+        ];
+        self.options
+            .clone()
+            .application_name("midshift")
+            .statement_cache_capacity(STATEMENTS_CACHED)
+            .options(limits)
+            .options([("search_path", self.schema)])
+            .disable_statement_logging()
+    }
+
+    async fn connect(&self, purpose: Purpose) -> Result<PgConnection, OpenError> {
+        let failed = |source| OpenError::Sql { doing: "connecting to PostgreSQL", source };
+        let options = self.options(purpose);
+        let connecting = tokio::time::timeout(CONNECT_PATIENCE, options.connect());
+        let connection = connecting.await.map_err(|_| failed(sqlx::Error::PoolTimedOut))?.map_err(failed)?;
+        let version = connection.server_version_num().unwrap_or_default();
+        if version < VERSION_MIN {
+            let found = format!("{}.{}", version / 10_000, version % 10_000);
+            return Err(OpenError::Unfit { name: "version", needed: "15 or newer", found });
+        }
+        Ok(connection)
+    }
+
+    /// A connection whose commits are durable.
+    pub(super) async fn writer(&self) -> Result<PgConnection, OpenError> {
+        let mut connection = self.connect(Purpose::Write).await?;
+        let durable = async {
+            for name in ["fsync", "full_page_writes", "synchronous_commit"] {
+                if setting(&mut connection, name).await? == "off" {
+                    return Err(OpenError::NotDurable { name, expected: "on", found: "off".to_owned() });
+                }
+            }
+            let found = setting(&mut connection, "server_encoding").await?;
+            if found != "UTF8" {
+                return Err(OpenError::Unfit { name: "the encoding", needed: "UTF8", found });
+            }
+            Ok(())
+        };
+        let slow = |_| OpenError::Sql { doing: "reading settings", source: sqlx::Error::PoolTimedOut };
+        tokio::time::timeout(CONNECT_PATIENCE, durable).await.map_err(slow)??;
+        Ok(connection)
+    }
+
+    /// A connection for changes of the schema.
+    pub(super) async fn migrator(&self) -> Result<PgConnection, OpenError> {
+        self.connect(Purpose::Migrate).await
+    }
+
+    /// Connections that only read.
+    pub(super) fn readers(&self) -> PgPool {
+        PgPoolOptions::new()
+            .max_connections(READERS)
+            .acquire_timeout(CONNECT_PATIENCE)
+            .connect_lazy_with(self.options(Purpose::Read).options([("default_transaction_read_only", "on")]))
+    }
+
+    /// A connection that hears `channel`; it has no limits, because it waits.
+    pub(super) async fn listener(&self, channel: &str) -> Result<PgListener, sqlx::Error> {
+        let options = self.options(Purpose::Read).options([("statement_timeout", 0)]);
+        let pool = PgPoolOptions::new().max_connections(1).acquire_timeout(CONNECT_PATIENCE).max_lifetime(None);
+        let mut listener = PgListener::connect_with(&pool.idle_timeout(None).connect_with(options).await?).await?;
+        listener.ignore_pool_close_event(true);
+        listener.eager_reconnect(false);
+        listener.listen(channel).await?;
+        Ok(listener)
+    }
+}
+
+async fn setting(connection: &mut PgConnection, name: &'static str) -> Result<String, OpenError> {
+    let row = sqlx::query("SELECT current_setting($1)").bind(name).fetch_one(connection).await;
+    row.and_then(|row| row.try_get(0)).map_err(|source| OpenError::Sql { doing: "reading a setting", source })
+}
+
+/// What a read answers, or that the server has not answered in time.
+pub(super) async fn patiently<T>(reading: impl Future<Output = Result<T, Error>>) -> Result<T, Error> {
+    tokio::time::timeout(READ_PATIENCE, reading).await.unwrap_or_else(|_| Err(Error::Unavailable(no_answer())))
+}
+
+/// The server has not answered.
+pub(super) fn no_answer() -> Cause {
+    Arc::new(std::io::Error::new(std::io::ErrorKind::TimedOut, "PostgreSQL has not answered in time"))
+}

@@ -1,0 +1,220 @@
+//! The writer task of one process's frames: each group is one transaction that has the log's head row for itself.
+//!
+//! Invariant: `frame_head.marked_position` is the newest position of all processes, and `frame_mark` is written with the frames:
+//! a robot may go on at another gateway, which must know at once how far it has come.
+
+use super::connect::{Database, WRITE_PATIENCE, no_answer};
+use super::writer::is_undone_by_others;
+use crate::frames::Marks;
+use crate::frames_queue::{FramesEngine, GAPS_KEPT, Packed, mark};
+use crate::queue::unavailable;
+use crate::{Error, Frame, FrameMark, Gap, OpenError, sql};
+use midshift_core::ids::SiteId;
+use midshift_core::time::Clock;
+use sqlx::{PgConnection, Row};
+use std::sync::Arc;
+use tokio::time::Instant;
+
+/// Rows that one slice of pruning takes.
+const PRUNE_ROWS: i64 = 100;
+/// How often a transaction is tried that the server undid because of others.
+const ATTEMPTS: u32 = 24;
+
+pub(super) struct FramesWriter {
+    database: Database,
+    /// None after a failure, until the next command.
+    connection: Option<PgConnection>,
+    site_id: SiteId,
+    clock: Arc<dyn Clock>,
+    bytes_max: u64,
+}
+
+/// What one transaction does.
+enum Work<'w> {
+    Append { rows: &'w [Packed], marks: Vec<FrameMark>, at_unix_ms: i64 },
+    Gaps(&'w [Gap]),
+    Prune { bytes_max: u64 },
+}
+
+impl FramesWriter {
+    pub(super) async fn open(
+        database: Database,
+        mut connection: PgConnection,
+        site_id: SiteId,
+        clock: Arc<dyn Clock>,
+        bytes_max: u64,
+    ) -> Result<Self, OpenError> {
+        sqlx::query(
+            "INSERT INTO frame_head (site_id, marked_position) VALUES ($1, 0) ON CONFLICT (site_id) DO NOTHING",
+        )
+        .bind(site_id.as_str())
+        .execute(&mut connection)
+        .await
+        .map_err(|source| OpenError::Sql { doing: "reading the head of the frame log", source })?;
+        Ok(Self { database, connection: Some(connection), site_id, clock, bytes_max })
+    }
+
+    async fn take(&mut self) -> Result<PgConnection, Error> {
+        match self.connection.take() {
+            Some(connection) => Ok(connection),
+            None => self.database.writer().await.map_err(|e| Error::Unavailable(Arc::new(e))),
+        }
+    }
+
+    /// Runs `work`; whatever fails, the connection is opened again: sending frames twice does no harm.
+    async fn transaction(&mut self, work: &Work<'_>) -> Result<u64, Error> {
+        let mut attempt = 0;
+        loop {
+            attempt += 1;
+            let mut connection = self.take().await?;
+            let done = tokio::time::timeout(WRITE_PATIENCE, once(&mut connection, &self.site_id, work)).await;
+            match done.map_err(|_| Error::Unavailable(no_answer()))? {
+                Ok(freed) => {
+                    self.connection = Some(connection);
+                    return Ok(freed);
+                }
+                Err(error) if is_undone_by_others(&error) && attempt < ATTEMPTS => {
+                    metrics::counter!("midshift_store_retries_total").increment(1);
+                }
+                Err(error) => return Err(unavailable(error)),
+            }
+        }
+    }
+}
+
+impl FramesEngine for FramesWriter {
+    async fn append(&mut self, frames: &[Frame], rows: &[Packed]) -> Result<(), Error> {
+        let mut marks = Marks::default();
+        for frame in frames {
+            marks.raise(&frame.robot_id, &frame.ring, frame.last_seq);
+        }
+        let started = Instant::now();
+        let work = Work::Append { rows, marks: marks.list(), at_unix_ms: self.clock.now().wall.0 };
+        self.transaction(&work).await?;
+        metrics::histogram!("midshift_store_frames_commit_seconds").record(started.elapsed().as_secs_f64());
+        Ok(())
+    }
+
+    async fn marks(&mut self) -> Result<Vec<FrameMark>, Error> {
+        let mut connection = self.take().await?;
+        let select = sqlx::query(sql::FRAME_MARKS).bind(self.site_id.as_str()).fetch_all(&mut connection);
+        let rows = tokio::time::timeout(WRITE_PATIENCE, select).await;
+        let rows = rows.map_err(|_| Error::Unavailable(no_answer()))?.map_err(unavailable)?;
+        self.connection = Some(connection);
+        let mut marks: Vec<FrameMark> = rows.iter().map(mark).collect::<Result<_, _>>().map_err(unavailable)?;
+        marks.sort_by(|a, b| (&a.robot_id, &a.ring).cmp(&(&b.robot_id, &b.ring)));
+        Ok(marks)
+    }
+
+    async fn gaps(&mut self, gaps: &[Gap]) -> Result<(), Error> {
+        self.transaction(&Work::Gaps(gaps)).await.map(drop)
+    }
+
+    async fn prune(&mut self) -> Result<u64, Error> {
+        self.transaction(&Work::Prune { bytes_max: self.bytes_max }).await
+    }
+
+    async fn close(self) -> Result<(), Error> {
+        match self.connection {
+            Some(connection) => sqlx::Connection::close(connection).await.map_err(unavailable),
+            None => Ok(()),
+        }
+    }
+}
+
+async fn once(connection: &mut PgConnection, site_id: &SiteId, work: &Work<'_>) -> Result<u64, sqlx::Error> {
+    sqlx::query("BEGIN").execute(&mut *connection).await?;
+    let head = sqlx::query("SELECT marked_position FROM frame_head WHERE site_id = $1 FOR UPDATE");
+    let position: i64 = head.bind(site_id.as_str()).fetch_one(&mut *connection).await?.try_get(0)?;
+    let freed = match work {
+        Work::Append { rows, marks, at_unix_ms } => {
+            append(connection, site_id, position, rows, *at_unix_ms).await?;
+            raise_marks(connection, site_id, marks).await?;
+            0
+        }
+        Work::Gaps(gaps) => {
+            report(connection, site_id, gaps).await?;
+            0
+        }
+        Work::Prune { bytes_max } => prune(connection, site_id, *bytes_max).await?,
+    };
+    sqlx::query("COMMIT").execute(connection).await?;
+    Ok(freed)
+}
+
+async fn append(
+    connection: &mut PgConnection,
+    site_id: &SiteId,
+    mut position: i64,
+    rows: &[Packed],
+    at_unix_ms: i64,
+) -> Result<(), sqlx::Error> {
+    for row in rows {
+        position += 1;
+        sqlx::query(sql::FRAME_INSERT)
+            .bind(site_id.as_str())
+            .bind(position)
+            .bind(at_unix_ms)
+            .bind(row.body.len() as i64)
+            .bind(row.body.as_slice())
+            .execute(&mut *connection)
+            .await?;
+    }
+    let head = sqlx::query("UPDATE frame_head SET marked_position = $1 WHERE site_id = $2");
+    head.bind(position).bind(site_id.as_str()).execute(connection).await.map(drop)
+}
+
+async fn raise_marks(connection: &mut PgConnection, site_id: &SiteId, marks: &[FrameMark]) -> Result<(), sqlx::Error> {
+    sqlx::query(
+        "INSERT INTO frame_mark (site_id, robot_id, ring, seq) \
+         SELECT $1, mark.* FROM UNNEST($2::text[], $3::text[], $4::bigint[]) AS mark \
+         ON CONFLICT (site_id, robot_id, ring) DO UPDATE SET seq = excluded.seq WHERE excluded.seq > frame_mark.seq",
+    )
+    .bind(site_id.as_str())
+    .bind(marks.iter().map(|m| m.robot_id.as_str()).collect::<Vec<_>>())
+    .bind(marks.iter().map(|m| &*m.ring).collect::<Vec<_>>())
+    .bind(marks.iter().map(|m| m.seq.cast_signed()).collect::<Vec<_>>())
+    .execute(connection)
+    .await
+    .map(drop)
+}
+
+async fn report(connection: &mut PgConnection, site_id: &SiteId, gaps: &[Gap]) -> Result<(), sqlx::Error> {
+    let newest = sqlx::query("SELECT COALESCE(MAX(position), 0) FROM gap WHERE site_id = $1").bind(site_id.as_str());
+    let newest: i64 = newest.fetch_one(&mut *connection).await?.try_get(0)?;
+    sqlx::query(
+        "INSERT INTO gap (site_id, position, robot_id, ring, lane, from_seq, to_seq, reason, at_unix_ms) \
+         SELECT $1, gap.* FROM UNNEST($2::bigint[], $3::text[], $4::text[], $5::text[], $6::bigint[], $7::bigint[], \
+         $8::text[], $9::bigint[]) AS gap",
+    )
+    .bind(site_id.as_str())
+    .bind((newest + 1..).take(gaps.len()).collect::<Vec<_>>())
+    .bind(gaps.iter().map(|g| g.robot_id.as_str()).collect::<Vec<_>>())
+    .bind(gaps.iter().map(|g| &*g.ring).collect::<Vec<_>>())
+    .bind(gaps.iter().map(|g| &*g.lane).collect::<Vec<_>>())
+    .bind(gaps.iter().map(|g| g.from_seq.cast_signed()).collect::<Vec<_>>())
+    .bind(gaps.iter().map(|g| g.to_seq.cast_signed()).collect::<Vec<_>>())
+    .bind(gaps.iter().map(|g| &*g.reason).collect::<Vec<_>>())
+    .bind(gaps.iter().map(|g| g.at_unix_ms).collect::<Vec<_>>())
+    .execute(&mut *connection)
+    .await?;
+    let kept = newest + gaps.len() as i64 - GAPS_KEPT;
+    sqlx::query(sql::GAPS_PRUNE).bind(site_id.as_str()).bind(kept).execute(connection).await.map(drop)
+}
+
+async fn prune(connection: &mut PgConnection, site_id: &SiteId, bytes_max: u64) -> Result<u64, sqlx::Error> {
+    let sum = sqlx::query("SELECT COALESCE(SUM(size), 0)::bigint FROM frame_log WHERE site_id = $1");
+    let sum: i64 = sum.bind(site_id.as_str()).fetch_one(&mut *connection).await?.try_get(0)?;
+    let oldest = sqlx::query(sql::FRAME_SIZES).bind(site_id.as_str()).bind(0i64).bind(PRUNE_ROWS);
+    let (mut freed, mut up_to) = (0, 0);
+    for row in oldest.fetch_all(&mut *connection).await? {
+        if sum.cast_unsigned() - freed <= bytes_max {
+            break;
+        }
+        up_to = row.try_get::<i64, _>(0)?;
+        freed += row.try_get::<i64, _>(1)?.cast_unsigned();
+    }
+    let delete = sqlx::query("DELETE FROM frame_log WHERE site_id = $1 AND position <= $2");
+    delete.bind(site_id.as_str()).bind(up_to).execute(connection).await?;
+    Ok(freed)
+}

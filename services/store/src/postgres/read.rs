@@ -1,0 +1,197 @@
+//! Reads beside the writer: each answer is of one moment.
+//!
+//! Invariant: what must hold together (rows and their number, entries and the head) is read in one transaction that sees one
+//! snapshot. Because whoever commits has the head row for itself, a snapshot that shows a number shows everything before it.
+
+use super::write_sql::is_text;
+use crate::queue::unavailable;
+use crate::sql::{self, ENTRY_READ, ROW_READ, entry, row};
+use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, Query, Snapshot, page_of};
+use midshift_core::ids::SiteId;
+use midshift_core::rows::{Entry, Key, Log, Row, Seq, Table};
+use sqlx::postgres::PgRow;
+use sqlx::{AssertSqlSafe, PgConnection, PgPool, Postgres, Row as _, Transaction};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+/// One snapshot for all statements, whatever the database's own default is.
+const BEGIN: &str = "BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY";
+
+pub(super) async fn begin(readers: &PgPool) -> Result<Transaction<'static, Postgres>, sqlx::Error> {
+    readers.begin_with(BEGIN).await
+}
+
+pub(super) async fn get(readers: &PgPool, site_id: &SiteId, keys: &[Key]) -> Result<Vec<Row>, sqlx::Error> {
+    let mut ids: BTreeMap<Table, Vec<&str>> = BTreeMap::new();
+    for key in keys.iter().filter(|key| is_text(&key.id)) {
+        ids.entry(key.table).or_default().push(&key.id);
+    }
+    let mut found: BTreeMap<Key, Row> = BTreeMap::new();
+    let select = |table: Table| format!("SELECT {ROW_READ} FROM {} WHERE site_id = $1 AND id = ANY($2)", table.name());
+    let mut take = |table: Table, rows: &[PgRow]| -> Result<(), sqlx::Error> {
+        for one in rows {
+            let one = row(table, one)?;
+            found.insert(one.key.clone(), one);
+        }
+        Ok(())
+    };
+    if ids.len() == 1 {
+        // One statement needs no transaction to be of one moment.
+        for (table, ids) in ids {
+            let select = sqlx::query(AssertSqlSafe(select(table))).bind(site_id.as_str()).bind(ids);
+            take(table, &select.fetch_all(readers).await?)?;
+        }
+    } else if !ids.is_empty() {
+        let mut transaction = begin(readers).await?;
+        for (table, ids) in ids {
+            let select = sqlx::query(AssertSqlSafe(select(table))).bind(site_id.as_str()).bind(ids);
+            take(table, &select.fetch_all(&mut *transaction).await?)?;
+        }
+    }
+    Ok(keys.iter().filter_map(|key| found.get(key).cloned()).collect())
+}
+
+/// Each state is read from its own stretch of the index and the stretches are merged, as with SQLite.
+pub(super) async fn list(readers: &PgPool, site_id: &SiteId, query: &Query) -> Result<Vec<Row>, sqlx::Error> {
+    if query.parent.as_deref().is_some_and(|parent| !is_text(parent)) {
+        return Ok(Vec::new());
+    }
+    let states: BTreeSet<i64> = query.states.iter().copied().collect();
+    let mut transaction = begin(readers).await?;
+    if states.is_empty() {
+        return list_one(&mut transaction, site_id, query, None).await;
+    }
+    let mut rows = Vec::new();
+    for state in states {
+        rows.extend(list_one(&mut transaction, site_id, query, Some(state)).await?);
+    }
+    Ok(sql::merged(query, rows))
+}
+
+async fn list_one(
+    connection: &mut PgConnection,
+    site_id: &SiteId,
+    query: &Query,
+    state: Option<i64>,
+) -> Result<Vec<Row>, sqlx::Error> {
+    let mut select = sqlx::query(AssertSqlSafe(sql::list(query, state))).bind(site_id.as_str());
+    if let Some(parent) = &query.parent {
+        select = select.bind(&**parent);
+    }
+    if let Some(state) = state {
+        select = select.bind(state);
+    }
+    if let Some(Cursor { order, id }) = &query.after {
+        // A cursor that somebody made up may have a NUL in it: what stands before that is where the list goes on.
+        select = select.bind(*order).bind(id.split('\0').next());
+    }
+    let rows = select.bind(query.rows_max() as i64).fetch_all(connection).await?;
+    rows.iter().map(|found| row(query.table, found)).collect()
+}
+
+pub(super) async fn snapshot(
+    readers: &PgPool,
+    site_id: &SiteId,
+    tables: &BTreeSet<Table>,
+) -> Result<Snapshot, sqlx::Error> {
+    let mut transaction = begin(readers).await?;
+    let seq = head(&mut *transaction, site_id).await?;
+    let mut rows = Vec::new();
+    for table in tables {
+        let select = sqlx::query(AssertSqlSafe(sql::whole(*table))).bind(site_id.as_str());
+        for found in select.fetch_all(&mut *transaction).await? {
+            rows.push(row(*table, &found)?);
+        }
+    }
+    Ok(Snapshot { seq, rows })
+}
+
+/// The newest number that is committed.
+pub(super) async fn head<'c>(
+    executor: impl sqlx::Executor<'c, Database = Postgres>,
+    site_id: &SiteId,
+) -> Result<Seq, sqlx::Error> {
+    sql::seq(&sqlx::query(sql::HEAD).bind(site_id.as_str()).fetch_one(executor).await?, 0)
+}
+
+pub(super) async fn feed(
+    readers: &PgPool,
+    site_id: &SiteId,
+    logs: &BTreeSet<Log>,
+    subjects: Option<&BTreeSet<Arc<str>>>,
+    after: Seq,
+    limit: usize,
+) -> Result<FeedPage, Error> {
+    let limit = limit.clamp(1, FEED_PAGE_MAX);
+    let mut transaction = begin(readers).await.map_err(unavailable)?;
+    let head = head(&mut *transaction, site_id).await.map_err(unavailable)?;
+    if after == head {
+        // Nothing is after the head, whatever has been pruned before it.
+        return Ok(page_of(Vec::new(), limit, head));
+    }
+    let oldest = oldest_cursor(&mut transaction, site_id, logs).await.map_err(unavailable)?;
+    if after < oldest || after > head {
+        return Err(Error::CursorExpired { asked: after, oldest });
+    }
+    let subjects: Option<Vec<&str>> = subjects.map(|of| of.iter().map(|s| &**s).filter(|s| is_text(s)).collect());
+    let mut entries = Vec::new();
+    for log in logs {
+        let page = log_page(&mut transaction, site_id, *log, subjects.as_deref(), after, limit).await;
+        entries.extend(page.map_err(unavailable)?);
+    }
+    entries.sort_unstable_by_key(|e: &Entry| e.seq);
+    Ok(page_of(entries, limit, head))
+}
+
+async fn oldest_cursor(
+    connection: &mut PgConnection,
+    site_id: &SiteId,
+    logs: &BTreeSet<Log>,
+) -> Result<Seq, sqlx::Error> {
+    let mut oldest = Seq(0);
+    for mark in sqlx::query(sql::LOG_MARKS).bind(site_id.as_str()).fetch_all(connection).await? {
+        let name: &str = mark.try_get(0)?;
+        if logs.iter().any(|log| log.name() == name) {
+            oldest = oldest.max(sql::seq(&mark, 1)?);
+        }
+    }
+    Ok(oldest)
+}
+
+async fn log_page(
+    connection: &mut PgConnection,
+    site_id: &SiteId,
+    log: Log,
+    subjects: Option<&[&str]>,
+    after: Seq,
+    limit: usize,
+) -> Result<Vec<Entry>, sqlx::Error> {
+    let about = if subjects.is_some() { " AND subject = ANY($4)" } else { "" };
+    let sql =
+        format!("SELECT {ENTRY_READ} FROM {} WHERE site_id = $1 AND seq > $2{about} ORDER BY seq LIMIT $3", log.name());
+    let mut select =
+        sqlx::query(AssertSqlSafe(sql)).bind(site_id.as_str()).bind(after.0.cast_signed()).bind(limit as i64);
+    if let Some(subjects) = subjects {
+        select = select.bind(subjects);
+    }
+    let rows = select.fetch_all(connection).await?;
+    rows.iter().map(|row| entry(log, row)).collect()
+}
+
+/// How many entries a log holds.
+pub(super) async fn count(readers: &PgPool, site_id: &SiteId, log: Log) -> Result<u64, sqlx::Error> {
+    let select = sqlx::query(AssertSqlSafe(sql::count(log))).bind(site_id.as_str());
+    Ok(select.fetch_one(readers).await?.try_get::<i64, _>(0)?.cast_unsigned())
+}
+
+/// Number and commit time of the oldest entries of a log.
+pub(super) async fn oldest(
+    readers: &PgPool,
+    site_id: &SiteId,
+    log: Log,
+    limit: usize,
+) -> Result<Vec<(Seq, i64)>, sqlx::Error> {
+    let select = sqlx::query(AssertSqlSafe(sql::oldest(log))).bind(site_id.as_str()).bind(limit as i64);
+    let rows = select.fetch_all(readers).await?;
+    rows.iter().map(|row| Ok((sql::seq(row, 0)?, row.try_get(1)?))).collect()
+}

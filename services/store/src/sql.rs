@@ -1,0 +1,163 @@
+//! SQL that both engines speak, and how their rows are read: texts, column lists, decoding.
+//!
+//! Invariant: only table and column names from closed lists are ever spliced into text; every value is bound. Binds are numbered
+//! (`$1`), which both engines take.
+
+use crate::{Cursor, Query};
+use midshift_core::rows::{Entry, Index, Key, Log, Revision, Row, Seq, Table};
+use sqlx::{ColumnIndex, Decode, Type};
+use std::sync::Arc;
+
+/// Columns of a row, as written.
+pub(crate) const ROW_COLUMNS: &str = "site_id, id, revision, state, parent, ord, body";
+/// Columns of a row, as [`row`] reads them.
+pub(crate) const ROW_READ: &str = "id, revision, state, parent, ord, body";
+/// Columns of an entry, as written.
+pub(crate) const ENTRY_COLUMNS: &str =
+    "site_id, seq, tbl, subject, revision, state, parent, ord, body, kind, actor, request_id, at_unix_ms";
+/// Columns of an entry, as [`entry`] reads them.
+pub(crate) const ENTRY_READ: &str =
+    "seq, tbl, subject, revision, state, parent, ord, body, kind, actor, request_id, at_unix_ms";
+/// What an upsert of rows does with those that are there.
+pub(crate) const ROW_CONFLICT: &str = "ON CONFLICT (site_id, id) DO UPDATE SET revision = excluded.revision, \
+     state = excluded.state, parent = excluded.parent, ord = excluded.ord, body = excluded.body";
+
+pub(crate) const HEAD: &str = "SELECT seq FROM store_head WHERE site_id = $1";
+pub(crate) const MOVE_HEAD: &str = "UPDATE store_head SET seq = $1 WHERE site_id = $2";
+pub(crate) const IDENTITY: &str = "SELECT site_id, store_id FROM store_head";
+pub(crate) const IDENTIFY: &str = "INSERT INTO store_head (site_id, store_id, seq) VALUES ($1, $2, $3)";
+pub(crate) const LOG_MARKS: &str = "SELECT log, pruned_seq FROM log_mark WHERE site_id = $1";
+pub(crate) const MARK_LOG: &str = "INSERT INTO log_mark (site_id, log, pruned_seq) VALUES ($1, $2, $3) \
+     ON CONFLICT (site_id, log) DO UPDATE SET pruned_seq = excluded.pruned_seq";
+pub(crate) const FRAME_SIZES: &str =
+    "SELECT position, size FROM frame_log WHERE site_id = $1 AND position > $2 ORDER BY position LIMIT $3";
+pub(crate) const FRAME_BODIES: &str = "SELECT position, at_unix_ms, body FROM frame_log \
+     WHERE site_id = $1 AND position > $2 AND position <= $3 ORDER BY position";
+pub(crate) const FRAME_INSERT: &str =
+    "INSERT INTO frame_log (site_id, position, at_unix_ms, size, body) VALUES ($1, $2, $3, $4, $5)";
+pub(crate) const FRAME_MARKS: &str = "SELECT robot_id, ring, seq FROM frame_mark WHERE site_id = $1";
+pub(crate) const GAPS: &str = "SELECT robot_id, ring, lane, from_seq, to_seq, reason, at_unix_ms FROM gap \
+     WHERE site_id = $1 ORDER BY position DESC LIMIT $2";
+pub(crate) const GAPS_OF_ROBOT: &str = "SELECT robot_id, ring, lane, from_seq, to_seq, reason, at_unix_ms FROM gap \
+     WHERE site_id = $1 AND robot_id = $3 ORDER BY position DESC LIMIT $2";
+pub(crate) const GAPS_PRUNE: &str = "DELETE FROM gap WHERE site_id = $1 AND position <= $2";
+
+/// All rows of a table.
+pub(crate) fn whole(table: Table) -> String {
+    format!("SELECT {ROW_READ} FROM {} WHERE site_id = $1 ORDER BY id", table.name())
+}
+
+/// How many entries a log holds.
+pub(crate) fn count(log: Log) -> String {
+    format!("SELECT COUNT(*) FROM {} WHERE site_id = $1", log.name())
+}
+
+/// Number and time of a log's oldest entries, at most `$2`.
+pub(crate) fn oldest(log: Log) -> String {
+    format!("SELECT seq, at_unix_ms FROM {} WHERE site_id = $1 ORDER BY seq LIMIT $2", log.name())
+}
+
+/// Takes a log's entries up to `$2` out.
+pub(crate) fn prune(log: Log) -> String {
+    format!("DELETE FROM {} WHERE site_id = $1 AND seq <= $2", log.name())
+}
+
+/// One page of a table, of one state or of any. Binds in order: site, then what is asked of parent, `state`, cursor (order, id), and
+/// the limit.
+pub(crate) fn list(query: &Query, state: Option<i64>) -> String {
+    let mut sql = format!("SELECT {ROW_READ} FROM {} WHERE site_id = $1", query.table.name());
+    let mut bound = 1;
+    let mut next = || {
+        bound += 1;
+        bound
+    };
+    if query.parent.is_some() {
+        sql += &format!(" AND parent = ${}", next());
+    }
+    if state.is_some() {
+        sql += &format!(" AND state = ${}", next());
+    }
+    if query.after.is_some() {
+        let side = if query.newest_first { '<' } else { '>' };
+        sql += &format!(" AND (ord, id) {side} (${}, ${})", next(), next());
+    }
+    sql += if query.newest_first { " ORDER BY ord DESC, id DESC" } else { " ORDER BY ord, id" };
+    sql + &format!(" LIMIT ${}", next())
+}
+
+/// Pages of several states, merged into the page of all of them.
+pub(crate) fn merged(query: &Query, mut rows: Vec<Row>) -> Vec<Row> {
+    rows.sort_by_cached_key(Cursor::of);
+    if query.newest_first {
+        rows.reverse();
+    }
+    rows.truncate(query.rows_max());
+    rows
+}
+
+/// The column form of a sort key: a row without one sorts before all others, on every engine.
+pub(crate) fn ord(order: Option<i64>) -> i64 {
+    order.unwrap_or(i64::MIN)
+}
+
+/// One row of `table` from [`ROW_READ`].
+pub(crate) fn row<'r, R>(table: Table, row: &'r R) -> Result<Row, sqlx::Error>
+where
+    R: sqlx::Row,
+    usize: ColumnIndex<R>,
+    &'r str: Decode<'r, R::Database> + Type<R::Database>,
+    i64: Decode<'r, R::Database> + Type<R::Database>,
+{
+    let order: i64 = row.try_get(4)?;
+    Ok(Row {
+        key: Key::new(table, row.try_get::<&str, _>(0)?),
+        revision: Revision(row.try_get::<i64, _>(1)?.cast_unsigned()),
+        index: Index {
+            state: row.try_get(2)?,
+            parent: row.try_get::<Option<&str>, _>(3)?.map(Arc::from),
+            order: (order != ord(None)).then_some(order),
+        },
+        body: Arc::from(row.try_get::<&str, _>(5)?),
+    })
+}
+
+/// One entry of `log` from [`ENTRY_READ`].
+pub(crate) fn entry<'r, R>(log: Log, row: &'r R) -> Result<Entry, sqlx::Error>
+where
+    R: sqlx::Row,
+    usize: ColumnIndex<R>,
+    &'r str: Decode<'r, R::Database> + Type<R::Database>,
+    i64: Decode<'r, R::Database> + Type<R::Database>,
+{
+    let text = |column: usize| Ok::<_, sqlx::Error>(row.try_get::<Option<&str>, _>(column)?.map(Arc::from));
+    let table = match row.try_get::<Option<&str>, _>(1)? {
+        None => None,
+        Some(name) => {
+            let table = Table::ALL.iter().copied().find(|table| table.name() == name);
+            Some(table.ok_or_else(|| sqlx::Error::Decode(format!("no table is called {name}").into()))?)
+        }
+    };
+    Ok(Entry {
+        seq: seq(row, 0)?,
+        log,
+        table,
+        subject: Arc::from(row.try_get::<&str, _>(2)?),
+        revision: Revision(row.try_get::<i64, _>(3)?.cast_unsigned()),
+        index: Index { state: row.try_get(4)?, parent: text(5)?, order: row.try_get(6)? },
+        body: text(7)?,
+        kind: Arc::from(row.try_get::<&str, _>(8)?),
+        actor: Arc::from(row.try_get::<&str, _>(9)?),
+        request_id: text(10)?,
+        at_unix_ms: row.try_get(11)?,
+    })
+}
+
+/// A number of the feed in one column.
+pub(crate) fn seq<'r, R>(row: &'r R, column: usize) -> Result<Seq, sqlx::Error>
+where
+    R: sqlx::Row,
+    usize: ColumnIndex<R>,
+    i64: Decode<'r, R::Database> + Type<R::Database>,
+{
+    Ok(Seq(row.try_get::<i64, _>(column)?.cast_unsigned()))
+}

@@ -1,0 +1,1 @@
+//! What only PostgreSQL has: several processes on one database, its failures, and how they hear of each other.

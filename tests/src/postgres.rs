@@ -1,0 +1,189 @@
+//! A PostgreSQL server of the tests' own: the machine's server programs on a new directory, as a user without rights.
+//!
+//! Invariant: it ends when the test program does, however that ends: a shell beside it waits for the end of a pipe that this
+//! process holds. It keeps its promises (`fsync` is on) and orders text by a language unless a column says otherwise.
+//! Uses nothing but the standard library and `tempfile`, so that any crate's tests can include this file.
+
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+/// Where Debian and others have the server programs.
+const PLACES: [&str; 3] = ["/usr/lib/postgresql", "/usr/local/pgsql", "/opt/postgresql"];
+/// Runs the server and ends it at the end of the pipe.
+const SUPERVISOR: &str =
+    "exec 3<&0; \"$@\" 3<&- >>\"$LOG\" 2>&1 & server=$!; (read -r _ <&3; kill -QUIT $server) & wait $server";
+const USER: &str = "postgres";
+
+/// A running server.
+pub struct PostgresServer {
+    programs: PathBuf,
+    dir: tempfile::TempDir,
+    supervisor: Option<Child>,
+    databases: AtomicU32,
+}
+
+impl PostgresServer {
+    /// The one server of this test program, started at first use.
+    pub fn shared() -> &'static Self {
+        static SERVER: OnceLock<PostgresServer> = OnceLock::new();
+        SERVER.get_or_init(Self::start)
+    }
+
+    /// A new server with no databases but its own.
+    ///
+    /// # Panics
+    /// If the machine has no server programs or they do not run.
+    pub fn start() -> Self {
+        let programs = programs();
+        let dir = tempfile::Builder::new().prefix("midshift-pg-").tempdir().expect("a directory");
+        let mut server = Self { programs, dir, supervisor: None, databases: AtomicU32::new(0) };
+        if let Some((uid, gid)) = unprivileged() {
+            std::os::unix::fs::chown(server.dir.path(), Some(uid), Some(gid)).expect("giving the directory away");
+        }
+        let mut init = server.command("initdb");
+        init.args(["-U", USER, "-A", "trust", "-E", "UTF8", "--no-sync", "--locale=C.UTF-8"]);
+        init.args(["--locale-provider=icu", "--icu-locale=en-US", "-D"]).arg(server.dir.path().join("data"));
+        run(&mut init);
+        server.start_again();
+        server
+    }
+
+    /// Ends the server at once, as if its power went: nothing is finished, the log is replayed at the next start.
+    ///
+    /// # Panics
+    /// If it does not run.
+    pub fn cut(&mut self) {
+        let mut supervisor = self.supervisor.take().expect("a running server");
+        drop(supervisor.stdin.take());
+        supervisor.wait().expect("the end of the server");
+    }
+
+    /// Starts the server again on the same files and waits until it takes connections.
+    ///
+    /// # Panics
+    /// If it does not come up.
+    pub fn start_again(&mut self) {
+        let dir = self.dir.path();
+        let mut command = Command::new("sh");
+        command.args(["-c", SUPERVISOR, "supervisor"]).arg(self.programs.join("postgres"));
+        command.arg("-D").arg(dir.join("data")).arg("-k").arg(dir).args(["-h", ""]);
+        command.args(["-c", "fsync=on", "-c", "max_connections=300", "-c", "shared_buffers=32MB"]);
+        command.env("LOG", dir.join("log")).current_dir(dir).stdin(Stdio::piped());
+        as_user(&mut command);
+        self.supervisor = Some(command.spawn().expect("sh"));
+        while !self.is_ready() {
+            let ended = self.supervisor.as_mut().and_then(|s| s.try_wait().expect("the supervisor"));
+            assert!(ended.is_none(), "the server does not start: {}", self.log());
+            std::thread::yield_now();
+        }
+    }
+
+    /// A new empty database, as a URL.
+    pub fn database(&self) -> String {
+        self.database_from("template0")
+    }
+
+    /// A copy of `template`, a database of this server that nobody uses.
+    pub fn database_from(&self, template: &str) -> String {
+        self.create(template, &format!("test_{}", self.databases.fetch_add(1, Ordering::Relaxed)))
+    }
+
+    /// A new empty database of this name, as a URL; it can be the template of others once nobody uses it.
+    pub fn database_named(&self, name: &str) -> String {
+        self.create("template0", name)
+    }
+
+    fn create(&self, template: &str, name: &str) -> String {
+        let mut create = self.client("createdb");
+        // A log of the copy is cheaper than the two checkpoints of the other way.
+        run(create.args(["-T", template, "--strategy=wal_log"]).arg(name));
+        self.url(name)
+    }
+
+    /// The URL of a database.
+    pub fn url(&self, database: &str) -> String {
+        format!("postgres://{USER}@localhost/{database}?host={}", self.dir.path().display())
+    }
+
+    /// The server's socket, for a proxy in front of it.
+    pub fn socket(&self) -> PathBuf {
+        self.dir.path().join(".s.PGSQL.5432")
+    }
+
+    fn is_ready(&self) -> bool {
+        let mut ready = self.client("pg_isready");
+        ready.stdout(Stdio::null()).status().is_ok_and(|status| status.success())
+    }
+
+    fn log(&self) -> String {
+        std::fs::read_to_string(self.dir.path().join("log")).unwrap_or_default()
+    }
+
+    /// A program of the server's, as its user.
+    fn command(&self, program: &str) -> Command {
+        let mut command = Command::new(self.programs.join(program));
+        command.current_dir(self.dir.path());
+        as_user(&mut command);
+        command
+    }
+
+    fn client(&self, program: &str) -> Command {
+        let mut command = self.command(program);
+        command.arg("-h").arg(self.dir.path()).args(["-U", USER]);
+        command
+    }
+}
+
+impl Drop for PostgresServer {
+    fn drop(&mut self) {
+        if self.supervisor.is_some() {
+            self.cut();
+        }
+    }
+}
+
+/// The newest server programs of the machine.
+fn programs() -> PathBuf {
+    let versions = PLACES.iter().filter_map(|place| std::fs::read_dir(place).ok()).flatten().flatten();
+    let version = |path: &Path| path.file_name().and_then(|n| n.to_str()?.parse::<u32>().ok());
+    let found = versions.map(|entry| entry.path()).filter(|path| path.join("bin/initdb").is_file());
+    let newest = found.filter_map(|path| Some((version(&path)?, path))).max();
+    let (version, path) = newest.unwrap_or_else(|| {
+        panic!(
+            "no PostgreSQL server programs in {PLACES:?}: install the package postgresql (cargo xtask test --install)"
+        )
+    });
+    assert!(version >= 15, "PostgreSQL {version} in {}: 15 or newer is needed", path.display());
+    path.join("bin")
+}
+
+/// Whom the server runs as: it refuses root. None: as whoever runs the tests.
+fn unprivileged() -> Option<(u32, u32)> {
+    let id = |args: &[&str]| {
+        let output = Command::new("id").args(args).output().ok().filter(|o| o.status.success())?;
+        String::from_utf8(output.stdout).ok()?.trim().parse::<u32>().ok()
+    };
+    if id(&["-u"]) != Some(0) {
+        return None;
+    }
+    let of = |user: &str| Some((id(&["-u", user])?, id(&["-g", user])?));
+    Some(of(USER).or_else(|| of("nobody")).expect("a user postgres or nobody"))
+}
+
+fn as_user(command: &mut Command) {
+    if let Some((uid, gid)) = unprivileged() {
+        std::os::unix::process::CommandExt::uid(command, uid);
+        std::os::unix::process::CommandExt::gid(command, gid);
+    }
+}
+
+fn run(command: &mut Command) {
+    let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("a program of PostgreSQL");
+    let mut said = String::new();
+    child.stderr.take().map(|mut stderr| stderr.read_to_string(&mut said));
+    let status = child.wait().expect("its end");
+    assert!(status.success(), "{command:?}: {said}");
+}
