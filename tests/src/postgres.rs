@@ -13,8 +13,8 @@ use std::sync::atomic::{AtomicU32, Ordering};
 /// Where Debian and others have the server programs.
 const PLACES: [&str; 3] = ["/usr/lib/postgresql", "/usr/local/pgsql", "/opt/postgresql"];
 /// Runs the server and ends it at the end of the pipe.
-const SUPERVISOR: &str =
-    "exec 3<&0; \"$@\" 3<&- >>\"$LOG\" 2>&1 & server=$!; (read -r _ <&3; kill -QUIT $server) & wait $server";
+const SUPERVISOR: &str = "exec 3<&0; \"$@\" 3<&- >>log 2>&1 & server=$!; (read -r _ <&3; kill -QUIT $server) & wait $server; \
+     if [ -n \"$REMOVED\" ]; then cd /; rm -rf \"$REMOVED\"; fi";
 const USER: &str = "postgres";
 
 /// A running server.
@@ -23,13 +23,14 @@ pub struct PostgresServer {
     dir: tempfile::TempDir,
     supervisor: Option<Child>,
     databases: AtomicU32,
+    is_shared: bool,
 }
 
 impl PostgresServer {
     /// The one server of this test program, started at first use.
     pub fn shared() -> &'static Self {
         static SERVER: OnceLock<PostgresServer> = OnceLock::new();
-        SERVER.get_or_init(Self::start)
+        SERVER.get_or_init(|| Self::start_new(true))
     }
 
     /// A new server with no databases but its own.
@@ -37,9 +38,13 @@ impl PostgresServer {
     /// # Panics
     /// If the machine has no server programs or they do not run.
     pub fn start() -> Self {
+        Self::start_new(false)
+    }
+
+    fn start_new(is_shared: bool) -> Self {
         let programs = programs();
         let dir = tempfile::Builder::new().prefix("midshift-pg-").tempdir().expect("a directory");
-        let mut server = Self { programs, dir, supervisor: None, databases: AtomicU32::new(0) };
+        let mut server = Self { programs, dir, supervisor: None, databases: AtomicU32::new(0), is_shared };
         if let Some((uid, gid)) = unprivileged() {
             std::os::unix::fs::chown(server.dir.path(), Some(uid), Some(gid)).expect("giving the directory away");
         }
@@ -71,7 +76,11 @@ impl PostgresServer {
         command.args(["-c", SUPERVISOR, "supervisor"]).arg(self.programs.join("postgres"));
         command.arg("-D").arg(dir.join("data")).arg("-k").arg(dir).args(["-h", ""]);
         command.args(["-c", "fsync=on", "-c", "max_connections=300", "-c", "shared_buffers=32MB"]);
-        command.env("LOG", dir.join("log")).current_dir(dir).stdin(Stdio::piped());
+        command.args(["-c", "log_line_prefix=%d: "]).current_dir(dir).stdin(Stdio::piped());
+        if self.is_shared {
+            // It is never dropped.
+            command.env("REMOVED", dir);
+        }
         as_user(&mut command);
         self.supervisor = Some(command.spawn().expect("sh"));
         while !self.is_ready() {
@@ -118,7 +127,8 @@ impl PostgresServer {
         ready.stdout(Stdio::null()).status().is_ok_and(|status| status.success())
     }
 
-    fn log(&self) -> String {
+    /// What the server has said so far; each line begins with the name of its database.
+    pub fn log(&self) -> String {
         std::fs::read_to_string(self.dir.path().join("log")).unwrap_or_default()
     }
 

@@ -18,6 +18,8 @@ const SPAWNS: &[(&str, &str)] = &[
     ("services/midshift/src/robots.rs", "the binary lets a person walk beside its robot"),
     ("services/store/src/sqlite/mod.rs", "the one writer of a file and its checkpoints"),
     ("services/store/src/sqlite/frames.rs", "the one writer of a file and its checkpoints"),
+    ("services/store/src/postgres/mod.rs", "the one writer of a process, and what hears of the others"),
+    ("services/store/src/postgres/frames.rs", "the one writer of a process"),
     ("services/midshift/src/dev.rs", "the binary wires the parts"),
     ("services/midshift/src/cli/mod.rs", "the binary listens for Ctrl-C"),
 ];

@@ -123,7 +123,7 @@ impl FramesEngine for FramesWriter {
 }
 
 async fn once(connection: &mut PgConnection, site_id: &SiteId, work: &Work<'_>) -> Result<u64, sqlx::Error> {
-    sqlx::query("BEGIN").execute(&mut *connection).await?;
+    sqlx::raw_sql("BEGIN").execute(&mut *connection).await?;
     let head = sqlx::query("SELECT marked_position FROM frame_head WHERE site_id = $1 FOR UPDATE");
     let position: i64 = head.bind(site_id.as_str()).fetch_one(&mut *connection).await?.try_get(0)?;
     let freed = match work {
@@ -138,7 +138,7 @@ async fn once(connection: &mut PgConnection, site_id: &SiteId, work: &Work<'_>) 
         }
         Work::Prune { bytes_max } => prune(connection, site_id, *bytes_max).await?,
     };
-    sqlx::query("COMMIT").execute(connection).await?;
+    sqlx::raw_sql("COMMIT").execute(connection).await?;
     Ok(freed)
 }
 

@@ -106,7 +106,7 @@ impl Writer {
                 }
                 Err(Undone::ByOthers(error)) => {
                     metrics::counter!("midshift_store_retries_total").increment(1);
-                    let ended = tokio::time::timeout(WRITE_PATIENCE, sqlx::query("ROLLBACK").execute(&mut connection));
+                    let ended = tokio::time::timeout(WRITE_PATIENCE, sqlx::raw_sql("ROLLBACK").execute(&mut connection));
                     if matches!(ended.await, Ok(Ok(_))) {
                         self.connection = Some(connection);
                     }
@@ -137,14 +137,14 @@ trait AsyncWork<T>: Send {
 
 async fn once<T>(connection: &mut PgConnection, site_id: &SiteId, work: &mut impl AsyncWork<T>) -> Result<T, Undone> {
     let statements = async {
-        sqlx::query("BEGIN").execute(&mut *connection).await?;
+        sqlx::raw_sql("BEGIN").execute(&mut *connection).await?;
         let head = write_sql::lock_head(connection, site_id).await?;
         work.run(connection, site_id, head).await
     };
     let (done, writes) =
         tokio::time::timeout(WRITE_PATIENCE, statements).await.map_err(|_| Undone::Before(no_answer()))??;
     let end = if writes { "COMMIT" } else { "ROLLBACK" };
-    let ended = tokio::time::timeout(WRITE_PATIENCE, sqlx::query(end).execute(connection)).await;
+    let ended = tokio::time::timeout(WRITE_PATIENCE, sqlx::raw_sql(end).execute(connection)).await;
     match ended {
         Ok(Ok(_)) => Ok(done),
         // What was judged under the lock was so, whatever became of the connection afterwards.

@@ -3,7 +3,9 @@
 
 mod contract;
 mod failure;
+mod partition;
 mod postgres;
+mod postgres_failure;
 mod projection;
 mod reopen;
 #[path = "../../../../tests/src/postgres.rs"]

@@ -81,6 +81,8 @@ proptest! {
             carried_forward_equals_built_anew(&short, &calls).await;
             let sqlite = crate::support::sqlite().await;
             carried_forward_equals_built_anew(&*sqlite.store, &calls).await;
+            let postgres = crate::support::postgres().await;
+            carried_forward_equals_built_anew(&*postgres.store, &calls).await;
         });
     }
 }

@@ -3,7 +3,9 @@
 use crate::support::{at, clock, one, put, site};
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::rows::{Expect, Key, Log, Revision, Seq, Table, Writer};
-use midshift_store::{Error, Frame, FrameLog, Gap, MemoryFrames, OpenError, SqliteFrames, SqliteStore, Store};
+use midshift_store::{
+    Error, Frame, FrameLog, Gap, MemoryFrames, OpenError, PostgresFrames, SqliteFrames, SqliteStore, Store,
+};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -111,6 +113,31 @@ async fn frames_in_memory_keep_the_contract() {
     the_frame_contract(&log).await;
     log.append(vec![frame("c", 1, 1, 990)]).await.unwrap();
     assert_eq!(log.read(0, usize::MAX).await.unwrap().len(), 2, "the oldest are gone");
+}
+
+#[tokio::test]
+async fn frames_on_postgresql_keep_the_contract_for_every_process_that_has_them_open() {
+    let config = crate::support::database().await;
+    let open = async || PostgresFrames::open(&config, site(), clock(), 300_000).await.unwrap();
+    let (log, other) = (open().await, open().await);
+    the_frame_contract(&log).await;
+    assert_eq!(marks(&other).await, [("a".to_owned(), 4), ("b".to_owned(), 9)], "a robot may go on elsewhere");
+    let last = log.read(0, usize::MAX).await.unwrap().last().unwrap().position;
+    let (one, two) = tokio::join!(log.append(vec![frame("a", 5, 5, 10)]), other.append(vec![frame("b", 10, 12, 10)]));
+    assert!(one.is_ok() && two.is_ok());
+    let read = other.read(last, usize::MAX).await.unwrap();
+    assert_eq!(read.iter().map(|f| f.position).collect::<Vec<_>>(), [last + 1, last + 2]);
+    for _ in 0..5 {
+        other.append(vec![frame("c", 1, 1, 100_000)]).await.unwrap();
+    }
+    assert!(log.prune().await.unwrap() > 200_000);
+    assert_eq!(other.prune().await.unwrap(), 0);
+    assert_eq!(log.read(0, usize::MAX).await.unwrap().len(), 2);
+    assert_eq!(marks(&open().await).await, [("a".to_owned(), 5), ("b".to_owned(), 12), ("c".to_owned(), 1)]);
+    let nul = Frame { ring: Arc::from("r\0"), ..frame("a", 6, 6, 1) };
+    assert!(matches!(log.append(vec![nul]).await, Err(Error::BadFrame(_))));
+    log.close().await;
+    assert!(log.append(vec![frame("a", 6, 6, 1)]).await.is_err());
 }
 
 #[tokio::test]

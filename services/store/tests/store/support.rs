@@ -7,6 +7,7 @@ use midshift_core::time::{Clock, Now, Utc};
 use midshift_store::{
     Applied, CommitError, MemoryStore, PostgresConfig, PostgresStore, SqliteStore, Store, StoreId, migrate_postgres,
 };
+use sqlx::{AssertSqlSafe, Connection, PgConnection};
 use std::sync::Arc;
 
 /// Wall time of every test.
@@ -60,6 +61,29 @@ pub async fn database() -> PostgresConfig {
         })
         .await;
     PostgresConfig::new(server.database_from("template_midshift"))
+}
+
+/// Someone else on the database, who may break the rules.
+pub async fn stranger(config: &PostgresConfig) -> PgConnection {
+    let mut connection = PgConnection::connect(&config.url).await.expect("a connection");
+    say(&mut connection, "SET search_path TO control").await;
+    connection
+}
+
+pub async fn say(stranger: &mut PgConnection, sql: &str) {
+    sqlx::raw_sql(AssertSqlSafe(sql)).execute(stranger).await.expect(sql);
+}
+
+/// The one number that `sql` asks for.
+pub async fn number(stranger: &mut PgConnection, sql: &str) -> i64 {
+    sqlx::query_scalar(AssertSqlSafe(sql)).fetch_one(stranger).await.expect(sql)
+}
+
+/// Returns once a writer of the store waits for a lock that someone else has.
+pub async fn until_a_writer_waits(stranger: &mut PgConnection) {
+    let waiting = "SELECT COUNT(*) FROM pg_stat_activity WHERE datname = current_database() \
+                   AND application_name = 'midshift' AND wait_event_type = 'Lock'";
+    while number(stranger, waiting).await == 0 {}
 }
 
 pub async fn postgres_at(config: &PostgresConfig) -> PostgresStore {
