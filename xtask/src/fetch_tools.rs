@@ -1,4 +1,5 @@
-//! The outside programs that tests of real components talk to, pinned, under `target/tools`; and strace, which is the system's.
+//! The outside programs that tests of real components talk to, pinned, under `target/tools`; and strace and PostgreSQL, which are
+//! the system's.
 //!
 //! Invariant: without `--install` nothing is fetched and nothing is skipped: what is missing is listed and the suite fails.
 //! A tool counts as there when its program exists and its stamp names the pinned version, so a second install is quick.
@@ -13,9 +14,16 @@ const GRPCURL: &str = "github.com/fullstorydev/grpcurl/cmd/grpcurl@v1.9.3";
 const BUF: &str = "github.com/bufbuild/buf/cmd/buf@v1.57.2";
 /// Its package and program of the system.
 const STRACE: &str = "strace";
+/// Its package and program of the system.
+const HAPROXY: &str = "haproxy";
 /// What the Python client needs; it pins gRPC for all of Python here.
 const PYTHON_CLIENT: &str = include_str!("../../clients/python/requirements.txt");
 const PYTHON: &[&str] = &["tuf==7.0.1", "securesystemslib[crypto]==1.6.0", "cryptography==50.0.2"];
+/// Its package, and where it has the server's programs, by version.
+const POSTGRESQL: &str = "postgresql";
+const POSTGRESQL_PROGRAMS: &str = "/usr/lib/postgresql";
+/// Oldest version that is tried out.
+const POSTGRESQL_MIN: u32 = 15;
 
 /// Paths of the tools.
 pub struct Tools {
@@ -27,6 +35,8 @@ pub struct Tools {
     pub python: PathBuf,
     /// strace, of any version that can inject signals.
     pub strace: PathBuf,
+    /// HAProxy, 2.6 or newer.
+    pub haproxy: PathBuf,
     /// Node.js, the system's.
     pub node: PathBuf,
 }
@@ -40,6 +50,7 @@ impl Tools {
             buf: tools.join("bin/buf"),
             python: tools.join("venv/bin/python"),
             strace: STRACE.into(),
+            haproxy: HAPROXY.into(),
             node: clients::NODE.into(),
         }
     }
@@ -60,7 +71,13 @@ impl Tools {
         if !tools.has_strace() {
             missing.push(format!("  {STRACE}, a program of the system"));
         }
+        if !tools.has_haproxy() {
+            missing.push(format!("  {HAPROXY}, a program of the system"));
+        }
         missing.extend(clients::missing(workspace).into_iter().map(|what| format!("  {what}")));
+        if !has_postgresql(Path::new(POSTGRESQL_PROGRAMS)) {
+            missing.push(format!("  {POSTGRESQL} {POSTGRESQL_MIN} or newer, server programs of the system"));
+        }
         if missing.is_empty() {
             return Ok(tools);
         }
@@ -90,8 +107,18 @@ impl Tools {
         if !tools.has_strace() {
             apt::install(workspace, &[STRACE])?;
         }
+        if !tools.has_haproxy() {
+            apt::install(workspace, &[HAPROXY])?;
+        }
         clients::install(workspace)?;
+        if !has_postgresql(Path::new(POSTGRESQL_PROGRAMS)) {
+            apt::install(workspace, &[POSTGRESQL])?;
+        }
         Self::find(workspace)
+    }
+
+    fn has_haproxy(&self) -> bool {
+        run::quietly(Command::new(&self.haproxy).arg("-v"))
     }
 
     fn has_strace(&self) -> bool {
@@ -104,6 +131,7 @@ impl Tools {
         command.env("MIDSHIFT_TEST_BUF", &self.buf);
         command.env("MIDSHIFT_TEST_PYTHON", &self.python);
         command.env("MIDSHIFT_TEST_STRACE", &self.strace);
+        command.env("MIDSHIFT_TEST_HAPROXY", &self.haproxy);
         command.env("MIDSHIFT_TEST_NODE", &self.node);
     }
 }
@@ -111,6 +139,16 @@ impl Tools {
 fn python_packages() -> Vec<&'static str> {
     let clients = PYTHON_CLIENT.lines().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with('#'));
     clients.chain(PYTHON.iter().copied()).collect()
+}
+
+/// Whether tests can start a server of their own. One that the system runs is of no use and in no way.
+fn has_postgresql(programs: &Path) -> bool {
+    let versions = std::fs::read_dir(programs).into_iter().flatten().flatten().map(|entry| entry.path());
+    let new_enough = |path: &PathBuf| {
+        let version = path.file_name().and_then(|name| name.to_str()?.parse::<u32>().ok());
+        version.is_some_and(|version| version >= POSTGRESQL_MIN)
+    };
+    versions.filter(new_enough).any(|path| ["initdb", "postgres"].iter().all(|p| path.join("bin").join(p).is_file()))
 }
 
 fn install_python(workspace: &Workspace, python: &Path) -> Result<()> {
@@ -145,7 +183,7 @@ fn present(program: &Path, version: &str) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::{present, stamp};
+    use super::{has_postgresql, present, stamp};
 
     #[test]
     fn a_tool_of_another_version_is_not_there() {
@@ -157,6 +195,22 @@ mod tests {
         stamp(&program, "v1").unwrap();
         assert!(present(&program, "v1"));
         assert!(!present(&program, "v2"));
+        std::fs::remove_dir_all(&directory).unwrap();
+    }
+
+    #[test]
+    fn postgresql_is_there_when_a_new_enough_version_has_its_server_programs() {
+        let directory = std::env::temp_dir().join(format!("xtask-pg-{}", std::process::id()));
+        let add = |file: &str| {
+            let path = directory.join(file);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, "").unwrap();
+            has_postgresql(&directory)
+        };
+        assert!(!has_postgresql(&directory), "no directory");
+        assert!(!add("14/bin/initdb") && !add("14/bin/postgres"), "too old");
+        assert!(!add("16/bin/initdb"), "a client only");
+        assert!(add("16/bin/postgres"));
         std::fs::remove_dir_all(&directory).unwrap();
     }
 }

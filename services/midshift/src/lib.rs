@@ -18,6 +18,7 @@ pub mod serve;
 pub mod server;
 pub mod site_file;
 mod software;
+pub mod storage;
 pub mod tally;
 pub mod throwaway;
 pub mod under_way;

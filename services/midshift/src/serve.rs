@@ -1,14 +1,14 @@
-//! `midshift serve`: everything persistent in one process, for a real site.
+//! `midshift serve`: everything persistent in one process, for a real site, on SQLite or PostgreSQL.
 
 use crate::planning::Planning;
 use crate::server::{Naive, Parts, Server};
+use crate::storage::Database;
 use crate::{clock, site_file};
 use anyhow::{Context, bail};
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use midshift_ota::OtaService;
 use midshift_ota::content::Room;
-use midshift_store::{FRAME_BYTES_DEFAULT, SqliteFrames, SqliteStore};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -22,9 +22,12 @@ pub struct Serve {
     /// The site file (or a .map grid, or an LIF .json). Without it the built-in demo site.
     #[arg(long)]
     pub site: Option<PathBuf>,
-    /// Where the databases are; made with mode 0700.
+    /// Where the databases and software of robots are; made with mode 0700.
     #[arg(long, default_value = "midshift-data")]
     pub data: PathBuf,
+    /// Rows and samples elsewhere.
+    #[command(flatten)]
+    pub database: Database,
     /// Address to listen on. Anything but loopback needs --insecure.
     #[arg(long, default_value = "127.0.0.1:7420")]
     pub listen: SocketAddr,
@@ -86,19 +89,18 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
     let clock = clock::clock(1000);
     crate::server::metrics_handle();
     let site_id = loaded.site.site_id().clone();
-    let store = Arc::new(SqliteStore::open(&args.data, site_id.clone(), clock.clone()).await?);
-    let frames = Arc::new(SqliteFrames::open(&args.data, site_id, clock.clone(), FRAME_BYTES_DEFAULT).await?);
+    let storage = args.database.open(&args.data, site_id, clock.clone()).await?;
     let ota = args.software.open(args.data.join("ota"), clock.clone()).await?;
     let listener = TcpListener::bind(args.listen).await.with_context(|| format!("listening on {}", args.listen))?;
     let beacons = match args.beacon_listen {
         Some(address) => Some(hear(address).await?),
         None => None,
     };
-    tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), "midshift serves");
+    tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), store = storage.engine(), "midshift serves");
     let planning = Planning::start()?;
     let parts = Parts {
-        store: store.clone(),
-        frames: frames.clone(),
+        store: storage.store(),
+        frames: storage.frames(),
         site: loaded.site,
         site_text: loaded.text,
         clock,
@@ -109,8 +111,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
     };
     let server = Server::new(parts, shutdown).await?.hearing(beacons);
     let served = server.serve(nodelay(listener)).await;
-    store.close().await;
-    frames.close().await;
+    storage.close().await;
     served
 }
 

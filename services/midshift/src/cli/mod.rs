@@ -22,6 +22,7 @@ use crate::dev::Dev;
 use crate::duration::duration;
 use crate::robots::AgentRun;
 use crate::serve::Serve;
+use crate::storage::Database;
 use crate::{dev, logs, robots, serve};
 use clap::{Parser, Subcommand};
 use client::{Call, Exit};
@@ -53,11 +54,14 @@ enum Command {
     Dev(Box<Dev>),
     /// Serve a site: everything persistent, one process.
     Serve(Serve),
-    /// Bring a data directory to this version's schema, without serving.
+    /// Bring a data directory, or a PostgreSQL database, to this version's schema, without serving.
     Migrate {
         /// The data directory.
-        #[arg(long)]
-        data: PathBuf,
+        #[arg(long, required_unless_present = "store")]
+        data: Option<PathBuf>,
+        /// The database instead.
+        #[command(flatten)]
+        database: Database,
     },
     /// Copy everything durable of a server into a folder, while it serves or not.
     Backup(backup::Take),
@@ -162,7 +166,7 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
     match command {
         Command::Dev(args) => develop(*args, out).await,
         Command::Serve(args) => Ok(serve::run(args, interrupts()).await?),
-        Command::Migrate { data } => migrate(&data, out).await,
+        Command::Migrate { data, database } => migrate(&data.unwrap_or_default(), &database, out).await,
         Command::Backup(args) => backup::take(&args, out).await,
         Command::Restore(args) => backup::restore(&args, out).await,
         Command::Agent(AgentVerb::Run(args)) => match robots::agent(args, interrupts()).await? {
@@ -216,8 +220,8 @@ async fn develop(args: Dev, out: &Out) -> Result<(), Exit> {
     Ok(())
 }
 
-async fn migrate(data: &std::path::Path, out: &Out) -> Result<(), Exit> {
-    let files = midshift_store::migrate(data).await.map_err(anyhow::Error::from)?;
+async fn migrate(data: &std::path::Path, database: &Database, out: &Out) -> Result<(), Exit> {
+    let files = database.migrate(data).await?;
     let json = |f: &midshift_store::Migrated| serde_json::json!({"file": f.file, "fromVersion": f.from, "toVersion": f.to, "applied": f.applied.len()});
     match out.format {
         Format::Table => files.iter().for_each(|f| {

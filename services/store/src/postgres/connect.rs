@@ -104,7 +104,7 @@ impl Database {
             .application_name("midshift")
             .statement_cache_capacity(STATEMENTS_CACHED)
             .options(limits)
-            .options([("search_path", self.schema)])
+            .options([("search_path", self.schema), ("client_min_messages", "warning")])
             .disable_statement_logging()
     }
 

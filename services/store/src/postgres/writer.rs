@@ -106,7 +106,8 @@ impl Writer {
                 }
                 Err(Undone::ByOthers(error)) => {
                     metrics::counter!("midshift_store_retries_total").increment(1);
-                    let ended = tokio::time::timeout(WRITE_PATIENCE, sqlx::raw_sql("ROLLBACK").execute(&mut connection));
+                    let ended =
+                        tokio::time::timeout(WRITE_PATIENCE, sqlx::raw_sql("ROLLBACK").execute(&mut connection));
                     if matches!(ended.await, Ok(Ok(_))) {
                         self.connection = Some(connection);
                     }

@@ -1,0 +1,106 @@
+//! Where a server keeps its rows and samples: files of its own, or a PostgreSQL database.
+
+use anyhow::{Context, bail};
+use midshift_core::ids::SiteId;
+use midshift_core::time::Clock;
+use midshift_store::{
+    FRAME_BYTES_DEFAULT, FrameLog, Migrated, PostgresConfig, PostgresFrames, PostgresStore, SqliteFrames, SqliteStore,
+    Store,
+};
+use std::path::Path;
+use std::sync::Arc;
+
+/// Which database.
+#[derive(Clone, Debug, Default, clap::Args)]
+pub struct Database {
+    /// A PostgreSQL database (15 or newer) for rows and samples, postgres://USER:PASSWORD@HOST/DATABASE, instead of SQLite in --data.
+    /// The connection is not encrypted yet: keep it on a network of its own.
+    #[arg(long, value_name = "URL", env = "MIDSHIFT_STORE", hide_env_values = true)]
+    pub store: Option<String>,
+}
+
+impl Database {
+    /// The address if it is one of PostgreSQL; the password is never shown.
+    fn postgres(&self) -> anyhow::Result<Option<PostgresConfig>> {
+        match &self.store {
+            None => Ok(None),
+            Some(url) if url.starts_with("postgres://") || url.starts_with("postgresql://") => {
+                Ok(Some(PostgresConfig::new(url)))
+            }
+            Some(_) => bail!("--store is not an address of PostgreSQL; try postgres://USER:PASSWORD@HOST/DATABASE"),
+        }
+    }
+
+    /// Brings the database, or the files in `data`, up to this version's schema.
+    pub async fn migrate(&self, data: &Path) -> anyhow::Result<Vec<Migrated>> {
+        match self.postgres()? {
+            Some(config) => Ok(midshift_store::migrate_postgres(&config).await?),
+            None => Ok(midshift_store::migrate(data).await?),
+        }
+    }
+
+    /// Opens what is kept of `site_id`.
+    pub async fn open(&self, data: &Path, site_id: SiteId, clock: Arc<dyn Clock>) -> anyhow::Result<Storage> {
+        match self.postgres()? {
+            Some(config) => {
+                let store = PostgresStore::open(&config, site_id.clone(), clock.clone()).await;
+                let store = store.context("opening the store in PostgreSQL")?;
+                let frames = PostgresFrames::open(&config, site_id, clock, FRAME_BYTES_DEFAULT).await;
+                Ok(Storage::Postgres(Arc::new(store), Arc::new(frames.context("opening the samples in PostgreSQL")?)))
+            }
+            None => {
+                let store = SqliteStore::open(data, site_id.clone(), clock.clone()).await?;
+                let frames = SqliteFrames::open(data, site_id, clock, FRAME_BYTES_DEFAULT).await?;
+                Ok(Storage::Sqlite(Arc::new(store), Arc::new(frames)))
+            }
+        }
+    }
+}
+
+/// What is open.
+pub enum Storage {
+    /// Two files in the data directory.
+    Sqlite(Arc<SqliteStore>, Arc<SqliteFrames>),
+    /// Two schemas of a database.
+    Postgres(Arc<PostgresStore>, Arc<PostgresFrames>),
+}
+
+impl Storage {
+    /// The rows.
+    pub fn store(&self) -> Arc<dyn Store> {
+        match self {
+            Self::Sqlite(store, _) => store.clone(),
+            Self::Postgres(store, _) => store.clone(),
+        }
+    }
+
+    /// The samples.
+    pub fn frames(&self) -> Arc<dyn FrameLog> {
+        match self {
+            Self::Sqlite(_, frames) => frames.clone(),
+            Self::Postgres(_, frames) => frames.clone(),
+        }
+    }
+
+    /// For the log.
+    pub const fn engine(&self) -> &'static str {
+        match self {
+            Self::Sqlite(..) => "sqlite",
+            Self::Postgres(..) => "postgresql",
+        }
+    }
+
+    /// Finishes what is queued and closes everything.
+    pub async fn close(&self) {
+        match self {
+            Self::Sqlite(store, frames) => {
+                store.close().await;
+                frames.close().await;
+            }
+            Self::Postgres(store, frames) => {
+                store.close().await;
+                frames.close().await;
+            }
+        }
+    }
+}
