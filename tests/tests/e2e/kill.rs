@@ -1,4 +1,5 @@
-//! Twenty agent processes survive `kill -9` of the server three times and of five agents once each, while they work.
+//! Twenty agent processes survive `kill -9` of the server three times and of five agents once each, while they work; and an immediate
+//! stop of PostgreSQL where the server keeps its rows there.
 
 use crate::harness::{Server, until};
 use crate::robots::Robots;
@@ -8,6 +9,7 @@ use midshift_core::site::{DEMO, text};
 use midshift_proto::task::v1::{SubmitTasksRequest, Task, TaskState};
 use midshift_sim::oracle::Oracle;
 use midshift_sim::workload::{Workload, WorkloadConfig};
+use midshift_tests::postgres::PostgresServer;
 use rand::rngs::StdRng;
 use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
@@ -68,11 +70,22 @@ async fn kill_one_at_work(
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn nothing_is_lost_and_nothing_done_twice_when_server_and_agents_are_killed_at_work() -> anyhow::Result<()> {
+    killed_at_work(None).await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn nothing_is_lost_and_nothing_done_twice_on_postgresql_which_ends_at_once_as_well() -> anyhow::Result<()> {
+    killed_at_work(Some(PostgresServer::start())).await
+}
+
+async fn killed_at_work(mut postgres: Option<PostgresServer>) -> anyhow::Result<()> {
     let seed: u64 = std::env::var("MIDSHIFT_SEED").ok().and_then(|s| s.parse().ok()).unwrap_or(20_261_120);
     let mut rng = StdRng::seed_from_u64(seed);
     let dir = tempfile::tempdir()?;
     let site = text::parse(DEMO)?;
-    let mut server = Server::start(dir.path()).await?;
+    let url = postgres.as_ref().map(PostgresServer::database);
+    let flags: Vec<&str> = url.iter().flat_map(|url| ["--store", url.as_str()]).collect();
+    let mut server = Server::start_with(dir.path(), DEMO, &flags).await?;
     let mut robots = Robots::start(dir.path(), &server, &site, ROBOTS)?;
     submit(&server, &site, seed).await?;
     let mut kills: Vec<(usize, bool)> =
@@ -84,7 +97,14 @@ async fn nothing_is_lost_and_nothing_done_twice_when_server_and_agents_are_kille
     // Tasks whose agent died inside a step that must not be done twice: for those a person may be asked.
     let mut inside = BTreeSet::new();
     let (mut killed, mut hits) = (BTreeSet::new(), 0);
-    for (at, of_server) in kills {
+    for (kill, (at, of_server)) in kills.into_iter().enumerate() {
+        if let Some(postgres) = postgres.as_mut().filter(|_| kill == 4) {
+            say!("seed {seed}: PostgreSQL ends at once, and starts again");
+            tokio::task::block_in_place(|| {
+                postgres.cut();
+                postgres.start_again();
+            });
+        }
         if of_server {
             let running = at_work(&server, at, &BTreeSet::new()).await?;
             say!("seed {seed}: kill -9 of the server with {at} done and {} at work", running.len());

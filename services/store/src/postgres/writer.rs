@@ -258,7 +258,7 @@ pub(super) async fn identify(
     if sqlx::query(sql::IDENTITY).fetch_optional(&mut *connection).await.map_err(failed)?.is_none() {
         sqlx::query(sql::IDENTIFY)
             .bind(site_id.as_str())
-            .bind(format!("{:032x}", rand::random::<u128>()))
+            .bind(crate::sql::fresh_id())
             .bind(created.0.max(0))
             .execute(&mut *connection)
             .await

@@ -3,8 +3,8 @@
 //! Invariant: a copy is one moment of its file, whole and durable, or it is not there. A store that was restored is another store: it gets an
 //! id of its own, so that nobody goes on from a number that the copy never gave.
 
-use super::schema::{self, Migration};
 use super::{CONTROL_DB, OpenError, TELEMETRY_DB};
+use crate::migrations::{self, Migration};
 use midshift_core::rows::Seq;
 use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{ConnectOptions, Connection, Row, SqliteConnection};
@@ -46,8 +46,8 @@ impl Database {
     }
     const fn migrations(self) -> &'static [Migration] {
         match self {
-            Self::Control => schema::CONTROL,
-            Self::Telemetry => schema::TELEMETRY,
+            Self::Control => migrations::CONTROL,
+            Self::Telemetry => migrations::TELEMETRY,
         }
     }
 
@@ -110,7 +110,7 @@ pub async fn renew_identity(dir: &Path) -> Result<(), OpenError> {
     let options = SqliteConnectOptions::new().filename(dir.join(CONTROL_DB)).busy_timeout(BUSY_TIMEOUT);
     let mut connection = options.connect().await.map_err(sql)?;
     sqlx::query("PRAGMA synchronous = FULL").execute(&mut connection).await.map_err(sql)?;
-    let id = super::writer::fresh_id();
+    let id = crate::sql::fresh_id();
     sqlx::query("UPDATE store_head SET store_id = $1").bind(id).execute(&mut connection).await.map_err(sql)?;
     connection.close().await.map_err(sql)
 }

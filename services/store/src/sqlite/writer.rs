@@ -181,11 +181,6 @@ pub(super) async fn head(connection: &mut SqliteConnection, site_id: &SiteId) ->
     sql::seq(&select.fetch_one(connection).await?, 0)
 }
 
-/// A name for a store that no other store has.
-pub(super) fn fresh_id() -> String {
-    format!("{:032x}", rand::random::<u128>())
-}
-
 /// Reads the store's identity, or makes one: a new store gets a random id and numbers from `created` on.
 pub(super) async fn identify(
     connection: &mut SqliteConnection,
@@ -196,7 +191,7 @@ pub(super) async fn identify(
     if sqlx::query(sql::IDENTITY).fetch_optional(&mut *connection).await.map_err(failed)?.is_none() {
         sqlx::query(sql::IDENTIFY)
             .bind(site_id.as_str())
-            .bind(fresh_id())
+            .bind(crate::sql::fresh_id())
             .bind(created.0.max(0))
             .execute(&mut *connection)
             .await
