@@ -128,6 +128,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 data,
                 listen,
                 insecure: false,
+                database: Default::default(),
                 beacon_listen: None,
                 software: Software { ota_keys, ota_quota_gib: 1, ota_spare_gib: 0, ota_keep_days: 7 },
             };

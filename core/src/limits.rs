@@ -102,8 +102,8 @@ pub const ACTIVATE_JOINT_DECIDEGREES: i32 = 700;
 pub const TASKS_COUNTED_EVERY: SiteDuration = SiteDuration::from_secs(60);
 /// Permission to activate lives so long from the heartbeat it is anchored to.
 pub const ACTIVATION_VALID: LinkDuration = LinkDuration::from_secs(5);
-/// A robot that was given a bundle and is not heard for so long is lost. Longer than a restart of any body.
-pub const LOST_AFTER: LinkDuration = LinkDuration::from_secs(120);
+/// A robot that was given a bundle and is not heard for so long is lost. Longer than a restart of any machine, also one that boots a new base.
+pub const LOST_AFTER: LinkDuration = LinkDuration::from_secs(300);
 /// A robot that its drain holds, and that does not ask to activate for so long, works on without the bundle.
 pub const READY_WITHIN: SiteDuration = SiteDuration::from_secs(600);
 /// A robot whose turn has come and that has not fetched the bundle for so long is passed over.

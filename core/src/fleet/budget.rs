@@ -2,8 +2,9 @@
 //!
 //! Called by `mod` before drains go on. Invariant: a drain that may wait begins only in an item that also writes its area's row, so two planners
 //! cannot both spend the last place; a robot that is out for several reasons counts once. Robots that charge or have no work are asked
-//! first. Drains of people and urgent ones count and do not wait. Whoever goes back from what was aborted waits for drains alone: a robot that only
-//! a person brings back to work would otherwise keep it on bad software for as long.
+//! first. Drains of people and urgent ones count and do not wait. Whoever goes back from what was aborted waits for drains alone, and for
+//! those only that end by themselves: a robot that only a person brings back to work would otherwise keep it on bad software for as long. What an
+//! area's rules keep in work by capability holds for it too.
 
 use super::rows::{AreaBudget, Drain, DrainState, RobotHolder};
 use super::view::View;
@@ -13,6 +14,7 @@ use crate::reason::{Code, Reason};
 use crate::robot::{Duty, Presence};
 use crate::task::state::Errand;
 use crate::time::Now;
+use crate::update::UpdateState;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Robots of one area.
@@ -22,7 +24,7 @@ struct Area {
     robots: BTreeSet<RobotId>,
     /// Of these, and of robots that were taken from there, those that are out of work.
     off_work: BTreeSet<RobotId>,
-    /// Of those out of work, the ones in a drain.
+    /// Of those out of work, the ones in a drain that comes to an end without a person.
     draining: BTreeSet<RobotId>,
     /// Robots in work that are heard and have a capability, as far as somebody asked.
     able: BTreeMap<String, usize>,
@@ -158,7 +160,7 @@ fn areas(view: &View, board: &Board, now: &Now) -> BTreeMap<AreaId, Area> {
         if duty != Duty::InWork || taken_here {
             area.off_work.insert(robot_id.clone());
         }
-        if taken_here {
+        if taken_here && comes_to_an_end(board, now, robot_id) {
             area.draining.insert(robot_id.clone());
         }
     }
@@ -166,10 +168,19 @@ fn areas(view: &View, board: &Board, now: &Now) -> BTreeMap<AreaId, Area> {
         if let Some(area_id) = &drain.area_id {
             let area = areas.entry(area_id.clone()).or_default();
             area.off_work.insert(drain.robot_id.clone());
-            area.draining.insert(drain.robot_id.clone());
+            if comes_to_an_end(board, now, &drain.robot_id) {
+                area.draining.insert(drain.robot_id.clone());
+            }
         }
     }
     areas
+}
+
+/// The robot is heard, and is not stuck with what it runs: its drain ends without a person.
+fn comes_to_an_end(board: &Board, now: &Now, robot_id: &RobotId) -> bool {
+    let is_stuck =
+        board.get(robot_id).and_then(|l| l.report.update.as_ref()).is_some_and(|u| u.state == UpdateState::Stuck);
+    !is_stuck && heard::presence(board, robot_id, now) != Presence::Offline
 }
 
 /// Why one more robot may not leave its work now.
@@ -186,13 +197,8 @@ fn refusal(view: &View, board: &Board, now: &Now, area_id: &AreaId, area: &mut A
         return Some(budget().with("off_work", off).with("most", most));
     }
     for (capability, least) in rules.keep_in_work.iter().filter(|(capability, _)| has(view, robot_id, capability)) {
-        let left = if drain.returns {
-            let stays = |id: &&RobotId| !area.draining.contains(*id) && *id != robot_id && has(view, id, capability);
-            area.robots.iter().filter(stays).count()
-        } else {
-            let counts = area.robots.contains(robot_id) && is_able(view, board, now, robot_id, capability);
-            area.able(view, board, now, capability).saturating_sub(usize::from(counts))
-        };
+        let counts = area.robots.contains(robot_id) && is_able(view, board, now, robot_id, capability);
+        let left = area.able(view, board, now, capability).saturating_sub(usize::from(counts));
         if left < *least as usize {
             return Some(budget().with("capability", capability).with("in_work", left).with("keep_in_work", least));
         }

@@ -3,7 +3,7 @@
 use super::rows::{Countdown, Phase, Rollout, RolloutRobot, Step};
 use super::view::View;
 use super::{Board, hear, robots, turns};
-use crate::fleet::rows::DrainState;
+use crate::fleet::rows::{Drain, DrainState};
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::time::{Now, Utc};
@@ -39,14 +39,9 @@ pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rol
         }
         Step::Draining => {
             let drain = r.drain_id.as_ref().and_then(|id| view.drain(id));
-            if let Some(drain) = drain {
-                since = drain.since;
-                if drain.state == DrainState::Draining {
-                    deadline = Some(drain.since.plus_ms(drain.within_ms));
-                }
-            }
-            let waits = drain.filter(|d| d.state == DrainState::Waiting).and_then(|d| d.why.clone());
-            waits.unwrap_or_else(|| Code::BlockedByDrain.into())
+            since = drain.map_or(r.since, |drain| drain.since);
+            deadline = draining_until(drain);
+            waiting(drain).unwrap_or_else(|| Code::BlockedByDrain.into())
         }
         Step::Activating => {
             let state = hear::report_of(view, board, r).filter(|u| u.directive >= r.directive).map(|u| u.state);
@@ -71,8 +66,23 @@ pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rol
             Reason::from(Code::BlockedByGate).with("phase", format!("{:?}", rollout.phase).to_uppercase())
         }
         Step::Committing => Code::BlockedByCommit.into(),
-        Step::Reverting => Code::BlockedByRevert.into(),
+        Step::Reverting => {
+            let drain = r.drain_id.as_ref().and_then(|id| view.drain(id));
+            since = drain.map_or(r.since, |drain| drain.since);
+            deadline = draining_until(drain);
+            waiting(drain).unwrap_or_else(|| Code::BlockedByRevert.into())
+        }
         Step::Stuck => Code::RollbackFailed.into(),
     };
     Some(Blocked { by, since, deadline })
+}
+
+/// When a drain that has begun must be over.
+fn draining_until(drain: Option<&Drain>) -> Option<Utc> {
+    drain.filter(|d| d.state == DrainState::Draining).map(|d| d.since.plus_ms(d.within_ms))
+}
+
+/// What a drain waits for before it begins.
+fn waiting(drain: Option<&Drain>) -> Option<Reason> {
+    drain.filter(|d| d.state == DrainState::Waiting).and_then(|d| d.why.clone())
 }

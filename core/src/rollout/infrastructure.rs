@@ -57,14 +57,12 @@ pub fn controls(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> Resu
     if heard * 1_000 >= controls.len() * limits::CONTROLS_HEARD_PERMILLE { Ok(()) } else { Err(Pause::Infrastructure) }
 }
 
-/// It is heard, and has been in its session for as long as a robot has to be missed to be lost, but for the time that it may take to come
-/// back. Whoever came back a moment ago was missed too: the network is back, and the missing robot may be about to be. A session's
-/// epoch is when it was opened, by the wall.
+/// It is heard, and was without a break for as long as a robot has to be missed to be lost, but for the time that it may take to come back
+/// after a start. Whoever came back a moment ago was missed too: the network is back, and the missing robot may be about to be.
 fn keeps_contact(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> bool {
-    let opened = view.sessions.get(robot_id.as_str()).map(|s| Utc(s.row.session_epoch as i64));
     let long_ms = limits::LOST_AFTER.as_ms() - limits::OFFLINE_AFTER.as_ms();
-    heard::presence(board, robot_id, now) != Presence::Offline
-        && opened.is_some_and(|opened| now.wall.ms_since(opened) >= long_ms)
+    let unbroken = view.contacts.get(robot_id).is_some_and(|c| now.link.since(c.since).as_ms() >= long_ms);
+    unbroken && heard::presence(board, robot_id, now) != Presence::Offline
 }
 
 /// It changes nothing now, and was in contact when the robot was heard last: one in a store room says nothing of the network.

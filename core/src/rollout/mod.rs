@@ -192,6 +192,9 @@ fn plan_all(
     sign: &dyn Sign,
     plan: &mut Plan,
 ) -> bool {
+    for live in heard.iter().filter_map(|id| board.get(id)) {
+        view.keep_contact(live);
+    }
     listen(view, now, board, heard, plan);
     welcome(view, now, board, plan);
     let open: Vec<RolloutId> =

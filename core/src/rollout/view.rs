@@ -15,7 +15,7 @@ use crate::policy::AreaPolicy;
 use crate::robot::{Duty, Lane, Presence};
 use crate::rows::{BadRow, Key, Revision, Row, Seq, Table, Writer};
 use crate::site::Site;
-use crate::time::Now;
+use crate::time::{LinkTime, Now};
 use crate::update::DesiredUpdate;
 use crate::work::{LaneMark, Live, Session};
 use std::collections::{BTreeMap, BTreeSet};
@@ -83,8 +83,19 @@ pub struct View {
     pub read: Now,
     /// Serving time at that moment.
     pub served: OtaClock,
+    /// How long robots are in contact without a break. Volatile: it begins anew with the process.
+    pub contacts: BTreeMap<RobotId, Contact>,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: super::bugs::Bugs,
+}
+
+/// A stretch of heartbeats without a break long enough to be missed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Contact {
+    /// The first of them.
+    pub since: LinkTime,
+    /// The newest.
+    pub last: LinkTime,
 }
 
 impl Picture for View {
@@ -260,6 +271,7 @@ impl View {
             started,
             read,
             served: OtaClock::default(),
+            contacts: BTreeMap::new(),
             bugs: super::bugs::Bugs::default(),
         }
     }
@@ -313,6 +325,15 @@ impl View {
         }
     }
 
+    /// A robot was heard.
+    pub fn keep_contact(&mut self, live: &Live) {
+        let at = live.processed_at;
+        let contact = self.contacts.entry(live.robot_id.clone()).or_insert(Contact { since: at, last: at });
+        if at.since(contact.last) > limits::OFFLINE_AFTER {
+            contact.since = at;
+        }
+        contact.last = at.max(contact.last);
+    }
     /// Milliseconds served on the site clock by `now`.
     pub fn served_ms(&self, now: &Now) -> u64 {
         self.served.site_ms + now.site.since(self.read.site).as_ms()

@@ -138,7 +138,7 @@ fn a_silent_network_pauses_and_is_nobodys_failure() {
     rig.robots[n].fate = Fate::Probation;
     rig.until(60, |r| r.of("ro", n).moments.switched.is_some());
     rig.robots.iter_mut().for_each(|r| r.is_off = true);
-    rig.ticks(130);
+    rig.ticks(310);
     assert!(rig.rollout("ro").pauses.contains(&super::super::rows::Pause::Infrastructure));
     assert_eq!(rig.of("ro", n).failure, None);
     rig.robots.iter_mut().for_each(|r| (r.is_off, r.fate) = (false, Fate::Good));
@@ -154,7 +154,7 @@ fn a_network_that_comes_back_for_the_others_first_burns_no_bundle() {
     rig.robots[n].fate = Fate::Probation;
     rig.until(60, |r| r.of("ro", n).moments.switched.is_some());
     rig.robots.iter_mut().for_each(|r| r.is_off = true);
-    rig.ticks(130);
+    rig.ticks(310);
     for other in (0..6).filter(|other| *other != n) {
         rig.robots[other].is_off = false;
         rig.robots[other].epoch = rig.now.wall.0 as u64;
@@ -163,7 +163,7 @@ fn a_network_that_comes_back_for_the_others_first_burns_no_bundle() {
     rig.ticks(2);
     assert!(rig.rollout("ro").pauses.contains(&super::super::rows::Pause::Infrastructure));
     assert_eq!(rig.of("ro", n).failure, None, "they were missed as long as it was");
-    rig.until(200, |r| r.of("ro", n).failure.is_some());
+    rig.until(600, |r| r.of("ro", n).failure.is_some());
     assert_eq!(
         rig.of("ro", n).failure.map(|f| f.code),
         Some(Code::RobotLost),
@@ -176,7 +176,7 @@ fn too_few_others_to_compare_with_pause_it_too() {
     let mut rig = Rig::new(3);
     rig.fates(Fate::Silent);
     rig.start(spec());
-    rig.ticks(140);
+    rig.ticks(330);
     assert!(rig.rollout("ro").pauses.contains(&super::super::rows::Pause::InfrastructureUnknown));
 }
 
@@ -193,7 +193,7 @@ fn a_lost_robot_is_taken_back_until_the_gate_of_its_wave_closes() {
         });
         let n = rig.order()[0];
         rig.robots[n].fate = Fate::Silent;
-        rig.until(300, |r| r.of("ro", n).failure.is_some());
+        rig.until(600, |r| r.of("ro", n).failure.is_some());
         assert_eq!(rig.of("ro", n).failure.expect("lost").code, Code::RobotLost);
         if late {
             // The wave goes on without it to its gate, and a person promotes it.
@@ -224,7 +224,7 @@ fn a_robot_that_goes_dark_on_trial_is_never_called_clean_and_counts_as_lost_if_o
     let n = rig.order()[0];
     rig.until(60, |r| r.step(n) == Step::Trial);
     rig.robots[n].is_off = true;
-    rig.until(300, |r| r.phase().goes_back());
+    rig.until(600, |r| r.phase().goes_back());
     let row = rig.rollout("ro");
     assert_eq!((row.promoted, row.abort.map(|a| a.robots)), (0, Some(vec![robot_id(n)])));
     assert_eq!(rig.of("ro", n).failure.expect("lost").code, Code::RobotLost);
@@ -258,7 +258,7 @@ fn robots_that_were_off_before_say_nothing_of_the_network() {
     rig.start(four);
     let n = rig.order()[0];
     rig.robots[n].fate = Fate::Silent;
-    rig.until(300, |r| r.phase().goes_back());
+    rig.until(600, |r| r.phase().goes_back());
     assert_eq!(rig.of("ro", n).failure.expect("lost").code, Code::RobotLost);
 }
 
@@ -270,7 +270,7 @@ fn a_robot_that_did_not_reach_its_server_burns_no_bundle_unless_it_was_lost_alon
         let n = rig.order()[0];
         rig.robots[n].fate = Fate::Silent;
         if alone {
-            rig.until(300, |r| r.of("ro", n).failure.is_some());
+            rig.until(600, |r| r.of("ro", n).failure.is_some());
         } else {
             rig.until(60, |r| r.step(n) == Step::Activating && r.of("ro", n).grant.is_some());
             rig.ticks(20);

@@ -205,8 +205,14 @@ fn whoever_goes_back_from_an_aborted_bundle_does_not_wait_for_robots_that_only_a
         ..request(0, false)
     });
     rig.fleet_turn();
-    let on = [3, 4, 8].map(|n| is_on(&rig, n));
+    let on = [3, 4].map(|n| is_on(&rig, n));
     assert_eq!(on.iter().filter(|on| **on).count(), 1, "those that go back wait for each other: {on:?}");
+    assert!(!is_on(&rig, 8), "of those that can tow two stay");
+    // Whoever went and is stuck, or is not heard any more, keeps nobody waiting.
+    let (gone, waits) = if on[0] { (3, 4) } else { (4, 3) };
+    rig.robots[gone].is_off = true;
+    rig.ticks(40);
+    assert!(is_on(&rig, waits), "a robot that is dark keeps nobody on a bad bundle");
 }
 
 fn request(n: usize, urgent: bool) -> crate::maintenance::DrainRequest {

@@ -95,8 +95,8 @@ impl Loop {
         let snapshot = self.parts.store.snapshot(TABLES).await?;
         let now = self.parts.clock.now();
         let served = self.view.served_ms(&now);
-        let unusable = std::mem::take(&mut self.view.unusable);
-        self.view = View { unusable, ..View::new(self.parts.site.clone(), self.started, now) };
+        let (unusable, contacts) = (std::mem::take(&mut self.view.unusable), std::mem::take(&mut self.view.contacts));
+        self.view = View { unusable, contacts, ..View::new(self.parts.site.clone(), self.started, now) };
         self.view.bugs = self.parts.bugs;
         self.view.load(&snapshot.rows, snapshot.seq)?;
         // The row is as old as the last commit; this process has served on since.
