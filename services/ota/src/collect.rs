@@ -41,7 +41,7 @@ pub struct Collected {
     pub encodings: u64,
     /// Their bytes.
     pub encoding_bytes: u64,
-    /// Files that could not be taken away. They are tried again.
+    /// Files and shorter ways that could not be taken away. They are tried again.
     pub failed: u64,
     /// Bytes of files that nothing names and whose time is not over.
     pub unnamed_bytes: u64,
@@ -123,7 +123,7 @@ impl Collector {
         let served_ms = named.served_ms;
         // What can be made again goes first, and at once.
         let swept = encodings.sweep(listed, kept.clone(), served_ms, self.room.unnamed_ms).await;
-        (done.encodings, done.encoding_bytes) = swept?;
+        (done.encodings, done.encoding_bytes, done.failed) = (swept.ways, swept.bytes, swept.failed);
         let mut since = BTreeMap::new();
         let seen = marks.touched;
         for stored in content.list().await? {

@@ -43,6 +43,17 @@ pub enum Way {
     Later,
 }
 
+/// What a sweep came to.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Swept {
+    /// Ways that were taken away.
+    pub ways: u64,
+    /// Their bytes.
+    pub bytes: u64,
+    /// Ways that the disk holds on to.
+    pub failed: u64,
+}
+
 struct Kept {
     encoded: Encoded,
     touched: u64,
@@ -191,11 +202,9 @@ impl Encodings {
         Ok(opened.map(|file| -> Reader { Box::new(tokio::fs::File::from_std(file).take(length)) }))
     }
 
-    /// Takes ways away, the one unused longest first, until `bytes` more are free. Whether so many became free.
-    ///
-    /// # Errors
-    /// The disk's.
-    pub async fn make_room(&self, bytes: u64) -> Result<bool, Error> {
+    /// Takes ways away, the one unused longest first, until `bytes` more are free. Whether so many became free. One that the disk holds
+    /// on to is passed over.
+    pub async fn make_room(&self, bytes: u64) -> bool {
         let inner = self.inner.clone();
         blocking(move || inner.evict(bytes)).await
     }
@@ -206,17 +215,14 @@ impl Encodings {
     }
 
     /// Takes away ways that lead to a file that is not among `listed`, lead from a file that is not among `kept`, or that nobody
-    /// has used for `unused_ms` of serving time. How many that were, and their bytes.
-    ///
-    /// # Errors
-    /// The disk's.
+    /// has used for `unused_ms` of serving time. One that the disk holds on to is counted, stays, and is tried again by the next sweep.
     pub async fn sweep(
         &self,
         listed: BTreeSet<Digest>,
         kept: BTreeSet<Digest>,
         served_ms: u64,
         unused_ms: u64,
-    ) -> Result<(u64, u64), Error> {
+    ) -> Swept {
         let inner = self.inner.clone();
         let is_of_use =
             move |key: &Key| listed.contains(&key.target) && key.base.is_none_or(|base| kept.contains(&base));
@@ -276,31 +282,42 @@ impl Inner {
         }
     }
 
-    fn evict(&self, bytes: u64) -> Result<bool, Error> {
+    /// Whether so many bytes became free.
+    fn evict(&self, bytes: u64) -> bool {
+        let mut by_use: Vec<(u64, Key)> = self.shelf().kept.iter().map(|(key, kept)| (kept.touched, *key)).collect();
+        by_use.sort_unstable();
         let mut freed = 0;
-        while freed < bytes {
-            let oldest = self.shelf().kept.iter().min_by_key(|(_, kept)| kept.touched).map(|(key, _)| *key);
-            let Some(oldest) = oldest else { return Ok(false) };
-            freed += self.take_away(oldest)?;
+        for (_, key) in by_use {
+            if freed >= bytes {
+                break;
+            }
+            freed += self.take_away(key).unwrap_or(0);
         }
-        Ok(true)
+        freed >= bytes
     }
 
-    /// Bytes that were taken away. A file that stays though it is known no more is found at the next start.
-    fn take_away(&self, key: Key) -> Result<u64, Error> {
-        let kept = {
-            let mut shelf = self.shelf();
-            let Some(kept) = shelf.kept.remove(&key) else { return Ok(0) };
-            shelf.by_digest.remove(&kept.encoded.digest);
-            kept
-        };
-        let path = self.folder.join(key.name(&kept.encoded.digest));
-        fs::remove_file(&path).map_err(at("removing", &path))?;
+    /// Bytes that were taken away. None: the disk holds on to the file, which is known and counted as before.
+    fn take_away(&self, key: Key) -> Option<u64> {
+        let Some(digest) = self.shelf().kept.get(&key).map(|kept| kept.encoded.digest) else { return Some(0) };
+        let path = self.folder.join(key.name(&digest));
+        match fs::remove_file(&path) {
+            Ok(()) => {}
+            // It went in between, and its room is given back by whoever forgets it.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            Err(error) => {
+                tracing::error!(%error, path = %path.display(), "a shorter way that nobody needs could not be taken away");
+                return None;
+            }
+        }
+        let mut shelf = self.shelf();
+        let Some(kept) = shelf.kept.remove(&key) else { return Some(0) };
+        shelf.by_digest.remove(&kept.encoded.digest);
+        drop(shelf);
         self.content.give_back(kept.encoded.length);
-        Ok(kept.encoded.length)
+        Some(kept.encoded.length)
     }
 
-    fn sweep(&self, is_of_use: impl Fn(&Key) -> bool, served_ms: u64, unused_ms: u64) -> Result<(u64, u64), Error> {
+    fn sweep(&self, is_of_use: impl Fn(&Key) -> bool, served_ms: u64, unused_ms: u64) -> Swept {
         let due: Vec<Key> = {
             let mut shelf = self.shelf();
             let (turn, now) = (shelf.swept, shelf.turn);
@@ -315,7 +332,17 @@ impl Inner {
             };
             shelf.kept.iter_mut().filter_map(overdue).collect()
         };
-        due.iter().try_fold((0, 0), |(count, bytes), key| Ok((count + 1, bytes + self.take_away(*key)?)))
+        let mut swept = Swept::default();
+        for key in due {
+            match self.take_away(key) {
+                Some(bytes) => {
+                    swept.ways += 1;
+                    swept.bytes += bytes;
+                }
+                None => swept.failed += 1,
+            }
+        }
+        swept
     }
 
     /// Takes room, from older ways if there is no other.
@@ -323,7 +350,7 @@ impl Inner {
         loop {
             let Err(error) = self.content.claim(bytes) else { return Ok(true) };
             let Some(lacking) = error.lacking() else { return Err(error) };
-            if !self.evict(lacking)? {
+            if !self.evict(lacking) {
                 return Ok(false);
             }
         }

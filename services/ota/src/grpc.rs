@@ -63,7 +63,7 @@ impl OtaService {
         let lacking = appended.as_ref().err().and_then(Error::lacking);
         // What can be made again makes room.
         if let Some(lacking) = lacking
-            && opened.encodings.make_room(lacking).await?
+            && opened.encodings.make_room(lacking).await
         {
             return Ok(opened.content.append(file, message.offset, data).await?);
         }

@@ -316,10 +316,11 @@ impl Repository {
         (self.newest(), guard)
     }
 
-    /// Files that a bundle consists of: its manifest and its components. None: the manifest is not here.
+    /// Files that a bundle consists of: its manifest and its components. None: the manifest is not here. A file of that digest that
+    /// is no manifest is all there is of it: robots say by themselves what they run, and any file may be named so.
     ///
     /// # Errors
-    /// The disk's, and a file of that digest that is no manifest.
+    /// The disk's, and a manifest of a release that cannot be read any more.
     pub async fn files_of(&self, bundle: Digest) -> Result<Option<Vec<Digest>>, Error> {
         if let Some(newest) = self.newest()
             && let Some(release) = newest.releases.iter().find(|release| release.digest == bundle)
@@ -329,10 +330,13 @@ impl Repository {
         if self.content.length(bundle).await?.is_none() {
             return Ok(None);
         }
-        let manifest = check::read_manifest(bundle, self.content.as_ref()).await?;
-        let damaged =
-            |text| Error::Damaged { folder: self.folder.clone(), text: format!("the manifest {bundle}: {text}") };
-        Ok(Some(files_of(bundle, &manifest.map_err(damaged)?)))
+        match check::read_manifest(bundle, self.content.as_ref()).await? {
+            Ok(manifest) => Ok(Some(files_of(bundle, &manifest))),
+            Err(text) if self.seen().await?.contains_key(&bundle) => {
+                Err(Error::Damaged { folder: self.folder.clone(), text: format!("the manifest {bundle}: {text}") })
+            }
+            Err(_) => Ok(Some(vec![bundle])),
+        }
     }
 
     /// Whether the repository has these roots already.

@@ -288,6 +288,63 @@ async fn when_nobody_can_tell_what_a_named_bundle_is_everything_stays() {
 }
 
 #[tokio::test]
+async fn a_robot_that_names_a_file_that_is_no_bundle_keeps_that_file_and_stops_no_pass() {
+    let mut shop = Shop::new(1 << 20).await;
+    let (old, new) = (with("1.0.0", &[]), with("2.0.0", &[]));
+    shop.release(&[&old, &new]).await;
+    shop.publish(&[&new]).await.expect("withdrawn");
+    shop.bring(b"stray").await.expect("room");
+    shop.bring(b"another").await.expect("room");
+    // A component of the withdrawn release, of the newest one, and a file of no release.
+    let component = &old.1[0].1;
+    let named = [component.as_slice(), new.1[0].1.as_slice(), b"stray"].map(|bytes| Digest::of(bytes).to_string());
+    shop.named.bundles = named.iter().map(|digest| BundleId::parse(digest).expect("an id")).collect();
+    shop.after(1).await;
+    assert_eq!(shop.after(TIME).await.files, 2, "the old manifest and the other file");
+    assert!(shop.has(component).await && shop.has(b"stray").await);
+    shop.name(&[]);
+    shop.after(1).await;
+    assert_eq!(shop.after(TIME).await.files, 2, "nobody names them any more");
+}
+
+#[tokio::test]
+async fn a_shorter_way_that_the_disk_holds_on_to_stops_no_pass_and_its_room_is_given_back_when_it_goes() {
+    let mut shop = Shop::new(1 << 20).await;
+    let (old, new) = programs();
+    let one = with("1.0.0", &[("old-program", &old), ("new-program", &new)]);
+    shop.release(&[&one]).await;
+    shop.bring(b"stray").await.expect("room");
+    let (old, new) = (wanted(&old), wanted(&new));
+    shop.encodings.way(new, &[old.digest]).await.expect("asked");
+    while shop.encodings.make_next().await {}
+    let files_bytes = bytes_in(&shop.dir.path().join("content"));
+    let ways_bytes = shop.encodings.bytes();
+    assert_eq!(shop.content.fill().used_bytes, files_bytes + ways_bytes);
+    let Way::Encoded(key, patch) = shop.encodings.way(new, &[old.digest]).await.expect("asked") else { panic!() };
+    assert_eq!(key.base, Some(old.digest));
+    shop.after(TIME).await;
+    // No file can be removed where a folder with something in it is.
+    let folder = shop.dir.path().join("encoded");
+    let entries = fs::read_dir(&folder).expect("a folder").map(|entry| entry.expect("an entry").path());
+    let stuck = entries.into_iter().find(|path| path.metadata().expect("a file").len() == patch.length);
+    let stuck = stuck.expect("the patch");
+    fs::remove_file(&stuck).expect("gone");
+    fs::create_dir_all(stuck.join("in-the-way")).expect("a folder");
+    shop.after(TIME).await;
+    assert_eq!(shop.after(TIME).await.failed, 1);
+    assert!(!shop.has(b"stray").await, "the pass went to its end");
+    assert_eq!(shop.encodings.bytes(), patch.length, "the other went");
+    let files_bytes = files_bytes - b"stray".len() as u64;
+    assert_eq!(shop.content.fill().used_bytes, files_bytes + patch.length, "what stays is counted");
+    assert!(!shop.encodings.make_room(1).await, "it cannot be had");
+    fs::remove_dir_all(&stuck).expect("gone");
+    // Gone without us: its room is free.
+    let done = shop.after(0).await;
+    assert_eq!((done.failed, done.encodings, shop.encodings.bytes()), (0, 1, 0));
+    assert_eq!(shop.content.fill().used_bytes, files_bytes);
+}
+
+#[tokio::test]
 async fn shorter_ways_go_first_and_are_made_again() {
     let mut shop = Shop::new(1 << 20).await;
     let (old, new) = programs();
