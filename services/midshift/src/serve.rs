@@ -46,7 +46,7 @@ pub struct Serve {
 /// Where software of robots comes from.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Software {
-    /// The folder with snapshot-*.pem and timestamp-*.pem of `bundle keygen`. Without it releases are neither taken nor given.
+    /// The folder with snapshot-*.pem, timestamp-*.pem and directive-*.pem of `bundle keygen`. Without it releases are neither taken nor given.
     #[arg(long, value_name = "DIR")]
     pub ota_keys: Option<PathBuf>,
     /// Room for software, GiB.

@@ -57,7 +57,9 @@ pub enum Error {
         role: &'static str,
     },
     /// None of the server's keys may sign.
-    #[error("root {root_version} names none of the server's {role} keys")]
+    #[error(
+        "the repository's root {root_version} names other {role} keys than this server has: it is another project's repository, or its new keys are not in the server's folder of keys"
+    )]
     NotNamed {
         /// The root.
         root_version: u64,
@@ -504,11 +506,12 @@ fn find(folder: &Path) -> Result<Option<Found>, Error> {
 }
 
 /// Makes what is signed in `folder` from now on have at least this version: robots have seen versions that a restored repository does not
-/// know of, and take nothing older. Nobody may serve from it.
+/// know of, and take nothing older. A version below that of an earlier call changes nothing. Nobody may serve from it.
 ///
 /// # Errors
-/// If it cannot be written.
+/// If what an earlier call said cannot be read, or it cannot be written.
 pub fn raise_floor(folder: &Path, version: u64) -> Result<(), Error> {
+    let version = version.max(read_floor(folder)?);
     Ok(write_whole(&folder.join(FLOOR), version.to_string().as_bytes())?)
 }
 

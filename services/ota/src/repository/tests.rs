@@ -189,6 +189,7 @@ async fn a_root_that_names_other_online_keys_is_refused_and_a_successor_that_lie
     let foreign = root(2, Seeds { timestamp: 66, ..SEEDS }, in_a_year(), &[SEEDS.root]);
     let error = room.repository.publish(vec![foreign], document.clone(), 1, START).await.expect_err("refused");
     assert!(matches!(error, Error::NotNamed { root_version: 2, role: "timestamp" }), "{error}");
+    assert!(error.to_string().starts_with("the repository's root 2 names other timestamp keys than this server has"));
     let next = root(2, Seeds { snapshot: 13, timestamp: 14, ..SEEDS }, in_a_year(), &[SEEDS.root]);
     room.repository.publish(vec![next], document, 1, START).await.expect("the keys lie ready");
     let believed = room.shown_to(&robot(), START).await.expect("believed");
@@ -338,6 +339,7 @@ async fn a_restored_repository_is_signed_anew_at_once_with_versions_above_all_th
     let before = room.repository.newest().expect("published").stamp;
     // Robots saw later versions, which the copy does not know.
     super::raise_floor(&room.metadata(), 1_000).expect("written");
+    super::raise_floor(&room.metadata(), 4).expect("it is never lowered");
     let room = room.restarted().await;
     room.repository.freshen(START).await.expect("signed");
     let stamp = room.repository.newest().expect("kept").stamp;
