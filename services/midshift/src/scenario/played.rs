@@ -177,13 +177,13 @@ pub fn all(c: &v1::RolloutCounts) -> u32 {
         + c.stuck
 }
 
-/// A verdict with its numbers.
+/// A verdict with its numbers. Waves are counted from 1 for people.
 pub fn verdict(v: &v1::RolloutVerdict) -> String {
     let outcome = short(v.outcome().as_str_name(), "ROLLOUT_OUTCOME_");
     let n = v.clean + v.failed;
     let mut text = format!(
         "wave {}: {outcome}, n {n}, failed {}, failure rate below {:.1} % with 95 % confidence",
-        v.wave,
+        v.wave + 1,
         v.failed,
         f64::from(v.upper_bound_permille) / 10.0
     );
@@ -215,3 +215,6 @@ pub fn medians(robots: &[v1::RolloutRobot]) -> OffWork {
         probation_ms: median(|o| o.probation.as_ref()),
     }
 }
+
+#[cfg(test)]
+mod tests;
