@@ -122,23 +122,39 @@ pub async fn verify(backup: &Path) -> anyhow::Result<Summary> {
     Ok(list.summary())
 }
 
-/// Makes a data directory of a backup, which is verified first. `to.data` must not be there, or be empty.
+/// Makes a data directory of a backup, which is verified first. Neither `to.data` nor `to.ota_keys` may be there.
 ///
 /// # Errors
-/// If the backup is not good, or something cannot be written. Nothing is left at `to` then.
+/// If the backup is not good, the clock is before it, or something cannot be written. Nothing is left at `to` then.
 pub async fn restore(backup: &Path, to: &Places, now: Utc) -> anyhow::Result<Summary> {
     let summary = verify(backup).await?;
+    ensure!(now >= summary.begun, "this machine's clock is before the moment of the backup; set it first");
     let place = Place::new(&to.data)?;
-    if let Some(keys) = &to.ota_keys {
-        ensure!(is_free(keys)?, "{} is not empty", keys.display());
+    // Keys that do not go into the data directory are made whole beside their own place.
+    let mut keys = None;
+    let mut within = Places { data: place.path().to_owned(), ota_keys: None };
+    if let Some(folder) = &to.ota_keys {
+        ensure!(summary.parts.iter().any(|(name, ..)| name == parts::KEYS), "the backup has no online keys");
+        within.ota_keys = Some(match folder.strip_prefix(&to.data) {
+            Ok(inside) => place.path().join(inside),
+            Err(_) => keys.insert((Place::new(folder)?, folder)).0.path().to_owned(),
+        });
     }
-    let within = Places { data: place.path().to_owned(), ota_keys: to.ota_keys.clone() };
     for (name, ..) in &summary.parts {
         if let Some(part) = PARTS.iter().find(|part| part.name() == name) {
             part.put_back(&backup.join(name), &within, now).await.with_context(|| format!("restoring {name}"))?;
         }
     }
-    place.name(&to.data).await?;
+    let mut named = None;
+    if let Some((place, folder)) = keys {
+        place.name(folder).await?;
+        named = Some(folder);
+    }
+    let done = place.name(&to.data).await;
+    if let (Err(_), Some(folder)) = (&done, named) {
+        fs::remove_dir_all(folder).with_context(|| format!("removing {}", folder.display()))?;
+    }
+    done?;
     Ok(summary)
 }
 
@@ -162,7 +178,7 @@ struct Place(tempfile::TempDir);
 
 impl Place {
     fn new(to: &Path) -> anyhow::Result<Self> {
-        ensure!(is_free(to)?, "{} is not empty; name a folder that is not there", to.display());
+        ensure!(is_free(to)?, "{} is there already; name a folder that is not there", to.display());
         let beside = to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         fs::create_dir_all(beside).with_context(|| format!("making {}", beside.display()))?;
         let place = tempfile::Builder::new().prefix(".midshift-").tempdir_in(beside);
@@ -176,9 +192,6 @@ impl Place {
         let (from, to) = (self.0.path().to_owned(), to.to_owned());
         blocking(move || {
             sync_tree(&from)?;
-            if to.exists() {
-                fs::remove_dir(&to).with_context(|| format!("replacing {}", to.display()))?;
-            }
             fs::rename(&from, &to).with_context(|| format!("naming {}", to.display()))?;
             let beside = to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
             File::open(beside)?.sync_all().with_context(|| format!("syncing {}", beside.display()))
@@ -190,9 +203,10 @@ impl Place {
     }
 }
 
+/// Whether nothing is there: also an empty folder may be what cannot be replaced, as where a disk is mounted.
 fn is_free(path: &Path) -> anyhow::Result<bool> {
-    match fs::read_dir(path) {
-        Ok(mut entries) => Ok(entries.next().is_none()),
+    match fs::symlink_metadata(path) {
+        Ok(_) => Ok(false),
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(true),
         Err(error) => Err(error).with_context(|| format!("reading {}", path.display())),
     }

@@ -83,6 +83,8 @@ const DOCUMENTS: &str = "metadata";
 const FILES: &str = "content";
 /// Names the newest of all documents.
 const TIMESTAMP: &str = "timestamp.json";
+/// A lost server signed at most so many times after the copy, whatever this machine's clock says: it does so twice a day and at each push.
+const VERSIONS_AHEAD: u64 = 1_000_000;
 
 #[async_trait]
 impl Part for Releases {
@@ -149,8 +151,11 @@ impl Part for Releases {
                 }
             }
             // Robots may have seen what was signed after the copy, and take nothing with a lower number.
-            let seconds = u64::try_from(now.0 / 1_000).unwrap_or(1).max(1);
-            raise_floor(&to.join(DOCUMENTS), seconds)?;
+            let seconds = u64::try_from(now.0 / 1_000).unwrap_or(1);
+            raise_floor(
+                &to.join(DOCUMENTS),
+                seconds.max(version_of(&to.join(DOCUMENTS))?.saturating_add(VERSIONS_AHEAD)),
+            )?;
             Ok(())
         })
         .await
@@ -161,7 +166,7 @@ impl Part for Releases {
 struct OnlineKeys;
 
 /// Where keys go if nobody says where.
-const KEYS: &str = "ota-keys";
+pub const KEYS: &str = "ota-keys";
 const ROLES: [&str; 3] = ["snapshot-", "timestamp-", "directive-"];
 
 #[async_trait]
@@ -204,6 +209,13 @@ impl Part for OnlineKeys {
         })
         .await
     }
+}
+
+/// Highest version that a folder's timestamp says; 0: nothing was ever published.
+fn version_of(documents: &Path) -> anyhow::Result<u64> {
+    let Some(timestamp) = read(&documents.join(TIMESTAMP))? else { return Ok(0) };
+    let stamp = midshift_bundle::freshness::stamp(&timestamp)?;
+    Ok(stamp.version.max(stamp.snapshot_version))
 }
 
 /// Targets document that a folder's timestamp leads to; none: nothing was ever published.

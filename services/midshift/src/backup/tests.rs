@@ -2,9 +2,15 @@
 
 use super::{Places, back_up, restore, verify};
 use crate::clock;
+use midshift_bundle::digest::Digest;
+use midshift_bundle::folder::Folder;
+use midshift_bundle::keys::SecretKey;
+use midshift_bundle::repository::{FileTarget, PEOPLE_LIFE_MS, Profile, sign_targets};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Expect, Index, Item, Key, RowChange, Seq, Table, Write, Writer};
 use midshift_core::time::Utc;
+use midshift_ota::content::{Content, DiskContent, Held, Room, Wanted};
+use midshift_ota::repository::{OnlineKeys, Repository, raise_floor};
 use midshift_store::{FRAME_BYTES_DEFAULT, Frame, FrameLog, SqliteFrames, SqliteStore, Store};
 use std::fs;
 use std::path::Path;
@@ -119,7 +125,7 @@ async fn nothing_is_written_over() {
     let used = Used::new().await;
     let backup = used.backed_up().await;
     let again = back_up(&used.places(), &backup, NOW).await.expect_err("it is there");
-    assert!(again.to_string().contains("is not empty"), "{again}");
+    assert!(again.to_string().contains("is there already"), "{again}");
     assert!(restore(&backup, &used.places(), NOW).await.is_err());
     verify(&backup).await.expect("as it was");
     let nowhere = Places { data: used.dir.path().join("nowhere"), ota_keys: None };
@@ -127,4 +133,90 @@ async fn nothing_is_written_over() {
     let error = back_up(&nowhere, &to, NOW).await.expect_err("there is nothing");
     assert!(error.to_string().contains("no server ever served"), "{error}");
     assert!(!to.exists());
+}
+
+async fn repository(data: &Path, keys: &Path) -> (Arc<DiskContent>, Repository) {
+    let ota = data.join("ota");
+    let content = Arc::new(DiskContent::open(&ota.join("content"), Room::of(1 << 30)).expect("a store"));
+    let keys = OnlineKeys::read(keys).expect("keys");
+    let repository = Repository::open(&ota.join("metadata"), keys, content.clone()).await.expect("a repository");
+    (content, repository)
+}
+
+impl Used {
+    /// Publishes one file. What is signed has at least this version. Where the keys are.
+    async fn release(&self, version: u64) -> std::path::PathBuf {
+        let (keys, people) = (self.dir.path().join("keys"), self.dir.path().join("repository"));
+        Folder::create(&people, &keys, Profile::Solo, NOW).expect("keys and a root");
+        let root = Folder::open(&people).expect("it").document("1.root.json").expect("readable").expect("a root");
+        let documents = self.places().data.join("ota").join("metadata");
+        fs::create_dir_all(&documents).expect("a folder");
+        raise_floor(&documents, version).expect("written");
+        let (content, repository) = repository(&self.places().data, &keys).await;
+        let bytes = b"a file of a release".to_vec();
+        let file = Wanted { digest: Digest::of(&bytes), length: bytes.len() as u64 };
+        let target = FileTarget { name: "walk".to_owned(), digest: file.digest, length: file.length };
+        content.append(file, 0, bytes.into()).await.expect("room");
+        assert_eq!(content.settle(file).await.expect("asked"), Held::Whole);
+        let key = SecretKey::read(&keys.join("targets-1.pem")).expect("a key");
+        let targets = sign_targets(None, &[target], &[], NOW.plus_ms(PEOPLE_LIFE_MS), &[&key]).expect("signed");
+        repository.publish(vec![root], targets, 0, NOW).await.expect("published");
+        keys
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_restored_repository_signs_above_what_robots_saw_by_the_clock_and_by_the_copy() {
+    for (version, least) in [(1, 1_780_000_000), (1_000_000_000_000, 1_000_001_000_000)] {
+        let used = Used::new().await;
+        let keys = used.release(version).await;
+        let from = Places { ota_keys: Some(keys), ..used.places() };
+        let backup = used.dir.path().join("backup");
+        back_up(&from, &backup, NOW).await.expect("a backup");
+        let at = |name| used.dir.path().join(name);
+        let to = Places { data: at("restored"), ota_keys: Some(at("restored-keys")) };
+        restore(&backup, &to, NOW).await.expect("restored");
+        let (content, repository) = repository(&to.data, &at("restored-keys")).await;
+        let copied = repository.newest().expect("what was published").stamp;
+        assert_eq!((copied.version, copied.snapshot_version), (version, version));
+        repository.freshen(NOW).await.expect("signed");
+        let newest = repository.newest().expect("it goes on");
+        assert_eq!((newest.stamp.version, newest.stamp.snapshot_version), (least, least));
+        let digest = newest.files["walk"].digest;
+        assert!(content.length(digest).await.expect("asked").is_some(), "its file came too");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn keys_come_whole_or_not_at_all() {
+    let used = Used::new().await;
+    let keys = used.release(1).await;
+    let backup = used.dir.path().join("backup");
+    back_up(&Places { ota_keys: Some(keys), ..used.places() }, &backup, NOW).await.expect("a backup");
+    let at = |name| used.dir.path().join(name);
+    fs::create_dir(at("there")).expect("an empty folder");
+    for (data, keys) in [("there", "new-keys"), ("new", "there")] {
+        let to = Places { data: at(data), ota_keys: Some(at(keys)) };
+        let error = restore(&backup, &to, NOW).await.expect_err("it is there").to_string();
+        assert!(error.contains("is there already"), "{error}");
+        assert!(!at("new").exists() && !at("new-keys").exists());
+    }
+    let inside = Places { data: at("one"), ota_keys: Some(at("one").join("keys")) };
+    restore(&backup, &inside, NOW).await.expect("both in one folder");
+    OnlineKeys::read(&at("one").join("keys")).expect("all of them");
+    let left = fs::read_dir(used.dir.path()).expect("a folder").map(|entry| entry.expect("an entry").file_name());
+    assert!(left.into_iter().all(|name| !name.to_string_lossy().starts_with(".midshift-")), "nothing half is left");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn with_a_clock_before_the_backup_or_keys_that_it_has_not_nothing_is_restored() {
+    let used = Used::new().await;
+    let backup = used.backed_up().await;
+    let to = Places { data: used.dir.path().join("restored"), ota_keys: None };
+    let error = restore(&backup, &to, Utc(NOW.0 - 1)).await.expect_err("the clock").to_string();
+    assert!(error.contains("clock is before the moment of the backup"), "{error}");
+    let with_keys = Places { ota_keys: Some(used.dir.path().join("keys")), ..to.clone() };
+    let error = restore(&backup, &with_keys, NOW).await.expect_err("it has none").to_string();
+    assert!(error.contains("no online keys"), "{error}");
+    assert!(!to.data.exists());
 }

@@ -16,7 +16,7 @@ pub struct Take {
     /// The folder of its online keys, if it was given one. Whoever has the backup has these keys.
     #[arg(long, value_name = "DIR")]
     ota_keys: Option<PathBuf>,
-    /// The folder to make. It must not be there, or be empty.
+    /// The folder to make. It must not be there, not even empty.
     #[arg(long)]
     to: PathBuf,
 }
@@ -27,10 +27,10 @@ pub struct Restore {
     /// The backup.
     #[arg(long)]
     from: PathBuf,
-    /// The data directory to make. It must not be there, or be empty.
+    /// The data directory to make. It must not be there, not even empty.
     #[arg(long, required_unless_present = "verify")]
     data: Option<PathBuf>,
-    /// Where online keys go; without it into the folder ota-keys of the data directory.
+    /// The folder to make for online keys, which must not be there; without it the folder ota-keys of the data directory.
     #[arg(long, value_name = "DIR")]
     ota_keys: Option<PathBuf>,
     /// Only look whether everything is there and as it was copied; write nothing.
