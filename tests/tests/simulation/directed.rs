@@ -272,6 +272,40 @@ fn a_server_that_is_killed_in_any_phase_ends_the_roll_out_as_without() {
     }
 }
 
+#[test]
+fn a_server_that_is_killed_before_a_roll_out_begins_begins_it_as_it_was_asked_to() {
+    for (seed, phase) in (40..).zip([Phase::Draft, Phase::Validated, Phase::Approved]) {
+        let mut scene = Scene::open(seed, 3);
+        let spec = spec(&scene.room, GOOD[0], &scene.all());
+        scene.order(Order::Begin { id: "killed".to_owned(), spec: Box::new(spec), supersede: false });
+        scene.comes_to("killed", phase);
+        kill(&mut scene);
+        assert_eq!(scene.ends("killed").phase, Phase::Completed, "{phase:?}");
+        scene.comes_to_rest();
+        scene.all_run(Some(GOOD[0]));
+    }
+}
+
+#[test]
+fn a_roll_out_that_stands_still_goes_on_standing_when_its_server_was_killed() {
+    let mut scene = Scene::open(43, 3);
+    scene.begin("killed", GOOD[0], |_| {});
+    scene.comes_to("killed", Phase::Applying);
+    scene.order(Order::Pause("killed".to_owned()));
+    let stands = |room: &mut Room| {
+        room.observer.look().changes().rollout("killed").is_some_and(|row| row.pauses.contains(&Pause::Operator))
+    };
+    scene.until("it to stand still", stands);
+    kill(&mut scene);
+    scene.pass(30_000);
+    assert!(stands(&mut scene.room));
+    scene.order(Order::Resume("killed".to_owned()));
+    scene.answered();
+    assert_eq!(scene.ends("killed").phase, Phase::Completed);
+    scene.comes_to_rest();
+    scene.all_run(Some(GOOD[0]));
+}
+
 fn kill(scene: &mut Scene) {
     scene.room.crash_server();
     scene.pass(2_000);
@@ -280,8 +314,8 @@ fn kill(scene: &mut Scene) {
 
 #[test]
 fn a_server_that_is_killed_at_any_step_of_a_robot_ends_the_roll_out_as_without() {
-    use UpdateState::{Committing, Downloading, Probation, RollingBack, Switching, Trial};
-    let steps = [Downloading, Switching, Probation, Trial, Committing, RollingBack];
+    use UpdateState::{Committing, Downloading, Probation, RollingBack, Staged, Switching, Trial};
+    let steps = [Downloading, Staged, Switching, Probation, Trial, Committing, RollingBack];
     for (seed, step) in (20..).zip(steps) {
         let mut scene = Scene::open(seed, 3);
         let back = step == RollingBack;
