@@ -130,8 +130,8 @@ fn an_abort_before_the_start_just_ends_it() {
     assert!(rig.verb("ro", Verb::Abort).expect("it was done"), "asked twice it is done once");
 }
 
-#[test]
-fn a_silent_network_pauses_and_is_nobodys_failure() {
+/// Nobody is heard any more since this canary is on probation, for longer than makes a robot lost.
+fn all_dark_on_probation() -> (Rig, usize) {
     let mut rig = Rig::new(6);
     rig.start(spec());
     let n = rig.order()[0];
@@ -139,6 +139,12 @@ fn a_silent_network_pauses_and_is_nobodys_failure() {
     rig.until(60, |r| r.of("ro", n).moments.switched.is_some());
     rig.robots.iter_mut().for_each(|r| r.is_off = true);
     rig.ticks(310);
+    (rig, n)
+}
+
+#[test]
+fn a_silent_network_pauses_and_is_nobodys_failure() {
+    let (mut rig, n) = all_dark_on_probation();
     assert!(rig.rollout("ro").pauses.contains(&super::super::rows::Pause::Infrastructure));
     assert_eq!(rig.of("ro", n).failure, None);
     rig.robots.iter_mut().for_each(|r| (r.is_off, r.fate) = (false, Fate::Good));
@@ -148,13 +154,7 @@ fn a_silent_network_pauses_and_is_nobodys_failure() {
 
 #[test]
 fn a_network_that_comes_back_for_the_others_first_burns_no_bundle() {
-    let mut rig = Rig::new(6);
-    rig.start(spec());
-    let n = rig.order()[0];
-    rig.robots[n].fate = Fate::Probation;
-    rig.until(60, |r| r.of("ro", n).moments.switched.is_some());
-    rig.robots.iter_mut().for_each(|r| r.is_off = true);
-    rig.ticks(310);
+    let (mut rig, n) = all_dark_on_probation();
     for other in (0..6).filter(|other| *other != n) {
         rig.robots[other].is_off = false;
         rig.robots[other].epoch = rig.now.wall.0 as u64;

@@ -101,17 +101,17 @@ impl Part for Releases {
             fs::create_dir_all(&documents)?;
             fs::create_dir_all(&files)?;
             // The timestamp first: whatever is published meanwhile, what this one leads to is kept.
-            copy_one(&from.join(DOCUMENTS).join(TIMESTAMP), &documents.join(TIMESTAMP))?;
+            copy_if_there(&from.join(DOCUMENTS).join(TIMESTAMP), &documents.join(TIMESTAMP))?;
             for path in entries(&from.join(DOCUMENTS))? {
                 let name = path.file_name().unwrap_or_default();
                 if name != TIMESTAMP && path.extension().is_some_and(|e| e == "json") {
-                    copy_one(&path, &documents.join(name))?;
+                    copy_if_there(&path, &documents.join(name))?;
                 }
             }
             for path in entries(&from.join(FILES))? {
                 // What is not whole yet has another name, and is brought again.
                 if let Some(digest) = digest_of(&path) {
-                    copy_one(&path, &files.join(digest.to_string()))?;
+                    copy_if_there(&path, &files.join(digest.to_string()))?;
                 }
             }
             Ok(true)
@@ -147,7 +147,7 @@ impl Part for Releases {
             for part in [DOCUMENTS, FILES] {
                 fs::create_dir_all(to.join(part))?;
                 for path in entries(&from.join(part))? {
-                    copy_one(&path, &to.join(part).join(path.file_name().unwrap_or_default()))?;
+                    copy(&path, &to.join(part).join(path.file_name().unwrap_or_default()))?;
                 }
             }
             // Robots may have seen what was signed after the copy, and take nothing with a lower number.
@@ -183,7 +183,7 @@ impl Part for OnlineKeys {
             for path in entries(&keys)? {
                 let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
                 if name.ends_with(".pem") && ROLES.iter().any(|role| name.starts_with(role)) {
-                    copy_one(&path, &folder.join(name))?;
+                    copy(&path, &folder.join(name))?;
                     some = true;
                 }
             }
@@ -203,7 +203,7 @@ impl Part for OnlineKeys {
             fs::create_dir_all(&to)?;
             fs::set_permissions(&to, fs::Permissions::from_mode(0o700))?;
             for path in entries(&from)? {
-                copy_one(&path, &to.join(path.file_name().unwrap_or_default()))?;
+                copy(&path, &to.join(path.file_name().unwrap_or_default()))?;
             }
             Ok(())
         })
@@ -261,11 +261,15 @@ fn digest_of(path: &Path) -> Option<Digest> {
     path.file_name()?.to_str()?.parse().ok()
 }
 
-/// Copies a file, with whom it may be read by. One that went meanwhile is left out.
-fn copy_one(from: &Path, to: &Path) -> anyhow::Result<()> {
-    match fs::copy(from, to) {
-        Ok(_) => Ok(()),
-        Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
-        Err(error) => Err(error).with_context(|| format!("copying {}", from.display())),
+/// Copies a file, with whom it may be read by.
+fn copy(from: &Path, to: &Path) -> anyhow::Result<()> {
+    fs::copy(from, to).map(drop).with_context(|| format!("copying {}", from.display()))
+}
+
+/// As [`copy`] from a server at work: a file that went meanwhile is left out.
+fn copy_if_there(from: &Path, to: &Path) -> anyhow::Result<()> {
+    match copy(from, to) {
+        Err(error) if error.downcast_ref::<std::io::Error>().is_some_and(|e| e.kind() == ErrorKind::NotFound) => Ok(()),
+        copied => copied,
     }
 }
