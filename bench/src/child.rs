@@ -124,6 +124,9 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
             let listen = listen.unwrap_or(address);
             answer_questions(listen, stop.clone(), metric)?;
             let serve = midshift::serve::Serve {
+                roles: Vec::new(),
+                drain_seconds: None,
+                no_software: false,
                 site,
                 data,
                 listen,

@@ -8,6 +8,7 @@ pub mod bugs;
 pub mod fleet;
 pub mod gates;
 pub mod ids;
+pub mod lead;
 pub mod limits;
 pub mod maintenance;
 pub mod picture;

@@ -151,6 +151,17 @@ pub const UNARY_DEADLINE: LinkDuration = LinkDuration::from_secs(30);
 pub const CANCEL_WAIT: LinkDuration = LinkDuration::from_secs(1);
 /// A person's or another process' late wake costs at most this.
 pub const SWEEP: LinkDuration = LinkDuration(250);
+/// The process that plans for a service writes so every so often: others see that it is there. L
+pub const LEAD_RENEWED_EVERY: LinkDuration = LinkDuration::from_secs(1);
+/// A process that could not write so for this long plans no more until it has read the row again: two renewals may be lost. L
+pub const LEAD_ENDS_AFTER: LinkDuration = LinkDuration::from_secs(3);
+/// Another process takes over when it has seen nothing written for this long: a second past [`LEAD_ENDS_AFTER`], for clocks that run at
+/// different rates. L
+pub const LEAD_FREE_AFTER: LinkDuration = LinkDuration::from_secs(4);
+/// Times that a command of a person is decided anew by a process that does not plan, because what it is about was changed meanwhile.
+pub const COMMAND_TRIES: u32 = 8;
+/// A process that ends lets another one plan within this, or the other one waits as if it had died. L
+pub const LEAD_LEFT_WITHIN: LinkDuration = LinkDuration::from_secs(1);
 /// Open streams are cut this long after Ctrl-C.
 pub const HARD_DRAIN: LinkDuration = LinkDuration::from_secs(2);
 /// A clone or fenced robot may come back after this.
@@ -163,6 +174,13 @@ pub const UPLOAD_PIECE_BYTES: usize = 1024 * 1024;
 pub const UPLOADS_MAX: usize = 64;
 /// Software that is brought is made durable this often, bytes: a cut costs less than this.
 pub const UPLOAD_SYNC_BYTES: u64 = 16 * 1024 * 1024;
+/// A process waits so long for another one that changes the same folder of releases: the longest turn makes a few MiB durable or takes files
+/// away. Shorter than [`UNARY_DEADLINE`], so that the caller hears why.
+pub const SOFTWARE_TURN_WAIT: LinkDuration = LinkDuration::from_secs(20);
+/// Processes that share a folder of releases look this often whether another one published, ms.
+pub const SOFTWARE_FOLLOW_EVERY_MS: u64 = 1_000;
+/// Versions before a file from which patches to it are made without being asked for, where gateways ask for none.
+pub const ENCODING_BASES_AHEAD: usize = 3;
 /// Bytes of all software that a server keeps, unless it was told otherwise.
 pub const SOFTWARE_BYTES_DEFAULT: u64 = 64 * 1024 * 1024 * 1024;
 /// Bytes that a server leaves free on the disk when it takes software, unless it was told otherwise: the databases lie there too.

@@ -3,11 +3,12 @@
 //! Called by `fleet` and `rollout`. Invariants: a row in a picture is at the revision it has in the store, or one that an item of the
 //! running cycle will write; a row written twice in one decision stands in its item once, with the first expectation and the last body.
 
+use crate::ids::RobotId;
 use crate::rows::{
-    BadRow, Entry, Expect, Fact, Item, Key, Log, Record, Revision, Row, RowChange, Table, Write, Writer,
+    BadRow, Entry, Expect, Fact, Item, Key, Log, Record, Revision, Row, RowChange, Silent, Table, Write, Writer,
 };
 use crate::time::Now;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// A row with its revision.
 #[derive(Clone, Debug, PartialEq)]
@@ -54,6 +55,18 @@ pub fn take<P: Picture, R: Viewed<P>>(
     };
     R::changed(picture, id, old.as_ref().map(|r| &r.row));
     Ok(())
+}
+
+/// Rows that an item touches, each once.
+pub fn touched(items: &[Item]) -> Vec<Key> {
+    let keys: BTreeSet<&Key> = items.iter().flat_map(|item| &item.rows).map(|row| &row.key).collect();
+    keys.into_iter().cloned().collect()
+}
+
+/// Entries that an item leaves in the log of its writer and the inbox once it is applied.
+pub fn entries_of(item: &Item) -> u64 {
+    let rows = item.rows.iter().filter(|row| !matches!(row.write, Write::Keep)).count();
+    (rows + item.facts.len()) as u64
 }
 
 /// The one row of a table that an item puts; none if it puts none.
@@ -108,6 +121,10 @@ impl<'a, P: Picture> Tx<'a, P> {
         let known = R::slot(self.view).get(id).map(|r| r.revision);
         self.at.insert(key.clone(), self.item.rows.len());
         self.item.keep(key, known.map_or(Expect::Absent, Expect::At));
+    }
+    /// Guards the silence of a robot: if anybody hears it first, this decision is not made.
+    pub fn rely_on_silence(&mut self, robot_id: &RobotId) {
+        self.item.silent = Some(Silent { robot_id: robot_id.clone(), position: 0 });
     }
     /// States a fact beside the rows.
     pub fn tell(&mut self, subject: &str, kind: &'static str, body: &impl serde::Serialize) {

@@ -71,12 +71,14 @@ codes! {
     CursorOfOtherStore = "CURSOR_OF_OTHER_STORE", "The cursor comes from another store. Start again without one.";
     StoreUnavailable = "STORE_UNAVAILABLE", "The store does not answer. Nothing was decided; try again.";
     CommitUnknown = "COMMIT_UNKNOWN", "Nobody knows whether it was committed. Send it again with the same request_id.";
+    MovedMeanwhile = "MOVED_MEANWHILE", "What the request is about was changed each time it was to be written. Nothing was done; send it again.";
     Overloaded = "OVERLOADED", "A queue is full. Try again later.";
     DeadlineExceeded = "DEADLINE_EXCEEDED", "The call took longer than its deadline. The outcome is unknown; ask again with the same request_id.";
     Internal = "INTERNAL", "A fault of midshift. The request_id is in the log.";
     // --- software on the server
     SoftwareNotFound = "SOFTWARE_NOT_FOUND", "No signed release lists this file, or no document has this name. List bundles.";
     NoOnlineKeys = "NO_ONLINE_KEYS", "The server has no keys that may say which release is the newest. Start it with --ota-keys and the folder that holds them.";
+    ServedElsewhere = "SERVED_ELSEWHERE", "This process is a gateway: releases are brought to, and listed by, processes with role ota. Ask at the public address.";
     UploadTooLarge = "UPLOAD_TOO_LARGE", "A file of a release has at most 8 GiB. Split it into several components.";
     UploadMoved = "UPLOAD_MOVED", "The file goes on at another byte than this piece. Ask GetUpload and go on from there.";
     UploadCorrupt = "UPLOAD_CORRUPT", "What was brought is not what its digest says, and was thrown away. Bring it again.";

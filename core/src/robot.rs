@@ -298,6 +298,14 @@ pub struct ReportedState {
     pub update: Option<UpdateReport>,
 }
 
+impl ReportedState {
+    /// A number that changes with whatever the robot does: only whether it changes counts, so that absurd numbers do no harm.
+    pub fn progress(&self) -> u64 {
+        let moved = |sum: u64, a: &ReportedAttempt| sum.wrapping_add(a.progress).wrapping_add(u64::from(a.step_index));
+        self.attempts.iter().fold(self.vitals.odometer_mm, moved)
+    }
+}
+
 /// What a robot says of itself that does not change within a session.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Inventory {

@@ -5,6 +5,7 @@
 //! A revision counts the writes of one row, from 1. Ids of rows that can be deleted are never used again, so
 //! a revision never means two things.
 
+use crate::ids::RobotId;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -74,6 +75,7 @@ tables! {
     Drain "drain" Fleet, "One taking of a robot out of work for maintenance. id = drain_id.";
     AreaBudget "area_budget" Fleet, "Robots of one area that are out of work, against how many may be. id = area_id.";
     CommandKey "command_key" Fleet, "request_id -> command carried out; kept 7 days.";
+    FleetLeader "fleet_leader" Fleet, "Which process of fleet plans; renewed each second where there may be several.";
     Session "session" Telemetry, "A robot's newest session: epoch, secret, hello inventory. id = robot_id.";
     Presence "presence" Telemetry, "ONLINE, SUSPECT, OFFLINE of a robot. id = robot_id.";
     LaneMark "lane_mark" Telemetry, "Highest durable CRITICAL and EVENT number per ring. id = robot_id/ring.";
@@ -88,6 +90,7 @@ tables! {
     AreaBundle "area_bundle" Ota, "What robots get that come to an area later. id = area_id.";
     OtaMark "ota_mark" Ota, "Last position of the feed that ota has consumed.";
     OtaClock "ota_clock" Ota, "Serving time of ota, and the last number it gave to a drain or permission.";
+    OtaLeader "ota_leader" Ota, "Which process of ota plans and signs; renewed each second where there may be several.";
 }
 
 impl Table {
@@ -305,12 +308,31 @@ pub struct Item {
     pub rows: Vec<RowChange>,
     /// Facts beside the rows.
     pub facts: Vec<Fact>,
+    /// A robot that must not have been heard meanwhile.
+    pub silent: Option<Silent>,
+}
+
+/// That no process has heard a robot since the newest heartbeats of all robots were read up to a position. Where only one process opens the
+/// store, its own board is the whole truth and this asks nothing.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Silent {
+    /// Which robot.
+    pub robot_id: RobotId,
+    /// Position in the log of newest heartbeats that the decision knew; 0: nothing of it.
+    pub position: u64,
 }
 
 impl Item {
     /// An empty item of `writer` on behalf of `actor`.
     pub fn new(writer: Writer, actor: impl AsRef<str>) -> Self {
-        Self { writer, actor: Arc::from(actor.as_ref()), request_id: None, rows: Vec::new(), facts: Vec::new() }
+        Self {
+            writer,
+            actor: Arc::from(actor.as_ref()),
+            request_id: None,
+            rows: Vec::new(),
+            facts: Vec::new(),
+            silent: None,
+        }
     }
     /// Creates a row.
     pub fn create<R: Record>(&mut self, record: &R, kind: &'static str) -> &mut Self {

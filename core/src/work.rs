@@ -11,6 +11,7 @@ use crate::robot::{Fault, HardwareStop, HeldPlace, Lane, Load, Mode, Vitals};
 use crate::rows::{Index, Record, Table};
 use crate::update::UpdateEvent;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// Section `work` of a robot's desired state: whole, newest wins.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -446,6 +447,51 @@ pub struct Live {
     pub progress_at: crate::time::SiteTime,
     /// Robot clock minus server clock, milliseconds, and its error.
     pub clock_offset_ms: Option<(i64, u64)>,
+}
+
+/// A heartbeat as its gateway tells other processes: without the clocks of one of them.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Told {
+    /// What the robot said.
+    pub report: crate::robot::ReportedState,
+    /// UTC of the gateway's wall at receipt, milliseconds.
+    pub received_unix_ms: i64,
+    /// As [`Live::clock_offset_ms`].
+    pub clock_offset_ms: Option<(i64, u64)>,
+}
+
+impl Told {
+    /// As text, for [`Told::parse`].
+    pub fn text(&self) -> Arc<str> {
+        // A heartbeat holds only plain data, which serde_json cannot fail to write.
+        serde_json::to_string(self).map_or_else(|e| unreachable!("a heartbeat is not JSON: {e}"), Arc::from)
+    }
+    /// From [`Told::text`].
+    ///
+    /// # Errors
+    /// If it is not such a text.
+    pub fn parse(text: &str) -> Result<Self, serde_json::Error> {
+        serde_json::from_str(text)
+    }
+    /// As this process knows it from `now` on, where it knew `before` of the robot; none if that is not older.
+    pub fn into_live(self, robot_id: &RobotId, before: Option<&Live>, now: crate::time::Now) -> Option<Live> {
+        let order = |report: &crate::robot::ReportedState| (report.session_epoch, report.hb);
+        if before.is_some_and(|before| order(&before.report) >= order(&self.report)) {
+            return None;
+        }
+        let progressed = before.is_none_or(|before| before.report.progress() != self.report.progress());
+        let progress_at = before.filter(|_| !progressed).map_or(now.site, |before| before.progress_at);
+        let Self { report, received_unix_ms, clock_offset_ms } = self;
+        let (robot_id, processed_at, processed_site) = (robot_id.clone(), now.link, now.site);
+        Some(Live { robot_id, report, processed_at, processed_site, received_unix_ms, progress_at, clock_offset_ms })
+    }
+}
+
+impl From<&Live> for Told {
+    fn from(live: &Live) -> Self {
+        let (received_unix_ms, clock_offset_ms) = (live.received_unix_ms, live.clock_offset_ms);
+        Self { report: live.report.clone(), received_unix_ms, clock_offset_ms }
+    }
 }
 
 impl Live {

@@ -5,6 +5,7 @@
 
 use crate::build::{self, inspect};
 use crate::digest::Digest;
+use crate::key_set::KeySet;
 use crate::keys::{self, SecretKey};
 use crate::manifest::{Component, Manifest};
 use crate::repository::{
@@ -53,6 +54,18 @@ fn io(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
     move |source| Error::Io { doing, path, source }
 }
 
+fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let folder = path.parent().unwrap_or(Path::new("."));
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".new");
+    let beside = folder.join(name);
+    let mut file = File::create(&beside)?;
+    file.write_all(bytes)?;
+    file.sync_all()?;
+    fs::rename(&beside, path)?;
+    File::open(folder)?.sync_all()
+}
+
 /// What signing came to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Signed {
@@ -71,6 +84,8 @@ pub struct Checked {
     pub targets_version: Option<u64>,
     /// Bundles, by name in the repository.
     pub bundles: Vec<Manifest>,
+    /// The newest set of keys that sign directives; none: robots have them from their `trust.json` alone.
+    pub key_set: Option<KeySet>,
 }
 
 /// A folder of release people.
@@ -157,15 +172,8 @@ impl Folder {
     }
     /// A document, whole or not at all.
     fn write(&self, name: &str, document: &[u8]) -> Result<(), Error> {
-        let (path, beside) = (self.metadata().join(name), self.metadata().join(format!("{name}.new")));
-        let write = || {
-            let mut file = File::create(&beside)?;
-            file.write_all(document)?;
-            file.sync_all()?;
-            fs::rename(&beside, &path)?;
-            File::open(self.metadata())?.sync_all()
-        };
-        write().map_err(io("writing", &path))
+        let path = self.metadata().join(name);
+        write_whole(&path, document).map_err(io("writing", &path))
     }
     /// Newest document of a role that has numbers.
     fn newest(&self, role: &str) -> Result<Option<(u64, Vec<u8>)>, Error> {
@@ -178,6 +186,13 @@ impl Folder {
             newest = newest.max(number);
         }
         newest.map(|number| Ok((number, self.read(&format!("{number}{suffix}"))?))).transpose()
+    }
+    /// Number of the newest targets document; none: nothing was ever signed.
+    ///
+    /// # Errors
+    /// If it cannot be read.
+    pub fn targets_version(&self) -> Result<Option<u64>, Error> {
+        Ok(self.newest("targets")?.map(|(number, _)| number))
     }
     fn root(&self) -> Result<Vec<u8>, Error> {
         let root = self.newest("root")?.map(|(_, document)| document);
@@ -228,6 +243,33 @@ impl Folder {
         let previous = self.newest("targets")?.map(|(_, document)| document);
         let signed = sign_targets(previous.as_deref(), &[], &gone, now.plus_ms(PEOPLE_LIFE_MS), keys)?;
         Ok((withdrawn, self.put(&signed)?))
+    }
+
+    /// Adds a set of keys that sign directives, as `bundle rekey` made it, and signs the targets document that lists it.
+    ///
+    /// # Errors
+    /// A file that is no such set, is not the next one, or is signed by no key of the set before nor of its own; a document that waits for
+    /// signatures.
+    pub fn add_keys(&self, envelope: &[u8], keys: &[&SecretKey], now: Utc) -> Result<(KeySet, Signed), Error> {
+        self.must_not_wait()?;
+        let refused = |text: String| Refusal::field("bundle", text);
+        let set = KeySet::read(envelope).map_err(|e| refused(e.to_string()))?;
+        let before = self.check()?.key_set;
+        let next = before.as_ref().map_or(1, |before| before.number + 1);
+        if set.number != next {
+            return Err(refused(format!("is set {} of directive keys; the next is {next}", set.number)).into());
+        }
+        // The first one is signed by a key that only robots and the server know.
+        if let Some(before) = &before {
+            KeySet::open(envelope, next, before.keys.iter().chain(&set.keys)).map_err(|e| refused(e.to_string()))?;
+        }
+        let file = FileTarget { name: set.target(), digest: Digest::of(envelope), length: envelope.len() as u64 };
+        let previous = self.newest("targets")?.map(|(_, document)| document);
+        let add = std::slice::from_ref(&file);
+        let signed = sign_targets(previous.as_deref(), add, &[], now.plus_ms(PEOPLE_LIFE_MS), keys)?;
+        let path = self.file(&file.name, file.digest);
+        write_whole(&path, envelope).map_err(io("writing", &path))?;
+        Ok((set, self.put(&signed)?))
     }
 
     fn must_not_wait(&self) -> Result<(), Error> {
@@ -291,11 +333,12 @@ impl Folder {
             before = next;
         }
         let Some((targets_version, targets)) = self.newest("targets")? else {
-            return Ok(Checked { root_version, targets_version: None, bundles: Vec::new() });
+            return Ok(Checked { root_version, targets_version: None, bundles: Vec::new(), key_set: None });
         };
         check_targets(&root, &targets)?;
         let mut bad = Violations::default();
         let mut bundles = Vec::new();
+        let mut key_set: Option<KeySet> = None;
         for target in listed(&targets)? {
             let path = self.file(&target.name, target.digest);
             let found = File::open(&path).and_then(|mut file| Digest::of_reader(&mut file, target.length));
@@ -308,8 +351,13 @@ impl Folder {
                 let bytes = fs::read(&path).map_err(io("reading", &path))?;
                 bundles.extend(bad.take(&target.name, Manifest::from_bytes(&bytes)));
             }
+            if KeySet::is_named(&target.name) && path.exists() {
+                let bytes = fs::read(&path).map_err(io("reading", &path))?;
+                let set = bad.take(&target.name, KeySet::read(&bytes));
+                key_set = key_set.into_iter().chain(set).max_by_key(|set| set.number);
+            }
         }
         bad.finish()?;
-        Ok(Checked { root_version, targets_version: Some(targets_version), bundles })
+        Ok(Checked { root_version, targets_version: Some(targets_version), bundles, key_set })
     }
 }

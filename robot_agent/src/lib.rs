@@ -10,6 +10,7 @@ pub mod core;
 pub mod device;
 pub mod dial;
 mod drive;
+pub mod durable;
 pub mod governor;
 mod installed;
 pub mod lanes;

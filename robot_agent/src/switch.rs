@@ -4,8 +4,9 @@
 //! Invariant: `current` is the set committed last and `previous` the one before it; only [`Switch::commit`] changes either, so the way
 //! back from a trial always leads to a set that was good; [`Switch::forget_previous`] may give up `previous`, never `current`. Written by the agent, and by the launcher while no agent runs.
 
-use std::fs::{self, File};
-use std::io::{self, Write};
+use crate::durable::replace;
+use std::fs;
+use std::io;
 use std::path::Path;
 
 /// The set that a robot came with: the program on the launcher's command line.
@@ -178,29 +179,6 @@ fn set_name(text: &str) -> Option<String> {
 /// Whether this may name a set: it becomes a folder.
 pub fn is_set_name(text: &str) -> bool {
     (1..=NAME_MAX).contains(&text.len()) && text.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit())
-}
-
-/// Puts a small file in place of another, whole or not at all: a new file beside it, synced, renamed, and its folder synced.
-///
-/// # Errors
-/// If it could not be written: the old one or this is there.
-pub fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let beside = path.with_extension("new");
-    let mut file = File::create(&beside)?;
-    file.write_all(bytes)?;
-    file.sync_all()?;
-    drop(file);
-    fs::rename(&beside, path)?;
-    sync_folder_of(path)
-}
-
-/// Makes names in the folder of `path` durable.
-///
-/// # Errors
-/// If the folder cannot be synced.
-pub fn sync_folder_of(path: &Path) -> io::Result<()> {
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    File::open(folder)?.sync_all()
 }
 
 #[cfg(test)]

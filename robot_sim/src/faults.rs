@@ -53,6 +53,13 @@ impl FaultRates {
             manual_per_hour: 0.0,
         }
     }
+    /// Of a body that works `pace` times as fast as real by a real clock: what comes with its work goes wrong as often in a minute as at its
+    /// own pace. What comes with time does anyway.
+    #[must_use]
+    pub fn paced(&self, pace: f64) -> Self {
+        let Self { silence_per_hour, manual_per_hour, .. } = *self;
+        Self { silence_per_hour, manual_per_hour, ..self.times(1.0 / pace.max(1.0)) }
+    }
     /// All rates times `factor`, shares at most 1.
     pub fn times(&self, factor: f64) -> Self {
         Self {

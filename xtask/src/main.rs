@@ -5,10 +5,13 @@
 
 mod apt;
 mod clients;
+mod docker;
 mod fetch_tools;
 mod go;
+mod images;
 mod parts;
 mod run;
+mod stack;
 mod suite;
 mod sweep;
 mod workspace;
@@ -29,9 +32,12 @@ enum Verb {
     /// Run the whole suite, or only the named parts, and print the minutes of each.
     Test {
         /// First install what the tests of real components need (grpcurl, buf, a Python with gRPC, the modules of the clients) into
-        /// target/tools, and strace, Go and Node.js into the system.
+        /// target/tools, and strace, Go, Node.js and docker into the system.
         #[arg(long)]
         install: bool,
+        /// Leave out the part `compose`, which needs docker.
+        #[arg(long)]
+        no_docker: bool,
         /// Parts to run, in the suite's order whatever the order here; none: all.
         #[arg(value_enum)]
         parts: Vec<parts::Part>,
@@ -48,6 +54,9 @@ enum Verb {
         #[arg(long, default_value_t = 1)]
         from: u64,
     },
+    /// The stack of a compose file as processes of this machine, without docker.
+    #[command(subcommand)]
+    Stack(stack::Verb),
     /// Write the golden files anew from what the code does now. Read the diff before you commit it.
     Golden,
     /// Format everything, then `golden`.
@@ -56,8 +65,9 @@ enum Verb {
 
 fn main() -> ExitCode {
     let outcome = workspace::Workspace::find().and_then(|workspace| match Cli::parse().verb {
-        Verb::Test { install, parts } => suite::test(&workspace, install, &parts),
+        Verb::Test { install, no_docker, parts } => suite::test(&workspace, install, no_docker, &parts),
         Verb::Torture { sweeps, seeds, from } => sweep::torture(&workspace, &sweeps, from, seeds),
+        Verb::Stack(verb) => stack::run(&workspace, verb),
         Verb::Golden => sweep::golden(&workspace),
         Verb::Tidy => sweep::tidy(&workspace),
     });

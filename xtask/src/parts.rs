@@ -4,8 +4,9 @@
 //! are the same in each and nothing is compiled twice.
 
 use crate::fetch_tools::Tools;
+use crate::stack::{self, Which};
 use crate::workspace::Workspace;
-use crate::{clients, run};
+use crate::{clients, docker, run};
 use anyhow::Result;
 use clap::ValueEnum;
 
@@ -30,6 +31,10 @@ pub enum Part {
     Suite,
     /// Examples in the documentation.
     Doc,
+    /// The split stack as processes: started, a task done through its proxy, ended.
+    Stack,
+    /// The split stack by docker-compose on a docker of its own: brought up, a task done through its proxy, brought down.
+    Compose,
 }
 
 /// What cargo's closing lines added up to.
@@ -56,17 +61,19 @@ impl Part {
             Self::Unit => "unit",
             Self::Suite => "suite",
             Self::Doc => "doc",
+            Self::Stack => "stack",
+            Self::Compose => "compose",
         }
     }
 
     /// Whether outside tools take part.
     pub fn needs_tools(self) -> bool {
-        matches!(self, Self::Buf | Self::Clients | Self::Unit | Self::Suite)
+        matches!(self, Self::Buf | Self::Clients | Self::Unit | Self::Suite | Self::Stack | Self::Compose)
     }
 
     /// Whether it runs tests, which need the built programs.
     pub fn runs_tests(self) -> bool {
-        matches!(self, Self::Unit | Self::Suite | Self::Doc)
+        matches!(self, Self::Unit | Self::Suite | Self::Doc | Self::Stack | Self::Compose)
     }
 
     /// Runs it; whether it succeeded. Tests are added to `count`.
@@ -92,12 +99,15 @@ impl Part {
             Self::Unit => Self::tests(workspace, tools, count, &["--lib", "--bins"]),
             Self::Suite => Self::tests(workspace, tools, count, &["--test", "*"]),
             Self::Doc => Self::tests(workspace, tools, count, &["--doc"]),
+            Self::Stack => count.one(stack::test(workspace, &Which::split(), Some(workspace.midshift()))),
+            Self::Compose => count.one(docker::test(workspace, &workspace.midshift())),
         }
     }
 
     fn tests(workspace: &Workspace, tools: Option<&Tools>, count: &mut Count, targets: &[&str]) -> Result<bool> {
         let mut command = workspace.cargo(&["test", "--workspace", "--no-fail-fast"]);
-        command.args(targets);
+        // What failed is said in a line; a hundred lines of where it was hide it.
+        command.args(targets).env("RUST_BACKTRACE", "0");
         workspace.export_programs(&mut command)?;
         if let Some(tools) = tools {
             tools.export(&mut command);
@@ -108,6 +118,14 @@ impl Part {
 }
 
 impl Count {
+    /// A part that is one test.
+    fn one(&mut self, passed: Result<bool>) -> Result<bool> {
+        let good = matches!(passed, Ok(true));
+        self.passed += u64::from(good);
+        self.failed += u64::from(!good);
+        passed
+    }
+
     /// Adds a closing line of a test program; every other line changes nothing.
     pub fn add(&mut self, line: &str) {
         let Some((_, numbers)) = line.strip_prefix("test result: ").and_then(|rest| rest.split_once(". ")) else {

@@ -5,8 +5,8 @@
 
 use crate::fetch_tools::Tools;
 use crate::parts::{Count, Part};
-use crate::run;
 use crate::workspace::Workspace;
+use crate::{docker, run};
 use anyhow::Result;
 use clap::ValueEnum;
 use std::time::Duration;
@@ -19,14 +19,21 @@ struct Line {
 }
 
 /// Runs `asked`, or everything if nothing is asked; whether all passed.
-pub fn test(workspace: &Workspace, install: bool, asked: &[Part]) -> Result<bool> {
-    let parts = in_order(asked);
+pub fn test(workspace: &Workspace, install: bool, no_docker: bool, asked: &[Part]) -> Result<bool> {
+    let mut parts = in_order(asked);
+    if no_docker {
+        parts.retain(|part| *part != Part::Compose);
+        run::say("--no-docker: the part `compose` is left out");
+    }
     let mut lines = Vec::new();
     let mut count = Count::default();
     let mut tools = None;
     if parts.iter().any(|part| part.needs_tools()) {
         let (found, took) = timed(|| if install { Tools::install(workspace) } else { Tools::find(workspace) });
         tools = Some(found?);
+        if install && parts.contains(&Part::Compose) {
+            docker::install(workspace)?;
+        }
         lines.push(Line { name: "tools", took, passed: true });
     }
     for part in parts {
@@ -92,6 +99,6 @@ mod tests {
         assert_eq!(in_order(&[Part::Suite, Part::Fmt]), [Part::Fmt, Part::Build, Part::Clients, Part::Suite]);
         assert_eq!(in_order(&[Part::Unit]), [Part::Build, Part::Unit]);
         assert_eq!(in_order(&[Part::Clippy]), [Part::Clippy]);
-        assert_eq!(in_order(&[]).len(), 9);
+        assert_eq!(in_order(&[]).len(), 11);
     }
 }

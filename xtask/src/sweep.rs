@@ -17,7 +17,7 @@ pub enum Sweep {
     Kills,
     /// Shifts of the deterministic simulation, with roll-outs of software.
     Simulation,
-    /// The power goes at each call of an update that changes the disk: all of them, whatever the seeds.
+    /// The power goes at each call of an update, and of the ways back from one, that changes the disk: all of them, whatever the seeds.
     Updates,
 }
 

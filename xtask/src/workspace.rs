@@ -37,6 +37,11 @@ impl Workspace {
         self.target.join("tools")
     }
 
+    /// The midshift program that the suite builds.
+    pub fn midshift(&self) -> PathBuf {
+        self.target.join("debug").join(format!("midshift{}", std::env::consts::EXE_SUFFIX))
+    }
+
     /// A PATH that begins with the pinned tools and `more`.
     pub fn path_with(&self, more: Vec<PathBuf>) -> std::ffi::OsString {
         let own = std::env::var_os("PATH").unwrap_or_default();

@@ -155,6 +155,9 @@ async fn serve(data: PathBuf, keys: PathBuf, listen: SocketAddr, stop: Cancellat
     drop(free);
     answer_questions(listen, stop.clone(), |_| 0)?;
     let serve = Serve {
+        roles: Vec::new(),
+        drain_seconds: None,
+        no_software: false,
         site: None,
         data,
         listen,

@@ -100,6 +100,11 @@ fn arm_once(view: &mut View, now: Now, plan: &mut Plan, task_id: &TaskId) {
 fn offer(tx: &mut Tx, task: &TaskState, intake: &TaskIntake, robot_id: &RobotId, board: &Board) {
     let Some(anchor) = anchor(tx.view, robot_id, board, limits::OFFER_VALID) else { return };
     tx.rely::<Session>(robot_id.as_str());
+    // Whoever had it before and never said that it ended may have been heard elsewhere a moment ago.
+    if let Some(before) = task.robot_id.as_ref().filter(|before| tx.view.held_by(before) == task.attempt_id().as_ref())
+    {
+        tx.rely_on_silence(before);
+    }
     let attempt = AttemptId { subject: Subject::Task(task.task_id.clone()), epoch: task.epoch + 1 };
     let mut granted = task.clone();
     granted.epoch += 1;

@@ -9,4 +9,6 @@ crate::seeded_bugs! {
     HeartbeatOvertakesEvents heartbeat_overtakes_events;
     /// Robots leave their work for a roll-out however many of the area have left it.
     BudgetIsForgotten budget_is_forgotten;
+    /// Every process plans, whoever leads: two that decide the same conflict for ever.
+    EverybodyLeads everybody_leads;
 }

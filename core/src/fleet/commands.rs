@@ -132,8 +132,6 @@ pub fn apply(tx: &mut Tx, command: &Command, actor: &str) {
         Command::Undrain { robot_id } => drain::release(tx, robot_id),
         Command::PutPolicy(policy) => {
             tx.put(policy.clone(), "area.policy_put");
-            let robots: Vec<RobotId> = tx.view.sessions.values().map(|s| s.row.robot_id.clone()).collect();
-            tx.view.policy_dirty.extend(robots);
         }
         Command::ClearPlace { place_id, reason } => {
             tx.tell(place_id.as_str(), "place.judged_clear", &serde_json::json!({"actor": actor, "reason": reason}));

@@ -1,12 +1,13 @@
 //! Takes robots out of work for maintenance and gives them back: the task at hand ends or waits at a step boundary, the robot parks, and
-//! only then the drain holds it. People ask for it, and the rollout service does by its rows.
+//! only then the drain holds it. People ask for it, and the rollout service does by its rows. A robot that carries the item of a task
+//! that is tried again is still at work: it ends that task first, and gets no other.
 //!
 //! Called by `mod`, with [`super::budget`] before it. Invariant: a drain takes the robot's mutex only from none, and gives it back only from itself; it never cuts a grasp and never leaves a
 //! robot in a lane. A drain whose deadline passes is refused and the robot works on.
 
 use super::rows::{Drain, DrainState, RobotAuthority, RobotHolder};
 use super::view::View;
-use super::{Board, Plan, Tx, errands, heard, repair, screen, way};
+use super::{Board, Plan, Tx, errands, heard, load, repair, screen, way};
 use crate::ids::{DrainId, RobotId};
 use crate::maintenance::{DrainRelease, DrainRequest};
 use crate::reason::{Code, Reason};
@@ -119,6 +120,14 @@ fn further(tx: &mut Tx, drain: &Drain, board: &Board) {
     let live = board.get(&drain.robot_id).cloned();
     match holder {
         RobotHolder::Maintenance(_) => {}
+        // The rest of its task is given to it, or a person comes for what it carries.
+        RobotHolder::None if load::must_deliver(tx.view, drain, live.as_deref()) => {
+            if left_ms == 0 {
+                refuse(tx, drain);
+            } else if let Some(live) = live.filter(|live| !load::goes_on(tx.view, Some(live))) {
+                park(tx, drain, &live, board);
+            }
+        }
         RobotHolder::None if is_at_rest(tx.view, drain, live.as_deref()) => take(tx, drain),
         _ if left_ms == 0 => refuse(tx, drain),
         RobotHolder::None => {

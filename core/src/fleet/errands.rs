@@ -30,6 +30,10 @@ pub fn plan(view: &mut View, board: &Board, now: Now, idle: Vec<Candidate>, plan
     let mut coming = Coming::of(view);
     for Candidate { robot_id, at: here, .. } in idle {
         let Some(live) = board.get(&robot_id) else { continue };
+        // Whoever drains is parked by its drain.
+        if view.drain_of(&robot_id).is_some() {
+            continue;
+        }
         if view.unwilling.get(&robot_id).is_some_and(|until| now.link < *until) {
             continue;
         }

@@ -19,6 +19,7 @@ pub mod explain;
 pub mod heard;
 pub mod inbox;
 pub mod incidents;
+pub mod load;
 pub mod places;
 pub mod pool;
 pub mod repair;
@@ -31,8 +32,9 @@ pub mod view;
 pub mod way;
 
 use crate::ids::RobotId;
+use crate::lead::Rivals;
 use crate::reason::{Code, Reason};
-use crate::rows::{Entry, Item, Log, Seq, Table};
+use crate::rows::{BadRow, Entry, Item, Key, Log, Revision, Row, Seq, Table};
 use crate::task::{Event, Phase, TaskRequest};
 use crate::time::Now;
 use crate::work::{InboxEntry, Live};
@@ -108,13 +110,7 @@ pub const LOGS: &[Log] = &[Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbo
 pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
     let consumed = view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq);
     for entry in entries {
-        if let Some(table) = entry.table.filter(|_| entry.seq > view.read_at) {
-            let key = crate::rows::Key { table, id: entry.subject.clone() };
-            if let Err(error) = view.absorb(&key, entry.revision, crate::picture::row_of(entry, table).as_ref()) {
-                plan.report.unreadable.push(error.to_string());
-            }
-        }
-        view.absorbed = view.absorbed.max(entry.seq);
+        take_row(view, entry, &mut plan.report.unreadable);
         if entry.seq <= consumed {
             continue;
         }
@@ -156,6 +152,52 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
             }
             _ => {}
         }
+    }
+}
+
+fn take_row(view: &mut View, entry: &Entry, unreadable: &mut Vec<String>) {
+    if let Some(table) = entry.table.filter(|_| entry.seq > view.read_at) {
+        let key = crate::rows::Key { table, id: entry.subject.clone() };
+        if let Err(error) = view.absorb(&key, entry.revision, crate::picture::row_of(entry, table).as_ref()) {
+            unreadable.push(error.to_string());
+        }
+    }
+    view.absorbed = view.absorbed.max(entry.seq);
+}
+
+/// Takes entries of the feed as somebody does who decides nothing: rows only. What a planner would have to look at is not gathered.
+pub fn follow_rows(view: &mut View, now: Now, entries: &[Entry], unreadable: &mut Vec<String>) {
+    for entry in entries {
+        take_row(view, entry, unreadable);
+        if entry.table == Some(Table::ServiceClock) {
+            view.served = view.clocks.get("fleet").map(|c| c.row).unwrap_or_default();
+            view.read = now;
+        }
+    }
+    view.rest();
+}
+
+/// Puts rows as they were just read over what was to become of them: an item that touches `keys` was not applied.
+///
+/// # Errors
+/// A row that cannot be read.
+pub fn reread(view: &mut View, keys: &[Key], rows: &[Row]) -> Result<(), BadRow> {
+    for key in keys {
+        view.absorb(key, Revision(u64::MAX), None)?;
+        if let Some(row) = rows.iter().find(|row| row.key == *key) {
+            view.absorb(key, row.revision, Some(row))?;
+        }
+    }
+    view.rest();
+    Ok(())
+}
+
+/// Who else may plan on a store that other processes open too, or not.
+pub fn rivals(is_shared: bool, bugs: bugs::Bugs) -> Rivals {
+    match (bugs.everybody_leads(), is_shared) {
+        (true, _) => Rivals::Ignored,
+        (false, true) => Rivals::Some,
+        (false, false) => Rivals::None,
     }
 }
 

@@ -1,8 +1,8 @@
 //! Grants places along routes: all passages up to the next standing place together with it, or nothing.
 //!
 //! Invariant: a place is given on only by the robot's own report or by a person, never by time. Queue order is class, then age;
-//! a request that cannot be served keeps the place it goes to from later ones, and once that has a seat the passages on the way too. First of all comes who lost a place of its released stretch:
-//! it may stand in a passage for which the others wait. Grants are traffic, never a safety function.
+//! a request that cannot be served keeps the place it goes to from later ones, and once that has a seat the passages on the way too. First of all come who lost a place of its released stretch
+//! and who stands in a passage with no standing place ahead: the others may wait for just that passage. Grants are traffic, never a safety function.
 
 use super::Tx;
 use super::anchor::next_generation;
@@ -82,8 +82,8 @@ fn adopt(tx: &mut Tx, robot_id: &RobotId, id: &str, grant_id: u64) {
 }
 
 struct Wish {
-    /// Nothing of its released stretch is missing.
-    whole: bool,
+    /// Nothing of its released stretch is missing, and it bars no passage.
+    patient: bool,
     class: Class,
     since: SiteTime,
     robot_id: RobotId,
@@ -101,12 +101,13 @@ pub fn advance(view: &mut View, board: &Board, now: Now, plan: &mut Plan) -> Rel
         let whole = missing(view, live, a).is_empty();
         if !whole || !is_released(view, robot_id, a) {
             let since = view.waits.get(robot_id).map_or(now.site, |w| w.since);
-            wishes.push(Wish { whole, class: class_of(view, a), since, robot_id: robot_id.clone() });
+            let patient = whole && !bars_passage(view, robot_id);
+            wishes.push(Wish { patient, class: class_of(view, a), since, robot_id: robot_id.clone() });
         }
     }
     let wanting: BTreeSet<RobotId> = wishes.iter().map(|w| w.robot_id.clone()).collect();
     view.waits.retain(|r, _| wanting.contains(r));
-    wishes.sort_by(|a, b| (a.whole, a.class, a.since, &a.robot_id).cmp(&(b.whole, b.class, b.since, &b.robot_id)));
+    wishes.sort_by(|a, b| (a.patient, a.class, a.since, &a.robot_id).cmp(&(b.patient, b.class, b.since, &b.robot_id)));
     let mut releases = Releases::default();
     let mut traffic = if wishes.is_empty() { Traffic::default() } else { Traffic::of(view) };
     for wish in &wishes {
@@ -115,6 +116,18 @@ pub fn advance(view: &mut View, board: &Board, now: Now, plan: &mut Plan) -> Rel
     }
     plan.report.tally.waiting_for_place = view.waits.len() as u64;
     releases
+}
+
+/// The robot is inside a passage and has no standing place to go on to: its task ended there.
+fn bars_passage(view: &View, robot_id: &RobotId) -> bool {
+    let mut inside = false;
+    for (place, holder) in super::view::held(view, robot_id) {
+        if place.standing {
+            return false;
+        }
+        inside |= holder.state == HolderState::Inside;
+    }
+    inside
 }
 
 fn class_of(view: &View, a: &Attempt) -> Class {
@@ -298,7 +311,7 @@ fn grant(tx: &mut Tx, robot_id: &RobotId, needed: &[PlaceIx], traffic: &mut Traf
     }
 }
 
-/// The robot stands in a place that others need while its own goal is taken: it goes to a free bay on the way.
+/// The robot stands in a place or passage that others need while its own goal is taken: it goes to a free bay on the way.
 fn step_aside(
     tx: &mut Tx,
     a: &Attempt,
@@ -310,13 +323,19 @@ fn step_aside(
     let robot_id = &a.robot_id;
     let released = work.released_index.unwrap_or(0) as usize;
     let Some(here) = work.route.get(released).and_then(|p| tx.view.site.find(&p.waypoint)) else { return false };
-    let Some(place) = tx.view.site.standing_at(here) else { return false };
+    let place = tx.view.site.standing_at(here);
     let kind = tx.view.site.waypoint(here).kind;
-    if matches!(kind, Kind::Hold | Kind::Park) || !stands_in(tx.view, robot_id, place) {
+    let bars = match place {
+        Some(place) => !matches!(kind, Kind::Hold | Kind::Park) && stands_in(tx.view, robot_id, place),
+        None => bars_passage(tx.view, robot_id),
+    };
+    if !bars {
         return false;
     }
-    let here_id = tx.view.site.place(place).place_id.clone();
-    let contested = tx.view.waits.iter().any(|(r, w)| r != robot_id && w.places.contains(&here_id));
+    let contested = place.is_some_and(|place| {
+        let here_id = tx.view.site.place(place).place_id.clone();
+        tx.view.waits.iter().any(|(r, w)| r != robot_id && w.places.contains(&here_id))
+    });
     if !contested && tx.now.site.since(since) < STEP_ASIDE_AFTER {
         return false;
     }
@@ -338,7 +357,7 @@ fn step_aside(
         route[0].ends_step = None;
         let Some(ixs) = way::indices(&site, &route) else { continue };
         let Some(first) = segments(&site, &ixs).into_iter().next() else { continue };
-        if first.standing == Some(place) || !grantable(tx.view, robot_id, &first.places(), traffic) {
+        if first.standing == place || !grantable(tx.view, robot_id, &first.places(), traffic) {
             continue;
         }
         grant(tx, robot_id, &first.places(), traffic);

@@ -4,7 +4,7 @@
 
 use super::rows::RobotHolder;
 use super::view::View;
-use super::{Board, heard, way};
+use super::{Board, heard, load, way};
 use crate::ids::{RobotId, Subject};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -31,7 +31,7 @@ pub fn robot(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> Resul
         Presence::Offline | Presence::Updating => return Err(Code::RobotOffline.into()),
     }
     let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
-    decided_by_people(view, robot_id)?;
+    decided_by_people(view, robot_id, Some(live))?;
     reported(live)?;
     match view.authority.get(robot_id.as_str()).map(|a| &a.row.holder) {
         None | Some(RobotHolder::None) => {}
@@ -49,7 +49,7 @@ pub fn robot(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> Resul
     Ok(())
 }
 
-fn decided_by_people(view: &View, robot_id: &RobotId) -> Result<(), Reason> {
+fn decided_by_people(view: &View, robot_id: &RobotId, live: Option<&Live>) -> Result<(), Reason> {
     if let Some(control) = view.control.get(robot_id.as_str()).map(|c| &c.row) {
         match control.duty() {
             Duty::InWork => {}
@@ -61,7 +61,9 @@ fn decided_by_people(view: &View, robot_id: &RobotId) -> Result<(), Reason> {
             Duty::Retired => return Err(Code::SkippedRetired.into()),
         }
     }
-    if let Some(drain) = view.drain_of(robot_id) {
+    if let Some(drain) = view.drain_of(robot_id)
+        && !live.is_some_and(|live| load::may_end_its_task(view, drain, live))
+    {
         return Err(Reason::from(Code::RobotDraining).with("drain_id", &drain.drain_id));
     }
     match view.robot_holds(robot_id).next() {
@@ -244,7 +246,7 @@ pub fn recallable(view: &View, board: &Board, robot_id: &RobotId) -> bool {
     let Some(id) = view.held_by(robot_id) else { return false };
     let Some(a) = view.attempt(id) else { return false };
     let Subject::Errand { .. } = id.subject else { return false };
-    if decided_by_people(view, robot_id).is_err() {
+    if decided_by_people(view, robot_id, None).is_err() {
         return false;
     }
     let working = matches!(

@@ -153,7 +153,6 @@ viewed! {
     RobotControl => control;
     RobotCounter => counters;
     SiteRow => sites;
-    AreaPolicy => policies;
     DesiredWork => desired_work;
     DesiredPolicy => desired_policy;
     ServiceClock => clocks;
@@ -187,6 +186,17 @@ impl Viewed<View> for TaskState {
         } else {
             view.queued.remove(&place);
         }
+    }
+}
+
+impl Viewed<View> for AreaPolicy {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.policies
+    }
+    /// Whoever put it, this process or another: every robot hears of it.
+    fn changed(view: &mut View, _id: &str, _old: Option<&Self>) {
+        let robots: Vec<RobotId> = view.sessions.values().map(|s| s.row.robot_id.clone()).collect();
+        view.policy_dirty.extend(robots);
     }
 }
 
@@ -433,6 +443,14 @@ impl View {
                 .is_some_and(|t| tasks.get(t.as_str()).is_some_and(|t| t.row.epoch == a.attempt.epoch));
             holds || newest || !a.phase.is_terminal()
         });
+    }
+
+    /// Forgets what a planner would have to look at: whoever plans next begins with a picture of its own.
+    pub fn rest(&mut self) {
+        self.forget_ended();
+        self.dirty.clear();
+        self.policy_dirty.clear();
+        self.fresh.clear();
     }
 
     /// Serving time at `now`.

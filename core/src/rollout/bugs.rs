@@ -9,4 +9,6 @@ crate::seeded_bugs! {
     PauseIsForgotten pause_is_forgotten;
     /// Robots are taken out of work for a roll-out however many are.
     InFlightIsForgotten in_flight_is_forgotten;
+    /// Every process plans, whoever leads: two that decide the same conflict for ever.
+    EverybodyLeads everybody_leads;
 }

@@ -6,6 +6,7 @@
 use super::robots::{is_gone, is_irreversible};
 use super::rows::{AreaBundle, Countdown, Outcome, Pause, Phase, Rollout, RolloutRobot, Step, Verdict};
 use super::served::{forget_area_bundles, is_served};
+use super::stamp::Stamp;
 use super::turns::{is_newcomer, is_retried};
 use super::verdict;
 use super::view::View;
@@ -98,7 +99,7 @@ pub fn abort(
 ) {
     let told = Reason::from(Code::RolloutAborted).with("rollout_id", &rollout.rollout_id).with("because", reason.code);
     incident(tx, None, &told);
-    rollout.abort = Some(verdict::abort(tx.view, &rollout, reason, hard, tx.now.utc, actor));
+    rollout.abort = Some(verdict::abort(tx.view, &rollout, reason, hard, &tx.now, actor));
     rollout.verdicts.extend(verdict);
     rollout.generation += 1;
     (rollout.soak, rollout.exposure) = (None, None);
@@ -317,12 +318,15 @@ pub fn forget_oldest(tx: &mut Tx) {
 /// Waits until nobody can activate it any more.
 fn aborting(tx: &mut Tx, rollout: Rollout) {
     let alive = |r: &RolloutRobot| r.grant.is_some() && r.moments.switched.is_none() && r.step == Step::Activating;
-    if !tx.view.robots_of(&rollout.rollout_id).any(alive) || tx.now.utc.ms_since(rollout.since) >= ABORT_WAITS_MS {
+    let now = Stamp::new(&tx.now, &tx.view.started);
+    let latched = rollout.abort.as_ref().and_then(|abort| abort.link);
+    let waited_ms = latched.map_or_else(|| tx.now.utc.ms_since(rollout.since), |latched| now.ms_since(&latched));
+    if !tx.view.robots_of(&rollout.rollout_id).any(alive) || waited_ms >= ABORT_WAITS_MS {
         enter(tx, rollout, Phase::RollingBack, "rollout.rolling_back");
     }
 }
 
-/// So long the phase says that permissions may be alive, milliseconds of site time: longer than any lives. A robot that is not heard keeps
+/// So long the phase says that permissions may be alive, milliseconds of link time, as permissions count: longer than any lives. A robot that is not heard keeps
 /// its drain, and nothing else waits for it.
 const ABORT_WAITS_MS: u64 = 60_000;
 

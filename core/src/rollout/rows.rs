@@ -248,6 +248,9 @@ pub struct Abort {
     pub touched: u32,
     /// UTC, site clock.
     pub at: Utc,
+    /// The same moment on the link clock. None: it was latched before that was kept.
+    #[serde(default)]
+    pub link: Option<Stamp>,
     /// Who, if it was a person.
     pub actor: Option<String>,
 }

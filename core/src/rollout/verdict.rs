@@ -6,6 +6,7 @@
 use super::hear::is_hard;
 use super::rows::{Abort, Counted, Outcome, Rollout, RolloutRobot, Step, Verdict};
 use super::spec::{SmallWave, SmallWaveFailure};
+use super::stamp::Stamp;
 use super::view::View;
 use super::{Board, Tx};
 use crate::fleet::heard;
@@ -157,11 +158,12 @@ pub fn against(view: &View, rollout: &Rollout) -> Option<(Reason, bool, Seen)> {
 }
 
 /// What is latched when a roll-out ends early.
-pub fn abort(view: &View, rollout: &Rollout, reason: Reason, hard: bool, at: Utc, actor: Option<String>) -> Abort {
+pub fn abort(view: &View, rollout: &Rollout, reason: Reason, hard: bool, now: &Now, actor: Option<String>) -> Abort {
     let failed = view.robots_of(&rollout.rollout_id).filter(|r| r.failure.is_some());
     let robots = failed.map(|r| r.robot_id.clone()).take(NAMED_MAX).collect();
     let touched = view.robots_of(&rollout.rollout_id).filter(|r| r.attempted).count() as u32;
-    Abort { reason, hard, robots, touched, at, actor }
+    let link = Some(Stamp::new(now, &view.started));
+    Abort { reason, hard, robots, touched, at: now.utc, link, actor }
 }
 
 /// Robots of the wave that have not worked enough to be judged, and may yet. Whom people or the breaker keep out of work is not waited for,

@@ -334,6 +334,12 @@ impl View {
         }
         contact.last = at.max(contact.last);
     }
+    /// Forgets since when robots were heard that are not there any more, or that a person has retired.
+    pub fn forget_contacts(&mut self, board: &Board) {
+        let mut contacts = std::mem::take(&mut self.contacts);
+        contacts.retain(|robot_id, _| board.contains_key(robot_id) && self.duty(robot_id) != Duty::Retired);
+        self.contacts = contacts;
+    }
     /// Milliseconds served on the site clock by `now`.
     pub fn served_ms(&self, now: &Now) -> u64 {
         self.served.site_ms + now.site.since(self.read.site).as_ms()

@@ -3,6 +3,7 @@
 mod building;
 mod directives;
 mod fresh;
+mod key_sets;
 mod keyring;
 mod metadata;
 mod releasing;

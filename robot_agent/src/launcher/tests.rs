@@ -1,11 +1,17 @@
 //! The launcher with real children.
 
+use super::choose::{boot_into, change_boot};
 use super::*;
+use crate::boot::{BASE, BOOT, Boot, Image, Slot};
 use crate::starts::TRIES_MAX;
+use crate::switch::{self, Switch};
+use std::net::UdpSocket;
+use std::path::PathBuf;
+use std::time::Duration;
 use tempfile::TempDir;
 
 fn given(text: &str) -> Result<Orders, String> {
-    orders(text.split(' ').map(str::to_owned))
+    Orders::read(text.split(' ').map(str::to_owned))
 }
 
 /// A robot's folder, and what its launcher was told: PROGRAM is a shell with this script.

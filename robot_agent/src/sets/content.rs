@@ -3,7 +3,7 @@
 //! Invariant: a chunk is marked only after its bytes were synced, so a mark that survived a power cut tells the truth.
 
 use super::{CHUNK_BYTES, CHUNKS_UNSYNCED_MAX, Error, Wanted};
-use crate::switch;
+use crate::durable;
 use midshift_bundle::digest::Digest;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Seek, SeekFrom, Write};
@@ -133,7 +133,7 @@ impl Part {
             return Ok(());
         }
         self.file.sync_data().map_err(io_error("syncing a download"))?;
-        switch::replace(&self.map, &self.marks.bits).map_err(io_error("marking a download"))?;
+        durable::replace(&self.map, &self.marks.bits).map_err(io_error("marking a download"))?;
         self.unsynced = 0;
         Ok(())
     }
@@ -146,9 +146,11 @@ impl Part {
             return Err(Error::Corrupt { digest: self.wanted.digest });
         }
         let name = || {
-            self.file.sync_all()?;
+            if self.unsynced > 0 {
+                self.file.sync_data()?;
+            }
             fs::rename(&self.path, to)?;
-            switch::sync_folder_of(to)?;
+            durable::sync_folder_of(to)?;
             remove(&self.map)
         };
         name().map_err(io_error("naming content"))
@@ -171,7 +173,7 @@ impl Part {
         let discard = || {
             remove(&self.map)?;
             remove(&self.path)?;
-            switch::sync_folder_of(&self.path)
+            durable::sync_folder_of(&self.path)
         };
         discard().map_err(io_error("throwing a download away"))
     }

@@ -15,9 +15,10 @@
 use super::content::{Part, remove};
 use super::{CHUNK_BYTES, Error, Holdings, Sets, Wanted, base_name};
 use crate::boot::BASE;
+use crate::durable;
 use crate::launcher::{PROGRAM, SWITCH};
 use crate::starts::TRIES_MAX;
-use crate::switch::{self, Switch};
+use crate::switch::Switch;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding::{self, Base};
 use midshift_bundle::manifest::{COMPONENT_BYTES_MAX, MANIFEST_BYTES_MAX};
@@ -64,7 +65,7 @@ impl DiskSets {
     /// # Errors
     /// The disk's.
     pub fn open(folder: &Path) -> Result<Self, Error> {
-        fs::create_dir_all(folder.join(CONTENT)).map_err(io_error("making the folder of sets"))?;
+        durable::make_folder(&folder.join(CONTENT)).map_err(io_error("making the folder of sets"))?;
         Ok(Self { folder: folder.to_owned(), part: None, overtaken: None })
     }
 
@@ -167,7 +168,7 @@ impl DiskSets {
         let name = || {
             out.get_ref().sync_all()?;
             fs::rename(&beside, to)?;
-            switch::sync_folder_of(to)?;
+            durable::sync_folder_of(to)?;
             remove(&to.with_extension("map"))?;
             remove(&to.with_extension("part"))?;
             remove(&to.with_extension("plain"))
@@ -203,20 +204,26 @@ impl DiskSets {
         }
         if let Some(program) = set.program() {
             let content = self.content(&program.digest);
+            // A program that lost its mode with the power could not be started.
             fs::set_permissions(&content, Permissions::from_mode(0o755))?;
+            File::open(&content)?.sync_all()?;
             fs::hard_link(content, beside.join(PROGRAM))?;
         }
         if set.base().is_some() {
-            fs::write(beside.join(BASE), base_name(set))?;
-            File::open(beside.join(BASE))?.sync_all()?;
+            durable::write(&beside.join(BASE), base_name(set).as_bytes())?;
         }
-        let page = beside.join(SET_FILE);
-        fs::write(&page, set.to_bytes())?;
-        File::open(&page)?.sync_all()?;
-        File::open(&beside)?.sync_all()?;
+        durable::write(&beside.join(SET_FILE), &set.to_bytes())?;
+        durable::sync_folder(&beside)?;
         fs::rename(&beside, folder)?;
-        switch::sync_folder_of(folder)
+        durable::sync_folder_of(folder)
     }
+}
+
+/// Deletes the folder of a set. Its page goes first and for good: without it the folder is no set, whatever else of it is left.
+fn delete_set(folder: &Path) -> io::Result<()> {
+    remove(&folder.join(SET_FILE))?;
+    durable::sync_folder(folder)?;
+    fs::remove_dir_all(folder)
 }
 
 fn read_limited(path: &Path, most: u64) -> io::Result<Vec<u8>> {
@@ -267,7 +274,7 @@ impl Sets for DiskSets {
 
     fn fetch_as_it_is(&mut self, wanted: &Wanted) -> Result<(), Error> {
         let note = self.content(&wanted.digest).with_extension("plain");
-        File::create(&note).and_then(|_| switch::sync_folder_of(&note)).map_err(io_error("noting a way"))
+        File::create(&note).and_then(|_| durable::sync_folder_of(&note)).map_err(io_error("noting a way"))
     }
 
     fn is_fetched_as_it_is(&mut self, wanted: &Wanted) -> Result<bool, Error> {
@@ -294,7 +301,7 @@ impl Sets for DiskSets {
         let read_back = self.verify_files(&id).map(|_| ());
         if let Err(Error::Corrupt { digest }) = read_back {
             // The disk has changed it since it was checked: it must come again.
-            let forget = || fs::remove_dir_all(&folder).and_then(|()| remove(&self.content(&digest)));
+            let forget = || delete_set(&folder).and_then(|()| remove(&self.content(&digest)));
             forget().map_err(io_error("throwing a set away"))?;
         }
         read_back.and_then(|()| self.install_base(set)).and_then(|()| self.verify_base(set))
@@ -334,9 +341,7 @@ impl Sets for DiskSets {
                 let name = entry.file_name().to_string_lossy().into_owned();
                 let half = name.strip_suffix(".new").is_some_and(|name| name.parse::<Digest>().is_ok());
                 if half || name.parse::<Digest>().is_ok_and(|id| !named.contains(&id)) {
-                    // Without its page it is no set any more, whatever is left of it.
-                    remove(&entry.path().join(SET_FILE))?;
-                    fs::remove_dir_all(entry.path())?;
+                    delete_set(&entry.path())?;
                 }
             }
             for entry in fs::read_dir(self.folder.join(CONTENT))? {

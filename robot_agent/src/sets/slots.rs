@@ -5,13 +5,14 @@
 use super::disk::{DiskSets, io_error, optional};
 use super::{Error, base_name};
 use crate::boot::{BOOT, Boot, Image, Slot};
+use crate::durable;
 use crate::launcher::SWITCH;
-use crate::switch::{self, FACTORY, Switch};
+use crate::switch::{FACTORY, Switch};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::{COMPONENT_BYTES_MAX, Component};
 use midshift_bundle::set::SetManifest;
-use std::fs::{self, File, Permissions};
-use std::os::unix::fs::PermissionsExt;
+use std::fs::File;
+use std::io;
 
 impl DiskSets {
     fn boot(&self) -> Result<Boot, Error> {
@@ -69,10 +70,11 @@ impl DiskSets {
         self.write_boot(&before, &mut boot)?;
         let slot = self.folder.join(spare.file());
         let copy = || {
-            fs::copy(self.content(&base.digest), &slot)?;
-            fs::set_permissions(&slot, Permissions::from_mode(0o644))?;
-            File::open(&slot)?.sync_all()?;
-            switch::sync_folder_of(&slot)
+            let is_new = !slot.try_exists()?;
+            let mut to = File::create(&slot)?;
+            io::copy(&mut File::open(self.content(&base.digest))?, &mut to)?;
+            to.sync_all()?;
+            if is_new { durable::sync_folder_of(&slot) } else { Ok(()) }
         };
         copy().map_err(io_error("writing a base"))?;
         self.verify_slot(spare, base)?;

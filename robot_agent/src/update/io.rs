@@ -8,9 +8,11 @@ use crate::sets::{self, CHUNK_BYTES, Sets, Wanted};
 use async_trait::async_trait;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding::{ENCODED_BYTES_MAX, ENCODED_BYTES_MIN};
+use midshift_bundle::key_set::{self, KeySet};
 use midshift_bundle::manifest::{MANIFEST_BYTES_MAX, Manifest};
-use midshift_bundle::trust::{self, Reading, Source, Trusted};
+use midshift_bundle::trust::{self, Listed, Reading, Refreshed, Source, Trusted};
 use midshift_core::reason::{Code, Reason};
+use std::collections::BTreeMap;
 use std::fmt;
 use std::io;
 use std::ops::Range;
@@ -133,7 +135,7 @@ impl Worker for UpdateWorker {
                 Ok(holdings) => Done::Holdings(Box::new(holdings)),
                 Err(error) => later(error),
             },
-            Job::Refresh { trusted, clock } => self.refresh(&trusted, clock).await,
+            Job::Refresh { trusted, clock, keys_after } => self.refresh(&trusted, clock, keys_after).await,
             Job::Fetch { wanted, bases, rate_bytes_s } => {
                 ended(self.fetch(wanted, &bases, &mut Pace::new(rate_bytes_s), &leave).await)
             }
@@ -176,13 +178,40 @@ impl UpdateWorker {
         self.on_disk(verb).await.map_or_else(|error| Done::Failed(of_disk(&error)), |()| Done::Ok)
     }
 
-    async fn refresh(&self, trusted: &Trusted, clock: Reading) -> Done {
+    async fn refresh(&self, trusted: &Trusted, clock: Reading, keys_after: u64) -> Done {
         match trusted.refresh(Arc::new(Metadata(self.remote.clone())), clock).await {
-            Ok(refreshed) => Done::Refreshed(Box::new(refreshed)),
+            Ok(refreshed) => match self.key_sets(&refreshed, keys_after).await {
+                Ok(key_sets) => Done::Refreshed { refreshed: Box::new(refreshed), key_sets },
+                Err(error) => later(error),
+            },
             Err(error) if error.is_unreachable() => later(error),
             Err(error @ trust::Error::Store { .. }) => later(error),
             Err(error) => refused(Reason::new(Code::MetadataRefused, error.to_string())),
         }
+    }
+
+    /// Listed sets of directive keys with a higher number than `after`. One that is longer than any is left out.
+    async fn key_sets(&self, refreshed: &Refreshed, after: u64) -> io::Result<BTreeMap<u64, Vec<u8>>> {
+        let numbered = |(name, listed): (&String, &Listed)| Some((KeySet::number_of(name)?, *listed));
+        let newer = refreshed.targets.iter().filter_map(numbered).filter(|(number, _)| *number > after);
+        let newer: BTreeMap<u64, Listed> =
+            newer.filter(|(_, listed)| (1..=key_set::ENVELOPE_BYTES_MAX as u64).contains(&listed.length)).collect();
+        let mut sets = BTreeMap::new();
+        for (number, listed) in newer.into_iter().take(key_set::SETS_MAX) {
+            let mut bytes = Vec::new();
+            let mut pieces = self.remote.range(&listed.digest, 0..listed.length).await?;
+            while let Some(piece) = pieces.next().await {
+                bytes.extend(piece?);
+                if bytes.len() as u64 > listed.length {
+                    break;
+                }
+            }
+            if Digest::of(&bytes) != listed.digest {
+                return Err(io::Error::new(io::ErrorKind::InvalidData, "a set of directive keys came as other bytes"));
+            }
+            sets.insert(number, bytes);
+        }
+        Ok(sets)
     }
 
     async fn verify(&self, set: &str) -> Done {

@@ -1,9 +1,10 @@
 //! The robot's updater without IO: which bytes to fetch, when to switch, when to go back.
 //!
-//! Rooms: here what it knows and asks for; `pursue` is the machine; `migrate` is what follows a commit; `io` does the jobs; `remote` asks the server. Called by the core.
+//! Rooms: here what it knows and asks for; `pursue` is the machine; `believes` is what it holds directives against; `migrate` is what follows a commit; `io` does the jobs; `remote` asks the server. Called by the core.
 //! Invariant: each side effect is a [`Job`], and a job begins only after the ledger row that explains it is durable; at most one job is
 //! under way. The switch record wins over the ledger.
 
+mod believes;
 pub mod io;
 pub mod migrate;
 mod pursue;
@@ -13,6 +14,7 @@ use crate::core::AgentCore;
 use crate::sets::{Holdings, Wanted};
 use crate::switch::Switch;
 use midshift_bundle::digest::Digest;
+use midshift_bundle::directive::Directive;
 use midshift_bundle::keys::{KeyId, PublicKey};
 use midshift_bundle::manifest::Manifest;
 use midshift_bundle::set::SetManifest;
@@ -46,6 +48,12 @@ pub struct UpdateConfig {
 pub struct SoftwareRow {
     /// Generation of the newest directive that was taken.
     pub directive: u64,
+    /// Digest of its envelope; none: it was taken before that was written down.
+    #[serde(default)]
+    pub envelope: Option<Digest>,
+    /// Keys that were handed over; none: those of the trust file count.
+    #[serde(default)]
+    pub keys: Option<HeldKeys>,
     /// Highest grant that was used.
     pub grant_id: u64,
     /// Lowest `rollback_index` of each component that may be taken.
@@ -58,6 +66,32 @@ pub struct SoftwareRow {
     pub due: Vec<DueMigration>,
     /// The newest update.
     pub update: Option<Update>,
+}
+
+/// Keys of directives that were handed over by those before them.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct HeldKeys {
+    /// Number of their set.
+    pub number: u64,
+    /// The keys, as 64 hexadecimal digits each.
+    #[serde(with = "hex_keys")]
+    pub keys: Vec<PublicKey>,
+    /// Keys that the trust file named when they were taken: another file counts instead of them, but never an older set.
+    pub from: Vec<KeyId>,
+}
+
+mod hex_keys {
+    use midshift_bundle::keys::PublicKey;
+    use serde::de::Error;
+    use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+    pub fn serialize<S: Serializer>(keys: &[PublicKey], to: S) -> Result<S::Ok, S::Error> {
+        keys.iter().map(PublicKey::hex).collect::<Vec<_>>().serialize(to)
+    }
+    pub fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<PublicKey>, D::Error> {
+        let keys = Vec::<String>::deserialize(from)?;
+        keys.iter().map(|key| PublicKey::from_hex(key).ok_or_else(|| D::Error::custom("no key"))).collect()
+    }
 }
 
 /// One update.
@@ -105,6 +139,8 @@ pub enum Job {
         trusted: Box<Trusted>,
         /// The robot's clock.
         clock: Reading,
+        /// Number of the set of directive keys that it has: newer ones are fetched.
+        keys_after: u64,
     },
     /// Have this content, whole and checked.
     Fetch {
@@ -143,7 +179,12 @@ pub enum Done {
     /// What is there.
     Holdings(Box<Holdings>),
     /// What the repository lists.
-    Refreshed(Box<Refreshed>),
+    Refreshed {
+        /// To be believed.
+        refreshed: Box<Refreshed>,
+        /// Envelopes of newer sets of directive keys, by the number under which they are listed.
+        key_sets: BTreeMap<u64, Vec<u8>>,
+    },
     /// A manifest.
     Manifest(Box<Manifest>),
     /// Done as asked.
@@ -180,6 +221,10 @@ pub(crate) struct Updater {
     pub(crate) next: Option<(Job, u64)>,
     /// Envelope that was looked at and needs no second look.
     pub(crate) judged: Option<String>,
+    /// Envelope that was there when the repository was last asked for newer keys.
+    pub(crate) keys_asked: Option<String>,
+    /// The repository is asked for newer keys alone.
+    pub(crate) asks_for_keys: bool,
     /// Generation of the section whose order to go back was refused because nothing is kept.
     pub(crate) no_way_back: Option<u64>,
     /// Content that is known to be there.
@@ -217,6 +262,11 @@ impl AgentCore {
 }
 
 impl SoftwareRow {
+    /// As it is once this directive was taken.
+    fn with(&self, directive: &Directive, desired: &DesiredUpdate) -> Self {
+        let envelope = Some(Digest::of(desired.directive.as_bytes()));
+        Self { directive: directive.generation, envelope, update: None, ..self.clone() }
+    }
     /// The newest update as it is reported.
     pub fn report(&self, progress_permille: u16) -> Option<UpdateReport> {
         let update = self.update.as_ref()?;

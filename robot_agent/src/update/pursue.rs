@@ -8,19 +8,17 @@ use crate::sets::{Holdings, Wanted};
 use crate::store::Op;
 use crate::switch::Switch;
 use midshift_bundle::digest::Digest;
-use midshift_bundle::directive::{Directive, Expected, Rejection};
+use midshift_bundle::directive::Rejection;
 use midshift_bundle::manifest::{Manifest, Migration};
 use midshift_bundle::set::{Fit, SetManifest, raised};
-use midshift_bundle::trust::{Reading, Refreshed, Trusted};
 use midshift_core::ids::{DrainId, PlaceId, SetId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{Fault, HardwareStop, Lane, Mode};
-use midshift_core::time::{LinkDuration, Now, SiteDuration, Utc};
+use midshift_core::time::{LinkDuration, Now, SiteDuration};
 use midshift_core::update::{DesiredUpdate, Goal, UpdateEvent, UpdateState};
 use midshift_core::work::RobotEvent;
 use std::collections::BTreeSet;
-use std::sync::Arc;
 
 /// First and longest pause after a job that may work the next time.
 const PAUSE: (LinkDuration, LinkDuration) = (LinkDuration(1_000), LinkDuration(60_000));
@@ -122,7 +120,9 @@ impl AgentCore {
         }
         match (job, done) {
             (_, Done::Holdings(holdings)) => self.look(*holdings),
-            (Job::Refresh { .. }, Done::Refreshed(refreshed)) => self.refreshed(now, *refreshed),
+            (Job::Refresh { .. }, Done::Refreshed { refreshed, key_sets }) => {
+                self.refreshed(now, *refreshed, &key_sets)
+            }
             (Job::Manifest { wanted }, Done::Manifest(manifest)) => self.plan(now, &wanted, &manifest),
             (Job::Fetch { wanted, .. }, Done::Ok) => {
                 self.update.fetched.insert(wanted.digest);
@@ -195,7 +195,7 @@ impl AgentCore {
     }
 
     /// Moves the update on, on the ledger and in a report.
-    fn move_to(&mut self, state: UpdateState, reason: Option<Reason>) {
+    pub(super) fn move_to(&mut self, state: UpdateState, reason: Option<Reason>) {
         let Some(update) = self.kept.ledger.software.update.clone() else { return };
         let reason = reason.or(update.reason.clone());
         self.put_update(Update { state, reason, ..update });
@@ -269,8 +269,7 @@ impl AgentCore {
         }
         match self.trusted() {
             Ok(trusted) => {
-                let clock = self.reading(now);
-                self.ask_for(Job::Refresh { trusted: Box::new(trusted), clock });
+                self.ask_to_refresh(trusted, self.reading(now));
                 true
             }
             Err(reason) => {
@@ -291,10 +290,21 @@ impl AgentCore {
             return false;
         }
         let software = self.kept.ledger.software.clone();
-        let opened = self.trusted().and_then(|trusted| {
-            let opened = self.opened(&desired, software.directive, trusted.now(self.reading(now)));
-            opened.map_err(|rejection| Reason::new(Code::DirectiveRefused, rejection.to_string()))
-        });
+        let trusted = match self.trusted() {
+            Ok(trusted) => trusted,
+            Err(reason) => {
+                self.refuse_directive(reason);
+                return false;
+            }
+        };
+        let opened = self.opened(&desired, software.directive, trusted.now(self.reading(now)));
+        if opened == Err(Rejection::NotSigned) && self.update.keys_asked.as_ref() != Some(&desired.directive) {
+            // The server may sign with a key that came since.
+            self.ask_to_refresh(trusted, self.reading(now));
+            self.update.asks_for_keys = true;
+            return true;
+        }
+        let opened = opened.map_err(|rejection| Reason::new(Code::DirectiveRefused, rejection.to_string()));
         let directive = match opened {
             Ok(directive) => directive,
             Err(reason) => {
@@ -307,6 +317,7 @@ impl AgentCore {
             self.refuse_directive(Reason::new(Code::DirectiveRefused, "another bundle is the committed one"));
             return false;
         };
+        let row = software.with(&directive, &desired);
         self.update.judged = Some(desired.directive);
         let is_irreversible = set.components.values().any(|c| c.data_migration == Migration::Irreversible);
         let update = Update {
@@ -322,26 +333,13 @@ impl AgentCore {
             probation_ms: desired.probation_ms,
             reason: None,
         };
-        self.put_software(SoftwareRow { directive: directive.generation, update: None, ..software });
+        self.put_software(row);
         self.put_update(update);
         true
     }
 
-    fn reading(&self, now: &Now) -> Reading {
-        let is_synced = self.update.config.as_ref().is_some_and(|c| c.clock_synced);
-        Reading { utc: now.wall, is_synced }
-    }
-
-    fn trusted(&self) -> Result<Trusted, Reason> {
-        if let Some(trusted) = &self.kept.ledger.trusted {
-            return Ok(Trusted::clone(trusted));
-        }
-        let root = self.update.config.as_ref().map(|c| c.root.as_slice()).unwrap_or_default();
-        Trusted::new(root).map_err(|e| Reason::new(Code::MetadataRefused, e.to_string()))
-    }
-
     /// The newest directive is not taken; it is not looked at again.
-    fn refuse_directive(&mut self, reason: Reason) {
+    pub(super) fn refuse_directive(&mut self, reason: Reason) {
         let Some(desired) = &self.update.desired else { return };
         tracing::warn!(robot_id = %self.config.robot_id, reason = reason.text(), "directive refused");
         self.update.judged = Some(desired.directive.clone());
@@ -358,73 +356,6 @@ impl AgentCore {
         }
     }
 
-    /// The repository has answered: what it says is believed first, then the directive is held against it.
-    fn refreshed(&mut self, now: &Now, refreshed: Refreshed) {
-        self.write(Op::Trusted(Arc::new(refreshed.trusted.clone())), true);
-        let time = refreshed.trusted.now(self.reading(now));
-        self.update.listed = Some(Arc::new(refreshed));
-        let Some(desired) = self.update.desired.clone() else { return };
-        if self.is_the_newest(&desired) {
-            // What it asked for stands on the ledger, or is over.
-            self.update.judged = Some(desired.directive);
-            return;
-        }
-        match self.open(&desired, time) {
-            Ok(directive) => {
-                self.update.judged = Some(desired.directive.clone());
-                self.update.fetched.clear();
-                let update = Update {
-                    state: UpdateState::Directed,
-                    bundle: directive.manifest,
-                    manifest_length: directive.manifest_length,
-                    rollback_floor: directive.rollback_floor,
-                    set: None,
-                    raises_floor: false,
-                    is_irreversible: false,
-                    drain_id: None,
-                    tries: 0,
-                    probation_ms: desired.probation_ms,
-                    reason: None,
-                };
-                let software = &self.kept.ledger.software;
-                self.put_software(SoftwareRow { directive: directive.generation, update: None, ..software.clone() });
-                self.put_update(update);
-            }
-            Err(reason) => self.refuse_directive(reason),
-        }
-    }
-
-    fn open(&self, desired: &DesiredUpdate, now: Utc) -> Result<Directive, Reason> {
-        let refused = |text: String| Reason::new(Code::DirectiveRefused, text);
-        let opened = self.opened(desired, self.kept.ledger.software.directive, now);
-        let directive = opened.map_err(|rejection| refused(rejection.to_string()))?;
-        if self.lists(&directive.manifest, directive.manifest_length) {
-            Ok(directive)
-        } else {
-            Err(refused("no release lists its bundle".to_owned()))
-        }
-    }
-
-    fn opened(&self, desired: &DesiredUpdate, generation: u64, now: Utc) -> Result<Directive, Rejection> {
-        let config = self.update.config.as_ref().ok_or(Rejection::NotSigned)?;
-        let keys = &config.directive_keys;
-        Directive::open(
-            desired.directive.as_bytes(),
-            &Expected { robot_id: &self.config.robot_id, keys, generation, now },
-        )
-    }
-
-    /// Whether the envelope is the one that was taken last: after a restart it comes again. What was taken does not expire.
-    fn is_the_newest(&self, desired: &DesiredUpdate) -> bool {
-        let newest = self.kept.ledger.software.directive;
-        newest > 0 && self.opened(desired, newest - 1, Utc(0)).is_ok_and(|d| d.generation == newest)
-    }
-
-    fn lists(&self, digest: &Digest, length: u64) -> bool {
-        let listed = self.update.listed.as_ref();
-        listed.is_some_and(|l| l.targets.values().any(|t| t.digest == *digest && t.length == length))
-    }
-
     // --- bytes
 
     fn directed(&mut self, update: &Update) {
@@ -433,17 +364,6 @@ impl AgentCore {
             return self.refresh_again();
         }
         self.ask_for(Job::Manifest { wanted: Wanted { digest: update.bundle, length: update.manifest_length } });
-    }
-
-    fn refresh_again(&mut self) {
-        match self.trusted() {
-            Ok(trusted) => {
-                let is_synced = false;
-                let clock = Reading { utc: trusted.time_floor(), is_synced };
-                self.ask_for(Job::Refresh { trusted: Box::new(trusted), clock });
-            }
-            Err(reason) => self.move_to(UpdateState::Refused, Some(reason)),
-        }
     }
 
     /// What comes of the bundle on this robot, or why it does not fit.

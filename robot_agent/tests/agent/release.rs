@@ -6,6 +6,7 @@ use midshift_agent::update::UpdateConfig;
 use midshift_agent::update::io::{Pieces, Remote, Way};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::directive::{Directive, LIFE_MS};
+use midshift_bundle::key_set::KeySet;
 use midshift_bundle::keys::SecretKey;
 use midshift_bundle::manifest::{Component, ComponentKind, FORMAT, Manifest, Migration, Needs, SafetyClass};
 use midshift_bundle::repository::{
@@ -47,6 +48,8 @@ struct Shelf {
     /// What is said of ways to a file, first one first; the last stays.
     ways: BTreeMap<Digest, Vec<Way>>,
     asked: Vec<Vec<Digest>>,
+    /// Seed of the directive key that robots are set up with; none: 7.
+    trust: Option<u8>,
 }
 
 /// A repository that robots reach.
@@ -214,15 +217,36 @@ impl Releases {
         change(&mut directive);
         String::from_utf8(directive.sign(&key(7))).expect("text")
     }
+    /// As [`Releases::directive`], signed with the key of another seed.
+    pub fn directive_by(&self, seed: u8, bundle: &Bundle, generation: u64) -> String {
+        let mut signed = Vec::new();
+        self.directive_as(bundle, generation, |directive| signed = directive.clone().sign(&key(seed)));
+        String::from_utf8(signed).expect("text")
+    }
+    /// A set of directive keys of these seeds, signed with the key of seed `by`, that the server holds and no release lists.
+    pub fn hold_keys(&self, number: u64, seeds: &[u8], by: u8) -> FileTarget {
+        let set = KeySet { number, keys: seeds.iter().map(|seed| key(*seed).public()).collect() };
+        let held = self.hold(&set.sign(&key(by)).expect("a set"));
+        FileTarget { name: set.target(), digest: held.digest, length: held.length }
+    }
+    /// As [`Releases::hold_keys`], and the newest release lists it.
+    pub fn list_keys(&self, number: u64, seeds: &[u8], by: u8) {
+        self.sign(&[self.hold_keys(number, seeds, by)]);
+    }
     /// What a robot is set up with.
     pub fn config(&self) -> UpdateConfig {
+        let trusted = key(self.shelf().trust.unwrap_or(7));
         UpdateConfig {
             root: self.shelf().documents["1.root.json"].clone(),
-            directive_keys: [key(7).public()].into_iter().map(|k| (k.id(), k)).collect(),
+            directive_keys: [trusted.public()].into_iter().map(|k| (k.id(), k)).collect(),
             clock_synced: true,
             allows_safety_related: false,
             is_launched: true,
         }
+    }
+    /// Robots are set up with the directive key of this seed from now on.
+    pub fn trust(&self, seed: u8) {
+        self.shelf().trust = Some(seed);
     }
     pub fn cut(&self, cut: bool) {
         self.shelf().cut = cut;

@@ -26,7 +26,7 @@ pub fn drain(name: &str) -> DrainId {
 #[derive(Clone)]
 pub struct Order {
     directive: String,
-    generation: u64,
+    pub generation: u64,
     drain_id: Option<DrainId>,
     granted: u64,
 }

@@ -7,6 +7,7 @@ mod encode;
 mod grpc;
 mod reconcile;
 mod retention;
+mod standby;
 
 pub use retention::prune;
 

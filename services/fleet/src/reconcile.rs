@@ -1,16 +1,20 @@
 //! The loop: take what is new, decide, commit, publish. A conflict means that somebody else decided too: the picture is built again.
+//! Of several processes on one store one leads and does all that; the others keep their picture by rows alone (`standby`).
 //!
-//! Invariant: the view has absorbed the whole feed before anything is decided on it.
+//! Invariant: the view has absorbed the whole feed before anything is decided on it; only a process that leads plans, and one that could not
+//! say so for a while reads the rows again before it does.
 
 use crate::{Look, Parts, Request};
 use midshift_core::fleet::view::{TABLES, View};
 use midshift_core::fleet::{Board, LOGS, Pace, Plan, absorb, commands, cycle, found, obeyed};
+use midshift_core::lead::{FleetLeader, Own, Seat, Stance};
 use midshift_core::limits;
+use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
-use midshift_core::rows::{Entry, Item, Log, Seq};
+use midshift_core::rows::{Entry, Item, Log, Seq, Table};
 use midshift_core::time::Now;
 use midshift_core::work::Live;
-use midshift_store::{CommitError, Dirty, Error, follow};
+use midshift_store::{CommitError, Dirty, Error, follow, lead};
 use std::time::Duration;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
@@ -23,17 +27,23 @@ const TIMER_GRAIN: Duration = Duration::from_millis(1);
 /// Requests taken into one cycle.
 const REQUESTS_PER_CYCLE: usize = 64;
 
-struct Loop {
-    parts: Parts,
-    view: View,
-    seq: Seq,
-    board: Board,
+pub(crate) struct Loop {
+    pub(crate) parts: Parts,
+    pub(crate) view: View,
+    pub(crate) seq: Seq,
+    pub(crate) board: Board,
     dirty: Dirty<Live>,
     started: Now,
     /// Until then what others write gathers: thinking takes half of the time at most.
     rested: Instant,
+    /// Up to where others' heartbeats are on the board that was taken last.
+    heard_up_to: u64,
     /// Questions that are answered once what they would see is committed.
-    looks: Vec<Look>,
+    pub(crate) looks: Vec<Look>,
+    /// Whether this process leads.
+    pub(crate) seat: Seat<FleetLeader>,
+    /// What this process wrote and has not read again.
+    own: Own,
 }
 
 type Replies = Vec<(oneshot::Sender<Result<(), Refusal>>, usize)>;
@@ -48,6 +58,13 @@ pub async fn run(
     let started = parts.clock.now();
     let dirty = parts.board.watch();
     let view = View::new(parts.site.clone(), started, started);
+    // A store of one process is its process' alone; and a simulation's, whose runs must be the same again.
+    let me = match parts.store.is_shared() {
+        true => format!("{:032x}", rand::random::<u128>()),
+        false => format!("alone-{}", parts.clock.now().wall.0),
+    };
+    let seat = Seat::new(me, midshift_core::fleet::rivals(parts.store.is_shared(), parts.bugs));
+    metrics::gauge!("midshift_fleet_leads").set(0);
     let mut this = Loop {
         parts,
         view,
@@ -56,7 +73,10 @@ pub async fn run(
         dirty,
         started,
         rested: Instant::now(),
+        heard_up_to: 0,
         looks: Vec::new(),
+        seat,
+        own: Own::default(),
     };
     this.rebuild_until_read(&shutdown).await;
     let mut sweep = tokio::time::interval(Duration::from_millis(limits::SWEEP.as_ms()));
@@ -65,10 +85,10 @@ pub async fn run(
     loop {
         let pace = tokio::select! {
             biased;
-            () = shutdown.cancelled() => return Ok(()),
+            () = shutdown.cancelled() => break,
             _ = sweep.tick() => Pace::Sweep,
-            n = requests.recv_many(&mut batch, REQUESTS_PER_CYCLE) => if n == 0 { return Ok(()) } else { Pace::Wake },
-            changed = news(&mut wake, this.rested) => if changed.is_err() { return Ok(()) } else { Pace::Wake },
+            n = requests.recv_many(&mut batch, REQUESTS_PER_CYCLE) => if n == 0 { break } else { Pace::Wake },
+            changed = news(&mut wake, this.rested) => if changed.is_err() { break } else { Pace::Wake },
         };
         if this.turn(pace, std::mem::take(&mut batch)).await.is_err() {
             tokio::time::sleep(STORE_RETRY).await;
@@ -77,12 +97,19 @@ pub async fn run(
             this.answer(this.parts.clock.now());
         }
     }
+    this.hand_over().await;
+    Ok(())
 }
 
 /// Something was written, and it is time to look.
 async fn news(wake: &mut watch::Receiver<Seq>, rested: Instant) -> Result<(), watch::error::RecvError> {
     tokio::time::sleep_until(rested).await;
     wake.changed().await
+}
+
+fn leads_no_more() {
+    metrics::gauge!("midshift_fleet_leads").set(0);
+    tracing::info!("this process does not lead fleet any more");
 }
 
 impl Loop {
@@ -96,8 +123,42 @@ impl Loop {
         }
     }
 
+    /// Reads who leads, and takes over if nobody does.
+    async fn take_part(&mut self) -> Result<(), Error> {
+        let led = self.seat.leads();
+        let began = lead::take_part(&mut self.seat, self.parts.store.as_ref(), self.parts.clock.as_ref()).await;
+        if led && !self.seat.leads() {
+            leads_no_more();
+        }
+        if began? {
+            self.begin_to_lead();
+        }
+        Ok(())
+    }
+
+    /// As after a start: every lease counts as renewed now, no timer fires soon, and nothing is remembered.
+    fn begin_to_lead(&mut self) {
+        self.started = self.parts.clock.now();
+        let router = self.view.router.clone();
+        self.view = View { router, ..View::new(self.parts.site.clone(), self.started, self.started) };
+        metrics::gauge!("midshift_fleet_leads").set(1);
+        metrics::counter!("midshift_fleet_takeovers_total").increment(1);
+        tracing::info!("this process leads fleet");
+    }
+
+    /// Lets another process lead at once, if this one does.
+    async fn hand_over(&mut self) {
+        let Some(is_said) = lead::hand_over(&mut self.seat, self.parts.store.as_ref()).await else { return };
+        if !is_said {
+            tracing::warn!("another process will lead fleet only after a while: this one could not say that it ends");
+        }
+        leads_no_more();
+    }
+
     /// Builds the picture from nothing and takes what was not consumed yet.
-    async fn rebuild(&mut self) -> Result<(), Error> {
+    pub(crate) async fn rebuild(&mut self) -> Result<(), Error> {
+        self.take_part().await?;
+        self.own.clear();
         let snapshot = self.parts.store.snapshot(TABLES).await?;
         let place_waits = self.view.place_waits;
         let (waits, attached) = (std::mem::take(&mut self.view.waits), std::mem::take(&mut self.view.attached));
@@ -118,23 +179,61 @@ impl Loop {
         self.view.unwilling = unwilling;
         self.view.place_waits = place_waits;
         self.seq = self.view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq).min(snapshot.seq);
+        metrics::counter!("midshift_fleet_rebuilds_total").increment(1);
+        if !self.seat.leads() {
+            self.seq = snapshot.seq;
+            self.view.rest();
+            return Ok(());
+        }
         let mut plan = Plan::default();
         found(&mut self.view, self.parts.clock.now(), &self.parts.site_text, &mut plan);
-        for result in self.parts.store.commit(plan.items).await {
-            result.map_err(|error| Error::Unavailable(std::sync::Arc::new(error)))?;
+        let entries: Vec<u64> = plan.items.iter().map(picture::entries_of).collect();
+        for (result, entries) in self.parts.store.commit(plan.items).await.into_iter().zip(entries) {
+            let applied = result.map_err(|error| Error::Unavailable(std::sync::Arc::new(error)))?;
+            self.own.wrote(applied.seq.0, entries);
         }
-        metrics::counter!("midshift_fleet_rebuilds_total").increment(1);
         Ok(())
     }
 
     /// One turn. An error: the picture can no longer be trusted.
     async fn turn(&mut self, pace: Pace, requests: Vec<Request>) -> Result<(), ()> {
+        self.hear();
+        let unreadable = |error| tracing::warn!(%error, "fleet cannot read the store");
+        // What the clock says comes first: a process that was away decides nothing before it has read who leads.
+        if self.seat.stance(self.parts.clock.now().link) == Stance::StepDown {
+            self.rebuild().await.map_err(unreadable)?;
+        }
+        if !self.seat.leads() {
+            let begun = Instant::now();
+            self.follow_rows().await.map_err(unreadable)?;
+            self.rest_after(begun.elapsed());
+            if self.seat.stance(self.parts.clock.now().link) == Stance::TakeOver {
+                self.rebuild().await.map_err(unreadable)?;
+            }
+        }
+        if self.seat.leads() { self.lead(pace, requests).await } else { self.assist(requests).await }
+    }
+
+    fn rest_after(&mut self, took: Duration) {
+        if took >= TIMER_GRAIN {
+            self.rested = Instant::now() + took;
+        }
+    }
+
+    /// Takes what robots said since.
+    fn hear(&mut self) {
+        // Before the board is taken: what is read into it meanwhile may be known, or not.
+        self.heard_up_to = self.parts.board.read_up_to();
         for (robot_id, live) in self.dirty.take() {
             match live {
                 Some(live) => self.board.insert(robot_id, live),
                 None => self.board.remove(&robot_id),
             };
         }
+    }
+
+    /// One turn of the process that plans.
+    async fn lead(&mut self, pace: Pace, requests: Vec<Request>) -> Result<(), ()> {
         let begun = Instant::now();
         let now = self.parts.clock.now();
         let mut plan = Plan::default();
@@ -142,14 +241,21 @@ impl Loop {
             .take_feed(now, &mut plan)
             .await
             .map_err(|error| tracing::warn!(%error, "fleet cannot read the feed"))?;
+        let renewal = match self.seat.stance(now.link) {
+            Stance::StepDown => {
+                // What was planned a moment ago is dropped, and with it the picture that holds it.
+                self.rebuild().await.map_err(|error| tracing::warn!(%error, "fleet cannot read the store"))?;
+                return self.assist(requests).await;
+            }
+            Stance::Renew => Some(self.seat.claim()),
+            Stance::Lead | Stance::StandBy | Stance::TakeOver => None,
+        };
         let replies = self.take_requests(requests, now, &mut plan);
         if foreign || !replies.is_empty() || pace == Pace::Sweep {
             cycle(&mut self.view, now, &self.board, pace, &mut plan);
         }
         let took = begun.elapsed();
-        if took >= TIMER_GRAIN {
-            self.rested = Instant::now() + took;
-        }
+        self.rest_after(took);
         metrics::histogram!("midshift_fleet_cycle_seconds").record(took.as_secs_f64());
         publish(&plan, &self.view, pace);
         if let Some(generation) = self.view.behind.take() {
@@ -163,27 +269,40 @@ impl Loop {
                 Err(error) => tracing::error!(%error, generation, "the store's numbers could not be raised"),
             }
         }
-        self.commit(plan, replies).await?;
+        for silent in plan.items.iter_mut().filter_map(|item| item.silent.as_mut()) {
+            silent.position = self.heard_up_to;
+        }
+        self.renew_and_commit(renewal, now, plan, replies).await?;
         self.answer(now);
         Ok(())
     }
 
     /// Answers every question from the picture, which holds only what is committed at this moment.
-    fn answer(&mut self, now: Now) {
+    pub(crate) fn answer(&mut self, now: Now) {
         for look in std::mem::take(&mut self.looks) {
             look(&self.view, &self.board, &now);
         }
     }
 
-    /// Absorbs the feed to its head; true if something came from others.
+    /// Absorbs the feed to its head; true if something came from others. Who leads is no news for a plan.
     async fn take_feed(&mut self, now: Now, plan: &mut Plan) -> Result<bool, Error> {
         let mut foreign = false;
-        let view = &mut self.view;
+        let mut seen = Ok(());
+        let clock = self.parts.clock.clone();
+        let Self { view, seat, own, .. } = self;
         let take = |entries: &[Entry]| {
-            foreign |= entries.iter().any(|e| e.log != Log::Fleet);
+            for entry in entries {
+                let is_lease = matches!(entry.table, Some(Table::FleetLeader | Table::OtaLeader));
+                let is_own = entry.log == Log::Fleet && own.is_own(entry.seq.0);
+                foreign |= !is_lease && !is_own;
+            }
+            if seen.is_ok() {
+                seen = seat.follow(entries, clock.now().link);
+            }
             absorb(view, now, entries, plan);
         };
         follow(self.parts.store.as_ref(), &mut self.seq, LOGS, take).await?;
+        seen?;
         Ok(foreign)
     }
 
@@ -223,11 +342,26 @@ impl Loop {
         replies
     }
 
-    async fn commit(&mut self, plan: Plan, replies: Replies) -> Result<(), ()> {
-        let kinds: Vec<(&'static str, Option<Seq>)> = plan.items.iter().map(|i| (kind_of(i), obeyed(i))).collect();
-        let results = if plan.items.is_empty() { Vec::new() } else { self.parts.store.commit(plan.items).await };
+    /// Commits the plan, and before it that this process still leads, if it is time to say so.
+    async fn renew_and_commit(
+        &mut self,
+        renewal: Option<Item>,
+        now: Now,
+        plan: Plan,
+        replies: Replies,
+    ) -> Result<(), ()> {
+        let renews = renewal.is_some();
+        let items: Vec<Item> = renewal.into_iter().chain(plan.items).collect();
+        let kinds: Vec<_> = items.iter().map(|i| (kind_of(i), obeyed(i), picture::entries_of(i))).collect();
+        let results = if items.is_empty() { Vec::new() } else { self.parts.store.commit(items).await };
+        if renews && results.first().is_some_and(Result::is_ok) {
+            self.seat.claimed(now.link);
+        }
         let mut trusted = Ok(());
-        for (result, (kind, entry)) in results.iter().zip(kinds) {
+        for (result, (kind, entry, entries)) in results.iter().zip(kinds) {
+            if let Ok(applied) = result {
+                self.own.wrote(applied.seq.0, entries);
+            }
             if let Err(error) = result {
                 if let (true, Some(seq)) = (error.is_final(), entry) {
                     tracing::error!(seq = seq.0, kind, "an entry of the log cannot be obeyed and is passed over");
@@ -240,7 +374,7 @@ impl Loop {
             }
         }
         for (reply, upto) in replies {
-            let lost = results.iter().take(upto).any(Result::is_err);
+            let lost = results.iter().skip(usize::from(renews)).take(upto).any(Result::is_err);
             let answer =
                 if lost { Err(Refusal::new(Kind::Unavailable, Reason::from(Code::CommitUnknown))) } else { Ok(()) };
             drop(reply.send(answer));

@@ -3,6 +3,7 @@
 use crate::background::{Acknowledged, Background, Pressure, Source, read_list};
 use crate::planning::Planning;
 use crate::report::{self, Inputs, Kind, Report};
+use crate::roles::Roles;
 use crate::scenario::{self, Scenario, Stage, Story};
 use crate::server::{Naive, Parts, Server};
 use crate::tally::{self, SharedTasks, Tasks};
@@ -16,6 +17,7 @@ use midshift_core::site::{Site, grid};
 use midshift_core::task::Phase;
 use midshift_core::time::{Clock, SiteTime};
 use midshift_core::work::Live;
+use midshift_sim::faults::FaultRates;
 use midshift_sim::hall::{Hall, HallConfig, Persistence};
 use midshift_sim::service::SimFace;
 use midshift_sim::swarm::{Swarm, SwarmConfig};
@@ -159,12 +161,16 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     let (store, frames) = stores(&args, &site, &clock).await?;
     let planning = Planning::start()?;
     let parts = Parts {
+        roles: Roles::default(),
+        drain: Duration::ZERO,
+        heard: None,
         store: store.clone(),
         frames,
         site: site.clone(),
         site_text: loaded.text,
         clock: clock.clone(),
         ota,
+        reader: None,
         sim: Some(SimFace::new(hall.clone(), clock.clone(), swarm.crash())),
         naive: Naive::default(),
         planning: planning.handle(),
@@ -239,6 +245,7 @@ fn hall_config(args: &Dev, site: &Arc<Site>, scene: Option<&Scene>) -> anyhow::R
         config.only = Some(0..args.robots - scene.launched);
         config.persistence = Persistence::Dir(scene.folder.path().to_owned());
         config.pace_permille = (args.speedup * 1000.0) as u32;
+        config.faults = FaultRates::default().paced(args.speedup);
     }
     if let Some(path) = &args.agents {
         let text = std::fs::read_to_string(path).with_context(|| format!("reading {}", path.display()))?;
@@ -363,7 +370,7 @@ impl Run {
         let acknowledged = Acknowledged::default();
         let no_progress_ms = Arc::new(AtomicU64::new(0));
         let background = self.background(&acknowledged)?;
-        let (fleet, board) = (server.fleet(), server.board());
+        let (fleet, board) = (server.fleet().context("a run without fleet")?, server.board());
         let (robots_stop, work_stop) = (CancellationToken::new(), CancellationToken::new());
         // Whatever happens here, nothing goes on without the rest.
         let _ends = [&robots_stop, &work_stop, &self.served_until].map(|token| token.clone().drop_guard());

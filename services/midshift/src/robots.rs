@@ -6,6 +6,7 @@ use anyhow::{Context, bail, ensure};
 use midshift_agent::bulk::Bulk;
 use midshift_agent::core::ExitReason;
 use midshift_agent::dial::TcpDial;
+use midshift_agent::durable;
 use midshift_core::ids::{RobotId, WaypointId};
 use midshift_core::time::Clock;
 use midshift_sim::body::{BodyConfig, SimBody};
@@ -129,7 +130,7 @@ pub async fn agent_in_hand(
 ) -> anyhow::Result<ExitReason> {
     let robot_id = RobotId::parse(&args.robot_id)?;
     let site = site_file::load(args.site.as_deref(), None, None)?.site;
-    std::fs::create_dir_all(&args.data).with_context(|| format!("making {}", args.data.display()))?;
+    durable::make_folder(&args.data).with_context(|| format!("making {}", args.data.display()))?;
     let clock = clock::clock(1000);
     let start = match &args.start {
         Some(name) => WaypointId::parse(name)?,
@@ -150,10 +151,9 @@ pub async fn agent_in_hand(
         ensure!(of == site.site_id(), "the trust file is for robots of site {of}; this is site {}", site.site_id());
         software.shape(&mut config);
     }
-    config.pace_permille = (args.body_speed.clamp(0.1, 100.0) * 1000.0) as u32;
-    if args.no_faults {
-        config.faults = FaultRates::none();
-    }
+    let pace = args.body_speed.clamp(0.1, 100.0);
+    config.pace_permille = (pace * 1000.0) as u32;
+    config.faults = if args.no_faults { FaultRates::none() } else { config.faults.paced(pace) };
     let now = clock.now();
     // Journals of several processes are judged together: by UTC, and by names of items that differ.
     let utc_base_ms = now.utc.0 - i64::try_from(now.site.0).unwrap_or(0);

@@ -1,20 +1,32 @@
-//! `midshift serve`: everything persistent in one process, for a real site, on SQLite or PostgreSQL.
+//! `midshift serve`: everything persistent, for a real site: in one process on SQLite or PostgreSQL, or some of the services in each of several
+//! processes on one PostgreSQL database.
 
 use crate::planning::Planning;
+use crate::roles::{Role, Roles};
 use crate::server::{Naive, Parts, Server};
-use crate::storage::Database;
+use crate::storage::{Database, Storage};
 use crate::{clock, site_file};
 use anyhow::{Context, bail};
 use midshift_core::limits;
 use midshift_core::time::Clock;
-use midshift_ota::OtaService;
 use midshift_ota::content::Room;
+use midshift_ota::folder::Owner;
+use midshift_ota::rollouts::known_bundles;
+use midshift_ota::{OtaReader, OtaService};
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 use tokio::net::{TcpListener, UdpSocket};
 use tokio_stream::wrappers::TcpListenerStream;
 use tokio_util::sync::CancellationToken;
+
+/// Robots change gateways in a second or two when they are told to; this is for those that are slow to answer.
+const DRAIN_DEFAULT_S: u64 = 20;
+
+/// A gateway waits so long for the folder that processes with role ota make, and looks so often.
+const SOFTWARE_WITHIN: Duration = Duration::from_secs(60);
+const SOFTWARE_LOOK: Duration = Duration::from_secs(1);
 
 /// What `serve` was asked for.
 #[derive(Clone, Debug, clap::Args)]
@@ -28,6 +40,14 @@ pub struct Serve {
     /// Rows and samples elsewhere.
     #[command(flatten)]
     pub database: Database,
+    /// Services of this process; all without it. Several processes with the rest share one PostgreSQL database, and any number may have
+    /// the same.
+    #[arg(long, value_delimiter = ',', value_name = "ROLE,…")]
+    pub roles: Vec<Role>,
+    /// Seconds that robots have to move to another gateway when this process is asked to end. 0: their sessions end at once. Without it 20
+    /// with --roles, else 0.
+    #[arg(long, value_name = "S", value_parser = clap::value_parser!(u64).range(0..=600))]
+    pub drain_seconds: Option<u64>,
     /// Address to listen on. Anything but loopback needs --insecure.
     #[arg(long, default_value = "127.0.0.1:7420")]
     pub listen: SocketAddr,
@@ -41,6 +61,10 @@ pub struct Serve {
     /// Where software of robots comes from.
     #[command(flatten)]
     pub software: Software,
+    /// Of a gateway without role ota: hand out no software. Without it the folder ota of --data must be the volume that the processes with
+    /// role ota keep, and this process waits a minute for it.
+    #[arg(long, env = "MIDSHIFT_NO_SOFTWARE")]
+    pub no_software: bool,
 }
 
 /// Where software of robots comes from.
@@ -61,15 +85,15 @@ pub struct Software {
 }
 
 impl Software {
-    /// The service, with its files in `folder`.
-    pub async fn open(&self, folder: PathBuf, clock: Arc<dyn Clock>) -> anyhow::Result<OtaService> {
+    /// The service, with its files in `folder`, which is `owner`'s.
+    pub async fn open(&self, folder: PathBuf, owner: Owner, clock: Arc<dyn Clock>) -> anyhow::Result<OtaService> {
         let Some(keys) = self.ota_keys.clone() else { return Ok(OtaService::without_keys()) };
         let room = Room {
             quota_bytes: self.ota_quota_gib << 30,
             spare_bytes: self.ota_spare_gib << 30,
             unnamed_ms: self.ota_keep_days * 24 * 3_600_000,
         };
-        let parts = midshift_ota::Parts { folder, keys, room, clock };
+        let parts = midshift_ota::Parts { folder, keys, room, clock, owner };
         OtaService::open(parts).await.context("opening software of robots")
     }
 }
@@ -82,6 +106,12 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
             args.listen
         );
     }
+    let roles = Roles::of(&args.roles);
+    if roles.are_split() && args.database.store.is_none() {
+        bail!(
+            "--roles {roles} leaves services to other processes, and only PostgreSQL can be shared with them: add --store postgres://USER:PASSWORD@HOST/DATABASE, or leave --roles out to serve everything on SQLite"
+        );
+    }
     let loaded = site_file::load(args.site.as_deref(), None, None)?;
     for warning in &loaded.warnings {
         tracing::warn!(warning, "site");
@@ -90,21 +120,35 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
     crate::server::metrics_handle();
     let site_id = loaded.site.site_id().clone();
     let storage = args.database.open(&args.data, site_id, clock.clone()).await?;
-    let ota = args.software.open(args.data.join("ota"), clock.clone()).await?;
+    let folder = args.data.join("ota");
+    let ota = match roles.has(Role::Ota) {
+        true => args.software.open(folder.clone(), owner(&storage).await?, clock.clone()).await?,
+        false => OtaService::without_keys(),
+    };
+    let hands_out = roles.has(Role::Telemetry) && !roles.has(Role::Ota) && !args.no_software;
+    let reader = match hands_out {
+        true => Some(reader(&folder, &storage, &shutdown).await?),
+        false => None,
+    };
+    let drain = Duration::from_secs(args.drain_seconds.unwrap_or(if roles.are_split() { DRAIN_DEFAULT_S } else { 0 }));
     let listener = TcpListener::bind(args.listen).await.with_context(|| format!("listening on {}", args.listen))?;
     let beacons = match args.beacon_listen {
         Some(address) => Some(hear(address).await?),
         None => None,
     };
-    tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), store = storage.engine(), "midshift serves");
+    tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), store = storage.engine(), %roles, "midshift serves");
     let planning = Planning::start()?;
     let parts = Parts {
+        roles,
+        drain,
         store: storage.store(),
         frames: storage.frames(),
+        heard: storage.heard(),
         site: loaded.site,
         site_text: loaded.text,
         clock,
         ota,
+        reader,
         sim: None,
         naive: Naive::default(),
         planning: planning.handle(),
@@ -113,6 +157,33 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
     let served = server.serve(nodelay(listener)).await;
     storage.close().await;
     served
+}
+
+/// Whose the folder of releases is.
+async fn owner(storage: &Storage) -> anyhow::Result<Owner> {
+    let store = storage.store();
+    let store_id = store.id().clone();
+    Ok(match store.is_shared() {
+        true => Owner::Shared { store_id, known_bundles: known_bundles(store.as_ref()).await? },
+        false => Owner::Alone(store_id),
+    })
+}
+
+/// The folder of releases that other processes keep: they may be starting too.
+async fn reader(folder: &Path, storage: &Storage, shutdown: &CancellationToken) -> anyhow::Result<OtaReader> {
+    let store_id = storage.store().id().clone();
+    let mut waited = Duration::ZERO;
+    loop {
+        match OtaReader::open(folder.to_owned(), store_id.clone()).await {
+            Ok(reader) => return Ok(reader),
+            Err(error) if waited < SOFTWARE_WITHIN && !shutdown.is_cancelled() => {
+                tracing::warn!(%error, "waiting for the folder of releases; --no-software does without it");
+            }
+            Err(error) => return Err(error).context("opening the folder of releases; --no-software does without it"),
+        }
+        tokio::time::sleep(SOFTWARE_LOOK).await;
+        waited += SOFTWARE_LOOK;
+    }
 }
 
 /// The socket that beacons come to.

@@ -1,29 +1,34 @@
-//! One server out of the services: gRPC, gRPC-Web, reflection, health and metrics on one port, over whatever connections it is given.
+//! One server out of the services of its roles: gRPC, gRPC-Web, reflection, health and metrics on one port, over whatever connections it is
+//! given.
 //!
 //! Invariant: every stream ends at shutdown; what does not end by itself is cut after a hard drain. A service that ends by itself takes the
-//! whole server with it: none is served without the others.
+//! whole server with it: none is served without the others. A gateway among several first says that it is not ready and lets its robots
+//! move over.
 
+use crate::roles::{Role, Roles};
+use crate::upkeep;
 use anyhow::{Context, bail};
 use axum::routing::get;
+use http::StatusCode;
 use metrics_exporter_prometheus::{PrometheusBuilder, PrometheusHandle};
-use midshift_core::fleet::rows::FleetMark;
 use midshift_core::limits;
-use midshift_core::rollout::rows::OtaMark;
 use midshift_core::site::Site;
 use midshift_core::time::Clock;
 use midshift_core::work::Live;
 use midshift_fleet::{FleetService, Reconciler};
-use midshift_ota::OtaService;
 use midshift_ota::rollouts::{Planner, RolloutService};
+use midshift_ota::{OtaReader, OtaService};
 use midshift_proto::sim::v1::sim_service_server::SimServiceServer;
 use midshift_sim::service::SimFace;
-use midshift_store::{FrameLog, LiveBoard, Retention, Store};
+use midshift_store::{FrameLog, HeardLog, LiveBoard, Store};
 use midshift_task::TaskService;
 use midshift_telemetry::TelemetryService;
+use std::collections::BTreeSet;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::UdpSocket;
+use tokio::sync::watch;
 use tokio_stream::Stream;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
@@ -35,24 +40,6 @@ use tonic_health::server::HealthReporter;
 
 /// Pings of the server on a quiet connection, and how long it waits for their answer.
 const KEEPALIVE: (Duration, Duration) = (Duration::from_secs(20), Duration::from_secs(10));
-/// Names under which the health service knows the server; the empty one is the whole.
-const HEALTH: [&str; 8] = [
-    "",
-    "midshift.task.v1.TaskService",
-    "midshift.fleet.v1.FleetService",
-    "midshift.telemetry.v1.TelemetryService",
-    "midshift.link.v1.LinkService",
-    "midshift.ota.v1.BundleService",
-    "midshift.ota.v1.ChunkService",
-    "midshift.ota.v1.RolloutService",
-];
-/// How often old log entries are taken away.
-const PRUNE_EVERY: Duration = Duration::from_secs(60);
-/// How often samples of histograms are folded: without a scrape they would gather for ever.
-const FOLD_EVERY: Duration = Duration::from_secs(5);
-/// Log entries kept at most, beside the days of [`limits::REMEMBER_DAYS`].
-const ENTRIES_MAX: u64 = 20_000_000;
-
 /// Naive rules of the services, for twins of tests. None by default.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Naive {
@@ -66,18 +53,26 @@ pub struct Naive {
 
 /// What a server is built from.
 pub struct Parts {
+    /// Which services it has.
+    pub roles: Roles,
+    /// How long robots have to move to another gateway before this one ends; zero: there is no other.
+    pub drain: Duration,
     /// The memory that services share.
     pub store: Arc<dyn Store>,
     /// Where STATUS is kept.
     pub frames: Arc<dyn FrameLog>,
+    /// Where several processes share newest heartbeats, if the store is one for several.
+    pub heard: Option<Arc<dyn HeardLog>>,
     /// The site.
     pub site: Arc<Site>,
     /// Its text.
     pub site_text: String,
     /// Clocks.
     pub clock: Arc<dyn Clock>,
-    /// Software of robots.
+    /// Software of robots, of a process with role ota.
     pub ota: OtaService,
+    /// Software of robots, of a gateway beside such processes.
+    pub reader: Option<OtaReader>,
     /// The simulator's face, if bodies live in this process.
     pub sim: Option<SimFace>,
     /// Naive rules for twins of tests; none outside them.
@@ -86,18 +81,21 @@ pub struct Parts {
     pub planning: tokio::runtime::Handle,
 }
 
-/// All services of one process, ready to be served.
+/// The services of one process, ready to be served.
 pub struct Server {
     parts: Parts,
-    task: TaskService,
-    fleet: FleetService,
-    reconciler: Reconciler,
-    telemetry: TelemetryService,
-    rollouts: RolloutService,
-    planner: Planner,
+    task: Option<TaskService>,
+    fleet: Option<(FleetService, Reconciler)>,
+    telemetry: Option<TelemetryService>,
+    rollouts: Option<(RolloutService, Planner)>,
     board: Arc<LiveBoard<Live>>,
     beacons: Option<UdpSocket>,
+    /// It was asked to end.
+    stop: CancellationToken,
+    /// Services end.
     shutdown: CancellationToken,
+    /// Whether more work may be sent here.
+    ready: Arc<watch::Sender<bool>>,
 }
 
 /// The one recorder of metrics of this process.
@@ -107,41 +105,48 @@ pub fn metrics_handle() -> Option<PrometheusHandle> {
 }
 
 impl Server {
-    /// Builds the services; nothing runs yet.
-    pub async fn new(parts: Parts, shutdown: CancellationToken) -> anyhow::Result<Self> {
+    /// Builds the services; nothing runs yet. They end some time after `stop`.
+    pub async fn new(parts: Parts, stop: CancellationToken) -> anyhow::Result<Self> {
         let board: Arc<LiveBoard<Live>> = LiveBoard::new();
-        let task =
-            midshift_task::Parts { store: parts.store.clone(), site: parts.site.clone(), clock: parts.clock.clone() };
-        let task = TaskService::open(task, shutdown.clone()).await.context("opening task intake")?;
-        let (fleet, reconciler) = FleetService::new(midshift_fleet::Parts {
-            store: parts.store.clone(),
-            board: board.clone(),
-            site: parts.site.clone(),
-            site_text: parts.site_text.clone(),
-            clock: parts.clock.clone(),
-            bugs: parts.naive.fleet,
+        let shutdown = CancellationToken::new();
+        let task = match parts.roles.has(Role::Task) {
+            true => Some(open_task(&parts, &shutdown).await?),
+            false => None,
+        };
+        let fleet = parts.roles.has(Role::Fleet).then(|| {
+            FleetService::new(midshift_fleet::Parts {
+                store: parts.store.clone(),
+                board: board.clone(),
+                site: parts.site.clone(),
+                site_text: parts.site_text.clone(),
+                clock: parts.clock.clone(),
+                bugs: parts.naive.fleet,
+            })
         });
-        let telemetry = TelemetryService::new(
-            midshift_telemetry::Parts {
+        let telemetry = parts.roles.has(Role::Telemetry).then(|| {
+            let parts = midshift_telemetry::Parts {
                 store: parts.store.clone(),
                 frames: parts.frames.clone(),
                 board: board.clone(),
+                heard: parts.heard.clone(),
                 clock: parts.clock.clone(),
                 bugs: parts.naive.telemetry,
-            },
-            shutdown.clone(),
-        );
-        let rollouts = midshift_ota::rollouts::Parts {
-            store: parts.store.clone(),
-            board: board.clone(),
-            site: parts.site.clone(),
-            clock: parts.clock.clone(),
-            ota: parts.ota.clone(),
-            bugs: parts.naive.rollouts,
-        };
-        let (rollouts, planner) = RolloutService::new(rollouts, shutdown.clone());
-        let beacons = None;
-        Ok(Self { parts, task, fleet, reconciler, telemetry, rollouts, planner, board, beacons, shutdown })
+            };
+            TelemetryService::new(parts, shutdown.clone())
+        });
+        let rollouts = parts.roles.has(Role::Ota).then(|| {
+            let parts = midshift_ota::rollouts::Parts {
+                store: parts.store.clone(),
+                board: board.clone(),
+                site: parts.site.clone(),
+                clock: parts.clock.clone(),
+                ota: parts.ota.clone(),
+                bugs: parts.naive.rollouts,
+            };
+            RolloutService::new(parts, shutdown.clone())
+        });
+        let (beacons, ready) = (None, Arc::new(watch::Sender::new(true)));
+        Ok(Self { parts, task, fleet, telemetry, rollouts, board, beacons, stop, shutdown, ready })
     }
 
     /// Listens for the beacons of launchers on this socket too.
@@ -151,12 +156,13 @@ impl Server {
 
     /// Roll-outs that name no probation have this one, milliseconds of site time.
     pub fn with_probation(self, probation_ms: u64) -> Self {
-        Self { rollouts: self.rollouts.with_probation(probation_ms), ..self }
+        let rollouts = self.rollouts.map(|(face, planner)| (face.with_probation(probation_ms), planner));
+        Self { rollouts, ..self }
     }
 
-    /// Fleet, for whoever reports in this process.
-    pub fn fleet(&self) -> FleetService {
-        self.fleet.clone()
+    /// Fleet, for whoever reports in this process, if it has it.
+    pub fn fleet(&self) -> Option<FleetService> {
+        self.fleet.as_ref().map(|(face, _)| face.clone())
     }
     /// Newest heartbeats, for whoever reports in this process.
     pub fn board(&self) -> Arc<LiveBoard<Live>> {
@@ -173,20 +179,35 @@ impl Server {
                 .register_encoded_file_descriptor_set(tonic_types::pb::FILE_DESCRIPTOR_SET)
         };
         let (health, health_service) = tonic_health::server::health_reporter();
-        tell(&health, ServingStatus::Serving).await;
         let mut routes = Routes::builder();
         routes
-            .add_service(self.task.grpc().max_decoding_message_size(control))
-            .add_service(self.fleet.grpc().max_decoding_message_size(control))
-            .add_service(self.telemetry.grpc().max_decoding_message_size(control))
-            .add_service(self.telemetry.link())
-            .add_service(self.telemetry.replay())
-            .add_service(self.parts.ota.bundles())
-            .add_service(self.parts.ota.chunks())
-            .add_service(self.rollouts.grpc().max_decoding_message_size(control))
             .add_service(health_service)
+            // Of all services, whichever are here: a proxy asks any process.
             .add_service(reflection().build_v1()?)
             .add_service(reflection().build_v1alpha()?);
+        if let Some(task) = &self.task {
+            routes.add_service(task.grpc().max_decoding_message_size(control));
+        }
+        if let Some((fleet, _)) = &self.fleet {
+            routes.add_service(fleet.grpc().max_decoding_message_size(control));
+        }
+        if let Some(telemetry) = &self.telemetry {
+            routes
+                .add_service(telemetry.grpc().max_decoding_message_size(control))
+                .add_service(telemetry.link())
+                .add_service(telemetry.replay());
+        }
+        if let Some((rollouts, _)) = &self.rollouts {
+            routes
+                .add_service(self.parts.ota.bundles())
+                .add_service(rollouts.grpc().max_decoding_message_size(control));
+        }
+        let has_bytes = self.telemetry.is_some() || self.rollouts.is_some();
+        match &self.parts.reader {
+            Some(reader) => drop(routes.add_service(reader.chunks()).add_service(reader.bundles())),
+            None if has_bytes => drop(routes.add_service(self.parts.ota.chunks())),
+            None => {}
+        }
         if let Some(sim) = self.parts.sim.clone() {
             let face: SimServiceServer<SimFace> = sim.server();
             routes.add_service(face);
@@ -198,7 +219,17 @@ impl Server {
         };
         // Browsers speak gRPC-Web to the services; Prometheus and clients of TUF speak plain HTTP/1.1 to the pages beside them.
         let services = routes.routes().into_axum_router().layer(tonic_web::GrpcWebLayer::new());
-        let pages = services.route("/metrics", get(metrics)).merge(self.parts.ota.pages());
+        let ready = self.ready.clone();
+        let readiness = move || {
+            let ready = *ready.borrow();
+            async move { if ready { (StatusCode::OK, "ready\n") } else { (StatusCode::SERVICE_UNAVAILABLE, "not ready\n") } }
+        };
+        let mut pages = services.route("/metrics", get(metrics)).route("/ready", get(readiness));
+        match &self.parts.reader {
+            Some(reader) => pages = pages.merge(reader.pages()),
+            None if has_bytes => pages = pages.merge(self.parts.ota.pages()),
+            None => {}
+        }
         Ok((Routes::from(pages), health))
     }
 
@@ -213,9 +244,9 @@ impl Server {
         E: Into<Box<dyn std::error::Error + Send + Sync>>,
     {
         let (routes, health) = self.routes().await?;
-        let shutdown = self.shutdown.clone();
+        let (stop, shutdown) = (self.stop.clone(), self.shutdown.clone());
         // However this ends, also in a panic: nobody goes on without it.
-        let _end = shutdown.clone().drop_guard();
+        let _end = (stop.clone().drop_guard(), shutdown.clone().drop_guard());
         let stopped = shutdown.clone();
         let transport = Transport::builder()
             .accept_http1(true)
@@ -225,56 +256,148 @@ impl Server {
             .timeout(Duration::from_millis(limits::UNARY_DEADLINE.as_ms()))
             .add_routes(routes)
             .serve_with_incoming_shutdown(incoming, async move { stopped.cancelled().await });
-        let keeper =
-            prune(self.task.clone(), self.parts.store.clone(), self.parts.frames.clone(), self.parts.clock.clone());
-        let fleet = AbortOnDropHandle::new(self.parts.planning.spawn(self.reconciler.run(shutdown.clone())));
-        let telemetry = self.telemetry.clone().run();
-        let ota = self.parts.ota.clone().run(shutdown.clone());
-        let planner = AbortOnDropHandle::new(self.parts.planning.spawn(self.planner.run(shutdown.clone())));
-        let (telemetry_of_ear, beacons) = (self.telemetry.clone(), self.beacons);
-        let ear = async {
-            if let Some(socket) = beacons {
-                telemetry_of_ear.hear(socket).await;
-            }
-        };
+        let readiness = tell(&health, self.parts.roles.services(), self.ready.subscribe());
+        let ending = end(stop.clone(), shutdown.clone(), self.parts.drain, self.telemetry.clone(), self.ready.clone());
+        let following = follow(&self.parts, self.board.clone());
+        let keeper = upkeep::run(&self.parts, self.task.clone());
         let failure = OnceLock::new();
         let services = async {
-            let fleet = until(&shutdown, "fleet", async { Ok(fleet.await??) });
-            let telemetry = until(&shutdown, "telemetry", async { Ok(telemetry.await?) });
-            let ota = until(&shutdown, "ota", async {
-                ota.await;
-                Ok(())
-            });
-            let rollouts = until(&shutdown, "rollouts", async { Ok(planner.await??) });
-            let ear = async {
-                ear.await;
-                Ok(())
+            let services = Running {
+                fleet: self.fleet.map(|(_, reconciler)| reconciler),
+                planner: self.rollouts.map(|(_, planner)| planner),
+                telemetry: self.telemetry,
+                beacons: self.beacons,
+                parts: &self.parts,
             };
-            if let Err(error) = tokio::try_join!(fleet, telemetry, ota, rollouts, ear) {
+            if let Err(error) = services.run(&shutdown).await {
                 tracing::error!(%error, "a service ended, and with it the server");
-                shutdown.cancel();
                 // Nothing else sets it.
                 let _ = failure.set(error);
+                stop.cancel();
+                shutdown.cancel();
             }
         };
         let hard = async {
             shutdown.cancelled().await;
-            tell(&health, ServingStatus::NotServing).await;
             tokio::time::sleep(Duration::from_millis(limits::HARD_DRAIN.as_ms())).await;
         };
         let transport = async {
             let served = transport.await;
             // Without a door there is nothing to serve.
+            stop.cancel();
             shutdown.cancel();
             served
         };
         tokio::select! {
-            (served, ()) = async { tokio::join!(transport, services) } => served.context("serving")?,
+            (served, (), ()) = async { tokio::join!(transport, services, ending) } => served.context("serving")?,
+            () = readiness => {}
             () = keeper => {}
-            () = fold(metrics_handle()) => {}
+            () = following => {}
             () = hard => tracing::info!("open streams were cut"),
         }
         failure.into_inner().map_or(Ok(()), Err)
+    }
+}
+
+async fn open_task(parts: &Parts, shutdown: &CancellationToken) -> anyhow::Result<TaskService> {
+    let task =
+        midshift_task::Parts { store: parts.store.clone(), site: parts.site.clone(), clock: parts.clock.clone() };
+    TaskService::open(task, shutdown.clone()).await.context("opening task intake")
+}
+
+/// What of a server runs by itself.
+struct Running<'p> {
+    fleet: Option<Reconciler>,
+    planner: Option<Planner>,
+    telemetry: Option<TelemetryService>,
+    beacons: Option<UdpSocket>,
+    parts: &'p Parts,
+}
+
+impl Running<'_> {
+    /// Until shutdown, or until one of them ends by itself.
+    async fn run(self, shutdown: &CancellationToken) -> anyhow::Result<()> {
+        let planning = &self.parts.planning;
+        let spawned = |name, service: Option<AbortOnDropHandle<_>>| async move {
+            match service {
+                Some(service) => until(shutdown, name, async { Ok(service.await??) }).await,
+                None => Ok(()),
+            }
+        };
+        let fleet = self.fleet.map(|r| AbortOnDropHandle::new(planning.spawn(r.run(shutdown.clone()))));
+        let planner = self.planner.map(|p| AbortOnDropHandle::new(planning.spawn(p.run(shutdown.clone()))));
+        let telemetry = async {
+            match self.telemetry.clone() {
+                Some(telemetry) => until(shutdown, "telemetry", async { Ok(telemetry.run().await?) }).await,
+                None => Ok(()),
+            }
+        };
+        let ear = async {
+            if let (Some(telemetry), Some(socket)) = (self.telemetry.clone(), self.beacons) {
+                telemetry.hear(socket).await;
+            }
+            Ok(())
+        };
+        let ota = async {
+            if self.parts.roles.has(Role::Ota) {
+                self.parts.ota.clone().run(shutdown.clone()).await;
+            }
+            Ok(())
+        };
+        let ota = async {
+            match self.parts.roles.has(Role::Ota) {
+                true => until(shutdown, "ota", ota).await,
+                false => Ok(()),
+            }
+        };
+        let reader = async {
+            if let Some(reader) = self.parts.reader.clone() {
+                reader.run(shutdown.clone()).await;
+            }
+            Ok(())
+        };
+        tokio::try_join!(spawned("fleet", fleet), spawned("rollouts", planner), telemetry, ear, ota, reader).map(drop)
+    }
+}
+
+/// Waits for `stop`, lets robots move to another gateway for as long as they have, and ends the services.
+async fn end(
+    stop: CancellationToken,
+    shutdown: CancellationToken,
+    drain: Duration,
+    telemetry: Option<TelemetryService>,
+    ready: Arc<watch::Sender<bool>>,
+) {
+    let mut cut_off = telemetry.as_ref().and_then(TelemetryService::cut_off);
+    loop {
+        tokio::select! {
+            () = stop.cancelled() => break,
+            lost = changed(&mut cut_off) => { ready.send_replace(!lost); }
+        }
+    }
+    ready.send_replace(false);
+    if let Some(telemetry) = telemetry.filter(|_| !drain.is_zero())
+        && tokio::time::timeout(drain, telemetry.move_over()).await.is_err()
+    {
+        tracing::info!("not every robot moved to another gateway in time");
+    }
+    shutdown.cancel();
+}
+
+async fn changed(watched: &mut Option<watch::Receiver<bool>>) -> bool {
+    if let Some(watched) = watched
+        && watched.changed().await.is_ok()
+    {
+        return *watched.borrow_and_update();
+    }
+    std::future::pending().await
+}
+
+/// Reads what other gateways hear, if there may be any.
+async fn follow(parts: &Parts, board: Arc<LiveBoard<Live>>) {
+    match parts.heard.clone() {
+        Some(heard) => midshift_store::follow_heard(heard, board, parts.clock.clone()).await,
+        None => std::future::pending().await,
     }
 }
 
@@ -291,49 +414,17 @@ async fn until(
     Ok(())
 }
 
-async fn tell(health: &HealthReporter, status: ServingStatus) {
-    for name in HEALTH {
-        health.set_service_status(name, status).await;
-    }
-}
-
-/// Folds samples of histograms, whether or not anybody scrapes.
-async fn fold(metrics: Option<PrometheusHandle>) {
+/// Keeps health as the process is ready or not, for each of its services.
+async fn tell(health: &HealthReporter, names: BTreeSet<&'static str>, mut ready: watch::Receiver<bool>) {
     loop {
-        tokio::time::sleep(FOLD_EVERY).await;
-        if let Some(metrics) = &metrics {
-            metrics.run_upkeep();
+        let status = if *ready.borrow_and_update() { ServingStatus::Serving } else { ServingStatus::NotServing };
+        for name in &names {
+            health.set_service_status(*name, status).await;
+        }
+        if ready.changed().await.is_err() {
+            return std::future::pending().await;
         }
     }
-}
-
-/// Takes old rows, entries and frames away, entries never past what fleet has not consumed.
-async fn prune(task: TaskService, store: Arc<dyn Store>, frames: Arc<dyn FrameLog>, clock: Arc<dyn Clock>) {
-    loop {
-        tokio::time::sleep(PRUNE_EVERY).await;
-        if let Err(error) = task.prune().await {
-            tracing::warn!(%error, "old requests could not be taken away");
-        }
-        if let Err(error) = midshift_fleet::prune(store.as_ref(), clock.as_ref()).await {
-            tracing::warn!(%error, "tasks that ended long ago could not be taken away");
-        }
-        if let Err(error) = prune_entries(store.as_ref(), clock.as_ref()).await {
-            tracing::warn!(%error, "old log entries could not be taken away");
-        }
-        if let Err(error) = frames.prune().await {
-            tracing::warn!(%error, "old status could not be taken away");
-        }
-    }
-}
-
-async fn prune_entries(store: &dyn Store, clock: &dyn Clock) -> Result<(), midshift_store::Error> {
-    // Until fleet has consumed something nothing may go.
-    let Some((mark, _)) = midshift_store::load::<FleetMark>(store, "fleet").await? else { return Ok(()) };
-    let days_ms = (limits::REMEMBER_DAYS * 86_400_000) as i64;
-    let ota = midshift_store::load::<OtaMark>(store, "ota").await?.map_or(mark.seq, |(mark, _)| mark.seq);
-    let floor = mark.seq.min(ota);
-    let keep = Retention { before_unix_ms: clock.now().wall.0 - days_ms, entries_max: ENTRIES_MAX, floor };
-    store.prune(keep).await.map(drop)
 }
 
 #[cfg(test)]
@@ -364,12 +455,16 @@ mod tests {
         let store_id = StoreId(Arc::from("store-1"));
         let planning = Planning::start()?;
         let parts = Parts {
+            roles: Roles::default(),
+            drain: Duration::ZERO,
+            heard: None,
             store: Arc::new(MemoryStore::new(loaded.site.site_id().clone(), store_id, clock.clone())),
             frames: Arc::new(MemoryFrames::new(clock.clone(), 1 << 20)),
             site: loaded.site,
             site_text: loaded.text,
             clock,
             ota: OtaService::without_keys(),
+            reader: None,
             sim: None,
             naive: Naive::default(),
             planning: planning.handle(),
@@ -419,20 +514,5 @@ mod tests {
         assert_eq!(next(&mut health).await?, Told::NotServing);
         drop(health);
         world.serving.await?
-    }
-
-    /// Whether the samples of a histogram were folded; only the text of the recorder tells without folding them itself.
-    fn folded(metrics: &PrometheusHandle, name: &str) -> bool {
-        format!("{metrics:?}").split_once("distributions:").is_some_and(|(_, folded)| folded.contains(name))
-    }
-
-    #[tokio::test(start_paused = true)]
-    async fn histograms_do_not_grow_while_nobody_scrapes() {
-        let recorder = PrometheusBuilder::new().build_recorder();
-        let metrics = recorder.handle();
-        metrics::with_local_recorder(&recorder, || metrics::histogram!("midshift_test_seconds").record(1.0));
-        assert!(!folded(&metrics, "midshift_test_seconds"));
-        let _ = tokio::time::timeout(FOLD_EVERY * 2, fold(Some(metrics.clone()))).await;
-        assert!(folded(&metrics, "midshift_test_seconds"));
     }
 }

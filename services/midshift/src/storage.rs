@@ -4,8 +4,8 @@ use anyhow::{Context, bail};
 use midshift_core::ids::SiteId;
 use midshift_core::time::Clock;
 use midshift_store::{
-    FRAME_BYTES_DEFAULT, FrameLog, Migrated, PostgresConfig, PostgresFrames, PostgresStore, SqliteFrames, SqliteStore,
-    Store,
+    FRAME_BYTES_DEFAULT, FrameLog, HeardLog, Migrated, PostgresConfig, PostgresFrames, PostgresHeard, PostgresStore,
+    SqliteFrames, SqliteStore, Store,
 };
 use std::path::Path;
 use std::sync::Arc;
@@ -45,8 +45,11 @@ impl Database {
             Some(config) => {
                 let store = PostgresStore::open(&config, site_id.clone(), clock.clone()).await;
                 let store = store.context("opening the store in PostgreSQL")?;
-                let frames = PostgresFrames::open(&config, site_id, clock, FRAME_BYTES_DEFAULT).await;
-                Ok(Storage::Postgres(Arc::new(store), Arc::new(frames.context("opening the samples in PostgreSQL")?)))
+                let frames = PostgresFrames::open(&config, site_id.clone(), clock, FRAME_BYTES_DEFAULT).await;
+                let frames = frames.context("opening the samples in PostgreSQL")?;
+                let heard =
+                    PostgresHeard::open(&config, site_id).await.context("opening the heartbeats in PostgreSQL")?;
+                Ok(Storage::Postgres(Arc::new(store), Arc::new(frames), Arc::new(heard)))
             }
             None => {
                 let store = SqliteStore::open(data, site_id.clone(), clock.clone()).await?;
@@ -62,7 +65,7 @@ pub enum Storage {
     /// Two files in the data directory.
     Sqlite(Arc<SqliteStore>, Arc<SqliteFrames>),
     /// Two schemas of a database.
-    Postgres(Arc<PostgresStore>, Arc<PostgresFrames>),
+    Postgres(Arc<PostgresStore>, Arc<PostgresFrames>, Arc<PostgresHeard>),
 }
 
 impl Storage {
@@ -70,7 +73,7 @@ impl Storage {
     pub fn store(&self) -> Arc<dyn Store> {
         match self {
             Self::Sqlite(store, _) => store.clone(),
-            Self::Postgres(store, _) => store.clone(),
+            Self::Postgres(store, ..) => store.clone(),
         }
     }
 
@@ -78,7 +81,15 @@ impl Storage {
     pub fn frames(&self) -> Arc<dyn FrameLog> {
         match self {
             Self::Sqlite(_, frames) => frames.clone(),
-            Self::Postgres(_, frames) => frames.clone(),
+            Self::Postgres(_, frames, _) => frames.clone(),
+        }
+    }
+
+    /// Where several processes share newest heartbeats; none where only one may open it.
+    pub fn heard(&self) -> Option<Arc<dyn HeardLog>> {
+        match self {
+            Self::Sqlite(..) => None,
+            Self::Postgres(_, _, heard) => Some(heard.clone()),
         }
     }
 
@@ -97,7 +108,8 @@ impl Storage {
                 store.close().await;
                 frames.close().await;
             }
-            Self::Postgres(store, frames) => {
+            Self::Postgres(store, frames, heard) => {
+                heard.close().await;
                 store.close().await;
                 frames.close().await;
             }

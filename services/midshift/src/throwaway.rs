@@ -11,6 +11,7 @@ use midshift_core::ids::SiteId;
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use midshift_ota::content::Room;
+use midshift_ota::folder::Owner;
 use midshift_ota::{OtaService, Parts};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -28,7 +29,8 @@ impl Throwaway {
         Folder::create(&this.repository(), &this.keys(), Profile::Solo, clock.now().wall)?;
         // No databases lie beside it that would need the rest of the disk.
         let room = Room::of(limits::SOFTWARE_BYTES_DEFAULT);
-        let parts = Parts { folder: this.dir.path().join("server"), keys: this.keys(), room, clock };
+        let parts =
+            Parts { folder: this.dir.path().join("server"), keys: this.keys(), room, clock, owner: Owner::Nobody };
         let service = OtaService::open(parts).await.context("opening software of robots")?;
         Ok((this, service))
     }

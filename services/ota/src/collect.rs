@@ -64,6 +64,17 @@ struct Marks {
     touched: u64,
 }
 
+fn read(path: &Path) -> Result<BTreeMap<Digest, u64>, content::Error> {
+    match fs::read(path) {
+        Ok(bytes) => Ok(serde_json::from_slice(&bytes).unwrap_or_else(|error| {
+            tracing::warn!(%error, "what is known of unnamed files cannot be read: they are all kept for their whole time");
+            BTreeMap::new()
+        })),
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(BTreeMap::new()),
+        Err(source) => Err(content::Error::Io { doing: "reading", path: path.to_owned(), source }),
+    }
+}
+
 /// The one that takes away.
 pub struct Collector {
     path: PathBuf,
@@ -79,14 +90,7 @@ impl Collector {
     /// The disk's.
     pub fn open(folder: &Path, room: Room) -> Result<Self, content::Error> {
         let path = folder.join(UNNAMED);
-        let since = match fs::read(&path) {
-            Ok(bytes) => serde_json::from_slice(&bytes).unwrap_or_else(|error| {
-                tracing::warn!(%error, "what is known of unnamed files cannot be read: they are all kept for their whole time");
-                BTreeMap::new()
-            }),
-            Err(error) if error.kind() == ErrorKind::NotFound => BTreeMap::new(),
-            Err(source) => return Err(content::Error::Io { doing: "reading", path, source }),
-        };
+        let since = read(&path)?;
         Ok(Self { path, room, marks: Marks { since, touched: 0 }.into(), last: Mutex::default() })
     }
 
@@ -111,7 +115,7 @@ impl Collector {
         named: &Named,
         at: Utc,
     ) -> Result<Collected, Error> {
-        let (newest, guard) = repository.still().await;
+        let (newest, guard) = repository.still().await?;
         let listed = newest.map(|newest| newest.digests().clone()).unwrap_or_default();
         let mut kept = listed.clone();
         for bundle in &named.bundles {
@@ -119,6 +123,9 @@ impl Collector {
             kept.extend(repository.files_of(digest).await?.unwrap_or_default());
         }
         let mut marks = self.marks.lock().await;
+        let path = self.path.clone();
+        // Another process may have made the pass before.
+        marks.since = blocking(move || read(&path)).await?;
         let mut done = Collected::default();
         let served_ms = named.served_ms;
         // What can be made again goes first, and at once.

@@ -4,6 +4,9 @@
 //! no more than the quota lies here, and the disk keeps its spare bytes. Whether a file may be handed out, and when one is needed no
 //! more, is not decided here.
 
+mod shared;
+
+use crate::folder::Gate;
 use crate::{blocking, is_of_one_thread};
 use async_trait::async_trait;
 use bytes::Bytes;
@@ -137,6 +140,18 @@ pub enum Error {
         /// Bytes that stay free on it.
         spare: u64,
     },
+    /// Another process that shares the folder does not come to an end with it.
+    #[error("another process holds {path} for too long")]
+    Busy {
+        /// The lock.
+        path: PathBuf,
+    },
+    /// This process only reads the folder.
+    #[error("{path} is only read here")]
+    ReadOnly {
+        /// The folder.
+        path: PathBuf,
+    },
     /// All bytes came, and they are others. They were thrown away.
     #[error("its bytes have the digest {found}")]
     WrongBytes {
@@ -194,6 +209,9 @@ pub trait Content: Send + Sync + 'static {
 struct Mark {
     length: u64,
     durable: u64,
+    /// Number of the process that wrote to the file last. None: there is one process only.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    writer: Option<u64>,
 }
 
 /// A file that is being brought.
@@ -207,11 +225,38 @@ struct Part {
 struct Entry {
     part: Arc<Mutex<Part>>,
     touched: u64,
+    changed: Changed,
 }
 
 struct Whole {
     length: u64,
     touched: u64,
+    changed: Changed,
+}
+
+/// When a file was changed last, as its file system says: seconds and nanoseconds. Only compared with itself. Zeros if nobody asks.
+type Changed = (i64, i64);
+
+/// Whose hand is on the folder.
+enum Hand {
+    /// Of one process: what it remembers is what is there.
+    Alone,
+    /// Of one of several: what is there may be another's, and is looked at anew at each turn.
+    Shared(Sharing),
+    /// Of one that only reads what others keep.
+    Reading,
+}
+
+/// What a process needs to share a folder of files.
+pub struct Sharing {
+    /// Its turns.
+    pub gate: Gate,
+    /// Its number, which no other living process has.
+    pub number: u64,
+    /// Nobody else works in the folder yet.
+    pub is_first: bool,
+    /// Folder of what is made of files: its bytes count too.
+    pub beside: PathBuf,
 }
 
 #[derive(Default)]
@@ -220,6 +265,8 @@ struct Shelf {
     parts: BTreeMap<Digest, Entry>,
     /// Bytes of all files, whole or not, and of what was made of them.
     used: u64,
+    /// Bytes of that for what is being made now, in a shared folder.
+    claimed: u64,
     /// Rises with each touch of a file by whoever brings it.
     turn: u64,
 }
@@ -237,6 +284,7 @@ impl Shelf {
 struct Inner {
     path: PathBuf,
     room: Room,
+    hand: Hand,
     shelf: Mutex<Shelf>,
 }
 
@@ -253,6 +301,10 @@ impl DiskContent {
     /// If it cannot be read or mended.
     pub fn open(path: &Path, room: Room) -> Result<Self, Error> {
         fs::create_dir_all(path).map_err(at("making", path))?;
+        Self::mended(path, room, Hand::Alone)
+    }
+
+    fn mended(path: &Path, room: Room, hand: Hand) -> Result<Self, Error> {
         let mut shelf = Shelf::default();
         let mut names = Vec::new();
         for entry in fs::read_dir(path).map_err(at("reading", path))? {
@@ -261,15 +313,16 @@ impl DiskContent {
             names.extend(entry.file_name().into_string().ok().map(|name| (name, length)));
         }
         let marks: Vec<String> = names.iter().map(|(name, _)| name).filter(|n| n.ends_with(".mark")).cloned().collect();
+        let changed = Changed::default();
         for (name, length) in names {
             if let Ok(digest) = name.parse::<Digest>() {
-                shelf.whole.insert(digest, Whole { length, touched: 0 });
+                shelf.whole.insert(digest, Whole { length, touched: 0, changed });
                 shelf.used += length;
             } else if let Some(digest) = name.strip_suffix(".part").and_then(|n| n.parse::<Digest>().ok())
                 && let Some(mark) = read_mark(path, digest, length)
             {
                 let part = Part { mark, written: mark.durable, open: None };
-                shelf.parts.insert(digest, Entry { part: Arc::new(Mutex::new(part)), touched: 0 });
+                shelf.parts.insert(digest, Entry { part: Arc::new(Mutex::new(part)), touched: 0, changed });
                 shelf.used += mark.durable;
             } else if !name.ends_with(".mark") {
                 remove(&path.join(name))?;
@@ -281,29 +334,52 @@ impl DiskContent {
                 remove(&path.join(name))?;
             }
         }
-        let inner = Inner { path: path.to_owned(), room, shelf: Mutex::new(shelf) };
+        let inner = Inner { path: path.to_owned(), room, hand, shelf: Mutex::new(shelf) };
         Ok(Self { inner: Arc::new(inner) })
     }
 
-    async fn in_background<T: Send + 'static>(&self, work: impl FnOnce(&Inner) -> T + Send + 'static) -> T {
+    /// Changes the folder, in a turn if others do so too. A turn lasts to the end of the work, whoever still waits for it.
+    async fn in_turn<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&Inner) -> Result<T, Error> + Send + 'static,
+    ) -> Result<T, Error> {
+        let turn = match &self.inner.hand {
+            Hand::Alone => None,
+            Hand::Shared(sharing) => Some(sharing.gate.take().await?),
+            Hand::Reading => return Err(Error::ReadOnly { path: self.inner.path.clone() }),
+        };
         let inner = self.inner.clone();
-        blocking(move || work(&inner)).await
+        blocking(move || {
+            let _turn = turn;
+            inner.look()?;
+            work(&inner)
+        })
+        .await
+    }
+
+    async fn opened(&self, digest: Digest, offset: u64) -> Result<Option<File>, Error> {
+        let inner = self.inner.clone();
+        blocking(move || inner.open_at(digest, offset)).await
     }
 }
 
 #[async_trait]
 impl Content for DiskContent {
     async fn length(&self, digest: Digest) -> Result<Option<u64>, Error> {
-        Ok(self.inner.shelf().whole.get(&digest).map(|whole| whole.length))
+        if matches!(self.inner.hand, Hand::Alone) {
+            return Ok(self.inner.shelf().whole.get(&digest).map(|whole| whole.length));
+        }
+        let inner = self.inner.clone();
+        blocking(move || inner.length_there(digest)).await
     }
     async fn append(&self, file: Wanted, offset: u64, piece: Bytes) -> Result<(), Error> {
-        self.in_background(move |inner| inner.append(file, offset, &piece)).await
+        self.in_turn(move |inner| inner.append(file, offset, &piece)).await
     }
     async fn settle(&self, file: Wanted) -> Result<Held, Error> {
-        self.in_background(move |inner| inner.settle(file)).await
+        self.in_turn(move |inner| inner.settle(file)).await
     }
     async fn read(&self, digest: Digest, range: Range<u64>) -> Result<Option<Reader>, Error> {
-        let opened = self.in_background(move |inner| inner.open_at(digest, range.start)).await?;
+        let opened = self.opened(digest, range.start).await?;
         let length = range.end.saturating_sub(range.start);
         let Some(mut file) = opened else { return Ok(None) };
         if is_of_one_thread() {
@@ -315,24 +391,30 @@ impl Content for DiskContent {
         Ok(Some(Box::new(AsyncReadExt::take(tokio::fs::File::from_std(file), length))))
     }
     async fn open(&self, digest: Digest) -> Result<Option<Box<dyn Base>>, Error> {
-        let opened = self.in_background(move |inner| inner.open_at(digest, 0)).await?;
+        let opened = self.opened(digest, 0).await?;
         Ok(opened.map(|file| -> Box<dyn Base> { Box::new(file) }))
     }
     async fn list(&self) -> Result<Vec<Stored>, Error> {
-        Ok(self.inner.list())
+        if matches!(self.inner.hand, Hand::Alone) {
+            return Ok(self.inner.list());
+        }
+        self.in_turn(|inner| Ok(inner.list())).await
     }
     async fn remove(&self, digest: Digest) -> Result<u64, Error> {
-        self.in_background(move |inner| inner.take_away(digest)).await
+        self.in_turn(move |inner| inner.take_away(digest)).await
     }
     fn fill(&self) -> Fill {
         Fill { used_bytes: self.inner.shelf().used, quota_bytes: self.inner.room.quota_bytes }
     }
     fn claim(&self, bytes: u64) -> Result<(), Error> {
-        self.inner.reserve(bytes, bytes)
+        self.inner.reserve(bytes, bytes)?;
+        self.inner.shelf().claimed += bytes;
+        Ok(())
     }
     fn give_back(&self, bytes: u64) {
         let mut shelf = self.inner.shelf();
         shelf.used = shelf.used.saturating_sub(bytes);
+        shelf.claimed = shelf.claimed.saturating_sub(bytes);
     }
 }
 
@@ -351,14 +433,19 @@ impl Inner {
     }
 
     fn open_at(&self, digest: Digest, offset: u64) -> Result<Option<File>, Error> {
-        if !self.shelf().whole.contains_key(&digest) {
+        // Who shares the folder asks the disk.
+        let is_gone = |shelf: &Shelf| matches!(self.hand, Hand::Alone) && !shelf.whole.contains_key(&digest);
+        if is_gone(&self.shelf()) {
             return Ok(None);
         }
         let path = self.whole(digest);
         let mut file = match File::open(&path) {
             Ok(file) => file,
+            Err(error) if error.kind() == io::ErrorKind::NotFound && !matches!(self.hand, Hand::Alone) => {
+                return Ok(None);
+            }
             // It was taken away in between.
-            Err(_) if !self.shelf().whole.contains_key(&digest) => return Ok(None),
+            Err(_) if is_gone(&self.shelf()) => return Ok(None),
             Err(error) => return Err(at("opening", &path)(error)),
         };
         file.seek(SeekFrom::Start(offset)).map_err(at("reading", &path))?;
@@ -373,6 +460,7 @@ impl Inner {
             let entry = {
                 let mut shelf = self.shelf();
                 if let Some(length) = shelf.touch(file.digest) {
+                    self.touch_there(file.digest)?;
                     return Err(Error::Moved { at: length, offset });
                 }
                 self.entry(&mut shelf, file)?
@@ -441,9 +529,10 @@ impl Inner {
                 self.forget(oldest)?;
             }
         }
-        let mark = Mark { length: file.length, durable: 0 };
+        let mark = Mark { length: file.length, durable: 0, writer: None };
         let part = Arc::new(Mutex::new(Part { mark, written: 0, open: None }));
-        shelf.parts.insert(file.digest, Entry { part: part.clone(), touched: turn });
+        let entry = Entry { part: part.clone(), touched: turn, changed: Changed::default() };
+        shelf.parts.insert(file.digest, entry);
         Ok(part)
     }
 
@@ -455,10 +544,10 @@ impl Inner {
         if part.mark.length != file.length {
             self.reset(part, file)?;
         }
-        self.reopen(part, file.digest)?;
         if offset != part.written {
             return Err(Error::Moved { at: part.written, offset });
         }
+        self.reopen(part, file.digest)?;
         let end = offset + piece.len() as u64;
         if end > file.length {
             return Err(Error::TooLong { length: file.length, end });
@@ -515,19 +604,20 @@ impl Inner {
     fn reset(&self, part: &mut Part, file: Wanted) -> Result<(), Error> {
         part.mark.durable = 0;
         self.fall_back(part);
-        part.mark.length = file.length;
+        part.mark = Mark { length: file.length, durable: 0, writer: None };
         self.forget(file.digest)
     }
 
-    /// Opens a part at its durable end and reads what is before it, once after a start.
+    /// Opens a part at its end and reads what is before it, once after a start and after another process wrote to it.
     fn reopen(&self, part: &mut Part, digest: Digest) -> Result<(), Error> {
         if part.open.is_some() {
             return Ok(());
         }
+        self.make_ours(part, digest)?;
         let path = self.part(digest);
         let open = || {
             let mut file = OpenOptions::new().create(true).truncate(false).read(true).write(true).open(&path)?;
-            file.set_len(part.mark.durable)?;
+            file.set_len(part.written)?;
             let mut hash = Hashing::default();
             let mut buffer = vec![0; READ_BYTES];
             loop {
@@ -545,16 +635,18 @@ impl Inner {
     /// The bytes first, then the word that they are there.
     fn sync(&self, part: &mut Part, digest: Digest) -> Result<(), Error> {
         let path = self.part(digest);
-        if let Some((file, _)) = &part.open
-            && let Err(source) = file.sync_data()
-        {
+        let synced = match &part.open {
+            Some((file, _)) => file.sync_data(),
+            // Another process wrote to it last.
+            None => File::open(&path).and_then(|file| file.sync_data()),
+        };
+        if let Err(source) = synced {
             // After a failed sync nobody knows what is on the disk.
             self.fall_back(part);
             return Err(at("syncing", &path)(source));
         }
         let mark = Mark { durable: part.written, ..part.mark };
-        let text = serde_json::to_vec(&mark).unwrap_or_else(|e| unreachable!("plain fields: {e}"));
-        write_whole(&self.mark(digest), &text)?;
+        self.write_mark(digest, &mark)?;
         part.mark = mark;
         Ok(())
     }
@@ -564,6 +656,7 @@ impl Inner {
             let entry = {
                 let mut shelf = self.shelf();
                 if let Some(length) = shelf.touch(file.digest) {
+                    self.touch_there(file.digest)?;
                     return if length == file.length { Ok(Held::Whole) } else { Err(Error::Size) };
                 }
                 shelf.turn += 1;
@@ -609,7 +702,8 @@ impl Inner {
         shelf.turn += 1;
         let touched = shelf.turn;
         shelf.parts.remove(&digest);
-        shelf.whole.insert(digest, Whole { length: part.written, touched });
+        let changed = Changed::default();
+        shelf.whole.insert(digest, Whole { length: part.written, touched, changed });
         drop(shelf);
         remove(&self.mark(digest))?;
         Ok(Held::Whole)

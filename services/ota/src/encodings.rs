@@ -3,10 +3,15 @@
 //! Invariant: what is made here can be made again, so everything here may go whenever room is needed; one is made at a time; a way is
 //! kept only if it is worth it; what comes of it is judged by the robot, by the digest that people signed.
 
+mod shared;
+
+pub use shared::is_worth_asking;
+
 use crate::blocking;
 use crate::content::{Content, Error, Reader, Wanted, sync_folder};
+use crate::folder::Gate;
 use midshift_bundle::digest::Digest;
-use midshift_bundle::encoding::{self, Base, ENCODED_BYTES_MAX, ENCODED_BYTES_MIN, Encoded};
+use midshift_bundle::encoding::{self, Base, Encoded};
 use midshift_core::limits;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fs::{self, File};
@@ -73,10 +78,23 @@ struct Shelf {
     turn: u64,
     /// Where it stood at the last sweep.
     swept: u64,
+    /// What a folder that others change was like at the newest look. None: nobody looked.
+    seen: Option<shared::Seen>,
+}
+
+/// Whose hand is on the folder.
+enum Hand {
+    /// Of one process.
+    Alone,
+    /// Of one of several that make ways, one at a time; it writes to a file of its own number until it is whole.
+    Shared(Gate, u64),
+    /// Of one that hands out what others made.
+    Reading,
 }
 
 struct Inner {
     folder: PathBuf,
+    hand: Hand,
     content: Arc<dyn Content>,
     shelf: Mutex<Shelf>,
     wake: Notify,
@@ -107,6 +125,20 @@ impl Shelf {
         self.turn += 1;
         self.kept.insert(key, Kept { encoded, touched: self.turn, used_ms: None });
         self.by_digest.insert(encoded.digest, key);
+    }
+    /// Whether it will be made: not if too many are.
+    fn queue(&mut self, key: Key) -> bool {
+        let is_queued = self.queue.contains(&key);
+        let may = is_queued || self.queue.len() < limits::ENCODINGS_QUEUED_MAX;
+        if may && !is_queued {
+            self.queue.push_back(key);
+        }
+        may
+    }
+    fn forget(&mut self, key: Key) -> Option<Encoded> {
+        let kept = self.kept.remove(&key)?;
+        self.by_digest.remove(&kept.encoded.digest);
+        Some(kept.encoded)
     }
     fn give_up(&mut self, key: Key) {
         if self.worthless.len() >= limits::ENCODINGS_WORTHLESS_MAX {
@@ -147,8 +179,12 @@ impl Encodings {
                 None => fs::remove_file(entry.path()).map_err(at("removing", &entry.path()))?,
             }
         }
-        let inner = Inner { folder: folder.to_owned(), content, shelf: Mutex::new(shelf), wake: Notify::new() };
-        Ok(Self { inner: Arc::new(inner) })
+        Ok(Self::new(folder, Hand::Alone, content, shelf))
+    }
+
+    fn new(folder: &Path, hand: Hand, content: Arc<dyn Content>, shelf: Shelf) -> Self {
+        let inner = Inner { folder: folder.to_owned(), hand, content, shelf: Mutex::new(shelf), wake: Notify::new() };
+        Self { inner: Arc::new(inner) }
     }
 
     /// How `target` is best fetched by a robot that has `bases`. Without an answer one is made, if not too many are asked for.
@@ -156,10 +192,14 @@ impl Encodings {
     /// # Errors
     /// The disk's.
     pub async fn way(&self, target: Wanted, bases: &[Digest]) -> Result<Way, Error> {
-        if !(ENCODED_BYTES_MIN..=ENCODED_BYTES_MAX).contains(&target.length) {
+        if !is_worth_asking(target.length) {
             return Ok(Way::Identity);
         }
+        self.follow().await?;
         let full = Key { target: target.digest, base: None };
+        if matches!(self.inner.hand, Hand::Reading) {
+            return Ok(self.inner.made(full, bases));
+        }
         let mut best = full;
         for base in bases.iter().filter(|base| **base != target.digest) {
             if self.inner.content.length(*base).await?.is_some() {
@@ -174,14 +214,10 @@ impl Encodings {
             let found = shelf.touch(best).map(|encoded| (best, encoded)).or(full_way);
             return Ok(found.map_or(Way::Identity, |(key, encoded)| Way::Encoded(key, encoded)));
         }
-        if !shelf.queue.contains(&best) {
-            if shelf.queue.len() >= limits::ENCODINGS_QUEUED_MAX {
-                return Ok(Way::Identity);
-            }
-            shelf.queue.push_back(best);
-            self.inner.wake.notify_one();
-        }
-        Ok(Way::Later)
+        let is_queued = shelf.queue(best);
+        drop(shelf);
+        self.inner.wake.notify_one();
+        Ok(if is_queued { Way::Later } else { Way::Identity })
     }
 
     /// What these bytes are a way to, and how many they are; none: they are not here.
@@ -215,7 +251,7 @@ impl Encodings {
     }
 
     /// Takes away ways that lead to a file that is not among `listed`, lead from a file that is not among `kept`, or that nobody
-    /// has used for `unused_ms` of serving time. One that the disk holds on to is counted, stays, and is tried again by the next sweep.
+    /// has used for `unused_ms` of serving time, which in a folder that is shared nobody knows. One that the disk holds on to is counted, stays, and is tried again by the next sweep.
     pub async fn sweep(
         &self,
         listed: BTreeSet<Digest>,
@@ -224,6 +260,7 @@ impl Encodings {
         unused_ms: u64,
     ) -> Swept {
         let inner = self.inner.clone();
+        let unused_ms = if matches!(inner.hand, Hand::Alone) { unused_ms } else { u64::MAX };
         let is_of_use =
             move |key: &Key| listed.contains(&key.target) && key.base.is_none_or(|base| kept.contains(&base));
         blocking(move || inner.sweep(is_of_use, served_ms, unused_ms)).await
@@ -232,7 +269,16 @@ impl Encodings {
     /// Makes what is asked for until shutdown.
     pub async fn run(&self, shutdown: &CancellationToken) {
         loop {
-            while self.make_next().await {
+            while self.is_asked() {
+                let turn = tokio::select! {
+                    biased;
+                    turn = self.turn() => turn,
+                    () = shutdown.cancelled() => return,
+                };
+                match turn {
+                    Ok(_turn) => drop(self.make_next().await),
+                    Err(error) => tracing::debug!(%error, "another process makes shorter ways"),
+                }
                 if shutdown.is_cancelled() {
                     return;
                 }
@@ -247,6 +293,9 @@ impl Encodings {
     /// Makes the next one. False: nothing is asked for.
     pub async fn make_next(&self) -> bool {
         let Some(key) = self.inner.shelf().queue.front().copied() else { return false };
+        if let Err(error) = self.look_before_making().await {
+            tracing::error!(%error, "what other processes made cannot be read");
+        }
         for key in [Key { base: None, ..key }, key] {
             if let Err(error) = self.inner.clone().make(key).await {
                 tracing::error!(%error, target = %key.target, "no shorter way could be made of a file");
@@ -310,11 +359,13 @@ impl Inner {
             }
         }
         let mut shelf = self.shelf();
-        let Some(kept) = shelf.kept.remove(&key) else { return Some(0) };
-        shelf.by_digest.remove(&kept.encoded.digest);
+        let Some(encoded) = shelf.forget(key) else { return Some(0) };
         drop(shelf);
-        self.content.give_back(kept.encoded.length);
-        Some(kept.encoded.length)
+        // In a folder that is shared what lies there is counted, and not what was claimed.
+        if matches!(self.hand, Hand::Alone) {
+            self.content.give_back(encoded.length);
+        }
+        Some(encoded.length)
     }
 
     fn sweep(&self, is_of_use: impl Fn(&Key) -> bool, served_ms: u64, unused_ms: u64) -> Swept {
@@ -388,10 +439,14 @@ impl Inner {
             self.shelf().give_up(key);
             return Ok(());
         }
-        let beside = self.folder.join("next.new");
+        let beside = match self.hand {
+            Hand::Shared(_, number) => self.folder.join(format!("{number}.new")),
+            Hand::Alone | Hand::Reading => self.folder.join("next.new"),
+        };
         let written = self.encode(&beside, &mut target, base.as_mut().map(|b| b as &mut dyn Base), length, most);
         let kept = written.as_ref().ok().copied().flatten().map_or(0, |encoded| encoded.length);
-        self.content.give_back(most - kept);
+        let is_counted_there = !matches!(self.hand, Hand::Alone);
+        self.content.give_back(if is_counted_there { most } else { most - kept });
         let Some(encoded) = written.map_err(at("writing", &beside))? else {
             self.shelf().give_up(key);
             return fs::remove_file(&beside).map_err(at("removing", &beside));

@@ -1,11 +1,13 @@
 //! Release people in a test: their keys, bundles, documents, and a robot that looks at what the server shows.
 
 use crate::content::{Content, DiskContent, Held, Room as Space, Wanted};
+use crate::folder::Owner;
 use crate::repository::{OnlineKeys, Repository};
 use crate::{OtaService, Parts};
 use async_trait::async_trait;
 use bytes::Bytes;
 use midshift_bundle::digest::Digest;
+use midshift_bundle::key_set::KeySet;
 use midshift_bundle::keys::SecretKey;
 use midshift_bundle::manifest::{Component, ComponentKind, FORMAT, Manifest, Migration, Needs, SafetyClass};
 use midshift_bundle::repository::{FileTarget, PEOPLE_LIFE_MS, RootDraft, Signers, sign_root, sign_targets};
@@ -92,6 +94,12 @@ pub fn files(name: &str, version: &str) -> Vec<(String, Vec<u8>)> {
     vec![(manifest.target(), manifest.to_bytes()), (manifest.components[0].target(), content)]
 }
 
+/// A set of directive keys of these seeds as a file of the repository, signed by the key of seed `by`.
+pub fn key_set(number: u64, seeds: &[u8], by: u8) -> (String, Vec<u8>) {
+    let set = KeySet { number, keys: seeds.iter().map(|seed| key(*seed).public()).collect() };
+    (set.target(), set.sign(&key(by)).expect("a set"))
+}
+
 pub fn target(name: &str, content: &[u8]) -> FileTarget {
     FileTarget { name: name.to_owned(), digest: Digest::of(content), length: content.len() as u64 }
 }
@@ -105,9 +113,14 @@ pub fn targets(previous: Option<&[u8]>, add: &[(String, Vec<u8>)], seed: u8) -> 
 /// Writes the online keys of [`SEEDS`] and their successors, which a root may name later.
 pub fn write_keys(folder: &Path) {
     std::fs::create_dir_all(folder).expect("a folder");
-    for (name, seed) in
-        [("snapshot-1", 3), ("snapshot-2", 13), ("timestamp-1", 4), ("timestamp-2", 14), ("directive-1", 5)]
-    {
+    for (name, seed) in [
+        ("snapshot-1", 3),
+        ("snapshot-2", 13),
+        ("timestamp-1", 4),
+        ("timestamp-2", 14),
+        ("directive-1", 5),
+        ("directive-2", 15),
+    ] {
         key(seed).write(&folder.join(format!("{name}.pem"))).expect("a key");
     }
 }
@@ -184,7 +197,7 @@ pub async fn service(dir: &TempDir) -> OtaService {
         write_keys(&keys);
     }
     let clock = Arc::new(ScaledClock::new(|| 0, START, 1000));
-    let parts = Parts { folder: dir.path().join("ota"), keys, room: Space::of(1 << 30), clock };
+    let parts = Parts { folder: dir.path().join("ota"), keys, room: Space::of(1 << 30), clock, owner: Owner::Nobody };
     OtaService::open(parts).await.expect("a service")
 }
 

@@ -1,28 +1,22 @@
-//! The gRPC faces of releases and bytes: decode, call, encode.
+//! The gRPC face of releases: decode, call, encode. That of bytes is at the hatch.
 
 use crate::content::{Error, Held, Wanted};
-use crate::encodings::Way;
 use crate::{OtaService, pages, refusal};
 use bytes::Bytes;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::COMPONENT_BYTES_MAX;
 use midshift_core::limits;
-use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
-use midshift_proto::chunk;
+use midshift_core::reason::{Refusal, Violations};
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::bundle_service_server::BundleService as BundleFace;
-use midshift_proto::ota::v1::chunk_service_server::ChunkService as ChunkFace;
-use std::pin::Pin;
-use tokio_stream::{Stream, StreamExt};
-use tokio_util::io::ReaderStream;
 use tonic::{Request, Response, Status, Streaming};
 
-fn status(refusal: &Refusal) -> Status {
+pub(crate) fn status(refusal: &Refusal) -> Status {
     metrics::counter!("midshift_ota_refused_total", "code" => refusal.reason.code.as_str()).increment(1);
     midshift_proto::status(refusal, None)
 }
 
-fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {
+pub(crate) fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {
     result.map(Response::new).map_err(|refusal| status(&refusal))
 }
 
@@ -83,86 +77,13 @@ impl OtaService {
         Ok(v1::PublishRepositoryResponse { root_version, targets_version })
     }
 
-    async fn metadata(&self, r: v1::GetMetadataRequest) -> Result<v1::GetMetadataResponse, Refusal> {
+    async fn list(&self, r: &v1::ListBundlesRequest) -> Result<v1::ListBundlesResponse, Refusal> {
         let opened = self.opened()?;
-        if r.name.is_empty() {
-            return Err(Refusal::field("name", "is required, e.g. timestamp.json"));
-        }
-        let found = opened.repository.document(&r.name).await?;
-        let reason = || Reason::from(Code::SoftwareNotFound).with("name", r.name.chars().take(100).collect::<String>());
-        let document = found.ok_or_else(|| Refusal::new(Kind::NotFound, reason()))?;
-        Ok(v1::GetMetadataResponse { document })
-    }
-
-    fn list(&self, r: &v1::ListBundlesRequest) -> Result<v1::ListBundlesResponse, Refusal> {
-        let opened = self.opened()?;
+        opened.repository.documents().follow_if_possible().await;
         let newest = opened.repository.newest();
         let releases = newest.as_ref().map(|newest| newest.releases.as_slice()).unwrap_or_default();
         let room = pages::room(opened.content.fill(), opened.encodings.bytes(), opened.collector.newest());
         pages::page(releases, room, r).map_err(|bad| Refusal::invalid(bad.0))
-    }
-
-    async fn encoding(&self, r: v1::GetEncodingRequest) -> Result<v1::GetEncodingResponse, Refusal> {
-        let opened = self.opened()?;
-        let mut bad = Violations::default();
-        let digest = bad.take("digest", r.digest.parse::<Digest>());
-        if r.base_digests.len() > limits::ENCODING_BASES_MAX {
-            bad.add("base_digests", format!("at most {}", limits::ENCODING_BASES_MAX));
-        }
-        let bases = r.base_digests.iter().take(limits::ENCODING_BASES_MAX);
-        let bases: Vec<Digest> = bases.filter_map(|base| bad.take("base_digests", base.parse())).collect();
-        bad.finish()?;
-        let digest = digest.ok_or_else(|| Refusal::field("digest", "is required"))?;
-        let file = opened.listed(digest).await?;
-        let mut answer = v1::GetEncodingResponse { encoding: v1::Encoding::Identity.into(), ..Default::default() };
-        match opened.encodings.way(file, &bases).await? {
-            Way::Identity => {}
-            Way::Later => answer.ask_again_ms = limits::ENCODING_ASK_AGAIN_MS,
-            Way::Encoded(key, encoded) => {
-                let kind = if key.base.is_some() { v1::Encoding::ZstdPatch } else { v1::Encoding::Zstd };
-                answer.encoding = kind.into();
-                answer.base_digest = key.base.map(String::from).unwrap_or_default();
-                answer.encoded_digest = encoded.digest.to_string();
-                answer.encoded_length = encoded.length;
-            }
-        }
-        Ok(answer)
-    }
-
-    async fn fetch(&self, r: v1::FetchChunksRequest) -> Result<Chunks, Refusal> {
-        let opened = self.opened()?;
-        let mut bad = Violations::default();
-        let digest = bad.take("digest", r.digest.parse::<Digest>());
-        if !(1..=limits::CHUNK_RANGE_BYTES).contains(&r.length) {
-            bad.add("length", format!("is required, 1..{}", limits::CHUNK_RANGE_BYTES));
-        }
-        bad.finish()?;
-        let digest = digest.ok_or_else(|| Refusal::field("digest", "is required"))?;
-        let encoded = opened.encodings.found(digest).filter(|(key, _)| opened.lists(key.target));
-        let length = match encoded {
-            Some((_, length)) => length,
-            None => opened.listed(digest).await?.length,
-        };
-        if r.offset >= length {
-            return Err(Refusal::field("offset", format!("the file has {length} bytes")));
-        }
-        let range = r.offset..(r.offset + r.length).min(length);
-        let reader = match encoded {
-            Some(_) => opened.encodings.read(digest, range).await?,
-            None => opened.content.read(digest, range).await?,
-        };
-        let reader = reader.ok_or_else(|| Refusal::new(Kind::NotFound, Code::SoftwareNotFound))?;
-        let mut offset = r.offset;
-        let stream = ReaderStream::with_capacity(reader, limits::CHUNK_BYTES).map(move |piece| {
-            let piece = piece.map_err(|error| {
-                tracing::error!(%error, %digest, "a signed file cannot be read");
-                status(&Refusal::new(Kind::Internal, Code::Internal))
-            })?;
-            let chunk = chunk::piece(offset, piece.to_vec());
-            offset += piece.len() as u64;
-            Ok(chunk)
-        });
-        Ok(Box::pin(stream))
     }
 }
 
@@ -203,32 +124,13 @@ impl BundleFace for OtaService {
         &self,
         r: Request<v1::GetMetadataRequest>,
     ) -> Result<Response<v1::GetMetadataResponse>, Status> {
-        answer(self.metadata(r.into_inner()).await)
+        answer(self.hatch().metadata(r.into_inner()).await)
     }
     async fn list_bundles(
         &self,
         r: Request<v1::ListBundlesRequest>,
     ) -> Result<Response<v1::ListBundlesResponse>, Status> {
-        answer(self.list(&r.into_inner()))
-    }
-}
-
-/// Pieces of a range on their way to a robot.
-type Chunks = Pin<Box<dyn Stream<Item = Result<v1::FetchChunksResponse, Status>> + Send>>;
-
-#[tonic::async_trait]
-impl ChunkFace for OtaService {
-    type FetchChunksStream = Chunks;
-
-    async fn get_encoding(
-        &self,
-        r: Request<v1::GetEncodingRequest>,
-    ) -> Result<Response<v1::GetEncodingResponse>, Status> {
-        answer(self.encoding(r.into_inner()).await)
-    }
-
-    async fn fetch_chunks(&self, r: Request<v1::FetchChunksRequest>) -> Result<Response<Chunks>, Status> {
-        answer(self.fetch(r.into_inner()).await)
+        answer(self.list(&r.into_inner()).await)
     }
 }
 

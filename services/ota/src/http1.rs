@@ -2,7 +2,7 @@
 //!
 //! Invariant: the same documents and files as over gRPC, and no other; nothing is changed over HTTP.
 
-use crate::OtaService;
+use crate::hatch::Hatch;
 use axum::Router;
 use axum::body::Body;
 use axum::extract::{Path, State};
@@ -20,8 +20,8 @@ use tokio_util::io::ReaderStream;
 const FOR_EVER: &str = "public, max-age=31536000, immutable";
 
 /// The two kinds of pages.
-pub fn router(service: OtaService) -> Router {
-    Router::new().route("/metadata/{name}", get(metadata)).route("/targets/{name}", get(target)).with_state(service)
+pub fn router(hatch: Hatch) -> Router {
+    Router::new().route("/metadata/{name}", get(metadata)).route("/targets/{name}", get(target)).with_state(hatch)
 }
 
 fn refused(refusal: &Refusal) -> Response {
@@ -34,9 +34,9 @@ fn refused(refusal: &Refusal) -> Response {
     (code, format!("{refusal}\n")).into_response()
 }
 
-async fn metadata(State(service): State<OtaService>, Path(name): Path<String>) -> Response {
-    let found = match service.opened() {
-        Ok(opened) => opened.repository.document(&name).await.map_err(Refusal::from),
+async fn metadata(State(hatch): State<Hatch>, Path(name): Path<String>) -> Response {
+    let found = match hatch.shown() {
+        Ok(shown) => shown.documents.document(&name).await.map_err(Refusal::from),
         Err(refusal) => Err(refusal),
     };
     match found {
@@ -49,8 +49,8 @@ async fn metadata(State(service): State<OtaService>, Path(name): Path<String>) -
     }
 }
 
-async fn target(State(service): State<OtaService>, Path(name): Path<String>, headers: HeaderMap) -> Response {
-    match send(&service, &name, &headers).await {
+async fn target(State(hatch): State<Hatch>, Path(name): Path<String>, headers: HeaderMap) -> Response {
+    match send(&hatch, &name, &headers).await {
         Ok(Some(response)) => response,
         Ok(None) => (StatusCode::NOT_FOUND, "no such file\n").into_response(),
         Err(refusal) => refused(&refusal),
@@ -58,11 +58,14 @@ async fn target(State(service): State<OtaService>, Path(name): Path<String>, hea
 }
 
 /// A signed file, or a range of it; none: no release lists it under this digest and name.
-async fn send(service: &OtaService, name: &str, headers: &HeaderMap) -> Result<Option<Response>, Refusal> {
-    let opened = service.opened()?;
+async fn send(hatch: &Hatch, name: &str, headers: &HeaderMap) -> Result<Option<Response>, Refusal> {
+    let shown = hatch.shown()?;
     let Some((digest, name)) = name.split_once('.') else { return Ok(None) };
     let Ok(digest) = digest.parse::<Digest>() else { return Ok(None) };
-    let newest = opened.repository.newest();
+    if let Err(refusal) = hatch.listed(digest).await {
+        return if refusal.kind() == Kind::NotFound { Ok(None) } else { Err(refusal) };
+    }
+    let newest = shown.documents.newest();
     let Some(file) = newest.as_ref().and_then(|n| n.files.get(name)).filter(|file| file.digest == digest) else {
         return Ok(None);
     };
@@ -79,7 +82,7 @@ async fn send(service: &OtaService, name: &str, headers: &HeaderMap) -> Result<O
             return Ok(Some((StatusCode::RANGE_NOT_SATISFIABLE, length).into_response()));
         }
     };
-    let Some(reader) = opened.content.read(digest, range.clone()).await? else { return Ok(None) };
+    let Some(reader) = shown.content.read(digest, range.clone()).await? else { return Ok(None) };
     let mut response = Response::builder()
         .status(code)
         .header(CONTENT_TYPE, "application/octet-stream")

@@ -1,32 +1,44 @@
 //! Software of robots on the server: keeps files of signed releases, says which release is the newest, hands out metadata and bytes.
 //!
-//! Called by the binary: [`OtaService::open`], its two gRPC faces, its pages over HTTP/1.1 and [`OtaService::run`]. Invariant: nothing is signed
-//! here that says what software is good; only files that the newest signed release lists are handed out, and
-//! what was made of them; none of those is ever taken away.
+//! Called by the binary: [`OtaService::open`], its two gRPC faces, its pages over HTTP/1.1 and [`OtaService::run`]; and [`OtaReader`] where only
+//! bytes are handed out. Several processes may share one folder. Invariant: nothing is signed here that says what software is good; only files
+//! that the newest signed release lists are handed out, and what was made of them; none of those is ever taken away.
 
 mod collect;
 pub mod content;
 pub mod encodings;
 #[cfg(test)]
 mod fixture;
+pub mod folder;
 mod grpc;
+mod hatch;
 mod http1;
 mod pages;
 mod refusal;
 pub mod repository;
 pub mod rollouts;
+#[cfg(test)]
+#[path = "together/tests.rs"]
+mod together;
 
 use collect::{Collector, Named};
-use content::{Content, DiskContent, Room, Wanted};
-use encodings::Encodings;
+use content::{Content, DiskContent, Room, Sharing};
+use encodings::{Encodings, Key};
+use folder::{Gate, Owner, Presence};
+use hatch::Hatch;
+use midshift_bundle::manifest::Component;
+use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::task::raw::parse_version;
 use midshift_core::time::{Clock, Utc};
 use midshift_proto::ota::v1::bundle_service_server::BundleServiceServer;
 use midshift_proto::ota::v1::chunk_service_server::ChunkServiceServer;
-use repository::{Error, OnlineKeys, Repository};
+use midshift_store::StoreId;
+use repository::{Documents, Error, Newest, OnlineKeys, Repository};
+use std::collections::BTreeMap;
 use std::panic::resume_unwind;
 use std::path::PathBuf;
-use std::sync::Arc;
+use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 use tokio::runtime::RuntimeFlavor;
 use tokio::sync::watch;
@@ -49,6 +61,8 @@ pub struct Parts {
     pub room: Room,
     /// Clocks. Documents are dated by the wall.
     pub clock: Arc<dyn Clock>,
+    /// Whose the folder is, and who else works in it.
+    pub owner: Owner,
 }
 
 struct Opened {
@@ -58,7 +72,12 @@ struct Opened {
     collector: Collector,
     /// What the planner said last of what is needed. None: it said nothing since the start.
     named: watch::Sender<Option<Named>>,
+    /// Whether this process keeps what was signed fresh: where several processes serve one folder, the one that plans does.
+    leads: watch::Sender<bool>,
     clock: Arc<dyn Clock>,
+    hatch: Hatch,
+    /// Ends with the service.
+    presence: Option<Presence>,
 }
 
 /// The service. Cheap to clone.
@@ -72,21 +91,44 @@ impl OtaService {
     /// Opens what is kept.
     ///
     /// # Errors
-    /// If keys, files or documents cannot be read, or documents do not hang together.
+    /// If the folder is another store's, or another process works in it that wants to be alone; if keys, files or documents cannot be read,
+    /// or documents do not hang together.
     pub async fn open(parts: Parts) -> Result<Self, Error> {
-        let (files, encoded) = (parts.folder.join("content"), parts.folder.join("encoded"));
-        let Parts { folder, keys, room, clock } = parts;
-        let metadata = folder.join("metadata");
-        let (keys, content, encodings, collector) = blocking(move || {
-            let keys = OnlineKeys::read(&keys)?;
-            let content: Arc<dyn Content> = Arc::new(DiskContent::open(&files, room)?);
-            let encodings = Encodings::open(&encoded, content.clone())?;
-            Ok::<_, Error>((keys, content, encodings, Collector::open(&folder, room)?))
+        let Parts { folder, keys, room, clock, owner } = parts;
+        let keys = blocking(move || OnlineKeys::read(&keys)).await?;
+        let presence = Presence::come(&folder, &owner).await?;
+        let sharing = presence.as_ref().filter(|_| matches!(owner, Owner::Shared { .. }));
+        let sharing = sharing.map(|presence| (presence.number, presence.is_first));
+        let of = folder.clone();
+        let (content, encodings, collector) = blocking(move || {
+            let (files, encoded) = (of.join("content"), of.join("encoded"));
+            let collector = Collector::open(&of, room)?;
+            let Some((number, is_first)) = sharing else {
+                let content: Arc<dyn Content> = Arc::new(DiskContent::open(&files, room)?);
+                let encodings = Encodings::open(&encoded, content.clone())?;
+                return Ok((content, encodings, collector));
+            };
+            let gate = Gate::new(Some(of.join(folder::CONTENT)));
+            let sharing = Sharing { gate, number, is_first, beside: encoded.clone() };
+            let content: Arc<dyn Content> = Arc::new(DiskContent::join(&files, room, sharing)?);
+            let making = Gate::new(Some(of.join(folder::ENCODED)));
+            let encodings = Encodings::join(&encoded, content.clone(), making, number, is_first)?;
+            Ok::<_, Error>((content, encodings, collector))
         })
         .await?;
-        let repository = Repository::open(&metadata, keys, content.clone()).await?;
-        let named = watch::Sender::new(None);
-        Ok(Self { opened: Some(Arc::new(Opened { content, encodings, repository, collector, named, clock })) })
+        if let Some(presence) = &presence {
+            presence.let_in().await?;
+        }
+        let metadata = folder.join("metadata");
+        let repository = if sharing.is_some() {
+            Repository::join(&metadata, keys, content.clone(), folder.join(folder::METADATA)).await?
+        } else {
+            Repository::open(&metadata, keys, content.clone()).await?
+        };
+        let hatch = Hatch::new(content.clone(), encodings.clone(), repository.documents().clone());
+        let (named, leads) = (watch::Sender::new(None), watch::Sender::new(true));
+        let opened = Opened { content, encodings, repository, collector, named, leads, clock, hatch, presence };
+        Ok(Self { opened: Some(Arc::new(opened)) })
     }
     /// A service of a server without keys: it touches no disk and answers every call with what to do.
     pub fn without_keys() -> Self {
@@ -97,12 +139,15 @@ impl OtaService {
         BundleServiceServer::new(self.clone()).max_decoding_message_size(MESSAGE_BYTES)
     }
     /// Bytes, for robots.
-    pub fn chunks(&self) -> ChunkServiceServer<Self> {
-        ChunkServiceServer::new(self.clone())
+    pub fn chunks(&self) -> ChunkServiceServer<Hatch> {
+        ChunkServiceServer::new(self.hatch())
     }
     /// `/metadata/…` and `/targets/…` over plain HTTP, for clients of TUF that are not ours.
     pub fn pages(&self) -> axum::Router {
-        http1::router(self.clone())
+        http1::router(self.hatch())
+    }
+    fn hatch(&self) -> Hatch {
+        self.opened.as_ref().map(|opened| opened.hatch.clone()).unwrap_or_default()
     }
     /// Keeps what was signed fresh, makes files shorter for robots, and takes away what nobody needs, until shutdown.
     pub async fn run(self, shutdown: CancellationToken) {
@@ -116,17 +161,30 @@ impl OtaService {
                 opened.keep_room(&shutdown).await;
             }
         };
-        tokio::join!(self.keep_fresh(&shutdown), making, collecting);
+        let following = async {
+            if let Some(opened) = self.opened.as_ref().filter(|opened| opened.is_shared()) {
+                opened.follow(&shutdown).await;
+            }
+        };
+        tokio::join!(self.keep_fresh(&shutdown), making, collecting, following);
     }
     async fn keep_fresh(&self, shutdown: &CancellationToken) {
+        let Some(opened) = &self.opened else { return shutdown.cancelled().await };
+        let mut leads = opened.leads.subscribe();
         loop {
-            if let Some(opened) = &self.opened {
-                opened.look().await;
-            }
+            opened.look().await;
             tokio::select! {
                 () = shutdown.cancelled() => return,
                 () = tokio::time::sleep(LOOK_EVERY) => {}
+                // What was due while nobody led is done at once.
+                Ok(()) = leads.changed() => {}
             }
+        }
+    }
+    /// This process signs and takes away, or does not any more: another one on the same store does.
+    fn lead(&self, leads: bool) {
+        if let Some(opened) = &self.opened {
+            opened.leads.send_if_modified(|known| std::mem::replace(known, leads) != leads);
         }
     }
     fn opened(&self) -> Result<&Opened, Refusal> {
@@ -134,7 +192,97 @@ impl OtaService {
     }
 }
 
+/// What a process has of the folder that others keep: it hands out bytes and documents, signs nothing and writes nothing. Cheap to clone.
+#[derive(Clone)]
+pub struct OtaReader {
+    hatch: Hatch,
+    documents: Documents,
+}
+
+impl OtaReader {
+    /// Opens the folder of a store that its processes with role ota keep.
+    ///
+    /// # Errors
+    /// If it is not there, does not say that it is this store's, or documents do not hang together.
+    pub async fn open(folder: PathBuf, store_id: StoreId) -> Result<Self, Error> {
+        let of = folder.clone();
+        blocking(move || folder::must_be_of(&of, &store_id)).await?;
+        let content: Arc<dyn Content> = Arc::new(DiskContent::reading(&folder.join("content")));
+        let encodings = Encodings::reading(&folder.join("encoded"), content.clone());
+        let documents = Documents::reading(&folder.join("metadata"), content.clone()).await?;
+        Ok(Self { hatch: Hatch::new(content, encodings, documents.clone()), documents })
+    }
+    /// Documents, for robots: nothing else of releases is answered here.
+    pub fn bundles(&self) -> BundleServiceServer<Hatch> {
+        BundleServiceServer::new(self.hatch.clone()).max_decoding_message_size(MESSAGE_BYTES)
+    }
+    /// Bytes, for robots.
+    pub fn chunks(&self) -> ChunkServiceServer<Hatch> {
+        ChunkServiceServer::new(self.hatch.clone())
+    }
+    /// `/metadata/…` and `/targets/…` over plain HTTP, for clients of TUF that are not ours.
+    pub fn pages(&self) -> axum::Router {
+        http1::router(self.hatch.clone())
+    }
+    /// Learns what others publish until shutdown.
+    pub async fn run(self, shutdown: CancellationToken) {
+        every_second(&shutdown, || self.documents.follow_if_possible()).await;
+    }
+}
+
+/// Follows what other processes publish.
+async fn every_second<F: Future<Output = ()>>(shutdown: &CancellationToken, follow: impl Fn() -> F) {
+    loop {
+        follow().await;
+        tokio::select! {
+            () = shutdown.cancelled() => return,
+            () = tokio::time::sleep(Duration::from_millis(limits::SOFTWARE_FOLLOW_EVERY_MS)) => {}
+        }
+    }
+}
+
+/// The ways that robots will ask for of files of a release, from the newest version of each component on: gateways do not ask.
+fn likely_ways(newest: &Newest) -> Vec<Key> {
+    let mut by_name: BTreeMap<&str, BTreeMap<(u64, u64, u64), &Component>> = BTreeMap::new();
+    for component in newest.releases.iter().flat_map(|release| &release.manifest.components) {
+        if let Some(version) = parse_version(&component.version) {
+            by_name.entry(&component.name).or_default().insert(version, component);
+        }
+    }
+    let mut keys = Vec::new();
+    for versions in by_name.values() {
+        let newest_first: Vec<&&Component> = versions.values().rev().collect();
+        for (age, target) in newest_first.iter().enumerate().filter(|(_, c)| encodings::is_worth_asking(c.length)) {
+            let before = newest_first[age + 1..].iter().filter(|base| base.digest != target.digest);
+            let bases = before.take(limits::ENCODING_BASES_AHEAD).map(|base| Some(base.digest));
+            keys.extend(bases.chain([None]).map(|base| (age, Key { target: target.digest, base })));
+        }
+    }
+    keys.sort_by_key(|(age, _)| *age);
+    keys.into_iter().map(|(_, key)| key).collect()
+}
+
 impl Opened {
+    fn is_shared(&self) -> bool {
+        self.presence.as_ref().is_some_and(Presence::is_shared)
+    }
+
+    /// Learns what other processes publish, and has made what robots will ask gateways for.
+    async fn follow(&self, shutdown: &CancellationToken) {
+        let wanted = std::sync::Mutex::new(0);
+        every_second(shutdown, || async {
+            self.repository.documents().follow_if_possible().await;
+            let Some(newest) = self.repository.newest() else { return };
+            let version = newest.targets.edition.version;
+            let is_new =
+                std::mem::replace(&mut *wanted.lock().unwrap_or_else(PoisonError::into_inner), version) != version;
+            if is_new {
+                self.encodings.want(likely_ways(&newest));
+            }
+        })
+        .await;
+    }
+
     fn now(&self) -> Utc {
         self.clock.now().wall
     }
@@ -155,6 +303,9 @@ impl Opened {
     }
 
     async fn collect(&self, named: &Named) {
+        if !*self.leads.borrow() {
+            return;
+        }
         let at = self.now();
         match self.collector.collect(self.content.as_ref(), &self.encodings, &self.repository, named, at).await {
             Ok(collected) => collected.tell(at),
@@ -164,11 +315,18 @@ impl Opened {
 
     async fn look(&self) {
         let now = self.now();
+        if self.is_shared()
+            && let Err(error) = self.content.list().await
+        {
+            tracing::error!(%error, "nobody knows how full the folder of releases is");
+        }
         let fill = self.content.fill();
         metrics::gauge!("midshift_ota_used_bytes").set(fill.used_bytes as f64);
         metrics::gauge!("midshift_ota_quota_bytes").set(fill.quota_bytes as f64);
         let before = self.repository.newest().map(|newest| newest.stamp);
-        if let Err(error) = self.repository.freshen(now).await {
+        if *self.leads.borrow()
+            && let Err(error) = self.repository.freshen(now).await
+        {
             tracing::error!(%error, "freshness could not be signed: robots take no new software once it has expired");
         }
         let Some(newest) = self.repository.newest() else { return };
@@ -189,21 +347,6 @@ impl Opened {
                 );
             }
         }
-    }
-
-    /// Whether the newest signed release lists it.
-    fn lists(&self, digest: midshift_bundle::digest::Digest) -> bool {
-        self.repository.newest().is_some_and(|newest| newest.lists(digest))
-    }
-
-    /// Which file is meant and how long it is, if a signed release lists it.
-    async fn listed(&self, digest: midshift_bundle::digest::Digest) -> Result<Wanted, Refusal> {
-        let not_found = || Refusal::new(Kind::NotFound, Code::SoftwareNotFound);
-        if !self.lists(digest) {
-            return Err(not_found());
-        }
-        let length = self.content.length(digest).await?.ok_or_else(not_found)?;
-        Ok(Wanted { digest, length })
     }
 }
 
@@ -228,9 +371,9 @@ fn is_of_one_thread() -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::content::Wanted;
     use crate::fixture::{START, files, release, service, write_keys};
     use crate::repository::FRESHEN_AFTER_MS;
-    use midshift_core::limits;
     use midshift_core::time::ScaledClock;
     use tokio::time::Instant;
 
@@ -241,7 +384,13 @@ mod tests {
         write_keys(&keys);
         let begun = Instant::now();
         let clock = ScaledClock::new(move || begun.elapsed().as_micros() as u64, START, 1000);
-        let parts = Parts { folder: dir.path().join("ota"), keys, room: Room::of(1 << 20), clock: Arc::new(clock) };
+        let parts = Parts {
+            folder: dir.path().join("ota"),
+            keys,
+            room: Room::of(1 << 20),
+            clock: Arc::new(clock),
+            owner: Owner::Nobody,
+        };
         let service = OtaService::open(parts).await.expect("a service");
         release(&service, &files("walk", "1.0.0")).await;
         let shutdown = CancellationToken::new();
@@ -268,7 +417,7 @@ mod tests {
         let clock: Arc<dyn Clock> = Arc::new(clock);
         let unnamed_ms = 2 * limits::COLLECT_EVERY_MS;
         let room = Room { unnamed_ms, ..Room::of(1 << 20) };
-        let parts = Parts { folder: dir.path().join("ota"), keys, room, clock: clock.clone() };
+        let parts = Parts { folder: dir.path().join("ota"), keys, room, clock: clock.clone(), owner: Owner::Nobody };
         let service = OtaService::open(parts).await.expect("a service");
         let walk = files("walk", "1.0.0");
         release(&service, &walk).await;
@@ -316,7 +465,7 @@ mod tests {
         let file = Wanted { digest: midshift_bundle::digest::Digest::of(stray), length: stray.len() as u64 };
         opened.content.append(file, 0, bytes::Bytes::from_static(stray)).await.expect("room");
         opened.content.settle(file).await.expect("whole");
-        let refusal = opened.listed(file.digest).await.expect_err("nobody signed it");
+        let refusal = opened.hatch.listed(file.digest).await.expect_err("nobody signed it");
         assert_eq!(refusal.reason.code, Code::SoftwareNotFound);
     }
 }

@@ -25,7 +25,8 @@ impl From<content::Error> for Refusal {
                 tracing::error!(%error, "the disk is full");
                 Self::new(Kind::Exhausted, Code::SoftwareFull)
             }
-            Error::Io { .. } => ours(&error),
+            Error::Io { .. } | Error::ReadOnly { .. } => ours(&error),
+            Error::Busy { .. } => Self::new(Kind::Unavailable, Reason::new(Code::Overloaded, text)),
             Error::Moved { at, .. } => {
                 Self::new(Kind::Conflict, Reason::new(Code::UploadMoved, text).with("durable_bytes", at))
             }
@@ -71,7 +72,9 @@ impl From<repository::Error> for Refusal {
                 let text = format!("not here yet: {}{more}", names.join(", "));
                 Self::new(Kind::Precondition, Reason::new(Code::FilesMissing, text).with("files", files.len()))
             }
-            Error::Key(_) | Error::Document(_) | Error::NoKeyFile { .. } | Error::Damaged { .. } => ours(&text),
+            Error::Key(_) | Error::Document(_) | Error::NoKeyFile { .. } | Error::Folder(_) | Error::Damaged { .. } => {
+                ours(&text)
+            }
         }
     }
 }

@@ -4,31 +4,31 @@
 //! is shown is what it leads to, so that a cut at any write leaves the older or the newer repository whole. Versions never go back.
 
 mod check;
+mod documents;
+
+pub use documents::Documents;
 
 use crate::blocking;
 use crate::content::{self, Content, write_whole};
+use crate::folder::{self, Gate, Turn};
 use midshift_bundle::digest::Digest;
-use midshift_bundle::freshness::{
-    self, Edition, OnlineRole, Stamp, check_online, newest_targets, root_edition, stamp, targets_edition,
-};
+use midshift_bundle::freshness::{self, Edition, OnlineRole, Stamp, check_online, newest_targets, root_edition, stamp};
+use midshift_bundle::key_set::KeySet;
 use midshift_bundle::keys::{self, SecretKey};
 use midshift_bundle::manifest::Manifest;
-use midshift_bundle::repository::{
-    self as documents, FileTarget, Online, TIMESTAMP_LIFE_MS, check_root, listed, sign_online,
-};
+use midshift_bundle::repository::{self as people, FileTarget, Online, TIMESTAMP_LIFE_MS, listed, sign_online};
 use midshift_core::reason::Refusal;
 use midshift_core::time::Utc;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, PoisonError, RwLock};
-use tokio::sync::{Mutex, OwnedMutexGuard};
+use std::sync::{Arc, PoisonError};
 
 /// A timestamp this old is signed anew: half its life.
 pub const FRESHEN_AFTER_MS: u64 = TIMESTAMP_LIFE_MS / 2;
 /// Snapshots kept for clients that read an older timestamp a moment ago.
-const SNAPSHOTS_KEPT: u64 = 16;
+const SNAPSHOTS_KEPT: usize = 16;
 /// What names the newest of everything.
 const TIMESTAMP: &str = "timestamp.json";
 /// When each bundle was seen first, by its digest. Not shown.
@@ -47,7 +47,7 @@ pub enum Error {
     Key(#[from] keys::Error),
     /// A document of this server.
     #[error(transparent)]
-    Document(#[from] documents::Error),
+    Document(#[from] people::Error),
     /// The folder has no key of a role.
     #[error("{folder} has no {role}-*.pem")]
     NoKeyFile {
@@ -66,6 +66,9 @@ pub enum Error {
         /// Whose.
         role: &'static str,
     },
+    /// The folder is not this store's, or not there.
+    #[error(transparent)]
+    Folder(#[from] folder::Error),
     /// What is offered breaks rules.
     #[error("{0}")]
     Refused(#[from] Refusal),
@@ -121,10 +124,15 @@ impl OnlineKeys {
         Ok(Self { snapshot: of("snapshot")?, timestamp: of("timestamp")?, directive: of("directive")? })
     }
 
-    /// The key that orders to robots are signed with: the first by name.
-    pub fn directive(&self) -> &SecretKey {
+    /// The key that orders to robots are signed with: the first that `set` names and that is here. Without a set, or if none of its keys is here,
+    /// the first by name.
+    fn directive(&self, set: Option<&KeySet>) -> &SecretKey {
         // Read: every role has one.
-        &self.directive[0]
+        self.named_by(set).unwrap_or(&self.directive[0])
+    }
+
+    fn named_by(&self, set: Option<&KeySet>) -> Option<&SecretKey> {
+        set?.keys.iter().find_map(|key| self.directive.iter().find(|own| own.public() == *key))
     }
 
     /// Signs that `targets` is the newest, with the keys that `root` names, and holds the result against it.
@@ -183,6 +191,8 @@ pub struct Newest {
     pub files: BTreeMap<String, FileTarget>,
     /// Bundles by name and version.
     pub releases: Vec<Release>,
+    /// The newest set of keys that sign directives; none: robots have them from their trust files alone.
+    pub key_set: Option<KeySet>,
     digests: BTreeSet<Digest>,
     timestamp: Vec<u8>,
 }
@@ -204,14 +214,14 @@ struct Publication {
     newest: Newest,
 }
 
-/// The repository of one server.
+/// The repository of a store, for one who signs.
 pub struct Repository {
     folder: PathBuf,
     keys: OnlineKeys,
     content: Arc<dyn Content>,
-    newest: Arc<RwLock<Option<Arc<Newest>>>>,
+    documents: Documents,
     /// One publication or signature at a time. Held to the end of its writes, whoever still waits for them.
-    writing: Arc<Mutex<()>>,
+    writing: Gate,
     /// Lowest version of a snapshot or timestamp that is signed.
     floor: u64,
 }
@@ -222,24 +232,64 @@ impl Repository {
     /// # Errors
     /// If it cannot be read, or what is there does not hang together.
     pub async fn open(folder: &Path, keys: OnlineKeys, content: Arc<dyn Content>) -> Result<Self, Error> {
-        let path = folder.to_owned();
-        let (found, floor) = blocking(move || Ok::<_, Error>((find(&path)?, read_floor(&path)?))).await?;
-        let newest = match found {
-            Some(found) => Some(Arc::new(found.complete(content.as_ref()).await?)),
-            None => None,
-        };
-        let (newest, folder) = (Arc::new(RwLock::new(newest)), folder.to_owned());
-        Ok(Self { folder, keys, content, newest, writing: Arc::default(), floor })
+        Self::opened(folder, keys, content, None).await
     }
 
-    /// Keys of this server.
-    pub fn keys(&self) -> &OnlineKeys {
-        &self.keys
+    /// As [`Repository::open`], for a folder in which other processes sign too: all that have a file at `lock` take turns.
+    ///
+    /// # Errors
+    /// As there.
+    pub async fn join(
+        folder: &Path,
+        keys: OnlineKeys,
+        content: Arc<dyn Content>,
+        lock: PathBuf,
+    ) -> Result<Self, Error> {
+        Self::opened(folder, keys, content, Some(lock)).await
+    }
+
+    async fn opened(
+        folder: &Path,
+        keys: OnlineKeys,
+        content: Arc<dyn Content>,
+        lock: Option<PathBuf>,
+    ) -> Result<Self, Error> {
+        let path = folder.to_owned();
+        let floor = blocking(move || {
+            fs::create_dir_all(&path).map_err(io("making", &path))?;
+            read_floor(&path)
+        })
+        .await?;
+        let is_shared = lock.is_some();
+        let documents = Documents::open(folder, content.clone(), is_shared).await?;
+        if let Some(set) = documents.newest().as_ref().and_then(|newest| newest.key_set.as_ref())
+            && keys.named_by(Some(set)).is_none()
+        {
+            tracing::error!(
+                number = set.number,
+                "no directive key of this server is current: robots refuse its orders"
+            );
+        }
+        Ok(Self { folder: folder.to_owned(), keys, content, documents, writing: Gate::new(lock), floor })
+    }
+
+    /// That nobody else publishes or signs, here or elsewhere, and what is the newest then.
+    async fn turn(&self) -> Result<(Turn, Option<Arc<Newest>>), Error> {
+        let turn = self.writing.take().await?;
+        self.documents.follow().await?;
+        Ok((turn, self.newest()))
+    }
+
+    /// The key that orders to robots are signed with: the first of the newest set of directive keys that is here. Without a set, or if none of
+    /// its keys is here, the first by name.
+    pub fn directive_key(&self) -> &SecretKey {
+        let newest = self.newest();
+        self.keys.directive(newest.as_ref().and_then(|newest| newest.key_set.as_ref()))
     }
 
     /// What it says now; none: nothing was ever published.
     pub fn newest(&self) -> Option<Arc<Newest>> {
-        self.newest.read().unwrap_or_else(PoisonError::into_inner).clone()
+        self.documents.newest()
     }
 
     /// A document by its name; none: there is none, or it was never made the newest.
@@ -247,22 +297,12 @@ impl Repository {
     /// # Errors
     /// The disk's.
     pub async fn document(&self, name: &str) -> Result<Option<Vec<u8>>, Error> {
-        let Some(newest) = self.newest() else { return Ok(None) };
-        if name == TIMESTAMP {
-            return Ok(Some(newest.timestamp.clone()));
-        }
-        let shown = [
-            ("root", newest.root.edition.version),
-            ("targets", newest.targets.edition.version),
-            ("snapshot", newest.stamp.snapshot_version),
-        ];
-        let number = |role: &str| name.strip_suffix(&format!(".{role}.json"))?.parse::<u64>().ok();
-        let is_shown = |(role, most): (&str, u64)| number(role).is_some_and(|n| n <= most && name == file(n, role));
-        if !shown.into_iter().any(is_shown) {
-            return Ok(None);
-        }
-        let path = self.folder.join(name);
-        blocking(move || read(&path)).await
+        self.documents.document(name).await
+    }
+
+    /// What is shown of it, also to those who may not sign.
+    pub const fn documents(&self) -> &Documents {
+        &self.documents
     }
 
     /// Makes documents the newest if `expected` is still the version of the newest targets document, 0 of none. A publication that is
@@ -277,8 +317,7 @@ impl Repository {
         expected: u64,
         now: Utc,
     ) -> Result<Arc<Newest>, Error> {
-        let writing = self.writing.clone().lock_owned().await;
-        let before = self.newest();
+        let (writing, before) = self.turn().await?;
         let newest = before.as_ref().map_or(0, |b| b.targets.edition.version);
         if newest != expected {
             return match before {
@@ -295,8 +334,8 @@ impl Repository {
     /// # Errors
     /// Why it was not signed.
     pub async fn freshen(&self, now: Utc) -> Result<Option<u64>, Error> {
-        let writing = self.writing.clone().lock_owned().await;
-        let Some(before) = self.newest() else { return Ok(None) };
+        let (writing, before) = self.turn().await?;
+        let Some(before) = before else { return Ok(None) };
         let issued = before.stamp.issued;
         let age_ms = now.ms_since(issued);
         // A clock that went back says nothing of the age.
@@ -312,10 +351,13 @@ impl Repository {
         Ok(Some(FRESHEN_AFTER_MS))
     }
 
-    /// What it says now, and that it says nothing else as long as the guard is held.
-    pub async fn still(&self) -> (Option<Arc<Newest>>, OwnedMutexGuard<()>) {
-        let guard = self.writing.clone().lock_owned().await;
-        (self.newest(), guard)
+    /// What it says now, and that it says nothing else as long as the turn lasts.
+    ///
+    /// # Errors
+    /// If nobody knows what it says.
+    pub async fn still(&self) -> Result<(Option<Arc<Newest>>, Turn), Error> {
+        let (turn, newest) = self.turn().await?;
+        Ok((newest, turn))
     }
 
     /// Files that a bundle consists of: its manifest and its components. None: the manifest is not here. A file of that digest that
@@ -339,6 +381,18 @@ impl Repository {
             }
             Err(_) => Ok(Some(vec![bundle])),
         }
+    }
+
+    /// Documents of a publication, in the order in which they would be written.
+    #[cfg(test)]
+    pub(crate) async fn prepared(
+        &self,
+        roots: Vec<Vec<u8>>,
+        targets: Vec<u8>,
+        now: Utc,
+    ) -> Result<Vec<(String, Vec<u8>)>, Error> {
+        let publication = self.prepare(self.newest().as_deref(), roots, targets, now).await?;
+        Ok(publication.writes)
     }
 
     /// Whether the repository has these roots already.
@@ -376,8 +430,14 @@ impl Repository {
         let root = check::roots(before.map(|b| &b.root), &roots, now)?;
         let targets = check::targets(&root, before.map(|b| &b.targets), targets, now)?;
         let files = listed(&targets.bytes)?;
+        if self.documents.is_shared() {
+            // What another process brought is durable under its name from here on.
+            self.content.list().await?;
+        }
         let mut seen = self.seen().await?;
         let releases = check::releases(&files, self.content.as_ref(), &mut seen, now).await?;
+        let key_set = check::key_sets(&files, before, self.content.as_ref(), &self.keys).await?;
+        seen = self.known_of(seen, &files).await?;
         let (online, stamp) = self.sign(before, &root, &targets.bytes, now)?;
         let first_root = root.edition.version + 1 - roots.len() as u64;
         let mut writes: Vec<(String, Vec<u8>)> =
@@ -387,7 +447,7 @@ impl Repository {
         writes.push((file(targets.edition.version, "targets"), targets.bytes.clone()));
         writes.push((file(stamp.snapshot_version, "snapshot"), online.snapshot));
         writes.push((TIMESTAMP.to_owned(), online.timestamp.clone()));
-        let newest = Newest::of(root, targets, stamp, files, releases, online.timestamp);
+        let newest = Newest { key_set, ..Newest::of(root, targets, stamp, files, releases, online.timestamp) };
         Ok(Publication { writes, newest })
     }
 
@@ -399,21 +459,35 @@ impl Repository {
         Ok((online, stamp))
     }
 
+    /// Those bundles whose manifest is listed or still here: of the others nobody asks.
+    async fn known_of(
+        &self,
+        mut seen: BTreeMap<Digest, Utc>,
+        files: &[FileTarget],
+    ) -> Result<BTreeMap<Digest, Utc>, Error> {
+        let listed: BTreeSet<Digest> = files.iter().map(|file| file.digest).collect();
+        for digest in seen.keys().copied().filter(|digest| !listed.contains(digest)).collect::<Vec<_>>() {
+            if self.content.length(digest).await?.is_none() {
+                seen.remove(&digest);
+            }
+        }
+        Ok(seen)
+    }
+
     async fn seen(&self) -> Result<BTreeMap<Digest, Utc>, Error> {
         let folder = self.folder.clone();
         blocking(move || read_seen(&folder)).await
     }
 
     /// Writes one document after the other, each whole and durable, and shows the result: also if nobody waits for it any more.
-    async fn commit(&self, writing: OwnedMutexGuard<()>, publication: Publication) -> Result<Arc<Newest>, Error> {
+    async fn commit(&self, writing: Turn, publication: Publication) -> Result<Arc<Newest>, Error> {
         let (folder, newest) = (self.folder.clone(), Arc::new(publication.newest));
-        let stale = newest.stamp.snapshot_version.checked_sub(SNAPSHOTS_KEPT);
-        let (place, shown) = (self.newest.clone(), newest.clone());
+        let (place, shown) = (self.documents.place(), newest.clone());
         blocking(move || {
             publication.writes.iter().try_for_each(|(name, bytes)| write_whole(&folder.join(name), bytes))?;
-            if let Some(stale) = stale {
-                // Whether it is gone matters to nobody.
-                let _ = fs::remove_file(folder.join(file(stale, "snapshot")));
+            if let Err(error) = prune(&folder) {
+                // Nobody reads them any more; the next publication tries again.
+                tracing::warn!(%error, "older documents stay");
             }
             *place.write().unwrap_or_else(PoisonError::into_inner) = Some(shown);
             drop(writing);
@@ -435,7 +509,7 @@ impl Newest {
     ) -> Self {
         let digests = files.iter().map(|file| file.digest).collect();
         let files = files.into_iter().map(|file| (file.name.clone(), file)).collect();
-        Self { root, targets, stamp, files, releases, digests, timestamp }
+        Self { root, targets, stamp, files, releases, key_set: None, digests, timestamp }
     }
 }
 
@@ -443,66 +517,24 @@ fn files_of(bundle: Digest, manifest: &Manifest) -> Vec<Digest> {
     std::iter::once(bundle).chain(manifest.components.iter().map(|component| component.digest)).collect()
 }
 
-/// Documents that the timestamp of a folder leads to.
-struct Found {
-    root: Kept,
-    targets: Kept,
-    timestamp: Vec<u8>,
-    stamp: Stamp,
-    seen: BTreeMap<Digest, Utc>,
-}
-
-impl Found {
-    /// With its bundles. A file that is gone is told and left out: the rest can be had still.
-    async fn complete(self, content: &dyn Content) -> Result<Newest, Error> {
-        let files = listed(&self.targets.bytes)?;
-        let mut releases = Vec::new();
-        for file in files.iter().filter(|file| check::is_manifest(file)) {
-            match check::manifest(file, content).await? {
-                Ok(manifest) => {
-                    let seen = self.seen.get(&file.digest).copied().unwrap_or_default();
-                    releases.push(Release { digest: file.digest, manifest, seen });
-                }
-                Err(problem) => tracing::error!(file = file.name, problem, "a signed bundle cannot be read"),
-            }
-        }
-        check::sort(&mut releases);
-        Ok(Newest::of(self.root, self.targets, self.stamp, files, releases, self.timestamp))
+/// Removes snapshots but for the last [`SNAPSHOTS_KEPT`], and targets documents that none of those left names. Roots stay: a robot that was away
+/// goes from each to the next.
+fn prune(folder: &Path) -> Result<(), Error> {
+    let (mut snapshots, mut targets) = (BTreeSet::new(), BTreeSet::new());
+    for entry in fs::read_dir(folder).map_err(io("reading", folder))? {
+        let name = entry.map_err(io("reading", folder))?.file_name();
+        let number = |role: &str| name.to_str()?.strip_suffix(&format!(".{role}.json"))?.parse::<u64>().ok();
+        snapshots.extend(number("snapshot"));
+        targets.extend(number("targets"));
     }
-}
-
-/// Reads a folder. Of the roots the newest counts under which everything else holds: a later one came with a publication that was cut.
-fn find(folder: &Path) -> Result<Option<Found>, Error> {
-    fs::create_dir_all(folder).map_err(io("making", folder))?;
-    let Some(timestamp) = read(&folder.join(TIMESTAMP))? else { return Ok(None) };
-    let damaged = |text: String| Error::Damaged { folder: folder.to_owned(), text };
-    let must = |name: String| read(&folder.join(&name))?.ok_or_else(|| damaged(format!("{name} is gone")));
-    let stamp = stamp(&timestamp)?;
-    let snapshot = must(file(stamp.snapshot_version, "snapshot"))?;
-    let targets = must(file(newest_targets(&snapshot)?, "targets"))?;
-    let online = Online { snapshot, timestamp };
-    let (mut before, mut root): (Option<Vec<u8>>, _) = (None, None);
-    let mut objection = "1.root.json is gone".to_owned();
-    for version in 1.. {
-        let Some(bytes) = read(&folder.join(file(version, "root")))? else { break };
-        if let Err(error) = check_root(before.as_ref().unwrap_or(&bytes), &bytes) {
-            objection = format!("{}: {error}", file(version, "root"));
-            break;
-        }
-        match check_online(&bytes, &targets, &online) {
-            Ok(()) => root = Some(bytes.clone()),
-            Err(error) => objection = error.to_string(),
-        }
-        before = Some(bytes);
-    }
-    let root = root.ok_or_else(|| damaged(objection))?;
-    Ok(Some(Found {
-        root: Kept { edition: root_edition(&root)?, bytes: root },
-        targets: Kept { edition: targets_edition(&targets)?, bytes: targets },
-        timestamp: online.timestamp,
-        stamp,
-        seen: read_seen(folder)?,
-    }))
+    let stale = snapshots.len().saturating_sub(SNAPSHOTS_KEPT);
+    let Some(oldest) = snapshots.iter().nth(stale) else { return Ok(()) };
+    // Both rise together, so the oldest snapshot names the oldest targets.
+    let Some(oldest) = read(&folder.join(file(*oldest, "snapshot")))? else { return Ok(()) };
+    let named = newest_targets(&oldest)?;
+    let gone = snapshots.iter().take(stale).map(|number| file(*number, "snapshot"));
+    let gone = gone.chain(targets.range(..named).map(|number| file(*number, "targets")));
+    gone.map(|name| folder.join(name)).try_for_each(|path| fs::remove_file(&path).map_err(io("removing", &path)))
 }
 
 /// Makes what is signed in `folder` from now on have at least this version: robots have seen versions that a restored repository does not

@@ -147,6 +147,17 @@ CREATE TABLE fleet_event (
     UNIQUE (site_id, seq)
 );
 
+CREATE TABLE fleet_leader (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE TABLE fleet_mark (
     site_id TEXT NOT NULL,
     id TEXT NOT NULL,
@@ -224,6 +235,17 @@ CREATE TABLE ota_event (
     request_id TEXT,
     at_unix_ms BIGINT NOT NULL,
     UNIQUE (site_id, seq)
+);
+
+CREATE TABLE ota_leader (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
 );
 
 CREATE TABLE ota_mark (
@@ -329,6 +351,22 @@ CREATE TABLE robot_inbox (
     request_id TEXT,
     at_unix_ms BIGINT NOT NULL,
     UNIQUE (site_id, seq)
+);
+
+CREATE TABLE robot_last (
+    site_id TEXT NOT NULL,
+    robot_id TEXT NOT NULL,
+    position BIGINT NOT NULL,
+    session_epoch BIGINT NOT NULL,
+    hb BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, robot_id)
+);
+
+CREATE TABLE robot_last_head (
+    site_id TEXT NOT NULL,
+    position BIGINT NOT NULL,
+    UNIQUE (site_id)
 );
 
 CREATE TABLE robot_software (
@@ -501,6 +539,8 @@ CREATE INDEX ota_event_by_subject ON ota_event (site_id, subject, seq);
 CREATE INDEX request_key_by_ord ON request_key (site_id, ord, id);
 
 CREATE INDEX robot_inbox_by_subject ON robot_inbox (site_id, subject, seq);
+
+CREATE INDEX robot_last_by_position ON robot_last (site_id, position);
 
 CREATE INDEX rollout_by_ord ON rollout (site_id, ord, id);
 

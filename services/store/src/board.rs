@@ -9,6 +9,7 @@
 use midshift_core::ids::RobotId;
 use std::collections::BTreeMap;
 use std::ops::Bound;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard};
 use tokio::sync::watch;
 
@@ -17,6 +18,8 @@ use tokio::sync::watch;
 pub struct LiveBoard<T> {
     robots: RwLock<Robots<T>>,
     changed: watch::Sender<u64>,
+    /// Up to where the log of newest heartbeats was read into it; 0: not at all.
+    read_up_to: AtomicU64,
 }
 
 #[derive(Debug)]
@@ -29,7 +32,7 @@ struct Robots<T> {
 impl<T> Default for LiveBoard<T> {
     fn default() -> Self {
         let robots = Robots { newest: BTreeMap::new(), by_number: BTreeMap::new(), number: 0 };
-        Self { robots: RwLock::new(robots), changed: watch::Sender::new(0) }
+        Self { robots: RwLock::new(robots), changed: watch::Sender::new(0), read_up_to: AtomicU64::new(0) }
     }
 }
 
@@ -78,6 +81,15 @@ impl<T: Send + Sync + 'static> LiveBoard<T> {
     /// All robots, sorted by id. The values are shared, not copied.
     pub fn all(&self) -> Vec<(RobotId, Arc<T>)> {
         self.robots().newest.iter().filter_map(|(id, (_, live))| Some((id.clone(), live.clone()?))).collect()
+    }
+
+    /// Up to which position of the [`crate::HeardLog`] everything is on the board; 0: it is not read from there.
+    pub fn read_up_to(&self) -> u64 {
+        self.read_up_to.load(Ordering::Acquire)
+    }
+
+    pub(crate) fn set_read_up_to(&self, position: u64) {
+        self.read_up_to.store(position, Ordering::Release);
     }
 
     /// A number that rises with every change.

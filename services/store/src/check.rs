@@ -106,7 +106,7 @@ pub(crate) fn decide(
 ) -> Result<Decided, CommitError> {
     form(&item)?;
     expectations(&item, found)?;
-    let Item { writer, actor, request_id, rows, facts } = item;
+    let Item { writer, actor, request_id, rows, facts, silent: _ } = item;
     let mut decided =
         Decided { rows: Vec::new(), entries: Vec::new(), applied: Applied { seq: head, revisions: Vec::new() } };
     let entry = |seq: &mut Seq, log, subject, kind: &str, body| {

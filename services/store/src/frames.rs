@@ -81,6 +81,11 @@ pub trait FrameLog: Send + Sync + 'static {
     async fn append(&self, frames: Vec<Frame>) -> Result<(), Error>;
     /// How far each ring has come, sorted by robot and ring; for start-up.
     async fn marks(&self) -> Result<Vec<FrameMark>, Error>;
+    /// How far one ring has come, whoever wrote it; 0: nothing of it is kept.
+    async fn mark(&self, robot_id: &RobotId, ring: &str) -> Result<u64, Error> {
+        let marks = self.marks().await?;
+        Ok(marks.iter().find(|m| m.robot_id == *robot_id && *m.ring == *ring).map_or(0, |m| m.seq))
+    }
     /// Frames after a position, whole groups, until `bytes_max` is passed. Empty: there is nothing newer.
     async fn read(&self, after: u64, bytes_max: usize) -> Result<Vec<StoredFrame>, Error>;
     /// Writes gaps down; durable on return.

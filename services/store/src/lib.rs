@@ -4,7 +4,7 @@
 //! acknowledged only once it is as durable as the store can make it. No decision about the fleet is made here.
 //! Called by the services through [`Store`]; [`MemoryStore`], [`SqliteStore`] and [`PostgresStore`] pass one contract suite (`tests/store/contract.rs`).
 //!
-//! What is volatile (heartbeats, poses) is on the [`LiveBoard`]; what is bulky (samples) is in the [`FrameLog`]; neither is a row.
+//! What is volatile (heartbeats, poses) is on the [`LiveBoard`], which several processes share through the [`HeardLog`]; what is bulky (samples) is in the [`FrameLog`]; neither is a row.
 
 mod board;
 mod check;
@@ -12,6 +12,8 @@ mod frames;
 mod frames_pack;
 mod frames_queue;
 mod group;
+mod heard;
+pub mod lead;
 mod migrations;
 mod model;
 mod model_table;
@@ -24,15 +26,16 @@ mod sqlite;
 
 pub use board::{Dirty, LiveBoard};
 pub use frames::{FRAME_BYTES_DEFAULT, Frame, FrameLog, FrameMark, GAPS_MAX, Gap, MemoryFrames, StoredFrame};
+pub use heard::{Heard, HeardLog, Kept, MemoryHeard, follow_heard};
 pub use migrations::Migrated;
 pub use model::MemoryStore;
 pub use open_error::OpenError;
-pub use postgres::{PostgresConfig, PostgresFrames, PostgresStore, Wakes, migrate_postgres};
+pub use postgres::{PostgresConfig, PostgresFrames, PostgresHeard, PostgresStore, Wakes, migrate_postgres};
 pub use projection::{Change, Fold, Projection};
-pub use sqlite::{Database, Described, SqliteFrames, SqliteStore, migrate, renew_identity};
+pub use sqlite::{Database, Described, SqliteFrames, SqliteStore, identity, migrate, renew_identity};
 
 use async_trait::async_trait;
-use midshift_core::ids::SiteId;
+use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::limits;
 use midshift_core::rows::{BadRow, Entry, Item, Key, Log, Record, Revision, Row, Seq, Table, Writer};
 use std::fmt;
@@ -106,6 +109,12 @@ pub enum CommitError {
         key: Key,
         /// Its revision; none if there is no such row.
         found: Option<Revision>,
+    },
+    /// A robot that had to be silent was heard meanwhile: plan again from what it says.
+    #[error("{robot_id} was heard meanwhile")]
+    Heard {
+        /// Which robot.
+        robot_id: RobotId,
     },
     /// A service tried to write what another one owns. A defect of the caller.
     #[error("{} may not write {owned}", writer.as_str())]
@@ -248,6 +257,8 @@ pub trait Store: Send + Sync + 'static {
     fn id(&self) -> &StoreId;
     /// The site whose rows these are; it is in every key.
     fn site_id(&self) -> &SiteId;
+    /// Whether other processes may write to it too while it is open.
+    fn is_shared(&self) -> bool;
     /// Applies items in order, each for itself; results in the same order. Returns after the fsync that holds them. A later
     /// item may expect the revision that an earlier one writes. Dropping the future takes nothing back.
     async fn commit(&self, items: Vec<Item>) -> Vec<Result<Applied, CommitError>>;

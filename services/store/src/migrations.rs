@@ -82,6 +82,11 @@ pub(crate) const CONTROL: &[Migration] = migrations!["control":
     "0060_rollout_robot_by_parent",
     "0061_rollout_by_ord",
     "0062_bundle_by_ord",
+    "0063_robot_last_head",
+    "0064_robot_last",
+    "0065_robot_last_by_position",
+    "0066_fleet_leader",
+    "0067_ota_leader",
 ];
 
 /// Of `telemetry.db`.

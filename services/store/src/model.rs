@@ -27,6 +27,7 @@ pub struct MemoryStore {
     site_id: SiteId,
     clock: Arc<dyn Clock>,
     log_entries_max: usize,
+    shared: bool,
     state: Mutex<State>,
     wake: watch::Sender<Seq>,
 }
@@ -63,13 +64,20 @@ impl MemoryStore {
         let head = Seq(clock.now().wall.0.max(0).cast_unsigned());
         let state = State { head, tables: BTreeMap::new(), logs: Default::default() };
         let wake = watch::Sender::new(head);
-        Self { id, site_id, clock, log_entries_max: LOG_ENTRIES_DEFAULT, state: Mutex::new(state), wake }
+        Self { id, site_id, clock, log_entries_max: LOG_ENTRIES_DEFAULT, shared: false, state: Mutex::new(state), wake }
     }
 
     /// Keeps at most `entries` in each log instead of 200,000.
     #[must_use]
     pub fn with_log_entries_max(mut self, entries: usize) -> Self {
         self.log_entries_max = entries;
+        self
+    }
+
+    /// Says of itself that it is shared: for tests of services that run several times.
+    #[must_use]
+    pub fn shared(mut self) -> Self {
+        self.shared = true;
         self
     }
 
@@ -128,6 +136,10 @@ impl Store for MemoryStore {
 
     fn site_id(&self) -> &SiteId {
         &self.site_id
+    }
+
+    fn is_shared(&self) -> bool {
+        self.shared
     }
 
     async fn commit(&self, items: Vec<Item>) -> Vec<Result<Applied, CommitError>> {

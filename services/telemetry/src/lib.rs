@@ -14,6 +14,7 @@ mod presence;
 mod registry;
 mod replay;
 mod session;
+mod shared;
 mod status;
 mod welcome;
 
@@ -26,10 +27,11 @@ use midshift_core::work::Live;
 use midshift_proto::link::v1::link_service_server::LinkServiceServer;
 use midshift_proto::link::v1::replay_service_server::ReplayServiceServer;
 use midshift_proto::telemetry::v1::telemetry_service_server::TelemetryServiceServer;
-use midshift_store::{Error, FrameLog, LiveBoard, Store};
+use midshift_store::{Error, FrameLog, HeardLog, LiveBoard, Store};
 use picture::Picture;
 use registry::Registry;
 use std::sync::Arc;
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 /// What the service is built from.
@@ -40,6 +42,8 @@ pub struct Parts {
     pub frames: Arc<dyn FrameLog>,
     /// Newest heartbeats, read by fleet.
     pub board: Arc<LiveBoard<Live>>,
+    /// Where other processes read them, if any may open the store too.
+    pub heard: Option<Arc<dyn HeardLog>>,
     /// Clocks.
     pub clock: Arc<dyn Clock>,
     /// Naive rules for twins of tests; none outside them.
@@ -51,6 +55,9 @@ pub(crate) struct Inner {
     pub picture: Picture,
     pub registry: Registry,
     pub ear: ear::Ear,
+    pub shared: Option<shared::Shared>,
+    /// Robots are asked to go to another gateway, and no new one is taken.
+    pub moving: CancellationToken,
     pub shutdown: CancellationToken,
 }
 
@@ -64,7 +71,8 @@ impl TelemetryService {
     /// A service that ends its sessions at `shutdown`. Sessions wait until [`TelemetryService::run`] has read the store once.
     pub fn new(parts: Parts, shutdown: CancellationToken) -> Self {
         let (picture, registry, ear) = (Picture::default(), Registry::default(), ear::Ear::default());
-        let inner = Inner { parts, picture, registry, ear, shutdown };
+        let shared = parts.heard.clone().map(shared::Shared::new);
+        let inner = Inner { parts, picture, registry, ear, shared, moving: CancellationToken::new(), shutdown };
         Self { inner: Arc::new(inner) }
     }
     /// The robots' face.
@@ -78,6 +86,20 @@ impl TelemetryService {
     /// The people's and programs' face.
     pub fn grpc(&self) -> TelemetryServiceServer<Self> {
         TelemetryServiceServer::new(self.clone())
+    }
+    /// Whether the database that several processes share has not been reached for long, so that no session is held here; it may come back.
+    /// None: this process needs nobody else.
+    pub fn cut_off(&self) -> Option<watch::Receiver<bool>> {
+        self.inner.shared.as_ref().map(shared::Shared::cut_off)
+    }
+    /// Sessions in charge here.
+    pub fn sessions(&self) -> usize {
+        self.inner.registry.in_charge()
+    }
+    /// Takes no new sessions and asks every robot to open its next one elsewhere; returns when none is left.
+    pub async fn move_over(&self) {
+        self.inner.moving.cancel();
+        self.inner.registry.empty().await;
     }
     /// Listens for the beacons of launchers on `socket` until shutdown: hints for people, which nobody proves and nothing is decided by.
     pub async fn hear(self, socket: tokio::net::UdpSocket) {
@@ -94,6 +116,7 @@ impl TelemetryService {
             () = inner.shutdown.cancelled() => Ok(()),
             result = picture::keep(&inner) => result,
             () = presence::keep(&inner) => Ok(()),
+            () = shared::keep(&inner) => Ok(()),
         }
     }
 }

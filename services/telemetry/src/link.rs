@@ -48,6 +48,9 @@ impl TelemetryService {
     async fn hold(&self, mut up: Streaming<v1::SessionRequest>, down: Down) -> Result<(), Refusal> {
         let hello = hello(&mut up).await?;
         welcome::check(&self.inner, &hello)?;
+        if self.inner.moving.is_cancelled() {
+            return Err(Refusal::new(Kind::Unavailable, Code::ShuttingDown));
+        }
         self.inner.picture.ready().await;
         let begun = welcome::begin(&self.inner, &hello).await?;
         tracing::info!(robot_id = %hello.robot_id, session_epoch = begun.welcome.session_epoch, observed = begun.welcome.observed, "session begun");

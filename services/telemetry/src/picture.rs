@@ -4,7 +4,7 @@
 
 use crate::Inner;
 use midshift_core::ids::RobotId;
-use midshift_core::rows::{BadRow, Table};
+use midshift_core::rows::{BadRow, Seq, Table};
 use midshift_core::update::DesiredUpdate;
 use midshift_core::work::{DesiredPolicy, DesiredWork, LaneMark, PresenceRow, Session};
 use midshift_store::{Change, Dirty, Error, Fold, LiveBoard, Projection};
@@ -12,9 +12,12 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 use std::time::Duration;
 use tokio::sync::watch;
+use tokio::time::Instant;
 
 /// Pause before a store that failed is read again.
 const STORE_RETRY: Duration = Duration::from_millis(200);
+/// How often it is read anew how far other gateways have kept STATUS.
+const MARKS_EVERY: Duration = Duration::from_secs(5);
 
 /// Desired state of one robot, section by section.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -47,6 +50,8 @@ pub struct Picture {
     rows: RwLock<Rows>,
     watchers: Mutex<BTreeMap<RobotId, watch::Sender<Sections>>>,
     ready: watch::Sender<bool>,
+    /// Up to where the feed has been taken.
+    absorbed: watch::Sender<Seq>,
     /// Robots that changed otherwise than by a heartbeat.
     touched: Arc<LiveBoard<()>>,
 }
@@ -80,6 +85,11 @@ impl Picture {
     pub async fn ready(&self) {
         // The sender lives as long as this picture.
         let _ = self.ready.subscribe().wait_for(|ready| *ready).await;
+    }
+    /// Waits until what the feed holds up to `seq` has been handed to sessions.
+    pub async fn absorbed(&self, seq: Seq) {
+        // The sender lives as long as this picture.
+        let _ = self.absorbed.subscribe().wait_for(|absorbed| *absorbed >= seq).await;
     }
     /// Says that something other than its newest heartbeat changed about a robot.
     pub fn touch(&self, robot_id: &RobotId) {
@@ -139,7 +149,12 @@ impl Fold for Keeper {
         drop(rows);
         match change.key.table {
             Table::DesiredWork | Table::DesiredPolicy | Table::DesiredUpdate => self.0.picture.publish(&robot_id),
-            Table::Session | Table::Presence => self.0.picture.touch(&robot_id),
+            Table::Session => {
+                let newest = self.0.picture.rows().sessions.get(&robot_id).map(|s| s.session_epoch);
+                self.0.registry.fence(&robot_id, newest.unwrap_or(0));
+                self.0.picture.touch(&robot_id);
+            }
+            Table::Presence => self.0.picture.touch(&robot_id),
             _ => {}
         }
         Ok(())
@@ -157,11 +172,13 @@ fn put<K: Ord, V>(map: &mut BTreeMap<K, V>, key: K, value: Option<V>) {
 pub async fn keep(inner: &Arc<Inner>) -> Result<(), Error> {
     let mut wake = inner.parts.store.wake();
     load_status(inner).await;
+    let mut read_marks = Instant::now();
     let mut projection = Projection::new(Keeper(inner.clone()));
     loop {
         wake.mark_unchanged();
         match projection.advance(inner.parts.store.as_ref()).await {
             Ok(_) => {
+                inner.picture.absorbed.send_replace(projection.seq());
                 inner.picture.ready.send_if_modified(|ready| !std::mem::replace(ready, true));
             }
             Err(error) => {
@@ -173,6 +190,11 @@ pub async fn keep(inner: &Arc<Inner>) -> Result<(), Error> {
         if wake.changed().await.is_err() {
             return Ok(());
         }
+        // Other gateways keep STATUS too; for people only, since a session asks for its own ring when it begins.
+        if inner.shared.is_some() && read_marks.elapsed() >= MARKS_EVERY {
+            read_marks = Instant::now();
+            load_status(inner).await;
+        }
     }
 }
 
@@ -181,7 +203,8 @@ async fn load_status(inner: &Inner) {
         Ok(marks) => {
             let mut rows = inner.picture.rows_mut();
             for mark in marks {
-                rows.status.insert((mark.robot_id, mark.ring), mark.seq);
+                let known = rows.status.entry((mark.robot_id, mark.ring)).or_default();
+                *known = mark.seq.max(*known);
             }
         }
         Err(error) => {

@@ -1,13 +1,14 @@
 //! Decides ONLINE, SUSPECT and OFFLINE from heartbeats alone, and writes what changed.
 //!
-//! Invariant: nobody's clock but ours takes part; a store that fails costs one period.
+//! Invariant: nobody's clock but ours takes part; a store that fails costs one period. Of several gateways the one that had the robot's
+//! newest session writes at once, the others a little later if it has not.
 
 use crate::Inner;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::robot::Presence;
 use midshift_core::rows::{Expect, Item, Record, Revision, Writer};
-use midshift_core::time::LinkTime;
+use midshift_core::time::{LinkDuration, LinkTime};
 use midshift_core::work::PresenceRow;
 use midshift_store::{Query, Store};
 use std::collections::BTreeMap;
@@ -27,6 +28,11 @@ pub fn of(heard: Option<LinkTime>, now: LinkTime) -> Presence {
     }
 }
 
+/// What another gateway should have written is left to it for this long.
+const LEFT_TO_OTHERS: LinkDuration = LinkDuration::from_secs(2);
+
+/// What is not ours to write yet, and since when.
+type Stood = BTreeMap<RobotId, (Presence, LinkTime)>;
 type Known = BTreeMap<RobotId, (PresenceRow, Revision)>;
 
 async fn read(store: &dyn Store) -> Option<Known> {
@@ -46,7 +52,7 @@ async fn read(store: &dyn Store) -> Option<Known> {
 
 /// Keeps presence until it is dropped.
 pub async fn keep(inner: &Inner) {
-    let mut known: Option<Known> = None;
+    let (mut known, mut stood): (Option<Known>, Stood) = (None, Stood::new());
     let started = inner.parts.clock.now().link;
     let mut tick = tokio::time::interval(PERIOD);
     tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -56,14 +62,14 @@ pub async fn keep(inner: &Inner) {
             known = read(inner.parts.store.as_ref()).await;
         }
         let Some(rows) = &mut known else { continue };
-        if !write(inner, rows, started).await {
+        if !write(inner, rows, &mut stood, started).await {
             known = None;
         }
     }
 }
 
 /// Writes what changed; false: the rows must be read again.
-async fn write(inner: &Inner, known: &mut Known, started: LinkTime) -> bool {
+async fn write(inner: &Inner, known: &mut Known, stood: &mut Stood, started: LinkTime) -> bool {
     let now = inner.parts.clock.now();
     let heard: BTreeMap<RobotId, LinkTime> =
         inner.parts.board.all().into_iter().map(|(id, live)| (id, live.processed_at)).collect();
@@ -78,7 +84,7 @@ async fn write(inner: &Inner, known: &mut Known, started: LinkTime) -> bool {
             let old = known.get(&robot_id);
             let same = old.is_some_and(|(row, _)| row.presence == presence);
             let too_early = young && !heard.contains_key(&robot_id);
-            if same || too_early {
+            if same || too_early || is_others(inner, &robot_id, (presence, now.link), stood) {
                 return None;
             }
             let row = PresenceRow { robot_id, presence, since_unix_ms: now.wall.0 };
@@ -102,6 +108,22 @@ async fn write(inner: &Inner, known: &mut Known, started: LinkTime) -> bool {
         known.insert(row.robot_id.clone(), (row, revision.next()));
     }
     applied
+}
+
+/// Whether another gateway writes it, or has.
+fn is_others(inner: &Inner, robot_id: &RobotId, (presence, now): (Presence, LinkTime), stood: &mut Stood) -> bool {
+    if inner.shared.is_none() || inner.registry.is_home(robot_id) {
+        return false;
+    }
+    if inner.picture.rows().presence.get(robot_id).is_some_and(|row| row.presence == presence) {
+        stood.remove(robot_id);
+        return true;
+    }
+    let since = stood.entry(robot_id.clone()).or_insert((presence, now));
+    if since.0 != presence {
+        *since = (presence, now);
+    }
+    now.since(since.1) < LEFT_TO_OTHERS
 }
 
 #[cfg(test)]

@@ -9,7 +9,7 @@ use midshift_core::time::{LinkTime, Utc};
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 
 /// One session in charge.
@@ -59,6 +59,10 @@ pub struct Registry {
     sessions: Mutex<BTreeMap<RobotId, InCharge>>,
     /// Since when each of the observed ones is attached.
     observed: Mutex<BTreeMap<RobotId, Vec<Utc>>>,
+    /// Which session of each robot ended here last.
+    left: Mutex<BTreeMap<RobotId, u64>>,
+    /// How many are in charge.
+    count: watch::Sender<usize>,
 }
 
 impl Registry {
@@ -78,8 +82,29 @@ impl Registry {
         if let Some(old) = sessions.insert(robot_id.clone(), session) {
             old.fenced.cancel();
         }
-        metrics::gauge!("midshift_telemetry_sessions").set(sessions.len() as f64);
+        self.counted(sessions.len());
         true
+    }
+    /// Ends the session of a robot that is older than the newest that was begun anywhere.
+    pub fn fence(&self, robot_id: &RobotId, newest_epoch: u64) {
+        if let Some(old) = self.sessions().get(robot_id).filter(|s| s.session_epoch < newest_epoch) {
+            old.fenced.cancel();
+        }
+        let mut left = self.left();
+        if left.get(robot_id).is_some_and(|epoch| *epoch < newest_epoch) {
+            left.remove(robot_id);
+        }
+    }
+    /// Whether the robot's newest session is, or was, here.
+    pub fn is_home(&self, robot_id: &RobotId) -> bool {
+        self.sessions().contains_key(robot_id) || self.left().contains_key(robot_id)
+    }
+    fn left(&self) -> std::sync::MutexGuard<'_, BTreeMap<RobotId, u64>> {
+        self.left.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+    /// Whether this session was in charge here, and is no more.
+    pub fn has_left(&self, robot_id: &RobotId, session_epoch: u64) -> bool {
+        self.left().get(robot_id) == Some(&session_epoch)
     }
     fn observed(&self) -> std::sync::MutexGuard<'_, BTreeMap<RobotId, Vec<Utc>>> {
         self.observed.lock().unwrap_or_else(PoisonError::into_inner)
@@ -108,7 +133,21 @@ impl Registry {
         let mut sessions = self.sessions();
         if sessions.get(robot_id).is_some_and(|s| s.session_epoch == session_epoch) {
             sessions.remove(robot_id);
+            self.left().insert(robot_id.clone(), session_epoch);
         }
-        metrics::gauge!("midshift_telemetry_sessions").set(sessions.len() as f64);
+        self.counted(sessions.len());
+    }
+    fn counted(&self, sessions: usize) {
+        metrics::gauge!("midshift_telemetry_sessions").set(sessions as f64);
+        self.count.send_replace(sessions);
+    }
+    /// Sessions in charge.
+    pub fn in_charge(&self) -> usize {
+        *self.count.borrow()
+    }
+    /// Waits until no session is in charge here.
+    pub async fn empty(&self) {
+        // The sender lives as long as the registry.
+        let _ = self.count.subscribe().wait_for(|count| *count == 0).await;
     }
 }

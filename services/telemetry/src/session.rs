@@ -9,24 +9,26 @@ use crate::offset::Offset;
 use crate::picture::Sections;
 use crate::registry::InCharge;
 use crate::replay::{Replay, overloaded};
+use crate::shared::{News, Shared};
 use crate::status::{self, Arrived, StatusLane};
-use crate::welcome::Begun;
+use crate::welcome::{self, Begun};
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
-use midshift_core::robot::{Lane, ReportedAttempt};
+use midshift_core::robot::Lane;
 use midshift_core::time::{LinkDuration, SiteTime};
 use midshift_core::work::{InboxEntry, InboxItem, Live};
 use midshift_proto::link::v1;
 use midshift_proto::session::{
     ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, ToRobot, Uplink,
 };
+use std::collections::VecDeque;
 use std::future::Future;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
 use tonic::{Status, Streaming};
 
@@ -40,6 +42,9 @@ const SESSION_LIFE_JITTER_S: u64 = 300;
 const MOVE_OVER_WITHIN: Duration = Duration::from_secs(30);
 /// After a failed commit the robot is asked again not sooner than this.
 const COMMIT_RETRY: Duration = Duration::from_millis(200);
+
+/// Heartbeats of one session that wait to be kept; of more the oldest is not answered any more.
+const UNECHOED_MAX: usize = 16;
 
 type Boxed<T> = Pin<Box<dyn Future<Output = T> + Send>>;
 
@@ -62,6 +67,10 @@ struct Session {
     replaying: Option<(u64, oneshot::Sender<Result<LaneAck, Refusal>>)>,
     offset: Offset,
     progress: (u64, SiteTime),
+    /// Heartbeats that are not where other processes read them yet, with the answer they get then.
+    unechoed: VecDeque<Echo>,
+    /// What becomes of them.
+    kept: (mpsc::Sender<News>, mpsc::Receiver<News>),
     out: Downlink,
     out_since: Option<Instant>,
 }
@@ -96,6 +105,8 @@ pub async fn run(inner: Arc<Inner>, hello: &Hello, begun: Begun, mut up: Streami
         replaying: None,
         offset: Offset::default(),
         progress: (0, now.site),
+        unechoed: VecDeque::new(),
+        kept: mpsc::channel(UNECHOED_MAX),
         out: Downlink::default(),
         out_since: None,
         robot_id: robot_id.clone(),
@@ -115,11 +126,12 @@ impl Session {
         desired: &mut tokio::sync::watch::Receiver<Sections>,
     ) -> End {
         let fenced = self.in_charge.as_ref().map(|c| c.fenced.clone()).unwrap_or_default();
-        let shutdown = self.inner.shutdown.clone();
+        let (ends, shutdown) = (self.inner.moving.clone(), self.inner.shutdown.clone());
         let jitter = Duration::from_secs(rand::random_range(0..=SESSION_LIFE_JITTER_S));
         let life = tokio::time::sleep(SESSION_LIFE + jitter);
         tokio::pin!(life);
         let observed = self.in_charge.is_none();
+        let mut cut_off = self.inner.shared.as_ref().map(Shared::cut_off);
         let older = older_is_silent(self.inner.clone(), self.robot_id.clone());
         tokio::pin!(older);
         let mut moving = false;
@@ -165,6 +177,12 @@ impl Session {
                         out.update = sections.update.as_deref().cloned();
                     });
                 }
+                Some(news) = self.kept.1.recv() => if let Some(end) = self.heard(news) {
+                    return end;
+                },
+                () = is_cut_off(&mut cut_off) => {
+                    return close(CloseCode::MoveOver, Code::StoreUnavailable, limits::FENCED_RETRY);
+                }
                 () = at(unread_at) => return close(CloseCode::TooSlow, Code::Overloaded, LinkDuration(1_000)),
                 () = at(ack_at) => self.ack_status(),
                 () = &mut life => {
@@ -172,11 +190,12 @@ impl Session {
                         return close(CloseCode::MoveOver, Code::MoveOver, LinkDuration(0));
                     }
                     moving = true;
-                    if let Some(in_charge) = &self.in_charge {
-                        in_charge.moving.store(true, Relaxed);
-                    }
-                    let message = ToRobot::MoveOver { within_ms: MOVE_OVER_WITHIN.as_millis() as u32 };
-                    let _ = down.try_send(Ok((&message).into()));
+                    self.move_over(down);
+                    life.as_mut().reset(Instant::now() + MOVE_OVER_WITHIN);
+                }
+                () = ends.cancelled(), if !moving => {
+                    moving = true;
+                    self.move_over(down);
                     life.as_mut().reset(Instant::now() + MOVE_OVER_WITHIN);
                 }
                 () = &mut older, if observed => {
@@ -184,6 +203,15 @@ impl Session {
                 }
             }
         }
+    }
+
+    /// Asks the robot for its next session.
+    fn move_over(&self, down: &Down) {
+        if let Some(in_charge) = &self.in_charge {
+            in_charge.moving.store(true, Relaxed);
+        }
+        let message = ToRobot::MoveOver { within_ms: MOVE_OVER_WITHIN.as_millis() as u32 };
+        let _ = down.try_send(Ok((&message).into()));
     }
 
     fn say(&mut self, change: impl FnOnce(&mut Downlink)) {
@@ -233,9 +261,7 @@ impl Session {
         let mut report = heartbeat.reported;
         report.session_epoch = self.epoch;
         let hb = report.hb;
-        // Only whether it changes counts, so that absurd numbers do no harm.
-        let moved = |sum: u64, a: &ReportedAttempt| sum.wrapping_add(a.progress).wrapping_add(u64::from(a.step_index));
-        let progress = report.attempts.iter().fold(report.vitals.odometer_mm, moved);
+        let progress = report.progress();
         if progress != self.progress.0 {
             self.progress = (progress, now.site);
         }
@@ -251,9 +277,37 @@ impl Session {
             progress_at: self.progress.1,
             clock_offset_ms: self.offset.estimate(),
         };
-        self.inner.parts.board.put(&self.robot_id, Arc::new(live));
+        let live = Arc::new(live);
         let clock = ClockSample { t1_us: heartbeat.sent_unix_us, t2_us, t3_us: t2_us, t4_us: 0 };
-        self.say(|out| out.echo = Some(Echo { hb, clock }));
+        let echo = Echo { hb, clock };
+        match &self.inner.shared {
+            None => {
+                self.inner.parts.board.put(&self.robot_id, live);
+                self.say(|out| out.echo = Some(echo));
+            }
+            Some(shared) => {
+                shared.take(live, &self.kept.0);
+                self.unechoed.push_back(echo);
+                if self.unechoed.len() > UNECHOED_MAX {
+                    self.unechoed.pop_front();
+                }
+            }
+        }
+    }
+
+    /// A heartbeat is where every process can read it, or will never be.
+    fn heard(&mut self, news: News) -> Option<End> {
+        match news {
+            News::Fenced => return Some(close(CloseCode::Fenced, Code::Fenced, limits::FENCED_RETRY)),
+            News::Kept(hb) => {
+                let upto = self.unechoed.iter().take_while(|echo| echo.hb <= hb).count();
+                let newest = self.unechoed.drain(..upto).next_back();
+                if newest.is_some() {
+                    self.say(|out| out.echo = newest);
+                }
+            }
+        }
+        None
     }
 
     fn events(&mut self, batch: LaneBatch) {
@@ -389,11 +443,25 @@ impl Session {
     }
 }
 
+/// The database that several processes share has not been reached for long; never, if there is none.
+async fn is_cut_off(cut_off: &mut Option<watch::Receiver<bool>>) {
+    match cut_off {
+        // The sender lives as long as the service.
+        Some(cut_off) => drop(cut_off.wait_for(|cut_off| *cut_off).await),
+        None => std::future::pending().await,
+    }
+}
+
 /// An observed session waits until the session in charge is gone or silent; then its robot may come back and take charge.
 async fn older_is_silent(inner: Arc<Inner>, robot_id: RobotId) {
     loop {
         tokio::time::sleep(Duration::from_millis(limits::HEARTBEAT.as_ms())).await;
-        let Some(older) = inner.registry.get(&robot_id) else { return };
+        let Some(older) = inner.registry.get(&robot_id) else {
+            if welcome::is_heard_elsewhere(&inner, &robot_id) {
+                continue;
+            }
+            return;
+        };
         let now = inner.parts.clock.now().link;
         if now.since(older.heard()) > limits::SUSPECT_AFTER {
             older.fenced.cancel();

@@ -4,6 +4,7 @@ use crate::Inner;
 use crate::registry::InCharge;
 use crate::replay::Replay;
 use midshift_bundle::installed::{self, Rejection};
+use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::robot::Lane;
@@ -58,15 +59,15 @@ pub async fn begin(inner: &Inner, hello: &Hello) -> Result<Begun, Refusal> {
     for _ in 0..TRIES {
         let row = load::<Session>(store, hello.robot_id.as_str()).await.map_err(unavailable)?;
         let mark = mark_of(inner, hello).await?;
-        let status = inner.picture.durable_status(&hello.robot_id, &Arc::from(hello.ring.as_str()));
+        let status = status_of(inner, hello).await?;
         let proven = row.as_ref().is_some_and(|(row, _)| {
             hello.previous.as_ref().is_some_and(|p| p.session_epoch == row.session_epoch && p.secret == row.secret)
         });
-        let older = inner.registry.get(&hello.robot_id);
+        let is_held = inner.registry.get(&hello.robot_id).is_some() || is_heard_elsewhere(inner, &hello.robot_id);
         let now = inner.parts.clock.now();
         let last = row.as_ref().map_or(0, |(r, _)| r.session_epoch);
         let session_epoch = (last + 1).max(now.wall.0.max(0) as u64);
-        if older.is_some() && !proven && !inner.parts.bugs.no_clone_fence() {
+        if is_held && !proven && !inner.parts.bugs.no_clone_fence() {
             note_clone(inner, hello).await;
             // Its epoch and secret are in no row: they prove nothing later.
             let welcome = welcome(inner, session_epoch, draw_secret(), &mark.0, status, true);
@@ -101,6 +102,23 @@ async fn mark_of(inner: &Inner, hello: &Hello) -> Result<(LaneMark, Revision), R
     let fresh = LaneMark { robot_id: hello.robot_id.clone(), ring: hello.ring.clone(), critical: 0, event: 0 };
     let found = load::<LaneMark>(inner.parts.store.as_ref(), &fresh.id()).await.map_err(unavailable)?;
     Ok(found.unwrap_or((fresh, Revision(0))))
+}
+
+/// Durable STATUS of the robot's ring, which another gateway may have kept.
+async fn status_of(inner: &Inner, hello: &Hello) -> Result<u64, Refusal> {
+    let ring: Arc<str> = Arc::from(hello.ring.as_str());
+    if inner.shared.is_some() {
+        let kept = inner.parts.frames.mark(&hello.robot_id, &ring).await.map_err(unavailable)?;
+        inner.picture.status_durable(&hello.robot_id, &ring, kept);
+    }
+    Ok(inner.picture.durable_status(&hello.robot_id, &ring))
+}
+
+/// Whether another gateway has heard the robot a moment ago.
+pub fn is_heard_elsewhere(inner: &Inner, robot_id: &RobotId) -> bool {
+    let Some(live) = inner.parts.board.get(robot_id).filter(|_| inner.shared.is_some()) else { return false };
+    let silent = inner.parts.clock.now().link.since(live.processed_at);
+    silent <= limits::SUSPECT_AFTER && !inner.registry.has_left(robot_id, live.report.session_epoch)
 }
 
 fn draw_secret() -> String {

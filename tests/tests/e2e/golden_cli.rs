@@ -448,6 +448,10 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     t.note(&["doctor", "-o", "json"])?;
     t.note(&["doctor"])?;
     t.note(&["sim", "world", "-o", "json"])?;
+    t.note(&["health"])?;
+    t.note(&["health", "--ready", "-o", "json"])?;
+    t.note(&["health", "--service", "midshift.fleet.v1.FleetService"])?;
+    t.note(&["health", "--service", "midshift.stop.v1.StopService"])?;
     faults(&mut t).await?;
 
     // Without a server.
@@ -489,6 +493,8 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     let nobody = free_port()?.to_string();
     t.server = nobody;
     t.note(&["robot", "ls", "-o", "json"])?;
+    t.note(&["health"])?;
+    t.note(&["health", "--ready"])?;
 
     if std::env::var_os("BLESS").is_some() {
         std::fs::create_dir_all(golden().parent().context("a folder")?)?;

@@ -59,6 +59,10 @@ impl Running {
         let ear = child.stdin.take().context("stdin was piped")?;
         Ok((Self(child), ear))
     }
+    /// Its process id.
+    pub fn id(&self) -> u32 {
+        self.0.id()
+    }
     /// SIGKILL, and waits until it is gone.
     pub fn kill(&mut self) -> anyhow::Result<()> {
         self.0.kill()?;
@@ -194,14 +198,24 @@ impl Server {
     }
     /// Tasks.
     pub fn tasks(&self) -> anyhow::Result<TaskServiceClient<Channel>> {
-        Ok(TaskServiceClient::new(self.channel()?))
+        tasks(self.address)
     }
     /// Every task in one of these states; none while the server does not answer.
     pub async fn in_states(&self, states: &[TaskState]) -> anyhow::Result<Option<Vec<Task>>> {
-        let filter = TaskFilter { states: states.iter().map(|s| *s as i32).collect(), ..TaskFilter::default() };
-        let request = ListTasksRequest { filter: Some(filter), page_size: 1_000, page_token: String::new() };
-        Ok(self.tasks()?.list_tasks(request).await.ok().map(|page| page.into_inner().tasks))
+        in_states(self.address, states).await
     }
+}
+
+/// The intake of tasks at an address.
+pub fn tasks(address: SocketAddr) -> anyhow::Result<TaskServiceClient<Channel>> {
+    Ok(TaskServiceClient::new(channel(address)?))
+}
+
+/// Every task in one of these states; none while nobody answers there.
+pub async fn in_states(address: SocketAddr, states: &[TaskState]) -> anyhow::Result<Option<Vec<Task>>> {
+    let filter = TaskFilter { states: states.iter().map(|s| *s as i32).collect(), ..TaskFilter::default() };
+    let request = ListTasksRequest { filter: Some(filter), page_size: 1_000, page_token: String::new() };
+    Ok(tasks(address)?.list_tasks(request).await.ok().map(|page| page.into_inner().tasks))
 }
 
 /// A channel that connects when it is used.

@@ -1,11 +1,11 @@
 //! Twenty agent processes survive `kill -9` of the server three times and of five agents once each, while they work; and an immediate
 //! stop of PostgreSQL where the server keeps its rows there.
 
-use crate::harness::{Server, until};
+use crate::harness::{Server, in_states, tasks, until};
 use crate::robots::Robots;
 use midshift::background::request;
 use midshift_agent::ledger::Holder;
-use midshift_core::site::{DEMO, text};
+use midshift_core::site::{DEMO, Site, text};
 use midshift_proto::task::v1::{SubmitTasksRequest, Task, TaskState};
 use midshift_sim::oracle::Oracle;
 use midshift_sim::workload::{Workload, WorkloadConfig};
@@ -14,28 +14,22 @@ use rand::rngs::StdRng;
 use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
 use std::collections::{BTreeMap, BTreeSet};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 const ROBOTS: usize = 20;
-const TASKS: usize = 100;
+/// Tasks of one run.
+pub const TASKS: usize = 100;
 
-/// Printed points make a failing run readable.
-macro_rules! say {
-    ($($text:tt)*) => {{
-        use std::io::Write;
-        let _ = writeln!(std::io::stderr(), $($text)*);
-    }};
-}
-
-async fn done_and_running(server: &Server) -> anyhow::Result<Option<(usize, Vec<Task>)>> {
-    let done = server.in_states(&[TaskState::Succeeded]).await?;
-    let running = server.in_states(&[TaskState::Running]).await?;
+async fn done_and_running(server: SocketAddr) -> anyhow::Result<Option<(usize, Vec<Task>)>> {
+    let done = in_states(server, &[TaskState::Succeeded]).await?;
+    let running = in_states(server, &[TaskState::Running]).await?;
     Ok(done.zip(running).map(|(done, running)| (done.len(), running)))
 }
 
 /// Waits until so many tasks are done and others are at work at robots that were not killed.
-async fn at_work(server: &Server, done: usize, killed: &BTreeSet<String>) -> anyhow::Result<Vec<Task>> {
+pub async fn at_work(server: SocketAddr, done: usize, killed: &BTreeSet<String>) -> anyhow::Result<Vec<Task>> {
     until(&format!("{done} tasks done and others at work"), Duration::from_secs(120), || async {
         let Some((n, mut running)) = done_and_running(server).await? else { return Ok(None) };
         running.retain(|task| !killed.contains(&task.robot_id));
@@ -54,7 +48,7 @@ async fn kill_one_at_work(
     rng: &mut StdRng,
 ) -> anyhow::Result<Holder> {
     loop {
-        let running = at_work(server, done, killed).await?;
+        let running = at_work(server.address, done, killed).await?;
         let Some(task) = running.choose(rng) else { anyhow::bail!("nothing is at work") };
         let id = task.robot_id.clone();
         robots.kill(&id)?;
@@ -86,8 +80,8 @@ async fn killed_at_work(mut postgres: Option<PostgresServer>) -> anyhow::Result<
     let url = postgres.as_ref().map(PostgresServer::database);
     let flags: Vec<&str> = url.iter().flat_map(|url| ["--store", url.as_str()]).collect();
     let mut server = Server::start_with(dir.path(), DEMO, &flags).await?;
-    let mut robots = Robots::start(dir.path(), &server, &site, ROBOTS)?;
-    submit(&server, &site, seed).await?;
+    let mut robots = Robots::start(dir.path(), server.address, &site, ROBOTS)?;
+    submit(server.address, &site, seed).await?;
     let mut kills: Vec<(usize, bool)> =
         [(8, true), (16, false), (24, false), (32, true), (40, false), (48, false), (56, true), (62, false)]
             .into_iter()
@@ -106,7 +100,7 @@ async fn killed_at_work(mut postgres: Option<PostgresServer>) -> anyhow::Result<
             });
         }
         if of_server {
-            let running = at_work(&server, at, &BTreeSet::new()).await?;
+            let running = at_work(server.address, at, &BTreeSet::new()).await?;
             say!("seed {seed}: kill -9 of the server with {at} done and {} at work", running.len());
             server.kill_and_restart().await?;
             continue;
@@ -124,33 +118,31 @@ async fn killed_at_work(mut postgres: Option<PostgresServer>) -> anyhow::Result<
         }
     }
     assert_eq!(hits, 5, "agents killed at work; {killed:?}");
-    let over =
-        [TaskState::Succeeded, TaskState::Failed, TaskState::Canceled, TaskState::Expired, TaskState::NeedsOperator];
-    let ended = until("the end of every task", Duration::from_secs(240), || async {
-        Ok(server.in_states(&over).await?.filter(|tasks| tasks.len() == TASKS))
-    })
-    .await;
-    if ended.is_err() {
-        let open = server
-            .in_states(&[
-                TaskState::Queued,
-                TaskState::Assigned,
-                TaskState::Running,
-                TaskState::Stopping,
-                TaskState::RetryWait,
-            ])
-            .await?;
-        for task in open.unwrap_or_default() {
-            say!("open: {} {:?} {} {:?}", task.task_id, task.state(), task.robot_id, task.attempt);
-        }
-    }
-    let ended = ended?;
+    let ended = all_over(server.address).await?;
     judge(&ended, &inside, &site, &robots)?;
     judge_ledgers(&ended, robots).await
 }
 
+/// Waits for the end of every task.
+pub async fn all_over(server: SocketAddr) -> anyhow::Result<Vec<Task>> {
+    let over =
+        [TaskState::Succeeded, TaskState::Failed, TaskState::Canceled, TaskState::Expired, TaskState::NeedsOperator];
+    let ended = until("the end of every task", Duration::from_secs(240), || async {
+        Ok(in_states(server, &over).await?.filter(|tasks| tasks.len() == TASKS))
+    })
+    .await;
+    if ended.is_err() {
+        let open =
+            [TaskState::Queued, TaskState::Assigned, TaskState::Running, TaskState::Stopping, TaskState::RetryWait];
+        for task in in_states(server, &open).await?.unwrap_or_default() {
+            say!("open: {} {:?} {} {:?}", task.task_id, task.state(), task.robot_id, task.attempt);
+        }
+    }
+    ended
+}
+
 /// Every robot's own memory: a task that succeeded was finished by one robot, once.
-async fn judge_ledgers(tasks: &[Task], mut robots: Robots) -> anyhow::Result<()> {
+pub async fn judge_ledgers(tasks: &[Task], mut robots: Robots) -> anyhow::Result<()> {
     let mut finished: BTreeMap<String, Vec<String>> = BTreeMap::new();
     let ids: Vec<String> = robots.ids();
     for id in ids {
@@ -176,7 +168,8 @@ async fn judge_ledgers(tasks: &[Task], mut robots: Robots) -> anyhow::Result<()>
     Ok(())
 }
 
-async fn submit(server: &Server, site: &midshift_core::site::Site, seed: u64) -> anyhow::Result<()> {
+/// Submits a hundred tasks between stations.
+pub async fn submit(server: SocketAddr, site: &Site, seed: u64) -> anyhow::Result<()> {
     let mut workload =
         Workload::new(WorkloadConfig::background(seed), site).ok_or_else(|| anyhow::anyhow!("no stations"))?;
     let items: Vec<SubmitTasksRequest> = (0..TASKS)
@@ -186,17 +179,13 @@ async fn submit(server: &Server, site: &midshift_core::site::Site, seed: u64) ->
             SubmitTasksRequest { item: Some(item) }
         })
         .collect();
-    let answer = server.tasks()?.submit_tasks(tokio_stream::iter(items)).await?.into_inner();
+    let answer = tasks(server)?.submit_tasks(tokio_stream::iter(items)).await?.into_inner();
     anyhow::ensure!(answer.results.len() == TASKS, "{} of {TASKS} answered", answer.results.len());
     Ok(())
 }
 
-fn judge(
-    tasks: &[Task],
-    inside: &BTreeSet<String>,
-    site: &midshift_core::site::Site,
-    robots: &Robots,
-) -> anyhow::Result<()> {
+/// Held against the journals of the bodies: nothing is lost, nothing was done twice; only what was killed `inside` a step may need a person.
+pub fn judge(tasks: &[Task], inside: &BTreeSet<String>, site: &Site, robots: &Robots) -> anyhow::Result<()> {
     let succeeded = tasks.iter().filter(|t| t.state() == TaskState::Succeeded).count();
     let others: Vec<_> = tasks.iter().filter(|t| t.state() != TaskState::Succeeded).collect();
     for task in &others {

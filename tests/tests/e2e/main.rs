@@ -2,6 +2,14 @@
 //!
 //! `cargo xtask test` builds the programs once and says where they are.
 
+/// Printed points make a failing run readable.
+macro_rules! say {
+    ($($text:tt)*) => {{
+        use std::io::Write;
+        let _ = writeln!(std::io::stderr(), $($text)*);
+    }};
+}
+
 mod begin_and_end;
 mod clients;
 mod cut;
@@ -20,5 +28,7 @@ mod restored;
 mod robots;
 mod rolled_out;
 mod room;
+mod split;
+mod stack;
 mod swarm_software;
 mod tuf;

@@ -83,7 +83,7 @@ async fn robots_carry_on_from_a_backup_that_was_taken_while_they_worked() -> any
     let dir = tempfile::tempdir()?;
     let site = text::parse(DEMO)?;
     let mut server = Server::start(dir.path()).await?;
-    let robots = Robots::start(dir.path(), &server, &site, ROBOTS)?;
+    let robots = Robots::start(dir.path(), server.address, &site, ROBOTS)?;
     let before = submit(&server, &site, 1, "before").await?;
     until_done(&server, 2).await?;
     let (data, backup) = (server.data(), dir.path().join("backup"));

@@ -1,12 +1,13 @@
 //! Robots as programs of their own.
 
-use crate::harness::{Running, Server, midshift};
+use crate::harness::{Running, midshift};
 use midshift_agent::ledger::Ledger;
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::store::Store;
 use midshift_core::site::Site;
 use midshift_sim::swarm::AGENT_FILE;
 use std::collections::BTreeMap;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -23,10 +24,9 @@ pub struct Robots {
 
 impl Robots {
     /// Starts `count` of them at starting places of the site.
-    pub fn start(dir: &Path, server: &Server, site: &Site, count: usize) -> anyhow::Result<Self> {
+    pub fn start(dir: &Path, server: SocketAddr, site: &Site, count: usize) -> anyhow::Result<Self> {
         let starts = site.starting_places(count).into_iter().map(|at| site.name_of(at).to_string()).collect();
-        let server = server.address.to_string();
-        let mut robots = Self { dir: dir.to_owned(), server, starts, running: BTreeMap::new() };
+        let mut robots = Self { dir: dir.to_owned(), server: server.to_string(), starts, running: BTreeMap::new() };
         (0..count).try_for_each(|number| robots.start_one(number))?;
         Ok(robots)
     }

@@ -19,7 +19,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
 /// A launcher with what it started; all of it goes with this.
-struct Robot {
+pub struct Robot {
     running: Running,
     sets: PathBuf,
 }
@@ -34,7 +34,7 @@ impl Drop for Robot {
 
 impl Robot {
     /// A robot in `home` that believes the release people of `samples`.
-    fn launch(home: &Path, samples: &Path, server: &str) -> anyhow::Result<Self> {
+    pub fn launch(id: &str, start: &str, home: &Path, samples: &Path, server: &str) -> anyhow::Result<Self> {
         std::fs::create_dir_all(home)?;
         let key = SecretKey::read(&samples.join("keys/directive-1.pem"))?.public();
         let root = std::fs::read(samples.join("repository/metadata/1.root.json"))?;
@@ -43,31 +43,35 @@ impl Robot {
         let (program, sets) = (midshift()?, home.join("sets"));
         let mut command = Command::new(&program);
         command.arg("launcher").arg("--record").arg(home.join("tries")).arg("--sets").arg(&sets).arg("--");
-        command.arg(&program).args(["agent", "run", "--robot-id", "rbt-01", "--no-faults", "--server", server]);
+        command.arg(&program).args(["agent", "run", "--robot-id", id, "--no-faults", "--server", server]);
+        command.args(["--start", start]);
         command.arg("--data").arg(home.join("data")).arg("--sets").arg(&sets);
         command.arg("--trust").arg(home.join("trust.json")).process_group(0);
         Ok(Self { running: Running::start(&mut command, &home.join("log"))?, sets })
     }
-    fn switch(&self) -> anyhow::Result<Switch> {
+    /// Its switch record.
+    pub fn switch(&self) -> anyhow::Result<Switch> {
         Ok(Switch::read(&self.sets.join(SWITCH))?)
     }
     /// Waits until it has committed this version.
-    async fn keeps(&self, version: &str) -> anyhow::Result<()> {
+    pub async fn keeps(&self, version: &str) -> anyhow::Result<()> {
         until("the robot to keep it", LIMIT, async || Ok((self.committed()?.as_deref() == Some(version)).then_some(())))
             .await
     }
     /// Version of the set that is committed.
-    fn committed(&self) -> anyhow::Result<Option<String>> {
+    pub fn committed(&self) -> anyhow::Result<Option<String>> {
         let switch = self.switch()?;
         Ok(DiskSets::open(&self.sets)?.holdings()?.version(&switch.current))
     }
 }
 
-fn call(arguments: &[&str]) -> anyhow::Result<Output> {
+/// The command line.
+pub fn call(arguments: &[&str]) -> anyhow::Result<Output> {
     Command::new(midshift()?).args(arguments).output().context("calling midshift")
 }
 
-fn done(arguments: &[&str]) -> anyhow::Result<()> {
+/// The command line, which must succeed.
+pub fn done(arguments: &[&str]) -> anyhow::Result<()> {
     let output = call(arguments)?;
     ensure!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
     Ok(())
@@ -82,7 +86,7 @@ async fn a_release_reaches_a_robot_and_a_bad_one_goes_back_though_the_server_is_
     done(&["bundle", "samples", &folder])?;
     let mut server = Server::start_with(dir.path(), DEMO, &["--ota-keys", &keys]).await?;
     let address = server.address.to_string();
-    let robot = Robot::launch(&dir.path().join("robot"), &samples, &address)?;
+    let robot = Robot::launch("rbt-01", "park-1", &dir.path().join("robot"), &samples, &address)?;
     done(&["bundle", "push", "--server", &address, &samples.join("repository").display().to_string()])?;
     until("the robot is known", LIMIT, async || {
         Ok(call(&["robot", "get", "--server", &address, "rbt-01"])?.status.success().then_some(()))

@@ -22,6 +22,7 @@ use midshift_core::time::{Clock, ScaledClock, Utc};
 use midshift_core::update::{ActivationGrant, DesiredUpdate, Goal, Installed, UpdateEvent, UpdateReport, UpdateState};
 use midshift_core::work::{DesiredWork, InboxItem, RobotEvent, SampleBody};
 use midshift_ota::content::Room;
+use midshift_ota::folder::Owner;
 use midshift_ota::{OtaService, Parts};
 use midshift_proto::convert::parse;
 use midshift_proto::link::v1;
@@ -152,7 +153,8 @@ impl Bench {
         let made = samples::make(&dir.path().join("samples"), None, Signer::Throwaway, BEGIN)?;
         let keys = made.keys.clone().context("has keys")?;
         let folder = dir.path().join("server");
-        let parts = Parts { folder, keys: keys.clone(), room: Room::of(1 << 20), clock: clock.clone() };
+        let parts =
+            Parts { folder, keys: keys.clone(), room: Room::of(1 << 20), clock: clock.clone(), owner: Owner::Nobody };
         let ota = OtaService::open(parts).await?;
         let (ends, incoming) = mpsc::channel(4);
         let (seen, sessions) = mpsc::channel(4);

@@ -7,6 +7,7 @@ use crate::orders::Order;
 use crate::room::{Naive, RoomConfig};
 use crate::run::steer;
 use crate::software::{BAD_WITH_LOAD, GOOD, HANGS};
+use midshift_core::gates::TaskTally;
 use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::rollout::rows::{Outcome, Pause, Phase, Rollout};
@@ -238,7 +239,9 @@ fn a_bundle_that_is_bad_only_with_a_load_touches_no_more_than_its_canaries_and_t
     let verdict = row.verdicts.last().expect("evidence");
     assert_eq!((verdict.outcome, verdict.wave), (Outcome::Aborted, 0), "{verdict:?}");
     assert!(verdict.robots.outcomes.failed >= 1 && verdict.attempted == abort.touched, "{verdict:?}");
-    assert!(verdict.tasks.trial.failed > verdict.tasks.trial.succeeded, "{verdict:?}");
+    let (trial, control) = (&verdict.tasks.trial, &verdict.tasks.control);
+    let all = |tally: &TaskTally| tally.succeeded + tally.failed;
+    assert!(trial.failed * all(control) > control.failed * all(trial), "tasks fail more often with it: {verdict:?}");
     scene.comes_to_rest();
     scene.all_run(None);
     // A permission that was alive at the abort may still be used: then its robot is among the touched.

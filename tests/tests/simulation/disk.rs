@@ -92,6 +92,9 @@ impl Store for ServerDisk {
     fn site_id(&self) -> &SiteId {
         self.inner.site_id()
     }
+    fn is_shared(&self) -> bool {
+        self.inner.is_shared()
+    }
     async fn commit(&self, items: Vec<Item>) -> Vec<Result<Applied, CommitError>> {
         let count = items.len();
         let (before, after) = {

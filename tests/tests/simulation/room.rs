@@ -10,6 +10,7 @@ use crate::disk::{ServerDisk, ServerFrames};
 use crate::net::{self, Ear, SERVER, Wire};
 use crate::observer::Shared;
 use crate::software::Software;
+use midshift::roles::Roles;
 use midshift::server::{Parts, Server};
 use midshift_agent::body::Body;
 use midshift_agent::bugs::Bugs;
@@ -260,12 +261,16 @@ fn serve(
                 let clock = MachineClock::boot(&time, Skew::default());
                 let ota = software.open(clock.clone()).await?;
                 let parts = Parts {
+                    roles: Roles::default(),
+                    drain: Duration::ZERO,
+                    heard: None,
                     store: disk.clone(),
                     frames: frames.clone(),
                     site: site.clone(),
                     site_text: site_text.clone(),
                     clock,
                     ota,
+                    reader: None,
                     sim: None,
                     naive: naive.server,
                     planning: tokio::runtime::Handle::current(),

@@ -13,6 +13,7 @@ use midshift_core::ids::{BundleId, SiteId};
 use midshift_core::limits;
 use midshift_core::time::{Clock, Utc};
 use midshift_ota::content::{Content, DiskContent, Room, Wanted};
+use midshift_ota::folder::Owner;
 use midshift_ota::repository::{OnlineKeys, Repository};
 use midshift_ota::{OtaService, Parts};
 use midshift_sim::behaviour::COMPONENT;
@@ -145,7 +146,8 @@ impl Software {
     /// The service of a server that starts now.
     pub async fn open(&self, clock: Arc<dyn Clock>) -> anyhow::Result<OtaService> {
         let room = Room::of(limits::SOFTWARE_BYTES_DEFAULT);
-        Ok(OtaService::open(Parts { folder: self.folder(), keys: self.keys(), room, clock }).await?)
+        Ok(OtaService::open(Parts { folder: self.folder(), keys: self.keys(), room, clock, owner: Owner::Nobody })
+            .await?)
     }
     /// The bundle of a version.
     pub fn bundle(&self, version: &str) -> &BundleId {

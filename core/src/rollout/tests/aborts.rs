@@ -281,3 +281,23 @@ fn a_robot_that_did_not_reach_its_server_burns_no_bundle_unless_it_was_lost_alon
         assert_eq!((rig.of("ro", n).failure.is_some(), !rig.ota.quarantines.is_empty()), (alone, alone));
     }
 }
+
+#[test]
+fn an_abort_waits_for_permissions_on_the_link_clock_however_fast_the_site_is() {
+    let mut rig = Rig::new(6);
+    rig.start(spec());
+    let n = rig.order()[0];
+    rig.robots[n].fate = Fate::Silent;
+    rig.until(20, |r| r.of("ro", n).grant.is_some());
+    rig.robots[n].is_off = true;
+    rig.must("ro", Verb::Abort);
+    // Ten minutes of the site in a second of the link.
+    rig.now.site.0 += 600_000;
+    rig.now.utc = rig.now.utc.plus_ms(600_000);
+    rig.tick();
+    assert_eq!((rig.phase(), rig.of("ro", n).step), (Phase::Aborting, Step::Activating));
+    rig.ticks(50);
+    assert_eq!(rig.phase(), Phase::Aborting);
+    rig.until(20, |r| r.phase() != Phase::Aborting);
+    assert_eq!(rig.of("ro", n).step, Step::Activating, "it keeps its drain");
+}

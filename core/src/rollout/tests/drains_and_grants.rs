@@ -1,6 +1,8 @@
 //! Drains with fleet's real law, and permissions that are given only inside them.
 
 use super::*;
+use crate::task::forms::Transport;
+use crate::task::{TaskIntake, TaskState};
 
 /// Drains of roll-out `ro` by state.
 fn drains(rig: &Rig, state: DrainState) -> usize {
@@ -213,6 +215,83 @@ fn whoever_goes_back_from_an_aborted_bundle_does_not_wait_for_robots_that_only_a
     rig.robots[gone].is_off = true;
     rig.ticks(40);
     assert!(is_on(&rig, waits), "a robot that is dark keeps nobody on a bad bundle");
+}
+
+/// An opened task of this robot, whose item it carries.
+fn opened(rig: &mut Rig, n: usize, phase: crate::task::Phase) {
+    let task_id = crate::ids::TaskId::parse(&format!("t{n}")).expect("an id");
+    rig.robots[n].load = Some(crate::robot::Load { task_id: Some(task_id.clone()), item: "box".into() });
+    let form = Transport {
+        kind: "transport".into(),
+        from_waypoint: "A01".into(),
+        to_waypoint: "B03".into(),
+        timeout_ms: Some(600_000),
+        ..Transport::default()
+    };
+    let intake = TaskIntake {
+        task_id,
+        spec: form.into_raw().check("task", &|_| true).expect("a task"),
+        actor: String::new(),
+        request_id: String::new(),
+        payload_hash: String::new(),
+        created: Utc(BEGIN),
+        number: n as u64,
+    };
+    rig.put(TaskState { phase, opened: Some(robot_id(n)), robot_id: Some(robot_id(n)), ..TaskState::born(&intake) });
+}
+
+#[test]
+fn a_robot_that_carries_the_item_of_a_task_that_is_tried_again_ends_it_before_it_is_taken() {
+    use crate::task::Phase;
+    let mut rig = Rig::new(2);
+    opened(&mut rig, 0, Phase::RetryWait);
+    rig.ticks(1);
+    rig.put(request(0, false));
+    rig.ticks(20);
+    let drain = |rig: &Rig| rig.fleet.drains["ota:0"].row.state;
+    assert_eq!(drain(&rig), DrainState::Draining);
+    opened(&mut rig, 0, Phase::Queued);
+    rig.ticks(2);
+    assert_eq!(drain(&rig), DrainState::Draining);
+    let work = |rig: &Rig, n: usize| crate::fleet::screen::robot(&rig.fleet, &rig.board, &robot_id(n), &rig.now);
+    assert_eq!(work(&rig, 0), Ok(()), "it may be given the rest of its task");
+    assert_eq!(work(&rig, 1), Ok(()));
+    rig.robots[0].load = None;
+    rig.ticks(2);
+    assert_eq!(drain(&rig), DrainState::Held);
+    assert!(work(&rig, 0).is_err());
+}
+
+#[test]
+fn a_robot_with_a_load_that_only_a_person_can_take_is_waited_for_until_its_drains_deadline() {
+    let mut rig = Rig::new(2);
+    opened(&mut rig, 0, crate::task::Phase::NeedsOperator);
+    rig.robots[1].load = Some(crate::robot::Load { task_id: None, item: "box".into() });
+    rig.ticks(1);
+    (0..2).for_each(|n| rig.put(request(n, false)));
+    rig.fleet_turn();
+    rig.ticks(20);
+    let state = |rig: &Rig, id: &str| rig.fleet.drains[id].row.state;
+    assert_eq!(["ota:0", "ota:1"].map(|id| state(&rig, id)), [DrainState::Draining; 2]);
+    rig.robots[1].load = None;
+    rig.ticks(60);
+    assert_eq!(["ota:0", "ota:1"].map(|id| state(&rig, id)), [DrainState::Refused, DrainState::Held]);
+    assert_eq!(rig.fleet.drains["ota:0"].row.why.as_ref().map(|why| why.code), Some(Code::SkippedBusy));
+}
+
+#[test]
+fn a_load_keeps_nobody_from_going_back_nor_from_a_person_who_asked_for_the_robot() {
+    let mut rig = Rig::new(2);
+    rig.robots[0].load = Some(crate::robot::Load { task_id: None, item: "box".into() });
+    opened(&mut rig, 1, crate::task::Phase::Queued);
+    rig.ticks(1);
+    let mut plan = fleet::Plan::default();
+    plan.decide(&mut rig.fleet, rig.now, "ana", |tx| drain::ask(tx, &robot_id(0), "oil", "ana", 60_000));
+    rig.commit(plan.items);
+    rig.put(crate::maintenance::DrainRequest { returns: true, ..request(1, false) });
+    rig.ticks(3);
+    let states: Vec<_> = rig.fleet.drains.values().map(|d| d.row.state).collect();
+    assert_eq!(states, [DrainState::Held, DrainState::Held]);
 }
 
 fn request(n: usize, urgent: bool) -> crate::maintenance::DrainRequest {

@@ -30,7 +30,7 @@ use crate::ids::{AreaId, BundleId, DrainId, RobotId, RolloutId, WaypointId};
 use crate::maintenance::ReleasedBy;
 use crate::policy::AreaPolicy;
 use crate::reason::{Code, Reason, Refusal};
-use crate::robot::{Fault, HardwareStop, Inventory, Lane, ReportedState, Vitals};
+use crate::robot::{Fault, HardwareStop, Inventory, Lane, Load, ReportedState, Vitals};
 use crate::rows::{Entry, Expect, Item, Key, Log, Record, Revision, Row, Seq, Write};
 use crate::site::{DEMO, Site};
 use crate::time::{LinkTime, Now, SiteTime, Utc};
@@ -89,6 +89,8 @@ struct Robot {
     /// It gets no tasks.
     idles: bool,
     stop: HardwareStop,
+    /// What it carries.
+    load: Option<Load>,
     at: &'static str,
 }
 
@@ -184,6 +186,7 @@ impl Rig {
             is_off: false,
             idles: false,
             stop: HardwareStop::None,
+            load: None,
             at: "park-1",
         });
         self.put(RobotAuthority { robot_id: id.clone(), holder: RobotHolder::None });
@@ -339,6 +342,7 @@ impl Rig {
                 ..Vitals::default()
             },
             hardware_stop: robot.stop,
+            load: robot.load.clone(),
             update: robot.report.clone(),
             ..ReportedState::default()
         };

@@ -170,3 +170,16 @@ fn a_retired_robot_gives_its_drain_back_and_is_waited_for_by_nobody() {
     assert_eq!(rig.of("ro", n).why.expect("a reason").code, Code::SkippedRetired);
     rig.until(300, |r| r.phase() == Phase::Completed);
 }
+
+#[test]
+fn since_when_a_robot_was_heard_is_forgotten_with_the_robot() {
+    let mut rig = Rig::new(3);
+    rig.ticks(3);
+    assert_eq!(rig.ota.contacts.len(), 3);
+    rig.board.remove(&robot_id(0));
+    rig.retire(1);
+    rig.ota_turn();
+    let board = rig.board.clone();
+    rig.ota.forget_contacts(&board);
+    assert_eq!(rig.ota.contacts.keys().collect::<Vec<_>>(), [&robot_id(2)]);
+}

@@ -7,6 +7,7 @@ mod drains;
 mod errands;
 mod explain;
 mod holds;
+mod leads;
 mod offers;
 mod people;
 mod picture;
@@ -14,6 +15,10 @@ mod places;
 mod races;
 mod restart;
 mod retries;
+#[expect(dead_code, reason = "other crates' tests use the rest of it")]
+#[path = "../../../../tests/src/postgres.rs"]
+mod server;
+mod several_hosts;
 mod stopping;
 mod twins;
 mod uncertain;

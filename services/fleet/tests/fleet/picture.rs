@@ -12,7 +12,6 @@ use midshift_core::task::raw::RawRetry;
 use midshift_core::task::{Phase, TaskState};
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
-use midshift_store::Store;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use std::collections::BTreeMap;

@@ -76,6 +76,26 @@ async fn a_robot_that_lost_its_way_out_of_a_passage_gets_it_before_those_who_wai
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_robot_whose_task_ended_inside_a_passage_is_served_before_those_who_wait_for_the_passage() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.robot("r2", "A").await;
+    w.submit_with("T1", "B", "A", |raw| (raw.robot_id, raw.stall_ms) = ("r1".to_owned(), Some(3_600_000))).await;
+    w.until("r1 is in the corridor", |s| s.holders("corridor") == [("r1".to_owned(), HolderState::Inside)]).await;
+    w.r("r1").drives = false;
+    w.submit_with("T2", "B", "A", |raw| (raw.robot_id, raw.priority) = ("r2".to_owned(), Some(0))).await;
+    let r2_inside = ("r2".to_owned(), HolderState::Inside);
+    w.until("r2 stands before it", |s| s.holders("wait-a").contains(&r2_inside)).await;
+    w.submit_with("T3", "B", "A", |raw| raw.robot_id = "r1".to_owned()).await;
+    w.cancel("T1", false).await;
+    w.until_phase("T1", Phase::Canceled).await;
+    w.r("r1").drives = true;
+    w.until_phase("T3", Phase::Succeeded).await;
+    w.until_phase("T2", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_permission_to_enter_is_anchored_again_after_a_reconnect() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;

@@ -1,12 +1,13 @@
-//! Two planners over one store.
+//! Two planners over one store. The lease keeps them from it, and is no more than a saving: here it is left out, and nothing is done twice.
 
 use crate::harness::World;
+use midshift_core::fleet::bugs::{Bugs, SeededBug};
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::Phase;
 
 #[tokio::test(start_paused = true)]
 async fn two_reconcilers_at_saturation_give_no_robot_two_holders_and_every_task_is_done() {
-    let mut w = World::at_start(DEMO).await;
+    let mut w = World::with(DEMO, Bugs::of(&[SeededBug::EverybodyLeads])).await;
     w.second_reconciler();
     w.pass(11).await;
     let stands = ["park-1", "park-1", "park-2", "park-2", "park-3", "park-3", "park-4", "park-4"];

@@ -99,7 +99,7 @@ async fn silence_frees_no_place_and_a_rule_that_does_lets_a_second_robot_in() {
 
 /// Two reconcilers plan for the same robots at once. Whether all they wrote keeps the laws.
 async fn two_planners(blind: bool) -> bool {
-    let mut w = World::at_start(DEMO).await;
+    let mut w = World::with(DEMO, Bugs::of(&[SeededBug::EverybodyLeads])).await;
     if blind {
         w.shaky.be_blind();
     }

@@ -6,6 +6,7 @@ use async_trait::async_trait;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::repository::listed;
 use midshift_core::time::Utc;
+use midshift_ota::folder::mark;
 use midshift_ota::repository::raise_floor;
 use midshift_store::Database;
 use std::fs::{self, File};
@@ -142,8 +143,13 @@ impl Part for Releases {
         .await
     }
     async fn put_back(&self, folder: &Path, to: &Places, now: Utc) -> anyhow::Result<()> {
+        // The rows were put back before it, under an id of their own.
+        let store_id = midshift_store::identity(&to.data).await?;
         let (from, to) = (folder.to_owned(), to.data.join(RELEASES));
         blocking(move || {
+            if let Some(store_id) = store_id {
+                mark(&to, &store_id)?;
+            }
             for part in [DOCUMENTS, FILES] {
                 fs::create_dir_all(to.join(part))?;
                 for path in entries(&from.join(part))? {

@@ -10,7 +10,9 @@ use midshift_core::ids::SiteId;
 use midshift_core::rows::{Expect, Index, Item, Key, RowChange, Seq, Table, Write, Writer};
 use midshift_core::time::Utc;
 use midshift_ota::content::{Content, DiskContent, Held, Room, Wanted};
+use midshift_ota::folder::{Owner, mark};
 use midshift_ota::repository::{OnlineKeys, Repository, raise_floor};
+use midshift_ota::{OtaService, Parts};
 use midshift_store::{FRAME_BYTES_DEFAULT, Frame, FrameLog, SqliteFrames, SqliteStore, Store};
 use std::fs;
 use std::path::Path;
@@ -185,6 +187,28 @@ async fn a_restored_repository_signs_above_what_robots_saw_by_the_clock_and_by_t
         let digest = newest.files["walk"].digest;
         assert!(content.length(digest).await.expect("asked").is_some(), "its file came too");
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn restored_releases_belong_to_the_restored_store_and_those_of_the_lost_one_do_not() {
+    let used = Used::new().await;
+    let keys = used.release(1).await;
+    let folder = used.places().data.join("ota");
+    mark(&folder, used.store.id()).expect("written");
+    let backup = used.backed_up().await;
+    let to = Places { data: used.dir.path().join("restored"), ota_keys: None };
+    restore(&backup, &to, NOW).await.expect("restored");
+    let (store, _frames) = open(&to.data).await;
+    let owned = |folder: &Path| Parts {
+        folder: folder.to_owned(),
+        keys: keys.clone(),
+        room: Room::of(1 << 30),
+        clock: clock::clock(1000),
+        owner: Owner::Shared { store_id: store.id().clone(), known_bundles: 1 },
+    };
+    OtaService::open(owned(&to.data.join("ota"))).await.expect("its own");
+    let error = OtaService::open(owned(&folder)).await.err().expect("the lost server's").to_string();
+    assert!(error.contains(&format!("belongs to store {}", used.store.id())), "{error}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -9,10 +9,12 @@ use clap::{Subcommand, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};
 use midshift_bundle::build;
 use midshift_bundle::folder::{Error, Folder, Signed};
-use midshift_bundle::keys::SecretKey;
+use midshift_bundle::key_set::{ENVELOPE_BYTES_MAX, KeySet};
+use midshift_bundle::keys::{PublicKey, SecretKey};
 use midshift_bundle::manifest::Manifest;
 use midshift_bundle::repository::Profile;
-use std::io::IsTerminal;
+use std::fs::File;
+use std::io::{IsTerminal, Read, Write};
 use std::path::{Path, PathBuf};
 
 /// Verbs of bundles.
@@ -38,9 +40,25 @@ pub enum Verb {
         #[arg(long)]
         out: PathBuf,
     },
-    /// Add a bundle to the repository and sign it; or sign what waits for one more signature.
+    /// Make the next set of keys that sign orders to robots, signed by one of those that do until now. Robots take it once `sign` has listed it.
+    Rekey {
+        /// A secret key that robots take orders of now, e.g. directive-1.pem.
+        #[arg(long)]
+        by: PathBuf,
+        /// A key of the set, secret or public; the server signs with the first that it has. A file that is not there becomes a new secret key.
+        /// A key that is not named has ended.
+        #[arg(long = "key", required = true)]
+        keys: Vec<PathBuf>,
+        /// Number of the set: one more than that of the newest, which `verify` tells.
+        #[arg(long, default_value_t = 1)]
+        number: u64,
+        /// A new file for the set.
+        #[arg(long)]
+        out: PathBuf,
+    },
+    /// Add a bundle, or a set of directive keys, to the repository and sign it; or sign what waits for one more signature.
     Sign {
-        /// The built bundle.
+        /// The built bundle, or the file that `rekey` made.
         #[arg(required_unless_present = "pending")]
         bundle: Option<PathBuf>,
         /// Sign what waits for signatures instead.
@@ -52,6 +70,12 @@ pub enum Verb {
         /// A secret key of targets; more than one if you hold more.
         #[arg(long, required = true)]
         key: Vec<PathBuf>,
+        /// Sign only if the repository has all that this server shows, host:port, so that versions never fork.
+        #[arg(long, conflicts_with = "upstream")]
+        server: Option<String>,
+        /// Sign only if the repository has all that this copy of it has.
+        #[arg(long)]
+        upstream: Option<PathBuf>,
     },
     /// Sign a release without a bundle, for good: robots that run it go on, and the server takes its files away some days after no roll-out and
     /// no robot names it any more. Push it afterwards.
@@ -142,7 +166,16 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     match verb {
         Verb::Keygen { profile, keys, repository } => keygen(profile, &keys, &repository, out),
         Verb::Build { folder, out: into } => build_one(&folder, &into, out),
-        Verb::Sign { bundle, pending: _, repository, key } => sign(bundle.as_deref(), &repository, &key, out),
+        Verb::Rekey { by, keys, number, out: into } => rekey(&by, &keys, number, &into, out),
+        Verb::Sign { bundle, pending: _, repository, key, server, upstream } => {
+            if let Some(server) = server {
+                push::has_all_of_server(Folder::open(&repository)?, &Call { server }).await?;
+            }
+            if let Some(copy) = upstream {
+                push::has_all_of_copy(&Folder::open(&repository)?, &Folder::open(&copy)?)?;
+            }
+            sign(bundle.as_deref(), &repository, &key, out)
+        }
         Verb::Withdraw { bundle, repository, key } => withdraw(&bundle, &repository, &key, out),
         Verb::Samples { dir, program, config_only, repository, key } => {
             let program = match program {
@@ -200,12 +233,52 @@ fn read_keys(paths: &[PathBuf]) -> Result<Vec<SecretKey>, Exit> {
     Ok(paths.iter().map(|path| SecretKey::read(path)).collect::<Result<Vec<_>, _>>().map_err(Error::from)?)
 }
 
+fn rekey(by: &Path, keys: &[PathBuf], number: u64, into: &Path, out: &Out) -> Result<(), Exit> {
+    let by = SecretKey::read(by).map_err(Error::from)?;
+    let mut set = KeySet { number, keys: Vec::new() };
+    for path in keys {
+        if !path.exists() {
+            let key = SecretKey::draw();
+            key.write(path).map_err(Error::from)?;
+            out.say(&format!("a new key, that only you can read: {}", path.display()));
+        }
+        let public = || SecretKey::read(path).map(|key| key.public());
+        set.keys.push(PublicKey::read(path).or_else(|_| public()).map_err(Error::from)?);
+    }
+    let envelope = set.sign(&by).map_err(Error::from)?;
+    let write = || {
+        let mut file = File::options().write(true).create_new(true).open(into)?;
+        file.write_all(&envelope)?;
+        file.sync_all()
+    };
+    write().map_err(|source| Error::Io { doing: "writing", path: into.to_owned(), source })?;
+    let ids: Vec<String> = set.keys.iter().map(|key| key.id().to_string()).collect();
+    told(&serde_json::json!({"number": number, "keys": ids, "file": into}), out);
+    out.say(&format!("set {number} of directive keys in {}: it has no secrets", into.display()));
+    out.next(&format!("midshift bundle sign {} --repository REPOSITORY --key targets-1.pem", into.display()));
+    Ok(())
+}
+
+/// The bytes of a set of directive keys; none: it is a folder, a bundle.
+fn key_set(path: &Path) -> Result<Option<Vec<u8>>, Exit> {
+    if path.is_dir() {
+        return Ok(None);
+    }
+    let mut bytes = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(ENVELOPE_BYTES_MAX as u64 + 1).read_to_end(&mut bytes));
+    read.map_err(|source| Error::Io { doing: "reading", path: path.to_owned(), source })?;
+    Ok(Some(bytes))
+}
+
 fn sign(bundle: Option<&Path>, repository: &Path, keys: &[PathBuf], out: &Out) -> Result<(), Exit> {
     let folder = Folder::open(repository)?;
     let keys = read_keys(keys)?;
     let keys: Vec<&SecretKey> = keys.iter().collect();
     let signed = match bundle {
-        Some(bundle) => folder.add(bundle, &keys, clock::wall())?.1,
+        Some(bundle) => match key_set(bundle)? {
+            Some(set) => folder.add_keys(&set, &keys, clock::wall())?.1,
+            None => folder.add(bundle, &keys, clock::wall())?.1,
+        },
         None => folder.cosign(&keys)?,
     };
     tell_signed(signed, repository, out);
@@ -265,7 +338,7 @@ fn verify(repository: &Path, out: &Out) -> Result<(), Exit> {
     match out.format {
         Format::Json | Format::Jsonl => {
             let bundles: Vec<_> = checked.bundles.iter().map(Manifest::target).collect();
-            let found = serde_json::json!({"rootVersion": checked.root_version, "targetsVersion": checked.targets_version, "bundles": bundles});
+            let found = serde_json::json!({"rootVersion": checked.root_version, "targetsVersion": checked.targets_version, "bundles": bundles, "directiveKeys": checked.key_set.as_ref().map(|set| set.number)});
             out.line(&found.to_string());
         }
         Format::Name => checked.bundles.iter().for_each(|bundle| out.line(&bundle.target())),
@@ -274,6 +347,10 @@ fn verify(repository: &Path, out: &Out) -> Result<(), Exit> {
             out.line(super::out::columns(&["BUNDLE", "VERSION", "COMPONENTS", "BYTES", "HARDWARE"], &rows).trim_end());
             let targets = checked.targets_version.map_or("none".to_owned(), |v| v.to_string());
             out.say(&format!("root {}, targets {targets}: every signature and every file holds", checked.root_version));
+            if let Some(set) = &checked.key_set {
+                let keys: Vec<String> = set.keys.iter().map(|key| key.id().to_string()).collect();
+                out.say(&format!("directive keys: set {}, {}", set.number, keys.join(" ")));
+            }
             out.next(&format!("midshift bundle push {}", repository.display()));
         }
     }
@@ -307,3 +384,6 @@ fn show(manifest: &Manifest, out: &Out) -> Result<(), Exit> {
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests;

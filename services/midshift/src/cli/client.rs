@@ -17,6 +17,7 @@ use std::time::Duration;
 use tokio::time::Instant;
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Request, Status, Streaming};
+use tonic_health::pb::health_client::HealthClient;
 
 /// A server that does not answer a connection within this is not there.
 const CONNECT_WITHIN: Duration = Duration::from_secs(3);
@@ -238,6 +239,10 @@ impl Call {
     /// Roll-outs of software.
     pub async fn rollouts(&self) -> Result<RolloutServiceClient<Channel>, Exit> {
         Ok(RolloutServiceClient::new(self.channel().await?).max_decoding_message_size(64 * 1024 * 1024))
+    }
+    /// Whether it serves.
+    pub async fn health(&self) -> Result<HealthClient<Channel>, Exit> {
+        Ok(HealthClient::new(self.channel().await?))
     }
     /// Faults of the simulator.
     pub async fn sim(&self) -> Result<SimServiceClient<Channel>, Exit> {

@@ -6,6 +6,7 @@ mod bundle;
 mod client;
 mod doctor;
 mod explain;
+mod health;
 mod incident;
 mod map;
 mod out;
@@ -52,7 +53,7 @@ struct Args {
 enum Command {
     /// A whole factory in one process, to try things: simulated robots, in memory, loopback. Not for production.
     Dev(Box<Dev>),
-    /// Serve a site: everything persistent, one process.
+    /// Serve a site: everything persistent, in one process or, with --roles, in several.
     Serve(Serve),
     /// Bring a data directory, or a PostgreSQL database, to this version's schema, without serving.
     Migrate {
@@ -109,6 +110,8 @@ enum Command {
     Quarantine(quarantine::Verb),
     /// Look for what may be wrong: server, store, robots, this machine.
     Doctor(Call),
+    /// Whether one process serves: exit code 0 or 1, for health checks.
+    Health(health::Health),
     /// What a reason means and what to try.
     ExplainError {
         /// The code, e.g. BATTERY_LOW. Without it: all.
@@ -185,6 +188,7 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Rollout(verb) => rollout::run(*verb, out).await,
         Command::Quarantine(verb) => quarantine::run(verb, out).await,
         Command::Doctor(call) => doctor::run(&call, out).await,
+        Command::Health(args) => health::run(args, out).await,
         Command::ExplainError { code } => explain::error(code.as_deref(), out),
     }
 }

@@ -41,9 +41,11 @@ pub async fn run(path: &Path, call: &Call, out: &Out) -> Result<(), Exit> {
         let next = format!("midshift bundle sign BUNDLE --repository {} --key targets-1.pem", path.display());
         return Err(Exit::usage(format!("nothing is signed in {}\n  try: {next}", path.display())));
     };
-    let mut push = Push { client: call.bundles().await?, folder, checked };
-    let roots = push.common_roots().await?;
-    let targets = push.common_targets(newest).await?;
+    let mut compared = Compared { client: call.bundles().await?, folder };
+    let roots = compared.common_roots().await?;
+    let targets = compared.common_targets(newest).await?;
+    let Compared { client, folder } = compared;
+    let mut push = Push { client, folder, checked };
     let mut told = v1::PublishRepositoryResponse { root_version: roots, targets_version: targets };
     // The first publication may begin anywhere; after it no version is left out.
     let versions = if targets == 0 { newest..=newest } else { targets + 1..=newest };
@@ -61,13 +63,35 @@ pub async fn run(path: &Path, call: &Call, out: &Out) -> Result<(), Exit> {
     Ok(())
 }
 
-struct Push {
-    client: Client,
-    folder: Folder,
-    checked: Checked,
+/// Holds a repository against that of a server: all that the server shows must be in it, or what is signed next would fork its versions.
+pub async fn has_all_of_server(folder: Folder, call: &Call) -> Result<(), Exit> {
+    let newest = folder.targets_version()?.unwrap_or_default();
+    let mut compared = Compared { client: call.bundles().await?, folder };
+    compared.common_roots().await?;
+    compared.common_targets(newest).await.map(drop)
 }
 
-impl Push {
+/// As [`has_all_of_server`], against another copy of the repository.
+pub fn has_all_of_copy(folder: &Folder, copy: &Folder) -> Result<(), Exit> {
+    let newest = folder.targets_version()?.unwrap_or_default();
+    let Some(theirs) = copy.targets_version()? else { return Ok(()) };
+    let name = format!("{theirs}.targets.json");
+    if theirs > newest {
+        return Err(behind("the other repository", theirs, newest));
+    }
+    if folder.document(&name)? != copy.document(&name)? {
+        return Err(diverged("the other repository", &name));
+    }
+    Ok(())
+}
+
+/// A repository beside that of a server.
+struct Compared {
+    client: Client,
+    folder: Folder,
+}
+
+impl Compared {
     /// A document of the server; none: it has none.
     async fn theirs(&mut self, name: &str) -> Result<Option<Vec<u8>>, Exit> {
         let request = v1::GetMetadataRequest { name: name.to_owned() };
@@ -77,9 +101,6 @@ impl Push {
             Err(status) => Err(status.into()),
         }
     }
-    fn ours(&self, name: &str) -> Result<Vec<u8>, Exit> {
-        self.folder.document(name)?.ok_or_else(|| Exit::new(1, format!("the repository has no {name}")))
-    }
 
     /// Version of the server's newest root, once every root that it has is known to be ours; 0: none.
     async fn common_roots(&mut self) -> Result<u64, Exit> {
@@ -87,7 +108,7 @@ impl Push {
             let name = format!("{version}.root.json");
             let Some(theirs) = self.theirs(&name).await? else { return Ok(version - 1) };
             if self.folder.document(&name)?.as_ref() != Some(&theirs) {
-                return Err(diverged(&name));
+                return Err(diverged("the server", &name));
             }
         }
         Ok(0)
@@ -101,10 +122,25 @@ impl Push {
         let version = newest_targets(&snapshot)?;
         let name = format!("{version}.targets.json");
         let theirs = self.theirs(&name).await?;
-        if version > newest || self.folder.document(&name)? != theirs {
-            return Err(diverged(&name));
+        if version > newest {
+            return Err(behind("the server", version, newest));
+        }
+        if self.folder.document(&name)? != theirs {
+            return Err(diverged("the server", &name));
         }
         Ok(version)
+    }
+}
+
+struct Push {
+    client: Client,
+    folder: Folder,
+    checked: Checked,
+}
+
+impl Push {
+    fn ours(&self, name: &str) -> Result<Vec<u8>, Exit> {
+        self.folder.document(name)?.ok_or_else(|| Exit::new(1, format!("the repository has no {name}")))
     }
 
     /// Brings the files of one targets document, then makes it the newest.
@@ -174,11 +210,18 @@ impl Push {
     }
 }
 
-fn diverged(name: &str) -> Exit {
-    let text = format!(
-        "the server has another {name} than this repository: somebody else published, or it is another project"
-    );
-    Exit::new(9, format!("{text}\n  try: take the repository of whoever pushed last, sign into that one and push it"))
+const TAKE_THEIRS: &str = "take the repository of whoever pushed last, sign into that one and push it";
+
+/// Somebody signed on top of what is here.
+fn behind(who: &str, theirs: u64, ours: u64) -> Exit {
+    let text = format!("{who} has targets {theirs} and this repository targets {ours}: somebody else signed meanwhile");
+    Exit::new(9, text).or_try(TAKE_THEIRS)
+}
+
+fn diverged(who: &str, name: &str) -> Exit {
+    let text =
+        format!("{who} has another {name} than this repository: somebody else published, or it is another project");
+    Exit::new(9, text).or_try(TAKE_THEIRS)
 }
 
 /// Messages of one call: they end with the file or when the call has lasted long enough.

@@ -93,13 +93,7 @@ async fn software(call: &Call) -> Result<Vec<v1::RobotSoftware>, Exit> {
 pub async fn revoke(call: &Call, bundle: String, reason: String, out: &Out) -> Result<(), Exit> {
     let request = v1::RevokeBundleRequest { bundle: bundle.clone(), reason };
     let answer = call.rollouts().await?.revoke_bundle(unary(request)).await.map_err(Exit::with_facts)?.into_inner();
-    out.one(&answer, &answer.bundle, || {
-        let stand = match answer.rollout_ids.as_slice() {
-            [] => "no roll-out of it is open".to_owned(),
-            ids => format!("these roll-outs stand still: {}", ids.join(" ")),
-        };
-        format!("{bundle} is taken back: nobody gets it any more; {stand}")
-    })?;
+    out.one(&answer, &answer.bundle, || format!("{bundle} is taken back: nobody gets it any more; {}", open(&answer)))?;
     match answer.rollout_ids.first() {
         Some(id) => out.next(&format!("midshift rollout abort {id}; then midshift bundle withdraw {bundle}")),
         None => out.next(&format!("midshift bundle withdraw {bundle} --repository REPOSITORY --key targets-1.pem")),
@@ -107,9 +101,34 @@ pub async fn revoke(call: &Call, bundle: String, reason: String, out: &Out) -> R
     Ok(())
 }
 
+/// What becomes of the roll-outs of a revoked bundle, in words.
+fn open(answer: &v1::RevokeBundleResponse) -> String {
+    let told = |what: &str, ids: &[String]| (!ids.is_empty()).then(|| format!("{what}: {}", ids.join(" ")));
+    let still = told("these roll-outs stand still", &answer.rollout_ids);
+    let back = told("these go back already", &answer.reverting_rollout_ids);
+    let all: Vec<String> = still.into_iter().chain(back).collect();
+    if all.is_empty() { "no roll-out of it is open".to_owned() } else { all.join("; ") }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn roll_outs_of_a_revoked_bundle_are_told_by_whether_they_stand_still_or_go_back() {
+        let said = |still: &[&str], back: &[&str]| {
+            let owned = |ids: &[&str]| ids.iter().map(|id| (*id).to_owned()).collect();
+            let (rollout_ids, reverting_rollout_ids) = (owned(still), owned(back));
+            open(&v1::RevokeBundleResponse {
+                rollout_ids,
+                reverting_rollout_ids,
+                ..v1::RevokeBundleResponse::default()
+            })
+        };
+        assert_eq!(said(&[], &[]), "no roll-out of it is open");
+        assert_eq!(said(&["a"], &[]), "these roll-outs stand still: a");
+        assert_eq!(said(&["a"], &["b", "c"]), "these roll-outs stand still: a; these go back already: b c");
+    }
 
     #[test]
     fn a_robot_is_counted_at_the_bundle_that_it_runs_and_at_no_other() {

@@ -2,10 +2,12 @@
 //!
 //! Invariant: nothing is written here, and all that is wrong with an offer is told at once as far as it can be known.
 
-use super::{Error, Kept, Release};
+use super::{Error, Kept, Newest, OnlineKeys, Release};
 use crate::content::Content;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::freshness::{root_edition, targets_edition};
+use midshift_bundle::key_set::{ENVELOPE_BYTES_MAX, KeySet, SETS_MAX};
+use midshift_bundle::keys::SecretKey;
 use midshift_bundle::manifest::{MANIFEST_BYTES_MAX, Manifest};
 use midshift_bundle::repository::{FileTarget, check_root, check_targets};
 use midshift_bundle::trust::METADATA_BYTES_MAX;
@@ -102,6 +104,90 @@ pub async fn releases(
     bad.finish()?;
     sort(&mut releases);
     Ok(releases)
+}
+
+/// The newest of the listed sets of directive keys, if robots can go from each to the next and this server can sign by it.
+pub async fn key_sets(
+    files: &[FileTarget],
+    before: Option<&Newest>,
+    content: &dyn Content,
+    own: &OnlineKeys,
+) -> Result<Option<KeySet>, Error> {
+    let mut bad = Violations::default();
+    let mut numbered = BTreeMap::new();
+    for file in files.iter().filter(|file| KeySet::is_named(&file.name)) {
+        match KeySet::number_of(&file.name) {
+            Some(number) => drop(numbered.insert(number, file)),
+            None => bad.add(
+                format!("targets.{}", file.name),
+                "a set of directive keys is listed as N.directive-keys, N from 1 on",
+            ),
+        }
+    }
+    let known = before.and_then(|before| before.key_set.as_ref());
+    let first = numbered.keys().next().copied().unwrap_or(1);
+    let newest = numbered.keys().last().copied().unwrap_or_default();
+    let gone = before.iter().flat_map(|before| before.files.keys()).filter(|name| KeySet::is_named(name));
+    for name in gone.filter(|name| !files.iter().any(|file| file.name == **name)) {
+        bad.add(format!("targets.{name}"), "is no longer listed; robots that were away need it");
+    }
+    if numbered.len() > SETS_MAX {
+        bad.add("targets", format!("lists more than {SETS_MAX} sets of directive keys"));
+    }
+    if first != 1 || numbered.len() as u64 != newest {
+        bad.add(
+            "targets",
+            format!("lists {} sets of directive keys up to {newest}.directive-keys; one is left out", numbered.len()),
+        );
+    }
+    bad.finish()?;
+    let mut last: Option<KeySet> = known.cloned();
+    let new = numbered.range(known.map_or(0, |known| known.number) + 1..);
+    let mut bad = Violations::default();
+    for (number, file) in new {
+        let field = format!("targets.{}", file.name);
+        let Some((set, envelope)) = bad.take(&field, key_set(file, content).await?) else { break };
+        // Only robots know who signed the first one of a repository that is new here.
+        let is_known = before.is_some() || last.is_some();
+        let can_sign = |last: &&KeySet| before.is_none() || own.named_by(Some(last)).is_some();
+        let signers = match last.as_ref().filter(can_sign) {
+            Some(last) => last.keys.clone(),
+            // The first one, or all keys of the one before are lost: robots have this server's from their trust files.
+            None => own.directive.iter().map(SecretKey::public).collect(),
+        };
+        if is_known && let Err(rejection) = KeySet::open(&envelope, *number, &signers) {
+            bad.add(&field, rejection.to_string());
+        } else if set.number != *number {
+            bad.add(&field, format!("is set {}", set.number));
+        }
+        last = Some(set);
+    }
+    if let Some(set) = last.as_ref().filter(|set| Some(*set) != known)
+        && own.named_by(Some(set)).is_none()
+    {
+        bad.add(
+            format!("targets.{}", set.target()),
+            "names no directive key of this server: put it into the folder of --ota-keys and start the server first",
+        );
+    }
+    bad.finish()?;
+    Ok(last)
+}
+
+/// The newest set of directive keys among listed files.
+pub fn newest_set(files: &[FileTarget]) -> Option<&FileTarget> {
+    files.iter().filter_map(|file| Some((KeySet::number_of(&file.name)?, file))).max_by_key(|(n, _)| *n).map(|(_, f)| f)
+}
+
+/// Reads a set of directive keys and its envelope; the inner error is what is wrong with it. Who signed it is not looked at.
+pub async fn key_set(file: &FileTarget, content: &dyn Content) -> Result<Result<(KeySet, Vec<u8>), String>, Error> {
+    let range = 0..ENVELOPE_BYTES_MAX as u64 + 1;
+    let Some(mut reader) = content.read(file.digest, range).await? else { return Ok(Err("is gone".to_owned())) };
+    let mut bytes = Vec::new();
+    if let Err(error) = reader.read_to_end(&mut bytes).await {
+        return Ok(Err(error.to_string()));
+    }
+    Ok(KeySet::read(&bytes).map(|set| (set, bytes)).map_err(|rejection| rejection.to_string()))
 }
 
 /// Whether a listed file is the manifest of a bundle.

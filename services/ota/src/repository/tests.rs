@@ -1,7 +1,11 @@
 //! What may be published, what is kept, and that a cut at any write leaves something that robots believe.
 
+mod key_sets;
+
 use super::{Error, FRESHEN_AFTER_MS, OnlineKeys, Repository, write_whole};
+use crate::content::Content;
 use crate::fixture::{Room, SEEDS, START, Seeds, bundle, files, first_root, key, robot, root, target, targets};
+use midshift_bundle::digest::Digest;
 use midshift_bundle::keys::SecretKey;
 use midshift_bundle::repository::{PEOPLE_LIFE_MS, TIMESTAMP_LIFE_MS, sign_targets};
 use midshift_core::time::Utc;
@@ -274,6 +278,49 @@ async fn weeks_of_signatures_leave_few_snapshots_and_robots_that_follow() {
     let names = fs::read_dir(room.metadata()).expect("a folder").map(|e| e.expect("an entry").file_name());
     let snapshots = names.filter(|n| n.to_string_lossy().ends_with(".snapshot.json")).count();
     assert_eq!(snapshots, 16);
+}
+
+#[tokio::test]
+async fn targets_that_no_kept_snapshot_names_go_and_every_root_stays() {
+    let (room, mut document) = published().await;
+    for version in 1..=20 {
+        let roots = if version == 5 { vec![root(2, SEEDS, in_a_year(), &[SEEDS.root])] } else { Vec::new() };
+        document = targets(Some(&document), &[], SEEDS.targets);
+        room.repository.publish(roots, document.clone(), version, START).await.expect("published");
+    }
+    let names = || -> Vec<String> {
+        let entries = fs::read_dir(room.metadata()).expect("a folder");
+        entries.map(|entry| entry.expect("an entry").file_name().into_string().expect("text")).collect()
+    };
+    let count = |role: &str| names().iter().filter(|name| name.ends_with(&format!(".{role}.json"))).count();
+    assert_eq!((count("root"), count("targets"), count("snapshot")), (2, 16, 16));
+    assert_eq!(room.repository.document("5.targets.json").await.expect("asked"), None);
+    assert!(room.repository.document("6.targets.json").await.expect("asked").is_some());
+    let late = START.plus_ms(20 * FRESHEN_AFTER_MS);
+    for half_day in 1..=20 {
+        room.repository.freshen(START.plus_ms(half_day * FRESHEN_AFTER_MS)).await.expect("signed");
+    }
+    assert_eq!((count("root"), count("targets"), count("snapshot")), (2, 1, 16), "all of them name the newest");
+    room.shown_to(&robot(), late).await.expect("believed");
+    room.restarted().await.shown_to(&robot(), late).await.expect("believed after a start");
+}
+
+#[tokio::test]
+async fn when_a_bundle_was_seen_is_forgotten_once_it_is_neither_listed_nor_here() {
+    let (room, first) = published().await;
+    let names = ["walk-1.0.0.manifest".to_owned(), "walk-gait-1.0.0.component".to_owned()];
+    let without = |previous: &[u8], names: &[String]| {
+        sign_targets(Some(previous), &[], names, in_a_year(), &[&key(SEEDS.targets)]).expect("targets")
+    };
+    let seen = || fs::read_to_string(room.metadata().join("seen.json")).expect("there").len() > "{}".len();
+    let second = without(&first, &names);
+    room.repository.publish(Vec::new(), second.clone(), 1, START).await.expect("published");
+    assert!(seen(), "its files are here still");
+    for (_, content) in files("walk", "1.0.0") {
+        room.content.remove(Digest::of(&content)).await.expect("removed");
+    }
+    room.repository.publish(Vec::new(), without(&second, &[]), 2, START).await.expect("published");
+    assert!(!seen());
 }
 
 #[tokio::test]

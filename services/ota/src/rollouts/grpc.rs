@@ -182,8 +182,10 @@ impl RolloutService {
         self.act(Command::Revoke { bundle: bundle.clone(), reason: r.reason }, None).await?;
         self.look(move |view, _, _| {
             let of = view.rollouts.values().map(|r| &r.row).filter(|r| r.spec.bundle == bundle && !r.phase.is_over());
-            let rollout_ids = of.map(|r| r.rollout_id.to_string()).collect();
-            v1::RevokeBundleResponse { bundle: bundle.to_string(), rollout_ids }
+            let (back, still): (Vec<&Rollout>, Vec<_>) = of.partition(|r| r.phase.goes_back() || r.revert_of.is_some());
+            let ids = |of: Vec<&Rollout>| of.into_iter().map(|r| r.rollout_id.to_string()).collect();
+            let (rollout_ids, reverting_rollout_ids) = (ids(still), ids(back));
+            v1::RevokeBundleResponse { bundle: bundle.to_string(), rollout_ids, reverting_rollout_ids }
         })
         .await
     }

@@ -9,9 +9,11 @@ mod encode;
 mod grpc;
 mod reconcile;
 mod releases;
+mod standby;
 mod watch;
 
 pub use directives::Signer;
+pub use releases::known_bundles;
 
 use crate::OtaService;
 use midshift_core::reason::{Code, Kind, Refusal};
@@ -85,6 +87,10 @@ impl RolloutService {
         let (sender, requests) = mpsc::channel(REQUESTS_MAX);
         let (changed, receiver) = channel::channel(Seq(0));
         let has_keys = parts.ota.opened().is_ok();
+        if parts.store.is_shared() {
+            // Until this process leads another one may sign.
+            parts.ota.lead(false);
+        }
         let probation_ms = PROBATION_DEFAULT_MS;
         let service = Self { requests: sender, changed: receiver, shutdown, has_keys, probation_ms };
         (service, Planner { parts, requests, changed })

@@ -1,19 +1,24 @@
 //! The loop: take what is new, decide, sign, commit. A conflict means that somebody else decided too: the picture is built again.
+//! Of several processes on one store one leads and does all that; the others keep their picture by rows alone (`standby`).
 //!
-//! Invariant: the view has absorbed the whole feed before anything is decided on it.
+//! Invariant: the view has absorbed the whole feed before anything is decided on it; only a process that leads plans, takes releases and
+//! signs, and one that could not say so for a while reads the rows again before it does.
 
 use super::directives::Signer;
 use super::{Look, Parts, Planner, Request, releases};
 use crate::collect::Named;
+use midshift_core::ids::RobotId;
+use midshift_core::lead::{OtaLeader, Own, Seat, Stance};
 use midshift_core::limits;
+use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::named::named;
 use midshift_core::rollout::view::{TABLES, View};
 use midshift_core::rollout::{Board, LOGS, Plan, absorb, commands, cycle, obeyed};
-use midshift_core::rows::Seq;
+use midshift_core::rows::{Entry, Item, Log, Seq, Table};
 use midshift_core::time::Now;
 use midshift_core::work::Live;
-use midshift_store::{CommitError, Dirty, Error, follow};
+use midshift_store::{CommitError, Dirty, Error, follow, lead};
 use std::collections::BTreeSet;
 use std::time::Duration;
 use tokio::sync::{oneshot, watch};
@@ -24,18 +29,24 @@ const STORE_RETRY: Duration = Duration::from_millis(200);
 /// Requests taken into one cycle.
 const REQUESTS_PER_CYCLE: usize = 64;
 
-struct Loop {
-    parts: Parts,
-    view: View,
-    seq: Seq,
-    board: Board,
+pub(super) struct Loop {
+    pub(super) parts: Parts,
+    pub(super) view: View,
+    pub(super) seq: Seq,
+    pub(super) board: Board,
     dirty: Dirty<Live>,
+    /// Robots with a heartbeat that no plan has seen.
+    heard: BTreeSet<RobotId>,
     started: Now,
-    changed: watch::Sender<Seq>,
+    pub(super) changed: watch::Sender<Seq>,
     /// Serving time at which it is said next which bundles are needed, milliseconds.
     say_at_ms: u64,
     /// Questions that are answered once what they would see is committed.
-    looks: Vec<Look>,
+    pub(super) looks: Vec<Look>,
+    /// Whether this process leads.
+    pub(super) seat: Seat<OtaLeader>,
+    /// What this process wrote and has not read again.
+    own: Own,
 }
 
 type Replies = Vec<(oneshot::Sender<Result<(), Refusal>>, usize)>;
@@ -51,10 +62,28 @@ pub async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Er
     let dirty = parts.board.watch();
     let view = View::new(parts.site.clone(), started, started);
     let board = Board::new();
-    let mut this = Loop { parts, view, seq: Seq(0), board, dirty, started, changed, say_at_ms: 0, looks: Vec::new() };
+    // A store of one process is its process' alone; and a simulation's, whose runs must be the same again.
+    let me = match parts.store.is_shared() {
+        true => format!("{:032x}", rand::random::<u128>()),
+        false => format!("alone-{}", parts.clock.now().wall.0),
+    };
+    let seat = Seat::new(me, midshift_core::rollout::rivals(parts.store.is_shared(), parts.bugs));
+    metrics::gauge!("midshift_ota_leads").set(0);
+    let mut this = Loop {
+        parts,
+        view,
+        seq: Seq(0),
+        board,
+        dirty,
+        heard: BTreeSet::new(),
+        started,
+        changed,
+        say_at_ms: 0,
+        looks: Vec::new(),
+        seat,
+        own: Own::default(),
+    };
     this.rebuild_until_read(&shutdown).await;
-    // Not before robots could say what they run.
-    this.say_at_ms = this.view.served_ms(&started) + limits::COLLECT_EVERY_MS;
     let mut sweep = tokio::time::interval(Duration::from_millis(limits::SWEEP.as_ms()));
     sweep.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     let mut batch = Vec::new();
@@ -62,8 +91,8 @@ pub async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Er
     loop {
         tokio::select! {
             biased;
-            () = shutdown.cancelled() => return Ok(()),
-            n = requests.recv_many(&mut batch, REQUESTS_PER_CYCLE) => if n == 0 { return Ok(()) },
+            () = shutdown.cancelled() => break,
+            n = requests.recv_many(&mut batch, REQUESTS_PER_CYCLE) => if n == 0 { break },
             _ = sweep.tick(), if !more => {}
             () = tokio::task::yield_now(), if more => {}
         }
@@ -77,6 +106,8 @@ pub async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Er
             }
         }
     }
+    this.hand_over().await;
+    Ok(())
 }
 
 impl Loop {
@@ -90,8 +121,53 @@ impl Loop {
         }
     }
 
+    /// Reads who leads, and takes over if nobody does.
+    async fn take_part(&mut self) -> Result<(), Error> {
+        let led = self.seat.leads();
+        let began = lead::take_part(&mut self.seat, self.parts.store.as_ref(), self.parts.clock.as_ref()).await;
+        if led && !self.seat.leads() {
+            self.lead_no_more();
+        }
+        if began? {
+            self.begin_to_lead();
+        }
+        Ok(())
+    }
+
+    /// As after a start: everybody counts as heard now, and nothing is remembered.
+    fn begin_to_lead(&mut self) {
+        self.started = self.parts.clock.now();
+        self.view = View::new(self.parts.site.clone(), self.started, self.started);
+        self.heard = self.board.keys().cloned().collect();
+        // Said anew once robots could say what they run.
+        self.say_at_ms = 0;
+        self.parts.ota.lead(true);
+        metrics::gauge!("midshift_ota_leads").set(1);
+        metrics::counter!("midshift_ota_takeovers_total").increment(1);
+        tracing::info!("this process leads roll-outs");
+    }
+
+    fn lead_no_more(&self) {
+        self.parts.ota.lead(false);
+        metrics::gauge!("midshift_ota_leads").set(0);
+        tracing::info!("this process does not lead roll-outs any more");
+    }
+
+    /// Lets another process lead at once, if this one does.
+    async fn hand_over(&mut self) {
+        let Some(is_said) = lead::hand_over(&mut self.seat, self.parts.store.as_ref()).await else { return };
+        if !is_said {
+            tracing::warn!(
+                "another process will lead roll-outs only after a while: this one could not say that it ends"
+            );
+        }
+        self.lead_no_more();
+    }
+
     /// Builds the picture from nothing.
-    async fn rebuild(&mut self) -> Result<(), Error> {
+    pub(super) async fn rebuild(&mut self) -> Result<(), Error> {
+        self.take_part().await?;
+        self.own.clear();
         let snapshot = self.parts.store.snapshot(TABLES).await?;
         let now = self.parts.clock.now();
         let served = self.view.served_ms(&now);
@@ -102,44 +178,108 @@ impl Loop {
         // The row is as old as the last commit; this process has served on since.
         self.view.served.site_ms = self.view.served.site_ms.max(served);
         self.seq = self.view.marks.get("ota").map_or(Seq(0), |m| m.row.seq).min(snapshot.seq);
+        if !self.seat.leads() {
+            self.seq = snapshot.seq;
+            self.view.arrived.clear();
+        } else if self.say_at_ms == 0 {
+            // Not before robots could say what they run.
+            self.say_at_ms = self.view.served_ms(&now) + limits::COLLECT_EVERY_MS;
+        }
         metrics::counter!("midshift_ota_rebuilds_total").increment(1);
         Ok(())
     }
 
     /// One turn; true: there is more to do at once. An error: the picture can no longer be trusted.
     async fn turn(&mut self, requests: Vec<Request>) -> Result<bool, ()> {
-        let mut heard = BTreeSet::new();
+        self.hear();
+        let unreadable = |error| tracing::warn!(%error, "roll-outs cannot read the store");
+        // What the clock says comes first: a process that was away decides nothing before it has read who leads.
+        if self.seat.stance(self.parts.clock.now().link) == Stance::StepDown {
+            self.rebuild().await.map_err(unreadable)?;
+        }
+        if !self.seat.leads() {
+            self.follow_rows().await.map_err(unreadable)?;
+            if self.seat.stance(self.parts.clock.now().link) == Stance::TakeOver {
+                self.rebuild().await.map_err(unreadable)?;
+            }
+        }
+        if self.seat.leads() { self.lead(requests).await } else { self.assist(requests).await.map(|()| false) }
+    }
+
+    /// Takes what robots said since.
+    fn hear(&mut self) {
         for (robot_id, live) in self.dirty.take() {
             match live {
                 Some(live) => {
-                    heard.insert(robot_id.clone());
+                    self.heard.insert(robot_id.clone());
                     self.board.insert(robot_id, live);
                 }
                 None => {
                     self.board.remove(&robot_id);
+                    self.view.contacts.remove(&robot_id);
                 }
             }
         }
+    }
+
+    /// Absorbs the feed to its head; gives back the newest entry of another process of this service.
+    async fn take_feed(&mut self, now: Now, plan: &mut Plan) -> Result<Option<Seq>, Error> {
+        let mut foreign = None;
+        let mut seen = Ok(());
+        let clock = self.parts.clock.clone();
+        let Self { view, seat, own, .. } = self;
+        let take = |entries: &[Entry]| {
+            for entry in entries.iter().filter(|e| e.log == Log::Ota) {
+                if !own.is_own(entry.seq.0) && entry.table != Some(Table::OtaLeader) {
+                    foreign = Some(entry.seq);
+                }
+            }
+            if seen.is_ok() {
+                seen = seat.follow(entries, clock.now().link);
+            }
+            absorb(view, now, entries, plan);
+        };
+        follow(self.parts.store.as_ref(), &mut self.seq, LOGS, take).await?;
+        seen?;
+        Ok(foreign)
+    }
+
+    /// One turn of the process that plans.
+    async fn lead(&mut self, requests: Vec<Request>) -> Result<bool, ()> {
         let now = self.parts.clock.now();
         let mut plan = Plan::default();
-        let view = &mut self.view;
-        follow(self.parts.store.as_ref(), &mut self.seq, LOGS, |entries| absorb(view, now, entries, &mut plan))
-            .await
-            .map_err(|error| tracing::warn!(%error, "roll-outs cannot read the feed"))?;
+        let unreadable = |error| tracing::warn!(%error, "roll-outs cannot read the feed");
+        let foreign = self.take_feed(now, &mut plan).await.map_err(unreadable)?;
+        let renewal = match self.seat.stance(now.link) {
+            Stance::StepDown => {
+                // What was planned a moment ago is dropped, and with it the picture that holds it.
+                self.rebuild().await.map_err(unreadable)?;
+                return self.assist(requests).await.map(|()| false);
+            }
+            Stance::Renew => Some(self.seat.claim()),
+            Stance::Lead | Stance::StandBy | Stance::TakeOver => None,
+        };
         let ota = self.parts.ota.clone();
         let Ok(opened) = ota.opened() else { return Ok(false) };
+        // Rows that another process committed from what it published are not undone.
+        opened.repository.documents().follow_if_possible().await;
         releases::take(&mut self.view, now, opened.repository.newest().as_deref(), &mut plan);
         let replies = self.take_requests(requests, now, &mut plan);
-        let signer = Signer(opened.repository.keys().directive());
+        let signer = Signer(opened.repository.directive_key());
+        let heard = std::mem::take(&mut self.heard);
         let more = cycle(&mut self.view, now, &self.board, &heard, &signer, &mut plan);
         for text in &plan.unreadable {
             tracing::error!(text, "roll-outs passed over something they cannot read");
         }
-        self.commit(plan, replies).await?;
+        self.renew_and_commit(renewal, now, plan, replies).await?;
         self.answer(now);
+        if let Some(seq) = foreign {
+            self.changed.send_replace(seq);
+        }
         let served_ms = self.view.served_ms(&now);
         if served_ms >= self.say_at_ms {
             self.say_at_ms = served_ms + limits::COLLECT_EVERY_MS;
+            self.view.forget_contacts(&self.board);
             // From rows that are committed, as answers are.
             opened.named.send_replace(Some(Named { bundles: named(&self.view, &now), served_ms }));
         }
@@ -147,7 +287,7 @@ impl Loop {
     }
 
     /// Answers every question from the picture, which holds only what is committed at this moment.
-    fn answer(&mut self, now: Now) {
+    pub(super) fn answer(&mut self, now: Now) {
         for look in std::mem::take(&mut self.looks) {
             look(&self.view, &self.board, &now);
         }
@@ -175,14 +315,31 @@ impl Loop {
         replies
     }
 
-    async fn commit(&mut self, plan: Plan, replies: Replies) -> Result<(), ()> {
-        let entries: Vec<Option<Seq>> = plan.items.iter().map(obeyed).collect();
-        let results = if plan.items.is_empty() { Vec::new() } else { self.parts.store.commit(plan.items).await };
+    /// Commits the plan, and before it that this process still leads, if it is time to say so.
+    async fn renew_and_commit(
+        &mut self,
+        renewal: Option<Item>,
+        now: Now,
+        plan: Plan,
+        replies: Replies,
+    ) -> Result<(), ()> {
+        let renews = renewal.is_some();
+        let items: Vec<Item> = renewal.into_iter().chain(plan.items).collect();
+        let about: Vec<(Option<Seq>, u64)> = items.iter().map(|i| (obeyed(i), picture::entries_of(i))).collect();
+        let results = if items.is_empty() { Vec::new() } else { self.parts.store.commit(items).await };
+        if renews && results.first().is_some_and(Result::is_ok) {
+            self.seat.claimed(now.link);
+        }
         let mut trusted = Ok(());
         let mut newest = None;
-        for (result, entry) in results.iter().zip(entries) {
+        for (place, (result, (entry, entries))) in results.iter().zip(about).enumerate() {
             match result {
-                Ok(applied) => newest = Some(applied.seq),
+                Ok(applied) => {
+                    self.own.wrote(applied.seq.0, entries);
+                    if !renews || place > 0 {
+                        newest = Some(applied.seq);
+                    }
+                }
                 Err(error) => {
                     if let (true, Some(seq)) = (error.is_final(), entry) {
                         tracing::error!(seq = seq.0, "an entry of the log cannot be obeyed and is passed over");
@@ -198,7 +355,7 @@ impl Loop {
             }
         }
         for (reply, upto) in replies {
-            let lost = results.iter().take(upto).any(Result::is_err);
+            let lost = results.iter().skip(usize::from(renews)).take(upto).any(Result::is_err);
             let answer = if lost { Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)) } else { Ok(()) };
             drop(reply.send(answer));
         }

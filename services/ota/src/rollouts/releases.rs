@@ -9,9 +9,19 @@ use midshift_core::limits;
 use midshift_core::rollout::Plan;
 use midshift_core::rollout::rows::Bundle;
 use midshift_core::rollout::view::View;
+use midshift_core::rows::Table;
 use midshift_core::task::raw::parse_version;
 use midshift_core::time::Now;
+use midshift_store::Store;
 use std::collections::{BTreeMap, BTreeSet};
+
+/// Bundles that the rows of a store know: with any, its folder of releases cannot be empty.
+///
+/// # Errors
+/// The store's.
+pub async fn known_bundles(store: &dyn Store) -> Result<usize, midshift_store::Error> {
+    Ok(store.snapshot(&[Table::Bundle]).await?.rows.len())
+}
 
 /// Makes the rows say what the release says.
 pub fn take(view: &mut View, now: Now, newest: Option<&Newest>, plan: &mut Plan) {

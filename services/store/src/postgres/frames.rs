@@ -92,6 +92,16 @@ impl FrameLog for PostgresFrames {
         self.commands.ask(|reply| Command::Marks { reply }).await
     }
 
+    async fn mark(&self, robot_id: &RobotId, ring: &str) -> Result<u64, Error> {
+        let select = sqlx::query("SELECT seq FROM frame_mark WHERE site_id = $1 AND robot_id = $2 AND ring = $3")
+            .bind(self.site_id.as_str())
+            .bind(robot_id.as_str())
+            .bind(ring.split('\0').next());
+        let row = patiently(async { select.fetch_optional(&self.readers).await.map_err(unavailable) }).await?;
+        let seq = row.map(|row| row.try_get::<i64, _>(0)).transpose().map_err(unavailable)?;
+        Ok(seq.map_or(0, i64::cast_unsigned))
+    }
+
     async fn read(&self, after: u64, bytes_max: usize) -> Result<Vec<StoredFrame>, Error> {
         patiently(async { self.page(after, bytes_max).await.map_err(unavailable) }).await
     }

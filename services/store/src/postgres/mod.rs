@@ -8,6 +8,7 @@
 mod connect;
 mod frames;
 mod frames_writer;
+mod heard;
 mod migrate;
 mod read;
 mod wake;
@@ -16,6 +17,7 @@ mod writer;
 
 pub use connect::{PostgresConfig, Wakes};
 pub use frames::PostgresFrames;
+pub use heard::PostgresHeard;
 
 use crate::migrations::{CONTROL, Migrated, TELEMETRY};
 use crate::queue::{PRUNE_SLICE, Queue, going, run, unavailable};
@@ -124,6 +126,10 @@ impl Store for PostgresStore {
 
     fn site_id(&self) -> &SiteId {
         &self.site_id
+    }
+
+    fn is_shared(&self) -> bool {
+        true
     }
 
     async fn commit(&self, items: Vec<Item>) -> Vec<Result<Applied, CommitError>> {

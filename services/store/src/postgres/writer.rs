@@ -5,12 +5,13 @@
 //! committed. Nothing is remembered from one transaction to the next: other processes write too.
 
 use super::connect::{Database, WRITE_PATIENCE, no_answer};
+use super::heard::broken_silence;
 use super::write_sql;
 use crate::group::Group;
 use crate::queue::{Engine, Failed, Results};
-use crate::{Cause, Error, OpenError, StoreId, sql};
+use crate::{Cause, CommitError, Error, OpenError, StoreId, sql};
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Item, Log, Seq};
+use midshift_core::rows::{Item, Log, Seq, Silent};
 use midshift_core::time::{Clock, Utc};
 use sqlx::{Connection, PgConnection, Row};
 use std::sync::Arc;
@@ -171,10 +172,15 @@ impl AsyncWork<(Vec<Results>, Seq)> for GroupCommit {
     ) -> Result<((Vec<Results>, Seq), bool), sqlx::Error> {
         let keys = self.items.iter().flatten().flat_map(|item| &item.rows).map(|change| &change.key);
         let base = write_sql::standings(connection, site_id, keys).await?;
+        let silent: Vec<&Silent> = self.items.iter().flatten().filter_map(|item| item.silent.as_ref()).collect();
+        let heard = broken_silence(connection, site_id, &silent).await?;
         let mut group = Group::new(head, base);
         // Judged from a copy, because it may have to be judged again.
-        let mut judge =
-            |items: &Vec<Item>| items.iter().map(|item| group.add(item.clone(), self.at_unix_ms)).collect::<Results>();
+        let mut add = |item: &Item| match item.silent.as_ref().filter(|silent| heard.contains(&silent.robot_id)) {
+            Some(silent) => Err(CommitError::Heard { robot_id: silent.robot_id.clone() }),
+            None => group.add(item.clone(), self.at_unix_ms),
+        };
+        let mut judge = |items: &Vec<Item>| items.iter().map(&mut add).collect::<Results>();
         let results: Vec<Results> = self.items.iter().map(&mut judge).collect();
         let writes = !group.entries.is_empty();
         if writes {

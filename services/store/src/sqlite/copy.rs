@@ -4,6 +4,7 @@
 //! id of its own, so that nobody goes on from a number that the copy never gave.
 
 use super::{CONTROL_DB, OpenError, TELEMETRY_DB};
+use crate::StoreId;
 use crate::migrations::{self, Migration};
 use midshift_core::rows::Seq;
 use sqlx::sqlite::SqliteConnectOptions;
@@ -113,6 +114,19 @@ pub async fn renew_identity(dir: &Path) -> Result<(), OpenError> {
     let id = crate::sql::fresh_id();
     sqlx::query("UPDATE store_head SET store_id = $1").bind(id).execute(&mut connection).await.map_err(sql)?;
     connection.close().await.map_err(sql)
+}
+
+/// Which store the `control.db` of a directory is, while nobody serves from it; none: nobody ever did.
+///
+/// # Errors
+/// If the file cannot be read.
+pub async fn identity(dir: &Path) -> Result<Option<StoreId>, OpenError> {
+    let sql = |source| OpenError::Sql { doing: "reading the id of the store", source };
+    let mut connection = read_only(&dir.join(CONTROL_DB)).await?;
+    let row = sqlx::query("SELECT store_id FROM store_head").fetch_optional(&mut connection).await.map_err(sql)?;
+    let id = row.map(|row| row.try_get::<String, _>(0)).transpose().map_err(sql)?;
+    connection.close().await.map_err(sql)?;
+    Ok(id.map(|id| StoreId(id.into())))
 }
 
 async fn read_only(path: &Path) -> Result<SqliteConnection, OpenError> {

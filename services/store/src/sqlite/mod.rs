@@ -15,7 +15,7 @@ mod tail;
 mod write_sql;
 mod writer;
 
-pub use copy::{Database, Described, renew_identity};
+pub use copy::{Database, Described, identity, renew_identity};
 pub use frames::SqliteFrames;
 
 use crate::migrations::{CONTROL, Migrated, TELEMETRY};
@@ -117,6 +117,10 @@ impl Store for SqliteStore {
 
     fn site_id(&self) -> &SiteId {
         &self.site_id
+    }
+
+    fn is_shared(&self) -> bool {
+        false
     }
 
     async fn commit(&self, items: Vec<Item>) -> Vec<Result<Applied, CommitError>> {

@@ -3,6 +3,7 @@
 
 mod contract;
 mod failure;
+mod heard;
 mod partition;
 mod postgres;
 mod postgres_failure;

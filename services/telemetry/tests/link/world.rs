@@ -49,13 +49,20 @@ pub async fn world_with(otherwise: Otherwise) -> Result<World> {
     let clock = clock();
     let store: Arc<dyn Store> =
         Arc::new(MemoryStore::new(SiteId::parse("s")?, StoreId(Arc::from("store-1")), clock.clone()));
-    let parts = Parts {
-        store: store.clone(),
+    serve(Parts {
+        store,
         frames: otherwise.frames.unwrap_or_else(|| Arc::new(MemoryFrames::new(clock.clone(), 1 << 20))),
         board: LiveBoard::new(),
+        heard: None,
         clock,
         bugs: otherwise.bugs,
-    };
+    })
+    .await
+}
+
+/// The service of these parts, and a way to it.
+pub async fn serve(parts: Parts) -> Result<World> {
+    let store = parts.store.clone();
     let service = TelemetryService::new(parts, CancellationToken::new());
     tokio::spawn(service.clone().run());
     let (pipes, incoming) = mpsc::channel::<std::io::Result<tokio::io::DuplexStream>>(8);
@@ -147,6 +154,15 @@ impl Robot {
                 && let Some(found) = look(&down)
             {
                 return Ok(found);
+            }
+        }
+        Err("the session ended".into())
+    }
+    /// It is asked for its next session.
+    pub async fn moves_over(&mut self) -> Result<()> {
+        while let Some(message) = self.down.message().await? {
+            if let ToRobot::MoveOver { .. } = midshift_proto::parse(message)? {
+                return Ok(());
             }
         }
         Err("the session ended".into())

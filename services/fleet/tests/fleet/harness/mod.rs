@@ -13,7 +13,7 @@ pub use seen::Seen;
 pub use shaky::Shaky;
 
 use midshift_core::fleet::bugs::Bugs;
-use midshift_core::ids::{RobotId, TaskId};
+use midshift_core::ids::{RobotId, SiteId, TaskId};
 use midshift_core::rows::{Entry, Expect, Item, Seq, Writer};
 use midshift_core::site::{Site, text};
 use midshift_core::task::forms::Transport;
@@ -44,7 +44,7 @@ struct Running {
 }
 
 pub struct World {
-    pub store: Arc<MemoryStore>,
+    pub store: Arc<dyn Store>,
     /// The store as fleet sees it.
     pub shaky: Arc<Shaky>,
     pub board: Arc<LiveBoard<Live>>,
@@ -74,12 +74,27 @@ impl World {
 
     /// As [`World::at_start`], with naive rules.
     pub async fn with(site_text: &'static str, bugs: Bugs) -> Self {
+        Self::over(site_text, bugs, alone).await
+    }
+
+    /// As [`World::on`], where other processes may come.
+    pub async fn shared(site_text: &'static str) -> Self {
+        let mut world = Self::over(site_text, Bugs::default(), in_company).await;
+        world.pass(11).await;
+        world
+    }
+
+    /// A world over a store of the caller's.
+    pub async fn over(
+        site_text: &'static str,
+        bugs: Bugs,
+        store: impl AsyncFnOnce(SiteId, Arc<dyn Clock>) -> Arc<dyn Store>,
+    ) -> Self {
         let begun = Instant::now();
         let monotonic = move || begun.elapsed().as_micros() as u64;
         let clock: Arc<dyn Clock> = Arc::new(ScaledClock::new(monotonic, BEGIN, 1000));
         let site = Arc::new(text::parse(site_text).expect("a site"));
-        let store = MemoryStore::new(site.site_id().clone(), StoreId(Arc::from("world")), clock.clone());
-        let (store, board) = (Arc::new(store), LiveBoard::new());
+        let (store, board) = (store(site.site_id().clone(), clock.clone()).await, LiveBoard::new());
         let shaky = Shaky::over(store.clone());
         let parts = Parts {
             store: shaky.clone(),
@@ -113,6 +128,33 @@ impl World {
     pub fn second_reconciler(&mut self) {
         let (_, running) = start(self.parts());
         self.running.push(running);
+    }
+
+    /// One more reconciler as another process has it: with its own face and its own way to the store.
+    pub fn other_process(&mut self) -> (FleetService, Arc<Shaky>) {
+        self.other_process_on(self.store.clone())
+    }
+
+    /// As [`World::other_process`], on a handle of its own.
+    pub fn other_process_on(&mut self, store: Arc<dyn Store>) -> (FleetService, Arc<Shaky>) {
+        let shaky = Shaky::over(store);
+        let (fleet, running) = start(Parts { store: shaky.clone(), ..self.parts() });
+        self.running.push(running);
+        (fleet, shaky)
+    }
+
+    /// The oldest reconciler is gone, as if its process had been killed.
+    pub async fn kill_first(&mut self) {
+        let running = self.running.remove(0);
+        running.task.abort();
+        assert!(running.task.await.is_err_and(|e| e.is_cancelled()), "it ran");
+    }
+
+    /// The oldest reconciler ends as it is asked to.
+    pub async fn end_first(&mut self) {
+        let running = self.running.remove(0);
+        running.shutdown.cancel();
+        running.task.await.expect("the reconciler ends");
     }
 
     /// Ends every reconciler; rows stay, the picture goes.
@@ -382,6 +424,19 @@ impl World {
     pub fn robot_ids(&self) -> Vec<String> {
         self.robots.keys().cloned().collect()
     }
+}
+
+fn in_memory(site_id: SiteId, clock: Arc<dyn Clock>) -> MemoryStore {
+    MemoryStore::new(site_id, StoreId(Arc::from("world")), clock)
+}
+
+async fn alone(site_id: SiteId, clock: Arc<dyn Clock>) -> Arc<dyn Store> {
+    Arc::new(in_memory(site_id, clock))
+}
+
+/// A store that says of itself that other processes have it too.
+async fn in_company(site_id: SiteId, clock: Arc<dyn Clock>) -> Arc<dyn Store> {
+    Arc::new(in_memory(site_id, clock).shared())
 }
 
 fn start(parts: Parts) -> (FleetService, Running) {

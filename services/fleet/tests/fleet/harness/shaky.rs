@@ -4,7 +4,7 @@
 use async_trait::async_trait;
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Expect, Item, Key, Log, Row, Seq, Table};
-use midshift_store::{Applied, CommitError, Error, FeedPage, MemoryStore, Query, Retention, Snapshot, Store, StoreId};
+use midshift_store::{Applied, CommitError, Error, FeedPage, Query, Retention, Snapshot, Store, StoreId};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use tokio::sync::watch;
@@ -13,20 +13,27 @@ use tokio::sync::watch;
 const OVERWRITTEN_MAX: u64 = 40;
 
 pub struct Shaky {
-    inner: Arc<MemoryStore>,
+    inner: Arc<dyn Store>,
     failing: AtomicBool,
     failed: AtomicU64,
     blind: AtomicBool,
     overwritten: AtomicU64,
     conflicts: AtomicU64,
+    /// Whoever uses this handle stands still.
+    frozen: watch::Sender<bool>,
+    freezes: AtomicBool,
+    outrun: Mutex<Option<Table>>,
     /// Items that touch this table are too large.
     narrow: Mutex<Option<Table>>,
 }
 
 impl Shaky {
-    pub fn over(inner: Arc<MemoryStore>) -> Arc<Self> {
+    pub fn over(inner: Arc<dyn Store>) -> Arc<Self> {
         Arc::new(Self {
             conflicts: AtomicU64::new(0),
+            frozen: watch::Sender::new(false),
+            freezes: AtomicBool::new(false),
+            outrun: Mutex::new(None),
             narrow: Mutex::new(None),
             inner,
             failing: AtomicBool::new(false),
@@ -38,6 +45,25 @@ impl Shaky {
     /// From now on every commit through this handle fails, or none does.
     pub fn fail(&self, failing: bool) {
         self.failing.store(failing, Ordering::Relaxed);
+    }
+    /// From now on no call through this handle begins, or all go on that wait.
+    pub fn freeze(&self, frozen: bool) {
+        self.frozen.send_replace(frozen);
+    }
+    /// The next commit through this handle does not begin, and nothing after it.
+    pub fn freeze_next_commit(&self) {
+        self.freezes.store(true, Ordering::Relaxed);
+    }
+    pub fn is_frozen(&self) -> bool {
+        *self.frozen.borrow()
+    }
+    /// From now on somebody else is always faster to write rows of this table.
+    pub fn outrun(&self, table: Option<Table>) {
+        *self.outrun.lock().expect("not poisoned") = table;
+    }
+    async fn thaws(&self) {
+        // The sender is here.
+        let _ = self.frozen.subscribe().wait_for(|frozen| !*frozen).await;
     }
     /// From now on every item that touches `table` is too large for this store.
     pub fn refuse(&self, table: Option<Table>) {
@@ -84,9 +110,22 @@ impl Store for Shaky {
     fn site_id(&self) -> &SiteId {
         self.inner.site_id()
     }
+    fn is_shared(&self) -> bool {
+        self.inner.is_shared()
+    }
     async fn commit(&self, items: Vec<Item>) -> Vec<Result<Applied, CommitError>> {
         // A disk takes time, in which somebody else may plan on the same picture.
         tokio::task::yield_now().await;
+        if !items.is_empty() && self.freezes.swap(false, Ordering::Relaxed) {
+            self.freeze(true);
+        }
+        self.thaws().await;
+        let outrun = *self.outrun.lock().expect("not poisoned");
+        let rows = items.iter().flat_map(|item| &item.rows);
+        if let Some(row) = rows.into_iter().find(|row| Some(row.key.table) == outrun) {
+            self.conflicts.fetch_add(1, Ordering::Relaxed);
+            return items.iter().map(|_| Err(CommitError::Conflict { key: row.key.clone(), found: None })).collect();
+        }
         if self.failing.load(Ordering::Relaxed) && !items.is_empty() {
             self.failed.fetch_add(1, Ordering::Relaxed);
             let cause = || Arc::new(std::io::Error::other("the disk is full"));
@@ -120,15 +159,18 @@ impl Store for Shaky {
         results
     }
     async fn get(&self, keys: Vec<Key>) -> Result<Vec<Row>, Error> {
+        self.thaws().await;
         self.inner.get(keys).await
     }
     async fn list(&self, query: Query) -> Result<Vec<Row>, Error> {
         self.inner.list(query).await
     }
     async fn snapshot(&self, tables: &[Table]) -> Result<Snapshot, Error> {
+        self.thaws().await;
         self.inner.snapshot(tables).await
     }
     async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error> {
+        self.thaws().await;
         self.inner.feed(after, logs, limit).await
     }
     async fn feed_of(&self, log: Log, subjects: &[Arc<str>], after: Seq, limit: usize) -> Result<FeedPage, Error> {

@@ -1,0 +1,351 @@
+//! Who of several processes of one service plans: one row that one of them holds and renews, and the others watch.
+//!
+//! Called by the reconcilers of fleet and of roll-outs. Invariant: no two clocks are compared. A leader counts from before it renewed, whoever
+//! watches counts from when it saw that, and the first count is the shorter one, so a leader stops by itself before anybody takes over. Two that
+//! lead all the same write nothing twice: every item expects revisions. The lease saves them from planning in vain.
+
+use crate::limits;
+use crate::rows::{BadRow, Entry, Expect, Item, Key, Record, Revision, Row, Table};
+use crate::time::LinkTime;
+use serde::{Deserialize, Serialize};
+use std::collections::VecDeque;
+use std::marker::PhantomData;
+
+/// The one row of a service's lease.
+pub trait LeaderRow: Record {
+    /// Of `holder`, at its number `beat`.
+    fn new(holder: String, beat: u64) -> Self;
+    /// Id of the process that leads; empty: none does.
+    fn holder(&self) -> &str;
+    /// Rises with every write.
+    fn beat(&self) -> u64;
+}
+
+macro_rules! leader_rows {
+    ($($(#[$doc:meta])* $row:ident $table:ident $id:literal;)*) => { $(
+        $(#[$doc])*
+        #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+        pub struct $row {
+            /// Id of the process, drawn at its start; empty: nobody leads.
+            pub holder: String,
+            /// Rises with every write of the row: whoever watches sees that the holder is there.
+            pub beat: u64,
+        }
+
+        impl Record for $row {
+            const TABLE: Table = Table::$table;
+            fn id(&self) -> String {
+                $id.to_owned()
+            }
+        }
+
+        impl LeaderRow for $row {
+            fn new(holder: String, beat: u64) -> Self {
+                Self { holder, beat }
+            }
+            fn holder(&self) -> &str {
+                &self.holder
+            }
+            fn beat(&self) -> u64 {
+                self.beat
+            }
+        }
+    )* };
+}
+
+leader_rows! {
+    /// Which process of fleet plans.
+    FleetLeader FleetLeader "fleet";
+    /// Which process of the rollout service plans and signs.
+    OtaLeader OtaLeader "ota";
+}
+
+/// Who else may lead.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Rivals {
+    /// The store opens for one process: whoever holds the row when this one starts is dead.
+    None,
+    /// Other processes on the same store.
+    Some,
+    /// Naive: everybody leads and nobody asks.
+    Ignored,
+}
+
+/// What a process does at this moment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stance {
+    /// It leads, and the row needs no write.
+    Lead,
+    /// It leads, and writes the row again.
+    Renew,
+    /// Another one leads.
+    StandBy,
+    /// Nobody leads: it writes itself into the row, and leads once that is committed.
+    TakeOver,
+    /// It led, and does not any more: it decides nothing before it has read the row again.
+    StepDown,
+}
+
+/// What a process believes of itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// It leads. Since when its newest claim counts: a reading of its link clock from before that was committed.
+    Leads(LinkTime),
+    /// It does not.
+    StandsBy,
+}
+
+/// The row as a process has seen it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Seen {
+    /// Who holds it; empty: nobody, or there is no row.
+    pub holder: String,
+    /// Its number.
+    pub beat: u64,
+    /// Its revision; 0: there is no row.
+    pub revision: Revision,
+    /// When this revision was seen first, on the link clock of whoever saw it.
+    pub since: LinkTime,
+    /// It has stood like this since before the process looked for the first time.
+    pub from_before: bool,
+}
+
+/// The law: what the process `me` does at `now`.
+pub fn decide(me: &str, part: Part, seen: &Seen, rivals: Rivals, now: LinkTime) -> Stance {
+    let mine = seen.holder == me;
+    match (part, rivals) {
+        (_, Rivals::Ignored) => Stance::Lead,
+        (Part::Leads(_), _) if !mine => Stance::StepDown,
+        (Part::Leads(_), Rivals::None) => Stance::Lead,
+        (Part::Leads(renewed), Rivals::Some) => match now.since(renewed) {
+            age if age >= limits::LEAD_ENDS_AFTER => Stance::StepDown,
+            age if age >= limits::LEAD_RENEWED_EVERY => Stance::Renew,
+            _ => Stance::Lead,
+        },
+        (Part::StandsBy, _) if mine || seen.holder.is_empty() => Stance::TakeOver,
+        (Part::StandsBy, Rivals::None) if seen.from_before => Stance::TakeOver,
+        (Part::StandsBy, Rivals::Some) if now.since(seen.since) >= limits::LEAD_FREE_AFTER => Stance::TakeOver,
+        (Part::StandsBy, _) => Stance::StandBy,
+    }
+}
+
+/// The place of one process: what it has seen of the row, and whether it leads.
+#[derive(Clone, Debug)]
+pub struct Seat<R> {
+    me: String,
+    rivals: Rivals,
+    part: Part,
+    seen: Option<Seen>,
+    row: PhantomData<R>,
+}
+
+impl<R: LeaderRow> Seat<R> {
+    /// The place of the process `me`, which has seen nothing yet.
+    pub const fn new(me: String, rivals: Rivals) -> Self {
+        Self { me, rivals, part: Part::StandsBy, seen: None, row: PhantomData }
+    }
+    /// Name of the row.
+    pub fn key() -> Key {
+        R::new(String::new(), 0).key()
+    }
+    /// Whether this process decides.
+    pub fn leads(&self) -> bool {
+        matches!(self.part, Part::Leads(_)) || self.rivals == Rivals::Ignored
+    }
+    /// Takes the row as it was read at `now`; none: there is no row.
+    ///
+    /// # Errors
+    /// A row that cannot be read.
+    pub fn read(&mut self, row: Option<&Row>, now: LinkTime) -> Result<(), BadRow> {
+        let Some(row) = row else {
+            if self.seen.is_none() {
+                let nobody = String::new();
+                self.seen =
+                    Some(Seen { holder: nobody, beat: 0, revision: Revision(0), since: now, from_before: true });
+            }
+            return Ok(());
+        };
+        let from_before = self.seen.is_none();
+        if self.seen.as_ref().is_some_and(|seen| seen.revision >= row.revision) {
+            return Ok(());
+        }
+        let (decoded, revision) = (row.decode::<R>()?, row.revision);
+        let (holder, beat) = (decoded.holder().to_owned(), decoded.beat());
+        self.seen = Some(Seen { holder, beat, revision, since: now, from_before });
+        Ok(())
+    }
+    /// Takes what the feed says of the row.
+    ///
+    /// # Errors
+    /// A row that cannot be read.
+    pub fn follow(&mut self, entries: &[Entry], now: LinkTime) -> Result<(), BadRow> {
+        let of_row = entries.iter().filter(|e| e.table == Some(R::TABLE));
+        // An older one says only what the newest overtook.
+        let newest = of_row.max_by_key(|e| e.revision).and_then(|e| crate::picture::row_of(e, R::TABLE));
+        newest.map_or(Ok(()), |row| self.read(Some(&row), now))
+    }
+    /// What to do at `now`. Before the row was read nobody leads.
+    pub fn stance(&self, now: LinkTime) -> Stance {
+        match &self.seen {
+            Some(seen) => decide(&self.me, self.part, seen, self.rivals, now),
+            None if self.rivals == Rivals::Ignored => Stance::Lead,
+            None => Stance::StandBy,
+        }
+    }
+    /// The item that takes over or renews. It conflicts if anybody else wrote the row since it was seen.
+    pub fn claim(&self) -> Item {
+        self.write(self.me.clone(), if self.leads() { "lead.renewed" } else { "lead.taken" })
+    }
+    /// The claim that was made from a reading of the clock at `at` is committed.
+    pub fn claimed(&mut self, at: LinkTime) {
+        let seen = self.seen.as_ref();
+        let (revision, beat) = seen.map_or((Revision(0), 0), |s| (s.revision, s.beat));
+        let (revision, beat) = (revision.next(), beat + 1);
+        self.seen = Some(Seen { holder: self.me.clone(), beat, revision, since: at, from_before: false });
+        self.part = Part::Leads(at);
+    }
+    /// The item that lets another one lead at once; none: this process does not lead, or there is no other.
+    pub fn release(&self) -> Option<Item> {
+        (matches!(self.part, Part::Leads(_)) && self.rivals == Rivals::Some)
+            .then(|| self.write(String::new(), "lead.left"))
+    }
+    /// It does not lead any more.
+    pub const fn step_down(&mut self) {
+        self.part = Part::StandsBy;
+    }
+    fn write(&self, holder: String, kind: &'static str) -> Item {
+        let (beat, revision) = self.seen.as_ref().map_or((0, Revision(0)), |s| (s.beat, s.revision));
+        let writer = R::TABLE.writer();
+        let mut item = Item::new(writer, writer.as_str());
+        let expect = if revision == Revision(0) { Expect::Absent } else { Expect::At(revision) };
+        item.put(&R::new(holder, beat + 1), expect, kind);
+        item
+    }
+}
+
+/// Entries of a service's own log that this process wrote: what else is in it, another process did.
+#[derive(Debug, Default)]
+pub struct Own {
+    /// First and last number of each item, rising.
+    ranges: VecDeque<(u64, u64)>,
+}
+
+impl Own {
+    /// An item of so many entries was applied, the last of which is `last`.
+    pub fn wrote(&mut self, last: u64, entries: u64) {
+        if entries > 0 {
+            self.ranges.push_back((last.saturating_sub(entries - 1), last));
+        }
+    }
+    /// Whether the entry is this process' own. Asked in the order of the feed.
+    pub fn is_own(&mut self, seq: u64) -> bool {
+        while self.ranges.front().is_some_and(|(_, last)| *last < seq) {
+            self.ranges.pop_front();
+        }
+        self.ranges.front().is_some_and(|(first, _)| *first <= seq)
+    }
+    /// Forgets everything: what is read again counts as another's.
+    pub fn clear(&mut self) {
+        self.ranges.clear();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::time::LinkDuration;
+
+    fn seen(holder: &str, since: u64, from_before: bool) -> Seen {
+        Seen { holder: holder.to_owned(), beat: 7, revision: Revision(7), since: LinkTime(since), from_before }
+    }
+
+    #[test]
+    fn the_law_of_the_lease() {
+        use Stance::{Lead, Renew, StandBy, StepDown, TakeOver};
+        let table: &[(&str, Part, Seen, Rivals, u64, Stance)] = &[
+            ("no row", Part::StandsBy, seen("", 0, true), Rivals::Some, 0, TakeOver),
+            ("an empty row", Part::StandsBy, seen("", 900, false), Rivals::Some, 900, TakeOver),
+            ("somebody leads", Part::StandsBy, seen("b", 0, true), Rivals::Some, 3_999, StandBy),
+            ("somebody led", Part::StandsBy, seen("b", 0, true), Rivals::Some, 4_000, TakeOver),
+            ("somebody led, seen late", Part::StandsBy, seen("b", 60_000, false), Rivals::Some, 63_999, StandBy),
+            ("a dead one's file", Part::StandsBy, seen("b", 0, true), Rivals::None, 0, TakeOver),
+            ("taken by one that came later", Part::StandsBy, seen("b", 5, false), Rivals::None, 99_999, StandBy),
+            ("own, not led", Part::StandsBy, seen("a", 0, false), Rivals::Some, 1, TakeOver),
+            ("renewed now", Part::Leads(LinkTime(0)), seen("a", 0, false), Rivals::Some, 999, Lead),
+            ("renewed a second ago", Part::Leads(LinkTime(0)), seen("a", 0, false), Rivals::Some, 1_000, Renew),
+            ("not renewed in vain", Part::Leads(LinkTime(0)), seen("a", 0, false), Rivals::Some, 2_999, Renew),
+            ("could not renew", Part::Leads(LinkTime(0)), seen("a", 0, false), Rivals::Some, 3_000, StepDown),
+            ("frozen for a minute", Part::Leads(LinkTime(0)), seen("a", 0, false), Rivals::Some, 60_000, StepDown),
+            ("taken over", Part::Leads(LinkTime(9_900)), seen("b", 9_950, false), Rivals::Some, 9_950, StepDown),
+            ("left by itself", Part::Leads(LinkTime(0)), seen("", 10, false), Rivals::Some, 10, StepDown),
+            ("alone for an hour", Part::Leads(LinkTime(0)), seen("a", 0, false), Rivals::None, 3_600_000, Lead),
+            ("alone no more", Part::Leads(LinkTime(0)), seen("b", 5, false), Rivals::None, 5, StepDown),
+            ("naive", Part::StandsBy, seen("b", 0, true), Rivals::Ignored, 0, Lead),
+        ];
+        for (what, part, seen, rivals, now, stance) in table {
+            assert_eq!(decide("a", *part, seen, *rivals, LinkTime(*now)), *stance, "{what}");
+        }
+    }
+
+    #[test]
+    fn a_leader_stops_before_anybody_takes_over_though_one_clock_is_a_tenth_faster() {
+        let LinkDuration(ends) = limits::LEAD_ENDS_AFTER;
+        let LinkDuration(free) = limits::LEAD_FREE_AFTER;
+        assert!(ends * 11 / 10 < free * 10 / 11, "{ends} {free}");
+        assert!(limits::LEAD_RENEWED_EVERY < limits::LEAD_ENDS_AFTER);
+    }
+
+    fn row(item: &Item, revision: u64) -> Row {
+        let crate::rows::Write::Put { index, body } = item.rows[0].write.clone() else { panic!("no row") };
+        Row { key: item.rows[0].key.clone(), revision: Revision(revision), index, body }
+    }
+
+    #[test]
+    fn a_leader_frozen_for_a_minute_finds_another_one_in_its_place() {
+        let mut a = Seat::<FleetLeader>::new("a".to_owned(), Rivals::Some);
+        let mut b = Seat::<FleetLeader>::new("b".to_owned(), Rivals::Some);
+        a.read(None, LinkTime(0)).expect("no row");
+        assert_eq!(a.stance(LinkTime(0)), Stance::TakeOver);
+        let first = a.claim();
+        assert_eq!(first.rows[0].expect, Expect::Absent);
+        a.claimed(LinkTime(0));
+        // Another machine, another clock.
+        b.read(Some(&row(&first, 1)), LinkTime(500_000)).expect("a row");
+        assert_eq!(b.stance(LinkTime(500_000)), Stance::StandBy);
+        let stale = a.claim();
+        let second = b.claim();
+        assert_eq!((b.stance(LinkTime(504_000)), second.rows[0].expect), (Stance::TakeOver, Expect::At(Revision(1))));
+        b.claimed(LinkTime(504_000));
+        assert_eq!(stale.rows[0].expect, Expect::At(Revision(1)), "what it wanted to write conflicts");
+        assert_eq!(a.stance(LinkTime(60_000)), Stance::StepDown);
+        a.step_down();
+        a.read(Some(&row(&second, 2)), LinkTime(60_000)).expect("a row");
+        assert_eq!(a.stance(LinkTime(60_000)), Stance::StandBy);
+        // It leaves, and the other one need not wait.
+        let left = b.release().expect("it leads");
+        a.read(Some(&row(&left, 3)), LinkTime(60_001)).expect("a row");
+        assert_eq!(a.stance(LinkTime(60_001)), Stance::TakeOver);
+    }
+
+    #[test]
+    fn whoever_saw_an_older_revision_again_learns_nothing_from_it() {
+        let mut a = Seat::<OtaLeader>::new("a".to_owned(), Rivals::Some);
+        a.read(None, LinkTime(0)).expect("no row");
+        let first = row(&a.claim(), 1);
+        a.claimed(LinkTime(1_000));
+        a.read(Some(&first), LinkTime(1_500)).expect("its own");
+        assert_eq!(a.stance(LinkTime(1_900)), Stance::Lead);
+        assert_eq!(a.stance(LinkTime(2_000)), Stance::Renew);
+    }
+
+    #[test]
+    fn what_another_process_wrote_between_two_items_is_told_apart() {
+        let mut own = Own::default();
+        own.wrote(12, 3);
+        own.wrote(20, 1);
+        own.wrote(20, 0);
+        let asked: Vec<bool> = (9..=21).map(|seq| own.is_own(seq)).collect();
+        let mine: Vec<u64> = (9..=21).zip(asked).filter(|(_, own)| *own).map(|(seq, _)| seq).collect();
+        assert_eq!(mine, [10, 11, 12, 20]);
+    }
+}

@@ -1,0 +1,151 @@
+//! What the updater believes: the repository's word, the keys that sign directives, and whether a directive holds against both.
+//!
+//! Invariant: what the repository says is written down before a directive is held against it; a new key counts only by the rule of
+//! [`midshift_bundle::key_set`]. Called by the machine.
+
+use super::{HeldKeys, Job, SoftwareRow, Update};
+use crate::core::AgentCore;
+use crate::store::Op;
+use midshift_bundle::digest::Digest;
+use midshift_bundle::directive::{Directive, Expected, Rejection};
+use midshift_bundle::key_set::Current;
+use midshift_bundle::trust::{Reading, Refreshed, Trusted};
+use midshift_core::reason::{Code, Reason};
+use midshift_core::time::{Now, Utc};
+use midshift_core::update::{DesiredUpdate, UpdateState};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+impl AgentCore {
+    pub(super) fn reading(&self, now: &Now) -> Reading {
+        let is_synced = self.update.config.as_ref().is_some_and(|c| c.clock_synced);
+        Reading { utc: now.wall, is_synced }
+    }
+
+    pub(super) fn trusted(&self) -> Result<Trusted, Reason> {
+        if let Some(trusted) = &self.kept.ledger.trusted {
+            return Ok(Trusted::clone(trusted));
+        }
+        let root = self.update.config.as_ref().map(|c| c.root.as_slice()).unwrap_or_default();
+        Trusted::new(root).map_err(|e| Reason::new(Code::MetadataRefused, e.to_string()))
+    }
+
+    /// Whose directives it takes: of the keys that were handed over last. Keys that a person put into its trust file since count instead.
+    fn directive_keys(&self) -> Current {
+        let own = self.update.config.as_ref().map(|c| c.directive_keys.clone()).unwrap_or_default();
+        let held = self.kept.ledger.software.keys.as_ref();
+        let number = held.map_or(0, |held| held.number);
+        match held.filter(|held| held.from.iter().eq(own.keys())) {
+            Some(held) => Current { number, keys: held.keys.iter().map(|key| (key.id(), key.clone())).collect() },
+            None => Current { number, keys: own },
+        }
+    }
+
+    /// Goes over to the newest set of keys that was handed over.
+    fn take_keys(&mut self, listed: &BTreeMap<u64, Vec<u8>>) {
+        let before = self.directive_keys();
+        let mut current = before.clone();
+        for (number, rejection) in current.follow(listed) {
+            tracing::warn!(robot_id = %self.config.robot_id, number, %rejection, "a set of directive keys was passed over");
+        }
+        if current == before {
+            return;
+        }
+        let keys: Vec<String> = current.keys.keys().map(ToString::to_string).collect();
+        tracing::info!(robot_id = %self.config.robot_id, number = current.number, ?keys, "directives are taken of other keys");
+        let from = self.update.config.iter().flat_map(|c| c.directive_keys.keys().copied()).collect();
+        let held = HeldKeys { number: current.number, keys: current.keys.into_values().collect(), from };
+        self.put_software(SoftwareRow { keys: Some(held), ..self.kept.ledger.software.clone() });
+    }
+
+    pub(super) fn ask_to_refresh(&mut self, trusted: Trusted, clock: Reading) {
+        let keys_after = self.directive_keys().number;
+        self.update.asks_for_keys = false;
+        self.ask_for(Job::Refresh { trusted: Box::new(trusted), clock, keys_after });
+    }
+
+    pub(super) fn refresh_again(&mut self) {
+        match self.trusted() {
+            Ok(trusted) => {
+                let is_synced = false;
+                let clock = Reading { utc: trusted.time_floor(), is_synced };
+                self.ask_to_refresh(trusted, clock);
+            }
+            Err(reason) => self.move_to(UpdateState::Refused, Some(reason)),
+        }
+    }
+
+    /// The repository has answered: what it says is believed first, then the directive is held against it.
+    pub(super) fn refreshed(&mut self, now: &Now, refreshed: Refreshed, key_sets: &BTreeMap<u64, Vec<u8>>) {
+        self.write(Op::Trusted(Arc::new(refreshed.trusted.clone())), true);
+        self.take_keys(key_sets);
+        let time = refreshed.trusted.now(self.reading(now));
+        self.update.listed = Some(Arc::new(refreshed));
+        let Some(desired) = self.update.desired.clone() else { return };
+        self.update.keys_asked = Some(desired.directive.clone());
+        if std::mem::take(&mut self.update.asks_for_keys) {
+            // The order to go back is held against them at its place.
+            return;
+        }
+        if self.is_the_newest(&desired) {
+            // What it asked for stands on the ledger, or is over.
+            self.update.judged = Some(desired.directive);
+            return;
+        }
+        match self.open(&desired, time) {
+            Ok(directive) => {
+                self.update.judged = Some(desired.directive.clone());
+                self.update.fetched.clear();
+                let update = Update {
+                    state: UpdateState::Directed,
+                    bundle: directive.manifest,
+                    manifest_length: directive.manifest_length,
+                    rollback_floor: directive.rollback_floor,
+                    set: None,
+                    raises_floor: false,
+                    is_irreversible: false,
+                    drain_id: None,
+                    tries: 0,
+                    probation_ms: desired.probation_ms,
+                    reason: None,
+                };
+                let row = self.kept.ledger.software.with(&directive, &desired);
+                self.put_software(row);
+                self.put_update(update);
+            }
+            Err(reason) => self.refuse_directive(reason),
+        }
+    }
+
+    fn open(&self, desired: &DesiredUpdate, now: Utc) -> Result<Directive, Reason> {
+        let refused = |text: String| Reason::new(Code::DirectiveRefused, text);
+        let opened = self.opened(desired, self.kept.ledger.software.directive, now);
+        let directive = opened.map_err(|rejection| refused(rejection.to_string()))?;
+        if self.lists(&directive.manifest, directive.manifest_length) {
+            Ok(directive)
+        } else {
+            Err(refused("no release lists its bundle".to_owned()))
+        }
+    }
+
+    pub(super) fn opened(&self, desired: &DesiredUpdate, generation: u64, now: Utc) -> Result<Directive, Rejection> {
+        let keys = &self.directive_keys().keys;
+        let expected = Expected { robot_id: &self.config.robot_id, keys, generation, now };
+        Directive::open(desired.directive.as_bytes(), &expected)
+    }
+
+    /// Whether the envelope is the one that was taken last: after a restart it comes again. What was taken does not expire, nor with its key.
+    pub(super) fn is_the_newest(&self, desired: &DesiredUpdate) -> bool {
+        let software = &self.kept.ledger.software;
+        if software.envelope == Some(Digest::of(desired.directive.as_bytes())) {
+            return true;
+        }
+        let newest = software.directive;
+        newest > 0 && self.opened(desired, newest - 1, Utc(0)).is_ok_and(|d| d.generation == newest)
+    }
+
+    pub(super) fn lists(&self, digest: &Digest, length: u64) -> bool {
+        let listed = self.update.listed.as_ref();
+        listed.is_some_and(|l| l.targets.values().any(|t| t.digest == *digest && t.length == length))
+    }
+}

@@ -1,0 +1,122 @@
+//! A process that does not lead: it keeps its picture by rows alone, answers from it, and carries out what people ask.
+//!
+//! Invariant: it decides nothing but commands. Each is decided on the picture, committed on the condition that nothing of it has changed,
+//! and decided anew if something has; the process that leads obeys what is written.
+
+use crate::Request;
+use crate::reconcile::Loop;
+use midshift_core::fleet::commands::{self, Command};
+use midshift_core::fleet::{LOGS, Tx, follow_rows, reread};
+use midshift_core::limits;
+use midshift_core::picture;
+use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::rows::{Entry, Item, Revision};
+use midshift_store::{CommitError, Error, follow};
+
+/// What a person asks of fleet.
+pub(crate) struct Asked<'a> {
+    command: &'a Command,
+    seen: Option<Revision>,
+    validate_only: bool,
+    actor: &'a str,
+    request_id: Option<&'a str>,
+}
+
+impl Loop {
+    /// Comes up to the head of the feed.
+    pub(crate) async fn follow_rows(&mut self) -> Result<(), Error> {
+        let now = self.parts.clock.now();
+        let mut unreadable = Vec::new();
+        let mut seen = Ok(());
+        let clock = self.parts.clock.clone();
+        let Self { view, seat, .. } = self;
+        let take = |entries: &[Entry]| {
+            if seen.is_ok() {
+                // Counted from when it was seen: a look may take long.
+                seen = seat.follow(entries, clock.now().link);
+            }
+            if !entries.is_empty() {
+                follow_rows(view, now, entries, &mut unreadable);
+            }
+        };
+        follow(self.parts.store.as_ref(), &mut self.seq, LOGS, take).await?;
+        for text in unreadable {
+            tracing::error!(text, "fleet passed over something it cannot read");
+        }
+        Ok(seen?)
+    }
+
+    /// Answers, and carries out what people ask. An error: the picture can no longer be trusted.
+    pub(crate) async fn assist(&mut self, requests: Vec<Request>) -> Result<(), ()> {
+        let mut trusted = Ok(());
+        for request in requests {
+            match request {
+                Request::Look(look) => self.looks.push(look),
+                Request::Do { command, seen, validate_only, actor, request_id, reply } => {
+                    let (actor, request_id) = (actor.as_str(), request_id.as_deref());
+                    let asked = Asked { command: &command, seen, validate_only, actor, request_id };
+                    let answer = match trusted {
+                        Ok(()) => self.carry_out(&asked).await,
+                        Err(()) => Ok(Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile))),
+                    };
+                    let answer = answer.unwrap_or_else(|error| {
+                        tracing::warn!(%error, "fleet cannot read the store");
+                        trusted = Err(());
+                        Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown))
+                    });
+                    drop(reply.send(answer));
+                }
+            }
+        }
+        trusted?;
+        self.answer(self.parts.clock.now());
+        Ok(())
+    }
+
+    /// The answer to whoever asked. An error: what came of it may not be in the picture.
+    async fn carry_out(&mut self, asked: &Asked<'_>) -> Result<Result<(), Refusal>, Error> {
+        for _ in 0..limits::COMMAND_TRIES {
+            let item = match self.decide(asked) {
+                Ok(Some(item)) => item,
+                Ok(None) => return Ok(Ok(())),
+                Err(refusal) => return Ok(Err(refusal)),
+            };
+            let keys = picture::touched(std::slice::from_ref(&item));
+            match self.parts.store.commit(vec![item]).await.pop() {
+                Some(Ok(_)) => return Ok(Ok(())),
+                Some(Err(CommitError::Conflict { .. })) => {
+                    metrics::counter!("midshift_fleet_commands_again_total").increment(1);
+                    let rows = self.parts.store.get(keys.clone()).await?;
+                    reread(&mut self.view, &keys, &rows)?;
+                    self.follow_rows().await?;
+                }
+                Some(Err(error)) => return Err(Error::Unavailable(std::sync::Arc::new(error))),
+                None => unreachable!("one result an item"),
+            }
+        }
+        Ok(Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile)))
+    }
+
+    /// What has to be written; none: nothing has.
+    fn decide(&mut self, asked: &Asked) -> Result<Option<Item>, Refusal> {
+        let Asked { command, seen, validate_only, actor, request_id } = asked;
+        if let Some(id) = request_id
+            && commands::is_repeat(&self.view, id, command, *seen)?
+        {
+            return Ok(None);
+        }
+        let now = self.parts.clock.now();
+        commands::check(&self.view, &self.board, &now, command, *seen)?;
+        if *validate_only {
+            return Ok(None);
+        }
+        let mut tx = Tx::new(&mut self.view, now, actor).on_request(*request_id);
+        commands::apply(&mut tx, command, actor);
+        if let Some(id) = request_id {
+            commands::remember(&mut tx, id, command, *seen);
+        }
+        let item = tx.finish();
+        self.view.rest();
+        Ok(item)
+    }
+}

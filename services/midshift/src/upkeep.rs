@@ -1,0 +1,93 @@
+//! What every process takes care of now and then: old rows, entries and frames of its roles, and samples of histograms.
+//!
+//! Called by [`crate::server`]. Invariant: nothing goes that a service has not consumed.
+
+use crate::roles::Role;
+use crate::server::{Parts, metrics_handle};
+use metrics_exporter_prometheus::PrometheusHandle;
+use midshift_core::fleet::rows::FleetMark;
+use midshift_core::limits;
+use midshift_core::rollout::rows::OtaMark;
+use midshift_core::time::Clock;
+use midshift_store::{Retention, Store};
+use midshift_task::TaskService;
+use std::time::Duration;
+
+/// How often old log entries are taken away.
+const PRUNE_EVERY: Duration = Duration::from_secs(60);
+/// How often samples of histograms are folded: without a scrape they would gather for ever.
+const FOLD_EVERY: Duration = Duration::from_secs(5);
+/// Log entries kept at most, beside the days of [`limits::REMEMBER_DAYS`].
+const ENTRIES_MAX: u64 = 20_000_000;
+
+/// Until it is dropped.
+pub async fn run(parts: &Parts, task: Option<TaskService>) {
+    tokio::join!(prune(parts, task), fold(metrics_handle()));
+}
+
+/// Folds samples of histograms, whether or not anybody scrapes.
+async fn fold(metrics: Option<PrometheusHandle>) {
+    loop {
+        tokio::time::sleep(FOLD_EVERY).await;
+        if let Some(metrics) = &metrics {
+            metrics.run_upkeep();
+        }
+    }
+}
+
+/// Takes old rows, entries and frames away, entries never past what fleet and roll-outs have not consumed.
+async fn prune(parts: &Parts, task: Option<TaskService>) {
+    let (store, clock) = (parts.store.as_ref(), parts.clock.as_ref());
+    loop {
+        tokio::time::sleep(PRUNE_EVERY).await;
+        if let Some(task) = &task
+            && let Err(error) = task.prune().await
+        {
+            tracing::warn!(%error, "old requests could not be taken away");
+        }
+        if parts.roles.has(Role::Fleet) {
+            if let Err(error) = midshift_fleet::prune(store, clock).await {
+                tracing::warn!(%error, "tasks that ended long ago could not be taken away");
+            }
+            if let Err(error) = prune_entries(store, clock).await {
+                tracing::warn!(%error, "old log entries could not be taken away");
+            }
+        }
+        if parts.roles.has(Role::Telemetry)
+            && let Err(error) = parts.frames.prune().await
+        {
+            tracing::warn!(%error, "old status could not be taken away");
+        }
+    }
+}
+
+async fn prune_entries(store: &dyn Store, clock: &dyn Clock) -> Result<(), midshift_store::Error> {
+    // Until fleet has consumed something nothing may go.
+    let Some((mark, _)) = midshift_store::load::<FleetMark>(store, "fleet").await? else { return Ok(()) };
+    let days_ms = (limits::REMEMBER_DAYS * 86_400_000) as i64;
+    let ota = midshift_store::load::<OtaMark>(store, "ota").await?.map_or(mark.seq, |(mark, _)| mark.seq);
+    let floor = mark.seq.min(ota);
+    let keep = Retention { before_unix_ms: clock.now().wall.0 - days_ms, entries_max: ENTRIES_MAX, floor };
+    store.prune(keep).await.map(drop)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use metrics_exporter_prometheus::PrometheusBuilder;
+
+    /// Whether the samples of a histogram were folded; only the text of the recorder tells without folding them itself.
+    fn folded(metrics: &PrometheusHandle, name: &str) -> bool {
+        format!("{metrics:?}").split_once("distributions:").is_some_and(|(_, folded)| folded.contains(name))
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn histograms_do_not_grow_while_nobody_scrapes() {
+        let recorder = PrometheusBuilder::new().build_recorder();
+        let metrics = recorder.handle();
+        metrics::with_local_recorder(&recorder, || metrics::histogram!("midshift_test_seconds").record(1.0));
+        assert!(!folded(&metrics, "midshift_test_seconds"));
+        let _ = tokio::time::timeout(FOLD_EVERY * 2, fold(Some(metrics.clone()))).await;
+        assert!(folded(&metrics, "midshift_test_seconds"));
+    }
+}

@@ -1,0 +1,327 @@
+//! The folder of releases as a whole: which store it belongs to, and how processes that share it keep out of each other's way.
+//!
+//! Invariant: in a folder of another store nothing is read or changed; a lock is the kernel's, on a file that stays, so that it ends with the
+//! process that holds it, however that ends; nobody waits for one without end. Called by the service when it opens, and by whoever restores
+//! a folder.
+
+use crate::blocking;
+use crate::content::{Error as Disk, sync_folder, write_whole};
+use midshift_core::limits;
+use midshift_store::StoreId;
+use rustix::fs::{FlockOperation, flock};
+use rustix::io::Errno;
+use std::fs::{self, File, OpenOptions};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::{Mutex, OwnedMutexGuard};
+use tokio::time::Instant;
+
+/// Says which store the folder belongs to: its id as text.
+const MARKER: &str = "store_id";
+/// Locked as long as a process works in the folder. Holds the number of the newest such process.
+const IN_USE: &str = "in-use.lock";
+/// Locked by whoever changes files of releases.
+pub const CONTENT: &str = "content.lock";
+/// Locked by whoever changes documents, or must not have them changed.
+pub const METADATA: &str = "metadata.lock";
+/// Locked by whoever makes shorter ways.
+pub const ENCODED: &str = "encoded.lock";
+/// What a new file system has by itself.
+const LOST_AND_FOUND: &str = "lost+found";
+/// Between two looks at a lock that another process holds.
+const LOOK_AGAIN: Duration = Duration::from_millis(2);
+
+/// Whose a folder is, and who else works in it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Owner {
+    /// It goes with the process that made it: nothing says whose it is.
+    Nobody,
+    /// Of this store, which has one process. A folder that says nothing becomes this store's.
+    Alone(StoreId),
+    /// Of this store, which has several processes. A folder that says nothing becomes this store's only if it is empty, and only if the
+    /// store knows no bundle: else the volume is not there.
+    Shared {
+        /// Which store.
+        store_id: StoreId,
+        /// Bundles that its rows know, see [`crate::rollouts::known_bundles`].
+        known_bundles: usize,
+    },
+}
+
+/// Why a folder is not opened.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The disk.
+    #[error(transparent)]
+    Disk(#[from] Disk),
+    /// It is another store's.
+    #[error(
+        "{folder} belongs to store {found}, and this is store {expected}: if the database was restored, restore this folder from the same backup; if a wrong volume is mounted, mount the one of this site"
+    )]
+    OtherStore {
+        /// The folder.
+        folder: PathBuf,
+        /// Whose it is.
+        found: String,
+        /// Whose it should be.
+        expected: StoreId,
+    },
+    /// It does not say whose it is.
+    #[error(
+        "{folder} has no file {MARKER} and nobody knows whether it is the folder of store {expected}: mount the volume of this site; a new one is begun by a process with role ota, in an empty folder; one from before this file was kept is taken over by one start of `midshift serve` with all roles"
+    )]
+    NoMarker {
+        /// The folder.
+        folder: PathBuf,
+        /// Whose it should be.
+        expected: StoreId,
+    },
+    /// It is empty, and should not be.
+    #[error(
+        "{folder} is empty and store {expected} knows {known_bundles} bundles: its volume is not mounted; mount it, or restore it from a backup"
+    )]
+    Emptied {
+        /// The folder.
+        folder: PathBuf,
+        /// Whose it should be.
+        expected: StoreId,
+        /// Bundles that the store knows.
+        known_bundles: usize,
+    },
+    /// Another process works in it.
+    #[error("another process works in {folder}: end it, or start both with --roles on one PostgreSQL store")]
+    InUse {
+        /// The folder.
+        folder: PathBuf,
+    },
+}
+
+fn at(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Disk {
+    let path = path.to_owned();
+    move |source| Disk::Io { doing, path, source }
+}
+
+/// Makes a folder say that it belongs to this store, durable. The folder is made if it is not there. Blocks.
+///
+/// # Errors
+/// If it cannot be written.
+pub fn mark(folder: &Path, store_id: &StoreId) -> Result<(), Disk> {
+    fs::create_dir_all(folder).map_err(at("making", folder))?;
+    write_whole(&folder.join(MARKER), format!("{store_id}\n").as_bytes())?;
+    folder.parent().map_or(Ok(()), sync_folder)
+}
+
+/// Whose a folder says that it is; none: it says nothing, or is not there.
+fn marked(folder: &Path) -> Result<Option<String>, Disk> {
+    let path = folder.join(MARKER);
+    match fs::read_to_string(&path) {
+        Ok(text) => Ok(Some(text.trim().to_owned())),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(at("reading", &path)(error)),
+    }
+}
+
+/// Refuses a folder of another store. Whether it says whose it is. Blocks.
+fn is_marked(folder: &Path, expected: &StoreId) -> Result<bool, Error> {
+    match marked(folder)? {
+        Some(found) if found == *expected.0 => Ok(true),
+        Some(found) => Err(Error::OtherStore { folder: folder.to_owned(), found, expected: expected.clone() }),
+        None => Ok(false),
+    }
+}
+
+/// Refuses a folder that does not say that it is this store's. Blocks.
+///
+/// # Errors
+/// If it is another's, says nothing or cannot be read.
+pub fn must_be_of(folder: &Path, expected: &StoreId) -> Result<(), Error> {
+    if is_marked(folder, expected)? {
+        return Ok(());
+    }
+    Err(Error::NoMarker { folder: folder.to_owned(), expected: expected.clone() })
+}
+
+fn is_empty(folder: &Path) -> Result<bool, Disk> {
+    for entry in fs::read_dir(folder).map_err(at("reading", folder))? {
+        let name = entry.map_err(at("reading", folder))?.file_name();
+        let ours = name.to_string_lossy();
+        if ours != IN_USE && ours != LOST_AND_FOUND && ours != format!("{MARKER}.new") {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+/// Refuses a folder of another store, and makes one that says nothing this store's if it may be. Nobody else is at it. Blocks.
+fn take(folder: &Path, owner: &Owner) -> Result<(), Error> {
+    match owner {
+        Owner::Nobody => Ok(()),
+        Owner::Alone(store_id) => {
+            if !is_marked(folder, store_id)? {
+                mark(folder, store_id)?;
+            }
+            Ok(())
+        }
+        Owner::Shared { store_id, known_bundles } => {
+            if is_marked(folder, store_id)? {
+                return Ok(());
+            }
+            let (folder_of, expected) = (|| folder.to_owned(), store_id.clone());
+            if !is_empty(folder)? {
+                return Err(Error::NoMarker { folder: folder_of(), expected });
+            }
+            if *known_bundles > 0 {
+                return Err(Error::Emptied { folder: folder_of(), expected, known_bundles: *known_bundles });
+            }
+            Ok(mark(folder, store_id)?)
+        }
+    }
+}
+
+fn lock_file(path: &Path) -> Result<File, Disk> {
+    let opened = OpenOptions::new().create(true).truncate(false).read(true).write(true).open(path);
+    opened.map_err(at("opening", path))
+}
+
+/// Whether the lock is ours now. Blocks no longer than the file system takes to say so.
+fn try_lock(file: &File, path: &Path, how: FlockOperation) -> Result<bool, Disk> {
+    match flock(file, how) {
+        Ok(()) => Ok(true),
+        Err(Errno::WOULDBLOCK | Errno::INTR) => Ok(false),
+        Err(error) => Err(at("locking", path)(error.into())),
+    }
+}
+
+/// That a process works in the folder, until it is dropped.
+pub struct Presence {
+    file: File,
+    path: PathBuf,
+    is_shared: bool,
+    /// Of this process among all that ever worked in the folder. No two that work in it at a time have the same.
+    pub number: u64,
+    /// Nobody else works in it now, so what a cut left may be mended.
+    pub is_first: bool,
+}
+
+impl Presence {
+    /// Comes into the folder, made if it is not there, whose owner is settled by that. None: nobody asks whose it is. Others wait until
+    /// [`Presence::let_in`].
+    ///
+    /// # Errors
+    /// If it is another store's, or does not say so and may not be taken, or the one who works in it wants to be alone.
+    pub async fn come(folder: &Path, owner: &Owner) -> Result<Option<Self>, Error> {
+        if *owner == Owner::Nobody {
+            return Ok(None);
+        }
+        let (path, of) = (folder.to_owned(), owner.clone());
+        let file = blocking(move || {
+            fs::create_dir_all(&path).map_err(at("making", &path))?;
+            lock_file(&path.join(IN_USE))
+        })
+        .await?;
+        let is_shared = matches!(owner, Owner::Shared { .. });
+        let path = folder.join(IN_USE);
+        let first_or_joined = || {
+            if try_lock(&file, &path, FlockOperation::NonBlockingLockExclusive)? {
+                return Ok(Some(true));
+            }
+            let joined = is_shared && try_lock(&file, &path, FlockOperation::NonBlockingLockShared)?;
+            Ok::<_, Disk>(joined.then_some(false))
+        };
+        let Some(is_first) = until_some(first_or_joined).await? else {
+            return Err(Error::InUse { folder: folder.to_owned() });
+        };
+        let inside = folder.to_owned();
+        blocking(move || take(&inside, &of)).await?;
+        let turn = Gate::new(Some(folder.join(CONTENT))).take().await?;
+        let inside = path.clone();
+        let number = blocking(move || {
+            let _turn = turn;
+            next_number(&inside)
+        })
+        .await?;
+        Ok(Some(Self { file, path, number, is_first, is_shared }))
+    }
+
+    /// Whether there may be others.
+    pub const fn is_shared(&self) -> bool {
+        self.is_shared
+    }
+
+    /// Lets others in, if there may be any: what a cut left is mended.
+    ///
+    /// # Errors
+    /// If the lock cannot be changed.
+    pub async fn let_in(&self) -> Result<(), Error> {
+        if !self.is_shared {
+            return Ok(());
+        }
+        // One who came first at the moment between two locks looks for things to mend too, finds none, and lets us in.
+        let shared = || Ok(try_lock(&self.file, &self.path, FlockOperation::NonBlockingLockShared)?.then_some(()));
+        let folder = || self.path.parent().unwrap_or(&self.path).to_owned();
+        until_some(shared).await?.ok_or_else(|| Error::InUse { folder: folder() })
+    }
+}
+
+/// Draws the next number. Nobody else does so meanwhile. After a loss of power it may be one that was drawn before: of a process that is no more.
+fn next_number(path: &Path) -> Result<u64, Disk> {
+    let text = fs::read_to_string(path).map_err(at("reading", path))?;
+    let number = text.trim().parse::<u64>().unwrap_or(0) + 1;
+    fs::write(path, number.to_string()).map_err(at("writing", path))?;
+    Ok(number)
+}
+
+/// Looks again and again, for [`limits::SOFTWARE_TURN_WAIT`] at most. None: it was all in vain.
+async fn until_some<T>(mut look: impl FnMut() -> Result<Option<T>, Disk>) -> Result<Option<T>, Disk> {
+    let begun = Instant::now();
+    loop {
+        if let Some(found) = look()? {
+            return Ok(Some(found));
+        }
+        if begun.elapsed() >= Duration::from_millis(limits::SOFTWARE_TURN_WAIT.as_ms()) {
+            return Ok(None);
+        }
+        tokio::time::sleep(LOOK_AGAIN).await;
+    }
+}
+
+/// Lets one at a time do something: of this process, and of all that share a folder if it is of a file.
+#[derive(Clone)]
+pub struct Gate {
+    here: Arc<Mutex<()>>,
+    path: Option<PathBuf>,
+}
+
+/// That it is somebody's turn, until it is dropped.
+pub struct Turn {
+    _file: Option<File>,
+    _here: OwnedMutexGuard<()>,
+}
+
+impl Gate {
+    /// A gate; with a file, for every process that has one of the same file.
+    pub fn new(path: Option<PathBuf>) -> Self {
+        Self { here: Arc::default(), path }
+    }
+
+    /// Waits for a turn.
+    ///
+    /// # Errors
+    /// If another process does not end its turn, or the lock cannot be had.
+    pub async fn take(&self) -> Result<Turn, Disk> {
+        let here = self.here.clone().lock_owned().await;
+        let Some(path) = self.path.clone() else { return Ok(Turn { _file: None, _here: here }) };
+        let opened = path.clone();
+        let file = blocking(move || lock_file(&opened)).await?;
+        let lock = || Ok(try_lock(&file, &path, FlockOperation::NonBlockingLockExclusive)?.then_some(()));
+        if until_some(lock).await?.is_none() {
+            return Err(Disk::Busy { path });
+        }
+        Ok(Turn { _file: Some(file), _here: here })
+    }
+}
+
+#[cfg(test)]
+mod tests;

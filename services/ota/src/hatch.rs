@@ -1,0 +1,196 @@
+//! Where bytes and documents are handed out, over gRPC to robots and over HTTP to others: from the folder of this process, or of others.
+//!
+//! Invariant: nothing is written or signed here, and only what the newest signed release lists is handed out, and what was made of that.
+
+use crate::content::{Content, Wanted};
+use crate::encodings::{Encodings, Way};
+use crate::grpc::{answer, status};
+use crate::repository::Documents;
+use midshift_bundle::digest::Digest;
+use midshift_core::limits;
+use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
+use midshift_proto::chunk;
+use midshift_proto::ota::v1;
+use midshift_proto::ota::v1::bundle_service_server::BundleService as BundleFace;
+use midshift_proto::ota::v1::chunk_service_server::ChunkService as ChunkFace;
+use std::pin::Pin;
+use std::sync::Arc;
+use tokio_stream::{Stream, StreamExt};
+use tokio_util::io::ReaderStream;
+use tonic::{Request, Response, Status, Streaming};
+
+/// What is handed out.
+pub struct Shown {
+    pub(crate) content: Arc<dyn Content>,
+    pub(crate) encodings: Encodings,
+    pub(crate) documents: Documents,
+}
+
+/// The hatch. Cheap to clone. One of a server without keys says so to everybody.
+#[derive(Clone, Default)]
+pub struct Hatch {
+    shown: Option<Arc<Shown>>,
+}
+
+impl Shown {
+    /// Whether the newest signed release lists it.
+    fn lists(&self, digest: Digest) -> bool {
+        self.documents.newest().is_some_and(|newest| newest.lists(digest))
+    }
+}
+
+impl Hatch {
+    pub(crate) fn new(content: Arc<dyn Content>, encodings: Encodings, documents: Documents) -> Self {
+        Self { shown: Some(Arc::new(Shown { content, encodings, documents })) }
+    }
+
+    pub(crate) fn shown(&self) -> Result<&Shown, Refusal> {
+        self.shown.as_deref().ok_or_else(|| Refusal::new(Kind::Precondition, Code::NoOnlineKeys))
+    }
+
+    /// A document by its name.
+    pub(crate) async fn metadata(&self, r: v1::GetMetadataRequest) -> Result<v1::GetMetadataResponse, Refusal> {
+        let shown = self.shown()?;
+        if r.name.is_empty() {
+            return Err(Refusal::field("name", "is required, e.g. timestamp.json"));
+        }
+        let found = shown.documents.document(&r.name).await?;
+        let reason = || Reason::from(Code::SoftwareNotFound).with("name", r.name.chars().take(100).collect::<String>());
+        let document = found.ok_or_else(|| Refusal::new(Kind::NotFound, reason()))?;
+        Ok(v1::GetMetadataResponse { document })
+    }
+
+    /// Which file is meant and how long it is, if a signed release lists it.
+    pub(crate) async fn listed(&self, digest: Digest) -> Result<Wanted, Refusal> {
+        let shown = self.shown()?;
+        let not_found = || Refusal::new(Kind::NotFound, Code::SoftwareNotFound);
+        if !shown.lists(digest) {
+            // Another process may have published it a moment ago.
+            shown.documents.follow_if_possible().await;
+            if !shown.lists(digest) {
+                return Err(not_found());
+            }
+        }
+        let length = shown.content.length(digest).await?.ok_or_else(not_found)?;
+        Ok(Wanted { digest, length })
+    }
+
+    async fn encoding(&self, r: v1::GetEncodingRequest) -> Result<v1::GetEncodingResponse, Refusal> {
+        let opened = self.shown()?;
+        let mut bad = Violations::default();
+        let digest = bad.take("digest", r.digest.parse::<Digest>());
+        if r.base_digests.len() > limits::ENCODING_BASES_MAX {
+            bad.add("base_digests", format!("at most {}", limits::ENCODING_BASES_MAX));
+        }
+        let bases = r.base_digests.iter().take(limits::ENCODING_BASES_MAX);
+        let bases: Vec<Digest> = bases.filter_map(|base| bad.take("base_digests", base.parse())).collect();
+        bad.finish()?;
+        let digest = digest.ok_or_else(|| Refusal::field("digest", "is required"))?;
+        let file = self.listed(digest).await?;
+        let mut answer = v1::GetEncodingResponse { encoding: v1::Encoding::Identity.into(), ..Default::default() };
+        match opened.encodings.way(file, &bases).await? {
+            Way::Identity => {}
+            Way::Later => answer.ask_again_ms = limits::ENCODING_ASK_AGAIN_MS,
+            Way::Encoded(key, encoded) => {
+                let kind = if key.base.is_some() { v1::Encoding::ZstdPatch } else { v1::Encoding::Zstd };
+                answer.encoding = kind.into();
+                answer.base_digest = key.base.map(String::from).unwrap_or_default();
+                answer.encoded_digest = encoded.digest.to_string();
+                answer.encoded_length = encoded.length;
+            }
+        }
+        Ok(answer)
+    }
+
+    async fn fetch(&self, r: v1::FetchChunksRequest) -> Result<Chunks, Refusal> {
+        let opened = self.shown()?;
+        let mut bad = Violations::default();
+        let digest = bad.take("digest", r.digest.parse::<Digest>());
+        if !(1..=limits::CHUNK_RANGE_BYTES).contains(&r.length) {
+            bad.add("length", format!("is required, 1..{}", limits::CHUNK_RANGE_BYTES));
+        }
+        bad.finish()?;
+        let digest = digest.ok_or_else(|| Refusal::field("digest", "is required"))?;
+        opened.encodings.follow().await?;
+        let encoded = opened.encodings.found(digest).filter(|(key, _)| opened.lists(key.target));
+        let length = match encoded {
+            Some((_, length)) => length,
+            None => self.listed(digest).await?.length,
+        };
+        if r.offset >= length {
+            return Err(Refusal::field("offset", format!("the file has {length} bytes")));
+        }
+        let range = r.offset..(r.offset + r.length).min(length);
+        let reader = match encoded {
+            Some(_) => opened.encodings.read(digest, range).await?,
+            None => opened.content.read(digest, range).await?,
+        };
+        let reader = reader.ok_or_else(|| Refusal::new(Kind::NotFound, Code::SoftwareNotFound))?;
+        let mut offset = r.offset;
+        let stream = ReaderStream::with_capacity(reader, limits::CHUNK_BYTES).map(move |piece| {
+            let piece = piece.map_err(|error| {
+                tracing::error!(%error, %digest, "a signed file cannot be read");
+                status(&Refusal::new(Kind::Internal, Code::Internal))
+            })?;
+            let chunk = chunk::piece(offset, piece.to_vec());
+            offset += piece.len() as u64;
+            Ok(chunk)
+        });
+        Ok(Box::pin(stream))
+    }
+}
+
+/// What robots ask a gateway for of releases; all else is for the processes that keep them.
+#[tonic::async_trait]
+impl BundleFace for Hatch {
+    async fn get_metadata(
+        &self,
+        r: Request<v1::GetMetadataRequest>,
+    ) -> Result<Response<v1::GetMetadataResponse>, Status> {
+        answer(self.metadata(r.into_inner()).await)
+    }
+    async fn get_upload(&self, _: Request<v1::GetUploadRequest>) -> Result<Response<v1::GetUploadResponse>, Status> {
+        elsewhere()
+    }
+    async fn upload_target(
+        &self,
+        _: Request<Streaming<v1::UploadTargetRequest>>,
+    ) -> Result<Response<v1::UploadTargetResponse>, Status> {
+        elsewhere()
+    }
+    async fn publish_repository(
+        &self,
+        _: Request<v1::PublishRepositoryRequest>,
+    ) -> Result<Response<v1::PublishRepositoryResponse>, Status> {
+        elsewhere()
+    }
+    async fn list_bundles(
+        &self,
+        _: Request<v1::ListBundlesRequest>,
+    ) -> Result<Response<v1::ListBundlesResponse>, Status> {
+        elsewhere()
+    }
+}
+
+fn elsewhere<T>() -> Result<Response<T>, Status> {
+    answer(Err(Refusal::new(Kind::Precondition, Code::ServedElsewhere)))
+}
+
+/// Pieces of a range on their way to a robot.
+type Chunks = Pin<Box<dyn Stream<Item = Result<v1::FetchChunksResponse, Status>> + Send>>;
+
+#[tonic::async_trait]
+impl ChunkFace for Hatch {
+    type FetchChunksStream = Chunks;
+
+    async fn get_encoding(
+        &self,
+        r: Request<v1::GetEncodingRequest>,
+    ) -> Result<Response<v1::GetEncodingResponse>, Status> {
+        answer(self.encoding(r.into_inner()).await)
+    }
+
+    async fn fetch_chunks(&self, r: Request<v1::FetchChunksRequest>) -> Result<Response<Chunks>, Status> {
+        answer(self.fetch(r.into_inner()).await)
+    }
+}

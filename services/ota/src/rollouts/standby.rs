@@ -1,0 +1,106 @@
+//! A process that does not lead: it keeps its picture by rows alone, answers from it, and carries out what people ask.
+//!
+//! Invariant: it decides nothing but commands, and signs nothing. Each is decided on the picture, committed on the condition that nothing of it
+//! has changed, and decided anew if something has; the process that leads obeys what is written.
+
+use super::Request;
+use super::reconcile::Loop;
+use midshift_core::limits;
+use midshift_core::picture;
+use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::rollout::commands::{self, Command};
+use midshift_core::rollout::{LOGS, Plan, follow_rows, reread};
+use midshift_core::rows::{Entry, Log, Revision, Table};
+use midshift_store::{CommitError, Error, follow};
+use std::sync::Arc;
+
+impl Loop {
+    /// Comes up to the head of the feed. Watchers look again if something of this service changed.
+    pub(super) async fn follow_rows(&mut self) -> Result<(), Error> {
+        let now = self.parts.clock.now();
+        let (mut unreadable, mut changed, mut seen) = (Vec::new(), None, Ok(()));
+        let clock = self.parts.clock.clone();
+        let Self { view, seat, .. } = self;
+        let take = |entries: &[Entry]| {
+            if seen.is_ok() {
+                // Counted from when it was seen: a look may take long.
+                seen = seat.follow(entries, clock.now().link);
+            }
+            let ours = |e: &&Entry| e.log == Log::Ota && e.table != Some(Table::OtaLeader);
+            changed = entries.iter().rfind(ours).map(|e| e.seq).or(changed);
+            follow_rows(view, now, entries, &mut unreadable);
+        };
+        follow(self.parts.store.as_ref(), &mut self.seq, LOGS, take).await?;
+        for text in unreadable {
+            tracing::error!(text, "roll-outs passed over something they cannot read");
+        }
+        if let Some(seq) = changed {
+            self.changed.send_replace(seq);
+        }
+        Ok(seen?)
+    }
+
+    /// Answers, and carries out what people ask. An error: the picture can no longer be trusted.
+    pub(super) async fn assist(&mut self, requests: Vec<Request>) -> Result<(), ()> {
+        let mut trusted = Ok(());
+        for request in requests {
+            match request {
+                Request::Look(look) => self.looks.push(look),
+                Request::Do { command, seen, actor, reply } => {
+                    let answer = match trusted {
+                        Ok(()) => self.carry_out(&command, seen, &actor).await,
+                        Err(()) => Ok(Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile))),
+                    };
+                    let answer = answer.unwrap_or_else(|error| {
+                        tracing::warn!(%error, "a request about a roll-out was not carried out whole");
+                        trusted = Err(());
+                        Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown))
+                    });
+                    drop(reply.send(answer));
+                }
+            }
+        }
+        trusted?;
+        self.answer(self.parts.clock.now());
+        Ok(())
+    }
+
+    /// The answer to whoever asked. An error: what came of it may not be in the picture.
+    async fn carry_out(
+        &mut self,
+        command: &Command,
+        seen: Option<Revision>,
+        actor: &str,
+    ) -> Result<Result<(), Refusal>, Error> {
+        for _ in 0..limits::COMMAND_TRIES {
+            match commands::check(&self.view, &self.board, command, seen) {
+                Err(refusal) => return Ok(Err(refusal)),
+                Ok(true) => return Ok(Ok(())),
+                Ok(false) => {}
+            }
+            let mut plan = Plan::default();
+            commands::apply(&mut self.view, &self.board, self.parts.clock.now(), command, actor, &mut plan);
+            self.view.arrived.clear();
+            let keys = picture::touched(&plan.items);
+            let results = self.parts.store.commit(plan.items).await;
+            let any_applied = results.iter().any(Result::is_ok);
+            match results.into_iter().find_map(Result::err) {
+                None => return Ok(Ok(())),
+                // Part of it stands: what is left of it is asked for again.
+                Some(error) if any_applied || !matches!(error, CommitError::Conflict { .. }) => {
+                    return Err(Error::Unavailable(Arc::new(error)));
+                }
+                Some(_) => {
+                    metrics::counter!("midshift_ota_commands_again_total").increment(1);
+                    let rows = self.parts.store.get(keys.clone()).await?;
+                    reread(&mut self.view, &keys, &rows)?;
+                    self.follow_rows().await?;
+                }
+            }
+        }
+        Ok(Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile)))
+    }
+}
+
+#[cfg(test)]
+mod tests;

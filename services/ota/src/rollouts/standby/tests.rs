@@ -1,0 +1,199 @@
+//! Two processes of the rollout service over one store and one folder: one plans and signs, the other carries out what people ask.
+
+use crate::content::Room;
+use crate::fixture::{START, files, release, write_keys};
+use crate::folder::Owner;
+use crate::repository::FRESHEN_AFTER_MS;
+use crate::rollouts::{Parts, RolloutService};
+use crate::{OtaService, Parts as OtaParts};
+use midshift_core::ids::RolloutId;
+use midshift_core::lead::OtaLeader;
+use midshift_core::rollout::bugs::Bugs;
+use midshift_core::rollout::rows::{Bundle, Phase, Rollout};
+use midshift_core::rows::{Record, Revision, Table};
+use midshift_core::site::{DEMO, Site, text};
+use midshift_core::time::{Clock, ScaledClock};
+use midshift_proto::ota::v1;
+use midshift_proto::ota::v1::rollout_service_server::RolloutService as Face;
+use midshift_store::{LiveBoard, MemoryStore, Store, StoreId};
+use std::sync::Arc;
+use std::time::Duration;
+use tempfile::TempDir;
+use tokio::task::JoinHandle;
+use tokio::time::Instant;
+use tokio_util::sync::CancellationToken;
+use tonic::Request;
+
+/// So long after the beginning of a test what is published in it has to be signed anew: it was made at [`START`].
+const DUE_MS: u64 = 60_000;
+
+/// What the processes share.
+struct World {
+    dir: TempDir,
+    store: Arc<MemoryStore>,
+    clock: Arc<dyn Clock>,
+    site: Arc<Site>,
+}
+
+/// One of them.
+struct Process {
+    ota: OtaService,
+    face: RolloutService,
+    shutdown: CancellationToken,
+    running: Vec<JoinHandle<()>>,
+}
+
+impl World {
+    fn new() -> Self {
+        let dir = TempDir::new().expect("a folder");
+        write_keys(&dir.path().join("keys"));
+        let begun = Instant::now();
+        let base = START.plus_ms(FRESHEN_AFTER_MS - DUE_MS);
+        let clock: Arc<dyn Clock> = Arc::new(ScaledClock::new(move || begun.elapsed().as_micros() as u64, base, 1000));
+        let site = Arc::new(text::parse(DEMO).expect("the demo reads"));
+        let store = MemoryStore::new(site.site_id().clone(), StoreId(Arc::from("store")), clock.clone()).shared();
+        Self { dir, store: Arc::new(store), clock, site }
+    }
+
+    async fn process(&self) -> Process {
+        let (folder, keys) = (self.dir.path().join("ota"), self.dir.path().join("keys"));
+        let owner = Owner::Shared { store_id: self.store.id().clone(), known_bundles: 0 };
+        let ota = OtaParts { folder, keys, room: Room::of(1 << 20), clock: self.clock.clone(), owner };
+        let ota = OtaService::open(ota).await.expect("a service");
+        let shutdown = CancellationToken::new();
+        let parts = Parts {
+            store: self.store.clone(),
+            board: LiveBoard::new(),
+            site: self.site.clone(),
+            clock: self.clock.clone(),
+            ota: ota.clone(),
+            bugs: Bugs::default(),
+        };
+        let (face, planner) = RolloutService::new(parts, shutdown.clone());
+        let token = shutdown.clone();
+        let planning = tokio::spawn(async move { planner.run(token).await.expect("without a fault") });
+        let serving = tokio::spawn(ota.clone().run(shutdown.clone()));
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        Process { ota, face, shutdown, running: vec![planning, serving] }
+    }
+
+    async fn row<R: Record>(&self, id: &str) -> Option<(R, Revision)> {
+        midshift_store::load(&*self.store, id).await.expect("a store")
+    }
+
+    async fn holder(&self) -> String {
+        self.row::<OtaLeader>("ota").await.map(|(row, _)| row.holder).unwrap_or_default()
+    }
+
+    /// Bundles that have a row.
+    async fn bundles(&self) -> Vec<Bundle> {
+        let rows = self.store.snapshot(&[Table::Bundle]).await.expect("a store").rows;
+        rows.iter().map(|row| row.decode().expect("a bundle")).collect()
+    }
+}
+
+impl Process {
+    /// As if it were killed.
+    fn kill(self) {
+        self.running.iter().for_each(JoinHandle::abort);
+    }
+    async fn end(self) {
+        self.shutdown.cancel();
+        for running in self.running {
+            running.await.expect("it ends");
+        }
+    }
+    fn signed(&self) -> u64 {
+        self.ota.opened().expect("keys").repository.newest().expect("published").stamp.version
+    }
+    async fn create(&self, id: &str, bundle: &str) -> Result<v1::Rollout, tonic::Status> {
+        let wave = v1::RolloutWave { size: Some(v1::rollout_wave::Size::Rest(true)) };
+        let spec = v1::RolloutSpec {
+            bundle: bundle.to_owned(),
+            waves: vec![wave],
+            allow_full_push: true,
+            ..Default::default()
+        };
+        let request = v1::CreateRolloutRequest { rollout_id: id.to_owned(), spec: Some(spec) };
+        let created = Face::create_rollout(&self.face, Request::new(request)).await?;
+        Ok(created.into_inner().rollout.expect("a roll-out"))
+    }
+    async fn phase(&self, id: &str) -> Option<Phase> {
+        let id = RolloutId::parse(id).expect("an id");
+        self.face.look(move |view, _, _| view.rollout(&id).map(|r| r.phase)).await.expect("it runs")
+    }
+}
+
+async fn secs(secs: u64) {
+    tokio::time::sleep(Duration::from_secs(secs)).await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn the_leader_takes_a_release_and_a_roll_out_created_at_the_standby_is_written_once() {
+    let world = World::new();
+    let leader = world.process().await;
+    let first = world.holder().await;
+    release(&leader.ota, &files("walk", "1.0.0")).await;
+    secs(2).await;
+    let bundles = world.bundles().await;
+    assert_eq!(bundles.len(), 1, "the leader has taken it");
+    let taken = world.row::<Bundle>(bundles[0].bundle.as_str()).await.expect("a row").1;
+    let standby = world.process().await;
+    secs(2).await;
+    let row = world.row::<Bundle>(bundles[0].bundle.as_str()).await.expect("a row").1;
+    assert_eq!((row, world.holder().await == first), (taken, true), "the other one takes nothing");
+    let bundle = bundles[0].bundle.as_str();
+    standby.create("r-1", bundle).await.expect("created");
+    let written = world.row::<Rollout>("r-1").await.expect("a row").1;
+    // The answer was lost, and the proxy asks the other one.
+    leader.create("r-1", bundle).await.expect("done already");
+    standby.create("r-1", bundle).await.expect("done already");
+    assert_eq!(world.row::<Rollout>("r-1").await.expect("a row").1, written, "written once");
+    assert_eq!((leader.phase("r-1").await, standby.phase("r-1").await), (Some(Phase::Draft), Some(Phase::Draft)));
+    assert_eq!(world.holder().await, first);
+    leader.end().await;
+    standby.end().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_was_signed_is_signed_anew_by_the_leader_alone() {
+    let world = World::new();
+    let leader = world.process().await;
+    release(&leader.ota, &files("walk", "1.0.0")).await;
+    let standby = world.process().await;
+    secs(5 * 60).await;
+    // Had the standby signed as well, there would be a third.
+    assert_eq!((leader.signed(), standby.signed()), (2, 2));
+    leader.end().await;
+    standby.end().await;
+    assert_eq!(world.holder().await, "", "the last one left the row empty");
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_was_signed_by_a_leader_that_was_killed_is_signed_anew_by_whoever_follows_it() {
+    let world = World::new();
+    let leader = world.process().await;
+    release(&leader.ota, &files("walk", "1.0.0")).await;
+    let standby = world.process().await;
+    let first = world.holder().await;
+    leader.kill();
+    secs(2).await;
+    assert_eq!(world.holder().await, first, "nobody knows yet that it is dead");
+    secs(5 * 60).await;
+    let second = world.holder().await;
+    assert!(second != first && !second.is_empty(), "{second}");
+    assert_eq!(standby.signed(), 2);
+    standby.end().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_leader_of_roll_outs_that_ends_as_asked_hands_over_at_once() {
+    let world = World::new();
+    let (leader, standby) = (world.process().await, world.process().await);
+    let first = world.holder().await;
+    leader.end().await;
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    let second = world.holder().await;
+    assert!(second != first && !second.is_empty(), "{second}");
+    standby.end().await;
+}

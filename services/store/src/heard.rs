@@ -1,0 +1,150 @@
+//! The newest heartbeat of each robot, where several processes must know it: gateways keep it, everybody reads what is new.
+//!
+//! Invariant: what [`HeardLog::keep`] has answered is what every later reader sees, and an item with
+//! [`midshift_core::rows::Silent`] is applied only if nothing of its robot was kept after the position that it names. So whoever
+//! gives a robot's work to another knows everything that the robot relies on. Bodies are not decoded here.
+//!
+//! A process that opens its store alone needs none of this: its [`crate::LiveBoard`] is the whole truth.
+
+use crate::{Error, LiveBoard, Store};
+use async_trait::async_trait;
+use midshift_core::ids::RobotId;
+use midshift_core::rows::Seq;
+use midshift_core::time::Clock;
+use midshift_core::work::{Live, Told};
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+/// How often others' heartbeats are looked for: a tenth of the period in which robots send them.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
+
+/// The newest heartbeat of one robot.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Heard {
+    /// Whose.
+    pub robot_id: RobotId,
+    /// Session that it came in.
+    pub session_epoch: u64,
+    /// Its number in that session.
+    pub hb: u64,
+    /// What it says, and what its gateway knows about it.
+    pub body: Arc<str>,
+}
+
+/// What became of a call of [`HeardLog::keep`].
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Kept {
+    /// Newest number of the store's feed at that moment: what was decided before is up to here.
+    pub head: Seq,
+    /// Robots of which a newer session has been heard already; theirs was not kept.
+    pub fenced: Vec<RobotId>,
+}
+
+/// The log of newest heartbeats.
+#[async_trait]
+pub trait HeardLog: Send + Sync + 'static {
+    /// Keeps heartbeats of different robots, each unless a newer session of its robot was heard; durable on return.
+    async fn keep(&self, heard: Vec<Heard>) -> Result<Kept, Error>;
+    /// The newest position; 0: nothing was ever kept.
+    async fn position(&self) -> Result<u64, Error>;
+    /// Robots heard after a position, each with its newest, and the position read up to.
+    async fn read(&self, after: u64) -> Result<(Vec<Heard>, u64), Error>;
+}
+
+impl From<&Live> for Heard {
+    fn from(live: &Live) -> Self {
+        let (session_epoch, hb) = (live.report.session_epoch, live.report.hb);
+        Self { robot_id: live.robot_id.clone(), session_epoch, hb, body: Told::from(live).text() }
+    }
+}
+
+/// Brings what gateways hear onto the board of this process, until it is dropped. A heartbeat counts as processed when it is read, which is
+/// never before its gateway had it. What was heard before this began is passed over: whoever is there is heard again within a second.
+pub async fn follow_heard(log: Arc<dyn HeardLog>, board: Arc<LiveBoard<Live>>, clock: Arc<dyn Clock>) {
+    let mut position = None;
+    loop {
+        match look(log.as_ref(), position, &board, clock.as_ref()).await {
+            Ok(read) => {
+                position = Some(read);
+                board.set_read_up_to(read);
+            }
+            Err(error) => tracing::debug!(%error, "others' heartbeats cannot be read, trying again"),
+        }
+        tokio::time::sleep(LOOK_EVERY).await;
+    }
+}
+
+async fn look(
+    log: &dyn HeardLog,
+    after: Option<u64>,
+    board: &LiveBoard<Live>,
+    clock: &dyn Clock,
+) -> Result<u64, Error> {
+    let Some(after) = after else { return log.position().await };
+    let (heard, position) = log.read(after).await?;
+    let now = clock.now();
+    for one in heard {
+        match Told::parse(&one.body) {
+            Ok(told) => {
+                let before = board.get(&one.robot_id);
+                if let Some(live) = told.into_live(&one.robot_id, before.as_deref(), now) {
+                    board.put(&one.robot_id, Arc::new(live));
+                }
+            }
+            Err(error) => {
+                tracing::error!(robot_id = %one.robot_id, %error, "a heartbeat of another gateway cannot be read")
+            }
+        }
+    }
+    Ok(position)
+}
+
+/// A [`HeardLog`] in memory, for several services over one store in one process.
+pub struct MemoryHeard {
+    store: Arc<dyn Store>,
+    state: Mutex<State>,
+}
+
+#[derive(Default)]
+struct State {
+    position: u64,
+    newest: BTreeMap<RobotId, (u64, Heard)>,
+}
+
+impl MemoryHeard {
+    /// An empty log beside `store`.
+    pub fn new(store: Arc<dyn Store>) -> Self {
+        Self { store, state: Mutex::default() }
+    }
+}
+
+#[async_trait]
+impl HeardLog for MemoryHeard {
+    async fn keep(&self, heard: Vec<Heard>) -> Result<Kept, Error> {
+        let mut fenced = Vec::new();
+        {
+            let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+            state.position += 1;
+            let position = state.position;
+            for one in heard {
+                if state.newest.get(&one.robot_id).is_some_and(|(_, old)| old.session_epoch > one.session_epoch) {
+                    fenced.push(one.robot_id);
+                } else {
+                    state.newest.insert(one.robot_id.clone(), (position, one));
+                }
+            }
+        }
+        Ok(Kept { head: *self.store.wake().borrow(), fenced })
+    }
+
+    async fn position(&self) -> Result<u64, Error> {
+        Ok(self.state.lock().unwrap_or_else(PoisonError::into_inner).position)
+    }
+
+    async fn read(&self, after: u64) -> Result<(Vec<Heard>, u64), Error> {
+        let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let newer = state.newest.values().filter(|(position, _)| *position > after);
+        Ok((newer.map(|(_, heard)| heard.clone()).collect(), state.position.max(after)))
+    }
+}

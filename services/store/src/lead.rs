@@ -1,0 +1,48 @@
+//! Taking part in who leads a service: the law is [`midshift_core::lead`], and this reads and writes its row.
+//!
+//! Invariant: what was read counts from after the reading, since an answer may take long; what was claimed counts from before the claim.
+
+use crate::{CommitError, Error, Store};
+use midshift_core::lead::{LeaderRow, Seat, Stance};
+use midshift_core::limits;
+use midshift_core::time::Clock;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// Reads who leads, and takes over if nobody does; true: this process leads from now on. It may have stepped down, also before an error.
+///
+/// # Errors
+/// If the row cannot be read, or nobody knows whether it was written.
+pub async fn take_part<R: LeaderRow>(seat: &mut Seat<R>, store: &dyn Store, clock: &dyn Clock) -> Result<bool, Error> {
+    if seat.stance(clock.now().link) == Stance::StepDown {
+        seat.step_down();
+    }
+    let rows = store.get(vec![Seat::<R>::key()]).await?;
+    let now = clock.now().link;
+    seat.read(rows.first(), now)?;
+    match seat.stance(now) {
+        Stance::StepDown => {
+            seat.step_down();
+            Ok(false)
+        }
+        Stance::TakeOver => match store.commit(vec![seat.claim()]).await.pop() {
+            Some(Ok(_)) => {
+                seat.claimed(now);
+                Ok(true)
+            }
+            Some(Err(CommitError::Conflict { .. })) => Ok(false),
+            Some(Err(error)) => Err(Error::Unavailable(Arc::new(error))),
+            None => unreachable!("one result an item"),
+        },
+        Stance::Lead | Stance::Renew | Stance::StandBy => Ok(false),
+    }
+}
+
+/// Lets another process lead at once, if this one does. None: there was nothing to leave; else whether the row says so.
+pub async fn hand_over<R: LeaderRow>(seat: &mut Seat<R>, store: &dyn Store) -> Option<bool> {
+    let item = seat.release()?;
+    let within = Duration::from_millis(limits::LEAD_LEFT_WITHIN.as_ms());
+    let left = tokio::time::timeout(within, store.commit(vec![item])).await;
+    seat.step_down();
+    Some(left.is_ok_and(|results| results.iter().all(Result::is_ok)))
+}

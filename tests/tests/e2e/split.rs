@@ -1,0 +1,231 @@
+//! The same services as processes of their own: each of them is killed or replaced while robots work, and nothing is lost.
+
+use crate::harness::{channel, in_states, until};
+use crate::kill::{all_over, at_work, judge, judge_ledgers, submit};
+use crate::robots::Robots;
+use crate::rolled_out::{Robot, call, done};
+use crate::room::LIMIT;
+use crate::stack::Stack;
+use midshift_core::site::{DEMO, text};
+use midshift_proto::ota::v1::GetRolloutRequest;
+use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
+use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
+use midshift_proto::telemetry::v1::{ListEventsRequest, ListRobotsRequest, Presence, event};
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::SocketAddr;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
+use tokio::time::Instant;
+
+const ROBOTS: usize = 20;
+
+/// What happens to the stack, one after the other, and what a line says of it.
+const BLOWS: [(&str, Blow); 10] = [
+    ("kill -9 of a fleet", Blow::Kill("fleet", 0)),
+    ("kill -9 of the other fleet", Blow::Kill("fleet", 1)),
+    ("kill -9 of a gateway", Blow::Kill("telemetry", 0)),
+    ("kill -9 of the task intake", Blow::Kill("task", 0)),
+    ("kill -9 of an ota", Blow::Kill("ota", 0)),
+    ("the end of whoever listens for commits", Blow::Deafen),
+    ("a reload of the proxy", Blow::Reload),
+    ("a gateway is asked to end", Blow::Ask("telemetry", 1)),
+    ("a fleet is asked to end", Blow::Ask("fleet", 0)),
+    ("PostgreSQL ends at once, and starts again", Blow::Cut),
+];
+
+enum Blow {
+    Kill(&'static str, usize),
+    Ask(&'static str, usize),
+    Deafen,
+    Reload,
+    Cut,
+}
+
+/// Every attempt that ever was, by task and epoch.
+async fn attempts(public: SocketAddr) -> anyhow::Result<Option<BTreeSet<(String, u64)>>> {
+    let tasks = in_states(public, &[]).await?;
+    let ids = |task: midshift_proto::task::v1::Task| Some((task.task_id, task.attempt?.epoch));
+    Ok(tasks.map(|tasks| tasks.into_iter().filter_map(ids).collect()))
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn tasks_go_on_while_every_process_of_a_split_stack_is_killed_or_replaced_in_turn() -> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let site = text::parse(DEMO)?;
+    let mut stack = Stack::start(dir.path(), DEMO, &["--drain-seconds", "20", "--no-software"], &[]).await?;
+    let robots = Robots::start(dir.path(), stack.robots, &site, ROBOTS)?;
+    submit(stack.public, &site, 7).await?;
+    let mut old_proxies = Vec::new();
+    for (nth, (what, blow)) in BLOWS.into_iter().enumerate() {
+        at_work(stack.public, 4 + 6 * nth, &BTreeSet::new()).await?;
+        let before = until("what was assigned so far", Duration::from_secs(30), || attempts(stack.public)).await?;
+        let begun = Instant::now();
+        match blow {
+            Blow::Kill(role, nth) => {
+                stack.kill(role, nth)?;
+                stack.restart(role, nth)?;
+            }
+            Blow::Ask(role, nth) => {
+                assert_eq!(stack.ask_to_end(role, nth).await?, Some(0), "{what}");
+                stack.restart(role, nth)?;
+            }
+            Blow::Deafen => stack.deafen()?,
+            Blow::Reload => old_proxies.push(stack.reload_proxy()?),
+            Blow::Cut => tokio::task::block_in_place(|| {
+                stack.postgres.cut();
+                stack.postgres.start_again();
+            }),
+        }
+        let next = until("the next assignment", Duration::from_secs(90), || async {
+            Ok(attempts(stack.public).await?.filter(|now| now.difference(&before).next().is_some()))
+        });
+        next.await?;
+        say!("{what}: the next assignment after {:.1} s", begun.elapsed().as_secs_f64());
+    }
+    let ended = all_over(stack.public).await?;
+    let online = until("every robot", Duration::from_secs(60), || async {
+        let page = TelemetryServiceClient::new(channel(stack.public)?).list_robots(ListRobotsRequest::default()).await;
+        let online = |page: &midshift_proto::telemetry::v1::ListRobotsResponse| {
+            page.robots.iter().filter(|robot| robot.presence() == Presence::Online).count() == ROBOTS
+        };
+        Ok(page.ok().map(tonic::Response::into_inner).filter(online).map(|page| page.robots.len()))
+    });
+    assert_eq!(online.await?, ROBOTS);
+    // No agent was killed: nothing may need a person.
+    judge(&ended, &BTreeSet::new(), &site, &robots)?;
+    events_have_no_hole(stack.public).await?;
+    judge_ledgers(&ended, robots).await
+}
+
+/// Every number of every ring is there, once and in order, whichever gateway took it.
+async fn events_have_no_hole(public: SocketAddr) -> anyhow::Result<()> {
+    let mut telemetry = TelemetryServiceClient::new(channel(public)?);
+    let (mut cursor, mut last) = (String::new(), BTreeMap::new());
+    loop {
+        let request = ListEventsRequest { page_size: 1_000, cursor, ..ListEventsRequest::default() };
+        let page = telemetry.list_events(request).await?.into_inner();
+        for said in page.events {
+            let Some(event::Item::Sample(sample)) = &said.item else { anyhow::bail!("not a sample: {said:?}") };
+            let known: &mut u64 = last.entry((said.robot_id.clone(), said.ring.clone(), said.lane)).or_default();
+            assert_eq!(sample.seq, *known + 1, "{} of ring {} lane {}", said.robot_id, said.ring, said.lane);
+            *known = sample.seq;
+        }
+        cursor = page.cursor;
+        if page.caught_up {
+            break;
+        }
+    }
+    let robots: BTreeSet<&String> = last.keys().map(|(robot, ..)| robot).collect();
+    assert_eq!(robots.len(), ROBOTS);
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_fleet_that_was_frozen_while_another_took_over_assigns_nothing_twice() -> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let site = text::parse(DEMO)?;
+    let mut stack = Stack::start(dir.path(), DEMO, &["--no-software"], &[]).await?;
+    let robots = Robots::start(dir.path(), stack.robots, &site, ROBOTS)?;
+    submit(stack.public, &site, 11).await?;
+    for (nth, done) in [(0, 8), (1, 24), (0, 40)] {
+        at_work(stack.public, done, &BTreeSet::new()).await?;
+        let before = until("what was assigned so far", Duration::from_secs(30), || attempts(stack.public)).await?;
+        stack.signal("fleet", nth, "STOP")?;
+        until("the next assignment", Duration::from_secs(90), || async {
+            Ok(attempts(stack.public).await?.filter(|now| now.difference(&before).next().is_some()))
+        })
+        .await?;
+        stack.signal("fleet", nth, "CONT")?;
+    }
+    let ended = all_over(stack.public).await?;
+    judge(&ended, &BTreeSet::new(), &site, &robots)?;
+    judge_ledgers(&ended, robots).await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_roll_out_goes_on_while_processes_that_plan_it_sign_it_and_hand_it_out_are_killed() -> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let samples = dir.path().join("samples");
+    let (folder, keys) = (samples.display().to_string(), samples.join("keys").display().to_string());
+    done(&["bundle", "samples", &folder])?;
+    let mut stack = Stack::start(dir.path(), DEMO, &[], &["--ota-keys", &keys]).await?;
+    let (public, door) = (stack.public.to_string(), stack.robots.to_string());
+    let mut robots = Vec::new();
+    for (id, start) in [("rbt-01", "park-1"), ("rbt-02", "park-2"), ("rbt-03", "park-3")] {
+        robots.push(Robot::launch(id, start, &dir.path().join(id), &samples, &door)?);
+    }
+    done(&["bundle", "push", "--server", &public, &samples.join("repository").display().to_string()])?;
+    for id in ["rbt-01", "rbt-02", "rbt-03"] {
+        until("the robot is known", LIMIT, async || {
+            Ok(call(&["robot", "get", "--server", &public, id])?.status.success().then_some(()))
+        })
+        .await?;
+    }
+    let begin = |id: &str| {
+        let quick = ["--soak", "0s", "--probation", "1s", "--exposure-tasks", "0", "--start"];
+        done(&[&["rollout", "create", "--server", &public, id, "--waves", "1,rest"][..], &quick].concat())
+    };
+    // Rows of a release are its leader's, a moment after it was published.
+    until("the release is known to whoever is asked", LIMIT, async || {
+        let listed = (0..4).map(|_| call(&["bundle", "ls", "--server", &public]));
+        let listed = listed.collect::<anyhow::Result<Vec<_>>>()?;
+        Ok(listed.iter().all(|l| String::from_utf8_lossy(&l.stdout).contains("1.5.1")).then_some(()))
+    })
+    .await?;
+    let blows: [(&'static str, usize); 4] = [("ota", 0), ("ota", 1), ("telemetry", 0), ("fleet", 0)];
+    begin("walk-1.5.0")?;
+    // Robots out of work at once, while the canary goes and later.
+    let most = [AtomicU32::new(0), AtomicU32::new(0)];
+    for (nth, (role, member)) in blows.into_iter().enumerate() {
+        stack.kill(role, member)?;
+        stack.restart(role, member)?;
+        // So that blows fall on different steps of it.
+        let wanted = u32::try_from(nth)?.min(2);
+        until("some are permitted", LIMIT, async || {
+            let Some((in_flight, wave, attempted)) = flight(stack.public, "walk-1.5.0").await? else { return Ok(None) };
+            most[usize::from(wave > 0)].fetch_max(in_flight, Ordering::Relaxed);
+            Ok((attempted >= wanted).then_some(()))
+        })
+        .await?;
+    }
+    until("somebody answers again", LIMIT, async || flight(stack.public, "walk-1.5.0").await).await?;
+    let waited = call(&["rollout", "wait", "--server", &public, "walk-1.5.0", "--timeout", "180s"])?;
+    assert_eq!(waited.status.code(), Some(0), "{}", String::from_utf8_lossy(&waited.stderr));
+    for robot in &robots {
+        robot.keeps("1.5.0").await?;
+    }
+    let most = most.map(AtomicU32::into_inner);
+    assert!(most[0] <= 1 && most[1] <= 2, "{most:?}: more were out of work than their wave");
+    begin("walk-1.6.0-bad-at-start")?;
+    until("one is permitted", LIMIT, async || {
+        Ok(flight(stack.public, "walk-1.6.0-bad-at-start").await?.filter(|(.., attempted)| *attempted > 0).map(|_| ()))
+    })
+    .await?;
+    for (role, member) in blows {
+        stack.kill(role, member)?;
+        stack.restart(role, member)?;
+    }
+    until("somebody answers again", LIMIT, async || flight(stack.public, "walk-1.6.0-bad-at-start").await).await?;
+    let waited = call(&["rollout", "wait", "--server", &public, "walk-1.6.0-bad-at-start", "--timeout", "180s"])?;
+    assert_eq!(waited.status.code(), Some(12), "{}", String::from_utf8_lossy(&waited.stderr));
+    for robot in &robots {
+        until("it is back on what it kept, or never left it", LIMIT, async || {
+            Ok((robot.committed()?.as_deref() == Some("1.5.0") && robot.switch()?.trial.is_none()).then_some(()))
+        })
+        .await?;
+    }
+    let (.., attempted) = flight(stack.public, "walk-1.6.0-bad-at-start").await?.unwrap_or_default();
+    assert_eq!(attempted, 1, "it ends at its canary");
+    Ok(())
+}
+
+/// How many robots of a roll-out are out of work for it, its wave, and how many were ever permitted; none while nobody answers.
+async fn flight(public: SocketAddr, id: &str) -> anyhow::Result<Option<(u32, u32, u32)>> {
+    let request = GetRolloutRequest { rollout_id: id.to_owned() };
+    let answer = RolloutServiceClient::new(channel(public)?).get_rollout(request).await;
+    let rollout = answer.ok().and_then(|answer| answer.into_inner().rollout);
+    Ok(rollout.map(|rollout| {
+        let attempted = rollout.counts.unwrap_or_default().attempted;
+        (rollout.in_flight, rollout.wave, attempted)
+    }))
+}
