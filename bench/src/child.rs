@@ -42,6 +42,9 @@ pub enum Role {
         /// Where it listens; without it on a free port.
         #[arg(long)]
         listen: Option<SocketAddr>,
+        /// A PostgreSQL database for its rows; without it they are in the data directory.
+        #[arg(long)]
+        store: Option<String>,
         /// Its online keys; without them it takes no software.
         #[arg(long)]
         ota_keys: Option<PathBuf>,
@@ -120,7 +123,7 @@ pub fn play(args: ChildArgs) -> anyhow::Result<()> {
 async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
     let address = std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?;
     match role {
-        Role::Serve { data, site, listen, ota_keys } => {
+        Role::Serve { data, site, listen, store, ota_keys } => {
             let listen = listen.unwrap_or(address);
             answer_questions(listen, stop.clone(), metric)?;
             let serve = midshift::serve::Serve {
@@ -131,7 +134,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 data,
                 listen,
                 insecure: false,
-                database: Default::default(),
+                database: midshift::storage::Database { store },
                 beacon_listen: None,
                 software: Software { ota_keys, ota_quota_gib: 1, ota_spare_gib: 0, ota_keep_days: 7 },
             };
@@ -266,13 +269,19 @@ impl Child {
         child.address = child.line()?.parse().context("a child that did not say its address")?;
         Ok(child)
     }
-    /// A server of midshift on a data directory, once it listens.
-    pub async fn serve(data: &Path, site: Option<&Path>, core: Option<usize>) -> anyhow::Result<Self> {
+    /// A server of midshift on a data directory, with its rows there or in a `store`, once it listens.
+    pub async fn serve(
+        data: &Path,
+        site: Option<&Path>,
+        store: Option<&str>,
+        core: Option<usize>,
+    ) -> anyhow::Result<Self> {
         let data = data.to_str().context("a path that is no text")?;
         let mut role = vec!["serve", "--data", data];
         if let Some(site) = site {
             role.extend(["--site", site.to_str().context("a path that is no text")?]);
         }
+        role.extend(store.iter().flat_map(|url| ["--store", url]));
         Self::start(&role, core)?.listening().await
     }
     /// Waits until it takes connections.

@@ -1,7 +1,7 @@
 //! Robots at the knee: each sends a heartbeat with one STATUS sample as soon as its credit lets it. And one that asks how fast an
 //! EVENT is acknowledged meanwhile.
 
-use crate::fsync::Disk;
+use crate::engine::Raw;
 use crate::robot::{self, Ear, Voice};
 use anyhow::Context;
 use midshift_core::ids::WaypointId;
@@ -55,23 +55,23 @@ async fn hear(mut ear: Ear, durable: watch::Sender<u64>, acked: &AtomicU64) -> a
     }
 }
 
-/// Milliseconds from each EVENT to its acknowledgement, and of one append to the disk after each, one at a time, for so long.
-pub async fn ask(server: &str, disk: &mut Disk, long: Duration) -> anyhow::Result<(Vec<f64>, Vec<f64>)> {
+/// Milliseconds from each EVENT to its acknowledgement, and of the raw limit after each, one at a time, for so long.
+pub async fn ask(server: &str, raw: &mut Raw, long: Duration) -> anyhow::Result<(Vec<f64>, Vec<f64>)> {
     let (mut voice, mut ear, _) = robot::attach(server, "asks-1", None).await?;
     let (started, mut beaten) = (Instant::now(), Instant::now());
-    let (mut acks_ms, mut syncs_ms) = (Vec::new(), Vec::new());
+    let (mut acks_ms, mut raws_ms) = (Vec::new(), Vec::new());
     while started.elapsed() < long {
         let begun = Instant::now();
         voice.tell_mode().await?;
         let seq = voice.produced(Lane::Event);
         while ear.acked(Lane::Event).await? < seq {}
         acks_ms.push(begun.elapsed().as_secs_f64() * 1e3);
-        syncs_ms.push(disk.append_ms()?);
+        raws_ms.push(raw.ms().await?);
         if beaten.elapsed().as_millis() >= u128::from(limits::HEARTBEAT.as_ms()) {
             beaten = Instant::now();
             voice.beat(false).await?;
         }
         tokio::time::sleep(ASK_EVERY).await;
     }
-    Ok((acks_ms, syncs_ms))
+    Ok((acks_ms, raws_ms))
 }

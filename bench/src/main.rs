@@ -2,6 +2,7 @@
 
 mod bare;
 mod child;
+mod engine;
 mod figure;
 mod flood;
 mod fsync;
@@ -58,8 +59,8 @@ fn main() -> anyhow::Result<()> {
     let mut failed = Vec::new();
     let figures = match args.name {
         Name::Plan => plan::run()?,
-        Name::Submit(args) => wait(submit::run(args))?,
-        Name::Offer(args) => wait(offer::run(args))?,
+        Name::Submit(args) => wait(submit::run(args, &note))?,
+        Name::Offer(args) => wait(offer::run(args, &note))?,
         Name::Link(args) => wait(link::run(args, &note))?,
         Name::Gates(args) => gates::run(args)?,
         Name::Ota(args) => {

@@ -1,25 +1,23 @@
-//! P5: from a submit to the offer in the hands of an idle robot, beside the disk of the same run.
+//! P5: from a submit to the offer in the hands of an idle robot, beside the raw limit of the engine in the same run.
 
-use crate::child::Child;
+use crate::engine::{Engine, EngineArgs};
 use crate::figure::{Figure, percentile};
-use crate::fsync::Disk;
 use crate::hall;
 use crate::robot::{self, Ear, Voice};
-use crate::submit::{place, transports};
+use crate::submit::transports;
 use anyhow::{Context, ensure};
 use midshift_core::limits;
 use midshift_core::site::grid;
 use midshift_core::work::{Assignment, AttemptReport, RobotEvent, WorkState, WorkStats};
 use midshift_proto::task::v1::SubmitTaskRequest;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
-use std::path::PathBuf;
 use std::time::Duration;
 use tokio::time::{Instant, interval};
 use tonic::transport::Channel;
 
 /// Commits on the way of an offer: the task, the grant, and one that may be under way before either.
 const COMMITS: f64 = 3.0;
-/// What everything but the disk may take, milliseconds.
+/// What everything but the commits may take, milliseconds.
 const REST_MS: f64 = 5.0;
 /// Side of the free grid the robot stands on.
 const SIDE: usize = 20;
@@ -30,57 +28,60 @@ pub struct OfferArgs {
     /// Submits of one round, one at a time, each to an idle robot.
     #[arg(long, default_value_t = 200)]
     submits: usize,
-    /// Rounds; in each, every submit is followed by one append to the disk.
+    /// Rounds; in each, every submit is followed by one append to the disk, or one single commit.
     #[arg(long, default_value_t = 5)]
     rounds: usize,
-    /// Where the databases are made and taken away again. Without it the temporary directory; it should be a real disk.
-    #[arg(long)]
-    dir: Option<PathBuf>,
+    #[command(flatten)]
+    engine: EngineArgs,
 }
 
-/// Runs rounds of submits and appends, in turn, against one server.
-pub async fn run(args: OfferArgs) -> anyhow::Result<Vec<Figure>> {
-    let dir = place(args.dir.as_ref())?;
-    let map = hall::map(dir.path(), SIDE)?;
+/// Runs rounds of submits and of the raw limit, in turn, against one server on each engine.
+pub async fn run(args: OfferArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figure>> {
+    let mut figures = Vec::new();
+    for engine in args.engine.engines(say) {
+        figures.extend(on(&args, &engine).await?);
+    }
+    Ok(figures)
+}
+
+async fn on(args: &OfferArgs, engine: &Engine) -> anyhow::Result<Vec<Figure>> {
+    let bed = engine.bed(args.engine.dir.as_ref())?;
+    let map = hall::map(bed.path(), SIDE)?;
     let site = grid::parse_map("bench", &std::fs::read_to_string(&map)?)?;
     let requests = transports(&site, args.submits * args.rounds)?;
-    let server = Child::serve(&dir.path().join("data"), Some(&map), None).await?;
+    let server = bed.serve(Some(&map), None).await?;
     let here = site.waypoints().first().context("an empty site")?.waypoint_id.clone();
     let (voice, ear, _) = robot::attach(&server.address.to_string(), "rbt-1", Some(here)).await?;
     let mut robot = Idle { voice, ear };
     robot.known_idle().await?;
     let mut client = TaskServiceClient::new(server.channel().await?);
-    let (mut offered, mut durable, mut syncs) = (Vec::new(), Vec::new(), Vec::new());
-    let mut disk = Disk::beside(dir.path())?;
+    let (mut offered, mut durable, mut raws) = (Vec::new(), Vec::new(), Vec::new());
+    let mut raw = bed.raw().await?;
     for (round, requests) in requests.chunks(args.submits.max(1)).enumerate() {
-        let (mut to_robot, mut to_client, mut to_disk) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut to_robot, mut to_client, mut by_itself) = (Vec::new(), Vec::new(), Vec::new());
         for (number, request) in requests.iter().enumerate() {
             let request = SubmitTaskRequest { request_id: format!("bench-{round}-{number}"), ..request.clone() };
             let (robot_ms, client_ms) = one(&mut client, &mut robot, request).await?;
             to_robot.push(robot_ms);
             to_client.push(client_ms);
-            to_disk.push(disk.append_ms()?);
+            by_itself.push(raw.ms().await?);
         }
         offered.push(to_robot);
         durable.push(to_client);
-        syncs.push(to_disk);
+        raws.push(by_itself);
     }
     let each = |rounds: &[Vec<f64>], share: f64| rounds.iter().map(|r| percentile(r, share)).collect::<Vec<_>>();
-    let sync = each(&syncs, 0.5);
-    let allowed: Vec<f64> = sync.iter().map(|ms| COMMITS * ms + REST_MS).collect();
-    let name = |what: &str| format!("submit to offer at an idle robot, {what}");
-    let disk = "fdatasync of 4 KiB, p50";
+    let (p50, p99) = (each(&raws, 0.5), each(&raws, 0.99));
+    let allowed: Vec<f64> = p50.iter().map(|ms| COMMITS * ms + REST_MS).collect();
+    let name = |what: &str| format!("submit to offer at an idle robot, {what}{}", engine.suffix());
+    let [told_p50, told_p99] = ["p50", "p99"].map(|what| format!("{}, {what}", engine.limit()));
+    let told_allowed = format!("3 x {told_p50} + 5 ms");
+    let answered = format!("submit to its durable answer, p50{}", engine.suffix());
     Ok(vec![
-        Figure::of("P5", name("p50"), "ms", &each(&offered, 0.5), Some(("3 x fdatasync p50 + 5 ms", &allowed))),
-        Figure::of("P5", name("p50, by the disk"), "ms", &each(&offered, 0.5), Some((disk, &sync))),
-        Figure::of(
-            "P5",
-            name("p99, by the disk"),
-            "ms",
-            &each(&offered, 0.99),
-            Some(("fdatasync of 4 KiB, p99", &each(&syncs, 0.99))),
-        ),
-        Figure::of("P5", "submit to its durable answer, p50", "ms", &each(&durable, 0.5), Some((disk, &sync))),
+        Figure::of("P5", name("p50"), "ms", &each(&offered, 0.5), Some((&told_allowed, &allowed))),
+        Figure::of("P5", name("p50, by the raw limit"), "ms", &each(&offered, 0.5), Some((&told_p50, &p50))),
+        Figure::of("P5", name("p99, by the raw limit"), "ms", &each(&offered, 0.99), Some((&told_p99, &p99))),
+        Figure::of("P5", answered, "ms", &each(&durable, 0.5), Some((&told_p50, &p50))),
     ])
 }
 

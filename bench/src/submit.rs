@@ -1,8 +1,9 @@
-//! P5: what one durable SubmitTask costs the server and how long it takes, beside a bare tonic call of the same messages and the disk.
+//! P5: what one durable SubmitTask costs the server and how long it takes, beside a bare tonic call of the same
+//! messages and the raw limits of the engine that keeps it.
 
 use crate::child::Child;
+use crate::engine::{Bed, Engine, EngineArgs};
 use crate::figure::{Figure, percentile};
-use crate::fsync::Disk;
 use anyhow::Context;
 use midshift_core::site::{DEMO, Site, text};
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
@@ -30,15 +31,14 @@ pub struct SubmitArgs {
     /// Calls under way at once, on one connection.
     #[arg(long, default_value_t = 50)]
     in_flight: usize,
-    /// Rounds of each: midshift, bare tonic, disk.
+    /// Rounds of each: midshift on each engine with its raw limits, bare tonic.
     #[arg(long, default_value_t = 5)]
     rounds: usize,
-    /// Appends to the disk of one round, half of them before midshift and half after.
+    /// Appends to the disk, or single commits, of one round, half of them before midshift and half after.
     #[arg(long, default_value_t = 300)]
     fsyncs: usize,
-    /// Where the databases are made and taken away again. Without it the temporary directory; it should be a real disk.
-    #[arg(long)]
-    dir: Option<PathBuf>,
+    #[command(flatten)]
+    engine: EngineArgs,
 }
 
 /// A directory for one round, below `dir` or the temporary one.
@@ -61,46 +61,97 @@ struct Load {
     p99_ms: f64,
 }
 
-/// Runs rounds of midshift, bare tonic and disk, in turn.
-pub async fn run(args: SubmitArgs) -> anyhow::Result<Vec<Figure>> {
+/// One round of midshift on one engine.
+struct Round {
+    load: Load,
+    /// Milliseconds of the raw limit, before and after.
+    raw_ms: Vec<f64>,
+    /// CPU of the database's own processes for each call, microseconds, if it has any.
+    database_us: Option<f64>,
+    /// Rows of the same size a second by COPY, if the engine has it.
+    copied_per_s: Option<f64>,
+}
+
+/// Runs rounds of midshift on each engine, its raw limits, and bare tonic, in turn.
+pub async fn run(args: SubmitArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figure>> {
     let requests = Arc::new(transports(&text::parse(DEMO)?, TRANSPORTS)?);
-    let (mut ours, mut bare, mut syncs) = (Vec::new(), Vec::new(), Vec::new());
-    for round in 0..args.rounds {
-        let dir = place(args.dir.as_ref())?;
-        let server = Child::serve(&dir.path().join("data"), None, None).await?;
-        let answer = one(server.channel().await?, &requests, round).await?;
-        let mut disk = Disk::beside(dir.path())?;
-        let mut sync_ms = disk.appends_ms(args.fsyncs / 2)?;
-        ours.push(load(&server, &requests, args.requests, args.in_flight).await?);
-        sync_ms.extend(disk.appends_ms(args.fsyncs / 2)?);
-        syncs.push(sync_ms);
-        drop(server);
+    let engines = args.engine.engines(say);
+    let (mut ours, mut bare): (Vec<Vec<Round>>, _) = (engines.iter().map(|_| Vec::new()).collect(), Vec::new());
+    for number in 0..args.rounds {
+        let mut answer = None;
+        for (engine, rounds) in engines.iter().zip(&mut ours) {
+            let bed = engine.bed(args.engine.dir.as_ref())?;
+            let server = bed.serve(None, None).await?;
+            let first = one(server.channel().await?, &requests, number).await?.encode_to_vec();
+            rounds.push(round(&args, engine, &bed, &server, &requests, first.len()).await?);
+            answer = Some(first);
+        }
+        let dir = place(args.engine.dir.as_ref())?;
         let path = dir.path().join("answer");
-        std::fs::write(&path, answer.encode_to_vec())?;
+        std::fs::write(&path, answer.context("no engine")?)?;
         let path = path.to_str().context("a path that is no text")?;
         let server = Child::start(&["unary", "--answer", path], None)?.listening().await?;
         bare.push(load(&server, &requests, args.requests * BARE_TIMES, args.in_flight).await?);
     }
-    let sync = |share: f64| syncs.iter().map(|s| percentile(s, share)).collect::<Vec<_>>();
-    let (sync_p50, sync_p99) = (sync(0.5), sync(0.99));
-    let of = |loads: &[Load], what: fn(&Load) -> f64| loads.iter().map(what).collect::<Vec<_>>();
-    let beside_bare = |name: &str, unit, what: fn(&Load) -> f64| {
-        let name = format!("durable SubmitTask, {} in flight, {name}", args.in_flight);
-        Figure::of("P5", name, unit, &of(&ours, what), Some(("bare tonic unary, same messages", &of(&bare, what))))
+    Ok(engines.iter().zip(&ours).flat_map(|(engine, rounds)| figures(args.in_flight, engine, rounds, &bare)).collect())
+}
+
+async fn round(
+    args: &SubmitArgs,
+    engine: &Engine,
+    bed: &Bed,
+    server: &Child,
+    requests: &Arc<Vec<SubmitTaskRequest>>,
+    bytes: usize,
+) -> anyhow::Result<Round> {
+    let mut raw = bed.raw().await?;
+    let mut raw_ms = raw.several_ms(args.fsyncs / 2).await?;
+    let before_s = engine.cpu_s()?;
+    let load = load(server, requests, args.requests, args.in_flight).await?;
+    let calls = (args.requests + warm(args.requests)) as f64;
+    let database_us = engine.cpu_s()?.zip(before_s).map(|(after_s, before_s)| (after_s - before_s) * 1e6 / calls);
+    raw_ms.extend(raw.several_ms(args.fsyncs / 2).await?);
+    let copied_per_s = bed.copied_per_s(args.requests, bytes, args.in_flight).await?;
+    Ok(Round { load, raw_ms, database_us, copied_per_s })
+}
+
+fn figures(in_flight: usize, engine: &Engine, ours: &[Round], bare: &[Load]) -> Vec<Figure> {
+    let name = |name: &str| format!("durable SubmitTask, {in_flight} in flight, {name}{}", engine.suffix());
+    let each = |what: fn(&Load) -> f64| ours.iter().map(|round| what(&round.load)).collect::<Vec<_>>();
+    let beside_bare = |what: &str, unit, of: fn(&Load) -> f64| {
+        let limit: Vec<f64> = bare.iter().map(of).collect();
+        Figure::of("P5", name(what), unit, &each(of), Some(("bare tonic unary, same messages", &limit)))
     };
-    let beside_disk = |name: &str, what: fn(&Load) -> f64, limit: &str, syncs: &[f64]| {
-        let name = format!("durable SubmitTask, {} in flight, {name}", args.in_flight);
-        Figure::of("P5", name, "ms", &of(&ours, what), Some((limit, syncs)))
+    let beside_raw = |what: &str, share: f64, of: fn(&Load) -> f64| {
+        let limit: Vec<f64> = ours.iter().map(|round| percentile(&round.raw_ms, share)).collect();
+        let told = format!("{}, {what}", engine.limit());
+        Figure::of("P5", name(&format!("{what}, by the raw limit")), "ms", &each(of), Some((&told, &limit)))
     };
-    Ok(vec![
+    let mut figures = vec![
         beside_bare("server CPU each", "us", |l| l.cpu_us),
         beside_bare("per server CPU-second", "1/CPU-s", |l| 1e6 / l.cpu_us),
         beside_bare("rate", "1/s", |l| l.per_s),
         beside_bare("p50", "ms", |l| l.p50_ms),
         beside_bare("p99", "ms", |l| l.p99_ms),
-        beside_disk("p50, by the disk", |l| l.p50_ms, "fdatasync of 4 KiB, p50", &sync_p50),
-        beside_disk("p99, by the disk", |l| l.p99_ms, "fdatasync of 4 KiB, p99", &sync_p99),
-    ])
+        beside_raw("p50", 0.5, |l| l.p50_ms),
+        beside_raw("p99", 0.99, |l| l.p99_ms),
+    ];
+    let copied: Vec<f64> = ours.iter().filter_map(|round| round.copied_per_s).collect();
+    if !copied.is_empty() {
+        let told = format!("COPY of rows of that size, {in_flight} a commit");
+        figures.push(Figure::of("P5", name("rate, by COPY"), "1/s", &each(|l| l.per_s), Some((&told, &copied))));
+    }
+    let database_us: Vec<f64> = ours.iter().filter_map(|round| round.database_us).collect();
+    if !database_us.is_empty() {
+        let limit = ("midshift's own", each(|l| l.cpu_us));
+        figures.push(Figure::of("P5", name("CPU of the database each"), "us", &database_us, Some((limit.0, &limit.1))));
+    }
+    figures
+}
+
+/// How many calls come first.
+fn warm(requests: usize) -> usize {
+    requests / 10 + 1
 }
 
 /// One call by itself, for the size of its answer.
@@ -116,7 +167,7 @@ async fn load(
     in_flight: usize,
 ) -> anyhow::Result<Load> {
     let client = TaskServiceClient::new(server.channel().await?);
-    calls(&client, requests, "warm", count / 10 + 1, in_flight).await?;
+    calls(&client, requests, "warm", warm(count), in_flight).await?;
     let (cpu_s, begun) = (server.cpu_s()?, Instant::now());
     let took_ms = calls(&client, requests, "bench", count, in_flight).await?;
     let (wall_s, cpu_s) = (begun.elapsed().as_secs_f64(), server.cpu_since_s(cpu_s)?);

@@ -37,21 +37,51 @@ fn assert_told(records: &[serde_json::Value], targets: &[&str], runs: u64) {
 }
 
 #[test]
-fn submits_are_told_beside_bare_calls_and_the_disk() {
+fn submits_are_told_beside_bare_calls_and_what_each_engine_can_do() {
     let sizes = ["--requests", "40", "--in-flight", "8", "--rounds", "2", "--fsyncs", "4"];
-    assert_told(&records("submit", &sizes), &["P5"], 2);
+    let records = records("submit", &sizes);
+    assert_told(&records, &["P5"], 2);
+    assert_both_engines(&records, &["fdatasync of 4 KiB, p50", "single commit of PostgreSQL, p50", "COPY"]);
 }
 
 #[test]
-fn offers_are_told_beside_the_disk() {
-    assert_told(&records("offer", &["--submits", "4", "--rounds", "2"]), &["P5"], 2);
+fn offers_are_told_beside_what_each_engine_can_do() {
+    let records = records("offer", &["--submits", "4", "--rounds", "2"]);
+    assert_told(&records, &["P5"], 2);
+    assert_both_engines(&records, &["fdatasync of 4 KiB, p50", "single commit of PostgreSQL, p50"]);
 }
 
 #[test]
-fn the_link_is_told_beside_a_bare_session_and_the_disk() {
+fn one_engine_is_enough() {
+    let records = records("offer", &["--submits", "2", "--rounds", "1", "--no-postgres"]);
+    assert!(
+        !records.is_empty() && !records.iter().any(|r| r["name"].to_string().contains("PostgreSQL")),
+        "{records:?}"
+    );
+}
+
+/// Each limit stands beside some figure, and the engines' figures are the same but for what only PostgreSQL has.
+fn assert_both_engines(records: &[serde_json::Value], limits: &[&str]) {
+    for limit in limits {
+        let told = |r: &serde_json::Value| r["limit"]["name"].as_str().is_some_and(|name| name.contains(limit));
+        assert!(records.iter().any(told), "nothing beside {limit}: {records:?}");
+    }
+    let names: Vec<&str> = records.iter().filter_map(|r| r["name"].as_str()).collect();
+    for name in names.iter().filter(|name| !name.ends_with(", on PostgreSQL")) {
+        assert!(names.contains(&format!("{name}, on PostgreSQL").as_str()), "{name} has no twin: {names:?}");
+    }
+}
+
+#[test]
+fn the_link_is_told_beside_a_bare_session_and_what_each_engine_can_do() {
     let sizes = ["--robots", "4", "--knee-robots", "2", "--rounds", "1", "--seconds", "2", "--knee-seconds", "3"];
     let sizes: Vec<&str> = sizes.into_iter().chain(["--settle-seconds", "0", "--ask-seconds", "1"]).collect();
-    assert_told(&records("link", &sizes), &["P1", "P4"], 1);
+    let records = records("link", &sizes);
+    assert_told(&records, &["P1", "P4"], 1);
+    assert_both_engines(
+        &records,
+        &["fdatasync of 4 KiB, p50", "single commit of PostgreSQL, p50", "COPY", "bare tonic sink"],
+    );
 }
 
 #[test]

@@ -30,7 +30,7 @@ impl PostgresServer {
     /// The one server of this test program, started at first use.
     pub fn shared() -> &'static Self {
         static SERVER: OnceLock<PostgresServer> = OnceLock::new();
-        SERVER.get_or_init(|| Self::start_new(true))
+        SERVER.get_or_init(|| Self::start_new(true, None))
     }
 
     /// A new server with no databases but its own.
@@ -38,12 +38,23 @@ impl PostgresServer {
     /// # Panics
     /// If the machine has no server programs or they do not run.
     pub fn start() -> Self {
-        Self::start_new(false)
+        Self::start_new(false, None)
     }
 
-    fn start_new(is_shared: bool) -> Self {
+    /// As [`PostgresServer::start`], with its files below `dir`.
+    pub fn start_in(dir: Option<&Path>) -> Self {
+        Self::start_new(false, dir)
+    }
+
+    /// Whether the machine has server programs.
+    pub fn is_installed() -> bool {
+        newest_programs().is_some()
+    }
+
+    fn start_new(is_shared: bool, dir: Option<&Path>) -> Self {
         let programs = programs();
-        let dir = tempfile::Builder::new().prefix("midshift-pg-").tempdir().expect("a directory");
+        let below = dir.map_or_else(std::env::temp_dir, Path::to_path_buf);
+        let dir = tempfile::Builder::new().prefix("midshift-pg-").tempdir_in(below).expect("a directory");
         let mut server = Self { programs, dir, supervisor: None, databases: AtomicU32::new(0), is_shared };
         if let Some((uid, gid)) = unprivileged() {
             std::os::unix::fs::chown(server.dir.path(), Some(uid), Some(gid)).expect("giving the directory away");
@@ -117,6 +128,12 @@ impl PostgresServer {
         format!("postgres://{USER}@localhost/{database}?host={}", self.dir.path().display())
     }
 
+    /// Number of the server's first process, the parent of all others.
+    pub fn pid(&self) -> Option<u32> {
+        let file = std::fs::read_to_string(self.dir.path().join("data/postmaster.pid")).ok()?;
+        file.lines().next()?.trim().parse().ok()
+    }
+
     /// The server's socket, for a proxy in front of it.
     pub fn socket(&self) -> PathBuf {
         self.dir.path().join(".s.PGSQL.5432")
@@ -155,13 +172,16 @@ impl Drop for PostgresServer {
     }
 }
 
-/// The newest server programs of the machine.
-fn programs() -> PathBuf {
+/// The newest server programs of the machine, and their version.
+fn newest_programs() -> Option<(u32, PathBuf)> {
     let versions = PLACES.iter().filter_map(|place| std::fs::read_dir(place).ok()).flatten().flatten();
     let version = |path: &Path| path.file_name().and_then(|n| n.to_str()?.parse::<u32>().ok());
     let found = versions.map(|entry| entry.path()).filter(|path| path.join("bin/initdb").is_file());
-    let newest = found.filter_map(|path| Some((version(&path)?, path))).max();
-    let (version, path) = newest.unwrap_or_else(|| {
+    found.filter_map(|path| Some((version(&path)?, path))).max()
+}
+
+fn programs() -> PathBuf {
+    let (version, path) = newest_programs().unwrap_or_else(|| {
         panic!(
             "no PostgreSQL server programs in {PLACES:?}: install the package postgresql (cargo xtask test --install)"
         )
