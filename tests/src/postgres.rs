@@ -128,6 +128,16 @@ impl PostgresServer {
         format!("postgres://{USER}@localhost/{database}?host={}", self.dir.path().display())
     }
 
+    /// What a statement answers in a database, as text without ornaments.
+    ///
+    /// # Panics
+    /// If it fails.
+    pub fn ask(&self, url: &str, sql: &str) -> String {
+        let output = self.command("psql").args(["-X", "-At", "-d", url, "-c", sql]).output().expect("psql");
+        assert!(output.status.success(), "{sql}: {}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8_lossy(&output.stdout).trim().to_owned()
+    }
+
     /// Number of the server's first process, the parent of all others.
     pub fn pid(&self) -> Option<u32> {
         let file = std::fs::read_to_string(self.dir.path().join("data/postmaster.pid")).ok()?;

@@ -179,7 +179,12 @@ pub async fn submit(server: SocketAddr, site: &Site, seed: u64) -> anyhow::Resul
             SubmitTasksRequest { item: Some(item) }
         })
         .collect();
-    let answer = tasks(server)?.submit_tasks(tokio_stream::iter(items)).await?.into_inner();
+    // As a client with retries does it: each has a request_id.
+    let answer = until("an answer to the submission", Duration::from_secs(60), || async {
+        let answer = tasks(server)?.submit_tasks(tokio_stream::iter(items.clone())).await;
+        Ok(answer.ok().map(tonic::Response::into_inner))
+    })
+    .await?;
     anyhow::ensure!(answer.results.len() == TASKS, "{} of {TASKS} answered", answer.results.len());
     Ok(())
 }

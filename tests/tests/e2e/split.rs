@@ -6,6 +6,7 @@ use crate::robots::Robots;
 use crate::rolled_out::{Robot, call, done};
 use crate::room::LIMIT;
 use crate::stack::Stack;
+use anyhow::Context;
 use midshift_core::site::{DEMO, text};
 use midshift_proto::ota::v1::GetRolloutRequest;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
@@ -57,7 +58,8 @@ async fn tasks_go_on_while_every_process_of_a_split_stack_is_killed_or_replaced_
     submit(stack.public, &site, 7).await?;
     let mut old_proxies = Vec::new();
     for (nth, (what, blow)) in BLOWS.into_iter().enumerate() {
-        at_work(stack.public, 4 + 6 * nth, &BTreeSet::new()).await?;
+        // So early that there is work left to assign after the last of them.
+        at_work(stack.public, 4 + 4 * nth, &BTreeSet::new()).await.context(what)?;
         let before = until("what was assigned so far", Duration::from_secs(30), || attempts(stack.public)).await?;
         let begun = Instant::now();
         match blow {
@@ -69,7 +71,7 @@ async fn tasks_go_on_while_every_process_of_a_split_stack_is_killed_or_replaced_
                 assert_eq!(stack.ask_to_end(role, nth).await?, Some(0), "{what}");
                 stack.restart(role, nth)?;
             }
-            Blow::Deafen => stack.deafen()?,
+            Blow::Deafen => stack.deafen().context(what)?,
             Blow::Reload => old_proxies.push(stack.reload_proxy()?),
             Blow::Cut => tokio::task::block_in_place(|| {
                 stack.postgres.cut();
@@ -79,7 +81,7 @@ async fn tasks_go_on_while_every_process_of_a_split_stack_is_killed_or_replaced_
         let next = until("the next assignment", Duration::from_secs(90), || async {
             Ok(attempts(stack.public).await?.filter(|now| now.difference(&before).next().is_some()))
         });
-        next.await?;
+        next.await.context(what)?;
         say!("{what}: the next assignment after {:.1} s", begun.elapsed().as_secs_f64());
     }
     let ended = all_over(stack.public).await?;
@@ -93,17 +95,21 @@ async fn tasks_go_on_while_every_process_of_a_split_stack_is_killed_or_replaced_
     assert_eq!(online.await?, ROBOTS);
     // No agent was killed: nothing may need a person.
     judge(&ended, &BTreeSet::new(), &site, &robots)?;
-    events_have_no_hole(stack.public).await?;
+    events_have_no_hole(stack.public).await.context("events")?;
     judge_ledgers(&ended, robots).await
 }
 
 /// Every number of every ring is there, once and in order, whichever gateway took it.
 async fn events_have_no_hole(public: SocketAddr) -> anyhow::Result<()> {
-    let mut telemetry = TelemetryServiceClient::new(channel(public)?);
+    let telemetry = TelemetryServiceClient::new(channel(public)?);
     let (mut cursor, mut last) = (String::new(), BTreeMap::new());
     loop {
         let request = ListEventsRequest { page_size: 1_000, cursor, ..ListEventsRequest::default() };
-        let page = telemetry.list_events(request).await?.into_inner();
+        let page = until("a page of events", LIMIT, || {
+            let (mut telemetry, request) = (telemetry.clone(), request.clone());
+            async move { Ok(telemetry.list_events(request).await.ok().map(tonic::Response::into_inner)) }
+        })
+        .await?;
         for said in page.events {
             let Some(event::Item::Sample(sample)) = &said.item else { anyhow::bail!("not a sample: {said:?}") };
             let known: &mut u64 = last.entry((said.robot_id.clone(), said.ring.clone(), said.lane)).or_default();

@@ -114,9 +114,8 @@ impl Stack {
     pub fn deafen(&self) -> anyhow::Result<()> {
         let sql = "SELECT count(pg_terminate_backend(pid)) FROM pg_stat_activity \
                    WHERE query ILIKE 'LISTEN%' AND pid <> pg_backend_pid()";
-        let output = Command::new("psql").args(["-At", "-d", &self.url, "-c", sql]).output().context("psql")?;
-        let said = String::from_utf8_lossy(&output.stdout).trim().to_owned();
-        anyhow::ensure!(output.status.success() && said != "0", "nobody listened: {said}");
+        let said = self.postgres.ask(&self.url, sql);
+        anyhow::ensure!(said != "0", "nobody listened");
         Ok(())
     }
 }
