@@ -1,14 +1,18 @@
 //! Long sweeps and golden files: calls of `cargo test` with an environment variable that the tests read.
 //!
 //! Invariant: a sweep that ran no test fails. `MIDSHIFT_SEED` is read by the test that kills programs, `MIDSHIFT_SEEDS` and
-//! `MIDSHIFT_SEED_FROM` by the simulation, `MIDSHIFT_SITES` by the power cuts, `BLESS` by tests with `golden` in their name.
+//! `MIDSHIFT_SEED_FROM` by the simulation, `MIDSHIFT_SITES` by the power cuts, `MIDSHIFT_SPLIT_ROBOTS` by the split stack, `BLESS` by tests with `golden` in their name.
 
+use crate::fetch_tools::Tools;
 use crate::parts::Count;
 use crate::run;
 use crate::workspace::Workspace;
 use anyhow::{Result, ensure};
 use clap::ValueEnum;
 use std::process::Command;
+
+/// Robots of a split stack under load.
+const SPLIT_ROBOTS: &str = "200";
 
 /// One kind of fault sweep.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -17,18 +21,20 @@ pub enum Sweep {
     Kills,
     /// Shifts of the deterministic simulation, with roll-outs of software.
     Simulation,
+    /// Each process of a split stack killed or replaced in turn with 200 robots at work.
+    Split,
     /// The power goes at each call of an update, and of the ways back from one, that changes the disk: all of them, whatever the seeds.
     Updates,
 }
 
 impl Sweep {
-    const ALL: [Self; 3] = [Self::Kills, Self::Simulation, Self::Updates];
+    const ALL: [Self; 4] = [Self::Kills, Self::Simulation, Self::Split, Self::Updates];
 
     fn seeds(self) -> u64 {
         match self {
             Self::Kills => 20,
             Self::Simulation => 2_000,
-            Self::Updates => 1,
+            Self::Split | Self::Updates => 1,
         }
     }
 
@@ -40,6 +46,7 @@ impl Sweep {
                 command.env("MIDSHIFT_SEED_FROM", from.to_string()).env("MIDSHIFT_SEEDS", seeds.to_string());
                 counted(&mut command)
             }
+            Self::Split => split(workspace, seeds),
             Self::Updates => {
                 let arguments =
                     ["test", "--package", "midshift-agent", "--test", "agent", "--", "power::", "--nocapture"];
@@ -71,6 +78,21 @@ fn kills(workspace: &Workspace, from: u64, seeds: u64) -> Result<bool> {
         workspace.export_programs(&mut command)?;
         if !counted(command.env("MIDSHIFT_SEED", seed.to_string()))? {
             run::say(&format!("next: cargo xtask torture kills --from {seed} --seeds 1"));
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+/// As often as `seeds` says: chance is the machine's.
+fn split(workspace: &Workspace, seeds: u64) -> Result<bool> {
+    ensure!(run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins"]))?, "the programs do not build");
+    let tools = Tools::find(workspace)?;
+    for _ in 0..seeds {
+        let mut command = test(workspace, "e2e", "split::tasks_go_on");
+        workspace.export_programs(&mut command)?;
+        tools.export(&mut command);
+        if !counted(command.env("MIDSHIFT_SPLIT_ROBOTS", SPLIT_ROBOTS))? {
             return Ok(false);
         }
     }

@@ -14,25 +14,54 @@ use std::process::Command;
 /// How many times as fast as real the bodies work; clocks are not touched.
 const BODY_SPEED: &str = "5";
 
-/// Agents in processes of their own, each with its folder, which can be killed and started again.
+/// Agents in processes of their own, each with its folder, which can be killed and started again; or many in few processes.
 pub struct Robots {
     dir: PathBuf,
     server: String,
     starts: Vec<String>,
     running: BTreeMap<String, Running>,
+    /// Processes that have many of them each.
+    crowds: Vec<Running>,
+    ids: Vec<String>,
 }
 
 impl Robots {
     /// Starts `count` of them at starting places of the site.
     pub fn start(dir: &Path, server: SocketAddr, site: &Site, count: usize) -> anyhow::Result<Self> {
         let starts = site.starting_places(count).into_iter().map(|at| site.name_of(at).to_string()).collect();
-        let mut robots = Self { dir: dir.to_owned(), server: server.to_string(), starts, running: BTreeMap::new() };
+        let mut robots = Self::none(dir, server);
+        robots.starts = starts;
         (0..count).try_for_each(|number| robots.start_one(number))?;
+        robots.ids = robots.running.keys().cloned().collect();
         Ok(robots)
+    }
+    /// `count` of them on the site of a file, shared out among `processes`, with bodies no faster than real ones.
+    pub fn crowd(dir: &Path, server: SocketAddr, site: &Path, count: usize, processes: usize) -> anyhow::Result<Self> {
+        let mut robots = Self::none(dir, server);
+        let digits = count.to_string().len();
+        robots.ids = (1..=count).map(|number| format!("rbt-{number:0digits$}")).collect();
+        for nth in 0..processes {
+            let [from, to] = [nth, nth + 1].map(|n| 1 + count * n / processes);
+            let mut command = Command::new(midshift()?);
+            command.args(["sim", "run", "--server", &robots.server, "--robots", &count.to_string(), "--no-faults"]);
+            command.args(["--only", &format!("{from}..{to}"), "--seed", "1"]).arg("--data").arg(dir);
+            command.arg("--site").arg(site);
+            robots.crowds.push(Running::start(&mut command, &dir.join(format!("crowd-{nth}.log")))?);
+        }
+        Ok(robots)
+    }
+    fn none(dir: &Path, server: SocketAddr) -> Self {
+        let (starts, running) = (Vec::new(), BTreeMap::new());
+        let (crowds, ids) = (Vec::new(), Vec::new());
+        Self { dir: dir.to_owned(), server: server.to_string(), starts, running, crowds, ids }
     }
     /// Names of all.
     pub fn ids(&self) -> Vec<String> {
-        self.running.keys().cloned().collect()
+        self.ids.clone()
+    }
+    /// SIGKILL to all of them.
+    pub fn kill_all(&mut self) -> anyhow::Result<()> {
+        self.running.values_mut().chain(&mut self.crowds).try_for_each(Running::kill)
     }
     fn start_one(&mut self, number: usize) -> anyhow::Result<()> {
         let id = format!("rbt-{:02}", number + 1);
@@ -70,6 +99,6 @@ impl Robots {
     }
     /// Journals of all bodies.
     pub fn journals(&self) -> Vec<PathBuf> {
-        self.running.keys().map(|id| self.dir.join(id).join("journal.jsonl")).collect()
+        self.ids.iter().map(|id| self.dir.join(id).join("journal.jsonl")).collect()
     }
 }

@@ -1,13 +1,13 @@
 //! The same services as processes of their own: each of them is killed or replaced while robots work, and nothing is lost.
 
 use crate::harness::{channel, in_states, until};
-use crate::kill::{all_over, at_work, judge, judge_ledgers, submit};
+use crate::kill::{TASKS, all_over, at_work, judge, judge_ledgers, submit};
 use crate::robots::Robots;
 use crate::rolled_out::{Robot, call, done};
 use crate::room::LIMIT;
 use crate::stack::Stack;
 use anyhow::Context;
-use midshift_core::site::{DEMO, text};
+use midshift_core::site::{DEMO, Site, grid, text};
 use midshift_proto::ota::v1::GetRolloutRequest;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
@@ -19,6 +19,11 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 const ROBOTS: usize = 20;
+/// How many instead, in few processes on a free floor; a long run for `cargo xtask torture split`.
+const MANY: &str = "MIDSHIFT_SPLIT_ROBOTS";
+/// Processes that share them, and tasks for each.
+const CROWDS: usize = 3;
+const TASKS_EACH: usize = 3;
 
 /// What happens to the stack, one after the other, and what a line says of it.
 const BLOWS: [(&str, Blow); 10] = [
@@ -42,6 +47,13 @@ enum Blow {
     Cut,
 }
 
+/// A floor without walls or passages on which so many robots find room and any cell is a station.
+fn free_floor(robots: usize) -> Result<Site, midshift_core::reason::Refusal> {
+    let side = robots.isqrt() * 2;
+    let rows = format!("{}\n", ".".repeat(side)).repeat(side);
+    grid::parse_map("floor", &format!("type octile\nheight {side}\nwidth {side}\nmap\n{rows}"))
+}
+
 /// Every attempt that ever was, by task and epoch.
 async fn attempts(public: SocketAddr) -> anyhow::Result<Option<BTreeSet<(String, u64)>>> {
     let tasks = in_states(public, &[]).await?;
@@ -52,14 +64,20 @@ async fn attempts(public: SocketAddr) -> anyhow::Result<Option<BTreeSet<(String,
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn tasks_go_on_while_every_process_of_a_split_stack_is_killed_or_replaced_in_turn() -> anyhow::Result<()> {
     let dir = tempfile::tempdir()?;
-    let site = text::parse(DEMO)?;
-    let mut stack = Stack::start(dir.path(), DEMO, &["--drain-seconds", "20", "--no-software"], &[]).await?;
-    let robots = Robots::start(dir.path(), stack.robots, &site, ROBOTS)?;
-    submit(stack.public, &site, 7).await?;
+    let many = std::env::var(MANY).ok().map(|many| many.parse::<usize>()).transpose().context(MANY)?;
+    let site = many.map_or_else(|| text::parse(DEMO), free_floor)?;
+    let (count, tasks) = many.map_or((ROBOTS, TASKS), |many| (many, many * TASKS_EACH));
+    let mut stack =
+        Stack::start(dir.path(), &text::render(&site), &["--drain-seconds", "20", "--no-software"], &[]).await?;
+    let robots = match many {
+        None => Robots::start(dir.path(), stack.robots, &site, count)?,
+        Some(_) => Robots::crowd(dir.path(), stack.robots, &dir.path().join("site.toml"), count, CROWDS)?,
+    };
+    submit(stack.public, &site, 7, tasks).await?;
     let mut old_proxies = Vec::new();
     for (nth, (what, blow)) in BLOWS.into_iter().enumerate() {
         // So early that there is work left to assign after the last of them.
-        at_work(stack.public, 4 + 4 * nth, &BTreeSet::new()).await.context(what)?;
+        at_work(stack.public, (4 + 4 * nth) * tasks / 100, &BTreeSet::new()).await.context(what)?;
         let before = until("what was assigned so far", Duration::from_secs(30), || attempts(stack.public)).await?;
         let begun = Instant::now();
         match blow {
@@ -84,23 +102,24 @@ async fn tasks_go_on_while_every_process_of_a_split_stack_is_killed_or_replaced_
         next.await.context(what)?;
         say!("{what}: the next assignment after {:.1} s", begun.elapsed().as_secs_f64());
     }
-    let ended = all_over(stack.public).await?;
+    let ended = all_over(stack.public, tasks).await?;
     let online = until("every robot", Duration::from_secs(60), || async {
-        let page = TelemetryServiceClient::new(channel(stack.public)?).list_robots(ListRobotsRequest::default()).await;
+        let request = ListRobotsRequest { page_size: 1_000, ..ListRobotsRequest::default() };
+        let page = TelemetryServiceClient::new(channel(stack.public)?).list_robots(request).await;
         let online = |page: &midshift_proto::telemetry::v1::ListRobotsResponse| {
-            page.robots.iter().filter(|robot| robot.presence() == Presence::Online).count() == ROBOTS
+            page.robots.iter().filter(|robot| robot.presence() == Presence::Online).count() == count
         };
         Ok(page.ok().map(tonic::Response::into_inner).filter(online).map(|page| page.robots.len()))
     });
-    assert_eq!(online.await?, ROBOTS);
+    assert_eq!(online.await?, count);
     // No agent was killed: nothing may need a person.
     judge(&ended, &BTreeSet::new(), &site, &robots)?;
-    events_have_no_hole(stack.public).await.context("events")?;
+    events_have_no_hole(stack.public, count).await.context("events")?;
     judge_ledgers(&ended, robots).await
 }
 
 /// Every number of every ring is there, once and in order, whichever gateway took it.
-async fn events_have_no_hole(public: SocketAddr) -> anyhow::Result<()> {
+async fn events_have_no_hole(public: SocketAddr, count: usize) -> anyhow::Result<()> {
     let telemetry = TelemetryServiceClient::new(channel(public)?);
     let (mut cursor, mut last) = (String::new(), BTreeMap::new());
     loop {
@@ -122,7 +141,7 @@ async fn events_have_no_hole(public: SocketAddr) -> anyhow::Result<()> {
         }
     }
     let robots: BTreeSet<&String> = last.keys().map(|(robot, ..)| robot).collect();
-    assert_eq!(robots.len(), ROBOTS);
+    assert_eq!(robots.len(), count);
     Ok(())
 }
 
@@ -132,7 +151,7 @@ async fn a_fleet_that_was_frozen_while_another_took_over_assigns_nothing_twice()
     let site = text::parse(DEMO)?;
     let mut stack = Stack::start(dir.path(), DEMO, &["--no-software"], &[]).await?;
     let robots = Robots::start(dir.path(), stack.robots, &site, ROBOTS)?;
-    submit(stack.public, &site, 11).await?;
+    submit(stack.public, &site, 11, TASKS).await?;
     for (nth, done) in [(0, 8), (1, 24), (0, 40)] {
         at_work(stack.public, done, &BTreeSet::new()).await?;
         let before = until("what was assigned so far", Duration::from_secs(30), || attempts(stack.public)).await?;
@@ -143,7 +162,7 @@ async fn a_fleet_that_was_frozen_while_another_took_over_assigns_nothing_twice()
         .await?;
         stack.signal("fleet", nth, "CONT")?;
     }
-    let ended = all_over(stack.public).await?;
+    let ended = all_over(stack.public, TASKS).await?;
     judge(&ended, &BTreeSet::new(), &site, &robots)?;
     judge_ledgers(&ended, robots).await
 }
