@@ -7,7 +7,7 @@ use crate::rolled_out::{Robot, call, done};
 use crate::room::LIMIT;
 use crate::stack::Stack;
 use anyhow::Context;
-use midshift_core::site::{DEMO, Site, grid, text};
+use midshift_core::site::{DEMO, grid, text};
 use midshift_proto::ota::v1::GetRolloutRequest;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
@@ -48,10 +48,10 @@ enum Blow {
 }
 
 /// A floor without walls or passages on which so many robots find room and any cell is a station.
-fn free_floor(robots: usize) -> Result<Site, midshift_core::reason::Refusal> {
+fn free_floor(robots: usize) -> String {
     let side = robots.isqrt() * 2;
     let rows = format!("{}\n", ".".repeat(side)).repeat(side);
-    grid::parse_map("floor", &format!("type octile\nheight {side}\nwidth {side}\nmap\n{rows}"))
+    format!("type octile\nheight {side}\nwidth {side}\nmap\n{rows}")
 }
 
 /// Every attempt that ever was, by task and epoch.
@@ -65,13 +65,13 @@ async fn attempts(public: SocketAddr) -> anyhow::Result<Option<BTreeSet<(String,
 async fn tasks_go_on_while_every_process_of_a_split_stack_is_killed_or_replaced_in_turn() -> anyhow::Result<()> {
     let dir = tempfile::tempdir()?;
     let many = std::env::var(MANY).ok().map(|many| many.parse::<usize>()).transpose().context(MANY)?;
-    let site = many.map_or_else(|| text::parse(DEMO), free_floor)?;
+    let map = many.map_or_else(|| DEMO.to_owned(), free_floor);
+    let site = if many.is_some() { grid::parse_map("site", &map) } else { text::parse(&map) }?;
     let (count, tasks) = many.map_or((ROBOTS, TASKS), |many| (many, many * TASKS_EACH));
-    let mut stack =
-        Stack::start(dir.path(), &text::render(&site), &["--drain-seconds", "20", "--no-software"], &[]).await?;
+    let mut stack = Stack::start(dir.path(), &map, &["--drain-seconds", "20", "--no-software"], &[]).await?;
     let robots = match many {
         None => Robots::start(dir.path(), stack.robots, &site, count)?,
-        Some(_) => Robots::crowd(dir.path(), stack.robots, &dir.path().join("site.toml"), count, CROWDS)?,
+        Some(_) => Robots::crowd(dir.path(), stack.robots, &stack.site, count, CROWDS)?,
     };
     submit(stack.public, &site, 7, tasks).await?;
     let mut old_proxies = Vec::new();

@@ -11,11 +11,30 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
+/// What all processes say, below the stack's folder.
+const LOG: &str = "stack.log";
+
 /// One process of a service.
 struct Member {
     role: &'static str,
     address: SocketAddr,
     running: Running,
+}
+
+impl Member {
+    /// Some if it may be given work; an error if it has ended.
+    fn is_ready(&mut self) -> anyhow::Result<Option<()>> {
+        anyhow::ensure!(!self.running.has_ended()?, "{} at {} ended", self.role, self.address);
+        let page = http1(self.address, "GET /ready HTTP/1.1\r\nHost: midshift\r\nConnection: close\r\n\r\n");
+        Ok(page.is_ok_and(|page| page.starts_with("HTTP/1.1 200")).then_some(()))
+    }
+}
+
+/// The end of what all processes said.
+fn said(dir: &Path) -> String {
+    let log = std::fs::read_to_string(dir.join(LOG)).unwrap_or_default();
+    let lines: Vec<&str> = log.lines().rev().take(20).collect();
+    lines.into_iter().rev().collect::<Vec<_>>().join("\n")
 }
 
 /// Flags of processes.
@@ -28,6 +47,8 @@ struct Flags {
 /// All of them.
 pub struct Stack {
     dir: PathBuf,
+    /// The site's file.
+    pub site: PathBuf,
     flags: Flags,
     /// The database server.
     pub postgres: PostgresServer,
@@ -41,9 +62,11 @@ pub struct Stack {
 }
 
 impl Stack {
-    /// One task intake, and two of each of the others; `flags` are for every process, `of_ota` for those with software as well.
+    /// One task intake, and two of each of the others, on a site of text or of a grid; `flags` are for every process, `of_ota` for those with software as well.
     pub async fn start(dir: &Path, site: &str, flags: &[&str], of_ota: &[&str]) -> anyhow::Result<Self> {
-        std::fs::write(dir.join("site.toml"), site)?;
+        let name = if site.starts_with("type octile") { "site.map" } else { "site.toml" };
+        let file = dir.join(name);
+        std::fs::write(&file, site)?;
         let postgres = tokio::task::block_in_place(PostgresServer::start);
         let url = tokio::task::block_in_place(|| postgres.database());
         let owned = |flags: &[&str]| flags.iter().map(|flag| (*flag).to_owned()).collect();
@@ -51,15 +74,14 @@ impl Stack {
         let mut members = Vec::new();
         for role in ["task", "fleet", "fleet", "telemetry", "telemetry", "ota", "ota"] {
             let address = free_port()?;
-            members.push(Member { role, address, running: run(dir, role, address, &url, &flags)? });
+            members.push(Member { role, address, running: run(dir, &file, role, address, &url, &flags)? });
         }
         let (public, robots) = (free_port()?, free_port()?);
         let proxy = proxy(dir, &members, public, robots, None)?;
-        let stack = Self { dir: dir.to_owned(), flags, postgres, url, members, proxy, public, robots };
-        for member in &stack.members {
-            until("a process that is ready", Duration::from_secs(60), || async {
-                let page = http1(member.address, "GET /ready HTTP/1.1\r\nHost: midshift\r\nConnection: close\r\n\r\n");
-                Ok(page.is_ok_and(|page| page.starts_with("HTTP/1.1 200")).then_some(()))
+        let mut stack = Self { dir: dir.to_owned(), site: file, flags, postgres, url, members, proxy, public, robots };
+        for member in &mut stack.members {
+            until("a process that is ready", Duration::from_secs(60), || {
+                std::future::ready(member.is_ready().with_context(|| said(dir)))
             })
             .await?;
         }
@@ -97,9 +119,9 @@ impl Stack {
 
     /// Starts one again that has ended, at its old address.
     pub fn restart(&mut self, role: &'static str, nth: usize) -> anyhow::Result<()> {
-        let (dir, url, flags) = (self.dir.clone(), self.url.clone(), self.flags.clone());
+        let (dir, site, url, flags) = (self.dir.clone(), self.site.clone(), self.url.clone(), self.flags.clone());
         let member = self.member(role, nth)?;
-        member.running = run(&dir, role, member.address, &url, &flags)?;
+        member.running = run(&dir, &site, role, member.address, &url, &flags)?;
         Ok(())
     }
 
@@ -120,14 +142,14 @@ impl Stack {
     }
 }
 
-fn run(dir: &Path, role: &str, address: SocketAddr, url: &str, flags: &Flags) -> anyhow::Result<Running> {
+fn run(dir: &Path, site: &Path, role: &str, address: SocketAddr, url: &str, flags: &Flags) -> anyhow::Result<Running> {
     let mut command = Command::new(midshift()?);
     command.args(["serve", "--roles", role, "--store", url, "--listen", &address.to_string(), "--data"]);
-    command.arg(dir.join("data")).arg("--site").arg(dir.join("site.toml")).args(&flags.of_all);
+    command.arg(dir.join("data")).arg("--site").arg(site).args(&flags.of_all);
     if role == "ota" {
         command.args(&flags.of_ota);
     }
-    Running::start(&mut command, &dir.join("stack.log"))
+    Running::start(&mut command, &dir.join(LOG))
 }
 
 fn proxy(
