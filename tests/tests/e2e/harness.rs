@@ -123,6 +123,12 @@ pub fn free_port() -> anyhow::Result<SocketAddr> {
     bail!("no port is free")
 }
 
+/// A folder for one test, taken away at its end unless `MIDSHIFT_TEST_KEEP` is set, for whoever wants to know what happened.
+pub fn folder() -> anyhow::Result<tempfile::TempDir> {
+    let keep = std::env::var_os("MIDSHIFT_TEST_KEEP").is_some();
+    Ok(tempfile::Builder::new().prefix("midshift-e2e-").disable_cleanup(keep).tempdir()?)
+}
+
 /// Looks until `condition` gives a value; an error names what was waited for.
 pub async fn until<T, F>(what: &str, limit: Duration, mut condition: impl FnMut() -> F) -> anyhow::Result<T>
 where

@@ -1,6 +1,6 @@
 //! The same services as processes of their own: each of them is killed or replaced while robots work, and nothing is lost.
 
-use crate::harness::{channel, in_states, until};
+use crate::harness::{channel, folder, in_states, until};
 use crate::kill::{TASKS, all_over, at_work, judge, judge_ledgers, submit};
 use crate::robots::Robots;
 use crate::rolled_out::{Robot, call, done};
@@ -63,7 +63,7 @@ async fn attempts(public: SocketAddr) -> anyhow::Result<Option<BTreeSet<(String,
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn tasks_go_on_while_every_process_of_a_split_stack_is_killed_or_replaced_in_turn() -> anyhow::Result<()> {
-    let dir = tempfile::tempdir()?;
+    let dir = folder()?;
     let many = std::env::var(MANY).ok().map(|many| many.parse::<usize>()).transpose().context(MANY)?;
     let map = many.map_or_else(|| DEMO.to_owned(), free_floor);
     let site = if many.is_some() { grid::parse_map("site", &map) } else { text::parse(&map) }?;
@@ -147,7 +147,7 @@ async fn events_have_no_hole(public: SocketAddr, count: usize) -> anyhow::Result
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_fleet_that_was_frozen_while_another_took_over_assigns_nothing_twice() -> anyhow::Result<()> {
-    let dir = tempfile::tempdir()?;
+    let dir = folder()?;
     let site = text::parse(DEMO)?;
     let mut stack = Stack::start(dir.path(), DEMO, &["--no-software"], &[]).await?;
     let robots = Robots::start(dir.path(), stack.robots, &site, ROBOTS)?;
@@ -169,7 +169,7 @@ async fn a_fleet_that_was_frozen_while_another_took_over_assigns_nothing_twice()
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_roll_out_goes_on_while_processes_that_plan_it_sign_it_and_hand_it_out_are_killed() -> anyhow::Result<()> {
-    let dir = tempfile::tempdir()?;
+    let dir = folder()?;
     let samples = dir.path().join("samples");
     let (folder, keys) = (samples.display().to_string(), samples.join("keys").display().to_string());
     done(&["bundle", "samples", &folder])?;
