@@ -181,7 +181,8 @@ impl Session {
                     return end;
                 },
                 () = is_cut_off(&mut cut_off) => {
-                    return close(CloseCode::MoveOver, Code::StoreUnavailable, limits::FENCED_RETRY);
+                    // To another gateway, while there is authority left.
+                    return close(CloseCode::MoveOver, Code::StoreUnavailable, LinkDuration(0));
                 }
                 () = at(unread_at) => return close(CloseCode::TooSlow, Code::Overloaded, LinkDuration(1_000)),
                 () = at(ack_at) => self.ack_status(),

@@ -26,7 +26,7 @@ const CROWDS: usize = 3;
 const TASKS_EACH: usize = 3;
 
 /// What happens to the stack, one after the other, and what a line says of it.
-const BLOWS: [(&str, Blow); 10] = [
+const BLOWS: [(&str, Blow); 11] = [
     ("kill -9 of a fleet", Blow::Kill("fleet", 0)),
     ("kill -9 of the other fleet", Blow::Kill("fleet", 1)),
     ("kill -9 of a gateway", Blow::Kill("telemetry", 0)),
@@ -37,6 +37,7 @@ const BLOWS: [(&str, Blow); 10] = [
     ("a gateway is asked to end", Blow::Ask("telemetry", 1)),
     ("a fleet is asked to end", Blow::Ask("fleet", 0)),
     ("PostgreSQL ends at once, and starts again", Blow::Cut),
+    ("PostgreSQL stays away until gateways let their robots go", Blow::Outage),
 ];
 
 enum Blow {
@@ -45,6 +46,7 @@ enum Blow {
     Deafen,
     Reload,
     Cut,
+    Outage,
 }
 
 /// A floor without walls or passages on which so many robots find room and any cell is a station.
@@ -95,6 +97,11 @@ async fn tasks_go_on_while_every_process_of_a_split_stack_is_killed_or_replaced_
                 stack.postgres.cut();
                 stack.postgres.start_again();
             }),
+            Blow::Outage => {
+                tokio::task::block_in_place(|| stack.postgres.cut());
+                stack.all_cut_off().await.context(what)?;
+                tokio::task::block_in_place(|| stack.postgres.start_again());
+            }
         }
         let next = until("the next assignment", Duration::from_secs(90), || async {
             Ok(attempts(stack.public).await?.filter(|now| now.difference(&before).next().is_some()))

@@ -132,6 +132,19 @@ impl Stack {
         Ok(std::mem::replace(&mut self.proxy, new))
     }
 
+    /// Waits until every gateway has let its robots go, since it does not reach the database.
+    pub async fn all_cut_off(&self) -> anyhow::Result<()> {
+        for gateway in self.members.iter().filter(|member| member.role == "telemetry") {
+            until("a gateway that says it is cut off", Duration::from_secs(60), || async {
+                let page =
+                    http1(gateway.address, "GET /metrics HTTP/1.1\r\nHost: midshift\r\nConnection: close\r\n\r\n");
+                Ok(page.is_ok_and(|page| page.lines().any(|line| line == "midshift_telemetry_cut_off 1")).then_some(()))
+            })
+            .await?;
+        }
+        Ok(())
+    }
+
     /// Ends every connection that hears of commits.
     pub fn deafen(&self) -> anyhow::Result<()> {
         let sql = "SELECT count(pg_terminate_backend(pid)) FROM pg_stat_activity \

@@ -175,4 +175,15 @@ impl Robot {
         }
         Err("the session ended without a word".into())
     }
+    /// As [`Robot::closes`]; an error if a heartbeat was echoed before it.
+    pub async fn closes_unechoed(&mut self) -> Result<Close> {
+        while let Some(message) = self.down.message().await? {
+            match midshift_proto::parse(message)? {
+                ToRobot::Close(close) => return Ok(close),
+                ToRobot::Downlink(down) if down.echo.is_some() => return Err(format!("echoed: {down:?}").into()),
+                _ => {}
+            }
+        }
+        Err("the session ended without a word".into())
+    }
 }
