@@ -55,11 +55,21 @@ pub struct SoftwareRules {
     pub windows: Vec<Window>,
     /// No new drain begins.
     pub frozen: bool,
+    /// The gate on rates of task failures ends a roll-out that has given permission to a robot of the area, also if its spec does not ask for
+    /// that. See [`crate::rollout::verdict::acts_on_rates`].
+    #[serde(default)]
+    pub acts_on_rates: bool,
 }
 
 impl Default for SoftwareRules {
     fn default() -> Self {
-        Self { off_work_permille: 100, keep_in_work: BTreeMap::new(), windows: Vec::new(), frozen: false }
+        Self {
+            off_work_permille: 100,
+            keep_in_work: BTreeMap::new(),
+            windows: Vec::new(),
+            frozen: false,
+            acts_on_rates: false,
+        }
     }
 }
 
@@ -207,6 +217,14 @@ mod tests {
     }
 
     #[test]
+    fn rules_that_were_stored_before_gates_could_be_switched_leave_rates_only_shown() {
+        let stored = r#"{"off_work_permille":100,"keep_in_work":{},"windows":[],"frozen":true}"#;
+        let rules: SoftwareRules = serde_json::from_str(stored).expect("an older row");
+        assert_eq!(rules, SoftwareRules { frozen: true, ..SoftwareRules::default() });
+        assert!(!rules.acts_on_rates);
+    }
+
+    #[test]
     fn every_broken_rule_for_software_is_told() {
         let window =
             Window { days: BTreeSet::from([0, 8]), from_minute: 1440, to_minute: 2000, zone: "Berlin".to_owned() };
@@ -214,7 +232,7 @@ mod tests {
             off_work_permille: 1001,
             keep_in_work: BTreeMap::from([(String::new(), 1)]),
             windows: vec![window],
-            frozen: false,
+            ..SoftwareRules::default()
         };
         let area = AreaId::parse("hall").expect("an id");
         let mut bad = Violations::default();

@@ -6,8 +6,9 @@ use super::Board;
 use super::matching::{self, Matched, Matching};
 use super::rows::Bundle;
 use super::spec::{RolloutSpec, Wave};
+use super::verdict::{self, ActsOnRates};
 use super::view::View;
-use crate::ids::{BundleId, RobotId, RolloutId};
+use crate::ids::{AreaId, BundleId, RobotId, RolloutId};
 use crate::reason::{Code, Kind, Reason, Refusal, Violations};
 use crate::task::raw::parse_version;
 use crate::update::Installed;
@@ -139,6 +140,18 @@ fn caveats(view: &View, spec: &RolloutSpec, bundle: &Bundle, matching: &Matching
     if spec.waves.contains(&Wave::Rest) && spec.waves.len() == 1 {
         caveats.push("all robots in one wave: a bad bundle reaches every one of them".to_owned());
     }
+    let areas = matching.robots.iter().filter_map(|r| r.stratum.area.as_ref());
+    let acts = if spec.acts_on_rates { Some(ActsOnRates::Spec) } else { verdict::areas_that_act(view, areas) };
+    caveats.extend(acts.map(|acts| match acts {
+        ActsOnRates::Spec => "rates of task failures end it too, as is asked for".to_owned(),
+        ActsOnRates::Areas(areas) => {
+            let areas: Vec<&str> = areas.iter().map(AreaId::as_str).collect();
+            format!(
+                "rates of task failures end it too once it has given permission to a robot there: the rules of {} say so",
+                areas.join(", ")
+            )
+        }
+    }));
     let said = |m: &Matched| view.sessions.get(m.robot_id.as_str()).and_then(|s| s.row.installed.as_ref());
     let named = |wrong: &dyn Fn(&Installed) -> bool| {
         let ids = matching.robots.iter().filter(|m| said(m).is_some_and(wrong)).map(|m| m.robot_id.to_string());

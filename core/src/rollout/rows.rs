@@ -227,7 +227,7 @@ pub struct Verdict {
     pub robots: OutcomeEvidence,
     /// What their tasks say, beside those of the others.
     pub tasks: FailureEvidence,
-    /// What follows from the tasks; it ends a roll-out only if that was asked for.
+    /// What follows from the tasks; it ends a roll-out only if its spec or the rules of an area say so.
     pub suspicion: Suspicion,
     /// UTC, site clock.
     pub at: Utc,

@@ -119,7 +119,8 @@ pub struct RolloutSpec {
     pub allow_full_push: bool,
     /// Bytes a second that each robot may download. 0: as fast as it goes.
     pub rate_bytes_s: u32,
-    /// The gate on rates of task failures ends the roll-out too; else it is only shown.
+    /// The gate on rates of task failures ends the roll-out too; else it is only shown, unless rules of an area say otherwise:
+    /// [`super::verdict::acts_on_rates`].
     pub acts_on_rates: bool,
 }
 

@@ -12,12 +12,12 @@ use super::{Board, Tx};
 use crate::fleet::heard;
 use crate::fleet::rows::RobotCounter;
 use crate::gates::{self, FEW_ROBOTS, RobotOutcomes, Suspicion, TaskTally};
-use crate::ids::{RobotId, RolloutId};
+use crate::ids::{AreaId, RobotId, RolloutId};
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::robot::{Duty, Presence};
 use crate::time::{Now, Utc};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 /// Robots named in an abort.
@@ -150,11 +150,60 @@ pub fn against(view: &View, rollout: &Rollout) -> Option<(Reason, bool, Seen)> {
     if seen.outcomes.verdict() == gates::Verdict::Abort {
         return Some((numbers(Code::TooManyFailed), false, seen));
     }
-    if rollout.spec.acts_on_rates && rollout.tasks.suspicion() == Suspicion::Release {
-        let e_value = format!("{:.1}", rollout.tasks.e_value());
-        return Some((Reason::from(Code::RateTooHigh).with("e_value", e_value), false, seen));
+    if rollout.tasks.suspicion() == Suspicion::Release
+        && let Some(by) = acts_on_rates(view, rollout)
+    {
+        let reason = Reason::from(Code::RateTooHigh).with("e_value", format!("{:.1}", rollout.tasks.e_value()));
+        return Some((by.told(reason), false, seen));
     }
     None
+}
+
+/// Who says that rates of task failures end a roll-out.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ActsOnRates {
+    /// Whoever asked for the roll-out.
+    Spec,
+    /// The rules of these areas, never none.
+    Areas(BTreeSet<AreaId>),
+}
+
+impl ActsOnRates {
+    /// Names areas in a reason, if it is they.
+    fn told(&self, reason: Reason) -> Reason {
+        match self {
+            Self::Spec => reason,
+            Self::Areas(areas) => {
+                let areas: Vec<&str> = areas.iter().map(AreaId::as_str).collect();
+                reason.with("area_ids", areas.join(" "))
+            }
+        }
+    }
+}
+
+/// Who says at this moment that the gate on rates of task failures ends the roll-out; none: what it finds is only shown. The spec, or else
+/// the rules of an area in which a robot is, as far as it said last, that was given permission to activate: tasks of such robots are the evidence,
+/// also when their wave was kept. Robots that it has not touched say nothing for or against it, so neither do their areas. Rules are read
+/// as they are now: a rule that is put while the roll-out runs holds at once, also for what was counted before. Nothing ends what is over, or takes
+/// something back.
+pub fn acts_on_rates(view: &View, rollout: &Rollout) -> Option<ActsOnRates> {
+    if rollout.phase.is_over() || rollout.revert_of.is_some() {
+        return None;
+    }
+    if rollout.spec.acts_on_rates {
+        return Some(ActsOnRates::Spec);
+    }
+    let attempted = view.robots_of(&rollout.rollout_id).filter(|r| r.attempted);
+    let software = attempted.filter_map(|r| view.software.get(r.robot_id.as_str()));
+    areas_that_act(view, software.filter_map(|s| s.row.area.as_ref()))
+}
+
+/// Those of the areas whose rules say that rates of task failures end roll-outs; none: no rules say so.
+pub fn areas_that_act<'a>(view: &View, areas: impl Iterator<Item = &'a AreaId>) -> Option<ActsOnRates> {
+    let areas: BTreeSet<&AreaId> = areas.collect();
+    let areas = areas.into_iter().filter(|area| view.policy(area).software.acts_on_rates);
+    let areas: BTreeSet<AreaId> = areas.cloned().collect();
+    (!areas.is_empty()).then_some(ActsOnRates::Areas(areas))
 }
 
 /// What is latched when a roll-out ends early.

@@ -14,7 +14,7 @@ pub mod task_list;
 pub mod text;
 
 use crate::ids::{AreaId, PlaceId, SiteId, WaypointId};
-use crate::policy::AreaPolicy;
+use crate::policy::{AreaPolicy, SoftwareRules};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -183,6 +183,9 @@ pub struct AreaDefaults {
     pub charge_opportunistic_permille: Option<u16>,
     /// Charging ends here, permille.
     pub charge_stop_permille: Option<u16>,
+    /// Rates of task failures end roll-outs here; see [`crate::policy::SoftwareRules::acts_on_rates`].
+    #[serde(default)]
+    pub acts_on_rates: bool,
 }
 
 /// A part of the site with its own policy.
@@ -211,6 +214,7 @@ impl Area {
                 .charge_opportunistic_permille
                 .unwrap_or(base.charge_opportunistic_permille),
             charge_stop_permille: d.charge_stop_permille.unwrap_or(base.charge_stop_permille),
+            software: SoftwareRules { acts_on_rates: d.acts_on_rates, ..base.software },
             ..base
         }
     }

@@ -8,6 +8,7 @@
 //! map_id = "shop"
 //! map_version = "1"
 //! area = [ { id = "floor", speed_limit_mm_s = 1500 } ]    # a waypoint without an area lies in the first one
+//! # beside it: people, avoidance_distance_mm, charge_*_permille, and acts_on_rates = true: rates of task failures end roll-outs there
 //! waypoint = [
 //!   { id = "j1", at = [0, 0] },                           # millimetres east and north
 //!   { id = "j2", at = [4000, 0] },
@@ -62,6 +63,8 @@ struct RawArea {
     charge_preemptible_permille: Option<u16>,
     charge_opportunistic_permille: Option<u16>,
     charge_stop_permille: Option<u16>,
+    #[serde(default)]
+    acts_on_rates: bool,
 }
 
 #[derive(Deserialize)]
@@ -183,6 +186,7 @@ fn area((field, raw): (String, RawArea)) -> DraftArea {
         charge_preemptible_permille: raw.charge_preemptible_permille,
         charge_opportunistic_permille: raw.charge_opportunistic_permille,
         charge_stop_permille: raw.charge_stop_permille,
+        acts_on_rates: raw.acts_on_rates,
     };
     DraftArea { field, id: raw.id, people: raw.people, defaults }
 }
@@ -270,6 +274,9 @@ fn write_area(area: &Area, out: &mut String) -> std::fmt::Result {
             write!(out, ", {key} = {value}")?;
         }
     }
+    if d.acts_on_rates {
+        write!(out, ", acts_on_rates = true")?;
+    }
     writeln!(out, " }},")
 }
 
@@ -342,6 +349,16 @@ mod tests {
             let again = parse(&render(&site)).expect("its own text reads");
             assert_eq!(again, site);
         }
+    }
+
+    #[test]
+    fn an_area_says_in_the_file_that_rates_of_failures_end_roll_outs_and_others_do_not() {
+        let acts = |site: &Site| site.areas()[0].policy().software.acts_on_rates;
+        let plain = text_of("{ path = [\"p\", \"q\", \"st\"] }", "");
+        assert!(!acts(&parse(&plain).expect("reads")));
+        let site = parse(&plain.replace("id = \"a\" ", "id = \"a\", acts_on_rates = true ")).expect("reads");
+        assert!(acts(&site));
+        assert_eq!(parse(&render(&site)).expect("its own text reads"), site);
     }
 
     #[test]

@@ -34,6 +34,7 @@ fn encode_rules(rules: &SoftwareRules) -> v1::SoftwareRules {
         keep_in_work: rules.keep_in_work.clone(),
         windows: rules.windows.iter().map(window).collect(),
         frozen: rules.frozen,
+        acts_on_rates: rules.acts_on_rates,
     }
 }
 
@@ -68,6 +69,7 @@ fn parse_rules(rules: v1::SoftwareRules) -> SoftwareRules {
         keep_in_work: rules.keep_in_work,
         windows: rules.windows.into_iter().map(window).collect(),
         frozen: rules.frozen,
+        acts_on_rates: rules.acts_on_rates,
     }
 }
 

@@ -21,6 +21,19 @@ fn a_policy_takes_defaults_for_what_is_absent_and_comes_back_whole() {
 }
 
 #[test]
+fn what_roll_outs_must_keep_to_comes_back_whole() {
+    let wire = json!({"areaId": "hall", "software": {
+        "offWorkPermille": 200, "keepInWork": {"pick": 3}, "frozen": true, "actsOnRates": true,
+        "windows": [{"days": [1, 5], "fromMinute": 1320, "toMinute": 300, "zone": "Europe/Berlin"}],
+    }});
+    let policy: AreaPolicy =
+        parse_field(Some(from_json::<v1::AreaPolicy>(wire).expect("json")), "policy").expect("valid");
+    let s = &policy.software;
+    assert_eq!((s.off_work_permille, s.windows.len(), s.frozen, s.acts_on_rates), (200, 1, true, true));
+    assert_eq!(parse_field(Some(encode_policy(&policy, None)), "policy"), Ok(policy));
+}
+
+#[test]
 fn a_policy_hears_every_rule_it_breaks() {
     let wire = json!({"areaId": "hall", "speedLimitMmS": 1, "avoidanceDistanceMm": 10_001, "chargeStopPermille": 100});
     let refusal =

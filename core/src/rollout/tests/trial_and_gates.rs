@@ -236,28 +236,97 @@ fn the_breaker_on_trial_counts_and_one_of_before_does_not() {
     assert!(rig.phase().goes_back());
 }
 
+/// Three of eight robots in the hall work on trial, and then half of their tasks fail: the release is suspected.
+fn suspected(acts_on_rates: bool, prepare: impl FnOnce(&mut Rig)) -> Rig {
+    let mut rig = Rig::new(8);
+    rig.checks_rebuild = false;
+    rig.works = false;
+    let waves = vec![Wave::Count(3), Wave::Rest];
+    rig.start(RolloutSpec { waves, allow_full_push: true, soak_ms: 3_000_000, acts_on_rates, ..spec() });
+    rig.until(60, |r| r.phase() == Phase::Soaking);
+    prepare(&mut rig);
+    for _ in 0..10 {
+        for n in 0..8 {
+            let trial = rig.step(n) == Step::Trial;
+            (0..4).for_each(|_| rig.ends_task(n, !trial));
+            (0..4).for_each(|_| rig.ends_task(n, true));
+        }
+        rig.pass(60_000);
+        rig.ota_turn();
+    }
+    assert_eq!(rig.rollout("ro").tasks.suspicion(), crate::gates::Suspicion::Release);
+    rig
+}
+
+fn ended_by(rig: &Rig) -> Option<(Code, Option<String>)> {
+    rig.rollout("ro").abort.map(|a| (a.reason.code, a.reason.metadata.get("area_ids").cloned()))
+}
+
+/// Puts rules of the area of quality, where no robot of a rig begins.
+fn quality_acts(rig: &mut Rig) {
+    let mut rules = AreaPolicy::default_of(AreaId::parse("quality").expect("an id"));
+    rules.software.acts_on_rates = true;
+    rig.put(rules);
+}
+
 #[test]
 fn a_rate_of_task_failures_is_shown_and_ends_it_only_if_that_was_asked_for() {
     for acts in [false, true] {
-        let mut rig = Rig::new(8);
-        rig.checks_rebuild = false;
-        rig.works = false;
-        let waves = vec![Wave::Count(3), Wave::Rest];
-        rig.start(RolloutSpec { waves, allow_full_push: true, soak_ms: 3_000_000, acts_on_rates: acts, ..spec() });
-        rig.until(60, |r| r.phase() == Phase::Soaking);
-        for _ in 0..10 {
-            for n in 0..8 {
-                let trial = rig.step(n) == Step::Trial;
-                (0..4).for_each(|_| rig.ends_task(n, !trial));
-                (0..4).for_each(|_| rig.ends_task(n, true));
-            }
-            rig.pass(60_000);
-            rig.ota_turn();
-        }
-        let rollout = rig.rollout("ro");
-        assert_eq!(rollout.tasks.suspicion(), crate::gates::Suspicion::Release);
-        assert_eq!(rollout.abort.map(|a| (a.reason.code, a.hard)), acts.then_some((Code::RateTooHigh, false)));
+        let rig = suspected(acts, |_| {});
+        assert_eq!(ended_by(&rig), acts.then_some((Code::RateTooHigh, None)));
+        assert!(rig.rollout("ro").abort.is_none_or(|a| !a.hard));
     }
+}
+
+#[test]
+fn a_rate_of_task_failures_ends_it_where_the_rules_of_the_area_say_so() {
+    let rig = suspected(false, |rig| rig.rules(|s| s.acts_on_rates = true));
+    assert_eq!(ended_by(&rig), Some((Code::RateTooHigh, Some("hall".to_owned()))));
+}
+
+#[test]
+fn rules_of_an_area_in_which_no_robot_was_given_permission_end_nothing_and_rules_that_are_put_later_do() {
+    let mut rig = suspected(false, |rig| {
+        quality_acts(rig);
+        let untouched = rig.order()[7];
+        rig.robots[untouched].at = "door-2";
+        rig.ticks(2);
+        assert!(!rig.of("ro", untouched).attempted);
+        let area = rig.ota.software_of(&robot_id(untouched)).area;
+        assert_eq!(area.map(|a| a.to_string()).as_deref(), Some("quality"), "it is seen there");
+    });
+    assert_eq!(ended_by(&rig), None);
+    rig.rules(|s| s.acts_on_rates = true);
+    rig.ota_turn();
+    assert_eq!(ended_by(&rig), Some((Code::RateTooHigh, Some("hall".to_owned()))));
+}
+
+#[test]
+fn a_robot_on_trial_that_drives_into_an_area_that_says_so_ends_it() {
+    let rig = suspected(false, |rig| {
+        quality_acts(rig);
+        let on_trial = rig.order()[0];
+        rig.robots[on_trial].at = "door-2";
+        rig.ticks(2);
+    });
+    assert_eq!(ended_by(&rig), Some((Code::RateTooHigh, Some("quality".to_owned()))));
+}
+
+#[test]
+fn who_says_that_rates_end_it_is_told_before_it_begins() {
+    let mut rig = Rig::new(4);
+    let caveats = |rig: &Rig, spec: &RolloutSpec| {
+        let run = super::super::dry_run::dry_run(&rig.ota, &rig.board, &rollout_id("ro"), spec).expect("it may begin");
+        run.caveats.into_iter().filter(|c| c.starts_with("rates of task failures")).collect::<Vec<_>>()
+    };
+    quality_acts(&mut rig);
+    rig.tick();
+    assert_eq!(caveats(&rig, &spec()), Vec::<String>::new());
+    let asked = RolloutSpec { acts_on_rates: true, ..spec() };
+    assert!(caveats(&rig, &asked)[0].ends_with("as is asked for"));
+    rig.rules(|s| s.acts_on_rates = true);
+    rig.tick();
+    assert!(caveats(&rig, &spec())[0].ends_with("the rules of hall say so"));
 }
 
 #[test]

@@ -7,7 +7,7 @@ use midshift_core::rollout::explain::blocked;
 use midshift_core::rollout::rows::{Abort, Act, Quarantine, RobotSoftware, Rollout, RolloutRobot, Step, Verdict};
 use midshift_core::rollout::spec::{RolloutSpec, Wave};
 use midshift_core::rollout::stamp::Stamp;
-use midshift_core::rollout::verdict;
+use midshift_core::rollout::verdict::{self, ActsOnRates};
 use midshift_core::rollout::view::View;
 use midshift_core::rows::Revision;
 use midshift_core::time::{Now, Utc};
@@ -175,6 +175,10 @@ pub fn rollout(view: &View, now: &Now, row: &Rollout) -> v1::Rollout {
         start_time: row.started.map(timestamp),
         since: Some(timestamp(row.since)),
         etag: etag(Revision(row.version)),
+        acts_on_rates_area_ids: match verdict::acts_on_rates(view, row) {
+            Some(ActsOnRates::Areas(areas)) => areas.iter().map(ToString::to_string).collect(),
+            _ => Vec::new(),
+        },
     }
 }
 

@@ -21,6 +21,9 @@ pub struct Rules {
     /// No robot is taken out of work for a roll-out.
     #[arg(long, value_name = "true|false", action = clap::ArgAction::Set)]
     frozen: Option<bool>,
+    /// A suspicion from rates of task failures ends roll-outs that have given permission to a robot of the area. Without it that is only shown.
+    #[arg(long, value_name = "true|false", action = clap::ArgAction::Set)]
+    acts_on_rates: Option<bool>,
 }
 
 /// One window, or that there is none.
@@ -51,6 +54,7 @@ impl Rules {
             rules.windows = self.window.into_iter().filter_map(at).collect();
         }
         rules.frozen = self.frozen.unwrap_or(rules.frozen);
+        rules.acts_on_rates = self.acts_on_rates.unwrap_or(rules.acts_on_rates);
         rules
     }
 }
@@ -125,6 +129,7 @@ pub fn shown(rules: &SoftwareRules) -> String {
     }
     let windows: Vec<String> = rules.windows.iter().map(told).collect();
     text += &if windows.is_empty() { "  at any time".to_owned() } else { format!("  only {}", windows.join("; ")) };
+    text += if rules.acts_on_rates { "  rates of failures act" } else { "" };
     text + if rules.frozen { "  FROZEN" } else { "" }
 }
 
@@ -162,12 +167,19 @@ mod tests {
 
     #[test]
     fn what_is_not_named_stays() {
-        let nothing = || Rules { off_work: None, keep_in_work: Vec::new(), window: Vec::new(), frozen: None };
+        let nothing = || Rules {
+            off_work: None,
+            keep_in_work: Vec::new(),
+            window: Vec::new(),
+            frozen: None,
+            acts_on_rates: None,
+        };
         let old = SoftwareRules {
             off_work_permille: Some(150),
             keep_in_work: [("pick".to_owned(), 3), ("lift".to_owned(), 1)].into(),
             windows: vec![at("daily 01:00-04:00 UTC")],
             frozen: true,
+            acts_on_rates: true,
         };
         assert_eq!(nothing().over(old.clone()), old);
         let change = Rules {
@@ -175,9 +187,12 @@ mod tests {
             keep_in_work: vec![("pick".to_owned(), 0), ("tow".to_owned(), 2)],
             window: vec![Window::Always],
             frozen: Some(false),
+            acts_on_rates: None,
         };
         let new = change.over(old);
-        assert_eq!(shown(&new), "\n  software: at most 20 % out of work  keep in work lift=1 tow=2  at any time");
+        let expected = "\n  software: at most 20 % out of work  keep in work lift=1 tow=2  at any time";
+        assert_eq!(shown(&new), format!("{expected}  rates of failures act"));
+        assert_eq!(shown(&Rules { acts_on_rates: Some(false), ..nothing() }.over(new)), expected);
     }
 
     #[test]

@@ -137,6 +137,23 @@ walk-1.5.0  SOAKING  wave 2/3  bundle walk-1.5.0
 }
 
 #[test]
+fn the_header_says_who_wants_rates_of_failures_to_end_it_as_long_as_they_may() {
+    let said = |change: &dyn Fn(&mut v1::Rollout)| {
+        let mut rollout = rollout();
+        change(&mut rollout);
+        text::header(&rollout).into_iter().find(|line| line.contains("rates of task failures"))
+    };
+    assert_eq!(said(&|_| {}), None);
+    let areas = |r: &mut v1::Rollout| r.acts_on_rates_area_ids = vec!["dock".into(), "hall".into()];
+    let by = "  rates of task failures end it too, ";
+    assert_eq!(said(&areas), Some(format!("{by}by the rules of dock, hall")));
+    let asked = |r: &mut v1::Rollout| r.spec.as_mut().unwrap().acts_on_rates = true;
+    assert_eq!(said(&asked), Some(format!("{by}as was asked for")));
+    let over = |r: &mut v1::Rollout| (r.phase, _) = (RolloutPhase::Completed as i32, asked(r));
+    assert_eq!(said(&over), None);
+}
+
+#[test]
 fn many_robots_of_one_wave_are_counted_and_not_listed() {
     let robots: Vec<_> = (0..30).map(|n| robot(&format!("rbt-{n:02}"), 1, RolloutStep::Trial)).collect();
     let lines = text::tree(&rollout(), robots.iter());

@@ -159,6 +159,7 @@ pub fn header(rollout: &v1::Rollout) -> Vec<String> {
         facts.push(format!("{few} had too few tasks, a person is asked in {}", span(left)));
     }
     lines.push(format!("  {}", facts.join(", ")));
+    lines.extend(acts_on_rates(rollout).map(|line| format!("  {line}")));
     let of = [("takes back", &rollout.revert_of), ("its place took", &rollout.superseded_by)];
     lines.extend(of.iter().filter(|(_, id)| !id.is_empty()).map(|(what, id)| format!("  {what} {id}")));
     lines.extend(rollout.abort.as_ref().map(|a| format!("  {}  {}", time(a.time.as_ref()), abort(a))));
@@ -167,6 +168,23 @@ pub fn header(rollout: &v1::Rollout) -> Vec<String> {
         lines.push(format!("  skipped: {}", skipped.join(", ")));
     }
     lines
+}
+
+/// Who says that rates of task failures end it; none: they are only shown.
+fn acts_on_rates(rollout: &v1::Rollout) -> Option<String> {
+    use RolloutPhase::{Aborted, Completed, Superseded};
+    if matches!(rollout.phase(), Completed | Aborted | Superseded) || !rollout.revert_of.is_empty() {
+        return None;
+    }
+    let areas = &rollout.acts_on_rates_area_ids;
+    let by = if rollout.spec.as_ref().is_some_and(|s| s.acts_on_rates) {
+        "as was asked for".to_owned()
+    } else if areas.is_empty() {
+        return None;
+    } else {
+        format!("by the rules of {}", areas.join(", "))
+    };
+    Some(format!("rates of task failures end it too, {by}"))
 }
 
 /// The end of a roll-out that ended early.
