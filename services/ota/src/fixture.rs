@@ -125,6 +125,24 @@ pub fn write_keys(folder: &Path) {
     }
 }
 
+/// Makes a file unreadable, also for root: a folder stands in its place.
+pub fn hide(file: &Path) {
+    std::fs::rename(file, beside(file)).expect("moved");
+    std::fs::create_dir(file).expect("a folder");
+}
+
+/// Puts a file back that was hidden.
+pub fn give_back(file: &Path) {
+    std::fs::remove_dir(file).expect("the folder");
+    std::fs::rename(beside(file), file).expect("moved back");
+}
+
+/// Not in its own folder: what nobody knows is taken out of that at a start.
+fn beside(file: &Path) -> PathBuf {
+    let name = file.file_name().expect("a name").to_string_lossy();
+    file.ancestors().nth(2).expect("a folder").join(format!("hidden-{name}"))
+}
+
 /// A repository in a folder of its own.
 pub struct Room {
     pub dir: TempDir,

@@ -191,8 +191,11 @@ pub struct Newest {
     pub files: BTreeMap<String, FileTarget>,
     /// Bundles by name and version.
     pub releases: Vec<Release>,
-    /// The newest set of keys that sign directives; none: robots have them from their trust files alone.
+    /// The newest set of keys that sign directives; none: robots have them from their trust files alone, or it is listed and cannot be read.
     pub key_set: Option<KeySet>,
+    /// Manifests and the newest set of directive keys that are listed and that the disk did not give, though they are there. They are tried
+    /// again at each look; nobody may conclude from it that they are gone.
+    pub unread: BTreeSet<Digest>,
     digests: BTreeSet<Digest>,
     timestamp: Vec<u8>,
 }
@@ -509,7 +512,7 @@ impl Newest {
     ) -> Self {
         let digests = files.iter().map(|file| file.digest).collect();
         let files = files.into_iter().map(|file| (file.name.clone(), file)).collect();
-        Self { root, targets, stamp, files, releases, key_set: None, digests, timestamp }
+        Self { root, targets, stamp, files, releases, key_set: None, unread: BTreeSet::new(), digests, timestamp }
     }
 }
 

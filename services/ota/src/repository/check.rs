@@ -15,6 +15,7 @@ use midshift_core::reason::Violations;
 use midshift_core::task::raw::parse_version;
 use midshift_core::time::Utc;
 use std::collections::BTreeMap;
+use std::path::Path;
 use tokio::io::AsyncReadExt;
 
 /// The newest root of a chain: each is the next after the one before, and signed by it.
@@ -179,14 +180,26 @@ pub fn newest_set(files: &[FileTarget]) -> Option<&FileTarget> {
     files.iter().filter_map(|file| Some((KeySet::number_of(&file.name)?, file))).max_by_key(|(n, _)| *n).map(|(_, f)| f)
 }
 
-/// Reads a set of directive keys and its envelope; the inner error is what is wrong with it. Who signed it is not looked at.
-pub async fn key_set(file: &FileTarget, content: &dyn Content) -> Result<Result<(KeySet, Vec<u8>), String>, Error> {
-    let range = 0..ENVELOPE_BYTES_MAX as u64 + 1;
-    let Some(mut reader) = content.read(file.digest, range).await? else { return Ok(Err("is gone".to_owned())) };
+/// The bytes of a listed file, as many as one may have and one more: enough to know that it is too long. None: it is not here.
+///
+/// # Errors
+/// The disk's, of which nobody knows whether they are there the next time: the file is no worse for it.
+async fn bytes_of(digest: Digest, most: u64, content: &dyn Content) -> Result<Option<Vec<u8>>, Error> {
+    let Some(mut reader) = content.read(digest, 0..most + 1).await? else { return Ok(None) };
     let mut bytes = Vec::new();
-    if let Err(error) = reader.read_to_end(&mut bytes).await {
-        return Ok(Err(error.to_string()));
-    }
+    let read = reader.read_to_end(&mut bytes).await;
+    read.map_err(super::io("reading", Path::new(&digest.to_string())))?;
+    Ok(Some(bytes))
+}
+
+/// Reads a set of directive keys and its envelope; the inner error is what is wrong with it. Who signed it is not looked at.
+///
+/// # Errors
+/// The disk's.
+pub async fn key_set(file: &FileTarget, content: &dyn Content) -> Result<Result<(KeySet, Vec<u8>), String>, Error> {
+    let Some(bytes) = bytes_of(file.digest, ENVELOPE_BYTES_MAX as u64, content).await? else {
+        return Ok(Err("is gone".to_owned()));
+    };
     Ok(KeySet::read(&bytes).map(|set| (set, bytes)).map_err(|rejection| rejection.to_string()))
 }
 
@@ -196,6 +209,9 @@ pub fn is_manifest(file: &FileTarget) -> bool {
 }
 
 /// Reads the manifest of a bundle; the inner error is what is wrong with it.
+///
+/// # Errors
+/// The disk's.
 pub async fn manifest(file: &FileTarget, content: &dyn Content) -> Result<Result<Manifest, String>, Error> {
     let read = read_manifest(file.digest, content).await?;
     Ok(read.and_then(|manifest| {
@@ -205,14 +221,13 @@ pub async fn manifest(file: &FileTarget, content: &dyn Content) -> Result<Result
 }
 
 /// Reads the manifest of a bundle, whatever its name; the inner error is what is wrong with it.
+///
+/// # Errors
+/// The disk's.
 pub async fn read_manifest(digest: Digest, content: &dyn Content) -> Result<Result<Manifest, String>, Error> {
-    // One byte too many is enough to know that it is too long.
-    let range = 0..MANIFEST_BYTES_MAX as u64 + 1;
-    let Some(mut reader) = content.read(digest, range).await? else { return Ok(Err("is gone".to_owned())) };
-    let mut bytes = Vec::new();
-    if let Err(error) = reader.read_to_end(&mut bytes).await {
-        return Ok(Err(error.to_string()));
-    }
+    let Some(bytes) = bytes_of(digest, MANIFEST_BYTES_MAX as u64, content).await? else {
+        return Ok(Err("is gone".to_owned()));
+    };
     Ok(Manifest::from_bytes(&bytes).map_err(|refusal| refusal.to_string()))
 }
 

@@ -1,14 +1,15 @@
 //! Documents as they are shown: what the timestamp of a folder leads to, and what another process that shares the folder made of it since.
 //!
 //! Invariant: nothing is written here. What is shown never goes back: a folder that says something older, or something else under the same
-//! number, is damaged, and what was shown before stays.
+//! number, is damaged, and what was shown before stays. A file that the disk does not give at the moment is not gone: what was known of it
+//! stays, and it is tried again at each look.
 
 use super::{Error, Kept, Newest, Online, Release, TIMESTAMP, check, file, read, read_seen};
 use crate::blocking;
 use crate::content::Content;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::freshness::{Stamp, check_online, newest_targets, root_edition, stamp, targets_edition};
-use midshift_bundle::repository::{check_root, listed};
+use midshift_bundle::repository::{FileTarget, check_root, listed};
 use midshift_core::time::Utc;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -28,8 +29,10 @@ pub struct Documents {
     folder: PathBuf,
     content: Arc<dyn Content>,
     newest: Place,
-    /// Other processes change the folder. One reads it anew at a time.
-    following: Option<Arc<Mutex<()>>>,
+    /// Other processes change the folder.
+    is_shared: bool,
+    /// One reads it anew at a time.
+    following: Arc<Mutex<()>>,
     /// The newest look came to nothing.
     is_failing: Arc<AtomicBool>,
 }
@@ -37,12 +40,12 @@ pub struct Documents {
 impl Documents {
     /// What a folder shows, of which nobody but its repository may change anything unless it is shared.
     pub(super) async fn open(folder: &Path, content: Arc<dyn Content>, is_shared: bool) -> Result<Self, Error> {
-        let following = is_shared.then(Arc::default);
         let this = Self {
             folder: folder.to_owned(),
             content,
             newest: Place::default(),
-            following,
+            is_shared,
+            following: Arc::default(),
             is_failing: Arc::default(),
         };
         this.take().await?;
@@ -63,7 +66,7 @@ impl Documents {
 
     /// Whether other processes change them.
     pub(super) const fn is_shared(&self) -> bool {
-        self.following.is_some()
+        self.is_shared
     }
 
     /// What they say now; none: nothing was ever published.
@@ -71,13 +74,15 @@ impl Documents {
         self.newest.read().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Learns what other processes published.
+    /// Learns what other processes published, and tries files again that the disk did not give.
     ///
     /// # Errors
     /// If it cannot be read, does not hang together, or is older than what was shown. Then that is shown still.
     pub async fn follow(&self) -> Result<(), Error> {
-        let Some(following) = &self.following else { return Ok(()) };
-        let _one = following.lock().await;
+        if !self.is_shared && self.newest().is_none_or(|newest| newest.unread.is_empty()) {
+            return Ok(());
+        }
+        let _one = self.following.lock().await;
         self.take().await
     }
 
@@ -102,7 +107,9 @@ impl Documents {
             let read = blocking(move || {
                 let timestamp = read(&folder.join(TIMESTAMP))?;
                 if timestamp.as_ref() == known.as_ref().map(|known| &known.timestamp) {
-                    return Ok((timestamp, Ok(None)));
+                    let again = known.filter(|known| !known.unread.is_empty());
+                    let again = again.map(|known| Found::again(&known, &folder)).transpose();
+                    return Ok((timestamp, again));
                 }
                 Ok::<_, Error>((timestamp, find(&folder)))
             });
@@ -110,8 +117,10 @@ impl Documents {
             let taken = match found {
                 Ok(None) if timestamp.is_some() || before.is_none() => return Ok(()),
                 Ok(None) => Err(self.damaged(format!("{TIMESTAMP} is gone"))),
-                Ok(Some(found)) => match found.complete(self.content.as_ref()).await {
-                    Ok(newest) => self.show(before.as_ref(), newest),
+                Ok(Some(found)) => match found.complete(self.content.as_ref(), before.as_deref()).await {
+                    Ok((newest, unread)) => {
+                        self.show(before.as_ref(), newest).map(|()| tell(before.as_deref(), &unread))
+                    }
                     Err(error) => Err(error),
                 },
                 Err(error) => Err(error),
@@ -134,6 +143,7 @@ impl Documents {
     /// Shows what was read after `before` was shown.
     fn show(&self, before: Option<&Arc<Newest>>, read: Newest) -> Result<(), Error> {
         let mut place = self.newest.write().unwrap_or_else(PoisonError::into_inner);
+        let is_again = before.is_some_and(|before| before.timestamp == read.timestamp);
         if let Some(shown) = place.as_deref() {
             let versions = |n: &Newest| {
                 [n.stamp.version, n.stamp.snapshot_version, n.targets.edition.version, n.root.edition.version]
@@ -141,6 +151,7 @@ impl Documents {
             let (shown, read) = (versions(shown), versions(&read));
             let is_older = read.iter().zip(shown).any(|(read, shown)| *read < shown) || read[0] == shown[0];
             let is_as_before = before.is_some_and(|before| place.as_ref().is_some_and(|p| Arc::ptr_eq(p, before)));
+            let is_older = is_older && !(is_as_before && is_again);
             if is_older && is_as_before {
                 let text = format!(
                     "timestamp, snapshot, targets and root were {shown:?} and are {read:?}: the folder was put back under a server at work; restart all processes that share it once it is what it should be"
@@ -181,6 +192,9 @@ impl Documents {
     }
 }
 
+/// Listed files that the disk does not give, with their names and why.
+type Unread = BTreeMap<Digest, (String, Error)>;
+
 /// Documents that the timestamp of a folder leads to.
 struct Found {
     root: Kept,
@@ -191,31 +205,78 @@ struct Found {
 }
 
 impl Found {
-    /// With its bundles. A file that is gone is told and left out: the rest can be had still.
-    async fn complete(self, content: &dyn Content) -> Result<Newest, Error> {
+    /// What was shown already, to try again what the disk did not give.
+    fn again(known: &Newest, folder: &Path) -> Result<Self, Error> {
+        Ok(Self {
+            root: known.root.clone(),
+            targets: known.targets.clone(),
+            timestamp: known.timestamp.clone(),
+            stamp: known.stamp,
+            seen: read_seen(folder)?,
+        })
+    }
+
+    /// With its bundles, `before` being what is shown until now. A file that is gone is told and left out: the rest can be had still. One that the
+    /// disk does not give is what it was in `before`, since its name is its digest, and is noted as unread.
+    async fn complete(self, content: &dyn Content, before: Option<&Newest>) -> Result<(Newest, Unread), Error> {
         let files = listed(&self.targets.bytes)?;
-        let mut releases = Vec::new();
+        let again = before.filter(|before| before.timestamp == self.timestamp);
+        let is_known = |file: &FileTarget| again.is_some_and(|again| !again.unread.contains(&file.digest));
+        let (mut releases, mut unread) = (Vec::new(), Unread::new());
         for file in files.iter().filter(|file| check::is_manifest(file)) {
-            match check::manifest(file, content).await? {
-                Ok(manifest) => {
+            let known = |newest: &Newest| newest.releases.iter().find(|r| r.digest == file.digest).cloned();
+            if is_known(file) {
+                // Nothing is read twice for the sake of others.
+                releases.extend(again.and_then(known));
+                continue;
+            }
+            match check::manifest(file, content).await {
+                Ok(Ok(manifest)) => {
                     let seen = self.seen.get(&file.digest).copied().unwrap_or_default();
                     releases.push(Release { digest: file.digest, manifest, seen });
                 }
-                Err(problem) => tracing::error!(file = file.name, problem, "a signed bundle cannot be read"),
+                Ok(Err(problem)) => tracing::error!(file = file.name, problem, "a signed bundle cannot be read"),
+                Err(error) => {
+                    releases.extend(before.and_then(known));
+                    unread.insert(file.digest, (file.name.clone(), error));
+                }
             }
         }
         check::sort(&mut releases);
         let key_set = match check::newest_set(&files) {
-            Some(file) => match check::key_set(file, content).await? {
-                Ok((set, _)) => Some(set),
-                Err(problem) => {
+            Some(file) if is_known(file) => again.and_then(|again| again.key_set.clone()),
+            Some(file) => match check::key_set(file, content).await {
+                Ok(Ok((set, _))) => Some(set),
+                Ok(Err(problem)) => {
                     tracing::error!(file = file.name, problem, "the newest set of directive keys cannot be read");
                     None
+                }
+                Err(error) => {
+                    unread.insert(file.digest, (file.name.clone(), error));
+                    let known = before.filter(|before| before.files.get(&file.name) == Some(file));
+                    known.and_then(|before| before.key_set.clone())
                 }
             },
             None => None,
         };
-        Ok(Newest { key_set, ..Newest::of(self.root, self.targets, self.stamp, files, releases, self.timestamp) })
+        let newest = Newest::of(self.root, self.targets, self.stamp, files, releases, self.timestamp);
+        Ok((Newest { key_set, unread: unread.keys().copied().collect(), ..newest }, unread))
+    }
+}
+
+/// Says once that the disk does not give files, and once that it does again.
+fn tell(before: Option<&Newest>, unread: &Unread) {
+    let is_known = |digest: &Digest| before.is_some_and(|before| before.unread.contains(digest));
+    for (file, error) in unread.iter().filter(|(digest, _)| !is_known(digest)).map(|(_, why)| why) {
+        tracing::warn!(
+            file,
+            %error,
+            "a signed file is there and cannot be read: what was known of it stays, and it is tried again at each look; see to the disk, and to who \
+             may read its folder `content`"
+        );
+    }
+    if unread.is_empty() && before.is_some_and(|before| !before.unread.is_empty()) {
+        tracing::info!("all signed files can be read again");
     }
 }
 

@@ -1,6 +1,7 @@
 //! What may be published, what is kept, and that a cut at any write leaves something that robots believe.
 
 mod key_sets;
+mod unread;
 
 use super::{Error, FRESHEN_AFTER_MS, OnlineKeys, Repository, write_whole};
 use crate::content::Content;

@@ -38,6 +38,9 @@ pub fn take(view: &mut View, now: Now, newest: Option<&Newest>, plan: &mut Plan)
             changed.push(Bundle { revoked, ..fresh(bundle, &release.manifest, length, release.seen) });
         }
     }
+    // What the disk does not give at the moment is not unlisted for that.
+    let unread = newest.into_iter().flat_map(|newest| &newest.unread);
+    listed.extend(unread.filter_map(|digest| BundleId::parse(&digest.to_string()).ok()));
     let gone = view.bundles.values().map(|b| &b.row).filter(|b| b.listed && !listed.contains(&b.bundle));
     changed.extend(gone.map(|b| Bundle { listed: false, ..b.clone() }));
     for rows in changed.chunks(limits::ITEM_ROWS_MAX) {

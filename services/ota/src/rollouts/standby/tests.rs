@@ -1,11 +1,12 @@
 //! Two processes of the rollout service over one store and one folder: one plans and signs, the other carries out what people ask.
 
 use crate::content::Room;
-use crate::fixture::{START, files, release, write_keys};
+use crate::fixture::{START, files, give_back, hide, release, write_keys};
 use crate::folder::Owner;
 use crate::repository::FRESHEN_AFTER_MS;
 use crate::rollouts::{Parts, RolloutService};
 use crate::{OtaService, Parts as OtaParts};
+use midshift_bundle::digest::Digest;
 use midshift_core::ids::RolloutId;
 use midshift_core::lead::OtaLeader;
 use midshift_core::rollout::bugs::Bugs;
@@ -196,4 +197,32 @@ async fn a_leader_of_roll_outs_that_ends_as_asked_hands_over_at_once() {
     let second = world.holder().await;
     assert!(second != first && !second.is_empty(), "{second}");
     standby.end().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_bundle_that_the_disk_does_not_give_is_not_unlisted_and_is_there_again_without_a_start() {
+    let world = World::new();
+    let walk = files("walk", "1.0.0");
+    let manifest = world.dir.path().join("ota/content").join(Digest::of(&walk[0].1).to_string());
+    let process = world.process().await;
+    release(&process.ota, &walk).await;
+    secs(2).await;
+    process.end().await;
+    hide(&manifest);
+    let process = world.process().await;
+    secs(3).await;
+    let known =
+        |process: &Process| process.ota.opened().expect("keys").repository.newest().expect("shown").releases.len();
+    assert_eq!(known(&process), 0, "nobody can read what it is");
+    assert!(world.bundles().await[0].listed, "roll-outs of it would stand still as if it had been taken back");
+    give_back(&manifest);
+    secs(2).await;
+    assert_eq!(known(&process), 1);
+    process.end().await;
+    // The twin: a file that is gone is gone.
+    std::fs::remove_file(&manifest).expect("removed");
+    let process = world.process().await;
+    secs(3).await;
+    assert!(!world.bundles().await[0].listed);
+    process.end().await;
 }
