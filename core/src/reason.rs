@@ -168,6 +168,7 @@ codes! {
     BlockedByWave = "WAITING_FOR_WAVE", "Its wave has not begun.";
     BlockedByPlaceInWave = "WAITING_FOR_PLACE_IN_WAVE", "As many robots as the roll-out allows are out of work for it.";
     BlockedByPause = "ROLLOUT_PAUSED", "The roll-out stands still. Resume it.";
+    NoDirectiveKey = "NO_DIRECTIVE_KEY", "The server has no directive key of the newest set, so robots would refuse its orders and it signs none. Put a directive-*.pem that the set names into its folder of --ota-keys, or push a next set that names one it has; see docs/runbooks/keys.md.";
     BlockedByRollout = "WAITING_FOR_ROLLOUT", "Another roll-out has the robot.";
     BlockedByDownload = "WAITING_FOR_DOWNLOAD", "The robot fetches the bundle while it works.";
     BlockedByDrain = "WAITING_FOR_DRAIN", "The robot ends its work and parks.";

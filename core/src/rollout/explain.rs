@@ -2,7 +2,7 @@
 
 use super::rows::{Countdown, Phase, Rollout, RolloutRobot, Step};
 use super::view::View;
-use super::{Board, hear, robots, turns};
+use super::{Board, hear, moves, robots, turns};
 use crate::fleet::rows::{Drain, DrainState};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -24,6 +24,10 @@ pub struct Blocked {
 pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Blocked> {
     let mut since = r.since;
     let mut deadline = None;
+    let due = if view.keyless { robots::next(view, board, now, rollout, r) } else { None };
+    if due.is_some_and(|due| moves::is_signed(view, rollout, r, &due)) {
+        return Some(Blocked { by: Code::NoDirectiveKey.into(), since, deadline });
+    }
     let by = match r.step {
         Step::Committed | Step::RolledBack | Step::Skipped => return None,
         Step::Waiting if !(rollout.phase.runs() || rollout.phase == Phase::Completed) => Code::BlockedByWave.into(),

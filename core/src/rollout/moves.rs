@@ -117,10 +117,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
         }
         Move::GoBack => {
             let drain_id = r.drain_id.clone();
-            let said = tx.view.software_of(&r.robot_id).report.map(|report| report.bundle);
-            let left = rollout.revert_of.is_some() && said.as_ref() != Some(&rollout.spec.bundle);
-            if left || !tx.view.desired.contains_key(r.robot_id.as_str()) {
-                // It was told something else since, and has left it: only a directive of its own leads back from what it kept.
+            if must_be_ordered_back(tx.view, &rollout, &r) {
                 order_back(tx, sign, &rollout, &mut r);
             } else {
                 desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Revert, drain_id, None));
@@ -144,6 +141,22 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             step(tx, r, Step::Stuck, "robot.stuck");
         }
     }
+}
+
+/// Whether what is due for `r` is told with a directive that must be signed for that.
+pub fn is_signed(view: &View, rollout: &Rollout, r: &RolloutRobot, due: &Move) -> bool {
+    match due {
+        Move::Stage | Move::SignAnew | Move::OrderBackAnew => true,
+        Move::GoBack => must_be_ordered_back(view, rollout, r),
+        _ => false,
+    }
+}
+
+/// It was told something else since, and has left it: only a directive of its own leads back from what it kept.
+fn must_be_ordered_back(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
+    let said = view.software_of(&r.robot_id).report.map(|report| report.bundle);
+    let left = rollout.revert_of.is_some() && said.as_ref() != Some(&rollout.spec.bundle);
+    left || !view.desired.contains_key(r.robot_id.as_str())
 }
 
 /// Why a drain without a permission that may be alive may end.

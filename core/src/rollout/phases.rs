@@ -57,7 +57,9 @@ fn pauses(tx: &mut Tx, board: &Board, rollout: &Rollout) {
     let asked = rollout.pauses.contains(&Pause::Operator).then_some(Pause::Operator);
     let gone = is_gone(tx.view, rollout).then_some(Pause::Revoked);
     let network = infrastructure::pause(tx.view, board, &tx.now, rollout);
-    let pauses = asked.into_iter().chain(gone).chain(network).collect();
+    // Who goes back was told already with what it goes back from; only what must be signed anew waits.
+    let keyless = (tx.view.keyless && rollout.revert_of.is_none()).then_some(Pause::Keyless);
+    let pauses = asked.into_iter().chain(gone).chain(network).chain(keyless).collect();
     if pauses != rollout.pauses {
         set_pauses(tx, rollout.clone(), pauses, "rollout.pauses_changed");
     }

@@ -241,6 +241,9 @@ fn staged(
 
 /// Why a robot that has the bundle is not taken out of work now.
 pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Reason> {
+    if rollout.pauses.contains(&Pause::Keyless) {
+        return Some(Code::NoDirectiveKey.into());
+    }
     if !rollout.pauses.is_empty() {
         return Some(Reason::from(Code::BlockedByPause).with("pauses", pauses(rollout)));
     }

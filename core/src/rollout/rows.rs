@@ -165,6 +165,8 @@ pub enum Pause {
     InfrastructureUnknown,
     /// Its bundle was taken back.
     Revoked,
+    /// The server has no key whose orders robots take: none could be told anything, nor be ordered back anew.
+    Keyless,
 }
 
 /// A stretch of serving time on the site clock that can stand still.

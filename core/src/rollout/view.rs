@@ -85,6 +85,8 @@ pub struct View {
     pub served: OtaClock,
     /// How long robots are in contact without a break. Volatile: it begins anew with the process.
     pub contacts: BTreeMap<RobotId, Contact>,
+    /// Nothing can be signed for robots at this moment. Volatile: known where directives are signed, at the last cycle.
+    pub keyless: bool,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: super::bugs::Bugs,
 }
@@ -272,6 +274,7 @@ impl View {
             read,
             served: OtaClock::default(),
             contacts: BTreeMap::new(),
+            keyless: false,
             bugs: super::bugs::Bugs::default(),
         }
     }

@@ -74,6 +74,7 @@ wire_enums! {
     }
     Pause = ota::v1::RolloutPause {
         Operator = Operator, Infrastructure = Infrastructure, InfrastructureUnknown = InfrastructureUnknown, Revoked = Revoked,
+        Keyless = Keyless,
     }
     Outcome = ota::v1::RolloutOutcome {
         Promoted = Promoted, PromotedUnproven = PromotedUnproven, PromotedByPerson = PromotedByPerson, Review = Review, Aborted = Aborted,

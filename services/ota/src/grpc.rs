@@ -7,6 +7,7 @@ use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::COMPONENT_BYTES_MAX;
 use midshift_core::limits;
 use midshift_core::reason::{Refusal, Violations};
+use midshift_proto::convert::shown;
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::bundle_service_server::BundleService as BundleFace;
 use tonic::{Request, Response, Status, Streaming};
@@ -83,7 +84,9 @@ impl OtaService {
         let newest = opened.repository.newest();
         let releases = newest.as_ref().map(|newest| newest.releases.as_slice()).unwrap_or_default();
         let room = pages::room(opened.content.fill(), opened.encodings.bytes(), opened.collector.newest());
-        pages::page(releases, room, r).map_err(|bad| Refusal::invalid(bad.0))
+        let page = pages::page(releases, room, r).map_err(|bad| Refusal::invalid(bad.0))?;
+        let keyless = opened.repository.directive_key().err().map(|keyless| shown(&keyless.reason()));
+        Ok(v1::ListBundlesResponse { keyless, ..page })
     }
 }
 

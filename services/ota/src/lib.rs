@@ -272,6 +272,8 @@ impl Opened {
         let wanted = std::sync::Mutex::new(0);
         every_second(shutdown, || async {
             self.repository.documents().follow_if_possible().await;
+            // Said before this process has to sign.
+            let _known = self.repository.find_directive_key().await;
             let Some(newest) = self.repository.newest() else { return };
             let version = newest.targets.edition.version;
             let is_new =

@@ -36,7 +36,8 @@ pub fn page(
     let page: Vec<&Release> = rest.by_ref().take(size).collect();
     let last = page.last().filter(|_| rest.next().is_some());
     let next_page_token = last.map(|r| format!("{}/{}", r.manifest.name, r.manifest.version)).unwrap_or_default();
-    Ok(v1::ListBundlesResponse { bundles: page.into_iter().map(encode).collect(), next_page_token, room: Some(room) })
+    let bundles = page.into_iter().map(encode).collect();
+    Ok(v1::ListBundlesResponse { bundles, next_page_token, room: Some(room), ..Default::default() })
 }
 
 /// How full the server is.

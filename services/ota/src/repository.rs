@@ -17,13 +17,13 @@ use midshift_bundle::key_set::KeySet;
 use midshift_bundle::keys::{self, SecretKey};
 use midshift_bundle::manifest::Manifest;
 use midshift_bundle::repository::{self as people, FileTarget, Online, TIMESTAMP_LIFE_MS, listed, sign_online};
-use midshift_core::reason::Refusal;
+use midshift_core::reason::{Code, Reason, Refusal};
 use midshift_core::time::Utc;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
 
 /// A timestamp this old is signed anew: half its life.
 pub const FRESHEN_AFTER_MS: u64 = TIMESTAMP_LIFE_MS / 2;
@@ -93,11 +93,35 @@ pub enum Error {
     },
 }
 
+/// Why no order to robots may be signed: they would refuse it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Keyless {
+    /// The newest set of directive keys names none that is here.
+    Ended {
+        /// The set's.
+        number: u64,
+    },
+    /// A set is listed and cannot be read, so nobody knows which keys have ended.
+    Unknown,
+}
+
+impl Keyless {
+    /// For people.
+    pub fn reason(self) -> Reason {
+        match self {
+            Self::Ended { number } => Reason::from(Code::NoDirectiveKey).with("set", number),
+            Self::Unknown => Reason::from(Code::NoDirectiveKey).with("set", "unreadable"),
+        }
+    }
+}
+
 /// Keys that say which release is the newest. More than one of a role may lie ready; the root says which counts.
 pub struct OnlineKeys {
+    folder: PathBuf,
     snapshot: Vec<SecretKey>,
     timestamp: Vec<SecretKey>,
-    directive: Vec<SecretKey>,
+    /// Read again when none of them may sign.
+    directive: RwLock<Vec<Arc<SecretKey>>>,
 }
 
 impl OnlineKeys {
@@ -106,33 +130,31 @@ impl OnlineKeys {
     /// # Errors
     /// If one cannot be read, or a role has none.
     pub fn read(folder: &Path) -> Result<Self, Error> {
-        let mut names = Vec::new();
-        for entry in fs::read_dir(folder).map_err(io("reading", folder))? {
-            names.extend(entry.map_err(io("reading", folder))?.file_name().into_string());
+        let (snapshot, timestamp) = (keys_of(folder, "snapshot")?, keys_of(folder, "timestamp")?);
+        let directive = RwLock::new(directive_keys(folder)?);
+        Ok(Self { folder: folder.to_owned(), snapshot, timestamp, directive })
+    }
+
+    /// The key that orders to robots are signed with: the first that the newest set names and that is here; without a set the first by name.
+    ///
+    /// # Errors
+    /// Robots take no orders of any key that is here.
+    fn directive(&self, newest: Option<&Newest>) -> Result<Arc<SecretKey>, Keyless> {
+        match newest.and_then(|newest| newest.key_set.as_ref()) {
+            Some(set) => self.named_by(set).ok_or(Keyless::Ended { number: set.number }),
+            None if newest.is_some_and(Newest::lists_sets) => Err(Keyless::Unknown),
+            // Read: every role has one.
+            None => Ok(self.directives()[0].clone()),
         }
-        names.sort();
-        let of = |role: &'static str| -> Result<Vec<SecretKey>, Error> {
-            let prefix = format!("{role}-");
-            let files = names.iter().filter(|name| name.starts_with(&prefix) && name.ends_with(".pem"));
-            let keys: Vec<SecretKey> =
-                files.map(|name| SecretKey::read(&folder.join(name))).collect::<Result<_, _>>()?;
-            if keys.is_empty() {
-                return Err(Error::NoKeyFile { folder: folder.to_owned(), role });
-            }
-            Ok(keys)
-        };
-        Ok(Self { snapshot: of("snapshot")?, timestamp: of("timestamp")?, directive: of("directive")? })
     }
 
-    /// The key that orders to robots are signed with: the first that `set` names and that is here. Without a set, or if none of its keys is here,
-    /// the first by name.
-    fn directive(&self, set: Option<&KeySet>) -> &SecretKey {
-        // Read: every role has one.
-        self.named_by(set).unwrap_or(&self.directive[0])
+    fn directives(&self) -> Vec<Arc<SecretKey>> {
+        self.directive.read().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    fn named_by(&self, set: Option<&KeySet>) -> Option<&SecretKey> {
-        set?.keys.iter().find_map(|key| self.directive.iter().find(|own| own.public() == *key))
+    fn named_by(&self, set: &KeySet) -> Option<Arc<SecretKey>> {
+        let here = self.directives();
+        set.keys.iter().find_map(|key| here.iter().find(|own| own.public() == *key)).cloned()
     }
 
     /// Signs that `targets` is the newest, with the keys that `root` names, and holds the result against it.
@@ -151,6 +173,26 @@ impl OnlineKeys {
         check_online(&root.bytes, targets, &online)?;
         Ok(online)
     }
+}
+
+/// Every key file of a role, by name. Never none.
+fn keys_of(folder: &Path, role: &'static str) -> Result<Vec<SecretKey>, Error> {
+    let mut names = Vec::new();
+    for entry in fs::read_dir(folder).map_err(io("reading", folder))? {
+        names.extend(entry.map_err(io("reading", folder))?.file_name().into_string());
+    }
+    names.sort();
+    let prefix = format!("{role}-");
+    let files = names.iter().filter(|name| name.starts_with(&prefix) && name.ends_with(".pem"));
+    let keys: Vec<SecretKey> = files.map(|name| SecretKey::read(&folder.join(name))).collect::<Result<_, _>>()?;
+    if keys.is_empty() {
+        return Err(Error::NoKeyFile { folder: folder.to_owned(), role });
+    }
+    Ok(keys)
+}
+
+fn directive_keys(folder: &Path) -> Result<Vec<Arc<SecretKey>>, Error> {
+    Ok(keys_of(folder, "directive")?.into_iter().map(Arc::new).collect())
 }
 
 fn io(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
@@ -205,6 +247,10 @@ impl Newest {
     pub const fn digests(&self) -> &BTreeSet<Digest> {
         &self.digests
     }
+    /// Whether sets of directive keys are listed, readable or not.
+    fn lists_sets(&self) -> bool {
+        self.files.keys().any(|name| KeySet::number_of(name).is_some())
+    }
     /// Whether a signed release has this file.
     pub fn lists(&self, digest: Digest) -> bool {
         self.digests.contains(&digest)
@@ -220,9 +266,11 @@ struct Publication {
 /// The repository of a store, for one who signs.
 pub struct Repository {
     folder: PathBuf,
-    keys: OnlineKeys,
+    keys: Arc<OnlineKeys>,
     content: Arc<dyn Content>,
     documents: Documents,
+    /// What was said last of why no order may be signed.
+    told: Mutex<Option<Keyless>>,
     /// One publication or signature at a time. Held to the end of its writes, whoever still waits for them.
     writing: Gate,
     /// Lowest version of a snapshot or timestamp that is signed.
@@ -265,15 +313,8 @@ impl Repository {
         .await?;
         let is_shared = lock.is_some();
         let documents = Documents::open(folder, content.clone(), is_shared).await?;
-        if let Some(set) = documents.newest().as_ref().and_then(|newest| newest.key_set.as_ref())
-            && keys.named_by(Some(set)).is_none()
-        {
-            tracing::error!(
-                number = set.number,
-                "no directive key of this server is current: robots refuse its orders"
-            );
-        }
-        Ok(Self { folder: folder.to_owned(), keys, content, documents, writing: Gate::new(lock), floor })
+        let (folder, writing) = (folder.to_owned(), Gate::new(lock));
+        Ok(Self { folder, keys: Arc::new(keys), content, documents, told: Mutex::default(), writing, floor })
     }
 
     /// That nobody else publishes or signs, here or elsewhere, and what is the newest then.
@@ -283,11 +324,48 @@ impl Repository {
         Ok((turn, self.newest()))
     }
 
-    /// The key that orders to robots are signed with: the first of the newest set of directive keys that is here. Without a set, or if none of
-    /// its keys is here, the first by name.
-    pub fn directive_key(&self) -> &SecretKey {
-        let newest = self.newest();
-        self.keys.directive(newest.as_ref().and_then(|newest| newest.key_set.as_ref()))
+    /// The key that orders to robots are signed with: the first of the newest set of directive keys that is here; without a set the first by
+    /// name.
+    ///
+    /// # Errors
+    /// Robots take no orders of any key that is here, so none may be signed.
+    pub fn directive_key(&self) -> Result<Arc<SecretKey>, Keyless> {
+        self.keys.directive(self.newest().as_deref())
+    }
+
+    /// As [`Repository::directive_key`]. If there is none, the folder of keys is looked at again; that there is none is said once until
+    /// there is one again.
+    ///
+    /// # Errors
+    /// As there.
+    pub async fn find_directive_key(&self) -> Result<Arc<SecretKey>, Keyless> {
+        let mut found = self.directive_key();
+        if found.is_err() {
+            let keys = self.keys.clone();
+            // A file that is being written is read the next time.
+            if let Ok(read) = blocking(move || directive_keys(&keys.folder)).await {
+                *self.keys.directive.write().unwrap_or_else(PoisonError::into_inner) = read;
+                found = self.directive_key();
+            }
+        }
+        let keyless = found.as_ref().err().copied();
+        let before = std::mem::replace(&mut *self.told.lock().unwrap_or_else(PoisonError::into_inner), keyless);
+        metrics::gauge!("midshift_ota_keyless").set(f64::from(u8::from(keyless.is_some())));
+        match keyless {
+            Some(keyless) if before != Some(keyless) => tracing::error!(
+                why = ?keyless,
+                "this process has no directive key that is current, so it signs no orders to robots: put a key of the newest set into its folder of \
+                 --ota-keys, or push a next set that names one it has"
+            ),
+            None if before.is_some() => tracing::info!("this process has a directive key that is current again"),
+            _ => {}
+        }
+        found
+    }
+
+    /// That there is no directive key is said anew.
+    pub fn forget_told(&self) {
+        *self.told.lock().unwrap_or_else(PoisonError::into_inner) = None;
     }
 
     /// What it says now; none: nothing was ever published.

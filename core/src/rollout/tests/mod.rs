@@ -7,6 +7,7 @@ mod aborts;
 mod agents;
 mod asks;
 mod drains_and_grants;
+mod keyless;
 mod named;
 mod newcomers_and_pins;
 mod people;
@@ -136,6 +137,8 @@ struct Rig {
     works: bool,
     /// Fleet does nothing.
     fleet_sleeps: bool,
+    /// The service has no key that robots know.
+    keyless: bool,
     checks_rebuild: bool,
 }
 
@@ -158,6 +161,7 @@ impl Rig {
             robots: Vec::new(),
             works: true,
             fleet_sleeps: false,
+            keyless: false,
             checks_rebuild: true,
         };
         rig.rules(|s| s.off_work_permille = 1_000);
@@ -378,7 +382,8 @@ impl Rig {
         absorb(&mut self.ota, self.now, &entries, &mut plan);
         ask(self, &mut plan);
         let heard = std::mem::take(&mut self.heard);
-        cycle(&mut self.ota, self.now, &self.board, &heard, &Plain, &mut plan);
+        let sign: Option<&dyn Sign> = if self.keyless { None } else { Some(&Plain) };
+        cycle(&mut self.ota, self.now, &self.board, &heard, sign, &mut plan);
         assert_eq!(plan.unreadable, Vec::<String>::new());
         self.commit(plan.items);
         if self.checks_rebuild {

@@ -102,7 +102,7 @@ fn roll_outs_beyond_the_limit_are_forgotten_and_none_that_robots_still_come_back
     rig.ota_at = rig.feed.len();
     absorb(&mut rig.ota, rig.now, &entries, &mut plan);
     for _ in 0..10 {
-        cycle(&mut rig.ota, rig.now, &rig.board, &BTreeSet::new(), &Plain, &mut plan);
+        cycle(&mut rig.ota, rig.now, &rig.board, &BTreeSet::new(), Some(&Plain), &mut plan);
     }
     assert_eq!(rig.ota.rollouts.len(), crate::limits::ROLLOUTS_MAX);
     assert!(rig.ota.rollouts.contains_key("ro") && rig.ota.rollouts.contains_key("old-0"));

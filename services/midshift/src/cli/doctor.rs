@@ -7,7 +7,7 @@ use crate::clock;
 use midshift_bundle::freshness::{newest_targets, root_edition, stamp, targets_edition};
 use midshift_bundle::repository::TIMESTAMP_LIFE_MS;
 use midshift_core::time::Utc;
-use midshift_proto::ota::v1::{GetMetadataRequest, ListBundlesRequest, SoftwareRoom};
+use midshift_proto::ota::v1::{GetMetadataRequest, ListBundlesRequest, ListBundlesResponse, SoftwareRoom};
 use midshift_proto::task::v1::{ListTasksRequest, TaskFilter, TaskState};
 use midshift_proto::telemetry::v1;
 use tonic::Code;
@@ -125,11 +125,21 @@ async fn releases(call: &Call) -> Vec<Finding> {
     found
 }
 
-/// How full the server is with software; none: it keeps none, or cannot be asked, which others say.
-async fn room(call: &Call) -> Option<Finding> {
+/// How full the server is with software, and whether it may sign orders; nothing: it keeps none, or cannot be asked, which others say.
+async fn room(call: &Call) -> Vec<Finding> {
     let request = ListBundlesRequest { page_size: 1, ..ListBundlesRequest::default() };
-    let room = call.bundles().await.ok()?.list_bundles(unary(request)).await.ok()?.into_inner().room?;
-    Some(fullness(&room))
+    let Ok(mut client) = call.bundles().await else { return Vec::new() };
+    let Ok(answer) = client.list_bundles(unary(request)).await else { return Vec::new() };
+    of_software(&answer.into_inner())
+}
+
+fn of_software(answer: &ListBundlesResponse) -> Vec<Finding> {
+    let keyless = answer.keyless.as_ref().map(|why| Finding {
+        what: "keys",
+        good: false,
+        text: format!("{}: {}", why.code, why.message),
+    });
+    answer.room.as_ref().map(fullness).into_iter().chain(keyless).collect()
 }
 
 fn fullness(room: &SoftwareRoom) -> Finding {
@@ -252,6 +262,8 @@ async fn operator(call: &Call) -> Result<Finding, Exit> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use midshift_core::reason::Reason;
+    use midshift_proto::convert::shown;
 
     #[test]
     fn people_are_told_sixty_days_before_what_they_sign_ends() {
@@ -265,6 +277,17 @@ mod tests {
         assert_eq!(early.text, "root 3 ends 1970-04-11T00:00:00.000Z: 61 days are left");
         assert_eq!(late.text, "root 3 ends 1970-04-11T00:00:00.000Z: 60 days are left; sign a new root");
         assert!(over.text.contains("it has EXPIRED; sign a new root"), "{}", over.text);
+    }
+
+    #[test]
+    fn a_server_that_signs_no_orders_is_told_beside_its_room() {
+        let room = Some(SoftwareRoom { quota_bytes: 10, ..SoftwareRoom::default() });
+        let well = ListBundlesResponse { room, ..ListBundlesResponse::default() };
+        assert_eq!(of_software(&well).iter().map(|f| f.what).collect::<Vec<_>>(), ["software"]);
+        let why = shown(&Reason::from(midshift_core::reason::Code::NoDirectiveKey));
+        let found = of_software(&ListBundlesResponse { keyless: Some(why), ..well });
+        assert_eq!((found[1].what, found[1].good), ("keys", false));
+        assert!(found[1].text.starts_with("NO_DIRECTIVE_KEY: The server has no directive key"), "{}", found[1].text);
     }
 
     #[test]

@@ -7,7 +7,6 @@ use crate::content::Content;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::freshness::{root_edition, targets_edition};
 use midshift_bundle::key_set::{ENVELOPE_BYTES_MAX, KeySet, SETS_MAX};
-use midshift_bundle::keys::SecretKey;
 use midshift_bundle::manifest::{MANIFEST_BYTES_MAX, Manifest};
 use midshift_bundle::repository::{FileTarget, check_root, check_targets};
 use midshift_bundle::trust::METADATA_BYTES_MAX;
@@ -150,11 +149,11 @@ pub async fn key_sets(
         let Some((set, envelope)) = bad.take(&field, key_set(file, content).await?) else { break };
         // Only robots know who signed the first one of a repository that is new here.
         let is_known = before.is_some() || last.is_some();
-        let can_sign = |last: &&KeySet| before.is_none() || own.named_by(Some(last)).is_some();
+        let can_sign = |last: &&KeySet| before.is_none() || own.named_by(last).is_some();
         let signers = match last.as_ref().filter(can_sign) {
             Some(last) => last.keys.clone(),
             // The first one, or all keys of the one before are lost: robots have this server's from their trust files.
-            None => own.directive.iter().map(SecretKey::public).collect(),
+            None => own.directives().iter().map(|key| key.public()).collect(),
         };
         if is_known && let Err(rejection) = KeySet::open(&envelope, *number, &signers) {
             bad.add(&field, rejection.to_string());
@@ -164,7 +163,7 @@ pub async fn key_sets(
         last = Some(set);
     }
     if let Some(set) = last.as_ref().filter(|set| Some(*set) != known)
-        && own.named_by(Some(set)).is_none()
+        && own.named_by(set).is_none()
     {
         bad.add(
             format!("targets.{}", set.target()),

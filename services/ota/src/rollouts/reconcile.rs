@@ -14,7 +14,7 @@ use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::named::named;
 use midshift_core::rollout::view::{TABLES, View};
-use midshift_core::rollout::{Board, LOGS, Plan, absorb, commands, cycle, obeyed};
+use midshift_core::rollout::{Board, LOGS, Plan, Sign, absorb, commands, cycle, obeyed};
 use midshift_core::rows::{Entry, Item, Log, Seq, Table};
 use midshift_core::time::Now;
 use midshift_core::work::Live;
@@ -142,6 +142,9 @@ impl Loop {
         // Said anew once robots could say what they run.
         self.say_at_ms = 0;
         self.parts.ota.lead(true);
+        if let Ok(opened) = self.parts.ota.opened() {
+            opened.repository.forget_told();
+        }
         metrics::gauge!("midshift_ota_leads").set(1);
         metrics::counter!("midshift_ota_takeovers_total").increment(1);
         tracing::info!("this process leads roll-outs");
@@ -265,9 +268,13 @@ impl Loop {
         opened.repository.documents().follow_if_possible().await;
         releases::take(&mut self.view, now, opened.repository.newest().as_deref(), &mut plan);
         let replies = self.take_requests(requests, now, &mut plan);
-        let signer = Signer(opened.repository.directive_key());
+        let key = opened.repository.find_directive_key().await.ok();
         let heard = std::mem::take(&mut self.heard);
-        let more = cycle(&mut self.view, now, &self.board, &heard, &signer, &mut plan);
+        let more = {
+            let signer = key.as_deref().map(Signer);
+            let sign = signer.as_ref().map(|signer| signer as &dyn Sign);
+            cycle(&mut self.view, now, &self.board, &heard, sign, &mut plan)
+        };
         for text in &plan.unreadable {
             tracing::error!(text, "roll-outs passed over something they cannot read");
         }

@@ -1,9 +1,11 @@
 //! Sets of directive keys: which may be listed, and with which key the server signs.
 
 use super::{fields, published};
-use crate::fixture::{Room, SEEDS, START, first_root, key, key_set, targets};
-use crate::repository::Error;
+use crate::fixture::{Room, SEEDS, START, first_root, give_back, hide, key, key_set, targets};
+use crate::repository::{Error, Keyless};
+use midshift_bundle::digest::Digest;
 use midshift_bundle::repository::{PEOPLE_LIFE_MS, sign_targets};
+use midshift_core::reason::Code;
 use std::fs;
 
 type File = (String, Vec<u8>);
@@ -16,7 +18,7 @@ async fn push(room: &Room, previous: &[u8], version: u64, files: &[File]) -> Res
 }
 
 fn signs_with(room: &Room) -> u8 {
-    let own = room.repository.directive_key().public();
+    let own = room.repository.directive_key().expect("one that is current").public();
     [5, 15, 25].into_iter().find(|seed| key(*seed).public() == own).expect("one of them")
 }
 
@@ -80,7 +82,37 @@ async fn a_repository_that_is_new_to_a_server_brings_all_its_sets() {
 }
 
 #[tokio::test]
-async fn after_all_keys_of_a_set_were_lost_the_server_signs_with_its_own_and_lists_them() {
+async fn a_server_without_a_key_of_the_newest_set_signs_nothing_until_the_key_is_there() {
+    let (room, first) = published().await;
+    push(&room, &first, 1, &[key_set(1, &[15], 5)]).await.expect("published");
+    let file = room.dir.path().join("keys/directive-2.pem");
+    fs::remove_file(&file).expect("it was not given to this process");
+    let room = room.restarted().await;
+    assert_eq!(room.repository.find_directive_key().await.err(), Some(Keyless::Ended { number: 1 }));
+    let reason = Keyless::Ended { number: 1 }.reason();
+    assert_eq!((reason.code, reason.metadata["set"].as_str()), (Code::NoDirectiveKey, "1"));
+    key(15).write(&file).expect("a key");
+    assert!(room.repository.directive_key().is_err(), "nobody has looked");
+    let found = room.repository.find_directive_key().await.expect("without a restart");
+    assert_eq!(found.public(), key(15).public());
+}
+
+#[tokio::test]
+async fn a_server_that_cannot_read_the_newest_set_signs_nothing_until_it_can() {
+    let (room, first) = published().await;
+    let set = key_set(1, &[15, 5], 5);
+    let path = room.dir.path().join("content").join(Digest::of(&set.1).to_string());
+    push(&room, &first, 1, &[set]).await.expect("published");
+    hide(&path);
+    let room = room.restarted().await;
+    assert_eq!(room.repository.find_directive_key().await.err(), Some(Keyless::Unknown), "5 may have ended");
+    give_back(&path);
+    room.repository.documents().follow().await.expect("readable");
+    assert_eq!(signs_with(&room), 15);
+}
+
+#[tokio::test]
+async fn after_all_keys_of_a_set_were_lost_the_server_signs_nothing_until_a_set_of_its_own_is_listed() {
     let (room, first) = published().await;
     let second = push(&room, &first, 1, &[key_set(1, &[15], 5)]).await.expect("published");
     for name in ["directive-1", "directive-2"] {
@@ -88,7 +120,8 @@ async fn after_all_keys_of_a_set_were_lost_the_server_signs_with_its_own_and_lis
     }
     key(25).write(&room.dir.path().join("keys/directive-3.pem")).expect("a key");
     let room = room.restarted().await;
-    assert_eq!(signs_with(&room), 25, "robots have it from their trust files");
-    push(&room, &second, 2, &[key_set(2, &[25], 25)]).await.expect("published");
+    assert_eq!(room.repository.directive_key().err(), Some(Keyless::Ended { number: 1 }));
+    push(&room, &second, 2, &[key_set(2, &[25], 25)]).await.expect("robots have it from their trust files");
+    assert_eq!(signs_with(&room), 25);
     assert_eq!(room.repository.newest().expect("there").key_set.as_ref().map(|set| set.number), Some(2));
 }

@@ -1,7 +1,7 @@
 //! Two processes of the rollout service over one store and one folder: one plans and signs, the other carries out what people ask.
 
 use crate::content::Room;
-use crate::fixture::{START, files, give_back, hide, release, write_keys};
+use crate::fixture::{START, files, give_back, hide, key, key_set, release, write_keys};
 use crate::folder::Owner;
 use crate::repository::FRESHEN_AFTER_MS;
 use crate::rollouts::{Parts, RolloutService};
@@ -15,6 +15,7 @@ use midshift_core::rows::{Record, Revision, Table};
 use midshift_core::site::{DEMO, Site, text};
 use midshift_core::time::{Clock, ScaledClock};
 use midshift_proto::ota::v1;
+use midshift_proto::ota::v1::bundle_service_server::BundleService as Bundles;
 use midshift_proto::ota::v1::rollout_service_server::RolloutService as Face;
 use midshift_store::{LiveBoard, MemoryStore, Store, StoreId};
 use std::sync::Arc;
@@ -225,4 +226,29 @@ async fn a_bundle_that_the_disk_does_not_give_is_not_unlisted_and_is_there_again
     secs(3).await;
     assert!(!world.bundles().await[0].listed);
     process.end().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_process_that_takes_over_without_a_current_directive_key_says_so_and_goes_on_when_it_has_one() {
+    let world = World::new();
+    let set = key_set(1, &[15], 5);
+    let all: Vec<_> = files("walk", "1.0.0").into_iter().chain([set]).collect();
+    let leader = world.process().await;
+    release(&leader.ota, &all).await;
+    secs(2).await;
+    let file = world.dir.path().join("keys/directive-2.pem");
+    std::fs::remove_file(&file).expect("the next process was not given it");
+    let next = world.process().await;
+    let keyless = async |process: &Process| process.face.look(|view, _, _| view.keyless).await.expect("it runs");
+    assert!(!keyless(&leader).await);
+    leader.end().await;
+    secs(6).await;
+    assert!(keyless(&next).await, "it leads and can sign nothing");
+    let request = Request::new(v1::ListBundlesRequest::default());
+    let listed = Bundles::list_bundles(&next.ota, request).await.expect("listed").into_inner();
+    assert_eq!(listed.keyless.map(|why| why.code), Some("NO_DIRECTIVE_KEY".to_owned()));
+    key(15).write(&file).expect("a key");
+    secs(2).await;
+    assert!(!keyless(&next).await);
+    next.end().await;
 }
