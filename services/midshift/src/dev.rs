@@ -4,7 +4,7 @@ use crate::background::{Acknowledged, Background, Pressure, Source, read_list};
 use crate::planning::Planning;
 use crate::report::{self, Inputs, Kind, Report};
 use crate::roles::Roles;
-use crate::scenario::{self, Scenario, Stage, Story};
+use crate::scenario::{self, Release, Scenario, Sight, Stage, Story};
 use crate::server::{Naive, Parts, Server};
 use crate::tally::{self, SharedTasks, Tasks};
 use crate::throwaway::Throwaway;
@@ -16,13 +16,12 @@ use midshift_agent::trust::Trust;
 use midshift_core::site::{Site, grid};
 use midshift_core::task::Phase;
 use midshift_core::time::{Clock, SiteTime};
-use midshift_core::work::Live;
 use midshift_sim::faults::FaultRates;
 use midshift_sim::hall::{Hall, HallConfig, Persistence};
 use midshift_sim::service::SimFace;
 use midshift_sim::swarm::{Swarm, SwarmConfig};
 use midshift_store::{
-    FRAME_BYTES_DEFAULT, FrameLog, LiveBoard, MemoryFrames, MemoryStore, SqliteFrames, SqliteStore, Store, StoreId,
+    FRAME_BYTES_DEFAULT, FrameLog, MemoryFrames, MemoryStore, SqliteFrames, SqliteStore, Store, StoreId,
 };
 use std::collections::VecDeque;
 use std::io::IsTerminal;
@@ -88,6 +87,21 @@ pub struct Dev {
     /// Play a story and fail if it did not go as it should. Five of the robots are launcher and agent processes; --speedup is that of bodies.
     #[arg(long, value_enum, conflicts_with_all = ["run_for", "map", "data", "rate"])]
     pub scenario: Option<Scenario>,
+    /// Which bundles the story rolls out, in this order, each once. Robots must keep the good one and go back from every other.
+    #[arg(
+        long,
+        value_enum,
+        value_delimiter = ',',
+        requires = "scenario",
+        default_values = ["good", "bad-at-start", "hangs", "bad-with-load"]
+    )]
+    pub bundles: Vec<Release>,
+    /// How long the story's roll-outs keep a robot on probation and let a wave soak, e.g. 3s.
+    #[arg(long, value_parser = crate::duration::duration, requires = "scenario", default_value = "10s")]
+    pub watched: Duration,
+    /// Nothing goes wrong by itself. What is bad only with a load makes such faults more frequent, so a story does without that bundle then.
+    #[arg(long)]
+    pub no_faults: bool,
 }
 
 impl Dev {
@@ -115,6 +129,8 @@ const LOAD: f64 = 0.6;
 const BACKLOG_PER_ROBOT: usize = 3;
 /// Probation of roll-outs that name none, milliseconds of site time: nobody waits minutes for each simulated robot.
 const PROBATION_MS: u64 = 10_000;
+/// Probation as the server takes it.
+const WATCHED: std::ops::RangeInclusive<Duration> = Duration::from_secs(1)..=Duration::from_secs(24 * 3_600);
 /// Where `dev` hears beacons if nobody else does.
 const BEACONS: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 7422);
 
@@ -128,6 +144,16 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     }
     if !(0.01..=200.0).contains(&args.speedup) {
         bail!("--speedup must be 0.01 to 200");
+    }
+    if args.no_faults && args.scenario.is_some() && args.bundles.contains(&Release::BadWithLoad) {
+        bail!("bad-with-load is bad by more faults, and --no-faults leaves none: name the other ones with --bundles");
+    }
+    if !WATCHED.contains(&args.watched) {
+        bail!("--watched must be 1s to 24h");
+    }
+    let is_twice = |(ix, release): (usize, &Release)| args.bundles[..ix].contains(release);
+    if args.bundles.iter().enumerate().any(is_twice) {
+        bail!("--bundles must name each bundle once");
     }
     let scene = args.scenario.map(|_| Scene::new(&args)).transpose()?;
     let loaded = site_file::load(args.site.as_deref(), args.map.as_deref(), Some(args.robots as u64))?;
@@ -181,7 +207,8 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     say(&greeting(&args, &site, address, &software));
     let stage = match scene {
         Some(scene) => {
-            Some(scene.stage(&args, &hall_config, &hall, server.board(), clock.clone(), address, trust, &software)?)
+            let sight = Sight { store: store.clone(), board: server.board(), site: site.clone(), clock: clock.clone() };
+            Some(scene.stage(&args, &hall_config, &hall, sight, address, trust, &software)?)
         }
         None => None,
     };
@@ -207,8 +234,7 @@ impl Scene {
         args: &Dev,
         config: &HallConfig,
         hall: &Hall,
-        board: Arc<LiveBoard<Live>>,
-        clock: Arc<dyn Clock>,
+        sight: Sight,
         address: SocketAddr,
         trust: Trust,
         software: &Throwaway,
@@ -221,8 +247,10 @@ impl Scene {
         let stage = Stage {
             server: address.to_string(),
             channel: tonic::transport::Endpoint::from_shared(format!("http://{address}"))?.connect_lazy(),
-            board,
-            clock,
+            sight,
+            releases: args.bundles.clone(),
+            watched_ms: u64::try_from(args.watched.as_millis()).unwrap_or(u64::MAX),
+            no_faults: args.no_faults,
             folder: self.folder.path().to_owned(),
             in_process,
             launched,
@@ -231,7 +259,6 @@ impl Scene {
             repository: (software.repository(), software.keys().join("targets-1.pem")),
             seed: args.seed,
             body_speed: args.speedup,
-            floor: config.site.clone(),
             site: args.site.clone(),
         };
         Ok((stage, self.folder))
@@ -246,6 +273,9 @@ fn hall_config(args: &Dev, site: &Arc<Site>, scene: Option<&Scene>) -> anyhow::R
         config.persistence = Persistence::Dir(scene.folder.path().to_owned());
         config.pace_permille = (args.speedup * 1000.0) as u32;
         config.faults = FaultRates::default().paced(args.speedup);
+    }
+    if args.no_faults {
+        config.faults = FaultRates::none();
     }
     if let Some(path) = &args.agents {
         let text = std::fs::read_to_string(path).with_context(|| format!("reading {}", path.display()))?;

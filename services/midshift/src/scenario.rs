@@ -4,6 +4,7 @@
 //! are real in all processes, so their journals can be judged together. Invariant: what is judged comes from the robots themselves (heartbeats,
 //! journals, switch records) wherever they can tell it; the report says where each figure is from.
 
+mod budget;
 mod played;
 mod watch;
 
@@ -13,25 +14,23 @@ use crate::samples::{self, Signer};
 use anyhow::{Context, ensure};
 use midshift_agent::switch::Switch;
 use midshift_agent::trust::Trust;
-use midshift_core::ids::{RobotId, WaypointId};
-use midshift_core::site::Site;
-use midshift_core::time::Clock;
-use midshift_core::work::Live;
+use midshift_core::ids::{AreaId, RobotId, WaypointId};
+use midshift_proto::fleet::v1::GetAreaPolicyRequest;
+use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::ota::v1::rollout_wave::Size;
-use midshift_store::LiveBoard;
 use played::{Played, all, evidence, medians, short, verdict};
 use rustix::process::{Pid, Signal, kill_process_group};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
-use std::sync::Arc;
 use std::time::Duration;
 use tokio::process::{Child, Command};
 use tokio_util::sync::CancellationToken;
 use tonic::transport::Channel;
-use watch::{Crowd, FirstRuns, Watcher};
+pub use watch::Sight;
+use watch::{FirstRuns, Watcher};
 
 /// Robots that are processes of their own, unless the fleet is too small for it.
 pub const LAUNCHED: usize = 5;
@@ -41,10 +40,12 @@ const LOOK_EVERY: Duration = Duration::from_millis(200);
 const LONGEST: Duration = Duration::from_secs(1_200);
 /// All robots must be at work within this, real time.
 const READY_WITHIN: Duration = Duration::from_secs(120);
-/// Probation and soak of each roll-out, milliseconds of site time.
-const WATCHED_MS: u64 = 10_000;
 /// Software that was permitted within a permission's life begins to run so much later at most, milliseconds.
 const START_TAKES_MS: i64 = 2_000;
+/// Robots must come to what the end of a roll-out tells them to run within this, real time.
+const SETTLES_WITHIN: Duration = Duration::from_secs(60);
+/// What a robot runs that may still go back.
+const ON_TRIAL: &str = "on trial";
 /// A launched robot that was asked to end has so long, real time.
 const ENDS_WITHIN: Duration = Duration::from_secs(10);
 /// A launched robot that gives no sign for so many seconds is killed by its launcher.
@@ -57,20 +58,39 @@ pub enum Scenario {
     UpdateMidshift,
 }
 
-/// One roll-out of the story.
-struct Act {
-    version: &'static str,
-    is_good: bool,
-    /// Tasks on trial that a robot is judged by. What is bad only now and then needs more than the breaker's three.
-    exposure_tasks: u64,
+/// A bundle that a story rolls out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Release {
+    /// All robots keep it.
+    Good,
+    /// Its program ends at its start.
+    BadAtStart,
+    /// Its program hangs on probation.
+    Hangs,
+    /// It goes wrong only while it carries something.
+    BadWithLoad,
 }
 
-const ACTS: [Act; 4] = [
-    Act { version: "1.5.0", is_good: true, exposure_tasks: 2 },
-    Act { version: "1.6.0-bad-at-start", is_good: false, exposure_tasks: 2 },
-    Act { version: "1.6.1-hangs", is_good: false, exposure_tasks: 2 },
-    Act { version: "1.6.2-bad-with-load", is_good: false, exposure_tasks: 12 },
-];
+impl Release {
+    const fn version(self) -> &'static str {
+        match self {
+            Self::Good => "1.5.0",
+            Self::BadAtStart => "1.6.0-bad-at-start",
+            Self::Hangs => "1.6.1-hangs",
+            Self::BadWithLoad => "1.6.2-bad-with-load",
+        }
+    }
+    fn is_good(self) -> bool {
+        self == Self::Good
+    }
+    /// Tasks on trial that a robot is judged by. What is bad only now and then needs more than the breaker's three.
+    const fn exposure_tasks(self) -> u64 {
+        if matches!(self, Self::BadWithLoad) { 12 } else { 2 }
+    }
+    fn label(self) -> String {
+        format!("{}-{}", samples::NAME, self.version())
+    }
+}
 
 /// What the stage needs.
 pub struct Stage {
@@ -78,10 +98,14 @@ pub struct Stage {
     pub server: String,
     /// The way to it.
     pub channel: Channel,
-    /// What robots say.
-    pub board: Arc<LiveBoard<Live>>,
-    /// Clocks.
-    pub clock: Arc<dyn Clock>,
+    /// What is looked at.
+    pub sight: Sight,
+    /// What is rolled out, in this order.
+    pub releases: Vec<Release>,
+    /// Probation and soak of each roll-out, milliseconds of site time, which is real time here.
+    pub watched_ms: u64,
+    /// Nothing goes wrong with bodies by itself.
+    pub no_faults: bool,
     /// Where everything lies that the launched robots keep.
     pub folder: PathBuf,
     /// Robots in this process.
@@ -98,9 +122,7 @@ pub struct Stage {
     pub body_speed: f64,
     /// Journals of all its bodies.
     pub journals: Vec<PathBuf>,
-    /// The site.
-    pub floor: Arc<Site>,
-    /// Its file, if it is not the built-in one.
+    /// The file of the site, if it is not the built-in one.
     pub site: Option<PathBuf>,
 }
 
@@ -136,10 +158,11 @@ impl Stage {
             body_speed: self.body_speed,
             acts: Vec::new(),
         };
-        for act in &ACTS {
-            let bad = if act.is_good { "" } else { ", which is bad" };
-            say(&format!("rolling out {}-{}{bad}", samples::NAME, act.version));
-            let played = self.act(act).await?;
+        let watcher = Watcher::begin(self.sight.clone(), self.permille().await?);
+        for release in &self.releases {
+            let bad = if release.is_good() { "" } else { ", which is bad" };
+            say(&format!("rolling out {}{bad}", release.label()));
+            let played = self.act(*release, &watcher).await?;
             played.lines().iter().for_each(|line| say(line));
             story.acts.push(played);
         }
@@ -164,6 +187,9 @@ impl Stage {
             ]);
             command.args(["--server", &self.server, "--start", start.as_str(), "--person"]);
             command.args(["--seed", &self.seed.to_string(), "--body-speed", &self.body_speed.to_string()]);
+            if self.no_faults {
+                command.arg("--no-faults");
+            }
             command.arg("--data").arg(&home).arg("--sets").arg(home.join("sets"));
             command.arg("--trust").arg(home.join("trust.json"));
             if let Some(site) = &self.site {
@@ -185,7 +211,7 @@ impl Stage {
         let all = self.robots();
         let ready = async {
             loop {
-                let heard = self.board.all();
+                let heard = self.sight.board.all();
                 if heard.len() == all && heard.iter().filter(|(_, l)| l.report.vitals.odometer_mm > 0).count() * 2 > all
                 {
                     return;
@@ -193,7 +219,7 @@ impl Stage {
                 tokio::time::sleep(LOOK_EVERY).await;
             }
         };
-        let heard = || self.board.all().len();
+        let heard = || self.sight.board.all().len();
         let waited = tokio::time::timeout(READY_WITHIN, ready).await;
         waited.map_err(|_| anyhow::anyhow!("only {} of {all} robots were heard at work", heard()))
     }
@@ -201,7 +227,7 @@ impl Stage {
     /// Builds, signs and pushes the samples, the last with the program that a person would use.
     async fn publish(&self) -> anyhow::Result<()> {
         let (repository, key) = (self.repository.0.clone(), self.repository.1.clone());
-        let (folder, now) = (self.folder.join("samples"), self.clock.now().wall);
+        let (folder, now) = (self.folder.join("samples"), self.sight.clock.now().wall);
         let signed = repository.clone();
         let make =
             move || samples::make(&folder, None, Signer::Named { repository: &signed, key: &key }, now).map(drop);
@@ -214,21 +240,36 @@ impl Stage {
         Ok(())
     }
 
-    async fn act(&self, act: &Act) -> anyhow::Result<Played> {
+    /// Of a thousand robots of each area, so many may be out of work at once.
+    async fn permille(&self) -> anyhow::Result<BTreeMap<AreaId, usize>> {
+        let mut client = FleetServiceClient::new(self.channel.clone());
+        let mut permille = BTreeMap::new();
+        for area in self.sight.site.areas() {
+            let request = GetAreaPolicyRequest { area_id: area.area_id.to_string() };
+            let policy = client.get_area_policy(request).await?.into_inner().policy.unwrap_or_default();
+            let software = policy.software.unwrap_or_default().off_work_permille;
+            let software =
+                software.with_context(|| format!("the rules of {} do not say their budget", area.area_id))?;
+            permille.insert(area.area_id.clone(), software as usize);
+        }
+        Ok(permille)
+    }
+
+    async fn act(&self, release: Release, watcher: &Watcher) -> anyhow::Result<Played> {
         let mut client = RolloutServiceClient::new(self.channel.clone());
-        let rollout_id = format!("{}-{}", samples::NAME, act.version);
-        let watched = duration(WATCHED_MS);
+        let rollout_id = release.label();
+        let before = self.versions().await?;
+        let watched = duration(self.watched_ms);
         let wave = |size| v1::RolloutWave { size: Some(size) };
         let spec = v1::RolloutSpec {
             bundle: rollout_id.clone(),
             waves: vec![wave(Size::Count(1)), wave(Size::Percent(25)), wave(Size::Rest(true))],
             soak: Some(watched),
             probation: Some(watched),
-            exposure_tasks: Some(act.exposure_tasks),
+            exposure_tasks: Some(release.exposure_tasks()),
             ..v1::RolloutSpec::default()
         };
         let begun = tokio::time::Instant::now();
-        let watcher = Watcher::begin(self.board.clone(), self.floor.clone());
         let id = rollout_id.clone();
         client.create_rollout(v1::CreateRolloutRequest { rollout_id: id.clone(), spec: Some(spec) }).await?;
         let (etag, reason) = (String::new(), "the story".to_owned());
@@ -239,28 +280,30 @@ impl Stage {
         client
             .start_rollout(v1::StartRolloutRequest { rollout_id: id.clone(), etag, reason, supersede: false })
             .await?;
-        let ended = tokio::time::timeout(LONGEST, async {
-            loop {
-                let request = v1::GetRolloutRequest { rollout_id: id.clone() };
-                let rollout = client.get_rollout(request).await?.into_inner().rollout.unwrap_or_default();
-                let ended = matches!(
-                    rollout.phase(),
-                    v1::RolloutPhase::Completed
-                        | v1::RolloutPhase::Aborted
-                        | v1::RolloutPhase::Superseded
-                        | v1::RolloutPhase::Review
-                );
-                if ended {
-                    return Ok::<_, tonic::Status>(rollout);
-                }
-                tokio::time::sleep(LOOK_EVERY).await;
-            }
-        });
-        let rollout =
-            ended.await.with_context(|| format!("{rollout_id} did not end within {} s", LONGEST.as_secs()))??;
+        let ended = tokio::time::timeout(LONGEST, self.until(&rollout_id, has_ended)).await;
+        ended.with_context(|| format!("{rollout_id} did not end within {} s", LONGEST.as_secs()))??;
         let wall_s = begun.elapsed().as_secs_f64();
-        let robots = self.robots_of(&rollout_id).await?;
-        self.judge(act, &rollout, &robots, watcher.crowd(), wall_s).await
+        // Its end says what every robot is to run. One that does not come to it is seen by what it runs.
+        let settled = tokio::time::timeout(SETTLES_WITHIN, self.until(&rollout_id, is_settled)).await;
+        let rollout = match settled {
+            Ok(rollout) => rollout?,
+            Err(_) => self.until(&rollout_id, has_ended).await?,
+        };
+        let (seen, most) = watcher.seen().await;
+        self.judge(release, &rollout, &before, Played::of(seen, most, wall_s)).await
+    }
+
+    /// The roll-out, as soon as it is so.
+    async fn until(&self, rollout_id: &str, is_so: fn(&v1::Rollout) -> bool) -> Result<v1::Rollout, tonic::Status> {
+        let mut client = RolloutServiceClient::new(self.channel.clone());
+        loop {
+            let request = v1::GetRolloutRequest { rollout_id: rollout_id.to_owned() };
+            let rollout = client.get_rollout(request).await?.into_inner().rollout.unwrap_or_default();
+            if is_so(&rollout) {
+                return Ok(rollout);
+            }
+            tokio::time::sleep(LOOK_EVERY).await;
+        }
     }
 
     async fn robots_of(&self, rollout_id: &str) -> anyhow::Result<Vec<v1::RolloutRobot>> {
@@ -270,66 +313,60 @@ impl Stage {
         Ok(client.list_rollout_robots(request).await?.into_inner().robots)
     }
 
+    /// `played` has what was seen meanwhile, and `before` what each robot ran.
     async fn judge(
         &self,
-        act: &Act,
+        release: Release,
         rollout: &v1::Rollout,
-        robots: &[v1::RolloutRobot],
-        crowd: Crowd,
-        wall_s: f64,
+        before: &BTreeMap<String, String>,
+        played: Played,
     ) -> anyhow::Result<Played> {
         let counts = rollout.counts.unwrap_or_default();
         let abort = rollout.abort.as_ref();
-        let runs = FirstRuns::read(self.journals.iter().map(PathBuf::as_path), act.version)?;
+        let runs = FirstRuns::read(self.journals.iter().map(PathBuf::as_path), release.version())?;
         let late_ms = midshift_core::limits::ACTIVATION_VALID.as_ms() as i64 + START_TAKES_MS;
         let aborted = abort.and_then(|a| a.time).map(|t| t.seconds * 1_000 + i64::from(t.nanos / 1_000_000));
-        let good = format!("{}-{}", samples::NAME, ACTS[0].version);
-        let should = if act.is_good { rollout.bundle_label.clone() } else { good };
-        let (kept_by, elsewhere) = self.who_runs(&rollout.bundle_label, &should).await?;
         let canary = rollout.waves.first().and_then(|w| w.counts).map_or(0, |c| all(&c) - c.skipped);
+        let after = self.versions().await?;
+        let should = |robot_id: &str| match release.is_good() {
+            true => release.version(),
+            false => before.get(robot_id).map_or("", String::as_str),
+        };
+        let elsewhere = after.iter().filter(|(id, version)| *version != should(id));
         Ok(Played {
             bundle: rollout.bundle_label.clone(),
-            is_good: act.is_good,
+            is_good: release.is_good(),
             phase: short(rollout.phase().as_str_name(), "ROLLOUT_PHASE_"),
             robots_that_ran_it: runs.robots(),
             activated_after_abort: aborted.map_or(0, |at| runs.after(at + late_ms)),
-            begun_at_once_most: runs.most_within(WATCHED_MS as i64),
+            begun_at_once_most: runs.most_within(self.watched_ms as i64),
             touched_at_abort: abort.map(|a| a.touched),
             touched: counts.attempted,
             canary: canary.max(1),
-            off_work_most: crowd.most,
-            off_work_allowed: crowd.allowed,
-            budget_broken: crowd.broken,
-            kept_by,
-            elsewhere,
+            kept_by: after.values().filter(|version| *version == release.version()).count(),
+            elsewhere: elsewhere.map(|(id, version)| format!("{id} ({version})")).collect(),
             verdicts: rollout.verdicts.iter().map(verdict).collect(),
             abort: abort.map(evidence),
-            off_work: medians(robots),
-            wall_s,
+            off_work: medians(&self.robots_of(&rollout.rollout_id).await?),
+            ..played
         })
     }
 
-    /// Robots that keep a bundle, and those that keep another one than they should. A launched robot is asked by its switch record, one
-    /// of this process by what it said.
-    async fn who_runs(&self, label: &str, should: &str) -> anyhow::Result<(usize, Vec<String>)> {
+    /// What each robot keeps. A launched robot is asked by its switch record, one of this process by what it said.
+    async fn versions(&self) -> anyhow::Result<BTreeMap<String, String>> {
         let mut client = RolloutServiceClient::new(self.channel.clone());
         let request = v1::ListRobotSoftwareRequest { page_size: 1_000, ..Default::default() };
         let software = client.list_robot_software(request).await?.into_inner().software;
         let launched: BTreeSet<&str> = self.launched.iter().map(|(id, _)| id.as_str()).collect();
-        let (mut kept, mut elsewhere) = (0, Vec::new());
-        for row in software {
-            let version = if launched.contains(row.robot_id.as_str()) {
-                self.recorded(&row.robot_id)?
-            } else {
-                row.version.clone()
+        let version = |row: v1::RobotSoftware| {
+            let version = match launched.contains(row.robot_id.as_str()) {
+                true => self.recorded(&row.robot_id)?,
+                false if row.on_trial.is_empty() => row.version,
+                false => ON_TRIAL.to_owned(),
             };
-            let runs = format!("{}-{version}", samples::NAME);
-            kept += usize::from(runs == label && row.on_trial.is_empty());
-            if runs != should {
-                elsewhere.push(format!("{} ({version})", row.robot_id));
-            }
-        }
-        Ok((kept, elsewhere))
+            Ok((row.robot_id, version))
+        };
+        software.into_iter().map(version).collect()
     }
 
     /// Version of the set that a launched robot's switch record names, which must be committed.
@@ -337,7 +374,7 @@ impl Stage {
         let sets = self.folder.join(robot_id).join("sets");
         let switch = Switch::read(&sets.join(midshift_agent::launcher::SWITCH))?;
         if switch.trial.is_some() {
-            return Ok("on trial".to_owned());
+            return Ok(ON_TRIAL.to_owned());
         }
         let holdings = midshift_agent::sets::Sets::holdings(&mut midshift_agent::sets::disk::DiskSets::open(&sets)?)?;
         Ok(holdings.version(&switch.current).unwrap_or_else(|| switch.current.clone()))
@@ -367,6 +404,17 @@ impl Drop for Launched {
     fn drop(&mut self) {
         self.signal(Signal::KILL);
     }
+}
+
+fn has_ended(rollout: &v1::Rollout) -> bool {
+    use v1::RolloutPhase::{Aborted, Completed, Review, Superseded};
+    matches!(rollout.phase(), Completed | Aborted | Superseded | Review)
+}
+
+/// Nobody is on the way to what it is to run.
+fn is_settled(rollout: &v1::Rollout) -> bool {
+    let c = rollout.counts.unwrap_or_default();
+    has_ended(rollout) && c.draining + c.activating + c.trial + c.committing + c.reverting == 0
 }
 
 fn duration(ms: u64) -> prost_types::Duration {

@@ -2,6 +2,7 @@
 //!
 //! Invariant: activations are judged by the bodies' own journals, which say each start of software; the rows under test are shown beside them.
 
+use super::budget::{Fullest, Seen};
 use midshift_proto::convert::ms_of;
 use midshift_proto::ota::v1;
 use serde::Serialize;
@@ -22,7 +23,7 @@ pub struct OffWork {
 }
 
 /// What one roll-out came to.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Default, Serialize)]
 pub struct Played {
     /// Which bundle.
     pub bundle: String,
@@ -43,13 +44,15 @@ pub struct Played {
     pub touched: u32,
     /// Robots of the canary wave (rows).
     pub canary: u32,
-    /// Most robots that changed their software at once (heartbeats).
+    /// Most robots that changed their software at once, over the whole site (heartbeats).
     pub off_work_most: usize,
-    /// As many might have, by then: of each area one of ten of the robots that were ever there together in this roll-out, at least one. A robot
-    /// counts for the area that it was taken from, wherever it and the others are afterwards (heartbeats and the areas' rules).
+    /// As many might have, over the whole site: of each area as many as might ever in this roll-out (heartbeats and the areas' rules).
     pub off_work_allowed: usize,
-    /// Looks at which more did than might.
-    pub budget_broken: usize,
+    /// The fullest moment of each area. A robot counts for the area that it was taken from, wherever it and the others are afterwards (rows of
+    /// drains; heartbeats and the areas' rules).
+    pub areas: Vec<Fullest>,
+    /// Where more robots were out of work than their area or their roll-out allows, or one changed its software at work (the same).
+    pub budget_broken: Vec<String>,
     /// Robots that keep it in the end: launched ones by their switch record, the others by their heartbeats' versions.
     pub kept_by: usize,
     /// Robots that run something else than they should.
@@ -89,6 +92,12 @@ impl Story {
 }
 
 impl Played {
+    /// What was seen while it was played; the rest is not known yet.
+    pub fn of(seen: Seen, off_work_most: usize, wall_s: f64) -> Self {
+        let Seen { areas, may_at_once, broken } = seen;
+        Self { off_work_most, off_work_allowed: may_at_once, areas, budget_broken: broken, wall_s, ..Self::default() }
+    }
+
     fn objections(&self, robots: usize) -> Vec<String> {
         let mut why = Vec::new();
         let mut not = |holds: bool, text: String| {
@@ -96,7 +105,10 @@ impl Played {
                 why.push(format!("{}: {text}", self.bundle));
             }
         };
-        not(self.budget_broken == 0, format!("more robots changed at once than may, {} times", self.budget_broken));
+        for broken in &self.budget_broken {
+            not(false, broken.clone());
+        }
+        not(!self.areas.is_empty(), "nobody was seen to be taken out of work for it".to_owned());
         let (begun, may) = (self.begun_at_once_most, self.off_work_allowed);
         not(begun <= may, format!("new software began on {begun} robots within one probation, {may} may"));
         not(self.elsewhere.is_empty(), format!("{} run something else", self.elsewhere.join(", ")));
@@ -142,6 +154,8 @@ impl Played {
             self.off_work_most.max(self.begun_at_once_most),
             self.off_work_allowed,
         )];
+        let areas = self.areas.iter().map(|a| format!("{} {} of {}", a.area_id, a.out, a.may)).collect::<Vec<_>>();
+        lines.push(format!("  out of work at once, of as many as may be: {}", areas.join(", ")));
         lines.push(format!(
             "  off work, medians in s: drain wait {} (site), park drive {} (site), parked to permitted {} (link), switch {} (link), probation {} (site)",
             ms(o.drain_wait_ms),

@@ -1,74 +1,166 @@
-//! Who changes its software at once, from heartbeats and from the bodies' journals.
+//! Who is out of work for new software at once, from rows, from heartbeats and from the bodies' own journals.
 //!
-//! Invariant: nothing here reads a row. Called by the story, for each of its roll-outs.
+//! Invariant: what robots say is taken before the rows that follow from it are judged; rows that could not be read are an objection.
+//! Called by the story, once, and asked for each of its roll-outs.
 
 use super::LOOK_EVERY;
+use super::budget::{Judge, Pace, Said, Seen};
+use midshift_core::fleet::rows::Drain;
 use midshift_core::ids::{AreaId, RobotId};
-use midshift_core::policy::SoftwareRules;
+use midshift_core::rollout::rows::{Rollout, RolloutRobot};
+use midshift_core::rows::{BadRow, Seq, Table};
 use midshift_core::site::Site;
+use midshift_core::time::Clock;
 use midshift_core::update::UpdateState;
 use midshift_core::work::Live;
 use midshift_sim::journal::{self, Effect};
-use midshift_store::LiveBoard;
+use midshift_store::{Change, Fold, LiveBoard, Projection, Store};
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 use tokio_util::task::AbortOnDropHandle;
 
-/// Looks at what robots say all the time.
+/// All rows of a roll-out must be read so long after its end, real time.
+const READ_WITHIN: Duration = Duration::from_secs(30);
+
+/// What is looked at.
+#[derive(Clone)]
+pub struct Sight {
+    /// Rows.
+    pub store: Arc<dyn Store>,
+    /// What robots say.
+    pub board: Arc<LiveBoard<Live>>,
+    /// Where they are.
+    pub site: Arc<Site>,
+    /// When.
+    pub clock: Arc<dyn Clock>,
+}
+
+/// Looks at what robots say and at rows all the time.
 pub struct Watcher {
-    crowd: Arc<Mutex<Crowd>>,
+    picture: Shared,
+    store: Arc<dyn Store>,
     _looks: AbortOnDropHandle<()>,
 }
 
-/// Robots that change their software at once, as their heartbeats say.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Crowd {
-    /// Most at once.
-    pub most: usize,
-    /// As many might be, by now: of each area the share of the most robots that were there together.
-    pub allowed: usize,
-    /// Looks at which more did than might.
-    pub broken: usize,
+/// What was looked at.
+#[derive(Debug, Default)]
+struct Picture {
+    judge: Judge,
+    /// Up to where rows were read.
+    seq: Seq,
+    /// Most robots that changed their software at once, as their heartbeats say.
+    most: usize,
+}
+
+type Shared = Arc<Mutex<Picture>>;
+
+fn lock(picture: &Shared) -> MutexGuard<'_, Picture> {
+    picture.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Watcher {
-    /// Looks until it is dropped.
-    pub fn begin(board: Arc<LiveBoard<Live>>, site: Arc<Site>) -> Self {
-        let crowd = Arc::new(Mutex::new(Crowd::default()));
-        let shared = crowd.clone();
+    /// Looks until it is dropped. Of a thousand robots of each area, so many may be out of work at once.
+    pub fn begin(sight: Sight, permille: BTreeMap<AreaId, usize>) -> Self {
+        let picture = Arc::new(Mutex::new(Picture { judge: Judge::new(permille), ..Picture::default() }));
+        let (shared, store) = (picture.clone(), sight.store.clone());
         let looks = AbortOnDropHandle::new(tokio::spawn(async move {
-            let mut allowed: BTreeMap<AreaId, usize> = BTreeMap::new();
+            let mut rows = Projection::new(Rows { sight: sight.clone(), picture: shared.clone() });
+            let mut wake = sight.store.wake();
             loop {
-                for (area, may) in allowances(&board, &site) {
-                    let most = allowed.entry(area).or_default();
-                    *most = may.max(*most);
-                }
-                let changing = changing(&board);
+                wake.mark_unchanged();
+                let read = rows.advance(sight.store.as_ref()).await;
                 {
-                    let mut crowd = shared.lock().unwrap_or_else(PoisonError::into_inner);
-                    crowd.allowed = allowed.values().sum();
-                    crowd.most = crowd.most.max(changing);
-                    crowd.broken += usize::from(changing > crowd.allowed);
+                    let mut picture = lock(&shared);
+                    if let Err(error) = read {
+                        return picture.judge.cannot(format!("rows could not be read: {error}"));
+                    }
+                    let said = sight.said();
+                    picture.judge.look(sight.clock.now().link, &said);
+                    picture.most = picture.most.max(said.iter().filter(|s| s.changes || s.goes_back).count());
+                    picture.seq = rows.seq();
                 }
-                tokio::time::sleep(LOOK_EVERY).await;
+                // A store that is gone ends with the story.
+                let _ = tokio::time::timeout(LOOK_EVERY, wake.changed()).await;
             }
         }));
-        Self { crowd, _looks: looks }
+        Self { picture, store, _looks: looks }
     }
-    /// What was seen so far.
-    pub fn crowd(&self) -> Crowd {
-        *self.crowd.lock().unwrap_or_else(PoisonError::into_inner)
+
+    /// What was seen since the last time, with all that is written by now; and the most robots that changed their software at once.
+    pub async fn seen(&self) -> (Seen, usize) {
+        let head = *self.store.wake().borrow();
+        let read = async {
+            while lock(&self.picture).seq < head {
+                tokio::time::sleep(LOOK_EVERY).await;
+            }
+        };
+        let is_read = tokio::time::timeout(READ_WITHIN, read).await.is_ok();
+        let mut picture = lock(&self.picture);
+        if !is_read {
+            let (seq, within) = (picture.seq.0, READ_WITHIN.as_secs());
+            picture.judge.cannot(format!("rows were read up to {seq} of {} within {within} s", head.0));
+        }
+        (picture.judge.take(), std::mem::take(&mut picture.most))
     }
 }
 
-/// Robots that change their software now.
-fn changing(board: &LiveBoard<Live>) -> usize {
-    let changes = |live: &Live| {
-        let state = live.report.update.as_ref().map(|u| u.state);
-        matches!(state, Some(UpdateState::Switching | UpdateState::Probation | UpdateState::RollingBack))
-    };
-    board.all().iter().filter(|(_, live)| changes(live)).count()
+impl Sight {
+    fn said(&self) -> Vec<Said> {
+        let said = |(robot_id, live): (RobotId, Arc<Live>)| {
+            let at = live.report.vitals.waypoint.as_ref().and_then(|w| self.site.find(w));
+            let state = live.report.update.as_ref().map(|u| u.state);
+            Said {
+                robot_id,
+                heard: live.processed_at,
+                area_id: at.map(|at| self.site.area_of(at).area_id.clone()),
+                is_stuck: state == Some(UpdateState::Stuck),
+                changes: matches!(state, Some(UpdateState::Switching | UpdateState::Probation)),
+                goes_back: state == Some(UpdateState::RollingBack),
+            }
+        };
+        self.board.all().into_iter().map(said).collect()
+    }
+}
+
+/// Takes rows to the judge, in the order of their commits.
+struct Rows {
+    sight: Sight,
+    picture: Shared,
+}
+
+impl Fold for Rows {
+    fn tables() -> &'static [Table] {
+        &[Table::Drain, Table::Rollout, Table::RolloutRobot]
+    }
+    fn reset(&mut self) {
+        lock(&self.picture).judge.forget_rows();
+    }
+    fn apply(&mut self, change: Change) -> Result<(), BadRow> {
+        let judge = &mut lock(&self.picture).judge;
+        match change.key.table {
+            Table::Drain => match change.decode::<Drain>()? {
+                Some(drain) => {
+                    judge.hear(self.sight.clock.now().link, &self.sight.said());
+                    judge.drain(drain);
+                }
+                None => judge.drain_is_gone(&change.key.id),
+            },
+            Table::Rollout => {
+                if let Some(rollout) = change.decode::<Rollout>()? {
+                    let pace = Pace { wave: rollout.wave, max_in_flight: rollout.spec.max_in_flight };
+                    judge.rollout(rollout.rollout_id, pace);
+                }
+            }
+            _ => {
+                if let Some(robot) = change.decode::<RolloutRobot>()? {
+                    judge.robot(robot.rollout_id, robot.robot_id, robot.wave);
+                }
+            }
+        }
+        Ok(())
+    }
 }
 
 /// When each robot first began to run a version, as the bodies' journals say; UTC of the site clock in milliseconds.
@@ -106,18 +198,6 @@ impl FirstRuns {
         let until = |from: i64| times.partition_point(|at| *at < from + ms);
         (0..times.len()).map(|ix| until(times[ix]) - ix).max().unwrap_or(0)
     }
-}
-
-/// How many robots of each area may be taken out of work, with as many there as are now.
-fn allowances(board: &LiveBoard<Live>, site: &Site) -> BTreeMap<AreaId, usize> {
-    let mut areas: BTreeMap<AreaId, usize> = BTreeMap::new();
-    for (_, live) in board.all() {
-        if let Some(at) = live.report.vitals.waypoint.as_ref().and_then(|w| site.find(w)) {
-            *areas.entry(site.area_of(at).area_id.clone()).or_default() += 1;
-        }
-    }
-    let rules = SoftwareRules::default();
-    areas.into_iter().map(|(area, robots)| (area, rules.off_work_max(robots))).collect()
 }
 
 #[cfg(test)]

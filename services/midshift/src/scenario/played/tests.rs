@@ -1,5 +1,6 @@
 //! Each way in which a roll-out of the story can be bad is one objection that names it.
 
+use super::super::budget::Fullest;
 use super::{OffWork, Played, Story, verdict};
 use midshift_proto::ota::v1;
 
@@ -19,7 +20,8 @@ fn played(is_good: bool) -> Played {
         canary: 2,
         off_work_most: 2,
         off_work_allowed: 2,
-        budget_broken: 0,
+        areas: vec![Fullest { area_id: "hall".to_owned(), out: 2, may: 2 }],
+        budget_broken: Vec::new(),
         kept_by: if is_good { ROBOTS } else { 0 },
         elsewhere: Vec::new(),
         verdicts: Vec::new(),
@@ -33,8 +35,9 @@ type Break = fn(&mut Played);
 
 #[test]
 fn each_figure_that_is_wrong_is_one_objection_that_names_it() {
-    let both: [(Break, &str); 3] = [
-        (|p| p.budget_broken = 1, "more robots changed at once than may, 1 times"),
+    let both: [(Break, &str); 4] = [
+        (|p| p.budget_broken = vec!["hall: 3 robots were out of work".to_owned()], "hall: 3 robots were out of work"),
+        (|p| p.areas.clear(), "nobody was seen to be taken out of work for it"),
         (|p| p.begun_at_once_most = 3, "new software began on 3 robots within one probation, 2 may"),
         (|p| p.elsewhere = vec!["r-7".to_owned()], "r-7 run something else"),
     ];
