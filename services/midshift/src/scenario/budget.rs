@@ -77,8 +77,8 @@ pub struct Judge {
     now: LinkTime,
     /// What is known was there when it began to look: nobody saw it begin.
     knows_all: bool,
-    /// Robots that changed their software outside of a drain when it looked last.
-    suspects: BTreeSet<RobotId>,
+    /// Robots that said outside of a drain that they change their software, and when they were heard with it last.
+    suspects: BTreeMap<RobotId, LinkTime>,
     seen: BTreeMap<AreaId, Fullest>,
     may: BTreeMap<AreaId, usize>,
     broken: Vec<String>,
@@ -128,13 +128,16 @@ impl Judge {
         self.hear(now, said);
         self.knows_all = true;
         let is_out = |robot_id: &RobotId| self.on.values().any(|d| d.robot_id == *robot_id);
-        let outside = said.iter().filter(|s| s.changes && !is_out(&s.robot_id)).map(|s| s.robot_id.clone());
-        let outside: BTreeSet<RobotId> = outside.collect();
-        // Once may be a heartbeat that is newer than the rows.
-        for robot_id in outside.intersection(&self.suspects) {
-            self.broken.push(format!("{robot_id} changed its software while no drain kept it out of work"));
+        let mut suspects = BTreeMap::new();
+        for said in said.iter().filter(|s| s.changes && !is_out(&s.robot_id)) {
+            let last = self.suspects.get(&said.robot_id).copied().unwrap_or(said.heard);
+            // One heartbeat proves nothing: an event ends a drain before the next heartbeat says the same.
+            if said.heard > last {
+                self.broken.push(format!("{} changed its software while no drain kept it out of work", said.robot_id));
+            }
+            suspects.insert(said.robot_id.clone(), said.heard);
         }
-        self.suspects = outside;
+        self.suspects = suspects;
         for area_id in self.permille.keys() {
             let may = self.may_be_out(area_id);
             let most = self.may.entry(area_id.clone()).or_default();

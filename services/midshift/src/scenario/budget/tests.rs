@@ -159,16 +159,20 @@ fn no_more_are_out_of_work_than_the_wave_has_or_the_roll_out_was_asked_for() {
 }
 
 #[test]
-fn software_that_changes_in_no_drain_is_an_objection_at_the_second_look() {
-    let changes = |s: Said| Said { changes: s.robot_id == robot(3), ..s };
-    let said: Vec<Said> = all().into_iter().map(changes).collect();
+fn software_that_changes_in_no_drain_is_an_objection_at_the_second_heartbeat() {
+    let later = LinkTime(NOW.0 + 1_000);
+    let heard = |at: LinkTime| {
+        let changes = |s: Said| Said { changes: s.robot_id == robot(3), heard: at, ..s };
+        all().into_iter().map(changes).collect::<Vec<Said>>()
+    };
     let mut inside = judge();
     inside.drain(drain(3, "hall"));
     let mut outside = judge();
     for judge in [&mut inside, &mut outside] {
-        judge.look(NOW, &said);
-        assert_eq!(judge.take().broken, Vec::<String>::new());
-        judge.look(NOW, &said);
+        judge.look(NOW, &heard(NOW));
+        judge.look(later, &heard(NOW));
+        assert_eq!(judge.take().broken, Vec::<String>::new(), "its drain may have ended by an event since");
+        judge.look(later, &heard(later));
     }
     assert_eq!(inside.take().broken, Vec::<String>::new());
     assert_eq!(outside.take().broken, ["r-03 changed its software while no drain kept it out of work"]);
