@@ -1,3 +1,4 @@
 //! The one integration suite of midshift: its tests are in `tests/tests`, over real programs and real parts.
 
+pub mod line;
 pub mod postgres;

@@ -5,7 +5,7 @@
 
 use crate::{Cause, Error, OpenError};
 use sqlx::postgres::{PgConnectOptions, PgListener, PgPool, PgPoolOptions};
-use sqlx::{ConnectOptions, PgConnection, Row};
+use sqlx::{ConnectOptions, Connection, PgConnection, Row};
 use std::str::FromStr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -30,6 +30,8 @@ pub(super) const WRITE_PATIENCE: Duration = Duration::from_secs(6);
 const READ_PATIENCE: Duration = Duration::from_secs(20);
 /// Connecting, or waiting for a read connection.
 const CONNECT_PATIENCE: Duration = Duration::from_secs(5);
+/// A read connection that comes back and does not answer within this is given up.
+const RETURN_PATIENCE: Duration = Duration::from_secs(2);
 /// Read connections of one store: a list, a snapshot and two feeds at once.
 const READERS: u32 = 4;
 /// A few statements for each table and log.
@@ -146,11 +148,18 @@ impl Database {
         self.connect(Purpose::Migrate).await
     }
 
-    /// Connections that only read.
+    /// Connections that only read. One whose reader has stopped waiting comes back in the middle of an answer, and the pool waits for the
+    /// rest of it without a limit: behind a network that swallows everything that would keep its place for a quarter of an hour.
     pub(super) fn readers(&self) -> PgPool {
         PgPoolOptions::new()
             .max_connections(READERS)
             .acquire_timeout(CONNECT_PATIENCE)
+            .after_release(|connection, _| {
+                Box::pin(async move {
+                    let answered = tokio::time::timeout(RETURN_PATIENCE, connection.ping()).await;
+                    answered.unwrap_or(Err(sqlx::Error::PoolTimedOut)).map(|()| true)
+                })
+            })
             .connect_lazy_with(self.options(Purpose::Read).options([("default_transaction_read_only", "on")]))
     }
 

@@ -4,6 +4,8 @@
 mod contract;
 mod failure;
 mod heard;
+#[path = "../../../../tests/src/line.rs"]
+mod line;
 mod partition;
 mod postgres;
 mod postgres_failure;
