@@ -116,6 +116,12 @@ impl PostgresServer {
         self.create("template0", name)
     }
 
+    /// Drops a database, whoever uses it, and makes an empty one of the same name.
+    pub fn emptied(&self, name: &str) {
+        run(self.client("dropdb").args(["--force", name]));
+        self.database_named(name);
+    }
+
     fn create(&self, template: &str, name: &str) -> String {
         let mut create = self.client("createdb");
         // A log of the copy is cheaper than the two checkpoints of the other way.

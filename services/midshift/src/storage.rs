@@ -21,7 +21,10 @@ pub struct Database {
 
 impl Database {
     /// The address if it is one of PostgreSQL; the password is never shown.
-    fn postgres(&self) -> anyhow::Result<Option<PostgresConfig>> {
+    ///
+    /// # Errors
+    /// If it is an address of something else.
+    pub fn postgres(&self) -> anyhow::Result<Option<PostgresConfig>> {
         match &self.store {
             None => Ok(None),
             Some(url) if url.starts_with("postgres://") || url.starts_with("postgresql://") => {

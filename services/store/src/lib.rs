@@ -30,9 +30,12 @@ pub use heard::{Heard, HeardLog, Kept, MemoryHeard, follow_heard};
 pub use migrations::Migrated;
 pub use model::MemoryStore;
 pub use open_error::OpenError;
-pub use postgres::{PostgresConfig, PostgresFrames, PostgresHeard, PostgresStore, Wakes, migrate_postgres};
+pub use postgres::{
+    CopiedSchema, PostgresConfig, PostgresCopy, PostgresFrames, PostgresHeard, PostgresRestore, PostgresStore,
+    RestoreError, Wakes, migrate_postgres,
+};
 pub use projection::{Change, Fold, Projection};
-pub use sqlite::{Database, Described, SqliteFrames, SqliteStore, identity, migrate, renew_identity};
+pub use sqlite::{Database, Described, SqliteFrames, SqliteStore, migrate, renew_identity};
 
 use async_trait::async_trait;
 use midshift_core::ids::{RobotId, SiteId};
@@ -55,6 +58,13 @@ pub const SEQ_PLAUSIBLE_MAX: Seq = Seq(1 << 53);
 /// Random text, made when a store is created or restored. A cursor of another store means: rebuild.
 #[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct StoreId(pub Arc<str>);
+
+impl StoreId {
+    /// The id of a store that is made or restored now: nobody else has it.
+    pub fn fresh() -> Self {
+        Self(sql::fresh_id().into())
+    }
+}
 
 impl fmt::Display for StoreId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

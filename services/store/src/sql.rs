@@ -25,7 +25,11 @@ pub(crate) const ROW_CONFLICT: &str = "ON CONFLICT (site_id, id) DO UPDATE SET r
 pub(crate) const HEAD: &str = "SELECT seq FROM store_head WHERE site_id = $1";
 pub(crate) const MOVE_HEAD: &str = "UPDATE store_head SET seq = $1 WHERE site_id = $2";
 pub(crate) const IDENTITY: &str = "SELECT site_id, store_id FROM store_head";
+/// Identity and newest number.
+pub(crate) const STORE: &str = "SELECT site_id, store_id, seq FROM store_head";
 pub(crate) const IDENTIFY: &str = "INSERT INTO store_head (site_id, store_id, seq) VALUES ($1, $2, $3)";
+/// Makes a restored store another one than it is a copy of.
+pub(crate) const RENEW: &str = "UPDATE store_head SET store_id = $1";
 pub(crate) const LOG_MARKS: &str = "SELECT log, pruned_seq FROM log_mark WHERE site_id = $1";
 pub(crate) const MARK_LOG: &str = "INSERT INTO log_mark (site_id, log, pruned_seq) VALUES ($1, $2, $3) \
      ON CONFLICT (site_id, log) DO UPDATE SET pruned_seq = excluded.pruned_seq";

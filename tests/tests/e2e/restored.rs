@@ -10,8 +10,9 @@ use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceCli
 use midshift_proto::telemetry::v1::{ListEventsRequest, event::Item};
 use midshift_sim::oracle::Oracle;
 use midshift_sim::workload::{Workload, WorkloadConfig};
+use midshift_tests::postgres::PostgresServer;
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
@@ -78,24 +79,78 @@ async fn reasons_of_gaps(server: &Server) -> anyhow::Result<Vec<String>> {
     }
 }
 
+/// Where the server keeps its rows and samples, and how those are lost.
+#[derive(Clone, Copy, Debug)]
+enum Engine {
+    Sqlite,
+    Postgres,
+}
+
+/// Database of the drill on PostgreSQL.
+const DATABASE: &str = "drill";
+
+impl Engine {
+    /// What `serve`, `backup` and `restore` are told.
+    fn flags(self) -> Vec<String> {
+        match self {
+            Self::Sqlite => Vec::new(),
+            Self::Postgres => vec!["--store".to_owned(), PostgresServer::shared().url(DATABASE)],
+        }
+    }
+    /// Names of the parts of a backup.
+    const fn parts(self) -> &'static str {
+        match self {
+            Self::Sqlite => "control\ntelemetry\n",
+            Self::Postgres => "postgresql\n",
+        }
+    }
+    fn prepare(self) {
+        if let Self::Postgres = self {
+            PostgresServer::shared().database_named(DATABASE);
+        }
+    }
+    /// Nothing of it is left.
+    fn lose(self, data: &Path) -> anyhow::Result<()> {
+        if let Self::Postgres = self {
+            PostgresServer::shared().emptied(DATABASE);
+        }
+        if data.exists() {
+            std::fs::remove_dir_all(data)?;
+        }
+        Ok(())
+    }
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn robots_carry_on_from_a_backup_that_was_taken_while_they_worked() -> anyhow::Result<()> {
+async fn robots_carry_on_from_a_backup_of_sqlite_that_was_taken_while_they_worked() -> anyhow::Result<()> {
+    drill(Engine::Sqlite).await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn robots_carry_on_from_a_backup_of_postgresql_that_was_taken_while_they_worked() -> anyhow::Result<()> {
+    drill(Engine::Postgres).await
+}
+
+async fn drill(engine: Engine) -> anyhow::Result<()> {
     let dir = tempfile::tempdir()?;
     let site = text::parse(DEMO)?;
-    let mut server = Server::start(dir.path()).await?;
+    engine.prepare();
+    let flags = engine.flags();
+    let flags: Vec<&str> = flags.iter().map(String::as_str).collect();
+    let mut server = Server::start_with(dir.path(), DEMO, &flags).await?;
     let robots = Robots::start(dir.path(), server.address, &site, ROBOTS)?;
     let before = submit(&server, &site, 1, "before").await?;
     until_done(&server, 2).await?;
     let (data, backup) = (server.data(), dir.path().join("backup"));
     let (data, backup) = (data.to_string_lossy(), backup.to_string_lossy());
-    run(&["backup", "--data", &data, "--to", &backup])?;
+    run(&[&["backup", "--data", &data, "--to", &backup][..], &flags].concat())?;
     let parts = run(&["restore", "--verify", "--from", &backup, "-o", "name"])?;
-    assert_eq!(parts, "control\ntelemetry\n");
+    assert_eq!(parts, engine.parts());
     // What is done from here on nobody but the robots will know of.
     until_done(&server, 6).await?;
     server.kill()?;
-    std::fs::remove_dir_all(server.data())?;
-    run(&["restore", "--from", &backup, "--data", &data])?;
+    engine.lose(&server.data())?;
+    run(&[&["restore", "--from", &backup, "--data", &data][..], &flags].concat())?;
     server.restart().await?;
     let after = submit(&server, &site, 2, "after").await?;
     let ended = until("every task to be over or with a person", Duration::from_secs(240), || async {

@@ -1,15 +1,24 @@
 //! Backups of a server: everything durable that it has, as a list of parts, each copied while the server works.
 //!
 //! Invariant: a backup is whole or it is not there: its folder gets its name when all of it is durable, and its list names each file with its
-//! digest. Restoring changes nothing but a data directory that was not there. Rows are copied before what they name, so that what a
-//! copied row names was there when it was copied. A thing that is durable and in no part is a defect: who adds one adds its part.
+//! digest. Restoring changes nothing but a data directory that was not there, and a database that had no row. Rows are copied before what
+//! they name, so that what a copied row names was there when it was copied. A thing that is durable and in no part is a defect: who adds one
+//! adds its part.
 
+mod files;
+mod keys;
 mod parts;
+mod place;
+mod releases;
+mod rows;
 
 use anyhow::{Context, bail, ensure};
+use files::write;
 use midshift_bundle::digest::Digest;
 use midshift_core::time::Utc;
-use parts::PARTS;
+use midshift_store::{PostgresConfig, PostgresRestore, RestoreError, StoreId};
+use parts::{KEYS, Making, PARTS, POSTGRES, Said};
+use place::Place;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -29,6 +38,8 @@ pub struct Places {
     pub data: PathBuf,
     /// The folder of its online keys, if it has any.
     pub ota_keys: Option<PathBuf>,
+    /// The database of its rows; none: they are files of SQLite in the data directory.
+    pub store: Option<PostgresConfig>,
 }
 
 /// One file of a backup.
@@ -74,16 +85,15 @@ pub struct Summary {
 pub async fn back_up(from: &Places, to: &Path, now: Utc) -> anyhow::Result<Summary> {
     let place = Place::new(to)?;
     let mut names = Vec::new();
-    let mut site_id = None;
+    let mut said = Said::default();
     for part in PARTS {
         let folder = place.path().join(part.name());
-        let is_there = part.copy(from, &folder).await.with_context(|| format!("copying {}", part.name()))?;
-        if is_there {
-            site_id = site_id.or(part.site_id(&folder).await?);
+        let copied = part.copy(from, &folder, &mut said).await;
+        if copied.with_context(|| format!("copying {}", part.name()))? {
             names.push(part.name().to_owned());
         }
     }
-    let site_id = site_id.with_context(|| format!("no server ever served from {}", from.data.display()))?;
+    let site_id = said.site_id.with_context(|| format!("no server ever served from {}", from.data.display()))?;
     let root = place.path().to_owned();
     let files = blocking(move || listed(&root)).await?;
     let midshift = env!("CARGO_PKG_VERSION").to_owned();
@@ -122,40 +132,79 @@ pub async fn verify(backup: &Path) -> anyhow::Result<Summary> {
     Ok(list.summary())
 }
 
-/// Makes a data directory of a backup, which is verified first. Neither `to.data` nor `to.ota_keys` may be there.
+/// Makes a data directory of a backup, which is verified first, and where its rows are of PostgreSQL an empty database. Neither `to.data`
+/// nor `to.ota_keys` may be there.
 ///
 /// # Errors
-/// If the backup is not good, the clock is before it, or something cannot be written. Nothing is left at `to` then.
+/// If the backup is not good or of the other engine, the clock is before it, the database is not empty, or something cannot be written.
+/// Nothing is left at `to` then, unless the database went silent at its last word: the error says so, and what to do.
 pub async fn restore(backup: &Path, to: &Places, now: Utc) -> anyhow::Result<Summary> {
     let summary = verify(backup).await?;
+    match (summary.has(POSTGRES), &to.store) {
+        (true, None) => bail!(
+            "the backup has rows of PostgreSQL and no database is named: add --store; it cannot become files of SQLite"
+        ),
+        (false, Some(_)) => bail!(
+            "the backup has rows of SQLite and cannot go into PostgreSQL: restore it without --store, with MIDSHIFT_STORE unset"
+        ),
+        _ => {}
+    }
     ensure!(now >= summary.begun, "this machine's clock is before the moment of the backup; set it first");
     let place = Place::new(&to.data)?;
     // Keys that do not go into the data directory are made whole beside their own place.
     let mut keys = None;
-    let mut within = Places { data: place.path().to_owned(), ota_keys: None };
+    let mut within = Places { data: place.path().to_owned(), ota_keys: None, store: to.store.clone() };
     if let Some(folder) = &to.ota_keys {
-        ensure!(summary.parts.iter().any(|(name, ..)| name == parts::KEYS), "the backup has no online keys");
+        ensure!(summary.has(KEYS), "the backup has no online keys");
         within.ota_keys = Some(match folder.strip_prefix(&to.data) {
             Ok(inside) => place.path().join(inside),
-            Err(_) => keys.insert((Place::new(folder)?, folder)).0.path().to_owned(),
+            Err(_) => keys.insert((Place::new(folder)?, folder.clone())).0.path().to_owned(),
         });
     }
-    for (name, ..) in &summary.parts {
-        if let Some(part) = PARTS.iter().find(|part| part.name() == name) {
-            part.put_back(&backup.join(name), &within, now).await.with_context(|| format!("restoring {name}"))?;
-        }
+    let mut making = Making { places: within, store_id: StoreId::fresh(), now, rows: None };
+    for part in PARTS.iter().rev().filter(|part| summary.has(part.name())) {
+        let put_back = part.put_back(&backup.join(part.name()), &mut making).await;
+        put_back.with_context(|| format!("restoring {}", part.name()))?;
+        // Before a database waits for its last word.
+        place.sync().await?;
     }
-    let mut named = None;
-    if let Some((place, folder)) = keys {
-        place.name(folder).await?;
-        named = Some(folder);
-    }
-    let done = place.name(&to.data).await;
-    if let (Err(_), Some(folder)) = (&done, named) {
-        fs::remove_dir_all(folder).with_context(|| format!("removing {}", folder.display()))?;
-    }
-    done?;
+    let places = keys.into_iter().chain([(place, to.data.clone())]);
+    name_all(places, making.rows).await?;
     Ok(summary)
+}
+
+/// Gives folders their names and commits the rows last: they alone make a server of it, and a folder without them belongs to no store.
+async fn name_all(places: impl Iterator<Item = (Place, PathBuf)>, rows: Option<PostgresRestore>) -> anyhow::Result<()> {
+    let mut named = Vec::new();
+    let named_all = async {
+        for (place, folder) in places {
+            place.name(&folder).await?;
+            named.push(folder);
+        }
+        match rows {
+            Some(rows) => rows.commit().await.map_err(anyhow::Error::from),
+            None => Ok(()),
+        }
+    };
+    let Err(error) = named_all.await else { return Ok(()) };
+    if matches!(error.downcast_ref(), Some(RestoreError::Unknown(_))) {
+        let folders: Vec<String> = named.iter().map(|folder| folder.display().to_string()).collect();
+        return Err(error.context(format!(
+            "if the database has rows of midshift now, all is restored; if it has none, remove {} and restore again",
+            folders.join(" and ")
+        )));
+    }
+    for folder in named {
+        fs::remove_dir_all(&folder).with_context(|| format!("removing {}", folder.display()))?;
+    }
+    Err(error)
+}
+
+impl Summary {
+    /// Whether it has a part of this name.
+    fn has(&self, part: &str) -> bool {
+        self.parts.iter().any(|(name, ..)| name == part)
+    }
 }
 
 impl List {
@@ -170,45 +219,6 @@ impl List {
             begun: Utc(self.begun_unix_ms),
             parts: self.parts.iter().map(of).collect(),
         }
-    }
-}
-
-/// A folder under a name of its own until it is whole.
-struct Place(tempfile::TempDir);
-
-impl Place {
-    fn new(to: &Path) -> anyhow::Result<Self> {
-        ensure!(is_free(to)?, "{} is there already; name a folder that is not there", to.display());
-        let beside = to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        fs::create_dir_all(beside).with_context(|| format!("making {}", beside.display()))?;
-        let place = tempfile::Builder::new().prefix(".midshift-").tempdir_in(beside);
-        Ok(Self(place.with_context(|| format!("making a folder in {}", beside.display()))?))
-    }
-    fn path(&self) -> &Path {
-        self.0.path()
-    }
-    /// Makes all of it durable and gives it its name.
-    async fn name(self, to: &Path) -> anyhow::Result<()> {
-        let (from, to) = (self.0.path().to_owned(), to.to_owned());
-        blocking(move || {
-            sync_tree(&from)?;
-            fs::rename(&from, &to).with_context(|| format!("naming {}", to.display()))?;
-            let beside = to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-            File::open(beside)?.sync_all().with_context(|| format!("syncing {}", beside.display()))
-        })
-        .await?;
-        // Its old name is nobody's now.
-        let _ = self.0.keep();
-        Ok(())
-    }
-}
-
-/// Whether nothing is there: also an empty folder may be what cannot be replaced, as where a disk is mounted.
-fn is_free(path: &Path) -> anyhow::Result<bool> {
-    match fs::symlink_metadata(path) {
-        Ok(_) => Ok(false),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(true),
-        Err(error) => Err(error).with_context(|| format!("reading {}", path.display())),
     }
 }
 
@@ -241,25 +251,11 @@ fn differences(list: &BTreeMap<String, Kept>, found: &BTreeMap<String, Kept>) ->
     missing.chain(strange).chain(other.map(|(path, _)| format!("{path} is not what was copied"))).collect()
 }
 
-fn sync_tree(folder: &Path) -> anyhow::Result<()> {
-    for entry in fs::read_dir(folder)? {
-        let path = entry?.path();
-        if path.is_dir() {
-            sync_tree(&path)?;
-        } else {
-            File::open(&path)?.sync_all().with_context(|| format!("syncing {}", path.display()))?;
-        }
-    }
-    File::open(folder)?.sync_all().with_context(|| format!("syncing {}", folder.display()))
-}
-
-fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
-    fs::write(path, bytes).with_context(|| format!("writing {}", path.display()))
-}
-
 async fn blocking<T: Send + 'static>(work: impl FnOnce() -> anyhow::Result<T> + Send + 'static) -> anyhow::Result<T> {
     tokio::task::spawn_blocking(work).await.context("work with files ended")?
 }
 
+#[cfg(test)]
+mod postgres_tests;
 #[cfg(test)]
 mod tests;

@@ -19,7 +19,7 @@ use std::path::Path;
 use std::sync::Arc;
 use tempfile::TempDir;
 
-const NOW: Utc = Utc(1_780_000_000_000);
+pub const NOW: Utc = Utc(1_780_000_000_000);
 
 /// A server's data directory, in use.
 struct Used {
@@ -28,7 +28,7 @@ struct Used {
     frames: SqliteFrames,
 }
 
-fn site() -> SiteId {
+pub fn site() -> SiteId {
     SiteId::parse("north").expect("a site")
 }
 
@@ -63,7 +63,7 @@ impl Used {
         self.store.commit(vec![item]).await.remove(0).expect("applied");
     }
     fn places(&self) -> Places {
-        Places { data: self.dir.path().join("data"), ota_keys: None }
+        Places { data: self.dir.path().join("data"), ota_keys: None, store: None }
     }
     async fn backed_up(&self) -> std::path::PathBuf {
         let to = self.dir.path().join("backup");
@@ -81,7 +81,7 @@ async fn what_is_restored_is_the_moment_of_the_copy_in_a_store_of_its_own() {
     assert_eq!((summary.site_id.as_str(), summary.begun), ("north", NOW));
     let names: Vec<&str> = summary.parts.iter().map(|(name, ..)| name.as_str()).collect();
     assert_eq!(names, ["control", "telemetry"]);
-    let to = Places { data: used.dir.path().join("restored"), ota_keys: None };
+    let to = Places { data: used.dir.path().join("restored"), ota_keys: None, store: None };
     restore(&backup, &to, NOW).await.expect("restored");
     let (store, frames) = open(&to.data).await;
     assert_ne!(store.id(), used.store.id(), "nobody may go on from a number of the other");
@@ -100,7 +100,7 @@ async fn every_change_of_a_backup_is_found_and_nothing_is_restored_of_it() {
     let middle = other.len() / 2;
     other[middle] ^= 1;
     let stray = backup.join("control").join("stray");
-    let to = Places { data: used.dir.path().join("restored"), ota_keys: None };
+    let to = Places { data: used.dir.path().join("restored"), ota_keys: None, store: None };
     type Spoil<'a> = &'a dyn Fn();
     let spoils: [(&str, Spoil); 3] = [
         ("is not what was copied", &|| fs::write(&file, &other).expect("written")),
@@ -130,7 +130,7 @@ async fn nothing_is_written_over() {
     assert!(again.to_string().contains("is there already"), "{again}");
     assert!(restore(&backup, &used.places(), NOW).await.is_err());
     verify(&backup).await.expect("as it was");
-    let nowhere = Places { data: used.dir.path().join("nowhere"), ota_keys: None };
+    let nowhere = Places { data: used.dir.path().join("nowhere"), ota_keys: None, store: None };
     let to = used.dir.path().join("of-nothing");
     let error = back_up(&nowhere, &to, NOW).await.expect_err("there is nothing");
     assert!(error.to_string().contains("no server ever served"), "{error}");
@@ -145,38 +145,36 @@ async fn repository(data: &Path, keys: &Path) -> (Arc<DiskContent>, Repository) 
     (content, repository)
 }
 
-impl Used {
-    /// Publishes one file. What is signed has at least this version. Where the keys are.
-    async fn release(&self, version: u64) -> std::path::PathBuf {
-        let (keys, people) = (self.dir.path().join("keys"), self.dir.path().join("repository"));
-        Folder::create(&people, &keys, Profile::Solo, NOW).expect("keys and a root");
-        let root = Folder::open(&people).expect("it").document("1.root.json").expect("readable").expect("a root");
-        let documents = self.places().data.join("ota").join("metadata");
-        fs::create_dir_all(&documents).expect("a folder");
-        raise_floor(&documents, version).expect("written");
-        let (content, repository) = repository(&self.places().data, &keys).await;
-        let bytes = b"a file of a release".to_vec();
-        let file = Wanted { digest: Digest::of(&bytes), length: bytes.len() as u64 };
-        let target = FileTarget { name: "walk".to_owned(), digest: file.digest, length: file.length };
-        content.append(file, 0, bytes.into()).await.expect("room");
-        assert_eq!(content.settle(file).await.expect("asked"), Held::Whole);
-        let key = SecretKey::read(&keys.join("targets-1.pem")).expect("a key");
-        let targets = sign_targets(None, &[target], &[], NOW.plus_ms(PEOPLE_LIFE_MS), &[&key]).expect("signed");
-        repository.publish(vec![root], targets, 0, NOW).await.expect("published");
-        keys
-    }
+/// Publishes one file in the data directory `data` with keys in `dir`. What is signed has at least this version. Where the keys are.
+pub async fn release(dir: &Path, data: &Path, version: u64) -> std::path::PathBuf {
+    let (keys, people) = (dir.join("keys"), dir.join("repository"));
+    Folder::create(&people, &keys, Profile::Solo, NOW).expect("keys and a root");
+    let root = Folder::open(&people).expect("it").document("1.root.json").expect("readable").expect("a root");
+    let documents = data.join("ota").join("metadata");
+    fs::create_dir_all(&documents).expect("a folder");
+    raise_floor(&documents, version).expect("written");
+    let (content, repository) = repository(data, &keys).await;
+    let bytes = b"a file of a release".to_vec();
+    let file = Wanted { digest: Digest::of(&bytes), length: bytes.len() as u64 };
+    let target = FileTarget { name: "walk".to_owned(), digest: file.digest, length: file.length };
+    content.append(file, 0, bytes.into()).await.expect("room");
+    assert_eq!(content.settle(file).await.expect("asked"), Held::Whole);
+    let key = SecretKey::read(&keys.join("targets-1.pem")).expect("a key");
+    let targets = sign_targets(None, &[target], &[], NOW.plus_ms(PEOPLE_LIFE_MS), &[&key]).expect("signed");
+    repository.publish(vec![root], targets, 0, NOW).await.expect("published");
+    keys
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_restored_repository_signs_above_what_robots_saw_by_the_clock_and_by_the_copy() {
     for (version, least) in [(1, 1_780_000_000), (1_000_000_000_000, 1_000_001_000_000)] {
         let used = Used::new().await;
-        let keys = used.release(version).await;
+        let keys = release(used.dir.path(), &used.places().data, version).await;
         let from = Places { ota_keys: Some(keys), ..used.places() };
         let backup = used.dir.path().join("backup");
         back_up(&from, &backup, NOW).await.expect("a backup");
         let at = |name| used.dir.path().join(name);
-        let to = Places { data: at("restored"), ota_keys: Some(at("restored-keys")) };
+        let to = Places { data: at("restored"), ota_keys: Some(at("restored-keys")), store: None };
         restore(&backup, &to, NOW).await.expect("restored");
         let (content, repository) = repository(&to.data, &at("restored-keys")).await;
         let copied = repository.newest().expect("what was published").stamp;
@@ -192,11 +190,11 @@ async fn a_restored_repository_signs_above_what_robots_saw_by_the_clock_and_by_t
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn restored_releases_belong_to_the_restored_store_and_those_of_the_lost_one_do_not() {
     let used = Used::new().await;
-    let keys = used.release(1).await;
+    let keys = release(used.dir.path(), &used.places().data, 1).await;
     let folder = used.places().data.join("ota");
     mark(&folder, used.store.id()).expect("written");
     let backup = used.backed_up().await;
-    let to = Places { data: used.dir.path().join("restored"), ota_keys: None };
+    let to = Places { data: used.dir.path().join("restored"), ota_keys: None, store: None };
     restore(&backup, &to, NOW).await.expect("restored");
     let (store, _frames) = open(&to.data).await;
     let owned = |folder: &Path| Parts {
@@ -214,18 +212,18 @@ async fn restored_releases_belong_to_the_restored_store_and_those_of_the_lost_on
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn keys_come_whole_or_not_at_all() {
     let used = Used::new().await;
-    let keys = used.release(1).await;
+    let keys = release(used.dir.path(), &used.places().data, 1).await;
     let backup = used.dir.path().join("backup");
     back_up(&Places { ota_keys: Some(keys), ..used.places() }, &backup, NOW).await.expect("a backup");
     let at = |name| used.dir.path().join(name);
     fs::create_dir(at("there")).expect("an empty folder");
     for (data, keys) in [("there", "new-keys"), ("new", "there")] {
-        let to = Places { data: at(data), ota_keys: Some(at(keys)) };
+        let to = Places { data: at(data), ota_keys: Some(at(keys)), store: None };
         let error = restore(&backup, &to, NOW).await.expect_err("it is there").to_string();
         assert!(error.contains("is there already"), "{error}");
         assert!(!at("new").exists() && !at("new-keys").exists());
     }
-    let inside = Places { data: at("one"), ota_keys: Some(at("one").join("keys")) };
+    let inside = Places { data: at("one"), ota_keys: Some(at("one").join("keys")), store: None };
     restore(&backup, &inside, NOW).await.expect("both in one folder");
     OnlineKeys::read(&at("one").join("keys")).expect("all of them");
     let left = fs::read_dir(used.dir.path()).expect("a folder").map(|entry| entry.expect("an entry").file_name());
@@ -236,7 +234,7 @@ async fn keys_come_whole_or_not_at_all() {
 async fn with_a_clock_before_the_backup_or_keys_that_it_has_not_nothing_is_restored() {
     let used = Used::new().await;
     let backup = used.backed_up().await;
-    let to = Places { data: used.dir.path().join("restored"), ota_keys: None };
+    let to = Places { data: used.dir.path().join("restored"), ota_keys: None, store: None };
     let error = restore(&backup, &to, Utc(NOW.0 - 1)).await.expect_err("the clock").to_string();
     assert!(error.contains("clock is before the moment of the backup"), "{error}");
     let with_keys = Places { ota_keys: Some(used.dir.path().join("keys")), ..to.clone() };

@@ -66,7 +66,7 @@ enum Command {
     },
     /// Copy everything durable of a server into a folder, while it serves or not.
     Backup(backup::Take),
-    /// Make a data directory of a backup, or only look whether the backup is good.
+    /// Make a data directory of a backup, and its database if it has one, or only look whether the backup is good.
     Restore(backup::Restore),
     /// A robot's agent.
     #[command(subcommand)]

@@ -22,6 +22,10 @@ const WRITE_STATEMENT_MS: u32 = 5_000;
 const READ_STATEMENT_MS: u32 = 15_000;
 /// Longest step of a migration, ms.
 const MIGRATE_STATEMENT_MS: u32 = 600_000;
+/// Longest copy of one table, ms.
+const COPY_STATEMENT_MS: u32 = 6 * 3_600_000;
+/// What a copy may do between two of its statements before the server gives it up, ms: files are named meanwhile.
+const COPY_IDLE_MS: u32 = 600_000;
 /// Silence after which the server believes a peer gone, ms.
 const PEER_LOST_MS: u32 = 10_000;
 /// What one transaction of the writer may take up to its COMMIT, and the COMMIT itself, before we stop waiting for an answer.
@@ -76,6 +80,7 @@ enum Purpose {
     Write,
     Read,
     Migrate,
+    Copy,
 }
 
 impl Database {
@@ -90,12 +95,17 @@ impl Database {
             Purpose::Write => WRITE_STATEMENT_MS,
             Purpose::Read => READ_STATEMENT_MS,
             Purpose::Migrate => MIGRATE_STATEMENT_MS,
+            Purpose::Copy => COPY_STATEMENT_MS,
         };
-        let lock_ms = if matches!(purpose, Purpose::Migrate) { MIGRATE_STATEMENT_MS } else { LOCK_TIMEOUT_MS };
+        let (lock_ms, idle_ms) = match purpose {
+            Purpose::Write | Purpose::Read => (LOCK_TIMEOUT_MS, IDLE_IN_TRANSACTION_MS),
+            Purpose::Migrate => (MIGRATE_STATEMENT_MS, IDLE_IN_TRANSACTION_MS),
+            Purpose::Copy => (MIGRATE_STATEMENT_MS, COPY_IDLE_MS),
+        };
         let limits = [
             ("lock_timeout", lock_ms),
             ("statement_timeout", statement_ms),
-            ("idle_in_transaction_session_timeout", IDLE_IN_TRANSACTION_MS),
+            ("idle_in_transaction_session_timeout", idle_ms),
             ("tcp_user_timeout", PEER_LOST_MS),
             ("tcp_keepalives_idle", PEER_LOST_MS / 2_000),
             ("tcp_keepalives_interval", 1),
@@ -125,7 +135,16 @@ impl Database {
 
     /// A connection whose commits are durable.
     pub(super) async fn writer(&self) -> Result<PgConnection, OpenError> {
-        let mut connection = self.connect(Purpose::Write).await?;
+        self.durable(Purpose::Write).await
+    }
+
+    /// A connection for whole tables, out or in, whose commits are durable.
+    pub(super) async fn copier(&self) -> Result<PgConnection, OpenError> {
+        self.durable(Purpose::Copy).await
+    }
+
+    async fn durable(&self, purpose: Purpose) -> Result<PgConnection, OpenError> {
+        let mut connection = self.connect(purpose).await?;
         let durable = async {
             for name in ["fsync", "full_page_writes", "synchronous_commit"] {
                 if setting(&mut connection, name).await? == "off" {

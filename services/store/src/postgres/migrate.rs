@@ -33,16 +33,9 @@ pub(super) async fn apply(
     let mut connection = database.migrator().await?;
     create(&mut connection, database.schema).await.map_err(sql)?;
     let mut transaction = connection.begin_with(BEGIN).await.map_err(sql)?;
-    sqlx::query(LOCK).execute(&mut *transaction).await.map_err(sql)?;
-    let row = sqlx::query(VERSION).fetch_one(&mut *transaction).await;
-    let from = row.and_then(|row| row.try_get::<i64, _>(0)).map_err(sql)? as u32;
+    let from = lock(&mut transaction).await.map_err(sql)?;
     let pending = pending(database.schema, migrations, from)?;
-    for (version, migration) in (i64::from(from) + 1..).zip(pending) {
-        let step = AssertSqlSafe(translated(migration.sql));
-        sqlx::query(step).execute(&mut *transaction).await.map_err(sql)?;
-        let raise = sqlx::query(RAISE_VERSION).bind(version).bind(migration.name);
-        raise.execute(&mut *transaction).await.map_err(sql)?;
-    }
+    climb(&mut transaction, from, pending).await.map_err(sql)?;
     if let Some((site_id, created)) = store {
         // Under the lock, so that two sites cannot both be the first one.
         super::writer::identify(&mut transaction, site_id, created).await?;
@@ -53,19 +46,37 @@ pub(super) async fn apply(
     Ok(Migrated { file: database.schema, from, to: migrations.len() as u32, applied })
 }
 
-/// Makes the schema and its row to lock.
+/// Waits until nobody else migrates the schema on the search path, and keeps others out until the transaction ends. Its version.
+pub(super) async fn lock(connection: &mut PgConnection) -> Result<u32, sqlx::Error> {
+    sqlx::query(LOCK).execute(&mut *connection).await?;
+    let row = sqlx::query(VERSION).fetch_one(connection).await?;
+    Ok(row.try_get::<i64, _>(0)? as u32)
+}
+
+/// Brings a schema of version `from` up by `steps`.
+pub(super) async fn climb(connection: &mut PgConnection, from: u32, steps: &[Migration]) -> Result<(), sqlx::Error> {
+    for (version, migration) in (i64::from(from) + 1..).zip(steps) {
+        sqlx::query(AssertSqlSafe(translated(migration.sql))).execute(&mut *connection).await?;
+        let raise = sqlx::query(RAISE_VERSION).bind(version).bind(migration.name);
+        raise.execute(&mut *connection).await?;
+    }
+    Ok(())
+}
+
+/// Makes a schema, which is on the search path, and its row to lock, if nobody else does so at the same moment.
+pub(super) async fn make(connection: &mut PgConnection, schema: &'static str) -> Result<(), sqlx::Error> {
+    for step in [format!("CREATE SCHEMA IF NOT EXISTS {schema}"), translated(SCHEMA_VERSION), LOCK_ROW.to_owned()] {
+        sqlx::query(AssertSqlSafe(step)).execute(&mut *connection).await?;
+    }
+    Ok(())
+}
+
+/// Makes the schema and its row to lock, whoever does so at the same moment.
 async fn create(connection: &mut PgConnection, schema: &'static str) -> Result<(), sqlx::Error> {
-    let schema = format!("CREATE SCHEMA IF NOT EXISTS {schema}");
     let mut attempt = 0;
     loop {
         attempt += 1;
-        let steps = async {
-            for step in [schema.clone(), translated(SCHEMA_VERSION), LOCK_ROW.to_owned()] {
-                sqlx::query(AssertSqlSafe(step)).execute(&mut *connection).await?;
-            }
-            Ok(())
-        };
-        match steps.await {
+        match make(connection, schema).await {
             Err(sqlx::Error::Database(error))
                 if attempt < CREATE_ATTEMPTS && is_made_twice(error.code().as_deref()) => {}
             outcome => return outcome,

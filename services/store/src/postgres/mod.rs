@@ -5,6 +5,7 @@
 //! SQL stays within what other engines that speak PostgreSQL's protocol have too: no NOTIFY in a transaction, no advisory locks,
 //! no triggers.
 
+mod backup;
 mod connect;
 mod frames;
 mod frames_writer;
@@ -15,6 +16,7 @@ mod wake;
 mod write_sql;
 mod writer;
 
+pub use backup::{CopiedSchema, PostgresCopy, PostgresRestore, RestoreError};
 pub use connect::{PostgresConfig, Wakes};
 pub use frames::PostgresFrames;
 pub use heard::PostgresHeard;

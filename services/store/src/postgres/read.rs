@@ -15,7 +15,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 /// One snapshot for all statements, whatever the database's own default is.
-const BEGIN: &str = "BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY";
+pub(super) const BEGIN: &str = "BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY";
 
 pub(super) async fn begin(readers: &PgPool) -> Result<Transaction<'static, Postgres>, sqlx::Error> {
     readers.begin_with(BEGIN).await

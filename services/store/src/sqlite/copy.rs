@@ -6,6 +6,7 @@
 use super::{CONTROL_DB, OpenError, TELEMETRY_DB};
 use crate::StoreId;
 use crate::migrations::{self, Migration};
+use crate::sql::RENEW;
 use midshift_core::rows::Seq;
 use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{ConnectOptions, Connection, Row, SqliteConnection};
@@ -102,31 +103,17 @@ impl Database {
     }
 }
 
-/// Makes a restored `control.db` another store than the one that it is a copy of.
+/// Makes a restored `control.db` the store `id`, another one than it is a copy of.
 ///
 /// # Errors
 /// If the file cannot be written.
-pub async fn renew_identity(dir: &Path) -> Result<(), OpenError> {
+pub async fn renew_identity(dir: &Path, id: &StoreId) -> Result<(), OpenError> {
     let sql = |source| OpenError::Sql { doing: "giving the restored store an id of its own", source };
     let options = SqliteConnectOptions::new().filename(dir.join(CONTROL_DB)).busy_timeout(BUSY_TIMEOUT);
     let mut connection = options.connect().await.map_err(sql)?;
     sqlx::query("PRAGMA synchronous = FULL").execute(&mut connection).await.map_err(sql)?;
-    let id = crate::sql::fresh_id();
-    sqlx::query("UPDATE store_head SET store_id = $1").bind(id).execute(&mut connection).await.map_err(sql)?;
+    sqlx::query(RENEW).bind(&*id.0).execute(&mut connection).await.map_err(sql)?;
     connection.close().await.map_err(sql)
-}
-
-/// Which store the `control.db` of a directory is, while nobody serves from it; none: nobody ever did.
-///
-/// # Errors
-/// If the file cannot be read.
-pub async fn identity(dir: &Path) -> Result<Option<StoreId>, OpenError> {
-    let sql = |source| OpenError::Sql { doing: "reading the id of the store", source };
-    let mut connection = read_only(&dir.join(CONTROL_DB)).await?;
-    let row = sqlx::query("SELECT store_id FROM store_head").fetch_optional(&mut connection).await.map_err(sql)?;
-    let id = row.map(|row| row.try_get::<String, _>(0)).transpose().map_err(sql)?;
-    connection.close().await.map_err(sql)?;
-    Ok(id.map(|id| StoreId(id.into())))
 }
 
 async fn read_only(path: &Path) -> Result<SqliteConnection, OpenError> {

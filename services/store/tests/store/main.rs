@@ -2,6 +2,8 @@
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 mod contract;
+mod copied;
+mod copied_wrong;
 mod failure;
 mod heard;
 #[path = "../../../../tests/src/line.rs"]
