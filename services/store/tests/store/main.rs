@@ -13,6 +13,7 @@ mod postgres;
 mod postgres_failure;
 mod projection;
 mod reopen;
+#[expect(dead_code, reason = "other crates' tests use the rest of it")]
 #[path = "../../../../tests/src/postgres.rs"]
 mod server;
 mod support;
