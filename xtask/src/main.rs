@@ -42,12 +42,13 @@ enum Verb {
         #[arg(value_enum)]
         parts: Vec<parts::Part>,
     },
-    /// Long fault sweeps, of which CI runs a sample: programs that are killed at work, simulated shifts, and power cuts of updates.
+    /// Long fault sweeps, of which CI runs a sample: programs that are killed at work, simulated shifts, power cuts of updates, and stories.
     Torture {
         /// Sweeps to run; none: all.
         #[arg(value_enum)]
         sweeps: Vec<sweep::Sweep>,
-        /// How many seeds each; unless told, 20 kills (about two minutes a seed) and 2000 simulated shifts (about a quarter of a second).
+        /// How many seeds each; unless told, 20 kills (about two minutes a seed), 2000 simulated shifts (about a quarter of a second) and 2
+        /// stories (about ten minutes).
         #[arg(long)]
         seeds: Option<u64>,
         /// The first seed. A failing seed alone: `torture SWEEP --from SEED --seeds 1`.

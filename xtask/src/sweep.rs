@@ -1,7 +1,8 @@
 //! Long sweeps and golden files: calls of `cargo test` with an environment variable that the tests read.
 //!
-//! Invariant: a sweep that ran no test fails. `MIDSHIFT_SEED` is read by the test that kills programs, `MIDSHIFT_SEEDS` and
-//! `MIDSHIFT_SEED_FROM` by the simulation, `MIDSHIFT_SITES` by the power cuts, `MIDSHIFT_SPLIT_ROBOTS` by the split stack, `BLESS` by tests with `golden` in their name.
+//! Invariant: a sweep that ran no test fails. `MIDSHIFT_SEED` is read by the test that kills programs and by stories, `MIDSHIFT_STORY` by
+//! stories, `MIDSHIFT_SEEDS` and `MIDSHIFT_SEED_FROM` by the simulation, `MIDSHIFT_SPLIT_ROBOTS` by the split stack, `MIDSHIFT_SITES` by the
+//! power cuts, `BLESS` by tests with `golden` in their name.
 
 use crate::fetch_tools::Tools;
 use crate::parts::Count;
@@ -25,22 +26,26 @@ pub enum Sweep {
     Split,
     /// The power goes at each call of an update, and of the ways back from one, that changes the disk: all of them, whatever the seeds.
     Updates,
+    /// Twenty robots, five of them launcher and agent processes, get a good release and three bad ones: about ten minutes a seed.
+    Stories,
 }
 
 impl Sweep {
-    const ALL: [Self; 4] = [Self::Kills, Self::Simulation, Self::Split, Self::Updates];
+    const ALL: [Self; 5] = [Self::Kills, Self::Simulation, Self::Split, Self::Updates, Self::Stories];
 
     fn seeds(self) -> u64 {
         match self {
             Self::Kills => 20,
             Self::Simulation => 2_000,
             Self::Split | Self::Updates => 1,
+            Self::Stories => 2,
         }
     }
 
     fn run(self, workspace: &Workspace, from: u64, seeds: u64) -> Result<bool> {
         match self {
-            Self::Kills => kills(workspace, from, seeds),
+            Self::Kills => each_seed(workspace, "kills", "kill::", from, seeds),
+            Self::Stories => each_seed(workspace, "stories", "story::", from, seeds),
             Self::Simulation => {
                 let mut command = test(workspace, "simulation", "many_seeds_keep_every_law");
                 command.env("MIDSHIFT_SEED_FROM", from.to_string()).env("MIDSHIFT_SEEDS", seeds.to_string());
@@ -70,14 +75,15 @@ fn test(workspace: &Workspace, target: &str, filter: &str) -> Command {
     workspace.cargo(&["test", "--package", "midshift-tests", "--test", target, "--", filter, "--nocapture"])
 }
 
-/// Kills programs at work, once with each seed of `from .. from + seeds`. Ends at the first that loses something.
-fn kills(workspace: &Workspace, from: u64, seeds: u64) -> Result<bool> {
+/// Real programs, once with each seed of `from .. from + seeds`. Ends at the first that breaks a law.
+fn each_seed(workspace: &Workspace, sweep: &str, filter: &str, from: u64, seeds: u64) -> Result<bool> {
     ensure!(run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins"]))?, "the programs do not build");
     for seed in from..from.saturating_add(seeds) {
-        let mut command = test(workspace, "e2e", "kill::");
+        let mut command = test(workspace, "e2e", filter);
         workspace.export_programs(&mut command)?;
-        if !counted(command.env("MIDSHIFT_SEED", seed.to_string()))? {
-            run::say(&format!("next: cargo xtask torture kills --from {seed} --seeds 1"));
+        command.env("MIDSHIFT_SEED", seed.to_string()).env("MIDSHIFT_STORY", "all");
+        if !counted(&mut command)? {
+            run::say(&format!("next: cargo xtask torture {sweep} --from {seed} --seeds 1"));
             return Ok(false);
         }
     }

@@ -30,5 +30,6 @@ mod rolled_out;
 mod room;
 mod split;
 mod stack;
+mod story;
 mod swarm_software;
 mod tuf;
