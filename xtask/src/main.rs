@@ -6,6 +6,7 @@
 mod apt;
 mod clients;
 mod docker;
+mod engine;
 mod fetch_tools;
 mod go;
 mod images;

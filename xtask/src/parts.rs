@@ -6,9 +6,10 @@
 use crate::fetch_tools::Tools;
 use crate::stack::{self, Which};
 use crate::workspace::Workspace;
-use crate::{clients, docker, run};
+use crate::{clients, docker, engine, run};
 use anyhow::Result;
 use clap::ValueEnum;
+use std::process::Command;
 
 /// One part.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
@@ -29,6 +30,8 @@ pub enum Part {
     Unit,
     /// The integration suite.
     Suite,
+    /// Its end-to-end tests again, with PostgreSQL behind the store.
+    Engine,
     /// Examples in the documentation.
     Doc,
     /// The split stack as processes: started, a task done through its proxy, ended.
@@ -60,6 +63,7 @@ impl Part {
             Self::Clients => "clients",
             Self::Unit => "unit",
             Self::Suite => "suite",
+            Self::Engine => "engine",
             Self::Doc => "doc",
             Self::Stack => "stack",
             Self::Compose => "compose",
@@ -68,12 +72,15 @@ impl Part {
 
     /// Whether outside tools take part.
     pub fn needs_tools(self) -> bool {
-        matches!(self, Self::Buf | Self::Clients | Self::Unit | Self::Suite | Self::Stack | Self::Compose)
+        matches!(
+            self,
+            Self::Buf | Self::Clients | Self::Unit | Self::Suite | Self::Engine | Self::Stack | Self::Compose
+        )
     }
 
     /// Whether it runs tests, which need the built programs.
     pub fn runs_tests(self) -> bool {
-        matches!(self, Self::Unit | Self::Suite | Self::Doc | Self::Stack | Self::Compose)
+        matches!(self, Self::Unit | Self::Suite | Self::Engine | Self::Doc | Self::Stack | Self::Compose)
     }
 
     /// Runs it; whether it succeeded. Tests are added to `count`.
@@ -96,28 +103,38 @@ impl Part {
                 let Some(tools) = tools else { return Ok(false) };
                 clients::build(workspace, &tools.python)
             }
-            Self::Unit => Self::tests(workspace, tools, count, &["--lib", "--bins"]),
-            Self::Suite => Self::tests(workspace, tools, count, &["--test", "*"]),
-            Self::Doc => Self::tests(workspace, tools, count, &["--doc"]),
+            Self::Unit => count.all(&mut tests(workspace, tools, &["--lib", "--bins"])?),
+            Self::Suite => count.all(&mut tests(workspace, tools, &["--test", "*"])?),
+            Self::Engine => {
+                let (name, value) = engine::VARIABLE;
+                count.all(tests(workspace, tools, &engine::selection())?.env(name, value))
+            }
+            Self::Doc => count.all(&mut tests(workspace, tools, &["--doc"])?),
             Self::Stack => count.one(stack::test(workspace, &Which::split(), Some(workspace.midshift()))),
             Self::Compose => count.one(docker::test(workspace, &workspace.midshift())),
         }
     }
+}
 
-    fn tests(workspace: &Workspace, tools: Option<&Tools>, count: &mut Count, targets: &[&str]) -> Result<bool> {
-        let mut command = workspace.cargo(&["test", "--workspace", "--no-fail-fast"]);
-        // What failed is said in a line; a hundred lines of where it was hide it.
-        command.args(targets).env("RUST_BACKTRACE", "0");
-        workspace.export_programs(&mut command)?;
-        if let Some(tools) = tools {
-            tools.export(&mut command);
-            clients::export(workspace, &mut command);
-        }
-        run::reading(&mut command, |line| count.add(line))
+/// `cargo test` of these targets, which hear where the programs are.
+fn tests(workspace: &Workspace, tools: Option<&Tools>, targets: &[&str]) -> Result<Command> {
+    let mut command = workspace.cargo(&["test", "--workspace", "--no-fail-fast"]);
+    // What failed is said in a line; a hundred lines of where it was hide it.
+    command.args(targets).env("RUST_BACKTRACE", "0");
+    workspace.export_programs(&mut command)?;
+    if let Some(tools) = tools {
+        tools.export(&mut command);
+        clients::export(workspace, &mut command);
     }
+    Ok(command)
 }
 
 impl Count {
+    /// Runs test programs to the end and adds theirs up; whether all succeeded.
+    fn all(&mut self, tests: &mut Command) -> Result<bool> {
+        run::reading(tests, |line| self.add(line))
+    }
+
     /// A part that is one test.
     fn one(&mut self, passed: Result<bool>) -> Result<bool> {
         let good = matches!(passed, Ok(true));

@@ -63,7 +63,7 @@ pub fn test(workspace: &Workspace, install: bool, no_docker: bool, asked: &[Part
 fn in_order(asked: &[Part]) -> Vec<Part> {
     let brought = |part: &Part| match part {
         Part::Build => asked.iter().any(|p| p.runs_tests()),
-        Part::Clients => asked.contains(&Part::Suite),
+        Part::Clients => asked.contains(&Part::Suite) || asked.contains(&Part::Engine),
         _ => false,
     };
     let wanted = |part: &Part| asked.is_empty() || asked.contains(part) || brought(part);
@@ -97,8 +97,9 @@ mod tests {
     #[test]
     fn parts_run_in_the_suites_order_and_tests_bring_the_build() {
         assert_eq!(in_order(&[Part::Suite, Part::Fmt]), [Part::Fmt, Part::Build, Part::Clients, Part::Suite]);
+        assert_eq!(in_order(&[Part::Engine]), [Part::Build, Part::Clients, Part::Engine]);
         assert_eq!(in_order(&[Part::Unit]), [Part::Build, Part::Unit]);
         assert_eq!(in_order(&[Part::Clippy]), [Part::Clippy]);
-        assert_eq!(in_order(&[]).len(), 11);
+        assert_eq!(in_order(&[]).len(), 12);
     }
 }

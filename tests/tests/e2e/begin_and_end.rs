@@ -1,5 +1,6 @@
 //! How the two servers begin and end: what they refuse to begin with, what they print, and that they leave when asked to.
 
+use crate::engine::fresh_store;
 use crate::harness::{Running, Server, channel, midshift, until};
 use anyhow::Context;
 use midshift_proto::task::v1::WatchTasksRequest;
@@ -41,7 +42,7 @@ async fn serve_refuses_to_leave_loopback_unless_somebody_says_insecure() -> anyh
 
     let log = dir.path().join("open.log");
     let mut command = Command::new(midshift()?);
-    command.current_dir(dir.path()).args(["serve", "--listen", "0.0.0.0:0", "--insecure"]);
+    command.current_dir(dir.path()).args(["serve", "--listen", "0.0.0.0:0", "--insecure"]).args(fresh_store()?);
     let mut open = Running::start(&mut command, &log)?;
     until("the server to say that it serves", LIMIT, || async {
         Ok(std::fs::read_to_string(&log)?.contains("midshift serves").then_some(()))

@@ -1,26 +1,12 @@
-//! Foreign clients as users have them: grpcurl by reflection, and Python with stubs from stock tools.
+//! Foreign clients as users have them: grpcurl by reflection, and Python with stubs from stock tools. What each does is a function of the
+//! address: a split stack is asked for the same in `languages.rs`.
 
-use crate::harness::{Running, channel, free_port, midshift, tool, until};
-use midshift_proto::telemetry::v1::ListRobotsRequest;
-use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
+use crate::factory::Factory;
+use crate::harness::tool;
 use std::net::SocketAddr;
 use std::path::Path;
 use std::process::{Command, Output};
 use std::time::Duration;
-
-/// A factory in memory with four robots, in `dir`; it says in `dev.log` how to go on.
-pub async fn dev(dir: &Path) -> anyhow::Result<(SocketAddr, Running)> {
-    let address = free_port()?;
-    let mut command = Command::new(midshift()?);
-    command.args(["dev", "--robots", "4", "--speedup", "10", "--seed", "3", "--listen", &address.to_string()]);
-    let running = Running::start(&mut command, &dir.join("dev.log"))?;
-    until("four robots", Duration::from_secs(30), || async {
-        let answer = TelemetryServiceClient::new(channel(address)?).list_robots(ListRobotsRequest::default()).await;
-        Ok(answer.ok().filter(|page| page.get_ref().robots.len() == 4).map(|_| ()))
-    })
-    .await?;
-    Ok((address, running))
-}
 
 /// Runs grpcurl.
 pub fn grpcurl(args: &[&str]) -> anyhow::Result<Output> {
@@ -46,7 +32,8 @@ pub fn http1(address: SocketAddr, request: &str) -> anyhow::Result<String> {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn prometheus_and_browsers_reach_the_same_port_over_http_1() -> anyhow::Result<()> {
     let dir = tempfile::tempdir()?;
-    let (address, _dev) = dev(dir.path()).await?;
+    let factory = Factory::one_box(dir.path()).await?;
+    let address = factory.address;
     let page = http1(address, "GET /metrics HTTP/1.1\r\nHost: midshift\r\nConnection: close\r\n\r\n")?;
     assert!(page.starts_with("HTTP/1.1 200") && page.contains("midshift_telemetry_heartbeats_total"), "{page}");
     assert!(!page.contains("rbt-"), "a metric has a label per robot");
@@ -63,7 +50,12 @@ async fn prometheus_and_browsers_reach_the_same_port_over_http_1() -> anyhow::Re
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn grpcurl_lists_submits_watches_and_hears_every_violation() -> anyhow::Result<()> {
     let dir = tempfile::tempdir()?;
-    let (address, _dev) = dev(dir.path()).await?;
+    let factory = Factory::one_box(dir.path()).await?;
+    grpcurl_passes(factory.address)
+}
+
+/// The whole of what grpcurl is asked to do.
+pub fn grpcurl_passes(address: SocketAddr) -> anyhow::Result<()> {
     let address = address.to_string();
     let services = text(&grpcurl(&[&address, "list"])?.stdout);
     for service in [
@@ -88,7 +80,7 @@ async fn grpcurl_lists_submits_watches_and_hears_every_violation() -> anyhow::Re
     assert!(said.contains(r#""fieldViolations""#), "its details cannot be read: {said}");
     let watch = r#"{"filter":{"task_ids":["TASK-GRPCURL"]}}"#;
     let watched = Command::new(tool("MIDSHIFT_TEST_GRPCURL")?)
-        .args(["-plaintext", "-max-time", "20", "-d", watch, &address, "midshift.task.v1.TaskService/WatchTasks"])
+        .args(["-plaintext", "-max-time", "60", "-d", watch, &address, "midshift.task.v1.TaskService/WatchTasks"])
         .output()?;
     let seen = text(&watched.stdout);
     assert!(seen.contains("TASK-GRPCURL") && seen.contains("TASK_STATE_SUCCEEDED"), "{seen} {}", text(&watched.stderr));
@@ -119,11 +111,16 @@ sys.exit("the watch ended: " + " > ".join(seen))
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_python_client_from_stock_tools_submits_and_watches() -> anyhow::Result<()> {
-    let python = tool("MIDSHIFT_TEST_PYTHON")?;
     let dir = tempfile::tempdir()?;
-    let (address, _dev) = dev(dir.path()).await?;
+    let factory = Factory::one_box(dir.path()).await?;
+    stock_python_passes(dir.path(), factory.address)
+}
+
+/// The same for a Python program whose stubs are generated into `dir`.
+pub fn stock_python_passes(dir: &Path, address: SocketAddr) -> anyhow::Result<()> {
+    let python = tool("MIDSHIFT_TEST_PYTHON")?;
     let proto = Path::new(env!("CARGO_MANIFEST_DIR")).join("../proto");
-    let out = dir.path().to_string_lossy().into_owned();
+    let out = dir.to_string_lossy().into_owned();
     let mut generate = Command::new(&python);
     generate
         .args(["-m", "grpc_tools.protoc", "-I"])
@@ -134,9 +131,9 @@ async fn a_python_client_from_stock_tools_submits_and_watches() -> anyhow::Resul
     }
     let generated = generate.output()?;
     assert!(generated.status.success(), "{}", text(&generated.stderr));
-    let script = dir.path().join("client.py");
+    let script = dir.join("client.py");
     std::fs::write(&script, CLIENT)?;
-    let ran = Command::new(&python).arg(&script).arg(address.to_string()).env("PYTHONPATH", dir.path()).output()?;
+    let ran = Command::new(&python).arg(&script).arg(address.to_string()).env("PYTHONPATH", dir).output()?;
     assert!(ran.status.success(), "{} {}", text(&ran.stdout), text(&ran.stderr));
     assert!(text(&ran.stdout).contains("TASK_STATE_SUCCEEDED"));
     Ok(())

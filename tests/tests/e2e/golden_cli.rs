@@ -2,6 +2,7 @@
 //!
 //! What differs from run to run (times, etags, positions in a log) stands there as its kind. Of a stream the first documents stand there.
 
+use crate::engine::fresh_store;
 use crate::harness::{Running, channel, free_port, midshift, until};
 use crate::room::{LIMIT, Room};
 use anyhow::Context;
@@ -200,7 +201,7 @@ async fn releases(room: &Room, t: &mut Transcript) -> anyhow::Result<()> {
     let address = free_port()?;
     let mut command = Command::new(&t.program);
     command.args(["serve", "--data", "served", "--ota-keys", "keys", "--listen", &address.to_string()]);
-    command.args(["--site", "site.toml"]);
+    command.args(["--site", "site.toml"]).args(fresh_store()?);
     let _serve = Running::start(command.current_dir(&t.dir), &t.dir.join("serve.log"))?;
     until("the server of software", LIMIT, || async {
         let mut client = BundleServiceClient::new(channel(address)?);

@@ -1,5 +1,6 @@
 //! Starts real programs in folders of their own and ends exactly those; waits for conditions, with limits.
 
+use crate::engine::fresh_store;
 use anyhow::{Context, bail};
 use midshift_core::site::DEMO;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
@@ -147,7 +148,7 @@ where
     }
 }
 
-/// A `midshift serve` on a data directory, which can be killed and started again.
+/// A `midshift serve` on a data directory and a store, which can be killed and started again.
 pub struct Server {
     /// Where it listens.
     pub address: SocketAddr,
@@ -165,11 +166,14 @@ impl Server {
     pub async fn start_on(dir: &Path, site: &str) -> anyhow::Result<Self> {
         Self::start_with(dir, site, &[]).await
     }
-    /// With more flags of `serve`.
+    /// With more flags of `serve`. A store that they name is the test's own; else it is a new one of the engine that the tests run on.
     pub async fn start_with(dir: &Path, site: &str, flags: &[&str]) -> anyhow::Result<Self> {
         std::fs::write(dir.join(SITE_FILE), site)?;
         let address = free_port()?;
-        let flags: Vec<String> = flags.iter().map(|flag| (*flag).to_owned()).collect();
+        let mut flags: Vec<String> = flags.iter().map(|flag| (*flag).to_owned()).collect();
+        if !flags.iter().any(|flag| flag == "--store") {
+            flags.extend(fresh_store()?);
+        }
         let running = Self::run(dir, address, &flags)?;
         let server = Self { address, dir: dir.to_owned(), flags, running };
         server.answers().await?;

@@ -3,15 +3,19 @@
 //!
 //! `cargo xtask test` builds them and says where they are.
 
-use crate::clients::dev;
-use crate::harness::{Running, Server, midshift, tool, until};
+use crate::clients::{grpcurl_passes, stock_python_passes};
+use crate::factory::Factory;
+use crate::harness::{Running, Server, channel, tasks, tool, until};
+use crate::rolled_out::{call, done};
 use crate::room::LIMIT;
+use crate::stack::Stack;
 use anyhow::{Context, ensure};
 use midshift_core::site::DEMO;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::ota::v1::{AbortRolloutRequest, GetRolloutRequest};
 use midshift_proto::task::v1::CancelTaskRequest;
 use std::io::Write;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -110,35 +114,29 @@ fn each_client_keeps_its_own_rules() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Takes the sample releases into the factory with its throw-away keys, as its first lines say.
-fn bring_samples(dir: &Path, server: &str) -> anyhow::Result<()> {
-    let log = said(&dir.join("dev.log"))?;
-    let flag = |name: &str| {
-        let mut words = log.split_whitespace().skip_while(|word| *word != name);
-        words.nth(1).with_context(|| format!("dev did not say its {name}")).map(str::to_owned)
-    };
-    let (repository, key) = (flag("--repository")?, flag("--key")?);
-    let samples = dir.join("samples").display().to_string();
-    let make = ["bundle", "samples", &samples, "--config-only", "--repository", &repository, "--key", &key];
-    midshift_does(&make)?;
-    midshift_does(&["bundle", "push", "--server", server, &repository])
-}
-
-fn midshift_does(arguments: &[&str]) -> anyhow::Result<()> {
-    let ran = Command::new(midshift()?).args(arguments).output()?;
-    ensure!(ran.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&ran.stderr));
-    Ok(())
-}
-
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn each_client_submits_watches_explains_hears_every_violation_and_watches_a_rollout() -> anyhow::Result<()> {
     let dir = tempfile::tempdir()?;
-    let (address, _dev) = dev(dir.path()).await?;
+    let factory = Factory::one_box(dir.path()).await?;
+    factory.bring_samples(dir.path())?;
+    tours_pass(dir.path(), factory.address).await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn each_client_and_foreign_ones_do_the_same_with_a_split_stack() -> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let factory = Factory::split(dir.path()).await?;
+    grpcurl_passes(factory.address)?;
+    stock_python_passes(dir.path(), factory.address)?;
+    tours_pass(dir.path(), factory.address).await
+}
+
+/// The tour of each client through a factory that has the sample releases, all at once.
+async fn tours_pass(dir: &Path, address: SocketAddr) -> anyhow::Result<()> {
     let server = address.to_string();
-    bring_samples(dir.path(), &server)?;
     let mut tours = Vec::new();
     for (language, robot) in ALL.into_iter().zip(["rbt-01", "rbt-02", "rbt-03"]) {
-        let log = dir.path().join(format!("{language:?}.log"));
+        let log = dir.join(format!("{language:?}.log"));
         let mut command = language.tour()?;
         tours.push((Running::start(command.args([&server, robot, "walk-1.5.0"]), &log)?, log, robot));
     }
@@ -176,32 +174,78 @@ async fn all_said(logs: &[PathBuf], beginning: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// What clients know by an address, all of which is killed and started again.
+enum Behind {
+    OneBox(Server),
+    Split(Box<Stack>),
+}
+
+impl Behind {
+    fn address(&self) -> SocketAddr {
+        match self {
+            Self::OneBox(server) => server.address,
+            Self::Split(stack) => stack.public,
+        }
+    }
+    fn kill(&mut self) -> anyhow::Result<()> {
+        match self {
+            Self::OneBox(server) => server.kill(),
+            Self::Split(stack) => stack.kill_all(),
+        }
+    }
+    async fn restart(&mut self) -> anyhow::Result<()> {
+        match self {
+            Self::OneBox(server) => server.restart().await,
+            Self::Split(stack) => stack.restart_all().await,
+        }
+    }
+}
+
+/// Sample releases in `dir`; the folder of their keys.
+fn samples(dir: &Path) -> anyhow::Result<String> {
+    done(&["bundle", "samples", &dir.join("samples").display().to_string()])?;
+    Ok(dir.join("samples/keys").display().to_string())
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn each_client_gives_up_in_time_and_outlives_a_server_that_is_killed() -> anyhow::Result<()> {
     let dir = tempfile::tempdir()?;
-    let samples = dir.path().join("samples");
-    let (folder, keys) = (samples.display().to_string(), samples.join("keys").display().to_string());
-    midshift_does(&["bundle", "samples", &folder])?;
-    let mut server = Server::start_with(dir.path(), DEMO, &["--ota-keys", &keys]).await?;
-    let address = server.address.to_string();
-    midshift_does(&["bundle", "push", "--server", &address, &samples.join("repository").display().to_string()])?;
+    let keys = samples(dir.path())?;
+    let server = Server::start_with(dir.path(), DEMO, &["--ota-keys", &keys]).await?;
+    endurance_passes(dir.path(), Behind::OneBox(server)).await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn each_client_gives_up_in_time_and_outlives_a_split_stack_that_is_killed() -> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let keys = samples(dir.path())?;
+    let stack = Stack::start(dir.path(), DEMO, &[], &["--ota-keys", &keys]).await?;
+    endurance_passes(dir.path(), Behind::Split(Box::new(stack))).await
+}
+
+/// Each client has a task and a roll-out under way when all that it talks to is killed, and both when it is back.
+async fn endurance_passes(dir: &Path, mut behind: Behind) -> anyhow::Result<()> {
+    let address = behind.address().to_string();
+    done(&["bundle", "push", "--server", &address, &dir.join("samples/repository").display().to_string()])?;
     let create = ["rollout", "create", "--server", &address, "walk-1.5.0", "--waves", "rest", "--allow-full-push"];
-    midshift_does(&create)?;
-    let logs = ALL.map(|language| dir.path().join(format!("{language:?}.log")));
+    // Another process than the one that took the release may be asked, and hears of it a moment later.
+    let known = || async { Ok(call(&create)?.status.success().then_some(())) };
+    until("the release to be known", LIMIT, known).await?;
+    let logs = ALL.map(|language| dir.join(format!("{language:?}.log")));
     let mut clients = Vec::new();
     for (language, log) in ALL.into_iter().zip(&logs) {
         let (running, ear) = Running::start_listening(language.endure()?.args([&address, "walk-1.5.0"]), log)?;
         clients.push((running, ear, log));
     }
     all_said(&logs, "submitted ").await?;
-    server.kill()?;
+    behind.kill()?;
     for (_, ear, _) in &mut clients {
         writeln!(ear, "killed")?;
     }
     all_said(&logs, "asking").await?;
-    server.restart().await?;
+    behind.restart().await?;
     all_said(&logs, "again ").await?;
-    let mut rollouts = RolloutServiceClient::new(server.channel()?);
+    let mut rollouts = RolloutServiceClient::new(channel(behind.address())?);
     let request = GetRolloutRequest { rollout_id: "walk-1.5.0".to_owned() };
     let rollout = rollouts.get_rollout(request).await?.into_inner().rollout.unwrap_or_default();
     let request = AbortRolloutRequest { rollout_id: rollout.rollout_id, etag: rollout.etag, ..Default::default() };
@@ -213,7 +257,7 @@ async fn each_client_gives_up_in_time_and_outlives_a_server_that_is_killed() -> 
         ensure!(after(&text, "again ").as_ref() == Some(&task_id), "it was made twice: {text}");
         ensure!(after(&text, "ended ").is_none(), "it ended too early: {text}");
         let request = CancelTaskRequest { task_id, reason: "the test is over".to_owned(), ..Default::default() };
-        server.tasks()?.cancel_task(request).await?;
+        tasks(behind.address())?.cancel_task(request).await?;
         ensure!(running.ends().await? == Some(0), "{}", said(log)?);
         ensure!(after(&said(log)?, "ended ").is_some_and(|state| state.ends_with("CANCELED")), "{}", said(log)?);
         ensure!(after(&said(log)?, "rollout ").is_some_and(|phase| phase.ends_with("ABORTED")), "{}", said(log)?);

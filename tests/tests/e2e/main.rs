@@ -13,6 +13,8 @@ macro_rules! say {
 mod begin_and_end;
 mod clients;
 mod cut;
+mod engine;
+mod factory;
 mod golden_cli;
 mod harness;
 mod held;

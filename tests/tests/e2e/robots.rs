@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// How many times as fast as real the bodies work; clocks are not touched.
-const BODY_SPEED: &str = "5";
+pub const BODY_SPEED: &str = "5";
 
 /// Agents in processes of their own, each with its folder, which can be killed and started again; or many in few processes.
 pub struct Robots {

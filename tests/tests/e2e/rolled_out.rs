@@ -2,6 +2,7 @@
 //! killed on the way.
 
 use crate::harness::{Running, Server, midshift, until};
+use crate::robots::BODY_SPEED;
 use crate::room::LIMIT;
 use anyhow::{Context, ensure};
 use midshift_agent::launcher::SWITCH;
@@ -44,7 +45,7 @@ impl Robot {
         let mut command = Command::new(&program);
         command.arg("launcher").arg("--record").arg(home.join("tries")).arg("--sets").arg(&sets).arg("--");
         command.arg(&program).args(["agent", "run", "--robot-id", id, "--no-faults", "--server", server]);
-        command.args(["--start", start]);
+        command.args(["--start", start, "--body-speed", BODY_SPEED]);
         command.arg("--data").arg(home.join("data")).arg("--sets").arg(&sets);
         command.arg("--trust").arg(home.join("trust.json")).process_group(0);
         Ok(Self { running: Running::start(&mut command, &home.join("log"))?, sets })

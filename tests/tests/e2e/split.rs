@@ -1,9 +1,10 @@
 //! The same services as processes of their own: each of them is killed or replaced while robots work, and nothing is lost.
 
+use crate::factory::with_software;
 use crate::harness::{channel, folder, in_states, until};
 use crate::kill::{TASKS, all_over, at_work, judge, judge_ledgers, submit};
 use crate::robots::Robots;
-use crate::rolled_out::{Robot, call, done};
+use crate::rolled_out::{call, done};
 use crate::room::LIMIT;
 use crate::stack::Stack;
 use anyhow::Context;
@@ -177,33 +178,12 @@ async fn a_fleet_that_was_frozen_while_another_took_over_assigns_nothing_twice()
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_roll_out_goes_on_while_processes_that_plan_it_sign_it_and_hand_it_out_are_killed() -> anyhow::Result<()> {
     let dir = folder()?;
-    let samples = dir.path().join("samples");
-    let (folder, keys) = (samples.display().to_string(), samples.join("keys").display().to_string());
-    done(&["bundle", "samples", &folder])?;
-    let mut stack = Stack::start(dir.path(), DEMO, &[], &["--ota-keys", &keys]).await?;
-    let (public, door) = (stack.public.to_string(), stack.robots.to_string());
-    let mut robots = Vec::new();
-    for (id, start) in [("rbt-01", "park-1"), ("rbt-02", "park-2"), ("rbt-03", "park-3")] {
-        robots.push(Robot::launch(id, start, &dir.path().join(id), &samples, &door)?);
-    }
-    done(&["bundle", "push", "--server", &public, &samples.join("repository").display().to_string()])?;
-    for id in ["rbt-01", "rbt-02", "rbt-03"] {
-        until("the robot is known", LIMIT, async || {
-            Ok(call(&["robot", "get", "--server", &public, id])?.status.success().then_some(()))
-        })
-        .await?;
-    }
+    let (mut stack, robots) = with_software(dir.path(), 3).await?;
+    let public = stack.public.to_string();
     let begin = |id: &str| {
         let quick = ["--soak", "0s", "--probation", "1s", "--exposure-tasks", "0", "--start"];
         done(&[&["rollout", "create", "--server", &public, id, "--waves", "1,rest"][..], &quick].concat())
     };
-    // Rows of a release are its leader's, a moment after it was published.
-    until("the release is known to whoever is asked", LIMIT, async || {
-        let listed = (0..4).map(|_| call(&["bundle", "ls", "--server", &public]));
-        let listed = listed.collect::<anyhow::Result<Vec<_>>>()?;
-        Ok(listed.iter().all(|l| String::from_utf8_lossy(&l.stdout).contains("1.5.1")).then_some(()))
-    })
-    .await?;
     let blows: [(&'static str, usize); 4] = [("ota", 0), ("ota", 1), ("telemetry", 0), ("fleet", 0)];
     begin("walk-1.5.0")?;
     // Robots out of work at once, while the canary goes and later.

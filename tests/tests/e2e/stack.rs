@@ -5,19 +5,23 @@ use crate::harness::{Running, channel, free_port, in_states, midshift, tool, unt
 use anyhow::Context;
 use midshift_proto::ota::v1::ListBundlesRequest;
 use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
+use midshift_tests::line::Line;
 use midshift_tests::postgres::PostgresServer;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
-/// What all processes say, below the stack's folder.
-const LOG: &str = "stack.log";
+/// Processes of a stack.
+const ROLES: [&str; 7] = ["task", "fleet", "fleet", "telemetry", "telemetry", "ota", "ota"];
 
 /// One process of a service.
 struct Member {
     role: &'static str,
     address: SocketAddr,
+    /// Its way to the database.
+    url: String,
+    log: PathBuf,
     running: Running,
 }
 
@@ -25,14 +29,13 @@ impl Member {
     /// Some if it may be given work; an error if it has ended.
     fn is_ready(&mut self) -> anyhow::Result<Option<()>> {
         anyhow::ensure!(!self.running.has_ended()?, "{} at {} ended", self.role, self.address);
-        let page = http1(self.address, "GET /ready HTTP/1.1\r\nHost: midshift\r\nConnection: close\r\n\r\n");
-        Ok(page.is_ok_and(|page| page.starts_with("HTTP/1.1 200")).then_some(()))
+        Ok(is_ready(self.address).is_some_and(|ready| ready).then_some(()))
     }
 }
 
-/// The end of what all processes said.
-fn said(dir: &Path) -> String {
-    let log = std::fs::read_to_string(dir.join(LOG)).unwrap_or_default();
+/// The end of what a process said.
+fn said(log: &Path) -> String {
+    let log = std::fs::read_to_string(log).unwrap_or_default();
     let lines: Vec<&str> = log.lines().rev().take(20).collect();
     lines.into_iter().rev().collect::<Vec<_>>().join("\n")
 }
@@ -55,6 +58,8 @@ pub struct Stack {
     url: String,
     members: Vec<Member>,
     proxy: Running,
+    /// The first gateway's own way to the database.
+    pub line: Line,
     /// Where people and programs go.
     pub public: SocketAddr,
     /// Where robots go.
@@ -71,28 +76,54 @@ impl Stack {
         let url = tokio::task::block_in_place(|| postgres.database());
         let owned = |flags: &[&str]| flags.iter().map(|flag| (*flag).to_owned()).collect();
         let flags = Flags { of_all: owned(flags), of_ota: owned(of_ota) };
-        let mut members = Vec::new();
-        for role in ["task", "fleet", "fleet", "telemetry", "telemetry", "ota", "ota"] {
-            let address = free_port()?;
-            members.push(Member { role, address, running: run(dir, &file, role, address, &url, &flags)? });
+        let line = Line::to(postgres.socket()).await?;
+        let mut members: Vec<Member> = Vec::new();
+        for role in ROLES {
+            let (address, nth) = (free_port()?, members.iter().filter(|member| member.role == role).count());
+            let url = if (role, nth) == ("telemetry", 0) { line.url(&url) } else { url.clone() };
+            let log = dir.join(format!("{role}-{nth}.log"));
+            let running = run(dir, &file, role, address, &url, &flags, &log)?;
+            members.push(Member { role, address, url, log, running });
         }
         let (public, robots) = (free_port()?, free_port()?);
         let proxy = proxy(dir, &members, public, robots, None)?;
-        let mut stack = Self { dir: dir.to_owned(), site: file, flags, postgres, url, members, proxy, public, robots };
-        for member in &mut stack.members {
+        let mut stack =
+            Self { dir: dir.to_owned(), site: file, flags, postgres, url, members, proxy, line, public, robots };
+        stack.answers().await?;
+        Ok(stack)
+    }
+
+    /// Waits until every process is ready and the proxy knows it.
+    async fn answers(&mut self) -> anyhow::Result<()> {
+        for member in &mut self.members {
             until("a process that is ready", Duration::from_secs(60), || {
-                std::future::ready(member.is_ready().with_context(|| said(dir)))
+                std::future::ready(member.is_ready().with_context(|| said(&member.log)))
             })
             .await?;
         }
         until("the stack's first answer", Duration::from_secs(60), || async {
-            let bundles = BundleServiceClient::new(channel(public)?).list_bundles(ListBundlesRequest::default()).await;
+            let mut client = BundleServiceClient::new(channel(self.public)?);
+            let bundles = client.list_bundles(ListBundlesRequest::default()).await;
             let is_served = |status: &tonic::Status| status.code() == tonic::Code::FailedPrecondition;
             let has_ota = bundles.as_ref().map_or_else(is_served, |_| true);
-            Ok(in_states(public, &[]).await?.filter(|_| has_ota).map(|_| ()))
+            Ok(in_states(self.public, &[]).await?.filter(|_| has_ota).map(|_| ()))
         })
-        .await?;
-        Ok(stack)
+        .await
+    }
+
+    /// Where one process listens, behind the proxy.
+    pub fn address(&mut self, role: &str, nth: usize) -> anyhow::Result<SocketAddr> {
+        Ok(self.member(role, nth)?.address)
+    }
+
+    /// What one process has said so far.
+    pub fn said(&mut self, role: &str, nth: usize) -> anyhow::Result<String> {
+        Ok(std::fs::read_to_string(&self.member(role, nth)?.log)?)
+    }
+
+    /// The database, by the way of all but the first gateway.
+    pub fn url(&self) -> &str {
+        &self.url
     }
 
     fn member(&mut self, role: &str, nth: usize) -> anyhow::Result<&mut Member> {
@@ -118,11 +149,26 @@ impl Stack {
     }
 
     /// Starts one again that has ended, at its old address.
-    pub fn restart(&mut self, role: &'static str, nth: usize) -> anyhow::Result<()> {
-        let (dir, site, url, flags) = (self.dir.clone(), self.site.clone(), self.url.clone(), self.flags.clone());
+    pub fn restart(&mut self, role: &str, nth: usize) -> anyhow::Result<()> {
+        let (dir, site, flags) = (self.dir.clone(), self.site.clone(), self.flags.clone());
         let member = self.member(role, nth)?;
-        member.running = run(&dir, &site, role, member.address, &url, &flags)?;
+        member.running = run(&dir, &site, role, member.address, &member.url, &flags, &member.log)?;
         Ok(())
+    }
+
+    /// SIGKILL of the proxy and of every process behind it.
+    pub fn kill_all(&mut self) -> anyhow::Result<()> {
+        self.proxy.kill()?;
+        self.members.iter_mut().try_for_each(|member| member.running.kill())
+    }
+
+    /// Starts all of them again after [`Stack::kill_all`], and waits until they answer.
+    pub async fn restart_all(&mut self) -> anyhow::Result<()> {
+        for member in &mut self.members {
+            member.running = run(&self.dir, member.role, member.address, &member.url, &self.flags, &member.log)?;
+        }
+        self.proxy = proxy(&self.dir, &self.members, self.public, self.robots, None)?;
+        self.answers().await
     }
 
     /// A new proxy takes over; streams that run go on in the old one, which this test ends with itself.
@@ -155,14 +201,28 @@ impl Stack {
     }
 }
 
-fn run(dir: &Path, site: &Path, role: &str, address: SocketAddr, url: &str, flags: &Flags) -> anyhow::Result<Running> {
+/// What a process says to a proxy that asks whether it is ready; none: nothing.
+pub fn is_ready(address: SocketAddr) -> Option<bool> {
+    let page = http1(address, "GET /ready HTTP/1.1\r\nHost: midshift\r\nConnection: close\r\n\r\n").ok()?;
+    Some(page.starts_with("HTTP/1.1 200"))
+}
+
+fn run(
+    dir: &Path,
+    site: &Path,
+    role: &str,
+    address: SocketAddr,
+    url: &str,
+    flags: &Flags,
+    log: &Path,
+) -> anyhow::Result<Running> {
     let mut command = Command::new(midshift()?);
     command.args(["serve", "--roles", role, "--store", url, "--listen", &address.to_string(), "--data"]);
     command.arg(dir.join("data")).arg("--site").arg(site).args(&flags.of_all);
     if role == "ota" {
         command.args(&flags.of_ota);
     }
-    Running::start(&mut command, &dir.join(LOG))
+    Running::start(&mut command, log)
 }
 
 fn proxy(
