@@ -11,6 +11,7 @@ pub mod ids;
 pub mod lead;
 pub mod limits;
 pub mod maintenance;
+pub mod once;
 pub mod picture;
 pub mod policy;
 pub mod reason;

@@ -90,6 +90,7 @@ tables! {
     AreaBundle "area_bundle" Ota, "What robots get that come to an area later. id = area_id.";
     OtaMark "ota_mark" Ota, "Last position of the feed that ota has consumed.";
     OtaClock "ota_clock" Ota, "Serving time of ota, and the last number it gave to a drain or permission.";
+    OtaCommandKey "ota_command_key" Ota, "request_id -> command about software carried out; kept 7 days.";
     OtaLeader "ota_leader" Ota, "Which process of ota plans and signs; renewed each second where there may be several.";
 }
 

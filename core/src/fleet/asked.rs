@@ -1,7 +1,9 @@
 //! What people ask of fleet directly, as it is kept with its request_id. What comes of it is in `commands`.
 
 use crate::ids::{PlaceId, RobotId};
+use crate::once::Asked;
 use crate::policy::AreaPolicy;
+use crate::rows::Table;
 use serde::{Deserialize, Serialize};
 
 /// One request.
@@ -57,4 +59,8 @@ pub enum Command {
         /// What was found.
         reason: String,
     },
+}
+
+impl Asked for Command {
+    const KEYS: Table = Table::CommandKey;
 }

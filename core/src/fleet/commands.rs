@@ -2,43 +2,13 @@
 
 use super::Tx;
 pub use super::asked::Command;
-use super::rows::{CommandKey, Cordon, HolderState, Place, PlaceHolder, RobotControl};
+use super::rows::{Cordon, HolderState, Place, PlaceHolder, RobotControl};
 use super::view::View;
 use super::{Board, drain, heard, incidents};
 use crate::ids::RobotId;
-use crate::limits;
 use crate::reason::{Code, Kind, Reason, Refusal, Violations};
 use crate::robot::Presence;
 use crate::rows::Revision;
-
-/// Used request_ids let go of with one command.
-const FORGOTTEN_AT_ONCE: usize = 4;
-
-/// Whether this is a command that was carried out already: the same request_id, and the same in every part.
-///
-/// # Errors
-/// The request_id was used for something else.
-pub fn is_repeat(view: &View, request_id: &str, command: &Command, seen: Option<Revision>) -> Result<bool, Refusal> {
-    match view.command_keys.get(request_id).map(|k| &k.row) {
-        None => Ok(false),
-        Some(known) if known.command == *command && known.seen == seen => Ok(true),
-        Some(_) => {
-            let reason = Reason::from(Code::RequestIdReused).with("request_id", request_id);
-            Err(Refusal::new(Kind::AlreadyExists, reason))
-        }
-    }
-}
-
-/// Writes down that a command was carried out, and lets go of a few that are past their time.
-pub fn remember(tx: &mut Tx, request_id: &str, command: &Command, seen: Option<Revision>) {
-    let at_unix_ms = tx.now.wall.0;
-    let oldest_ms = at_unix_ms - (limits::REMEMBER_DAYS * 86_400_000) as i64;
-    let past = tx.view.command_keys.values().filter(|k| k.row.at_unix_ms < oldest_ms).take(FORGOTTEN_AT_ONCE);
-    let past: Vec<String> = past.map(|k| k.row.id.clone()).collect();
-    past.iter().for_each(|id| tx.delete::<CommandKey>(id, "command.forgotten"));
-    let key = CommandKey { id: request_id.to_owned(), command: command.clone(), seen, at_unix_ms };
-    tx.put(key, "command.done");
-}
 
 /// Checks a command against what is known; an error changes nothing.
 pub fn check(

@@ -4,7 +4,7 @@ use super::asked::Command;
 use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, RolloutId, SiteId, TaskId};
 use crate::reason::Reason;
 use crate::robot::Duty;
-use crate::rows::{Index, Record, Revision, Seq, Table};
+use crate::rows::{Index, Record, Seq, Table};
 use crate::time::Utc;
 use crate::work::WorkStats;
 use serde::{Deserialize, Serialize};
@@ -448,25 +448,5 @@ impl Record for Drain {
     }
 }
 
-/// A used request_id of a command: the same command again is the same command, and is not carried out twice. Kept 7 days.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct CommandKey {
-    /// The client's request_id.
-    pub id: String,
-    /// What it asked for.
-    pub command: Command,
-    /// The etag it gave.
-    pub seen: Option<Revision>,
-    /// UTC of the wall, unix ms.
-    pub at_unix_ms: i64,
-}
-
-impl Record for CommandKey {
-    const TABLE: Table = Table::CommandKey;
-    fn id(&self) -> String {
-        self.id.clone()
-    }
-    fn index(&self) -> Index {
-        Index { order: Some(self.at_unix_ms), ..Index::default() }
-    }
-}
+/// A used request_id of a command.
+pub type CommandKey = crate::once::CommandKey<Command>;

@@ -14,14 +14,17 @@ use super::{Board, Plan, Tx, assign, moves, phases, robots, verdict};
 use crate::gates::FailureEvidence;
 use crate::ids::{BundleId, RobotId, RolloutId};
 use crate::limits;
+use crate::once;
 use crate::reason::{Code, Kind, Reason, Refusal, Violations};
-use crate::rows::Revision;
+use crate::rows::{Revision, Table};
 use crate::time::Now;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
 /// One request about a roll-out.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Verb {
     /// Check it, and go on to VALIDATED.
     Submit,
@@ -47,7 +50,8 @@ pub enum Verb {
 }
 
 /// One request.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Command {
     /// Write a roll-out down.
     Create {
@@ -98,6 +102,64 @@ pub enum Command {
         /// Which.
         bundle: BundleId,
     },
+}
+
+impl once::Asked for Command {
+    const KEYS: Table = Table::OtaCommandKey;
+}
+
+/// A command as somebody asks for it.
+#[derive(Clone, Debug)]
+pub struct Ask {
+    /// What.
+    pub command: Command,
+    /// Only if the roll-out is still as this says.
+    pub seen: Option<Revision>,
+    /// To be checked and not carried out.
+    pub check_only: CheckOnly,
+    /// The same id with the same command is one request. A [`Verb::Start`] and a [`Verb::RetryFailed`] take none: they are more than one item.
+    pub request_id: Option<String>,
+    /// Who asks.
+    pub actor: String,
+}
+
+/// Whether a command is only checked.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum CheckOnly {
+    /// Nothing is written.
+    Yes,
+    /// It is carried out.
+    No,
+}
+
+/// Decides on a request whole: what was carried out before, under its request_id or by what is known, is not carried out again.
+///
+/// # Errors
+/// Why not; a request_id that was used for something else.
+pub fn take(view: &mut View, board: &Board, now: Now, ask: &Ask, plan: &mut Plan) -> Result<(), Refusal> {
+    let Ask { command, seen, check_only, request_id, actor } = ask;
+    if let Some(id) = request_id
+        && once::is_repeat(&view.command_keys, id, command, *seen)?
+    {
+        return Ok(());
+    }
+    let is_done = check(view, board, command, *seen)?;
+    if *check_only == CheckOnly::Yes {
+        return Ok(());
+    }
+    match request_id {
+        None if is_done => {}
+        None => apply(view, board, now, command, actor, plan),
+        Some(id) => {
+            let mut tx = Tx::new(view, now, actor).on_request(Some(id));
+            if !is_done {
+                apply_one(&mut tx, board, command, actor);
+            }
+            once::remember(&mut tx, id, command, *seen);
+            plan.items.extend(tx.finish());
+        }
+    }
+    Ok(())
 }
 
 fn not_found(code: Code, key: &str, id: &impl ToString) -> Refusal {

@@ -629,3 +629,6 @@ impl Record for OtaClock {
         "ota".to_owned()
     }
 }
+
+/// A used request_id of a command.
+pub type CommandKey = crate::once::CommandKey<super::commands::Command>;

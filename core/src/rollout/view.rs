@@ -2,7 +2,9 @@
 //!
 //! Called by every room of `rollout`. Invariant: as [`crate::picture`] says; after a conflict the whole view is built again, never patched.
 
-use super::rows::{AreaBundle, Bundle, OtaClock, OtaMark, Quarantine, RobotSoftware, Rollout, RolloutRobot};
+use super::rows::{
+    AreaBundle, Bundle, CommandKey, OtaClock, OtaMark, Quarantine, RobotSoftware, Rollout, RolloutRobot,
+};
 use crate::fleet::Board;
 use crate::fleet::heard;
 use crate::fleet::rows::{Drain, RobotAuthority, RobotControl, RobotCounter, RobotHolder};
@@ -47,6 +49,8 @@ pub struct View {
     pub marks: Slot<OtaMark>,
     /// Serving time and numbers.
     pub clocks: Slot<OtaClock>,
+    /// Used request_ids.
+    pub command_keys: Slot<CommandKey>,
     /// Drains (fleet's).
     pub drains: Slot<Drain>,
     /// Robots' mutexes (fleet's).
@@ -118,6 +122,7 @@ viewed! {
     DesiredUpdate => desired;
     OtaMark => marks;
     OtaClock => clocks;
+    CommandKey => command_keys;
     Drain => drains;
     RobotAuthority => authority;
     RobotCounter => counters;
@@ -230,6 +235,7 @@ pub const TABLES: &[Table] = &[
     Table::AreaBundle,
     Table::OtaMark,
     Table::OtaClock,
+    Table::OtaCommandKey,
     Table::Drain,
     Table::RobotAuthority,
     Table::RobotControl,
@@ -255,6 +261,7 @@ impl View {
             area_bundles: Slot::new(),
             marks: Slot::new(),
             clocks: Slot::new(),
+            command_keys: Slot::new(),
             drains: Slot::new(),
             authority: Slot::new(),
             control: Slot::new(),
@@ -318,6 +325,7 @@ impl View {
             AreaBundle => AreaBundle,
             OtaMark => OtaMark,
             OtaClock => OtaClock,
+            OtaCommandKey => CommandKey,
             Drain => Drain,
             RobotAuthority => RobotAuthority,
             RobotControl => RobotControl,

@@ -9,6 +9,7 @@ use midshift_core::fleet::view::{TABLES, View};
 use midshift_core::fleet::{Board, LOGS, Pace, Plan, absorb, commands, cycle, found, obeyed};
 use midshift_core::lead::{FleetLeader, Own, Seat, Stance};
 use midshift_core::limits;
+use midshift_core::once;
 use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::rows::{Entry, Item, Log, Seq, Table};
@@ -313,7 +314,7 @@ impl Loop {
                 Request::Look(look) => self.looks.push(look),
                 Request::Do { command, seen, validate_only, actor, request_id, reply } => {
                     let repeat = match &request_id {
-                        Some(id) => commands::is_repeat(&self.view, id, &command, seen),
+                        Some(id) => once::is_repeat(&self.view.command_keys, id, &*command, seen),
                         None => Ok(false),
                     };
                     let is_repeat = matches!(repeat, Ok(true));
@@ -332,7 +333,7 @@ impl Loop {
                         midshift_core::fleet::Tx::new(&mut self.view, now, &actor).on_request(request_id.as_deref());
                     commands::apply(&mut tx, &command, &actor);
                     if let Some(id) = &request_id {
-                        commands::remember(&mut tx, id, &command, seen);
+                        once::remember(&mut tx, id, &*command, seen);
                     }
                     plan.items.extend(tx.finish());
                     replies.push((reply, plan.items.len()));

@@ -8,6 +8,7 @@ use crate::reconcile::Loop;
 use midshift_core::fleet::commands::{self, Command};
 use midshift_core::fleet::{LOGS, Tx, follow_rows, reread};
 use midshift_core::limits;
+use midshift_core::once;
 use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Entry, Item, Revision};
@@ -101,7 +102,7 @@ impl Loop {
     fn decide(&mut self, asked: &Asked) -> Result<Option<Item>, Refusal> {
         let Asked { command, seen, validate_only, actor, request_id } = asked;
         if let Some(id) = request_id
-            && commands::is_repeat(&self.view, id, command, *seen)?
+            && once::is_repeat(&self.view.command_keys, id, *command, *seen)?
         {
             return Ok(None);
         }
@@ -113,7 +114,7 @@ impl Loop {
         let mut tx = Tx::new(&mut self.view, now, actor).on_request(*request_id);
         commands::apply(&mut tx, command, actor);
         if let Some(id) = request_id {
-            commands::remember(&mut tx, id, command, *seen);
+            once::remember(&mut tx, id, *command, *seen);
         }
         let item = tx.finish();
         self.view.rest();

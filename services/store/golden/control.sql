@@ -220,6 +220,17 @@ CREATE TABLE ota_clock (
     UNIQUE (site_id, id)
 );
 
+CREATE TABLE ota_command_key (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE TABLE ota_event (
     site_id TEXT NOT NULL,
     seq BIGINT NOT NULL,

@@ -87,6 +87,7 @@ pub(crate) const CONTROL: &[Migration] = migrations!["control":
     "0065_robot_last_by_position",
     "0066_fleet_leader",
     "0067_ota_leader",
+    "0068_ota_command_key",
 ];
 
 /// Of `telemetry.db`.

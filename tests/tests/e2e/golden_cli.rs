@@ -254,7 +254,10 @@ async fn rollouts(room: &Room, t: &mut Transcript, address: SocketAddr) -> anyho
     t.note(&["rollout", "create", "walk-9", "--dry-run"])?;
     t.note(&["rollout", "create", "walk-1.5.0", "--waves", "101%,rest,0", "--probation", "10ms", "--dry-run"])?;
     t.note(&["rollout", "create", "walk-1.5.0", "--waves", "1,many", "--dry-run"])?;
-    t.note(&["robot", "pin", "r2", "--reason", "it is being measured"])?;
+    let pin = ["robot", "pin", "r2", "--request-id", "pin-1", "--reason"];
+    t.note(&[&pin[..], &["it is being measured", "--dry-run"]].concat())?;
+    t.note(&[&pin[..], &["it is being measured"]].concat())?;
+    t.note(&[&pin[..], &["it is being mended"]].concat())?;
     t.note(&["robot", "pin", "r9", "--reason", "it is being measured"])?;
     t.note(&[&create[..], &["--dry-run"]].concat())?;
     t.note(&["robot", "unpin", "r2", "-o", "json"])?;
@@ -299,7 +302,8 @@ async fn rollouts(room: &Room, t: &mut Transcript, address: SocketAddr) -> anyho
     t.note(&["rollout", "rollback", "walk-1.5.0", "--as", "back"])?;
     t.note(&["quarantine", "ls"])?;
     t.note(&["quarantine", "ls", "-o", "json"])?;
-    t.note(&["quarantine", "lift", "r2", "walk-1.5.0"])?;
+    t.note(&["quarantine", "lift", "r2", "walk-1.5.0", "--dry-run"])?;
+    t.note(&["bundle", "revoke", "walk-1.5.0", "--reason", "it limps", "--dry-run"])?;
     t.note(&["bundle", "revoke", "walk-1.5.0", "--reason", "it limps"])?;
     t.note(&["rollout", "create", "again", "--bundle", "walk-1.5.0"])?;
     t.note(&["robot", "retire", "r2", "--reason", "sold", "-o", "name"])?;

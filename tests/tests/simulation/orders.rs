@@ -117,13 +117,22 @@ async fn ask(order: &Order) -> Result<(), Status> {
         Order::Abort(id) => verb!(client, abort_rollout, AbortRolloutRequest, id),
         Order::Exclude(rollout_id, robot_id) => {
             let etag = seen(&mut client, &rollout_id).await?.etag;
-            let request = ota::ExcludeRobotRequest { rollout_id, robot_id, etag, reason: "drawn".to_owned() };
+            let request = ota::ExcludeRobotRequest {
+                rollout_id,
+                robot_id,
+                etag,
+                reason: "drawn".to_owned(),
+                ..Default::default()
+            };
             client.exclude_robot(request).await.map(drop)
         }
-        Order::Pin(robot_id) => {
-            client.pin_robot(ota::PinRobotRequest { robot_id, reason: "drawn".to_owned() }).await.map(drop)
+        Order::Pin(robot_id) => client
+            .pin_robot(ota::PinRobotRequest { robot_id, reason: "drawn".to_owned(), ..Default::default() })
+            .await
+            .map(drop),
+        Order::Unpin(robot_id) => {
+            client.unpin_robot(ota::UnpinRobotRequest { robot_id, ..Default::default() }).await.map(drop)
         }
-        Order::Unpin(robot_id) => client.unpin_robot(ota::UnpinRobotRequest { robot_id }).await.map(drop),
         Order::Drain(robot_id) => {
             let request = DrainRobotRequest { robot_id, reason: "to look at it".to_owned(), ..Default::default() };
             FleetServiceClient::new(channel).drain_robot(request).await.map(drop)

@@ -10,6 +10,7 @@ mod drains_and_grants;
 mod keyless;
 mod named;
 mod newcomers_and_pins;
+mod once;
 mod people;
 mod recovery;
 mod reverts_and_second_pass;

@@ -1,6 +1,6 @@
 //! `midshift bundle …`: what release people do with keys and bundles. Only `push`, `ls` and `revoke` need a server.
 
-use super::client::{Call, Exit};
+use super::client::{Call, Change, Exit};
 use super::out::{Format, Out};
 use super::{push, released};
 use crate::clock;
@@ -129,6 +129,9 @@ pub enum Verb {
         call: Call,
     },
     /// Take a bundle back: its roll-outs stand still and nobody gets it any more. Robots that run it go on.
+    ///
+    /// It signs nothing and cannot be undone; `bundle withdraw` takes it out of the releases too. With --dry-run it only names the roll-outs that
+    /// would stand still.
     Revoke {
         #[command(flatten)]
         call: Call,
@@ -137,6 +140,8 @@ pub enum Verb {
         /// Why.
         #[arg(long)]
         reason: String,
+        #[command(flatten)]
+        change: Change,
     },
 }
 
@@ -192,7 +197,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Verify { repository } => verify(&repository, out),
         Verb::Push { repository, call } => push::run(&repository, &call, out).await,
         Verb::Ls { call } => released::list(&call, out).await,
-        Verb::Revoke { call, bundle, reason } => released::revoke(&call, bundle, reason, out).await,
+        Verb::Revoke { call, bundle, reason, change } => released::revoke(&call, bundle, reason, change, out).await,
     }
 }
 

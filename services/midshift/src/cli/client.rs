@@ -257,6 +257,9 @@ pub fn unary<T>(message: T) -> Request<T> {
     request
 }
 
+/// What comes after a check that found nothing against it.
+pub const WOULD: &str = "the same without --dry-run does it";
+
 /// What every verb that changes something takes.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Change {

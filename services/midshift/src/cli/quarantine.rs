@@ -1,6 +1,6 @@
 //! `midshift quarantine …`: bundles that robots went back from.
 
-use super::client::{Call, Exit, unary};
+use super::client::{Call, Change, Exit, WOULD, unary};
 use super::out::Out;
 use clap::Subcommand;
 use midshift_proto::convert::time_of;
@@ -22,6 +22,8 @@ pub enum Verb {
         robot_id: String,
         /// As NAME-VERSION or by its SHA-256.
         bundle: String,
+        #[command(flatten)]
+        change: Change,
     },
 }
 
@@ -47,10 +49,20 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             }
             Ok(())
         }
-        Verb::Lift { call, robot_id, bundle } => {
-            let request = v1::LiftQuarantineRequest { robot_id: robot_id.clone(), bundle: bundle.clone() };
+        Verb::Lift { call, robot_id, bundle, change } => {
+            let request = v1::LiftQuarantineRequest {
+                robot_id: robot_id.clone(),
+                bundle: bundle.clone(),
+                request_id: change.request_id,
+                validate_only: change.dry_run,
+            };
             let answer = call.rollouts().await?.lift_quarantine(unary(request)).await.map_err(Exit::with_facts)?;
-            out.one(&answer.into_inner(), &robot_id, || format!("{robot_id} may have {bundle} again"))?;
+            let may = if change.dry_run { "could have" } else { "may have" };
+            out.one(&answer.into_inner(), &robot_id, || format!("{robot_id} {may} {bundle} again"))?;
+            if change.dry_run {
+                out.next(WOULD);
+                return Ok(());
+            }
             out.next(
                 "midshift rollout ls; a completed roll-out tries it again with: midshift rollout retry ID --failed",
             );

@@ -1,6 +1,6 @@
 //! `midshift bundle ls` and `revoke`: bundles as the server has them, and who runs them.
 
-use super::client::{Call, Exit, unary};
+use super::client::{Call, Change, Exit, WOULD, unary};
 use super::out::{Format, Out};
 use midshift_proto::ota::v1;
 use std::collections::BTreeMap;
@@ -90,9 +90,15 @@ async fn software(call: &Call) -> Result<Vec<v1::RobotSoftware>, Exit> {
 }
 
 /// Takes a bundle back.
-pub async fn revoke(call: &Call, bundle: String, reason: String, out: &Out) -> Result<(), Exit> {
-    let request = v1::RevokeBundleRequest { bundle: bundle.clone(), reason };
+pub async fn revoke(call: &Call, bundle: String, reason: String, change: Change, out: &Out) -> Result<(), Exit> {
+    let Change { request_id, dry_run: validate_only } = change;
+    let request = v1::RevokeBundleRequest { bundle: bundle.clone(), reason, request_id, validate_only };
     let answer = call.rollouts().await?.revoke_bundle(unary(request)).await.map_err(Exit::with_facts)?.into_inner();
+    if validate_only {
+        out.one(&answer, &answer.bundle, || format!("{bundle} would be taken back; then {}", open(&answer)))?;
+        out.next(WOULD);
+        return Ok(());
+    }
     out.one(&answer, &answer.bundle, || format!("{bundle} is taken back: nobody gets it any more; {}", open(&answer)))?;
     match answer.rollout_ids.first() {
         Some(id) => out.next(&format!("midshift rollout abort {id}; then midshift bundle withdraw {bundle}")),

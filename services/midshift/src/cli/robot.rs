@@ -1,6 +1,6 @@
 //! `midshift robot …`
 
-use super::client::{Call, Change, Exit, unary};
+use super::client::{Call, Change, Exit, WOULD, unary};
 use super::out::{Format, Out};
 use super::rollout;
 use clap::Subcommand;
@@ -103,9 +103,16 @@ pub enum Verb {
         /// Why.
         #[arg(long)]
         reason: String,
+        #[command(flatten)]
+        change: Change,
     },
     /// Let it take part in roll-outs again.
-    Unpin(One),
+    Unpin {
+        #[command(flatten)]
+        one: One,
+        #[command(flatten)]
+        change: Change,
+    },
     /// Leave it out of a roll-out that did not take it out of work yet.
     Exclude {
         #[command(flatten)]
@@ -116,6 +123,8 @@ pub enum Verb {
         /// Why.
         #[arg(long, default_value = "")]
         reason: String,
+        #[command(flatten)]
+        change: Change,
     },
 }
 
@@ -198,19 +207,31 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             out.next(&format!("midshift robot uncordon {} brings it back", one.robot_id));
             Ok(())
         }
-        Verb::Pin { one, reason } => {
-            let request = ota::PinRobotRequest { robot_id: one.robot_id.clone(), reason };
+        Verb::Pin { one, reason, change } => {
+            let request = ota::PinRobotRequest {
+                robot_id: one.robot_id.clone(),
+                reason,
+                request_id: change.request_id,
+                validate_only: change.dry_run,
+            };
             let answer = one.call.rollouts().await?.pin_robot(unary(request)).await.map_err(Exit::with_facts)?;
             software(&answer.into_inner().software.unwrap_or_default(), out)?;
-            out.next(&format!("midshift robot unpin {}", one.robot_id));
+            let next = format!("midshift robot unpin {}", one.robot_id);
+            out.next(if change.dry_run { WOULD } else { &next });
             Ok(())
         }
-        Verb::Unpin(one) => {
-            let request = ota::UnpinRobotRequest { robot_id: one.robot_id.clone() };
+        Verb::Unpin { one, change } => {
+            let request = ota::UnpinRobotRequest {
+                robot_id: one.robot_id,
+                request_id: change.request_id,
+                validate_only: change.dry_run,
+            };
             let answer = one.call.rollouts().await?.unpin_robot(unary(request)).await.map_err(Exit::with_facts)?;
             software(&answer.into_inner().software.unwrap_or_default(), out)
         }
-        Verb::Exclude { one, from, reason } => rollout::exclude(&one.call, from, one.robot_id, reason, out).await,
+        Verb::Exclude { one, from, reason, change } => {
+            rollout::exclude(&one.call, from, one.robot_id, reason, change, out).await
+        }
     }
 }
 

@@ -1,10 +1,10 @@
 //! The gRPC face of roll-outs: decode, call, encode.
 
 use super::{RolloutService, decode, encode, watch};
-use midshift_core::ids::{RobotId, RolloutId};
+use midshift_core::ids::{RequestId, RobotId, RolloutId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
-use midshift_core::rollout::commands::{Command, Verb};
+use midshift_core::rollout::commands::{CheckOnly, Command, Verb};
 use midshift_core::rollout::dry_run::dry_run;
 use midshift_core::rollout::rows::Rollout;
 use midshift_core::rollout::view::View;
@@ -37,6 +37,18 @@ fn required_reason(text: &str, bad: &mut Violations) {
     }
 }
 
+/// The client's request_id; none: no protection.
+fn request_id(text: &str, bad: &mut Violations) -> Option<String> {
+    if !text.is_empty() {
+        bad.take("request_id", RequestId::parse(text));
+    }
+    (!text.is_empty()).then(|| text.to_owned())
+}
+
+fn check_only(validate_only: bool) -> CheckOnly {
+    if validate_only { CheckOnly::Yes } else { CheckOnly::No }
+}
+
 /// What all verbs about one roll-out say.
 struct About<'a> {
     rollout_id: &'a str,
@@ -56,6 +68,17 @@ impl RolloutService {
     }
 
     async fn verb(&self, about: About<'_>, verb: Verb, needs_etag: bool) -> Result<Option<v1::Rollout>, Refusal> {
+        self.verb_once(about, verb, needs_etag, CheckOnly::No, None).await
+    }
+
+    async fn verb_once(
+        &self,
+        about: About<'_>,
+        verb: Verb,
+        needs_etag: bool,
+        check_only: CheckOnly,
+        request_id: Option<String>,
+    ) -> Result<Option<v1::Rollout>, Refusal> {
         let mut bad = Violations::default();
         let rollout_id = bad.take("rollout_id", RolloutId::parse(about.rollout_id));
         if about.reason.len() > limits::REASON_BYTES_MAX {
@@ -68,7 +91,7 @@ impl RolloutService {
         bad.finish()?;
         let rollout_id = rollout_id.ok_or_else(internal)?;
         let command = Command::Do { rollout_id: rollout_id.clone(), verb, reason: about.reason.to_owned() };
-        self.act(command, seen).await?;
+        self.act_once(command, seen, check_only, request_id).await?;
         self.shown(rollout_id).await.map(Some)
     }
 
@@ -123,9 +146,11 @@ impl RolloutService {
     async fn exclude(&self, r: v1::ExcludeRobotRequest) -> Result<v1::ExcludeRobotResponse, Refusal> {
         let mut bad = Violations::default();
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        let request_id = request_id(&r.request_id, &mut bad);
         bad.finish()?;
         let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
-        let rollout = self.verb(about, Verb::Exclude(robot_id.ok_or_else(internal)?), false).await?;
+        let verb = Verb::Exclude(robot_id.ok_or_else(internal)?);
+        let rollout = self.verb_once(about, verb, false, check_only(r.validate_only), request_id).await?;
         Ok(v1::ExcludeRobotResponse { rollout })
     }
 
@@ -176,10 +201,12 @@ impl RolloutService {
 
     async fn revoke(&self, r: v1::RevokeBundleRequest) -> Result<v1::RevokeBundleResponse, Refusal> {
         let mut bad = Violations::default();
+        let request_id = request_id(&r.request_id, &mut bad);
         required_reason(&r.reason, &mut bad);
         bad.finish()?;
         let bundle = self.bundle(&r.bundle).await?;
-        self.act(Command::Revoke { bundle: bundle.clone(), reason: r.reason }, None).await?;
+        let command = Command::Revoke { bundle: bundle.clone(), reason: r.reason };
+        self.act_once(command, None, check_only(r.validate_only), request_id).await?;
         self.look(move |view, _, _| {
             let of = view.rollouts.values().map(|r| &r.row).filter(|r| r.spec.bundle == bundle && !r.phase.is_over());
             let (back, still): (Vec<&Rollout>, Vec<_>) = of.partition(|r| r.phase.goes_back() || r.revert_of.is_some());
@@ -197,19 +224,23 @@ impl RolloutService {
     async fn pin(&self, r: v1::PinRobotRequest) -> Result<v1::PinRobotResponse, Refusal> {
         let mut bad = Violations::default();
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        let request_id = request_id(&r.request_id, &mut bad);
         required_reason(&r.reason, &mut bad);
         bad.finish()?;
         let robot_id = robot_id.ok_or_else(internal)?;
-        self.act(Command::Pin { robot_id: robot_id.clone(), reason: r.reason }, None).await?;
+        let command = Command::Pin { robot_id: robot_id.clone(), reason: r.reason };
+        self.act_once(command, None, check_only(r.validate_only), request_id).await?;
         Ok(v1::PinRobotResponse { software: self.software_of(robot_id).await? })
     }
 
     async fn unpin(&self, r: v1::UnpinRobotRequest) -> Result<v1::UnpinRobotResponse, Refusal> {
         let mut bad = Violations::default();
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        let request_id = request_id(&r.request_id, &mut bad);
         bad.finish()?;
         let robot_id = robot_id.ok_or_else(internal)?;
-        self.act(Command::Unpin { robot_id: robot_id.clone() }, None).await?;
+        let command = Command::Unpin { robot_id: robot_id.clone() };
+        self.act_once(command, None, check_only(r.validate_only), request_id).await?;
         Ok(v1::UnpinRobotResponse { software: self.software_of(robot_id).await? })
     }
 
@@ -242,10 +273,12 @@ impl RolloutService {
     async fn lift(&self, r: v1::LiftQuarantineRequest) -> Result<v1::LiftQuarantineResponse, Refusal> {
         let mut bad = Violations::default();
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        let request_id = request_id(&r.request_id, &mut bad);
         bad.finish()?;
         let robot_id = robot_id.ok_or_else(internal)?;
         let bundle = self.bundle(&r.bundle).await?;
-        self.act(Command::LiftQuarantine { robot_id, bundle }, None).await?;
+        self.act_once(Command::LiftQuarantine { robot_id, bundle }, None, check_only(r.validate_only), request_id)
+            .await?;
         Ok(v1::LiftQuarantineResponse {})
     }
 }

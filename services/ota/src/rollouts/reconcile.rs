@@ -12,6 +12,7 @@ use midshift_core::lead::{OtaLeader, Own, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::rollout::commands::CheckOnly;
 use midshift_core::rollout::named::named;
 use midshift_core::rollout::view::{TABLES, View};
 use midshift_core::rollout::{Board, LOGS, Plan, Sign, absorb, commands, cycle, obeyed};
@@ -305,16 +306,13 @@ impl Loop {
         for request in requests {
             match request {
                 Request::Look(look) => self.looks.push(look),
-                Request::Do { command, seen, actor, reply } => {
-                    match commands::check(&self.view, &self.board, &command, seen) {
-                        Err(refusal) => {
-                            drop(reply.send(Err(refusal)));
-                            continue;
-                        }
-                        // What was asked before is in the store, or in an item before this one.
-                        Ok(true) => {}
-                        Ok(false) => commands::apply(&mut self.view, &self.board, now, &command, &actor, plan),
+                Request::Do { ask, reply } => {
+                    let taken = commands::take(&mut self.view, &self.board, now, &ask, plan);
+                    if taken.is_err() || ask.check_only == CheckOnly::Yes {
+                        drop(reply.send(taken));
+                        continue;
                     }
+                    // What was asked before is in the store, or in an item before this one.
                     replies.push((reply, plan.items.len()));
                 }
             }

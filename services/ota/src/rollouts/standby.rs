@@ -8,9 +8,9 @@ use super::reconcile::Loop;
 use midshift_core::limits;
 use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Refusal};
-use midshift_core::rollout::commands::{self, Command};
+use midshift_core::rollout::commands::{self, Ask};
 use midshift_core::rollout::{LOGS, Plan, follow_rows, reread};
-use midshift_core::rows::{Entry, Log, Revision, Table};
+use midshift_core::rows::{Entry, Log, Table};
 use midshift_store::{CommitError, Error, follow};
 use std::sync::Arc;
 
@@ -46,9 +46,9 @@ impl Loop {
         for request in requests {
             match request {
                 Request::Look(look) => self.looks.push(look),
-                Request::Do { command, seen, actor, reply } => {
+                Request::Do { ask, reply } => {
                     let answer = match trusted {
-                        Ok(()) => self.carry_out(&command, seen, &actor).await,
+                        Ok(()) => self.carry_out(&ask).await,
                         Err(()) => Ok(Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile))),
                     };
                     let answer = answer.unwrap_or_else(|error| {
@@ -66,21 +66,14 @@ impl Loop {
     }
 
     /// The answer to whoever asked. An error: what came of it may not be in the picture.
-    async fn carry_out(
-        &mut self,
-        command: &Command,
-        seen: Option<Revision>,
-        actor: &str,
-    ) -> Result<Result<(), Refusal>, Error> {
+    async fn carry_out(&mut self, ask: &Ask) -> Result<Result<(), Refusal>, Error> {
         for _ in 0..limits::COMMAND_TRIES {
-            match commands::check(&self.view, &self.board, command, seen) {
-                Err(refusal) => return Ok(Err(refusal)),
-                Ok(true) => return Ok(Ok(())),
-                Ok(false) => {}
-            }
             let mut plan = Plan::default();
-            commands::apply(&mut self.view, &self.board, self.parts.clock.now(), command, actor, &mut plan);
+            let taken = commands::take(&mut self.view, &self.board, self.parts.clock.now(), ask, &mut plan);
             self.view.arrived.clear();
+            if taken.is_err() || plan.items.is_empty() {
+                return Ok(taken);
+            }
             let keys = picture::touched(&plan.items);
             let results = self.parts.store.commit(plan.items).await;
             let any_applied = results.iter().any(Result::is_ok);

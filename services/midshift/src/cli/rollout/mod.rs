@@ -10,7 +10,7 @@ mod parse;
 mod tests;
 mod text;
 
-use super::client::{Call, Exit, unary};
+use super::client::{Call, Change, Exit, unary};
 use super::out::Out;
 use clap::{Subcommand, ValueEnum};
 use midshift_proto::ota::v1;
@@ -246,8 +246,22 @@ async fn roll_back(one: &One, new_rollout_id: String, start: bool, out: &Out) ->
 }
 
 /// Leaves a robot out.
-pub async fn exclude(call: &Call, rollout_id: String, robot_id: String, reason: String, out: &Out) -> Result<(), Exit> {
-    let request = v1::ExcludeRobotRequest { rollout_id, etag: String::new(), reason, robot_id };
+pub async fn exclude(
+    call: &Call,
+    rollout_id: String,
+    robot_id: String,
+    reason: String,
+    change: Change,
+    out: &Out,
+) -> Result<(), Exit> {
+    let request = v1::ExcludeRobotRequest {
+        rollout_id,
+        etag: String::new(),
+        reason,
+        robot_id,
+        request_id: change.request_id,
+        validate_only: change.dry_run,
+    };
     let answer = call.rollouts().await?.exclude_robot(unary(request)).await.map_err(Exit::with_facts)?;
     show(&answer.into_inner().rollout.unwrap_or_default(), out)
 }

@@ -252,3 +252,35 @@ async fn a_process_that_takes_over_without_a_current_directive_key_says_so_and_g
     assert!(!keyless(&next).await);
     next.end().await;
 }
+
+#[tokio::test(start_paused = true)]
+async fn a_bundle_is_taken_back_once_for_a_request_id_whichever_process_is_asked_and_a_check_takes_nothing_back() {
+    let world = World::new();
+    let leader = world.process().await;
+    release(&leader.ota, &files("walk", "1.0.0")).await;
+    secs(2).await;
+    let standby = world.process().await;
+    secs(2).await;
+    let bundle = world.bundles().await[0].bundle.to_string();
+    let revoke = async |process: &Process, reason: &str, validate_only: bool| {
+        let (bundle, reason, request_id) = (bundle.clone(), reason.to_owned(), "r-1".to_owned());
+        let request = v1::RevokeBundleRequest { bundle, reason, request_id, validate_only };
+        Face::revoke_bundle(&process.face, Request::new(request)).await
+    };
+    for process in [&leader, &standby] {
+        revoke(process, "it limps", true).await.expect("nothing is against it");
+    }
+    let (row, unread) = world.row::<Bundle>(&bundle).await.expect("a row");
+    assert_eq!(row.revoked, None, "it was only asked whether it may be");
+    revoke(&standby, "it limps", false).await.expect("taken back");
+    let written = world.row::<Bundle>(&bundle).await.expect("a row").1;
+    assert!(written > unread);
+    for process in [&leader, &standby] {
+        revoke(process, "it limps", false).await.expect("done already");
+        let other = revoke(process, "it leaks", false).await.expect_err("the id is taken");
+        assert_eq!(other.code(), tonic::Code::AlreadyExists);
+    }
+    assert_eq!(world.row::<Bundle>(&bundle).await.expect("a row").1, written, "written once");
+    leader.end().await;
+    standby.end().await;
+}

@@ -1,0 +1,79 @@
+//! Commands with a request_id: asked again with the same id and the same in every part, a command is not carried out again.
+//!
+//! Called by what decides on commands in `fleet` and `rollout`. Invariant: the key is written in the item that carries the command out, so that
+//! neither stands without the other. What is answered to the second is how things are by then.
+
+use crate::limits;
+use crate::picture::{Picture, Slot, Tx, Viewed};
+use crate::reason::{Code, Kind, Reason, Refusal};
+use crate::rows::{Index, Record, Revision, Table};
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+
+/// Used request_ids let go of with one command.
+const FORGOTTEN_AT_ONCE: usize = 4;
+
+/// What people may ask of one service.
+pub trait Asked: Serialize + DeserializeOwned + Clone + PartialEq + Send + Sync + 'static {
+    /// Where its used request_ids are kept.
+    const KEYS: Table;
+}
+
+/// A used request_id of a command. Kept 7 days.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(bound = "C: Asked")]
+pub struct CommandKey<C> {
+    /// The client's request_id.
+    pub id: String,
+    /// What it asked for.
+    pub command: C,
+    /// The etag it gave.
+    pub seen: Option<Revision>,
+    /// UTC of the wall, unix ms.
+    pub at_unix_ms: i64,
+}
+
+impl<C: Asked> Record for CommandKey<C> {
+    const TABLE: Table = C::KEYS;
+    fn id(&self) -> String {
+        self.id.clone()
+    }
+    fn index(&self) -> Index {
+        Index { order: Some(self.at_unix_ms), ..Index::default() }
+    }
+}
+
+/// Whether this is a command that was carried out already: the same request_id, and the same in every part.
+///
+/// # Errors
+/// The request_id was used for something else.
+pub fn is_repeat<C: Asked>(
+    known: &Slot<CommandKey<C>>,
+    request_id: &str,
+    command: &C,
+    seen: Option<Revision>,
+) -> Result<bool, Refusal> {
+    match known.get(request_id).map(|k| &k.row) {
+        None => Ok(false),
+        Some(known) if known.command == *command && known.seen == seen => Ok(true),
+        Some(_) => {
+            let reason = Reason::from(Code::RequestIdReused).with("request_id", request_id);
+            Err(Refusal::new(Kind::AlreadyExists, reason))
+        }
+    }
+}
+
+/// Writes down that a command was carried out, and lets go of a few that are past their time.
+pub fn remember<P: Picture, C: Asked>(tx: &mut Tx<'_, P>, request_id: &str, command: &C, seen: Option<Revision>)
+where
+    CommandKey<C>: Viewed<P>,
+{
+    let at_unix_ms = tx.now.wall.0;
+    let oldest_ms = at_unix_ms - (limits::REMEMBER_DAYS * 86_400_000) as i64;
+    let known = CommandKey::<C>::slot(tx.view).values();
+    let past = known.filter(|k| k.row.at_unix_ms < oldest_ms).take(FORGOTTEN_AT_ONCE);
+    let past: Vec<String> = past.map(|k| k.row.id.clone()).collect();
+    past.iter().for_each(|id| tx.delete::<CommandKey<C>>(id, "command.forgotten"));
+    let key = CommandKey { id: request_id.to_owned(), command: command.clone(), seen, at_unix_ms };
+    tx.put(key, "command.done");
+}
