@@ -165,7 +165,8 @@ impl Stack {
     /// Starts all of them again after [`Stack::kill_all`], and waits until they answer.
     pub async fn restart_all(&mut self) -> anyhow::Result<()> {
         for member in &mut self.members {
-            member.running = run(&self.dir, member.role, member.address, &member.url, &self.flags, &member.log)?;
+            member.running =
+                run(&self.dir, &self.site, member.role, member.address, &member.url, &self.flags, &member.log)?;
         }
         self.proxy = proxy(&self.dir, &self.members, self.public, self.robots, None)?;
         self.answers().await

@@ -10,7 +10,7 @@ mod parse;
 mod tests;
 mod text;
 
-use super::client::{Call, Change, Exit, unary};
+use super::client::{Call, Change, Exit, WOULD, unary};
 use super::out::Out;
 use clap::{Subcommand, ValueEnum};
 use midshift_proto::ota::v1;
@@ -71,6 +71,8 @@ pub enum Verb {
         /// Why.
         #[arg(long, default_value = "")]
         reason: String,
+        #[command(flatten)]
+        change: Change,
     },
     /// List roll-outs, the newest first.
     Ls {
@@ -210,7 +212,9 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Abort(seen) => act_on(&seen, Ask::Abort, out).await,
         Verb::Rollback { one, new_id, start } => roll_back(&one, new_id, start, out).await,
         Verb::Retry { said, failed: _ } => act(&said, Ask::Retry, out).await,
-        Verb::Exclude { one, robot_id, reason } => exclude(&one.call, one.rollout_id, robot_id, reason, out).await,
+        Verb::Exclude { one, robot_id, reason, change } => {
+            exclude(&one.call, one.rollout_id, robot_id, reason, change, out).await
+        }
         Verb::Ls { call } => look::list(&call, out).await,
         Verb::Get { one, robots } => look::get(&one, robots, out).await,
         Verb::Robots(one) => look::robots(&one, out).await,
@@ -263,7 +267,11 @@ pub async fn exclude(
         validate_only: change.dry_run,
     };
     let answer = call.rollouts().await?.exclude_robot(unary(request)).await.map_err(Exit::with_facts)?;
-    show(&answer.into_inner().rollout.unwrap_or_default(), out)
+    show(&answer.into_inner().rollout.unwrap_or_default(), out)?;
+    if change.dry_run {
+        out.next(WOULD);
+    }
+    Ok(())
 }
 
 /// Submits, approves and starts one that is written down, and says each.
