@@ -40,6 +40,8 @@ const SESSION_LIFE: Duration = Duration::from_secs(55 * 60);
 const SESSION_LIFE_JITTER_S: u64 = 300;
 /// Time to open the next session.
 const MOVE_OVER_WITHIN: Duration = Duration::from_secs(30);
+/// A robot whose gateway cannot reach the database looks for another after this: much of its authority is over by then.
+const CUT_OFF_RETRY: LinkDuration = LinkDuration(500);
 /// After a failed commit the robot is asked again not sooner than this.
 const COMMIT_RETRY: Duration = Duration::from_millis(200);
 
@@ -181,8 +183,7 @@ impl Session {
                     return end;
                 },
                 () = is_cut_off(&mut cut_off) => {
-                    // To another gateway, while there is authority left.
-                    return close(CloseCode::MoveOver, Code::StoreUnavailable, LinkDuration(0));
+                    return close(CloseCode::MoveOver, Code::StoreUnavailable, CUT_OFF_RETRY);
                 }
                 () = at(unread_at) => return close(CloseCode::TooSlow, Code::Overloaded, LinkDuration(1_000)),
                 () = at(ack_at) => self.ack_status(),

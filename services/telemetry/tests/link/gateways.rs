@@ -3,6 +3,7 @@
 use crate::world::{Result, Robot, World, clock, serve};
 use async_trait::async_trait;
 use midshift_core::ids::{RobotId, SiteId};
+use midshift_core::reason::Code;
 use midshift_core::rows::{Expect, Item, Log, Seq, Writer};
 use midshift_core::time::Clock;
 use midshift_core::work::DesiredWork;
@@ -127,7 +128,7 @@ async fn a_gateway_that_is_cut_off_echoes_nothing_and_its_robot_works_on_at_anot
     robot.beat().await?;
     let proof = robot.proof();
     let close = robot.closes_unechoed().await?;
-    assert_eq!((close.code, close.retry_after_ms), (CloseCode::MoveOver, 0), "at once, or its authority runs out");
+    assert_eq!(close.code, CloseCode::MoveOver);
     let mut cut_off = first.service.cut_off().ok_or("a gateway among several")?;
     assert!(*cut_off.borrow_and_update());
     let mut next = Robot::attach(&second, Some(proof)).await?;
@@ -136,6 +137,19 @@ async fn a_gateway_that_is_cut_off_echoes_nothing_and_its_robot_works_on_at_anot
     assert_eq!(next.hears(|down| down.echo.map(|e| e.hb)).await?, 1);
     wire.is_cut.store(false, Ordering::SeqCst);
     cut_off.wait_for(|cut_off| !cut_off).await?;
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_gateway_that_is_cut_off_sends_its_robots_away_for_no_longer_than_a_moment() -> Result<()> {
+    let site = Site::new()?;
+    let (gateway, wire) = site.gateway().await?;
+    let mut robot = Robot::attach(&gateway, None).await?;
+    wire.is_cut.store(true, Ordering::SeqCst);
+    robot.beat().await?;
+    let close = robot.closes().await?;
+    assert_eq!((close.code, close.reason.code), (CloseCode::MoveOver, Code::StoreUnavailable));
+    assert!(close.retry_after_ms <= 1_000, "its authority goes on ending meanwhile: {close:?}");
     Ok(())
 }
 
