@@ -28,6 +28,7 @@ const LEFT_OUT: &[(&str, &str)] = &[
     ("launched::a_set_that_", NO_SERVER),
     ("launched::sets_and_trust_", NO_SERVER),
     ("measured::", DEV),
+    ("partition::", ALWAYS),
     ("public_address::", DEV),
     ("restored::", "`midshift backup` copies SQLite's files; a database is copied by PostgreSQL's own programs"),
     ("split::", ALWAYS),

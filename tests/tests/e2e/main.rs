@@ -24,6 +24,7 @@ mod launched;
 mod ledger_cuts;
 mod measured;
 mod minimal_robot;
+mod partition;
 mod proxy;
 mod public_address;
 mod restored;

@@ -19,7 +19,8 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 use tokio::time::Instant;
 
-const ROBOTS: usize = 20;
+/// Agents of a stack at work.
+pub const ROBOTS: usize = 20;
 /// How many instead, in few processes on a free floor; a long run for `cargo xtask torture split`.
 const MANY: &str = "MIDSHIFT_SPLIT_ROBOTS";
 /// Processes that share them, and tasks for each.
@@ -127,7 +128,7 @@ async fn tasks_go_on_while_every_process_of_a_split_stack_is_killed_or_replaced_
 }
 
 /// Every number of every ring is there, once and in order, whichever gateway took it.
-async fn events_have_no_hole(public: SocketAddr, count: usize) -> anyhow::Result<()> {
+pub async fn events_have_no_hole(public: SocketAddr, count: usize) -> anyhow::Result<()> {
     let telemetry = TelemetryServiceClient::new(channel(public)?);
     let (mut cursor, mut last) = (String::new(), BTreeMap::new());
     loop {
