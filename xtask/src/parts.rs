@@ -98,7 +98,8 @@ impl Part {
                 let Some(tools) = tools else { return Ok(false) };
                 run::succeeds(workspace.command(&tools.buf).arg("lint").current_dir(workspace.root.join("proto")))
             }
-            Self::Build => run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins"])),
+            // Tests too: a build without them has other features, and everything would be compiled twice.
+            Self::Build => run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins", "--tests"])),
             Self::Clients => {
                 let Some(tools) = tools else { return Ok(false) };
                 clients::build(workspace, &tools.python)
