@@ -16,6 +16,8 @@ pub struct Workspace {
     pub root: PathBuf,
     /// Cargo's target directory.
     pub target: PathBuf,
+    /// This program, as it was called: a build of everything may put a new one in its place, and then the system says that it is deleted.
+    pub this: PathBuf,
 }
 
 impl Workspace {
@@ -29,7 +31,8 @@ impl Workspace {
         ensure!(output.status.success(), "cargo metadata: {}", String::from_utf8_lossy(&output.stderr).trim());
         let metadata: serde_json::Value = serde_json::from_slice(&output.stdout).context("reading cargo metadata")?;
         let path = |key: &str| metadata[key].as_str().map(PathBuf::from).with_context(|| format!("no {key}"));
-        Ok(Self { root: path("workspace_root")?, target: path("target_directory")? })
+        let this = std::env::current_exe().context("this program")?;
+        Ok(Self { root: path("workspace_root")?, target: path("target_directory")?, this })
     }
 
     /// Where downloaded tools are kept.

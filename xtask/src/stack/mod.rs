@@ -184,7 +184,7 @@ fn detached(workspace: &Workspace, which: &Which, binary: Option<PathBuf>) -> Re
     make(&folder)?;
     let log = folder.join("stack.log");
     let file = std::fs::File::create(&log).with_context(|| format!("opening {}", log.display()))?;
-    let mut command = Command::new(std::env::current_exe().context("this program")?);
+    let mut command = Command::new(&workspace.this);
     command.args(["stack", "up", "--binary"]).arg(binary).arg("--file").arg(&which.file).arg("--state").arg(&folder);
     command.stdin(Stdio::null()).stdout(file.try_clone().context("its log")?).stderr(file).process_group(0);
     let mut child = command.spawn().context("starting the supervisor")?;
@@ -232,7 +232,7 @@ pub fn test(workspace: &Workspace, which: &Which, binary: Option<PathBuf>) -> Re
     let folder = std::env::temp_dir().join(format!("midshift-stack-test-{}", std::process::id()));
     let state = folder.display().to_string();
     let own = |verb: &[&str]| {
-        let mut command = workspace.command(std::env::current_exe().unwrap_or_default());
+        let mut command = workspace.command(&workspace.this);
         command.args(["stack"]).args(verb).arg("--file").arg(&which.file).args(["--state", &state]);
         command
     };
