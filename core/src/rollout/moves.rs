@@ -143,11 +143,16 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
     }
 }
 
-/// Whether what is due for `r` is told with a directive that must be signed for that.
+/// Whether what is due for `r` is told with a directive that must be signed for that, or takes it out of work only for one.
 pub fn is_signed(view: &View, rollout: &Rollout, r: &RolloutRobot, due: &Move) -> bool {
     match due {
         Move::Stage | Move::SignAnew | Move::OrderBackAnew => true,
         Move::GoBack => must_be_ordered_back(view, rollout, r),
+        Move::AskDrain => rollout.revert_of.is_some() && must_be_ordered_back(view, rollout, r),
+        Move::Revert => {
+            let hard = rollout.abort.as_ref().is_some_and(|a| a.hard) || r.failure.is_some();
+            r.drain_id.is_none() && !hard && must_be_ordered_back(view, rollout, r)
+        }
         _ => false,
     }
 }

@@ -3,7 +3,7 @@
 //! Invariant: an abort is latched in the item that ends the roll-out, and nothing takes it back; a soak stands still while the roll-out does;
 //! stuck and unreachable robots never keep a fleet waiting.
 
-use super::robots::{is_gone, is_irreversible};
+use super::robots::{is_gone, is_irreversible, is_keyless};
 use super::rows::{AreaBundle, Countdown, Outcome, Pause, Phase, Rollout, RolloutRobot, Step, Verdict};
 use super::served::{forget_area_bundles, is_served};
 use super::stamp::Stamp;
@@ -57,8 +57,7 @@ fn pauses(tx: &mut Tx, board: &Board, rollout: &Rollout) {
     let asked = rollout.pauses.contains(&Pause::Operator).then_some(Pause::Operator);
     let gone = is_gone(tx.view, rollout).then_some(Pause::Revoked);
     let network = infrastructure::pause(tx.view, board, &tx.now, rollout);
-    // Who goes back was told already with what it goes back from; only what must be signed anew waits.
-    let keyless = (tx.view.keyless && rollout.revert_of.is_none()).then_some(Pause::Keyless);
+    let keyless = is_keyless(tx.view, rollout).then_some(Pause::Keyless);
     let pauses = asked.into_iter().chain(gone).chain(network).chain(keyless).collect();
     if pauses != rollout.pauses {
         set_pauses(tx, rollout.clone(), pauses, "rollout.pauses_changed");

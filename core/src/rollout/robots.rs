@@ -241,7 +241,7 @@ fn staged(
 
 /// Why a robot that has the bundle is not taken out of work now.
 pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Reason> {
-    if rollout.pauses.contains(&Pause::Keyless) {
+    if rollout.pauses.contains(&Pause::Keyless) || is_keyless(view, rollout) {
         return Some(Code::NoDirectiveKey.into());
     }
     if !rollout.pauses.is_empty() {
@@ -304,7 +304,14 @@ fn draining(view: &View, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Opti
 
 /// No robot of it gets permission now.
 fn stands_still(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
-    (left_out(view, rollout, r).is_some() || !rollout.pauses.is_empty()) && !view.bugs.pause_is_forgotten()
+    let stands = left_out(view, rollout, r).is_some() || !rollout.pauses.is_empty() || is_keyless(view, rollout);
+    stands && !view.bugs.pause_is_forgotten()
+}
+
+/// Nobody can sign what its robots take, whatever its phase: newcomers of one that is completed wait too. Who goes back was told already
+/// with what it goes back from.
+pub fn is_keyless(view: &View, rollout: &Rollout) -> bool {
+    view.keyless && rollout.revert_of.is_none()
 }
 
 fn activating(

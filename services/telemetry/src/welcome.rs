@@ -56,6 +56,10 @@ fn unavailable(error: impl std::fmt::Display) -> Refusal {
 /// Admits the session, in charge or observed.
 pub async fn begin(inner: &Inner, hello: &Hello) -> Result<Begun, Refusal> {
     let store = inner.parts.store.as_ref();
+    // Asking a database that is away takes time that the robot's authority has not.
+    if inner.shared.as_ref().is_some_and(|shared| *shared.cut_off().borrow()) {
+        return Err(unavailable("this gateway has lost the database"));
+    }
     for _ in 0..TRIES {
         let row = load::<Session>(store, hello.robot_id.as_str()).await.map_err(unavailable)?;
         let mark = mark_of(inner, hello).await?;

@@ -72,3 +72,19 @@ fn an_order_back_that_must_be_signed_anew_waits_for_a_key_and_nothing_else_does(
     rig.keyless = false;
     rig.until(60, |r| r.ota.desired.get(robot_id(n).as_str()).is_some_and(|d| d.row.generation > told));
 }
+
+#[test]
+fn who_comes_after_the_end_is_not_switched_without_a_key() {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    rig.until(400, |r| r.phase() == Phase::Completed);
+    rig.ticks(4);
+    rig.arrive();
+    rig.until(100, |r| r.count(Step::Staged) == 1);
+    rig.keyless = true;
+    rig.ticks(90);
+    assert_eq!((rig.step(4), rig.robots[4].version.as_str()), (Step::Staged, "0.9.0"));
+    assert_eq!(waits_for(&rig, 4), Some(Code::NoDirectiveKey));
+    rig.keyless = false;
+    rig.until(100, |r| r.robots[4].kept == "2.0.0");
+}

@@ -162,3 +162,22 @@ fn an_order_to_fetch_that_lay_too_long_while_the_server_was_away_leaves_nobody_o
     let r = rig.of("ro", 1);
     assert!(r.why.is_none() && matches!(r.step, Step::Staged | Step::Draining), "{:?} {:?}", r.why, r.step);
 }
+
+#[test]
+fn whom_only_a_signed_order_leads_back_stays_at_work_until_there_is_a_key() {
+    let mut rig = left_another(1);
+    rig.keyless = true;
+    take_back(&mut rig);
+    rig.ticks(120);
+    let waits = rig.of("back", 1);
+    assert_eq!((waits.step, waits.drain_id), (Step::Staged, None), "out of work it would keep others from going back");
+    assert_eq!(rig.robots[1].version, "2.0.0");
+    assert!(
+        (0..4)
+            .filter(|n| *n != 1)
+            .any(|n| rig.of("back", n).step == Step::RolledBack || rig.robots[n].version == "0.9.0")
+    );
+    rig.keyless = false;
+    rig.until(300, |r| r.rollout("back").phase == Phase::Completed);
+    assert!(rig.robots.iter().all(|r| r.version == "0.9.0"));
+}

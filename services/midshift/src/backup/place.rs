@@ -5,6 +5,7 @@
 use super::blocking;
 use anyhow::{Context, ensure};
 use std::fs::{self, File};
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
 /// A folder under a name of its own until it is whole.
@@ -15,7 +16,9 @@ impl Place {
         ensure!(is_free(to)?, "{} is there already; name a folder that is not there", to.display());
         let beside = to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         fs::create_dir_all(beside).with_context(|| format!("making {}", beside.display()))?;
-        let place = tempfile::Builder::new().prefix(".midshift-").tempdir_in(beside);
+        // Rows prove robots' successions: they are for their owner alone.
+        let private = fs::Permissions::from_mode(0o700);
+        let place = tempfile::Builder::new().prefix(".midshift-").permissions(private).tempdir_in(beside);
         Ok(Self(place.with_context(|| format!("making a folder in {}", beside.display()))?))
     }
     pub(super) fn path(&self) -> &Path {
