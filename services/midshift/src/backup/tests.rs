@@ -15,6 +15,7 @@ use midshift_ota::repository::{OnlineKeys, Repository, raise_floor};
 use midshift_ota::{OtaService, Parts};
 use midshift_store::{FRAME_BYTES_DEFAULT, Frame, FrameLog, SqliteFrames, SqliteStore, Store};
 use std::fs;
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::sync::Arc;
 use tempfile::TempDir;
@@ -68,6 +69,8 @@ impl Used {
     async fn backed_up(&self) -> std::path::PathBuf {
         let to = self.dir.path().join("backup");
         back_up(&self.places(), &to, NOW).await.expect("a backup");
+        let mode = std::fs::metadata(&to).expect("it is there").permissions().mode();
+        assert_eq!(mode & 0o777, 0o700, "its rows prove robots' successions");
         to
     }
 }

@@ -131,6 +131,7 @@ async fn a_gateway_that_is_cut_off_echoes_nothing_and_its_robot_works_on_at_anot
     assert_eq!(close.code, CloseCode::MoveOver);
     let mut cut_off = first.service.cut_off().ok_or("a gateway among several")?;
     assert!(*cut_off.borrow_and_update());
+    assert!(Robot::attach(&first, Some(proof.clone())).await.is_err(), "it would ask a database that is away");
     let mut next = Robot::attach(&second, Some(proof)).await?;
     assert!(!next.welcome.observed);
     next.beat().await?;
