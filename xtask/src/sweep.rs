@@ -22,7 +22,7 @@ pub enum Sweep {
     Kills,
     /// Shifts of the deterministic simulation, with roll-outs of software.
     Simulation,
-    /// Each process of a split stack killed or replaced in turn with 200 robots at work.
+    /// A process of each service of a split stack killed or replaced in turn with 200 robots at work, as often as --seeds says; it draws nothing.
     Split,
     /// The power goes at each call of an update, and of the ways back from one, that changes the disk: all of them, whatever the seeds.
     Updates,

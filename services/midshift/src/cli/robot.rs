@@ -227,7 +227,11 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
                 validate_only: change.dry_run,
             };
             let answer = one.call.rollouts().await?.unpin_robot(unary(request)).await.map_err(Exit::with_facts)?;
-            software(&answer.into_inner().software.unwrap_or_default(), out)
+            software(&answer.into_inner().software.unwrap_or_default(), out)?;
+            if change.dry_run {
+                out.next(WOULD);
+            }
+            Ok(())
         }
         Verb::Exclude { one, from, reason, change } => {
             rollout::exclude(&one.call, from, one.robot_id, reason, change, out).await
