@@ -237,8 +237,17 @@ pub fn tasks(address: SocketAddr) -> anyhow::Result<TaskServiceClient<Channel>> 
 /// Every task in one of these states; none while nobody answers there.
 pub async fn in_states(address: SocketAddr, states: &[TaskState]) -> anyhow::Result<Option<Vec<Task>>> {
     let filter = TaskFilter { states: states.iter().map(|s| *s as i32).collect(), ..TaskFilter::default() };
-    let request = ListTasksRequest { filter: Some(filter), page_size: 1_000, page_token: String::new() };
-    Ok(tasks(address)?.list_tasks(request).await.ok().map(|page| page.into_inner().tasks))
+    let mut request = ListTasksRequest { filter: Some(filter), page_size: 1_000, page_token: String::new() };
+    let (mut client, mut all) = (tasks(address)?, Vec::new());
+    loop {
+        let Ok(page) = client.list_tasks(request.clone()).await else { return Ok(None) };
+        let page = page.into_inner();
+        all.extend(page.tasks);
+        if page.next_page_token.is_empty() {
+            return Ok(Some(all));
+        }
+        request.page_token = page.next_page_token;
+    }
 }
 
 /// A channel that connects when it is used.

@@ -80,7 +80,7 @@ async fn killed_at_work(mut postgres: Option<PostgresServer>) -> anyhow::Result<
     let url = postgres.as_ref().map(PostgresServer::database);
     let flags: Vec<&str> = url.iter().flat_map(|url| ["--store", url.as_str()]).collect();
     let mut server = Server::start_with(dir.path(), DEMO, &flags).await?;
-    let mut robots = Robots::start(dir.path(), server.address, &site, ROBOTS)?;
+    let mut robots = Robots::start(dir.path(), server.address, server.address, &site, ROBOTS).await?;
     submit(server.address, &site, seed, TASKS).await?;
     let mut kills: Vec<(usize, bool)> =
         [(8, true), (16, false), (24, false), (32, true), (40, false), (48, false), (56, true), (62, false)]

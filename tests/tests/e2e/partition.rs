@@ -125,7 +125,7 @@ async fn cut_off(sever: fn(&Line), seed: u64) -> anyhow::Result<()> {
     let site = text::parse(DEMO)?;
     let mut stack = Stack::start(dir.path(), DEMO, &["--no-software"], &[]).await?;
     let (gateway, other) = (stack.address("telemetry", 0)?, stack.address("telemetry", 1)?);
-    let robots = Robots::start(dir.path(), stack.robots, &site, ROBOTS)?;
+    let robots = Robots::start(dir.path(), stack.robots, stack.public, &site, ROBOTS).await?;
     submit(stack.public, &site, seed, TASKS).await?;
     let mut here = BTreeSet::new();
     for done in (4..).step_by(2) {
@@ -161,6 +161,11 @@ async fn cut_off(sever: fn(&Line), seed: u64) -> anyhow::Result<()> {
         }
     }
     assert!(moved.keys().eq(before.keys()), "not all of {before:?} are at the other gateway: {moved:?}");
+    let last_ms = moved.values().max().map_or(0, |next| next.cast_signed() - cut_unix_ms);
+    say!(
+        "the last of them was at the other gateway after {last_ms} ms; their authority to go on lasts {:?}",
+        limits::AUTHORITY
+    );
     // Work goes on meanwhile, also that of the robots that moved.
     let done = in_states(stack.public, &[TaskState::Succeeded]).await?;
     at_work(stack.public, done.map_or(0, |done| done.len()) + 10, &BTreeSet::new()).await?;

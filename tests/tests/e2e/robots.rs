@@ -1,15 +1,18 @@
 //! Robots as programs of their own.
 
-use crate::harness::{Running, midshift};
+use crate::harness::{Running, channel, midshift, until};
 use midshift_agent::ledger::Ledger;
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::store::Store;
 use midshift_core::site::Site;
+use midshift_proto::fleet::v1::ListPlacesRequest;
+use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_sim::swarm::AGENT_FILE;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::time::Duration;
 
 /// How many times as fast as real the bodies work; clocks are not touched.
 pub const BODY_SPEED: &str = "5";
@@ -26,13 +29,29 @@ pub struct Robots {
 }
 
 impl Robots {
-    /// Starts `count` of them at starting places of the site.
-    pub fn start(dir: &Path, server: SocketAddr, site: &Site, count: usize) -> anyhow::Result<Self> {
+    /// Starts `count` of them at starting places of the site, and waits until the server at `public` knows where each stands: a robot that nobody
+    /// has heard of yet may stand in a place that is given to others meanwhile.
+    pub async fn start(
+        dir: &Path,
+        server: SocketAddr,
+        public: SocketAddr,
+        site: &Site,
+        count: usize,
+    ) -> anyhow::Result<Self> {
         let starts = site.starting_places(count).into_iter().map(|at| site.name_of(at).to_string()).collect();
         let mut robots = Self::none(dir, server);
         robots.starts = starts;
         (0..count).try_for_each(|number| robots.start_one(number))?;
         robots.ids = robots.running.keys().cloned().collect();
+        let all: BTreeSet<&String> = robots.ids.iter().collect();
+        until("every robot in its place", Duration::from_secs(60), || async {
+            let request = ListPlacesRequest { in_use: true, page_size: 1_000, ..ListPlacesRequest::default() };
+            let page = FleetServiceClient::new(channel(public)?).list_places(request).await;
+            let places = page.map_or_else(|_| Vec::new(), |page| page.into_inner().places);
+            let stand: BTreeSet<&String> = places.iter().flat_map(|p| &p.holders).map(|h| &h.robot_id).collect();
+            Ok((stand == all).then_some(()))
+        })
+        .await?;
         Ok(robots)
     }
     /// `count` of them on the site of a file, shared out among `processes`, with bodies no faster than real ones.
