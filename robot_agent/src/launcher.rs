@@ -69,6 +69,12 @@ enum Ending {
 
 /// The whole program: `arguments` without its name.
 pub fn main(arguments: impl Iterator<Item = String>) -> ExitCode {
+    let mut arguments = arguments.peekable();
+    if let Some(told) = arguments.peek().and_then(|first| of_itself(first)) {
+        // Who does not want to hear it may close the pipe.
+        let _ = writeln!(io::stdout(), "{told}");
+        return ExitCode::SUCCESS;
+    }
     let orders = match Orders::read(arguments) {
         Ok(orders) => orders,
         Err(problem) => {
@@ -82,6 +88,15 @@ pub fn main(arguments: impl Iterator<Item = String>) -> ExitCode {
             say(&error.to_string());
             ExitCode::FAILURE
         }
+    }
+}
+
+/// What a first argument that asks about the program itself is answered.
+fn of_itself(first: &str) -> Option<&'static str> {
+    match first {
+        "--version" | "-V" => Some(concat!("midshift-launcher ", env!("CARGO_PKG_VERSION"))),
+        "--help" | "-h" => Some(USAGE_TEXT),
+        _ => None,
     }
 }
 

@@ -56,7 +56,9 @@ impl Daemon {
                 Err(said) => run::say(&format!("dockerd with {driver} does not start:\n{said}")),
             }
         }
-        bail!("dockerd does not run on this machine; next: cargo xtask test --no-docker leaves this part out")
+        bail!(
+            "dockerd does not run on this machine; next: `cargo xtask test --no-docker` and `dist --no-image` do without"
+        )
     }
 
     /// The daemon, or the end of what it said.
@@ -126,6 +128,20 @@ fn is_forwarding_denied() -> bool {
 #[expect(clippy::disallowed_methods, reason = "a pause between looks at another program, outside of any runtime")]
 fn pause() {
     std::thread::sleep(LOOK);
+}
+
+/// Gives `work` a docker: the one that answers here, else one of its own below `temporary`, ended afterwards.
+pub fn with_any(temporary: &Path, work: impl FnOnce(&dyn Fn() -> Command) -> Result<()>) -> Result<()> {
+    let usual = || {
+        let mut command = Command::new("docker");
+        command.stdin(Stdio::null());
+        command
+    };
+    if run::quietly(usual().arg("info")) {
+        return work(&usual);
+    }
+    let daemon = Daemon::start(temporary)?;
+    work(&|| daemon.docker())
 }
 
 /// Brings the split stack up, does a task through its proxy, brings it down. Whether all of that was done.

@@ -86,7 +86,7 @@ impl Root {
         Ok(())
     }
 
-    fn build(&self, docker: &impl Fn() -> Command, name: &str, lines: &str) -> Result<()> {
+    fn build(&self, docker: &dyn Fn() -> Command, name: &str, lines: &str) -> Result<()> {
         let file = self.context.join("Dockerfile");
         std::fs::write(&file, format!("FROM scratch\nCOPY root/ /\n{lines}")).context("writing a Dockerfile")?;
         build(docker().args(["build", "-q", "-t", name]).arg(&self.context))
@@ -115,20 +115,40 @@ pub struct Images {
     pub postgresql: &'static str,
 }
 
-/// Builds all of them below `temporary`, with this binary.
-pub fn make(docker: &impl Fn() -> Command, temporary: &Path, repository: &Path, midshift: &Path) -> Result<Images> {
+/// What images stand on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Bases {
+    /// The public images that deploy/Dockerfile names: docker pulls them.
+    AsWritten,
+    /// The libraries of this machine.
+    OfThisMachine,
+}
+
+/// Builds all of them below `temporary`, with this binary, on the libraries of this machine.
+pub fn make(docker: &dyn Fn() -> Command, temporary: &Path, repository: &Path, midshift: &Path) -> Result<Images> {
     let images =
         Images { midshift: "midshift:packed", proxy: "midshift-proxy:packed", postgresql: "midshift-postgres:packed" };
-    let mut base = Root::new(&temporary.join("base"))?;
-    base.libraries(midshift)?;
-    base.build(docker, "midshift-base:machine", "")?;
-    let mut proxy = Root::new(&temporary.join("proxy-base"))?;
-    proxy.libraries(midshift)?;
-    let haproxy = run::output(Command::new("sh").args(["-c", "command -v haproxy"])).context("no haproxy")?;
-    proxy.put(Path::new(haproxy.trim()))?;
-    proxy.build(docker, "midshift-proxy-base:machine", "")?;
+    packed(docker, temporary, repository, midshift, Bases::OfThisMachine, [images.midshift, images.proxy])?;
     database(docker, temporary, images.postgresql)?;
+    Ok(images)
+}
 
+/// Builds midshift and the proxy by the packed stages of deploy/Dockerfile, with this binary, under these names.
+pub fn packed(
+    docker: &dyn Fn() -> Command,
+    temporary: &Path,
+    repository: &Path,
+    midshift: &Path,
+    bases: Bases,
+    names: [&str; 2],
+) -> Result<()> {
+    let arguments = match bases {
+        Bases::AsWritten => [None, None],
+        Bases::OfThisMachine => {
+            machine_bases(docker, temporary, midshift)?;
+            [Some("BASE=midshift-base:machine"), Some("PROXY_BASE=midshift-proxy-base:machine")]
+        }
+    };
     // The context of the packed stages: the repository's own files and the binary.
     let context = temporary.join("packed");
     for folder in ["deploy/proxy", "deploy/data", "sites"] {
@@ -142,19 +162,31 @@ pub fn make(docker: &impl Fn() -> Command, temporary: &Path, repository: &Path, 
     std::fs::copy(midshift, context.join("midshift")).context("copying midshift")?;
     // Debug information is four fifths of it, and goes three times through the daemon.
     run::quietly(Command::new("strip").arg("-g").arg(context.join("midshift")));
-    for (target, base, image) in [
-        ("packed", "BASE=midshift-base:machine", images.midshift),
-        ("packed-proxy", "PROXY_BASE=midshift-proxy-base:machine", images.proxy),
-    ] {
+    for (target, name) in ["packed", "packed-proxy"].into_iter().zip(names) {
         let mut command = docker();
-        command.args(["build", "-q", "--build-arg", "BASE=midshift-base:machine", "--build-arg", base]);
-        command.args(["--target", target, "-t", image, "-f"]).arg(repository.join("deploy/Dockerfile")).arg(&context);
+        command.args(["build", "-q"]);
+        // An older docker builds the stages above the wanted one too.
+        for argument in arguments.iter().flatten() {
+            command.args(["--build-arg", argument]);
+        }
+        command.args(["--target", target, "-t", name, "-f"]).arg(repository.join("deploy/Dockerfile")).arg(&context);
         build(&mut command)?;
     }
-    Ok(images)
+    Ok(())
 }
 
-fn database(docker: &impl Fn() -> Command, temporary: &Path, name: &str) -> Result<()> {
+fn machine_bases(docker: &dyn Fn() -> Command, temporary: &Path, midshift: &Path) -> Result<()> {
+    let mut base = Root::new(&temporary.join("base"))?;
+    base.libraries(midshift)?;
+    base.build(docker, "midshift-base:machine", "")?;
+    let mut proxy = Root::new(&temporary.join("proxy-base"))?;
+    proxy.libraries(midshift)?;
+    let haproxy = run::output(Command::new("sh").args(["-c", "command -v haproxy"])).context("no haproxy")?;
+    proxy.put(Path::new(haproxy.trim()))?;
+    proxy.build(docker, "midshift-proxy-base:machine", "")
+}
+
+fn database(docker: &dyn Fn() -> Command, temporary: &Path, name: &str) -> Result<()> {
     let programs = postgresql::programs()?;
     let version = programs.parent().context("programs have a folder")?;
     let mut root = Root::new(&temporary.join("database"))?;

@@ -5,6 +5,7 @@
 
 mod apt;
 mod clients;
+mod dist;
 mod docker;
 mod engine;
 mod fetch_tools;
@@ -59,6 +60,8 @@ enum Verb {
     /// The stack of a compose file as processes of this machine, without docker.
     #[command(subcommand)]
     Stack(stack::Verb),
+    /// Everything a release consists of: archives of programs and source, images, digests. Nothing is uploaded.
+    Dist(dist::Options),
     /// Write the golden files anew from what the code does now. Read the diff before you commit it.
     Golden,
     /// Format everything, then `golden`.
@@ -70,6 +73,7 @@ fn main() -> ExitCode {
         Verb::Test { install, no_docker, parts } => suite::test(&workspace, install, no_docker, &parts),
         Verb::Torture { sweeps, seeds, from } => sweep::torture(&workspace, &sweeps, from, seeds),
         Verb::Stack(verb) => stack::run(&workspace, verb),
+        Verb::Dist(options) => dist::dist(&workspace, &options),
         Verb::Golden => sweep::golden(&workspace),
         Verb::Tidy => sweep::tidy(&workspace),
     });

@@ -6,7 +6,7 @@
 use crate::fetch_tools::Tools;
 use crate::stack::{self, Which};
 use crate::workspace::Workspace;
-use crate::{clients, docker, engine, run};
+use crate::{clients, dist, docker, engine, run};
 use anyhow::Result;
 use clap::ValueEnum;
 use std::process::Command;
@@ -34,6 +34,8 @@ pub enum Part {
     Engine,
     /// Examples in the documentation.
     Doc,
+    /// Archives of a release: the same twice, whole, and what is in them starts.
+    Dist,
     /// The split stack as processes: started, a task done through its proxy, ended.
     Stack,
     /// The split stack by docker-compose on a docker of its own: brought up, a task done through its proxy, brought down.
@@ -65,6 +67,7 @@ impl Part {
             Self::Suite => "suite",
             Self::Engine => "engine",
             Self::Doc => "doc",
+            Self::Dist => "dist",
             Self::Stack => "stack",
             Self::Compose => "compose",
         }
@@ -80,7 +83,7 @@ impl Part {
 
     /// Whether it runs tests, which need the built programs.
     pub fn runs_tests(self) -> bool {
-        matches!(self, Self::Unit | Self::Suite | Self::Engine | Self::Doc | Self::Stack | Self::Compose)
+        matches!(self, Self::Unit | Self::Suite | Self::Engine | Self::Doc | Self::Dist | Self::Stack | Self::Compose)
     }
 
     /// Runs it; whether it succeeded. Tests are added to `count`.
@@ -111,6 +114,7 @@ impl Part {
                 count.all(tests(workspace, tools, &engine::selection())?.env(name, value))
             }
             Self::Doc => count.all(&mut tests(workspace, tools, &["--doc"])?),
+            Self::Dist => count.one(dist::test(workspace)),
             Self::Stack => count.one(stack::test(workspace, &Which::split(), Some(workspace.midshift()))),
             Self::Compose => count.one(docker::test(workspace, &workspace.midshift())),
         }

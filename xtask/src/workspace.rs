@@ -16,6 +16,8 @@ pub struct Workspace {
     pub root: PathBuf,
     /// Cargo's target directory.
     pub target: PathBuf,
+    /// The version that all crates share.
+    version: Option<String>,
     /// This program, as it was called: a build of everything may put a new one in its place, and then the system says that it is deleted.
     pub this: PathBuf,
 }
@@ -32,7 +34,15 @@ impl Workspace {
         let metadata: serde_json::Value = serde_json::from_slice(&output.stdout).context("reading cargo metadata")?;
         let path = |key: &str| metadata[key].as_str().map(PathBuf::from).with_context(|| format!("no {key}"));
         let this = std::env::current_exe().context("this program")?;
-        Ok(Self { root: path("workspace_root")?, target: path("target_directory")?, this })
+        let ours = |package: &&serde_json::Value| package["name"] == "midshift";
+        let midshift = metadata["packages"].as_array().and_then(|all| all.iter().find(ours));
+        let version = midshift.and_then(|package| package["version"].as_str()).map(str::to_owned);
+        Ok(Self { root: path("workspace_root")?, target: path("target_directory")?, version, this })
+    }
+
+    /// The version of midshift at hand.
+    pub fn version(&self) -> Result<String> {
+        self.version.clone().context("cargo knows of no package midshift")
     }
 
     /// Where downloaded tools are kept.

@@ -4,14 +4,17 @@
 //! its answer: what was submitted is what was acknowledged.
 
 use anyhow::{Context, bail};
+use midshift_core::fleet::rows::Place;
 use midshift_core::ids::TaskId;
+use midshift_core::rows::Table;
 use midshift_core::site::{Site, grid, task_list};
 use midshift_core::task::forms::Transport;
 use midshift_core::time::Clock;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::task::v1::{self, SubmitTaskRequest, SubmitTasksRequest, submit_task_request::Body};
 use midshift_sim::workload::{Workload, WorkloadConfig};
-use std::collections::VecDeque;
+use midshift_store::Store;
+use std::collections::{BTreeSet, VecDeque};
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -149,8 +152,32 @@ pub struct Background {
 
 /// How often the client looks, real time.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
+/// So long work waits for robots that do not come, real time.
+const ROBOTS_COME: Duration = Duration::from_secs(30);
 /// Tasks of one call.
 const BURST: usize = 500;
+
+/// Waits until fleet knows where each of so many robots stands, or until they have had time enough: a robot that nobody has heard of yet may stand in
+/// a place that is given to another one.
+pub async fn all_stand(store: &dyn Store, robots: usize) -> anyhow::Result<()> {
+    let known = async {
+        loop {
+            let places = store.snapshot(&[Table::PlaceGrant]).await?;
+            let mut standing = BTreeSet::new();
+            for row in &places.rows {
+                standing.extend(row.decode::<Place>()?.holders.into_iter().map(|holder| holder.robot_id));
+            }
+            if standing.len() >= robots {
+                return Ok(());
+            }
+            tokio::time::sleep(LOOK_EVERY).await;
+        }
+    };
+    tokio::time::timeout(ROBOTS_COME, known).await.unwrap_or_else(|_| {
+        tracing::warn!(robots, "not every robot has come; work begins without the others");
+        Ok(())
+    })
+}
 
 impl Background {
     /// Submits until `stop`, or until its list is over.

@@ -1,6 +1,6 @@
 //! `midshift dev`: a whole factory in one process, in memory, on loopback, with simulated robots and work of its own. Not for production.
 
-use crate::background::{Acknowledged, Background, Pressure, Source, read_list};
+use crate::background::{Acknowledged, Background, Pressure, Source, all_stand, read_list};
 use crate::planning::Planning;
 use crate::report::{self, Inputs, Kind, Report};
 use crate::roles::Roles;
@@ -389,6 +389,27 @@ impl Run {
         })
     }
 
+    /// Work for robots that stand where fleet knows of them; where nothing is reserved they may stand anywhere.
+    fn work(
+        &self,
+        background: Background,
+        channel: tonic::transport::Channel,
+        stop: CancellationToken,
+    ) -> impl Future<Output = anyhow::Result<()>> + Send + use<> {
+        let reserved = self.site.collisions_modelled().then_some(self.args.robots);
+        let store = self.store.clone();
+        async move {
+            if let Some(robots) = reserved {
+                let asked = stop.cancelled();
+                tokio::select! {
+                    standing = all_stand(&*store, robots) => standing?,
+                    () = asked => return Ok(()),
+                }
+            }
+            background.run(channel, stop).await
+        }
+    }
+
     async fn together(
         self,
         server: Server,
@@ -412,7 +433,7 @@ impl Run {
             serving: tokio::spawn(server.serve(serve::nodelay(listener))),
             following: tokio::spawn(async { Ok(following.await?) }),
             robots: tokio::spawn(async { Ok(swarm.await.map(drop)?) }),
-            working: tokio::spawn(background.run(channel, work_stop.clone())),
+            working: tokio::spawn(self.work(background, channel, work_stop.clone())),
         };
         let progress = report::watch_progress(board, self.clock.clone(), no_progress_ms.clone());
         let _progress = AbortOnDropHandle::new(tokio::spawn(progress));
