@@ -3,7 +3,7 @@
 //! Invariant: a report counts only for the newest epoch of its task; older ones are fenced and counted, never obeyed.
 
 use super::Tx;
-use super::rows::{HoldToken, HolderState, RobotControl};
+use super::rows::{HoldToken, HolderState, PlaceHolder, RobotControl};
 use super::tasks::{News, event_of, happen};
 use super::{Tally, errands, tasks};
 use crate::ids::{PlaceId, RobotId};
@@ -66,7 +66,12 @@ fn release(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
 /// Obeys news of a place.
 pub fn place(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: u64, news: PlaceNews) {
     let Some(mut place) = tx.view.places.get(place_id.as_str()).map(|p| p.row.clone()) else { return };
-    let Some(at) = place.holders.iter().position(|h| h.robot_id == *robot_id && h.grant_id == grant_id) else { return };
+    let Some(at) = place.holders.iter().position(|h| h.robot_id == *robot_id && h.grant_id == grant_id) else {
+        if news == PlaceNews::Entered {
+            adopt(tx, robot_id, place_id.as_str(), grant_id);
+        }
+        return;
+    };
     let kind = match news {
         PlaceNews::Entered => {
             place.holders[at].state = HolderState::Inside;
@@ -85,6 +90,21 @@ pub fn place(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: u64,
         }
     };
     tx.put(place, kind);
+}
+
+/// A robot is where the rows do not know of it: its word is taken, whatever the capacity, before the place is given to another one.
+pub fn adopt(tx: &mut Tx, robot_id: &RobotId, place_id: &str, grant_id: u64) {
+    let Some(mut place) = tx.view.places.get(place_id).map(|p| p.row.clone()) else { return };
+    if place.holder(robot_id).is_some() {
+        return;
+    }
+    place.holders.push(PlaceHolder {
+        robot_id: robot_id.clone(),
+        grant_id,
+        state: HolderState::Inside,
+        since: tx.now.utc,
+    });
+    tx.put(place, "place.adopted");
 }
 
 /// A person took the robot over: what it has becomes UNCERTAIN. Back in automatic mode, its heartbeat says what it still has.

@@ -62,23 +62,8 @@ pub fn repair(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
         inside.entry(waypoint.as_str()).or_insert(0);
     }
     for (id, grant_id) in inside {
-        adopt(tx, robot_id, id, grant_id);
+        inbox::adopt(tx, robot_id, id, grant_id);
     }
-}
-
-/// A robot stands where the rows do not know of it: the truth is taken, whatever the capacity.
-fn adopt(tx: &mut Tx, robot_id: &RobotId, id: &str, grant_id: u64) {
-    let Some(mut place) = tx.view.places.get(id).map(|p| p.row.clone()) else { return };
-    if place.holder(robot_id).is_some() {
-        return;
-    }
-    place.holders.push(PlaceHolder {
-        robot_id: robot_id.clone(),
-        grant_id,
-        state: HolderState::Inside,
-        since: tx.now.utc,
-    });
-    tx.put(place, "place.adopted");
 }
 
 struct Wish {

@@ -2,8 +2,10 @@
 
 use crate::harness::World;
 use midshift_core::fleet::rows::HolderState;
+use midshift_core::ids::PlaceId;
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::Phase;
+use midshift_core::work::{PlaceNews, RobotEvent};
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
 use tonic::Request;
@@ -31,6 +33,24 @@ async fn the_second_robot_waits_before_an_exclusive_passage_and_goes_when_the_fi
     w.until("r1 has left", |s| !s.has("r1", "corridor")).await;
     w.until("r2 has it", |s| s.has("r2", "corridor")).await;
     w.until_phase("T2", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_place_that_a_robot_says_it_is_in_is_nobody_elses_though_no_heartbeat_has_said_so_yet() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    // As a robot that has just come: its event is here, and no heartbeat since that counts.
+    w.robot("r2", "park-b").await;
+    w.r("r2").talks = false;
+    let place_id = PlaceId::parse("charge").expect("a place");
+    w.r("r2").says(RobotEvent::Place { place_id, grant_id: 0, news: PlaceNews::Entered });
+    w.r("r1").battery_permille = 150;
+    w.pass_while(30, "r1 does not get the charger", |s| !s.has("r1", "charge")).await;
+    assert_eq!(w.seen().await.holders("charge"), [("r2".to_owned(), HolderState::Inside)]);
+    let left = PlaceId::parse("charge").expect("a place");
+    w.r("r2").says(RobotEvent::Place { place_id: left, grant_id: 0, news: PlaceNews::Left });
+    w.until("r1 has the charger", |s| s.has("r1", "charge")).await;
     w.lawful().await;
 }
 
