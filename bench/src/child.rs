@@ -167,6 +167,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 data: None,
                 no_faults: true,
                 listen: None,
+                trust: None,
             };
             midshift::robots::swarm(swarm, stop).await
         }

@@ -22,7 +22,8 @@ pub enum Sweep {
     Kills,
     /// Shifts of the deterministic simulation, with roll-outs of software.
     Simulation,
-    /// A process of each service of a split stack killed or replaced in turn with 200 robots at work, as often as --seeds says; it draws nothing.
+    /// A process of each service of a split stack killed or replaced in turn while 200 robots work and a release goes out to them, and then a bad one; as
+    /// often as --seeds says, it draws nothing.
     Split,
     /// The power goes at each call of an update, and of the ways back from one, that changes the disk: all of them, whatever the seeds.
     Updates,

@@ -1,8 +1,8 @@
 //! Robots in processes of their own: one agent with a simulated body that survives its process, or a swarm against a server elsewhere.
 
-use crate::software::Software;
+use crate::software::{self, Software};
 use crate::{clock, site_file};
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, bail};
 use midshift_agent::bulk::Bulk;
 use midshift_agent::core::ExitReason;
 use midshift_agent::dial::TcpDial;
@@ -100,6 +100,9 @@ pub struct SimRun {
     /// Nothing goes wrong by itself.
     #[arg(long)]
     pub no_faults: bool,
+    /// Whose software they take: the trust file of a robot of the site. Without it they keep what they came with.
+    #[arg(long)]
+    pub trust: Option<PathBuf>,
     /// Also answer `sim.v1` (faults) here.
     #[arg(long)]
     pub listen: Option<SocketAddr>,
@@ -144,11 +147,9 @@ pub async fn agent_in_hand(
         bail!("the site has no waypoint {start}");
     }
     let software = args.sets.as_deref().zip(args.trust.as_deref());
-    let software = software.map(|(sets, trust)| Software::open(sets, trust)).transpose()?;
+    let software = software.map(|(sets, trust)| Software::open(sets, software::trust_of(trust, &site)?)).transpose()?;
     let mut config = BodyConfig::new(robot_id.clone(), args.seed, start);
     if let Some(software) = &software {
-        let of = &software.trust.site;
-        ensure!(of == site.site_id(), "the trust file is for robots of site {of}; this is site {}", site.site_id());
         software.shape(&mut config);
     }
     let pace = args.body_speed.clamp(0.1, 100.0);
@@ -220,8 +221,10 @@ pub async fn swarm(args: SimRun, stop: CancellationToken) -> anyhow::Result<()> 
     if let Some(dir) = &args.data {
         config.persistence = Persistence::Dir(dir.clone());
     }
+    let trust = args.trust.as_deref().map(|file| software::trust_of(file, &config.site)).transpose()?;
     let hall = Arc::new(Hall::open(&config, &clock.now())?);
     let mut swarm = SwarmConfig::tcp(hall.clone(), clock.clone(), &uri(&args.server), args.seed);
+    swarm.software = trust;
     swarm.persistence = config.persistence.clone();
     let swarm = Swarm::new(swarm);
     let face = SimFace::new(hall, clock, swarm.crash());

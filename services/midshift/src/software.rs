@@ -13,6 +13,7 @@ use midshift_agent::trust::Trust;
 use midshift_agent::update::UpdateConfig;
 use midshift_agent::update::io::UpdateWorker;
 use midshift_agent::update::remote::GrpcRemote;
+use midshift_core::site::Site;
 use midshift_core::time::{Clock, LinkDuration};
 use midshift_sim::behaviour::{Behaviour, COMPONENT};
 use midshift_sim::body::BodyConfig;
@@ -22,10 +23,17 @@ use std::sync::Arc;
 /// Called once a second while the agent lives.
 type Pulse = Box<dyn FnMut() + Send>;
 
+/// Reads the trust file of robots of `site`. An error if it is for those of another one.
+pub fn trust_of(file: &Path, site: &Site) -> anyhow::Result<Trust> {
+    let trust = Trust::read(file)?;
+    let (of, this) = (&trust.site, site.site_id());
+    ensure!(of == this, "the trust file is for robots of site {of}; this is site {this}");
+    Ok(trust)
+}
+
 /// What a robot runs and may take.
 pub struct Software {
-    /// What it believes.
-    pub trust: Trust,
+    trust: Trust,
     sets: DiskSets,
     /// Name of the set that runs.
     running: String,
@@ -37,9 +45,8 @@ pub struct Software {
 }
 
 impl Software {
-    /// Reads the trust file and the set that runs.
-    pub fn open(sets: &Path, trust: &Path) -> anyhow::Result<Self> {
-        let trust = Trust::read(trust)?;
+    /// Reads the set that runs.
+    pub fn open(sets: &Path, trust: Trust) -> anyhow::Result<Self> {
         let mut sets = DiskSets::open(sets)?;
         let told = std::env::var(launcher::SET).ok();
         if let Some(set) = &told {

@@ -30,6 +30,7 @@ mod public_address;
 mod restored;
 mod robots;
 mod rolled_out;
+mod rolling;
 mod room;
 mod split;
 mod stack;

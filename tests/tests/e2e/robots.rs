@@ -54,8 +54,15 @@ impl Robots {
         .await?;
         Ok(robots)
     }
-    /// `count` of them on the site of a file, shared out among `processes`, with bodies no faster than real ones.
-    pub fn crowd(dir: &Path, server: SocketAddr, site: &Path, count: usize, processes: usize) -> anyhow::Result<Self> {
+    /// `count` of them on the site of a file, shared out among `processes`, with bodies no faster than real ones; they take software as `trust` says.
+    pub fn crowd(
+        dir: &Path,
+        server: SocketAddr,
+        site: &Path,
+        trust: &Path,
+        count: usize,
+        processes: usize,
+    ) -> anyhow::Result<Self> {
         let mut robots = Self::none(dir, server);
         let digits = count.to_string().len();
         robots.ids = (1..=count).map(|number| format!("rbt-{number:0digits$}")).collect();
@@ -64,7 +71,7 @@ impl Robots {
             let mut command = Command::new(midshift()?);
             command.args(["sim", "run", "--server", &robots.server, "--robots", &count.to_string(), "--no-faults"]);
             command.args(["--only", &format!("{from}..{to}"), "--seed", "1"]).arg("--data").arg(dir);
-            command.arg("--site").arg(site);
+            command.arg("--site").arg(site).arg("--trust").arg(trust);
             robots.crowds.push(Running::start(&mut command, &dir.join(format!("crowd-{nth}.log")))?);
         }
         Ok(robots)

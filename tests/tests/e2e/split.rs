@@ -5,9 +5,10 @@ use crate::harness::{channel, folder, in_states, until};
 use crate::kill::{TASKS, all_over, at_work, judge, judge_ledgers, submit};
 use crate::robots::Robots;
 use crate::rolled_out::{call, done};
+use crate::rolling::{self, Rolling};
 use crate::room::LIMIT;
 use crate::stack::Stack;
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use midshift::clock::clock;
 use midshift_core::site::{DEMO, grid, text};
 use midshift_proto::convert::common::time_of;
@@ -77,12 +78,27 @@ async fn tasks_go_on_while_every_process_of_a_split_stack_is_killed_or_replaced_
     let map = many.map_or_else(|| DEMO.to_owned(), free_floor);
     let site = if many.is_some() { grid::parse_map("site", &map) } else { text::parse(&map) }?;
     let (count, tasks) = many.map_or((ROBOTS, TASKS), |many| (many, many * TASKS_EACH));
-    let mut stack = Stack::start(dir.path(), &map, &["--drain-seconds", "20", "--no-software"], &[]).await?;
-    let robots = match many {
-        None => Robots::start(dir.path(), stack.robots, stack.public, &site, count).await?,
-        Some(_) => Robots::crowd(dir.path(), stack.robots, &stack.site, count, CROWDS)?,
+    let samples = dir.path().join("samples");
+    let (mut stack, robots) = match many {
+        None => {
+            let stack = Stack::start(dir.path(), &map, &["--drain-seconds", "20", "--no-software"], &[]).await?;
+            let robots = Robots::start(dir.path(), stack.robots, stack.public, &site, count).await?;
+            (stack, robots)
+        }
+        Some(_) => {
+            rolling::prepare(&samples, &site)?;
+            let keys = samples.join("keys").display().to_string();
+            let stack = Stack::start(dir.path(), &map, &["--drain-seconds", "20"], &["--ota-keys", &keys]).await?;
+            let trust = samples.join("trust.json");
+            let robots = Robots::crowd(dir.path(), stack.robots, &stack.site, &trust, count, CROWDS)?;
+            (stack, robots)
+        }
     };
     submit(stack.public, &site, 7, tasks).await?;
+    let rolling = match many {
+        Some(_) => Some(Rolling::begin(&stack, &samples, "walk-1.5.0", count).await?),
+        None => None,
+    };
     let mut old_proxies = Vec::new();
     for (nth, (what, blow)) in BLOWS.into_iter().enumerate() {
         // So early that there is work left to assign after the last of them.
@@ -115,6 +131,17 @@ async fn tasks_go_on_while_every_process_of_a_split_stack_is_killed_or_replaced_
         say!("{what}: the next assignment after {:.1} s", begun.0.elapsed().as_secs_f64());
     }
     let ended = all_over(stack.public, tasks).await?;
+    if let Some(rolling) = rolling {
+        let good = rolling.ends(0).await?;
+        ensure!(good.committed as usize == count, "not every robot keeps it: {good:?}");
+        let bad = Rolling::begin(&stack, &samples, "walk-1.6.0-bad-at-start", count).await?.ends(12).await?;
+        ensure!(bad.attempted == 1 && bad.committed == 0, "it ends at its canary: {bad:?}");
+        for (id, version, ran) in [("walk-1.5.0", "1.5.0", count), ("walk-1.6.0-bad-at-start", "1.6.0-bad-at-start", 1)]
+        {
+            let began = rolling::ran_in_their_drains(&stack, &site, &robots, id, version).await?;
+            ensure!(began >= ran, "{id} ran on {began} robots by their journals");
+        }
+    }
     let online = until("every robot", Duration::from_secs(60), || async {
         let request = ListRobotsRequest { page_size: 1_000, ..ListRobotsRequest::default() };
         let page = TelemetryServiceClient::new(channel(stack.public)?).list_robots(request).await;

@@ -1,0 +1,147 @@
+//! Roll-outs under way on a split stack with a crowd of simulated robots at work, while its processes are killed: a good one, then a bad one.
+
+use crate::harness::{channel, until};
+use crate::robots::Robots;
+use crate::rolled_out::{call, done};
+use crate::stack::Stack;
+use anyhow::{Context, ensure};
+use midshift::clock::clock;
+use midshift_agent::trust::Trust;
+use midshift_bundle::keys::SecretKey;
+use midshift_core::ids::RobotId;
+use midshift_core::rollout::rows::RolloutRobot;
+use midshift_core::rows::Table;
+use midshift_core::site::Site;
+use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
+use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
+use midshift_proto::ota::v1::{GetRolloutRequest, ListBundlesRequest, RolloutCounts};
+use midshift_sim::journal::{self, Effect};
+use midshift_store::{PostgresConfig, PostgresStore, Store};
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::path::Path;
+use std::time::Duration;
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::AbortOnDropHandle;
+
+/// Of every hundred robots that a wave may have: the canary, a tenth, the rest.
+const WAVES: &str = "1,10%,rest";
+/// A roll-out to every robot of a crowd may take so long.
+const LIMIT: Duration = Duration::from_secs(900);
+const LOOK: Duration = Duration::from_millis(200);
+
+/// Sample releases, and who robots of a site believe: `samples` gets `keys`, `repository` and `trust.json`.
+pub fn prepare(samples: &Path, site: &Site) -> anyhow::Result<()> {
+    done(&["bundle", "samples", &samples.display().to_string(), "--config-only"])?;
+    let key = SecretKey::read(&samples.join("keys/directive-1.pem"))?.public();
+    let root = std::fs::read(samples.join("repository/metadata/1.root.json"))?;
+    let trust = Trust { root, directive_keys: [(key.id(), key)].into(), site: site.site_id().clone() };
+    Ok(trust.write(&samples.join("trust.json"))?)
+}
+
+/// Robots out of work for a roll-out, and how far it is; none while nobody answers.
+async fn counts(public: SocketAddr, id: &str) -> anyhow::Result<Option<(u32, RolloutCounts)>> {
+    let request = GetRolloutRequest { rollout_id: id.to_owned() };
+    let answer = RolloutServiceClient::new(channel(public)?).get_rollout(request).await;
+    let rollout = answer.ok().and_then(|answer| answer.into_inner().rollout);
+    Ok(rollout.map(|rollout| (rollout.in_flight, rollout.counts.unwrap_or_default())))
+}
+
+/// The roll-out of one release, looked at again and again.
+pub struct Rolling {
+    id: &'static str,
+    public: SocketAddr,
+    robots: usize,
+    looking: AbortOnDropHandle<anyhow::Result<u32>>,
+    enough: CancellationToken,
+}
+
+impl Rolling {
+    /// Pushes the releases of `samples`, and begins with this one.
+    pub async fn begin(stack: &Stack, samples: &Path, id: &'static str, robots: usize) -> anyhow::Result<Self> {
+        let public = stack.public.to_string();
+        done(&["bundle", "push", "--server", &public, &samples.join("repository").display().to_string()])?;
+        until("the release is known to whoever is asked", LIMIT, async || {
+            let mut is_known = true;
+            for _ in 0..4 {
+                let mut client = BundleServiceClient::new(channel(stack.public)?);
+                let listed = client.list_bundles(ListBundlesRequest::default());
+                let bundles = listed.await.map_or_else(|_| Vec::new(), |page| page.into_inner().bundles);
+                is_known &= !bundles.is_empty();
+            }
+            Ok(is_known.then_some(()))
+        })
+        .await?;
+        let quick = ["--waves", WAVES, "--soak", "5s", "--probation", "5s", "--exposure-tasks", "0", "--start"];
+        done(&[&["rollout", "create", "--server", &public, id][..], &quick].concat())?;
+        let (enough, address) = (CancellationToken::new(), stack.public);
+        let most = looked_at(address, id, robots, enough.clone());
+        Ok(Self { id, public: address, robots, looking: AbortOnDropHandle::new(tokio::spawn(most)), enough })
+    }
+
+    /// Waits for its end with this exit code of `rollout wait`; how far it came. More robots out of work than its wave and its area allow is an error.
+    pub async fn ends(self, code: i32) -> anyhow::Result<RolloutCounts> {
+        let (public, id) = (self.public.to_string(), self.id);
+        let limit = format!("{}s", LIMIT.as_secs());
+        let waited =
+            tokio::task::block_in_place(|| call(&["rollout", "wait", "--server", &public, id, "--timeout", &limit]))?;
+        let said = String::from_utf8_lossy(&waited.stderr).into_owned();
+        ensure!(waited.status.code() == Some(code), "{id}: {:?} {said}", waited.status.code());
+        self.enough.cancel();
+        let most = self.looking.await.context("looking at it")??;
+        let (_, counts) = until("how far it came", LIMIT, || counts(self.public, id)).await?;
+        say!(
+            "{id}: {} of {} robots keep it, {} were permitted, at most {most} out of work at once",
+            counts.committed,
+            self.robots,
+            counts.attempted
+        );
+        Ok(counts)
+    }
+}
+
+/// The most robots that were ever out of work for it at once. An error when they are more than may be: 10 % of the robots of the area, and no more than
+/// one while only the canary was ever permitted.
+async fn looked_at(public: SocketAddr, id: &str, robots: usize, enough: CancellationToken) -> anyhow::Result<u32> {
+    let (mut most, allowed) = (0, u32::try_from(robots.div_ceil(10))?);
+    while enough.run_until_cancelled(tokio::time::sleep(LOOK)).await.is_some() {
+        let Some((in_flight, counts)) = counts(public, id).await? else { continue };
+        let may = if counts.attempted <= 1 && counts.committed == 0 { 1 } else { allowed };
+        ensure!(in_flight <= may, "{id}: {in_flight} robots are out of work for it, {may} may be: {counts:?}");
+        most = most.max(in_flight);
+    }
+    Ok(most)
+}
+
+/// By the bodies' own journals: whoever ran this release began to while its drain held it, once, and before the server heard of it.
+pub async fn ran_in_their_drains(
+    stack: &Stack,
+    site: &Site,
+    robots: &Robots,
+    id: &str,
+    version: &str,
+) -> anyhow::Result<usize> {
+    let store = PostgresStore::open(&PostgresConfig::new(stack.url()), site.site_id().clone(), clock(1000)).await?;
+    let snapshot = store.snapshot(&[Table::RolloutRobot]).await?;
+    store.close().await;
+    let rows = snapshot.rows.iter().map(|row| row.decode::<RolloutRobot>()).collect::<Result<Vec<_>, _>>()?;
+    let rows: BTreeMap<&RobotId, &RolloutRobot> =
+        rows.iter().filter(|row| row.rollout_id.as_str() == id).map(|row| (&row.robot_id, row)).collect();
+    let mut ran = 0;
+    for path in robots.journals() {
+        for entry in journal::read(&path)? {
+            let (Effect::Ran { version: began }, Some(robot)) = (&entry.effect, &entry.robot_id) else { continue };
+            if began != version {
+                continue;
+            }
+            ran += 1;
+            let moments =
+                &rows.get(robot).with_context(|| format!("{robot} ran {version} and is not in {id}"))?.moments;
+            let held =
+                moments.held.with_context(|| format!("{robot} ran {version} and was never held: {moments:?}"))?;
+            ensure!(held.0 <= entry.utc_ms, "{robot} ran {version} at {} before {moments:?}", entry.utc_ms);
+            ensure!(moments.switched.is_none_or(|at| entry.utc_ms <= at.0), "{robot} ran {version} again: {moments:?}");
+        }
+    }
+    Ok(ran)
+}
