@@ -147,7 +147,7 @@ fn caveats(view: &View, spec: &RolloutSpec, bundle: &Bundle, matching: &Matching
         ActsOnRates::Areas(areas) => {
             let areas: Vec<&str> = areas.iter().map(AreaId::as_str).collect();
             format!(
-                "rates of task failures end it too once it has given permission to a robot there: the rules of {} say so",
+                "rates of task failures end it too once a robot that has run it is there: the rules of {} say so",
                 areas.join(", ")
             )
         }

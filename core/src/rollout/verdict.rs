@@ -182,9 +182,9 @@ impl ActsOnRates {
 }
 
 /// Who says at this moment that the gate on rates of task failures ends the roll-out; none: what it finds is only shown. The spec, or else
-/// the rules of an area in which a robot is, as far as it said last, that was given permission to activate: tasks of such robots are the evidence,
-/// also when their wave was kept. Robots that it has not touched say nothing for or against it, so neither do their areas. Rules are read
-/// as they are now: a rule that is put while the roll-out runs holds at once, also for what was counted before. Nothing ends what is over, or takes
+/// the rules of an area in which a robot is, as far as it said last, that has run the bundle on trial: tasks of such robots are the evidence,
+/// also when their wave was kept. Robots that never ran it say nothing for or against it, also if they were given permission, so neither do
+/// their areas. Rules are read as they are now: a rule that is put while the roll-out runs holds at once, also for what was counted before. Nothing ends what is over, or takes
 /// something back.
 pub fn acts_on_rates(view: &View, rollout: &Rollout) -> Option<ActsOnRates> {
     if rollout.phase.is_over() || rollout.revert_of.is_some() {
@@ -193,8 +193,8 @@ pub fn acts_on_rates(view: &View, rollout: &Rollout) -> Option<ActsOnRates> {
     if rollout.spec.acts_on_rates {
         return Some(ActsOnRates::Spec);
     }
-    let attempted = view.robots_of(&rollout.rollout_id).filter(|r| r.attempted);
-    let software = attempted.filter_map(|r| view.software.get(r.robot_id.as_str()));
+    let ran_it = view.robots_of(&rollout.rollout_id).filter(|r| r.moments.on_trial.is_some());
+    let software = ran_it.filter_map(|r| view.software.get(r.robot_id.as_str()));
     areas_that_act(view, software.filter_map(|s| s.row.area.as_ref()))
 }
 

@@ -302,6 +302,22 @@ fn rules_of_an_area_in_which_no_robot_was_given_permission_end_nothing_and_rules
 }
 
 #[test]
+fn rules_of_an_area_with_a_robot_that_was_given_permission_and_never_ran_it_end_nothing() {
+    let rig = suspected(false, |rig| {
+        quality_acts(rig);
+        let dawdles = rig.order()[7];
+        rig.robots[dawdles].at = "door-2";
+        rig.ticks(2);
+        let given = RolloutRobot { attempted: true, ..rig.of("ro", dawdles) };
+        rig.put(given);
+        rig.ota_turn();
+        let row = rig.of("ro", dawdles);
+        assert!(row.attempted && row.moments.on_trial.is_none());
+    });
+    assert_eq!(ended_by(&rig), None);
+}
+
+#[test]
 fn a_robot_on_trial_that_drives_into_an_area_that_says_so_ends_it() {
     let rig = suspected(false, |rig| {
         quality_acts(rig);

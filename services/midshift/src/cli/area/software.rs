@@ -21,7 +21,7 @@ pub struct Rules {
     /// No robot is taken out of work for a roll-out.
     #[arg(long, value_name = "true|false", action = clap::ArgAction::Set)]
     frozen: Option<bool>,
-    /// A suspicion from rates of task failures ends roll-outs that have given permission to a robot of the area. Without it that is only shown.
+    /// A suspicion from rates of task failures ends roll-outs whose bundle a robot of the area has run. Without it that is only shown.
     #[arg(long, value_name = "true|false", action = clap::ArgAction::Set)]
     acts_on_rates: Option<bool>,
 }
