@@ -1,12 +1,13 @@
 //! Commands with a request_id: asked again with the same id and the same in every part, a command is not carried out again.
 //!
 //! Called by what decides on commands in `fleet` and `rollout`. Invariant: the key is written in the item that carries the command out, so that
-//! neither stands without the other. What is answered to the second is how things are by then.
+//! neither stands without the other. What is answered to the second is that, and how things are by then.
 
 use crate::limits;
 use crate::picture::{Picture, Slot, Tx, Viewed};
 use crate::reason::{Code, Kind, Reason, Refusal};
 use crate::rows::{Index, Record, Revision, Table};
+use crate::time::Utc;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
@@ -43,7 +44,27 @@ impl<C: Asked> Record for CommandKey<C> {
     }
 }
 
-/// Whether this is a command that was carried out already: the same request_id, and the same in every part.
+/// When this command was carried out already: the same request_id, and the same in every part. None: it was not.
+///
+/// # Errors
+/// The request_id was used for something else.
+pub fn done_before<C: Asked>(
+    known: &Slot<CommandKey<C>>,
+    request_id: &str,
+    command: &C,
+    seen: Option<Revision>,
+) -> Result<Option<Utc>, Refusal> {
+    match known.get(request_id).map(|k| &k.row) {
+        None => Ok(None),
+        Some(known) if known.command == *command && known.seen == seen => Ok(Some(Utc(known.at_unix_ms))),
+        Some(_) => {
+            let reason = Reason::from(Code::RequestIdReused).with("request_id", request_id);
+            Err(Refusal::new(Kind::AlreadyExists, reason))
+        }
+    }
+}
+
+/// As [`done_before`], of which only whether it was matters.
 ///
 /// # Errors
 /// The request_id was used for something else.
@@ -53,14 +74,7 @@ pub fn is_repeat<C: Asked>(
     command: &C,
     seen: Option<Revision>,
 ) -> Result<bool, Refusal> {
-    match known.get(request_id).map(|k| &k.row) {
-        None => Ok(false),
-        Some(known) if known.command == *command && known.seen == seen => Ok(true),
-        Some(_) => {
-            let reason = Reason::from(Code::RequestIdReused).with("request_id", request_id);
-            Err(Refusal::new(Kind::AlreadyExists, reason))
-        }
-    }
+    done_before(known, request_id, command, seen).map(|at| at.is_some())
 }
 
 /// Writes down that a command was carried out, and lets go of a few that are past their time.

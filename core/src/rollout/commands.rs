@@ -17,7 +17,7 @@ use crate::limits;
 use crate::once;
 use crate::reason::{Code, Kind, Reason, Refusal, Violations};
 use crate::rows::{Revision, Table};
-use crate::time::Now;
+use crate::time::{Now, Utc};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -132,20 +132,29 @@ pub enum CheckOnly {
     No,
 }
 
+/// What became of a request that nothing is against.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Taken {
+    /// It is carried out, or may be if it was only to be checked. It may be that it changes nothing.
+    Now,
+    /// It was carried out then under its request_id, UTC of the wall. Nothing is done now, nor would be.
+    Before(Utc),
+}
+
 /// Decides on a request whole: what was carried out before, under its request_id or by what is known, is not carried out again.
 ///
 /// # Errors
 /// Why not; a request_id that was used for something else.
-pub fn take(view: &mut View, board: &Board, now: Now, ask: &Ask, plan: &mut Plan) -> Result<(), Refusal> {
+pub fn take(view: &mut View, board: &Board, now: Now, ask: &Ask, plan: &mut Plan) -> Result<Taken, Refusal> {
     let Ask { command, seen, check_only, request_id, actor } = ask;
     if let Some(id) = request_id
-        && once::is_repeat(&view.command_keys, id, command, *seen)?
+        && let Some(at) = once::done_before(&view.command_keys, id, command, *seen)?
     {
-        return Ok(());
+        return Ok(Taken::Before(at));
     }
     let is_done = check(view, board, command, *seen)?;
     if *check_only == CheckOnly::Yes {
-        return Ok(());
+        return Ok(Taken::Now);
     }
     match request_id {
         None if is_done => {}
@@ -159,7 +168,7 @@ pub fn take(view: &mut View, board: &Board, now: Now, ask: &Ask, plan: &mut Plan
             plan.items.extend(tx.finish());
         }
     }
-    Ok(())
+    Ok(Taken::Now)
 }
 
 fn not_found(code: Code, key: &str, id: &impl ToString) -> Refusal {

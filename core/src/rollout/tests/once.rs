@@ -1,6 +1,6 @@
 //! Commands that are only checked, and commands that are sent twice.
 
-use super::commands::{Ask, CheckOnly};
+use super::commands::{Ask, CheckOnly, Taken};
 use super::*;
 use crate::once::CommandKey;
 
@@ -19,9 +19,9 @@ fn asked(command: &Command, check_only: CheckOnly, request_id: Option<&str>) -> 
 }
 
 impl Rig {
-    fn once(&mut self, command: &Command, request_id: &str) -> Result<(), Refusal> {
+    fn once(&mut self, command: &Command, request_id: &str) -> Result<Taken, Refusal> {
         self.ota_turn();
-        let mut taken = Ok(());
+        let mut taken = Ok(Taken::Now);
         let ask = asked(command, CheckOnly::No, Some(request_id));
         self.ota_plan(|rig, plan| taken = commands::take(&mut rig.ota, &rig.board, rig.now, &ask, plan));
         taken
@@ -75,7 +75,8 @@ fn what_is_only_checked_writes_nothing_and_finds_what_would_be_refused() {
         let mut plan = Plan::default();
         for id in [None, Some("a")] {
             let ask = asked(&command, CheckOnly::Yes, id);
-            commands::take(&mut rig.ota, &rig.board, rig.now, &ask, &mut plan).expect("nothing is against it");
+            let taken = commands::take(&mut rig.ota, &rig.board, rig.now, &ask, &mut plan);
+            assert_eq!(taken.expect("nothing is against it"), Taken::Now);
         }
         assert_eq!(plan.items, Vec::<Item>::new(), "{command:?}");
     }
@@ -94,8 +95,11 @@ fn each_command_is_carried_out_once_for_its_request_id_and_another_one_is_refuse
         let key: CommandKey<Command> = rig.row(&id).expect("it is written down");
         assert_eq!(key.command, command);
         let mut plan = Plan::default();
-        let ask = asked(&command, CheckOnly::No, Some(&id));
-        commands::take(&mut rig.ota, &rig.board, rig.now, &ask, &mut plan).expect("it was done");
+        for check_only in [CheckOnly::No, CheckOnly::Yes] {
+            let ask = asked(&command, check_only, Some(&id));
+            let taken = commands::take(&mut rig.ota, &rig.board, rig.now, &ask, &mut plan).expect("it was done");
+            assert_eq!(taken, Taken::Before(Utc(key.at_unix_ms)), "{command:?} {check_only:?}");
+        }
         assert_eq!(plan.items, Vec::<Item>::new(), "{command:?}");
         assert_eq!(rig.once(&pin(7), &id).expect_err("it is taken").reason.code, Code::RequestIdReused);
     }

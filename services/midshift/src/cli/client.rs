@@ -5,6 +5,7 @@ use crate::robots::uri;
 use midshift_bundle::build;
 use midshift_bundle::folder::Error;
 use midshift_core::reason::{Kind, Refusal};
+use midshift_proto::convert::time_of;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
@@ -260,6 +261,34 @@ pub fn unary<T>(message: T) -> Request<T> {
 /// What comes after a check that found nothing against it.
 pub const WOULD: &str = "the same without --dry-run does it";
 
+/// What is said where a call with the same request_id did it before; none: there was none.
+pub fn done_before(at: Option<&prost_types::Timestamp>, change: DryRun) -> Option<String> {
+    let does = match change {
+        DryRun::Yes => "the same without --dry-run does nothing more",
+        DryRun::No => "this one changed nothing",
+    };
+    at.map(|at| format!("it was done at {} under this --request-id: {does}", time_of(at).rfc3339()))
+}
+
+/// Says how a command ended that takes a request_id: that it was done before, that it would be done, or what comes `next`, if anything.
+pub fn ended(done: Option<&prost_types::Timestamp>, change: DryRun, next: &str, out: &Out) {
+    match (done_before(done, change), change) {
+        (Some(told), _) => out.say(&told),
+        (None, DryRun::Yes) => out.next(WOULD),
+        (None, DryRun::No) if next.is_empty() => {}
+        (None, DryRun::No) => out.next(next),
+    }
+}
+
+/// Whether something was only checked.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DryRun {
+    /// Nothing changes.
+    Yes,
+    /// It is done.
+    No,
+}
+
 /// What every verb that changes something takes.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Change {
@@ -269,4 +298,25 @@ pub struct Change {
     /// Protects against a double call: the same id and content are one request.
     #[arg(long, default_value = "")]
     pub request_id: String,
+}
+
+impl Change {
+    /// Whether it is only checked.
+    pub fn only(&self) -> DryRun {
+        if self.dry_run { DryRun::Yes } else { DryRun::No }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_command_that_was_done_before_under_its_request_id_is_not_said_to_be_done_by_another_call() {
+        let at = prost_types::Timestamp::default();
+        assert_eq!(done_before(None, DryRun::Yes), None);
+        let said = [DryRun::Yes, DryRun::No].map(|only| done_before(Some(&at), only).expect("it was done"));
+        assert!(said.iter().all(|said| said.starts_with("it was done at 1970-01-01T00:00:00")), "{said:?}");
+        assert!(said[0].ends_with("does nothing more") && said[1].ends_with("changed nothing"), "{said:?}");
+    }
 }

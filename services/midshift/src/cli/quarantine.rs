@@ -1,6 +1,6 @@
 //! `midshift quarantine …`: bundles that robots went back from.
 
-use super::client::{Call, Change, Exit, WOULD, unary};
+use super::client::{Call, Change, DryRun, Exit, ended, unary};
 use super::out::Out;
 use clap::Subcommand;
 use midshift_proto::convert::time_of;
@@ -50,6 +50,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             Ok(())
         }
         Verb::Lift { call, robot_id, bundle, change } => {
+            let only = change.only();
             let request = v1::LiftQuarantineRequest {
                 robot_id: robot_id.clone(),
                 bundle: bundle.clone(),
@@ -57,17 +58,26 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
                 validate_only: change.dry_run,
             };
             let answer = call.rollouts().await?.lift_quarantine(unary(request)).await.map_err(Exit::with_facts)?;
-            let may = if change.dry_run { "could have" } else { "may have" };
-            out.one(&answer.into_inner(), &robot_id, || format!("{robot_id} {may} {bundle} again"))?;
-            if change.dry_run {
-                out.next(WOULD);
-                return Ok(());
-            }
-            out.next(
-                "midshift rollout ls; a completed roll-out tries it again with: midshift rollout retry ID --failed",
-            );
+            let answer = answer.into_inner();
+            out.one(&answer, &robot_id, || lifted(&answer, &robot_id, &bundle, only))?;
+            let next =
+                "midshift rollout ls; a completed roll-out tries it again with: midshift rollout retry ID --failed";
+            ended(answer.done_before.as_ref(), only, next, out);
             Ok(())
         }
+    }
+}
+
+/// What is so after a call to lift it: a check alone that no call was before leaves a quarantine in place.
+fn lifted(answer: &v1::LiftQuarantineResponse, robot_id: &str, bundle: &str, only: DryRun) -> String {
+    match (&answer.quarantine, only) {
+        (Some(_), DryRun::Yes) if answer.done_before.is_none() => format!("{robot_id} could have {bundle} again"),
+        (Some(kept), _) => {
+            let why = kept.reason.as_ref().map_or("", |reason| &reason.code);
+            let since = kept.since.as_ref().map(|t| time_of(t).rfc3339()).unwrap_or_default();
+            format!("{robot_id} may not have {bundle}: it went back from it since, {since} {why}")
+        }
+        (None, _) => format!("{robot_id} may have {bundle} again"),
     }
 }
 
@@ -89,6 +99,26 @@ fn row(quarantine: &v1::Quarantine) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_lift_says_what_is_so_now_and_a_robot_that_went_back_again_is_not_said_to_be_free() {
+        let said = |before: bool, is_kept: bool, only| {
+            let done_before = before.then(prost_types::Timestamp::default);
+            let reason =
+                Some(midshift_proto::common::v1::Reason { code: "PROBATION_FAILED".into(), ..Default::default() });
+            let kept = v1::Quarantine { reason, since: done_before, ..Default::default() };
+            let quarantine = is_kept.then_some(kept);
+            lifted(&v1::LiftQuarantineResponse { done_before, quarantine }, "r-1", "walk-1.5.0", only)
+        };
+        assert_eq!(said(false, false, DryRun::No), "r-1 may have walk-1.5.0 again");
+        assert_eq!(said(false, true, DryRun::Yes), "r-1 could have walk-1.5.0 again");
+        let again =
+            "r-1 may not have walk-1.5.0: it went back from it since, 1970-01-01T00:00:00.000Z PROBATION_FAILED";
+        for only in [DryRun::No, DryRun::Yes] {
+            assert_eq!(said(true, true, only), again);
+            assert_eq!(said(true, false, only), "r-1 may have walk-1.5.0 again");
+        }
+    }
 
     #[test]
     fn a_bundle_that_no_release_lists_any_more_is_called_by_its_digest() {

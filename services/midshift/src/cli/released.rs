@@ -1,6 +1,6 @@
 //! `midshift bundle ls` and `revoke`: bundles as the server has them, and who runs them.
 
-use super::client::{Call, Change, Exit, WOULD, unary};
+use super::client::{Call, Change, Exit, WOULD, ended, unary};
 use super::out::{Format, Out};
 use midshift_proto::ota::v1;
 use std::collections::BTreeMap;
@@ -91,9 +91,14 @@ async fn software(call: &Call) -> Result<Vec<v1::RobotSoftware>, Exit> {
 
 /// Takes a bundle back.
 pub async fn revoke(call: &Call, bundle: String, reason: String, change: Change, out: &Out) -> Result<(), Exit> {
-    let Change { request_id, dry_run: validate_only } = change;
+    let (only, Change { request_id, dry_run: validate_only }) = (change.only(), change);
     let request = v1::RevokeBundleRequest { bundle: bundle.clone(), reason, request_id, validate_only };
     let answer = call.rollouts().await?.revoke_bundle(unary(request)).await.map_err(Exit::with_facts)?.into_inner();
+    if answer.done_before.is_some() {
+        out.one(&answer, &answer.bundle, || format!("{bundle} was taken back before; {}", open(&answer)))?;
+        ended(answer.done_before.as_ref(), only, "", out);
+        return Ok(());
+    }
     if validate_only {
         out.one(&answer, &answer.bundle, || format!("{bundle} would be taken back; then {}", open(&answer)))?;
         out.next(WOULD);

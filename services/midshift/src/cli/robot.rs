@@ -1,6 +1,6 @@
 //! `midshift robot …`
 
-use super::client::{Call, Change, Exit, WOULD, unary};
+use super::client::{Call, Change, Exit, ended, unary};
 use super::out::{Format, Out};
 use super::rollout;
 use clap::Subcommand;
@@ -208,6 +208,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             Ok(())
         }
         Verb::Pin { one, reason, change } => {
+            let only = change.only();
             let request = ota::PinRobotRequest {
                 robot_id: one.robot_id.clone(),
                 reason,
@@ -215,22 +216,22 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
                 validate_only: change.dry_run,
             };
             let answer = one.call.rollouts().await?.pin_robot(unary(request)).await.map_err(Exit::with_facts)?;
-            software(&answer.into_inner().software.unwrap_or_default(), out)?;
-            let next = format!("midshift robot unpin {}", one.robot_id);
-            out.next(if change.dry_run { WOULD } else { &next });
+            let answer = answer.into_inner();
+            software(&answer.software.unwrap_or_default(), out)?;
+            ended(answer.done_before.as_ref(), only, &format!("midshift robot unpin {}", one.robot_id), out);
             Ok(())
         }
         Verb::Unpin { one, change } => {
+            let only = change.only();
             let request = ota::UnpinRobotRequest {
                 robot_id: one.robot_id,
                 request_id: change.request_id,
                 validate_only: change.dry_run,
             };
             let answer = one.call.rollouts().await?.unpin_robot(unary(request)).await.map_err(Exit::with_facts)?;
-            software(&answer.into_inner().software.unwrap_or_default(), out)?;
-            if change.dry_run {
-                out.next(WOULD);
-            }
+            let answer = answer.into_inner();
+            software(&answer.software.unwrap_or_default(), out)?;
+            ended(answer.done_before.as_ref(), only, "", out);
             Ok(())
         }
         Verb::Exclude { one, from, reason, change } => {

@@ -4,11 +4,12 @@ use super::{RolloutService, decode, encode, watch};
 use midshift_core::ids::{RequestId, RobotId, RolloutId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
-use midshift_core::rollout::commands::{CheckOnly, Command, Verb};
+use midshift_core::rollout::commands::{CheckOnly, Command, Taken, Verb};
 use midshift_core::rollout::dry_run::dry_run;
-use midshift_core::rollout::rows::Rollout;
+use midshift_core::rollout::rows::{Quarantine, Rollout};
 use midshift_core::rollout::view::View;
 use midshift_proto::convert::task::revision_of;
+use midshift_proto::convert::timestamp;
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::rollout_service_server::RolloutService as Face;
 use midshift_proto::pages;
@@ -49,6 +50,14 @@ fn check_only(validate_only: bool) -> CheckOnly {
     if validate_only { CheckOnly::Yes } else { CheckOnly::No }
 }
 
+/// When a call with the same request_id did it, for an answer; none: no such call.
+fn done_before(taken: Taken) -> Option<prost_types::Timestamp> {
+    match taken {
+        Taken::Now => None,
+        Taken::Before(at) => Some(timestamp(at)),
+    }
+}
+
 /// What all verbs about one roll-out say.
 struct About<'a> {
     rollout_id: &'a str,
@@ -68,7 +77,7 @@ impl RolloutService {
     }
 
     async fn verb(&self, about: About<'_>, verb: Verb, needs_etag: bool) -> Result<Option<v1::Rollout>, Refusal> {
-        self.verb_once(about, verb, needs_etag, CheckOnly::No, None).await
+        self.verb_once(about, verb, needs_etag, CheckOnly::No, None).await.map(|(rollout, _)| Some(rollout))
     }
 
     async fn verb_once(
@@ -78,7 +87,7 @@ impl RolloutService {
         needs_etag: bool,
         check_only: CheckOnly,
         request_id: Option<String>,
-    ) -> Result<Option<v1::Rollout>, Refusal> {
+    ) -> Result<(v1::Rollout, Taken), Refusal> {
         let mut bad = Violations::default();
         let rollout_id = bad.take("rollout_id", RolloutId::parse(about.rollout_id));
         if about.reason.len() > limits::REASON_BYTES_MAX {
@@ -91,8 +100,8 @@ impl RolloutService {
         bad.finish()?;
         let rollout_id = rollout_id.ok_or_else(internal)?;
         let command = Command::Do { rollout_id: rollout_id.clone(), verb, reason: about.reason.to_owned() };
-        self.act_once(command, seen, check_only, request_id).await?;
-        self.shown(rollout_id).await.map(Some)
+        let taken = self.act_once(command, seen, check_only, request_id).await?;
+        Ok((self.shown(rollout_id).await?, taken))
     }
 
     async fn bundle(&self, text: &str) -> Result<midshift_core::ids::BundleId, Refusal> {
@@ -150,8 +159,8 @@ impl RolloutService {
         bad.finish()?;
         let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
         let verb = Verb::Exclude(robot_id.ok_or_else(internal)?);
-        let rollout = self.verb_once(about, verb, false, check_only(r.validate_only), request_id).await?;
-        Ok(v1::ExcludeRobotResponse { rollout })
+        let (rollout, taken) = self.verb_once(about, verb, false, check_only(r.validate_only), request_id).await?;
+        Ok(v1::ExcludeRobotResponse { rollout: Some(rollout), done_before: done_before(taken) })
     }
 
     async fn roll_back(&self, r: v1::RollBackRolloutRequest) -> Result<v1::RollBackRolloutResponse, Refusal> {
@@ -206,13 +215,14 @@ impl RolloutService {
         bad.finish()?;
         let bundle = self.bundle(&r.bundle).await?;
         let command = Command::Revoke { bundle: bundle.clone(), reason: r.reason };
-        self.act_once(command, None, check_only(r.validate_only), request_id).await?;
+        let taken = self.act_once(command, None, check_only(r.validate_only), request_id).await?;
         self.look(move |view, _, _| {
             let of = view.rollouts.values().map(|r| &r.row).filter(|r| r.spec.bundle == bundle && !r.phase.is_over());
             let (back, still): (Vec<&Rollout>, Vec<_>) = of.partition(|r| r.phase.goes_back() || r.revert_of.is_some());
             let ids = |of: Vec<&Rollout>| of.into_iter().map(|r| r.rollout_id.to_string()).collect();
             let (rollout_ids, reverting_rollout_ids) = (ids(still), ids(back));
-            v1::RevokeBundleResponse { bundle: bundle.to_string(), rollout_ids, reverting_rollout_ids }
+            let (bundle, done_before) = (bundle.to_string(), done_before(taken));
+            v1::RevokeBundleResponse { bundle, rollout_ids, reverting_rollout_ids, done_before }
         })
         .await
     }
@@ -229,8 +239,9 @@ impl RolloutService {
         bad.finish()?;
         let robot_id = robot_id.ok_or_else(internal)?;
         let command = Command::Pin { robot_id: robot_id.clone(), reason: r.reason };
-        self.act_once(command, None, check_only(r.validate_only), request_id).await?;
-        Ok(v1::PinRobotResponse { software: self.software_of(robot_id).await? })
+        let taken = self.act_once(command, None, check_only(r.validate_only), request_id).await?;
+        let software = self.software_of(robot_id).await?;
+        Ok(v1::PinRobotResponse { software, done_before: done_before(taken) })
     }
 
     async fn unpin(&self, r: v1::UnpinRobotRequest) -> Result<v1::UnpinRobotResponse, Refusal> {
@@ -240,8 +251,9 @@ impl RolloutService {
         bad.finish()?;
         let robot_id = robot_id.ok_or_else(internal)?;
         let command = Command::Unpin { robot_id: robot_id.clone() };
-        self.act_once(command, None, check_only(r.validate_only), request_id).await?;
-        Ok(v1::UnpinRobotResponse { software: self.software_of(robot_id).await? })
+        let taken = self.act_once(command, None, check_only(r.validate_only), request_id).await?;
+        let software = self.software_of(robot_id).await?;
+        Ok(v1::UnpinRobotResponse { software, done_before: done_before(taken) })
     }
 
     async fn software(&self, r: v1::ListRobotSoftwareRequest) -> Result<v1::ListRobotSoftwareResponse, Refusal> {
@@ -277,9 +289,14 @@ impl RolloutService {
         bad.finish()?;
         let robot_id = robot_id.ok_or_else(internal)?;
         let bundle = self.bundle(&r.bundle).await?;
-        self.act_once(Command::LiftQuarantine { robot_id, bundle }, None, check_only(r.validate_only), request_id)
-            .await?;
-        Ok(v1::LiftQuarantineResponse {})
+        let command = Command::LiftQuarantine { robot_id: robot_id.clone(), bundle: bundle.clone() };
+        let taken = self.act_once(command, None, check_only(r.validate_only), request_id).await?;
+        self.look(move |view, _, _| {
+            let quarantine = view.quarantines.get(&Quarantine::id_of(&robot_id, &bundle));
+            let quarantine = quarantine.map(|q| encode::quarantine(view, &q.row));
+            v1::LiftQuarantineResponse { done_before: done_before(taken), quarantine }
+        })
+        .await
     }
 }
 

@@ -19,7 +19,7 @@ use crate::OtaService;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::Board;
 use midshift_core::rollout::bugs::Bugs;
-use midshift_core::rollout::commands::{Ask, CheckOnly, Command};
+use midshift_core::rollout::commands::{Ask, CheckOnly, Command, Taken};
 use midshift_core::rollout::spec::PROBATION_DEFAULT_MS;
 use midshift_core::rollout::view::View;
 use midshift_core::rows::{Revision, Seq};
@@ -57,7 +57,7 @@ type Look = Box<dyn FnOnce(&View, &Board, &Now) + Send>;
 /// Something a person asks of the planner.
 enum Request {
     /// Change something; answered after the commit.
-    Do { ask: Box<Ask>, reply: oneshot::Sender<Result<(), Refusal>> },
+    Do { ask: Box<Ask>, reply: oneshot::Sender<Result<Taken, Refusal>> },
     /// Look at something.
     Look(Look),
 }
@@ -127,7 +127,7 @@ impl RolloutService {
     }
     /// Carries out a command and waits for its commit.
     async fn act(&self, command: Command, seen: Option<Revision>) -> Result<(), Refusal> {
-        self.act_once(command, seen, CheckOnly::No, None).await
+        self.act_once(command, seen, CheckOnly::No, None).await.map(drop)
     }
     /// As [`Self::act`], of a caller who may send it again, or only wants to know whether it may be.
     async fn act_once(
@@ -136,7 +136,7 @@ impl RolloutService {
         seen: Option<Revision>,
         check_only: CheckOnly,
         request_id: Option<String>,
-    ) -> Result<(), Refusal> {
+    ) -> Result<Taken, Refusal> {
         let (reply, answer) = oneshot::channel();
         // Until login exists nobody is known by name.
         let ask = Ask { command, seen, check_only, request_id, actor: "anonymous".to_owned() };

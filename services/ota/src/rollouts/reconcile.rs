@@ -12,7 +12,7 @@ use midshift_core::lead::{OtaLeader, Own, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Refusal};
-use midshift_core::rollout::commands::CheckOnly;
+use midshift_core::rollout::commands::{CheckOnly, Taken};
 use midshift_core::rollout::named::named;
 use midshift_core::rollout::view::{TABLES, View};
 use midshift_core::rollout::{Board, LOGS, Plan, Sign, absorb, commands, cycle, obeyed};
@@ -50,7 +50,7 @@ pub(super) struct Loop {
     own: Own,
 }
 
-type Replies = Vec<(oneshot::Sender<Result<(), Refusal>>, usize)>;
+type Replies = Vec<(oneshot::Sender<Result<Taken, Refusal>>, Taken, usize)>;
 
 /// Runs until `shutdown`.
 pub async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Error> {
@@ -308,12 +308,13 @@ impl Loop {
                 Request::Look(look) => self.looks.push(look),
                 Request::Do { ask, reply } => {
                     let taken = commands::take(&mut self.view, &self.board, now, &ask, plan);
-                    if taken.is_err() || ask.check_only == CheckOnly::Yes {
-                        drop(reply.send(taken));
-                        continue;
+                    match taken {
+                        // What was asked before is in the store, or in an item before this one.
+                        Ok(taken) if ask.check_only == CheckOnly::No => {
+                            replies.push((reply, taken, plan.items.len()));
+                        }
+                        taken => drop(reply.send(taken)),
                     }
-                    // What was asked before is in the store, or in an item before this one.
-                    replies.push((reply, plan.items.len()));
                 }
             }
         }
@@ -359,9 +360,9 @@ impl Loop {
                 }
             }
         }
-        for (reply, upto) in replies {
+        for (reply, taken, upto) in replies {
             let lost = results.iter().skip(usize::from(renews)).take(upto).any(Result::is_err);
-            let answer = if lost { Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)) } else { Ok(()) };
+            let answer = if lost { Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)) } else { Ok(taken) };
             drop(reply.send(answer));
         }
         if let Some(seq) = newest {

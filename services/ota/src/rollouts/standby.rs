@@ -8,7 +8,7 @@ use super::reconcile::Loop;
 use midshift_core::limits;
 use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Refusal};
-use midshift_core::rollout::commands::{self, Ask};
+use midshift_core::rollout::commands::{self, Ask, Taken};
 use midshift_core::rollout::{LOGS, Plan, follow_rows, reread};
 use midshift_core::rows::{Entry, Log, Table};
 use midshift_store::{CommitError, Error, follow};
@@ -66,7 +66,7 @@ impl Loop {
     }
 
     /// The answer to whoever asked. An error: what came of it may not be in the picture.
-    async fn carry_out(&mut self, ask: &Ask) -> Result<Result<(), Refusal>, Error> {
+    async fn carry_out(&mut self, ask: &Ask) -> Result<Result<Taken, Refusal>, Error> {
         for _ in 0..limits::COMMAND_TRIES {
             let mut plan = Plan::default();
             let taken = commands::take(&mut self.view, &self.board, self.parts.clock.now(), ask, &mut plan);
@@ -78,7 +78,7 @@ impl Loop {
             let results = self.parts.store.commit(plan.items).await;
             let any_applied = results.iter().any(Result::is_ok);
             match results.into_iter().find_map(Result::err) {
-                None => return Ok(Ok(())),
+                None => return Ok(taken),
                 // Part of it stands: what is left of it is asked for again.
                 Some(error) if any_applied || !matches!(error, CommitError::Conflict { .. }) => {
                     return Err(Error::Unavailable(Arc::new(error)));

@@ -10,7 +10,7 @@ mod parse;
 mod tests;
 mod text;
 
-use super::client::{Call, Change, Exit, WOULD, unary};
+use super::client::{Call, Change, Exit, ended, unary};
 use super::out::Out;
 use clap::{Subcommand, ValueEnum};
 use midshift_proto::ota::v1;
@@ -258,6 +258,7 @@ pub async fn exclude(
     change: Change,
     out: &Out,
 ) -> Result<(), Exit> {
+    let only = change.only();
     let request = v1::ExcludeRobotRequest {
         rollout_id,
         etag: String::new(),
@@ -267,10 +268,9 @@ pub async fn exclude(
         validate_only: change.dry_run,
     };
     let answer = call.rollouts().await?.exclude_robot(unary(request)).await.map_err(Exit::with_facts)?;
-    show(&answer.into_inner().rollout.unwrap_or_default(), out)?;
-    if change.dry_run {
-        out.next(WOULD);
-    }
+    let answer = answer.into_inner();
+    show(&answer.rollout.unwrap_or_default(), out)?;
+    ended(answer.done_before.as_ref(), only, "", out);
     Ok(())
 }
 
