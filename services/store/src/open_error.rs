@@ -30,6 +30,23 @@ pub enum OpenError {
         #[source]
         source: sqlx::Error,
     },
+    /// A table could not be copied whole.
+    #[error("copying table {table} out of PostgreSQL failed")]
+    Table {
+        /// Its schema and name.
+        table: String,
+        /// Why, such as that this user may not read it.
+        #[source]
+        source: sqlx::Error,
+    },
+    /// One of the schemas is not there, or nobody has made its tables.
+    #[error(
+        "the database has no tables of schema {schema}, so a copy of it is not whole: bring it up with midshift migrate --store"
+    )]
+    NoSchema {
+        /// Which.
+        schema: &'static str,
+    },
     /// A commit would not be durable.
     #[error("{name} is {found}, must be {expected}: commits would not be durable")]
     NotDurable {

@@ -28,6 +28,9 @@ const COPY_STATEMENT_MS: u32 = 6 * 3_600_000;
 const COPY_IDLE_MS: u32 = 600_000;
 /// Silence after which the server believes a peer gone, ms.
 const PEER_LOST_MS: u32 = 10_000;
+/// So often the server looks whether its client is still there while it works for it or waits for a lock, ms. By itself it never looks, and a statement
+/// of a process that is gone goes on to its end.
+const CLIENT_LOOK: &str = "SELECT set_config('client_connection_check_interval', '1000', false)";
 /// What one transaction of the writer may take up to its COMMIT, and the COMMIT itself, before we stop waiting for an answer.
 pub(super) const WRITE_PATIENCE: Duration = Duration::from_secs(6);
 /// The same for one read.
@@ -111,19 +114,26 @@ impl Database {
             ("tcp_keepalives_interval", 1),
             ("tcp_keepalives_count", PEER_LOST_MS / 2_000),
         ];
+        // A copy whose rows a policy would hide fails instead.
+        let security = matches!(purpose, Purpose::Copy).then_some(("row_security", "off"));
         self.options
             .clone()
             .application_name("midshift")
             .statement_cache_capacity(STATEMENTS_CACHED)
             .options(limits)
             .options([("search_path", self.schema), ("client_min_messages", "warning")])
+            .options(security)
             .disable_statement_logging()
     }
 
     async fn connect(&self, purpose: Purpose) -> Result<PgConnection, OpenError> {
         let failed = |source| OpenError::Sql { doing: "connecting to PostgreSQL", source };
         let options = self.options(purpose);
-        let connecting = tokio::time::timeout(CONNECT_PATIENCE, options.connect());
+        let connecting = tokio::time::timeout(CONNECT_PATIENCE, async {
+            let mut connection = options.connect().await?;
+            look_after(&mut connection).await?;
+            Ok(connection)
+        });
         let connection = connecting.await.map_err(|_| failed(sqlx::Error::PoolTimedOut))?.map_err(failed)?;
         let version = connection.server_version_num().unwrap_or_default();
         if version < VERSION_MIN {
@@ -173,6 +183,7 @@ impl Database {
         PgPoolOptions::new()
             .max_connections(READERS)
             .acquire_timeout(CONNECT_PATIENCE)
+            .after_connect(|connection, _| Box::pin(look_after(connection)))
             .after_release(|connection, _| {
                 Box::pin(async move {
                     let answered = tokio::time::timeout(RETURN_PATIENCE, connection.ping()).await;
@@ -191,6 +202,15 @@ impl Database {
         listener.eager_reconnect(false);
         listener.listen(channel).await?;
         Ok(listener)
+    }
+}
+
+/// Has the server end what it does for a client that is gone. Not an option of the connection: a server on a machine that cannot tell would refuse it,
+/// and goes without.
+async fn look_after(connection: &mut PgConnection) -> Result<(), sqlx::Error> {
+    match sqlx::query(CLIENT_LOOK).execute(connection).await {
+        Err(sqlx::Error::Database(_)) => Ok(()),
+        looked => looked.map(drop),
     }
 }
 

@@ -223,6 +223,7 @@ async fn a_process_of_a_lost_database_does_not_go_on_in_the_restored_one() {
     let server = PostgresServer::shared();
     let config = PostgresConfig::new(server.database_named("lost"));
     let store = postgres_at(&config).await;
+    drop(frames(&config).await);
     let (dir, copy) = taken(&config).await;
     server.emptied("lost");
     restored(&config, dir.path(), &copy).await.unwrap();

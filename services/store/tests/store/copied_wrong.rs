@@ -2,9 +2,9 @@
 
 use crate::copied::{all, fresh, restored, taken, used};
 use crate::server::PostgresServer;
-use crate::support::{database, postgres_at, say, stranger, until_a_writer_waits};
+use crate::support::{database, number, postgres_at, say, stranger, until_a_writer_waits};
 use midshift_core::rows::{Seq, Table};
-use midshift_store::{PostgresConfig, RestoreError, Store};
+use midshift_store::{OpenError, PostgresConfig, PostgresCopy, RestoreError, Store};
 use std::fs;
 
 /// Where the first row of a file begins.
@@ -146,4 +146,74 @@ async fn a_commit_without_an_answer_is_told_as_unknown() {
     let refused = restored(&config, dir.path(), &copy).await.unwrap_err();
     assert!(matches!(refused, RestoreError::Unknown(_)), "{refused:?}");
     assert!(PostgresServer::shared().log().contains("terminating connection due to administrator command"));
+}
+
+#[tokio::test]
+async fn a_table_that_the_user_may_not_read_whole_is_named_and_not_left_out() {
+    let config = used().await;
+    let mut owner = stranger(&config).await;
+    let name: String = sqlx::query_scalar("SELECT current_database()").fetch_one(&mut owner).await.unwrap();
+    let reader = PostgresConfig::new(config.url.replacen("//postgres@", &format!("//reader_of_{name}@"), 1));
+    let steps = [
+        (
+            "CREATE ROLE {} LOGIN; GRANT USAGE ON SCHEMA control TO {}; GRANT SELECT ON ALL TABLES IN SCHEMA control TO {}",
+            Some("telemetry.schema_version"),
+        ),
+        (
+            "GRANT USAGE ON SCHEMA telemetry TO {}; GRANT SELECT ON ALL TABLES IN SCHEMA telemetry TO {}; \
+             REVOKE SELECT ON telemetry.frame_log FROM {}",
+            Some("telemetry.frame_log"),
+        ),
+        (
+            "GRANT SELECT ON telemetry.frame_log TO {}; ALTER TABLE telemetry.frame_log ENABLE ROW LEVEL SECURITY",
+            Some("telemetry.frame_log"),
+        ),
+        ("ALTER TABLE telemetry.frame_log DISABLE ROW LEVEL SECURITY", None),
+    ];
+    for (sql, named) in steps {
+        say(&mut owner, &sql.replace("{}", &format!("reader_of_{name}"))).await;
+        let dir = tempfile::tempdir().unwrap();
+        let taken = PostgresCopy::take(&reader, dir.path()).await;
+        match named {
+            Some(named) => {
+                let refused = taken.expect_err(sql);
+                assert!(matches!(&refused, OpenError::Table { table, .. } if table == named), "{sql}: {refused:?}");
+            }
+            None => assert_eq!(taken.unwrap().expect("a store").check(dir.path()), Vec::<String>::new()),
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_database_with_one_of_the_schemas_is_refused_and_so_is_a_copy_without_the_other() {
+    let config = used().await;
+    let (dir, mut copy) = taken(&config).await;
+    let samples = copy.schemas.get_mut("telemetry").unwrap();
+    samples.version = 0;
+    samples.tables.clear();
+    assert_eq!(copy.check(dir.path()), ["schema telemetry was not copied"]);
+    for sql in ["DELETE FROM telemetry.schema_version WHERE version > 0", "DROP SCHEMA telemetry CASCADE"] {
+        say(&mut stranger(&config).await, sql).await;
+        let dir = tempfile::tempdir().unwrap();
+        let refused = PostgresCopy::take(&config, dir.path()).await.expect_err(sql);
+        assert!(matches!(refused, OpenError::NoSchema { schema: "telemetry" }), "{sql}: {refused:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_server_ends_what_it_does_for_a_copy_that_was_given_up() {
+    let config = used().await;
+    let mut other = stranger(&config).await;
+    say(&mut other, "BEGIN; LOCK TABLE telemetry.frame_head IN ACCESS EXCLUSIVE MODE").await;
+    let copied = config.clone();
+    let copying = tokio::spawn(async move { taken(&copied).await });
+    // What a transaction sees of others' work is of one moment, so that one does not look.
+    let mut watcher = stranger(&config).await;
+    until_a_writer_waits(&mut watcher).await;
+    copying.abort();
+    // It would wait for the lock for ten minutes, and everybody else behind it.
+    let waiting = "SELECT COUNT(*) FROM pg_locks WHERE NOT granted AND database = \
+                   (SELECT oid FROM pg_database WHERE datname = current_database())";
+    while number(&mut watcher, waiting).await > 0 {}
+    say(&mut other, "COMMIT").await;
 }

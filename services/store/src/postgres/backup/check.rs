@@ -38,6 +38,10 @@ impl PostgresCopy {
                 wrong.push(format!("schema {schema} is {version}, this release knows {known}: use the newer release"));
                 continue;
             };
+            if made.is_empty() {
+                wrong.push(format!("schema {schema} was not copied"));
+                continue;
+            }
             let shapes = tables(schema, made);
             let counted = self.schemas.get(schema).map(|copied| &copied.tables);
             let strange = counted.into_iter().flat_map(BTreeMap::keys);

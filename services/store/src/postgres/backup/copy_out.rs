@@ -16,10 +16,16 @@ use tokio_stream::StreamExt;
 
 /// What is gathered before it is written, bytes. A row may be larger.
 const BUFFER_BYTES: usize = 1 << 18;
-const EXISTS: &str = "SELECT COUNT(*) FROM information_schema.tables WHERE table_schema = $1 AND table_name = $2";
+/// Asked of the catalogue, which everybody may read: `information_schema` hides what this user has no rights on.
+const EXISTS: &str = "SELECT COUNT(*) FROM pg_catalog.pg_class AS c JOIN pg_catalog.pg_namespace AS n ON n.oid = c.relnamespace \
+                      WHERE n.nspname = $1 AND c.relname = $2";
 
 fn failed(source: sqlx::Error) -> OpenError {
     OpenError::Sql { doing: "copying out of PostgreSQL", source }
+}
+
+fn failed_at(table: String, source: sqlx::Error) -> OpenError {
+    OpenError::Table { table, source }
 }
 
 fn io(source: std::io::Error) -> OpenError {
@@ -36,14 +42,15 @@ impl PostgresCopy {
     /// ever served from this database.
     ///
     /// # Errors
-    /// If the database cannot be reached, was written by a newer release, or the files cannot be written. Some are there then.
+    /// If the database cannot be reached, was written by a newer release, has only one of the schemas or a table that this user may not read
+    /// whole, or the files cannot be written. Some are there then.
     pub async fn take(config: &PostgresConfig, folder: &Path) -> Result<Option<Self>, OpenError> {
         let mut connection = Database::new(config, CONTROL_SCHEMA)?.copier().await?;
         in_time(sqlx::raw_sql(read::BEGIN).execute(&mut connection)).await.map_err(failed)?;
         let mut schemas = BTreeMap::new();
         let mut shapes = Vec::new();
         for (schema, migrations) in SCHEMAS {
-            let version = version(&mut connection, schema).await.map_err(failed)?;
+            let version = version(&mut connection, schema).await?;
             let ahead = pending(schema, migrations, version)?.len();
             let of_version = tables(schema, migrations.get(..migrations.len() - ahead).unwrap_or_default());
             schemas.insert(schema.to_owned(), CopiedSchema { version, tables: BTreeMap::new() });
@@ -54,6 +61,11 @@ impl PostgresCopy {
         }
         let head = in_time(sqlx::query(sql::STORE).fetch_optional(&mut connection)).await.map_err(failed)?;
         let Some(head) = head else { return Ok(None) };
+        if let Some((schema, _)) =
+            SCHEMAS.into_iter().find(|(schema, _)| schemas.get(*schema).is_none_or(CopiedSchema::is_unmade))
+        {
+            return Err(OpenError::NoSchema { schema });
+        }
         let mut copy = Self {
             site_id: head.try_get(0).map_err(failed)?,
             store_id: head.try_get(1).map_err(failed)?,
@@ -72,14 +84,17 @@ impl PostgresCopy {
 }
 
 /// 0: there is no such schema.
-async fn version(connection: &mut PgConnection, schema: &'static str) -> Result<u32, sqlx::Error> {
+async fn version(connection: &mut PgConnection, schema: &'static str) -> Result<u32, OpenError> {
     let exists = sqlx::query(EXISTS).bind(schema).bind("schema_version").fetch_one(&mut *connection);
-    if in_time(exists).await?.try_get::<i64, _>(0)? == 0 {
+    let exists = in_time(exists).await.and_then(|row| row.try_get::<i64, _>(0)).map_err(failed)?;
+    if exists == 0 {
         return Ok(0);
     }
-    let select = VERSION.replace("schema_version", &format!("{schema}.schema_version"));
-    let row = in_time(sqlx::query(AssertSqlSafe(select)).fetch_one(connection)).await?;
-    Ok(row.try_get::<i64, _>(0)? as u32)
+    let table = format!("{schema}.schema_version");
+    let select = VERSION.replace("schema_version", &table);
+    let row = in_time(sqlx::query(AssertSqlSafe(select)).fetch_one(connection)).await;
+    let version = row.and_then(|row| row.try_get::<i64, _>(0)).map_err(|source| failed_at(table, source))?;
+    Ok(version as u32)
 }
 
 /// How many rows went into the file: what the database says, not what was written.
@@ -87,6 +102,7 @@ async fn write(connection: &mut PgConnection, folder: &Path, table: &TableShape)
     let path = file(folder, table);
     tokio::fs::create_dir_all(folder.join(table.schema)).await.map_err(io)?;
     let mut file = BufWriter::with_capacity(BUFFER_BYTES, File::create_new(path).await.map_err(io)?);
+    let failed = |source| failed_at(format!("{}.{}", table.schema, table.name), source);
     let statement = format!("COPY {} TO STDOUT (FORMAT binary)", table.columns());
     let mut rows = in_time(connection.copy_out_raw(&statement)).await.map_err(failed)?;
     loop {

@@ -49,6 +49,13 @@ pub struct CopiedSchema {
     pub tables: BTreeMap<String, u64>,
 }
 
+impl CopiedSchema {
+    /// Nobody had made its tables.
+    const fn is_unmade(&self) -> bool {
+        self.version == 0
+    }
+}
+
 impl PostgresCopy {
     /// How many rows a table of schema `control` had; none: there was no such table.
     pub fn rows(&self, table: &str) -> Option<u64> {
