@@ -1,6 +1,7 @@
 //! Folders that are whole or not there.
 //!
 //! Invariant: a folder gets its name when all of it is durable; until then it is under a name of its own beside it, and goes when it is dropped.
+//! Of one whose name may not be durable the name is taken back, or what is there is said.
 
 use super::blocking;
 use anyhow::{Context, ensure};
@@ -33,16 +34,28 @@ impl Place {
     pub(super) async fn name(self, to: &Path) -> anyhow::Result<()> {
         self.sync().await?;
         let (from, to) = (self.0.path().to_owned(), to.to_owned());
-        blocking(move || {
-            fs::rename(&from, &to).with_context(|| format!("naming {}", to.display()))?;
-            let beside = to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-            File::open(beside)?.sync_all().with_context(|| format!("syncing {}", beside.display()))
-        })
-        .await?;
+        blocking(move || name(&from, &to, File::sync_all)).await?;
         // Its old name is nobody's now.
         let _ = self.0.keep();
         Ok(())
     }
+}
+
+/// Renames, and makes the new name durable by `sync` of the folder that it is in. Where that fails it has its old name again.
+fn name(from: &Path, to: &Path, sync: impl FnOnce(&File) -> std::io::Result<()>) -> anyhow::Result<()> {
+    let beside = to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    // What cannot be opened cannot be synced: that is known before anything has its name.
+    let folder = File::open(beside).with_context(|| format!("opening {}", beside.display()))?;
+    fs::rename(from, to).with_context(|| format!("naming {}", to.display()))?;
+    let Err(error) = sync(&folder) else { return Ok(()) };
+    let error = anyhow::Error::from(error).context(format!("syncing {}", beside.display()));
+    Err(match fs::rename(to, from) {
+        Ok(()) => error,
+        Err(back) => error.context(format!(
+            "{} is there and whole, but it may be gone after a power cut, and its name cannot be taken back ({back}): remove it and try again",
+            to.display()
+        )),
+    })
 }
 
 /// Whether nothing is there: also an empty folder may be what cannot be replaced, as where a disk is mounted.
@@ -64,4 +77,45 @@ fn sync_tree(folder: &Path) -> anyhow::Result<()> {
         }
     }
     File::open(folder)?.sync_all().with_context(|| format!("syncing {}", folder.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::{Error, ErrorKind};
+
+    /// A folder with a file in it under a name of its own, and where it goes.
+    fn placed(beside: &tempfile::TempDir) -> (Place, std::path::PathBuf) {
+        let to = beside.path().join("backup");
+        let place = Place::new(&to).expect("a folder");
+        fs::write(place.path().join("rows"), b"rows").expect("written");
+        (place, to)
+    }
+
+    fn full() -> std::io::Result<()> {
+        Err(Error::from(ErrorKind::StorageFull))
+    }
+
+    #[test]
+    fn a_folder_whose_name_is_not_durable_is_not_there() {
+        let beside = tempfile::tempdir().expect("a folder");
+        let (place, to) = placed(&beside);
+        let error = name(place.path(), &to, |_| full()).expect_err("it is not durable");
+        assert!(format!("{error:#}").starts_with("syncing "), "{error:#}");
+        assert!(!to.exists() && place.path().join("rows").is_file(), "it is as it was before");
+        drop(place);
+        assert_eq!(fs::read_dir(beside.path()).expect("a folder").count(), 0, "nothing is left");
+    }
+
+    #[test]
+    fn a_folder_whose_name_cannot_be_taken_back_is_said_to_be_there() {
+        let beside = tempfile::tempdir().expect("a folder");
+        let (place, to) = placed(&beside);
+        let old = place.path().join("in the way");
+        let error = name(place.path(), &to, |_| fs::create_dir_all(&old).and_then(|()| full()));
+        let error = format!("{:#}", error.expect_err("it is not durable"));
+        assert!(error.starts_with(&format!("{} is there and whole", to.display())), "{error}");
+        assert!(error.contains("remove it and try again") && error.contains("syncing"), "{error}");
+        assert_eq!(fs::read(to.join("rows")).expect("it is there"), b"rows");
+    }
 }
