@@ -17,7 +17,8 @@ use files::write;
 use midshift_bundle::digest::Digest;
 use midshift_core::time::Utc;
 use midshift_store::{PostgresConfig, PostgresRestore, RestoreError, StoreId};
-use parts::{KEYS, Making, PARTS, POSTGRES, Said};
+pub use parts::KEYS;
+use parts::{Making, PARTS, POSTGRES, Said};
 use place::Place;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -201,6 +202,10 @@ async fn name_all(places: impl Iterator<Item = (Place, PathBuf)>, rows: Option<P
 }
 
 impl Summary {
+    /// Whether online keys are in it.
+    pub fn has_keys(&self) -> bool {
+        self.has(KEYS)
+    }
     /// Whether it has a part of this name.
     fn has(&self, part: &str) -> bool {
         self.parts.iter().any(|(name, ..)| name == part)

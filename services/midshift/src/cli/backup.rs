@@ -2,11 +2,11 @@
 
 use super::client::Exit;
 use super::out::{Format, Out, columns};
-use crate::backup::{self, Places, Summary};
+use crate::backup::{self, KEYS, Places, Summary};
 use crate::clock;
 use crate::storage::Database;
 use midshift_proto::convert::timestamp;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// What to copy.
 #[derive(Clone, Debug, clap::Args)]
@@ -50,7 +50,7 @@ pub async fn take(args: &Take, out: &Out) -> Result<(), Exit> {
     let from = Places { data: args.data.clone(), ota_keys: args.ota_keys.clone(), store: args.database.postgres()? };
     let summary = backup::back_up(&from, &args.to, clock::clock(1000).now().wall).await?;
     show(&summary, out)?;
-    out.next(&format!("midshift restore --verify --from {}", args.to.display()));
+    out.next(&format!("midshift restore --verify --from {}", word(&args.to.to_string_lossy())));
     Ok(())
 }
 
@@ -65,9 +65,54 @@ pub async fn restore(args: &Restore, out: &Out) -> Result<(), Exit> {
     let to = Places { data, ota_keys: args.ota_keys.clone(), store: args.database.postgres()? };
     let summary = backup::restore(&args.from, &to, clock::clock(1000).now().wall).await?;
     show(&summary, out)?;
-    let store = if to.store.is_some() { " --store postgres://…" } else { "" };
-    out.next(&format!("midshift serve --data {}{store}", to.data.display()));
+    let keys = summary.has_keys().then(|| to.ota_keys.clone().unwrap_or_else(|| to.data.join(KEYS)));
+    let (note, command) = serve(&to.data, args.database.store.as_deref(), keys.as_deref());
+    note.iter().for_each(|note| out.say(note));
+    out.next(&command);
     Ok(())
+}
+
+/// The command that starts a server of a restored directory, and what must be done before it. No password is in either.
+fn serve(data: &Path, store: Option<&str>, keys: Option<&Path>) -> (Option<String>, String) {
+    let mut command = format!("midshift serve --data {}", word(&data.to_string_lossy()));
+    let mut note = None;
+    match store.map(|url| (url, without_password(url))) {
+        Some((url, shown)) if url == shown => command += &format!(" --store {}", word(url)),
+        Some((_, shown)) => {
+            note = Some(format!(
+                "set MIDSHIFT_STORE to the address of the database, {shown} with its password, which is not shown here"
+            ));
+        }
+        None => {}
+    }
+    if let Some(keys) = keys {
+        command += &format!(" --ota-keys {}", word(&keys.to_string_lossy()));
+    }
+    (note, command)
+}
+
+/// An address of PostgreSQL as it may be shown: a password can stand before the host and among the parameters.
+fn without_password(url: &str) -> String {
+    let (scheme, rest) = url.split_once("://").unwrap_or(("postgres", url));
+    let (place, parameters) = rest.split_once('?').map_or((rest, None), |(place, after)| (place, Some(after)));
+    // A password may hold an @ or a slash that nobody encoded: what is before the last @ is the user's.
+    let place = match place.rsplit_once('@') {
+        Some((user, host)) => format!("{}@{host}", user.split(':').next().unwrap_or_default()),
+        None => place.to_owned(),
+    };
+    let kept = parameters.into_iter().flat_map(|all| all.split('&'));
+    let kept: Vec<&str> = kept.filter(|one| !one.to_ascii_lowercase().starts_with("password=")).collect();
+    let parameters = if kept.is_empty() { String::new() } else { format!("?{}", kept.join("&")) };
+    format!("{scheme}://{place}{parameters}")
+}
+
+/// One word of a shell.
+fn word(text: &str) -> String {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./:@%+=,".contains(c);
+    if !text.is_empty() && text.chars().all(is_plain) {
+        return text.to_owned();
+    }
+    format!("'{}'", text.replace('\'', "'\\''"))
 }
 
 fn show(summary: &Summary, out: &Out) -> Result<(), Exit> {
@@ -93,4 +138,39 @@ fn show(summary: &Summary, out: &Out) -> Result<(), Exit> {
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_that_comes_next_can_be_pasted_and_has_no_password() {
+        let (data, keys) = (Path::new("new data"), Path::new("new data/ota-keys"));
+        assert_eq!(serve(Path::new("data"), None, None), (None, "midshift serve --data data".to_owned()));
+        let open = "postgres://postgres@localhost/site?host=/run/pg&application_name=a";
+        let (note, command) = serve(data, Some(open), Some(keys));
+        assert_eq!(note, None);
+        assert_eq!(
+            command,
+            format!("midshift serve --data 'new data' --store '{open}' --ota-keys 'new data/ota-keys'")
+        );
+        for secret in [
+            "postgresql://ana:s3cret@db:5433/site",
+            "postgres://ana:s3c/r@s3cret@db/site",
+            "postgres://ana@db/site?sslmode=disable&password=s3cret",
+            "postgres://db/site?PASSWORD=s3cret",
+        ] {
+            let (note, command) = serve(data, Some(secret), None);
+            assert_eq!(command, "midshift serve --data 'new data'", "{secret}");
+            let note = note.expect("what to do first");
+            assert!(note.contains("MIDSHIFT_STORE") && note.contains("/site"), "{note}");
+            assert!(!note.contains("s3c"), "{note}");
+        }
+    }
+
+    #[test]
+    fn a_word_of_a_shell_is_quoted_where_it_must_be() {
+        assert_eq!(["a/b.c", "a b", "it's", ""].map(word), ["a/b.c", "'a b'", "'it'\\''s'", "''"]);
+    }
 }
