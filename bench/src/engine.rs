@@ -4,12 +4,12 @@
 //! Invariant: each round has a directory or a database of its own, taken away with it. PostgreSQL keeps its promises: `fsync` is on and
 //! a commit waits for its log. Called by `submit`, `offer` and `link`.
 
-use crate::child::{Child, cpu_of_s};
+use crate::child::{Child, cpu_of_ended_s, cpu_of_s};
 use crate::fsync::Disk;
 use crate::submit::place;
-use anyhow::{Context, ensure};
-use sqlx::postgres::{PgConnection, PgPoolCopyExt};
-use sqlx::{Connection, Executor, PgPool};
+use anyhow::{Context, bail, ensure};
+use sqlx::postgres::PgConnection;
+use sqlx::{Connection, Executor};
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use tokio::time::Instant;
@@ -24,6 +24,13 @@ use postgres_server::PostgresServer;
 const COMMIT: &str = "single commit of PostgreSQL";
 /// Bytes of the row of one commit, as pgbench's history has it, rounded up.
 const COMMIT_BYTES: usize = 64;
+
+/// How often the CPU of the database's processes is added up anew because one of them ended meanwhile.
+const COUNTS_MAX: usize = 16;
+/// How what COPY is given begins in PostgreSQL's binary format: its mark, then no flags and no extension.
+const COPY_BEGIN: &[u8] = b"PGCOPY\n\xff\r\n\0\0\0\0\0\0\0\0\0";
+/// What a row says of its columns that is none but the end.
+const COPY_END: i16 = -1;
 
 /// Which engines are measured.
 #[derive(Clone, Debug, clap::Args)]
@@ -76,28 +83,39 @@ impl Engine {
         }
     }
     /// A new place for one round, below `dir` or the temporary directory.
-    pub fn bed(&self, dir: Option<&PathBuf>) -> anyhow::Result<Bed> {
-        let url = match self {
+    pub fn bed(&self, dir: Option<&PathBuf>) -> anyhow::Result<Bed<'_>> {
+        let database = match self {
             Self::Sqlite => None,
-            Self::Postgres(server) => Some(server.database()),
+            Self::Postgres(server) => Some((server, server.database())),
         };
-        Ok(Bed { dir: place(dir)?, url })
+        Ok(Bed { dir: place(dir)?, database })
     }
-    /// CPU spent so far by the database's own processes, seconds; none where it is the server itself.
+    /// CPU spent so far by the database's own processes, also by those that have ended, seconds; none where it is the server itself.
     pub fn cpu_s(&self) -> anyhow::Result<Option<f64>> {
         let Self::Postgres(server) = self else { return Ok(None) };
         let postmaster = server.pid().context("PostgreSQL does not say its number")?;
-        let mut cpu_s = cpu_of_s(postmaster)?;
-        for entry in std::fs::read_dir("/proc")? {
-            let name = entry?.file_name();
-            let Some(pid) = name.to_str().and_then(|name| name.parse::<u32>().ok()) else { continue };
-            // A process that has ended meanwhile is counted by nobody, which is less than a clock tick.
-            if parent_of(pid) == Some(postmaster) {
-                cpu_s += cpu_of_s(pid).unwrap_or(0.0);
+        for _ in 0..COUNTS_MAX {
+            let ended_s = cpu_of_ended_s(postmaster)?;
+            let living_s = cpu_of_s(postmaster)? + cpu_of_children_s(postmaster)?;
+            // What ended meanwhile would be counted twice or by nobody.
+            if cpu_of_ended_s(postmaster)? == ended_s {
+                return Ok(Some(living_s + ended_s));
             }
         }
-        Ok(Some(cpu_s))
+        bail!("processes of PostgreSQL end faster than their CPU can be added up")
     }
+}
+
+fn cpu_of_children_s(parent: u32) -> anyhow::Result<f64> {
+    let mut cpu_s = 0.0;
+    for entry in std::fs::read_dir("/proc")? {
+        let name = entry?.file_name();
+        let Some(pid) = name.to_str().and_then(|name| name.parse::<u32>().ok()) else { continue };
+        if parent_of(pid) == Some(parent) {
+            cpu_s += cpu_of_s(pid).unwrap_or(0.0);
+        }
+    }
+    Ok(cpu_s)
 }
 
 fn parent_of(pid: u32) -> Option<u32> {
@@ -105,48 +123,77 @@ fn parent_of(pid: u32) -> Option<u32> {
     stat.rsplit_once(')')?.1.split_whitespace().nth(1)?.parse().ok()
 }
 
-/// The place of one server's rows.
-pub struct Bed {
+/// The place of one server's rows. Its database goes with it, whoever uses it still.
+pub struct Bed<'e> {
     dir: TempDir,
-    url: Option<String>,
+    /// The server and the address of the database.
+    database: Option<(&'e PostgresServer, String)>,
 }
 
-impl Bed {
+impl Drop for Bed<'_> {
+    fn drop(&mut self) {
+        if let Some((server, url)) = &self.database {
+            server.drop_database(url);
+        }
+    }
+}
+
+impl Bed<'_> {
     /// A directory beside the rows.
     pub fn path(&self) -> &Path {
         self.dir.path()
     }
+    fn url(&self) -> Option<&str> {
+        self.database.as_ref().map(|(_, url)| url.as_str())
+    }
     /// A server of midshift here, once it listens.
     pub async fn serve(&self, site: Option<&Path>, core: Option<usize>) -> anyhow::Result<Child> {
-        Child::serve(&self.dir.path().join("data"), site, self.url.as_deref(), core).await
+        Child::serve(&self.dir.path().join("data"), site, self.url(), core).await
     }
     /// The raw limit here.
     pub async fn raw(&self) -> anyhow::Result<Raw> {
-        let Some(url) = &self.url else { return Ok(Raw::Disk(Disk::beside(self.dir.path())?)) };
+        let Some(url) = self.url() else { return Ok(Raw::Disk(Disk::beside(self.dir.path())?)) };
         let mut connection = PgConnection::connect(url).await?;
         connection.execute("CREATE TABLE raw_commit (id bigserial PRIMARY KEY, body bytea NOT NULL)").await?;
         Ok(Raw::Commit(Box::new(connection)))
     }
-    /// Rows a second of `bytes` each by COPY on one connection, so many in each commit; none where there is no such thing.
+    /// Rows a second of `bytes` each by COPY in the binary format on one connection, so many in each commit; none where there is no such thing.
+    /// What is sent lies ready before the clock runs.
     pub async fn copied_per_s(&self, rows: usize, bytes: usize, in_commit: usize) -> anyhow::Result<Option<f64>> {
-        let Some(url) = &self.url else { return Ok(None) };
-        let pool = PgPool::connect(url).await?;
-        pool.execute("CREATE TABLE raw_copy (id bigint PRIMARY KEY, body bytea NOT NULL)").await?;
-        let (body, begun) = ("5a".repeat(bytes), Instant::now());
-        let mut first = 0;
-        while first < rows {
-            let last = (first + in_commit.max(1)).min(rows);
-            let text: String = (first..last).map(|id| format!("{id}\t\\\\x{body}\n")).collect();
-            let mut copy = pool.copy_in_raw("COPY raw_copy FROM STDIN").await?;
-            copy.send(text.as_bytes()).await?;
-            ensure!(copy.finish().await? == (last - first) as u64, "COPY lost rows");
-            first = last;
+        let Some(url) = self.url() else { return Ok(None) };
+        let ids: Vec<i64> = (0..rows as i64).collect();
+        let body = vec![0x5a; bytes];
+        let ready: Vec<(u64, Vec<u8>)> = ids
+            .chunks(in_commit.max(1))
+            .map(|ids| Ok((ids.len() as u64, copied(ids, &body)?)))
+            .collect::<anyhow::Result<_>>()?;
+        let mut connection = PgConnection::connect(url).await?;
+        connection.execute("CREATE TABLE raw_copy (id bigint PRIMARY KEY, body bytea NOT NULL)").await?;
+        let begun = Instant::now();
+        for (count, bytes) in &ready {
+            let mut copy = connection.copy_in_raw("COPY raw_copy FROM STDIN (FORMAT binary)").await?;
+            copy.send(bytes.as_slice()).await?;
+            ensure!(copy.finish().await? == *count, "COPY lost rows");
         }
         let per_s = rows as f64 / begun.elapsed().as_secs_f64();
-        pool.execute("DROP TABLE raw_copy").await?;
-        pool.close().await;
+        connection.execute("DROP TABLE raw_copy").await?;
+        connection.close().await?;
         Ok(Some(per_s))
     }
+}
+
+/// Rows of an id and a body as COPY takes them.
+fn copied(ids: &[i64], body: &[u8]) -> anyhow::Result<Vec<u8>> {
+    let mut all = COPY_BEGIN.to_vec();
+    for id in ids {
+        all.extend(2_i16.to_be_bytes());
+        for field in [&id.to_be_bytes()[..], body] {
+            all.extend(i32::try_from(field.len())?.to_be_bytes());
+            all.extend(field);
+        }
+    }
+    all.extend(COPY_END.to_be_bytes());
+    Ok(all)
 }
 
 /// The raw limit of a durable answer.
@@ -178,5 +225,41 @@ impl Raw {
             took_ms.push(self.ms().await?);
         }
         Ok(took_ms)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const DATABASES: &str = "SELECT count(*) FROM pg_database WHERE datname LIKE 'test_%'";
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn the_database_of_a_round_goes_with_it_and_copy_takes_what_lay_ready() {
+        let engine = Engine::Postgres(PostgresServer::start());
+        let Engine::Postgres(server) = &engine else { unreachable!("it is") };
+        let bed = engine.bed(None).expect("a place");
+        assert!(bed.copied_per_s(10, 100, 3).await.expect("rows").is_some_and(|per_s| per_s > 0.0));
+        // Somebody uses it still.
+        let _raw = bed.raw().await.expect("a connection");
+        assert_eq!(server.ask(&server.url("postgres"), DATABASES), "1");
+        drop(bed);
+        assert_eq!(server.ask(&server.url("postgres"), DATABASES), "0");
+    }
+
+    #[test]
+    fn what_a_process_of_the_database_spent_that_has_ended_is_counted() {
+        let engine = Engine::Postgres(PostgresServer::start());
+        let Engine::Postgres(server) = &engine else { unreachable!("it is") };
+        let cpu_s = || engine.cpu_s().expect("numbers").expect("of PostgreSQL");
+        let before_s = cpu_s();
+        let work = "SELECT pg_backend_pid() FROM (SELECT sum(sqrt(n)) FROM generate_series(1, 3000000) AS n) AS done";
+        let pid = server.ask(&server.url("postgres"), work);
+        let is_there = || Path::new("/proc").join(&pid).exists();
+        while is_there() {
+            std::thread::yield_now();
+        }
+        let spent_s = cpu_s() - before_s;
+        assert!(spent_s >= 0.1, "{spent_s} s of three million roots");
     }
 }

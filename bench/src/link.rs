@@ -204,7 +204,7 @@ fn at_the_knee(engine: &Engine, robots: usize, ours: &Legs, sink: &Legs) -> Vec<
     figures
 }
 
-async fn server(of: Of<'_>, bed: &Bed, map: &Path) -> anyhow::Result<Child> {
+async fn server(of: Of<'_>, bed: &Bed<'_>, map: &Path) -> anyhow::Result<Child> {
     let core = Some(0);
     match of {
         Of::Midshift(_) => bed.serve(Some(map), core).await,
@@ -282,7 +282,7 @@ async fn measure(
 }
 
 /// Under the load that is there, one more robot asks how long an acknowledgement takes, and the raw limit is asked in turn with it.
-async fn ask(args: &LinkArgs, server: &Child, bed: &Bed, of: Of<'_>, leg: &mut Leg) -> anyhow::Result<()> {
+async fn ask(args: &LinkArgs, server: &Child, bed: &Bed<'_>, of: Of<'_>, leg: &mut Leg) -> anyhow::Result<()> {
     if matches!(of, Of::Midshift(_)) {
         let (mut raw, long) = (bed.raw().await?, Duration::from_secs(args.ask_seconds));
         (leg.acks_ms, leg.raws_ms) = flood::ask(&server.address.to_string(), &mut raw, long).await?;

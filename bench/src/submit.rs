@@ -99,7 +99,7 @@ pub async fn run(args: SubmitArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Fig
 async fn round(
     args: &SubmitArgs,
     engine: &Engine,
-    bed: &Bed,
+    bed: &Bed<'_>,
     server: &Child,
     requests: &Arc<Vec<SubmitTaskRequest>>,
     bytes: usize,

@@ -122,6 +122,13 @@ impl PostgresServer {
         self.database_named(name);
     }
 
+    /// Drops the database at a URL of this server, whoever uses it. One that is gone already, and a server that has ended, are no errors.
+    pub fn drop_database(&self, url: &str) {
+        let name = url.split('/').nth(3).and_then(|rest| rest.split('?').next()).unwrap_or_default();
+        let mut drop = self.client("dropdb");
+        let _ended = drop.args(["--force", "--if-exists", name]).stdout(Stdio::null()).stderr(Stdio::null()).status();
+    }
+
     fn create(&self, template: &str, name: &str) -> String {
         let mut create = self.client("createdb");
         // A log of the copy is cheaper than the two checkpoints of the other way.
