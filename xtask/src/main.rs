@@ -49,13 +49,14 @@ enum Verb {
         /// Sweeps to run; none: all.
         #[arg(value_enum)]
         sweeps: Vec<sweep::Sweep>,
-        /// How many seeds each; unless told, 20 kills (about two minutes a seed), 2000 simulated shifts (about a quarter of a second) and 2
-        /// stories (about ten minutes).
+        /// How many seeds each, and how often split; unless told, 20 kills (about two minutes a seed), 2000 simulated shifts (about a quarter
+        /// of a second), 2 stories (about ten minutes) and split once. Updates take none.
         #[arg(long)]
         seeds: Option<u64>,
-        /// The first seed. A failing seed alone: `torture SWEEP --from SEED --seeds 1`.
-        #[arg(long, default_value_t = 1)]
-        from: u64,
+        /// The first seed of kills, simulation and stories; unless told, 1. Split and updates draw nothing and take none. A failing seed alone:
+        /// `torture kills|simulation|stories --from SEED --seeds 1`.
+        #[arg(long)]
+        from: Option<u64>,
     },
     /// The stack of a compose file as processes of this machine, without docker.
     #[command(subcommand)]

@@ -43,6 +43,14 @@ impl Sweep {
         }
     }
 
+    /// Whether what it does comes of seeds.
+    const fn draws(self) -> bool {
+        match self {
+            Self::Kills | Self::Simulation | Self::Stories => true,
+            Self::Split | Self::Updates => false,
+        }
+    }
+
     fn run(self, workspace: &Workspace, from: u64, seeds: u64) -> Result<bool> {
         match self {
             Self::Kills => each_seed(workspace, "kills", "kill::", from, seeds),
@@ -63,13 +71,21 @@ impl Sweep {
 }
 
 /// Runs these sweeps, or all; whether all laws held.
-pub fn torture(workspace: &Workspace, sweeps: &[Sweep], from: u64, seeds: Option<u64>) -> Result<bool> {
+pub fn torture(workspace: &Workspace, sweeps: &[Sweep], from: Option<u64>, seeds: Option<u64>) -> Result<bool> {
     ensure!(seeds != Some(0), "--seeds must be at least 1");
+    let from = first_seed(sweeps, from)?;
     let mut held = true;
     for sweep in Sweep::ALL.into_iter().filter(|s| sweeps.is_empty() || sweeps.contains(s)) {
         held &= sweep.run(workspace, from, seeds.unwrap_or(sweep.seeds()))?;
     }
     Ok(held)
+}
+
+/// The first seed of these sweeps, or of all.
+fn first_seed(sweeps: &[Sweep], from: Option<u64>) -> Result<u64> {
+    let draws = sweeps.is_empty() || sweeps.iter().any(|sweep| sweep.draws());
+    ensure!(from.is_none() || draws, "--from names a seed, and what you named draws nothing: leave it out");
+    Ok(from.unwrap_or(1))
 }
 
 fn test(workspace: &Workspace, target: &str, filter: &str) -> Command {
@@ -127,4 +143,17 @@ fn counted(command: &mut Command) -> Result<bool> {
     run::print(&format!("{} passed, {} failed", count.passed, count.failed));
     ensure!(!succeeded || count.passed > 0, "no test matched");
     Ok(succeeded)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_first_seed_is_refused_where_nothing_is_drawn() {
+        assert_eq!(first_seed(&[], Some(7)).expect("some draw"), 7);
+        assert_eq!(first_seed(&[Sweep::Split, Sweep::Kills], Some(7)).expect("one draws"), 7);
+        assert_eq!(first_seed(&[Sweep::Split], None).expect("no seed"), 1);
+        assert!(first_seed(&[Sweep::Split, Sweep::Updates], Some(7)).is_err());
+    }
 }
