@@ -432,10 +432,32 @@ impl Inner {
         self.path.join(format!("{digest}.mark"))
     }
 
+    /// Whether a file that this process did not know is there and is what its name says: a person put it back.
+    fn take_back(&self, digest: Digest) -> Result<bool, Error> {
+        let path = self.whole(digest);
+        let mut file = match File::open(&path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(false),
+            opened => opened.map_err(at("opening", &path))?,
+        };
+        let Ok((found, length)) = Digest::of_reader(&mut file, COMPONENT_BYTES_MAX) else { return Ok(false) };
+        if found != digest {
+            return Ok(false);
+        }
+        file.sync_all().map_err(at("syncing", &path))?;
+        sync_folder(&self.path)?;
+        let mut shelf = self.shelf();
+        if !shelf.parts.contains_key(&digest) && !shelf.whole.contains_key(&digest) {
+            shelf.whole.insert(digest, Whole { length, touched: 0, changed: Changed::default() });
+            shelf.used += length;
+        }
+        Ok(shelf.whole.contains_key(&digest))
+    }
+
     fn open_at(&self, digest: Digest, offset: u64) -> Result<Option<File>, Error> {
         // Who shares the folder asks the disk.
         let is_gone = |shelf: &Shelf| matches!(self.hand, Hand::Alone) && !shelf.whole.contains_key(&digest);
-        if is_gone(&self.shelf()) {
+        let is_unknown = is_gone(&self.shelf());
+        if is_unknown && !self.take_back(digest)? {
             return Ok(None);
         }
         let path = self.whole(digest);

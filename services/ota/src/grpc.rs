@@ -80,7 +80,7 @@ impl OtaService {
 
     async fn list(&self, r: &v1::ListBundlesRequest) -> Result<v1::ListBundlesResponse, Refusal> {
         let opened = self.opened()?;
-        opened.repository.documents().follow_if_possible().await;
+        opened.repository.documents().look_if_possible().await;
         let newest = opened.repository.newest();
         let releases = newest.as_ref().map(|newest| newest.releases.as_slice()).unwrap_or_default();
         let room = pages::room(opened.content.fill(), opened.encodings.bytes(), opened.collector.newest());

@@ -66,7 +66,7 @@ impl Hatch {
         let not_found = || Refusal::new(Kind::NotFound, Code::SoftwareNotFound);
         if !shown.lists(digest) {
             // Another process may have published it a moment ago.
-            shown.documents.follow_if_possible().await;
+            shown.documents.look_if_possible().await;
             if !shown.lists(digest) {
                 return Err(not_found());
             }

@@ -162,7 +162,7 @@ impl OtaService {
             }
         };
         let following = async {
-            if let Some(opened) = self.opened.as_ref().filter(|opened| opened.is_shared()) {
+            if let Some(opened) = &self.opened {
                 opened.follow(&shutdown).await;
             }
         };
@@ -267,14 +267,14 @@ impl Opened {
         self.presence.as_ref().is_some_and(Presence::is_shared)
     }
 
-    /// Learns what other processes publish, and has made what robots will ask gateways for.
+    /// Tries files and keys again that could not be read, learns what other processes publish, and has made what robots will ask gateways for.
     async fn follow(&self, shutdown: &CancellationToken) {
         let wanted = std::sync::Mutex::new(0);
         every_second(shutdown, || async {
             self.repository.documents().follow_if_possible().await;
             // Said before this process has to sign.
             let _known = self.repository.find_directive_key().await;
-            let Some(newest) = self.repository.newest() else { return };
+            let Some(newest) = self.repository.newest().filter(|_| self.is_shared()) else { return };
             let version = newest.targets.edition.version;
             let is_new =
                 std::mem::replace(&mut *wanted.lock().unwrap_or_else(PoisonError::into_inner), version) != version;

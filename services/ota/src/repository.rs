@@ -101,8 +101,17 @@ pub enum Keyless {
         /// The set's.
         number: u64,
     },
-    /// A set is listed and cannot be read, so nobody knows which keys have ended.
+    /// A set is listed and the disk does not give it, so nobody knows which keys have ended.
     Unknown,
+    /// The newest set is listed, and its file is gone or damaged. It is tried again each second.
+    Lost(SetLost),
+}
+
+/// The newest set of directive keys is listed, and its file is gone or damaged.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SetLost {
+    /// The set's.
+    pub number: u64,
 }
 
 impl Keyless {
@@ -111,6 +120,24 @@ impl Keyless {
         match self {
             Self::Ended { number } => Reason::from(Code::NoDirectiveKey).with("set", number),
             Self::Unknown => Reason::from(Code::NoDirectiveKey).with("set", "unreadable"),
+            Self::Lost(SetLost { number }) => {
+                Reason::from(Code::NoDirectiveKey).with("set", number).with("file", "gone or damaged")
+            }
+        }
+    }
+
+    /// What to do about it.
+    const fn advice(self) -> &'static str {
+        match self {
+            Self::Ended { .. } => {
+                "put a key of the newest set into the folder of --ota-keys, or push a next set that names one it has"
+            }
+            Self::Unknown => {
+                "see to the disk, and to who may read its folder `content`: which keys have ended is read there"
+            }
+            Self::Lost(_) => {
+                "put the file of the newest set, N.directive-keys, back into the folder `content` under its SHA-256, from a backup or from the repository that was pushed"
+            }
         }
     }
 }
@@ -142,7 +169,9 @@ impl OnlineKeys {
     fn directive(&self, newest: Option<&Newest>) -> Result<Arc<SecretKey>, Keyless> {
         match newest.and_then(|newest| newest.key_set.as_ref()) {
             Some(set) => self.named_by(set).ok_or(Keyless::Ended { number: set.number }),
-            None if newest.is_some_and(Newest::lists_sets) => Err(Keyless::Unknown),
+            None if newest.is_some_and(Newest::lists_sets) => {
+                Err(newest.and_then(|newest| newest.set_lost).map_or(Keyless::Unknown, Keyless::Lost))
+            }
             // Read: every role has one.
             None => Ok(self.directives()[0].clone()),
         }
@@ -235,9 +264,11 @@ pub struct Newest {
     pub releases: Vec<Release>,
     /// The newest set of keys that sign directives; none: robots have them from their trust files alone, or it is listed and cannot be read.
     pub key_set: Option<KeySet>,
-    /// Manifests and the newest set of directive keys that are listed and that the disk did not give, though they are there. They are tried
-    /// again at each look; nobody may conclude from it that they are gone.
+    /// Manifests that are listed and that the disk did not give, though they are there, and the newest set of directive keys if it could not be
+    /// read for whatever reason. They are tried again each second; nobody may conclude from it that they are gone.
     pub unread: BTreeSet<Digest>,
+    /// The newest set of directive keys is gone or damaged, and what it was is not known.
+    pub set_lost: Option<SetLost>,
     digests: BTreeSet<Digest>,
     timestamp: Vec<u8>,
 }
@@ -333,7 +364,7 @@ impl Repository {
         self.keys.directive(self.newest().as_deref())
     }
 
-    /// As [`Repository::directive_key`]. If there is none, the folder of keys is looked at again; that there is none is said once until
+    /// As [`Repository::directive_key`], for one who asks now and then. If there is none, the folder of keys is looked at again; that there is none is said once until
     /// there is one again.
     ///
     /// # Errors
@@ -354,8 +385,8 @@ impl Repository {
         match keyless {
             Some(keyless) if before != Some(keyless) => tracing::error!(
                 why = ?keyless,
-                "this process has no directive key that is current, so it signs no orders to robots: put a key of the newest set into its folder of \
-                 --ota-keys, or push a next set that names one it has"
+                advice = keyless.advice(),
+                "this process has no directive key that is current, so it signs no orders to robots"
             ),
             None if before.is_some() => tracing::info!("this process has a directive key that is current again"),
             _ => {}
@@ -590,7 +621,18 @@ impl Newest {
     ) -> Self {
         let digests = files.iter().map(|file| file.digest).collect();
         let files = files.into_iter().map(|file| (file.name.clone(), file)).collect();
-        Self { root, targets, stamp, files, releases, key_set: None, unread: BTreeSet::new(), digests, timestamp }
+        Self {
+            root,
+            targets,
+            stamp,
+            files,
+            releases,
+            key_set: None,
+            unread: BTreeSet::new(),
+            set_lost: None,
+            digests,
+            timestamp,
+        }
     }
 }
 

@@ -2,13 +2,14 @@
 //!
 //! Invariant: nothing is written here. What is shown never goes back: a folder that says something older, or something else under the same
 //! number, is damaged, and what was shown before stays. A file that the disk does not give at the moment is not gone: what was known of it
-//! stays, and it is tried again at each look.
+//! stays, and it is tried again each time the folder is followed, once a second; never by whoever only asks for something.
 
-use super::{Error, Kept, Newest, Online, Release, TIMESTAMP, check, file, read, read_seen};
+use super::{Error, Kept, Newest, Online, Release, SetLost, TIMESTAMP, check, file, read, read_seen};
 use crate::blocking;
 use crate::content::Content;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::freshness::{Stamp, check_online, newest_targets, root_edition, stamp, targets_edition};
+use midshift_bundle::key_set::KeySet;
 use midshift_bundle::repository::{FileTarget, check_root, listed};
 use midshift_core::time::Utc;
 use std::collections::BTreeMap;
@@ -48,7 +49,7 @@ impl Documents {
             following: Arc::default(),
             is_failing: Arc::default(),
         };
-        this.take().await?;
+        this.take(Unread::Again).await?;
         Ok(this)
     }
 
@@ -74,7 +75,8 @@ impl Documents {
         self.newest.read().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Learns what other processes published, and tries files again that the disk did not give.
+    /// Learns what other processes published, and tries files again that could not be read. For one who does so now and then: a disk may take
+    /// its time to say that it does not give a file.
     ///
     /// # Errors
     /// If it cannot be read, does not hang together, or is older than what was shown. Then that is shown still.
@@ -83,12 +85,29 @@ impl Documents {
             return Ok(());
         }
         let _one = self.following.lock().await;
-        self.take().await
+        self.take(Unread::Again).await
     }
 
     /// As [`Documents::follow`]; if it begins to fail, that is logged.
     pub async fn follow_if_possible(&self) {
         let followed = self.follow().await;
+        self.tell_failing(followed);
+    }
+
+    /// Learns what other processes published, for somebody who asks for something: what could not be read is not tried again. If it begins to
+    /// fail, that is logged.
+    pub async fn look_if_possible(&self) {
+        if !self.is_shared {
+            return;
+        }
+        let looked = {
+            let _one = self.following.lock().await;
+            self.take(Unread::Left).await
+        };
+        self.tell_failing(looked);
+    }
+
+    fn tell_failing(&self, followed: Result<(), Error>) {
         let failed_before = self.is_failing.swap(followed.is_err(), Ordering::Relaxed);
         match followed {
             Err(error) if !failed_before => {
@@ -99,7 +118,7 @@ impl Documents {
         }
     }
 
-    async fn take(&self) -> Result<(), Error> {
+    async fn take(&self, unread: Unread) -> Result<(), Error> {
         let mut tries = 1;
         loop {
             let before = self.newest();
@@ -107,7 +126,7 @@ impl Documents {
             let read = blocking(move || {
                 let timestamp = read(&folder.join(TIMESTAMP))?;
                 if timestamp.as_ref() == known.as_ref().map(|known| &known.timestamp) {
-                    let again = known.filter(|known| !known.unread.is_empty());
+                    let again = known.filter(|known| unread == Unread::Again && !known.unread.is_empty());
                     let again = again.map(|known| Found::again(&known, &folder)).transpose();
                     return Ok((timestamp, again));
                 }
@@ -172,7 +191,7 @@ impl Documents {
     /// # Errors
     /// The disk's.
     pub async fn document(&self, name: &str) -> Result<Option<Vec<u8>>, Error> {
-        self.follow_if_possible().await;
+        self.look_if_possible().await;
         let Some(newest) = self.newest() else { return Ok(None) };
         if name == TIMESTAMP {
             return Ok(Some(newest.timestamp.clone()));
@@ -192,8 +211,25 @@ impl Documents {
     }
 }
 
-/// Listed files that the disk does not give, with their names and why.
-type Unread = BTreeMap<Digest, (String, Error)>;
+/// What is done about listed files that could not be read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Unread {
+    /// They are tried again.
+    Again,
+    /// They are left for the next time.
+    Left,
+}
+
+/// Why a listed file that is tried again could not be read.
+enum Why {
+    /// The disk does not give it, though it is there.
+    Disk(Error),
+    /// It is the newest set of directive keys, and gone or not what it must be. Without it nothing is signed, so it is waited for.
+    Lost(String),
+}
+
+/// Listed files that are tried again, with their names and why.
+type Missed = BTreeMap<Digest, (String, Why)>;
 
 /// Documents that the timestamp of a folder leads to.
 struct Found {
@@ -217,12 +253,13 @@ impl Found {
     }
 
     /// With its bundles, `before` being what is shown until now. A file that is gone is told and left out: the rest can be had still. One that the
-    /// disk does not give is what it was in `before`, since its name is its digest, and is noted as unread.
-    async fn complete(self, content: &dyn Content, before: Option<&Newest>) -> Result<(Newest, Unread), Error> {
+    /// disk does not give, and the newest set of directive keys also if it is gone, is what it was in `before`, since its name is its digest,
+    /// and is noted as unread.
+    async fn complete(self, content: &dyn Content, before: Option<&Newest>) -> Result<(Newest, Missed), Error> {
         let files = listed(&self.targets.bytes)?;
         let again = before.filter(|before| before.timestamp == self.timestamp);
         let is_known = |file: &FileTarget| again.is_some_and(|again| !again.unread.contains(&file.digest));
-        let (mut releases, mut unread) = (Vec::new(), Unread::new());
+        let (mut releases, mut unread) = (Vec::new(), Missed::new());
         for file in files.iter().filter(|file| check::is_manifest(file)) {
             let known = |newest: &Newest| newest.releases.iter().find(|r| r.digest == file.digest).cloned();
             if is_known(file) {
@@ -238,42 +275,57 @@ impl Found {
                 Ok(Err(problem)) => tracing::error!(file = file.name, problem, "a signed bundle cannot be read"),
                 Err(error) => {
                     releases.extend(before.and_then(known));
-                    unread.insert(file.digest, (file.name.clone(), error));
+                    unread.insert(file.digest, (file.name.clone(), Why::Disk(error)));
                 }
             }
         }
         check::sort(&mut releases);
-        let key_set = match check::newest_set(&files) {
-            Some(file) if is_known(file) => again.and_then(|again| again.key_set.clone()),
-            Some(file) => match check::key_set(file, content).await {
-                Ok(Ok((set, _))) => Some(set),
-                Ok(Err(problem)) => {
-                    tracing::error!(file = file.name, problem, "the newest set of directive keys cannot be read");
-                    None
-                }
-                Err(error) => {
-                    unread.insert(file.digest, (file.name.clone(), error));
+        let (mut key_set, mut set_lost) = (None, None);
+        if let Some(file) = check::newest_set(&files) {
+            if is_known(file) {
+                key_set = again.and_then(|again| again.key_set.clone());
+            } else {
+                let why = match check::key_set(file, content).await {
+                    Ok(Ok((set, _))) => {
+                        key_set = Some(set);
+                        None
+                    }
+                    Ok(Err(problem)) => Some(Why::Lost(problem)),
+                    Err(error) => Some(Why::Disk(error)),
+                };
+                if let Some(why) = why {
                     let known = before.filter(|before| before.files.get(&file.name) == Some(file));
-                    known.and_then(|before| before.key_set.clone())
+                    key_set = known.and_then(|before| before.key_set.clone());
+                    let is_lost = key_set.is_none() && matches!(why, Why::Lost(_));
+                    set_lost = KeySet::number_of(&file.name).filter(|_| is_lost).map(|number| SetLost { number });
+                    unread.insert(file.digest, (file.name.clone(), why));
                 }
-            },
-            None => None,
-        };
+            }
+        }
         let newest = Newest::of(self.root, self.targets, self.stamp, files, releases, self.timestamp);
-        Ok((Newest { key_set, unread: unread.keys().copied().collect(), ..newest }, unread))
+        Ok((Newest { key_set, set_lost, unread: unread.keys().copied().collect(), ..newest }, unread))
     }
 }
 
-/// Says once that the disk does not give files, and once that it does again.
-fn tell(before: Option<&Newest>, unread: &Unread) {
+/// Says once that files cannot be read, and once that they can again.
+fn tell(before: Option<&Newest>, unread: &Missed) {
     let is_known = |digest: &Digest| before.is_some_and(|before| before.unread.contains(digest));
-    for (file, error) in unread.iter().filter(|(digest, _)| !is_known(digest)).map(|(_, why)| why) {
-        tracing::warn!(
-            file,
-            %error,
-            "a signed file is there and cannot be read: what was known of it stays, and it is tried again at each look; see to the disk, and to who \
-             may read its folder `content`"
-        );
+    for (digest, (file, why)) in unread.iter().filter(|(digest, _)| !is_known(digest)) {
+        match why {
+            Why::Disk(error) => tracing::warn!(
+                file,
+                %error,
+                "a signed file is there and cannot be read: what was known of it stays, and it is tried again each second; see to the disk, and to \
+                 who may read its folder `content`"
+            ),
+            Why::Lost(problem) => tracing::error!(
+                file,
+                problem,
+                %digest,
+                "the newest set of directive keys is not here: put its file back into the folder `content` under its SHA-256, from a backup or \
+                 from the repository that was pushed; it is tried again each second"
+            ),
+        }
     }
     if unread.is_empty() && before.is_some_and(|before| !before.unread.is_empty()) {
         tracing::info!("all signed files can be read again");

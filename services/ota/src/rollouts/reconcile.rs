@@ -266,10 +266,11 @@ impl Loop {
         let ota = self.parts.ota.clone();
         let Ok(opened) = ota.opened() else { return Ok(false) };
         // Rows that another process committed from what it published are not undone.
-        opened.repository.documents().follow_if_possible().await;
+        opened.repository.documents().look_if_possible().await;
         releases::take(&mut self.view, now, opened.repository.newest().as_deref(), &mut plan);
         let replies = self.take_requests(requests, now, &mut plan);
-        let key = opened.repository.find_directive_key().await.ok();
+        // The service looks for one each second.
+        let key = opened.repository.directive_key().ok();
         let heard = std::mem::take(&mut self.heard);
         let more = {
             let signer = key.as_deref().map(Signer);

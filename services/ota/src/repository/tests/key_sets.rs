@@ -2,7 +2,7 @@
 
 use super::{fields, published};
 use crate::fixture::{Room, SEEDS, START, first_root, give_back, hide, key, key_set, targets};
-use crate::repository::{Error, Keyless};
+use crate::repository::{Documents, Error, FRESHEN_AFTER_MS, Keyless, SetLost};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::repository::{PEOPLE_LIFE_MS, sign_targets};
 use midshift_core::reason::Code;
@@ -124,4 +124,46 @@ async fn after_all_keys_of_a_set_were_lost_the_server_signs_nothing_until_a_set_
     push(&room, &second, 2, &[key_set(2, &[25], 25)]).await.expect("robots have it from their trust files");
     assert_eq!(signs_with(&room), 25);
     assert_eq!(room.repository.newest().expect("there").key_set.as_ref().map(|set| set.number), Some(2));
+}
+
+#[tokio::test]
+async fn a_server_whose_newest_set_is_gone_or_damaged_says_which_and_signs_again_once_it_is_back() {
+    for damaged in [None, Some(&b"not a set"[..])] {
+        let (room, first) = published().await;
+        let set = key_set(1, &[15, 5], 5);
+        let path = room.dir.path().join("content").join(Digest::of(&set.1).to_string());
+        push(&room, &first, 1, std::slice::from_ref(&set)).await.expect("published");
+        match damaged {
+            None => fs::remove_file(&path).expect("removed"),
+            Some(bytes) => fs::write(&path, bytes).expect("spoiled"),
+        }
+        let room = room.restarted().await;
+        let lost = Keyless::Lost(SetLost { number: 1 });
+        assert_eq!(room.repository.find_directive_key().await.err(), Some(lost), "5 may have ended");
+        let reason = lost.reason();
+        assert_eq!((reason.code, reason.metadata["file"].as_str()), (Code::NoDirectiveKey, "gone or damaged"));
+        room.repository.documents().follow().await.expect("the rest is readable");
+        assert_eq!(room.repository.directive_key().err(), Some(lost));
+        fs::write(&path, b"half of").expect("begun");
+        room.repository.documents().follow().await.expect("the rest is readable");
+        assert_eq!(room.repository.directive_key().err(), Some(lost), "it is not the set");
+        fs::write(&path, &set.1).expect("put back");
+        room.repository.documents().follow().await.expect("readable");
+        assert_eq!(signs_with(&room), 15, "without a restart");
+        assert!(room.repository.newest().expect("shown").unread.is_empty());
+    }
+}
+
+#[tokio::test]
+async fn a_set_that_goes_while_it_is_known_is_known_still() {
+    let (room, first) = published().await;
+    let set = key_set(1, &[15, 5], 5);
+    let path = room.dir.path().join("content").join(Digest::of(&set.1).to_string());
+    push(&room, &first, 1, &[set]).await.expect("published");
+    let other = Documents::reading(&room.metadata(), room.content.clone()).await.expect("readable");
+    fs::remove_file(&path).expect("removed");
+    room.repository.freshen(START.plus_ms(FRESHEN_AFTER_MS)).await.expect("signed");
+    other.follow().await.expect("the rest is readable");
+    let newest = other.newest().expect("shown");
+    assert_eq!((newest.key_set.as_ref().map(|set| set.number), newest.set_lost), (Some(1), None));
 }

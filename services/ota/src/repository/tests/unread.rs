@@ -104,3 +104,21 @@ async fn a_file_that_is_gone_is_left_out_and_not_waited_for() {
     let newest = room.repository.newest().expect("shown");
     assert_eq!((versions(&newest), newest.unread.len()), (Vec::<&str>::new(), 0));
 }
+
+#[tokio::test]
+async fn whoever_only_asks_for_a_document_tries_nothing_again() {
+    let room = Room::new().await;
+    let walk = files("walk", "1.0.0");
+    room.bring(&walk).await;
+    let document = targets(None, &walk, SEEDS.targets);
+    room.repository.publish(vec![first_root()], document, 0, START).await.expect("published");
+    hide(&path_of(&room, &walk[0]));
+    let content: Arc<dyn Content> = Arc::new(DiskContent::reading(&room.dir.path().join("content")));
+    let other = Documents::reading(&room.metadata(), content).await.expect("readable");
+    give_back(&path_of(&room, &walk[0]));
+    other.document("timestamp.json").await.expect("readable").expect("there");
+    other.look_if_possible().await;
+    assert_eq!(other.newest().expect("shown").unread.len(), 1, "the next second does");
+    other.follow().await.expect("readable");
+    assert!(other.newest().expect("shown").unread.is_empty());
+}
