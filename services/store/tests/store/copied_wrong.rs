@@ -210,10 +210,16 @@ async fn the_server_ends_what_it_does_for_a_copy_that_was_given_up() {
     // What a transaction sees of others' work is of one moment, so that one does not look.
     let mut watcher = stranger(&config).await;
     until_a_writer_waits(&mut watcher).await;
+    let waiter = "SELECT pid::bigint FROM pg_locks WHERE NOT granted AND database = \
+                  (SELECT oid FROM pg_database WHERE datname = current_database())";
+    let waiter = number(&mut watcher, waiter).await;
     copying.abort();
-    // It would wait for the lock for ten minutes, and everybody else behind it.
-    let waiting = "SELECT COUNT(*) FROM pg_locks WHERE NOT granted AND database = \
-                   (SELECT oid FROM pg_database WHERE datname = current_database())";
-    while number(&mut watcher, waiting).await > 0 {}
+    // By itself it would wait for the lock for ten minutes, and everybody else behind it.
+    let is_there = format!("SELECT COUNT(*) FROM pg_stat_activity WHERE pid = {waiter}");
+    while number(&mut watcher, &is_there).await > 0 {}
+    let name: String = sqlx::query_scalar("SELECT current_database()").fetch_one(&mut watcher).await.unwrap();
+    let log = PostgresServer::shared().log();
+    let mut said = log.lines().filter(|line| line.starts_with(&format!("{name}: ")));
+    assert!(said.any(|line| line.ends_with("connection to client lost")), "{log}");
     say(&mut other, "COMMIT").await;
 }
