@@ -2,3 +2,7 @@
 
 pub mod line;
 pub mod postgres;
+pub mod released;
+pub mod rows;
+pub mod shape;
+pub mod wire;
