@@ -14,5 +14,6 @@ mod plant;
 mod recorded;
 mod robots;
 mod run;
+mod schemas;
 mod stores;
 mod tap;
