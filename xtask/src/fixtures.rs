@@ -37,7 +37,7 @@ fn record(workspace: &Workspace, version: &str) -> Result<bool> {
     let (to, part) = places(&folder(workspace), version)?;
     let tools = Tools::find(workspace)?;
     ensure!(run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins"]))?, "the programs do not build");
-    let mut run = workspace.cargo(&["test", "--package", "midshift-tests", "--test", "released", "--", "recorded::"]);
+    let mut run = workspace.cargo(&["test", "--workspace", "--test", "released", "--", "recorded::"]);
     workspace.export_programs(&mut run)?;
     tools.export(&mut run);
     ensure!(run::succeeds(run.env(RECORD, &part))?, "the run failed");
