@@ -47,12 +47,6 @@ impl Shapes {
         };
         Self(text.lines().filter_map(line).collect())
     }
-    /// Adds what another has.
-    pub fn join(&mut self, other: Self) {
-        for (at, words) in other.0 {
-            self.0.entry(at).or_default().extend(words);
-        }
-    }
 }
 
 type Noted = RefCell<BTreeMap<String, BTreeSet<String>>>;
@@ -69,8 +63,8 @@ impl<'de, 'n> Reader<'de, 'n> {
     }
     fn note(&self, kind: &str, words: &[&str]) {
         let mut noted = self.noted.borrow_mut();
-        let at = format!("{} {kind}", self.at);
-        noted.entry(at.replace(' ', ":")).or_default().extend(words.iter().map(|word| (*word).to_owned()));
+        let at = noted.entry(format!("{}:{kind}", self.at)).or_default();
+        at.extend(words.iter().map(|word| (*word).to_owned()));
     }
     fn fields(&self, fields: &'de Map<String, Value>, names: Option<&'static [&'static str]>) -> Fields<'de, 'n, '_> {
         Fields { of: self, rest: fields.iter(), next: None, names, is_foreign_due: names.is_some() }
@@ -255,5 +249,69 @@ impl<'de> VariantAccess<'de> for Content<'de, '_> {
     }
     fn struct_variant<V: Visitor<'de>>(self, names: &'static [&'static str], visitor: V) -> Result<V::Value, Error> {
         self.there()?.deserialize_struct("", names, visitor)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Shapes;
+    use serde::Deserialize;
+    use serde_json::json;
+    use std::collections::BTreeMap;
+
+    #[derive(Debug, PartialEq, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    enum Way {
+        Idle,
+        Drives { to: String },
+        Holds(Vec<Load>),
+    }
+
+    #[derive(Debug, PartialEq, Deserialize)]
+    struct Load {
+        grams: Option<u32>,
+    }
+
+    #[derive(Debug, PartialEq, Deserialize)]
+    struct Row {
+        way: Way,
+        loads: BTreeMap<u64, Load>,
+    }
+
+    #[derive(Debug, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    struct Strict {
+        #[serde(rename = "n")]
+        _n: u32,
+    }
+
+    #[test]
+    fn a_row_is_read_and_every_field_and_word_that_its_type_knows_is_noted() {
+        let mut shapes = Shapes::default();
+        let row: Row = shapes.read("row", &json!({"way": "idle", "loads": {"7": {"grams": null}}})).expect("a row");
+        let loads = [(7, Load { grams: None })].into();
+        assert_eq!(row, Row { way: Way::Idle, loads });
+        for held in [json!({"drives": {"to": "A01"}}), json!({"holds": [{"grams": 3}]})] {
+            let row: Row = shapes.read("row", &json!({"way": held, "loads": {}})).expect("a row");
+            assert!(
+                matches!(&row.way, Way::Drives { to } if to == "A01")
+                    || row.way == Way::Holds(vec![Load { grams: Some(3) }])
+            );
+        }
+        let text = "row.loads.*:fields grams\nrow.way.drives:fields to\nrow.way.holds[]:fields grams\n\
+                    row.way:words drives holds idle\nrow:fields loads way\n";
+        assert_eq!(shapes.text(), text);
+        assert_eq!(Shapes::parse(text), shapes);
+    }
+
+    #[test]
+    fn a_type_that_refuses_a_field_of_a_later_release_cannot_be_read() {
+        let refused = Shapes::default().read::<Strict>("row", &json!({"n": 1})).expect_err("refused");
+        assert!(refused.to_string().contains("of_a_later_release"), "{refused}");
+    }
+
+    #[test]
+    fn a_word_that_nobody_knows_is_refused() {
+        assert!(Shapes::default().read::<Way>("way", &json!("flies")).is_err());
     }
 }

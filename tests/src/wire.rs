@@ -99,3 +99,30 @@ pub fn kinds(frames: &[Frame]) -> anyhow::Result<Vec<Frame>> {
     }
     Ok(kept)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::{Frame, kinds};
+
+    fn metadata(bytes: &[u8]) -> Frame {
+        let path = "/midshift.ota.v1.BundleService/GetMetadata".to_owned();
+        Frame { path, is_up: true, bytes: bytes.to_vec() }
+    }
+
+    #[test]
+    fn a_line_is_the_frame_again_and_half_a_byte_is_none() {
+        let frame = metadata(&[0x0a, 0x01, b'x']);
+        assert_eq!(frame.line(), "up /midshift.ota.v1.BundleService/GetMetadata 0a0178");
+        assert_eq!(Frame::parse(&frame.line()).expect("a frame"), frame);
+        for wrong in ["up /a/b 0a1", "aside /a/b 0a", "up /a/b", "up /a/b xy"] {
+            assert!(Frame::parse(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn of_frames_that_are_made_of_the_same_the_first_is_kept() {
+        let frames = [metadata(&[0x0a, 0x01, b'x']), metadata(&[]), metadata(&[0x0a, 0x01, b'y'])];
+        assert_eq!(kinds(&frames).expect("they can be read"), frames[..2]);
+        assert!(kinds(&[metadata(&[0xff])]).is_err());
+    }
+}
