@@ -36,7 +36,9 @@ fn folder(workspace: &Workspace) -> PathBuf {
 fn record(workspace: &Workspace, version: &str) -> Result<bool> {
     let (to, part) = places(&folder(workspace), version)?;
     let tools = Tools::find(workspace)?;
-    ensure!(run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins"]))?, "the programs do not build");
+    // Tests too: a build without them has other features.
+    let build = ["build", "--workspace", "--bins", "--tests"];
+    ensure!(run::succeeds(&mut workspace.cargo(&build))?, "the programs do not build");
     let mut run = workspace.cargo(&["test", "--workspace", "--test", "released", "--", "recorded::"]);
     workspace.export_programs(&mut run)?;
     tools.export(&mut run);
