@@ -6,14 +6,26 @@
 
 use crate::workspace::Workspace;
 use crate::{docker, images, run};
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Programs of an archive.
 const PROGRAMS: [&str; 2] = ["midshift", "midshift-launcher"];
 /// What goes with them, files and folders of the repository.
-const BESIDE: [&str; 8] = ["CHANGELOG.md", "LICENSE", "README.md", "clients", "deploy", "docs", "proto", "sites"];
+const BESIDE: [&str; 11] = [
+    "ARCHITECTURE.md",
+    "CHANGELOG.md",
+    "LICENSE",
+    "README.md",
+    "STYLE.md",
+    "clients",
+    "deploy",
+    "docs",
+    "ota_bundles/README.md",
+    "proto",
+    "sites",
+];
 
 /// What to make.
 #[derive(clap::Args)]
@@ -38,6 +50,8 @@ pub fn dist(workspace: &Workspace, options: &Options) -> Result<bool> {
     ensure!(is_told(&notes, &version), "CHANGELOG.md has no heading \"## {version}\": say first what is in it");
     let to = options.to.clone().unwrap_or_else(|| workspace.target.join(format!("release-{version}")));
     ensure!(!to.exists(), "{} is there already; remove it or name another folder by --to", to.display());
+    let left = workspace.root.join("tests/fixtures").join(&version);
+    ensure!(left.is_dir(), "nobody has kept what a run of {version} leaves; next: cargo xtask fixtures record");
     let packages = ["build", "--locked", "--profile", "dist", "-p", "midshift", "-p", "midshift-agent", "--bins"];
     if !run::succeeds(&mut workspace.cargo(&packages))? {
         return Ok(false);
@@ -46,6 +60,8 @@ pub fn dist(workspace: &Workspace, options: &Options) -> Result<bool> {
     let made = temporary.path.join("made");
     let programs = workspace.target.join("dist");
     archives(workspace, &version, &programs, &temporary.path, &made)?;
+    let archive = made.join(format!("{}.tar.gz", name_of(&version)));
+    ensure!(starts(&archive, &temporary.path, &version)?, "what is in the archive does not start");
     if !options.no_image {
         let bases = if options.machine_bases { images::Bases::OfThisMachine } else { images::Bases::AsWritten };
         let program = programs.join(PROGRAMS[0]);
@@ -54,7 +70,13 @@ pub fn dist(workspace: &Workspace, options: &Options) -> Result<bool> {
         })?;
     }
     digests(&made)?;
-    run::succeeds(Command::new("cp").arg("-r").arg(&made).arg(&to))?;
+    // Whole or not at all: the folder gets its name when everything is in it.
+    let part = to.with_extension("part");
+    let copied = run::succeeds(Command::new("cp").arg("-r").arg(&made).arg(&part)).is_ok_and(|copied| copied);
+    if !copied || std::fs::rename(&part, &to).is_err() {
+        let _ = std::fs::remove_dir_all(&part);
+        bail!("{} could not be written", to.display());
+    }
     for line in std::fs::read_to_string(to.join("SHA256SUMS")).context("reading digests")?.lines() {
         run::print(line);
     }

@@ -157,7 +157,7 @@ const ROBOTS_COME: Duration = Duration::from_secs(30);
 /// Tasks of one call.
 const BURST: usize = 500;
 
-/// Waits until fleet knows where each of so many robots stands, or until they have had time enough: a robot that nobody has heard of yet may stand in
+/// Waits until fleet knows where each of so many robots stands, or until they have had time enough. A robot that nobody has heard of yet may stand in
 /// a place that is given to another one.
 pub async fn all_stand(store: &dyn Store, robots: usize) -> anyhow::Result<()> {
     let known = async {

@@ -32,6 +32,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tempfile::TempDir;
 use tokio::net::TcpListener;
+use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
 
@@ -395,6 +396,7 @@ impl Run {
         background: Background,
         channel: tonic::transport::Channel,
         stop: CancellationToken,
+        standing: oneshot::Sender<()>,
     ) -> impl Future<Output = anyhow::Result<()>> + Send + use<> {
         let reserved = self.site.collisions_modelled().then_some(self.args.robots);
         let store = self.store.clone();
@@ -406,6 +408,8 @@ impl Run {
                     () = asked => return Ok(()),
                 }
             }
+            // Nobody asks any more if the run is over.
+            let _ = standing.send(());
             background.run(channel, stop).await
         }
     }
@@ -425,7 +429,7 @@ impl Run {
         let (robots_stop, work_stop) = (CancellationToken::new(), CancellationToken::new());
         // Whatever happens here, nothing goes on without the rest.
         let _ends = [&robots_stop, &work_stop, &self.served_until].map(|token| token.clone().drop_guard());
-        let begun = self.clock.now();
+        let (stand, standing) = oneshot::channel();
         let following = tally::follow(self.store.clone(), self.tasks.clone(), self.served_until.clone());
         let swarm = swarm.run(robots_stop.clone());
         let channel = tonic::transport::Endpoint::from_shared(format!("http://{address}"))?.connect_lazy();
@@ -433,10 +437,17 @@ impl Run {
             serving: tokio::spawn(server.serve(serve::nodelay(listener))),
             following: tokio::spawn(async { Ok(following.await?) }),
             robots: tokio::spawn(async { Ok(swarm.await.map(drop)?) }),
-            working: tokio::spawn(self.work(background, channel, work_stop.clone())),
+            working: tokio::spawn(self.work(background, channel, work_stop.clone(), stand)),
         };
         let progress = report::watch_progress(board, self.clock.clone(), no_progress_ms.clone());
         let _progress = AbortOnDropHandle::new(tokio::spawn(progress));
+        // A run is measured from the moment at which there may be work.
+        tokio::select! {
+            _ = standing => {}
+            () = self.stop.cancelled() => {}
+            error = parts.first_end() => return Err(error),
+        }
+        let begun = self.clock.now();
         let story = tokio::select! {
             story = self.until_over(begun.site, say) => story?,
             error = parts.first_end() => return Err(error),

@@ -139,11 +139,14 @@ where
     let mut look = tokio::time::interval(LOOK_EVERY);
     loop {
         look.tick().await;
-        if let Some(value) = condition().await? {
-            return Ok(value);
-        }
-        if Instant::now() > end {
-            bail!("waited {limit:?} in vain for: {what}");
+        // A look at somebody who says nothing must end too.
+        match tokio::time::timeout_at(end, condition()).await {
+            Ok(found) => {
+                if let Some(value) = found? {
+                    return Ok(value);
+                }
+            }
+            Err(_) => bail!("waited {limit:?} in vain for: {what}"),
         }
     }
 }

@@ -162,6 +162,7 @@ async fn cut_off(sever: fn(&Line), seed: u64) -> anyhow::Result<()> {
     }
     assert!(moved.keys().eq(before.keys()), "not all of {before:?} are at the other gateway: {moved:?}");
     let last_ms = moved.values().max().map_or(0, |next| next.cast_signed() - cut_unix_ms);
+    ensure!(last_ms < limits::AUTHORITY.as_ms().cast_signed(), "after {last_ms} ms their authority was over");
     say!(
         "the last of them was at the other gateway after {last_ms} ms; their authority to go on lasts {:?}",
         limits::AUTHORITY

@@ -39,12 +39,26 @@ pub fn prepare(samples: &Path, site: &Site) -> anyhow::Result<()> {
     Ok(trust.write(&samples.join("trust.json"))?)
 }
 
-/// Robots out of work for a roll-out, and how far it is; none while nobody answers.
-async fn counts(public: SocketAddr, id: &str) -> anyhow::Result<Option<(u32, RolloutCounts)>> {
+/// A roll-out as it is; none while nobody answers.
+async fn seen(public: SocketAddr, id: &str) -> anyhow::Result<Option<Seen>> {
     let request = GetRolloutRequest { rollout_id: id.to_owned() };
     let answer = RolloutServiceClient::new(channel(public)?).get_rollout(request).await;
     let rollout = answer.ok().and_then(|answer| answer.into_inner().rollout);
-    Ok(rollout.map(|rollout| (rollout.in_flight, rollout.counts.unwrap_or_default())))
+    Ok(rollout.map(|rollout| Seen {
+        wave: rollout.wave,
+        in_flight: rollout.in_flight,
+        counts: rollout.counts.unwrap_or_default(),
+    }))
+}
+
+/// How far a roll-out is.
+#[derive(Debug)]
+struct Seen {
+    /// From 0.
+    wave: u32,
+    /// Robots out of work for it.
+    in_flight: u32,
+    counts: RolloutCounts,
 }
 
 /// The roll-out of one release, looked at again and again.
@@ -79,6 +93,14 @@ impl Rolling {
         Ok(Self { id, public: address, robots, looking: AbortOnDropHandle::new(tokio::spawn(most)), enough })
     }
 
+    /// How far it is, for a person; an error if more were out of work for it than may be.
+    pub async fn stands(&self) -> anyhow::Result<String> {
+        ensure!(!self.looking.is_finished(), "{}: nobody looks at it any more", self.id);
+        let Some(seen) = seen(self.public, self.id).await? else { return Ok("nobody says".to_owned()) };
+        let (in_flight, kept) = (seen.in_flight, seen.counts.committed);
+        Ok(format!("    {}: wave {}, {in_flight} out of work, {kept} of {} keep it", self.id, seen.wave, self.robots))
+    }
+
     /// Waits for its end with this exit code of `rollout wait`; how far it came. More robots out of work than its wave and its area allow is an error.
     pub async fn ends(self, code: i32) -> anyhow::Result<RolloutCounts> {
         let (public, id) = (self.public.to_string(), self.id);
@@ -89,7 +111,7 @@ impl Rolling {
         ensure!(waited.status.code() == Some(code), "{id}: {:?} {said}", waited.status.code());
         self.enough.cancel();
         let most = self.looking.await.context("looking at it")??;
-        let (_, counts) = until("how far it came", LIMIT, || counts(self.public, id)).await?;
+        let counts = until("how far it came", LIMIT, || seen(self.public, id)).await?.counts;
         say!(
             "{id}: {} of {} robots keep it, {} were permitted, at most {most} out of work at once",
             counts.committed,
@@ -101,40 +123,41 @@ impl Rolling {
 }
 
 /// The most robots that were ever out of work for it at once. An error when they are more than may be: 10 % of the robots of the area, and no more than
-/// one while only the canary was ever permitted.
+/// one in the first wave.
 async fn looked_at(public: SocketAddr, id: &str, robots: usize, enough: CancellationToken) -> anyhow::Result<u32> {
     let (mut most, allowed) = (0, u32::try_from(robots.div_ceil(10))?);
-    while enough.run_until_cancelled(tokio::time::sleep(LOOK)).await.is_some() {
-        let Some((in_flight, counts)) = counts(public, id).await? else { continue };
-        let may = if counts.attempted <= 1 && counts.committed == 0 { 1 } else { allowed };
-        ensure!(in_flight <= may, "{id}: {in_flight} robots are out of work for it, {may} may be: {counts:?}");
-        most = most.max(in_flight);
+    let mut look = tokio::time::interval(LOOK);
+    while enough.run_until_cancelled(look.tick()).await.is_some() {
+        let Some(seen) = seen(public, id).await? else { continue };
+        let may = if seen.wave == 0 { 1 } else { allowed };
+        ensure!(seen.in_flight <= may, "{id}: more robots than {may} are out of work for it: {seen:?}");
+        most = most.max(seen.in_flight);
     }
     Ok(most)
 }
 
-/// By the bodies' own journals: whoever ran this release began to while its drain held it, once, and before the server heard of it.
+/// By the bodies' own journals: how often each robot began to run this release, which it did while its drain held it and before the server heard of it.
 pub async fn ran_in_their_drains(
     stack: &Stack,
     site: &Site,
     robots: &Robots,
     id: &str,
     version: &str,
-) -> anyhow::Result<usize> {
+) -> anyhow::Result<BTreeMap<RobotId, usize>> {
     let store = PostgresStore::open(&PostgresConfig::new(stack.url()), site.site_id().clone(), clock(1000)).await?;
     let snapshot = store.snapshot(&[Table::RolloutRobot]).await?;
     store.close().await;
     let rows = snapshot.rows.iter().map(|row| row.decode::<RolloutRobot>()).collect::<Result<Vec<_>, _>>()?;
     let rows: BTreeMap<&RobotId, &RolloutRobot> =
         rows.iter().filter(|row| row.rollout_id.as_str() == id).map(|row| (&row.robot_id, row)).collect();
-    let mut ran = 0;
+    let mut ran = BTreeMap::new();
     for path in robots.journals() {
         for entry in journal::read(&path)? {
             let (Effect::Ran { version: began }, Some(robot)) = (&entry.effect, &entry.robot_id) else { continue };
             if began != version {
                 continue;
             }
-            ran += 1;
+            *ran.entry(robot.clone()).or_insert(0) += 1;
             let moments =
                 &rows.get(robot).with_context(|| format!("{robot} ran {version} and is not in {id}"))?.moments;
             let held =

@@ -216,7 +216,12 @@ async fn the_server_ends_what_it_does_for_a_copy_that_was_given_up() {
     copying.abort();
     // By itself it would wait for the lock for ten minutes, and everybody else behind it.
     let is_there = format!("SELECT COUNT(*) FROM pg_stat_activity WHERE pid = {waiter}");
-    while number(&mut watcher, &is_there).await > 0 {}
+    let gone = async {
+        while number(&mut watcher, &is_there).await > 0 {
+            tokio::task::yield_now().await;
+        }
+    };
+    tokio::time::timeout(std::time::Duration::from_secs(60), gone).await.expect("the server ends it");
     let name: String = sqlx::query_scalar("SELECT current_database()").fetch_one(&mut watcher).await.unwrap();
     let log = PostgresServer::shared().log();
     let mut said = log.lines().filter(|line| line.starts_with(&format!("{name}: ")));
