@@ -12,9 +12,8 @@ use midshift_core::ids::RobotId;
 use midshift_core::rollout::rows::RolloutRobot;
 use midshift_core::rows::Table;
 use midshift_core::site::Site;
-use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
-use midshift_proto::ota::v1::{GetRolloutRequest, ListBundlesRequest, RolloutCounts};
+use midshift_proto::ota::v1::{GetRolloutRequest, RolloutCounts};
 use midshift_sim::journal::{self, Effect};
 use midshift_store::{PostgresConfig, PostgresStore, Store};
 use std::collections::BTreeMap;
@@ -75,17 +74,6 @@ impl Rolling {
     pub async fn begin(stack: &Stack, samples: &Path, id: &'static str, robots: usize) -> anyhow::Result<Self> {
         let public = stack.public.to_string();
         done(&["bundle", "push", "--server", &public, &samples.join("repository").display().to_string()])?;
-        until("the release is known to whoever is asked", LIMIT, async || {
-            let mut is_known = true;
-            for _ in 0..4 {
-                let mut client = BundleServiceClient::new(channel(stack.public)?);
-                let listed = client.list_bundles(ListBundlesRequest::default());
-                let bundles = listed.await.map_or_else(|_| Vec::new(), |page| page.into_inner().bundles);
-                is_known &= !bundles.is_empty();
-            }
-            Ok(is_known.then_some(()))
-        })
-        .await?;
         let quick = ["--waves", WAVES, "--soak", "5s", "--probation", "5s", "--exposure-tasks", "0", "--start"];
         done(&[&["rollout", "create", "--server", &public, id][..], &quick].concat())?;
         let (enough, address) = (CancellationToken::new(), stack.public);

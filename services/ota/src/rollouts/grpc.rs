@@ -1,7 +1,8 @@
 //! The gRPC face of roll-outs: decode, call, encode.
 
 use super::{RolloutService, decode, encode, watch};
-use midshift_core::ids::{RequestId, RobotId, RolloutId};
+use crate::repository::Release;
+use midshift_core::ids::{BundleId, RequestId, RobotId, RolloutId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::rollout::commands::{CheckOnly, Command, Taken, Verb};
@@ -14,10 +15,15 @@ use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::rollout_service_server::RolloutService as Face;
 use midshift_proto::pages;
 use std::sync::Arc;
+use std::time::Duration;
 use tokio::sync::mpsc;
+use tokio::time::Instant;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
 
+/// So long a caller waits for the row of a bundle that is published: the process that plans writes it within a second, and another takes over within 5.
+const ROWS_COME: Duration = Duration::from_secs(8);
+const ROWS_LOOK: Duration = Duration::from_millis(50);
 /// Messages that wait for a watcher.
 const WATCH_MAX: usize = 4;
 
@@ -104,9 +110,29 @@ impl RolloutService {
         Ok((self.shown(rollout_id).await?, taken))
     }
 
-    async fn bundle(&self, text: &str) -> Result<midshift_core::ids::BundleId, Refusal> {
-        let text = text.to_owned();
-        self.look(move |view, _, _| decode::bundle(view, &text)).await?
+    /// The bundle that a caller names. One that is published and has no row yet is waited for: whoever has just pushed it asks another process.
+    async fn bundle(&self, text: &str) -> Result<BundleId, Refusal> {
+        let until = Instant::now() + ROWS_COME;
+        loop {
+            let named = text.to_owned();
+            let found = self.look(move |view, _, _| decode::bundle(view, &named)).await?;
+            let is_late = found.is_err() && Instant::now() < until && self.is_published(text).await?;
+            if !is_late {
+                return found;
+            }
+            tokio::time::sleep(ROWS_LOOK).await;
+        }
+    }
+
+    async fn is_published(&self, bundle: &str) -> Result<bool, Refusal> {
+        let opened = self.ota.opened()?;
+        opened.repository.documents().look_if_possible().await;
+        let newest = opened.repository.newest();
+        let is_named = |release: &Release| {
+            let manifest = &release.manifest;
+            release.digest.to_string() == bundle || format!("{}-{}", manifest.name, manifest.version) == bundle
+        };
+        Ok(newest.is_some_and(|newest| newest.releases.iter().any(is_named)))
     }
 
     async fn create(&self, r: v1::CreateRolloutRequest) -> Result<v1::CreateRolloutResponse, Refusal> {
@@ -132,6 +158,9 @@ impl RolloutService {
         let rollout_id = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
         bad.finish()?;
         let rollout_id = rollout_id.ok_or_else(internal)?;
+        if let Some(spec) = &r.spec {
+            self.bundle(&spec.bundle).await?;
+        }
         let probation_ms = self.probation_ms;
         self.look(move |view, board, _| {
             let spec = match r.spec {

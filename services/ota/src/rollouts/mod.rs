@@ -69,7 +69,7 @@ pub struct RolloutService {
     /// Position up to which the picture is committed; changes with it.
     changed: channel::Receiver<Seq>,
     shutdown: CancellationToken,
-    has_keys: bool,
+    ota: OtaService,
     /// Probation of roll-outs that name none, milliseconds of site time.
     probation_ms: u64,
 }
@@ -86,13 +86,13 @@ impl RolloutService {
     pub fn new(parts: Parts, shutdown: CancellationToken) -> (Self, Planner) {
         let (sender, requests) = mpsc::channel(REQUESTS_MAX);
         let (changed, receiver) = channel::channel(Seq(0));
-        let has_keys = parts.ota.opened().is_ok();
+        let ota = parts.ota.clone();
         if parts.store.is_shared() {
             // Until this process leads another one may sign.
             parts.ota.lead(false);
         }
         let probation_ms = PROBATION_DEFAULT_MS;
-        let service = Self { requests: sender, changed: receiver, shutdown, has_keys, probation_ms };
+        let service = Self { requests: sender, changed: receiver, shutdown, ota, probation_ms };
         (service, Planner { parts, requests, changed })
     }
     /// Roll-outs that name no probation have this one instead of [`PROBATION_DEFAULT_MS`], milliseconds of site time.
@@ -104,9 +104,7 @@ impl RolloutService {
         RolloutServiceServer::new(self.clone())
     }
     async fn send(&self, request: Request) -> Result<(), Refusal> {
-        if !self.has_keys {
-            return Err(Refusal::new(Kind::Precondition, Code::NoOnlineKeys));
-        }
+        self.ota.opened()?;
         self.requests.try_send(request).map_err(|e| match e {
             mpsc::error::TrySendError::Full(_) => Refusal::new(Kind::Exhausted, Code::Overloaded),
             mpsc::error::TrySendError::Closed(_) => Refusal::new(Kind::Unavailable, Code::ShuttingDown),

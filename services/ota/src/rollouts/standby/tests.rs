@@ -158,6 +158,22 @@ async fn the_leader_takes_a_release_and_a_roll_out_created_at_the_standby_is_wri
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_roll_out_of_what_was_pushed_a_moment_ago_is_taken_by_the_process_that_has_no_row_of_it_yet() {
+    let world = World::new();
+    let leader = world.process().await;
+    let standby = world.process().await;
+    release(&leader.ota, &files("walk", "1.0.0")).await;
+    assert!(world.bundles().await.is_empty(), "the leader has not come to it");
+    let created = standby.create("r-1", "walk-1.0.0").await.expect("it waits for the row");
+    assert_eq!(created.rollout_id, "r-1");
+    let asked = Instant::now();
+    let unknown = standby.create("r-2", "walk-9.0.0").await.expect_err("nobody published it");
+    assert_eq!((unknown.code(), asked.elapsed()), (tonic::Code::NotFound, Duration::ZERO), "nothing to wait for");
+    leader.end().await;
+    standby.end().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn what_was_signed_is_signed_anew_by_the_leader_alone() {
     let world = World::new();
     let leader = world.process().await;
