@@ -86,10 +86,10 @@ impl Rolling {
         ensure!(!self.looking.is_finished(), "{}: nobody looks at it any more", self.id);
         let Some(seen) = seen(self.public, self.id).await? else { return Ok("nobody says".to_owned()) };
         let (in_flight, kept) = (seen.in_flight, seen.counts.committed);
-        Ok(format!("    {}: wave {}, {in_flight} out of work, {kept} of {} keep it", self.id, seen.wave, self.robots))
+        Ok(format!("    {}: wave {}, {in_flight} asked, {kept} of {} keep it", self.id, seen.wave, self.robots))
     }
 
-    /// Waits for its end with this exit code of `rollout wait`; how far it came. More robots out of work than its wave and its area allow is an error.
+    /// Waits for its end with this exit code of `rollout wait`; how far it came. More robots asked than its wave has is an error.
     pub async fn ends(self, code: i32) -> anyhow::Result<RolloutCounts> {
         let (public, id) = (self.public.to_string(), self.id);
         let limit = format!("{}s", LIMIT.as_secs());
@@ -101,7 +101,7 @@ impl Rolling {
         let most = self.looking.await.context("looking at it")??;
         let counts = until("how far it came", LIMIT, || seen(self.public, id)).await?.counts;
         say!(
-            "{id}: {} of {} robots keep it, {} were permitted, at most {most} out of work at once",
+            "{id}: {} of {} robots keep it, {} were permitted, at most {most} were asked at once",
             counts.committed,
             self.robots,
             counts.attempted
@@ -110,18 +110,46 @@ impl Rolling {
     }
 }
 
-/// The most robots that were ever out of work for it at once. An error when they are more than may be: 10 % of the robots of the area, and no more than
-/// one in the first wave.
+/// The most robots that its drains were ever asked of at once, those that still waited for the area among them. An error when they are more than its wave.
 async fn looked_at(public: SocketAddr, id: &str, robots: usize, enough: CancellationToken) -> anyhow::Result<u32> {
-    let (mut most, allowed) = (0, u32::try_from(robots.div_ceil(10))?);
+    let tenth = robots.div_ceil(10);
+    let sizes = [1, tenth, robots.saturating_sub(1 + tenth)];
+    let mut most = 0;
     let mut look = tokio::time::interval(LOOK);
     while enough.run_until_cancelled(look.tick()).await.is_some() {
         let Some(seen) = seen(public, id).await? else { continue };
-        let may = if seen.wave == 0 { 1 } else { allowed };
-        ensure!(seen.in_flight <= may, "{id}: more robots than {may} are out of work for it: {seen:?}");
+        let wave = sizes.get(seen.wave as usize).copied().unwrap_or_default();
+        ensure!(seen.in_flight as usize <= wave, "{id}: its wave has {wave} robots: {seen:?}");
         most = most.max(seen.in_flight);
     }
     Ok(most)
+}
+
+/// What the planner keeps of each robot of a roll-out.
+async fn rows(stack: &Stack, site: &Site, id: &str) -> anyhow::Result<BTreeMap<RobotId, RolloutRobot>> {
+    let store = PostgresStore::open(&PostgresConfig::new(stack.url()), site.site_id().clone(), clock(1000)).await?;
+    let snapshot = store.snapshot(&[Table::RolloutRobot]).await?;
+    store.close().await;
+    let rows = snapshot.rows.iter().map(|row| row.decode::<RolloutRobot>()).collect::<Result<Vec<_>, _>>()?;
+    Ok(rows.into_iter().filter(|row| row.rollout_id.as_str() == id).map(|row| (row.robot_id.clone(), row)).collect())
+}
+
+/// The most robots that were out of work for a roll-out at once: from the moment at which each got no new work until its probation was over.
+pub async fn most_out_of_work(stack: &Stack, site: &Site, id: &str) -> anyhow::Result<usize> {
+    let mut turns = Vec::new();
+    for row in rows(stack, site, id).await?.values() {
+        if let Some((out, back)) = row.moments.draining.zip(row.moments.on_trial) {
+            turns.extend([(out.0, 1), (back.0, -1)]);
+        }
+    }
+    // Who comes back makes room for who goes in the same millisecond.
+    turns.sort_unstable();
+    let (mut now, mut most) = (0_i64, 0);
+    for (_, turn) in turns {
+        now += turn;
+        most = most.max(now);
+    }
+    Ok(usize::try_from(most)?)
 }
 
 /// By the bodies' own journals: how often each robot began to run this release, which it did while its drain held it and before the server heard of it.
@@ -132,12 +160,7 @@ pub async fn ran_in_their_drains(
     id: &str,
     version: &str,
 ) -> anyhow::Result<BTreeMap<RobotId, usize>> {
-    let store = PostgresStore::open(&PostgresConfig::new(stack.url()), site.site_id().clone(), clock(1000)).await?;
-    let snapshot = store.snapshot(&[Table::RolloutRobot]).await?;
-    store.close().await;
-    let rows = snapshot.rows.iter().map(|row| row.decode::<RolloutRobot>()).collect::<Result<Vec<_>, _>>()?;
-    let rows: BTreeMap<&RobotId, &RolloutRobot> =
-        rows.iter().filter(|row| row.rollout_id.as_str() == id).map(|row| (&row.robot_id, row)).collect();
+    let rows = rows(stack, site, id).await?;
     let mut ran = BTreeMap::new();
     for path in robots.journals() {
         for entry in journal::read(&path)? {

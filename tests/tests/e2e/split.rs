@@ -139,6 +139,9 @@ async fn tasks_go_on_while_every_process_of_a_split_stack_is_killed_or_replaced_
         ensure!(good.committed as usize == count, "not every robot keeps it: {good:?}");
         let ran = rolling::ran_in_their_drains(&stack, &site, &robots, "walk-1.5.0", "1.5.0").await?;
         ensure!(ran.len() == count && ran.values().all(|times| *times == 1), "each robot begins it once: {ran:?}");
+        let most = rolling::most_out_of_work(&stack, &site, "walk-1.5.0").await?;
+        say!("walk-1.5.0: at most {most} robots out of work at once, of {count}");
+        ensure!((1..=count.div_ceil(10)).contains(&most), "a tenth may be: {most}");
         let id = "walk-1.6.0-bad-at-start";
         let bad = Rolling::begin(&stack, &samples, id, count).await?;
         for (role, nth) in [("ota", 0), ("ota", 1), ("fleet", 0), ("telemetry", 0)] {
