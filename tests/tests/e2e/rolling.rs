@@ -99,7 +99,12 @@ impl Rolling {
         ensure!(waited.status.code() == Some(code), "{id}: {:?} {said}", waited.status.code());
         self.enough.cancel();
         let most = self.looking.await.context("looking at it")??;
-        let counts = until("how far it came", LIMIT, || seen(self.public, id)).await?.counts;
+        // It is over when each robot is past its probation; what each keeps it writes a moment later.
+        let counts = until("what each robot keeps", LIMIT, async || {
+            let seen = seen(self.public, id).await?;
+            Ok(seen.map(|seen| seen.counts).filter(|counts| counts.committing == 0))
+        })
+        .await?;
         say!(
             "{id}: {} of {} robots keep it, {} were permitted, at most {most} were asked at once",
             counts.committed,
