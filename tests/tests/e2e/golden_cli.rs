@@ -343,6 +343,7 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     };
     let robot = room.robot("r1", "park-a", room.server.address, &[])?;
     room.until_held("park-a", "r1", true).await?;
+    room.until_it_obeys("r1").await?;
 
     // Robots, places, areas.
     t.note(&["robot", "ls", "-o", "json"])?;

@@ -75,7 +75,10 @@ impl Rolling {
         let public = stack.public.to_string();
         done(&["bundle", "push", "--server", &public, &samples.join("repository").display().to_string()])?;
         let quick = ["--waves", WAVES, "--soak", "5s", "--probation", "5s", "--exposure-tasks", "0", "--start"];
-        done(&[&["rollout", "create", "--server", &public, id][..], &quick].concat())?;
+        // A process that has not written since its database was away does not know what became of its first write; to ask again does no harm.
+        let create = [&["rollout", "create", "--server", &public, id][..], &quick].concat();
+        until("it to be created", Duration::from_secs(30), async || Ok(call(&create)?.status.success().then_some(())))
+            .await?;
         let (enough, address) = (CancellationToken::new(), stack.public);
         let most = looked_at(address, id, robots, enough.clone());
         Ok(Self { id, public: address, robots, looking: AbortOnDropHandle::new(tokio::spawn(most)), enough })

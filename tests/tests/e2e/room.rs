@@ -17,7 +17,7 @@ use midshift_proto::link::v1::sample;
 use midshift_proto::task::v1::submit_task_request::Body;
 use midshift_proto::task::v1::{FlatTask, SubmitTaskRequest, TaskState};
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
-use midshift_proto::telemetry::v1::{ListEventsRequest, event::Item};
+use midshift_proto::telemetry::v1::{ListEventsRequest, ListRobotsRequest, Presence, event::Item};
 use midshift_sim::body::{BodyConfig, SimBody};
 use midshift_sim::faults::FaultRates;
 use midshift_sim::handle::SimHandle;
@@ -137,6 +137,21 @@ impl Room {
         until(&format!("{place} held by {robot}: {held}"), LIMIT, || async {
             let found = self.place(place).await?.holders.iter().any(|h| h.robot_id == robot);
             Ok((found == held).then_some(()))
+        })
+        .await
+    }
+
+    /// Waits until a robot is online and has said that it took what it was given.
+    pub async fn until_it_obeys(&self, robot: &str) -> anyhow::Result<()> {
+        until(&format!("{robot} to obey"), LIMIT, || async {
+            let mut client = TelemetryServiceClient::new(self.server.channel()?);
+            let robots = client.list_robots(ListRobotsRequest::default()).await?.into_inner().robots;
+            let obeys = |r: &midshift_proto::telemetry::v1::Robot| {
+                let said = r.reported.clone().unwrap_or_default();
+                let works = said.vitals.is_some_and(|vitals| vitals.energy_mwh > 0);
+                r.presence() == Presence::Online && said.applied_work > 0 && said.applied_policy > 0 && works
+            };
+            Ok(robots.iter().any(|r| r.robot_id == robot && obeys(r)).then_some(()))
         })
         .await
     }
