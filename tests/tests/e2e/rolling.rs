@@ -96,6 +96,7 @@ impl Rolling {
     pub async fn ends(self, code: i32) -> anyhow::Result<RolloutCounts> {
         let (public, id) = (self.public.to_string(), self.id);
         let limit = format!("{}s", LIMIT.as_secs());
+        until("somebody answers", LIMIT, || seen(self.public, id)).await?;
         let waited =
             tokio::task::block_in_place(|| call(&["rollout", "wait", "--server", &public, id, "--timeout", &limit]))?;
         let said = String::from_utf8_lossy(&waited.stderr).into_owned();
