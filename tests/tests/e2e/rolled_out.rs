@@ -11,7 +11,7 @@ use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::switch::{FACTORY, Switch};
 use midshift_agent::trust::Trust;
 use midshift_bundle::keys::SecretKey;
-use midshift_core::site::{DEMO, text};
+use midshift_core::site::{DEMO, Site, text};
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::ota::v1::{GetRolloutRequest, ListQuarantinesRequest};
 use std::io::{BufRead, BufReader};
@@ -37,10 +37,7 @@ impl Robot {
     /// A robot in `home` that believes the release people of `samples`.
     pub fn launch(id: &str, start: &str, home: &Path, samples: &Path, server: &str) -> anyhow::Result<Self> {
         std::fs::create_dir_all(home)?;
-        let key = SecretKey::read(&samples.join("keys/directive-1.pem"))?.public();
-        let root = std::fs::read(samples.join("repository/metadata/1.root.json"))?;
-        let site = text::parse(DEMO)?.site_id().clone();
-        Trust { root, directive_keys: [(key.id(), key)].into(), site }.write(&home.join("trust.json"))?;
+        trust(samples, &text::parse(DEMO)?)?.write(&home.join("trust.json"))?;
         let (program, sets) = (midshift()?, home.join("sets"));
         let mut command = Command::new(&program);
         command.arg("launcher").arg("--record").arg(home.join("tries")).arg("--sets").arg(&sets).arg("--");
@@ -64,6 +61,13 @@ impl Robot {
         let switch = self.switch()?;
         Ok(DiskSets::open(&self.sets)?.holdings()?.version(&switch.current))
     }
+}
+
+/// What a robot of `site` believes that believes the release people of `samples`.
+pub fn trust(samples: &Path, site: &Site) -> anyhow::Result<Trust> {
+    let key = SecretKey::read(&samples.join("keys/directive-1.pem"))?.public();
+    let root = std::fs::read(samples.join("repository/metadata/1.root.json"))?;
+    Ok(Trust { root, directive_keys: [(key.id(), key)].into(), site: site.site_id().clone() })
 }
 
 /// The command line.

@@ -2,12 +2,10 @@
 
 use crate::harness::{channel, until};
 use crate::robots::Robots;
-use crate::rolled_out::{call, done};
+use crate::rolled_out::{call, done, trust};
 use crate::stack::Stack;
 use anyhow::{Context, ensure};
 use midshift::clock::clock;
-use midshift_agent::trust::Trust;
-use midshift_bundle::keys::SecretKey;
 use midshift_core::ids::RobotId;
 use midshift_core::rollout::rows::RolloutRobot;
 use midshift_core::rows::Table;
@@ -32,14 +30,11 @@ const LOOK: Duration = Duration::from_millis(200);
 /// Sample releases, and who robots of a site believe: `samples` gets `keys`, `repository` and `trust.json`.
 pub fn prepare(samples: &Path, site: &Site) -> anyhow::Result<()> {
     done(&["bundle", "samples", &samples.display().to_string(), "--config-only"])?;
-    let key = SecretKey::read(&samples.join("keys/directive-1.pem"))?.public();
-    let root = std::fs::read(samples.join("repository/metadata/1.root.json"))?;
-    let trust = Trust { root, directive_keys: [(key.id(), key)].into(), site: site.site_id().clone() };
-    Ok(trust.write(&samples.join("trust.json"))?)
+    Ok(trust(samples, site)?.write(&samples.join("trust.json"))?)
 }
 
 /// A roll-out as it is; none while nobody answers.
-async fn seen(public: SocketAddr, id: &str) -> anyhow::Result<Option<Seen>> {
+pub async fn seen(public: SocketAddr, id: &str) -> anyhow::Result<Option<Seen>> {
     let request = GetRolloutRequest { rollout_id: id.to_owned() };
     let answer = RolloutServiceClient::new(channel(public)?).get_rollout(request).await;
     let rollout = answer.ok().and_then(|answer| answer.into_inner().rollout);
@@ -52,12 +47,13 @@ async fn seen(public: SocketAddr, id: &str) -> anyhow::Result<Option<Seen>> {
 
 /// How far a roll-out is.
 #[derive(Debug)]
-struct Seen {
+pub struct Seen {
     /// From 0.
-    wave: u32,
-    /// Robots out of work for it.
-    in_flight: u32,
-    counts: RolloutCounts,
+    pub wave: u32,
+    /// Robots whose drains it has asked for, those that still wait for the rules of their area among them.
+    pub in_flight: u32,
+    /// Robots by how far they are.
+    pub counts: RolloutCounts,
 }
 
 /// The roll-out of one release, looked at again and again.

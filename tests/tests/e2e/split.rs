@@ -12,8 +12,6 @@ use anyhow::{Context, ensure};
 use midshift::clock::clock;
 use midshift_core::site::{DEMO, grid, text};
 use midshift_proto::convert::common::time_of;
-use midshift_proto::ota::v1::GetRolloutRequest;
-use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
 use midshift_proto::telemetry::v1::{ListEventsRequest, ListRobotsRequest, Presence, event};
 use std::collections::{BTreeMap, BTreeSet};
@@ -233,13 +231,13 @@ async fn a_roll_out_goes_on_while_processes_that_plan_it_sign_it_and_hand_it_out
         // So that blows fall on different steps of it.
         let wanted = u32::try_from(nth)?.min(2);
         until("some are permitted", LIMIT, async || {
-            let Some((in_flight, wave, attempted)) = flight(stack.public, "walk-1.5.0").await? else { return Ok(None) };
-            most[usize::from(wave > 0)].fetch_max(in_flight, Ordering::Relaxed);
-            Ok((attempted >= wanted).then_some(()))
+            let Some(seen) = rolling::seen(stack.public, "walk-1.5.0").await? else { return Ok(None) };
+            most[usize::from(seen.wave > 0)].fetch_max(seen.in_flight, Ordering::Relaxed);
+            Ok((seen.counts.attempted >= wanted).then_some(()))
         })
         .await?;
     }
-    until("somebody answers again", LIMIT, async || flight(stack.public, "walk-1.5.0").await).await?;
+    until("somebody answers again", LIMIT, async || rolling::seen(stack.public, "walk-1.5.0").await).await?;
     let waited = call(&["rollout", "wait", "--server", &public, "walk-1.5.0", "--timeout", "180s"])?;
     assert_eq!(waited.status.code(), Some(0), "{}", String::from_utf8_lossy(&waited.stderr));
     for robot in &robots {
@@ -249,14 +247,16 @@ async fn a_roll_out_goes_on_while_processes_that_plan_it_sign_it_and_hand_it_out
     assert!(most[0] <= 1 && most[1] <= 2, "{most:?}: more were out of work than their wave");
     begin("walk-1.6.0-bad-at-start")?;
     until("one is permitted", LIMIT, async || {
-        Ok(flight(stack.public, "walk-1.6.0-bad-at-start").await?.filter(|(.., attempted)| *attempted > 0).map(|_| ()))
+        let seen = rolling::seen(stack.public, "walk-1.6.0-bad-at-start").await?;
+        Ok(seen.filter(|seen| seen.counts.attempted > 0).map(|_| ()))
     })
     .await?;
     for (role, member) in blows {
         stack.kill(role, member)?;
         stack.restart(role, member)?;
     }
-    until("somebody answers again", LIMIT, async || flight(stack.public, "walk-1.6.0-bad-at-start").await).await?;
+    until("somebody answers again", LIMIT, async || rolling::seen(stack.public, "walk-1.6.0-bad-at-start").await)
+        .await?;
     let waited = call(&["rollout", "wait", "--server", &public, "walk-1.6.0-bad-at-start", "--timeout", "180s"])?;
     assert_eq!(waited.status.code(), Some(12), "{}", String::from_utf8_lossy(&waited.stderr));
     for robot in &robots {
@@ -265,18 +265,7 @@ async fn a_roll_out_goes_on_while_processes_that_plan_it_sign_it_and_hand_it_out
         })
         .await?;
     }
-    let (.., attempted) = flight(stack.public, "walk-1.6.0-bad-at-start").await?.unwrap_or_default();
-    assert_eq!(attempted, 1, "it ends at its canary");
+    let ended = rolling::seen(stack.public, "walk-1.6.0-bad-at-start").await?.context("nobody answers")?;
+    assert_eq!(ended.counts.attempted, 1, "it ends at its canary");
     Ok(())
-}
-
-/// How many robots of a roll-out are out of work for it, its wave, and how many were ever permitted; none while nobody answers.
-async fn flight(public: SocketAddr, id: &str) -> anyhow::Result<Option<(u32, u32, u32)>> {
-    let request = GetRolloutRequest { rollout_id: id.to_owned() };
-    let answer = RolloutServiceClient::new(channel(public)?).get_rollout(request).await;
-    let rollout = answer.ok().and_then(|answer| answer.into_inner().rollout);
-    Ok(rollout.map(|rollout| {
-        let attempted = rollout.counts.unwrap_or_default().attempted;
-        (rollout.in_flight, rollout.wave, attempted)
-    }))
 }
