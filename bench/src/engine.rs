@@ -5,8 +5,8 @@
 //! a commit waits for its log. Called by `submit`, `offer` and `link`.
 
 use crate::child::{Child, cpu_of_ended_s, cpu_of_s};
-use crate::fsync::Disk;
-use crate::submit::place;
+use crate::fsync::{Disk, place};
+use crate::raw::Raw;
 use anyhow::{Context, bail, ensure};
 use sqlx::postgres::PgConnection;
 use sqlx::{Connection, Executor};
@@ -22,8 +22,6 @@ use postgres_server::PostgresServer;
 
 /// Name of the limit that a durable answer stands beside where rows are in PostgreSQL.
 const COMMIT: &str = "single commit of PostgreSQL";
-/// Bytes of the row of one commit, as pgbench's history has it, rounded up.
-const COMMIT_BYTES: usize = 64;
 
 /// How often the CPU of the database's processes is added up anew because one of them ended meanwhile.
 const COUNTS_MAX: usize = 16;
@@ -194,38 +192,6 @@ fn copied(ids: &[i64], body: &[u8]) -> anyhow::Result<Vec<u8>> {
     }
     all.extend(COPY_END.to_be_bytes());
     Ok(all)
-}
-
-/// The raw limit of a durable answer.
-pub enum Raw {
-    /// An append to a file, with fdatasync.
-    Disk(Disk),
-    /// One INSERT of a small row, which is a transaction of its own, on a connection of its own.
-    Commit(Box<PgConnection>),
-}
-
-impl Raw {
-    /// Milliseconds of one.
-    pub async fn ms(&mut self) -> anyhow::Result<f64> {
-        match self {
-            Self::Disk(disk) => disk.append_ms(),
-            Self::Commit(connection) => {
-                let begun = Instant::now();
-                let insert =
-                    sqlx::query("INSERT INTO raw_commit (body) VALUES ($1)").bind([0x5a_u8; COMMIT_BYTES].as_slice());
-                insert.execute(&mut **connection).await?;
-                Ok(begun.elapsed().as_secs_f64() * 1e3)
-            }
-        }
-    }
-    /// The same of several in a row.
-    pub async fn several_ms(&mut self, times: usize) -> anyhow::Result<Vec<f64>> {
-        let mut took_ms = Vec::with_capacity(times);
-        for _ in 0..times {
-            took_ms.push(self.ms().await?);
-        }
-        Ok(took_ms)
-    }
 }
 
 #[cfg(test)]

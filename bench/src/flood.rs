@@ -1,7 +1,7 @@
 //! Robots at the knee: each sends a heartbeat with one STATUS sample as soon as its credit lets it. And one that asks how fast an
 //! EVENT is acknowledged meanwhile.
 
-use crate::engine::Raw;
+use crate::raw::Raw;
 use crate::robot::{self, Ear, Voice};
 use anyhow::Context;
 use midshift_core::ids::WaypointId;

@@ -1,8 +1,9 @@
 //! The raw limit of everything durable: appending a page to a file and waiting until the disk has it.
 
+use anyhow::Context;
 use std::fs::{File, OpenOptions};
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use tokio::time::Instant;
 
 /// What one commit writes at least.
@@ -27,4 +28,10 @@ impl Disk {
     pub fn appends_ms(&mut self, times: usize) -> anyhow::Result<Vec<f64>> {
         (0..times).map(|_| self.append_ms()).collect()
     }
+}
+
+/// A directory for one round, below `dir` or the temporary one.
+pub fn place(dir: Option<&PathBuf>) -> anyhow::Result<tempfile::TempDir> {
+    let made = dir.map_or_else(tempfile::tempdir, tempfile::tempdir_in);
+    made.context("making a directory for the databases")
 }

@@ -13,6 +13,7 @@ mod offer;
 mod ota;
 mod plan;
 mod questions;
+mod raw;
 mod robot;
 mod sink;
 mod submit;

@@ -4,13 +4,13 @@
 use crate::child::Child;
 use crate::engine::{Bed, Engine, EngineArgs};
 use crate::figure::{Figure, percentile};
+use crate::fsync::place;
 use anyhow::Context;
 use midshift_core::site::{DEMO, Site, text};
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::task::v1::{SubmitTaskRequest, SubmitTaskResponse};
 use midshift_sim::workload::{Workload, WorkloadConfig};
 use prost::Message;
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use tokio::task::JoinSet;
@@ -39,12 +39,6 @@ pub struct SubmitArgs {
     fsyncs: usize,
     #[command(flatten)]
     engine: EngineArgs,
-}
-
-/// A directory for one round, below `dir` or the temporary one.
-pub fn place(dir: Option<&PathBuf>) -> anyhow::Result<tempfile::TempDir> {
-    let made = dir.map_or_else(tempfile::tempdir, tempfile::tempdir_in);
-    made.context("making a directory for the databases")
 }
 
 /// Transports of the demo site.

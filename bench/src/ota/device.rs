@@ -5,7 +5,7 @@
 use super::programs;
 use super::resume::{self, ResumeArgs};
 use crate::figure::{Figure, median};
-use crate::submit::place;
+use crate::fsync::place;
 use anyhow::{Context, ensure};
 use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::sets::{CHUNK_BYTES, Sets, Wanted};

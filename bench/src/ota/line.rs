@@ -11,7 +11,7 @@ use super::noise::{Release, Releases};
 use super::parts::{JAM, LEAVE, MEND, PULL, TAKE, Taken};
 use crate::child::Child;
 use crate::figure::{Figure, percentile};
-use crate::submit::place;
+use crate::fsync::place;
 use anyhow::{Context, bail, ensure};
 use midshift_core::robot::FAULT_JAM;
 use midshift_proto::ota::v1;

@@ -2,8 +2,8 @@
 
 use super::rollouts::Rollouts;
 use crate::child::{Child, SESSIONS};
+use crate::fsync::place;
 use crate::ota::release::People;
-use crate::submit::place;
 use anyhow::{Context, ensure};
 use midshift_bundle::directive::{Directive, Expected};
 use midshift_core::ids::SiteId;
