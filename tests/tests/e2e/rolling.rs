@@ -7,6 +7,7 @@ use crate::stack::Stack;
 use anyhow::{Context, ensure};
 use midshift::clock::clock;
 use midshift_core::ids::RobotId;
+use midshift_core::limits;
 use midshift_core::rollout::rows::RolloutRobot;
 use midshift_core::rows::Table;
 use midshift_core::site::Site;
@@ -26,6 +27,8 @@ const WAVES: &str = "1,10%,rest";
 /// A roll-out to every robot of a crowd may take so long.
 const LIMIT: Duration = Duration::from_secs(900);
 const LOOK: Duration = Duration::from_millis(200);
+/// From a robot's decision to switch, which must fall within the life of its permission, to what its body writes of it, ms.
+const BEGIN_MS: u64 = 2_000;
 
 /// Sample releases, and who robots of a site believe: `samples` gets `keys`, `repository` and `trust.json`.
 pub fn prepare(samples: &Path, site: &Site) -> anyhow::Result<()> {
@@ -71,10 +74,7 @@ impl Rolling {
         let public = stack.public.to_string();
         done(&["bundle", "push", "--server", &public, &samples.join("repository").display().to_string()])?;
         let quick = ["--waves", WAVES, "--soak", "5s", "--probation", "5s", "--exposure-tasks", "0", "--start"];
-        // A process that has not written since its database was away does not know what became of its first write; to ask again does no harm.
-        let create = [&["rollout", "create", "--server", &public, id][..], &quick].concat();
-        until("it to be created", Duration::from_secs(30), async || Ok(call(&create)?.status.success().then_some(())))
-            .await?;
+        done(&[&["rollout", "create", "--server", &public, id][..], &quick].concat())?;
         let (enough, address) = (CancellationToken::new(), stack.public);
         let most = looked_at(address, id, robots, enough.clone());
         Ok(Self { id, public: address, robots, looking: AbortOnDropHandle::new(tokio::spawn(most)), enough })
@@ -157,7 +157,8 @@ pub async fn most_out_of_work(stack: &Stack, site: &Site, id: &str) -> anyhow::R
     Ok(usize::try_from(most)?)
 }
 
-/// By the bodies' own journals: how often each robot began to run this release, which it did while its drain held it and before the server heard of it.
+/// By the bodies' own journals: how often each robot began to run this release, which it did while its drain held it, within the life of its
+/// permission, and before the server heard of it.
 pub async fn ran_in_their_drains(
     stack: &Stack,
     site: &Site,
@@ -179,6 +180,14 @@ pub async fn ran_in_their_drains(
             let held =
                 moments.held.with_context(|| format!("{robot} ran {version} and was never held: {moments:?}"))?;
             ensure!(held.0 <= entry.utc_ms, "{robot} ran {version} at {} before {moments:?}", entry.utc_ms);
+            let permitted = moments
+                .granted_link
+                .with_context(|| format!("{robot} ran {version} and was never permitted: {moments:?}"))?;
+            let after_ms = entry.utc_ms - permitted.wall.0;
+            ensure!(
+                (0..=(limits::ACTIVATION_VALID.as_ms() + BEGIN_MS).cast_signed()).contains(&after_ms),
+                "{robot} ran {version} {after_ms} ms after its permission: {moments:?}"
+            );
             ensure!(moments.switched.is_none_or(|at| entry.utc_ms <= at.0), "{robot} ran {version} again: {moments:?}");
         }
     }

@@ -224,6 +224,16 @@ pub(super) async fn patiently<T>(reading: impl Future<Output = Result<T, Error>>
     tokio::time::timeout(READ_PATIENCE, reading).await.unwrap_or_else(|_| Err(Error::Unavailable(no_answer())))
 }
 
+/// The connection is no more: what was open on it is rolled back, and nothing can be said on it again. Classes 08 and 57P0x are the server's own words for it.
+pub(super) fn is_gone(error: &sqlx::Error) -> bool {
+    let told = |code: &str| code.starts_with("08") || code.starts_with("57P0");
+    match error {
+        sqlx::Error::Io(_) => true,
+        sqlx::Error::Database(error) => error.code().is_some_and(|code| told(&code)),
+        _ => false,
+    }
+}
+
 /// The server has not answered.
 pub(super) fn no_answer() -> Cause {
     Arc::new(std::io::Error::new(std::io::ErrorKind::TimedOut, "PostgreSQL has not answered in time"))

@@ -3,7 +3,7 @@
 //! Invariant: `frame_head.marked_position` is the newest position of all processes, and `frame_mark` is written with the frames:
 //! a robot may go on at another gateway, which must know at once how far it has come.
 
-use super::connect::{Database, WRITE_PATIENCE, no_answer};
+use super::connect::{Database, WRITE_PATIENCE, is_gone, no_answer};
 use super::writer::is_undone_by_others;
 use crate::frames::Marks;
 use crate::frames_queue::{FramesEngine, GAPS_KEPT, Packed, mark};
@@ -66,6 +66,7 @@ impl FramesWriter {
         let mut attempt = 0;
         loop {
             attempt += 1;
+            let is_kept = self.connection.is_some();
             let mut connection = self.take().await?;
             let done = tokio::time::timeout(WRITE_PATIENCE, once(&mut connection, &self.site_id, work)).await;
             match done.map_err(|_| Error::Unavailable(no_answer()))? {
@@ -73,7 +74,7 @@ impl FramesWriter {
                     self.connection = Some(connection);
                     return Ok(freed);
                 }
-                Err(error) if is_undone_by_others(&error) && attempt < ATTEMPTS => {
+                Err(error) if (is_undone_by_others(&error) || is_kept && is_gone(&error)) && attempt < ATTEMPTS => {
                     metrics::counter!("midshift_store_retries_total").increment(1);
                 }
                 Err(error) => return Err(unavailable(error)),

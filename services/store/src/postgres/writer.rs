@@ -4,7 +4,7 @@
 //! go at COMMIT. So number order is commit order over all processes, and what an item expects or keeps is still so when it is
 //! committed. Nothing is remembered from one transaction to the next: other processes write too.
 
-use super::connect::{Database, WRITE_PATIENCE, no_answer};
+use super::connect::{Database, WRITE_PATIENCE, is_gone, no_answer};
 use super::heard::broken_silence;
 use super::write_sql;
 use crate::group::Group;
@@ -40,6 +40,8 @@ pub(super) struct Writer {
 enum Undone {
     /// Nothing of it was written, and it may be tried again.
     ByOthers(sqlx::Error),
+    /// Nothing of it was written: the connection is no more.
+    Gone(sqlx::Error),
     /// Nothing of it was written.
     Before(Cause),
     /// Nobody knows.
@@ -48,7 +50,11 @@ enum Undone {
 
 impl From<sqlx::Error> for Undone {
     fn from(error: sqlx::Error) -> Self {
-        if is_undone_by_others(&error) { Self::ByOthers(error) } else { Self::Before(Arc::new(error)) }
+        match error {
+            error if is_undone_by_others(&error) => Self::ByOthers(error),
+            error if is_gone(&error) => Self::Gone(error),
+            error => Self::Before(Arc::new(error)),
+        }
     }
 }
 
@@ -96,7 +102,9 @@ impl Writer {
         let mut attempt = 0;
         loop {
             attempt += 1;
-            let mut connection = match self.connection.take() {
+            let kept = self.connection.take();
+            let is_kept = kept.is_some();
+            let mut connection = match kept {
                 Some(connection) => connection,
                 None => self.connect().await.map_err(Failed::Before)?,
             };
@@ -118,6 +126,11 @@ impl Writer {
                     let longest = PAUSE_MAX.min(Duration::from_millis(1 << attempt.min(6)));
                     tokio::time::sleep(longest.mul_f64(rand::random())).await;
                 }
+                // It may have ended long before, with a server that is there again: a new one says so.
+                Err(Undone::Gone(_)) if is_kept && attempt < ATTEMPTS => {
+                    metrics::counter!("midshift_store_retries_total").increment(1);
+                }
+                Err(Undone::Gone(error)) => return Err(Failed::Before(Arc::new(error))),
                 // Dropping the connection rolls back what it had open.
                 Err(Undone::Before(cause)) => return Err(Failed::Before(cause)),
                 Err(Undone::AtCommit(cause)) => return Err(Failed::AtCommit(cause)),
