@@ -19,6 +19,7 @@ pub mod robot;
 pub mod rollout;
 pub mod rows;
 pub mod site;
+pub mod stop;
 pub mod task;
 pub mod time;
 pub mod update;

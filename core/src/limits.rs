@@ -234,3 +234,31 @@ pub const BEACON_SOURCES_MAX: usize = 4_096;
 pub const BEACON_SHOWN: LinkDuration = LinkDuration(5_000);
 /// A program that gives no sign within this is started again by its launcher: what is shown as the time by which a robot is back.
 pub const BEACON_BACK_WITHIN: LinkDuration = LinkDuration(15_000);
+/// A robot checks in with the stop service so often.
+pub const CHECK_IN: LinkDuration = LinkDuration::from_secs(1);
+/// Without a check-in for so long a robot is shown as unreachable.
+pub const CHECK_IN_MISSED: LinkDuration = LinkDuration::from_secs(3);
+/// Answered check-ins in a row that end a silence.
+pub const CHECK_INS_GOOD: u32 = 3;
+/// Silence of the stop service after which a robot drives slowly. Longer than a planned restart of it, twice over.
+pub const SILENCE_SLOW: LinkDuration = LinkDuration::from_secs(10);
+/// Silence after which it stands. A network that is away for 20 s must not stop work where nobody walks.
+pub const SILENCE_STAND: LinkDuration = LinkDuration::from_secs(30);
+/// The same among people, or where nobody knows: slower ...
+pub const SILENCE_SLOW_PEOPLE: LinkDuration = LinkDuration::from_secs(3);
+/// ... and standing.
+pub const SILENCE_STAND_PEOPLE: LinkDuration = LinkDuration::from_secs(6);
+/// Stops that are engaged and not reset, of one site. The last ones are kept for stops of the whole fleet.
+pub const STOPS_MAX: usize = 256;
+/// Of these, so many are for stops of the whole fleet only.
+pub const STOPS_FOR_FLEET: usize = 16;
+/// Resets remembered; the oldest are forgotten first, and a robot that was away since then stays stopped until its stop is reset by name.
+pub const RESETS_MAX: usize = 2_048;
+/// A reset is remembered so long, for robots that were away.
+pub const RESETS_KEPT: LinkDuration = LinkDuration::from_secs(90 * 24 * 3_600);
+/// Boxes that tell where a stop is: some 2 KiB of a message; larger ones take the place of more.
+pub const REGION_BOXES_MAX: usize = 128;
+/// A robot this near to a stopped part lies inside, millimetres: how wrong its pose may be, how large it is, and how far it rolls on from 1.5 m/s.
+pub const STOP_MARGIN_MM: i32 = 2_000;
+/// What a robot drives at most while a stop or a silence slows it, millimetres per second.
+pub const STOP_SLOW_MM_S: u32 = 300;

@@ -161,7 +161,7 @@ async fn a_writer_that_slept_while_the_server_was_away_writes_at_once_when_it_is
     let store = postgres_at(&PostgresConfig::new(server.database())).await;
     let attempt = |id: &str| vec![put(Table::Attempt, id, Expect::Absent, "1")];
     one(&store, Writer::Fleet, attempt("a")).await.unwrap();
-    tokio::task::spawn_blocking(move || {
+    let _up = tokio::task::spawn_blocking(move || {
         server.cut();
         server.start_again();
         server

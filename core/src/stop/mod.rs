@@ -1,0 +1,19 @@
+//! Fleet stop: the law that the stop service and every robot share. An operational stop request, not a safety function.
+//!
+//! A stop is named, engaged once and reset by its name. Both are facts that only add up ([`latch`]), so it does not matter in which order, how
+//! often or by which way a robot hears of them. Who lies inside a stop decides each robot by its own pose ([`region`]); who hears nothing slows
+//! down and stands by itself ([`ladder`]); what all of it comes to for one robot is [`robot`], and what people are shown of it [`roster`].
+//!
+//! Invariant: nothing here makes a robot move that stood. A reset takes a stop away and leaves `resume:<id>`; only a person's resume ends that.
+//! Absent on purpose: the store, the task queue, a level that cuts power.
+
+pub mod ladder;
+pub mod latch;
+pub mod region;
+pub mod robot;
+pub mod roster;
+pub mod scope;
+
+pub use latch::{Latch, Reset, Stop};
+pub use region::Region;
+pub use scope::Scope;

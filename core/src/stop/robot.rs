@@ -1,0 +1,276 @@
+//! What stops come to for one robot: the level that it obeys, and what a person has to resume before it moves again.
+//!
+//! Invariant: the level is the most restrictive of all that is known; once it was [`StopLevel::Halt`] or more by a stop, no message but that stop's reset *and* a
+//! resume of it, in whatever order they arrive, lets the robot move. A robot that has not been told since it began, stands.
+//! Kept by the agent in a file of its own, apart from the ledger of its work.
+
+use super::ladder::{Around, Ladder, Stage};
+use super::latch::{Latch, Reset, Stop};
+use crate::ids::{RobotId, StopId};
+use crate::limits;
+use crate::robot::{Pose, StopLevel};
+use crate::time::{LinkTime, Now, Utc};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
+
+/// What survives the end of the agent.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Kept {
+    /// Stops and resets it was told of.
+    pub latch: Latch,
+    /// What stood it and was not resumed: stops, reset or not, and silences among people.
+    pub awaiting: BTreeSet<StopId>,
+}
+
+/// What a robot does about stops at one moment.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Obeyed {
+    /// The most restrictive of all.
+    pub level: StopLevel,
+    /// Effective stops that it lies inside of.
+    pub inside: Vec<StopId>,
+    /// How far the silence has come.
+    pub stage: Stage,
+    /// [`Kept`] has changed and must be kept again.
+    pub is_changed: bool,
+}
+
+/// One robot's stops since it began.
+#[derive(Clone, Debug)]
+pub struct RobotStop {
+    robot_id: RobotId,
+    kept: Kept,
+    ladder: Ladder,
+    is_told: bool,
+    silence: Option<StopId>,
+}
+
+impl RobotStop {
+    /// A robot that begins with what it has kept.
+    pub fn begin(robot_id: RobotId, kept: Kept, now: LinkTime) -> Self {
+        Self { robot_id, kept, ladder: Ladder::begin(now), is_told: false, silence: None }
+    }
+
+    /// What must survive.
+    pub fn kept(&self) -> &Kept {
+        &self.kept
+    }
+
+    /// The stop service has said all that is effective now. Whether anything is new.
+    pub fn told_all(&mut self, all: Latch) -> bool {
+        self.is_told = true;
+        self.kept.latch.merge(all)
+    }
+
+    /// It has said something since. Whether it is new.
+    pub fn told(&mut self, stops: Vec<Stop>, resets: Vec<Reset>) -> bool {
+        let engaged = stops.into_iter().fold(false, |new, stop| self.kept.latch.engage(stop) | new);
+        resets.into_iter().fold(engaged, |new, reset| self.kept.latch.reset(reset) | new)
+    }
+
+    /// The check-in that was sent at `sent` has its answer.
+    pub fn answered(&mut self, sent: LinkTime) {
+        self.ladder.answered(sent);
+    }
+
+    /// People resumed these. One whose stop is still effective here waits for its reset. Whether anything changed.
+    pub fn resumed(&mut self, stop_ids: &BTreeSet<StopId>) -> bool {
+        let Kept { latch, awaiting } = &mut self.kept;
+        let before = awaiting.len();
+        awaiting.retain(|id| !stop_ids.contains(id) || latch.is_effective(id));
+        awaiting.len() < before
+    }
+
+    /// What to do at `now`, standing or driving at `pose`.
+    pub fn look(&mut self, now: &Now, pose: Option<&Pose>, around: Around) -> Obeyed {
+        let mut is_changed = self.kept.latch.forget(now.wall, limits::RESETS_MAX);
+        let stage = self.ladder.look(now.link, around);
+        let over: Vec<(StopId, StopLevel)> =
+            self.kept.latch.over(&self.robot_id, pose).map(|stop| (stop.stop_id.clone(), stop.level)).collect();
+        for (stop_id, _) in over.iter().filter(|(_, level)| *level >= StopLevel::Halt) {
+            is_changed |= self.kept.awaiting.insert(stop_id.clone());
+        }
+        is_changed |= self.silent(stage, around, now.wall);
+        let stops = over.iter().map(|(_, level)| *level).max().unwrap_or_default();
+        let held = if self.kept.awaiting.is_empty() { StopLevel::None } else { StopLevel::Halt };
+        let silence = match stage {
+            Stage::Heard => StopLevel::None,
+            Stage::Slow => StopLevel::Slow,
+            Stage::Stand if !self.is_told => StopLevel::Halt,
+            Stage::Stand => StopLevel::ControlledStopPosture,
+        };
+        let untold = if self.is_told { StopLevel::None } else { StopLevel::Halt };
+        let level = [stops, held, silence, untold].into_iter().max().unwrap_or_default();
+        Obeyed { level, inside: over.into_iter().map(|(id, _)| id).collect(), stage, is_changed }
+    }
+
+    /// A silence that stood it among people is a person's to end; at its beginning nobody was heard yet, and it did not stand for people.
+    fn silent(&mut self, stage: Stage, around: Around, wall: Utc) -> bool {
+        if stage != Stage::Stand {
+            self.silence = None;
+            return false;
+        }
+        if !self.is_told || around == Around::Robots || self.silence.is_some() {
+            return false;
+        }
+        let named = format!("SILENCE-{}-{}", self.robot_id, wall.0);
+        self.silence = StopId::parse(&named).ok();
+        self.silence.clone().is_some_and(|id| self.kept.awaiting.insert(id))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::scope::Scope;
+    use super::*;
+    use crate::time::SiteTime;
+    use std::collections::{BTreeMap, VecDeque};
+
+    fn id(n: u8) -> StopId {
+        StopId::parse(&format!("STOP-{n}")).expect("an id")
+    }
+
+    fn robot() -> RobotId {
+        RobotId::parse("r1").expect("an id")
+    }
+
+    fn stop(n: u8, level: StopLevel) -> Stop {
+        Stop {
+            stop_id: id(n),
+            scope: Scope::Fleet,
+            level,
+            engaged: Utc(1),
+            actor: String::new(),
+            reason: String::new(),
+            region: None,
+            proof: Vec::new(),
+        }
+    }
+
+    fn reset(n: u8) -> Reset {
+        Reset { stop_id: id(n), at: Utc(2), actor: String::new(), reason: String::new() }
+    }
+
+    fn at(ms: u64) -> Now {
+        Now { site: SiteTime(ms), link: LinkTime(ms), utc: Utc(ms as i64), wall: Utc(ms as i64) }
+    }
+
+    /// Told of nothing, and answered in each second up to and with the third.
+    fn free() -> RobotStop {
+        let mut robot = RobotStop::begin(robot(), Kept::default(), LinkTime(0));
+        robot.told_all(Latch::default());
+        (1..4).for_each(|s| robot.answered(LinkTime(s * 1000)));
+        assert_eq!(robot.look(&at(3_000), None, Around::People).level, StopLevel::None);
+        robot
+    }
+
+    #[test]
+    fn a_robot_begins_stopped_until_it_was_told_and_answered() {
+        let mut robot = RobotStop::begin(robot(), Kept::default(), LinkTime(0));
+        assert_eq!(robot.look(&at(0), None, Around::Robots).level, StopLevel::Halt);
+        (1..4).for_each(|s| robot.answered(LinkTime(s * 1000)));
+        assert_eq!(robot.look(&at(3_000), None, Around::Robots).level, StopLevel::Halt, "answered, and not told");
+        robot.told_all(Latch::default());
+        assert_eq!(robot.look(&at(3_000), None, Around::Robots).level, StopLevel::None);
+        assert!(robot.kept().awaiting.is_empty(), "a start is no stop");
+    }
+
+    #[test]
+    fn slow_ends_with_its_reset_and_asks_for_no_resume() {
+        let mut robot = free();
+        robot.told(vec![stop(1, StopLevel::Slow)], vec![]);
+        assert_eq!(robot.look(&at(3_100), None, Around::Robots).level, StopLevel::Slow);
+        robot.told(vec![], vec![reset(1)]);
+        assert_eq!(robot.look(&at(3_200), None, Around::Robots).level, StopLevel::None);
+    }
+
+    #[test]
+    fn a_silence_among_people_waits_for_a_resume_and_elsewhere_it_does_not() {
+        for (around, level) in [(Around::People, StopLevel::Halt), (Around::Robots, StopLevel::None)] {
+            let mut robot = free();
+            assert_eq!(robot.look(&at(60_000), None, around).level, StopLevel::ControlledStopPosture);
+            (60..63).for_each(|s| robot.answered(LinkTime(s * 1000)));
+            assert_eq!(robot.look(&at(62_000), None, around).level, level, "{around:?}");
+            let silences = robot.kept().awaiting.clone();
+            assert_eq!(silences.len(), usize::from(around == Around::People));
+            robot.resumed(&silences);
+            assert_eq!(robot.look(&at(62_100), None, around).level, StopLevel::None);
+        }
+    }
+
+    #[test]
+    fn a_resume_that_overtakes_the_reset_waits_for_it() {
+        let mut robot = free();
+        robot.told(vec![stop(1, StopLevel::Halt)], vec![]);
+        robot.look(&at(3_100), None, Around::Robots);
+        assert!(!robot.resumed(&[id(1)].into()));
+        robot.told(vec![], vec![reset(1)]);
+        assert_eq!(robot.look(&at(3_200), None, Around::Robots).level, StopLevel::Halt);
+        assert!(robot.resumed(&[id(1)].into()));
+        assert_eq!(robot.look(&at(3_300), None, Around::Robots).level, StopLevel::None);
+    }
+
+    /// What may happen to a robot, at any time and in any order.
+    #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+    enum Happens {
+        Engaged(u8),
+        Reset(u8),
+        Resumed(u8),
+        ToldAll,
+        Answered,
+        Began,
+    }
+
+    /// All that matters of a robot and of what it was told, to know a state again.
+    type Seen = (bool, Kept, StopLevel, [(bool, bool, bool); 2]);
+
+    /// Walks every state that two stops, their resets and resumes, restarts and answers lead to.
+    #[test]
+    fn no_way_leads_from_standing_to_moving_without_a_reset_and_a_resume_of_each_stop() {
+        let all = [1, 2].into_iter().flat_map(|n| [Happens::Engaged(n), Happens::Reset(n), Happens::Resumed(n)]);
+        let all: Vec<Happens> = all.chain([Happens::ToldAll, Happens::Answered, Happens::Began]).collect();
+        // Which stops stood the robot, which of them were reset, and which resumed after that.
+        let mut seen: BTreeMap<String, Seen> = BTreeMap::new();
+        let mut todo =
+            VecDeque::from([(RobotStop::begin(robot(), Kept::default(), LinkTime(0)), [(false, false, false); 2])]);
+        let mut stood_and_moved = 0;
+        while let Some((before, facts)) = todo.pop_front() {
+            for happens in &all {
+                let (mut robot, mut facts) = (before.clone(), facts);
+                let now = at(3_000);
+                match *happens {
+                    Happens::Engaged(n) => drop(robot.told(vec![stop(n, StopLevel::Halt)], vec![])),
+                    Happens::Reset(n) => {
+                        robot.told(vec![], vec![reset(n)]);
+                        facts[usize::from(n) - 1].1 = true;
+                    }
+                    Happens::Resumed(n) => {
+                        robot.resumed(&[id(n)].into());
+                        let fact = &mut facts[usize::from(n) - 1];
+                        fact.2 |= fact.1;
+                    }
+                    Happens::ToldAll => drop(robot.told_all(Latch::default())),
+                    Happens::Answered => (1..4).for_each(|s| robot.answered(LinkTime(s * 1000))),
+                    Happens::Began => robot = RobotStop::begin(self::robot(), robot.kept().clone(), LinkTime(0)),
+                }
+                let level = robot.look(&now, None, Around::Robots).level;
+                for (n, fact) in [1, 2].into_iter().zip(&mut facts) {
+                    fact.0 |= robot.kept().awaiting.contains(&id(n));
+                }
+                if level < StopLevel::Halt {
+                    for (stood, was_reset, was_resumed) in facts {
+                        assert!(!stood || was_reset && was_resumed, "{happens:?} freed {robot:?}");
+                        stood_and_moved += usize::from(stood);
+                    }
+                }
+                let state = (robot.is_told, robot.kept.clone(), level, facts);
+                let key = format!("{state:?}");
+                if !seen.contains_key(&key) {
+                    seen.insert(key, state);
+                    todo.push_back((robot, facts));
+                }
+            }
+        }
+        assert!(seen.len() > 50 && stood_and_moved > 0, "{} states, {stood_and_moved} freed", seen.len());
+    }
+}

@@ -1,0 +1,143 @@
+//! What people are shown of one stop and one robot: only what the robot itself has said, and for how long it has said nothing.
+//!
+//! Invariant: STANDSTILL_CONFIRMED needs a report of this robot, heard after it kept this stop, that says it stands and obeys it. Silence never confirms.
+//! Called by the stop service.
+
+use super::ladder::{Around, Stage};
+use super::latch::Stop;
+use crate::ids::StopId;
+use crate::limits;
+use crate::robot::StopLevel;
+use crate::time::LinkTime;
+use std::collections::BTreeSet;
+
+/// The newest report of one robot.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Heard {
+    /// When it came, link clock of the stop service.
+    pub at: LinkTime,
+    /// Newest state of the latch that it has taken over.
+    pub generation: u64,
+    /// What it took over survives its end.
+    pub is_durable: bool,
+    /// What it obeys.
+    pub level: StopLevel,
+    /// It stands and will not move by itself.
+    pub is_still: bool,
+    /// Stops that it lies inside of.
+    pub inside: BTreeSet<StopId>,
+    /// How far its silence had come.
+    pub stage: Stage,
+    /// Whom it has around itself, as far as it knows.
+    pub around: Around,
+    /// What waits for a person's resume.
+    pub awaiting: BTreeSet<StopId>,
+}
+
+/// How far one robot is with one stop.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Confirmation {
+    /// It was told, and has not said that it knows.
+    Requested,
+    /// It knows. If the stop only slows it, it does.
+    Acked,
+    /// It knows, and does not lie inside.
+    Outside,
+    /// It stands, and obeys.
+    StandstillConfirmed,
+    /// It is not heard.
+    Unreachable {
+        /// Since when; none if it was never heard by this process.
+        since: Option<LinkTime>,
+        /// When its own silence makes it stand at the latest; none if it was never heard.
+        self_stop_by: Option<LinkTime>,
+    },
+}
+
+impl Confirmation {
+    /// Nothing more is to come of it by itself.
+    pub const fn is_settled(self, stop: &Stop) -> bool {
+        match self {
+            Self::StandstillConfirmed | Self::Outside => true,
+            Self::Acked => matches!(stop.level, StopLevel::Slow),
+            Self::Requested | Self::Unreachable { .. } => false,
+        }
+    }
+}
+
+/// How far a robot is with `stop`, which the latch has since `generation`.
+pub fn confirmation(stop: &Stop, generation: u64, robot: Option<&Heard>, now: LinkTime) -> Confirmation {
+    let Some(heard) = robot else { return Confirmation::Unreachable { since: None, self_stop_by: None } };
+    if now.since(heard.at) >= limits::CHECK_IN_MISSED {
+        let by = heard.at + heard.around.patience().1;
+        return Confirmation::Unreachable { since: Some(heard.at), self_stop_by: Some(by) };
+    }
+    match heard {
+        heard if heard.generation < generation => Confirmation::Requested,
+        heard if !heard.inside.contains(&stop.stop_id) => Confirmation::Outside,
+        heard if heard.is_still && heard.level >= stop.level && stop.level >= StopLevel::Halt => {
+            Confirmation::StandstillConfirmed
+        }
+        _ => Confirmation::Acked,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::scope::Scope;
+    use super::*;
+    use crate::time::Utc;
+
+    fn stop(level: StopLevel) -> Stop {
+        Stop {
+            stop_id: StopId::parse("STOP-1").expect("an id"),
+            scope: Scope::Fleet,
+            level,
+            engaged: Utc(0),
+            actor: String::new(),
+            reason: String::new(),
+            region: None,
+            proof: Vec::new(),
+        }
+    }
+
+    fn standing() -> Heard {
+        Heard {
+            at: LinkTime(10_000),
+            generation: 7,
+            is_durable: true,
+            level: StopLevel::Halt,
+            is_still: true,
+            inside: [StopId::parse("STOP-1").expect("an id")].into(),
+            stage: Stage::Heard,
+            around: Around::People,
+            awaiting: BTreeSet::new(),
+        }
+    }
+
+    fn of(level: StopLevel, heard: Heard) -> Confirmation {
+        confirmation(&stop(level), 7, Some(&heard), LinkTime(10_500))
+    }
+
+    #[test]
+    fn only_a_robot_that_says_it_stands_and_obeys_is_shown_as_standing() {
+        let halt = StopLevel::Halt;
+        assert_eq!(of(halt, standing()), Confirmation::StandstillConfirmed);
+        assert_eq!(of(halt, Heard { is_still: false, ..standing() }), Confirmation::Acked);
+        assert_eq!(of(StopLevel::ControlledStopPosture, standing()), Confirmation::Acked, "not yet in its posture");
+        assert_eq!(of(halt, Heard { level: StopLevel::Slow, ..standing() }), Confirmation::Acked);
+        assert_eq!(of(halt, Heard { generation: 6, ..standing() }), Confirmation::Requested);
+        assert_eq!(of(halt, Heard { inside: BTreeSet::new(), ..standing() }), Confirmation::Outside);
+        assert_eq!(of(StopLevel::Slow, standing()), Confirmation::Acked, "standing is not what was asked for");
+    }
+
+    #[test]
+    fn silence_says_since_when_and_until_when_and_confirms_nothing() {
+        let silent = confirmation(&stop(StopLevel::Halt), 7, Some(&standing()), LinkTime(13_000));
+        let (since, self_stop_by) = (Some(LinkTime(10_000)), Some(LinkTime(16_000)));
+        assert_eq!(silent, Confirmation::Unreachable { since, self_stop_by });
+        let never = Confirmation::Unreachable { since: None, self_stop_by: None };
+        assert_eq!(confirmation(&stop(StopLevel::Halt), 7, None, LinkTime(0)), never);
+        assert!(!silent.is_settled(&stop(StopLevel::Halt)) && !never.is_settled(&stop(StopLevel::Halt)));
+    }
+}
