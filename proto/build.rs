@@ -3,7 +3,7 @@
 use prost::Message;
 use std::path::PathBuf;
 
-const FILES: [&str; 14] = [
+const FILES: [&str; 17] = [
     "midshift/common/v1/common.proto",
     "midshift/task/v1/task.proto",
     "midshift/task/v1/task_service.proto",
@@ -15,6 +15,9 @@ const FILES: [&str; 14] = [
     "midshift/ota/v1/bundle_service.proto",
     "midshift/ota/v1/rollout.proto",
     "midshift/ota/v1/rollout_service.proto",
+    "midshift/stop/v1/stop.proto",
+    "midshift/stop/v1/stop_link_service.proto",
+    "midshift/stop/v1/stop_service.proto",
     "midshift/telemetry/v1/telemetry.proto",
     "midshift/telemetry/v1/telemetry_service.proto",
     "midshift/sim/v1/sim_service.proto",

@@ -2,7 +2,7 @@
 //!
 //! Four independent facts, each with one owner: presence (telemetry), mode (the robot), duty (fleet), software (OTA, later).
 
-use crate::ids::{AttemptId, PlaceId, TaskId, WaypointId};
+use crate::ids::{AttemptId, PlaceId, StopId, TaskId, WaypointId};
 use crate::update::UpdateReport;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -285,8 +285,14 @@ pub struct ReportedState {
     pub attempts: Vec<ReportedAttempt>,
     /// Places it stands in or may enter.
     pub places: Vec<HeldPlace>,
-    /// The stop it obeys.
+    /// The level of stop it obeys, of fleet stops, of silence or of what waits for a resume.
     pub stop_level: StopLevel,
+    /// Fleet stops that are effective, as far as it knows, and that it lies inside of.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub stops: Vec<StopId>,
+    /// Fleet stops and silences that stood it and that nobody has resumed: it does not move before.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub awaiting_resume: Vec<StopId>,
     /// Maker's safety system.
     pub hardware_stop: HardwareStop,
     /// Maker's protective field is violated.

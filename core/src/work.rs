@@ -4,7 +4,7 @@
 //! Written by fleet, composed and sent by telemetry, obeyed by the agent.
 
 use crate::authority::Authority;
-use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, WaypointId};
+use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, StopId, WaypointId};
 use crate::reason::Reason;
 pub use crate::robot::WorkState;
 use crate::robot::{Fault, HardwareStop, HeldPlace, Lane, Load, Mode, Vitals};
@@ -33,6 +33,9 @@ pub struct DesiredWork {
     /// The drain that holds the robot: no work, and its software may change.
     #[serde(default)]
     pub maintenance: Option<DrainId>,
+    /// Stops that people resumed for it, as long as it says that it waits for that. One whose reset it has not heard of waits on.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub resumed: Vec<StopId>,
 }
 
 impl Record for DesiredWork {

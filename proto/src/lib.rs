@@ -45,6 +45,9 @@ packages! {
     /// `midshift.ota.v1`: software of robots.
     #[expect(clippy::allow_attributes, reason = "generated code")]
     ota "midshift.ota.v1";
+    /// `midshift.stop.v1`: fleet stop.
+    #[expect(clippy::allow_attributes, reason = "generated code")]
+    stop "midshift.stop.v1";
     /// `midshift.telemetry.v1`: what robots said.
     #[expect(clippy::allow_attributes, reason = "generated code")]
     telemetry "midshift.telemetry.v1";

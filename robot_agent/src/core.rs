@@ -281,6 +281,8 @@ impl AgentCore {
             places: self.places.held(),
             // Nothing carries a level of stop to a robot yet; a halt of the body here only ends a motion.
             stop_level: StopLevel::None,
+            stops: Vec::new(),
+            awaiting_resume: Vec::new(),
             hardware_stop: self.hardware_stop,
             field_violation: self.body.state(now.site).field_violation,
             fault: self.unfit.as_ref().or(self.standing_fault.as_ref()).cloned(),

@@ -7,6 +7,8 @@
 use crate::workspace::Workspace;
 use crate::{docker, images, run};
 use anyhow::{Context, Result, bail, ensure};
+use std::fs::Permissions;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -178,6 +180,9 @@ fn save(
         let file = to.join(format!("{}-image.tar", image.replace(':', "-")));
         ensure!(run::succeeds(docker().arg("save").arg("-o").arg(&file).arg(image))?, "docker save failed");
         ensure!(run::succeeds(Command::new("gzip").arg("-n").arg(&file))?, "gzip failed");
+        // docker makes it for one user alone; the rest of a release is for everybody.
+        let packed = file.with_extension("tar.gz");
+        std::fs::set_permissions(&packed, Permissions::from_mode(0o644)).context("letting others read an image")?;
     }
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! The part `compose` of the suite: deploy/compose/split.yaml brought up for real by docker-compose on a docker of the suite's own.
+//! The part `compose` of the suite: the stacks of deploy/compose brought up for real by docker-compose on a docker of the suite's own.
 //!
 //! Invariant: the daemon has its files, its socket and its networks apart from any other, is ended by its id, and leaves nothing but what is cached
 //! nowhere. It is not skipped: where docker cannot run the part fails, unless the suite was told `--no-docker`.
@@ -18,6 +18,19 @@ const LOOKS: usize = 300;
 const PACKAGES: [&str; 2] = ["docker.io", "docker-compose"];
 /// Storage of layers: the usual one, and one that works everywhere and copies.
 const DRIVERS: [&str; 2] = ["overlay2", "vfs"];
+
+/// A stack that is brought up.
+struct Stack {
+    file: &'static str,
+    /// Its containers, and how many of them are asked for their health.
+    containers: usize,
+    asked: usize,
+}
+
+const STACKS: [Stack; 2] = [
+    Stack { file: "deploy/compose/one-box.yaml", containers: 2, asked: 1 },
+    Stack { file: "deploy/compose/split.yaml", containers: 11, asked: 8 },
+];
 
 /// The daemon is often where only root looks.
 fn program(name: &str) -> Option<PathBuf> {
@@ -144,7 +157,7 @@ pub fn with_any(temporary: &Path, work: impl FnOnce(&dyn Fn() -> Command) -> Res
     work(&|| daemon.docker())
 }
 
-/// Brings the split stack up, does a task through its proxy, brings it down. Whether all of that was done.
+/// Brings each stack up, does a task through its public address, brings it down. Whether all of that was done.
 pub fn test(workspace: &Workspace, midshift: &Path) -> Result<bool> {
     let missing = missing();
     ensure!(
@@ -154,15 +167,31 @@ pub fn test(workspace: &Workspace, midshift: &Path) -> Result<bool> {
     );
     // Short, since a socket's path may not be longer than 107 bytes.
     let temporary = std::env::temp_dir().join(format!("midshift-docker-{}", std::process::id()));
-    let outcome = Daemon::start(&temporary).and_then(|daemon| stack_of(&daemon, workspace, &temporary, midshift));
+    let outcome = Daemon::start(&temporary).and_then(|daemon| stacks(&daemon, workspace, &temporary, midshift));
     if temporary.exists() {
         std::fs::remove_dir_all(&temporary).with_context(|| format!("removing {}", temporary.display()))?;
     }
     outcome
 }
 
-fn stack_of(daemon: &Daemon, workspace: &Workspace, temporary: &Path, midshift: &Path) -> Result<bool> {
+fn stacks(daemon: &Daemon, workspace: &Workspace, temporary: &Path, midshift: &Path) -> Result<bool> {
     let images = images::make(&|| daemon.docker(), temporary, &workspace.root, midshift)?;
+    for stack in &STACKS {
+        run::say(stack.file);
+        if !works(stack, daemon, workspace, &images, midshift)? {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+fn works(
+    stack: &Stack,
+    daemon: &Daemon,
+    workspace: &Workspace,
+    images: &images::Images,
+    midshift: &Path,
+) -> Result<bool> {
     let held = [(); 2].map(|()| TcpListener::bind("127.0.0.1:0"));
     let mut ports = Vec::new();
     for listener in &held {
@@ -172,19 +201,20 @@ fn stack_of(daemon: &Daemon, workspace: &Workspace, temporary: &Path, midshift: 
     drop(held);
     let compose = |arguments: &[&str]| {
         let mut command = daemon.command("docker-compose");
-        command.arg("-f").arg(workspace.root.join("deploy/compose/split.yaml")).args(arguments);
+        command.arg("-f").arg(workspace.root.join(stack.file)).args(arguments);
         command.env("COMPOSE_PROJECT_NAME", "midshift-suite").env("MIDSHIFT_POSTGRES_PASSWORD", "of-the-suite");
         command.env("MIDSHIFT_IMAGE", images.midshift).env("MIDSHIFT_PROXY_IMAGE", images.proxy);
         command.env("MIDSHIFT_POSTGRES_IMAGE", images.postgresql).env("MIDSHIFT_SITES", workspace.root.join("sites"));
-        command.env("MIDSHIFT_PUBLIC_PORT", ports[0].to_string());
+        // Each stack has its own name for it.
+        command.env("MIDSHIFT_PUBLIC_PORT", ports[0].to_string()).env("MIDSHIFT_ONE_BOX_PORT", ports[0].to_string());
         command.env("MIDSHIFT_ROBOTS_PORT", ports[1].to_string());
         command
     };
     let public = format!("127.0.0.1:{}", ports[0]);
     // It waits for health where the file says so: the robots start last, after the proxy, after everything else.
     let done = run::succeeds(&mut compose(&["up", "-d", "--no-build"]))?
-        && all_healthy(daemon)?
-        && stack::task(workspace, midshift, &public)?;
+        && all_healthy(daemon, stack)?
+        && crate::stack::task(workspace, midshift, &public)?;
     if !done {
         run::succeeds(&mut compose(&["ps"]))?;
         run::succeeds(&mut compose(&["logs", "--no-color", "--tail", "20"]))?;
@@ -193,7 +223,7 @@ fn stack_of(daemon: &Daemon, workspace: &Workspace, temporary: &Path, midshift: 
 }
 
 /// Every container that is asked for its health says that it is healthy, and none of the others ended.
-fn all_healthy(daemon: &Daemon) -> Result<bool> {
+fn all_healthy(daemon: &Daemon, stack: &Stack) -> Result<bool> {
     let mut list = daemon.docker();
     let said = run::output(list.args(["ps", "-a", "--format", "{{.Names}} {{.Status}}"])).context("docker ps")?;
     let (mut up, mut healthy) = (0, 0);
@@ -202,5 +232,5 @@ fn all_healthy(daemon: &Daemon) -> Result<bool> {
         healthy += usize::from(line.ends_with("(healthy)"));
     }
     run::say(&format!("{up} containers are up, {healthy} of them say that they are healthy"));
-    Ok(up == 11 && healthy == 8)
+    Ok(up == stack.containers && healthy == stack.asked)
 }

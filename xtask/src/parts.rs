@@ -38,7 +38,7 @@ pub enum Part {
     Dist,
     /// The split stack as processes: started, a task done through its proxy, ended.
     Stack,
-    /// The split stack by docker-compose on a docker of its own: brought up, a task done through its proxy, brought down.
+    /// Both stacks by docker-compose on a docker of its own: each brought up, a task done through its public address, brought down.
     Compose,
 }
 

@@ -53,6 +53,7 @@ pub fn compose(tx: &mut Tx, robot_id: &RobotId, board: &Board, releases: &Releas
             Some(RobotHolder::Maintenance(drain_id)) => Some(drain_id.clone()),
             _ => None,
         },
+        resumed: Vec::new(),
     };
     let behind = session.applied_work > old.generation;
     if stands.is_some() && new == old && !behind {
@@ -79,6 +80,7 @@ pub fn empty(robot_id: &RobotId) -> DesiredWork {
         resume: None,
         closed: Vec::new(),
         maintenance: None,
+        resumed: Vec::new(),
     }
 }
 

@@ -1,10 +1,11 @@
 //! Enums of core and their numbers on the wire.
 
-use crate::{common, fleet, link, ota, task, telemetry};
+use crate::{common, fleet, link, ota, stop, task, telemetry};
 use midshift_core::fleet::rows::{DrainState, HolderState};
 use midshift_core::robot::{Duty, FaultClass, HardwareStop, Lane, Mode, Presence, StopLevel};
 use midshift_core::rollout::rows::{Outcome, Pause, Phase as RolloutPhase, Step as RolloutStep};
 use midshift_core::rollout::spec::{AbortScope, SmallWave, SmallWaveFailure};
+use midshift_core::stop::ladder::Stage;
 use midshift_core::task::state::Errand;
 use midshift_core::task::{AttemptPhase, Phase, Resolution, Then};
 use midshift_core::update::{Goal, UpdateState};
@@ -55,6 +56,7 @@ wire_enums! {
     Mode = link::v1::Mode { Automatic = Automatic, Manual = Manual, Service = Service }
     StopLevel = link::v1::StopLevel { None = Unspecified, Slow = Slow, Halt = Halt, ControlledStopPosture = ControlledStopPosture }
     HardwareStop = link::v1::HardwareStop { None = Unspecified, Manual = Manual, AutoAck = AutoAck, Remote = Remote }
+    Stage = stop::v1::SilenceStage { Heard = Heard, Slow = Slow, Stand = Stand }
     WorkState = link::v1::WorkState {
         Accepted = Accepted, Refused = Refused, Navigating = Navigating, Executing = Executing, Paused = Paused, Stopping = Stopping,
         Succeeded = Succeeded, Failed = Failed, Aborted = Aborted, Suspended = Suspended, StepUnknown = StepUnknown,

@@ -8,6 +8,7 @@ pub mod fleet;
 pub mod robot;
 pub mod sample;
 pub mod session;
+pub mod stop;
 pub mod task;
 pub mod telemetry;
 pub mod update;

@@ -1,5 +1,6 @@
 //! What a robot says of itself: inventory, heartbeat, vitals, attempts, places.
 
+use super::stop::{names, stop_ids};
 use super::{At, Parse, WireEnum, counted, from_one, id, list, maybe, maybe_id, need, permille, word};
 use crate::link::v1;
 use midshift_core::ids::{AttemptId, PlaceId, Subject, TaskId, WaypointId};
@@ -204,6 +205,8 @@ impl From<&ReportedState> for v1::ReportedState {
             fault: state.fault.as_ref().map(Into::into),
             applied_update: state.applied_update,
             update: state.update.as_ref().map(Into::into),
+            stops: names(&state.stops),
+            awaiting_resume: names(&state.awaiting_resume),
         }
     }
 }
@@ -220,6 +223,8 @@ impl Parse<ReportedState> for v1::ReportedState {
         let hardware_stop = word(self.hardware_stop, at.field("hardware_stop"), bad);
         let fault = maybe(self.fault, at.field("fault"), bad);
         let update = maybe(self.update, at.field("update"), bad);
+        let stops = stop_ids(&self.stops, at.field("stops"), bad);
+        let awaiting_resume = stop_ids(&self.awaiting_resume, at.field("awaiting_resume"), bad);
         let applied_update = counted(self.applied_update, at.field("applied_update"), bad);
         let hb = counted(self.hb, at.field("hb"), bad);
         let session_epoch = counted(self.session_epoch, at.field("session_epoch"), bad);
@@ -238,6 +243,8 @@ impl Parse<ReportedState> for v1::ReportedState {
             attempts: attempts?,
             places: places?,
             stop_level: stop_level?,
+            stops: stops?,
+            awaiting_resume: awaiting_resume?,
             hardware_stop: hardware_stop?,
             field_violation: self.field_violation,
             fault: fault?,

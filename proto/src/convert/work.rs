@@ -1,5 +1,6 @@
 //! Desired state: what goes down to a robot.
 
+use super::stop::{names, stop_ids};
 use super::{
     At, Parse, WireEnum, common, from_one, from_struct, id, list, maybe, maybe_id, need, permille, to_struct, word,
 };
@@ -186,6 +187,7 @@ impl From<&DesiredWork> for v1::DesiredWork {
             resume: work.resume.as_ref().map(Into::into),
             closed: work.closed.iter().map(Into::into).collect(),
             maintenance: work.maintenance.as_ref().map(ToString::to_string).unwrap_or_default(),
+            resumed: names(&work.resumed),
         }
     }
 }
@@ -199,6 +201,7 @@ impl Parse<DesiredWork> for v1::DesiredWork {
         let resume = maybe(self.resume, at.field("resume"), bad);
         let closed = list(self.closed, at.field("closed"), bad);
         let maintenance = maybe_id(&self.maintenance, DrainId::parse, at.field("maintenance"), bad);
+        let resumed = stop_ids(&self.resumed, at.field("resumed"), bad);
         Some(DesiredWork {
             robot_id: robot_id?,
             generation: generation?,
@@ -208,6 +211,7 @@ impl Parse<DesiredWork> for v1::DesiredWork {
             resume: resume?,
             closed: closed?,
             maintenance: maintenance?,
+            resumed: resumed?,
         })
     }
 }

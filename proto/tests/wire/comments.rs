@@ -175,6 +175,8 @@ fn every_service_is_in_the_descriptor_set() {
         "ota.v1.ChunkService",
         "ota.v1.RolloutService",
         "sim.v1.SimService",
+        "stop.v1.StopLinkService",
+        "stop.v1.StopService",
         "task.v1.TaskService",
         "telemetry.v1.TelemetryService",
     ];

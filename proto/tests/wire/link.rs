@@ -1,7 +1,9 @@
 //! The link there and back: what core says is what the other end hears.
 
 use midshift_core::authority::Authority;
-use midshift_core::ids::{AreaId, AttemptId, BundleId, DrainId, PlaceId, RobotId, SetId, Subject, TaskId, WaypointId};
+use midshift_core::ids::{
+    AreaId, AttemptId, BundleId, DrainId, PlaceId, RobotId, SetId, StopId, Subject, TaskId, WaypointId,
+};
 use midshift_core::limits;
 use midshift_core::policy::AreaPolicy;
 use midshift_core::reason::{Code, Reason};
@@ -88,6 +90,8 @@ fn reported() -> ReportedState {
     ReportedState {
         mode: Mode::Service,
         stop_level: StopLevel::ControlledStopPosture,
+        stops: vec![stop_id()],
+        awaiting_resume: vec![stop_id(), stop_id()],
         hardware_stop: HardwareStop::Remote,
         field_violation: true,
         applied_update: 3,
@@ -127,6 +131,10 @@ fn events() -> Vec<RobotEvent> {
         RobotEvent::Update(UpdateEvent::DirectiveRefused { generation: 7, reason: Code::DirectiveRefused.into() }),
         RobotEvent::Update(UpdateEvent::Ready { drain_id: drain(), set: set() }),
     ]
+}
+
+fn stop_id() -> StopId {
+    StopId::parse("STOP-20260601-ABCDEFGHJK").expect("id")
 }
 
 fn drain() -> DrainId {
@@ -216,6 +224,7 @@ fn work() -> DesiredWork {
         resume: Some(authority()),
         closed: vec![attempt(), errand()],
         maintenance: Some(drain()),
+        resumed: vec![stop_id(), stop_id()],
     }
 }
 

@@ -433,6 +433,7 @@ impl Rig {
             resume: None,
             closed: Vec::new(),
             maintenance: None,
+            resumed: Vec::new(),
         }
     }
     /// Sends desired work with the next generation.

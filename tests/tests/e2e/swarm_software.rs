@@ -313,6 +313,7 @@ impl Bench {
             resume: None,
             closed: Vec::new(),
             maintenance: drain_id.filter(|_| !works),
+            resumed: Vec::new(),
         };
         let echo = Some(Echo { hb, clock: ClockSample::default() });
         let down = Downlink { echo, acks, work: Some(work), update: Some(update), ..Downlink::default() };

@@ -62,6 +62,7 @@ fn work() -> DesiredWork {
         resume: None,
         closed: Vec::new(),
         maintenance: None,
+        resumed: Vec::new(),
     }
 }
 

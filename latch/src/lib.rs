@@ -1,0 +1,250 @@
+//! One small file that holds one value, and is whole after every end of its writer, also on a full disk.
+//!
+//! Two slots of fixed size, made and filled when the file is made. A write goes to the slot that does not hold the newest value and is durable when it
+//! returns; whoever reads takes the whole slot with the higher generation. So no write needs a new block, a name or a second file, and a write that is cut
+//! anywhere leaves the value before it. Invariant: one writer at a time, held by a lock on the file; readers beside it need none.
+//! Used by the stop service and by robots for what must not be forgotten: which stops are engaged. Absent on purpose: everything else.
+
+mod slot;
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use slot::Slot;
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io;
+use std::os::unix::fs::{FileExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+
+/// What keeps a value from being kept or read.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The disk says no.
+    #[error("{doing} {path}: {source}", path = path.display())]
+    Io {
+        /// What was being done.
+        doing: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
+    /// Neither slot is whole: something else wrote to it, or the disk lost it.
+    #[error("{path} holds no whole value: move it away and look at it; a copy of it from before can be put in its place", path = path.display())]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+    },
+    /// Its newest value is of a form that this build does not know.
+    #[error("{path} holds what this build does not understand: {source}", path = path.display())]
+    Foreign {
+        /// The file.
+        path: PathBuf,
+        /// What of it.
+        source: serde_json::Error,
+    },
+    /// Another process writes it.
+    #[error("{path} is held by another process", path = path.display())]
+    Held {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The value does not fit a slot.
+    #[error("{bytes} bytes do not fit a slot of {room} bytes")]
+    TooLarge {
+        /// What it takes.
+        bytes: usize,
+        /// What there is.
+        room: usize,
+    },
+}
+
+/// The file, open for writing.
+#[derive(Debug)]
+pub struct LatchFile {
+    path: PathBuf,
+    file: File,
+    room: usize,
+    generation: u64,
+}
+
+impl LatchFile {
+    /// Opens the file for its one writer, with its newest value. A file that is not there is made with `first`, in slots of `room` bytes; one that is there
+    /// keeps the slots it has.
+    pub fn open<T: Serialize + DeserializeOwned>(path: &Path, room: usize, first: T) -> Result<(Self, T), Error> {
+        if !path.exists() {
+            make(path, room, &first)?;
+        }
+        let doing = "opening";
+        let file = OpenOptions::new().read(true).write(true).open(path).map_err(|e| io_error(doing, path, e))?;
+        match file.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => return Err(Error::Held { path: path.to_owned() }),
+            Err(TryLockError::Error(source)) => return Err(io_error("locking", path, source)),
+        }
+        let (room, newest) = newest(&file, path)?;
+        let value = understand(&newest, path)?;
+        Ok((Self { path: path.to_owned(), file, room, generation: newest.generation }, value))
+    }
+
+    /// Keeps a value. Durable when this returns. After an error the file holds this value or the one before it.
+    pub fn write<T: Serialize>(&mut self, value: &T) -> Result<(), Error> {
+        let slot = Slot { generation: self.generation + 1, payload: json(value, &self.path)? };
+        let bytes = slot.encode(self.room)?;
+        let at = slot.generation % 2 * self.room as u64;
+        self.file.write_all_at(&bytes, at).map_err(|e| io_error("writing", &self.path, e))?;
+        self.file.sync_data().map_err(|e| io_error("syncing", &self.path, e))?;
+        self.generation = slot.generation;
+        Ok(())
+    }
+
+    /// Rises with every value that is kept.
+    pub fn generation(&self) -> u64 {
+        self.generation
+    }
+}
+
+/// The newest value and its generation, for whoever only reads. A file in which the writer is at work is read again.
+pub fn read<T: DeserializeOwned>(path: &Path) -> Result<(u64, T), Error> {
+    let file = File::open(path).map_err(|e| io_error("opening", path, e))?;
+    // A writer touches one slot at a time, and the other one is whole.
+    let (_, newest) = newest(&file, path).or_else(|_| newest(&file, path))?;
+    Ok((newest.generation, understand(&newest, path)?))
+}
+
+/// Makes the file whole or not at all: under another name first, which one that was left behind gives way to.
+fn make<T: Serialize>(path: &Path, room: usize, first: &T) -> Result<(), Error> {
+    let part = path.with_extension("part");
+    let failed = |source| io_error("making", path, source);
+    let mut all = Slot { generation: 0, payload: json(first, path)? }.encode(room)?;
+    all.resize(2 * room, 0);
+    let mut options = OpenOptions::new();
+    let file = options.write(true).create(true).truncate(true).mode(0o600).open(&part).map_err(failed)?;
+    file.write_all_at(&all, 0).and_then(|()| file.sync_all()).map_err(failed)?;
+    std::fs::rename(&part, path).map_err(failed)?;
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    File::open(folder).and_then(|folder| folder.sync_all()).map_err(failed)
+}
+
+/// Size of a slot, and the newer whole one.
+fn newest(file: &File, path: &Path) -> Result<(usize, Slot), Error> {
+    let length = file.metadata().map_err(|e| io_error("reading", path, e))?.len();
+    let unreadable = || Error::Unreadable { path: path.to_owned() };
+    let room = usize::try_from(length / 2).map_err(|_| unreadable())?;
+    if length % 2 != 0 || !slot::ROOMS.contains(&room) {
+        return Err(unreadable());
+    }
+    let mut bytes = vec![0; room];
+    let mut whole = Vec::new();
+    for at in [0, room as u64] {
+        file.read_exact_at(&mut bytes, at).map_err(|e| io_error("reading", path, e))?;
+        whole.extend(Slot::decode(&bytes).filter(|slot| slot.generation % 2 * room as u64 == at));
+    }
+    whole.into_iter().max_by_key(|slot| slot.generation).map(|slot| (room, slot)).ok_or_else(unreadable)
+}
+
+fn json<T: Serialize>(value: &T, path: &Path) -> Result<Vec<u8>, Error> {
+    serde_json::to_vec(value).map_err(|e| io_error("writing", path, io::Error::other(e)))
+}
+
+fn understand<T: DeserializeOwned>(slot: &Slot, path: &Path) -> Result<T, Error> {
+    serde_json::from_slice(&slot.payload).map_err(|source| Error::Foreign { path: path.to_owned(), source })
+}
+
+fn io_error(doing: &'static str, path: &Path, source: io::Error) -> Error {
+    Error::Io { doing, path: path.to_owned(), source }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use std::fs;
+
+    const ROOM: usize = 4096;
+
+    fn made(folder: &Path) -> (PathBuf, LatchFile) {
+        let path = folder.join("latch");
+        let (file, first) = LatchFile::open(&path, ROOM, "first".to_owned()).unwrap();
+        assert_eq!(first, "first");
+        (path, file)
+    }
+
+    fn newest(path: &Path) -> Result<String, Error> {
+        read(path).map(|(_, value)| value)
+    }
+
+    #[test]
+    fn what_was_kept_last_is_there_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, mut file) = made(folder.path());
+        for n in 0..5 {
+            file.write(&format!("value {n}")).unwrap();
+            assert_eq!(read::<String>(&path).unwrap(), (n + 1, format!("value {n}")));
+        }
+        drop(file);
+        let (file, value) = LatchFile::open(&path, 2 * ROOM, String::new()).unwrap();
+        assert_eq!((value.as_str(), file.generation()), ("value 4", 5));
+        assert_eq!(fs::metadata(&path).unwrap().len(), 2 * ROOM as u64, "it keeps the slots it has");
+    }
+
+    #[test]
+    fn one_process_writes_at_a_time() {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, _file) = made(folder.path());
+        assert!(matches!(LatchFile::open(&path, ROOM, String::new()), Err(Error::Held { .. })));
+        assert_eq!(newest(&path).unwrap(), "first");
+    }
+
+    #[test]
+    fn a_value_that_does_not_fit_is_refused_and_the_one_before_it_stays() {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, mut file) = made(folder.path());
+        assert!(matches!(file.write(&"x".repeat(ROOM)), Err(Error::TooLarge { room: ROOM, .. })));
+        assert_eq!(newest(&path).unwrap(), "first");
+    }
+
+    #[test]
+    fn a_file_without_a_whole_slot_is_said_to_be_unreadable() {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, file) = made(folder.path());
+        drop(file);
+        for bytes in [vec![], vec![0; 2 * ROOM], vec![7; 2 * ROOM], vec![0; 3], vec![0; 64]] {
+            fs::write(&path, &bytes).unwrap();
+            assert!(matches!(newest(&path), Err(Error::Unreadable { .. })), "{} bytes", bytes.len());
+            assert!(LatchFile::open(&path, ROOM, String::new()).is_err(), "nor is it made anew");
+        }
+    }
+
+    #[test]
+    fn what_was_left_behind_while_it_was_made_gives_way() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join("latch.part"), "half").unwrap();
+        let (path, _file) = made(folder.path());
+        assert_eq!(newest(&path).unwrap(), "first");
+        assert!(!folder.path().join("latch.part").exists());
+    }
+
+    proptest! {
+        /// A write is cut after any number of its bytes, over whatever the slot held.
+        #[test]
+        fn a_write_that_is_cut_anywhere_leaves_the_value_before_it(cut in 0..70_usize, writes in 0..4_u64) {
+            let folder = tempfile::tempdir().unwrap();
+            let (path, mut file) = made(folder.path());
+            for n in 0..writes {
+                file.write(&format!("value {n} {}", "y".repeat(n as usize * 100))).unwrap();
+            }
+            drop(file);
+            let (generation, before) = read::<String>(&path).unwrap();
+            let next = Slot { generation: generation + 1, payload: b"\"the next, somewhat longer value\"".to_vec() };
+            let bytes = next.encode(ROOM).unwrap();
+            let at = next.generation % 2 * ROOM as u64;
+            OpenOptions::new().write(true).open(&path).unwrap().write_all_at(&bytes[..cut.min(bytes.len())], at).unwrap();
+            let found = newest(&path).unwrap();
+            prop_assert!(found == before || found == "the next, somewhat longer value", "{found}");
+            // And the file goes on being written.
+            let (mut file, _) = LatchFile::open(&path, ROOM, String::new()).unwrap();
+            file.write(&"after").unwrap();
+            prop_assert_eq!(newest(&path).unwrap(), "after");
+        }
+    }
+}

@@ -1,0 +1,234 @@
+//! Stops, resets and what a robot says of them.
+
+use super::{At, Parse, WireEnum, counted, id, list, need, text, word};
+use crate::stop::v1;
+use midshift_core::ids::{AreaId, PlaceId, RobotId, StopId};
+use midshift_core::limits;
+use midshift_core::reason::Violations;
+use midshift_core::robot::StopLevel;
+use midshift_core::stop::region::Bounds;
+use midshift_core::stop::{Region, Reset, Scope, Stop};
+use midshift_core::time::Utc;
+
+/// The stop service's mark on a stop, bytes.
+const PROOF_BYTES_MAX: usize = 64;
+/// The name of who engaged or reset one, bytes.
+const ACTOR_BYTES_MAX: usize = 128;
+
+/// Names of stops, as they are written.
+pub fn names<'a>(stop_ids: impl IntoIterator<Item = &'a StopId>) -> Vec<String> {
+    stop_ids.into_iter().map(ToString::to_string).collect()
+}
+
+/// Reads names of stops, at most [`limits::STOPS_MAX`].
+pub(crate) fn stop_ids(names: &[String], at: At<'_>, bad: &mut Violations) -> Option<Vec<StopId>> {
+    if names.len() > limits::STOPS_MAX {
+        bad.add(at.to_string(), format!("must be at most {}", limits::STOPS_MAX));
+        return None;
+    }
+    names.iter().enumerate().map(|(i, name)| id(name, StopId::parse, at.index(i), bad)).collect()
+}
+
+impl From<&Scope> for v1::Scope {
+    fn from(scope: &Scope) -> Self {
+        use v1::scope::Scope as W;
+        let scope = match scope {
+            Scope::Robot(id) => W::RobotId(id.to_string()),
+            Scope::Zone(id) => W::Zone(id.to_string()),
+            Scope::Area(id) => W::AreaId(id.to_string()),
+            Scope::Fleet => W::Fleet(v1::Fleet {}),
+        };
+        Self { scope: Some(scope) }
+    }
+}
+
+impl Parse<Scope> for v1::Scope {
+    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<Scope> {
+        use v1::scope::Scope as W;
+        match self.scope {
+            Some(W::RobotId(robot)) => id(&robot, RobotId::parse, at.field("robot_id"), bad).map(Scope::Robot),
+            Some(W::Zone(zone)) => id(&zone, PlaceId::parse, at.field("zone"), bad).map(Scope::Zone),
+            Some(W::AreaId(area)) => id(&area, AreaId::parse, at.field("area_id"), bad).map(Scope::Area),
+            Some(W::Fleet(v1::Fleet {})) => Some(Scope::Fleet),
+            None => {
+                bad.add(at.to_string(), "is required: a robot, a zone, an area or the fleet");
+                None
+            }
+        }
+    }
+}
+
+impl From<&Bounds> for v1::Box {
+    fn from(b: &Bounds) -> Self {
+        Self { x0_mm: b.x0_mm, y0_mm: b.y0_mm, x1_mm: b.x1_mm, y1_mm: b.y1_mm }
+    }
+}
+
+impl From<&Stop> for v1::Stop {
+    fn from(stop: &Stop) -> Self {
+        Self {
+            stop_id: stop.stop_id.to_string(),
+            scope: Some((&stop.scope).into()),
+            level: stop.level.to_wire(),
+            engaged_unix_ms: stop.engaged.0,
+            actor: stop.actor.clone(),
+            reason: stop.reason.clone(),
+            boxes: stop.region.iter().flat_map(|region| region.boxes().iter().map(Into::into)).collect(),
+            proof: stop.proof.clone(),
+        }
+    }
+}
+
+impl Parse<Stop> for v1::Stop {
+    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<Stop> {
+        let before = bad.0.len();
+        let stop_id = id(&self.stop_id, StopId::parse, at.field("stop_id"), bad);
+        let scope = need(self.scope, at.field("scope"), bad);
+        let level = word(self.level, at.field("level"), bad).filter(|level| {
+            let is_one = *level != StopLevel::None;
+            if !is_one {
+                bad.add(at.field("level").to_string(), "UNSPECIFIED is not a value");
+            }
+            is_one
+        });
+        let lengths = [
+            ("actor", self.actor.len(), ACTOR_BYTES_MAX),
+            ("reason", self.reason.len(), limits::REASON_BYTES_MAX),
+            ("proof", self.proof.len(), PROOF_BYTES_MAX),
+            ("boxes", self.boxes.len(), limits::REGION_BOXES_MAX),
+        ];
+        for (name, length, max) in lengths.into_iter().filter(|(_, length, max)| length > max) {
+            bad.add(at.field(name).to_string(), format!("must be at most {max}, not {length}"));
+        }
+        let boxes =
+            self.boxes.iter().map(|b| Bounds { x0_mm: b.x0_mm, y0_mm: b.y0_mm, x1_mm: b.x1_mm, y1_mm: b.y1_mm });
+        let region = (!self.boxes.is_empty() && bad.0.len() == before).then(|| Region::new(boxes));
+        let stop = Stop {
+            stop_id: stop_id?,
+            scope: scope?,
+            level: level?,
+            engaged: Utc(self.engaged_unix_ms),
+            actor: self.actor,
+            reason: self.reason,
+            region,
+            proof: self.proof,
+        };
+        (bad.0.len() == before).then_some(stop)
+    }
+}
+
+impl From<&Reset> for v1::Reset {
+    fn from(reset: &Reset) -> Self {
+        Self {
+            stop_id: reset.stop_id.to_string(),
+            at_unix_ms: reset.at.0,
+            actor: reset.actor.clone(),
+            reason: reset.reason.clone(),
+        }
+    }
+}
+
+impl Parse<Reset> for v1::Reset {
+    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<Reset> {
+        let stop_id = id(&self.stop_id, StopId::parse, at.field("stop_id"), bad);
+        let actor = text(self.actor, ACTOR_BYTES_MAX, at.field("actor"), bad);
+        let reason = text(self.reason, limits::REASON_BYTES_MAX, at.field("reason"), bad);
+        Some(Reset { stop_id: stop_id?, at: Utc(self.at_unix_ms), actor: actor?, reason: reason? })
+    }
+}
+
+/// What comes down a robot's line.
+#[derive(Clone, Debug, PartialEq)]
+pub enum FromStop {
+    /// Facts to add.
+    Told {
+        /// Engaged.
+        stops: Vec<Stop>,
+        /// Reset.
+        resets: Vec<Reset>,
+        /// State of the latch with them.
+        generation: u64,
+    },
+    /// All that is effective was said.
+    Synced {
+        /// State of the latch.
+        generation: u64,
+    },
+    /// The answer to a check-in.
+    CheckedIn {
+        /// Its number.
+        nonce: u64,
+        /// State of the latch.
+        generation: u64,
+    },
+    /// Dial again before this line closes.
+    MoveOver,
+}
+
+impl Parse<FromStop> for v1::AttendResponse {
+    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<FromStop> {
+        use v1::attend_response::Message as W;
+        match self.message {
+            Some(W::Told(told)) => {
+                let at = at.field("told");
+                let stops = list(told.stops, at.field("stops"), bad);
+                let resets = list(told.resets, at.field("resets"), bad);
+                let generation = counted(told.generation, at.field("generation"), bad);
+                Some(FromStop::Told { stops: stops?, resets: resets?, generation: generation? })
+            }
+            Some(W::Synced(synced)) => {
+                let generation = counted(synced.generation, at.field("synced").field("generation"), bad)?;
+                Some(FromStop::Synced { generation })
+            }
+            Some(W::CheckedIn(answer)) => {
+                let generation = counted(answer.generation, at.field("checked_in").field("generation"), bad)?;
+                Some(FromStop::CheckedIn { nonce: answer.nonce, generation })
+            }
+            Some(W::MoveOver(v1::MoveOver {})) => Some(FromStop::MoveOver),
+            None => {
+                bad.add(at.field("message").to_string(), "is required");
+                None
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::parse;
+
+    fn stop() -> Stop {
+        Stop {
+            stop_id: StopId::parse("STOP-20260601-ABCDEFGHJK").expect("an id"),
+            scope: Scope::Area(AreaId::parse("hall").expect("an id")),
+            level: StopLevel::Halt,
+            engaged: Utc(5),
+            actor: "anna".to_owned(),
+            reason: "a pallet fell".to_owned(),
+            region: Some(Region::of_box(0, 0, 10, 10)),
+            proof: vec![1, 2],
+        }
+    }
+
+    #[test]
+    fn a_stop_and_its_reset_read_back() {
+        assert_eq!(parse::<Stop, _>(v1::Stop::from(&stop())), Ok(stop()));
+        let reset = Reset { stop_id: stop().stop_id, at: Utc(7), actor: "bert".to_owned(), reason: "clear".to_owned() };
+        assert_eq!(parse::<Reset, _>(v1::Reset::from(&reset)), Ok(reset));
+        for scope in [Scope::Fleet, Scope::Robot(RobotId::parse("r1").expect("an id"))] {
+            assert_eq!(parse::<Scope, _>(v1::Scope::from(&scope)), Ok(scope));
+        }
+    }
+
+    #[test]
+    fn a_stop_hears_every_rule_it_breaks() {
+        let wire =
+            v1::Stop { stop_id: "?".to_owned(), scope: None, level: 0, reason: "x".repeat(300), ..(&stop()).into() };
+        let refusal = parse::<Stop, _>(wire).expect_err("it breaks four rules");
+        let said = format!("{refusal:?}");
+        for field in ["stop_id", "scope", "level", "reason"] {
+            assert!(said.contains(field), "{field}: {said}");
+        }
+    }
+}
