@@ -108,6 +108,7 @@ codes! {
     RobotBrokenOff = "ROBOT_BROKEN_OFF", "Three failed attempts in ten minutes took the robot out of dispatch. Look at it, then uncordon it.";
     RobotDraining = "ROBOT_DRAINING", "The robot is taken out of work for maintenance. It gets work again when its drain is released.";
     RobotHeld = "ROBOT_HELD", "A hold token stands on the robot. Resume it.";
+    StopEngaged = "STOP_ENGAGED", "A fleet stop is engaged over the robot, or it waits for a resume after one, or it does not hear the stop service. `midshift stop status` says which.";
     RobotStopped = "ROBOT_STOPPED", "The robot reports a stop of its own safety system.";
     RobotBusy = "ROBOT_BUSY", "The robot has other work.";
     RobotReconciling = "ROBOT_RECONCILING", "The robot's report differs from the record; it gets work once they agree.";
@@ -240,6 +241,7 @@ codes! {
     RobotBreakerOpened = "ROBOT_BREAKER_OPENED", "A robot failed three attempts in ten minutes.";
     PlaceQuarantined = "PLACE_QUARANTINED", "A place is kept closed until the robot inside reports or a person clears it.";
     HoldByPerson = "HOLD_BY_PERSON", "A person asked for a pause.";
+    HoldByStop = "HOLD_BY_STOP", "A fleet stop stopped the robot. Reset it, then resume what it held.";
     HoldByBody = "HOLD_BY_BODY", "The robot's own safety system stopped it.";
 }
 

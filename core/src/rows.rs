@@ -21,11 +21,13 @@ pub enum Writer {
     Telemetry,
     /// Software of robots.
     Ota,
+    /// What follows the stop service and keeps a copy of its stops.
+    Stop,
 }
 
 impl Writer {
     /// All writers.
-    pub const ALL: [Writer; 4] = [Writer::Task, Writer::Fleet, Writer::Telemetry, Writer::Ota];
+    pub const ALL: [Writer; 5] = [Writer::Task, Writer::Fleet, Writer::Telemetry, Writer::Ota, Writer::Stop];
     /// Name in tables and logs.
     pub const fn as_str(self) -> &'static str {
         match self {
@@ -33,6 +35,7 @@ impl Writer {
             Self::Fleet => "fleet",
             Self::Telemetry => "telemetry",
             Self::Ota => "ota",
+            Self::Stop => "stop",
         }
     }
 }
@@ -92,6 +95,7 @@ tables! {
     OtaClock "ota_clock" Ota, "Serving time of ota, and the last number it gave to a drain or permission.";
     OtaCommandKey "ota_command_key" Ota, "request_id -> command about software carried out; kept 7 days.";
     OtaLeader "ota_leader" Ota, "Which process of ota plans and signs; renewed each second where there may be several.";
+    StopRecord "stop_record" Stop, "A copy of one fleet stop and of its reset. id = stop_id, order = when it was engaged.";
 }
 
 impl Table {
@@ -117,11 +121,13 @@ pub enum Log {
     RobotInbox,
     /// `ota_event`.
     Ota,
+    /// `stop_event`.
+    Stop,
 }
 
 impl Log {
     /// All logs.
-    pub const ALL: [Log; 5] = [Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox, Log::Ota];
+    pub const ALL: [Log; 6] = [Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox, Log::Ota, Log::Stop];
     /// Its name in SQL.
     pub const fn name(self) -> &'static str {
         match self {
@@ -130,6 +136,7 @@ impl Log {
             Self::Telemetry => "telemetry_event",
             Self::RobotInbox => "robot_inbox",
             Self::Ota => "ota_event",
+            Self::Stop => "stop_event",
         }
     }
     /// The one service that writes it.
@@ -139,6 +146,7 @@ impl Log {
             Self::Fleet => Writer::Fleet,
             Self::Telemetry | Self::RobotInbox => Writer::Telemetry,
             Self::Ota => Writer::Ota,
+            Self::Stop => Writer::Stop,
         }
     }
     /// The log that row changes of `writer` go to.
@@ -148,6 +156,7 @@ impl Log {
             Writer::Fleet => Self::Fleet,
             Writer::Telemetry => Self::Telemetry,
             Writer::Ota => Self::Ota,
+            Writer::Stop => Self::Stop,
         }
     }
 }

@@ -53,7 +53,7 @@ pub fn compose(tx: &mut Tx, robot_id: &RobotId, board: &Board, releases: &Releas
             Some(RobotHolder::Maintenance(drain_id)) => Some(drain_id.clone()),
             _ => None,
         },
-        resumed: Vec::new(),
+        resumed: tx.view.control.get(robot_id.as_str()).map(|c| c.row.resumed.clone()).unwrap_or_default(),
     };
     let behind = session.applied_work > old.generation;
     if stands.is_some() && new == old && !behind {

@@ -150,7 +150,7 @@ pub fn hardware_stop(tx: &mut Tx, robot_id: &RobotId, stop: HardwareStop) {
 }
 
 /// Every offer writes the robot's control row: one that was planned without the token that has just come is lost.
-fn touch(tx: &mut Tx, robot_id: &RobotId) {
+pub(super) fn touch(tx: &mut Tx, robot_id: &RobotId) {
     let known = tx.view.control.get(robot_id.as_str()).map(|c| c.row.clone());
     tx.put(known.unwrap_or_else(|| RobotControl::new(robot_id.clone())), "robot.held");
 }
@@ -160,7 +160,9 @@ pub fn holds_changed(tx: &mut Tx, robot_id: &RobotId) {
     tx.view.dirty.insert(robot_id.clone());
     let Some(task_id) = tx.view.held_by(robot_id).and_then(|a| a.subject.task_id().cloned()) else { return };
     let Some(task) = tx.view.task(&task_id).cloned() else { return };
-    let why: Reason = Code::HoldByBody.into();
+    let fleet_stop =
+        tx.view.robot_holds(robot_id).all(|h| h.token != stop_token(robot_id) && h.token != resume_token(robot_id));
+    let why: Reason = if fleet_stop { Code::HoldByStop } else { Code::HoldByBody }.into();
     let event = if tasks::is_held(tx, &task) { Event::Hold } else { Event::LastHoldGone };
     let why = (event == Event::Hold).then_some(&why);
     happen(tx, &task_id, News::of(event, why));

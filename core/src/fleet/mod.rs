@@ -26,6 +26,7 @@ pub mod repair;
 pub mod requests;
 pub mod rows;
 pub mod screen;
+pub mod stops;
 pub mod tasks;
 pub mod timers;
 pub mod view;
@@ -104,7 +105,7 @@ impl Plan {
 }
 
 /// Logs that fleet reads.
-pub const LOGS: &[Log] = &[Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox, Log::Ota];
+pub const LOGS: &[Log] = &[Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox, Log::Ota, Log::Stop];
 
 /// Takes entries of the feed, in commit order: rows into the view, requests and robots' events into decisions.
 pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
@@ -275,6 +276,9 @@ pub enum Pace {
 pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Plan) {
     welcome(view, now, board, plan);
     let heard = if pace == Pace::Sweep { sweep(view, now, board, plan) } else { BTreeSet::new() };
+    if pace == Pace::Sweep || view.stops_changed {
+        stops::plan(view, board, now, plan);
+    }
     drain::obey(view, now, plan);
     budget::plan(view, board, now, plan);
     drain::plan(view, board, now, plan);

@@ -136,6 +136,7 @@ fn resume(tx: &mut Tx, resume: &Resume) {
     match resume {
         Resume::Robot(hold) => {
             tx.delete::<HoldToken>(&HoldToken::id_of(&hold.robot_id, &hold.token), "hold.resumed");
+            super::stops::resumed(tx, &hold.robot_id, &hold.token);
             holds_changed(tx, &hold.robot_id);
         }
         Resume::Task(task_id, tokens) => {

@@ -1,7 +1,7 @@
 //! Rows that fleet alone writes, apart from tasks and attempts: places, the robot's mutex, control, timers, holds, counters, marks.
 
 use super::asked::Command;
-use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, RolloutId, SiteId, TaskId};
+use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, RolloutId, SiteId, StopId, TaskId};
 use crate::reason::Reason;
 use crate::robot::Duty;
 use crate::rows::{Index, Record, Seq, Table};
@@ -126,12 +126,24 @@ pub struct RobotControl {
     pub errands: u64,
     /// Tasks given to it so far; breaks ties between equally near robots.
     pub tasks: u64,
+    /// Fleet stops that people resumed for it, oldest first, until it is heard to wait for them no more.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub resumed: Vec<StopId>,
 }
 
 impl RobotControl {
     /// A robot nobody has said anything about.
     pub fn new(robot_id: RobotId) -> Self {
-        Self { robot_id, cordon: None, retired: None, breaker: None, failures: Vec::new(), errands: 0, tasks: 0 }
+        Self {
+            robot_id,
+            cordon: None,
+            retired: None,
+            breaker: None,
+            failures: Vec::new(),
+            errands: 0,
+            tasks: 0,
+            resumed: Vec::new(),
+        }
     }
     /// Whether it gets work.
     pub fn duty(&self) -> Duty {
@@ -222,7 +234,8 @@ impl Record for Timer {
 pub struct HoldToken {
     /// Whose.
     pub robot_id: RobotId,
-    /// `stop:body:<robot>` while the body's own safety system stops it, `resume:body:<robot>` until a person resumes.
+    /// `stop:body:<robot>` while the body's own safety system stops it, `stop:<stop_id>` while a fleet stop does; `resume:` and the same until a person
+    /// resumes.
     pub token: String,
     /// UTC, site clock.
     pub since: Utc,

@@ -31,6 +31,7 @@ pub fn robot(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> Resul
         Presence::Offline | Presence::Updating => return Err(Code::RobotOffline.into()),
     }
     let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
+    super::stops::screen(view, robot_id, Some(live))?;
     decided_by_people(view, robot_id, Some(live))?;
     reported(live)?;
     match view.authority.get(robot_id.as_str()).map(|a| &a.row.holder) {
@@ -78,8 +79,11 @@ pub(super) fn reported(live: &Live) -> Result<(), Reason> {
     if r.mode != Mode::Automatic {
         return Err(Code::RobotManual.into());
     }
-    if r.hardware_stop != HardwareStop::None || r.stop_level >= StopLevel::Halt {
+    if r.hardware_stop != HardwareStop::None {
         return Err(Code::RobotStopped.into());
+    }
+    if r.stop_level >= StopLevel::Halt {
+        return Err(Code::StopEngaged.into());
     }
     match &r.fault {
         Some(fault) if fault.class != FaultClass::Recoverable => {

@@ -15,6 +15,7 @@ use crate::policy::AreaPolicy;
 use crate::rows::{BadRow, Key, Revision, Row, Table, Writer};
 use crate::site::Site;
 use crate::site::route::Router;
+use crate::stop::record::StopRecord;
 use crate::task::{Attempt, Phase, TaskIntake, TaskState};
 use crate::time::{Now, Utc};
 use crate::work::{DesiredPolicy, DesiredWork, LaneMark, PresenceRow, Session};
@@ -99,6 +100,10 @@ pub struct View {
     pub presence: Slot<PresenceRow>,
     /// Durable lane numbers (telemetry's).
     pub lane_marks: Slot<LaneMark>,
+    /// Copies of fleet stops (stop's).
+    pub stops: Slot<StopRecord>,
+    /// A stop was engaged or reset since tokens were last put right.
+    pub stops_changed: bool,
     /// Places a robot holds: robot → place ids.
     pub held_places: BTreeMap<RobotId, BTreeSet<String>>,
     /// Robots whose desired work must be composed again in this cycle.
@@ -197,6 +202,15 @@ impl Viewed<View> for AreaPolicy {
     fn changed(view: &mut View, _id: &str, _old: Option<&Self>) {
         let robots: Vec<RobotId> = view.sessions.values().map(|s| s.row.robot_id.clone()).collect();
         view.policy_dirty.extend(robots);
+    }
+}
+
+impl Viewed<View> for StopRecord {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.stops
+    }
+    fn changed(view: &mut View, _id: &str, _old: Option<&Self>) {
+        view.stops_changed = true;
     }
 }
 
@@ -304,6 +318,7 @@ pub const TABLES: &[Table] = &[
     Table::Session,
     Table::Presence,
     Table::LaneMark,
+    Table::StopRecord,
 ];
 
 impl View {
@@ -340,6 +355,8 @@ impl View {
             sessions: Slot::new(),
             presence: Slot::new(),
             lane_marks: Slot::new(),
+            stops: Slot::new(),
+            stops_changed: false,
             held_places: BTreeMap::new(),
             dirty: BTreeSet::new(),
             policy_dirty: BTreeSet::new(),
@@ -396,6 +413,7 @@ impl View {
             Table::Session => self.take::<Session>(key, revision, row),
             Table::Presence => self.take::<PresenceRow>(key, revision, row),
             Table::LaneMark => self.take::<LaneMark>(key, revision, row),
+            Table::StopRecord => self.take::<StopRecord>(key, revision, row),
             Table::DrainRequest => self.take::<DrainRequest>(key, revision, row),
             Table::DrainRelease => self.take::<DrainRelease>(key, revision, row),
             Table::AreaBudget => self.take::<AreaBudget>(key, revision, row),

@@ -9,12 +9,9 @@ use crate::work::{RoutePoint, StepKind, WorkStep};
 
 /// Places that no route may lead into now.
 pub fn closed(view: &View) -> Blocked {
-    Blocked::new(
-        view.places
-            .values()
-            .filter(|p| p.row.quarantine.is_some())
-            .filter_map(|p| view.site.find_place(&p.row.place_id)),
-    )
+    let quarantined = view.places.values().filter(|p| p.row.quarantine.is_some());
+    let quarantined = quarantined.filter_map(|p| view.site.find_place(&p.row.place_id));
+    Blocked::new(quarantined.chain(super::stops::closed(view)))
 }
 
 /// Goals of the goto steps from `from_step` on, with their step numbers.

@@ -9,6 +9,7 @@
 
 pub mod ladder;
 pub mod latch;
+pub mod record;
 pub mod region;
 pub mod robot;
 pub mod roster;

@@ -175,5 +175,6 @@ pub(crate) fn log_index(log: Log) -> usize {
         Log::Telemetry => 2,
         Log::RobotInbox => 3,
         Log::Ota => 4,
+        Log::Stop => 5,
     }
 }

@@ -88,6 +88,9 @@ pub(crate) const CONTROL: &[Migration] = migrations!["control":
     "0066_fleet_leader",
     "0067_ota_leader",
     "0068_ota_command_key",
+    "0069_stop_record",
+    "0070_stop_event",
+    "0071_stop_event_by_subject",
 ];
 
 /// Of `telemetry.db`.

@@ -11,7 +11,7 @@ use midshift_proto::fleet::v1::fleet_service_server::FleetService;
 use tonic::Request;
 
 /// The verdict's code, and the reason against `r1`.
-async fn why(w: &World, task_id: &str) -> (String, String) {
+pub async fn why(w: &World, task_id: &str) -> (String, String) {
     let ask = v1::ExplainTaskRequest { task_id: task_id.to_owned() };
     let told = w.fleet.explain_task(Request::new(ask)).await.expect("an explanation").into_inner();
     let told = told.explanation.expect("an explanation");

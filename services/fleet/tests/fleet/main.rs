@@ -20,6 +20,7 @@ mod retries;
 mod server;
 mod several_hosts;
 mod stopping;
+mod stops;
 mod twins;
 mod uncertain;
 mod waiting;

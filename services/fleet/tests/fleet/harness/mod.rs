@@ -14,8 +14,9 @@ pub use shaky::Shaky;
 
 use midshift_core::fleet::bugs::Bugs;
 use midshift_core::ids::{RobotId, SiteId, TaskId};
-use midshift_core::rows::{Entry, Expect, Item, Seq, Writer};
+use midshift_core::rows::{Entry, Expect, Item, Record, Seq, Writer};
 use midshift_core::site::{Site, text};
+use midshift_core::stop::record::StopRecord;
 use midshift_core::task::forms::Transport;
 use midshift_core::task::{Ask, Phase, RawTask, TaskIntake, TaskRequest, TaskState};
 use midshift_core::time::{Clock, ScaledClock, Utc};
@@ -302,6 +303,14 @@ impl World {
     pub async fn resume(&mut self, robot: &str) {
         let robot_ids = vec![RobotId::parse(robot).expect("an id")];
         self.ask(Ask::ResumeHeld { stop_id: None, area_id: None, task_ids: Vec::new(), robot_ids }).await;
+    }
+
+    /// The copy of a stop, as it stands now.
+    pub async fn stop(&self, record: &StopRecord) {
+        let known = midshift_store::load::<StopRecord>(&*self.store, &record.id()).await.expect("a store");
+        let mut item = Item::new(Writer::Stop, "tests");
+        item.put(record, known.map_or(Expect::Absent, |(_, revision)| Expect::At(revision)), "stop.copied");
+        self.commit(item).await;
     }
 
     /// Fleet's own rows, as an earlier fleet has left them.

@@ -1,10 +1,11 @@
 //! A scripted robot: obeys its desired state by the rules of the link, one small act a step, unless a test tells it otherwise.
 
 use midshift_core::authority::{Authority, SentHeartbeats};
-use midshift_core::ids::{AttemptId, PlaceId, RobotId, WaypointId};
+use midshift_core::ids::{AttemptId, PlaceId, RobotId, StopId, WaypointId};
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{
-    Fault, HardwareStop, HeldPlace, Inventory, Lane, Load, Mode, ReportedAttempt, ReportedState, Vitals,
+    Fault, HardwareStop, HeldPlace, Inventory, Lane, Load, Mode, Pose, ReportedAttempt, ReportedState, StopLevel,
+    Vitals,
 };
 use midshift_core::site::Site;
 use midshift_core::time::{LinkTime, Now, SiteTime};
@@ -43,6 +44,12 @@ pub struct Robot {
     pub battery_permille: u16,
     pub mode: Mode,
     pub hardware_stop: HardwareStop,
+    /// Where it says it is; none: it does not know.
+    pub pose: Option<Pose>,
+    /// Fleet stops that it obeys.
+    pub stops: Vec<StopId>,
+    /// Fleet stops that stood it and that nobody has resumed.
+    pub awaiting: Vec<StopId>,
     /// A fault that stands.
     pub fault: Option<Fault>,
     pub load: Option<Load>,
@@ -108,6 +115,9 @@ impl Robot {
             battery_permille: 1_000,
             mode: Mode::Automatic,
             hardware_stop: HardwareStop::None,
+            pose: None,
+            stops: Vec::new(),
+            awaiting: Vec::new(),
             fault: None,
             load: None,
             inventory: Inventory {
@@ -170,6 +180,16 @@ impl Robot {
         self.hardware_stop = stop;
         self.paused |= stop != HardwareStop::None;
         self.says(RobotEvent::HardwareStop(stop));
+    }
+    /// It hears of a fleet stop and stands.
+    pub fn stands_for(&mut self, stop_id: &StopId) {
+        self.stops.push(stop_id.clone());
+        self.awaiting.push(stop_id.clone());
+        self.paused = true;
+    }
+    /// It hears of the reset, and stays where it is.
+    pub fn hears_of_the_reset(&mut self, stop_id: &StopId) {
+        self.stops.retain(|id| id != stop_id);
     }
     /// A report about an attempt, whatever the robot itself believes.
     pub fn reports(&mut self, attempt: AttemptId, state: WorkState) {
@@ -250,8 +270,12 @@ impl Robot {
         self.hb += 1;
         self.beaten = Some(now.link);
         self.sent.sent(self.hb, now.link);
-        let vitals =
-            Vitals { waypoint: Some(self.here.clone()), battery_permille: self.battery_permille, ..Vitals::default() };
+        let vitals = Vitals {
+            pose: self.pose,
+            waypoint: Some(self.here.clone()),
+            battery_permille: self.battery_permille,
+            ..Vitals::default()
+        };
         let report = ReportedState {
             hb: self.hb,
             session_epoch: self.session_epoch,
@@ -263,6 +287,9 @@ impl Robot {
             attempts: self.attempts.clone(),
             places: self.places.clone(),
             hardware_stop: self.hardware_stop,
+            stop_level: if self.awaiting.is_empty() { StopLevel::None } else { StopLevel::Halt },
+            stops: self.stops.clone(),
+            awaiting_resume: self.awaiting.clone(),
             fault: self.fault.clone(),
             ..ReportedState::default()
         };
@@ -294,6 +321,7 @@ impl Robot {
 
     fn apply(&mut self, desired: DesiredWork, now: &Now) {
         self.applied = desired.generation;
+        self.awaiting.retain(|id| !desired.resumed.contains(id));
         self.obey_holds(&desired, now);
         self.take_grants(&desired, now);
         self.attempts.retain(|a| !desired.closed.contains(&a.attempt));

@@ -1,0 +1,169 @@
+//! Fleet stops as fleet sees them: hold tokens of robots, from the copy of the stops and from what robots themselves report.
+//!
+//! Either says stopped: stopped. A token `stop:<id>` ends only as `resume:<id>`, and that only by a person. Invariant: nothing here stops a robot, which hears
+//! of its stop by a way of its own; this keeps work from it, and keeps it standing when its stop is over.
+
+use super::inbox::{holds_changed, touch};
+use super::rows::{HoldToken, RobotControl};
+use super::view::View;
+use super::{Board, Plan, Tx, heard};
+use crate::ids::{RobotId, StopId};
+use crate::limits;
+use crate::reason::{Code, Reason};
+use crate::robot::{Presence, StopLevel};
+use crate::site::{PlaceIx, Site};
+use crate::stop::{Scope, Stop};
+use crate::time::Now;
+use crate::work::Live;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// How a stop holds a robot.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Hold {
+    /// It is engaged.
+    Stop,
+    /// It is over, and nobody has resumed the robot.
+    Resume,
+}
+
+impl Hold {
+    fn token(self, stop_id: &StopId) -> String {
+        match self {
+            Self::Stop => format!("stop:{stop_id}"),
+            Self::Resume => format!("resume:{stop_id}"),
+        }
+    }
+    /// Reads a token of a fleet stop; those of the body's own safety system are of another form.
+    fn read(token: &str) -> Option<(StopId, Self)> {
+        let stop = token.strip_prefix("stop:").map(|id| (id, Self::Stop));
+        let (id, hold) = stop.or_else(|| token.strip_prefix("resume:").map(|id| (id, Self::Resume)))?;
+        Some((StopId::parse(id).ok()?, hold))
+    }
+}
+
+/// Stops that stand robots, as they were copied.
+fn standing(view: &View) -> impl Iterator<Item = &Stop> {
+    let effective = view.stops.values().map(|s| &s.row).filter(|record| record.is_effective());
+    effective.map(|record| &record.stop).filter(|stop| stop.level >= StopLevel::Halt)
+}
+
+/// Of these, whom a robot lies inside of.
+fn over<'v>(view: &'v View, robot_id: &'v RobotId, live: Option<&'v Live>) -> impl Iterator<Item = &'v Stop> {
+    let pose = live.and_then(|live| live.report.vitals.pose.as_ref());
+    standing(view).filter(move |stop| stop.includes(robot_id, pose))
+}
+
+/// Whether a stop keeps work from the robot, also before its token is written.
+pub(super) fn screen(view: &View, robot_id: &RobotId, live: Option<&Live>) -> Result<(), Reason> {
+    match over(view, robot_id, live).next() {
+        Some(stop) => Err(Reason::from(Code::StopEngaged).with("stop_id", &stop.stop_id).with("scope", &stop.scope)),
+        None => Ok(()),
+    }
+}
+
+/// Places that lie inside of a stop of a part of the site: nobody is let into them.
+pub(super) fn closed(view: &View) -> BTreeSet<PlaceIx> {
+    let site: &Site = &view.site;
+    let mut closed = BTreeSet::new();
+    for stop in standing(view) {
+        match &stop.scope {
+            Scope::Zone(place_id) => closed.extend(site.find_place(place_id)),
+            Scope::Area(area_id) => {
+                let area = site.find_area(area_id);
+                let places = (0..site.places().len() as u32).map(PlaceIx);
+                closed.extend(places.filter(|ix| {
+                    let at = site.place(*ix).waypoint();
+                    at.is_some_and(|at| Some(site.waypoint(at).area) == area)
+                }));
+            }
+            Scope::Robot(_) | Scope::Fleet => {}
+        }
+    }
+    closed
+}
+
+/// Puts right the tokens of every robot that a stop or its own report concerns.
+pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
+    let all = std::mem::take(&mut view.stops_changed);
+    if !all && view.holds.is_empty() && !board.values().any(|live| is_concerned(live)) {
+        return;
+    }
+    let known: Vec<RobotId> = view.authority.values().map(|a| a.row.robot_id.clone()).collect();
+    for robot_id in known {
+        let live = board.get(&robot_id).cloned();
+        let held = view.robot_holds(&robot_id).next().is_some();
+        let resumed = view.control.get(robot_id.as_str()).is_some_and(|c| !c.row.resumed.is_empty());
+        if all || held || resumed || live.as_deref().is_some_and(is_concerned) {
+            let online = heard::presence(board, &robot_id, &now) == Presence::Online;
+            plan.decide(view, now, "stop", |tx| look(tx, &robot_id, live.as_deref().filter(|_| online)));
+        }
+    }
+}
+
+fn is_concerned(live: &Live) -> bool {
+    !live.report.awaiting_resume.is_empty()
+}
+
+/// Puts one robot's tokens right; `live` only while it is heard.
+fn look(tx: &mut Tx, robot_id: &RobotId, live: Option<&Live>) {
+    let (waits, engaged): (BTreeSet<StopId>, BTreeSet<StopId>) = match live.map(|live| &live.report) {
+        Some(r) => (r.awaiting_resume.iter().cloned().collect(), r.stops.iter().cloned().collect()),
+        None => Default::default(),
+    };
+    let mut stopped: BTreeSet<StopId> = over(tx.view, robot_id, live).map(|stop| stop.stop_id.clone()).collect();
+    stopped.extend(waits.intersection(&engaged).cloned());
+    let tokens: BTreeMap<StopId, Hold> = tx.view.robot_holds(robot_id).filter_map(|h| Hold::read(&h.token)).collect();
+    let control = tx.view.control.get(robot_id.as_str()).map(|c| c.row.clone());
+    let control = control.unwrap_or_else(|| RobotControl::new(robot_id.clone()));
+    let mut wanted = tokens.clone();
+    for stop_id in &stopped {
+        wanted.insert(stop_id.clone(), Hold::Stop);
+    }
+    for (stop_id, hold) in &tokens {
+        // Of a robot that is not heard only the copy tells; what only the robot knew stays.
+        let is_told = live.is_some() || tx.view.stops.contains_key(stop_id.as_str());
+        if *hold == Hold::Stop && !stopped.contains(stop_id) && is_told {
+            wanted.insert(stop_id.clone(), Hold::Resume);
+        }
+    }
+    for stop_id in waits.iter().filter(|id| !control.resumed.contains(id)) {
+        wanted.entry(stop_id.clone()).or_insert(Hold::Resume);
+    }
+    // A robot that is heard and waits no more has taken its resume; one that is stopped again needs another.
+    let keeps = |id: &StopId| !wanted.contains_key(id) && (live.is_none() || waits.contains(id));
+    let resumed: Vec<StopId> = control.resumed.iter().filter(|id| keeps(id)).cloned().collect();
+    if resumed != control.resumed {
+        tx.put(RobotControl { resumed, ..control }, "robot.resumed");
+        tx.view.dirty.insert(robot_id.clone());
+    }
+    if wanted != tokens {
+        write(tx, robot_id, &tokens, &wanted);
+    }
+}
+
+fn write(tx: &mut Tx, robot_id: &RobotId, tokens: &BTreeMap<StopId, Hold>, wanted: &BTreeMap<StopId, Hold>) {
+    let since = tx.now.utc;
+    for (stop_id, hold) in wanted.iter().filter(|(id, hold)| tokens.get(*id) != Some(hold)) {
+        if let Some(old) = tokens.get(stop_id) {
+            tx.delete::<HoldToken>(&HoldToken::id_of(robot_id, &old.token(stop_id)), "hold.replaced");
+        }
+        let fact = if *hold == Hold::Stop { "hold.stopped" } else { "hold.awaits_resume" };
+        tx.put(HoldToken { robot_id: robot_id.clone(), token: hold.token(stop_id), since }, fact);
+    }
+    touch(tx, robot_id);
+    holds_changed(tx, robot_id);
+}
+
+/// A person took a token away: the robot hears which stop it need not wait for any more.
+pub(super) fn resumed(tx: &mut Tx, robot_id: &RobotId, token: &str) {
+    let Some((stop_id, Hold::Resume)) = Hold::read(token) else { return };
+    let known = tx.view.control.get(robot_id.as_str()).map(|c| c.row.clone());
+    let mut control = known.unwrap_or_else(|| RobotControl::new(robot_id.clone()));
+    if !control.resumed.contains(&stop_id) {
+        control.resumed.push(stop_id);
+        // The oldest was for a robot that has not been heard for long: it is resumed once more.
+        let surplus = control.resumed.len().saturating_sub(limits::STOPS_MAX);
+        control.resumed.drain(..surplus);
+        tx.put(control, "robot.resumed");
+    }
+}
