@@ -85,23 +85,17 @@ pub(super) fn closed(view: &View) -> BTreeSet<PlaceIx> {
 /// Puts right the tokens of every robot that a stop or its own report concerns.
 pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
     let all = std::mem::take(&mut view.stops_changed);
-    if !all && view.holds.is_empty() && !board.values().any(|live| is_concerned(live)) {
-        return;
+    let held = view.holds.values().map(|h| &h.row).filter(|h| Hold::read(&h.token).is_some());
+    let resumed = view.control.values().map(|c| &c.row).filter(|c| !c.resumed.is_empty());
+    let waiting = board.iter().filter(|(_, live)| !live.report.awaiting_resume.is_empty());
+    let known = view.authority.values().map(|a| &a.row.robot_id).filter(|_| all);
+    let concerned = held.map(|h| &h.robot_id).chain(resumed.map(|c| &c.robot_id)).chain(waiting.map(|(id, _)| id));
+    let concerned: BTreeSet<RobotId> = concerned.chain(known).cloned().collect();
+    for robot_id in concerned.into_iter().filter(|id| view.sessions.contains_key(id.as_str())).collect::<Vec<_>>() {
+        let online = heard::presence(board, &robot_id, &now) == Presence::Online;
+        let live = board.get(&robot_id).filter(|_| online).cloned();
+        plan.decide(view, now, "stop", |tx| look(tx, &robot_id, live.as_deref()));
     }
-    let known: Vec<RobotId> = view.authority.values().map(|a| a.row.robot_id.clone()).collect();
-    for robot_id in known {
-        let live = board.get(&robot_id).cloned();
-        let held = view.robot_holds(&robot_id).next().is_some();
-        let resumed = view.control.get(robot_id.as_str()).is_some_and(|c| !c.row.resumed.is_empty());
-        if all || held || resumed || live.as_deref().is_some_and(is_concerned) {
-            let online = heard::presence(board, &robot_id, &now) == Presence::Online;
-            plan.decide(view, now, "stop", |tx| look(tx, &robot_id, live.as_deref().filter(|_| online)));
-        }
-    }
-}
-
-fn is_concerned(live: &Live) -> bool {
-    !live.report.awaiting_resume.is_empty()
 }
 
 /// Puts one robot's tokens right; `live` only while it is heard.

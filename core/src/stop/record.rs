@@ -1,8 +1,10 @@
 //! The copy of a stop that services read: written by what follows the stop service, which itself never sees the store.
 
-use super::latch::{Reset, Stop};
-use crate::rows::{Index, Record, Table};
+use super::latch::{Latch, Reset, Stop};
+use crate::ids::StopId;
+use crate::rows::{Expect, Index, Item, Record, Revision, Table, Writer};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// One stop and its reset.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -27,5 +29,124 @@ impl Record for StopRecord {
     }
     fn index(&self) -> Index {
         Index { state: Some(i64::from(self.is_effective())), order: Some(self.stop.engaged.0), ..Index::default() }
+    }
+}
+
+/// What must be written so that the copy has all that the latch knows, each stop by itself. What the latch has lost and was not reset stays: the copy is then the
+/// one place in which it stands.
+pub fn copy(latch: &Latch, copied: &BTreeMap<StopId, (StopRecord, Revision)>) -> Vec<Item> {
+    let mut items = Vec::new();
+    for stop in latch.stops() {
+        let record = StopRecord { stop: stop.clone(), reset: latch.reset_of(&stop.stop_id).cloned() };
+        match copied.get(&stop.stop_id) {
+            None => items.push(write(&record, Expect::Absent)),
+            Some((known, revision)) if *known != record => items.push(write(&record, Expect::At(*revision))),
+            Some(_) => {}
+        }
+    }
+    for (known, revision) in copied.values().filter(|(known, _)| latch.stop(&known.stop.stop_id).is_none()) {
+        match (latch.reset_of(&known.stop.stop_id), &known.reset) {
+            (Some(reset), None) => {
+                let record = StopRecord { reset: Some(reset.clone()), ..known.clone() };
+                items.push(write(&record, Expect::At(*revision)));
+            }
+            // Its reset was long ago, and its name is forgotten everywhere.
+            (None, Some(reset)) => {
+                let mut item = Item::new(Writer::Stop, &reset.actor);
+                item.delete(known.key(), *revision, "stop.forgotten");
+                items.push(item);
+            }
+            (Some(_), Some(_)) | (None, None) => {}
+        }
+    }
+    items
+}
+
+fn write(record: &StopRecord, expect: Expect) -> Item {
+    let (actor, fact) = match &record.reset {
+        Some(reset) => (&reset.actor, "stop.reset"),
+        None => (&record.stop.actor, "stop.engaged"),
+    };
+    let mut item = Item::new(Writer::Stop, actor);
+    item.put(record, expect, fact);
+    item
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::scope::Scope;
+    use super::*;
+    use crate::robot::StopLevel;
+    use crate::time::Utc;
+
+    fn stop(name: &str) -> Stop {
+        Stop {
+            stop_id: StopId::parse(name).expect("an id"),
+            scope: Scope::Fleet,
+            level: StopLevel::Halt,
+            engaged: Utc(1),
+            actor: "anna".to_owned(),
+            reason: String::new(),
+            region: None,
+            proof: Vec::new(),
+        }
+    }
+
+    fn reset(name: &str) -> Reset {
+        let stop_id = StopId::parse(name).expect("an id");
+        Reset { stop_id, at: Utc(2), actor: "bert".to_owned(), reason: "clear".to_owned() }
+    }
+
+    fn latch(stops: &[&str], resets: &[&str]) -> Latch {
+        let mut latch = Latch::default();
+        for name in stops {
+            latch.engage(stop(name));
+        }
+        for name in resets {
+            latch.reset(reset(name));
+        }
+        latch
+    }
+
+    fn copied(records: &[(&str, bool)]) -> BTreeMap<StopId, (StopRecord, Revision)> {
+        let record = |(name, over): &(&str, bool)| {
+            let record = StopRecord { stop: stop(name), reset: over.then(|| reset(name)) };
+            (record.stop.stop_id.clone(), (record, Revision(7)))
+        };
+        records.iter().map(record).collect()
+    }
+
+    /// Each written row with who did it and what it says of the stop.
+    fn said(items: &[Item]) -> Vec<(String, String, Option<bool>)> {
+        let row = |item: &Item| {
+            let change = &item.rows[0];
+            let record = crate::picture::written::<StopRecord>(item);
+            (change.key.id.to_string(), item.actor.to_string(), record.map(|record| record.is_effective()))
+        };
+        items.iter().map(row).collect()
+    }
+
+    #[test]
+    fn what_is_engaged_and_reset_is_copied_once_with_who_did_it() {
+        let known = latch(&["S1", "S2"], &["S2"]);
+        let told =
+            [("S1".to_owned(), "anna".to_owned(), Some(true)), ("S2".to_owned(), "bert".to_owned(), Some(false))];
+        assert_eq!(said(&copy(&known, &BTreeMap::new())), told);
+        assert_eq!(said(&copy(&known, &copied(&[("S1", false), ("S2", false)]))), told[1..]);
+        assert_eq!(said(&copy(&known, &copied(&[("S1", false), ("S2", true)]))), []);
+    }
+
+    #[test]
+    fn a_latch_that_was_lost_takes_no_stop_out_of_the_copy_and_a_reset_by_name_ends_it() {
+        let lost = copied(&[("S1", false)]);
+        assert_eq!(said(&copy(&latch(&[], &[]), &lost)), []);
+        let ended = [("S1".to_owned(), "bert".to_owned(), Some(false))];
+        assert_eq!(said(&copy(&latch(&[], &["S1"]), &lost)), ended);
+    }
+
+    #[test]
+    fn a_stop_that_was_reset_and_forgotten_leaves_the_copy() {
+        let forgotten = [("S1".to_owned(), "bert".to_owned(), None)];
+        assert_eq!(said(&copy(&latch(&[], &[]), &copied(&[("S1", true)]))), forgotten);
     }
 }

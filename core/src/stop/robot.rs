@@ -239,7 +239,9 @@ mod tests {
                 let (mut robot, mut facts) = (before.clone(), facts);
                 let now = at(3_000);
                 match *happens {
-                    Happens::Engaged(n) => drop(robot.told(vec![stop(n, StopLevel::Halt)], vec![])),
+                    Happens::Engaged(n) => {
+                        robot.told(vec![stop(n, StopLevel::Halt)], vec![]);
+                    }
                     Happens::Reset(n) => {
                         robot.told(vec![], vec![reset(n)]);
                         facts[usize::from(n) - 1].1 = true;
@@ -249,7 +251,9 @@ mod tests {
                         let fact = &mut facts[usize::from(n) - 1];
                         fact.2 |= fact.1;
                     }
-                    Happens::ToldAll => drop(robot.told_all(Latch::default())),
+                    Happens::ToldAll => {
+                        robot.told_all(Latch::default());
+                    }
                     Happens::Answered => (1..4).for_each(|s| robot.answered(LinkTime(s * 1000))),
                     Happens::Began => robot = RobotStop::begin(self::robot(), robot.kept().clone(), LinkTime(0)),
                 }

@@ -1,7 +1,7 @@
 //! Fleet stops: who is held, by whose word, until when, and what is kept from them.
 
 use crate::explain::why;
-use crate::harness::{BEGIN, World};
+use crate::harness::{BEGIN, Seen, World};
 use midshift_core::ids::{PlaceId, RobotId, StopId};
 use midshift_core::reason::Code;
 use midshift_core::robot::{Pose, StopLevel};
@@ -58,8 +58,8 @@ async fn a_stop_that_was_copied_holds_a_robot_that_has_not_said_a_word_of_it() {
     resume_all(&mut w).await;
     w.until_phase("T1", Phase::Succeeded).await;
     assert_eq!(w.r("r1").resumed.len(), 1, "by a permission of its own");
-    let seen = w.seen().await;
-    assert!(seen.control("r1").resumed.is_empty() && seen.work("r1").resumed.is_empty(), "it never waited for it");
+    let is_over = |s: &Seen| s.control("r1").resumed.is_empty() && s.work("r1").resumed.is_empty();
+    w.until("it never waited for it", is_over).await;
     w.lawful().await;
 }
 
@@ -87,7 +87,8 @@ async fn while_either_says_stopped_it_is_stopped() {
     let mut w = at_work().await;
     w.stop(&fleet_wide()).await;
     w.r("r1").stands_for(&s1());
-    w.until("it is held", |s| s.tokens("r1") == ["stop:STOP-1"]).await;
+    w.pass(2).await;
+    assert_eq!(w.seen().await.tokens("r1"), ["stop:STOP-1"]);
     w.stop(&reset(fleet_wide())).await;
     w.pass_while(30, "the robot has not heard of the reset", |s| s.tokens("r1") == ["stop:STOP-1"]).await;
     resume_all(&mut w).await;
@@ -128,19 +129,38 @@ async fn nobody_gets_work_while_the_fleet_is_stopped_and_explain_says_so() {
     w.lawful().await;
 }
 
-#[tokio::test(start_paused = true)]
-async fn a_stopped_zone_lets_nobody_in_and_holds_nobody_elsewhere() {
-    let mut w = World::on(CORRIDOR).await;
+/// The corridor is stopped, and nobody is near it.
+fn stopped_corridor(w: &mut World) -> StopRecord {
     let corridor = PlaceId::parse("corridor").expect("a place");
     let region = Region::of_zone(&w.site, &corridor).expect("its boxes");
-    let zone = engaged(Scope::Zone(corridor), StopLevel::Halt, Some(region));
-    w.robot("r1", "park-a").await;
     w.r("r1").pose = Some(Pose { x_mm: 0, y_mm: 3_000, theta_mrad: 0 });
+    engaged(Scope::Zone(corridor), StopLevel::Halt, Some(region))
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_stopped_zone_lets_nobody_in_and_holds_nobody_elsewhere() {
+    let mut w = at_work().await;
+    let zone = stopped_corridor(&mut w);
+    w.pass(2).await;
     w.stop(&zone).await;
-    w.submit("T1", "A", "B").await;
-    w.until_phase("T1", Phase::Running).await;
+    w.r("r1").works = true;
     w.pass_while(120, "the corridor is stopped", |s| s.tokens("r1").is_empty() && !s.has("r1", "corridor")).await;
     assert_eq!(w.seen().await.phase("T1"), Phase::Running);
+    w.stop(&reset(zone)).await;
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn work_beyond_a_stopped_zone_waits_for_its_reset() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    let zone = stopped_corridor(&mut w);
+    w.pass(2).await;
+    w.stop(&zone).await;
+    w.submit("T1", "A", "B").await;
+    w.pass_while(60, "no way leads to B", |s| s.phase("T1") == Phase::Queued).await;
+    assert_eq!(why(&w, "T1").await.1, Code::PlaceBlocked.as_str());
     w.stop(&reset(zone)).await;
     w.until_phase("T1", Phase::Succeeded).await;
     w.lawful().await;
