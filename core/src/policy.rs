@@ -127,6 +127,9 @@ pub struct AreaPolicy {
     pub charge_stop_permille: u16,
     /// Above this a charging robot may be called to work, permille.
     pub charge_preemptible_permille: u16,
+    /// No people walk here, as its site says: a robot bears the silence of the stop service longer. Set by fleet for robots; no person puts it.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub without_people: bool,
     /// What roll-outs of software must keep to.
     #[serde(default)]
     pub software: SoftwareRules,
@@ -143,6 +146,7 @@ impl AreaPolicy {
             charge_opportunistic_permille: 800,
             charge_stop_permille: 900,
             charge_preemptible_permille: 350,
+            without_people: false,
             software: SoftwareRules::default(),
         }
     }

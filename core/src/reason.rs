@@ -108,8 +108,8 @@ codes! {
     RobotBrokenOff = "ROBOT_BROKEN_OFF", "Three failed attempts in ten minutes took the robot out of dispatch. Look at it, then uncordon it.";
     RobotDraining = "ROBOT_DRAINING", "The robot is taken out of work for maintenance. It gets work again when its drain is released.";
     RobotHeld = "ROBOT_HELD", "A hold token stands on the robot. Resume it.";
-    StopEngaged = "STOP_ENGAGED", "A fleet stop is engaged over the robot, or it waits for a resume after one, or it does not hear the stop service. `midshift stop status` says which.";
-    RobotStopped = "ROBOT_STOPPED", "The robot reports a stop of its own safety system.";
+    StopEngaged = "STOP_ENGAGED", "A fleet stop is engaged over the robot. `midshift stop status` says which; reset it, then resume.";
+    RobotStopped = "ROBOT_STOPPED", "The robot reports a stop: of its own safety system, a fleet stop, or because it does not hear the stop service.";
     RobotBusy = "ROBOT_BUSY", "The robot has other work.";
     RobotReconciling = "ROBOT_RECONCILING", "The robot's report differs from the record; it gets work once they agree.";
     RobotObserved = "ROBOT_OBSERVED", "Two sessions claim this robot id. This one is watched and gets no work.";

@@ -7,7 +7,7 @@ use crate::authority::Authority;
 use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, StopId, WaypointId};
 use crate::reason::Reason;
 pub use crate::robot::WorkState;
-use crate::robot::{Fault, HardwareStop, HeldPlace, Lane, Load, Mode, Vitals};
+use crate::robot::{Fault, HardwareStop, HeldPlace, Lane, Load, Mode, StopLevel, Vitals};
 use crate::rows::{Index, Record, Table};
 use crate::update::UpdateEvent;
 use serde::{Deserialize, Serialize};
@@ -271,6 +271,15 @@ pub enum RobotEvent {
         what: String,
         /// Why, for a person.
         detail: String,
+    },
+    /// What it obeys of fleet stops and of their silence changed. A start that nobody stopped says nothing.
+    FleetStop {
+        /// What it obeys now.
+        level: StopLevel,
+        /// Effective stops that it lies inside of.
+        stops: Vec<StopId>,
+        /// What waits for a person's resume.
+        awaiting_resume: Vec<StopId>,
     },
     /// News of its software.
     Update(UpdateEvent),

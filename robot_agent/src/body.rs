@@ -118,6 +118,9 @@ pub trait Body: Send {
     fn resume(&mut self, now: SiteTime);
     /// Brings it to this level of operational stop and drops its order, except for [`StopLevel::Slow`].
     fn stop(&mut self, now: SiteTime, level: StopLevel);
+    /// The level of operational stop that the robot obeys from now on; told whenever it changes. What follows of it for its orders the agent says by
+    /// [`Body::pause`], [`Body::stop`] and the speeds of its path; a body that has more to slow down or to show does that here.
+    fn obeys(&mut self, _now: SiteTime, _level: StopLevel) {}
     /// It stands and will not move by itself.
     fn standstill(&self, now: SiteTime) -> bool;
     /// Takes the posture in which it may stand for long.

@@ -9,6 +9,7 @@ use crate::lanes::{STATUS_SAMPLE_BYTES, Sender};
 use crate::ledger::SessionMemory;
 use crate::places::Places;
 use crate::replay::{Pace, Replayed};
+use crate::stop::{CheckIn, StopNews, Stops};
 use crate::store::{Kept, Op};
 use crate::throttle::Throttle;
 use crate::update::{Done, Job, UpdateConfig, Updater};
@@ -52,6 +53,8 @@ pub enum Input {
     Persisted(u64),
     /// What came of the job under way.
     Done(Box<Done>),
+    /// The line to the stop service, or the file of stops, says something.
+    Stop(Box<StopNews>),
     /// What came of the old STATUS under way, in the session of this epoch.
     Replayed(u64, Replayed),
 }
@@ -78,6 +81,12 @@ pub enum Output {
     Replay(Box<StatusReplay>),
     /// Do this beside everything else and say [`Input::Done`]. At most one is under way.
     Job(Box<Job>),
+    /// Say this to the stop service under this number; drop it if there is no line.
+    CheckIn(u64, Box<CheckIn>),
+    /// Make a new line to the stop service: this one does not work.
+    RedialStop(&'static str),
+    /// Keep these stops and say [`StopNews::Kept`] with this number. At most one is under way.
+    KeepStops(u64, Box<midshift_core::stop::robot::Kept>),
     /// Leave the job under way: what it has so far is kept.
     DropJob,
     /// End the process.
@@ -137,6 +146,8 @@ pub struct AgentCore {
     pub(crate) wake_link: Option<LinkTime>,
     pub(crate) wake_site: Option<SiteTime>,
     pub(crate) update: Updater,
+    /// None: it has no line to a stop service, and obeys none.
+    pub(crate) stop: Option<Box<Stops>>,
     pub(crate) authority: LinkDuration,
     session: Option<Session>,
     sender: Sender,
@@ -194,6 +205,7 @@ impl AgentCore {
             last_site: now.site,
             wake_link: None,
             wake_site: None,
+            stop: None,
             authority: limits::AUTHORITY,
             session: None,
             pace: Pace::default(),
@@ -222,9 +234,13 @@ impl AgentCore {
         }
         self.elapse(&now);
         self.take_news(&now);
+        if let Input::Stop(news) = &input {
+            self.hear_stop(&now, StopNews::clone(news));
+        }
+        self.obey(&now);
         match input {
             Input::Start => self.start(&now),
-            Input::Tick | Input::Persisted(_) => {}
+            Input::Tick | Input::Persisted(_) | Input::Stop(_) => {}
             Input::Connected(welcome) => self.connected(&now, welcome),
             Input::Down(down) => {
                 // What the body has just ended is over before the server's word about it is heard.
@@ -242,7 +258,9 @@ impl AgentCore {
                 }
             }
         }
+        self.obey(&now);
         self.advance(&now);
+        self.say_stop(&now, &mut out);
         out.extend(self.pursue_update(&now).map(Output::Exit));
         let beat = self.beat(&now);
         self.write_events(&now);
@@ -255,9 +273,10 @@ impl AgentCore {
     /// When to call again.
     pub fn next_wake(&self, now: &Now) -> Wake {
         let replay = self.pace.next_at(now.link).filter(|_| self.session.is_some() && self.sender.replays_apart());
-        let link = [Some(self.next_beat), self.wake_link, self.throttle.next_at(), replay];
+        let (stop_link, stop_site) = self.stop_wakes();
+        let link = [Some(self.next_beat), self.wake_link, self.throttle.next_at(), replay, stop_link];
         let body = self.body.next_change(now.site);
-        let site = [Some(self.next_status), body, self.times_out_at(now), self.wake_site];
+        let site = [Some(self.next_status), body, self.times_out_at(now), self.wake_site, stop_site];
         Wake {
             link: link.into_iter().flatten().min().unwrap_or(self.next_beat),
             site: site.into_iter().flatten().min(),
@@ -279,10 +298,9 @@ impl AgentCore {
             load: self.body.load(),
             attempts: self.reported_attempts(now),
             places: self.places.held(),
-            // Nothing carries a level of stop to a robot yet; a halt of the body here only ends a motion.
-            stop_level: StopLevel::None,
-            stops: Vec::new(),
-            awaiting_resume: Vec::new(),
+            stop_level: self.stop_level(),
+            stops: self.stops_inside(),
+            awaiting_resume: self.stops_awaiting(),
             hardware_stop: self.hardware_stop,
             field_violation: self.body.state(now.site).field_violation,
             fault: self.unfit.as_ref().or(self.standing_fault.as_ref()).cloned(),

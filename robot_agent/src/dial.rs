@@ -5,6 +5,7 @@
 use async_trait::async_trait;
 use hyper_util::rt::TokioIo;
 use std::io;
+use std::marker::PhantomData;
 use std::pin::Pin;
 use std::task::{Context, Poll};
 use std::time::Duration;
@@ -13,6 +14,7 @@ use tokio::net::TcpStream;
 use tokio::sync::watch;
 use tonic::codec::BufferSettings;
 use tonic::transport::{Channel, Endpoint};
+use tonic_prost::{ProstDecoder, ProstEncoder};
 
 /// Stream window of one robot, bytes: enough for the largest control message.
 const STREAM_WINDOW: u32 = 128 * 1024;
@@ -55,9 +57,32 @@ pub fn bulk_endpoint(uri: &str) -> Result<Endpoint, Error> {
     Ok(endpoint(uri)?.initial_stream_window_size(BULK_WINDOW).initial_connection_window_size(BULK_WINDOW))
 }
 
-/// Buffers of a session's messages.
-pub(crate) fn buffers() -> BufferSettings {
-    BufferSettings::new(CODEC_BYTES, 32 * 1024)
+/// Messages of a line with small first buffers: thousands of robots may live in one process.
+#[derive(Debug)]
+pub(crate) struct SmallCodec<E, D>(PhantomData<(E, D)>);
+
+impl<E, D> Default for SmallCodec<E, D> {
+    fn default() -> Self {
+        Self(PhantomData)
+    }
+}
+
+impl<E, D> tonic::codec::Codec for SmallCodec<E, D>
+where
+    E: prost::Message + Send + 'static,
+    D: prost::Message + Default + Send + 'static,
+{
+    type Encode = E;
+    type Decode = D;
+    type Encoder = ProstEncoder<E>;
+    type Decoder = ProstDecoder<D>;
+
+    fn encoder(&mut self) -> Self::Encoder {
+        ProstEncoder::new(BufferSettings::new(CODEC_BYTES, 32 * 1024))
+    }
+    fn decoder(&mut self) -> Self::Decoder {
+        ProstDecoder::new(BufferSettings::new(CODEC_BYTES, 32 * 1024))
+    }
 }
 
 /// TCP, with a network that may be cut.

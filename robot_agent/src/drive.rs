@@ -89,12 +89,12 @@ impl AgentCore {
     }
 
     fn path(&self, order: &Assignment, next: usize, limit: usize) -> Vec<PathPoint> {
-        let policy = &self.kept.ledger.policy;
+        let (policy, stop) = (&self.kept.ledger.policy, self.stop_level());
         let point = |p: &RoutePoint| PathPoint {
             waypoint: p.waypoint.clone(),
             x_mm: p.x_mm,
             y_mm: p.y_mm,
-            speed_mm_s: governor::speed_mm_s(&self.limits, policy, order.speed_limit_mm_s, p),
+            speed_mm_s: governor::speed_mm_s(&self.limits, policy, order.speed_limit_mm_s, stop, p),
             keep_off_mm: governor::keep_off_mm(policy, p),
         };
         order.route[next..=limit].iter().map(point).collect()

@@ -4,18 +4,32 @@
 //! for every path, and again when a policy changes.
 
 use midshift_core::ids::AreaId;
+use midshift_core::limits;
 use midshift_core::policy::AreaPolicy;
+use midshift_core::robot::StopLevel;
 use midshift_core::work::RoutePoint;
 
 use crate::body::BodyLimits;
 
-/// Speed on the way to `point`, millimetres per second: the lowest of maker, area, lane and task, but never below the
+/// Speed on the way to `point`, millimetres per second: the lowest of maker, area, lane, task and stop, but never below the
 /// floor of the body, which must be able to clear a lane.
-pub fn speed_mm_s(body: &BodyLimits, areas: &[AreaPolicy], task_mm_s: Option<u32>, point: &RoutePoint) -> u32 {
+pub fn speed_mm_s(
+    body: &BodyLimits,
+    areas: &[AreaPolicy],
+    task_mm_s: Option<u32>,
+    stop: StopLevel,
+    point: &RoutePoint,
+) -> u32 {
     let area = policy_of(areas, &point.area_id).and_then(|p| p.speed_limit_mm_s);
-    let layers = [area, point.speed_limit_mm_s, task_mm_s];
+    let stop = (stop > StopLevel::None).then_some(limits::STOP_SLOW_MM_S);
+    let layers = [area, point.speed_limit_mm_s, task_mm_s, stop];
     let lowest = layers.into_iter().flatten().fold(body.speed_mm_s, u32::min);
     lowest.max(body.floor_speed_mm_s.min(body.speed_mm_s))
+}
+
+/// The fastest that a stop or a silence of level SLOW lets it go anywhere, millimetres per second.
+pub fn slowed_mm_s(body: &BodyLimits) -> u32 {
+    limits::STOP_SLOW_MM_S.min(body.speed_mm_s).max(body.floor_speed_mm_s.min(body.speed_mm_s))
 }
 
 /// Distance to keep on the way to `point`, millimetres, as its area asks for; none: the body's own.
@@ -47,11 +61,21 @@ mod tests {
             speed_limit_mm_s: Some(1_000),
             area_id: area_id.clone(),
         };
-        assert_eq!(speed_mm_s(&body, &[], None, &point), 1_000);
-        assert_eq!(speed_mm_s(&body, &[], Some(700), &point), 700);
+        assert_eq!(speed_mm_s(&body, &[], None, StopLevel::None, &point), 1_000);
+        assert_eq!(speed_mm_s(&body, &[], Some(700), StopLevel::None, &point), 700);
+        for stop in [StopLevel::Slow, StopLevel::Halt] {
+            assert_eq!(speed_mm_s(&body, &[], Some(700), stop, &point), 300);
+            assert_eq!(slowed_mm_s(&body), 300);
+            let strong = BodyLimits { floor_speed_mm_s: 400, ..body };
+            assert_eq!((speed_mm_s(&strong, &[], None, stop, &point), slowed_mm_s(&strong)), (400, 400));
+        }
         let slow = |v| [AreaPolicy { speed_limit_mm_s: Some(v), ..AreaPolicy::default_of(area_id.clone()) }];
-        assert_eq!(speed_mm_s(&body, &slow(300), Some(700), &point), 300);
-        assert_eq!(speed_mm_s(&body, &slow(60), None, &point), 100);
-        assert_eq!(speed_mm_s(&body, &slow(5_000), None, &RoutePoint { speed_limit_mm_s: None, ..point }), 1_500);
+        assert_eq!(speed_mm_s(&body, &slow(300), Some(700), StopLevel::None, &point), 300);
+        assert_eq!(speed_mm_s(&body, &slow(200), None, StopLevel::Slow, &point), 200);
+        assert_eq!(speed_mm_s(&body, &slow(60), None, StopLevel::None, &point), 100);
+        assert_eq!(
+            speed_mm_s(&body, &slow(5_000), None, StopLevel::None, &RoutePoint { speed_limit_mm_s: None, ..point }),
+            1_500
+        );
     }
 }

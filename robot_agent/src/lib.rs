@@ -26,6 +26,7 @@ pub mod session;
 pub mod sets;
 pub mod sqlite;
 pub mod starts;
+pub mod stop;
 pub mod store;
 pub mod switch;
 pub mod throttle;

@@ -34,19 +34,22 @@ impl AgentCore {
         }
         let given_back = self.places.desired(&desired.grants, now.link);
         given_back.into_iter().for_each(|e| self.emit(Lane::Event, e));
-        self.mind_hold(now, &desired);
+        let (is_held, resume) = (desired.held, desired.resume);
         self.mind_maintenance(desired.maintenance.clone());
         let assignment = desired.assignment.clone();
         self.desired = Some(desired);
+        self.obey(now);
+        self.mind_hold(now, is_held, resume);
         self.on_assignment(now, assignment);
     }
 
-    fn mind_hold(&mut self, now: &Now, desired: &DesiredWork) {
+    /// A permission to go on counts while nothing stops the robot; it is looked at again when the stop is over.
+    pub(crate) fn mind_hold(&mut self, now: &Now, is_held: bool, resume: Option<Authority>) {
         if self.work.is_none() {
             self.resume_needed = false;
-        } else if desired.held {
+        } else if is_held {
             self.resume_needed = true;
-        } else if let Some(resume) = desired.resume.filter(|_| self.resume_needed)
+        } else if let Some(resume) = resume.filter(|_| self.resume_needed && !self.is_stopped())
             && self.may_act(now, &resume, "resume").is_ok()
         {
             self.resume_needed = false;
@@ -135,6 +138,9 @@ impl AgentCore {
         }
         if self.mode != Mode::Automatic {
             return self.refuse(now, &assignment, Code::NotAutomatic.into());
+        }
+        if self.is_stopped() {
+            return self.refuse(now, &assignment, Reason::from(Code::RobotStopped).with("by", "fleet stop"));
         }
         if self.kept.ledger.maintenance.is_some() || self.changes_software() {
             return self.refuse(now, &assignment, Code::InMaintenance.into());

@@ -9,9 +9,12 @@ use crate::bugs::Bugs;
 use crate::bulk::Bulk;
 use crate::core::{AgentCore, CoreConfig, ExitReason, Input, Output};
 use crate::device::DeviceKey;
-use crate::dial::{self, Dial};
+use crate::dial::{Dial, SmallCodec};
 use crate::replay::Replayed;
 use crate::sets::Holdings;
+use crate::stop::keep::unreadable;
+use crate::stop::line::{Line, Said, StopLine};
+use crate::stop::{CheckIn, StopNews};
 use crate::store::{self, Op, Store};
 use crate::update::io::Worker;
 use crate::update::{Done, Job, UpdateConfig};
@@ -36,7 +39,6 @@ use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
 use tonic::Streaming;
 use tonic::transport::Channel;
-use tonic_prost::{ProstDecoder, ProstEncoder};
 
 /// What one agent is told at its start.
 pub struct AgentConfig {
@@ -54,6 +56,8 @@ pub struct AgentConfig {
     pub update: Option<Updates>,
     /// Called with each heartbeat's period, whether or not there is a session: tells a launcher that the agent lives.
     pub pulse: Option<Box<dyn FnMut() + Send>>,
+    /// Its way to the stop service; none: it has none, and obeys no fleet stop.
+    pub stop: Option<StopLine>,
 }
 
 /// What an agent needs to change its software.
@@ -136,6 +140,7 @@ enum Woken {
     DialNow,
     Greeted(Greeted),
     Down(Option<Box<v1::SessionResponse>>),
+    Stop(Said),
 }
 
 /// One agent.
@@ -144,6 +149,7 @@ pub struct Agent {
     core: AgentCore,
     clock: Arc<dyn Clock>,
     lines: Lines,
+    stop: Option<Line>,
     open: Option<Open>,
     way: Way,
     retry: ExponentialBackoff,
@@ -185,6 +191,13 @@ pub async fn run(
     };
     let mut core = AgentCore::new(core, body, kept, clock.now());
     core.saw(holdings);
+    let mut stop = None;
+    if let Some(line) = config.stop.take() {
+        let now = clock.now();
+        let (line, loaded) = Line::begin(line, unreadable(&config.robot_id, now.wall), config.seed).await;
+        core.obeys_stops(loaded, now.link);
+        stop = Some(line);
+    }
     let agent = Agent {
         retry: retries(config.seed),
         refused: String::new(),
@@ -192,6 +205,7 @@ pub async fn run(
         core,
         clock,
         lines,
+        stop,
         open: None,
         way: Way::Idle,
         store: Some(store),
@@ -256,6 +270,7 @@ impl Agent {
                 Woken::Channel(Err(why)) => self.failed(&why),
                 Woken::Greeted(greeted) => self.greeted(greeted),
                 Woken::Down(message) => self.heard(message),
+                Woken::Stop(said) => self.hear_stop(said),
             }
         }
     }
@@ -272,9 +287,10 @@ impl Agent {
     async fn wait(&mut self, shutdown: &CancellationToken) -> Woken {
         let now = self.clock.now();
         let due = tokio::time::sleep(self.until_due(&now));
-        let Self { committing, working, replaying, way, open, .. } = self;
+        let Self { committing, working, replaying, way, open, stop, .. } = self;
         tokio::select! {
             biased;
+            said = stopping(stop) => Woken::Stop(said),
             (store, done) = ready(committing) => { *committing = None; Woken::Committed(store, done) }
             () = shutdown.cancelled() => Woken::Shutdown,
             (worker, done) = ready(working) => { *working = None; Woken::Worked(worker, Box::new(done)) }
@@ -316,6 +332,9 @@ impl Agent {
                 Output::Persist(batch, ops) => self.persist(batch, ops),
                 Output::Send(message) => self.send(*message),
                 Output::Replay(replay) => self.replay(*replay),
+                Output::CheckIn(nonce, check_in) => self.check_in(nonce, &check_in),
+                Output::RedialStop(why) => self.stop.iter_mut().for_each(|line| line.redial(why)),
+                Output::KeepStops(number, kept) => self.stop.iter_mut().for_each(|line| line.keep(number, &kept)),
                 Output::Job(job) => self.work_on(*job),
                 Output::DropJob => self.leave.cancel(),
                 Output::Exit(reason) => self.exit = Some(reason),
@@ -330,6 +349,22 @@ impl Agent {
             let done = store.commit(&ops).await;
             (store, done)
         }));
+    }
+
+    fn check_in(&mut self, nonce: u64, check_in: &CheckIn) {
+        if self.stop.as_mut().is_some_and(|line| !line.check_in(nonce, check_in)) {
+            self.step(Input::Stop(Box::new(StopNews::LineLost)));
+        }
+    }
+
+    fn hear_stop(&mut self, said: Said) {
+        let Some(line) = &mut self.stop else { return };
+        if matches!(said, Said::DialNow) {
+            return line.dial_now(&self.config.robot_id, &self.config.boot_id, self.core.kept_stops());
+        }
+        if let Some(news) = line.take_in(&self.config.robot_id, said) {
+            self.step(Input::Stop(Box::new(news)));
+        }
     }
 
     fn work_on(&mut self, job: Job) {
@@ -502,7 +537,7 @@ async fn greet(channel: Channel, hello: v1::SessionRequest, clock: Arc<dyn Clock
     }
     let path = tonic::codegen::http::uri::PathAndQuery::from_static(PATH);
     let request = tonic::Request::new(ReceiverStream::new(queue));
-    let mut down = match client.streaming(request, path, SmallCodec).await {
+    let mut down = match client.streaming(request, path, SmallCodec::default()).await {
         Ok(response) => response.into_inner(),
         Err(status) => return failed("session", &status),
     };
@@ -521,27 +556,16 @@ async fn greet(channel: Channel, hello: v1::SessionRequest, clock: Arc<dyn Clock
     }
 }
 
-/// Messages of a session with small first buffers: thousands of robots may live in one process.
-#[derive(Clone, Copy, Debug, Default)]
-struct SmallCodec;
-
-impl tonic::codec::Codec for SmallCodec {
-    type Encode = v1::SessionRequest;
-    type Decode = v1::SessionResponse;
-    type Encoder = ProstEncoder<v1::SessionRequest>;
-    type Decoder = ProstDecoder<v1::SessionResponse>;
-
-    fn encoder(&mut self) -> Self::Encoder {
-        ProstEncoder::new(dial::buffers())
-    }
-    fn decoder(&mut self) -> Self::Decoder {
-        ProstDecoder::new(dial::buffers())
-    }
-}
-
 async fn ready<T>(future: &mut Option<Boxed<T>>) -> T {
     match future {
         Some(future) => future.await,
+        None => pending().await,
+    }
+}
+
+async fn stopping(line: &mut Option<Line>) -> Said {
+    match line {
+        Some(line) => line.next().await,
         None => pending().await,
     }
 }

@@ -45,7 +45,7 @@ pub(crate) enum Pause {
     No,
     /// It finishes what may not be interrupted and drives no further than the next standing place it holds.
     WindDown,
-    /// A person or the maker's safety system has it: it stands at once.
+    /// A person, the maker's safety system or a fleet stop has it: it stands at once.
     Now,
 }
 
@@ -127,7 +127,7 @@ fn timeout(what: &str) -> Fault {
 impl AgentCore {
     /// Whether the robot may go on now.
     pub(crate) fn pause(&self, now: &Now) -> Pause {
-        if self.mode != Mode::Automatic || self.hardware_stop != HardwareStop::None {
+        if self.mode != Mode::Automatic || self.hardware_stop != HardwareStop::None || self.is_stopped() {
             return Pause::Now;
         }
         if self.is_held() || self.suspends() || !self.has_lease(now) { Pause::WindDown } else { Pause::No }
@@ -164,7 +164,7 @@ impl AgentCore {
     pub(crate) fn elapse(&mut self, now: &Now) {
         let passed = now.site.since(self.last_site).as_ms();
         self.last_site = now.site;
-        let held = self.is_held();
+        let held = self.is_held() || self.is_stopped();
         let Some(work) = &mut self.work else { return };
         work.holder.duration_ms += passed;
         if !held && !work.holder.unknown {
@@ -299,6 +299,9 @@ impl AgentCore {
 
     fn advance_once(&mut self, now: &Now) -> bool {
         let pause = self.pause(now);
+        if pause == Pause::No {
+            self.goes_on();
+        }
         self.check_timeouts(now);
         let Some(work) = self.work.as_ref() else { return false };
         if work.ending.is_some() {
@@ -315,7 +318,9 @@ impl AgentCore {
             Doing::Acting => {
                 let may_pause = work.step().is_some_and(|s| s.pause_allowed);
                 let stand = pause == Pause::Now || (pause == Pause::WindDown && may_pause);
-                self.mind_pause(now, stand, stand)
+                // What stood by a stop goes on by permission only, also where it may not be paused.
+                let keep = stand || (pause != Pause::No && self.has_stood());
+                self.mind_pause(now, stand, keep)
             }
             Doing::Charging => self.mind_charge(now),
             Doing::Parking => {
@@ -403,7 +408,7 @@ impl AgentCore {
                     self.interrupt_action(now);
                     return true;
                 }
-                self.mind_pause(now, false, false)
+                self.mind_pause(now, false, pause != Pause::No && self.has_stood())
             }
         }
     }

@@ -83,6 +83,8 @@ pub enum Injected {
     Jam,
     /// No network for this long: the agent goes on, and nothing it says is heard.
     DropNetwork(SiteDuration),
+    /// No way to the stop service for this long: everything else goes on.
+    DropStopLine(SiteDuration),
     /// A person drives for this long.
     Manual(SiteDuration),
     /// The maker's own safety system stops it for this long and ends that by itself.

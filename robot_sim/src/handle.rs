@@ -40,6 +40,10 @@ impl SimHandle {
     pub fn network(&self) -> watch::Receiver<bool> {
         self.lock().network()
     }
+    /// See [`SimBody::stop_network`].
+    pub fn stop_network(&self) -> watch::Receiver<bool> {
+        self.lock().stop_network()
+    }
     /// See [`SimBody::counts`].
     pub fn counts(&self) -> Counts {
         self.lock().counts()
@@ -67,6 +71,9 @@ impl Body for SimHandle {
     }
     fn stop(&mut self, now: SiteTime, level: StopLevel) {
         self.lock().stop(now, level);
+    }
+    fn obeys(&mut self, now: SiteTime, level: StopLevel) {
+        self.lock().obeys(now, level);
     }
     fn standstill(&self, now: SiteTime) -> bool {
         self.lock().standstill(now)

@@ -4,6 +4,7 @@
 //! all it has written. It is what runs are judged by ([`crate::oracle`]).
 
 use midshift_core::ids::{PlaceId, RobotId, TaskId, WaypointId};
+use midshift_core::robot::StopLevel;
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 use std::fs::{File, OpenOptions};
@@ -99,6 +100,23 @@ pub enum Effect {
     Left {
         /// Which.
         place_id: PlaceId,
+    },
+    /// The robot obeys another level of operational stop from now on.
+    Obeys {
+        /// Which.
+        level: StopLevel,
+        /// Millimetres driven so far.
+        odometer_mm: u64,
+    },
+    /// While it obeys a stop that it has to stand by, the robot came to a standstill.
+    Stood {
+        /// Millimetres driven so far: what it drives until it is released, it drives while it is stopped.
+        odometer_mm: u64,
+    },
+    /// While it obeys a stop that it has to stand by, and after it stood, the robot began to move.
+    Moved {
+        /// Millimetres driven so far.
+        odometer_mm: u64,
     },
     /// Software began to run on the robot, however short it lived.
     Ran {

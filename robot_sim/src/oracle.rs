@@ -146,7 +146,8 @@ impl Oracle {
             }
             (Effect::Entered { place_id }, Some(robot)) => self.entered(place_id, robot, entry.utc_ms),
             (Effect::Left { place_id }, Some(robot)) => self.left(place_id, robot, entry.utc_ms),
-            (Effect::Ran { .. }, Some(_)) => {}
+            // What a stop allows is judged by who knows when it was engaged.
+            (Effect::Ran { .. } | Effect::Obeys { .. } | Effect::Stood { .. } | Effect::Moved { .. }, Some(_)) => {}
             (_, None) => self.broke(entry, "done by nobody"),
         }
     }

@@ -17,6 +17,8 @@ use midshift_agent::session::{self, AgentConfig, Lines};
 use midshift_agent::sets;
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::starts::HANG_SECONDS;
+use midshift_agent::stop::keep::{FileStops, KeepStops, MemoryStops, STOP_FILE};
+use midshift_agent::stop::line::StopLine;
 use midshift_agent::store::{self, Store};
 use midshift_agent::trust::Trust;
 use midshift_core::ids::{RobotId, TaskId};
@@ -90,6 +92,8 @@ pub struct SwarmConfig {
     pub dial: DialFor,
     /// The same beside the sessions: for software and old STATUS.
     pub bulk: DialFor,
+    /// The way to the stop service, at its own address; none: they have none, and obey no fleet stop.
+    pub stop: Option<DialFor>,
     /// Where ledgers and rings are kept: in memory, or in `<dir>/<robot_id>/agent.db`.
     pub persistence: Persistence,
     /// Decides the spread of starts and of attempts to connect.
@@ -105,6 +109,13 @@ pub struct SwarmConfig {
 }
 
 impl SwarmConfig {
+    /// With stop lines over TCP to `http://host:port`.
+    #[must_use]
+    pub fn with_stop(self, uri: &str) -> Self {
+        let uri = uri.to_owned();
+        let dial: DialFor = Arc::new(move |_, network| Ok(Arc::new(TcpDial::new(&uri, Some(network))?)));
+        Self { stop: Some(dial), ..self }
+    }
     /// Over TCP to `http://host:port`, all in memory, with a person to whom no load is dear.
     pub fn tcp(hall: Arc<Hall>, clock: Arc<dyn Clock>, uri: &str, seed: u64) -> Self {
         let (link, bulk) = (uri.to_owned(), uri.to_owned());
@@ -113,6 +124,7 @@ impl SwarmConfig {
             clock,
             dial: Arc::new(move |_, network| Ok(Arc::new(TcpDial::new(&link, Some(network))?))),
             bulk: Arc::new(move |_, network| Ok(Arc::new(TcpDial::bulk(&bulk, Some(network))?))),
+            stop: None,
             persistence: Persistence::Memory,
             seed,
             spread: Duration::from_millis(500),
@@ -163,6 +175,7 @@ impl Swarm {
                 crashes: self.crashes.clone(),
                 rng: ChaCha8Rng::seed_from_u64(rng.random()),
                 memory: MemoryStore::new(),
+                stops: MemoryStops::default(),
                 starts_after: Duration::from_micros(rng.random_range(0..=spread_us)),
             };
             agents.spawn(life.run(ending.clone()));
@@ -207,6 +220,7 @@ struct Life {
     crashes: Arc<BTreeMap<RobotId, Notify>>,
     rng: ChaCha8Rng,
     memory: MemoryStore,
+    stops: MemoryStops,
     starts_after: Duration,
 }
 
@@ -327,6 +341,7 @@ impl Life {
         let wall = self.config.clock.now().wall.0;
         Ok(AgentConfig {
             update,
+            stop: self.stop_line()?,
             robot_id,
             boot_id: format!("{wall:x}-{:016x}", self.rng.random::<u64>()),
             new_ring_id: format!("{wall:x}-{:016x}", self.rng.random::<u64>()),
@@ -334,6 +349,20 @@ impl Life {
             bugs: self.config.bugs,
             pulse: launched.map(Launched::pulse),
         })
+    }
+    /// Its way to the stop service, if the swarm has one, and what it keeps of stops: across its crashes, as a disk would.
+    fn stop_line(&self) -> Result<Option<StopLine>, Error> {
+        let Some(dial) = &self.config.stop else { return Ok(None) };
+        let robot_id = self.robot.robot_id();
+        let keep: Box<dyn KeepStops> = match &self.config.persistence {
+            Persistence::Memory => Box::new(self.stops.clone()),
+            Persistence::Dir(dir) => {
+                let dir = dir.join(robot_id.as_str());
+                make_dir(&dir)?;
+                Box::new(FileStops::new(&dir.join(STOP_FILE)))
+            }
+        };
+        Ok(Some(StopLine { dial: dial(robot_id, self.robot.stop_network())?, keep }))
     }
     async fn store(&self) -> Result<Box<dyn Store>, Error> {
         let Persistence::Dir(dir) = &self.config.persistence else { return Ok(Box::new(self.memory.clone())) };

@@ -140,6 +140,10 @@ impl World {
     pub fn leave(&mut self, at: SiteTime, robot: &RobotId, place_id: PlaceId) {
         self.record(at, Some(robot), Effect::Left { place_id });
     }
+    /// A robot stands, moves or obeys otherwise by an operational stop.
+    pub fn stop(&mut self, at: SiteTime, robot: &RobotId, effect: Effect) {
+        self.record(at, Some(robot), effect);
+    }
     /// Software began to run on a robot.
     pub fn run(&mut self, at: SiteTime, robot: &RobotId, version: String) {
         self.record(at, Some(robot), Effect::Ran { version });
@@ -214,6 +218,7 @@ impl World {
             }
             Effect::Shipped { item, waypoint } => take(&mut self.lying, waypoint, item),
             Effect::Entered { .. } | Effect::Left { .. } | Effect::Ran { .. } => {}
+            Effect::Obeys { .. } | Effect::Stood { .. } | Effect::Moved { .. } => {}
         }
     }
 }

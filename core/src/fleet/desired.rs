@@ -12,6 +12,7 @@ use super::{Board, way};
 use crate::authority::Authority;
 use crate::ids::{AttemptId, RobotId};
 use crate::limits;
+use crate::policy::AreaPolicy;
 use crate::task::{Attempt, AttemptPhase, Then};
 
 use crate::work::{Assignment, DesiredPolicy, DesiredWork, GrantedPlace, Live, RoutePoint, WorkState};
@@ -214,7 +215,10 @@ pub fn compose_policy(tx: &mut Tx, robot_id: &RobotId) {
         .site
         .areas()
         .iter()
-        .map(|a| tx.view.policies.get(a.area_id.as_str()).map_or_else(|| a.policy(), |p| p.row.clone()))
+        .map(|a| {
+            let rules = tx.view.policies.get(a.area_id.as_str()).map_or_else(|| a.policy(), |p| p.row.clone());
+            AreaPolicy { without_people: !a.people, ..rules }
+        })
         .collect();
     let old = tx.view.desired_policy.get(robot_id.as_str()).map(|d| d.row.clone());
     if old.as_ref().is_some_and(|o| o.areas == areas) {

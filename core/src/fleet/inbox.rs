@@ -25,6 +25,8 @@ pub fn take(tx: &mut Tx, entry: &InboxEntry, tally: &mut Tally) {
         RobotEvent::StaleAuthority { .. } => tally.stale_authority += 1,
         // The rollout service reads these itself.
         RobotEvent::Update(_) => {}
+        // Its heartbeat says the same, and holds come of that.
+        RobotEvent::FleetStop { .. } => {}
         RobotEvent::Fault { .. } | RobotEvent::Load(_) | RobotEvent::BatteryCritical { .. } => {}
     }
 }

@@ -79,11 +79,8 @@ pub(super) fn reported(live: &Live) -> Result<(), Reason> {
     if r.mode != Mode::Automatic {
         return Err(Code::RobotManual.into());
     }
-    if r.hardware_stop != HardwareStop::None {
+    if r.hardware_stop != HardwareStop::None || r.stop_level >= StopLevel::Halt {
         return Err(Code::RobotStopped.into());
-    }
-    if r.stop_level >= StopLevel::Halt {
-        return Err(Code::StopEngaged.into());
     }
     match &r.fault {
         Some(fault) if fault.class != FaultClass::Recoverable => {

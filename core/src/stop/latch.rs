@@ -158,13 +158,16 @@ impl Latch {
     pub fn forget(&mut self, now: Utc, resets_max: usize) -> bool {
         let old = self.resets.values().filter(|reset| is_past(reset.at, now)).count();
         let surplus = self.resets.len().saturating_sub(resets_max).max(old);
+        if surplus == 0 {
+            return false;
+        }
         let mut by_age: Vec<_> = self.resets.values().map(|reset| (reset.at, reset.stop_id.clone())).collect();
         by_age.sort_unstable();
         for (_, stop_id) in by_age.into_iter().take(surplus) {
             self.resets.remove(&stop_id);
             self.stops.remove(&stop_id);
         }
-        surplus > 0
+        true
     }
 }
 

@@ -6,6 +6,7 @@
 
 use super::ladder::{Around, Ladder, Stage};
 use super::latch::{Latch, Reset, Stop};
+use super::scope::Scope;
 use crate::ids::{RobotId, StopId};
 use crate::limits;
 use crate::robot::{Pose, StopLevel};
@@ -54,6 +55,21 @@ impl RobotStop {
     /// What must survive.
     pub fn kept(&self) -> &Kept {
         &self.kept
+    }
+
+    /// The stop service has said all that is effective since it began.
+    pub fn is_told(&self) -> bool {
+        self.is_told
+    }
+
+    /// When the silence comes further if nothing is answered before. None: it is as far as it gets.
+    pub fn silence_at(&self, around: Around) -> Option<LinkTime> {
+        self.ladder.next_at(around)
+    }
+
+    /// A stop for a part of the site is effective: driving alone may bring the robot into it.
+    pub fn has_parts(&self) -> bool {
+        self.kept.latch.effective().any(|stop| matches!(stop.scope, Scope::Zone(_) | Scope::Area(_)))
     }
 
     /// The stop service has said all that is effective now. Whether anything is new.
@@ -121,7 +137,6 @@ impl RobotStop {
 
 #[cfg(test)]
 mod tests {
-    use super::super::scope::Scope;
     use super::*;
     use crate::time::SiteTime;
     use std::collections::{BTreeMap, VecDeque};

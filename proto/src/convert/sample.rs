@@ -1,5 +1,6 @@
 //! Samples, gaps and events of the lanes. A sample that cannot be read becomes a poison entry: recorded, acknowledged, never looped on.
 
+use super::stop::{names, stop_ids};
 use super::{At, Parse, WireEnum, from_one, id, maybe, need, permille, text, word};
 use crate::link::v1;
 use crate::session::LaneBatch;
@@ -57,6 +58,11 @@ impl From<&RobotEvent> for v1::RobotEvent {
             RobotEvent::StaleAuthority { what, detail } => {
                 W::StaleAuthority(v1::StaleAuthorityReport { what: what.clone(), detail: detail.clone() })
             }
+            RobotEvent::FleetStop { level, stops, awaiting_resume } => W::FleetStop(v1::FleetStopReport {
+                level: level.to_wire(),
+                stops: names(stops),
+                awaiting_resume: names(awaiting_resume),
+            }),
             RobotEvent::Update(event) => W::Update(event.into()),
             RobotEvent::BatteryCritical { battery_permille } => {
                 W::BatteryCritical(v1::BatteryCriticalReport { battery_permille: u32::from(*battery_permille) })
@@ -94,6 +100,13 @@ impl Parse<RobotEvent> for v1::RobotEvent {
             W::StaleAuthority(report) => {
                 let what = text(report.what, 64, at.field("stale_authority").field("what"), bad);
                 Some(RobotEvent::StaleAuthority { what: what?, detail: report.detail })
+            }
+            W::FleetStop(report) => {
+                let at = at.field("fleet_stop");
+                let level = word(report.level, at.field("level"), bad);
+                let stops = stop_ids(&report.stops, at.field("stops"), bad);
+                let awaiting_resume = stop_ids(&report.awaiting_resume, at.field("awaiting_resume"), bad);
+                Some(RobotEvent::FleetStop { level: level?, stops: stops?, awaiting_resume: awaiting_resume? })
             }
             W::Update(news) => news.parse_at(at.field("update"), bad).map(RobotEvent::Update),
             W::BatteryCritical(report) => {

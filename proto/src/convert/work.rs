@@ -226,6 +226,7 @@ impl From<&AreaPolicy> for v1::AreaRules {
             charge_opportunistic_permille: u32::from(policy.charge_opportunistic_permille),
             charge_stop_permille: u32::from(policy.charge_stop_permille),
             charge_preemptible_permille: u32::from(policy.charge_preemptible_permille),
+            without_people: policy.without_people,
         }
     }
 }
@@ -246,6 +247,7 @@ impl Parse<AreaPolicy> for v1::AreaRules {
             charge_opportunistic_permille: opportunistic?,
             charge_stop_permille: stop?,
             charge_preemptible_permille: preemptible?,
+            without_people: self.without_people,
             // What roll-outs keep to is no robot's matter.
             software: SoftwareRules::default(),
         })

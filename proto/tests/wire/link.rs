@@ -127,6 +127,8 @@ fn events() -> Vec<RobotEvent> {
         RobotEvent::Load(Some(Load { task_id: None, item: "box".into() })),
         RobotEvent::StaleAuthority { what: "offer".into(), detail: "late".into() },
         RobotEvent::BatteryCritical { battery_permille: 49 },
+        RobotEvent::FleetStop { level: StopLevel::None, stops: vec![], awaiting_resume: vec![] },
+        RobotEvent::FleetStop { level: StopLevel::Halt, stops: vec![stop_id()], awaiting_resume: vec![stop_id()] },
         RobotEvent::Update(UpdateEvent::Changed(update_report())),
         RobotEvent::Update(UpdateEvent::DirectiveRefused { generation: 7, reason: Code::DirectiveRefused.into() }),
         RobotEvent::Update(UpdateEvent::Ready { drain_id: drain(), set: set() }),
@@ -232,6 +234,7 @@ fn policy() -> DesiredPolicy {
     let hall = AreaPolicy {
         speed_limit_mm_s: Some(800),
         avoidance_distance_mm: Some(1_200),
+        without_people: true,
         ..AreaPolicy::default_of(AreaId::parse("hall").expect("id"))
     };
     DesiredPolicy {

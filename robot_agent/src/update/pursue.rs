@@ -524,7 +524,7 @@ impl AgentCore {
             () if self.work.is_some() => no("attempt"),
             () if self.body.load().is_some() => no("load"),
             () if self.is_in_passage() => no("passage"),
-            () if self.hardware_stop != HardwareStop::None => no("stop"),
+            () if self.hardware_stop != HardwareStop::None || self.is_stopped() => no("stop"),
             () if self.mode != Mode::Automatic => no("mode"),
             () if !self.body.standstill(now.site) => no("motion"),
             () if state.battery_permille < limits::ACTIVATE_BATTERY_PERMILLE => no("battery"),
@@ -559,6 +559,11 @@ impl AgentCore {
         let name = update.set_name()?;
         if holdings.switch.running() == name {
             return Some(ExitReason::Switched);
+        }
+        if self.is_stopped() {
+            // It was stopped before the record was written: the grant was not used.
+            self.move_to(UpdateState::Staged, Some(Reason::from(Code::ActivationBlocked).with("by", "stop")));
+            return None;
         }
         let mut switch = holdings.switch.clone();
         switch.try_out(&name);
@@ -689,7 +694,8 @@ impl AgentCore {
             return None;
         }
         // A task that is held or stopped does not keep the robot from going back; one that goes on does, until it is drained.
-        let works = self.work.is_some() && self.hardware_stop == HardwareStop::None && !self.resume_needed;
+        let stopped = self.hardware_stop != HardwareStop::None || self.is_stopped();
+        let works = self.work.is_some() && !stopped && !self.resume_needed;
         if works || !self.body.standstill(now.site) {
             return None;
         }

@@ -111,6 +111,7 @@ async fn beside_a_download(is_shared: bool) -> Carried {
     let worker = UpdateWorker::new(Box::new(MemorySets::new()), Arc::new(GrpcRemote::new(lines.bulk.clone())));
     let robot_id = RobotId::parse("rbt-01").expect("a name");
     let config = AgentConfig {
+        stop: None,
         update: Some(Updates { config: shop.releases.config(), worker: Box::new(worker) }),
         robot_id: robot_id.clone(),
         boot_id: "boot-1".into(),

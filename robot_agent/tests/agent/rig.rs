@@ -6,11 +6,14 @@ use midshift_agent::bugs::Bugs;
 use midshift_agent::core::{AgentCore, CoreConfig, ExitReason, Input, Output};
 use midshift_agent::memory::MemoryStore;
 use midshift_agent::sets::memory::MemorySets;
+use midshift_agent::stop::keep::Loaded;
+use midshift_agent::stop::{CheckIn, StopNews};
 use midshift_agent::update::io::{UpdateWorker, Worker};
 use midshift_agent::update::{Done, Failure, Job};
 use midshift_core::authority::Authority;
 use midshift_core::ids::{AreaId, AttemptId, PlaceId, RobotId, Subject, TaskId, WaypointId};
 use midshift_core::robot::{Fault, HardwareStop, Inventory, Lane, Load, Mode, Pose, ReportedState, StopLevel};
+use midshift_core::stop::robot::Kept;
 use midshift_core::time::{LinkTime, Now, SiteTime, Utc};
 use midshift_core::update::UpdateState;
 use midshift_core::work::{
@@ -35,6 +38,8 @@ pub struct BodyLog {
     pub waypoint: Option<WaypointId>,
     pub pose: Pose,
     pub load: Option<Load>,
+    /// Levels that it was told, in order.
+    pub levels: Vec<StopLevel>,
     pub mode: Mode,
     pub hardware_stop: HardwareStop,
     pub checked: Checked,
@@ -60,6 +65,7 @@ impl TestBody {
             waypoint: Some(waypoint(name)),
             pose: Pose { x_mm: x_of(name), ..Pose::default() },
             load: None,
+            levels: Vec::new(),
             mode: Mode::Automatic,
             hardware_stop: HardwareStop::None,
             checked: Checked::Unknown,
@@ -137,15 +143,22 @@ impl Body for TestBody {
     fn resume(&mut self, _: SiteTime) {
         self.lock().paused = false;
     }
-    fn stop(&mut self, _: SiteTime, _: StopLevel) {
+    fn obeys(&mut self, _: SiteTime, level: StopLevel) {
+        self.lock().levels.push(level);
+    }
+    fn stop(&mut self, _: SiteTime, level: StopLevel) {
         let mut log = self.lock();
+        if level <= StopLevel::Slow {
+            return;
+        }
         log.stops += 1;
+        log.paused = false;
         log.path.clear();
         log.acting = None;
     }
     fn standstill(&self, _: SiteTime) -> bool {
         let log = self.lock();
-        log.path.is_empty() && log.acting.is_none()
+        log.paused || log.path.is_empty() && log.acting.is_none()
     }
     fn park(&mut self, _: SiteTime) {
         self.lock().parks += 1;
@@ -213,8 +226,25 @@ pub struct Rig {
     pub exit: Option<ExitReason>,
     /// Software that can be changed, and the ends of its jobs.
     pub updates: Option<Updates>,
+    /// The stop service, which is the test, and the robot's file of stops.
+    pub stop: StopDesk,
     generation: u64,
     heard: [u64; 3],
+}
+
+/// The stop service and the file of stops, as the test has them.
+#[derive(Clone, Default)]
+pub struct StopDesk {
+    /// The robot has a stop line.
+    pub is_there: bool,
+    /// What it said, with the numbers.
+    pub check_ins: Vec<(u64, CheckIn)>,
+    /// Why it wants another line.
+    pub redials: Vec<&'static str>,
+    /// Its file refuses every write.
+    pub disk_fails: bool,
+    /// What its file holds.
+    pub kept: Kept,
 }
 
 /// What a robot needs to change its software, and what happens to it on the way.
@@ -281,16 +311,28 @@ impl Rig {
     }
     /// One whose software can be changed.
     pub fn updatable(releases: &Releases) -> Self {
-        Self::new(TestBody::at("A"), MemoryStore::new(), Bugs::default(), Some(Updates::of(releases)), START_MS)
+        Self::updatable_with(releases, StopDesk::default())
+    }
+    /// One with a stop line, if there is one.
+    pub fn updatable_with(releases: &Releases, stop: StopDesk) -> Self {
+        let updates = Some(Updates::of(releases));
+        Self::new(TestBody::at("A"), MemoryStore::new(), Bugs::default(), updates, START_MS, stop)
     }
     pub fn with(body: TestBody, store: MemoryStore, bugs: Bugs) -> Self {
-        Self::new(body, store, bugs, None, START_MS)
+        Self::new(body, store, bugs, None, START_MS, StopDesk::default())
     }
-    fn new(body: TestBody, store: MemoryStore, bugs: Bugs, updates: Option<Updates>, ms: u64) -> Self {
+    /// One that stands at `name` and has a stop line.
+    pub fn stoppable(name: &str, stop: StopDesk) -> Self {
+        Self::new(TestBody::at(name), MemoryStore::new(), Bugs::default(), None, START_MS, stop)
+    }
+    fn new(body: TestBody, store: MemoryStore, bugs: Bugs, updates: Option<Updates>, ms: u64, stop: StopDesk) -> Self {
         let kept = store.load_now("ring-1");
         let update = updates.as_ref().map(|u| u.releases.config());
         let config = CoreConfig { robot_id: RobotId::parse("rbt-01").expect("a name"), bugs, update };
-        let core = AgentCore::new(config, Box::new(body.clone()), kept, now_at(ms));
+        let mut core = AgentCore::new(config, Box::new(body.clone()), kept, now_at(ms));
+        if stop.is_there {
+            core.obeys_stops(Loaded { kept: stop.kept.clone(), is_durable: true }, LinkTime(ms));
+        }
         let mut rig = Self {
             core,
             body,
@@ -306,6 +348,7 @@ impl Rig {
             reported: None,
             exit: None,
             updates,
+            stop,
             generation: 100,
             heard: [0; 3],
         };
@@ -315,7 +358,8 @@ impl Rig {
     /// The process is killed and started again: what was not durable is gone.
     pub fn restart(self) -> Self {
         let updates = self.updates.map(|u| Updates { dark: false, ..u });
-        let mut next = Self::new(self.body, self.store, Bugs::default(), updates, self.ms);
+        let stop = StopDesk { check_ins: Vec::new(), redials: Vec::new(), ..self.stop };
+        let mut next = Self::new(self.body, self.store, Bugs::default(), updates, self.ms, stop);
         next.generation = self.generation;
         next.heard = self.heard;
         next.epoch = self.epoch;
@@ -343,6 +387,15 @@ impl Rig {
                         let done = self.updates.as_ref().filter(|_| happens).map(|u| u.work(Job::clone(&job)));
                         self.updates.iter_mut().for_each(|u| u.jobs.push(Job::clone(&job)));
                         inputs.extend(done.filter(|_| is_heard).map(|done| Input::Done(Box::new(done))));
+                    }
+                    Output::CheckIn(nonce, check_in) => self.stop.check_ins.push((nonce, *check_in)),
+                    Output::RedialStop(why) => self.stop.redials.push(why),
+                    Output::KeepStops(number, kept) => {
+                        let is_durable = !self.stop.disk_fails;
+                        if is_durable {
+                            self.stop.kept = *kept;
+                        }
+                        inputs.push(Input::Stop(Box::new(StopNews::Kept { number, is_durable })));
                     }
                     Output::DropJob => {}
                     Output::Send(message) => self.sent(*message),

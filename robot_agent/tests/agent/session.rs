@@ -193,6 +193,7 @@ impl Bench {
         let server = Server::builder().add_service(desk).add_service(shelf);
         tokio::spawn(server.serve_with_incoming(ReceiverStream::new(incoming)));
         let config = AgentConfig {
+            stop: None,
             update,
             robot_id: RobotId::parse("rbt-01").expect("a name"),
             boot_id: "boot-1".into(),

@@ -11,7 +11,7 @@ mod orders;
 use crate::behaviour::Behaviour;
 use crate::energy::{Effort, Stores};
 use crate::faults::{self, FaultRates, Injected, draw_next, draw_secs};
-use crate::journal::Work;
+use crate::journal::{Effect, Work};
 use crate::motion::Leg;
 use crate::world::{SharedWorld, lock};
 use acts::Act;
@@ -19,7 +19,7 @@ use kept::Keeper;
 pub use kept::{Error, JOURNAL_FILE};
 use midshift_agent::body::{BodyNews, PathPoint};
 use midshift_core::ids::{PlaceId, RobotId, TaskId, WaypointId};
-use midshift_core::robot::{Fault, HardwareStop, Load, Mode};
+use midshift_core::robot::{Fault, HardwareStop, Load, Mode, StopLevel};
 use midshift_core::site::Site;
 use midshift_core::time::{SiteDuration, SiteTime};
 use nalgebra::Isometry2;
@@ -180,6 +180,8 @@ pub struct SimBody {
     phase: Phase,
     paused: bool,
     slow: bool,
+    /// The level of operational stop that its agent obeys, and whether it has stood since that was one to stand by.
+    obeyed: (StopLevel, bool),
     parked: bool,
     charging: bool,
     mode: Mode,
@@ -196,6 +198,9 @@ pub struct SimBody {
     pending_block: Option<SiteDuration>,
     misses_next: u32,
     network: watch::Sender<bool>,
+    /// As `network`, of its stop line alone: that needs both.
+    stop_network: watch::Sender<bool>,
+    stop_dropped_until: Option<SiteTime>,
     drop_at: Option<SiteTime>,
     dropped_until: Option<SiteTime>,
     stopped_until: Option<SiteTime>,
@@ -233,6 +238,7 @@ impl SimBody {
             phase: Phase::Still,
             paused: false,
             slow: false,
+            obeyed: (StopLevel::None, false),
             parked: false,
             charging: false,
             mode: Mode::Automatic,
@@ -249,6 +255,8 @@ impl SimBody {
             pending_block: None,
             misses_next: 0,
             network: watch::Sender::new(true),
+            stop_network: watch::Sender::new(true),
+            stop_dropped_until: None,
             drop_at: draw_next(&mut rng, now, config.faults.silence_per_hour),
             dropped_until: None,
             stopped_until: None,
@@ -271,6 +279,13 @@ impl SimBody {
     /// Whether its network is up, now and whenever it changes.
     pub fn network(&self) -> watch::Receiver<bool> {
         self.network.subscribe()
+    }
+    /// Whether its way to the stop service is up: it falls with its network, and also alone.
+    pub fn stop_network(&self) -> watch::Receiver<bool> {
+        self.stop_network.subscribe()
+    }
+    fn note_network(&self) {
+        self.stop_network.send_replace(*self.network.borrow() && self.stop_dropped_until.is_none());
     }
     /// Faults so far by the maker's code.
     pub fn faults_by_code(&self) -> &BTreeMap<u32, u64> {
@@ -313,6 +328,10 @@ impl SimBody {
             Injected::GripperMissed(times) => self.misses_next = times.max(1),
             Injected::Jam => self.jam(now),
             Injected::DropNetwork(lasts) => self.lose_network(now, lasts),
+            Injected::DropStopLine(lasts) => {
+                self.stop_dropped_until = Some(now + lasts);
+                self.note_network();
+            }
             Injected::Manual(lasts) => self.take_over(now, lasts),
             Injected::HardwareStop(lasts) => self.stop_hard(now, lasts),
             Injected::LowBattery(permille) => {
@@ -375,8 +394,10 @@ impl SimBody {
         while let Some(at) = self.next_event().filter(|at| *at <= now) {
             self.settle(at.max(self.at));
             self.happen(at.max(self.at));
+            self.note_motion(at.max(self.at));
         }
         self.settle(now);
+        self.note_motion(now);
     }
 
     /// The next moment at which something happens by itself.
@@ -392,7 +413,7 @@ impl SimBody {
         };
         let empties = self.stores.lasts(&self.effort(f64::from(self.speed_mm_s(self.at)))).map(|lasts| self.at + lasts);
         let dead = (self.is_empty() && self.broken.is_none()).then_some(self.at);
-        let drops = [self.drop_at, self.dropped_until];
+        let drops = [self.drop_at, self.dropped_until, self.stop_dropped_until];
         let stands = [self.stopped_until, self.manual_at, self.manual_until];
         [phase, empties, dead].into_iter().chain(drops).chain(stands).flatten().min()
     }
@@ -402,6 +423,10 @@ impl SimBody {
         if due(self.dropped_until) {
             self.dropped_until = None;
             self.network.send_replace(true);
+            self.note_network();
+        } else if due(self.stop_dropped_until) {
+            self.stop_dropped_until = None;
+            self.note_network();
         } else if due(self.drop_at) {
             self.drop_at = draw_next(&mut self.rng, now, self.config.faults.silence_per_hour);
             let lasts = draw_secs(&mut self.rng, 2..=20);
@@ -528,6 +553,7 @@ impl SimBody {
         self.counts.silences += 1;
         self.dropped_until = Some(now + lasts);
         self.network.send_replace(false);
+        self.note_network();
     }
     fn stop_hard(&mut self, now: SiteTime, lasts: SiteDuration) {
         self.stopped_until = Some(now + lasts);
@@ -536,6 +562,18 @@ impl SimBody {
             self.hardware_stop = HardwareStop::AutoAck;
             self.news.push_back(BodyNews::HardwareStop(HardwareStop::AutoAck));
         }
+    }
+    /// Its journal says whether it stands or moves under a stop that it has to stand by.
+    fn note_motion(&mut self, now: SiteTime) {
+        let (level, stood) = self.obeyed;
+        let stands = !matches!(self.phase, Phase::Leg { .. });
+        if level < StopLevel::Halt || stands == stood {
+            return;
+        }
+        self.obeyed.1 = stands;
+        let odometer_mm = self.odometer_mm as u64;
+        let effect = if stands { Effect::Stood { odometer_mm } } else { Effect::Moved { odometer_mm } };
+        lock(&self.world).stop(now, &self.config.robot_id, effect);
     }
     /// Whether something other than the world keeps it standing.
     fn is_kept(&self) -> bool {

@@ -2,7 +2,8 @@
 
 use super::{MODEL, Order, Phase, SPEED_FLOOR_MM_S, SPEED_MAX_MM_S, SimBody};
 use crate::faults;
-use crate::journal::Work;
+use crate::journal::{Effect, Work};
+use crate::world::lock;
 use midshift_agent::body::{Body, BodyLimits, BodyNews, BodyOrder, BodyState, Checked, PathPoint};
 use midshift_core::ids::{TaskId, WaypointId};
 use midshift_core::robot::{Fault, HardwareStop, Inventory, Load, Mode, Pose, StopLevel};
@@ -61,6 +62,7 @@ impl Body for SimBody {
             }
         }
         self.go(now);
+        self.note_motion(now);
         Ok(())
     }
     fn pause(&mut self, now: SiteTime) {
@@ -69,22 +71,18 @@ impl Body for SimBody {
             self.halt(now);
             self.paused = true;
         }
+        self.note_motion(now);
     }
     fn resume(&mut self, now: SiteTime) {
         self.advance(now);
         self.paused = false;
         self.go(now);
+        self.note_motion(now);
     }
     fn stop(&mut self, now: SiteTime, level: StopLevel) {
         self.advance(now);
         match level {
-            StopLevel::None | StopLevel::Slow => {
-                self.slow = level == StopLevel::Slow;
-                if matches!(self.phase, Phase::Leg { .. }) {
-                    self.halt(now);
-                    self.go(now);
-                }
-            }
+            StopLevel::None | StopLevel::Slow => self.slow_down(now, level == StopLevel::Slow),
             StopLevel::Halt | StopLevel::ControlledStopPosture => {
                 self.halt(now);
                 if self.order.is_some() {
@@ -93,6 +91,15 @@ impl Body for SimBody {
                 self.parked |= level == StopLevel::ControlledStopPosture;
             }
         }
+        self.note_motion(now);
+    }
+    fn obeys(&mut self, now: SiteTime, level: StopLevel) {
+        self.advance(now);
+        self.slow_down(now, level == StopLevel::Slow);
+        self.obeyed = (level, false);
+        let odometer_mm = self.odometer_mm as u64;
+        lock(&self.world).stop(now, &self.config.robot_id, Effect::Obeys { level, odometer_mm });
+        self.note_motion(now);
     }
     fn standstill(&self, _now: SiteTime) -> bool {
         matches!(self.phase, Phase::Still) && (self.order.is_none() || self.is_kept())
@@ -167,6 +174,14 @@ impl Body for SimBody {
 }
 
 impl SimBody {
+    /// Its joints and wheels go slowly, or as fast as they are asked to again.
+    fn slow_down(&mut self, now: SiteTime, is_slow: bool) {
+        let changes = std::mem::replace(&mut self.slow, is_slow) != is_slow;
+        if changes && matches!(self.phase, Phase::Leg { .. }) {
+            self.halt(now);
+            self.go(now);
+        }
+    }
     /// A path that begins with the beginning of the lane it is on goes on to the end of that lane, not back.
     fn without_passed(&self, mut path: VecDeque<PathPoint>) -> VecDeque<PathPoint> {
         let passed = |path: &VecDeque<PathPoint>| match (&self.lane, path.front(), path.get(1)) {

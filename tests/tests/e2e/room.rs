@@ -69,6 +69,7 @@ impl Room {
         let site = Arc::new(text::parse(CORRIDOR)?);
         let body = SimHandle::new(SimBody::new(config, site, self.world.clone(), self.clock.now().site)?);
         let agent = AgentConfig {
+            stop: None,
             update: None,
             robot_id,
             boot_id: format!("boot-{name}"),

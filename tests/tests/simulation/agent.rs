@@ -117,6 +117,7 @@ impl Agent {
         let updates = self.launched.updates(&self.trust, bulk.clone())?;
         let worker = SlowWorker::new(updates.worker, self.launched.clone(), &robot_id, &self.observer, number);
         let config = AgentConfig {
+            stop: None,
             update: Some(Updates { worker: Box::new(worker), ..updates }),
             robot_id: robot_id.clone(),
             boot_id: format!("boot-{}-{life}", self.robot),

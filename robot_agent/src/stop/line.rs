@@ -1,0 +1,294 @@
+//! The line to the stop service: a connection of its own, dialed again for as long as it takes, and the writes of what must be kept.
+//!
+//! Invariant: it decides nothing. Neither the session nor bulk nor the ledger can hold it up: it shares no connection, no queue and no disk write with them.
+//! Asked to move over it has the next line before it leaves this one. A message that cannot be read ends the line. Called by the shell alone.
+
+use super::keep::{self, KeepStops, Loaded};
+use super::{CheckIn, StopNews};
+use crate::dial::{Dial, SmallCodec};
+use midshift_core::ids::RobotId;
+use midshift_core::limits;
+use midshift_core::stop::Stop;
+use midshift_core::stop::ladder::Stage;
+use midshift_core::stop::robot::Kept;
+use midshift_proto::convert::WireEnum;
+use midshift_proto::convert::parse;
+use midshift_proto::convert::stop::{FromStop, names};
+use midshift_proto::stop::v1;
+use prost::Message;
+use rand::{RngExt, SeedableRng};
+use std::future::{Future, pending};
+use std::ops::Range;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::Streaming;
+
+/// An agent's way to the stop service.
+pub struct StopLine {
+    /// Makes its connections, to the stop service's own address.
+    pub dial: Arc<dyn Dial>,
+    /// Keeps what must not be forgotten.
+    pub keep: Box<dyn KeepStops>,
+}
+
+/// The way the line takes.
+const PATH: &str = "/midshift.stop.v1.StopLinkService/Attend";
+/// Shortest and longest pause between attempts to connect, milliseconds of real time.
+const RETRY_MS: Range<u64> = 200..5_000;
+/// A line that is to move over is made again within this, milliseconds of real time.
+const SOON_MS: Range<u64> = 1..500;
+/// Messages that may wait for the wire: check-ins of three seconds and of their changes. A line that is stuck this long is given up.
+const OUTBOUND: usize = 16;
+/// Bytes of stops that are said first; what does not fit is kept, and obeyed all the same.
+const ATTEND_BYTES_MAX: usize = 48 * 1024;
+
+type Boxed<T> = Pin<Box<dyn Future<Output = T> + Send>>;
+/// The keeper comes back from each write, with its number.
+type Written = (Box<dyn KeepStops>, u64, Result<(), keep::Error>);
+
+/// An open line.
+pub(crate) struct Open {
+    up: mpsc::Sender<v1::AttendRequest>,
+    down: Streaming<v1::AttendResponse>,
+}
+
+/// On the way to a line.
+enum Way {
+    Idle,
+    Waiting(Pin<Box<tokio::time::Sleep>>),
+    Dialing(Boxed<Result<Open, String>>),
+}
+
+/// What the line brings.
+pub(crate) enum Said {
+    /// It is time to dial.
+    DialNow,
+    /// What came of it.
+    Dialed(Result<Open, String>),
+    /// A message; none: the line ended.
+    Heard(Option<Box<v1::AttendResponse>>),
+    /// What came of a write.
+    Kept(Box<dyn KeepStops>, u64, Result<(), keep::Error>),
+}
+
+/// The line of one robot.
+pub(crate) struct Line {
+    dial: Arc<dyn Dial>,
+    rng: rand::rngs::StdRng,
+    open: Option<Open>,
+    way: Way,
+    failures: u32,
+    /// Why there is no line, as the log was told.
+    refused: String,
+    keeper: Option<Box<dyn KeepStops>>,
+    keeping: Option<Boxed<Written>>,
+}
+
+impl Line {
+    /// Reads what was kept, and is ready to dial.
+    pub(crate) async fn begin(line: StopLine, unreadable: Kept, seed: u64) -> (Self, Loaded) {
+        let StopLine { dial, mut keep } = line;
+        let loaded = keep.load(unreadable).await;
+        let line = Self {
+            dial,
+            rng: rand::rngs::StdRng::seed_from_u64(seed ^ 0x7374_6f70),
+            open: None,
+            way: Way::Waiting(Box::pin(tokio::time::sleep(Duration::ZERO))),
+            failures: 0,
+            refused: String::new(),
+            keeper: Some(keep),
+            keeping: None,
+        };
+        (line, loaded)
+    }
+
+    /// What it brings next. May be dropped and called again at any time.
+    pub(crate) async fn next(&mut self) -> Said {
+        let Self { open, way, keeping, .. } = self;
+        tokio::select! {
+            biased;
+            message = heard(open) => Said::Heard(message.map(Box::new)),
+            said = progress(way) => { *way = Way::Idle; said }
+            (keeper, number, done) = written(keeping) => { *keeping = None; Said::Kept(keeper, number, done) }
+        }
+    }
+
+    /// Makes the next line. What it says first is as it is known now.
+    pub(crate) fn dial_now<'a>(&mut self, robot_id: &RobotId, boot_id: &str, stops: impl Iterator<Item = &'a Stop>) {
+        let first = attend(robot_id, boot_id, stops);
+        let opening = open(self.dial.clone(), first);
+        let limit = Duration::from_millis(limits::CHECK_IN_MISSED.as_ms());
+        self.way = Way::Dialing(Box::pin(async move {
+            tokio::time::timeout(limit, opening).await.unwrap_or_else(|_| Err("nobody answers".to_owned()))
+        }));
+    }
+
+    /// What of it the core must hear.
+    pub(crate) fn take_in(&mut self, robot_id: &RobotId, said: Said) -> Option<StopNews> {
+        match said {
+            Said::DialNow => None,
+            Said::Dialed(Ok(open)) => {
+                tracing::info!(%robot_id, "stop line open");
+                self.open = Some(open);
+                // A number that was never used before, in any life of this robot.
+                Some(StopNews::Attended { nonce: self.rng.random::<u64>() ^ rand::random::<u64>() })
+            }
+            Said::Dialed(Err(why)) => {
+                self.tell(robot_id, &why);
+                self.wait_to_dial();
+                None
+            }
+            Said::Heard(None) => self.lost("the line ended"),
+            Said::Heard(Some(message)) => match parse(*message) {
+                Ok(FromStop::Told { stops, resets, generation }) => Some(StopNews::Told { stops, resets, generation }),
+                Ok(FromStop::Synced { generation }) => {
+                    self.failures = 0;
+                    self.refused.clear();
+                    Some(StopNews::Synced { generation })
+                }
+                Ok(FromStop::CheckedIn { nonce, generation }) => Some(StopNews::CheckedIn { nonce, generation }),
+                Ok(FromStop::MoveOver) => {
+                    if matches!(self.way, Way::Idle) {
+                        let pause = self.rng.random_range(SOON_MS);
+                        self.wait(pause);
+                    }
+                    None
+                }
+                Err(refusal) => {
+                    self.tell(robot_id, &format!("a message cannot be read: {refusal}"));
+                    self.lost("a message cannot be read")
+                }
+            },
+            Said::Kept(keeper, number, done) => {
+                self.keeper = Some(keeper);
+                if let Err(error) = &done {
+                    tracing::error!(%robot_id, %error, "stops not kept: they are obeyed all the same");
+                }
+                Some(StopNews::Kept { number, is_durable: done.is_ok() })
+            }
+        }
+    }
+
+    /// Sends a check-in. False: the line was stuck and is given up.
+    pub(crate) fn check_in(&mut self, nonce: u64, check_in: &CheckIn) -> bool {
+        let Some(open) = &self.open else { return true };
+        let wire = v1::AttendRequest {
+            message: Some(v1::attend_request::Message::CheckIn(v1::CheckIn {
+                nonce,
+                generation: check_in.generation,
+                durable: check_in.is_durable,
+                obeys: check_in.obeys.to_wire(),
+                standstill: check_in.is_still,
+                inside: names(&check_in.inside),
+                awaiting_resume: names(&check_in.awaiting_resume),
+                silence: match check_in.silence {
+                    Stage::Heard => v1::SilenceStage::Heard,
+                    Stage::Slow => v1::SilenceStage::Slow,
+                    Stage::Stand => v1::SilenceStage::Stand,
+                } as i32,
+                without_people: check_in.is_without_people,
+            })),
+        };
+        let is_sent = open.up.try_send(wire).is_ok();
+        if !is_sent {
+            self.redial("the way up is stuck");
+        }
+        is_sent
+    }
+
+    /// This line does not work: another one.
+    pub(crate) fn redial(&mut self, why: &str) {
+        tracing::warn!(why, "stop line given up");
+        self.open = None;
+        if matches!(self.way, Way::Idle) {
+            self.wait_to_dial();
+        }
+    }
+
+    /// Writes what must be kept beside everything else.
+    pub(crate) fn keep(&mut self, number: u64, kept: &Kept) {
+        let Some(mut keeper) = self.keeper.take() else { return };
+        let kept = kept.clone();
+        self.keeping = Some(Box::pin(async move {
+            let done = keeper.keep(kept).await;
+            (keeper, number, done)
+        }));
+    }
+
+    fn lost(&mut self, why: &str) -> Option<StopNews> {
+        self.redial(why);
+        Some(StopNews::LineLost)
+    }
+
+    /// Says once why there is no line: it is tried again for as long as it takes.
+    fn tell(&mut self, robot_id: &RobotId, why: &str) {
+        if self.refused != why {
+            tracing::warn!(%robot_id, why, "no stop line");
+            why.clone_into(&mut self.refused);
+        }
+    }
+
+    fn wait_to_dial(&mut self) {
+        let most = (2 * RETRY_MS.start << self.failures.min(8)).min(RETRY_MS.end);
+        self.failures = self.failures.saturating_add(1);
+        let pause = self.rng.random_range(RETRY_MS.start..=most);
+        self.wait(pause);
+    }
+
+    fn wait(&mut self, pause_ms: u64) {
+        self.way = Way::Waiting(Box::pin(tokio::time::sleep(Duration::from_millis(pause_ms))));
+    }
+}
+
+/// Who comes, and what it knows.
+fn attend<'a>(robot_id: &RobotId, boot_id: &str, stops: impl Iterator<Item = &'a Stop>) -> v1::AttendRequest {
+    let mut room = ATTEND_BYTES_MAX;
+    let fitting = stops.take(limits::STOPS_MAX).map(v1::Stop::from).take_while(|stop| {
+        let bytes = stop.encoded_len();
+        let fits = bytes <= room;
+        room = room.saturating_sub(bytes);
+        fits
+    });
+    let attend = v1::Attend { robot_id: robot_id.to_string(), boot_id: boot_id.to_owned(), stops: fitting.collect() };
+    v1::AttendRequest { message: Some(v1::attend_request::Message::Attend(attend)) }
+}
+
+async fn open(dial: Arc<dyn Dial>, first: v1::AttendRequest) -> Result<Open, String> {
+    let channel = dial.dial().await.map_err(|e| e.to_string())?;
+    let (up, queue) = mpsc::channel(OUTBOUND);
+    up.try_send(first).map_err(|e| e.to_string())?;
+    let mut client = tonic::client::Grpc::new(channel);
+    client.ready().await.map_err(|e| e.to_string())?;
+    let path = tonic::codegen::http::uri::PathAndQuery::from_static(PATH);
+    let request = tonic::Request::new(ReceiverStream::new(queue));
+    let answer = client.streaming(request, path, SmallCodec::default()).await.map_err(|status| status.to_string())?;
+    Ok(Open { up, down: answer.into_inner() })
+}
+
+async fn heard(open: &mut Option<Open>) -> Option<v1::AttendResponse> {
+    match open {
+        Some(open) => open.down.message().await.ok().flatten(),
+        None => pending().await,
+    }
+}
+
+async fn progress(way: &mut Way) -> Said {
+    match way {
+        Way::Idle => pending().await,
+        Way::Waiting(sleep) => {
+            sleep.await;
+            Said::DialNow
+        }
+        Way::Dialing(dialing) => Said::Dialed(dialing.await),
+    }
+}
+
+async fn written(keeping: &mut Option<Boxed<Written>>) -> Written {
+    match keeping {
+        Some(writing) => writing.await,
+        None => pending().await,
+    }
+}

@@ -1,0 +1,347 @@
+//! Fleet stop on the robot: what it was told, what it obeys, what it says of that, and what must be kept. Without IO.
+//!
+//! Rooms: here what it knows and when it must say something; `obey` is what the body does about it; `line` is the shell's connection to the
+//! stop service; `keep` the file. Invariant: it is obeyed before it is written or answered; a stop that cannot be written is obeyed all the same and
+//! said to be not durable. Nothing of the link, of bulk or of the ledger is on its path. Called by the core.
+
+pub mod keep;
+pub mod line;
+mod obey;
+
+use crate::core::Output;
+use keep::Loaded;
+use midshift_core::ids::{AreaId, RobotId, StopId, WaypointId};
+use midshift_core::limits;
+use midshift_core::robot::{Pose, StopLevel};
+use midshift_core::stop::ladder::{Around, Stage};
+use midshift_core::stop::robot::{Kept, Obeyed, RobotStop};
+use midshift_core::stop::{Latch, Reset, Stop};
+use midshift_core::time::{LinkDuration, LinkTime, Now, SiteTime};
+use std::collections::{BTreeSet, VecDeque};
+
+/// Check-ins whose answer is still taken; older ones fed nothing any more anyway.
+const UNANSWERED_MAX: usize = 64;
+/// The service knows more than this robot was told for so long: the way down is broken, and another is made.
+const BEHIND_MAX: LinkDuration = LinkDuration(2_000);
+/// After a write that failed the next one comes after this.
+const WRITE_AGAIN: LinkDuration = LinkDuration(1_000);
+
+/// What the line brings.
+#[derive(Clone, Debug, PartialEq)]
+pub enum StopNews {
+    /// A line is open. Its check-ins are numbered from here, at random.
+    Attended {
+        /// First number.
+        nonce: u64,
+    },
+    /// Facts to add.
+    Told {
+        /// Engaged.
+        stops: Vec<Stop>,
+        /// Reset.
+        resets: Vec<Reset>,
+        /// State of the latch with them.
+        generation: u64,
+    },
+    /// All that is effective was said.
+    Synced {
+        /// State of the latch.
+        generation: u64,
+    },
+    /// The answer to one check-in.
+    CheckedIn {
+        /// Its number.
+        nonce: u64,
+        /// State of the latch.
+        generation: u64,
+    },
+    /// There is no line any more.
+    LineLost,
+    /// What came of the write with this number.
+    Kept {
+        /// Its number.
+        number: u64,
+        /// It survives the end of the process.
+        is_durable: bool,
+    },
+}
+
+/// What a robot says to the stop service.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct CheckIn {
+    /// Newest state of the latch that was taken over from this line. 0: none yet.
+    pub generation: u64,
+    /// It survives the end of the process.
+    pub is_durable: bool,
+    /// What it obeys.
+    pub obeys: StopLevel,
+    /// It stands and will not move by itself.
+    pub is_still: bool,
+    /// Effective stops that it lies inside of.
+    pub inside: Vec<StopId>,
+    /// What waits for a person's resume.
+    pub awaiting_resume: Vec<StopId>,
+    /// How far its silence has come.
+    pub silence: Stage,
+    /// It knows that no people are around it.
+    pub is_without_people: bool,
+}
+
+impl CheckIn {
+    /// The part of it that does not wait for the next second. A robot that works stands and drives all the time.
+    fn is_urgent_after(&self, old: &Self) -> bool {
+        let calm = |c: &Self| Self {
+            is_still: c.is_still && c.obeys >= StopLevel::Halt,
+            is_without_people: false,
+            ..c.clone()
+        };
+        calm(self) != calm(old)
+    }
+}
+
+/// The line at hand.
+#[derive(Debug)]
+struct Attending {
+    nonce: u64,
+    /// Sent and not answered, oldest first.
+    unanswered: VecDeque<(u64, LinkTime)>,
+    /// When something of it was answered last; at first when it was opened.
+    answered: LinkTime,
+    generation: u64,
+    is_synced: bool,
+    behind_since: Option<LinkTime>,
+    next: LinkTime,
+    said: Option<CheckIn>,
+}
+
+/// Where the robot was when the areas around it were last known.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Floor {
+    pub(crate) at: Option<WaypointId>,
+    pub(crate) heading: Option<WaypointId>,
+    pub(crate) areas: Vec<AreaId>,
+}
+
+/// What a robot that has a stop line knows of stops.
+#[derive(Debug)]
+pub(crate) struct Stops {
+    robot: RobotStop,
+    pub(crate) obeyed: Obeyed,
+    pub(crate) around: Around,
+    /// The level that the body was told last.
+    pub(crate) bodily: StopLevel,
+    /// It stood, and nothing has let it go on since.
+    pub(crate) has_stood: bool,
+    pub(crate) floor: Floor,
+    /// Drives near a stopped part: it is looked at again then, site clock.
+    pub(crate) look_at: Option<SiteTime>,
+    /// As it was said in a sample last.
+    pub(crate) said: (StopLevel, Vec<StopId>, Vec<StopId>),
+    line: Option<Attending>,
+    /// Number of the newest state that must be kept, of the one being written, of the one that is durable.
+    changes: u64,
+    writing: Option<u64>,
+    durable: u64,
+    write_at: LinkTime,
+}
+
+impl Stops {
+    /// A robot that begins with what it has kept.
+    pub(crate) fn begin(robot_id: RobotId, loaded: Loaded, now: LinkTime) -> Self {
+        let mut stops = Self {
+            robot: RobotStop::begin(robot_id, loaded.kept, now),
+            obeyed: Obeyed { level: StopLevel::Halt, stage: Stage::Stand, ..Obeyed::default() },
+            around: Around::People,
+            bodily: StopLevel::None,
+            has_stood: false,
+            floor: Floor::default(),
+            look_at: None,
+            said: Default::default(),
+            line: None,
+            changes: 0,
+            writing: None,
+            durable: 0,
+            write_at: now,
+        };
+        stops.changed(!loaded.is_durable);
+        stops
+    }
+
+    /// What must survive.
+    pub(crate) fn kept(&self) -> &Kept {
+        self.robot.kept()
+    }
+
+    /// What waits for a person, at most [`limits::STOPS_MAX`].
+    pub(crate) fn awaiting(&self) -> Vec<StopId> {
+        self.kept().awaiting.iter().take(limits::STOPS_MAX).cloned().collect()
+    }
+
+    /// Effective stops that it lies inside of, at most [`limits::STOPS_MAX`].
+    pub(crate) fn inside(&self) -> Vec<StopId> {
+        self.obeyed.inside.iter().take(limits::STOPS_MAX).cloned().collect()
+    }
+
+    /// Whether it was told since it began.
+    pub(crate) fn is_told(&self) -> bool {
+        self.robot.is_told()
+    }
+
+    /// Driving alone may bring it into a stopped part.
+    pub(crate) fn has_parts(&self) -> bool {
+        self.robot.has_parts()
+    }
+
+    fn changed(&mut self, is_changed: bool) {
+        self.changes += u64::from(is_changed);
+    }
+
+    /// People resumed these.
+    pub(crate) fn resumed(&mut self, stop_ids: &BTreeSet<StopId>) {
+        let is_changed = self.robot.resumed(stop_ids);
+        self.changed(is_changed);
+    }
+
+    /// Looks at everything at this moment.
+    pub(crate) fn look(&mut self, now: &Now, pose: Option<&Pose>, around: Around) {
+        self.around = around;
+        self.obeyed = self.robot.look(now, pose, around);
+        self.changed(self.obeyed.is_changed);
+    }
+
+    /// Takes in what the line brings.
+    pub(crate) fn hear(&mut self, now: LinkTime, news: StopNews) {
+        match news {
+            StopNews::Attended { nonce } => {
+                self.line = Some(Attending {
+                    nonce,
+                    unanswered: VecDeque::new(),
+                    answered: now,
+                    generation: 0,
+                    is_synced: false,
+                    behind_since: None,
+                    // The first one follows what it is told, which comes at once.
+                    next: now + limits::CHECK_IN,
+                    said: None,
+                });
+            }
+            StopNews::Told { stops, resets, generation } => {
+                let is_changed = self.robot.told(stops, resets);
+                self.changed(is_changed);
+                // Before all was said, one part of it is no state of the latch.
+                if let Some(line) = self.line.as_mut().filter(|line| line.is_synced) {
+                    line.knows(generation);
+                }
+            }
+            StopNews::Synced { generation } => {
+                let is_changed = self.robot.told_all(Latch::default());
+                self.changed(is_changed);
+                if let Some(line) = &mut self.line {
+                    line.is_synced = true;
+                    line.knows(generation);
+                    line.next = now;
+                }
+            }
+            StopNews::CheckedIn { nonce, generation } => {
+                let fed = self.line.as_mut().and_then(|line| line.answered(now, nonce, generation));
+                fed.into_iter().for_each(|sent| self.robot.answered(sent));
+            }
+            StopNews::LineLost => self.line = None,
+            StopNews::Kept { number, is_durable } => {
+                self.writing = None;
+                if is_durable {
+                    self.durable = self.durable.max(number);
+                } else {
+                    self.write_at = now + WRITE_AGAIN;
+                }
+            }
+        }
+    }
+
+    /// What is to be said and written now.
+    pub(crate) fn say(&mut self, now: LinkTime, is_still: bool, out: &mut Vec<Output>) {
+        if self.writing.is_none() && self.changes > self.durable && now >= self.write_at {
+            self.writing = Some(self.changes);
+            out.push(Output::KeepStops(self.changes, Box::new(self.kept().clone())));
+        }
+        let check_in = self.check_in(is_still);
+        let Some(line) = &mut self.line else { return };
+        if let Some(why) = line.is_broken(now) {
+            self.line = None;
+            return out.push(Output::RedialStop(why));
+        }
+        let is_urgent = line.said.as_ref().is_some_and(|said| check_in.is_urgent_after(said));
+        if now < line.next && !is_urgent {
+            return;
+        }
+        let nonce = line.nonce;
+        line.nonce = nonce.wrapping_add(1);
+        line.next = now + limits::CHECK_IN;
+        line.said = Some(check_in.clone());
+        if line.unanswered.len() == UNANSWERED_MAX {
+            line.unanswered.pop_front();
+        }
+        line.unanswered.push_back((nonce, now));
+        out.push(Output::CheckIn(nonce, Box::new(check_in)));
+    }
+
+    fn check_in(&self, is_still: bool) -> CheckIn {
+        CheckIn {
+            generation: self.line.as_ref().map_or(0, |line| line.generation),
+            is_durable: self.durable >= self.changes,
+            obeys: self.obeyed.level,
+            is_still,
+            inside: self.inside(),
+            awaiting_resume: self.awaiting(),
+            silence: self.obeyed.stage,
+            is_without_people: self.around == Around::Robots,
+        }
+    }
+
+    /// When it must be looked at again, link clock.
+    pub(crate) fn next_at(&self) -> Option<LinkTime> {
+        let write = (self.writing.is_none() && self.changes > self.durable).then_some(self.write_at);
+        let line = self.line.as_ref().map(Attending::next_at);
+        [write, line, self.robot.silence_at(self.around)].into_iter().flatten().min()
+    }
+}
+
+impl Attending {
+    fn knows(&mut self, generation: u64) {
+        self.generation = self.generation.max(generation);
+        self.behind_since = None;
+    }
+
+    /// When the check-in was sent that this answers. None: it answers none, or the service knows of what it has not told yet.
+    fn answered(&mut self, now: LinkTime, nonce: u64, generation: u64) -> Option<LinkTime> {
+        let at = self.unanswered.iter().position(|(sent, _)| *sent == nonce)?;
+        let (_, sent) = self.unanswered.remove(at)?;
+        // Answers come in order: what was asked before is not answered any more.
+        self.unanswered.drain(..at);
+        self.answered = now;
+        if generation > self.generation {
+            self.behind_since.get_or_insert(now);
+            return None;
+        }
+        Some(sent)
+    }
+
+    /// Since when it has waited for an answer.
+    fn waits_since(&self) -> LinkTime {
+        self.unanswered.front().map_or(self.answered, |(_, sent)| (*sent).max(self.answered))
+    }
+
+    fn is_broken(&self, now: LinkTime) -> Option<&'static str> {
+        if now.since(self.waits_since()) >= limits::CHECK_IN_MISSED {
+            return Some("no answer");
+        }
+        let behind = self.behind_since.is_some_and(|since| now.since(since) >= BEHIND_MAX);
+        behind.then_some("a stop was not told")
+    }
+
+    fn next_at(&self) -> LinkTime {
+        let silent = self.waits_since() + limits::CHECK_IN_MISSED;
+        let behind = self.behind_since.map(|since| since + BEHIND_MAX);
+        [Some(self.next), Some(silent), behind].into_iter().flatten().min().unwrap_or(self.next)
+    }
+}
