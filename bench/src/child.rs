@@ -5,7 +5,7 @@
 use crate::questions::answer_questions;
 use crate::sink::Seen;
 use anyhow::{Context, bail, ensure};
-use midshift::robots::SimRun;
+use midshift::robots::{SimRun, StopFlags};
 use midshift::serve::Software;
 use std::io::{BufRead, BufReader, Write};
 use std::net::SocketAddr;
@@ -168,6 +168,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 no_faults: true,
                 listen: None,
                 trust: None,
+                stop: StopFlags::none(),
             };
             midshift::robots::swarm(swarm, stop).await
         }

@@ -6,7 +6,7 @@
 use crate::questions::answer_questions;
 use crate::robot;
 use anyhow::Context;
-use midshift::robots::AgentRun;
+use midshift::robots::{AgentRun, StopFlags};
 use midshift::serve::{Serve, Software};
 use midshift_agent::bulk::Bulk;
 use midshift_agent::dial::TcpDial;
@@ -201,6 +201,7 @@ async fn agent(
         sets: Some(home.join("sets")),
         trust: Some(home.join("trust.json")),
         clock_unsynced: false,
+        stop: StopFlags::none(),
     };
     let hand = move |body: &SimHandle, clock: &Arc<dyn Clock>| {
         // Nobody else sets it.

@@ -13,7 +13,7 @@ use midshift_core::ids::{AreaId, StopId};
 use midshift_core::robot::{Lane, StopLevel};
 use midshift_core::stop::ladder::Around;
 use midshift_core::time::{LinkTime, Now, SiteDuration, SiteTime};
-use midshift_core::work::RobotEvent;
+use midshift_core::work::{DesiredWork, RobotEvent};
 
 /// A robot that drives while a part of the site is stopped looks this often where it is: 150 mm at its fastest.
 const LOOK: SiteDuration = SiteDuration(100);
@@ -67,7 +67,9 @@ impl AgentCore {
 
     /// What people resumed, as the newest desired work says. Said once, it stays true: a reset may come after it.
     fn resume_stops(&mut self) {
-        let Some(desired) = self.desired.as_ref().filter(|desired| !desired.resumed.is_empty()) else { return };
+        let is_observed = self.is_observed();
+        let says = |desired: &&DesiredWork| !desired.resumed.is_empty() && !is_observed;
+        let Some(desired) = self.desired.as_ref().filter(says) else { return };
         if let Some(stop) = &mut self.stop
             && !stop.kept().awaiting.is_empty()
         {
@@ -95,11 +97,12 @@ impl AgentCore {
         stop.look(now, pose.as_ref(), around);
         let (level, bodily) = (stop.obeyed.level, std::mem::replace(&mut stop.bodily, stop.obeyed.level));
         let is_awaiting = !stop.kept().awaiting.is_empty();
+        stop.has_stood |= level >= StopLevel::Halt;
         if level != bodily {
             self.body.obeys(now.site, level);
+            self.beat_at_once(now);
         }
         if level >= StopLevel::Halt {
-            stop.has_stood = true;
             self.resume_needed |= is_awaiting && self.work.is_some();
             self.stand(now, level, level > bodily);
         } else if before >= StopLevel::Halt {

@@ -62,6 +62,7 @@ impl AgentCore {
 
     /// Decides what is next, if nothing is under way.
     pub(crate) fn pursue_update(&mut self, now: &Now) -> Option<ExitReason> {
+        self.take_switch_back();
         if self.update.config.is_none() || self.update.next.is_some() {
             return None;
         }
@@ -553,6 +554,15 @@ impl AgentCore {
         let standing = |place: &PlaceId| here.iter().any(|w| w.as_str() == place.as_str());
         let row = &self.kept.ledger.places;
         row.inside.keys().chain(row.committed.keys()).any(|place| !standing(place))
+    }
+
+    /// A switch that waits for the disk does not wait for the end of a stop.
+    fn take_switch_back(&mut self) {
+        let state = self.kept.ledger.software.update.as_ref().map(|u| u.state);
+        let waits = matches!(self.update.next, Some((Job::Write(_), _)));
+        if waits && state == Some(UpdateState::Switching) && self.is_stopped() {
+            self.update.next = None;
+        }
     }
 
     fn switching(&mut self, update: &Update, holdings: &Holdings) -> Option<ExitReason> {

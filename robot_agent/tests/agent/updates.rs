@@ -106,7 +106,7 @@ pub fn stage(rig: &mut Rig, releases: &Releases, bundle: &Bundle, generation: u6
 }
 
 /// Drains the robot, lets it ask, and grants.
-fn activate(rig: &mut Rig, order: &mut Order, name: &str) {
+pub fn activate(rig: &mut Rig, order: &mut Order, name: &str) {
     order.drain_id = Some(drain(name));
     maintain(rig, order.drain_id.clone().as_ref());
     want(rig, order.to(Goal::Activate));

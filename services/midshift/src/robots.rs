@@ -7,6 +7,8 @@ use midshift_agent::bulk::Bulk;
 use midshift_agent::core::ExitReason;
 use midshift_agent::dial::TcpDial;
 use midshift_agent::durable;
+use midshift_agent::stop::keep::{FileStops, STOP_FILE};
+use midshift_agent::stop::line::StopLine;
 use midshift_core::ids::{RobotId, WaypointId};
 use midshift_core::time::Clock;
 use midshift_sim::body::{BodyConfig, SimBody};
@@ -27,6 +29,48 @@ use tokio_util::task::AbortOnDropHandle;
 
 /// How often a person looks, real time.
 const VISIT: Duration = Duration::from_secs(5);
+
+/// Port of the stop service: its own, beside the server's.
+const STOP_PORT: u16 = 7421;
+
+/// The way to the stop service.
+#[derive(Clone, Debug, Default, clap::Args)]
+pub struct StopFlags {
+    /// The stop service, host:port. Without it the host of --server, port 7421. A robot stands until it was told there what is stopped.
+    #[arg(long, value_name = "ADDR", conflicts_with = "no_stop_line")]
+    pub stop_server: Option<String>,
+    /// No line to a stop service: fleet stop does not reach these robots, and they do not slow down or stand when nobody is heard.
+    #[arg(long)]
+    pub no_stop_line: bool,
+}
+
+impl StopFlags {
+    /// None to be had.
+    pub fn none() -> Self {
+        Self { stop_server: None, no_stop_line: true }
+    }
+    /// Where the stop service is; none: there is to be no line, which is said aloud.
+    fn uri(&self, server: &str) -> Option<String> {
+        if self.no_stop_line {
+            tracing::warn!("no stop line: fleet stop does not reach these robots");
+            return None;
+        }
+        Some(self.stop_server.as_deref().map_or_else(|| beside(server), uri))
+    }
+}
+
+/// The stop service that is beside a server: same host, its own port.
+fn beside(server: &str) -> String {
+    let uri = uri(server);
+    let (scheme, rest) = uri.split_once("://").unwrap_or(("http", &uri));
+    let authority = rest.split('/').next().unwrap_or(rest);
+    // The last colon is the port's, unless it stands inside the brackets of an address.
+    let host = match authority.rsplit_once(':') {
+        Some((host, port)) if !port.contains(']') => host,
+        _ => authority,
+    };
+    format!("{scheme}://{host}:{STOP_PORT}")
+}
 
 /// One agent with a simulated body.
 #[derive(Clone, Debug, clap::Args)]
@@ -68,6 +112,9 @@ pub struct AgentRun {
     /// The machine's clock is not set from the network: the end of a signature is not judged by it.
     #[arg(long, requires = "sets")]
     pub clock_unsynced: bool,
+    /// The way to the stop service.
+    #[command(flatten)]
+    pub stop: StopFlags,
 }
 
 /// Robots of one process against a server elsewhere.
@@ -106,6 +153,9 @@ pub struct SimRun {
     /// Also answer `sim.v1` (faults) here.
     #[arg(long)]
     pub listen: Option<SocketAddr>,
+    /// The way to the stop service.
+    #[command(flatten)]
+    pub stop: StopFlags,
 }
 
 fn part(text: &str) -> Result<(usize, usize), String> {
@@ -165,7 +215,7 @@ pub async fn agent_in_hand(
     hand(&handle, &clock);
     let _person =
         args.person.then(|| AbortOnDropHandle::new(tokio::spawn(visit(handle.clone(), args.seed, clock.clone()))));
-    let network = handle.network();
+    let (network, stop_network) = (handle.network(), handle.stop_network());
     let uri = uri(&args.server);
     let link = Arc::new(TcpDial::new(&uri, Some(network.clone()))?);
     let bulk = Bulk::new(Arc::new(TcpDial::bulk(&uri, Some(network))?));
@@ -178,7 +228,15 @@ pub async fn agent_in_hand(
         update.config.clock_synced = !args.clock_unsynced;
     }
     let store = midshift_agent::sqlite::SqliteStore::open(&args.data.join(AGENT_FILE)).await?;
+    let stop_line = match args.stop.uri(&args.server) {
+        Some(uri) => Some(StopLine {
+            dial: Arc::new(TcpDial::new(&uri, Some(stop_network))?),
+            keep: Box::new(FileStops::new(&args.data.join(STOP_FILE))),
+        }),
+        None => None,
+    };
     let agent = midshift_agent::session::AgentConfig {
+        stop: stop_line,
         update,
         robot_id,
         boot_id: format!("{:032x}", rand::random::<u128>()),
@@ -224,6 +282,9 @@ pub async fn swarm(args: SimRun, stop: CancellationToken) -> anyhow::Result<()> 
     let trust = args.trust.as_deref().map(|file| software::trust_of(file, &config.site)).transpose()?;
     let hall = Arc::new(Hall::open(&config, &clock.now())?);
     let mut swarm = SwarmConfig::tcp(hall.clone(), clock.clone(), &uri(&args.server), args.seed);
+    if let Some(uri) = args.stop.uri(&args.server) {
+        swarm = swarm.with_stop(&uri);
+    }
     swarm.software = trust;
     swarm.persistence = config.persistence.clone();
     let swarm = Swarm::new(swarm);
@@ -243,4 +304,25 @@ pub async fn swarm(args: SimRun, stop: CancellationToken) -> anyhow::Result<()> 
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_stop_service_is_beside_the_server_unless_it_is_named_or_not_wanted() {
+        for (server, stop) in [
+            ("127.0.0.1:7420", "http://127.0.0.1:7421"),
+            ("https://plant.example:7420", "https://plant.example:7421"),
+            ("plant.example", "http://plant.example:7421"),
+            ("[::1]:7420", "http://[::1]:7421"),
+            ("[::1]", "http://[::1]:7421"),
+        ] {
+            assert_eq!(StopFlags::default().uri(server).as_deref(), Some(stop), "{server}");
+        }
+        let named = StopFlags { stop_server: Some("stop:1".to_owned()), ..StopFlags::default() };
+        assert_eq!(named.uri("a:2").as_deref(), Some("http://stop:1"));
+        assert_eq!(StopFlags::none().uri("a:2"), None);
+    }
 }

@@ -1,0 +1,665 @@
+//! Fleet stop: what a robot does about stops and about their silence, and what lets it go on. The link's server and the stop service are the test.
+
+use crate::rig::{Rig, StopDesk, action, goto, point};
+use midshift_agent::core::Input;
+use midshift_agent::stop::{CheckIn, StopNews};
+use midshift_core::ids::{AreaId, RobotId, StopId};
+use midshift_core::policy::AreaPolicy;
+use midshift_core::robot::{Load, Pose, StopLevel};
+use midshift_core::stop::ladder::Stage;
+use midshift_core::stop::{Region, Reset, Scope, Stop};
+use midshift_core::time::Utc;
+use midshift_core::work::{Assignment, DesiredPolicy, DesiredWork, Effect, RobotEvent, WorkState, WorkStep};
+use midshift_proto::session::Downlink;
+use std::collections::BTreeSet;
+
+pub fn stop_id(n: u64) -> StopId {
+    StopId::parse(&format!("STOP-{n}")).expect("an id")
+}
+
+pub fn stop(n: u64, level: StopLevel) -> Stop {
+    Stop {
+        stop_id: stop_id(n),
+        scope: Scope::Fleet,
+        level,
+        engaged: Utc(1_700_000_000_000),
+        actor: "anna".into(),
+        reason: "a pallet fell".into(),
+        region: None,
+        proof: Vec::new(),
+    }
+}
+
+pub fn reset(n: u64) -> Reset {
+    Reset { stop_id: stop_id(n), at: Utc(1_700_000_000_001), actor: "bert".into(), reason: "clear".into() }
+}
+
+/// Generation of the latch with the `n`-th message.
+const SYNCED: u64 = 10;
+
+pub fn desk() -> StopDesk {
+    StopDesk { is_there: true, ..StopDesk::default() }
+}
+
+pub fn hear(rig: &mut Rig, news: StopNews) {
+    rig.put(Input::Stop(Box::new(news)));
+}
+
+pub fn told(rig: &mut Rig, stops: Vec<Stop>, resets: Vec<Reset>) {
+    hear(rig, StopNews::Told { stops, resets, generation: SYNCED });
+}
+
+/// A line opens, and nothing is effective.
+pub fn attend(rig: &mut Rig) {
+    let nonce = rig.ms * 1_000;
+    hear(rig, StopNews::Attended { nonce });
+    hear(rig, StopNews::Synced { generation: SYNCED });
+}
+
+/// Every check-in that waits is answered.
+fn answer(rig: &mut Rig) {
+    for (nonce, _) in std::mem::take(&mut rig.stop.check_ins) {
+        hear(rig, StopNews::CheckedIn { nonce, generation: SYNCED });
+    }
+}
+
+/// Time passes; both servers answer.
+pub fn serve(rig: &mut Rig, ms: u64) {
+    for _ in 0..ms / 500 {
+        rig.silence(500);
+        answer(rig);
+        rig.echo();
+    }
+}
+
+/// Time passes; the link's server answers and the stop service is silent.
+fn stop_silence(rig: &mut Rig, ms: u64) {
+    for _ in 0..ms / 500 {
+        rig.pass(500);
+        rig.stop.check_ins.clear();
+    }
+}
+
+fn level(rig: &Rig) -> StopLevel {
+    let at = crate::rig::now_at(rig.ms);
+    rig.core.reported(&at).stop_level
+}
+
+fn awaiting(rig: &Rig) -> Vec<String> {
+    let at = crate::rig::now_at(rig.ms);
+    rig.core.reported(&at).awaiting_resume.iter().map(ToString::to_string).collect()
+}
+
+fn said(rig: &Rig) -> CheckIn {
+    rig.stop.check_ins.last().expect("it said something").1.clone()
+}
+
+/// Stands at A, is connected to both servers and free to go.
+pub fn free() -> Rig {
+    freed(Rig::stoppable("A", desk()))
+}
+
+pub fn freed(mut rig: Rig) -> Rig {
+    rig.connect();
+    attend(&mut rig);
+    serve(&mut rig, 4_000);
+    assert_eq!(level(&rig), StopLevel::None);
+    rig
+}
+
+fn to_c(rig: &Rig) -> Assignment {
+    let route = vec![point("A", None, false, &[]), point("B", None, false, &[]), point("C", Some(0), false, &[])];
+    rig.offer("T1", 1, vec![goto("C")], route)
+}
+
+/// Drives to C over B.
+fn driving() -> Rig {
+    let mut rig = free();
+    rig.work(rig.desired(Some(to_c(&rig))));
+    assert_eq!((rig.body.goes_to().len(), rig.body.log().paused), (2, false));
+    rig.reports();
+    rig
+}
+
+/// Whether the body is under way.
+fn moves(rig: &Rig) -> bool {
+    let log = rig.body.log();
+    !log.paused && (!log.path.is_empty() || log.acting.is_some())
+}
+
+fn speeds(rig: &Rig) -> Vec<u32> {
+    rig.body.log().path.iter().map(|p| p.speed_mm_s).collect()
+}
+
+/// What people resumed and whether there is a fresh permission to go on.
+fn resume(rig: &mut Rig, resumed: &[StopId], is_permitted: bool) {
+    let resume = is_permitted.then(|| rig.authority(10_000));
+    let order = rig.core.kept().ledger.holder.is_some().then(|| to_c(rig));
+    rig.work(DesiredWork { resumed: resumed.to_vec(), resume, ..rig.desired(order) });
+}
+
+fn halted() -> Rig {
+    let mut rig = driving();
+    told(&mut rig, vec![stop(1, StopLevel::Halt)], vec![]);
+    serve(&mut rig, 1_000);
+    assert!(!moves(&rig));
+    rig
+}
+
+#[test]
+fn a_stop_stands_a_driving_robot_within_the_step_that_hears_it_whatever_its_disks_do() {
+    let mut rig = driving();
+    rig.body.set(|log| log.load = Some(Load { task_id: None, item: "box".into() }));
+    rig.slow_disk = true;
+    rig.pass(1_000);
+    rig.stop.check_ins.clear();
+    rig.stop.disk_fails = true;
+    told(&mut rig, vec![stop(1, StopLevel::Halt)], vec![]);
+    assert!(!moves(&rig));
+    let said = said(&rig);
+    assert_eq!((said.obeys, said.is_still, said.is_durable), (StopLevel::Halt, true, false));
+    assert_eq!(said.inside, [stop_id(1)]);
+    assert_eq!(rig.body.log().levels.last(), Some(&StopLevel::Halt));
+    rig.flush();
+    rig.pass(500);
+    let reported = rig.reported.clone().expect("a heartbeat");
+    assert_eq!((reported.stop_level, reported.stops), (StopLevel::Halt, vec![stop_id(1)]));
+    assert_eq!(reported.attempts[0].state, WorkState::Paused);
+    assert!(reported.load.is_some() && rig.body.goes_to().len() == 2, "it keeps its load and its order");
+    let level_said = |e: &RobotEvent| matches!(e, RobotEvent::FleetStop { level: StopLevel::Halt, stops, .. } if *stops == [stop_id(1)]);
+    assert!(rig.events.iter().any(level_said));
+}
+
+#[test]
+fn a_heartbeat_says_a_stop_at_once_and_not_only_with_the_next_second() {
+    let mut rig = driving();
+    rig.silence(500);
+    let before = rig.hb;
+    told(&mut rig, vec![stop(1, StopLevel::Halt)], vec![]);
+    assert!(rig.hb > before);
+}
+
+#[test]
+fn a_posture_drops_the_order_and_the_work_is_done_from_where_it_stands() {
+    let mut rig = driving();
+    rig.body.reach();
+    rig.pass(500);
+    let before = rig.body.log().stops;
+    told(&mut rig, vec![stop(1, StopLevel::ControlledStopPosture)], vec![]);
+    assert_eq!((rig.body.log().stops, rig.body.goes_to().len()), (before + 1, 0));
+    serve(&mut rig, 3_000);
+    assert_eq!(rig.body.log().stops, before + 1, "it is told once");
+    assert_eq!(rig.states().last(), Some(&(WorkState::Paused, 0)));
+    told(&mut rig, vec![], vec![reset(1)]);
+    resume(&mut rig, &[stop_id(1)], true);
+    serve(&mut rig, 2_000);
+    assert_eq!(rig.body.goes_to(), ["C"]);
+}
+
+#[test]
+fn in_whatever_order_and_however_often_it_is_told_it_obeys_the_same() {
+    let say: [fn(&mut Rig); 4] = [
+        |rig| told(rig, vec![stop(1, StopLevel::Halt)], vec![]),
+        |rig| told(rig, vec![], vec![reset(1)]),
+        |rig| told(rig, vec![stop(2, StopLevel::Halt)], vec![]),
+        |rig| hear(rig, StopNews::Synced { generation: SYNCED }),
+    ];
+    let mut orders = 0;
+    for order in 0..256 {
+        let order = [order % 4, order / 4 % 4, order / 16 % 4, order / 64];
+        if BTreeSet::from(order).len() < 4 {
+            continue;
+        }
+        orders += 1;
+        let mut rig = driving();
+        for at in order {
+            say[at](&mut rig);
+            say[at](&mut rig);
+        }
+        order.iter().for_each(|at| say[*at](&mut rig));
+        let reported = rig.core.reported(&crate::rig::now_at(rig.ms));
+        assert_eq!((reported.stop_level, reported.stops), (StopLevel::Halt, vec![stop_id(2)]), "{order:?}");
+        assert!(!moves(&rig));
+    }
+    assert_eq!(orders, 24);
+}
+
+#[test]
+fn a_reset_moves_nobody_and_neither_does_half_of_a_resume() {
+    let mut rig = halted();
+    told(&mut rig, vec![], vec![reset(1)]);
+    serve(&mut rig, 3_000);
+    assert_eq!((moves(&rig), level(&rig), awaiting(&rig)), (false, StopLevel::Halt, vec!["STOP-1".into()]));
+    resume(&mut rig, &[], true);
+    serve(&mut rig, 3_000);
+    assert!(!moves(&rig), "a permission, and nobody resumed the stop");
+    resume(&mut rig, &[stop_id(7)], true);
+    serve(&mut rig, 3_000);
+    assert!(!moves(&rig), "another stop was resumed");
+    resume(&mut rig, &[stop_id(1)], false);
+    serve(&mut rig, 3_000);
+    assert_eq!((level(&rig), awaiting(&rig).len()), (StopLevel::None, 0));
+    assert!(!moves(&rig), "resumed, and no permission to go on");
+    resume(&mut rig, &[], true);
+    serve(&mut rig, 1_000);
+    assert!(moves(&rig));
+    assert_eq!(rig.states().last(), Some(&(WorkState::Navigating, 0)));
+}
+
+#[test]
+fn reset_and_resume_let_it_go_on_in_either_order() {
+    for is_reset_first in [true, false] {
+        let mut rig = halted();
+        if is_reset_first {
+            told(&mut rig, vec![], vec![reset(1)]);
+        }
+        resume(&mut rig, &[stop_id(1)], true);
+        assert!(!moves(&rig));
+        if !is_reset_first {
+            serve(&mut rig, 2_000);
+            assert!(!moves(&rig), "resumed, and still engaged as far as it knows");
+            told(&mut rig, vec![], vec![reset(1)]);
+            assert!(!moves(&rig), "a heartbeat sent since was not answered yet");
+        }
+        serve(&mut rig, 2_000);
+        assert!(moves(&rig), "reset first: {is_reset_first}");
+    }
+}
+
+#[test]
+fn a_permission_that_grew_old_while_it_was_stopped_moves_nobody() {
+    let mut rig = halted();
+    resume(&mut rig, &[stop_id(1)], true);
+    serve(&mut rig, 12_000);
+    told(&mut rig, vec![], vec![reset(1)]);
+    serve(&mut rig, 3_000);
+    assert_eq!((level(&rig), moves(&rig)), (StopLevel::None, false));
+    resume(&mut rig, &[], true);
+    serve(&mut rig, 1_000);
+    assert!(moves(&rig));
+}
+
+#[test]
+fn a_desired_state_of_before_the_stop_lets_nobody_go_on() {
+    let mut rig = driving();
+    let before = DesiredWork {
+        resume: Some(rig.authority(10_000)),
+        resumed: vec![stop_id(1)],
+        generation: 7,
+        ..rig.desired(Some(to_c(&rig)))
+    };
+    told(&mut rig, vec![stop(1, StopLevel::Halt)], vec![]);
+    told(&mut rig, vec![], vec![reset(1)]);
+    rig.down(Downlink { work: Some(before), ..Downlink::default() });
+    serve(&mut rig, 3_000);
+    assert_eq!((moves(&rig), level(&rig)), (false, StopLevel::Halt));
+}
+
+fn stiff(rig: &Rig) -> Assignment {
+    let step = WorkStep { pause_allowed: false, cancel_allowed: false, ..action("pick", Effect::CheckFirst) };
+    rig.offer("T1", 1, vec![step], vec![])
+}
+
+#[test]
+fn an_action_that_may_not_be_paused_stands_too_and_goes_on_by_permission_only() {
+    let mut rig = free();
+    rig.work(rig.desired(Some(stiff(&rig))));
+    assert!(moves(&rig));
+    told(&mut rig, vec![stop(1, StopLevel::Halt)], vec![]);
+    assert!(!moves(&rig));
+    told(&mut rig, vec![], vec![reset(1)]);
+    rig.work(DesiredWork { resumed: vec![stop_id(1)], ..rig.desired(Some(stiff(&rig))) });
+    serve(&mut rig, 2_000);
+    assert_eq!((level(&rig), moves(&rig)), (StopLevel::None, false));
+    rig.work(DesiredWork { resume: Some(rig.authority(10_000)), ..rig.desired(Some(stiff(&rig))) });
+    serve(&mut rig, 1_000);
+    assert!(moves(&rig));
+}
+
+#[test]
+fn what_stood_it_stands_it_again_after_it_was_killed() {
+    let mut rig = halted().restart();
+    assert_eq!((level(&rig), rig.core.kept_stops().count()), (StopLevel::Halt, 1));
+    // A stop service that has forgotten it.
+    rig.connect();
+    attend(&mut rig);
+    rig.work(rig.desired(Some(to_c(&rig))));
+    serve(&mut rig, 5_000);
+    assert_eq!((level(&rig), moves(&rig)), (StopLevel::Halt, false));
+    rig.silence(1_000);
+    assert_eq!(said(&rig).inside, [stop_id(1)]);
+}
+
+#[test]
+fn what_was_reset_while_it_was_dead_still_waits_for_its_resume() {
+    let mut rig = halted().restart();
+    rig.connect();
+    attend(&mut rig);
+    told(&mut rig, vec![], vec![reset(1)]);
+    rig.work(rig.desired(Some(to_c(&rig))));
+    serve(&mut rig, 5_000);
+    assert_eq!((level(&rig), moves(&rig), awaiting(&rig)), (StopLevel::Halt, false, vec!["STOP-1".into()]));
+    resume(&mut rig, &[stop_id(1)], false);
+    serve(&mut rig, 2_000);
+    assert!(!moves(&rig), "the permission is needed after a restart too");
+    resume(&mut rig, &[], true);
+    serve(&mut rig, 2_000);
+    assert!(moves(&rig));
+}
+
+#[test]
+fn a_stop_that_cannot_be_written_is_obeyed_said_to_be_not_durable_and_written_later() {
+    let mut rig = driving();
+    rig.silence(1_000);
+    assert!(said(&rig).is_durable);
+    answer(&mut rig);
+    rig.stop.disk_fails = true;
+    told(&mut rig, vec![stop(1, StopLevel::Halt)], vec![]);
+    serve(&mut rig, 2_000);
+    rig.silence(1_000);
+    assert_eq!((said(&rig).obeys, said(&rig).is_durable), (StopLevel::Halt, false));
+    assert_eq!(rig.stop.kept.latch.stops().count(), 0);
+    rig.stop.disk_fails = false;
+    serve(&mut rig, 2_000);
+    rig.silence(1_000);
+    assert!(said(&rig).is_durable);
+    assert!(rig.stop.kept.awaiting.contains(&stop_id(1)));
+}
+
+#[test]
+fn a_robot_that_starts_stands_until_it_was_told_and_answered() {
+    let mut rig = Rig::stoppable("A", desk());
+    rig.connect();
+    serve(&mut rig, 5_000);
+    assert_eq!(level(&rig), StopLevel::Halt, "no line");
+    rig.work(rig.desired(Some(to_c(&rig))));
+    assert_eq!((rig.refusals(), moves(&rig)), (vec!["ROBOT_STOPPED".into()], false));
+    hear(&mut rig, StopNews::Attended { nonce: 5 });
+    serve(&mut rig, 5_000);
+    assert_eq!(level(&rig), StopLevel::Halt, "answered, and not told");
+    let mut rig = Rig::stoppable("A", desk());
+    rig.connect();
+    attend(&mut rig);
+    rig.pass(2_000);
+    assert_eq!(level(&rig), StopLevel::Halt, "told, and not answered");
+    attend(&mut rig);
+    serve(&mut rig, 4_000);
+    assert_eq!((level(&rig), awaiting(&rig).len()), (StopLevel::None, 0), "a start waits for nobody");
+    let about_stops = |e: &RobotEvent| matches!(e, RobotEvent::FleetStop { .. });
+    assert!(!rig.events.iter().any(about_stops), "and is no news");
+}
+
+#[test]
+fn work_that_was_under_way_at_a_restart_goes_on_without_a_resume_if_nobody_stopped_it() {
+    let mut rig = driving().restart();
+    rig.connect();
+    rig.work(rig.desired(Some(to_c(&rig))));
+    rig.pass(3_000);
+    assert!(!moves(&rig));
+    attend(&mut rig);
+    serve(&mut rig, 4_000);
+    assert!(moves(&rig));
+}
+
+#[test]
+fn a_service_that_reads_and_never_answers_slows_and_stands_the_robot_and_is_dialed_again() {
+    let mut rig = driving();
+    stop_silence(&mut rig, 2_000);
+    assert_eq!((level(&rig), moves(&rig)), (StopLevel::None, true));
+    stop_silence(&mut rig, 1_500);
+    assert_eq!((level(&rig), speeds(&rig)), (StopLevel::Slow, vec![300, 300]));
+    assert_eq!(rig.stop.redials, ["no answer"]);
+    // Others are dialed, and hang as it did.
+    for _ in 0..3 {
+        attend(&mut rig);
+        stop_silence(&mut rig, 1_000);
+    }
+    assert_eq!((level(&rig), moves(&rig)), (StopLevel::ControlledStopPosture, false));
+}
+
+#[test]
+fn answers_that_lay_in_a_buffer_feed_nothing() {
+    let mut rig = driving();
+    let mut late = Vec::new();
+    for _ in 0..14 {
+        attend(&mut rig);
+        rig.pass(1_000);
+        late.append(&mut rig.stop.check_ins);
+    }
+    assert!(late.len() >= 14 && !moves(&rig));
+    let stood = level(&rig);
+    for (nonce, _) in late {
+        hear(&mut rig, StopNews::CheckedIn { nonce, generation: SYNCED });
+    }
+    rig.put(Input::Tick);
+    assert_eq!((level(&rig), stood), (StopLevel::ControlledStopPosture, StopLevel::ControlledStopPosture));
+    // Nor does the answer to a check-in of another.
+    attend(&mut rig);
+    (0..9).for_each(|n| hear(&mut rig, StopNews::CheckedIn { nonce: n, generation: SYNCED }));
+    assert_eq!(level(&rig), StopLevel::ControlledStopPosture);
+    serve(&mut rig, 4_000);
+    assert_eq!((level(&rig), awaiting(&rig).len()), (StopLevel::Halt, 1), "heard again, and a person resumes it");
+}
+
+#[test]
+fn an_answer_of_a_service_that_has_not_told_all_feeds_nothing_and_another_line_is_made() {
+    let mut rig = driving();
+    for _ in 0..8 {
+        rig.pass(500);
+        for (nonce, _) in std::mem::take(&mut rig.stop.check_ins) {
+            hear(&mut rig, StopNews::CheckedIn { nonce, generation: SYNCED + 1 });
+        }
+    }
+    assert_eq!((rig.stop.redials.as_slice(), level(&rig)), (&["a stop was not told"][..], StopLevel::Slow));
+}
+
+/// The hall, without people if its rules say so.
+fn rules(rig: &mut Rig, without_people: bool) {
+    let area = AreaPolicy { without_people, ..AreaPolicy::default_of(AreaId::parse("hall").expect("a name")) };
+    let policy = DesiredPolicy {
+        robot_id: RobotId::parse("rbt-01").expect("a name"),
+        generation: 5,
+        areas: vec![area],
+    };
+    rig.down(Downlink { policy: Some(policy), ..Downlink::default() });
+}
+
+#[test]
+fn twenty_seconds_without_the_service_slow_a_robot_where_nobody_walks_and_it_goes_on_by_itself() {
+    let mut rig = driving();
+    rules(&mut rig, true);
+    serve(&mut rig, 1_000);
+    rig.silence(1_000);
+    assert!(said(&rig).is_without_people);
+    answer(&mut rig);
+    hear(&mut rig, StopNews::LineLost);
+    stop_silence(&mut rig, 9_000);
+    assert_eq!((level(&rig), speeds(&rig)), (StopLevel::None, vec![1_500, 1_500]));
+    stop_silence(&mut rig, 11_000);
+    assert_eq!((level(&rig), moves(&rig), speeds(&rig)), (StopLevel::Slow, true, vec![300, 300]));
+    attend(&mut rig);
+    serve(&mut rig, 4_000);
+    assert_eq!((level(&rig), awaiting(&rig).len()), (StopLevel::None, 0));
+    assert_eq!((moves(&rig), speeds(&rig)), (true, vec![1_500, 1_500]));
+}
+
+#[test]
+fn thirty_seconds_stand_it_there_too_and_it_still_goes_on_by_itself() {
+    let mut rig = driving();
+    rules(&mut rig, true);
+    serve(&mut rig, 1_000);
+    hear(&mut rig, StopNews::LineLost);
+    stop_silence(&mut rig, 31_000);
+    assert_eq!((level(&rig), moves(&rig)), (StopLevel::ControlledStopPosture, false));
+    attend(&mut rig);
+    serve(&mut rig, 5_000);
+    assert_eq!((level(&rig), awaiting(&rig).len(), moves(&rig)), (StopLevel::None, 0, true));
+}
+
+#[test]
+fn the_same_twenty_seconds_stand_it_among_people_and_a_person_resumes_it() {
+    let mut rig = driving();
+    rules(&mut rig, false);
+    serve(&mut rig, 1_000);
+    hear(&mut rig, StopNews::LineLost);
+    stop_silence(&mut rig, 20_000);
+    assert_eq!((level(&rig), moves(&rig)), (StopLevel::ControlledStopPosture, false));
+    attend(&mut rig);
+    serve(&mut rig, 5_000);
+    assert_eq!((level(&rig), moves(&rig)), (StopLevel::Halt, false));
+    let waits = awaiting(&rig);
+    assert!(waits.len() == 1 && waits[0].starts_with("SILENCE-rbt-01-"), "{waits:?}");
+    let silence = StopId::parse(&waits[0]).expect("an id");
+    resume(&mut rig, &[silence], true);
+    serve(&mut rig, 2_000);
+    assert_eq!((level(&rig), moves(&rig)), (StopLevel::None, true));
+}
+
+#[test]
+fn a_robot_that_does_not_know_where_it_is_counts_as_among_people() {
+    let mut rig = free();
+    rules(&mut rig, true);
+    serve(&mut rig, 1_000);
+    rig.silence(1_000);
+    assert!(!said(&rig).is_without_people, "no route has told it in which area it stands");
+}
+
+#[test]
+fn a_restart_of_the_links_server_never_moves_the_ladder() {
+    let mut rig = driving();
+    rig.put(Input::Disconnected);
+    for _ in 0..40 {
+        rig.silence(500);
+        answer(&mut rig);
+        assert_eq!(level(&rig), StopLevel::None);
+    }
+    rig.connect();
+    serve(&mut rig, 1_000);
+    assert_eq!(level(&rig), StopLevel::None);
+}
+
+#[test]
+fn slow_caps_the_drive_under_way_at_once_and_gives_it_back_without_a_resume() {
+    let mut rig = driving();
+    assert_eq!(speeds(&rig), [1_500, 1_500]);
+    rig.slow_disk = true;
+    rig.pass(1_000);
+    told(&mut rig, vec![stop(1, StopLevel::Slow)], vec![]);
+    assert_eq!((speeds(&rig), moves(&rig)), (vec![300, 300], true));
+    rig.flush();
+    serve(&mut rig, 1_000);
+    assert_eq!((speeds(&rig), level(&rig)), (vec![300, 300], StopLevel::Slow));
+    told(&mut rig, vec![], vec![reset(1)]);
+    assert_eq!((speeds(&rig), level(&rig), awaiting(&rig).len()), (vec![1_500, 1_500], StopLevel::None, 0));
+    assert!(moves(&rig));
+    assert_eq!(rig.body.log().levels, [StopLevel::Halt, StopLevel::None, StopLevel::Slow, StopLevel::None]);
+}
+
+#[test]
+fn what_was_halted_under_a_slow_stop_goes_on_slowly() {
+    let mut rig = halted();
+    told(&mut rig, vec![stop(2, StopLevel::Slow)], vec![reset(1)]);
+    resume(&mut rig, &[stop_id(1)], true);
+    serve(&mut rig, 2_000);
+    assert_eq!((moves(&rig), speeds(&rig)), (true, vec![300, 300]));
+}
+
+/// A stop of the part around B, which lies 5 m from A.
+fn around_b() -> Stop {
+    let region = Some(Region::of_box(4_500, -500, 5_500, 500));
+    Stop { scope: Scope::Area(AreaId::parse("hall").expect("a name")), region, ..stop(1, StopLevel::Halt) }
+}
+
+fn stand_at(rig: &Rig, x_mm: i32) {
+    rig.body.set(|log| log.pose = Pose { x_mm, ..Pose::default() });
+}
+
+#[test]
+fn a_stop_of_a_part_stands_who_is_inside_by_pose_and_who_does_not_know() {
+    let mut rig = driving();
+    told(&mut rig, vec![around_b()], vec![]);
+    assert_eq!((level(&rig), moves(&rig)), (StopLevel::None, true), "it is at A");
+    let mut rig = driving();
+    stand_at(&rig, 4_000);
+    told(&mut rig, vec![around_b()], vec![]);
+    assert_eq!((level(&rig), moves(&rig)), (StopLevel::Halt, false));
+    let mut rig = driving();
+    rig.body.set(|log| log.waypoint = None);
+    told(&mut rig, vec![around_b()], vec![]);
+    assert_eq!((level(&rig), moves(&rig)), (StopLevel::Halt, false), "it does not know where it is");
+    let mut rig = driving();
+    told(&mut rig, vec![Stop { region: None, ..around_b() }], vec![]);
+    assert_eq!((level(&rig), moves(&rig)), (StopLevel::Halt, false), "nobody says where");
+    let mut rig = driving();
+    let other = Scope::Robot(RobotId::parse("rbt-02").expect("a name"));
+    told(&mut rig, vec![Stop { scope: other, ..stop(1, StopLevel::Halt) }], vec![]);
+    assert!(moves(&rig));
+}
+
+#[test]
+fn a_robot_that_drives_into_a_stopped_part_stands_at_its_border() {
+    let mut rig = driving();
+    told(&mut rig, vec![around_b()], vec![]);
+    let mut x_mm = 0;
+    while moves(&rig) && x_mm < 5_000 {
+        let now = crate::rig::now_at(rig.ms);
+        let wake = rig.core.next_wake(&now);
+        let step = wake.site.map_or(1_000, |at| at.since(now.site).as_ms()).min(wake.link.since(now.link).as_ms());
+        assert!(step <= 100, "it looks after {step} ms");
+        rig.ms += step.max(1);
+        x_mm += 150 * step as i32 / 100;
+        stand_at(&rig, x_mm);
+        rig.put(Input::Tick);
+        answer(&mut rig);
+    }
+    assert!((2_500..2_700).contains(&x_mm), "it stands {x_mm} mm from where it set out");
+    assert_eq!(awaiting(&rig), ["STOP-1"]);
+}
+
+#[test]
+fn while_it_stands_nothing_begins_and_the_time_of_its_attempt_stands_still() {
+    let mut rig = halted();
+    serve(&mut rig, 700_000);
+    assert_eq!(rig.states().iter().find(|(state, _)| state.is_over()), None, "600 s were allowed");
+    // Another task: the work at hand is taken back, and nothing else is begun.
+    let other = Assignment { attempt: crate::rig::attempt("T2", 1), ..to_c(&rig) };
+    rig.work(rig.desired(None));
+    serve(&mut rig, 1_000);
+    assert_eq!(rig.states().last(), Some(&(WorkState::Aborted, 0)));
+    rig.work(rig.desired(Some(Assignment { offer: rig.authority(5_000), ..other })));
+    assert_eq!(rig.refusals(), ["ROBOT_STOPPED"]);
+    assert!(!moves(&rig));
+}
+
+#[test]
+fn an_errand_to_a_posture_or_a_charger_begins_nothing_either() {
+    for name in ["park", "charge"] {
+        let mut rig = free();
+        let steps = vec![action("inspect", Effect::Repeatable), action(name, Effect::Repeatable)];
+        let steps = vec![WorkStep { kind: action("pick", Effect::Repeatable).kind, ..steps[0].clone() }, steps[1].clone()];
+        rig.work(rig.desired(Some(rig.offer("T1", 1, steps, vec![]))));
+        told(&mut rig, vec![stop(1, StopLevel::Halt)], vec![]);
+        rig.body.done();
+        serve(&mut rig, 2_000);
+        let log = rig.body.log();
+        assert_eq!((log.parks, log.charging), (0, false), "{name}");
+        assert_eq!(rig.states().last(), Some(&(WorkState::Paused, 1)));
+    }
+}
+
+#[test]
+fn a_line_says_once_a_second_what_is_so_and_at_once_what_has_changed() {
+    let mut rig = free();
+    rig.stop.check_ins.clear();
+    for _ in 0..20 {
+        rig.silence(500);
+        let waiting = rig.stop.check_ins.last().cloned();
+        waiting.into_iter().for_each(|(nonce, _)| hear(&mut rig, StopNews::CheckedIn { nonce, generation: SYNCED }));
+    }
+    assert_eq!(rig.stop.check_ins.len(), 10);
+    let nonces: BTreeSet<u64> = rig.stop.check_ins.iter().map(|(nonce, _)| *nonce).collect();
+    assert_eq!(nonces.len(), 10, "each has a number of its own");
+    told(&mut rig, vec![stop(1, StopLevel::Slow)], vec![]);
+    let said = said(&rig);
+    assert_eq!((rig.stop.check_ins.len() > 10, said.obeys, said.silence), (true, StopLevel::Slow, Stage::Heard));
+}
