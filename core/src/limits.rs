@@ -262,3 +262,33 @@ pub const REGION_BOXES_MAX: usize = 128;
 pub const STOP_MARGIN_MM: i32 = 2_000;
 /// What a robot drives at most while a stop or a silence slows it, millimetres per second.
 pub const STOP_SLOW_MM_S: u32 = 300;
+/// Robots that the stop service knows at a time, and lines it holds: two sites of the largest size that is measured.
+pub const STOP_ROBOTS_MAX: usize = 20_000;
+/// A robot's line to the stop service on which nothing comes up, or nothing is read, for so long is closed.
+pub const STOP_LINE_SILENT: LinkDuration = LinkDuration::from_secs(10);
+/// A line says who comes within this, or is closed.
+pub const STOP_ATTEND_WITHIN: LinkDuration = LinkDuration::from_secs(5);
+/// Bytes of one message of stops and resets to a robot: what every client takes.
+pub const STOP_TOLD_BYTES: usize = 60 * 1024;
+/// Messages that wait for a robot to read them; with one more it is told everything anew when it reads again.
+pub const STOP_OUTBOX_MAX: usize = 16;
+/// Answers to check-ins that wait for a robot to read them; the oldest feed its ladder the least and go first.
+pub const STOP_ANSWERS_MAX: usize = 4;
+/// Someone who engages or resets waits at most this long for the disk before hearing that it is not durable yet.
+pub const STOP_DURABLE_WITHIN: LinkDuration = LinkDuration::from_secs(1);
+/// What the disk refused is tried again so often.
+pub const STOP_DISK_AGAIN: LinkDuration = LinkDuration::from_secs(1);
+/// Changes of robots are told to who engaged a stop at most so often.
+pub const STOP_CONFIRM_EVERY: LinkDuration = LinkDuration(50);
+/// And to who watches the whole.
+pub const STOP_STATUS_EVERY: LinkDuration = LinkDuration(100);
+/// Who engaged a stop is told of robots for so long at most.
+pub const STOP_CONFIRM_FOR: LinkDuration = LinkDuration::from_secs(120);
+/// Streams that tell of robots at a time. A stop is engaged also when there is no room for one more; its stream then says how it is, and ends.
+pub const STOP_WATCHERS_MAX: usize = 256;
+/// Request ids of stops that are remembered, the newest.
+pub const STOP_REQUESTS_MAX: usize = 1_024;
+/// Records of the audit of stops that wait for the disk; of more the count is kept.
+pub const STOP_AUDIT_QUEUE: usize = 1_024;
+/// Bytes of a slot of the latch file: 2,048 resets with their stops and 256 stops with 128 boxes each, as JSON.
+pub const STOP_LATCH_BYTES: usize = 8 * 1024 * 1024;

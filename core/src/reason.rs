@@ -75,6 +75,10 @@ codes! {
     Overloaded = "OVERLOADED", "A queue is full. Try again later.";
     DeadlineExceeded = "DEADLINE_EXCEEDED", "The call took longer than its deadline. The outcome is unknown; ask again with the same request_id.";
     Internal = "INTERNAL", "A fault of midshift. The request_id is in the log.";
+    // --- fleet stop
+    StopsFull = "STOPS_FULL", "As many stops are engaged as there may be; the last ones are kept for the whole fleet. Engage the whole fleet, or reset what is over.";
+    StopWasReset = "STOP_WAS_RESET", "The stop was reset, so nobody obeys it any more. Engage another one with a new request_id.";
+    LineReplaced = "LINE_REPLACED", "A newer line of this robot took the place of this one. If two machines use one robot id, find the second.";
     // --- software on the server
     SoftwareNotFound = "SOFTWARE_NOT_FOUND", "No signed release lists this file, or no document has this name. List bundles.";
     NoOnlineKeys = "NO_ONLINE_KEYS", "The server has no keys that may say which release is the newest. Start it with --ota-keys and the folder that holds them.";

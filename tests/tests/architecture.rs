@@ -12,6 +12,8 @@ const SPAWNS: &[(&str, &str)] = &[
     ("services/telemetry/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
     ("services/task/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
     ("services/ota/src/rollouts/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
+    ("services/stop/src/line.rs", "one task a robot's line: it must outlive the handler that opened it"),
+    ("services/stop/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
     ("services/midshift/src/scenario.rs", "the binary makes releases for a story"),
     ("services/midshift/src/scenario/watch.rs", "the binary looks at robots while a story is played"),
     ("services/midshift/src/backup/mod.rs", "files are copied and read beside the runtime's threads"),

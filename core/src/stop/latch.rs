@@ -90,7 +90,10 @@ impl Latch {
     /// Adds a stop. Whether anything is new.
     pub fn engage(&mut self, stop: Stop) -> bool {
         let known = self.stops.get(&stop.stop_id);
-        let joined = known.map_or_else(|| stop.clone(), |known| known.clone().join(stop.clone()));
+        let mut joined = known.map_or_else(|| stop.clone(), |known| known.clone().join(stop.clone()));
+        if self.resets.contains_key(&joined.stop_id) {
+            joined.region = None;
+        }
         let is_new = known != Some(&joined);
         if is_new {
             self.stops.insert(joined.stop_id.clone(), joined);
@@ -102,6 +105,10 @@ impl Latch {
     pub fn reset(&mut self, reset: Reset) -> bool {
         let newer = self.resets.get(&reset.stop_id).is_none_or(|known| *known < reset);
         if newer {
+            // Where a stop was matters to nobody any more, and is most of what it takes to keep one.
+            if let Some(stop) = self.stops.get_mut(&reset.stop_id) {
+                stop.region = None;
+            }
             self.resets.insert(reset.stop_id.clone(), reset);
         }
         newer

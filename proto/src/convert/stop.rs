@@ -6,6 +6,7 @@ use midshift_core::ids::{AreaId, PlaceId, RobotId, StopId};
 use midshift_core::limits;
 use midshift_core::reason::Violations;
 use midshift_core::robot::StopLevel;
+use midshift_core::stop::ladder::{Around, Stage};
 use midshift_core::stop::region::Bounds;
 use midshift_core::stop::{Region, Reset, Scope, Stop};
 use midshift_core::time::Utc;
@@ -137,6 +138,118 @@ impl Parse<Reset> for v1::Reset {
     }
 }
 
+/// What comes up a robot's line.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ToStop {
+    /// Who comes, and which stops it keeps.
+    Attend {
+        /// Who.
+        robot_id: RobotId,
+        /// New for each start of its agent.
+        boot_id: String,
+        /// Engaged and not reset, as far as it knows.
+        stops: Vec<Stop>,
+    },
+    /// What it does now.
+    CheckIn(CheckIn),
+}
+
+/// What a robot says of itself, and the number that proves that both still think.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct CheckIn {
+    /// Never used before by this robot.
+    pub nonce: u64,
+    /// Newest state of the latch that it has taken over.
+    pub generation: u64,
+    /// What it took over survives its own end.
+    pub is_durable: bool,
+    /// What it obeys.
+    pub level: StopLevel,
+    /// It stands and will not move by itself.
+    pub is_still: bool,
+    /// Effective stops that it lies inside of.
+    pub inside: Vec<StopId>,
+    /// What waits for a person's resume.
+    pub awaiting: Vec<StopId>,
+    /// How far its silence had come.
+    pub stage: Stage,
+    /// Whom it has around itself.
+    pub around: Around,
+}
+
+/// How long the name of a start of an agent may be, bytes.
+const BOOT_BYTES_MAX: usize = 64;
+
+impl From<&ToStop> for v1::AttendRequest {
+    fn from(said: &ToStop) -> Self {
+        use v1::attend_request::Message as W;
+        let message = match said {
+            ToStop::Attend { robot_id, boot_id, stops } => W::Attend(v1::Attend {
+                robot_id: robot_id.to_string(),
+                boot_id: boot_id.clone(),
+                stops: stops.iter().map(Into::into).collect(),
+            }),
+            ToStop::CheckIn(said) => W::CheckIn(v1::CheckIn {
+                nonce: said.nonce,
+                generation: said.generation,
+                durable: said.is_durable,
+                obeys: said.level.to_wire(),
+                standstill: said.is_still,
+                inside: names(&said.inside),
+                awaiting_resume: names(&said.awaiting),
+                silence: said.stage.to_wire(),
+                without_people: said.around == Around::Robots,
+            }),
+        };
+        Self { message: Some(message) }
+    }
+}
+
+impl Parse<ToStop> for v1::AttendRequest {
+    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<ToStop> {
+        use v1::attend_request::Message as W;
+        match self.message {
+            Some(W::Attend(attend)) => {
+                let at = at.field("attend");
+                let robot_id = id(&attend.robot_id, RobotId::parse, at.field("robot_id"), bad);
+                let boot_id = text(attend.boot_id, BOOT_BYTES_MAX, at.field("boot_id"), bad);
+                if attend.stops.len() > limits::STOPS_MAX {
+                    bad.add(at.field("stops").to_string(), format!("must be at most {}", limits::STOPS_MAX));
+                    return None;
+                }
+                let stops = list(attend.stops, at.field("stops"), bad);
+                Some(ToStop::Attend { robot_id: robot_id?, boot_id: boot_id?, stops: stops? })
+            }
+            Some(W::CheckIn(said)) => said.parse_at(at.field("check_in"), bad).map(ToStop::CheckIn),
+            None => {
+                bad.add(at.field("message").to_string(), "is required");
+                None
+            }
+        }
+    }
+}
+
+impl Parse<CheckIn> for v1::CheckIn {
+    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<CheckIn> {
+        let generation = counted(self.generation, at.field("generation"), bad);
+        let level = word(self.obeys, at.field("obeys"), bad);
+        let inside = stop_ids(&self.inside, at.field("inside"), bad);
+        let awaiting = stop_ids(&self.awaiting_resume, at.field("awaiting_resume"), bad);
+        let stage = word(self.silence, at.field("silence"), bad);
+        Some(CheckIn {
+            nonce: self.nonce,
+            generation: generation?,
+            is_durable: self.durable,
+            level: level?,
+            is_still: self.standstill,
+            inside: inside?,
+            awaiting: awaiting?,
+            stage: stage?,
+            around: if self.without_people { Around::Robots } else { Around::People },
+        })
+    }
+}
+
 /// What comes down a robot's line.
 #[derive(Clone, Debug, PartialEq)]
 pub enum FromStop {
@@ -219,6 +332,32 @@ mod tests {
         for scope in [Scope::Fleet, Scope::Robot(RobotId::parse("r1").expect("an id"))] {
             assert_eq!(parse::<Scope, _>(v1::Scope::from(&scope)), Ok(scope));
         }
+    }
+
+    #[test]
+    fn what_a_robot_says_reads_back_and_a_wrong_word_of_it_is_told() {
+        let check_in = CheckIn {
+            nonce: 9,
+            generation: 5,
+            is_durable: true,
+            level: StopLevel::Halt,
+            is_still: true,
+            inside: vec![stop().stop_id],
+            awaiting: vec![stop().stop_id],
+            stage: Stage::Slow,
+            around: Around::Robots,
+        };
+        let robot_id = RobotId::parse("r1").expect("an id");
+        let said = [
+            ToStop::CheckIn(check_in),
+            ToStop::Attend { robot_id, boot_id: "b".to_owned(), stops: vec![stop()] },
+        ];
+        for said in said {
+            assert_eq!(parse::<ToStop, _>(v1::AttendRequest::from(&said)), Ok(said));
+        }
+        let message = Some(v1::attend_request::Message::CheckIn(v1::CheckIn::default()));
+        let refusal = parse::<ToStop, _>(v1::AttendRequest { message }).expect_err("no silence stage");
+        assert_eq!(refusal.violations[0].field, "check_in.silence");
     }
 
     #[test]

@@ -1,0 +1,183 @@
+//! What changes the latch: engaging, taking a lost stop from a robot, resetting.
+//!
+//! Invariant: a stop goes to all lines before anything waits for the disk; changes reach every line in the order of their generations. What is answered
+//! was written and recorded, or says that it was not.
+
+use crate::audit::{Action, Note};
+use crate::law::{Asked, Law, Resetting};
+use crate::outbox::Frame;
+use crate::{Inner, frames, lock};
+use midshift_core::ids::{RequestId, RobotId, StopId};
+use midshift_core::reason::{Code, Kind, Reason, Refusal};
+use midshift_core::robot::StopLevel;
+use midshift_core::stop::latch::is_past;
+use midshift_core::stop::{Reset, Scope, Stop};
+use midshift_core::time::{Now, Utc};
+use std::collections::BTreeSet;
+
+/// What somebody wants stopped.
+pub struct Wanted {
+    /// Whom.
+    pub scope: Scope,
+    /// How.
+    pub level: StopLevel,
+    /// Why; may be empty.
+    pub reason: String,
+    /// Protects against a double call, with the hash of the request.
+    pub request: Option<(RequestId, String)>,
+    /// Who.
+    pub actor: String,
+}
+
+/// A stop that is engaged.
+pub struct Engaged {
+    /// It.
+    pub stop: Stop,
+    /// What the disk must have had its turn with.
+    pub version: u64,
+}
+
+/// Engages a stop and tells all lines.
+///
+/// # Errors
+/// No such part of the site; no room; the request was another one, or its stop was reset. Nothing is engaged then.
+pub fn engage(inner: &Inner, wanted: Wanted) -> Result<Engaged, Refusal> {
+    let region = inner.ground.region(&wanted.scope)?;
+    let now = inner.clock.now();
+    let fan = lock(&inner.fan);
+    let mut law = lock(&inner.law);
+    if let Some(engaged) = before(&law, &wanted)? {
+        return Ok(engaged);
+    }
+    law.room(&wanted.scope)?;
+    let (actor, reason) = (wanted.actor, wanted.reason);
+    let (scope, level) = (wanted.scope, wanted.level);
+    let mut stop =
+        Stop { stop_id: law.draw(now.wall), scope, level, engaged: now.wall, actor, reason, region, proof: Vec::new() };
+    inner.key.mark(&mut stop);
+    let request_id = wanted.request.as_ref().map(|(id, _)| id.to_string());
+    let asked = wanted.request.map(|(id, hash)| (id, Asked { stop_id: stop.stop_id.clone(), hash, at: now.wall }));
+    let generation = law.engage(stop.clone(), asked);
+    let version = law.version();
+    let note = note(Action::Engaged, &stop, now.wall);
+    inner.disk.note(request_id.iter().fold(note, |note, id| note.with("request_id", id)));
+    drop(law);
+    let told = generation.map_or(0, |generation| tell(inner, &stop, generation, &now));
+    drop(fan);
+    inner.disk.wake();
+    inner.touch();
+    metrics::counter!("midshift_stop_engaged_total").increment(1);
+    tracing::warn!(stop_id = %stop.stop_id, level = ?stop.level, told, "stop engaged");
+    Ok(Engaged { stop, version })
+}
+
+/// What the same request engaged before.
+fn before(law: &Law, wanted: &Wanted) -> Result<Option<Engaged>, Refusal> {
+    let Some((request_id, hash)) = &wanted.request else { return Ok(None) };
+    let Some(asked) = law.asked(request_id) else { return Ok(None) };
+    if asked.hash != *hash {
+        let text = "this request_id engaged another stop; nothing more was stopped";
+        let reason = Reason::new(Code::RequestIdReused, text).with("stop_id", &asked.stop_id);
+        return Err(Refusal::new(Kind::AlreadyExists, reason));
+    }
+    match law.latch().stop(&asked.stop_id).filter(|stop| law.latch().is_effective(&stop.stop_id)) {
+        Some(stop) => Ok(Some(Engaged { stop: stop.clone(), version: law.version() })),
+        None => Err(was_reset(&asked.stop_id)),
+    }
+}
+
+/// Nobody obeys it any more.
+pub fn was_reset(stop_id: &StopId) -> Refusal {
+    Refusal::new(Kind::Precondition, Reason::from(Code::StopWasReset).with("stop_id", stop_id))
+}
+
+/// Takes stops of the service's own making, which it has lost, from a robot. The others come back: they are only shown.
+pub fn adopt(inner: &Inner, robot_id: &RobotId, stops: Vec<Stop>) -> BTreeSet<StopId> {
+    let now = inner.clock.now();
+    let mut foreign = BTreeSet::new();
+    let (mut is_lost, mut adopted) = (Vec::new(), 0);
+    {
+        let law = lock(&inner.law);
+        for stop in stops {
+            let latch = law.latch();
+            if latch.stop(&stop.stop_id).is_none() && latch.reset_of(&stop.stop_id).is_none() {
+                is_lost.push(stop);
+            }
+        }
+    }
+    // Outside of the lock: a signature takes its time.
+    let (own, others): (Vec<Stop>, Vec<Stop>) =
+        is_lost.into_iter().partition(|stop| !is_past(stop.engaged, now.wall) && inner.key.knows(stop));
+    foreign.extend(others.into_iter().map(|stop| stop.stop_id));
+    let _fan = lock(&inner.fan);
+    for stop in own {
+        let mut law = lock(&inner.law);
+        if law.latch().reset_of(&stop.stop_id).is_some() {
+            continue;
+        }
+        if law.room(&stop.scope).is_err() {
+            foreign.insert(stop.stop_id);
+            continue;
+        }
+        let Some(generation) = law.engage(stop.clone(), None) else { continue };
+        inner.disk.note(note(Action::Adopted, &stop, now.wall).with("robot_id", robot_id));
+        drop(law);
+        tell(inner, &stop, generation, &now);
+        adopted += 1;
+        metrics::counter!("midshift_stop_adopted_total").increment(1);
+        tracing::warn!(stop_id = %stop.stop_id, %robot_id, "a lost stop was taken from a robot");
+    }
+    if adopted > 0 {
+        inner.disk.wake();
+        inner.touch();
+    }
+    foreign
+}
+
+/// Notes a reset. It counts after the disk's turn, see [`settle`].
+pub fn reset(inner: &Inner, stop_id: StopId, reason: String, actor: String) -> Resetting {
+    let now = inner.clock.now();
+    let mut law = lock(&inner.law);
+    let resetting = law.reset(Reset { stop_id, at: now.wall, actor, reason });
+    if resetting.is_new {
+        let Reset { stop_id, actor, reason, .. } = &resetting.reset;
+        let note = Note { actor: actor.clone(), ..Note::own(now.wall, Action::Reset) };
+        inner.disk.note(
+            note.with("stop_id", stop_id).with("reason", reason).with("was_engaged", resetting.was_engaged),
+        );
+    }
+    drop(law);
+    inner.disk.wake();
+    resetting
+}
+
+/// The disk had its turn with all up to `version`, or is not waited for any longer: resets among them count now, and all lines hear so.
+pub fn settle(inner: &Inner, version: u64) {
+    let now = inner.clock.now();
+    let fan = lock(&inner.fan);
+    let settled = lock(&inner.law).settle(version, now.wall);
+    if settled.is_empty() {
+        return;
+    }
+    for (reset, generation) in settled {
+        for bytes in frames::told([], [&reset], generation) {
+            let resets = [reset.stop_id.clone()].into();
+            inner.robots.tell(&Frame { generation, bytes, resets }, now.link);
+        }
+        metrics::counter!("midshift_stop_reset_total").increment(1);
+        tracing::warn!(stop_id = %reset.stop_id, "stop reset");
+    }
+    drop(fan);
+    inner.touch();
+}
+
+fn tell(inner: &Inner, stop: &Stop, generation: u64, now: &Now) -> usize {
+    let told = frames::told([stop], [], generation).into_iter();
+    told.map(|bytes| inner.robots.tell(&Frame { generation, bytes, resets: [].into() }, now.link)).sum()
+}
+
+fn note(action: Action, stop: &Stop, at: Utc) -> Note {
+    let Stop { stop_id, scope, level, actor, reason, .. } = stop;
+    let note = Note { actor: actor.clone(), ..Note::own(at, action) };
+    note.with("stop_id", stop_id).with("scope", scope).with("level", format!("{level:?}")).with("reason", reason)
+}

@@ -1,0 +1,154 @@
+//! How far robots are with one stop, for whoever engaged it: the whole, then what changed.
+//!
+//! Invariant: what is told of a robot is what [`confirmation`] makes of its own newest word; nothing is confirmed by time. Leaving early takes nothing back.
+
+use crate::acts::was_reset;
+use crate::{Inner, Times, lock};
+use midshift_core::ids::RobotId;
+use midshift_core::limits;
+use midshift_core::reason::Refusal;
+use midshift_core::robot::StopLevel;
+use midshift_core::stop::roster::{Confirmation, confirmation};
+use midshift_core::stop::{Scope, Stop};
+use midshift_core::time::Now;
+use midshift_proto::convert::WireEnum;
+use midshift_proto::stop::v1;
+use std::collections::BTreeMap;
+use std::time::Duration;
+use tokio::sync::{mpsc, watch};
+use tonic::Status;
+
+/// Silence becomes visible at most this late.
+const LOOK_EVERY: Duration = Duration::from_millis(250);
+
+/// Adds one robot.
+pub fn count(counts: &mut v1::Counts, confirmation: Confirmation) {
+    *match confirmation {
+        Confirmation::Requested => &mut counts.requested,
+        Confirmation::Acked => &mut counts.acked,
+        Confirmation::Outside => &mut counts.outside,
+        Confirmation::StandstillConfirmed => &mut counts.standstill_confirmed,
+        Confirmation::Unreachable { .. } => &mut counts.unreachable,
+    } += 1;
+}
+
+fn encode(robot_id: &RobotId, confirmation: Confirmation, obeys: StopLevel, now: &Now) -> v1::RobotStop {
+    use v1::Confirmation as W;
+    let (word, since, by) = match confirmation {
+        Confirmation::Requested => (W::Requested, None, None),
+        Confirmation::Acked => (W::Acked, None, None),
+        Confirmation::Outside => (W::Outside, None, None),
+        Confirmation::StandstillConfirmed => (W::StandstillConfirmed, None, None),
+        Confirmation::Unreachable { since, self_stop_by } => (W::Unreachable, since, self_stop_by),
+    };
+    v1::RobotStop {
+        robot_id: robot_id.to_string(),
+        confirmation: word.into(),
+        unreachable_since_unix_ms: since.map_or(0, |at| now.wall_at(at).0),
+        self_stop_by_unix_ms: by.map_or(0, |at| now.wall_at(at).0),
+        obeys: obeys.to_wire(),
+    }
+}
+
+/// What a look at all robots found.
+struct Seen {
+    news: Vec<v1::RobotStop>,
+    counts: v1::Counts,
+    /// Nothing more is to come by itself.
+    is_over: bool,
+}
+
+struct Watching<'a> {
+    inner: &'a Inner,
+    stop: Stop,
+    told: BTreeMap<RobotId, (Confirmation, StopLevel)>,
+}
+
+impl Watching<'_> {
+    /// # Errors
+    /// The stop was reset.
+    fn look(&mut self, now: &Now) -> Result<Seen, Refusal> {
+        let stop_id = &self.stop.stop_id;
+        let law = lock(&self.inner.law);
+        let since = law.effective().find(|(stop, _)| stop.stop_id == *stop_id).map(|(_, since)| since);
+        drop(law);
+        let since = since.ok_or_else(|| was_reset(stop_id))?;
+        let robots = self.inner.robots.all();
+        let mut seen = Seen { news: Vec::new(), counts: v1::Counts::default(), is_over: true };
+        let mut found = BTreeMap::new();
+        for robot in &robots {
+            let said = robot.said();
+            let heard = said.heard.as_ref();
+            let confirmation = confirmation(&self.stop, since, heard, now.link);
+            found.insert(robot.robot_id.clone(), (confirmation, heard.map(|h| h.level).unwrap_or_default()));
+        }
+        if let Scope::Robot(robot_id) = &self.stop.scope {
+            // One that nobody knows of: nobody knows either whether it stands.
+            let unknown = (confirmation(&self.stop, since, None, now.link), StopLevel::None);
+            found.entry(robot_id.clone()).or_insert(unknown);
+        }
+        for (robot_id, (confirmation, obeys)) in &found {
+            count(&mut seen.counts, *confirmation);
+            seen.is_over &= confirmation.is_settled(&self.stop) || self.has_stood_by_itself(*confirmation, now);
+            if self.told.get(robot_id) != Some(&(*confirmation, *obeys)) {
+                seen.news.push(encode(robot_id, *confirmation, *obeys, now));
+            }
+        }
+        self.told = found;
+        Ok(seen)
+    }
+
+    /// A robot that is not heard stands by its own silence by now. One that was never heard was answered by nobody since this process began.
+    fn has_stood_by_itself(&self, confirmation: Confirmation, now: &Now) -> bool {
+        match confirmation {
+            Confirmation::Unreachable { self_stop_by: Some(by), .. } => now.link >= by,
+            Confirmation::Unreachable { self_stop_by: None, .. } => {
+                now.link.since(self.inner.started) >= limits::SILENCE_STAND
+            }
+            _ => false,
+        }
+    }
+}
+
+/// Tells of a stop until nothing more is to come, or the reader leaves. `may_stay`: there is room for one more reader; else it is told once.
+pub async fn tell(
+    inner: &Inner,
+    stop: Stop,
+    mut durable: bool,
+    version: u64,
+    may_stay: bool,
+    sender: mpsc::Sender<Result<v1::EngageResponse, Status>>,
+) {
+    let mut changed: watch::Receiver<u64> = inner.changed.subscribe();
+    let begun = inner.clock.now().link;
+    let mut watching = Watching { inner, stop, told: BTreeMap::new() };
+    let mut first = Some(v1::Stop::from(&watching.stop));
+    loop {
+        changed.mark_unchanged();
+        let now = inner.clock.now();
+        let seen = match watching.look(&now) {
+            Ok(seen) => seen,
+            Err(refusal) => {
+                let _ = sender.send(Err(midshift_proto::status(&refusal, None))).await;
+                return;
+            }
+        };
+        let was_durable = durable;
+        durable |= inner.disk.holds(version);
+        if first.is_some() || !seen.news.is_empty() || durable != was_durable {
+            let (stop, robots, counts) = (first.take(), seen.news, Some(seen.counts));
+            if sender.send(Ok(v1::EngageResponse { stop, robots, counts, durable })).await.is_err() {
+                return;
+            }
+        }
+        if seen.is_over || !may_stay || now.link.since(begun) >= limits::STOP_CONFIRM_FOR {
+            return;
+        }
+        tokio::time::sleep(Duration::from_millis(limits::STOP_CONFIRM_EVERY.as_ms())).await;
+        tokio::select! {
+            () = sender.closed() => return,
+            _ = changed.changed() => {}
+            () = tokio::time::sleep(LOOK_EVERY) => {}
+        }
+    }
+}

@@ -1,0 +1,201 @@
+//! The one writer of the folder: the latch, then the audit, then the audit's last hash into the latch.
+//!
+//! Invariant: who engages or resets waits for a turn of this writer and no longer than [`limits::STOP_DURABLE_WITHIN`]; what the disk refused is tried again
+//! each second and with each change. Records that wait are bounded, and those left out are counted.
+
+use crate::audit::{Action, Audit, Note, Tail};
+use crate::law::Kept;
+use crate::{Inner, acts, blocking, lock};
+use midshift_core::limits;
+use midshift_core::time::Utc;
+use midshift_latch::{Error, LatchFile};
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+use tokio::sync::{Notify, watch};
+
+/// How far the disk is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Outcome {
+    /// It had its turn with this.
+    tried: u64,
+    /// It holds this.
+    kept: u64,
+}
+
+#[derive(Default)]
+struct Queue {
+    notes: VecDeque<Note>,
+    dropped: u64,
+}
+
+/// What the rest of the service knows of the disk.
+#[derive(Default)]
+pub struct Disk {
+    queue: Mutex<Queue>,
+    wake: Notify,
+    outcome: watch::Sender<Outcome>,
+}
+
+impl Disk {
+    /// A record to write.
+    pub fn note(&self, note: Note) {
+        let mut queue = lock(&self.queue);
+        if queue.notes.len() < limits::STOP_AUDIT_QUEUE {
+            queue.notes.push_back(note);
+        } else {
+            queue.dropped += 1;
+            metrics::counter!("midshift_stop_audit_dropped_total").increment(1);
+        }
+    }
+    /// There is something to do.
+    pub fn wake(&self) {
+        self.wake.notify_one();
+    }
+    /// Waits for the disk's turn with `version`. Whether it is durable.
+    pub async fn turn(&self, version: u64) -> bool {
+        let mut outcome = self.outcome.subscribe();
+        let within = Duration::from_millis(limits::STOP_DURABLE_WITHIN.as_ms());
+        let turn = outcome.wait_for(|outcome| outcome.tried >= version);
+        matches!(tokio::time::timeout(within, turn).await, Ok(Ok(outcome)) if outcome.kept >= version)
+    }
+    /// Whether it holds `version`.
+    pub fn holds(&self, version: u64) -> bool {
+        self.outcome.borrow().kept >= version
+    }
+    fn take(&self, now: Utc) -> Vec<Note> {
+        let mut queue = lock(&self.queue);
+        let mut notes: Vec<Note> = queue.notes.drain(..).collect();
+        let dropped = std::mem::take(&mut queue.dropped);
+        if dropped > 0 {
+            notes.push(Note::own(now, Action::Dropped).with("records", dropped));
+        }
+        notes
+    }
+    fn put_back(&self, notes: Vec<Note>) {
+        let mut queue = lock(&self.queue);
+        for note in notes.into_iter().rev() {
+            match note.fields.get("records").filter(|_| note.action == Action::Dropped) {
+                Some(records) => queue.dropped += records.parse::<u64>().unwrap_or(1),
+                None => queue.notes.push_front(note),
+            }
+        }
+    }
+    fn is_empty(&self) -> bool {
+        let queue = lock(&self.queue);
+        queue.notes.is_empty() && queue.dropped == 0
+    }
+}
+
+/// The files.
+pub struct Writer {
+    /// The latch.
+    pub file: LatchFile,
+    /// The audit.
+    pub audit: Audit,
+    /// The last record that the latch file knows of.
+    pub known: Tail,
+}
+
+/// What became of one turn.
+struct Turn {
+    latch: Result<(), Error>,
+    audit: Result<(), (std::io::Error, Vec<Note>)>,
+}
+
+impl Writer {
+    fn turn(&mut self, kept: Option<Kept>, notes: Vec<Note>, now: Utc) -> Turn {
+        let latch = match &kept {
+            Some(kept) => self.file.write(kept).map(|()| self.known = kept.audit.clone()),
+            None => Ok(()),
+        };
+        let audit = match notes.is_empty() {
+            true => Ok(()),
+            false => self.audit.append(&notes, now).map_err(|error| (error, notes)),
+        };
+        Turn { latch, audit }
+    }
+}
+
+/// Which files refuse.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Refusing {
+    latch: bool,
+    audit: bool,
+}
+
+/// Writes until shutdown, and once more then.
+pub async fn keep(inner: &Arc<Inner>, mut writer: Writer) {
+    let mut refusing = Refusing::default();
+    loop {
+        let is_last = inner.shutdown.is_cancelled();
+        // Whatever comes from now on wakes it again.
+        let version = lock(&inner.law).version();
+        let is_due = !inner.disk.holds(version);
+        let tail_is_due = writer.audit.tail() != &writer.known;
+        if is_due || tail_is_due || !inner.disk.is_empty() {
+            let before = refusing;
+            (writer, refusing) = turn(inner, writer, version, is_due || tail_is_due).await;
+            said(before, refusing);
+            if refusing == Refusing::default() && !is_last {
+                continue;
+            }
+        }
+        if is_last {
+            return;
+        }
+        let again = Duration::from_millis(limits::STOP_DISK_AGAIN.as_ms());
+        tokio::select! {
+            () = inner.disk.wake.notified() => {}
+            () = inner.shutdown.cancelled() => {}
+            () = tokio::time::sleep(again), if refusing != Refusing::default() => {}
+        }
+    }
+}
+
+async fn turn(inner: &Arc<Inner>, mut writer: Writer, version: u64, is_due: bool) -> (Writer, Refusing) {
+    let now = inner.clock.now().wall;
+    let kept = is_due.then(|| lock(&inner.law).kept(writer.audit.tail().clone()));
+    let notes = inner.disk.take(now);
+    let (back, turn) = blocking(move || {
+        let turn = writer.turn(kept, notes, now);
+        (writer, turn)
+    })
+    .await;
+    let mut refusing = Refusing::default();
+    if let Err(error) = &turn.latch {
+        refusing.latch = true;
+        tracing::debug!(%error, "the latch was not written");
+        if matches!(error, Error::TooLarge { .. }) {
+            tracing::error!("the latch does not fit its file: the older half of its resets is forgotten");
+            lock(&inner.law).shorten(now);
+        }
+    }
+    if let Err((error, notes)) = turn.audit {
+        refusing.audit = true;
+        tracing::debug!(%error, "the audit was not written");
+        inner.disk.put_back(notes);
+    }
+    acts::settle(inner, version);
+    inner.disk.outcome.send_modify(|outcome| {
+        outcome.tried = outcome.tried.max(version);
+        if is_due && !refusing.latch {
+            outcome.kept = outcome.kept.max(version);
+        }
+    });
+    inner.touch();
+    (back, refusing)
+}
+
+/// One line a change.
+fn said(before: Refusing, now: Refusing) {
+    metrics::gauge!("midshift_stop_latch_durable").set(f64::from(u8::from(!now.latch)));
+    metrics::gauge!("midshift_stop_audit_durable").set(f64::from(u8::from(!now.audit)));
+    for (file, before, now) in [("latch", before.latch, now.latch), ("audit", before.audit, now.audit)] {
+        match (before, now) {
+            (false, true) => tracing::error!(file, "the disk refuses a file of the stop service; it goes on in memory and tries again"),
+            (true, false) => tracing::warn!(file, "the disk takes a file of the stop service again"),
+            _ => {}
+        }
+    }
+}

@@ -1,0 +1,107 @@
+//! The robots' face, by hand: what generated code does, with messages that are bytes already.
+//!
+//! A stop goes to all robots as it was encoded once. Invariant: the wire is that of `stop_link_service.proto`; a generated client cannot tell.
+
+use crate::line;
+use crate::outbox::Down;
+use crate::{Inner, StopService};
+use bytes::{BufMut, Bytes};
+use midshift_core::limits;
+use midshift_proto::stop::v1;
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use tonic::body::Body;
+use tonic::codec::{BufferSettings, Codec, EncodeBuf, Encoder};
+use tonic::codegen::{Body as HttpBody, BoxFuture, Service, StdError, http};
+use tonic::server::{Grpc, NamedService, StreamingService};
+use tonic::{Request, Response, Status, Streaming};
+use tonic_prost::{ProstCodec, ProstDecoder};
+
+/// Bytes of a buffer each way at first, and when it is handed on: a line is quiet, and there are many.
+const BUFFER: (usize, usize) = (512, 32 * 1024);
+
+/// `midshift.stop.v1.StopLinkService`. Cheap to clone.
+#[derive(Clone)]
+pub struct LinkFace(Arc<Inner>);
+
+impl StopService {
+    /// The robots' face.
+    pub fn link(&self) -> LinkFace {
+        LinkFace(self.inner.clone())
+    }
+}
+
+struct Ready;
+struct AsIs;
+
+impl Codec for Ready {
+    type Encode = Bytes;
+    type Decode = v1::AttendRequest;
+    type Encoder = AsIs;
+    type Decoder = ProstDecoder<v1::AttendRequest>;
+
+    fn encoder(&mut self) -> AsIs {
+        AsIs
+    }
+    fn decoder(&mut self) -> Self::Decoder {
+        ProstCodec::<v1::AttendResponse, v1::AttendRequest>::raw_decoder(BufferSettings::new(BUFFER.0, BUFFER.1))
+    }
+}
+
+impl Encoder for AsIs {
+    type Item = Bytes;
+    type Error = Status;
+
+    fn encode(&mut self, item: Bytes, buffer: &mut EncodeBuf<'_>) -> Result<(), Status> {
+        buffer.put(item);
+        Ok(())
+    }
+    fn buffer_settings(&self) -> BufferSettings {
+        BufferSettings::new(BUFFER.0, BUFFER.1)
+    }
+}
+
+struct Attend(Arc<Inner>);
+
+impl StreamingService<v1::AttendRequest> for Attend {
+    type Response = Bytes;
+    type ResponseStream = Down;
+    type Future = BoxFuture<Response<Down>, Status>;
+
+    fn call(&mut self, request: Request<Streaming<v1::AttendRequest>>) -> Self::Future {
+        let inner = self.0.clone();
+        Box::pin(async move { line::attend(inner, request.into_inner()).await })
+    }
+}
+
+impl<B> Service<http::Request<B>> for LinkFace
+where
+    B: HttpBody + Send + 'static,
+    B::Error: Into<StdError> + Send + 'static,
+{
+    type Response = http::Response<Body>;
+    type Error = Infallible;
+    type Future = BoxFuture<Self::Response, Infallible>;
+
+    fn poll_ready(&mut self, _: &mut Context<'_>) -> Poll<Result<(), Infallible>> {
+        Poll::Ready(Ok(()))
+    }
+
+    fn call(&mut self, request: http::Request<B>) -> Self::Future {
+        let inner = self.0.clone();
+        Box::pin(async move {
+            if request.uri().path() != "/midshift.stop.v1.StopLinkService/Attend" {
+                return Ok(Status::unimplemented("").into_http());
+            }
+            // A robot brings up to 256 stops with 128 boxes each.
+            let mut grpc =
+                Grpc::new(Ready).apply_max_message_size_config(Some(limits::TELEMETRY_BATCH_BYTES), None);
+            Ok(grpc.streaming(Attend(inner), request).await)
+        })
+    }
+}
+
+impl NamedService for LinkFace {
+    const NAME: &'static str = "midshift.stop.v1.StopLinkService";
+}

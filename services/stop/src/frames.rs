@@ -1,0 +1,61 @@
+//! Messages to robots as bytes: encoded once, whatever the number of robots that are told.
+//!
+//! Invariant: no message is larger than [`limits::STOP_TOLD_BYTES`], except for one stop or reset that is, and none is.
+
+use bytes::Bytes;
+use midshift_core::limits;
+use midshift_core::stop::{Reset, Stop};
+use midshift_proto::stop::v1::{self, attend_response::Message as W};
+use prost::Message;
+
+fn encoded(message: W) -> Bytes {
+    v1::AttendResponse { message: Some(message) }.encode_to_vec().into()
+}
+
+/// Stops and resets, in as many messages as they need. `generation` 0: they are a part of what `synced` ends.
+pub fn told<'a>(
+    stops: impl IntoIterator<Item = &'a Stop>,
+    resets: impl IntoIterator<Item = &'a Reset>,
+    generation: u64,
+) -> Vec<Bytes> {
+    let (mut all, mut next, mut bytes) = (Vec::new(), v1::Told { generation, ..v1::Told::default() }, 0);
+    let mut room_for = |more: usize, next: &mut v1::Told| {
+        if bytes + more > limits::STOP_TOLD_BYTES && bytes > 0 {
+            let full = std::mem::replace(next, v1::Told { generation, ..v1::Told::default() });
+            all.push(encoded(W::Told(full)));
+            bytes = 0;
+        }
+        bytes += more;
+    };
+    // A tag and a length come before each.
+    const FRAME: usize = 8;
+    for stop in stops {
+        let stop = v1::Stop::from(stop);
+        room_for(stop.encoded_len() + FRAME, &mut next);
+        next.stops.push(stop);
+    }
+    for reset in resets {
+        let reset = v1::Reset::from(reset);
+        room_for(reset.encoded_len() + FRAME, &mut next);
+        next.resets.push(reset);
+    }
+    if bytes > 0 {
+        all.push(encoded(W::Told(next)));
+    }
+    all
+}
+
+/// All that is effective was said.
+pub fn synced(generation: u64) -> Bytes {
+    encoded(W::Synced(v1::Synced { generation }))
+}
+
+/// The answer to a check-in.
+pub fn checked_in(nonce: u64, generation: u64) -> Bytes {
+    encoded(W::CheckedIn(v1::CheckedIn { nonce, generation }))
+}
+
+/// Dial again.
+pub fn move_over() -> Bytes {
+    encoded(W::MoveOver(v1::MoveOver {}))
+}

@@ -1,0 +1,78 @@
+//! Where parts of the site are, found once at the start: an engage must not wait for it.
+
+use midshift_core::ids::{AreaId, PlaceId};
+use midshift_core::reason::{Code, Kind, Reason, Refusal};
+use midshift_core::site::Site;
+use midshift_core::stop::{Region, Scope};
+use std::collections::BTreeMap;
+use std::fmt::Display;
+
+/// Names that a refusal lists; of more it says how many.
+const NAMES_MAX: usize = 24;
+
+/// The regions of all parts.
+#[derive(Default)]
+pub struct Ground(Option<Parts>);
+
+struct Parts {
+    areas: BTreeMap<AreaId, Option<Region>>,
+    zones: BTreeMap<PlaceId, Option<Region>>,
+}
+
+impl Ground {
+    /// Of a site. None: there is no site file, and every part means everywhere.
+    pub fn of(site: Option<&Site>) -> Self {
+        // A part without a place on the map is everywhere.
+        let placed = |region: Option<Region>| region.filter(|region| !region.boxes().is_empty());
+        Self(site.map(|site| {
+            let areas = site.areas().iter().map(|a| (a.area_id.clone(), placed(Region::of_area(site, &a.area_id))));
+            let zones = site.places().iter().map(|p| (p.place_id.clone(), placed(Region::of_zone(site, &p.place_id))));
+            Parts { areas: areas.collect(), zones: zones.collect() }
+        }))
+    }
+
+    /// Where a stop is.
+    ///
+    /// # Errors
+    /// A part that the site does not have.
+    pub fn region(&self, scope: &Scope) -> Result<Option<Region>, Refusal> {
+        let Some(parts) = &self.0 else { return Ok(None) };
+        match scope {
+            Scope::Robot(_) | Scope::Fleet => Ok(None),
+            Scope::Area(id) => parts.areas.get(id).cloned().ok_or_else(|| {
+                let reason = Reason::new(Code::AreaNotFound, none("area", id, parts.areas.keys()));
+                Refusal::new(Kind::NotFound, reason.with("area_id", id))
+            }),
+            Scope::Zone(id) => parts.zones.get(id).cloned().ok_or_else(|| {
+                let reason = Reason::new(Code::PlaceNotFound, none("zone", id, parts.zones.keys()));
+                Refusal::new(Kind::NotFound, reason.with("place_id", id))
+            }),
+        }
+    }
+}
+
+fn none<'a, T: Display + 'a>(what: &str, id: &T, there: impl ExactSizeIterator<Item = &'a T>) -> String {
+    let all = there.len();
+    let names: Vec<String> = there.take(NAMES_MAX).map(|name| name.to_string()).collect();
+    let more = if all > names.len() { format!(" and {} more", all - names.len()) } else { String::new() };
+    format!("the site has no {what} {id}; it has {}{more}. Nothing was stopped", names.join(", "))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use midshift_core::site::{DEMO, text};
+
+    #[test]
+    fn an_unknown_part_is_refused_with_what_there_is_and_without_a_site_a_part_is_everywhere() {
+        let site = text::parse(DEMO).unwrap();
+        let ground = Ground::of(Some(&site));
+        let door = Scope::Zone(PlaceId::parse("door").unwrap());
+        assert!(ground.region(&door).unwrap().is_some());
+        let nowhere = Scope::Area(AreaId::parse("nowhere").unwrap());
+        let refusal = ground.region(&nowhere).unwrap_err();
+        assert_eq!(refusal.kind(), Kind::NotFound);
+        assert!(refusal.reason.text().contains(site.areas()[0].area_id.as_str()), "{refusal}");
+        assert_eq!(Ground::of(None).region(&nowhere).unwrap(), None);
+    }
+}

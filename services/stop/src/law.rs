@@ -1,0 +1,307 @@
+//! What is engaged and reset, in memory: the latch with its generation, and what of it waits for the disk.
+//!
+//! Invariant: held behind one lock for moments, never while anything is waited for. A stop counts as soon as it is engaged here; a reset counts only when the
+//! disk has had its turn with it, so that an end in between never leaves robots without a stop that the service still shows.
+
+use crate::audit::Tail;
+use crate::frames;
+use bytes::Bytes;
+use midshift_core::ids::{RequestId, StopId};
+use midshift_core::limits;
+use midshift_core::reason::{Code, Kind, Reason, Refusal};
+use midshift_core::stop::{Latch, Reset, Scope, Stop};
+use midshift_core::time::Utc;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// What survives the end of the service.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub struct Kept {
+    /// Stops and resets.
+    pub latch: Latch,
+    /// State of the latch.
+    pub generation: u64,
+    /// Which request engaged which stop.
+    #[serde(default)]
+    pub requests: BTreeMap<RequestId, Asked>,
+    /// The last record of the audit.
+    #[serde(default)]
+    pub audit: Tail,
+}
+
+/// What was engaged by one request.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Asked {
+    /// The stop.
+    pub stop_id: StopId,
+    /// SHA-256 of the request, hexadecimal.
+    pub hash: String,
+    /// When.
+    pub at: Utc,
+}
+
+/// A reset that the disk has not had its turn with.
+#[derive(Clone, Debug)]
+struct Pending {
+    version: u64,
+    reset: Reset,
+}
+
+/// What became of a reset.
+#[derive(Clone, Debug)]
+pub struct Resetting {
+    /// The reset that counts: the first one.
+    pub reset: Reset,
+    /// It was engaged until now.
+    pub was_engaged: bool,
+    /// There was none before.
+    pub is_new: bool,
+    /// What the disk must have had its turn with.
+    pub version: u64,
+}
+
+/// The latch at work.
+pub struct Law {
+    latch: Latch,
+    generation: u64,
+    since: BTreeMap<StopId, u64>,
+    requests: BTreeMap<RequestId, Asked>,
+    pending: Vec<Pending>,
+    version: u64,
+    everything: Option<Arc<[Bytes]>>,
+}
+
+impl Law {
+    /// With what was kept. Generations go on rising, also if the last of them were not kept.
+    pub fn begin(kept: Kept, now: Utc) -> Self {
+        let generation = now.0.max(0).cast_unsigned().max(kept.generation + 1);
+        let since = kept.latch.effective().map(|stop| (stop.stop_id.clone(), generation)).collect();
+        let (latch, requests) = (kept.latch, kept.requests);
+        // The new generation is kept too.
+        Self { latch, generation, since, requests, pending: Vec::new(), version: 1, everything: None }
+    }
+
+    /// The latch.
+    pub fn latch(&self) -> &Latch {
+        &self.latch
+    }
+
+    /// Its state.
+    pub fn generation(&self) -> u64 {
+        self.generation
+    }
+
+    /// Counts what is to be kept.
+    pub fn version(&self) -> u64 {
+        self.version
+    }
+
+    /// Effective stops, each with the generation it came with.
+    pub fn effective(&self) -> impl Iterator<Item = (&Stop, u64)> {
+        self.latch.effective().map(|stop| (stop, self.since.get(&stop.stop_id).copied().unwrap_or(self.generation)))
+    }
+
+    /// What a request engaged before.
+    pub fn asked(&self, request_id: &RequestId) -> Option<&Asked> {
+        self.requests.get(request_id)
+    }
+
+    /// Whether there is room for one more stop.
+    ///
+    /// # Errors
+    /// As many as there may be are engaged.
+    pub fn room(&self, scope: &Scope) -> Result<(), Refusal> {
+        let room = if *scope == Scope::Fleet { limits::STOPS_MAX } else { limits::STOPS_MAX - limits::STOPS_FOR_FLEET };
+        let engaged = self.latch.effective().count();
+        if engaged < room {
+            return Ok(());
+        }
+        let help = if *scope == Scope::Fleet {
+            "reset what is over; the whole fleet is stopped already if one of them is for the fleet"
+        } else {
+            "the last ones are kept for the whole fleet: engage the fleet, or reset what is over"
+        };
+        let text = format!("{engaged} stops are engaged and nothing more was stopped: {help}");
+        Err(Refusal::new(Kind::Exhausted, Reason::new(Code::StopsFull, text).with("engaged", engaged)))
+    }
+
+    /// A name that was never used.
+    pub fn draw(&self, now: Utc) -> StopId {
+        loop {
+            let id = draw_id(now, rand::random());
+            if self.latch.stop(&id).is_none() && self.latch.reset_of(&id).is_none() {
+                return id;
+            }
+        }
+    }
+
+    /// Adds a stop. The state of the latch with it; none: it was known.
+    pub fn engage(&mut self, stop: Stop, asked: Option<(RequestId, Asked)>) -> Option<u64> {
+        let stop_id = stop.stop_id.clone();
+        if !self.latch.engage(stop) {
+            return None;
+        }
+        if let Some((request_id, asked)) = asked {
+            self.requests.insert(request_id, asked);
+            if self.requests.len() > limits::STOP_REQUESTS_MAX {
+                let oldest = self.requests.iter().min_by_key(|(_, asked)| asked.at).map(|(id, _)| id.clone());
+                oldest.map(|id| self.requests.remove(&id));
+            }
+        }
+        self.change();
+        self.since.insert(stop_id, self.generation);
+        Some(self.generation)
+    }
+
+    /// Notes a reset, which counts after the disk's turn. The first reset of a stop is the one that counts.
+    pub fn reset(&mut self, reset: Reset) -> Resetting {
+        let stop_id = &reset.stop_id;
+        let known = self.latch.reset_of(stop_id).cloned();
+        let pending = self.pending.iter().find(|p| p.reset.stop_id == *stop_id);
+        if let Some(known) = known.or_else(|| pending.map(|p| p.reset.clone())) {
+            let version = pending.map_or(self.version, |p| p.version);
+            return Resetting { reset: known, was_engaged: false, is_new: false, version };
+        }
+        let was_engaged = self.latch.is_effective(stop_id);
+        self.version += 1;
+        self.pending.push(Pending { version: self.version, reset: reset.clone() });
+        Resetting { reset, was_engaged, is_new: true, version: self.version }
+    }
+
+    /// The disk had its turn with all up to `version`: resets among them count now. Each comes back with the state of the latch that has it.
+    pub fn settle(&mut self, version: u64, now: Utc) -> Vec<(Reset, u64)> {
+        let settled: Vec<Pending> = self.pending.extract_if(.., |p| p.version <= version).collect();
+        let mut counted = Vec::new();
+        for Pending { reset, .. } in settled {
+            self.latch.reset(reset.clone());
+            self.since.remove(&reset.stop_id);
+            self.generation += 1;
+            counted.push((reset, self.generation));
+        }
+        if !counted.is_empty() {
+            self.latch.forget(now, limits::RESETS_MAX);
+            self.everything = None;
+        }
+        counted
+    }
+
+    /// What is to be kept, with what waits for it.
+    pub fn kept(&self, audit: Tail) -> Kept {
+        let mut latch = self.latch.clone();
+        for pending in &self.pending {
+            latch.reset(pending.reset.clone());
+        }
+        Kept { latch, generation: self.generation, requests: self.requests.clone(), audit }
+    }
+
+    /// It does not fit the file: the older half of the resets is forgotten.
+    pub fn shorten(&mut self, now: Utc) {
+        let half = self.latch.resets().count() / 2;
+        self.latch.forget(now, half);
+        self.version += 1;
+    }
+
+    /// All that is effective, as messages to a robot.
+    pub fn everything(&mut self) -> Arc<[Bytes]> {
+        let latch = &self.latch;
+        self.everything.get_or_insert_with(|| frames::told(latch.effective(), [], 0).into()).clone()
+    }
+
+    fn change(&mut self) {
+        self.generation += 1;
+        self.version += 1;
+        self.everything = None;
+    }
+}
+
+/// `STOP-YYYYMMDD-` and 10 base-32 characters.
+fn draw_id(utc: Utc, drawn: u64) -> StopId {
+    const BASE32: &[u8; 32] = b"0123456789ABCDEFGHJKMNPQRSTVWXYZ";
+    let day = utc.rfc3339().get(..10).unwrap_or_default().replace('-', "");
+    let tail: String = (0..10).map(|i| char::from(BASE32[(drawn >> (i * 5)) as usize & 31])).collect();
+    // Letters, digits and hyphens only, 24 of them.
+    StopId::parse(&format!("STOP-{day}-{tail}")).unwrap_or_else(|e| unreachable!("drawn id: {e}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use midshift_core::ids::RobotId;
+    use midshift_core::robot::StopLevel;
+
+    fn stop(id: StopId, scope: Scope) -> Stop {
+        let (actor, reason) = (String::new(), String::new());
+        Stop { stop_id: id, scope, level: StopLevel::Halt, engaged: Utc(1), actor, reason, region: None, proof: vec![] }
+    }
+
+    fn reset(stop_id: &StopId) -> Reset {
+        Reset { stop_id: stop_id.clone(), at: Utc(2), actor: "a".to_owned(), reason: "over".to_owned() }
+    }
+
+    #[test]
+    fn a_reset_counts_after_the_turn_of_the_disk_and_what_is_kept_has_it_before() {
+        let mut law = Law::begin(Kept::default(), Utc(1_000));
+        let id = law.draw(Utc(0));
+        law.engage(stop(id.clone(), Scope::Fleet), None).unwrap();
+        let resetting = law.reset(reset(&id));
+        assert!(resetting.was_engaged && law.latch().is_effective(&id), "robots still obey it");
+        assert!(!law.kept(Tail::default()).latch.is_effective(&id));
+        assert!(law.settle(resetting.version - 1, Utc(2)).is_empty());
+        assert_eq!(law.settle(resetting.version, Utc(2)), [(reset(&id), law.generation())]);
+        assert!(!law.latch().is_effective(&id));
+        let again = law.reset(Reset { reason: "again".to_owned(), ..reset(&id) });
+        assert_eq!((again.was_engaged, again.is_new, again.reset.reason.as_str()), (false, false, "over"));
+    }
+
+    #[test]
+    fn generations_rise_over_restarts_whatever_the_wall_says() {
+        let law = Law::begin(Kept { generation: 5_000, ..Kept::default() }, Utc(1_000));
+        assert_eq!(law.generation(), 5_001);
+        assert_eq!(Law::begin(Kept::default(), Utc(1_000)).generation(), 1_000);
+    }
+
+    #[test]
+    fn the_last_stops_are_kept_for_the_fleet_and_the_refusal_says_so() {
+        let mut law = Law::begin(Kept::default(), Utc(0));
+        let robot = Scope::Robot(RobotId::parse("r1").unwrap());
+        for _ in 0..limits::STOPS_MAX - limits::STOPS_FOR_FLEET {
+            law.room(&robot).unwrap();
+            let id = law.draw(Utc(0));
+            law.engage(stop(id, robot.clone()), None).unwrap();
+        }
+        let refusal = law.room(&robot).unwrap_err();
+        assert_eq!((refusal.kind(), refusal.reason.code), (Kind::Exhausted, Code::StopsFull));
+        assert!(refusal.reason.text().contains("engage the fleet"), "{refusal}");
+        for _ in 0..limits::STOPS_FOR_FLEET {
+            law.room(&Scope::Fleet).unwrap();
+            let id = law.draw(Utc(0));
+            law.engage(stop(id, Scope::Fleet), None).unwrap();
+        }
+        assert!(law.room(&Scope::Fleet).is_err());
+    }
+
+    #[test]
+    fn the_fullest_latch_fits_its_slot() {
+        let boxes = (0..limits::REGION_BOXES_MAX as i32).map(|i| midshift_core::stop::region::Bounds {
+            x0_mm: -i * 1_000_000,
+            y0_mm: i * 1_000_000 - i32::MAX,
+            x1_mm: -i * 1_000_000 + 1,
+            y1_mm: i32::MAX - i * 10,
+        });
+        let region = Some(midshift_core::stop::Region::new(boxes));
+        let mut latch = Latch::default();
+        for n in 0..limits::STOPS_MAX + limits::RESETS_MAX {
+            let (actor, reason) = ("a".repeat(128), "r".repeat(limits::REASON_BYTES_MAX));
+            let id = draw_id(Utc(0), n as u64);
+            let (region, proof) = (region.clone(), vec![255; 64]);
+            let stop = Stop { actor: actor.clone(), reason: reason.clone(), region, proof, ..stop(id, Scope::Fleet) };
+            if n < limits::RESETS_MAX {
+                latch.reset(Reset { actor, reason, ..reset(&stop.stop_id) });
+            }
+            latch.engage(stop);
+        }
+        let bytes = serde_json::to_vec(&Kept { latch, ..Kept::default() }).unwrap().len();
+        assert!(bytes < limits::STOP_LATCH_BYTES * 3 / 4, "{bytes}");
+    }
+}

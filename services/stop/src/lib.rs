@@ -1,0 +1,379 @@
+//! Fleet stop as a service: stops are engaged at once, kept in files of its own, told to every robot, and shown as each robot itself confirms them.
+//!
+//! An operational stop request: not a safety function, no performance level. The independent emergency stop is the hardware of the robot's maker and
+//! integrator, whose state midshift shows and never replaces; midshift is not suitable as part of a safety system.
+//!
+//! Called by the binary: [`StopService::open`], its gRPC faces or [`StopService::routes`], [`StopService::run`] and [`serve`]. Invariant: nothing of the store, the task
+//! queue or another service lies on its way; an engage waits for no robot, and for the disk only with its answer; a folder that cannot be trusted
+//! begins with the fleet stopped. Absent on purpose: login, which does not exist yet: whoever reaches the port may engage and reset.
+
+mod acts;
+pub mod audit;
+mod confirm;
+mod disk;
+mod face;
+mod frames;
+mod grpc;
+mod ground;
+mod law;
+mod line;
+mod outbox;
+mod proof;
+mod robots;
+mod snapshot;
+mod status;
+
+pub use face::LinkFace;
+pub use snapshot::Roster;
+
+use audit::{Action, Audit, Broken, Note, Verified};
+use disk::{Disk, Writer};
+use ground::Ground;
+use law::{Kept, Law};
+use midshift_core::limits;
+use midshift_core::robot::StopLevel;
+use midshift_core::site::Site;
+use midshift_core::stop::{Scope, Stop};
+use midshift_core::time::{Clock, LinkTime, Now, Utc};
+use midshift_latch::LatchFile;
+use midshift_proto::stop::v1::stop_service_server::StopServiceServer;
+use proof::{Found, Key};
+use robots::Robots;
+use std::fs::DirBuilder;
+use std::io;
+use std::os::unix::fs::DirBuilderExt;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::sync::{Semaphore, watch};
+use tokio_stream::Stream;
+use tokio_util::sync::CancellationToken;
+use tonic::service::Routes;
+use tonic::transport::server::Connected;
+
+/// Until login exists nobody is known by name.
+const ACTOR: &str = "anonymous";
+/// Messages on their way to one watcher.
+const WATCH_MAX: usize = 4;
+/// Names of the files that others look at.
+const LATCH: &str = "latch";
+/// Robots have so long to dial again before their lines end.
+const MOVE_OVER_WITHIN: Duration = Duration::from_millis(500);
+/// Pings on a quiet connection, and how long their answer may take.
+const KEEPALIVE: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(10));
+
+/// What keeps the service from beginning, or ends it.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The folder says no.
+    #[error("opening the folder of stops {path}: {source}", path = path.display())]
+    Folder {
+        /// Which.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
+    /// The latch cannot be held.
+    #[error(transparent)]
+    Latch(#[from] midshift_latch::Error),
+    /// The descriptors of its own services cannot be read.
+    #[error("building reflection: {0}")]
+    Reflection(#[from] tonic_reflection::server::Error),
+    /// The port is gone.
+    #[error("serving: {0}")]
+    Serving(#[from] tonic::transport::Error),
+    /// A part of it ended.
+    #[error("a part of the stop service ended by itself")]
+    Ended,
+}
+
+/// What the service is built from.
+pub struct Parts {
+    /// Latch, audit, key and roster; made with mode 0700. One process has it at a time.
+    pub folder: PathBuf,
+    /// Where areas and zones are. None: every part means everywhere.
+    pub site: Option<Arc<Site>>,
+    /// Clocks.
+    pub clock: Arc<dyn Clock>,
+}
+
+pub(crate) struct Inner {
+    clock: Arc<dyn Clock>,
+    ground: Ground,
+    key: Key,
+    /// Taken before `law` by whoever changes it: lines hear of changes in their order.
+    fan: Mutex<()>,
+    law: Mutex<Law>,
+    robots: Robots,
+    disk: Disk,
+    /// Counts what watchers may want to look at.
+    changed: watch::Sender<u64>,
+    watchers: Arc<Semaphore>,
+    started: LinkTime,
+    /// It was asked to end.
+    shutdown: CancellationToken,
+    /// Streams end.
+    ended: CancellationToken,
+}
+
+impl Inner {
+    fn touch(&self) {
+        self.changed.send_modify(|n| *n += 1);
+    }
+}
+
+/// A lock whose holder panicked holds what it held: the latch only ever adds up.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Work with files, off the threads that answer.
+async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
+    match tokio::task::spawn_blocking(work).await {
+        Ok(done) => done,
+        Err(error) if error.is_panic() => std::panic::resume_unwind(error.into_panic()),
+        // The runtime goes away, and with it whoever waits.
+        Err(_) => std::future::pending().await,
+    }
+}
+
+/// Moments of the link clock as people read them.
+trait Times {
+    /// UTC of the wall at a moment before or after now.
+    fn wall_at(&self, at: LinkTime) -> Utc;
+}
+
+impl Times for Now {
+    fn wall_at(&self, at: LinkTime) -> Utc {
+        Utc(self.wall.0 + at.0.cast_signed() - self.link.0.cast_signed())
+    }
+}
+
+/// The service. Cheap to clone.
+#[derive(Clone)]
+pub struct StopService {
+    inner: Arc<Inner>,
+    folder: PathBuf,
+    writer: Arc<Mutex<Option<Writer>>>,
+}
+
+impl StopService {
+    /// Opens the folder. Nothing runs yet; [`StopService::run`] does, until `shutdown`.
+    ///
+    /// # Errors
+    /// The folder cannot be used, or another process has it ([`midshift_latch::Error::Held`]).
+    pub fn open(parts: Parts, shutdown: CancellationToken) -> Result<Self, Error> {
+        let Parts { folder, site, clock } = parts;
+        let failed = |source| Error::Folder { path: folder.clone(), source };
+        let now = clock.now();
+        DirBuilder::new().recursive(true).mode(0o700).create(&folder).map_err(failed)?;
+        let opened = open(&folder, now.wall)?;
+        let ended = CancellationToken::new();
+        let inner = Arc::new(Inner {
+            ground: Ground::of(site.as_deref()),
+            key: opened.key,
+            fan: Mutex::new(()),
+            law: Mutex::new(Law::begin(opened.kept, now.wall)),
+            robots: Robots::default(),
+            disk: Disk::default(),
+            changed: watch::Sender::new(0),
+            watchers: Arc::new(Semaphore::new(limits::STOP_WATCHERS_MAX)),
+            started: now.link,
+            clock,
+            shutdown,
+            ended,
+        });
+        let engaged = lock(&inner.law).latch().effective().count();
+        opened.notes.into_iter().for_each(|note| inner.disk.note(note));
+        inner.disk.note(Note::own(now.wall, Action::Started).with("engaged", engaged));
+        if let (_, Some(roster)) = snapshot::look(&folder.join(snapshot::NAME), None) {
+            snapshot::take(&inner, roster);
+        }
+        tracing::info!(engaged, "stop service opened");
+        Ok(Self { inner, folder, writer: Arc::new(Mutex::new(Some(opened.writer))) })
+    }
+
+    /// The people's and programs' face.
+    pub fn grpc(&self) -> StopServiceServer<Self> {
+        StopServiceServer::new(self.clone()).max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES)
+    }
+
+    /// Stops that are engaged now.
+    pub fn engaged(&self) -> usize {
+        lock(&self.inner.law).latch().effective().count()
+    }
+
+    /// Both faces, health of both, and reflection of these and nothing else.
+    ///
+    /// # Errors
+    /// The descriptors cannot be read: a fault of the build.
+    pub async fn routes(&self) -> Result<Routes, Error> {
+        let reflection = || {
+            let names = ["midshift.stop.v1.StopService", "midshift.stop.v1.StopLinkService", "grpc.health.v1.Health"];
+            let builder = tonic_reflection::server::Builder::configure()
+                .register_encoded_file_descriptor_set(midshift_proto::FILE_DESCRIPTOR_SET)
+                .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+                .register_encoded_file_descriptor_set(tonic_types::pb::FILE_DESCRIPTOR_SET);
+            names.into_iter().fold(builder, |builder, name| builder.with_service_name(name))
+        };
+        let (health, health_service) = tonic_health::server::health_reporter();
+        health.set_serving::<StopServiceServer<Self>>().await;
+        health.set_serving::<LinkFace>().await;
+        let mut routes = Routes::builder();
+        routes
+            .add_service(health_service)
+            .add_service(reflection().build_v1()?)
+            .add_service(reflection().build_v1alpha()?)
+            .add_service(self.grpc())
+            .add_service(self.link());
+        Ok(routes.routes())
+    }
+
+    /// Keeps files and roster until shutdown; then tells robots to dial again and ends all streams. Called once.
+    ///
+    /// # Errors
+    /// A part ended by itself, or it was called before.
+    pub async fn run(self) -> Result<(), Error> {
+        let inner = self.inner;
+        let Some(writer) = lock(&self.writer).take() else { return Err(Error::Ended) };
+        let (shutdown, ended) = (inner.shutdown.clone(), inner.ended.clone());
+        let _end = ended.clone().drop_guard();
+        let moving = async {
+            shutdown.cancelled().await;
+            let now = inner.clock.now().link;
+            inner.robots.lines().iter().for_each(|line| line.move_over(now));
+            tokio::time::sleep(MOVE_OVER_WITHIN).await;
+            inner.robots.lines().iter().for_each(|line| line.end(outbox::End::Done, now));
+        };
+        let following = async {
+            tokio::select! {
+                () = shutdown.cancelled() => {}
+                () = snapshot::keep(&inner, self.folder.clone(), None) => {}
+            }
+        };
+        tokio::join!(disk::keep(&inner, writer), moving, following);
+        Ok(())
+    }
+}
+
+/// Serves connections until the service's shutdown, which is bounded: streams that do not end by themselves are cut.
+///
+/// # Errors
+/// The service ended by itself, or the connections did.
+pub async fn serve<I, IO, E>(service: StopService, routes: Routes, incoming: I) -> Result<(), Error>
+where
+    I: Stream<Item = Result<IO, E>> + Send + 'static,
+    IO: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+    E: Into<Box<dyn std::error::Error + Send + Sync>>,
+{
+    let (shutdown, ended) = (service.inner.shutdown.clone(), service.inner.ended.clone());
+    // However this ends, also in a panic: nothing goes on without the rest.
+    let _end = shutdown.clone().drop_guard();
+    let drained = ended.clone();
+    let transport = tonic::transport::Server::builder()
+        .accept_http1(true)
+        .http2_keepalive_interval(Some(KEEPALIVE.0))
+        .http2_keepalive_timeout(Some(KEEPALIVE.1))
+        .max_concurrent_streams(limits::STREAMS_PER_CONNECTION)
+        .timeout(Duration::from_millis(limits::UNARY_DEADLINE.as_ms()))
+        .add_routes(routes)
+        .serve_with_incoming_shutdown(incoming, async move { drained.cancelled().await });
+    let cut = async {
+        ended.cancelled().await;
+        tokio::time::sleep(Duration::from_millis(limits::HARD_DRAIN.as_ms())).await;
+    };
+    let running = service.run();
+    let serving = async {
+        tokio::select! {
+            served = transport => served.map_err(Error::from),
+            () = cut => Ok(()),
+        }
+    };
+    let (served, ran) = tokio::join!(
+        async {
+            let served = serving.await;
+            shutdown.cancel();
+            served
+        },
+        running
+    );
+    served.and(ran)
+}
+
+/// Reads the whole audit in the folder of a stop service, also while it runs.
+///
+/// # Errors
+/// The first thing that is wrong with it.
+pub fn verify(folder: &Path) -> Result<Verified, Broken> {
+    let (_, kept) = midshift_latch::read::<Kept>(&folder.join(LATCH))?;
+    audit::verify(folder, &kept.audit)
+}
+
+struct Opened {
+    kept: Kept,
+    writer: Writer,
+    key: Key,
+    notes: Vec<Note>,
+}
+
+/// Reads what was kept. What cannot be read is moved aside, and the fleet is stopped.
+fn open(folder: &Path, now: Utc) -> Result<Opened, Error> {
+    let failed = |source| Error::Folder { path: folder.to_owned(), source };
+    let path = folder.join(LATCH);
+    let room = limits::STOP_LATCH_BYTES;
+    let is_first = !path.exists() && !folder.join(proof::NAME).exists();
+    // Of two that begin for the first time at once, the one that holds the latch makes the key.
+    let first = if is_first { Some(LatchFile::open(&path, room, Kept::default())?) } else { None };
+    let is_gone = !is_first && !path.exists();
+    let (key, found) = Key::open(folder, now).map_err(failed)?;
+    let mut notes = Vec::new();
+    // In the file before anything else is: an end right after this leaves the fleet stopped too.
+    let mut lose = |why: String| {
+        let mut kept = Kept::default();
+        let stop = of_lost_latch(&kept, &key, now);
+        tracing::error!(why, stop_id = %stop.stop_id, "THE LATCH COULD NOT BE READ: the whole fleet is stopped until this stop is reset by name");
+        notes.push(Note::own(now, Action::LatchLost).with("stop_id", &stop.stop_id).with("why", why));
+        kept.latch.engage(stop);
+        kept
+    };
+    let opened = match first {
+        Some(opened) => Ok(opened),
+        None if is_gone => LatchFile::open(&path, room, lose("it is gone".to_owned())),
+        None => LatchFile::open(&path, room, Kept::default()),
+    };
+    let (file, kept) = match opened {
+        Err(error @ (midshift_latch::Error::Unreadable { .. } | midshift_latch::Error::Foreign { .. })) => {
+            let aside = audit::set_aside(&path, now).map_err(failed)?;
+            LatchFile::open(&path, room, lose(format!("{error}; moved to {}", aside.display())))?
+        }
+        opened => opened?,
+    };
+    if found == Found::Replaced {
+        tracing::error!("the key of the stop service could not be read and was moved aside; stops that robots bring back are not known again");
+        notes.push(Note::own(now, Action::KeyLost));
+    }
+    let (audit, found) = Audit::open(folder, kept.audit.clone(), now);
+    if !found.is_empty() {
+        tracing::error!("the end of the audit of stops was gone or not whole");
+    }
+    notes.extend(found);
+    let known = kept.audit.clone();
+    Ok(Opened { kept, writer: Writer { file, audit, known }, key, notes })
+}
+
+/// Nobody knows what was engaged: everything is.
+fn of_lost_latch(kept: &Kept, key: &Key, now: Utc) -> Stop {
+    let mut stop = Stop {
+        stop_id: Law::begin(kept.clone(), now).draw(now),
+        scope: Scope::Fleet,
+        level: StopLevel::Halt,
+        engaged: now,
+        actor: "midshift".to_owned(),
+        reason: "the latch could not be read, so nobody knows which stops were engaged".to_owned(),
+        region: None,
+        proof: Vec::new(),
+    };
+    key.mark(&mut stop);
+    stop
+}

@@ -1,0 +1,144 @@
+//! A robot's line: who comes, what it keeps, and each check-in answered after a look at the latch.
+//!
+//! Invariant: a check-in is heard only from the robot's newest line, and a generation that was not told on this line is none. A line on which nothing
+//! comes up, or nothing is read, is closed: the robot's own silence does the rest.
+
+use crate::outbox::{Down, End, Outbox};
+use crate::robots::{Robot, Robots};
+use crate::{Inner, acts, lock};
+use midshift_core::ids::RobotId;
+use midshift_core::limits;
+use midshift_core::reason::{Code, Kind, Reason, Refusal};
+use midshift_core::stop::Stop;
+use midshift_core::stop::roster::Heard;
+use midshift_core::time::Now;
+use midshift_proto::convert::stop::{CheckIn, ToStop};
+use midshift_proto::stop::v1;
+use std::sync::Arc;
+use std::time::Duration;
+use tonic::{Response, Status, Streaming};
+
+/// Reads who comes, and begins the line.
+pub async fn attend(inner: Arc<Inner>, mut up: Streaming<v1::AttendRequest>) -> Result<Response<Down>, Status> {
+    let begun = begin(&inner, &mut up).await;
+    let (robot, outbox) = begun.map_err(|refusal| midshift_proto::status(&refusal, None))?;
+    let down = Down::new(inner.clone(), outbox.clone());
+    tokio::spawn(async move {
+        hold(&inner, &robot, &outbox, up).await;
+        Robots::detach(&robot, &outbox);
+        metrics::gauge!("midshift_stop_lines").decrement(1);
+        tracing::info!(robot_id = %robot.robot_id, "stop line ended");
+    });
+    Ok(Response::new(down))
+}
+
+async fn begin(
+    inner: &Arc<Inner>,
+    up: &mut Streaming<v1::AttendRequest>,
+) -> Result<(Arc<Robot>, Arc<Outbox>), Refusal> {
+    if inner.shutdown.is_cancelled() {
+        return Err(Refusal::new(Kind::Unavailable, Code::ShuttingDown));
+    }
+    let (robot_id, boot_id, stops) = first(up).await?;
+    let robot = inner.robots.of(&robot_id)?;
+    let listed = stops.iter().map(|stop| stop.stop_id.clone()).collect();
+    let foreign = acts::adopt(inner, &robot_id, stops);
+    let outbox = Arc::new(Outbox::new(listed));
+    let now = inner.clock.now();
+    {
+        // No change of the latch falls between: the line begins with the whole, and hears of everything after it.
+        let _fan = lock(&inner.fan);
+        Robots::attach(&robot, &outbox, &boot_id, foreign, now.link);
+    }
+    metrics::gauge!("midshift_stop_lines").increment(1);
+    tracing::info!(%robot_id, "stop line begun");
+    inner.touch();
+    Ok((robot, outbox))
+}
+
+async fn first(up: &mut Streaming<v1::AttendRequest>) -> Result<(RobotId, String, Vec<Stop>), Refusal> {
+    let within = Duration::from_millis(limits::STOP_ATTEND_WITHIN.as_ms());
+    let Ok(Ok(Some(message))) = tokio::time::timeout(within, up.message()).await else {
+        return Err(Refusal::new(Kind::Deadline, Reason::new(Code::ProtocolError, "nobody said who comes")));
+    };
+    match midshift_proto::parse(message)? {
+        ToStop::Attend { robot_id, boot_id, stops } => Ok((robot_id, boot_id, stops)),
+        ToStop::CheckIn(_) => Err(Refusal::field("message", "the first message must be attend")),
+    }
+}
+
+/// Hears a robot until its line is over.
+async fn hold(inner: &Arc<Inner>, robot: &Robot, outbox: &Arc<Outbox>, mut up: Streaming<v1::AttendRequest>) {
+    let silent = Duration::from_millis(limits::STOP_LINE_SILENT.as_ms());
+    loop {
+        let message = tokio::select! {
+            biased;
+            () = outbox.gone.cancelled() => return,
+            message = tokio::time::timeout(silent, up.message()) => message,
+        };
+        let now = inner.clock.now();
+        let over = match message {
+            Ok(Ok(Some(message))) => take(inner, robot, outbox, message, &now).err(),
+            Ok(Ok(None) | Err(_)) => return outbox.end(End::Done, now.link),
+            Err(_) => Some(late("nothing came up this line")),
+        };
+        let unread = || (outbox.unread_for(now.link) >= limits::STOP_LINE_SILENT).then(|| late("nothing is read"));
+        if let Some(refusal) = over.or_else(unread) {
+            tracing::warn!(robot_id = %robot.robot_id, code = %refusal.reason.code, "stop line closed");
+            return outbox.end(End::Refused(refusal), now.link);
+        }
+    }
+}
+
+fn late(what: &str) -> Refusal {
+    let text = format!("{what} for {} s", limits::STOP_LINE_SILENT.as_ms() / 1000);
+    Refusal::new(Kind::Deadline, Reason::new(Code::ProtocolError, text))
+}
+
+fn take(
+    inner: &Inner,
+    robot: &Robot,
+    outbox: &Arc<Outbox>,
+    message: v1::AttendRequest,
+    now: &Now,
+) -> Result<(), Refusal> {
+    match midshift_proto::parse(message)? {
+        ToStop::Attend { .. } => Err(Refusal::field("message", "attend comes once")),
+        ToStop::CheckIn(said) => {
+            check_in(inner, robot, outbox, said, now);
+            Ok(())
+        }
+    }
+}
+
+fn check_in(inner: &Inner, robot: &Robot, outbox: &Arc<Outbox>, said: CheckIn, now: &Now) {
+    // Before the answer: if the latch cannot be looked at, nobody is answered.
+    let at = lock(&inner.law).generation();
+    let nonce = said.nonce;
+    let heard = Heard {
+        at: now.link,
+        // It may remember a service that numbered otherwise.
+        generation: if said.generation <= outbox.sent() { said.generation } else { 0 },
+        is_durable: said.is_durable,
+        level: said.level,
+        is_still: said.is_still,
+        inside: said.inside.into_iter().collect(),
+        stage: said.stage,
+        around: said.around,
+        awaiting: said.awaiting.into_iter().collect(),
+    };
+    let mut state = robot.said();
+    if !state.line.as_ref().is_some_and(|line| Arc::ptr_eq(line, outbox)) {
+        return;
+    }
+    let is_news = state.heard.as_ref().is_none_or(|before| {
+        now.link.since(before.at) >= limits::CHECK_IN_MISSED || Heard { at: heard.at, ..before.clone() } != heard
+    });
+    state.heard = Some(heard);
+    drop(state);
+    outbox.answer(nonce, at, now.link);
+    metrics::counter!("midshift_stop_check_ins_total").increment(1);
+    if is_news {
+        inner.touch();
+    }
+}

@@ -1,0 +1,246 @@
+//! What waits for one robot to read it.
+//!
+//! Invariant: bounded, and whoever puts something in never waits. A robot that reads too slowly is told everything anew from the latch when it reads again, so that
+//! nothing is lost by leaving messages out. An answer to a check-in never overtakes what it speaks of. The stream is read by the connection itself: no
+//! task stands between a stop and the socket.
+
+use crate::{Inner, frames, lock};
+use bytes::Bytes;
+use midshift_core::ids::StopId;
+use midshift_core::limits;
+use midshift_core::reason::Refusal;
+use midshift_core::time::{LinkDuration, LinkTime};
+use std::collections::{BTreeSet, VecDeque};
+use std::pin::Pin;
+use std::sync::{Arc, Mutex};
+use std::task::{Context, Poll, Waker};
+use tokio_stream::Stream;
+use tokio_util::sync::CancellationToken;
+use tonic::Status;
+
+/// One message of stops and resets, for all robots.
+#[derive(Clone)]
+pub struct Frame {
+    /// State of the latch with it.
+    pub generation: u64,
+    /// Encoded.
+    pub bytes: Bytes,
+    /// What it resets, so that it can be said again.
+    pub resets: Arc<[StopId]>,
+}
+
+/// Why a line ends.
+#[derive(Clone, Debug)]
+pub enum End {
+    /// In order.
+    Done,
+    /// For a reason that the robot hears.
+    Refused(Refusal),
+}
+
+struct Waiting {
+    frames: VecDeque<Frame>,
+    /// Bytes to send before anything else: the whole, as it was when it was begun to be said.
+    whole: VecDeque<Bytes>,
+    /// Some: everything is to be said anew, with these resets.
+    behind: Option<BTreeSet<StopId>>,
+    /// State of the latch that was handed to the connection.
+    sent: u64,
+    answers: VecDeque<(u64, u64)>,
+    moves_over: bool,
+    unread_since: Option<LinkTime>,
+    end: Option<End>,
+    waker: Option<Waker>,
+}
+
+/// The outbox of one line.
+pub struct Outbox {
+    waiting: Mutex<Waiting>,
+    /// The line is over.
+    pub gone: CancellationToken,
+}
+
+impl Outbox {
+    /// Of a robot that keeps these stops: of those that were reset it hears so.
+    pub fn new(listed: BTreeSet<StopId>) -> Self {
+        let waiting = Waiting {
+            frames: VecDeque::new(),
+            whole: VecDeque::new(),
+            behind: Some(listed),
+            sent: 0,
+            answers: VecDeque::new(),
+            moves_over: false,
+            unread_since: None,
+            end: None,
+            waker: None,
+        };
+        Self { waiting: Mutex::new(waiting), gone: CancellationToken::new() }
+    }
+
+    fn put(&self, now: LinkTime, put: impl FnOnce(&mut Waiting)) {
+        let mut waiting = lock(&self.waiting);
+        put(&mut waiting);
+        waiting.unread_since.get_or_insert(now);
+        let waker = waiting.waker.take();
+        drop(waiting);
+        if let Some(waker) = waker {
+            waker.wake();
+        }
+    }
+
+    /// A change of the latch.
+    pub fn tell(&self, frame: &Frame, now: LinkTime) {
+        self.put(now, |waiting| {
+            if waiting.behind.is_none() && waiting.frames.len() < limits::STOP_OUTBOX_MAX {
+                return waiting.frames.push_back(frame.clone());
+            }
+            // Too much for it: it is told from the latch when it reads again. What it was told to forget is in no list of what is engaged.
+            let left: Vec<Frame> = waiting.frames.drain(..).collect();
+            let behind = waiting.behind.get_or_insert_default();
+            behind.extend(left.iter().chain([frame]).flat_map(|frame| frame.resets.iter().cloned()));
+        });
+    }
+
+    /// The answer to a check-in that came when the latch was at `generation`.
+    pub fn answer(&self, nonce: u64, generation: u64, now: LinkTime) {
+        self.put(now, |waiting| {
+            if waiting.answers.len() >= limits::STOP_ANSWERS_MAX {
+                waiting.answers.pop_front();
+            }
+            // An answer waits for a change that nobody put in: it is said from the latch.
+            let is_held = waiting.answers.front().is_some_and(|(_, generation)| *generation > waiting.sent);
+            if is_held && waiting.frames.is_empty() && waiting.whole.is_empty() {
+                waiting.behind.get_or_insert_default();
+            }
+            waiting.answers.push_back((nonce, generation));
+        });
+    }
+
+    /// The robot is to dial again.
+    pub fn move_over(&self, now: LinkTime) {
+        self.put(now, |waiting| waiting.moves_over = true);
+    }
+
+    /// Ends the line.
+    pub fn end(&self, end: End, now: LinkTime) {
+        self.put(now, |waiting| {
+            waiting.frames.clear();
+            waiting.whole.clear();
+            waiting.answers.clear();
+            waiting.behind = None;
+            waiting.end.get_or_insert(end);
+        });
+        self.gone.cancel();
+    }
+
+    /// State of the latch that this robot was told on this line.
+    pub fn sent(&self) -> u64 {
+        lock(&self.waiting).sent
+    }
+
+    /// For how long something has waited to be read.
+    pub fn unread_for(&self, now: LinkTime) -> LinkDuration {
+        lock(&self.waiting).unread_since.map_or(LinkDuration(0), |since| now.since(since))
+    }
+
+    #[cfg(test)]
+    fn held(&self) -> (usize, usize) {
+        let waiting = lock(&self.waiting);
+        (waiting.frames.len() + waiting.whole.len(), waiting.answers.len())
+    }
+}
+
+/// What the connection reads.
+pub struct Down {
+    inner: Arc<Inner>,
+    outbox: Arc<Outbox>,
+}
+
+impl Down {
+    /// Of an outbox.
+    pub fn new(inner: Arc<Inner>, outbox: Arc<Outbox>) -> Self {
+        Self { inner, outbox }
+    }
+}
+
+impl Drop for Down {
+    fn drop(&mut self) {
+        self.outbox.gone.cancel();
+    }
+}
+
+impl Waiting {
+    fn next(&mut self, inner: &Inner) -> Option<Bytes> {
+        if let Some(bytes) = self.whole.pop_front() {
+            return Some(bytes);
+        }
+        if let Some(resets) = self.behind.take() {
+            let mut law = lock(&inner.law);
+            self.whole.extend(law.everything().iter().cloned());
+            let resets = resets.iter().filter_map(|id| law.latch().reset_of(id));
+            self.whole.extend(frames::told([], resets, 0));
+            self.sent = law.generation();
+            self.whole.push_back(frames::synced(self.sent));
+            return self.whole.pop_front();
+        }
+        while let Some(frame) = self.frames.pop_front() {
+            // What was said with the whole needs not be said again.
+            if frame.generation > self.sent {
+                self.sent = frame.generation;
+                return Some(frame.bytes);
+            }
+        }
+        if let Some((nonce, _)) = self.answers.pop_front_if(|(_, generation)| *generation <= self.sent) {
+            return Some(frames::checked_in(nonce, self.sent));
+        }
+        std::mem::take(&mut self.moves_over).then(frames::move_over)
+    }
+}
+
+impl Stream for Down {
+    type Item = Result<Bytes, Status>;
+
+    fn poll_next(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        let mut waiting = lock(&self.outbox.waiting);
+        if let Some(bytes) = waiting.next(&self.inner) {
+            return Poll::Ready(Some(Ok(bytes)));
+        }
+        // The connection takes more than there is.
+        waiting.unread_since = None;
+        match waiting.end.take() {
+            Some(End::Done) => Poll::Ready(None),
+            Some(End::Refused(refusal)) => Poll::Ready(Some(Err(midshift_proto::status(&refusal, None)))),
+            None => {
+                waiting.waker = Some(cx.waker().clone());
+                Poll::Pending
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn frame(generation: u64, reset: Option<&str>) -> Frame {
+        let resets = reset.map(|id| StopId::parse(id).unwrap()).into_iter().collect();
+        Frame { generation, bytes: Bytes::from(generation.to_string()), resets }
+    }
+
+    #[test]
+    fn a_robot_that_reads_nothing_holds_a_bounded_number_and_hears_of_every_reset_later() {
+        let outbox = Outbox::new(BTreeSet::new());
+        lock(&outbox.waiting).behind = None;
+        for n in 1..100_u64 {
+            outbox.tell(&frame(n, Some(&format!("STOP-{n}"))), LinkTime(5));
+            outbox.answer(n, n, LinkTime(5));
+            let (frames, answers) = outbox.held();
+            assert!(frames <= limits::STOP_OUTBOX_MAX && answers <= limits::STOP_ANSWERS_MAX);
+        }
+        let waiting = lock(&outbox.waiting);
+        assert_eq!(waiting.behind.as_ref().map(BTreeSet::len), Some(99));
+        assert_eq!(waiting.answers.back(), Some(&(99, 99)), "the newest answer is kept");
+        drop(waiting);
+        assert_eq!(outbox.unread_for(LinkTime(10_005)), limits::STOP_LINE_SILENT);
+    }
+}

@@ -1,0 +1,170 @@
+//! Who belongs to the fleet and what each robot said last.
+//!
+//! Invariant: bounded; each robot has a lock of its own that is held for moments, so that whoever reads of all robots holds up nobody.
+
+use crate::lock;
+use crate::outbox::{End, Frame, Outbox};
+use midshift_core::ids::{RobotId, StopId};
+use midshift_core::limits;
+use midshift_core::reason::{Code, Kind, Reason, Refusal};
+use midshift_core::stop::roster::Heard;
+use midshift_core::time::LinkTime;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard};
+
+/// One robot.
+pub struct Robot {
+    /// Who.
+    pub robot_id: RobotId,
+    said: Mutex<Said>,
+}
+
+/// What is known of it.
+#[derive(Default)]
+pub struct Said {
+    /// Its newest check-in with this process.
+    pub heard: Option<Heard>,
+    /// Stops that it keeps and that are not the service's.
+    pub foreign: BTreeSet<StopId>,
+    /// The start of its agent that was heard last.
+    pub boot_id: String,
+    /// It stands in the snapshot.
+    pub is_listed: bool,
+    /// Its line.
+    pub line: Option<Arc<Outbox>>,
+}
+
+impl Robot {
+    /// What is known of it.
+    pub fn said(&self) -> std::sync::MutexGuard<'_, Said> {
+        lock(&self.said)
+    }
+}
+
+type Map = BTreeMap<RobotId, Arc<Robot>>;
+
+/// All of them.
+#[derive(Default)]
+pub struct Robots(RwLock<Map>);
+
+impl Robots {
+    fn read(&self) -> RwLockReadGuard<'_, Map> {
+        self.0.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// All, by name.
+    pub fn all(&self) -> Vec<Arc<Robot>> {
+        self.read().values().cloned().collect()
+    }
+
+    /// One of them; made if there is room, or if one that nobody lists and nobody has heard can go.
+    ///
+    /// # Errors
+    /// There is no room.
+    pub fn of(&self, robot_id: &RobotId) -> Result<Arc<Robot>, Refusal> {
+        if let Some(robot) = self.read().get(robot_id) {
+            return Ok(robot.clone());
+        }
+        let mut map = self.0.write().unwrap_or_else(PoisonError::into_inner);
+        if map.len() >= limits::STOP_ROBOTS_MAX {
+            let stray = map.values().find(|robot| is_stray(robot)).map(|robot| robot.robot_id.clone());
+            let Some(stray) = stray else {
+                let text = format!("{} robots are known and no more are taken", map.len());
+                return Err(Refusal::new(Kind::Exhausted, Reason::new(Code::Overloaded, text)));
+            };
+            map.remove(&stray);
+        }
+        let robot = || Arc::new(Robot { robot_id: robot_id.clone(), said: Mutex::default() });
+        Ok(map.entry(robot_id.clone()).or_insert_with(robot).clone())
+    }
+
+    /// Takes over who is listed. One that is listed no more stays as long as it has been heard.
+    pub fn list(&self, listed: &BTreeSet<RobotId>) {
+        let mut map = self.0.write().unwrap_or_else(PoisonError::into_inner);
+        map.retain(|robot_id, robot| {
+            let mut said = robot.said();
+            said.is_listed = listed.contains(robot_id);
+            said.is_listed || said.line.is_some() || said.heard.is_some()
+        });
+        for robot_id in listed {
+            if map.len() >= limits::STOP_ROBOTS_MAX {
+                break;
+            }
+            let said = || Mutex::new(Said { is_listed: true, ..Said::default() });
+            let robot = || Arc::new(Robot { robot_id: robot_id.clone(), said: said() });
+            map.entry(robot_id.clone()).or_insert_with(robot);
+        }
+    }
+
+    /// Tells all lines of a change.
+    pub fn tell(&self, frame: &Frame, now: LinkTime) -> usize {
+        let mut told = 0;
+        for robot in self.read().values() {
+            if let Some(line) = &robot.said().line {
+                line.tell(frame, now);
+                told += 1;
+            }
+        }
+        told
+    }
+
+    /// All lines.
+    pub fn lines(&self) -> Vec<Arc<Outbox>> {
+        self.read().values().filter_map(|robot| robot.said().line.clone()).collect()
+    }
+
+    /// A line begins; an older one of the same robot ends.
+    pub fn attach(robot: &Robot, line: &Arc<Outbox>, boot_id: &str, foreign: BTreeSet<StopId>, now: LinkTime) {
+        let mut said = robot.said();
+        if said.boot_id != boot_id {
+            let was_heard = said.heard.as_ref().is_some_and(|heard| now.since(heard.at) < limits::CHECK_IN_MISSED);
+            if said.line.is_some() && was_heard {
+                metrics::counter!("midshift_stop_lines_contested_total").increment(1);
+                tracing::warn!(robot_id = %robot.robot_id, "another start of this robot took over its line while it was heard");
+            }
+            // What another start confirmed confirms nothing of this one.
+            if let Some(heard) = &mut said.heard {
+                heard.generation = 0;
+            }
+            boot_id.clone_into(&mut said.boot_id);
+        }
+        said.foreign = foreign;
+        if let Some(older) = said.line.replace(line.clone()) {
+            older.end(End::Refused(Refusal::new(Kind::Conflict, Code::LineReplaced)), now);
+        }
+    }
+
+    /// A line is over.
+    pub fn detach(robot: &Robot, line: &Arc<Outbox>) {
+        let mut said = robot.said();
+        if said.line.as_ref().is_some_and(|current| Arc::ptr_eq(current, line)) {
+            said.line = None;
+        }
+    }
+}
+
+fn is_stray(robot: &Robot) -> bool {
+    let said = robot.said();
+    !said.is_listed && said.line.is_none()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn id(n: usize) -> RobotId {
+        RobotId::parse(&format!("r{n}")).unwrap()
+    }
+
+    #[test]
+    fn the_roster_is_bounded_and_who_nobody_lists_goes_first() {
+        let robots = Robots::default();
+        robots.list(&(1..limits::STOP_ROBOTS_MAX).map(id).collect());
+        robots.of(&id(0)).unwrap();
+        robots.of(&id(99_999)).unwrap();
+        assert_eq!(robots.all().len(), limits::STOP_ROBOTS_MAX);
+        assert!(robots.all().iter().all(|robot| robot.robot_id != id(0)), "the stray one went");
+        robots.of(&id(99_999)).unwrap().said().line = Some(Arc::new(Outbox::new(BTreeSet::new())));
+        assert_eq!(robots.of(&id(99_998)).err().map(|refusal| refusal.kind()), Some(Kind::Exhausted));
+    }
+}

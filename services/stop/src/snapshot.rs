@@ -1,0 +1,96 @@
+//! What others write beside the service's own files: who belongs to the fleet.
+//!
+//! Invariant: written whole under another name and renamed, so that a reader never sees half; one that cannot be read is told once, and the last good
+//! one stays in force. Absent on purpose: `principals.snapshot`, which comes with login.
+
+use crate::{Inner, blocking};
+use midshift_core::ids::RobotId;
+use midshift_core::limits;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Read, Write};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// Its name in the folder.
+pub const NAME: &str = "roster.snapshot";
+const LOOK_EVERY: Duration = Duration::from_secs(1);
+/// Names of 64 bytes, with room.
+const BYTES_MAX: u64 = limits::STOP_ROBOTS_MAX as u64 * 80;
+
+/// Who belongs to the fleet.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Roster {
+    /// At most [`limits::STOP_ROBOTS_MAX`].
+    pub robots: BTreeSet<RobotId>,
+}
+
+impl Roster {
+    /// Writes it into the folder of a stop service, whole or not at all. Called by whoever knows the fleet.
+    ///
+    /// # Errors
+    /// The disk.
+    pub fn write(&self, folder: &Path) -> io::Result<()> {
+        let part = folder.join(format!("{NAME}.part"));
+        let mut file = OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(&part)?;
+        file.write_all(&serde_json::to_vec(self)?)?;
+        file.sync_all()?;
+        fs::rename(part, folder.join(NAME))
+    }
+}
+
+/// Which file it was.
+type Mark = (u64, i64, i64, u64);
+
+fn mark(path: &Path) -> Option<Mark> {
+    let found = fs::metadata(path).ok()?;
+    Some((found.ino(), found.mtime(), found.mtime_nsec(), found.len()))
+}
+
+/// The roster of a folder, if it is another file than `before`. None inside: it cannot be read.
+pub fn look(path: &Path, before: Option<Mark>) -> (Option<Mark>, Option<Result<Roster, String>>) {
+    let now = mark(path);
+    if now == before || now.is_none() {
+        return (before, None);
+    }
+    let read = || -> Result<Roster, String> {
+        let mut text = Vec::new();
+        let file = File::open(path).map_err(|e| e.to_string())?;
+        file.take(BYTES_MAX + 1).read_to_end(&mut text).map_err(|e| e.to_string())?;
+        if text.len() as u64 > BYTES_MAX {
+            return Err(format!("it has more than {BYTES_MAX} bytes"));
+        }
+        serde_json::from_slice(&text).map_err(|e| e.to_string())
+    };
+    (now, Some(read()))
+}
+
+/// Follows the file until the task is ended.
+pub async fn keep(inner: &Inner, folder: PathBuf, mut known: Option<Mark>) {
+    let path = folder.join(NAME);
+    loop {
+        tokio::time::sleep(LOOK_EVERY).await;
+        let (at, before) = (path.clone(), known);
+        let (found, roster) = blocking(move || look(&at, before)).await;
+        known = found;
+        if let Some(roster) = roster {
+            take(inner, roster);
+        }
+    }
+}
+
+/// Puts a roster in force.
+pub fn take(inner: &Inner, roster: Result<Roster, String>) {
+    match roster {
+        Ok(roster) => {
+            inner.robots.list(&roster.robots);
+            metrics::gauge!("midshift_stop_roster").set(roster.robots.len() as f64);
+            tracing::info!(robots = roster.robots.len(), "roster taken over");
+            inner.touch();
+        }
+        Err(error) => tracing::error!(error, "the roster cannot be read; the last good one stays in force"),
+    }
+}

@@ -1,0 +1,294 @@
+//! A stop service as it is served, on a runtime of its own that can be ended like a process; and a robot's end of a line.
+
+use midshift_core::ids::{RobotId, StopId};
+use midshift_core::robot::StopLevel;
+use midshift_core::site::Site;
+use midshift_core::stop::ladder::{Around, Stage};
+use midshift_core::stop::{Latch, Stop};
+use midshift_core::time::{Clock, ScaledClock, Utc};
+use midshift_proto::convert::stop::{CheckIn, FromStop, ToStop};
+use midshift_proto::stop::v1;
+use midshift_proto::stop::v1::stop_link_service_client::StopLinkServiceClient;
+use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
+use midshift_stop::{Error, Parts, StopService, serve};
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+use tokio::net::TcpListener;
+use tokio::runtime::Runtime;
+use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
+use tokio::time::Instant;
+use tokio_stream::wrappers::{ReceiverStream, TcpListenerStream};
+use tokio_util::sync::CancellationToken;
+use tonic::transport::Channel;
+use tonic::{Code, Status, Streaming};
+
+/// Whatever is waited for comes within this, or the test fails.
+pub const WITHIN: Duration = Duration::from_secs(20);
+
+/// All servers of the test program have one wall.
+fn elapsed_us() -> u64 {
+    static START: OnceLock<Instant> = OnceLock::new();
+    START.get_or_init(Instant::now).elapsed().as_micros() as u64
+}
+
+pub struct Server {
+    runtime: Option<Runtime>,
+    serving: JoinHandle<Result<(), Error>>,
+    shutdown: CancellationToken,
+    pub address: SocketAddr,
+    ahead_us: Arc<AtomicU64>,
+}
+
+impl Server {
+    pub async fn start(folder: &Path) -> Self {
+        Self::with_site(folder, None).await
+    }
+
+    pub async fn with_site(folder: &Path, site: Option<Arc<Site>>) -> Self {
+        let ahead_us = Arc::new(AtomicU64::new(0));
+        let ahead = ahead_us.clone();
+        let clock = ScaledClock::new(move || elapsed_us() + ahead.load(Relaxed), Utc(1_780_000_000_000), 1000);
+        let clock: Arc<dyn Clock> = Arc::new(clock);
+        let shutdown = CancellationToken::new();
+        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
+        let service = eventually(async || {
+            let parts = Parts { folder: folder.to_owned(), site: site.clone(), clock: clock.clone() };
+            match StopService::open(parts, shutdown.clone()) {
+                // The one before has not let go of it yet.
+                Err(Error::Latch(midshift_latch::Error::Held { .. })) => None,
+                opened => Some(opened.unwrap()),
+            }
+        })
+        .await;
+        let (address, incoming) = runtime
+            .spawn(async {
+                let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+                (listener.local_addr().unwrap(), TcpListenerStream::new(listener))
+            })
+            .await
+            .unwrap();
+        let serving = runtime.spawn(async move {
+            let routes = service.routes().await?;
+            serve(service, routes, incoming).await
+        });
+        Self { runtime: Some(runtime), serving, shutdown, address, ahead_us }
+    }
+
+    /// The link clock and the wall of this server go ahead.
+    pub fn ahead(&self, ms: u64) {
+        self.ahead_us.fetch_add(ms * 1000, Relaxed);
+    }
+
+    pub fn ask_to_end(&self) {
+        self.shutdown.cancel();
+    }
+
+    /// Ends in order.
+    pub async fn end(mut self) {
+        self.shutdown.cancel();
+        (&mut self.serving).await.unwrap().unwrap();
+    }
+
+    /// Is gone from one moment to the next.
+    pub fn kill(mut self) {
+        self.runtime.take().unwrap().shutdown_background();
+    }
+
+    pub async fn channel(&self) -> Channel {
+        Channel::from_shared(format!("http://{}", self.address)).unwrap().connect().await.unwrap()
+    }
+
+    pub async fn client(&self) -> StopServiceClient<Channel> {
+        StopServiceClient::new(self.channel().await)
+    }
+
+    pub async fn status(&self) -> v1::Status {
+        let answer = self.client().await.get_status(v1::GetStatusRequest {}).await.unwrap();
+        answer.into_inner().status.unwrap()
+    }
+
+    pub async fn engaged(&self) -> Vec<String> {
+        self.status().await.stops.into_iter().map(|stop| stop.stop.unwrap().stop_id).collect()
+    }
+
+    /// Engages, and leaves after the first message.
+    pub async fn engage(&self, request: v1::EngageRequest) -> Result<v1::EngageResponse, Status> {
+        let mut stream = self.client().await.engage(request).await?.into_inner();
+        Ok(stream.message().await?.unwrap())
+    }
+
+    pub async fn reset(&self, stop_id: &str) -> v1::ResetResponse {
+        let request = v1::ResetRequest { stop_id: stop_id.to_owned(), reason: "looked, is clear".to_owned() };
+        self.client().await.reset(request).await.unwrap().into_inner()
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        if let Some(runtime) = self.runtime.take() {
+            runtime.shutdown_background();
+        }
+    }
+}
+
+pub fn fleet() -> v1::EngageRequest {
+    scope(v1::scope::Scope::Fleet(v1::Fleet {}))
+}
+
+pub fn scope(scope: v1::scope::Scope) -> v1::EngageRequest {
+    let scope = Some(v1::Scope { scope: Some(scope) });
+    v1::EngageRequest { scope, level: 0, reason: "drill".to_owned(), request_id: String::new() }
+}
+
+pub fn id_of(answer: &v1::EngageResponse) -> String {
+    answer.stop.as_ref().unwrap().stop_id.clone()
+}
+
+/// Asks again and again until there is something, and fails if nothing comes.
+pub async fn eventually<T>(mut look: impl AsyncFnMut() -> Option<T>) -> T {
+    let begun = Instant::now();
+    loop {
+        if let Some(found) = look().await {
+            return found;
+        }
+        assert!(begun.elapsed() < WITHIN, "it did not come");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+}
+
+pub async fn within<T>(future: impl Future<Output = T>) -> T {
+    tokio::time::timeout(WITHIN, future).await.expect("it did not come")
+}
+
+/// A robot's end of a line. It takes over what it is told, and says only what the test says.
+pub struct Robot {
+    pub robot_id: RobotId,
+    up: mpsc::Sender<v1::AttendRequest>,
+    pub down: Streaming<v1::AttendResponse>,
+    pub latch: Latch,
+    pub generation: u64,
+    pub is_synced: bool,
+    nonce: u64,
+    pub answered: u64,
+    pub is_moved: bool,
+}
+
+impl Robot {
+    pub async fn dial(server: &Server, name: &str, stops: Vec<Stop>) -> Self {
+        Self::start(server, name, "boot", stops).await.unwrap()
+    }
+
+    pub async fn start(server: &Server, name: &str, boot: &str, stops: Vec<Stop>) -> Result<Self, Status> {
+        let robot_id = RobotId::parse(name).unwrap();
+        let (up, sent) = mpsc::channel(4);
+        let latch = stops.iter().fold(Latch::default(), |mut latch, stop| {
+            latch.engage(stop.clone());
+            latch
+        });
+        let attend = ToStop::Attend { robot_id: robot_id.clone(), boot_id: boot.to_owned(), stops };
+        up.send((&attend).into()).await.unwrap();
+        let mut client = StopLinkServiceClient::new(server.channel().await);
+        let down = client.attend(ReceiverStream::new(sent)).await?.into_inner();
+        let (generation, nonce, answered) = (0, 0, 0);
+        Ok(Self { robot_id, up, down, latch, generation, is_synced: false, nonce, answered, is_moved: false })
+    }
+
+    /// Reads one message. None: the line is over.
+    pub async fn read(&mut self) -> Result<bool, Status> {
+        let Some(message) = within(self.down.message()).await? else { return Ok(false) };
+        match midshift_proto::parse(message).unwrap() {
+            FromStop::Told { stops, resets, generation } => {
+                stops.into_iter().for_each(|stop| drop(self.latch.engage(stop).then_some(())));
+                resets.into_iter().for_each(|reset| drop(self.latch.reset(reset).then_some(())));
+                self.generation = self.generation.max(generation);
+            }
+            FromStop::Synced { generation } => {
+                self.generation = self.generation.max(generation);
+                self.is_synced = true;
+            }
+            FromStop::CheckedIn { nonce, generation } => {
+                assert_eq!(generation, self.generation, "an answer never overtakes what it speaks of");
+                self.answered = nonce;
+            }
+            FromStop::MoveOver => self.is_moved = true,
+        }
+        Ok(true)
+    }
+
+    pub async fn until(&mut self, mut is_so: impl FnMut(&Self) -> bool) {
+        while !is_so(self) {
+            assert!(self.read().await.unwrap(), "the line ended");
+        }
+    }
+
+    pub async fn synced(mut self) -> Self {
+        self.until(|robot| robot.is_synced).await;
+        self
+    }
+
+    /// Says that it obeys all it knows of, standing or not.
+    pub fn obeying(&self, is_still: bool) -> CheckIn {
+        let inside: Vec<StopId> = self.latch.over(&self.robot_id, None).map(|stop| stop.stop_id.clone()).collect();
+        CheckIn {
+            nonce: 0,
+            generation: self.generation,
+            is_durable: true,
+            level: self.latch.level(&self.robot_id, None),
+            is_still,
+            awaiting: inside.clone(),
+            inside,
+            stage: Stage::Heard,
+            around: Around::People,
+        }
+    }
+
+    pub async fn say(&mut self, said: CheckIn) {
+        self.nonce += 1;
+        let said = ToStop::CheckIn(CheckIn { nonce: self.nonce, ..said });
+        self.up.send((&said).into()).await.unwrap();
+    }
+
+    /// Checks in and waits for the answer.
+    pub async fn check_in(&mut self, said: CheckIn) {
+        self.say(said).await;
+        let nonce = self.nonce;
+        self.until(|robot| robot.answered == nonce).await;
+    }
+
+    pub fn effective(&self) -> Vec<String> {
+        self.latch.effective().map(|stop| stop.stop_id.to_string()).collect()
+    }
+
+    pub fn knows(&self, stop_id: &str) -> bool {
+        self.latch.stop(&StopId::parse(stop_id).unwrap()).is_some()
+    }
+}
+
+/// A stop as the service told it to a robot.
+pub fn told(robot: &Robot, stop_id: &str) -> Stop {
+    robot.latch.stop(&StopId::parse(stop_id).unwrap()).unwrap().clone()
+}
+
+pub fn code(result: Result<impl Sized, Status>) -> Code {
+    result.err().map_or(Code::Ok, |status| status.code())
+}
+
+pub fn halt() -> i32 {
+    use midshift_proto::convert::WireEnum;
+    StopLevel::Halt.to_wire()
+}
+
+pub struct Folder(tempfile::TempDir);
+
+impl Folder {
+    pub fn new() -> Self {
+        Self(tempfile::tempdir().unwrap())
+    }
+    pub fn path(&self) -> PathBuf {
+        self.0.path().join("stop")
+    }
+}

@@ -1,0 +1,174 @@
+//! Robots' lines: what they carry, when they end, and that none of them holds up another.
+
+use crate::harness::{Folder, Robot, Server, WITHIN, code, eventually, fleet, id_of, scope, within};
+use midshift_core::site::{DEMO, text};
+use midshift_proto::convert::stop::ToStop;
+use midshift_proto::refusal_of;
+use midshift_proto::stop::v1;
+use midshift_proto::stop::v1::scope::Scope as W;
+use midshift_proto::stop::v1::stop_link_service_client::StopLinkServiceClient;
+use midshift_stop::{Error, Parts, StopService};
+use std::sync::Arc;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::sync::CancellationToken;
+use tonic::Code;
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_client::HealthClient;
+
+#[tokio::test]
+async fn a_check_in_is_answered_with_its_number_and_what_was_told() {
+    let folder = Folder::new();
+    let server = Server::start(&folder.path()).await;
+    let mut robot = Robot::dial(&server, "r1", vec![]).await.synced().await;
+    for _ in 0..3 {
+        let said = robot.obeying(true);
+        robot.check_in(said).await;
+        // `Robot::read` holds each answer against the newest change it was told.
+        server.engage(fleet()).await.unwrap();
+    }
+    robot.until(|robot| robot.effective().len() == 3).await;
+    let heard = server.status().await.robots[0].heard_unix_ms;
+    assert!(heard > 1_780_000_000_000, "{heard}");
+}
+
+#[tokio::test]
+async fn a_newer_line_of_a_robot_takes_the_place_of_the_older_one() {
+    let folder = Folder::new();
+    let server = Server::start(&folder.path()).await;
+    let mut older = Robot::dial(&server, "r1", vec![]).await.synced().await;
+    let said = older.obeying(true);
+    older.check_in(said).await;
+    let id = id_of(&server.engage(fleet()).await.unwrap());
+    older.until(|robot| robot.knows(&id)).await;
+    let said = older.obeying(true);
+    older.check_in(said).await;
+    assert_eq!(server.status().await.stops[0].counts.unwrap().standstill_confirmed, 1);
+    let mut newer = Robot::start(&server, "r1", "another boot", vec![]).await.unwrap().synced().await;
+    let end = loop {
+        match older.read().await {
+            Ok(true) => {}
+            end => break end,
+        }
+    };
+    assert_eq!(refusal_of(&end.unwrap_err()).reason, "LINE_REPLACED");
+    let counts = server.status().await.stops[0].counts.unwrap();
+    assert_eq!(counts.standstill_confirmed, 0, "what the start before confirmed confirms nothing of this one");
+    let said = newer.obeying(true);
+    newer.check_in(said).await;
+    assert_eq!(server.status().await.stops[0].counts.unwrap().standstill_confirmed, 1);
+}
+
+#[tokio::test]
+async fn a_line_that_does_not_begin_with_attend_or_breaks_its_rules_is_refused() {
+    let folder = Folder::new();
+    let server = Server::start(&folder.path()).await;
+    let robot = Robot::dial(&server, "r1", vec![]).await.synced().await;
+    let messages = [
+        (&ToStop::CheckIn(robot.obeying(true))).into(),
+        v1::AttendRequest { message: None },
+        v1::AttendRequest { message: Some(v1::attend_request::Message::Attend(v1::Attend::default())) },
+    ];
+    for message in messages {
+        let (up, sent) = mpsc::channel(1);
+        up.send(message).await.unwrap();
+        let mut client = StopLinkServiceClient::new(server.channel().await);
+        assert_eq!(code(client.attend(ReceiverStream::new(sent)).await), Code::InvalidArgument);
+    }
+}
+
+/// Two hundred and forty stops with boxes are far more than a connection holds for a robot that reads nothing.
+#[tokio::test]
+async fn a_robot_that_reads_nothing_holds_up_nobody_and_hears_everything_when_it_reads_again() {
+    let folder = Folder::new();
+    let site = Arc::new(text::parse(DEMO).unwrap());
+    let area = site.areas()[0].area_id.to_string();
+    let server = Server::with_site(&folder.path(), Some(site)).await;
+    let mut slow = Robot::dial(&server, "slow", vec![]).await;
+    let mut quick = Robot::dial(&server, "quick", vec![]).await.synced().await;
+    let mut client = server.client().await;
+    let mut reset = Vec::new();
+    for n in 0..240 {
+        let request = scope(W::AreaId(area.clone()));
+        let mut stream = within(client.engage(request)).await.unwrap().into_inner();
+        let id = id_of(&within(stream.message()).await.unwrap().unwrap());
+        quick.until(|robot| robot.knows(&id)).await;
+        let said = quick.obeying(true);
+        quick.check_in(said).await;
+        if n % 4 == 0 {
+            server.reset(&id).await;
+            reset.push(id);
+        }
+    }
+    let last = id_of(&server.engage(fleet()).await.unwrap());
+    quick.until(|robot| robot.knows(&last) && robot.effective().len() == 181).await;
+    slow.until(|robot| robot.knows(&last)).await;
+    let said = slow.obeying(true);
+    slow.check_in(said).await;
+    assert_eq!(slow.effective(), quick.effective(), "without those that were reset meanwhile");
+}
+
+#[tokio::test]
+async fn an_end_in_order_asks_robots_to_dial_again_and_is_bounded() {
+    let folder = Folder::new();
+    let server = Server::start(&folder.path()).await;
+    let mut robot = Robot::dial(&server, "r1", vec![]).await.synced().await;
+    let mut watch = server.client().await.watch_status(v1::WatchStatusRequest {}).await.unwrap().into_inner();
+    server.ask_to_end();
+    robot.until(|robot| robot.is_moved).await;
+    while robot.read().await.is_ok_and(|goes_on| goes_on) {}
+    while within(watch.message()).await.is_ok_and(|message| message.is_some()) {}
+    tokio::time::timeout(WITHIN, server.end()).await.expect("it ends");
+}
+
+#[tokio::test]
+async fn one_process_has_a_folder_at_a_time() {
+    let folder = Folder::new();
+    let _server = Server::start(&folder.path()).await;
+    let clock = midshift_core::time::ScaledClock::new(|| 0, midshift_core::time::Utc(0), 1000);
+    let parts = Parts { folder: folder.path(), site: None, clock: Arc::new(clock) };
+    let second = StopService::open(parts, CancellationToken::new());
+    assert!(matches!(second.err(), Some(Error::Latch(midshift_latch::Error::Held { .. }))));
+}
+
+#[tokio::test]
+async fn health_and_reflection_speak_of_this_service_and_nothing_else() {
+    use tonic_reflection::pb::v1::server_reflection_client::ServerReflectionClient;
+    use tonic_reflection::pb::v1::server_reflection_request::MessageRequest;
+    use tonic_reflection::pb::v1::server_reflection_response::MessageResponse;
+    let folder = Folder::new();
+    let server = Server::start(&folder.path()).await;
+    for service in ["", "midshift.stop.v1.StopService", "midshift.stop.v1.StopLinkService"] {
+        let request = HealthCheckRequest { service: service.to_owned() };
+        let answer = HealthClient::new(server.channel().await).check(request).await.unwrap().into_inner();
+        assert_eq!(answer.status, 1, "{service}");
+    }
+    let list = MessageRequest::ListServices(String::new());
+    let request = tonic_reflection::pb::v1::ServerReflectionRequest { host: String::new(), message_request: Some(list) };
+    let stream = tokio_stream::iter([request]);
+    let mut client = ServerReflectionClient::new(server.channel().await);
+    let mut answers = client.server_reflection_info(stream).await.unwrap().into_inner();
+    let answer = answers.message().await.unwrap().unwrap().message_response.unwrap();
+    let MessageResponse::ListServicesResponse(list) = answer else { panic!("{answer:?}") };
+    let mut names: Vec<String> = list.service.into_iter().map(|service| service.name).collect();
+    names.sort_unstable();
+    assert_eq!(names, ["grpc.health.v1.Health", "midshift.stop.v1.StopLinkService", "midshift.stop.v1.StopService"]);
+}
+
+#[tokio::test]
+async fn many_robots_hear_a_stop_and_each_is_counted() {
+    let folder = Folder::new();
+    let server = Server::start(&folder.path()).await;
+    let mut robots = Vec::new();
+    for n in 0..100 {
+        robots.push(Robot::dial(&server, &format!("r{n}"), vec![]).await.synced().await);
+    }
+    let id = id_of(&server.engage(fleet()).await.unwrap());
+    for robot in &mut robots {
+        robot.until(|robot| robot.knows(&id)).await;
+        let said = robot.obeying(true);
+        robot.check_in(said).await;
+    }
+    let counted = async || server.status().await.stops[0].counts.unwrap().standstill_confirmed == 100;
+    eventually(async || counted().await.then_some(())).await;
+}
