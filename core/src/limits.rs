@@ -292,3 +292,44 @@ pub const STOP_REQUESTS_MAX: usize = 1_024;
 pub const STOP_AUDIT_QUEUE: usize = 1_024;
 /// Bytes of a slot of the latch file: 2,048 resets with their stops and 256 stops with 128 boxes each, as JSON.
 pub const STOP_LATCH_BYTES: usize = 8 * 1024 * 1024;
+
+// --- the edge: what a connection may take before, and beside, what its requests may. All L.
+
+/// Connections of one port. Below the 20,000 descriptors that some systems give a process at most, with room for files.
+pub const CONNECTIONS_MAX: usize = 16_384;
+/// Of these, so many from one address (one /64 of IPv6): a quarter, for a site's robots may stand behind one router.
+pub const CONNECTIONS_PER_NETWORK_MAX: usize = 4_096;
+/// A TLS handshake is done within this: three round trips on the worst radio link, ten times over.
+pub const TLS_HANDSHAKE_WITHIN: LinkDuration = LinkDuration::from_secs(5);
+/// The head of a connection's first request is there within this; who connects has something to ask.
+pub const FIRST_REQUEST_WITHIN: LinkDuration = LinkDuration::from_secs(5);
+/// A later head of an HTTP/1.1 connection is there within this, counted from the answer before it: twice a usual scrape interval.
+pub const HTTP1_HEAD_WITHIN: LinkDuration = LinkDuration::from_secs(30);
+/// Bytes of the head of an HTTP/1.1 request, and of what is read ahead.
+pub const HTTP1_HEAD_BYTES: usize = 64 * 1024;
+/// Bytes of the header list of an HTTP/2 request, as HTTP/2 counts them: what peers take by default.
+pub const HEADER_LIST_BYTES: u32 = 16 * 1024;
+/// A connection without a stream for so long is closed. Longer than what people and programs pause between two calls.
+pub const CONNECTION_IDLE: LinkDuration = LinkDuration::from_secs(300);
+/// A quiet HTTP/2 connection is pinged so often: shorter than what routers forget a connection after.
+pub const KEEPALIVE_EVERY: LinkDuration = LinkDuration::from_secs(20);
+/// A ping that is not answered within this ends the connection: with the pause before it as long as [`AUTHORITY`].
+pub const KEEPALIVE_WITHIN: LinkDuration = LinkDuration::from_secs(10);
+/// The first pause when the process has no descriptor or memory for another connection; it doubles with each failure.
+pub const ACCEPT_PAUSE: LinkDuration = LinkDuration(100);
+/// The longest such pause: a connection waits no longer than this once there is room.
+pub const ACCEPT_PAUSE_MAX: LinkDuration = LinkDuration::from_secs(1);
+/// An old connection's streams are told so long before HTTP/2 tells the peer: a robot moves over in a second or two.
+pub const CONNECTION_NOTICE: LinkDuration = LinkDuration::from_secs(5);
+/// A connection that was told to go is closed after this.
+pub const CONNECTION_GRACE: LinkDuration = LinkDuration::from_secs(30);
+/// Requests under way on one port, open streams included: four a connection.
+pub const REQUESTS_MAX: usize = 65_536;
+/// Of these, so many of one principal: a quarter.
+pub const REQUESTS_PER_PRINCIPAL_MAX: usize = 16_384;
+/// Requests a second that one principal may begin for long; who has more to say has a batch or a stream for it.
+pub const REQUESTS_PER_SECOND: u32 = 1_000;
+/// Requests that it may begin at once.
+pub const REQUESTS_BURST: u32 = 2_000;
+/// Principals whose rate is remembered; the one heard longest ago is forgotten first, and begins anew.
+pub const RATES_REMEMBERED: usize = 16_384;

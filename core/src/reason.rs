@@ -73,6 +73,7 @@ codes! {
     CommitUnknown = "COMMIT_UNKNOWN", "Nobody knows whether it was committed. Send it again with the same request_id.";
     MovedMeanwhile = "MOVED_MEANWHILE", "What the request is about was changed each time it was to be written. Nothing was done; send it again.";
     Overloaded = "OVERLOADED", "A queue is full. Try again later.";
+    TooManyRequests = "TOO_MANY_REQUESTS", "One caller has more requests open, or begins more a second, than it may. Wait as long as the answer says, and send many things in one batch or over one stream.";
     DeadlineExceeded = "DEADLINE_EXCEEDED", "The call took longer than its deadline. The outcome is unknown; ask again with the same request_id.";
     Internal = "INTERNAL", "A fault of midshift. The request_id is in the log.";
     // --- fleet stop
