@@ -168,7 +168,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 no_faults: true,
                 listen: None,
                 trust: None,
-                stop: StopFlags::none(),
+                stop: StopFlags::default(),
             };
             midshift::robots::swarm(swarm, stop).await
         }

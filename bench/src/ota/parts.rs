@@ -201,7 +201,7 @@ async fn agent(
         sets: Some(home.join("sets")),
         trust: Some(home.join("trust.json")),
         clock_unsynced: false,
-        stop: StopFlags::none(),
+        stop: StopFlags::default(),
     };
     let hand = move |body: &SimHandle, clock: &Arc<dyn Clock>| {
         // Nobody else sets it.

@@ -348,10 +348,8 @@ mod tests {
             around: Around::Robots,
         };
         let robot_id = RobotId::parse("r1").expect("an id");
-        let said = [
-            ToStop::CheckIn(check_in),
-            ToStop::Attend { robot_id, boot_id: "b".to_owned(), stops: vec![stop()] },
-        ];
+        let said =
+            [ToStop::CheckIn(check_in), ToStop::Attend { robot_id, boot_id: "b".to_owned(), stops: vec![stop()] }];
         for said in said {
             assert_eq!(parse::<ToStop, _>(v1::AttendRequest::from(&said)), Ok(said));
         }

@@ -144,12 +144,7 @@ impl Bench {
         let dial = Arc::new(Pipes { ends, network: watch::channel(true).1 });
         Self::over(dial, lines, store, keep)
     }
-    fn over(
-        dial: Arc<dyn Dial>,
-        lines: mpsc::Receiver<Seen>,
-        store: Box<dyn Store>,
-        keep: Box<dyn KeepStops>,
-    ) -> Self {
+    fn over(dial: Arc<dyn Dial>, lines: mpsc::Receiver<Seen>, store: Box<dyn Store>, keep: Box<dyn KeepStops>) -> Self {
         let config = AgentConfig {
             stop: Some(StopLine { dial, keep }),
             update: None,
@@ -324,8 +319,12 @@ async fn a_message_that_cannot_be_read_ends_the_line_and_what_was_told_before_st
     let mut line = bench.free().await;
     line.tell(&[stop(1, StopLevel::Halt)], 2).await;
     line.until(2, |c| c.obeys == HALT).await;
-    line.say(v1::attend_response::Message::Told(v1::Told { stops: vec![v1::Stop::default()], resets: vec![], generation: 3 }))
-        .await;
+    line.say(v1::attend_response::Message::Told(v1::Told {
+        stops: vec![v1::Stop::default()],
+        resets: vec![],
+        generation: 3,
+    }))
+    .await;
     while line.next().await.is_some() {}
     let mut next = bench.line().await;
     let attend = next.attend().await;

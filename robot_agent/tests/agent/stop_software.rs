@@ -3,7 +3,9 @@
 use crate::release::Releases;
 use crate::rig::{Rig, action};
 use crate::stops::{attend, desk, freed, hear, reset, serve, stop, stop_id, told};
-use crate::updates::{Order, activate, drain, maintain, name_of, on_trial, relaunch, report, stage, state, switch, want};
+use crate::updates::{
+    Order, activate, drain, maintain, name_of, on_trial, relaunch, report, stage, state, switch, want,
+};
 use midshift_agent::stop::StopNews;
 use midshift_core::robot::StopLevel;
 use midshift_core::update::{Goal, UpdateState};

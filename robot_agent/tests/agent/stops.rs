@@ -456,11 +456,8 @@ fn an_answer_of_a_service_that_has_not_told_all_feeds_nothing_and_another_line_i
 /// The hall, without people if its rules say so.
 fn rules(rig: &mut Rig, without_people: bool) {
     let area = AreaPolicy { without_people, ..AreaPolicy::default_of(AreaId::parse("hall").expect("a name")) };
-    let policy = DesiredPolicy {
-        robot_id: RobotId::parse("rbt-01").expect("a name"),
-        generation: 5,
-        areas: vec![area],
-    };
+    let policy =
+        DesiredPolicy { robot_id: RobotId::parse("rbt-01").expect("a name"), generation: 5, areas: vec![area] };
     rig.down(Downlink { policy: Some(policy), ..Downlink::default() });
 }
 
@@ -636,7 +633,8 @@ fn an_errand_to_a_posture_or_a_charger_begins_nothing_either() {
     for name in ["park", "charge"] {
         let mut rig = free();
         let steps = vec![action("inspect", Effect::Repeatable), action(name, Effect::Repeatable)];
-        let steps = vec![WorkStep { kind: action("pick", Effect::Repeatable).kind, ..steps[0].clone() }, steps[1].clone()];
+        let steps =
+            vec![WorkStep { kind: action("pick", Effect::Repeatable).kind, ..steps[0].clone() }, steps[1].clone()];
         rig.work(rig.desired(Some(rig.offer("T1", 1, steps, vec![]))));
         told(&mut rig, vec![stop(1, StopLevel::Halt)], vec![]);
         rig.body.done();

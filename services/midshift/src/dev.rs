@@ -200,6 +200,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         reader: None,
         sim: Some(SimFace::new(hall.clone(), clock.clone(), swarm.crash())),
         naive: Naive::default(),
+        stops: None,
         planning: planning.handle(),
     };
     // The server ends after its robots and its client, or the last of them would be cut off at Ctrl-C.

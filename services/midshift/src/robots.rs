@@ -30,46 +30,23 @@ use tokio_util::task::AbortOnDropHandle;
 /// How often a person looks, real time.
 const VISIT: Duration = Duration::from_secs(5);
 
-/// Port of the stop service: its own, beside the server's.
-const STOP_PORT: u16 = 7421;
-
 /// The way to the stop service.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub struct StopFlags {
-    /// The stop service, host:port. Without it the host of --server, port 7421. A robot stands until it was told there what is stopped.
-    #[arg(long, value_name = "ADDR", conflicts_with = "no_stop_line")]
+    /// The stop service, host:port; of a server beside it the port is 7421. With it a robot stands until it was told there what is stopped. Without it fleet stop
+    /// reaches these robots only by the work that fleet gives them, and they do not slow down or stand when nobody is heard.
+    #[arg(long, value_name = "ADDR")]
     pub stop_server: Option<String>,
-    /// No line to a stop service: fleet stop does not reach these robots, and they do not slow down or stand when nobody is heard.
-    #[arg(long)]
-    pub no_stop_line: bool,
 }
 
 impl StopFlags {
-    /// None to be had.
-    pub fn none() -> Self {
-        Self { stop_server: None, no_stop_line: true }
-    }
     /// Where the stop service is; none: there is to be no line, which is said aloud.
-    fn uri(&self, server: &str) -> Option<String> {
-        if self.no_stop_line {
-            tracing::warn!("no stop line: fleet stop does not reach these robots");
-            return None;
+    fn uri(&self) -> Option<String> {
+        if self.stop_server.is_none() {
+            tracing::warn!("no stop line: fleet stop does not reach these robots by a way of its own");
         }
-        Some(self.stop_server.as_deref().map_or_else(|| beside(server), uri))
+        self.stop_server.as_deref().map(uri)
     }
-}
-
-/// The stop service that is beside a server: same host, its own port.
-fn beside(server: &str) -> String {
-    let uri = uri(server);
-    let (scheme, rest) = uri.split_once("://").unwrap_or(("http", &uri));
-    let authority = rest.split('/').next().unwrap_or(rest);
-    // The last colon is the port's, unless it stands inside the brackets of an address.
-    let host = match authority.rsplit_once(':') {
-        Some((host, port)) if !port.contains(']') => host,
-        _ => authority,
-    };
-    format!("{scheme}://{host}:{STOP_PORT}")
 }
 
 /// One agent with a simulated body.
@@ -228,7 +205,7 @@ pub async fn agent_in_hand(
         update.config.clock_synced = !args.clock_unsynced;
     }
     let store = midshift_agent::sqlite::SqliteStore::open(&args.data.join(AGENT_FILE)).await?;
-    let stop_line = match args.stop.uri(&args.server) {
+    let stop_line = match args.stop.uri() {
         Some(uri) => Some(StopLine {
             dial: Arc::new(TcpDial::new(&uri, Some(stop_network))?),
             keep: Box::new(FileStops::new(&args.data.join(STOP_FILE))),
@@ -282,7 +259,7 @@ pub async fn swarm(args: SimRun, stop: CancellationToken) -> anyhow::Result<()> 
     let trust = args.trust.as_deref().map(|file| software::trust_of(file, &config.site)).transpose()?;
     let hall = Arc::new(Hall::open(&config, &clock.now())?);
     let mut swarm = SwarmConfig::tcp(hall.clone(), clock.clone(), &uri(&args.server), args.seed);
-    if let Some(uri) = args.stop.uri(&args.server) {
+    if let Some(uri) = args.stop.uri() {
         swarm = swarm.with_stop(&uri);
     }
     swarm.software = trust;
@@ -304,25 +281,4 @@ pub async fn swarm(args: SimRun, stop: CancellationToken) -> anyhow::Result<()> 
         }
     }
     Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_stop_service_is_beside_the_server_unless_it_is_named_or_not_wanted() {
-        for (server, stop) in [
-            ("127.0.0.1:7420", "http://127.0.0.1:7421"),
-            ("https://plant.example:7420", "https://plant.example:7421"),
-            ("plant.example", "http://plant.example:7421"),
-            ("[::1]:7420", "http://[::1]:7421"),
-            ("[::1]", "http://[::1]:7421"),
-        ] {
-            assert_eq!(StopFlags::default().uri(server).as_deref(), Some(stop), "{server}");
-        }
-        let named = StopFlags { stop_server: Some("stop:1".to_owned()), ..StopFlags::default() };
-        assert_eq!(named.uri("a:2").as_deref(), Some("http://stop:1"));
-        assert_eq!(StopFlags::none().uri("a:2"), None);
-    }
 }

@@ -138,6 +138,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
     };
     tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), store = storage.engine(), %roles, "midshift serves");
     let planning = Planning::start()?;
+    let fleet_follows = roles.has(Role::Fleet);
     let parts = Parts {
         roles,
         drain,
@@ -151,6 +152,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
         reader,
         sim: None,
         naive: Naive::default(),
+        stops: fleet_follows.then(|| args.data.join("stop")),
         planning: planning.handle(),
     };
     let server = Server::new(parts, shutdown).await?.hearing(beacons);

@@ -6,6 +6,7 @@
 //! move over.
 
 use crate::roles::{Role, Roles};
+use crate::stop_follower::StopFollower;
 use crate::upkeep;
 use anyhow::{Context, bail};
 use axum::routing::get;
@@ -24,6 +25,7 @@ use midshift_store::{FrameLog, HeardLog, LiveBoard, Store};
 use midshift_task::TaskService;
 use midshift_telemetry::TelemetryService;
 use std::collections::BTreeSet;
+use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -77,6 +79,8 @@ pub struct Parts {
     pub sim: Option<SimFace>,
     /// Naive rules for twins of tests; none outside them.
     pub naive: Naive,
+    /// Where the stop service beside this process keeps its files, if there is one.
+    pub stops: Option<PathBuf>,
     /// Where fleet plans; see [`crate::planning`].
     pub planning: tokio::runtime::Handle,
 }
@@ -356,7 +360,16 @@ impl Running<'_> {
             }
             Ok(())
         };
-        tokio::try_join!(spawned("fleet", fleet), spawned("rollouts", planner), telemetry, ear, ota, reader).map(drop)
+        let stops = self.parts.stops.clone().map(|folder| StopFollower::new(folder, self.parts.store.clone()));
+        let stops = async {
+            if let Some(follower) = stops {
+                // It ends with the others.
+                shutdown.run_until_cancelled(follower.run()).await;
+            }
+            Ok(())
+        };
+        let planners = async { tokio::try_join!(spawned("fleet", fleet), spawned("rollouts", planner)) };
+        tokio::try_join!(planners, telemetry, ear, ota, reader, stops).map(drop)
     }
 }
 
@@ -467,6 +480,7 @@ mod tests {
             reader: None,
             sim: None,
             naive: Naive::default(),
+            stops: None,
             planning: planning.handle(),
         };
         let shutdown = CancellationToken::new();

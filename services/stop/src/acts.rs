@@ -142,9 +142,9 @@ pub fn reset(inner: &Inner, stop_id: StopId, reason: String, actor: String) -> R
     if resetting.is_new {
         let Reset { stop_id, actor, reason, .. } = &resetting.reset;
         let note = Note { actor: actor.clone(), ..Note::own(now.wall, Action::Reset) };
-        inner.disk.note(
-            note.with("stop_id", stop_id).with("reason", reason).with("was_engaged", resetting.was_engaged),
-        );
+        inner
+            .disk
+            .note(note.with("stop_id", stop_id).with("reason", reason).with("was_engaged", resetting.was_engaged));
     }
     drop(law);
     inner.disk.wake();

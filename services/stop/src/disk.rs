@@ -193,7 +193,10 @@ fn said(before: Refusing, now: Refusing) {
     metrics::gauge!("midshift_stop_audit_durable").set(f64::from(u8::from(!now.audit)));
     for (file, before, now) in [("latch", before.latch, now.latch), ("audit", before.audit, now.audit)] {
         match (before, now) {
-            (false, true) => tracing::error!(file, "the disk refuses a file of the stop service; it goes on in memory and tries again"),
+            (false, true) => tracing::error!(
+                file,
+                "the disk refuses a file of the stop service; it goes on in memory and tries again"
+            ),
             (true, false) => tracing::warn!(file, "the disk takes a file of the stop service again"),
             _ => {}
         }

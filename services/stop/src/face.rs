@@ -95,8 +95,7 @@ where
                 return Ok(Status::unimplemented("").into_http());
             }
             // A robot brings up to 256 stops with 128 boxes each.
-            let mut grpc =
-                Grpc::new(Ready).apply_max_message_size_config(Some(limits::TELEMETRY_BATCH_BYTES), None);
+            let mut grpc = Grpc::new(Ready).apply_max_message_size_config(Some(limits::TELEMETRY_BATCH_BYTES), None);
             Ok(grpc.streaming(Attend(inner), request).await)
         })
     }

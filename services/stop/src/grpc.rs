@@ -47,7 +47,10 @@ fn wanted(r: v1::EngageRequest) -> Result<Wanted, Refusal> {
 }
 
 impl StopService {
-    async fn engage_now(&self, r: v1::EngageRequest) -> Result<ReceiverStream<Result<v1::EngageResponse, Status>>, Refusal> {
+    async fn engage_now(
+        &self,
+        r: v1::EngageRequest,
+    ) -> Result<ReceiverStream<Result<v1::EngageResponse, Status>>, Refusal> {
         let inner = self.inner.clone();
         let engaged = acts::engage(&inner, wanted(r)?)?;
         let durable = inner.disk.turn(engaged.version).await;
@@ -68,7 +71,10 @@ impl StopService {
         let mut bad = Violations::default();
         let stop_id = bad.take("stop_id", StopId::parse(&r.stop_id));
         if r.reason.trim().is_empty() || r.reason.len() > limits::REASON_BYTES_MAX {
-            bad.add("reason", format!("is required, 1-{} bytes: what you saw that makes it safe", limits::REASON_BYTES_MAX));
+            bad.add(
+                "reason",
+                format!("is required, 1-{} bytes: what you saw that makes it safe", limits::REASON_BYTES_MAX),
+            );
         }
         bad.finish()?;
         let stop_id = stop_id.ok_or_else(|| Refusal::field("stop_id", "cannot be read"))?;

@@ -13,8 +13,8 @@ mod confirm;
 mod disk;
 mod face;
 mod frames;
-mod grpc;
 mod ground;
+mod grpc;
 mod law;
 mod line;
 mod outbox;
@@ -33,7 +33,7 @@ use law::{Kept, Law};
 use midshift_core::limits;
 use midshift_core::robot::StopLevel;
 use midshift_core::site::Site;
-use midshift_core::stop::{Scope, Stop};
+use midshift_core::stop::{Latch, Scope, Stop};
 use midshift_core::time::{Clock, LinkTime, Now, Utc};
 use midshift_latch::LatchFile;
 use midshift_proto::stop::v1::stop_service_server::StopServiceServer;
@@ -310,6 +310,14 @@ pub fn verify(folder: &Path) -> Result<Verified, Broken> {
     audit::verify(folder, &kept.audit)
 }
 
+/// What the stop service in this folder keeps, and a number that rises with each change of it; also while it runs.
+///
+/// # Errors
+/// There is no latch, or none that can be read.
+pub fn latch(folder: &Path) -> Result<(u64, Latch), midshift_latch::Error> {
+    midshift_latch::read::<Kept>(&folder.join(LATCH)).map(|(generation, kept)| (generation, kept.latch))
+}
+
 struct Opened {
     kept: Kept,
     writer: Writer,
@@ -350,7 +358,9 @@ fn open(folder: &Path, now: Utc) -> Result<Opened, Error> {
         opened => opened?,
     };
     if found == Found::Replaced {
-        tracing::error!("the key of the stop service could not be read and was moved aside; stops that robots bring back are not known again");
+        tracing::error!(
+            "the key of the stop service could not be read and was moved aside; stops that robots bring back are not known again"
+        );
         notes.push(Note::own(now, Action::KeyLost));
     }
     let (audit, found) = Audit::open(folder, kept.audit.clone(), now);

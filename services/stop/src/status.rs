@@ -156,7 +156,9 @@ mod tests {
         let mut robots: Vec<Option<Heard>> = vec![None];
         for at in [7_000, 7_001, 9_000] {
             for generation in 0..=6 {
-                for (level, is_still) in [(StopLevel::Halt, true), (StopLevel::Slow, false), (StopLevel::ControlledStopPosture, true)] {
+                for (level, is_still) in
+                    [(StopLevel::Halt, true), (StopLevel::Slow, false), (StopLevel::ControlledStopPosture, true)]
+                {
                     for inside in [vec![], vec![1, 2], vec![2, 3, 6, 99]] {
                         robots.push(Some(Heard {
                             at: LinkTime(at),

@@ -273,6 +273,7 @@ fn serve(
                     reader: None,
                     sim: None,
                     naive: naive.server,
+                    stops: None,
                     planning: tokio::runtime::Handle::current(),
                 };
                 // A service manager starts a server again that could not read its disk.

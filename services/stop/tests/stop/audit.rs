@@ -20,7 +20,8 @@ async fn what_was_engaged_and_reset_is_recorded_before_the_answer_and_every_chan
     server.reset(&ids[0]).await;
     assert!(fs::read_to_string(&path).unwrap().contains("\"RESET\""));
     // The latch hears of the last record a moment after the answer.
-    let known = || midshift_latch::read::<serde_json::Value>(&folder.path().join("latch")).unwrap().1["audit"]["n"].clone();
+    let known =
+        || midshift_latch::read::<serde_json::Value>(&folder.path().join("latch")).unwrap().1["audit"]["n"].clone();
     eventually(async || (known() == 5).then_some(())).await;
     assert_eq!(verify(&folder.path()).unwrap().records, 5, "one is of the start");
     server.kill();

@@ -18,7 +18,8 @@ impl Small {
     fn mount() -> Self {
         let folder = Folder::new();
         fs::create_dir(folder.path()).unwrap();
-        let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", "size=20m", "tmpfs"]).arg(folder.path()).status();
+        let mounted =
+            Command::new("mount").args(["-t", "tmpfs", "-o", "size=20m", "tmpfs"]).arg(folder.path()).status();
         assert!(mounted.is_ok_and(|status| status.success()), "this test mounts a tmpfs: run it as root");
         Self(folder)
     }

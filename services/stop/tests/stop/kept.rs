@@ -201,12 +201,8 @@ async fn what_cannot_be_engaged_is_refused_with_every_reason_and_nothing_is_enga
     let folder = Folder::new();
     let site = Arc::new(text::parse(DEMO).unwrap());
     let server = Server::with_site(&folder.path(), Some(site)).await;
-    let bad = v1::EngageRequest {
-        scope: None,
-        level: 99,
-        reason: "x".repeat(257),
-        request_id: "with spaces".to_owned(),
-    };
+    let bad =
+        v1::EngageRequest { scope: None, level: 99, reason: "x".repeat(257), request_id: "with spaces".to_owned() };
     let answer = refusal_of(&server.engage(bad).await.unwrap_err());
     let fields: Vec<&str> = answer.violations.iter().map(|v| v.field.as_str()).collect();
     assert_eq!(fields, ["level", "reason", "request_id", "scope"]);

@@ -144,7 +144,8 @@ async fn health_and_reflection_speak_of_this_service_and_nothing_else() {
         assert_eq!(answer.status, 1, "{service}");
     }
     let list = MessageRequest::ListServices(String::new());
-    let request = tonic_reflection::pb::v1::ServerReflectionRequest { host: String::new(), message_request: Some(list) };
+    let request =
+        tonic_reflection::pb::v1::ServerReflectionRequest { host: String::new(), message_request: Some(list) };
     let stream = tokio_stream::iter([request]);
     let mut client = ServerReflectionClient::new(server.channel().await);
     let mut answers = client.server_reflection_info(stream).await.unwrap().into_inner();

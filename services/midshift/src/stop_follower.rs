@@ -1,0 +1,138 @@
+//! Beside a stop service: copies its stops into the store, and writes for it who the robots of the site are.
+//!
+//! The stop service never sees the store, and nobody on its way waits for this: it reads the files that the stop service keeps, whatever state that is in. Invariant: a
+//! stop that was copied is taken out only after its reset was forgotten, also if the stop service has lost its folder.
+
+use anyhow::Context;
+use midshift_core::fleet::rows::RobotControl;
+use midshift_core::ids::{RobotId, StopId};
+use midshift_core::robot::Duty;
+use midshift_core::rows::{Log, Revision, Seq, Table};
+use midshift_core::stop::record::{StopRecord, copy};
+use midshift_stop::Roster;
+use midshift_store::{CommitError, Store, follow};
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// How often the files are looked at: fleet knows of a stop a quarter of a second after robots at the latest.
+const LOOK: Duration = Duration::from_millis(250);
+/// How often it is looked up which robots a person has retired, in looks: ten seconds.
+const RETIRED_EVERY: u32 = 40;
+
+/// What follows one stop service.
+pub struct StopFollower {
+    folder: PathBuf,
+    store: Arc<dyn Store>,
+    /// Generation of the latch that was copied last.
+    copied: Option<u64>,
+    /// Robots that have ever said hello, up to an entry of the feed.
+    attached: Option<(BTreeSet<RobotId>, Seq)>,
+    retired: BTreeSet<RobotId>,
+    /// As it was written last.
+    roster: Option<BTreeSet<RobotId>>,
+    /// As the log was told.
+    failing: bool,
+}
+
+impl StopFollower {
+    /// Of the stop service that keeps its files in `folder`.
+    pub fn new(folder: PathBuf, store: Arc<dyn Store>) -> Self {
+        let (copied, attached, retired, roster) = (None, None, BTreeSet::new(), None);
+        Self { folder, store, copied, attached, retired, roster, failing: false }
+    }
+
+    /// Until it is dropped.
+    pub async fn run(mut self) {
+        let mut look = tokio::time::interval(LOOK);
+        for n in 0_u32.. {
+            look.tick().await;
+            let followed = self.follow(n % RETIRED_EVERY == 0).await;
+            if let (Err(error), false) = (&followed, self.failing) {
+                tracing::warn!(error = format!("{error:#}"), "stops are not copied into the store");
+            }
+            self.failing = followed.is_err();
+            metrics::gauge!("midshift_stop_follower_failing").set(f64::from(u8::from(self.failing)));
+        }
+    }
+
+    async fn follow(&mut self, is_retired_due: bool) -> anyhow::Result<()> {
+        // No stop service was ever started here.
+        if !self.folder.exists() {
+            return Ok(());
+        }
+        if is_retired_due {
+            self.look_who_is_retired().await?;
+        }
+        self.look_who_attached().await?;
+        self.tell_roster().await?;
+        self.copy().await
+    }
+
+    /// Writes what the latch has and the store has not.
+    async fn copy(&mut self) -> anyhow::Result<()> {
+        let folder = self.folder.clone();
+        let read = tokio::task::spawn_blocking(move || midshift_stop::latch(&folder));
+        let (generation, latch) = read.await.context("reading the latch")??;
+        if self.copied == Some(generation) {
+            return Ok(());
+        }
+        let snapshot = self.store.snapshot(&[Table::StopRecord]).await.context("reading copies of stops")?;
+        let mut copied: BTreeMap<StopId, (StopRecord, Revision)> = BTreeMap::new();
+        for row in &snapshot.rows {
+            let record: StopRecord = row.decode()?;
+            copied.insert(record.stop.stop_id.clone(), (record, row.revision));
+        }
+        let mut is_whole = true;
+        for result in self.store.commit(copy(&latch, &copied)).await {
+            match result {
+                Ok(_) => {}
+                // Another follower was faster: looked at again.
+                Err(CommitError::Conflict { .. }) => is_whole = false,
+                Err(error) => return Err(error).context("copying a stop"),
+            }
+        }
+        self.copied = is_whole.then_some(generation);
+        Ok(())
+    }
+
+    async fn look_who_is_retired(&mut self) -> anyhow::Result<()> {
+        let snapshot = self.store.snapshot(&[Table::RobotControl]).await.context("reading who is retired")?;
+        let controls = snapshot.rows.iter().map(|row| row.decode::<RobotControl>()).collect::<Result<Vec<_>, _>>()?;
+        self.retired = controls.into_iter().filter(|c| c.duty() == Duty::Retired).map(|c| c.robot_id).collect();
+        Ok(())
+    }
+
+    async fn look_who_attached(&mut self) -> anyhow::Result<()> {
+        let Some((robots, seq)) = &mut self.attached else {
+            let snapshot = self.store.snapshot(&[Table::Session]).await.context("reading who the robots are")?;
+            let ids = snapshot.rows.iter().map(|row| RobotId::parse(&row.key.id));
+            self.attached = Some((ids.collect::<Result<_, _>>()?, snapshot.seq));
+            return Ok(());
+        };
+        let news = follow(&*self.store, seq, &[Log::Telemetry], |page| {
+            let sessions = page.iter().filter(|entry| entry.table == Some(Table::Session));
+            robots.extend(sessions.filter_map(|entry| RobotId::parse(&entry.subject).ok()));
+        });
+        if news.await.is_err() {
+            // What was missed of the feed stands in the rows.
+            self.attached = None;
+        }
+        Ok(())
+    }
+
+    /// Writes who the robots are, if that has changed.
+    async fn tell_roster(&mut self) -> anyhow::Result<()> {
+        let Some((attached, _)) = &self.attached else { return Ok(()) };
+        let robots: BTreeSet<RobotId> = attached.difference(&self.retired).cloned().collect();
+        if self.roster.as_ref() == Some(&robots) {
+            return Ok(());
+        }
+        let (folder, roster) = (self.folder.clone(), Roster { robots: robots.clone() });
+        let written = tokio::task::spawn_blocking(move || roster.write(&folder)).await;
+        written.context("writing the roster")?.context("writing the roster")?;
+        self.roster = Some(robots);
+        Ok(())
+    }
+}
