@@ -1,0 +1,222 @@
+//! One connection from the handshake to its end: proven, admitted, served, asked to go, cut.
+//!
+//! Invariant: at each moment something ends it that the peer has no say in: the handshake's time, the first request's, the idle one, keep-alive
+//! pings, its age, a denial, or the stop of the port. Nothing here waits for a service.
+
+use crate::activity::{Activity, Unused};
+use crate::config::{Config, std};
+use crate::peer::{ConnectionId, Denied, Peer, Principals};
+use crate::requests::{Asker, Door, Rules};
+use crate::seats::network;
+use http::{Request, Response};
+use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
+use hyper_util::server::conn::auto;
+use midshift_core::limits;
+use rustls::ServerConfig;
+use std::convert::Infallible;
+use std::net::SocketAddr;
+use std::pin::pin;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::sync::watch;
+use tokio::time::{sleep, timeout};
+use tokio_rustls::TlsAcceptor;
+use tokio_util::sync::CancellationToken;
+use tonic::body::Body;
+use tower::Service;
+
+/// How a connection ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum End {
+    /// The peer closed it, or both had nothing more to say.
+    Closed,
+    /// It broke, or the peer broke the protocol.
+    Broken,
+    /// The TLS handshake failed.
+    HandshakeFailed,
+    /// The TLS handshake took too long.
+    HandshakeSlow,
+    /// No request came.
+    NoRequest,
+    /// No stream was open for a long time.
+    Idle,
+    /// It was old.
+    Old,
+    /// Its peer may not be connected, or no longer.
+    Denied,
+    /// The port closed.
+    Stopped,
+}
+
+impl End {
+    /// For metrics.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Closed => "closed",
+            Self::Broken => "broken",
+            Self::HandshakeFailed => "handshake_failed",
+            Self::HandshakeSlow => "handshake_slow",
+            Self::NoRequest => "no_request",
+            Self::Idle => "idle",
+            Self::Old => "old",
+            Self::Denied => "denied",
+            Self::Stopped => "stopped",
+        }
+    }
+}
+
+/// What all connections of a port share.
+pub(crate) struct Port<S> {
+    pub config: Config,
+    pub services: S,
+    pub principals: Arc<dyn Principals>,
+    pub tls: Option<watch::Receiver<Arc<ServerConfig>>>,
+    pub rules: Arc<Rules>,
+    pub http: auto::Builder<TokioExecutor>,
+}
+
+/// HTTP/2 and HTTP/1.1 within the limits of `config`.
+pub(crate) fn http(config: &Config) -> auto::Builder<TokioExecutor> {
+    let mut builder = auto::Builder::new(TokioExecutor::new());
+    builder
+        .http2()
+        .timer(TokioTimer::new())
+        .max_concurrent_streams(config.streams_per_connection)
+        .max_header_list_size(config.header_list_bytes)
+        .keep_alive_interval(std(config.keepalive_every))
+        .keep_alive_timeout(std(config.keepalive_within));
+    builder
+        .http1()
+        .timer(TokioTimer::new())
+        .header_read_timeout(std(config.http1_head))
+        .max_buf_size(limits::HTTP1_HEAD_BYTES);
+    builder
+}
+
+/// Why a connection that is served ends before its peer closes it.
+enum Reason {
+    Stop,
+    Denied(Denied),
+    Unused(Unused),
+    Old,
+}
+
+impl<S> Port<S>
+where
+    S: Service<Request<Body>, Response = Response<Body>, Error = Infallible> + Clone + Send + Sync + 'static,
+    S::Future: Send,
+{
+    /// From the first byte to the end. Dropping it cuts the connection.
+    pub async fn run<Io>(self: Arc<Self>, io: Io, address: SocketAddr, id: ConnectionId, stop: CancellationToken) -> End
+    where
+        Io: AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    {
+        let Some(tls) = &self.tls else {
+            return self.serve(io, Peer::new(address, None, id), stop).await;
+        };
+        // What is newest now; a connection keeps it.
+        let acceptor = TlsAcceptor::from(tls.borrow().clone());
+        let handshake = timeout(std(self.config.tls_handshake), acceptor.accept(io));
+        let io = tokio::select! {
+            () = stop.cancelled() => return End::Stopped,
+            done = handshake => match done {
+                Ok(Ok(io)) => io,
+                Ok(Err(error)) => {
+                    tracing::debug!(port = self.config.port, connection = id.0, %error, "a TLS handshake failed");
+                    return End::HandshakeFailed;
+                }
+                Err(_) => return End::HandshakeSlow,
+            },
+        };
+        let shown = io.get_ref().1.peer_certificates().and_then(<[_]>::first);
+        let leaf = shown.map(|leaf| leaf.clone().into_owned());
+        self.serve(io, Peer::new(address, leaf, id), stop).await
+    }
+
+    async fn serve<Io>(&self, io: Io, peer: Peer, stop: CancellationToken) -> End
+    where
+        Io: AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    {
+        // Before asking, so that no change falls in between.
+        let mut changed = self.principals.changed();
+        let principal = match self.principals.admit(&peer) {
+            Ok(principal) => principal,
+            Err(denied) => return self.denied(&peer, denied),
+        };
+        let asker = principal.clone().map_or_else(|| Asker::Network(network(peer.address.ip())), Asker::Principal);
+        let activity = Activity::new();
+        let door = Door {
+            services: self.services.clone(),
+            rules: self.rules.clone(),
+            activity: activity.clone(),
+            peer: peer.clone(),
+            principal,
+            asker,
+        };
+        let mut served = pin!(self.http.serve_connection(TokioIo::new(io), door));
+        let reason = tokio::select! {
+            // First, so that no request is taken before its time is counted.
+            biased;
+            unused = activity.unused(std(self.config.first_request), std(self.config.idle)) => Reason::Unused(unused),
+            denied = self.asked_again(&peer, &mut changed) => Reason::Denied(denied),
+            () = stop.cancelled() => Reason::Stop,
+            () = self.grows_old(&peer) => Reason::Old,
+            done = served.as_mut() => return self.ended(&peer, done),
+        };
+        let (end, time) = match reason {
+            Reason::Denied(denied) => return self.denied(&peer, denied),
+            // It hears why and is not waited for.
+            Reason::Unused(Unused::NoRequest) => (End::NoRequest, Some(Duration::ZERO)),
+            Reason::Unused(Unused::Idle) => (End::Idle, Some(Duration::ZERO)),
+            Reason::Old => (End::Old, self.config.age.map(|age| std(age.grace))),
+            // Whoever stopped the port counts the time for all.
+            Reason::Stop => (End::Stopped, None),
+        };
+        peer.leaves();
+        served.as_mut().graceful_shutdown();
+        let time_over = async {
+            match time {
+                Some(time) => sleep(time).await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            biased;
+            _ = served => end,
+            denied = self.asked_again(&peer, &mut changed) => self.denied(&peer, denied),
+            () = time_over => end,
+        }
+    }
+
+    /// Resolves when the peer may not be connected any longer.
+    async fn asked_again(&self, peer: &Peer, changed: &mut watch::Receiver<u64>) -> Denied {
+        while changed.changed().await.is_ok() {
+            if let Err(denied) = self.principals.admit(peer) {
+                return denied;
+            }
+        }
+        // Nothing changes any more.
+        std::future::pending().await
+    }
+
+    /// Resolves when the connection is old and its streams have had notice.
+    async fn grows_old(&self, peer: &Peer) {
+        let Some(age) = self.config.age else { return std::future::pending().await };
+        sleep(age.drawn(rand::random())).await;
+        peer.leaves();
+        sleep(std(age.notice)).await;
+    }
+
+    fn denied(&self, peer: &Peer, denied: Denied) -> End {
+        let (port, connection) = (self.config.port, peer.connection.0);
+        tracing::info!(port, connection, address = %peer.address, reason = %denied, "a connection was denied");
+        End::Denied
+    }
+
+    fn ended(&self, peer: &Peer, done: Result<(), Box<dyn std::error::Error + Send + Sync>>) -> End {
+        let Err(error) = done else { return End::Closed };
+        tracing::debug!(port = self.config.port, connection = peer.connection.0, %error, "a connection broke");
+        End::Broken
+    }
+}

@@ -1,0 +1,146 @@
+//! The accept loop in front of the services of a port: who may come in, how long they may take, and how they are asked to leave.
+//!
+//! Called by the binary and by stop: [`Edge::new`] around the services, [`Edge::with_tls`], then [`Edge::serve`] over whatever connections
+//! there are. Invariant: no peer holds anything for longer than a limit of [`Config`] says; what one peer does costs no other peer its
+//! connection; `serve` returns within the drain's time of its stop, whatever is open.
+//!
+//! tonic's own server leaves a silent peer connected for ever, spins when there is no descriptor, waits for open streams for ever when it is
+//! stopped, and neither changes its certificate nor cuts a peer off; so connections are accepted, proven and ended here. What is absent:
+//! any knowledge of robots and people ([`Principals`] is asked), and any rule about what a request may do.
+
+mod accept;
+mod activity;
+mod answer;
+mod config;
+mod connection;
+mod deadline;
+mod listen;
+mod peer;
+mod rates;
+mod requests;
+mod seats;
+pub mod tls;
+
+pub use config::{Age, Config, Rate};
+pub use listen::{Incoming, Listen};
+pub use peer::{Anybody, ConnectionId, Denied, Peer, Principal, Principals};
+
+use accept::Accept;
+use config::std;
+use connection::{End, Port};
+use http::{Request, Response};
+use requests::Rules;
+use rustls::ServerConfig;
+use seats::{Full, Seats, network};
+use std::convert::Infallible;
+use std::sync::Arc;
+use tokio::sync::watch;
+use tokio::task::{JoinError, JoinSet};
+use tokio::time::timeout;
+use tokio_util::sync::CancellationToken;
+use tonic::body::Body;
+use tower::Service;
+
+/// One port: its services and its limits.
+pub struct Edge<S> {
+    port: Port<S>,
+}
+
+/// How serving ended.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Served {
+    /// Connections that were open at the stop and ended by themselves.
+    pub left: usize,
+    /// Connections that were cut when the drain's time was over.
+    pub cut: usize,
+}
+
+impl<S> Edge<S>
+where
+    S: Service<Request<Body>, Response = Response<Body>, Error = Infallible> + Clone + Send + Sync + 'static,
+    S::Future: Send,
+{
+    /// `services` (tonic's `Routes`) behind the limits of `config`, for whom `principals` lets in. Plain text without [`Edge::with_tls`].
+    pub fn new(config: Config, principals: Arc<dyn Principals>, services: S) -> Self {
+        let (rules, http) = (Arc::new(Rules::new(&config)), connection::http(&config));
+        Self { port: Port { config, services, principals, tls: None, rules, http } }
+    }
+
+    /// TLS as [`tls::server_config`] makes it. Each new connection takes the newest one; live ones keep theirs.
+    #[must_use]
+    pub fn with_tls(self, newest: watch::Receiver<Arc<ServerConfig>>) -> Self {
+        Self { port: Port { tls: Some(newest), ..self.port } }
+    }
+
+    /// Serves until `stop`, or until `listener` has no more; then each connection is asked to go, and what is left after the drain's time
+    /// is cut. Dropping the future cuts everything.
+    pub async fn serve<L: Listen>(self, listener: L, stop: CancellationToken) -> Served {
+        let shared = Arc::new(self.port);
+        let (config, name) = (&shared.config, shared.config.port);
+        let seats = Seats::new(config.connections_max, config.connections_per_network_max);
+        let gauge = metrics::gauge!("midshift_edge_connections", "port" => name);
+        let (mut accept, mut connections, mut last) = (Accept::new(listener, name), JoinSet::new(), 0);
+        let leave = stop.child_token();
+        loop {
+            let accepted = tokio::select! {
+                biased;
+                () = stop.cancelled() => break,
+                Some(ended) = connections.join_next() => {
+                    count(name, ended);
+                    gauge.set(connections.len() as f64);
+                    continue;
+                }
+                accepted = accept.next() => accepted,
+            };
+            let Some((io, address)) = accepted else { break };
+            match seats.take(network(address.ip())) {
+                Ok(seat) => {
+                    last += 1;
+                    let connection = shared.clone().run(io, address, ConnectionId(last), leave.clone());
+                    connections.spawn(async move {
+                        let end = connection.await;
+                        drop(seat);
+                        end
+                    });
+                    gauge.set(connections.len() as f64);
+                }
+                // Dropped with `io`: closed at once, before a byte of it is read.
+                Err(full) => refuse(name, full),
+            }
+        }
+        drop(accept);
+        leave.cancel();
+        let open = connections.len();
+        let drained = timeout(std(config.drain), async {
+            while let Some(ended) = connections.join_next().await {
+                count(name, ended);
+            }
+        });
+        // An error says that the time is over; what is left is what is counted.
+        let _ = drained.await;
+        let cut = connections.len();
+        connections.shutdown().await;
+        gauge.set(0.0);
+        tracing::info!(port = name, left = open - cut, cut, "the port is closed");
+        Served { left: open - cut, cut }
+    }
+}
+
+fn refuse(port: &'static str, full: Full) {
+    let reason = match full {
+        Full::Total => "connections_max",
+        Full::Kind => "connections_per_network_max",
+    };
+    metrics::counter!("midshift_edge_refused_total", "port" => port, "reason" => reason).increment(1);
+}
+
+fn count(port: &'static str, ended: Result<End, JoinError>) {
+    let reason = match ended {
+        Ok(end) => end.as_str(),
+        Err(error) => {
+            tracing::error!(port, %error, "a connection's task ended with a fault");
+            "fault"
+        }
+    };
+    metrics::counter!("midshift_edge_closed_total", "port" => port, "reason" => reason).increment(1);
+}

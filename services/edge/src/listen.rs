@@ -1,0 +1,63 @@
+//! Where connections come from: a socket, or a stream of whatever else can be read and written, so that a simulation brings its own network.
+//!
+//! Invariant: says what the system says. No retry, no pause and no error is swallowed here.
+
+use std::io;
+use std::net::SocketAddr;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::{TcpListener, TcpStream};
+use tokio_stream::{Stream, StreamExt};
+
+/// A source of connections.
+pub trait Listen: Send + 'static {
+    /// One connection.
+    type Io: AsyncRead + AsyncWrite + Unpin + Send + 'static;
+
+    /// The next connection and where it is from; none: there will be no more. Cancel safe: a call that is dropped loses no connection.
+    ///
+    /// # Errors
+    /// As the system says; the caller decides by its kind whether to go on at once.
+    fn accept(&mut self) -> impl Future<Output = io::Result<Option<(Self::Io, SocketAddr)>>> + Send;
+}
+
+impl Listen for TcpListener {
+    type Io = TcpStream;
+
+    async fn accept(&mut self) -> io::Result<Option<(TcpStream, SocketAddr)>> {
+        let (stream, address) = TcpListener::accept(self).await?;
+        // A robot's heartbeat is one small segment; it does not wait for another. A peer that is gone already is found at its first read.
+        let _ = stream.set_nodelay(true);
+        Ok(Some((stream, address)))
+    }
+}
+
+/// Connections of a stream; where each is from, its function says.
+#[derive(Debug)]
+pub struct Incoming<S, F> {
+    stream: S,
+    address: F,
+}
+
+impl<S, F> Incoming<S, F> {
+    /// Connections of `stream`, each from what `address` says of it.
+    pub const fn new(stream: S, address: F) -> Self {
+        Self { stream, address }
+    }
+}
+
+impl<S, F, Io> Listen for Incoming<S, F>
+where
+    S: Stream<Item = io::Result<Io>> + Unpin + Send + 'static,
+    F: Fn(&Io) -> SocketAddr + Send + Sync + 'static,
+    Io: AsyncRead + AsyncWrite + Unpin + Send + 'static,
+{
+    type Io = Io;
+
+    async fn accept(&mut self) -> io::Result<Option<(Io, SocketAddr)>> {
+        let next = self.stream.next().await.transpose()?;
+        Ok(next.map(|io| {
+            let address = (self.address)(&io);
+            (io, address)
+        }))
+    }
+}

@@ -1,0 +1,123 @@
+//! How many may be inside: in total, and of one kind.
+//!
+//! Invariant: what was taken is given back when its [`Seat`] is dropped, also by a panic; a kind of which nobody is inside costs no memory.
+//! Used for connections by network, and for requests by principal.
+
+use std::collections::HashMap;
+use std::hash::Hash;
+use std::net::{IpAddr, Ipv6Addr};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// Which limit was reached.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Full {
+    /// Of all.
+    Total,
+    /// Of this kind.
+    Kind,
+}
+
+#[derive(Debug)]
+struct Taken<K> {
+    total: usize,
+    kinds: HashMap<K, usize>,
+}
+
+#[derive(Debug)]
+pub(crate) struct Seats<K> {
+    total_max: usize,
+    kind_max: usize,
+    taken: Mutex<Taken<K>>,
+}
+
+/// One who is inside.
+#[derive(Debug)]
+pub(crate) struct Seat<K: Eq + Hash> {
+    kind: K,
+    of: Arc<Seats<K>>,
+}
+
+impl<K: Eq + Hash + Clone> Seats<K> {
+    pub fn new(total_max: usize, kind_max: usize) -> Arc<Self> {
+        let taken = Mutex::new(Taken { total: 0, kinds: HashMap::new() });
+        Arc::new(Self { total_max, kind_max, taken })
+    }
+
+    /// A seat, or which limit is reached.
+    pub fn take(self: &Arc<Self>, kind: K) -> Result<Seat<K>, Full> {
+        let mut taken = self.taken();
+        if taken.total >= self.total_max {
+            return Err(Full::Total);
+        }
+        if taken.kinds.get(&kind).copied().unwrap_or(0) >= self.kind_max {
+            return Err(Full::Kind);
+        }
+        taken.total += 1;
+        *taken.kinds.entry(kind.clone()).or_insert(0) += 1;
+        Ok(Seat { kind, of: self.clone() })
+    }
+}
+
+impl<K> Seats<K> {
+    fn taken(&self) -> MutexGuard<'_, Taken<K>> {
+        self.taken.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl<K: Eq + Hash> Drop for Seat<K> {
+    fn drop(&mut self) {
+        let mut taken = self.of.taken();
+        taken.total -= 1;
+        let left = taken.kinds.get_mut(&self.kind).map_or(0, |count| {
+            *count -= 1;
+            *count
+        });
+        if left == 0 {
+            taken.kinds.remove(&self.kind);
+        }
+    }
+}
+
+/// Whom an address stands for: an IPv4 address for itself, one of IPv6 for its /64, which any single machine has to itself.
+pub(crate) fn network(address: IpAddr) -> IpAddr {
+    match address.to_canonical() {
+        IpAddr::V4(v4) => v4.into(),
+        IpAddr::V6(v6) => Ipv6Addr::from(u128::from(v6) & !u128::from(u64::MAX)).into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_kind_fills_its_own_seats_and_leaves_the_others() {
+        let seats = Seats::new(3, 2);
+        let first = seats.take("a").expect("room");
+        let _second = seats.take("a").expect("room");
+        assert_eq!(seats.take("a").err(), Some(Full::Kind));
+        let _other = seats.take("b").expect("room for another kind");
+        assert_eq!(seats.take("c").err(), Some(Full::Total));
+        drop(first);
+        let _again = seats.take("a").expect("a seat that was given back");
+    }
+
+    #[test]
+    fn nothing_is_kept_of_those_who_left() {
+        let seats = Seats::new(10, 10);
+        for kind in 0..1000 {
+            drop(seats.take(kind).expect("room"));
+        }
+        let taken = seats.taken();
+        assert_eq!((taken.total, taken.kinds.len()), (0, 0));
+    }
+
+    #[test]
+    fn a_machine_is_one_network_however_many_addresses_it_has() {
+        let network = |text: &str| super::network(text.parse().expect("an address"));
+        assert_eq!(network("2001:db8:1:2::1"), network("2001:db8:1:2:ffff::9"));
+        assert_ne!(network("2001:db8:1:2::1"), network("2001:db8:1:3::1"));
+        assert_eq!(network("::ffff:192.0.2.7"), network("192.0.2.7"));
+        assert_ne!(network("192.0.2.7"), network("192.0.2.8"));
+    }
+}
