@@ -1,0 +1,123 @@
+//! How much and how fast one may ask, and until when one is answered.
+
+use crate::frames::{dial, until_closed};
+use crate::principals::Register;
+use crate::world::{HERE, SOON, THERE, World, within};
+use midshift_core::reason::Code as Reason;
+use midshift_edge::{Config, Rate};
+use midshift_proto::status::RETRY_AFTER;
+use std::num::NonZeroU32;
+use std::sync::Arc;
+use tokio::io::AsyncWriteExt;
+use tonic::Code;
+
+const PAGE: &str = "GET /who HTTP/1.1\r\nhost: edge\r\n\r\n";
+
+/// A token comes back in a time that no test has.
+fn three_at_once() -> Rate {
+    Rate { per_second: NonZeroU32::MIN, burst: NonZeroU32::MIN.saturating_add(2) }
+}
+
+async fn named(config: Config) -> World {
+    World::with(config, Arc::new(Register::default()), None).await
+}
+
+#[tokio::test]
+async fn who_floods_is_told_when_to_come_back_and_another_is_served() {
+    let world = named(Config { rate: three_at_once(), ..Config::default() }).await;
+    // Two connections of one principal have one bucket.
+    let mut flood = [world.client().await, world.client().await];
+    let mut refused = None;
+    for turn in 0..1_000 {
+        let answered = flood[turn % 2].asked("/who").await;
+        if answered.status.code() != Code::Ok {
+            refused = Some((turn, answered));
+            break;
+        }
+    }
+    let (turn, refused) = refused.expect("a refusal");
+    let answer = refused.answer();
+    assert!(turn >= 3, "a burst is let in");
+    assert_eq!((answer.grpc, answer.code), (Code::ResourceExhausted, Some(Reason::TooManyRequests)));
+    assert_eq!(answer.retry_after, Some(RETRY_AFTER));
+    assert!(refused.head.headers().contains_key("grpc-status"), "trailers alone: nothing was begun");
+    assert_eq!(world.counter("midshift_edge_requests_refused_total", ("reason", "TOO_MANY_REQUESTS")), 1);
+    let mut other = world.client_from(THERE).await;
+    assert_eq!(other.asked("/who").await.status.code(), Code::Ok);
+}
+
+#[tokio::test]
+async fn a_flood_of_http_1_hears_429() {
+    let world = World::open(Config { rate: three_at_once(), ..Config::default() }).await;
+    let mut browser = dial(world.address, HERE).await;
+    browser.write_all(PAGE.repeat(200).as_bytes()).await.expect("written");
+    browser.write_all(b"GET /who HTTP/1.1\r\nhost: edge\r\nconnection: close\r\n\r\n").await.expect("written");
+    let said = within(until_closed(&mut browser)).await;
+    let said = String::from_utf8_lossy(&said);
+    assert!(
+        said.contains("HTTP/1.1 200") && said.contains("HTTP/1.1 429") && said.contains("retry-after: 1"),
+        "{said}"
+    );
+}
+
+#[tokio::test]
+async fn calls_that_stay_open_are_counted_for_their_principal_until_they_end() {
+    let world = named(Config { requests_per_principal_max: 1, ..Config::default() }).await;
+    let mut client = world.client().await;
+    let open = client.begin("/stream", None).await.expect("a stream");
+    let open = within(open).await.expect("its head");
+    assert_eq!(client.asked("/who").await.answer().code, Some(Reason::TooManyRequests));
+    let mut other = world.client_from(THERE).await;
+    assert_eq!(other.asked("/who").await.status.code(), Code::Ok);
+    drop(open);
+    while client.asked("/who").await.status.code() != Code::Ok {}
+}
+
+#[tokio::test]
+async fn a_port_that_is_full_of_calls_says_so() {
+    let world = named(Config { requests_max: 1, ..Config::default() }).await;
+    let mut client = world.client().await;
+    let _open = within(client.begin("/stream", None).await.expect("a stream")).await.expect("its head");
+    let mut other = world.client_from(THERE).await;
+    let answer = other.asked("/who").await.answer();
+    assert_eq!((answer.grpc, answer.code), (Code::ResourceExhausted, Some(Reason::Overloaded)));
+}
+
+#[tokio::test]
+async fn a_callers_time_ends_a_call_that_hangs() {
+    let world = World::open(Config::default()).await;
+    let mut client = world.client().await;
+    let late = client.ask("/hang", Some("50m")).await.expect("an answer");
+    assert_eq!((late.answer().grpc, late.answer().code), (Code::DeadlineExceeded, Some(Reason::DeadlineExceeded)));
+}
+
+#[tokio::test]
+async fn a_callers_time_ends_a_stream_that_has_begun() {
+    let world = World::open(Config::default()).await;
+    let mut client = world.client().await;
+    let stream = within(client.begin("/stream", Some("50m")).await.expect("a stream")).await.expect("its head");
+    assert!(!stream.headers().contains_key("grpc-status"), "the head came before the end");
+    let late = within(crate::world::whole(stream)).await.expect("an end with a status");
+    assert_eq!((late.answer().grpc, late.answer().code), (Code::DeadlineExceeded, Some(Reason::DeadlineExceeded)));
+    assert_eq!(client.asked("/who").await.status.code(), Code::Ok, "its connection goes on");
+}
+
+#[tokio::test]
+async fn the_ports_own_time_is_for_the_head_and_streams_outlive_it() {
+    let world = World::open(Config { head: SOON, ..Config::default() }).await;
+    let mut client = world.client().await;
+    let session = within(client.begin("/pulse", None).await.expect("a stream")).await.expect("its head");
+    // Begun after the session and ended by the port's time: so much time has gone by for the session too.
+    for _ in 0..2 {
+        assert_eq!(client.ask("/hang", Some("1H")).await.expect("an answer").status.code(), Code::DeadlineExceeded);
+    }
+    client.asked("/poke").await;
+    assert!(within(session.into_body().data()).await.expect("a word").is_ok());
+}
+
+#[tokio::test]
+async fn a_time_that_is_none_is_refused_and_not_ignored() {
+    let world = World::open(Config::default()).await;
+    let answer = world.client().await.ask("/who", Some("soon")).await.expect("an answer").answer();
+    assert_eq!((answer.grpc, answer.violations[0].field.as_str()), (Code::InvalidArgument, "grpc-timeout"));
+}
