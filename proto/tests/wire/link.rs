@@ -301,8 +301,8 @@ fn what_a_robot_says_is_what_the_server_hears() {
     let mut items: Vec<_> = items
         .map(|(e, seq)| InboxItem::Sample(Sample { seq, robot_unix_ms: -1, body: SampleBody::Event(e) }))
         .collect();
-    items.push(InboxItem::Gap(Gap { lane: Lane::Event, from_seq: 13, to_seq: 14, reason: Code::Overflow.into() }));
-    let status = Sample { seq: 15, robot_unix_ms: 1_780_300_000_000, body: SampleBody::Status(vitals()) };
+    items.push(InboxItem::Gap(Gap { lane: Lane::Event, from_seq: 15, to_seq: 16, reason: Code::Overflow.into() }));
+    let status = Sample { seq: 17, robot_unix_ms: 1_780_300_000_000, body: SampleBody::Status(vitals()) };
     let messages = [
         FromRobot::Hello(Box::new(hello())),
         FromRobot::Hello(Box::new(Hello {

@@ -448,6 +448,34 @@ CREATE TABLE site (
     UNIQUE (site_id, id)
 );
 
+CREATE TABLE stop_event (
+    site_id TEXT NOT NULL,
+    seq BIGINT NOT NULL,
+    tbl TEXT,
+    subject TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT,
+    body TEXT,
+    kind TEXT NOT NULL,
+    actor TEXT NOT NULL,
+    request_id TEXT,
+    at_unix_ms BIGINT NOT NULL,
+    UNIQUE (site_id, seq)
+);
+
+CREATE TABLE stop_record (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE TABLE store_head (
     site_id TEXT NOT NULL,
     store_id TEXT NOT NULL,
@@ -556,6 +584,8 @@ CREATE INDEX robot_last_by_position ON robot_last (site_id, position);
 CREATE INDEX rollout_by_ord ON rollout (site_id, ord, id);
 
 CREATE INDEX rollout_robot_by_parent ON rollout_robot (site_id, parent, ord, id);
+
+CREATE INDEX stop_event_by_subject ON stop_event (site_id, subject, seq);
 
 CREATE INDEX task_event_by_subject ON task_event (site_id, subject, seq);
 

@@ -34,6 +34,7 @@ mod rolling;
 mod room;
 mod split;
 mod stack;
+mod stopped;
 mod story;
 mod swarm_software;
 mod tuf;

@@ -21,6 +21,8 @@ pub const BODY_SPEED: &str = "5";
 pub struct Robots {
     dir: PathBuf,
     server: String,
+    /// The stop service that agents of their own dial.
+    stops: Option<String>,
     starts: Vec<String>,
     running: BTreeMap<String, Running>,
     /// Processes that have many of them each.
@@ -38,9 +40,20 @@ impl Robots {
         site: &Site,
         count: usize,
     ) -> anyhow::Result<Self> {
+        Self::start_beside(dir, server, public, None, site, count).await
+    }
+    /// As [`Robots::start`], with lines to the stop service at `stops`.
+    pub async fn start_beside(
+        dir: &Path,
+        server: SocketAddr,
+        public: SocketAddr,
+        stops: Option<SocketAddr>,
+        site: &Site,
+        count: usize,
+    ) -> anyhow::Result<Self> {
         let starts = site.starting_places(count).into_iter().map(|at| site.name_of(at).to_string()).collect();
         let mut robots = Self::none(dir, server);
-        robots.starts = starts;
+        (robots.starts, robots.stops) = (starts, stops.map(|address| address.to_string()));
         (0..count).try_for_each(|number| robots.start_one(number))?;
         robots.ids = robots.running.keys().cloned().collect();
         let all: BTreeSet<&String> = robots.ids.iter().collect();
@@ -77,9 +90,9 @@ impl Robots {
         Ok(robots)
     }
     fn none(dir: &Path, server: SocketAddr) -> Self {
-        let (starts, running) = (Vec::new(), BTreeMap::new());
+        let (starts, running, stops) = (Vec::new(), BTreeMap::new(), None);
         let (crowds, ids) = (Vec::new(), Vec::new());
-        Self { dir: dir.to_owned(), server: server.to_string(), starts, running, crowds, ids }
+        Self { dir: dir.to_owned(), server: server.to_string(), stops, starts, running, crowds, ids }
     }
     /// Names of all.
     pub fn ids(&self) -> Vec<String> {
@@ -106,6 +119,9 @@ impl Robots {
             "--no-faults",
         ]);
         command.args(["--start", &self.starts[number], "--seed", &number.to_string()]).arg("--data").arg(&dir);
+        if let Some(stops) = &self.stops {
+            command.args(["--stop-server", stops]);
+        }
         let running = Running::start(&mut command, &dir.join("agent.log"))?;
         self.running.insert(id, running);
         Ok(())

@@ -1,0 +1,159 @@
+//! A fleet stop with real programs: everybody stands, the server dead or not, and nobody moves before a person has reset and resumed it.
+
+use crate::harness::{Running, Server, channel, free_port, midshift, until};
+use crate::kill::{all_over, at_work, judge, submit};
+use crate::robots::Robots;
+use crate::rolled_out::{call, done};
+use anyhow::{Context, ensure};
+use midshift_core::robot::StopLevel;
+use midshift_core::site::{DEMO, Site, text};
+use midshift_proto::fleet::v1::GetRobotControlRequest;
+use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
+use midshift_proto::stop::v1::GetStatusRequest;
+use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
+use midshift_sim::journal::{self, Effect};
+use std::collections::BTreeSet;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::Duration;
+
+const ROBOTS: usize = 8;
+const TASKS: usize = 40;
+const LIMIT: Duration = Duration::from_secs(60);
+
+/// A stop service in a process of its own, beside a server's data.
+struct StopServer {
+    address: SocketAddr,
+    dir: PathBuf,
+    running: Running,
+}
+
+impl StopServer {
+    async fn start(dir: &Path) -> anyhow::Result<Self> {
+        let address = free_port()?;
+        let server = Self { address, dir: dir.to_owned(), running: Self::run(dir, address)? };
+        server.answers().await?;
+        Ok(server)
+    }
+    fn run(dir: &Path, address: SocketAddr) -> anyhow::Result<Running> {
+        let mut command = Command::new(midshift()?);
+        command.args(["stop", "serve", "--listen", &address.to_string(), "--data"]).arg(dir.join("data"));
+        Running::start(command.arg("--site").arg(dir.join("site.toml")), &dir.join("stop.log"))
+    }
+    async fn kill_and_restart(&mut self) -> anyhow::Result<()> {
+        self.running.kill()?;
+        self.running = Self::run(&self.dir, self.address)?;
+        self.answers().await
+    }
+    async fn answers(&self) -> anyhow::Result<()> {
+        until("the stop service's first answer", LIMIT, async || Ok(self.engaged().await.ok().map(drop))).await
+    }
+    /// Names of what is engaged.
+    async fn engaged(&self) -> anyhow::Result<Vec<String>> {
+        let mut client = StopServiceClient::new(channel(self.address)?);
+        let status = client.get_status(GetStatusRequest {}).await?.into_inner().status.unwrap_or_default();
+        Ok(status.stops.into_iter().filter_map(|engaged| engaged.stop).map(|stop| stop.stop_id).collect())
+    }
+    /// Stops by the command line, which waits until all have confirmed; the stop's name.
+    fn stop(&self, whom: &[&str]) -> anyhow::Result<String> {
+        let address = self.address.to_string();
+        let stop = ["stop", "--stop-server", &address, "--reason", "a drill", "-o", "name"];
+        let output = tokio::task::block_in_place(|| call(&[&stop[..], whom].concat()))?;
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        ensure!(output.status.success(), "{whom:?}: {:?} {said}", output.status.code());
+        say!("{whom:?}: {said}");
+        Ok(String::from_utf8(output.stdout)?.trim().to_owned())
+    }
+    fn reset(&self, stop_id: &str) -> anyhow::Result<()> {
+        let address = self.address.to_string();
+        done(&["stop", "reset", "--stop-server", &address, stop_id, "--reason", "all clear"])
+    }
+}
+
+/// Waits until fleet holds every robot by this token.
+async fn until_all_have(server: SocketAddr, robots: &Robots, token: &str) -> anyhow::Result<()> {
+    until(&format!("{token} on every robot"), LIMIT, async || {
+        let mut client = FleetServiceClient::new(channel(server)?);
+        for robot_id in robots.ids() {
+            let Ok(answer) = client.get_robot_control(GetRobotControlRequest { robot_id }).await else {
+                return Ok(None);
+            };
+            let control = answer.into_inner().control.unwrap_or_default();
+            if !control.hold_tokens.iter().any(|held| held == token) {
+                return Ok(None);
+            }
+        }
+        Ok(Some(()))
+    })
+    .await
+}
+
+/// What the bodies wrote while they obeyed a stop: each stood, and none moved before it was released.
+fn judge_stops(robots: &Robots) -> anyhow::Result<()> {
+    let mut stood = 0;
+    for path in robots.journals() {
+        let (mut is_stopped, mut stands_at) = (false, None);
+        for entry in journal::read(&path)? {
+            match entry.effect {
+                Effect::Obeys { level, odometer_mm } => {
+                    if let Some(at) = stands_at.take() {
+                        ensure!(
+                            odometer_mm == at,
+                            "{}: it drove while it was stopped: {at} to {odometer_mm}",
+                            path.display()
+                        );
+                    }
+                    is_stopped = level >= StopLevel::Halt;
+                }
+                Effect::Stood { odometer_mm } => {
+                    stood += 1;
+                    stands_at = Some(odometer_mm);
+                }
+                Effect::Moved { odometer_mm } => {
+                    ensure!(!is_stopped, "{}: it moved at {odometer_mm} while it was stopped", path.display());
+                }
+                _ => {}
+            }
+        }
+    }
+    ensure!(stood >= 2 * ROBOTS, "each robot stood at its start and for a stop: {stood}");
+    Ok(())
+}
+
+async fn resume(server: &Server, stop_id: &str) -> anyhow::Result<()> {
+    let address = server.address.to_string();
+    done(&["task", "resume", "--server", &address, "--stop-id", stop_id, "--reason", "all clear"])
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stopped_fleet_stands_through_every_kill_until_it_is_reset_and_resumed() -> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let site: Site = text::parse(DEMO)?;
+    let mut server = Server::start(dir.path()).await?;
+    let mut stops = StopServer::start(dir.path()).await?;
+    let (address, stop_address) = (server.address, Some(stops.address));
+    let robots = Robots::start_beside(dir.path(), address, address, stop_address, &site, ROBOTS).await?;
+    submit(address, &site, 7, TASKS).await?;
+    at_work(address, 8, &BTreeSet::new()).await?;
+
+    let first = stops.stop(&["--all"])?;
+    until_all_have(address, &robots, &format!("stop:{first}")).await?;
+    server.kill()?;
+    let second = stops.stop(&["--robot", "rbt-01", "--level", "posture"])?;
+    stops.kill_and_restart().await?;
+    let engaged = stops.engaged().await?;
+    ensure!(engaged == [first.clone(), second.clone()], "after kill -9 it knows of {engaged:?}");
+    stops.reset(&second)?;
+    stops.reset(&first)?;
+    server.restart().await?;
+    until_all_have(address, &robots, &format!("resume:{first}")).await?;
+    resume(&server, &first).await?;
+    resume(&server, &second).await?;
+
+    let ended = all_over(address, TASKS).await?;
+    judge(&ended, &BTreeSet::new(), &site, &robots)?;
+    judge_stops(&robots)?;
+    let data = dir.path().join("data").display().to_string();
+    done(&["stop", "verify", "--data", &data]).context("the audit of stops")
+}
