@@ -43,13 +43,15 @@ pub struct RobotStop {
     kept: Kept,
     ladder: Ladder,
     is_told: bool,
+    /// It was answered often enough since it began that a silence is one.
+    was_heard: bool,
     silence: Option<StopId>,
 }
 
 impl RobotStop {
     /// A robot that begins with what it has kept.
     pub fn begin(robot_id: RobotId, kept: Kept, now: LinkTime) -> Self {
-        Self { robot_id, kept, ladder: Ladder::begin(now), is_told: false, silence: None }
+        Self { robot_id, kept, ladder: Ladder::begin(now), is_told: false, was_heard: false, silence: None }
     }
 
     /// What must survive.
@@ -101,6 +103,7 @@ impl RobotStop {
     pub fn look(&mut self, now: &Now, pose: Option<&Pose>, around: Around) -> Obeyed {
         let mut is_changed = self.kept.latch.forget(now.wall, limits::RESETS_MAX);
         let stage = self.ladder.look(now.link, around);
+        self.was_heard |= stage < Stage::Stand;
         let over: Vec<(StopId, StopLevel)> =
             self.kept.latch.over(&self.robot_id, pose).map(|stop| (stop.stop_id.clone(), stop.level)).collect();
         for (stop_id, _) in over.iter().filter(|(_, level)| *level >= StopLevel::Halt) {
@@ -112,7 +115,7 @@ impl RobotStop {
         let silence = match stage {
             Stage::Heard => StopLevel::None,
             Stage::Slow => StopLevel::Slow,
-            Stage::Stand if !self.is_told => StopLevel::Halt,
+            Stage::Stand if !self.is_told || !self.was_heard => StopLevel::Halt,
             Stage::Stand => StopLevel::ControlledStopPosture,
         };
         let untold = if self.is_told { StopLevel::None } else { StopLevel::Halt };
@@ -126,7 +129,7 @@ impl RobotStop {
             self.silence = None;
             return false;
         }
-        if !self.is_told || around == Around::Robots || self.silence.is_some() {
+        if !self.is_told || !self.was_heard || around == Around::Robots || self.silence.is_some() {
             return false;
         }
         let named = format!("SILENCE-{}-{}", self.robot_id, wall.0);
@@ -191,6 +194,18 @@ mod tests {
     }
 
     #[test]
+    fn a_start_among_people_is_no_silence_however_long_it_takes_to_be_answered() {
+        let mut robot = RobotStop::begin(robot(), Kept::default(), LinkTime(0));
+        robot.told_all(Latch::default());
+        for ms in [0, 5_000, 60_000] {
+            assert_eq!(robot.look(&at(ms), None, Around::People).level, StopLevel::Halt);
+        }
+        (60..63).for_each(|s| robot.answered(LinkTime(s * 1000)));
+        assert_eq!(robot.look(&at(62_500), None, Around::People).level, StopLevel::None);
+        assert!(robot.kept().awaiting.is_empty());
+    }
+
+    #[test]
     fn slow_ends_with_its_reset_and_asks_for_no_resume() {
         let mut robot = free();
         robot.told(vec![stop(1, StopLevel::Slow)], vec![]);
@@ -237,7 +252,7 @@ mod tests {
     }
 
     /// All that matters of a robot and of what it was told, to know a state again.
-    type Seen = (bool, Kept, StopLevel, [(bool, bool, bool); 2]);
+    type Seen = ([bool; 2], Kept, StopLevel, [(bool, bool, bool); 2]);
 
     /// Walks every state that two stops, their resets and resumes, restarts and answers lead to.
     #[test]
@@ -282,7 +297,7 @@ mod tests {
                         stood_and_moved += usize::from(stood);
                     }
                 }
-                let state = (robot.is_told, robot.kept.clone(), level, facts);
+                let state = ([robot.is_told, robot.was_heard], robot.kept.clone(), level, facts);
                 let key = format!("{state:?}");
                 if !seen.contains_key(&key) {
                     seen.insert(key, state);
