@@ -132,6 +132,8 @@ pub(crate) struct Stops {
     pub(crate) bodily: StopLevel,
     /// It stood, and nothing has let it go on since.
     pub(crate) has_stood: bool,
+    /// It was free to move once since it began.
+    pub(crate) was_free: bool,
     pub(crate) floor: Floor,
     /// Drives near a stopped part: it is looked at again then, site clock.
     pub(crate) look_at: Option<SiteTime>,
@@ -154,6 +156,7 @@ impl Stops {
             around: Around::People,
             bodily: StopLevel::None,
             has_stood: false,
+            was_free: false,
             floor: Floor::default(),
             look_at: None,
             said: Default::default(),
@@ -180,11 +183,6 @@ impl Stops {
     /// Effective stops that it lies inside of, at most [`limits::STOPS_MAX`].
     pub(crate) fn inside(&self) -> Vec<StopId> {
         self.obeyed.inside.iter().take(limits::STOPS_MAX).cloned().collect()
-    }
-
-    /// Whether it was told since it began.
-    pub(crate) fn is_told(&self) -> bool {
-        self.robot.is_told()
     }
 
     /// Driving alone may bring it into a stopped part.

@@ -184,7 +184,8 @@ impl AgentCore {
     fn tell_stop(&mut self, now: &Now) {
         let Some(stop) = &mut self.stop else { return };
         let new = (stop.obeyed.level, stop.inside(), stop.awaiting());
-        let is_start = !stop.is_told() && new.1.is_empty() && new.2.is_empty();
+        stop.was_free |= new.0 < StopLevel::Halt;
+        let is_start = !stop.was_free && new.1.is_empty() && new.2.is_empty();
         if new == stop.said || is_start {
             return;
         }

@@ -20,6 +20,7 @@ mod rig;
 mod session;
 mod sets;
 mod steps;
+mod stop_chaos;
 mod stop_line;
 mod stop_software;
 mod stops;

@@ -304,8 +304,8 @@ async fn asked_to_move_over_it_has_the_next_line_before_it_leaves_this_one() {
     let mut old = bench.free().await;
     old.say(v1::attend_response::Message::MoveOver(v1::MoveOver {})).await;
     let mut next = bench.line().await;
-    next.attend().await;
     assert!(!old.down.is_closed(), "until the next one is open it listens to this one");
+    next.attend().await;
     next.synced(4).await;
     let said = next.until(4, |c| c.generation == 4).await;
     assert_eq!(said.obeys, 0, "nothing moved over but the line");

@@ -2,11 +2,10 @@
 
 use crate::release::Releases;
 use crate::rig::{Rig, action};
-use crate::stops::{attend, desk, freed, hear, reset, serve, stop, stop_id, told};
+use crate::stops::{attend, desk, freed, reset, serve, stop, stop_id, told};
 use crate::updates::{
     Order, activate, drain, maintain, name_of, on_trial, relaunch, report, stage, state, switch, want,
 };
-use midshift_agent::stop::StopNews;
 use midshift_core::robot::StopLevel;
 use midshift_core::update::{Goal, UpdateState};
 use midshift_core::work::{DesiredWork, Effect};
@@ -81,7 +80,6 @@ fn a_robot_that_is_stopped_at_work_goes_back_where_it_stands_and_nothing_moves()
     let acts = rig.body.log().acts;
     let mut rig = relaunch(rig);
     attend(&mut rig);
-    hear(&mut rig, StopNews::Synced { generation: 10 });
     serve(&mut rig, 5_000);
     assert_eq!((state(&rig), rig.body.log().acts), (Some(UpdateState::RolledBack), acts));
     assert_eq!(switch(&rig).running(), "factory");

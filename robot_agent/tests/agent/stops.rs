@@ -58,8 +58,8 @@ pub fn attend(rig: &mut Rig) {
 
 /// Every check-in that waits is answered.
 fn answer(rig: &mut Rig) {
-    for (nonce, _) in std::mem::take(&mut rig.stop.check_ins) {
-        hear(rig, StopNews::CheckedIn { nonce, generation: SYNCED });
+    for (nonce, said) in std::mem::take(&mut rig.stop.check_ins) {
+        hear(rig, StopNews::CheckedIn { nonce, generation: said.generation });
     }
 }
 
@@ -122,7 +122,7 @@ fn driving() -> Rig {
 }
 
 /// Whether the body is under way.
-fn moves(rig: &Rig) -> bool {
+pub fn moves(rig: &Rig) -> bool {
     let log = rig.body.log();
     !log.paused && (!log.path.is_empty() || log.acting.is_some())
 }
@@ -406,7 +406,7 @@ fn a_service_that_reads_and_never_answers_slows_and_stands_the_robot_and_is_dial
     let mut rig = driving();
     stop_silence(&mut rig, 2_000);
     assert_eq!((level(&rig), moves(&rig)), (StopLevel::None, true));
-    stop_silence(&mut rig, 1_500);
+    stop_silence(&mut rig, 2_000);
     assert_eq!((level(&rig), speeds(&rig)), (StopLevel::Slow, vec![300, 300]));
     assert_eq!(rig.stop.redials, ["no answer"]);
     // Others are dialed, and hang as it did.
@@ -632,9 +632,7 @@ fn while_it_stands_nothing_begins_and_the_time_of_its_attempt_stands_still() {
 fn an_errand_to_a_posture_or_a_charger_begins_nothing_either() {
     for name in ["park", "charge"] {
         let mut rig = free();
-        let steps = vec![action("inspect", Effect::Repeatable), action(name, Effect::Repeatable)];
-        let steps =
-            vec![WorkStep { kind: action("pick", Effect::Repeatable).kind, ..steps[0].clone() }, steps[1].clone()];
+        let steps = vec![action("pick", Effect::Repeatable), action(name, Effect::Repeatable)];
         rig.work(rig.desired(Some(rig.offer("T1", 1, steps, vec![]))));
         told(&mut rig, vec![stop(1, StopLevel::Halt)], vec![]);
         rig.body.done();
