@@ -64,7 +64,7 @@ impl Judge {
         match act {
             Act::Engage(n, level) => {
                 if level >= StopLevel::Halt && !self.reset.contains(&n) {
-                    self.is_permitted &= !self.stood.insert(n) && !self.resumed.contains(&n);
+                    self.is_permitted &= !self.stood.insert(n);
                 }
                 told(&mut self.rig, vec![stop(n, level)], vec![]);
             }

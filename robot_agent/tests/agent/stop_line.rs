@@ -303,8 +303,13 @@ async fn asked_to_move_over_it_has_the_next_line_before_it_leaves_this_one() {
     let mut bench = Bench::new();
     let mut old = bench.free().await;
     old.say(v1::attend_response::Message::MoveOver(v1::MoveOver {})).await;
-    let mut next = bench.line().await;
-    assert!(!old.down.is_closed(), "until the next one is open it listens to this one");
+    let mut next = loop {
+        tokio::select! {
+            biased;
+            next = bench.lines.recv() => break next.expect("the robot dials"),
+            message = old.next() => assert!(message.is_some(), "it left before it had the next one"),
+        }
+    };
     next.attend().await;
     next.synced(4).await;
     let said = next.until(4, |c| c.generation == 4).await;

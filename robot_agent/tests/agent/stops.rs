@@ -173,8 +173,13 @@ fn a_stop_stands_a_driving_robot_within_the_step_that_hears_it_whatever_its_disk
 #[test]
 fn a_heartbeat_says_a_stop_at_once_and_not_only_with_the_next_second() {
     let mut rig = driving();
-    rig.silence(500);
+    let quiet = rig.hb;
+    while rig.hb == quiet {
+        rig.silence(500);
+    }
+    // Not within the quarter of a second after a heartbeat, and long before the next one.
     let before = rig.hb;
+    rig.ms += 300;
     told(&mut rig, vec![stop(1, StopLevel::Halt)], vec![]);
     assert!(rig.hb > before);
 }
@@ -253,11 +258,14 @@ fn reset_and_resume_let_it_go_on_in_either_order() {
         if is_reset_first {
             told(&mut rig, vec![], vec![reset(1)]);
         }
+        // Not in the very millisecond of the heartbeat that was answered last.
+        rig.ms += 1;
         resume(&mut rig, &[stop_id(1)], true);
         assert!(!moves(&rig));
         if !is_reset_first {
             serve(&mut rig, 2_000);
             assert!(!moves(&rig), "resumed, and still engaged as far as it knows");
+            rig.ms += 1;
             told(&mut rig, vec![], vec![reset(1)]);
             assert!(!moves(&rig), "a heartbeat sent since was not answered yet");
         }
