@@ -242,8 +242,11 @@ impl StopService {
         let moving = async {
             shutdown.cancelled().await;
             let now = inner.clock.now().link;
-            inner.robots.lines().iter().for_each(|line| line.move_over(now));
-            tokio::time::sleep(MOVE_OVER_WITHIN).await;
+            let lines = inner.robots.lines();
+            lines.iter().for_each(|line| line.move_over(now));
+            if !lines.is_empty() {
+                tokio::time::sleep(MOVE_OVER_WITHIN).await;
+            }
             inner.robots.lines().iter().for_each(|line| line.end(outbox::End::Done, now));
         };
         let following = async {

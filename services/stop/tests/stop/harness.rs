@@ -202,8 +202,12 @@ impl Robot {
         let Some(message) = within(self.down.message()).await? else { return Ok(false) };
         match midshift_proto::parse(message).unwrap() {
             FromStop::Told { stops, resets, generation } => {
-                stops.into_iter().for_each(|stop| drop(self.latch.engage(stop).then_some(())));
-                resets.into_iter().for_each(|reset| drop(self.latch.reset(reset).then_some(())));
+                for stop in stops {
+                    self.latch.engage(stop);
+                }
+                for reset in resets {
+                    self.latch.reset(reset);
+                }
                 self.generation = self.generation.max(generation);
             }
             FromStop::Synced { generation } => {

@@ -1,7 +1,7 @@
 //! Robots' lines: what they carry, when they end, and that none of them holds up another.
 
 use crate::harness::{Folder, Robot, Server, WITHIN, code, eventually, fleet, id_of, scope, within};
-use midshift_core::site::{DEMO, text};
+use midshift_core::site::grid;
 use midshift_proto::convert::stop::ToStop;
 use midshift_proto::refusal_of;
 use midshift_proto::stop::v1;
@@ -77,31 +77,32 @@ async fn a_line_that_does_not_begin_with_attend_or_breaks_its_rules_is_refused()
     }
 }
 
-/// Two hundred and forty stops with boxes are far more than a connection holds for a robot that reads nothing.
+/// Eighty stops of 2 KiB are more than a connection holds for a robot that reads nothing.
 #[tokio::test]
 async fn a_robot_that_reads_nothing_holds_up_nobody_and_hears_everything_when_it_reads_again() {
     let folder = Folder::new();
-    let site = Arc::new(text::parse(DEMO).unwrap());
+    let map = format!("type octile\nheight 24\nwidth 24\nmap\n{}", format!("{}\n", ".".repeat(24)).repeat(24));
+    let site = Arc::new(grid::parse_map("hall", &map).unwrap());
     let area = site.areas()[0].area_id.to_string();
     let server = Server::with_site(&folder.path(), Some(site)).await;
     let mut slow = Robot::dial(&server, "slow", vec![]).await;
     let mut quick = Robot::dial(&server, "quick", vec![]).await.synced().await;
     let mut client = server.client().await;
-    let mut reset = Vec::new();
-    for n in 0..240 {
+    for n in 0..80 {
         let request = scope(W::AreaId(area.clone()));
         let mut stream = within(client.engage(request)).await.unwrap().into_inner();
         let id = id_of(&within(stream.message()).await.unwrap().unwrap());
         quick.until(|robot| robot.knows(&id)).await;
         let said = quick.obeying(true);
         quick.check_in(said).await;
-        if n % 4 == 0 {
+        if n % 8 == 0 {
             server.reset(&id).await;
-            reset.push(id);
+            let said = slow.obeying(true);
+            slow.say(said).await;
         }
     }
     let last = id_of(&server.engage(fleet()).await.unwrap());
-    quick.until(|robot| robot.knows(&last) && robot.effective().len() == 181).await;
+    quick.until(|robot| robot.knows(&last) && robot.effective().len() == 71).await;
     slow.until(|robot| robot.knows(&last)).await;
     let said = slow.obeying(true);
     slow.check_in(said).await;
