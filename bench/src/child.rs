@@ -130,6 +130,8 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 roles: Vec::new(),
                 drain_seconds: None,
                 no_software: false,
+                stop_listen: std::net::SocketAddr::from(([127, 0, 0, 1], midshift::stop::PORT)),
+                no_stop: true,
                 site,
                 data,
                 listen,

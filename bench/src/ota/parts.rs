@@ -158,6 +158,8 @@ async fn serve(data: PathBuf, keys: PathBuf, listen: SocketAddr, stop: Cancellat
         roles: Vec::new(),
         drain_seconds: None,
         no_software: false,
+        stop_listen: std::net::SocketAddr::from(([127, 0, 0, 1], midshift::stop::PORT)),
+        no_stop: true,
         site: None,
         data,
         listen,

@@ -6,6 +6,7 @@ use crate::report::{self, Inputs, Kind, Report};
 use crate::roles::Roles;
 use crate::scenario::{self, Release, Scenario, Sight, Stage, Story};
 use crate::server::{Naive, Parts, Server};
+use crate::stop::{self, Beside};
 use crate::tally::{self, SharedTasks, Tasks};
 use crate::throwaway::Throwaway;
 use crate::under_way::{self, UnderWay};
@@ -181,6 +182,8 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     let mut swarm = SwarmConfig::tcp(hall.clone(), clock.clone(), &format!("http://{address}"), args.seed);
     let live = tasks.clone();
     swarm.person = Some(Arc::new(move |id| tally::look(&live, |t| t.is_live(id))));
+    let stops = Stops::start(&args, site.clone(), clock.clone(), address)?;
+    swarm = swarm.with_stop(&format!("http://{}", stops.beside.address()));
     let (software, ota) = Throwaway::make(clock.clone()).await?;
     let trust = software.trust(site.site_id().clone())?;
     swarm.software = Some(trust.clone());
@@ -200,13 +203,13 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         reader: None,
         sim: Some(SimFace::new(hall.clone(), clock.clone(), swarm.crash())),
         naive: Naive::default(),
-        stops: None,
+        stops: Some(stops.folder.clone()),
         planning: planning.handle(),
     };
     // The server ends after its robots and its client, or the last of them would be cut off at Ctrl-C.
     let served_until = CancellationToken::new();
     let server = Server::new(parts, served_until.clone()).await?.hearing(beacons).with_probation(PROBATION_MS);
-    say(&greeting(&args, &site, address, &software));
+    say(&greeting(&args, &site, address, stops.beside.address(), &software));
     let stage = match scene {
         Some(scene) => {
             let sight = Sight { store: store.clone(), board: server.board(), site: site.clone(), clock: clock.clone() };
@@ -214,8 +217,47 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         }
         None => None,
     };
-    let run = Run { args, site, clock, hall, run_id, tasks, store, stop, served_until, stage, _software: software };
+    let run = Run {
+        args,
+        site,
+        clock,
+        hall,
+        run_id,
+        tasks,
+        store,
+        stop,
+        served_until,
+        stage,
+        _software: software,
+        _stops: stops,
+    };
     run.together(server, swarm, listener, address, say).await
+}
+
+/// The stop service of the run, in a folder that goes with it unless everything is kept.
+struct Stops {
+    beside: Beside,
+    folder: PathBuf,
+    _temporary: Option<TempDir>,
+}
+
+impl Stops {
+    /// On the usual port, or on a free one if that is taken or the server asked for a free one too.
+    fn start(args: &Dev, site: Arc<Site>, clock: Arc<dyn Clock>, address: SocketAddr) -> anyhow::Result<Self> {
+        let free = SocketAddr::new(address.ip(), 0);
+        let usual = if args.listen.port() == 0 { free } else { SocketAddr::new(address.ip(), stop::PORT) };
+        let listener = std::net::TcpListener::bind(usual).or_else(|_| std::net::TcpListener::bind(free));
+        let listener = listener.context("listening for stops")?;
+        let (folder, temporary) = match &args.data {
+            Some(data) => (data.join(stop::FOLDER), None),
+            None => {
+                let temporary = tempfile::tempdir().context("making a folder for stops")?;
+                (temporary.path().join(stop::FOLDER), Some(temporary))
+            }
+        };
+        let beside = Beside::start(folder.clone(), site, clock, listener)?;
+        Ok(Self { beside, folder, _temporary: temporary })
+    }
 }
 
 /// What a story needs from the beginning: a folder for what its robots keep.
@@ -302,7 +344,7 @@ async fn stores(
     Ok((Arc::new(MemoryStore::new(site_id, id, clock.clone())), Arc::new(frames)))
 }
 
-fn greeting(args: &Dev, site: &Site, address: SocketAddr, software: &Throwaway) -> String {
+fn greeting(args: &Dev, site: &Site, address: SocketAddr, stops: SocketAddr, software: &Throwaway) -> String {
     let program = std::env::args().next().unwrap_or_else(|| "midshift".to_owned());
     let (keys, repository) = (software.keys(), software.repository());
     let (keys, repository) = (keys.display(), repository.display());
@@ -311,6 +353,7 @@ fn greeting(args: &Dev, site: &Site, address: SocketAddr, software: &Throwaway) 
         .as_ref()
         .map_or("data in memory (--data DIR keeps it)".to_owned(), |d| format!("data in {}", d.display()));
     let server = if address.port() == 7420 { String::new() } else { format!(" --server {address}") };
+    let stop_server = if stops.port() == stop::PORT { String::new() } else { format!(" --stop-server {stops}") };
     let mut stations =
         site.stations().chain(site.of_kind(midshift_core::site::Kind::Junction)).map(|w| site.name_of(w).to_string());
     let (from, to) = if site.source() == midshift_core::site::Source::Authored && site.site_id().as_str() == "demo" {
@@ -326,9 +369,11 @@ fn greeting(args: &Dev, site: &Site, address: SocketAddr, software: &Throwaway) 
     format!(
         "midshift dev  {} simulated robots, site \"{}\", {kept}{clock}\n\
          gRPC http://{address} (reflection on)   metrics http://{address}/metrics   no login, no TLS: NOT for production\n\
+         Stop http://{stops}: an operational stop request, not a safety function\n\
          Try:  {program} task submit{server} --from {from} --to {to} --sku SKU-88231 --wait\n\
          \x20     {program} robot ls{server}\n\
          \x20     {program} sim fault{server} rbt-04 --drop-network 20s\n\
+         \x20     {program} stop{stop_server} --all --reason drill\n\
          \x20     grpcurl -plaintext {address} list\n\
          \x20     {program} bundle samples SAMPLES --config-only --repository {repository} --key {keys}/targets-1.pem\n\
          \x20     {program} bundle push{server} {repository}\n\
@@ -352,6 +397,8 @@ struct Run {
     stage: Option<(Stage, TempDir)>,
     /// Its folder goes with the run.
     _software: Throwaway,
+    /// Ends after everything else.
+    _stops: Stops,
 }
 
 impl Run {

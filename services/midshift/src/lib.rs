@@ -19,6 +19,7 @@ pub mod serve;
 pub mod server;
 pub mod site_file;
 mod software;
+pub mod stop;
 pub mod stop_follower;
 pub mod storage;
 pub mod tally;

@@ -58,6 +58,12 @@ pub struct Serve {
     /// network can send: it is shown and decides nothing. Without it nobody listens.
     #[arg(long, value_name = "ADDR")]
     pub beacon_listen: Option<SocketAddr>,
+    /// Where its stop service listens: a process of its own that is started unless one answers there, and that stays when this one ends.
+    #[arg(long, value_name = "ADDR", default_value_t = SocketAddr::from(([127, 0, 0, 1], crate::stop::PORT)))]
+    pub stop_listen: SocketAddr,
+    /// Start no stop service: it runs elsewhere, or under a unit of its own. With --roles none is started either.
+    #[arg(long, env = "MIDSHIFT_NO_STOP")]
+    pub no_stop: bool,
     /// Where software of robots comes from.
     #[command(flatten)]
     pub software: Software,
@@ -136,6 +142,10 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
         Some(address) => Some(hear(address).await?),
         None => None,
     };
+    let has_stop = !args.no_stop && !roles.are_split();
+    if has_stop {
+        crate::stop::start(args.site.as_deref(), &args.data, args.stop_listen, args.insecure).await?;
+    }
     tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), store = storage.engine(), %roles, "midshift serves");
     let planning = Planning::start()?;
     let fleet_follows = roles.has(Role::Fleet);
@@ -152,11 +162,20 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
         reader,
         sim: None,
         naive: Naive::default(),
-        stops: fleet_follows.then(|| args.data.join("stop")),
+        stops: fleet_follows.then(|| args.data.join(crate::stop::FOLDER)),
         planning: planning.handle(),
     };
     let server = Server::new(parts, shutdown).await?.hearing(beacons);
-    let served = server.serve(nodelay(listener)).await;
+    let kept = async {
+        match has_stop {
+            true => crate::stop::keep(args.site.as_deref(), &args.data, args.stop_listen, args.insecure).await,
+            false => std::future::pending().await,
+        }
+    };
+    let served = tokio::select! {
+        served = server.serve(nodelay(listener)) => served,
+        () = kept => Ok(()),
+    };
     storage.close().await;
     served
 }

@@ -42,7 +42,8 @@ async fn serve_refuses_to_leave_loopback_unless_somebody_says_insecure() -> anyh
 
     let log = dir.path().join("open.log");
     let mut command = Command::new(midshift()?);
-    command.current_dir(dir.path()).args(["serve", "--listen", "0.0.0.0:0", "--insecure"]).args(fresh_store()?);
+    command.env("MIDSHIFT_NO_STOP", "true").current_dir(dir.path());
+    command.args(["serve", "--listen", "0.0.0.0:0", "--insecure"]).args(fresh_store()?);
     let mut open = Running::start(&mut command, &log)?;
     until("the server to say that it serves", LIMIT, || async {
         Ok(std::fs::read_to_string(&log)?.contains("midshift serves").then_some(()))

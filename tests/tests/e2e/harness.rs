@@ -184,7 +184,12 @@ impl Server {
     }
     fn run(dir: &Path, address: SocketAddr, flags: &[String]) -> anyhow::Result<Running> {
         let mut command = Command::new(midshift()?);
-        command.args(["serve", "--data"]).arg(dir.join("data")).args(["--listen", &address.to_string()]);
+        // Its stop service would outlive the test, on a port that all tests share.
+        command
+            .env("MIDSHIFT_NO_STOP", "true")
+            .args(["serve", "--data"])
+            .arg(dir.join("data"))
+            .args(["--listen", &address.to_string()]);
         command.arg("--site").arg(dir.join(SITE_FILE)).args(flags);
         Running::start(&mut command, &dir.join("server.log"))
     }

@@ -58,7 +58,12 @@ impl Server {
     }
     fn run(dir: &Path, address: SocketAddr, flags: &[String]) -> anyhow::Result<Running> {
         let mut command = Command::new(midshift()?);
-        command.arg("serve").arg("--data").arg(dir.join("data")).args(["--listen", &address.to_string()]);
+        command
+            .env("MIDSHIFT_NO_STOP", "true")
+            .arg("serve")
+            .arg("--data")
+            .arg(dir.join("data"))
+            .args(["--listen", &address.to_string()]);
         command.arg("--site").arg(dir.join("site.toml")).args(flags);
         Running::start(&mut command, &dir.join("server.log"))
     }

@@ -16,6 +16,7 @@ mod released;
 mod robot;
 mod rollout;
 mod sim;
+mod stop;
 mod task;
 mod zone;
 
@@ -87,6 +88,8 @@ enum Command {
     /// Robots.
     #[command(subcommand)]
     Robot(robot::Verb),
+    /// Stop robots at once: an operational stop request, not a safety function.
+    Stop(Box<stop::Stop>),
     /// Passages and standing places.
     #[command(subcommand)]
     Zone(zone::Verb),
@@ -132,7 +135,11 @@ pub fn main() -> ExitCode {
         // Before anything that a launcher must not need: no runtime, no threads.
         return launcher::main(arguments.into_iter());
     }
-    let serves = matches!(args.command, Command::Serve(_) | Command::Agent(_) | Command::Sim(sim::Verb::Run(_)));
+    let serves = match &args.command {
+        Command::Serve(_) | Command::Agent(_) | Command::Sim(sim::Verb::Run(_)) => true,
+        Command::Stop(stop) => stop.serves().is_some(),
+        _ => false,
+    };
     logs::start(args.log, if serves { "info" } else { "warn" });
     let out = Out::new(args.output);
     let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
@@ -180,6 +187,10 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Sim(verb) => sim::run(verb, out, interrupts()).await,
         Command::Task(verb) => task::run(verb, out).await,
         Command::Robot(verb) => robot::run(verb, out).await,
+        Command::Stop(stop) => match stop.serves() {
+            Some(args) => Ok(crate::stop::run(args.clone(), interrupts()).await?),
+            None => stop::run(*stop, out).await,
+        },
         Command::Zone(verb) => zone::run(verb, out).await,
         Command::Incident(verb) => incident::run(verb, out).await,
         Command::Area(verb) => area::run(verb, out).await,

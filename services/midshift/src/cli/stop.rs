@@ -1,0 +1,489 @@
+//! `midshift stop …`: stops the fleet or a part of it, shows what each robot confirms, resets. Never asks back.
+//!
+//! An operational stop request: not a safety function, no performance level. Nothing is shown as standing that a robot has not said itself.
+
+use super::client::{Exit, unary};
+use super::out::{Format, Out};
+use crate::robots::uri;
+use crate::stop::{FOLDER, PORT, StopServe};
+use clap::{Args, Subcommand, ValueEnum};
+use midshift_core::time::Utc;
+use midshift_proto::link::v1::StopLevel;
+use midshift_proto::stop::v1;
+use midshift_proto::stop::v1::scope::Scope;
+use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::time::Duration;
+use tonic::transport::{Channel, Endpoint, Uri};
+
+/// A stop service that does not answer a connection within this is not there.
+const CONNECT_WITHIN: Duration = Duration::from_secs(3);
+/// Stops that were not confirmed by all.
+const NOT_ALL: u8 = 13;
+/// Every robot of a site in one message.
+const ANSWER_BYTES_MAX: usize = 64 * 1024 * 1024;
+
+/// Which stop service.
+#[derive(Clone, Debug, Args)]
+pub struct StopCall {
+    /// The business server, host:port: its host has the stop service on port 7421.
+    #[arg(long, env = "MIDSHIFT_SERVER", default_value = "127.0.0.1:7420")]
+    server: String,
+    /// The stop service, host:port, if it is elsewhere.
+    #[arg(long, env = "MIDSHIFT_STOP_SERVER", value_name = "HOST:PORT")]
+    stop_server: Option<String>,
+}
+
+impl StopCall {
+    fn address(&self) -> Result<String, Exit> {
+        if let Some(stop_server) = &self.stop_server {
+            return Ok(stop_server.clone());
+        }
+        let uri: Uri = uri(&self.server).parse().map_err(|e| Exit::usage(format!("--server {}: {e}", self.server)))?;
+        let host = uri.host().ok_or_else(|| Exit::usage(format!("--server {} has no host", self.server)))?;
+        Ok(format!("{host}:{PORT}"))
+    }
+
+    async fn client(&self) -> Result<StopServiceClient<Channel>, Exit> {
+        let address = self.address()?;
+        let endpoint = Endpoint::from_shared(uri(&address)).map_err(|e| Exit::usage(format!("{address}: {e}")))?;
+        let channel = endpoint.connect_timeout(CONNECT_WITHIN).connect().await.map_err(|_| {
+            Exit::new(
+                5,
+                format!(
+                    "no stop service at {address}: nothing was stopped or reset. Use the robots' own emergency stops if you must\n  try: name it with --stop-server, or start one with `midshift stop serve`"
+                ),
+            )
+        })?;
+        Ok(StopServiceClient::new(channel).max_decoding_message_size(ANSWER_BYTES_MAX))
+    }
+}
+
+/// What robots do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Level {
+    /// Drive at most 300 mm/s, and work on.
+    Slow,
+    /// Stand still, powered.
+    Halt,
+    /// Move into a posture that stays stable, then stand.
+    Posture,
+}
+
+/// Whom a stop is for.
+#[derive(Clone, Debug, Args)]
+#[group(required = true, multiple = false)]
+struct Whom {
+    /// Every robot of the site.
+    #[arg(long)]
+    all: bool,
+    /// One robot, wherever it is.
+    #[arg(long, value_name = "ID")]
+    robot: Option<String>,
+    /// Every robot in or near one passage or standing place.
+    #[arg(long, value_name = "ID")]
+    zone: Option<String>,
+    /// Every robot in or near one area.
+    #[arg(long, value_name = "ID")]
+    area: Option<String>,
+}
+
+impl Whom {
+    fn scope(self) -> v1::Scope {
+        let narrow = self.robot.map(Scope::RobotId).or(self.zone.map(Scope::Zone)).or(self.area.map(Scope::AreaId));
+        v1::Scope { scope: Some(narrow.unwrap_or(Scope::Fleet(v1::Fleet {}))) }
+    }
+}
+
+/// Engages a stop.
+#[derive(Clone, Debug, Args)]
+pub struct Engage {
+    #[command(flatten)]
+    call: StopCall,
+    #[command(flatten)]
+    whom: Whom,
+    /// What they do.
+    #[arg(long, value_enum, default_value_t = Level::Halt)]
+    level: Level,
+    /// Why, for those who come later.
+    #[arg(long, default_value = "")]
+    reason: String,
+    /// Protects against a double call: the same id and content are one stop.
+    #[arg(long, default_value = "")]
+    request_id: String,
+    /// Do not wait for what robots confirm.
+    #[arg(long)]
+    no_wait: bool,
+}
+
+/// Stops robots, at once and without asking back: an operational stop request.
+///
+/// Not a safety function and no performance level: the independent emergency stop is the hardware of the robot's maker and integrator.
+/// A stop stays until it is reset by its name; a reset makes nothing move. Exit code 13: not every robot has confirmed.
+#[derive(Args)]
+#[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
+pub struct Stop {
+    #[command(subcommand)]
+    verb: Option<Verb>,
+    #[command(flatten)]
+    engage: Option<Engage>,
+}
+
+/// What is done with stops besides engaging them.
+#[derive(Subcommand)]
+enum Verb {
+    /// What is engaged, and how robots are.
+    Status {
+        #[command(flatten)]
+        call: StopCall,
+        /// Again whenever it changes, until Ctrl-C.
+        #[arg(long)]
+        watch: bool,
+    },
+    /// Take one stop away. Robots that stood stay where they are until they are resumed.
+    Reset {
+        #[command(flatten)]
+        call: StopCall,
+        /// Its name.
+        stop_id: String,
+        /// What you saw that makes it right.
+        #[arg(long)]
+        reason: String,
+    },
+    /// Check that nobody has changed the audit of stops. Exit code 1 if somebody has.
+    Verify {
+        /// The data folder of the stop service, on this machine.
+        #[arg(long, default_value = "midshift-data")]
+        data: PathBuf,
+    },
+    /// Run the stop service: a process of its own beside `midshift serve`, with its own port and files.
+    Serve(StopServe),
+}
+
+impl Stop {
+    /// What to serve, if that is what was asked for.
+    pub fn serves(&self) -> Option<&StopServe> {
+        match &self.verb {
+            Some(Verb::Serve(args)) => Some(args),
+            _ => None,
+        }
+    }
+}
+
+/// Runs one verb; `serve` is not among them.
+pub async fn run(stop: Stop, out: &Out) -> Result<(), Exit> {
+    match (stop.verb, stop.engage) {
+        (None, Some(engage)) => self::engage(engage, out).await,
+        (Some(Verb::Status { call, watch: false }), _) => {
+            let answer = call.client().await?.get_status(unary(v1::GetStatusRequest {})).await?.into_inner();
+            show(&answer, out)
+        }
+        (Some(Verb::Status { call, .. }), _) => watch(&call, out).await,
+        (Some(Verb::Reset { call, stop_id, reason }), _) => {
+            reset(&call, v1::ResetRequest { stop_id, reason }, out).await
+        }
+        (Some(Verb::Verify { data }), _) => {
+            let folder = data.join(FOLDER);
+            let verified = midshift_stop::verify(&folder).map_err(|broken| {
+                Exit::new(
+                    1,
+                    format!("{}: {broken}\n  try: compare it with a backup", folder.join("audit.jsonl").display()),
+                )
+            })?;
+            match out.format {
+                Format::Table => {
+                    out.line(&format!("{} records hold together, the last is {}", verified.records, verified.hash))
+                }
+                Format::Name => out.line(&verified.hash),
+                Format::Json | Format::Jsonl => {
+                    out.value(&serde_json::json!({"records": verified.records, "hash": verified.hash}))?;
+                }
+            }
+            Ok(())
+        }
+        (Some(Verb::Serve(_)), _) | (None, None) => {
+            Err(Exit::usage("nobody was named: --all, --robot, --zone or --area"))
+        }
+    }
+}
+
+async fn engage(args: Engage, out: &Out) -> Result<(), Exit> {
+    let level = match args.level {
+        Level::Slow => StopLevel::Slow,
+        Level::Halt => StopLevel::Halt,
+        Level::Posture => StopLevel::ControlledStopPosture,
+    };
+    let request = v1::EngageRequest {
+        scope: Some(args.whom.scope()),
+        level: level.into(),
+        reason: args.reason,
+        request_id: args.request_id,
+    };
+    let mut client = args.call.client().await?;
+    let mut stream = client.engage(request).await.map_err(Exit::with_facts)?.into_inner();
+    let mut told = Told::default();
+    while let Some(message) = stream.message().await.map_err(|status| told.cut(status))? {
+        told.take(message, out)?;
+        if args.no_wait {
+            break;
+        }
+    }
+    told.end(args.no_wait, out)
+}
+
+/// What was told of one stop until now.
+#[derive(Default)]
+struct Told {
+    stop: v1::Stop,
+    robots: BTreeMap<String, v1::RobotStop>,
+    last: v1::EngageResponse,
+}
+
+impl Told {
+    fn take(&mut self, message: v1::EngageResponse, out: &Out) -> Result<(), Exit> {
+        if out.format == Format::Jsonl {
+            out.json(&message)?;
+        }
+        if let Some(stop) = &message.stop {
+            self.stop = stop.clone();
+            match out.format {
+                Format::Table => out.line(&format!("{} {} {} engaged", stop.stop_id, level(stop.level), whom(stop))),
+                Format::Name => out.line(&stop.stop_id),
+                Format::Json | Format::Jsonl => {}
+            }
+        }
+        for robot in &message.robots {
+            // That it was told is no news, and a fleet is long.
+            if out.format == Format::Table && robot.confirmation() != v1::Confirmation::Requested {
+                out.line(&confirmed(robot));
+            }
+            self.robots.insert(robot.robot_id.clone(), robot.clone());
+        }
+        self.last = message;
+        Ok(())
+    }
+
+    /// The stream broke: the stop stands all the same.
+    fn cut(&self, status: tonic::Status) -> Exit {
+        let stop_id = &self.stop.stop_id;
+        let exit = Exit::from(status);
+        if stop_id.is_empty() {
+            return exit;
+        }
+        Exit::new(NOT_ALL, format!("{stop_id} was engaged, and what robots confirm is not heard any more: {exit}"))
+            .or_try("midshift stop status")
+    }
+
+    fn is_settled(&self, robot: &v1::RobotStop) -> bool {
+        use v1::Confirmation as C;
+        match robot.confirmation() {
+            C::StandstillConfirmed | C::Outside => true,
+            C::Acked => self.stop.level() == StopLevel::Slow,
+            C::Requested | C::Unreachable | C::Unspecified => false,
+        }
+    }
+
+    fn end(self, no_wait: bool, out: &Out) -> Result<(), Exit> {
+        let stop_id = &self.stop.stop_id;
+        if out.format == Format::Json {
+            let robots = self.robots.values().cloned().collect();
+            out.json(&v1::EngageResponse { stop: Some(self.stop.clone()), robots, ..self.last.clone() })?;
+        }
+        if !self.last.durable {
+            out.say("warning: the stop service's disk refused it; robots were told and keep it, and it is written as soon as it can be");
+        }
+        out.next(&format!("midshift stop status; when it is over: midshift stop reset {stop_id} --reason TEXT"));
+        if no_wait {
+            return Ok(());
+        }
+        let counts = self.last.counts.unwrap_or_default();
+        let said = summary(&counts);
+        if self.robots.is_empty() {
+            return Err(Exit::new(
+                NOT_ALL,
+                format!("{stop_id} is engaged and the stop service knows of no robot: nobody has confirmed it"),
+            ));
+        }
+        let missing: Vec<&str> =
+            self.robots.values().filter(|r| !self.is_settled(r)).map(|r| r.robot_id.as_str()).collect();
+        if missing.is_empty() {
+            out.say(&said);
+            return Ok(());
+        }
+        let shown = missing[..missing.len().min(20)].join(", ");
+        let more = if missing.len() > 20 { format!(" and {} more", missing.len() - 20) } else { String::new() };
+        let text = format!(
+            "{stop_id} is engaged and {} of {} robots have not confirmed it: {shown}{more}\n  {said}",
+            missing.len(),
+            self.robots.len()
+        );
+        Err(Exit::new(NOT_ALL, text)
+            .or_try("look at these robots; their own emergency stops do not depend on midshift"))
+    }
+}
+
+fn summary(counts: &v1::Counts) -> String {
+    format!(
+        "{} stand, {} acknowledged, {} are elsewhere, {} requested, {} unreachable",
+        counts.standstill_confirmed, counts.acked, counts.outside, counts.requested, counts.unreachable
+    )
+}
+
+fn level(number: i32) -> &'static str {
+    StopLevel::try_from(number).map_or("?", |level| level.as_str_name().trim_start_matches("STOP_LEVEL_"))
+}
+
+/// A level that somebody obeys; none is said as `-`.
+fn obeys(number: i32) -> String {
+    if number == 0 { "-".to_owned() } else { level(number).to_owned() }
+}
+
+fn whom(stop: &v1::Stop) -> String {
+    match stop.scope.as_ref().and_then(|scope| scope.scope.as_ref()) {
+        Some(Scope::RobotId(id)) => format!("robot {id}"),
+        Some(Scope::Zone(id)) => format!("zone {id}"),
+        Some(Scope::AreaId(id)) => format!("area {id}"),
+        Some(Scope::Fleet(_)) => "fleet".to_owned(),
+        None => "?".to_owned(),
+    }
+}
+
+fn at(unix_ms: i64) -> String {
+    if unix_ms == 0 { "never".to_owned() } else { Utc(unix_ms).rfc3339() }
+}
+
+fn confirmed(robot: &v1::RobotStop) -> String {
+    let word = robot.confirmation().as_str_name().trim_start_matches("CONFIRMATION_");
+    if robot.confirmation() != v1::Confirmation::Unreachable {
+        return format!("{}  {word}", robot.robot_id);
+    }
+    let by = match robot.self_stop_by_unix_ms {
+        0 => "nobody can tell when it stands".to_owned(),
+        by => format!("stands by itself by {}", at(by)),
+    };
+    format!("{}  {word} since {}, {by}", robot.robot_id, at(robot.unreachable_since_unix_ms))
+}
+
+fn show(answer: &v1::GetStatusResponse, out: &Out) -> Result<(), Exit> {
+    let status = answer.status.clone().unwrap_or_default();
+    match out.format {
+        Format::Json | Format::Jsonl => out.json(answer)?,
+        Format::Name => status.stops.iter().flat_map(|s| &s.stop).for_each(|stop| out.line(&stop.stop_id)),
+        Format::Table => table(&status, out),
+    }
+    Ok(())
+}
+
+fn table(status: &v1::Status, out: &Out) {
+    if !status.durable {
+        out.say("warning: the stop service's disk refuses what is engaged; robots keep it");
+    }
+    if status.stops.is_empty() {
+        out.line("nothing is engaged");
+    } else {
+        let row = |engaged: &v1::EngagedStop| {
+            let stop = engaged.stop.clone().unwrap_or_default();
+            let counts = engaged.counts.unwrap_or_default();
+            let engaged = at(stop.engaged_unix_ms);
+            vec![
+                stop.stop_id.clone(),
+                level(stop.level).to_owned(),
+                whom(&stop),
+                engaged,
+                summary(&counts),
+                stop.reason,
+            ]
+        };
+        let header = ["STOP", "LEVEL", "WHOM", "ENGAGED", "ROBOTS", "REASON"];
+        out.line(&super::out::columns(&header, &status.stops.iter().map(row).collect::<Vec<_>>()));
+    }
+    if status.robots.is_empty() {
+        return out.say("the stop service knows of no robot");
+    }
+    let row = |robot: &v1::RobotStatus| {
+        vec![
+            robot.robot_id.clone(),
+            obeys(robot.obeys),
+            if robot.standstill { "yes" } else { "no" }.to_owned(),
+            at(robot.heard_unix_ms),
+            robot.awaiting_resume.join(", "),
+            robot.foreign_stops.join(", "),
+        ]
+    };
+    let header = ["ROBOT", "OBEYS", "STANDS", "HEARD", "AWAITS RESUME", "FOREIGN STOPS"];
+    out.line(&super::out::columns(&header, &status.robots.iter().map(row).collect::<Vec<_>>()));
+}
+
+async fn watch(call: &StopCall, out: &Out) -> Result<(), Exit> {
+    let mut stream = call.client().await?.watch_status(v1::WatchStatusRequest {}).await?.into_inner();
+    while let Some(message) = stream.message().await? {
+        show(&v1::GetStatusResponse { status: message.status }, out)?;
+    }
+    Ok(())
+}
+
+async fn reset(call: &StopCall, request: v1::ResetRequest, out: &Out) -> Result<(), Exit> {
+    let answer = call.client().await?.reset(unary(request)).await?.into_inner();
+    let reset = answer.reset.clone().unwrap_or_default();
+    out.one(&answer, &reset.stop_id, || {
+        let was =
+            if answer.was_engaged { "was engaged and is reset" } else { "was not engaged here; its name is reset" };
+        format!("{} {was} since {} by {}: {}", reset.stop_id, at(reset.at_unix_ms), reset.actor, reset.reason)
+    })?;
+    if !answer.durable {
+        out.say("warning: the stop service's disk refused the reset; robots were told, and it is written as soon as it can be");
+    }
+    out.next(&format!(
+        "robots that stood stay where they are; when it is right that they move: midshift task resume --stop-id {} --reason TEXT",
+        reset.stop_id
+    ));
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn call(server: &str, stop_server: Option<&str>) -> String {
+        let stop_server = stop_server.map(str::to_owned);
+        StopCall { server: server.to_owned(), stop_server }.address().expect("an address")
+    }
+
+    #[test]
+    fn the_stop_service_is_on_the_host_of_the_server_unless_it_is_named() {
+        assert_eq!(call("127.0.0.1:7420", None), "127.0.0.1:7421");
+        assert_eq!(call("http://fleet.local:9000", None), "fleet.local:7421");
+        assert_eq!(call("[::1]:7420", None), "[::1]:7421");
+        assert_eq!(call("fleet.local:7420", Some("other:1")), "other:1");
+    }
+
+    #[test]
+    fn only_what_robots_said_counts_as_confirmed() {
+        let robot = |confirmation: v1::Confirmation| v1::RobotStop {
+            robot_id: "r1".to_owned(),
+            confirmation: confirmation.into(),
+            ..v1::RobotStop::default()
+        };
+        let told = |level: StopLevel| Told {
+            stop: v1::Stop { level: level.into(), ..v1::Stop::default() },
+            ..Told::default()
+        };
+        let settled = |level, confirmation| told(level).is_settled(&robot(confirmation));
+        assert!(settled(StopLevel::Halt, v1::Confirmation::StandstillConfirmed));
+        assert!(settled(StopLevel::Halt, v1::Confirmation::Outside));
+        assert!(
+            !settled(StopLevel::Halt, v1::Confirmation::Acked) && settled(StopLevel::Slow, v1::Confirmation::Acked)
+        );
+        assert!(!settled(StopLevel::Halt, v1::Confirmation::Unreachable));
+        let text = confirmed(&v1::RobotStop {
+            unreachable_since_unix_ms: 1_000,
+            self_stop_by_unix_ms: 7_000,
+            ..robot(v1::Confirmation::Unreachable)
+        });
+        assert_eq!(
+            text,
+            "r1  UNREACHABLE since 1970-01-01T00:00:01.000Z, stands by itself by 1970-01-01T00:00:07.000Z"
+        );
+    }
+}

@@ -1,0 +1,212 @@
+//! `midshift stop serve`: the stop service in a process of its own; in `dev` a thread of its own; beside `serve` on one box a process that outlives it.
+//!
+//! An operational stop request, not a safety function. Invariant: nothing of the store, the task queue or the business server lies on its way. Nothing here
+//! ends a running stop service: `serve` starts one where none is, and leaves it alone for ever.
+
+use crate::{clock, server, site_file};
+use anyhow::{Context, bail};
+use axum::routing::get;
+use midshift_core::site::Site;
+use midshift_core::time::Clock;
+use midshift_stop::{Parts, StopService};
+use std::net::SocketAddr;
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::net::TcpListener;
+use tokio_util::sync::CancellationToken;
+use tonic::service::Routes;
+use tonic::transport::Endpoint;
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_client::HealthClient;
+
+/// Its port, beside the 7420 of the business.
+pub const PORT: u16 = 7421;
+/// The folder of its files below the data folder.
+pub const FOLDER: &str = "stop";
+/// A stop service that was started answers within this, or `serve` says that it did not.
+const UP_WITHIN: Duration = Duration::from_secs(10);
+const LOOK_EVERY: Duration = Duration::from_millis(100);
+/// Beside `serve` it is looked after so often, and started again after so many looks in vain: within [`midshift_core::limits::SILENCE_SLOW`].
+const KEPT_EVERY: Duration = Duration::from_secs(2);
+const MISSES: u32 = 2;
+
+/// What `stop serve` was asked for.
+#[derive(Clone, Debug, clap::Args)]
+pub struct StopServe {
+    /// The site file, as for `midshift serve`: where areas and zones are. Without it the built-in demo site.
+    #[arg(long)]
+    pub site: Option<PathBuf>,
+    /// The data folder; its own files are in stop below it, made with mode 0700.
+    #[arg(long, default_value = "midshift-data")]
+    pub data: PathBuf,
+    /// Address to listen on. Anything but loopback needs --insecure.
+    #[arg(long, default_value_t = SocketAddr::from(([127, 0, 0, 1], PORT)))]
+    pub listen: SocketAddr,
+    /// There is no login and no TLS yet: say that you know, and listen off loopback all the same.
+    #[arg(long)]
+    pub insecure: bool,
+}
+
+/// Serves until `shutdown`.
+///
+/// # Errors
+/// The folder cannot be used or another process has it, the port is taken, or a part ended by itself.
+pub async fn run(args: StopServe, shutdown: CancellationToken) -> anyhow::Result<()> {
+    if !args.listen.ip().is_loopback() && !args.insecure {
+        bail!(
+            "{} is not loopback and midshift has no login yet: whoever reaches it can stop the fleet and reset stops. Add --insecure if you mean it",
+            args.listen
+        );
+    }
+    let loaded = site_file::load(args.site.as_deref(), None, None)?;
+    let listener = TcpListener::bind(args.listen).await.with_context(|| format!("listening on {}", args.listen))?;
+    let folder = args.data.join(FOLDER);
+    tracing::info!(address = %listener.local_addr()?, folder = %folder.display(), "midshift stop serves: an operational stop request, not a safety function");
+    serve(folder, loaded.site, clock::clock(1000), listener, shutdown).await
+}
+
+async fn serve(
+    folder: PathBuf,
+    site: Arc<Site>,
+    clock: Arc<dyn Clock>,
+    listener: TcpListener,
+    shutdown: CancellationToken,
+) -> anyhow::Result<()> {
+    server::metrics_handle();
+    let service = StopService::open(Parts { folder, site: Some(site), clock }, shutdown)?;
+    let metrics = || async { server::metrics_handle().map(|handle| handle.render()).unwrap_or_default() };
+    let pages = service.routes().await?.into_axum_router().layer(tonic_web::GrpcWebLayer::new());
+    let routes = Routes::from(pages.route("/metrics", get(metrics)));
+    midshift_stop::serve(service, routes, crate::serve::nodelay(listener)).await.context("serving stops")
+}
+
+/// The stop service of `dev`: a thread with a runtime of its own, so that no plan and no simulated robot holds it up.
+pub struct Beside {
+    shutdown: CancellationToken,
+    thread: Option<std::thread::JoinHandle<anyhow::Result<()>>>,
+    address: SocketAddr,
+}
+
+impl Beside {
+    /// Begins to serve `listener`.
+    ///
+    /// # Errors
+    /// No thread or no runtime.
+    pub fn start(
+        folder: PathBuf,
+        site: Arc<Site>,
+        clock: Arc<dyn Clock>,
+        listener: std::net::TcpListener,
+    ) -> anyhow::Result<Self> {
+        let address = listener.local_addr()?;
+        listener.set_nonblocking(true)?;
+        let shutdown = CancellationToken::new();
+        let stop = shutdown.clone();
+        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+        let work = move || {
+            let served = runtime.block_on(async {
+                let listener = TcpListener::from_std(listener)?;
+                serve(folder, site, clock, listener, stop).await
+            });
+            if let Err(error) = &served {
+                tracing::error!(%error, "the stop service ended");
+            }
+            runtime.shutdown_timeout(Duration::from_secs(2));
+            served
+        };
+        let thread = std::thread::Builder::new().name("stop".to_owned()).spawn(work)?;
+        Ok(Self { shutdown, thread: Some(thread), address })
+    }
+    /// Where it listens.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+}
+
+impl Drop for Beside {
+    fn drop(&mut self) {
+        self.shutdown.cancel();
+        // It ends within its own bounds; why it ended was logged.
+        let _ = self.thread.take().map(std::thread::JoinHandle::join);
+    }
+}
+
+/// Starts a stop service as a process that outlives this one, unless one answers already.
+///
+/// # Errors
+/// It did not come up: no `serve` without a way to stop robots, unless `--no-stop` says that it is elsewhere.
+pub async fn start(site: Option<&Path>, data: &Path, listen: SocketAddr, insecure: bool) -> anyhow::Result<()> {
+    if !listen.ip().is_loopback() && !insecure {
+        bail!("{listen} is not loopback and midshift has no login yet. Add --insecure if you mean it");
+    }
+    if answers(listen).await {
+        tracing::info!(address = %listen, "a stop service answers already and is left alone");
+        return Ok(());
+    }
+    let mut child = spawn(site, data, listen, insecure)?;
+    let mut waited = Duration::ZERO;
+    while !answers(listen).await {
+        if let Some(status) = child.try_wait()? {
+            bail!(
+                "the stop service ended at once ({status}); what it said stands above. `midshift stop serve` by itself shows it too; --no-stop if it runs elsewhere"
+            );
+        }
+        if waited >= UP_WITHIN {
+            bail!(
+                "the stop service at {listen} did not answer within {} s; --no-stop if it runs elsewhere",
+                UP_WITHIN.as_secs()
+            );
+        }
+        tokio::time::sleep(LOOK_EVERY).await;
+        waited += LOOK_EVERY;
+    }
+    tracing::info!(address = %listen, process = child.id(), "a stop service was started; it stays when this process ends");
+    Ok(())
+}
+
+fn spawn(site: Option<&Path>, data: &Path, listen: SocketAddr, insecure: bool) -> anyhow::Result<Child> {
+    let program = std::env::current_exe().context("finding this program")?;
+    let mut command = Command::new(program);
+    command.args(["stop", "serve", "--listen", &listen.to_string(), "--data"]).arg(data);
+    if let Some(site) = site {
+        command.arg("--site").arg(site);
+    }
+    if insecure {
+        command.arg("--insecure");
+    }
+    // A group of its own: neither Ctrl-C at a terminal nor a kill of this group reaches it.
+    command.process_group(0).stdin(Stdio::null()).stdout(Stdio::null());
+    command.spawn().context("starting the stop service")
+}
+
+/// Looks after it until the task is ended: one that is gone is started again, before robots among people stand still for want of an answer.
+pub async fn keep(site: Option<&Path>, data: &Path, listen: SocketAddr, insecure: bool) {
+    let mut misses = 0;
+    loop {
+        tokio::time::sleep(KEPT_EVERY).await;
+        misses = if answers(listen).await { 0 } else { misses + 1 };
+        if misses < MISSES {
+            continue;
+        }
+        tracing::error!(address = %listen, "the stop service does not answer and is started again");
+        if let Err(error) = start(site, data, listen, insecure).await {
+            tracing::error!(%error, "the stop service was not started");
+        }
+        misses = 0;
+    }
+}
+
+/// Whether a stop service serves there.
+async fn answers(listen: SocketAddr) -> bool {
+    let asked = async {
+        let channel = Endpoint::from_shared(format!("http://{listen}")).ok()?.connect().await.ok()?;
+        let service = "midshift.stop.v1.StopService".to_owned();
+        HealthClient::new(channel).check(HealthCheckRequest { service }).await.ok()
+    };
+    let answer = tokio::time::timeout(LOOK_EVERY * 10, asked).await;
+    answer.is_ok_and(|answer| answer.is_some_and(|answer| answer.get_ref().status() == ServingStatus::Serving))
+}
