@@ -232,7 +232,7 @@ impl Line {
     }
 
     fn wait_to_dial(&mut self) {
-        let most = (2 * RETRY_MS.start << self.failures.min(8)).min(RETRY_MS.end);
+        let most = ((2 * RETRY_MS.start) << self.failures.min(8)).min(RETRY_MS.end);
         self.failures = self.failures.saturating_add(1);
         let pause = self.rng.random_range(RETRY_MS.start..=most);
         self.wait(pause);
