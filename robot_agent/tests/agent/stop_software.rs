@@ -7,8 +7,8 @@ use crate::updates::{
     Order, activate, drain, maintain, name_of, on_trial, relaunch, report, stage, state, switch, want,
 };
 use midshift_core::robot::StopLevel;
-use midshift_core::update::{Goal, UpdateState};
-use midshift_core::work::{DesiredWork, Effect};
+use midshift_core::update::{Goal, UpdateEvent, UpdateState};
+use midshift_core::work::{DesiredWork, Effect, RobotEvent};
 
 fn staged() -> (Rig, Order, Releases) {
     let releases = Releases::new();
@@ -34,6 +34,9 @@ fn nothing_is_activated_while_a_robot_is_stopped_and_after_its_resume_it_is() {
     activate(&mut rig, &mut order, "drain-1");
     serve(&mut rig, 3_000);
     assert_eq!((state(&rig), rig.exit, blocked_by(&rig).as_deref()), (Some(UpdateState::Staged), None, Some("stop")));
+    let begun =
+        |e: &RobotEvent| matches!(e, RobotEvent::Update(UpdateEvent::Changed(r)) if r.state == UpdateState::Switching);
+    assert!(!rig.events.iter().any(begun), "its grant is not even used");
     told(&mut rig, vec![], vec![reset(1)]);
     let maintenance = Some(drain("drain-1"));
     rig.work(DesiredWork { maintenance, resumed: vec![stop_id(1)], ..rig.desired(None) });

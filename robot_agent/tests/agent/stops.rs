@@ -561,6 +561,23 @@ fn slow_caps_the_drive_under_way_at_once_and_gives_it_back_without_a_resume() {
 }
 
 #[test]
+fn slow_does_not_wait_for_a_grant_that_waits_for_the_disk() {
+    let mut rig = free();
+    let work = |rig: &Rig, grants| {
+        let route = vec![point("A", None, false, &[]), point("B", None, false, &[]), point("C", Some(0), true, &[])];
+        DesiredWork { grants, ..rig.desired(Some(rig.offer("T1", 1, vec![goto("C")], route))) }
+    };
+    rig.work(work(&rig, vec![]));
+    rig.slow_disk = true;
+    rig.work(work(&rig, vec![rig.grant("C", 11)]));
+    assert_eq!(rig.body.goes_to(), ["B"], "the grant is not on the ledger yet");
+    told(&mut rig, vec![stop(1, StopLevel::Slow)], vec![]);
+    assert_eq!(speeds(&rig), [300]);
+    rig.flush();
+    assert_eq!((rig.body.goes_to().len(), speeds(&rig)), (2, vec![300, 300]));
+}
+
+#[test]
 fn what_was_halted_under_a_slow_stop_goes_on_slowly() {
     let mut rig = halted();
     told(&mut rig, vec![stop(2, StopLevel::Slow)], vec![reset(1)]);
