@@ -127,7 +127,7 @@ pub struct Stop {
     #[command(subcommand)]
     verb: Option<Verb>,
     #[command(flatten)]
-    engage: Option<Engage>,
+    engage: Engage,
 }
 
 /// What is done with stops besides engaging them.
@@ -173,17 +173,15 @@ impl Stop {
 
 /// Runs one verb; `serve` is not among them.
 pub async fn run(stop: Stop, out: &Out) -> Result<(), Exit> {
-    match (stop.verb, stop.engage) {
-        (None, Some(engage)) => self::engage(engage, out).await,
-        (Some(Verb::Status { call, watch: false }), _) => {
+    match stop.verb {
+        None => engage(stop.engage, out).await,
+        Some(Verb::Status { call, watch: false }) => {
             let answer = call.client().await?.get_status(unary(v1::GetStatusRequest {})).await?.into_inner();
             show(&answer, out)
         }
-        (Some(Verb::Status { call, .. }), _) => watch(&call, out).await,
-        (Some(Verb::Reset { call, stop_id, reason }), _) => {
-            reset(&call, v1::ResetRequest { stop_id, reason }, out).await
-        }
-        (Some(Verb::Verify { data }), _) => {
+        Some(Verb::Status { call, .. }) => watch(&call, out).await,
+        Some(Verb::Reset { call, stop_id, reason }) => reset(&call, v1::ResetRequest { stop_id, reason }, out).await,
+        Some(Verb::Verify { data }) => {
             let folder = data.join(FOLDER);
             let verified = midshift_stop::verify(&folder).map_err(|broken| {
                 Exit::new(
@@ -202,9 +200,7 @@ pub async fn run(stop: Stop, out: &Out) -> Result<(), Exit> {
             }
             Ok(())
         }
-        (Some(Verb::Serve(_)), _) | (None, None) => {
-            Err(Exit::usage("nobody was named: --all, --robot, --zone or --area"))
-        }
+        Some(Verb::Serve(_)) => Err(Exit::usage("stop serve is no call")),
     }
 }
 
@@ -456,6 +452,29 @@ mod tests {
         assert_eq!(call("http://fleet.local:9000", None), "fleet.local:7421");
         assert_eq!(call("[::1]:7420", None), "[::1]:7421");
         assert_eq!(call("fleet.local:7420", Some("other:1")), "other:1");
+    }
+
+    #[derive(clap::Parser)]
+    struct Line {
+        #[command(flatten)]
+        stop: Stop,
+    }
+
+    #[test]
+    fn whom_to_stop_is_named_once_and_verbs_need_nobody() {
+        use clap::Parser;
+        let parse = |words: &str| Line::try_parse_from(["stop"].into_iter().chain(words.split_whitespace()));
+        let all = parse("--all --reason drill").unwrap_or_else(|e| panic!("{e}")).stop;
+        assert!(all.verb.is_none() && all.engage.whom.all);
+        let area = parse("--area hall --level slow --no-wait").unwrap_or_else(|e| panic!("{e}")).stop;
+        assert_eq!((area.engage.whom.area.as_deref(), area.engage.level), (Some("hall"), Level::Slow));
+        assert!(
+            parse("status --watch").is_ok_and(|line| matches!(line.stop.verb, Some(Verb::Status { watch: true, .. })))
+        );
+        assert!(parse("serve").is_ok_and(|line| line.stop.serves().is_some()));
+        for wrong in ["", "--reason drill", "--all --robot r1", "--all status"] {
+            assert!(parse(wrong).is_err(), "{wrong}");
+        }
     }
 
     #[test]
