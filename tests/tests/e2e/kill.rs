@@ -132,8 +132,14 @@ pub async fn all_over(server: SocketAddr, count: usize) -> anyhow::Result<Vec<Ta
     })
     .await;
     if ended.is_err() {
-        let open =
-            [TaskState::Queued, TaskState::Assigned, TaskState::Running, TaskState::Stopping, TaskState::RetryWait];
+        let open = [
+            TaskState::Queued,
+            TaskState::Assigned,
+            TaskState::Running,
+            TaskState::Held,
+            TaskState::Stopping,
+            TaskState::RetryWait,
+        ];
         for task in in_states(server, &open).await?.unwrap_or_default() {
             say!("open: {} {:?} {} {:?}", task.task_id, task.state(), task.robot_id, task.attempt);
         }

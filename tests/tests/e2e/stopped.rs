@@ -1,6 +1,6 @@
 //! A fleet stop with real programs: everybody stands, the server dead or not, and nobody moves before a person has reset and resumed it.
 
-use crate::harness::{Running, Server, channel, free_port, midshift, until};
+use crate::harness::{Running, Server, channel, folder, free_port, midshift, until};
 use crate::kill::{all_over, at_work, judge, submit};
 use crate::robots::Robots;
 use crate::rolled_out::{call, done};
@@ -71,11 +71,11 @@ impl StopServer {
     }
 }
 
-/// Waits until fleet holds every robot by this token.
-async fn until_all_have(server: SocketAddr, robots: &Robots, token: &str) -> anyhow::Result<()> {
-    until(&format!("{token} on every robot"), LIMIT, async || {
+/// Waits until fleet holds these robots by this token.
+async fn until_held(server: SocketAddr, robots: &[String], token: &str) -> anyhow::Result<()> {
+    until(&format!("{token} on {robots:?}"), LIMIT, async || {
         let mut client = FleetServiceClient::new(channel(server)?);
-        for robot_id in robots.ids() {
+        for robot_id in robots.to_owned() {
             let Ok(answer) = client.get_robot_control(GetRobotControlRequest { robot_id }).await else {
                 return Ok(None);
             };
@@ -128,7 +128,7 @@ async fn resume(server: &Server, stop_id: &str) -> anyhow::Result<()> {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_stopped_fleet_stands_through_every_kill_until_it_is_reset_and_resumed() -> anyhow::Result<()> {
-    let dir = tempfile::tempdir()?;
+    let dir = folder()?;
     let site: Site = text::parse(DEMO)?;
     let mut server = Server::start(dir.path()).await?;
     let mut stops = StopServer::start(dir.path()).await?;
@@ -138,7 +138,7 @@ async fn a_stopped_fleet_stands_through_every_kill_until_it_is_reset_and_resumed
     at_work(address, 8, &BTreeSet::new()).await?;
 
     let first = stops.stop(&["--all"])?;
-    until_all_have(address, &robots, &format!("stop:{first}")).await?;
+    until_held(address, &robots.ids(), &format!("stop:{first}")).await?;
     server.kill()?;
     let second = stops.stop(&["--robot", "rbt-01", "--level", "posture"])?;
     stops.kill_and_restart().await?;
@@ -147,7 +147,8 @@ async fn a_stopped_fleet_stands_through_every_kill_until_it_is_reset_and_resumed
     stops.reset(&second)?;
     stops.reset(&first)?;
     server.restart().await?;
-    until_all_have(address, &robots, &format!("resume:{first}")).await?;
+    until_held(address, &robots.ids(), &format!("resume:{first}")).await?;
+    until_held(address, &["rbt-01".to_owned()], &format!("resume:{second}")).await?;
     resume(&server, &first).await?;
     resume(&server, &second).await?;
 
