@@ -17,6 +17,7 @@ const SPAWNS: &[(&str, &str)] = &[
     ("services/midshift/src/scenario.rs", "the binary makes releases for a story"),
     ("services/midshift/src/scenario/watch.rs", "the binary looks at robots while a story is played"),
     ("services/midshift/src/backup/mod.rs", "files are copied and read beside the runtime's threads"),
+    ("services/midshift/src/stop_follower.rs", "files of the stop service are read beside the runtime's threads"),
     ("services/midshift/src/robots.rs", "the binary lets a person walk beside its robot"),
     ("services/store/src/sqlite/mod.rs", "the one writer of a file and its checkpoints"),
     ("services/store/src/sqlite/frames.rs", "the one writer of a file and its checkpoints"),
@@ -30,6 +31,7 @@ const SPAWNS: &[(&str, &str)] = &[
 const EMPTY_WORDS: [&str; 6] = ["Manager", "Helper", "Util", "Common", "Data", "Info"];
 const NAMES_KEPT: &[(&str, &str)] = &[
     ("ConnectInfo", "tonic's name in `Connected`"),
+    ("Data", "http-body's name in `Body`"),
     ("DataFile", "a file of the data directory, beside its lock file"),
 ];
 

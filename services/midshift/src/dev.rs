@@ -104,6 +104,10 @@ pub struct Dev {
     /// Nothing goes wrong by itself. What is bad only with a load makes such faults more frequent, so a story does without that bundle then.
     #[arg(long)]
     pub no_faults: bool,
+    /// Robots dial the stop service of this run, so that `midshift stop` reaches them. They stand until it has told them, and a network that is away for seconds stands
+    /// those among people until somebody resumes them.
+    #[arg(long)]
+    pub stop_lines: bool,
 }
 
 impl Dev {
@@ -183,7 +187,9 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     let live = tasks.clone();
     swarm.person = Some(Arc::new(move |id| tally::look(&live, |t| t.is_live(id))));
     let stops = Stops::start(&args, site.clone(), clock.clone(), address)?;
-    swarm = swarm.with_stop(&format!("http://{}", stops.beside.address()));
+    if args.stop_lines {
+        swarm = swarm.with_stop(&format!("http://{}", stops.beside.address()));
+    }
     let (software, ota) = Throwaway::make(clock.clone()).await?;
     let trust = software.trust(site.site_id().clone())?;
     swarm.software = Some(trust.clone());
@@ -354,6 +360,10 @@ fn greeting(args: &Dev, site: &Site, address: SocketAddr, stops: SocketAddr, sof
         .map_or("data in memory (--data DIR keeps it)".to_owned(), |d| format!("data in {}", d.display()));
     let server = if address.port() == 7420 { String::new() } else { format!(" --server {address}") };
     let stop_server = if stops.port() == stop::PORT { String::new() } else { format!(" --stop-server {stops}") };
+    let try_stop = match args.stop_lines {
+        true => format!("      {program} stop{stop_server} --all --reason drill\n"),
+        false => String::new(),
+    };
     let mut stations =
         site.stations().chain(site.of_kind(midshift_core::site::Kind::Junction)).map(|w| site.name_of(w).to_string());
     let (from, to) = if site.source() == midshift_core::site::Source::Authored && site.site_id().as_str() == "demo" {
@@ -373,7 +383,7 @@ fn greeting(args: &Dev, site: &Site, address: SocketAddr, stops: SocketAddr, sof
          Try:  {program} task submit{server} --from {from} --to {to} --sku SKU-88231 --wait\n\
          \x20     {program} robot ls{server}\n\
          \x20     {program} sim fault{server} rbt-04 --drop-network 20s\n\
-         \x20     {program} stop{stop_server} --all --reason drill\n\
+         {try_stop}\
          \x20     grpcurl -plaintext {address} list\n\
          \x20     {program} bundle samples SAMPLES --config-only --repository {repository} --key {keys}/targets-1.pem\n\
          \x20     {program} bundle push{server} {repository}\n\

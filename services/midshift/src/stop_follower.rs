@@ -8,6 +8,7 @@ use midshift_core::fleet::rows::RobotControl;
 use midshift_core::ids::{RobotId, StopId};
 use midshift_core::robot::Duty;
 use midshift_core::rows::{Log, Revision, Seq, Table};
+use midshift_core::stop::Latch;
 use midshift_core::stop::record::{StopRecord, copy};
 use midshift_stop::Roster;
 use midshift_store::{CommitError, Store, follow};
@@ -58,23 +59,19 @@ impl StopFollower {
     }
 
     async fn follow(&mut self, is_retired_due: bool) -> anyhow::Result<()> {
-        // No stop service was ever started here.
-        if !self.folder.exists() {
-            return Ok(());
-        }
+        let folder = self.folder.clone();
+        let read = tokio::task::spawn_blocking(move || midshift_stop::latch(&folder));
+        let Some((generation, latch)) = read.await.context("reading the latch")?? else { return Ok(()) };
         if is_retired_due {
             self.look_who_is_retired().await?;
         }
         self.look_who_attached().await?;
         self.tell_roster().await?;
-        self.copy().await
+        self.copy(generation, &latch).await
     }
 
     /// Writes what the latch has and the store has not.
-    async fn copy(&mut self) -> anyhow::Result<()> {
-        let folder = self.folder.clone();
-        let read = tokio::task::spawn_blocking(move || midshift_stop::latch(&folder));
-        let (generation, latch) = read.await.context("reading the latch")??;
+    async fn copy(&mut self, generation: u64, latch: &Latch) -> anyhow::Result<()> {
         if self.copied == Some(generation) {
             return Ok(());
         }
@@ -85,7 +82,7 @@ impl StopFollower {
             copied.insert(record.stop.stop_id.clone(), (record, row.revision));
         }
         let mut is_whole = true;
-        for result in self.store.commit(copy(&latch, &copied)).await {
+        for result in self.store.commit(copy(latch, &copied)).await {
             match result {
                 Ok(_) => {}
                 // Another follower was faster: looked at again.

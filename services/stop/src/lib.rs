@@ -313,12 +313,16 @@ pub fn verify(folder: &Path) -> Result<Verified, Broken> {
     audit::verify(folder, &kept.audit)
 }
 
-/// What the stop service in this folder keeps, and a number that rises with each change of it; also while it runs.
+/// What the stop service in this folder keeps, and a number that rises with each change of it; also while it runs. None: none was ever started here.
 ///
 /// # Errors
-/// There is no latch, or none that can be read.
-pub fn latch(folder: &Path) -> Result<(u64, Latch), midshift_latch::Error> {
-    midshift_latch::read::<Kept>(&folder.join(LATCH)).map(|(generation, kept)| (generation, kept.latch))
+/// The latch cannot be read.
+pub fn latch(folder: &Path) -> Result<Option<(u64, Latch)>, midshift_latch::Error> {
+    let path = folder.join(LATCH);
+    if !path.exists() {
+        return Ok(None);
+    }
+    midshift_latch::read::<Kept>(&path).map(|(generation, kept)| Some((generation, kept.latch)))
 }
 
 struct Opened {
