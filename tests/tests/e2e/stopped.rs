@@ -75,7 +75,7 @@ impl StopServer {
 async fn until_held(server: SocketAddr, robots: &[String], token: &str) -> anyhow::Result<()> {
     until(&format!("{token} on {robots:?}"), LIMIT, async || {
         let mut client = FleetServiceClient::new(channel(server)?);
-        for robot_id in robots.to_owned() {
+        for robot_id in robots.iter().cloned() {
             let Ok(answer) = client.get_robot_control(GetRobotControlRequest { robot_id }).await else {
                 return Ok(None);
             };

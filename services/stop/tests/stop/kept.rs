@@ -38,7 +38,7 @@ async fn a_kill_keeps_stops_and_the_names_of_those_that_were_reset() {
     server.kill();
 
     let server = Server::start(&folder.path()).await;
-    assert_eq!(server.engaged().await, [stands.clone()]);
+    assert_eq!(server.engaged().await, std::slice::from_ref(&stands));
     // It was away when its stop was reset, and brings it back.
     let robot = Robot::dial(&server, "r1", vec![was_told]).await.synced().await;
     assert_eq!(robot.effective(), [stands]);
@@ -134,8 +134,8 @@ async fn a_stop_of_another_make_is_shown_and_not_taken_up_and_its_reset_reaches_
     let server = Server::start(&folder.path()).await;
     let mut robot = Robot::dial(&server, "r1", vec![was_told]).await.synced().await;
     assert!(server.engaged().await.is_empty());
-    assert_eq!(server.status().await.robots[0].foreign_stops, [id.clone()]);
-    assert_eq!(robot.effective(), [id.clone()], "the robot goes on obeying");
+    assert_eq!(server.status().await.robots[0].foreign_stops, std::slice::from_ref(&id));
+    assert_eq!(robot.effective(), std::slice::from_ref(&id), "the robot goes on obeying");
     server.reset(&id).await;
     robot.until(|robot| robot.effective().is_empty()).await;
     assert!(server.status().await.robots[0].foreign_stops.is_empty());
@@ -190,7 +190,7 @@ async fn a_repeated_request_engages_one_stop_and_another_body_is_refused() {
     assert_eq!(id_of(&server.engage(spelled_out).await.unwrap()), id);
     let other = v1::EngageRequest { reason: "another".to_owned(), ..request.clone() };
     assert_eq!(code(server.engage(other).await), Code::AlreadyExists);
-    assert_eq!(server.engaged().await, [id.clone()]);
+    assert_eq!(server.engaged().await, std::slice::from_ref(&id));
     server.reset(&id).await;
     // To be shown a stop that nobody obeys any more would be a lie.
     assert_eq!(code(server.engage(request).await), Code::FailedPrecondition);
