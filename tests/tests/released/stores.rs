@@ -32,6 +32,11 @@ const NEW_WORDS: &[(&str, &str)] = &[
         "said only while a fleet stop is engaged: a stop service is started when every process of the site knows of it (CHANGELOG)",
     ),
     ("HOLD_BY_STOP", "the same"),
+    ("fleet_stop", "said only by robots with a line to a stop service: the same"),
+    ("STOPS_FULL", "an answer of the stop service, which writes no row"),
+    ("STOP_WAS_RESET", "the same"),
+    ("LINE_REPLACED", "the same"),
+    ("TOO_MANY_REQUESTS", "an answer of a port, which writes no row"),
 ];
 
 /// The store of a release as a database that this build may open: a folder of `data`, or a database.
