@@ -94,11 +94,6 @@ impl Ladder {
             Stage::Stand => None,
         }
     }
-
-    /// When the newest check-in was sent that was answered.
-    pub const fn fed(&self) -> LinkTime {
-        self.fed
-    }
 }
 
 #[cfg(test)]
@@ -163,7 +158,7 @@ mod tests {
     fn an_answer_to_an_older_check_in_feeds_nothing() {
         let mut ladder = at_ease();
         heard(&mut ladder, 1..3);
-        assert_eq!(ladder.fed(), LinkTime(3_000));
+        assert_eq!(ladder.fed, LinkTime(3_000));
     }
 
     #[test]

@@ -8,6 +8,7 @@ pub mod cli;
 pub mod clock;
 pub mod dev;
 pub mod duration;
+pub mod listen;
 pub mod logs;
 pub mod planning;
 pub mod report;

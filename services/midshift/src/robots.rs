@@ -271,7 +271,7 @@ pub async fn swarm(args: SimRun, stop: CancellationToken) -> anyhow::Result<()> 
         None => drop(robots.await?),
         Some(address) => {
             let listener = TcpListener::bind(address).await.with_context(|| format!("listening on {address}"))?;
-            let incoming = crate::serve::nodelay(listener);
+            let incoming = crate::listen::nodelay(listener);
             let served = tonic::transport::Server::builder()
                 .add_service(face.server())
                 .serve_with_incoming_shutdown(incoming, stop.cancelled_owned());

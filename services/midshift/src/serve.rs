@@ -1,6 +1,7 @@
 //! `midshift serve`: everything persistent, for a real site: in one process on SQLite or PostgreSQL, or some of the services in each of several
 //! processes on one PostgreSQL database.
 
+use crate::listen::nodelay;
 use crate::planning::Planning;
 use crate::roles::{Role, Roles};
 use crate::server::{Naive, Parts, Server};
@@ -18,7 +19,6 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::{TcpListener, UdpSocket};
-use tokio_stream::wrappers::TcpListenerStream;
 use tokio_util::sync::CancellationToken;
 
 /// Robots change gateways in a second or two when they are told to; this is for those that are slow to answer.
@@ -210,12 +210,4 @@ async fn reader(folder: &Path, storage: &Storage, shutdown: &CancellationToken) 
 /// The socket that beacons come to.
 pub async fn hear(address: SocketAddr) -> anyhow::Result<UdpSocket> {
     UdpSocket::bind(address).await.with_context(|| format!("listening for beacons on {address}"))
-}
-
-/// Connections without Nagle's delay: a grant must not wait for an acknowledgement.
-pub fn nodelay(
-    listener: TcpListener,
-) -> impl tokio_stream::Stream<Item = std::io::Result<tokio::net::TcpStream>> + Send + 'static {
-    use tokio_stream::StreamExt;
-    TcpListenerStream::new(listener).map(|stream| stream.and_then(|s| s.set_nodelay(true).map(|()| s)))
 }

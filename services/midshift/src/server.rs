@@ -443,8 +443,8 @@ async fn tell(health: &HealthReporter, names: BTreeSet<&'static str>, mut ready:
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::listen::nodelay;
     use crate::planning::Planning;
-    use crate::serve::nodelay;
     use crate::{clock, site_file};
     use midshift_store::{MemoryFrames, MemoryStore, StoreId};
     use tokio::net::TcpListener;

@@ -81,7 +81,7 @@ async fn serve(
     let metrics = || async { server::metrics_handle().map(|handle| handle.render()).unwrap_or_default() };
     let pages = service.routes().await?.into_axum_router().layer(tonic_web::GrpcWebLayer::new());
     let routes = Routes::from(pages.route("/metrics", get(metrics)));
-    midshift_stop::serve(service, routes, crate::serve::nodelay(listener)).await.context("serving stops")
+    midshift_stop::serve(service, routes, crate::listen::nodelay(listener)).await.context("serving stops")
 }
 
 /// The stop service of `dev`: a thread with a runtime of its own, so that no plan and no simulated robot holds it up.
