@@ -140,7 +140,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 beacon_listen: None,
                 software: Software { ota_keys, ota_quota_gib: 1, ota_spare_gib: 0, ota_keep_days: 7 },
             };
-            midshift::serve::run(serve, stop).await
+            midshift::serve::run(serve, stop, &|_| ()).await
         }
         Role::Unary { answer } => {
             answer_questions(address, stop.clone(), |_| 0)?;

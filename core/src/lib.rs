@@ -7,6 +7,7 @@ pub mod authority;
 pub mod bugs;
 pub mod fleet;
 pub mod gates;
+pub mod identity;
 pub mod ids;
 pub mod lead;
 pub mod limits;

@@ -333,3 +333,30 @@ pub const REQUESTS_PER_SECOND: u32 = 1_000;
 pub const REQUESTS_BURST: u32 = 2_000;
 /// Principals whose rate is remembered; the one heard longest ago is forgotten first, and begins anew.
 pub const RATES_REMEMBERED: usize = 16_384;
+
+// --- identity
+
+/// How long a certificate of a robot is good, link clock. It is renewed at half of it.
+pub const ROBOT_CERTIFICATE_VALID: LinkDuration = LinkDuration::from_secs(7 * 24 * 3_600);
+/// How long a certificate of a server process is good, link clock. It is renewed at half of it.
+pub const SERVER_CERTIFICATE_VALID: LinkDuration = LinkDuration::from_secs(90 * 24 * 3_600);
+/// How long the site's own root is good: it outlives the machines.
+pub const AUTHORITY_VALID: LinkDuration = LinkDuration::from_secs(20 * 365 * 24 * 3_600);
+/// Clocks of robots may be slow by so much when they get their first certificate.
+pub const CERTIFICATE_BACKDATED: LinkDuration = LinkDuration::from_secs(24 * 3_600);
+/// A key that was taken out is denied for as long as a certificate of it may be genuine, and a day for clocks that differ.
+pub const KEY_DENIED_FOR: LinkDuration = LinkDuration::from_secs(8 * 24 * 3_600);
+/// A secret that enrols a robot is good for an hour.
+pub const ENROLMENT_VALID: LinkDuration = LinkDuration::from_secs(3_600);
+/// A token whose time is over may engage stops for so much longer: a forgotten renewal must not take the stop away from a wall panel.
+pub const TOKEN_STOPS_AFTER_EXPIRY: LinkDuration = LinkDuration::from_secs(30 * 24 * 3_600);
+/// Longest life of a token, link clock.
+pub const TOKEN_VALID_MAX: LinkDuration = LinkDuration::from_secs(366 * 24 * 3_600);
+/// Tokens of a site that were not revoked.
+pub const TOKENS_MAX: usize = 10_000;
+/// Grants of one token.
+pub const GRANTS_MAX: usize = 64;
+/// Bytes of a signing request, PEM.
+pub const SIGNING_REQUEST_BYTES: usize = 8 * 1024;
+/// Names and addresses of a server's certificate.
+pub const SERVER_NAMES_MAX: usize = 32;

@@ -23,6 +23,10 @@ pub enum Kind {
     Exhausted,
     /// Not now, nobody's fault; try later.
     Unavailable,
+    /// Nobody knows who asks.
+    Unauthenticated,
+    /// Who asks may not.
+    Denied,
     /// Too late.
     Deadline,
     /// Ours; the text is hidden.
@@ -76,6 +80,20 @@ codes! {
     TooManyRequests = "TOO_MANY_REQUESTS", "One caller has more requests open, or begins more a second, than it may. Wait as long as the answer says, and send many things in one batch or over one stream.";
     DeadlineExceeded = "DEADLINE_EXCEEDED", "The call took longer than its deadline. The outcome is unknown; ask again with the same request_id.";
     Internal = "INTERNAL", "A fault of midshift. The request_id is in the log.";
+    // --- who asks, and what it may
+    SignInNeeded = "SIGN_IN_NEEDED", "Nobody knows who asks. Sign in with `midshift login`, or send the header authorization: Bearer TOKEN.";
+    TokenUnknown = "TOKEN_UNKNOWN", "The token is none of this site, or it was revoked. Ask whoever runs the site for another one.";
+    TokenExpired = "TOKEN_EXPIRED", "The token's time is over. It may still engage stops for 30 days. Ask whoever runs the site for another one.";
+    NotPermitted = "NOT_PERMITTED", "No role that you were given permits this here. `midshift context show` says which you have; whoever runs the site can give more.";
+    NotThisRobot = "NOT_THIS_ROBOT", "A robot speaks for itself alone, by its own certificate. Enrol the machine under the name it uses.";
+    NotYourOwn = "NOT_YOUR_OWN", "Whoever wrote a roll-out does not approve it. Ask somebody else with role ota-approver.";
+    RobotEnrolled = "ROBOT_ENROLLED", "The robot is enrolled with another machine. Replace it, or revoke it first.";
+    EnrolmentUnknown = "ENROLMENT_UNKNOWN", "The secret is none that was handed out last for this robot. Enrol it again and use the new line.";
+    EnrolmentUsed = "ENROLMENT_USED", "The secret was used by another machine. If that was not you, revoke the robot; then enrol it again.";
+    EnrolmentExpired = "ENROLMENT_EXPIRED", "The secret was good for an hour. Enrol the robot again and use the new line.";
+    KeyDenied = "KEY_DENIED", "The key of this machine was revoked or replaced, or is not the robot's. Remove its identity folder and enrol it anew.";
+    TokenNotFound = "TOKEN_NOT_FOUND", "No token has this id. List tokens.";
+    LastAdmin = "LAST_ADMIN", "It is the last token that may administer the site. Make another one first.";
     // --- fleet stop
     StopsFull = "STOPS_FULL", "As many stops are engaged as there may be; the last ones are kept for the whole fleet. Engage the whole fleet, or reset what is over.";
     StopWasReset = "STOP_WAS_RESET", "The stop was reset, so nobody obeys it any more. Engage another one with a new request_id.";

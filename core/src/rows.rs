@@ -23,11 +23,14 @@ pub enum Writer {
     Ota,
     /// What follows the stop service and keeps a copy of its stops.
     Stop,
+    /// Who is who.
+    Identity,
 }
 
 impl Writer {
     /// All writers.
-    pub const ALL: [Writer; 5] = [Writer::Task, Writer::Fleet, Writer::Telemetry, Writer::Ota, Writer::Stop];
+    pub const ALL: [Writer; 6] =
+        [Writer::Task, Writer::Fleet, Writer::Telemetry, Writer::Ota, Writer::Stop, Writer::Identity];
     /// Name in tables and logs.
     pub const fn as_str(self) -> &'static str {
         match self {
@@ -36,6 +39,7 @@ impl Writer {
             Self::Telemetry => "telemetry",
             Self::Ota => "ota",
             Self::Stop => "stop",
+            Self::Identity => "identity",
         }
     }
 }
@@ -96,6 +100,10 @@ tables! {
     OtaCommandKey "ota_command_key" Ota, "request_id -> command about software carried out; kept 7 days.";
     OtaLeader "ota_leader" Ota, "Which process of ota plans and signs; renewed each second where there may be several.";
     StopRecord "stop_record" Stop, "A copy of one fleet stop and of its reset. id = stop_id, order = when it was engaged.";
+    Token "token" Identity, "A token of a person or a program: digest, rights, expiry. id = token_id, order = creation.";
+    RobotIdentity "robot_identity" Identity, "A robot's key, the newest secret that enrols it, keys that were taken out. id = robot_id.";
+    Authority "authority" Identity, "The root certificate of the site. id = site_id.";
+    ServerCertificate "server_certificate" Identity, "What one server process asked to prove itself with, and the answer. id = digest of its key.";
 }
 
 impl Table {
@@ -123,11 +131,14 @@ pub enum Log {
     Ota,
     /// `stop_event`.
     Stop,
+    /// `identity_event`.
+    Identity,
 }
 
 impl Log {
     /// All logs.
-    pub const ALL: [Log; 6] = [Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox, Log::Ota, Log::Stop];
+    pub const ALL: [Log; 7] =
+        [Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox, Log::Ota, Log::Stop, Log::Identity];
     /// Its name in SQL.
     pub const fn name(self) -> &'static str {
         match self {
@@ -137,6 +148,7 @@ impl Log {
             Self::RobotInbox => "robot_inbox",
             Self::Ota => "ota_event",
             Self::Stop => "stop_event",
+            Self::Identity => "identity_event",
         }
     }
     /// The one service that writes it.
@@ -147,6 +159,7 @@ impl Log {
             Self::Telemetry | Self::RobotInbox => Writer::Telemetry,
             Self::Ota => Writer::Ota,
             Self::Stop => Writer::Stop,
+            Self::Identity => Writer::Identity,
         }
     }
     /// The log that row changes of `writer` go to.
@@ -157,6 +170,7 @@ impl Log {
             Writer::Telemetry => Self::Telemetry,
             Writer::Ota => Self::Ota,
             Writer::Stop => Self::Stop,
+            Writer::Identity => Self::Identity,
         }
     }
 }

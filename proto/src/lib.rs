@@ -3,6 +3,7 @@
 //! Invariant: no rule is decided here. Conversions parse into core types, listing every violation, or write core types out; rules live in core.
 //! Called by every service, the agent, the simulator and the CLI.
 
+pub mod access;
 pub mod chunk;
 pub mod convert;
 pub mod json;
@@ -39,6 +40,8 @@ packages! {
     /// `midshift.fleet.v1`: robots as the dispatcher sees them, places, areas, and why.
     #[expect(clippy::allow_attributes, reason = "generated code")]
     fleet "midshift.fleet.v1";
+    /// `midshift.identity.v1`: who is who.
+    identity "midshift.identity.v1";
     /// `midshift.link.v1`: the robot's session.
     #[expect(clippy::allow_attributes, clippy::large_enum_variant, reason = "generated code")]
     link "midshift.link.v1";

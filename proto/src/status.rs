@@ -30,6 +30,8 @@ const fn grpc_code(kind: Kind, code: Code) -> tonic::Code {
         (Kind::Conflict, _) => tonic::Code::Aborted,
         (Kind::Exhausted, _) => tonic::Code::ResourceExhausted,
         (Kind::Unavailable, _) => tonic::Code::Unavailable,
+        (Kind::Unauthenticated, _) => tonic::Code::Unauthenticated,
+        (Kind::Denied, _) => tonic::Code::PermissionDenied,
         (Kind::Deadline, _) => tonic::Code::DeadlineExceeded,
         (Kind::Internal, _) => tonic::Code::Internal,
     }

@@ -1,6 +1,6 @@
 //! The key of the machine that a robot's agent runs on: made at its first start, kept on its ledger, and signing what it says of itself.
 //!
-//! Invariant: the secret never leaves the ledger: it is shown, logged and sent nowhere.
+//! Invariant: the secret never leaves the machine: it is shown, logged and sent nowhere.
 
 use midshift_bundle::installed;
 use midshift_bundle::keys::SecretKey;
@@ -25,6 +25,10 @@ impl DeviceKey {
     /// Its public part, 64 hexadecimal digits.
     pub fn public(&self) -> String {
         self.0.public().hex()
+    }
+    /// The secret as PKCS #8 in PEM, for the handshakes of this machine.
+    pub(crate) fn tls_pem(&self) -> String {
+        self.0.to_pem()
     }
     /// What a robot says of its software, signed.
     pub fn seal(&self, installed: Installed) -> String {

@@ -2,6 +2,7 @@
 //!
 //! Invariant: keep-alive of HTTP/2 is not liveness and is off; the agent itself gives a silent session up. Called by the shell.
 
+use crate::tls::Tls;
 use async_trait::async_trait;
 use hyper_util::rt::TokioIo;
 use std::io;
@@ -12,6 +13,7 @@ use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::TcpStream;
 use tokio::sync::watch;
+use tokio_util::either::Either;
 use tonic::codec::BufferSettings;
 use tonic::transport::{Channel, Endpoint};
 use tonic_prost::{ProstDecoder, ProstEncoder};
@@ -91,10 +93,11 @@ pub struct TcpDial {
     endpoint: Endpoint,
     address: String,
     network: Option<watch::Receiver<bool>>,
+    tls: Option<Tls>,
 }
 
 impl TcpDial {
-    /// To `uri`, `http://host:port`. While `network` says false nothing passes and nothing is dialed.
+    /// To `uri`, `http://host:port` or `https://`. While `network` says false nothing passes and nothing is dialed.
     pub fn new(uri: &str, network: Option<watch::Receiver<bool>>) -> Result<Self, Error> {
         Self::over(endpoint(uri)?, network)
     }
@@ -107,16 +110,22 @@ impl TcpDial {
     fn over(endpoint: Endpoint, network: Option<watch::Receiver<bool>>) -> Result<Self, Error> {
         let authority = endpoint.uri().authority().map(ToString::to_string);
         let address = authority.ok_or_else(|| Error("the address needs a host and a port".into()))?;
-        Ok(Self { endpoint, address, network })
+        Ok(Self { endpoint, address, network, tls: None })
+    }
+
+    /// Over TLS.
+    #[must_use]
+    pub fn with_tls(self, tls: impl Into<Option<Tls>>) -> Self {
+        Self { tls: tls.into(), ..self }
     }
 }
 
 #[async_trait]
 impl Dial for TcpDial {
     async fn dial(&self) -> Result<Channel, Error> {
-        let (address, network) = (self.address.clone(), self.network.clone());
+        let Self { address, network, tls, .. } = self.clone();
         let connect = tower::service_fn(move |_: tonic::transport::Uri| {
-            let (address, network) = (address.clone(), network.clone());
+            let (address, network, tls) = (address.clone(), network.clone(), tls.clone());
             async move {
                 if let Some(network) = &network {
                     let mut network = network.clone();
@@ -124,7 +133,11 @@ impl Dial for TcpDial {
                 }
                 let stream = TcpStream::connect(&address).await?;
                 tune(&stream)?;
-                Ok::<_, io::Error>(TokioIo::new(Cut::new(stream, network)))
+                let stream = Cut::new(stream, network);
+                Ok::<_, io::Error>(TokioIo::new(match tls {
+                    Some(tls) => Either::Right(Box::new(tls.over(stream).await?)),
+                    None => Either::Left(stream),
+                }))
             }
         });
         self.endpoint.connect_with_connector(connect).await.map_err(|e| Error(e.into()))

@@ -168,7 +168,7 @@ async fn serve(data: PathBuf, keys: PathBuf, listen: SocketAddr, stop: Cancellat
         software: Software { ota_keys: Some(keys), ota_quota_gib: 64, ota_spare_gib: 0, ota_keep_days: 7 },
         database: Default::default(),
     };
-    midshift::serve::run(serve, stop).await
+    midshift::serve::run(serve, stop, &|_| ()).await
 }
 
 async fn agent(

@@ -52,6 +52,8 @@ fn page(refusal: &Refusal) -> Response<Body> {
         Kind::Exhausted => StatusCode::TOO_MANY_REQUESTS,
         Kind::Deadline => StatusCode::GATEWAY_TIMEOUT,
         Kind::Invalid => StatusCode::BAD_REQUEST,
+        Kind::Unauthenticated => StatusCode::UNAUTHORIZED,
+        Kind::Denied => StatusCode::FORBIDDEN,
         _ => StatusCode::SERVICE_UNAVAILABLE,
     };
     if refusal.kind() == Kind::Exhausted {

@@ -6,8 +6,7 @@
 use crate::activity::{Activity, Unused};
 use crate::config::{Config, std};
 use crate::peer::{ConnectionId, Denied, Peer, Principals};
-use crate::requests::{Asker, Door, Rules};
-use crate::seats::network;
+use crate::requests::{Door, Rules};
 use http::{Request, Response};
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto;
@@ -140,19 +139,16 @@ where
     {
         // Before asking, so that no change falls in between.
         let mut changed = self.principals.changed();
-        let principal = match self.principals.admit(&peer) {
-            Ok(principal) => principal,
-            Err(denied) => return self.denied(&peer, denied),
-        };
-        let asker = principal.clone().map_or_else(|| Asker::Network(network(peer.address.ip())), Asker::Principal);
+        if let Err(denied) = self.principals.admit(&peer) {
+            return self.denied(&peer, denied);
+        }
         let activity = Activity::new();
         let door = Door {
             services: self.services.clone(),
             rules: self.rules.clone(),
             activity: activity.clone(),
             peer: peer.clone(),
-            principal,
-            asker,
+            principals: self.principals.clone(),
         };
         let mut served = pin!(self.http.serve_connection(TokioIo::new(io), door));
         let reason = tokio::select! {

@@ -5,8 +5,8 @@
 //! connection; `serve` returns within the drain's time of its stop, whatever is open.
 //!
 //! tonic's own server leaves a silent peer connected for ever, spins when there is no descriptor, waits for open streams for ever when it is
-//! stopped, and neither changes its certificate nor cuts a peer off; so connections are accepted, proven and ended here. What is absent:
-//! any knowledge of robots and people ([`Principals`] is asked), and any rule about what a request may do.
+//! stopped, and neither changes its certificate nor cuts a peer off; so connections are accepted, proven and ended here. Who asks is
+//! said by [`Principals`], what each path needs by the .proto files; what is absent is any rule about a single robot, task or area.
 
 mod accept;
 mod activity;
@@ -14,6 +14,7 @@ mod answer;
 mod config;
 mod connection;
 mod deadline;
+mod known;
 mod listen;
 mod peer;
 mod rates;
@@ -22,8 +23,9 @@ mod seats;
 pub mod tls;
 
 pub use config::{Age, Config, Rate};
+pub use known::{Known, robot_of};
 pub use listen::{Incoming, Listen};
-pub use peer::{Anybody, ConnectionId, Denied, Peer, Principal, Principals};
+pub use peer::{Anybody, ConnectionId, Denied, Peer, Principals};
 
 use accept::Accept;
 use config::std;

@@ -3,6 +3,9 @@
 //! Invariant: the edge decides nothing about anybody. It asks [`Principals`] once the handshake has proven a certificate and before a byte
 //! of HTTP is read, and again each time that the answer may have changed. Identity implements it over a cache.
 
+use http::HeaderMap;
+use midshift_core::identity::Caller;
+use midshift_core::reason::Refusal;
 use rustls::pki_types::CertificateDer;
 use std::fmt;
 use std::net::SocketAddr;
@@ -52,10 +55,6 @@ impl Peer {
     }
 }
 
-/// Whom a connection belongs to, for limits: a robot, a person, a program. In the extensions of its requests.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct Principal(pub Arc<str>);
-
 /// Why a connection is refused or cut.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Denied {
@@ -75,18 +74,23 @@ pub enum Denied {
 
 /// Who may be connected.
 pub trait Principals: Send + Sync + 'static {
-    /// Whom this connection belongs to; none: nobody in particular, and its address stands for it in limits. Asked for each connection on
-    /// the runtime's threads: answers from memory.
+    /// Whether this connection may be. Asked for each one, on the runtime's threads: answers from memory.
     ///
     /// # Errors
-    /// If it may not be connected, or no longer.
-    fn admit(&self, peer: &Peer) -> Result<Option<Principal>, Denied>;
+    /// It may not be, or no longer.
+    fn admit(&self, peer: &Peer) -> Result<(), Denied>;
 
     /// Changes whenever an answer of [`Principals::admit`] may have: every live connection is asked about again, and who is denied is cut.
     fn changed(&self) -> watch::Receiver<u64>;
+
+    /// Who asks, by what the connection has proven and by the head of one request. Answers from memory.
+    ///
+    /// # Errors
+    /// It shows something that is worth nothing.
+    fn caller(&self, peer: &Peer, headers: &HeaderMap) -> Result<Caller, Refusal>;
 }
 
-/// Lets everybody in, by address: for `dev`, where there is no login.
+/// Lets everybody in and do everything: for `dev`, where there is no login. Limits count addresses.
 #[derive(Debug)]
 pub struct Anybody(watch::Sender<u64>);
 
@@ -97,10 +101,13 @@ impl Default for Anybody {
 }
 
 impl Principals for Anybody {
-    fn admit(&self, _: &Peer) -> Result<Option<Principal>, Denied> {
-        Ok(None)
+    fn admit(&self, _: &Peer) -> Result<(), Denied> {
+        Ok(())
     }
     fn changed(&self) -> watch::Receiver<u64> {
         self.0.subscribe()
+    }
+    fn caller(&self, _: &Peer, _: &HeaderMap) -> Result<Caller, Refusal> {
+        Ok(Caller::local())
     }
 }

@@ -1,18 +1,22 @@
-//! What each request passes before its service sees it: how many and how fast its principal may ask, and until when it is answered.
+//! What each request passes before its service sees it: who asks, how many and how fast it may ask, whether it may ask for that at all, and until when it is
+//! answered.
 //!
-//! Invariant: a request is refused by its head alone; not a byte of its body was decoded. A service is told who asks ([`Peer`]).
+//! Invariant: a request is refused by its head alone; not a byte of its body was decoded. A service is told who asks ([`Caller`], [`Peer`]).
 
 use crate::activity::{Activity, OpenStream};
 use crate::answer::Speech;
 use crate::config::{Config, std};
 use crate::deadline::{self, Bounded};
-use crate::peer::{Peer, Principal};
+use crate::peer::{Peer, Principals};
 use crate::rates::Rates;
-use crate::seats::{Full, Seat, Seats};
+use crate::seats::{Full, Seat, Seats, network};
 use http::{HeaderMap, Request, Response};
 use hyper::body::Incoming;
 use hyper::service::Service as HyperService;
+use midshift_core::identity::{Caller, TokenId, Who};
+use midshift_core::ids::RobotId;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
+use midshift_proto::access;
 use std::convert::Infallible;
 use std::net::IpAddr;
 use std::pin::Pin;
@@ -25,10 +29,23 @@ use tower::{Service, ServiceExt};
 /// Whom a request counts for.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub(crate) enum Asker {
-    /// Who was admitted by name.
-    Principal(Principal),
+    /// A robot.
+    Robot(RobotId),
+    /// The holder of a token.
+    Token(TokenId),
     /// Everybody else of one address.
     Network(IpAddr),
+}
+
+impl Asker {
+    /// Whoever shows something worthless counts for its address.
+    fn of(caller: Result<&Caller, &Refusal>, peer: &Peer) -> Self {
+        match caller.map(Caller::who) {
+            Ok(Who::Robot(robot_id)) => Self::Robot(robot_id.clone()),
+            Ok(Who::Holder { token, .. }) => Self::Token(token.clone()),
+            Ok(Who::Local | Who::Nobody) | Err(_) => Self::Network(network(peer.address.ip())),
+        }
+    }
 }
 
 /// What all requests of a port share.
@@ -81,8 +98,24 @@ pub(crate) struct Door<S> {
     pub rules: Arc<Rules>,
     pub activity: Activity,
     pub peer: Peer,
-    pub principal: Option<Principal>,
-    pub asker: Asker,
+    pub principals: Arc<dyn Principals>,
+}
+
+impl<S> Door<S> {
+    /// Who asks, and what it holds for that; or why it goes no further.
+    fn admit(&self, request: &Request<Incoming>, speech: &Speech, now: Instant) -> Result<(Caller, Admitted), Refusal> {
+        let (path, headers) = (request.uri().path(), request.headers());
+        let caller = self.principals.caller(&self.peer, headers);
+        // Before anything else is said: guessing is limited too.
+        let admitted = self.rules.admit(&Asker::of(caller.as_ref(), &self.peer), headers, speech, now)?;
+        let caller = caller?;
+        access::check(&caller, path).inspect_err(|refusal| {
+            if refusal.kind() == Kind::Denied {
+                tracing::info!(port = self.rules.port, actor = %caller, path, "a request was denied");
+            }
+        })?;
+        Ok((caller, admitted))
+    }
 }
 
 impl<S> HyperService<Request<Incoming>> for Door<S>
@@ -97,8 +130,7 @@ where
     fn call(&self, mut request: Request<Incoming>) -> Self::Future {
         let (stream, now) = (self.activity.begin(), Instant::now());
         let speech = Speech::of(request.headers());
-        let admitted = self.rules.admit(&self.asker, request.headers(), &speech, now);
-        let Admitted { seat, deadline } = match admitted {
+        let (caller, Admitted { seat, deadline }) = match self.admit(&request, &speech, now) {
             Ok(admitted) => admitted,
             Err(refusal) => {
                 let (port, reason) = (self.rules.port, refusal.reason.code.as_str());
@@ -109,9 +141,7 @@ where
             }
         };
         request.extensions_mut().insert(self.peer.clone());
-        if let Some(principal) = &self.principal {
-            request.extensions_mut().insert(principal.clone());
-        }
+        request.extensions_mut().insert(caller);
         let head = deadline.map_or(now + self.rules.head, |deadline| deadline.min(now + self.rules.head));
         let answer = self.services.clone().oneshot(request.map(Body::new));
         Box::pin(async move {

@@ -1,3 +1,306 @@
 //! Who is who: the certificate authority of a site, enrolment of robots, tokens of people and programs, and the audit.
 //!
-//! Invariant: no secret leaves this crate but once, in the answer to whoever it was made for; what is stored of it is a digest.
+//! Invariant: no secret leaves this crate but once, in the answer to whoever it was made for; what is stored of it is a digest. One process of a site has the
+//! authority's key and answers for it; each process has this crate's picture of who is known, and a key of its own.
+
+mod authority;
+mod encode;
+mod files;
+mod grpc;
+mod proof;
+mod register;
+mod tokens;
+
+pub use authority::PUBLIC_FILE;
+pub use proof::ServerProof;
+
+use authority::{Authority, asked};
+use midshift_core::identity::{Authority as AuthorityRow, Directory, Secret, ServerCertificate};
+use midshift_core::ids::SiteId;
+use midshift_core::limits;
+use midshift_core::reason::Refusal;
+use midshift_core::time::{Clock, Utc};
+use midshift_proto::identity::v1::enrolment_service_server::EnrolmentServiceServer;
+use midshift_proto::identity::v1::identity_service_server::IdentityServiceServer;
+use midshift_store::Store;
+use proof::OwnKey;
+use register::{Register, written};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+
+/// Rows are looked at so often although nobody woke us, link clock: time alone changes who is known.
+const LOOK_EVERY: Duration = Duration::from_secs(1);
+/// A process waits so long at its start for whoever has the authority.
+const ANSWERED_WITHIN: Duration = Duration::from_secs(120);
+
+/// Why identity cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A file or folder.
+    #[error("{path}: {source}", path = path.display())]
+    Folder {
+        /// Which.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// A folder with keys that others may look into.
+    #[error("{path} has keys and is open to others (mode {mode:03o}): chmod 700 it, after asking who may have read it", path = path.display())]
+    Open {
+        /// Which.
+        path: PathBuf,
+        /// Its mode.
+        mode: u32,
+    },
+    /// A key or certificate on disk.
+    #[error("{path} is no key and certificate of this build: {source}", path = path.display())]
+    Unreadable {
+        /// Which.
+        path: PathBuf,
+        /// Why.
+        source: rcgen::Error,
+    },
+    /// A name that the server is to be called.
+    #[error("a name of the server is none: {source}")]
+    Names {
+        /// Why.
+        source: rcgen::Error,
+    },
+    /// A key or signature could not be made.
+    #[error("making a key or a certificate: {0}")]
+    Signing(#[source] rcgen::Error),
+    /// The store has a root and the folder has none, or another one.
+    #[error("the store knows another root certificate of this site than {path} has: bring that folder back from a backup; robots and people trust the root in the store", path = path.display())]
+    OtherAuthority {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// Nobody answered.
+    #[error("no process with role identity signed this server's certificate within {} s: start one on the same store", ANSWERED_WITHIN.as_secs())]
+    NotAnswered,
+    /// The store.
+    #[error("reading who is known: {0}")]
+    Store(#[source] midshift_store::Error),
+    /// A decision was refused.
+    #[error(transparent)]
+    Refused(#[from] Refusal),
+}
+
+/// What identity is made of.
+pub struct Parts {
+    /// Where its keys are, for its owner alone; made if it is not there.
+    pub folder: PathBuf,
+    /// The rows.
+    pub store: Arc<dyn Store>,
+    /// Clocks.
+    pub clock: Arc<dyn Clock>,
+    /// Whether this process has the site's authority.
+    pub duty: Duty,
+    /// Host names and addresses of this process, beside those every server has.
+    pub names: Vec<String>,
+    /// What enrolled robots are told to trust for software, JSON; empty: nothing.
+    pub trust_json: String,
+}
+
+/// What a process does for others.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Duty {
+    /// It has the authority's key, signs, and serves identity.
+    Authority,
+    /// It asks.
+    Member,
+}
+
+/// Names that every server of a site answers to: clients that pin the root ask for the first.
+pub const NAMES: [&str; 4] = ["midshift", "localhost", "127.0.0.1", "::1"];
+
+struct Inner {
+    site_id: SiteId,
+    clock: Arc<dyn Clock>,
+    store: Arc<dyn Store>,
+    register: Register,
+    authority: Option<Authority>,
+    own: OwnKey,
+    proof: watch::Sender<ServerProof>,
+    trust_json: String,
+}
+
+/// Identity of one process. Clones are the same.
+#[derive(Clone)]
+pub struct IdentityService(Arc<Inner>);
+
+impl IdentityService {
+    /// Opens it; when this answers, the process has a certificate.
+    ///
+    /// # Errors
+    /// Files, the store, or nobody who signs.
+    pub async fn open(parts: Parts, shutdown: &CancellationToken) -> Result<Self, Error> {
+        let Parts { folder, store, clock, duty, names, trust_json } = parts;
+        files::make_folder(&folder)?;
+        let site_id = store.site_id().clone();
+        let register = Register::new(store.clone(), clock.clone());
+        let authority = match duty {
+            Duty::Authority => Some(own_authority(&folder, &site_id, &register, clock.now().wall).await?),
+            Duty::Member => None,
+        };
+        let mut all: Vec<String> = NAMES.map(str::to_owned).into();
+        all.extend(names.into_iter().filter(|name| !NAMES.contains(&name.as_str())));
+        all.truncate(limits::SERVER_NAMES_MAX);
+        let own = OwnKey::open(&folder, all)?;
+        own.ask(&register, clock.now().wall).await?;
+        if let Some(authority) = &authority {
+            answer(authority, &register, clock.now().wall).await?;
+        }
+        let proof = waited_for(&own, &register, &*store, shutdown).await?;
+        files::write(&folder, PUBLIC_FILE, &proof.authority_pem, files::PUBLIC)?;
+        let proof = watch::Sender::new(proof);
+        Ok(Self(Arc::new(Inner { site_id, clock, store, register, authority, own, proof, trust_json })))
+    }
+
+    /// Keeps up with the rows, signs what servers ask for, and renews its own certificate, until `shutdown`.
+    pub async fn run(&self, shutdown: CancellationToken) {
+        let (mut wake, mut tick) = (self.0.store.wake(), tokio::time::interval(LOOK_EVERY));
+        let mut failing = false;
+        loop {
+            tokio::select! {
+                () = shutdown.cancelled() => return,
+                _ = tick.tick() => {}
+                changed = wake.changed() => if changed.is_err() { return },
+            }
+            let kept = self.keep_up().await;
+            if let (Err(error), false) = (&kept, failing) {
+                tracing::warn!(%error, "identity does not keep up with its rows");
+            }
+            failing = kept.is_err();
+            metrics::gauge!("midshift_identity_failing").set(f64::from(u8::from(failing)));
+        }
+    }
+
+    async fn keep_up(&self) -> Result<(), Error> {
+        let inner = &*self.0;
+        let now = inner.clock.now().wall;
+        inner.register.refresh().await.map_err(Error::Store)?;
+        inner.own.ask(&inner.register, now).await?;
+        if let Some(authority) = &inner.authority {
+            answer(authority, &inner.register, now).await?;
+        }
+        if let Some(proof) = inner.own.proof(&inner.register).await? {
+            inner.proof.send_if_modified(|known| {
+                let differs = *known != proof;
+                *known = proof;
+                differs
+            });
+        }
+        Ok(())
+    }
+
+    /// What ports may know of people, programs and robots.
+    pub fn directory(&self) -> watch::Receiver<Arc<Directory>> {
+        self.0.register.directory()
+    }
+    /// What this process proves itself with.
+    pub fn proof(&self) -> watch::Receiver<ServerProof> {
+        self.0.proof.subscribe()
+    }
+    /// Rights and robots, of a process with the authority.
+    pub fn identity(&self) -> IdentityServiceServer<Self> {
+        IdentityServiceServer::new(self.clone())
+    }
+    /// Enrolment, of a process with the authority.
+    pub fn enrolment(&self) -> EnrolmentServiceServer<Self> {
+        EnrolmentServiceServer::new(self.clone())
+    }
+
+    /// The first token of a site that has none: may do everything. None if there is one.
+    ///
+    /// # Errors
+    /// The store does not answer.
+    pub async fn first_token(&self) -> Result<Option<String>, Error> {
+        Ok(tokens::first(&self.0.register, self.0.clock.now().wall).await?.map(|secret| secret.reveal(Secret::TOKEN)))
+    }
+
+    /// Another such token, for whoever has lost the first one and has the machine.
+    ///
+    /// # Errors
+    /// The store does not answer.
+    pub async fn spare_token(&self) -> Result<String, Error> {
+        Ok(tokens::spare(&self.0.register, self.0.clock.now().wall).await?.reveal(Secret::TOKEN))
+    }
+}
+
+/// The authority in the folder: the one the rows know, or a first one.
+async fn own_authority(folder: &Path, site_id: &SiteId, register: &Register, now: Utc) -> Result<Authority, Error> {
+    let known = register.look(|view| view.authority.as_ref().map(|(row, _)| row.certificate_pem.clone()));
+    let (known, found) = (known.await.map_err(Error::Store)?, Authority::load(folder, site_id)?);
+    let other = || Error::OtherAuthority { path: folder.to_owned() };
+    let authority = match (known, found) {
+        (Some(known), Some(found)) if found.certificate_pem() == known => return Ok(found),
+        (Some(_), _) => return Err(other()),
+        (None, Some(found)) => found,
+        (None, None) => Authority::make(folder, site_id, now)?,
+    };
+    let row = AuthorityRow { site_id: site_id.clone(), certificate_pem: authority.certificate_pem().to_owned() };
+    let told = register.decide(|view| match &view.authority {
+        None => Ok((Some(written(&row, None, "midshift", "authority.made")), true)),
+        Some((known, _)) => Ok((None, known.certificate_pem == row.certificate_pem)),
+    });
+    if told.await? { Ok(authority) } else { Err(other()) }
+}
+
+/// Signs what servers asked for.
+async fn answer(authority: &Authority, register: &Register, now: Utc) -> Result<(), Error> {
+    let open = |row: &&ServerCertificate| row.chain_pem.is_none();
+    let waiting =
+        register.look(|view| view.servers.values().map(|(row, _)| row).filter(open).cloned().collect::<Vec<_>>());
+    for row in waiting.await.map_err(Error::Store)? {
+        let signed = match asked(&row.request_pem) {
+            Ok(asked) => authority.sign_server(asked, &row.names, now),
+            Err(refusal) => Err(refusal.into()),
+        };
+        let signed = match signed {
+            Ok(signed) => signed,
+            Err(error) => {
+                tracing::warn!(%error, key = %row.key, "a server asked for a certificate that cannot be signed");
+                continue;
+            }
+        };
+        let answered =
+            ServerCertificate { chain_pem: Some(signed.chain_pem), expires_unix_ms: signed.expires.0, ..row.clone() };
+        register
+            .decide(|view| match view.servers.get(&row.key.to_string()) {
+                Some((known, at)) if *known == row => {
+                    Ok((Some(written(&answered, Some(*at), "midshift", "server.certified")), ()))
+                }
+                _ => Ok((None, ())),
+            })
+            .await?;
+    }
+    Ok(())
+}
+
+async fn waited_for(
+    own: &OwnKey,
+    register: &Register,
+    store: &dyn Store,
+    shutdown: &CancellationToken,
+) -> Result<ServerProof, Error> {
+    let mut wake = store.wake();
+    let answered = async {
+        loop {
+            if let Some(proof) = own.proof(register).await? {
+                return Ok(proof);
+            }
+            let woken = tokio::time::timeout(LOOK_EVERY, wake.changed()).await;
+            if matches!(woken, Ok(Err(_))) {
+                return Err(Error::NotAnswered);
+            }
+        }
+    };
+    tokio::select! {
+        () = shutdown.cancelled() => Err(Error::NotAnswered),
+        answered = tokio::time::timeout(ANSWERED_WITHIN, answered) => answered.unwrap_or(Err(Error::NotAnswered)),
+    }
+}

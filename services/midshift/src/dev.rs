@@ -10,7 +10,7 @@ use crate::stop::{self, Beside};
 use crate::tally::{self, SharedTasks, Tasks};
 use crate::throwaway::Throwaway;
 use crate::under_way::{self, UnderWay};
-use crate::{clock, listen, serve, site_file};
+use crate::{clock, door, serve, site_file};
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 use midshift_agent::trust::Trust;
@@ -210,6 +210,8 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         sim: Some(SimFace::new(hall.clone(), clock.clone(), swarm.crash())),
         naive: Naive::default(),
         stops: Some(stops.folder.clone()),
+        identity: None,
+        port: door::alone("business"),
         planning: planning.handle(),
     };
     // The server ends after its robots and its client, or the last of them would be cut off at Ctrl-C.
@@ -492,7 +494,7 @@ impl Run {
         let swarm = swarm.run(robots_stop.clone());
         let channel = tonic::transport::Endpoint::from_shared(format!("http://{address}"))?.connect_lazy();
         let mut parts = UnderWay {
-            serving: tokio::spawn(server.serve(listen::nodelay(listener))),
+            serving: tokio::spawn(server.serve(listener)),
             following: tokio::spawn(async { Ok(following.await?) }),
             robots: tokio::spawn(async { Ok(swarm.await.map(drop)?) }),
             working: tokio::spawn(self.work(background, channel, work_stop.clone(), stand)),

@@ -7,6 +7,7 @@ pub mod backup;
 pub mod cli;
 pub mod clock;
 pub mod dev;
+pub mod door;
 pub mod duration;
 pub mod listen;
 pub mod logs;

@@ -14,14 +14,16 @@ pub enum Role {
     Telemetry,
     /// Releases and roll-outs.
     Ota,
+    /// The site's authority: who is who. One process of a site.
+    Identity,
 }
 
 impl Role {
     /// All of them.
-    pub const ALL: [Self; 4] = [Self::Task, Self::Fleet, Self::Telemetry, Self::Ota];
+    pub const ALL: [Self; 5] = [Self::Task, Self::Fleet, Self::Telemetry, Self::Ota, Self::Identity];
 
     /// gRPC services of this role, as health names them.
-    const fn services(self) -> &'static [&'static str] {
+    pub const fn services(self) -> &'static [&'static str] {
         match self {
             Self::Task => &["midshift.task.v1.TaskService"],
             Self::Fleet => &["midshift.fleet.v1.FleetService"],
@@ -34,6 +36,7 @@ impl Role {
             Self::Ota => {
                 &["midshift.ota.v1.BundleService", "midshift.ota.v1.ChunkService", "midshift.ota.v1.RolloutService"]
             }
+            Self::Identity => &["midshift.identity.v1.IdentityService", "midshift.identity.v1.EnrolmentService"],
         }
     }
 }

@@ -1,25 +1,33 @@
 //! `midshift serve`: everything persistent, for a real site: in one process on SQLite or PostgreSQL, or some of the services in each of several
 //! processes on one PostgreSQL database.
 
-use crate::listen::nodelay;
+use crate::dev::Say;
+use crate::door::{self, Share};
 use crate::planning::Planning;
 use crate::roles::{Role, Roles};
 use crate::server::{Naive, Parts, Server};
 use crate::storage::{Database, Storage};
-use crate::{clock, site_file};
+use crate::{clock, site_file, stop, stop_follower};
 use anyhow::{Context, bail};
+use midshift_agent::tls;
 use midshift_core::limits;
 use midshift_core::time::Clock;
+use midshift_identity::{Duty, IdentityService};
 use midshift_ota::content::Room;
 use midshift_ota::folder::Owner;
 use midshift_ota::rollouts::known_bundles;
 use midshift_ota::{OtaReader, OtaService};
+use std::io::Write;
 use std::net::SocketAddr;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::{TcpListener, UdpSocket};
 use tokio_util::sync::CancellationToken;
+
+/// The folder of keys and certificates below the data folder.
+pub const IDENTITY: &str = "identity";
 
 /// Robots change gateways in a second or two when they are told to; this is for those that are slow to answer.
 const DRAIN_DEFAULT_S: u64 = 20;
@@ -48,12 +56,25 @@ pub struct Serve {
     /// with --roles, else 0.
     #[arg(long, value_name = "S", value_parser = clap::value_parser!(u64).range(0..=600))]
     pub drain_seconds: Option<u64>,
-    /// Address to listen on. Anything but loopback needs --insecure.
+    /// Address to listen on.
     #[arg(long, default_value = "127.0.0.1:7420")]
     pub listen: SocketAddr,
-    /// There is no login and no TLS yet: say that you know, and listen off loopback all the same.
+    /// No TLS and no login: whoever reaches the port may move robots.
     #[arg(long)]
     pub insecure: bool,
+    /// Host name or address under which clients that are not ours reach this server, for its certificate; more than one may be given. midshift, localhost, the
+    /// loopback addresses and that of --listen are always in it.
+    #[arg(long = "name", value_name = "NAME", conflicts_with = "insecure")]
+    pub names: Vec<String>,
+    /// Where the first token of a new site goes, a new file for its owner alone. Without it standard output.
+    #[arg(long, value_name = "FILE", conflicts_with = "insecure")]
+    pub first_token_file: Option<PathBuf>,
+    /// Make one more token that may do everything, for whoever has lost the first one.
+    #[arg(long, conflicts_with = "insecure")]
+    pub spare_token: bool,
+    /// What one peer may take.
+    #[command(flatten)]
+    pub share: Share,
     /// UDP address to hear launchers of robots on whose agent does not run, e.g. 0.0.0.0:7422. What is heard is a hint that anybody in the
     /// network can send: it is shown and decides nothing. Without it nobody listens.
     #[arg(long, value_name = "ADDR")]
@@ -67,6 +88,9 @@ pub struct Serve {
     /// Where software of robots comes from.
     #[command(flatten)]
     pub software: Software,
+    /// What enrolled robots are told to trust as software: the trust file of a robot of the site.
+    #[arg(long, value_name = "FILE", conflicts_with = "insecure")]
+    pub trust: Option<PathBuf>,
     /// Of a gateway without role ota: hand out no software. Without it the folder ota of --data must be the volume that the processes with
     /// role ota keep, and this process waits a minute for it.
     #[arg(long, env = "MIDSHIFT_NO_SOFTWARE")]
@@ -104,13 +128,10 @@ impl Software {
     }
 }
 
-/// Runs until `shutdown`.
-pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()> {
-    if !args.listen.ip().is_loopback() && !args.insecure {
-        bail!(
-            "{} is not loopback and midshift has no login yet: whoever reaches it can move robots. Add --insecure if you mean it",
-            args.listen
-        );
+/// Runs until `shutdown`. The first token of a site is said, and nothing else.
+pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow::Result<()> {
+    if args.insecure {
+        tracing::warn!(address = %args.listen, "no TLS and no login: whoever reaches this port may move robots");
     }
     let roles = Roles::of(&args.roles);
     if roles.are_split() && args.database.store.is_none() {
@@ -127,6 +148,10 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
     let site_id = loaded.site.site_id().clone();
     let storage = args.database.open(&args.data, site_id, clock.clone()).await?;
     let folder = args.data.join("ota");
+    let identity = match args.insecure {
+        true => None,
+        false => Some(identity(&args, &roles, &storage, &clock, &shutdown).await?),
+    };
     let ota = match roles.has(Role::Ota) {
         true => args.software.open(folder.clone(), owner(&storage).await?, clock.clone()).await?,
         false => OtaService::without_keys(),
@@ -143,14 +168,24 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
         None => None,
     };
     let has_stop = !args.no_stop && !roles.are_split();
+    let beside = stop::Started {
+        site: args.site.clone(),
+        data: args.data.clone(),
+        listen: args.stop_listen,
+        authority_pem: identity.as_ref().map(|identity| identity.proof().borrow().authority_pem.clone()),
+    };
     if has_stop {
-        crate::stop::start(args.site.as_deref(), &args.data, args.stop_listen, args.insecure).await?;
+        if let Some(identity) = &identity {
+            stop_follower::tell_principals(&args.data.join(stop::FOLDER), identity)
+                .context("telling the stop service who is known")?;
+        }
+        beside.start().await?;
     }
     tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), store = storage.engine(), %roles, "midshift serves");
     let planning = Planning::start()?;
     let fleet_follows = roles.has(Role::Fleet);
     let parts = Parts {
-        roles,
+        roles: roles.clone(),
         drain,
         store: storage.store(),
         frames: storage.frames(),
@@ -162,22 +197,91 @@ pub async fn run(args: Serve, shutdown: CancellationToken) -> anyhow::Result<()>
         reader,
         sim: None,
         naive: Naive::default(),
-        stops: fleet_follows.then(|| args.data.join(crate::stop::FOLDER)),
+        stops: fleet_follows.then(|| args.data.join(stop::FOLDER)),
+        port: match identity {
+            Some(_) => args.share.config("business"),
+            None => door::alone("business"),
+        },
+        identity: identity.clone(),
         planning: planning.handle(),
     };
+    if let Some(identity) = &identity {
+        greet(&args, &roles, identity, listener.local_addr()?, say).await?;
+    }
     let server = Server::new(parts, shutdown).await?.hearing(beacons);
     let kept = async {
         match has_stop {
-            true => crate::stop::keep(args.site.as_deref(), &args.data, args.stop_listen, args.insecure).await,
+            true => beside.keep().await,
             false => std::future::pending().await,
         }
     };
     let served = tokio::select! {
-        served = server.serve(nodelay(listener)) => served,
+        served = server.serve(listener) => served,
         () = kept => Ok(()),
     };
     storage.close().await;
     served
+}
+
+/// Who is who, with the site's authority if this process has the role, and with the certificate of this process.
+async fn identity(
+    args: &Serve,
+    roles: &Roles,
+    storage: &Storage,
+    clock: &Arc<dyn Clock>,
+    shutdown: &CancellationToken,
+) -> anyhow::Result<IdentityService> {
+    let mut names = args.names.clone();
+    if !args.listen.ip().is_unspecified() {
+        names.push(args.listen.ip().to_string());
+    }
+    let parts = midshift_identity::Parts {
+        folder: args.data.join(IDENTITY),
+        store: storage.store(),
+        clock: clock.clone(),
+        duty: if roles.has(Role::Identity) { Duty::Authority } else { Duty::Member },
+        names,
+        trust_json: match &args.trust {
+            Some(file) => std::fs::read_to_string(file).with_context(|| format!("reading {}", file.display()))?,
+            None => String::new(),
+        },
+    };
+    IdentityService::open(parts, shutdown).await.context("opening identity")
+}
+
+/// Hands out the first token of a new site, once.
+async fn greet(
+    args: &Serve,
+    roles: &Roles,
+    identity: &IdentityService,
+    address: SocketAddr,
+    say: Say<'_>,
+) -> anyhow::Result<()> {
+    if !roles.has(Role::Identity) {
+        return Ok(());
+    }
+    let token = match identity.first_token().await? {
+        Some(token) => token,
+        None if args.spare_token => identity.spare_token().await?,
+        None => return Ok(()),
+    };
+    if let Some(file) = &args.first_token_file {
+        let mut new =
+            std::fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(file).with_context(|| {
+                format!("writing the token to {}; it is lost: start again with --spare-token", file.display())
+            })?;
+        return writeln!(new, "{token}").with_context(|| format!("writing {}", file.display()));
+    }
+    let pin = tls::pin_of(&identity.proof().borrow().authority_pem)?;
+    let authority = args.data.join(IDENTITY).join(midshift_identity::PUBLIC_FILE);
+    say(&format!(
+        "A token that may do everything on this site, for a year. It is shown once:\n\n  {token}\n\n\
+         Sign in:  midshift login {address} --pin {pin}\n\
+         Or:       grpcurl -cacert {} -H \"authorization: Bearer $MIDSHIFT_TOKEN\" {address} midshift.identity.v1.IdentityService/WhoAmI\n\
+         Narrower tokens for everybody else: midshift token create --help",
+        authority.display()
+    ));
+    Ok(())
 }
 
 /// Whose the folder of releases is.

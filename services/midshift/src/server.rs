@@ -5,6 +5,7 @@
 //! whole server with it: none is served without the others. A gateway among several first says that it is not ready and lets its robots
 //! move over.
 
+use crate::door::{self, Login};
 use crate::roles::{Role, Roles};
 use crate::stop_follower::StopFollower;
 use crate::upkeep;
@@ -16,7 +17,9 @@ use midshift_core::limits;
 use midshift_core::site::Site;
 use midshift_core::time::Clock;
 use midshift_core::work::Live;
+use midshift_edge::Listen;
 use midshift_fleet::{FleetService, Reconciler};
+use midshift_identity::IdentityService;
 use midshift_ota::rollouts::{Planner, RolloutService};
 use midshift_ota::{OtaReader, OtaService};
 use midshift_proto::sim::v1::sim_service_server::SimServiceServer;
@@ -28,20 +31,14 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
-use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::UdpSocket;
 use tokio::sync::watch;
-use tokio_stream::Stream;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
 use tonic::service::Routes;
-use tonic::transport::Server as Transport;
-use tonic::transport::server::Connected;
 use tonic_health::ServingStatus;
 use tonic_health::server::HealthReporter;
 
-/// Pings of the server on a quiet connection, and how long it waits for their answer.
-const KEEPALIVE: (Duration, Duration) = (Duration::from_secs(20), Duration::from_secs(10));
 /// Naive rules of the services, for twins of tests. None by default.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Naive {
@@ -81,6 +78,10 @@ pub struct Parts {
     pub naive: Naive,
     /// Where the stop service beside this process keeps its files, if there is one.
     pub stops: Option<PathBuf>,
+    /// Who is who, with TLS; none: no login, plain text.
+    pub identity: Option<IdentityService>,
+    /// Limits of the port.
+    pub port: midshift_edge::Config,
     /// Where fleet plans; see [`crate::planning`].
     pub planning: tokio::runtime::Handle,
 }
@@ -206,6 +207,10 @@ impl Server {
                 .add_service(self.parts.ota.bundles())
                 .add_service(rollouts.grpc().max_decoding_message_size(control));
         }
+        if let Some(identity) = self.parts.identity.as_ref().filter(|_| self.parts.roles.has(Role::Identity)) {
+            routes.add_service(identity.identity().max_decoding_message_size(control));
+            routes.add_service(identity.enrolment().max_decoding_message_size(control));
+        }
         let has_bytes = self.telemetry.is_some() || self.rollouts.is_some();
         match &self.parts.reader {
             Some(reader) => drop(routes.add_service(reader.chunks()).add_service(reader.bundles())),
@@ -241,26 +246,23 @@ impl Server {
     ///
     /// # Errors
     /// If a service ends before shutdown; everything else has been shut down then.
-    pub async fn serve<I, IO, E>(self, incoming: I) -> anyhow::Result<()>
-    where
-        I: Stream<Item = Result<IO, E>> + Send + 'static,
-        IO: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
-        E: Into<Box<dyn std::error::Error + Send + Sync>>,
-    {
+    pub async fn serve(self, listener: impl Listen) -> anyhow::Result<()> {
         let (routes, health) = self.routes().await?;
         let (stop, shutdown) = (self.stop.clone(), self.shutdown.clone());
         // However this ends, also in a panic: nobody goes on without it.
         let _end = (stop.clone().drop_guard(), shutdown.clone().drop_guard());
-        let stopped = shutdown.clone();
-        let transport = Transport::builder()
-            .accept_http1(true)
-            .http2_keepalive_interval(Some(KEEPALIVE.0))
-            .http2_keepalive_timeout(Some(KEEPALIVE.1))
-            .max_concurrent_streams(limits::STREAMS_PER_CONNECTION)
-            .timeout(Duration::from_millis(limits::UNARY_DEADLINE.as_ms()))
-            .add_routes(routes)
-            .serve_with_incoming_shutdown(incoming, async move { stopped.cancelled().await });
-        let readiness = tell(&health, self.parts.roles.services(), self.ready.subscribe());
+        let login = self.parts.identity.as_ref().map(|identity| Login {
+            site_id: self.parts.site.site_id().clone(),
+            clock: self.parts.clock.clone(),
+            directory: identity.directory(),
+            proof: identity.proof(),
+        });
+        let transport = door::serve(self.parts.port.clone(), login, routes, listener, shutdown.clone());
+        let mut names = self.parts.roles.services();
+        if self.parts.identity.is_none() {
+            names.retain(|name| !Role::Identity.services().contains(name));
+        }
+        let readiness = tell(&health, names, self.ready.subscribe());
         let ending = end(stop.clone(), shutdown.clone(), self.parts.drain, self.telemetry.clone(), self.ready.clone());
         let following = follow(&self.parts, self.board.clone());
         let keeper = upkeep::run(&self.parts, self.task.clone());
@@ -360,7 +362,17 @@ impl Running<'_> {
             }
             Ok(())
         };
-        let stops = self.parts.stops.clone().map(|folder| StopFollower::new(folder, self.parts.store.clone()));
+        let identity = async {
+            if let Some(identity) = &self.parts.identity {
+                identity.run(shutdown.clone()).await;
+            }
+            Ok(())
+        };
+        let stops = self
+            .parts
+            .stops
+            .clone()
+            .map(|folder| StopFollower::new(folder, self.parts.store.clone(), self.parts.identity.clone()));
         let stops = async {
             if let Some(follower) = stops {
                 // It ends with the others.
@@ -369,7 +381,7 @@ impl Running<'_> {
             Ok(())
         };
         let planners = async { tokio::try_join!(spawned("fleet", fleet), spawned("rollouts", planner)) };
-        tokio::try_join!(planners, telemetry, ear, ota, reader, stops).map(drop)
+        tokio::try_join!(planners, telemetry, ear, ota, reader, stops, identity).map(drop)
     }
 }
 
@@ -443,7 +455,6 @@ async fn tell(health: &HealthReporter, names: BTreeSet<&'static str>, mut ready:
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::listen::nodelay;
     use crate::planning::Planning;
     use crate::{clock, site_file};
     use midshift_store::{MemoryFrames, MemoryStore, StoreId};
@@ -477,6 +488,8 @@ mod tests {
             site_text: loaded.text,
             clock,
             ota: OtaService::without_keys(),
+            identity: None,
+            port: door::alone("business"),
             reader: None,
             sim: None,
             naive: Naive::default(),
@@ -487,7 +500,7 @@ mod tests {
         let server = Server::new(parts, shutdown.clone()).await?;
         let listener = TcpListener::bind("127.0.0.1:0").await?;
         let channel = Endpoint::from_shared(format!("http://{}", listener.local_addr()?))?.connect_lazy();
-        let serving = tokio::spawn(server.serve(nodelay(listener)));
+        let serving = tokio::spawn(server.serve(listener));
         Ok(World { planning, shutdown, serving, channel })
     }
 

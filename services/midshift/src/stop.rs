@@ -3,12 +3,17 @@
 //! An operational stop request, not a safety function. Invariant: nothing of the store, the task queue or the business server lies on its way. Nothing here
 //! ends a running stop service: `serve` starts one where none is, and leaves it alone for ever.
 
+use crate::door::{self, Login, Share};
 use crate::{clock, server, site_file};
 use anyhow::{Context, bail};
 use axum::routing::get;
+use midshift_agent::dial::{Dial, TcpDial};
+use midshift_agent::tls::{self, Tls};
 use midshift_core::site::Site;
 use midshift_core::time::Clock;
-use midshift_stop::{Parts, StopService};
+use midshift_edge::Config;
+use midshift_identity::ServerProof;
+use midshift_stop::{Parts, Principals, StopService};
 use std::net::SocketAddr;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
@@ -16,9 +21,9 @@ use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::TcpListener;
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
-use tonic::transport::Endpoint;
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
@@ -30,6 +35,8 @@ pub const FOLDER: &str = "stop";
 /// A stop service that was started answers within this, or `serve` says that it did not.
 const UP_WITHIN: Duration = Duration::from_secs(10);
 const LOOK_EVERY: Duration = Duration::from_millis(100);
+/// How often it is looked whether somebody else is known: with the writer's own second, two after a revocation at the latest.
+const PRINCIPALS_EVERY: Duration = Duration::from_millis(500);
 /// Beside `serve` it is looked after so often, and started again after so many looks in vain: within [`midshift_core::limits::SILENCE_SLOW`].
 const KEPT_EVERY: Duration = Duration::from_secs(2);
 const MISSES: u32 = 2;
@@ -43,12 +50,15 @@ pub struct StopServe {
     /// The data folder; its own files are in stop below it, made with mode 0700.
     #[arg(long, default_value = "midshift-data")]
     pub data: PathBuf,
-    /// Address to listen on. Anything but loopback needs --insecure.
+    /// Address to listen on.
     #[arg(long, default_value_t = SocketAddr::from(([127, 0, 0, 1], PORT)))]
     pub listen: SocketAddr,
-    /// There is no login and no TLS yet: say that you know, and listen off loopback all the same.
+    /// No TLS and no login: whoever reaches the port may stop the fleet and reset stops.
     #[arg(long)]
     pub insecure: bool,
+    /// What one peer may take.
+    #[command(flatten)]
+    pub share: Share,
 }
 
 /// Serves until `shutdown`.
@@ -56,23 +66,74 @@ pub struct StopServe {
 /// # Errors
 /// The folder cannot be used or another process has it, the port is taken, or a part ended by itself.
 pub async fn run(args: StopServe, shutdown: CancellationToken) -> anyhow::Result<()> {
-    if !args.listen.ip().is_loopback() && !args.insecure {
-        bail!(
-            "{} is not loopback and midshift has no login yet: whoever reaches it can stop the fleet and reset stops. Add --insecure if you mean it",
-            args.listen
-        );
+    if args.insecure {
+        tracing::warn!(address = %args.listen, "no TLS and no login: whoever reaches this port may stop the fleet and reset stops");
     }
     let loaded = site_file::load(args.site.as_deref(), None, None)?;
     let listener = TcpListener::bind(args.listen).await.with_context(|| format!("listening on {}", args.listen))?;
     let folder = args.data.join(FOLDER);
     tracing::info!(address = %listener.local_addr()?, folder = %folder.display(), "midshift stop serves: an operational stop request, not a safety function");
-    serve(folder, loaded.site, clock::clock(1000), listener, shutdown).await
+    let clock = clock::clock(1000);
+    let (config, login) = match args.insecure {
+        true => (door::alone("stop"), None),
+        false => (args.share.config("stop"), Some(known(&folder, &loaded.site, &clock).await?)),
+    };
+    serve(folder, loaded.site, clock, (config, login), listener, shutdown).await
+}
+
+/// Who is known, as whoever has the store wrote it down beside the latch; followed from then on.
+async fn known(folder: &Path, site: &Site, clock: &Arc<dyn Clock>) -> anyhow::Result<Login> {
+    let mut waited = Duration::ZERO;
+    let first = loop {
+        match Principals::read(folder) {
+            Ok(Some(principals)) => break principals,
+            Err(error) => return Err(error).context("reading who is known"),
+            Ok(None) if waited >= UP_WITHIN => bail!(
+                "{} says not who is known: start `midshift serve` on the same data folder first, or its role stop-follower beside this",
+                folder.join(Principals::NAME).display()
+            ),
+            Ok(None) => {}
+        }
+        tokio::time::sleep(LOOK_EVERY).await;
+        waited += LOOK_EVERY;
+    };
+    let (directory, proof) =
+        (watch::Sender::new(Arc::new(first.directory.clone())), watch::Sender::new(proof_of(&first)));
+    let login = Login {
+        site_id: site.site_id().clone(),
+        clock: clock.clone(),
+        directory: directory.subscribe(),
+        proof: proof.subscribe(),
+    };
+    let (folder, mut last) = (folder.to_owned(), first);
+    // As long as the port is open: it ends with the receivers.
+    tokio::spawn(async move {
+        while !directory.is_closed() {
+            tokio::time::sleep(PRINCIPALS_EVERY).await;
+            match Principals::read(&folder) {
+                Ok(Some(newest)) if newest != last => {
+                    proof.send_replace(proof_of(&newest));
+                    directory.send_replace(Arc::new(newest.directory.clone()));
+                    last = newest;
+                }
+                Ok(_) => {}
+                Err(error) => tracing::warn!(%error, "who is known cannot be read; the last that could stays in force"),
+            }
+        }
+    });
+    Ok(login)
+}
+
+fn proof_of(principals: &Principals) -> ServerProof {
+    let Principals { chain_pem, key_pem, authority_pem, .. } = principals.clone();
+    ServerProof { chain_pem, key_pem, authority_pem }
 }
 
 async fn serve(
     folder: PathBuf,
     site: Arc<Site>,
     clock: Arc<dyn Clock>,
+    (config, login): (Config, Option<Login>),
     listener: TcpListener,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
@@ -81,7 +142,8 @@ async fn serve(
     let metrics = || async { server::metrics_handle().map(|handle| handle.render()).unwrap_or_default() };
     let pages = service.routes().await?.into_axum_router().layer(tonic_web::GrpcWebLayer::new());
     let routes = Routes::from(pages.route("/metrics", get(metrics)));
-    midshift_stop::serve(service, routes, crate::listen::nodelay(listener)).await.context("serving stops")
+    let port = door::serve(config, login, routes, listener, service.drained());
+    midshift_stop::serve(service, port).await.context("serving stops")?
 }
 
 /// The stop service of `dev`: a thread with a runtime of its own, so that no plan and no simulated robot holds it up.
@@ -110,7 +172,7 @@ impl Beside {
         let work = move || {
             let served = runtime.block_on(async {
                 let listener = TcpListener::from_std(listener)?;
-                serve(folder, site, clock, listener, stop).await
+                serve(folder, site, clock, (door::alone("stop"), None), listener, stop).await
             });
             if let Err(error) = &served {
                 tracing::error!(%error, "the stop service ended");
@@ -135,78 +197,92 @@ impl Drop for Beside {
     }
 }
 
-/// Starts a stop service as a process that outlives this one, unless one answers already.
-///
-/// # Errors
-/// It did not come up: no `serve` without a way to stop robots, unless `--no-stop` says that it is elsewhere.
-pub async fn start(site: Option<&Path>, data: &Path, listen: SocketAddr, insecure: bool) -> anyhow::Result<()> {
-    if !listen.ip().is_loopback() && !insecure {
-        bail!("{listen} is not loopback and midshift has no login yet. Add --insecure if you mean it");
-    }
-    if answers(listen).await {
-        tracing::info!(address = %listen, "a stop service answers already and is left alone");
-        return Ok(());
-    }
-    let mut child = spawn(site, data, listen, insecure)?;
-    let mut waited = Duration::ZERO;
-    while !answers(listen).await {
-        if let Some(status) = child.try_wait()? {
-            bail!(
-                "the stop service ended at once ({status}); what it said stands above. `midshift stop serve` by itself shows it too; --no-stop if it runs elsewhere"
-            );
-        }
-        if waited >= UP_WITHIN {
-            bail!(
-                "the stop service at {listen} did not answer within {} s; --no-stop if it runs elsewhere",
-                UP_WITHIN.as_secs()
-            );
-        }
-        tokio::time::sleep(LOOK_EVERY).await;
-        waited += LOOK_EVERY;
-    }
-    tracing::info!(address = %listen, process = child.id(), "a stop service was started; it stays when this process ends");
-    Ok(())
+/// The stop service beside a server on one box.
+pub struct Started {
+    /// The site file.
+    pub site: Option<PathBuf>,
+    /// The data folder.
+    pub data: PathBuf,
+    /// Where it listens.
+    pub listen: SocketAddr,
+    /// The site's root; none: plain text, no login.
+    pub authority_pem: Option<String>,
 }
 
-fn spawn(site: Option<&Path>, data: &Path, listen: SocketAddr, insecure: bool) -> anyhow::Result<Child> {
-    let program = std::env::current_exe().context("finding this program")?;
-    let mut command = Command::new(program);
-    command.args(["stop", "serve", "--listen", &listen.to_string(), "--data"]).arg(data);
-    if let Some(site) = site {
-        command.arg("--site").arg(site);
-    }
-    if insecure {
-        command.arg("--insecure");
-    }
-    // A group of its own: neither Ctrl-C at a terminal nor a kill of this group reaches it.
-    command.process_group(0).stdin(Stdio::null()).stdout(Stdio::null());
-    command.spawn().context("starting the stop service")
-}
-
-/// Looks after it until the task is ended: one that is gone is started again, before robots among people stand still for want of an answer.
-pub async fn keep(site: Option<&Path>, data: &Path, listen: SocketAddr, insecure: bool) {
-    let mut misses = 0;
-    loop {
-        tokio::time::sleep(KEPT_EVERY).await;
-        misses = if answers(listen).await { 0 } else { misses + 1 };
-        if misses < MISSES {
-            continue;
+impl Started {
+    /// Starts it as a process that outlives this one, unless one of this site answers already.
+    ///
+    /// # Errors
+    /// It did not come up: no `serve` without a way to stop robots, unless `--no-stop` says that it is elsewhere.
+    pub async fn start(&self) -> anyhow::Result<()> {
+        let listen = self.listen;
+        if self.answers().await {
+            tracing::info!(address = %listen, "a stop service answers already and is left alone");
+            return Ok(());
         }
-        tracing::error!(address = %listen, "the stop service does not answer and is started again");
-        if let Err(error) = start(site, data, listen, insecure).await {
-            tracing::error!(%error, "the stop service was not started");
+        let mut child = self.spawn()?;
+        let mut waited = Duration::ZERO;
+        while !self.answers().await {
+            if let Some(status) = child.try_wait()? {
+                bail!(
+                    "the stop service ended at once ({status}); what it said stands above. `midshift stop serve` by itself shows it too; --no-stop if it runs elsewhere"
+                );
+            }
+            if waited >= UP_WITHIN {
+                bail!(
+                    "the stop service at {listen} did not answer within {} s, or one of another site has the port; --no-stop if it runs elsewhere, --stop-listen for another port",
+                    UP_WITHIN.as_secs()
+                );
+            }
+            tokio::time::sleep(LOOK_EVERY).await;
+            waited += LOOK_EVERY;
         }
-        misses = 0;
+        tracing::info!(address = %listen, process = child.id(), "a stop service was started; it stays when this process ends");
+        Ok(())
     }
-}
 
-/// Whether a stop service serves there.
-async fn answers(listen: SocketAddr) -> bool {
-    let asked = async {
-        let channel = Endpoint::from_shared(format!("http://{listen}")).ok()?.connect().await.ok()?;
-        let service = "midshift.stop.v1.StopService".to_owned();
-        HealthClient::new(channel).check(HealthCheckRequest { service }).await.ok()
-    };
-    let answer = tokio::time::timeout(LOOK_EVERY * 10, asked).await;
-    answer.is_ok_and(|answer| answer.is_some_and(|answer| answer.get_ref().status() == ServingStatus::Serving))
+    fn spawn(&self) -> anyhow::Result<Child> {
+        let program = std::env::current_exe().context("finding this program")?;
+        let mut command = Command::new(program);
+        command.args(["stop", "serve", "--listen", &self.listen.to_string(), "--data"]).arg(&self.data);
+        if let Some(site) = &self.site {
+            command.arg("--site").arg(site);
+        }
+        if self.authority_pem.is_none() {
+            command.arg("--insecure");
+        }
+        // A group of its own: neither Ctrl-C at a terminal nor a kill of this group reaches it.
+        command.process_group(0).stdin(Stdio::null()).stdout(Stdio::null());
+        command.spawn().context("starting the stop service")
+    }
+
+    /// Looks after it until the task is ended: one that is gone is started again, before robots among people stand still for want of an answer.
+    pub async fn keep(&self) {
+        let mut misses = 0;
+        loop {
+            tokio::time::sleep(KEPT_EVERY).await;
+            misses = if self.answers().await { 0 } else { misses + 1 };
+            if misses < MISSES {
+                continue;
+            }
+            tracing::error!(address = %self.listen, "the stop service does not answer and is started again");
+            if let Err(error) = self.start().await {
+                tracing::error!(%error, "the stop service was not started");
+            }
+            misses = 0;
+        }
+    }
+
+    /// Whether a stop service of this site serves there.
+    async fn answers(&self) -> bool {
+        let asked = async {
+            let tls = self.authority_pem.as_deref().map(|root| tls::config(root, None)).transpose().ok()?;
+            let scheme = if tls.is_some() { "https" } else { "http" };
+            let dial = TcpDial::new(&format!("{scheme}://{}", self.listen), None).ok()?.with_tls(tls.map(Tls::fixed));
+            let service = "midshift.stop.v1.StopService".to_owned();
+            HealthClient::new(dial.dial().await.ok()?).check(HealthCheckRequest { service }).await.ok()
+        };
+        let answer = tokio::time::timeout(LOOK_EVERY * 10, asked).await;
+        answer.is_ok_and(|answer| answer.is_some_and(|answer| answer.get_ref().status() == ServingStatus::Serving))
+    }
 }

@@ -10,10 +10,12 @@ use midshift_core::robot::Duty;
 use midshift_core::rows::{Log, Revision, Seq, Table};
 use midshift_core::stop::Latch;
 use midshift_core::stop::record::{StopRecord, copy};
-use midshift_stop::Roster;
+use midshift_identity::{IdentityService, ServerProof};
+use midshift_stop::{Principals, Roster};
 use midshift_store::{CommitError, Store, follow};
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::PathBuf;
+use std::io;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -21,6 +23,20 @@ use std::time::Duration;
 const LOOK: Duration = Duration::from_millis(250);
 /// How often it is looked up which robots a person has retired, in looks: ten seconds.
 const RETIRED_EVERY: u32 = 40;
+
+/// Who is known, as the stop service is told.
+fn principals(identity: &IdentityService) -> Principals {
+    let ServerProof { chain_pem, key_pem, authority_pem } = identity.proof().borrow().clone();
+    Principals { directory: (**identity.directory().borrow()).clone(), chain_pem, key_pem, authority_pem }
+}
+
+/// Writes it into the folder of a stop service that is about to be started.
+///
+/// # Errors
+/// The disk.
+pub fn tell_principals(folder: &Path, identity: &IdentityService) -> io::Result<()> {
+    principals(identity).write(folder)
+}
 
 /// What follows one stop service.
 pub struct StopFollower {
@@ -33,15 +49,18 @@ pub struct StopFollower {
     retired: BTreeSet<RobotId>,
     /// As it was written last.
     roster: Option<BTreeSet<RobotId>>,
+    /// Who is known, and what that was when it was written last.
+    identity: Option<(IdentityService, Option<Principals>)>,
     /// As the log was told.
     failing: bool,
 }
 
 impl StopFollower {
     /// Of the stop service that keeps its files in `folder`.
-    pub fn new(folder: PathBuf, store: Arc<dyn Store>) -> Self {
+    pub fn new(folder: PathBuf, store: Arc<dyn Store>, identity: Option<IdentityService>) -> Self {
         let (copied, attached, retired, roster) = (None, None, BTreeSet::new(), None);
-        Self { folder, store, copied, attached, retired, roster, failing: false }
+        let identity = identity.map(|identity| (identity, None));
+        Self { folder, store, copied, attached, retired, roster, identity, failing: false }
     }
 
     /// Until it is dropped.
@@ -59,6 +78,8 @@ impl StopFollower {
     }
 
     async fn follow(&mut self, is_retired_due: bool) -> anyhow::Result<()> {
+        // First, and whatever the stop service is doing: it may be waiting for this.
+        self.tell_who_is_known().await?;
         let folder = self.folder.clone();
         let read = tokio::task::spawn_blocking(move || midshift_stop::latch(&folder));
         let Some((generation, latch)) = read.await.context("reading the latch")?? else { return Ok(()) };
@@ -116,6 +137,20 @@ impl StopFollower {
             // What was missed of the feed stands in the rows.
             self.attached = None;
         }
+        Ok(())
+    }
+
+    /// Writes who is known, if that has changed.
+    async fn tell_who_is_known(&mut self) -> anyhow::Result<()> {
+        let Some((identity, told)) = &mut self.identity else { return Ok(()) };
+        let newest = principals(identity);
+        if told.as_ref() == Some(&newest) {
+            return Ok(());
+        }
+        let (folder, writing) = (self.folder.clone(), newest.clone());
+        let written = tokio::task::spawn_blocking(move || writing.write(&folder)).await;
+        written.context("writing who is known")?.context("writing who is known")?;
+        *told = Some(newest);
         Ok(())
     }
 

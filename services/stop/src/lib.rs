@@ -24,7 +24,7 @@ mod snapshot;
 mod status;
 
 pub use face::LinkFace;
-pub use snapshot::Roster;
+pub use snapshot::{Principals, Roster};
 
 use audit::{Action, Audit, Broken, Note, Verified};
 use disk::{Disk, Writer};
@@ -45,12 +45,9 @@ use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
-use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::{Semaphore, watch};
-use tokio_stream::Stream;
 use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
-use tonic::transport::server::Connected;
 
 /// Until login exists nobody is known by name.
 const ACTOR: &str = "anonymous";
@@ -60,8 +57,6 @@ const WATCH_MAX: usize = 4;
 const LATCH: &str = "latch";
 /// Robots have so long to dial again before their lines end.
 const MOVE_OVER_WITHIN: Duration = Duration::from_millis(500);
-/// Pings on a quiet connection, and how long their answer may take.
-const KEEPALIVE: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(10));
 
 /// What keeps the service from beginning, or ends it.
 #[derive(Debug, thiserror::Error)]
@@ -80,9 +75,6 @@ pub enum Error {
     /// The descriptors of its own services cannot be read.
     #[error("building reflection: {0}")]
     Reflection(#[from] tonic_reflection::server::Error),
-    /// The port is gone.
-    #[error("serving: {0}")]
-    Serving(#[from] tonic::transport::Error),
     /// A part of it ended.
     #[error("a part of the stop service ended by itself")]
     Ended,
@@ -230,6 +222,11 @@ impl StopService {
         Ok(routes.routes())
     }
 
+    /// When its lines have ended, so that its port may close.
+    pub fn drained(&self) -> CancellationToken {
+        self.inner.ended.clone()
+    }
+
     /// Keeps files and roster until shutdown; then tells robots to dial again and ends all streams. Called once.
     ///
     /// # Errors
@@ -260,48 +257,22 @@ impl StopService {
     }
 }
 
-/// Serves connections until the service's shutdown, which is bounded: streams that do not end by themselves are cut.
+/// Runs the service behind `port`, which serves its routes until [`StopService::drained`] and then within its own bounds. What the port said at its end.
 ///
 /// # Errors
-/// The service ended by itself, or the connections did.
-pub async fn serve<I, IO, E>(service: StopService, routes: Routes, incoming: I) -> Result<(), Error>
-where
-    I: Stream<Item = Result<IO, E>> + Send + 'static,
-    IO: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
-    E: Into<Box<dyn std::error::Error + Send + Sync>>,
-{
-    let (shutdown, ended) = (service.inner.shutdown.clone(), service.inner.ended.clone());
+/// The service ended by itself.
+pub async fn serve<E>(service: StopService, port: impl Future<Output = Result<(), E>>) -> Result<Result<(), E>, Error> {
+    let shutdown = service.inner.shutdown.clone();
     // However this ends, also in a panic: nothing goes on without the rest.
     let _end = shutdown.clone().drop_guard();
-    let drained = ended.clone();
-    let transport = tonic::transport::Server::builder()
-        .accept_http1(true)
-        .http2_keepalive_interval(Some(KEEPALIVE.0))
-        .http2_keepalive_timeout(Some(KEEPALIVE.1))
-        .max_concurrent_streams(limits::STREAMS_PER_CONNECTION)
-        .timeout(Duration::from_millis(limits::UNARY_DEADLINE.as_ms()))
-        .add_routes(routes)
-        .serve_with_incoming_shutdown(incoming, async move { drained.cancelled().await });
-    let cut = async {
-        ended.cancelled().await;
-        tokio::time::sleep(Duration::from_millis(limits::HARD_DRAIN.as_ms())).await;
-    };
     let running = service.run();
     let serving = async {
-        tokio::select! {
-            served = transport => served.map_err(Error::from),
-            () = cut => Ok(()),
-        }
+        let served = port.await;
+        shutdown.cancel();
+        served
     };
-    let (served, ran) = tokio::join!(
-        async {
-            let served = serving.await;
-            shutdown.cancel();
-            served
-        },
-        running
-    );
-    served.and(ran)
+    let (served, ran) = tokio::join!(serving, running);
+    ran.map(|()| served)
 }
 
 /// Reads the whole audit in the folder of a stop service, also while it runs.

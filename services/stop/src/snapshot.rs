@@ -1,16 +1,17 @@
-//! What others write beside the service's own files: who belongs to the fleet.
+//! What others write beside the service's own files: who belongs to the fleet, and who is known.
 //!
 //! Invariant: written whole under another name and renamed, so that a reader never sees half; one that cannot be read is told once, and the last good
-//! one stays in force. Absent on purpose: `principals.snapshot`, which comes with login.
+//! one stays in force.
 
 use crate::{Inner, blocking};
+use midshift_core::identity::Directory;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Write};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -34,11 +35,55 @@ impl Roster {
     /// # Errors
     /// The disk.
     pub fn write(&self, folder: &Path) -> io::Result<()> {
-        let part = folder.join(format!("{NAME}.part"));
-        let mut file = OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(&part)?;
-        file.write_all(&serde_json::to_vec(self)?)?;
-        file.sync_all()?;
-        fs::rename(part, folder.join(NAME))
+        write(folder, NAME, &serde_json::to_vec(self)?)
+    }
+}
+
+fn write(folder: &Path, name: &str, bytes: &[u8]) -> io::Result<()> {
+    fs::DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
+    let part = folder.join(format!("{name}.part"));
+    let mut file = OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(&part)?;
+    file.write_all(bytes)?;
+    file.sync_all()?;
+    fs::rename(part, folder.join(name))
+}
+
+/// Who is known, and what the port proves itself with: all that a stop service needs of identity.
+#[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Principals {
+    /// Tokens and keys that were taken out.
+    pub directory: Directory,
+    /// Certificate of the server and the root behind it, PEM.
+    pub chain_pem: String,
+    /// Its private key, PEM.
+    pub key_pem: String,
+    /// The root that robots are held against, PEM.
+    pub authority_pem: String,
+}
+
+impl Principals {
+    /// Name of the file.
+    pub const NAME: &str = "principals.snapshot";
+
+    /// Writes it into the folder of a stop service, whole or not at all, for its owner alone.
+    ///
+    /// # Errors
+    /// The disk.
+    pub fn write(&self, folder: &Path) -> io::Result<()> {
+        write(folder, Self::NAME, &serde_json::to_vec(self)?)
+    }
+
+    /// What stands in the folder; none: nothing was written yet.
+    ///
+    /// # Errors
+    /// It cannot be read.
+    pub fn read(folder: &Path) -> io::Result<Option<Self>> {
+        match fs::read(folder.join(Self::NAME)) {
+            Ok(text) => Ok(Some(serde_json::from_slice(&text)?)),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(error),
+        }
     }
 }
 

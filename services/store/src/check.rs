@@ -176,5 +176,6 @@ pub(crate) fn log_index(log: Log) -> usize {
         Log::RobotInbox => 3,
         Log::Ota => 4,
         Log::Stop => 5,
+        Log::Identity => 6,
     }
 }

@@ -91,6 +91,13 @@ pub(crate) const CONTROL: &[Migration] = migrations!["control":
     "0069_stop_record",
     "0070_stop_event",
     "0071_stop_event_by_subject",
+    "0072_token",
+    "0073_robot_identity",
+    "0074_authority",
+    "0075_server_certificate",
+    "0076_identity_event",
+    "0077_identity_event_by_subject",
+    "0078_token_by_ord",
 ];
 
 /// Of `telemetry.db`.

@@ -2,7 +2,10 @@
 
 use crate::frames::{GOAWAY, HEADERS, Raw, dial, until_closed};
 use crate::world::{HERE, THERE, World, within};
-use midshift_edge::{Config, Denied, Peer, Principal, Principals};
+use http::HeaderMap;
+use midshift_core::identity::Caller;
+use midshift_core::reason::Refusal;
+use midshift_edge::{Config, Denied, Peer, Principals};
 use std::collections::BTreeSet;
 use std::net::{IpAddr, Ipv4Addr};
 use std::sync::{Arc, Mutex};
@@ -27,12 +30,15 @@ impl Register {
 }
 
 impl Principals for Register {
-    fn admit(&self, peer: &Peer) -> Result<Option<Principal>, Denied> {
+    fn admit(&self, peer: &Peer) -> Result<(), Denied> {
         let address = peer.address.ip();
         if self.denied.lock().expect("not poisoned").contains(&address) {
             return Err(Denied::Revoked);
         }
-        Ok(Some(Principal(address.to_string().into())))
+        Ok(())
+    }
+    fn caller(&self, _: &Peer, _: &HeaderMap) -> Result<Caller, Refusal> {
+        Ok(Caller::local())
     }
     fn changed(&self) -> watch::Receiver<u64> {
         self.changed.subscribe()
@@ -44,7 +50,7 @@ async fn a_revoked_principals_connection_is_cut_and_anothers_goes_on() {
     let register = Arc::new(Register::default());
     let world = World::with(Config::default(), register.clone(), None).await;
     let mut stays = world.client().await;
-    assert_eq!(stays.asked("/who").await.header("principal"), "127.0.0.1");
+    assert_eq!(stays.asked("/who").await.header("principal"), "anonymous");
     let mut stream = stays.begin("/pulse", None).await.expect("a stream");
     let mut stream = within(&mut stream).await.expect("its head").into_body();
     let mut goes = Raw::dial(world.address, THERE).await;

@@ -4,7 +4,8 @@ use bytes::Bytes;
 use http::{HeaderMap, HeaderValue, Request, Response};
 use http_body::{Body as HttpBody, Frame};
 use http_body_util::StreamBody;
-use midshift_edge::{Peer, Principal};
+use midshift_core::identity::Caller;
+use midshift_edge::Peer;
 use std::convert::Infallible;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -69,7 +70,7 @@ async fn answer(request: Request<Body>, poked: Arc<Notify>) -> Response<Body> {
             grpc(Body::new(StreamBody::new(ReceiverStream::new(said))))
         }
         _ => {
-            let principal = request.extensions().get::<Principal>().map(|p| p.0.to_string()).unwrap_or_default();
+            let principal = request.extensions().get::<Caller>().map(ToString::to_string).unwrap_or_default();
             let leaf = peer.certificate.as_ref().map(|leaf| leaf.to_vec()).unwrap_or_default();
             let mut response = ok(leaf);
             let put = |text: String| HeaderValue::from_str(&text).expect("plain text");

@@ -175,7 +175,7 @@ fn interrupts() -> CancellationToken {
 async fn run(command: Command, out: &Out) -> Result<(), Exit> {
     match command {
         Command::Dev(args) => develop(*args, out).await,
-        Command::Serve(args) => Ok(serve::run(args, interrupts()).await?),
+        Command::Serve(args) => Ok(serve::run(args, interrupts(), &|text| out.line(text)).await?),
         Command::Migrate { data, database } => migrate(&data.unwrap_or_default(), &database, out).await,
         Command::Backup(args) => backup::take(&args, out).await,
         Command::Restore(args) => backup::restore(&args, out).await,

@@ -1,0 +1,216 @@
+//! Who asks, and what it may.
+
+use super::grant::{Access, Grant, Permission, Scope};
+use super::token::TokenId;
+use crate::ids::{AreaId, RobotId};
+use crate::reason::{Code, Kind, Reason, Refusal};
+use std::fmt;
+use std::sync::Arc;
+
+/// Who asks.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Who {
+    /// Somebody who showed nothing.
+    Nobody,
+    /// Whoever reaches a port without login (`dev`), or code of the same process: may do everything.
+    Local,
+    /// A robot, by its certificate.
+    Robot(RobotId),
+    /// A person or a program, by a token.
+    Holder {
+        /// Of which token.
+        token: TokenId,
+        /// Its name, which stands for it as an actor.
+        name: Arc<str>,
+    },
+}
+
+/// Who asks, with its rights. In the extensions of each request that came through a port.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Caller {
+    who: Who,
+    grants: Arc<[Grant]>,
+    /// Its token's time is over, for less than [`crate::limits::TOKEN_STOPS_AFTER_EXPIRY`]: it may engage stops and nothing else.
+    expired: bool,
+}
+
+impl Caller {
+    /// Somebody who showed nothing.
+    pub fn nobody() -> Self {
+        Self { who: Who::Nobody, grants: Arc::default(), expired: false }
+    }
+    /// Whoever may do everything.
+    pub fn local() -> Self {
+        Self { who: Who::Local, grants: Arc::default(), expired: false }
+    }
+    /// A robot.
+    pub fn robot(robot_id: RobotId) -> Self {
+        Self { who: Who::Robot(robot_id), grants: Arc::default(), expired: false }
+    }
+    /// The holder of a token; of one that is `expired`, it may still engage stops.
+    pub fn holder(token: TokenId, name: Arc<str>, grants: Arc<[Grant]>, expired: bool) -> Self {
+        Self { who: Who::Holder { token, name }, grants, expired }
+    }
+    /// Who it is.
+    pub const fn who(&self) -> &Who {
+        &self.who
+    }
+    /// Its grants.
+    pub fn grants(&self) -> &[Grant] {
+        &self.grants
+    }
+
+    /// Whether a method with this rule is for it at all, somewhere. Of what it may be asked is held against [`Caller::may_over`] where the object is known;
+    /// a method of the whole site is decided here.
+    ///
+    /// # Errors
+    /// Not signed in, or no grant that permits it.
+    pub fn may_call(&self, access: Access) -> Result<(), Refusal> {
+        let permission = access.permission;
+        let allowed = match (&self.who, permission) {
+            (_, Permission::Anybody) | (Who::Local, _) => true,
+            (Who::Robot(_), needed) => matches!(needed, Permission::Robot | Permission::SignedIn),
+            (Who::Nobody, _) => return Err(Refusal::new(Kind::Unauthenticated, Code::SignInNeeded)),
+            (Who::Holder { .. }, Permission::Stop) => !self.grants.is_empty(),
+            (Who::Holder { .. }, _) if self.expired => {
+                return Err(Refusal::new(Kind::Unauthenticated, Code::TokenExpired));
+            }
+            (Who::Holder { .. }, needed) => self.grants.iter().any(|grant| {
+                grant.role.permits(needed) && (access.object != super::Object::Site || grant.scope == Scope::Site)
+            }),
+        };
+        if allowed { Ok(()) } else { Err(self.denied(permission)) }
+    }
+
+    /// Whether it may do that to something that lies in these areas: each of them must be in the scope of a grant that permits it, and something without any
+    /// area is the site's.
+    pub fn may_over<'a>(&self, permission: Permission, areas: impl IntoIterator<Item = &'a AreaId>) -> bool {
+        if matches!(self.who, Who::Local) {
+            return true;
+        }
+        let permits = |area: Option<&AreaId>| {
+            self.grants.iter().any(|grant| {
+                grant.role.permits(permission) && area.map_or(grant.scope == Scope::Site, |area| grant.scope.has(area))
+            })
+        };
+        let mut areas = areas.into_iter().peekable();
+        match areas.peek() {
+            None => permits(None),
+            Some(_) => areas.all(|area| permits(Some(area))),
+        }
+    }
+
+    /// As [`Caller::may_over`], as an answer.
+    ///
+    /// # Errors
+    /// It may not.
+    pub fn needs<'a>(
+        &self,
+        permission: Permission,
+        areas: impl IntoIterator<Item = &'a AreaId>,
+    ) -> Result<(), Refusal> {
+        if self.may_over(permission, areas) { Ok(()) } else { Err(self.denied(permission)) }
+    }
+
+    /// Whether it is this robot, or one for whom robots' own calls are open.
+    ///
+    /// # Errors
+    /// It is somebody else.
+    pub fn is_robot(&self, robot_id: &RobotId) -> Result<(), Refusal> {
+        match &self.who {
+            Who::Local => Ok(()),
+            Who::Robot(own) if own == robot_id => Ok(()),
+            Who::Nobody => Err(Refusal::new(Kind::Unauthenticated, Code::SignInNeeded)),
+            _ => Err(Refusal::new(
+                Kind::Denied,
+                Reason::new(Code::NotThisRobot, format!("{self} may not speak for {robot_id}"))
+                    .with("robot_id", robot_id),
+            )),
+        }
+    }
+
+    fn denied(&self, permission: Permission) -> Refusal {
+        let reason = Reason::new(Code::NotPermitted, format!("{self} may not: it needs {permission:?}"));
+        Refusal::new(Kind::Denied, reason.with("permission", format!("{permission:?}").to_uppercase()))
+    }
+}
+
+/// As an actor: what decisions are recorded under.
+impl fmt::Display for Caller {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.who {
+            Who::Nobody => f.write_str("nobody"),
+            Who::Local => f.write_str("anonymous"),
+            Who::Robot(robot_id) => write!(f, "robot:{robot_id}"),
+            Who::Holder { name, .. } => f.write_str(name),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::grant::Object;
+    use super::*;
+
+    fn area(name: &str) -> AreaId {
+        AreaId::parse(name).expect("an area")
+    }
+
+    fn holder(grants: &[&str]) -> Caller {
+        let grants = grants.iter().map(|grant| grant.parse().expect("a grant")).collect();
+        Caller::holder(TokenId::new("t1").expect("an id"), "anna".into(), grants, false)
+    }
+
+    fn rule(permission: Permission, object: Object) -> Access {
+        Access { permission, object }
+    }
+
+    #[test]
+    fn a_role_in_one_area_and_another_role_in_another_are_never_merged() {
+        let caller = holder(&["operator@packing", "viewer@storage"]);
+        assert!(caller.may_over(Permission::Operate, [&area("packing")]));
+        assert!(!caller.may_over(Permission::Operate, [&area("storage")]));
+        assert!(caller.may_over(Permission::Read, [&area("packing"), &area("storage")]));
+        assert!(!caller.may_over(Permission::Operate, [&area("packing"), &area("storage")]));
+        assert!(!caller.may_over(Permission::Read, []), "what lies nowhere is the site's");
+        assert!(holder(&["viewer"]).may_over(Permission::Read, []));
+    }
+
+    #[test]
+    fn what_is_asked_of_the_site_needs_a_grant_of_the_site() {
+        let site = rule(Permission::Administer, Object::Site);
+        assert!(holder(&["admin"]).may_call(site).is_ok());
+        let refused = holder(&["admin@packing"]).may_call(site).expect_err("an area is not the site");
+        assert_eq!((refused.kind(), refused.reason.code), (Kind::Denied, Code::NotPermitted));
+    }
+
+    #[test]
+    fn nobody_is_asked_to_sign_in_and_a_robot_does_nothing_that_is_for_people() {
+        let read = rule(Permission::Read, Object::List);
+        assert_eq!(Caller::nobody().may_call(read).expect_err("nobody").kind(), Kind::Unauthenticated);
+        let robot = Caller::robot(RobotId::parse("r7").expect("an id"));
+        assert_eq!(robot.may_call(read).expect_err("a robot").kind(), Kind::Denied);
+        assert!(robot.may_call(rule(Permission::Robot, Object::Robot)).is_ok());
+        assert!(holder(&["admin"]).may_call(rule(Permission::Robot, Object::Robot)).is_err());
+        assert!(Caller::nobody().may_call(rule(Permission::Anybody, Object::None)).is_ok());
+    }
+
+    #[test]
+    fn a_robot_speaks_for_itself_alone() {
+        let [own, other] = ["r7", "r8"].map(|id| RobotId::parse(id).expect("an id"));
+        let robot = Caller::robot(own.clone());
+        assert!(robot.is_robot(&own).is_ok());
+        assert_eq!(robot.is_robot(&other).expect_err("another").reason.code, Code::NotThisRobot);
+        assert_eq!(holder(&["admin"]).is_robot(&own).expect_err("a person").kind(), Kind::Denied);
+    }
+
+    #[test]
+    fn a_token_whose_time_is_over_still_stops_and_does_nothing_else() {
+        let grants: Arc<[Grant]> = Arc::from(["stop-resetter".parse().expect("a grant")]);
+        let late = Caller::holder(TokenId::new("t1").expect("an id"), "anna".into(), grants, true);
+        assert!(late.may_call(rule(Permission::Stop, Object::None)).is_ok());
+        let refused = late.may_call(rule(Permission::Reset, Object::None)).expect_err("late");
+        assert_eq!(refused.reason.code, Code::TokenExpired);
+        assert!(late.may_call(rule(Permission::SignedIn, Object::None)).is_err());
+    }
+}

@@ -1,0 +1,78 @@
+//! The rule of each path that a port answers: of midshift's own methods as their .proto files declare it, of all others here.
+//!
+//! Invariant: default deny. A path without a rule is for nobody, whoever asks. The rules of methods are made from the descriptors when this crate is built, so
+//! that there is no second place to forget.
+
+use midshift_core::identity::{Access, Caller, Object, Permission, Who};
+use midshift_core::reason::{Code, Kind, Reason, Refusal};
+
+/// What a path needs; none: nobody may ask for it.
+pub fn of(path: &str) -> Option<Access> {
+    method(path).or_else(|| foreign(path))
+}
+
+fn method(path: &str) -> Option<Access> {
+    include!(concat!(env!("OUT_DIR"), "/access.rs"))
+}
+
+/// What is not declared in a .proto of ours: health, reflection, pages.
+fn foreign(path: &str) -> Option<Access> {
+    let permission = match path {
+        "/ready" | "/grpc.health.v1.Health/Check" | "/grpc.health.v1.Health/Watch" => Permission::Anybody,
+        "/metrics" => Permission::Read,
+        _ if path.starts_with("/grpc.reflection.") => Permission::SignedIn,
+        _ if ["/metadata/", "/targets/"].iter().any(|pages| path.starts_with(pages)) => Permission::SignedIn,
+        _ => return None,
+    };
+    Some(Access { permission, object: Object::None })
+}
+
+/// Whether this caller may ask for that path at all.
+///
+/// # Errors
+/// Not signed in, not permitted, or nobody may.
+pub fn check(caller: &Caller, path: &str) -> Result<(), Refusal> {
+    match of(path) {
+        Some(access) => caller.may_call(access),
+        None => match caller.who() {
+            // The services say themselves what is not there.
+            Who::Local => Ok(()),
+            Who::Nobody => Err(Refusal::new(Kind::Unauthenticated, Code::SignInNeeded)),
+            _ => Err(Refusal::new(
+                Kind::Denied,
+                Reason::new(Code::NotPermitted, "no rule of this server lets anybody ask for that"),
+            )),
+        },
+    }
+}
+
+/// Who asks, as the port found out; a request that never came through a port is of this process.
+pub fn caller<T>(request: &tonic::Request<T>) -> Caller {
+    request.extensions().get::<Caller>().cloned().unwrap_or_else(Caller::local)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use prost_reflect::DescriptorPool;
+
+    #[test]
+    fn every_method_of_every_service_declares_who_may_call_it() {
+        let pool = DescriptorPool::decode(crate::FILE_DESCRIPTOR_SET).expect("descriptors");
+        let methods: Vec<_> = pool.services().flat_map(|service| service.methods().collect::<Vec<_>>()).collect();
+        assert!(methods.len() > 70, "{}", methods.len());
+        let path = |m: &prost_reflect::MethodDescriptor| format!("/{}/{}", m.parent_service().full_name(), m.name());
+        let without: Vec<String> = methods.iter().map(path).filter(|path| method(path).is_none()).collect();
+        assert_eq!(without, Vec::<String>::new());
+    }
+
+    #[test]
+    fn a_path_without_a_rule_is_for_nobody() {
+        assert_eq!(of("/midshift.task.v1.TaskService/DropAll"), None);
+        assert_eq!(check(&Caller::nobody(), "/elsewhere").expect_err("nobody").kind(), Kind::Unauthenticated);
+        assert!(check(&Caller::nobody(), "/grpc.health.v1.Health/Check").is_ok());
+        assert!(check(&Caller::nobody(), "/metrics").is_err());
+        let robot = Caller::robot(midshift_core::ids::RobotId::parse("r7").expect("an id"));
+        assert_eq!(check(&robot, "/elsewhere").expect_err("a robot").kind(), Kind::Denied);
+    }
+}

@@ -1,0 +1,93 @@
+//! Principals of a port with login: robots by the certificates of the site, people and programs by their tokens.
+//!
+//! Invariant: answers come from memory alone, from the newest directory that was published; nothing of the store lies on the way of a request. Before the first
+//! one no token is known, while robots with a genuine certificate come in: the stop line of a robot must not wait for anybody.
+
+use crate::peer::{Denied, Peer, Principals};
+use http::HeaderMap;
+use http::header::AUTHORIZATION;
+use midshift_core::identity::{Caller, Digest, Directory, Secret};
+use midshift_core::ids::{RobotId, SiteId};
+use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::time::Clock;
+use rustls::pki_types::CertificateDer;
+use sha2::Digest as _;
+use std::sync::Arc;
+use tokio::sync::watch;
+use webpki::EndEntityCert;
+
+/// Everybody a directory knows.
+pub struct Known {
+    site_id: SiteId,
+    clock: Arc<dyn Clock>,
+    directory: watch::Sender<Arc<Directory>>,
+    changed: watch::Sender<u64>,
+}
+
+impl Known {
+    /// Of this site; nobody but its robots before [`Known::publish`].
+    pub fn new(site_id: SiteId, clock: Arc<dyn Clock>) -> Self {
+        let (directory, changed) = (watch::Sender::new(Arc::default()), watch::Sender::new(0));
+        Self { site_id, clock, directory, changed }
+    }
+
+    /// What holds from now on. Whoever it denies is cut at once.
+    pub fn publish(&self, directory: Directory) {
+        let is_new = self.directory.send_if_modified(|known| {
+            let differs = **known != directory;
+            if differs {
+                *known = Arc::new(directory);
+            }
+            differs
+        });
+        if is_new {
+            self.changed.send_modify(|n| *n += 1);
+        }
+    }
+
+    fn robot(&self, leaf: &CertificateDer<'_>) -> Result<RobotId, Denied> {
+        let (robot_id, key) = robot_of(leaf, &self.site_id).ok_or(Denied::Unknown)?;
+        if self.directory.borrow().denies(&key) { Err(Denied::Revoked) } else { Ok(robot_id) }
+    }
+}
+
+impl Principals for Known {
+    fn admit(&self, peer: &Peer) -> Result<(), Denied> {
+        // Who shows none shows a token with each request.
+        peer.certificate.as_ref().map_or(Ok(()), |leaf| self.robot(leaf).map(drop))
+    }
+
+    fn changed(&self) -> watch::Receiver<u64> {
+        self.changed.subscribe()
+    }
+
+    fn caller(&self, peer: &Peer, headers: &HeaderMap) -> Result<Caller, Refusal> {
+        if let Some(leaf) = &peer.certificate {
+            let unknown = |_| Refusal::new(Kind::Unauthenticated, Code::KeyDenied);
+            return self.robot(leaf).map(Caller::robot).map_err(unknown);
+        }
+        let Some(shown) = headers.get(AUTHORIZATION) else { return Ok(Caller::nobody()) };
+        let text = shown.to_str().ok().and_then(|text| {
+            let (scheme, text) = text.split_once(' ')?;
+            scheme.eq_ignore_ascii_case("bearer").then_some(text)
+        });
+        let secret = text.and_then(|text| Secret::read(Secret::TOKEN, text));
+        let Some(secret) = secret else { return Err(Refusal::new(Kind::Unauthenticated, Code::TokenUnknown)) };
+        let digest = Digest(sha2::Sha256::digest(secret.bytes()).into());
+        self.directory.borrow().holder(secret.id(), &digest, self.clock.now().wall)
+    }
+}
+
+/// Which robot a certificate is of, and the digest of its public key; none: it is of no robot of this site. That it is genuine was proven in the handshake.
+pub fn robot_of(leaf: &CertificateDer<'_>, site_id: &SiteId) -> Option<(RobotId, Digest)> {
+    let certificate = EndEntityCert::try_from(leaf).ok()?;
+    let prefix = format!("spiffe://{site_id}/robot/");
+    let mut names = certificate.valid_uri_names();
+    let robot_id = names.next()?.strip_prefix(&prefix).and_then(|id| RobotId::parse(id).ok())?;
+    // A second name would be a second robot.
+    if names.next().is_some() {
+        return None;
+    }
+    let key = sha2::Sha256::digest(certificate.subject_public_key_info());
+    Some((robot_id, Digest(key.into())))
+}

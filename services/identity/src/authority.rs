@@ -1,0 +1,146 @@
+//! The site's own certificate authority: made once, its key in one file, and what it signs.
+//!
+//! Invariant: what is signed is said here and never by who asks: of a request only the public key is taken. A robot's certificate is good as a client alone, a
+//! server's as a server alone.
+
+use crate::{Error, files};
+use midshift_core::identity::Digest;
+use midshift_core::ids::{RobotId, SiteId};
+use midshift_core::limits;
+use midshift_core::reason::Refusal;
+use midshift_core::time::{LinkDuration, Utc};
+use rcgen::{
+    BasicConstraints, Certificate, CertificateParams, CertificateSigningRequestParams, DistinguishedName, DnType,
+    ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, KeyUsagePurpose, PublicKeyData, SanType,
+};
+use sha2::Digest as _;
+use std::path::Path;
+use time::OffsetDateTime;
+
+/// Key and certificate in one file, so that there is never one without the other.
+const FILE: &str = "authority.pem";
+/// The certificate alone, for whoever wants to hold the server against it.
+pub const PUBLIC_FILE: &str = "ca.pem";
+
+/// Who signs.
+pub struct Authority {
+    issuer: Issuer<'static, KeyPair>,
+    certificate_pem: String,
+    site_id: SiteId,
+}
+
+/// A certificate that was signed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Signed {
+    /// PEM, the leaf first.
+    pub chain_pem: String,
+    /// When it is over.
+    pub expires: Utc,
+}
+
+/// A signing request whose signature holds.
+pub struct Asked {
+    request: CertificateSigningRequestParams,
+    /// Digest of its public key.
+    pub key: Digest,
+}
+
+/// Reads a signing request.
+///
+/// # Errors
+/// It is none, or is not signed by the key in it.
+pub fn asked(request_pem: &str) -> Result<Asked, Refusal> {
+    let bad = |text: String| Refusal::field("request_pem", text);
+    if request_pem.len() > limits::SIGNING_REQUEST_BYTES {
+        return Err(bad(format!("must be at most {} bytes", limits::SIGNING_REQUEST_BYTES)));
+    }
+    let request = CertificateSigningRequestParams::from_pem(request_pem)
+        .map_err(|error| bad(format!("must be a PKCS #10 request in PEM, signed by its own key: {error}")))?;
+    let key = Digest(sha2::Sha256::digest(request.public_key.subject_public_key_info()).into());
+    Ok(Asked { request, key })
+}
+
+impl Authority {
+    /// The one in `folder`; none if it has none.
+    pub fn load(folder: &Path, site_id: &SiteId) -> Result<Option<Self>, Error> {
+        let Some(text) = files::read(folder, FILE)? else { return Ok(None) };
+        let read = || -> Result<Self, rcgen::Error> {
+            let start = text.find("-----BEGIN CERTIFICATE").unwrap_or(text.len());
+            let (key, certificate_pem) = text.split_at(start);
+            let issuer = Issuer::from_ca_cert_pem(certificate_pem, KeyPair::from_pem(key)?)?;
+            Ok(Self { issuer, certificate_pem: certificate_pem.to_owned(), site_id: site_id.clone() })
+        };
+        read().map(Some).map_err(|source| Error::Unreadable { path: folder.join(FILE), source })
+    }
+
+    /// A new one in `folder`.
+    pub fn make(folder: &Path, site_id: &SiteId, now: Utc) -> Result<Self, Error> {
+        let mut params = CertificateParams::default();
+        params.distinguished_name = name(&format!("midshift {site_id}"));
+        params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
+        params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
+        last(&mut params, now, limits::AUTHORITY_VALID);
+        let key = KeyPair::generate().map_err(Error::Signing)?;
+        let certificate_pem = params.self_signed(&key).map_err(Error::Signing)?.pem();
+        files::write(folder, FILE, &format!("{}{certificate_pem}", key.serialize_pem()), files::PRIVATE)?;
+        Ok(Self { issuer: Issuer::new(params, key), certificate_pem, site_id: site_id.clone() })
+    }
+
+    /// Its own certificate, PEM.
+    pub fn certificate_pem(&self) -> &str {
+        &self.certificate_pem
+    }
+
+    /// For a robot: `spiffe://SITE/robot/ID`.
+    ///
+    /// # Errors
+    /// The signature cannot be made.
+    pub fn sign_robot(&self, asked: Asked, robot_id: &RobotId, now: Utc) -> Result<Signed, Error> {
+        let uri = format!("spiffe://{}/robot/{robot_id}", self.site_id);
+        let mut params = leaf(robot_id.as_str(), ExtendedKeyUsagePurpose::ClientAuth);
+        params.subject_alt_names = vec![SanType::URI(uri.try_into().map_err(Error::Signing)?)];
+        let expires = last(&mut params, now, limits::ROBOT_CERTIFICATE_VALID);
+        Ok(Signed { chain_pem: self.sign(asked, params)?.pem(), expires })
+    }
+
+    /// For a server process under these names and addresses. The root stands behind it, so that a machine that knows its digest alone can check it.
+    ///
+    /// # Errors
+    /// A name is none, or the signature cannot be made.
+    pub fn sign_server(&self, asked: Asked, names: &[String], now: Utc) -> Result<Signed, Error> {
+        let mut params = leaf("midshift", ExtendedKeyUsagePurpose::ServerAuth);
+        params.subject_alt_names = CertificateParams::new(names).map_err(Error::Signing)?.subject_alt_names;
+        let expires = last(&mut params, now, limits::SERVER_CERTIFICATE_VALID);
+        let leaf = self.sign(asked, params)?;
+        Ok(Signed { chain_pem: format!("{}{}", leaf.pem(), self.certificate_pem), expires })
+    }
+
+    fn sign(&self, mut asked: Asked, params: CertificateParams) -> Result<Certificate, Error> {
+        asked.request.params = params;
+        asked.request.signed_by(&self.issuer).map_err(Error::Signing)
+    }
+}
+
+fn leaf(common_name: &str, usage: ExtendedKeyUsagePurpose) -> CertificateParams {
+    let mut params = CertificateParams::default();
+    params.distinguished_name = name(common_name);
+    params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
+    params.extended_key_usages = vec![usage];
+    params.use_authority_key_identifier_extension = true;
+    params
+}
+
+fn name(common: &str) -> DistinguishedName {
+    let mut name = DistinguishedName::new();
+    name.push(DnType::CommonName, common);
+    name
+}
+
+/// From a day ago, for clocks that are slow, until `valid` from now.
+fn last(params: &mut CertificateParams, now: Utc, valid: LinkDuration) -> Utc {
+    let expires = now.0.saturating_add_unsigned(valid.as_ms());
+    let at = |ms: i64| OffsetDateTime::from_unix_timestamp(ms.div_euclid(1000)).unwrap_or(OffsetDateTime::UNIX_EPOCH);
+    params.not_before = at(now.0.saturating_sub_unsigned(limits::CERTIFICATE_BACKDATED.as_ms()));
+    params.not_after = at(expires);
+    Utc(expires)
+}

@@ -1,0 +1,159 @@
+//! Who is known, in memory: carried forward from the rows, changed by decisions of core, told to the ports.
+//!
+//! Invariant: a decision is told to the ports of this process before its answer leaves; other processes hear of it with the store's wake.
+
+use midshift_core::identity::{Authority, Directory, RobotIdentity, ServerCertificate, TokenId, TokenRecord};
+use midshift_core::ids::RobotId;
+use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::rows::{BadRow, Expect, Item, Record, Revision, Table, Writer};
+use midshift_core::time::Clock;
+use midshift_store::{Change, CommitError, Error, Fold, Projection, Store};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use tokio::sync::{Mutex, watch};
+
+/// Decisions that were overtaken are taken again so often.
+const TRIES: usize = 8;
+
+/// The rows as maps.
+#[derive(Debug, Default)]
+pub struct View {
+    /// Tokens.
+    pub tokens: BTreeMap<TokenId, (TokenRecord, Revision)>,
+    /// Robots.
+    pub robots: BTreeMap<RobotId, (RobotIdentity, Revision)>,
+    /// Certificates of servers, by the digest of the key.
+    pub servers: BTreeMap<String, (ServerCertificate, Revision)>,
+    /// The root.
+    pub authority: Option<(Authority, Revision)>,
+}
+
+impl Fold for View {
+    fn tables() -> &'static [Table] {
+        &[Table::Token, Table::RobotIdentity, Table::ServerCertificate, Table::Authority]
+    }
+    fn reset(&mut self) {
+        *self = Self::default();
+    }
+    fn apply(&mut self, change: Change) -> Result<(), BadRow> {
+        let revision = change.revision;
+        match change.key.table {
+            Table::Token => {
+                if let Some(token) = change.decode::<TokenRecord>()? {
+                    self.tokens.insert(token.token_id.clone(), (token, revision));
+                }
+            }
+            Table::RobotIdentity => {
+                if let Some(robot) = change.decode::<RobotIdentity>()? {
+                    self.robots.insert(robot.robot_id.clone(), (robot, revision));
+                }
+            }
+            Table::ServerCertificate => match change.decode::<ServerCertificate>()? {
+                Some(server) => drop(self.servers.insert(server.id(), (server, revision))),
+                None => drop(self.servers.remove(&*change.key.id)),
+            },
+            Table::Authority => self.authority = change.decode::<Authority>()?.map(|authority| (authority, revision)),
+            _ => {}
+        }
+        Ok(())
+    }
+}
+
+/// What a decision comes to: what is written, if anything, and what is answered.
+pub type Decision<T> = (Option<Item>, T);
+
+/// The rows, and who is told of them.
+pub struct Register {
+    store: Arc<dyn Store>,
+    clock: Arc<dyn Clock>,
+    rows: Mutex<Projection<View>>,
+    directory: watch::Sender<Arc<Directory>>,
+}
+
+impl Register {
+    /// Nothing is read yet.
+    pub fn new(store: Arc<dyn Store>, clock: Arc<dyn Clock>) -> Self {
+        Self {
+            store,
+            clock,
+            rows: Mutex::new(Projection::new(View::default())),
+            directory: watch::Sender::new(Arc::default()),
+        }
+    }
+
+    /// What ports may know.
+    pub fn directory(&self) -> watch::Receiver<Arc<Directory>> {
+        self.directory.subscribe()
+    }
+
+    /// Comes up to the store's head and tells the ports.
+    ///
+    /// # Errors
+    /// The store does not answer.
+    pub async fn refresh(&self) -> Result<(), Error> {
+        let mut rows = self.rows.lock().await;
+        rows.advance(&*self.store).await?;
+        let view = rows.fold();
+        let (tokens, robots) = (view.tokens.values().map(|(t, _)| t), view.robots.values().map(|(r, _)| r));
+        let directory = Directory::of(tokens, robots, self.clock.now().wall);
+        self.directory.send_if_modified(|known| {
+            let differs = **known != directory;
+            if differs {
+                *known = Arc::new(directory);
+            }
+            differs
+        });
+        Ok(())
+    }
+
+    /// Looks at the rows as they are now.
+    ///
+    /// # Errors
+    /// The store does not answer.
+    pub async fn look<T>(&self, look: impl FnOnce(&View) -> T) -> Result<T, Error> {
+        self.refresh().await?;
+        Ok(look(self.rows.lock().await.fold()))
+    }
+
+    /// Decides, writes, and tells the ports. What another decision has overtaken is decided again.
+    ///
+    /// # Errors
+    /// As decided; the store does not answer; nobody knows whether it was written.
+    pub async fn decide<T>(&self, mut decide: impl FnMut(&View) -> Result<Decision<T>, Refusal>) -> Result<T, Refusal> {
+        for _ in 0..TRIES {
+            let (item, answer) = self.look(&mut decide).await.map_err(unavailable)??;
+            let Some(item) = item else { return Ok(answer) };
+            match self.store.commit(vec![item]).await.remove(0) {
+                Ok(_) => {
+                    if let Err(error) = self.refresh().await {
+                        tracing::warn!(%error, "a decision is written and this port does not know it yet");
+                    }
+                    return Ok(answer);
+                }
+                Err(CommitError::Conflict { .. }) => {}
+                Err(error @ CommitError::Unavailable(_)) => return Err(unavailable(error)),
+                Err(error @ CommitError::Unknown(_)) => {
+                    tracing::warn!(%error, "nobody knows whether a decision was written");
+                    return Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown));
+                }
+                Err(error) => {
+                    tracing::error!(%error, "a decision cannot be written");
+                    return Err(Refusal::new(Kind::Internal, Code::Internal));
+                }
+            }
+        }
+        Err(Refusal::new(Kind::Conflict, Code::MovedMeanwhile))
+    }
+}
+
+/// An item that writes one record: new, or over the one that was looked at.
+pub fn written<R: Record>(record: &R, at: Option<Revision>, actor: &str, kind: &'static str) -> Item {
+    let mut item = Item::new(Writer::Identity, actor);
+    item.put(record, at.map_or(Expect::Absent, Expect::At), kind);
+    item
+}
+
+fn unavailable(error: impl std::error::Error) -> Refusal {
+    tracing::warn!(%error, "the store does not answer");
+    Refusal::new(Kind::Unavailable, Code::StoreUnavailable)
+}

@@ -1,0 +1,124 @@
+//! The door of a port: an edge around its services, and who may come in: everybody in plain text (`dev`), or whom identity knows, over TLS.
+//!
+//! Invariant: every port of the binary has this door and no other; what a request may do was decided before a service sees it.
+
+use anyhow::Context;
+use midshift_core::identity::Directory;
+use midshift_core::ids::SiteId;
+use midshift_core::limits;
+use midshift_core::time::Clock;
+use midshift_edge::tls::{Clients, server_config};
+use midshift_edge::{Anybody, Config, Edge, Known, Listen, Rate};
+use midshift_identity::ServerProof;
+use rustls::ServerConfig;
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use std::num::NonZeroU32;
+use std::sync::Arc;
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+use tonic::service::Routes;
+
+/// How much one peer may take of a port.
+#[derive(Clone, Copy, Debug, clap::Args)]
+pub struct Share {
+    /// Connections from one address, or one /64 of IPv6, at a time. A proxy in front is one address.
+    #[arg(long, default_value_t = limits::CONNECTIONS_PER_NETWORK_MAX)]
+    pub connections_per_address: usize,
+    /// Requests that one robot, token or address may begin a second, for long; ten times as many at once.
+    #[arg(long, default_value = "1000")]
+    pub requests_per_second: NonZeroU32,
+}
+
+impl Share {
+    /// The limits of a port with this name.
+    pub fn config(self, port: &'static str) -> Config {
+        let burst = self.requests_per_second.saturating_mul(const { NonZeroU32::new(10).unwrap() });
+        let rate = Rate { per_second: self.requests_per_second, burst };
+        Config { port, connections_per_network_max: self.connections_per_address, rate, ..Config::default() }
+    }
+}
+
+/// Limits of a port without login, where all robots and people come from one address.
+pub fn alone(port: &'static str) -> Config {
+    let all = const { NonZeroU32::new(1_000_000).unwrap() };
+    let rate = Rate { per_second: all, burst: all };
+    let requests_per_principal_max = limits::REQUESTS_MAX;
+    Config {
+        port,
+        connections_per_network_max: limits::CONNECTIONS_MAX,
+        requests_per_principal_max,
+        rate,
+        // Programs of the same machine dial long before they ask.
+        first_request: limits::CONNECTION_IDLE,
+        ..Config::default()
+    }
+}
+
+/// What a port with login follows while it is open.
+pub struct Login {
+    /// Which site's robots.
+    pub site_id: SiteId,
+    /// For the expiry of tokens.
+    pub clock: Arc<dyn Clock>,
+    /// Who is known.
+    pub directory: watch::Receiver<Arc<Directory>>,
+    /// What the port proves itself with.
+    pub proof: watch::Receiver<ServerProof>,
+}
+
+/// Serves `listener` until `stop`, then drains and cuts. Without a login everybody may do everything, in plain text.
+///
+/// # Errors
+/// What the port is to prove itself with cannot be used.
+pub async fn serve<L: Listen>(
+    config: Config,
+    login: Option<Login>,
+    services: Routes,
+    listener: L,
+    stop: CancellationToken,
+) -> anyhow::Result<()> {
+    let Some(login) = login else {
+        Edge::new(config, Arc::new(Anybody::default()), services).serve(listener, stop).await;
+        return Ok(());
+    };
+    let Login { site_id, clock, mut directory, mut proof } = login;
+    let known = Arc::new(Known::new(site_id, clock));
+    known.publish((**directory.borrow_and_update()).clone());
+    let tls = watch::Sender::new(tls(&proof.borrow_and_update().clone())?);
+    let edge = Edge::new(config, known.clone(), services).with_tls(tls.subscribe());
+    let following = async {
+        while directory.changed().await.is_ok() {
+            known.publish((**directory.borrow_and_update()).clone());
+        }
+        std::future::pending::<()>().await;
+    };
+    let renewing = async {
+        while proof.changed().await.is_ok() {
+            let newest = proof.borrow_and_update().clone();
+            match self::tls(&newest) {
+                Ok(newest) => drop(tls.send_replace(newest)),
+                Err(error) => tracing::error!(
+                    error = format!("{error:#}"),
+                    "a renewed certificate is of no use; the old one stays"
+                ),
+            }
+        }
+        std::future::pending::<()>().await;
+    };
+    tokio::select! {
+        _ = edge.serve(listener, stop) => Ok(()),
+        () = following => Ok(()),
+        () = renewing => Ok(()),
+    }
+}
+
+fn tls(proof: &ServerProof) -> anyhow::Result<Arc<ServerConfig>> {
+    let certificates = |pem: &str| -> anyhow::Result<Vec<CertificateDer<'static>>> {
+        Ok(CertificateDer::pem_slice_iter(pem.as_bytes()).collect::<Result<_, _>>()?)
+    };
+    let chain = certificates(&proof.chain_pem).context("reading the server's certificate")?;
+    let key = PrivateKeyDer::from_pem_slice(proof.key_pem.as_bytes()).context("reading the server's key")?;
+    let roots = certificates(&proof.authority_pem).context("reading the site's root")?;
+    server_config(chain, key, Clients::Asked(roots)).context("what the server proves itself with")
+}
