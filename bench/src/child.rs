@@ -135,7 +135,12 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 site,
                 data,
                 listen,
-                insecure: false,
+                insecure: true,
+                names: Vec::new(),
+                first_token_file: None,
+                spare_token: false,
+                share: Default::default(),
+                trust: None,
                 database: midshift::storage::Database { store },
                 beacon_listen: None,
                 software: Software { ota_keys, ota_quota_gib: 1, ota_spare_gib: 0, ota_keep_days: 7 },
@@ -172,7 +177,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 trust: None,
                 stop: StopFlags::default(),
             };
-            midshift::robots::swarm(swarm, stop).await
+            midshift::robots::swarm(swarm, None, stop).await
         }
         Role::Hearers(args) => {
             let heard = Arc::new(crate::ota::hearers::Heard::of(args.robots));

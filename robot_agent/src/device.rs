@@ -2,6 +2,7 @@
 //!
 //! Invariant: the secret never leaves the machine: it is shown, logged and sent nowhere.
 
+use crate::store::{self, Op, Store};
 use midshift_bundle::installed;
 use midshift_bundle::keys::SecretKey;
 use midshift_core::update::Installed;
@@ -34,6 +35,19 @@ impl DeviceKey {
     pub fn seal(&self, installed: Installed) -> String {
         installed::seal(installed, &self.0)
     }
+}
+
+/// The key on a ledger, made if it has none. A new store formats its ring with `new_ring_id`.
+///
+/// # Errors
+/// The ledger cannot be read or written.
+pub async fn key_of(store: &mut dyn Store, new_ring_id: &str) -> Result<DeviceKey, store::Error> {
+    if let Some(key) = store.load(new_ring_id).await?.ledger.device {
+        return Ok(key);
+    }
+    let key = DeviceKey::draw();
+    store.commit(&[Op::Device(key.clone())]).await?;
+    Ok(key)
 }
 
 impl PartialEq for DeviceKey {

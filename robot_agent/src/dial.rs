@@ -13,6 +13,7 @@ use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::TcpStream;
 use tokio::sync::watch;
+use tokio_rustls::client::TlsStream;
 use tokio_util::either::Either;
 use tonic::codec::BufferSettings;
 use tonic::transport::{Channel, Endpoint};
@@ -107,7 +108,8 @@ impl TcpDial {
         Self::over(bulk_endpoint(uri)?, network)
     }
 
-    fn over(endpoint: Endpoint, network: Option<watch::Receiver<bool>>) -> Result<Self, Error> {
+    /// With settings of one's own.
+    pub fn over(endpoint: Endpoint, network: Option<watch::Receiver<bool>>) -> Result<Self, Error> {
         let authority = endpoint.uri().authority().map(ToString::to_string);
         let address = authority.ok_or_else(|| Error("the address needs a host and a port".into()))?;
         Ok(Self { endpoint, address, network, tls: None })
@@ -120,27 +122,49 @@ impl TcpDial {
     }
 }
 
+impl TcpDial {
+    /// A connection that is made when it is used.
+    pub fn lazy(&self) -> Channel {
+        self.endpoint.connect_with_connector_lazy(self.connector())
+    }
+
+    fn connector(
+        &self,
+    ) -> impl tower::Service<tonic::transport::Uri, Response = TokioIo<Wire>, Error = io::Error, Future: Send> + Send + use<>
+    {
+        let dial = self.clone();
+        tower::service_fn(move |_: tonic::transport::Uri| {
+            let dial = dial.clone();
+            async move { dial.wire().await.map(TokioIo::new) }
+        })
+    }
+
+    /// A connection without HTTP.
+    ///
+    /// # Errors
+    /// Nobody is there, or it is none of the site.
+    pub async fn wire(&self) -> io::Result<Wire> {
+        if let Some(network) = &self.network {
+            let mut network = network.clone();
+            network.wait_for(|up| *up).await.map_err(io::Error::other)?;
+        }
+        let stream = TcpStream::connect(&self.address).await?;
+        tune(&stream)?;
+        let stream = Cut::new(stream, self.network.clone());
+        Ok(match &self.tls {
+            Some(tls) => Either::Right(Box::new(tls.over(stream).await?)),
+            None => Either::Left(stream),
+        })
+    }
+}
+
+/// Plain or TLS.
+pub type Wire = Either<Cut<TcpStream>, Box<TlsStream<Cut<TcpStream>>>>;
+
 #[async_trait]
 impl Dial for TcpDial {
     async fn dial(&self) -> Result<Channel, Error> {
-        let Self { address, network, tls, .. } = self.clone();
-        let connect = tower::service_fn(move |_: tonic::transport::Uri| {
-            let (address, network, tls) = (address.clone(), network.clone(), tls.clone());
-            async move {
-                if let Some(network) = &network {
-                    let mut network = network.clone();
-                    network.wait_for(|up| *up).await.map_err(io::Error::other)?;
-                }
-                let stream = TcpStream::connect(&address).await?;
-                tune(&stream)?;
-                let stream = Cut::new(stream, network);
-                Ok::<_, io::Error>(TokioIo::new(match tls {
-                    Some(tls) => Either::Right(Box::new(tls.over(stream).await?)),
-                    None => Either::Left(stream),
-                }))
-            }
-        });
-        self.endpoint.connect_with_connector(connect).await.map_err(|e| Error(e.into()))
+        self.endpoint.connect_with_connector(self.connector()).await.map_err(|e| Error(e.into()))
     }
 }
 

@@ -20,6 +20,7 @@ use midshift_agent::starts::HANG_SECONDS;
 use midshift_agent::stop::keep::{FileStops, KeepStops, MemoryStops, STOP_FILE};
 use midshift_agent::stop::line::StopLine;
 use midshift_agent::store::{self, Store};
+use midshift_agent::tls::Tls;
 use midshift_agent::trust::Trust;
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::robot::StopLevel;
@@ -46,6 +47,8 @@ const RESTART: Duration = Duration::from_millis(500);
 
 /// Makes the way to the server for one robot; nothing may pass while its network says false.
 pub type DialFor = Arc<dyn Fn(&RobotId, watch::Receiver<bool>) -> Result<Arc<dyn Dial>, dial::Error> + Send + Sync>;
+/// How each robot speaks TLS; one that is not in it speaks plain text.
+pub type TlsOf = Arc<BTreeMap<RobotId, Tls>>;
 /// Whether a task still wants its item from the robot that carries it.
 pub type Live = Arc<dyn Fn(&TaskId) -> bool + Send + Sync>;
 
@@ -92,6 +95,8 @@ pub struct SwarmConfig {
     pub dial: DialFor,
     /// The same beside the sessions: for software and old STATUS.
     pub bulk: DialFor,
+    /// How robots speak TLS.
+    pub tls: TlsOf,
     /// The way to the stop service, at its own address; none: they have none, and obey no fleet stop.
     pub stop: Option<DialFor>,
     /// Where ledgers and rings are kept: in memory, or in `<dir>/<robot_id>/agent.db`.
@@ -109,21 +114,33 @@ pub struct SwarmConfig {
 }
 
 impl SwarmConfig {
-    /// With stop lines over TCP to `http://host:port`.
+    /// With stop lines over TCP to `uri`; over TLS if its sessions are.
     #[must_use]
     pub fn with_stop(self, uri: &str) -> Self {
-        let uri = uri.to_owned();
-        let dial: DialFor = Arc::new(move |_, network| Ok(Arc::new(TcpDial::new(&uri, Some(network))?)));
+        let (uri, tls) = (uri.to_owned(), self.tls.clone());
+        let dial: DialFor = Arc::new(move |robot, network| {
+            Ok(Arc::new(TcpDial::new(&uri, Some(network))?.with_tls(tls.get(robot).cloned())))
+        });
         Self { stop: Some(dial), ..self }
     }
     /// Over TCP to `http://host:port`, all in memory, with a person to whom no load is dear.
     pub fn tcp(hall: Arc<Hall>, clock: Arc<dyn Clock>, uri: &str, seed: u64) -> Self {
+        Self::over(hall, clock, uri, Arc::default(), seed)
+    }
+    /// As [`SwarmConfig::tcp`], to `https://host:port` for those robots that have a way to speak TLS.
+    pub fn over(hall: Arc<Hall>, clock: Arc<dyn Clock>, uri: &str, tls: TlsOf, seed: u64) -> Self {
         let (link, bulk) = (uri.to_owned(), uri.to_owned());
+        let (link_tls, bulk_tls) = (tls.clone(), tls.clone());
         Self {
             hall,
             clock,
-            dial: Arc::new(move |_, network| Ok(Arc::new(TcpDial::new(&link, Some(network))?))),
-            bulk: Arc::new(move |_, network| Ok(Arc::new(TcpDial::bulk(&bulk, Some(network))?))),
+            dial: Arc::new(move |robot, network| {
+                Ok(Arc::new(TcpDial::new(&link, Some(network))?.with_tls(link_tls.get(robot).cloned())))
+            }),
+            bulk: Arc::new(move |robot, network| {
+                Ok(Arc::new(TcpDial::bulk(&bulk, Some(network))?.with_tls(bulk_tls.get(robot).cloned())))
+            }),
+            tls,
             stop: None,
             persistence: Persistence::Memory,
             seed,

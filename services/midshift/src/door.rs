@@ -30,6 +30,13 @@ pub struct Share {
     pub requests_per_second: NonZeroU32,
 }
 
+impl Default for Share {
+    fn default() -> Self {
+        const PER_SECOND: NonZeroU32 = NonZeroU32::new(limits::REQUESTS_PER_SECOND).unwrap();
+        Self { connections_per_address: limits::CONNECTIONS_PER_NETWORK_MAX, requests_per_second: PER_SECOND }
+    }
+}
+
 impl Share {
     /// The limits of a port with this name.
     pub fn config(self, port: &'static str) -> Config {

@@ -1,14 +1,20 @@
 //! Robots in processes of their own: one agent with a simulated body that survives its process, or a swarm against a server elsewhere.
 
+use crate::machines::Machines;
 use crate::software::{self, Software};
+use crate::way::Way;
 use crate::{clock, site_file};
 use anyhow::{Context, bail};
 use midshift_agent::bulk::Bulk;
 use midshift_agent::core::ExitReason;
+use midshift_agent::device;
 use midshift_agent::dial::TcpDial;
 use midshift_agent::durable;
+use midshift_agent::enrolment::{self, Enrolled, Identity, Invitation};
+use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::stop::keep::{FileStops, STOP_FILE};
 use midshift_agent::stop::line::StopLine;
+use midshift_agent::store::Store;
 use midshift_core::ids::{RobotId, WaypointId};
 use midshift_core::time::Clock;
 use midshift_sim::body::{BodyConfig, SimBody};
@@ -20,7 +26,7 @@ use midshift_sim::service::SimFace;
 use midshift_sim::swarm::{AGENT_FILE, Swarm, SwarmConfig};
 use midshift_sim::world::WorldConfig;
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::TcpListener;
@@ -41,11 +47,11 @@ pub struct StopFlags {
 
 impl StopFlags {
     /// Where the stop service is; none: there is to be no line, which is said aloud.
-    fn uri(&self) -> Option<String> {
+    fn address(&self) -> Option<&str> {
         if self.stop_server.is_none() {
             tracing::warn!("no stop line: fleet stop does not reach these robots by a way of its own");
         }
-        self.stop_server.as_deref().map(uri)
+        self.stop_server.as_deref()
     }
 }
 
@@ -61,6 +67,9 @@ pub struct AgentRun {
     /// Where the ledger, the body and its journal are kept: a killed agent does not teleport its body or lose its load.
     #[arg(long)]
     pub data: PathBuf,
+    /// What `midshift robot enroll` printed, once: this machine becomes the robot, and keeps its certificate in --data.
+    #[arg(long, env = "MIDSHIFT_ENROLL", hide_env_values = true, value_name = "SECRET", value_parser = invitation)]
+    pub enroll: Option<Arc<Invitation>>,
     /// The site file the body lives on. Without it the built-in demo site.
     #[arg(long)]
     pub site: Option<PathBuf>,
@@ -135,6 +144,10 @@ pub struct SimRun {
     pub stop: StopFlags,
 }
 
+fn invitation(text: &str) -> Result<Arc<Invitation>, enrolment::Error> {
+    text.parse().map(Arc::new)
+}
+
 fn part(text: &str) -> Result<(usize, usize), String> {
     let bad = || "must be FROM..TO, from 1, TO not included".to_owned();
     let (from, to) = text.split_once("..").ok_or_else(bad)?;
@@ -142,9 +155,13 @@ fn part(text: &str) -> Result<(usize, usize), String> {
     if from == 0 || to <= from { Err(bad()) } else { Ok((from - 1, to - 1)) }
 }
 
-/// The address with its scheme.
+/// The address with its scheme, for plain text.
 pub fn uri(server: &str) -> String {
-    if server.contains("://") { server.to_owned() } else { format!("http://{server}") }
+    with_scheme("http", server)
+}
+
+fn with_scheme(scheme: &str, server: &str) -> String {
+    if server.contains("://") { server.to_owned() } else { format!("{scheme}://{server}") }
 }
 
 /// Runs one agent until `stop`. Fenced twice is an error: another machine has this robot's name.
@@ -173,7 +190,24 @@ pub async fn agent_in_hand(
     if site.find(&start).is_none() {
         bail!("the site has no waypoint {start}");
     }
-    let software = args.sets.as_deref().zip(args.trust.as_deref());
+    let mut store: Box<dyn Store> = Box::new(SqliteStore::open(&args.data.join(AGENT_FILE)).await?);
+    let new_ring_id = format!("{:032x}", rand::random::<u128>());
+    let identity = match &args.enroll {
+        None if Enrolled::read(&args.data)?.is_none() => {
+            tracing::warn!(
+                server = args.server,
+                "not enrolled: the session is plain text, and the server must let everybody in"
+            );
+            None
+        }
+        invitation => {
+            let key = device::key_of(&mut *store, &new_ring_id).await?;
+            Some(Identity::open(&args.data, &robot_id, key, &args.server, invitation.as_deref()).await?)
+        }
+    };
+    let tls = identity.as_ref().map(Identity::tls);
+    let trust = args.trust.clone().or(trust_of_site(&args.data, identity.as_ref())?);
+    let software = args.sets.as_deref().zip(trust.as_deref());
     let software = software.map(|(sets, trust)| Software::open(sets, software::trust_of(trust, &site)?)).transpose()?;
     let mut config = BodyConfig::new(robot_id.clone(), args.seed, start);
     if let Some(software) = &software {
@@ -193,9 +227,12 @@ pub async fn agent_in_hand(
     let _person =
         args.person.then(|| AbortOnDropHandle::new(tokio::spawn(visit(handle.clone(), args.seed, clock.clone()))));
     let (network, stop_network) = (handle.network(), handle.stop_network());
-    let uri = uri(&args.server);
-    let link = Arc::new(TcpDial::new(&uri, Some(network.clone()))?);
-    let bulk = Bulk::new(Arc::new(TcpDial::bulk(&uri, Some(network))?));
+    let scheme = if tls.is_some() { "https" } else { "http" };
+    let uri = with_scheme(scheme, &args.server);
+    let link = Arc::new(TcpDial::new(&uri, Some(network.clone()))?.with_tls(tls.clone()));
+    let bulk = Bulk::new(Arc::new(TcpDial::bulk(&uri, Some(network))?.with_tls(tls.clone())));
+    let _renewing =
+        identity.map(|identity| AbortOnDropHandle::new(tokio::spawn(identity.keep(link.clone(), clock.clone()))));
     let mut pulse = midshift_agent::pulse::for_launcher();
     if let Some(software) = &software {
         pulse = software.pulse(pulse, &clock);
@@ -204,10 +241,9 @@ pub async fn agent_in_hand(
     if let Some(update) = &mut update {
         update.config.clock_synced = !args.clock_unsynced;
     }
-    let store = midshift_agent::sqlite::SqliteStore::open(&args.data.join(AGENT_FILE)).await?;
-    let stop_line = match args.stop.uri() {
-        Some(uri) => Some(StopLine {
-            dial: Arc::new(TcpDial::new(&uri, Some(stop_network))?),
+    let stop_line = match args.stop.address() {
+        Some(address) => Some(StopLine {
+            dial: Arc::new(TcpDial::new(&with_scheme(scheme, address), Some(stop_network))?.with_tls(tls.clone())),
             keep: Box::new(FileStops::new(&args.data.join(STOP_FILE))),
         }),
         None => None,
@@ -217,18 +253,28 @@ pub async fn agent_in_hand(
         update,
         robot_id,
         boot_id: format!("{:032x}", rand::random::<u128>()),
-        new_ring_id: format!("{:032x}", rand::random::<u128>()),
+        new_ring_id,
         seed: rand::random(),
         bugs: midshift_agent::bugs::Bugs::default(),
         pulse,
     };
     let lines = midshift_agent::session::Lines { link, bulk };
-    match midshift_agent::session::run(agent, Box::new(handle), Box::new(store), clock, lines, stop).await? {
+    match midshift_agent::session::run(agent, Box::new(handle), store, clock, lines, stop).await? {
         reason @ (ExitReason::Shutdown | ExitReason::Switched) => Ok(reason),
         ExitReason::FencedTwice => {
             bail!("fenced twice: another machine runs as this robot. Find it, then start this one again")
         }
     }
+}
+
+/// The trust file that came with the enrolment, if one did.
+fn trust_of_site(data: &Path, identity: Option<&Identity>) -> anyhow::Result<Option<PathBuf>> {
+    let Some(text) = identity.map(|identity| &identity.enrolled().trust_json).filter(|text| !text.is_empty()) else {
+        return Ok(None);
+    };
+    let path = data.join("trust.json");
+    durable::replace(&path, text.as_bytes()).with_context(|| format!("writing {}", path.display()))?;
+    Ok(Some(path))
 }
 
 /// A person who looks after one robot.
@@ -242,8 +288,8 @@ async fn visit(robot: SimHandle, seed: u64, clock: Arc<dyn Clock>) {
     }
 }
 
-/// Runs a swarm until `stop`.
-pub async fn swarm(args: SimRun, stop: CancellationToken) -> anyhow::Result<()> {
+/// Runs a swarm until `stop`; enrolled by whoever is signed in, or in plain text.
+pub async fn swarm(args: SimRun, signed_in: Option<Way>, stop: CancellationToken) -> anyhow::Result<()> {
     let site = site_file::load(args.site.as_deref(), None, None)?.site;
     let clock: Arc<dyn Clock> = clock::clock(1000);
     let mut config = HallConfig::new(site, args.robots, args.seed);
@@ -258,10 +304,20 @@ pub async fn swarm(args: SimRun, stop: CancellationToken) -> anyhow::Result<()> 
     }
     let trust = args.trust.as_deref().map(|file| software::trust_of(file, &config.site)).transpose()?;
     let hall = Arc::new(Hall::open(&config, &clock.now())?);
-    let mut swarm = SwarmConfig::tcp(hall.clone(), clock.clone(), &uri(&args.server), args.seed);
-    if let Some(uri) = args.stop.uri() {
-        swarm = swarm.with_stop(&uri);
+    let (machines, scheme) = match &signed_in {
+        None => (None, "http"),
+        Some(way) => {
+            let ids = hall.robots().iter().map(|robot| robot.robot_id().clone()).collect();
+            (Some(Machines::enrol(way, &args.server, ids, args.data.as_deref()).await?), "https")
+        }
+    };
+    let tls = machines.as_ref().map(Machines::tls).unwrap_or_default();
+    let mut swarm =
+        SwarmConfig::over(hall.clone(), clock.clone(), &with_scheme(scheme, &args.server), Arc::new(tls), args.seed);
+    if let Some(address) = args.stop.address() {
+        swarm = swarm.with_stop(&with_scheme(scheme, address));
     }
+    let _renewing = machines.map(|machines| machines.keep(&args.server, &clock)).transpose()?;
     swarm.software = trust;
     swarm.persistence = config.persistence.clone();
     let swarm = Swarm::new(swarm);

@@ -1,6 +1,5 @@
 //! How the two servers begin and end: what they refuse to begin with, what they print, and that they leave when asked to.
 
-use crate::engine::fresh_store;
 use crate::harness::{Running, Server, channel, midshift, until};
 use anyhow::Context;
 use midshift_proto::task::v1::WatchTasksRequest;
@@ -30,28 +29,6 @@ async fn printed_address(log: &Path) -> anyhow::Result<SocketAddr> {
         Ok(address.and_then(|a| a.parse().ok()))
     })
     .await
-}
-
-#[tokio::test]
-async fn serve_refuses_to_leave_loopback_unless_somebody_says_insecure() -> anyhow::Result<()> {
-    let dir = tempfile::tempdir()?;
-    let (code, said) = refused(dir.path(), &["serve", "--listen", "0.0.0.0:0"]).await?;
-    assert_eq!(code, Some(1), "{said}");
-    assert!(said.contains("0.0.0.0:0 is not loopback") && said.contains("Add --insecure if you mean it"), "{said}");
-    assert!(!dir.path().join("midshift-data").exists(), "it had begun");
-
-    let log = dir.path().join("open.log");
-    let mut command = Command::new(midshift()?);
-    command.env("MIDSHIFT_NO_STOP", "true").current_dir(dir.path());
-    command.args(["serve", "--listen", "0.0.0.0:0", "--insecure"]).args(fresh_store()?);
-    let mut open = Running::start(&mut command, &log)?;
-    until("the server to say that it serves", LIMIT, || async {
-        Ok(std::fs::read_to_string(&log)?.contains("midshift serves").then_some(()))
-    })
-    .await?;
-    open.signal("TERM")?;
-    assert_eq!(open.ends().await?, Some(0));
-    Ok(())
 }
 
 #[tokio::test]

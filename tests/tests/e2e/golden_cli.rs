@@ -201,7 +201,7 @@ async fn releases(room: &Room, t: &mut Transcript) -> anyhow::Result<()> {
     let address = free_port()?;
     let mut command = Command::new(&t.program);
     command.env("MIDSHIFT_NO_STOP", "true");
-    command.args(["serve", "--data", "served", "--ota-keys", "keys", "--listen", &address.to_string()]);
+    command.args(["serve", "--insecure", "--data", "served", "--ota-keys", "keys", "--listen", &address.to_string()]);
     command.args(["--site", "site.toml"]).args(fresh_store()?);
     let _serve = Running::start(command.current_dir(&t.dir), &t.dir.join("serve.log"))?;
     until("the server of software", LIMIT, || async {

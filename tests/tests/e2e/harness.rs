@@ -187,7 +187,7 @@ impl Server {
         // Its stop service would outlive the test, on a port that all tests share.
         command
             .env("MIDSHIFT_NO_STOP", "true")
-            .args(["serve", "--data"])
+            .args(["serve", "--insecure", "--data"])
             .arg(dir.join("data"))
             .args(["--listen", &address.to_string()]);
         command.arg("--site").arg(dir.join(SITE_FILE)).args(flags);

@@ -218,7 +218,7 @@ fn run(
     log: &Path,
 ) -> anyhow::Result<Running> {
     let mut command = Command::new(midshift()?);
-    command.args(["serve", "--roles", role, "--store", url, "--listen", &address.to_string(), "--data"]);
+    command.args(["serve", "--insecure", "--roles", role, "--store", url, "--listen", &address.to_string(), "--data"]);
     command.arg(dir.join("data")).arg("--site").arg(site).args(&flags.of_all);
     if role == "ota" {
         command.args(&flags.of_ota);

@@ -38,7 +38,7 @@ impl StopServer {
     }
     fn run(dir: &Path, address: SocketAddr) -> anyhow::Result<Running> {
         let mut command = Command::new(midshift()?);
-        command.args(["stop", "serve", "--listen", &address.to_string(), "--data"]).arg(dir.join("data"));
+        command.args(["stop", "serve", "--insecure", "--listen", &address.to_string(), "--data"]).arg(dir.join("data"));
         Running::start(command.arg("--site").arg(dir.join("site.toml")), &dir.join("stop.log"))
     }
     async fn kill_and_restart(&mut self) -> anyhow::Result<()> {

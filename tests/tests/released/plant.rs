@@ -60,7 +60,7 @@ impl Server {
         let mut command = Command::new(midshift()?);
         command
             .env("MIDSHIFT_NO_STOP", "true")
-            .arg("serve")
+            .args(["serve", "--insecure"])
             .arg("--data")
             .arg(dir.join("data"))
             .args(["--listen", &address.to_string()]);

@@ -20,6 +20,7 @@ use midshift_core::robot::StopLevel;
 use midshift_core::site::{DEMO, Site, text};
 use midshift_core::task::machine::Phase;
 use midshift_core::time::{SiteDuration, SiteTime};
+use midshift_edge::Incoming;
 use midshift_ota::rollouts::RolloutService;
 use midshift_sim::faults::{FaultRates, Injected};
 use midshift_sim::hall::{Hall, HallConfig};
@@ -29,6 +30,11 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio_util::sync::CancellationToken;
+
+/// Where machines of the simulation are, for a port that counts addresses.
+const fn nowhere(_: &net::Connection) -> std::net::SocketAddr {
+    std::net::SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 1)
+}
 
 /// Time of one step of the network.
 const TICK: Duration = Duration::from_millis(10);
@@ -274,6 +280,8 @@ fn serve(
                     sim: None,
                     naive: naive.server,
                     stops: None,
+                    identity: None,
+                    port: midshift::door::alone("business"),
                     planning: tokio::runtime::Handle::current(),
                 };
                 // A service manager starts a server again that could not read its disk.
@@ -295,7 +303,9 @@ fn serve(
                             planner.run(CancellationToken::new()).await
                         });
                     }
-                    server.serve(net::incoming(wire.clone()).await?).await?;
+                    server
+                        .serve(Incoming::new(net::incoming(wire.clone()).await?, nowhere as fn(&net::Connection) -> _))
+                        .await?;
                 }
                 tokio::time::sleep(Duration::from_millis(500)).await;
             }

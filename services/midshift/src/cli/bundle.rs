@@ -174,7 +174,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Rekey { by, keys, number, out: into } => rekey(&by, &keys, number, &into, out),
         Verb::Sign { bundle, pending: _, repository, key, server, upstream } => {
             if let Some(server) = server {
-                push::has_all_of_server(Folder::open(&repository)?, &Call { server }).await?;
+                push::has_all_of_server(Folder::open(&repository)?, &Call::to(server)).await?;
             }
             if let Some(copy) = upstream {
                 push::has_all_of_copy(&Folder::open(&repository)?, &Folder::open(&copy)?)?;

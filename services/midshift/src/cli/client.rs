@@ -1,27 +1,27 @@
 //! Calls of the command line: which server, what an error means for a person and for the exit code.
 
+use crate::cli::context::Contexts;
 use crate::cli::out::Out;
-use crate::robots::uri;
+use crate::way::{Line, Way};
 use midshift_bundle::build;
 use midshift_bundle::folder::Error;
 use midshift_core::reason::{Kind, Refusal};
 use midshift_proto::convert::time_of;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
+use midshift_proto::identity::v1::identity_service_client::IdentityServiceClient;
 use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::sim::v1::sim_service_client::SimServiceClient;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
 use std::ops::ControlFlow;
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 use tokio::time::Instant;
-use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Request, Status, Streaming};
 use tonic_health::pb::health_client::HealthClient;
 
-/// A server that does not answer a connection within this is not there.
-const CONNECT_WITHIN: Duration = Duration::from_secs(3);
 /// Longest unary call.
 const CALL_WITHIN: Duration = Duration::from_secs(30);
 /// A server that is gone while something is followed may stay away so long.
@@ -34,12 +34,90 @@ const PAUSE_MAX: Duration = Duration::from_secs(5);
 const NOT_THERE: &str = "this server does not know the call\n  try: faults and worlds are with `midshift dev` or `midshift sim run --listen`; \
      for anything else look at the server's version";
 
-/// Which server.
+/// Which server, and as whom.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Call {
+    /// The server, host:port. Without it that of the context, or 127.0.0.1:7420.
+    #[arg(long, env = "MIDSHIFT_SERVER")]
+    server: Option<String>,
+    /// As whom.
+    #[command(flatten)]
+    login: Login,
+}
+
+/// As whom a server is asked.
+#[derive(Clone, Debug, Default, clap::Args)]
+pub struct Login {
+    /// Which of the remembered sites (`midshift context ls`). Without it the current one.
+    #[arg(long, env = "MIDSHIFT_CONTEXT", value_name = "NAME")]
+    context: Option<String>,
+    /// The site's root certificate, PEM. Without it that of the context; where there is neither, plain text.
+    #[arg(long, env = "MIDSHIFT_CA", value_name = "FILE")]
+    ca: Option<PathBuf>,
+    /// Where the token is. Without it MIDSHIFT_TOKEN, or that of the context.
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
+}
+
+/// Where the business server is if nobody says otherwise.
+const SERVER: &str = "127.0.0.1:7420";
+
+/// What flags, environment and context come to.
+pub struct Resolved {
     /// The server, host:port.
-    #[arg(long, env = "MIDSHIFT_SERVER", default_value = "127.0.0.1:7420")]
     pub server: String,
+    /// The stop service, host:port, if the context names one.
+    pub stop_server: Option<String>,
+    authority_pem: Option<String>,
+    token: Option<String>,
+}
+
+impl Login {
+    /// With `server` if it was named. A context stands for its own server alone: another one gets neither its root nor its token.
+    pub fn resolve(&self, server: Option<&str>) -> Result<Resolved, Exit> {
+        let contexts = Contexts::read()?;
+        let known = contexts.pick(self.context.as_deref())?;
+        let known = known.filter(|known| server.is_none_or(|server| server == known.server) || self.context.is_some());
+        let read = |file: &PathBuf| {
+            std::fs::read_to_string(file).map_err(|error| Exit::usage(format!("reading {}: {error}", file.display())))
+        };
+        let from_environment = || std::env::var("MIDSHIFT_TOKEN").ok().filter(|token| !token.is_empty());
+        let token = match &self.token_file {
+            Some(file) => Some(read(file)?),
+            None => from_environment().or_else(|| known.map(|known| known.token.clone())),
+        };
+        let authority_pem = match &self.ca {
+            Some(file) => Some(read(file)?),
+            None => known.map(|known| known.authority_pem.clone()),
+        };
+        let server = server.map(str::to_owned).or_else(|| known.map(|known| known.server.clone()));
+        Ok(Resolved {
+            server: server.unwrap_or_else(|| SERVER.to_owned()),
+            stop_server: known.and_then(|known| known.stop_server.clone()),
+            authority_pem,
+            token,
+        })
+    }
+}
+
+impl Resolved {
+    /// A server in plain text, without a context.
+    #[cfg(test)]
+    pub fn plain(server: &str) -> Self {
+        Self { server: server.to_owned(), stop_server: None, authority_pem: None, token: None }
+    }
+    /// Whether a root is known.
+    pub const fn is_secure(&self) -> bool {
+        self.authority_pem.is_some()
+    }
+    /// The way to `address` of this site.
+    pub fn way(&self, address: &str) -> Result<Way, Exit> {
+        let way = match &self.authority_pem {
+            Some(root) => Way::secure(address, root, self.token.as_deref()),
+            None => Way::plain(address),
+        };
+        way.map_err(|error| Exit::usage(format!("{error:#}")))
+    }
 }
 
 /// An end that is not success.
@@ -208,47 +286,74 @@ async fn again<T>(open: &impl AsyncFn() -> Result<Streaming<T>, Exit>) -> Result
 }
 
 impl Call {
-    async fn channel(&self) -> Result<Channel, Exit> {
-        let endpoint = Endpoint::from_shared(uri(&self.server))
-            .map_err(|e| Exit::usage(format!("--server {}: {e}", self.server)))?;
-        endpoint.connect_timeout(CONNECT_WITHIN).connect().await.map_err(|_| {
-            Exit::new(
-                5,
-                format!(
-                    "no server at {}\n  try: start one with `midshift dev`, or name another with --server",
-                    self.server
-                ),
-            )
-        })
+    /// This server, as whom environment and context say.
+    pub fn to(server: String) -> Self {
+        Self { server: Some(server), login: Login::default() }
+    }
+    /// The server, host:port.
+    pub fn address(&self) -> Result<String, Exit> {
+        Ok(self.resolved()?.server)
+    }
+    /// What flags, environment and context come to.
+    pub fn resolved(&self) -> Result<Resolved, Exit> {
+        self.login.resolve(self.server.as_deref())
+    }
+    /// A channel that stands.
+    pub async fn line(&self) -> Result<Line, Exit> {
+        let resolved = self.resolved()?;
+        let way = resolved.way(&resolved.server)?;
+        way.connect().await.map_err(|error| no_server(&resolved, &error))
+    }
+    /// Who is who.
+    pub async fn identity(&self) -> Result<IdentityServiceClient<Line>, Exit> {
+        Ok(IdentityServiceClient::new(self.line().await?))
     }
     /// Task intake.
-    pub async fn task(&self) -> Result<TaskServiceClient<Channel>, Exit> {
-        Ok(TaskServiceClient::new(self.channel().await?).max_decoding_message_size(64 * 1024 * 1024))
+    pub async fn task(&self) -> Result<TaskServiceClient<Line>, Exit> {
+        Ok(TaskServiceClient::new(self.line().await?).max_decoding_message_size(64 * 1024 * 1024))
     }
     /// Fleet.
-    pub async fn fleet(&self) -> Result<FleetServiceClient<Channel>, Exit> {
-        Ok(FleetServiceClient::new(self.channel().await?).max_decoding_message_size(64 * 1024 * 1024))
+    pub async fn fleet(&self) -> Result<FleetServiceClient<Line>, Exit> {
+        Ok(FleetServiceClient::new(self.line().await?).max_decoding_message_size(64 * 1024 * 1024))
     }
     /// Telemetry.
-    pub async fn telemetry(&self) -> Result<TelemetryServiceClient<Channel>, Exit> {
-        Ok(TelemetryServiceClient::new(self.channel().await?).max_decoding_message_size(64 * 1024 * 1024))
+    pub async fn telemetry(&self) -> Result<TelemetryServiceClient<Line>, Exit> {
+        Ok(TelemetryServiceClient::new(self.line().await?).max_decoding_message_size(64 * 1024 * 1024))
     }
     /// Releases of software.
-    pub async fn bundles(&self) -> Result<BundleServiceClient<Channel>, Exit> {
-        Ok(BundleServiceClient::new(self.channel().await?).max_decoding_message_size(64 * 1024 * 1024))
+    pub async fn bundles(&self) -> Result<BundleServiceClient<Line>, Exit> {
+        Ok(BundleServiceClient::new(self.line().await?).max_decoding_message_size(64 * 1024 * 1024))
     }
     /// Roll-outs of software.
-    pub async fn rollouts(&self) -> Result<RolloutServiceClient<Channel>, Exit> {
-        Ok(RolloutServiceClient::new(self.channel().await?).max_decoding_message_size(64 * 1024 * 1024))
+    pub async fn rollouts(&self) -> Result<RolloutServiceClient<Line>, Exit> {
+        Ok(RolloutServiceClient::new(self.line().await?).max_decoding_message_size(64 * 1024 * 1024))
     }
     /// Whether it serves.
-    pub async fn health(&self) -> Result<HealthClient<Channel>, Exit> {
-        Ok(HealthClient::new(self.channel().await?))
+    pub async fn health(&self) -> Result<HealthClient<Line>, Exit> {
+        Ok(HealthClient::new(self.line().await?))
     }
     /// Faults of the simulator.
-    pub async fn sim(&self) -> Result<SimServiceClient<Channel>, Exit> {
-        Ok(SimServiceClient::new(self.channel().await?))
+    pub async fn sim(&self) -> Result<SimServiceClient<Line>, Exit> {
+        Ok(SimServiceClient::new(self.line().await?))
     }
+}
+
+/// Why nothing stands: nobody is there, it is of another site, or it speaks TLS and we do not.
+fn no_server(resolved: &Resolved, error: &dyn std::error::Error) -> Exit {
+    let server = &resolved.server;
+    let mut causes = std::iter::successors(error.source(), |cause| cause.source());
+    let is_tls = causes.any(|cause| cause.to_string().contains("certificate"));
+    Exit::new(
+        5,
+        match is_tls {
+            true => format!(
+                "the server at {server} is not of the site that you signed in to\n  try: midshift login {server} --pin DIGEST, with the digest that this server printed"
+            ),
+            false => {
+                format!("no server at {server}\n  try: start one with `midshift dev`, or name another with --server")
+            }
+        },
+    )
 }
 
 /// A unary request with its deadline on the wire.

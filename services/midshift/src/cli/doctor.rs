@@ -54,7 +54,7 @@ pub async fn run(call: &Call, out: &Out) -> Result<(), Exit> {
         Err(_) => found.push(Finding {
             what: "server",
             good: false,
-            text: format!("nothing answers at {}; start `midshift dev` or `midshift serve`", call.server),
+            text: format!("nothing answers at {}; start `midshift dev` or `midshift serve`", call.address()?),
         }),
         Ok(_) => server(call, &mut found).await?,
     }
@@ -95,9 +95,7 @@ fn descriptors() -> Finding {
 }
 
 async fn server(call: &Call, found: &mut Vec<Finding>) -> Result<(), Exit> {
-    let endpoint = tonic::transport::Endpoint::from_shared(crate::robots::uri(&call.server))
-        .map_err(|e| Exit::usage(e.to_string()))?;
-    let channel = endpoint.connect().await.map_err(|e| Exit::new(5, e.to_string()))?;
+    let channel = call.line().await?;
     for service in SERVICES {
         let request = tonic_health::pb::HealthCheckRequest { service: service.to_owned() };
         let status = HealthClient::new(channel.clone()).check(unary(request)).await.map(|r| r.into_inner().status());

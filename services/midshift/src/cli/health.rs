@@ -2,13 +2,10 @@
 //!
 //! The exit code is 0 or 1 and nothing else, as those who ask want it.
 
-use super::client::{Call, Exit, unary};
+use super::client::{Call, Exit, Resolved, unary};
 use super::out::{Format, Out};
-use crate::robots::uri;
 use std::time::Duration;
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
-use tokio::net::TcpStream;
-use tonic::transport::Uri;
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 
@@ -33,15 +30,16 @@ pub struct Health {
 
 /// Asks; exit code 1 if it does not serve, or does not say so in time.
 pub async fn run(args: Health, out: &Out) -> Result<(), Exit> {
+    let resolved = args.call.resolved()?;
     let asked = async {
         match args.ready {
-            true => ready(&args.call.server).await,
+            true => ready(&resolved).await,
             false => serving(&args.call, args.service.clone()).await,
         }
     };
     let answer = tokio::time::timeout(args.timeout, asked).await;
     let answer = answer.unwrap_or_else(|_| Err(format!("no answer within {:?}", args.timeout)));
-    let server = &args.call.server;
+    let server = &resolved.server;
     let status = answer.map_err(|why| Exit::new(1, format!("{server}: {why}")))?;
     match out.format {
         Format::Table => out.line(&format!("{server}: {status}")),
@@ -63,15 +61,11 @@ async fn serving(call: &Call, service: String) -> Result<&'static str, String> {
     }
 }
 
-async fn ready(server: &str) -> Result<&'static str, String> {
-    let address: Uri = uri(server).parse().map_err(|error| format!("{error}"))?;
-    let authority = address.authority().ok_or("it has no host and port")?;
-    let port = authority.port_u16().unwrap_or(80);
+async fn ready(resolved: &Resolved) -> Result<&'static str, String> {
     let failed = |error: std::io::Error| error.to_string();
-    // A name in brackets is an IPv6 address.
-    let host = authority.host().trim_matches(['[', ']']);
-    let mut stream = TcpStream::connect((host, port)).await.map_err(failed)?;
-    let request = format!("GET /ready HTTP/1.1\r\nHost: {authority}\r\nConnection: close\r\n\r\n");
+    let way = resolved.way(&resolved.server).map_err(|exit| exit.to_string())?;
+    let mut stream = way.wire().await.map_err(failed)?;
+    let request = format!("GET /ready HTTP/1.1\r\nHost: {}\r\nConnection: close\r\n\r\n", resolved.server);
     stream.write_all(request.as_bytes()).await.map_err(failed)?;
     let mut line = String::new();
     let mut answer = BufReader::new(tokio::io::AsyncReadExt::take(stream, LINE_MAX));

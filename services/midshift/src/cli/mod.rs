@@ -4,7 +4,9 @@ mod area;
 mod backup;
 mod bundle;
 mod client;
+mod context;
 mod doctor;
+mod enrol;
 mod explain;
 mod health;
 mod incident;
@@ -18,6 +20,7 @@ mod rollout;
 mod sim;
 mod stop;
 mod task;
+mod token;
 mod zone;
 
 use crate::dev::Dev;
@@ -111,6 +114,14 @@ enum Command {
     /// Bundles that robots went back from and do not get again.
     #[command(subcommand)]
     Quarantine(quarantine::Verb),
+    /// Sign in to a site: prove it by its root, and remember it with a token.
+    Login(context::Login),
+    /// Which sites are remembered, and which one is used.
+    #[command(subcommand)]
+    Context(context::Verb),
+    /// Rights of people and programs.
+    #[command(subcommand)]
+    Token(token::Verb),
     /// Look for what may be wrong: server, store, robots, this machine.
     Doctor(Call),
     /// Whether one process serves: exit code 0 or 1, for health checks.
@@ -136,7 +147,7 @@ pub fn main() -> ExitCode {
         return launcher::main(arguments.into_iter());
     }
     let serves = match &args.command {
-        Command::Serve(_) | Command::Agent(_) | Command::Sim(sim::Verb::Run(_)) => true,
+        Command::Serve(_) | Command::Agent(_) | Command::Sim(sim::Verb::Run { .. }) => true,
         Command::Stop(stop) => stop.serves().is_some(),
         _ => false,
     };
@@ -198,6 +209,9 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Bundle(verb) => bundle::run(verb, out).await,
         Command::Rollout(verb) => rollout::run(*verb, out).await,
         Command::Quarantine(verb) => quarantine::run(verb, out).await,
+        Command::Login(args) => context::login(args, out).await,
+        Command::Context(verb) => context::run(verb, out).await,
+        Command::Token(verb) => token::run(verb, out).await,
         Command::Doctor(call) => doctor::run(&call, out).await,
         Command::Health(args) => health::run(args, out).await,
         Command::ExplainError { code } => explain::error(code.as_deref(), out),

@@ -5,6 +5,7 @@
 
 use super::client::{Call, Exit, unary};
 use super::out::Out;
+use crate::way::Line;
 use indicatif::{ProgressBar, ProgressStyle};
 use midshift_bundle::folder::{Checked, Folder};
 use midshift_bundle::freshness::{newest_targets, stamp};
@@ -18,14 +19,13 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 use tokio::time::Instant;
 use tonic::Code;
-use tonic::transport::Channel;
 
 /// Bytes of one message.
 const PIECE_BYTES: usize = 256 * 1024;
 /// One call brings as much as fits into this, so that slow lines stay far below the server's limit for a call.
 const CALL_FOR: Duration = Duration::from_secs(5);
 
-type Client = BundleServiceClient<Channel>;
+type Client = BundleServiceClient<Line>;
 
 impl From<documents::Error> for Exit {
     fn from(error: documents::Error) -> Self {

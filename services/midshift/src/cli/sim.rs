@@ -1,6 +1,6 @@
 //! `midshift sim …`: simulated robots, and faults in them.
 
-use super::client::{Call, Exit, unary};
+use super::client::{Call, Exit, Login, unary};
 use super::out::Out;
 use crate::robots::{SimRun, swarm};
 use clap::Subcommand;
@@ -12,7 +12,13 @@ use tokio_util::sync::CancellationToken;
 #[derive(Subcommand)]
 pub enum Verb {
     /// Run simulated robots against a server.
-    Run(Box<SimRun>),
+    Run {
+        #[command(flatten)]
+        run: Box<SimRun>,
+        /// As whom they are enrolled: somebody who may administer the site. Signed in nowhere, they speak plain text.
+        #[command(flatten)]
+        login: Login,
+    },
     /// Make something go wrong with a simulated robot (of `midshift dev`, or of a `sim run --listen`).
     Fault(FaultArgs),
     /// What the bodies themselves say: items, picks, violations.
@@ -87,7 +93,11 @@ impl What {
 /// Runs one verb.
 pub async fn run(verb: Verb, out: &Out, stop: CancellationToken) -> Result<(), Exit> {
     match verb {
-        Verb::Run(args) => Ok(swarm(*args, stop).await?),
+        Verb::Run { run, login } => {
+            let resolved = login.resolve(Some(&run.server))?;
+            let way = if resolved.is_secure() { Some(resolved.way(&run.server)?) } else { None };
+            Ok(swarm(*run, way, stop).await?)
+        }
         Verb::Fault(args) => {
             let request = v1::InjectFaultRequest { robot_id: args.robot_id.clone(), fault: args.what.fault() };
             let answer = args.call.sim().await?.inject_fault(unary(request)).await?.into_inner();

@@ -2,10 +2,11 @@
 //!
 //! An operational stop request: not a safety function, no performance level. Nothing is shown as standing that a robot has not said itself.
 
-use super::client::{Exit, unary};
+use super::client::{Exit, Login, Resolved, unary};
 use super::out::{Format, Out};
 use crate::robots::uri;
 use crate::stop::{FOLDER, PORT, StopServe};
+use crate::way::Line;
 use clap::{Args, Subcommand, ValueEnum};
 use midshift_core::time::Utc;
 use midshift_proto::link::v1::StopLevel;
@@ -14,41 +15,42 @@ use midshift_proto::stop::v1::scope::Scope;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::time::Duration;
-use tonic::transport::{Channel, Endpoint, Uri};
+use tonic::transport::Uri;
 
-/// A stop service that does not answer a connection within this is not there.
-const CONNECT_WITHIN: Duration = Duration::from_secs(3);
 /// Stops that were not confirmed by all.
 const NOT_ALL: u8 = 13;
 /// Every robot of a site in one message.
 const ANSWER_BYTES_MAX: usize = 64 * 1024 * 1024;
 
-/// Which stop service.
+/// Which stop service, and as whom.
 #[derive(Clone, Debug, Args)]
 pub struct StopCall {
-    /// The business server, host:port: its host has the stop service on port 7421.
-    #[arg(long, env = "MIDSHIFT_SERVER", default_value = "127.0.0.1:7420")]
-    server: String,
+    /// The business server, host:port: its host has the stop service on port 7421. Without it that of the context, or 127.0.0.1:7420.
+    #[arg(long, env = "MIDSHIFT_SERVER")]
+    server: Option<String>,
     /// The stop service, host:port, if it is elsewhere.
     #[arg(long, env = "MIDSHIFT_STOP_SERVER", value_name = "HOST:PORT")]
     stop_server: Option<String>,
+    /// As whom.
+    #[command(flatten)]
+    login: Login,
 }
 
 impl StopCall {
-    fn address(&self) -> Result<String, Exit> {
-        if let Some(stop_server) = &self.stop_server {
+    fn address(&self, resolved: &Resolved) -> Result<String, Exit> {
+        if let Some(stop_server) = self.stop_server.as_ref().or(resolved.stop_server.as_ref()) {
             return Ok(stop_server.clone());
         }
-        let uri: Uri = uri(&self.server).parse().map_err(|e| Exit::usage(format!("--server {}: {e}", self.server)))?;
-        let host = uri.host().ok_or_else(|| Exit::usage(format!("--server {} has no host", self.server)))?;
+        let server = &resolved.server;
+        let uri: Uri = uri(server).parse().map_err(|e| Exit::usage(format!("--server {server}: {e}")))?;
+        let host = uri.host().ok_or_else(|| Exit::usage(format!("--server {server} has no host")))?;
         Ok(format!("{host}:{PORT}"))
     }
 
-    async fn client(&self) -> Result<StopServiceClient<Channel>, Exit> {
-        let address = self.address()?;
-        let endpoint = Endpoint::from_shared(uri(&address)).map_err(|e| Exit::usage(format!("{address}: {e}")))?;
-        let channel = endpoint.connect_timeout(CONNECT_WITHIN).connect().await.map_err(|_| {
+    async fn client(&self) -> Result<StopServiceClient<Line>, Exit> {
+        let resolved = self.login.resolve(self.server.as_deref())?;
+        let address = self.address(&resolved)?;
+        let line = resolved.way(&address)?.connect().await.map_err(|_| {
             Exit::new(
                 5,
                 format!(
@@ -56,7 +58,7 @@ impl StopCall {
                 ),
             )
         })?;
-        Ok(StopServiceClient::new(channel).max_decoding_message_size(ANSWER_BYTES_MAX))
+        Ok(StopServiceClient::new(line).max_decoding_message_size(ANSWER_BYTES_MAX))
     }
 }
 
@@ -443,7 +445,8 @@ mod tests {
 
     fn call(server: &str, stop_server: Option<&str>) -> String {
         let stop_server = stop_server.map(str::to_owned);
-        StopCall { server: server.to_owned(), stop_server }.address().expect("an address")
+        let call = StopCall { server: None, stop_server, login: Login::default() };
+        call.address(&Resolved::plain(server)).expect("an address")
     }
 
     #[test]

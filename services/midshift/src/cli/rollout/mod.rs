@@ -12,11 +12,11 @@ mod text;
 
 use super::client::{Call, Change, Exit, ended, unary};
 use super::out::Out;
+use crate::way::Line;
 use clap::{Subcommand, ValueEnum};
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use std::time::Duration;
-use tonic::transport::Channel;
 
 /// Verbs of roll-outs.
 #[derive(Subcommand)]
@@ -152,7 +152,7 @@ pub struct Seen {
 }
 
 /// The service.
-type Client = RolloutServiceClient<Channel>;
+type Client = RolloutServiceClient<Line>;
 
 /// A request about one roll-out.
 #[derive(Clone, Copy, Debug)]

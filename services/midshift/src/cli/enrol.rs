@@ -1,0 +1,61 @@
+//! `midshift robot enroll|replace|revoke|identities`: which machine is which robot.
+
+use super::client::{Call, Exit, unary};
+use super::out::Out;
+use midshift_proto::convert::time_of;
+use midshift_proto::identity::v1;
+
+/// Hands out a secret, and the line that uses it.
+pub async fn offer(call: &Call, robot_id: String, replace: bool, out: &Out) -> Result<(), Exit> {
+    let asked = v1::CreateEnrolmentRequest { robot_id: robot_id.clone(), replace };
+    let offered = call.identity().await?.create_enrolment(unary(asked)).await?.into_inner();
+    let server = call.address()?;
+    out.one(&offered, &offered.secret, || {
+        format!(
+            "midshift agent run --robot-id {robot_id} --server {server} --data /var/lib/midshift-agent --enroll {}",
+            offered.secret
+        )
+    })?;
+    let until = offered.expire_time.as_ref().map_or_else(String::new, |time| time_of(time).rfc3339());
+    out.next(&format!("run it on the robot, once, before {until}; the secret is shown once"));
+    Ok(())
+}
+
+/// Takes a robot's key out.
+pub async fn revoke(call: &Call, robot_id: String, out: &Out) -> Result<(), Exit> {
+    let revoked = call.identity().await?.revoke_robot(unary(v1::RevokeRobotRequest { robot_id })).await?.into_inner();
+    let robot = revoked.robot.clone().unwrap_or_default();
+    out.one(&revoked, &robot.robot_id, || format!("{} is let in nowhere until it is enrolled anew", robot.robot_id))?;
+    out.next(
+        "it stands when its silence ladder says so; its places stay taken until it reports or a person clears them",
+    );
+    Ok(())
+}
+
+/// Lists who is enrolled.
+pub async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
+    let mut client = call.identity().await?;
+    let mut asked = v1::ListRobotIdentitiesRequest { page_size: 1_000, ..Default::default() };
+    let mut all = v1::ListRobotIdentitiesResponse::default();
+    loop {
+        let page = client.list_robot_identities(unary(asked.clone())).await?.into_inner();
+        all.robots.extend(page.robots);
+        if page.next_page_token.is_empty() {
+            break;
+        }
+        asked.page_token = page.next_page_token;
+    }
+    let at =
+        |time: &Option<prost_types::Timestamp>| time.as_ref().map_or_else(|| "-".to_owned(), |t| time_of(t).rfc3339());
+    let row = |robot: &v1::RobotIdentity| {
+        let state = match (robot.key_sha256.is_empty(), &robot.revoke_time, &robot.enrolment_expire_time) {
+            (false, _, Some(_)) => "enrolled, replacement open".to_owned(),
+            (false, _, None) => "enrolled".to_owned(),
+            (true, _, Some(_)) => "waits for its machine".to_owned(),
+            (true, Some(_), None) => format!("revoked by {}", robot.revoked_by),
+            (true, None, None) => "never enrolled".to_owned(),
+        };
+        vec![robot.robot_id.clone(), state, at(&robot.enrol_time), at(&robot.expire_time)]
+    };
+    Ok(out.many(&all, &all.robots, |r| r.robot_id.clone(), &["ROBOT", "STATE", "SINCE", "CERTIFICATE UNTIL"], row)?)
+}
