@@ -26,6 +26,7 @@ pub const PUBLIC_FILE: &str = "ca.pem";
 pub struct Authority {
     issuer: Issuer<'static, KeyPair>,
     certificate_pem: String,
+    pin: Digest,
     site_id: SiteId,
 }
 
@@ -56,7 +57,7 @@ pub fn asked(request_pem: &str) -> Result<Asked, Refusal> {
     }
     let request = CertificateSigningRequestParams::from_pem(request_pem)
         .map_err(|error| bad(format!("must be a PKCS #10 request in PEM, signed by its own key: {error}")))?;
-    let key = Digest(sha2::Sha256::digest(request.public_key.subject_public_key_info()).into());
+    let key = digest(&request.public_key);
     Ok(Asked { request, key })
 }
 
@@ -67,8 +68,10 @@ impl Authority {
         let read = || -> Result<Self, rcgen::Error> {
             let start = text.find("-----BEGIN CERTIFICATE").unwrap_or(text.len());
             let (key, certificate_pem) = text.split_at(start);
-            let issuer = Issuer::from_ca_cert_pem(certificate_pem, KeyPair::from_pem(key)?)?;
-            Ok(Self { issuer, certificate_pem: certificate_pem.to_owned(), site_id: site_id.clone() })
+            let key = KeyPair::from_pem(key)?;
+            let pin = digest(&key);
+            let issuer = Issuer::from_ca_cert_pem(certificate_pem, key)?;
+            Ok(Self { issuer, certificate_pem: certificate_pem.to_owned(), pin, site_id: site_id.clone() })
         };
         read().map(Some).map_err(|source| Error::Unreadable { path: folder.join(FILE), source })
     }
@@ -83,12 +86,18 @@ impl Authority {
         let key = KeyPair::generate().map_err(Error::Signing)?;
         let certificate_pem = params.self_signed(&key).map_err(Error::Signing)?.pem();
         files::write(folder, FILE, &format!("{}{certificate_pem}", key.serialize_pem()), files::PRIVATE)?;
-        Ok(Self { issuer: Issuer::new(params, key), certificate_pem, site_id: site_id.clone() })
+        let pin = digest(&key);
+        Ok(Self { issuer: Issuer::new(params, key), certificate_pem, pin, site_id: site_id.clone() })
     }
 
     /// Its own certificate, PEM.
     pub fn certificate_pem(&self) -> &str {
         &self.certificate_pem
+    }
+
+    /// Digest of its public key: all that a machine must know of the site beforehand.
+    pub const fn pin(&self) -> Digest {
+        self.pin
     }
 
     /// For a robot: `spiffe://SITE/robot/ID`.
@@ -119,6 +128,10 @@ impl Authority {
         asked.request.params = params;
         asked.request.signed_by(&self.issuer).map_err(Error::Signing)
     }
+}
+
+fn digest(key: &impl PublicKeyData) -> Digest {
+    Digest(sha2::Sha256::digest(key.subject_public_key_info()).into())
 }
 
 fn leaf(common_name: &str, usage: ExtendedKeyUsagePurpose) -> CertificateParams {

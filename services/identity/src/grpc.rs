@@ -77,7 +77,7 @@ impl IdentityService {
         actor: &Caller,
     ) -> Result<v1::CreateEnrolmentResponse, Refusal> {
         let robot_id = robot_of(&r.robot_id)?;
-        self.authority()?;
+        let pin = self.authority()?.pin();
         let (secret, now) = (tokens::draw(), self.now());
         let replace = if r.replace { Replace::Yes } else { Replace::No };
         let offered = self.0.register.decide(|view| {
@@ -87,7 +87,7 @@ impl IdentityService {
         });
         let robot = offered.await?;
         let expires = robot.enrolment.map_or(now, |open| Utc(open.expires_unix_ms));
-        let secret = secret.reveal(Secret::ENROLMENT);
+        let secret = format!("{}.{pin}", secret.reveal(Secret::ENROLMENT));
         Ok(v1::CreateEnrolmentResponse { secret, expire_time: Some(timestamp(expires)) })
     }
 

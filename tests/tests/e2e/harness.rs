@@ -2,17 +2,19 @@
 
 use crate::engine::fresh_store;
 use anyhow::{Context, bail};
+use midshift::way::{Line, Way};
 use midshift_core::site::DEMO;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::task::v1::{ListTasksRequest, Task, TaskFilter, TaskState};
+use std::collections::BTreeMap;
 use std::future::Future;
 use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 use tokio::time::Instant;
-use tonic::transport::{Channel, Endpoint};
 
 /// The site of a server, in its folder.
 const SITE_FILE: &str = "site.toml";
@@ -151,6 +153,52 @@ where
     }
 }
 
+/// What this program knows of a site whose ports have TLS and login: where its root is, and a token that may do everything.
+#[derive(Clone)]
+struct Known {
+    authority: PathBuf,
+    token: String,
+    way: Way,
+}
+
+/// By address. What is not here is spoken to in plain text.
+static KNOWN: Mutex<BTreeMap<SocketAddr, Known>> = Mutex::new(BTreeMap::new());
+
+fn known(address: SocketAddr) -> Option<Known> {
+    KNOWN.lock().unwrap_or_else(PoisonError::into_inner).get(&address).cloned()
+}
+
+/// Whether the site at `address` has TLS and login.
+pub fn has_login(address: SocketAddr) -> bool {
+    known(address).is_some()
+}
+
+/// Another port of the site that `of` is known for.
+pub fn same_site(of: SocketAddr, port: SocketAddr) -> anyhow::Result<()> {
+    let Some(site) = known(of) else { return Ok(()) };
+    let way = Way::secure(&port.to_string(), &std::fs::read_to_string(&site.authority)?, Some(&site.token))?;
+    KNOWN.lock().unwrap_or_else(PoisonError::into_inner).insert(port, Known { way, ..site });
+    Ok(())
+}
+
+/// Signs a command in to the site at `address`, if that has a login.
+pub fn sign_in(command: &mut Command, address: SocketAddr) {
+    if let Some(site) = known(address) {
+        command.env("MIDSHIFT_CA", site.authority).env("MIDSHIFT_TOKEN", site.token);
+    }
+}
+
+/// The command line with these arguments, signed in to the server that they name.
+pub fn command(arguments: &[&str]) -> anyhow::Result<Command> {
+    let mut command = Command::new(midshift()?);
+    let named = |flag: &str| arguments.iter().skip_while(|a| **a != flag).nth(1).and_then(|a| a.parse().ok());
+    if let Some(address) = named("--server").or_else(|| named("--stop-server")) {
+        sign_in(&mut command, address);
+    }
+    command.args(arguments);
+    Ok(command)
+}
+
 /// A `midshift serve` on a data directory and a store, which can be killed and started again.
 pub struct Server {
     /// Where it listens.
@@ -169,8 +217,17 @@ impl Server {
     pub async fn start_on(dir: &Path, site: &str) -> anyhow::Result<Self> {
         Self::start_with(dir, site, &[]).await
     }
-    /// With more flags of `serve`. A store that they name is the test's own; else it is a new one of the engine that the tests run on.
+    /// With TLS and login; this program is signed in and may do everything.
+    pub async fn secure(dir: &Path, flags: &[&str]) -> anyhow::Result<Self> {
+        let token = dir.join("token").display().to_string();
+        let of_one_machine = ["--connections-per-address", "16000", "--requests-per-second", "100000"];
+        Self::begin(dir, DEMO, &[&of_one_machine[..], &["--first-token-file", &token], flags].concat()).await
+    }
+    /// With more flags of `serve`, in plain text. A store that they name is the test's own; else it is a new one of the engine that the tests run on.
     pub async fn start_with(dir: &Path, site: &str, flags: &[&str]) -> anyhow::Result<Self> {
+        Self::begin(dir, site, &[&["--insecure"], flags].concat()).await
+    }
+    async fn begin(dir: &Path, site: &str, flags: &[&str]) -> anyhow::Result<Self> {
         std::fs::write(dir.join(SITE_FILE), site)?;
         let address = free_port()?;
         let mut flags: Vec<String> = flags.iter().map(|flag| (*flag).to_owned()).collect();
@@ -178,7 +235,11 @@ impl Server {
             flags.extend(fresh_store()?);
         }
         let running = Self::run(dir, address, &flags)?;
+        let is_secure = !flags.iter().any(|flag| flag == "--insecure");
         let server = Self { address, dir: dir.to_owned(), flags, running };
+        if is_secure {
+            server.sign_in().await?;
+        }
         server.answers().await?;
         Ok(server)
     }
@@ -187,11 +248,24 @@ impl Server {
         // Its stop service would outlive the test, on a port that all tests share.
         command
             .env("MIDSHIFT_NO_STOP", "true")
-            .args(["serve", "--insecure", "--data"])
+            .args(["serve", "--data"])
             .arg(dir.join("data"))
             .args(["--listen", &address.to_string()]);
         command.arg("--site").arg(dir.join(SITE_FILE)).args(flags);
         Running::start(&mut command, &dir.join("server.log"))
+    }
+    /// Waits for the first token of the new site, and remembers the site.
+    async fn sign_in(&self) -> anyhow::Result<()> {
+        let (authority, token) = (self.data().join("identity/ca.pem"), self.dir.join("token"));
+        let token = until("the first token", Duration::from_secs(30), async || {
+            let token = std::fs::read_to_string(&token).unwrap_or_default();
+            Ok(token.ends_with('\n').then(|| token.trim().to_owned()))
+        });
+        let token =
+            token.await.with_context(|| std::fs::read_to_string(self.dir.join("server.log")).unwrap_or_default())?;
+        let way = Way::secure(&self.address.to_string(), &std::fs::read_to_string(&authority)?, Some(&token))?;
+        KNOWN.lock().unwrap_or_else(PoisonError::into_inner).insert(self.address, Known { authority, token, way });
+        Ok(())
     }
     /// SIGKILL and a new start on the same data.
     pub async fn kill_and_restart(&mut self) -> anyhow::Result<()> {
@@ -224,11 +298,11 @@ impl Server {
         .await
     }
     /// A channel that connects when it is used.
-    pub fn channel(&self) -> anyhow::Result<Channel> {
+    pub fn channel(&self) -> anyhow::Result<Line> {
         channel(self.address)
     }
     /// Tasks.
-    pub fn tasks(&self) -> anyhow::Result<TaskServiceClient<Channel>> {
+    pub fn tasks(&self) -> anyhow::Result<TaskServiceClient<Line>> {
         tasks(self.address)
     }
     /// Every task in one of these states; none while the server does not answer.
@@ -238,7 +312,7 @@ impl Server {
 }
 
 /// The intake of tasks at an address.
-pub fn tasks(address: SocketAddr) -> anyhow::Result<TaskServiceClient<Channel>> {
+pub fn tasks(address: SocketAddr) -> anyhow::Result<TaskServiceClient<Line>> {
     Ok(TaskServiceClient::new(channel(address)?))
 }
 
@@ -258,7 +332,10 @@ pub async fn in_states(address: SocketAddr, states: &[TaskState]) -> anyhow::Res
     }
 }
 
-/// A channel that connects when it is used.
-pub fn channel(address: SocketAddr) -> anyhow::Result<Channel> {
-    Ok(Endpoint::from_shared(format!("http://{address}"))?.connect_lazy())
+/// A channel that connects when it is used, signed in if the site has a login.
+pub fn channel(address: SocketAddr) -> anyhow::Result<Line> {
+    Ok(match known(address) {
+        Some(site) => site.way.lazy(),
+        None => Way::plain(&address.to_string())?.lazy(),
+    })
 }

@@ -1,6 +1,6 @@
 //! A backup is taken while robots work, the server is lost, and the robots carry on from what was restored.
 
-use crate::harness::{Server, midshift, until};
+use crate::harness::{Server, command, until};
 use crate::robots::Robots;
 use midshift::background::request;
 use midshift_core::site::{DEMO, Site, text};
@@ -13,14 +13,13 @@ use midshift_sim::workload::{Workload, WorkloadConfig};
 use midshift_tests::postgres::PostgresServer;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::time::Duration;
 
 const ROBOTS: usize = 6;
 const TASKS: usize = 12;
 
 fn run(arguments: &[&str]) -> anyhow::Result<String> {
-    let output = Command::new(midshift()?).args(arguments).output()?;
+    let output = command(arguments)?.output()?;
     anyhow::ensure!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
     Ok(String::from_utf8(output.stdout)?)
 }
@@ -100,8 +99,8 @@ impl Engine {
     /// Names of the parts of a backup.
     const fn parts(self) -> &'static str {
         match self {
-            Self::Sqlite => "control\ntelemetry\n",
-            Self::Postgres => "postgresql\n",
+            Self::Sqlite => "control\ntelemetry\nidentity\n",
+            Self::Postgres => "postgresql\nidentity\n",
         }
     }
     fn prepare(self) {
@@ -137,7 +136,7 @@ async fn drill(engine: Engine) -> anyhow::Result<()> {
     engine.prepare();
     let flags = engine.flags();
     let flags: Vec<&str> = flags.iter().map(String::as_str).collect();
-    let mut server = Server::start_with(dir.path(), DEMO, &flags).await?;
+    let mut server = Server::secure(dir.path(), &flags).await?;
     let robots = Robots::start(dir.path(), server.address, server.address, &site, ROBOTS).await?;
     let before = submit(&server, &site, 1, "before").await?;
     until_done(&server, 2).await?;

@@ -1,12 +1,14 @@
 //! Robots as programs of their own.
 
-use crate::harness::{Running, channel, midshift, until};
+use crate::harness::{Running, channel, has_login, midshift, until};
 use midshift_agent::ledger::Ledger;
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::store::Store;
 use midshift_core::site::Site;
 use midshift_proto::fleet::v1::ListPlacesRequest;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
+use midshift_proto::identity::v1::CreateEnrolmentRequest;
+use midshift_proto::identity::v1::identity_service_client::IdentityServiceClient;
 use midshift_sim::swarm::AGENT_FILE;
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
@@ -54,7 +56,10 @@ impl Robots {
         let starts = site.starting_places(count).into_iter().map(|at| site.name_of(at).to_string()).collect();
         let mut robots = Self::none(dir, server);
         (robots.starts, robots.stops) = (starts, stops.map(|address| address.to_string()));
-        (0..count).try_for_each(|number| robots.start_one(number))?;
+        for number in 0..count {
+            let enrolment = enrolment(public, &robot_id(number)).await?;
+            robots.start_one(number, enrolment.as_deref())?;
+        }
         robots.ids = robots.running.keys().cloned().collect();
         let all: BTreeSet<&String> = robots.ids.iter().collect();
         until("every robot in its place", Duration::from_secs(60), || async {
@@ -102,8 +107,8 @@ impl Robots {
     pub fn kill_all(&mut self) -> anyhow::Result<()> {
         self.running.values_mut().chain(&mut self.crowds).try_for_each(Running::kill)
     }
-    fn start_one(&mut self, number: usize) -> anyhow::Result<()> {
-        let id = format!("rbt-{:02}", number + 1);
+    fn start_one(&mut self, number: usize, enrolment: Option<&str>) -> anyhow::Result<()> {
+        let id = robot_id(number);
         let dir = self.dir.join(&id);
         std::fs::create_dir_all(&dir)?;
         let mut command = Command::new(midshift()?);
@@ -122,6 +127,9 @@ impl Robots {
         if let Some(stops) = &self.stops {
             command.args(["--stop-server", stops]);
         }
+        if let Some(secret) = enrolment {
+            command.args(["--enroll", secret]);
+        }
         let running = Running::start(&mut command, &dir.join("agent.log"))?;
         self.running.insert(id, running);
         Ok(())
@@ -133,7 +141,7 @@ impl Robots {
     /// Starts one again that was killed.
     pub fn restart(&mut self, id: &str) -> anyhow::Result<()> {
         let number: usize = id.trim_start_matches("rbt-").parse()?;
-        self.start_one(number - 1)
+        self.start_one(number - 1, None)
     }
     /// What a robot remembers; its agent must not run.
     pub async fn ledger(&self, id: &str) -> anyhow::Result<Ledger> {
@@ -143,4 +151,18 @@ impl Robots {
     pub fn journals(&self) -> Vec<PathBuf> {
         self.ids.iter().map(|id| self.dir.join(id).join("journal.jsonl")).collect()
     }
+}
+
+fn robot_id(number: usize) -> String {
+    format!("rbt-{:02}", number + 1)
+}
+
+/// A secret that enrols one machine as this robot; none: the site has no login.
+pub async fn enrolment(public: SocketAddr, robot_id: &str) -> anyhow::Result<Option<String>> {
+    if !has_login(public) {
+        return Ok(None);
+    }
+    let request = CreateEnrolmentRequest { robot_id: robot_id.to_owned(), replace: false };
+    let offered = IdentityServiceClient::new(channel(public)?).create_enrolment(request).await?.into_inner();
+    Ok(Some(offered.secret))
 }

@@ -1,8 +1,9 @@
 //! Software from the release people to a robot, with nothing but what they have: the command line, a server, a launcher and its agent. The server is
 //! killed on the way.
 
-use crate::harness::{Running, Server, midshift, until};
+use crate::harness::{Running, Server, command, midshift, until};
 use crate::robots::BODY_SPEED;
+use crate::robots::enrolment;
 use crate::room::LIMIT;
 use anyhow::{Context, ensure};
 use midshift_agent::launcher::SWITCH;
@@ -35,11 +36,21 @@ impl Drop for Robot {
 
 impl Robot {
     /// A robot in `home` that believes the release people of `samples`.
-    pub fn launch(id: &str, start: &str, home: &Path, samples: &Path, server: &str) -> anyhow::Result<Self> {
+    pub fn launch(
+        id: &str,
+        start: &str,
+        home: &Path,
+        samples: &Path,
+        server: &str,
+        enrolment: Option<&str>,
+    ) -> anyhow::Result<Self> {
         std::fs::create_dir_all(home)?;
         trust(samples, &text::parse(DEMO)?)?.write(&home.join("trust.json"))?;
         let (program, sets) = (midshift()?, home.join("sets"));
         let mut command = Command::new(&program);
+        if let Some(secret) = enrolment {
+            command.env("MIDSHIFT_ENROLL", secret);
+        }
         command.arg("launcher").arg("--record").arg(home.join("tries")).arg("--sets").arg(&sets).arg("--");
         command.arg(&program).args(["agent", "run", "--robot-id", id, "--no-faults", "--server", server]);
         command.args(["--start", start, "--body-speed", BODY_SPEED]);
@@ -72,7 +83,7 @@ pub fn trust(samples: &Path, site: &Site) -> anyhow::Result<Trust> {
 
 /// The command line.
 pub fn call(arguments: &[&str]) -> anyhow::Result<Output> {
-    Command::new(midshift()?).args(arguments).output().context("calling midshift")
+    command(arguments)?.output().context("calling midshift")
 }
 
 /// The command line, which must succeed.
@@ -89,9 +100,10 @@ async fn a_release_reaches_a_robot_and_a_bad_one_goes_back_though_the_server_is_
     let samples = dir.path().join("samples");
     let (folder, keys) = (samples.display().to_string(), samples.join("keys").display().to_string());
     done(&["bundle", "samples", &folder])?;
-    let mut server = Server::start_with(dir.path(), DEMO, &["--ota-keys", &keys]).await?;
+    let mut server = Server::secure(dir.path(), &["--ota-keys", &keys]).await?;
     let address = server.address.to_string();
-    let robot = Robot::launch("rbt-01", "park-1", &dir.path().join("robot"), &samples, &address)?;
+    let enrolment = enrolment(server.address, "rbt-01").await?;
+    let robot = Robot::launch("rbt-01", "park-1", &dir.path().join("robot"), &samples, &address, enrolment.as_deref())?;
     done(&["bundle", "push", "--server", &address, &samples.join("repository").display().to_string()])?;
     until("the robot is known", LIMIT, async || {
         Ok(call(&["robot", "get", "--server", &address, "rbt-01"])?.status.success().then_some(()))
@@ -130,7 +142,7 @@ async fn a_release_reaches_a_robot_and_a_bad_one_goes_back_though_the_server_is_
     .await?;
     // Who watches is told that the server is gone, and goes on when it is back.
     let watch = ["rollout", "watch", "--server", &address, "walk-1.6.0-bad-at-start"];
-    let mut watching = Command::new(midshift()?).args(watch).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
+    let mut watching = command(&watch)?.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
     let mut said = BufReader::new(watching.stdout.take().context("no pipe")?).lines();
     ensure!(said.next().is_some(), "nothing was said of the roll-out");
     server.kill_and_restart().await?;

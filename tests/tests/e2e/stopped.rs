@@ -1,6 +1,6 @@
 //! A fleet stop with real programs: everybody stands, the server dead or not, and nobody moves before a person has reset and resumed it.
 
-use crate::harness::{Running, Server, channel, folder, free_port, midshift, until};
+use crate::harness::{Running, Server, channel, folder, free_port, midshift, same_site, until};
 use crate::kill::{all_over, at_work, judge, submit};
 use crate::robots::Robots;
 use crate::rolled_out::{call, done};
@@ -30,15 +30,16 @@ struct StopServer {
 }
 
 impl StopServer {
-    async fn start(dir: &Path) -> anyhow::Result<Self> {
+    async fn start(dir: &Path, beside: SocketAddr) -> anyhow::Result<Self> {
         let address = free_port()?;
+        same_site(beside, address)?;
         let server = Self { address, dir: dir.to_owned(), running: Self::run(dir, address)? };
         server.answers().await?;
         Ok(server)
     }
     fn run(dir: &Path, address: SocketAddr) -> anyhow::Result<Running> {
         let mut command = Command::new(midshift()?);
-        command.args(["stop", "serve", "--insecure", "--listen", &address.to_string(), "--data"]).arg(dir.join("data"));
+        command.args(["stop", "serve", "--listen", &address.to_string(), "--data"]).arg(dir.join("data"));
         Running::start(command.arg("--site").arg(dir.join("site.toml")), &dir.join("stop.log"))
     }
     async fn kill_and_restart(&mut self) -> anyhow::Result<()> {
@@ -130,8 +131,8 @@ async fn resume(server: &Server, stop_id: &str) -> anyhow::Result<()> {
 async fn a_stopped_fleet_stands_through_every_kill_until_it_is_reset_and_resumed() -> anyhow::Result<()> {
     let dir = folder()?;
     let site: Site = text::parse(DEMO)?;
-    let mut server = Server::start(dir.path()).await?;
-    let mut stops = StopServer::start(dir.path()).await?;
+    let mut server = Server::secure(dir.path(), &[]).await?;
+    let mut stops = StopServer::start(dir.path(), server.address).await?;
     let (address, stop_address) = (server.address, Some(stops.address));
     let robots = Robots::start_beside(dir.path(), address, address, stop_address, &site, ROBOTS).await?;
     submit(address, &site, 7, TASKS).await?;

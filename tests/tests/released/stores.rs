@@ -22,6 +22,11 @@ pub const EMPTY: &[(&str, &str)] = &[
     ),
     ("stop_record", "a stop service writes them, and none runs beside the server of a run"),
     ("stop_event", "the same"),
+    ("token", "a server without login, as 0.1.0 is, writes none"),
+    ("robot_identity", "the same"),
+    ("authority", "the same"),
+    ("server_certificate", "the same"),
+    ("identity_event", "the same"),
 ];
 
 /// Words of enums that a release does not know and this build may write all the same, with why a process of that release that shares the store does
@@ -37,6 +42,19 @@ const NEW_WORDS: &[(&str, &str)] = &[
     ("STOP_WAS_RESET", "the same"),
     ("LINE_REPLACED", "the same"),
     ("TOO_MANY_REQUESTS", "an answer of a port, which writes no row"),
+    ("SIGN_IN_NEEDED", "an answer of a port or of identity, which writes no row"),
+    ("TOKEN_UNKNOWN", "the same"),
+    ("TOKEN_EXPIRED", "the same"),
+    ("NOT_PERMITTED", "the same"),
+    ("NOT_THIS_ROBOT", "the same"),
+    ("NOT_YOUR_OWN", "the same"),
+    ("ROBOT_ENROLLED", "the same"),
+    ("ENROLMENT_UNKNOWN", "the same"),
+    ("ENROLMENT_USED", "the same"),
+    ("ENROLMENT_EXPIRED", "the same"),
+    ("KEY_DENIED", "the same"),
+    ("TOKEN_NOT_FOUND", "the same"),
+    ("LAST_ADMIN", "the same"),
 ];
 
 /// The store of a release as a database that this build may open: a folder of `data`, or a database.

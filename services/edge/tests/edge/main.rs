@@ -8,6 +8,7 @@ mod crowds;
 mod frames;
 mod hostile;
 mod leaving;
+mod login;
 mod principals;
 mod proofs;
 mod readings;

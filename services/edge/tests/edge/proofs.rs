@@ -4,7 +4,7 @@ use crate::frames::{PREFACE, dial, until_closed};
 use crate::world::{Client, HERE, SOON, World, within};
 use midshift_edge::tls::{Clients, server_config};
 use midshift_edge::{Anybody, Config, ConnectionId, Edge, Incoming, Peer};
-use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
+use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair, SanType};
 use rustls::crypto::aws_lc_rs;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName};
 use rustls::version::TLS13;
@@ -19,32 +19,42 @@ use tokio_stream::StreamExt;
 use tokio_util::sync::CancellationToken;
 
 /// Who signs certificates of servers and of robots alike.
-struct Authority(CertifiedIssuer<'static, KeyPair>);
+pub struct Authority(CertifiedIssuer<'static, KeyPair>);
 
-struct Identity {
-    leaf: CertificateDer<'static>,
+pub struct Identity {
+    pub leaf: CertificateDer<'static>,
     key: PrivateKeyDer<'static>,
 }
 
 impl Authority {
-    fn new() -> Self {
+    pub fn new() -> Self {
         let mut params = CertificateParams::new(Vec::new()).expect("parameters");
         params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
         Self(CertifiedIssuer::self_signed(params, KeyPair::generate().expect("a key")).expect("a root"))
     }
 
-    fn root(&self) -> CertificateDer<'static> {
+    pub fn root(&self) -> CertificateDer<'static> {
         self.0.der().clone()
     }
 
-    fn issue(&self, name: &str) -> Identity {
+    pub fn issue(&self, name: &str) -> Identity {
+        self.sign(CertificateParams::new(vec![name.to_owned()]).expect("parameters"))
+    }
+
+    /// For who is named by this and nothing else.
+    pub fn issue_uri(&self, uri: &str) -> Identity {
+        let mut params = CertificateParams::default();
+        params.subject_alt_names = vec![SanType::URI(uri.try_into().expect("plain text"))];
+        self.sign(params)
+    }
+
+    fn sign(&self, params: CertificateParams) -> Identity {
         let key = KeyPair::generate().expect("a key");
-        let params = CertificateParams::new(vec![name.to_owned()]).expect("parameters");
         let leaf = params.signed_by(&key, &self.0).expect("a certificate").der().clone();
         Identity { leaf, key: PrivateKeyDer::try_from(key.serialize_der()).expect("a key") }
     }
 
-    fn server(&self, clients: Clients) -> Arc<ServerConfig> {
+    pub fn server(&self, clients: Clients) -> Arc<ServerConfig> {
         let Identity { leaf, key } = self.issue("edge");
         server_config(vec![leaf], key, clients).expect("a server's TLS")
     }
@@ -67,7 +77,7 @@ impl Authority {
         Arc::new(config)
     }
 
-    async fn connect(&self, world: &World, identity: Option<&Identity>) -> std::io::Result<TlsStream<TcpStream>> {
+    pub async fn connect(&self, world: &World, identity: Option<&Identity>) -> std::io::Result<TlsStream<TcpStream>> {
         shake_hands(world, self.client(identity)).await
     }
 }

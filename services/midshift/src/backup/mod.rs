@@ -6,6 +6,7 @@
 //! adds its part.
 
 mod files;
+mod identity;
 mod keys;
 mod parts;
 mod place;

@@ -1,6 +1,7 @@
 //! The registry of everything durable that a server keeps, in the order in which it is copied.
 
 use super::Places;
+use super::identity::Identity;
 use super::keys::OnlineKeys;
 use super::releases::Releases;
 use super::rows::{Rows, Schemas};
@@ -11,8 +12,8 @@ use std::path::Path;
 
 /// All parts. Rows come first: what they name is copied after them and never taken away while a copied row may name it. They are put
 /// back in the other order: the rows make a server of the rest.
-pub const PARTS: [&dyn Part; 5] =
-    [&Rows(Database::Control), &Rows(Database::Telemetry), &Schemas, &Releases, &OnlineKeys];
+pub const PARTS: [&dyn Part; 6] =
+    [&Rows(Database::Control), &Rows(Database::Telemetry), &Schemas, &Releases, &OnlineKeys, &Identity];
 
 /// Name of the part of online keys, and of the folder where they go if nobody says where.
 pub const KEYS: &str = "ota-keys";

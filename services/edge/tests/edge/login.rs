@@ -1,0 +1,164 @@
+//! Ports with login: who a certificate or a token makes of a peer, and what that peer may ask for.
+
+use crate::proofs::{Authority, Identity};
+use crate::world::{Client, Whole, World, whole, within};
+use http::Request;
+use midshift_core::identity::{Digest, Directory, DirectoryToken, Secret, TokenId};
+use midshift_core::ids::SiteId;
+use midshift_core::reason::Code;
+use midshift_core::time::{Clock, ScaledClock, Utc};
+use midshift_edge::tls::Clients;
+use midshift_edge::{Config, Known, robot_of};
+use sha2::Digest as _;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use tokio::sync::watch;
+
+const LIST: &str = "/midshift.task.v1.TaskService/ListTasks";
+const SUBMIT: &str = "/midshift.task.v1.TaskService/SubmitTask";
+const SESSION: &str = "/midshift.link.v1.LinkService/Session";
+const ENGAGE: &str = "/midshift.stop.v1.StopService/Engage";
+const HEALTH: &str = "/grpc.health.v1.Health/Check";
+
+struct Port {
+    world: World,
+    authority: Authority,
+    known: Arc<Known>,
+    _tls: watch::Sender<Arc<rustls::ServerConfig>>,
+}
+
+fn site() -> SiteId {
+    SiteId::parse("factory").expect("a site")
+}
+
+fn clock() -> Arc<dyn Clock> {
+    Arc::new(ScaledClock::new(|| 0, Utc(1_000_000), 1000))
+}
+
+impl Port {
+    async fn open() -> Self {
+        let authority = Authority::new();
+        let known = Arc::new(Known::new(site(), clock()));
+        let (tls, newest) = watch::channel(authority.server(Clients::Asked(vec![authority.root()])));
+        let world = World::with(Config::default(), known.clone(), Some(newest)).await;
+        Self { world, authority, known, _tls: tls }
+    }
+    fn robot(&self, name: &str) -> Identity {
+        self.authority.issue_uri(&format!("spiffe://factory/robot/{name}"))
+    }
+    async fn client(&self, shown: Option<&Identity>) -> Client {
+        Client::over(self.authority.connect(&self.world, shown).await.expect("a handshake")).await
+    }
+    /// Makes `secret` a token with these rights, good until that moment.
+    fn knows(&self, secret: &Secret, grants: &[&str], expires_unix_ms: i64) {
+        let grants = grants.iter().map(|grant| grant.parse().expect("a grant")).collect();
+        let digest = Digest(sha2::Sha256::digest(secret.bytes()).into());
+        let token = DirectoryToken { name: "anna".into(), digest, grants, expires_unix_ms };
+        self.known.publish(Directory { tokens: [(secret.id().clone(), token)].into(), denied: BTreeMap::new() });
+    }
+}
+
+fn secret() -> Secret {
+    Secret::new(TokenId::new("t1").expect("an id"), [7; 32])
+}
+
+async fn asked(client: &mut Client, path: &str, authorization: Option<&str>) -> Option<Whole> {
+    let mut request = Request::post(format!("http://edge{path}")).header("content-type", "application/grpc");
+    if let Some(text) = authorization {
+        request = request.header("authorization", text);
+    }
+    let response = within(client.send(request.body(()).expect("a request"))).await?;
+    whole(within(response).await.ok()?).await
+}
+
+async fn code(client: &mut Client, path: &str, authorization: Option<&str>) -> Result<String, Code> {
+    let answer = asked(client, path, authorization).await.expect("an answer");
+    match answer.answer().code {
+        None => Ok(answer.header("principal").to_owned()),
+        Some(code) => Err(code),
+    }
+}
+
+#[tokio::test]
+async fn a_robot_is_who_its_certificate_says_and_may_call_what_is_for_robots_alone() {
+    let port = Port::open().await;
+    let mut robot = port.client(Some(&port.robot("r7"))).await;
+    assert_eq!(code(&mut robot, SESSION, None).await, Ok("robot:r7".to_owned()));
+    assert_eq!(code(&mut robot, LIST, None).await, Err(Code::NotPermitted));
+    assert_eq!(code(&mut robot, "/midshift.task.v1.TaskService/NoSuch", None).await, Err(Code::NotPermitted));
+}
+
+#[tokio::test]
+async fn a_certificate_that_names_no_robot_of_this_site_is_not_let_in() {
+    let port = Port::open().await;
+    let strangers = [
+        port.authority.issue_uri("spiffe://elsewhere/robot/r7"),
+        port.authority.issue_uri("spiffe://factory/server/r7"),
+        port.authority.issue_uri("spiffe://factory/robot/"),
+        port.authority.issue("r7"),
+    ];
+    for stranger in &strangers {
+        if let Ok(stream) = port.authority.connect(&port.world, Some(stranger)).await {
+            assert!(asked(&mut Client::over(stream).await, HEALTH, None).await.is_none());
+        }
+    }
+    port.world.closed_times("denied", strangers.len() as u64).await;
+}
+
+#[tokio::test]
+async fn a_revoked_robot_is_cut_and_does_not_come_back_while_another_works_on() {
+    let port = Port::open().await;
+    let (revoked, other) = (port.robot("r7"), port.robot("r8"));
+    let (mut goes, mut stays) = (port.client(Some(&revoked)).await, port.client(Some(&other)).await);
+    assert!(code(&mut goes, SESSION, None).await.is_ok() && code(&mut stays, SESSION, None).await.is_ok());
+    let (_, key) = robot_of(&revoked.leaf, &site()).expect("a robot");
+    port.known.publish(Directory { tokens: BTreeMap::new(), denied: [(key, i64::MAX)].into() });
+    port.world.closed_for("denied").await;
+    assert!(asked(&mut goes, SESSION, None).await.is_none());
+    if let Ok(stream) = port.authority.connect(&port.world, Some(&revoked)).await {
+        assert!(asked(&mut Client::over(stream).await, SESSION, None).await.is_none());
+    }
+    assert_eq!(code(&mut stays, SESSION, None).await, Ok("robot:r8".to_owned()));
+}
+
+#[tokio::test]
+async fn the_holder_of_a_token_may_do_what_its_roles_permit_and_nothing_else() {
+    let port = Port::open().await;
+    let secret = secret();
+    port.knows(&secret, &["viewer"], i64::MAX);
+    let bearer = format!("Bearer {}", secret.reveal(Secret::TOKEN));
+    let mut client = port.client(None).await;
+    assert_eq!(code(&mut client, LIST, Some(&bearer)).await, Ok("anna".to_owned()));
+    assert_eq!(code(&mut client, ENGAGE, Some(&bearer)).await, Ok("anna".to_owned()), "anyone signed in may stop");
+    assert_eq!(code(&mut client, SUBMIT, Some(&bearer)).await, Err(Code::NotPermitted));
+    assert_eq!(code(&mut client, SESSION, Some(&bearer)).await, Err(Code::NotPermitted));
+    assert_eq!(code(&mut client, LIST, None).await, Err(Code::SignInNeeded), "each request shows it");
+    assert!(code(&mut client, HEALTH, None).await.is_ok());
+}
+
+#[tokio::test]
+async fn what_is_no_token_of_the_site_is_worth_nothing() {
+    let port = Port::open().await;
+    let secret = secret();
+    let good = secret.reveal(Secret::TOKEN);
+    port.knows(&secret, &["viewer"], i64::MAX);
+    let mut client = port.client(None).await;
+    let wrong = Secret::new(TokenId::new("t1").expect("an id"), [8; 32]).reveal(Secret::TOKEN);
+    for shown in [format!("Bearer {wrong}"), good.clone(), format!("Basic {good}"), "Bearer".to_owned()] {
+        assert_eq!(code(&mut client, LIST, Some(&shown)).await, Err(Code::TokenUnknown), "{shown}");
+    }
+    port.known.publish(Directory::default());
+    assert_eq!(code(&mut client, LIST, Some(&format!("bearer {good}"))).await, Err(Code::TokenUnknown), "revoked");
+}
+
+#[tokio::test]
+async fn an_expired_token_still_engages_a_stop_and_resets_none() {
+    let port = Port::open().await;
+    let secret = secret();
+    port.knows(&secret, &["stop-resetter"], 999_999);
+    let bearer = format!("Bearer {}", secret.reveal(Secret::TOKEN));
+    let mut client = port.client(None).await;
+    assert!(code(&mut client, ENGAGE, Some(&bearer)).await.is_ok());
+    let reset = code(&mut client, "/midshift.stop.v1.StopService/Reset", Some(&bearer)).await;
+    assert_eq!(reset, Err(Code::TokenExpired));
+}

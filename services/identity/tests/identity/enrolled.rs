@@ -1,0 +1,143 @@
+//! Machines that become robots, and robots that are taken out.
+
+use crate::world::{Machine, World, asked_by, code, enrol, secret};
+use midshift_core::identity::{Caller, Digest};
+use midshift_core::ids::RobotId;
+use midshift_core::limits;
+use midshift_core::reason::Code;
+use midshift_identity::IdentityService;
+use midshift_proto::identity::v1::enrolment_service_server::EnrolmentService as _;
+use midshift_proto::identity::v1::identity_service_server::IdentityService as _;
+use midshift_proto::identity::v1::{
+    ListRobotIdentitiesRequest, RenewCertificateRequest, RevokeRobotRequest, RobotIdentity,
+};
+use tonic::Request;
+
+async fn robot(identity: &IdentityService, robot_id: &str) -> RobotIdentity {
+    let request = Request::new(ListRobotIdentitiesRequest::default());
+    let all = identity.list_robot_identities(request).await.expect("a list").into_inner().robots;
+    all.into_iter().find(|robot| robot.robot_id == robot_id).expect("a robot")
+}
+
+fn denies(identity: &IdentityService, key: &str) -> bool {
+    let key: Digest = key.parse().expect("a digest");
+    identity.directory().borrow().denies(&key)
+}
+
+#[tokio::test]
+async fn a_machine_gets_a_certificate_that_says_which_robot_it_is_whatever_it_asked_for() {
+    let world = World::new();
+    let identity = world.open().await.expect("opened");
+    let line = secret(&identity, "r7", false).await.expect("a secret");
+    let answer = enrol(&identity, "r7", &line, &Machine::new()).await.expect("enrolled");
+    assert_eq!(answer.authority_pem, identity.proof().borrow().authority_pem);
+    let leaf = pem(&answer.certificate_pem);
+    let leaf = webpki::types::CertificateDer::from(leaf);
+    let certificate = webpki::EndEntityCert::try_from(&leaf).expect("a certificate");
+    assert_eq!(certificate.valid_uri_names().collect::<Vec<_>>(), ["spiffe://factory/robot/r7"]);
+    assert_eq!(certificate.valid_dns_names().count(), 0);
+    assert_eq!(answer.trust_json, "{}");
+}
+
+fn pem(text: &str) -> Vec<u8> {
+    use webpki::types::pem::PemObject;
+    webpki::types::CertificateDer::from_pem_slice(text.as_bytes()).expect("PEM").to_vec()
+}
+
+#[tokio::test]
+async fn a_secret_that_was_used_lets_no_second_machine_in() {
+    let world = World::new();
+    let identity = world.open().await.expect("opened");
+    let (line, first) = (secret(&identity, "r7", false).await.expect("a secret"), Machine::new());
+    enrol(&identity, "r7", &line, &first).await.expect("enrolled");
+    enrol(&identity, "r7", &line, &first).await.expect("the answer was lost on its way");
+    let second = enrol(&identity, "r7", &line, &Machine::new()).await.expect_err("another machine");
+    assert_eq!(code(&second), Some(Code::EnrolmentUsed));
+    let other = enrol(&identity, "r8", &line, &Machine::new()).await.expect_err("another robot");
+    assert_eq!(code(&other), Some(Code::EnrolmentUnknown));
+}
+
+#[tokio::test]
+async fn a_secret_is_worth_nothing_after_its_hour_or_after_a_newer_one() {
+    let world = World::new();
+    let identity = world.open().await.expect("opened");
+    let old = secret(&identity, "r7", false).await.expect("a secret");
+    let new = secret(&identity, "r7", false).await.expect("a secret");
+    let refused = enrol(&identity, "r7", &old, &Machine::new()).await.expect_err("an older one");
+    assert_eq!(code(&refused), Some(Code::EnrolmentUnknown));
+    world.pass_ms(limits::ENROLMENT_VALID.as_ms());
+    let refused = enrol(&identity, "r7", &new, &Machine::new()).await.expect_err("too late");
+    assert_eq!(code(&refused), Some(Code::EnrolmentExpired));
+}
+
+#[tokio::test]
+async fn a_robot_that_is_replaced_goes_on_until_the_new_machine_is_there_and_then_its_key_is_denied() {
+    let world = World::new();
+    let identity = world.open().await.expect("opened");
+    let line = secret(&identity, "r7", false).await.expect("a secret");
+    enrol(&identity, "r7", &line, &Machine::new()).await.expect("enrolled");
+    let old = robot(&identity, "r7").await.key_sha256;
+    let refused = secret(&identity, "r7", false).await.expect_err("it is enrolled");
+    assert_eq!(code(&refused), Some(Code::RobotEnrolled));
+    let line = secret(&identity, "r7", true).await.expect("a secret for another machine");
+    assert!(!denies(&identity, &old));
+    enrol(&identity, "r7", &line, &Machine::new()).await.expect("enrolled");
+    assert!(denies(&identity, &old));
+    assert!(!denies(&identity, &robot(&identity, "r7").await.key_sha256));
+}
+
+#[tokio::test]
+async fn a_revoked_robot_is_denied_at_once_and_gets_no_new_certificate() {
+    let world = World::new();
+    let identity = world.open().await.expect("opened");
+    let (line, machine) = (secret(&identity, "r7", false).await.expect("a secret"), Machine::new());
+    enrol(&identity, "r7", &line, &machine).await.expect("enrolled");
+    let key = robot(&identity, "r7").await.key_sha256;
+    let revoke = || Request::new(RevokeRobotRequest { robot_id: "r7".to_owned() });
+    identity.revoke_robot(revoke()).await.expect("revoked");
+    assert!(denies(&identity, &key), "before the answer left");
+    identity.revoke_robot(revoke()).await.expect("again: the same answer");
+    let own = Caller::robot(RobotId::parse("r7").expect("an id"));
+    let request = RenewCertificateRequest { robot_id: "r7".to_owned(), request_pem: machine.request() };
+    let refused = identity.renew_certificate(asked_by(own, request)).await.expect_err("revoked");
+    assert_eq!(code(&refused), Some(Code::KeyDenied));
+}
+
+#[tokio::test]
+async fn a_robot_renews_its_own_certificate_for_its_own_key_and_no_other() {
+    let world = World::new();
+    let identity = world.open().await.expect("opened");
+    let machines = [Machine::new(), Machine::new()];
+    for (robot_id, machine) in ["r7", "r8"].into_iter().zip(&machines) {
+        let line = secret(&identity, robot_id, false).await.expect("a secret");
+        enrol(&identity, robot_id, &line, machine).await.expect("enrolled");
+    }
+    let own = || Caller::robot(RobotId::parse("r7").expect("an id"));
+    let renew = |robot_id: &str, machine: &Machine| {
+        asked_by(own(), RenewCertificateRequest { robot_id: robot_id.to_owned(), request_pem: machine.request() })
+    };
+    identity.renew_certificate(renew("r7", &machines[0])).await.expect("renewed");
+    let another = identity.renew_certificate(renew("r8", &machines[1])).await.expect_err("another robot");
+    assert_eq!(code(&another), Some(Code::NotThisRobot));
+    let key = identity.renew_certificate(renew("r7", &machines[1])).await.expect_err("another key");
+    assert_eq!(code(&key), Some(Code::KeyDenied));
+}
+
+#[tokio::test]
+async fn what_is_no_signing_request_is_refused_and_uses_no_secret_up() {
+    let world = World::new();
+    let identity = world.open().await.expect("opened");
+    let line = secret(&identity, "r7", false).await.expect("a secret");
+    let mut broken = Machine::new().request();
+    broken.replace_range(60..64, "AAAA");
+    for request_pem in ["", "-----BEGIN CERTIFICATE REQUEST-----", &broken] {
+        let request = midshift_proto::identity::v1::EnrolRequest {
+            robot_id: "r7".to_owned(),
+            secret: crate::world::shown(&line),
+            request_pem: request_pem.to_owned(),
+        };
+        let refused = identity.enrol(Request::new(request)).await.expect_err("no request");
+        assert_eq!(code(&refused), Some(Code::InvalidRequest));
+    }
+    enrol(&identity, "r7", &line, &Machine::new()).await.expect("the secret is as good as before");
+}

@@ -1,0 +1,6 @@
+//! Identity over a store in memory and real files: the site's authority, enrolment, tokens.
+
+mod authority;
+mod enrolled;
+mod tokens;
+mod world;

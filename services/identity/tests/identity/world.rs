@@ -1,0 +1,107 @@
+//! A site with its identity, and machines that want to be robots of it.
+
+use midshift_core::identity::Caller;
+use midshift_core::ids::SiteId;
+use midshift_core::reason::Code;
+use midshift_core::time::{Clock, ScaledClock, Utc};
+use midshift_identity::{Duty, Error, IdentityService, Parts};
+use midshift_proto::identity::v1::enrolment_service_server::EnrolmentService as _;
+use midshift_proto::identity::v1::identity_service_server::IdentityService as _;
+use midshift_proto::identity::v1::{CreateEnrolmentRequest, EnrolRequest, EnrolResponse};
+use midshift_proto::refusal_of;
+use midshift_store::{MemoryStore, Store, StoreId};
+use rcgen::{CertificateParams, KeyPair};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use tempfile::TempDir;
+use tokio_util::sync::CancellationToken;
+use tonic::{Request, Status};
+
+pub struct World {
+    pub store: Arc<dyn Store>,
+    pub clock: Arc<dyn Clock>,
+    us: Arc<AtomicU64>,
+    pub dir: TempDir,
+}
+
+impl World {
+    pub fn new() -> Self {
+        let us = Arc::new(AtomicU64::new(0));
+        let source = us.clone();
+        // Certificates are held against the machine's own clock by those who check them.
+        let clock: Arc<dyn Clock> = Arc::new(ScaledClock::new(move || source.load(Ordering::Relaxed), wall(), 1000));
+        let site = SiteId::parse("factory").expect("a site");
+        let store = Arc::new(MemoryStore::new(site, StoreId::fresh(), clock.clone()));
+        Self { store, clock, us, dir: TempDir::new().expect("a folder") }
+    }
+    pub fn pass_ms(&self, ms: u64) {
+        self.us.fetch_add(ms * 1000, Ordering::Relaxed);
+    }
+    pub fn folder(&self) -> PathBuf {
+        self.dir.path().join("identity")
+    }
+    pub async fn open(&self) -> Result<IdentityService, Error> {
+        self.open_in(self.folder(), Duty::Authority).await
+    }
+    pub async fn open_in(&self, folder: PathBuf, duty: Duty) -> Result<IdentityService, Error> {
+        let parts = Parts {
+            folder,
+            store: self.store.clone(),
+            clock: self.clock.clone(),
+            duty,
+            names: vec!["fleet.local".to_owned()],
+            trust_json: "{}".to_owned(),
+        };
+        IdentityService::open(parts, &CancellationToken::new()).await
+    }
+}
+
+fn wall() -> Utc {
+    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).expect("after 1970");
+    Utc(i64::try_from(since.as_millis()).expect("before the year 292277026596"))
+}
+
+/// A machine with a key of its own.
+pub struct Machine(KeyPair);
+
+impl Machine {
+    pub fn new() -> Self {
+        Self(KeyPair::generate_for(&rcgen::PKCS_ED25519).expect("a key"))
+    }
+    pub fn request(&self) -> String {
+        // It may ask for any name: the site says which it gets.
+        let params = CertificateParams::new(vec!["root.example".to_owned()]).expect("parameters");
+        params.serialize_request(&self.0).and_then(|request| request.pem()).expect("a request")
+    }
+}
+
+pub fn asked_by<T>(caller: Caller, message: T) -> Request<T> {
+    let mut request = Request::new(message);
+    request.extensions_mut().insert(caller);
+    request
+}
+
+pub fn code(status: &Status) -> Option<Code> {
+    refusal_of(status).code
+}
+
+pub async fn secret(identity: &IdentityService, robot_id: &str, replace: bool) -> Result<String, Status> {
+    let request = CreateEnrolmentRequest { robot_id: robot_id.to_owned(), replace };
+    Ok(identity.create_enrolment(Request::new(request)).await?.into_inner().secret)
+}
+
+/// What of the line is the secret's own.
+pub fn shown(line: &str) -> String {
+    line.rsplit_once('.').expect("a digest behind it").0.to_owned()
+}
+
+pub async fn enrol(
+    identity: &IdentityService,
+    robot: &str,
+    line: &str,
+    machine: &Machine,
+) -> Result<EnrolResponse, Status> {
+    let request = EnrolRequest { robot_id: robot.to_owned(), secret: shown(line), request_pem: machine.request() };
+    Ok(identity.enrol(asked_by(Caller::nobody(), request)).await?.into_inner())
+}
