@@ -461,6 +461,13 @@ pub struct Live {
     pub clock_offset_ms: Option<(i64, u64)>,
 }
 
+impl Live {
+    /// The area in which the robot is: that of the waypoint it was at last. None: not known.
+    pub fn area<'s>(&self, site: &'s crate::site::Site) -> Option<&'s AreaId> {
+        site.area_at(self.report.vitals.waypoint.as_ref())
+    }
+}
+
 /// A heartbeat as its gateway tells other processes: without the clocks of one of them.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Told {

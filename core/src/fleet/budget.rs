@@ -8,7 +8,7 @@
 
 use super::rows::{AreaBudget, Drain, DrainState, RobotHolder};
 use super::view::View;
-use super::{Board, Plan, Tx, heard, way};
+use super::{Board, Plan, Tx, heard, objects};
 use crate::ids::{AreaId, RobotId};
 use crate::reason::{Code, Reason};
 use crate::robot::{Duty, Presence};
@@ -79,7 +79,7 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
     keep_rows(view, now, &areas, plan);
     waiting.sort_by_cached_key(|d| (!d.urgent, cost(view, &d.robot_id), d.since, d.drain_id.clone()));
     for drain in waiting {
-        let here = area_of(view, board, &drain.robot_id);
+        let here = objects::area_of(view, board, &drain.robot_id);
         let why = match (&here, view.drain_of(&drain.robot_id)) {
             (_, Some(other)) => Some(Reason::from(Code::RobotDraining).with("drain_id", &other.drain_id)),
             (Some(area), None) if !drain.urgent => {
@@ -144,15 +144,10 @@ fn cost(view: &View, robot_id: &RobotId) -> u8 {
     }
 }
 
-fn area_of(view: &View, board: &Board, robot_id: &RobotId) -> Option<AreaId> {
-    let at = way::find(view, board.get(robot_id)?.report.vitals.waypoint.as_ref())?;
-    Some(view.site.area_of(at).area_id.clone())
-}
-
 fn areas(view: &View, board: &Board, now: &Now) -> BTreeMap<AreaId, Area> {
     let mut areas: BTreeMap<AreaId, Area> = BTreeMap::new();
     for robot_id in board.keys().filter(|id| heard::presence(board, id, now) != Presence::Offline) {
-        let Some(area_id) = area_of(view, board, robot_id) else { continue };
+        let Some(area_id) = objects::area_of(view, board, robot_id) else { continue };
         let area = areas.entry(area_id).or_default();
         area.robots.insert(robot_id.clone());
         let duty = view.control.get(robot_id.as_str()).map_or(Duty::InWork, |c| c.row.duty());

@@ -20,6 +20,7 @@ pub mod heard;
 pub mod inbox;
 pub mod incidents;
 pub mod load;
+pub mod objects;
 pub mod places;
 pub mod pool;
 pub mod repair;

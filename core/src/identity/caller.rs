@@ -112,6 +112,24 @@ impl Caller {
         if self.may_over(permission, areas) { Ok(()) } else { Err(self.denied(permission)) }
     }
 
+    /// Whether it may do that everywhere: where something lies does not matter then.
+    pub fn may_everywhere(&self, permission: Permission) -> bool {
+        self.may_over(permission, [])
+    }
+
+    /// Whether it may do that to something that is there and lies in these areas. What it may not even see is `missing` to it.
+    ///
+    /// # Errors
+    /// It may not see it, or sees it and may not do that.
+    pub fn acts_on<'a>(
+        &self,
+        permission: Permission,
+        areas: impl IntoIterator<Item = &'a AreaId> + Copy,
+        missing: impl FnOnce() -> Refusal,
+    ) -> Result<(), Refusal> {
+        if self.may_over(Permission::Read, areas) { self.needs(permission, areas) } else { Err(missing()) }
+    }
+
     /// Whether it is this robot, or one for whom robots' own calls are open.
     ///
     /// # Errors
@@ -174,6 +192,20 @@ mod tests {
         assert!(!caller.may_over(Permission::Operate, [&area("packing"), &area("storage")]));
         assert!(!caller.may_over(Permission::Read, []), "what lies nowhere is the site's");
         assert!(holder(&["viewer"]).may_over(Permission::Read, []));
+    }
+
+    #[test]
+    fn what_a_caller_may_not_see_is_missing_to_it_and_what_it_sees_is_denied() {
+        let caller = holder(&["operator@packing", "viewer@storage"]);
+        let acts = |name: &str| {
+            let missing = || Refusal::new(Kind::NotFound, Code::TaskNotFound);
+            caller.acts_on(Permission::Operate, [&area(name)], missing).map_err(|refusal| refusal.kind())
+        };
+        assert_eq!(["packing", "storage", "yard"].map(acts), [Ok(()), Err(Kind::Denied), Err(Kind::NotFound)]);
+        assert!(!caller.may_everywhere(Permission::Read));
+        assert!(
+            holder(&["viewer"]).may_everywhere(Permission::Read) && Caller::local().may_everywhere(Permission::Reset)
+        );
     }
 
     #[test]

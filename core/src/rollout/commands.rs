@@ -10,8 +10,9 @@ use super::rows::{
 };
 use super::spec::{RolloutSpec, Wave};
 use super::view::View;
-use super::{Board, Plan, Tx, assign, moves, phases, robots, verdict};
+use super::{Board, Plan, Tx, assign, moves, objects, phases, robots, verdict};
 use crate::gates::FailureEvidence;
+use crate::identity::Caller;
 use crate::ids::{BundleId, RobotId, RolloutId};
 use crate::limits;
 use crate::once;
@@ -120,7 +121,7 @@ pub struct Ask {
     /// The same id with the same command is one request. A [`Verb::Start`] and a [`Verb::RetryFailed`] take none: they are more than one item.
     pub request_id: Option<String>,
     /// Who asks.
-    pub actor: String,
+    pub by: Caller,
 }
 
 /// Whether a command is only checked.
@@ -144,9 +145,11 @@ pub enum Taken {
 /// Decides on a request whole: what was carried out before, under its request_id or by what is known, is not carried out again.
 ///
 /// # Errors
-/// Why not; a request_id that was used for something else.
+/// Why not; whoever asks may not; a request_id that was used for something else.
 pub fn take(view: &mut View, board: &Board, now: Now, ask: &Ask, plan: &mut Plan) -> Result<Taken, Refusal> {
-    let Ask { command, seen, check_only, request_id, actor } = ask;
+    let Ask { command, seen, check_only, request_id, by } = ask;
+    objects::permit(view, board, by, command)?;
+    let actor = &by.to_string();
     if let Some(id) = request_id
         && let Some(at) = once::done_before(&view.command_keys, id, command, *seen)?
     {
@@ -310,6 +313,12 @@ fn may_start(view: &View, board: &Board, rollout: &Rollout, supersede: bool) -> 
         }
         _ => Ok(()),
     }
+}
+
+/// Roll-outs that would end if this one began in their place.
+pub(super) fn superseded(view: &View, board: &Board, rollout_id: &RolloutId) -> BTreeSet<RolloutId> {
+    let known = view.rollout(rollout_id).and_then(|rollout| Some((rollout, members(view, board, rollout).ok()?)));
+    known.map(|(rollout, (robots, _))| overlapping(view, rollout, robots.iter().map(|(id, ..)| id))).unwrap_or_default()
 }
 
 fn members(view: &View, board: &Board, rollout: &Rollout) -> Result<Members, Refusal> {

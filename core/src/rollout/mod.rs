@@ -18,6 +18,7 @@ pub mod matching;
 pub mod moves;
 pub mod named;
 pub mod newcomers;
+pub mod objects;
 pub mod phases;
 pub mod robots;
 pub mod rows;

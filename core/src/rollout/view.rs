@@ -403,8 +403,7 @@ impl View {
     }
     /// The area in which a robot is.
     pub fn area_of(&self, live: &Live) -> Option<AreaId> {
-        let at = live.report.vitals.waypoint.as_ref().and_then(|w| self.site.find(w))?;
-        Some(self.site.area_of(at).area_id.clone())
+        live.area(&self.site).cloned()
     }
     /// Everything that the robot had said when it sent this heartbeat was consumed, nothing that it said since, and it belongs to the newest
     /// session.

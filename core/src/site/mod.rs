@@ -6,6 +6,7 @@
 
 mod draft;
 pub mod grid;
+mod lies;
 pub mod lif;
 pub mod lint;
 pub mod route;

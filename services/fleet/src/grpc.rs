@@ -2,12 +2,15 @@
 
 use crate::{FleetService, encode};
 use midshift_core::fleet::commands::Command;
+use midshift_core::fleet::objects::{sees_incident, sees_place, sees_robot, sees_task};
 use midshift_core::fleet::rows::Incident;
 use midshift_core::fleet::{explain, view::View};
+use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{AreaId, PlaceId, RobotId, TaskId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::rows::Revision;
+use midshift_proto::access::caller;
 use midshift_proto::convert::fleet::encode_policy;
 use midshift_proto::convert::ms_of;
 use midshift_proto::convert::task::revision_of;
@@ -43,7 +46,7 @@ fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {
 }
 
 impl FleetService {
-    async fn cordon(&self, r: v1::CordonRobotRequest) -> Result<v1::CordonRobotResponse, Refusal> {
+    async fn cordon(&self, r: v1::CordonRobotRequest, by: &Caller) -> Result<v1::CordonRobotResponse, Refusal> {
         let mut bad = Violations::default();
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
         let request_id = request_id(&r.request_id, &mut bad);
@@ -51,24 +54,30 @@ impl FleetService {
         bad.finish()?;
         let robot_id = robot_id.ok_or_else(internal)?;
         let command = Command::Cordon { robot_id: robot_id.clone(), reason: r.reason };
-        self.act(command, revision_of(&r.etag), r.validate_only, request_id).await?;
+        self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
         let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
         Ok(v1::CordonRobotResponse { control: Some(control) })
     }
 
-    async fn uncordon(&self, r: v1::UncordonRobotRequest) -> Result<v1::UncordonRobotResponse, Refusal> {
+    async fn uncordon(&self, r: v1::UncordonRobotRequest, by: &Caller) -> Result<v1::UncordonRobotResponse, Refusal> {
         let mut bad = Violations::default();
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
         let request_id = request_id(&r.request_id, &mut bad);
         bad.finish()?;
         let robot_id = robot_id.ok_or_else(internal)?;
-        self.act(Command::Uncordon { robot_id: robot_id.clone() }, revision_of(&r.etag), r.validate_only, request_id)
-            .await?;
+        self.act(
+            Command::Uncordon { robot_id: robot_id.clone() },
+            by,
+            revision_of(&r.etag),
+            r.validate_only,
+            request_id,
+        )
+        .await?;
         let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
         Ok(v1::UncordonRobotResponse { control: Some(control) })
     }
 
-    async fn retire(&self, r: v1::RetireRobotRequest) -> Result<v1::RetireRobotResponse, Refusal> {
+    async fn retire(&self, r: v1::RetireRobotRequest, by: &Caller) -> Result<v1::RetireRobotResponse, Refusal> {
         let mut bad = Violations::default();
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
         let request_id = request_id(&r.request_id, &mut bad);
@@ -76,12 +85,12 @@ impl FleetService {
         bad.finish()?;
         let robot_id = robot_id.ok_or_else(internal)?;
         let command = Command::Retire { robot_id: robot_id.clone(), reason: r.reason };
-        self.act(command, revision_of(&r.etag), r.validate_only, request_id).await?;
+        self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
         let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
         Ok(v1::RetireRobotResponse { control: Some(control) })
     }
 
-    async fn drain(&self, r: v1::DrainRobotRequest) -> Result<v1::DrainRobotResponse, Refusal> {
+    async fn drain(&self, r: v1::DrainRobotRequest, by: &Caller) -> Result<v1::DrainRobotResponse, Refusal> {
         let mut bad = Violations::default();
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
         let request_id = request_id(&r.request_id, &mut bad);
@@ -94,36 +103,46 @@ impl FleetService {
         let robot_id = robot_id.ok_or_else(internal)?;
         let (within_ms, reason) = (within_ms.unsigned_abs(), r.reason);
         let command = Command::Drain { robot_id: robot_id.clone(), reason, within_ms };
-        self.act(command, revision_of(&r.etag), r.validate_only, request_id).await?;
+        self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
         let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
         Ok(v1::DrainRobotResponse { control: Some(control) })
     }
 
-    async fn undrain(&self, r: v1::UndrainRobotRequest) -> Result<v1::UndrainRobotResponse, Refusal> {
+    async fn undrain(&self, r: v1::UndrainRobotRequest, by: &Caller) -> Result<v1::UndrainRobotResponse, Refusal> {
         let mut bad = Violations::default();
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
         let request_id = request_id(&r.request_id, &mut bad);
         bad.finish()?;
         let robot_id = robot_id.ok_or_else(internal)?;
         let command = Command::Undrain { robot_id: robot_id.clone() };
-        self.act(command, revision_of(&r.etag), r.validate_only, request_id).await?;
+        self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
         let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
         Ok(v1::UndrainRobotResponse { control: Some(control) })
     }
 
-    async fn control(&self, r: v1::GetRobotControlRequest) -> Result<v1::GetRobotControlResponse, Refusal> {
+    async fn control(
+        &self,
+        r: v1::GetRobotControlRequest,
+        by: &Caller,
+    ) -> Result<v1::GetRobotControlResponse, Refusal> {
         let robot_id = RobotId::parse(&r.robot_id).map_err(|e| Refusal::field("robot_id", e.to_string()))?;
+        let by = by.clone();
         let found = self
-            .look(move |view, _, _| {
-                view.sessions.contains_key(robot_id.as_str()).then(|| encode::control(view, &robot_id))
+            .look(move |view, board, _| {
+                let is_there = view.sessions.contains_key(robot_id.as_str());
+                let is_seen = is_there && sees_robot(view, board, &by, &robot_id);
+                is_seen.then(|| encode::control(view, &robot_id))
             })
             .await?;
         let control = found.ok_or_else(|| not_found(Code::RobotNotFound, &r.robot_id))?;
         Ok(v1::GetRobotControlResponse { control: Some(control) })
     }
 
-    async fn policy(&self, area_id: AreaId) -> Result<v1::AreaPolicy, Refusal> {
+    async fn policy(&self, area_id: AreaId, by: &Caller) -> Result<v1::AreaPolicy, Refusal> {
         let id = area_id.clone();
+        if !by.may_over(Permission::Read, [&area_id]) {
+            return Err(not_found(Code::AreaNotFound, area_id));
+        }
         let found = self
             .look(move |view, _, _| {
                 let area = view.site.find_area(&id)?;
@@ -135,7 +154,7 @@ impl FleetService {
         found.ok_or_else(|| not_found(Code::AreaNotFound, area_id))
     }
 
-    async fn put_policy(&self, r: v1::PutAreaPolicyRequest) -> Result<v1::PutAreaPolicyResponse, Refusal> {
+    async fn put_policy(&self, r: v1::PutAreaPolicyRequest, by: &Caller) -> Result<v1::PutAreaPolicyResponse, Refusal> {
         let mut bad = Violations::default();
         let request_id = request_id(&r.request_id, &mut bad);
         let wire = r.policy.unwrap_or_default();
@@ -145,15 +164,16 @@ impl FleetService {
         bad.finish()?;
         let policy = policy.ok_or_else(|| Refusal::field("policy", "is required"))?;
         let area_id = policy.area_id.clone();
-        self.act(Command::PutPolicy(policy), seen, r.validate_only, request_id).await?;
+        self.act(Command::PutPolicy(policy), by, seen, r.validate_only, request_id).await?;
         let robots = self.look(|view, _, _| view.sessions.len() as u32).await?;
-        Ok(v1::PutAreaPolicyResponse { policy: Some(self.policy(area_id).await?), robots })
+        Ok(v1::PutAreaPolicyResponse { policy: Some(self.policy(area_id, by).await?), robots })
     }
 
-    async fn places(&self, r: v1::ListPlacesRequest) -> Result<v1::ListPlacesResponse, Refusal> {
+    async fn places(&self, r: v1::ListPlacesRequest, by: &Caller) -> Result<v1::ListPlacesResponse, Refusal> {
         let mut bad = Violations::default();
         let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
+        let by = by.clone();
         let (places, next_page_token) = self
             .look(move |view: &View, _, _| {
                 let in_use = |p: &midshift_core::fleet::rows::Place| {
@@ -162,6 +182,7 @@ impl FleetService {
                         || view.waits.values().any(|w| w.places.contains(&p.place_id))
                 };
                 let rows = view.places.iter().filter(|(_, p)| !r.in_use || in_use(&p.row));
+                let rows = rows.filter(|(_, p)| sees_place(view, &by, &p.row.place_id));
                 pages::page(
                     rows.map(|(id, p)| (id.clone(), encode::place(view, &p.row, p.revision))),
                     &r.page_token,
@@ -172,7 +193,7 @@ impl FleetService {
         Ok(v1::ListPlacesResponse { places, next_page_token })
     }
 
-    async fn clear(&self, r: v1::ClearPlaceRequest) -> Result<v1::ClearPlaceResponse, Refusal> {
+    async fn clear(&self, r: v1::ClearPlaceRequest, by: &Caller) -> Result<v1::ClearPlaceResponse, Refusal> {
         let mut bad = Violations::default();
         let place_id = bad.take("place_id", PlaceId::parse(&r.place_id));
         let request_id = request_id(&r.request_id, &mut bad);
@@ -184,80 +205,95 @@ impl FleetService {
         bad.finish()?;
         let place_id = place_id.ok_or_else(internal)?;
         let command = Command::ClearPlace { place_id: place_id.clone(), reason: r.reason };
-        self.act(command, seen, r.validate_only, request_id).await?;
+        self.act(command, by, seen, r.validate_only, request_id).await?;
         let place = self
             .look(move |view, _, _| view.places.get(place_id.as_str()).map(|p| encode::place(view, &p.row, p.revision)))
             .await?;
         Ok(v1::ClearPlaceResponse { place })
     }
 
-    async fn why_task(&self, r: v1::ExplainTaskRequest) -> Result<v1::ExplainTaskResponse, Refusal> {
+    async fn why_task(&self, r: v1::ExplainTaskRequest, by: &Caller) -> Result<v1::ExplainTaskResponse, Refusal> {
         let task_id = TaskId::parse(&r.task_id).map_err(|e| Refusal::field("task_id", e.to_string()))?;
+        let by = by.clone();
         let found = self
             .look(move |view, board, now| {
-                explain::task(view, board, now, &task_id).map(|e| encode::task_explanation(&task_id, &e, now.utc))
+                let mut found = explain::task(view, board, now, &task_id).filter(|_| sees_task(view, &by, &task_id))?;
+                found.candidates.retain(|c| sees_robot(view, board, &by, &c.robot_id));
+                Some(encode::task_explanation(&task_id, &found, now.utc))
             })
             .await?;
         let explanation = found.ok_or_else(|| not_found(Code::TaskNotFound, &r.task_id))?;
         Ok(v1::ExplainTaskResponse { explanation: Some(explanation) })
     }
 
-    async fn why_robot(&self, r: v1::ExplainRobotRequest) -> Result<v1::ExplainRobotResponse, Refusal> {
+    async fn why_robot(&self, r: v1::ExplainRobotRequest, by: &Caller) -> Result<v1::ExplainRobotResponse, Refusal> {
         let robot_id = RobotId::parse(&r.robot_id).map_err(|e| Refusal::field("robot_id", e.to_string()))?;
+        let by = by.clone();
         let found = self
             .look(move |view, board, now| {
-                explain::robot(view, board, now, &robot_id).map(|e| encode::robot_explanation(view, now, &robot_id, &e))
+                let found = explain::robot(view, board, now, &robot_id);
+                let mut found = found.filter(|_| sees_robot(view, board, &by, &robot_id))?;
+                found.candidates.retain(|c| sees_task(view, &by, &c.task_id));
+                Some(encode::robot_explanation(view, now, &robot_id, &found))
             })
             .await?;
         let explanation = found.ok_or_else(|| not_found(Code::RobotNotFound, &r.robot_id))?;
         Ok(v1::ExplainRobotResponse { explanation: Some(explanation) })
     }
 
-    async fn incidents(&self, r: v1::ListIncidentsRequest) -> Result<v1::ListIncidentsResponse, Refusal> {
+    async fn incidents(&self, r: v1::ListIncidentsRequest, by: &Caller) -> Result<v1::ListIncidentsResponse, Refusal> {
         let mut bad = Violations::default();
         let size = pages::size(r.page_size, &mut bad);
         let robot_id = if r.robot_id.is_empty() { None } else { bad.take("robot_id", RobotId::parse(&r.robot_id)) };
         bad.finish()?;
+        let by = by.clone();
         let (incidents, next_page_token) = self
-            .look(move |view: &View, _, _| {
+            .look(move |view: &View, board, _| {
                 let wanted = |i: &Incident| {
                     (r.include_closed || i.closed.is_none()) && (robot_id.is_none() || i.robot_id == robot_id)
                 };
                 let rows = view.incidents.iter().filter(|(_, i)| wanted(&i.row));
+                let rows = rows.filter(|(_, i)| sees_incident(view, board, &by, &i.row));
                 pages::page(rows.map(|(id, i)| (id.clone(), encode::incident(&i.row, i.revision))), &r.page_token, size)
             })
             .await?;
         Ok(v1::ListIncidentsResponse { incidents, next_page_token })
     }
 
-    async fn incident(&self, incident_id: String) -> Result<v1::Incident, Refusal> {
-        let id = incident_id.clone();
-        let look = |view: &View, id: &str| view.incidents.get(id).map(|i| encode::incident(&i.row, i.revision));
-        let found = self.look(move |view, _, _| look(view, &id)).await?;
+    async fn incident(&self, incident_id: String, by: &Caller) -> Result<v1::Incident, Refusal> {
+        let (id, by) = (incident_id.clone(), by.clone());
+        let found = self
+            .look(move |view, board, _| {
+                let found = view.incidents.get(&id).filter(|i| sees_incident(view, board, &by, &i.row));
+                found.map(|i| encode::incident(&i.row, i.revision))
+            })
+            .await?;
         found.ok_or_else(|| not_found(Code::IncidentNotFound, incident_id))
     }
 
-    async fn close_one(&self, r: v1::CloseIncidentRequest) -> Result<v1::CloseIncidentResponse, Refusal> {
+    async fn close_one(&self, r: v1::CloseIncidentRequest, by: &Caller) -> Result<v1::CloseIncidentResponse, Refusal> {
         let mut bad = Violations::default();
         let request_id = request_id(&r.request_id, &mut bad);
         reason_text(&r.reason, &mut bad);
         bad.finish()?;
         let command = Command::CloseIncident { incident_id: r.incident_id.clone(), reason: r.reason };
-        self.act(command, revision_of(&r.etag), r.validate_only, request_id).await?;
-        Ok(v1::CloseIncidentResponse { incident: Some(self.incident(r.incident_id).await?) })
+        self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
+        Ok(v1::CloseIncidentResponse { incident: Some(self.incident(r.incident_id, by).await?) })
     }
 
-    async fn counters(&self, r: v1::ListCountersRequest) -> Result<v1::ListCountersResponse, Refusal> {
+    async fn counters(&self, r: v1::ListCountersRequest, by: &Caller) -> Result<v1::ListCountersResponse, Refusal> {
         let mut bad = Violations::default();
         let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
+        let by = by.clone();
         let (counters, next_page_token) = self
-            .look(move |view, _, _| {
+            .look(move |view, board, _| {
                 let wanted = |c: &midshift_core::fleet::rows::RobotCounter| {
                     (r.robot_ids.is_empty() || r.robot_ids.iter().any(|id| id == c.robot_id.as_str()))
                         && (r.software.is_empty() || r.software == c.software)
                 };
                 let rows = view.counters.iter().filter(|(_, c)| wanted(&c.row));
+                let rows = rows.filter(|(_, c)| sees_robot(view, board, &by, &c.row.robot_id));
                 pages::page(rows.map(|(id, c)| (id.clone(), encode::counter(&c.row))), &r.page_token, size)
             })
             .await?;
@@ -276,42 +312,49 @@ impl Face for FleetService {
         &self,
         r: Request<v1::CordonRobotRequest>,
     ) -> Result<Response<v1::CordonRobotResponse>, Status> {
-        answer(self.cordon(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.cordon(r.into_inner(), &by).await)
     }
     async fn uncordon_robot(
         &self,
         r: Request<v1::UncordonRobotRequest>,
     ) -> Result<Response<v1::UncordonRobotResponse>, Status> {
-        answer(self.uncordon(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.uncordon(r.into_inner(), &by).await)
     }
     async fn retire_robot(
         &self,
         r: Request<v1::RetireRobotRequest>,
     ) -> Result<Response<v1::RetireRobotResponse>, Status> {
-        answer(self.retire(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.retire(r.into_inner(), &by).await)
     }
     async fn drain_robot(&self, r: Request<v1::DrainRobotRequest>) -> Result<Response<v1::DrainRobotResponse>, Status> {
-        answer(self.drain(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.drain(r.into_inner(), &by).await)
     }
     async fn undrain_robot(
         &self,
         r: Request<v1::UndrainRobotRequest>,
     ) -> Result<Response<v1::UndrainRobotResponse>, Status> {
-        answer(self.undrain(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.undrain(r.into_inner(), &by).await)
     }
     async fn get_robot_control(
         &self,
         r: Request<v1::GetRobotControlRequest>,
     ) -> Result<Response<v1::GetRobotControlResponse>, Status> {
-        answer(self.control(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.control(r.into_inner(), &by).await)
     }
     async fn get_area_policy(
         &self,
         r: Request<v1::GetAreaPolicyRequest>,
     ) -> Result<Response<v1::GetAreaPolicyResponse>, Status> {
+        let by = caller(&r);
         let area_id = AreaId::parse(&r.into_inner().area_id).map_err(|e| Refusal::field("area_id", e.to_string()));
         let policy = match area_id {
-            Ok(area_id) => self.policy(area_id).await,
+            Ok(area_id) => self.policy(area_id, &by).await,
             Err(refusal) => Err(refusal),
         };
         answer(policy.map(|policy| v1::GetAreaPolicyResponse { policy: Some(policy) }))
@@ -320,49 +363,58 @@ impl Face for FleetService {
         &self,
         r: Request<v1::PutAreaPolicyRequest>,
     ) -> Result<Response<v1::PutAreaPolicyResponse>, Status> {
-        answer(self.put_policy(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.put_policy(r.into_inner(), &by).await)
     }
     async fn list_places(&self, r: Request<v1::ListPlacesRequest>) -> Result<Response<v1::ListPlacesResponse>, Status> {
-        answer(self.places(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.places(r.into_inner(), &by).await)
     }
     async fn clear_place(&self, r: Request<v1::ClearPlaceRequest>) -> Result<Response<v1::ClearPlaceResponse>, Status> {
-        answer(self.clear(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.clear(r.into_inner(), &by).await)
     }
     async fn explain_task(
         &self,
         r: Request<v1::ExplainTaskRequest>,
     ) -> Result<Response<v1::ExplainTaskResponse>, Status> {
-        answer(self.why_task(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.why_task(r.into_inner(), &by).await)
     }
     async fn explain_robot(
         &self,
         r: Request<v1::ExplainRobotRequest>,
     ) -> Result<Response<v1::ExplainRobotResponse>, Status> {
-        answer(self.why_robot(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.why_robot(r.into_inner(), &by).await)
     }
     async fn list_incidents(
         &self,
         r: Request<v1::ListIncidentsRequest>,
     ) -> Result<Response<v1::ListIncidentsResponse>, Status> {
-        answer(self.incidents(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.incidents(r.into_inner(), &by).await)
     }
     async fn get_incident(
         &self,
         r: Request<v1::GetIncidentRequest>,
     ) -> Result<Response<v1::GetIncidentResponse>, Status> {
-        let incident = self.incident(r.into_inner().incident_id).await;
+        let by = caller(&r);
+        let incident = self.incident(r.into_inner().incident_id, &by).await;
         answer(incident.map(|incident| v1::GetIncidentResponse { incident: Some(incident) }))
     }
     async fn close_incident(
         &self,
         r: Request<v1::CloseIncidentRequest>,
     ) -> Result<Response<v1::CloseIncidentResponse>, Status> {
-        answer(self.close_one(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.close_one(r.into_inner(), &by).await)
     }
     async fn list_counters(
         &self,
         r: Request<v1::ListCountersRequest>,
     ) -> Result<Response<v1::ListCountersResponse>, Status> {
-        answer(self.counters(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.counters(r.into_inner(), &by).await)
     }
 }

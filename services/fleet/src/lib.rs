@@ -14,6 +14,7 @@ pub use retention::prune;
 use midshift_core::fleet::Board;
 use midshift_core::fleet::commands::Command;
 use midshift_core::fleet::view::View;
+use midshift_core::identity::Caller;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::Revision;
 use midshift_core::site::Site;
@@ -54,7 +55,7 @@ enum Request {
         command: Box<Command>,
         seen: Option<Revision>,
         validate_only: bool,
-        actor: String,
+        by: Caller,
         request_id: Option<String>,
         reply: oneshot::Sender<Result<(), Refusal>>,
     },
@@ -113,14 +114,14 @@ impl FleetService {
     async fn act(
         &self,
         command: Command,
+        by: &Caller,
         seen: Option<Revision>,
         validate_only: bool,
         request_id: Option<String>,
     ) -> Result<(), Refusal> {
         let (reply, answer) = oneshot::channel();
-        // Until login exists nobody is known by name.
-        let actor = "anonymous".to_owned();
-        self.send(Request::Do { command: Box::new(command), seen, validate_only, actor, request_id, reply }).await?;
+        let (command, by) = (Box::new(command), by.clone());
+        self.send(Request::Do { command, seen, validate_only, by, request_id, reply }).await?;
         answer.await.map_err(|_| Refusal::new(Kind::Unavailable, Code::CommitUnknown))?
     }
 }

@@ -6,7 +6,7 @@
 
 use crate::{Look, Parts, Request};
 use midshift_core::fleet::view::{TABLES, View};
-use midshift_core::fleet::{Board, LOGS, Pace, Plan, absorb, commands, cycle, found, obeyed};
+use midshift_core::fleet::{Board, LOGS, Pace, Plan, absorb, commands, cycle, found, obeyed, objects};
 use midshift_core::lead::{FleetLeader, Own, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::once;
@@ -312,11 +312,13 @@ impl Loop {
         for request in requests {
             match request {
                 Request::Look(look) => self.looks.push(look),
-                Request::Do { command, seen, validate_only, actor, request_id, reply } => {
-                    let repeat = match &request_id {
+                Request::Do { command, seen, validate_only, by, request_id, reply } => {
+                    let permitted = objects::permit(&self.view, &self.board, &by, &command);
+                    let repeat = permitted.and_then(|()| match &request_id {
                         Some(id) => once::is_repeat(&self.view.command_keys, id, &*command, seen),
                         None => Ok(false),
-                    };
+                    });
+                    let actor = by.to_string();
                     let is_repeat = matches!(repeat, Ok(true));
                     let check = || commands::check(&self.view, &self.board, &now, &command, seen);
                     let checked = repeat.and_then(|known| if known { Ok(()) } else { check() });

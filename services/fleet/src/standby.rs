@@ -6,7 +6,8 @@
 use crate::Request;
 use crate::reconcile::Loop;
 use midshift_core::fleet::commands::{self, Command};
-use midshift_core::fleet::{LOGS, Tx, follow_rows, reread};
+use midshift_core::fleet::{LOGS, Tx, follow_rows, objects, reread};
+use midshift_core::identity::Caller;
 use midshift_core::limits;
 use midshift_core::once;
 use midshift_core::picture;
@@ -19,7 +20,7 @@ pub(crate) struct Asked<'a> {
     command: &'a Command,
     seen: Option<Revision>,
     validate_only: bool,
-    actor: &'a str,
+    by: &'a Caller,
     request_id: Option<&'a str>,
 }
 
@@ -53,9 +54,9 @@ impl Loop {
         for request in requests {
             match request {
                 Request::Look(look) => self.looks.push(look),
-                Request::Do { command, seen, validate_only, actor, request_id, reply } => {
-                    let (actor, request_id) = (actor.as_str(), request_id.as_deref());
-                    let asked = Asked { command: &command, seen, validate_only, actor, request_id };
+                Request::Do { command, seen, validate_only, by, request_id, reply } => {
+                    let request_id = request_id.as_deref();
+                    let asked = Asked { command: &command, seen, validate_only, by: &by, request_id };
                     let answer = match trusted {
                         Ok(()) => self.carry_out(&asked).await,
                         Err(()) => Ok(Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile))),
@@ -100,7 +101,8 @@ impl Loop {
 
     /// What has to be written; none: nothing has.
     fn decide(&mut self, asked: &Asked) -> Result<Option<Item>, Refusal> {
-        let Asked { command, seen, validate_only, actor, request_id } = asked;
+        let Asked { command, seen, validate_only, by, request_id } = asked;
+        objects::permit(&self.view, &self.board, by, command)?;
         if let Some(id) = request_id
             && once::is_repeat(&self.view.command_keys, id, *command, *seen)?
         {
@@ -111,8 +113,9 @@ impl Loop {
         if *validate_only {
             return Ok(None);
         }
-        let mut tx = Tx::new(&mut self.view, now, actor).on_request(*request_id);
-        commands::apply(&mut tx, command, actor);
+        let actor = by.to_string();
+        let mut tx = Tx::new(&mut self.view, now, &actor).on_request(*request_id);
+        commands::apply(&mut tx, command, &actor);
         if let Some(id) = request_id {
             once::remember(&mut tx, id, *command, *seen);
         }

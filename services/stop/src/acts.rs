@@ -3,10 +3,11 @@
 //! Invariant: a stop goes to all lines before anything waits for the disk; changes reach every line in the order of their generations. What is answered
 //! was written and recorded, or says that it was not.
 
-use crate::audit::{Action, Note};
+use crate::audit::{Action, MIDSHIFT, Note};
 use crate::law::{Asked, Law, Resetting};
 use crate::outbox::Frame;
 use crate::{Inner, frames, lock};
+use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{RequestId, RobotId, StopId};
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::robot::StopLevel;
@@ -120,7 +121,8 @@ pub fn adopt(inner: &Inner, robot_id: &RobotId, stops: Vec<Stop>) -> BTreeSet<St
             continue;
         }
         let Some(generation) = law.engage(stop.clone(), None) else { continue };
-        inner.disk.note(note(Action::Adopted, &stop, now.wall).with("robot_id", robot_id));
+        let engaged = note(Action::Adopted, &stop, now.wall).with("engaged_by", &stop.actor);
+        inner.disk.note(Note { actor: MIDSHIFT.to_owned(), ..engaged.with("robot_id", robot_id) });
         drop(law);
         tell(inner, &stop, generation, &now);
         adopted += 1;
@@ -135,10 +137,15 @@ pub fn adopt(inner: &Inner, robot_id: &RobotId, stops: Vec<Stop>) -> BTreeSet<St
 }
 
 /// Notes a reset. It counts after the disk's turn, see [`settle`].
-pub fn reset(inner: &Inner, stop_id: StopId, reason: String, actor: String) -> Resetting {
+///
+/// # Errors
+/// Whoever asks may not reset where the stop is. One that is not known may be anywhere.
+pub fn reset(inner: &Inner, stop_id: StopId, reason: String, by: &Caller) -> Result<Resetting, Refusal> {
     let now = inner.clock.now();
     let mut law = lock(&inner.law);
-    let resetting = law.reset(Reset { stop_id, at: now.wall, actor, reason });
+    let areas = law.latch().stop(&stop_id).map(|stop| inner.ground.areas(&stop.scope)).unwrap_or_default();
+    by.needs(Permission::Reset, &areas)?;
+    let resetting = law.reset(Reset { stop_id, at: now.wall, actor: by.to_string(), reason });
     if resetting.is_new {
         let Reset { stop_id, actor, reason, .. } = &resetting.reset;
         let note = Note { actor: actor.clone(), ..Note::own(now.wall, Action::Reset) };
@@ -148,7 +155,7 @@ pub fn reset(inner: &Inner, stop_id: StopId, reason: String, actor: String) -> R
     }
     drop(law);
     inner.disk.wake();
-    resetting
+    Ok(resetting)
 }
 
 /// The disk had its turn with all up to `version`, or is not waited for any longer: resets among them count now, and all lines hear so.

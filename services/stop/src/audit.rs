@@ -53,10 +53,13 @@ pub struct Note {
     pub fields: BTreeMap<String, String>,
 }
 
+/// What the service does by itself is done under this name.
+pub const MIDSHIFT: &str = "midshift";
+
 impl Note {
     /// Of the service itself.
     pub fn own(at: Utc, action: Action) -> Self {
-        Self { at, actor: "midshift".to_owned(), action, fields: BTreeMap::new() }
+        Self { at, actor: MIDSHIFT.to_owned(), action, fields: BTreeMap::new() }
     }
     /// With one more field.
     pub fn with(mut self, name: &str, value: impl ToString) -> Self {

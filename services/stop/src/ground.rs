@@ -4,7 +4,7 @@ use midshift_core::ids::{AreaId, PlaceId};
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::site::Site;
 use midshift_core::stop::{Region, Scope};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Display;
 
 /// Names that a refusal lists; of more it says how many.
@@ -17,6 +17,8 @@ pub struct Ground(Option<Parts>);
 struct Parts {
     areas: BTreeMap<AreaId, Option<Region>>,
     zones: BTreeMap<PlaceId, Option<Region>>,
+    /// The areas that a zone leads through.
+    around: BTreeMap<PlaceId, BTreeSet<AreaId>>,
 }
 
 impl Ground {
@@ -27,8 +29,18 @@ impl Ground {
         Self(site.map(|site| {
             let areas = site.areas().iter().map(|a| (a.area_id.clone(), placed(Region::of_area(site, &a.area_id))));
             let zones = site.places().iter().map(|p| (p.place_id.clone(), placed(Region::of_zone(site, &p.place_id))));
-            Parts { areas: areas.collect(), zones: zones.collect() }
+            let around = site.places().iter().map(|p| (p.place_id.clone(), site.areas_of_place(&p.place_id)));
+            Parts { areas: areas.collect(), zones: zones.collect(), around: around.collect() }
         }))
+    }
+
+    /// The areas in which a stop is; none: it is the site's. Where a robot stands is not asked: it goes on standing when it is somewhere else.
+    pub fn areas(&self, scope: &Scope) -> BTreeSet<AreaId> {
+        match scope {
+            Scope::Robot(_) | Scope::Fleet => BTreeSet::new(),
+            Scope::Area(id) => BTreeSet::from([id.clone()]),
+            Scope::Zone(id) => self.0.as_ref().and_then(|parts| parts.around.get(id)).cloned().unwrap_or_default(),
+        }
     }
 
     /// Where a stop is.

@@ -1,12 +1,14 @@
 //! The people's and programs' face: decode, call, encode.
 
 use crate::acts::{self, Wanted};
-use crate::{ACTOR, StopService, WATCH_MAX, confirm, status};
+use crate::{StopService, WATCH_MAX, confirm, status};
+use midshift_core::identity::Caller;
 use midshift_core::ids::{RequestId, StopId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::robot::StopLevel;
 use midshift_core::stop::Scope;
+use midshift_proto::access::caller;
 use midshift_proto::convert::{At, WireEnum};
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::stop_service_server::StopService as Face;
@@ -17,7 +19,7 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
 
-fn wanted(r: v1::EngageRequest) -> Result<Wanted, Refusal> {
+fn wanted(r: v1::EngageRequest, by: &Caller) -> Result<Wanted, Refusal> {
     let mut bad = Violations::default();
     let level = StopLevel::from_wire(r.level);
     if level.is_none() {
@@ -43,16 +45,17 @@ fn wanted(r: v1::EngageRequest) -> Result<Wanted, Refusal> {
     let asked = v1::EngageRequest { level: level.to_wire(), request_id: String::new(), ..r.clone() };
     let hash: String = Sha256::digest(asked.encode_to_vec()).iter().map(|byte| format!("{byte:02x}")).collect();
     let request = request_id.map(|id| (id, hash));
-    Ok(Wanted { scope, level, reason: r.reason, request, actor: ACTOR.to_owned() })
+    Ok(Wanted { scope, level, reason: r.reason, request, actor: by.to_string() })
 }
 
 impl StopService {
     async fn engage_now(
         &self,
         r: v1::EngageRequest,
+        by: &Caller,
     ) -> Result<ReceiverStream<Result<v1::EngageResponse, Status>>, Refusal> {
         let inner = self.inner.clone();
-        let engaged = acts::engage(&inner, wanted(r)?)?;
+        let engaged = acts::engage(&inner, wanted(r, by)?)?;
         let durable = inner.disk.turn(engaged.version).await;
         let (sender, stream) = mpsc::channel(WATCH_MAX);
         let room = inner.watchers.clone().try_acquire_owned().ok();
@@ -67,7 +70,7 @@ impl StopService {
         Ok(ReceiverStream::new(stream))
     }
 
-    async fn take_back(&self, r: v1::ResetRequest) -> Result<v1::ResetResponse, Refusal> {
+    async fn take_back(&self, r: v1::ResetRequest, by: &Caller) -> Result<v1::ResetResponse, Refusal> {
         let mut bad = Violations::default();
         let stop_id = bad.take("stop_id", StopId::parse(&r.stop_id));
         if r.reason.trim().is_empty() || r.reason.len() > limits::REASON_BYTES_MAX {
@@ -78,7 +81,7 @@ impl StopService {
         }
         bad.finish()?;
         let stop_id = stop_id.ok_or_else(|| Refusal::field("stop_id", "cannot be read"))?;
-        let resetting = acts::reset(&self.inner, stop_id, r.reason, ACTOR.to_owned());
+        let resetting = acts::reset(&self.inner, stop_id, r.reason, by)?;
         let durable = self.inner.disk.turn(resetting.version).await;
         // A disk that does not answer holds up nobody who has looked and says that it is over.
         acts::settle(&self.inner, resetting.version);
@@ -118,10 +121,12 @@ impl Face for StopService {
     type WatchStatusStream = ReceiverStream<Result<v1::WatchStatusResponse, Status>>;
 
     async fn engage(&self, r: Request<v1::EngageRequest>) -> Result<Response<Self::EngageStream>, Status> {
-        answer(self.engage_now(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.engage_now(r.into_inner(), &by).await)
     }
     async fn reset(&self, r: Request<v1::ResetRequest>) -> Result<Response<v1::ResetResponse>, Status> {
-        answer(self.take_back(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.take_back(r.into_inner(), &by).await)
     }
     async fn get_status(&self, _: Request<v1::GetStatusRequest>) -> Result<Response<v1::GetStatusResponse>, Status> {
         answer(Ok(v1::GetStatusResponse { status: Some(status::status(&self.inner)) }))

@@ -49,8 +49,6 @@ use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
 
-/// Until login exists nobody is known by name.
-const ACTOR: &str = "anonymous";
 /// Messages on their way to one watcher.
 const WATCH_MAX: usize = 4;
 /// Names of the files that others look at.

@@ -6,6 +6,7 @@
 use crate::outbox::{Down, End, Outbox};
 use crate::robots::{Robot, Robots};
 use crate::{Inner, acts, lock};
+use midshift_core::identity::Caller;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
@@ -18,9 +19,13 @@ use std::sync::Arc;
 use std::time::Duration;
 use tonic::{Response, Status, Streaming};
 
-/// Reads who comes, and begins the line.
-pub async fn attend(inner: Arc<Inner>, mut up: Streaming<v1::AttendRequest>) -> Result<Response<Down>, Status> {
-    let begun = begin(&inner, &mut up).await;
+/// Reads who comes, and begins the line. A robot comes by its own certificate alone.
+pub async fn attend(
+    inner: Arc<Inner>,
+    by: &Caller,
+    mut up: Streaming<v1::AttendRequest>,
+) -> Result<Response<Down>, Status> {
+    let begun = begin(&inner, by, &mut up).await;
     let (robot, outbox) = begun.map_err(|refusal| midshift_proto::status(&refusal, None))?;
     let down = Down::new(inner.clone(), outbox.clone());
     tokio::spawn(async move {
@@ -34,12 +39,14 @@ pub async fn attend(inner: Arc<Inner>, mut up: Streaming<v1::AttendRequest>) -> 
 
 async fn begin(
     inner: &Arc<Inner>,
+    by: &Caller,
     up: &mut Streaming<v1::AttendRequest>,
 ) -> Result<(Arc<Robot>, Arc<Outbox>), Refusal> {
     if inner.shutdown.is_cancelled() {
         return Err(Refusal::new(Kind::Unavailable, Code::ShuttingDown));
     }
     let (robot_id, boot_id, stops) = first(up).await?;
+    by.is_robot(&robot_id)?;
     let robot = inner.robots.of(&robot_id)?;
     let listed = stops.iter().map(|stop| stop.stop_id.clone()).collect();
     let foreign = acts::adopt(inner, &robot_id, stops);

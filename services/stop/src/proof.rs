@@ -90,7 +90,7 @@ mod tests {
             scope: Scope::Fleet,
             level: StopLevel::Halt,
             engaged: Utc(1),
-            actor: "anonymous".to_owned(),
+            actor: "anna".to_owned(),
             reason: "drill".to_owned(),
             region: Some(Region::of_box(1, 2, 3, 4)),
             proof: Vec::new(),

@@ -4,7 +4,8 @@
 //! answered with its task for as long as its key is kept, even if its rules would no longer hold.
 
 use crate::TaskService;
-use crate::rows::{TaskRows, exist, read, unavailable};
+use crate::rows::{TaskRows, are_seen, read, unavailable};
+use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{RequestId, TaskId};
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violation};
 use midshift_core::rows::{Item, Table, Writer};
@@ -94,15 +95,16 @@ fn draw_id(utc: Utc, number: u64) -> TaskId {
 }
 
 impl TaskService {
-    /// Checks every rule of one request.
-    async fn check(&self, request: v1::SubmitTaskRequest) -> Result<Wanted, Refusal> {
+    /// Checks every rule of one request, and whether the caller may bring such work to where it goes.
+    async fn check(&self, request: v1::SubmitTaskRequest, by: &Caller) -> Result<Wanted, Refusal> {
         let hash = hash(&request);
         let submission = Submission::read(request);
         let (request_id, task_id) = (submission.request_id.clone(), submission.task_id.clone());
         let site = &self.inner.parts.site;
         let spec = submission.check(&|waypoint| site.find(waypoint).is_some())?;
+        self.dispatches(&spec, by)?;
         if !spec.depends_on.is_empty() {
-            let found = exist::<TaskIntake>(self.store(), &spec.depends_on).await?;
+            let found = are_seen(self.store(), site, by, &spec.depends_on).await?;
             let unknown = spec.depends_on.iter().zip(found).enumerate().filter(|(_, (_, found))| !found);
             let violations: Vec<Violation> = unknown
                 .map(|(i, (id, _))| Violation {
@@ -117,22 +119,31 @@ impl TaskService {
         Ok(Wanted { request_id, task_id, spec, hash })
     }
 
+    fn dispatches(&self, spec: &TaskSpec, by: &Caller) -> Result<(), Refusal> {
+        let dispatch = Permission::Dispatch;
+        if by.may_everywhere(dispatch) {
+            Ok(())
+        } else {
+            by.needs(dispatch, &self.inner.parts.site.areas_of_task(spec))
+        }
+    }
+
     /// The item of an admission, with the id asked for or a drawn one.
-    fn compose(&self, wanted: Wanted, actor: &str) -> Admission {
-        let now = self.inner.parts.clock.now();
+    fn compose(&self, wanted: Wanted, by: &Caller) -> Admission {
+        let (now, actor) = (self.inner.parts.clock.now(), by.to_string());
         let number = self.next_number();
         let drawn = || draw_id(now.utc, self.inner.salt.wrapping_add(number));
         let task_id = wanted.task_id.clone().unwrap_or_else(drawn);
         let intake = TaskIntake {
             task_id: task_id.clone(),
             spec: wanted.spec.clone(),
-            actor: actor.to_owned(),
+            actor: actor.clone(),
             request_id: wanted.request_id.as_ref().map(ToString::to_string).unwrap_or_default(),
             payload_hash: wanted.hash.clone(),
             created: now.utc,
             number,
         };
-        let mut item = Item::new(Writer::Task, actor);
+        let mut item = Item::new(Writer::Task, &actor);
         item.request_id = wanted.request_id.as_ref().map(|id| id.as_str().into());
         if let Some(request_id) = &wanted.request_id {
             let key = RequestKey {
@@ -149,14 +160,16 @@ impl TaskService {
 
     /// Checks a request and composes its admission, or finds the one it repeats: the site and the tasks it was checked against
     /// may have changed since.
-    pub async fn prepare(&self, request: v1::SubmitTaskRequest, actor: &str) -> Result<Prepared, Refusal> {
+    pub async fn prepare(&self, request: v1::SubmitTaskRequest, by: &Caller) -> Result<Prepared, Refusal> {
         let hash = hash(&request);
         let named = Submission::read(request.clone());
-        match self.check(request).await {
-            Ok(wanted) => Ok(Prepared::New(Box::new(self.compose(wanted, actor)))),
+        match self.check(request, by).await {
+            Ok(wanted) => Ok(Prepared::New(Box::new(self.compose(wanted, by)))),
             Err(refusal) if refusal.kind() == Kind::Invalid => {
                 let known = self.known(named.request_id.as_ref(), named.task_id.as_ref(), &hash).await?;
-                known.map(Prepared::Known).ok_or(refusal)
+                let known = known.ok_or(refusal)?;
+                self.dispatches(&read(self.store(), &known).await?.intake.spec, by)?;
+                Ok(Prepared::Known(known))
             }
             Err(refusal) => Err(refusal),
         }
@@ -184,7 +197,7 @@ impl TaskService {
         &self,
         admission: Admission,
         result: Result<Applied, CommitError>,
-        actor: &str,
+        by: &Caller,
     ) -> Result<Admitted, Refusal> {
         match result {
             Ok(_) => {
@@ -193,7 +206,7 @@ impl TaskService {
             }
             Err(CommitError::Conflict { key, .. }) if key.table == Table::RequestKey => self.repeated(admission).await,
             Err(CommitError::Conflict { .. }) if admission.wanted.task_id.is_some() => self.same_id(admission).await,
-            Err(CommitError::Conflict { .. }) => Ok(Admitted::Again(Box::new(self.compose(admission.wanted, actor)))),
+            Err(CommitError::Conflict { .. }) => Ok(Admitted::Again(Box::new(self.compose(admission.wanted, by)))),
             Err(CommitError::Unknown(_)) => Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)),
             Err(CommitError::TooLarge) => Err(Refusal::field("body", "is too large to be stored")),
             Err(
@@ -240,12 +253,12 @@ impl TaskService {
     }
 
     /// Admits one task.
-    pub async fn submit(&self, request: v1::SubmitTaskRequest, actor: &str) -> Result<v1::Task, Refusal> {
+    pub async fn submit(&self, request: v1::SubmitTaskRequest, by: &Caller) -> Result<v1::Task, Refusal> {
         if request.validate_only {
-            return Ok(encode_checked(&self.check(request).await?.spec));
+            return Ok(encode_checked(&self.check(request, by).await?.spec));
         }
-        let durable = match self.prepare(request, actor).await? {
-            Prepared::New(admission) => self.admit(*admission, actor).await?,
+        let durable = match self.prepare(request, by).await? {
+            Prepared::New(admission) => self.admit(*admission, by).await?,
             Prepared::Known(task_id) => Durable::Known(task_id),
         };
         match durable {
@@ -255,11 +268,11 @@ impl TaskService {
     }
 
     /// Commits an admission, with another id each time the drawn one was taken.
-    pub async fn admit(&self, mut admission: Admission, actor: &str) -> Result<Durable, Refusal> {
+    pub async fn admit(&self, mut admission: Admission, by: &Caller) -> Result<Durable, Refusal> {
         for _ in 0..DRAWS {
             let item = admission.item.clone();
             let result = self.commit(vec![item]).await.pop().ok_or_else(no_result)?;
-            match self.settle(admission, result, actor).await? {
+            match self.settle(admission, result, by).await? {
                 Admitted::Durable(durable) => return Ok(durable),
                 Admitted::Again(next) => admission = *next,
             }

@@ -3,10 +3,11 @@
 //! Invariant: whether fleet has looked at a request is read from fleet's own mark, never guessed from how a task looks. A repeat of a
 //! request_id with the same body is the same request: it writes nothing and its etag is not asked for again.
 
+use crate::TaskService;
 use crate::admit::no_result;
 use crate::rows::{TaskRows, read, unavailable};
-use crate::{ACTOR, TaskService};
 use midshift_core::fleet::rows::FleetMark;
+use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{AreaId, RequestId, RobotId, TaskId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
@@ -30,6 +31,7 @@ struct Asked {
     reason: String,
     request_id: Option<RequestId>,
     hash: String,
+    actor: String,
 }
 
 fn reason_text(text: &str, bad: &mut Violations) {
@@ -73,7 +75,7 @@ fn same_etag(seen: Option<Revision>, task: &TaskRows) -> Result<(), Refusal> {
 
 impl TaskService {
     /// Asks for the end of a task.
-    pub async fn cancel(&self, r: v1::CancelTaskRequest) -> Result<v1::CancelTaskResponse, Refusal> {
+    pub async fn cancel(&self, r: v1::CancelTaskRequest, by: &Caller) -> Result<v1::CancelTaskResponse, Refusal> {
         let mut bad = Violations::default();
         let task_id = bad.take("task_id", TaskId::parse(&r.task_id));
         reason_text(&r.reason, &mut bad);
@@ -82,7 +84,7 @@ impl TaskService {
         let task_id = task_id.ok_or_else(internal)?;
         let same = v1::CancelTaskRequest { request_id: String::new(), validate_only: false, ..r.clone() };
         let hash = hash("cancel", &same);
-        let task = read(self.store(), &task_id).await?;
+        let task = self.to_act_on(&task_id, by, Permission::Dispatch).await?;
         let earlier = self.asked_before(request_id.as_ref(), &hash).await?;
         if earlier.is_none() {
             if task.state.phase == Phase::Canceled {
@@ -97,13 +99,14 @@ impl TaskService {
             return Ok(v1::CancelTaskResponse { task: Some(task.encode()), pending: false });
         }
         let ask = Ask::Cancel { task_id: task_id.clone(), force: r.force };
-        let pending = self.ask(earlier, Asked { ask, reason: r.reason, request_id, hash }).await?;
+        let pending =
+            self.ask(earlier, Asked { ask, reason: r.reason, request_id, hash, actor: by.to_string() }).await?;
         let task = read(self.store(), &task_id).await?;
         Ok(v1::CancelTaskResponse { task: Some(task.encode()), pending })
     }
 
     /// A person's answer to NEEDS_OPERATOR.
-    pub async fn resolve(&self, r: v1::ResolveTaskRequest) -> Result<v1::ResolveTaskResponse, Refusal> {
+    pub async fn resolve(&self, r: v1::ResolveTaskRequest, by: &Caller) -> Result<v1::ResolveTaskResponse, Refusal> {
         let mut bad = Violations::default();
         let task_id = bad.take("task_id", TaskId::parse(&r.task_id));
         reason_text(&r.reason, &mut bad);
@@ -120,7 +123,7 @@ impl TaskService {
         let (Some(task_id), Some(resolution)) = (task_id, resolution) else { return Err(internal()) };
         let same = v1::ResolveTaskRequest { request_id: String::new(), validate_only: false, ..r.clone() };
         let hash = hash("resolve", &same);
-        let task = read(self.store(), &task_id).await?;
+        let task = self.to_act_on(&task_id, by, Permission::Operate).await?;
         let earlier = self.asked_before(request_id.as_ref(), &hash).await?;
         if earlier.is_none() {
             if task.state.phase.is_terminal() {
@@ -136,13 +139,14 @@ impl TaskService {
             return Ok(v1::ResolveTaskResponse { task: Some(task.encode()), pending: false });
         }
         let ask = Ask::Resolve { task_id: task_id.clone(), resolution };
-        let pending = self.ask(earlier, Asked { ask, reason: r.reason, request_id, hash }).await?;
+        let pending =
+            self.ask(earlier, Asked { ask, reason: r.reason, request_id, hash, actor: by.to_string() }).await?;
         let task = read(self.store(), &task_id).await?;
         Ok(v1::ResolveTaskResponse { task: Some(task.encode()), pending })
     }
 
     /// Takes `resume:` tokens away.
-    pub async fn resume(&self, r: v1::ResumeHeldRequest) -> Result<v1::ResumeHeldResponse, Refusal> {
+    pub async fn resume(&self, r: v1::ResumeHeldRequest, by: &Caller) -> Result<v1::ResumeHeldResponse, Refusal> {
         let mut bad = Violations::default();
         reason_text(&r.reason, &mut bad);
         let request_id = request_id(&r.request_id, &mut bad);
@@ -171,14 +175,16 @@ impl TaskService {
             bad.add("stop_id", "name a stop_id, an area_id, task_ids or robot_ids: nothing is resumed by accident");
         }
         bad.finish()?;
+        let ask = Ask::ResumeHeld { stop_id, area_id, task_ids, robot_ids };
+        self.may_resume(&ask, by).await?;
         let same = v1::ResumeHeldRequest { request_id: String::new(), validate_only: false, ..r.clone() };
         let hash = hash("resume", &same);
         let earlier = self.asked_before(request_id.as_ref(), &hash).await?;
         if r.validate_only {
             return Ok(v1::ResumeHeldResponse { pending: false });
         }
-        let ask = Ask::ResumeHeld { stop_id, area_id, task_ids, robot_ids };
-        let pending = self.ask(earlier, Asked { ask, reason: r.reason, request_id, hash }).await?;
+        let pending =
+            self.ask(earlier, Asked { ask, reason: r.reason, request_id, hash, actor: by.to_string() }).await?;
         Ok(v1::ResumeHeldResponse { pending })
     }
 
@@ -229,7 +235,7 @@ impl TaskService {
     /// Commits a request. The key goes first, so that the number of the item is that of the request itself.
     async fn write(&self, asked: Asked) -> Result<Seq, Refusal> {
         let now = self.inner.parts.clock.now();
-        let mut item = Item::new(Writer::Task, ACTOR);
+        let mut item = Item::new(Writer::Task, &asked.actor);
         item.request_id = asked.request_id.as_ref().map(|r| r.as_str().into());
         if let Some(request_id) = &asked.request_id {
             let key = RequestKey {
@@ -241,7 +247,7 @@ impl TaskService {
             item.create(&key, "request.used");
         }
         let id = format!("{:013}-{:016x}", now.wall.0, rand::random::<u64>());
-        let (ask, reason, actor) = (asked.ask, asked.reason, ACTOR.to_owned());
+        let Asked { ask, reason, actor, .. } = asked;
         item.create(&TaskRequest { id, ask, reason, actor, at_unix_ms: now.wall.0 }, "task.asked");
         match self.commit(vec![item]).await.pop().ok_or_else(no_result)? {
             Ok(applied) => Ok(applied.seq),

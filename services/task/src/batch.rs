@@ -2,8 +2,9 @@
 //!
 //! Invariant: an item is checked after everything sent before it that it depends on was committed, wherever slices end.
 
+use crate::TaskService;
 use crate::admit::{Admitted, Durable, Prepared, no_result};
-use crate::{ACTOR, TaskService};
+use midshift_core::identity::Caller;
 use midshift_core::limits;
 use midshift_core::reason::Refusal;
 use midshift_proto::common::v1::FieldViolation;
@@ -13,6 +14,7 @@ use std::collections::BTreeSet;
 /// A batch under way.
 pub struct Batch<'a> {
     service: &'a TaskService,
+    by: &'a Caller,
     slice: Vec<v1::SubmitTaskRequest>,
     /// Ids that items of the slice chose.
     chosen: BTreeSet<String>,
@@ -20,9 +22,9 @@ pub struct Batch<'a> {
 }
 
 impl<'a> Batch<'a> {
-    /// An empty one.
-    pub fn new(service: &'a TaskService) -> Self {
-        Self { service, slice: Vec::new(), chosen: BTreeSet::new(), results: Vec::new() }
+    /// An empty one of this caller.
+    pub fn new(service: &'a TaskService, by: &'a Caller) -> Self {
+        Self { service, by, slice: Vec::new(), chosen: BTreeSet::new(), results: Vec::new() }
     }
 
     /// Takes the next item; what came before is committed first if the slice is full or the item depends on it.
@@ -68,9 +70,9 @@ impl<'a> Batch<'a> {
                 Ok(Prepared::Known(task_id)) => Ok(Durable::Known(task_id)),
                 Ok(Prepared::New(admission)) => match committed.next() {
                     None => Err(no_result()),
-                    Some(result) => match self.service.settle(*admission, result, ACTOR).await {
+                    Some(result) => match self.service.settle(*admission, result, self.by).await {
                         Ok(Admitted::Durable(durable)) => Ok(durable),
-                        Ok(Admitted::Again(next)) => self.service.admit(*next, ACTOR).await,
+                        Ok(Admitted::Again(next)) => self.service.admit(*next, self.by).await,
                         Err(refusal) => Err(refusal),
                     },
                 },
@@ -86,7 +88,7 @@ impl<'a> Batch<'a> {
         if request.validate_only {
             return Err(Refusal::field("validate_only", "is not for a batch"));
         }
-        self.service.prepare(request, ACTOR).await
+        self.service.prepare(request, self.by).await
     }
 }
 

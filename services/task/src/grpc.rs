@@ -1,12 +1,14 @@
 //! The gRPC face of task intake: decode, call, encode.
 
 use crate::batch::Batch;
-use crate::{ACTOR, TaskService, rows};
+use crate::{TaskService, rows};
+use midshift_core::identity::Caller;
 use midshift_core::ids::{RequestId, Subject, TaskId};
 use midshift_core::limits;
 use midshift_core::reason::{Kind, Refusal};
 use midshift_core::rows::Table;
 use midshift_core::task::Attempt;
+use midshift_proto::access::caller;
 use midshift_proto::task::v1::{self, task_service_server::TaskService as Face};
 use midshift_store::Query;
 use tokio::sync::mpsc;
@@ -43,10 +45,10 @@ impl CallId {
 }
 
 impl TaskService {
-    async fn get(&self, r: v1::GetTaskRequest) -> Result<v1::GetTaskResponse, Refusal> {
+    async fn get(&self, r: v1::GetTaskRequest, by: &Caller) -> Result<v1::GetTaskResponse, Refusal> {
         let task_id = TaskId::parse(&r.task_id).map_err(|e| Refusal::field("task_id", e.to_string()))?;
         let store = self.store();
-        let task = rows::read(store, &task_id).await?;
+        let task = rows::read_for(store, &self.inner.parts.site, by, &task_id).await?;
         let query = Query {
             limit: limits::PAGE_MAX,
             ..Query::all(Table::Attempt).of_parent(Subject::Task(task_id).to_string())
@@ -64,48 +66,49 @@ impl Face for TaskService {
 
     async fn submit_task(&self, r: Request<v1::SubmitTaskRequest>) -> Result<Response<v1::SubmitTaskResponse>, Status> {
         let id = CallId::of(&r, &r.get_ref().request_id);
-        let task = self.submit(r.into_inner(), ACTOR).await;
+        let by = caller(&r);
+        let task = self.submit(r.into_inner(), &by).await;
         id.answer(task.map(|task| v1::SubmitTaskResponse { task: Some(task) }))
     }
     async fn submit_tasks(
         &self,
         r: Request<Streaming<v1::SubmitTasksRequest>>,
     ) -> Result<Response<v1::SubmitTasksResponse>, Status> {
-        let id = CallId::of(&r, "");
+        let (id, by) = (CallId::of(&r, ""), caller(&r));
         let mut stream = r.into_inner();
-        let mut batch = Batch::new(self);
+        let mut batch = Batch::new(self, &by);
         while let Some(message) = stream.message().await? {
             batch.take(message.item.unwrap_or_default()).await.map_err(|refusal| id.status(&refusal))?;
         }
         Ok(Response::new(v1::SubmitTasksResponse { results: batch.finish().await }))
     }
     async fn get_task(&self, r: Request<v1::GetTaskRequest>) -> Result<Response<v1::GetTaskResponse>, Status> {
-        let id = CallId::of(&r, "");
-        id.answer(self.get(r.into_inner()).await)
+        let (id, by) = (CallId::of(&r, ""), caller(&r));
+        id.answer(self.get(r.into_inner(), &by).await)
     }
     async fn list_tasks(&self, r: Request<v1::ListTasksRequest>) -> Result<Response<v1::ListTasksResponse>, Status> {
-        let id = CallId::of(&r, "");
-        id.answer(self.list(r.into_inner()).await)
+        let (id, by) = (CallId::of(&r, ""), caller(&r));
+        id.answer(self.list(r.into_inner(), &by).await)
     }
     async fn cancel_task(&self, r: Request<v1::CancelTaskRequest>) -> Result<Response<v1::CancelTaskResponse>, Status> {
-        let id = CallId::of(&r, &r.get_ref().request_id);
-        id.answer(self.cancel(r.into_inner()).await)
+        let (id, by) = (CallId::of(&r, &r.get_ref().request_id), caller(&r));
+        id.answer(self.cancel(r.into_inner(), &by).await)
     }
     async fn resolve_task(
         &self,
         r: Request<v1::ResolveTaskRequest>,
     ) -> Result<Response<v1::ResolveTaskResponse>, Status> {
-        let id = CallId::of(&r, &r.get_ref().request_id);
-        id.answer(self.resolve(r.into_inner()).await)
+        let (id, by) = (CallId::of(&r, &r.get_ref().request_id), caller(&r));
+        id.answer(self.resolve(r.into_inner(), &by).await)
     }
     async fn resume_held(&self, r: Request<v1::ResumeHeldRequest>) -> Result<Response<v1::ResumeHeldResponse>, Status> {
-        let id = CallId::of(&r, &r.get_ref().request_id);
-        id.answer(self.resume(r.into_inner()).await)
+        let (id, by) = (CallId::of(&r, &r.get_ref().request_id), caller(&r));
+        id.answer(self.resume(r.into_inner(), &by).await)
     }
     async fn watch_tasks(&self, r: Request<v1::WatchTasksRequest>) -> Result<Response<Self::WatchTasksStream>, Status> {
-        let id = CallId::of(&r, "");
+        let (id, by) = (CallId::of(&r, ""), caller(&r));
         let (sender, stream) = mpsc::channel(WATCH_MAX);
-        let watcher = self.watcher(r.into_inner(), sender).map_err(|refusal| id.status(&refusal))?;
+        let watcher = self.watcher(r.into_inner(), by, sender).map_err(|refusal| id.status(&refusal))?;
         tokio::spawn(watcher.run(id));
         Ok(Response::new(ReceiverStream::new(stream)))
     }

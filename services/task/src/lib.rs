@@ -10,6 +10,7 @@ mod grpc;
 mod images;
 mod list;
 mod prune;
+mod reach;
 mod rows;
 mod watch;
 
@@ -26,8 +27,6 @@ use tokio::sync::Semaphore;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
-/// Until login exists nobody is known by name.
-const ACTOR: &str = "anonymous";
 /// Watchers at a time. Each reads the feed for itself: about 100 KB and one read a commit.
 pub const WATCHERS_MAX: usize = 1_000;
 

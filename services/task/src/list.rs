@@ -1,7 +1,8 @@
 //! One page of tasks, newest first. A page token is bound to its filter.
 
 use crate::TaskService;
-use crate::rows::{TaskRows, read_many, unavailable};
+use crate::rows::{TaskRows, read_many, sees, unavailable};
+use midshift_core::identity::Caller;
 use midshift_core::ids::TaskId;
 use midshift_core::limits;
 use midshift_core::reason::{Refusal, Violations};
@@ -38,8 +39,8 @@ fn cursor_of(text: &str, print: &str) -> Result<Cursor, Refusal> {
 }
 
 impl TaskService {
-    /// One page.
-    pub async fn list(&self, r: v1::ListTasksRequest) -> Result<v1::ListTasksResponse, Refusal> {
+    /// One page of what the caller may see.
+    pub async fn list(&self, r: v1::ListTasksRequest, by: &Caller) -> Result<v1::ListTasksResponse, Refusal> {
         let print = print_of(&r.filter);
         let filter: TaskFilter = midshift_proto::parse_field(Some(r.filter.unwrap_or_default()), "filter")?;
         let mut bad = Violations::default();
@@ -47,9 +48,9 @@ impl TaskService {
         bad.finish()?;
         let after = if r.page_token.is_empty() { None } else { Some(cursor_of(&r.page_token, &print)?) };
         if filter.task_ids.is_empty() {
-            self.page(&filter, &print, size, after).await
+            self.page(&filter, by, &print, size, after).await
         } else {
-            self.named(&filter, &print, size, after).await
+            self.named(&filter, by, &print, size, after).await
         }
     }
 
@@ -57,6 +58,7 @@ impl TaskService {
     async fn named(
         &self,
         filter: &TaskFilter,
+        by: &Caller,
         print: &str,
         size: usize,
         after: Option<Cursor>,
@@ -65,7 +67,9 @@ impl TaskService {
         let place =
             |task: &TaskRows| Cursor { order: task.state.number as i64, id: task.state.task_id.as_str().into() };
         let mut found = read_many(self.store(), &ids).await?;
-        found.retain(|t| filter.admits(&t.intake, &t.state) && after.as_ref().is_none_or(|after| place(t) < *after));
+        let site = &self.inner.parts.site;
+        let admits = |t: &TaskRows| filter.admits(&t.intake, &t.state) && sees(site, by, &t.intake);
+        found.retain(|t| admits(t) && after.as_ref().is_none_or(|after| place(t) < *after));
         found.sort_by_key(|task| std::cmp::Reverse(place(task)));
         let more = found.len() > size;
         found.truncate(size);
@@ -77,11 +81,12 @@ impl TaskService {
     async fn page(
         &self,
         filter: &TaskFilter,
+        by: &Caller,
         print: &str,
         size: usize,
         mut after: Option<Cursor>,
     ) -> Result<v1::ListTasksResponse, Refusal> {
-        let store = self.store();
+        let (store, site) = (self.store(), &self.inner.parts.site);
         let mut tasks = Vec::new();
         let mut scanned = 0;
         loop {
@@ -103,7 +108,8 @@ impl TaskService {
             for row in &rows {
                 after = Some(Cursor::of(row));
                 let task = TaskId::parse(&row.key.id).ok().and_then(|id| found.remove(&id));
-                if let Some(task) = task.filter(|t| filter.admits(&t.intake, &t.state)) {
+                let admits = |t: &TaskRows| filter.admits(&t.intake, &t.state) && sees(site, by, &t.intake);
+                if let Some(task) = task.filter(admits) {
                     tasks.push(task.encode());
                 }
                 if tasks.len() == size {

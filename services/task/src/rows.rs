@@ -2,9 +2,11 @@
 
 use midshift_core::fleet::requests::allowed_resolutions;
 use midshift_core::fleet::rows::{RobotAuthority, RobotHolder};
+use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::TaskId;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
-use midshift_core::rows::{Key, Record, Revision, Row, Table};
+use midshift_core::rows::{BadRow, Key, Revision, Row, Table};
+use midshift_core::site::Site;
 use midshift_core::task::{Attempt, Resolution, TaskIntake, TaskState};
 use midshift_proto::convert::task::{TaskView, encode_task};
 use midshift_proto::task::v1;
@@ -53,6 +55,17 @@ pub fn unavailable(error: impl std::fmt::Display) -> Refusal {
 /// No such task.
 pub fn not_found(task_id: &TaskId) -> Refusal {
     Refusal::new(Kind::NotFound, Reason::from(Code::TaskNotFound).with("task_id", task_id))
+}
+
+/// One task that this caller may see.
+pub async fn read_for(store: &dyn Store, site: &Site, by: &Caller, task_id: &TaskId) -> Result<TaskRows, Refusal> {
+    let task = read(store, task_id).await?;
+    if sees(site, by, &task.intake) { Ok(task) } else { Err(not_found(task_id)) }
+}
+
+/// Whether a caller may see a task: all areas of its goals.
+pub fn sees(site: &Site, by: &Caller, intake: &TaskIntake) -> bool {
+    by.may_everywhere(Permission::Read) || by.may_over(Permission::Read, &site.areas_of_task(&intake.spec))
 }
 
 /// One task.
@@ -123,9 +136,13 @@ pub async fn robot_kept(store: &dyn Store, state: &TaskState) -> Result<bool, Er
     Ok(found.is_some_and(|(authority, _)| keeps(&authority, state)))
 }
 
-/// Whether a record of this id exists.
-pub async fn exist<R: Record>(store: &dyn Store, ids: &[TaskId]) -> Result<Vec<bool>, Refusal> {
-    let keys = ids.iter().map(|id| Key::new(R::TABLE, id.as_str())).collect();
+/// Whether there is a task of this id that a caller may see.
+pub async fn are_seen(store: &dyn Store, site: &Site, by: &Caller, ids: &[TaskId]) -> Result<Vec<bool>, Refusal> {
+    let keys = ids.iter().map(|id| Key::new(Table::TaskIntake, id.as_str())).collect();
     let found = by_id(store, keys).await.map_err(unavailable)?;
-    Ok(ids.iter().map(|id| found.contains_key(id.as_str())).collect())
+    let seen = |row: &Row| -> Result<bool, BadRow> {
+        Ok(by.may_everywhere(Permission::Read) || sees(site, by, &row.decode::<TaskIntake>()?))
+    };
+    let seen = ids.iter().map(|id| found.get(id.as_str()).map_or(Ok(false), seen));
+    seen.collect::<Result<_, BadRow>>().map_err(unavailable)
 }

@@ -6,8 +6,9 @@
 use crate::TaskService;
 use crate::grpc::CallId;
 use crate::images::{Image, Images};
-use crate::rows::{read_many, robot_kept, unavailable};
+use crate::rows::{read_many, robot_kept, sees, unavailable};
 use midshift_core::fleet::requests::allowed_resolutions;
+use midshift_core::identity::Caller;
 use midshift_core::ids::TaskId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
@@ -36,6 +37,8 @@ pub type Sender = mpsc::Sender<Result<v1::WatchTasksResponse, Status>>;
 pub struct Watcher {
     service: TaskService,
     filter: TaskFilter,
+    /// Who watches: it is told of nothing that it may not see.
+    by: Caller,
     sender: Sender,
     /// Begins with the tasks as they are.
     from_now: bool,
@@ -63,13 +66,14 @@ impl From<Refusal> for Stop {
 
 impl TaskService {
     /// A watcher at `cursor`, or at the beginning of now.
-    pub fn watcher(&self, r: v1::WatchTasksRequest, sender: Sender) -> Result<Watcher, Refusal> {
+    pub fn watcher(&self, r: v1::WatchTasksRequest, by: Caller, sender: Sender) -> Result<Watcher, Refusal> {
         let filter: TaskFilter = midshift_proto::parse_field(Some(r.filter.unwrap_or_default()), "filter")?;
         let after = self.position(&r.cursor)?;
         let place = self.inner.watchers.clone().try_acquire_owned();
         Ok(Watcher {
             service: self.clone(),
             filter,
+            by,
             sender,
             from_now: r.cursor.is_empty(),
             after,
@@ -156,7 +160,8 @@ impl Watcher {
             after = Some(Cursor::of(last));
             let ids: Vec<TaskId> = rows.iter().filter_map(|r| TaskId::parse(&r.key.id).ok()).collect();
             for task in read_many(store.as_ref(), &ids).await? {
-                if self.filter.admits(&task.intake, &task.state) {
+                let is_seen = sees(&self.service.inner.parts.site, &self.by, &task.intake);
+                if is_seen && self.filter.admits(&task.intake, &task.state) {
                     self.shown.insert(task.state.number, task.revision);
                     self.keep_near(&task.state, true);
                     self.send(Item::Existing(task.encode()), None).await?;
@@ -202,7 +207,8 @@ impl Watcher {
         let said = self.shown.get(&state.number).is_some_and(|shown| entry.revision <= *shown);
         let admitted = self.filter.admits(intake, &state);
         let leaves = !admitted && self.near.contains(&state.number);
-        if said || !(admitted || leaves) {
+        let is_seen = sees(&self.service.inner.parts.site, &self.by, intake);
+        if said || !(admitted || leaves) || !is_seen {
             return Ok(());
         }
         // What may be answered is about now: the robot's row as it is.

@@ -1,6 +1,7 @@
 //! Robots and their events for people and programs: decode, look at the picture and the board, encode.
 
 use crate::{Inner, TelemetryService};
+use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
@@ -8,6 +9,7 @@ use midshift_core::robot::{Lane, Presence};
 use midshift_core::rows::{Log, Seq};
 use midshift_core::time::Utc;
 use midshift_core::work::{InboxEntry, InboxItem, Live, RobotEvent, SampleBody};
+use midshift_proto::access::caller;
 use midshift_proto::convert::WireEnum;
 use midshift_proto::convert::telemetry::{RobotView, encode_event, encode_robot};
 use midshift_proto::pages;
@@ -28,14 +30,15 @@ const WATCH_MAX: usize = 4;
 const PERIOD_DEFAULT_MS: u32 = 1_000;
 const PERIOD_MS: std::ops::RangeInclusive<u32> = 50..=60_000;
 
-#[derive(Clone, Default)]
+/// Which robots somebody asks for, and who: nobody is shown what it may not see.
 struct Filter {
+    by: Caller,
     robot_ids: BTreeSet<String>,
     presences: BTreeSet<Presence>,
     labels: BTreeMap<String, String>,
 }
 
-fn filter(wire: Option<v1::RobotFilter>, bad: &mut Violations) -> Filter {
+fn filter(wire: Option<v1::RobotFilter>, by: Caller, bad: &mut Violations) -> Filter {
     let wire = wire.unwrap_or_default();
     let mut presences = BTreeSet::new();
     for (i, number) in wire.presences.iter().enumerate() {
@@ -47,7 +50,7 @@ fn filter(wire: Option<v1::RobotFilter>, bad: &mut Violations) -> Filter {
     if wire.robot_ids.len() > limits::PAGE_MAX {
         bad.add("filter.robot_ids", "must be at most 1000");
     }
-    Filter { robot_ids: wire.robot_ids.into_iter().collect(), presences, labels: wire.labels.into_iter().collect() }
+    Filter { by, robot_ids: wire.robot_ids.into_iter().collect(), presences, labels: wire.labels.into_iter().collect() }
 }
 
 fn encode(inner: &Inner, robot_id: &RobotId, live: Option<&Live>) -> Option<v1::Robot> {
@@ -74,7 +77,18 @@ fn encode(inner: &Inner, robot_id: &RobotId, live: Option<&Live>) -> Option<v1::
     Some(v1::Robot { beacon, ..encode_robot(view, now.link) })
 }
 
+/// Whether a caller may see a robot: where it is now, by its newest heartbeat.
+fn sees(inner: &Inner, by: &Caller, robot_id: &RobotId) -> bool {
+    by.may_everywhere(Permission::Read) || {
+        let live = inner.parts.board.get(robot_id);
+        by.may_over(Permission::Read, inner.picture.rows().area_of(live.as_deref()))
+    }
+}
+
 fn admits(inner: &Inner, filter: &Filter, robot_id: &RobotId) -> bool {
+    if !sees(inner, &filter.by, robot_id) {
+        return false;
+    }
     let rows = inner.picture.rows();
     let presence = rows.presence.get(robot_id).map_or(Presence::Offline, |p| p.presence);
     let labels = rows.sessions.get(robot_id).map(|s| &s.inventory.labels);
@@ -84,10 +98,10 @@ fn admits(inner: &Inner, filter: &Filter, robot_id: &RobotId) -> bool {
 }
 
 impl TelemetryService {
-    fn list(&self, r: v1::ListRobotsRequest) -> Result<v1::ListRobotsResponse, Refusal> {
+    fn list(&self, r: v1::ListRobotsRequest, by: Caller) -> Result<v1::ListRobotsResponse, Refusal> {
         let mut bad = Violations::default();
         let size = pages::size(r.page_size, &mut bad);
-        let filter = filter(r.filter, &mut bad);
+        let filter = filter(r.filter, by, &mut bad);
         bad.finish()?;
         let inner = &self.inner;
         let ids: Vec<RobotId> = inner.picture.rows().sessions.keys().cloned().collect();
@@ -98,16 +112,16 @@ impl TelemetryService {
         Ok(v1::ListRobotsResponse { robots, next_page_token })
     }
 
-    fn get(&self, r: &v1::GetRobotRequest) -> Result<v1::GetRobotResponse, Refusal> {
+    fn get(&self, r: &v1::GetRobotRequest, by: &Caller) -> Result<v1::GetRobotResponse, Refusal> {
         let robot_id = RobotId::parse(&r.robot_id).map_err(|e| Refusal::field("robot_id", e.to_string()))?;
-        let robot = encode(&self.inner, &robot_id, self.inner.parts.board.get(&robot_id).as_deref());
-        match robot {
+        let robot = || encode(&self.inner, &robot_id, self.inner.parts.board.get(&robot_id).as_deref());
+        match sees(&self.inner, by, &robot_id).then(robot).flatten() {
             Some(robot) => Ok(v1::GetRobotResponse { robot: Some(robot) }),
             None => Err(Refusal::new(Kind::NotFound, Reason::from(Code::RobotNotFound).with("robot_id", &r.robot_id))),
         }
     }
 
-    async fn events(&self, r: v1::ListEventsRequest) -> Result<v1::ListEventsResponse, Refusal> {
+    async fn events(&self, r: v1::ListEventsRequest, by: &Caller) -> Result<v1::ListEventsResponse, Refusal> {
         let mut bad = Violations::default();
         let size = pages::size(r.page_size, &mut bad);
         if r.robot_ids.len() > limits::PAGE_MAX {
@@ -124,7 +138,7 @@ impl TelemetryService {
         };
         let page = match page {
             Err(Error::CursorExpired { oldest, .. }) if r.cursor.is_empty() => {
-                return Box::pin(self.events(v1::ListEventsRequest { cursor: self.cursor(oldest), ..r })).await;
+                return Box::pin(self.events(v1::ListEventsRequest { cursor: self.cursor(oldest), ..r }, by)).await;
             }
             Err(Error::CursorExpired { .. }) => return Err(Refusal::new(Kind::Precondition, Code::CursorExpired)),
             Err(error) => {
@@ -132,13 +146,16 @@ impl TelemetryService {
             }
             Ok(page) => page,
         };
+        let mut seen: BTreeMap<RobotId, bool> = BTreeMap::new();
         let events = page
             .entries
             .iter()
             .filter_map(|entry| {
                 let said: InboxEntry = serde_json::from_str(entry.body.as_ref()?).ok()?;
                 let about = r.subject.is_empty() || subject(&said).is_some_and(|s| s == r.subject);
-                about.then(|| encode_event(&said, Utc(entry.at_unix_ms), self.cursor(entry.seq)))
+                let is_seen = |robot_id: &RobotId| sees(&self.inner, by, robot_id);
+                let is_seen = *seen.entry(said.robot_id.clone()).or_insert_with_key(is_seen);
+                (about && is_seen).then(|| encode_event(&said, Utc(entry.at_unix_ms), self.cursor(entry.seq)))
             })
             .collect();
         Ok(v1::ListEventsResponse { events, cursor: self.cursor(page.next), caught_up: page.next >= page.head })
@@ -181,21 +198,24 @@ impl Face for TelemetryService {
     type WatchRobotsStream = ReceiverStream<Result<v1::WatchRobotsResponse, Status>>;
 
     async fn list_robots(&self, r: Request<v1::ListRobotsRequest>) -> Result<Response<v1::ListRobotsResponse>, Status> {
-        answer(self.list(r.into_inner()))
+        let by = caller(&r);
+        answer(self.list(r.into_inner(), by))
     }
     async fn get_robot(&self, r: Request<v1::GetRobotRequest>) -> Result<Response<v1::GetRobotResponse>, Status> {
-        answer(self.get(&r.into_inner()))
+        let by = caller(&r);
+        answer(self.get(&r.into_inner(), &by))
     }
     async fn list_events(&self, r: Request<v1::ListEventsRequest>) -> Result<Response<v1::ListEventsResponse>, Status> {
-        answer(self.events(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.events(r.into_inner(), &by).await)
     }
     async fn watch_robots(
         &self,
         r: Request<v1::WatchRobotsRequest>,
     ) -> Result<Response<Self::WatchRobotsStream>, Status> {
-        let r = r.into_inner();
+        let (by, r) = (caller(&r), r.into_inner());
         let mut bad = Violations::default();
-        let filter = filter(r.filter, &mut bad);
+        let filter = filter(r.filter, by, &mut bad);
         let period_ms = if r.period_ms == 0 { PERIOD_DEFAULT_MS } else { r.period_ms };
         if !PERIOD_MS.contains(&period_ms) {
             bad.add("period_ms", "must be 50..60000; 0: 1000");

@@ -2,8 +2,10 @@
 
 use crate::session::{self, Down};
 use crate::{TelemetryService, welcome};
+use midshift_core::identity::Caller;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::time::Utc;
+use midshift_proto::access::caller;
 use midshift_proto::link::v1::{self, link_service_server::LinkService};
 use midshift_proto::session::{FromRobot, Hello, ToRobot};
 use std::time::Duration;
@@ -26,12 +28,13 @@ impl LinkService for TelemetryService {
     ) -> Result<Response<Self::SessionStream>, Status> {
         let (down, stream) = mpsc::channel(DOWN_MAX);
         let service = self.clone();
+        let by = caller(&request);
         let up = request.into_inner();
         tokio::spawn(async move {
             let shutdown = service.inner.shutdown.clone();
             tokio::select! {
                 () = down.closed() => {}
-                result = service.hold(up, down.clone()) => {
+                result = service.hold(&by, up, down.clone()) => {
                     if let Err(refusal) = result
                         && !shutdown.is_cancelled()
                     {
@@ -45,8 +48,10 @@ impl LinkService for TelemetryService {
 }
 
 impl TelemetryService {
-    async fn hold(&self, mut up: Streaming<v1::SessionRequest>, down: Down) -> Result<(), Refusal> {
+    async fn hold(&self, by: &Caller, mut up: Streaming<v1::SessionRequest>, down: Down) -> Result<(), Refusal> {
         let hello = hello(&mut up).await?;
+        // Before anything is asked about that robot, or done to a session of it.
+        by.is_robot(&hello.robot_id)?;
         welcome::check(&self.inner, &hello)?;
         if self.inner.moving.is_cancelled() {
             return Err(Refusal::new(Kind::Unavailable, Code::ShuttingDown));

@@ -3,10 +3,12 @@
 //! Invariant: telemetry only composes and sends desired state; it never changes or re-dates it.
 
 use crate::Inner;
-use midshift_core::ids::RobotId;
+use midshift_core::fleet::rows::SiteRow;
+use midshift_core::ids::{AreaId, RobotId};
 use midshift_core::rows::{BadRow, Seq, Table};
+use midshift_core::site::{Site, text};
 use midshift_core::update::DesiredUpdate;
-use midshift_core::work::{DesiredPolicy, DesiredWork, LaneMark, PresenceRow, Session};
+use midshift_core::work::{DesiredPolicy, DesiredWork, LaneMark, Live, PresenceRow, Session};
 use midshift_store::{Change, Dirty, Error, Fold, LiveBoard, Projection};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
@@ -42,6 +44,15 @@ pub struct Rows {
     /// Highest durable STATUS number by (robot, ring).
     pub status: BTreeMap<(RobotId, Arc<str>), u64>,
     desired: BTreeMap<RobotId, Sections>,
+    /// The map, as fleet keeps it; none: every robot is somewhere on the site.
+    site: Option<Arc<Site>>,
+}
+
+impl Rows {
+    /// The area in which a robot is by its newest heartbeat; none: not known.
+    pub fn area_of(&self, live: Option<&Live>) -> Option<&AreaId> {
+        live?.area(self.site.as_ref()?)
+    }
 }
 
 /// The picture, shared between sessions and RPCs.
@@ -126,6 +137,7 @@ impl Fold for Keeper {
             Table::Session,
             Table::Presence,
             Table::LaneMark,
+            Table::Site,
         ]
     }
     fn reset(&mut self) {
@@ -134,6 +146,10 @@ impl Fold for Keeper {
         *rows = Rows { status, ..Rows::default() };
     }
     fn apply(&mut self, change: Change) -> Result<(), BadRow> {
+        if change.key.table == Table::Site {
+            self.0.picture.rows_mut().site = change.decode::<SiteRow>()?.and_then(|row| map_of(&row));
+            return Ok(());
+        }
         let id = change.key.id.to_string();
         let Ok(robot_id) = RobotId::parse(id.split('/').next().unwrap_or_default()) else { return Ok(()) };
         let mut rows = self.0.picture.rows_mut();
@@ -159,6 +175,14 @@ impl Fold for Keeper {
         }
         Ok(())
     }
+}
+
+fn map_of(row: &SiteRow) -> Option<Arc<Site>> {
+    let read = text::parse(&row.text);
+    if read.is_err() {
+        tracing::warn!(site_id = %row.site_id, "the map cannot be read: robots are shown to those only that see the whole site");
+    }
+    read.ok().map(Arc::new)
 }
 
 fn put<K: Ord, V>(map: &mut BTreeMap<K, V>, key: K, value: Option<V>) {

@@ -4,7 +4,9 @@
 //! durable; a batch that cannot be handed over is refused, never kept waiting. Called by robots.
 
 use crate::TelemetryService;
+use midshift_core::identity::Caller;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
+use midshift_proto::access::caller;
 use midshift_proto::link::v1::replay_service_server::ReplayService;
 use midshift_proto::link::v1::{ReplayStatusRequest, ReplayStatusResponse};
 use midshift_proto::session::{LaneAck, LaneBatch, StatusReplay};
@@ -40,8 +42,9 @@ impl ReplayService for TelemetryService {
         &self,
         request: Request<ReplayStatusRequest>,
     ) -> Result<Response<ReplayStatusResponse>, Status> {
+        let by = caller(&request);
         let ack = match parse(request.into_inner()) {
-            Ok(replay) => self.hand_over(replay).await,
+            Ok(replay) => self.hand_over(&by, replay).await,
             Err(refusal) => Err(refusal),
         };
         ack.map(|ack| Response::new((&ack).into())).map_err(|refusal| status(&refusal, None))
@@ -49,7 +52,8 @@ impl ReplayService for TelemetryService {
 }
 
 impl TelemetryService {
-    async fn hand_over(&self, replay: StatusReplay) -> Result<LaneAck, Refusal> {
+    async fn hand_over(&self, by: &Caller, replay: StatusReplay) -> Result<LaneAck, Refusal> {
+        by.is_robot(&replay.robot_id)?;
         let in_charge = self.inner.registry.get(&replay.robot_id).ok_or_else(not_in_charge)?;
         if in_charge.session_epoch != replay.session_epoch || *in_charge.secret != *replay.session_secret {
             return Err(not_in_charge());

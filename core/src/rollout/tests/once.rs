@@ -2,6 +2,7 @@
 
 use super::commands::{Ask, CheckOnly, Taken};
 use super::*;
+use crate::identity::Caller;
 use crate::once::CommandKey;
 
 fn pin(n: usize) -> Command {
@@ -14,7 +15,7 @@ fn asked(command: &Command, check_only: CheckOnly, request_id: Option<&str>) -> 
         seen: None,
         check_only,
         request_id: request_id.map(Into::into),
-        actor: "ana".into(),
+        by: Caller::local(),
     }
 }
 

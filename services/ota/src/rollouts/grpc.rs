@@ -2,13 +2,16 @@
 
 use super::{RolloutService, decode, encode, watch};
 use crate::repository::Release;
+use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{BundleId, RequestId, RobotId, RolloutId};
 use midshift_core::limits;
-use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
+use midshift_core::reason::{Code, Kind, Refusal, Violations};
 use midshift_core::rollout::commands::{CheckOnly, Command, Taken, Verb};
 use midshift_core::rollout::dry_run::dry_run;
+use midshift_core::rollout::objects;
 use midshift_core::rollout::rows::{Quarantine, Rollout};
 use midshift_core::rollout::view::View;
+use midshift_proto::access::caller;
 use midshift_proto::convert::task::revision_of;
 use midshift_proto::convert::timestamp;
 use midshift_proto::ota::v1;
@@ -66,20 +69,16 @@ fn done_before(taken: Taken) -> Option<prost_types::Timestamp> {
 
 /// What all verbs about one roll-out say.
 struct About<'a> {
+    by: &'a Caller,
     rollout_id: &'a str,
     etag: &'a str,
     reason: &'a str,
 }
 
 impl RolloutService {
-    async fn shown(&self, rollout_id: RolloutId) -> Result<v1::Rollout, Refusal> {
-        self.look(move |view, _, now| {
-            let rowed = view.rollouts.get(rollout_id.as_str());
-            let reason = || Reason::from(Code::RolloutNotFound).with("rollout_id", &rollout_id);
-            let rowed = rowed.ok_or_else(|| Refusal::new(Kind::NotFound, reason()))?;
-            Ok(encode::rollout(view, now, &rowed.row))
-        })
-        .await?
+    async fn shown(&self, rollout_id: RolloutId, by: &Caller) -> Result<v1::Rollout, Refusal> {
+        let by = by.clone();
+        self.look(move |view, _, now| Ok(encode::rollout(view, now, objects::seen(view, &by, &rollout_id)?))).await?
     }
 
     async fn verb(&self, about: About<'_>, verb: Verb, needs_etag: bool) -> Result<Option<v1::Rollout>, Refusal> {
@@ -106,8 +105,8 @@ impl RolloutService {
         bad.finish()?;
         let rollout_id = rollout_id.ok_or_else(internal)?;
         let command = Command::Do { rollout_id: rollout_id.clone(), verb, reason: about.reason.to_owned() };
-        let taken = self.act_once(command, seen, check_only, request_id).await?;
-        Ok((self.shown(rollout_id).await?, taken))
+        let taken = self.act_once(command, about.by, seen, check_only, request_id).await?;
+        Ok((self.shown(rollout_id, about.by).await?, taken))
     }
 
     /// The bundle that a caller names. One that is published and has no row yet is waited for: whoever has just pushed it asks another process.
@@ -135,7 +134,7 @@ impl RolloutService {
         Ok(newest.is_some_and(|newest| newest.releases.iter().any(is_named)))
     }
 
-    async fn create(&self, r: v1::CreateRolloutRequest) -> Result<v1::CreateRolloutResponse, Refusal> {
+    async fn create(&self, r: v1::CreateRolloutRequest, by: &Caller) -> Result<v1::CreateRolloutResponse, Refusal> {
         let mut bad = Violations::default();
         let rollout_id = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
         let spec = r.spec.unwrap_or_default();
@@ -149,11 +148,11 @@ impl RolloutService {
         spec.check(&mut bad);
         bad.finish()?;
         let rollout_id = rollout_id.ok_or_else(internal)?;
-        self.act(Command::Create { rollout_id: rollout_id.clone(), spec: Arc::new(spec) }, None).await?;
-        Ok(v1::CreateRolloutResponse { rollout: Some(self.shown(rollout_id).await?) })
+        self.act(Command::Create { rollout_id: rollout_id.clone(), spec: Arc::new(spec) }, by, None).await?;
+        Ok(v1::CreateRolloutResponse { rollout: Some(self.shown(rollout_id, by).await?) })
     }
 
-    async fn plan(&self, r: v1::PlanRolloutRequest) -> Result<v1::PlanRolloutResponse, Refusal> {
+    async fn plan(&self, r: v1::PlanRolloutRequest, by: &Caller) -> Result<v1::PlanRolloutResponse, Refusal> {
         let mut bad = Violations::default();
         let rollout_id = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
         bad.finish()?;
@@ -161,7 +160,7 @@ impl RolloutService {
         if let Some(spec) = &r.spec {
             self.bundle(&spec.bundle).await?;
         }
-        let probation_ms = self.probation_ms;
+        let (probation_ms, by) = (self.probation_ms, by.clone());
         self.look(move |view, board, _| {
             let spec = match r.spec {
                 Some(wire) => {
@@ -171,45 +170,50 @@ impl RolloutService {
                     bad.finish()?;
                     Arc::new(spec)
                 }
-                None => view.rollout(&rollout_id).map(|r| r.spec.clone()).ok_or_else(|| {
-                    Refusal::new(Kind::NotFound, Reason::from(Code::RolloutNotFound).with("rollout_id", &rollout_id))
-                })?,
+                None => objects::seen(view, &by, &rollout_id)?.spec.clone(),
             };
+            by.needs(Permission::Author, &spec.selector.areas)?;
             let run = dry_run(view, board, &rollout_id, &spec)?;
             Ok(encode::plan(&run, spec.waves.len()))
         })
         .await?
     }
 
-    async fn exclude(&self, r: v1::ExcludeRobotRequest) -> Result<v1::ExcludeRobotResponse, Refusal> {
+    async fn exclude(&self, r: v1::ExcludeRobotRequest, by: &Caller) -> Result<v1::ExcludeRobotResponse, Refusal> {
         let mut bad = Violations::default();
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
         let request_id = request_id(&r.request_id, &mut bad);
         bad.finish()?;
-        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let about = About { by, rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
         let verb = Verb::Exclude(robot_id.ok_or_else(internal)?);
         let (rollout, taken) = self.verb_once(about, verb, false, check_only(r.validate_only), request_id).await?;
         Ok(v1::ExcludeRobotResponse { rollout: Some(rollout), done_before: done_before(taken) })
     }
 
-    async fn roll_back(&self, r: v1::RollBackRolloutRequest) -> Result<v1::RollBackRolloutResponse, Refusal> {
+    async fn roll_back(
+        &self,
+        r: v1::RollBackRolloutRequest,
+        by: &Caller,
+    ) -> Result<v1::RollBackRolloutResponse, Refusal> {
         let mut bad = Violations::default();
         let of = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
         let rollout_id = bad.take("new_rollout_id", RolloutId::parse(&r.new_rollout_id));
         bad.finish()?;
         let (of, rollout_id) = of.zip(rollout_id).ok_or_else(internal)?;
-        self.act(Command::Rollback { of, rollout_id: rollout_id.clone() }, None).await?;
-        Ok(v1::RollBackRolloutResponse { rollout: Some(self.shown(rollout_id).await?) })
+        self.act(Command::Rollback { of, rollout_id: rollout_id.clone() }, by, None).await?;
+        Ok(v1::RollBackRolloutResponse { rollout: Some(self.shown(rollout_id, by).await?) })
     }
 
-    async fn list(&self, r: v1::ListRolloutsRequest) -> Result<v1::ListRolloutsResponse, Refusal> {
+    async fn list(&self, r: v1::ListRolloutsRequest, by: &Caller) -> Result<v1::ListRolloutsResponse, Refusal> {
         let mut bad = Violations::default();
         let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
+        let by = by.clone();
         self.look(move |view, _, now| {
             // The newest first.
             let key = |r: &Rollout| format!("{:020}/{}", i64::MAX - r.created.at.0, r.rollout_id);
-            let mut all: Vec<_> = view.rollouts.values().map(|r| (key(&r.row), r)).collect();
+            let mut all: Vec<_> =
+                view.rollouts.values().filter(|r| objects::sees(&by, &r.row)).map(|r| (key(&r.row), r)).collect();
             all.sort_by(|a, b| a.0.cmp(&b.0));
             let (rows, next_page_token) = pages::page(all.into_iter(), &r.page_token, size);
             let rollouts = rows.into_iter().map(|r| encode::rollout(view, now, &r.row)).collect();
@@ -218,16 +222,18 @@ impl RolloutService {
         .await
     }
 
-    async fn robots(&self, r: v1::ListRolloutRobotsRequest) -> Result<v1::ListRolloutRobotsResponse, Refusal> {
+    async fn robots(
+        &self,
+        r: v1::ListRolloutRobotsRequest,
+        by: &Caller,
+    ) -> Result<v1::ListRolloutRobotsResponse, Refusal> {
         let mut bad = Violations::default();
         let size = pages::size(r.page_size, &mut bad);
         let rollout_id = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
         bad.finish()?;
-        let rollout_id = rollout_id.ok_or_else(internal)?;
+        let (rollout_id, by) = (rollout_id.ok_or_else(internal)?, by.clone());
         self.look(move |view, board, now| {
-            let row = view.rollout(&rollout_id).ok_or_else(|| {
-                Refusal::new(Kind::NotFound, Reason::from(Code::RolloutNotFound).with("rollout_id", &rollout_id))
-            })?;
+            let row = objects::seen(view, &by, &rollout_id)?;
             let asked = |id: &RobotId| r.robot_id.is_empty() || id.as_str() == r.robot_id;
             let rows = view.robots_of(&rollout_id).filter(|r| asked(&r.robot_id));
             let (rows, next_page_token) = pages::page(rows.map(|r| (r.robot_id.to_string(), r)), &r.page_token, size);
@@ -237,14 +243,14 @@ impl RolloutService {
         .await?
     }
 
-    async fn revoke(&self, r: v1::RevokeBundleRequest) -> Result<v1::RevokeBundleResponse, Refusal> {
+    async fn revoke(&self, r: v1::RevokeBundleRequest, by: &Caller) -> Result<v1::RevokeBundleResponse, Refusal> {
         let mut bad = Violations::default();
         let request_id = request_id(&r.request_id, &mut bad);
         required_reason(&r.reason, &mut bad);
         bad.finish()?;
         let bundle = self.bundle(&r.bundle).await?;
         let command = Command::Revoke { bundle: bundle.clone(), reason: r.reason };
-        let taken = self.act_once(command, None, check_only(r.validate_only), request_id).await?;
+        let taken = self.act_once(command, by, None, check_only(r.validate_only), request_id).await?;
         self.look(move |view, _, _| {
             let of = view.rollouts.values().map(|r| &r.row).filter(|r| r.spec.bundle == bundle && !r.phase.is_over());
             let (back, still): (Vec<&Rollout>, Vec<_>) = of.partition(|r| r.phase.goes_back() || r.revert_of.is_some());
@@ -260,7 +266,7 @@ impl RolloutService {
         self.look(move |view: &View, _, _| Some(encode::software(&view.software_of(&robot_id)))).await
     }
 
-    async fn pin(&self, r: v1::PinRobotRequest) -> Result<v1::PinRobotResponse, Refusal> {
+    async fn pin(&self, r: v1::PinRobotRequest, by: &Caller) -> Result<v1::PinRobotResponse, Refusal> {
         let mut bad = Violations::default();
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
         let request_id = request_id(&r.request_id, &mut bad);
@@ -268,29 +274,35 @@ impl RolloutService {
         bad.finish()?;
         let robot_id = robot_id.ok_or_else(internal)?;
         let command = Command::Pin { robot_id: robot_id.clone(), reason: r.reason };
-        let taken = self.act_once(command, None, check_only(r.validate_only), request_id).await?;
+        let taken = self.act_once(command, by, None, check_only(r.validate_only), request_id).await?;
         let software = self.software_of(robot_id).await?;
         Ok(v1::PinRobotResponse { software, done_before: done_before(taken) })
     }
 
-    async fn unpin(&self, r: v1::UnpinRobotRequest) -> Result<v1::UnpinRobotResponse, Refusal> {
+    async fn unpin(&self, r: v1::UnpinRobotRequest, by: &Caller) -> Result<v1::UnpinRobotResponse, Refusal> {
         let mut bad = Violations::default();
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
         let request_id = request_id(&r.request_id, &mut bad);
         bad.finish()?;
         let robot_id = robot_id.ok_or_else(internal)?;
         let command = Command::Unpin { robot_id: robot_id.clone() };
-        let taken = self.act_once(command, None, check_only(r.validate_only), request_id).await?;
+        let taken = self.act_once(command, by, None, check_only(r.validate_only), request_id).await?;
         let software = self.software_of(robot_id).await?;
         Ok(v1::UnpinRobotResponse { software, done_before: done_before(taken) })
     }
 
-    async fn software(&self, r: v1::ListRobotSoftwareRequest) -> Result<v1::ListRobotSoftwareResponse, Refusal> {
+    async fn software(
+        &self,
+        r: v1::ListRobotSoftwareRequest,
+        by: &Caller,
+    ) -> Result<v1::ListRobotSoftwareResponse, Refusal> {
         let mut bad = Violations::default();
         let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
-        self.look(move |view, _, _| {
+        let by = by.clone();
+        self.look(move |view, board, _| {
             let rows = view.software.iter().filter(|(id, _)| r.robot_id.is_empty() || **id == r.robot_id);
+            let rows = rows.filter(|(_, s)| objects::sees_robot(view, board, &by, &s.row.robot_id));
             let (rows, next_page_token) = pages::page(rows.map(|(id, s)| (id.clone(), s)), &r.page_token, size);
             let software = rows.into_iter().map(|s| encode::software(&s.row)).collect();
             v1::ListRobotSoftwareResponse { software, next_page_token }
@@ -298,12 +310,18 @@ impl RolloutService {
         .await
     }
 
-    async fn quarantines(&self, r: v1::ListQuarantinesRequest) -> Result<v1::ListQuarantinesResponse, Refusal> {
+    async fn quarantines(
+        &self,
+        r: v1::ListQuarantinesRequest,
+        by: &Caller,
+    ) -> Result<v1::ListQuarantinesResponse, Refusal> {
         let mut bad = Violations::default();
         let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
-        self.look(move |view, _, _| {
-            let rows = view.quarantines.iter().map(|(id, q)| (id.clone(), q));
+        let by = by.clone();
+        self.look(move |view, board, _| {
+            let seen = |q: &&Quarantine| objects::sees_robot(view, board, &by, &q.robot_id);
+            let rows = view.quarantines.iter().filter(|(_, q)| seen(&&q.row)).map(|(id, q)| (id.clone(), q));
             let (rows, next_page_token) = pages::page(rows, &r.page_token, size);
             let quarantines = rows.into_iter().map(|q| encode::quarantine(view, &q.row)).collect();
             v1::ListQuarantinesResponse { quarantines, next_page_token }
@@ -311,7 +329,7 @@ impl RolloutService {
         .await
     }
 
-    async fn lift(&self, r: v1::LiftQuarantineRequest) -> Result<v1::LiftQuarantineResponse, Refusal> {
+    async fn lift(&self, r: v1::LiftQuarantineRequest, by: &Caller) -> Result<v1::LiftQuarantineResponse, Refusal> {
         let mut bad = Violations::default();
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
         let request_id = request_id(&r.request_id, &mut bad);
@@ -319,7 +337,7 @@ impl RolloutService {
         let robot_id = robot_id.ok_or_else(internal)?;
         let bundle = self.bundle(&r.bundle).await?;
         let command = Command::LiftQuarantine { robot_id: robot_id.clone(), bundle: bundle.clone() };
-        let taken = self.act_once(command, None, check_only(r.validate_only), request_id).await?;
+        let taken = self.act_once(command, by, None, check_only(r.validate_only), request_id).await?;
         self.look(move |view, _, _| {
             let quarantine = view.quarantines.get(&Quarantine::id_of(&robot_id, &bundle));
             let quarantine = quarantine.map(|q| encode::quarantine(view, &q.row));
@@ -337,20 +355,22 @@ impl Face for RolloutService {
         &self,
         r: Request<v1::CreateRolloutRequest>,
     ) -> Result<Response<v1::CreateRolloutResponse>, Status> {
-        answer(self.create(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.create(r.into_inner(), &by).await)
     }
     async fn plan_rollout(
         &self,
         r: Request<v1::PlanRolloutRequest>,
     ) -> Result<Response<v1::PlanRolloutResponse>, Status> {
-        answer(self.plan(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.plan(r.into_inner(), &by).await)
     }
     async fn submit_rollout(
         &self,
         r: Request<v1::SubmitRolloutRequest>,
     ) -> Result<Response<v1::SubmitRolloutResponse>, Status> {
-        let r = r.into_inner();
-        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let (by, r) = (caller(&r), r.into_inner());
+        let about = About { by: &by, rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
         let rollout = self.verb(about, Verb::Submit, false).await;
         answer(rollout.map(|rollout| v1::SubmitRolloutResponse { rollout }))
     }
@@ -358,8 +378,8 @@ impl Face for RolloutService {
         &self,
         r: Request<v1::ApproveRolloutRequest>,
     ) -> Result<Response<v1::ApproveRolloutResponse>, Status> {
-        let r = r.into_inner();
-        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let (by, r) = (caller(&r), r.into_inner());
+        let about = About { by: &by, rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
         let rollout = self.verb(about, Verb::Approve, false).await;
         answer(rollout.map(|rollout| v1::ApproveRolloutResponse { rollout }))
     }
@@ -367,8 +387,8 @@ impl Face for RolloutService {
         &self,
         r: Request<v1::StartRolloutRequest>,
     ) -> Result<Response<v1::StartRolloutResponse>, Status> {
-        let r = r.into_inner();
-        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let (by, r) = (caller(&r), r.into_inner());
+        let about = About { by: &by, rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
         let rollout = self.verb(about, Verb::Start { supersede: r.supersede }, false).await;
         answer(rollout.map(|rollout| v1::StartRolloutResponse { rollout }))
     }
@@ -376,8 +396,8 @@ impl Face for RolloutService {
         &self,
         r: Request<v1::PauseRolloutRequest>,
     ) -> Result<Response<v1::PauseRolloutResponse>, Status> {
-        let r = r.into_inner();
-        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let (by, r) = (caller(&r), r.into_inner());
+        let about = About { by: &by, rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
         let rollout = self.verb(about, Verb::Pause, false).await;
         answer(rollout.map(|rollout| v1::PauseRolloutResponse { rollout }))
     }
@@ -385,8 +405,8 @@ impl Face for RolloutService {
         &self,
         r: Request<v1::ResumeRolloutRequest>,
     ) -> Result<Response<v1::ResumeRolloutResponse>, Status> {
-        let r = r.into_inner();
-        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let (by, r) = (caller(&r), r.into_inner());
+        let about = About { by: &by, rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
         let rollout = self.verb(about, Verb::Resume, true).await;
         answer(rollout.map(|rollout| v1::ResumeRolloutResponse { rollout }))
     }
@@ -394,8 +414,8 @@ impl Face for RolloutService {
         &self,
         r: Request<v1::PromoteRolloutRequest>,
     ) -> Result<Response<v1::PromoteRolloutResponse>, Status> {
-        let r = r.into_inner();
-        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let (by, r) = (caller(&r), r.into_inner());
+        let about = About { by: &by, rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
         let rollout = self.verb(about, Verb::Promote, true).await;
         answer(rollout.map(|rollout| v1::PromoteRolloutResponse { rollout }))
     }
@@ -403,8 +423,8 @@ impl Face for RolloutService {
         &self,
         r: Request<v1::AbortRolloutRequest>,
     ) -> Result<Response<v1::AbortRolloutResponse>, Status> {
-        let r = r.into_inner();
-        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let (by, r) = (caller(&r), r.into_inner());
+        let about = About { by: &by, rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
         let rollout = self.verb(about, Verb::Abort, true).await;
         answer(rollout.map(|rollout| v1::AbortRolloutResponse { rollout }))
     }
@@ -412,8 +432,8 @@ impl Face for RolloutService {
         &self,
         r: Request<v1::RetryRolloutRequest>,
     ) -> Result<Response<v1::RetryRolloutResponse>, Status> {
-        let r = r.into_inner();
-        let about = About { rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let (by, r) = (caller(&r), r.into_inner());
+        let about = About { by: &by, rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
         let rollout = self.verb(about, Verb::RetryFailed, false).await;
         answer(rollout.map(|rollout| v1::RetryRolloutResponse { rollout }))
     }
@@ -421,59 +441,70 @@ impl Face for RolloutService {
         &self,
         r: Request<v1::ExcludeRobotRequest>,
     ) -> Result<Response<v1::ExcludeRobotResponse>, Status> {
-        answer(self.exclude(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.exclude(r.into_inner(), &by).await)
     }
     async fn roll_back_rollout(
         &self,
         r: Request<v1::RollBackRolloutRequest>,
     ) -> Result<Response<v1::RollBackRolloutResponse>, Status> {
-        answer(self.roll_back(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.roll_back(r.into_inner(), &by).await)
     }
     async fn list_rollouts(
         &self,
         r: Request<v1::ListRolloutsRequest>,
     ) -> Result<Response<v1::ListRolloutsResponse>, Status> {
-        answer(self.list(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.list(r.into_inner(), &by).await)
     }
     async fn list_rollout_robots(
         &self,
         r: Request<v1::ListRolloutRobotsRequest>,
     ) -> Result<Response<v1::ListRolloutRobotsResponse>, Status> {
-        answer(self.robots(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.robots(r.into_inner(), &by).await)
     }
     async fn revoke_bundle(
         &self,
         r: Request<v1::RevokeBundleRequest>,
     ) -> Result<Response<v1::RevokeBundleResponse>, Status> {
-        answer(self.revoke(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.revoke(r.into_inner(), &by).await)
     }
     async fn pin_robot(&self, r: Request<v1::PinRobotRequest>) -> Result<Response<v1::PinRobotResponse>, Status> {
-        answer(self.pin(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.pin(r.into_inner(), &by).await)
     }
     async fn unpin_robot(&self, r: Request<v1::UnpinRobotRequest>) -> Result<Response<v1::UnpinRobotResponse>, Status> {
-        answer(self.unpin(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.unpin(r.into_inner(), &by).await)
     }
     async fn list_robot_software(
         &self,
         r: Request<v1::ListRobotSoftwareRequest>,
     ) -> Result<Response<v1::ListRobotSoftwareResponse>, Status> {
-        answer(self.software(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.software(r.into_inner(), &by).await)
     }
     async fn list_quarantines(
         &self,
         r: Request<v1::ListQuarantinesRequest>,
     ) -> Result<Response<v1::ListQuarantinesResponse>, Status> {
-        answer(self.quarantines(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.quarantines(r.into_inner(), &by).await)
     }
     async fn lift_quarantine(
         &self,
         r: Request<v1::LiftQuarantineRequest>,
     ) -> Result<Response<v1::LiftQuarantineResponse>, Status> {
-        answer(self.lift(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.lift(r.into_inner(), &by).await)
     }
     async fn get_rollout(&self, r: Request<v1::GetRolloutRequest>) -> Result<Response<v1::GetRolloutResponse>, Status> {
+        let by = caller(&r);
         let rollout = match named(&r.into_inner().rollout_id) {
-            Ok(rollout_id) => self.shown(rollout_id).await,
+            Ok(rollout_id) => self.shown(rollout_id, &by).await,
             Err(refusal) => Err(refusal),
         };
         answer(rollout.map(|rollout| v1::GetRolloutResponse { rollout: Some(rollout) }))
@@ -482,6 +513,7 @@ impl Face for RolloutService {
         &self,
         r: Request<v1::WatchRolloutRequest>,
     ) -> Result<Response<Self::WatchRolloutStream>, Status> {
+        let by = caller(&r);
         let rollout_id = named(&r.into_inner().rollout_id).map_err(|refusal| midshift_proto::status(&refusal, None))?;
         let (sender, stream) = mpsc::channel(WATCH_MAX);
         let service = self.clone();
@@ -489,7 +521,7 @@ impl Face for RolloutService {
             let shutdown = service.shutdown.clone();
             tokio::select! {
                 () = shutdown.cancelled() => {}
-                () = watch::watch(service, rollout_id, sender) => {}
+                () = watch::watch(service, rollout_id, by, sender) => {}
             }
         });
         Ok(Response::new(ReceiverStream::new(stream)))

@@ -16,6 +16,7 @@ pub use directives::Signer;
 pub use releases::known_bundles;
 
 use crate::OtaService;
+use midshift_core::identity::Caller;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::Board;
 use midshift_core::rollout::bugs::Bugs;
@@ -124,20 +125,20 @@ impl RolloutService {
         answer.await.map_err(|_| Refusal::new(Kind::Unavailable, Code::ShuttingDown))
     }
     /// Carries out a command and waits for its commit.
-    async fn act(&self, command: Command, seen: Option<Revision>) -> Result<(), Refusal> {
-        self.act_once(command, seen, CheckOnly::No, None).await.map(drop)
+    async fn act(&self, command: Command, by: &Caller, seen: Option<Revision>) -> Result<(), Refusal> {
+        self.act_once(command, by, seen, CheckOnly::No, None).await.map(drop)
     }
     /// As [`Self::act`], of a caller who may send it again, or only wants to know whether it may be.
     async fn act_once(
         &self,
         command: Command,
+        by: &Caller,
         seen: Option<Revision>,
         check_only: CheckOnly,
         request_id: Option<String>,
     ) -> Result<Taken, Refusal> {
         let (reply, answer) = oneshot::channel();
-        // Until login exists nobody is known by name.
-        let ask = Ask { command, seen, check_only, request_id, actor: "anonymous".to_owned() };
+        let ask = Ask { command, seen, check_only, request_id, by: by.clone() };
         self.send(Request::Do { ask: Box::new(ask), reply }).await?;
         answer.await.map_err(|_| Refusal::new(Kind::Unavailable, Code::CommitUnknown))?
     }

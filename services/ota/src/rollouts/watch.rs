@@ -1,10 +1,11 @@
 //! A roll-out as it goes: now, and with each change, until it has ended.
 
 use super::{RolloutService, encode};
+use midshift_core::identity::Caller;
 use midshift_core::ids::RolloutId;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
-use midshift_core::rollout::Board;
 use midshift_core::rollout::view::View;
+use midshift_core::rollout::{Board, objects};
 use midshift_core::rows::Revision;
 use midshift_core::time::Now;
 use midshift_proto::ota::v1;
@@ -33,8 +34,9 @@ impl Told {
         board: &Board,
         now: &Now,
         id: &RolloutId,
+        by: &Caller,
     ) -> Result<(Option<v1::WatchRolloutResponse>, bool), Refusal> {
-        let rowed = view.rollouts.get(id.as_str());
+        let rowed = view.rollouts.get(id.as_str()).filter(|rowed| objects::sees(by, &rowed.row));
         let reason = || Reason::from(Code::RolloutNotFound).with("rollout_id", id);
         let rowed = rowed.ok_or_else(|| Refusal::new(Kind::NotFound, reason()))?;
         let first = self.rollout.is_none();
@@ -60,16 +62,17 @@ impl Told {
 pub async fn watch(
     service: RolloutService,
     id: RolloutId,
+    by: Caller,
     sender: mpsc::Sender<Result<v1::WatchRolloutResponse, Status>>,
 ) {
     let mut told = Told::default();
     let mut changed = service.changed.clone();
     loop {
         changed.mark_unchanged();
-        let asked = id.clone();
+        let (asked, by) = (id.clone(), by.clone());
         let looked = service
             .look(move |view, board, now| {
-                let next = told.next(view, board, now, &asked);
+                let next = told.next(view, board, now, &asked, &by);
                 (told, next)
             })
             .await;
