@@ -193,6 +193,18 @@ mod tests {
     }
 
     #[test]
+    fn the_page_about_security_says_what_each_role_permits() {
+        let page = include_str!("../../../docs/security.md");
+        let rows = page.lines().filter(|line| line.starts_with("| `") && line.matches('|').count() == 4);
+        let expected = Role::ALL.iter().map(|role| {
+            let all: Vec<String> = role.permissions().iter().map(|p| format!("{p:?}").to_uppercase()).collect();
+            let all = if all.is_empty() { "-".to_owned() } else { all.join(" ") };
+            format!("| `{}` | {all} | {} |", role.as_str(), role.help())
+        });
+        assert_eq!(rows.collect::<Vec<_>>(), expected.collect::<Vec<_>>());
+    }
+
+    #[test]
     fn everybody_signed_in_may_stop_and_only_its_own_role_resets() {
         assert!(Role::ALL.iter().all(|role| role.permits(Permission::Stop)));
         let reset: Vec<_> = Role::ALL.iter().filter(|role| role.permits(Permission::Reset)).collect();

@@ -12,6 +12,7 @@ mod named;
 mod newcomers_and_pins;
 mod once;
 mod people;
+mod reach;
 mod recovery;
 mod reverts_and_second_pass;
 mod sequences;

@@ -13,6 +13,7 @@ mod people;
 mod picture;
 mod places;
 mod races;
+mod reach;
 mod restart;
 mod retries;
 #[expect(dead_code, reason = "other crates' tests use the rest of it")]

@@ -1,6 +1,8 @@
 //! A stop service as it is served, on a runtime of its own that can be ended like a process; and a robot's end of a line.
 
+use midshift_core::identity::{Caller, TokenId};
 use midshift_core::ids::{RobotId, StopId};
+use midshift_core::limits;
 use midshift_core::robot::StopLevel;
 use midshift_core::site::Site;
 use midshift_core::stop::ladder::{Around, Stage};
@@ -23,8 +25,9 @@ use tokio::task::JoinHandle;
 use tokio::time::Instant;
 use tokio_stream::wrappers::{ReceiverStream, TcpListenerStream};
 use tokio_util::sync::CancellationToken;
+use tonic::service::InterceptorLayer;
 use tonic::transport::Channel;
-use tonic::{Code, Status, Streaming};
+use tonic::{Code, Request, Status, Streaming};
 
 /// Whatever is waited for comes within this, or the test fails.
 pub const WITHIN: Duration = Duration::from_secs(20);
@@ -33,6 +36,33 @@ pub const WITHIN: Duration = Duration::from_secs(20);
 fn elapsed_us() -> u64 {
     static START: OnceLock<Instant> = OnceLock::new();
     START.get_or_init(Instant::now).elapsed().as_micros() as u64
+}
+
+/// Header in which a test says who asks; without it nobody is asked.
+pub const AS: &str = "as";
+
+/// As a port finds out who asks: `robot:r1`, or `name role@area ...` for the holder of a token.
+fn known(mut request: Request<()>) -> Result<Request<()>, Status> {
+    if let Some(said) = request.metadata().get(AS).map(|said| said.to_str().unwrap().to_owned()) {
+        let mut words = said.split(' ');
+        let name = words.next().unwrap();
+        let caller = match name.strip_prefix("robot:") {
+            Some(robot_id) => Caller::robot(RobotId::parse(robot_id).unwrap()),
+            None => {
+                let grants = words.map(|grant| grant.parse().unwrap()).collect();
+                Caller::holder(TokenId::new("t1").unwrap(), name.into(), grants, false)
+            }
+        };
+        request.extensions_mut().insert(caller);
+    }
+    Ok(request)
+}
+
+/// A request of this caller.
+pub fn asked_as<T>(who: &str, message: T) -> Request<T> {
+    let mut request = Request::new(message);
+    request.metadata_mut().insert(AS, who.parse().unwrap());
+    request
 }
 
 pub struct Server {
@@ -72,8 +102,23 @@ impl Server {
             .await
             .unwrap();
         let serving = runtime.spawn(async move {
-            let routes = service.routes().await?;
-            serve(service, routes, incoming).await
+            let (routes, drained) = (service.routes().await?, service.drained());
+            let port = tonic::transport::Server::builder()
+                .accept_http1(true)
+                .layer(InterceptorLayer::new(known))
+                .add_routes(routes)
+                .serve_with_incoming_shutdown(incoming, drained.clone().cancelled_owned());
+            let cut = async {
+                drained.cancelled().await;
+                tokio::time::sleep(Duration::from_millis(limits::HARD_DRAIN.as_ms())).await;
+            };
+            let port = async {
+                tokio::select! {
+                    served = port => served,
+                    () = cut => Ok(()),
+                }
+            };
+            serve(service, port).await.map(|served| served.unwrap())
         });
         Self { runtime: Some(runtime), serving, shutdown, address, ahead_us }
     }

@@ -8,3 +8,4 @@ mod disk;
 mod harness;
 mod kept;
 mod lines;
+mod reach;

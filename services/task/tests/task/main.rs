@@ -7,5 +7,6 @@ mod forms;
 mod intake;
 mod lists;
 mod prune;
+mod reach;
 mod watches;
 mod world;

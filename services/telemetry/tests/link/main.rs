@@ -3,6 +3,7 @@
 mod disk;
 mod gateways;
 mod machines;
+mod reach;
 mod replay;
 mod robots;
 mod sessions;

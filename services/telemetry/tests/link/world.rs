@@ -1,6 +1,7 @@
 //! Telemetry over a real gRPC connection in memory, and a robot that says what a test wants.
 
-use midshift_core::ids::{RobotId, SiteId};
+use midshift_core::identity::{Caller, TokenId};
+use midshift_core::ids::{RobotId, SiteId, WaypointId};
 use midshift_core::robot::{Inventory, Lane, Mode, ReportedState, Vitals};
 use midshift_core::time::{Clock, ScaledClock, Utc};
 use midshift_core::work::{InboxItem, RobotEvent, Sample, SampleBody};
@@ -16,8 +17,9 @@ use std::sync::Arc;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
-use tonic::Streaming;
+use tonic::service::InterceptorLayer;
 use tonic::transport::{Channel, Endpoint, Server};
+use tonic::{Request, Status, Streaming};
 
 pub type Result<T> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>>;
 
@@ -66,8 +68,8 @@ pub async fn serve(parts: Parts) -> Result<World> {
     let service = TelemetryService::new(parts, CancellationToken::new());
     tokio::spawn(service.clone().run());
     let (pipes, incoming) = mpsc::channel::<std::io::Result<tokio::io::DuplexStream>>(8);
-    let server =
-        Server::builder().add_service(service.link()).add_service(service.replay()).add_service(service.grpc());
+    let mut port = Server::builder().layer(InterceptorLayer::new(known));
+    let server = port.add_service(service.link()).add_service(service.replay()).add_service(service.grpc());
     tokio::spawn(server.serve_with_incoming(ReceiverStream::new(incoming)));
     let connector = tower::service_fn(move |_: tonic::transport::Uri| {
         let pipes = pipes.clone();
@@ -79,6 +81,35 @@ pub async fn serve(parts: Parts) -> Result<World> {
     });
     let channel = Endpoint::from_static("http://memory").connect_with_connector(connector).await?;
     Ok(World { store, channel, service })
+}
+
+/// Header in which a test says who asks; without it nobody is asked.
+const AS: &str = "as";
+
+/// As a port finds out who asks: `robot:r1`, or `name role@area ...` for the holder of a token.
+fn known(mut request: Request<()>) -> std::result::Result<Request<()>, Status> {
+    if let Some(said) = request.metadata().get(AS).and_then(|said| said.to_str().ok()).map(str::to_owned) {
+        let unreadable = || Status::internal("a test says who asks in words that mean nothing");
+        let mut words = said.split(' ');
+        let name = words.next().ok_or_else(unreadable)?;
+        let caller = match name.strip_prefix("robot:") {
+            Some(robot_id) => Caller::robot(RobotId::parse(robot_id).map_err(|_| unreadable())?),
+            None => {
+                let grants: std::result::Result<_, _> = words.map(str::parse).collect();
+                let token = TokenId::new("t1").ok_or_else(unreadable)?;
+                Caller::holder(token, name.into(), grants.map_err(|_| unreadable())?, false)
+            }
+        };
+        request.extensions_mut().insert(caller);
+    }
+    Ok(request)
+}
+
+/// A request of this caller.
+pub fn asked_as<T>(who: &str, message: T) -> Result<Request<T>> {
+    let mut request = Request::new(message);
+    request.metadata_mut().insert(AS, who.parse()?);
+    Ok(request)
 }
 
 /// STATUS of these numbers.
@@ -116,10 +147,18 @@ impl Robot {
         Self::attach_saying(world, hello(previous)?).await
     }
     pub async fn attach_saying(world: &World, hello: Hello) -> Result<Self> {
+        Self::attach_asking(world, hello, Request::new).await
+    }
+    /// As somebody says who asks.
+    pub async fn attach_asking(
+        world: &World,
+        hello: Hello,
+        ask: impl FnOnce(ReceiverStream<SessionRequest>) -> Request<ReceiverStream<SessionRequest>>,
+    ) -> Result<Self> {
         let (up, outbound) = mpsc::channel(16);
         up.send((&FromRobot::Hello(Box::new(hello))).into()).await?;
-        let mut down =
-            LinkServiceClient::new(world.channel.clone()).session(ReceiverStream::new(outbound)).await?.into_inner();
+        let mut client = LinkServiceClient::new(world.channel.clone());
+        let mut down = client.session(ask(ReceiverStream::new(outbound))).await?.into_inner();
         let first = down.message().await?.ok_or("no welcome")?;
         let ToRobot::Welcome(welcome) = midshift_proto::parse(first)? else { return Err("not a welcome".into()) };
         Ok(Self { up, down, welcome, hb: 0 })
@@ -134,9 +173,15 @@ impl Robot {
         self.beat_with(None).await
     }
     pub async fn beat_with(&mut self, clock: Option<ClockSample>) -> Result<()> {
+        self.beat_at(None, clock).await
+    }
+    /// A heartbeat from a waypoint.
+    pub async fn beat_at(&mut self, waypoint: Option<&str>, clock: Option<ClockSample>) -> Result<()> {
         self.hb += 1;
-        let reported =
-            ReportedState { hb: self.hb, session_epoch: self.welcome.session_epoch, ..ReportedState::default() };
+        let waypoint = waypoint.map(WaypointId::parse).transpose()?;
+        let vitals = Vitals { waypoint, ..Vitals::default() };
+        let session_epoch = self.welcome.session_epoch;
+        let reported = ReportedState { hb: self.hb, session_epoch, vitals, ..ReportedState::default() };
         self.say(Uplink { heartbeat: Some(Heartbeat { reported, sent_unix_us: 0, clock }), batches: Vec::new() }).await
     }
     pub async fn events(&self, seqs: std::ops::RangeInclusive<u64>) -> Result<()> {

@@ -1,5 +1,7 @@
 //! Two processes of the rollout service over one store and one folder: one plans and signs, the other carries out what people ask.
 
+mod reach;
+
 use crate::content::Room;
 use crate::fixture::{START, files, give_back, hide, key, key_set, release, write_keys};
 use crate::folder::Owner;
