@@ -94,6 +94,9 @@ pub enum Role {
     /// One of the measurements of software.
     #[command(flatten)]
     Ota(crate::ota::parts::Part),
+    /// One of the measurements of stops.
+    #[command(flatten)]
+    Stop(crate::stop::Part),
 }
 
 /// A child's arguments.
@@ -199,6 +202,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
             }
         }
         Role::Ota(part) => crate::ota::parts::play(part, address, stop).await,
+        Role::Stop(part) => crate::stop::play(part, address, stop).await,
     }
 }
 

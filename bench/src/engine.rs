@@ -2,7 +2,7 @@
 //! single commit by itself and rows by COPY.
 //!
 //! Invariant: each round has a directory or a database of its own, taken away with it. PostgreSQL keeps its promises: `fsync` is on and
-//! a commit waits for its log. Called by `submit`, `offer` and `link`.
+//! a commit waits for its log. Called by `submit`, `offer`, `link` and `stop`.
 
 use crate::child::{Child, cpu_of_ended_s, cpu_of_s};
 use crate::fsync::{Disk, place};
@@ -66,6 +66,21 @@ impl EngineArgs {
 }
 
 impl Engine {
+    /// PostgreSQL, with its files below `dir`.
+    pub fn postgres(dir: Option<&Path>) -> anyhow::Result<Self> {
+        ensure!(
+            PostgresServer::is_installed(),
+            "the machine has no server programs of PostgreSQL: install the package postgresql"
+        );
+        Ok(Self::Postgres(PostgresServer::start_in(dir)))
+    }
+    /// Number of the database's first process; none where it is the server itself.
+    pub fn pid(&self) -> Option<u32> {
+        match self {
+            Self::Sqlite => None,
+            Self::Postgres(server) => server.pid(),
+        }
+    }
     /// What names of figures end with.
     pub fn suffix(&self) -> &'static str {
         match self {
@@ -105,15 +120,18 @@ impl Engine {
 }
 
 fn cpu_of_children_s(parent: u32) -> anyhow::Result<f64> {
-    let mut cpu_s = 0.0;
+    Ok(children_of(parent)?.into_iter().map(|pid| cpu_of_s(pid).unwrap_or(0.0)).sum())
+}
+
+/// Processes that a process has started and that live.
+pub fn children_of(parent: u32) -> anyhow::Result<Vec<u32>> {
+    let mut children = Vec::new();
     for entry in std::fs::read_dir("/proc")? {
         let name = entry?.file_name();
-        let Some(pid) = name.to_str().and_then(|name| name.parse::<u32>().ok()) else { continue };
-        if parent_of(pid) == Some(parent) {
-            cpu_s += cpu_of_s(pid).unwrap_or(0.0);
-        }
+        let pid = name.to_str().and_then(|name| name.parse().ok());
+        children.extend(pid.filter(|pid| parent_of(*pid) == Some(parent)));
     }
-    Ok(cpu_s)
+    Ok(children)
 }
 
 fn parent_of(pid: u32) -> Option<u32> {

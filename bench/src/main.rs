@@ -16,6 +16,7 @@ mod questions;
 mod raw;
 mod robot;
 mod sink;
+mod stop;
 mod submit;
 
 use clap::{Parser, Subcommand};
@@ -37,6 +38,8 @@ enum Name {
     Gates(gates::GatesArgs),
     /// Software of robots: directives, ten thousand robots assigned, the way back; a download at line rate, patches, downloads that are cut off.
     Ota(ota::OtaArgs),
+    /// From an engaged stop to its acknowledgement by every robot, with nothing beside, under load, and with everything else broken.
+    Stop(stop::StopArgs),
     /// What the other names start: this program in one role.
     #[command(hide = true)]
     Child(child::ChildArgs),
@@ -66,6 +69,11 @@ fn main() -> anyhow::Result<()> {
         Name::Gates(args) => gates::run(args)?,
         Name::Ota(args) => {
             let told = wait(async { Ok(ota::run(args, &note).await) })?;
+            failed = told.failed;
+            told.figures
+        }
+        Name::Stop(args) => {
+            let told = wait(async { Ok(stop::run(args, &note).await) })?;
             failed = told.failed;
             told.figures
         }

@@ -85,6 +85,16 @@ fn the_link_is_told_beside_a_bare_session_and_what_each_engine_can_do() {
 }
 
 #[test]
+fn a_stop_is_told_beside_a_bare_write_loop_under_each_load_and_with_each_thing_broken() {
+    let records = records("stop", &["--robots", "6", "--rounds", "1", "--settle-ms", "100"]);
+    assert_told(&records, &["P8"], 1);
+    for beside in ["nothing beside", "knee", "downloads", "PostgreSQL stopped", "disk full", "server killed"] {
+        let told = records.iter().filter(|r| r["name"].as_str().is_some_and(|name| name.contains(beside)));
+        assert_eq!(told.count(), 5, "{beside}: {records:?}");
+    }
+}
+
+#[test]
 fn software_of_robots_is_told_beside_idle_robots_and_the_disk() {
     let sizes = ["--part", "server", "--robots", "20", "--back-robots", "3", "--rounds", "1"];
     let sizes: Vec<&str> = sizes.into_iter().chain(["--idle-seconds", "1", "--directives", "20"]).collect();

@@ -9,7 +9,7 @@ mod heard;
 pub mod hearers;
 mod line;
 mod netns;
-mod noise;
+pub mod noise;
 pub mod parts;
 mod programs;
 mod release;
@@ -64,7 +64,8 @@ pub struct Told {
 }
 
 impl Told {
-    fn add(&mut self, part: &str, measured: anyhow::Result<Vec<Figure>>) {
+    /// Adds a part that was measured, or why it was not.
+    pub fn add(&mut self, part: &str, measured: anyhow::Result<Vec<Figure>>) {
         match measured {
             Ok(figures) => self.figures.extend(figures),
             Err(error) => self.failed.push(format!("{part}: {error:#}")),
@@ -99,7 +100,7 @@ async fn parts(args: &OtaArgs, told: &mut Told, say: &dyn Fn(&str)) {
 }
 
 /// Waits for somebody who wants an end.
-async fn stopped() -> String {
+pub async fn stopped() -> String {
     match signal(SignalKind::terminate()) {
         Err(error) => format!("SIGTERM cannot be heard: {error}"),
         Ok(mut terminated) => tokio::select! {

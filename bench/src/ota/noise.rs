@@ -1,6 +1,6 @@
 //! Releases to measure with: one file of noise a bundle, signed with throw-away keys, and brought to a server.
 //!
-//! Called by [`super::line`] and [`super::resume`].
+//! Called by [`super::line`], [`super::resume`] and, for downloads beside a stop, [`crate::stop`].
 
 use crate::child::Child;
 use anyhow::{Context, bail, ensure};
