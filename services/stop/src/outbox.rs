@@ -184,9 +184,9 @@ impl Waiting {
             return self.whole.pop_front();
         }
         while let Some(frame) = self.frames.pop_front() {
-            // What was said with the whole needs not be said again.
-            if frame.generation > self.sent {
-                self.sent = frame.generation;
+            // A stop that was said with the whole needs not be said again. A reset may not be in it: the whole is what is engaged.
+            if frame.generation > self.sent || !frame.resets.is_empty() {
+                self.sent = self.sent.max(frame.generation);
                 return Some(frame.bytes);
             }
         }
@@ -221,6 +221,11 @@ impl Stream for Down {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::acts::{self, Wanted};
+    use crate::{Parts, StopService};
+    use midshift_core::robot::StopLevel;
+    use midshift_core::stop::Scope;
+    use midshift_core::time::{ScaledClock, Utc};
 
     fn frame(generation: u64, reset: Option<&str>) -> Frame {
         let resets = reset.map(|id| StopId::parse(id).unwrap()).into_iter().collect();
@@ -242,5 +247,34 @@ mod tests {
         assert_eq!(waiting.answers.back(), Some(&(99, 99)), "the newest answer is kept");
         drop(waiting);
         assert_eq!(outbox.unread_for(LinkTime(10_005)), limits::STOP_LINE_SILENT);
+    }
+
+    #[test]
+    fn a_robot_that_was_told_the_whole_before_a_reset_was_put_in_hears_of_the_reset_all_the_same() {
+        let folder = tempfile::tempdir().unwrap();
+        let clock = Arc::new(ScaledClock::new(|| 0, Utc(1_000), 1000));
+        let parts = Parts { folder: folder.path().join("stop"), site: None, clock };
+        let inner = StopService::open(parts, CancellationToken::new()).unwrap().inner;
+        let wanted = Wanted {
+            scope: Scope::Fleet,
+            level: StopLevel::Halt,
+            reason: String::new(),
+            request: None,
+            actor: String::new(),
+        };
+        let stop_id = acts::engage(&inner, wanted).unwrap().stop.stop_id;
+        let outbox = Outbox::new(BTreeSet::new());
+        let heard = || -> Vec<Bytes> { std::iter::from_fn(|| lock(&outbox.waiting).next(&inner)).collect() };
+        heard();
+        let resetting = acts::reset(&inner, stop_id, "over".to_owned(), String::new());
+        // The latch has it; the lines are told one after the other, and this one checks in twice before its turn.
+        let (reset, generation) = lock(&inner.law).settle(resetting.version, Utc(1_000)).remove(0);
+        outbox.answer(1, generation, LinkTime(5));
+        outbox.answer(2, generation, LinkTime(5));
+        let synced = frames::synced(generation);
+        assert!(heard().contains(&synced), "it is told the whole");
+        let bytes = frames::told([], [&reset], generation).remove(0);
+        outbox.tell(&Frame { generation, bytes: bytes.clone(), resets: [reset.stop_id].into() }, LinkTime(5));
+        assert_eq!(heard(), [bytes]);
     }
 }
