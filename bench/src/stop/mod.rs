@@ -16,7 +16,7 @@ use crate::ota::{Told, stopped};
 use anyhow::{Context, ensure};
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
 use midshift_proto::stop::v1::{EngageRequest, Fleet, ResetRequest, Scope, scope};
-use robots::{ATTACHED, FREE, Moments, STAND, TAKE, TAKE_BARE};
+use robots::{ANSWERED, ATTACHED, FREE, Moments, STAND, TAKE, TAKE_BARE};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -256,8 +256,7 @@ impl Stage {
             sleep(Duration::from_millis(1)).await;
         }
         let known_ns = fan::now_ns();
-        // Their answers are on the way still.
-        sleep(LOOK_EVERY * 5).await;
+        self.until(ANSWERED, TURN_WITHIN).await?;
         self.turn(TAKE_BARE, begun_ns, known_ns)
     }
 }

@@ -37,6 +37,8 @@ pub const ATTACHED: &str = "attached";
 pub const STAND: &str = "stand";
 /// How many have the answer to a check-in that says they know of no stop.
 pub const FREE: &str = "free";
+/// How many have the answer to what they wrote to the bare fan-out since it was asked for last.
+pub const ANSWERED: &str = "answered";
 /// Writes down when each was told and acknowledged; the answer is how many.
 pub const TAKE: &str = "take";
 /// The same of the bare fan-out.
@@ -107,6 +109,7 @@ impl All {
             ATTACHED => self.count(|seen| seen.is_synced && seen.has_socket),
             STAND => self.count(|seen| !seen.stops.is_empty() && seen.is_answered),
             FREE => self.count(|seen| seen.stops.is_empty() && seen.is_answered),
+            ANSWERED => self.count(|seen| seen.bare.acked_ns > 0),
             TAKE => self.write(&self.args.out, |seen| &mut seen.stop),
             TAKE_BARE => self.write(&self.args.out, |seen| &mut seen.bare),
             _ => 0,
