@@ -32,6 +32,7 @@ const LEFT_OUT: &[(&str, &str)] = &[
     ("public_address::", DEV),
     ("restored::", "it has a drill for each engine in the first run"),
     ("split::", ALWAYS),
+    ("stopped::a_stop_that_is_engaged_while_the_database_", ALWAYS),
     ("story::", DEV),
     ("swarm_software::", NO_SERVER),
 ];

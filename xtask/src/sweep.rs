@@ -2,7 +2,7 @@
 //!
 //! Invariant: a sweep that ran no test fails. `MIDSHIFT_SEED` is read by the test that kills programs and by stories, `MIDSHIFT_STORY` by
 //! stories, `MIDSHIFT_SEEDS` and `MIDSHIFT_SEED_FROM` by the simulation, `MIDSHIFT_SPLIT_ROBOTS` by the split stack, `MIDSHIFT_SITES` by the
-//! power cuts, `BLESS` by tests with `golden` in their name.
+//! power cuts and kills at calls, `BLESS` by tests with `golden` in their name.
 
 use crate::fetch_tools::Tools;
 use crate::parts::Count;
@@ -27,18 +27,20 @@ pub enum Sweep {
     Split,
     /// The power goes at each call of an update, and of the ways back from one, that changes the disk: all of them, whatever the seeds.
     Updates,
+    /// The stop service, and a robot that keeps what it is told of stops, are killed at each call that changes their files: all of them, whatever the seeds.
+    Latch,
     /// Twenty robots, five of them launcher and agent processes, get a good release and three bad ones: about ten minutes a seed.
     Stories,
 }
 
 impl Sweep {
-    const ALL: [Self; 5] = [Self::Kills, Self::Simulation, Self::Split, Self::Updates, Self::Stories];
+    const ALL: [Self; 6] = [Self::Kills, Self::Simulation, Self::Split, Self::Updates, Self::Latch, Self::Stories];
 
     fn seeds(self) -> u64 {
         match self {
             Self::Kills => 20,
             Self::Simulation => 2_000,
-            Self::Split | Self::Updates => 1,
+            Self::Split | Self::Updates | Self::Latch => 1,
             Self::Stories => 2,
         }
     }
@@ -47,7 +49,7 @@ impl Sweep {
     const fn draws(self) -> bool {
         match self {
             Self::Kills | Self::Simulation | Self::Stories => true,
-            Self::Split | Self::Updates => false,
+            Self::Split | Self::Updates | Self::Latch => false,
         }
     }
 
@@ -61,11 +63,9 @@ impl Sweep {
                 counted(&mut command)
             }
             Self::Split => split(workspace, seeds),
-            Self::Updates => {
-                let arguments =
-                    ["test", "--package", "midshift-agent", "--test", "agent", "--", "power::", "--nocapture"];
-                counted(workspace.cargo(&arguments).env("MIDSHIFT_SITES", "all"))
-            }
+            Self::Updates => every_site(workspace, "midshift-agent", "agent", "power::"),
+            Self::Latch => Ok(every_site(workspace, "midshift-stop", "stop", "killed::")?
+                && every_site(workspace, "midshift-agent", "agent", "stop_cuts::")?),
         }
     }
 }
@@ -86,6 +86,12 @@ fn first_seed(sweeps: &[Sweep], from: Option<u64>) -> Result<u64> {
     let draws = sweeps.is_empty() || sweeps.iter().any(|sweep| sweep.draws());
     ensure!(from.is_none() || draws, "--from names a seed, and what you named draws nothing: leave it out");
     Ok(from.unwrap_or(1))
+}
+
+/// Tests that cut a process off at its calls: at every one.
+fn every_site(workspace: &Workspace, package: &str, target: &str, filter: &str) -> Result<bool> {
+    let arguments = ["test", "--package", package, "--test", target, "--", filter, "--nocapture"];
+    counted(workspace.cargo(&arguments).env("MIDSHIFT_SITES", "all"))
 }
 
 fn test(workspace: &Workspace, target: &str, filter: &str) -> Command {

@@ -21,9 +21,12 @@ mod session;
 mod sets;
 mod steps;
 mod stop_chaos;
+mod stop_cuts;
 mod stop_line;
 mod stop_software;
 mod stops;
+#[path = "../../../tests/src/strace.rs"]
+mod strace;
 mod trusts;
 mod updates;
 mod ways;

@@ -6,6 +6,7 @@
 
 use crate::durability::{self, Event, events, judge, names};
 use crate::sets::{bytes, component, noise, patch, put, set, wanted};
+use crate::strace::{Sites, Victim, killed_at, run, sites, strace, traced};
 use midshift_agent::boot::{BASE, BOOT, Boot};
 use midshift_agent::durable::make_folder;
 use midshift_agent::launcher::SWITCH;
@@ -22,18 +23,13 @@ use midshift_bundle::set::SetManifest;
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand::seq::SliceRandom;
-use std::collections::{BTreeMap, BTreeSet};
-use std::ffi::OsString;
+use std::collections::BTreeSet;
 use std::fs;
-use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
-use std::process::{Command, ExitStatus};
-use tempfile::NamedTempFile;
+use std::process::Command;
 
 /// Names the folder to the process that is to be killed.
 const UPDATE_IN: &str = "MIDSHIFT_TEST_UPDATE_IN";
-/// Calls that change what is on a disk. One that opens a new file leaves the same as the next one that writes to it finds.
-const CALLS: &str = "write,pwrite64,fsync,fdatasync,rename,renameat,renameat2,link,linkat,unlink,unlinkat,rmdir,mkdir,mkdirat,ftruncate,chmod,fchmodat";
 /// Names what it is to go through.
 const COURSE: &str = "MIDSHIFT_TEST_COURSE";
 /// The test that goes through it.
@@ -274,70 +270,10 @@ fn a_course_ends_and_gone_through_once_more_it_changes_nothing() {
     }
 }
 
-/// Calls that change a folder, as one whole run made them.
-struct Sites {
-    /// The name of each, and the how manieth of that name it is.
-    calls: Vec<(String, usize)>,
-    /// What they touched, below the folder.
-    paths: BTreeSet<String>,
-}
-
-/// `strace` with these arguments, and where the trace comes.
-fn strace(arguments: &[String]) -> (Command, NamedTempFile) {
-    let log = NamedTempFile::new().expect("a file");
-    let mut command =
-        Command::new(std::env::var_os("MIDSHIFT_TEST_STRACE").unwrap_or_else(|| OsString::from("strace")));
-    command.args(["-f", "-qq", "-y", "-o"]).arg(log.path()).args(arguments);
-    (command, log)
-}
-
-/// How it ended, and the trace.
-fn run(mut command: Command, log: &NamedTempFile) -> (ExitStatus, String) {
-    let output = command.output();
-    let program = command.get_program().display();
-    let output = output.unwrap_or_else(|e| panic!("{program}: {e}: run `cargo xtask test --install`"));
-    (output.status, fs::read_to_string(log.path()).expect("a trace"))
-}
-
-/// One of these tests on a folder in a process of its own, under `strace` with these arguments; how it ended, and the trace.
-fn traced(test: &str, course: &str, folder: &Path, arguments: &[String]) -> (ExitStatus, String) {
-    let (mut command, log) = strace(arguments);
-    command.arg(std::env::current_exe().expect("this test")).args(["--exact", &format!("power::{test}")]);
-    command.env(UPDATE_IN, folder).env(COURSE, course);
-    run(command, &log)
-}
-
-/// Runs it to its end and finds the calls that touch its folder.
-fn sites(test: &str, course: &str, folder: &Path) -> Sites {
-    let (status, trace) = traced(test, course, folder, &["-e".to_owned(), format!("trace={CALLS}")]);
-    assert!(status.success(), "{status}: {trace}");
-    let folder = folder.to_string_lossy();
-    let mut count: BTreeMap<&str, usize> = BTreeMap::new();
-    let mut sites = Sites { calls: Vec::new(), paths: BTreeSet::new() };
-    for line in trace.lines().filter(|line| line.contains(&*folder)) {
-        // strace fills a thread's number up to five places: of a small one more than one space follows.
-        let name =
-            line.split_whitespace().nth(1).and_then(|call| call.split('(').next()).expect("a thread, then a call");
-        let number = count.entry(name).or_default();
-        *number += 1;
-        sites.calls.push((name.to_owned(), *number));
-        let below = line.match_indices(&*folder).map(|(at, _)| &line[at + folder.len()..]);
-        sites.paths.extend(below.filter_map(|rest| rest.split(['>', '"']).next()).map(str::to_owned));
-    }
-    sites
-}
-
-/// Kills it as it enters a call.
-fn killed_at(test: &str, course: &str, folder: &Path, paths: &BTreeSet<String>, (name, number): &(String, usize)) {
-    let whole = folder.to_string_lossy();
-    let only = paths.iter().flat_map(|path| ["-P".to_owned(), format!("{whole}{path}")]);
-    let inject = format!("inject={name}:signal=SIGKILL:when={number}");
-    let arguments: Vec<String> =
-        only.chain(["-e".to_owned(), format!("trace={name}"), "-e".to_owned(), inject]).collect();
-    let (status, trace) = traced(test, course, folder, &arguments);
-    let last = trace.lines().rev().find(|line| line.contains('('));
-    let is_there = last.is_some_and(|call| call.contains(&*whole) && call.ends_with("= ?"));
-    assert!(is_there && status.signal() == Some(9), "not killed at {name} {number}: {status}: {trace}");
+/// Runs one of these tests on a folder in a process of its own.
+fn at<T>(test: &str, course: &str, folder: &Path, verb: impl FnOnce(&Victim<'_>) -> T) -> T {
+    let environment = [(UPDATE_IN, folder.as_os_str().to_owned()), (COURSE, course.into())];
+    verb(&Victim { test: &format!("power::{test}"), environment: &environment, folder })
 }
 
 /// Cuts a course at a sample of its calls, or at all of them: what is left is started, and it ends all the same. What was cut.
@@ -347,7 +283,7 @@ fn cut(course: Course) -> String {
     let told = format!("{course:?}");
     let folder = tempfile::tempdir().expect("a folder");
     let kept = course.begin(folder.path());
-    let Sites { calls: mut cuts, paths } = sites(GOES, &told, folder.path());
+    let Sites { calls: mut cuts, paths } = at(GOES, &told, folder.path(), sites);
     assert_ended(course, folder.path(), &kept, "under strace");
     let found = cuts.len();
     assert!(found > course.sample(), "{found} calls change the disk: {cuts:?}");
@@ -361,7 +297,7 @@ fn cut(course: Course) -> String {
         let when = format!("{course:?} killed at {site:?}, MIDSHIFT_SEED={seed}");
         let folder = tempfile::tempdir().expect("a folder");
         let kept = course.begin(folder.path());
-        killed_at(GOES, &told, folder.path(), &paths, site);
+        at(GOES, &told, folder.path(), |victim| killed_at(victim, &paths, site));
         assert_bootable(folder.path(), &when);
         assert_boots(folder.path(), &when);
         let switch = DiskSets::open(folder.path()).expect("opens").holdings().expect("tells").switch;
@@ -431,8 +367,9 @@ fn what_a_robot_relies_on_was_synced_before() {
     let home = tempfile::tempdir().expect("a folder");
     let root = home.path().canonicalize().expect("is there");
     let there = names(&root);
-    let (status, trace) = traced(test, "", &root, &["-e".to_owned(), format!("trace={}", durability::CALLS)]);
-    assert!(status.success(), "{status}: {trace}");
+    let calls = ["-e".to_owned(), format!("trace={}", durability::CALLS)];
+    let (output, trace) = at(test, "", &root, |victim| traced(victim, &calls));
+    assert!(output.status.success(), "{}: {trace}", output.status);
     let found = events(&trace, &root.to_string_lossy());
     let data = root.join("robot/data").to_string_lossy().into_owned();
     let syncs = assert_durable(&found, &there, &data);
@@ -457,8 +394,8 @@ fn what_a_launcher_relies_on_was_synced_before_it_starts_a_program() {
         let (mut command, log) = strace(&["-e".to_owned(), format!("trace={}", durability::CALLS)]);
         command.arg(env!("CARGO_BIN_EXE_midshift-launcher")).arg("--record").arg(&tries).arg("--sets").arg(&sets);
         command.args(["--", "false"]);
-        let (status, trace) = run(command, &log);
-        assert!(status.success(), "{status}: {trace}");
+        let (output, trace) = run(command, &log);
+        assert!(output.status.success(), "{}: {trace}", output.status);
         let events = events(&trace, &root.to_string_lossy());
         let writes_tries = |event: &Event| matches!(event, Event::Renamed(_, to) if tries.as_os_str() == to.as_str());
         let starts = events.iter().position(|event| *event == Event::Started).expect("starts a program");
@@ -481,9 +418,9 @@ fn twin_a_switch_record_that_is_written_where_it_lies_is_lost_with_the_power() {
     let twin = "twin_a_switch_record_that_is_written_where_it_lies_is_lost_with_the_power";
     let folder = tempfile::tempdir().expect("a folder");
     robot(folder.path());
-    let Sites { calls, paths } = sites(twin, "", folder.path());
+    let Sites { calls, paths } = at(twin, "", folder.path(), sites);
     let [write] = &calls[..] else { panic!("{calls:?}") };
     assert_bootable(folder.path(), "without a cut");
-    killed_at(twin, "", folder.path(), &paths, write);
+    at(twin, "", folder.path(), |victim| killed_at(victim, &paths, write));
     assert!(DiskSets::open(folder.path()).expect("opens").holdings().is_err(), "the naive way is good enough");
 }

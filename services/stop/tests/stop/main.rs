@@ -7,5 +7,9 @@ mod confirmed;
 mod disk;
 mod harness;
 mod kept;
+mod killed;
 mod lines;
+#[expect(dead_code, reason = "shared with the agent's tests, which ask for more")]
+#[path = "../../../../tests/src/strace.rs"]
 mod reach;
+mod strace;
