@@ -35,6 +35,7 @@ mod room;
 mod split;
 mod stack;
 mod stopped;
+mod stopped_release;
 mod story;
 mod swarm_software;
 mod tuf;

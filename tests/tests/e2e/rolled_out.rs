@@ -16,6 +16,7 @@ use midshift_core::site::{DEMO, Site, text};
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::ota::v1::{GetRolloutRequest, ListQuarantinesRequest};
 use std::io::{BufRead, BufReader};
+use std::net::SocketAddr;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -35,13 +36,14 @@ impl Drop for Robot {
 }
 
 impl Robot {
-    /// A robot in `home` that believes the release people of `samples`.
+    /// A robot in `home` that believes the release people of `samples`, with a line to the stop service at `stops`.
     pub fn launch(
         id: &str,
         start: &str,
         home: &Path,
         samples: &Path,
         server: &str,
+        stops: Option<SocketAddr>,
         enrolment: Option<&str>,
     ) -> anyhow::Result<Self> {
         std::fs::create_dir_all(home)?;
@@ -56,11 +58,19 @@ impl Robot {
         command.args(["--start", start, "--body-speed", BODY_SPEED]);
         command.arg("--data").arg(home.join("data")).arg("--sets").arg(&sets);
         command.arg("--trust").arg(home.join("trust.json")).process_group(0);
+        if let Some(stops) = stops {
+            command.args(["--stop-server", &stops.to_string()]);
+        }
         Ok(Self { running: Running::start(&mut command, &home.join("log"))?, sets })
     }
     /// Its switch record.
     pub fn switch(&self) -> anyhow::Result<Switch> {
         Ok(Switch::read(&self.sets.join(SWITCH))?)
+    }
+    /// It runs a set that it has not committed.
+    pub fn is_on_trial(&self) -> bool {
+        // Before its first change of software there is no record.
+        self.switch().is_ok_and(|switch| switch.trial.is_some())
     }
     /// Waits until it has committed this version.
     pub async fn keeps(&self, version: &str) -> anyhow::Result<()> {
@@ -103,7 +113,7 @@ async fn a_release_reaches_a_robot_and_a_bad_one_goes_back_though_the_server_is_
     let mut server = Server::secure(dir.path(), &["--ota-keys", &keys]).await?;
     let address = server.address.to_string();
     let enrolment = enrolment(server.address, "rbt-01").await?;
-    let robot = Robot::launch("rbt-01", "park-1", &dir.path().join("robot"), &samples, &address, enrolment.as_deref())?;
+    let robot = Robot::launch("rbt-01", "park-1", &dir.path().join("robot"), &samples, &address, None, enrolment.as_deref())?;
     done(&["bundle", "push", "--server", &address, &samples.join("repository").display().to_string()])?;
     until("the robot is known", LIMIT, async || {
         Ok(call(&["robot", "get", "--server", &address, "rbt-01"])?.status.success().then_some(()))
