@@ -77,7 +77,13 @@ pub async fn play(part: Part, address: SocketAddr, stop: CancellationToken) -> a
     match part {
         Part::StopServe { data } => {
             crate::questions::answer_questions(address, stop.clone(), |_| 0)?;
-            let serve = midshift::stop::StopServe { site: None, data, listen: address, insecure: false };
+            let serve = midshift::stop::StopServe {
+                site: None,
+                data,
+                listen: address,
+                insecure: true,
+                share: Default::default(),
+            };
             midshift::stop::run(serve, stop).await
         }
         Part::Fan => fan::serve(address, stop).await,

@@ -69,7 +69,7 @@ pub async fn with_software(dir: &Path, robots: usize) -> anyhow::Result<(Stack, 
     let (public, door) = (stack.public.to_string(), stack.robots.to_string());
     let ids: Vec<String> = (1..=robots).map(|number| format!("rbt-{number:02}")).collect();
     let launch = |(number, id): (usize, &String)| {
-        Robot::launch(id, &format!("park-{}", number + 1), &dir.join(id), &samples, &door, None)
+        Robot::launch(id, &format!("park-{}", number + 1), &dir.join(id), &samples, &door, None, None)
     };
     let launched = ids.iter().enumerate().map(launch).collect::<anyhow::Result<Vec<_>>>()?;
     done(&["bundle", "push", "--server", &public, &samples.join("repository").display().to_string()])?;

@@ -113,7 +113,8 @@ async fn a_release_reaches_a_robot_and_a_bad_one_goes_back_though_the_server_is_
     let mut server = Server::secure(dir.path(), &["--ota-keys", &keys]).await?;
     let address = server.address.to_string();
     let enrolment = enrolment(server.address, "rbt-01").await?;
-    let robot = Robot::launch("rbt-01", "park-1", &dir.path().join("robot"), &samples, &address, None, enrolment.as_deref())?;
+    let robot =
+        Robot::launch("rbt-01", "park-1", &dir.path().join("robot"), &samples, &address, None, enrolment.as_deref())?;
     done(&["bundle", "push", "--server", &address, &samples.join("repository").display().to_string()])?;
     until("the robot is known", LIMIT, async || {
         Ok(call(&["robot", "get", "--server", &address, "rbt-01"])?.status.success().then_some(()))

@@ -196,8 +196,8 @@ async fn a_stop_that_is_engaged_while_the_database_is_gone_is_recorded_and_holds
     let site: Site = text::parse(DEMO)?;
     let mut postgres = PostgresServer::start();
     let url = postgres.database();
-    let server = Server::start_with(dir.path(), DEMO, &["--store", &url]).await?;
-    let stops = StopServer::start(dir.path()).await?;
+    let server = Server::secure(dir.path(), &["--store", &url]).await?;
+    let stops = StopServer::start(dir.path(), server.address).await?;
     let address = server.address;
     let robots = Robots::start_beside(dir.path(), address, address, Some(stops.address), &site, ROBOTS).await?;
     submit(address, &site, 7, TASKS).await?;

@@ -3,6 +3,7 @@
 
 use crate::harness::{Server, folder, until};
 use crate::kill::{all_over, at_work, submit};
+use crate::robots::enrolment;
 use crate::rolled_out::{Robot, call, done};
 use crate::rolling::seen;
 use crate::room::LIMIT;
@@ -43,15 +44,16 @@ async fn a_canary_of_a_bad_release_goes_back_under_a_fleet_stop_and_nobody_moves
     let samples = dir.path().join("samples");
     done(&["bundle", "samples", &samples.display().to_string(), "--config-only"])?;
     let keys = samples.join("keys").display().to_string();
-    let server = Server::start_with(dir.path(), DEMO, &["--ota-keys", &keys]).await?;
-    let stops = StopServer::start(dir.path()).await?;
+    let server = Server::secure(dir.path(), &["--ota-keys", &keys]).await?;
+    let stops = StopServer::start(dir.path(), server.address).await?;
     let address = server.address.to_string();
     let ids: Vec<String> = (1..=ROBOTS).map(|number| format!("rbt-{number:02}")).collect();
-    let launch = |(number, id): (usize, &String)| {
-        let start = format!("park-{}", number + 1);
-        Robot::launch(id, &start, &dir.path().join(id), &samples, &address, Some(stops.address))
-    };
-    let robots = ids.iter().enumerate().map(launch).collect::<anyhow::Result<Vec<_>>>()?;
+    let mut robots = Vec::new();
+    for (number, id) in ids.iter().enumerate() {
+        let (start, enrolment) = (format!("park-{}", number + 1), enrolment(server.address, id).await?);
+        let (home, stops) = (dir.path().join(id), Some(stops.address));
+        robots.push(Robot::launch(id, &start, &home, &samples, &address, stops, enrolment.as_deref())?);
+    }
     let journals: Vec<PathBuf> = ids.iter().map(|id| dir.path().join(id).join("data/journal.jsonl")).collect();
     done(&["bundle", "push", "--server", &address, &samples.join("repository").display().to_string()])?;
     for id in &ids {

@@ -32,7 +32,7 @@ async fn a_machine_gets_a_certificate_that_says_which_robot_it_is_whatever_it_as
     let answer = enrol(&identity, "r7", &line, &Machine::new()).await.expect("enrolled");
     assert_eq!(answer.authority_pem, identity.proof().borrow().authority_pem);
     let leaf = pem(&answer.certificate_pem);
-    let leaf = webpki::types::CertificateDer::from(leaf);
+    let leaf = rustls::pki_types::CertificateDer::from(leaf);
     let certificate = webpki::EndEntityCert::try_from(&leaf).expect("a certificate");
     assert_eq!(certificate.valid_uri_names().collect::<Vec<_>>(), ["spiffe://factory/robot/r7"]);
     assert_eq!(certificate.valid_dns_names().count(), 0);
@@ -40,8 +40,8 @@ async fn a_machine_gets_a_certificate_that_says_which_robot_it_is_whatever_it_as
 }
 
 fn pem(text: &str) -> Vec<u8> {
-    use webpki::types::pem::PemObject;
-    webpki::types::CertificateDer::from_pem_slice(text.as_bytes()).expect("PEM").to_vec()
+    use rustls::pki_types::pem::PemObject;
+    rustls::pki_types::CertificateDer::from_pem_slice(text.as_bytes()).expect("PEM").to_vec()
 }
 
 #[tokio::test]
