@@ -212,7 +212,7 @@ async fn a_stop_that_is_engaged_while_the_database_is_gone_is_recorded_and_holds
     tokio::task::block_in_place(|| postgres.start_again());
 
     until_held(address, &robots.ids(), &format!("stop:{stop_id}")).await?;
-    let recorded = format!("SELECT count(*) FROM stop_record WHERE id = '{stop_id}'");
+    let recorded = format!("SELECT count(*) FROM control.stop_record WHERE id = '{stop_id}'");
     until("the record of the stop", LIMIT, async || {
         let found = tokio::task::block_in_place(|| postgres.ask(&url, &recorded));
         Ok((found == "1").then_some(()))
