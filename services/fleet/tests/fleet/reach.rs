@@ -37,7 +37,7 @@ async fn world() -> World {
     w.robot("r1", "park-1").await;
     w.robot("r2", "Q01").await;
     // It would park in the hall.
-    w.r("r2").works = false;
+    w.r("r2").drives = false;
     w.step().await;
     w
 }
@@ -74,7 +74,7 @@ async fn a_process_that_does_not_lead_asks_the_same_of_a_caller() {
     w.robot("r1", "park-1").await;
     w.robot("r2", "Q01").await;
     // It would park in the hall.
-    w.r("r2").works = false;
+    w.r("r2").drives = false;
     let (standby, _) = w.other_process();
     w.pass(1).await;
     let anna = anna(&["operator@hall", "viewer@quality"]);
@@ -212,7 +212,7 @@ async fn an_incident_is_shown_and_closed_where_what_it_is_about_is() {
 #[tokio::test(start_paused = true)]
 async fn why_a_task_waits_is_told_to_whoever_sees_it_and_names_the_robots_that_it_sees() {
     let mut w = world().await;
-    w.r("r1").works = false;
+    w.r("r1").drives = false;
     w.submit_with("T1", "Q01", "Q01", |raw| raw.selector_labels = [("none".to_owned(), "has-it".to_owned())].into())
         .await;
     w.submit_with("T2", "A01", "A01", |raw| raw.selector_labels = [("none".to_owned(), "has-it".to_owned())].into())

@@ -26,6 +26,7 @@ fn spec(areas: &[&str]) -> Option<v1::RolloutSpec> {
         bundle: "walk-1.0.0".to_owned(),
         selector: Some(v1::RolloutSelector { area_ids, ..Default::default() }),
         waves: vec![wave],
+        allow_full_push: true,
         ..Default::default()
     })
 }
