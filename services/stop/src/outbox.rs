@@ -221,9 +221,9 @@ impl Stream for Down {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use midshift_core::identity::Caller;
     use crate::acts::{self, Wanted};
     use crate::{Parts, StopService};
+    use midshift_core::identity::Caller;
     use midshift_core::robot::StopLevel;
     use midshift_core::stop::Scope;
     use midshift_core::time::{ScaledClock, Utc};
@@ -267,7 +267,8 @@ mod tests {
         let outbox = Outbox::new(BTreeSet::new());
         let heard = || -> Vec<Bytes> { std::iter::from_fn(|| lock(&outbox.waiting).next(&inner)).collect() };
         heard();
-        let resetting = acts::reset(&inner, stop_id, "over".to_owned(), &Caller::local()).expect("nobody is asked here");
+        let resetting =
+            acts::reset(&inner, stop_id, "over".to_owned(), &Caller::local()).expect("nobody is asked here");
         // The latch has it; the lines are told one after the other, and this one checks in twice before its turn.
         let (reset, generation) = lock(&inner.law).settle(resetting.version, Utc(1_000)).remove(0);
         outbox.answer(1, generation, LinkTime(5));

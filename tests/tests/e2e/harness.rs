@@ -4,6 +4,8 @@ use crate::engine::fresh_store;
 use anyhow::{Context, bail};
 use midshift::way::{Line, Way};
 use midshift_core::site::DEMO;
+use midshift_proto::identity::v1::CreateTokenRequest;
+use midshift_proto::identity::v1::identity_service_client::IdentityServiceClient;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::task::v1::{ListTasksRequest, Task, TaskFilter, TaskState};
 use std::collections::BTreeMap;
@@ -158,6 +160,8 @@ where
 struct Known {
     authority: PathBuf,
     token: String,
+    /// Of somebody else, who may approve what the first one wrote.
+    second: String,
     way: Way,
 }
 
@@ -196,6 +200,16 @@ pub fn command(arguments: &[&str]) -> anyhow::Result<Command> {
         sign_in(&mut command, address);
     }
     command.args(arguments);
+    Ok(command)
+}
+
+/// The same, signed in as somebody else, who may approve what the first one wrote.
+pub fn second(arguments: &[&str]) -> anyhow::Result<Command> {
+    let mut command = command(arguments)?;
+    let named = arguments.iter().skip_while(|a| **a != "--server").nth(1).and_then(|a| a.parse().ok());
+    if let Some(site) = named.and_then(known) {
+        command.env("MIDSHIFT_TOKEN", site.second);
+    }
     Ok(command)
 }
 
@@ -264,7 +278,18 @@ impl Server {
         let token =
             token.await.with_context(|| std::fs::read_to_string(self.dir.join("server.log")).unwrap_or_default())?;
         let way = Way::secure(&self.address.to_string(), &std::fs::read_to_string(&authority)?, Some(&token))?;
-        KNOWN.lock().unwrap_or_else(PoisonError::into_inner).insert(self.address, Known { authority, token, way });
+        let identity = IdentityServiceClient::new(way.lazy());
+        let grants = vec!["ota-approver".to_owned()];
+        let request = CreateTokenRequest { name: "second".to_owned(), grants, valid_seconds: 86_400 };
+        let second = until("a second token", Duration::from_secs(30), || {
+            let (mut identity, request) = (identity.clone(), request.clone());
+            async move { Ok(identity.create_token(request).await.ok().map(|made| made.into_inner().secret)) }
+        })
+        .await?;
+        KNOWN
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .insert(self.address, Known { authority, token, second, way });
         Ok(())
     }
     /// SIGKILL and a new start on the same data.

@@ -1,7 +1,7 @@
 //! Software from the release people to a robot, with nothing but what they have: the command line, a server, a launcher and its agent. The server is
 //! killed on the way.
 
-use crate::harness::{Running, Server, command, midshift, until};
+use crate::harness::{Running, Server, command, midshift, second, until};
 use crate::robots::BODY_SPEED;
 use crate::robots::enrolment;
 use crate::room::LIMIT;
@@ -96,6 +96,14 @@ pub fn call(arguments: &[&str]) -> anyhow::Result<Output> {
     command(arguments)?.output().context("calling midshift")
 }
 
+/// Begins a roll-out that is written down: somebody else approves it.
+pub fn begin_rollout(address: &str, id: &str) -> anyhow::Result<()> {
+    done(&["rollout", "submit", "--server", address, id])?;
+    let approved = second(&["rollout", "approve", "--server", address, id, "--reason", "tried at home"])?.output()?;
+    ensure!(approved.status.success(), "{}", String::from_utf8_lossy(&approved.stderr));
+    done(&["rollout", "start", "--server", address, id])
+}
+
 /// The command line, which must succeed.
 pub fn done(arguments: &[&str]) -> anyhow::Result<()> {
     let output = call(arguments)?;
@@ -121,19 +129,10 @@ async fn a_release_reaches_a_robot_and_a_bad_one_goes_back_though_the_server_is_
     })
     .await?;
     let begin = |id: &str| {
-        let all = [
-            "--waves",
-            "rest",
-            "--allow-full-push",
-            "--soak",
-            "0s",
-            "--probation",
-            "1s",
-            "--exposure-tasks",
-            "0",
-            "--start",
-        ];
-        done(&[&["rollout", "create", "--server", &address, id][..], &all].concat())
+        let all =
+            ["--waves", "rest", "--allow-full-push", "--soak", "0s", "--probation", "1s", "--exposure-tasks", "0"];
+        done(&[&["rollout", "create", "--server", &address, id][..], &all].concat())?;
+        begin_rollout(&address, id)
     };
     begin("walk-1.5.0")?;
     let wait = |id: &str| call(&["rollout", "wait", "--server", &address, id, "--timeout", "120s"]);

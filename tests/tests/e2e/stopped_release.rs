@@ -4,7 +4,7 @@
 use crate::harness::{Server, folder, until};
 use crate::kill::{all_over, at_work, submit};
 use crate::robots::enrolment;
-use crate::rolled_out::{Robot, call, done};
+use crate::rolled_out::{Robot, begin_rollout, call, done};
 use crate::rolling::seen;
 use crate::room::LIMIT;
 use crate::stopped::{StopServer, judge_stops, resume, until_held};
@@ -67,9 +67,8 @@ async fn a_canary_of_a_bad_release_goes_back_under_a_fleet_stop_and_nobody_moves
 
     let id = format!("walk-{BAD}");
     let slow = ["--waves", "1,rest", "--allow-full-push", "--soak", "1h", "--probation", "1h"];
-    done(
-        &[&["rollout", "create", "--server", &address, &id][..], &slow, &["--exposure-tasks", "0", "--start"]].concat(),
-    )?;
+    done(&[&["rollout", "create", "--server", &address, &id][..], &slow, &["--exposure-tasks", "0"]].concat())?;
+    begin_rollout(&address, &id)?;
     until("the canary on probation", LIMIT, async || {
         let counts = seen(server.address, &id).await?.map(|seen| seen.counts).unwrap_or_default();
         Ok((counts.attempted == 1 && robots.iter().any(|robot| robot.is_on_trial())).then_some(()))

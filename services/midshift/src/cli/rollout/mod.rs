@@ -278,7 +278,12 @@ pub async fn exclude(
 async fn begin(client: &mut Client, rollout_id: &str, supersede: bool, out: &Out) -> Result<v1::Rollout, Exit> {
     ask(client, Ask::Submit, rollout_id, "", "").await?;
     out.say("checked against the fleet");
-    let approved = ask(client, Ask::Approve, rollout_id, "", "").await?;
+    let by_another =
+        format!("midshift rollout approve {rollout_id} by somebody else, then midshift rollout start {rollout_id}");
+    let approved = ask(client, Ask::Approve, rollout_id, "", "").await.map_err(|exit| match exit.code() {
+        6 => exit.or_try(&by_another),
+        _ => exit,
+    })?;
     out.say(approval(&approved));
     let started = ask(client, Ask::Start { supersede }, rollout_id, "", "").await?;
     out.say("started");
