@@ -5,6 +5,7 @@
 //! A revision counts the writes of one row, from 1. Ids of rows that can be deleted are never used again, so
 //! a revision never means two things.
 
+use crate::audit::Note;
 use crate::ids::RobotId;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -96,7 +97,19 @@ tables! {
     OtaCommandKey "ota_command_key" Ota, "request_id -> command about software carried out; kept 7 days.";
     OtaLeader "ota_leader" Ota, "Which process of ota plans and signs; renewed each second where there may be several.";
     StopRecord "stop_record" Stop, "A copy of one fleet stop and of its reset. id = stop_id, order = when it was engaged.";
+    TaskAudit "task_audit" Task, "What people and programs asked of task intake, as a chain. Order = number. Written by notes of items alone.";
+    FleetAudit "fleet_audit" Fleet, "What they decided about robots, places and areas, as a chain.";
+    OtaAudit "ota_audit" Ota, "What they decided about software, as a chain.";
+    StopAudit "stop_audit" Stop, "Stops and resets as they were copied, as a chain.";
 }
+
+/// Each service that decides for somebody, with the table of its audit.
+const AUDITS: &[(Writer, Table)] = &[
+    (Writer::Task, Table::TaskAudit),
+    (Writer::Fleet, Table::FleetAudit),
+    (Writer::Ota, Table::OtaAudit),
+    (Writer::Stop, Table::StopAudit),
+];
 
 impl Table {
     /// Who may create a row. `task_state` is born with its `task_intake`: the one declared exception.
@@ -105,6 +118,22 @@ impl Table {
             Self::TaskState => Writer::Task,
             other => other.writer(),
         }
+    }
+    /// Where the audit of a service is; none: it decides nothing for anybody.
+    pub fn audit_of(writer: Writer) -> Option<Self> {
+        AUDITS.iter().find(|(of, _)| *of == writer).map(|(_, table)| *table)
+    }
+    /// Where the audit of the service of this name is.
+    pub fn audit_named(service: &str) -> Option<Self> {
+        AUDITS.iter().find(|(of, _)| of.as_str() == service).map(|(_, table)| *table)
+    }
+    /// Whether it is an audit, which only notes of items write.
+    pub fn is_audit(self) -> bool {
+        AUDITS.iter().any(|(_, table)| *table == self)
+    }
+    /// The services that have an audit, and where it is.
+    pub const fn audits() -> &'static [(Writer, Self)] {
+        AUDITS
     }
 }
 
@@ -318,6 +347,8 @@ pub struct Item {
     pub rows: Vec<RowChange>,
     /// Facts beside the rows.
     pub facts: Vec<Fact>,
+    /// What it leaves in the audit of its writer; none: nobody asked for it.
+    pub note: Option<Box<Note>>,
     /// A robot that must not have been heard meanwhile.
     pub silent: Option<Silent>,
 }
@@ -341,6 +372,7 @@ impl Item {
             request_id: None,
             rows: Vec::new(),
             facts: Vec::new(),
+            note: None,
             silent: None,
         }
     }
@@ -368,9 +400,14 @@ impl Item {
         self.rows.push(RowChange { key, expect: Expect::At(revision), write: Write::Delete, kind });
         self
     }
+    /// Leaves this in the audit.
+    pub fn audit(&mut self, note: Note) -> &mut Self {
+        self.note = Some(Box::new(note));
+        self
+    }
     /// Whether it would change anything.
     pub fn is_empty(&self) -> bool {
-        self.facts.is_empty() && self.rows.iter().all(|r| matches!(r.write, Write::Keep))
+        self.note.is_none() && self.facts.is_empty() && self.rows.iter().all(|r| matches!(r.write, Write::Keep))
     }
 }
 
