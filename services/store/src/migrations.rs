@@ -91,6 +91,15 @@ pub(crate) const CONTROL: &[Migration] = migrations!["control":
     "0069_stop_record",
     "0070_stop_event",
     "0071_stop_event_by_subject",
+    "0072_audit_head",
+    "0073_task_audit",
+    "0074_fleet_audit",
+    "0075_ota_audit",
+    "0076_stop_audit",
+    "0077_task_audit_by_ord",
+    "0078_fleet_audit_by_ord",
+    "0079_ota_audit_by_ord",
+    "0080_stop_audit_by_ord",
 ];
 
 /// Of `telemetry.db`.
