@@ -80,7 +80,10 @@ impl Loop {
             let item = match self.decide(asked) {
                 Ok(Some(item)) => item,
                 Ok(None) => return Ok(Ok(())),
-                Err(refusal) => return Ok(Err(refusal)),
+                Err(refusal) => {
+                    self.note_refusal(asked, &refusal).await;
+                    return Ok(Err(refusal));
+                }
             };
             let keys = picture::touched(std::slice::from_ref(&item));
             match self.parts.store.commit(vec![item]).await.pop() {
@@ -96,6 +99,14 @@ impl Loop {
             }
         }
         Ok(Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile)))
+    }
+
+    /// Whoever asked hears why, whether or not that can be written down.
+    async fn note_refusal(&self, asked: &Asked<'_>, refusal: &Refusal) {
+        if !asked.validate_only {
+            let item = commands::refusal(&self.view, asked.command, asked.actor, asked.request_id, refusal);
+            drop(self.parts.store.commit(item.into_iter().collect()).await);
+        }
     }
 
     /// What has to be written; none: nothing has.

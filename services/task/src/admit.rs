@@ -5,6 +5,7 @@
 
 use crate::TaskService;
 use crate::rows::{TaskRows, exist, read, unavailable};
+use midshift_core::audit::Note;
 use midshift_core::ids::{RequestId, TaskId};
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violation};
 use midshift_core::rows::{Item, Table, Writer};
@@ -143,7 +144,8 @@ impl TaskService {
             };
             item.create(&key, "request.used");
         }
-        item.create(&intake, "task.admitted").create(&TaskState::born(&intake), "task.born");
+        let note = Note::new("task.submit").about("task", &task_id).with("sha256", &wanted.hash);
+        item.create(&intake, "task.admitted").create(&TaskState::born(&intake), "task.born").audit(note);
         Admission { wanted, intake, item }
     }
 
