@@ -3,13 +3,14 @@
 use prost::Message;
 use std::path::PathBuf;
 
-const FILES: [&str; 18] = [
+const FILES: [&str; 19] = [
     "midshift/common/v1/access.proto",
     "midshift/common/v1/common.proto",
     "midshift/task/v1/task.proto",
     "midshift/task/v1/task_service.proto",
     "midshift/fleet/v1/fleet.proto",
     "midshift/fleet/v1/fleet_service.proto",
+    "midshift/identity/v1/audit_service.proto",
     "midshift/link/v1/link.proto",
     "midshift/link/v1/replay_service.proto",
     "midshift/link/v1/update.proto",

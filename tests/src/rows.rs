@@ -8,7 +8,7 @@ use anyhow::{Context, ensure};
 use midshift_core::once::CommandKey;
 use midshift_core::rows::{Entry, Index, Log, Record, Seq, Table};
 use midshift_core::work::{InboxEntry, Told};
-use midshift_core::{fleet, lead, maintenance, policy, rollout, stop, task, update, work};
+use midshift_core::{audit, fleet, lead, maintenance, policy, rollout, stop, task, update, work};
 use midshift_proto::link::v1::LaneBatch;
 use midshift_proto::parse;
 use midshift_proto::session;
@@ -146,6 +146,10 @@ records! {
     OtaCommandKey CommandKey<rollout::commands::Command>;
     OtaLeader lead::OtaLeader;
     StopRecord stop::record::StopRecord;
+    TaskAudit audit::TaskAudit;
+    FleetAudit audit::FleetAudit;
+    OtaAudit audit::OtaAudit;
+    StopAudit audit::StopAudit;
 }
 
 fn hold_as<R: Record>(shapes: &mut Shapes, id: &str, index: &Index, body: &str) -> anyhow::Result<()> {

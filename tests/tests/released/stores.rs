@@ -22,6 +22,7 @@ pub const EMPTY: &[(&str, &str)] = &[
     ),
     ("stop_record", "a stop service writes them, and none runs beside the server of a run"),
     ("stop_event", "the same"),
+    ("stop_audit", "the same"),
 ];
 
 /// Words of enums that a release does not know and this build may write all the same, with why a process of that release that shares the store does

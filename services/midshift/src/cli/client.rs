@@ -7,6 +7,7 @@ use midshift_bundle::folder::Error;
 use midshift_core::reason::{Kind, Refusal};
 use midshift_proto::convert::time_of;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
+use midshift_proto::identity::v1::audit_service_client::AuditServiceClient;
 use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::sim::v1::sim_service_client::SimServiceClient;
@@ -240,6 +241,10 @@ impl Call {
     /// Roll-outs of software.
     pub async fn rollouts(&self) -> Result<RolloutServiceClient<Channel>, Exit> {
         Ok(RolloutServiceClient::new(self.channel().await?).max_decoding_message_size(64 * 1024 * 1024))
+    }
+    /// Who decided what.
+    pub async fn audit(&self) -> Result<AuditServiceClient<Channel>, Exit> {
+        Ok(AuditServiceClient::new(self.channel().await?).max_decoding_message_size(64 * 1024 * 1024))
     }
     /// Whether it serves.
     pub async fn health(&self) -> Result<HealthClient<Channel>, Exit> {

@@ -1,6 +1,7 @@
 //! The command line: one binary, noun then verb. Data to stdout, talk to stderr, `-o json` is the contract.
 
 mod area;
+mod audit;
 mod backup;
 mod bundle;
 mod client;
@@ -111,6 +112,9 @@ enum Command {
     /// Bundles that robots went back from and do not get again.
     #[command(subcommand)]
     Quarantine(quarantine::Verb),
+    /// Who decided what: look, take it away, and check that nothing of it was changed.
+    #[command(subcommand)]
+    Audit(Box<audit::Verb>),
     /// Look for what may be wrong: server, store, robots, this machine.
     Doctor(Call),
     /// Whether one process serves: exit code 0 or 1, for health checks.
@@ -198,6 +202,7 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Bundle(verb) => bundle::run(verb, out).await,
         Command::Rollout(verb) => rollout::run(*verb, out).await,
         Command::Quarantine(verb) => quarantine::run(verb, out).await,
+        Command::Audit(verb) => audit::run(*verb, out).await,
         Command::Doctor(call) => doctor::run(&call, out).await,
         Command::Health(args) => health::run(args, out).await,
         Command::ExplainError { code } => explain::error(code.as_deref(), out),
