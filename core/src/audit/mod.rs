@@ -97,13 +97,27 @@ pub struct Note {
     pub refused: Option<Code>,
     /// For [`CUT`]: the newest row that goes.
     pub cut: Option<Head>,
+    /// May stand in one row with others of its kind that are committed with it.
+    pub crowd: Crowd,
 }
+
+/// Whether notes may share a row.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Crowd {
+    /// It has a row of its own.
+    Alone,
+    /// Notes of one actor and one action that stand beside each other in one transaction share a row.
+    Shared,
+}
+
+/// Things that one shared row is about at most.
+const CROWD_MAX: usize = 256;
 
 impl Note {
     /// That this was done.
     pub fn new(action: &'static str) -> Self {
         let (about, with, reason) = (Vec::new(), BTreeMap::new(), String::new());
-        Self { action, about, with, reason, refused: None, cut: None }
+        Self { action, about, with, reason, refused: None, cut: None, crowd: Crowd::Alone }
     }
     /// A row that quotes the heads of the other chains as they are when it is committed.
     pub fn anchor() -> Self {
@@ -130,6 +144,11 @@ impl Note {
     pub fn because(mut self, reason: impl Into<String>) -> Self {
         self.reason = reason.into();
         self
+    }
+    /// Many come at once, and one row may tell of them: each is about one thing and has the same fields as the others.
+    #[must_use]
+    pub fn shared(self) -> Self {
+        Self { crowd: Crowd::Shared, ..self }
     }
     /// It was not done.
     #[must_use]
@@ -164,6 +183,44 @@ pub fn refusal(writer: Writer, actor: &str, request_id: Option<&str>, note: Note
     is_decision.then_some(item)
 }
 
+/// What one row is going to say, while more may come to it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Draft {
+    /// Whose chain.
+    pub writer: Writer,
+    /// What.
+    pub note: Box<Note>,
+    /// On whose behalf.
+    pub by: By,
+}
+
+impl Draft {
+    /// Takes another one into this row: values of a field stand side by side in the order of what they are about, with a space between them. Gives
+    /// it back if it needs a row of its own.
+    pub fn join(&mut self, other: Self) -> Option<Self> {
+        let (note, theirs) = (&mut *self.note, &*other.note);
+        let alike = note.crowd == Crowd::Shared
+            && theirs.crowd == Crowd::Shared
+            && (note.action, note.refused, &note.reason) == (theirs.action, theirs.refused, &theirs.reason)
+            && note.with.keys().eq(theirs.with.keys())
+            && (&self.by.actor, self.by.at_unix_ms) == (&other.by.actor, other.by.at_unix_ms)
+            && self.by.request_id.is_some() == other.by.request_id.is_some()
+            && note.about.len() + theirs.about.len() <= CROWD_MAX;
+        if !alike {
+            return Some(other);
+        }
+        for (value, more) in note.with.values_mut().zip(theirs.with.values()) {
+            value.push(' ');
+            value.push_str(more);
+        }
+        note.about.extend(other.note.about);
+        if let (Some(known), Some(more)) = (&self.by.request_id, &other.by.request_id) {
+            self.by.request_id = Some(format!("{known} {more}").into());
+        }
+        None
+    }
+}
+
 /// One row of a chain as it is read. Of a newer release it may say more than this.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct AuditRow {
@@ -183,7 +240,7 @@ pub struct AuditRow {
     /// What else was asked for.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub with: BTreeMap<String, String>,
-    /// The request behind it; empty: none was named.
+    /// The request behind it; empty: none was named. Of a row that tells of many: one for each thing that it is about, with a space between them.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub request_id: String,
     /// Why, as the person said it.

@@ -81,7 +81,8 @@ impl Loop {
                 Ok(Some(item)) => item,
                 Ok(None) => return Ok(Ok(())),
                 Err(refusal) => {
-                    self.note_refusal(asked, &refusal).await;
+                    // Whoever asked hears why, whether or not that can be written down.
+                    drop(self.parts.store.commit(self.refused(asked, &refusal)).await);
                     return Ok(Err(refusal));
                 }
             };
@@ -101,12 +102,11 @@ impl Loop {
         Ok(Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile)))
     }
 
-    /// Whoever asked hears why, whether or not that can be written down.
-    async fn note_refusal(&self, asked: &Asked<'_>, refusal: &Refusal) {
-        if !asked.validate_only {
-            let item = commands::refusal(&self.view, asked.command, asked.actor, asked.request_id, refusal);
-            drop(self.parts.store.commit(item.into_iter().collect()).await);
-        }
+    /// What a refusal leaves in the audit.
+    fn refused(&self, asked: &Asked<'_>, refusal: &Refusal) -> Vec<Item> {
+        let Asked { command, validate_only, actor, request_id, .. } = asked;
+        let item = commands::refusal(&self.view, command, actor, *request_id, refusal);
+        item.into_iter().filter(|_| !validate_only).collect()
     }
 
     /// What has to be written; none: nothing has.

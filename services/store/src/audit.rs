@@ -4,35 +4,51 @@
 //! is their order whatever process they come from. What goes of it is a beginning, and only with the row that says so.
 
 use crate::sql;
-use midshift_core::audit::{self, By, Head, Note};
+use midshift_core::audit::{self, Draft, Head};
 use midshift_core::rows::{Row, Table, Writer};
 use sqlx::{ColumnIndex, Decode, Type};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Where each chain stands. A chain without rows is not among them.
 pub(crate) type Heads = BTreeMap<Writer, Head>;
 
-/// What an item leaves in the audit.
-#[derive(Debug)]
-pub(crate) struct Audited {
-    pub(crate) writer: Writer,
-    pub(crate) note: Box<Note>,
-    pub(crate) by: By,
-}
+/// What the items of one transaction leave in the audit, in their order.
+#[derive(Default)]
+pub(crate) struct Growth(Vec<Draft>);
 
-/// A row behind its chain, and what goes with it.
+/// Rows behind their chains, and what goes of those.
+#[derive(Default)]
 pub(crate) struct Grown {
-    pub(crate) row: Row,
-    /// Rows of this table up to this number go.
-    pub(crate) cut: Option<(Table, u64)>,
+    pub(crate) rows: Vec<Row>,
+    pub(crate) writers: BTreeSet<Writer>,
+    /// Rows of a table up to a number go.
+    pub(crate) cuts: BTreeMap<Table, u64>,
 }
 
-impl Audited {
-    /// Puts it behind its chain. None: its writer has none, which was refused before.
-    pub(crate) fn grow(&self, heads: &mut Heads) -> Option<Grown> {
-        let row = audit::append(heads, self.writer, &self.note, &self.by)?;
-        let table = row.key.table;
-        Some(Grown { row, cut: self.note.cut.as_ref().map(|head| (table, head.n)) })
+impl Growth {
+    /// What stands beside the note before it may share its row.
+    pub(crate) fn take(&mut self, draft: Draft) {
+        let own = match self.0.last_mut() {
+            Some(last) if last.writer == draft.writer => last.join(draft),
+            _ => Some(draft),
+        };
+        self.0.extend(own);
+    }
+    /// Whether there is nothing.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+    /// Puts all of it behind the chains.
+    pub(crate) fn grow(self, heads: &mut Heads) -> Grown {
+        let mut grown = Grown::default();
+        for Draft { writer, note, by } in self.0 {
+            // A writer without a chain was refused before.
+            let Some(row) = audit::append(heads, writer, &note, &by) else { continue };
+            grown.cuts.extend(note.cut.map(|head| (row.key.table, head.n)));
+            grown.writers.insert(writer);
+            grown.rows.push(row);
+        }
+        grown
     }
 }
 

@@ -2,9 +2,8 @@
 //!
 //! Invariant: nothing here depends on the engine, so that all engines refuse the same items for the same reason.
 
-use crate::audit::Audited;
 use crate::{Applied, CommitError, ID_BYTES_MAX};
-use midshift_core::audit::By;
+use midshift_core::audit::{By, Draft};
 use midshift_core::limits;
 use midshift_core::rows::{Entry, Expect, Fact, Index, Item, Key, Log, Revision, Row, RowChange, Seq, Table, Write};
 use std::collections::BTreeSet;
@@ -103,7 +102,7 @@ pub(crate) struct Decided {
     /// Its entries, numbered from the head given.
     pub(crate) entries: Vec<Entry>,
     /// What it leaves in the audit.
-    pub(crate) audited: Option<Audited>,
+    pub(crate) audited: Option<Draft>,
     /// The answer.
     pub(crate) applied: Applied,
 }
@@ -119,7 +118,7 @@ pub(crate) fn decide(
     expectations(&item, found)?;
     let Item { writer, actor, request_id, rows, facts, note, silent: _ } = item;
     let by = || By { actor: actor.clone(), request_id: request_id.clone(), at_unix_ms };
-    let audited = note.map(|note| Audited { writer, note, by: by() });
+    let audited = note.map(|note| Draft { writer, note, by: by() });
     let applied = Applied { seq: head, revisions: Vec::new() };
     let mut decided = Decided { rows: Vec::new(), entries: Vec::new(), audited, applied };
     let entry = |seq: &mut Seq, log, subject, kind: &str, body| {

@@ -3,7 +3,7 @@
 //! Invariant: pure. Items are judged in order, each against what the ones before it in the group leave; a row that several items
 //! write is written once, as the last one leaves it.
 
-use crate::audit::Heads;
+use crate::audit::{Growth, Heads};
 use crate::check::{After, decide};
 use crate::{Applied, CommitError};
 use midshift_core::rows::{Entry, Item, Key, Revision, Row, Seq, Table, Writer};
@@ -23,6 +23,8 @@ pub(crate) struct Group {
     pub(crate) head: Seq,
     /// Where the chains of the audit stand after the group.
     pub(crate) chains: Heads,
+    /// What comes to them.
+    growth: Growth,
     /// Chains that grew in it.
     pub(crate) grown: BTreeSet<Writer>,
     /// Chains that were cut in it, and up to which number.
@@ -32,10 +34,18 @@ pub(crate) struct Group {
 impl Group {
     pub(crate) fn new(head: Seq, base: HashMap<Key, Standing>, chains: Heads) -> Self {
         let (rows, entries) = (BTreeMap::new(), Vec::new());
-        Self { base, rows, entries, head, chains, grown: BTreeSet::new(), cuts: BTreeMap::new() }
+        let (growth, grown, cuts) = (Growth::default(), BTreeSet::new(), BTreeMap::new());
+        Self { base, rows, entries, head, chains, growth, grown, cuts }
     }
 
-    /// Whether there is anything to write.
+    /// After the last item: the rows of the audit.
+    pub(crate) fn seal(&mut self) {
+        let growth = std::mem::take(&mut self.growth).grow(&mut self.chains);
+        self.rows.extend(growth.rows.into_iter().map(|row| (row.key.clone(), Some(row))));
+        (self.grown, self.cuts) = (growth.writers, growth.cuts);
+    }
+
+    /// Whether there is anything to write. Asked when it is sealed.
     pub(crate) fn writes(&self) -> bool {
         !self.entries.is_empty() || !self.grown.is_empty()
     }
@@ -50,12 +60,8 @@ impl Group {
         }
         self.entries.extend(decided.entries);
         self.head = decided.applied.seq;
-        if let Some(audited) = decided.audited
-            && let Some(grown) = audited.grow(&mut self.chains)
-        {
-            self.rows.insert(grown.row.key.clone(), Some(grown.row));
-            self.grown.insert(audited.writer);
-            self.cuts.extend(grown.cut);
+        if let Some(draft) = decided.audited {
+            self.growth.take(draft);
         }
         Ok(decided.applied)
     }

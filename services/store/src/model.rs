@@ -4,7 +4,7 @@
 //! Invariant: synchronous and deterministic: no task, no file, no randomness; same calls, same clock readings, same answers.
 //! Nothing survives the process.
 
-use crate::audit::Heads;
+use crate::audit::{Growth, Heads};
 use crate::check::{After, decide, log_index};
 use crate::model_table::Rows;
 use crate::{
@@ -39,6 +39,7 @@ struct State {
     tables: BTreeMap<Table, Rows>,
     logs: [Kept; Log::ALL.len()],
     chains: Heads,
+    growth: Growth,
 }
 
 /// What is left of one log.
@@ -65,7 +66,8 @@ impl MemoryStore {
     /// An empty store whose numbers start at the clock's wall time now.
     pub fn new(site_id: SiteId, id: StoreId, clock: Arc<dyn Clock>) -> Self {
         let head = Seq(clock.now().wall.0.max(0).cast_unsigned());
-        let state = State { head, tables: BTreeMap::new(), logs: Default::default(), chains: Heads::new() };
+        let (tables, logs, chains, growth) = (BTreeMap::new(), Default::default(), Heads::new(), Growth::default());
+        let state = State { head, tables, logs, chains, growth };
         let wake = watch::Sender::new(head);
         Self { id, site_id, clock, log_entries_max: LOG_ENTRIES_DEFAULT, shared: false, state: Mutex::new(state), wake }
     }
@@ -106,13 +108,24 @@ impl State {
             }
         }
         self.head = decided.applied.seq;
-        if let Some(grown) = decided.audited.and_then(|audited| audited.grow(&mut self.chains)) {
-            self.tables.entry(grown.row.key.table).or_default().put(grown.row);
-            if let Some((table, up_to)) = grown.cut {
-                self.tables.entry(table).or_default().delete_up_to(up_to.cast_signed());
-            }
+        if let Some(draft) = decided.audited {
+            self.growth.take(draft);
         }
         Ok(decided.applied)
+    }
+
+    /// After the last item of a call: the rows of the audit.
+    fn seal(&mut self) {
+        if self.growth.is_empty() {
+            return;
+        }
+        let grown = std::mem::take(&mut self.growth).grow(&mut self.chains);
+        for row in grown.rows {
+            self.tables.entry(row.key.table).or_default().put(row);
+        }
+        for (table, up_to) in grown.cuts {
+            self.tables.entry(table).or_default().delete_up_to(up_to.cast_signed());
+        }
     }
 
     fn row(&self, key: &Key) -> Option<&Row> {
@@ -156,6 +169,7 @@ impl Store for MemoryStore {
         let mut state = self.state();
         let before = state.head;
         let results = items.into_iter().map(|item| state.apply(item, at_unix_ms, self.log_entries_max)).collect();
+        state.seal();
         if state.head > before {
             self.wake.send_replace(state.head);
         }

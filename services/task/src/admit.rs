@@ -144,7 +144,7 @@ impl TaskService {
             };
             item.create(&key, "request.used");
         }
-        let note = Note::new("task.submit").about("task", &task_id).with("sha256", &wanted.hash);
+        let note = Note::new("task.submit").about("task", &task_id).with("sha256", &wanted.hash).shared();
         item.create(&intake, "task.admitted").create(&TaskState::born(&intake), "task.born").audit(note);
         Admission { wanted, intake, item }
     }

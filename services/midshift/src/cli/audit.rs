@@ -13,6 +13,9 @@ use std::fs::{File, OpenOptions};
 use std::io::{BufRead, BufReader, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+/// Of what one row is about, so much stands in a table.
+const ABOUT_SHOWN: usize = 4;
+
 /// Verbs of the audit.
 #[derive(Subcommand)]
 pub enum Verb {
@@ -136,7 +139,12 @@ fn name(row: &v1::AuditRow) -> String {
 
 fn row(row: &v1::AuditRow) -> Vec<String> {
     let heads = row.heads.iter().map(|head| format!("{}:{}", head.service, head.n));
-    let about: Vec<String> = row.about.iter().cloned().chain(heads).collect();
+    let mut about: Vec<String> = row.about.iter().cloned().chain(heads).collect();
+    if about.len() > ABOUT_SHOWN {
+        let more = about.len() - ABOUT_SHOWN;
+        about.truncate(ABOUT_SHOWN);
+        about.push(format!("and {more} more"));
+    }
     vec![
         row.time.as_ref().map(|t| time_of(t).rfc3339()).unwrap_or_default(),
         name(row),

@@ -198,6 +198,7 @@ impl AsyncWork<(Vec<Results>, Seq)> for GroupCommit {
         };
         let mut judge = |items: &Vec<Item>| items.iter().map(&mut add).collect::<Results>();
         let results: Vec<Results> = self.items.iter().map(&mut judge).collect();
+        group.seal();
         let writes = group.writes();
         if writes {
             write_sql::rows(connection, site_id, &group.rows).await?;

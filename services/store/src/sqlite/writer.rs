@@ -145,6 +145,7 @@ impl Engine for Writer {
         let at_unix_ms = self.clock.now().wall.0;
         let judge = |items: Vec<Item>| items.into_iter().map(|item| group.add(item, at_unix_ms)).collect();
         let results = items.into_iter().map(judge).collect();
+        group.seal();
         if group.writes() {
             self.write(&group).await?;
         }

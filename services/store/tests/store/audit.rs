@@ -1,7 +1,7 @@
 //! The chains of the audit, the same on every engine: in the item, in commit order over all processes, and whole after whatever ends them.
 
 use crate::support::{at, clock, database, number, one, postgres_at, put, say, site, stranger};
-use midshift_core::audit::{Broken, Chain, Head, Mark, Note, Verified};
+use midshift_core::audit::{AuditRow, Broken, Chain, Head, Mark, Note, Verified};
 use midshift_core::rows::{Expect, Item, Log, RowChange, Seq, Table, Write, Writer};
 use midshift_store::{CommitError, Cursor, Query, SqliteStore, Store};
 use std::sync::Arc;
@@ -23,6 +23,7 @@ contract! {
     an_anchor_quotes_the_others_as_they_are_when_it_is_committed
     what_is_cut_is_a_beginning_and_the_rest_holds
     who_writes_at_the_same_moment_is_in_one_chain
+    admissions_that_come_together_share_rows_and_none_is_left_out
 }
 
 fn noted(writer: Writer, action: &'static str, rows: Vec<RowChange>) -> Item {
@@ -137,6 +138,34 @@ async fn who_writes_at_the_same_moment_is_in_one_chain(store: Arc<dyn Store>) {
     }
     assert!(tasks.join_all().await.into_iter().flatten().all(|applied| applied));
     assert_eq!(holds(&*store, Writer::Fleet).await, (1, 128));
+}
+
+async fn admissions_that_come_together_share_rows_and_none_is_left_out(store: Arc<dyn Store>) {
+    let admission = |n: usize, actor: &str| {
+        let mut item = Item::new(Writer::Task, actor);
+        item.rows.push(put(Table::TaskIntake, &format!("T{n}"), Expect::Absent, "{}"));
+        item.request_id = Some(format!("q{n}").into());
+        item.audit(Note::new("task.submit").about("task", format!("T{n}")).with("sha256", format!("{n:064}")).shared());
+        item
+    };
+    // One that is there already, and one of somebody else in the middle.
+    let actor = |n| if n == 100 { "bert" } else { "anna" };
+    let items: Vec<Item> = (0..200).chain([7]).map(|n| admission(n, actor(n))).collect();
+    assert_eq!(commit(&*store, items).await.iter().filter(|applied| **applied).count(), 200);
+    holds(&*store, Writer::Task).await;
+    let rows = store.list(Query::all(Table::TaskAudit)).await.unwrap();
+    assert!(rows.len() >= 3 && rows.len() < 100, "{} rows", rows.len());
+    let read: Vec<AuditRow> = rows.iter().map(|row| serde_json::from_str(&row.body).unwrap()).collect();
+    let mut told = 0;
+    for row in &read {
+        let (digests, requests) = (row.with["sha256"].split(' '), row.request_id.split(' '));
+        for ((about, digest), request) in row.about.iter().zip(digests).zip(requests) {
+            assert_eq!((about.as_str(), request), (&*format!("task:T{told}"), &*format!("q{told}")));
+            assert_eq!((digest, row.actor.as_str()), (&*format!("{told:064}"), actor(told)));
+            told += 1;
+        }
+    }
+    assert_eq!(told, 200, "in their order, each once");
 }
 
 #[tokio::test]
