@@ -4,13 +4,14 @@ use prost_reflect::{DescriptorPool, MethodDescriptor, ReflectMessage, Value};
 use std::fmt::Write;
 use std::path::PathBuf;
 
-const FILES: [&str; 20] = [
+const FILES: [&str; 21] = [
     "midshift/common/v1/access.proto",
     "midshift/common/v1/common.proto",
     "midshift/task/v1/task.proto",
     "midshift/task/v1/task_service.proto",
     "midshift/fleet/v1/fleet.proto",
     "midshift/fleet/v1/fleet_service.proto",
+    "midshift/identity/v1/audit_service.proto",
     "midshift/identity/v1/enrolment_service.proto",
     "midshift/identity/v1/identity_service.proto",
     "midshift/link/v1/link.proto",

@@ -3,6 +3,7 @@
 //! Invariant: nothing here does IO, reads a clock, draws a random number by itself or awaits. Functions take
 //! `now` and values and return values; services act on what is returned.
 
+pub mod audit;
 pub mod authority;
 pub mod bugs;
 pub mod fleet;

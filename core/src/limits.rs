@@ -143,6 +143,12 @@ pub const RING_STATUS_MAX: usize = 4_096;
 pub const REMEMBER_DAYS: u64 = 7;
 /// Days that what people asked of tasks and robots is kept, to be looked up.
 pub const ASKED_DAYS: u64 = 30;
+/// Days that the audit keeps who decided what: a year, and five weeks to ask about its end.
+pub const AUDIT_DAYS: u64 = 400;
+/// Milliseconds of the wall between two rows of a chain that quote the heads of the others: what an end that was taken away can hide in.
+pub const AUDIT_ANCHOR_EVERY_MS: u64 = 3_600_000;
+/// Rows of the audit that one look for what is wanted reads; a page that has found less goes on with the next call.
+pub const AUDIT_LOOK_ROWS: usize = 20_000;
 /// Finished ids a ledger keeps whatever their age.
 pub const LEDGER_IDS_MIN: usize = 100_000;
 /// Longest unary call. L

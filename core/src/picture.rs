@@ -3,6 +3,7 @@
 //! Called by `fleet` and `rollout`. Invariants: a row in a picture is at the revision it has in the store, or one that an item of the
 //! running cycle will write; a row written twice in one decision stands in its item once, with the first expectation and the last body.
 
+use crate::audit::Note;
 use crate::ids::RobotId;
 use crate::rows::{
     BadRow, Entry, Expect, Fact, Item, Key, Log, Record, Revision, Row, RowChange, Silent, Table, Write, Writer,
@@ -125,6 +126,10 @@ impl<'a, P: Picture> Tx<'a, P> {
     /// Guards the silence of a robot: if anybody hears it first, this decision is not made.
     pub fn rely_on_silence(&mut self, robot_id: &RobotId) {
         self.item.silent = Some(Silent { robot_id: robot_id.clone(), position: 0 });
+    }
+    /// Leaves this in the audit.
+    pub fn audit(&mut self, note: Note) {
+        self.item.audit(note);
     }
     /// States a fact beside the rows.
     pub fn tell(&mut self, subject: &str, kind: &'static str, body: &impl serde::Serialize) {

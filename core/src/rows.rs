@@ -5,6 +5,7 @@
 //! A revision counts the writes of one row, from 1. Ids of rows that can be deleted are never used again, so
 //! a revision never means two things.
 
+use crate::audit::Note;
 use crate::ids::RobotId;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -104,7 +105,21 @@ tables! {
     RobotIdentity "robot_identity" Identity, "A robot's key, the newest secret that enrols it, keys that were taken out. id = robot_id.";
     Authority "authority" Identity, "The root certificate of the site. id = site_id.";
     ServerCertificate "server_certificate" Identity, "What one server process asked to prove itself with, and the answer. id = digest of its key.";
+    TaskAudit "task_audit" Task, "What people and programs asked of task intake, as a chain. Order = number. Written by notes of items alone.";
+    FleetAudit "fleet_audit" Fleet, "What they decided about robots, places and areas, as a chain.";
+    OtaAudit "ota_audit" Ota, "What they decided about software, as a chain.";
+    StopAudit "stop_audit" Stop, "Stops and resets as they were copied, as a chain.";
+    IdentityAudit "identity_audit" Identity, "What they decided about tokens and identities of robots, as a chain.";
 }
+
+/// Each service that decides for somebody, with the table of its audit.
+const AUDITS: &[(Writer, Table)] = &[
+    (Writer::Task, Table::TaskAudit),
+    (Writer::Fleet, Table::FleetAudit),
+    (Writer::Ota, Table::OtaAudit),
+    (Writer::Stop, Table::StopAudit),
+    (Writer::Identity, Table::IdentityAudit),
+];
 
 impl Table {
     /// Who may create a row. `task_state` is born with its `task_intake`: the one declared exception.
@@ -113,6 +128,22 @@ impl Table {
             Self::TaskState => Writer::Task,
             other => other.writer(),
         }
+    }
+    /// Where the audit of a service is; none: it decides nothing for anybody.
+    pub fn audit_of(writer: Writer) -> Option<Self> {
+        AUDITS.iter().find(|(of, _)| *of == writer).map(|(_, table)| *table)
+    }
+    /// Where the audit of the service of this name is.
+    pub fn audit_named(service: &str) -> Option<Self> {
+        AUDITS.iter().find(|(of, _)| of.as_str() == service).map(|(_, table)| *table)
+    }
+    /// Whether it is an audit, which only notes of items write.
+    pub fn is_audit(self) -> bool {
+        AUDITS.iter().any(|(_, table)| *table == self)
+    }
+    /// The services that have an audit, and where it is.
+    pub const fn audits() -> &'static [(Writer, Self)] {
+        AUDITS
     }
 }
 
@@ -332,6 +363,8 @@ pub struct Item {
     pub rows: Vec<RowChange>,
     /// Facts beside the rows.
     pub facts: Vec<Fact>,
+    /// What it leaves in the audit of its writer; none: nobody asked for it.
+    pub note: Option<Box<Note>>,
     /// A robot that must not have been heard meanwhile.
     pub silent: Option<Silent>,
 }
@@ -355,6 +388,7 @@ impl Item {
             request_id: None,
             rows: Vec::new(),
             facts: Vec::new(),
+            note: None,
             silent: None,
         }
     }
@@ -382,9 +416,14 @@ impl Item {
         self.rows.push(RowChange { key, expect: Expect::At(revision), write: Write::Delete, kind });
         self
     }
+    /// Leaves this in the audit.
+    pub fn audit(&mut self, note: Note) -> &mut Self {
+        self.note = Some(Box::new(note));
+        self
+    }
     /// Whether it would change anything.
     pub fn is_empty(&self) -> bool {
-        self.facts.is_empty() && self.rows.iter().all(|r| matches!(r.write, Write::Keep))
+        self.note.is_none() && self.facts.is_empty() && self.rows.iter().all(|r| matches!(r.write, Write::Keep))
     }
 }
 

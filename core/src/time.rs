@@ -76,6 +76,10 @@ impl Utc {
     pub const fn ms_since(self, earlier: Self) -> u64 {
         if self.0 > earlier.0 { (self.0 - earlier.0) as u64 } else { 0 }
     }
+    /// Reads RFC 3339 with its offset, to the millisecond; none: it is not of that form.
+    pub fn parse_rfc3339(text: &str) -> Option<Self> {
+        text.parse::<jiff::Timestamp>().ok().map(|t| Self(t.as_millisecond()))
+    }
     /// RFC 3339 text in UTC with milliseconds.
     pub fn rfc3339(self) -> String {
         jiff::Timestamp::from_millisecond(self.0).map_or_else(|_| self.0.to_string(), |t| format!("{t:.3}"))

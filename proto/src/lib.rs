@@ -40,7 +40,8 @@ packages! {
     /// `midshift.fleet.v1`: robots as the dispatcher sees them, places, areas, and why.
     #[expect(clippy::allow_attributes, reason = "generated code")]
     fleet "midshift.fleet.v1";
-    /// `midshift.identity.v1`: who is who.
+    /// `midshift.identity.v1`: who is who, and who did what.
+    #[expect(clippy::allow_attributes, reason = "generated code")]
     identity "midshift.identity.v1";
     /// `midshift.link.v1`: the robot's session.
     #[expect(clippy::allow_attributes, clippy::large_enum_variant, reason = "generated code")]

@@ -8,7 +8,7 @@ use anyhow::{Context, ensure};
 use midshift_core::once::CommandKey;
 use midshift_core::rows::{Entry, Index, Log, Record, Seq, Table};
 use midshift_core::work::{InboxEntry, Told};
-use midshift_core::{fleet, identity, lead, maintenance, policy, rollout, stop, task, update, work};
+use midshift_core::{audit, fleet, identity, lead, maintenance, policy, rollout, stop, task, update, work};
 use midshift_proto::link::v1::LaneBatch;
 use midshift_proto::parse;
 use midshift_proto::session;
@@ -150,6 +150,11 @@ records! {
     RobotIdentity identity::RobotIdentity;
     Authority identity::Authority;
     ServerCertificate identity::ServerCertificate;
+    TaskAudit audit::TaskAudit;
+    FleetAudit audit::FleetAudit;
+    OtaAudit audit::OtaAudit;
+    StopAudit audit::StopAudit;
+    IdentityAudit audit::IdentityAudit;
 }
 
 fn hold_as<R: Record>(shapes: &mut Shapes, id: &str, index: &Index, body: &str) -> anyhow::Result<()> {

@@ -11,6 +11,7 @@ const SPAWNS: &[(&str, &str)] = &[
     ("services/telemetry/src/link.rs", "one task a session: it must outlive the handler that opened it"),
     ("services/telemetry/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
     ("services/task/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
+    ("services/identity/src/audit/grpc.rs", "one task an export or verification, ended by its reader or by shutdown"),
     ("services/ota/src/rollouts/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
     ("services/stop/src/line.rs", "one task a robot's line: it must outlive the handler that opened it"),
     ("services/stop/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),

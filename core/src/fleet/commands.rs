@@ -5,10 +5,11 @@ pub use super::asked::Command;
 use super::rows::{Cordon, HolderState, Place, PlaceHolder, RobotControl};
 use super::view::View;
 use super::{Board, drain, heard, incidents};
+use crate::audit::{self, Note};
 use crate::ids::RobotId;
 use crate::reason::{Code, Kind, Reason, Refusal, Violations};
 use crate::robot::Presence;
-use crate::rows::Revision;
+use crate::rows::{Item, Record, Revision, Writer};
 
 /// Checks a command against what is known; an error changes nothing.
 pub fn check(
@@ -77,8 +78,43 @@ pub fn check(
     }
 }
 
+/// What a command leaves in the audit.
+pub fn note(view: &View, command: &Command) -> Note {
+    let of_robot = |action, robot_id: &RobotId| Note::new(action).about("robot", robot_id);
+    match command {
+        Command::Cordon { robot_id, reason } => of_robot("robot.cordon", robot_id).because(reason),
+        Command::Uncordon { robot_id } => of_robot("robot.uncordon", robot_id),
+        Command::Retire { robot_id, reason } => of_robot("robot.retire", robot_id).because(reason),
+        Command::Drain { robot_id, reason, within_ms } => {
+            of_robot("robot.drain", robot_id).because(reason).with("within_ms", within_ms)
+        }
+        Command::Undrain { robot_id } => of_robot("robot.undrain", robot_id),
+        Command::PutPolicy(policy) => {
+            Note::new("area.put_policy").about("area", &policy.area_id).with("policy", policy.body())
+        }
+        Command::ClearPlace { place_id, reason } => {
+            let note = Note::new("place.clear").about("place", place_id).because(reason);
+            let robots = view.places.get(place_id.as_str()).into_iter().flat_map(|place| &place.row.holders);
+            robots.fold(note, |note, holder| note.about("robot", &holder.robot_id))
+        }
+        Command::CloseIncident { incident_id, reason } => {
+            let note = Note::new("incident.close").about("incident", incident_id).because(reason);
+            let Some(incident) = view.incidents.get(incident_id).map(|i| &i.row) else { return note };
+            let note = incident.robot_id.iter().fold(note, |note, id| note.about("robot", id));
+            let note = incident.task_id.iter().fold(note, |note, id| note.about("task", id));
+            incident.area_id.iter().fold(note, |note, id| note.about("area", id))
+        }
+    }
+}
+
+/// What a command that was refused leaves in the audit, if anything.
+pub fn refusal(view: &View, command: &Command, actor: &str, request_id: Option<&str>, why: &Refusal) -> Option<Item> {
+    audit::refusal(Writer::Fleet, actor, request_id, note(view, command), why)
+}
+
 /// Carries out a command that passed its check.
 pub fn apply(tx: &mut Tx, command: &Command, actor: &str) {
+    tx.audit(note(tx.view, command));
     match command {
         Command::Cordon { robot_id, reason } => {
             let mut control = control(tx, robot_id);

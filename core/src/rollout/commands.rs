@@ -5,19 +5,21 @@
 
 use super::dry_run::{bundle, dry_run};
 use super::matching::{self, Members, keeps};
+use super::noted::{note, note_of_verb};
 use super::rows::{
     Act, Bundle, Counted, Outcome, Pause, Phase, Quarantine, RobotSoftware, Rollout, RolloutRobot, Step, Verdict,
 };
 use super::spec::{RolloutSpec, Wave};
 use super::view::View;
 use super::{Board, Plan, Tx, assign, moves, objects, phases, robots, verdict};
+use crate::audit::{self, Note};
 use crate::gates::FailureEvidence;
 use crate::identity::Caller;
 use crate::ids::{BundleId, RobotId, RolloutId};
 use crate::limits;
 use crate::once;
 use crate::reason::{Code, Kind, Reason, Refusal, Violations};
-use crate::rows::{Revision, Table};
+use crate::rows::{Revision, Table, Writer};
 use crate::time::{Now, Utc};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
@@ -142,7 +144,8 @@ pub enum Taken {
     Before(Utc),
 }
 
-/// Decides on a request whole: what was carried out before, under its request_id or by what is known, is not carried out again.
+/// Decides on a request whole: what was carried out before, under its request_id or by what is known, is not carried out again. What is refused may leave
+/// an item too, for the audit alone.
 ///
 /// # Errors
 /// Why not; whoever asks may not; a request_id that was used for something else.
@@ -155,7 +158,14 @@ pub fn take(view: &mut View, board: &Board, now: Now, ask: &Ask, plan: &mut Plan
     {
         return Ok(Taken::Before(at));
     }
-    let is_done = check(view, board, command, *seen)?;
+    let is_done = match check(view, board, command, *seen) {
+        Err(refusal) if *check_only == CheckOnly::No => {
+            let item = audit::refusal(Writer::Ota, actor, request_id.as_deref(), note(command), &refusal);
+            plan.items.extend(item);
+            return Err(refusal);
+        }
+        checked => checked?,
+    };
     if *check_only == CheckOnly::Yes {
         return Ok(Taken::Now);
     }
@@ -164,6 +174,7 @@ pub fn take(view: &mut View, board: &Board, now: Now, ask: &Ask, plan: &mut Plan
         None => apply(view, board, now, command, actor, plan),
         Some(id) => {
             let mut tx = Tx::new(view, now, actor).on_request(Some(id));
+            tx.audit(note(command));
             if !is_done {
                 apply_one(&mut tx, board, command, actor);
             }
@@ -349,7 +360,10 @@ pub fn apply(view: &mut View, board: &Board, now: Now, command: &Command, actor:
         Command::Do { rollout_id, verb: Verb::RetryFailed, reason } => {
             retry_failed(view, now, rollout_id, actor, reason, plan);
         }
-        command => plan.decide(view, now, actor, |tx| apply_one(tx, board, command, actor)),
+        command => plan.decide(view, now, actor, |tx| {
+            tx.audit(note(command));
+            apply_one(tx, board, command, actor);
+        }),
     }
 }
 
@@ -477,6 +491,8 @@ fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bo
         for other in &others {
             plan.decide(view, now, actor, |tx| {
                 let Some(old) = tx.view.rollout(other).cloned() else { return };
+                let ended = Note::new("rollout.abort").about("rollout", other).with("superseded_by", id);
+                tx.audit(ended);
                 let reason = Reason::from(Code::SupersededBy).with("rollout_id", id);
                 let old = Rollout { superseded_by: Some(id.clone()), ..old };
                 if old.phase.goes_back() {
@@ -502,6 +518,8 @@ fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bo
             ..rollout.clone()
         };
         tx.put(row, "rollout.started");
+        let supersede = Verb::Start { supersede };
+        tx.audit(note_of_verb(id, &supersede, ""));
         assign::add(tx, &rollout, first);
     });
     for slice in slices {
@@ -513,8 +531,11 @@ fn retry_failed(view: &mut View, now: Now, id: &RolloutId, actor: &str, reason: 
     let Some(rollout) = view.rollout(id).cloned() else { return };
     let wave = rollout.spec.waves.len() as u32 + 1;
     let robots: Vec<RolloutRobot> = view.robots_of(id).filter(|r| is_to_retry(r)).cloned().collect();
-    for slice in robots.chunks(limits::ITEM_ROWS_MAX / 4) {
+    for (nth, slice) in robots.chunks(limits::ITEM_ROWS_MAX / 4).enumerate() {
         plan.decide(view, now, actor, |tx| {
+            if nth == 0 {
+                tx.audit(note_of_verb(id, &Verb::RetryFailed, reason));
+            }
             for r in slice {
                 let key = Quarantine::id_of(&r.robot_id, &rollout.spec.bundle);
                 tx.delete::<Quarantine>(&key, "quarantine.lifted");

@@ -18,6 +18,7 @@ pub mod matching;
 pub mod moves;
 pub mod named;
 pub mod newcomers;
+mod noted;
 pub mod objects;
 pub mod phases;
 pub mod robots;

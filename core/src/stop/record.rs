@@ -1,6 +1,8 @@
 //! The copy of a stop that services read: written by what follows the stop service, which itself never sees the store.
 
 use super::latch::{Latch, Reset, Stop};
+use super::scope::Scope;
+use crate::audit::Note;
 use crate::ids::StopId;
 use crate::rows::{Expect, Index, Item, Record, Revision, Table, Writer};
 use serde::{Deserialize, Serialize};
@@ -39,7 +41,11 @@ pub fn copy(latch: &Latch, copied: &BTreeMap<StopId, (StopRecord, Revision)>) ->
     for stop in latch.stops() {
         let record = StopRecord { stop: stop.clone(), reset: latch.reset_of(&stop.stop_id).cloned() };
         match copied.get(&stop.stop_id) {
-            None => items.push(write(&record, Expect::Absent)),
+            // Engaged by one and reset by another in between: each leaves its own row in the audit.
+            None => {
+                items.push(write(&StopRecord { reset: None, ..record.clone() }, Expect::Absent));
+                items.extend(record.reset.is_some().then(|| write(&record, Expect::At(Revision(1)))));
+            }
             Some((known, revision)) if *known != record => items.push(write(&record, Expect::At(*revision))),
             Some(_) => {}
         }
@@ -63,18 +69,31 @@ pub fn copy(latch: &Latch, copied: &BTreeMap<StopId, (StopRecord, Revision)>) ->
 }
 
 fn write(record: &StopRecord, expect: Expect) -> Item {
-    let (actor, fact) = match &record.reset {
-        Some(reset) => (&reset.actor, "stop.reset"),
-        None => (&record.stop.actor, "stop.engaged"),
+    let stop = &record.stop;
+    let (actor, fact, note) = match &record.reset {
+        Some(reset) => {
+            (&reset.actor, "stop.reset", Note::new("stop.reset").because(&reset.reason).with("at_unix_ms", reset.at.0))
+        }
+        None => {
+            let level = format!("{:?}", stop.level);
+            let note = Note::new("stop.engage").because(&stop.reason).with("level", level).with("scope", &stop.scope);
+            (&stop.actor, "stop.engaged", note.with("at_unix_ms", stop.engaged.0))
+        }
+    };
+    let note = note.about("stop", &stop.stop_id);
+    let note = match &stop.scope {
+        Scope::Robot(id) => note.about("robot", id),
+        Scope::Zone(id) => note.about("place", id),
+        Scope::Area(id) => note.about("area", id),
+        Scope::Fleet => note,
     };
     let mut item = Item::new(Writer::Stop, actor);
-    item.put(record, expect, fact);
+    item.put(record, expect, fact).audit(note);
     item
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::scope::Scope;
     use super::*;
     use crate::robot::StopLevel;
     use crate::time::Utc;
@@ -129,10 +148,13 @@ mod tests {
     #[test]
     fn what_is_engaged_and_reset_is_copied_once_with_who_did_it() {
         let known = latch(&["S1", "S2"], &["S2"]);
-        let told =
-            [("S1".to_owned(), "anna".to_owned(), Some(true)), ("S2".to_owned(), "bert".to_owned(), Some(false))];
-        assert_eq!(said(&copy(&known, &BTreeMap::new())), told);
-        assert_eq!(said(&copy(&known, &copied(&[("S1", false), ("S2", false)]))), told[1..]);
+        let told = [("S1", "anna", true), ("S2", "anna", true), ("S2", "bert", false)];
+        let told = told.map(|(name, actor, effective)| (name.to_owned(), actor.to_owned(), Some(effective)));
+        let items = copy(&known, &BTreeMap::new());
+        assert_eq!(said(&items), told);
+        let actions: Vec<_> = items.iter().filter_map(|item| Some(item.note.as_ref()?.action)).collect();
+        assert_eq!(actions, ["stop.engage", "stop.engage", "stop.reset"], "each in the audit, by whoever it was");
+        assert_eq!(said(&copy(&known, &copied(&[("S1", false), ("S2", false)]))), told[2..]);
         assert_eq!(said(&copy(&known, &copied(&[("S1", false), ("S2", true)]))), []);
     }
 

@@ -2,6 +2,7 @@
 
 use super::machine::{Phase, Then};
 use super::spec::TaskSpec;
+use crate::audit::Note;
 use crate::authority::Authority;
 use crate::ids::{AttemptId, RobotId, Subject, TaskId, WaypointId};
 use crate::reason::Reason;
@@ -318,6 +319,27 @@ pub enum Ask {
         /// These robots.
         robot_ids: Vec<RobotId>,
     },
+}
+
+impl Ask {
+    /// What it leaves in the audit.
+    pub fn note(&self) -> Note {
+        match self {
+            Self::Cancel { task_id, force } => Note::new("task.cancel").about("task", task_id).with("force", force),
+            Self::Resolve { task_id, resolution } => {
+                let word = serde_json::to_value(resolution).unwrap_or_default();
+                let word = word.as_str().map_or_else(|| format!("{resolution:?}"), str::to_owned);
+                Note::new("task.resolve").about("task", task_id).with("resolution", word)
+            }
+            Self::ResumeHeld { stop_id, area_id, task_ids, robot_ids } => {
+                let note = Note::new("task.resume");
+                let note = stop_id.iter().fold(note, |note, id| note.about("stop", id));
+                let note = area_id.iter().fold(note, |note, id| note.about("area", id));
+                let note = task_ids.iter().fold(note, |note, id| note.about("task", id));
+                robot_ids.iter().fold(note, |note, id| note.about("robot", id))
+            }
+        }
+    }
 }
 
 /// One such request: append-only, consumed by fleet in order.

@@ -322,6 +322,10 @@ impl Loop {
                     let is_repeat = matches!(repeat, Ok(true));
                     let check = || commands::check(&self.view, &self.board, &now, &command, seen);
                     let checked = repeat.and_then(|known| if known { Ok(()) } else { check() });
+                    if let (Err(refusal), false) = (&checked, validate_only) {
+                        let request_id = request_id.as_deref();
+                        plan.items.extend(commands::refusal(&self.view, &command, &actor, request_id, refusal));
+                    }
                     if checked.is_err() || validate_only {
                         drop(reply.send(checked));
                         continue;

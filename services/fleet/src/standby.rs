@@ -81,7 +81,11 @@ impl Loop {
             let item = match self.decide(asked) {
                 Ok(Some(item)) => item,
                 Ok(None) => return Ok(Ok(())),
-                Err(refusal) => return Ok(Err(refusal)),
+                Err(refusal) => {
+                    // Whoever asked hears why, whether or not that can be written down.
+                    drop(self.parts.store.commit(self.refused(asked, &refusal)).await);
+                    return Ok(Err(refusal));
+                }
             };
             let keys = picture::touched(std::slice::from_ref(&item));
             match self.parts.store.commit(vec![item]).await.pop() {
@@ -97,6 +101,13 @@ impl Loop {
             }
         }
         Ok(Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile)))
+    }
+
+    /// What a refusal leaves in the audit.
+    fn refused(&self, asked: &Asked<'_>, refusal: &Refusal) -> Vec<Item> {
+        let Asked { command, validate_only, by, request_id, .. } = asked;
+        let item = commands::refusal(&self.view, command, &by.to_string(), *request_id, refusal);
+        item.into_iter().filter(|_| !validate_only).collect()
     }
 
     /// What has to be written; none: nothing has.

@@ -1,9 +1,10 @@
 //! The two faces: decode, decide, encode.
 
 use crate::authority::{Authority, Signed, asked};
-use crate::register::written;
+use crate::register::{decided, written};
 use crate::tokens::{self, Wanted};
 use crate::{Error, IdentityService, encode};
+use midshift_core::audit::Note;
 use midshift_core::identity::{Caller, Replace, RobotIdentity, Secret, TokenId, Who};
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
@@ -79,11 +80,20 @@ impl IdentityService {
         let robot_id = robot_of(&r.robot_id)?;
         let pin = self.authority()?.pin();
         let (secret, now) = (tokens::draw(), self.now());
-        let replace = if r.replace { Replace::Yes } else { Replace::No };
+        let (replace, offer) = if r.replace { (Replace::Yes, "robot.replace") } else { (Replace::No, "robot.enroll") };
         let offered = self.0.register.decide(|view| {
             let (mut robot, at) = known(view.robots.get(&robot_id), &robot_id);
             robot.offer(secret.id().clone(), tokens::digest(&secret), replace, now)?;
-            Ok((Some(written(&robot, at, &actor.to_string(), "robot.enrolment_offered")), robot))
+            Ok((
+                Some(decided(
+                    &robot,
+                    at,
+                    &actor.to_string(),
+                    "robot.enrolment_offered",
+                    Note::new(offer).about("robot", &robot_id),
+                )),
+                robot,
+            ))
         });
         let robot = offered.await?;
         let expires = robot.enrolment.map_or(now, |open| Utc(open.expires_unix_ms));
@@ -102,7 +112,16 @@ impl IdentityService {
             }
             let mut robot = robot.clone();
             robot.revoke(&actor.to_string(), now);
-            Ok((Some(written(&robot, Some(*at), &actor.to_string(), "robot.revoked")), robot))
+            Ok((
+                Some(decided(
+                    &robot,
+                    Some(*at),
+                    &actor.to_string(),
+                    "robot.revoked",
+                    Note::new("robot.revoke").about("robot", &robot_id),
+                )),
+                robot,
+            ))
         });
         Ok(v1::RevokeRobotResponse { robot: Some(encode::robot(&revoked.await?)) })
     }
@@ -139,7 +158,16 @@ impl IdentityService {
                 let (mut robot, at) = known(view.robots.get(&robot_id), &robot_id);
                 robot.enrol(secret.id(), &digest, key, now)?;
                 robot.renew(&key, expires)?;
-                Ok((Some(written(&robot, at, &format!("robot:{robot_id}"), "robot.enrolled")), ()))
+                Ok((
+                    Some(decided(
+                        &robot,
+                        at,
+                        &format!("robot:{robot_id}"),
+                        "robot.enrolled",
+                        Note::new("robot.enrolled").about("robot", &robot_id).with("key", key),
+                    )),
+                    (),
+                ))
             })
             .await?;
         let Signed { chain_pem, expires } = authority.sign_robot(asked, &robot_id, now).map_err(|e| hidden(&e))?;

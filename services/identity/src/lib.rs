@@ -3,6 +3,7 @@
 //! Invariant: no secret leaves this crate but once, in the answer to whoever it was made for; what is stored of it is a digest. One process of a site has the
 //! authority's key and answers for it; each process has this crate's picture of who is known, and a key of its own.
 
+pub mod audit;
 mod authority;
 mod encode;
 mod files;

@@ -2,6 +2,7 @@
 //!
 //! Invariant: a decision is told to the ports of this process before its answer leaves; other processes hear of it with the store's wake.
 
+use midshift_core::audit::Note;
 use midshift_core::identity::{Authority, Directory, RobotIdentity, ServerCertificate, TokenId, TokenRecord};
 use midshift_core::ids::RobotId;
 use midshift_core::reason::{Code, Kind, Refusal};
@@ -150,6 +151,13 @@ impl Register {
 pub fn written<R: Record>(record: &R, at: Option<Revision>, actor: &str, kind: &'static str) -> Item {
     let mut item = Item::new(Writer::Identity, actor);
     item.put(record, at.map_or(Expect::Absent, Expect::At), kind);
+    item
+}
+
+/// The same as somebody's decision, with what it leaves in the audit.
+pub fn decided<R: Record>(record: &R, at: Option<Revision>, actor: &str, kind: &'static str, note: Note) -> Item {
+    let mut item = written(record, at, actor, kind);
+    item.audit(note);
     item
 }
 

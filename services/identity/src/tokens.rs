@@ -1,6 +1,7 @@
 //! Tokens of people and programs: made, listed, taken back.
 
-use crate::register::{Register, View, written};
+use crate::register::{Register, View, decided};
+use midshift_core::audit::Note;
 use midshift_core::identity::{Act, Digest, Grant, Permission, Role, Scope, Secret, TokenId, TokenRecord};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
@@ -87,12 +88,21 @@ fn everything() -> Wanted {
     Wanted { name: FIRST.to_owned(), grants: roles.map(site).into(), valid: limits::TOKEN_VALID_MAX }
 }
 
+fn note(action: &'static str, token: &TokenRecord) -> Note {
+    Note::new(action).about("token", &token.token_id).with("name", &token.name)
+}
+
+fn made_note(token: &TokenRecord) -> Note {
+    let grants: Vec<String> = token.grants.iter().map(ToString::to_string).collect();
+    note("token.create", token).with("grants", grants.join(" "))
+}
+
 /// The first token of a site; none if there ever was one.
 pub async fn first(register: &Register, now: Utc) -> Result<Option<Secret>, Refusal> {
     let secret = draw();
     let record = everything().record(&secret, "midshift", now);
     let made = register.decide(|view| match view.tokens.is_empty() {
-        true => Ok((Some(written(&record, None, "midshift", "token.created")), true)),
+        true => Ok((Some(decided(&record, None, "midshift", "token.created", made_note(&record))), true)),
         false => Ok((None, false)),
     });
     Ok(made.await?.then_some(secret))
@@ -102,7 +112,9 @@ pub async fn first(register: &Register, now: Utc) -> Result<Option<Secret>, Refu
 pub async fn spare(register: &Register, now: Utc) -> Result<Secret, Refusal> {
     let secret = draw();
     let record = everything().record(&secret, "midshift", now);
-    register.decide(|_| Ok((Some(written(&record, None, "midshift", "token.created")), ()))).await?;
+    register
+        .decide(|_| Ok((Some(decided(&record, None, "midshift", "token.created", made_note(&record))), ())))
+        .await?;
     Ok(secret)
 }
 
@@ -122,7 +134,7 @@ pub async fn create(
                 let text = format!("the site has {live} tokens that were not revoked: revoke those that nobody uses");
                 return Err(Refusal::new(Kind::Exhausted, Reason::new(Code::Overloaded, text)));
             }
-            Ok((Some(written(&record, None, actor, "token.created")), ()))
+            Ok((Some(decided(&record, None, actor, "token.created", made_note(&record))), ()))
         })
         .await?;
     Ok((record, secret))
@@ -144,7 +156,7 @@ pub async fn revoke(register: &Register, token_id: &TokenId, actor: &str, now: U
             }
             let revoked = Some(Act { actor: actor.to_owned(), at_unix_ms: now.0 });
             let token = TokenRecord { revoked, ..token.clone() };
-            Ok((Some(written(&token, Some(*at), actor, "token.revoked")), token))
+            Ok((Some(decided(&token, Some(*at), actor, "token.revoked", note("token.revoke", &token))), token))
         })
         .await
 }

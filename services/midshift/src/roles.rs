@@ -25,7 +25,7 @@ impl Role {
     /// gRPC services of this role, as health names them.
     pub const fn services(self) -> &'static [&'static str] {
         match self {
-            Self::Task => &["midshift.task.v1.TaskService"],
+            Self::Task => &["midshift.task.v1.TaskService", "midshift.identity.v1.AuditService"],
             Self::Fleet => &["midshift.fleet.v1.FleetService"],
             Self::Telemetry => &[
                 "midshift.telemetry.v1.TelemetryService",

@@ -20,6 +20,7 @@ use midshift_core::work::Live;
 use midshift_edge::Listen;
 use midshift_fleet::{FleetService, Reconciler};
 use midshift_identity::IdentityService;
+use midshift_identity::audit::AuditService;
 use midshift_ota::rollouts::{Planner, RolloutService};
 use midshift_ota::{OtaReader, OtaService};
 use midshift_proto::sim::v1::sim_service_server::SimServiceServer;
@@ -191,7 +192,10 @@ impl Server {
             .add_service(reflection().build_v1()?)
             .add_service(reflection().build_v1alpha()?);
         if let Some(task) = &self.task {
-            routes.add_service(task.grpc().max_decoding_message_size(control));
+            let audit = AuditService::new(self.parts.store.clone(), self.parts.clock.clone(), self.shutdown.clone());
+            routes
+                .add_service(task.grpc().max_decoding_message_size(control))
+                .add_service(audit.grpc().max_decoding_message_size(control));
         }
         if let Some((fleet, _)) = &self.fleet {
             routes.add_service(fleet.grpc().max_decoding_message_size(control));

@@ -1,4 +1,4 @@
-//! What every process takes care of now and then: old rows, entries and frames of its roles, and samples of histograms.
+//! What every process takes care of now and then: old rows, entries and frames of its roles, the chains of the audit, and samples of histograms.
 //!
 //! Called by [`crate::server`]. Invariant: nothing goes that a service has not consumed.
 
@@ -8,7 +8,9 @@ use metrics_exporter_prometheus::PrometheusHandle;
 use midshift_core::fleet::rows::FleetMark;
 use midshift_core::limits;
 use midshift_core::rollout::rows::OtaMark;
+use midshift_core::rows::Writer;
 use midshift_core::time::Clock;
+use midshift_identity::audit::upkeep as audit;
 use midshift_store::{Retention, Store};
 use midshift_task::TaskService;
 use std::time::Duration;
@@ -22,7 +24,7 @@ const ENTRIES_MAX: u64 = 20_000_000;
 
 /// Until it is dropped.
 pub async fn run(parts: &Parts, task: Option<TaskService>) {
-    tokio::join!(prune(parts, task), fold(metrics_handle()));
+    tokio::join!(prune(parts, task), fold(metrics_handle()), keep_audit(parts));
 }
 
 /// Folds samples of histograms, whether or not anybody scrapes.
@@ -58,6 +60,26 @@ async fn prune(parts: &Parts, task: Option<TaskService>) {
         {
             tracing::warn!(%error, "old status could not be taken away");
         }
+    }
+}
+
+/// Lets the chains of this process' services quote the others each hour, and end where they are old.
+async fn keep_audit(parts: &Parts) {
+    let of_roles = [
+        (Role::Task, Writer::Task),
+        (Role::Fleet, Writer::Fleet),
+        (Role::Ota, Writer::Ota),
+        (Role::Identity, Writer::Identity),
+    ];
+    let of_roles = of_roles.into_iter().filter(|(role, _)| parts.roles.has(*role)).map(|(_, writer)| writer);
+    let writers: Vec<Writer> = of_roles.chain(parts.stops.is_some().then_some(Writer::Stop)).collect();
+    loop {
+        for writer in &writers {
+            if let Err(error) = audit::keep(parts.store.as_ref(), parts.clock.as_ref(), *writer).await {
+                tracing::warn!(%error, chain = writer.as_str(), "a chain of the audit was not looked after");
+            }
+        }
+        tokio::time::sleep(PRUNE_EVERY).await;
     }
 }
 

@@ -42,6 +42,14 @@ CREATE TABLE attempt (
     UNIQUE (site_id, id)
 );
 
+CREATE TABLE audit_head (
+    site_id TEXT NOT NULL,
+    chain TEXT NOT NULL,
+    n BIGINT NOT NULL,
+    hash TEXT NOT NULL,
+    UNIQUE (site_id, chain)
+);
+
 CREATE TABLE bundle (
     site_id TEXT NOT NULL,
     id TEXT NOT NULL,
@@ -130,6 +138,17 @@ CREATE TABLE drain_request (
     UNIQUE (site_id, id)
 );
 
+CREATE TABLE fleet_audit (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE TABLE fleet_event (
     site_id TEXT NOT NULL,
     seq BIGINT NOT NULL,
@@ -207,6 +226,17 @@ CREATE TABLE log_mark (
     log TEXT NOT NULL,
     pruned_seq BIGINT NOT NULL,
     UNIQUE (site_id, log)
+);
+
+CREATE TABLE ota_audit (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
 );
 
 CREATE TABLE ota_clock (
@@ -448,6 +478,17 @@ CREATE TABLE site (
     UNIQUE (site_id, id)
 );
 
+CREATE TABLE stop_audit (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE TABLE stop_event (
     site_id TEXT NOT NULL,
     seq BIGINT NOT NULL,
@@ -481,6 +522,17 @@ CREATE TABLE store_head (
     store_id TEXT NOT NULL,
     seq BIGINT NOT NULL,
     UNIQUE (site_id)
+);
+
+CREATE TABLE task_audit (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
 );
 
 CREATE TABLE task_event (
@@ -567,11 +619,15 @@ CREATE INDEX attempt_by_state ON attempt (site_id, state, ord, id);
 
 CREATE INDEX bundle_by_ord ON bundle (site_id, ord, id);
 
+CREATE INDEX fleet_audit_by_ord ON fleet_audit (site_id, ord, id);
+
 CREATE INDEX fleet_event_by_subject ON fleet_event (site_id, subject, seq);
 
 CREATE INDEX incident_by_ord ON incident (site_id, ord, id);
 
 CREATE INDEX incident_by_state ON incident (site_id, state, ord, id);
+
+CREATE INDEX ota_audit_by_ord ON ota_audit (site_id, ord, id);
 
 CREATE INDEX ota_event_by_subject ON ota_event (site_id, subject, seq);
 
@@ -585,7 +641,11 @@ CREATE INDEX rollout_by_ord ON rollout (site_id, ord, id);
 
 CREATE INDEX rollout_robot_by_parent ON rollout_robot (site_id, parent, ord, id);
 
+CREATE INDEX stop_audit_by_ord ON stop_audit (site_id, ord, id);
+
 CREATE INDEX stop_event_by_subject ON stop_event (site_id, subject, seq);
+
+CREATE INDEX task_audit_by_ord ON task_audit (site_id, ord, id);
 
 CREATE INDEX task_event_by_subject ON task_event (site_id, subject, seq);
 

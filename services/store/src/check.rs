@@ -3,8 +3,9 @@
 //! Invariant: nothing here depends on the engine, so that all engines refuse the same items for the same reason.
 
 use crate::{Applied, CommitError, ID_BYTES_MAX};
+use midshift_core::audit::{By, Draft};
 use midshift_core::limits;
-use midshift_core::rows::{Entry, Expect, Fact, Index, Item, Key, Log, Revision, Row, RowChange, Seq, Write};
+use midshift_core::rows::{Entry, Expect, Fact, Index, Item, Key, Log, Revision, Row, RowChange, Seq, Table, Write};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
@@ -15,7 +16,7 @@ pub(crate) fn item_bytes(item: &Item) -> usize {
         body + r.key.id.len()
     });
     let facts = item.facts.iter().map(|f| f.body.len() + f.subject.len());
-    rows.chain(facts).sum()
+    rows.chain(facts).sum::<usize>() + item.note.as_ref().map_or(0, |note| note.bytes())
 }
 
 /// What can be said of an item without looking at any row.
@@ -33,6 +34,9 @@ fn form(item: &Item) -> Result<(), CommitError> {
             return Err(CommitError::DuplicateKey { key: change.key.clone() });
         }
         may_change(item, change)?;
+    }
+    if item.note.is_some() && Table::audit_of(item.writer).is_none() {
+        return Err(CommitError::NotTheWriter { writer: item.writer, owned: "an audit" });
     }
     item.facts.iter().try_for_each(|fact| may_state(item, fact))
 }
@@ -59,6 +63,10 @@ fn texts(item: &Item) -> Result<(), CommitError> {
 
 fn may_change(item: &Item, change: &RowChange) -> Result<(), CommitError> {
     let table = change.key.table;
+    if table.is_audit() {
+        // Rows of an audit come from notes alone.
+        return Err(CommitError::NotTheWriter { writer: item.writer, owned: table.name() });
+    }
     let owner = match (&change.write, change.expect) {
         (Write::Keep, _) => return Ok(()),
         (Write::Put { .. }, Expect::Absent) => table.born_by(),
@@ -93,6 +101,8 @@ pub(crate) struct Decided {
     pub(crate) rows: Vec<After>,
     /// Its entries, numbered from the head given.
     pub(crate) entries: Vec<Entry>,
+    /// What it leaves in the audit.
+    pub(crate) audited: Option<Draft>,
     /// The answer.
     pub(crate) applied: Applied,
 }
@@ -106,9 +116,11 @@ pub(crate) fn decide(
 ) -> Result<Decided, CommitError> {
     form(&item)?;
     expectations(&item, found)?;
-    let Item { writer, actor, request_id, rows, facts, silent: _ } = item;
-    let mut decided =
-        Decided { rows: Vec::new(), entries: Vec::new(), applied: Applied { seq: head, revisions: Vec::new() } };
+    let Item { writer, actor, request_id, rows, facts, note, silent: _ } = item;
+    let by = || By { actor: actor.clone(), request_id: request_id.clone(), at_unix_ms };
+    let audited = note.map(|note| Draft { writer, note, by: by() });
+    let applied = Applied { seq: head, revisions: Vec::new() };
+    let mut decided = Decided { rows: Vec::new(), entries: Vec::new(), audited, applied };
     let entry = |seq: &mut Seq, log, subject, kind: &str, body| {
         *seq = Seq(seq.0 + 1);
         Entry {

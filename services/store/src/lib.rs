@@ -6,6 +6,7 @@
 //!
 //! What is volatile (heartbeats, poses) is on the [`LiveBoard`], which several processes share through the [`HeardLog`]; what is bulky (samples) is in the [`FrameLog`]; neither is a row.
 
+mod audit;
 mod board;
 mod check;
 mod frames;
@@ -38,9 +39,11 @@ pub use projection::{Change, Fold, Projection};
 pub use sqlite::{Database, Described, SqliteFrames, SqliteStore, migrate, renew_identity};
 
 use async_trait::async_trait;
+use midshift_core::audit::Head;
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::limits;
 use midshift_core::rows::{BadRow, Entry, Item, Key, Log, Record, Revision, Row, Seq, Table, Writer};
+use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::Arc;
 use tokio::sync::watch;
@@ -290,6 +293,8 @@ pub trait Store: Send + Sync + 'static {
     /// Makes the next number higher than `at_least`: someone has seen a number that this store never gave (it was restored
     /// from an old backup). Returns the head; a number above [`SEQ_PLAUSIBLE_MAX`] is refused.
     async fn raise_head(&self, at_least: Seq) -> Result<Seq, Error>;
+    /// The newest row of each chain of the audit that has rows, as it was noted when that row was written.
+    async fn audit_heads(&self) -> Result<BTreeMap<Writer, Head>, Error>;
     /// Takes old entries out of the logs, in small slices that let commits pass. Returns how many went.
     async fn prune(&self, keep: Retention) -> Result<u64, Error>;
 }

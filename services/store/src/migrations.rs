@@ -98,6 +98,17 @@ pub(crate) const CONTROL: &[Migration] = migrations!["control":
     "0076_identity_event",
     "0077_identity_event_by_subject",
     "0078_token_by_ord",
+    "0079_audit_head",
+    "0080_task_audit",
+    "0081_fleet_audit",
+    "0082_ota_audit",
+    "0083_stop_audit",
+    "0084_task_audit_by_ord",
+    "0085_fleet_audit_by_ord",
+    "0086_ota_audit_by_ord",
+    "0087_stop_audit_by_ord",
+    "0088_identity_audit",
+    "0089_identity_audit_by_ord",
 ];
 
 /// Of `telemetry.db`.

@@ -4,6 +4,7 @@
 //! Invariant: synchronous and deterministic: no task, no file, no randomness; same calls, same clock readings, same answers.
 //! Nothing survives the process.
 
+use crate::audit::{Growth, Heads};
 use crate::check::{After, decide, log_index};
 use crate::model_table::Rows;
 use crate::{
@@ -11,8 +12,9 @@ use crate::{
     Store, StoreId,
 };
 use async_trait::async_trait;
+use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Entry, Item, Key, Log, Row, Seq, Table};
+use midshift_core::rows::{Entry, Item, Key, Log, Row, Seq, Table, Writer};
 use midshift_core::time::Clock;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -36,6 +38,8 @@ struct State {
     head: Seq,
     tables: BTreeMap<Table, Rows>,
     logs: [Kept; Log::ALL.len()],
+    chains: Heads,
+    growth: Growth,
 }
 
 /// What is left of one log.
@@ -62,7 +66,8 @@ impl MemoryStore {
     /// An empty store whose numbers start at the clock's wall time now.
     pub fn new(site_id: SiteId, id: StoreId, clock: Arc<dyn Clock>) -> Self {
         let head = Seq(clock.now().wall.0.max(0).cast_unsigned());
-        let state = State { head, tables: BTreeMap::new(), logs: Default::default() };
+        let (tables, logs, chains, growth) = (BTreeMap::new(), Default::default(), Heads::new(), Growth::default());
+        let state = State { head, tables, logs, chains, growth };
         let wake = watch::Sender::new(head);
         Self { id, site_id, clock, log_entries_max: LOG_ENTRIES_DEFAULT, shared: false, state: Mutex::new(state), wake }
     }
@@ -103,7 +108,24 @@ impl State {
             }
         }
         self.head = decided.applied.seq;
+        if let Some(draft) = decided.audited {
+            self.growth.take(draft);
+        }
         Ok(decided.applied)
+    }
+
+    /// After the last item of a call: the rows of the audit.
+    fn seal(&mut self) {
+        if self.growth.is_empty() {
+            return;
+        }
+        let grown = std::mem::take(&mut self.growth).grow(&mut self.chains);
+        for row in grown.rows {
+            self.tables.entry(row.key.table).or_default().put(row);
+        }
+        for (table, up_to) in grown.cuts {
+            self.tables.entry(table).or_default().delete_up_to(up_to.cast_signed());
+        }
     }
 
     fn row(&self, key: &Key) -> Option<&Row> {
@@ -147,6 +169,7 @@ impl Store for MemoryStore {
         let mut state = self.state();
         let before = state.head;
         let results = items.into_iter().map(|item| state.apply(item, at_unix_ms, self.log_entries_max)).collect();
+        state.seal();
         if state.head > before {
             self.wake.send_replace(state.head);
         }
@@ -195,6 +218,10 @@ impl Store for MemoryStore {
             self.wake.send_replace(state.head);
         }
         Ok(state.head)
+    }
+
+    async fn audit_heads(&self) -> Result<BTreeMap<Writer, Head>, Error> {
+        Ok(self.state().chains.clone())
     }
 
     async fn prune(&self, keep: Retention) -> Result<u64, Error> {

@@ -50,6 +50,14 @@ impl Rows {
         }
     }
 
+    /// Takes rows out from the lowest order on.
+    pub(crate) fn delete_up_to(&mut self, order: i64) {
+        while let Some(place) = self.by_order.first().filter(|place| place.order <= order) {
+            let id = place.id.clone();
+            self.delete(&id);
+        }
+    }
+
     fn unlink(&mut self, place: &Cursor, index: &Index) {
         self.by_order.remove(place);
         if let Some(parent) = &index.parent {

@@ -33,6 +33,10 @@ pub(crate) const RENEW: &str = "UPDATE store_head SET store_id = $1";
 pub(crate) const LOG_MARKS: &str = "SELECT log, pruned_seq FROM log_mark WHERE site_id = $1";
 pub(crate) const MARK_LOG: &str = "INSERT INTO log_mark (site_id, log, pruned_seq) VALUES ($1, $2, $3) \
      ON CONFLICT (site_id, log) DO UPDATE SET pruned_seq = excluded.pruned_seq";
+/// Where each chain of the audit stands, as it was noted with its newest row.
+pub(crate) const AUDIT_HEADS: &str = "SELECT chain, n, hash, NULL AS body FROM audit_head WHERE site_id = $1";
+pub(crate) const MOVE_AUDIT_HEAD: &str = "INSERT INTO audit_head (site_id, chain, n, hash) VALUES ($1, $2, $3, $4) \
+     ON CONFLICT (site_id, chain) DO UPDATE SET n = excluded.n, hash = excluded.hash";
 pub(crate) const FRAME_SIZES: &str =
     "SELECT position, size FROM frame_log WHERE site_id = $1 AND position > $2 ORDER BY position LIMIT $3";
 pub(crate) const FRAME_BODIES: &str = "SELECT position, at_unix_ms, body FROM frame_log \
@@ -64,6 +68,11 @@ pub(crate) fn oldest(log: Log) -> String {
 /// Takes a log's entries up to `$2` out.
 pub(crate) fn prune(log: Log) -> String {
     format!("DELETE FROM {} WHERE site_id = $1 AND seq <= $2", log.name())
+}
+
+/// Takes a chain's rows up to number `$2` out.
+pub(crate) fn cut(table: Table) -> String {
+    format!("DELETE FROM {} WHERE site_id = $1 AND ord <= $2", table.name())
 }
 
 /// One page of a table, of one state or of any. Binds in order: site, then what is asked of parent, `state`, cursor (order, id), and

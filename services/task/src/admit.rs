@@ -5,6 +5,7 @@
 
 use crate::TaskService;
 use crate::rows::{TaskRows, are_seen, read, unavailable};
+use midshift_core::audit::Note;
 use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{RequestId, TaskId};
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violation};
@@ -154,7 +155,8 @@ impl TaskService {
             };
             item.create(&key, "request.used");
         }
-        item.create(&intake, "task.admitted").create(&TaskState::born(&intake), "task.born");
+        let note = Note::new("task.submit").about("task", &task_id).with("sha256", &wanted.hash).shared();
+        item.create(&intake, "task.admitted").create(&TaskState::born(&intake), "task.born").audit(note);
         Admission { wanted, intake, item }
     }
 

@@ -6,6 +6,7 @@
 use crate::TaskService;
 use crate::admit::no_result;
 use crate::rows::{TaskRows, read, unavailable};
+use midshift_core::audit::{self, Note};
 use midshift_core::fleet::rows::FleetMark;
 use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{AreaId, RequestId, RobotId, TaskId};
@@ -32,6 +33,16 @@ struct Asked {
     request_id: Option<RequestId>,
     hash: String,
     actor: String,
+    /// The robot that has the task.
+    robot_id: Option<RobotId>,
+}
+
+impl Asked {
+    /// What it leaves in the audit.
+    fn note(&self) -> Note {
+        let note = self.ask.note().because(&self.reason);
+        self.robot_id.iter().fold(note, |note, id| note.about("robot", id))
+    }
 }
 
 fn reason_text(text: &str, bad: &mut Violations) {
@@ -86,21 +97,20 @@ impl TaskService {
         let hash = hash("cancel", &same);
         let task = self.to_act_on(&task_id, by, Permission::Dispatch).await?;
         let earlier = self.asked_before(request_id.as_ref(), &hash).await?;
-        if earlier.is_none() {
-            if task.state.phase == Phase::Canceled {
-                return Ok(v1::CancelTaskResponse { task: Some(task.encode()), pending: false });
-            }
-            if task.state.phase.is_terminal() {
-                return Err(ended(&task));
-            }
-            same_etag(revision_of(&r.etag), &task)?;
-        }
-        if r.validate_only {
+        if earlier.is_none() && task.state.phase == Phase::Canceled {
             return Ok(v1::CancelTaskResponse { task: Some(task.encode()), pending: false });
         }
-        let ask = Ask::Cancel { task_id: task_id.clone(), force: r.force };
-        let pending =
-            self.ask(earlier, Asked { ask, reason: r.reason, request_id, hash, actor: by.to_string() }).await?;
+        let fits = || {
+            if task.state.phase.is_terminal() { Err(ended(&task)) } else { same_etag(revision_of(&r.etag), &task) }
+        };
+        let fits = if earlier.is_none() { fits() } else { Ok(()) };
+        let (ask, robot_id) = (Ask::Cancel { task_id: task_id.clone(), force: r.force }, task.state.robot_id.clone());
+        let asked = Asked { ask, reason: r.reason, request_id, hash, actor: by.to_string(), robot_id };
+        if r.validate_only {
+            return fits.map(|()| v1::CancelTaskResponse { task: Some(task.encode()), pending: false });
+        }
+        self.noted(&asked, fits).await?;
+        let pending = self.ask(earlier, asked).await?;
         let task = read(self.store(), &task_id).await?;
         Ok(v1::CancelTaskResponse { task: Some(task.encode()), pending })
     }
@@ -125,7 +135,7 @@ impl TaskService {
         let hash = hash("resolve", &same);
         let task = self.to_act_on(&task_id, by, Permission::Operate).await?;
         let earlier = self.asked_before(request_id.as_ref(), &hash).await?;
-        if earlier.is_none() {
+        let fits = || {
             if task.state.phase.is_terminal() {
                 return Err(ended(&task));
             }
@@ -134,13 +144,16 @@ impl TaskService {
                 let reason = Reason::from(Code::ResolutionNotAllowed).with("state", task.state.phase.as_str());
                 return Err(Refusal::new(Kind::Precondition, reason.with("task_id", &task_id)));
             }
-        }
+            Ok(())
+        };
+        let fits = if earlier.is_none() { fits() } else { Ok(()) };
+        let (ask, robot_id) = (Ask::Resolve { task_id: task_id.clone(), resolution }, task.state.robot_id.clone());
+        let asked = Asked { ask, reason: r.reason, request_id, hash, actor: by.to_string(), robot_id };
         if r.validate_only {
-            return Ok(v1::ResolveTaskResponse { task: Some(task.encode()), pending: false });
+            return fits.map(|()| v1::ResolveTaskResponse { task: Some(task.encode()), pending: false });
         }
-        let ask = Ask::Resolve { task_id: task_id.clone(), resolution };
-        let pending =
-            self.ask(earlier, Asked { ask, reason: r.reason, request_id, hash, actor: by.to_string() }).await?;
+        self.noted(&asked, fits).await?;
+        let pending = self.ask(earlier, asked).await?;
         let task = read(self.store(), &task_id).await?;
         Ok(v1::ResolveTaskResponse { task: Some(task.encode()), pending })
     }
@@ -183,8 +196,8 @@ impl TaskService {
         if r.validate_only {
             return Ok(v1::ResumeHeldResponse { pending: false });
         }
-        let pending =
-            self.ask(earlier, Asked { ask, reason: r.reason, request_id, hash, actor: by.to_string() }).await?;
+        let asked = Asked { ask, reason: r.reason, request_id, hash, actor: by.to_string(), robot_id: None };
+        let pending = self.ask(earlier, asked).await?;
         Ok(v1::ResumeHeldResponse { pending })
     }
 
@@ -232,6 +245,16 @@ impl TaskService {
         Ok(!self.looked_at(place).await?)
     }
 
+    /// Leaves a refusal in the audit. Whoever asked hears why, whether or not that can be written down.
+    async fn noted(&self, asked: &Asked, fits: Result<(), Refusal>) -> Result<(), Refusal> {
+        if let Err(refusal) = &fits {
+            let request_id = asked.request_id.as_ref().map(RequestId::as_str);
+            let item = audit::refusal(Writer::Task, &asked.actor, request_id, asked.note(), refusal);
+            drop(self.commit(item.into_iter().collect()).await);
+        }
+        fits
+    }
+
     /// Commits a request. The key goes first, so that the number of the item is that of the request itself.
     async fn write(&self, asked: Asked) -> Result<Seq, Refusal> {
         let now = self.inner.parts.clock.now();
@@ -246,6 +269,7 @@ impl TaskService {
             };
             item.create(&key, "request.used");
         }
+        item.audit(asked.note());
         let id = format!("{:013}-{:016x}", now.wall.0, rand::random::<u64>());
         let Asked { ask, reason, actor, .. } = asked;
         item.create(&TaskRequest { id, ask, reason, actor, at_unix_ms: now.wall.0 }, "task.asked");

@@ -10,6 +10,7 @@ macro_rules! say {
     }};
 }
 
+mod audited;
 mod begin_and_end;
 mod clients;
 mod cut;

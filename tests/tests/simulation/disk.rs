@@ -5,14 +5,16 @@
 use crate::observer::Shared;
 use midshift_agent::memory::MemoryStore as RobotMemory;
 use midshift_agent::store::{Error as RobotError, Kept, Op, Store as RobotStore};
+use midshift_core::audit::Head;
 use midshift_core::ids::{RobotId, SiteId};
-use midshift_core::rows::{Item, Key, Log, Row, Seq, Table};
+use midshift_core::rows::{Item, Key, Log, Row, Seq, Table, Writer};
 use midshift_store::{
     Applied, Cause, CommitError, Error, FeedPage, Frame, FrameLog, FrameMark, Gap, MemoryFrames, MemoryStore, Query,
     Retention, Snapshot, Store, StoreId, StoredFrame,
 };
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::sync::watch;
@@ -149,6 +151,10 @@ impl Store for ServerDisk {
     }
     async fn raise_head(&self, at_least: Seq) -> Result<Seq, Error> {
         self.inner.raise_head(at_least).await
+    }
+    async fn audit_heads(&self) -> Result<BTreeMap<Writer, Head>, Error> {
+        self.readable()?;
+        self.inner.audit_heads().await
     }
     async fn prune(&self, keep: Retention) -> Result<u64, Error> {
         self.inner.prune(keep).await

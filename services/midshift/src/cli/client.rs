@@ -8,6 +8,7 @@ use midshift_bundle::folder::Error;
 use midshift_core::reason::{Kind, Refusal};
 use midshift_proto::convert::time_of;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
+use midshift_proto::identity::v1::audit_service_client::AuditServiceClient;
 use midshift_proto::identity::v1::identity_service_client::IdentityServiceClient;
 use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
@@ -327,6 +328,10 @@ impl Call {
     /// Roll-outs of software.
     pub async fn rollouts(&self) -> Result<RolloutServiceClient<Line>, Exit> {
         Ok(RolloutServiceClient::new(self.line().await?).max_decoding_message_size(64 * 1024 * 1024))
+    }
+    /// Who decided what.
+    pub async fn audit(&self) -> Result<AuditServiceClient<Line>, Exit> {
+        Ok(AuditServiceClient::new(self.line().await?).max_decoding_message_size(64 * 1024 * 1024))
     }
     /// Whether it serves.
     pub async fn health(&self) -> Result<HealthClient<Line>, Exit> {

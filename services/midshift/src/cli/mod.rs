@@ -1,6 +1,7 @@
 //! The command line: one binary, noun then verb. Data to stdout, talk to stderr, `-o json` is the contract.
 
 mod area;
+mod audit;
 mod backup;
 mod bundle;
 mod client;
@@ -114,6 +115,9 @@ enum Command {
     /// Bundles that robots went back from and do not get again.
     #[command(subcommand)]
     Quarantine(quarantine::Verb),
+    /// Who decided what: look, take it away, and check that nothing of it was changed.
+    #[command(subcommand)]
+    Audit(Box<audit::Verb>),
     /// Sign in to a site: prove it by its root, and remember it with a token.
     Login(context::Login),
     /// Which sites are remembered, and which one is used.
@@ -209,6 +213,7 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Bundle(verb) => bundle::run(verb, out).await,
         Command::Rollout(verb) => rollout::run(*verb, out).await,
         Command::Quarantine(verb) => quarantine::run(verb, out).await,
+        Command::Audit(verb) => audit::run(*verb, out).await,
         Command::Login(args) => context::login(args, out).await,
         Command::Context(verb) => context::run(verb, out).await,
         Command::Token(verb) => token::run(verb, out).await,

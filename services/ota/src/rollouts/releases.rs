@@ -4,6 +4,7 @@
 
 use crate::repository::Newest;
 use midshift_bundle::manifest::{ComponentKind, Manifest, Migration};
+use midshift_core::audit::Note;
 use midshift_core::ids::BundleId;
 use midshift_core::limits;
 use midshift_core::rollout::Plan;
@@ -45,6 +46,11 @@ pub fn take(view: &mut View, now: Now, newest: Option<&Newest>, plan: &mut Plan)
     changed.extend(gone.map(|b| Bundle { listed: false, ..b.clone() }));
     for rows in changed.chunks(limits::ITEM_ROWS_MAX) {
         plan.decide(view, now, "ota", |tx| {
+            let about = |listed| rows.iter().filter(move |row| row.listed == listed).map(|row| &row.bundle);
+            let (listed, unlisted) = (about(true), about(false).map(ToString::to_string).collect::<Vec<_>>());
+            let note = listed.fold(Note::new("bundle.publish"), |note, bundle| note.about("bundle", bundle));
+            let note = unlisted.iter().fold(note, |note, bundle| note.about("bundle", bundle));
+            tx.audit(if unlisted.is_empty() { note } else { note.with("unlisted", unlisted.join(" ")) });
             for row in rows {
                 tx.put(row.clone(), if row.listed { "bundle.listed" } else { "bundle.unlisted" });
             }

@@ -71,7 +71,12 @@ impl Loop {
             let mut plan = Plan::default();
             let taken = commands::take(&mut self.view, &self.board, self.parts.clock.now(), ask, &mut plan);
             self.view.arrived.clear();
-            if taken.is_err() || plan.items.is_empty() {
+            if taken.is_err() {
+                // That it was refused; whoever asked hears why, whether or not that can be written down.
+                drop(self.parts.store.commit(plan.items).await);
+                return Ok(taken);
+            }
+            if plan.items.is_empty() {
                 return Ok(taken);
             }
             let keys = picture::touched(&plan.items);

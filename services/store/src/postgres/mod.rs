@@ -28,11 +28,12 @@ use crate::{
 };
 use async_trait::async_trait;
 use connect::{Database, patiently};
+use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Item, Key, Log, Row, Seq, Table};
+use midshift_core::rows::{Item, Key, Log, Row, Seq, Table, Writer as Author};
 use midshift_core::time::Clock;
 use sqlx::PgPool;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
@@ -172,6 +173,10 @@ impl Store for PostgresStore {
 
     async fn raise_head(&self, at_least: Seq) -> Result<Seq, Error> {
         self.commands.raise_head(at_least).await
+    }
+
+    async fn audit_heads(&self) -> Result<BTreeMap<Author, Head>, Error> {
+        patiently(async { read::audit_heads(&self.readers, &self.site_id).await.map_err(unavailable) }).await
     }
 
     async fn prune(&self, keep: Retention) -> Result<u64, Error> {

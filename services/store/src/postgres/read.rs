@@ -4,6 +4,7 @@
 //! snapshot. Because whoever commits has the head row for itself, a snapshot that shows a number shows everything before it.
 
 use super::write_sql::is_text;
+use crate::audit::{self, Heads};
 use crate::queue::unavailable;
 use crate::sql::{self, ENTRY_READ, ROW_READ, entry, row};
 use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, Query, Snapshot, page_of};
@@ -176,6 +177,12 @@ async fn log_page(
     }
     let rows = select.fetch_all(connection).await?;
     rows.iter().map(|row| entry(log, row)).collect()
+}
+
+/// Where the chains of the audit stand, as it was noted.
+pub(super) async fn audit_heads(readers: &PgPool, site_id: &SiteId) -> Result<Heads, sqlx::Error> {
+    let rows = sqlx::query(sql::AUDIT_HEADS).bind(site_id.as_str()).fetch_all(readers).await?;
+    audit::heads(&rows)
 }
 
 /// How many entries a log holds.

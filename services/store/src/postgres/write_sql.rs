@@ -2,7 +2,8 @@
 //!
 //! Invariant: as [`crate::sql`].
 
-use crate::group::Standing;
+use crate::audit::{self, Heads};
+use crate::group::{Group, Standing};
 use crate::sql::{self, ENTRY_COLUMNS, ROW_COLUMNS, ROW_CONFLICT, ord};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Entry, Key, Log, Revision, Row, Seq, Table};
@@ -81,6 +82,26 @@ pub(super) async fn entries(
         .bind(of_log.iter().map(|e| e.at_unix_ms).collect::<Vec<_>>())
         .execute(&mut *connection)
         .await?;
+    }
+    Ok(())
+}
+
+/// Where the chains of the audit stand. Nobody moves them while the head row is locked.
+pub(super) async fn chains(connection: &mut PgConnection, site_id: &SiteId) -> Result<Heads, sqlx::Error> {
+    let rows = sqlx::query(AssertSqlSafe(audit::select_heads())).bind(site_id.as_str()).fetch_all(connection).await?;
+    audit::heads(&rows)
+}
+
+/// Moves the heads of the chains that grew, and takes what was cut.
+pub(super) async fn grow(connection: &mut PgConnection, site_id: &SiteId, group: &Group) -> Result<(), sqlx::Error> {
+    for writer in &group.grown {
+        let head = group.chains.get(writer).cloned().unwrap_or_default();
+        let upsert = sqlx::query(sql::MOVE_AUDIT_HEAD).bind(site_id.as_str()).bind(writer.as_str());
+        upsert.bind(head.n.cast_signed()).bind(head.hash).execute(&mut *connection).await?;
+    }
+    for (table, up_to) in &group.cuts {
+        let delete = sqlx::query(AssertSqlSafe(sql::cut(*table))).bind(site_id.as_str()).bind(up_to.cast_signed());
+        delete.execute(&mut *connection).await?;
     }
     Ok(())
 }

@@ -7,6 +7,7 @@
 use super::connect::{Database, WRITE_PATIENCE, is_gone, no_answer};
 use super::heard::broken_silence;
 use super::write_sql;
+use crate::audit::Heads;
 use crate::group::Group;
 use crate::queue::{Engine, Failed, Results};
 use crate::{Cause, CommitError, Error, OpenError, StoreId, sql};
@@ -187,7 +188,9 @@ impl AsyncWork<(Vec<Results>, Seq)> for GroupCommit {
         let base = write_sql::standings(connection, site_id, keys).await?;
         let silent: Vec<&Silent> = self.items.iter().flatten().filter_map(|item| item.silent.as_ref()).collect();
         let heard = broken_silence(connection, site_id, &silent).await?;
-        let mut group = Group::new(head, base);
+        let is_audited = self.items.iter().flatten().any(|item| item.note.is_some());
+        let chains = if is_audited { write_sql::chains(connection, site_id).await? } else { Heads::new() };
+        let mut group = Group::new(head, base, chains);
         // Judged from a copy, because it may have to be judged again.
         let mut add = |item: &Item| match item.silent.as_ref().filter(|silent| heard.contains(&silent.robot_id)) {
             Some(silent) => Err(CommitError::Heard { robot_id: silent.robot_id.clone() }),
@@ -195,10 +198,12 @@ impl AsyncWork<(Vec<Results>, Seq)> for GroupCommit {
         };
         let mut judge = |items: &Vec<Item>| items.iter().map(&mut add).collect::<Results>();
         let results: Vec<Results> = self.items.iter().map(&mut judge).collect();
-        let writes = !group.entries.is_empty();
+        group.seal();
+        let writes = group.writes();
         if writes {
             write_sql::rows(connection, site_id, &group.rows).await?;
             write_sql::entries(connection, site_id, &group.entries).await?;
+            write_sql::grow(connection, site_id, &group).await?;
             write_sql::head(connection, site_id, group.head).await?;
         }
         Ok(((results, group.head), writes))

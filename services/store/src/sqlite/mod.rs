@@ -25,11 +25,12 @@ use crate::{
 };
 use async_trait::async_trait;
 use file::DataFile;
+use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Entry, Item, Key, Log, Row, Seq, Table};
+use midshift_core::rows::{Entry, Item, Key, Log, Row, Seq, Table, Writer as Author};
 use midshift_core::time::Clock;
 use sqlx::SqlitePool;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::Arc;
 use tail::Tail;
@@ -161,6 +162,10 @@ impl Store for SqliteStore {
 
     async fn raise_head(&self, at_least: Seq) -> Result<Seq, Error> {
         self.commands.raise_head(at_least).await
+    }
+
+    async fn audit_heads(&self) -> Result<BTreeMap<Author, Head>, Error> {
+        read::audit_heads(&self.readers, &self.site_id).await.map_err(unavailable)
     }
 
     async fn prune(&self, keep: Retention) -> Result<u64, Error> {

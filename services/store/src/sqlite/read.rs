@@ -4,6 +4,7 @@
 //! closed lists are spliced into text.
 
 use super::write_sql::placeholders;
+use crate::audit::{self, Heads};
 use crate::queue::unavailable;
 use crate::sql::{self, ENTRY_READ, ROW_READ, entry, row};
 use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, Query, Snapshot, page_of};
@@ -200,6 +201,12 @@ async fn log_page(
     }
     let rows = select.bind(limit as i64).fetch_all(connection).await?;
     rows.iter().map(|row| entry(log, row)).collect()
+}
+
+/// Where the chains of the audit stand, as it was noted.
+pub(super) async fn audit_heads(readers: &SqlitePool, site_id: &SiteId) -> Result<Heads, sqlx::Error> {
+    let rows = sqlx::query(sql::AUDIT_HEADS).bind(site_id.as_str()).fetch_all(readers).await?;
+    audit::heads(&rows)
 }
 
 /// How many entries a log holds.

@@ -5,7 +5,8 @@
 //! Multi-row statements use plain `?`: SQLite finds a numbered name by walking all names, so that thousands of `$n` would cost a
 //! square. An engine that needs numbers writes them in [`placeholders`].
 
-use crate::group::Standing;
+use crate::audit::{self, Heads};
+use crate::group::{Group, Standing};
 use crate::sql::{self, ENTRY_COLUMNS, ROW_COLUMNS, ROW_CONFLICT, ord};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Entry, Key, Log, Revision, Row, Seq, Table};
@@ -126,6 +127,30 @@ fn append<'q>(log: Log, site_id: &'q SiteId, entries: &[&Entry]) -> Statement<'q
             .bind(entry.at_unix_ms);
     }
     statement
+}
+
+/// Where the chains of the audit stand.
+pub(super) async fn chains(connection: &mut SqliteConnection, site_id: &SiteId) -> Result<Heads, sqlx::Error> {
+    let rows = prepared(audit::select_heads()).bind(site_id.as_str()).fetch_all(connection).await?;
+    audit::heads(&rows)
+}
+
+/// Moves the heads of the chains that grew, and takes what was cut.
+pub(super) async fn grow(
+    connection: &mut SqliteConnection,
+    site_id: &SiteId,
+    group: &Group,
+) -> Result<(), sqlx::Error> {
+    for writer in &group.grown {
+        let head = group.chains.get(writer).cloned().unwrap_or_default();
+        let upsert = sqlx::query(sql::MOVE_AUDIT_HEAD).bind(site_id.as_str()).bind(writer.as_str());
+        upsert.bind(head.n.cast_signed()).bind(head.hash).execute(&mut *connection).await?;
+    }
+    for (table, up_to) in &group.cuts {
+        let delete = prepared(sql::cut(*table)).bind(site_id.as_str()).bind(up_to.cast_signed());
+        delete.execute(&mut *connection).await?;
+    }
+    Ok(())
 }
 
 /// Moves the head row.

@@ -8,6 +8,7 @@ use super::file::DataFile;
 use super::revisions::Revisions;
 use super::tail::Tail;
 use super::write_sql;
+use crate::audit::Heads;
 use crate::group::{Group, Standing};
 use crate::queue::{Engine, Failed, Results, closed};
 use crate::{Cause, Error, OpenError, StoreId, sql};
@@ -29,6 +30,8 @@ pub(super) struct Writer {
     tail: Arc<Tail>,
     wake: watch::Sender<Seq>,
     head: Seq,
+    /// Where the chains of the audit stand, once it was asked.
+    chains: Option<Heads>,
 }
 
 impl Writer {
@@ -41,7 +44,8 @@ impl Writer {
         wake: watch::Sender<Seq>,
         head: Seq,
     ) -> Self {
-        Self { file, connection: Some(connection), site_id, clock, revisions: Revisions::default(), tail, wake, head }
+        let (connection, revisions, chains) = (Some(connection), Revisions::default(), None);
+        Self { file, connection, site_id, clock, revisions, tail, wake, head, chains }
     }
 
     /// A group that knows where all rows stand that its items name.
@@ -68,13 +72,24 @@ impl Writer {
                 base.insert(key, standing);
             }
         }
-        Ok(Group::new(self.head, base))
+        let is_audited = items.iter().flatten().any(|item| item.note.is_some());
+        Ok(Group::new(self.head, base, if is_audited { self.chains().await? } else { Heads::new() }))
+    }
+
+    async fn chains(&mut self) -> Result<Heads, Cause> {
+        if let Some(chains) = &self.chains {
+            return Ok(chains.clone());
+        }
+        let connection = self.connection.as_mut().ok_or_else(closed)?;
+        let chains = write_sql::chains(connection, &self.site_id).await.map_err(|error| self.fail(error))?;
+        Ok(self.chains.insert(chains).clone())
     }
 
     /// Forgets everything that a broken connection may have left behind.
     fn fail(&mut self, error: sqlx::Error) -> Cause {
         self.connection = None;
         self.revisions.forget_all();
+        self.chains = None;
         Arc::new(error)
     }
 
@@ -86,6 +101,7 @@ impl Writer {
         let mut connection = self.file.writer().await.map_err(|e| -> Cause { Arc::new(e) })?;
         let head = head(&mut connection, &self.site_id).await.map_err(|e| -> Cause { Arc::new(e) })?;
         self.revisions.forget_all();
+        self.chains = None;
         self.tail.restart(head);
         self.head = head;
         self.wake.send_replace(head);
@@ -102,12 +118,16 @@ impl Writer {
             // Dropping the connection rolls back what it had open.
             self.connection = None;
             self.revisions.forget_all();
+            self.chains = None;
         }
         outcome
     }
 
     /// After the commit: what was written is known, then readable at the head, then announced.
     fn take(&mut self, group: Group) {
+        if !group.grown.is_empty() {
+            self.chains = Some(group.chains);
+        }
         for (key, row) in group.rows {
             self.revisions.put(key, row.map(|row| row.revision));
         }
@@ -125,7 +145,8 @@ impl Engine for Writer {
         let at_unix_ms = self.clock.now().wall.0;
         let judge = |items: Vec<Item>| items.into_iter().map(|item| group.add(item, at_unix_ms)).collect();
         let results = items.into_iter().map(judge).collect();
-        if !group.entries.is_empty() {
+        group.seal();
+        if group.writes() {
             self.write(&group).await?;
         }
         self.take(group);
@@ -143,7 +164,7 @@ impl Engine for Writer {
     async fn raise_head(&mut self, at_least: Seq) -> Result<Seq, Error> {
         self.connect().await.map_err(Error::Unavailable)?;
         if at_least > self.head {
-            let mut group = Group::new(self.head, HashMap::new());
+            let mut group = Group::new(self.head, HashMap::new(), Heads::new());
             group.head = at_least;
             let written = self.write(&group).await;
             written.map_err(|(Failed::Before(cause) | Failed::AtCommit(cause))| Error::Unavailable(cause))?;
@@ -169,6 +190,7 @@ async fn transaction(connection: &mut SqliteConnection, site_id: &SiteId, group:
         sqlx::query("BEGIN IMMEDIATE").execute(&mut *connection).await?;
         write_sql::rows(connection, site_id, &group.rows).await?;
         write_sql::entries(connection, site_id, &group.entries).await?;
+        write_sql::grow(connection, site_id, group).await?;
         write_sql::head(connection, site_id, group.head).await
     };
     statements.await.map_err(|error| Failed::Before(Arc::new(error)))?;

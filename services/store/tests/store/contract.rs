@@ -303,13 +303,15 @@ async fn concurrent_writers_all_make_progress_and_numbers_have_no_holes(store: A
 
 async fn a_row_reads_back_as_written_in_every_table(store: Arc<dyn Store>) {
     let index = Index { state: Some(-1), parent: Some(Arc::from("päron")), order: Some(i64::MAX) };
-    for table in Table::ALL {
+    // Rows of an audit are written by notes: `audit.rs`.
+    let all = || Table::ALL.iter().filter(|table| !table.is_audit());
+    for table in all() {
         let row = indexed(*table, "it's", Expect::Absent, "{\"a\":\"\\u0000ö\"}", index.clone());
         one(&*store, table.born_by(), vec![row]).await.unwrap();
     }
     let snapshot = store.snapshot(Table::ALL).await.unwrap();
     let tables: BTreeSet<Table> = snapshot.rows.iter().map(|row| row.key.table).collect();
-    assert_eq!(tables.len(), Table::ALL.len());
+    assert_eq!(tables.len(), all().count());
     for row in &snapshot.rows {
         assert_eq!((&row.index, &*row.body), (&index, "{\"a\":\"\\u0000ö\"}"));
     }

@@ -1,6 +1,7 @@
 //! Tests of the store through its public face: one contract over all engines, projections, and what outlives a process.
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
+mod audit;
 mod contract;
 mod copied;
 mod copied_wrong;

@@ -2,9 +2,11 @@
 //! then the last writer wins.
 
 use async_trait::async_trait;
+use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Expect, Item, Key, Log, Row, Seq, Table};
+use midshift_core::rows::{Expect, Item, Key, Log, Row, Seq, Table, Writer};
 use midshift_store::{Applied, CommitError, Error, FeedPage, Query, Retention, Snapshot, Store, StoreId};
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use tokio::sync::watch;
@@ -181,6 +183,9 @@ impl Store for Shaky {
     }
     async fn raise_head(&self, at_least: Seq) -> Result<Seq, Error> {
         self.inner.raise_head(at_least).await
+    }
+    async fn audit_heads(&self) -> Result<BTreeMap<Writer, Head>, Error> {
+        self.inner.audit_heads().await
     }
     async fn prune(&self, keep: Retention) -> Result<u64, Error> {
         self.inner.prune(keep).await
