@@ -19,6 +19,8 @@ const SPAWNS: &[(&str, &str)] = &[
     ("services/midshift/src/scenario/watch.rs", "the binary looks at robots while a story is played"),
     ("services/midshift/src/backup/mod.rs", "files are copied and read beside the runtime's threads"),
     ("services/midshift/src/stop_follower.rs", "files of the stop service are read beside the runtime's threads"),
+    ("services/midshift/src/machines.rs", "the binary enrols many machines side by side and renews what they got"),
+    ("services/midshift/src/stop.rs", "who is known is followed as long as the port of the stop service is open"),
     ("services/midshift/src/robots.rs", "the binary lets a person walk beside its robot"),
     ("services/store/src/sqlite/mod.rs", "the one writer of a file and its checkpoints"),
     ("services/store/src/sqlite/frames.rs", "the one writer of a file and its checkpoints"),

@@ -59,7 +59,7 @@ fn every_file_says_how_to_try_it() {
         let path = format!("{}/{}", env!("CARGO_MANIFEST_DIR"), file.name());
         let text = std::fs::read_to_string(&path).expect("the file");
         let header: Vec<_> = text.lines().take_while(|l| l.starts_with("//")).collect();
-        assert!(header.iter().any(|l| l.starts_with("// Try: grpcurl -plaintext")), "{path}");
+        assert!(header.iter().any(|l| ["-plaintext", "-cacert"].iter().any(|way| l.starts_with(&format!("// Try: grpcurl {way}")))), "{path}");
     }
 }
 
@@ -169,6 +169,9 @@ fn every_service_is_in_the_descriptor_set() {
     services.sort();
     let wanted = [
         "fleet.v1.FleetService",
+        "identity.v1.AuditService",
+        "identity.v1.EnrolmentService",
+        "identity.v1.IdentityService",
         "link.v1.LinkService",
         "link.v1.ReplayService",
         "ota.v1.BundleService",

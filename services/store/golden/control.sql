@@ -50,6 +50,17 @@ CREATE TABLE audit_head (
     UNIQUE (site_id, chain)
 );
 
+CREATE TABLE authority (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE TABLE bundle (
     site_id TEXT NOT NULL,
     id TEXT NOT NULL,
@@ -197,6 +208,34 @@ CREATE TABLE hold_token (
     ord BIGINT NOT NULL,
     body TEXT NOT NULL,
     UNIQUE (site_id, id)
+);
+
+CREATE TABLE identity_audit (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
+CREATE TABLE identity_event (
+    site_id TEXT NOT NULL,
+    seq BIGINT NOT NULL,
+    tbl TEXT,
+    subject TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT,
+    body TEXT,
+    kind TEXT NOT NULL,
+    actor TEXT NOT NULL,
+    request_id TEXT,
+    at_unix_ms BIGINT NOT NULL,
+    UNIQUE (site_id, seq)
 );
 
 CREATE TABLE incident (
@@ -377,6 +416,17 @@ CREATE TABLE robot_counter (
     UNIQUE (site_id, id)
 );
 
+CREATE TABLE robot_identity (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE TABLE robot_inbox (
     site_id TEXT NOT NULL,
     seq BIGINT NOT NULL,
@@ -444,6 +494,17 @@ CREATE TABLE rollout_robot (
 );
 
 CREATE TABLE schema_version (version BIGINT NOT NULL, name TEXT NOT NULL, UNIQUE (version));
+
+CREATE TABLE server_certificate (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
 
 CREATE TABLE service_clock (
     site_id TEXT NOT NULL,
@@ -613,6 +674,17 @@ CREATE TABLE timer (
     UNIQUE (site_id, id)
 );
 
+CREATE TABLE token (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE INDEX attempt_by_parent ON attempt (site_id, parent, ord, id);
 
 CREATE INDEX attempt_by_state ON attempt (site_id, state, ord, id);
@@ -622,6 +694,10 @@ CREATE INDEX bundle_by_ord ON bundle (site_id, ord, id);
 CREATE INDEX fleet_audit_by_ord ON fleet_audit (site_id, ord, id);
 
 CREATE INDEX fleet_event_by_subject ON fleet_event (site_id, subject, seq);
+
+CREATE INDEX identity_audit_by_ord ON identity_audit (site_id, ord, id);
+
+CREATE INDEX identity_event_by_subject ON identity_event (site_id, subject, seq);
 
 CREATE INDEX incident_by_ord ON incident (site_id, ord, id);
 
@@ -664,4 +740,6 @@ CREATE INDEX task_state_by_state ON task_state (site_id, state, ord, id);
 CREATE INDEX telemetry_event_by_subject ON telemetry_event (site_id, subject, seq);
 
 CREATE INDEX timer_by_ord ON timer (site_id, ord, id);
+
+CREATE INDEX token_by_ord ON token (site_id, ord, id);
 
