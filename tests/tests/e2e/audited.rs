@@ -37,7 +37,7 @@ fn said(server: &Server, arguments: &[&str]) -> anyhow::Result<String> {
 }
 
 fn submit(server: &Server, task_id: &str) -> anyhow::Result<String> {
-    said(server, &["task", "submit", "--task-id", task_id, "--from", "A", "--to", "B"])
+    said(server, &["task", "submit", "--task-id", task_id, "--from", "A01", "--to", "B03"])
 }
 
 /// Rows that fit, the newest first.
