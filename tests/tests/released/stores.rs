@@ -22,13 +22,11 @@ pub const EMPTY: &[(&str, &str)] = &[
     ),
     ("stop_record", "a stop service writes them, and none runs beside the server of a run"),
     ("stop_event", "the same"),
-    ("stop_audit", "the same"),
     ("token", "a server without login, as 0.1.0 is, writes none"),
     ("robot_identity", "the same"),
     ("authority", "the same"),
     ("server_certificate", "the same"),
     ("identity_event", "the same"),
-    ("identity_audit", "the same"),
 ];
 
 /// Words of enums that a release does not know and this build may write all the same, with why a process of that release that shares the store does
