@@ -59,7 +59,9 @@ fn every_file_says_how_to_try_it() {
         let path = format!("{}/{}", env!("CARGO_MANIFEST_DIR"), file.name());
         let text = std::fs::read_to_string(&path).expect("the file");
         let header: Vec<_> = text.lines().take_while(|l| l.starts_with("//")).collect();
-        assert!(header.iter().any(|l| ["-plaintext", "-cacert"].iter().any(|way| l.starts_with(&format!("// Try: grpcurl {way}")))), "{path}");
+        let tries =
+            |l: &&str| ["-plaintext", "-cacert"].iter().any(|way| l.starts_with(&format!("// Try: grpcurl {way}")));
+        assert!(header.iter().any(tries), "{path}");
     }
 }
 

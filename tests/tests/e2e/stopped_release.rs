@@ -14,7 +14,7 @@ use midshift_core::site::{DEMO, text};
 use midshift_proto::task::v1::TaskState;
 use midshift_sim::journal::{self, Effect};
 use std::collections::BTreeSet;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 const ROBOTS: usize = 4;
 const TASKS: usize = 16;
@@ -22,7 +22,7 @@ const TASKS: usize = 16;
 const BAD: &str = "1.6.2-bad-with-load";
 
 /// Where the body stood at the end of its journal, and how often it ran the bad release.
-fn travelled(journal: &PathBuf) -> anyhow::Result<(u64, usize)> {
+fn travelled(journal: &Path) -> anyhow::Result<(u64, usize)> {
     let (mut odometer, mut ran) = (0, 0);
     for entry in journal::read(journal)? {
         match entry.effect {
@@ -78,7 +78,7 @@ async fn a_canary_of_a_bad_release_goes_back_under_a_fleet_stop_and_nobody_moves
     // It comes back with success: every robot has confirmed that it stands.
     let stop_id = stops.stop(&["--all"])?;
     until_held(server.address, &ids, &format!("stop:{stop_id}")).await?;
-    let stood = journals.iter().map(travelled).collect::<anyhow::Result<Vec<_>>>()?;
+    let stood = journals.iter().map(|journal| travelled(journal)).collect::<anyhow::Result<Vec<_>>>()?;
     done(&["rollout", "abort", "--server", &address, &id, "--reason", "somebody fell"])?;
     let waited = tokio::task::block_in_place(|| {
         call(&["rollout", "wait", "--server", &address, &id, "--for", "ended", "--timeout", "90s"])
@@ -95,7 +95,7 @@ async fn a_canary_of_a_bad_release_goes_back_under_a_fleet_stop_and_nobody_moves
 
     stops.reset(&stop_id)?;
     until_held(server.address, &ids, &format!("resume:{stop_id}")).await?;
-    let stands = journals.iter().map(travelled).collect::<anyhow::Result<Vec<_>>>()?;
+    let stands = journals.iter().map(|journal| travelled(journal)).collect::<anyhow::Result<Vec<_>>>()?;
     for ((id, (before, _)), (now, _)) in ids.iter().zip(&stood).zip(&stands) {
         ensure!(before == now, "{id} moved under the stop: from {before} to {now} mm");
     }

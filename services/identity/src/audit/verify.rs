@@ -34,9 +34,9 @@ pub(super) fn noted(r: &v1::VerifyAuditRequest) -> Result<Vec<Mark>, Refusal> {
         let is_known = Table::audit_named(&head.service).is_some();
         match Mark::parse(&format!("{}:{}:{}", head.service, head.n, head.hash)) {
             Some(mark) if is_known => noted.push(mark),
-            Some(_) => bad.add(&format!("heads[{i}].service"), "has no audit"),
+            Some(_) => bad.add(format!("heads[{i}].service"), "has no audit"),
             None => {
-                bad.add(&format!("heads[{i}]"), "needs a service, a number, and 64 hexadecimal digits in lower case")
+                bad.add(format!("heads[{i}]"), "needs a service, a number, and 64 hexadecimal digits in lower case")
             }
         }
     }

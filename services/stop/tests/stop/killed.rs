@@ -3,6 +3,8 @@
 //!
 //! Without being asked a seeded sample of the calls is cut; `MIDSHIFT_SITES=all` cuts every one. A write of which half arrives is the latch file's own test.
 
+#![expect(clippy::print_stdout, reason = "the one that is killed says what it has done")]
+
 use crate::harness::{Folder, Robot, Server, eventually, scope};
 use crate::strace::{Sites, Victim, killed_after, sites};
 use midshift_core::stop::Stop;
