@@ -22,7 +22,7 @@ pub async fn unary(answer: &Path, address: SocketAddr, stop: CancellationToken) 
     let listener = TcpListener::bind(address).await?;
     Server::builder()
         .add_service(TaskServiceServer::new(Unary(answer)))
-        .serve_with_incoming_shutdown(midshift::listen::nodelay(listener), stop.cancelled_owned())
+        .serve_with_incoming_shutdown(crate::listen::nodelay(listener), stop.cancelled_owned())
         .await?;
     Ok(())
 }

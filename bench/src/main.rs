@@ -9,6 +9,7 @@ mod fsync;
 mod gates;
 mod hall;
 mod link;
+mod listen;
 mod offer;
 mod ota;
 mod plan;

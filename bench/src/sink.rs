@@ -41,7 +41,7 @@ pub async fn serve(seen: Arc<Seen>, answers: bool, address: SocketAddr, stop: Ca
     let listener = TcpListener::bind(address).await?;
     tonic::transport::Server::builder()
         .add_service(LinkServiceServer::new(Sink { seen, answers }))
-        .serve_with_incoming_shutdown(midshift::listen::nodelay(listener), stop.cancelled_owned())
+        .serve_with_incoming_shutdown(crate::listen::nodelay(listener), stop.cancelled_owned())
         .await?;
     Ok(())
 }

@@ -135,7 +135,7 @@ mod tests {
             expires_unix_ms: DAY_MS,
             revoked,
         };
-        let tokens = [record("t1", None), record("t2", Some(crate::identity::Deny::act("bert", 5)))];
+        let tokens = [record("t1", None), record("t2", Some(crate::identity::Act::new("bert", 5)))];
         let denied = vec![
             Deny { key: Digest([1; 32]), until_unix_ms: DAY_MS },
             Deny { key: Digest([2; 32]), until_unix_ms: 3 * DAY_MS },

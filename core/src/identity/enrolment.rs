@@ -20,13 +20,6 @@ pub struct Deny {
     pub until_unix_ms: i64,
 }
 
-impl Deny {
-    /// Somebody's act.
-    pub fn act(actor: &str, at_unix_ms: i64) -> Act {
-        Act { actor: actor.to_owned(), at_unix_ms }
-    }
-}
-
 /// A secret that was handed out for a robot.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct EnrolmentState {
@@ -143,7 +136,7 @@ impl RobotIdentity {
     pub fn revoke(&mut self, actor: &str, now: Utc) {
         self.deny(now);
         self.enrolment = None;
-        self.revoked = Some(Deny::act(actor, now.0));
+        self.revoked = Some(Act::new(actor, now.0));
     }
 
     /// What is there of a key is denied for as long as a certificate of it may be genuine.

@@ -14,6 +14,13 @@ pub struct Act {
     pub at_unix_ms: i64,
 }
 
+impl Act {
+    /// Somebody's, at that moment.
+    pub fn new(actor: &str, at_unix_ms: i64) -> Self {
+        Self { actor: actor.to_owned(), at_unix_ms }
+    }
+}
+
 /// A token of a person or a program: what is kept of it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TokenRecord {

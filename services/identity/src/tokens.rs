@@ -154,7 +154,7 @@ pub async fn revoke(register: &Register, token_id: &TokenId, actor: &str, now: U
             {
                 return Err(Refusal::new(Kind::Precondition, Code::LastAdmin));
             }
-            let revoked = Some(Act { actor: actor.to_owned(), at_unix_ms: now.0 });
+            let revoked = Some(Act::new(actor, now.0));
             let token = TokenRecord { revoked, ..token.clone() };
             Ok((Some(decided(&token, Some(*at), actor, "token.revoked", note("token.revoke", &token))), token))
         })

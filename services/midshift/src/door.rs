@@ -25,7 +25,7 @@ pub struct Share {
     /// Connections from one address, or one /64 of IPv6, at a time. A proxy in front is one address.
     #[arg(long, default_value_t = limits::CONNECTIONS_PER_NETWORK_MAX)]
     pub connections_per_address: usize,
-    /// Requests that one robot, token or address may begin a second, for long; ten times as many at once.
+    /// Requests that one robot, token or address may begin a second, for long; twice as many at once.
     #[arg(long, default_value = "1000")]
     pub requests_per_second: NonZeroU32,
 }
@@ -40,7 +40,9 @@ impl Default for Share {
 impl Share {
     /// The limits of a port with this name.
     pub fn config(self, port: &'static str) -> Config {
-        let burst = self.requests_per_second.saturating_mul(const { NonZeroU32::new(10).unwrap() });
+        let burst = self
+            .requests_per_second
+            .saturating_mul(const { NonZeroU32::new(limits::REQUESTS_BURST / limits::REQUESTS_PER_SECOND).unwrap() });
         let rate = Rate { per_second: self.requests_per_second, burst };
         Config { port, connections_per_network_max: self.connections_per_address, rate, ..Config::default() }
     }

@@ -9,7 +9,6 @@ pub mod clock;
 pub mod dev;
 pub mod door;
 pub mod duration;
-pub mod listen;
 pub mod logs;
 pub mod machines;
 pub mod planning;

@@ -1,5 +1,6 @@
 //! Robots in processes of their own: one agent with a simulated body that survives its process, or a swarm against a server elsewhere.
 
+use crate::door;
 use crate::machines::Machines;
 use crate::software::{self, Software};
 use crate::way::Way;
@@ -32,6 +33,7 @@ use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
+use tonic::service::Routes;
 
 /// How often a person looks, real time.
 const VISIT: Duration = Duration::from_secs(5);
@@ -327,10 +329,8 @@ pub async fn swarm(args: SimRun, signed_in: Option<Way>, stop: CancellationToken
         None => drop(robots.await?),
         Some(address) => {
             let listener = TcpListener::bind(address).await.with_context(|| format!("listening on {address}"))?;
-            let incoming = crate::listen::nodelay(listener);
-            let served = tonic::transport::Server::builder()
-                .add_service(face.server())
-                .serve_with_incoming_shutdown(incoming, stop.cancelled_owned());
+            let routes = Routes::new(face.server());
+            let served = door::serve(door::alone("sim"), None, routes, listener, stop);
             let (robots, served) = tokio::join!(robots, served);
             robots?;
             served?;

@@ -10,7 +10,7 @@ use axum::routing::get;
 use midshift_agent::dial::{Dial, TcpDial};
 use midshift_agent::tls::{self, Tls};
 use midshift_core::site::Site;
-use midshift_core::time::Clock;
+use midshift_core::time::{Clock, LinkDuration};
 use midshift_edge::Config;
 use midshift_identity::ServerProof;
 use midshift_stop::{Parts, Principals, StopService};
@@ -35,6 +35,8 @@ pub const FOLDER: &str = "stop";
 /// A stop service that was started answers within this, or `serve` says that it did not.
 const UP_WITHIN: Duration = Duration::from_secs(10);
 const LOOK_EVERY: Duration = Duration::from_millis(100);
+/// Pings on a quiet connection of a watcher: one that is gone is found out twice as fast as on the business port.
+const KEEPALIVE_EVERY: LinkDuration = LinkDuration::from_secs(10);
 /// How often it is looked whether somebody else is known: with the writer's own second, two after a revocation at the latest.
 const PRINCIPALS_EVERY: Duration = Duration::from_millis(500);
 /// Beside `serve` it is looked after so often, and started again after so many looks in vain: within [`midshift_core::limits::SILENCE_SLOW`].
@@ -142,6 +144,7 @@ async fn serve(
     let metrics = || async { server::metrics_handle().map(|handle| handle.render()).unwrap_or_default() };
     let pages = service.routes().await?.into_axum_router().layer(tonic_web::GrpcWebLayer::new());
     let routes = Routes::from(pages.route("/metrics", get(metrics)));
+    let config = Config { keepalive_every: KEEPALIVE_EVERY, ..config };
     let port = door::serve(config, login, routes, listener, service.drained());
     midshift_stop::serve(service, port).await.context("serving stops")?
 }

@@ -35,6 +35,10 @@ const PAUSE_MAX: Duration = Duration::from_secs(5);
 const NOT_THERE: &str = "this server does not know the call\n  try: faults and worlds are with `midshift dev` or `midshift sim run --listen`; \
      for anything else look at the server's version";
 
+/// What a connection says that ended before anything was answered.
+const BROKE_OFF: &str = "the server broke the connection off before it answered\n  try: sign in, if it speaks TLS: midshift login SERVER --pin DIGEST, with the \
+     digest that it printed at its first start";
+
 /// Which server, and as whom.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Call {
@@ -228,6 +232,8 @@ impl From<Status> for Exit {
         let violations = answer.violations.iter().map(|v| (v.field.as_str(), v.description.as_str()));
         let mut text = broken_rules(violations).unwrap_or_else(|| match status.message() {
             _ if status.code() == Code::Unimplemented => NOT_THERE.to_owned(),
+            // What plain text hears of a port that speaks TLS.
+            message if message.starts_with("h2 protocol error") => BROKE_OFF.to_owned(),
             "" => status.code().to_string(),
             message => message.to_owned(),
         });

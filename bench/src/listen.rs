@@ -1,4 +1,4 @@
-//! Connections as every port of the binary takes them.
+//! Connections of bare loops, taken as every port of the binary takes its own.
 
 use tokio::net::TcpListener;
 use tokio_stream::wrappers::TcpListenerStream;
