@@ -58,7 +58,7 @@ impl Floor {
         let (data, listen) = (self.path("data")?, self.address.to_string());
         let map = self.map.to_str().context("a path that is no text")?;
         let keys = self.people.keys.to_str().context("a path that is no text")?;
-        let role = ["serve", "--insecure", "--data", &data, "--site", map, "--listen", &listen, "--ota-keys", keys];
+        let role = ["serve", "--data", &data, "--site", map, "--listen", &listen, "--ota-keys", keys];
         Child::start(&role, Some(0))?.listening().await
     }
     /// Starts robots that hear, on the other cores.
