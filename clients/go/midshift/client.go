@@ -5,11 +5,16 @@ package midshift
 import (
 	"context"
 	"crypto/rand"
+	"crypto/tls"
+	"crypto/x509"
 	_ "embed"
+	"errors"
+	"os"
 	"time"
 
 	"google.golang.org/grpc"
 	"google.golang.org/grpc/backoff"
+	"google.golang.org/grpc/credentials"
 	"google.golang.org/grpc/credentials/insecure"
 	"google.golang.org/grpc/keepalive"
 
@@ -37,10 +42,61 @@ type Client struct {
 	Rollouts  otav1.RolloutServiceClient
 }
 
+// SignIn says whom a client believes and who it is.
+type SignIn struct {
+	// The site's root, PEM. Without it the client speaks plain text, as midshift dev does, and takes no token.
+	AuthorityPEM []byte
+	// One that midshift token create printed. Empty: nobody.
+	Token string
+}
+
+// FromEnvironment is signed in as the command line is: by the file that MIDSHIFT_CA names, and MIDSHIFT_TOKEN. Neither is set: plain text.
+func FromEnvironment() (SignIn, error) {
+	as := SignIn{Token: os.Getenv("MIDSHIFT_TOKEN")}
+	path := os.Getenv("MIDSHIFT_CA")
+	if path == "" {
+		return as, nil
+	}
+	pem, err := os.ReadFile(path)
+	as.AuthorityPEM = pem
+	return as, err
+}
+
+func (as SignIn) options() ([]grpc.DialOption, error) {
+	if as.AuthorityPEM == nil {
+		if as.Token != "" {
+			return nil, errors.New("a token goes to no server whose root is not known: give AuthorityPEM too")
+		}
+		return []grpc.DialOption{grpc.WithTransportCredentials(insecure.NewCredentials())}, nil
+	}
+	roots := x509.NewCertPool()
+	if !roots.AppendCertsFromPEM(as.AuthorityPEM) {
+		return nil, errors.New("no certificate in AuthorityPEM")
+	}
+	over := credentials.NewTLS(&tls.Config{RootCAs: roots, MinVersion: tls.VersionTLS13})
+	options := []grpc.DialOption{grpc.WithTransportCredentials(over)}
+	if as.Token != "" {
+		options = append(options, grpc.WithPerRPCCredentials(bearer(as.Token)))
+	}
+	return options, nil
+}
+
+// bearer is a token, which goes over TLS only.
+type bearer string
+
+func (b bearer) GetRequestMetadata(context.Context, ...string) (map[string]string, error) {
+	return map[string]string{"authorization": "Bearer " + string(b)}, nil
+}
+
+func (bearer) RequireTransportSecurity() bool { return true }
+
 // New makes a client of server, host:port. It connects when it is used; Close it.
-func New(server string) (*Client, error) {
-	connection, err := grpc.NewClient("passthrough:///"+server,
-		grpc.WithTransportCredentials(insecure.NewCredentials()),
+func New(server string, as SignIn) (*Client, error) {
+	signedIn, err := as.options()
+	if err != nil {
+		return nil, err
+	}
+	connection, err := grpc.NewClient("passthrough:///"+server, append(signedIn,
 		grpc.WithDefaultServiceConfig(ServiceConfig),
 		// A server that is gone without a word is noticed within 40 s, also while nothing but a watch is open.
 		grpc.WithKeepaliveParams(keepalive.ClientParameters{Time: 30 * time.Second, Timeout: 10 * time.Second}),
@@ -49,7 +105,7 @@ func New(server string) (*Client, error) {
 			MinConnectTimeout: 5 * time.Second,
 		}),
 		grpc.WithUnaryInterceptor(unary),
-	)
+	)...)
 	if err != nil {
 		return nil, err
 	}

@@ -2,7 +2,12 @@
 
     python minimal_robot.py --server 127.0.0.1:7420 --robot-id rbt-py --data robot.json --journal effects.txt --at park-a 0 3000
 
-It needs the generated stubs and nothing else of midshift: one thread reads the session, everything else happens in `Robot.tick`.
+Against a server with TLS it also needs the site's root and, once, the line that `midshift robot enroll rbt-py` prints:
+
+    python minimal_robot.py ... --ca midshift-data/identity/ca.pem --enroll mse.ID.SECRET.DIGEST
+
+It needs the generated stubs, `cryptography` for its key, and nothing else of midshift: one thread reads the session, everything else happens in
+`Robot.tick`.
 """
 
 import argparse
@@ -18,8 +23,13 @@ import time
 import uuid
 
 import grpc
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 from google.protobuf import json_format
 from midshift.common.v1 import common_pb2
+from midshift.identity.v1 import enrolment_service_pb2 as enrolment
+from midshift.identity.v1 import enrolment_service_pb2_grpc
 from midshift.link.v1 import link_pb2 as link
 from midshift.link.v1 import link_pb2_grpc
 
@@ -50,6 +60,7 @@ class Memory:
         self.dirty = True
         self.row = {
             "ring": str(uuid.uuid4()),
+            "identity": None,  # {key_pem, certificate_pem, authority_pem, expires_unix_s}
             "session": None,  # {epoch, secret, store_id}
             "applied_work": 0,
             "applied_policy": 0,
@@ -73,7 +84,8 @@ class Memory:
         if not self.dirty:
             return
         new = self.path.with_suffix(".new")
-        with open(new, "w") as file:
+        # Its key is in there.
+        with open(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
             json.dump(self.row, file)
             file.flush()
             os.fsync(file.fileno())
@@ -91,11 +103,78 @@ class Memory:
         self.dirty = True
 
 
+class Identity:
+    """Who this machine is at its site: a key that never leaves it, and a certificate of that key for some days."""
+
+    CERTIFICATE_LIFE_S = 7 * 24 * 3600
+
+    def __init__(self, args: argparse.Namespace, memory: Memory) -> None:
+        self.server, self.robot_id, self.memory = args.server, args.robot_id, memory
+        if args.ca and not memory["identity"]:
+            if not args.enroll:
+                sys.exit(f"not enrolled: run `midshift robot enroll {args.robot_id}` and give its line with --enroll")
+            self._enrol(args.ca.read_bytes(), args.enroll)
+
+    def channel(self) -> grpc.Channel:
+        """A new connection, on which this machine shows who it is; in plain text where the site has no login."""
+        options = [("grpc.enable_retries", 0), ("grpc.use_local_subchannel_pool", 1)]
+        mine = self.memory["identity"]
+        if not mine:
+            return grpc.insecure_channel(self.server, options)
+        if time.time() > mine["expires_unix_s"] - self.CERTIFICATE_LIFE_S / 2:
+            self._renew(mine, options)
+        return grpc.secure_channel(self.server, self._shown(self.memory["identity"]), options)
+
+    @staticmethod
+    def _shown(mine: dict) -> grpc.ChannelCredentials:
+        return grpc.ssl_channel_credentials(*(mine[name].encode() for name in ("authority_pem", "key_pem", "certificate_pem")))
+
+    @staticmethod
+    def _request(key: ec.EllipticCurvePrivateKey) -> str:
+        """A signing request. Names are the site's to give."""
+        request = x509.CertificateSigningRequestBuilder(x509.Name([])).sign(key, hashes.SHA256())
+        return request.public_bytes(serialization.Encoding.PEM).decode()
+
+    def _enrol(self, authority_pem: bytes, line: str) -> None:
+        secret, pin = line.rsplit(".", 1)
+        spki = (serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
+        digest = hashes.Hash(hashes.SHA256())
+        digest.update(x509.load_pem_x509_certificate(authority_pem).public_key().public_bytes(*spki))
+        if digest.finalize().hex() != pin:
+            sys.exit("the file of --ca is not the root of the site that the line of --enroll came from")
+        key = ec.generate_private_key(ec.SECP256R1())
+        pem = (serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+        asked = enrolment.EnrolRequest(robot_id=self.robot_id, secret=secret, request_pem=self._request(key))
+        with grpc.secure_channel(self.server, grpc.ssl_channel_credentials(authority_pem)) as channel:
+            answer = enrolment_service_pb2_grpc.EnrolmentServiceStub(channel).Enrol(asked, timeout=10)
+        self._keep(key.private_bytes(*pem).decode(), answer)
+
+    def _renew(self, mine: dict, options: list) -> None:
+        key = serialization.load_pem_private_key(mine["key_pem"].encode(), password=None)
+        asked = enrolment.RenewCertificateRequest(robot_id=self.robot_id, request_pem=self._request(key))
+        try:
+            with grpc.secure_channel(self.server, self._shown(mine), options) as channel:
+                stub = enrolment_service_pb2_grpc.EnrolmentServiceStub(channel)
+                self._keep(mine["key_pem"], stub.RenewCertificate(asked, timeout=10))
+        except grpc.RpcError as error:
+            # The old one is good for days.
+            say("not renewed:", error.code().name, error.details())
+
+    def _keep(self, key_pem: str, answer) -> None:
+        self.memory["identity"] = {
+            "key_pem": key_pem,
+            "certificate_pem": answer.certificate_pem,
+            "authority_pem": answer.authority_pem,
+            "expires_unix_s": answer.expire_time.seconds,
+        }
+        self.memory.save()
+
+
 class Session:
     """One stream. What comes down, and its end (None), goes into `inbox` with this session."""
 
-    def __init__(self, server: str, hello: link.Hello, inbox: queue.Queue) -> None:
-        self.channel = grpc.insecure_channel(server, [("grpc.enable_retries", 0), ("grpc.use_local_subchannel_pool", 1)])
+    def __init__(self, channel: grpc.Channel, hello: link.Hello, inbox: queue.Queue) -> None:
+        self.channel = channel
         self.up: queue.Queue = queue.Queue(64)
         self.up.put(link.SessionRequest(hello=hello))
         self.call = link_pb2_grpc.LinkServiceStub(self.channel).Session(iter(self.up.get, None))
@@ -130,6 +209,7 @@ class Robot:
         self.boot_id = str(uuid.uuid4())
         waypoint, x_mm, y_mm = args.at
         self.memory = Memory(args.data, [waypoint, int(x_mm), int(y_mm)])
+        self.identity = Identity(args, self.memory)
         self.inbox: queue.Queue = queue.Queue()
         self.session: Session | None = None
         self.dial_at_ms = 0.0
@@ -245,7 +325,7 @@ class Robot:
             next_seq = self.memory["produced"] + 1
             hello.lanes.add(lane=EVENT, first_seq=min(kept, default=next_seq), next_seq=next_seq)
         self.memory.save()
-        self.session = Session(self.args.server, hello, self.inbox)
+        self.session = Session(self.identity.channel(), hello, self.inbox)
 
     def lost(self, why: str, at_least_ms: float = 0) -> None:
         say("session lost:", why)
@@ -737,6 +817,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--server", required=True)
     parser.add_argument("--robot-id", required=True)
+    parser.add_argument("--ca", type=pathlib.Path, help="the site's root, PEM; without it everything is plain text")
+    parser.add_argument("--enroll", help="what `midshift robot enroll` printed, needed once")
     parser.add_argument("--data", required=True, type=pathlib.Path)
     parser.add_argument("--journal", required=True, type=pathlib.Path)
     parser.add_argument("--at", required=True, nargs=3, metavar=("WAYPOINT", "X_MM", "Y_MM"))

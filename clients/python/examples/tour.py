@@ -70,7 +70,7 @@ def rollout(midshift: Client, robot_id: str, bundle: str) -> None:
 
 def main() -> None:
     sys.stdout.reconfigure(line_buffering=True)
-    with Client(sys.argv[1]) as midshift:
+    with Client.from_environment(sys.argv[1]) as midshift:
         bad_request(midshift)
         transport(midshift)
         if len(sys.argv) > 3:

@@ -15,7 +15,7 @@ from midshift_client import Client, DeadlineExceeded
 def main() -> None:
     sys.stdout.reconfigure(line_buffering=True)
     flat = task_pb2.FlatTask(task_type="transport", to_waypoint="B03", timeout_seconds=600)
-    with Client(sys.argv[1]) as midshift:
+    with Client.from_environment(sys.argv[1]) as midshift:
         task = midshift.submit(flat=flat, request_id="endure-python")
         ended = []
         waiting = threading.Thread(target=lambda: ended.append(midshift.wait(task.task_id, timeout_s=120)), daemon=True)

@@ -7,7 +7,7 @@ import grpc
 from google.protobuf import any_pb2, duration_pb2
 from google.rpc import error_details_pb2, status_pb2
 from grpc_status import rpc_status
-from midshift_client import InvalidRequest, MidshiftError, Overloaded, Unavailable, Violation, error_of, service_config
+from midshift_client import Client, InvalidRequest, MidshiftError, Overloaded, Unavailable, Violation, error_of, service_config
 
 
 class Failed(grpc.RpcError):
@@ -68,6 +68,12 @@ class Retries(unittest.TestCase):
         self.assertIn("SubmitTask", named)
         self.assertNotIn("SubmitTasks", named)
         self.assertEqual([rule["retryPolicy"]["retryableStatusCodes"] for rule in rules], [["UNAVAILABLE"]])
+
+
+class SignIn(unittest.TestCase):
+    def test_a_token_goes_to_nobody_in_plain_text(self):
+        with self.assertRaisesRegex(ValueError, "whose root is not known"):
+            Client("127.0.0.1:1", token="mst.a.b")
 
 
 if __name__ == "__main__":

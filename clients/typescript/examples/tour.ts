@@ -8,7 +8,7 @@
 
 import { RolloutPhase, RolloutStep } from "../gen/midshift/ota/v1/rollout_pb.js";
 import { TaskState } from "../gen/midshift/task/v1/task_pb.js";
-import { Client, MidshiftError, status } from "../src/index.js";
+import { Client, fromEnvironment, MidshiftError, status } from "../src/index.js";
 
 async function transport(midshift: Client): Promise<void> {
   const flat = { taskType: "transport", fromWaypoint: "A01", toWaypoint: "B03", itemSku: "SKU-88231", timeoutSeconds: 600 };
@@ -61,7 +61,7 @@ async function rollout(midshift: Client, robotId: string, bundle: string): Promi
 
 const [server, robotId, bundle] = process.argv.slice(2);
 if (!server) throw new Error("usage: tour SERVER [ROBOT BUNDLE]");
-const midshift = new Client(server);
+const midshift = new Client(server, fromEnvironment());
 try {
   await badRequest(midshift);
   await transport(midshift);

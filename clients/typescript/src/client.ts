@@ -1,7 +1,7 @@
 /** The connection, the calls that people make most, and the two watches that outlive a restart of the server. */
 
 import { type MessageInitShape } from "@bufbuild/protobuf";
-import { Client as Connection, credentials, status } from "@grpc/grpc-js";
+import { Client as Connection, type ChannelCredentials, credentials, Metadata, status } from "@grpc/grpc-js";
 import { randomUUID } from "node:crypto";
 import { readFileSync } from "node:fs";
 import { setTimeout as sleep } from "node:timers/promises";
@@ -43,6 +43,35 @@ class Pause {
   }
 }
 
+/** Whom a client believes and who it is. */
+export interface SignIn {
+  /** The site's root, PEM. Without it the client speaks plain text, as `midshift dev` does, and takes no token. */
+  authorityPem?: Buffer | undefined;
+  /** One that `midshift token create` printed. Without it: nobody. */
+  token?: string | undefined;
+}
+
+/** Signed in as the command line is: by the file that MIDSHIFT_CA names, and MIDSHIFT_TOKEN. Neither is set: plain text. */
+export function fromEnvironment(): SignIn {
+  const { MIDSHIFT_CA: authority, MIDSHIFT_TOKEN: token } = process.env;
+  return { authorityPem: authority ? readFileSync(authority) : undefined, token: token || undefined };
+}
+
+function channelCredentials({ authorityPem, token }: SignIn): ChannelCredentials {
+  if (!authorityPem) {
+    if (token) throw new Error("a token goes to no server whose root is not known: give authorityPem too");
+    return credentials.createInsecure();
+  }
+  const tls = credentials.createSsl(authorityPem);
+  if (!token) return tls;
+  const bearer = new Metadata();
+  bearer.set("authorization", `Bearer ${token}`);
+  return credentials.combineChannelCredentials(
+    tls,
+    credentials.createFromMetadataGenerator((_, done) => done(null, bearer)),
+  );
+}
+
 /** One server. Close it when it is not needed any more. */
 export class Client {
   private readonly connection: Connection;
@@ -53,8 +82,8 @@ export class Client {
   readonly rollouts: Stubs<typeof RolloutService>;
 
   /** `server` is host:port. Connects when it is used. */
-  constructor(server: string) {
-    this.connection = new Connection(server, credentials.createInsecure(), {
+  constructor(server: string, signIn: SignIn = {}) {
+    this.connection = new Connection(server, channelCredentials(signIn), {
       "grpc.service_config": serviceConfig(),
       "grpc.enable_retries": 1,
       // A server that is gone without a word is noticed within 40 s, also while nothing but a watch is open.

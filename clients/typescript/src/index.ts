@@ -3,7 +3,7 @@
  * Messages are in `gen/midshift/<noun>/v1`, as protoc-gen-es makes them.
  */
 
-export { Client, ROLLOUT_ENDED, serviceConfig, TASK_ENDED } from "./client.js";
+export { Client, fromEnvironment, ROLLOUT_ENDED, serviceConfig, type SignIn, TASK_ENDED } from "./client.js";
 export { DOMAIN, errorOf, MidshiftError, type Violation } from "./errors.js";
 export { type CallOptions, DEADLINE_MS, type Stubs, stubs } from "./stubs.js";
 export { status } from "@grpc/grpc-js";

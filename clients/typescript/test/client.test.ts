@@ -5,7 +5,7 @@ import { BadRequest, ErrorInfo, RequestInfo, RetryInfo } from "nice-grpc-error-d
 import { Status } from "nice-grpc-error-details/lib/proto/google/rpc/status.js";
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { errorOf, serviceConfig } from "../src/index.js";
+import { Client, errorOf, serviceConfig } from "../src/index.js";
 
 function failed(code: status, details: string, ...said: [string, Uint8Array][]): ServiceError {
   const metadata = new Metadata();
@@ -48,4 +48,8 @@ test("only what may be sent again is", () => {
   const named = rules.flatMap((rule) => rule.name.map(({ method }) => method));
   assert.ok(named.includes("SubmitTask") && !named.includes("SubmitTasks"));
   assert.deepEqual(rules.map((rule) => rule.retryPolicy.retryableStatusCodes), [["UNAVAILABLE"]]);
+});
+
+test("a token goes to nobody in plain text", () => {
+  assert.throws(() => new Client("127.0.0.1:1", { token: "mst.a.b" }), /whose root is not known/);
 });

@@ -8,10 +8,10 @@
 import { once } from "node:events";
 import { RolloutPhase } from "../gen/midshift/ota/v1/rollout_pb.js";
 import { TaskState } from "../gen/midshift/task/v1/task_pb.js";
-import { Client, MidshiftError, status } from "../src/index.js";
+import { Client, fromEnvironment, MidshiftError, status } from "../src/index.js";
 
 const [server, rolloutId] = process.argv.slice(2) as [string, string];
-const midshift = new Client(server);
+const midshift = new Client(server, fromEnvironment());
 const flat = { taskType: "transport", toWaypoint: "B03", timeoutSeconds: 600 };
 const submit = (deadlineMs: number) => midshift.submit({ requestId: "endure-typescript", body: { case: "flat", value: flat } }, { deadlineMs });
 async function lastPhase(): Promise<RolloutPhase | undefined> {

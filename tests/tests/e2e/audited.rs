@@ -1,6 +1,6 @@
 //! The audit as its reader has it: what was asked for stands there with who asked, and what somebody changes in the database shows.
 
-use crate::harness::{Server, folder, midshift, until};
+use crate::harness::{Server, command, folder, until};
 use anyhow::{Context, bail, ensure};
 use serde_json::Value;
 use std::path::Path;
@@ -25,7 +25,8 @@ fn sql(file: &Path, statements: &[&str]) -> anyhow::Result<()> {
 }
 
 fn call(server: &Server, arguments: &[&str]) -> anyhow::Result<Output> {
-    let output = Command::new(midshift()?).args(arguments).args(["--server", &server.address.to_string()]).output();
+    let address = server.address.to_string();
+    let output = command(&[arguments, &["--server", &address]].concat())?.output();
     output.with_context(|| format!("calling {arguments:?}"))
 }
 
@@ -81,7 +82,7 @@ async fn what_was_asked_for_stands_in_the_audit_and_an_export_of_it_holds_withou
     let dir = folder()?;
     let mut server = Server::start(dir.path()).await?;
     decide(&server)?;
-    assert_eq!(actions(&server, &[])?, ["task.cancel", "task.submit", "task.submit", "task.submit"]);
+    assert_eq!(actions(&server, &["--service", "task"])?, ["task.cancel", "task.submit", "task.submit", "task.submit"]);
     assert_eq!(actions(&server, &["--subject", "task:T1"])?, ["task.cancel", "task.submit"]);
     assert_eq!(actions(&server, &["--action", "task.c", "--since", "1h"])?, ["task.cancel"]);
     assert_eq!(actions(&server, &["--actor", "nobody"])?, [""; 0]);

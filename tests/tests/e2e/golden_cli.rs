@@ -3,7 +3,7 @@
 //! What differs from run to run (times, etags, positions in a log) stands there as its kind. Of a stream the first documents stand there.
 
 use crate::engine::fresh_store;
-use crate::harness::{Running, channel, free_port, midshift, until};
+use crate::harness::{Running, channel, first_sign_in, free_port, midshift, sign_in, until};
 use crate::room::{LIMIT, Room};
 use anyhow::Context;
 use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
@@ -72,6 +72,9 @@ impl Transcript {
         let mut command = Command::new("sh");
         command.args(["-c", "ulimit -n 1024 && exec \"$0\" \"$@\""]).arg(&self.program).args(arguments);
         command.env("MIDSHIFT_SERVER", &self.server).env_remove("NO_COLOR").current_dir(&self.dir);
+        if let Ok(address) = self.server.parse() {
+            sign_in(&mut command, address);
+        }
         command
     }
 
@@ -201,9 +204,10 @@ async fn releases(room: &Room, t: &mut Transcript) -> anyhow::Result<()> {
     let address = free_port()?;
     let mut command = Command::new(&t.program);
     command.env("MIDSHIFT_NO_STOP", "true");
-    command.args(["serve", "--insecure", "--data", "served", "--ota-keys", "keys", "--listen", &address.to_string()]);
-    command.args(["--site", "site.toml"]).args(fresh_store()?);
+    command.args(["serve", "--data", "served", "--ota-keys", "keys", "--listen", &address.to_string()]);
+    command.args(["--site", "site.toml", "--first-token-file", "served-token"]).args(fresh_store()?);
     let _serve = Running::start(command.current_dir(&t.dir), &t.dir.join("serve.log"))?;
+    first_sign_in(address, &t.dir.join("served"), &t.dir.join("served-token")).await?;
     until("the server of software", LIMIT, || async {
         let mut client = BundleServiceClient::new(channel(address)?);
         Ok(client.list_bundles(ListBundlesRequest::default()).await.ok().map(|_| ()))
@@ -240,7 +244,7 @@ async fn rollouts(room: &Room, t: &mut Transcript, address: SocketAddr) -> anyho
     let said = ["--reason", "looked at it"];
     t.note(&["rollout", "ls"])?;
     t.note(&[&create[..], &["--dry-run"]].concat())?;
-    let _robot = room.robot("r2", "park-b", address, &[])?;
+    let _robot = room.robot("r2", "park-b", address, &[]).await?;
     let client = RolloutServiceClient::new(channel(address)?);
     until("a robot whose software is known", LIMIT, || async {
         let software = client.clone().list_robot_software(ListRobotSoftwareRequest::default()).await?.into_inner();
@@ -342,7 +346,7 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
         server: room.server.address.to_string(),
         text: String::new(),
     };
-    let robot = room.robot("r1", "park-a", room.server.address, &[])?;
+    let robot = room.robot("r1", "park-a", room.server.address, &[]).await?;
     room.until_held("park-a", "r1", true).await?;
     room.until_it_obeys("r1").await?;
 

@@ -172,6 +172,11 @@ fn known(address: SocketAddr) -> Option<Known> {
     KNOWN.lock().unwrap_or_else(PoisonError::into_inner).get(&address).cloned()
 }
 
+/// The file with the root of the site at `address`.
+pub fn authority(address: SocketAddr) -> anyhow::Result<PathBuf> {
+    known(address).map(|site| site.authority).with_context(|| format!("{address} has no login"))
+}
+
 /// Whether the site at `address` has TLS and login.
 pub fn has_login(address: SocketAddr) -> bool {
     known(address).is_some()
@@ -213,6 +218,27 @@ pub fn second(arguments: &[&str]) -> anyhow::Result<Command> {
     Ok(command)
 }
 
+/// Waits for the first token of a new site with this data, and remembers the site: whoever asks at `address` is signed in from now on.
+pub async fn first_sign_in(address: SocketAddr, data: &Path, token: &Path) -> anyhow::Result<()> {
+    let token = until("the first token", Duration::from_secs(30), async || {
+        let token = std::fs::read_to_string(token).unwrap_or_default();
+        Ok(token.ends_with('\n').then(|| token.trim().to_owned()))
+    })
+    .await?;
+    let authority = data.join("identity/ca.pem");
+    let way = Way::secure(&address.to_string(), &std::fs::read_to_string(&authority)?, Some(&token))?;
+    let identity = IdentityServiceClient::new(way.lazy());
+    let grants = vec!["ota-approver".to_owned()];
+    let request = CreateTokenRequest { name: "second".to_owned(), grants, valid_seconds: 86_400 };
+    let second = until("a second token", Duration::from_secs(30), || {
+        let (mut identity, request) = (identity.clone(), request.clone());
+        async move { Ok(identity.create_token(request).await.ok().map(|made| made.into_inner().secret)) }
+    })
+    .await?;
+    KNOWN.lock().unwrap_or_else(PoisonError::into_inner).insert(address, Known { authority, token, second, way });
+    Ok(())
+}
+
 /// A `midshift serve` on a data directory and a store, which can be killed and started again.
 pub struct Server {
     /// Where it listens.
@@ -223,7 +249,7 @@ pub struct Server {
 }
 
 impl Server {
-    /// Starts it and waits until it answers.
+    /// Starts it with TLS and login, and waits until it answers; this program is signed in and may do everything.
     pub async fn start(dir: &Path) -> anyhow::Result<Self> {
         Self::start_on(dir, DEMO).await
     }
@@ -231,29 +257,19 @@ impl Server {
     pub async fn start_on(dir: &Path, site: &str) -> anyhow::Result<Self> {
         Self::start_with(dir, site, &[]).await
     }
-    /// With TLS and login; this program is signed in and may do everything.
-    pub async fn secure(dir: &Path, flags: &[&str]) -> anyhow::Result<Self> {
-        let token = dir.join("token").display().to_string();
-        let of_one_machine = ["--connections-per-address", "16000", "--requests-per-second", "100000"];
-        Self::begin(dir, DEMO, &[&of_one_machine[..], &["--first-token-file", &token], flags].concat()).await
-    }
-    /// With more flags of `serve`, in plain text. A store that they name is the test's own; else it is a new one of the engine that the tests run on.
+    /// With more flags of `serve`. A store that they name is the test's own; else it is a new one of the engine that the tests run on.
     pub async fn start_with(dir: &Path, site: &str, flags: &[&str]) -> anyhow::Result<Self> {
-        Self::begin(dir, site, &[&["--insecure"], flags].concat()).await
-    }
-    async fn begin(dir: &Path, site: &str, flags: &[&str]) -> anyhow::Result<Self> {
         std::fs::write(dir.join(SITE_FILE), site)?;
-        let address = free_port()?;
-        let mut flags: Vec<String> = flags.iter().map(|flag| (*flag).to_owned()).collect();
+        let (address, token) = (free_port()?, dir.join("token").display().to_string());
+        let of_one_machine = ["--connections-per-address", "16000", "--requests-per-second", "100000"];
+        let flags = [&of_one_machine[..], &["--first-token-file", &token], flags].concat();
+        let mut flags: Vec<String> = flags.into_iter().map(str::to_owned).collect();
         if !flags.iter().any(|flag| flag == "--store") {
             flags.extend(fresh_store()?);
         }
         let running = Self::run(dir, address, &flags)?;
-        let is_secure = !flags.iter().any(|flag| flag == "--insecure");
         let server = Self { address, dir: dir.to_owned(), flags, running };
-        if is_secure {
-            server.sign_in().await?;
-        }
+        server.sign_in().await?;
         server.answers().await?;
         Ok(server)
     }
@@ -268,29 +284,9 @@ impl Server {
         command.arg("--site").arg(dir.join(SITE_FILE)).args(flags);
         Running::start(&mut command, &dir.join("server.log"))
     }
-    /// Waits for the first token of the new site, and remembers the site.
     async fn sign_in(&self) -> anyhow::Result<()> {
-        let (authority, token) = (self.data().join("identity/ca.pem"), self.dir.join("token"));
-        let token = until("the first token", Duration::from_secs(30), async || {
-            let token = std::fs::read_to_string(&token).unwrap_or_default();
-            Ok(token.ends_with('\n').then(|| token.trim().to_owned()))
-        });
-        let token =
-            token.await.with_context(|| std::fs::read_to_string(self.dir.join("server.log")).unwrap_or_default())?;
-        let way = Way::secure(&self.address.to_string(), &std::fs::read_to_string(&authority)?, Some(&token))?;
-        let identity = IdentityServiceClient::new(way.lazy());
-        let grants = vec!["ota-approver".to_owned()];
-        let request = CreateTokenRequest { name: "second".to_owned(), grants, valid_seconds: 86_400 };
-        let second = until("a second token", Duration::from_secs(30), || {
-            let (mut identity, request) = (identity.clone(), request.clone());
-            async move { Ok(identity.create_token(request).await.ok().map(|made| made.into_inner().secret)) }
-        })
-        .await?;
-        KNOWN
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .insert(self.address, Known { authority, token, second, way });
-        Ok(())
+        let said = || std::fs::read_to_string(self.dir.join("server.log")).unwrap_or_default();
+        first_sign_in(self.address, &self.data(), &self.dir.join("token")).await.with_context(said)
     }
     /// SIGKILL and a new start on the same data.
     pub async fn kill_and_restart(&mut self) -> anyhow::Result<()> {

@@ -39,7 +39,7 @@ struct LateOffer {
 async fn late_offer(bugs: &[SeededBug]) -> anyhow::Result<LateOffer> {
     let room = Room::open().await?;
     let proxy = Proxy::before(room.server.address).await?;
-    let robot = room.robot("r1", "park-a", proxy.address, bugs)?;
+    let robot = room.robot("r1", "park-a", proxy.address, bugs).await?;
     room.until_held("park-a", "r1", true).await?;
     proxy.hold(true);
     room.submit("T1", "r1").await?;
@@ -82,10 +82,10 @@ async fn grant_over_a_reconnect(bugs: &[SeededBug]) -> anyhow::Result<usize> {
     let room = Room::open().await?;
     let proxy = Proxy::before(room.server.address).await?;
     // A robot in somebody's hands stands in the goal, so the other waits before the corridor.
-    let blocker = room.robot("r1", "B", room.server.address, &[])?;
+    let blocker = room.robot("r1", "B", room.server.address, &[]).await?;
     blocker.body.inject(room.clock.now().site, Injected::Manual(SiteDuration::from_secs(3_600)));
     room.until_held("B", "r1", true).await?;
-    let robot = room.robot("r2", "park-a", proxy.address, bugs)?;
+    let robot = room.robot("r2", "park-a", proxy.address, bugs).await?;
     room.submit("T1", "r2").await?;
     until("r2 stands before the corridor", LIMIT, || async {
         let inside = robot.body.lock().inside().iter().any(|p| p.as_str() == "wait-a");

@@ -79,7 +79,7 @@ async fn killed_at_work(mut postgres: Option<PostgresServer>) -> anyhow::Result<
     let site = text::parse(DEMO)?;
     let url = postgres.as_ref().map(PostgresServer::database);
     let flags: Vec<&str> = url.iter().flat_map(|url| ["--store", url.as_str()]).collect();
-    let mut server = Server::secure(dir.path(), &flags).await?;
+    let mut server = Server::start_with(dir.path(), DEMO, &flags).await?;
     let mut robots = Robots::start(dir.path(), server.address, server.address, &site, ROBOTS).await?;
     submit(server.address, &site, seed, TASKS).await?;
     let mut kills: Vec<(usize, bool)> =

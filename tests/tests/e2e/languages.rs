@@ -5,7 +5,8 @@
 
 use crate::clients::{grpcurl_passes, stock_python_passes};
 use crate::factory::Factory;
-use crate::harness::{Running, Server, channel, tasks, tool, until};
+use crate::harness::{Running, Server, authority, channel, sign_in, tasks, tool, until};
+use crate::robots::enrolment;
 use crate::rolled_out::{call, done};
 use crate::room::LIMIT;
 use crate::stack::Stack;
@@ -81,11 +82,14 @@ impl Language {
 }
 
 /// A robot in Python that knows nothing of midshift but the .proto files, and stands in `park-a` of the corridor.
-pub fn minimal_robot(name: &str, server: &str, dir: &Path) -> anyhow::Result<Command> {
+pub async fn minimal_robot(name: &str, server: SocketAddr, dir: &Path) -> anyhow::Result<Command> {
+    let (line, authority) = (enrolment(server, name).await?.context("a site with a login")?, authority(server)?);
+    let server = server.to_string();
     let (memory, journal) = (dir.join("robot.json").display().to_string(), dir.join("effects").display().to_string());
-    let arguments = ["--server", server, "--robot-id", name, "--data", &memory, "--journal", &journal];
+    let arguments = ["--server", &server, "--robot-id", name, "--data", &memory, "--journal", &journal];
     let mut command = Language::Python.run("examples/minimal_robot.py", &arguments)?;
     command.args(["--at", "park-a", "0", "3000", "--speed-mm-s", "5000", "--act-ms", "1500"]);
+    command.args(["--enroll", &line]).arg("--ca").arg(authority);
     Ok(command)
 }
 
@@ -105,9 +109,9 @@ fn each_client_keeps_its_own_rules() -> anyhow::Result<()> {
         let text = [ran.stdout, ran.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat();
         ensure!(ran.status.success(), "{language:?}: {text}");
         let counted = match language {
-            Language::Python => text.contains("Ran 4 tests"),
-            Language::Go => text.matches("--- PASS").count() == 4,
-            Language::TypeScript => text.contains("# pass 4"),
+            Language::Python => text.contains("Ran 5 tests"),
+            Language::Go => text.matches("--- PASS").count() == 5,
+            Language::TypeScript => text.contains("# pass 5"),
         };
         ensure!(counted, "{language:?} did not run what it should: {text}");
     }
@@ -138,6 +142,7 @@ async fn tours_pass(dir: &Path, address: SocketAddr) -> anyhow::Result<()> {
     for (language, robot) in ALL.into_iter().zip(["rbt-01", "rbt-02", "rbt-03"]) {
         let log = dir.join(format!("{language:?}.log"));
         let mut command = language.tour()?;
+        sign_in(&mut command, address);
         tours.push((Running::start(command.args([&server, robot, "walk-1.5.0"]), &log)?, log, robot));
     }
     for (mut tour, log, robot) in tours {
@@ -234,7 +239,9 @@ async fn endurance_passes(dir: &Path, mut behind: Behind) -> anyhow::Result<()> 
     let logs = ALL.map(|language| dir.join(format!("{language:?}.log")));
     let mut clients = Vec::new();
     for (language, log) in ALL.into_iter().zip(&logs) {
-        let (running, ear) = Running::start_listening(language.endure()?.args([&address, "walk-1.5.0"]), log)?;
+        let mut command = language.endure()?;
+        sign_in(&mut command, behind.address());
+        let (running, ear) = Running::start_listening(command.args([&address, "walk-1.5.0"]), log)?;
         clients.push((running, ear, log));
     }
     all_said(&logs, "submitted ").await?;

@@ -1,6 +1,7 @@
 //! A robot as it is started in earnest: `midshift launcher` keeps `midshift agent run` running from a folder of sets.
 
 use crate::harness::{Running, Server, midshift, until};
+use crate::robots::enrolment;
 use crate::room::LIMIT;
 use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::sets::{Sets, Wanted};
@@ -121,10 +122,13 @@ impl Machine {
         Ok(store.commit(&[Op::Software(Box::new(row))]).await?)
     }
     /// The launcher with an agent that dials `server`; what the robot came with ends at once and well.
-    fn launch(&self, server: &str) -> anyhow::Result<Launched> {
+    fn launch(&self, server: &str, enrolment: Option<&str>) -> anyhow::Result<Launched> {
         let midshift = midshift()?;
         let script = format!("test $MIDSHIFT_SET = {FACTORY} || exec \"$0\" \"$@\"");
         let mut command = Command::new(&midshift);
+        if let Some(secret) = enrolment {
+            command.env("MIDSHIFT_ENROLL", secret);
+        }
         command.arg("launcher").arg("--record").arg(self.path("tries")).arg("--sets").arg(self.path("sets"));
         command.args(["--hang", HANG_S, "--", "sh", "-c", &script]).arg(&midshift);
         command.args(["agent", "run", "--robot-id", "rbt-01", "--no-faults", "--server", server]);
@@ -153,7 +157,7 @@ async fn put_away(behaviour: &str) -> anyhow::Result<String> {
     machine.switch(|switch| switch.try_out(&name))?;
     machine.remember_probation(&set).await?;
     // Nobody listens there: what a set does to its program needs no server.
-    let mut launched = machine.launch("127.0.0.1:1")?;
+    let mut launched = machine.launch("127.0.0.1:1", None)?;
     let code = launched.0.ends().await?;
     let (said, switch) = (text_of(&machine.log()), record(&machine)?);
     anyhow::ensure!(code == Some(0), "the launcher ended with {code:?}: {said}");
@@ -186,7 +190,8 @@ async fn a_launched_robot_says_the_version_of_the_set_it_runs() -> anyhow::Resul
         switch.try_out(&set.id().to_string());
         switch.commit();
     })?;
-    let _launched = machine.launch(&server.address.to_string())?;
+    let _launched =
+        machine.launch(&server.address.to_string(), enrolment(server.address, "rbt-01").await?.as_deref())?;
     let version = until("the robot's version", LIMIT, || async {
         let mut client = TelemetryServiceClient::new(server.channel()?);
         let asked = client.get_robot(GetRobotRequest { robot_id: "rbt-01".to_owned() }).await;

@@ -4,6 +4,8 @@
 //! `strace` stops the agent after each call that makes its ledger or its switch record durable; what the ledger says then decides whether it is killed.
 
 use crate::harness::{Running, Server, midshift, until};
+use crate::robots::enrolment;
+use crate::rolled_out::{begin_rollout, call, done};
 use anyhow::{Context, ensure};
 use midshift::clock::clock;
 use midshift::samples::{Signer, make};
@@ -24,7 +26,7 @@ use std::ffi::OsString;
 use std::fs;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Command;
 use std::sync::Mutex;
 use std::time::Duration;
 use tokio::time::Instant;
@@ -67,16 +69,6 @@ impl Cut {
     fn goes_back(self) -> bool {
         BACK.contains(&self.step)
     }
-}
-
-fn call(arguments: &[&str]) -> anyhow::Result<Output> {
-    Command::new(midshift()?).args(arguments).output().context("calling midshift")
-}
-
-fn done(arguments: &[&str]) -> anyhow::Result<()> {
-    let output = call(arguments)?;
-    ensure!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
-    Ok(())
 }
 
 /// A robot and its server. All of it goes with this.
@@ -126,6 +118,9 @@ impl Station {
         command.args(["agent", "run", "--robot-id", "rbt-01", "--no-faults", "--server", &address]);
         command.arg("--data").arg(robot.join("data")).arg("--sets").arg(robot.join("sets"));
         command.arg("--trust").arg(robot.join("trust.json")).process_group(0);
+        if let Some(secret) = enrolment(server.address, "rbt-01").await? {
+            command.env("MIDSHIFT_ENROLL", secret);
+        }
         let launcher = Running::start(&mut command, &robot.join("log"))?;
         let this = Self { home, server, launcher, updates: 0 };
         until("the robot is known", LIMIT, async || {
@@ -189,8 +184,8 @@ impl Station {
         let bundle = format!("walk-{version}");
         let soak = if cut.goes_back() { "1h" } else { "0s" };
         let all = ["--bundle", &bundle, "--waves", "rest", "--allow-full-push", "--soak", soak, "--probation", "1s"];
-        let start = ["--exposure-tasks", "0", "--start"];
-        done(&[&["rollout", "create", "--server", &address, &id][..], &all, &start].concat())?;
+        done(&[&["rollout", "create", "--server", &address, &id, "--exposure-tasks", "0"][..], &all].concat())?;
+        begin_rollout(&address, &id)?;
         let starts = self.killed_at(cut, version, &id).await?;
         // What is started now is whole.
         let name = until("the launcher to start the agent again", LIMIT, async || {

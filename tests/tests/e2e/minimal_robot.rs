@@ -76,7 +76,7 @@ async fn a_robot_from_the_proto_files_alone_outlives_kills_and_a_cut_and_does_no
     let mut room = Room::open_on(&CORRIDOR.replace("speed_limit_mm_s = 1500", "speed_limit_mm_s = 5000")).await?;
     let (dir, proxy) = (&room.dir.path().to_owned(), Proxy::before(room.server.address).await?);
     let log = dir.join("robot.log");
-    let mut command = minimal_robot(NAME, &proxy.address.to_string(), dir)?;
+    let mut command = minimal_robot(NAME, proxy.address, dir).await?;
     let mut robot = Running::start(&mut command, &log)?;
     room.until_held("park-a", NAME, true).await?;
 
@@ -145,7 +145,7 @@ async fn every_event_is_there_once(room: &Room) -> anyhow::Result<()> {
 async fn a_robot_from_the_proto_files_alone_refuses_an_offer_that_lay_in_a_buffer() -> anyhow::Result<()> {
     let room = Room::open_on(&CORRIDOR.replace("speed_limit_mm_s = 1500", "speed_limit_mm_s = 5000")).await?;
     let (dir, proxy) = (room.dir.path(), Proxy::before(room.server.address).await?);
-    let mut command = minimal_robot(NAME, &proxy.address.to_string(), dir)?;
+    let mut command = minimal_robot(NAME, proxy.address, dir).await?;
     let _robot = Running::start(&mut command, &dir.join("robot.log"))?;
     room.until_held("park-a", NAME, true).await?;
     proxy.hold(true);

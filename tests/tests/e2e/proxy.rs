@@ -2,6 +2,7 @@
 //!
 //! Invariant: bytes are delayed, never changed and never reordered; what robots say always passes.
 
+use crate::harness::same_site;
 use std::net::SocketAddr;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
@@ -25,6 +26,7 @@ impl Proxy {
     pub async fn before(server: SocketAddr) -> anyhow::Result<Self> {
         let listener = TcpListener::bind("127.0.0.1:0").await?;
         let address = listener.local_addr()?;
+        same_site(server, address)?;
         let (held, cuts) = (watch::Sender::new(false), watch::Sender::new(0));
         let (hold, cut) = (held.subscribe(), cuts.subscribe());
         let mut accepting = JoinSet::new();

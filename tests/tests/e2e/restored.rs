@@ -136,7 +136,7 @@ async fn drill(engine: Engine) -> anyhow::Result<()> {
     engine.prepare();
     let flags = engine.flags();
     let flags: Vec<&str> = flags.iter().map(String::as_str).collect();
-    let mut server = Server::secure(dir.path(), &flags).await?;
+    let mut server = Server::start_with(dir.path(), DEMO, &flags).await?;
     let robots = Robots::start(dir.path(), server.address, server.address, &site, ROBOTS).await?;
     let before = submit(&server, &site, 1, "before").await?;
     until_done(&server, 2).await?;

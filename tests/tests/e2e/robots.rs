@@ -1,9 +1,13 @@
 //! Robots as programs of their own.
 
 use crate::harness::{Running, channel, has_login, midshift, until};
+use midshift_agent::device::DeviceKey;
+use midshift_agent::enrolment::enrol;
 use midshift_agent::ledger::Ledger;
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::store::Store;
+use midshift_agent::tls::Tls;
+use midshift_core::ids::RobotId;
 use midshift_core::site::Site;
 use midshift_proto::fleet::v1::ListPlacesRequest;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
@@ -155,6 +159,14 @@ impl Robots {
 
 fn robot_id(number: usize) -> String {
     format!("rbt-{:02}", number + 1)
+}
+
+/// How a robot in this process speaks to the site of the server at `address`: enrolled there; none: the site has no login.
+pub async fn enrolled(address: SocketAddr, robot_id: &RobotId) -> anyhow::Result<Option<Tls>> {
+    let Some(secret) = enrolment(address, robot_id.as_str()).await? else { return Ok(None) };
+    let key = DeviceKey::draw();
+    let enrolled = enrol(&address.to_string(), robot_id, &secret.parse()?, &key).await?;
+    Ok(Some(Tls::fixed(enrolled.config(&key)?)))
 }
 
 /// A secret that enrols one machine as this robot; none: the site has no login.

@@ -118,7 +118,7 @@ async fn a_release_reaches_a_robot_and_a_bad_one_goes_back_though_the_server_is_
     let samples = dir.path().join("samples");
     let (folder, keys) = (samples.display().to_string(), samples.join("keys").display().to_string());
     done(&["bundle", "samples", &folder])?;
-    let mut server = Server::secure(dir.path(), &["--ota-keys", &keys]).await?;
+    let mut server = Server::start_with(dir.path(), DEMO, &["--ota-keys", &keys]).await?;
     let address = server.address.to_string();
     let enrolment = enrolment(server.address, "rbt-01").await?;
     let robot =

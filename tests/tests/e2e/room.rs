@@ -1,6 +1,7 @@
 //! A real server on the corridor site, with robots whose agents run in the test's own process.
 
 use crate::harness::{Server, until};
+use crate::robots::enrolled;
 use anyhow::Context;
 use midshift_agent::bugs::{Bugs, SeededBug};
 use midshift_agent::bulk::Bulk;
@@ -61,8 +62,15 @@ impl Room {
     }
 
     /// A robot whose body stands at `start` and whose agent dials `address`.
-    pub fn robot(&self, name: &str, start: &str, address: SocketAddr, bugs: &[SeededBug]) -> anyhow::Result<Robot> {
+    pub async fn robot(
+        &self,
+        name: &str,
+        start: &str,
+        address: SocketAddr,
+        bugs: &[SeededBug],
+    ) -> anyhow::Result<Robot> {
         let robot_id = RobotId::parse(name)?;
+        let tls = enrolled(address, &robot_id).await?;
         let mut config = BodyConfig::new(robot_id.clone(), 1, WaypointId::parse(start)?);
         (config.faults, config.battery_permille, config.drains) = (FaultRates::none(), Some(1_000), false);
         config.pace_permille = 5_000;
@@ -78,9 +86,9 @@ impl Room {
             bugs: Bugs::of(bugs),
             pulse: None,
         };
-        let uri = format!("http://{address}");
-        let bulk = Bulk::new(Arc::new(TcpDial::bulk(&uri, None)?));
-        let lines = Lines { link: Arc::new(TcpDial::new(&uri, None)?), bulk };
+        let uri = format!("https://{address}");
+        let bulk = Bulk::new(Arc::new(TcpDial::bulk(&uri, None)?.with_tls(tls.clone())));
+        let lines = Lines { link: Arc::new(TcpDial::new(&uri, None)?.with_tls(tls)), bulk };
         let (store, clock, witness) = (Box::new(MemoryStore::new()), self.clock.clone(), Box::new(body.clone()));
         let running = async move {
             // Ends with the test.

@@ -141,7 +141,7 @@ pub fn resume(server: &Server, stop_id: &str) -> anyhow::Result<()> {
 async fn a_stopped_fleet_stands_through_every_kill_until_it_is_reset_and_resumed() -> anyhow::Result<()> {
     let dir = folder()?;
     let site: Site = text::parse(DEMO)?;
-    let mut server = Server::secure(dir.path(), &[]).await?;
+    let mut server = Server::start(dir.path()).await?;
     let mut stops = StopServer::start(dir.path(), server.address).await?;
     let (address, stop_address) = (server.address, Some(stops.address));
     let robots = Robots::start_beside(dir.path(), address, address, stop_address, &site, ROBOTS).await?;
@@ -196,7 +196,7 @@ async fn a_stop_that_is_engaged_while_the_database_is_gone_is_recorded_and_holds
     let site: Site = text::parse(DEMO)?;
     let mut postgres = PostgresServer::start();
     let url = postgres.database();
-    let server = Server::secure(dir.path(), &["--store", &url]).await?;
+    let server = Server::start_with(dir.path(), DEMO, &["--store", &url]).await?;
     let stops = StopServer::start(dir.path(), server.address).await?;
     let address = server.address;
     let robots = Robots::start_beside(dir.path(), address, address, Some(stops.address), &site, ROBOTS).await?;

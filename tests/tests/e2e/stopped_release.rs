@@ -44,7 +44,7 @@ async fn a_canary_of_a_bad_release_goes_back_under_a_fleet_stop_and_nobody_moves
     let samples = dir.path().join("samples");
     done(&["bundle", "samples", &samples.display().to_string(), "--config-only"])?;
     let keys = samples.join("keys").display().to_string();
-    let server = Server::secure(dir.path(), &["--ota-keys", &keys]).await?;
+    let server = Server::start_with(dir.path(), DEMO, &["--ota-keys", &keys]).await?;
     let stops = StopServer::start(dir.path(), server.address).await?;
     let address = server.address.to_string();
     let ids: Vec<String> = (1..=ROBOTS).map(|number| format!("rbt-{number:02}")).collect();

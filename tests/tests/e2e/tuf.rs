@@ -2,24 +2,36 @@
 //!
 //! The lies are told by a small server between the two, and on the disk of ours; each is followed by the truth, which is taken.
 
-use crate::harness::{Server, midshift, tool};
+use crate::harness::{Server, command, sign_in, tool};
 use midshift_core::site::DEMO;
 use std::path::Path;
 use std::process::Command;
 
 /// A robot that trusts python-tuf, and a liar: `python robot.py PART SERVER ROOT WORK`.
 const CLIENT: &str = r#"
-import datetime, os, shutil, sys, threading, urllib.error, urllib.request
+import datetime, os, shutil, ssl, sys, threading, urllib.error, urllib.request
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from tuf.api import exceptions
-from tuf.ngclient import Updater
+from tuf.ngclient import FetcherInterface, Updater
 
 part, server, root, work = sys.argv[1:]
 lies = {}
+site = ssl.create_default_context(cafile=os.environ["MIDSHIFT_CA"])
+
+def ask(url):
+    signed_in = {"Authorization": "Bearer " + os.environ["MIDSHIFT_TOKEN"]} if url.startswith(server) else {}
+    with urllib.request.urlopen(urllib.request.Request(url, headers=signed_in), context=site) as answer:
+        return answer.read()
+
+class SignedIn(FetcherInterface):
+    def _fetch(self, url):
+        try:
+            return iter([ask(url)])
+        except urllib.error.HTTPError as error:
+            raise exceptions.DownloadHTTPError(str(error), error.code) from error
 
 def get(name):
-    with urllib.request.urlopen(f"{server}/metadata/{name}") as answer:
-        return answer.read()
+    return ask(f"{server}/metadata/{name}")
 
 class Between(BaseHTTPRequestHandler):
     def do_GET(self):
@@ -27,8 +39,7 @@ class Between(BaseHTTPRequestHandler):
         code, body = 200, lies.get(name)
         if body is None:
             try:
-                with urllib.request.urlopen(server + self.path) as answer:
-                    body = answer.read()
+                body = ask(server + self.path)
             except urllib.error.HTTPError as error:
                 code, body = error.code, b""
         self.send_response(code)
@@ -49,7 +60,8 @@ def client(name, base=server):
         os.makedirs(os.path.join(folder, sub), exist_ok=True)
     with open(root, "rb") as file:
         first = file.read()
-    return Updater(f"{folder}/metadata", f"{base}/metadata/", f"{folder}/targets", f"{base}/targets/", bootstrap=first)
+    return Updater(f"{folder}/metadata", f"{base}/metadata/", f"{folder}/targets", f"{base}/targets/",
+                   fetcher=SignedIn(), bootstrap=first)
 
 def download(updater, name):
     found = updater.get_targetinfo(name)
@@ -111,7 +123,7 @@ elif part == "tampered":
 
 /// Runs the program in `dir` and wants it to succeed.
 fn release(dir: &Path, arguments: &[&str]) -> anyhow::Result<()> {
-    let done = Command::new(midshift()?).args(arguments).current_dir(dir).output()?;
+    let done = command(arguments)?.current_dir(dir).output()?;
     anyhow::ensure!(done.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&done.stderr));
     Ok(())
 }
@@ -135,7 +147,13 @@ fn python(dir: &Path, server: &Server, part: &str) -> anyhow::Result<Vec<String>
     let script = dir.join("robot.py");
     std::fs::write(&script, CLIENT)?;
     let mut command = Command::new(tool("MIDSHIFT_TEST_PYTHON")?);
-    command.arg(&script).args([part, &format!("http://{}", server.address), "repository/metadata/1.root.json", "work"]);
+    command.arg(&script).args([
+        part,
+        &format!("https://{}", server.address),
+        "repository/metadata/1.root.json",
+        "work",
+    ]);
+    sign_in(&mut command, server.address);
     let ran = command.current_dir(dir).output()?;
     anyhow::ensure!(ran.status.success(), "{part}: {}", String::from_utf8_lossy(&ran.stderr));
     Ok(String::from_utf8(ran.stdout)?.lines().map(str::to_owned).collect())

@@ -27,7 +27,11 @@ func main() {
 }
 
 func endure(server, rolloutID string) error {
-	client, err := midshift.New(server)
+	as, err := midshift.FromEnvironment()
+	if err != nil {
+		return err
+	}
+	client, err := midshift.New(server, as)
 	if err != nil {
 		return err
 	}

@@ -31,7 +31,11 @@ func tour(args []string) error {
 	if len(args) != 1 && len(args) != 3 {
 		return errors.New("usage: tour SERVER [ROBOT BUNDLE]")
 	}
-	client, err := midshift.New(args[0])
+	as, err := midshift.FromEnvironment()
+	if err != nil {
+		return err
+	}
+	client, err := midshift.New(args[0], as)
 	if err != nil {
 		return err
 	}

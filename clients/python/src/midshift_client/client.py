@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.resources
+import os
+import pathlib
 import random
 import time
 import uuid
@@ -41,7 +43,12 @@ def service_config() -> str:
     return importlib.resources.files(__package__).joinpath("service_config.json").read_text(encoding="utf-8")
 
 
-def _channel(server: str) -> grpc.Channel:
+def _credentials(authority_pem: bytes, token: str | None) -> grpc.ChannelCredentials:
+    tls = grpc.ssl_channel_credentials(authority_pem)
+    return grpc.composite_channel_credentials(tls, grpc.access_token_call_credentials(token)) if token else tls
+
+
+def _channel(server: str, authority_pem: bytes | None, token: str | None) -> grpc.Channel:
     options = [
         ("grpc.service_config", service_config()),
         ("grpc.enable_retries", 1),
@@ -53,6 +60,10 @@ def _channel(server: str) -> grpc.Channel:
         ("grpc.min_reconnect_backoff_ms", 200),
         ("grpc.max_reconnect_backoff_ms", 5_000),
     ]
+    if authority_pem is not None:
+        return grpc.secure_channel(server, _credentials(authority_pem, token), options)
+    if token:
+        raise ValueError("a token goes to no server whose root is not known: give authority_pem too")
     return grpc.insecure_channel(server, options)
 
 
@@ -74,14 +85,23 @@ class _Pause:
 class Client:
     """One server. Safe to share between threads; close it, or use it in a `with`."""
 
-    def __init__(self, server: str) -> None:
-        """`server` is host:port. Connects when it is used."""
-        self._channel = _channel(server)
+    def __init__(self, server: str, *, authority_pem: bytes | None = None, token: str | None = None) -> None:
+        """`server` is host:port, `authority_pem` the site's root, `token` one that `midshift token create` printed.
+
+        Without a root it speaks plain text, as `midshift dev` does, and takes no token. Connects when it is used.
+        """
+        self._channel = _channel(server, authority_pem, token)
         #: Stubs for everything that has no method here: `call` gives them deadline and typed errors.
         self.tasks = task_service_pb2_grpc.TaskServiceStub(self._channel)
         self.fleet = fleet_service_pb2_grpc.FleetServiceStub(self._channel)
         self.telemetry = telemetry_service_pb2_grpc.TelemetryServiceStub(self._channel)
         self.rollouts = rollout_service_pb2_grpc.RolloutServiceStub(self._channel)
+
+    @classmethod
+    def from_environment(cls, server: str) -> Client:
+        """Signed in as the command line is: by the file that MIDSHIFT_CA names, and MIDSHIFT_TOKEN. Neither is set: plain text."""
+        authority, token = os.environ.get("MIDSHIFT_CA"), os.environ.get("MIDSHIFT_TOKEN")
+        return cls(server, authority_pem=pathlib.Path(authority).read_bytes() if authority else None, token=token)
 
     def __enter__(self) -> Client:
         return self
