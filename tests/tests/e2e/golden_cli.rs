@@ -3,7 +3,7 @@
 //! What differs from run to run (times, etags, positions in a log) stands there as its kind. Of a stream the first documents stand there.
 
 use crate::engine::fresh_store;
-use crate::harness::{Running, channel, first_sign_in, free_port, midshift, sign_in, until};
+use crate::harness::{Running, channel, first_sign_in, free_port, midshift, sign_in, sign_in_second, until};
 use crate::room::{LIMIT, Room};
 use anyhow::Context;
 use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
@@ -63,6 +63,8 @@ struct Transcript {
     program: PathBuf,
     dir: PathBuf,
     server: String,
+    /// Asked by somebody else, who may approve what the first one wrote.
+    is_second: bool,
     text: String,
 }
 
@@ -73,6 +75,7 @@ impl Transcript {
         command.args(["-c", "ulimit -n 1024 && exec \"$0\" \"$@\""]).arg(&self.program).args(arguments);
         command.env("MIDSHIFT_SERVER", &self.server).env_remove("NO_COLOR").current_dir(&self.dir);
         if let Ok(address) = self.server.parse() {
+            let sign_in = if self.is_second { sign_in_second } else { sign_in };
             sign_in(&mut command, address);
         }
         command
@@ -277,8 +280,15 @@ async fn rollouts(room: &Room, t: &mut Transcript, address: SocketAddr) -> anyho
     t.note(&["rollout", "start", "walk-1.5.0"])?;
     t.note(&["rollout", "wait", "walk-1.5.0", "--timeout", "10ms"])?;
 
-    // Begun.
+    // Approved by another than its author, and begun.
+    let approve = ["rollout", "approve", "walk-1.5.0", "--reason", "tried at home"];
     t.note(&[&create[..], &["--start"]].concat())?;
+    t.note(&["rollout", "submit", "walk-1.5.0"])?;
+    t.note(&approve)?;
+    t.is_second = true;
+    t.note(&approve)?;
+    t.is_second = false;
+    t.note(&["rollout", "start", "walk-1.5.0"])?;
     until("the robot fetches", LIMIT, || async {
         let request = ListRolloutRobotsRequest { rollout_id: "walk-1.5.0".to_owned(), ..Default::default() };
         let robots = client.clone().list_rollout_robots(request).await?.into_inner().robots;
@@ -344,6 +354,7 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
         program: midshift()?,
         dir: room.dir.path().to_owned(),
         server: room.server.address.to_string(),
+        is_second: false,
         text: String::new(),
     };
     let robot = room.robot("r1", "park-a", room.server.address, &[]).await?;

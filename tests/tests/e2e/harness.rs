@@ -197,6 +197,14 @@ pub fn sign_in(command: &mut Command, address: SocketAddr) {
     }
 }
 
+/// The same as somebody else, who may approve what the first one wrote.
+pub fn sign_in_second(command: &mut Command, address: SocketAddr) {
+    sign_in(command, address);
+    if let Some(site) = known(address) {
+        command.env("MIDSHIFT_TOKEN", site.second);
+    }
+}
+
 /// The command line with these arguments, signed in to the server that they name.
 pub fn command(arguments: &[&str]) -> anyhow::Result<Command> {
     let mut command = Command::new(midshift()?);
@@ -211,9 +219,8 @@ pub fn command(arguments: &[&str]) -> anyhow::Result<Command> {
 /// The same, signed in as somebody else, who may approve what the first one wrote.
 pub fn second(arguments: &[&str]) -> anyhow::Result<Command> {
     let mut command = command(arguments)?;
-    let named = arguments.iter().skip_while(|a| **a != "--server").nth(1).and_then(|a| a.parse().ok());
-    if let Some(site) = named.and_then(known) {
-        command.env("MIDSHIFT_TOKEN", site.second);
+    if let Some(address) = arguments.iter().skip_while(|a| **a != "--server").nth(1).and_then(|a| a.parse().ok()) {
+        sign_in_second(&mut command, address);
     }
     Ok(command)
 }
