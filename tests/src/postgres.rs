@@ -16,6 +16,8 @@ const PLACES: [&str; 3] = ["/usr/lib/postgresql", "/usr/local/pgsql", "/opt/post
 const SUPERVISOR: &str = "exec 3<&0; \"$@\" 3<&- >>log 2>&1 & server=$!; (read -r _ <&3; kill -QUIT $server) & wait $server; \
      if [ -n \"$REMOVED\" ]; then cd /; rm -rf \"$REMOVED\"; fi";
 const USER: &str = "postgres";
+/// Part of every URL. The server asks nobody for it; no program may write it into its log.
+pub const PASSWORD: &str = "kept-from-every-log";
 
 /// A running server.
 pub struct PostgresServer {
@@ -138,7 +140,7 @@ impl PostgresServer {
 
     /// The URL of a database.
     pub fn url(&self, database: &str) -> String {
-        format!("postgres://{USER}@localhost/{database}?host={}", self.dir.path().display())
+        format!("postgres://{USER}:{PASSWORD}@localhost/{database}?host={}", self.dir.path().display())
     }
 
     /// What a statement answers in a database, as text without ornaments.

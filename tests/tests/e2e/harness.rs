@@ -8,6 +8,7 @@ use midshift_proto::identity::v1::CreateTokenRequest;
 use midshift_proto::identity::v1::identity_service_client::IdentityServiceClient;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::task::v1::{ListTasksRequest, Task, TaskFilter, TaskState};
+use midshift_tests::postgres::PASSWORD;
 use std::collections::BTreeMap;
 use std::future::Future;
 use std::net::{SocketAddr, TcpListener};
@@ -47,15 +48,43 @@ pub fn tool(variable: &str) -> anyhow::Result<PathBuf> {
     Ok(path.into())
 }
 
-/// A program that is killed when the test lets it go.
-pub struct Running(Child);
+/// Names of secrets that this run uses, and what must therefore be in no log.
+static SECRETS: Mutex<BTreeMap<String, &'static str>> = Mutex::new(BTreeMap::new());
+
+/// From now on no program may have written `secret` into its log when it ends.
+pub fn keep_secret(what: &'static str, secret: &str) {
+    SECRETS.lock().unwrap_or_else(PoisonError::into_inner).insert(secret.to_owned(), what);
+}
+
+/// What of a token or an enrolment nobody may know: its third part.
+pub fn secret_part(line: &str) -> anyhow::Result<&str> {
+    line.split('.').nth(2).filter(|secret| secret.len() >= 32).with_context(|| format!("no secret in {line}"))
+}
+
+/// The secrets that are in a log.
+fn told(log: &str) -> Vec<&'static str> {
+    let secrets = SECRETS.lock().unwrap_or_else(PoisonError::into_inner);
+    let known = secrets.iter().map(|(secret, what)| (secret.as_str(), *what));
+    let all = known.chain([(PASSWORD, "the database's password")]);
+    all.filter(|(secret, _)| log.contains(secret)).map(|(_, what)| what).collect()
+}
+
+/// What a program may write about itself, in every end-to-end test: more than it does by default.
+pub const LOG: &str = "info,midshift=debug,midshift_agent=debug,midshift_edge=debug,midshift_identity=debug,midshift_stop=debug,\
+                   midshift_store=debug,midshift_telemetry=debug";
+
+/// A program that is killed when the test lets it go. Then its log is read: no secret of the run may be in it.
+pub struct Running {
+    child: Child,
+    log: PathBuf,
+}
 
 impl Running {
     /// Starts it; what it says goes to `log`.
     pub fn start(command: &mut Command, log: &Path) -> anyhow::Result<Self> {
         let file = std::fs::OpenOptions::new().create(true).append(true).open(log)?;
         let child = command.stdin(Stdio::null()).stdout(file.try_clone()?).stderr(file).spawn();
-        Ok(Self(child.with_context(|| format!("starting {command:?}"))?))
+        Ok(Self { child: child.with_context(|| format!("starting {command:?}"))?, log: log.to_owned() })
     }
     /// The same for a program that is spoken to.
     pub fn start_listening(command: &mut Command, log: &Path) -> anyhow::Result<(Self, ChildStdin)> {
@@ -63,27 +92,27 @@ impl Running {
         let child = command.stdin(Stdio::piped()).stdout(file.try_clone()?).stderr(file).spawn();
         let mut child = child.with_context(|| format!("starting {command:?}"))?;
         let ear = child.stdin.take().context("stdin was piped")?;
-        Ok((Self(child), ear))
+        Ok((Self { child, log: log.to_owned() }, ear))
     }
     /// Its process id.
     pub fn id(&self) -> u32 {
-        self.0.id()
+        self.child.id()
     }
     /// SIGKILL, and waits until it is gone.
     pub fn kill(&mut self) -> anyhow::Result<()> {
-        self.0.kill()?;
-        self.0.wait()?;
+        self.child.kill()?;
+        self.child.wait()?;
         Ok(())
     }
     /// Sends a signal by its name, e.g. `INT`.
     pub fn signal(&self, name: &str) -> anyhow::Result<()> {
-        let sent = Command::new("kill").args(["-s", name, &self.0.id().to_string()]).status()?;
+        let sent = Command::new("kill").args(["-s", name, &self.child.id().to_string()]).status()?;
         anyhow::ensure!(sent.success(), "kill -s {name}: {sent}");
         Ok(())
     }
     /// The same to the whole group that it leads: it must have been started with `process_group(0)`.
     pub fn signal_group(&self, name: &str) -> anyhow::Result<()> {
-        let sent = Command::new("kill").args(["-s", name, "--", &format!("-{}", self.0.id())]).output()?;
+        let sent = Command::new("kill").args(["-s", name, "--", &format!("-{}", self.child.id())]).output()?;
         anyhow::ensure!(sent.status.success(), "kill -s {name}: {}", sent.status);
         Ok(())
     }
@@ -93,7 +122,7 @@ impl Running {
         let mut look = tokio::time::interval(LOOK_EVERY);
         while Instant::now() < end {
             look.tick().await;
-            if let Some(status) = self.0.try_wait()? {
+            if let Some(status) = self.child.try_wait()? {
                 return Ok(status.code());
             }
         }
@@ -101,13 +130,16 @@ impl Running {
     }
     /// Whether it has ended by itself.
     pub fn has_ended(&mut self) -> anyhow::Result<bool> {
-        Ok(self.0.try_wait()?.is_some())
+        Ok(self.child.try_wait()?.is_some())
     }
 }
 
 impl Drop for Running {
     fn drop(&mut self) {
         let _ = self.kill();
+        let told = told(&std::fs::read_to_string(&self.log).unwrap_or_default());
+        // A test that has failed says why itself.
+        assert!(told.is_empty() || std::thread::panicking(), "{} tells {told:?}", self.log.display());
     }
 }
 
@@ -242,6 +274,11 @@ pub async fn first_sign_in(address: SocketAddr, data: &Path, token: &Path) -> an
         async move { Ok(identity.create_token(request).await.ok().map(|made| made.into_inner().secret)) }
     })
     .await?;
+    for token in [&token, &second] {
+        keep_secret("a token", secret_part(token)?);
+    }
+    let key = std::fs::read_to_string(data.join("identity/authority.pem"))?;
+    keep_secret("the authority's key", key.lines().nth(1).context("a key in PEM")?);
     KNOWN.lock().unwrap_or_else(PoisonError::into_inner).insert(address, Known { authority, token, second, way });
     Ok(())
 }
@@ -284,6 +321,7 @@ impl Server {
         let mut command = Command::new(midshift()?);
         // Its stop service would outlive the test, on a port that all tests share.
         command
+            .env("MIDSHIFT_LOG", LOG)
             .env("MIDSHIFT_NO_STOP", "true")
             .args(["serve", "--data"])
             .arg(dir.join("data"))
@@ -366,4 +404,18 @@ pub fn channel(address: SocketAddr) -> anyhow::Result<Line> {
         Some(site) => site.way.lazy(),
         None => Way::plain(&address.to_string())?.lazy(),
     })
+}
+
+#[test]
+#[should_panic(expected = "tells [\"a word\"]")]
+fn a_program_that_writes_a_secret_into_its_log_fails_its_test() {
+    keep_secret("a word", "xyzzy-only-here");
+    let dir = folder().expect("a folder");
+    let mut command = Command::new("sh");
+    let running = Running::start(command.args(["-c", "echo xyzzy-only-here; exec sleep 60"]), &dir.path().join("log"));
+    let log = dir.path().join("log");
+    while std::fs::read_to_string(&log).unwrap_or_default().is_empty() {
+        std::thread::yield_now();
+    }
+    drop(running);
 }

@@ -1,6 +1,6 @@
 //! Robots as programs of their own.
 
-use crate::harness::{Running, channel, has_login, midshift, until};
+use crate::harness::{LOG, Running, channel, has_login, keep_secret, midshift, secret_part, until};
 use midshift_agent::device::DeviceKey;
 use midshift_agent::enrolment::enrol;
 use midshift_agent::ledger::Ledger;
@@ -134,7 +134,7 @@ impl Robots {
         if let Some(secret) = enrolment {
             command.args(["--enroll", secret]);
         }
-        let running = Running::start(&mut command, &dir.join("agent.log"))?;
+        let running = Running::start(command.env("MIDSHIFT_LOG", LOG), &dir.join("agent.log"))?;
         self.running.insert(id, running);
         Ok(())
     }
@@ -176,5 +176,6 @@ pub async fn enrolment(public: SocketAddr, robot_id: &str) -> anyhow::Result<Opt
     }
     let request = CreateEnrolmentRequest { robot_id: robot_id.to_owned(), replace: false };
     let offered = IdentityServiceClient::new(channel(public)?).create_enrolment(request).await?.into_inner();
+    keep_secret("an enrolment", secret_part(&offered.secret)?);
     Ok(Some(offered.secret))
 }

@@ -1,7 +1,9 @@
 //! A fleet stop with real programs: everybody stands, the server dead or not, its database there or not, and nobody moves before a person has reset and resumed
 //! it.
 
-use crate::harness::{Running, Server, channel, folder, free_port, has_login, in_states, midshift, same_site, until};
+use crate::harness::{
+    Running, Server, channel, folder, free_port, has_login, in_states, keep_secret, midshift, same_site, until,
+};
 use crate::kill::{all_over, at_work, judge, submit};
 use crate::robots::Robots;
 use crate::rolled_out::{call, done};
@@ -23,6 +25,8 @@ use std::time::Duration;
 
 const ROBOTS: usize = 8;
 const TASKS: usize = 40;
+/// Why somebody stops, which is nothing for a log.
+const REASON: &str = "somebody fell beside dock seven";
 const LIMIT: Duration = Duration::from_secs(60);
 
 /// A stop service in a process of its own, beside a server's data.
@@ -66,8 +70,9 @@ impl StopServer {
     }
     /// Stops by the command line, which waits until all have confirmed; the stop's name.
     pub fn stop(&self, whom: &[&str]) -> anyhow::Result<String> {
+        keep_secret("why somebody stopped", REASON);
         let address = self.address.to_string();
-        let stop = ["stop", "--stop-server", &address, "--reason", "a drill", "-o", "name"];
+        let stop = ["stop", "--stop-server", &address, "--reason", REASON, "-o", "name"];
         let output = tokio::task::block_in_place(|| call(&[&stop[..], whom].concat()))?;
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         ensure!(output.status.success(), "{whom:?}: {:?} {said}", output.status.code());
