@@ -23,7 +23,7 @@ use midshift_identity::IdentityService;
 use midshift_identity::audit::AuditService;
 use midshift_ota::rollouts::{Planner, RolloutService};
 use midshift_ota::{OtaReader, OtaService};
-use midshift_proto::sim::v1::sim_service_server::SimServiceServer;
+use midshift_proto::sim::v1::sim_service_server::{self, SimServiceServer};
 use midshift_sim::service::SimFace;
 use midshift_store::{FrameLog, HeardLog, LiveBoard, Store};
 use midshift_task::TaskService;
@@ -38,6 +38,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
 use tonic::service::Routes;
 use tonic_health::ServingStatus;
+use tonic_health::pb::health_server;
 use tonic_health::server::HealthReporter;
 
 /// Naive rules of the services, for twins of tests. None by default.
@@ -177,18 +178,24 @@ impl Server {
 
     async fn routes(&self) -> anyhow::Result<(Routes, HealthReporter)> {
         let control = limits::CONTROL_MESSAGE_BYTES;
+        // Of all services of a server, whichever are here: a proxy asks any process. Those of the stop service answer on a port of its own.
+        let names = Role::ALL.into_iter().flat_map(Role::services).copied();
+        let names: BTreeSet<&str> = names
+            .chain(self.parts.sim.as_ref().map(|_| sim_service_server::SERVICE_NAME))
+            .chain([health_server::SERVICE_NAME])
+            .collect();
         let reflection = || {
-            tonic_reflection::server::Builder::configure()
+            let builder = tonic_reflection::server::Builder::configure()
                 .register_encoded_file_descriptor_set(midshift_proto::FILE_DESCRIPTOR_SET)
                 .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
                 // Without these a generic client cannot read the details of a refusal.
-                .register_encoded_file_descriptor_set(tonic_types::pb::FILE_DESCRIPTOR_SET)
+                .register_encoded_file_descriptor_set(tonic_types::pb::FILE_DESCRIPTOR_SET);
+            names.iter().fold(builder, |builder, name| builder.with_service_name(*name))
         };
         let (health, health_service) = tonic_health::server::health_reporter();
         let mut routes = Routes::builder();
         routes
             .add_service(health_service)
-            // Of all services, whichever are here: a proxy asks any process.
             .add_service(reflection().build_v1()?)
             .add_service(reflection().build_v1alpha()?);
         if let Some(task) = &self.task {

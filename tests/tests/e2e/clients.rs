@@ -61,11 +61,13 @@ pub fn grpcurl_passes(address: SocketAddr) -> anyhow::Result<()> {
     for service in [
         "midshift.task.v1.TaskService",
         "midshift.fleet.v1.FleetService",
-        "midshift.sim.v1.SimService",
+        "midshift.identity.v1.IdentityService",
         "grpc.health.v1.Health",
     ] {
         assert!(services.contains(service), "{services}");
     }
+    // They answer on a port of their own.
+    assert!(!services.contains("midshift.stop.v1"), "{services}");
     let good = r#"{"request_id":"g1","task_id":"TASK-GRPCURL","flat":{"task_type":"transport","priority":0,"from_waypoint":"A01","to_waypoint":"B03","item_sku":"SKU-1","timeout_seconds":600}}"#;
     let submitted = grpcurl(&["-d", good, &address, "midshift.task.v1.TaskService/SubmitTask"])?;
     assert!(submitted.status.success(), "{}", text(&submitted.stderr));
