@@ -196,6 +196,11 @@ pub async fn submit(server: SocketAddr, site: &Site, seed: u64, count: usize) ->
 
 /// Held against the journals of the bodies: nothing is lost, nothing was done twice; only what was killed `inside` a step may need a person.
 pub fn judge(tasks: &[Task], inside: &BTreeSet<String>, site: &Site, robots: &Robots) -> anyhow::Result<()> {
+    judge_journals(tasks, inside, site, &robots.journals())
+}
+
+/// The same, of robots with these journals.
+pub fn judge_journals(tasks: &[Task], inside: &BTreeSet<String>, site: &Site, paths: &[PathBuf]) -> anyhow::Result<()> {
     let succeeded = tasks.iter().filter(|t| t.state() == TaskState::Succeeded).count();
     let others: Vec<_> = tasks.iter().filter(|t| t.state() != TaskState::Succeeded).collect();
     for task in &others {
@@ -210,7 +215,6 @@ pub fn judge(tasks: &[Task], inside: &BTreeSet<String>, site: &Site, robots: &Ro
             task.task_id
         );
     }
-    let paths = robots.journals();
     let paths: Vec<&Path> = paths.iter().map(PathBuf::as_path).collect();
     let oracle = Oracle::read(site, paths)?;
     let verdict = oracle.verdict();

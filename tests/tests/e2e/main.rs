@@ -24,6 +24,7 @@ mod languages;
 mod launched;
 mod ledger_cuts;
 mod measured;
+mod mid_shift;
 mod minimal_robot;
 mod partition;
 mod proxy;

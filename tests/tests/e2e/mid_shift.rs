@@ -1,0 +1,75 @@
+//! Software in the middle of a shift, over TLS with enrolled robots and one server: a good release reaches all of them while they work and the server is
+//! killed, a bad one stops at its canary, and no task is lost.
+
+use crate::harness::{Server, folder, until};
+use crate::kill::{all_over, at_work, judge_journals, submit};
+use crate::robots::enrolment;
+use crate::rolled_out::{Robot, begin_rollout, call, done};
+use crate::room::LIMIT;
+use anyhow::ensure;
+use midshift_core::site::{DEMO, text};
+use midshift_proto::task::v1::TaskState;
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+
+const ROBOTS: usize = 6;
+const TASKS: usize = 40;
+/// The release that all of them take, and the one that none keeps.
+const GOOD: &str = "1.5.0";
+const BAD: &str = "1.6.0-bad-at-start";
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_fleet_takes_a_release_in_the_middle_of_a_shift_and_loses_no_task_though_the_server_is_killed()
+-> anyhow::Result<()> {
+    let dir = folder()?;
+    let site = text::parse(DEMO)?;
+    let samples = dir.path().join("samples");
+    done(&["bundle", "samples", &samples.display().to_string()])?;
+    let keys = samples.join("keys").display().to_string();
+    let mut server = Server::start_with(dir.path(), DEMO, &["--ota-keys", &keys]).await?;
+    let address = server.address.to_string();
+    let ids: Vec<String> = (1..=ROBOTS).map(|number| format!("rbt-{number:02}")).collect();
+    let mut robots = Vec::new();
+    for (number, id) in ids.iter().enumerate() {
+        let (start, enrolment) = (format!("park-{}", number + 1), enrolment(server.address, id).await?);
+        robots.push(Robot::launch(id, &start, &dir.path().join(id), &samples, &address, None, enrolment.as_deref())?);
+    }
+    let journals: Vec<PathBuf> = ids.iter().map(|id| dir.path().join(id).join("data/journal.jsonl")).collect();
+    done(&["bundle", "push", "--server", &address, &samples.join("repository").display().to_string()])?;
+    for id in &ids {
+        until("the robot is known", LIMIT, async || {
+            Ok(call(&["robot", "get", "--server", &address, id])?.status.success().then_some(()))
+        })
+        .await?;
+    }
+    submit(server.address, &site, 23, TASKS).await?;
+    at_work(server.address, 2, &BTreeSet::new()).await?;
+
+    let begin = |version: &str| {
+        let (id, quick) = (format!("walk-{version}"), ["--soak", "1s", "--probation", "2s", "--exposure-tasks", "0"]);
+        done(&[&["rollout", "create", "--server", &address, &id, "--waves", "1,50%,rest"][..], &quick].concat())?;
+        begin_rollout(&address, &id)
+    };
+    let ended = |version: &str| {
+        let id = format!("walk-{version}");
+        tokio::task::block_in_place(|| call(&["rollout", "wait", "--server", &address, &id, "--timeout", "180s"]))
+    };
+    begin(GOOD)?;
+    until("the canary keeps it on trial", LIMIT, async || Ok(robots.iter().any(Robot::is_on_trial).then_some(())))
+        .await?;
+    server.kill_and_restart().await?;
+    let waited = ended(GOOD)?;
+    ensure!(waited.status.code() == Some(0), "{}", String::from_utf8_lossy(&waited.stderr));
+    for robot in &robots {
+        robot.keeps(GOOD).await?;
+    }
+    begin(BAD)?;
+    let waited = ended(BAD)?;
+    ensure!(waited.status.code() == Some(12), "{}", String::from_utf8_lossy(&waited.stderr));
+    let tasks = all_over(server.address, TASKS).await?;
+    ensure!(tasks.iter().all(|task| task.state() == TaskState::Succeeded), "{tasks:?}");
+    for robot in &robots {
+        ensure!(robot.committed()?.as_deref() == Some(GOOD), "{:?}", robot.switch()?);
+    }
+    judge_journals(&tasks, &BTreeSet::new(), &site, &journals)
+}
