@@ -170,6 +170,8 @@ pub const COMMAND_TRIES: u32 = 8;
 pub const LEAD_LEFT_WITHIN: LinkDuration = LinkDuration::from_secs(1);
 /// Open streams are cut this long after Ctrl-C.
 pub const HARD_DRAIN: LinkDuration = LinkDuration::from_secs(2);
+/// A heartbeat of the older session that arrives so long after the Hello of another machine was not on its way when that came: both are alive.
+pub const CLONE_SURE_AFTER: LinkDuration = LinkDuration::from_secs(2);
 /// A clone or fenced robot may come back after this.
 pub const FENCED_RETRY: LinkDuration = LinkDuration::from_secs(60);
 /// Bytes of one site, map or layout file.

@@ -29,6 +29,14 @@ pub fn open(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, task_id: Op
     tx.put(incident, "incident.opened");
 }
 
+/// Opens one of a machine with a robot's name, unless an open one says of the same start of a machine what this would: it attaches again and again.
+pub fn open_second(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>) {
+    let same = |i: &Incident| i.closed.is_none() && i.robot_id.as_ref() == robot_id && i.reason == reason;
+    if !tx.view.incidents.values().any(|i| same(&i.row)) {
+        open(tx, reason, robot_id, None);
+    }
+}
+
 /// A person has looked into it.
 pub fn close(tx: &mut Tx, incident_id: &str, reason: &str, actor: &str) {
     let Some(mut incident) = tx.view.incidents.get(incident_id).map(|i| i.row.clone()) else { return };

@@ -139,7 +139,7 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
             (Log::Telemetry, None, _) if &*entry.kind == CLONE_SEEN => {
                 plan.decide(view, now, "fleet", |tx| {
                     let robot_id = RobotId::parse(&entry.subject).ok();
-                    incidents::open(tx, Code::CloneSeen.into(), robot_id.as_ref(), None);
+                    incidents::open_second(tx, clone_seen(entry), robot_id.as_ref());
                     mark(tx, entry.seq);
                 });
             }
@@ -217,6 +217,14 @@ pub fn obeyed(item: &Item) -> Option<Seq> {
 
 /// Kind of the fact that a second machine has attached with a robot's name, stated by telemetry.
 pub const CLONE_SEEN: &str = "session.clone_seen";
+
+/// The second machine, as telemetry met it: its start, and the certificate that it showed.
+fn clone_seen(entry: &Entry) -> Reason {
+    let said: BTreeMap<String, serde_json::Value> =
+        entry.body.as_deref().and_then(|body| serde_json::from_str(body).ok()).unwrap_or_default();
+    let known = ["boot_id", "certificate"].into_iter().filter_map(|key| Some((key, said.get(key)?.as_str()?)));
+    known.fold(Code::CloneSeen.into(), |reason: Reason, (key, value)| reason.with(key, value))
+}
 
 fn mark(tx: &mut Tx, seq: Seq) {
     tx.put(FleetMark { seq }, "fleet.consumed");

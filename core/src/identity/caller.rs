@@ -32,28 +32,38 @@ pub struct Caller {
     grants: Arc<[Grant]>,
     /// Its token's time is over, for less than [`crate::limits::TOKEN_STOPS_AFTER_EXPIRY`]: it may engage stops and nothing else.
     expired: bool,
+    certificate: Option<Arc<str>>,
 }
 
 impl Caller {
     /// Somebody who showed nothing.
     pub fn nobody() -> Self {
-        Self { who: Who::Nobody, grants: Arc::default(), expired: false }
+        Self { who: Who::Nobody, grants: Arc::default(), expired: false, certificate: None }
     }
     /// Whoever may do everything.
     pub fn local() -> Self {
-        Self { who: Who::Local, grants: Arc::default(), expired: false }
+        Self { who: Who::Local, grants: Arc::default(), expired: false, certificate: None }
     }
     /// A robot.
     pub fn robot(robot_id: RobotId) -> Self {
-        Self { who: Who::Robot(robot_id), grants: Arc::default(), expired: false }
+        Self { who: Who::Robot(robot_id), grants: Arc::default(), expired: false, certificate: None }
+    }
+    /// The same with the serial number of the certificate that it showed, in hex.
+    #[must_use]
+    pub fn with_certificate(self, serial: Option<Arc<str>>) -> Self {
+        Self { certificate: serial, ..self }
     }
     /// The holder of a token; of one that is `expired`, it may still engage stops.
     pub fn holder(token: TokenId, name: Arc<str>, grants: Arc<[Grant]>, expired: bool) -> Self {
-        Self { who: Who::Holder { token, name }, grants, expired }
+        Self { who: Who::Holder { token, name }, grants, expired, certificate: None }
     }
     /// Who it is.
     pub const fn who(&self) -> &Who {
         &self.who
+    }
+    /// Serial number of the certificate that it showed, in hex; none: it showed none.
+    pub const fn certificate(&self) -> Option<&Arc<str>> {
+        self.certificate.as_ref()
     }
     /// Its grants.
     pub fn grants(&self) -> &[Grant] {

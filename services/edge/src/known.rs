@@ -64,7 +64,8 @@ impl Principals for Known {
     fn caller(&self, peer: &Peer, headers: &HeaderMap) -> Result<Caller, Refusal> {
         if let Some(leaf) = &peer.certificate {
             let unknown = |_| Refusal::new(Kind::Unauthenticated, Code::KeyDenied);
-            return self.robot(leaf).map(Caller::robot).map_err(unknown);
+            let robot = self.robot(leaf).map(Caller::robot).map_err(unknown)?;
+            return Ok(robot.with_certificate(serial_of(leaf)));
         }
         let Some(shown) = headers.get(AUTHORIZATION) else { return Ok(Caller::nobody()) };
         let text = shown.to_str().ok().and_then(|text| {
@@ -76,6 +77,13 @@ impl Principals for Known {
         let digest = Digest(sha2::Sha256::digest(secret.bytes()).into());
         self.directory.borrow().holder(secret.id(), &digest, self.clock.now().wall)
     }
+}
+
+/// Serial number of a certificate, in hex; none: it cannot be read.
+pub fn serial_of(leaf: &CertificateDer<'_>) -> Option<Arc<str>> {
+    let certificate = EndEntityCert::try_from(leaf).ok()?;
+    let hex: String = certificate.serial().iter().map(|byte| format!("{byte:02x}")).collect();
+    Some(hex.into())
 }
 
 /// Which robot a certificate is of, and the digest of its public key; none: it is of no robot of this site. That it is genuine was proven in the handshake.

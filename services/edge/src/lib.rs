@@ -23,7 +23,7 @@ mod seats;
 pub mod tls;
 
 pub use config::{Age, Config, Rate};
-pub use known::{Known, robot_of};
+pub use known::{Known, robot_of, serial_of};
 pub use listen::{Incoming, Listen};
 pub use peer::{Anybody, ConnectionId, Denied, Peer, Principals};
 

@@ -13,6 +13,7 @@ mod picture;
 mod presence;
 mod registry;
 mod replay;
+mod second;
 mod session;
 mod shared;
 mod status;

@@ -57,11 +57,11 @@ impl TelemetryService {
             return Err(Refusal::new(Kind::Unavailable, Code::ShuttingDown));
         }
         self.inner.picture.ready().await;
-        let begun = welcome::begin(&self.inner, &hello).await?;
+        let begun = welcome::begin(&self.inner, &hello, by).await?;
         tracing::info!(robot_id = %hello.robot_id, session_epoch = begun.welcome.session_epoch, observed = begun.welcome.observed, "session begun");
         let (robot_id, epoch) = (hello.robot_id.clone(), begun.welcome.session_epoch);
         // Also if this future is dropped in the middle: the robot is no longer attached here.
-        let observed = begun.in_charge.is_none().then(|| self.inner.parts.clock.now().wall);
+        let observed = begun.part.is_err().then(|| self.inner.parts.clock.now().wall);
         let _leave = Leave { service: self, robot_id: &robot_id, epoch, observed };
         if let Some(since) = observed {
             self.inner.registry.observe(&robot_id, since);

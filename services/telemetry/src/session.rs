@@ -9,9 +9,10 @@ use crate::offset::Offset;
 use crate::picture::Sections;
 use crate::registry::InCharge;
 use crate::replay::{Replay, overloaded};
+use crate::second::Second;
 use crate::shared::{News, Shared};
 use crate::status::{self, Arrived, StatusLane};
-use crate::welcome::{self, Begun};
+use crate::welcome::Begun;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
@@ -59,6 +60,8 @@ struct Session {
     ring: Arc<str>,
     epoch: u64,
     in_charge: Option<InCharge>,
+    /// What it is observed as; none: it is in charge.
+    second: Option<Second>,
     events: Events,
     committing: Option<Boxed<Outcome>>,
     status: StatusLane,
@@ -94,11 +97,16 @@ pub async fn run(inner: Arc<Inner>, hello: &Hello, begun: Begun, mut up: Streami
     let mut desired = inner.picture.watch(&robot_id);
     desired.mark_changed();
     let now = inner.parts.clock.now();
-    let (in_charge, replays) = begun.in_charge.unzip();
+    let (part, second) = match begun.part {
+        Ok(part) => (Some(part), None),
+        Err(second) => (None, Some(second)),
+    };
+    let (in_charge, replays) = part.unzip();
     let mut session = Session {
         ring: Arc::from(hello.ring.as_str()),
         epoch,
         in_charge,
+        second,
         events: Events::new(begun.mark.0, begun.mark.1),
         committing: None,
         status: StatusLane::new(robot_id.clone(), Arc::from(hello.ring.as_str()), begun.status),
@@ -132,10 +140,9 @@ impl Session {
         let jitter = Duration::from_secs(rand::random_range(0..=SESSION_LIFE_JITTER_S));
         let life = tokio::time::sleep(SESSION_LIFE + jitter);
         tokio::pin!(life);
-        let observed = self.in_charge.is_none();
         let mut cut_off = self.inner.shared.as_ref().map(Shared::cut_off);
-        let older = older_is_silent(self.inner.clone(), self.robot_id.clone());
-        tokio::pin!(older);
+        let alone = is_alone(self.inner.clone(), self.second.take());
+        tokio::pin!(alone);
         let mut moving = false;
         loop {
             self.start_writes();
@@ -200,7 +207,7 @@ impl Session {
                     self.move_over(down);
                     life.as_mut().reset(Instant::now() + MOVE_OVER_WITHIN);
                 }
-                () = &mut older, if observed => {
+                () = &mut alone => {
                     return close(CloseCode::MoveOver, Code::MoveOver, LinkDuration(0));
                 }
             }
@@ -454,22 +461,11 @@ async fn is_cut_off(cut_off: &mut Option<watch::Receiver<bool>>) {
     }
 }
 
-/// An observed session waits until the session in charge is gone or silent; then its robot may come back and take charge.
-async fn older_is_silent(inner: Arc<Inner>, robot_id: RobotId) {
-    loop {
-        tokio::time::sleep(Duration::from_millis(limits::HEARTBEAT.as_ms())).await;
-        let Some(older) = inner.registry.get(&robot_id) else {
-            if welcome::is_heard_elsewhere(&inner, &robot_id) {
-                continue;
-            }
-            return;
-        };
-        let now = inner.parts.clock.now().link;
-        if now.since(older.heard()) > limits::SUSPECT_AFTER {
-            older.fenced.cancel();
-            inner.registry.leave(&robot_id, older.session_epoch);
-            return;
-        }
+/// The older session of an observed one is gone or silent; never, if this one is in charge.
+async fn is_alone(inner: Arc<Inner>, second: Option<Second>) {
+    match second {
+        Some(second) => second.is_alone(inner).await,
+        None => std::future::pending().await,
     }
 }
 

@@ -3,15 +3,16 @@
 use crate::Inner;
 use crate::registry::InCharge;
 use crate::replay::Replay;
+use crate::second::{Second, heard_elsewhere};
 use midshift_bundle::installed::{self, Rejection};
-use midshift_core::ids::RobotId;
+use midshift_core::identity::Caller;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::robot::Lane;
-use midshift_core::rows::{Expect, Fact, Item, Log, Record, Revision, Writer};
+use midshift_core::rows::{Expect, Item, Record, Revision, Writer};
 use midshift_core::update::Installed;
 use midshift_core::work::{LaneMark, Session};
-use midshift_proto::session::{Hello, LaneAck, PROTOCOL_VERSION, Welcome};
+use midshift_proto::session::{Hello, LaneAck, PROTOCOL_VERSION, Previous, Welcome};
 use midshift_store::{CommitError, load};
 use std::sync::Arc;
 use tokio::sync::mpsc;
@@ -23,8 +24,8 @@ const STATUS_PERIOD_MS: u32 = 2_000;
 
 /// What a session begins with.
 pub struct Begun {
-    /// Its place in the registry, and replays for it; none: observed only.
-    pub in_charge: Option<(InCharge, mpsc::Receiver<Replay>)>,
+    /// Its place in the registry, and replays for it; or what it is observed as.
+    pub part: Result<(InCharge, mpsc::Receiver<Replay>), Second>,
     /// What the robot is told.
     pub welcome: Welcome,
     /// Durable numbers of its ring, with the revision of their row.
@@ -54,7 +55,7 @@ fn unavailable(error: impl std::fmt::Display) -> Refusal {
 }
 
 /// Admits the session, in charge or observed.
-pub async fn begin(inner: &Inner, hello: &Hello) -> Result<Begun, Refusal> {
+pub async fn begin(inner: &Inner, hello: &Hello, by: &Caller) -> Result<Begun, Refusal> {
     let store = inner.parts.store.as_ref();
     // Asking a database that is away takes time that the robot's authority has not.
     if inner.shared.as_ref().is_some_and(|shared| *shared.cut_off().borrow()) {
@@ -64,18 +65,20 @@ pub async fn begin(inner: &Inner, hello: &Hello) -> Result<Begun, Refusal> {
         let row = load::<Session>(store, hello.robot_id.as_str()).await.map_err(unavailable)?;
         let mark = mark_of(inner, hello).await?;
         let status = status_of(inner, hello).await?;
+        // A secret lies in a file and can be copied with it: of another start it proves nothing while the older session is heard.
         let proven = row.as_ref().is_some_and(|(row, _)| {
-            hello.previous.as_ref().is_some_and(|p| p.session_epoch == row.session_epoch && p.secret == row.secret)
+            let known = |p: &Previous| p.session_epoch == row.session_epoch && p.secret == row.secret;
+            hello.boot_id == row.boot_id && hello.previous.as_ref().is_some_and(known)
         });
-        let is_held = inner.registry.get(&hello.robot_id).is_some() || is_heard_elsewhere(inner, &hello.robot_id);
+        let here = inner.registry.get(&hello.robot_id).is_some();
+        let is_held = here || heard_elsewhere(inner, &hello.robot_id).is_some();
         let now = inner.parts.clock.now();
         let last = row.as_ref().map_or(0, |(r, _)| r.session_epoch);
         let session_epoch = (last + 1).max(now.wall.0.max(0) as u64);
         if is_held && !proven && !inner.parts.bugs.no_clone_fence() {
-            note_clone(inner, hello).await;
             // Its epoch and secret are in no row: they prove nothing later.
             let welcome = welcome(inner, session_epoch, draw_secret(), &mark.0, status, true);
-            return Ok(Begun { in_charge: None, welcome, mark, status });
+            return Ok(Begun { part: Err(Second::new(inner, hello, by)), welcome, mark, status });
         }
         let live = inner.parts.board.get(&hello.robot_id);
         let measured = live.and_then(|live| live.clock_offset_ms).map(|(offset, _)| offset);
@@ -97,7 +100,7 @@ pub async fn begin(inner: &Inner, hello: &Hello) -> Result<Begun, Refusal> {
             continue;
         }
         let welcome = welcome(inner, session_epoch, session.secret, &mark.0, status, false);
-        return Ok(Begun { in_charge: Some((in_charge, replays)), welcome, mark, status });
+        return Ok(Begun { part: Ok((in_charge, replays)), welcome, mark, status });
     }
     Err(Refusal::new(Kind::Conflict, Code::CloneSeen))
 }
@@ -116,13 +119,6 @@ async fn status_of(inner: &Inner, hello: &Hello) -> Result<u64, Refusal> {
         inner.picture.status_durable(&hello.robot_id, &ring, kept);
     }
     Ok(inner.picture.durable_status(&hello.robot_id, &ring))
-}
-
-/// Whether another gateway has heard the robot a moment ago.
-pub fn is_heard_elsewhere(inner: &Inner, robot_id: &RobotId) -> bool {
-    let Some(live) = inner.parts.board.get(robot_id).filter(|_| inner.shared.is_some()) else { return false };
-    let silent = inner.parts.clock.now().link.since(live.processed_at);
-    silent <= limits::SUSPECT_AFTER && !inner.registry.has_left(robot_id, live.report.session_epoch)
 }
 
 fn draw_secret() -> String {
@@ -212,24 +208,5 @@ fn welcome(
         protocol_version: PROTOCOL_VERSION,
         clock_rate_permille: inner.parts.clock.rate_permille(),
         observed,
-    }
-}
-
-/// Two machines with one id: a fact for people, once per Hello.
-async fn note_clone(inner: &Inner, hello: &Hello) {
-    metrics::counter!("midshift_telemetry_clones_total").increment(1);
-    tracing::warn!(robot_id = %hello.robot_id, boot_id = %hello.boot_id, "second session without proof of succession, observed only");
-    let mut item = Item::new(Writer::Telemetry, hello.robot_id.as_str());
-    let body =
-        serde_json::json!({"robot_id": hello.robot_id, "boot_id": hello.boot_id, "code": Code::CloneSeen.as_str()});
-    let subject = Arc::from(hello.robot_id.as_str());
-    item.facts.push(Fact {
-        log: Log::Telemetry,
-        subject,
-        kind: "session.clone_seen",
-        body: Arc::from(body.to_string()),
-    });
-    if let Some(Err(error)) = inner.parts.store.commit(vec![item]).await.pop() {
-        tracing::warn!(%error, "clone could not be recorded");
     }
 }

@@ -147,3 +147,16 @@ async fn a_second_machine_with_a_robots_name_is_an_incident() {
     w.until("a person is told", |s| s.incidents() == [Code::CloneSeen]).await;
     w.lawful().await;
 }
+
+#[tokio::test(start_paused = true)]
+async fn a_second_machine_that_attaches_again_is_told_of_once_while_the_incident_is_open() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.clone_seen("r1").await;
+    w.until("a person is told", |s| s.incidents() == [Code::CloneSeen]).await;
+    w.clone_seen("r1").await;
+    w.clone_seen("r2").await;
+    let seen = w.until("the next one is told of", |s| s.incidents().len() > 1).await;
+    assert_eq!(seen.incidents(), [Code::CloneSeen; 2], "one of each robot");
+    w.lawful().await;
+}

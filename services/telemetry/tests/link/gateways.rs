@@ -4,7 +4,7 @@ use crate::world::{Result, Robot, World, clock, serve};
 use async_trait::async_trait;
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::reason::Code;
-use midshift_core::rows::{Expect, Item, Log, Seq, Writer};
+use midshift_core::rows::{Expect, Item, Writer};
 use midshift_core::time::Clock;
 use midshift_core::work::DesiredWork;
 use midshift_proto::session::CloseCode;
@@ -180,10 +180,11 @@ async fn a_session_without_proof_is_only_observed_while_another_gateway_hears_th
         robot.beat().await?;
         robot.hears(|down| down.echo).await?;
     }
-    let mut clone = Robot::attach(&second, None).await?;
+    let mut clone = Robot::attach_saying(&second, crate::second::started("boot-2", None)?).await?;
     assert!(clone.welcome.observed);
-    let facts = site.store.feed(Seq(0), &[Log::Telemetry], 100).await?.entries;
-    assert!(facts.iter().any(|f| &*f.kind == "session.clone_seen"));
+    while crate::second::told(&second).await?.is_empty() {
+        crate::second::a_second_passes(&mut robot).await?;
+    }
     // It falls silent: the other is asked to come back, and then it is in charge.
     assert_eq!(clone.closes().await?.code, CloseCode::MoveOver);
     assert!(!Robot::attach(&second, None).await?.welcome.observed);

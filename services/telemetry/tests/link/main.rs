@@ -6,6 +6,7 @@ mod machines;
 mod reach;
 mod replay;
 mod robots;
+mod second;
 mod sessions;
 mod status;
 mod world;

@@ -78,26 +78,6 @@ async fn without_the_fence_a_clone_takes_over_a_robot_that_is_heard() -> Result<
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_session_without_proof_is_only_observed_while_the_older_one_is_heard() -> Result<()> {
-    let world = world().await?;
-    let mut first = Robot::attach(&world, None).await?;
-    first.beat().await?;
-    let mut clone = Robot::attach(&world, None).await?;
-    assert!(clone.welcome.observed);
-    clone.events(1..=1).await?;
-    first.beat().await?;
-    assert_eq!(first.hears(|down| down.echo.map(|e| e.hb)).await?, 1);
-    assert_eq!(inbox(&world).await?, 0, "an observed session writes nothing");
-    let facts = world.store.feed(Seq(0), &[Log::Telemetry], 100).await?.entries;
-    assert!(facts.iter().any(|f| &*f.kind == "session.clone_seen"));
-    // The older one falls silent: the clone is asked to come back, and then it is in charge.
-    let close = clone.closes().await?;
-    assert_eq!(close.code, CloseCode::MoveOver);
-    assert!(!Robot::attach(&world, None).await?.welcome.observed);
-    Ok(())
-}
-
-#[tokio::test(start_paused = true)]
 async fn a_new_session_remembers_the_clock_that_the_one_before_measured() -> Result<()> {
     let world = world().await?;
     let offset = async || -> Result<Option<i64>> {

@@ -86,14 +86,18 @@ pub async fn serve(parts: Parts) -> Result<World> {
 /// Header in which a test says who asks; without it nobody is asked.
 const AS: &str = "as";
 
-/// As a port finds out who asks: `robot:r1`, or `name role@area ...` for the holder of a token.
+/// As a port finds out who asks: `robot:r1`, `robot:r1#SERIAL` with the serial number of its certificate, or `name role@area ...` for the holder of a token.
 fn known(mut request: Request<()>) -> std::result::Result<Request<()>, Status> {
     if let Some(said) = request.metadata().get(AS).and_then(|said| said.to_str().ok()).map(str::to_owned) {
         let unreadable = || Status::internal("a test says who asks in words that mean nothing");
         let mut words = said.split(' ');
         let name = words.next().ok_or_else(unreadable)?;
         let caller = match name.strip_prefix("robot:") {
-            Some(robot_id) => Caller::robot(RobotId::parse(robot_id).map_err(|_| unreadable())?),
+            Some(robot) => {
+                let (robot_id, serial) = robot.split_once('#').map_or((robot, None), |(id, serial)| (id, Some(serial)));
+                let robot = Caller::robot(RobotId::parse(robot_id).map_err(|_| unreadable())?);
+                robot.with_certificate(serial.map(Into::into))
+            }
             None => {
                 let grants: std::result::Result<_, _> = words.map(str::parse).collect();
                 let token = TokenId::new("t1").ok_or_else(unreadable)?;

@@ -1,0 +1,94 @@
+//! A machine that attaches with the name of a robot that is attached already, and does not prove that it is the same: it is watched, until it is clear which it is.
+//!
+//! Either the older session falls silent: then this was its robot, started anew, and comes back to take charge. Or the older one is heard on: then both machines are
+//! alive, and people are told. Invariant: nobody is told of a robot that restarted or moved, and none of the two is told apart by what it could have copied.
+
+use crate::Inner;
+use midshift_core::fleet::CLONE_SEEN;
+use midshift_core::identity::Caller;
+use midshift_core::ids::RobotId;
+use midshift_core::limits;
+use midshift_core::reason::Code;
+use midshift_core::rows::{Fact, Item, Log, Writer};
+use midshift_core::time::LinkTime;
+use midshift_proto::session::Hello;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// Such a machine.
+pub struct Second {
+    robot_id: RobotId,
+    boot_id: String,
+    /// Serial number of the certificate that it showed.
+    certificate: Option<Arc<str>>,
+    since: LinkTime,
+}
+
+impl Second {
+    /// Whoever said this Hello, now.
+    pub fn new(inner: &Inner, hello: &Hello, by: &Caller) -> Self {
+        let (robot_id, boot_id) = (hello.robot_id.clone(), hello.boot_id.clone());
+        tracing::info!(%robot_id, boot_id, "second session without proof of succession, observed until the older one is silent");
+        Self { robot_id, boot_id, certificate: by.certificate().cloned(), since: inner.parts.clock.now().link }
+    }
+
+    /// Waits until the session in charge is gone or silent; then this robot may come back and take charge. Tells people once if both are alive.
+    pub async fn is_alone(self, inner: Arc<Inner>) {
+        let mut is_told = false;
+        loop {
+            tokio::time::sleep(Duration::from_millis(limits::HEARTBEAT.as_ms())).await;
+            let Some(heard) = self.older_heard(&inner) else { return };
+            if !is_told && heard.since(self.since) >= limits::CLONE_SURE_AFTER {
+                is_told = self.tell(&inner).await;
+            }
+        }
+    }
+
+    /// When the older session was heard last; none: it is gone, here or at another gateway, or has been silent for long.
+    fn older_heard(&self, inner: &Inner) -> Option<LinkTime> {
+        let now = inner.parts.clock.now().link;
+        let Some(older) = inner.registry.get(&self.robot_id) else { return heard_elsewhere(inner, &self.robot_id) };
+        if now.since(older.heard()) <= limits::SUSPECT_AFTER {
+            return Some(older.heard());
+        }
+        older.fenced.cancel();
+        inner.registry.leave(&self.robot_id, older.session_epoch);
+        None
+    }
+
+    /// Whether it is on record, for fleet to make an incident of it.
+    async fn tell(&self, inner: &Inner) -> bool {
+        let Self { robot_id, boot_id, certificate, .. } = self;
+        let certificate = certificate.as_deref();
+        tracing::warn!(%robot_id, boot_id, certificate, "two machines with the name of one robot are alive: the second is observed only");
+        let body = serde_json::json!({
+            "robot_id": robot_id, "boot_id": boot_id, "certificate": certificate, "code": Code::CloneSeen.as_str(),
+        });
+        let mut item = Item::new(Writer::Telemetry, robot_id.as_str());
+        item.facts.push(Fact {
+            log: Log::Telemetry,
+            subject: Arc::from(robot_id.as_str()),
+            kind: CLONE_SEEN,
+            body: Arc::from(body.to_string()),
+        });
+        match inner.parts.store.commit(vec![item]).await.pop() {
+            Some(Ok(_)) => {
+                metrics::counter!("midshift_telemetry_clones_total").increment(1);
+                true
+            }
+            Some(Err(error)) => {
+                tracing::warn!(%error, "a second machine could not be recorded yet");
+                false
+            }
+            None => false,
+        }
+    }
+}
+
+/// When another gateway heard the robot, if that was a moment ago.
+pub fn heard_elsewhere(inner: &Inner, robot_id: &RobotId) -> Option<LinkTime> {
+    let live = inner.parts.board.get(robot_id).filter(|_| inner.shared.is_some())?;
+    let silent = inner.parts.clock.now().link.since(live.processed_at);
+    let is_heard = silent <= limits::SUSPECT_AFTER && !inner.registry.has_left(robot_id, live.report.session_epoch);
+    is_heard.then_some(live.processed_at)
+}
