@@ -15,7 +15,7 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
-use tough::schema::{RoleType, Root, Signed};
+use tough::schema::{RoleType, Root, Signed, Timestamp};
 use tough::{
     Bytes, ExpirationEnforcement, Limits, RepositoryLoader, TransportError, TransportErrorKind, TransportStream,
 };
@@ -25,6 +25,11 @@ use url::Url;
 pub const METADATA_BYTES_MAX: u64 = 4 * 1024 * 1024;
 /// New roots taken in one refresh.
 const ROOTS_MAX: u64 = 64;
+/// So far may the time that a server tells lie beyond the newest signed one. More than the day that a timestamp lives, so that one that is withheld is seen to have
+/// expired; not much more, so that a server whose clock is years ahead keeps a robot from its updates for two days at most.
+const TOLD_AHEAD_MS: u64 = 2 * 24 * 3_600 * 1_000;
+/// A floor that rises by less is not worth a write.
+const TOLD_STEP_MS: i64 = 3_600 * 1_000;
 /// Nothing is fetched from here: it gives documents their names.
 const NOWHERE: &str = "https://metadata.invalid/";
 
@@ -153,6 +158,18 @@ impl Trusted {
     pub fn time_floor(&self) -> Utc {
         self.time_floor
     }
+    /// As a server told the time over a connection on which it proved itself: the floor rises to that, at most to two days beyond the time of the newest signed
+    /// timestamp, and never falls. None: by less than an hour, or nothing signed has said any time yet.
+    #[must_use]
+    pub fn told(&self, time: Utc) -> Option<Self> {
+        let is_later = |floor: Utc| floor.0.saturating_sub(self.time_floor.0) >= TOLD_STEP_MS;
+        if !is_later(time) {
+            return None;
+        }
+        let timestamp: Signed<Timestamp> = serde_json::from_str(self.timestamp.as_deref()?).ok()?;
+        let time_floor = time.min(issued_at(&timestamp.signed)?.plus_ms(TOLD_AHEAD_MS));
+        is_later(time_floor).then(|| Self { time_floor, ..self.clone() })
+    }
     /// The moment that expiry is held against.
     pub fn now(&self, clock: Reading) -> Utc {
         if clock.is_synced { clock.utc.max(self.time_floor) } else { self.time_floor }
@@ -245,8 +262,7 @@ impl Trusted {
             (Kept::Snapshot, "snapshot", snapshot.signed.version.get(), snapshot.signed.expires),
             (Kept::Targets, "targets", targets.signed.version.get(), targets.signed.expires),
         ];
-        let issued = timestamp.signed._extra.get(ISSUED_AT).and_then(serde_json::Value::as_i64).map_or(Utc(0), Utc);
-        let time_floor = self.time_floor.max(issued);
+        let time_floor = self.time_floor.max(issued_at(&timestamp.signed).unwrap_or(Utc(0)));
         let now = Self { time_floor, ..self.clone() }.now(clock);
         let mut versions = BTreeMap::new();
         for (kept, role, version, expires) in offered {
@@ -274,6 +290,11 @@ impl Trusted {
         });
         Ok(Refreshed { trusted, targets: listed.collect() })
     }
+}
+
+/// When it was signed, as its signer says.
+fn issued_at(timestamp: &Timestamp) -> Option<Utc> {
+    timestamp._extra.get(ISSUED_AT).and_then(serde_json::Value::as_i64).map(Utc)
 }
 
 /// Gives `tough` documents of a source and keeps them as they came.

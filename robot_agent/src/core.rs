@@ -18,7 +18,7 @@ use midshift_core::authority::SentHeartbeats;
 use midshift_core::ids::{AttemptId, PlaceId, RobotId, WaypointId};
 use midshift_core::limits;
 use midshift_core::robot::{Fault, FaultClass, HardwareStop, Inventory, Lane, Mode, ReportedState, StopLevel, Vitals};
-use midshift_core::time::{LinkDuration, LinkTime, Now, SiteDuration, SiteTime};
+use midshift_core::time::{LinkDuration, LinkTime, Now, SiteDuration, SiteTime, Utc};
 use midshift_core::work::{DesiredPolicy, DesiredWork, RobotEvent, SampleBody};
 use midshift_proto::session::{ClockSample, Downlink, Heartbeat, LaneAck, LaneBatch, StatusReplay, Uplink, Welcome};
 use std::collections::{BTreeSet, VecDeque};
@@ -32,6 +32,8 @@ pub struct CoreConfig {
     pub bugs: Bugs,
     /// What it believes of software; none: its software is not changed.
     pub update: Option<UpdateConfig>,
+    /// Its server proves itself on each connection: what time it tells is believed within bounds.
+    pub server_is_proven: bool,
 }
 
 /// What happened outside.
@@ -423,6 +425,7 @@ impl AgentCore {
                 self.update.server_reached = true;
             }
             self.clock = Some(ClockSample { t4_us: now.wall.0 * 1000, ..echo.clock });
+            self.told_the_time(Utc(echo.clock.t3_us / 1000));
         }
         for ack in &down.acks {
             self.acked(ack);

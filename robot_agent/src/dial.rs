@@ -42,6 +42,10 @@ pub struct Error(pub Box<dyn std::error::Error + Send + Sync>);
 pub trait Dial: Send + Sync {
     /// A new connection.
     async fn dial(&self) -> Result<Channel, Error>;
+    /// Whether each connection is one on which the server has proven by its certificate that it is of the site.
+    fn proves_server(&self) -> bool {
+        false
+    }
 }
 
 /// The settings every robot's connection has, whatever carries it.
@@ -165,6 +169,9 @@ pub type Wire = Either<Cut<TcpStream>, Box<TlsStream<Cut<TcpStream>>>>;
 impl Dial for TcpDial {
     async fn dial(&self) -> Result<Channel, Error> {
         self.endpoint.connect_with_connector(self.connector()).await.map_err(|e| Error(e.into()))
+    }
+    fn proves_server(&self) -> bool {
+        self.tls.is_some()
     }
 }
 

@@ -188,6 +188,7 @@ pub async fn run(
         robot_id: config.robot_id.clone(),
         bugs: config.bugs,
         update: config.update.as_ref().map(|u| u.config.clone()),
+        server_is_proven: lines.link.proves_server(),
     };
     let mut core = AgentCore::new(core, body, kept, clock.now());
     core.saw(holdings);

@@ -30,6 +30,17 @@ impl AgentCore {
         Trusted::new(root).map_err(|e| Reason::new(Code::MetadataRefused, e.to_string()))
     }
 
+    /// The server told the time with the echo of a heartbeat: what it proved itself for raises the floor, within bounds.
+    pub(crate) fn told_the_time(&mut self, time: Utc) {
+        if !self.config.server_is_proven {
+            return;
+        }
+        self.update.told = self.update.told.max(Some(time));
+        if let Some(trusted) = self.kept.ledger.trusted.as_ref().and_then(|trusted| trusted.told(time)) {
+            self.write(Op::Trusted(Arc::new(trusted)), false);
+        }
+    }
+
     /// Whose directives it takes: of the keys that were handed over last. Keys that a person put into its trust file since count instead.
     fn directive_keys(&self) -> Current {
         let own = self.update.config.as_ref().map(|c| c.directive_keys.clone()).unwrap_or_default();
@@ -76,7 +87,11 @@ impl AgentCore {
     }
 
     /// The repository has answered: what it says is believed first, then the directive is held against it.
-    pub(super) fn refreshed(&mut self, now: &Now, refreshed: Refreshed, key_sets: &BTreeMap<u64, Vec<u8>>) {
+    pub(super) fn refreshed(&mut self, now: &Now, mut refreshed: Refreshed, key_sets: &BTreeMap<u64, Vec<u8>>) {
+        // What it was told meanwhile counts beside what was signed.
+        if let Some(later) = self.update.told.and_then(|time| refreshed.trusted.told(time)) {
+            refreshed.trusted = later;
+        }
         self.write(Op::Trusted(Arc::new(refreshed.trusted.clone())), true);
         self.take_keys(key_sets);
         let time = refreshed.trusted.now(self.reading(now));

@@ -225,6 +225,8 @@ pub(crate) struct Updater {
     pub(crate) keys_asked: Option<String>,
     /// The repository is asked for newer keys alone.
     pub(crate) asks_for_keys: bool,
+    /// The latest time that a proven server told.
+    pub(crate) told: Option<Utc>,
     /// Generation of the section whose order to go back was refused because nothing is kept.
     pub(crate) no_way_back: Option<u64>,
     /// Content that is known to be there.

@@ -27,6 +27,7 @@ mod stop_software;
 mod stops;
 #[path = "../../../tests/src/strace.rs"]
 mod strace;
+mod told_time;
 mod trusts;
 mod updates;
 mod ways;

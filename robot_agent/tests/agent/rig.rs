@@ -328,7 +328,8 @@ impl Rig {
     fn new(body: TestBody, store: MemoryStore, bugs: Bugs, updates: Option<Updates>, ms: u64, stop: StopDesk) -> Self {
         let kept = store.load_now("ring-1");
         let update = updates.as_ref().map(|u| u.releases.config());
-        let config = CoreConfig { robot_id: RobotId::parse("rbt-01").expect("a name"), bugs, update };
+        let config =
+            CoreConfig { robot_id: RobotId::parse("rbt-01").expect("a name"), bugs, update, server_is_proven: true };
         let mut core = AgentCore::new(config, Box::new(body.clone()), kept, now_at(ms));
         if stop.is_there {
             core.obeys_stops(Loaded { kept: stop.kept.clone(), is_durable: true }, LinkTime(ms));

@@ -11,7 +11,7 @@ use std::io;
 use std::sync::Arc;
 
 #[derive(Debug)]
-struct Metadata(Releases);
+pub struct Metadata(pub Releases);
 
 #[async_trait::async_trait]
 impl Source for Metadata {
