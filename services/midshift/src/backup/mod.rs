@@ -12,6 +12,7 @@ mod parts;
 mod place;
 mod releases;
 mod rows;
+mod stops;
 
 use anyhow::{Context, bail, ensure};
 use files::write;

@@ -5,6 +5,7 @@ use super::identity::Identity;
 use super::keys::OnlineKeys;
 use super::releases::Releases;
 use super::rows::{Rows, Schemas};
+use super::stops::Stops;
 use async_trait::async_trait;
 use midshift_core::time::Utc;
 use midshift_store::{Database, PostgresRestore, StoreId};
@@ -12,8 +13,8 @@ use std::path::Path;
 
 /// All parts. Rows come first: what they name is copied after them and never taken away while a copied row may name it. They are put
 /// back in the other order: the rows make a server of the rest.
-pub const PARTS: [&dyn Part; 6] =
-    [&Rows(Database::Control), &Rows(Database::Telemetry), &Schemas, &Releases, &OnlineKeys, &Identity];
+pub const PARTS: [&dyn Part; 7] =
+    [&Rows(Database::Control), &Rows(Database::Telemetry), &Schemas, &Releases, &OnlineKeys, &Identity, &Stops];
 
 /// Name of the part of online keys, and of the folder where they go if nobody says where.
 pub const KEYS: &str = "ota-keys";

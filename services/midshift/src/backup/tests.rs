@@ -245,3 +245,31 @@ async fn with_a_clock_before_the_backup_or_keys_that_it_has_not_nothing_is_resto
     assert!(error.contains("no online keys"), "{error}");
     assert!(!to.data.exists());
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_backup_has_the_files_of_a_stop_service_that_runs_and_none_of_one_that_lost_its_latch() {
+    let used = Used::new().await;
+    let folder = used.places().data.join("stop");
+    let parts = midshift_stop::Parts { folder: folder.clone(), site: None, clock: clock::clock(1000) };
+    let _service = midshift_stop::StopService::open(parts, Default::default()).expect("opened");
+    fs::write(folder.join("roster.snapshot.part"), b"half").expect("written");
+    let backup = used.backed_up().await;
+    let summary = verify(&backup).await.expect("it is good");
+    assert!(summary.has("stop"), "{summary:?}");
+    let to = Places { data: used.dir.path().join("restored"), ota_keys: None, store: None };
+    restore(&backup, &to, NOW).await.expect("restored");
+    let restored = to.data.join("stop");
+    assert_eq!(fs::metadata(&restored).expect("a folder").permissions().mode() & 0o777, 0o700);
+    for name in ["latch", "key.pem"] {
+        assert_eq!(fs::read(restored.join(name)).expect("it is there"), fs::read(folder.join(name)).expect("as here"));
+        assert_eq!(fs::metadata(restored.join(name)).expect("a file").permissions().mode() & 0o777, 0o600);
+    }
+    assert!(!restored.join("roster.snapshot.part").exists(), "what is being written is in no backup");
+
+    fs::write(backup.join("stop/latch"), b"nothing").expect("written");
+    let error = verify(&backup).await.expect_err("it is broken").to_string();
+    assert!(error.contains("stop/latch is not what was copied") && error.contains("no whole value"), "{error}");
+    fs::remove_file(folder.join("latch")).expect("removed");
+    let error = back_up(&used.places(), &used.dir.path().join("second"), NOW).await.expect_err("nobody knows");
+    assert!(format!("{error:#}").contains("has lost a file: start `midshift stop serve` once"), "{error:#}");
+}

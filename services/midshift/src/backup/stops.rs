@@ -1,0 +1,97 @@
+//! The files of the stop service beside the server: which stops are engaged, its key, its audit, and who is known to it.
+//!
+//! What a restore brings back stops at least what stood at the backup. A reset that came later is not in it: that stop is engaged again, and is reset by name
+//! once more. A stop that came later is brought back by robots, who keep it themselves, and taken from them because the key is the same.
+
+use super::files::{copy, copy_if_there, entries};
+use super::parts::{Making, Part, Said};
+use super::{Places, blocking};
+use crate::stop::FOLDER;
+use anyhow::{Context, ensure};
+use async_trait::async_trait;
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+
+/// Latch, key, audit and snapshots.
+pub struct Stops;
+
+/// Which stops are engaged.
+const LATCH: &str = "latch";
+/// By which the service knows its own stops when robots bring them back.
+const KEY: &str = "key.pem";
+/// A file that is written over while it is read is read again so often.
+const TRIES: usize = 5;
+
+#[async_trait]
+impl Part for Stops {
+    fn name(&self) -> &'static str {
+        FOLDER
+    }
+    async fn copy(&self, from: &Places, folder: &Path, _said: &mut Said) -> anyhow::Result<bool> {
+        let (from, folder) = (from.data.join(FOLDER), folder.to_owned());
+        blocking(move || {
+            let (has_latch, has_key) = (from.join(LATCH).exists(), from.join(KEY).exists());
+            if !has_latch && !has_key {
+                return Ok(false);
+            }
+            ensure!(
+                has_latch && has_key,
+                "{} has lost a file: start `midshift stop serve` once, which stops the fleet if nobody knows any more what was stopped, and take the backup then",
+                from.display()
+            );
+            private(&folder)?;
+            // Before the audit: its newest record that the latch knows of must be there.
+            latch(&from, &folder)?;
+            for path in entries(&from)? {
+                let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+                if name != LATCH && !name.ends_with(".part") {
+                    copy_if_there(&path, &folder.join(name))?;
+                }
+            }
+            Ok(true)
+        })
+        .await
+    }
+    async fn check(&self, folder: &Path) -> anyhow::Result<Vec<String>> {
+        let folder = folder.to_owned();
+        blocking(move || {
+            let mut wrong = Vec::new();
+            if let Err(error) = midshift_stop::verify(&folder) {
+                wrong.push(error.to_string());
+            }
+            if !fs::read_to_string(folder.join(KEY)).unwrap_or_default().contains("PRIVATE KEY-----\n") {
+                wrong.push(format!("{KEY} has no key"));
+            }
+            Ok(wrong)
+        })
+        .await
+    }
+    async fn put_back(&self, folder: &Path, to: &mut Making) -> anyhow::Result<()> {
+        let (from, to) = (folder.to_owned(), to.places.data.join(FOLDER));
+        blocking(move || {
+            private(&to)?;
+            entries(&from)?.iter().try_for_each(|path| copy(path, &to.join(path.file_name().unwrap_or_default())))
+        })
+        .await
+    }
+}
+
+fn private(folder: &Path) -> anyhow::Result<()> {
+    fs::create_dir_all(folder)?;
+    fs::set_permissions(folder, fs::Permissions::from_mode(0o700))?;
+    Ok(())
+}
+
+/// The latch, which its writer may be writing over: one of its two halves is whole in a copy unless it was written twice meanwhile.
+fn latch(from: &Path, folder: &Path) -> anyhow::Result<()> {
+    let mut copied = None;
+    for _ in 0..TRIES {
+        copy(&from.join(LATCH), &folder.join(LATCH))?;
+        match midshift_stop::latch(folder) {
+            Ok(_) => return Ok(()),
+            Err(error) => copied = Some(error),
+        }
+    }
+    copied.map_or(Ok(()), |error| Err(error).context("copying the latch"))
+}
