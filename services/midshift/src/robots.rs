@@ -4,7 +4,7 @@ use crate::door;
 use crate::machines::Machines;
 use crate::software::{self, Software};
 use crate::way::Way;
-use crate::{clock, site_file};
+use crate::{clock, site_file, stop};
 use anyhow::{Context, bail};
 use midshift_agent::bulk::Bulk;
 use midshift_agent::core::ExitReason;
@@ -41,19 +41,27 @@ const VISIT: Duration = Duration::from_secs(5);
 /// The way to the stop service.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub struct StopFlags {
-    /// The stop service, host:port; of a server beside it the port is 7421. With it a robot stands until it was told there what is stopped. Without it fleet stop
-    /// reaches these robots only by the work that fleet gives them, and they do not slow down or stand when nobody is heard.
-    #[arg(long, value_name = "ADDR")]
+    /// The stop service, host:port. Without it that on port 7421 of the server, if the robots are enrolled; where there is no login there is no line then. With a line
+    /// a robot stands until it was told what is stopped, and slows down and stands when nobody answers.
+    #[arg(long, value_name = "ADDR", conflicts_with = "no_stop")]
     pub stop_server: Option<String>,
+    /// No line to a stop service: fleet stop reaches these robots only by the work that fleet gives them, and they do not slow down or stand when nobody is heard.
+    #[arg(long)]
+    pub no_stop: bool,
 }
 
 impl StopFlags {
-    /// Where the stop service is; none: there is to be no line, which is said aloud.
-    fn address(&self) -> Option<&str> {
-        if self.stop_server.is_none() {
-            tracing::warn!("no stop line: fleet stop does not reach these robots by a way of its own");
+    /// Where the stop service is for robots of the server at `server`, over TLS or not; none: there is to be no line, which is said aloud.
+    fn address(&self, server: &str, is_secure: bool) -> Option<String> {
+        let beside = || is_secure.then(|| stop::beside(server)).flatten();
+        let address = if self.no_stop { None } else { self.stop_server.clone().or_else(beside) };
+        match &address {
+            Some(address) => {
+                tracing::info!(address, "these robots stand until the stop service has told them what is stopped")
+            }
+            None => tracing::warn!("no stop line: fleet stop does not reach these robots by a way of its own"),
         }
-        self.stop_server.as_deref()
+        address
     }
 }
 
@@ -243,9 +251,9 @@ pub async fn agent_in_hand(
     if let Some(update) = &mut update {
         update.config.clock_synced = !args.clock_unsynced;
     }
-    let stop_line = match args.stop.address() {
+    let stop_line = match args.stop.address(&args.server, tls.is_some()) {
         Some(address) => Some(StopLine {
-            dial: Arc::new(TcpDial::new(&with_scheme(scheme, address), Some(stop_network))?.with_tls(tls.clone())),
+            dial: Arc::new(TcpDial::new(&with_scheme(scheme, &address), Some(stop_network))?.with_tls(tls.clone())),
             keep: Box::new(FileStops::new(&args.data.join(STOP_FILE))),
         }),
         None => None,
@@ -316,8 +324,8 @@ pub async fn swarm(args: SimRun, signed_in: Option<Way>, stop: CancellationToken
     let tls = machines.as_ref().map(Machines::tls).unwrap_or_default();
     let mut swarm =
         SwarmConfig::over(hall.clone(), clock.clone(), &with_scheme(scheme, &args.server), Arc::new(tls), args.seed);
-    if let Some(address) = args.stop.address() {
-        swarm = swarm.with_stop(&with_scheme(scheme, address));
+    if let Some(address) = args.stop.address(&args.server, machines.is_some()) {
+        swarm = swarm.with_stop(&with_scheme(scheme, &address));
     }
     let _renewing = machines.map(|machines| machines.keep(&args.server, &clock)).transpose()?;
     swarm.software = trust;
@@ -337,4 +345,23 @@ pub async fn swarm(args: SimRun, signed_in: Option<Way>, stop: CancellationToken
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn enrolled_robots_have_a_stop_line_to_the_host_of_their_server_unless_they_are_told_otherwise() {
+        let flags = |named: Option<&str>, no_stop| StopFlags { stop_server: named.map(str::to_owned), no_stop };
+        let default = flags(None, false);
+        assert_eq!(default.address("fleet.local:7420", true).as_deref(), Some("fleet.local:7421"));
+        assert_eq!(default.address("https://[::1]:9000", true).as_deref(), Some("[::1]:7421"));
+        assert_eq!(default.address("fleet.local:7420", false), None, "where there is no login");
+        assert_eq!(flags(None, true).address("fleet.local:7420", true), None);
+        for is_secure in [false, true] {
+            let named = flags(Some("stops:1"), false).address("fleet.local:7420", is_secure);
+            assert_eq!(named.as_deref(), Some("stops:1"));
+        }
+    }
 }

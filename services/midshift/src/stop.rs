@@ -4,6 +4,7 @@
 //! ends a running stop service: `serve` starts one where none is, and leaves it alone for ever.
 
 use crate::door::{self, Login, Share};
+use crate::robots::uri;
 use crate::{clock, server, site_file};
 use anyhow::{Context, bail};
 use axum::routing::get;
@@ -42,6 +43,12 @@ const PRINCIPALS_EVERY: Duration = Duration::from_millis(500);
 /// Beside `serve` it is looked after so often, and started again after so many looks in vain: within [`midshift_core::limits::SILENCE_SLOW`].
 const KEPT_EVERY: Duration = Duration::from_secs(2);
 const MISSES: u32 = 2;
+
+/// The stop service on the host of a server: host:port. None: `server` names no host.
+pub fn beside(server: &str) -> Option<String> {
+    let uri: http::Uri = uri(server).parse().ok()?;
+    Some(format!("{}:{PORT}", uri.host()?))
+}
 
 /// What `stop serve` was asked for.
 #[derive(Clone, Debug, clap::Args)]

@@ -1,8 +1,12 @@
 //! `midshift doctor`: looks for what may be wrong, and says what to try.
 
+mod machine;
+mod shown;
+mod site;
+
 use super::client::{Call, Exit, unary};
 use super::out::{Format, Out, columns};
-use super::released;
+use super::{released, stop};
 use crate::clock;
 use midshift_bundle::freshness::{newest_targets, root_edition, stamp, targets_edition};
 use midshift_bundle::repository::TIMESTAMP_LIFE_MS;
@@ -10,14 +14,13 @@ use midshift_core::time::Utc;
 use midshift_proto::ota::v1::{GetMetadataRequest, ListBundlesRequest, ListBundlesResponse, SoftwareRoom};
 use midshift_proto::task::v1::{ListTasksRequest, TaskFilter, TaskState};
 use midshift_proto::telemetry::v1;
+use std::path::PathBuf;
 use tonic::Code;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
 /// Robot clocks further off than this are worth a look, milliseconds.
 const SKEW_MAX_MS: i64 = 2_000;
-/// Descriptors a server for a thousand robots should have.
-const DESCRIPTORS_WANTED: u64 = 4_096;
 
 /// People are told so long before a document that they sign ends, milliseconds: 60 days.
 const PEOPLE_TOLD_MS: u64 = 60 * DAY_MS;
@@ -40,23 +43,50 @@ const SERVICES: [&str; 6] = [
     "midshift.ota.v1.RolloutService",
 ];
 
+/// What to look at.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Doctor {
+    #[command(flatten)]
+    call: Call,
+    /// The stop service, host:port, if it is not on port 7421 of the server.
+    #[arg(long, env = "MIDSHIFT_STOP_SERVER", value_name = "HOST:PORT")]
+    stop_server: Option<String>,
+    /// The server's data folder, if this is its machine.
+    #[arg(long, default_value = "midshift-data")]
+    data: PathBuf,
+}
+
+#[derive(Debug)]
 struct Finding {
     what: &'static str,
     good: bool,
     text: String,
 }
 
+impl Finding {
+    fn good(what: &'static str, text: impl Into<String>) -> Self {
+        Self { what, good: true, text: text.into() }
+    }
+    /// A person should look into it.
+    fn look(what: &'static str, text: impl Into<String>) -> Self {
+        Self { what, good: false, text: text.into() }
+    }
+}
+
 /// Runs every check; exit code 1 if one is not good.
-pub async fn run(call: &Call, out: &Out) -> Result<(), Exit> {
-    let mut found =
-        vec![Finding { what: "version", good: true, text: env!("CARGO_PKG_VERSION").to_owned() }, descriptors()];
-    match call.telemetry().await {
-        Err(_) => found.push(Finding {
-            what: "server",
-            good: false,
-            text: format!("nothing answers at {}; start `midshift dev` or `midshift serve`", call.address()?),
-        }),
-        Ok(_) => server(call, &mut found).await?,
+pub async fn run(doctor: &Doctor, out: &Out) -> Result<(), Exit> {
+    let mut found = vec![Finding::good("version", env!("CARGO_PKG_VERSION"))];
+    found.extend(machine::data(&doctor.data));
+    match doctor.call.telemetry().await {
+        Err(_) => {
+            found.push(machine::descriptors(None));
+            let at = doctor.call.address()?;
+            found.push(Finding::look(
+                "server",
+                format!("nothing answers at {at}; start `midshift dev` or `midshift serve`"),
+            ));
+        }
+        Ok(_) => server(doctor, &mut found).await?,
     }
     match out.format {
         Format::Json | Format::Jsonl => {
@@ -77,39 +107,25 @@ pub async fn run(call: &Call, out: &Out) -> Result<(), Exit> {
     if bad == 0 { Ok(()) } else { Err(Exit::new(1, format!("{bad} checks want a look"))) }
 }
 
-fn descriptors() -> Finding {
-    let text = std::fs::read_to_string("/proc/self/limits").unwrap_or_default();
-    let limit = text
-        .lines()
-        .find(|l| l.starts_with("Max open files"))
-        .and_then(|l| l.split_whitespace().nth(3))
-        .and_then(|n| n.parse::<u64>().ok());
-    match limit {
-        None => Finding { what: "descriptors", good: true, text: "limit unknown on this system".to_owned() },
-        Some(n) => Finding {
-            what: "descriptors",
-            good: n >= DESCRIPTORS_WANTED,
-            text: format!("{n} open files allowed here; a robot takes one"),
-        },
-    }
-}
-
-async fn server(call: &Call, found: &mut Vec<Finding>) -> Result<(), Exit> {
+async fn server(doctor: &Doctor, found: &mut Vec<Finding>) -> Result<(), Exit> {
+    let (call, now) = (&doctor.call, clock::wall());
+    let resolved = call.resolved()?;
     let channel = call.line().await?;
     for service in SERVICES {
         let request = tonic_health::pb::HealthCheckRequest { service: service.to_owned() };
         let status = HealthClient::new(channel.clone()).check(unary(request)).await.map(|r| r.into_inner().status());
         let good = matches!(status, Ok(ServingStatus::Serving));
-        found.push(Finding {
-            what: "service",
-            good,
-            text: format!("{service} {}", if good { "serves" } else { "does not serve" }),
-        });
+        let text = format!("{service} {}", if good { "serves" } else { "does not serve" });
+        found.push(Finding { what: "service", good, text });
     }
     found.push(store(call).await);
     found.extend(robots(call).await?);
     found.push(operator(call).await?);
     found.extend(releases(call).await);
+    found.extend(shown::certificates(&resolved, now).await);
+    found.extend(site::identities(call, &resolved, now).await);
+    found.push(site::exposure(&resolved));
+    found.push(site::stop(&resolved, &stop::address(doctor.stop_server.as_deref(), &resolved)?).await);
     Ok(())
 }
 
@@ -231,19 +247,41 @@ async fn store(call: &Call) -> Finding {
     Finding { what: "store", good, text }
 }
 
-async fn robots(call: &Call) -> Result<[Finding; 2], Exit> {
+async fn robots(call: &Call) -> Result<Vec<Finding>, Exit> {
     let request = v1::ListRobotsRequest { page_size: 1_000, ..v1::ListRobotsRequest::default() };
-    let robots = call.telemetry().await?.list_robots(unary(request)).await?.into_inner().robots;
+    let mut client = call.telemetry().await?;
+    let answer = client.list_robots(unary(request.clone())).await?;
+    let server = shown::clock(answer.metadata(), clock::wall());
+    let mut page = answer.into_inner();
+    let mut robots = std::mem::take(&mut page.robots);
+    while !page.next_page_token.is_empty() {
+        let next = v1::ListRobotsRequest { page_token: page.next_page_token, ..request.clone() };
+        page = client.list_robots(unary(next)).await?.into_inner();
+        robots.append(&mut page.robots);
+    }
     let online = robots.iter().filter(|r| r.presence() == v1::Presence::Online).count();
-    let skewed = robots.iter().filter(|r| r.clock_offset_ms.is_some_and(|o| o.abs() > SKEW_MAX_MS)).count();
-    Ok([
-        Finding { what: "robots", good: online == robots.len(), text: format!("{online} of {} online", robots.len()) },
-        Finding {
-            what: "clocks",
-            good: skewed == 0,
-            text: format!("{skewed} robots off by more than {SKEW_MAX_MS} ms"),
-        },
+    let good = online == robots.len();
+    Ok(vec![
+        machine::descriptors(Some(robots.len())),
+        Finding { what: "robots", good, text: format!("{online} of {} online", robots.len()) },
+        server,
+        clocks(&robots),
     ])
+}
+
+/// Clocks of robots beside the server's, as their heartbeats measure them.
+fn clocks(robots: &[v1::Robot]) -> Finding {
+    let offset = |robot: &v1::Robot| robot.clock_offset_ms.unwrap_or_default();
+    let skewed = robots.iter().filter(|robot| offset(robot).abs() > SKEW_MAX_MS);
+    let count = skewed.clone().count();
+    let text = format!("{count} robots off by more than {SKEW_MAX_MS} ms");
+    match skewed.max_by_key(|robot| offset(robot).abs()) {
+        None => Finding::good("clocks", text),
+        Some(worst) => Finding::look(
+            "clocks",
+            format!("{text}, most of all {} by {} ms: set them from the network (NTP)", worst.robot_id, offset(worst)),
+        ),
+    }
 }
 
 async fn operator(call: &Call) -> Result<Finding, Exit> {

@@ -31,7 +31,7 @@ use crate::serve::Serve;
 use crate::storage::Database;
 use crate::{dev, logs, robots, serve};
 use clap::{Parser, Subcommand};
-use client::{Call, Exit};
+use client::Exit;
 use midshift_agent::core::ExitReason;
 use midshift_agent::launcher::{self, SWITCHED};
 use out::{Format, Out};
@@ -94,6 +94,8 @@ enum Command {
     Robot(robot::Verb),
     /// Stop robots at once: an operational stop request, not a safety function.
     Stop(Box<stop::Stop>),
+    /// Let robots and tasks go on that stand held, after their stop was reset: `midshift resume --stop ID`.
+    Resume(Box<task::Resume>),
     /// Passages and standing places.
     #[command(subcommand)]
     Zone(zone::Verb),
@@ -126,8 +128,8 @@ enum Command {
     /// Rights of people and programs.
     #[command(subcommand)]
     Token(token::Verb),
-    /// Look for what may be wrong: server, store, robots, this machine.
-    Doctor(Call),
+    /// Look for what may be wrong: server, store, robots, certificates, clocks, disk, limits, and who can reach what.
+    Doctor(doctor::Doctor),
     /// Whether one process serves: exit code 0 or 1, for health checks.
     Health(health::Health),
     /// What a reason means and what to try.
@@ -206,6 +208,7 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
             Some(args) => Ok(crate::stop::run(args.clone(), interrupts()).await?),
             None => stop::run(*stop, out).await,
         },
+        Command::Resume(resume) => resume.run(out).await,
         Command::Zone(verb) => zone::run(verb, out).await,
         Command::Incident(verb) => incident::run(verb, out).await,
         Command::Area(verb) => area::run(verb, out).await,
@@ -217,7 +220,7 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Login(args) => context::login(args, out).await,
         Command::Context(verb) => context::run(verb, out).await,
         Command::Token(verb) => token::run(verb, out).await,
-        Command::Doctor(call) => doctor::run(&call, out).await,
+        Command::Doctor(doctor) => doctor::run(&doctor, out).await,
         Command::Health(args) => health::run(args, out).await,
         Command::ExplainError { code } => explain::error(code.as_deref(), out),
     }

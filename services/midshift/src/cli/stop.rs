@@ -4,8 +4,7 @@
 
 use super::client::{Exit, Login, Resolved, unary};
 use super::out::{Format, Out};
-use crate::robots::uri;
-use crate::stop::{FOLDER, PORT, StopServe};
+use crate::stop::{FOLDER, StopServe};
 use crate::way::Line;
 use clap::{Args, Subcommand, ValueEnum};
 use midshift_core::time::Utc;
@@ -15,7 +14,6 @@ use midshift_proto::stop::v1::scope::Scope;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use tonic::transport::Uri;
 
 /// Stops that were not confirmed by all.
 const NOT_ALL: u8 = 13;
@@ -36,20 +34,19 @@ pub struct StopCall {
     login: Login,
 }
 
-impl StopCall {
-    fn address(&self, resolved: &Resolved) -> Result<String, Exit> {
-        if let Some(stop_server) = self.stop_server.as_ref().or(resolved.stop_server.as_ref()) {
-            return Ok(stop_server.clone());
-        }
-        let server = &resolved.server;
-        let uri: Uri = uri(server).parse().map_err(|e| Exit::usage(format!("--server {server}: {e}")))?;
-        let host = uri.host().ok_or_else(|| Exit::usage(format!("--server {server} has no host")))?;
-        Ok(format!("{host}:{PORT}"))
+/// Where the stop service of a site is: as it was named, or on the host of its server.
+pub fn address(named: Option<&str>, resolved: &Resolved) -> Result<String, Exit> {
+    if let Some(stop_server) = named.or(resolved.stop_server.as_deref()) {
+        return Ok(stop_server.to_owned());
     }
+    let server = &resolved.server;
+    crate::stop::beside(server).ok_or_else(|| Exit::usage(format!("--server {server} names no host")))
+}
 
+impl StopCall {
     async fn client(&self) -> Result<StopServiceClient<Line>, Exit> {
         let resolved = self.login.resolve(self.server.as_deref())?;
-        let address = self.address(&resolved)?;
+        let address = address(self.stop_server.as_deref(), &resolved)?;
         let line = resolved.way(&address)?.connect().await.map_err(|_| {
             Exit::new(
                 5,
@@ -433,7 +430,7 @@ async fn reset(call: &StopCall, request: v1::ResetRequest, out: &Out) -> Result<
         out.say("warning: the stop service's disk refused the reset; robots were told, and it is written as soon as it can be");
     }
     out.next(&format!(
-        "robots that stood stay where they are; when it is right that they move: midshift task resume --stop-id {} --reason TEXT",
+        "robots that stood stay where they are; when it is right that they move: midshift resume --stop {} --reason TEXT",
         reset.stop_id
     ));
     Ok(())
@@ -444,9 +441,7 @@ mod tests {
     use super::*;
 
     fn call(server: &str, stop_server: Option<&str>) -> String {
-        let stop_server = stop_server.map(str::to_owned);
-        let call = StopCall { server: None, stop_server, login: Login::default() };
-        call.address(&Resolved::plain(server)).expect("an address")
+        address(stop_server, &Resolved::plain(server)).expect("an address")
     }
 
     #[test]

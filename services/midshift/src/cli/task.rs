@@ -74,27 +74,51 @@ pub enum Verb {
         #[command(flatten)]
         change: Change,
     },
-    /// Let held tasks and robots go on.
-    Resume {
-        #[command(flatten)]
-        call: Call,
-        /// The stop whose tokens go.
-        #[arg(long, default_value = "")]
-        stop_id: String,
-        /// Everything in this area.
-        #[arg(long, default_value = "")]
-        area: String,
-        /// These robots.
-        #[arg(long)]
-        robot: Vec<String>,
-        /// These tasks.
-        task_ids: Vec<String>,
-        /// Why.
-        #[arg(long)]
-        reason: String,
-        #[command(flatten)]
-        change: Change,
-    },
+    /// Let held tasks and robots go on: the same as `midshift resume`.
+    Resume(Resume),
+}
+
+/// Who goes on.
+#[derive(clap::Args)]
+pub struct Resume {
+    #[command(flatten)]
+    call: Call,
+    /// The stop that stood them. It must be reset first.
+    #[arg(long = "stop", visible_alias = "stop-id", value_name = "ID", default_value = "")]
+    stop_id: String,
+    /// Everything in this area.
+    #[arg(long, default_value = "")]
+    area: String,
+    /// These robots.
+    #[arg(long)]
+    robot: Vec<String>,
+    /// These tasks.
+    task_ids: Vec<String>,
+    /// Why.
+    #[arg(long)]
+    reason: String,
+    #[command(flatten)]
+    change: Change,
+}
+
+impl Resume {
+    /// Asks for it.
+    pub async fn run(self, out: &Out) -> Result<(), Exit> {
+        let Self { call, stop_id, area, robot, task_ids, reason, change } = self;
+        let request = v1::ResumeHeldRequest {
+            stop_id,
+            area_id: area,
+            task_ids,
+            robot_ids: robot,
+            request_id: change.request_id,
+            reason,
+            validate_only: change.dry_run,
+        };
+        let answer = call.task().await?.resume_held(unary(request)).await?.into_inner();
+        out.one(&answer, "", || "resume asked for".to_owned())?;
+        out.next("midshift task ls --state held");
+        Ok(())
+    }
 }
 
 /// One task.
@@ -238,21 +262,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Resolve { one, resolution, reason, if_match, change } => {
             resolve(one, resolution, reason, if_match, change, out).await
         }
-        Verb::Resume { call, stop_id, area, robot, task_ids, reason, change } => {
-            let request = v1::ResumeHeldRequest {
-                stop_id,
-                area_id: area,
-                task_ids,
-                robot_ids: robot,
-                request_id: change.request_id,
-                reason,
-                validate_only: change.dry_run,
-            };
-            let answer = call.task().await?.resume_held(unary(request)).await?.into_inner();
-            out.one(&answer, "", || "resume asked for".to_owned())?;
-            out.next("midshift task ls --state held");
-            Ok(())
-        }
+        Verb::Resume(resume) => resume.run(out).await,
     }
 }
 
