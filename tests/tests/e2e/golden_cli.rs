@@ -35,6 +35,8 @@ const OPAQUE: [&str; 12] = [
 /// Keys of measurements.
 const MEASURED: [&str; 7] =
     ["heartbeat", "energyMwh", "hottestJointDecidegrees", "durationMs", "attachedMs", "pathMm", "loadedPathMm"];
+/// Nobody listens there.
+const NOBODY: &str = "127.0.0.1:1";
 /// Keys that are there once so many heartbeats have come.
 const LATE: [&str; 2] = ["clockErrorMs", "clockOffsetMs"];
 
@@ -322,7 +324,7 @@ async fn rollouts(room: &Room, t: &mut Transcript, address: SocketAddr) -> anyho
     t.note(&["bundle", "revoke", "walk-1.5.0", "--reason", "it limps"])?;
     t.note(&["rollout", "create", "again", "--bundle", "walk-1.5.0"])?;
     t.note(&["robot", "retire", "r2", "--reason", "sold", "-o", "name"])?;
-    t.note(&["doctor", "-o", "json"])?;
+    t.note(&["doctor", "--stop-server", NOBODY, "-o", "json"])?;
     Ok(())
 }
 
@@ -467,8 +469,8 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     t.note(&["incident", "close", "nothing", "--reason", "I looked"])?;
 
     t.note(&["zone", "ls", "-o", "name"])?;
-    t.note(&["doctor", "-o", "json"])?;
-    t.note(&["doctor"])?;
+    t.note(&["doctor", "--stop-server", NOBODY, "-o", "json"])?;
+    t.note(&["doctor", "--stop-server", NOBODY])?;
     t.note(&["sim", "world", "-o", "json"])?;
     t.note(&["health"])?;
     t.note(&["health", "--ready", "-o", "json"])?;

@@ -367,6 +367,10 @@ impl Server {
     pub fn channel(&self) -> anyhow::Result<Line> {
         channel(self.address)
     }
+    /// The way there, signed in; only of a site with a login.
+    pub fn way(&self) -> anyhow::Result<Way> {
+        known(self.address).map(|site| site.way).context("the site has no login")
+    }
     /// Tasks.
     pub fn tasks(&self) -> anyhow::Result<TaskServiceClient<Line>> {
         tasks(self.address)

@@ -131,7 +131,7 @@ impl Machine {
         }
         command.arg("launcher").arg("--record").arg(self.path("tries")).arg("--sets").arg(self.path("sets"));
         command.args(["--hang", HANG_S, "--", "sh", "-c", &script]).arg(&midshift);
-        command.args(["agent", "run", "--robot-id", "rbt-01", "--no-faults", "--server", server]);
+        command.args(["agent", "run", "--robot-id", "rbt-01", "--no-faults", "--no-stop", "--server", server]);
         command.arg("--data").arg(self.path("data")).arg("--sets").arg(self.path("sets"));
         command.arg("--trust").arg(self.path("trust.json")).process_group(0);
         Ok(Launched(Running::start(&mut command, &self.log())?))

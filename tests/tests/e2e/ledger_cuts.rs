@@ -115,7 +115,7 @@ impl Station {
         let mut command = Command::new(midshift()?);
         command.arg("launcher").arg("--record").arg(robot.join("tries")).arg("--sets").arg(robot.join("sets"));
         command.args(["--", "sh", "-c", &script(&robot), "sh"]).arg(midshift()?);
-        command.args(["agent", "run", "--robot-id", "rbt-01", "--no-faults", "--server", &address]);
+        command.args(["agent", "run", "--robot-id", "rbt-01", "--no-faults", "--no-stop", "--server", &address]);
         command.arg("--data").arg(robot.join("data")).arg("--sets").arg(robot.join("sets"));
         command.arg("--trust").arg(robot.join("trust.json")).process_group(0);
         if let Some(secret) = enrolment(server.address, "rbt-01").await? {

@@ -2,6 +2,7 @@
 
 use crate::harness::{Server, command, until};
 use crate::robots::Robots;
+use crate::stopped::{StopServer, resume, until_held};
 use midshift::background::request;
 use midshift_core::site::{DEMO, Site, text};
 use midshift_proto::task::v1::submit_task_result::Outcome;
@@ -167,5 +168,60 @@ async fn drill(engine: Engine) -> anyhow::Result<()> {
     let journals = robots.journals();
     let verdict = Oracle::read(&site, journals.iter().map(PathBuf::as_path))?.verdict();
     assert!(verdict.items_conserved() && verdict.exclusion_violations == 0, "{verdict:?}");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_restored_stop_service_stops_what_stood_at_the_backup_and_takes_later_stops_back_from_robots()
+-> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let site = text::parse(DEMO)?;
+    let mut server = Server::secure(dir.path(), &[]).await?;
+    let mut stops = StopServer::start(dir.path(), server.address).await?;
+    let robots =
+        Robots::start_beside(dir.path(), server.address, server.address, Some(stops.address), &site, 4).await?;
+    let [stood, reset_later] = [stops.stop(&["--robot", "rbt-01"])?, stops.stop(&["--robot", "rbt-02"])?];
+    let reset_before = stops.stop(&["--robot", "rbt-04"])?;
+    stops.reset(&reset_before)?;
+    let (data, backup) = (server.data(), dir.path().join("backup"));
+    let (data, backup) = (data.to_string_lossy(), backup.to_string_lossy());
+    run(&["backup", "--data", &data, "--to", &backup])?;
+    assert_eq!(run(&["restore", "--verify", "--from", &backup, "-o", "name"])?, "control\ntelemetry\nidentity\nstop\n");
+    // Of these two nobody but the robots will know.
+    stops.reset(&reset_later)?;
+    let later = stops.stop(&["--robot", "rbt-03"])?;
+    until_held(server.address, &["rbt-03".to_owned()], &format!("stop:{later}")).await?;
+    server.kill()?;
+    stops.kill()?;
+    std::fs::remove_dir_all(server.data())?;
+    run(&["restore", "--from", &backup, "--data", &data])?;
+    server.restart().await?;
+    stops.restart().await?;
+
+    let mut expected = vec![stood.clone(), reset_later.clone(), later.clone()];
+    expected.sort();
+    until("the robot brings its stop back", Duration::from_secs(60), || async {
+        let mut engaged = stops.engaged().await.unwrap_or_default();
+        engaged.sort();
+        Ok((engaged == expected).then_some(()))
+    })
+    .await?;
+    for (robot, stop_id) in [("rbt-01", &stood), ("rbt-02", &reset_later), ("rbt-03", &later)] {
+        until_held(server.address, &[robot.to_owned()], &format!("stop:{stop_id}")).await?;
+    }
+    run(&["stop", "verify", "--data", &data])?;
+    // Reset by name once more, and resumed: then all of them work.
+    for stop_id in &expected {
+        stops.reset(stop_id)?;
+    }
+    for (robot, stop_id) in
+        [("rbt-01", &stood), ("rbt-02", &reset_later), ("rbt-03", &later), ("rbt-04", &reset_before)]
+    {
+        until_held(server.address, &[robot.to_owned()], &format!("resume:{stop_id}")).await?;
+        resume(&server, stop_id)?;
+    }
+    submit(&server, &site, 2, "after").await?;
+    until_done(&server, TASKS).await?;
+    assert_eq!(robots.ids().len(), 4);
     Ok(())
 }

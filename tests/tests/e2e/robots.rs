@@ -1,6 +1,7 @@
 //! Robots as programs of their own.
 
 use crate::harness::{LOG, Running, channel, has_login, keep_secret, midshift, secret_part, until};
+use anyhow::Context;
 use midshift_agent::device::DeviceKey;
 use midshift_agent::enrolment::enrol;
 use midshift_agent::ledger::Ledger;
@@ -92,7 +93,7 @@ impl Robots {
             let [from, to] = [nth, nth + 1].map(|n| 1 + count * n / processes);
             let mut command = Command::new(midshift()?);
             command.args(["sim", "run", "--server", &robots.server, "--robots", &count.to_string(), "--no-faults"]);
-            command.args(["--only", &format!("{from}..{to}"), "--seed", "1"]).arg("--data").arg(dir);
+            command.args(["--no-stop", "--only", &format!("{from}..{to}"), "--seed", "1"]).arg("--data").arg(dir);
             command.arg("--site").arg(site).arg("--trust").arg(trust);
             robots.crowds.push(Running::start(&mut command, &dir.join(format!("crowd-{nth}.log")))?);
         }
@@ -113,8 +114,28 @@ impl Robots {
     }
     fn start_one(&mut self, number: usize, enrolment: Option<&str>) -> anyhow::Result<()> {
         let id = robot_id(number);
-        let dir = self.dir.join(&id);
-        std::fs::create_dir_all(&dir)?;
+        let running = self.run(number, &self.dir.join(&id), enrolment)?;
+        self.running.insert(id, running);
+        Ok(())
+    }
+    /// A copy of all that the machine of a robot keeps, taken in a moment in which it does nothing, and a second agent of it.
+    pub fn copy(&self, id: &str, to: &Path) -> anyhow::Result<Running> {
+        let robot = self.running.get(id).context("a robot that runs")?;
+        robot.signal("STOP")?;
+        std::fs::create_dir_all(to)?;
+        for file in std::fs::read_dir(self.dir.join(id))? {
+            let file = file?;
+            if file.file_type()?.is_file() {
+                std::fs::copy(file.path(), to.join(file.file_name()))?;
+            }
+        }
+        robot.signal("CONT")?;
+        self.run(id.trim_start_matches("rbt-").parse::<usize>()? - 1, to, None)
+    }
+    /// Starts one with what lies in `dir`.
+    pub fn run(&self, number: usize, dir: &Path, enrolment: Option<&str>) -> anyhow::Result<Running> {
+        let id = robot_id(number);
+        std::fs::create_dir_all(dir)?;
         let mut command = Command::new(midshift()?);
         command.args([
             "agent",
@@ -127,16 +148,15 @@ impl Robots {
             BODY_SPEED,
             "--no-faults",
         ]);
-        command.args(["--start", &self.starts[number], "--seed", &number.to_string()]).arg("--data").arg(&dir);
-        if let Some(stops) = &self.stops {
-            command.args(["--stop-server", stops]);
-        }
+        command.args(["--start", &self.starts[number], "--seed", &number.to_string()]).arg("--data").arg(dir);
+        match &self.stops {
+            Some(stops) => command.args(["--stop-server", stops]),
+            None => command.arg("--no-stop"),
+        };
         if let Some(secret) = enrolment {
             command.args(["--enroll", secret]);
         }
-        let running = Running::start(command.env("MIDSHIFT_LOG", LOG), &dir.join("agent.log"))?;
-        self.running.insert(id, running);
-        Ok(())
+        Running::start(command.env("MIDSHIFT_LOG", LOG), &dir.join("agent.log"))
     }
     /// SIGKILL.
     pub fn kill(&mut self, id: &str) -> anyhow::Result<()> {
@@ -146,6 +166,20 @@ impl Robots {
     pub fn restart(&mut self, id: &str) -> anyhow::Result<()> {
         let number: usize = id.trim_start_matches("rbt-").parse()?;
         self.start_one(number - 1, None)
+    }
+    /// None yet, on starting places of the site.
+    pub fn waiting(dir: &Path, server: SocketAddr, site: &Site, count: usize) -> Self {
+        let starts = site.starting_places(count).into_iter().map(|at| site.name_of(at).to_string()).collect();
+        Self { starts, ..Self::none(dir, server) }
+    }
+    /// The key of the machine in this folder, whether or not its agent runs.
+    pub async fn device(folder: &Path) -> anyhow::Result<DeviceKey> {
+        let copy = tempfile::tempdir()?;
+        for name in [AGENT_FILE.to_owned(), format!("{AGENT_FILE}-wal")] {
+            let _ = std::fs::copy(folder.join(&name), copy.path().join(&name));
+        }
+        let kept = SqliteStore::open(&copy.path().join(AGENT_FILE)).await?.load("").await?;
+        kept.ledger.device.context("a key")
     }
     /// What a robot remembers; its agent must not run.
     pub async fn ledger(&self, id: &str) -> anyhow::Result<Ledger> {

@@ -58,9 +58,10 @@ impl Robot {
         command.args(["--start", start, "--body-speed", BODY_SPEED]);
         command.arg("--data").arg(home.join("data")).arg("--sets").arg(&sets);
         command.arg("--trust").arg(home.join("trust.json")).process_group(0);
-        if let Some(stops) = stops {
-            command.args(["--stop-server", &stops.to_string()]);
-        }
+        match stops {
+            Some(stops) => command.args(["--stop-server", &stops.to_string()]),
+            None => command.arg("--no-stop"),
+        };
         Ok(Self { running: Running::start(&mut command, &home.join("log"))?, sets })
     }
     /// Its switch record.

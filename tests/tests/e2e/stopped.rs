@@ -54,8 +54,12 @@ impl StopServer {
         }
         Running::start(command.arg("--site").arg(dir.join("site.toml")), &dir.join("stop.log"))
     }
-    async fn kill_and_restart(&mut self) -> anyhow::Result<()> {
-        self.running.kill()?;
+    /// SIGKILL.
+    pub fn kill(&mut self) -> anyhow::Result<()> {
+        self.running.kill()
+    }
+    /// A new start after a kill, with whatever lies in the data directory now.
+    pub async fn restart(&mut self) -> anyhow::Result<()> {
         self.running = Self::run(&self.dir, self.address)?;
         self.answers().await
     }
@@ -139,7 +143,7 @@ pub fn judge_stops(journals: Vec<PathBuf>) -> anyhow::Result<()> {
 /// Resumes by the command line whatever one stop stood.
 pub fn resume(server: &Server, stop_id: &str) -> anyhow::Result<()> {
     let address = server.address.to_string();
-    done(&["task", "resume", "--server", &address, "--stop-id", stop_id, "--reason", "all clear"])
+    done(&["resume", "--server", &address, "--stop", stop_id, "--reason", "all clear"])
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -157,7 +161,8 @@ async fn a_stopped_fleet_stands_through_every_kill_until_it_is_reset_and_resumed
     until_held(address, &robots.ids(), &format!("stop:{first}")).await?;
     server.kill()?;
     let second = stops.stop(&["--robot", "rbt-01", "--level", "posture"])?;
-    stops.kill_and_restart().await?;
+    stops.kill()?;
+    stops.restart().await?;
     let engaged = stops.engaged().await?;
     ensure!(engaged == [first.clone(), second.clone()], "after kill -9 it knows of {engaged:?}");
     stops.reset(&second)?;

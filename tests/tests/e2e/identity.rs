@@ -1,0 +1,207 @@
+//! Who is who with real programs over TLS: a copied key, a revoked robot, a secret that is used twice, and a token that reaches too far.
+
+use crate::harness::{Running, Server, channel, folder, midshift, sign_in, until};
+use crate::kill::{all_over, at_work, judge, submit};
+use crate::robots::{Robots, enrolment};
+use crate::rolled_out::{call, done};
+use anyhow::{Context, ensure};
+use midshift_agent::dial::{Dial, TcpDial};
+use midshift_agent::enrolment::Enrolled;
+use midshift_agent::tls::Tls;
+use midshift_core::reason::Code;
+use midshift_core::site::{DEMO, Site, text};
+use midshift_proto::telemetry::v1::GetRobotRequest;
+use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
+use midshift_sim::journal;
+use serde_json::Value;
+use std::collections::BTreeSet;
+use std::net::SocketAddr;
+use std::path::Path;
+use std::process::{Command, Output};
+use std::time::Duration;
+
+const ROBOTS: usize = 6;
+const TASKS: usize = 30;
+const LIMIT: Duration = Duration::from_secs(60);
+
+/// What the command line prints as JSON.
+fn json(server: &Server, arguments: &[&str]) -> anyhow::Result<Value> {
+    let address = server.address.to_string();
+    let output = call(&[arguments, &["-o", "json", "--server", &address]].concat())?;
+    ensure!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    Ok(serde_json::from_slice(&output.stdout)?)
+}
+
+fn incidents(server: &Server) -> anyhow::Result<Vec<Value>> {
+    let listed = json(server, &["incident", "ls", "--all"])?;
+    Ok(listed["incidents"].as_array().cloned().unwrap_or_default())
+}
+
+/// Whether a second machine is attached with the robot's name, and whether the robot itself was heard a moment ago.
+async fn presence(server: SocketAddr, robot_id: &str) -> anyhow::Result<(bool, bool)> {
+    let request = GetRobotRequest { robot_id: robot_id.to_owned() };
+    let robot = TelemetryServiceClient::new(channel(server)?).get_robot(request).await?.into_inner().robot;
+    let robot = robot.context("a robot")?;
+    let is_heard = robot.age.is_some_and(|age| age.seconds < 3);
+    Ok((robot.observed, is_heard))
+}
+
+/// Serial number of the certificate in a machine's folder, by the server that took it.
+fn serial(folder: &Path) -> anyhow::Result<String> {
+    use rustls::pki_types::pem::PemObject;
+    let enrolled = Enrolled::read(folder)?.context("it is enrolled")?;
+    let leaf = rustls::pki_types::CertificateDer::from_pem_slice(enrolled.certificate_pem.as_bytes())?;
+    Ok(midshift_edge::serial_of(&leaf).context("a serial number")?.to_string())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_copied_key_is_observed_with_an_incident_while_the_original_works_and_a_revoked_robot_is_cut()
+-> anyhow::Result<()> {
+    let dir = folder()?;
+    let site: Site = text::parse(DEMO)?;
+    let server = Server::secure(dir.path(), &[]).await?;
+    let address = server.address;
+    let robots = Robots::start(dir.path(), address, address, &site, ROBOTS).await?;
+    submit(address, &site, 7, TASKS).await?;
+    at_work(address, 4, &BTreeSet::new()).await?;
+
+    let elsewhere = dir.path().join("copy");
+    let mut copy = robots.copy("rbt-01", &elsewhere)?;
+    let journal = elsewhere.join("journal.jsonl");
+    let before = journal::read(&journal)?.len();
+    until("the second machine is seen", LIMIT, async || {
+        let (observed, is_heard) = presence(address, "rbt-01").await?;
+        Ok((observed && is_heard).then_some(()))
+    })
+    .await?;
+    let told = until("the incident", LIMIT, async || {
+        let told = incidents(&server)?;
+        Ok((!told.is_empty()).then_some(told))
+    })
+    .await?;
+    let [incident] = told.as_slice() else { anyhow::bail!("more than one: {told:?}") };
+    let reason = &incident["reason"];
+    assert_eq!((&incident["robotId"], &reason["code"]), (&"rbt-01".into(), &Code::CloneSeen.as_str().into()));
+    assert_eq!(reason["metadata"]["certificate"], serial(&elsewhere)?.into());
+
+    // The original works on, and all is done as if there were no other.
+    let ended = all_over(address, TASKS).await?;
+    judge(&ended, &BTreeSet::new(), &site, &robots)?;
+    ensure!(!copy.has_ended()?, "the second machine stays where it can be seen");
+    let written: Vec<_> = journal::read(&journal)?.into_iter().skip(before).collect();
+    ensure!(written.is_empty(), "the second machine did something: {written:?}");
+    ensure!(incidents(&server)?.len() == 1, "told once: {:?}", incidents(&server)?);
+
+    // Whoever it was: the key is worth nothing any more, on connections that stand and on new ones.
+    done(&["robot", "revoke", "rbt-01", "--server", &address.to_string()])?;
+    until("both are cut off", LIMIT, async || Ok((presence(address, "rbt-01").await? == (false, false)).then_some(())))
+        .await?;
+    ensure!(attach(&server, &elsewhere).await.is_err(), "a revoked key was let in");
+    for other in robots.ids().iter().skip(1) {
+        ensure!(presence(address, other).await? == (false, true), "{other} is not concerned");
+    }
+    Ok(())
+}
+
+/// Uses the key of rbt-01 on a new connection.
+async fn attach(server: &Server, folder: &Path) -> anyhow::Result<()> {
+    use midshift_proto::identity::v1::RenewCertificateRequest;
+    use midshift_proto::identity::v1::enrolment_service_client::EnrolmentServiceClient;
+    let enrolled = Enrolled::read(folder)?.context("it is enrolled")?;
+    let key = Robots::device(folder).await?;
+    let dial = TcpDial::new(&format!("https://{}", server.address), None)?;
+    let channel = dial.with_tls(Tls::fixed(enrolled.config(&key)?)).dial().await?;
+    let request = RenewCertificateRequest { robot_id: "rbt-01".to_owned(), request_pem: String::new() };
+    match EnrolmentServiceClient::new(channel).renew_certificate(request).await {
+        // It was let in, and asked for nothing.
+        Err(status) if status.code() == tonic::Code::InvalidArgument => Ok(()),
+        Err(status) => Err(status.into()),
+        Ok(_) => Ok(()),
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_secret_that_enrolled_one_machine_is_refused_to_the_next() -> anyhow::Result<()> {
+    let dir = folder()?;
+    let server = Server::secure(dir.path(), &[]).await?;
+    let site: Site = text::parse(DEMO)?;
+    let secret = enrolment(server.address, "rbt-01").await?.context("a secret")?;
+    let robots = Robots::waiting(dir.path(), server.address, &site, 1);
+    let _first = robots.run(0, &dir.path().join("rbt-01"), Some(&secret))?;
+    until("the first machine", LIMIT, async || {
+        Ok(presence(server.address, "rbt-01").await.ok().filter(|(_, is_heard)| *is_heard).map(drop))
+    })
+    .await?;
+    let other = dir.path().join("other");
+    let mut second: Running = robots.run(0, &other, Some(&secret))?;
+    ensure!(second.ends().await? == Some(1), "the second machine was let in");
+    let said = std::fs::read_to_string(other.join("agent.log"))?;
+    ensure!(said.contains("was used"), "{said}");
+    ensure!(Enrolled::read(&other)?.is_none() && incidents(&server)?.is_empty(), "{said}");
+    Ok(())
+}
+
+/// The command line as the holder of this token has it.
+fn call_as(server: &Server, token: &str, arguments: &[&str]) -> anyhow::Result<Output> {
+    let mut command = Command::new(midshift()?);
+    sign_in(&mut command, server.address);
+    command.env("MIDSHIFT_TOKEN", token).args(arguments).args(["--server", &server.address.to_string()]);
+    Ok(command.output()?)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_token_that_acts_outside_its_area_is_denied_and_that_stands_in_the_audit() -> anyhow::Result<()> {
+    let dir = folder()?;
+    let server = Server::secure(dir.path(), &[]).await?;
+    done(&[
+        "task",
+        "submit",
+        "--task-id",
+        "T1",
+        "--from",
+        "A01",
+        "--to",
+        "A02",
+        "--server",
+        &server.address.to_string(),
+    ])?;
+    let made = json(&server, &["token", "create", "bert", "--role", "viewer,dispatcher@packing"])?;
+    let token = made["secret"].as_str().context("a secret")?;
+    let cancel = ["task", "cancel", "T1", "--reason", "in my way", "--request-id", "c1"];
+    let output = call_as(&server, token, &cancel)?;
+    let said = String::from_utf8_lossy(&output.stderr);
+    ensure!(output.status.code() == Some(6) && said.contains(Code::NotPermitted.as_str()), "{output:?}");
+    let rows = json(&server, &["audit", "ls", "--actor", "bert"])?;
+    let [row] = rows["rows"].as_array().map(Vec::as_slice).unwrap_or_default() else { anyhow::bail!("{rows}") };
+    assert_eq!((&row["action"], &row["outcome"]), (&"task.cancel".into(), &Code::NotPermitted.as_str().into()));
+    let task = json(&server, &["task", "get", "T1"])?;
+    ensure!(!task.to_string().contains("cancel"), "nothing became of it: {task}");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn doctor_looks_at_certificates_tokens_rights_and_for_the_stop_service() -> anyhow::Result<()> {
+    let dir = folder()?;
+    let server = Server::secure(dir.path(), &[]).await?;
+    let _secret = enrolment(server.address, "rbt-01").await?;
+    let (address, data) = (server.address.to_string(), server.data().display().to_string());
+    let nobody = "127.0.0.1:1";
+    let output = call(&["doctor", "--server", &address, "--data", &data, "--stop-server", nobody, "-o", "json"])?;
+    ensure!(output.status.code() == Some(1), "{output:?}");
+    let found: Vec<Value> = serde_json::from_slice(&output.stdout)?;
+    let of = |check: &str| -> Vec<(bool, &str)> {
+        let of = found.iter().filter(|finding| finding["check"] == check);
+        of.filter_map(|finding| Some((finding["good"].as_bool()?, finding["text"].as_str()?))).collect()
+    };
+    let [(true, leaf), (true, root), (true, robots)] = of("certificates")[..] else { anyhow::bail!("{found:?}") };
+    ensure!(leaf.starts_with("the server's ends ") && leaf.ends_with(" in 89 days"), "{leaf}");
+    ensure!(root.starts_with("the site's root ends "), "{root}");
+    assert_eq!(robots, "no robot is enrolled");
+    let [(false, tokens)] = of("tokens")[..] else { anyhow::bail!("{found:?}") };
+    ensure!(tokens.contains("within 14 days end: second;"), "{tokens}");
+    ensure!(of("exposure").iter().all(|(good, _)| *good) && of("exposure").len() == 2, "{found:?}");
+    ensure!(of("disk").len() == 1 && of("clocks")[0] == (true, "the server and this machine agree"), "{found:?}");
+    let [(false, stop)] = of("stop")[..] else { anyhow::bail!("{found:?}") };
+    ensure!(stop.contains("midshift stop serve"), "{stop}");
+    Ok(())
+}
