@@ -153,6 +153,8 @@ fn the_floor_rises_within_two_days_of_the_newest_signature_and_never_falls() {
     let floor_at = |rig: &mut Rig, hours: u64| {
         let clock = ClockSample { t3_us: SIGNED.plus_ms(hours * HOUR_MS).0 * 1000, ..ClockSample::default() };
         rig.down(Downlink { echo: Some(Echo { hb: 1, clock }), ..Downlink::default() });
+        // It is written with what comes next.
+        rig.pass(2_000);
         rig.store.kept().expect("loaded").ledger.trusted.map(|t| (t.time_floor().0 - SIGNED.0) / 3_600_000)
     };
     assert_eq!(floor_at(&mut rig, 9), None, "nothing signed has said any time yet");

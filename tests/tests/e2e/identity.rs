@@ -81,8 +81,11 @@ async fn a_copied_key_is_observed_with_an_incident_while_the_original_works_and_
     .await?;
     let [incident] = told.as_slice() else { anyhow::bail!("more than one: {told:?}") };
     let reason = &incident["reason"];
-    assert_eq!((&incident["robotId"], &reason["code"]), (&"rbt-01".into(), &Code::CloneSeen.as_str().into()));
-    assert_eq!(reason["metadata"]["certificate"], serial(&elsewhere)?.into());
+    assert_eq!(
+        (&incident["robotId"], &reason["code"]),
+        (&Value::from("rbt-01"), &Value::from(Code::CloneSeen.as_str()))
+    );
+    assert_eq!(reason["metadata"]["certificate"], Value::from(serial(&elsewhere)?));
 
     // The original works on, and all is done as if there were no other.
     let ended = all_over(address, TASKS).await?;
@@ -173,7 +176,10 @@ async fn a_token_that_acts_outside_its_area_is_denied_and_that_stands_in_the_aud
     ensure!(output.status.code() == Some(6) && said.contains(Code::NotPermitted.as_str()), "{output:?}");
     let rows = json(&server, &["audit", "ls", "--actor", "bert"])?;
     let [row] = rows["rows"].as_array().map(Vec::as_slice).unwrap_or_default() else { anyhow::bail!("{rows}") };
-    assert_eq!((&row["action"], &row["outcome"]), (&"task.cancel".into(), &Code::NotPermitted.as_str().into()));
+    assert_eq!(
+        (&row["action"], &row["outcome"]),
+        (&Value::from("task.cancel"), &Value::from(Code::NotPermitted.as_str()))
+    );
     let task = json(&server, &["task", "get", "T1"])?;
     ensure!(!task.to_string().contains("cancel"), "nothing became of it: {task}");
     Ok(())
