@@ -4,9 +4,10 @@ use prost_reflect::{DescriptorPool, MethodDescriptor, ReflectMessage, Value};
 use std::fmt::Write;
 use std::path::PathBuf;
 
-const FILES: [&str; 21] = [
+const FILES: [&str; 22] = [
     "midshift/common/v1/access.proto",
     "midshift/common/v1/common.proto",
+    "midshift/common/v1/privacy.proto",
     "midshift/task/v1/task.proto",
     "midshift/task/v1/task_service.proto",
     "midshift/fleet/v1/fleet.proto",

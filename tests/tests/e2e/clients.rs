@@ -128,8 +128,13 @@ pub fn stock_python_passes(dir: &Path, address: SocketAddr) -> anyhow::Result<()
         .args(["-m", "grpc_tools.protoc", "-I"])
         .arg(&proto)
         .args([format!("--python_out={out}"), format!("--grpc_python_out={out}")]);
-    for file in ["common/v1/access.proto", "common/v1/common.proto", "task/v1/task.proto", "task/v1/task_service.proto"]
-    {
+    for file in [
+        "common/v1/access.proto",
+        "common/v1/common.proto",
+        "common/v1/privacy.proto",
+        "task/v1/task.proto",
+        "task/v1/task_service.proto",
+    ] {
         generate.arg(proto.join("midshift").join(file));
     }
     let generated = generate.output()?;
