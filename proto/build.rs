@@ -1,6 +1,6 @@
 //! Compiles the .proto files with protox (no protoc to install) into messages, servers, clients and one descriptor set.
 
-use prost_reflect::{DescriptorPool, MethodDescriptor, ReflectMessage, Value};
+use prost_reflect::{DescriptorPool, FieldDescriptor, MessageDescriptor, MethodDescriptor, ReflectMessage, Value};
 use std::fmt::Write;
 use std::path::PathBuf;
 
@@ -38,10 +38,14 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let out = PathBuf::from(std::env::var("OUT_DIR")?);
     // Encoded by protox itself: prost's types forget options that they do not know.
     let encoded = compiler.encode_file_descriptor_set();
-    std::fs::write(out.join("access.rs"), access(&DescriptorPool::decode(encoded.as_slice())?)?)?;
+    let pool = DescriptorPool::decode(encoded.as_slice())?;
+    std::fs::write(out.join("access.rs"), access(&pool)?)?;
     std::fs::write(out.join("descriptor_set.bin"), encoded)?;
+    let with_secrets = with_secrets(&pool)?;
+    std::fs::write(out.join("secrets.rs"), without_secrets(&with_secrets)?)?;
     let mut config = tonic_prost_build::Config::new();
     config.enable_type_names();
+    config.skip_debug(with_secrets.iter().map(|message| format!(".{}", message.full_name())));
     tonic_prost_build::configure().btree_map(".").compile_fds_with_config(set, config)?;
     Ok(())
 }
@@ -70,6 +74,70 @@ fn access(pool: &DescriptorPool) -> Result<String, Box<dyn std::error::Error>> {
     }
     arms.push_str("_ => None,\n}\n");
     Ok(arms)
+}
+
+/// Messages with a field that proves who somebody is.
+fn with_secrets(pool: &DescriptorPool) -> Result<Vec<MessageDescriptor>, Box<dyn std::error::Error>> {
+    let ours = pool.all_messages().filter(|message| message.package_name().starts_with("midshift."));
+    let mut found = Vec::new();
+    for message in ours {
+        for field in message.fields() {
+            if is_secret(pool, &field)? {
+                found.push(message.clone());
+                break;
+            }
+        }
+    }
+    Ok(found)
+}
+
+/// Whether this field is of the class of credentials, by itself or by its message.
+fn is_secret(pool: &DescriptorPool, field: &FieldDescriptor) -> Result<bool, Box<dyn std::error::Error>> {
+    let option = |name: &str| pool.get_extension_by_name(name).ok_or("the option is not declared");
+    let (of_field, of_message) = (option("midshift.common.v1.field_privacy")?, option("midshift.common.v1.privacy")?);
+    let message = field.parent_message();
+    let (own, whole) = (field.options(), message.options());
+    let said = match (own.has_extension(&of_field), whole.has_extension(&of_message)) {
+        (true, _) => own.get_extension(&of_field),
+        // A message of ours says itself what it is.
+        _ if field.kind().as_message().is_some_and(|kind| kind.package_name().starts_with("midshift.")) => {
+            return Ok(false);
+        }
+        (false, true) => whole.get_extension(&of_message),
+        (false, false) => return Ok(false),
+    };
+    let class =
+        said.as_message().and_then(|said| said.get_field_by_name("data").and_then(|class| class.as_enum_number()));
+    let kind = pool.get_enum_by_name("midshift.common.v1.DataClass").ok_or("there are no classes")?;
+    let secret = kind.get_value_by_name("DATA_CLASS_CREDENTIAL").ok_or("there is no class of credentials")?;
+    Ok(class == Some(secret.number()))
+}
+
+/// Their `Debug`, which shows all fields but those.
+fn without_secrets(messages: &[MessageDescriptor]) -> Result<String, Box<dyn std::error::Error>> {
+    let mut text = String::new();
+    for message in messages {
+        if message.oneofs().any(|oneof| !oneof.is_synthetic()) {
+            return Err(format!(
+                "{} has a secret and a oneof: give the secret a message of its own",
+                message.full_name()
+            )
+            .into());
+        }
+        let package = message.package_name().trim_start_matches("midshift.").replace('.', "::");
+        let (path, name) = (format!("crate::{package}::{}", message.name()), message.name());
+        writeln!(text, "impl ::core::fmt::Debug for {path} {{")?;
+        writeln!(text, "fn fmt(&self, f: &mut ::core::fmt::Formatter<'_>) -> ::core::fmt::Result {{")?;
+        writeln!(text, "f.debug_struct({name:?})")?;
+        for field in message.fields() {
+            if !is_secret(message.parent_pool(), &field)? {
+                let field = field.name();
+                writeln!(text, ".field({field:?}, &self.{field})")?;
+            }
+        }
+        writeln!(text, ".finish_non_exhaustive()\n}}\n}}")?;
+    }
+    Ok(text)
 }
 
 /// `PERMISSION_SIGNED_IN` as core names it: `SignedIn`.

@@ -16,6 +16,7 @@ pub mod maintenance;
 pub mod once;
 pub mod picture;
 pub mod policy;
+pub mod privacy;
 pub mod reason;
 pub mod robot;
 pub mod rollout;

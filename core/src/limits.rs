@@ -143,6 +143,12 @@ pub const RING_STATUS_MAX: usize = 4_096;
 pub const REMEMBER_DAYS: u64 = 7;
 /// Days that what people asked of tasks and robots is kept, to be looked up.
 pub const ASKED_DAYS: u64 = 30;
+/// Days that STATUS samples are kept, if there is room for them so long.
+pub const STATUS_DAYS: u64 = 30;
+/// Hours that a position is kept as it came: a day, to find out what went wrong in the last shift. Then it is made coarser.
+pub const POSITION_PRECISE_HOURS: u64 = 24;
+/// What is left of a position then, millimetres: in which square of this side a robot was. An aisle, and not a shelf.
+pub const POSITION_COARSE_MM: i32 = 5_000;
 /// Days that the audit keeps who decided what: a year, and five weeks to ask about its end.
 pub const AUDIT_DAYS: u64 = 400;
 /// Milliseconds of the wall between two rows of a chain that quote the heads of the others: what an end that was taken away can hide in.
@@ -178,6 +184,8 @@ pub const FENCED_RETRY: LinkDuration = LinkDuration::from_secs(60);
 pub const SITE_FILE_BYTES: usize = 64 * 1024 * 1024;
 /// Bytes of one message that brings software to the server.
 pub const UPLOAD_PIECE_BYTES: usize = 1024 * 1024;
+/// Bytes of one signed document that says which software there is.
+pub const SIGNED_DOCUMENT_BYTES: usize = 4 * 1024 * 1024;
 /// Files that are being brought at a time; when there is one more, the one left alone longest is thrown away.
 pub const UPLOADS_MAX: usize = 64;
 /// Software that is brought is made durable this often, bytes: a cut costs less than this.
@@ -264,6 +272,8 @@ pub const STOPS_FOR_FLEET: usize = 16;
 pub const RESETS_MAX: usize = 2_048;
 /// A reset is remembered so long, for robots that were away.
 pub const RESETS_KEPT: LinkDuration = LinkDuration::from_secs(90 * 24 * 3_600);
+/// Bytes of the mark by which a stop service knows a stop of its own again.
+pub const STOP_PROOF_BYTES: usize = 64;
 /// Boxes that tell where a stop is: some 2 KiB of a message; larger ones take the place of more.
 pub const REGION_BOXES_MAX: usize = 128;
 /// A robot this near to a stopped part lies inside, millimetres: how wrong its pose may be, how large it is, and how far it rolls on from 1.5 m/s.

@@ -3,8 +3,8 @@
 //! Called by what decides on commands in `fleet` and `rollout`. Invariant: the key is written in the item that carries the command out, so that
 //! neither stands without the other. What is answered to the second is that, and how things are by then.
 
-use crate::limits;
 use crate::picture::{Picture, Slot, Tx, Viewed};
+use crate::privacy;
 use crate::reason::{Code, Kind, Reason, Refusal};
 use crate::rows::{Index, Record, Revision, Table};
 use crate::time::Utc;
@@ -83,7 +83,7 @@ where
     CommandKey<C>: Viewed<P>,
 {
     let at_unix_ms = tx.now.wall.0;
-    let oldest_ms = at_unix_ms - (limits::REMEMBER_DAYS * 86_400_000) as i64;
+    let oldest_ms = privacy::of(C::KEYS).before(tx.now.wall).map_or(i64::MIN, |before| before.0);
     let known = CommandKey::<C>::slot(tx.view).values();
     let past = known.filter(|k| k.row.at_unix_ms < oldest_ms).take(FORGOTTEN_AT_ONCE);
     let past: Vec<String> = past.map(|k| k.row.id.clone()).collect();

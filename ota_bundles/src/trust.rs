@@ -22,7 +22,7 @@ use tough::{
 use url::Url;
 
 /// Bytes of one metadata document.
-pub const METADATA_BYTES_MAX: u64 = 4 * 1024 * 1024;
+pub const METADATA_BYTES_MAX: u64 = midshift_core::limits::SIGNED_DOCUMENT_BYTES as u64;
 /// New roots taken in one refresh.
 const ROOTS_MAX: u64 = 64;
 /// So far may the time that a server tells lie beyond the newest signed one. More than the day that a timestamp lives, so that one that is withheld is seen to have

@@ -11,6 +11,11 @@ pub mod pages;
 pub mod session;
 pub mod status;
 
+/// `Debug` of messages with a secret: everything but it. Made from the options of their fields, as no message can be forgotten that way.
+mod secrets {
+    include!(concat!(env!("OUT_DIR"), "/secrets.rs"));
+}
+
 pub use convert::{Parse, parse, parse_field, parse_word};
 pub use status::{refusal_of, status};
 

@@ -11,8 +11,6 @@ use midshift_core::stop::region::Bounds;
 use midshift_core::stop::{Region, Reset, Scope, Stop};
 use midshift_core::time::Utc;
 
-/// The stop service's mark on a stop, bytes.
-const PROOF_BYTES_MAX: usize = 64;
 /// The name of who engaged or reset one, bytes.
 const ACTOR_BYTES_MAX: usize = 128;
 
@@ -95,7 +93,7 @@ impl Parse<Stop> for v1::Stop {
         let lengths = [
             ("actor", self.actor.len(), ACTOR_BYTES_MAX),
             ("reason", self.reason.len(), limits::REASON_BYTES_MAX),
-            ("proof", self.proof.len(), PROOF_BYTES_MAX),
+            ("proof", self.proof.len(), limits::STOP_PROOF_BYTES),
             ("boxes", self.boxes.len(), limits::REGION_BOXES_MAX),
         ];
         for (name, length, max) in lengths.into_iter().filter(|(_, length, max)| length > max) {

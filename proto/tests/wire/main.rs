@@ -5,5 +5,6 @@ mod article;
 mod comments;
 mod fleet;
 mod link;
+mod privacy;
 mod task;
 mod telemetry;
