@@ -1,18 +1,17 @@
-//! Takes away what is past its time: tasks that ended long ago with their attempts, and all but the newest errands of a robot.
+//! Takes away what is past its time: tasks that ended long ago with their attempts, all but the newest errands of a robot, and used request_ids.
 //!
 //! Invariant: only ended tasks go, none before its attempts. Called by the binary now and then.
 
 use midshift_core::fleet::rows::RobotControl;
 use midshift_core::ids::{AttemptId, Subject};
 use midshift_core::limits;
+use midshift_core::privacy;
 use midshift_core::rows::{Item, Key, Row, Table, Writer};
 use midshift_core::task::{Phase, TaskState};
 use midshift_core::time::Clock;
-use midshift_store::{CommitError, Error, Query, Store};
+use midshift_store::{CommitError, Error, Query, Store, aged};
 use std::sync::Arc;
 
-/// A day, milliseconds.
-const DAY_MS: u64 = 86_400_000;
 /// Tasks taken away in one call.
 const TASKS_AT_ONCE: usize = 200;
 /// Newest errands kept of each robot.
@@ -25,17 +24,25 @@ const ERRANDS_LOOKED_AT: u64 = 200;
 /// # Errors
 /// If the store does not answer.
 pub async fn prune(store: &dyn Store, clock: &dyn Clock) -> Result<u64, Error> {
-    Ok(prune_tasks(store, clock).await? + prune_errands(store).await?)
+    Ok(prune_tasks(store, clock).await? + prune_errands(store).await? + prune_commands(store, clock).await?)
+}
+
+/// A used request_id goes with the commands after it; where there are none, here.
+async fn prune_commands(store: &dyn Store, clock: &dyn Clock) -> Result<u64, Error> {
+    match privacy::of(Table::CommandKey).before(clock.now().wall) {
+        Some(before) => aged::take_away(store, Table::CommandKey, before.0, "command.forgotten").await,
+        None => Ok(0),
+    }
 }
 
 async fn prune_tasks(store: &dyn Store, clock: &dyn Clock) -> Result<u64, Error> {
     let terminal = Phase::ALL.into_iter().filter(|p| p.is_terminal()).map(Phase::number);
     let oldest_first = store.list(Query::all(Table::TaskState).in_states(terminal)).await?;
-    let now = clock.now().utc;
+    let Some(before) = privacy::of(Table::TaskState).before(clock.now().utc) else { return Ok(0) };
     let mut items = Vec::new();
     for row in oldest_first {
         let Ok(state) = row.decode::<TaskState>() else { continue };
-        if now.ms_since(state.changed) < limits::ASKED_DAYS * DAY_MS {
+        if state.changed > before {
             continue;
         }
         let mut rows = store.list(Query::all(Table::Attempt).of_parent(state.task_id.as_str())).await?;

@@ -1,3 +1,9 @@
+CREATE TABLE frame_coarse (
+    site_id TEXT NOT NULL,
+    position BIGINT NOT NULL,
+    UNIQUE (site_id)
+);
+
 CREATE TABLE frame_head (
     site_id TEXT NOT NULL,
     marked_position BIGINT NOT NULL,

@@ -7,7 +7,8 @@ use crate::Error;
 use async_trait::async_trait;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
-use midshift_core::time::Clock;
+use midshift_core::privacy;
+use midshift_core::time::{Clock, Utc};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -15,6 +16,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 pub const FRAME_BYTES_DEFAULT: u64 = 2 * 1024 * 1024 * 1024;
 /// Gaps kept in memory by [`MemoryFrames`], and listed at most by one call.
 pub const GAPS_MAX: usize = 10_000;
+/// After this no frame is kept, milliseconds.
+pub(crate) const DAYS_MS: u64 = limits::STATUS_DAYS * 24 * 3_600_000;
 /// Bytes of a ring's name.
 const RING_BYTES_MAX: usize = 64;
 
@@ -74,6 +77,23 @@ pub struct Gap {
     pub at_unix_ms: i64,
 }
 
+/// What makes the samples of one frame coarser; none: they cannot be read. Done twice, it is as done once.
+pub type Coarsen = fn(&[u8]) -> Option<Vec<u8>>;
+
+/// When the oldest of what is kept became durable, UTC unix ms.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct FramesOldest {
+    /// Of all frames; none: there is none.
+    pub any: Option<i64>,
+    /// Of those that are as they came; none: there is none.
+    pub precise: Option<i64>,
+}
+
+/// Whether a row that became durable then is so old, or so plainly of a wrong clock, that it is to be treated as old.
+pub(crate) fn is_aged(at_unix_ms: i64, now: Utc, age_ms: u64) -> bool {
+    now.ms_since(Utc(at_unix_ms)) >= age_ms || at_unix_ms > now.0
+}
+
 /// The log of frames.
 #[async_trait]
 pub trait FrameLog: Send + Sync + 'static {
@@ -92,8 +112,14 @@ pub trait FrameLog: Send + Sync + 'static {
     async fn report_gaps(&self, gaps: Vec<Gap>) -> Result<(), Error>;
     /// Newest gaps of one robot or of all, newest first, at most [`GAPS_MAX`].
     async fn gaps(&self, robot_id: Option<&RobotId>, limit: usize) -> Result<Vec<Gap>, Error>;
-    /// Takes the oldest frames out until the kept ones are within their bytes; in small slices. Returns the bytes freed.
+    /// Takes the oldest frames out until the kept ones are within their bytes and their days ([`privacy::Retention::Coarsened`]); in small
+    /// slices. Returns the bytes freed.
     async fn prune(&self) -> Result<u64, Error>;
+    /// Lets `coarsen` at the samples of frames that are older than [`privacy::PRECISE_MS`], each once whoever else does so, oldest first; in small slices,
+    /// each of one transaction. Frames keep their positions and numbers. Returns how many rows were changed.
+    async fn coarsen(&self, coarsen: Coarsen) -> Result<u64, Error>;
+    /// How old what is kept is.
+    async fn oldest(&self) -> Result<FramesOldest, Error>;
 }
 
 /// Refuses what would spoil the group it is written with.
@@ -161,6 +187,8 @@ struct Kept {
     position: u64,
     marks: Marks,
     gaps: VecDeque<Gap>,
+    /// Position up to which frames were made coarser.
+    coarse: u64,
 }
 
 impl MemoryFrames {
@@ -236,6 +264,33 @@ impl FrameLog for MemoryFrames {
     }
 
     async fn prune(&self) -> Result<u64, Error> {
-        Ok(self.state().prune(self.bytes_max))
+        let now = self.clock.now().wall;
+        let mut state = self.state();
+        let aged = state.frames.iter().take_while(|f| now.ms_since(Utc(f.at_unix_ms)) >= DAYS_MS).count();
+        let freed: u64 = state.frames.drain(..aged).map(|f| f.frame.bytes.len() as u64).sum();
+        state.bytes -= freed;
+        Ok(freed + state.prune(self.bytes_max))
+    }
+
+    async fn coarsen(&self, coarsen: Coarsen) -> Result<u64, Error> {
+        let now = self.clock.now().wall;
+        let mut guard = self.state();
+        let state = &mut *guard;
+        let mut changed = 0;
+        let start = state.frames.partition_point(|f| f.position <= state.coarse);
+        for stored in state.frames.range_mut(start..).take_while(|f| is_aged(f.at_unix_ms, now, privacy::PRECISE_MS)) {
+            state.bytes -= stored.frame.bytes.len() as u64;
+            stored.frame.bytes = Arc::from(coarsen(&stored.frame.bytes).unwrap_or_default());
+            state.bytes += stored.frame.bytes.len() as u64;
+            state.coarse = stored.position;
+            changed += 1;
+        }
+        Ok(changed)
+    }
+
+    async fn oldest(&self) -> Result<FramesOldest, Error> {
+        let state = self.state();
+        let precise = state.frames.iter().find(|f| f.position > state.coarse);
+        Ok(FramesOldest { any: state.frames.front().map(|f| f.at_unix_ms), precise: precise.map(|f| f.at_unix_ms) })
     }
 }

@@ -3,7 +3,7 @@
 //! Invariant: `unpack(pack(frames)) == frames`; a row cut short or garbled is an error, never a shorter answer.
 //! Layout, all little-endian: u8 length and robot_id, u8 length and ring, u64 first, u64 last, u32 length and bytes.
 
-use crate::Frame;
+use crate::{Coarsen, Frame};
 use midshift_core::ids::RobotId;
 use std::sync::Arc;
 
@@ -23,6 +23,19 @@ pub(crate) fn pack(frame: &Frame, out: &mut Vec<u8>) -> Result<(), BadFrames> {
     out.extend(length.to_le_bytes());
     out.extend(frame.bytes.iter());
     Ok(())
+}
+
+/// A row as it is once `coarsen` was let at each of its frames. A frame that cannot be read is left without its samples, and its numbers stay.
+pub(crate) fn coarser(body: &[u8], coarsen: Coarsen) -> Result<Vec<u8>, BadFrames> {
+    let mut out = Vec::with_capacity(body.len());
+    for frame in unpack(body)? {
+        let bytes = coarsen(&frame.bytes).unwrap_or_else(|| {
+            tracing::error!(robot_id = %frame.robot_id, first_seq = frame.first_seq, last_seq = frame.last_seq, "samples cannot be read and were taken out");
+            Vec::new()
+        });
+        pack(&Frame { bytes: Arc::from(bytes), ..frame }, &mut out)?;
+    }
+    Ok(out)
 }
 
 pub(crate) fn unpack(mut rest: &[u8]) -> Result<Vec<Frame>, BadFrames> {

@@ -2,10 +2,13 @@
 //!
 //! Invariant: nobody is told "durable" before the commit of the engine ([`FramesEngine`]) has returned.
 
-use crate::frames_pack::{pack, unpack};
+use crate::frames::{DAYS_MS, is_aged};
+use crate::frames_pack::{coarser, pack, unpack};
 use crate::queue::closed;
-use crate::{Error, Frame, FrameMark, Gap, StoredFrame};
+use crate::{Coarsen, Error, Frame, FrameMark, FramesOldest, Gap, StoredFrame};
 use midshift_core::ids::RobotId;
+use midshift_core::privacy::PRECISE_MS;
+use midshift_core::time::Utc;
 use sqlx::{ColumnIndex, Decode, Type};
 use std::sync::Arc;
 use tokio::sync::{mpsc, oneshot};
@@ -28,6 +31,8 @@ pub(crate) enum Command {
     Marks { reply: Reply<Vec<FrameMark>> },
     Gaps { gaps: Vec<Gap>, reply: Reply<()> },
     Prune { reply: Reply<u64> },
+    Coarsen { coarsen: Coarsen, reply: Reply<u64> },
+    Oldest { reply: Reply<FramesOldest> },
     Close { reply: Reply<()> },
 }
 
@@ -41,6 +46,10 @@ pub(crate) trait FramesEngine: Send + 'static {
     fn gaps(&mut self, gaps: &[Gap]) -> impl Future<Output = Result<(), Error>> + Send;
     /// Takes a slice of the oldest rows out; returns the bytes freed, 0 when the kept ones are within their limit.
     fn prune(&mut self) -> impl Future<Output = Result<u64, Error>> + Send;
+    /// Makes a slice of the oldest rows coarser that are due, in one transaction that also notes how far it came; returns how many, 0 when none is due.
+    fn coarsen(&mut self, coarsen: Coarsen) -> impl Future<Output = Result<u64, Error>> + Send;
+    /// As [`crate::FrameLog::oldest`].
+    fn oldest(&mut self) -> impl Future<Output = Result<FramesOldest, Error>> + Send;
     /// Writes down what is only in memory and lets go of what is open.
     fn close(self) -> impl Future<Output = Result<(), Error>> + Send;
 }
@@ -76,6 +85,8 @@ pub(crate) async fn run(mut engine: impl FramesEngine, mut queue: mpsc::Receiver
             Command::Marks { reply } => drop(reply.send(engine.marks().await)),
             Command::Gaps { gaps, reply } => drop(reply.send(engine.gaps(&gaps).await)),
             Command::Prune { reply } => drop(reply.send(engine.prune().await)),
+            Command::Coarsen { coarsen, reply } => drop(reply.send(engine.coarsen(coarsen).await)),
+            Command::Oldest { reply } => drop(reply.send(engine.oldest().await)),
             Command::Close { reply } => {
                 drop(reply.send(engine.close().await));
                 return;
@@ -144,14 +155,56 @@ impl FramesQueue {
 
     /// Prunes slice by slice.
     pub(crate) async fn prune(&self) -> Result<u64, Error> {
-        let mut freed = 0;
+        self.slices(|reply| Command::Prune { reply }).await
+    }
+
+    /// Makes what is due coarser, slice by slice.
+    pub(crate) async fn coarsen(&self, coarsen: Coarsen) -> Result<u64, Error> {
+        self.slices(|reply| Command::Coarsen { coarsen, reply }).await
+    }
+
+    async fn slices(&self, command: impl Fn(Reply<u64>) -> Command) -> Result<u64, Error> {
+        let mut done = 0;
         loop {
-            match self.ask(|reply| Command::Prune { reply }).await? {
-                0 => return Ok(freed),
-                slice => freed += slice,
+            match self.ask(&command).await? {
+                0 => return Ok(done),
+                slice => done += slice,
             }
         }
     }
+}
+
+/// Rows that one slice makes coarser: a MiB or two of reading and writing.
+pub(crate) const COARSE_ROWS: i64 = 16;
+
+/// Of the oldest rows ([`crate::sql::FRAME_SIZES`]), `kept` bytes in all, how many go for their age or for `bytes_max`: the position of the last one, and their
+/// bytes.
+pub(crate) fn surplus(rows: &[(i64, i64, i64)], kept: u64, bytes_max: u64, now: Utc) -> (i64, u64) {
+    let (mut up_to, mut freed) = (0, 0);
+    for (position, size, at_unix_ms) in rows {
+        // What a wrong clock has stamped ahead of now is young enough to be kept.
+        let is_old = now.ms_since(Utc(*at_unix_ms)) >= DAYS_MS;
+        if kept.saturating_sub(freed) <= bytes_max && !is_old {
+            break;
+        }
+        up_to = *position;
+        freed += size.cast_unsigned();
+    }
+    (up_to, freed)
+}
+
+/// Of the oldest rows that are as they came ([`crate::sql::FRAMES_NEXT`]) those that are due, made coarser.
+pub(crate) fn made_coarser(
+    rows: &[(i64, i64, Vec<u8>)],
+    now: Utc,
+    coarsen: Coarsen,
+) -> Result<Vec<(i64, Vec<u8>)>, Error> {
+    let due = rows.iter().take_while(|(_, at_unix_ms, _)| is_aged(*at_unix_ms, now, PRECISE_MS));
+    due.map(|(position, _, body)| match coarser(body, coarsen) {
+        Ok(body) => Ok((*position, body)),
+        Err(error) => Err(Error::Unavailable(Arc::new(error))),
+    })
+    .collect()
 }
 
 /// How many of the rows whose sizes these are belong to a page that holds `bytes` already: the position of the last one, and the

@@ -6,6 +6,7 @@
 //!
 //! What is volatile (heartbeats, poses) is on the [`LiveBoard`], which several processes share through the [`HeardLog`]; what is bulky (samples) is in the [`FrameLog`]; neither is a row.
 
+pub mod aged;
 mod audit;
 mod board;
 mod check;
@@ -26,7 +27,9 @@ mod sql;
 mod sqlite;
 
 pub use board::{Dirty, LiveBoard};
-pub use frames::{FRAME_BYTES_DEFAULT, Frame, FrameLog, FrameMark, GAPS_MAX, Gap, MemoryFrames, StoredFrame};
+pub use frames::{
+    Coarsen, FRAME_BYTES_DEFAULT, Frame, FrameLog, FrameMark, FramesOldest, GAPS_MAX, Gap, MemoryFrames, StoredFrame,
+};
 pub use heard::{Heard, HeardLog, Kept, MemoryHeard, follow_heard};
 pub use migrations::Migrated;
 pub use model::MemoryStore;

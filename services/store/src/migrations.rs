@@ -118,6 +118,7 @@ pub(crate) const TELEMETRY: &[Migration] = migrations!["telemetry":
     "0003_frame_mark",
     "0004_gap",
     "0005_gap_by_robot",
+    "0006_frame_coarse",
 ];
 
 /// What a migration run did to one file of SQLite or one schema of PostgreSQL.

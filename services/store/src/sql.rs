@@ -38,9 +38,21 @@ pub(crate) const AUDIT_HEADS: &str = "SELECT chain, n, hash, NULL AS body FROM a
 pub(crate) const MOVE_AUDIT_HEAD: &str = "INSERT INTO audit_head (site_id, chain, n, hash) VALUES ($1, $2, $3, $4) \
      ON CONFLICT (site_id, chain) DO UPDATE SET n = excluded.n, hash = excluded.hash";
 pub(crate) const FRAME_SIZES: &str =
-    "SELECT position, size FROM frame_log WHERE site_id = $1 AND position > $2 ORDER BY position LIMIT $3";
+    "SELECT position, size, at_unix_ms FROM frame_log WHERE site_id = $1 AND position > $2 ORDER BY position LIMIT $3";
 pub(crate) const FRAME_BODIES: &str = "SELECT position, at_unix_ms, body FROM frame_log \
      WHERE site_id = $1 AND position > $2 AND position <= $3 ORDER BY position";
+/// The oldest rows that were not made coarser yet, at most `$3`; `$2` is the newest that was.
+pub(crate) const FRAMES_NEXT: &str = "SELECT position, at_unix_ms, body FROM frame_log \
+     WHERE site_id = $1 AND position > $2 ORDER BY position LIMIT $3";
+pub(crate) const FRAME_REPLACE: &str = "UPDATE frame_log SET size = $3, body = $4 WHERE site_id = $1 AND position = $2";
+/// Up to where rows were made coarser.
+pub(crate) const COARSE_HEAD: &str = "SELECT COALESCE(MAX(position), 0) FROM frame_coarse WHERE site_id = $1";
+pub(crate) const MOVE_COARSE_HEAD: &str = "INSERT INTO frame_coarse (site_id, position) VALUES ($1, $2) \
+     ON CONFLICT (site_id) DO UPDATE SET position = excluded.position";
+/// The oldest row, and the oldest that was not made coarser yet.
+pub(crate) const FRAMES_OLDEST: &str = "SELECT \
+     (SELECT at_unix_ms FROM frame_log WHERE site_id = $1 ORDER BY position LIMIT 1), \
+     (SELECT at_unix_ms FROM frame_log WHERE site_id = $1 AND position > $2 ORDER BY position LIMIT 1)";
 pub(crate) const FRAME_INSERT: &str =
     "INSERT INTO frame_log (site_id, position, at_unix_ms, size, body) VALUES ($1, $2, $3, $4, $5)";
 pub(crate) const FRAME_MARKS: &str = "SELECT robot_id, ring, seq FROM frame_mark WHERE site_id = $1";

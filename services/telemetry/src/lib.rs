@@ -10,6 +10,7 @@ mod grpc;
 mod link;
 mod offset;
 mod picture;
+pub mod precision;
 mod presence;
 mod registry;
 mod replay;

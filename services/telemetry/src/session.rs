@@ -241,7 +241,7 @@ impl Session {
         let read = midshift_proto::parse::<FromRobot, _>(message);
         let Ok(FromRobot::Uplink(Uplink { heartbeat, batches })) = read else {
             let detail = read.err().map(|e| e.to_string()).unwrap_or_else(|| "a second hello".to_owned());
-            tracing::warn!(robot_id = %self.robot_id, detail, "session ended by a message that breaks its rules");
+            tracing::warn!(robot_id = %self.robot_id, code = Code::ProtocolError.as_str(), "session ended by a message that breaks its rules");
             let reason = Reason::new(Code::ProtocolError, detail);
             return Some(End::Close(Close { code: CloseCode::Protocol, reason, retry_after_ms: 1_000 }));
         };

@@ -90,11 +90,11 @@ pub async fn keep(inner: &Inner) {
             }
             failed => {
                 let detail = failed.map_or_else(|_| "no answer in time".to_owned(), |e| format!("{:?}", e.err()));
-                tracing::debug!(detail, "heartbeats could not be kept");
+                tracing::debug!(error = detail, "heartbeats could not be kept");
                 let lost = reached.elapsed() >= CUT_OFF_AFTER;
                 if lost && !shared.cut_off.send_replace(true) {
                     tracing::error!(
-                        detail,
+                        error = detail,
                         "cut off from the database: sessions end here, robots may go to another gateway"
                     );
                 }

@@ -5,6 +5,7 @@
 //! on the session, by one numbering: whichever way a batch took, what is known of it is dropped. Invariant: what waits for the
 //! disk is bounded by the credit the robot was given; a robot that sends more is let go.
 
+use crate::precision::coarsen_late;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::Reason;
@@ -104,7 +105,9 @@ impl StatusLane {
             }
         }
         let Some(first_seq) = first else { return Arrived::Known };
-        let bytes = v1::LaneBatch::from(batch).encode_to_vec();
+        let mut wire = v1::LaneBatch::from(batch);
+        coarsen_late(&mut wire, now);
+        let bytes = wire.encode_to_vec();
         if self.unkept_bytes + bytes.len() > WAITING_BYTES_MAX {
             return Arrived::OverCredit;
         }

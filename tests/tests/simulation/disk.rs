@@ -9,8 +9,8 @@ use midshift_core::audit::Head;
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::rows::{Item, Key, Log, Row, Seq, Table, Writer};
 use midshift_store::{
-    Applied, Cause, CommitError, Error, FeedPage, Frame, FrameLog, FrameMark, Gap, MemoryFrames, MemoryStore, Query,
-    Retention, Snapshot, Store, StoreId, StoredFrame,
+    Applied, Cause, Coarsen, CommitError, Error, FeedPage, Frame, FrameLog, FrameMark, FramesOldest, Gap, MemoryFrames,
+    MemoryStore, Query, Retention, Snapshot, Store, StoreId, StoredFrame,
 };
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
@@ -202,6 +202,12 @@ impl FrameLog for ServerFrames {
     }
     async fn prune(&self) -> Result<u64, Error> {
         self.inner.prune().await
+    }
+    async fn coarsen(&self, coarsen: Coarsen) -> Result<u64, Error> {
+        self.inner.coarsen(coarsen).await
+    }
+    async fn oldest(&self) -> Result<FramesOldest, Error> {
+        self.inner.oldest().await
     }
 }
 

@@ -4,13 +4,12 @@
 
 use midshift_core::audit::{Head, Kind, Note, open};
 use midshift_core::limits;
+use midshift_core::privacy;
 use midshift_core::rows::{Item, Row, Table, Writer};
 use midshift_core::time::Clock;
 use midshift_store::{CommitError, Error, Query, Store};
 use std::sync::Arc;
 
-/// Milliseconds of a day.
-const DAY_MS: i64 = 86_400_000;
 /// Slices of old rows that go in one call: what is left goes with the next.
 const SLICES_MAX: usize = 20;
 
@@ -27,10 +26,10 @@ pub async fn keep(store: &dyn Store, clock: &dyn Clock, writer: Writer) -> Resul
     if last.is_none_or(|last| now.abs_diff(last) >= limits::AUDIT_ANCHOR_EVERY_MS) {
         write(store, writer, Note::anchor()).await?;
     }
-    let before = now - limits::AUDIT_DAYS as i64 * DAY_MS;
+    let Some(before) = privacy::of(table).before(clock.now().wall) else { return Ok(()) };
     for _ in 0..SLICES_MAX {
         let oldest = store.list(Query::all(table)).await?;
-        let old = oldest.iter().take_while(|row| at(row).is_some_and(|at| at < before)).last();
+        let old = oldest.iter().take_while(|row| at(row).is_some_and(|at| at < before.0)).last();
         let Some(up_to) = old.and_then(head) else { break };
         write(store, writer, Note::cut(up_to)).await?;
     }

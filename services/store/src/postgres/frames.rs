@@ -9,7 +9,7 @@ use crate::frames::{GAPS_MAX, frames_well_formed, gaps_well_formed};
 use crate::frames_queue::{Command, FramesQueue, READ_ROWS, gap, page_end, run, stored};
 use crate::migrations::TELEMETRY;
 use crate::queue::unavailable;
-use crate::{Error, Frame, FrameLog, FrameMark, Gap, OpenError, StoredFrame, sql};
+use crate::{Coarsen, Error, Frame, FrameLog, FrameMark, FramesOldest, Gap, OpenError, StoredFrame, sql};
 use async_trait::async_trait;
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::time::Clock;
@@ -118,5 +118,13 @@ impl FrameLog for PostgresFrames {
 
     async fn prune(&self) -> Result<u64, Error> {
         self.commands.prune().await
+    }
+
+    async fn coarsen(&self, coarsen: Coarsen) -> Result<u64, Error> {
+        self.commands.coarsen(coarsen).await
+    }
+
+    async fn oldest(&self) -> Result<FramesOldest, Error> {
+        self.commands.ask(|reply| Command::Oldest { reply }).await
     }
 }

@@ -6,11 +6,11 @@
 use super::connect::{Database, WRITE_PATIENCE, is_gone, no_answer};
 use super::writer::is_undone_by_others;
 use crate::frames::Marks;
-use crate::frames_queue::{FramesEngine, GAPS_KEPT, Packed, mark};
+use crate::frames_queue::{COARSE_ROWS, FramesEngine, GAPS_KEPT, Packed, made_coarser, mark, surplus};
 use crate::queue::unavailable;
-use crate::{Error, Frame, FrameMark, Gap, OpenError, sql};
+use crate::{Coarsen, Error, Frame, FrameMark, FramesOldest, Gap, OpenError, sql};
 use midshift_core::ids::SiteId;
-use midshift_core::time::Clock;
+use midshift_core::time::{Clock, Utc};
 use sqlx::{PgConnection, Row};
 use std::sync::Arc;
 use tokio::time::Instant;
@@ -33,7 +33,8 @@ pub(super) struct FramesWriter {
 enum Work<'w> {
     Append { rows: &'w [Packed], marks: Vec<FrameMark>, at_unix_ms: i64 },
     Gaps(&'w [Gap]),
-    Prune { bytes_max: u64 },
+    Prune { bytes_max: u64, now: Utc },
+    Coarsen { coarsen: Coarsen, now: Utc },
 }
 
 impl FramesWriter {
@@ -112,7 +113,19 @@ impl FramesEngine for FramesWriter {
     }
 
     async fn prune(&mut self) -> Result<u64, Error> {
-        self.transaction(&Work::Prune { bytes_max: self.bytes_max }).await
+        self.transaction(&Work::Prune { bytes_max: self.bytes_max, now: self.clock.now().wall }).await
+    }
+
+    async fn coarsen(&mut self, coarsen: Coarsen) -> Result<u64, Error> {
+        self.transaction(&Work::Coarsen { coarsen, now: self.clock.now().wall }).await
+    }
+
+    async fn oldest(&mut self) -> Result<FramesOldest, Error> {
+        let mut connection = self.take().await?;
+        let read = tokio::time::timeout(WRITE_PATIENCE, oldest(&mut connection, &self.site_id)).await;
+        let oldest = read.map_err(|_| Error::Unavailable(no_answer()))?.map_err(unavailable)?;
+        self.connection = Some(connection);
+        Ok(oldest)
     }
 
     async fn close(self) -> Result<(), Error> {
@@ -137,7 +150,8 @@ async fn once(connection: &mut PgConnection, site_id: &SiteId, work: &Work<'_>) 
             report(connection, site_id, gaps).await?;
             0
         }
-        Work::Prune { bytes_max } => prune(connection, site_id, *bytes_max).await?,
+        Work::Prune { bytes_max, now } => prune(connection, site_id, *bytes_max, *now).await?,
+        Work::Coarsen { coarsen, now } => make_coarser(connection, site_id, *coarsen, *now).await?,
     };
     sqlx::raw_sql("COMMIT").execute(connection).await?;
     Ok(freed)
@@ -203,19 +217,53 @@ async fn report(connection: &mut PgConnection, site_id: &SiteId, gaps: &[Gap]) -
     sqlx::query(sql::GAPS_PRUNE).bind(site_id.as_str()).bind(kept).execute(connection).await.map(drop)
 }
 
-async fn prune(connection: &mut PgConnection, site_id: &SiteId, bytes_max: u64) -> Result<u64, sqlx::Error> {
+async fn prune(connection: &mut PgConnection, site_id: &SiteId, bytes_max: u64, now: Utc) -> Result<u64, sqlx::Error> {
     let sum = sqlx::query("SELECT COALESCE(SUM(size), 0)::bigint FROM frame_log WHERE site_id = $1");
     let sum: i64 = sum.bind(site_id.as_str()).fetch_one(&mut *connection).await?.try_get(0)?;
     let oldest = sqlx::query(sql::FRAME_SIZES).bind(site_id.as_str()).bind(0i64).bind(PRUNE_ROWS);
-    let (mut freed, mut up_to) = (0, 0);
-    for row in oldest.fetch_all(&mut *connection).await? {
-        if sum.cast_unsigned() - freed <= bytes_max {
-            break;
-        }
-        up_to = row.try_get::<i64, _>(0)?;
-        freed += row.try_get::<i64, _>(1)?.cast_unsigned();
-    }
+    let rows = oldest.fetch_all(&mut *connection).await?;
+    let sizes = rows.iter().map(|row| Ok((row.try_get(0)?, row.try_get(1)?, row.try_get(2)?)));
+    let sizes = sizes.collect::<Result<Vec<_>, sqlx::Error>>()?;
+    let (up_to, freed) = surplus(&sizes, sum.cast_unsigned(), bytes_max, now);
     let delete = sqlx::query("DELETE FROM frame_log WHERE site_id = $1 AND position <= $2");
     delete.bind(site_id.as_str()).bind(up_to).execute(connection).await?;
     Ok(freed)
+}
+
+async fn coarse_head(connection: &mut PgConnection, site_id: &SiteId) -> Result<i64, sqlx::Error> {
+    sqlx::query(sql::COARSE_HEAD).bind(site_id.as_str()).fetch_one(connection).await?.try_get(0)
+}
+
+/// Makes a slice coarser that is due. The head row is this transaction's, so of several processes one does it.
+async fn make_coarser(
+    connection: &mut PgConnection,
+    site_id: &SiteId,
+    coarsen: Coarsen,
+    now: Utc,
+) -> Result<u64, sqlx::Error> {
+    let coarse = coarse_head(connection, site_id).await?;
+    let next = sqlx::query(sql::FRAMES_NEXT).bind(site_id.as_str()).bind(coarse).bind(COARSE_ROWS);
+    let rows = next.fetch_all(&mut *connection).await?;
+    let rows = rows.iter().map(|row| Ok((row.try_get(0)?, row.try_get(1)?, row.try_get(2)?)));
+    let rows = rows.collect::<Result<Vec<(i64, i64, Vec<u8>)>, sqlx::Error>>()?;
+    let coarse = made_coarser(&rows, now, coarsen).map_err(|error| sqlx::Error::Decode(Box::new(error)))?;
+    for (position, body) in &coarse {
+        sqlx::query(sql::FRAME_REPLACE)
+            .bind(site_id.as_str())
+            .bind(position)
+            .bind(body.len() as i64)
+            .bind(body.as_slice())
+            .execute(&mut *connection)
+            .await?;
+    }
+    if let Some((position, _)) = coarse.last() {
+        sqlx::query(sql::MOVE_COARSE_HEAD).bind(site_id.as_str()).bind(position).execute(connection).await?;
+    }
+    Ok(coarse.len() as u64)
+}
+
+async fn oldest(connection: &mut PgConnection, site_id: &SiteId) -> Result<FramesOldest, sqlx::Error> {
+    let coarse = coarse_head(connection, site_id).await?;
+    let row = sqlx::query(sql::FRAMES_OLDEST).bind(site_id.as_str()).bind(coarse).fetch_one(connection).await?;
+    Ok(FramesOldest { any: row.try_get(0)?, precise: row.try_get(1)? })
 }

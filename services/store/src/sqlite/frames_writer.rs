@@ -7,9 +7,9 @@ use super::file::DataFile;
 use super::write_sql::placeholders;
 use crate::frames::Marks;
 use crate::frames_pack::unpack;
-use crate::frames_queue::{FramesEngine, GAPS_KEPT, Packed, mark};
+use crate::frames_queue::{COARSE_ROWS, FramesEngine, GAPS_KEPT, Packed, made_coarser, mark, surplus};
 use crate::queue::unavailable;
-use crate::{Error, Frame, FrameMark, Gap, OpenError, sql};
+use crate::{Coarsen, Error, Frame, FrameMark, FramesOldest, Gap, OpenError, sql};
 use midshift_core::ids::SiteId;
 use midshift_core::time::Clock;
 use sqlx::{AssertSqlSafe, Connection, Row, SqliteConnection};
@@ -72,6 +72,15 @@ impl FramesWriter {
         Ok(())
     }
 
+    /// What is beyond the bytes or days that are kept, of the oldest rows: the position of the last, and their bytes.
+    async fn surplus(&self, open: &mut Open) -> Result<(i64, u64), sqlx::Error> {
+        let oldest = sqlx::query(sql::FRAME_SIZES).bind(self.site_id.as_str()).bind(0).bind(SLICE_ROWS as i64);
+        let rows = oldest.fetch_all(&mut open.connection).await?;
+        let sizes = rows.iter().map(|row| Ok((row.try_get(0)?, row.try_get(1)?, row.try_get(2)?)));
+        let sizes = sizes.collect::<Result<Vec<_>, sqlx::Error>>()?;
+        Ok(surplus(&sizes, open.bytes, self.bytes_max, self.clock.now().wall))
+    }
+
     async fn write_marks(&mut self) -> Result<(), Error> {
         self.ready().await?;
         let Some(mut open) = self.open.take() else { return Ok(()) };
@@ -124,15 +133,43 @@ impl FramesEngine for FramesWriter {
 
     async fn prune(&mut self) -> Result<u64, Error> {
         self.ready().await?;
-        if self.open.as_ref().is_none_or(|open| open.bytes <= self.bytes_max) {
+        let Some(mut open) = self.open.take() else { return Ok(0) };
+        let (up_to, freed) = self.surplus(&mut open).await.map_err(unavailable)?;
+        self.open = Some(open);
+        if freed == 0 {
             return Ok(0);
         }
         // What is pruned is no longer there to fold marks from.
         self.write_marks().await?;
         let Some(mut open) = self.open.take() else { return Ok(0) };
-        let freed = prune(&mut open, &self.site_id, self.bytes_max).await.map_err(unavailable)?;
+        prune(&mut open, &self.site_id, up_to).await.map_err(unavailable)?;
+        open.bytes -= freed;
         self.open = Some(open);
         Ok(freed)
+    }
+
+    async fn coarsen(&mut self, coarsen: Coarsen) -> Result<u64, Error> {
+        let now = self.clock.now().wall;
+        self.ready().await?;
+        let Some(mut open) = self.open.take() else { return Ok(0) };
+        let next = precise(&mut open.connection, &self.site_id).await.map_err(unavailable)?;
+        let coarse = made_coarser(&next, now, coarsen)?;
+        if !coarse.is_empty() {
+            let sizes = |rows: &mut dyn Iterator<Item = usize>| rows.sum::<usize>() as u64;
+            let before = sizes(&mut next.iter().take(coarse.len()).map(|(_, _, body)| body.len()));
+            replace(&mut open.connection, &self.site_id, &coarse).await.map_err(unavailable)?;
+            open.bytes = open.bytes - before + sizes(&mut coarse.iter().map(|(_, body)| body.len()));
+        }
+        self.open = Some(open);
+        Ok(coarse.len() as u64)
+    }
+
+    async fn oldest(&mut self) -> Result<FramesOldest, Error> {
+        self.ready().await?;
+        let Some(mut open) = self.open.take() else { return Ok(FramesOldest::default()) };
+        let oldest = oldest(&mut open.connection, &self.site_id).await.map_err(unavailable)?;
+        self.open = Some(open);
+        Ok(oldest)
     }
 }
 
@@ -229,28 +266,55 @@ async fn write_gaps(open: &mut Open, site_id: &SiteId, gaps: &[Gap]) -> Result<(
     transaction.commit().await
 }
 
-async fn prune(open: &mut Open, site_id: &SiteId, bytes_max: u64) -> Result<u64, sqlx::Error> {
-    let oldest = sqlx::query(sql::FRAME_SIZES)
-        .bind(site_id.as_str())
-        .bind(0)
-        .bind(SLICE_ROWS as i64)
-        .fetch_all(&mut open.connection)
-        .await?;
-    let (mut freed, mut up_to) = (0, 0);
-    for row in oldest {
-        if open.bytes - freed <= bytes_max {
-            break;
-        }
-        up_to = row.try_get::<i64, _>(0)?;
-        freed += row.try_get::<i64, _>(1)?.cast_unsigned();
-    }
+async fn prune(open: &mut Open, site_id: &SiteId, up_to: i64) -> Result<(), sqlx::Error> {
     sqlx::query("DELETE FROM frame_log WHERE site_id = $1 AND position <= $2")
         .bind(site_id.as_str())
         .bind(up_to)
         .execute(&mut open.connection)
+        .await
+        .map(drop)
+}
+
+async fn coarse_head(connection: &mut SqliteConnection, site_id: &SiteId) -> Result<i64, sqlx::Error> {
+    sqlx::query(sql::COARSE_HEAD).bind(site_id.as_str()).fetch_one(connection).await?.try_get(0)
+}
+
+/// The oldest rows that are as they came: position, moment, body.
+async fn precise(connection: &mut SqliteConnection, site_id: &SiteId) -> Result<Vec<(i64, i64, Vec<u8>)>, sqlx::Error> {
+    let coarse = coarse_head(connection, site_id).await?;
+    let next = sqlx::query(sql::FRAMES_NEXT).bind(site_id.as_str()).bind(coarse).bind(COARSE_ROWS);
+    let rows = next.fetch_all(connection).await?;
+    rows.iter().map(|row| Ok((row.try_get(0)?, row.try_get(1)?, row.try_get(2)?))).collect()
+}
+
+/// Puts coarser rows in the place of those that came, and notes how far that is.
+async fn replace(
+    connection: &mut SqliteConnection,
+    site_id: &SiteId,
+    coarse: &[(i64, Vec<u8>)],
+) -> Result<(), sqlx::Error> {
+    let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
+    for (position, body) in coarse {
+        sqlx::query(sql::FRAME_REPLACE)
+            .bind(site_id.as_str())
+            .bind(position)
+            .bind(body.len() as i64)
+            .bind(body.as_slice())
+            .execute(&mut *transaction)
+            .await?;
+    }
+    sqlx::query(sql::MOVE_COARSE_HEAD)
+        .bind(site_id.as_str())
+        .bind(coarse.last().map_or(0, |(position, _)| *position))
+        .execute(&mut *transaction)
         .await?;
-    open.bytes -= freed;
-    Ok(freed)
+    transaction.commit().await
+}
+
+async fn oldest(connection: &mut SqliteConnection, site_id: &SiteId) -> Result<FramesOldest, sqlx::Error> {
+    let coarse = coarse_head(connection, site_id).await?;
+    let row = sqlx::query(sql::FRAMES_OLDEST).bind(site_id.as_str()).bind(coarse).fetch_one(connection).await?;
+    Ok(FramesOldest { any: row.try_get(0)?, precise: row.try_get(1)? })
 }
 
 /// Marks as written down and folded forward from the log's tail; the last position; the bytes kept; the last gap.

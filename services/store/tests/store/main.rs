@@ -2,6 +2,7 @@
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 mod audit;
+mod coarse;
 mod contract;
 mod copied;
 mod copied_wrong;

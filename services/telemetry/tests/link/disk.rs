@@ -2,7 +2,7 @@
 
 use async_trait::async_trait;
 use midshift_core::ids::RobotId;
-use midshift_store::{Error, Frame, FrameLog, FrameMark, Gap, MemoryFrames, StoredFrame};
+use midshift_store::{Coarsen, Error, Frame, FrameLog, FrameMark, FramesOldest, Gap, MemoryFrames, StoredFrame};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use tokio::sync::watch;
@@ -67,5 +67,11 @@ impl FrameLog for Disk {
     }
     async fn prune(&self) -> Result<u64, Error> {
         self.inner.prune().await
+    }
+    async fn coarsen(&self, coarsen: Coarsen) -> Result<u64, Error> {
+        self.inner.coarsen(coarsen).await
+    }
+    async fn oldest(&self) -> Result<FramesOldest, Error> {
+        self.inner.oldest().await
     }
 }
