@@ -87,7 +87,10 @@ fn told(mut event: RobotEvent, more: u32) -> RobotEvent {
         match &mut event {
             RobotEvent::Fault { fault, .. } => fault.message.push_str(&note),
             RobotEvent::StaleAuthority { detail, .. } => detail.push_str(&note),
-            _ => tracing::warn!(changes = more, ?event, "changes summarised"),
+            RobotEvent::Mode(_) => tracing::warn!(changes = more, "changes of mode summarised"),
+            RobotEvent::HardwareStop(_) => tracing::warn!(changes = more, "changes of the hardware stop summarised"),
+            RobotEvent::Load(_) => tracing::warn!(changes = more, "changes of the load summarised"),
+            _ => tracing::warn!(changes = more, "changes summarised"),
         }
     }
     event

@@ -173,6 +173,23 @@ pub enum Job {
     Collect(BTreeSet<Digest>),
 }
 
+impl Job {
+    /// Its name in the log.
+    pub const fn as_str(&self) -> &'static str {
+        match self {
+            Self::Look => "look",
+            Self::Refresh { .. } => "refresh",
+            Self::Fetch { .. } => "fetch",
+            Self::Manifest { .. } => "manifest",
+            Self::Stage(_) => "stage",
+            Self::Verify(_) => "verify",
+            Self::Write(_) => "write",
+            Self::Migrate { .. } => "migrate",
+            Self::Collect(_) => "collect",
+        }
+    }
+}
+
 /// What came of a job.
 #[derive(Clone, Debug)]
 pub enum Done {

@@ -149,7 +149,7 @@ impl AgentCore {
             }
             (job, Done::Failed(Failure::Later(why))) => self.put_off(now, &job, &why),
             (job, Done::Failed(Failure::Refused(reason))) => self.job_refused(now, job, reason),
-            (job, done) => tracing::error!(?job, ?done, "a job ended as another"),
+            (job, done) => tracing::error!(job = job.as_str(), "a job ended as another"),
         }
     }
 
@@ -167,7 +167,7 @@ impl AgentCore {
     fn put_off(&mut self, now: &Now, job: &Job, why: &str) {
         let failures = self.update.pause.map_or(0, |(_, failures)| failures) + 1;
         let pause = PAUSE.0.as_ms().saturating_mul(1 << (failures - 1).min(6)).min(PAUSE.1.as_ms());
-        tracing::info!(robot_id = %self.config.robot_id, ?job, why, pause_ms = pause, "update is put off");
+        tracing::info!(robot_id = %self.config.robot_id, job = job.as_str(), why, pause_ms = pause, "update is put off");
         self.update.pause = Some((now.link + LinkDuration(pause), failures));
         if let Job::Migrate { due, .. } = job {
             self.not_migrated(due, why);
@@ -208,7 +208,7 @@ impl AgentCore {
             tracing::error!(?from, to = ?update.state, "no step of an update");
             return;
         }
-        tracing::info!(robot_id = %self.config.robot_id, bundle = %update.bundle, state = ?update.state, reason = ?update.reason, "update");
+        tracing::info!(robot_id = %self.config.robot_id, bundle = %update.bundle, state = ?update.state, reason = update.reason.as_ref().map(|reason| reason.code.as_str()), "update");
         self.update.collected = false;
         self.put_software(SoftwareRow { update: Some(update), ..self.kept.ledger.software.clone() });
         if let Some(report) = self.update_report() {
@@ -342,7 +342,7 @@ impl AgentCore {
     /// The newest directive is not taken; it is not looked at again.
     pub(super) fn refuse_directive(&mut self, reason: Reason) {
         let Some(desired) = &self.update.desired else { return };
-        tracing::warn!(robot_id = %self.config.robot_id, reason = reason.text(), "directive refused");
+        tracing::warn!(robot_id = %self.config.robot_id, reason = reason.code.as_str(), "directive refused");
         self.update.judged = Some(desired.directive.clone());
         let refused = UpdateEvent::DirectiveRefused { generation: desired.generation, reason };
         self.emit(Lane::Event, RobotEvent::Update(refused));

@@ -206,7 +206,7 @@ where
 
     fn denied(&self, peer: &Peer, denied: Denied) -> End {
         let (port, connection) = (self.config.port, peer.connection.0);
-        tracing::info!(port, connection, address = %peer.address, reason = %denied, "a connection was denied");
+        tracing::info!(port, connection, address = %peer.address, denied = %denied, "a connection was denied");
         End::Denied
     }
 

@@ -35,7 +35,7 @@ impl CallId {
     pub fn status(&self, refusal: &Refusal) -> Status {
         crate::count(refusal);
         if refusal.kind() == Kind::Internal {
-            tracing::error!(request_id = self.0, %refusal, "a call failed by our own fault");
+            tracing::error!(request_id = self.0, code = refusal.reason.code.as_str(), "a call failed by our own fault");
         }
         midshift_proto::status(refusal, Some(&self.0))
     }
