@@ -66,10 +66,11 @@ fn access(pool: &DescriptorPool) -> Result<String, Box<dyn std::error::Error>> {
             variant(&method, rule, field, value.as_ref(), prefix)
         };
         let (permission, object) = (word("permission", "PERMISSION_")?, word("object", "OBJECT_")?);
+        let class = word("load_class", "LOAD_CLASS_")?;
         let path = format!("/{}/{}", method.parent_service().full_name(), method.name());
         writeln!(
             arms,
-            "{path:?} => Some(Access {{ permission: Permission::{permission}, object: Object::{object} }}),"
+            "{path:?} => Some(Access {{ permission: Permission::{permission}, object: Object::{object}, class: Class::{class} }}),"
         )?;
     }
     arms.push_str("_ => None,\n}\n");

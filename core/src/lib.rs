@@ -14,6 +14,7 @@ pub mod lead;
 pub mod limits;
 pub mod maintenance;
 pub mod once;
+pub mod overload;
 pub mod picture;
 pub mod policy;
 pub mod privacy;

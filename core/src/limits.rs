@@ -306,6 +306,8 @@ pub const STOP_CONFIRM_FOR: LinkDuration = LinkDuration::from_secs(120);
 pub const STOP_WATCHERS_MAX: usize = 256;
 /// Request ids of stops that are remembered, the newest.
 pub const STOP_REQUESTS_MAX: usize = 1_024;
+/// Denials that the audit of stops takes a minute: they share its file and its queue with the stops themselves. Of more the count is kept.
+pub const STOP_DENIALS_PER_MINUTE: u32 = 60;
 /// Records of the audit of stops that wait for the disk; of more the count is kept.
 pub const STOP_AUDIT_QUEUE: usize = 1_024;
 /// Bytes of a slot of the latch file: 2,048 resets with their stops and 256 stops with 128 boxes each, as JSON.
@@ -349,6 +351,31 @@ pub const REQUESTS_PER_PRINCIPAL_MAX: usize = 16_384;
 pub const REQUESTS_PER_SECOND: u32 = 1_000;
 /// Requests that it may begin at once.
 pub const REQUESTS_BURST: u32 = 2_000;
+/// Of what a port or a caller has, so much is kept for each class of calls above the one that asks ([`crate::overload::Class`]), permille: a
+/// tenth is enough to decide something and to stop while everything below it is flooded.
+pub const CLASS_KEPT_PERMILLE: usize = 100;
+/// Usual age at which a connection is asked to go, a tenth more or less. With notice and grace it ends within an hour: a certificate that was renewed is
+/// soon the one in use, and connections spread anew over the processes behind a proxy.
+pub const CONNECTION_AGE: LinkDuration = LinkDuration::from_secs(54 * 60);
+/// What streams of an old connection are ended with is on its way for so long before the connection is cut.
+pub const CONNECTION_LAST: LinkDuration = LinkDuration::from_secs(1);
+/// Hellos of robots that one process carries out at a time; each is a write, and writes of so many are one or two groups. Further ones are told when to
+/// come again, so that a storm of ten thousand is over in seconds and none of them waits until it gives up.
+pub const HELLOS_MAX: usize = 512;
+/// A robot whose Hello found no room comes again after a time drawn evenly from this and as much again.
+pub const HELLO_AGAIN: LinkDuration = LinkDuration::from_secs(1);
+/// One caller that is denied again and again leaves a row in the audit so often; what lies between is counted in the next row.
+pub const DENIALS_EVERY: LinkDuration = LinkDuration::from_secs(60);
+/// Rows of one caller at once.
+pub const DENIALS_BURST: u32 = 16;
+/// All denied callers of one port together leave a row so often: a flood for a year fills 15 GB.
+pub const DENIALS_ALL_EVERY: LinkDuration = LinkDuration::from_secs(1);
+/// Rows of all at once.
+pub const DENIALS_ALL_BURST: u32 = 128;
+/// Denials that wait to be written; of more the count is kept.
+pub const DENIALS_QUEUED_MAX: usize = 256;
+/// Bytes of the path of a denied request that are kept: longer than any of ours.
+pub const DENIED_PATH_BYTES: usize = 128;
 /// Principals whose rate is remembered; the one heard longest ago is forgotten first, and begins anew.
 pub const RATES_REMEMBERED: usize = 16_384;
 

@@ -2,6 +2,7 @@
 //!
 //! Invariant: every error a caller can see is one [`Kind`] and one [`Code`]; the only door to a gRPC status is in `midshift-proto`.
 
+use crate::time::LinkDuration;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt;
@@ -353,13 +354,20 @@ pub struct Refusal {
     pub reason: Reason,
     /// For [`Kind::Invalid`]: each broken rule.
     pub violations: Vec<Violation>,
+    /// Not to be tried again sooner; none: as long as is usual for its kind.
+    pub again_after: Option<LinkDuration>,
     kind: Kind,
 }
 
 impl Refusal {
     /// A refusal of `kind` for `reason`.
     pub fn new(kind: Kind, reason: impl Into<Reason>) -> Self {
-        Self { reason: reason.into(), violations: Vec::new(), kind }
+        Self { reason: reason.into(), violations: Vec::new(), again_after: None, kind }
+    }
+    /// Not to be tried again sooner than this.
+    #[must_use]
+    pub fn again_after(self, again_after: LinkDuration) -> Self {
+        Self { again_after: Some(again_after), ..self }
     }
     /// Bad input with all its violations.
     pub fn invalid(violations: Vec<Violation>) -> Self {

@@ -4,6 +4,7 @@
 //! that there is no second place to forget.
 
 use midshift_core::identity::{Access, Caller, Object, Permission, Who};
+use midshift_core::overload::Class;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 
 /// What a path needs; none: nobody may ask for it.
@@ -17,14 +18,23 @@ fn method(path: &str) -> Option<Access> {
 
 /// What is not declared in a .proto of ours: health, reflection, pages.
 fn foreign(path: &str) -> Option<Access> {
-    let permission = match path {
-        "/ready" | "/grpc.health.v1.Health/Check" | "/grpc.health.v1.Health/Watch" => Permission::Anybody,
-        "/metrics" => Permission::Read,
-        _ if path.starts_with("/grpc.reflection.") => Permission::SignedIn,
-        _ if ["/metadata/", "/targets/"].iter().any(|pages| path.starts_with(pages)) => Permission::SignedIn,
+    let (permission, class) = match path {
+        "/ready" | "/grpc.health.v1.Health/Check" | "/grpc.health.v1.Health/Watch" => {
+            (Permission::Anybody, Class::Control)
+        }
+        "/metrics" => (Permission::Read, Class::Status),
+        _ if path.starts_with("/grpc.reflection.") => (Permission::SignedIn, Class::Status),
+        _ if ["/metadata/", "/targets/"].iter().any(|pages| path.starts_with(pages)) => {
+            (Permission::SignedIn, Class::Bulk)
+        }
         _ => return None,
     };
-    Some(Access { permission, object: Object::None })
+    Some(Access { permission, object: Object::None, class })
+}
+
+/// What is shed first; a path without a rule is the first to go.
+pub fn class(path: &str) -> Class {
+    of(path).map_or(Class::Bulk, |access| access.class)
 }
 
 /// Whether this caller may ask for that path at all.

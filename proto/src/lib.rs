@@ -7,6 +7,7 @@ pub mod access;
 pub mod chunk;
 pub mod convert;
 pub mod json;
+pub mod leaving;
 pub mod pages;
 pub mod session;
 pub mod status;
@@ -17,6 +18,7 @@ mod secrets {
 }
 
 pub use convert::{Parse, parse, parse_field, parse_word};
+pub use leaving::Leaving;
 pub use status::{refusal_of, status};
 
 /// Descriptors of all packages with their comments, for reflection and JSON.

@@ -56,7 +56,8 @@ pub fn status(refusal: &Refusal, request_id: Option<&str>) -> Status {
             details.add_precondition_failure_violation(reason.code.as_str(), subject(&reason.metadata), cut(text));
         }
         Kind::Exhausted | Kind::Unavailable => {
-            details.set_retry_info(Some(RETRY_AFTER));
+            let own = refusal.again_after.map(|after| Duration::from_millis(after.as_ms()));
+            details.set_retry_info(Some(own.unwrap_or(RETRY_AFTER)));
         }
         _ => {}
     }
@@ -148,6 +149,7 @@ pub fn refusal_of(status: &Status) -> Answer {
 mod tests {
     use super::*;
     use midshift_core::reason::Reason;
+    use midshift_core::time::LinkDuration;
 
     #[test]
     fn a_caller_reads_what_the_server_refused() {
@@ -202,6 +204,12 @@ mod tests {
         assert_eq!((answer.grpc, answer.retry_after), (tonic::Code::ResourceExhausted, Some(RETRY_AFTER)));
         let answer = refusal_of(&status(&Refusal::new(Kind::Precondition, Code::CursorExpired), None));
         assert_eq!((answer.grpc, answer.code), (tonic::Code::OutOfRange, Some(Code::CursorExpired)));
+    }
+
+    #[test]
+    fn a_refusal_that_names_a_time_of_its_own_is_told_with_it() {
+        let later = Refusal::new(Kind::Exhausted, Code::Overloaded).again_after(LinkDuration(1_700));
+        assert_eq!(refusal_of(&status(&later, None)).retry_after, Some(Duration::from_millis(1_700)));
     }
 
     #[test]

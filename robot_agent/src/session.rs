@@ -25,6 +25,7 @@ use midshift_core::robot::{Lane, ReportedState};
 use midshift_core::time::{Clock, LinkDuration, LinkTime, Now};
 use midshift_proto::convert::parse;
 use midshift_proto::link::v1;
+use midshift_proto::refusal_of;
 use midshift_proto::session::{
     Close, CloseCode, FromRobot, Hello, LanePosition, PROTOCOL_VERSION, Previous, StatusReplay, ToRobot, Uplink,
     Welcome,
@@ -37,8 +38,8 @@ use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
-use tonic::Streaming;
 use tonic::transport::Channel;
+use tonic::{Status, Streaming};
 
 /// What one agent is told at its start.
 pub struct AgentConfig {
@@ -127,6 +128,8 @@ enum Greeted {
     Welcome(Box<(Open, Welcome)>),
     Closed(Close),
     Failed(String),
+    /// The server said no, and perhaps when to ask again.
+    Refused(String, Option<Duration>),
 }
 
 /// What ended a wait.
@@ -471,15 +474,21 @@ impl Agent {
                 self.step(Input::Connected(welcome));
             }
             Greeted::Closed(close) => self.closed(&close),
-            Greeted::Failed(why) => {
-                // Once: it is tried again for as long as it takes.
-                if self.refused != why {
-                    tracing::warn!(robot_id = %self.config.robot_id, why, "no session");
-                    self.refused.clone_from(&why);
-                }
-                self.failed(&why);
-            }
+            Greeted::Failed(why) => self.greeting_failed(&why, None),
+            Greeted::Refused(why, again_after) => self.greeting_failed(&why, again_after),
         }
+    }
+
+    fn greeting_failed(&mut self, why: &str, again_after: Option<Duration>) {
+        // Once: it is tried again for as long as it takes.
+        if self.refused != why {
+            tracing::warn!(robot_id = %self.config.robot_id, why, "no session");
+            why.clone_into(&mut self.refused);
+        }
+        // As the server asks, and apart from others that it asked the same; a server cannot send it away for long.
+        let asked = again_after.map(|after| after.min(RETRY.end) + self.soon());
+        let own = self.retry.next().unwrap_or(RETRY.end);
+        self.wait_to_dial(Some(asked.map_or(own, |asked| asked.max(own))));
     }
 
     fn heard(&mut self, message: Option<Box<v1::SessionResponse>>) {
@@ -529,6 +538,8 @@ impl Agent {
 async fn greet(channel: Channel, hello: v1::SessionRequest, clock: Arc<dyn Clock>) -> Greeted {
     let (up, queue) = mpsc::channel(OUTBOUND);
     let failed = |what: &str, detail: &dyn std::fmt::Display| Greeted::Failed(format!("{what}: {detail}"));
+    let refused =
+        |what: &str, status: &Status| Greeted::Refused(format!("{what}: {status}"), refusal_of(status).retry_after);
     if up.try_send(hello).is_err() {
         return Greeted::Failed("the way up is closed".to_owned());
     }
@@ -540,7 +551,7 @@ async fn greet(channel: Channel, hello: v1::SessionRequest, clock: Arc<dyn Clock
     let request = tonic::Request::new(ReceiverStream::new(queue));
     let mut down = match client.streaming(request, path, SmallCodec::default()).await {
         Ok(response) => response.into_inner(),
-        Err(status) => return failed("session", &status),
+        Err(status) => return refused("session", &status),
     };
     match down.message().await {
         Ok(Some(first)) => match parse(first) {
@@ -553,7 +564,7 @@ async fn greet(channel: Channel, hello: v1::SessionRequest, clock: Arc<dyn Clock
             Err(refusal) => failed("welcome", &refusal),
         },
         Ok(None) => Greeted::Failed("the stream ended before a welcome".to_owned()),
-        Err(status) => failed("welcome", &status),
+        Err(status) => refused("welcome", &status),
     }
 }
 

@@ -179,6 +179,7 @@ impl fmt::Display for Caller {
 mod tests {
     use super::super::grant::Object;
     use super::*;
+    use crate::overload::Class;
 
     fn area(name: &str) -> AreaId {
         AreaId::parse(name).expect("an area")
@@ -190,7 +191,7 @@ mod tests {
     }
 
     fn rule(permission: Permission, object: Object) -> Access {
-        Access { permission, object }
+        Access { permission, object, class: Class::Control }
     }
 
     #[test]

@@ -88,6 +88,7 @@ fn same(a: &Digest, b: &Digest) -> bool {
 mod tests {
     use super::super::grant::{Access, Object, Permission};
     use super::*;
+    use crate::overload::Class;
 
     const DAY_MS: i64 = 24 * 3_600 * 1_000;
 
@@ -116,7 +117,9 @@ mod tests {
         let at = |day: i64| directory.holder(&id, &Digest([7; 32]), Utc(day * DAY_MS));
         let (stop, read) = (Permission::Stop, Permission::Read);
         let may = |day, permission| {
-            at(day).and_then(|caller| caller.may_call(Access { permission, object: Object::None })).is_ok()
+            at(day)
+                .and_then(|caller| caller.may_call(Access { permission, object: Object::None, class: Class::Control }))
+                .is_ok()
         };
         assert!(may(0, stop) && may(0, read));
         assert!(may(1, stop) && !may(1, read));

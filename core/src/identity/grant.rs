@@ -1,6 +1,7 @@
 //! Roles, what each of them permits, and where a grant of one holds.
 
 use crate::ids::AreaId;
+use crate::overload::Class;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
@@ -62,6 +63,8 @@ pub struct Access {
     pub permission: Permission,
     /// Of what.
     pub object: Object,
+    /// What is shed first.
+    pub class: Class,
 }
 
 macro_rules! roles {

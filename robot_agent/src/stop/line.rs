@@ -14,9 +14,11 @@ use midshift_core::stop::robot::Kept;
 use midshift_proto::convert::WireEnum;
 use midshift_proto::convert::parse;
 use midshift_proto::convert::stop::{FromStop, names};
+use midshift_proto::refusal_of;
 use midshift_proto::stop::v1;
 use prost::Message;
 use rand::{RngExt, SeedableRng};
+use std::fmt::Display;
 use std::future::{Future, pending};
 use std::ops::Range;
 use std::pin::Pin;
@@ -24,7 +26,7 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::Streaming;
+use tonic::{Status, Streaming};
 
 /// An agent's way to the stop service.
 pub struct StopLine {
@@ -38,6 +40,8 @@ pub struct StopLine {
 const PATH: &str = "/midshift.stop.v1.StopLinkService/Attend";
 /// Shortest and longest pause between attempts to connect, milliseconds of real time.
 const RETRY_MS: Range<u64> = 200..5_000;
+/// A refusal is given way to for so long at most: well below the time after which a robot among people stands.
+const ASKED_MS_MAX: u128 = 1_500;
 /// A line that is to move over is made again within this, milliseconds of real time.
 const SOON_MS: Range<u64> = 1..500;
 /// Messages that may wait for the wire: check-ins of three seconds and of their changes. A line that is stuck this long is given up.
@@ -55,11 +59,27 @@ pub(crate) struct Open {
     down: Streaming<v1::AttendResponse>,
 }
 
+/// Why there is no line.
+pub(crate) struct NoLine {
+    why: String,
+    /// What the stop service asks for.
+    again_after: Option<Duration>,
+}
+
+impl NoLine {
+    fn failed(why: impl Display) -> Self {
+        Self { why: why.to_string(), again_after: None }
+    }
+    fn refused(status: &Status) -> Self {
+        Self { again_after: refusal_of(status).retry_after, ..Self::failed(status) }
+    }
+}
+
 /// On the way to a line.
 enum Way {
     Idle,
     Waiting(Pin<Box<tokio::time::Sleep>>),
-    Dialing(Boxed<Result<Open, String>>),
+    Dialing(Boxed<Result<Open, NoLine>>),
 }
 
 /// What the line brings.
@@ -67,7 +87,7 @@ pub(crate) enum Said {
     /// It is time to dial.
     DialNow,
     /// What came of it.
-    Dialed(Result<Open, String>),
+    Dialed(Result<Open, NoLine>),
     /// A message; none: the line ended.
     Heard(Option<Box<v1::AttendResponse>>),
     /// What came of a write.
@@ -122,7 +142,7 @@ impl Line {
         let opening = open(self.dial.clone(), first);
         let limit = Duration::from_millis(limits::CHECK_IN_MISSED.as_ms());
         self.way = Way::Dialing(Box::pin(async move {
-            tokio::time::timeout(limit, opening).await.unwrap_or_else(|_| Err("nobody answers".to_owned()))
+            tokio::time::timeout(limit, opening).await.unwrap_or_else(|_| Err(NoLine::failed("nobody answers")))
         }));
     }
 
@@ -136,9 +156,9 @@ impl Line {
                 // A number that was never used before, in any life of this robot.
                 Some(StopNews::Attended { nonce: self.rng.random::<u64>() ^ rand::random::<u64>() })
             }
-            Said::Dialed(Err(why)) => {
+            Said::Dialed(Err(NoLine { why, again_after })) => {
                 self.tell(robot_id, &why);
-                self.wait_to_dial();
+                self.wait_to_dial(again_after);
                 None
             }
             Said::Heard(None) => self.lost("the line ended"),
@@ -204,7 +224,7 @@ impl Line {
         tracing::warn!(why, "stop line given up");
         self.open = None;
         if matches!(self.way, Way::Idle) {
-            self.wait_to_dial();
+            self.wait_to_dial(None);
         }
     }
 
@@ -231,10 +251,14 @@ impl Line {
         }
     }
 
-    fn wait_to_dial(&mut self) {
+    /// Not sooner than the service asks for, but never so late that a service which turns robots away makes them stand by itself.
+    fn wait_to_dial(&mut self, again_after: Option<Duration>) {
         let most = ((2 * RETRY_MS.start) << self.failures.min(8)).min(RETRY_MS.end);
         self.failures = self.failures.saturating_add(1);
         let pause = self.rng.random_range(RETRY_MS.start..=most);
+        let asked_ms = again_after.map_or(0, |after| after.as_millis().min(ASKED_MS_MAX));
+        let asked_ms = u64::try_from(asked_ms).unwrap_or_default();
+        let pause = if asked_ms > pause { asked_ms + self.rng.random_range(SOON_MS) } else { pause };
         self.wait(pause);
     }
 
@@ -256,15 +280,16 @@ fn attend<'a>(robot_id: &RobotId, boot_id: &str, stops: impl Iterator<Item = &'a
     v1::AttendRequest { message: Some(v1::attend_request::Message::Attend(attend)) }
 }
 
-async fn open(dial: Arc<dyn Dial>, first: v1::AttendRequest) -> Result<Open, String> {
-    let channel = dial.dial().await.map_err(|e| e.to_string())?;
+async fn open(dial: Arc<dyn Dial>, first: v1::AttendRequest) -> Result<Open, NoLine> {
+    let channel = dial.dial().await.map_err(NoLine::failed)?;
     let (up, queue) = mpsc::channel(OUTBOUND);
-    up.try_send(first).map_err(|e| e.to_string())?;
+    up.try_send(first).map_err(NoLine::failed)?;
     let mut client = tonic::client::Grpc::new(channel);
-    client.ready().await.map_err(|e| e.to_string())?;
+    client.ready().await.map_err(NoLine::failed)?;
     let path = tonic::codegen::http::uri::PathAndQuery::from_static(PATH);
     let request = tonic::Request::new(ReceiverStream::new(queue));
-    let answer = client.streaming(request, path, SmallCodec::default()).await.map_err(|status| status.to_string())?;
+    let answer = client.streaming(request, path, SmallCodec::default()).await;
+    let answer = answer.map_err(|status| NoLine::refused(&status))?;
     Ok(Open { up, down: answer.into_inner() })
 }
 

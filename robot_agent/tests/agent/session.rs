@@ -22,9 +22,9 @@ use midshift_bundle::manifest::ComponentKind;
 use midshift_bundle::set::SetManifest;
 use midshift_core::authority::Authority;
 use midshift_core::ids::RobotId;
-use midshift_core::reason::Code;
+use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::robot::{Lane, Mode, Vitals};
-use midshift_core::time::{Clock, ScaledClock, Utc};
+use midshift_core::time::{Clock, LinkDuration, ScaledClock, Utc};
 use midshift_core::work::{Assignment, DesiredWork, InboxItem, RobotEvent, SampleBody, WorkState};
 use midshift_proto::convert::parse;
 use midshift_proto::link::v1;
@@ -269,6 +269,30 @@ async fn a_server_that_falls_silent_is_given_up_and_dialed_again() {
     let waited = begin.elapsed().as_secs();
     assert!((10..25).contains(&waited), "{waited} s");
     assert!(second.hello().await.previous.is_some());
+    bench.end().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_server_that_is_overloaded_is_asked_again_when_it_says_and_not_sooner() {
+    let mut bench = Bench::new(Box::new(MemoryStore::new()));
+    let mut refused = bench.session().await;
+    refused.hello().await;
+    let overloaded = Refusal::new(Kind::Exhausted, Code::Overloaded).again_after(LinkDuration::from_secs(5));
+    refused.down.send(Err(midshift_proto::status(&overloaded, None))).await.expect("the robot listens");
+    let begin = tokio::time::Instant::now();
+    let mut second = bench.session().await;
+    let waited = begin.elapsed();
+    assert!((Duration::from_secs(5)..Duration::from_secs(7)).contains(&waited), "{waited:?}");
+    second.hello().await;
+    // Nobody can send a robot away for long.
+    let for_ever = Refusal::new(Kind::Exhausted, Code::Overloaded).again_after(LinkDuration::from_secs(86_400));
+    second.down.send(Err(midshift_proto::status(&for_ever, None))).await.expect("the robot listens");
+    let begin = tokio::time::Instant::now();
+    let mut third = bench.session().await;
+    assert!(begin.elapsed() < Duration::from_secs(12), "{:?}", begin.elapsed());
+    third.hello().await;
+    third.welcome(5).await;
+    assert_eq!(third.beat().await, 1);
     bench.end().await;
 }
 

@@ -63,7 +63,7 @@ impl Default for Config {
             keepalive_within: limits::KEEPALIVE_WITHIN,
             streams_per_connection: limits::STREAMS_PER_CONNECTION,
             header_list_bytes: limits::HEADER_LIST_BYTES,
-            age: None,
+            age: Some(Age::after(limits::CONNECTION_AGE)),
             requests_max: limits::REQUESTS_MAX,
             requests_per_principal_max: limits::REQUESTS_PER_PRINCIPAL_MAX,
             rate: Rate::default(),

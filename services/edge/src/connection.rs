@@ -5,6 +5,7 @@
 
 use crate::activity::{Activity, Unused};
 use crate::config::{Config, std};
+use crate::denials::Denials;
 use crate::peer::{ConnectionId, Denied, Peer, Principals};
 use crate::requests::{Door, Rules};
 use http::{Request, Response};
@@ -70,6 +71,7 @@ pub(crate) struct Port<S> {
     pub config: Config,
     pub services: S,
     pub principals: Arc<dyn Principals>,
+    pub denials: Option<Arc<Denials>>,
     pub tls: Option<watch::Receiver<Arc<ServerConfig>>>,
     pub rules: Arc<Rules>,
     pub http: auto::Builder<TokioExecutor>,
@@ -149,6 +151,7 @@ where
             activity: activity.clone(),
             peer: peer.clone(),
             principals: self.principals.clone(),
+            denials: self.denials.clone(),
         };
         let mut served = pin!(self.http.serve_connection(TokioIo::new(io), door));
         let reason = tokio::select! {
@@ -169,7 +172,7 @@ where
             // Whoever stopped the port counts the time for all.
             Reason::Stop => (End::Stopped, None),
         };
-        peer.leaves();
+        peer.leaving.begin();
         served.as_mut().graceful_shutdown();
         let time_over = async {
             match time {
@@ -179,9 +182,14 @@ where
         };
         tokio::select! {
             biased;
-            _ = served => end,
+            _ = served.as_mut() => end,
             denied = self.asked_again(&peer, &mut changed) => self.denied(&peer, denied),
-            () = time_over => end,
+            () = time_over => {
+                // Whoever still has a stream hears why it ends.
+                peer.over.cancel();
+                let _ = timeout(std(limits::CONNECTION_LAST), served).await;
+                end
+            }
         }
     }
 
@@ -200,7 +208,7 @@ where
     async fn grows_old(&self, peer: &Peer) {
         let Some(age) = self.config.age else { return std::future::pending().await };
         sleep(age.drawn(rand::random())).await;
-        peer.leaves();
+        peer.leaving.begin();
         sleep(std(age.notice)).await;
     }
 

@@ -4,15 +4,17 @@
 //! caller cannot have meant is refused, not ignored.
 
 use crate::answer::Speech;
+use crate::peer::Peer;
 use bytes::Bytes;
 use http::HeaderMap;
 use http_body::{Body as HttpBody, Frame, SizeHint};
-use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_proto::status;
 use std::pin::Pin;
 use std::task::{Context, Poll};
 use std::time::Duration;
 use tokio::time::{Instant, Sleep, sleep_until};
+use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 use tonic::Status;
 use tonic::body::Body;
 
@@ -51,17 +53,50 @@ pub(crate) fn over() -> Refusal {
     Refusal::new(Kind::Deadline, Code::DeadlineExceeded)
 }
 
-/// An answer's body that ends at its caller's deadline, and what is held as long as it lasts.
+/// That the connection under a stream ends: an old one that its peer did not leave.
+pub(crate) struct Over {
+    token: CancellationToken,
+    heard: Option<Pin<Box<WaitForCancellationFutureOwned>>>,
+}
+
+impl Over {
+    pub fn of(peer: &Peer) -> Self {
+        Self { token: peer.over.clone(), heard: None }
+    }
+    /// Whether it is; wakes the task when it will be.
+    fn poll(&mut self, cx: &mut Context<'_>) -> bool {
+        let heard = self.heard.get_or_insert_with(|| Box::pin(self.token.clone().cancelled_owned()));
+        heard.as_mut().poll(cx).is_ready()
+    }
+}
+
+/// What a caller hears whose connection is old.
+fn old() -> Refusal {
+    let text = "the connection is old and ends; go on over a new one";
+    Refusal::new(Kind::Unavailable, Reason::new(Code::MoveOver, text))
+}
+
+/// An answer's body that ends at its caller's deadline or with its connection, and what is held as long as it lasts.
 pub(crate) struct Bounded<H> {
     body: Body,
-    ends: Option<(Pin<Box<Sleep>>, Speech)>,
+    ends: Option<Pin<Box<Sleep>>>,
+    over: Over,
+    speech: Speech,
     _held: H,
 }
 
 impl<H> Bounded<H> {
     /// `body` until `deadline`, in the language of its caller; `held` is dropped with it.
-    pub fn new(body: Body, deadline: Option<Instant>, speech: Speech, held: H) -> Self {
-        Self { body, ends: deadline.map(|at| (Box::pin(sleep_until(at)), speech)), _held: held }
+    pub fn new(body: Body, deadline: Option<Instant>, over: Over, speech: Speech, held: H) -> Self {
+        Self { body, ends: deadline.map(|at| Box::pin(sleep_until(at))), over, speech, _held: held }
+    }
+
+    /// The last that is said.
+    fn end(&mut self, why: &Refusal) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        // The service's side of the stream ends here, not when the peer has read everything.
+        (self.body, self.ends) = (Body::empty(), None);
+        self.over = Over { token: CancellationToken::new(), heard: None };
+        Poll::Ready(Some(ended(&self.speech, why)))
     }
 }
 
@@ -72,12 +107,17 @@ impl<H: Unpin> HttpBody for Bounded<H> {
     fn poll_frame(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
         let this = self.get_mut();
         // The deadline first: a stream that always has more would never be asked otherwise.
-        if let Some((_, speech)) = this.ends.take_if(|(sleep, _)| sleep.as_mut().poll(cx).is_ready()) {
-            // The service's side of the stream ends here, not when the peer has read everything.
-            this.body = Body::empty();
-            return Poll::Ready(Some(ended(&speech)));
+        if this.ends.as_mut().is_some_and(|sleep| sleep.as_mut().poll(cx).is_ready()) {
+            return this.end(&over());
         }
-        Pin::new(&mut this.body).poll_frame(cx)
+        if this.over.token.is_cancelled() {
+            return this.end(&old());
+        }
+        let frame = Pin::new(&mut this.body).poll_frame(cx);
+        if frame.is_pending() && this.over.poll(cx) {
+            return this.end(&old());
+        }
+        frame
     }
 
     fn is_end_stream(&self) -> bool {
@@ -91,8 +131,8 @@ impl<H: Unpin> HttpBody for Bounded<H> {
 
 /// Trailers where the caller understands them. In gRPC-Web they would be bytes of its encoding, so there the answer breaks off: the caller
 /// has counted the same time and expects no more.
-fn ended(speech: &Speech) -> Result<Frame<Bytes>, Status> {
-    let status = status::status(&over(), None);
+fn ended(speech: &Speech, why: &Refusal) -> Result<Frame<Bytes>, Status> {
+    let status = status::status(why, None);
     let mut trailers = HeaderMap::new();
     match speech {
         Speech::Grpc => status.add_header(&mut trailers).map(|()| Frame::trailers(trailers)),
@@ -133,12 +173,33 @@ mod tests {
         }
     }
 
+    fn never() -> Over {
+        Over { token: CancellationToken::new(), heard: None }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_silent_stream_of_a_connection_that_ends_says_that_it_may_go_on_elsewhere() {
+        let (_sender, said) = tokio::sync::mpsc::channel::<Result<Frame<Bytes>, Status>>(1);
+        let silent = Body::new(http_body_util::StreamBody::new(tokio_stream::wrappers::ReceiverStream::new(said)));
+        let token = CancellationToken::new();
+        let mut body = Bounded::new(silent, None, Over { token: token.clone(), heard: None }, Speech::Grpc, ());
+        let ends = async {
+            tokio::task::yield_now().await;
+            token.cancel();
+        };
+        let (frame, ()) = tokio::join!(body.frame(), ends);
+        let trailers = frame.expect("a frame").expect("no error").into_trailers().expect("trailers");
+        let answer = status::refusal_of(&Status::from_header_map(&trailers).expect("a status"));
+        assert_eq!((answer.grpc, answer.code), (tonic::Code::Unavailable, Some(Code::MoveOver)));
+        assert!(answer.retry_after.is_some() && body.frame().await.is_none());
+    }
+
     #[tokio::test(start_paused = true)]
     async fn a_stream_that_always_has_more_ends_with_a_status_all_the_same() {
         let (service, held) = (Arc::new(()), Arc::new(()));
         let deadline = Instant::now() + Duration::from_secs(1);
         let endless = Body::new(Endless(service.clone()));
-        let mut body = Bounded::new(endless, Some(deadline), Speech::Grpc, held.clone());
+        let mut body = Bounded::new(endless, Some(deadline), never(), Speech::Grpc, held.clone());
         assert!(body.frame().await.expect("a frame").expect("no error").is_data());
         tokio::time::advance(Duration::from_secs(2)).await;
         let end = body.frame().await.expect("a frame").expect("no error").into_trailers().expect("trailers");

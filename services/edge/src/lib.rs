@@ -14,6 +14,7 @@ mod answer;
 mod config;
 mod connection;
 mod deadline;
+mod denials;
 mod known;
 mod listen;
 mod peer;
@@ -23,6 +24,7 @@ mod seats;
 pub mod tls;
 
 pub use config::{Age, Config, Rate};
+pub use denials::{Denial, Denials};
 pub use known::{Known, robot_of, serial_of};
 pub use listen::{Incoming, Listen};
 pub use peer::{Anybody, ConnectionId, Denied, Peer, Principals};
@@ -31,6 +33,7 @@ use accept::Accept;
 use config::std;
 use connection::{End, Port};
 use http::{Request, Response};
+use midshift_core::overload::Class;
 use requests::Rules;
 use rustls::ServerConfig;
 use seats::{Full, Seats, network};
@@ -65,13 +68,19 @@ where
     /// `services` (tonic's `Routes`) behind the limits of `config`, for whom `principals` lets in. Plain text without [`Edge::with_tls`].
     pub fn new(config: Config, principals: Arc<dyn Principals>, services: S) -> Self {
         let (rules, http) = (Arc::new(Rules::new(&config)), connection::http(&config));
-        Self { port: Port { config, services, principals, tls: None, rules, http } }
+        Self { port: Port { config, services, principals, denials: None, tls: None, rules, http } }
     }
 
     /// TLS as [`tls::server_config`] makes it. Each new connection takes the newest one; live ones keep theirs.
     #[must_use]
     pub fn with_tls(self, newest: watch::Receiver<Arc<ServerConfig>>) -> Self {
         Self { port: Port { tls: Some(newest), ..self.port } }
+    }
+
+    /// Who is denied is told there.
+    #[must_use]
+    pub fn with_denials(self, denials: Denials) -> Self {
+        Self { port: Port { denials: Some(Arc::new(denials)), ..self.port } }
     }
 
     /// Serves until `stop`, or until `listener` has no more; then each connection is asked to go, and what is left after the drain's time
@@ -95,7 +104,7 @@ where
                 accepted = accept.next() => accepted,
             };
             let Some((io, address)) = accepted else { break };
-            match seats.take(network(address.ip())) {
+            match seats.take(network(address.ip()), Class::Stop) {
                 Ok(seat) => {
                     last += 1;
                     let connection = shared.clone().run(io, address, ConnectionId(last), leave.clone());

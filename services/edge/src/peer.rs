@@ -6,6 +6,7 @@
 use http::HeaderMap;
 use midshift_core::identity::Caller;
 use midshift_core::reason::Refusal;
+use midshift_proto::Leaving;
 use rustls::pki_types::CertificateDer;
 use std::fmt;
 use std::net::SocketAddr;
@@ -32,7 +33,9 @@ pub struct Peer {
     pub certificate: Option<Arc<CertificateDer<'static>>>,
     /// Which connection.
     pub connection: ConnectionId,
-    leaving: CancellationToken,
+    pub(crate) leaving: Leaving,
+    /// Its streams end now.
+    pub(crate) over: CancellationToken,
 }
 
 impl Peer {
@@ -41,17 +44,14 @@ impl Peer {
         certificate: Option<CertificateDer<'static>>,
         connection: ConnectionId,
     ) -> Self {
-        Self { address, certificate: certificate.map(Arc::new), connection, leaving: CancellationToken::new() }
+        let (leaving, over) = (Leaving::default(), CancellationToken::new());
+        Self { address, certificate: certificate.map(Arc::new), connection, leaving, over }
     }
 
     /// Resolves when the connection is about to be asked to go, for its age or because the port closes. Whoever holds a stream on it uses the
     /// time to send its peer elsewhere. Never resolves for a connection that is cut.
     pub async fn leaving(&self) {
-        self.leaving.cancelled().await;
-    }
-
-    pub(crate) fn leaves(&self) {
-        self.leaving.cancel();
+        self.leaving.begun().await;
     }
 }
 

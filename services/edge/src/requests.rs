@@ -6,7 +6,8 @@
 use crate::activity::{Activity, OpenStream};
 use crate::answer::Speech;
 use crate::config::{Config, std};
-use crate::deadline::{self, Bounded};
+use crate::deadline::{self, Bounded, Over};
+use crate::denials::Denials;
 use crate::peer::{Peer, Principals};
 use crate::rates::Rates;
 use crate::seats::{Full, Seat, Seats, network};
@@ -54,6 +55,8 @@ pub(crate) struct Rules {
     head: Duration,
     rates: Rates<Asker>,
     seats: Arc<Seats<Asker>>,
+    /// Requests under way.
+    gauge: metrics::Gauge,
 }
 
 impl Rules {
@@ -63,19 +66,22 @@ impl Rules {
             head: std(config.head),
             rates: Rates::new(config.rate, config.rates_remembered),
             seats: Seats::new(config.requests_max, config.requests_per_principal_max),
+            gauge: metrics::gauge!("midshift_edge_requests", "port" => config.port),
         }
     }
 
     /// Its seat and its caller's own deadline, or why it goes no further.
-    fn admit(&self, asker: &Asker, headers: &HeaderMap, speech: &Speech, now: Instant) -> Result<Admitted, Refusal> {
-        if !self.rates.take(asker, now) {
+    fn admit(&self, asker: &Asker, path: &str, headers: &HeaderMap, speech: &Speech) -> Result<Admitted, Refusal> {
+        let (class, now) = (access::class(path), Instant::now());
+        if !self.rates.take(asker, now, class) {
             return Err(Refusal::new(Kind::Exhausted, Code::TooManyRequests));
         }
-        let seat = self.seats.take(asker.clone()).map_err(|full| match full {
+        let seat = self.seats.take(asker.clone(), class);
+        let seat = seat.map(|seat| Inside::new(&self.gauge, seat)).map_err(|full| match full {
             Full::Kind => Refusal::new(Kind::Exhausted, Code::TooManyRequests),
             Full::Total => Refusal::new(
                 Kind::Exhausted,
-                Reason::new(Code::Overloaded, "as many requests are under way as this port takes"),
+                Reason::new(Code::Overloaded, "as many requests are under way as this port takes of such"),
             ),
         })?;
         let given = if *speech == Speech::Http { None } else { deadline::given(headers)? };
@@ -85,12 +91,31 @@ impl Rules {
 }
 
 struct Admitted {
-    seat: Seat<Asker>,
+    seat: Inside,
     deadline: Option<Instant>,
 }
 
 /// What an answer keeps until its body is gone. Fields are never read.
-type Held = (OpenStream, Option<Seat<Asker>>);
+type Held = (OpenStream, Option<Inside>);
+
+/// One request under way, with its seat.
+pub(crate) struct Inside {
+    gauge: metrics::Gauge,
+    _seat: Seat<Asker>,
+}
+
+impl Inside {
+    fn new(gauge: &metrics::Gauge, seat: Seat<Asker>) -> Self {
+        gauge.increment(1.0);
+        Self { gauge: gauge.clone(), _seat: seat }
+    }
+}
+
+impl Drop for Inside {
+    fn drop(&mut self) {
+        self.gauge.decrement(1.0);
+    }
+}
 
 /// The services, as one connection reaches them.
 pub(crate) struct Door<S> {
@@ -99,22 +124,40 @@ pub(crate) struct Door<S> {
     pub activity: Activity,
     pub peer: Peer,
     pub principals: Arc<dyn Principals>,
+    pub denials: Option<Arc<Denials>>,
 }
 
 impl<S> Door<S> {
     /// Who asks, and what it holds for that; or why it goes no further.
-    fn admit(&self, request: &Request<Incoming>, speech: &Speech, now: Instant) -> Result<(Caller, Admitted), Refusal> {
+    fn admit(&self, request: &Request<Incoming>, speech: &Speech) -> Result<(Caller, Admitted), Refusal> {
         let (path, headers) = (request.uri().path(), request.headers());
         let caller = self.principals.caller(&self.peer, headers);
+        let asker = Asker::of(caller.as_ref(), &self.peer);
         // Before anything else is said: guessing is limited too.
-        let admitted = self.rules.admit(&Asker::of(caller.as_ref(), &self.peer), headers, speech, now)?;
-        let caller = caller?;
-        access::check(&caller, path).inspect_err(|refusal| {
-            if refusal.kind() == Kind::Denied {
-                tracing::info!(port = self.rules.port, actor = %caller, path, "a request was denied");
-            }
-        })?;
-        Ok((caller, admitted))
+        let admitted = self.rules.admit(&asker, path, headers, speech)?;
+        let allowed = match &caller {
+            Ok(caller) => access::check(caller, path),
+            Err(worthless) => Err(worthless.clone()),
+        };
+        if let Err(refusal) = &allowed {
+            self.denied(&asker, caller.as_ref().ok(), path, refusal);
+        }
+        allowed?;
+        Ok((caller?, admitted))
+    }
+
+    /// Tells whoever writes it down. Somebody who showed nothing was denied nothing: it is asked to sign in.
+    fn denied(&self, asker: &Asker, caller: Option<&Caller>, path: &str, refusal: &Refusal) {
+        if caller.is_some_and(|caller| matches!(caller.who(), Who::Nobody)) {
+            return;
+        }
+        let (actor, address) = (caller.map(ToString::to_string), self.peer.address.ip());
+        let actor = actor.unwrap_or_else(|| Caller::nobody().to_string());
+        let code = refusal.reason.code;
+        tracing::info!(port = self.rules.port, actor, path, %code, "a request was denied");
+        if let Some(denials) = &self.denials {
+            denials.tell(asker, actor, network(address), path, code);
+        }
     }
 }
 
@@ -129,27 +172,30 @@ where
 
     fn call(&self, mut request: Request<Incoming>) -> Self::Future {
         let (stream, now) = (self.activity.begin(), Instant::now());
+        let over = Over::of(&self.peer);
         let speech = Speech::of(request.headers());
-        let (caller, Admitted { seat, deadline }) = match self.admit(&request, &speech, now) {
+        let (caller, Admitted { seat, deadline }) = match self.admit(&request, &speech) {
             Ok(admitted) => admitted,
             Err(refusal) => {
                 let (port, reason) = (self.rules.port, refusal.reason.code.as_str());
                 metrics::counter!("midshift_edge_requests_refused_total", "port" => port, "reason" => reason)
                     .increment(1);
-                let refused = speech.refuse(&refusal).map(|body| Bounded::new(body, None, speech, (stream, None)));
+                let refused =
+                    speech.refuse(&refusal).map(|body| Bounded::new(body, None, over, speech, (stream, None)));
                 return Box::pin(std::future::ready(Ok(refused)));
             }
         };
         request.extensions_mut().insert(self.peer.clone());
+        request.extensions_mut().insert(self.peer.leaving.clone());
         request.extensions_mut().insert(caller);
         let head = deadline.map_or(now + self.rules.head, |deadline| deadline.min(now + self.rules.head));
         let answer = self.services.clone().oneshot(request.map(Body::new));
         Box::pin(async move {
             let Ok(Ok(response)) = timeout_at(head, answer).await else {
                 let late = speech.refuse(&deadline::over());
-                return Ok(late.map(|body| Bounded::new(body, None, speech, (stream, Some(seat)))));
+                return Ok(late.map(|body| Bounded::new(body, None, over, speech, (stream, Some(seat)))));
             };
-            Ok(response.map(|body| Bounded::new(body, deadline, speech, (stream, Some(seat)))))
+            Ok(response.map(|body| Bounded::new(body, deadline, over, speech, (stream, Some(seat)))))
         })
     }
 }

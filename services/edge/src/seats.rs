@@ -3,6 +3,7 @@
 //! Invariant: what was taken is given back when its [`Seat`] is dropped, also by a panic; a kind of which nobody is inside costs no memory.
 //! Used for connections by network, and for requests by principal.
 
+use midshift_core::overload::Class;
 use std::collections::HashMap;
 use std::hash::Hash;
 use std::net::{IpAddr, Ipv6Addr};
@@ -43,13 +44,13 @@ impl<K: Eq + Hash + Clone> Seats<K> {
         Arc::new(Self { total_max, kind_max, taken })
     }
 
-    /// A seat, or which limit is reached.
-    pub fn take(self: &Arc<Self>, kind: K) -> Result<Seat<K>, Full> {
+    /// A seat for something of this class, or which limit is reached: the last seats, of all and of each kind, are for higher classes.
+    pub fn take(self: &Arc<Self>, kind: K, class: Class) -> Result<Seat<K>, Full> {
         let mut taken = self.taken();
-        if taken.total >= self.total_max {
+        if taken.total >= class.share(self.total_max) {
             return Err(Full::Total);
         }
-        if taken.kinds.get(&kind).copied().unwrap_or(0) >= self.kind_max {
+        if taken.kinds.get(&kind).copied().unwrap_or(0) >= class.share(self.kind_max) {
             return Err(Full::Kind);
         }
         taken.total += 1;
@@ -93,20 +94,36 @@ mod tests {
     #[test]
     fn one_kind_fills_its_own_seats_and_leaves_the_others() {
         let seats = Seats::new(3, 2);
-        let first = seats.take("a").expect("room");
-        let _second = seats.take("a").expect("room");
-        assert_eq!(seats.take("a").err(), Some(Full::Kind));
-        let _other = seats.take("b").expect("room for another kind");
-        assert_eq!(seats.take("c").err(), Some(Full::Total));
+        let first = seats.take("a", Class::Stop).expect("room");
+        let _second = seats.take("a", Class::Stop).expect("room");
+        assert_eq!(seats.take("a", Class::Stop).err(), Some(Full::Kind));
+        let _other = seats.take("b", Class::Stop).expect("room for another kind");
+        assert_eq!(seats.take("c", Class::Stop).err(), Some(Full::Total));
         drop(first);
-        let _again = seats.take("a").expect("a seat that was given back");
+        let _again = seats.take("a", Class::Stop).expect("a seat that was given back");
+    }
+
+    #[test]
+    fn the_lowest_class_is_shed_first_and_the_highest_last() {
+        let seats = Seats::new(10, 10);
+        let mut inside = Vec::new();
+        let mut fill = |class| {
+            while let Ok(seat) = seats.take("a", class) {
+                inside.push(seat);
+            }
+            inside.len()
+        };
+        assert_eq!(Class::ALL.map(&mut fill), [6, 7, 8, 9, 10]);
+        inside.truncate(6);
+        assert_eq!(seats.take("b", Class::Bulk).err(), Some(Full::Total));
+        assert!(seats.take("b", Class::Status).is_ok());
     }
 
     #[test]
     fn nothing_is_kept_of_those_who_left() {
         let seats = Seats::new(10, 10);
         for kind in 0..1000 {
-            drop(seats.take(kind).expect("room"));
+            drop(seats.take(kind, Class::Stop).expect("room"));
         }
         let taken = seats.taken();
         assert_eq!((taken.total, taken.kinds.len()), (0, 0));

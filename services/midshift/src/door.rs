@@ -8,7 +8,7 @@ use midshift_core::ids::SiteId;
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use midshift_edge::tls::{Clients, server_config};
-use midshift_edge::{Anybody, Config, Edge, Known, Listen, Rate};
+use midshift_edge::{Anybody, Config, Denials, Edge, Known, Listen, Rate};
 use midshift_identity::ServerProof;
 use rustls::ServerConfig;
 use rustls::pki_types::pem::PemObject;
@@ -74,6 +74,8 @@ pub struct Login {
     pub directory: watch::Receiver<Arc<Directory>>,
     /// What the port proves itself with.
     pub proof: watch::Receiver<ServerProof>,
+    /// Who is told whom it denies what.
+    pub denials: Denials,
 }
 
 /// Serves `listener` until `stop`, then drains and cuts. Without a login everybody may do everything, in plain text.
@@ -91,11 +93,11 @@ pub async fn serve<L: Listen>(
         Edge::new(config, Arc::new(Anybody::default()), services).serve(listener, stop).await;
         return Ok(());
     };
-    let Login { site_id, clock, mut directory, mut proof } = login;
+    let Login { site_id, clock, mut directory, mut proof, denials } = login;
     let known = Arc::new(Known::new(site_id, clock));
     known.publish((**directory.borrow_and_update()).clone());
     let tls = watch::Sender::new(tls(&proof.borrow_and_update().clone())?);
-    let edge = Edge::new(config, known.clone(), services).with_tls(tls.subscribe());
+    let edge = Edge::new(config, known.clone(), services).with_tls(tls.subscribe()).with_denials(denials);
     let following = async {
         while directory.changed().await.is_ok() {
             known.publish((**directory.borrow_and_update()).clone());
@@ -131,3 +133,6 @@ fn tls(proof: &ServerProof) -> anyhow::Result<Arc<ServerConfig>> {
     let roots = certificates(&proof.authority_pem).context("reading the site's root")?;
     server_config(chain, key, Clients::Asked(roots)).context("what the server proves itself with")
 }
+
+#[cfg(test)]
+mod tests;

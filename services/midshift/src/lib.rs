@@ -6,6 +6,7 @@ pub mod background;
 pub mod backup;
 pub mod cli;
 pub mod clock;
+mod denials;
 pub mod dev;
 pub mod door;
 pub mod duration;

@@ -5,6 +5,7 @@
 //! whole server with it: none is served without the others. A gateway among several first says that it is not ready and lets its robots
 //! move over.
 
+use crate::denials;
 use crate::door::{self, Login};
 use crate::roles::{Role, Roles};
 use crate::stop_follower::StopFollower;
@@ -17,7 +18,7 @@ use midshift_core::limits;
 use midshift_core::site::Site;
 use midshift_core::time::Clock;
 use midshift_core::work::Live;
-use midshift_edge::Listen;
+use midshift_edge::{Denials, Listen};
 use midshift_fleet::{FleetService, Reconciler};
 use midshift_identity::IdentityService;
 use midshift_identity::audit::AuditService;
@@ -262,12 +263,15 @@ impl Server {
         let (stop, shutdown) = (self.stop.clone(), self.shutdown.clone());
         // However this ends, also in a panic: nobody goes on without it.
         let _end = (stop.clone().drop_guard(), shutdown.clone().drop_guard());
+        let (sink, denials) = Denials::new(self.parts.port.port);
         let login = self.parts.identity.as_ref().map(|identity| Login {
             site_id: self.parts.site.site_id().clone(),
             clock: self.parts.clock.clone(),
             directory: identity.directory(),
             proof: identity.proof(),
+            denials: sink,
         });
+        let writing = denials::write(&*self.parts.store, denials);
         let transport = door::serve(self.parts.port.clone(), login, routes, listener, shutdown.clone());
         let mut names = self.parts.roles.services();
         if self.parts.identity.is_none() {
@@ -309,6 +313,7 @@ impl Server {
             (served, (), ()) = async { tokio::join!(transport, services, ending) } => served.context("serving")?,
             () = readiness => {}
             () = keeper => {}
+            () = writing => {}
             () = following => {}
             () = hard => tracing::info!("open streams were cut"),
         }

@@ -12,7 +12,7 @@ use midshift_agent::dial::{Dial, TcpDial};
 use midshift_agent::tls::{self, Tls};
 use midshift_core::site::Site;
 use midshift_core::time::{Clock, LinkDuration};
-use midshift_edge::Config;
+use midshift_edge::{Config, Denial, Denials};
 use midshift_identity::ServerProof;
 use midshift_stop::{Parts, Principals, StopService};
 use std::net::SocketAddr;
@@ -22,6 +22,7 @@ use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::TcpListener;
+use tokio::sync::mpsc::Receiver;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
@@ -31,6 +32,8 @@ use tonic_health::pb::health_client::HealthClient;
 
 /// Its port, beside the 7420 of the business.
 pub const PORT: u16 = 7421;
+/// As metrics and logs name it.
+const PORT_NAME: &str = "stop";
 /// The folder of its files below the data folder.
 pub const FOLDER: &str = "stop";
 /// A stop service that was started answers within this, or `serve` says that it did not.
@@ -84,14 +87,14 @@ pub async fn run(args: StopServe, shutdown: CancellationToken) -> anyhow::Result
     tracing::info!(address = %listener.local_addr()?, folder = %folder.display(), "midshift stop serves: an operational stop request, not a safety function");
     let clock = clock::clock(1000);
     let (config, login) = match args.insecure {
-        true => (door::alone("stop"), None),
-        false => (args.share.config("stop"), Some(known(&folder, &loaded.site, &clock).await?)),
+        true => (door::alone(PORT_NAME), None),
+        false => (args.share.config(PORT_NAME), Some(known(&folder, &loaded.site, &clock).await?)),
     };
     serve(folder, loaded.site, clock, (config, login), listener, shutdown).await
 }
 
 /// Who is known, as whoever has the store wrote it down beside the latch; followed from then on.
-async fn known(folder: &Path, site: &Site, clock: &Arc<dyn Clock>) -> anyhow::Result<Login> {
+async fn known(folder: &Path, site: &Site, clock: &Arc<dyn Clock>) -> anyhow::Result<(Login, Receiver<Denial>)> {
     let mut waited = Duration::ZERO;
     let first = loop {
         match Principals::read(folder) {
@@ -108,11 +111,13 @@ async fn known(folder: &Path, site: &Site, clock: &Arc<dyn Clock>) -> anyhow::Re
     };
     let (directory, proof) =
         (watch::Sender::new(Arc::new(first.directory.clone())), watch::Sender::new(proof_of(&first)));
+    let (denials, told) = Denials::new(PORT_NAME);
     let login = Login {
         site_id: site.site_id().clone(),
         clock: clock.clone(),
         directory: directory.subscribe(),
         proof: proof.subscribe(),
+        denials,
     };
     let (folder, mut last) = (folder.to_owned(), first);
     // As long as the port is open: it ends with the receivers.
@@ -130,7 +135,7 @@ async fn known(folder: &Path, site: &Site, clock: &Arc<dyn Clock>) -> anyhow::Re
             }
         }
     });
-    Ok(login)
+    Ok((login, told))
 }
 
 fn proof_of(principals: &Principals) -> ServerProof {
@@ -142,7 +147,7 @@ async fn serve(
     folder: PathBuf,
     site: Arc<Site>,
     clock: Arc<dyn Clock>,
-    (config, login): (Config, Option<Login>),
+    (config, login): (Config, Option<(Login, Receiver<Denial>)>),
     listener: TcpListener,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
@@ -152,8 +157,26 @@ async fn serve(
     let pages = service.routes().await?.into_axum_router().layer(tonic_web::GrpcWebLayer::new());
     let routes = Routes::from(pages.route("/metrics", get(metrics)));
     let config = Config { keepalive_every: KEEPALIVE_EVERY, ..config };
+    let (login, denials) = login.unzip();
     let port = door::serve(config, login, routes, listener, service.drained());
+    let recording = record(service.clone(), denials);
+    let port = async {
+        tokio::select! {
+            served = port => served,
+            () = recording => Ok(()),
+        }
+    };
     midshift_stop::serve(service, port).await.context("serving stops")?
+}
+
+/// Records whom the port denies what in the stop service's own file, until it is dropped.
+async fn record(service: StopService, denials: Option<Receiver<Denial>>) {
+    if let Some(mut denials) = denials {
+        while let Some(Denial { actor, network, path, code, left_out }) = denials.recv().await {
+            service.denied(&actor, network, &path, code, left_out);
+        }
+    }
+    std::future::pending().await
 }
 
 /// The stop service of `dev`: a thread with a runtime of its own, so that no plan and no simulated robot holds it up.
@@ -182,7 +205,7 @@ impl Beside {
         let work = move || {
             let served = runtime.block_on(async {
                 let listener = TcpListener::from_std(listener)?;
-                serve(folder, site, clock, (door::alone("stop"), None), listener, stop).await
+                serve(folder, site, clock, (door::alone(PORT_NAME), None), listener, stop).await
             });
             if let Err(error) = &served {
                 tracing::error!(%error, "the stop service ended");

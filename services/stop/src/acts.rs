@@ -144,7 +144,12 @@ pub fn reset(inner: &Inner, stop_id: StopId, reason: String, by: &Caller) -> Res
     let now = inner.clock.now();
     let mut law = lock(&inner.law);
     let areas = law.latch().stop(&stop_id).map(|stop| inner.ground.areas(&stop.scope)).unwrap_or_default();
-    by.needs(Permission::Reset, &areas)?;
+    if let Err(refusal) = by.needs(Permission::Reset, &areas) {
+        let note = Note { actor: by.to_string(), ..Note::own(now.wall, Action::Denied) };
+        let note = note.with("code", refusal.reason.code).with("asked", "stop.reset").with("stop_id", stop_id);
+        inner.disk.denied(note, 0);
+        return Err(refusal);
+    }
     let resetting = law.reset(Reset { stop_id, at: now.wall, actor: by.to_string(), reason });
     if resetting.is_new {
         let Reset { stop_id, actor, reason, .. } = &resetting.reset;

@@ -36,6 +36,8 @@ pub enum Action {
     KeyLost,
     /// The end of this file was gone or not whole.
     AuditLost,
+    /// Somebody asked for what it may not.
+    Denied,
     /// Records were left out, because the disk refused them and memory for them is limited.
     Dropped,
 }

@@ -27,6 +27,15 @@ struct Outcome {
 struct Queue {
     notes: VecDeque<Note>,
     dropped: u64,
+    denials: Denials,
+}
+
+/// How many denials were recorded in this minute, and how many since the last of them were not.
+#[derive(Default)]
+struct Denials {
+    minute: i64,
+    recorded: u32,
+    left_out: u64,
 }
 
 /// What the rest of the service knows of the disk.
@@ -47,6 +56,28 @@ impl Disk {
             queue.dropped += 1;
             metrics::counter!("midshift_stop_audit_dropped_total").increment(1);
         }
+    }
+    /// A denial to record, if those of this minute and half of the queue leave room: stops themselves need it more. What is left out is counted in
+    /// the next one.
+    pub fn denied(&self, note: Note, also_left_out: u64) {
+        let mut queue = lock(&self.queue);
+        let has_room = queue.notes.len() < limits::STOP_AUDIT_QUEUE / 2;
+        let denials = &mut queue.denials;
+        denials.left_out += also_left_out;
+        let minute = note.at.0.div_euclid(60_000);
+        if denials.minute != minute {
+            (denials.minute, denials.recorded) = (minute, 0);
+        }
+        if !has_room || denials.recorded >= limits::STOP_DENIALS_PER_MINUTE {
+            denials.left_out += 1;
+            metrics::counter!("midshift_stop_denials_left_out_total").increment(1);
+            return;
+        }
+        denials.recorded += 1;
+        let left_out = std::mem::take(&mut denials.left_out);
+        queue.notes.push_back(if left_out > 0 { note.with("left_out", left_out) } else { note });
+        drop(queue);
+        self.wake();
     }
     /// There is something to do.
     pub fn wake(&self) {
@@ -200,5 +231,26 @@ fn said(before: Refusing, now: Refusing) {
             (true, false) => tracing::warn!(file, "the disk takes a file of the stop service again"),
             _ => {}
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn denials_are_recorded_as_far_as_stops_leave_room_and_counted_beyond() {
+        let disk = Disk::default();
+        let denied = |at_ms| disk.denied(Note::own(Utc(at_ms), Action::Denied), 0);
+        let most = u64::from(limits::STOP_DENIALS_PER_MINUTE);
+        (0..most + 40).for_each(|_| denied(1_000));
+        assert_eq!(disk.take(Utc(1_000)).len() as u64, most);
+        denied(61_000);
+        let next = disk.take(Utc(61_000));
+        assert_eq!(next[0].fields.get("left_out").map(String::as_str), Some("40"));
+        (0..limits::STOP_AUDIT_QUEUE / 2).for_each(|_| disk.note(Note::own(Utc(0), Action::Engaged)));
+        denied(121_000);
+        let notes = disk.take(Utc(121_000));
+        assert!(notes.iter().all(|note| note.action == Action::Engaged), "none while stops wait for the disk");
     }
 }

@@ -7,6 +7,7 @@ use crate::outbox::Down;
 use crate::{Inner, StopService};
 use bytes::{BufMut, Bytes};
 use midshift_core::limits;
+use midshift_proto::Leaving;
 use midshift_proto::access::caller;
 use midshift_proto::stop::v1;
 use std::convert::Infallible;
@@ -71,8 +72,8 @@ impl StreamingService<v1::AttendRequest> for Attend {
     type Future = BoxFuture<Response<Down>, Status>;
 
     fn call(&mut self, request: Request<Streaming<v1::AttendRequest>>) -> Self::Future {
-        let (inner, by) = (self.0.clone(), caller(&request));
-        Box::pin(async move { line::attend(inner, &by, request.into_inner()).await })
+        let (inner, by, leaving) = (self.0.clone(), caller(&request), Leaving::of(&request));
+        Box::pin(async move { line::attend(inner, &by, leaving, request.into_inner()).await })
     }
 }
 

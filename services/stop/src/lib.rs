@@ -5,7 +5,7 @@
 //!
 //! Called by the binary: [`StopService::open`], its gRPC faces or [`StopService::routes`], [`StopService::run`] and [`serve`]. Invariant: nothing of the store, the task
 //! queue or another service lies on its way; an engage waits for no robot, and for the disk only with its answer; a folder that cannot be trusted
-//! begins with the fleet stopped. Absent on purpose: login, which does not exist yet: whoever reaches the port may engage and reset.
+//! begins with the fleet stopped. Absent on purpose: who may come in: that is the port's, and is told here only so that it can be recorded.
 
 mod acts;
 pub mod audit;
@@ -31,6 +31,7 @@ use disk::{Disk, Writer};
 use ground::Ground;
 use law::{Kept, Law};
 use midshift_core::limits;
+use midshift_core::reason::Code;
 use midshift_core::robot::StopLevel;
 use midshift_core::site::Site;
 use midshift_core::stop::{Latch, Scope, Stop};
@@ -41,6 +42,7 @@ use proof::{Found, Key};
 use robots::Robots;
 use std::fs::DirBuilder;
 use std::io;
+use std::net::IpAddr;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -218,6 +220,13 @@ impl StopService {
             .add_service(self.grpc())
             .add_service(self.link());
         Ok(routes.routes())
+    }
+
+    /// Records that the port denied somebody something, unless too many are; `left_out`: so many that the port itself did not tell of.
+    pub fn denied(&self, actor: &str, network: IpAddr, path: &str, code: Code, left_out: u64) {
+        let note = Note { actor: actor.to_owned(), ..Note::own(self.inner.clock.now().wall, Action::Denied) };
+        let note = note.with("code", code).with("asked", path).with("network", network);
+        self.inner.disk.denied(note, left_out);
     }
 
     /// When its lines have ended, so that its port may close.

@@ -13,8 +13,10 @@ use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::stop::Stop;
 use midshift_core::stop::roster::Heard;
 use midshift_core::time::Now;
+use midshift_proto::Leaving;
 use midshift_proto::convert::stop::{CheckIn, ToStop};
 use midshift_proto::stop::v1;
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 use tonic::{Response, Status, Streaming};
@@ -23,13 +25,14 @@ use tonic::{Response, Status, Streaming};
 pub async fn attend(
     inner: Arc<Inner>,
     by: &Caller,
+    leaving: Leaving,
     mut up: Streaming<v1::AttendRequest>,
 ) -> Result<Response<Down>, Status> {
     let begun = begin(&inner, by, &mut up).await;
     let (robot, outbox) = begun.map_err(|refusal| midshift_proto::status(&refusal, None))?;
     let down = Down::new(inner.clone(), outbox.clone());
     tokio::spawn(async move {
-        hold(&inner, &robot, &outbox, up).await;
+        hold(&inner, &robot, &outbox, &leaving, up).await;
         Robots::detach(&robot, &outbox);
         metrics::gauge!("midshift_stop_lines").decrement(1);
         tracing::info!(robot_id = %robot.robot_id, "stop line ended");
@@ -75,12 +78,26 @@ async fn first(up: &mut Streaming<v1::AttendRequest>) -> Result<(RobotId, String
 }
 
 /// Hears a robot until its line is over.
-async fn hold(inner: &Arc<Inner>, robot: &Robot, outbox: &Arc<Outbox>, mut up: Streaming<v1::AttendRequest>) {
+async fn hold(
+    inner: &Arc<Inner>,
+    robot: &Robot,
+    outbox: &Arc<Outbox>,
+    leaving: &Leaving,
+    mut up: Streaming<v1::AttendRequest>,
+) {
+    // An old connection: the robot has its next line before it leaves this one.
+    let mut moves = pin!(leaving.begun());
+    let mut is_moving = false;
     let silent = Duration::from_millis(limits::STOP_LINE_SILENT.as_ms());
     loop {
         let message = tokio::select! {
             biased;
             () = outbox.gone.cancelled() => return,
+            () = &mut moves, if !is_moving => {
+                is_moving = true;
+                outbox.move_over(inner.clock.now().link);
+                continue;
+            }
             message = tokio::time::timeout(silent, up.message()) => message,
         };
         let now = inner.clock.now();

@@ -33,7 +33,7 @@ use midshift_store::{Error, FrameLog, HeardLog, LiveBoard, Store};
 use picture::Picture;
 use registry::Registry;
 use std::sync::Arc;
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 
 /// What the service is built from.
@@ -58,6 +58,8 @@ pub(crate) struct Inner {
     pub registry: Registry,
     pub ear: ear::Ear,
     pub shared: Option<shared::Shared>,
+    /// Room for robots that say hello.
+    pub hellos: Arc<Semaphore>,
     /// Robots are asked to go to another gateway, and no new one is taken.
     pub moving: CancellationToken,
     pub shutdown: CancellationToken,
@@ -74,7 +76,8 @@ impl TelemetryService {
     pub fn new(parts: Parts, shutdown: CancellationToken) -> Self {
         let (picture, registry, ear) = (Picture::default(), Registry::default(), ear::Ear::default());
         let shared = parts.heard.clone().map(shared::Shared::new);
-        let inner = Inner { parts, picture, registry, ear, shared, moving: CancellationToken::new(), shutdown };
+        let hellos = Arc::new(Semaphore::new(midshift_core::limits::HELLOS_MAX));
+        let inner = Inner { parts, picture, registry, ear, shared, hellos, moving: CancellationToken::new(), shutdown };
         Self { inner: Arc::new(inner) }
     }
     /// The robots' face.

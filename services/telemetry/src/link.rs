@@ -3,8 +3,10 @@
 use crate::session::{self, Down};
 use crate::{TelemetryService, welcome};
 use midshift_core::identity::Caller;
+use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
-use midshift_core::time::Utc;
+use midshift_core::time::{LinkDuration, Utc};
+use midshift_proto::Leaving;
 use midshift_proto::access::caller;
 use midshift_proto::link::v1::{self, link_service_server::LinkService};
 use midshift_proto::session::{FromRobot, Hello, ToRobot};
@@ -28,13 +30,13 @@ impl LinkService for TelemetryService {
     ) -> Result<Response<Self::SessionStream>, Status> {
         let (down, stream) = mpsc::channel(DOWN_MAX);
         let service = self.clone();
-        let by = caller(&request);
+        let (by, leaving) = (caller(&request), Leaving::of(&request));
         let up = request.into_inner();
         tokio::spawn(async move {
             let shutdown = service.inner.shutdown.clone();
             tokio::select! {
                 () = down.closed() => {}
-                result = service.hold(&by, up, down.clone()) => {
+                result = service.hold(&by, leaving, up, down.clone()) => {
                     if let Err(refusal) = result
                         && !shutdown.is_cancelled()
                     {
@@ -48,7 +50,13 @@ impl LinkService for TelemetryService {
 }
 
 impl TelemetryService {
-    async fn hold(&self, by: &Caller, mut up: Streaming<v1::SessionRequest>, down: Down) -> Result<(), Refusal> {
+    async fn hold(
+        &self,
+        by: &Caller,
+        leaving: Leaving,
+        mut up: Streaming<v1::SessionRequest>,
+        down: Down,
+    ) -> Result<(), Refusal> {
         let hello = hello(&mut up).await?;
         // Before anything is asked about that robot, or done to a session of it.
         by.is_robot(&hello.robot_id)?;
@@ -56,8 +64,10 @@ impl TelemetryService {
         if self.inner.moving.is_cancelled() {
             return Err(Refusal::new(Kind::Unavailable, Code::ShuttingDown));
         }
+        let room = self.inner.hellos.clone().try_acquire_owned().map_err(|_| crowded(rand::random()))?;
         self.inner.picture.ready().await;
         let begun = welcome::begin(&self.inner, &hello, by).await?;
+        drop(room);
         tracing::info!(robot_id = %hello.robot_id, session_epoch = begun.welcome.session_epoch, observed = begun.welcome.observed, "session begun");
         let (robot_id, epoch) = (hello.robot_id.clone(), begun.welcome.session_epoch);
         // Also if this future is dropped in the middle: the robot is no longer attached here.
@@ -71,10 +81,20 @@ impl TelemetryService {
         if down.send(Ok((&message).into())).await.is_err() {
             return Ok(());
         }
-        session::run(self.inner.clone(), &hello, begun, up, down).await;
+        session::run(self.inner.clone(), &hello, begun, leaving, up, down).await;
         tracing::info!(%robot_id, session_epoch = epoch, "session ended");
         Ok(())
     }
+}
+
+/// Too many come at once. `draw` is even over all of `u32`: those who are told so together do not come again together.
+fn crowded(draw: u32) -> Refusal {
+    let least_ms = limits::HELLO_AGAIN.as_ms();
+    let spread_ms = u128::from(least_ms) * u128::from(draw) / u128::from(u32::MAX);
+    let again_after = LinkDuration(least_ms + u64::try_from(spread_ms).unwrap_or(least_ms));
+    metrics::counter!("midshift_telemetry_hellos_put_off_total").increment(1);
+    let text = format!("{} robots are saying hello", limits::HELLOS_MAX);
+    Refusal::new(Kind::Exhausted, Reason::new(Code::Overloaded, text)).again_after(again_after)
 }
 
 struct Leave<'a> {
@@ -106,5 +126,17 @@ async fn hello(up: &mut Streaming<v1::SessionRequest>) -> Result<Hello, Refusal>
     match midshift_proto::parse(message)? {
         FromRobot::Hello(hello) => Ok(*hello),
         FromRobot::Uplink(_) => Err(Refusal::field("message", "the first message must be a hello")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn robots_that_are_put_off_together_do_not_come_again_together() {
+        let least = limits::HELLO_AGAIN.as_ms();
+        let after = |draw| crowded(draw).again_after.map(LinkDuration::as_ms);
+        assert_eq!([0, u32::MAX / 2, u32::MAX].map(after), [Some(least), Some(least + least / 2 - 1), Some(2 * least)]);
     }
 }

@@ -19,6 +19,7 @@ use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::robot::Lane;
 use midshift_core::time::{LinkDuration, SiteTime};
 use midshift_core::work::{InboxEntry, InboxItem, Live};
+use midshift_proto::Leaving;
 use midshift_proto::link::v1;
 use midshift_proto::session::{
     ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, ToRobot, Uplink,
@@ -35,11 +36,7 @@ use tonic::{Status, Streaming};
 
 /// A robot that does not read what is sent is let go after this.
 const UNREAD_MAX: Duration = Duration::from_secs(10);
-/// A session lives at most this long ...
-const SESSION_LIFE: Duration = Duration::from_secs(55 * 60);
-/// ... and up to this much longer, drawn at random, so that not all move at once.
-const SESSION_LIFE_JITTER_S: u64 = 300;
-/// Time to open the next session.
+/// Time to open the next session: what is left of the connection once it is old.
 const MOVE_OVER_WITHIN: Duration = Duration::from_secs(30);
 /// A robot whose gateway cannot reach the database looks for another after this: much of its authority is over by then.
 const CUT_OFF_RETRY: LinkDuration = LinkDuration(500);
@@ -91,7 +88,14 @@ fn close(code: CloseCode, reason: Code, retry_after: LinkDuration) -> End {
 }
 
 /// Runs a session to its end. The Welcome has been sent.
-pub async fn run(inner: Arc<Inner>, hello: &Hello, begun: Begun, mut up: Streaming<v1::SessionRequest>, down: Down) {
+pub async fn run(
+    inner: Arc<Inner>,
+    hello: &Hello,
+    begun: Begun,
+    leaving: Leaving,
+    mut up: Streaming<v1::SessionRequest>,
+    down: Down,
+) {
     let robot_id = hello.robot_id.clone();
     let epoch = begun.welcome.session_epoch;
     let mut desired = inner.picture.watch(&robot_id);
@@ -122,7 +126,7 @@ pub async fn run(inner: Arc<Inner>, hello: &Hello, begun: Begun, mut up: Streami
         robot_id: robot_id.clone(),
         inner: inner.clone(),
     };
-    let end = session.run(&mut up, &down, &mut desired).await;
+    let end = session.run(&leaving, &mut up, &down, &mut desired).await;
     if let End::Close(close) = end {
         let _ = down.try_send(Ok((&ToRobot::Close(close)).into()));
     }
@@ -131,19 +135,25 @@ pub async fn run(inner: Arc<Inner>, hello: &Hello, begun: Begun, mut up: Streami
 impl Session {
     async fn run(
         &mut self,
+        leaving: &Leaving,
         up: &mut Streaming<v1::SessionRequest>,
         down: &Down,
         desired: &mut tokio::sync::watch::Receiver<Sections>,
     ) -> End {
         let fenced = self.in_charge.as_ref().map(|c| c.fenced.clone()).unwrap_or_default();
         let (ends, shutdown) = (self.inner.moving.clone(), self.inner.shutdown.clone());
-        let jitter = Duration::from_secs(rand::random_range(0..=SESSION_LIFE_JITTER_S));
-        let life = tokio::time::sleep(SESSION_LIFE + jitter);
-        tokio::pin!(life);
+        // The server goes, or the connection is old.
+        let moves = async {
+            tokio::select! {
+                () = ends.cancelled() => {}
+                () = leaving.begun() => {}
+            }
+        };
+        tokio::pin!(moves);
         let mut cut_off = self.inner.shared.as_ref().map(Shared::cut_off);
         let alone = is_alone(self.inner.clone(), self.second.take());
         tokio::pin!(alone);
-        let mut moving = false;
+        let mut moves_until = None;
         loop {
             self.start_writes();
             let waits = self.out != Downlink::default();
@@ -194,18 +204,10 @@ impl Session {
                 }
                 () = at(unread_at) => return close(CloseCode::TooSlow, Code::Overloaded, LinkDuration(1_000)),
                 () = at(ack_at) => self.ack_status(),
-                () = &mut life => {
-                    if moving {
-                        return close(CloseCode::MoveOver, Code::MoveOver, LinkDuration(0));
-                    }
-                    moving = true;
+                () = at(moves_until) => return close(CloseCode::MoveOver, Code::MoveOver, LinkDuration(0)),
+                () = &mut moves, if moves_until.is_none() => {
+                    moves_until = Some(Instant::now() + MOVE_OVER_WITHIN);
                     self.move_over(down);
-                    life.as_mut().reset(Instant::now() + MOVE_OVER_WITHIN);
-                }
-                () = ends.cancelled(), if !moving => {
-                    moving = true;
-                    self.move_over(down);
-                    life.as_mut().reset(Instant::now() + MOVE_OVER_WITHIN);
                 }
                 () = &mut alone => {
                     return close(CloseCode::MoveOver, Code::MoveOver, LinkDuration(0));

@@ -1,6 +1,6 @@
 //! The audit as its reader has it: what was asked for stands there with who asked, and what somebody changes in the database shows.
 
-use crate::harness::{Server, command, folder, until};
+use crate::harness::{Server, command, folder, second, until};
 use anyhow::{Context, bail, ensure};
 use serde_json::Value;
 use std::path::Path;
@@ -162,5 +162,29 @@ async fn what_is_changed_in_the_database_is_named_by_verify_after_the_next_start
         server.restart().await?;
         said(&server, &["audit", "verify"])?;
     }
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn whoever_is_denied_stands_in_the_audit_of_the_service_that_was_asked() -> anyhow::Result<()> {
+    let dir = folder()?;
+    let server = Server::secure(dir.path(), &[]).await?;
+    let address = server.address.to_string();
+    // It may approve roll-outs and see things, and bring no task in.
+    let submit = ["task", "submit", "--task-id", "T1", "--from", "A01", "--to", "B03", "--server", &address];
+    let denied = second(&submit)?.output()?;
+    let said = String::from_utf8_lossy(&denied.stderr).into_owned();
+    ensure!(!denied.status.success() && said.contains("NOT_PERMITTED"), "{said}");
+    let list = ["audit", "ls", "-o", "json", "--action", "request.deny", "--server", &address];
+    let row = until("a row of the denial", Duration::from_secs(20), async || {
+        let listed: Value = serde_json::from_slice(&command(&list)?.output()?.stdout)?;
+        Ok(listed["rows"].as_array().and_then(|rows| rows.first()).cloned())
+    });
+    let row = row.await?;
+    let told = ["service", "actor", "outcome"].map(|field| row[field].as_str().unwrap_or_default());
+    assert_eq!(told, ["task", "second", "NOT_PERMITTED"], "{row}");
+    assert_eq!(row["with"]["path"], "/midshift.task.v1.TaskService/SubmitTask", "{row}");
+    let verified = command(&["audit", "verify", "--server", &address])?.output()?;
+    ensure!(verified.status.success(), "{}", String::from_utf8_lossy(&verified.stderr));
     Ok(())
 }

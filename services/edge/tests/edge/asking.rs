@@ -11,7 +11,15 @@ use std::sync::Arc;
 use tokio::io::AsyncWriteExt;
 use tonic::Code;
 
-const PAGE: &str = "GET /who HTTP/1.1\r\nhost: edge\r\n\r\n";
+/// Of a class that a flood of lower ones takes nothing from.
+const HEALTH: &str = "/grpc.health.v1.Health/Check";
+const ENGAGE: &str = "/midshift.stop.v1.StopService/Engage";
+const CANCEL: &str = "/midshift.task.v1.TaskService/CancelTask";
+const LIST: &str = "/midshift.task.v1.TaskService/ListTasks";
+const WATCH: &str = "/midshift.task.v1.TaskService/WatchTasks";
+const FETCH: &str = "/midshift.ota.v1.ChunkService/FetchChunks";
+
+const PAGE: &str = "GET /ready HTTP/1.1\r\nhost: edge\r\n\r\n";
 
 /// A token comes back in a time that no test has.
 fn three_at_once() -> Rate {
@@ -29,7 +37,7 @@ async fn who_floods_is_told_when_to_come_back_and_another_is_served() {
     let mut flood = [world.client().await, world.client().await];
     let mut refused = None;
     for turn in 0..1_000 {
-        let answered = flood[turn % 2].asked("/who").await;
+        let answered = flood[turn % 2].asked(HEALTH).await;
         if answered.status.code() != Code::Ok {
             refused = Some((turn, answered));
             break;
@@ -43,7 +51,7 @@ async fn who_floods_is_told_when_to_come_back_and_another_is_served() {
     assert!(refused.head.headers().contains_key("grpc-status"), "trailers alone: nothing was begun");
     assert_eq!(world.counter("midshift_edge_requests_refused_total", ("reason", "TOO_MANY_REQUESTS")), 1);
     let mut other = world.client_from(THERE).await;
-    assert_eq!(other.asked("/who").await.status.code(), Code::Ok);
+    assert_eq!(other.asked(HEALTH).await.status.code(), Code::Ok);
 }
 
 #[tokio::test]
@@ -51,7 +59,7 @@ async fn a_flood_of_http_1_hears_429() {
     let world = World::open(Config { rate: three_at_once(), ..Config::default() }).await;
     let mut browser = dial(world.address, HERE).await;
     browser.write_all(PAGE.repeat(200).as_bytes()).await.expect("written");
-    browser.write_all(b"GET /who HTTP/1.1\r\nhost: edge\r\nconnection: close\r\n\r\n").await.expect("written");
+    browser.write_all(b"GET /ready HTTP/1.1\r\nhost: edge\r\nconnection: close\r\n\r\n").await.expect("written");
     let said = within(until_closed(&mut browser)).await;
     let said = String::from_utf8_lossy(&said);
     assert!(
@@ -81,6 +89,58 @@ async fn a_port_that_is_full_of_calls_says_so() {
     let mut other = world.client_from(THERE).await;
     let answer = other.asked("/who").await.answer();
     assert_eq!((answer.grpc, answer.code), (Code::ResourceExhausted, Some(Reason::Overloaded)));
+}
+
+#[tokio::test]
+async fn a_full_port_sheds_the_lowest_first_and_serves_all_again_by_itself() {
+    let world = named(Config { requests_max: 10, ..Config::default() }).await;
+    let mut flood = world.client().await;
+    // As many as come in, of each class in turn, from the lowest on.
+    let mut open = Vec::new();
+    let mut filled = Vec::new();
+    for path in [FETCH, LIST, WATCH, CANCEL, ENGAGE] {
+        while let Some(head) = flood.held(path).await {
+            open.push(head);
+        }
+        filled.push(open.len());
+    }
+    assert_eq!(filled, [6, 7, 8, 9, 10]);
+    // Somebody else is served in the order of classes while the flood goes down.
+    let mut other = world.client_from(THERE).await;
+    let mut answers = async |path| other.asked(path).await.answer();
+    let refused = answers(ENGAGE).await;
+    assert_eq!((refused.grpc, refused.code), (Code::ResourceExhausted, Some(Reason::Overloaded)));
+    assert_eq!(refused.retry_after, Some(RETRY_AFTER));
+    for (n, (now, not_yet)) in
+        [(ENGAGE, Some(CANCEL)), (CANCEL, Some(WATCH)), (WATCH, Some(LIST)), (LIST, Some(FETCH)), (FETCH, None)]
+            .into_iter()
+            .enumerate()
+    {
+        drop(open.pop());
+        while world.requests_open() + n + 1 > 10 {
+            tokio::task::yield_now().await;
+        }
+        assert_eq!(answers(now).await.grpc, Code::Ok, "{now}");
+        if let Some(not_yet) = not_yet {
+            assert_eq!(answers(not_yet).await.code, Some(Reason::Overloaded), "{not_yet}");
+        }
+    }
+    drop(open);
+    while flood.asked(FETCH).await.status.code() != Code::Ok {}
+}
+
+#[tokio::test]
+async fn a_caller_that_floods_with_what_can_wait_can_still_stop() {
+    let ten = NonZeroU32::MIN.saturating_add(9);
+    let world = named(Config { rate: Rate { per_second: NonZeroU32::MIN, burst: ten }, ..Config::default() }).await;
+    let mut flood = world.client().await;
+    let mut served = 0;
+    while flood.asked(FETCH).await.status.code() == Code::Ok {
+        served += 1;
+    }
+    assert!(served >= 6, "{served}");
+    assert_eq!(flood.asked(FETCH).await.answer().code, Some(Reason::TooManyRequests));
+    assert_eq!(flood.asked(ENGAGE).await.status.code(), Code::Ok);
 }
 
 #[tokio::test]

@@ -2,6 +2,7 @@
 
 use crate::frames::{END_STREAM, GOAWAY, HEADERS, Raw, dial, until_closed};
 use crate::world::{HERE, SOON, World, within};
+use midshift_core::reason::Code as Reason;
 use midshift_core::time::LinkDuration;
 use midshift_edge::{Age, Config, Served};
 use tokio::net::TcpSocket;
@@ -70,6 +71,18 @@ async fn an_old_connections_streams_are_told_before_its_peer_is() {
         }
     }
     assert_eq!(order, ["the stream ended", "goaway"]);
+}
+
+#[tokio::test]
+async fn who_still_watches_when_an_old_connection_ends_hears_that_it_may_go_on_over_a_new_one() {
+    let world = World::open(old_soon(SOON, SOON)).await;
+    let mut client = world.client().await;
+    let watching = within(client.begin("/stream", None).await.expect("a stream")).await.expect("its head");
+    let whole = within(crate::world::whole(watching)).await.expect("an end with a status");
+    let answer = whole.answer();
+    assert_eq!((answer.grpc, answer.code), (Code::Unavailable, Some(Reason::MoveOver)));
+    assert!(answer.retry_after.is_some());
+    world.closed_for("old").await;
 }
 
 #[tokio::test]

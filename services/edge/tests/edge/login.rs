@@ -8,11 +8,11 @@ use midshift_core::ids::SiteId;
 use midshift_core::reason::Code;
 use midshift_core::time::{Clock, ScaledClock, Utc};
 use midshift_edge::tls::Clients;
-use midshift_edge::{Config, Known, robot_of};
+use midshift_edge::{Config, Denial, Denials, Known, robot_of};
 use sha2::Digest as _;
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use tokio::sync::watch;
+use tokio::sync::{mpsc, watch};
 
 const LIST: &str = "/midshift.task.v1.TaskService/ListTasks";
 const SUBMIT: &str = "/midshift.task.v1.TaskService/SubmitTask";
@@ -24,6 +24,7 @@ struct Port {
     world: World,
     authority: Authority,
     known: Arc<Known>,
+    denials: mpsc::Receiver<Denial>,
     _tls: watch::Sender<Arc<rustls::ServerConfig>>,
 }
 
@@ -40,8 +41,9 @@ impl Port {
         let authority = Authority::new();
         let known = Arc::new(Known::new(site(), clock()));
         let (tls, newest) = watch::channel(authority.server(Clients::Asked(vec![authority.root()])));
-        let world = World::with(Config::default(), known.clone(), Some(newest)).await;
-        Self { world, authority, known, _tls: tls }
+        let (tell, denials) = Denials::new("business");
+        let world = World::telling(Config::default(), known.clone(), Some(newest), Some(tell)).await;
+        Self { world, authority, known, denials, _tls: tls }
     }
     fn robot(&self, name: &str) -> Identity {
         self.authority.issue_uri(&format!("spiffe://factory/robot/{name}"))
@@ -161,4 +163,62 @@ async fn an_expired_token_still_engages_a_stop_and_resets_none() {
     assert!(code(&mut client, ENGAGE, Some(&bearer)).await.is_ok());
     let reset = code(&mut client, "/midshift.stop.v1.StopService/Reset", Some(&bearer)).await;
     assert_eq!(reset, Err(Code::TokenExpired));
+}
+
+fn said(actor: &str, path: &str, code: Code) -> Denial {
+    let network = std::net::Ipv4Addr::LOCALHOST.into();
+    Denial { actor: actor.to_owned(), network, path: path.to_owned(), code, left_out: 0 }
+}
+
+#[tokio::test]
+async fn whoever_may_not_or_shows_something_worthless_is_told_of_and_who_showed_nothing_is_not() {
+    let mut port = Port::open().await;
+    let secret = secret();
+    port.knows(&secret, &["viewer"], i64::MAX);
+    let token = format!("Bearer {}", secret.reveal(Secret::TOKEN));
+    let mut client = port.client(None).await;
+    assert_eq!(code(&mut client, LIST, Some(&token)).await, Ok("anna".to_owned()));
+    assert_eq!(code(&mut client, SUBMIT, None).await, Err(Code::SignInNeeded));
+    assert_eq!(code(&mut client, SUBMIT, Some(&token)).await, Err(Code::NotPermitted));
+    let other = Secret::new(TokenId::new("t2").expect("an id"), [7; 32]).reveal(Secret::TOKEN);
+    assert_eq!(code(&mut client, LIST, Some(&format!("Bearer {other}"))).await, Err(Code::TokenUnknown));
+    port.knows(&secret, &["viewer"], 1);
+    assert_eq!(code(&mut client, LIST, Some(&token)).await, Err(Code::TokenExpired));
+    let mut robot = port.client(Some(&port.robot("r7"))).await;
+    assert_eq!(code(&mut robot, LIST, None).await, Err(Code::NotPermitted));
+    let mut told = Vec::new();
+    while let Ok(denial) = port.denials.try_recv() {
+        told.push(denial);
+    }
+    let expected = [
+        said("anna", SUBMIT, Code::NotPermitted),
+        said("nobody", LIST, Code::TokenUnknown),
+        said("anna", LIST, Code::TokenExpired),
+        said("robot:r7", LIST, Code::NotPermitted),
+    ];
+    assert_eq!(told, expected);
+}
+
+#[tokio::test]
+async fn a_flood_of_guesses_is_told_of_a_few_times_and_counted() {
+    let mut port = Port::open().await;
+    let guess = Secret::new(TokenId::new("t9").expect("an id"), [9; 32]).reveal(Secret::TOKEN);
+    let guess = format!("Bearer {guess}");
+    let mut client = port.client(None).await;
+    for _ in 0..200 {
+        assert_eq!(code(&mut client, LIST, Some(&guess)).await, Err(Code::TokenUnknown));
+    }
+    let mut told = 0;
+    while port.denials.try_recv().is_ok() {
+        told += 1;
+    }
+    // A token comes back in a minute, which a slow machine may take.
+    assert!((16..100).contains(&told), "{told}");
+    let left_out = port.world.counter("midshift_edge_denials_left_out_total", ("port", "business"));
+    assert_eq!(told + left_out, 200);
+    // Somebody else is told of all the same, and what was left out with it.
+    let mut robot = port.client(Some(&port.robot("r7"))).await;
+    assert_eq!(code(&mut robot, LIST, None).await, Err(Code::NotPermitted));
+    let next = port.denials.try_recv().expect("told");
+    assert_eq!((next.actor.as_str(), next.left_out), ("robot:r7", left_out));
 }

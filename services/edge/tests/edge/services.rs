@@ -16,7 +16,7 @@ use tonic::body::Body;
 use tower::Service;
 
 /// Answers by path: `/who` tells who asked, `/hang` never answers, `/stream` answers and goes on without a word, `/pulse` says a word for each
-/// `/poke`, `/leaving` ends when its connection is about to be asked to go.
+/// `/poke`, `/leaving` ends when its connection is about to be asked to go. Any path with a header `hold` is as `/stream`.
 #[derive(Clone, Default)]
 pub struct Services {
     poked: Arc<Notify>,
@@ -42,6 +42,9 @@ impl Service<Request<Body>> for Services {
 async fn answer(request: Request<Body>, poked: Arc<Notify>) -> Response<Body> {
     let peer = request.extensions().get::<Peer>().expect("each request says who asks").clone();
     let path = request.uri().path().to_owned();
+    if request.headers().contains_key("hold") {
+        return grpc(Body::new(Silent { _request: request.into_body() }));
+    }
     match path.as_str() {
         "/hang" => std::future::pending().await,
         "/stream" => grpc(Body::new(Silent { _request: request.into_body() })),

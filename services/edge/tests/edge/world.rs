@@ -7,7 +7,7 @@ use bytes::Bytes;
 use h2::client::SendRequest;
 use http::{Request, Response};
 use midshift_core::time::LinkDuration;
-use midshift_edge::{Anybody, Config, Edge, Principals, Served};
+use midshift_edge::{Anybody, Config, Denials, Edge, Principals, Served};
 use midshift_proto::status::{Answer, refusal_of};
 use rustls::ServerConfig;
 use std::net::SocketAddr;
@@ -51,6 +51,16 @@ impl World {
         principals: Arc<dyn Principals>,
         tls: Option<watch::Receiver<Arc<ServerConfig>>>,
     ) -> Self {
+        Self::telling(config, principals, tls, None).await
+    }
+
+    /// With somebody who is told of denials.
+    pub async fn telling(
+        config: Config,
+        principals: Arc<dyn Principals>,
+        tls: Option<watch::Receiver<Arc<ServerConfig>>>,
+        denials: Option<Denials>,
+    ) -> Self {
         // Of this thread: each test has its own, and its runtime has no other thread.
         let readings: &'static Readings = Box::leak(Box::default());
         let _recorder = metrics::set_default_local_recorder(readings);
@@ -60,6 +70,10 @@ impl World {
         let edge = Edge::new(config, principals, Services::default());
         let edge = match tls {
             Some(newest) => edge.with_tls(newest),
+            None => edge,
+        };
+        let edge = match denials {
+            Some(denials) => edge.with_denials(denials),
             None => edge,
         };
         let serving = tokio::spawn(edge.serve(listener, stop.clone()));
@@ -96,6 +110,11 @@ impl World {
     /// Connections that are open, as the gauge says.
     pub fn open_connections(&self) -> f64 {
         self.readings.gauge("midshift_edge_connections")
+    }
+
+    /// Requests under way, as the gauge says.
+    pub fn requests_open(&self) -> usize {
+        self.readings.gauge("midshift_edge_requests") as usize
     }
 
     /// Waits until a connection that ended for this reason is counted.
@@ -150,6 +169,14 @@ impl Client {
             request = request.header("grpc-timeout", timeout);
         }
         self.send(request.body(()).expect("a request")).await
+    }
+
+    /// A call of that path that stays open; none: it was refused.
+    pub async fn held(&mut self, path: &str) -> Option<Response<h2::RecvStream>> {
+        let request = Request::post(format!("http://edge{path}")).header("content-type", "application/grpc");
+        let request = request.header("hold", "yes").body(()).expect("a request");
+        let response = within(within(self.send(request)).await?).await.ok()?;
+        (!response.headers().contains_key("grpc-status")).then_some(response)
     }
 
     pub async fn send(&mut self, request: Request<()>) -> Option<h2::client::ResponseFuture> {

@@ -8,6 +8,7 @@ use midshift_core::site::Site;
 use midshift_core::stop::ladder::{Around, Stage};
 use midshift_core::stop::{Latch, Stop};
 use midshift_core::time::{Clock, ScaledClock, Utc};
+use midshift_proto::Leaving;
 use midshift_proto::convert::stop::{CheckIn, FromStop, ToStop};
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::stop_link_service_client::StopLinkServiceClient;
@@ -16,7 +17,7 @@ use midshift_stop::{Error, Parts, StopService, serve};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
@@ -71,6 +72,8 @@ pub struct Server {
     shutdown: CancellationToken,
     pub address: SocketAddr,
     ahead_us: Arc<AtomicU64>,
+    /// What requests that come now are told of their connection.
+    leaving: Arc<Mutex<Leaving>>,
 }
 
 impl Server {
@@ -101,11 +104,17 @@ impl Server {
             })
             .await
             .unwrap();
+        let leaving = Arc::new(Mutex::new(Leaving::default()));
+        let told = leaving.clone();
+        let asked = move |mut request: Request<()>| {
+            request.extensions_mut().insert(told.lock().unwrap().clone());
+            known(request)
+        };
         let serving = runtime.spawn(async move {
             let (routes, drained) = (service.routes().await?, service.drained());
             let port = tonic::transport::Server::builder()
                 .accept_http1(true)
-                .layer(InterceptorLayer::new(known))
+                .layer(InterceptorLayer::new(asked))
                 .add_routes(routes)
                 .serve_with_incoming_shutdown(incoming, drained.clone().cancelled_owned());
             let cut = async {
@@ -120,7 +129,12 @@ impl Server {
             };
             serve(service, port).await.map(|served| served.unwrap())
         });
-        Self { runtime: Some(runtime), serving, shutdown, address, ahead_us }
+        Self { runtime: Some(runtime), serving, shutdown, address, ahead_us, leaving }
+    }
+
+    /// All connections that there are now are old.
+    pub fn age(&self) {
+        std::mem::take(&mut *self.leaving.lock().unwrap()).begin();
     }
 
     /// The link clock and the wall of this server go ahead.

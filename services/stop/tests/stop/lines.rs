@@ -60,6 +60,29 @@ async fn a_newer_line_of_a_robot_takes_the_place_of_the_older_one() {
 }
 
 #[tokio::test]
+async fn a_robot_on_an_old_connection_has_its_next_line_before_it_leaves_this_one() {
+    let folder = Folder::new();
+    let server = Server::start(&folder.path()).await;
+    let mut old = Robot::dial(&server, "r1", vec![]).await.synced().await;
+    for _ in 0..10 {
+        server.age();
+        old.until(|robot| robot.is_moved).await;
+        // Nothing is missed meanwhile: it is answered, and told of stops.
+        let id = id_of(&server.engage(fleet()).await.unwrap());
+        old.until(|robot| robot.knows(&id)).await;
+        let said = old.obeying(true);
+        old.check_in(said).await;
+        let mut next = Robot::dial(&server, "r1", vec![]).await.synced().await;
+        assert!(next.knows(&id) && !next.is_moved);
+        let said = next.obeying(true);
+        next.check_in(said).await;
+        while let Ok(true) = old.read().await {}
+        old = next;
+    }
+    assert_eq!(server.status().await.robots.len(), 1);
+}
+
+#[tokio::test]
 async fn a_line_that_does_not_begin_with_attend_or_breaks_its_rules_is_refused() {
     let folder = Folder::new();
     let server = Server::start(&folder.path()).await;

@@ -1,6 +1,6 @@
 //! Who engages, who resets, and who comes as a robot.
 
-use crate::harness::{Folder, Robot, Server, asked_as, fleet, id_of, scope};
+use crate::harness::{Folder, Robot, Server, asked_as, eventually, fleet, id_of, scope};
 use midshift_core::ids::RobotId;
 use midshift_core::site::{DEMO, text};
 use midshift_proto::convert::stop::ToStop;
@@ -65,7 +65,11 @@ async fn anyone_engages_any_part_under_its_own_name_and_a_reset_needs_its_role_w
     }
     let unknown = reset(&server, "bea stop-resetter@hall", "STOP-never").await.unwrap_err();
     assert_eq!(unknown.code(), Code::PermissionDenied, "a stop that nobody knows may be anywhere");
-    let audit = fs::read_to_string(folder.path().join("audit.jsonl")).unwrap();
+    let audit = || fs::read_to_string(folder.path().join("audit.jsonl")).unwrap();
+    // Refusals wait for the disk, whoever was refused does not.
+    let denied = || audit().lines().filter(|line| line.contains("\"DENIED\"") && line.contains("\"bea\"")).count();
+    eventually(async || (denied() == 17).then_some(())).await;
+    let audit = audit();
     let actors = |action: &str, actor: &str| {
         audit.lines().filter(|line| line.contains(action) && line.contains(&format!("\"{actor}\""))).count()
     };

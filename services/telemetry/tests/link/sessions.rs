@@ -1,7 +1,9 @@
 //! A robot's session: welcome, acknowledgements, desired state, succession, clones.
 
-use crate::world::{Otherwise, Result, Robot, World, world, world_with};
+use crate::world::{Otherwise, Result, Robot, World, hello, world, world_with};
 use midshift_core::ids::RobotId;
+use midshift_core::limits;
+use midshift_core::reason::Code;
 use midshift_core::robot::Lane;
 use midshift_core::rows::{Expect, Item, Log, Seq, Writer};
 use midshift_core::work::{DesiredWork, Session};
@@ -74,6 +76,73 @@ async fn without_the_fence_a_clone_takes_over_a_robot_that_is_heard() -> Result<
     first.beat().await?;
     let clone = Robot::attach(&world, None).await?;
     assert!(!clone.welcome.observed, "two machines of one name, and the second has its work");
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn robots_of_old_connections_move_over_again_and_again_and_none_is_taken_for_a_clone() -> Result<()> {
+    let world = world().await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    for _ in 0..100 {
+        robot.beat().await?;
+        world.age();
+        robot.moves_over().await?;
+        robot.beat().await?;
+        assert_eq!(robot.hears(|down| down.echo.map(|e| e.hb)).await?, 2, "until the next session it is served");
+        let next = Robot::attach(&world, Some(robot.proof())).await?;
+        assert!(!next.welcome.observed);
+        assert_eq!(robot.closes().await?.code, CloseCode::MoveOver);
+        robot = next;
+    }
+    let facts = world.store.feed(Seq(0), &[Log::Telemetry], 1_000).await?.entries;
+    assert!(facts.len() >= 100 && !facts.iter().any(|f| &*f.kind == "session.clone_seen"));
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_stays_on_an_old_connection_is_told_to_go() -> Result<()> {
+    let world = world().await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    world.age();
+    robot.moves_over().await?;
+    let close = robot.closes().await?;
+    assert_eq!((close.code, close.retry_after_ms), (CloseCode::MoveOver, 0));
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn of_a_storm_of_robots_some_are_put_off_with_a_time_and_all_come_in() -> Result<()> {
+    let (read, reads) = tokio::sync::oneshot::channel::<()>();
+    let world = crate::world::world_after(async move { drop(reads.await) }).await?;
+    let mut storm = tokio::task::JoinSet::new();
+    let mut channel = world.dial().await?;
+    let mut attach = async |n: usize| -> Result<_> {
+        // As many streams of one connection as any server takes.
+        if n.is_multiple_of(100) {
+            channel = world.dial().await?;
+        }
+        let robot_id = RobotId::parse(&format!("r{n}"))?;
+        let hello = midshift_proto::session::Hello { robot_id, ..hello(None)? };
+        Ok(Robot::attach_over(channel.clone(), hello, tonic::Request::new))
+    };
+    for n in 0..=limits::HELLOS_MAX {
+        storm.spawn(attach(n).await?);
+    }
+    let first = storm.join_next().await.ok_or("nobody")??;
+    let refused = first.err().ok_or("welcome before anything was read")?;
+    let refused = refused.downcast_ref::<tonic::Status>().ok_or("no status")?;
+    let answer = midshift_proto::refusal_of(refused);
+    assert_eq!((answer.grpc, answer.code), (tonic::Code::ResourceExhausted, Some(Code::Overloaded)));
+    let least = std::time::Duration::from_millis(limits::HELLO_AGAIN.as_ms());
+    assert!(answer.retry_after.is_some_and(|after| (least..=2 * least).contains(&after)), "{answer:?}");
+    read.send(()).map_err(|()| "it ended")?;
+    let mut welcome = 0;
+    while let Some(attached) = storm.join_next().await {
+        attached??;
+        welcome += 1;
+    }
+    assert_eq!(welcome, limits::HELLOS_MAX);
+    assert!(attach(limits::HELLOS_MAX + 1).await?.await.is_ok(), "there is room again, and nothing was restarted");
     Ok(())
 }
 

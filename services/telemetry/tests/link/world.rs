@@ -5,6 +5,7 @@ use midshift_core::ids::{RobotId, SiteId, WaypointId};
 use midshift_core::robot::{Inventory, Lane, Mode, ReportedState, Vitals};
 use midshift_core::time::{Clock, ScaledClock, Utc};
 use midshift_core::work::{InboxItem, RobotEvent, Sample, SampleBody};
+use midshift_proto::Leaving;
 use midshift_proto::link::v1::link_service_client::LinkServiceClient;
 use midshift_proto::link::v1::{SessionRequest, SessionResponse};
 use midshift_proto::session::{
@@ -13,7 +14,7 @@ use midshift_proto::session::{
 use midshift_store::{FrameLog, LiveBoard, MemoryFrames, MemoryStore, Store, StoreId};
 use midshift_telemetry::{Bugs, Parts, TelemetryService};
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
@@ -27,6 +28,35 @@ pub struct World {
     pub store: Arc<dyn Store>,
     pub channel: Channel,
     pub service: TelemetryService,
+    leaving: Leavings,
+    pipes: Pipes,
+}
+
+/// What requests that come now are told of their connection.
+type Leavings = Arc<Mutex<Leaving>>;
+type Pipes = mpsc::Sender<std::io::Result<tokio::io::DuplexStream>>;
+
+impl World {
+    /// All connections that there are now are old.
+    pub fn age(&self) {
+        std::mem::take(&mut *self.leaving.lock().expect("not poisoned")).begin();
+    }
+    /// Another connection.
+    pub async fn dial(&self) -> Result<Channel> {
+        dial(self.pipes.clone()).await
+    }
+}
+
+async fn dial(pipes: Pipes) -> Result<Channel> {
+    let connector = tower::service_fn(move |_: tonic::transport::Uri| {
+        let pipes = pipes.clone();
+        async move {
+            let (ours, theirs) = tokio::io::duplex(1 << 16);
+            pipes.send(Ok(theirs)).await.map_err(std::io::Error::other)?;
+            Ok::<_, std::io::Error>(hyper_util::rt::TokioIo::new(ours))
+        }
+    });
+    Ok(Endpoint::from_static("http://memory").connect_with_connector(connector).await?)
 }
 
 /// What a world may have otherwise.
@@ -51,36 +81,45 @@ pub async fn world_with(otherwise: Otherwise) -> Result<World> {
     let clock = clock();
     let store: Arc<dyn Store> =
         Arc::new(MemoryStore::new(SiteId::parse("s")?, StoreId(Arc::from("store-1")), clock.clone()));
-    serve(Parts {
-        store,
-        frames: otherwise.frames.unwrap_or_else(|| Arc::new(MemoryFrames::new(clock.clone(), 1 << 20))),
-        board: LiveBoard::new(),
-        heard: None,
-        clock,
-        bugs: otherwise.bugs,
-    })
-    .await
+    let frames = otherwise.frames.unwrap_or_else(|| Arc::new(MemoryFrames::new(clock.clone(), 1 << 20)));
+    serve(Parts { store, frames, board: LiveBoard::new(), heard: None, clock, bugs: otherwise.bugs }).await
+}
+
+/// A world whose service has read nothing before `read`.
+pub async fn world_after(read: impl Future<Output = ()> + Send + 'static) -> Result<World> {
+    let clock = clock();
+    let store = Arc::new(MemoryStore::new(SiteId::parse("s")?, StoreId(Arc::from("store-1")), clock.clone()));
+    let frames = Arc::new(MemoryFrames::new(clock.clone(), 1 << 20));
+    let bugs = Bugs::default();
+    serve_after(Parts { store, frames, board: LiveBoard::new(), heard: None, clock, bugs }, read).await
 }
 
 /// The service of these parts, and a way to it.
 pub async fn serve(parts: Parts) -> Result<World> {
+    serve_after(parts, std::future::ready(())).await
+}
+
+/// The same, of a service that has read nothing before `read`.
+pub async fn serve_after(parts: Parts, read: impl Future<Output = ()> + Send + 'static) -> Result<World> {
     let store = parts.store.clone();
     let service = TelemetryService::new(parts, CancellationToken::new());
-    tokio::spawn(service.clone().run());
+    let running = service.clone();
+    tokio::spawn(async move {
+        read.await;
+        running.run().await
+    });
     let (pipes, incoming) = mpsc::channel::<std::io::Result<tokio::io::DuplexStream>>(8);
-    let mut port = Server::builder().layer(InterceptorLayer::new(known));
+    let leaving = Leavings::default();
+    let told = leaving.clone();
+    let layer = InterceptorLayer::new(move |mut request: Request<()>| {
+        request.extensions_mut().insert(told.lock().expect("not poisoned").clone());
+        known(request)
+    });
+    let mut port = Server::builder().layer(layer);
     let server = port.add_service(service.link()).add_service(service.replay()).add_service(service.grpc());
     tokio::spawn(server.serve_with_incoming(ReceiverStream::new(incoming)));
-    let connector = tower::service_fn(move |_: tonic::transport::Uri| {
-        let pipes = pipes.clone();
-        async move {
-            let (ours, theirs) = tokio::io::duplex(1 << 16);
-            pipes.send(Ok(theirs)).await.map_err(std::io::Error::other)?;
-            Ok::<_, std::io::Error>(hyper_util::rt::TokioIo::new(ours))
-        }
-    });
-    let channel = Endpoint::from_static("http://memory").connect_with_connector(connector).await?;
-    Ok(World { store, channel, service })
+    let channel = dial(pipes.clone()).await?;
+    Ok(World { store, channel, service, leaving, pipes })
 }
 
 /// Header in which a test says who asks; without it nobody is asked.
@@ -159,9 +198,17 @@ impl Robot {
         hello: Hello,
         ask: impl FnOnce(ReceiverStream<SessionRequest>) -> Request<ReceiverStream<SessionRequest>>,
     ) -> Result<Self> {
+        Self::attach_over(world.channel.clone(), hello, ask).await
+    }
+    /// Over a connection of its own.
+    pub async fn attach_over(
+        channel: Channel,
+        hello: Hello,
+        ask: impl FnOnce(ReceiverStream<SessionRequest>) -> Request<ReceiverStream<SessionRequest>>,
+    ) -> Result<Self> {
         let (up, outbound) = mpsc::channel(16);
         up.send((&FromRobot::Hello(Box::new(hello))).into()).await?;
-        let mut client = LinkServiceClient::new(world.channel.clone());
+        let mut client = LinkServiceClient::new(channel);
         let mut down = client.session(ask(ReceiverStream::new(outbound))).await?.into_inner();
         let first = down.message().await?.ok_or("no welcome")?;
         let ToRobot::Welcome(welcome) = midshift_proto::parse(first)? else { return Err("not a welcome".into()) };
