@@ -168,7 +168,7 @@ async fn what_is_changed_in_the_database_is_named_by_verify_after_the_next_start
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn whoever_is_denied_stands_in_the_audit_of_the_service_that_was_asked() -> anyhow::Result<()> {
     let dir = folder()?;
-    let server = Server::secure(dir.path(), &[]).await?;
+    let server = Server::start(dir.path()).await?;
     let address = server.address.to_string();
     // It may approve roll-outs and see things, and bring no task in.
     let submit = ["task", "submit", "--task-id", "T1", "--from", "A01", "--to", "B03", "--server", &address];
