@@ -26,13 +26,25 @@ pub struct PostgresServer {
     supervisor: Option<Child>,
     databases: AtomicU32,
     is_shared: bool,
+    /// Where it listens on loopback over TLS too; none: on its socket alone.
+    secured: Option<u16>,
+}
+
+/// What a server proves itself with, and whom it lets in; PEM.
+pub struct Proof<'p> {
+    /// Its certificate.
+    pub chain: &'p str,
+    /// Its key.
+    pub key: &'p str,
+    /// Who signs for clients.
+    pub root: &'p str,
 }
 
 impl PostgresServer {
     /// The one server of this test program, started at first use.
     pub fn shared() -> &'static Self {
         static SERVER: OnceLock<PostgresServer> = OnceLock::new();
-        SERVER.get_or_init(|| Self::start_new(true, None))
+        SERVER.get_or_init(|| Self::start_new(true, None, None))
     }
 
     /// A new server with no databases but its own.
@@ -40,12 +52,22 @@ impl PostgresServer {
     /// # Panics
     /// If the machine has no server programs or they do not run.
     pub fn start() -> Self {
-        Self::start_new(false, None)
+        Self::start_new(false, None, None)
     }
 
     /// As [`PostgresServer::start`], with its files below `dir`.
     pub fn start_in(dir: Option<&Path>) -> Self {
-        Self::start_new(false, dir)
+        Self::start_new(false, dir, None)
+    }
+
+    /// A server that also listens on loopback, over TLS alone, and lets nobody in there who shows no certificate of its root with the user's name.
+    pub fn secured(proof: &Proof<'_>) -> Self {
+        Self::start_new(false, None, Some(proof))
+    }
+
+    /// Its port on loopback, of one with TLS.
+    pub const fn port(&self) -> Option<u16> {
+        self.secured
     }
 
     /// Whether the machine has server programs.
@@ -53,11 +75,12 @@ impl PostgresServer {
         newest_programs().is_some()
     }
 
-    fn start_new(is_shared: bool, dir: Option<&Path>) -> Self {
+    fn start_new(is_shared: bool, dir: Option<&Path>, proof: Option<&Proof<'_>>) -> Self {
         let programs = programs();
         let below = dir.map_or_else(std::env::temp_dir, Path::to_path_buf);
         let dir = tempfile::Builder::new().prefix("midshift-pg-").tempdir_in(below).expect("a directory");
-        let mut server = Self { programs, dir, supervisor: None, databases: AtomicU32::new(0), is_shared };
+        let mut server =
+            Self { programs, dir, supervisor: None, databases: AtomicU32::new(0), is_shared, secured: None };
         if let Some((uid, gid)) = unprivileged() {
             std::os::unix::fs::chown(server.dir.path(), Some(uid), Some(gid)).expect("giving the directory away");
         }
@@ -65,8 +88,28 @@ impl PostgresServer {
         init.args(["-U", USER, "-A", "trust", "-E", "UTF8", "--no-sync", "--locale=C.UTF-8"]);
         init.args(["--locale-provider=icu", "--icu-locale=en-US", "-D"]).arg(server.dir.path().join("data"));
         run(&mut init);
+        if let Some(proof) = proof {
+            server.secure(proof);
+        }
         server.start_again();
         server
+    }
+
+    fn secure(&mut self, proof: &Proof<'_>) {
+        let data = self.dir.path().join("data");
+        let access = "local all all trust\nhostssl all all 127.0.0.1/32 trust clientcert=verify-full\n";
+        let files =
+            [("pg_hba.conf", access), ("proof.crt", proof.chain), ("proof.key", proof.key), ("root.crt", proof.root)];
+        for (name, text) in files {
+            let path = data.join(name);
+            std::fs::write(&path, text).expect("a file");
+            std::fs::set_permissions(&path, std::os::unix::fs::PermissionsExt::from_mode(0o600)).expect("its mode");
+            if let Some((uid, gid)) = unprivileged() {
+                std::os::unix::fs::chown(&path, Some(uid), Some(gid)).expect("giving the file away");
+            }
+        }
+        let free = std::net::TcpListener::bind("127.0.0.1:0").and_then(|free| free.local_addr()).expect("a free port");
+        self.secured = Some(free.port());
     }
 
     /// Ends the server at once, as if its power went: nothing is finished, the log is replayed at the next start.
@@ -90,6 +133,10 @@ impl PostgresServer {
         command.arg("-D").arg(dir.join("data")).arg("-k").arg(dir).args(["-h", ""]);
         command.args(["-c", "fsync=on", "-c", "max_connections=300", "-c", "shared_buffers=32MB"]);
         command.args(["-c", "log_line_prefix=%d: "]).current_dir(dir).stdin(Stdio::piped());
+        if let Some(port) = self.secured {
+            command.args(["-h", "127.0.0.1", "-p", &port.to_string(), "-c", "ssl=on", "-c", "ssl_ca_file=root.crt"]);
+            command.args(["-c", "ssl_cert_file=proof.crt", "-c", "ssl_key_file=proof.key"]);
+        }
         if self.is_shared {
             // It is never dropped.
             command.env("REMOVED", dir);
@@ -140,7 +187,8 @@ impl PostgresServer {
 
     /// The URL of a database.
     pub fn url(&self, database: &str) -> String {
-        format!("postgres://{USER}:{PASSWORD}@localhost/{database}?host={}", self.dir.path().display())
+        let port = self.secured.map_or_else(String::new, |port| format!("&port={port}"));
+        format!("postgres://{USER}:{PASSWORD}@localhost/{database}?host={}{port}", self.dir.path().display())
     }
 
     /// What a statement answers in a database, as text without ornaments.
@@ -185,7 +233,7 @@ impl PostgresServer {
 
     /// The server's socket, for a proxy in front of it.
     pub fn socket(&self) -> PathBuf {
-        self.dir.path().join(".s.PGSQL.5432")
+        self.dir.path().join(format!(".s.PGSQL.{}", self.secured.unwrap_or(5432)))
     }
 
     fn is_ready(&self) -> bool {
@@ -202,6 +250,9 @@ impl PostgresServer {
     fn command(&self, program: &str) -> Command {
         let mut command = Command::new(self.programs.join(program));
         command.current_dir(self.dir.path());
+        if let Some(port) = self.secured {
+            command.env("PGPORT", port.to_string());
+        }
         as_user(&mut command);
         command
     }

@@ -5,7 +5,7 @@ use midshift_core::ids::SiteId;
 use midshift_core::time::Clock;
 use midshift_store::{
     FRAME_BYTES_DEFAULT, FrameLog, HeardLog, Migrated, PostgresConfig, PostgresFrames, PostgresHeard, PostgresStore,
-    SqliteFrames, SqliteStore, Store,
+    Road, SqliteFrames, SqliteStore, Store,
 };
 use std::path::Path;
 use std::sync::Arc;
@@ -13,8 +13,9 @@ use std::sync::Arc;
 /// Which database.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub struct Database {
-    /// A PostgreSQL database (15 or newer) for rows and samples, postgres://USER:PASSWORD@HOST/DATABASE, instead of SQLite in --data.
-    /// The connection is not encrypted yet: keep it on a network of its own.
+    /// A PostgreSQL database (15 or newer) for rows and samples, postgres://USER:PASSWORD@HOST/DATABASE, instead of SQLite in --data. On another machine
+    /// than this one the address ends in ?sslmode=verify-full&sslrootcert=FILE, and &sslcert=FILE&sslkey=FILE where the database asks for a
+    /// certificate; ?sslmode=disable says that the network in between is trusted with everything.
     #[arg(long, value_name = "URL", env = "MIDSHIFT_STORE", hide_env_values = true)]
     pub store: Option<String>,
 }
@@ -23,12 +24,14 @@ impl Database {
     /// The address if it is one of PostgreSQL; the password is never shown.
     ///
     /// # Errors
-    /// If it is an address of something else.
+    /// If it is an address of something else, or nobody would have to prove there that it is the database.
     pub fn postgres(&self) -> anyhow::Result<Option<PostgresConfig>> {
         match &self.store {
             None => Ok(None),
             Some(url) if url.starts_with("postgres://") || url.starts_with("postgresql://") => {
-                Ok(Some(PostgresConfig::new(url)))
+                let config = PostgresConfig::new(url);
+                proven(&config)?;
+                Ok(Some(config))
             }
             Some(_) => bail!("--store is not an address of PostgreSQL; try postgres://USER:PASSWORD@HOST/DATABASE"),
         }
@@ -61,6 +64,20 @@ impl Database {
             }
         }
     }
+}
+
+/// Refuses a way on which anybody could pass for the database.
+fn proven(config: &PostgresConfig) -> anyhow::Result<()> {
+    match config.road()? {
+        Road::Local | Road::Proven => {}
+        Road::Plain => tracing::warn!(
+            "sslmode=disable: whoever is on the network between here and PostgreSQL reads and changes every row, and so commands the fleet"
+        ),
+        Road::Unproven => bail!(
+            "--store names a database on another machine and does not say how it proves itself: add ?sslmode=verify-full&sslrootcert=FILE, the certificate that its own is signed by; on a network of its own that nobody else reaches ?sslmode=disable goes without"
+        ),
+    }
+    Ok(())
 }
 
 /// What is open.
@@ -116,6 +133,26 @@ impl Storage {
                 store.close().await;
                 frames.close().await;
             }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Database;
+
+    #[test]
+    fn a_database_elsewhere_that_proves_nothing_is_refused_and_told_what_to_add() {
+        let said = |store: &str| Database { store: Some(store.to_owned()) }.postgres().map(|_| ());
+        let refused = said("postgres://midshift:secret@db.local/midshift").expect_err("it is refused").to_string();
+        assert!(refused.contains("sslmode=verify-full") && !refused.contains("secret"), "{refused}");
+        assert!(said("postgres://midshift@db.local/midshift?sslmode=require").is_err());
+        for taken in [
+            "localhost/midshift",
+            "db/midshift?sslmode=verify-full&sslrootcert=/root.crt",
+            "db/midshift?sslmode=disable",
+        ] {
+            said(&format!("postgres://midshift@{taken}")).expect(taken);
         }
     }
 }

@@ -36,7 +36,7 @@ pub use model::MemoryStore;
 pub use open_error::OpenError;
 pub use postgres::{
     CopiedSchema, PostgresConfig, PostgresCopy, PostgresFrames, PostgresHeard, PostgresRestore, PostgresStore,
-    RestoreError, Wakes, migrate_postgres,
+    RestoreError, Road, Wakes, migrate_postgres,
 };
 pub use projection::{Change, Fold, Projection};
 pub use sqlite::{Database, Described, SqliteFrames, SqliteStore, migrate, renew_identity};

@@ -1,11 +1,13 @@
 //! Connections to PostgreSQL, each with the bounds that keep a broken process from holding others up.
 //!
 //! Invariant: every connection has a lock, statement and idle-in-transaction limit on the server's side, and every call one on
-//! ours. No connection that writes is handed out by a server that would lose what it acknowledged.
+//! ours. No connection that writes is handed out by a server that would lose what it acknowledged. What is encrypted is TLS 1.3 with a server that proved its
+//! name; what is not stays on this machine, or was said to be so in the address.
 
 use crate::{Cause, Error, OpenError};
-use sqlx::postgres::{PgConnectOptions, PgListener, PgPool, PgPoolOptions};
+use sqlx::postgres::{PgConnectOptions, PgListener, PgPool, PgPoolOptions, PgSslMode};
 use sqlx::{ConnectOptions, Connection, PgConnection, Row};
+use std::net::IpAddr;
 use std::str::FromStr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -39,6 +41,10 @@ const READ_PATIENCE: Duration = Duration::from_secs(20);
 const CONNECT_PATIENCE: Duration = Duration::from_secs(5);
 /// A read connection that comes back and does not answer within this is given up.
 const RETURN_PATIENCE: Duration = Duration::from_secs(2);
+/// The TLS of this connection, as the server sees it.
+const TLS_VERSION: &str = "SELECT version FROM pg_stat_ssl WHERE pid = pg_backend_pid()";
+/// The only one that is spoken.
+const TLS_NEEDED: &str = "TLSv1.3";
 /// Read connections of one store: a list, a snapshot and two feeds at once.
 const READERS: u32 = 4;
 /// A few statements for each table and log.
@@ -68,12 +74,53 @@ impl PostgresConfig {
     pub fn new(url: impl Into<String>) -> Self {
         Self { url: url.into(), wakes: Wakes::Notified }
     }
+
+    /// How the database is reached.
+    ///
+    /// # Errors
+    /// If the address cannot be read.
+    pub fn road(&self) -> Result<Road, OpenError> {
+        Ok(road(&read(&self.url)?))
+    }
+}
+
+/// How a database is reached.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Road {
+    /// Within this machine, in plain text: a socket file, or loopback.
+    Local,
+    /// TLS 1.3 with a server that proves its name by the root in the address (`sslmode=verify-full`).
+    Proven,
+    /// Plain text over a network, and the address says so: `sslmode=disable`.
+    Plain,
+    /// Over a network, and whatever is there would be believed: no `sslmode`, or one that proves nothing.
+    Unproven,
+}
+
+fn read(url: &str) -> Result<PgConnectOptions, OpenError> {
+    PgConnectOptions::from_str(url)
+        .map_err(|source| OpenError::Sql { doing: "reading the address of PostgreSQL", source })
+}
+
+fn road(options: &PgConnectOptions) -> Road {
+    let host = options.get_host().trim_matches(['[', ']']);
+    let is_loopback = host.parse::<IpAddr>().map_or(host == "localhost", |ip| ip.is_loopback());
+    match options.get_ssl_mode() {
+        PgSslMode::VerifyFull => Road::Proven,
+        // Whoever asks for TLS gets it, also within the machine.
+        PgSslMode::Prefer | PgSslMode::Allow | PgSslMode::Disable if is_loopback || options.get_socket().is_some() => {
+            Road::Local
+        }
+        PgSslMode::Disable => Road::Plain,
+        _ => Road::Unproven,
+    }
 }
 
 /// One PostgreSQL schema of the database: `control` or `telemetry`.
 #[derive(Clone)]
 pub(super) struct Database {
     options: PgConnectOptions,
+    road: Road,
     pub(super) schema: &'static str,
 }
 
@@ -88,9 +135,11 @@ enum Purpose {
 
 impl Database {
     pub(super) fn new(config: &PostgresConfig, schema: &'static str) -> Result<Self, OpenError> {
-        let options = PgConnectOptions::from_str(&config.url)
-            .map_err(|source| OpenError::Sql { doing: "reading the address of PostgreSQL", source })?;
-        Ok(Self { options, schema })
+        let options = read(&config.url)?;
+        let road = road(&options);
+        // A server of this machine with a certificate for nobody in particular is not asked for it.
+        let options = if road == Road::Local { options.ssl_mode(PgSslMode::Disable) } else { options };
+        Ok(Self { options, road, schema })
     }
 
     fn options(&self, purpose: Purpose) -> PgConnectOptions {
@@ -131,7 +180,7 @@ impl Database {
         let options = self.options(purpose);
         let connecting = tokio::time::timeout(CONNECT_PATIENCE, async {
             let mut connection = options.connect().await?;
-            look_after(&mut connection).await?;
+            welcome(&mut connection, self.road).await?;
             Ok(connection)
         });
         let connection = connecting.await.map_err(|_| failed(sqlx::Error::PoolTimedOut))?.map_err(failed)?;
@@ -180,10 +229,11 @@ impl Database {
     /// Connections that only read. One whose reader has stopped waiting comes back in the middle of an answer, and the pool waits for the
     /// rest of it without a limit: behind a network that swallows everything that would keep its place for a quarter of an hour.
     pub(super) fn readers(&self) -> PgPool {
+        let road = self.road;
         PgPoolOptions::new()
             .max_connections(READERS)
             .acquire_timeout(CONNECT_PATIENCE)
-            .after_connect(|connection, _| Box::pin(look_after(connection)))
+            .after_connect(move |connection, _| Box::pin(welcome(connection, road)))
             .after_release(|connection, _| {
                 Box::pin(async move {
                     let answered = tokio::time::timeout(RETURN_PATIENCE, connection.ping()).await;
@@ -202,6 +252,29 @@ impl Database {
         listener.eager_reconnect(false);
         listener.listen(channel).await?;
         Ok(listener)
+    }
+}
+
+/// What every connection begins with, but that of a listener, which only hears numbers.
+async fn welcome(connection: &mut PgConnection, road: Road) -> Result<(), sqlx::Error> {
+    if road == Road::Proven {
+        check_version(connection).await?;
+    }
+    look_after(connection).await
+}
+
+/// The library would speak version 1.2 too. A server that does not say what it speaks has none of PostgreSQL's tables for that, and was proven all the same.
+async fn check_version(connection: &mut PgConnection) -> Result<(), sqlx::Error> {
+    let version: Option<String> =
+        match sqlx::query_scalar::<_, Option<String>>(TLS_VERSION).fetch_optional(connection).await {
+            Err(sqlx::Error::Database(_)) => None,
+            told => told?.flatten(),
+        };
+    match version {
+        Some(version) if version != TLS_NEEDED => Err(sqlx::Error::Configuration(
+            format!("PostgreSQL speaks {version} and must speak {TLS_NEEDED}: set ssl_min_protocol_version = '{TLS_NEEDED}' there").into(),
+        )),
+        _ => Ok(()),
     }
 }
 
@@ -237,4 +310,28 @@ pub(super) fn is_gone(error: &sqlx::Error) -> bool {
 /// The server has not answered.
 pub(super) fn no_answer() -> Cause {
     Arc::new(std::io::Error::new(std::io::ErrorKind::TimedOut, "PostgreSQL has not answered in time"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{PostgresConfig, Road};
+
+    #[test]
+    fn a_database_over_a_network_is_proven_or_its_address_says_that_it_is_plain() {
+        let road = |rest: &str| PostgresConfig::new(format!("postgres://u:p@{rest}")).road().ok();
+        for local in
+            ["localhost/d", "127.0.0.1:5433/d", "x/d?host=/run/postgresql", "[::1]/d", "localhost/d?sslmode=disable"]
+        {
+            assert_eq!(road(local), Some(Road::Local), "{local}");
+        }
+        for unproven in ["db/d", "10.0.0.1/d", "db/d?sslmode=prefer", "db/d?sslmode=require", "db/d?sslmode=verify-ca"]
+        {
+            assert_eq!(road(unproven), Some(Road::Unproven), "{unproven}");
+        }
+        assert_eq!(road("x/d?host=db.local"), Some(Road::Unproven));
+        assert_eq!(road("db/d?sslmode=disable"), Some(Road::Plain));
+        assert_eq!(road("db/d?sslmode=verify-full&sslrootcert=/r"), Some(Road::Proven));
+        assert_eq!(road("127.0.0.1/d?sslmode=verify-full&sslrootcert=/r"), Some(Road::Proven));
+        assert!(PostgresConfig::new("postgres://[").road().is_err());
+    }
 }

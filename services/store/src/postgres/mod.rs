@@ -17,7 +17,7 @@ mod write_sql;
 mod writer;
 
 pub use backup::{CopiedSchema, PostgresCopy, PostgresRestore, RestoreError};
-pub use connect::{PostgresConfig, Wakes};
+pub use connect::{PostgresConfig, Road, Wakes};
 pub use frames::PostgresFrames;
 pub use heard::PostgresHeard;
 

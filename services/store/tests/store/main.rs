@@ -13,6 +13,7 @@ mod line;
 mod partition;
 mod postgres;
 mod postgres_failure;
+mod postgres_tls;
 mod projection;
 mod reopen;
 #[expect(dead_code, reason = "other crates' tests use the rest of it")]

@@ -1,0 +1,6 @@
+//! No roots of the public web: what is believed is what an address names (docs/decisions/0048).
+
+use pki_types::TrustAnchor;
+
+/// None.
+pub const TLS_SERVER_ROOTS: &[TrustAnchor<'static>] = &[];
