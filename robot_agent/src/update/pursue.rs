@@ -149,7 +149,7 @@ impl AgentCore {
             }
             (job, Done::Failed(Failure::Later(why))) => self.put_off(now, &job, &why),
             (job, Done::Failed(Failure::Refused(reason))) => self.job_refused(now, job, reason),
-            (job, done) => tracing::error!(job = job.as_str(), "a job ended as another"),
+            (job, _) => tracing::error!(job = job.as_str(), "a job ended as another"),
         }
     }
 

@@ -93,7 +93,7 @@ mod tests {
     #[test]
     fn who_floods_with_what_can_wait_can_still_decide_and_stop_and_gets_no_less_for_long() {
         let (rates, mut now) = (Rates::new(rate(10, 10), 8), Instant::now());
-        let mut let_in = |class, tries, now| (0..tries).filter(|_| rates.take(&"a", now, class)).count();
+        let let_in = |class, tries, now| (0..tries).filter(|_| rates.take(&"a", now, class)).count();
         assert_eq!(Class::ALL.map(|class| let_in(class, 100, now)), [6, 1, 1, 1, 1]);
         let mut bulk = 0;
         for _ in 0..100 {

@@ -59,7 +59,7 @@ async fn a_copied_key_is_observed_with_an_incident_while_the_original_works_and_
 -> anyhow::Result<()> {
     let dir = folder()?;
     let site: Site = text::parse(DEMO)?;
-    let server = Server::secure(dir.path(), &[]).await?;
+    let server = Server::start(dir.path()).await?;
     let address = server.address;
     let robots = Robots::start(dir.path(), address, address, &site, ROBOTS).await?;
     submit(address, &site, 7, TASKS).await?;
@@ -127,7 +127,7 @@ async fn attach(server: &Server, folder: &Path) -> anyhow::Result<()> {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_secret_that_enrolled_one_machine_is_refused_to_the_next() -> anyhow::Result<()> {
     let dir = folder()?;
-    let server = Server::secure(dir.path(), &[]).await?;
+    let server = Server::start(dir.path()).await?;
     let site: Site = text::parse(DEMO)?;
     let secret = enrolment(server.address, "rbt-01").await?.context("a secret")?;
     let robots = Robots::waiting(dir.path(), server.address, &site, 1);
@@ -156,7 +156,7 @@ fn call_as(server: &Server, token: &str, arguments: &[&str]) -> anyhow::Result<O
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_token_that_acts_outside_its_area_is_denied_and_that_stands_in_the_audit() -> anyhow::Result<()> {
     let dir = folder()?;
-    let server = Server::secure(dir.path(), &[]).await?;
+    let server = Server::start(dir.path()).await?;
     done(&[
         "task",
         "submit",
@@ -189,7 +189,7 @@ async fn a_token_that_acts_outside_its_area_is_denied_and_that_stands_in_the_aud
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn doctor_looks_at_certificates_tokens_rights_and_for_the_stop_service() -> anyhow::Result<()> {
     let dir = folder()?;
-    let server = Server::secure(dir.path(), &[]).await?;
+    let server = Server::start(dir.path()).await?;
     let _secret = enrolment(server.address, "rbt-01").await?;
     let (address, data) = (server.address.to_string(), server.data().display().to_string());
     let nobody = "127.0.0.1:1";

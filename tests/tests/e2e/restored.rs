@@ -176,7 +176,7 @@ async fn a_restored_stop_service_stops_what_stood_at_the_backup_and_takes_later_
 -> anyhow::Result<()> {
     let dir = tempfile::tempdir()?;
     let site = text::parse(DEMO)?;
-    let mut server = Server::secure(dir.path(), &[]).await?;
+    let mut server = Server::start(dir.path()).await?;
     let mut stops = StopServer::start(dir.path(), server.address).await?;
     let robots =
         Robots::start_beside(dir.path(), server.address, server.address, Some(stops.address), &site, 4).await?;
