@@ -1,25 +1,28 @@
 //! What every process takes care of now and then: old rows, entries and frames of its roles, the chains of the audit, and samples of histograms.
 //!
-//! Called by [`crate::server`]. Invariant: nothing goes that a service has not consumed.
+//! Which of it goes when is in [`privacy::KEPT`]. Called by [`crate::server`]. Invariant: nothing goes that a service has not consumed.
+
+mod oldest;
 
 use crate::roles::Role;
 use crate::server::{Parts, metrics_handle};
 use metrics_exporter_prometheus::PrometheusHandle;
 use midshift_core::fleet::rows::FleetMark;
-use midshift_core::limits;
+use midshift_core::privacy::{self, Retention};
 use midshift_core::rollout::rows::OtaMark;
-use midshift_core::rows::Writer;
+use midshift_core::rows::{Table, Writer};
 use midshift_core::time::Clock;
 use midshift_identity::audit::upkeep as audit;
-use midshift_store::{Retention, Store};
+use midshift_store::{FrameLog, Retention as EntriesKept, Store, aged};
 use midshift_task::TaskService;
+use midshift_telemetry::precision;
 use std::time::Duration;
 
 /// How often old log entries are taken away.
 const PRUNE_EVERY: Duration = Duration::from_secs(60);
 /// How often samples of histograms are folded: without a scrape they would gather for ever.
 const FOLD_EVERY: Duration = Duration::from_secs(5);
-/// Log entries kept at most, beside the days of [`limits::REMEMBER_DAYS`].
+/// Log entries kept at most, beside the days of [`Retention::Week`].
 const ENTRIES_MAX: u64 = 20_000_000;
 
 /// Until it is dropped.
@@ -37,17 +40,41 @@ async fn fold(metrics: Option<PrometheusHandle>) {
     }
 }
 
-/// Takes old rows, entries and frames away, entries never past what fleet and roll-outs have not consumed.
+/// Takes old rows, entries and frames away, entries never past what fleet and roll-outs have not consumed, and tells how old the rest is.
 async fn prune(parts: &Parts, task: Option<TaskService>) {
-    let (store, clock) = (parts.store.as_ref(), parts.clock.as_ref());
+    let (store, frames, clock) = (parts.store.as_ref(), parts.frames.as_ref(), parts.clock.as_ref());
     loop {
         tokio::time::sleep(PRUNE_EVERY).await;
-        if let Some(task) = &task
+        let turn = Turn { store, frames, clock, task: task.as_ref() };
+        turn.take(|role| parts.roles.has(role)).await;
+        if let Err(error) = oldest::tell(store, frames, clock).await {
+            tracing::warn!(%error, "how old the oldest rows are cannot be read");
+        }
+    }
+}
+
+/// One turn over everything that goes by age.
+pub struct Turn<'t> {
+    /// Rows and entries.
+    pub store: &'t dyn Store,
+    /// Samples.
+    pub frames: &'t dyn FrameLog,
+    /// Clocks.
+    pub clock: &'t dyn Clock,
+    /// Intake of tasks, in a process that has it.
+    pub task: Option<&'t TaskService>,
+}
+
+impl Turn<'_> {
+    /// Takes away what the services of this process keep too long. What fails is told, and done another time.
+    pub async fn take(&self, has: impl Fn(Role) -> bool) {
+        let (store, frames, clock) = (self.store, self.frames, self.clock);
+        if let Some(task) = self.task
             && let Err(error) = task.prune().await
         {
             tracing::warn!(%error, "old requests could not be taken away");
         }
-        if parts.roles.has(Role::Fleet) {
+        if has(Role::Fleet) {
             if let Err(error) = midshift_fleet::prune(store, clock).await {
                 tracing::warn!(%error, "tasks that ended long ago could not be taken away");
             }
@@ -55,10 +82,20 @@ async fn prune(parts: &Parts, task: Option<TaskService>) {
                 tracing::warn!(%error, "old log entries could not be taken away");
             }
         }
-        if parts.roles.has(Role::Telemetry)
-            && let Err(error) = parts.frames.prune().await
+        if has(Role::Ota)
+            && let Some(before) = privacy::of(Table::OtaCommandKey).before(clock.now().wall)
+            && let Err(error) = aged::take_away(store, Table::OtaCommandKey, before.0, "command.forgotten").await
         {
-            tracing::warn!(%error, "old status could not be taken away");
+            tracing::warn!(%error, "old requests about software could not be taken away");
+        }
+        if has(Role::Telemetry) {
+            if let Err(error) = frames.prune().await {
+                tracing::warn!(%error, "old status could not be taken away");
+            }
+            match frames.coarsen(precision::coarsen).await {
+                Ok(rows) => metrics::counter!("midshift_telemetry_coarsened_total").increment(rows),
+                Err(error) => tracing::warn!(%error, "old positions could not be made coarser"),
+            }
         }
     }
 }
@@ -86,13 +123,15 @@ async fn keep_audit(parts: &Parts) {
 async fn prune_entries(store: &dyn Store, clock: &dyn Clock) -> Result<(), midshift_store::Error> {
     // Until fleet has consumed something nothing may go.
     let Some((mark, _)) = midshift_store::load::<FleetMark>(store, "fleet").await? else { return Ok(()) };
-    let days_ms = (limits::REMEMBER_DAYS * 86_400_000) as i64;
+    let Some(before) = Retention::Week.before(clock.now().wall) else { return Ok(()) };
     let ota = midshift_store::load::<OtaMark>(store, "ota").await?.map_or(mark.seq, |(mark, _)| mark.seq);
     let floor = mark.seq.min(ota);
-    let keep = Retention { before_unix_ms: clock.now().wall.0 - days_ms, entries_max: ENTRIES_MAX, floor };
+    let keep = EntriesKept { before_unix_ms: before.0, entries_max: ENTRIES_MAX, floor };
     store.prune(keep).await.map(drop)
 }
 
+#[cfg(test)]
+mod aging;
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,0 +1,92 @@
+//! How old what is kept is, for each place that goes by age: the metric by which anybody sees that the purge works, and the test that it does.
+//!
+//! Invariant: nothing is taken away here. The list of places and ages is [`privacy::KEPT`], by which the jobs go too.
+
+use midshift_core::audit::AuditRow;
+use midshift_core::privacy::{self, DataClass, Kept, Place};
+use midshift_core::rows::{Log, Row, Seq, Table};
+use midshift_core::task::{Phase, TaskState};
+use midshift_core::time::{Clock, Now, Utc};
+use midshift_store::{Error, FrameLog, Query, Store};
+
+/// The oldest of one place.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Oldest {
+    /// Where.
+    pub place: Place,
+    /// What the place is there for.
+    pub class: DataClass,
+    /// How old it is, milliseconds; 0: there is nothing.
+    pub age_ms: u64,
+    /// How old it may get, milliseconds.
+    pub age_max_ms: u64,
+}
+
+/// Of each place that goes by age and can be asked. Attempts and intakes go with their task; files of the stop service and of robots are looked after by those.
+///
+/// # Errors
+/// If the store or the log of samples cannot be read.
+pub async fn look(store: &dyn Store, frames: &dyn FrameLog, clock: &dyn Clock) -> Result<Vec<Oldest>, Error> {
+    let (now, mut found) = (clock.now(), Vec::new());
+    for kept in privacy::KEPT {
+        if let (Some(age_max_ms), Some(class)) = (kept.age_max_ms(), kept.holds.first())
+            && let Some(age_ms) = age(store, frames, now, kept).await?
+        {
+            found.push(Oldest { place: kept.place, class: *class, age_ms, age_max_ms });
+        }
+    }
+    Ok(found)
+}
+
+/// The same as metrics: `midshift_oldest_row_seconds` and, beside it, `midshift_retention_seconds`.
+///
+/// # Errors
+/// As [`look`].
+pub async fn tell(store: &dyn Store, frames: &dyn FrameLog, clock: &dyn Clock) -> Result<(), Error> {
+    for Oldest { place, class, age_ms, age_max_ms } in look(store, frames, clock).await? {
+        let labels = [("class", class.as_str()), ("place", place.as_str())];
+        metrics::gauge!("midshift_oldest_row_seconds", &labels).set(age_ms as f64 / 1_000.0);
+        metrics::gauge!("midshift_retention_seconds", &labels).set(age_max_ms as f64 / 1_000.0);
+    }
+    Ok(())
+}
+
+/// Milliseconds; none: this place is not asked.
+async fn age(store: &dyn Store, frames: &dyn FrameLog, now: Now, kept: &Kept) -> Result<Option<u64>, Error> {
+    let wall = |at: Option<i64>| Some(at.map_or(0, |at| now.wall.ms_since(Utc(at))));
+    Ok(match kept.place {
+        Place::Samples => wall(frames.oldest().await?.precise),
+        Place::CoarseSamples => wall(frames.oldest().await?.any),
+        Place::Log(log) => wall(first_entry(store, log).await?),
+        Place::Table(Table::TaskState) => Some(ended(store).await?.map_or(0, |at| now.utc.ms_since(at))),
+        Place::Table(table) if table.is_audit() => wall(first(store, table).await?.and_then(|row| written(&row))),
+        Place::Table(Table::RequestKey | Table::TaskRequest | Table::CommandKey | Table::OtaCommandKey) => {
+            let Place::Table(table) = kept.place else { return Ok(None) };
+            wall(first(store, table).await?.and_then(|row| row.index.order))
+        }
+        Place::Table(_) | Place::Gaps | Place::Heard | Place::File(_) | Place::Robot(_) => None,
+    })
+}
+
+async fn first(store: &dyn Store, table: Table) -> Result<Option<Row>, Error> {
+    Ok(store.list(Query { limit: 1, ..Query::all(table) }).await?.pop())
+}
+
+fn written(row: &Row) -> Option<i64> {
+    serde_json::from_str::<AuditRow>(&row.body).ok().map(|row| row.at_unix_ms)
+}
+
+async fn first_entry(store: &dyn Store, log: Log) -> Result<Option<i64>, Error> {
+    let page = match store.feed(Seq(0), &[log], 1).await {
+        Err(Error::CursorExpired { oldest, .. }) => store.feed(oldest, &[log], 1).await?,
+        page => page?,
+    };
+    Ok(page.entries.first().map(|entry| entry.at_unix_ms))
+}
+
+/// When the task ended that ended longest ago, of the first page in the order of admission: what the purge looks at too.
+async fn ended(store: &dyn Store) -> Result<Option<Utc>, Error> {
+    let terminal = Phase::ALL.into_iter().filter(|phase| phase.is_terminal()).map(Phase::number);
+    let rows = store.list(Query::all(Table::TaskState).in_states(terminal)).await?;
+    Ok(rows.iter().filter_map(|row| row.decode::<TaskState>().ok()).map(|state| state.changed).min())
+}
