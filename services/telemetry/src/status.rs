@@ -248,6 +248,26 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn a_sample_that_comes_a_day_late_is_kept_coarse_and_a_fresh_one_as_it_came() {
+        let now = Utc(1_800_000_000_000);
+        let pose = Some(midshift_core::robot::Pose { x_mm: 12_345, y_mm: -1, theta_mrad: 7 });
+        let at = |seq, age_ms: u64| {
+            let body = SampleBody::Status(Vitals { pose, ..Vitals::default() });
+            InboxItem::Sample(Sample { seq, robot_unix_ms: now.0.saturating_sub_unsigned(age_ms), body })
+        };
+        let (day, mut lane) = (midshift_core::privacy::PRECISE_MS, lane());
+        let batch = LaneBatch { lane: Lane::Status, items: vec![at(1, day), at(2, day - 1)] };
+        assert_eq!(lane.arrive(&batch, now), Arrived::Taken);
+        let write = lane.next_write().expect("something waits");
+        let kept = v1::LaneBatch::decode(&*write.frames[0].bytes).expect("a batch");
+        let headings = kept.samples.iter().map(|sample| match &sample.body {
+            Some(v1::sample::Body::Status(vitals)) => vitals.pose.map(|pose| (pose.x_mm, pose.theta_mrad)),
+            _ => None,
+        });
+        assert_eq!(headings.collect::<Vec<_>>(), [Some((12_500, 0)), Some((12_345, 7))]);
+    }
+
+    #[tokio::test]
     async fn a_gap_is_kept_from_where_nothing_was_taken() {
         let mut lane = lane();
         assert_eq!(arrive(&mut lane, vec![sample(1), sample(2)]), Arrived::Taken);
