@@ -120,6 +120,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let told = || data(folder.path()).pop().expect("rights");
         let open = |path: &Path, mode| fs::set_permissions(path, fs::Permissions::from_mode(mode)).expect("a mode");
+        open(folder.path(), 0o700);
         assert!(told().good, "{}", told().text);
         let keys = folder.path().join(IDENTITY);
         fs::create_dir(&keys).expect("a folder");
