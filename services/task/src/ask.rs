@@ -95,7 +95,13 @@ impl TaskService {
         let task_id = task_id.ok_or_else(internal)?;
         let same = v1::CancelTaskRequest { request_id: String::new(), validate_only: false, ..r.clone() };
         let hash = hash("cancel", &same);
-        let task = self.to_act_on(&task_id, by, Permission::Dispatch).await?;
+        let task = match self.to_act_on(&task_id, by, Permission::Dispatch).await {
+            Err(refusal) if !r.validate_only => {
+                let ask = Ask::Cancel { task_id, force: r.force };
+                return Err(self.denied(ask, r.reason, request_id, by, refusal).await);
+            }
+            looked => looked?,
+        };
         let earlier = self.asked_before(request_id.as_ref(), &hash).await?;
         if earlier.is_none() && task.state.phase == Phase::Canceled {
             return Ok(v1::CancelTaskResponse { task: Some(task.encode()), pending: false });
@@ -133,7 +139,13 @@ impl TaskService {
         let (Some(task_id), Some(resolution)) = (task_id, resolution) else { return Err(internal()) };
         let same = v1::ResolveTaskRequest { request_id: String::new(), validate_only: false, ..r.clone() };
         let hash = hash("resolve", &same);
-        let task = self.to_act_on(&task_id, by, Permission::Operate).await?;
+        let task = match self.to_act_on(&task_id, by, Permission::Operate).await {
+            Err(refusal) if !r.validate_only => {
+                let ask = Ask::Resolve { task_id, resolution };
+                return Err(self.denied(ask, r.reason, request_id, by, refusal).await);
+            }
+            looked => looked?,
+        };
         let earlier = self.asked_before(request_id.as_ref(), &hash).await?;
         let fits = || {
             if task.state.phase.is_terminal() {
@@ -189,7 +201,10 @@ impl TaskService {
         }
         bad.finish()?;
         let ask = Ask::ResumeHeld { stop_id, area_id, task_ids, robot_ids };
-        self.may_resume(&ask, by).await?;
+        match self.may_resume(&ask, by).await {
+            Err(refusal) if !r.validate_only => return Err(self.denied(ask, r.reason, request_id, by, refusal).await),
+            looked => looked?,
+        }
         let same = v1::ResumeHeldRequest { request_id: String::new(), validate_only: false, ..r.clone() };
         let hash = hash("resume", &same);
         let earlier = self.asked_before(request_id.as_ref(), &hash).await?;
@@ -243,6 +258,23 @@ impl TaskService {
             None => self.write(asked).await?,
         };
         Ok(!self.looked_at(place).await?)
+    }
+
+    /// Leaves it in the audit if the caller may not, and gives the refusal back. What it may not even see is about nothing that there is.
+    async fn denied(
+        &self,
+        ask: Ask,
+        reason: String,
+        request_id: Option<RequestId>,
+        by: &Caller,
+        refusal: Refusal,
+    ) -> Refusal {
+        if refusal.kind() != Kind::Denied {
+            return refusal;
+        }
+        let asked = Asked { ask, reason, request_id, hash: String::new(), actor: by.to_string(), robot_id: None };
+        let noted = self.noted(&asked, Err(refusal)).await;
+        noted.err().unwrap_or_else(internal)
     }
 
     /// Leaves a refusal in the audit. Whoever asked hears why, whether or not that can be written down.
