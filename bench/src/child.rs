@@ -97,6 +97,9 @@ pub enum Role {
     /// One of the measurements of stops.
     #[command(flatten)]
     Stop(crate::stop::Part),
+    /// One of the measurements of hostile peers.
+    #[command(flatten)]
+    Edge(crate::edge::Part),
 }
 
 /// A child's arguments.
@@ -203,6 +206,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
         }
         Role::Ota(part) => crate::ota::parts::play(part, address, stop).await,
         Role::Stop(part) => crate::stop::play(part, address, stop).await,
+        Role::Edge(part) => crate::edge::play(part, address, stop).await,
     }
 }
 

@@ -2,6 +2,7 @@
 
 mod bare;
 mod child;
+mod edge;
 mod engine;
 mod figure;
 mod flood;
@@ -41,6 +42,8 @@ enum Name {
     Ota(ota::OtaArgs),
     /// From an engaged stop to its acknowledgement by every robot, with nothing beside, under load, and with everything else broken.
     Stop(stop::StopArgs),
+    /// What slow, half-open, broken and flooding peers cost a client that does no harm, and what becomes of them.
+    Edge(edge::EdgeArgs),
     /// What the other names start: this program in one role.
     #[command(hide = true)]
     Child(child::ChildArgs),
@@ -75,6 +78,11 @@ fn main() -> anyhow::Result<()> {
         }
         Name::Stop(args) => {
             let told = wait(async { Ok(stop::run(args, &note).await) })?;
+            failed = told.failed;
+            told.figures
+        }
+        Name::Edge(args) => {
+            let told = wait(async { Ok(edge::run(args, &note).await) })?;
             failed = told.failed;
             told.figures
         }

@@ -95,6 +95,18 @@ fn a_stop_is_told_beside_a_bare_write_loop_under_each_load_and_with_each_thing_b
 }
 
 #[test]
+fn a_client_is_served_beside_hostile_peers_of_each_kind_and_each_peer_is_turned_away() {
+    let records = records("edge", &["--peers", "20", "--rounds", "1", "--calls", "20", "--gap-ms", "1"]);
+    assert_told(&records, &["edge"], 1);
+    for load in ["slow peers", "half-open peers", "out of descriptors", "broken frames", "flood of requests"] {
+        let told: Vec<_> =
+            records.iter().filter(|r| r["name"].as_str().is_some_and(|name| name.contains(load))).collect();
+        assert_eq!(told.len(), 4, "{load}: {records:?}");
+        assert!(told[3]["median"].as_f64().is_some_and(|turned_away| turned_away > 0.0), "{load}: {told:?}");
+    }
+}
+
+#[test]
 fn software_of_robots_is_told_beside_idle_robots_and_the_disk() {
     let sizes = ["--part", "server", "--robots", "20", "--back-robots", "3", "--rounds", "1"];
     let sizes: Vec<&str> = sizes.into_iter().chain(["--idle-seconds", "1", "--directives", "20"]).collect();

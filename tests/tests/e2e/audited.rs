@@ -174,7 +174,7 @@ async fn whoever_is_denied_stands_in_the_audit_of_the_service_that_was_asked() -
     let submit = ["task", "submit", "--task-id", "T1", "--from", "A01", "--to", "B03", "--server", &address];
     let denied = second(&submit)?.output()?;
     let said = String::from_utf8_lossy(&denied.stderr).into_owned();
-    ensure!(!denied.status.success() && said.contains("NOT_PERMITTED"), "{said}");
+    ensure!(denied.status.code() == Some(6) && said.contains("second may not"), "{said}");
     let list = ["audit", "ls", "-o", "json", "--action", "request.deny", "--server", &address];
     let row = until("a row of the denial", Duration::from_secs(20), async || {
         let listed: Value = serde_json::from_slice(&command(&list)?.output()?.stdout)?;
