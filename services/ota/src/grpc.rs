@@ -1,12 +1,15 @@
 //! The gRPC face of releases: decode, call, encode. That of bytes is at the hatch.
 
 use crate::content::{Error, Held, Wanted};
+use crate::repository::Act;
 use crate::{OtaService, pages, refusal};
 use bytes::Bytes;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::COMPONENT_BYTES_MAX;
+use midshift_core::identity::Caller;
 use midshift_core::limits;
 use midshift_core::reason::{Refusal, Violations};
+use midshift_proto::access::caller;
 use midshift_proto::convert::shown;
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::bundle_service_server::BundleService as BundleFace;
@@ -70,9 +73,14 @@ impl OtaService {
         Ok(v1::UploadTargetResponse { durable_bytes: durable(held, file), is_complete: held == Held::Whole })
     }
 
-    async fn publish(&self, r: v1::PublishRepositoryRequest) -> Result<v1::PublishRepositoryResponse, Refusal> {
+    async fn publish(
+        &self,
+        r: v1::PublishRepositoryRequest,
+        by: &Caller,
+    ) -> Result<v1::PublishRepositoryResponse, Refusal> {
         let opened = self.opened()?;
-        let newest = opened.repository.publish(r.roots, r.targets, r.expected_targets_version, opened.now()).await?;
+        let act = Act { by: by.to_string(), at: opened.now() };
+        let newest = opened.repository.publish(r.roots, r.targets, r.expected_targets_version, act).await?;
         let (root_version, targets_version) = (newest.root.edition.version, newest.targets.edition.version);
         tracing::info!(root_version, targets_version, bundles = newest.releases.len(), "a release was published");
         Ok(v1::PublishRepositoryResponse { root_version, targets_version })
@@ -121,7 +129,8 @@ impl BundleFace for OtaService {
         &self,
         r: Request<v1::PublishRepositoryRequest>,
     ) -> Result<Response<v1::PublishRepositoryResponse>, Status> {
-        answer(self.publish(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.publish(r.into_inner(), &by).await)
     }
     async fn get_metadata(
         &self,

@@ -19,6 +19,7 @@ use midshift_bundle::manifest::Manifest;
 use midshift_bundle::repository::{self as people, FileTarget, Online, TIMESTAMP_LIFE_MS, listed, sign_online};
 use midshift_core::reason::{Code, Reason, Refusal};
 use midshift_core::time::Utc;
+use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::io;
@@ -33,6 +34,8 @@ const SNAPSHOTS_KEPT: usize = 16;
 const TIMESTAMP: &str = "timestamp.json";
 /// When each bundle was seen first, by its digest. Not shown.
 const SEEN: &str = "seen.json";
+/// Who published what, for the audit.
+const BY: &str = "by.json";
 /// Lowest version of what is signed here from now on, as a number. Only a restored repository has it. Not shown.
 const FLOOR: &str = "floor.json";
 
@@ -249,6 +252,51 @@ pub struct Release {
     pub seen: Utc,
 }
 
+/// Who publishes, and when.
+#[derive(Clone, Debug)]
+pub struct Act {
+    /// Who.
+    pub by: String,
+    /// When.
+    pub at: Utc,
+}
+
+#[cfg(test)]
+impl From<Utc> for Act {
+    fn from(at: Utc) -> Self {
+        Self { by: "release".to_owned(), at }
+    }
+}
+
+/// Who published what: nothing that robots see. Of a publication by an older release nobody is known.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct By {
+    /// The newest targets document.
+    newest: Option<String>,
+    /// Each bundle of it, since it was listed.
+    bundles: BTreeMap<Digest, String>,
+}
+
+impl By {
+    /// After a publication of these.
+    fn after(mut self, by: String, releases: &[Release]) -> Self {
+        self.bundles.retain(|digest, _| releases.iter().any(|release| release.digest == *digest));
+        for release in releases {
+            self.bundles.entry(release.digest).or_insert_with(|| by.clone());
+        }
+        Self { newest: Some(by), ..self }
+    }
+    /// Who published the newest document.
+    pub fn newest(&self) -> Option<&str> {
+        self.newest.as_deref()
+    }
+    /// Who listed this bundle.
+    pub fn bundle(&self, digest: &Digest) -> Option<&str> {
+        self.bundles.get(digest).map(String::as_str)
+    }
+}
+
 /// What the repository says now.
 #[derive(Clone, Debug)]
 pub struct Newest {
@@ -262,6 +310,8 @@ pub struct Newest {
     pub files: BTreeMap<String, FileTarget>,
     /// Bundles by name and version.
     pub releases: Vec<Release>,
+    /// Who published them.
+    pub by: By,
     /// The newest set of keys that sign directives; none: robots have them from their trust files alone, or it is listed and cannot be read.
     pub key_set: Option<KeySet>,
     /// Manifests that are listed and that the disk did not give, though they are there, and the newest set of directive keys if it could not be
@@ -427,7 +477,7 @@ impl Repository {
         roots: Vec<Vec<u8>>,
         targets: Vec<u8>,
         expected: u64,
-        now: Utc,
+        act: impl Into<Act>,
     ) -> Result<Arc<Newest>, Error> {
         let (writing, before) = self.turn().await?;
         let newest = before.as_ref().map_or(0, |b| b.targets.edition.version);
@@ -437,7 +487,7 @@ impl Repository {
                 _ => Err(Error::Moved { newest, expected }),
             };
         }
-        let publication = self.prepare(before.as_deref(), roots, targets, now).await?;
+        let publication = self.prepare(before.as_deref(), roots, targets, act.into()).await?;
         self.commit(writing, publication).await
     }
 
@@ -503,7 +553,7 @@ impl Repository {
         targets: Vec<u8>,
         now: Utc,
     ) -> Result<Vec<(String, Vec<u8>)>, Error> {
-        let publication = self.prepare(self.newest().as_deref(), roots, targets, now).await?;
+        let publication = self.prepare(self.newest().as_deref(), roots, targets, now.into()).await?;
         Ok(publication.writes)
     }
 
@@ -525,7 +575,7 @@ impl Repository {
         before: Option<&Newest>,
         roots: Vec<Vec<u8>>,
         targets: Vec<u8>,
-        now: Utc,
+        Act { by, at: now }: Act,
     ) -> Result<Publication, Error> {
         let known = match before {
             // A root that came before is no news.
@@ -556,10 +606,12 @@ impl Repository {
             (first_root..).map(|version| file(version, "root")).zip(roots).collect();
         let seen = serde_json::to_vec(&seen).unwrap_or_else(|e| unreachable!("plain fields: {e}"));
         writes.push((SEEN.to_owned(), seen));
+        let by = self.by().await?.after(by, &releases);
+        writes.push((BY.to_owned(), serde_json::to_vec(&by).unwrap_or_else(|e| unreachable!("plain fields: {e}"))));
         writes.push((file(targets.edition.version, "targets"), targets.bytes.clone()));
         writes.push((file(stamp.snapshot_version, "snapshot"), online.snapshot));
         writes.push((TIMESTAMP.to_owned(), online.timestamp.clone()));
-        let newest = Newest { key_set, ..Newest::of(root, targets, stamp, files, releases, online.timestamp) };
+        let newest = Newest { key_set, by, ..Newest::of(root, targets, stamp, files, releases, online.timestamp) };
         Ok(Publication { writes, newest })
     }
 
@@ -589,6 +641,11 @@ impl Repository {
     async fn seen(&self) -> Result<BTreeMap<Digest, Utc>, Error> {
         let folder = self.folder.clone();
         blocking(move || read_seen(&folder)).await
+    }
+
+    async fn by(&self) -> Result<By, Error> {
+        let folder = self.folder.clone();
+        blocking(move || read_by(&folder)).await
     }
 
     /// Writes one document after the other, each whole and durable, and shows the result: also if nobody waits for it any more.
@@ -627,6 +684,7 @@ impl Newest {
             stamp,
             files,
             releases,
+            by: By::default(),
             key_set: None,
             unread: BTreeSet::new(),
             set_lost: None,
@@ -680,6 +738,11 @@ fn read_seen(folder: &Path) -> Result<BTreeMap<Digest, Utc>, Error> {
     let bytes = read(&folder.join(SEEN))?.unwrap_or_else(|| b"{}".to_vec());
     serde_json::from_slice(&bytes)
         .map_err(|e| Error::Damaged { folder: folder.to_owned(), text: format!("{SEEN}: {e}") })
+}
+
+fn read_by(folder: &Path) -> Result<By, Error> {
+    let bytes = read(&folder.join(BY))?.unwrap_or_else(|| b"{}".to_vec());
+    serde_json::from_slice(&bytes).map_err(|e| Error::Damaged { folder: folder.to_owned(), text: format!("{BY}: {e}") })
 }
 
 fn file(version: u64, role: &str) -> String {

@@ -4,7 +4,7 @@
 //! number, is damaged, and what was shown before stays. A file that the disk does not give at the moment is not gone: what was known of it
 //! stays, and it is tried again each time the folder is followed, once a second; never by whoever only asks for something.
 
-use super::{Error, Kept, Newest, Online, Release, SetLost, TIMESTAMP, check, file, read, read_seen};
+use super::{By, Error, Kept, Newest, Online, Release, SetLost, TIMESTAMP, check, file, read, read_by, read_seen};
 use crate::blocking;
 use crate::content::Content;
 use midshift_bundle::digest::Digest;
@@ -238,6 +238,7 @@ struct Found {
     timestamp: Vec<u8>,
     stamp: Stamp,
     seen: BTreeMap<Digest, Utc>,
+    by: By,
 }
 
 impl Found {
@@ -249,6 +250,7 @@ impl Found {
             timestamp: known.timestamp.clone(),
             stamp: known.stamp,
             seen: read_seen(folder)?,
+            by: read_by(folder)?,
         })
     }
 
@@ -303,7 +305,7 @@ impl Found {
             }
         }
         let newest = Newest::of(self.root, self.targets, self.stamp, files, releases, self.timestamp);
-        Ok((Newest { key_set, set_lost, unread: unread.keys().copied().collect(), ..newest }, unread))
+        Ok((Newest { key_set, set_lost, by: self.by, unread: unread.keys().copied().collect(), ..newest }, unread))
     }
 }
 
@@ -362,5 +364,6 @@ fn find(folder: &Path) -> Result<Option<Found>, Error> {
         timestamp: online.timestamp,
         stamp,
         seen: read_seen(folder)?,
+        by: read_by(folder)?,
     }))
 }

@@ -3,7 +3,7 @@
 mod key_sets;
 mod unread;
 
-use super::{Error, FRESHEN_AFTER_MS, OnlineKeys, Repository, write_whole};
+use super::{Act, By, Error, FRESHEN_AFTER_MS, OnlineKeys, Repository, write_whole};
 use crate::content::Content;
 use crate::fixture::{Room, SEEDS, START, Seeds, bundle, files, first_root, key, robot, root, target, targets};
 use midshift_bundle::digest::Digest;
@@ -123,6 +123,20 @@ async fn an_expired_root_is_refused() {
     let old = root(1, SEEDS, START, &[SEEDS.root]);
     let error = room.repository.publish(vec![old], document, 0, START).await.expect_err("refused");
     assert_eq!(fields(&error), ["roots"]);
+}
+
+#[tokio::test]
+async fn who_published_each_bundle_is_known_also_after_a_start() {
+    let (room, first) = published().await;
+    let second = targets(Some(&first), &[], SEEDS.targets);
+    let act = Act { by: "anna".to_owned(), at: START };
+    let newest = room.repository.publish(Vec::new(), second, 1, act).await.expect("the second");
+    let old = newest.releases[0].digest;
+    let known = |by: &By| (by.newest().map(str::to_owned), by.bundle(&old).map(str::to_owned));
+    let expected = (Some("anna".to_owned()), Some("release".to_owned()));
+    assert_eq!(known(&newest.by), expected);
+    let again = room.restarted().await.repository.newest().expect("a release");
+    assert_eq!(known(&again.by), expected);
 }
 
 #[tokio::test]

@@ -2,7 +2,8 @@
 //!
 //! Invariant: a row is never deleted, so that a roll-out always knows what it is of; a bundle that the release lists no more is unlisted.
 
-use crate::repository::Newest;
+use crate::repository::{By, Newest};
+use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::{ComponentKind, Manifest, Migration};
 use midshift_core::audit::Note;
 use midshift_core::ids::BundleId;
@@ -44,18 +45,35 @@ pub fn take(view: &mut View, now: Now, newest: Option<&Newest>, plan: &mut Plan)
     listed.extend(unread.filter_map(|digest| BundleId::parse(&digest.to_string()).ok()));
     let gone = view.bundles.values().map(|b| &b.row).filter(|b| b.listed && !listed.contains(&b.bundle));
     changed.extend(gone.map(|b| Bundle { listed: false, ..b.clone() }));
-    for rows in changed.chunks(limits::ITEM_ROWS_MAX) {
-        plan.decide(view, now, "ota", |tx| {
-            let about = |listed| rows.iter().filter(move |row| row.listed == listed).map(|row| &row.bundle);
-            let (listed, unlisted) = (about(true), about(false).map(ToString::to_string).collect::<Vec<_>>());
-            let note = listed.fold(Note::new("bundle.publish"), |note, bundle| note.about("bundle", bundle));
-            let note = unlisted.iter().fold(note, |note, bundle| note.about("bundle", bundle));
-            tx.audit(if unlisted.is_empty() { note } else { note.with("unlisted", unlisted.join(" ")) });
-            for row in rows {
-                tx.put(row.clone(), if row.listed { "bundle.listed" } else { "bundle.unlisted" });
-            }
-        });
+    let mut by_whom: BTreeMap<&str, Vec<Bundle>> = BTreeMap::new();
+    for row in changed {
+        by_whom.entry(publisher(newest, &row)).or_default().push(row);
     }
+    for (actor, changed) in by_whom {
+        for rows in changed.chunks(limits::ITEM_ROWS_MAX) {
+            plan.decide(view, now, actor, |tx| {
+                let about = |listed| rows.iter().filter(move |row| row.listed == listed).map(|row| &row.bundle);
+                let (listed, unlisted) = (about(true), about(false).map(ToString::to_string).collect::<Vec<_>>());
+                let note = listed.fold(Note::new("bundle.publish"), |note, bundle| note.about("bundle", bundle));
+                let note = unlisted.iter().fold(note, |note, bundle| note.about("bundle", bundle));
+                tx.audit(if unlisted.is_empty() { note } else { note.with("unlisted", unlisted.join(" ")) });
+                for row in rows {
+                    tx.put(row.clone(), if row.listed { "bundle.listed" } else { "bundle.unlisted" });
+                }
+            });
+        }
+    }
+}
+
+/// Who listed a bundle, or published the release that lists it no more. Of a release that an older version of midshift took nobody knows.
+fn publisher<'a>(newest: Option<&'a Newest>, row: &Bundle) -> &'a str {
+    let by = newest.map(|newest| &newest.by);
+    let digest = row.bundle.as_str().parse::<Digest>().ok();
+    let whom = match row.listed {
+        true => digest.and_then(|digest| by?.bundle(&digest)),
+        false => by.and_then(By::newest),
+    };
+    whom.unwrap_or("ota")
 }
 
 fn fresh(bundle: BundleId, manifest: &Manifest, manifest_length: u64, published: midshift_core::time::Utc) -> Bundle {
