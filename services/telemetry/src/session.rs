@@ -227,7 +227,10 @@ impl Session {
 
     fn say(&mut self, change: impl FnOnce(&mut Downlink)) {
         change(&mut self.out);
-        self.out_since.get_or_insert_with(Instant::now);
+        // What says nothing is not sent, and nobody is too slow for it.
+        if self.out != Downlink::default() {
+            self.out_since.get_or_insert_with(Instant::now);
+        }
     }
 
     /// What is to be sent, with the moment of sending in its clock sample.
