@@ -5,7 +5,7 @@
 use crate::questions::answer_questions;
 use crate::sink::Seen;
 use anyhow::{Context, bail, ensure};
-use midshift::robots::{SimRun, StopFlags};
+use midshift::robots::{IdentityFlags, SimRun, StopFlags};
 use midshift::serve::Software;
 use std::io::{BufRead, BufReader, Write};
 use std::net::SocketAddr;
@@ -144,6 +144,8 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 insecure: true,
                 names: Vec::new(),
                 first_token_file: None,
+                root_file: None,
+                identity: None,
                 spare_token: false,
                 share: Default::default(),
                 trust: None,
@@ -181,6 +183,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 no_faults: true,
                 listen: None,
                 trust: None,
+                identity: IdentityFlags::default(),
                 stop: StopFlags::default(),
             };
             midshift::robots::swarm(swarm, None, stop).await

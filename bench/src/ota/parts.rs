@@ -6,7 +6,7 @@
 use crate::questions::answer_questions;
 use crate::robot;
 use anyhow::Context;
-use midshift::robots::{AgentRun, StopFlags};
+use midshift::robots::{AgentRun, IdentityFlags, StopFlags};
 use midshift::serve::{Serve, Software};
 use midshift_agent::bulk::Bulk;
 use midshift_agent::dial::TcpDial;
@@ -166,6 +166,8 @@ async fn serve(data: PathBuf, keys: PathBuf, listen: SocketAddr, stop: Cancellat
         insecure: true,
         names: Vec::new(),
         first_token_file: None,
+        root_file: None,
+        identity: None,
         spare_token: false,
         share: Default::default(),
         trust: None,
@@ -209,6 +211,7 @@ async fn agent(
         sets: Some(home.join("sets")),
         trust: Some(home.join("trust.json")),
         clock_unsynced: false,
+        identity: IdentityFlags::default(),
         stop: StopFlags::default(),
     };
     let hand = move |body: &SimHandle, clock: &Arc<dyn Clock>| {

@@ -25,6 +25,21 @@ pub struct ServerProof {
     pub authority_pem: String,
 }
 
+impl ServerProof {
+    /// Writes certificates and key as one file into `folder`, for its owner alone, whole or not at all. Whether it was another one before.
+    ///
+    /// # Errors
+    /// The disk.
+    pub fn write(&self, folder: &Path, name: &str) -> Result<bool, Error> {
+        let text = format!("{}{}", self.chain_pem, self.key_pem);
+        if files::read(folder, name)?.as_ref() == Some(&text) {
+            return Ok(false);
+        }
+        files::write(folder, name, &text, files::PRIVATE)?;
+        Ok(true)
+    }
+}
+
 /// Without the key.
 impl std::fmt::Debug for ServerProof {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {

@@ -50,6 +50,22 @@ pub struct StopFlags {
     pub no_stop: bool,
 }
 
+/// The way to whoever says who is who.
+#[derive(Clone, Debug, Default, clap::Args)]
+pub struct IdentityFlags {
+    /// Where certificates are given out and renewed, host:port, if not at --server: of a site in several processes the address of the one with role identity, or that
+    /// of the proxy for it.
+    #[arg(long, env = "MIDSHIFT_IDENTITY_SERVER", value_name = "ADDR")]
+    pub identity_server: Option<String>,
+}
+
+impl IdentityFlags {
+    /// That address, or `server`.
+    pub fn address<'a>(&'a self, server: &'a str) -> &'a str {
+        self.identity_server.as_deref().unwrap_or(server)
+    }
+}
+
 impl StopFlags {
     /// Where the stop service is for robots of the server at `server`, over TLS or not; none: there is to be no line, which is said aloud.
     fn address(&self, server: &str, is_secure: bool) -> Option<String> {
@@ -108,6 +124,9 @@ pub struct AgentRun {
     /// The machine's clock is not set from the network: the end of a signature is not judged by it.
     #[arg(long, requires = "sets")]
     pub clock_unsynced: bool,
+    /// The way to whoever says who is who.
+    #[command(flatten)]
+    pub identity: IdentityFlags,
     /// The way to the stop service.
     #[command(flatten)]
     pub stop: StopFlags,
@@ -149,6 +168,9 @@ pub struct SimRun {
     /// Also answer `sim.v1` (faults) here.
     #[arg(long)]
     pub listen: Option<SocketAddr>,
+    /// The way to whoever says who is who.
+    #[command(flatten)]
+    pub identity: IdentityFlags,
     /// The way to the stop service.
     #[command(flatten)]
     pub stop: StopFlags,
@@ -212,7 +234,8 @@ pub async fn agent_in_hand(
         }
         invitation => {
             let key = device::key_of(&mut *store, &new_ring_id).await?;
-            Some(Identity::open(&args.data, &robot_id, key, &args.server, invitation.as_deref()).await?)
+            let address = args.identity.address(&args.server);
+            Some(Identity::open(&args.data, &robot_id, key, address, invitation.as_deref()).await?)
         }
     };
     let tls = identity.as_ref().map(Identity::tls);
@@ -241,8 +264,10 @@ pub async fn agent_in_hand(
     let uri = with_scheme(scheme, &args.server);
     let link = Arc::new(TcpDial::new(&uri, Some(network.clone()))?.with_tls(tls.clone()));
     let bulk = Bulk::new(Arc::new(TcpDial::bulk(&uri, Some(network))?.with_tls(tls.clone())));
+    let renewal = with_scheme(scheme, args.identity.address(&args.server));
+    let renewal = Arc::new(TcpDial::new(&renewal, Some(handle.network()))?.with_tls(tls.clone()));
     let _renewing =
-        identity.map(|identity| AbortOnDropHandle::new(tokio::spawn(identity.keep(link.clone(), clock.clone()))));
+        identity.map(|identity| AbortOnDropHandle::new(tokio::spawn(identity.keep(renewal, clock.clone()))));
     let mut pulse = midshift_agent::pulse::for_launcher();
     if let Some(software) = &software {
         pulse = software.pulse(pulse, &clock);
@@ -318,7 +343,8 @@ pub async fn swarm(args: SimRun, signed_in: Option<Way>, stop: CancellationToken
         None => (None, "http"),
         Some(way) => {
             let ids = hall.robots().iter().map(|robot| robot.robot_id().clone()).collect();
-            (Some(Machines::enrol(way, &args.server, ids, args.data.as_deref()).await?), "https")
+            let address = args.identity.address(&args.server);
+            (Some(Machines::enrol(way, address, ids, args.data.as_deref()).await?), "https")
         }
     };
     let tls = machines.as_ref().map(Machines::tls).unwrap_or_default();
@@ -327,7 +353,7 @@ pub async fn swarm(args: SimRun, signed_in: Option<Way>, stop: CancellationToken
     if let Some(address) = args.stop.address(&args.server, machines.is_some()) {
         swarm = swarm.with_stop(&with_scheme(scheme, &address));
     }
-    let _renewing = machines.map(|machines| machines.keep(&args.server, &clock)).transpose()?;
+    let _renewing = machines.map(|machines| machines.keep(args.identity.address(&args.server), &clock)).transpose()?;
     swarm.software = trust;
     swarm.persistence = config.persistence.clone();
     let swarm = Swarm::new(swarm);

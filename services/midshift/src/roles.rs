@@ -16,11 +16,15 @@ pub enum Role {
     Ota,
     /// The site's authority: who is who. One process of a site.
     Identity,
+    /// Beside a stop service, on the same data folder: copies its stops into the store, and tells it who is known and who the robots are. Of several on one
+    /// folder one does, and the others wait for its end.
+    StopFollower,
 }
 
 impl Role {
     /// All of them.
-    pub const ALL: [Self; 5] = [Self::Task, Self::Fleet, Self::Telemetry, Self::Ota, Self::Identity];
+    pub const ALL: [Self; 6] =
+        [Self::Task, Self::Fleet, Self::Telemetry, Self::Ota, Self::Identity, Self::StopFollower];
 
     /// gRPC services of this role, as health names them.
     pub const fn services(self) -> &'static [&'static str] {
@@ -37,6 +41,18 @@ impl Role {
                 &["midshift.ota.v1.BundleService", "midshift.ota.v1.ChunkService", "midshift.ota.v1.RolloutService"]
             }
             Self::Identity => &["midshift.identity.v1.IdentityService", "midshift.identity.v1.EnrolmentService"],
+            Self::StopFollower => &[],
+        }
+    }
+    /// As it is written behind --roles.
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Task => "task",
+            Self::Fleet => "fleet",
+            Self::Telemetry => "telemetry",
+            Self::Ota => "ota",
+            Self::Identity => "identity",
+            Self::StopFollower => "stop-follower",
         }
     }
 }
@@ -72,7 +88,21 @@ impl Roles {
 
 impl fmt::Display for Roles {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let names: Vec<String> = self.0.iter().map(|role| format!("{role:?}").to_lowercase()).collect();
+        let names: Vec<&str> = self.0.iter().map(|role| role.name()).collect();
         f.write_str(&names.join(","))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Role, Roles};
+    use clap::ValueEnum;
+
+    #[test]
+    fn roles_are_shown_as_they_are_written() {
+        for role in Role::ALL {
+            assert_eq!(role.to_possible_value().map(|value| value.get_name().to_owned()).as_deref(), Some(role.name()));
+        }
+        assert!(Roles::of(&[Role::StopFollower]).are_split() && !Roles::default().are_split());
     }
 }

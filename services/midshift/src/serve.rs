@@ -9,7 +9,7 @@ use crate::server::{Naive, Parts, Server};
 use crate::storage::{Database, Storage};
 use crate::{clock, site_file, stop, stop_follower};
 use anyhow::{Context, bail};
-use midshift_agent::tls;
+use midshift_agent::{durable, tls};
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use midshift_identity::{Duty, IdentityService};
@@ -69,6 +69,13 @@ pub struct Serve {
     /// Where the first token of a new site goes, a new file for its owner alone. Without it standard output.
     #[arg(long, value_name = "FILE", conflicts_with = "insecure")]
     pub first_token_file: Option<PathBuf>,
+    /// Where the site's root certificate goes too, for everybody to read: what robots, people and the proxy hold the site's servers against.
+    #[arg(long, value_name = "FILE", conflicts_with = "insecure")]
+    pub root_file: Option<PathBuf>,
+    /// Where the keys and the certificate of this process are; made with mode 0700. Without it the folder identity of --data. Processes that share --data need
+    /// one each.
+    #[arg(long, value_name = "DIR", env = "MIDSHIFT_IDENTITY")]
+    pub identity: Option<PathBuf>,
     /// Make one more token that may do everything, for whoever has lost the first one.
     #[arg(long, conflicts_with = "insecure")]
     pub spare_token: bool,
@@ -82,7 +89,7 @@ pub struct Serve {
     /// Where its stop service listens: a process of its own that is started unless one answers there, and that stays when this one ends.
     #[arg(long, value_name = "ADDR", default_value_t = SocketAddr::from(([127, 0, 0, 1], crate::stop::PORT)))]
     pub stop_listen: SocketAddr,
-    /// Start no stop service: it runs elsewhere, or under a unit of its own. With --roles none is started either.
+    /// Start no stop service: it runs elsewhere, or under a unit of its own. With --roles none is started either; the role stop-follower belongs beside it.
     #[arg(long, env = "MIDSHIFT_NO_STOP")]
     pub no_stop: bool,
     /// Where software of robots comes from.
@@ -128,6 +135,13 @@ impl Software {
     }
 }
 
+impl Serve {
+    /// The folder of the keys of this process.
+    fn own_keys(&self) -> PathBuf {
+        self.identity.clone().unwrap_or_else(|| self.data.join(IDENTITY))
+    }
+}
+
 /// Runs until `shutdown`. The first token of a site is said, and nothing else.
 pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow::Result<()> {
     if args.insecure {
@@ -137,6 +151,11 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
     if roles.are_split() && args.database.store.is_none() {
         bail!(
             "--roles {roles} leaves services to other processes, and only PostgreSQL can be shared with them: add --store postgres://USER:PASSWORD@HOST/DATABASE, or leave --roles out to serve everything on SQLite"
+        );
+    }
+    if args.identity.is_some() && roles.has(Role::Identity) {
+        bail!(
+            "--identity is for processes without role identity: the site's authority is in the folder identity of --data, where a backup finds it"
         );
     }
     let loaded = site_file::load(args.site.as_deref(), None, None)?;
@@ -183,7 +202,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
     }
     tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), store = storage.engine(), %roles, "midshift serves");
     let planning = Planning::start()?;
-    let fleet_follows = roles.has(Role::Fleet);
+    let follows = roles.has(Role::StopFollower);
     let parts = Parts {
         roles: roles.clone(),
         drain,
@@ -197,7 +216,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         reader,
         sim: None,
         naive: Naive::default(),
-        stops: fleet_follows.then(|| args.data.join(stop::FOLDER)),
+        stops: follows.then(|| args.data.join(stop::FOLDER)),
         port: match identity {
             Some(_) => args.share.config("business"),
             None => door::alone("business"),
@@ -236,7 +255,7 @@ async fn identity(
         names.push(args.listen.ip().to_string());
     }
     let parts = midshift_identity::Parts {
-        folder: args.data.join(IDENTITY),
+        folder: args.own_keys(),
         store: storage.store(),
         clock: clock.clone(),
         duty: if roles.has(Role::Identity) { Duty::Authority } else { Duty::Member },
@@ -246,7 +265,12 @@ async fn identity(
             None => String::new(),
         },
     };
-    IdentityService::open(parts, shutdown).await.context("opening identity")
+    let identity = IdentityService::open(parts, shutdown).await.context("opening identity")?;
+    if let Some(file) = &args.root_file {
+        let root = identity.proof().borrow().authority_pem.clone();
+        durable::replace(file, root.as_bytes()).with_context(|| format!("writing {}", file.display()))?;
+    }
+    Ok(identity)
 }
 
 /// Hands out the first token of a new site, once.
@@ -273,7 +297,7 @@ async fn greet(
         return writeln!(new, "{token}").with_context(|| format!("writing {}", file.display()));
     }
     let pin = tls::pin_of(&identity.proof().borrow().authority_pem)?;
-    let authority = args.data.join(IDENTITY).join(midshift_identity::PUBLIC_FILE);
+    let authority = args.own_keys().join(midshift_identity::PUBLIC_FILE);
     say(&format!(
         "A token that may do everything on this site, for a year. It is shown once:\n\n  {token}\n\n\
          Sign in:  midshift login {address} --pin {pin}\n\

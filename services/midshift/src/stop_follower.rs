@@ -1,7 +1,8 @@
 //! Beside a stop service: copies its stops into the store, and writes for it who the robots of the site are.
 //!
 //! The stop service never sees the store, and nobody on its way waits for this: it reads the files that the stop service keeps, whatever state that is in. Invariant: a
-//! stop that was copied is taken out only after its reset was forgotten, also if the stop service has lost its folder.
+//! stop that was copied is taken out only after its reset was forgotten, also if the stop service has lost its folder. One process at a time follows a folder:
+//! whoever holds the lock in it.
 
 use anyhow::Context;
 use midshift_core::fleet::rows::RobotControl;
@@ -14,13 +15,17 @@ use midshift_identity::{IdentityService, ServerProof};
 use midshift_stop::{Principals, Roster};
 use midshift_store::{CommitError, Store, follow};
 use std::collections::{BTreeMap, BTreeSet};
+use std::fs::{DirBuilder, File, OpenOptions, TryLockError};
 use std::io;
+use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
 /// How often the files are looked at: fleet knows of a stop a quarter of a second after robots at the latest.
 const LOOK: Duration = Duration::from_millis(250);
+/// Whoever follows holds this, in the folder of the stop service; the system lets it go with the process, however that ends.
+const TURN: &str = "follower.lock";
 /// How often it is looked up which robots a person has retired, in looks: ten seconds.
 const RETIRED_EVERY: u32 = 40;
 
@@ -36,6 +41,18 @@ fn principals(identity: &IdentityService) -> Principals {
 /// The disk.
 pub fn tell_principals(folder: &Path, identity: &IdentityService) -> io::Result<()> {
     principals(identity).write(folder)
+}
+
+/// The turn to follow, if nobody has it; the folder is made if it is not there.
+fn turn_of(folder: &Path) -> io::Result<Option<File>> {
+    DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
+    let path = folder.join(TURN);
+    let file = OpenOptions::new().create(true).truncate(false).write(true).mode(0o600).open(path)?;
+    match file.try_lock() {
+        Ok(()) => Ok(Some(file)),
+        Err(TryLockError::WouldBlock) => Ok(None),
+        Err(TryLockError::Error(error)) => Err(error),
+    }
 }
 
 /// What follows one stop service.
@@ -66,6 +83,7 @@ impl StopFollower {
     /// Until it is dropped.
     pub async fn run(mut self) {
         let mut look = tokio::time::interval(LOOK);
+        let _turn = self.turn(&mut look).await;
         for n in 0_u32.. {
             look.tick().await;
             let followed = self.follow(n % RETIRED_EVERY == 0).await;
@@ -74,6 +92,32 @@ impl StopFollower {
             }
             self.failing = followed.is_err();
             metrics::gauge!("midshift_stop_follower_failing").set(f64::from(u8::from(self.failing)));
+        }
+    }
+
+    /// Waits until nobody else follows this folder.
+    async fn turn(&mut self, look: &mut tokio::time::Interval) -> File {
+        let mut is_told = false;
+        loop {
+            look.tick().await;
+            match turn_of(&self.folder) {
+                Ok(Some(turn)) => {
+                    self.failing = false;
+                    return turn;
+                }
+                Ok(None) if !is_told => {
+                    tracing::info!(folder = %self.folder.display(), "another process follows this stop service; this one waits for its end");
+                    is_told = true;
+                }
+                Ok(None) => {}
+                Err(error) => {
+                    if !self.failing {
+                        tracing::warn!(%error, folder = %self.folder.display(), "the folder of the stop service cannot be used");
+                    }
+                    self.failing = true;
+                    metrics::gauge!("midshift_stop_follower_failing").set(1.0);
+                }
+            }
         }
     }
 
@@ -165,6 +209,23 @@ impl StopFollower {
         let written = tokio::task::spawn_blocking(move || roster.write(&folder)).await;
         written.context("writing the roster")?.context("writing the roster")?;
         self.roster = Some(robots);
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_process_at_a_time_follows_a_stop_service_and_its_end_makes_room() -> io::Result<()> {
+        let dir = tempfile::tempdir()?;
+        let folder = dir.path().join("stop");
+        let first = turn_of(&folder)?;
+        assert!(first.is_some());
+        assert!(turn_of(&folder)?.is_none(), "two follow at once");
+        drop(first);
+        assert!(turn_of(&folder)?.is_some(), "nobody follows any more");
         Ok(())
     }
 }

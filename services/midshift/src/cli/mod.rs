@@ -4,6 +4,7 @@ mod area;
 mod audit;
 mod backup;
 mod bundle;
+mod certificate;
 mod client;
 mod context;
 mod doctor;
@@ -128,6 +129,9 @@ enum Command {
     /// Rights of people and programs.
     #[command(subcommand)]
     Token(token::Verb),
+    /// Certificates of programs that are none of ours: the proxy before a site, the database behind it.
+    #[command(subcommand)]
+    Certificate(Box<certificate::Verb>),
     /// Look for what may be wrong: server, store, robots, certificates, clocks, disk, limits, and who can reach what.
     Doctor(doctor::Doctor),
     /// Whether one process serves: exit code 0 or 1, for health checks.
@@ -220,6 +224,7 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Login(args) => context::login(args, out).await,
         Command::Context(verb) => context::run(verb, out).await,
         Command::Token(verb) => token::run(verb, out).await,
+        Command::Certificate(verb) => certificate::run(*verb, interrupts(), out).await,
         Command::Doctor(doctor) => doctor::run(&doctor, out).await,
         Command::Health(args) => health::run(args, out).await,
         Command::ExplainError { code } => explain::error(code.as_deref(), out),

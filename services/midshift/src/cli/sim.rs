@@ -95,7 +95,7 @@ pub async fn run(verb: Verb, out: &Out, stop: CancellationToken) -> Result<(), E
     match verb {
         Verb::Run { run, login } => {
             let resolved = login.resolve(Some(&run.server))?;
-            let way = if resolved.is_secure() { Some(resolved.way(&run.server)?) } else { None };
+            let way = if resolved.is_secure() { Some(resolved.way(run.identity.address(&run.server))?) } else { None };
             Ok(swarm(*run, way, stop).await?)
         }
         Verb::Fault(args) => {
