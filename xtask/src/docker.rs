@@ -22,14 +22,30 @@ const DRIVERS: [&str; 2] = ["overlay2", "vfs"];
 /// A stack that is brought up.
 struct Stack {
     file: &'static str,
-    /// Its containers, and how many of them are asked for their health.
+    /// Its containers that stay, and how many of them are asked for their health.
     containers: usize,
     asked: usize,
+    /// What its port for people is called.
+    public: &'static str,
+    /// Which one hands out the first token.
+    identity: &'static str,
 }
 
 const STACKS: [Stack; 2] = [
-    Stack { file: "deploy/compose/one-box.yaml", containers: 2, asked: 1 },
-    Stack { file: "deploy/compose/split.yaml", containers: 11, asked: 8 },
+    Stack {
+        file: "deploy/compose/one-box.yaml",
+        containers: 3,
+        asked: 2,
+        identity: "midshift",
+        public: "MIDSHIFT_ONE_BOX_PORT",
+    },
+    Stack {
+        file: "deploy/compose/split.yaml",
+        containers: 14,
+        asked: 11,
+        identity: "identity",
+        public: "MIDSHIFT_PUBLIC_PORT",
+    },
 ];
 
 /// The daemon is often where only root looks.
@@ -178,7 +194,7 @@ fn stacks(daemon: &Daemon, workspace: &Workspace, temporary: &Path, midshift: &P
     let images = images::make(&|| daemon.docker(), temporary, &workspace.root, midshift)?;
     for stack in &STACKS {
         run::say(stack.file);
-        if !works(stack, daemon, workspace, &images, midshift)? {
+        if !works(stack, daemon, workspace, temporary, &images, midshift)? {
             return Ok(false);
         }
     }
@@ -189,14 +205,15 @@ fn works(
     stack: &Stack,
     daemon: &Daemon,
     workspace: &Workspace,
+    temporary: &Path,
     images: &images::Images,
     midshift: &Path,
 ) -> Result<bool> {
-    let held = [(); 2].map(|()| TcpListener::bind("127.0.0.1:0"));
+    let held = stack::PORTS.map(|name| (name, TcpListener::bind("127.0.0.1:0")));
     let mut ports = Vec::new();
-    for listener in &held {
+    for (name, listener) in &held {
         let listener = listener.as_ref().map_err(|e| anyhow::anyhow!("a free port: {e}"))?;
-        ports.push(listener.local_addr().context("its number")?.port());
+        ports.push((*name, listener.local_addr().context("its number")?.port()));
     }
     drop(held);
     let compose = |arguments: &[&str]| {
@@ -205,21 +222,31 @@ fn works(
         command.env("COMPOSE_PROJECT_NAME", "midshift-suite").env("MIDSHIFT_POSTGRES_PASSWORD", "of-the-suite");
         command.env("MIDSHIFT_IMAGE", images.midshift).env("MIDSHIFT_PROXY_IMAGE", images.proxy);
         command.env("MIDSHIFT_POSTGRES_IMAGE", images.postgresql).env("MIDSHIFT_SITES", workspace.root.join("sites"));
-        // Each stack has its own name for it.
-        command.env("MIDSHIFT_PUBLIC_PORT", ports[0].to_string()).env("MIDSHIFT_ONE_BOX_PORT", ports[0].to_string());
-        command.env("MIDSHIFT_ROBOTS_PORT", ports[1].to_string());
+        command.envs(ports.iter().map(|(name, port)| (name, port.to_string())));
         command
     };
-    let public = format!("127.0.0.1:{}", ports[0]);
+    let of_public = ports.iter().find(|(name, _)| *name == stack.public);
+    let public = format!("127.0.0.1:{}", of_public.context("it publishes none")?.1);
     // It waits for health where the file says so: the robots start last, after the proxy, after everything else.
     let done = run::succeeds(&mut compose(&["up", "-d", "--no-build"]))?
         && all_healthy(daemon, stack)?
-        && crate::stack::task(workspace, midshift, &public)?;
+        && crate::stack::task(workspace, midshift, &public, &site(stack, daemon, temporary, &compose)?)?;
     if !done {
         run::succeeds(&mut compose(&["ps"]))?;
         run::succeeds(&mut compose(&["logs", "--no-color", "--tail", "20"]))?;
     }
     Ok(run::succeeds(&mut compose(&["down", "-v", "-t", "5"]))? && done)
+}
+
+/// What a person would take out of the stack to sign in.
+fn site(stack: &Stack, daemon: &Daemon, to: &Path, compose: &dyn Fn(&[&str]) -> Command) -> Result<crate::stack::Site> {
+    let id = run::output(&mut compose(&["ps", "-q", stack.identity])).context("docker-compose ps")?;
+    let site = crate::stack::Site { root: to.join("ca.pem"), token: to.join("token") };
+    for (from, to) in [("site/ca.pem", &site.root), ("token/token", &site.token)] {
+        let from = format!("{}:/var/lib/midshift-{from}", id.trim());
+        ensure!(run::succeeds(daemon.docker().args(["cp", &from]).arg(to))?, "{from} cannot be copied");
+    }
+    Ok(site)
 }
 
 /// Every container that is asked for its health says that it is healthy, and none of the others ended.

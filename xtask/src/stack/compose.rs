@@ -39,8 +39,12 @@ pub struct Service {
     pub command: Vec<String>,
     /// Its environment.
     pub environment: BTreeMap<String, String>,
-    /// Services that must be healthy before.
+    /// Services that must be healthy, or have done their work, before.
     pub depends_on: Vec<String>,
+    /// Of these, those that end.
+    pub after: Vec<String>,
+    /// It does its work once and ends.
+    pub once: bool,
     /// Folders outside and their paths inside.
     pub volumes: Vec<(String, String)>,
     /// Ports of the machine and inside.
@@ -76,6 +80,8 @@ pub fn read(text: &str, variables: &Variables) -> Result<Vec<Service>> {
         }
     }
     ensure!(!services.is_empty(), "it has no services");
+    let once: Vec<String> = services.iter().flat_map(|service| service.after.clone()).collect();
+    services.iter_mut().for_each(|service| service.once = once.contains(&service.name));
     Ok(services)
 }
 
@@ -96,6 +102,8 @@ impl Reader<'_> {
             command: Vec::new(),
             environment: BTreeMap::new(),
             depends_on: Vec::new(),
+            after: Vec::new(),
+            once: false,
             volumes: Vec::new(),
             ports: Vec::new(),
             health: None,
@@ -119,7 +127,11 @@ impl Reader<'_> {
                 for (on, how) in merged(hash(value)?)? {
                     let condition = merged(hash(&how)?)?.into_iter().find(|(key, _)| key == "condition");
                     let condition = condition.map(|(_, condition)| self.text(&condition)).transpose()?;
-                    ensure!(condition.as_deref() == Some("service_healthy"), "only `service_healthy` is known here");
+                    match condition.as_deref() {
+                        Some("service_healthy") => {}
+                        Some("service_completed_successfully") => service.after.push(on.clone()),
+                        _ => bail!("only `service_healthy` and `service_completed_successfully` are known here"),
+                    }
                     service.depends_on.push(on);
                 }
             }
@@ -288,6 +300,9 @@ services:
         assert!(why(FILE).contains("PASSWORD is not set: set it"));
         assert!(why("services: {a: {privileged: true}}").contains("service a: privileged: the key is not known"));
         assert!(why("services: {a: {depends_on: {b: {condition: service_started}}}}").contains("service_healthy"));
+        let ends = "services: {a: {}, b: {depends_on: {a: {condition: service_completed_successfully}}}}";
+        let once: Vec<bool> = read(ends, &Variables::new()).unwrap().iter().map(|service| service.once).collect();
+        assert_eq!(once, [true, false]);
         assert!(why("services: {a: {healthcheck: {test: [CMD-SHELL, x]}}}").contains("[CMD, program"));
         assert!(why("services: {a: {command: [\"$HOME\"]}}").contains("without braces"));
         assert!(why("configs: {}").contains("`configs` is not known"));

@@ -26,7 +26,16 @@ const LOOK: Duration = Duration::from_millis(200);
 /// A task of the demo site.
 const TASK: [&str; 9] = ["task", "submit", "--from", "A01", "--to", "B03", "--sku", "SKU-1", "--wait"];
 /// Ports that the file publishes; a stack of a test has free ones.
-const PORTS: [&str; 3] = ["MIDSHIFT_PUBLIC_PORT", "MIDSHIFT_ROBOTS_PORT", "MIDSHIFT_ONE_BOX_PORT"];
+pub const PORTS: [&str; 5] = [
+    "MIDSHIFT_PUBLIC_PORT",
+    "MIDSHIFT_ROBOTS_PORT",
+    "MIDSHIFT_MACHINES_PORT",
+    "MIDSHIFT_STOP_PORT",
+    "MIDSHIFT_ONE_BOX_PORT",
+];
+/// What the first start left for whoever signs in, below the folder of volumes.
+const ROOT: &str = "site/ca.pem";
+const TOKEN: &str = "token/token";
 
 /// Which stack.
 #[derive(Args, Clone)]
@@ -151,10 +160,12 @@ fn up(workspace: &Workspace, which: &Which, binary: Option<PathBuf>) -> Result<b
     let public = services.iter().find_map(|s| s.ports.first()).map(|(outside, _)| format!("127.0.0.1:{outside}"));
     let public = public.context("no service has a port for people")?;
     let state = State::begin(&folder, public.clone())?;
+    let site = Site::below(&folder);
     run::say(&format!("{} processes, logs in {}", processes.len(), folder.display()));
     supervise::run(processes, state, || {
-        run::say(&format!("all are healthy; people and programs come in at {public}, without any login (--insecure)"));
-        run::say(&format!("next: midshift robot ls --server {public}"));
+        run::say(&format!("all are healthy; people and programs come in at {public}"));
+        let (root, token) = (site.root.display(), site.token.display());
+        run::say(&format!("next: midshift login {public} --ca {root} --token-file {token}"));
     })
 }
 
@@ -227,7 +238,7 @@ fn down(folder: &Path, volumes: bool) -> Result<bool> {
 pub fn test(workspace: &Workspace, which: &Which, binary: Option<PathBuf>) -> Result<bool> {
     let binary = midshift(workspace, binary)?;
     if let Some(state) = State::find(&which.folder(workspace)?) {
-        return task(workspace, &binary, &state.public);
+        return task(workspace, &binary, &state.public, &Site::below(&state.folder));
     }
     let folder = std::env::temp_dir().join(format!("midshift-stack-test-{}", std::process::id()));
     let state = folder.display().to_string();
@@ -244,7 +255,8 @@ pub fn test(workspace: &Workspace, which: &Which, binary: Option<PathBuf>) -> Re
         start.env(port, free.and_then(|f| f.local_addr()).context("a free port")?.port().to_string());
     }
     let done = run::succeeds(&mut start)?
-        && State::find(&folder).is_some_and(|s| task(workspace, &binary, &s.public).unwrap_or(false));
+        && State::find(&folder)
+            .is_some_and(|s| task(workspace, &binary, &s.public, &Site::below(&folder)).unwrap_or(false));
     if !done {
         run::say(&format!("logs are in {state}"));
         down(&folder, false)?;
@@ -253,7 +265,25 @@ pub fn test(workspace: &Workspace, which: &Which, binary: Option<PathBuf>) -> Re
     run::succeeds(&mut own(&["down", "--volumes"]))
 }
 
+/// What signs in to a stack: files with the site's root and its first token.
+pub struct Site {
+    /// PEM.
+    pub root: PathBuf,
+    /// May do everything.
+    pub token: PathBuf,
+}
+
+impl Site {
+    /// Of a stack with its state in `folder`.
+    fn below(folder: &Path) -> Self {
+        let volumes = folder.join("volumes");
+        Self { root: volumes.join(ROOT), token: volumes.join(TOKEN) }
+    }
+}
+
 /// One task through the public address, to its end.
-pub fn task(workspace: &Workspace, midshift: &Path, public: &str) -> Result<bool> {
-    run::succeeds(workspace.command(midshift).args(TASK).args(["--server", public]))
+pub fn task(workspace: &Workspace, midshift: &Path, public: &str, site: &Site) -> Result<bool> {
+    let mut command = workspace.command(midshift);
+    command.args(TASK).args(["--server", public, "--ca"]).arg(&site.root).arg("--token-file").arg(&site.token);
+    run::succeeds(&mut command)
 }

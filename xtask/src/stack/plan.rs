@@ -46,8 +46,10 @@ pub struct Process {
     pub environment: BTreeMap<String, String>,
     /// Folders to be made before.
     pub folders: Vec<PathBuf>,
-    /// Which must be healthy before.
+    /// Which must be healthy, or have done their work, before.
     pub depends_on: Vec<String>,
+    /// It does its work once and ends.
+    pub once: bool,
     /// Program and arguments that succeed when it is healthy, and how often to ask; none: running is healthy.
     pub health: Option<(PathBuf, Vec<String>, Duration)>,
     /// The signal that asks it to end, without SIG.
@@ -122,6 +124,7 @@ fn process(
         environment,
         folders: volumes.into_iter().map(|(folder, _)| folder).collect(),
         depends_on: service.depends_on.clone(),
+        once: service.once,
         health,
         stop_signal: service.stop_signal.trim_start_matches("SIG").to_owned(),
         grace: service.grace,
@@ -202,13 +205,26 @@ fn folder(source: &str, here: &Path, state: &Path) -> PathBuf {
     if source.starts_with(['.', '/']) { here.join(source) } else { state.join("volumes").join(source) }
 }
 
-/// The same text with a path of a volume as it is on this machine.
+/// The same text with paths of volumes as they are on this machine, wherever they stand whole.
 fn outside(text: &str, volumes: &[(PathBuf, &str)]) -> String {
-    let found = volumes.iter().find_map(|(folder, target)| {
-        let rest = text.strip_prefix(target)?;
-        (rest.is_empty() || rest.starts_with('/')).then(|| format!("{}{rest}", folder.display()))
-    });
-    found.unwrap_or_else(|| text.to_owned())
+    let mut text = text.to_owned();
+    for (folder, target) in volumes {
+        let mut from = 0;
+        while let Some(at) = path_at(&text, target, from) {
+            let path = folder.display().to_string();
+            text.replace_range(at..at + target.len(), &path);
+            from = at + path.len();
+        }
+    }
+    text
+}
+
+fn path_at(text: &str, path: &str, from: usize) -> Option<usize> {
+    let is_name = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+    let found = text.match_indices(path).map(|(at, _)| at).filter(|at| *at >= from);
+    found.into_iter().find(|at| {
+        !text[..*at].ends_with(|c: char| is_name(c) || c == '/') && !text[at + path.len()..].starts_with(is_name)
+    })
 }
 
 #[cfg(test)]
@@ -223,7 +239,7 @@ mod tests {
             variables_of(&std::fs::read_to_string(root.join("deploy/compose/.env.example")).unwrap());
         // Whatever else runs on this machine.
         let free = || TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port().to_string();
-        for port in ["MIDSHIFT_PUBLIC_PORT", "MIDSHIFT_ROBOTS_PORT", "MIDSHIFT_ONE_BOX_PORT"] {
+        for port in crate::stack::PORTS {
             variables.insert(port.to_owned(), free());
         }
         let services = read(&std::fs::read_to_string(&file).unwrap(), &variables).unwrap();
@@ -241,7 +257,8 @@ mod tests {
                 let health = process.health.iter().flat_map(|(_, arguments, _)| arguments);
                 for text in process.arguments.iter().chain(process.environment.values()).chain(health) {
                     assert!(names.iter().all(|name| ports_after(text, name).next().is_none()), "{name}: {text}");
-                    assert!(!text.starts_with("/var/lib") && !text.starts_with("/etc/midshift"), "{name}: {text}");
+                    assert!(!text.contains("/var/lib") && !text.starts_with("/etc/midshift"), "{name}: {text}");
+                    assert!(!text.contains("--insecure"), "{name}: {text}");
                     assert!(!text.contains("0.0.0.0"), "{name}: {text}");
                 }
             }
@@ -252,7 +269,7 @@ mod tests {
     fn the_split_stack_has_each_part_of_its_kind() {
         let (_, processes) = shipped("split.yaml");
         let of = |kind| processes.iter().filter(|p| p.kind == kind).count();
-        assert_eq!((of(Kind::Midshift), of(Kind::Proxy), of(Kind::Postgresql)), (9, 1, 1));
+        assert_eq!((of(Kind::Midshift), of(Kind::Proxy), of(Kind::Postgresql)), (14, 1, 1));
         let gateways: Vec<_> = processes.iter().filter(|p| p.name.starts_with("gateway")).collect();
         assert!(gateways.iter().all(|g| g.folders.contains(&PathBuf::from("/state/volumes/software"))));
         let mut listens: Vec<_> =
@@ -260,8 +277,10 @@ mod tests {
         let all = listens.len();
         listens.sort();
         listens.dedup();
-        // Three containers of robots dial one address.
-        assert_eq!(listens.len(), all - 2);
+        // Three containers of robots dial the same three addresses, of which one is told to who listens there too.
+        assert_eq!(listens.len(), all - 7);
+        let once: Vec<&str> = processes.iter().filter(|p| p.once).map(|p| p.name.as_str()).collect();
+        assert_eq!(once, ["database-keys", "proxy-certificate"]);
     }
 
     #[test]
@@ -274,5 +293,9 @@ mod tests {
         assert_eq!(reached(":7420", "task", &doors), "127.0.0.1:9001");
         assert_eq!(outside("/data/x", &[("/s".into(), "/data")]), "/s/x");
         assert_eq!(outside("/database", &[("/s".into(), "/data")]), "/database");
+        assert_eq!(
+            outside("a=/data/x&b=/data&c=/x/data", &[("/data/s".into(), "/data")]),
+            "a=/data/s/x&b=/data/s&c=/x/data"
+        );
     }
 }

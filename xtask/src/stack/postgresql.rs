@@ -27,8 +27,11 @@ pub fn programs() -> Result<PathBuf> {
 
 /// Makes its files and its database before the first start.
 pub fn prepare(process: &Process) -> Result<()> {
-    let folder = process.folders.first().context("it needs a folder")?;
+    let (folder, others) = process.folders.split_first().context("it needs a folder")?;
     let data = folder.join("data");
+    for other in others {
+        give_keys(other)?;
+    }
     if data.join("PG_VERSION").exists() {
         return Ok(());
     }
@@ -53,6 +56,17 @@ pub fn prepare(process: &Process) -> Result<()> {
     single.stdin(std::fs::File::open(&script).context("reading a statement")?);
     said(as_user(&mut single))?;
     std::fs::remove_file(&script).context("removing a statement")
+}
+
+/// The server takes a key only from a file of its own user.
+fn give_keys(folder: &Path) -> Result<()> {
+    if let Some((uid, gid)) = unprivileged()? {
+        for entry in std::fs::read_dir(folder).with_context(|| format!("reading {}", folder.display()))? {
+            let path = entry.context("an entry")?.path();
+            std::os::unix::fs::chown(&path, Some(uid), Some(gid)).context("giving a key of the database away")?;
+        }
+    }
+    Ok(())
 }
 
 fn said(command: &mut Command) -> Result<()> {

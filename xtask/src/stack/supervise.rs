@@ -78,10 +78,15 @@ fn look(held: &mut [Held], state: &mut State) -> Result<()> {
         if let Some(child) = &mut one.child
             && let Some(status) = child.try_wait().context("looking at a process")?
         {
+            if one.process.once && status.success() {
+                (one.child, one.healthy) = (None, true);
+                continue;
+            }
             run::say(&format!("{} ended: {status}; it is started again", one.process.name));
             (one.child, one.healthy, one.next) = (None, false, Instant::now() + AGAIN);
         }
-        if Instant::now() < one.next {
+        // What has done its work is not done again.
+        if Instant::now() < one.next || (one.process.once && one.healthy) {
             continue;
         }
         if one.child.is_none() {
@@ -92,7 +97,7 @@ fn look(held: &mut [Held], state: &mut State) -> Result<()> {
                 one.child = Some(child);
                 one.next = Instant::now() + ASK;
             }
-        } else if !one.healthy {
+        } else if !one.healthy && !one.process.once {
             one.healthy = is_healthy(&one.process);
             let every = one.process.health.as_ref().map_or(ASK, |(_, _, every)| *every);
             one.next = Instant::now() + every.min(ASK);
