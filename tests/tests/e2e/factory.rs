@@ -2,6 +2,7 @@
 //! PostgreSQL behind the proxy, with robots as programs too.
 
 use crate::harness::{Running, channel, free_port, midshift, until};
+use crate::robots::enrolment;
 use crate::rolled_out::{Robot, call, done};
 use crate::room::LIMIT;
 use crate::stack::Stack;
@@ -68,10 +69,11 @@ pub async fn with_software(dir: &Path, robots: usize) -> anyhow::Result<(Stack, 
     let stack = Stack::start(dir, DEMO, &[], &["--ota-keys", &keys]).await?;
     let (public, door) = (stack.public.to_string(), stack.robots.to_string());
     let ids: Vec<String> = (1..=robots).map(|number| format!("rbt-{number:02}")).collect();
-    let launch = |(number, id): (usize, &String)| {
-        Robot::launch(id, &format!("park-{}", number + 1), &dir.join(id), &samples, &door, None, None)
-    };
-    let launched = ids.iter().enumerate().map(launch).collect::<anyhow::Result<Vec<_>>>()?;
+    let mut launched = Vec::with_capacity(robots);
+    for (number, id) in ids.iter().enumerate() {
+        let (start, enrolment) = (format!("park-{}", number + 1), enrolment(stack.public, id).await?);
+        launched.push(Robot::launch(id, &start, &dir.join(id), &samples, &door, None, enrolment.as_deref())?);
+    }
     done(&["bundle", "push", "--server", &public, &samples.join("repository").display().to_string()])?;
     for id in &ids {
         until("the robot is known", LIMIT, async || {

@@ -3,7 +3,7 @@
 //! What differs from run to run (times, etags, positions in a log) stands there as its kind. Of a stream the first documents stand there.
 
 use crate::engine::fresh_store;
-use crate::harness::{Running, channel, first_sign_in, free_port, midshift, sign_in, sign_in_second, until};
+use crate::harness::{Running, channel, free_port, midshift, sign_in, sign_in_second, sign_in_to, until};
 use crate::room::{LIMIT, Room};
 use anyhow::Context;
 use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
@@ -212,7 +212,7 @@ async fn releases(room: &Room, t: &mut Transcript) -> anyhow::Result<()> {
     command.args(["serve", "--data", "served", "--ota-keys", "keys", "--listen", &address.to_string()]);
     command.args(["--site", "site.toml", "--first-token-file", "served-token"]).args(fresh_store()?);
     let _serve = Running::start(command.current_dir(&t.dir), &t.dir.join("serve.log"))?;
-    first_sign_in(address, &t.dir.join("served"), &t.dir.join("served-token")).await?;
+    sign_in_to(address, t.dir.join("served/identity/ca.pem"), &t.dir.join("served-token")).await?;
     until("the server of software", LIMIT, || async {
         let mut client = BundleServiceClient::new(channel(address)?);
         Ok(client.list_bundles(ListBundlesRequest::default()).await.ok().map(|_| ()))

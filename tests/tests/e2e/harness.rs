@@ -214,6 +214,35 @@ pub fn has_login(address: SocketAddr) -> bool {
     known(address).is_some()
 }
 
+/// Waits for the first token of a new site, which comes into the file `token`, and remembers the site: its identity is at `address`.
+pub async fn sign_in_to(address: SocketAddr, authority: PathBuf, token: &Path) -> anyhow::Result<()> {
+    let token = until("the first token", Duration::from_secs(30), async || {
+        let token = std::fs::read_to_string(token).unwrap_or_default();
+        Ok(token.ends_with('\n').then(|| token.trim().to_owned()))
+    });
+    let token = token.await?;
+    let way = Way::secure(&address.to_string(), &std::fs::read_to_string(&authority)?, Some(&token))?;
+    let identity = IdentityServiceClient::new(way.lazy());
+    let grants = vec!["ota-approver".to_owned()];
+    let request = CreateTokenRequest { name: "second".to_owned(), grants, valid_seconds: 86_400 };
+    let second = until("a second token", Duration::from_secs(30), || {
+        let (mut identity, request) = (identity.clone(), request.clone());
+        async move { Ok(identity.create_token(request).await.ok().map(|made| made.into_inner().secret)) }
+    })
+    .await?;
+    for token in [&token, &second] {
+        keep_secret("a token", secret_part(token)?);
+    }
+    let site = Known { authority, token, second, way };
+    KNOWN.lock().unwrap_or_else(PoisonError::into_inner).insert(address, site);
+    Ok(())
+}
+
+/// The token of this program for the site at `address`, if that has a login.
+pub fn token(address: SocketAddr) -> Option<String> {
+    known(address).map(|site| site.token)
+}
+
 /// Another port of the site that `of` is known for.
 pub fn same_site(of: SocketAddr, port: SocketAddr) -> anyhow::Result<()> {
     let Some(site) = known(of) else { return Ok(()) };
@@ -255,32 +284,6 @@ pub fn second(arguments: &[&str]) -> anyhow::Result<Command> {
         sign_in_second(&mut command, address);
     }
     Ok(command)
-}
-
-/// Waits for the first token of a new site with this data, and remembers the site: whoever asks at `address` is signed in from now on.
-pub async fn first_sign_in(address: SocketAddr, data: &Path, token: &Path) -> anyhow::Result<()> {
-    let token = until("the first token", Duration::from_secs(30), async || {
-        let token = std::fs::read_to_string(token).unwrap_or_default();
-        Ok(token.ends_with('\n').then(|| token.trim().to_owned()))
-    })
-    .await?;
-    let authority = data.join("identity/ca.pem");
-    let way = Way::secure(&address.to_string(), &std::fs::read_to_string(&authority)?, Some(&token))?;
-    let identity = IdentityServiceClient::new(way.lazy());
-    let grants = vec!["ota-approver".to_owned()];
-    let request = CreateTokenRequest { name: "second".to_owned(), grants, valid_seconds: 86_400 };
-    let second = until("a second token", Duration::from_secs(30), || {
-        let (mut identity, request) = (identity.clone(), request.clone());
-        async move { Ok(identity.create_token(request).await.ok().map(|made| made.into_inner().secret)) }
-    })
-    .await?;
-    for token in [&token, &second] {
-        keep_secret("a token", secret_part(token)?);
-    }
-    let key = std::fs::read_to_string(data.join("identity/authority.pem"))?;
-    keep_secret("the authority's key", key.lines().nth(1).context("a key in PEM")?);
-    KNOWN.lock().unwrap_or_else(PoisonError::into_inner).insert(address, Known { authority, token, second, way });
-    Ok(())
 }
 
 /// A `midshift serve` on a data directory and a store, which can be killed and started again.
@@ -331,7 +334,11 @@ impl Server {
     }
     async fn sign_in(&self) -> anyhow::Result<()> {
         let said = || std::fs::read_to_string(self.dir.join("server.log")).unwrap_or_default();
-        first_sign_in(self.address, &self.data(), &self.dir.join("token")).await.with_context(said)
+        let authority = self.data().join("identity/ca.pem");
+        sign_in_to(self.address, authority, &self.dir.join("token")).await.with_context(said)?;
+        let key = std::fs::read_to_string(self.data().join("identity/authority.pem"))?;
+        keep_secret("the authority's key", key.lines().nth(1).context("a key in PEM")?);
+        Ok(())
     }
     /// SIGKILL and a new start on the same data.
     pub async fn kill_and_restart(&mut self) -> anyhow::Result<()> {
@@ -404,10 +411,12 @@ pub async fn in_states(address: SocketAddr, states: &[TaskState]) -> anyhow::Res
 
 /// A channel that connects when it is used, signed in if the site has a login.
 pub fn channel(address: SocketAddr) -> anyhow::Result<Line> {
-    Ok(match known(address) {
-        Some(site) => site.way.lazy(),
-        None => Way::plain(&address.to_string())?.lazy(),
-    })
+    Ok(way(address)?.lazy())
+}
+
+/// The way to an address, over TLS and signed in if the site has a login.
+pub fn way(address: SocketAddr) -> anyhow::Result<Way> {
+    known(address).map_or_else(|| Way::plain(&address.to_string()), |site| Ok(site.way))
 }
 
 #[test]

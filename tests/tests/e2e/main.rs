@@ -16,6 +16,7 @@ mod clients;
 mod cut;
 mod engine;
 mod factory;
+mod followed;
 mod golden_cli;
 mod handed_over;
 mod harness;

@@ -144,7 +144,7 @@ async fn cut_off(sever: fn(&Line), seed: u64) -> anyhow::Result<()> {
     sever(&stack.line);
     say!("seed {seed}: a gateway with {} robots has lost its database", before.len());
     until("the gateway to say that it is not ready", LIMIT, || async {
-        Ok(is_ready(gateway).is_some_and(|ready| !ready).then_some(()))
+        Ok(is_ready(gateway).await.is_some_and(|ready| !ready).then_some(()))
     })
     .await?;
     until("every robot online, those of the gateway in newer sessions", LIMIT, || async {
@@ -170,12 +170,12 @@ async fn cut_off(sever: fn(&Line), seed: u64) -> anyhow::Result<()> {
     // Work goes on meanwhile, also that of the robots that moved.
     let done = in_states(stack.public, &[TaskState::Succeeded]).await?;
     at_work(stack.public, done.map_or(0, |done| done.len()) + 10, &BTreeSet::new()).await?;
-    ensure!(is_ready(gateway) == Some(false), "it says that it is ready without a database");
+    ensure!(is_ready(gateway).await == Some(false), "it says that it is ready without a database");
     assert_eq!(begun(&stack.said("telemetry", 0)?).len(), sessions, "it began a session without its database");
 
     stack.line.heal();
     until("the gateway to be ready again", LIMIT, || async {
-        Ok(is_ready(gateway).is_some_and(|ready| ready).then_some(()))
+        Ok(is_ready(gateway).await.is_some_and(|ready| ready).then_some(()))
     })
     .await?;
     // It has what it missed: it says the same as the other one.

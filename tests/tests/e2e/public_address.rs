@@ -1,44 +1,42 @@
-//! One public address: a stock proxy with the configuration that is shipped, before a server, for people, programs and robots.
+//! One public address: a stock proxy with the configuration that is shipped, before the services of a site, for people, programs and robots, over TLS.
 
-use crate::clients::{grpcurl, http1, text};
-use crate::harness::{Running, channel, free_port, midshift, tool, until};
+use crate::clients::text;
+use crate::harness::{channel, folder, midshift, sign_in, tool, until};
+use crate::robots::Robots;
+use crate::stack::Stack;
+use midshift_core::site::{DEMO, text as site_text};
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
-use midshift_proto::telemetry::v1::{ListRobotsRequest, Presence, RobotFilter};
-use std::net::SocketAddr;
+use midshift_proto::telemetry::v1::{ListRobotsRequest, Presence};
 use std::path::Path;
-use std::process::Command;
+use std::process::{Command, Output};
 use std::time::Duration;
 
-/// The proxy before one process that has every service: where people go, and where robots go.
-fn proxy(server: SocketAddr, log: &Path) -> anyhow::Result<(SocketAddr, SocketAddr, Running)> {
-    let (public, robots) = (free_port()?, free_port()?);
-    let configuration = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/proxy/haproxy.cfg");
-    let mut command = Command::new(tool("MIDSHIFT_TEST_HAPROXY")?);
-    command.args(["-db", "-f", configuration]);
-    for service in ["TASK", "FLEET", "TELEMETRY", "OTA", "GATEWAY"] {
-        command.env(format!("MIDSHIFT_{service}"), server.to_string());
-    }
-    command.env("MIDSHIFT_PUBLIC", public.to_string()).env("MIDSHIFT_ROBOTS", robots.to_string());
-    Ok((public, robots, Running::start(&mut command, log)?))
+/// A stock client that knows the site's root and a token, both from files.
+fn grpcurl(dir: &Path, arguments: &[&str]) -> anyhow::Result<Output> {
+    let token = std::fs::read_to_string(dir.join("token"))?;
+    let mut command = Command::new(tool("MIDSHIFT_TEST_GRPCURL")?);
+    command.args(["-max-time", "10", "-cacert"]).arg(dir.join("ca.pem"));
+    command.args(["-H", &format!("authorization: Bearer {}", token.trim())]).args(arguments);
+    Ok(command.output()?)
 }
+
+/// Prints a page that is read over HTTP/1.1.
+const PAGE: &str = r#"
+import ssl, sys, urllib.request
+asked = urllib.request.Request(sys.argv[1], headers={"Authorization": "Bearer " + open(sys.argv[3]).read().strip()})
+print(urllib.request.urlopen(asked, context=ssl.create_default_context(cafile=sys.argv[2]), timeout=10).read().decode())
+"#;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn people_programs_and_robots_come_through_the_shipped_proxy() -> anyhow::Result<()> {
-    let dir = tempfile::tempdir()?;
-    let server = free_port()?;
-    // In real time, as the robot that comes later has it.
-    let mut command = Command::new(midshift()?);
-    command.args(["dev", "--robots", "4", "--seed", "3", "--listen", &server.to_string()]);
-    let _dev = Running::start(&mut command, &dir.path().join("dev.log"))?;
-    let (public, robots, _proxy) = proxy(server, &dir.path().join("proxy.log"))?;
-    until("the proxy's first answer", Duration::from_secs(30), || async {
-        let answer = TelemetryServiceClient::new(channel(public)?).list_robots(ListRobotsRequest::default()).await;
-        Ok(answer.ok().filter(|page| page.get_ref().robots.len() == 4).map(|_| ()))
-    })
-    .await?;
-    let public = public.to_string();
+    let dir = folder()?;
+    let site = site_text::parse(DEMO)?;
+    let stack = Stack::start(dir.path(), DEMO, &["--no-software"], &[]).await?;
+    let _robots = Robots::start(dir.path(), stack.robots, stack.public, &site, 4).await?;
+    let address = stack.public;
+    let public = address.to_string();
     // Every service is shown, and each path reaches its own.
-    let services = text(&grpcurl(&[&public, "list"])?.stdout);
+    let services = text(&grpcurl(dir.path(), &[&public, "list"])?.stdout);
     for service in
         ["task.v1.TaskService", "fleet.v1.FleetService", "telemetry.v1.TelemetryService", "ota.v1.RolloutService"]
     {
@@ -48,14 +46,18 @@ async fn people_programs_and_robots_come_through_the_shipped_proxy() -> anyhow::
         "midshift.fleet.v1.FleetService/ListIncidents",
         "midshift.telemetry.v1.TelemetryService/ListRobots",
         "midshift.ota.v1.RolloutService/ListRollouts",
+        "midshift.identity.v1.IdentityService/WhoAmI",
+        "midshift.identity.v1.AuditService/ListAudit",
     ];
     for path in paths {
-        let answer = grpcurl(&["-d", "{}", &public, path])?;
+        let answer = grpcurl(dir.path(), &["-d", "{}", &public, path])?;
         assert!(answer.status.success(), "{path}: {}", text(&answer.stderr));
     }
     // A task, and the stream that waits for its end; errors come whole.
     let run = |arguments: &[&str]| {
-        Command::new(midshift()?).args(arguments).args(["--server", &public]).output().map_err(anyhow::Error::from)
+        let mut command = Command::new(midshift()?);
+        sign_in(&mut command, address);
+        command.args(arguments).args(["--server", &public]).output().map_err(anyhow::Error::from)
     };
     let done = run(&["task", "submit", "--from", "A01", "--to", "B03", "--sku", "SKU-1", "--wait"])?;
     assert!(done.status.success(), "{}", text(&done.stderr));
@@ -63,20 +65,17 @@ async fn people_programs_and_robots_come_through_the_shipped_proxy() -> anyhow::
     let said = text(&refused.stderr);
     assert!(said.contains("nowhere") && said.contains("elsewhere"), "{said}");
     // HTTP/1.1 on the same address.
-    let address: SocketAddr = public.parse()?;
-    let page = http1(address, "GET /metrics HTTP/1.1\r\nHost: midshift\r\nConnection: close\r\n\r\n")?;
-    assert!(page.starts_with("HTTP/1.1 200") && page.contains("midshift_telemetry_heartbeats_total"), "{page}");
+    let mut python = Command::new(tool("MIDSHIFT_TEST_PYTHON")?);
+    python.args(["-c", PAGE, &format!("https://{public}/metrics")]).arg(dir.path().join("ca.pem"));
+    let page = python.arg(dir.path().join("token")).output()?;
+    assert!(text(&page.stdout).contains("midshift_"), "{} {}", text(&page.stdout), text(&page.stderr));
     // Robots have an address of their own, and none here.
-    let link = grpcurl(&["-d", "{}", &public, "midshift.link.v1.LinkService/Session"])?;
+    let link = grpcurl(dir.path(), &["-d", "{}", &public, "midshift.link.v1.LinkService/Session"])?;
     assert!(!link.status.success() && text(&link.stderr).contains("404"), "{}", text(&link.stderr));
-    let mut agent = Command::new(midshift()?);
-    agent.args(["agent", "run", "--robot-id", "rbt-77", "--start", "hold-pack", "--server", &robots.to_string()]);
-    let _agent = Running::start(agent.arg("--data").arg(dir.path().join("rbt-77")), &dir.path().join("agent.log"))?;
-    until("the robot behind the proxy", Duration::from_secs(30), || async {
-        let filter = RobotFilter { robot_ids: vec!["rbt-77".to_owned()], ..RobotFilter::default() };
-        let request = ListRobotsRequest { filter: Some(filter), ..ListRobotsRequest::default() };
-        let found = TelemetryServiceClient::new(channel(address)?).list_robots(request).await?.into_inner().robots;
-        Ok(found.first().filter(|robot| robot.presence() == Presence::Online).map(|_| ()))
+    until("the robots behind the proxy", Duration::from_secs(30), || async {
+        let page = TelemetryServiceClient::new(channel(address)?).list_robots(ListRobotsRequest::default()).await?;
+        let online = page.get_ref().robots.iter().filter(|robot| robot.presence() == Presence::Online).count();
+        Ok((online == 4).then_some(()))
     })
     .await
 }

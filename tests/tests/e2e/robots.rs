@@ -1,6 +1,7 @@
 //! Robots as programs of their own.
 
-use crate::harness::{LOG, Running, channel, has_login, keep_secret, midshift, secret_part, until};
+use crate::harness::{LOG, Running, channel, has_login, keep_secret, midshift, secret_part, sign_in, until};
+use crate::stack::tell_identity;
 use anyhow::Context;
 use midshift_agent::device::DeviceKey;
 use midshift_agent::enrolment::enrol;
@@ -95,6 +96,8 @@ impl Robots {
             command.args(["sim", "run", "--server", &robots.server, "--robots", &count.to_string(), "--no-faults"]);
             command.args(["--no-stop", "--only", &format!("{from}..{to}"), "--seed", "1"]).arg("--data").arg(dir);
             command.arg("--site").arg(site).arg("--trust").arg(trust);
+            sign_in(&mut command, server);
+            tell_identity(&mut command, &robots.server);
             robots.crowds.push(Running::start(&mut command, &dir.join(format!("crowd-{nth}.log")))?);
         }
         Ok(robots)
@@ -156,6 +159,7 @@ impl Robots {
         if let Some(secret) = enrolment {
             command.args(["--enroll", secret]);
         }
+        tell_identity(&mut command, &self.server);
         Running::start(command.env("MIDSHIFT_LOG", LOG), &dir.join("agent.log"))
     }
     /// SIGKILL.

@@ -5,6 +5,7 @@ use crate::harness::{Running, Server, command, midshift, second, until};
 use crate::robots::BODY_SPEED;
 use crate::robots::enrolment;
 use crate::room::LIMIT;
+use crate::stack::tell_identity;
 use anyhow::{Context, ensure};
 use midshift_agent::launcher::SWITCH;
 use midshift_agent::sets::Sets;
@@ -62,6 +63,7 @@ impl Robot {
             Some(stops) => command.args(["--stop-server", &stops.to_string()]),
             None => command.arg("--no-stop"),
         };
+        tell_identity(&mut command, server);
         Ok(Self { running: Running::start(&mut command, &home.join("log"))?, sets })
     }
     /// Its switch record.

@@ -2,7 +2,7 @@
 
 use crate::harness::{channel, until};
 use crate::robots::Robots;
-use crate::rolled_out::{call, done, trust};
+use crate::rolled_out::{begin_rollout, call, done, trust};
 use crate::stack::Stack;
 use anyhow::{Context, ensure};
 use midshift::clock::clock;
@@ -73,8 +73,9 @@ impl Rolling {
     pub async fn begin(stack: &Stack, samples: &Path, id: &'static str, robots: usize) -> anyhow::Result<Self> {
         let public = stack.public.to_string();
         done(&["bundle", "push", "--server", &public, &samples.join("repository").display().to_string()])?;
-        let quick = ["--waves", WAVES, "--soak", "5s", "--probation", "5s", "--exposure-tasks", "0", "--start"];
+        let quick = ["--waves", WAVES, "--soak", "5s", "--probation", "5s", "--exposure-tasks", "0"];
         done(&[&["rollout", "create", "--server", &public, id][..], &quick].concat())?;
+        begin_rollout(&public, id)?;
         let (enough, address) = (CancellationToken::new(), stack.public);
         let most = looked_at(address, id, robots, enough.clone());
         Ok(Self { id, public: address, robots, looking: AbortOnDropHandle::new(tokio::spawn(most)), enough })

@@ -4,7 +4,7 @@ use crate::factory::with_software;
 use crate::harness::{channel, folder, in_states, until};
 use crate::kill::{TASKS, all_over, at_work, judge, judge_ledgers, submit};
 use crate::robots::Robots;
-use crate::rolled_out::{call, done};
+use crate::rolled_out::{begin_rollout, call, done};
 use crate::rolling::{self, Rolling};
 use crate::room::LIMIT;
 use crate::stack::Stack;
@@ -28,7 +28,8 @@ const CROWDS: usize = 3;
 const TASKS_EACH: usize = 3;
 
 /// What happens to the stack, one after the other, and what a line says of it.
-const BLOWS: [(&str, Blow); 15] = [
+const BLOWS: [(&str, Blow); 16] = [
+    ("kill -9 of identity", Blow::Kill("identity", 0)),
     ("kill -9 of a fleet", Blow::Kill("fleet", 0)),
     ("kill -9 of the other fleet", Blow::Kill("fleet", 1)),
     ("kill -9 of a gateway", Blow::Kill("telemetry", 0)),
@@ -218,8 +219,9 @@ async fn a_roll_out_goes_on_while_processes_that_plan_it_sign_it_and_hand_it_out
     let (mut stack, robots) = with_software(dir.path(), 3).await?;
     let public = stack.public.to_string();
     let begin = |id: &str| {
-        let quick = ["--soak", "0s", "--probation", "1s", "--exposure-tasks", "0", "--start"];
-        done(&[&["rollout", "create", "--server", &public, id, "--waves", "1,rest"][..], &quick].concat())
+        let quick = ["--soak", "0s", "--probation", "1s", "--exposure-tasks", "0"];
+        done(&[&["rollout", "create", "--server", &public, id, "--waves", "1,rest"][..], &quick].concat())?;
+        begin_rollout(&public, id)
     };
     let blows: [(&'static str, usize); 4] = [("ota", 0), ("ota", 1), ("telemetry", 0), ("fleet", 0)];
     begin("walk-1.5.0")?;
