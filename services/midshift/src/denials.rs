@@ -48,7 +48,7 @@ fn chain(path: &str) -> Writer {
         Some(Role::Task) => Writer::Task,
         Some(Role::Fleet) => Writer::Fleet,
         Some(Role::Ota) => Writer::Ota,
-        Some(Role::Telemetry | Role::Identity) | None => Writer::Identity,
+        Some(Role::Telemetry | Role::Identity | Role::StopFollower) | None => Writer::Identity,
     }
 }
 

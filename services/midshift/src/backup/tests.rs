@@ -11,7 +11,7 @@ use midshift_core::rows::{Expect, Index, Item, Key, RowChange, Seq, Table, Write
 use midshift_core::time::Utc;
 use midshift_ota::content::{Content, DiskContent, Held, Room, Wanted};
 use midshift_ota::folder::{Owner, mark};
-use midshift_ota::repository::{OnlineKeys, Repository, raise_floor};
+use midshift_ota::repository::{Act, OnlineKeys, Repository, raise_floor};
 use midshift_ota::{OtaService, Parts};
 use midshift_store::{FRAME_BYTES_DEFAULT, Frame, FrameLog, SqliteFrames, SqliteStore, Store};
 use std::fs;
@@ -164,7 +164,8 @@ pub async fn release(dir: &Path, data: &Path, version: u64) -> std::path::PathBu
     assert_eq!(content.settle(file).await.expect("asked"), Held::Whole);
     let key = SecretKey::read(&keys.join("targets-1.pem")).expect("a key");
     let targets = sign_targets(None, &[target], &[], NOW.plus_ms(PEOPLE_LIFE_MS), &[&key]).expect("signed");
-    repository.publish(vec![root], targets, 0, NOW).await.expect("published");
+    let act = Act { by: "release".to_owned(), at: NOW };
+    repository.publish(vec![root], targets, 0, act).await.expect("published");
     keys
 }
 
