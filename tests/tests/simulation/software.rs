@@ -14,7 +14,7 @@ use midshift_core::limits;
 use midshift_core::time::{Clock, Utc};
 use midshift_ota::content::{Content, DiskContent, Room, Wanted};
 use midshift_ota::folder::Owner;
-use midshift_ota::repository::{OnlineKeys, Repository};
+use midshift_ota::repository::{Act, OnlineKeys, Repository};
 use midshift_ota::{OtaService, Parts};
 use midshift_sim::behaviour::COMPONENT;
 use midshift_sim::body::MODEL;
@@ -134,7 +134,8 @@ impl Software {
         }
         let keys = OnlineKeys::read(&self.keys())?;
         let repository = Repository::open(&self.folder().join("metadata"), keys, Arc::new(content)).await?;
-        repository.publish(vec![root], targets, 0, now).await?;
+        let act = Act { by: "release".to_owned(), at: now };
+        repository.publish(vec![root], targets, 0, act).await?;
         Ok(())
     }
     fn keys(&self) -> PathBuf {

@@ -238,7 +238,8 @@ async fn a_cut_at_any_write_leaves_a_repository_that_robots_believe() {
         let roots = vec![root(2, rotated, in_a_year(), &[SEEDS.root, rotated.root])];
         let document = targets(Some(&first), &more, rotated.targets);
         let before = room.repository.newest();
-        let publication = room.repository.prepare(before.as_deref(), roots.clone(), document.clone(), START).await;
+        let publication =
+            room.repository.prepare(before.as_deref(), roots.clone(), document.clone(), START.into()).await;
         let writes = publication.expect("it holds").writes;
         for (name, bytes) in &writes[..cut] {
             write_whole(&room.metadata().join(name), bytes).expect("written");
