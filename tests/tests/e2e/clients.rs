@@ -2,15 +2,22 @@
 //! address: a split stack is asked for the same in `languages.rs`.
 
 use crate::factory::Factory;
-use crate::harness::tool;
+use crate::harness::{authority, sign_in, token, tool};
 use std::net::SocketAddr;
 use std::path::Path;
 use std::process::{Command, Output};
 use std::time::Duration;
 
-/// Runs grpcurl.
-pub fn grpcurl(args: &[&str]) -> anyhow::Result<Output> {
-    Ok(Command::new(tool("MIDSHIFT_TEST_GRPCURL")?).arg("-plaintext").args(["-max-time", "60"]).args(args).output()?)
+/// Runs grpcurl with `flags` on `what` of the server at `address`, signed in if that has a login.
+pub fn grpcurl(address: SocketAddr, flags: &[&str], what: &str) -> anyhow::Result<Output> {
+    let mut command = Command::new(tool("MIDSHIFT_TEST_GRPCURL")?);
+    match token(address) {
+        Some(token) => {
+            command.arg("-cacert").arg(authority(address)?).args(["-H", &format!("authorization: Bearer {token}")])
+        }
+        None => command.arg("-plaintext"),
+    };
+    Ok(command.args(["-max-time", "60"]).args(flags).args([&address.to_string(), what]).output()?)
 }
 
 /// What a program said.
@@ -56,8 +63,7 @@ async fn grpcurl_lists_submits_watches_and_hears_every_violation() -> anyhow::Re
 
 /// The whole of what grpcurl is asked to do.
 pub fn grpcurl_passes(address: SocketAddr) -> anyhow::Result<()> {
-    let address = address.to_string();
-    let services = text(&grpcurl(&[&address, "list"])?.stdout);
+    let services = text(&grpcurl(address, &[], "list")?.stdout);
     for service in [
         "midshift.task.v1.TaskService",
         "midshift.fleet.v1.FleetService",
@@ -69,11 +75,11 @@ pub fn grpcurl_passes(address: SocketAddr) -> anyhow::Result<()> {
     // They answer on a port of their own.
     assert!(!services.contains("midshift.stop.v1"), "{services}");
     let good = r#"{"request_id":"g1","task_id":"TASK-GRPCURL","flat":{"task_type":"transport","priority":0,"from_waypoint":"A01","to_waypoint":"B03","item_sku":"SKU-1","timeout_seconds":600}}"#;
-    let submitted = grpcurl(&["-d", good, &address, "midshift.task.v1.TaskService/SubmitTask"])?;
+    let submitted = grpcurl(address, &["-d", good], "midshift.task.v1.TaskService/SubmitTask")?;
     assert!(submitted.status.success(), "{}", text(&submitted.stderr));
     assert!(text(&submitted.stdout).contains("TASK-GRPCURL"));
     let bad = r#"{"flat":{"task_type":"Bad Type","priority":12,"to_waypoint":"nowhere"}}"#;
-    let refused = grpcurl(&["-d", bad, &address, "midshift.task.v1.TaskService/SubmitTask"])?;
+    let refused = grpcurl(address, &["-d", bad], "midshift.task.v1.TaskService/SubmitTask")?;
     let said = text(&refused.stderr);
     assert!(!refused.status.success());
     for field in ["InvalidArgument", "flat.task_type", "flat.priority", "flat.to_waypoint", "flat.timeout_seconds"] {
@@ -81,18 +87,21 @@ pub fn grpcurl_passes(address: SocketAddr) -> anyhow::Result<()> {
     }
     assert!(said.contains(r#""fieldViolations""#), "its details cannot be read: {said}");
     let watch = r#"{"filter":{"task_ids":["TASK-GRPCURL"]}}"#;
-    let watched = Command::new(tool("MIDSHIFT_TEST_GRPCURL")?)
-        .args(["-plaintext", "-max-time", "60", "-d", watch, &address, "midshift.task.v1.TaskService/WatchTasks"])
-        .output()?;
+    let watched = grpcurl(address, &["-d", watch], "midshift.task.v1.TaskService/WatchTasks")?;
     let seen = text(&watched.stdout);
     assert!(seen.contains("TASK-GRPCURL") && seen.contains("TASK_STATE_SUCCEEDED"), "{seen} {}", text(&watched.stderr));
     Ok(())
 }
 
 const CLIENT: &str = r#"
-import sys, grpc
+import os, sys, grpc
 from midshift.task.v1 import task_pb2, task_service_pb2, task_service_pb2_grpc
-channel = grpc.insecure_channel(sys.argv[1])
+if "MIDSHIFT_CA" in os.environ:
+    tls = grpc.ssl_channel_credentials(open(os.environ["MIDSHIFT_CA"], "rb").read())
+    signed_in = grpc.access_token_call_credentials(os.environ["MIDSHIFT_TOKEN"])
+    channel = grpc.secure_channel(sys.argv[1], grpc.composite_channel_credentials(tls, signed_in))
+else:
+    channel = grpc.insecure_channel(sys.argv[1])
 client = task_service_pb2_grpc.TaskServiceStub(channel)
 flat = task_pb2.FlatTask(task_type="transport", priority=0, from_waypoint="A02", to_waypoint="B01", item_sku="SKU-2", timeout_seconds=600)
 task = client.SubmitTask(task_service_pb2.SubmitTaskRequest(request_id="py-1", flat=flat), timeout=10).task
@@ -141,7 +150,9 @@ pub fn stock_python_passes(dir: &Path, address: SocketAddr) -> anyhow::Result<()
     assert!(generated.status.success(), "{}", text(&generated.stderr));
     let script = dir.join("client.py");
     std::fs::write(&script, CLIENT)?;
-    let ran = Command::new(&python).arg(&script).arg(address.to_string()).env("PYTHONPATH", dir).output()?;
+    let mut command = Command::new(&python);
+    sign_in(&mut command, address);
+    let ran = command.arg(&script).arg(address.to_string()).env("PYTHONPATH", dir).output()?;
     assert!(ran.status.success(), "{} {}", text(&ran.stdout), text(&ran.stderr));
     assert!(text(&ran.stdout).contains("TASK_STATE_SUCCEEDED"));
     Ok(())

@@ -258,7 +258,7 @@ async fn a_cut_at_any_write_leaves_a_repository_that_robots_believe() {
         assert_eq!(room.shown_to(&believed, START).await.expect("believed").targets.len(), 4);
         if is_published {
             assert_eq!(writes.last().expect("writes").0, "timestamp.json");
-            assert_eq!(cut, 5, "root, seen, targets, snapshot, timestamp");
+            assert_eq!(cut, 6, "root, seen, by, targets, snapshot, timestamp");
             break;
         }
         cut += 1;

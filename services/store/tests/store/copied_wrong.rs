@@ -153,7 +153,7 @@ async fn a_table_that_the_user_may_not_read_whole_is_named_and_not_left_out() {
     let config = used().await;
     let mut owner = stranger(&config).await;
     let name: String = sqlx::query_scalar("SELECT current_database()").fetch_one(&mut owner).await.unwrap();
-    let reader = PostgresConfig::new(config.url.replacen("//postgres@", &format!("//reader_of_{name}@"), 1));
+    let reader = PostgresConfig::new(config.url.replacen("//postgres:", &format!("//reader_of_{name}:"), 1));
     let steps = [
         (
             "CREATE ROLE {} LOGIN; GRANT USAGE ON SCHEMA control TO {}; GRANT SELECT ON ALL TABLES IN SCHEMA control TO {}",
