@@ -69,17 +69,24 @@ mod tests {
     async fn a_denial_is_a_row_with_who_what_and_why_and_how_many_more_there_were() {
         let clock = Arc::new(ScaledClock::new(|| 0, Utc(1_000_000), 1000));
         let store = MemoryStore::new(SiteId::parse("s").expect("a site"), StoreId("store-1".into()), clock);
-        let mut wake = store.wake();
         let (sender, denials) = mpsc::channel(1);
         let path = "/midshift.task.v1.TaskService/SubmitTask".to_owned();
         let (actor, network) = ("anna".to_owned(), Ipv4Addr::LOCALHOST.into());
         let denial = Denial { actor, network, path, code: Code::NotPermitted, left_out: 7 };
         sender.send(denial).await.expect("there is room");
-        tokio::select! {
+        let written = async {
+            loop {
+                let rows = store.list(Query::all(Table::TaskAudit)).await.expect("rows");
+                if !rows.is_empty() {
+                    return rows;
+                }
+                tokio::task::yield_now().await;
+            }
+        };
+        let rows = tokio::select! {
             () = write(&store, denials) => panic!("it goes on until it is dropped"),
-            woken = wake.changed() => woken.expect("the store is there"),
-        }
-        let rows = store.list(Query::all(Table::TaskAudit)).await.expect("rows");
+            rows = written => rows,
+        };
         let row: AuditRow = serde_json::from_str(&rows[0].body).expect("a row");
         let with = |name: &str| row.with.get(name).map(String::as_str);
         assert_eq!((rows.len(), row.actor.as_str(), row.action.as_str()), (1, "anna", ACTION));

@@ -243,6 +243,11 @@ pub fn token(address: SocketAddr) -> Option<String> {
     known(address).map(|site| site.token)
 }
 
+/// The token of somebody else, who may approve what this program wrote.
+pub fn approver(address: SocketAddr) -> Option<String> {
+    known(address).map(|site| site.second)
+}
+
 /// Another port of the site that `of` is known for.
 pub fn same_site(of: SocketAddr, port: SocketAddr) -> anyhow::Result<()> {
     let Some(site) = known(of) else { return Ok(()) };

@@ -5,7 +5,7 @@
 
 use crate::clients::{grpcurl_passes, stock_python_passes};
 use crate::factory::Factory;
-use crate::harness::{Running, Server, authority, channel, sign_in, tasks, tool, until};
+use crate::harness::{Running, Server, approver, authority, channel, sign_in, tasks, tool, until};
 use crate::robots::enrolment;
 use crate::rolled_out::{call, done};
 use crate::room::LIMIT;
@@ -143,6 +143,8 @@ async fn tours_pass(dir: &Path, address: SocketAddr) -> anyhow::Result<()> {
         let log = dir.join(format!("{language:?}.log"));
         let mut command = language.tour()?;
         sign_in(&mut command, address);
+        let other = approver(address);
+        command.envs(other.iter().map(|token| ("MIDSHIFT_APPROVER_TOKEN", token)));
         tours.push((Running::start(command.args([&server, robot, "walk-1.5.0"]), &log)?, log, robot));
     }
     for (mut tour, log, robot) in tours {

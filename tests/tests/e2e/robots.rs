@@ -1,8 +1,9 @@
 //! Robots as programs of their own.
 
-use crate::harness::{LOG, Running, channel, has_login, keep_secret, midshift, secret_part, sign_in, until};
-use crate::stack::tell_identity;
+use crate::harness::{LOG, Running, channel, has_login, keep_secret, midshift, secret_part, sign_in, until, way};
+use crate::stack::{machines_of, tell_identity};
 use anyhow::Context;
+use midshift::machines::Machines;
 use midshift_agent::device::DeviceKey;
 use midshift_agent::enrolment::enrol;
 use midshift_agent::ledger::Ledger;
@@ -62,9 +63,13 @@ impl Robots {
         let starts = site.starting_places(count).into_iter().map(|at| site.name_of(at).to_string()).collect();
         let mut robots = Self::none(dir, server);
         (robots.starts, robots.stops) = (starts, stops.map(|address| address.to_string()));
+        // First all of them are enrolled: one that works before another is heard may be sent to where that one stands.
+        let ids = (0..count).map(|number| RobotId::parse(&robot_id(number))).collect::<Result<Vec<_>, _>>()?;
+        if has_login(public) {
+            Machines::enrol(&way(public)?, &machines_of(server).to_string(), ids, Some(dir)).await?;
+        }
         for number in 0..count {
-            let enrolment = enrolment(public, &robot_id(number)).await?;
-            robots.start_one(number, enrolment.as_deref())?;
+            robots.start_one(number, None)?;
         }
         robots.ids = robots.running.keys().cloned().collect();
         let all: BTreeSet<&String> = robots.ids.iter().collect();

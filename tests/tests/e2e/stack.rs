@@ -33,6 +33,11 @@ pub fn tell_identity(command: &mut Command, server: &str) {
     }
 }
 
+/// Where robots of the server at this address get their certificates.
+pub fn machines_of(server: SocketAddr) -> SocketAddr {
+    MACHINES.lock().unwrap_or_else(PoisonError::into_inner).get(&server).copied().unwrap_or(server)
+}
+
 /// One process of a service.
 struct Member {
     role: &'static str,
