@@ -117,7 +117,7 @@ fn of_message(message: &MessageDescriptor) -> Option<Said> {
 fn of_field(field: &FieldDescriptor) -> Option<Said> {
     let own = read(&field.options(), field.parent_message().parent_pool(), "field_privacy").flatten();
     let holds_ours = || matches!(field.kind(), Kind::Message(kind) if kind.package_name().starts_with("midshift.") && !kind.is_map_entry());
-    own.or_else(|| if holds_ours() { None } else { of_message(&field.parent_message()) })
+    own.or_else(|| if holds_ours() { None } else { of_message(field.parent_message()) })
 }
 
 /// Messages that do not say whole what they hold, and fields that say it wrongly or for nothing.

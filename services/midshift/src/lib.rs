@@ -30,3 +30,8 @@ pub mod throwaway;
 pub mod under_way;
 mod upkeep;
 pub mod way;
+
+#[cfg(test)]
+#[path = "../../../tests/src/postgres.rs"]
+#[expect(dead_code, reason = "other tests need more of it")]
+mod postgres_server;

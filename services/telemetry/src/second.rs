@@ -33,7 +33,7 @@ impl Second {
     }
 
     /// Waits until the session in charge is gone or silent; then this robot may come back and take charge. Tells people once if both are alive.
-    pub async fn is_alone(self, inner: Arc<Inner>) {
+    pub async fn until_alone(self, inner: Arc<Inner>) {
         let mut is_told = false;
         loop {
             tokio::time::sleep(Duration::from_millis(limits::HEARTBEAT.as_ms())).await;

@@ -151,7 +151,7 @@ impl Session {
         };
         tokio::pin!(moves);
         let mut cut_off = self.inner.shared.as_ref().map(Shared::cut_off);
-        let alone = is_alone(self.inner.clone(), self.second.take());
+        let alone = until_alone(self.inner.clone(), self.second.take());
         tokio::pin!(alone);
         let mut moves_until = None;
         loop {
@@ -467,9 +467,9 @@ async fn is_cut_off(cut_off: &mut Option<watch::Receiver<bool>>) {
 }
 
 /// The older session of an observed one is gone or silent; never, if this one is in charge.
-async fn is_alone(inner: Arc<Inner>, second: Option<Second>) {
+async fn until_alone(inner: Arc<Inner>, second: Option<Second>) {
     match second {
-        Some(second) => second.is_alone(inner).await,
+        Some(second) => second.until_alone(inner).await,
         None => std::future::pending().await,
     }
 }

@@ -1,20 +1,16 @@
 //! A backup of a server on PostgreSQL has its rows and its releases, and becomes one store again or nothing.
 
-#[path = "../../../../tests/src/postgres.rs"]
-#[expect(dead_code, reason = "other tests need more of it")]
-mod server;
-
 use super::parts::POSTGRES;
 use super::place::Place;
 use super::tests::{NOW, release, site};
 use super::{Places, back_up, name_all, restore, verify};
 use crate::clock;
+use crate::postgres_server::PostgresServer;
 use midshift_core::rows::{Expect, Index, Item, Key, RowChange, Table, Write, Writer};
 use midshift_ota::content::Room;
 use midshift_ota::folder::{Owner, mark};
 use midshift_ota::{OtaService, Parts};
 use midshift_store::{PostgresConfig, PostgresCopy, PostgresFrames, PostgresRestore, PostgresStore, Store, StoreId};
-use server::PostgresServer;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

@@ -1,11 +1,8 @@
 //! Nothing that goes by age gets older than it may, on every engine, and positions are as precise as they may be.
 
-#[path = "../../../../tests/src/postgres.rs"]
-#[expect(dead_code, reason = "other tests need more of it")]
-mod server;
-
 use super::oldest::{Oldest, look};
 use super::{Turn, audit};
+use crate::postgres_server::PostgresServer;
 use midshift_core::fleet::rows::FleetMark;
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::privacy::{self, Place, Retention};
@@ -24,7 +21,6 @@ use midshift_store::{
 };
 use midshift_task::TaskService;
 use prost::Message;
-use server::PostgresServer;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering};
