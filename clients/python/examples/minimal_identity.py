@@ -1,0 +1,79 @@
+"""Who a machine is at its site: the chapter "Who it is" of docs/robot-protocol.md as a program, for minimal_robot.py."""
+
+import argparse
+import sys
+import time
+
+import grpc
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from midshift.identity.v1 import enrolment_service_pb2 as enrolment
+from midshift.identity.v1 import enrolment_service_pb2_grpc
+
+
+class Identity:
+    """Who this machine is at its site: a key that never leaves it, and a certificate of that key for some days."""
+
+    CERTIFICATE_LIFE_S = 7 * 24 * 3600
+
+    def __init__(self, args: argparse.Namespace, memory) -> None:
+        self.server, self.robot_id, self.memory = args.server, args.robot_id, memory
+        if args.ca and not memory["identity"]:
+            if not args.enroll:
+                sys.exit(f"not enrolled: run `midshift robot enroll {args.robot_id}` and give its line with --enroll")
+            self._enrol(args.ca.read_bytes(), args.enroll)
+
+    def channel(self) -> grpc.Channel:
+        """A new connection, on which this machine shows who it is; in plain text where the site has no login."""
+        options = [("grpc.enable_retries", 0), ("grpc.use_local_subchannel_pool", 1)]
+        mine = self.memory["identity"]
+        if not mine:
+            return grpc.insecure_channel(self.server, options)
+        if time.time() > mine["expires_unix_s"] - self.CERTIFICATE_LIFE_S / 2:
+            self._renew(mine, options)
+        return grpc.secure_channel(self.server, self._shown(self.memory["identity"]), options)
+
+    @staticmethod
+    def _shown(mine: dict) -> grpc.ChannelCredentials:
+        return grpc.ssl_channel_credentials(*(mine[name].encode() for name in ("authority_pem", "key_pem", "certificate_pem")))
+
+    @staticmethod
+    def _request(key: ec.EllipticCurvePrivateKey) -> str:
+        """A signing request. Names are the site's to give."""
+        request = x509.CertificateSigningRequestBuilder(x509.Name([])).sign(key, hashes.SHA256())
+        return request.public_bytes(serialization.Encoding.PEM).decode()
+
+    def _enrol(self, authority_pem: bytes, line: str) -> None:
+        secret, pin = line.rsplit(".", 1)
+        spki = (serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
+        digest = hashes.Hash(hashes.SHA256())
+        digest.update(x509.load_pem_x509_certificate(authority_pem).public_key().public_bytes(*spki))
+        if digest.finalize().hex() != pin:
+            sys.exit("the file of --ca is not the root of the site that the line of --enroll came from")
+        key = ec.generate_private_key(ec.SECP256R1())
+        pem = (serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+        asked = enrolment.EnrolRequest(robot_id=self.robot_id, secret=secret, request_pem=self._request(key))
+        with grpc.secure_channel(self.server, grpc.ssl_channel_credentials(authority_pem)) as channel:
+            answer = enrolment_service_pb2_grpc.EnrolmentServiceStub(channel).Enrol(asked, timeout=10)
+        self._keep(key.private_bytes(*pem).decode(), answer)
+
+    def _renew(self, mine: dict, options: list) -> None:
+        key = serialization.load_pem_private_key(mine["key_pem"].encode(), password=None)
+        asked = enrolment.RenewCertificateRequest(robot_id=self.robot_id, request_pem=self._request(key))
+        try:
+            with grpc.secure_channel(self.server, self._shown(mine), options) as channel:
+                stub = enrolment_service_pb2_grpc.EnrolmentServiceStub(channel)
+                self._keep(mine["key_pem"], stub.RenewCertificate(asked, timeout=10))
+        except grpc.RpcError as error:
+            # The old one is good for days.
+            print("not renewed:", error.code().name, error.details(), flush=True)
+
+    def _keep(self, key_pem: str, answer) -> None:
+        self.memory["identity"] = {
+            "key_pem": key_pem,
+            "certificate_pem": answer.certificate_pem,
+            "authority_pem": answer.authority_pem,
+            "expires_unix_s": answer.expire_time.seconds,
+        }
+        self.memory.save()
