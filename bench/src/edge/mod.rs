@@ -7,7 +7,7 @@ mod hostile;
 
 use crate::child::Child;
 use crate::figure::{Figure, percentile};
-use crate::ota::{Told, stopped};
+use crate::ota::{Told, unless_stopped};
 use anyhow::{Context, ensure};
 use hostile::{ANSWERED, REFUSED, THERE, TURNED_AWAY};
 use midshift::door::{self, Share};
@@ -130,12 +130,7 @@ pub async fn play(part: Part, address: SocketAddr, stop: CancellationToken) -> a
 /// Runs every load. What cannot be made here is named and takes no other with it; Ctrl-C and SIGTERM end all.
 pub async fn run(args: EdgeArgs, say: &dyn Fn(&str)) -> Told {
     let mut told = Told::default();
-    let ended = tokio::select! {
-        // First, so that it listens before anything is made.
-        biased;
-        why = stopped() => Some(why),
-        () = all(&args, &mut told, say) => None,
-    };
+    let ended = unless_stopped(all(&args, &mut told, say)).await;
     told.failed.extend(ended);
     told
 }

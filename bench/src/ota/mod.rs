@@ -76,13 +76,8 @@ impl Told {
 /// Runs the parts that were asked for. One that fails takes no other with it; Ctrl-C and SIGTERM end all of them, and what they made goes.
 pub async fn run(args: OtaArgs, say: &dyn Fn(&str)) -> Told {
     let mut told = Told::default();
-    let stopped = tokio::select! {
-        // First, so that it listens before anything is made.
-        biased;
-        why = stopped() => Some(why),
-        () = parts(&args, &mut told, say) => None,
-    };
-    told.failed.extend(stopped);
+    let ended = unless_stopped(parts(&args, &mut told, say)).await;
+    told.failed.extend(ended);
     told
 }
 
@@ -99,8 +94,18 @@ async fn parts(args: &OtaArgs, told: &mut Told, say: &dyn Fn(&str)) {
     }
 }
 
+/// Runs `all` to its end, or to that of somebody's patience; why it ended early.
+pub async fn unless_stopped(all: impl Future<Output = ()>) -> Option<String> {
+    tokio::select! {
+        // First, so that it listens before anything is made.
+        biased;
+        why = stopped() => Some(why),
+        () = all => None,
+    }
+}
+
 /// Waits for somebody who wants an end.
-pub async fn stopped() -> String {
+async fn stopped() -> String {
     match signal(SignalKind::terminate()) {
         Err(error) => format!("SIGTERM cannot be heard: {error}"),
         Ok(mut terminated) => tokio::select! {

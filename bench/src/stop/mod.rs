@@ -12,7 +12,7 @@ mod scene;
 use crate::child::Child;
 use crate::figure::{Figure, percentile};
 use crate::link;
-use crate::ota::{Told, stopped};
+use crate::ota::{Told, unless_stopped};
 use anyhow::{Context, ensure};
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
 use midshift_proto::stop::v1::{EngageRequest, Fleet, ResetRequest, Scope, scope};
@@ -100,12 +100,7 @@ pub async fn play(part: Part, address: SocketAddr, stop: CancellationToken) -> a
 /// Runs every size and situation. What cannot be made here is named and takes no other with it; Ctrl-C and SIGTERM end all, and what was made goes.
 pub async fn run(args: StopArgs, say: &dyn Fn(&str)) -> Told {
     let mut told = Told::default();
-    let ended = tokio::select! {
-        // First, so that it listens before anything is made.
-        biased;
-        why = stopped() => Some(why),
-        () = all(&args, &mut told, say) => None,
-    };
+    let ended = unless_stopped(all(&args, &mut told, say)).await;
     told.failed.extend(ended);
     told
 }

@@ -63,6 +63,7 @@ mod tests {
     use midshift_store::{MemoryStore, Query, StoreId};
     use std::net::Ipv4Addr;
     use std::sync::Arc;
+    use std::time::Duration;
     use tokio::sync::mpsc;
 
     #[tokio::test]
@@ -85,7 +86,7 @@ mod tests {
         };
         let rows = tokio::select! {
             () = write(&store, denials) => panic!("it goes on until it is dropped"),
-            rows = written => rows,
+            rows = tokio::time::timeout(Duration::from_secs(60), written) => rows.expect("a row"),
         };
         let row: AuditRow = serde_json::from_str(&rows[0].body).expect("a row");
         let with = |name: &str| row.with.get(name).map(String::as_str);

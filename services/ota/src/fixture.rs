@@ -2,7 +2,7 @@
 
 use crate::content::{Content, DiskContent, Held, Room as Space, Wanted};
 use crate::folder::Owner;
-use crate::repository::{OnlineKeys, Repository};
+use crate::repository::{Act, OnlineKeys, Repository};
 use crate::{OtaService, Parts};
 use async_trait::async_trait;
 use bytes::Bytes;
@@ -228,5 +228,5 @@ pub async fn release(service: &OtaService, files: &[(String, Vec<u8>)]) {
         opened.content.settle(file).await.expect("whole");
     }
     let document = targets(None, files, SEEDS.targets);
-    opened.repository.publish(vec![first_root()], document, 0, START).await.expect("published");
+    opened.repository.publish(vec![first_root()], document, 0, Act::of_release(START)).await.expect("published");
 }

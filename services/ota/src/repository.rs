@@ -262,8 +262,9 @@ pub struct Act {
 }
 
 #[cfg(test)]
-impl From<Utc> for Act {
-    fn from(at: Utc) -> Self {
+impl Act {
+    /// Of whoever makes releases in tests.
+    pub fn of_release(at: Utc) -> Self {
         Self { by: "release".to_owned(), at }
     }
 }
@@ -477,7 +478,7 @@ impl Repository {
         roots: Vec<Vec<u8>>,
         targets: Vec<u8>,
         expected: u64,
-        act: impl Into<Act>,
+        act: Act,
     ) -> Result<Arc<Newest>, Error> {
         let (writing, before) = self.turn().await?;
         let newest = before.as_ref().map_or(0, |b| b.targets.edition.version);
@@ -487,7 +488,7 @@ impl Repository {
                 _ => Err(Error::Moved { newest, expected }),
             };
         }
-        let publication = self.prepare(before.as_deref(), roots, targets, act.into()).await?;
+        let publication = self.prepare(before.as_deref(), roots, targets, act).await?;
         self.commit(writing, publication).await
     }
 
@@ -553,7 +554,7 @@ impl Repository {
         targets: Vec<u8>,
         now: Utc,
     ) -> Result<Vec<(String, Vec<u8>)>, Error> {
-        let publication = self.prepare(self.newest().as_deref(), roots, targets, now.into()).await?;
+        let publication = self.prepare(self.newest().as_deref(), roots, targets, Act::of_release(now)).await?;
         Ok(publication.writes)
     }
 

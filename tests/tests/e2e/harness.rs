@@ -424,16 +424,15 @@ pub fn way(address: SocketAddr) -> anyhow::Result<Way> {
     known(address).map_or_else(|| Way::plain(&address.to_string()), |site| Ok(site.way))
 }
 
-#[test]
+#[tokio::test]
 #[should_panic(expected = "tells [\"a word\"]")]
-fn a_program_that_writes_a_secret_into_its_log_fails_its_test() {
+async fn a_program_that_writes_a_secret_into_its_log_fails_its_test() {
     keep_secret("a word", "xyzzy-only-here");
     let dir = folder().expect("a folder");
-    let mut command = Command::new("sh");
-    let running = Running::start(command.args(["-c", "echo xyzzy-only-here; exec sleep 60"]), &dir.path().join("log"));
     let log = dir.path().join("log");
-    while std::fs::read_to_string(&log).unwrap_or_default().is_empty() {
-        std::thread::yield_now();
-    }
+    let mut command = Command::new("sh");
+    let running = Running::start(command.args(["-c", "echo xyzzy-only-here; exec sleep 60"]), &log);
+    let written = async || Ok(std::fs::read_to_string(&log).ok().filter(|text| text.ends_with('\n')));
+    until("its log", Duration::from_secs(30), written).await.expect("a line");
     drop(running);
 }

@@ -3,14 +3,12 @@
 
 use crate::harness::{Server, folder, until};
 use crate::kill::{all_over, at_work, judge_journals, submit};
-use crate::robots::enrolment;
-use crate::rolled_out::{Robot, begin_rollout, call, done};
+use crate::rolled_out::{Robot, begin_rollout, call, done, fleet};
 use crate::room::LIMIT;
 use anyhow::ensure;
 use midshift_core::site::{DEMO, text};
 use midshift_proto::task::v1::TaskState;
 use std::collections::BTreeSet;
-use std::path::PathBuf;
 
 const ROBOTS: usize = 6;
 const TASKS: usize = 40;
@@ -28,20 +26,7 @@ async fn a_fleet_takes_a_release_in_the_middle_of_a_shift_and_loses_no_task_thou
     let keys = samples.join("keys").display().to_string();
     let mut server = Server::start_with(dir.path(), DEMO, &["--ota-keys", &keys]).await?;
     let address = server.address.to_string();
-    let ids: Vec<String> = (1..=ROBOTS).map(|number| format!("rbt-{number:02}")).collect();
-    let mut robots = Vec::new();
-    for (number, id) in ids.iter().enumerate() {
-        let (start, enrolment) = (format!("park-{}", number + 1), enrolment(server.address, id).await?);
-        robots.push(Robot::launch(id, &start, &dir.path().join(id), &samples, &address, None, enrolment.as_deref())?);
-    }
-    let journals: Vec<PathBuf> = ids.iter().map(|id| dir.path().join(id).join("data/journal.jsonl")).collect();
-    done(&["bundle", "push", "--server", &address, &samples.join("repository").display().to_string()])?;
-    for id in &ids {
-        until("the robot is known", LIMIT, async || {
-            Ok(call(&["robot", "get", "--server", &address, id])?.status.success().then_some(()))
-        })
-        .await?;
-    }
+    let (robots, journals) = fleet(dir.path(), server.address, &samples, None, ROBOTS).await?;
     submit(server.address, &site, 23, TASKS).await?;
     at_work(server.address, 2, &BTreeSet::new()).await?;
 

@@ -87,6 +87,32 @@ impl Robot {
     }
 }
 
+/// `count` robots under launchers, each enrolled and with a line to the stop service at `stops`, on a server that has the releases of `samples` and knows
+/// all of them; `rbt-01` and so on, with the journals of their bodies.
+pub async fn fleet(
+    dir: &Path,
+    server: SocketAddr,
+    samples: &Path,
+    stops: Option<SocketAddr>,
+    count: usize,
+) -> anyhow::Result<(Vec<Robot>, Vec<PathBuf>)> {
+    let address = server.to_string();
+    let ids: Vec<String> = (1..=count).map(|number| format!("rbt-{number:02}")).collect();
+    let mut robots = Vec::new();
+    for (number, id) in ids.iter().enumerate() {
+        let (start, enrolment) = (format!("park-{}", number + 1), enrolment(server, id).await?);
+        robots.push(Robot::launch(id, &start, &dir.join(id), samples, &address, stops, enrolment.as_deref())?);
+    }
+    done(&["bundle", "push", "--server", &address, &samples.join("repository").display().to_string()])?;
+    for id in &ids {
+        until("the robot is known", LIMIT, async || {
+            Ok(call(&["robot", "get", "--server", &address, id])?.status.success().then_some(()))
+        })
+        .await?;
+    }
+    Ok((robots, ids.iter().map(|id| dir.join(id).join("data/journal.jsonl")).collect()))
+}
+
 /// What a robot of `site` believes that believes the release people of `samples`.
 pub fn trust(samples: &Path, site: &Site) -> anyhow::Result<Trust> {
     let key = SecretKey::read(&samples.join("keys/directive-1.pem"))?.public();

@@ -3,8 +3,7 @@
 
 use crate::harness::{Server, folder, until};
 use crate::kill::{all_over, at_work, submit};
-use crate::robots::enrolment;
-use crate::rolled_out::{Robot, begin_rollout, call, done};
+use crate::rolled_out::{Robot, begin_rollout, call, done, fleet};
 use crate::rolling::seen;
 use crate::room::LIMIT;
 use crate::stopped::{StopServer, judge_stops, resume, until_held};
@@ -14,7 +13,7 @@ use midshift_core::site::{DEMO, text};
 use midshift_proto::task::v1::TaskState;
 use midshift_sim::journal::{self, Effect};
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 const ROBOTS: usize = 4;
 const TASKS: usize = 16;
@@ -48,20 +47,7 @@ async fn a_canary_of_a_bad_release_goes_back_under_a_fleet_stop_and_nobody_moves
     let stops = StopServer::start(dir.path(), server.address).await?;
     let address = server.address.to_string();
     let ids: Vec<String> = (1..=ROBOTS).map(|number| format!("rbt-{number:02}")).collect();
-    let mut robots = Vec::new();
-    for (number, id) in ids.iter().enumerate() {
-        let (start, enrolment) = (format!("park-{}", number + 1), enrolment(server.address, id).await?);
-        let (home, stops) = (dir.path().join(id), Some(stops.address));
-        robots.push(Robot::launch(id, &start, &home, &samples, &address, stops, enrolment.as_deref())?);
-    }
-    let journals: Vec<PathBuf> = ids.iter().map(|id| dir.path().join(id).join("data/journal.jsonl")).collect();
-    done(&["bundle", "push", "--server", &address, &samples.join("repository").display().to_string()])?;
-    for id in &ids {
-        until("the robot is known", LIMIT, async || {
-            Ok(call(&["robot", "get", "--server", &address, id])?.status.success().then_some(()))
-        })
-        .await?;
-    }
+    let (robots, journals) = fleet(dir.path(), server.address, &samples, Some(stops.address), ROBOTS).await?;
     submit(server.address, &site, 11, TASKS).await?;
     at_work(server.address, 2, &BTreeSet::new()).await?;
 

@@ -5,7 +5,7 @@ use crate::content::{Content, DiskContent, Error, Held, Room, Wanted};
 use crate::encodings::tests::programs;
 use crate::encodings::{Encodings, Way};
 use crate::fixture::{SEEDS, START, bundle, first_root, key, target, write_keys};
-use crate::repository::{OnlineKeys, Repository};
+use crate::repository::{Act, OnlineKeys, Repository};
 use bytes::Bytes;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::Manifest;
@@ -78,7 +78,7 @@ impl Shop {
         let document = sign_targets(previous, &add, &gone, expires, &[&key(SEEDS.targets)]).expect("targets");
         let expected = before.as_ref().map_or(0, |newest| newest.targets.edition.version);
         let roots = if expected == 0 { vec![first_root()] } else { Vec::new() };
-        self.repository.publish(roots, document, expected, START).await.map(drop)
+        self.repository.publish(roots, document, expected, Act::of_release(START)).await.map(drop)
     }
     /// Brings and publishes.
     async fn release(&self, bundles: &[&Bundle]) {

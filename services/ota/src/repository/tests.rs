@@ -18,7 +18,7 @@ async fn published() -> (Room, Vec<u8>) {
     let files = files("walk", "1.0.0");
     room.bring(&files).await;
     let document = targets(None, &files, SEEDS.targets);
-    room.repository.publish(vec![first_root()], document.clone(), 0, START).await.expect("published");
+    room.repository.publish(vec![first_root()], document.clone(), 0, Act::of_release(START)).await.expect("published");
     (room, document)
 }
 
@@ -41,7 +41,7 @@ async fn a_release_is_shown_to_robots_and_kept_over_a_restart() {
     room.bring(&more).await;
     let second = targets(Some(&first), &more, SEEDS.targets);
     let later = START.plus_ms(1000);
-    let newest = room.repository.publish(Vec::new(), second, 1, later).await.expect("the second");
+    let newest = room.repository.publish(Vec::new(), second, 1, Act::of_release(later)).await.expect("the second");
     let room = room.restarted().await;
     let kept = room.repository.newest().expect("kept");
     assert_eq!((kept.targets.clone(), kept.releases.clone()), (newest.targets.clone(), newest.releases.clone()));
@@ -56,7 +56,8 @@ async fn bundles_are_sorted_by_version_as_numbers() {
     let all: Vec<_> = ["1.10.0", "1.9.0"].iter().flat_map(|v| files("walk", v)).chain(files("arm", "2.0.0")).collect();
     room.bring(&all).await;
     let document = targets(None, &all, SEEDS.targets);
-    let newest = room.repository.publish(vec![first_root()], document, 0, START).await.expect("published");
+    let newest =
+        room.repository.publish(vec![first_root()], document, 0, Act::of_release(START)).await.expect("published");
     let names: Vec<String> = newest.releases.iter().map(|r| r.manifest.target()).collect();
     assert_eq!(names, ["arm-2.0.0.manifest", "walk-1.9.0.manifest", "walk-1.10.0.manifest"]);
 }
@@ -84,10 +85,15 @@ async fn the_first_publication_brings_the_whole_chain_of_roots() {
     let document = targets(None, &files, SEEDS.targets);
     let second = root(2, SEEDS, in_a_year(), &[SEEDS.root]);
     for roots in [vec![], vec![second.clone()], vec![first_root(), first_root()]] {
-        let error = room.repository.publish(roots, document.clone(), 0, START).await.expect_err("refused");
+        let error =
+            room.repository.publish(roots, document.clone(), 0, Act::of_release(START)).await.expect_err("refused");
         assert!(fields(&error).iter().all(|field| field.starts_with("roots")), "{error}");
     }
-    let newest = room.repository.publish(vec![first_root(), second], document, 0, START).await.expect("published");
+    let newest = room
+        .repository
+        .publish(vec![first_root(), second], document, 0, Act::of_release(START))
+        .await
+        .expect("published");
     assert_eq!(newest.root.edition.version, 2);
     room.shown_to(&robot(), START).await.expect("believed");
 }
@@ -98,7 +104,7 @@ async fn a_root_that_the_one_before_did_not_sign_is_refused() {
     let thief = Seeds { root: 66, targets: 66, ..SEEDS };
     let document = targets(Some(&first), &[], thief.targets);
     let stolen = root(2, thief, in_a_year(), &[thief.root]);
-    let error = room.repository.publish(vec![stolen], document, 1, START).await.expect_err("refused");
+    let error = room.repository.publish(vec![stolen], document, 1, Act::of_release(START)).await.expect_err("refused");
     assert_eq!(fields(&error), ["roots[0]"]);
 }
 
@@ -110,7 +116,8 @@ async fn targets_of_a_stranger_or_of_the_wrong_number_or_expired_are_refused() {
     let stranger = targets(Some(&first), &[], 66);
     let expired = sign_targets(Some(&first), &[], &[], START, &[&key(SEEDS.targets)]).expect("targets");
     for document in [first.clone(), third, stranger, expired, b"{}".to_vec(), Vec::new()] {
-        let error = room.repository.publish(Vec::new(), document, 1, START).await.expect_err("refused");
+        let error =
+            room.repository.publish(Vec::new(), document, 1, Act::of_release(START)).await.expect_err("refused");
         assert!(fields(&error).contains(&"targets"), "{error}");
     }
     assert_eq!(room.repository.newest().expect("as before").targets.bytes, first);
@@ -121,7 +128,7 @@ async fn an_expired_root_is_refused() {
     let room = Room::new().await;
     let document = targets(None, &[], SEEDS.targets);
     let old = root(1, SEEDS, START, &[SEEDS.root]);
-    let error = room.repository.publish(vec![old], document, 0, START).await.expect_err("refused");
+    let error = room.repository.publish(vec![old], document, 0, Act::of_release(START)).await.expect_err("refused");
     assert_eq!(fields(&error), ["roots"]);
 }
 
@@ -145,14 +152,19 @@ async fn who_publishes_on_an_older_version_is_told_which_is_the_newest() {
     let more = files("walk", "1.1.0");
     room.bring(&more).await;
     let second = targets(Some(&first), &more, SEEDS.targets);
-    room.repository.publish(Vec::new(), second.clone(), 1, START).await.expect("one of them");
+    room.repository.publish(Vec::new(), second.clone(), 1, Act::of_release(START)).await.expect("one of them");
     let other = targets(Some(&first), &[], SEEDS.targets);
     for expected in [0, 1, 7] {
-        let error = room.repository.publish(Vec::new(), other.clone(), expected, START).await.expect_err("too late");
+        let error = room
+            .repository
+            .publish(Vec::new(), other.clone(), expected, Act::of_release(START))
+            .await
+            .expect_err("too late");
         assert!(matches!(error, Error::Moved { newest: 2, .. }), "{error}");
     }
     let root = fs::read(room.metadata().join("1.root.json")).expect("the root");
-    let again = room.repository.publish(vec![root], second, 1, START).await.expect("the answer was lost");
+    let again =
+        room.repository.publish(vec![root], second, 1, Act::of_release(START)).await.expect("the answer was lost");
     assert_eq!(again.targets.edition.version, 2);
     assert_eq!(again.stamp.version, 2, "nothing was signed for that");
 }
@@ -162,12 +174,19 @@ async fn all_files_that_are_not_here_are_told() {
     let room = Room::new().await;
     let all = files("walk", "1.0.0");
     let document = targets(None, &all, SEEDS.targets);
-    let error =
-        room.repository.publish(vec![first_root()], document.clone(), 0, START).await.expect_err("none is here");
+    let error = room
+        .repository
+        .publish(vec![first_root()], document.clone(), 0, Act::of_release(START))
+        .await
+        .expect_err("none is here");
     let Error::Missing(missing) = error else { panic!("{error}") };
     assert_eq!(missing.len(), 2);
     room.bring(&all[..1]).await;
-    let error = room.repository.publish(vec![first_root()], document, 0, START).await.expect_err("one is missing");
+    let error = room
+        .repository
+        .publish(vec![first_root()], document, 0, Act::of_release(START))
+        .await
+        .expect_err("one is missing");
     let Error::Missing(missing) = error else { panic!("{error}") };
     assert_eq!(missing[0].name, "walk-gait-1.0.0.component");
 }
@@ -180,7 +199,8 @@ async fn a_length_that_lies_counts_as_missing() {
     let mut listed: Vec<_> = all.iter().map(|(name, content)| target(name, content)).collect();
     listed[1].length += 1;
     let document = sign_targets(None, &listed, &[], in_a_year(), &[&key(SEEDS.targets)]).expect("targets");
-    let error = room.repository.publish(vec![first_root()], document, 0, START).await.expect_err("refused");
+    let error =
+        room.repository.publish(vec![first_root()], document, 0, Act::of_release(START)).await.expect_err("refused");
     assert!(matches!(&error, Error::Missing(missing) if missing.len() == 1), "{error}");
 }
 
@@ -194,7 +214,8 @@ async fn a_manifest_that_is_none_or_names_what_is_not_listed_is_refused() {
     let all = [alone, renamed, none];
     room.bring(&all).await;
     let document = targets(None, &all, SEEDS.targets);
-    let error = room.repository.publish(vec![first_root()], document, 0, START).await.expect_err("refused");
+    let error =
+        room.repository.publish(vec![first_root()], document, 0, Act::of_release(START)).await.expect_err("refused");
     assert_eq!(
         fields(&error),
         ["targets.jump-1.0.0.manifest", "targets.run-1.0.0.manifest", "targets.walk-1.0.0.manifest"]
@@ -206,11 +227,12 @@ async fn a_root_that_names_other_online_keys_is_refused_and_a_successor_that_lie
     let (room, first) = published().await;
     let document = targets(Some(&first), &[], SEEDS.targets);
     let foreign = root(2, Seeds { timestamp: 66, ..SEEDS }, in_a_year(), &[SEEDS.root]);
-    let error = room.repository.publish(vec![foreign], document.clone(), 1, START).await.expect_err("refused");
+    let error =
+        room.repository.publish(vec![foreign], document.clone(), 1, Act::of_release(START)).await.expect_err("refused");
     assert!(matches!(error, Error::NotNamed { root_version: 2, role: "timestamp" }), "{error}");
     assert!(error.to_string().starts_with("the repository's root 2 names other timestamp keys than this server has"));
     let next = root(2, Seeds { snapshot: 13, timestamp: 14, ..SEEDS }, in_a_year(), &[SEEDS.root]);
-    room.repository.publish(vec![next], document, 1, START).await.expect("the keys lie ready");
+    room.repository.publish(vec![next], document, 1, Act::of_release(START)).await.expect("the keys lie ready");
     let believed = room.shown_to(&robot(), START).await.expect("believed");
     let room = room.restarted().await;
     room.shown_to(&believed.trusted, START).await.expect("believed after a restart");
@@ -239,7 +261,7 @@ async fn a_cut_at_any_write_leaves_a_repository_that_robots_believe() {
         let document = targets(Some(&first), &more, rotated.targets);
         let before = room.repository.newest();
         let publication =
-            room.repository.prepare(before.as_deref(), roots.clone(), document.clone(), START.into()).await;
+            room.repository.prepare(before.as_deref(), roots.clone(), document.clone(), Act::of_release(START)).await;
         let writes = publication.expect("it holds").writes;
         for (name, bytes) in &writes[..cut] {
             write_whole(&room.metadata().join(name), bytes).expect("written");
@@ -253,7 +275,7 @@ async fn a_cut_at_any_write_leaves_a_repository_that_robots_believe() {
             let seen = room.shown_to(robot, START).await.unwrap_or_else(|e| panic!("after {cut} writes: {e}"));
             assert_eq!(seen.targets.len(), if is_published { 4 } else { 2 }, "after {cut} writes");
         }
-        let again = room.repository.publish(roots, document, 1, START).await.expect("asked again");
+        let again = room.repository.publish(roots, document, 1, Act::of_release(START)).await.expect("asked again");
         assert_eq!((again.root.edition.version, again.targets.edition.version), (2, 2));
         assert_eq!(room.shown_to(&believed, START).await.expect("believed").targets.len(), 4);
         if is_published {
@@ -302,7 +324,7 @@ async fn targets_that_no_kept_snapshot_names_go_and_every_root_stays() {
     for version in 1..=20 {
         let roots = if version == 5 { vec![root(2, SEEDS, in_a_year(), &[SEEDS.root])] } else { Vec::new() };
         document = targets(Some(&document), &[], SEEDS.targets);
-        room.repository.publish(roots, document.clone(), version, START).await.expect("published");
+        room.repository.publish(roots, document.clone(), version, Act::of_release(START)).await.expect("published");
     }
     let names = || -> Vec<String> {
         let entries = fs::read_dir(room.metadata()).expect("a folder");
@@ -330,12 +352,12 @@ async fn when_a_bundle_was_seen_is_forgotten_once_it_is_neither_listed_nor_here(
     };
     let seen = || fs::read_to_string(room.metadata().join("seen.json")).expect("there").len() > "{}".len();
     let second = without(&first, &names);
-    room.repository.publish(Vec::new(), second.clone(), 1, START).await.expect("published");
+    room.repository.publish(Vec::new(), second.clone(), 1, Act::of_release(START)).await.expect("published");
     assert!(seen(), "its files are here still");
     for (_, content) in files("walk", "1.0.0") {
         room.content.remove(Digest::of(&content)).await.expect("removed");
     }
-    room.repository.publish(Vec::new(), without(&second, &[]), 2, START).await.expect("published");
+    room.repository.publish(Vec::new(), without(&second, &[]), 2, Act::of_release(START)).await.expect("published");
     assert!(!seen());
 }
 
@@ -375,7 +397,7 @@ async fn a_publication_that_nobody_waits_for_any_more_is_written_to_its_end_and_
         let room = Room::new().await;
         room.bring(&files).await;
         let document = targets(None, &files, SEEDS.targets);
-        let mut publishing = Box::pin(room.repository.publish(vec![first_root()], document, 0, START));
+        let mut publishing = Box::pin(room.repository.publish(vec![first_root()], document, 0, Act::of_release(START)));
         let mut is_over = false;
         while !is_over && !room.metadata().join("1.root.json").exists() {
             tokio::select! {

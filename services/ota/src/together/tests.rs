@@ -6,7 +6,7 @@ use crate::encodings::tests::{noise, programs};
 use crate::fixture::{SEEDS, START, bundle, files, first_root, robot, root, targets, write_keys};
 use crate::folder::Owner;
 use crate::hatch::Hatch;
-use crate::repository::{self, FRESHEN_AFTER_MS};
+use crate::repository::{self, Act, FRESHEN_AFTER_MS};
 use crate::{Opened, OtaReader, OtaService, Parts};
 use bytes::Bytes;
 use http::{Request as Get, StatusCode};
@@ -124,7 +124,7 @@ async fn publish(
     }
     let document = targets(previous, files, SEEDS.targets);
     let roots = if previous.is_none() { vec![first_root()] } else { Vec::new() };
-    opened(service).repository.publish(roots, document.clone(), expected, START).await?;
+    opened(service).repository.publish(roots, document.clone(), expected, Act::of_release(START)).await?;
     Ok(document)
 }
 
@@ -239,7 +239,11 @@ async fn a_publication_is_known_to_the_other_at_once_and_who_did_not_know_it_is_
     let second = publish(&two, Some(&first), &files("walk", "1.1.0"), 1).await.expect("on the newest");
     let error = publish(&one, Some(&first), &files("arm", "1.0.0"), 1).await.expect_err("too late");
     assert!(matches!(error, repository::Error::Moved { newest: 2, expected: 1 }), "{error}");
-    let again = opened(&one).repository.publish(Vec::new(), second, 1, START).await.expect("the answer was lost");
+    let again = opened(&one)
+        .repository
+        .publish(Vec::new(), second, 1, Act::of_release(START))
+        .await
+        .expect("the answer was lost");
     assert_eq!(again.stamp.version, 2, "nothing was signed for that");
     assert_eq!((shown(&one).await, shown(&two).await), ((2, 2), (2, 2)));
 }
@@ -314,7 +318,8 @@ async fn a_process_killed_at_any_write_of_a_publication_leaves_the_other_able_to
         let is_published = cut == writes.len();
         assert_eq!(shown(&two).await, if is_published { (2, 2) } else { (1, 1) }, "after {cut} writes");
         refreshed(&trusted, &two.hatch(), START).await;
-        let again = opened(&two).repository.publish(roots, document, 1, START).await.expect("sent again");
+        let again =
+            opened(&two).repository.publish(roots, document, 1, Act::of_release(START)).await.expect("sent again");
         assert_eq!((again.root.edition.version, again.targets.edition.version, again.stamp.version), (2, 2, 2));
         refreshed(&trusted, &site.reader().await.hatch, START).await;
         if is_published {
@@ -454,7 +459,7 @@ async fn what_is_withdrawn_by_others_is_handed_out_no_more_once_the_gateway_foll
     let key = crate::fixture::key(SEEDS.targets);
     let ends = START.plus_ms(PEOPLE_LIFE_MS);
     let document = midshift_bundle::repository::sign_targets(Some(&first), &[], &names, ends, &[&key]).expect("signed");
-    opened(&one).repository.publish(Vec::new(), document, 1, START).await.expect("withdrawn");
+    opened(&one).repository.publish(Vec::new(), document, 1, Act::of_release(START)).await.expect("withdrawn");
     reader.documents.follow().await.expect("readable");
     let refused = fetched(&reader.hatch, Digest::of(&walk[1].1), 1).await.expect_err("withdrawn");
     assert_eq!(refused.code(), Code::NotFound);

@@ -11,6 +11,7 @@ use rcgen::{
     BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
 };
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// Who signs for a database and its clients.
 struct Authority {
@@ -46,6 +47,19 @@ impl Authority {
         let key = KeyPair::generate().unwrap();
         (params.signed_by(&key, &self.issuer).unwrap().pem(), key.serialize_pem())
     }
+}
+
+/// Looks until there is a value: somebody else's process takes its time, and not for ever.
+async fn within<T>(mut look: impl AsyncFnMut() -> Option<T>) -> T {
+    let looks = async {
+        loop {
+            if let Some(seen) = look().await {
+                return seen;
+            }
+            tokio::task::yield_now().await;
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(60), looks).await.expect("in time")
 }
 
 /// Files that addresses name.
@@ -94,7 +108,7 @@ async fn everything_of_a_store_goes_over_tls_1_3_when_both_sides_prove_themselve
     assert_eq!(reader.snapshot(&[Table::Attempt]).await.unwrap().rows.len(), 1);
     let of_ours = "FROM pg_stat_activity JOIN pg_stat_ssl USING (pid) WHERE application_name = 'midshift'";
     let count = |what: &str| server.ask(&near, &format!("SELECT count(*) {of_ours} {what}")).parse::<u32>().unwrap();
-    while count("AND query LIKE 'LISTEN%'") < 2 {}
+    within(async || (count("AND query LIKE 'LISTEN%'") >= 2).then_some(())).await;
     assert!(count("") >= 5, "writers, readers and who listens");
     let others = format!("SELECT count(*) {of_ours} AND version IS DISTINCT FROM 'TLSv1.3'");
     assert_eq!(server.ask(&near, &others), "0", "connections without it");
@@ -127,14 +141,16 @@ async fn neither_a_false_server_nor_a_client_without_a_certificate_comes_to_a_co
     server.ask(&server.url("rows"), "ALTER SYSTEM SET ssl_max_protocol_version = 'TLSv1.2'");
     server.ask(&server.url("rows"), "SELECT pg_reload_conf()");
     let good = address("127.0.0.1", port, "rows", &root) + &own;
-    let old = loop {
-        match PostgresStore::open(&PostgresConfig::new(&good), site(), clock()).await {
-            Err(OpenError::Sql { source, .. }) => break source.to_string(),
-            Err(error) => panic!("{error:?}"),
-            // It has not read its settings again yet.
-            Ok(store) => store.close().await,
+    let old = within(async || match PostgresStore::open(&PostgresConfig::new(&good), site(), clock()).await {
+        Err(OpenError::Sql { source, .. }) => Some(source.to_string()),
+        Err(error) => panic!("{error:?}"),
+        // It has not read its settings again yet.
+        Ok(store) => {
+            store.close().await;
+            None
         }
-    };
+    })
+    .await;
     assert!(old.contains("ssl_min_protocol_version"), "an old version: {old}");
 }
 

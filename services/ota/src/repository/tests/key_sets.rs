@@ -2,7 +2,7 @@
 
 use super::{fields, published};
 use crate::fixture::{Room, SEEDS, START, first_root, give_back, hide, key, key_set, targets};
-use crate::repository::{Documents, Error, FRESHEN_AFTER_MS, Keyless, SetLost};
+use crate::repository::{Act, Documents, Error, FRESHEN_AFTER_MS, Keyless, SetLost};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::repository::{PEOPLE_LIFE_MS, sign_targets};
 use midshift_core::reason::Code;
@@ -14,7 +14,7 @@ type File = (String, Vec<u8>);
 async fn push(room: &Room, previous: &[u8], version: u64, files: &[File]) -> Result<Vec<u8>, Error> {
     room.bring(files).await;
     let document = targets(Some(previous), files, SEEDS.targets);
-    room.repository.publish(Vec::new(), document.clone(), version, START).await.map(|_| document)
+    room.repository.publish(Vec::new(), document.clone(), version, Act::of_release(START)).await.map(|_| document)
 }
 
 fn signs_with(room: &Room) -> u8 {
@@ -67,7 +67,7 @@ async fn a_set_stays_listed_for_robots_that_were_away() {
     let without = ["1.directive-keys".to_owned()];
     let expires = START.plus_ms(PEOPLE_LIFE_MS);
     let third = sign_targets(Some(&second), &[], &without, expires, &[&key(SEEDS.targets)]).expect("targets");
-    let error = room.repository.publish(Vec::new(), third, 2, START).await.expect_err("refused");
+    let error = room.repository.publish(Vec::new(), third, 2, Act::of_release(START)).await.expect_err("refused");
     assert_eq!(fields(&error), ["targets.1.directive-keys"]);
 }
 
@@ -77,7 +77,7 @@ async fn a_repository_that_is_new_to_a_server_brings_all_its_sets() {
     let files = [key_set(1, &[25], 66), key_set(2, &[15], 25)];
     room.bring(&files).await;
     let document = targets(None, &files, SEEDS.targets);
-    room.repository.publish(vec![first_root()], document, 0, START).await.expect("published");
+    room.repository.publish(vec![first_root()], document, 0, Act::of_release(START)).await.expect("published");
     assert_eq!(signs_with(&room), 15);
 }
 

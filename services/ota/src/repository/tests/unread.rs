@@ -3,7 +3,7 @@
 use super::published;
 use crate::content::{Content, DiskContent};
 use crate::fixture::{Room, SEEDS, START, files, first_root, give_back, hide, key_set, targets};
-use crate::repository::{Documents, Error, FRESHEN_AFTER_MS, Newest};
+use crate::repository::{Act, Documents, Error, FRESHEN_AFTER_MS, Newest};
 use midshift_bundle::digest::Digest;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -26,14 +26,15 @@ async fn what_was_known_stays() {
     let all: Vec<File> = walk.iter().cloned().chain([set.clone()]).collect();
     room.bring(&all).await;
     let document = targets(None, &all, SEEDS.targets);
-    room.repository.publish(vec![first_root()], document.clone(), 0, START).await.expect("published");
+    room.repository.publish(vec![first_root()], document.clone(), 0, Act::of_release(START)).await.expect("published");
     let content: Arc<dyn Content> = Arc::new(DiskContent::reading(&room.dir.path().join("content")));
     let other = Documents::reading(&room.metadata(), content).await.expect("readable");
     for file in [&walk[0], &set] {
         hide(&path_of(&room, file));
     }
     let next = targets(Some(&document), &[], SEEDS.targets);
-    let error = room.repository.publish(Vec::new(), next, 1, START).await.expect_err("nobody can check it");
+    let error =
+        room.repository.publish(Vec::new(), next, 1, Act::of_release(START)).await.expect_err("nobody can check it");
     assert!(matches!(error, Error::Disk(_)), "{error}");
     room.repository.freshen(START.plus_ms(FRESHEN_AFTER_MS)).await.expect("signed");
     for _ in 0..2 {
@@ -68,7 +69,7 @@ async fn a_start_shows_the_rest() {
     let all: Vec<File> = old.iter().chain(&new).cloned().chain([set.clone()]).collect();
     room.bring(&all).await;
     let document = targets(None, &all, SEEDS.targets);
-    room.repository.publish(vec![first_root()], document, 0, START).await.expect("published");
+    room.repository.publish(vec![first_root()], document, 0, Act::of_release(START)).await.expect("published");
     for file in [&new[0], &set] {
         hide(&path_of(&room, file));
     }
@@ -111,7 +112,7 @@ async fn whoever_only_asks_for_a_document_tries_nothing_again() {
     let walk = files("walk", "1.0.0");
     room.bring(&walk).await;
     let document = targets(None, &walk, SEEDS.targets);
-    room.repository.publish(vec![first_root()], document, 0, START).await.expect("published");
+    room.repository.publish(vec![first_root()], document, 0, Act::of_release(START)).await.expect("published");
     hide(&path_of(&room, &walk[0]));
     let content: Arc<dyn Content> = Arc::new(DiskContent::reading(&room.dir.path().join("content")));
     let other = Documents::reading(&room.metadata(), content).await.expect("readable");
