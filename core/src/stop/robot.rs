@@ -132,10 +132,18 @@ impl RobotStop {
         if !self.is_told || !self.was_heard || around == Around::Robots || self.silence.is_some() {
             return false;
         }
-        let named = format!("SILENCE-{}-{}", self.robot_id, wall.0);
+        let named = format!("{SILENCE}{}-{}", self.robot_id, wall.0);
         self.silence = StopId::parse(&named).ok();
         self.silence.clone().is_some_and(|id| self.kept.awaiting.insert(id))
     }
+}
+
+/// How the names of silences begin; no stop that somebody engaged is named so.
+const SILENCE: &str = "SILENCE-";
+
+/// It names a silence that stood a robot, and no stop that somebody engaged.
+pub fn is_silence(stop_id: &StopId) -> bool {
+    stop_id.as_str().starts_with(SILENCE)
 }
 
 #[cfg(test)]
@@ -223,6 +231,7 @@ mod tests {
             assert_eq!(robot.look(&at(62_000), None, around).level, level, "{around:?}");
             let silences = robot.kept().awaiting.clone();
             assert_eq!(silences.len(), usize::from(around == Around::People));
+            assert!(silences.iter().all(is_silence) && !is_silence(&id(1)));
             robot.resumed(&silences);
             assert_eq!(robot.look(&at(62_100), None, around).level, StopLevel::None);
         }

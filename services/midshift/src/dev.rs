@@ -10,7 +10,7 @@ use crate::stop::{self, Beside};
 use crate::tally::{self, SharedTasks, Tasks};
 use crate::throwaway::Throwaway;
 use crate::under_way::{self, UnderWay};
-use crate::{clock, door, serve, site_file};
+use crate::{clock, door, resuming, serve, site_file};
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 use midshift_agent::trust::Trust;
@@ -104,10 +104,6 @@ pub struct Dev {
     /// Nothing goes wrong by itself. What is bad only with a load makes such faults more frequent, so a story does without that bundle then.
     #[arg(long)]
     pub no_faults: bool,
-    /// Robots dial the stop service of this run, so that `midshift stop` reaches them. They stand until it has told them, and a network that is away for seconds stands
-    /// those among people until somebody resumes them.
-    #[arg(long)]
-    pub stop_lines: bool,
 }
 
 impl Dev {
@@ -183,13 +179,11 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     };
     let run_id = format!("dev-{}-{}-", args.seed, clock.now().wall.0);
     let tasks = Arc::new(Mutex::new(Tasks::of_run(&run_id)));
-    let mut swarm = SwarmConfig::tcp(hall.clone(), clock.clone(), &format!("http://{address}"), args.seed);
+    let stops = Stops::start(&args, site.clone(), clock.clone(), address)?;
+    let mut swarm = SwarmConfig::tcp(hall.clone(), clock.clone(), &format!("http://{address}"), args.seed)
+        .with_stop(&format!("http://{}", stops.beside.address()));
     let live = tasks.clone();
     swarm.person = Some(Arc::new(move |id| tally::look(&live, |t| t.is_live(id))));
-    let stops = Stops::start(&args, site.clone(), clock.clone(), address)?;
-    if args.stop_lines {
-        swarm = swarm.with_stop(&format!("http://{}", stops.beside.address()));
-    }
     let (software, ota) = Throwaway::make(clock.clone()).await?;
     let trust = software.trust(site.site_id().clone())?;
     swarm.software = Some(trust.clone());
@@ -221,7 +215,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     let stage = match scene {
         Some(scene) => {
             let sight = Sight { store: store.clone(), board: server.board(), site: site.clone(), clock: clock.clone() };
-            Some(scene.stage(&args, &hall_config, &hall, sight, address, trust, &software)?)
+            Some(scene.stage(&args, &hall_config, &hall, sight, [address, stops.beside.address()], trust, &software)?)
         }
         None => None,
     };
@@ -287,7 +281,7 @@ impl Scene {
         config: &HallConfig,
         hall: &Hall,
         sight: Sight,
-        address: SocketAddr,
+        [address, stops]: [SocketAddr; 2],
         trust: Trust,
         software: &Throwaway,
     ) -> anyhow::Result<(Stage, TempDir)> {
@@ -298,6 +292,7 @@ impl Scene {
         let theirs = scenario::journals(self.folder.path(), &launched);
         let stage = Stage {
             server: address.to_string(),
+            stop_server: stops.to_string(),
             channel: tonic::transport::Endpoint::from_shared(format!("http://{address}"))?.connect_lazy(),
             sight,
             releases: args.bundles.clone(),
@@ -362,10 +357,6 @@ fn greeting(args: &Dev, site: &Site, address: SocketAddr, stops: SocketAddr, sof
         .map_or("data in memory (--data DIR keeps it)".to_owned(), |d| format!("data in {}", d.display()));
     let server = if address.port() == 7420 { String::new() } else { format!(" --server {address}") };
     let stop_server = if stops.port() == stop::PORT { String::new() } else { format!(" --stop-server {stops}") };
-    let try_stop = match args.stop_lines {
-        true => format!("      {program} stop{stop_server} --all --reason drill\n"),
-        false => String::new(),
-    };
     let mut stations =
         site.stations().chain(site.of_kind(midshift_core::site::Kind::Junction)).map(|w| site.name_of(w).to_string());
     let (from, to) = if site.source() == midshift_core::site::Source::Authored && site.site_id().as_str() == "demo" {
@@ -385,7 +376,7 @@ fn greeting(args: &Dev, site: &Site, address: SocketAddr, stops: SocketAddr, sof
          Try:  {program} task submit{server} --from {from} --to {to} --sku SKU-88231 --wait\n\
          \x20     {program} robot ls{server}\n\
          \x20     {program} sim fault{server} rbt-04 --drop-network 20s\n\
-         {try_stop}\
+         \x20     {program} stop{stop_server} --all --reason drill\n\
          \x20     grpcurl -plaintext {address} list\n\
          \x20     {program} bundle samples SAMPLES --config-only --repository {repository} --key {keys}/targets-1.pem\n\
          \x20     {program} bundle push{server} {repository}\n\
@@ -497,8 +488,9 @@ impl Run {
             serving: tokio::spawn(server.serve(listener)),
             following: tokio::spawn(async { Ok(following.await?) }),
             robots: tokio::spawn(async { Ok(swarm.await.map(drop)?) }),
-            working: tokio::spawn(self.work(background, channel, work_stop.clone(), stand)),
+            working: tokio::spawn(self.work(background, channel.clone(), work_stop.clone(), stand)),
         };
+        let _resuming = AbortOnDropHandle::new(tokio::spawn(resuming::rounds(board.clone(), channel.clone())));
         let progress = report::watch_progress(board, self.clock.clone(), no_progress_ms.clone());
         let _progress = AbortOnDropHandle::new(tokio::spawn(progress));
         // A run is measured from the moment at which there may be work.

@@ -14,6 +14,7 @@ pub mod logs;
 pub mod machines;
 pub mod planning;
 pub mod report;
+mod resuming;
 pub mod robots;
 pub mod roles;
 pub mod samples;

@@ -96,6 +96,8 @@ impl Release {
 pub struct Stage {
     /// Host and port of the server.
     pub server: String,
+    /// Host and port of the stop service.
+    pub stop_server: String,
     /// The way to it.
     pub channel: Channel,
     /// What is looked at.
@@ -185,7 +187,8 @@ impl Stage {
                 "--robot-id",
                 robot_id.as_str(),
             ]);
-            command.args(["--server", &self.server, "--start", start.as_str(), "--person"]);
+            command.args(["--server", &self.server, "--stop-server", &self.stop_server]);
+            command.args(["--start", start.as_str(), "--person"]);
             command.args(["--seed", &self.seed.to_string(), "--body-speed", &self.body_speed.to_string()]);
             if self.no_faults {
                 command.arg("--no-faults");
