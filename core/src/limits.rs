@@ -161,6 +161,8 @@ pub const LEDGER_IDS_MIN: usize = 100_000;
 pub const UNARY_DEADLINE: LinkDuration = LinkDuration::from_secs(30);
 /// How long CancelTask waits for fleet before it answers with the task as it is.
 pub const CANCEL_WAIT: LinkDuration = LinkDuration::from_secs(1);
+/// How long a resume of a stop waits until fleet has seen its reset: longer than the copy of a reset and a heartbeat take.
+pub const RESUME_WAIT: LinkDuration = LinkDuration::from_secs(3);
 /// A person's or another process' late wake costs at most this.
 pub const SWEEP: LinkDuration = LinkDuration(250);
 /// The process that plans for a service writes so every so often: others see that it is there. L

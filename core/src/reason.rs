@@ -97,6 +97,7 @@ codes! {
     LastAdmin = "LAST_ADMIN", "It is the last token that may administer the site. Make another one first.";
     // --- fleet stop
     StopsFull = "STOPS_FULL", "As many stops are engaged as there may be; the last ones are kept for the whole fleet. Engage the whole fleet, or reset what is over.";
+    StopNotFound = "STOP_NOT_FOUND", "Nothing is known of this stop. `midshift stop status` says which are engaged; a robot that stands says what it waits for.";
     StopWasReset = "STOP_WAS_RESET", "The stop was reset, so nobody obeys it any more. Engage another one with a new request_id.";
     LineReplaced = "LINE_REPLACED", "A newer line of this robot took the place of this one. If two machines use one robot id, find the second.";
     // --- software on the server

@@ -2,21 +2,25 @@
 //! same load.
 //!
 //! Invariant: the stop service is a process of its own on the first core, as is the bare loop; robots are on the others; robots' check-ins go on in the turns of both.
-//! Called by `main`. Rooms: here the turns and figures; `scene` what goes on beside; `robots`, `fan` and `pull` are children.
+//! Called by `main`. Rooms: here the turns and figures; `scene` what goes on beside; `site` who may come in; `robots`, `fan` and `pull` are children.
 
 mod fan;
 mod pull;
 mod robots;
 mod scene;
+mod site;
 
 use crate::child::Child;
 use crate::figure::{Figure, percentile};
 use crate::link;
 use crate::ota::{Told, unless_stopped};
 use anyhow::{Context, ensure};
+use midshift::door::Share;
+use midshift_core::limits::CONNECTIONS_MAX;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
 use midshift_proto::stop::v1::{EngageRequest, Fleet, ResetRequest, Scope, scope};
 use robots::{ANSWERED, ATTACHED, FREE, Moments, STAND, TAKE, TAKE_BARE};
+use site::Site;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -81,8 +85,9 @@ pub async fn play(part: Part, address: SocketAddr, stop: CancellationToken) -> a
                 site: None,
                 data,
                 listen: address,
-                insecure: true,
-                share: Default::default(),
+                insecure: false,
+                // All robots of a run come from one address.
+                share: Share { connections_per_address: CONNECTIONS_MAX, ..Share::default() },
             };
             midshift::stop::run(serve, stop).await
         }
@@ -115,12 +120,22 @@ async fn all(args: &StopArgs, told: &mut Told, say: &dyn Fn(&str)) {
             }
             Err(error) => return told.failed.push(format!("{error:#}")),
         };
+        let site = match proven(args, robots).await {
+            Ok(site) => site,
+            Err(error) => return told.failed.push(format!("{robots} robots are not enrolled: {error:#}")),
+        };
         for beside in scene::Beside::all(&args.beside) {
             let name = format!("{robots} robots, {}", beside.words());
             say(&name);
-            told.add(&name, scene::measure(args, robots, beside, say).await.map(|turns| turns.figures(&name)));
+            told.add(&name, scene::measure(args, &site, robots, beside, say).await.map(|turns| turns.figures(&name)));
         }
     }
+}
+
+/// A site with so many robots.
+async fn proven(args: &StopArgs, robots: usize) -> anyhow::Result<Site> {
+    let room = crate::fsync::place(args.dir.as_ref())?;
+    Site::with(robots, room.path()).await
 }
 
 /// What one turn came to, milliseconds from the moment of asking.
@@ -163,7 +178,7 @@ impl Turns {
 /// Everybody who takes part.
 struct Stage {
     robots: usize,
-    client: StopServiceClient<tonic::transport::Channel>,
+    client: StopServiceClient<midshift::way::Line>,
     /// Ended before those that they dial.
     simulators: Vec<(Child, PathBuf)>,
     fan: Child,
@@ -176,19 +191,22 @@ fn text(path: &Path) -> anyhow::Result<&str> {
 
 impl Stage {
     /// Starts the stop service on `data` and the bare loop, and waits until every robot is on both. What children write is below `room`.
-    async fn set(robots: usize, data: &Path, room: &Path) -> anyhow::Result<Self> {
+    async fn set(site: &Site, robots: usize, data: &Path, room: &Path) -> anyhow::Result<Self> {
+        site.admit(data)?;
         let stop = Child::start(&["stop-serve", "--data", text(data)?], Some(0))?.listening().await?;
         let fan = Child::start(&["fan"], Some(0))?.listening().await?;
         let (address, fan_address) = (stop.address.to_string(), fan.address.to_string());
         let mut simulators = Vec::new();
         for part in 0..SIMULATORS {
-            let out = room.join(format!("moments-{part}.json"));
-            let [from, to] = [part, part + 1].map(|n| (robots * n / SIMULATORS).to_string());
+            let [out, proofs] = ["moments", "proofs"].map(|name| room.join(format!("{name}-{part}.json")));
+            let [from, to] = [part, part + 1].map(|n| robots * n / SIMULATORS);
+            site.hand_out(from..to, &proofs)?;
+            let [from, to] = [from, to].map(|n| n.to_string());
             let role = ["attend", "--stop", &address, "--fan", &fan_address, "--from", &from, "--to", &to, "--out"];
-            let role = [&role[..], &[text(&out)?]].concat();
+            let role = [&role[..], &[text(&out)?, "--proofs", text(&proofs)?]].concat();
             simulators.push((Child::start(&role, Some(1 + part))?, out));
         }
-        let client = StopServiceClient::new(stop.channel().await?);
+        let client = StopServiceClient::new(site.way(&address)?.connect().await?);
         let mut stage = Self { robots, client, simulators, fan, _stop: stop };
         stage.until(ATTACHED, ATTACH_WITHIN).await?;
         stage.until(FREE, ATTACH_WITHIN).await?;
@@ -265,12 +283,13 @@ impl Stage {
 /// The turns; `before` brings about before each what goes on beside.
 async fn turns(
     args: &StopArgs,
+    site: &Site,
     robots: usize,
     data: &Path,
     room: &Path,
     mut before: impl AsyncFnMut() -> anyhow::Result<()>,
 ) -> anyhow::Result<Turns> {
-    let mut stage = Stage::set(robots, data, room).await?;
+    let mut stage = Stage::set(site, robots, data, room).await?;
     let mut turns = Turns::default();
     for _ in 0..args.rounds {
         sleep(Duration::from_millis(args.settle_ms)).await;

@@ -4,7 +4,8 @@
 //! then once more when it is durable, as the agent does (its file is in memory). It is resumed with the reset: nobody plans for it. It has no body and no ladder.
 //! Invariant: a line or a socket that ends ends the process, so that no robot is left out of a figure. Called by children only.
 
-use super::fan;
+use super::site::Proof;
+use super::{fan, site};
 use anyhow::{Context, bail};
 use midshift_agent::dial::{Dial, TcpDial};
 use midshift_core::limits;
@@ -59,6 +60,9 @@ pub struct AttendArgs {
     /// One past the last.
     #[arg(long)]
     to: usize,
+    /// What each of them shows.
+    #[arg(long)]
+    proofs: PathBuf,
     /// Where moments are written.
     #[arg(long)]
     out: PathBuf,
@@ -128,9 +132,9 @@ impl All {
 pub async fn run(all: Arc<All>, stop: CancellationToken) -> anyhow::Result<()> {
     let opening = Arc::new(Semaphore::new(OPENING));
     let mut tasks = JoinSet::new();
-    for at in 0..all.robots.len() {
+    for (at, proof) in Proof::read(&all.args.proofs)?.into_iter().enumerate() {
         let (line, socket) = ((all.clone(), opening.clone()), (all.clone(), opening.clone()));
-        tasks.spawn(async move { attend(&line.0, at, &line.1).await });
+        tasks.spawn(async move { attend(&line.0, &proof, at, &line.1).await });
         tasks.spawn(async move { hear(&socket.0, at, &socket.1).await });
     }
     tokio::select! {
@@ -140,11 +144,11 @@ pub async fn run(all: Arc<All>, stop: CancellationToken) -> anyhow::Result<()> {
 }
 
 /// One robot on its stop line, to its end.
-async fn attend(all: &All, at: usize, opening: &Semaphore) -> anyhow::Result<()> {
+async fn attend(all: &All, proof: &Proof, at: usize, opening: &Semaphore) -> anyhow::Result<()> {
     let permit = opening.acquire().await?;
-    let channel = TcpDial::new(&midshift::robots::uri(&all.args.stop), None)?.dial().await?;
+    let channel = TcpDial::new(&format!("https://{}", all.args.stop), None)?.with_tls(proof.tls()?).dial().await?;
     let (up, outbound) = mpsc::channel(OUTBOUND);
-    let robot_id = format!("rbt-{:05}", all.args.from + at);
+    let robot_id = site::robot_id(all.args.from + at);
     let first = Attend { boot_id: format!("{robot_id}-boot"), robot_id, stops: Vec::new() };
     up.send(AttendRequest { message: Some(Up::Attend(first)) }).await?;
     let mut down = StopLinkServiceClient::new(channel).attend(ReceiverStream::new(outbound)).await?.into_inner();

@@ -2,6 +2,7 @@
 //!
 //! Invariant: the load is there in the turns of both; whatever was mounted or stopped is unmounted or goes on however the measurement ends.
 
+use super::site::Site;
 use super::{StopArgs, Turns, text, turns};
 use crate::child::Child;
 use crate::engine::{Engine, children_of};
@@ -67,16 +68,22 @@ impl Beside {
 }
 
 /// One size in one situation.
-pub async fn measure(args: &StopArgs, robots: usize, beside: Beside, say: &dyn Fn(&str)) -> anyhow::Result<Turns> {
+pub async fn measure(
+    args: &StopArgs,
+    site: &Site,
+    robots: usize,
+    beside: Beside,
+    say: &dyn Fn(&str),
+) -> anyhow::Result<Turns> {
     let room = place(args.dir.as_ref())?;
     let stops = room.path().join("stops");
     match beside {
-        Beside::Nothing => turns(args, robots, &stops, room.path(), async || Ok(())).await,
-        Beside::Ingest => ingest(args, robots, room.path(), say).await,
-        Beside::Bulk => bulk(args, robots, room.path(), say).await,
-        Beside::Database => database(args, robots, room.path()).await,
-        Beside::Disk => disk(args, robots, room.path()).await,
-        Beside::Kill => kill(args, robots, room.path()).await,
+        Beside::Nothing => turns(args, site, robots, &stops, room.path(), async || Ok(())).await,
+        Beside::Ingest => ingest(args, site, robots, room.path(), say).await,
+        Beside::Bulk => bulk(args, site, robots, room.path(), say).await,
+        Beside::Database => database(args, site, robots, room.path()).await,
+        Beside::Disk => disk(args, site, robots, room.path()).await,
+        Beside::Kill => kill(args, site, robots, room.path()).await,
     }
 }
 
@@ -101,20 +108,20 @@ async fn until(child: &mut Child, counter: &str, least: u64) -> anyhow::Result<(
     Ok(())
 }
 
-async fn ingest(args: &StopArgs, robots: usize, room: &Path, say: &dyn Fn(&str)) -> anyhow::Result<Turns> {
+async fn ingest(args: &StopArgs, site: &Site, robots: usize, room: &Path, say: &dyn Fn(&str)) -> anyhow::Result<Turns> {
     let server = server(room).await?;
     let (address, flooding) = (server.address.to_string(), KNEE_ROBOTS.to_string());
     let mut flood = Child::start(&["flood", "--server", &address, "--robots", &flooding], Some(1))?;
     until(&mut flood, "acked", 1).await?;
     let (begun, cpu_s, acked) = (Instant::now(), server.cpu_s()?, flood.ask("acked")?);
-    let turns = turns(args, robots, &room.join("stops"), room, async || Ok(())).await?;
+    let turns = turns(args, site, robots, &room.join("stops"), room, async || Ok(())).await?;
     let wall_s = begun.elapsed().as_secs_f64();
     let (reports, cpu_s) = ((flood.ask("acked")? - acked) as f64, server.cpu_since_s(cpu_s)?);
     say(&format!("  beside: {:.0} durable reports a second, {:.2} core", reports / wall_s, cpu_s / wall_s));
     Ok(turns)
 }
 
-async fn bulk(args: &StopArgs, robots: usize, room: &Path, say: &dyn Fn(&str)) -> anyhow::Result<Turns> {
+async fn bulk(args: &StopArgs, site: &Site, robots: usize, room: &Path, say: &dyn Fn(&str)) -> anyhow::Result<Turns> {
     let mut releases = Releases::make(&room.join("releases"))?;
     let release = releases.add(1, FILE_BYTES)?;
     let (data, keys) = (room.join("data"), releases.keys());
@@ -127,7 +134,7 @@ async fn bulk(args: &StopArgs, robots: usize, room: &Path, say: &dyn Fn(&str)) -
     let mut pull = Child::start(&role, Some(1))?;
     until(&mut pull, "bytes", 1).await?;
     let (begun, before) = (Instant::now(), pull.ask("bytes")?);
-    let turns = turns(args, robots, &room.join("stops"), room, async || Ok(())).await?;
+    let turns = turns(args, site, robots, &room.join("stops"), room, async || Ok(())).await?;
     let mib = (pull.ask("bytes")? - before) as f64 / 1_048_576.0;
     say(&format!("  beside: {:.0} MiB a second in {DOWNLOADS} downloads", mib / begun.elapsed().as_secs_f64()));
     Ok(turns)
@@ -161,7 +168,7 @@ impl Drop for Stopped {
     }
 }
 
-async fn database(args: &StopArgs, robots: usize, room: &Path) -> anyhow::Result<Turns> {
+async fn database(args: &StopArgs, site: &Site, robots: usize, room: &Path) -> anyhow::Result<Turns> {
     let engine = Engine::postgres(args.dir.as_deref())?;
     let bed = engine.bed(args.dir.as_ref())?;
     let map = hall::map(room, (HEARERS as f64).sqrt() as usize + 2)?;
@@ -169,7 +176,7 @@ async fn database(args: &StopArgs, robots: usize, room: &Path) -> anyhow::Result
     let _hearers = hearers(&server).await?;
     until(&mut server, crate::child::SESSIONS, HEARERS as u64).await?;
     let _stopped = Stopped::all_of(engine.pid().context("PostgreSQL does not say its number")?)?;
-    turns(args, robots, &room.join("stops"), room, async || Ok(())).await
+    turns(args, site, robots, &room.join("stops"), room, async || Ok(())).await
 }
 
 /// A file system in memory, gone with its value.
@@ -202,18 +209,18 @@ impl Drop for Small {
     }
 }
 
-async fn disk(args: &StopArgs, robots: usize, room: &Path) -> anyhow::Result<Turns> {
+async fn disk(args: &StopArgs, site: &Site, robots: usize, room: &Path) -> anyhow::Result<Turns> {
     let small = Small::mount(room.join("disk"))?;
     let mut server = server(&small.0).await?;
     let _hearers = hearers(&server).await?;
     until(&mut server, crate::child::SESSIONS, HEARERS as u64).await?;
     // Again before each turn: whatever was freed meanwhile is taken.
-    turns(args, robots, &small.0.join("stops"), room, async || small.fill()).await
+    turns(args, site, robots, &small.0.join("stops"), room, async || small.fill()).await
 }
 
-async fn kill(args: &StopArgs, robots: usize, room: &Path) -> anyhow::Result<Turns> {
+async fn kill(args: &StopArgs, site: &Site, robots: usize, room: &Path) -> anyhow::Result<Turns> {
     let mut hearing: Option<Child> = None;
-    turns(args, robots, &room.join("stops"), room, async || {
+    turns(args, site, robots, &room.join("stops"), room, async || {
         drop(hearing.take());
         let mut server = server(room).await?;
         hearing = Some(hearers(&server).await?);

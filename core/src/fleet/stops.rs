@@ -19,7 +19,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 /// How a stop holds a robot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Hold {
+pub enum Hold {
     /// It is engaged.
     Stop,
     /// It is over, and nobody has resumed the robot.
@@ -34,7 +34,7 @@ impl Hold {
         }
     }
     /// Reads a token of a fleet stop; those of the body's own safety system are of another form.
-    fn read(token: &str) -> Option<(StopId, Self)> {
+    pub fn read(token: &str) -> Option<(StopId, Self)> {
         let stop = token.strip_prefix("stop:").map(|id| (id, Self::Stop));
         let (id, hold) = stop.or_else(|| token.strip_prefix("resume:").map(|id| (id, Self::Resume)))?;
         Some((StopId::parse(id).ok()?, hold))

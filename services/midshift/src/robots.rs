@@ -43,9 +43,9 @@ const VISIT: Duration = Duration::from_secs(5);
 pub struct StopFlags {
     /// The stop service, host:port. Without it that on port 7421 of the server, if the robots are enrolled; where there is no login there is no line then. With a line
     /// a robot stands until it was told what is stopped, and slows down and stands when nobody answers.
-    #[arg(long, value_name = "ADDR", conflicts_with = "no_stop")]
+    #[arg(long, env = "MIDSHIFT_STOP_SERVER", value_name = "ADDR")]
     pub stop_server: Option<String>,
-    /// No line to a stop service: fleet stop reaches these robots only by the work that fleet gives them, and they do not slow down or stand when nobody is heard.
+    /// No line to a stop service, also if one is named: fleet stop reaches these robots only by the work that fleet gives them, and they do not slow down or stand when nobody is heard.
     #[arg(long)]
     pub no_stop: bool,
 }

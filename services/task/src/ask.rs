@@ -1,4 +1,4 @@
-//! What people ask of admitted tasks: cancel, resolve, resume. The request is made durable; fleet obeys it; we wait a little and show the task.
+//! What people ask of admitted tasks: cancel, resolve; `resume` is a room of its own. The request is made durable; fleet obeys it; we wait a little and show the task.
 //!
 //! Invariant: whether fleet has looked at a request is read from fleet's own mark, never guessed from how a task looks. A repeat of a
 //! request_id with the same body is the same request: it writes nothing and its etag is not asked for again.
@@ -9,7 +9,7 @@ use crate::rows::{TaskRows, read, unavailable};
 use midshift_core::audit::{self, Note};
 use midshift_core::fleet::rows::FleetMark;
 use midshift_core::identity::{Caller, Permission};
-use midshift_core::ids::{AreaId, RequestId, RobotId, TaskId};
+use midshift_core::ids::{RequestId, RobotId, TaskId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::rows::{Entry, Item, Log, Revision, Seq, Table, Writer};
@@ -27,14 +27,14 @@ use std::time::Duration;
 const ENTRIES: usize = 16;
 
 /// A request to be made durable.
-struct Asked {
-    ask: Ask,
-    reason: String,
-    request_id: Option<RequestId>,
-    hash: String,
-    actor: String,
+pub(crate) struct Asked {
+    pub(crate) ask: Ask,
+    pub(crate) reason: String,
+    pub(crate) request_id: Option<RequestId>,
+    pub(crate) hash: String,
+    pub(crate) actor: String,
     /// The robot that has the task.
-    robot_id: Option<RobotId>,
+    pub(crate) robot_id: Option<RobotId>,
 }
 
 impl Asked {
@@ -45,17 +45,17 @@ impl Asked {
     }
 }
 
-fn reason_text(text: &str, bad: &mut Violations) {
+pub(crate) fn reason_text(text: &str, bad: &mut Violations) {
     if text.is_empty() || text.len() > limits::REASON_BYTES_MAX {
         bad.add("reason", "is required, 1-256 bytes");
     }
 }
 
-fn request_id(text: &str, bad: &mut Violations) -> Option<RequestId> {
+pub(crate) fn request_id(text: &str, bad: &mut Violations) -> Option<RequestId> {
     if text.is_empty() { None } else { bad.take("request_id", RequestId::parse(text)) }
 }
 
-fn hash(verb: &str, message: &impl Message) -> String {
+pub(crate) fn hash(verb: &str, message: &impl Message) -> String {
     let mut digest = Sha256::new();
     digest.update(verb);
     digest.update(message.encode_to_vec());
@@ -66,7 +66,7 @@ fn reused(id: &RequestId) -> Refusal {
     Refusal::new(Kind::AlreadyExists, Reason::from(Code::RequestIdReused).with("request_id", id))
 }
 
-fn internal() -> Refusal {
+pub(crate) fn internal() -> Refusal {
     Refusal::new(Kind::Internal, Code::Internal)
 }
 
@@ -170,54 +170,12 @@ impl TaskService {
         Ok(v1::ResolveTaskResponse { task: Some(task.encode()), pending })
     }
 
-    /// Takes `resume:` tokens away.
-    pub async fn resume(&self, r: v1::ResumeHeldRequest, by: &Caller) -> Result<v1::ResumeHeldResponse, Refusal> {
-        let mut bad = Violations::default();
-        reason_text(&r.reason, &mut bad);
-        let request_id = request_id(&r.request_id, &mut bad);
-        let area_id = if r.area_id.is_empty() { None } else { bad.take("area_id", AreaId::parse(&r.area_id)) };
-        if area_id.as_ref().is_some_and(|area| self.inner.parts.site.find_area(area).is_none()) {
-            bad.add("area_id", "the site has no such area");
-        }
-        let most = limits::PAGE_MAX;
-        if r.task_ids.len() > most || r.robot_ids.len() > most {
-            bad.add("task_ids", "at most 1000 task_ids and 1000 robot_ids");
-        }
-        let task_ids: Vec<TaskId> = r
-            .task_ids
-            .iter()
-            .enumerate()
-            .filter_map(|(i, id)| bad.take(&format!("task_ids[{i}]"), TaskId::parse(id)))
-            .collect();
-        let robot_ids: Vec<RobotId> = r
-            .robot_ids
-            .iter()
-            .enumerate()
-            .filter_map(|(i, id)| bad.take(&format!("robot_ids[{i}]"), RobotId::parse(id)))
-            .collect();
-        let stop_id = Some(r.stop_id.clone()).filter(|s| !s.is_empty());
-        if stop_id.is_none() && area_id.is_none() && task_ids.is_empty() && robot_ids.is_empty() {
-            bad.add("stop_id", "name a stop_id, an area_id, task_ids or robot_ids: nothing is resumed by accident");
-        }
-        bad.finish()?;
-        let ask = Ask::ResumeHeld { stop_id, area_id, task_ids, robot_ids };
-        match self.may_resume(&ask, by).await {
-            Err(refusal) if !r.validate_only => return Err(self.denied(ask, r.reason, request_id, by, refusal).await),
-            looked => looked?,
-        }
-        let same = v1::ResumeHeldRequest { request_id: String::new(), validate_only: false, ..r.clone() };
-        let hash = hash("resume", &same);
-        let earlier = self.asked_before(request_id.as_ref(), &hash).await?;
-        if r.validate_only {
-            return Ok(v1::ResumeHeldResponse { pending: false });
-        }
-        let asked = Asked { ask, reason: r.reason, request_id, hash, actor: by.to_string(), robot_id: None };
-        let pending = self.ask(earlier, asked).await?;
-        Ok(v1::ResumeHeldResponse { pending })
-    }
-
     /// Where the request stands that this one repeats; none: it is new.
-    async fn asked_before(&self, request_id: Option<&RequestId>, hash: &str) -> Result<Option<Seq>, Refusal> {
+    pub(crate) async fn asked_before(
+        &self,
+        request_id: Option<&RequestId>,
+        hash: &str,
+    ) -> Result<Option<Seq>, Refusal> {
         let Some(id) = request_id else { return Ok(None) };
         match load::<RequestKey>(self.store(), id.as_str()).await.map_err(unavailable)? {
             Some((key, _)) if key.payload_hash == hash => self.place_of(id).await.map(Some).map_err(unavailable),
@@ -252,7 +210,7 @@ impl TaskService {
     }
 
     /// Makes a request durable unless it is a repeat, and waits a little for fleet. True: fleet has not looked at it yet.
-    async fn ask(&self, earlier: Option<Seq>, asked: Asked) -> Result<bool, Refusal> {
+    pub(crate) async fn ask(&self, earlier: Option<Seq>, asked: Asked) -> Result<bool, Refusal> {
         let place = match earlier {
             Some(place) => place,
             None => self.write(asked).await?,
@@ -261,7 +219,7 @@ impl TaskService {
     }
 
     /// Leaves it in the audit if the caller may not, and gives the refusal back. What it may not even see is about nothing that there is.
-    async fn denied(
+    pub(crate) async fn denied(
         &self,
         ask: Ask,
         reason: String,
@@ -278,7 +236,7 @@ impl TaskService {
     }
 
     /// Leaves a refusal in the audit. Whoever asked hears why, whether or not that can be written down.
-    async fn noted(&self, asked: &Asked, fits: Result<(), Refusal>) -> Result<(), Refusal> {
+    pub(crate) async fn noted(&self, asked: &Asked, fits: Result<(), Refusal>) -> Result<(), Refusal> {
         if let Err(refusal) = &fits {
             let request_id = asked.request_id.as_ref().map(RequestId::as_str);
             let item = audit::refusal(Writer::Task, &asked.actor, request_id, asked.note(), refusal);

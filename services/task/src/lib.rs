@@ -11,6 +11,7 @@ mod images;
 mod list;
 mod prune;
 mod reach;
+mod resume;
 mod rows;
 mod watch;
 

@@ -40,6 +40,7 @@ const NEW_WORDS: &[(&str, &str)] = &[
     ("fleet_stop", "said only by robots with a line to a stop service: the same"),
     ("STOPS_FULL", "an answer of the stop service, which writes no row"),
     ("STOP_WAS_RESET", "the same"),
+    ("STOP_NOT_FOUND", "an answer of task, which writes no row"),
     ("LINE_REPLACED", "the same"),
     ("TOO_MANY_REQUESTS", "an answer of a port, which writes no row"),
     ("SIGN_IN_NEEDED", "an answer of a port or of identity, which writes no row"),

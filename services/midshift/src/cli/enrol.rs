@@ -9,16 +9,19 @@ use midshift_proto::identity::v1;
 pub async fn offer(call: &Call, robot_id: String, replace: bool, out: &Out) -> Result<(), Exit> {
     let asked = v1::CreateEnrolmentRequest { robot_id: robot_id.clone(), replace };
     let offered = call.identity().await?.create_enrolment(unary(asked)).await?.into_inner();
-    let server = call.address()?;
-    out.one(&offered, &offered.secret, || {
-        format!(
-            "midshift agent run --robot-id {robot_id} --server {server} --data /var/lib/midshift-agent --enroll {}",
-            offered.secret
-        )
-    })?;
+    let (server, stop_server) = (call.address()?, call.resolved()?.stop_server);
+    out.one(&offered, &offered.secret, || line(&robot_id, &server, stop_server.as_deref(), &offered.secret))?;
     let until = offered.expire_time.as_ref().map_or_else(String::new, |time| time_of(time).rfc3339());
     out.next(&format!("run it on the robot, once, before {until}; the secret is shown once"));
     Ok(())
+}
+
+/// What is run on the robot. Where stops are is said if it is not the usual port of the server.
+fn line(robot_id: &str, server: &str, stop_server: Option<&str>, secret: &str) -> String {
+    let stops = stop_server.map_or_else(String::new, |address| format!(" --stop-server {address}"));
+    format!(
+        "midshift agent run --robot-id {robot_id} --server {server}{stops} --data /var/lib/midshift-agent --enroll {secret}"
+    )
 }
 
 /// Takes a robot's key out.
@@ -58,4 +61,15 @@ pub async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
         vec![robot.robot_id.clone(), state, at(&robot.enrol_time), at(&robot.expire_time)]
     };
     Ok(out.many(&all, &all.robots, |r| r.robot_id.clone(), &["ROBOT", "STATE", "SINCE", "CERTIFICATE UNTIL"], row)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::line;
+
+    #[test]
+    fn the_line_of_a_robot_says_where_stops_are_if_its_site_has_them_elsewhere() {
+        assert!(!line("r7", "hub:7420", None, "s").contains("--stop-server"));
+        assert!(line("r7", "hub:7420", Some("hub:18421"), "s").contains(" --server hub:7420 --stop-server hub:18421 "));
+    }
 }

@@ -62,7 +62,7 @@ impl StopCall {
 /// What robots do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Level {
-    /// Drive at most 300 mm/s, and work on.
+    /// Drive at most 300 mm/s, or as slowly as the body can if that is faster, and work on.
     Slow,
     /// Stand still, powered.
     Halt,

@@ -115,9 +115,23 @@ impl Resume {
             validate_only: change.dry_run,
         };
         let answer = call.task().await?.resume_held(unary(request)).await?.into_inner();
-        out.one(&answer, "", || "resume asked for".to_owned())?;
+        out.one(&answer, "", || resumed(&answer))?;
+        if !answer.still_stopped.is_empty() {
+            let text = format!("not resumed: {}", answer.still_stopped.join(", "));
+            return Err(Exit::new(9, text).or_try("the same again when they are heard: midshift robot ls"));
+        }
         out.next("midshift task ls --state held");
         Ok(())
+    }
+}
+
+fn resumed(answer: &v1::ResumeHeldResponse) -> String {
+    match (answer.robots, answer.pending) {
+        (Some(0), _) => "nothing waited for it".to_owned(),
+        (Some(1), false) => "1 robot resumed".to_owned(),
+        (Some(robots), false) => format!("{robots} robots resumed"),
+        (_, true) => "resume asked for; fleet has not looked at it yet".to_owned(),
+        (None, false) => "resumed".to_owned(),
     }
 }
 

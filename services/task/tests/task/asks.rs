@@ -1,9 +1,12 @@
 //! Cancel, resolve, resume: durable, obeyed by fleet, safe to repeat.
 
 use crate::world::{World, reason, submit, transport};
-use midshift_core::task::Phase;
+use midshift_core::fleet::rows::HoldToken;
+use midshift_core::rows::Record;
+use midshift_core::task::{Phase, TaskRequest};
 use midshift_proto::task::v1::task_service_server::TaskService as _;
 use midshift_proto::task::v1::{self, CancelTaskRequest, Resolution, ResolveTaskRequest, ResumeHeldRequest};
+use midshift_store::{Query, Store};
 use tonic::{Code, Request, Status};
 
 fn cancel(task_id: &str) -> CancelTaskRequest {
@@ -152,6 +155,7 @@ async fn a_resume_says_why_and_whom_and_whether_fleet_has_looked_at_it() {
     let refused = call(ResumeHeldRequest::default()).await.expect_err("no reason and nobody named");
     let fields: Vec<_> = midshift_proto::refusal_of(&refused).violations.into_iter().map(|v| v.field).collect();
     assert_eq!(fields, ["reason", "stop_id"]);
+    world.copies_stop("s1", true).await;
     let request = ResumeHeldRequest {
         stop_id: "s1".into(),
         request_id: "go-1".into(),
@@ -163,6 +167,55 @@ async fn a_resume_says_why_and_whom_and_whether_fleet_has_looked_at_it() {
     assert!(!call(request.clone()).await.expect("the same request").pending);
     let other = ResumeHeldRequest { stop_id: "s2".into(), ..request };
     assert_eq!(reason(&call(other).await.expect_err("another body")), "REQUEST_ID_REUSED");
+}
+
+fn resume(stop_id: &str) -> ResumeHeldRequest {
+    ResumeHeldRequest { stop_id: stop_id.into(), reason: "clear".into(), ..ResumeHeldRequest::default() }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_resume_before_the_reset_is_refused_and_is_not_kept_for_later() {
+    let world = World::new().await;
+    let call = async |request| world.service.resume_held(Request::new(request)).await.map(|a| a.into_inner());
+    let unknown = call(resume("STOP-9")).await.expect_err("nobody knows of it");
+    assert_eq!((unknown.code(), reason(&unknown).as_str()), (Code::NotFound, "STOP_NOT_FOUND"));
+    world.copies_stop("STOP-1", false).await;
+    world.fleet_holds(None, "stop:STOP-1").await;
+    for validate_only in [false, true] {
+        let early = call(ResumeHeldRequest { validate_only, ..resume("STOP-1") }).await.expect_err("it is engaged");
+        assert_eq!((early.code(), reason(&early).as_str()), (Code::FailedPrecondition, "STOP_ENGAGED"));
+    }
+    let asked = world.store.list(Query::all(TaskRequest::TABLE)).await.expect("a store that answers");
+    assert!(asked.is_empty(), "nothing is kept for later");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_resume_right_after_the_reset_waits_until_fleet_has_seen_it() {
+    let world = World::new().await;
+    world.copies_stop("STOP-1", true).await;
+    world.fleet_holds(None, "stop:STOP-1").await;
+    let fleet_sees = async {
+        world.fleet_holds(Some("stop:STOP-1"), "resume:STOP-1").await;
+        let head = world.head();
+        world.fleet_turns_after(head).await;
+    };
+    let (answer, ()) = tokio::join!(world.service.resume_held(Request::new(resume("STOP-1"))), fleet_sees);
+    let answer = answer.expect("durable").into_inner();
+    assert_eq!((answer.robots, answer.pending, answer.still_stopped.len()), (Some(1), false, 0));
+    let left = world.store.list(Query::all(HoldToken::TABLE)).await.expect("a store that answers");
+    assert!(left.is_empty(), "the robot may go on");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_resume_names_the_robots_that_it_does_not_let_go() {
+    let world = World::new().await;
+    world.copies_stop("STOP-1", true).await;
+    world.fleet_holds(None, "stop:STOP-1").await;
+    let answer = world.service.resume_held(Request::new(resume("STOP-1"))).await.expect("durable").into_inner();
+    assert_eq!((answer.robots, answer.still_stopped), (Some(0), vec!["r1".to_owned()]));
+    let others = ResumeHeldRequest { robot_ids: vec!["r2".into()], ..resume("STOP-1") };
+    let answer = world.service.resume_held(Request::new(others)).await.expect("durable").into_inner();
+    assert_eq!((answer.robots, answer.still_stopped.len()), (Some(0), 0), "of those that it names");
 }
 
 #[tokio::test(start_paused = true)]

@@ -1,9 +1,13 @@
 //! A service over a store in memory, and somebody who plays fleet: either by core's own law or row by row.
 
+use midshift_core::fleet::rows::HoldToken;
 use midshift_core::fleet::{LOGS, Plan, absorb, view::TABLES, view::View};
-use midshift_core::ids::{AttemptId, RobotId, SiteId, Subject, TaskId};
-use midshift_core::rows::{Item, Record, Revision, Seq, Writer};
+use midshift_core::ids::{AttemptId, RobotId, SiteId, StopId, Subject, TaskId};
+use midshift_core::robot::StopLevel;
+use midshift_core::rows::{Item, Key, Record, Revision, Seq, Writer};
 use midshift_core::site::{DEMO, Site, text};
+use midshift_core::stop::record::StopRecord;
+use midshift_core::stop::{Reset, Scope, Stop};
 use midshift_core::task::{Attempt, AttemptPhase, Phase, TaskState};
 use midshift_core::time::{Clock, Now, SiteTime, Utc};
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
@@ -109,6 +113,29 @@ impl World {
         }
         let (_, revision) = self.state(&task.id()).await;
         item.update(task, revision, "task.changed");
+        self.store.commit(vec![item]).await.pop().expect("a result").expect("applied");
+    }
+    /// The copy of a fleet stop that was engaged, and reset if so.
+    pub async fn copies_stop(&self, stop_id: &str, is_reset: bool) {
+        let (stop_id, actor) = (StopId::parse(stop_id).expect("an id"), "anna".to_owned());
+        let reset = Reset { stop_id: stop_id.clone(), at: NOON, actor: actor.clone(), reason: "clear".to_owned() };
+        let (level, reason) = (StopLevel::Halt, "a drill".to_owned());
+        let stop =
+            Stop { stop_id, scope: Scope::Fleet, level, engaged: NOON, actor, reason, region: None, proof: Vec::new() };
+        let mut item = Item::new(Writer::Stop, "stop-follower");
+        item.create(&StopRecord { stop, reset: is_reset.then_some(reset) }, "stop.copied");
+        self.store.commit(vec![item]).await.pop().expect("a result").expect("applied");
+    }
+    /// Fleet takes one token of r1 away, if any, and writes the other.
+    pub async fn fleet_holds(&self, old: Option<&str>, token: &str) {
+        let robot_id = RobotId::parse("r1").expect("an id");
+        let mut item = Item::new(Writer::Fleet, "fleet");
+        if let Some(old) = old.map(|old| HoldToken::id_of(&robot_id, old)) {
+            let (_, revision) =
+                load::<HoldToken>(self.store.as_ref(), &old).await.expect("a store that answers").expect("a token");
+            item.delete(Key::new(HoldToken::TABLE, old), revision, "hold.replaced");
+        }
+        item.create(&HoldToken { robot_id, token: token.to_owned(), since: NOON }, "hold.stopped");
         self.store.commit(vec![item]).await.pop().expect("a result").expect("applied");
     }
     /// Fleet gives the task to a robot that works on it.
