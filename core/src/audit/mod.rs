@@ -5,7 +5,7 @@
 
 mod verify;
 
-pub use verify::{Broken, Chain, Export, Held, Mark, Verified};
+pub use verify::{Broken, Chain, Ends, Export, Held, Mark, Verified};
 
 use crate::reason::{self, Code, Refusal};
 use crate::rows::{Index, Item, Key, Record, Revision, Row, Table, Writer};

@@ -1,5 +1,6 @@
 use super::*;
 use crate::reason::{Kind as RefusalKind, Reason};
+use crate::time::Utc;
 use proptest::prelude::*;
 
 fn by(actor: &str, at_unix_ms: i64) -> By {
@@ -18,11 +19,15 @@ fn decisions(n: usize) -> Vec<Note> {
 }
 
 fn noted(head: &Head) -> Mark {
-    Mark { service: "fleet".to_owned(), head: head.clone(), by: "your note".to_owned() }
+    Mark { service: "fleet".to_owned(), head: head.clone(), by: "your note".to_owned(), at_unix_ms: None }
 }
 
+/// When everything here is verified.
+const NOW: Utc = Utc(1_000 * DAY_MS);
+const DAY_MS: i64 = 24 * 3_600_000;
+
 fn verify(rows: &[Row], known: &[Mark]) -> Result<Verified, Broken> {
-    let mut chain = Chain::new("fleet", known.iter().cloned());
+    let mut chain = Chain::new("fleet", known.iter().cloned(), NOW);
     for row in rows {
         chain.take_row(row)?;
     }
@@ -118,11 +123,46 @@ fn a_chain_begins_behind_old_rows_only_where_a_row_of_it_says_so() {
     let mut rows = grow(&mut heads, &decisions(4));
     let third: AuditRow = serde_json::from_str(&rows[2].body).expect("JSON");
     rows.extend(grow(&mut heads, &[Note::cut(third.head()), Note::new("robot.uncordon")]));
-    let known = [noted(&heads[&Writer::Fleet]), noted(&Head { n: 2, hash: NOTHING.to_owned() })];
-    let held = verify(&rows[3..], &known).expect("it was cut there, and a row that was cut is not asked for");
+    let known = [noted(&heads[&Writer::Fleet])];
+    let held = verify(&rows[3..], &known).expect("it was cut there");
     assert_eq!((held.first, held.rows), (4, 3));
-    assert_eq!(verify(&rows[2..], &known[..1]), Err(Broken::Beheaded { first: 3 }), "not there");
-    assert_eq!(verify(&rows[4..], &known[..1]), Err(Broken::Beheaded { first: 5 }));
+    assert_eq!(verify(&rows[2..], &known), Err(Broken::Beheaded { first: 3 }), "not there");
+    assert_eq!(verify(&rows[4..], &known), Err(Broken::Beheaded { first: 5 }));
+}
+
+#[test]
+fn a_cut_takes_no_row_that_a_person_noted_or_that_was_quoted_when_it_was_young() {
+    const CUT: i64 = 500 * DAY_MS;
+    const KEPT: i64 = 400 * DAY_MS;
+    let mut heads = BTreeMap::new();
+    grow(&mut heads, &decisions(6));
+    let old = heads[&Writer::Fleet].clone();
+    // All that is left says of itself that the rows before it were cut.
+    let cut = |at: i64| {
+        let row = append(&mut heads.clone(), Writer::Fleet, &Note::cut(old.clone()), &by("fleet", at));
+        [row.expect("fleet has a chain")]
+    };
+    let quoted = |n: u64, at: i64| {
+        let (hash, by) = (old.hash.clone(), format!("row 9 of task"));
+        [Mark { service: "fleet".to_owned(), head: Head { n, hash }, by, at_unix_ms: Some(at) }]
+    };
+    let early = |n: u64, by: &str| Err(Broken::CutEarly { first: 7, known: n, by: by.to_owned() });
+    assert_eq!(verify(&cut(CUT), &[noted(&old)]), early(6, "your note"));
+    assert_eq!(verify(&cut(CUT), &[noted(&Head { n: 2, hash: NOTHING.to_owned() })]), early(2, "your note"));
+    assert_eq!(verify(&cut(CUT), &quoted(6, CUT - 1)), early(6, "row 9 of task"));
+    assert_eq!(verify(&cut(CUT), &quoted(3, CUT - KEPT + DAY_MS)), early(3, "row 9 of task"));
+    assert!(verify(&cut(CUT), &quoted(6, CUT - KEPT - 1)).is_ok(), "old when it went");
+    let late = cut(NOW.0 + 2 * KEPT);
+    assert_eq!(verify(&late, &quoted(6, NOW.0 - DAY_MS)), early(6, "row 9 of task"), "nothing was cut in the future");
+    // One row of the chain that is looked up where it should be.
+    let ends = Ends { first: 7, last: 7, cut_unix_ms: Some(CUT), now_unix_ms: NOW.0 };
+    let hold = |mark: &[Mark], ends| mark[0].hold(None, ends);
+    assert_eq!(hold(&quoted(6, CUT - 1), ends), early(6, "row 9 of task").map(|_: Verified| ()));
+    assert_eq!(hold(&quoted(6, CUT - KEPT - 1), ends), Ok(()));
+    assert!(
+        hold(&quoted(6, CUT - KEPT - 1), Ends { cut_unix_ms: None, ..ends }).is_err(),
+        "nothing says that it was cut"
+    );
 }
 
 #[test]
@@ -139,11 +179,11 @@ fn an_anchor_quotes_the_heads_of_the_others_and_a_row_that_is_not_the_quoted_one
         (mark.service.as_str(), &mark.head, mark.by.as_str()),
         ("fleet", &heads[&Writer::Fleet], "row 1 of task")
     );
-    assert_eq!(mark.hold(Some(&rows[2].body), (0, 0)), Ok(()));
-    assert!(matches!(mark.hold(Some(&rows[1].body), (0, 0)), Err(Broken::Rewritten { n: 3, .. })));
-    assert!(matches!(mark.hold(None, (1, 2)), Err(Broken::Truncated { last: 2, known: 3, .. })));
-    assert!(matches!(mark.hold(None, (1, 5)), Err(Broken::Order { expected: 3, .. })));
-    assert_eq!(mark.hold(None, (4, 5)), Ok(()), "it was cut, which its own chain answers for");
+    let ends = |first, last| Ends { first, last, ..Ends::default() };
+    assert_eq!(mark.hold(Some(&rows[2].body), ends(0, 0)), Ok(()));
+    assert!(matches!(mark.hold(Some(&rows[1].body), ends(0, 0)), Err(Broken::Rewritten { n: 3, .. })));
+    assert!(matches!(mark.hold(None, ends(1, 2)), Err(Broken::Truncated { last: 2, known: 3, .. })));
+    assert!(matches!(mark.hold(None, ends(1, 5)), Err(Broken::Order { expected: 3, .. })));
 }
 
 #[test]
@@ -180,7 +220,7 @@ fn export() -> (Export, Vec<String>) {
 
 fn read(export: &Export, lines: &[String]) -> BTreeMap<String, Result<Verified, Broken>> {
     let quoted: Vec<Mark> = lines.iter().flat_map(|line| Mark::in_line(line)).collect();
-    let mut held = Held::new(export, &quoted);
+    let mut held = Held::new(export, &quoted, NOW);
     lines.iter().for_each(|line| held.take(line));
     held.finish()
 }

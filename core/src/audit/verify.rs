@@ -3,7 +3,9 @@
 //! Invariant: the first thing that is wrong is what is said; nothing behind it is believed. One row at a time is held in memory.
 
 use super::{AuditRow, CUT, Head, id_of, index_of, link, open};
+use crate::limits;
 use crate::rows::{Revision, Row, Table};
+use crate::time::Utc;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -36,6 +38,16 @@ pub enum Broken {
         /// Its first row.
         first: u64,
     },
+    /// It begins behind a row that somebody knows of and that was not old enough to go, whatever its own rows say of a cut.
+    #[error("it begins with row {first}, and {by} has row {known}: only what is older than {days} days may be cut, and it was not, or nobody here can tell", days = limits::AUDIT_DAYS)]
+    CutEarly {
+        /// Its first row.
+        first: u64,
+        /// One that was there.
+        known: u64,
+        /// Who knows it.
+        by: String,
+    },
     /// Rows are gone that somebody knows of.
     #[error("it ends with row {last}, and {by} has row {known}: its end was taken away")]
     Truncated {
@@ -63,7 +75,7 @@ impl Broken {
             Self::Altered { .. } => "ALTERED",
             Self::Unlinked { .. } => "UNLINKED",
             Self::Order { .. } => "ORDER",
-            Self::Beheaded { .. } => "BEHEADED",
+            Self::Beheaded { .. } | Self::CutEarly { .. } => "BEHEADED",
             Self::Truncated { .. } => "TRUNCATED",
             Self::Rewritten { .. } => "REWRITTEN",
         }
@@ -74,7 +86,7 @@ impl Broken {
             Self::Altered { n } | Self::Unlinked { n } | Self::Rewritten { n, .. } => *n,
             Self::Order { expected, .. } => *expected,
             Self::Beheaded { first } => *first,
-            Self::Truncated { known, .. } => *known,
+            Self::Truncated { known, .. } | Self::CutEarly { known, .. } => *known,
         }
     }
 }
@@ -99,6 +111,34 @@ pub struct Mark {
     pub head: Head,
     /// Who has it, for the text of an error.
     pub by: String,
+    /// When the row that quotes it was committed, UTC of the wall, unix ms; none: a note of which nobody knows when it was taken.
+    pub at_unix_ms: Option<i64>,
+}
+
+/// Where a chain begins and ends, and when it was cut there.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Ends {
+    /// Its first row; 0: it has none.
+    pub first: u64,
+    /// Its newest row; 0: it has none.
+    pub last: u64,
+    /// When its newest row of a cut was committed, unix ms; none: it has none.
+    pub cut_unix_ms: Option<i64>,
+    /// Now, for whoever verifies: nothing was cut later. Unix ms.
+    pub now_unix_ms: i64,
+}
+
+impl Ends {
+    /// What a mark below the first row says: it may be missing only if it was quoted so long before the cut that the row was old by then. Clocks of two
+    /// processes that write rows may differ by an hour.
+    fn missing(&self, mark: &Mark) -> Result<(), Broken> {
+        const KEPT_MS: i64 = (limits::AUDIT_DAYS * 24 * 3_600_000).cast_signed();
+        const CLOCKS_MS: i64 = 3_600_000;
+        let cut = self.cut_unix_ms.map(|cut| cut.min(self.now_unix_ms));
+        let was_old = cut.zip(mark.at_unix_ms).is_some_and(|(cut, at)| at < cut.saturating_sub(KEPT_MS) + CLOCKS_MS);
+        let early = || Broken::CutEarly { first: self.first, known: mark.head.n, by: mark.by.clone() };
+        if was_old { Ok(()) } else { Err(early()) }
+    }
 }
 
 impl Mark {
@@ -114,25 +154,36 @@ impl Mark {
         let (service, n, hash) = (parts.next()?, parts.next()?.parse().ok()?, parts.next()?);
         let is_hash = hash.len() == 64 && hash.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
         let head = Head { n, hash: hash.to_owned() };
-        (!service.is_empty() && is_hash).then(|| Self { service: service.to_owned(), head, by: "your note".to_owned() })
+        (!service.is_empty() && is_hash).then(|| Self {
+            service: service.to_owned(),
+            head,
+            by: "your note".to_owned(),
+            at_unix_ms: None,
+        })
     }
     /// What an anchor quotes.
     pub fn quoted(row: &AuditRow) -> impl Iterator<Item = Self> + '_ {
         let by = format!("row {} of {}", row.n, row.service);
         let quoted = row.heads.iter().filter(|(_, head)| head.n > 0);
-        quoted.map(move |(service, head)| Self { service: service.clone(), head: head.clone(), by: by.clone() })
+        let at_unix_ms = Some(row.at_unix_ms);
+        quoted.map(move |(service, head)| Self {
+            service: service.clone(),
+            head: head.clone(),
+            by: by.clone(),
+            at_unix_ms,
+        })
     }
-    /// Whether `body`, the row of this number, is the one noted down; none: there is none, and the chain begins with `first` and ends with `last`.
+    /// Whether `body`, the row of this number, is the one noted down; none: there is none in a chain with these ends.
     ///
     /// # Errors
     /// It is not, or it should be there.
-    pub fn hold(&self, body: Option<&str>, (first, last): (u64, u64)) -> Result<(), Broken> {
+    pub fn hold(&self, body: Option<&str>, ends: Ends) -> Result<(), Broken> {
         let (n, by) = (self.head.n, || self.by.clone());
         match body {
             Some(body) if open(body).is_some_and(|row| row.hash == self.head.hash) => Ok(()),
             Some(_) => Err(Broken::Rewritten { n, by: by() }),
-            None if n < first => Ok(()),
-            None if n > last => Err(Broken::Truncated { last, known: n, by: by() }),
+            None if n < ends.first => ends.missing(self),
+            None if n > ends.last => Err(Broken::Truncated { last: ends.last, known: n, by: by() }),
             None => Err(Broken::Order { expected: n, found: n + 1 }),
         }
     }
@@ -146,19 +197,23 @@ pub struct Chain {
     marks: BTreeMap<u64, BTreeSet<Mark>>,
     /// Where it begins, if not with row 1, until a row says that it was cut there.
     cut: Option<Head>,
+    /// When it was.
+    cut_unix_ms: Option<i64>,
+    now: Utc,
     first: u64,
     rows: u64,
     head: Head,
 }
 
 impl Chain {
-    /// Of `service`, to be held against what is noted of it.
-    pub fn new(service: &str, noted: impl IntoIterator<Item = Mark>) -> Self {
+    /// Of `service`, to be held against what is noted of it. `now` is the time of whoever verifies: a cut that says that it is to come is none of later.
+    pub fn new(service: &str, noted: impl IntoIterator<Item = Mark>, now: Utc) -> Self {
         let mut marks: BTreeMap<u64, BTreeSet<Mark>> = BTreeMap::new();
         for mark in noted.into_iter().filter(|mark| mark.service == service && mark.head.n > 0) {
             marks.entry(mark.head.n).or_default().insert(mark);
         }
-        Self { service: service.to_owned(), marks, cut: None, first: 0, rows: 0, head: Head::default() }
+        let (service, head) = (service.to_owned(), Head::default());
+        Self { service, marks, cut: None, cut_unix_ms: None, now, first: 0, rows: 0, head }
     }
 
     /// Takes the next row as its table has it, and gives it back as it is read.
@@ -206,7 +261,7 @@ impl Chain {
             return Err(Broken::Rewritten { n: read.n, by: mark.by });
         }
         if read.action == CUT && read.cut.is_some() && read.cut == self.cut {
-            self.cut = None;
+            (self.cut, self.cut_unix_ms) = (None, Some(read.at_unix_ms));
         }
         self.first = if self.rows == 0 { read.n } else { self.first };
         self.rows += 1;
@@ -224,7 +279,7 @@ impl Chain {
         self.marks.range(self.head.n + 1..).next().is_some()
     }
 
-    /// After the last row. A noted row that was cut is not asked for.
+    /// After the last row. A row that was quoted long enough before it was cut is not asked for; one that a person noted is.
     ///
     /// # Errors
     /// What is wrong with the chain as a whole.
@@ -232,6 +287,9 @@ impl Chain {
         if self.cut.is_some() {
             return Err(Broken::Beheaded { first: self.first });
         }
+        let (first, last) = (self.first, self.head.n);
+        let ends = Ends { first, last, cut_unix_ms: self.cut_unix_ms, now_unix_ms: self.now.0 };
+        self.marks.range(..first).flat_map(|(_, marks)| marks).try_for_each(|mark| ends.missing(mark))?;
         let beyond = self.marks.range(self.head.n + 1..).next_back().and_then(|(_, marks)| marks.first());
         if let Some(mark) = beyond {
             return Err(Broken::Truncated { last: self.head.n, known: mark.head.n, by: mark.by.clone() });
@@ -266,24 +324,31 @@ impl Export {
     /// Its heads, as noted rows.
     pub fn marks(&self) -> impl Iterator<Item = Mark> + '_ {
         let by = || "the first line of the export".to_owned();
-        self.heads.iter().map(move |(service, head)| Mark { service: service.clone(), head: head.clone(), by: by() })
+        self.heads.iter().map(move |(service, head)| Mark {
+            service: service.clone(),
+            head: head.clone(),
+            by: by(),
+            at_unix_ms: None,
+        })
     }
 }
 
 /// The chains of an export while its lines are read.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub struct Held {
+    now: Utc,
     chains: BTreeMap<String, Chain>,
     verdicts: BTreeMap<String, Broken>,
 }
 
 impl Held {
-    /// Of an export with this first line, to be held against rows noted elsewhere and quoted by the anchors in it.
-    pub fn new(export: &Export, noted: &[Mark]) -> Self {
+    /// Of an export with this first line, to be held against rows noted elsewhere and quoted by the anchors in it; `now` is the
+    /// time of whoever verifies.
+    pub fn new(export: &Export, noted: &[Mark], now: Utc) -> Self {
         let names = export.heads.keys().chain(noted.iter().map(|mark| &mark.service));
         let marks: Vec<Mark> = export.marks().chain(noted.iter().cloned()).collect();
-        let chain = |name: &String| (name.clone(), Chain::new(name, marks.iter().cloned()));
-        Self { chains: names.map(chain).collect(), verdicts: BTreeMap::new() }
+        let chain = |name: &String| (name.clone(), Chain::new(name, marks.iter().cloned(), now));
+        Self { now, chains: names.map(chain).collect(), verdicts: BTreeMap::new() }
     }
     /// Takes a line behind the first. A chain is not read behind what is wrong with it.
     pub fn take(&mut self, line: &str) {
@@ -294,7 +359,7 @@ impl Held {
         if self.verdicts.contains_key(&service) {
             return;
         }
-        let chain = self.chains.entry(service.clone()).or_insert_with(|| Chain::new(&service, []));
+        let chain = self.chains.entry(service.clone()).or_insert_with(|| Chain::new(&service, [], self.now));
         if let Err(broken) = chain.take(line) {
             self.verdicts.insert(service, broken);
         }

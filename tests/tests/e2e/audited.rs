@@ -2,6 +2,7 @@
 
 use crate::harness::{Server, command, folder, second, until};
 use anyhow::{Context, bail, ensure};
+use midshift_core::audit::{Head, Mark, link};
 use serde_json::Value;
 use std::path::Path;
 use std::process::{Command, Output};
@@ -12,7 +13,7 @@ const STATEMENTS: &str = "import sqlite3, sys
 connection = sqlite3.connect(sys.argv[1])
 connection.execute('PRAGMA wal_checkpoint(TRUNCATE)')
 for statement in sys.argv[2:]:
-    assert connection.execute(statement).rowcount == 1, statement
+    assert connection.execute(statement).rowcount >= 1, statement
 connection.commit()
 connection.execute('PRAGMA wal_checkpoint(TRUNCATE)')";
 
@@ -162,6 +163,56 @@ async fn what_is_changed_in_the_database_is_named_by_verify_after_the_next_start
         server.restart().await?;
         said(&server, &["audit", "verify"])?;
     }
+    Ok(())
+}
+
+/// Statements that put one row in the place of a whole chain: it says of itself that all before it was old and cut.
+fn forged(head: &Head) -> Vec<String> {
+    let Head { n, hash: prev } = head;
+    let (next, at) = (n + 1, midshift::clock::wall().0);
+    let said = format!(
+        r#"{{"service":"identity","n":{next},"at_unix_ms":{at},"actor":"identity","action":"audit.cut","outcome":"DONE","cut":{{"n":{n},"hash":"{prev}"}}}}"#
+    );
+    let hash = link(prev, &said);
+    let open = said.strip_suffix('}').unwrap_or(&said);
+    let body = format!(r#"{open},"prev":"{prev}","hash":"{hash}"}}"#);
+    let (id, columns) = (format!("{next:016}"), "site_id, id, revision, state, parent, ord, body");
+    vec![
+        "DELETE FROM identity_audit".to_owned(),
+        format!(
+            "INSERT INTO identity_audit ({columns}) SELECT site_id, '{id}', 1, 2, NULL, {next}, '{body}' FROM audit_head WHERE chain = 'identity'"
+        ),
+        format!("UPDATE audit_head SET n = {next}, hash = '{hash}' WHERE chain = 'identity'"),
+    ]
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_is_changed_to_look_as_if_it_was_old_and_cut_is_named_by_the_head_that_somebody_noted()
+-> anyhow::Result<()> {
+    let dir = folder()?;
+    let mut server = Server::start(dir.path()).await?;
+    until("a row of each service that quotes the others", Duration::from_secs(30), || async {
+        Ok((rows(&server, &["--action", "audit.anchor"])?.len() >= 4).then_some(()))
+    })
+    .await?;
+    let heads = said(&server, &["audit", "verify", "-o", "name"])?;
+    let noted = heads.lines().find(|head| head.starts_with("identity:")).context("a head")?;
+    let head = Mark::parse(noted).context("a head")?.head;
+    server.kill()?;
+    let file = server.data().join("control.db");
+    sql(&file, &forged(&head).iter().map(String::as_str).collect::<Vec<_>>())?;
+    server.restart().await?;
+    let told = objection(&server, &["--head", noted])?;
+    let expected = format!("identity: it begins with row {}, and your note has row {}", head.n + 1, head.n);
+    ensure!(told.contains(&expected), "{told}");
+    // An export says the same without a server.
+    let file = dir.path().join("audit.jsonl").to_string_lossy().into_owned();
+    said(&server, &["audit", "export", "--out", &file])?;
+    let told = objection(&server, &["--file", &file, "--head", noted])?;
+    ensure!(told.contains(&expected), "{told}");
+    // Nobody needs to have noted anything where other chains quote it.
+    let told = objection(&server, &[])?;
+    ensure!(told.contains("identity: it begins with row ") && told.contains(" has row "), "{told}");
     Ok(())
 }
 

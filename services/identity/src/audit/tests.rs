@@ -174,10 +174,35 @@ async fn rows_go_after_four_hundred_days_and_what_is_left_holds() {
     world.pass(1);
     world.keep(Writer::Fleet).await;
     let left: Vec<u64> = world.rows(Writer::Fleet).await.iter().map(|row| row.n).collect();
-    assert_eq!(left, [6, 7, 8], "the newest decision, the anchor and the row that says what went");
+    assert_eq!(
+        left,
+        [5, 6, 7, 8],
+        "the last one until the next is old, that one, the anchor and the row that says what went"
+    );
     let verdicts = world.verify(Vec::new()).await;
     assert!(verdicts.iter().all(|v| v.broken.is_none()), "also a row that another chain quotes: {verdicts:?}");
-    assert_eq!(verdicts.iter().find(|v| v.service == "fleet").map(|v| (v.first, v.rows)), Some((6, 3)));
+    assert_eq!(verdicts.iter().find(|v| v.service == "fleet").map(|v| (v.first, v.rows)), Some((5, 4)));
+    // Somebody who noted a row down is told that it went: nobody here knows when that was.
+    let noted = Mark::parse(&format!("fleet:2:{}", "0".repeat(64))).unwrap_or_else(|| panic!("a head"));
+    let broken =
+        world.verify(vec![noted]).await.into_iter().find_map(|v| v.broken).unwrap_or_else(|| panic!("it holds"));
+    assert_eq!((broken.what.as_str(), broken.n), ("BEHEADED", 2));
+    assert!(broken.text.starts_with("it begins with row 5, and your note has row 2: "), "{}", broken.text);
+}
+
+#[tokio::test]
+async fn a_quote_of_a_row_that_went_before_it_was_old_shows_that_it_was_taken_away() {
+    let world = World::new();
+    for n in 0..3 {
+        world.note(Writer::Fleet, "anna", cordon(&format!("r{n}"))).await;
+    }
+    world.keep(Writer::Task).await;
+    let head = world.rows(Writer::Fleet).await[2].head();
+    world.note(Writer::Fleet, "fleet", Note::cut(head)).await;
+    let verdicts = world.verify(Vec::new()).await;
+    let broken = verdicts.iter().find_map(|v| v.broken.as_ref()).unwrap_or_else(|| panic!("{verdicts:?}"));
+    assert_eq!((broken.what.as_str(), broken.n), ("BEHEADED", 3));
+    assert!(broken.text.contains("row 1 of task has row 3"), "{}", broken.text);
 }
 
 #[tokio::test]
@@ -193,7 +218,7 @@ async fn an_export_holds_by_itself_and_has_the_heads_that_verify_says() {
     assert_eq!(lines.len(), 1 + 301 + 1);
     let export = midshift_core::audit::Export::parse(&lines[0]).unwrap_or_else(|| panic!("an export"));
     let quoted: Vec<Mark> = lines[1..].iter().flat_map(|line| Mark::in_line(line)).collect();
-    let mut held = Held::new(&export, &quoted);
+    let mut held = Held::new(&export, &quoted, Utc(BEGIN));
     lines[1..].iter().for_each(|line| held.take(line));
     let offline = held.finish();
     let head = |verdict: &v1::AuditVerdict| verdict.head.clone().map(|h| Head { n: h.n, hash: h.hash });

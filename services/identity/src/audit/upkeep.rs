@@ -29,8 +29,10 @@ pub async fn keep(store: &dyn Store, clock: &dyn Clock, writer: Writer) -> Resul
     let Some(before) = privacy::of(table).before(clock.now().wall) else { return Ok(()) };
     for _ in 0..SLICES_MAX {
         let oldest = store.list(Query::all(table)).await?;
-        let old = oldest.iter().take_while(|row| at(row).is_some_and(|at| at < before.0)).last();
-        let Some(up_to) = old.and_then(head) else { break };
+        let old = oldest.iter().take_while(|row| at(row).is_some_and(|at| at < before.0)).count();
+        // The last of them stays until the row behind it is old too: till then other chains may have quoted it, and a quote that is younger than the cut
+        // allows shows a chain whose beginning was taken away.
+        let Some(up_to) = old.checked_sub(2).and_then(|last| oldest.get(last)).and_then(head) else { break };
         write(store, writer, Note::cut(up_to)).await?;
     }
     Ok(())

@@ -5,9 +5,9 @@
 
 use super::look::encode_head;
 use super::{AuditService, page, unavailable};
-use midshift_core::audit::{Broken, Chain, Head, Mark, Verified, id_of};
+use midshift_core::audit::{AuditRow, Broken, Chain, Ends, Head, Kind, Mark, Verified, id_of};
 use midshift_core::reason::{Refusal, Violations};
-use midshift_core::rows::{Key, Table};
+use midshift_core::rows::{Key, Row, Table};
 use midshift_proto::identity::v1;
 use midshift_store::{Cursor, Query};
 use std::collections::BTreeMap;
@@ -52,12 +52,13 @@ impl AuditService {
             service: writer.as_str().to_owned(),
             head: head.clone(),
             by: "the store's note of its newest row".to_owned(),
+            at_unix_ms: None,
         });
         let marks: Vec<Mark> = own.chain(noted).collect();
         let (mut verdicts, mut broken_quotes, mut read) = (Verdicts::new(), BTreeMap::new(), 0);
         for (writer, table) in Table::audits() {
             let name = writer.as_str();
-            let mut chain = Chain::new(name, marks.iter().cloned());
+            let mut chain = Chain::new(name, marks.iter().cloned(), self.clock.now().wall);
             let verdict = loop {
                 match self.stretch(&mut chain, *table, &mut read, &mut broken_quotes).await? {
                     Ok(true) => {}
@@ -113,7 +114,7 @@ impl AuditService {
             for mark in marks {
                 let Some(key) = key(mark) else { continue };
                 let body = bodies.get(&key).copied();
-                let ends = if body.is_some() { (0, 0) } else { self.ends(key.table).await? };
+                let ends = if body.is_some() { Ends::default() } else { self.ends(key.table).await? };
                 if let Err(found) = mark.hold(body, ends) {
                     broken.push((mark.service.clone(), found));
                 }
@@ -122,15 +123,21 @@ impl AuditService {
         Ok(broken)
     }
 
-    /// Numbers of the oldest and the newest row of a chain; 0: it has none.
-    async fn ends(&self, table: Table) -> Result<(u64, u64), Refusal> {
-        let mut ends = [0; 2];
-        for (end, newest_first) in ends.iter_mut().zip([false, true]) {
-            let query = Query { limit: 1, newest_first, ..Query::all(table) };
-            let row = self.store.list(query).await.map_err(unavailable)?.pop();
-            *end = row.and_then(|row| row.index.order).unwrap_or(0).max(0).cast_unsigned();
-        }
-        Ok((ends[0], ends[1]))
+    /// Where a chain begins and ends now.
+    async fn ends(&self, table: Table) -> Result<Ends, Refusal> {
+        let one = async |query: Query| {
+            let rows = self.store.list(Query { limit: 1, ..query }).await;
+            rows.map(|mut rows| rows.pop()).map_err(unavailable)
+        };
+        let newest = || Query { newest_first: true, ..Query::all(table) };
+        let n = |row: Option<Row>| row.and_then(|row| row.index.order).unwrap_or(0).max(0).cast_unsigned();
+        let at = |row: Row| serde_json::from_str::<AuditRow>(&row.body).ok().map(|row| row.at_unix_ms);
+        Ok(Ends {
+            first: n(one(Query::all(table)).await?),
+            last: n(one(newest()).await?),
+            cut_unix_ms: one(newest().in_states([Kind::Cut.number()])).await?.and_then(at),
+            now_unix_ms: self.clock.now().wall.0,
+        })
     }
 }
 

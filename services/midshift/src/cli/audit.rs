@@ -16,6 +16,9 @@ use std::path::{Path, PathBuf};
 /// Of what one row is about, so much stands in a table.
 const ABOUT_SHOWN: usize = 4;
 
+/// How far a verification is, is said from so many rows on.
+const TOLD_FROM: u64 = 1_000;
+
 /// Verbs of the audit.
 #[derive(Subcommand)]
 pub enum Verb {
@@ -23,7 +26,7 @@ pub enum Verb {
     Ls {
         #[command(flatten)]
         call: Call,
-        /// Only by this service: task, fleet, ota, stop.
+        /// Only by this service: task, fleet, ota, stop, identity.
         #[arg(long, default_value = "", hide_default_value = true)]
         service: String,
         /// Only asked for by this person or program.
@@ -224,7 +227,7 @@ fn read(path: &Path, noted: &[Mark]) -> Result<v1::VerifyAuditResponse, Exit> {
     for line in first {
         marks.extend(Mark::in_line(&line?));
     }
-    let (mut held, mut rows_read) = (Held::new(&export, &marks), 0);
+    let (mut held, mut rows_read) = (Held::new(&export, &marks, crate::clock::wall()), 0);
     for line in lines()?.skip(1) {
         held.take(&line?);
         rows_read += 1;
@@ -257,7 +260,10 @@ async fn verify(call: &Call, noted: Vec<Mark>, out: &Out) -> Result<v1::VerifyAu
         if !message.verdicts.is_empty() {
             return Ok(message);
         }
-        out.say(&format!("{} rows read", message.rows_read));
+        // Between chains that hardly have rows there is nothing to tell.
+        if message.rows_read >= TOLD_FROM {
+            out.say(&format!("{} rows read", message.rows_read));
+        }
     }
     Err(Exit::new(5, "the server ended before it was through\n  try: the same again"))
 }
