@@ -112,7 +112,7 @@ fn fleet(site: &Arc<Site>, robots: usize, tasks: usize, seed: u64, now: Now) -> 
         let session = Session {
             robot_id: robot_id.clone(),
             session_epoch: 1,
-            secret: String::new(),
+            secret: Default::default(),
             boot_id: String::new(),
             ring: String::new(),
             inventory,

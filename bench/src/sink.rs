@@ -100,7 +100,7 @@ impl Drop for Drain {
 fn welcome() -> Welcome {
     Welcome {
         session_epoch: 1_800_000_000_000,
-        session_secret: "no secret".to_owned(),
+        session_secret: "no secret".into(),
         store_id: "no store".to_owned(),
         acks: Vec::new(),
         heartbeat_period_ms: limits::HEARTBEAT.as_ms() as u32,

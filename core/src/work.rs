@@ -367,7 +367,7 @@ pub struct Session {
     /// max(old + 1, unix ms): sessions with less are fenced.
     pub session_epoch: u64,
     /// Proves succession in the next Hello.
-    pub secret: String,
+    pub secret: crate::identity::SessionSecret,
     /// New for each start of the agent.
     pub boot_id: String,
     /// Random, made when the robot's ring was formatted.

@@ -2,6 +2,7 @@
 //!
 //! Called by the agent (says [`FromRobot`], hears [`ToRobot`]) and by telemetry (the other way round).
 
+use midshift_core::identity::SessionSecret;
 use midshift_core::ids::RobotId;
 use midshift_core::reason::Reason;
 use midshift_core::robot::{Inventory, Lane, ReportedState};
@@ -73,7 +74,7 @@ pub struct Previous {
     /// Its epoch.
     pub session_epoch: u64,
     /// The secret of its Welcome.
-    pub secret: String,
+    pub secret: SessionSecret,
 }
 
 /// Where the numbers of one lane stand on the robot.
@@ -91,7 +92,7 @@ pub struct Welcome {
     /// Sessions with less are fenced.
     pub session_epoch: u64,
     /// Proves succession in the next Hello.
-    pub session_secret: String,
+    pub session_secret: SessionSecret,
     /// Which store serves.
     pub store_id: String,
     /// What is durable of this ring.
@@ -160,7 +161,7 @@ pub struct StatusReplay {
     /// The session that this robot has now.
     pub session_epoch: u64,
     /// The secret of its Welcome.
-    pub session_secret: String,
+    pub session_secret: SessionSecret,
     /// Lane STATUS.
     pub batch: LaneBatch,
 }

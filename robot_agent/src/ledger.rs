@@ -7,6 +7,7 @@ use crate::device::DeviceKey;
 use crate::store::Op;
 use crate::update::SoftwareRow;
 use midshift_bundle::trust::Trusted;
+use midshift_core::identity::SessionSecret;
 use midshift_core::ids::{AttemptId, DrainId, PlaceId, Subject};
 use midshift_core::limits;
 use midshift_core::policy::AreaPolicy;
@@ -22,7 +23,7 @@ pub struct SessionMemory {
     /// Its epoch.
     pub session_epoch: u64,
     /// Its secret.
-    pub secret: String,
+    pub secret: SessionSecret,
     /// The store it was with.
     pub store_id: String,
 }

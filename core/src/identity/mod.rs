@@ -8,6 +8,7 @@ mod directory;
 mod enrolment;
 mod grant;
 mod rows;
+mod session;
 mod token;
 
 pub use caller::{Caller, Who};
@@ -15,4 +16,5 @@ pub use directory::{Directory, DirectoryToken};
 pub use enrolment::{Deny, EnrolmentState, Replace, RobotIdentity};
 pub use grant::{Access, Grant, Object, Permission, Role, Scope};
 pub use rows::{Act, Authority, ServerCertificate, TokenRecord};
+pub use session::SessionSecret;
 pub use token::{Digest, Secret, TokenId};

@@ -85,7 +85,7 @@ impl From<&Hello> for v1::Hello {
             previous: hello
                 .previous
                 .as_ref()
-                .map(|p| v1::PreviousSession { session_epoch: p.session_epoch, secret: p.secret.clone() }),
+                .map(|p| v1::PreviousSession { session_epoch: p.session_epoch, secret: p.secret.reveal().to_owned() }),
             inventory: Some((&hello.inventory).into()),
             reported: Some((&hello.reported).into()),
             ring: hello.ring.clone(),
@@ -103,7 +103,7 @@ impl Parse<Previous> for v1::PreviousSession {
     fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<Previous> {
         let session_epoch = from_one(self.session_epoch, at.field("session_epoch"), bad);
         let secret = text(self.secret, 128, at.field("secret"), bad);
-        Some(Previous { session_epoch: session_epoch?, secret: secret? })
+        Some(Previous { session_epoch: session_epoch?, secret: secret?.into() })
     }
 }
 
@@ -153,7 +153,7 @@ impl From<&Welcome> for v1::Welcome {
     fn from(welcome: &Welcome) -> Self {
         Self {
             session_epoch: welcome.session_epoch,
-            session_secret: welcome.session_secret.clone(),
+            session_secret: welcome.session_secret.reveal().to_owned(),
             store_id: welcome.store_id.clone(),
             acks: welcome.acks.iter().map(Into::into).collect(),
             heartbeat_period_ms: welcome.heartbeat_period_ms,
@@ -176,7 +176,7 @@ impl Parse<Welcome> for v1::Welcome {
         let status_period = from_one(u64::from(self.status_period_ms), at.field("status_period_ms"), bad);
         Some(Welcome {
             session_epoch: session_epoch?,
-            session_secret: session_secret?,
+            session_secret: session_secret?.into(),
             store_id: self.store_id,
             acks: acks?,
             heartbeat_period_ms: period? as u32,
@@ -239,7 +239,7 @@ impl From<&StatusReplay> for v1::ReplayStatusRequest {
         Self {
             robot_id: replay.robot_id.to_string(),
             session_epoch: replay.session_epoch,
-            session_secret: replay.session_secret.clone(),
+            session_secret: replay.session_secret.reveal().to_owned(),
             batch: Some((&replay.batch).into()),
         }
     }
@@ -263,7 +263,7 @@ impl Parse<StatusReplay> for v1::ReplayStatusRequest {
         Some(StatusReplay {
             robot_id: robot_id?,
             session_epoch: session_epoch?,
-            session_secret: session_secret?,
+            session_secret: session_secret?.into(),
             batch: batch?,
         })
     }

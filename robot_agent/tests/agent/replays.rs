@@ -82,7 +82,7 @@ fn after_a_break_events_come_first_then_the_live_heartbeat_and_old_status_goes_b
     assert_eq!((on_link(&rig, Lane::Event), on_link(&rig, Lane::Status)), (vec![1], vec![]));
     assert_eq!((rig.hb, beside(&rig)), (1, vec![(1, 256)]));
     let replay = &rig.replays[0];
-    let said = (replay.robot_id.as_str(), replay.session_epoch, replay.session_secret.as_str(), replay.batch.lane);
+    let said = (replay.robot_id.as_str(), replay.session_epoch, replay.session_secret.reveal(), replay.batch.lane);
     assert_eq!(said, ("rbt-01", rig.epoch, "secret", Lane::Status));
     // As long as there is no answer: heartbeats and events go, no other batch does, and newer samples wait.
     rig.body.says(BodyNews::Mode(Mode::Automatic));

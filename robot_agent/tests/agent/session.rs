@@ -97,8 +97,12 @@ impl Seen {
         self.down.send(Ok(v1::SessionResponse::from(&message))).await.expect("the robot listens");
     }
     pub async fn welcome(&self, session_epoch: u64) {
-        self.say(ToRobot::Welcome(Welcome { session_epoch, session_secret: format!("s{session_epoch}"), ..welcome() }))
-            .await;
+        self.say(ToRobot::Welcome(Welcome {
+            session_epoch,
+            session_secret: format!("s{session_epoch}").into(),
+            ..welcome()
+        }))
+        .await;
     }
     async fn close(&self, code: CloseCode) {
         self.say(ToRobot::Close(Close { code, reason: Code::Fenced.into(), retry_after_ms: 0 })).await;
@@ -468,7 +472,7 @@ async fn old_status_goes_over_bulk_ends_with_its_session_and_begins_again_in_the
     first.hello().await;
     first.welcome(5).await;
     let asked = bench.replays.recv().await.expect("old status");
-    assert_eq!((asked.replay.session_epoch, asked.replay.session_secret.as_str()), (5, "s5"));
+    assert_eq!((asked.replay.session_epoch, asked.replay.session_secret.reveal()), (5, "s5"));
     assert_eq!(seqs(&asked.replay.batch.items)[..40], (1..=40).collect::<Vec<_>>());
     for hb in 1..=4 {
         assert_eq!(first.beat().await, hb, "it holds no heartbeat up");

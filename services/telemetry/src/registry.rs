@@ -4,6 +4,7 @@
 //! Invariant: a session that did not prove its succession is never in charge while the older one is heard.
 
 use crate::replay::{self, Replay};
+use midshift_core::identity::SessionSecret;
 use midshift_core::ids::RobotId;
 use midshift_core::time::{LinkTime, Utc};
 use std::collections::BTreeMap;
@@ -18,7 +19,7 @@ pub struct InCharge {
     /// Its epoch.
     pub session_epoch: u64,
     /// The secret of its Welcome: with the epoch, what proves that a replay is for it.
-    pub secret: Arc<str>,
+    pub secret: SessionSecret,
     /// To its task.
     pub replays: mpsc::Sender<Replay>,
     /// When its newest heartbeat was processed, milliseconds of link time.
@@ -31,11 +32,11 @@ pub struct InCharge {
 
 impl InCharge {
     /// Begins at `now`; and where its task finds replays.
-    pub fn new(session_epoch: u64, secret: &str, now: LinkTime) -> (Self, mpsc::Receiver<Replay>) {
+    pub fn new(session_epoch: u64, secret: SessionSecret, now: LinkTime) -> (Self, mpsc::Receiver<Replay>) {
         let (replays, waiting) = mpsc::channel(replay::WAITING_MAX);
         let this = Self {
             session_epoch,
-            secret: Arc::from(secret),
+            secret,
             replays,
             heard: Arc::new(AtomicU64::new(now.0)),
             fenced: CancellationToken::new(),

@@ -5,7 +5,7 @@ use crate::registry::InCharge;
 use crate::replay::Replay;
 use crate::second::{Second, heard_elsewhere};
 use midshift_bundle::installed::{self, Rejection};
-use midshift_core::identity::Caller;
+use midshift_core::identity::{Caller, SessionSecret};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::robot::Lane;
@@ -95,7 +95,7 @@ pub async fn begin(inner: &Inner, hello: &Hello, by: &Caller) -> Result<Begun, R
             None => return Err(unavailable("the store gave no answer")),
         }
         told(hello, &said);
-        let (in_charge, replays) = InCharge::new(session_epoch, &session.secret, now.link);
+        let (in_charge, replays) = InCharge::new(session_epoch, session.secret.clone(), now.link);
         if !inner.registry.take_charge(&hello.robot_id, in_charge.clone()) {
             continue;
         }
@@ -121,8 +121,8 @@ async fn status_of(inner: &Inner, hello: &Hello) -> Result<u64, Refusal> {
     Ok(inner.picture.durable_status(&hello.robot_id, &ring))
 }
 
-fn draw_secret() -> String {
-    format!("{:032x}", rand::random::<u128>())
+fn draw_secret() -> SessionSecret {
+    format!("{:032x}", rand::random::<u128>()).into()
 }
 
 /// What a Hello says of the robot's software, held against the key that its machine is known by.
@@ -190,7 +190,7 @@ fn session_row(hello: &Hello, session_epoch: u64, said: &Said) -> Session {
 fn welcome(
     inner: &Inner,
     session_epoch: u64,
-    session_secret: String,
+    session_secret: SessionSecret,
     mark: &LaneMark,
     status: u64,
     observed: bool,

@@ -340,7 +340,7 @@ impl Bench {
 fn welcome(session_epoch: u64) -> Welcome {
     Welcome {
         session_epoch,
-        session_secret: format!("s{session_epoch}"),
+        session_secret: format!("s{session_epoch}").into(),
         store_id: "store-1".to_owned(),
         acks: Vec::new(),
         heartbeat_period_ms: 1_000,

@@ -218,7 +218,7 @@ impl Rig {
         let row = Session {
             robot_id: robot.id.clone(),
             session_epoch: robot.epoch,
-            secret: String::new(),
+            secret: Default::default(),
             boot_id: String::new(),
             ring: "ring".into(),
             inventory,

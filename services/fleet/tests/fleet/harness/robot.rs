@@ -244,7 +244,7 @@ impl Robot {
         Session {
             robot_id: self.id.clone(),
             session_epoch: self.session_epoch,
-            secret: "secret".to_owned(),
+            secret: "secret".into(),
             boot_id: format!("boot-{}", self.boots),
             ring: "ring".to_owned(),
             inventory: self.inventory.clone(),
