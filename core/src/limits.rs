@@ -356,6 +356,8 @@ pub const REQUESTS_BURST: u32 = 2_000;
 /// Of what a port or a caller has, so much is kept for each class of calls above the one that asks ([`crate::overload::Class`]), permille: a
 /// tenth is enough to decide something and to stop while everything below it is flooded.
 pub const CLASS_KEPT_PERMILLE: usize = 100;
+/// How often a connection without a certificate is looked at for tokens that have ended: a stream goes on no longer than that behind its token.
+pub const CONNECTION_ASKED_AGAIN: LinkDuration = LinkDuration::from_secs(5);
 /// Usual age at which a connection is asked to go, a tenth more or less. With notice and grace it ends within an hour: a certificate that was renewed is
 /// soon the one in use, and connections spread anew over the processes behind a proxy.
 pub const CONNECTION_AGE: LinkDuration = LinkDuration::from_secs(54 * 60);

@@ -6,6 +6,7 @@
 pub mod access;
 pub mod chunk;
 pub mod convert;
+pub mod denying;
 pub mod json;
 pub mod leaving;
 pub mod pages;
@@ -18,6 +19,7 @@ mod secrets {
 }
 
 pub use convert::{Parse, parse, parse_field, parse_word};
+pub use denying::Denying;
 pub use leaving::Leaving;
 pub use status::{refusal_of, status};
 

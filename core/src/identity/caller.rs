@@ -65,6 +65,10 @@ impl Caller {
     pub const fn certificate(&self) -> Option<&Arc<str>> {
         self.certificate.as_ref()
     }
+    /// Whether its token's time is over: it may engage stops and nothing else.
+    pub const fn is_expired(&self) -> bool {
+        self.expired
+    }
     /// Its grants.
     pub fn grants(&self) -> &[Grant] {
         &self.grants

@@ -90,8 +90,8 @@ impl RobotIdentity {
         Ok(())
     }
 
-    /// A machine shows the secret and its key, and becomes the robot. The same key with the same secret again is the same answer, since the first one may have
-    /// been lost on its way.
+    /// A machine shows the secret and its key, and becomes the robot. The same key with the same secret again, within the secret's time, is the same answer,
+    /// since the first one may have been lost on its way.
     ///
     /// # Errors
     /// The secret is another, used, or too old; the key was denied before.
@@ -101,10 +101,11 @@ impl RobotIdentity {
         else {
             return bad(Code::EnrolmentUnknown);
         };
+        let is_over = now.0 >= open.expires_unix_ms;
         match open.used_unix_ms {
-            Some(_) if self.key == Some(key) && self.revoked.is_none() => return Ok(()),
-            Some(_) => return bad(Code::EnrolmentUsed),
-            None if now.0 >= open.expires_unix_ms => return bad(Code::EnrolmentExpired),
+            Some(_) if self.key != Some(key) || self.revoked.is_some() => return bad(Code::EnrolmentUsed),
+            _ if is_over => return bad(Code::EnrolmentExpired),
+            Some(_) => return Ok(()),
             None => {}
         }
         if self.denied.iter().any(|deny| deny.key == key) {
@@ -130,6 +131,11 @@ impl RobotIdentity {
         }
         self.expires_unix_ms = Some(expires.0);
         Ok(())
+    }
+
+    /// Whether this key is its own, or was and was taken out: another robot with it would be the same machine, or let a denied one in.
+    pub fn knows(&self, key: &Digest) -> bool {
+        self.key.as_ref() == Some(key) || self.denied.iter().any(|deny| deny.key == *key)
     }
 
     /// Takes its key out, and the secret that was handed out for it.
@@ -187,6 +193,20 @@ mod tests {
         let again = robot.enrol(&id("s1"), &SECRET, SECOND, Utc(2)).expect_err("another machine");
         assert_eq!(again.reason.code, Code::EnrolmentUsed);
         assert_eq!(robot.key, Some(FIRST));
+        let late = robot.enrol(&id("s1"), &SECRET, FIRST, Utc(limits::ENROLMENT_VALID.as_ms().cast_signed()));
+        assert_eq!(
+            late.expect_err("its time is over").reason.code,
+            Code::EnrolmentExpired,
+            "the answer is not kept for ever"
+        );
+    }
+
+    #[test]
+    fn a_key_that_another_robot_has_or_had_enrols_nobody_else() {
+        let (mut first, other) = (enrolled(), RobotIdentity::new(RobotId::parse("r8").expect("an id")));
+        assert!(first.knows(&FIRST) && !first.knows(&SECOND) && !other.knows(&FIRST));
+        first.revoke("anna", Utc(2));
+        assert!(first.knows(&FIRST), "what was taken out is nobody's");
     }
 
     #[test]

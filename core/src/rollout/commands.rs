@@ -151,21 +151,22 @@ pub enum Taken {
 /// Why not; whoever asks may not; a request_id that was used for something else.
 pub fn take(view: &mut View, board: &Board, now: Now, ask: &Ask, plan: &mut Plan) -> Result<Taken, Refusal> {
     let Ask { command, seen, check_only, request_id, by } = ask;
-    objects::permit(view, board, by, command)?;
     let actor = &by.to_string();
+    // For the audit, also if whoever asks may not. What it may not even see is about nothing that there is, and leaves nothing.
+    let mut refused = |refusal: Refusal| {
+        if *check_only == CheckOnly::No {
+            let item = audit::refusal(Writer::Ota, actor, request_id.as_deref(), note(command), &refusal);
+            plan.items.extend(item);
+        }
+        refusal
+    };
+    objects::permit(view, board, by, command).map_err(&mut refused)?;
     if let Some(id) = request_id
         && let Some(at) = once::done_before(&view.command_keys, id, command, *seen)?
     {
         return Ok(Taken::Before(at));
     }
-    let is_done = match check(view, board, command, *seen) {
-        Err(refusal) if *check_only == CheckOnly::No => {
-            let item = audit::refusal(Writer::Ota, actor, request_id.as_deref(), note(command), &refusal);
-            plan.items.extend(item);
-            return Err(refusal);
-        }
-        checked => checked?,
-    };
+    let is_done = check(view, board, command, *seen).map_err(refused)?;
     if *check_only == CheckOnly::Yes {
         return Ok(Taken::Now);
     }

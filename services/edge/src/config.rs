@@ -29,6 +29,8 @@ pub struct Config {
     pub keepalive_every: LinkDuration,
     /// Time for the answer to a ping.
     pub keepalive_within: LinkDuration,
+    /// How often it is asked whether a connection without a certificate may still be there.
+    pub asked_again: LinkDuration,
     /// Streams of one connection at a time; a peer is told so and waits.
     pub streams_per_connection: u32,
     /// Bytes of the header list of an HTTP/2 request.
@@ -61,6 +63,7 @@ impl Default for Config {
             idle: limits::CONNECTION_IDLE,
             keepalive_every: limits::KEEPALIVE_EVERY,
             keepalive_within: limits::KEEPALIVE_WITHIN,
+            asked_again: limits::CONNECTION_ASKED_AGAIN,
             streams_per_connection: limits::STREAMS_PER_CONNECTION,
             header_list_bytes: limits::HEADER_LIST_BYTES,
             age: Some(Age::after(limits::CONNECTION_AGE)),

@@ -164,6 +164,11 @@ where
             done = served.as_mut() => return self.ended(&peer, done),
         };
         let (end, time) = match reason {
+            Reason::Denied(Denied::Token) => {
+                let end = self.denied(&peer, Denied::Token);
+                peer.over.cancel();
+                (end, Some(Duration::ZERO))
+            }
             Reason::Denied(denied) => return self.denied(&peer, denied),
             // It hears why and is not waited for.
             Reason::Unused(Unused::NoRequest) => (End::NoRequest, Some(Duration::ZERO)),
@@ -195,13 +200,20 @@ where
 
     /// Resolves when the peer may not be connected any longer.
     async fn asked_again(&self, peer: &Peer, changed: &mut watch::Receiver<u64>) -> Denied {
-        while changed.changed().await.is_ok() {
+        loop {
+            let is_changed = tokio::select! {
+                changed = changed.changed() => changed.is_ok(),
+                // A certificate's time is looked at in its handshake, a token's with each request: what is left are streams.
+                () = sleep(std(self.config.asked_again)), if peer.certificate.is_none() => true,
+            };
+            if !is_changed {
+                // Nothing changes any more.
+                return std::future::pending().await;
+            }
             if let Err(denied) = self.principals.admit(peer) {
                 return denied;
             }
         }
-        // Nothing changes any more.
-        std::future::pending().await
     }
 
     /// Resolves when the connection is old and its streams have had notice.

@@ -7,7 +7,7 @@ use crate::rates::{Bucket, Rates};
 use crate::requests::Asker;
 use midshift_core::limits;
 use midshift_core::overload::Class;
-use midshift_core::reason::Code;
+use midshift_core::reason::{Code, Reason};
 use midshift_core::time::LinkDuration;
 use std::net::IpAddr;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -23,6 +23,8 @@ pub struct Denial {
     pub network: IpAddr,
     /// What it asked for; cut at [`limits::DENIED_PATH_BYTES`].
     pub path: String,
+    /// The robot that it named, if the refusal says which.
+    pub robot_id: Option<String>,
     /// Why not.
     pub code: Code,
     /// Denials of this port since the one handed over before that were not.
@@ -52,7 +54,7 @@ impl Denials {
         (Self { port, sink, each, all, left_out: AtomicU64::new(0) }, told)
     }
 
-    pub(crate) fn tell(&self, asker: &Asker, actor: String, network: IpAddr, path: &str, code: Code) {
+    pub(crate) fn tell(&self, asker: &Asker, actor: String, network: IpAddr, path: &str, reason: &Reason) {
         let now = Instant::now();
         let is_fit = self.each.take(asker, now, Class::Stop) && self.all.take(&(), now, Class::Stop);
         let Some(place) = is_fit.then(|| self.sink.try_reserve().ok()).flatten() else {
@@ -61,6 +63,7 @@ impl Denials {
             return;
         };
         let path = path.get(..path.floor_char_boundary(limits::DENIED_PATH_BYTES)).unwrap_or_default().to_owned();
-        place.send(Denial { actor, network, path, code, left_out: self.left_out.swap(0, Relaxed) });
+        let (robot_id, code) = (reason.metadata.get("robot_id").cloned(), reason.code);
+        place.send(Denial { actor, network, path, robot_id, code, left_out: self.left_out.swap(0, Relaxed) });
     }
 }

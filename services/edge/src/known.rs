@@ -6,7 +6,7 @@
 use crate::peer::{Denied, Peer, Principals};
 use http::HeaderMap;
 use http::header::AUTHORIZATION;
-use midshift_core::identity::{Caller, Digest, Directory, Secret};
+use midshift_core::identity::{Caller, Digest, Directory, Secret, TokenId};
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::time::Clock;
@@ -53,8 +53,13 @@ impl Known {
 
 impl Principals for Known {
     fn admit(&self, peer: &Peer) -> Result<(), Denied> {
-        // Who shows none shows a token with each request.
-        peer.certificate.as_ref().map_or(Ok(()), |leaf| self.robot(leaf).map(drop))
+        if let Some(leaf) = &peer.certificate {
+            return self.robot(leaf).map(drop);
+        }
+        // Who shows none shows a token with each request: streams of one that was taken back or is over do not go on.
+        let (directory, now) = (self.directory.borrow(), self.clock.now().wall);
+        let is_good = |token: &TokenId| directory.tokens.get(token).is_some_and(|known| known.expires_unix_ms > now.0);
+        if peer.showed_all(is_good) { Ok(()) } else { Err(Denied::Token) }
     }
 
     fn changed(&self) -> watch::Receiver<u64> {
@@ -75,7 +80,14 @@ impl Principals for Known {
         let secret = text.and_then(|text| Secret::read(Secret::TOKEN, text));
         let Some(secret) = secret else { return Err(Refusal::new(Kind::Unauthenticated, Code::TokenUnknown)) };
         let digest = Digest(sha2::Sha256::digest(secret.bytes()).into());
-        self.directory.borrow().holder(secret.id(), &digest, self.clock.now().wall)
+        let holder = || self.directory.borrow().holder(secret.id(), &digest, self.clock.now().wall);
+        let caller = holder()?;
+        // One that only stops any more begins no stream, and its connection is left alone.
+        if !caller.is_expired() && peer.shows(secret.id()) {
+            // Whoever was taken back in between was not asked about with this connection.
+            return holder();
+        }
+        Ok(caller)
     }
 }
 

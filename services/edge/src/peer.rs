@@ -4,13 +4,14 @@
 //! of HTTP is read, and again each time that the answer may have changed. Identity implements it over a cache.
 
 use http::HeaderMap;
-use midshift_core::identity::Caller;
+use midshift_core::identity::{Caller, TokenId};
 use midshift_core::reason::Refusal;
 use midshift_proto::Leaving;
 use rustls::pki_types::CertificateDer;
+use std::collections::BTreeSet;
 use std::fmt;
 use std::net::SocketAddr;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
@@ -36,6 +37,8 @@ pub struct Peer {
     pub(crate) leaving: Leaving,
     /// Its streams end now.
     pub(crate) over: CancellationToken,
+    /// Whose requests it carried, as far as they may do more than stop: open streams are among them.
+    tokens: Arc<Mutex<BTreeSet<TokenId>>>,
 }
 
 impl Peer {
@@ -45,7 +48,18 @@ impl Peer {
         connection: ConnectionId,
     ) -> Self {
         let (leaving, over) = (Leaving::default(), CancellationToken::new());
-        Self { address, certificate: certificate.map(Arc::new), connection, leaving, over }
+        Self { address, certificate: certificate.map(Arc::new), connection, leaving, over, tokens: Arc::default() }
+    }
+
+    /// Remembers that it showed this token; whether that is new.
+    pub(crate) fn shows(&self, token: &TokenId) -> bool {
+        let mut tokens = self.tokens.lock().unwrap_or_else(PoisonError::into_inner);
+        !tokens.contains(token) && tokens.insert(token.clone())
+    }
+
+    /// Whether each token that it showed is so.
+    pub(crate) fn showed_all(&self, is_so: impl FnMut(&TokenId) -> bool) -> bool {
+        self.tokens.lock().unwrap_or_else(PoisonError::into_inner).iter().all(is_so)
     }
 
     /// Resolves when the connection is about to be asked to go, for its age or because the port closes. Whoever holds a stream on it uses the
@@ -58,23 +72,22 @@ impl Peer {
 /// Why a connection is refused or cut.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Denied {
-    /// A certificate is needed here.
-    #[error("no client certificate")]
-    NoCertificate,
     /// Its certificate is genuine and names nobody we know.
     #[error("a certificate of nobody known")]
     Unknown,
-    /// It was taken out.
+    /// Its certificate was taken out.
     #[error("a revoked certificate")]
     Revoked,
-    /// Its time is over.
-    #[error("an expired certificate")]
-    Expired,
+    /// A token that it showed was taken back, or its time is over. Its streams end now; an answer that is under way still leaves, such as that of whoever took
+    /// its own token back.
+    #[error("a token that was revoked or is over")]
+    Token,
 }
 
 /// Who may be connected.
 pub trait Principals: Send + Sync + 'static {
-    /// Whether this connection may be. Asked for each one, on the runtime's threads: answers from memory.
+    /// Whether this connection may be. Asked for each one, on the runtime's threads: answers from memory. Asked again each time that [`Principals::changed`]
+    /// says so, and where no certificate was shown each [`crate::Config::asked_again`], since time alone ends a token.
     ///
     /// # Errors
     /// It may not be, or no longer.

@@ -11,13 +11,14 @@ use crate::denials::Denials;
 use crate::peer::{Peer, Principals};
 use crate::rates::Rates;
 use crate::seats::{Full, Seat, Seats, network};
-use http::{HeaderMap, Request, Response};
+use http::{HeaderMap, Request, Response, Uri};
 use hyper::body::Incoming;
 use hyper::service::Service as HyperService;
 use midshift_core::identity::{Caller, TokenId, Who};
 use midshift_core::ids::RobotId;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
-use midshift_proto::access;
+use midshift_proto::denying::Told;
+use midshift_proto::{Denying, access};
 use std::convert::Infallible;
 use std::net::IpAddr;
 use std::pin::Pin;
@@ -151,13 +152,53 @@ impl<S> Door<S> {
         if caller.is_some_and(|caller| matches!(caller.who(), Who::Nobody)) {
             return;
         }
-        let (actor, address) = (caller.map(ToString::to_string), self.peer.address.ip());
+        let (actor, from) = (caller.map(ToString::to_string), network(self.peer.address.ip()));
         let actor = actor.unwrap_or_else(|| Caller::nobody().to_string());
-        let code = refusal.reason.code;
-        tracing::info!(port = self.rules.port, actor, path, %code, "a request was denied");
-        if let Some(denials) = &self.denials {
-            denials.tell(asker, actor, network(address), path, code);
-        }
+        tell(self.rules.port, self.denials.as_deref(), asker, actor, from, path, refusal);
+    }
+
+    /// For a service that denies what only it can judge.
+    fn denying(&self, caller: &Caller, uri: &Uri) -> Denying {
+        let Some(denials) = self.denials.clone() else { return Denying::default() };
+        let asker = Asker::of(Ok(caller), &self.peer);
+        let (port, from, caller) = (self.rules.port, network(self.peer.address.ip()), caller.clone());
+        Denying::new(Arc::new(Inward { port, denials, asker, caller, from, uri: uri.clone() }))
+    }
+}
+
+fn tell(
+    port: &'static str,
+    denials: Option<&Denials>,
+    asker: &Asker,
+    actor: String,
+    from: IpAddr,
+    path: &str,
+    refusal: &Refusal,
+) {
+    let code = refusal.reason.code;
+    tracing::info!(port, actor, path, %code, "a request was denied");
+    if let Some(denials) = denials {
+        denials.tell(asker, actor, from, path, &refusal.reason);
+    }
+}
+
+/// One request that the port let in, for whoever denies it then.
+struct Inward {
+    port: &'static str,
+    denials: Arc<Denials>,
+    asker: Asker,
+    caller: Caller,
+    from: IpAddr,
+    uri: Uri,
+}
+
+impl Told for Inward {
+    fn denied(&self, refusal: &Refusal) {
+        let (port, reason) = (self.port, refusal.reason.code.as_str());
+        metrics::counter!("midshift_edge_requests_denied_inside_total", "port" => port, "reason" => reason)
+            .increment(1);
+        let actor = self.caller.to_string();
+        tell(port, Some(&*self.denials), &self.asker, actor, self.from, self.uri.path(), refusal);
     }
 }
 
@@ -187,6 +228,8 @@ where
         };
         request.extensions_mut().insert(self.peer.clone());
         request.extensions_mut().insert(self.peer.leaving.clone());
+        let denying = self.denying(&caller, request.uri());
+        request.extensions_mut().insert(denying);
         request.extensions_mut().insert(caller);
         let head = deadline.map_or(now + self.rules.head, |deadline| deadline.min(now + self.rules.head));
         let answer = self.services.clone().oneshot(request.map(Body::new));

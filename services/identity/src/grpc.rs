@@ -10,6 +10,7 @@ use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::time::Utc;
+use midshift_proto::Denying;
 use midshift_proto::access::caller;
 use midshift_proto::convert::common::timestamp;
 use midshift_proto::identity::v1;
@@ -81,19 +82,11 @@ impl IdentityService {
         let pin = self.authority()?.pin();
         let (secret, now) = (tokens::draw(), self.now());
         let (replace, offer) = if r.replace { (Replace::Yes, "robot.replace") } else { (Replace::No, "robot.enroll") };
-        let offered = self.0.register.decide(|view| {
+        let (actor, note) = (actor.to_string(), Note::new(offer).about("robot", &robot_id));
+        let offered = self.0.register.decide_for(&actor, note.clone(), |view| {
             let (mut robot, at) = known(view.robots.get(&robot_id), &robot_id);
             robot.offer(secret.id().clone(), tokens::digest(&secret), replace, now)?;
-            Ok((
-                Some(decided(
-                    &robot,
-                    at,
-                    &actor.to_string(),
-                    "robot.enrolment_offered",
-                    Note::new(offer).about("robot", &robot_id),
-                )),
-                robot,
-            ))
+            Ok((Some(decided(&robot, at, &actor, "robot.enrolment_offered", note.clone())), robot))
         });
         let robot = offered.await?;
         let expires = robot.enrolment.map_or(now, |open| Utc(open.expires_unix_ms));
@@ -152,12 +145,18 @@ impl IdentityService {
         let (authority, asked, now) = (self.authority()?, asked(&r.request_pem)?, self.now());
         let (key, digest) = (asked.key, tokens::digest(&secret));
         let expires = Utc(now.0.saturating_add_unsigned(limits::ROBOT_CERTIFICATE_VALID.as_ms()));
+        // One at a time: whether a key is another robot's is decided over all of them.
+        let _alone = self.0.enrolling.lock().await;
         self.0
             .register
             .decide(|view| {
                 let (mut robot, at) = known(view.robots.get(&robot_id), &robot_id);
                 robot.enrol(secret.id(), &digest, key, now)?;
                 robot.renew(&key, expires)?;
+                if view.robots.values().any(|(other, _)| other.robot_id != robot_id && other.knows(&key)) {
+                    let text = "the key of this machine is, or was, that of another robot";
+                    return Err(Refusal::new(Kind::Unauthenticated, Reason::new(Code::KeyDenied, text)));
+                }
                 Ok((
                     Some(decided(
                         &robot,
@@ -169,7 +168,8 @@ impl IdentityService {
                     (),
                 ))
             })
-            .await?;
+            .await
+            .map_err(|refusal| about(refusal, &robot_id))?;
         let Signed { chain_pem, expires } = authority.sign_robot(asked, &robot_id, now).map_err(|e| hidden(&e))?;
         tracing::info!(%robot_id, %key, "a robot was enrolled");
         Ok(v1::EnrolResponse {
@@ -197,7 +197,8 @@ impl IdentityService {
                 robot.renew(&key, expires)?;
                 Ok((Some(written(&robot, at, &caller.to_string(), "robot.certificate_renewed")), ()))
             })
-            .await?;
+            .await
+            .map_err(|refusal| about(refusal, &robot_id))?;
         let Signed { chain_pem, expires } = authority.sign_robot(asked, &robot_id, now).map_err(|e| hidden(&e))?;
         Ok(v1::RenewCertificateResponse {
             certificate_pem: chain_pem,
@@ -205,6 +206,12 @@ impl IdentityService {
             expire_time: Some(timestamp(expires)),
         })
     }
+}
+
+/// The same refusal with whom it is about, for the row of the audit that it leaves.
+fn about(mut refusal: Refusal, robot_id: &RobotId) -> Refusal {
+    refusal.reason = refusal.reason.clone().with("robot_id", robot_id);
+    refusal
 }
 
 type Row<'a> = Option<&'a (RobotIdentity, midshift_core::rows::Revision)>;
@@ -277,13 +284,14 @@ impl IdentityFace for IdentityService {
 #[tonic::async_trait]
 impl EnrolmentFace for IdentityService {
     async fn enrol(&self, request: Request<v1::EnrolRequest>) -> Result<Response<v1::EnrolResponse>, Status> {
-        answered(self.enrolled(request.into_inner()).await)
+        let denying = Denying::of(&request);
+        answered(self.enrolled(request.into_inner()).await.inspect_err(|refusal| denying.tell(refusal)))
     }
     async fn renew_certificate(
         &self,
         request: Request<v1::RenewCertificateRequest>,
     ) -> Result<Response<v1::RenewCertificateResponse>, Status> {
-        let caller = caller(&request);
-        answered(self.renewed(request.into_inner(), &caller).await)
+        let (caller, denying) = (caller(&request), Denying::of(&request));
+        answered(self.renewed(request.into_inner(), &caller).await.inspect_err(|refusal| denying.tell(refusal)))
     }
 }

@@ -13,6 +13,7 @@ mod register;
 mod tokens;
 
 pub use authority::PUBLIC_FILE;
+pub use files::make_folder;
 pub use proof::ServerProof;
 
 use authority::{Authority, asked};
@@ -48,8 +49,8 @@ pub enum Error {
         /// Why.
         source: std::io::Error,
     },
-    /// A folder with keys that others may look into.
-    #[error("{path} has keys and is open to others (mode {mode:03o}): chmod 700 it, after asking who may have read it", path = path.display())]
+    /// A folder with keys or other secrets that others may look into.
+    #[error("{path} has keys or other secrets and is open to others (mode {mode:03o}): type `chmod 700 {path}`, after asking who may have read it", path = path.display())]
     Open {
         /// Which.
         path: PathBuf,
@@ -127,6 +128,8 @@ struct Inner {
     own: OwnKey,
     proof: watch::Sender<ServerProof>,
     trust_json: String,
+    /// Held while a robot is enrolled.
+    enrolling: tokio::sync::Mutex<()>,
 }
 
 /// Identity of one process. Clones are the same.
@@ -158,7 +161,17 @@ impl IdentityService {
         let proof = waited_for(&own, &register, &*store, shutdown).await?;
         files::write(&folder, PUBLIC_FILE, &proof.authority_pem, files::PUBLIC)?;
         let proof = watch::Sender::new(proof);
-        Ok(Self(Arc::new(Inner { site_id, clock, store, register, authority, own, proof, trust_json })))
+        Ok(Self(Arc::new(Inner {
+            site_id,
+            clock,
+            store,
+            register,
+            authority,
+            own,
+            proof,
+            trust_json,
+            enrolling: tokio::sync::Mutex::default(),
+        })))
     }
 
     /// Keeps up with the rows, signs what servers ask for, and renews its own certificate, until `shutdown`.

@@ -2,7 +2,7 @@
 //!
 //! Invariant: a decision is told to the ports of this process before its answer leaves; other processes hear of it with the store's wake.
 
-use midshift_core::audit::Note;
+use midshift_core::audit::{self, Note};
 use midshift_core::identity::{Authority, Directory, RobotIdentity, ServerCertificate, TokenId, TokenRecord};
 use midshift_core::ids::RobotId;
 use midshift_core::reason::{Code, Kind, Refusal};
@@ -144,6 +144,25 @@ impl Register {
             }
         }
         Err(Refusal::new(Kind::Conflict, Code::MovedMeanwhile))
+    }
+
+    /// As [`Register::decide`], of somebody's decision: what is refused as things are stands in the audit too, by `note`. Whoever asked hears why, whether or
+    /// not that can be written down.
+    ///
+    /// # Errors
+    /// The same.
+    pub async fn decide_for<T>(
+        &self,
+        actor: &str,
+        note: Note,
+        decide: impl FnMut(&View) -> Result<Decision<T>, Refusal>,
+    ) -> Result<T, Refusal> {
+        let decided = self.decide(decide).await;
+        if let Err(refusal) = &decided {
+            let item = audit::refusal(Writer::Identity, actor, None, note, refusal);
+            drop(self.store.commit(item.into_iter().collect()).await);
+        }
+        decided
     }
 }
 

@@ -5,6 +5,7 @@ use midshift_core::audit::Note;
 use midshift_core::identity::{Act, Digest, Grant, Permission, Role, Scope, Secret, TokenId, TokenRecord};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
+use midshift_core::rows::Writer;
 use midshift_core::time::{LinkDuration, Utc};
 use sha2::Digest as _;
 
@@ -13,6 +14,8 @@ const FIRST: &str = "admin";
 /// Characters of a token's id.
 const ID_CHARS: usize = 10;
 const NAME_MAX: usize = 64;
+/// Names that stand in the audit for midshift itself, beside those of its services, or for whoever shows nothing.
+const RESERVED: [&str; 3] = ["anonymous", "nobody", "midshift"];
 const DAY: LinkDuration = LinkDuration::from_secs(24 * 3_600);
 
 /// A secret from the system's randomness, under an id of its own.
@@ -51,15 +54,22 @@ impl Wanted {
         let is_fit = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || "-_.@".contains(c);
         if name.is_empty() || name.len() > NAME_MAX || !name.chars().all(is_fit) {
             bad.add("name", "must be 1-64 of [a-z0-9-_.@]");
-        } else if ["anonymous", "nobody", "midshift"].contains(&name) {
-            bad.add("name", "stands for nobody: choose another");
+        } else if RESERVED.contains(&name) || Writer::ALL.iter().any(|service| service.as_str() == name) {
+            bad.add("name", "stands for midshift itself in the audit, or for nobody: choose another");
         }
         if grants.is_empty() || grants.len() > limits::GRANTS_MAX {
             bad.add("grants", format!("must be 1-{}: what it may do", limits::GRANTS_MAX));
         }
-        let read = grants.iter().enumerate();
-        let grants: Vec<Grant> =
-            read.filter_map(|(n, text)| bad.take(&format!("grants[{n}]"), text.parse::<Grant>())).collect();
+        let read = |(n, text): (usize, &String)| {
+            let (field, grant) = (format!("grants[{n}]"), text.parse::<Grant>());
+            let grant = bad.take(&field, grant)?;
+            if matches!(grant, Grant { role: Role::Admin | Role::Auditor, scope: Scope::Area(_) }) {
+                let role = grant.role.as_str();
+                bad.add(field, format!("{grant} permits no more than viewer does: {role} is of the whole site"));
+            }
+            Some(grant)
+        };
+        let grants: Vec<Grant> = grants.iter().enumerate().filter_map(read).collect();
         let days = DAY.as_ms() / 1000..=limits::TOKEN_VALID_MAX.as_ms() / 1000;
         if !days.contains(&valid_seconds) {
             bad.add("valid_seconds", "must be 86400..31622400: 1 to 366 days");
@@ -143,8 +153,9 @@ pub async fn create(
 /// Takes one back.
 pub async fn revoke(register: &Register, token_id: &TokenId, actor: &str, now: Utc) -> Result<TokenRecord, Refusal> {
     let not_found = || Refusal::new(Kind::NotFound, Reason::from(Code::TokenNotFound).with("token_id", token_id));
+    let asked = Note::new("token.revoke").about("token", token_id);
     register
-        .decide(|view| {
+        .decide_for(actor, asked, |view| {
             let (token, at) = view.tokens.get(token_id).ok_or_else(not_found)?;
             if token.revoked.is_some() {
                 return Ok((None, token.clone()));

@@ -34,9 +34,13 @@ pub async fn write(store: &dyn Store, mut denials: Receiver<Denial>) {
 }
 
 fn item(denial: Denial) -> Item {
-    let Denial { actor, network, path, code, left_out } = denial;
+    let Denial { actor, network, path, robot_id, code, left_out } = denial;
     let mut item = Item::new(chain(&path), &actor);
     let note = Note::new(ACTION).with("path", path).with("network", network).refused(code);
+    let note = match robot_id {
+        Some(robot_id) => note.about("robot", robot_id),
+        None => note,
+    };
     item.audit(if left_out > 0 { note.with("left_out", left_out) } else { note });
     item
 }
@@ -73,7 +77,8 @@ mod tests {
         let (sender, denials) = mpsc::channel(1);
         let path = "/midshift.task.v1.TaskService/SubmitTask".to_owned();
         let (actor, network) = ("anna".to_owned(), Ipv4Addr::LOCALHOST.into());
-        let denial = Denial { actor, network, path, code: Code::NotPermitted, left_out: 7 };
+        let robot_id = Some("r7".to_owned());
+        let denial = Denial { actor, network, path, robot_id, code: Code::NotPermitted, left_out: 7 };
         sender.send(denial).await.expect("there is room");
         let written = async {
             loop {
@@ -91,7 +96,7 @@ mod tests {
         let row: AuditRow = serde_json::from_str(&rows[0].body).expect("a row");
         let with = |name: &str| row.with.get(name).map(String::as_str);
         assert_eq!((rows.len(), row.actor.as_str(), row.action.as_str()), (1, "anna", ACTION));
-        assert_eq!(row.outcome, "NOT_PERMITTED");
+        assert_eq!((row.outcome.as_str(), row.about.as_slice()), ("NOT_PERMITTED", &["robot:r7".to_owned()][..]));
         assert_eq!(with("path"), Some("/midshift.task.v1.TaskService/SubmitTask"));
         assert_eq!((with("network"), with("left_out")), (Some("127.0.0.1"), Some("7")));
     }

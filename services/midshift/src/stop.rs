@@ -81,6 +81,10 @@ pub async fn run(args: StopServe, shutdown: CancellationToken) -> anyhow::Result
     if args.insecure {
         tracing::warn!(address = %args.listen, "no TLS and no login: whoever reaches this port may stop the fleet and reset stops");
     }
+    if !args.insecure {
+        // Who is known, and what this port proves itself with, lie below it.
+        midshift_identity::make_folder(&args.data).context("opening the data folder")?;
+    }
     let loaded = site_file::load(args.site.as_deref(), None, None)?;
     let listener = TcpListener::bind(args.listen).await.with_context(|| format!("listening on {}", args.listen))?;
     let folder = args.data.join(FOLDER);
@@ -172,7 +176,7 @@ async fn serve(
 /// Records whom the port denies what in the stop service's own file, until it is dropped.
 async fn record(service: StopService, denials: Option<Receiver<Denial>>) {
     if let Some(mut denials) = denials {
-        while let Some(Denial { actor, network, path, code, left_out }) = denials.recv().await {
+        while let Some(Denial { actor, network, path, code, left_out, robot_id: _ }) = denials.recv().await {
             service.denied(&actor, network, &path, code, left_out);
         }
     }

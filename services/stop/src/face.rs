@@ -7,9 +7,9 @@ use crate::outbox::Down;
 use crate::{Inner, StopService};
 use bytes::{BufMut, Bytes};
 use midshift_core::limits;
-use midshift_proto::Leaving;
 use midshift_proto::access::caller;
 use midshift_proto::stop::v1;
+use midshift_proto::{Denying, Leaving};
 use std::convert::Infallible;
 use std::sync::Arc;
 use std::task::{Context, Poll};
@@ -73,7 +73,8 @@ impl StreamingService<v1::AttendRequest> for Attend {
 
     fn call(&mut self, request: Request<Streaming<v1::AttendRequest>>) -> Self::Future {
         let (inner, by, leaving) = (self.0.clone(), caller(&request), Leaving::of(&request));
-        Box::pin(async move { line::attend(inner, &by, leaving, request.into_inner()).await })
+        let denying = Denying::of(&request);
+        Box::pin(async move { line::attend(inner, &by, leaving, &denying, request.into_inner()).await })
     }
 }
 

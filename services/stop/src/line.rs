@@ -13,9 +13,9 @@ use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::stop::Stop;
 use midshift_core::stop::roster::Heard;
 use midshift_core::time::Now;
-use midshift_proto::Leaving;
 use midshift_proto::convert::stop::{CheckIn, ToStop};
 use midshift_proto::stop::v1;
+use midshift_proto::{Denying, Leaving};
 use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
@@ -26,10 +26,12 @@ pub async fn attend(
     inner: Arc<Inner>,
     by: &Caller,
     leaving: Leaving,
+    denying: &Denying,
     mut up: Streaming<v1::AttendRequest>,
 ) -> Result<Response<Down>, Status> {
     let begun = begin(&inner, by, &mut up).await;
-    let (robot, outbox) = begun.map_err(|refusal| midshift_proto::status(&refusal, None))?;
+    let (robot, outbox) =
+        begun.inspect_err(|refusal| denying.tell(refusal)).map_err(|refusal| midshift_proto::status(&refusal, None))?;
     let down = Down::new(inner.clone(), outbox.clone());
     tokio::spawn(async move {
         hold(&inner, &robot, &outbox, &leaving, up).await;

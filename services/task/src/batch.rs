@@ -7,6 +7,7 @@ use crate::admit::{Admitted, Durable, Prepared, no_result};
 use midshift_core::identity::Caller;
 use midshift_core::limits;
 use midshift_core::reason::Refusal;
+use midshift_proto::Denying;
 use midshift_proto::common::v1::FieldViolation;
 use midshift_proto::task::v1::{self, submit_task_request::Body, submit_task_result::Outcome};
 use std::collections::BTreeSet;
@@ -15,6 +16,7 @@ use std::collections::BTreeSet;
 pub struct Batch<'a> {
     service: &'a TaskService,
     by: &'a Caller,
+    denying: Denying,
     slice: Vec<v1::SubmitTaskRequest>,
     /// Ids that items of the slice chose.
     chosen: BTreeSet<String>,
@@ -22,9 +24,9 @@ pub struct Batch<'a> {
 }
 
 impl<'a> Batch<'a> {
-    /// An empty one of this caller.
-    pub fn new(service: &'a TaskService, by: &'a Caller) -> Self {
-        Self { service, by, slice: Vec::new(), chosen: BTreeSet::new(), results: Vec::new() }
+    /// An empty one of this caller; what it may not is told there.
+    pub fn new(service: &'a TaskService, by: &'a Caller, denying: Denying) -> Self {
+        Self { service, by, denying, slice: Vec::new(), chosen: BTreeSet::new(), results: Vec::new() }
     }
 
     /// Takes the next item; what came before is committed first if the slice is full or the item depends on it.
@@ -77,6 +79,7 @@ impl<'a> Batch<'a> {
                     },
                 },
             };
+            let outcome = outcome.inspect_err(|refusal| self.denying.tell(refusal));
             self.results.push(result_of(request_id, outcome));
         }
     }

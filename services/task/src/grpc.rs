@@ -8,6 +8,7 @@ use midshift_core::limits;
 use midshift_core::reason::{Kind, Refusal};
 use midshift_core::rows::Table;
 use midshift_core::task::Attempt;
+use midshift_proto::Denying;
 use midshift_proto::access::caller;
 use midshift_proto::task::v1::{self, task_service_server::TaskService as Face};
 use midshift_store::Query;
@@ -66,17 +67,17 @@ impl Face for TaskService {
 
     async fn submit_task(&self, r: Request<v1::SubmitTaskRequest>) -> Result<Response<v1::SubmitTaskResponse>, Status> {
         let id = CallId::of(&r, &r.get_ref().request_id);
-        let by = caller(&r);
-        let task = self.submit(r.into_inner(), &by).await;
+        let (by, denying) = (caller(&r), Denying::of(&r));
+        let task = self.submit(r.into_inner(), &by).await.inspect_err(|refusal| denying.tell(refusal));
         id.answer(task.map(|task| v1::SubmitTaskResponse { task: Some(task) }))
     }
     async fn submit_tasks(
         &self,
         r: Request<Streaming<v1::SubmitTasksRequest>>,
     ) -> Result<Response<v1::SubmitTasksResponse>, Status> {
-        let (id, by) = (CallId::of(&r, ""), caller(&r));
+        let (id, by, denying) = (CallId::of(&r, ""), caller(&r), Denying::of(&r));
         let mut stream = r.into_inner();
-        let mut batch = Batch::new(self, &by);
+        let mut batch = Batch::new(self, &by, denying);
         while let Some(message) = stream.message().await? {
             batch.take(message.item.unwrap_or_default()).await.map_err(|refusal| id.status(&refusal))?;
         }

@@ -6,10 +6,10 @@ use midshift_core::identity::Caller;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::time::{LinkDuration, Utc};
-use midshift_proto::Leaving;
 use midshift_proto::access::caller;
 use midshift_proto::link::v1::{self, link_service_server::LinkService};
 use midshift_proto::session::{FromRobot, Hello, ToRobot};
+use midshift_proto::{Denying, Leaving};
 use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -30,13 +30,16 @@ impl LinkService for TelemetryService {
     ) -> Result<Response<Self::SessionStream>, Status> {
         let (down, stream) = mpsc::channel(DOWN_MAX);
         let service = self.clone();
-        let (by, leaving) = (caller(&request), Leaving::of(&request));
+        let (by, leaving, denying) = (caller(&request), Leaving::of(&request), Denying::of(&request));
         let up = request.into_inner();
         tokio::spawn(async move {
             let shutdown = service.inner.shutdown.clone();
             tokio::select! {
                 () = down.closed() => {}
                 result = service.hold(&by, leaving, up, down.clone()) => {
+                    if let Err(refusal) = &result {
+                        denying.tell(refusal);
+                    }
                     if let Err(refusal) = result
                         && !shutdown.is_cancelled()
                     {

@@ -10,7 +10,7 @@ use midshift_proto::access::caller;
 use midshift_proto::link::v1::replay_service_server::ReplayService;
 use midshift_proto::link::v1::{ReplayStatusRequest, ReplayStatusResponse};
 use midshift_proto::session::{LaneAck, LaneBatch, StatusReplay};
-use midshift_proto::{parse, status};
+use midshift_proto::{Denying, parse, status};
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::oneshot;
 use tonic::{Request, Response, Status};
@@ -42,12 +42,14 @@ impl ReplayService for TelemetryService {
         &self,
         request: Request<ReplayStatusRequest>,
     ) -> Result<Response<ReplayStatusResponse>, Status> {
-        let by = caller(&request);
+        let (by, denying) = (caller(&request), Denying::of(&request));
         let ack = match parse(request.into_inner()) {
             Ok(replay) => self.hand_over(&by, replay).await,
             Err(refusal) => Err(refusal),
         };
-        ack.map(|ack| Response::new((&ack).into())).map_err(|refusal| status(&refusal, None))
+        ack.inspect_err(|refusal| denying.tell(refusal))
+            .map(|ack| Response::new((&ack).into()))
+            .map_err(|refusal| status(&refusal, None))
     }
 }
 
@@ -55,7 +57,7 @@ impl TelemetryService {
     async fn hand_over(&self, by: &Caller, replay: StatusReplay) -> Result<LaneAck, Refusal> {
         by.is_robot(&replay.robot_id)?;
         let in_charge = self.inner.registry.get(&replay.robot_id).ok_or_else(not_in_charge)?;
-        if in_charge.session_epoch != replay.session_epoch || *in_charge.secret != *replay.session_secret {
+        if in_charge.session_epoch != replay.session_epoch || in_charge.secret != replay.session_secret {
             return Err(not_in_charge());
         }
         let samples = replay.batch.items.len() as u64;

@@ -4,6 +4,7 @@ use crate::harness::{Running, Server, channel, folder, midshift, sign_in, until}
 use crate::kill::{all_over, at_work, judge, submit};
 use crate::robots::{Robots, enrolment};
 use crate::rolled_out::{call, done};
+use crate::stopped::StopServer;
 use anyhow::{Context, ensure};
 use midshift_agent::dial::{Dial, TcpDial};
 use midshift_agent::enrolment::Enrolled;
@@ -151,6 +152,40 @@ fn call_as(server: &Server, token: &str, arguments: &[&str]) -> anyhow::Result<O
     sign_in(&mut command, server.address);
     command.env("MIDSHIFT_TOKEN", token).args(arguments).args(["--server", &server.address.to_string()]);
     Ok(command.output()?)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_token_that_was_revoked_is_worth_nothing_at_the_stop_port_either_and_what_it_watched_ends()
+-> anyhow::Result<()> {
+    let dir = folder()?;
+    let server = Server::start(dir.path()).await?;
+    let stops = StopServer::start(dir.path(), server.address).await?;
+    let made = json(&server, &["token", "create", "bert", "--role", "viewer"])?;
+    let token = made["secret"].as_str().context("a secret")?;
+    let token_id = made["token"]["tokenId"].as_str().or(made["token"]["token_id"].as_str()).context("an id")?;
+    let stop_port = stops.address.to_string();
+    let as_bert = |more: &[&str]| {
+        let mut command = Command::new(midshift()?);
+        sign_in(&mut command, stops.address);
+        command.env("MIDSHIFT_TOKEN", token).args(["stop", "status", "--stop-server", &stop_port]).args(more);
+        anyhow::Ok(command)
+    };
+    until("the stop port to know the token", LIMIT, async || Ok(as_bert(&[])?.status()?.success().then_some(())))
+        .await?;
+    let mut watching = Running::start(&mut as_bert(&["--watch"])?, &dir.path().join("watching.log"))?;
+    until("the first word to whoever watches", LIMIT, async || {
+        Ok((!std::fs::read_to_string(dir.path().join("watching.log"))?.is_empty()).then_some(()))
+    })
+    .await?;
+    done(&["token", "revoke", token_id, "--server", &server.address.to_string()])?;
+    until("the stop port to know that it is none any more", LIMIT, async || {
+        let output = as_bert(&[])?.output()?;
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        Ok((!output.status.success() && said.contains("none of this site")).then_some(()))
+    })
+    .await?;
+    ensure!(watching.ends().await?.is_some_and(|code| code != 0), "it goes on");
+    Ok(())
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

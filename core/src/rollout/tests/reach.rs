@@ -42,6 +42,34 @@ impl Rig {
     }
 }
 
+#[test]
+fn whoever_may_not_leaves_that_in_the_audit_and_who_only_checks_or_sees_nothing_leaves_nothing() {
+    let mut rig = Rig::rooms();
+    let (anna, blind) = (holder("anna", &["ota-author", "ota-approver"]), holder("ben", &["ota-approver@quality"]));
+    rig.by(&anna, &create("ro", &["hall"])).expect("she is an author");
+    rig.by(&anna, &verb("ro", Verb::Submit)).expect("she is an author");
+    let approve = verb("ro", Verb::Approve);
+    let mut left = |by: &Caller, check_only| {
+        let (command, by) = (approve.clone(), by.clone());
+        let request_id = Some("q1".to_owned());
+        let ask = Ask { command, seen: None, check_only, request_id, by };
+        let mut plan = Plan::default();
+        let taken = commands::take(&mut rig.ota, &rig.board, rig.now, &ask, &mut plan);
+        assert!(taken.is_err());
+        let told = plan.items.iter().map(|item| {
+            assert!(item.rows.is_empty(), "it says that alone");
+            let note = item.note.as_ref().expect("a note");
+            (note.action, item.actor.to_string(), note.about.clone(), note.refused)
+        });
+        told.collect::<Vec<_>>()
+    };
+    let row = ("rollout.approve", "anna".to_owned(), vec!["rollout:ro".to_owned()], Some(Code::NotYourOwn));
+    assert_eq!(left(&anna, CheckOnly::No), [row]);
+    assert_eq!(left(&holder("carl", &["viewer"]), CheckOnly::No).len(), 1);
+    assert_eq!(left(&anna, CheckOnly::Yes), []);
+    assert_eq!(left(&blind, CheckOnly::No), [], "to him it is not there");
+}
+
 const DENIED: Result<(), (Kind, Code)> = Err((Kind::Denied, Code::NotPermitted));
 const MISSING: Result<(), (Kind, Code)> = Err((Kind::NotFound, Code::RolloutNotFound));
 

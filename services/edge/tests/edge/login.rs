@@ -6,12 +6,13 @@ use http::Request;
 use midshift_core::identity::{Digest, Directory, DirectoryToken, Secret, TokenId};
 use midshift_core::ids::SiteId;
 use midshift_core::reason::Code;
-use midshift_core::time::{Clock, ScaledClock, Utc};
+use midshift_core::time::{Clock, LinkDuration, ScaledClock, Utc};
 use midshift_edge::tls::Clients;
 use midshift_edge::{Config, Denial, Denials, Known, robot_of};
 use sha2::Digest as _;
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use tokio::sync::{mpsc, watch};
 
 const LIST: &str = "/midshift.task.v1.TaskService/ListTasks";
@@ -21,6 +22,7 @@ const ENGAGE: &str = "/midshift.stop.v1.StopService/Engage";
 const HEALTH: &str = "/grpc.health.v1.Health/Check";
 
 struct Port {
+    us: Arc<AtomicU64>,
     world: World,
     authority: Authority,
     known: Arc<Known>,
@@ -32,18 +34,23 @@ fn site() -> SiteId {
     SiteId::parse("factory").expect("a site")
 }
 
-fn clock() -> Arc<dyn Clock> {
-    Arc::new(ScaledClock::new(|| 0, Utc(1_000_000), 1000))
-}
+/// What its ports know is the time, in unix ms, at the beginning of each test.
+const BEGIN: i64 = 1_000_000;
 
 impl Port {
     async fn open() -> Self {
-        let authority = Authority::new();
-        let known = Arc::new(Known::new(site(), clock()));
+        Self::open_with(Config::default()).await
+    }
+    async fn open_with(config: Config) -> Self {
+        let (authority, us) = (Authority::new(), Arc::new(AtomicU64::new(0)));
+        let source = us.clone();
+        let clock: Arc<dyn Clock> =
+            Arc::new(ScaledClock::new(move || source.load(Ordering::Relaxed), Utc(BEGIN), 1000));
+        let known = Arc::new(Known::new(site(), clock));
         let (tls, newest) = watch::channel(authority.server(Clients::Asked(vec![authority.root()])));
         let (tell, denials) = Denials::new("business");
-        let world = World::telling(Config::default(), known.clone(), Some(newest), Some(tell)).await;
-        Self { world, authority, known, denials, _tls: tls }
+        let world = World::telling(config, known.clone(), Some(newest), Some(tell)).await;
+        Self { us, world, authority, known, denials, _tls: tls }
     }
     fn robot(&self, name: &str) -> Identity {
         self.authority.issue_uri(&format!("spiffe://factory/robot/{name}"))
@@ -165,9 +172,87 @@ async fn an_expired_token_still_engages_a_stop_and_resets_none() {
     assert_eq!(reset, Err(Code::TokenExpired));
 }
 
+/// A stream of whoever shows this; its head was let in.
+async fn held(client: &mut Client, path: &str, bearer: &str) {
+    let request = Request::post(format!("http://edge{path}")).header("content-type", "application/grpc");
+    let request = request.header("hold", "yes").header("authorization", bearer).body(()).expect("a request");
+    let response = within(within(client.send(request)).await.expect("sent")).await.expect("a head");
+    assert!(!response.headers().contains_key("grpc-status"), "{response:?}");
+}
+
+#[tokio::test]
+async fn the_streams_of_a_token_that_was_taken_back_end_with_their_connection_and_those_of_another_go_on() {
+    let port = Port::open().await;
+    let [gone, kept] = ["t1", "t2"].map(|id| Secret::new(TokenId::new(id).expect("an id"), [7; 32]));
+    let known = |secrets: &[&Secret]| {
+        let token = |secret: &&Secret| {
+            let digest = Digest(sha2::Sha256::digest(secret.bytes()).into());
+            let grants = ["viewer".parse().expect("a grant")].into();
+            let token = DirectoryToken { name: "anna".into(), digest, grants, expires_unix_ms: i64::MAX };
+            (secret.id().clone(), token)
+        };
+        port.known.publish(Directory { tokens: secrets.iter().map(token).collect(), denied: BTreeMap::new() });
+    };
+    known(&[&gone, &kept]);
+    let [first, second] = [&gone, &kept].map(|secret| format!("Bearer {}", secret.reveal(Secret::TOKEN)));
+    let (mut goes, mut stays) = (port.client(None).await, port.client(None).await);
+    held(&mut goes, LIST, &first).await;
+    held(&mut stays, LIST, &second).await;
+    known(&[&kept]);
+    port.world.closed_for("denied").await;
+    assert!(asked(&mut goes, LIST, Some(&first)).await.is_none());
+    assert!(code(&mut stays, LIST, Some(&second)).await.is_ok());
+    assert_eq!(port.world.open_connections(), 1.0);
+}
+
+#[tokio::test]
+async fn the_streams_of_a_token_end_when_its_time_is_over_and_it_still_stops() {
+    let config = Config { asked_again: LinkDuration(20), ..Config::default() };
+    let port = Port::open_with(config).await;
+    let secret = secret();
+    port.knows(&secret, &["viewer"], BEGIN + 1_000);
+    let bearer = format!("Bearer {}", secret.reveal(Secret::TOKEN));
+    let mut client = port.client(None).await;
+    held(&mut client, LIST, &bearer).await;
+    // Nothing is published: time alone ends it.
+    port.us.store(1_000_000, Ordering::Relaxed);
+    port.world.closed_for("denied").await;
+    let mut again = port.client(None).await;
+    assert!(code(&mut again, ENGAGE, Some(&bearer)).await.is_ok());
+    assert_eq!(code(&mut again, LIST, Some(&bearer)).await, Err(Code::TokenExpired));
+    assert!(code(&mut again, ENGAGE, Some(&bearer)).await.is_ok(), "its connection is left alone");
+}
+
+#[tokio::test]
+async fn a_certificate_whose_time_is_over_does_not_get_through_the_handshake() {
+    let port = Port::open().await;
+    let late = port.authority.issue_uri_until("spiffe://factory/robot/r7", (2020, 1, 1));
+    if let Ok(stream) = port.authority.connect(&port.world, Some(&late)).await {
+        assert!(asked(&mut Client::over(stream).await, SESSION, None).await.is_none());
+    }
+    port.world.closed_for("handshake_failed").await;
+    let good = port.authority.issue_uri_until("spiffe://factory/robot/r7", (4000, 1, 1));
+    let mut robot = port.client(Some(&good)).await;
+    assert!(code(&mut robot, SESSION, None).await.is_ok());
+}
+
+#[tokio::test]
+async fn what_a_service_denies_behind_the_port_is_told_of_as_what_the_port_denies() {
+    let mut port = Port::open().await;
+    let mut robot = port.client(Some(&port.robot("r7"))).await;
+    let request = Request::post(format!("http://edge{SESSION}")).header("content-type", "application/grpc");
+    let request = request.header("deny", "yes").body(()).expect("a request");
+    within(within(robot.send(request)).await.expect("sent")).await.expect("an answer");
+    let told = within(port.denials.recv()).await.expect("told");
+    let expected = Denial { robot_id: Some("r8".to_owned()), ..said("robot:r7", SESSION, Code::NotThisRobot) };
+    assert_eq!(told, expected);
+    let name = "midshift_edge_requests_denied_inside_total";
+    assert_eq!(port.world.counter(name, ("reason", "NOT_THIS_ROBOT")), 1);
+}
+
 fn said(actor: &str, path: &str, code: Code) -> Denial {
     let network = std::net::Ipv4Addr::LOCALHOST.into();
-    Denial { actor: actor.to_owned(), network, path: path.to_owned(), code, left_out: 0 }
+    Denial { actor: actor.to_owned(), network, path: path.to_owned(), robot_id: None, code, left_out: 0 }
 }
 
 #[tokio::test]

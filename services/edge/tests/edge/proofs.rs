@@ -48,6 +48,14 @@ impl Authority {
         self.sign(params)
     }
 
+    /// The same, good until that day.
+    pub fn issue_uri_until(&self, uri: &str, (year, month, day): (i32, u8, u8)) -> Identity {
+        let mut params = CertificateParams::default();
+        params.subject_alt_names = vec![SanType::URI(uri.try_into().expect("plain text"))];
+        params.not_after = rcgen::date_time_ymd(year, month, day);
+        self.sign(params)
+    }
+
     fn sign(&self, params: CertificateParams) -> Identity {
         let key = KeyPair::generate().expect("a key");
         let leaf = params.signed_by(&key, &self.0).expect("a certificate").der().clone();

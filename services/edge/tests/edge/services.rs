@@ -5,7 +5,9 @@ use http::{HeaderMap, HeaderValue, Request, Response};
 use http_body::{Body as HttpBody, Frame};
 use http_body_util::StreamBody;
 use midshift_core::identity::Caller;
+use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_edge::Peer;
+use midshift_proto::Denying;
 use std::convert::Infallible;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -16,7 +18,8 @@ use tonic::body::Body;
 use tower::Service;
 
 /// Answers by path: `/who` tells who asked, `/hang` never answers, `/stream` answers and goes on without a word, `/pulse` says a word for each
-/// `/poke`, `/leaving` ends when its connection is about to be asked to go. Any path with a header `hold` is as `/stream`.
+/// `/poke`, `/leaving` ends when its connection is about to be asked to go. Any path with a header `hold` is as `/stream`; with `deny`
+/// it says that it denies what the port let in.
 #[derive(Clone, Default)]
 pub struct Services {
     poked: Arc<Notify>,
@@ -42,6 +45,11 @@ impl Service<Request<Body>> for Services {
 async fn answer(request: Request<Body>, poked: Arc<Notify>) -> Response<Body> {
     let peer = request.extensions().get::<Peer>().expect("each request says who asks").clone();
     let path = request.uri().path().to_owned();
+    if request.headers().contains_key("deny") {
+        let reason = Reason::from(Code::NotThisRobot).with("robot_id", "r8");
+        Denying::of(&tonic::Request::from_http(request)).tell(&Refusal::new(Kind::Denied, reason));
+        return ok(Vec::new());
+    }
     if request.headers().contains_key("hold") {
         return grpc(Body::new(Silent { _request: request.into_body() }));
     }

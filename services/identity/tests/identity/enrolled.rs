@@ -1,16 +1,18 @@
 //! Machines that become robots, and robots that are taken out.
 
-use crate::world::{Machine, World, asked_by, code, enrol, secret};
+use crate::world::{Heard, Machine, World, asked_by, code, enrol, secret};
 use midshift_core::identity::{Caller, Digest};
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_identity::IdentityService;
+use midshift_proto::Denying;
 use midshift_proto::identity::v1::enrolment_service_server::EnrolmentService as _;
 use midshift_proto::identity::v1::identity_service_server::IdentityService as _;
 use midshift_proto::identity::v1::{
     ListRobotIdentitiesRequest, RenewCertificateRequest, RevokeRobotRequest, RobotIdentity,
 };
+use std::sync::Arc;
 use tonic::Request;
 
 async fn robot(identity: &IdentityService, robot_id: &str) -> RobotIdentity {
@@ -58,6 +60,48 @@ async fn a_secret_that_was_used_lets_no_second_machine_in() {
 }
 
 #[tokio::test]
+async fn a_machine_is_one_robot_and_its_key_lets_no_other_one_in_also_after_it_was_revoked() {
+    let world = World::new();
+    let identity = world.open().await.expect("opened");
+    let (line, machine) = (secret(&identity, "r7", false).await.expect("a secret"), Machine::new());
+    enrol(&identity, "r7", &line, &machine).await.expect("enrolled");
+    let other = secret(&identity, "r8", false).await.expect("a secret");
+    let refused = enrol(&identity, "r8", &other, &machine).await.expect_err("it is r7");
+    assert_eq!(code(&refused), Some(Code::KeyDenied));
+    let revoke = RevokeRobotRequest { robot_id: "r7".to_owned() };
+    identity.revoke_robot(Request::new(revoke)).await.expect("revoked");
+    let refused = enrol(&identity, "r8", &other, &machine).await.expect_err("it was r7");
+    assert_eq!(code(&refused), Some(Code::KeyDenied));
+    enrol(&identity, "r8", &other, &Machine::new()).await.expect("the secret is as good as before");
+}
+
+#[tokio::test]
+async fn whoever_may_not_enrol_or_renew_is_told_of_with_the_robot_that_it_named() {
+    let world = World::new();
+    let identity = world.open().await.expect("opened");
+    let (line, machine, told) =
+        (secret(&identity, "r7", false).await.expect("a secret"), Machine::new(), Heard::default());
+    let told = Arc::new(told);
+    let enrol = async |robot_id: &str, machine: &Machine| {
+        let (robot_id, secret) = (robot_id.to_owned(), crate::world::shown(&line));
+        let request = midshift_proto::identity::v1::EnrolRequest { robot_id, secret, request_pem: machine.request() };
+        let mut request = asked_by(Caller::nobody(), request);
+        request.extensions_mut().insert(Denying::new(told.clone()));
+        identity.enrol(request).await.is_ok()
+    };
+    assert!(!enrol("r8", &machine).await && enrol("r7", &machine).await && !enrol("r7", &Machine::new()).await);
+    let own = Caller::robot(RobotId::parse("r7").expect("an id"));
+    let request = RenewCertificateRequest { robot_id: "r7".to_owned(), request_pem: Machine::new().request() };
+    let mut request = asked_by(own, request);
+    request.extensions_mut().insert(Denying::new(told.clone()));
+    assert!(identity.renew_certificate(request).await.is_err());
+    let robot = |id: &str| Some(id.to_owned());
+    let expected =
+        [(Code::EnrolmentUnknown, robot("r8")), (Code::EnrolmentUsed, robot("r7")), (Code::KeyDenied, robot("r7"))];
+    assert_eq!(*told.0.lock().expect("not poisoned"), expected);
+}
+
+#[tokio::test]
 async fn a_secret_is_worth_nothing_after_its_hour_or_after_a_newer_one() {
     let world = World::new();
     let identity = world.open().await.expect("opened");
@@ -79,6 +123,8 @@ async fn a_robot_that_is_replaced_goes_on_until_the_new_machine_is_there_and_the
     let old = robot(&identity, "r7").await.key_sha256;
     let refused = secret(&identity, "r7", false).await.expect_err("it is enrolled");
     assert_eq!(code(&refused), Some(Code::RobotEnrolled));
+    let last = world.audited().await.pop().expect("a row");
+    assert_eq!((last.action.as_str(), last.outcome.as_str()), ("robot.enroll", "ROBOT_ENROLLED"));
     let line = secret(&identity, "r7", true).await.expect("a secret for another machine");
     assert!(!denies(&identity, &old));
     enrol(&identity, "r7", &line, &Machine::new()).await.expect("enrolled");

@@ -90,6 +90,13 @@ async fn every_broken_rule_of_a_token_is_told_at_once_and_none_is_made() {
     let fields: Vec<String> = refusal_of(&refused).violations.into_iter().map(|v| v.field).collect();
     assert_eq!(fields, ["name", "grants[0]", "grants[1]", "valid_seconds"]);
     assert!(create(&identity, "anonymous", &["viewer"], DAY_S).await.is_err(), "it stands for nobody");
+    for own in ["task", "fleet", "ota", "stop", "identity", "telemetry", "midshift"] {
+        assert!(create(&identity, own, &["viewer"], DAY_S).await.is_err(), "{own} acts for itself in the audit");
+    }
+    let refused = create(&identity, "anna", &["viewer", "auditor@packing", "admin@hall"], DAY_S).await;
+    let violations = refusal_of(&refused.expect_err("they are of the site")).violations;
+    assert_eq!(violations.iter().map(|v| v.field.as_str()).collect::<Vec<_>>(), ["grants[1]", "grants[2]"]);
+    assert_eq!(violations[1].description, "admin@hall permits no more than viewer does: admin is of the whole site");
     assert!(create(&identity, "anna", &[], DAY_S).await.is_err());
     assert!(list(&identity).await.is_empty());
 }
@@ -99,9 +106,12 @@ async fn the_last_token_that_may_administer_the_site_stays() {
     let world = World::new();
     let identity = world.open().await.expect("opened");
     let (first, _) = create(&identity, "anna", &["admin"], DAY_S).await.expect("made");
-    create(&identity, "bert", &["admin@packing", "operator"], DAY_S).await.expect("made");
+    create(&identity, "bert", &["operator"], DAY_S).await.expect("made");
     let refused = revoke(&identity, &first.token_id).await.expect_err("the last one");
     assert_eq!(code(&refused), Some(Code::LastAdmin));
+    let last = world.audited().await.pop().expect("a row");
+    assert_eq!((last.action.as_str(), last.outcome.as_str()), ("token.revoke", "LAST_ADMIN"));
+    assert!(last.is_about(&first.token_id));
     create(&identity, "carla", &["admin"], DAY_S).await.expect("made");
     revoke(&identity, &first.token_id).await.expect("there is another one");
 }

@@ -1,19 +1,22 @@
 //! A site with its identity, and machines that want to be robots of it.
 
+use midshift_core::audit::AuditRow;
 use midshift_core::identity::Caller;
 use midshift_core::ids::SiteId;
-use midshift_core::reason::Code;
+use midshift_core::reason::{Code, Refusal};
+use midshift_core::rows::Table;
 use midshift_core::time::{Clock, ScaledClock, Utc};
 use midshift_identity::{Duty, Error, IdentityService, Parts};
+use midshift_proto::denying::Told;
 use midshift_proto::identity::v1::enrolment_service_server::EnrolmentService as _;
 use midshift_proto::identity::v1::identity_service_server::IdentityService as _;
 use midshift_proto::identity::v1::{CreateEnrolmentRequest, EnrolRequest, EnrolResponse};
 use midshift_proto::refusal_of;
-use midshift_store::{MemoryStore, Store, StoreId};
+use midshift_store::{MemoryStore, Query, Store, StoreId};
 use rcgen::{CertificateParams, KeyPair};
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 use tempfile::TempDir;
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Status};
@@ -37,6 +40,11 @@ impl World {
     }
     pub fn pass_ms(&self, ms: u64) {
         self.us.fetch_add(ms * 1000, Ordering::Relaxed);
+    }
+    /// Rows of the audit, the oldest first.
+    pub async fn audited(&self) -> Vec<AuditRow> {
+        let rows = self.store.list(Query::all(Table::IdentityAudit)).await.expect("rows");
+        rows.iter().map(|row| serde_json::from_str(&row.body).expect("a row")).collect()
     }
     pub fn folder(&self) -> PathBuf {
         self.dir.path().join("identity")
@@ -68,6 +76,17 @@ impl Machine {
         // It may ask for any name: the site says which it gets.
         let params = CertificateParams::new(vec!["root.example".to_owned()]).expect("parameters");
         params.serialize_request(&self.0).and_then(|request| request.pem()).expect("a request")
+    }
+}
+
+/// Whoever writes down what the service denies: codes, each with the robot that it is about.
+#[derive(Default)]
+pub struct Heard(pub Mutex<Vec<(Code, Option<String>)>>);
+
+impl Told for Heard {
+    fn denied(&self, refusal: &Refusal) {
+        let robot_id = refusal.reason.metadata.get("robot_id").cloned();
+        self.0.lock().expect("not poisoned").push((refusal.reason.code, robot_id));
     }
 }
 

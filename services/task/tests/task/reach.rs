@@ -4,14 +4,34 @@ use crate::world::{NOON, World, patrol, reason, submit, transport};
 use midshift_core::fleet::rows::{HolderState, Place, PlaceHolder};
 use midshift_core::identity::{Caller, TokenId};
 use midshift_core::ids::{PlaceId, RobotId};
+use midshift_core::reason::Refusal;
 use midshift_core::rows::{Item, Table, Writer};
 use midshift_core::task::{TaskIntake, TaskRequest};
+use midshift_proto::Denying;
+use midshift_proto::denying::Told;
 use midshift_proto::task::v1::submit_task_request::Body;
 use midshift_proto::task::v1::task_service_server::TaskService as _;
 use midshift_proto::task::v1::{self, SubmitTaskRequest, submit_task_result::Outcome, watch_tasks_response};
 use midshift_store::{Query, Store, load};
+use std::sync::{Arc, Mutex};
 use tokio_stream::StreamExt;
 use tonic::{Code, Request};
+
+/// Whoever writes down what the service denies.
+#[derive(Default)]
+struct Heard(Mutex<Vec<String>>);
+
+impl Heard {
+    fn codes(&self) -> Vec<String> {
+        self.0.lock().expect("not poisoned").clone()
+    }
+}
+
+impl Told for Heard {
+    fn denied(&self, refusal: &Refusal) {
+        self.0.lock().expect("not poisoned").push(refusal.reason.code.as_str().to_owned());
+    }
+}
 
 fn asked<T>(by: &Caller, message: T) -> Request<T> {
     let mut request = Request::new(message);
@@ -67,6 +87,11 @@ async fn work_is_brought_in_where_the_caller_dispatches_and_under_its_name() {
             assert_eq!((refused.code(), reason(&refused).as_str()), (Code::PermissionDenied, "NOT_PERMITTED"));
         }
     }
+    let told = Arc::new(Heard::default());
+    let mut request = asked(&anna, drive("other", "Q01", &[]));
+    request.extensions_mut().insert(Denying::new(told.clone()));
+    world.service.submit_task(request).await.expect_err("not her area");
+    assert_eq!(told.codes(), ["NOT_PERMITTED"], "for the audit");
     let nowhere = v1::step::Kind::Wait(v1::Wait { duration: Some(prost_types::Duration { seconds: 1, nanos: 0 }) });
     let mut request = patrol("nowhere", &[]);
     if let Some(Body::Spec(spec)) = &mut request.body {

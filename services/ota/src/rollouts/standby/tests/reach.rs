@@ -1,7 +1,9 @@
 //! Callers who may do something in some areas only, at the process that leads and at the one that does not.
 
 use super::*;
+use midshift_core::audit::AuditRow;
 use midshift_core::identity::{Caller, TokenId};
+use midshift_store::Query;
 use tonic::{Code, Response, Status};
 
 fn asked<T>(by: &Caller, message: T) -> Request<T> {
@@ -83,6 +85,14 @@ async fn roll_outs_are_written_seen_and_approved_by_whoever_may_where_they_are_f
         assert_eq!(approve(&anna, "quality").await, "NOT_PERMITTED");
         assert_eq!(approve(&blind, "quality").await, "ROLLOUT_NOT_FOUND");
     }
+    let rows = world.store.list(Query::all(Table::OtaAudit)).await.expect("rows");
+    let rows = rows.iter().map(|row| serde_json::from_str::<AuditRow>(&row.body).expect("a row"));
+    let denied: Vec<String> = rows
+        .filter(|row| row.action == "rollout.approve" && row.actor == "anna")
+        .map(|row| format!("{} {}", row.about.join(" "), row.outcome))
+        .collect();
+    let twice = ["rollout:hall NOT_YOUR_OWN", "rollout:quality NOT_PERMITTED"].repeat(2);
+    assert_eq!(denied, twice, "by the one that leads and by the other");
     leader.end().await;
     standby.end().await;
 }
