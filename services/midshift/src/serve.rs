@@ -158,6 +158,10 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
             "--identity is for processes without role identity: the site's authority is in the folder identity of --data, where a backup finds it"
         );
     }
+    if !args.insecure {
+        // The databases have secrets of sessions, whichever process of the site they are of.
+        midshift_identity::make_folder(&args.data).context("opening the data folder")?;
+    }
     let loaded = site_file::load(args.site.as_deref(), None, None)?;
     for warning in &loaded.warnings {
         tracing::warn!(warning, "site");

@@ -6,7 +6,9 @@ use midshift_proto::task::v1::WatchTasksRequest;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::telemetry::v1::WatchRobotsRequest;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
+use std::fs::Permissions;
 use std::net::SocketAddr;
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
@@ -41,6 +43,28 @@ async fn a_second_server_on_the_same_data_is_refused_and_the_first_goes_on() -> 
     assert_eq!(code, Some(1), "{said}");
     assert!(said.contains("is in use by another server; stop it first, or choose another directory"), "{said}");
     assert!(first.in_states(&[]).await?.is_some(), "the first one answers");
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_data_folder_that_others_may_read_is_refused_with_what_to_type_and_serves_once_it_is_closed()
+-> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let mut server = Server::start(dir.path()).await?;
+    let data = dir.path().join("data");
+    assert_eq!(data.metadata()?.permissions().mode() & 0o777, 0o700, "as it was made");
+    server.kill()?;
+    std::fs::set_permissions(&data, Permissions::from_mode(0o755))?;
+    let path = data.to_str().context("a plain path")?;
+    let of_both = ["--data", path, "--listen", "127.0.0.1:0"];
+    for program in [&["serve", "--no-stop"][..], &["stop", "serve"]] {
+        let (code, said) = refused(dir.path(), &[program, &of_both].concat()).await?;
+        assert_eq!(code, Some(1), "{said}");
+        assert!(said.contains("(mode 755)") && said.contains(&format!("`chmod 700 {path}`")), "{said}");
+    }
+    std::fs::set_permissions(&data, Permissions::from_mode(0o700))?;
+    server.restart().await?;
+    assert!(server.in_states(&[]).await?.is_some(), "it answers");
     Ok(())
 }
 

@@ -12,6 +12,7 @@ use midshift_tests::released::{Release, sqlite_file};
 use midshift_tests::rows::{self, Found};
 use midshift_tests::shape::Shapes;
 use std::collections::BTreeSet;
+use std::os::unix::fs::DirBuilderExt;
 use std::path::Path;
 
 /// What a run leaves nothing in, and why. Anything else that is empty fails.
@@ -67,7 +68,8 @@ pub fn restore(release: &Release, engine: Engine, data: &Path) -> anyhow::Result
         server.load(&url, &from.join("store.sql"));
         return Ok(Some(url));
     }
-    std::fs::create_dir_all(data)?;
+    // As `serve` makes it.
+    std::fs::DirBuilder::new().recursive(true).mode(0o700).create(data)?;
     for name in ["control", "telemetry"] {
         let text = std::fs::read_to_string(from.join(format!("{name}.sql")))?;
         sqlite_file(&text, &data.join(format!("{name}.db")))?;
