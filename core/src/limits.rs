@@ -266,7 +266,8 @@ pub const SILENCE_STAND: LinkDuration = LinkDuration::from_secs(30);
 pub const SILENCE_SLOW_PEOPLE: LinkDuration = LinkDuration::from_secs(3);
 /// ... and standing.
 pub const SILENCE_STAND_PEOPLE: LinkDuration = LinkDuration::from_secs(6);
-/// Stops that are engaged and not reset, of one site. The last ones are kept for stops of the whole fleet.
+/// Stops that are engaged and not reset, of one site. The last ones are kept for stops of the whole fleet. One of the whole fleet that is more restrictive than every
+/// other of it is engaged beyond that: at most two more, for there are three levels.
 pub const STOPS_MAX: usize = 256;
 /// Of these, so many are for stops of the whole fleet only.
 pub const STOPS_FOR_FLEET: usize = 16;
@@ -288,6 +289,10 @@ pub const STOP_ROBOTS_MAX: usize = 20_000;
 pub const STOP_LINE_SILENT: LinkDuration = LinkDuration::from_secs(10);
 /// A line says who comes within this, or is closed.
 pub const STOP_ATTEND_WITHIN: LinkDuration = LinkDuration::from_secs(5);
+/// Bytes of the stops that a robot brings whole when it attends; of the rest it brings the names. Little enough for a poor radio within [`CHECK_IN_MISSED`].
+pub const STOP_ATTEND_BYTES: usize = 256 * 1024;
+/// A machine that is not let in to a robot's line stands in the audit of stops so often.
+pub const LINE_HELD_NOTED_EVERY: LinkDuration = LinkDuration::from_secs(600);
 /// Bytes of one message of stops and resets to a robot: what every client takes.
 pub const STOP_TOLD_BYTES: usize = 60 * 1024;
 /// Messages that wait for a robot to read them; with one more it is told everything anew when it reads again.

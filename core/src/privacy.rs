@@ -231,6 +231,7 @@ kept! {
     Place::File("stop/principals") => [Credential, Person] Stop Newest;
     Place::File("stop/roster") => [Machine] Stop Newest;
     Place::File("stop/audit") => [Person, Operations] Account Standing;
+    Place::File("stop/log") => [Machine, Operations] Diagnose Counted;
     Place::File("identity") => [Credential] Identify Standing;
     Place::File("releases") => [Software] Update Standing;
     Place::Robot("ledger") => [Operations, Credential] Operate Week;

@@ -100,6 +100,7 @@ codes! {
     StopNotFound = "STOP_NOT_FOUND", "Nothing is known of this stop. `midshift stop status` says which are engaged; a robot that stands says what it waits for.";
     StopWasReset = "STOP_WAS_RESET", "The stop was reset, so nobody obeys it any more. Engage another one with a new request_id.";
     LineReplaced = "LINE_REPLACED", "A newer line of this robot took the place of this one. If two machines use one robot id, find the second.";
+    LineHeld = "LINE_HELD", "Another start of this robot is heard on its line to the stop service, so this one is not let in. It dials again by itself and is let in when the other has ended. If two machines use one robot id, find the second and revoke the key.";
     // --- software on the server
     SoftwareNotFound = "SOFTWARE_NOT_FOUND", "No signed release lists this file, or no document has this name. List bundles.";
     NoOnlineKeys = "NO_ONLINE_KEYS", "The server has no keys that may say which release is the newest. Start it with --ota-keys and the folder that holds them.";

@@ -36,6 +36,7 @@ const LEFT_OUT: &[(&str, &str)] = &[
     ("public_address::", DEV),
     ("restored::", "it has a drill for each engine in the first run"),
     ("split::", ALWAYS),
+    ("stop_alone::", "the stop service has files of its own; the server beside it has the store of one box"),
     ("stopped::a_stop_that_is_engaged_while_the_database_", ALWAYS),
     ("story::", DEV),
     ("swarm_software::", NO_SERVER),

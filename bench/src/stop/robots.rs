@@ -149,7 +149,7 @@ async fn attend(all: &All, proof: &Proof, at: usize, opening: &Semaphore) -> any
     let channel = TcpDial::new(&format!("https://{}", all.args.stop), None)?.with_tls(proof.tls()?).dial().await?;
     let (up, outbound) = mpsc::channel(OUTBOUND);
     let robot_id = site::robot_id(all.args.from + at);
-    let first = Attend { boot_id: format!("{robot_id}-boot"), robot_id, stops: Vec::new() };
+    let first = Attend { boot_id: format!("{robot_id}-boot"), robot_id, ..Attend::default() };
     up.send(AttendRequest { message: Some(Up::Attend(first)) }).await?;
     let mut down = StopLinkServiceClient::new(channel).attend(ReceiverStream::new(outbound)).await?.into_inner();
     let mut robot = Robot { seen: &all.robots[at], up, generation: 0, is_durable: true, nonce: 0, news: u64::MAX };

@@ -25,7 +25,7 @@ pub enum Permission {
     Author,
     /// Approve roll-outs that somebody else wrote.
     Approve,
-    /// Engage a stop.
+    /// Engage a stop, and see what is stopped.
     Stop,
     /// Reset a stop.
     Reset,

@@ -28,7 +28,7 @@ pub struct Kept {
 pub struct Obeyed {
     /// The most restrictive of all.
     pub level: StopLevel,
-    /// Effective stops that it lies inside of.
+    /// Effective stops that it lies inside of, the most restrictive first: a list that is cut off loses none that matters more than what it keeps.
     pub inside: Vec<StopId>,
     /// How far the silence has come.
     pub stage: Stage,
@@ -104,8 +104,9 @@ impl RobotStop {
         let mut is_changed = self.kept.latch.forget(now.wall, limits::RESETS_MAX);
         let stage = self.ladder.look(now.link, around);
         self.was_heard |= stage < Stage::Stand;
-        let over: Vec<(StopId, StopLevel)> =
+        let mut over: Vec<(StopId, StopLevel)> =
             self.kept.latch.over(&self.robot_id, pose).map(|stop| (stop.stop_id.clone(), stop.level)).collect();
+        over.sort_by_key(|(_, level)| std::cmp::Reverse(*level));
         for (stop_id, _) in over.iter().filter(|(_, level)| *level >= StopLevel::Halt) {
             is_changed |= self.kept.awaiting.insert(stop_id.clone());
         }
@@ -211,6 +212,21 @@ mod tests {
         (60..63).for_each(|s| robot.answered(LinkTime(s * 1000)));
         assert_eq!(robot.look(&at(62_500), None, Around::People).level, StopLevel::None);
         assert!(robot.kept().awaiting.is_empty());
+    }
+
+    #[test]
+    fn of_more_stops_than_it_can_name_it_names_the_most_restrictive() {
+        let mut robot = free();
+        let slow = (0..limits::STOPS_MAX).map(|n| Stop {
+            stop_id: StopId::parse(&format!("STOP-A{n}")).expect("an id"),
+            ..stop(0, StopLevel::Slow)
+        });
+        let (last, posture) = (StopId::parse("STOP-Z").expect("an id"), StopLevel::ControlledStopPosture);
+        let halts = [stop(9, StopLevel::Halt), Stop { stop_id: last.clone(), ..stop(0, posture) }];
+        robot.told(slow.chain(halts).collect(), vec![]);
+        let obeyed = robot.look(&at(3_100), None, Around::Robots);
+        assert_eq!((obeyed.level, obeyed.inside.len()), (posture, limits::STOPS_MAX + 2));
+        assert_eq!(obeyed.inside[..2], [last, id(9)]);
     }
 
     #[test]

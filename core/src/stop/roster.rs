@@ -5,7 +5,8 @@
 
 use super::ladder::{Around, Stage};
 use super::latch::Stop;
-use crate::ids::StopId;
+use super::scope::Scope;
+use crate::ids::{RobotId, StopId};
 use crate::limits;
 use crate::robot::StopLevel;
 use crate::time::LinkTime;
@@ -37,7 +38,7 @@ pub struct Heard {
 /// How far one robot is with one stop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Confirmation {
-    /// It was told, and has not said that it knows.
+    /// It was told, and has not said that it knows; or says that it knows and does not take a stop that is meant for it wherever it is for its own.
     Requested,
     /// It knows. If the stop only slows it, it does.
     Acked,
@@ -65,8 +66,24 @@ impl Confirmation {
     }
 }
 
-/// How far a robot is with `stop`, which the latch has since `generation`.
-pub fn confirmation(stop: &Stop, generation: u64, robot: Option<&Heard>, now: LinkTime) -> Confirmation {
+/// A robot that does not lie inside of this stop is still meant by it: there is no elsewhere for it. One that knows of a reset of it that the service has lost
+/// says so, and must not be shown as if nothing were asked of it.
+pub fn means_everywhere(stop: &Stop, robot_id: &RobotId) -> bool {
+    match &stop.scope {
+        Scope::Fleet => true,
+        Scope::Robot(id) => id == robot_id,
+        Scope::Zone(_) | Scope::Area(_) => false,
+    }
+}
+
+/// How far `robot_id`, of whom `robot` is the newest report, is with `stop`, which the latch has since `generation`.
+pub fn confirmation(
+    stop: &Stop,
+    generation: u64,
+    robot_id: &RobotId,
+    robot: Option<&Heard>,
+    now: LinkTime,
+) -> Confirmation {
     let Some(heard) = robot else { return Confirmation::Unreachable { since: None, self_stop_by: None } };
     if now.since(heard.at) >= limits::CHECK_IN_MISSED {
         let by = heard.at + heard.around.patience().1;
@@ -74,6 +91,7 @@ pub fn confirmation(stop: &Stop, generation: u64, robot: Option<&Heard>, now: Li
     }
     match heard {
         heard if heard.generation < generation => Confirmation::Requested,
+        heard if !heard.inside.contains(&stop.stop_id) && means_everywhere(stop, robot_id) => Confirmation::Requested,
         heard if !heard.inside.contains(&stop.stop_id) => Confirmation::Outside,
         heard if heard.is_still && heard.level >= stop.level && stop.level >= StopLevel::Halt => {
             Confirmation::StandstillConfirmed
@@ -84,8 +102,8 @@ pub fn confirmation(stop: &Stop, generation: u64, robot: Option<&Heard>, now: Li
 
 #[cfg(test)]
 mod tests {
-    use super::super::scope::Scope;
     use super::*;
+    use crate::ids::AreaId;
     use crate::time::Utc;
 
     fn stop(level: StopLevel) -> Stop {
@@ -115,8 +133,12 @@ mod tests {
         }
     }
 
+    fn robot(id: &str) -> RobotId {
+        RobotId::parse(id).expect("an id")
+    }
+
     fn of(level: StopLevel, heard: Heard) -> Confirmation {
-        confirmation(&stop(level), 7, Some(&heard), LinkTime(10_500))
+        confirmation(&stop(level), 7, &robot("r1"), Some(&heard), LinkTime(10_500))
     }
 
     #[test]
@@ -127,17 +149,29 @@ mod tests {
         assert_eq!(of(StopLevel::ControlledStopPosture, standing()), Confirmation::Acked, "not yet in its posture");
         assert_eq!(of(halt, Heard { level: StopLevel::Slow, ..standing() }), Confirmation::Acked);
         assert_eq!(of(halt, Heard { generation: 6, ..standing() }), Confirmation::Requested);
-        assert_eq!(of(halt, Heard { inside: BTreeSet::new(), ..standing() }), Confirmation::Outside);
         assert_eq!(of(StopLevel::Slow, standing()), Confirmation::Acked, "standing is not what was asked for");
     }
 
     #[test]
+    fn a_robot_is_elsewhere_only_for_a_stop_that_has_an_elsewhere() {
+        let heard = Heard { inside: BTreeSet::new(), ..standing() };
+        let with = |scope: Scope| {
+            let stop = Stop { scope, ..stop(StopLevel::Halt) };
+            confirmation(&stop, 7, &robot("r1"), Some(&heard), LinkTime(10_500))
+        };
+        assert_eq!(with(Scope::Fleet), Confirmation::Requested, "it knows of a reset that the service has lost");
+        assert_eq!(with(Scope::Robot(robot("r1"))), Confirmation::Requested);
+        assert_eq!(with(Scope::Robot(robot("r2"))), Confirmation::Outside);
+        assert_eq!(with(Scope::Area(AreaId::parse("hall").expect("an id"))), Confirmation::Outside);
+    }
+
+    #[test]
     fn silence_says_since_when_and_until_when_and_confirms_nothing() {
-        let silent = confirmation(&stop(StopLevel::Halt), 7, Some(&standing()), LinkTime(13_000));
+        let silent = confirmation(&stop(StopLevel::Halt), 7, &robot("r1"), Some(&standing()), LinkTime(13_000));
         let (since, self_stop_by) = (Some(LinkTime(10_000)), Some(LinkTime(16_000)));
         assert_eq!(silent, Confirmation::Unreachable { since, self_stop_by });
         let never = Confirmation::Unreachable { since: None, self_stop_by: None };
-        assert_eq!(confirmation(&stop(StopLevel::Halt), 7, None, LinkTime(0)), never);
+        assert_eq!(confirmation(&stop(StopLevel::Halt), 7, &robot("r1"), None, LinkTime(0)), never);
         assert!(!silent.is_settled(&stop(StopLevel::Halt)) && !never.is_settled(&stop(StopLevel::Halt)));
     }
 }

@@ -147,6 +147,8 @@ pub enum ToStop {
         boot_id: String,
         /// Engaged and not reset, as far as it knows.
         stops: Vec<Stop>,
+        /// Names of the rest.
+        more: Vec<StopId>,
     },
     /// What it does now.
     CheckIn(CheckIn),
@@ -182,10 +184,11 @@ impl From<&ToStop> for v1::AttendRequest {
     fn from(said: &ToStop) -> Self {
         use v1::attend_request::Message as W;
         let message = match said {
-            ToStop::Attend { robot_id, boot_id, stops } => W::Attend(v1::Attend {
+            ToStop::Attend { robot_id, boot_id, stops, more } => W::Attend(v1::Attend {
                 robot_id: robot_id.to_string(),
                 boot_id: boot_id.clone(),
                 stops: stops.iter().map(Into::into).collect(),
+                more_stop_ids: names(more),
             }),
             ToStop::CheckIn(said) => W::CheckIn(v1::CheckIn {
                 nonce: said.nonce,
@@ -216,7 +219,8 @@ impl Parse<ToStop> for v1::AttendRequest {
                     return None;
                 }
                 let stops = list(attend.stops, at.field("stops"), bad);
-                Some(ToStop::Attend { robot_id: robot_id?, boot_id: boot_id?, stops: stops? })
+                let more = stop_ids(&attend.more_stop_ids, at.field("more_stop_ids"), bad);
+                Some(ToStop::Attend { robot_id: robot_id?, boot_id: boot_id?, stops: stops?, more: more? })
             }
             Some(W::CheckIn(said)) => said.parse_at(at.field("check_in"), bad).map(ToStop::CheckIn),
             None => {
@@ -346,8 +350,11 @@ mod tests {
             around: Around::Robots,
         };
         let robot_id = RobotId::parse("r1").expect("an id");
-        let said =
-            [ToStop::CheckIn(check_in), ToStop::Attend { robot_id, boot_id: "b".to_owned(), stops: vec![stop()] }];
+        let more = vec![StopId::parse("STOP-20260601-ABCDEFGHJL").expect("an id")];
+        let said = [
+            ToStop::CheckIn(check_in),
+            ToStop::Attend { robot_id, boot_id: "b".to_owned(), stops: vec![stop()], more },
+        ];
         for said in said {
             assert_eq!(parse::<ToStop, _>(v1::AttendRequest::from(&said)), Ok(said));
         }

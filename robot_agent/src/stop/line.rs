@@ -25,6 +25,7 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::mpsc;
+use tokio::time::Instant;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Status, Streaming};
 
@@ -40,14 +41,16 @@ pub struct StopLine {
 const PATH: &str = "/midshift.stop.v1.StopLinkService/Attend";
 /// Shortest and longest pause between attempts to connect, milliseconds of real time.
 const RETRY_MS: Range<u64> = 200..5_000;
+/// The longest while a line was lost, or this robot began, no longer ago than [`SOON_FOR`]: a service that is started again has its robots back before those among
+/// people stand. Each draws its pause, so that they do not come at once.
+const RETRY_SOON_MS: u64 = 1_000;
+const SOON_FOR: Duration = Duration::from_secs(10);
 /// A refusal is given way to for so long at most: well below the time after which a robot among people stands.
 const ASKED_MS_MAX: u128 = 1_500;
 /// A line that is to move over is made again within this, milliseconds of real time.
 const SOON_MS: Range<u64> = 1..500;
 /// Messages that may wait for the wire: check-ins of three seconds and of their changes. A line that is stuck this long is given up.
 const OUTBOUND: usize = 16;
-/// Bytes of stops that are said first; what does not fit is kept, and obeyed all the same.
-const ATTEND_BYTES_MAX: usize = 48 * 1024;
 
 type Boxed<T> = Pin<Box<dyn Future<Output = T> + Send>>;
 /// The keeper comes back from each write, with its number.
@@ -101,6 +104,8 @@ pub(crate) struct Line {
     open: Option<Open>,
     way: Way,
     failures: u32,
+    /// Since when there is no line that works.
+    without: Instant,
     /// Why there is no line, as the log was told.
     refused: String,
     keeper: Option<Box<dyn KeepStops>>,
@@ -118,6 +123,7 @@ impl Line {
             open: None,
             way: Way::Waiting(Box::pin(tokio::time::sleep(Duration::ZERO))),
             failures: 0,
+            without: Instant::now(),
             refused: String::new(),
             keeper: Some(keep),
             keeping: None,
@@ -222,6 +228,9 @@ impl Line {
     /// This line does not work: another one.
     pub(crate) fn redial(&mut self, why: &str) {
         tracing::warn!(why, "stop line given up");
+        if self.failures == 0 {
+            self.without = Instant::now();
+        }
         self.open = None;
         if matches!(self.way, Way::Idle) {
             self.wait_to_dial(None);
@@ -253,7 +262,8 @@ impl Line {
 
     /// Not sooner than the service asks for, but never so late that a service which turns robots away makes them stand by itself.
     fn wait_to_dial(&mut self, again_after: Option<Duration>) {
-        let most = ((2 * RETRY_MS.start) << self.failures.min(8)).min(RETRY_MS.end);
+        let longest = if self.without.elapsed() < SOON_FOR { RETRY_SOON_MS } else { RETRY_MS.end };
+        let most = ((2 * RETRY_MS.start) << self.failures.min(8)).min(longest);
         self.failures = self.failures.saturating_add(1);
         let pause = self.rng.random_range(RETRY_MS.start..=most);
         let asked_ms = again_after.map_or(0, |after| after.as_millis().min(ASKED_MS_MAX));
@@ -267,16 +277,24 @@ impl Line {
     }
 }
 
-/// Who comes, and what it knows.
+/// Who comes, and what it knows: whole as far as there is room, the most restrictive first, and the rest by name. Of more than twice as many as there may be it says
+/// nothing; it keeps them and obeys them all the same.
 fn attend<'a>(robot_id: &RobotId, boot_id: &str, stops: impl Iterator<Item = &'a Stop>) -> v1::AttendRequest {
-    let mut room = ATTEND_BYTES_MAX;
-    let fitting = stops.take(limits::STOPS_MAX).map(v1::Stop::from).take_while(|stop| {
-        let bytes = stop.encoded_len();
-        let fits = bytes <= room;
-        room = room.saturating_sub(bytes);
-        fits
-    });
-    let attend = v1::Attend { robot_id: robot_id.to_string(), boot_id: boot_id.to_owned(), stops: fitting.collect() };
+    let mut known: Vec<&Stop> = stops.collect();
+    known.sort_by_key(|stop| std::cmp::Reverse(stop.level));
+    let (mut room, mut whole, mut more) = (limits::STOP_ATTEND_BYTES, Vec::new(), Vec::new());
+    for stop in known {
+        let wire = v1::Stop::from(stop);
+        let bytes = wire.encoded_len();
+        if bytes <= room && whole.len() < limits::STOPS_MAX {
+            room -= bytes;
+            whole.push(wire);
+        } else if more.len() < limits::STOPS_MAX {
+            more.push(wire.stop_id);
+        }
+    }
+    let (robot_id, boot_id) = (robot_id.to_string(), boot_id.to_owned());
+    let attend = v1::Attend { robot_id, boot_id, stops: whole, more_stop_ids: more };
     v1::AttendRequest { message: Some(v1::attend_request::Message::Attend(attend)) }
 }
 

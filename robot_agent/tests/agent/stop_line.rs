@@ -13,10 +13,12 @@ use midshift_agent::session::{AgentConfig, Error, Lines, run};
 use midshift_agent::stop::keep::{FileStops, KeepStops, Loaded, MemoryStops, STOP_FILE, unreadable};
 use midshift_agent::stop::line::StopLine;
 use midshift_agent::store::{self, Op, Store};
-use midshift_core::ids::RobotId;
+use midshift_core::ids::{AreaId, RobotId};
+use midshift_core::limits;
 use midshift_core::robot::StopLevel;
-use midshift_core::stop::Stop;
+use midshift_core::stop::region::Bounds;
 use midshift_core::stop::robot::Kept;
+use midshift_core::stop::{Region, Scope, Stop};
 use midshift_core::time::{Clock, ScaledClock, Utc};
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::stop_link_service_server::{StopLinkService, StopLinkServiceServer};
@@ -273,7 +275,7 @@ async fn a_service_that_reads_and_never_answers_is_left_after_three_seconds_and_
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_service_that_is_not_there_is_dialed_again_with_growing_pauses() {
+async fn a_service_that_is_not_there_is_dialed_each_second_for_ten_and_then_with_growing_pauses() {
     let (tries, mut tried) = mpsc::channel(64);
     struct Refused(mpsc::Sender<Instant>);
     #[async_trait]
@@ -286,15 +288,90 @@ async fn a_service_that_is_not_there_is_dialed_again_with_growing_pauses() {
     let (store, keep) = (Box::new(MemoryStore::new()), Box::new(MemoryStops::default()));
     let bench = Bench::over(Arc::new(Refused(tries)), mpsc::channel(1).1, store, keep);
     let mut pauses = Vec::new();
-    let mut before = tried.recv().await.expect("dials");
-    for _ in 0..20 {
+    let begun = tried.recv().await.expect("dials");
+    let (mut before, mut early) = (begun, Vec::new());
+    for _ in 0..40 {
         let at = tried.recv().await.expect("dials again");
-        pauses.push(at.duration_since(before).as_millis());
+        let pause = at.duration_since(before).as_millis();
+        pauses.push(pause);
+        if before.duration_since(begun) < Duration::from_secs(10) {
+            early.push(pause);
+        }
         before = at;
     }
+    assert!(early.len() >= 10 && early.iter().all(|ms| *ms <= 1_010), "{early:?}");
     assert!(pauses.iter().all(|ms| (200..=5_010).contains(ms)), "{pauses:?}");
-    assert!(pauses[0] <= 410 && pauses[5..].iter().any(|ms| *ms > 1_000), "{pauses:?}");
+    assert!(pauses[0] <= 410 && pauses[early.len()..].iter().any(|ms| *ms > 2_000), "{pauses:?}");
     assert!(pauses[5..].iter().collect::<BTreeSet<_>>().len() > 10, "they differ");
+    bench.end().await;
+}
+
+/// A way that is there, and gone when the test says so; each dial is told.
+struct Flaky(Pipes, mpsc::Sender<Instant>);
+
+#[async_trait]
+impl Dial for Flaky {
+    async fn dial(&self) -> Result<Channel, dial::Error> {
+        let _ = self.1.try_send(Instant::now());
+        match *self.0.network.borrow() {
+            true => self.0.dial().await,
+            false => Err(dial::Error("refused".into())),
+        }
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_line_that_worked_for_long_and_is_lost_is_dialed_each_second_again() {
+    let (ends, incoming) = mpsc::channel(4);
+    let (seen, lines) = mpsc::channel(4);
+    let server = Server::builder().add_service(StopLinkServiceServer::new(Desk(seen)));
+    tokio::spawn(server.serve_with_incoming(ReceiverStream::new(incoming)));
+    let (network, is_there) = watch::channel(true);
+    let (tries, mut tried) = mpsc::channel(64);
+    let dial = Arc::new(Flaky(Pipes { ends, network: is_there }, tries));
+    let mut bench = Bench::over(dial, lines, Box::new(MemoryStore::new()), Box::new(MemoryStops::default()));
+    let mut line = bench.free().await;
+    let begun = Instant::now();
+    line.until(1, |_| begun.elapsed() > Duration::from_secs(60)).await;
+    while tried.try_recv().is_ok() {}
+    network.send_replace(false);
+    drop(line);
+    let lost = Instant::now();
+    let mut before = lost;
+    while lost.elapsed() < Duration::from_secs(9) {
+        let at = tried.recv().await.expect("dials again");
+        assert!(at.duration_since(before) <= Duration::from_millis(1_010), "{:?}", at.duration_since(before));
+        before = at;
+    }
+    bench.end().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn stops_that_find_no_room_are_brought_by_name_and_their_resets_reach_it() {
+    let boxes = (0..128).map(|i| Bounds { x0_mm: -i * 1_000_000, y0_mm: i32::MAX - i, x1_mm: i, y1_mm: i32::MAX });
+    let region = Some(Region::new(boxes));
+    let mut bench = Bench::new();
+    let mut line = bench.line().await;
+    line.attend().await;
+    let hall = Scope::Area(AreaId::parse("hall").expect("an id"));
+    let large = |n: u8| Stop { scope: hall.clone(), region: region.clone(), ..stop(n, StopLevel::Slow) };
+    let all: Vec<Stop> = (0..200).map(large).collect();
+    for some in all.chunks(10) {
+        line.tell(some, 0).await;
+    }
+    line.tell(&[Stop { level: StopLevel::Halt, ..large(250) }], 0).await;
+    line.synced(1).await;
+    line.until(1, |c| c.inside.len() == 201 && c.durable).await;
+    drop(line);
+    let mut next = bench.line().await;
+    let attend = next.attend().await;
+    let bytes: usize = attend.stops.iter().map(prost::Message::encoded_len).sum();
+    assert!(bytes <= limits::STOP_ATTEND_BYTES && attend.stops.len() > 14, "{bytes}, {}", attend.stops.len());
+    assert_eq!(attend.stops[0].stop_id, stop_id(250).as_str(), "the most restrictive first");
+    let whole: BTreeSet<&String> = attend.stops.iter().map(|stop| &stop.stop_id).collect();
+    let more: BTreeSet<&String> = attend.more_stop_ids.iter().collect();
+    assert!(whole.is_disjoint(&more) && !more.is_empty());
+    assert_eq!(whole.len() + more.len(), 201, "every one of them");
     bench.end().await;
 }
 

@@ -17,7 +17,9 @@ pub enum Format {
 pub fn start(format: Format, default: &str) {
     let filter = EnvFilter::try_from_env("MIDSHIFT_LOG").unwrap_or_else(|_| EnvFilter::new(default));
     let colour = std::env::var_os("NO_COLOR").is_none() && std::io::IsTerminal::is_terminal(&std::io::stderr());
+    // A line that stderr does not take is lost. Said there again it would end the process, and a full disk must end nothing.
     let lines = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_target(false);
+    let lines = lines.log_internal_errors(false);
     // A second start in one process (tests) keeps the first.
     let _ = match format {
         Format::Text => lines.with_ansi(colour).try_init(),

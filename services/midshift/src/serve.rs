@@ -197,12 +197,13 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         listen: args.stop_listen,
         authority_pem: identity.as_ref().map(|identity| identity.proof().borrow().authority_pem.clone()),
     };
+    let mut started = None;
     if has_stop {
         if let Some(identity) = &identity {
             stop_follower::tell_principals(&args.data.join(stop::FOLDER), identity)
                 .context("telling the stop service who is known")?;
         }
-        beside.start().await?;
+        started = beside.start().await?;
     }
     tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), store = storage.engine(), %roles, "midshift serves");
     let planning = Planning::start()?;
@@ -234,7 +235,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
     let server = Server::new(parts, shutdown).await?.hearing(beacons);
     let kept = async {
         match has_stop {
-            true => beside.keep().await,
+            true => beside.keep(started).await,
             false => std::future::pending().await,
         }
     };

@@ -1,24 +1,24 @@
 //! `midshift stop serve`: the stop service in a process of its own; in `dev` a thread of its own; beside `serve` on one box a process that outlives it.
 //!
 //! An operational stop request, not a safety function. Invariant: nothing of the store, the task queue or the business server lies on its way. Nothing here
-//! ends a running stop service: `serve` starts one where none is, and leaves it alone for ever.
+//! ends a running stop service: `serve` starts one where none is, and leaves it alone for ever. The room `started` is that.
+
+mod started;
+
+pub use started::{LOG, Started};
 
 use crate::door::{self, Login, Share};
 use crate::robots::uri;
 use crate::{clock, server, site_file};
 use anyhow::{Context, bail};
 use axum::routing::get;
-use midshift_agent::dial::{Dial, TcpDial};
-use midshift_agent::tls::{self, Tls};
 use midshift_core::site::Site;
 use midshift_core::time::{Clock, LinkDuration};
 use midshift_edge::{Config, Denial, Denials};
 use midshift_identity::ServerProof;
 use midshift_stop::{Parts, Principals, StopService};
 use std::net::SocketAddr;
-use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::TcpListener;
@@ -26,9 +26,6 @@ use tokio::sync::mpsc::Receiver;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
-use tonic_health::pb::HealthCheckRequest;
-use tonic_health::pb::health_check_response::ServingStatus;
-use tonic_health::pb::health_client::HealthClient;
 
 /// Its port, beside the 7420 of the business.
 pub const PORT: u16 = 7421;
@@ -43,9 +40,6 @@ const LOOK_EVERY: Duration = Duration::from_millis(100);
 const KEEPALIVE_EVERY: LinkDuration = LinkDuration::from_secs(10);
 /// How often it is looked whether somebody else is known: with the writer's own second, two after a revocation at the latest.
 const PRINCIPALS_EVERY: Duration = Duration::from_millis(500);
-/// Beside `serve` it is looked after so often, and started again after so many looks in vain: within [`midshift_core::limits::SILENCE_SLOW`].
-const KEPT_EVERY: Duration = Duration::from_secs(2);
-const MISSES: u32 = 2;
 
 /// The stop service on the host of a server: host:port. None: `server` names no host.
 pub fn beside(server: &str) -> Option<String> {
@@ -231,95 +225,5 @@ impl Drop for Beside {
         self.shutdown.cancel();
         // It ends within its own bounds; why it ended was logged.
         let _ = self.thread.take().map(std::thread::JoinHandle::join);
-    }
-}
-
-/// The stop service beside a server on one box.
-pub struct Started {
-    /// The site file.
-    pub site: Option<PathBuf>,
-    /// The data folder.
-    pub data: PathBuf,
-    /// Where it listens.
-    pub listen: SocketAddr,
-    /// The site's root; none: plain text, no login.
-    pub authority_pem: Option<String>,
-}
-
-impl Started {
-    /// Starts it as a process that outlives this one, unless one of this site answers already.
-    ///
-    /// # Errors
-    /// It did not come up: no `serve` without a way to stop robots, unless `--no-stop` says that it is elsewhere.
-    pub async fn start(&self) -> anyhow::Result<()> {
-        let listen = self.listen;
-        if self.answers().await {
-            tracing::info!(address = %listen, "a stop service answers already and is left alone");
-            return Ok(());
-        }
-        let mut child = self.spawn()?;
-        let mut waited = Duration::ZERO;
-        while !self.answers().await {
-            if let Some(status) = child.try_wait()? {
-                bail!(
-                    "the stop service ended at once ({status}); what it said stands above. `midshift stop serve` by itself shows it too; --no-stop if it runs elsewhere"
-                );
-            }
-            if waited >= UP_WITHIN {
-                bail!(
-                    "the stop service at {listen} did not answer within {} s, or one of another site has the port; --no-stop if it runs elsewhere, --stop-listen for another port",
-                    UP_WITHIN.as_secs()
-                );
-            }
-            tokio::time::sleep(LOOK_EVERY).await;
-            waited += LOOK_EVERY;
-        }
-        tracing::info!(address = %listen, process = child.id(), "a stop service was started; it stays when this process ends");
-        Ok(())
-    }
-
-    fn spawn(&self) -> anyhow::Result<Child> {
-        let program = std::env::current_exe().context("finding this program")?;
-        let mut command = Command::new(program);
-        command.args(["stop", "serve", "--listen", &self.listen.to_string(), "--data"]).arg(&self.data);
-        if let Some(site) = &self.site {
-            command.arg("--site").arg(site);
-        }
-        if self.authority_pem.is_none() {
-            command.arg("--insecure");
-        }
-        // A group of its own: neither Ctrl-C at a terminal nor a kill of this group reaches it.
-        command.process_group(0).stdin(Stdio::null()).stdout(Stdio::null());
-        command.spawn().context("starting the stop service")
-    }
-
-    /// Looks after it until the task is ended: one that is gone is started again, before robots among people stand still for want of an answer.
-    pub async fn keep(&self) {
-        let mut misses = 0;
-        loop {
-            tokio::time::sleep(KEPT_EVERY).await;
-            misses = if self.answers().await { 0 } else { misses + 1 };
-            if misses < MISSES {
-                continue;
-            }
-            tracing::error!(address = %self.listen, "the stop service does not answer and is started again");
-            if let Err(error) = self.start().await {
-                tracing::error!(%error, "the stop service was not started");
-            }
-            misses = 0;
-        }
-    }
-
-    /// Whether a stop service of this site serves there.
-    async fn answers(&self) -> bool {
-        let asked = async {
-            let tls = self.authority_pem.as_deref().map(|root| tls::config(root, None)).transpose().ok()?;
-            let scheme = if tls.is_some() { "https" } else { "http" };
-            let dial = TcpDial::new(&format!("{scheme}://{}", self.listen), None).ok()?.with_tls(tls.map(Tls::fixed));
-            let service = "midshift.stop.v1.StopService".to_owned();
-            HealthClient::new(dial.dial().await.ok()?).check(HealthCheckRequest { service }).await.ok()
-        };
-        let answer = tokio::time::timeout(LOOK_EVERY * 10, asked).await;
-        answer.is_ok_and(|answer| answer.is_some_and(|answer| answer.get_ref().status() == ServingStatus::Serving))
     }
 }

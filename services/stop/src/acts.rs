@@ -50,7 +50,7 @@ pub fn engage(inner: &Inner, wanted: Wanted) -> Result<Engaged, Refusal> {
     if let Some(engaged) = before(&law, &wanted)? {
         return Ok(engaged);
     }
-    law.room(&wanted.scope)?;
+    law.room(&wanted.scope, wanted.level)?;
     let (actor, reason) = (wanted.actor, wanted.reason);
     let (scope, level) = (wanted.scope, wanted.level);
     let mut stop =
@@ -92,13 +92,14 @@ pub fn was_reset(stop_id: &StopId) -> Refusal {
     Refusal::new(Kind::Precondition, Reason::from(Code::StopWasReset).with("stop_id", stop_id))
 }
 
-/// Takes stops of the service's own making, which it has lost, from a robot. The others come back: they are only shown.
-pub fn adopt(inner: &Inner, robot_id: &RobotId, stops: Vec<Stop>) -> BTreeSet<StopId> {
+/// Takes stops of the service's own making, which it has lost, from a robot. The others come back, and those of which it brings the name alone: they are only shown.
+pub fn adopt(inner: &Inner, robot_id: &RobotId, stops: Vec<Stop>, more: Vec<StopId>) -> BTreeSet<StopId> {
     let now = inner.clock.now();
-    let mut foreign = BTreeSet::new();
+    let mut foreign: BTreeSet<StopId> = more.into_iter().collect();
     let (mut is_lost, mut adopted) = (Vec::new(), 0);
     {
         let law = lock(&inner.law);
+        foreign.retain(|stop_id| law.latch().stop(stop_id).is_none());
         for stop in stops {
             let latch = law.latch();
             if latch.stop(&stop.stop_id).is_none() && latch.reset_of(&stop.stop_id).is_none() {
@@ -116,7 +117,7 @@ pub fn adopt(inner: &Inner, robot_id: &RobotId, stops: Vec<Stop>) -> BTreeSet<St
         if law.latch().reset_of(&stop.stop_id).is_some() {
             continue;
         }
-        if law.room(&stop.scope).is_err() {
+        if law.room(&stop.scope, stop.level).is_err() {
             foreign.insert(stop.stop_id);
             continue;
         }

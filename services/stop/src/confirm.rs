@@ -79,12 +79,12 @@ impl Watching<'_> {
         for robot in &robots {
             let said = robot.said();
             let heard = said.heard.as_ref();
-            let confirmation = confirmation(&self.stop, since, heard, now.link);
+            let confirmation = confirmation(&self.stop, since, &robot.robot_id, heard, now.link);
             found.insert(robot.robot_id.clone(), (confirmation, heard.map(|h| h.level).unwrap_or_default()));
         }
         if let Scope::Robot(robot_id) = &self.stop.scope {
             // One that nobody knows of: nobody knows either whether it stands.
-            let unknown = (confirmation(&self.stop, since, None, now.link), StopLevel::None);
+            let unknown = (confirmation(&self.stop, since, robot_id, None, now.link), StopLevel::None);
             found.entry(robot_id.clone()).or_insert(unknown);
         }
         for (robot_id, (confirmation, obeys)) in &found {

@@ -9,6 +9,7 @@ use bytes::Bytes;
 use midshift_core::ids::{RequestId, StopId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
+use midshift_core::robot::StopLevel;
 use midshift_core::stop::{Latch, Reset, Scope, Stop};
 use midshift_core::time::Utc;
 use serde::{Deserialize, Serialize};
@@ -107,18 +108,21 @@ impl Law {
         self.requests.get(request_id)
     }
 
-    /// Whether there is room for one more stop.
+    /// Whether there is room for one more stop. For one of the whole fleet there always is, unless the fleet obeys one already that stops it at least as much: whoever
+    /// fills the latch keeps nobody from more.
     ///
     /// # Errors
     /// As many as there may be are engaged.
-    pub fn room(&self, scope: &Scope) -> Result<(), Refusal> {
-        let room = if *scope == Scope::Fleet { limits::STOPS_MAX } else { limits::STOPS_MAX - limits::STOPS_FOR_FLEET };
+    pub fn room(&self, scope: &Scope, level: StopLevel) -> Result<(), Refusal> {
+        let is_fleet = *scope == Scope::Fleet;
+        let room = if is_fleet { limits::STOPS_MAX } else { limits::STOPS_MAX - limits::STOPS_FOR_FLEET };
         let engaged = self.latch.effective().count();
-        if engaged < room {
+        let of_fleet = || self.latch.effective().filter(|stop| stop.scope == Scope::Fleet).map(|stop| stop.level).max();
+        if engaged < room || is_fleet && of_fleet().is_none_or(|most| most < level) {
             return Ok(());
         }
-        let help = if *scope == Scope::Fleet {
-            "reset what is over; the whole fleet is stopped already if one of them is for the fleet"
+        let help = if is_fleet {
+            "the whole fleet is stopped already by one that stops it at least as much; reset what is over"
         } else {
             "the last ones are kept for the whole fleet: engage the fleet, or reset what is over"
         };
@@ -228,7 +232,6 @@ fn draw_id(utc: Utc, drawn: u64) -> StopId {
 mod tests {
     use super::*;
     use midshift_core::ids::RobotId;
-    use midshift_core::robot::StopLevel;
 
     fn stop(id: StopId, scope: Scope) -> Stop {
         let (actor, reason) = (String::new(), String::new());
@@ -265,20 +268,41 @@ mod tests {
     fn the_last_stops_are_kept_for_the_fleet_and_the_refusal_says_so() {
         let mut law = Law::begin(Kept::default(), Utc(0));
         let robot = Scope::Robot(RobotId::parse("r1").unwrap());
+        let halt = StopLevel::Halt;
         for _ in 0..limits::STOPS_MAX - limits::STOPS_FOR_FLEET {
-            law.room(&robot).unwrap();
+            law.room(&robot, halt).unwrap();
             let id = law.draw(Utc(0));
             law.engage(stop(id, robot.clone()), None).unwrap();
         }
-        let refusal = law.room(&robot).unwrap_err();
+        let refusal = law.room(&robot, halt).unwrap_err();
         assert_eq!((refusal.kind(), refusal.reason.code), (Kind::Exhausted, Code::StopsFull));
         assert!(refusal.reason.text().contains("engage the fleet"), "{refusal}");
         for _ in 0..limits::STOPS_FOR_FLEET {
-            law.room(&Scope::Fleet).unwrap();
+            law.room(&Scope::Fleet, halt).unwrap();
             let id = law.draw(Utc(0));
             law.engage(stop(id, Scope::Fleet), None).unwrap();
         }
-        assert!(law.room(&Scope::Fleet).is_err());
+        let refusal = law.room(&Scope::Fleet, halt).unwrap_err();
+        assert!(refusal.reason.text().contains("stopped already"), "{refusal}");
+    }
+
+    #[test]
+    fn whoever_fills_the_latch_with_slow_ones_keeps_nobody_from_halting_the_fleet() {
+        let mut law = Law::begin(Kept::default(), Utc(0));
+        let mut engage = |level, times: usize| {
+            (0..times).find_map(|_| {
+                law.room(&Scope::Fleet, level).err().or_else(|| {
+                    let id = law.draw(Utc(0));
+                    law.engage(Stop { level, ..stop(id, Scope::Fleet) }, None).unwrap();
+                    None
+                })
+            })
+        };
+        assert!(engage(StopLevel::Slow, limits::STOPS_MAX).is_none());
+        assert!(engage(StopLevel::Slow, 1).is_some(), "the fleet is slow already");
+        assert!(engage(StopLevel::Halt, 1).is_none() && engage(StopLevel::Halt, 1).is_some());
+        assert!(engage(StopLevel::ControlledStopPosture, 1).is_none() && engage(StopLevel::Halt, 1).is_some());
+        assert_eq!(law.latch().effective().count(), limits::STOPS_MAX + 2);
     }
 
     #[test]

@@ -46,7 +46,6 @@ use std::net::IpAddr;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
@@ -55,8 +54,6 @@ use tonic::service::Routes;
 const WATCH_MAX: usize = 4;
 /// Names of the files that others look at.
 const LATCH: &str = "latch";
-/// Robots have so long to dial again before their lines end.
-const MOVE_OVER_WITHIN: Duration = Duration::from_millis(500);
 
 /// What keeps the service from beginning, or ends it.
 #[derive(Debug, thiserror::Error)]
@@ -234,7 +231,8 @@ impl StopService {
         self.inner.ended.clone()
     }
 
-    /// Keeps files and roster until shutdown; then tells robots to dial again and ends all streams. Called once.
+    /// Keeps files and roster until shutdown; then tells robots to dial again and ends all streams, without waiting: whoever is to follow can begin only when this
+    /// one has let go of the folder and the port, and robots are without a line for that long. Called once.
     ///
     /// # Errors
     /// A part ended by itself, or it was called before.
@@ -246,12 +244,9 @@ impl StopService {
         let moving = async {
             shutdown.cancelled().await;
             let now = inner.clock.now().link;
-            let lines = inner.robots.lines();
-            lines.iter().for_each(|line| line.move_over(now));
-            if !lines.is_empty() {
-                tokio::time::sleep(MOVE_OVER_WITHIN).await;
-            }
-            inner.robots.lines().iter().for_each(|line| line.end(outbox::End::Done, now));
+            // A line that begins now sees that it is too late, or is among these.
+            let _fan = lock(&inner.fan);
+            inner.robots.lines().iter().for_each(|line| line.finish(now));
         };
         let following = async {
             tokio::select! {

@@ -3,16 +3,17 @@
 //! Invariant: a check-in is heard only from the robot's newest line, and a generation that was not told on this line is none. A line on which nothing
 //! comes up, or nothing is read, is closed: the robot's own silence does the rest.
 
+use crate::audit::{Action, Note};
 use crate::outbox::{Down, End, Outbox};
-use crate::robots::{Robot, Robots};
+use crate::robots::{Comes, Held, Robot, Robots};
 use crate::{Inner, acts, lock};
 use midshift_core::identity::Caller;
-use midshift_core::ids::RobotId;
+use midshift_core::ids::{RobotId, StopId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::stop::Stop;
 use midshift_core::stop::roster::Heard;
-use midshift_core::time::Now;
+use midshift_core::time::{LinkDuration, Now};
 use midshift_proto::convert::stop::{CheckIn, ToStop};
 use midshift_proto::stop::v1;
 use midshift_proto::{Denying, Leaving};
@@ -47,34 +48,57 @@ async fn begin(
     by: &Caller,
     up: &mut Streaming<v1::AttendRequest>,
 ) -> Result<(Arc<Robot>, Arc<Outbox>), Refusal> {
-    if inner.shutdown.is_cancelled() {
-        return Err(Refusal::new(Kind::Unavailable, Code::ShuttingDown));
-    }
-    let (robot_id, boot_id, stops) = first(up).await?;
+    let First { robot_id, boot_id, stops, more } = first(up).await?;
     by.is_robot(&robot_id)?;
     let robot = inner.robots.of(&robot_id)?;
-    let listed = stops.iter().map(|stop| stop.stop_id.clone()).collect();
-    let foreign = acts::adopt(inner, &robot_id, stops);
+    let listed = stops.iter().map(|stop| &stop.stop_id).chain(&more).cloned().collect();
+    let foreign = acts::adopt(inner, &robot_id, stops, more);
     let outbox = Arc::new(Outbox::new(listed));
     let now = inner.clock.now();
-    {
+    let attached = {
         // No change of the latch falls between: the line begins with the whole, and hears of everything after it.
         let _fan = lock(&inner.fan);
-        Robots::attach(&robot, &outbox, &boot_id, foreign, now.link);
-    }
+        if inner.shutdown.is_cancelled() {
+            // Whoever follows is about to be there: nothing to wait for.
+            return Err(Refusal::new(Kind::Unavailable, Code::ShuttingDown).again_after(LinkDuration(0)));
+        }
+        Robots::attach(&robot, &outbox, Comes { boot_id, foreign }, now.link)
+    };
+    attached.map_err(|held| held_by_another(inner, &robot_id, by, held, &now))?;
     metrics::gauge!("midshift_stop_lines").increment(1);
     tracing::info!(%robot_id, "stop line begun");
     inner.touch();
     Ok((robot, outbox))
 }
 
-async fn first(up: &mut Streaming<v1::AttendRequest>) -> Result<(RobotId, String, Vec<Stop>), Refusal> {
+/// Another start of this robot is heard: a second machine, or a first one that lost its power a moment ago.
+fn held_by_another(inner: &Inner, robot_id: &RobotId, by: &Caller, held: Held, now: &Now) -> Refusal {
+    metrics::counter!("midshift_stop_lines_contested_total").increment(1);
+    if held.is_news {
+        tracing::warn!(%robot_id, "another start of this robot was not let in while one is heard");
+        let note = Note { actor: by.to_string(), ..Note::own(now.wall, Action::Denied) };
+        let note = note.with("code", Code::LineHeld).with("asked", "stop.attend").with("robot_id", robot_id);
+        let certificate = by.certificate();
+        inner.disk.denied(certificate.iter().fold(note, |note, serial| note.with("certificate", serial)), 0);
+    }
+    Refusal::new(Kind::Unavailable, Code::LineHeld).again_after(held.for_now)
+}
+
+/// What is said first.
+struct First {
+    robot_id: RobotId,
+    boot_id: String,
+    stops: Vec<Stop>,
+    more: Vec<StopId>,
+}
+
+async fn first(up: &mut Streaming<v1::AttendRequest>) -> Result<First, Refusal> {
     let within = Duration::from_millis(limits::STOP_ATTEND_WITHIN.as_ms());
     let Ok(Ok(Some(message))) = tokio::time::timeout(within, up.message()).await else {
         return Err(Refusal::new(Kind::Deadline, Reason::new(Code::ProtocolError, "nobody said who comes")));
     };
     match midshift_proto::parse(message)? {
-        ToStop::Attend { robot_id, boot_id, stops } => Ok((robot_id, boot_id, stops)),
+        ToStop::Attend { robot_id, boot_id, stops, more } => Ok(First { robot_id, boot_id, stops, more }),
         ToStop::CheckIn(_) => Err(Refusal::field("message", "the first message must be attend")),
     }
 }

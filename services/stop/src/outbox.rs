@@ -121,6 +121,15 @@ impl Outbox {
         self.put(now, |waiting| waiting.moves_over = true);
     }
 
+    /// The robot is to dial again, and this line ends when it has read what waits for it.
+    pub fn finish(&self, now: LinkTime) {
+        self.put(now, |waiting| {
+            waiting.moves_over = true;
+            waiting.end.get_or_insert(End::Done);
+        });
+        self.gone.cancel();
+    }
+
     /// Ends the line.
     pub fn end(&self, end: End, now: LinkTime) {
         self.put(now, |waiting| {

@@ -8,7 +8,7 @@ use midshift_core::ids::{RobotId, StopId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::stop::roster::Heard;
-use midshift_core::time::LinkTime;
+use midshift_core::time::{LinkDuration, LinkTime};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard};
 
@@ -32,6 +32,37 @@ pub struct Said {
     pub is_listed: bool,
     /// Its line.
     pub line: Option<Arc<Outbox>>,
+    /// When its line was begun.
+    pub begun: LinkTime,
+    /// When it was noted last that another machine was not let in.
+    pub held: Option<LinkTime>,
+}
+
+/// Who comes.
+pub struct Comes {
+    /// The start of its agent.
+    pub boot_id: String,
+    /// Stops that it keeps and that are not the service's.
+    pub foreign: BTreeSet<StopId>,
+}
+
+/// Somebody who is not let in, because another start of the robot is heard.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Held {
+    /// So long at least nobody else is let in.
+    pub for_now: LinkDuration,
+    /// It is to be noted: it was not for a while.
+    pub is_news: bool,
+}
+
+impl Said {
+    /// How long its line still counts as heard. None: there is none, or it says nothing.
+    fn holds_for(&self, now: LinkTime) -> Option<LinkDuration> {
+        self.line.as_ref()?;
+        let heard = self.heard.as_ref().map_or(self.begun, |heard| heard.at.max(self.begun));
+        let silent = now.since(heard);
+        (silent < limits::CHECK_IN_MISSED).then(|| LinkDuration(limits::CHECK_IN_MISSED.as_ms() - silent.as_ms()))
+    }
 }
 
 impl Robot {
@@ -113,25 +144,33 @@ impl Robots {
         self.read().values().filter_map(|robot| robot.said().line.clone()).collect()
     }
 
-    /// A line begins; an older one of the same robot ends.
-    pub fn attach(robot: &Robot, line: &Arc<Outbox>, boot_id: &str, foreign: BTreeSet<StopId>, now: LinkTime) {
+    /// A line begins; an older one of the same robot ends. A start of it that is heard keeps its line: whoever has a copy of its key takes nothing over, and says
+    /// nothing in its place.
+    ///
+    /// # Errors
+    /// Another start of this robot is heard.
+    pub fn attach(robot: &Robot, line: &Arc<Outbox>, comes: Comes, now: LinkTime) -> Result<(), Held> {
+        let Comes { boot_id, foreign } = comes;
         let mut said = robot.said();
         if said.boot_id != boot_id {
-            let was_heard = said.heard.as_ref().is_some_and(|heard| now.since(heard.at) < limits::CHECK_IN_MISSED);
-            if said.line.is_some() && was_heard {
-                metrics::counter!("midshift_stop_lines_contested_total").increment(1);
-                tracing::warn!(robot_id = %robot.robot_id, "another start of this robot took over its line while it was heard");
+            if let Some(for_now) = said.holds_for(now) {
+                let is_news = said.held.is_none_or(|at| now.since(at) >= limits::LINE_HELD_NOTED_EVERY);
+                if is_news {
+                    said.held = Some(now);
+                }
+                return Err(Held { for_now, is_news });
             }
             // What another start confirmed confirms nothing of this one.
             if let Some(heard) = &mut said.heard {
                 heard.generation = 0;
             }
-            boot_id.clone_into(&mut said.boot_id);
+            said.boot_id = boot_id;
         }
-        said.foreign = foreign;
+        (said.foreign, said.begun) = (foreign, now);
         if let Some(older) = said.line.replace(line.clone()) {
             older.end(End::Refused(Refusal::new(Kind::Conflict, Code::LineReplaced)), now);
         }
+        Ok(())
     }
 
     /// A line is over.

@@ -4,10 +4,10 @@
 
 use crate::confirm::count;
 use crate::{Inner, Times, lock};
-use midshift_core::ids::StopId;
+use midshift_core::ids::{RobotId, StopId};
 use midshift_core::limits;
-use midshift_core::stop::Stop;
-use midshift_core::stop::roster::{Heard, confirmation};
+use midshift_core::stop::roster::{Heard, confirmation, means_everywhere};
+use midshift_core::stop::{Scope, Stop};
 use midshift_core::time::Now;
 use midshift_proto::convert::WireEnum;
 use midshift_proto::convert::stop::names;
@@ -26,6 +26,9 @@ const HEARD_EVERY: Duration = Duration::from_secs(5);
 struct Tally<'a> {
     stops: &'a [(Stop, u64)],
     index: BTreeMap<&'a StopId, usize>,
+    /// Stops of the whole fleet, and of single robots.
+    of_fleet: Vec<usize>,
+    of_robots: BTreeMap<&'a RobotId, Vec<usize>>,
     newest: u64,
     counts: Vec<v1::Counts>,
     /// Robots that are not heard: for no stop they are anything else.
@@ -36,12 +39,19 @@ struct Tally<'a> {
 impl<'a> Tally<'a> {
     fn new(stops: &'a [(Stop, u64)]) -> Self {
         let index = stops.iter().enumerate().map(|(i, (stop, _))| (&stop.stop_id, i)).collect();
+        let of_fleet = (0..stops.len()).filter(|i| stops[*i].0.scope == Scope::Fleet).collect();
+        let mut of_robots: BTreeMap<&RobotId, Vec<usize>> = BTreeMap::new();
+        for (i, (stop, _)) in stops.iter().enumerate() {
+            if let Scope::Robot(robot_id) = &stop.scope {
+                of_robots.entry(robot_id).or_default().push(i);
+            }
+        }
         let newest = stops.iter().map(|(_, since)| *since).max().unwrap_or_default();
         let counts = vec![v1::Counts::default(); stops.len()];
-        Self { stops, index, newest, counts, unreachable: 0, heard: 0 }
+        Self { stops, index, of_fleet, of_robots, newest, counts, unreachable: 0, heard: 0 }
     }
-    fn add(&mut self, robot: Option<&Heard>, now: &Now) {
-        let Some(heard) = robot.filter(|heard| now.link.since(heard.at) < limits::CHECK_IN_MISSED) else {
+    fn add(&mut self, robot_id: &RobotId, robot: Option<&Heard>, now: &Now) {
+        let Some(heard) = robot.filter(|heard| is_heard(heard, now)) else {
             self.unreachable += 1;
             return;
         };
@@ -50,11 +60,23 @@ impl<'a> Tally<'a> {
             let told = self.stops.iter().zip(&mut self.counts).filter(|((_, since), _)| heard.generation < *since);
             told.for_each(|(_, counts)| counts.requested += 1);
         }
+        let own: &[usize] = self.of_robots.get(robot_id).map_or(&[], Vec::as_slice);
+        let mut meant = self.of_fleet.len() + own.len();
         for stop_id in &heard.inside {
             let Some((at, (stop, since))) = self.index.get(stop_id).map(|at| (*at, &self.stops[*at])) else { continue };
+            meant -= usize::from(means_everywhere(stop, robot_id));
             if heard.generation >= *since {
-                count(&mut self.counts[at], confirmation(stop, *since, Some(heard), now.link));
+                count(&mut self.counts[at], confirmation(stop, *since, robot_id, Some(heard), now.link));
             }
+        }
+        if meant == 0 {
+            return;
+        }
+        // Rare: it counts itself out of what is meant for it wherever it is.
+        for at in self.of_fleet.iter().chain(own) {
+            let (stop, since) = &self.stops[*at];
+            self.counts[*at].requested +=
+                u32::from(heard.generation >= *since && !heard.inside.contains(&stop.stop_id));
         }
     }
     fn finish(mut self) -> Vec<v1::Counts> {
@@ -65,6 +87,11 @@ impl<'a> Tally<'a> {
         }
         self.counts
     }
+}
+
+/// Whether what a robot says of itself is how it is now.
+fn is_heard(heard: &Heard, now: &Now) -> bool {
+    now.link.since(heard.at) < limits::CHECK_IN_MISSED
 }
 
 /// The whole at one moment.
@@ -81,7 +108,7 @@ pub fn status(inner: &Inner) -> v1::Status {
     for robot in inner.robots.all() {
         let said = robot.said();
         let heard = said.heard.as_ref();
-        tally.add(heard, &now);
+        tally.add(&robot.robot_id, heard, &now);
         robots.push(v1::RobotStatus {
             robot_id: robot.robot_id.to_string(),
             obeys: heard.map(|h| h.level).unwrap_or_default().to_wire(),
@@ -90,6 +117,7 @@ pub fn status(inner: &Inner) -> v1::Status {
             awaiting_resume: heard.map(|h| names(&h.awaiting)).unwrap_or_default(),
             foreign_stops: names(said.foreign.difference(&resets)),
             durable: heard.is_some_and(|h| h.is_durable),
+            heard: heard.is_some_and(|h| is_heard(h, &now)),
         });
     }
     let counts = tally.finish();
@@ -133,8 +161,8 @@ pub async fn tell(inner: &Inner, sender: mpsc::Sender<Result<v1::WatchStatusResp
 #[cfg(test)]
 mod tests {
     use super::*;
+    use midshift_core::ids::AreaId;
     use midshift_core::robot::StopLevel;
-    use midshift_core::stop::Scope;
     use midshift_core::stop::ladder::{Around, Stage};
     use midshift_core::time::{LinkTime, Utc};
 
@@ -142,9 +170,14 @@ mod tests {
         StopId::parse(&format!("STOP-{n}")).unwrap()
     }
 
+    /// Of the fleet, of an area, and of one robot.
     fn stop(n: u64, level: StopLevel) -> (Stop, u64) {
         let (actor, reason) = (String::new(), String::new());
-        let scope = Scope::Fleet;
+        let scope = match n % 4 {
+            0 => Scope::Area(AreaId::parse("hall").unwrap()),
+            1 => Scope::Robot(RobotId::parse("r1").unwrap()),
+            _ => Scope::Fleet,
+        };
         (Stop { stop_id: id(n), scope, level, engaged: Utc(0), actor, reason, region: None, proof: vec![] }, n)
     }
 
@@ -176,12 +209,13 @@ mod tests {
             }
         }
         let mut tally = Tally::new(&stops);
-        robots.iter().for_each(|robot| tally.add(robot.as_ref(), &now));
+        let named: Vec<RobotId> = (0..robots.len()).map(|n| RobotId::parse(&format!("r{}", n % 3)).unwrap()).collect();
+        named.iter().zip(&robots).for_each(|(robot_id, robot)| tally.add(robot_id, robot.as_ref(), &now));
         let counts = tally.finish();
         for ((stop, since), found) in stops.iter().zip(counts) {
             let mut one_by_one = v1::Counts::default();
-            for robot in &robots {
-                count(&mut one_by_one, confirmation(stop, *since, robot.as_ref(), now.link));
+            for (robot_id, robot) in named.iter().zip(&robots) {
+                count(&mut one_by_one, confirmation(stop, *since, robot_id, robot.as_ref(), now.link));
             }
             assert_eq!(found, one_by_one, "{}", stop.stop_id);
         }

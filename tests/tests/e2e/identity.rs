@@ -62,7 +62,8 @@ async fn a_copied_key_is_observed_with_an_incident_while_the_original_works_and_
     let site: Site = text::parse(DEMO)?;
     let server = Server::start(dir.path()).await?;
     let address = server.address;
-    let robots = Robots::start(dir.path(), address, address, &site, ROBOTS).await?;
+    let stops = StopServer::start(dir.path(), address).await?;
+    let robots = Robots::start_beside(dir.path(), address, address, Some(stops.address), &site, ROBOTS).await?;
     submit(address, &site, 7, TASKS).await?;
     at_work(address, 4, &BTreeSet::new()).await?;
 
@@ -93,8 +94,12 @@ async fn a_copied_key_is_observed_with_an_incident_while_the_original_works_and_
     judge(&ended, &BTreeSet::new(), &site, &robots)?;
     ensure!(!copy.has_ended()?, "the second machine stays where it can be seen");
     let mut written: Vec<_> = journal::read(&journal)?.into_iter().skip(before).collect();
-    written.retain(|entry| !matches!(entry.effect, Effect::Ran { .. }));
+    written.retain(|entry| !matches!(entry.effect, Effect::Ran { .. } | Effect::Obeys { .. } | Effect::Stood { .. }));
     ensure!(written.is_empty(), "the second machine did something: {written:?}");
+    // Nor has it the line to the stop service, and that was written down.
+    let audit = std::fs::read_to_string(dir.path().join("data/stop/audit.jsonl"))?;
+    let held = audit.lines().filter(|line| line.contains(Code::LineHeld.as_str())).collect::<Vec<_>>();
+    ensure!(held.len() == 1 && held[0].contains("rbt-01"), "{audit}");
     ensure!(incidents(&server)?.len() == 1, "told once: {:?}", incidents(&server)?);
 
     // Whoever it was: the key is worth nothing any more, on connections that stand and on new ones.

@@ -39,6 +39,7 @@ mod rolling;
 mod room;
 mod split;
 mod stack;
+mod stop_alone;
 mod stopped;
 mod stopped_release;
 mod story;

@@ -43,6 +43,7 @@ const NEW_WORDS: &[(&str, &str)] = &[
     ("STOP_WAS_RESET", "the same"),
     ("STOP_NOT_FOUND", "an answer of task, which writes no row"),
     ("LINE_REPLACED", "the same"),
+    ("LINE_HELD", "the same"),
     ("TOO_MANY_REQUESTS", "an answer of a port, which writes no row"),
     ("SIGN_IN_NEEDED", "an answer of a port or of identity, which writes no row"),
     ("TOKEN_UNKNOWN", "the same"),

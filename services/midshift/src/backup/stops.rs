@@ -1,12 +1,12 @@
 //! The files of the stop service beside the server: which stops are engaged, its key, its audit, and who is known to it.
 //!
-//! What a restore brings back stops at least what stood at the backup. A reset that came later is not in it: that stop is engaged again, and is reset by name
-//! once more. A stop that came later is brought back by robots, who keep it themselves, and taken from them because the key is the same.
+//! What a restore brings back is what was engaged at the backup. A reset that came later is not in it: that stop is engaged again for the service and for robots that
+//! have not heard of the reset; those that have do not obey it, and say so. It is reset by name once more. A stop that came later is brought back by robots, who keep it themselves, and taken from them because the key is the same.
 
 use super::files::{copy, copy_if_there, entries};
 use super::parts::{Making, Part, Said};
 use super::{Places, blocking};
-use crate::stop::FOLDER;
+use crate::stop::{FOLDER, LOG};
 use anyhow::{Context, ensure};
 use async_trait::async_trait;
 use std::fs;
@@ -45,7 +45,7 @@ impl Part for Stops {
             latch(&from, &folder)?;
             for path in entries(&from)? {
                 let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-                if name != LATCH && !name.ends_with(".part") {
+                if ![LATCH, LOG].contains(&name.as_str()) && !name.ends_with(".part") {
                     copy_if_there(&path, &folder.join(name))?;
                 }
             }

@@ -253,6 +253,7 @@ async fn a_backup_has_the_files_of_a_stop_service_that_runs_and_none_of_one_that
     let folder = used.places().data.join("stop");
     let parts = midshift_stop::Parts { folder: folder.clone(), site: None, clock: clock::clock(1000) };
     let _service = midshift_stop::StopService::open(parts, Default::default()).expect("opened");
+    fs::write(folder.join(crate::stop::LOG), b"what it said").expect("written");
     fs::write(folder.join("roster.snapshot.part"), b"half").expect("written");
     let backup = used.backed_up().await;
     let summary = verify(&backup).await.expect("it is good");
@@ -260,6 +261,7 @@ async fn a_backup_has_the_files_of_a_stop_service_that_runs_and_none_of_one_that
     let to = Places { data: used.dir.path().join("restored"), ota_keys: None, store: None };
     restore(&backup, &to, NOW).await.expect("restored");
     let restored = to.data.join("stop");
+    assert!(!restored.join(crate::stop::LOG).exists(), "a log is nothing to bring back");
     assert_eq!(fs::metadata(&restored).expect("a folder").permissions().mode() & 0o777, 0o700);
     for name in ["latch", "key.pem"] {
         assert_eq!(fs::read(restored.join(name)).expect("it is there"), fs::read(folder.join(name)).expect("as here"));

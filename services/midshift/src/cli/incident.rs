@@ -1,7 +1,7 @@
 //! `midshift incident …`: what a person should look into.
 
 use super::client::{Call, Change, Exit, unary};
-use super::out::Out;
+use super::out::{Out, plain};
 use clap::Subcommand;
 use midshift_proto::convert::time_of;
 use midshift_proto::fleet::v1;
@@ -89,10 +89,10 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
 
 fn show(incident: &v1::Incident, out: &Out) -> Result<(), Exit> {
     let text = || {
-        let reason = incident.reason.as_ref().map(|r| format!("{}  {}", r.code, r.message)).unwrap_or_default();
+        let reason = incident.reason.as_ref().map(|r| format!("{}  {}", r.code, plain(&r.message))).unwrap_or_default();
         let facts = incident.reason.iter().flat_map(|r| &r.metadata).collect::<std::collections::BTreeMap<_, _>>();
-        let facts: String = facts.into_iter().map(|(key, value)| format!("\n  {key}: {value}")).collect();
-        let closed = incident.closed.as_ref().map(|c| format!("\nclosed by {}: {}", c.actor, c.reason));
+        let facts: String = facts.into_iter().map(|(key, value)| format!("\n  {key}: {}", plain(value))).collect();
+        let closed = incident.closed.as_ref().map(|c| format!("\nclosed by {}: {}", plain(&c.actor), plain(&c.reason)));
         format!("{}\n{reason}{facts}{}", row(incident).join("  "), closed.unwrap_or_default())
     };
     out.one(incident, &incident.incident_id, text)?;

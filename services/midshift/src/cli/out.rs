@@ -2,6 +2,7 @@
 
 use clap::ValueEnum;
 use prost::{Message, Name};
+use std::borrow::Cow;
 use std::io::Write;
 
 /// How results are printed.
@@ -28,14 +29,15 @@ impl Out {
     pub fn new(format: Format) -> Self {
         Self { format }
     }
-    /// A line of data.
+    /// A line of data; for people without anything that their terminal would obey.
     pub fn line(&self, text: &str) {
+        let text = if self.format == Format::Table { lines(text) } else { text.into() };
         // A reader that went away is no error of ours.
         let _ = writeln!(std::io::stdout().lock(), "{text}");
     }
     /// A word to the person.
     pub fn say(&self, text: &str) {
-        let _ = writeln!(std::io::stderr().lock(), "{text}");
+        let _ = writeln!(std::io::stderr().lock(), "{}", lines(text));
     }
     /// What to do next, for a person only.
     pub fn next(&self, text: &str) {
@@ -90,10 +92,35 @@ impl Out {
     }
 }
 
+/// What somebody typed, as it may stand in a line: a sign for each character that a terminal would obey, and for each that would begin a line or turn one around. Every
+/// free text that is shown outside of [`columns`] goes through this.
+pub fn plain(text: &str) -> Cow<'_, str> {
+    shown(text, |_| false)
+}
+
+/// The same of whole lines.
+fn lines(text: &str) -> Cow<'_, str> {
+    shown(text, |c| c == '\n')
+}
+
+fn shown(text: &str, is_fine: impl Fn(char) -> bool) -> Cow<'_, str> {
+    let is_bad = |c: char| is_obeyed(c) && !is_fine(c);
+    match text.contains(is_bad) {
+        true => text.replace(is_bad, "\u{fffd}").into(),
+        false => text.into(),
+    }
+}
+
+/// Control characters, line and paragraph separators, and what turns the direction of writing.
+fn is_obeyed(c: char) -> bool {
+    c.is_control() || matches!(c, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}' | '\u{200e}' | '\u{200f}')
+}
+
 /// Columns as wide as their widest cell.
 pub fn columns(header: &[&str], rows: &[Vec<String>]) -> String {
+    let rows: Vec<Vec<Cow<'_, str>>> = rows.iter().map(|row| row.iter().map(|cell| plain(cell)).collect()).collect();
     let mut widths: Vec<usize> = header.iter().map(|h| h.len()).collect();
-    for row in rows {
+    for row in &rows {
         for (width, cell) in widths.iter_mut().zip(row) {
             *width = (*width).max(cell.chars().count());
         }
@@ -105,7 +132,7 @@ pub fn columns(header: &[&str], rows: &[Vec<String>]) -> String {
     let mut text = line(header.to_vec());
     for row in rows {
         text.push('\n');
-        text += &line(row.iter().map(String::as_str).collect());
+        text += &line(row.iter().map(AsRef::as_ref).collect());
     }
     text
 }
@@ -118,5 +145,16 @@ mod tests {
     fn columns_line_up_and_end_without_spaces() {
         let text = columns(&["ID", "STATE"], &[vec!["a".into(), "QUEUED".into()], vec!["long".into(), String::new()]]);
         assert_eq!(text, "ID    STATE\na     QUEUED\nlong");
+    }
+
+    #[test]
+    fn what_somebody_typed_neither_begins_a_line_nor_moves_the_cursor() {
+        let typed = "x\nnothing is engaged\x1b[2J\r\u{9b}1A\u{202e}y";
+        let sign = '\u{fffd}';
+        let told = format!("x{sign}nothing is engaged{sign}[2J{sign}{sign}1A{sign}y");
+        assert_eq!(plain(typed), told);
+        assert_eq!(columns(&["REASON"], &[vec![typed.into()]]), format!("REASON\n{told}"));
+        assert_eq!(lines(typed), told.replacen(sign, "\n", 1), "a line of ours may be several");
+        assert_eq!(plain("größer, 走る"), "größer, 走る");
     }
 }

@@ -2,7 +2,7 @@
 
 use super::client::{Call, Change, Exit, ended, unary};
 use super::enrol;
-use super::out::{Format, Out};
+use super::out::{Format, Out, plain};
 use super::rollout;
 use clap::Subcommand;
 use midshift_core::time::Utc;
@@ -268,7 +268,7 @@ fn software(software: &ota::RobotSoftware, out: &Out) -> Result<(), Exit> {
             text += &format!(", tries {}", short(&software.on_trial));
         }
         match &software.pin {
-            Some(pin) => text + &format!("  pinned by {} ({})", pin.actor, pin.reason),
+            Some(pin) => text + &format!("  pinned by {} ({})", plain(&pin.actor), plain(&pin.reason)),
             None => text + "  not pinned",
         }
     })?;
@@ -281,7 +281,7 @@ fn control(control: &fleet::RobotControl, out: &Out) -> anyhow::Result<()> {
 
 fn control_line(control: &fleet::RobotControl) -> String {
     let duty = control.duty().as_str_name().trim_start_matches("DUTY_");
-    let why = control.cordon.as_ref().map(|c| format!(" ({})", c.reason)).unwrap_or_default();
+    let why = control.cordon.as_ref().map(|c| format!(" ({})", plain(&c.reason))).unwrap_or_default();
     let holder = if control.holder.is_empty() { "no work" } else { &control.holder };
     let holds = if control.hold_tokens.is_empty() {
         String::new()
@@ -431,7 +431,7 @@ async fn explain(one: &One, out: &Out) -> Result<(), Exit> {
     out.one(&answer, &one.robot_id, || {
         let mut text = control_line(&e.control.clone().unwrap_or_default());
         match &e.verdict {
-            Some(reason) => text += &format!("\n  {}: {}\n", reason.code, reason.message),
+            Some(reason) => text += &format!("\n  {}: {}\n", reason.code, plain(&reason.message)),
             None => text += "\n  nothing keeps it from work\n",
         }
         let rows: Vec<Vec<String>> = e

@@ -1,9 +1,9 @@
 //! `midshift stop …`: stops the fleet or a part of it, shows what each robot confirms, resets. Never asks back.
 //!
-//! An operational stop request: not a safety function, no performance level. Nothing is shown as standing that a robot has not said itself.
+//! An operational stop request; not a safety function, no performance level. Nothing is shown as standing that a robot has not said itself.
 
 use super::client::{Exit, Login, Resolved, unary};
-use super::out::{Format, Out};
+use super::out::{Format, Out, plain};
 use crate::stop::{FOLDER, StopServe};
 use crate::way::Line;
 use clap::{Args, Subcommand, ValueEnum};
@@ -47,16 +47,19 @@ impl StopCall {
     async fn client(&self) -> Result<StopServiceClient<Line>, Exit> {
         let resolved = self.login.resolve(self.server.as_deref())?;
         let address = address(self.stop_server.as_deref(), &resolved)?;
-        let line = resolved.way(&address)?.connect().await.map_err(|_| {
-            Exit::new(
-                5,
-                format!(
-                    "no stop service at {address}: nothing was stopped or reset. Use the robots' own emergency stops if you must\n  try: name it with --stop-server, or start one with `midshift stop serve`"
-                ),
-            )
-        })?;
+        let line = resolved.way(&address)?.connect().await.map_err(|error| nobody(&address, &*error.0))?;
         Ok(StopServiceClient::new(line).max_decoding_message_size(ANSWER_BYTES_MAX))
     }
+}
+
+/// There is no way to it, and why: nothing listens, a certificate that is not of the site, plain text where TLS is spoken.
+fn nobody(address: &str, error: &dyn std::error::Error) -> Exit {
+    let causes = std::iter::successors(error.source(), |cause| cause.source());
+    let why = causes.last().map_or_else(|| error.to_string(), ToString::to_string);
+    let text = format!(
+        "no stop service at {address} ({why}): nothing was stopped or reset. Use the robots' own emergency stops if you must\n  try: name it with --stop-server, or start one with `midshift stop serve`"
+    );
+    Exit::new(5, text)
 }
 
 /// What robots do.
@@ -116,9 +119,9 @@ pub struct Engage {
     no_wait: bool,
 }
 
-/// Stops robots, at once and without asking back: an operational stop request.
+/// Stops robots, at once and without asking back: an operational stop request; not a safety function, no performance level; the independent emergency stop is the robot
+/// maker's and the integrator's hardware.
 ///
-/// Not a safety function and no performance level: the independent emergency stop is the hardware of the robot's maker and integrator.
 /// A stop stays until it is reset by its name; a reset makes nothing move. Exit code 13: not every robot has confirmed.
 #[derive(Args)]
 #[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
@@ -370,7 +373,12 @@ fn show(answer: &v1::GetStatusResponse, out: &Out) -> Result<(), Exit> {
     Ok(())
 }
 
+/// What this is, in one line.
+const WHAT_IT_IS: &str =
+    "operational stop requests, not a safety function: the independent emergency stop is the robots' own hardware";
+
 fn table(status: &v1::Status, out: &Out) {
+    out.say(WHAT_IT_IS);
     if !status.durable {
         out.say("warning: the stop service's disk refuses what is engaged; robots keep it");
     }
@@ -396,18 +404,25 @@ fn table(status: &v1::Status, out: &Out) {
     if status.robots.is_empty() {
         return out.say("the stop service knows of no robot");
     }
-    let row = |robot: &v1::RobotStatus| {
-        vec![
-            robot.robot_id.clone(),
-            obeys(robot.obeys),
-            if robot.standstill { "yes" } else { "no" }.to_owned(),
-            at(robot.heard_unix_ms),
-            robot.awaiting_resume.join(", "),
-            robot.foreign_stops.join(", "),
-        ]
-    };
     let header = ["ROBOT", "OBEYS", "STANDS", "HEARD", "AWAITS RESUME", "FOREIGN STOPS"];
-    out.line(&super::out::columns(&header, &status.robots.iter().map(row).collect::<Vec<_>>()));
+    out.line(&super::out::columns(&header, &status.robots.iter().map(of_robot).collect::<Vec<_>>()));
+}
+
+/// Nobody knows what a robot does that is not heard now, whatever it said last.
+fn of_robot(robot: &v1::RobotStatus) -> Vec<String> {
+    let (obeyed, stands) = match (robot.heard, robot.standstill) {
+        (false, _) => ("?".to_owned(), "?"),
+        (true, true) => (obeys(robot.obeys), "yes"),
+        (true, false) => (obeys(robot.obeys), "no"),
+    };
+    vec![
+        robot.robot_id.clone(),
+        obeyed,
+        stands.to_owned(),
+        at(robot.heard_unix_ms),
+        robot.awaiting_resume.join(", "),
+        robot.foreign_stops.join(", "),
+    ]
 }
 
 async fn watch(call: &StopCall, out: &Out) -> Result<(), Exit> {
@@ -424,7 +439,13 @@ async fn reset(call: &StopCall, request: v1::ResetRequest, out: &Out) -> Result<
     out.one(&answer, &reset.stop_id, || {
         let was =
             if answer.was_engaged { "was engaged and is reset" } else { "was not engaged here; its name is reset" };
-        format!("{} {was} since {} by {}: {}", reset.stop_id, at(reset.at_unix_ms), reset.actor, reset.reason)
+        format!(
+            "{} {was} since {} by {}: {}",
+            reset.stop_id,
+            at(reset.at_unix_ms),
+            plain(&reset.actor),
+            plain(&reset.reason)
+        )
     })?;
     if !answer.durable {
         out.say("warning: the stop service's disk refused the reset; robots were told, and it is written as soon as it can be");
@@ -473,6 +494,29 @@ mod tests {
         for wrong in ["", "--reason drill", "--all --robot r1", "--all status"] {
             assert!(parse(wrong).is_err(), "{wrong}");
         }
+    }
+
+    #[test]
+    fn nobody_knows_what_a_robot_does_that_is_not_heard_now() {
+        let robot = |heard, heard_unix_ms, standstill| {
+            let obeys = if standstill { StopLevel::Halt } else { StopLevel::Unspecified }.into();
+            v1::RobotStatus { heard, heard_unix_ms, standstill, obeys, ..v1::RobotStatus::default() }
+        };
+        let shown = |robot: &v1::RobotStatus| of_robot(robot)[1..4].join(" ");
+        assert_eq!(shown(&robot(false, 0, false)), "? ? never");
+        assert_eq!(shown(&robot(false, 1_000, true)), "? ? 1970-01-01T00:00:01.000Z", "silent for an hour");
+        assert_eq!(shown(&robot(true, 1_000, true)), "HALT yes 1970-01-01T00:00:01.000Z");
+        assert_eq!(shown(&robot(true, 1_000, false)), "- no 1970-01-01T00:00:01.000Z");
+    }
+
+    #[test]
+    fn why_there_is_no_way_to_a_stop_service_is_told() {
+        let cause = std::io::Error::other("invalid peer certificate: UnknownIssuer");
+        let error = anyhow::Error::from(cause).context("transport error").into_boxed_dyn_error();
+        let said = nobody("host:7421", &*error).to_string();
+        assert!(said.contains("at host:7421 (invalid peer certificate: UnknownIssuer): nothing"), "{said}");
+        let said = nobody("host:7421", &std::io::Error::other("refused")).to_string();
+        assert!(said.contains("(refused)"), "{said}");
     }
 
     #[test]

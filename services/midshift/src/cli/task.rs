@@ -1,7 +1,7 @@
 //! `midshift task …`
 
 use super::client::{Call, Change, Exit, unary};
-use super::out::{Format, Out};
+use super::out::{Format, Out, plain};
 use crate::background::{read_list, request};
 use crate::site_file;
 use clap::{Subcommand, ValueEnum};
@@ -343,7 +343,7 @@ fn priority(task: &v1::Task) -> String {
 
 fn show(task: &v1::Task, out: &Out) -> anyhow::Result<()> {
     out.one(task, &task.task_id, || {
-        let why = task.reason.as_ref().map(|r| format!("\n  {}: {}", r.code, r.message)).unwrap_or_default();
+        let why = task.reason.as_ref().map(|r| format!("\n  {}: {}", r.code, plain(&r.message))).unwrap_or_default();
         format!("{}  {}  {}  {}{why}", task.task_id, state(task), task.robot_id, way(task))
     })
 }
@@ -475,7 +475,7 @@ async fn get(one: &One, out: &Out) -> Result<(), Exit> {
     out.one(&answer, &task.task_id, || {
         let mut text = format!("{}  {}  priority {}  {}\n", task.task_id, state(&task), priority(&task), way(&task));
         if let Some(reason) = &task.reason {
-            text += &format!("  {}: {}\n", reason.code, reason.message);
+            text += &format!("  {}: {}\n", reason.code, plain(&reason.message));
         }
         let done = task
             .allowed_resolutions()
@@ -486,7 +486,8 @@ async fn get(one: &One, out: &Out) -> Result<(), Exit> {
         }
         for attempt in &answer.attempts {
             let name = attempt.state().as_str_name().trim_start_matches("ATTEMPT_STATE_");
-            let fault = attempt.fault.as_ref().map(|f| format!("  fault {} {}", f.code, f.message)).unwrap_or_default();
+            let fault =
+                attempt.fault.as_ref().map(|f| format!("  fault {} {}", f.code, plain(&f.message))).unwrap_or_default();
             let refusal = attempt.refusal.as_ref().map(|r| format!("  {}", r.code)).unwrap_or_default();
             text += &format!(
                 "  attempt {}  {}  {name}  step {}{fault}{refusal}\n",
@@ -513,7 +514,7 @@ async fn explain(one: &One, out: &Out) -> Result<(), Exit> {
             text += &format!("  number {position} in the queue");
         }
         match &e.verdict {
-            Some(reason) => text += &format!("\n  {}: {}\n", reason.code, reason.message),
+            Some(reason) => text += &format!("\n  {}: {}\n", reason.code, plain(&reason.message)),
             None => text += "\n  nothing holds it\n",
         }
         let rows: Vec<Vec<String>> = e

@@ -106,7 +106,7 @@ async fn a_stop_line_on_an_old_connection_is_asked_to_move_over() {
     let service = midshift_stop::StopService::open(parts, stop.clone()).expect("it opens");
     let address = port(service.routes().await.expect("its faces"), stop.clone()).await;
     let robot_id = RobotId::parse("r1").expect("an id");
-    let attend = ToStop::Attend { robot_id, boot_id: "boot".to_owned(), stops: Vec::new() };
+    let attend = ToStop::Attend { robot_id, boot_id: "boot".to_owned(), stops: Vec::new(), more: Vec::new() };
     let (up, said) = mpsc::channel(4);
     up.send((&attend).into()).await.expect("there is room");
     let mut client = StopLinkServiceClient::new(dial(address).await);

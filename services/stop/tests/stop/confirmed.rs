@@ -1,8 +1,10 @@
 //! What people are shown of robots is what robots have said themselves.
 
 use crate::harness::{Folder, Robot, Server, eventually, fleet, id_of, scope, within};
-use midshift_core::ids::RobotId;
+use midshift_core::ids::{RobotId, StopId};
 use midshift_core::robot::StopLevel;
+use midshift_core::stop::Reset;
+use midshift_core::time::Utc;
 use midshift_proto::convert::stop::CheckIn;
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::Confirmation as C;
@@ -48,6 +50,21 @@ async fn standing_is_shown_when_the_robot_says_so_and_not_before() {
     let status = server.status().await;
     assert_eq!(status.stops[0].counts.unwrap().standstill_confirmed, 1);
     assert_eq!(status.robots[0].awaiting_resume, [id]);
+}
+
+#[tokio::test]
+async fn a_robot_that_knows_of_a_reset_which_the_service_has_lost_is_not_shown_as_elsewhere() {
+    let folder = Folder::new();
+    let server = Server::start(&folder.path()).await;
+    let id = id_of(&server.engage(fleet()).await.unwrap());
+    let mut robot = Robot::dial(&server, "r1", vec![]).await.synced().await;
+    let reset = Reset { stop_id: StopId::parse(&id).unwrap(), at: Utc(2), actor: "a".into(), reason: "over".into() };
+    robot.latch.reset(reset);
+    let said = robot.obeying(false);
+    assert!(said.inside.is_empty());
+    robot.check_in(said).await;
+    let counts = server.status().await.stops[0].counts.unwrap();
+    assert_eq!(counts, v1::Counts { requested: 1, ..v1::Counts::default() });
 }
 
 #[tokio::test]

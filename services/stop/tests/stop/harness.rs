@@ -242,13 +242,27 @@ impl Robot {
     }
 
     pub async fn start(server: &Server, name: &str, boot: &str, stops: Vec<Stop>) -> Result<Self, Status> {
+        Self::attend(server, name, boot, (stops, Vec::new())).await
+    }
+
+    /// One that brings names alone.
+    pub async fn bringing(server: &Server, name: &str, more: Vec<StopId>) -> Self {
+        Self::attend(server, name, "boot", (Vec::new(), more)).await.unwrap()
+    }
+
+    async fn attend(
+        server: &Server,
+        name: &str,
+        boot: &str,
+        (stops, more): (Vec<Stop>, Vec<StopId>),
+    ) -> Result<Self, Status> {
         let robot_id = RobotId::parse(name).unwrap();
         let (up, sent) = mpsc::channel(4);
         let latch = stops.iter().fold(Latch::default(), |mut latch, stop| {
             latch.engage(stop.clone());
             latch
         });
-        let attend = ToStop::Attend { robot_id: robot_id.clone(), boot_id: boot.to_owned(), stops };
+        let attend = ToStop::Attend { robot_id: robot_id.clone(), boot_id: boot.to_owned(), stops, more };
         up.send((&attend).into()).await.unwrap();
         let mut client = StopLinkServiceClient::new(server.channel().await);
         let down = client.attend(ReceiverStream::new(sent)).await?.into_inner();

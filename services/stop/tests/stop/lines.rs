@@ -1,6 +1,7 @@
 //! Robots' lines: what they carry, when they end, and that none of them holds up another.
 
 use crate::harness::{Folder, Robot, Server, WITHIN, code, eventually, fleet, id_of, scope, within};
+use midshift_core::ids::StopId;
 use midshift_core::site::grid;
 use midshift_proto::convert::stop::ToStop;
 use midshift_proto::refusal_of;
@@ -9,6 +10,7 @@ use midshift_proto::stop::v1::scope::Scope as W;
 use midshift_proto::stop::v1::stop_link_service_client::StopLinkServiceClient;
 use midshift_stop::{Error, Parts, StopService};
 use std::sync::Arc;
+use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
@@ -32,6 +34,21 @@ async fn a_check_in_is_answered_with_its_number_and_what_was_told() {
     assert!(heard > 1_780_000_000_000, "{heard}");
 }
 
+/// Reads a line to its end: why it ended.
+async fn ended(line: &mut Robot) -> String {
+    loop {
+        match line.read().await {
+            Ok(true) => {}
+            Ok(false) => return String::new(),
+            Err(status) => return refusal_of(&status).reason,
+        }
+    }
+}
+
+async fn standing(server: &Server) -> u32 {
+    server.status().await.stops[0].counts.unwrap().standstill_confirmed
+}
+
 #[tokio::test]
 async fn a_newer_line_of_a_robot_takes_the_place_of_the_older_one() {
     let folder = Folder::new();
@@ -39,24 +56,74 @@ async fn a_newer_line_of_a_robot_takes_the_place_of_the_older_one() {
     let mut older = Robot::dial(&server, "r1", vec![]).await.synced().await;
     let said = older.obeying(true);
     older.check_in(said).await;
-    let id = id_of(&server.engage(fleet()).await.unwrap());
-    older.until(|robot| robot.knows(&id)).await;
-    let said = older.obeying(true);
-    older.check_in(said).await;
-    assert_eq!(server.status().await.stops[0].counts.unwrap().standstill_confirmed, 1);
-    let mut newer = Robot::start(&server, "r1", "another boot", vec![]).await.unwrap().synced().await;
-    let end = loop {
-        match older.read().await {
-            Ok(true) => {}
-            end => break end,
-        }
-    };
-    assert_eq!(refusal_of(&end.unwrap_err()).reason, "LINE_REPLACED");
-    let counts = server.status().await.stops[0].counts.unwrap();
-    assert_eq!(counts.standstill_confirmed, 0, "what the start before confirmed confirms nothing of this one");
+    let mut newer = Robot::dial(&server, "r1", vec![]).await.synced().await;
+    assert_eq!(ended(&mut older).await, "LINE_REPLACED");
     let said = newer.obeying(true);
     newer.check_in(said).await;
-    assert_eq!(server.status().await.stops[0].counts.unwrap().standstill_confirmed, 1);
+}
+
+#[tokio::test]
+async fn a_copied_key_takes_over_no_line_that_is_heard_and_confirms_nothing_in_its_place() {
+    let folder = Folder::new();
+    let server = Server::start(&folder.path()).await;
+    let mut own = Robot::dial(&server, "r1", vec![]).await.synced().await;
+    let id = id_of(&server.engage(fleet()).await.unwrap());
+    own.until(|robot| robot.knows(&id)).await;
+    let said = own.obeying(false);
+    own.check_in(said).await;
+    for _ in 0..20 {
+        let refused = Robot::start(&server, "r1", "a copy", vec![]).await.err().unwrap();
+        let answer = refusal_of(&refused);
+        assert_eq!((answer.grpc, answer.reason.as_str()), (Code::Unavailable, "LINE_HELD"));
+        let again = answer.retry_after.unwrap();
+        assert!(again > Duration::ZERO && again <= Duration::from_secs(3), "{again:?}");
+    }
+    assert_eq!(standing(&server).await, 0, "it drives, and says so itself");
+    let said = own.obeying(true);
+    own.check_in(said).await;
+    assert_eq!(standing(&server).await, 1);
+    let noted = || std::fs::read_to_string(folder.path().join("audit.jsonl")).unwrap().matches("LINE_HELD").count();
+    eventually(async || (noted() > 0).then_some(())).await;
+    // Until it is not heard any more: a power cut closes no line.
+    server.ahead(3_000);
+    let mut other = Robot::start(&server, "r1", "a copy", vec![]).await.unwrap().synced().await;
+    assert_eq!(ended(&mut own).await, "LINE_REPLACED");
+    assert_eq!(standing(&server).await, 0, "what the start before confirmed confirms nothing of this one");
+    let said = other.obeying(true);
+    other.check_in(said).await;
+    assert_eq!(standing(&server).await, 1);
+    server.end().await;
+    assert_eq!(noted(), 1, "it floods nothing");
+}
+
+#[tokio::test]
+async fn a_robot_whose_agent_was_killed_is_let_in_at_once() {
+    let folder = Folder::new();
+    let server = Server::start(&folder.path()).await;
+    let mut killed = Robot::dial(&server, "r1", vec![]).await.synced().await;
+    let said = killed.obeying(true);
+    killed.check_in(said).await;
+    drop(killed);
+    // Its clock stands: nothing is waited for but the end of the connection.
+    let next = eventually(async || Robot::start(&server, "r1", "the next boot", vec![]).await.ok()).await;
+    next.synced().await;
+}
+
+#[tokio::test]
+async fn what_a_robot_brings_by_name_alone_is_shown_and_its_reset_reaches_it() {
+    let folder = Folder::new();
+    let server = Server::start(&folder.path()).await;
+    let [was_reset, unknown] = ["STOP-20260601-AAAAAAAAAA", "STOP-20260601-BBBBBBBBBB"];
+    server.reset(was_reset).await;
+    let engaged = id_of(&server.engage(fleet()).await.unwrap());
+    let more = [was_reset, unknown, &engaged].map(|id| StopId::parse(id).unwrap()).into();
+    let mut robot = Robot::bringing(&server, "r1", more).await.synced().await;
+    let is_told = |robot: &Robot, id: &str| robot.latch.reset_of(&StopId::parse(id).unwrap()).is_some();
+    robot.until(|robot| is_told(robot, was_reset)).await;
+    assert!(!is_told(&robot, unknown) && !is_told(&robot, &engaged));
+    assert_eq!(server.status().await.robots[0].foreign_stops, [unknown]);
+    server.reset(unknown).await;
+    robot.until(|robot| is_told(robot, unknown)).await;
 }
 
 #[tokio::test]
@@ -138,9 +205,10 @@ async fn an_end_in_order_asks_robots_to_dial_again_and_is_bounded() {
     let server = Server::start(&folder.path()).await;
     let mut robot = Robot::dial(&server, "r1", vec![]).await.synced().await;
     let mut watch = server.client().await.watch_status(v1::WatchStatusRequest {}).await.unwrap().into_inner();
+    let id = id_of(&server.engage(fleet()).await.unwrap());
     server.ask_to_end();
-    robot.until(|robot| robot.is_moved).await;
     while robot.read().await.is_ok_and(|goes_on| goes_on) {}
+    assert!(robot.is_moved && robot.knows(&id), "what waits for it is said first");
     while within(watch.message()).await.is_ok_and(|message| message.is_some()) {}
     tokio::time::timeout(WITHIN, server.end()).await.expect("it ends");
 }

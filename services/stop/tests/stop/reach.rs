@@ -84,7 +84,7 @@ async fn a_certificate_of_another_robot_begins_no_line_and_ends_none() {
     let attend = async |who: &str| {
         let (up, sent) = mpsc::channel(4);
         let (robot_id, boot_id) = (RobotId::parse("r1").unwrap(), "boot".to_owned());
-        up.send((&ToStop::Attend { robot_id, boot_id, stops: vec![] }).into()).await.unwrap();
+        up.send((&ToStop::Attend { robot_id, boot_id, stops: vec![], more: vec![] }).into()).await.unwrap();
         let mut client = StopLinkServiceClient::new(server.channel().await);
         client.attend(asked_as(who, ReceiverStream::new(sent))).await.map(drop)
     };

@@ -2,7 +2,7 @@
 
 use super::{Client, One, text};
 use crate::cli::client::{Call, Exit, unary};
-use crate::cli::out::{Format, Out, columns};
+use crate::cli::out::{Format, Out, columns, plain};
 use midshift_proto::convert::time_of;
 use midshift_proto::json::to_json;
 use midshift_proto::ota::v1;
@@ -248,7 +248,7 @@ pub fn events(rollout: &v1::Rollout, robots: &[v1::RolloutRobot]) -> Vec<Event> 
         events.extend(time.map(|time| Event { time, what, text }));
     };
     let said = |act: &v1::RolloutAct, what: &str| {
-        let why = if act.reason.is_empty() { String::new() } else { format!(" ({})", act.reason) };
+        let why = if act.reason.is_empty() { String::new() } else { format!(" ({})", plain(&act.reason)) };
         format!("{what} by {}{why}", act.actor)
     };
     for (what, word, act) in

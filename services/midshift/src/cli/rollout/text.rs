@@ -3,6 +3,7 @@
 //! Invariant: pure functions of messages; nothing is asked of a server here, and no clock is read. Waves are counted from 1 for people, as
 //! `wave 1/3`; on the wire from 0.
 
+use crate::cli::out::plain;
 use midshift_proto::common::v1::Reason;
 use midshift_proto::convert::{ms_of, time_of};
 use midshift_proto::ota::v1::rollout_wave::Size;
@@ -40,7 +41,7 @@ pub fn robots(count: u32) -> String {
 
 /// A reason with its sentence.
 pub fn reason(reason: &Reason) -> String {
-    format!("{}: {}", reason.code, reason.message).trim_end_matches([':', ' ']).to_owned()
+    format!("{}: {}", reason.code, plain(&reason.message)).trim_end_matches([':', ' ']).to_owned()
 }
 
 fn because(why: Option<&Reason>) -> String {
@@ -139,7 +140,7 @@ pub fn counts(counts: &v1::RolloutCounts) -> String {
 
 /// Who did something, when, and why.
 pub fn act(what: &str, act: &v1::RolloutAct) -> String {
-    let why = if act.reason.is_empty() { String::new() } else { format!(" ({})", act.reason) };
+    let why = if act.reason.is_empty() { String::new() } else { format!(" ({})", plain(&act.reason)) };
     format!("{what} by {} {}{why}", act.actor, time(act.time.as_ref()))
 }
 
