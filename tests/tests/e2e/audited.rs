@@ -1,6 +1,7 @@
 //! The audit as its reader has it: what was asked for stands there with who asked, and what somebody changes in the database shows.
 
 use crate::harness::{Server, command, folder, second, until};
+use crate::secrets::heard;
 use anyhow::{Context, bail, ensure};
 use midshift_core::audit::{Head, Mark, link};
 use serde_json::Value;
@@ -27,8 +28,7 @@ fn sql(file: &Path, statements: &[&str]) -> anyhow::Result<()> {
 
 fn call(server: &Server, arguments: &[&str]) -> anyhow::Result<Output> {
     let address = server.address.to_string();
-    let output = command(&[arguments, &["--server", &address]].concat())?.output();
-    output.with_context(|| format!("calling {arguments:?}"))
+    heard(&mut command(&[arguments, &["--server", &address]].concat())?)
 }
 
 /// What a command prints that must succeed.
@@ -223,19 +223,19 @@ async fn whoever_is_denied_stands_in_the_audit_of_the_service_that_was_asked() -
     let address = server.address.to_string();
     // It may approve roll-outs and see things, and bring no task in.
     let submit = ["task", "submit", "--task-id", "T1", "--from", "A01", "--to", "B03", "--server", &address];
-    let denied = second(&submit)?.output()?;
+    let denied = heard(&mut second(&submit)?)?;
     let said = String::from_utf8_lossy(&denied.stderr).into_owned();
     ensure!(denied.status.code() == Some(6) && said.contains("second may not"), "{said}");
     let list = ["audit", "ls", "-o", "json", "--action", "request.deny", "--server", &address];
     let row = until("a row of the denial", Duration::from_secs(20), async || {
-        let listed: Value = serde_json::from_slice(&command(&list)?.output()?.stdout)?;
+        let listed: Value = serde_json::from_slice(&heard(&mut command(&list)?)?.stdout)?;
         Ok(listed["rows"].as_array().and_then(|rows| rows.first()).cloned())
     });
     let row = row.await?;
     let told = ["service", "actor", "outcome"].map(|field| row[field].as_str().unwrap_or_default());
     assert_eq!(told, ["task", "second", "NOT_PERMITTED"], "{row}");
     assert_eq!(row["with"]["path"], "/midshift.task.v1.TaskService/SubmitTask", "{row}");
-    let verified = command(&["audit", "verify", "--server", &address])?.output()?;
+    let verified = heard(&mut command(&["audit", "verify", "--server", &address])?)?;
     ensure!(verified.status.success(), "{}", String::from_utf8_lossy(&verified.stderr));
     Ok(())
 }

@@ -5,6 +5,7 @@
 use crate::engine::fresh_store;
 use crate::harness::{Running, channel, free_port, midshift, sign_in, sign_in_second, sign_in_to, until};
 use crate::room::{LIMIT, Room};
+use crate::secrets::heard;
 use anyhow::Context;
 use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
@@ -84,7 +85,7 @@ impl Transcript {
     }
 
     fn run(&self, arguments: &[&str]) -> anyhow::Result<Output> {
-        self.command(arguments).output().with_context(|| format!("running {arguments:?}"))
+        heard(&mut self.command(arguments))
     }
 
     /// Runs a command and writes down what it printed and how it ended; its standard output.

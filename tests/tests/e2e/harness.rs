@@ -1,6 +1,7 @@
 //! Starts real programs in folders of their own and ends exactly those; waits for conditions, with limits.
 
 use crate::engine::fresh_store;
+use crate::secrets::{keep_keys, keep_secret, secret_part, told_by_log};
 use anyhow::{Context, bail};
 use midshift::way::{Line, Way};
 use midshift_core::site::DEMO;
@@ -8,7 +9,6 @@ use midshift_proto::identity::v1::CreateTokenRequest;
 use midshift_proto::identity::v1::identity_service_client::IdentityServiceClient;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::task::v1::{ListTasksRequest, Task, TaskFilter, TaskState};
-use midshift_tests::postgres::PASSWORD;
 use std::collections::BTreeMap;
 use std::future::Future;
 use std::net::{SocketAddr, TcpListener};
@@ -46,27 +46,6 @@ pub fn tool(variable: &str) -> anyhow::Result<PathBuf> {
     let path = std::env::var_os(variable)
         .with_context(|| format!("{variable} is not set: run `cargo xtask test --install`"))?;
     Ok(path.into())
-}
-
-/// Names of secrets that this run uses, and what must therefore be in no log.
-static SECRETS: Mutex<BTreeMap<String, &'static str>> = Mutex::new(BTreeMap::new());
-
-/// From now on no program may have written `secret` into its log when it ends.
-pub fn keep_secret(what: &'static str, secret: &str) {
-    SECRETS.lock().unwrap_or_else(PoisonError::into_inner).insert(secret.to_owned(), what);
-}
-
-/// What of a token or an enrolment nobody may know: its third part.
-pub fn secret_part(line: &str) -> anyhow::Result<&str> {
-    line.split('.').nth(2).filter(|secret| secret.len() >= 32).with_context(|| format!("no secret in {line}"))
-}
-
-/// The secrets that are in a log.
-fn told(log: &str) -> Vec<&'static str> {
-    let secrets = SECRETS.lock().unwrap_or_else(PoisonError::into_inner);
-    let known = secrets.iter().map(|(secret, what)| (secret.as_str(), *what));
-    let all = known.chain([(PASSWORD, "the database's password")]);
-    all.filter(|(secret, _)| log.contains(secret)).map(|(_, what)| what).collect()
 }
 
 /// What a program may write about itself, in every end-to-end test: more than it does by default.
@@ -137,9 +116,14 @@ impl Running {
 impl Drop for Running {
     fn drop(&mut self) {
         let _ = self.kill();
-        let told = told(&std::fs::read_to_string(&self.log).unwrap_or_default());
         // A test that has failed says why itself.
-        assert!(told.is_empty() || std::thread::panicking(), "{} tells {told:?}", self.log.display());
+        if !std::thread::panicking() {
+            let log = std::fs::read(&self.log);
+            let log =
+                log.unwrap_or_else(|error| panic!("what it said in {} is not there: {error}", self.log.display()));
+            let told = told_by_log(&log);
+            assert!(told.is_empty(), "{} tells {told:?}", self.log.display());
+        }
     }
 }
 
@@ -341,9 +325,7 @@ impl Server {
         let said = || std::fs::read_to_string(self.dir.join("server.log")).unwrap_or_default();
         let authority = self.data().join("identity/ca.pem");
         sign_in_to(self.address, authority, &self.dir.join("token")).await.with_context(said)?;
-        let key = std::fs::read_to_string(self.data().join("identity/authority.pem"))?;
-        keep_secret("the authority's key", key.lines().nth(1).context("a key in PEM")?);
-        Ok(())
+        keep_keys(&self.dir)
     }
     /// SIGKILL and a new start on the same data.
     pub async fn kill_and_restart(&mut self) -> anyhow::Result<()> {
@@ -422,17 +404,4 @@ pub fn channel(address: SocketAddr) -> anyhow::Result<Line> {
 /// The way to an address, over TLS and signed in if the site has a login.
 pub fn way(address: SocketAddr) -> anyhow::Result<Way> {
     known(address).map_or_else(|| Way::plain(&address.to_string()), |site| Ok(site.way))
-}
-
-#[tokio::test]
-#[should_panic(expected = "tells [\"a word\"]")]
-async fn a_program_that_writes_a_secret_into_its_log_fails_its_test() {
-    keep_secret("a word", "xyzzy-only-here");
-    let dir = folder().expect("a folder");
-    let log = dir.path().join("log");
-    let mut command = Command::new("sh");
-    let running = Running::start(command.args(["-c", "echo xyzzy-only-here; exec sleep 60"]), &log);
-    let written = async || Ok(std::fs::read_to_string(&log).ok().filter(|text| text.ends_with('\n')));
-    until("its log", Duration::from_secs(30), written).await.expect("a line");
-    drop(running);
 }

@@ -3,6 +3,7 @@
 use crate::harness::{Running, Server, midshift, until};
 use crate::robots::enrolment;
 use crate::room::LIMIT;
+use crate::secrets::heard;
 use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::sets::{Sets, Wanted};
 use midshift_agent::sqlite::SqliteStore;
@@ -207,7 +208,7 @@ fn sets_and_trust_go_together_and_a_trust_file_of_another_site_is_refused() -> a
     let run = |arguments: &[&str]| -> anyhow::Result<(Option<i32>, String)> {
         let mut command = Command::new(midshift()?);
         command.args(["agent", "run", "--robot-id", "rbt-01", "--server", "127.0.0.1:1", "--data"]);
-        let ended = command.arg(machine.path("data")).args(arguments).output()?;
+        let ended = heard(command.arg(machine.path("data")).args(arguments))?;
         Ok((ended.status.code(), String::from_utf8_lossy(&ended.stderr).into_owned()))
     };
     let (sets, trust) = (machine.path("sets"), machine.path("trust.json"));

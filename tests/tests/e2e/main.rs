@@ -37,6 +37,7 @@ mod robots;
 mod rolled_out;
 mod rolling;
 mod room;
+mod secrets;
 mod split;
 mod stack;
 mod stop_alone;

@@ -3,6 +3,7 @@
 use crate::clients::{grpcurl, text};
 use crate::harness::{channel, folder, midshift, sign_in, tool, until};
 use crate::robots::Robots;
+use crate::secrets::heard;
 use crate::stack::Stack;
 use midshift_core::site::{DEMO, text as site_text};
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
@@ -49,7 +50,7 @@ async fn people_programs_and_robots_come_through_the_shipped_proxy() -> anyhow::
     let run = |arguments: &[&str]| {
         let mut command = Command::new(midshift()?);
         sign_in(&mut command, address);
-        command.args(arguments).args(["--server", &public]).output().map_err(anyhow::Error::from)
+        heard(command.args(arguments).args(["--server", &public]))
     };
     let done = run(&["task", "submit", "--from", "A01", "--to", "B03", "--sku", "SKU-1", "--wait"])?;
     assert!(done.status.success(), "{}", text(&done.stderr));

@@ -2,6 +2,7 @@
 
 use crate::harness::{Server, command, until};
 use crate::robots::Robots;
+use crate::secrets::heard;
 use crate::stopped::{StopServer, resume, until_held};
 use midshift::background::request;
 use midshift_core::site::{DEMO, Site, text};
@@ -20,7 +21,7 @@ const ROBOTS: usize = 6;
 const TASKS: usize = 12;
 
 fn run(arguments: &[&str]) -> anyhow::Result<String> {
-    let output = command(arguments)?.output()?;
+    let output = heard(&mut command(arguments)?)?;
     anyhow::ensure!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
     Ok(String::from_utf8(output.stdout)?)
 }

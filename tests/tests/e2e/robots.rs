@@ -1,6 +1,7 @@
 //! Robots as programs of their own.
 
-use crate::harness::{LOG, Running, channel, has_login, keep_secret, midshift, secret_part, sign_in, until, way};
+use crate::harness::{LOG, Running, channel, has_login, midshift, sign_in, until, way};
+use crate::secrets::{keep_key, keep_secret, secret_part};
 use crate::stack::{machines_of, tell_identity};
 use anyhow::Context;
 use midshift::machines::Machines;
@@ -60,9 +61,21 @@ impl Robots {
         site: &Site,
         count: usize,
     ) -> anyhow::Result<Self> {
-        let starts = site.starting_places(count).into_iter().map(|at| site.name_of(at).to_string()).collect();
+        let starts: Vec<String> =
+            site.starting_places(count).into_iter().map(|at| site.name_of(at).to_string()).collect();
+        Self::start_at(dir, server, public, stops, &starts).await
+    }
+    /// As [`Robots::start_beside`], one at each of these waypoints.
+    pub async fn start_at(
+        dir: &Path,
+        server: SocketAddr,
+        public: SocketAddr,
+        stops: Option<SocketAddr>,
+        starts: &[String],
+    ) -> anyhow::Result<Self> {
+        let count = starts.len();
         let mut robots = Self::none(dir, server);
-        (robots.starts, robots.stops) = (starts, stops.map(|address| address.to_string()));
+        (robots.starts, robots.stops) = (starts.to_vec(), stops.map(|address| address.to_string()));
         // First all of them are enrolled: one that works before another is heard may be sent to where that one stands.
         let ids = (0..count).map(|number| RobotId::parse(&robot_id(number))).collect::<Result<Vec<_>, _>>()?;
         if has_login(public) {
@@ -81,6 +94,9 @@ impl Robots {
             Ok((stand == all).then_some(()))
         })
         .await?;
+        for id in &robots.ids {
+            keep_secrets(&dir.join(id)).await?;
+        }
         Ok(robots)
     }
     /// `count` of them on the site of a file, shared out among `processes`, with bodies no faster than real ones; they take software as `trust` says.
@@ -183,12 +199,7 @@ impl Robots {
     }
     /// The key of the machine in this folder, whether or not its agent runs.
     pub async fn device(folder: &Path) -> anyhow::Result<DeviceKey> {
-        let copy = tempfile::tempdir()?;
-        for name in [AGENT_FILE.to_owned(), format!("{AGENT_FILE}-wal")] {
-            let _ = std::fs::copy(folder.join(&name), copy.path().join(&name));
-        }
-        let kept = SqliteStore::open(&copy.path().join(AGENT_FILE)).await?.load("").await?;
-        kept.ledger.device.context("a key")
+        remembered(folder).await?.device.context("a key")
     }
     /// What a robot remembers; its agent must not run.
     pub async fn ledger(&self, id: &str) -> anyhow::Result<Ledger> {
@@ -198,6 +209,25 @@ impl Robots {
     pub fn journals(&self) -> Vec<PathBuf> {
         self.ids.iter().map(|id| self.dir.join(id).join("journal.jsonl")).collect()
     }
+}
+
+/// What the machine in this folder remembers, whether or not its agent runs.
+async fn remembered(folder: &Path) -> anyhow::Result<Ledger> {
+    let copy = tempfile::tempdir()?;
+    for name in [AGENT_FILE.to_owned(), format!("{AGENT_FILE}-wal")] {
+        let _ = std::fs::copy(folder.join(&name), copy.path().join(&name));
+    }
+    Ok(SqliteStore::open(&copy.path().join(AGENT_FILE)).await?.load("").await?.ledger)
+}
+
+/// Nobody may be told the key of the machine in this folder, nor what proves its session.
+async fn keep_secrets(folder: &Path) -> anyhow::Result<()> {
+    // A copy that is made while the machine writes may be of no use.
+    let known = || async { Ok(remembered(folder).await.ok().filter(|known| !known.session.secret.is_empty())) };
+    let known = until("what a machine remembers", Duration::from_secs(30), known).await?;
+    keep_secret("a session's secret", &known.session.secret);
+    let key = serde_json::to_value(known.device.context("a key")?)?;
+    keep_key("a machine's key", key.as_str().context("a key in PEM")?)
 }
 
 fn robot_id(number: usize) -> String {

@@ -5,6 +5,7 @@ use crate::harness::{Running, Server, command, midshift, second, until};
 use crate::robots::BODY_SPEED;
 use crate::robots::enrolment;
 use crate::room::LIMIT;
+use crate::secrets::heard;
 use crate::stack::tell_identity;
 use anyhow::{Context, ensure};
 use midshift_agent::launcher::SWITCH;
@@ -122,13 +123,13 @@ pub fn trust(samples: &Path, site: &Site) -> anyhow::Result<Trust> {
 
 /// The command line.
 pub fn call(arguments: &[&str]) -> anyhow::Result<Output> {
-    command(arguments)?.output().context("calling midshift")
+    heard(&mut command(arguments)?)
 }
 
 /// Begins a roll-out that is written down: somebody else approves it.
 pub fn begin_rollout(address: &str, id: &str) -> anyhow::Result<()> {
     done(&["rollout", "submit", "--server", address, id])?;
-    let approved = second(&["rollout", "approve", "--server", address, id, "--reason", "tried at home"])?.output()?;
+    let approved = heard(&mut second(&["rollout", "approve", "--server", address, id, "--reason", "tried at home"])?)?;
     ensure!(approved.status.success(), "{}", String::from_utf8_lossy(&approved.stderr));
     done(&["rollout", "start", "--server", address, id])
 }

@@ -4,6 +4,7 @@
 use crate::harness::{
     Running, channel, free_port, in_states, midshift, same_site, sign_in_to, token, tool, until, way,
 };
+use crate::secrets::heard;
 use anyhow::Context;
 use midshift_proto::ota::v1::ListBundlesRequest;
 use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
@@ -117,7 +118,7 @@ impl Stack {
         MACHINES.lock().unwrap_or_else(PoisonError::into_inner).insert(robots, machines);
         let mut ask = Command::new(midshift()?);
         ask.args(["certificate", "get", "--name", "localhost", "--store", &url, "--site"]).arg(&file);
-        let got = ask.arg("--out").arg(dir.join("proxy")).output()?;
+        let got = heard(ask.arg("--out").arg(dir.join("proxy")))?;
         anyhow::ensure!(got.status.success(), "{}", String::from_utf8_lossy(&got.stderr));
         let proxy = proxy(dir, &members, [public, robots, machines], None)?;
         let mut stack = Self {
@@ -298,7 +299,7 @@ impl Proven {
         let mut make = Command::new(midshift()?);
         make.args(["certificate", "database", "--host", "127.0.0.1", "--user", "postgres"]);
         make.arg("--server-out").arg(folder.join("server")).arg("--client-out").arg(folder.join("client"));
-        let made = make.output()?;
+        let made = heard(&mut make)?;
         anyhow::ensure!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
         Ok(Self(folder))
     }

@@ -1,12 +1,11 @@
 //! A fleet stop with real programs: everybody stands, the server dead or not, its database there or not, and nobody moves before a person has reset and resumed
 //! it.
 
-use crate::harness::{
-    Running, Server, channel, folder, free_port, has_login, in_states, keep_secret, midshift, same_site, until,
-};
+use crate::harness::{Running, Server, channel, folder, free_port, has_login, in_states, midshift, same_site, until};
 use crate::kill::{all_over, at_work, judge, submit};
 use crate::robots::Robots;
 use crate::rolled_out::{call, done};
+use crate::secrets::keep_from_logs;
 use anyhow::{Context, ensure};
 use midshift_core::reason::Code;
 use midshift_core::robot::StopLevel;
@@ -74,7 +73,7 @@ impl StopServer {
     }
     /// Stops by the command line, which waits until all have confirmed; the stop's name.
     pub fn stop(&self, whom: &[&str]) -> anyhow::Result<String> {
-        keep_secret("why somebody stopped", REASON);
+        keep_from_logs("why somebody stopped", REASON);
         let address = self.address.to_string();
         let stop = ["stop", "--stop-server", &address, "--reason", REASON, "-o", "name"];
         let output = tokio::task::block_in_place(|| call(&[&stop[..], whom].concat()))?;

@@ -3,6 +3,7 @@
 //! The lies are told by a small server between the two, and on the disk of ours; each is followed by the truth, which is taken.
 
 use crate::harness::{Server, command, sign_in, tool};
+use crate::secrets::heard;
 use midshift_core::site::DEMO;
 use std::path::Path;
 use std::process::Command;
@@ -123,7 +124,7 @@ elif part == "tampered":
 
 /// Runs the program in `dir` and wants it to succeed.
 fn release(dir: &Path, arguments: &[&str]) -> anyhow::Result<()> {
-    let done = command(arguments)?.current_dir(dir).output()?;
+    let done = heard(command(arguments)?.current_dir(dir))?;
     anyhow::ensure!(done.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&done.stderr));
     Ok(())
 }
