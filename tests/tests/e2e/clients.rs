@@ -2,11 +2,14 @@
 //! address: a split stack is asked for the same in `languages.rs`.
 
 use crate::factory::Factory;
-use crate::harness::{authority, sign_in, token, tool};
+use crate::harness::{authority, sign_in, token, tool, way};
+use crate::secrets::heard;
+use anyhow::Context;
 use std::net::SocketAddr;
 use std::path::Path;
 use std::process::{Command, Output};
 use std::time::Duration;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
 /// Runs grpcurl with `flags` on `what` of the server at `address`, signed in if that has a login.
 pub fn grpcurl(address: SocketAddr, flags: &[&str], what: &str) -> anyhow::Result<Output> {
@@ -17,7 +20,7 @@ pub fn grpcurl(address: SocketAddr, flags: &[&str], what: &str) -> anyhow::Resul
         }
         None => command.arg("-plaintext"),
     };
-    Ok(command.args(["-max-time", "60"]).args(flags).args([&address.to_string(), what]).output()?)
+    heard(command.args(["-max-time", "60"]).args(flags).args([&address.to_string(), what]))
 }
 
 /// What a program said.
@@ -25,14 +28,15 @@ pub fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
 }
 
-/// One request over HTTP/1.1.
-pub fn http1(address: SocketAddr, request: &str) -> anyhow::Result<String> {
-    use std::io::{Read, Write};
-    let mut stream = std::net::TcpStream::connect(address)?;
-    stream.set_read_timeout(Some(Duration::from_secs(10)))?;
-    stream.write_all(request.as_bytes())?;
+/// One request over HTTP/1.1, whose first line and own headers are given, signed in.
+async fn http1(address: SocketAddr, request: &str, body: &[u8]) -> anyhow::Result<String> {
+    let mut stream = way(address)?.wire().await?;
+    let token = token(address).context("a login")?;
+    let all = "Host: midshift\r\nConnection: close\r\nAuthorization: Bearer";
+    stream.write_all(format!("{request}\r\n{all} {token}\r\n\r\n").as_bytes()).await?;
+    stream.write_all(body).await?;
     let mut answer = Vec::new();
-    stream.read_to_end(&mut answer)?;
+    tokio::time::timeout(Duration::from_secs(30), stream.read_to_end(&mut answer)).await??;
     Ok(text(&answer))
 }
 
@@ -41,12 +45,12 @@ async fn prometheus_and_browsers_reach_the_same_port_over_http_1() -> anyhow::Re
     let dir = tempfile::tempdir()?;
     let factory = Factory::one_box(dir.path()).await?;
     let address = factory.address;
-    let page = http1(address, "GET /metrics HTTP/1.1\r\nHost: midshift\r\nConnection: close\r\n\r\n")?;
+    let page = http1(address, "GET /metrics HTTP/1.1", b"").await?;
     assert!(page.starts_with("HTTP/1.1 200") && page.contains("midshift_telemetry_heartbeats_total"), "{page}");
     assert!(!page.contains("rbt-"), "a metric has a label per robot");
-    let web = "POST /midshift.telemetry.v1.TelemetryService/ListRobots HTTP/1.1\r\nHost: midshift\r\nConnection: close\r\n\
-               Content-Type: application/grpc-web+proto\r\nContent-Length: 5\r\n\r\n\0\0\0\0\0";
-    let answer = http1(address, web)?;
+    let web = "POST /midshift.telemetry.v1.TelemetryService/ListRobots HTTP/1.1\r\n\
+               Content-Type: application/grpc-web+proto\r\nContent-Length: 5";
+    let answer = http1(address, web, &[0; 5]).await?;
     assert!(
         answer.starts_with("HTTP/1.1 200") && answer.contains("rbt-01") && answer.contains("grpc-status:0"),
         "{answer}"

@@ -122,7 +122,6 @@ fn each_client_keeps_its_own_rules() -> anyhow::Result<()> {
 async fn each_client_submits_watches_explains_hears_every_violation_and_watches_a_rollout() -> anyhow::Result<()> {
     let dir = tempfile::tempdir()?;
     let factory = Factory::one_box(dir.path()).await?;
-    factory.bring_samples(dir.path())?;
     tours_pass(dir.path(), factory.address).await
 }
 

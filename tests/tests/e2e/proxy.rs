@@ -1,9 +1,10 @@
-//! A proxy in the way of robots, which can hold back what the server says, byte for byte, or cut every connection.
+//! A proxy in the way of robots, which can hold back what the server says, byte for byte, cut every connection, or let nothing through at all for a while.
 //!
-//! Invariant: bytes are delayed, never changed and never reordered; what robots say always passes.
+//! Invariant: bytes are delayed or lost with their connection, never changed and never reordered; what robots say passes unless nothing does.
 
 use crate::harness::same_site;
 use std::net::SocketAddr;
+use std::pin::pin;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
@@ -18,6 +19,7 @@ pub struct Proxy {
     pub address: SocketAddr,
     held: watch::Sender<bool>,
     cuts: watch::Sender<u64>,
+    severed: watch::Sender<bool>,
     _accepting: JoinSet<()>,
 }
 
@@ -27,27 +29,45 @@ impl Proxy {
         let listener = TcpListener::bind("127.0.0.1:0").await?;
         let address = listener.local_addr()?;
         same_site(server, address)?;
-        let (held, cuts) = (watch::Sender::new(false), watch::Sender::new(0));
-        let (hold, cut) = (held.subscribe(), cuts.subscribe());
+        let (held, cuts, severed) = (watch::Sender::new(false), watch::Sender::new(0), watch::Sender::new(false));
+        let (hold, cut, sever) = (held.subscribe(), cuts.subscribe(), severed.subscribe());
         let mut accepting = JoinSet::new();
         accepting.spawn(async move {
             let mut connections = JoinSet::new();
             while let Ok((robot, _)) = listener.accept().await {
-                let (hold, mut cut) = (hold.clone(), cut.clone());
+                let (hold, mut cut, mut sever) = (hold.clone(), cut.clone(), sever.clone());
                 cut.mark_unchanged();
                 connections.spawn(async move {
+                    // Both ends stay open until all is over.
+                    let mut carried = pin!(carry(robot, server, hold));
+                    let until_over = async {
+                        tokio::select! {
+                            biased;
+                            _ = sever.wait_for(|severed| *severed) => {}
+                            _ = &mut carried => return,
+                        }
+                        let _ = sever.wait_for(|severed| !severed).await;
+                    };
                     tokio::select! {
-                        _ = carry(robot, server, hold) => {}
+                        () = until_over => {}
                         _ = cut.changed() => {}
                     }
                 });
             }
         });
-        Ok(Self { address, held, cuts, _accepting: accepting })
+        Ok(Self { address, held, cuts, severed, _accepting: accepting })
     }
     /// From now on nothing the server says arrives; or all of it at once.
     pub fn hold(&self, held: bool) {
         self.held.send_replace(held);
+    }
+    /// From now on nothing arrives at either end, and nobody hears why.
+    pub fn sever(&self) {
+        self.severed.send_replace(true);
+    }
+    /// New connections pass again; those of before, and those that were tried meanwhile, are over.
+    pub fn mend(&self) {
+        self.severed.send_replace(false);
     }
     /// Ends every connection there is; what was held back on them is lost.
     pub fn cut(&self) {
