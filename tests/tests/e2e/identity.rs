@@ -4,13 +4,18 @@ use crate::harness::{Running, Server, channel, folder, midshift, sign_in, until}
 use crate::kill::{all_over, at_work, judge, submit};
 use crate::robots::{Robots, enrolment};
 use crate::rolled_out::{call, done};
+use crate::secrets::heard;
 use crate::stopped::StopServer;
+use crate::unheard::obeyed;
 use anyhow::{Context, ensure};
 use midshift_agent::dial::{Dial, TcpDial};
 use midshift_agent::enrolment::Enrolled;
 use midshift_agent::tls::Tls;
 use midshift_core::reason::Code;
+use midshift_core::robot::StopLevel;
 use midshift_core::site::{DEMO, Site, text};
+use midshift_proto::stop::v1::GetStatusRequest;
+use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
 use midshift_proto::telemetry::v1::GetRobotRequest;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
 use midshift_sim::journal::{self, Effect};
@@ -130,6 +135,42 @@ async fn attach(server: &Server, folder: &Path) -> anyhow::Result<()> {
     }
 }
 
+/// Asks a stop service what is stopped, with the key of the robot in this folder.
+async fn asks_for_stops(stops: SocketAddr, folder: &Path) -> anyhow::Result<()> {
+    let (enrolled, key) = (Enrolled::read(folder)?.context("it is enrolled")?, Robots::device(folder).await?);
+    let dial = TcpDial::new(&format!("https://{stops}"), None)?;
+    let channel = dial.with_tls(Tls::fixed(enrolled.config(&key)?)).dial().await?;
+    StopServiceClient::new(channel).get_status(GetStatusRequest {}).await?;
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_revoked_robot_is_cut_off_from_the_stop_service_too_and_stands_by_itself() -> anyhow::Result<()> {
+    let dir = folder()?;
+    let site: Site = text::parse(DEMO)?;
+    let server = Server::start(dir.path()).await?;
+    let stops = StopServer::start(dir.path(), server.address).await?;
+    let (address, line) = (server.address, Some(stops.address));
+    let robots = Robots::start_beside(dir.path(), address, address, line, &site, 2).await?;
+    let journals = robots.journals();
+    let newest = |nth: usize| Ok::<_, anyhow::Error>(obeyed(&journals[nth])?.last().copied());
+    until("both are let go", LIMIT, async || {
+        Ok((newest(0)? == Some(StopLevel::None) && newest(1)? == Some(StopLevel::None)).then_some(()))
+    })
+    .await?;
+    let folders = ["rbt-01", "rbt-02"].map(|id| dir.path().join(id));
+    for folder in &folders {
+        asks_for_stops(stops.address, folder).await?;
+    }
+    done(&["robot", "revoke", "rbt-01", "--server", &address.to_string()])?;
+    // Its line does not stand any more: nobody answers its check-ins.
+    until("it stands by silence", LIMIT, async || Ok((newest(0)? >= Some(StopLevel::Halt)).then_some(()))).await?;
+    ensure!(asks_for_stops(stops.address, &folders[0]).await.is_err(), "a revoked key was let in");
+    asks_for_stops(stops.address, &folders[1]).await.context("the other one is not concerned")?;
+    ensure!(newest(1)? == Some(StopLevel::None), "{:?}", obeyed(&journals[1])?);
+    Ok(())
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_secret_that_enrolled_one_machine_is_refused_to_the_next() -> anyhow::Result<()> {
     let dir = folder()?;
@@ -156,7 +197,7 @@ fn call_as(server: &Server, token: &str, arguments: &[&str]) -> anyhow::Result<O
     let mut command = Command::new(midshift()?);
     sign_in(&mut command, server.address);
     command.env("MIDSHIFT_TOKEN", token).args(arguments).args(["--server", &server.address.to_string()]);
-    Ok(command.output()?)
+    heard(&mut command)
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -46,3 +46,4 @@ mod stopped_release;
 mod story;
 mod swarm_software;
 mod tuf;
+mod unheard;
