@@ -10,6 +10,8 @@ macro_rules! say {
     }};
 }
 
+mod anybody;
+mod areas;
 mod audited;
 mod begin_and_end;
 mod clients;
@@ -33,6 +35,7 @@ mod partition;
 mod proxy;
 mod public_address;
 mod restored;
+mod rights;
 mod robots;
 mod rolled_out;
 mod rolling;
