@@ -3,6 +3,7 @@
 use super::protocol::{Action, Asked, Holder, Protocol, State, in_flight};
 use stateright::{Checker, HasDiscoveries, Model, Property};
 use std::collections::HashMap;
+use std::hash::Hash;
 
 pub const IN_FLIGHT: &str = "no more robots are out of work than the wave allows";
 pub const ONE_HOLDER: &str = "a robot switches or works only while it is held for that and nothing else";
@@ -86,7 +87,7 @@ fn not_freed(protocol: &Protocol, state: &State) -> bool {
 }
 
 /// All that was asked for is over, and the robot is nobody's or at work.
-fn is_end(state: &State) -> bool {
+pub fn is_end(state: &State) -> bool {
     state.robots.iter().all(|robot| {
         let over = robot.drains.iter().all(|d| matches!(d.asked, Asked::Never | Asked::Over));
         let told = robot.switching.is_none() && !robot.untold.contains(&true);
@@ -94,21 +95,23 @@ fn is_end(state: &State) -> bool {
     })
 }
 
-/// Counts the states from which a state can be reached in which every drain has ended. Stateright has no word for it: its
-/// "eventually" means every way, and some ways never let a message arrive.
-pub fn ends_everywhere(protocol: &Protocol) -> usize {
-    let first = protocol.first();
-    let mut numbers = HashMap::from([(first.clone(), 0usize)]);
-    let mut before: Vec<Vec<u32>> = vec![Vec::new()];
-    let mut open = vec![first];
-    let mut ends = Vec::new();
+/// Counts the states from which one can be reached that `is_end`. Stateright has no word for it: its "eventually" means every way, and
+/// some ways never let a message arrive.
+pub fn ends_everywhere<M: Model>(model: &M, is_end: impl Fn(&M::State) -> bool) -> usize
+where
+    M::State: Clone + Eq + Hash,
+{
+    let mut open = model.init_states();
+    let mut numbers: HashMap<M::State, usize> = open.iter().cloned().zip(0..).collect();
+    let mut before: Vec<Vec<u32>> = vec![Vec::new(); open.len()];
+    let (mut ends, mut actions) = (Vec::new(), Vec::new());
     while let Some(state) = open.pop() {
         let number = numbers[&state];
         if is_end(&state) {
             ends.push(number);
         }
-        for action in protocol.possible(&state) {
-            let next = protocol.after(&state, action);
+        model.actions(&state, &mut actions);
+        for next in actions.drain(..).filter_map(|action| model.next_state(&state, action)) {
             let count = numbers.len();
             let known = *numbers.entry(next.clone()).or_insert(count);
             if known == count {
@@ -132,11 +135,16 @@ const STEPS_MAX: usize = 30;
 
 /// The shortest way to break a law, if there is one. One depth after the other: where several states of a block break a law, stateright
 /// tells the last that it saw.
-pub fn shortest(protocol: Protocol, law: &'static str) -> Option<Vec<Action>> {
+pub fn shortest<M>(model: M, law: &'static str) -> Option<Vec<M::Action>>
+where
+    M: Model + Clone + Send + Sync + 'static,
+    M::State: Clone + Hash + PartialEq + Send + Sync + 'static,
+    M::Action: Clone + PartialEq,
+{
     (1..=STEPS_MAX).find_map(|steps| {
         let found = HasDiscoveries::AllOf([law].into());
         // It counts states, of which there is one more than steps, and stops before the one that is named.
-        let checker = protocol.checker().finish_when(found).target_max_depth(steps + 2).spawn_bfs().join();
+        let checker = model.clone().checker().finish_when(found).target_max_depth(steps + 2).spawn_bfs().join();
         checker.discovery(law).map(|path| path.into_actions())
     })
 }
