@@ -143,7 +143,7 @@ fn a_cut_takes_no_row_that_a_person_noted_or_that_was_quoted_when_it_was_young()
         [row.expect("fleet has a chain")]
     };
     let quoted = |n: u64, at: i64| {
-        let (hash, by) = (old.hash.clone(), format!("row 9 of task"));
+        let (hash, by) = (old.hash.clone(), "row 9 of task".to_owned());
         [Mark { service: "fleet".to_owned(), head: Head { n, hash }, by, at_unix_ms: Some(at) }]
     };
     let early = |n: u64, by: &str| Err(Broken::CutEarly { first: 7, known: n, by: by.to_owned() });

@@ -223,9 +223,10 @@ async fn remembered(folder: &Path) -> anyhow::Result<Ledger> {
 /// Nobody may be told the key of the machine in this folder, nor what proves its session.
 async fn keep_secrets(folder: &Path) -> anyhow::Result<()> {
     // A copy that is made while the machine writes may be of no use.
-    let known = || async { Ok(remembered(folder).await.ok().filter(|known| !known.session.secret.is_empty())) };
+    let known =
+        || async { Ok(remembered(folder).await.ok().filter(|known| !known.session.secret.reveal().is_empty())) };
     let known = until("what a machine remembers", Duration::from_secs(30), known).await?;
-    keep_secret("a session's secret", &known.session.secret);
+    keep_secret("a session's secret", known.session.secret.reveal());
     let key = serde_json::to_value(known.device.context("a key")?)?;
     keep_key("a machine's key", key.as_str().context("a key in PEM")?)
 }

@@ -7,6 +7,9 @@ mod engine;
 #[path = "../e2e/harness.rs"]
 #[expect(dead_code, reason = "the end-to-end tests use the rest of it")]
 mod harness;
+#[path = "../e2e/secrets.rs"]
+#[expect(dead_code, reason = "the end-to-end tests use the rest of it")]
+mod secrets;
 
 mod carried;
 mod frames;

@@ -470,7 +470,9 @@ impl Parties {
                 line.synced = true;
                 let whole = line.whole;
                 self.hear(at, robot, whole);
-                self.happens(at, robot, robot.stage, |stop| drop(stop.told_all(Latch::default())));
+                self.happens(at, robot, robot.stage, |stop| {
+                    stop.told_all(Latch::default());
+                });
             }
             Action::HearStop { robot, stop } => {
                 self.comes(robot, &mut next.robots[robot], Facts { engaged: bit(stop), reset: 0 });
@@ -497,7 +499,9 @@ impl Parties {
             Action::HearResumed(at) => {
                 let robot = &mut next.robots[at];
                 let resumed = self.ids(at, robot.resumed);
-                self.happens(at, robot, robot.stage, |stop| drop(stop.resumed(&resumed)));
+                self.happens(at, robot, robot.stage, |stop| {
+                    stop.resumed(&resumed);
+                });
             }
             other => unreachable!("{other:?} is not of one robot"),
         }
