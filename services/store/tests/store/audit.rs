@@ -3,6 +3,7 @@
 use crate::support::{at, clock, database, number, one, postgres_at, put, say, site, stranger};
 use midshift_core::audit::{AuditRow, Broken, Chain, Head, Mark, Note, Verified};
 use midshift_core::rows::{Expect, Item, Log, RowChange, Seq, Table, Write, Writer};
+use midshift_core::time::Utc;
 use midshift_store::{CommitError, Cursor, Query, SqliteStore, Store};
 use std::sync::Arc;
 
@@ -45,7 +46,8 @@ async fn commit(store: &dyn Store, items: Vec<Item>) -> Vec<bool> {
 async fn verify(store: &dyn Store, writer: Writer) -> Result<Verified, Broken> {
     let (table, service) = (Table::audit_of(writer).unwrap(), writer.as_str());
     let head = store.audit_heads().await.unwrap().remove(&writer).unwrap_or_default();
-    let mut chain = Chain::new(service, [Mark { service: service.to_owned(), head, by: "the store".to_owned() }]);
+    let noted = Mark { service: service.to_owned(), head, by: "the store".to_owned(), at_unix_ms: None };
+    let mut chain = Chain::new(service, [noted], Utc(i64::MAX));
     let mut after = None;
     loop {
         let page = store.list(Query { after, limit: 100, ..Query::all(table) }).await.unwrap();
