@@ -73,10 +73,11 @@ impl Cut {
 
 /// A robot and its server. All of it goes with this.
 struct Station {
-    home: tempfile::TempDir,
     server: Server,
     launcher: Running,
     updates: usize,
+    /// Last: what the others said lies in it.
+    home: tempfile::TempDir,
 }
 
 impl Drop for Station {

@@ -108,9 +108,11 @@ async fn asked_about(
     words: &Words,
     others: &Words,
 ) -> anyhow::Result<Option<String>> {
-    let answer = somebody.asks(method, method.filled(words)?, 1).await?;
+    let answer = match somebody.asks(method, method.filled(words)?, 1).await? {
+        Ok(answer) => Ok(method.read(&answer)?),
+        Err(status) => Err(status),
+    };
     // Items of a stream are refused in the answer.
-    let answer = answer.and_then(|answer| method.read(&answer).map_err(|e| tonic::Status::internal(e.to_string())));
     let code = match &answer {
         Ok(text) if text.contains(&format!("\"{}\"", Said::NotPermitted.as_str())) => Code::PermissionDenied,
         Ok(_) => Code::Ok,
