@@ -1,6 +1,7 @@
 //! How the two servers begin and end: what they refuse to begin with, what they print, and that they leave when asked to.
 
 use crate::harness::{Running, Server, channel, midshift, until};
+use crate::rolled_out::{call, done};
 use anyhow::Context;
 use midshift_proto::task::v1::WatchTasksRequest;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
@@ -107,4 +108,30 @@ async fn dev_ends_at_once_with_an_error_when_its_own_work_is_refused() -> anyhow
     assert_eq!(code, Some(1), "{said}");
     assert!(said.contains("the client ended before the run was over: background task refused"), "{said}");
     Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn dev_takes_the_sample_releases_with_the_keys_that_its_first_lines_name() -> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let log = dir.path().join("dev.log");
+    let mut command = Command::new(midshift()?);
+    let dev = command.args(["dev", "--robots", "2", "--keep-open", "4", "--listen", "127.0.0.1:0"]);
+    let _dev = Running::start(dev, &log)?;
+    let address = printed_address(&log).await?.to_string();
+    let flag = async |name: &str| {
+        let said = async || {
+            let log = std::fs::read_to_string(&log)?;
+            Ok(log.split_whitespace().skip_while(|word| *word != name).nth(1).map(str::to_owned))
+        };
+        until("dev to name its keys", LIMIT, said).await
+    };
+    let (repository, key) = (flag("--repository").await?, flag("--key").await?);
+    let samples = dir.path().join("samples").display().to_string();
+    done(&["bundle", "samples", &samples, "--config-only", "--repository", &repository, "--key", &key])?;
+    done(&["bundle", "push", "--server", &address, &repository])?;
+    let known = async || {
+        let listed = call(&["bundle", "ls", "--server", &address])?;
+        Ok(String::from_utf8_lossy(&listed.stdout).contains("1.5.0").then_some(()))
+    };
+    until("the release is known", LIMIT, known).await
 }
