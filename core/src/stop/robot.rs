@@ -266,66 +266,146 @@ mod tests {
     }
 
     /// What may happen to a robot, at any time and in any order.
-    #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+    #[derive(Clone, Copy, Debug, PartialEq, Eq)]
     enum Happens {
         Engaged(u8),
         Reset(u8),
         Resumed(u8),
+        /// People resume the silences that it waits for.
+        SilencesResumed,
         ToldAll,
         Answered,
+        /// Nobody answers for a minute.
+        Silence,
+        /// It comes to people, or leaves them.
+        Walked,
+        /// What was reset is forgotten by its age.
+        Forgot,
         Began,
     }
 
-    /// Walks every state that two stops, their resets and resumes, restarts and answers lead to.
+    /// Of one stop: it stood the robot, it was reset, and resumed after that.
+    type Facts = [(bool, bool, bool); 2];
+
+    #[derive(Clone)]
+    struct Way {
+        robot: RobotStop,
+        facts: Facts,
+        around: Around,
+        link_ms: u64,
+        level: StopLevel,
+        stage: Stage,
+    }
+
+    impl Way {
+        fn after(&self, happens: Happens) -> Self {
+            let mut next = self.clone();
+            let mut wall = Utc(3);
+            match happens {
+                Happens::Engaged(n) => {
+                    // A name that was forgotten here is a new stop.
+                    let latch = &next.robot.kept.latch;
+                    if latch.stop(&id(n)).is_none() && latch.reset_of(&id(n)).is_none() {
+                        next.facts[usize::from(n) - 1] = Default::default();
+                    }
+                    next.robot.told(vec![stop(n, StopLevel::Halt)], vec![]);
+                }
+                Happens::Reset(n) => {
+                    next.robot.told(vec![], vec![reset(n)]);
+                    next.facts[usize::from(n) - 1].1 = true;
+                }
+                Happens::Resumed(n) => {
+                    next.robot.resumed(&[id(n)].into());
+                    let fact = &mut next.facts[usize::from(n) - 1];
+                    fact.2 |= fact.1;
+                }
+                Happens::SilencesResumed => {
+                    let silences = next.silences();
+                    next.robot.resumed(&silences);
+                }
+                Happens::ToldAll => {
+                    next.robot.told_all(Latch::default());
+                }
+                Happens::Answered => {
+                    (1..4).for_each(|s| next.robot.answered(LinkTime(self.link_ms + s * 1_000)));
+                    next.link_ms += 3_000;
+                }
+                Happens::Silence => next.link_ms += 60_000,
+                Happens::Walked => {
+                    next.around = if self.around == Around::People { Around::Robots } else { Around::People };
+                }
+                Happens::Forgot => wall = wall.plus_ms(2 * limits::RESETS_KEPT.as_ms()),
+                Happens::Began => {
+                    let kept = next.robot.kept().clone();
+                    next.robot = RobotStop::begin(robot(), kept, LinkTime(self.link_ms));
+                }
+            }
+            let obeyed = next.robot.look(&Now { wall, ..at(next.link_ms) }, None, next.around);
+            (next.level, next.stage) = (obeyed.level, obeyed.stage);
+            for (n, fact) in [1, 2].into_iter().zip(&mut next.facts) {
+                fact.0 |= next.robot.kept().awaiting.contains(&id(n));
+            }
+            next
+        }
+
+        fn silences(&self) -> BTreeSet<StopId> {
+            self.robot.kept().awaiting.iter().filter(|id| is_silence(id)).cloned().collect()
+        }
+
+        fn is_free(&self) -> bool {
+            self.level < StopLevel::Halt
+        }
+
+        /// All of it but the moment.
+        fn key(&self) -> impl Ord + use<> {
+            let RobotStop { kept, is_told, was_heard, silence, .. } = &self.robot;
+            let of = |n| (kept.latch.stop(&id(n)).is_some(), kept.latch.reset_of(&id(n)).is_some());
+            let around = (self.around, self.stage, silence.is_some());
+            ([of(1), of(2)], kept.awaiting.clone(), *is_told, *was_heard, around, self.facts)
+        }
+    }
+
+    /// Walks every state that two stops, their resets and resumes, silences with and without people, what is forgotten, restarts and answers lead to.
     #[test]
     fn no_way_leads_from_standing_to_moving_without_a_reset_and_a_resume_of_each_stop() {
         let all = [1, 2].into_iter().flat_map(|n| [Happens::Engaged(n), Happens::Reset(n), Happens::Resumed(n)]);
-        let all: Vec<Happens> = all.chain([Happens::ToldAll, Happens::Answered, Happens::Began]).collect();
-        // Which stops stood the robot, which of them were reset, and which resumed after that.
-        let mut seen: BTreeSet<String> = BTreeSet::new();
-        let mut todo =
-            VecDeque::from([(RobotStop::begin(robot(), Kept::default(), LinkTime(0)), [(false, false, false); 2])]);
-        let mut stood_and_moved = 0;
-        while let Some((before, facts)) = todo.pop_front() {
+        let others = [Happens::ToldAll, Happens::Answered, Happens::Began, Happens::Silence, Happens::Walked];
+        let all: Vec<Happens> = all.chain(others).chain([Happens::Forgot, Happens::SilencesResumed]).collect();
+        let first = Way {
+            robot: RobotStop::begin(robot(), Kept::default(), LinkTime(0)),
+            facts: Facts::default(),
+            around: Around::Robots,
+            link_ms: 0,
+            level: StopLevel::Halt,
+            stage: Stage::Stand,
+        };
+        let (mut seen, mut todo) = (BTreeSet::from([first.key()]), VecDeque::from([first]));
+        let (mut stood_and_moved, mut let_go_of_silence) = (0, 0);
+        while let Some(before) = todo.pop_front() {
             for happens in &all {
-                let (mut robot, mut facts) = (before.clone(), facts);
-                let now = at(3_000);
-                match *happens {
-                    Happens::Engaged(n) => {
-                        robot.told(vec![stop(n, StopLevel::Halt)], vec![]);
-                    }
-                    Happens::Reset(n) => {
-                        robot.told(vec![], vec![reset(n)]);
-                        facts[usize::from(n) - 1].1 = true;
-                    }
-                    Happens::Resumed(n) => {
-                        robot.resumed(&[id(n)].into());
-                        let fact = &mut facts[usize::from(n) - 1];
-                        fact.2 |= fact.1;
-                    }
-                    Happens::ToldAll => {
-                        robot.told_all(Latch::default());
-                    }
-                    Happens::Answered => (1..4).for_each(|s| robot.answered(LinkTime(s * 1000))),
-                    Happens::Began => robot = RobotStop::begin(self::robot(), robot.kept().clone(), LinkTime(0)),
+                let after = before.after(*happens);
+                let silences = after.silences();
+                if after.is_free() {
+                    let facts = after.facts.iter();
+                    assert!(
+                        facts.clone().all(|(stood, was_reset, was_resumed)| !stood || *was_reset && *was_resumed),
+                        "{happens:?} freed {:?}",
+                        after.robot
+                    );
+                    assert!(silences.is_empty(), "{happens:?} freed it from a silence: {:?}", after.robot);
+                    stood_and_moved += facts.filter(|fact| fact.0).count();
                 }
-                let level = robot.look(&now, None, Around::Robots).level;
-                for (n, fact) in [1, 2].into_iter().zip(&mut facts) {
-                    fact.0 |= robot.kept().awaiting.contains(&id(n));
-                }
-                if level < StopLevel::Halt {
-                    for (stood, was_reset, was_resumed) in facts {
-                        assert!(!stood || was_reset && was_resumed, "{happens:?} freed {robot:?}");
-                        stood_and_moved += usize::from(stood);
-                    }
-                }
-                let state = ([robot.is_told, robot.was_heard], robot.kept.clone(), level, facts);
-                let key = format!("{state:?}");
-                if seen.insert(key) {
-                    todo.push_back((robot, facts));
+                // Only people end what a silence among people began, and every such silence that stood a moving robot begins it.
+                let is_resumed = *happens == Happens::SilencesResumed;
+                assert!(is_resumed || silences.is_superset(&before.silences()), "{happens:?}: {:?}", after.robot);
+                let was_among = before.is_free() && before.around == Around::People;
+                assert!(!was_among || *happens != Happens::Silence || !silences.is_empty(), "{:?}", after.robot);
+                let_go_of_silence += usize::from(is_resumed && after.is_free() != before.is_free());
+                if seen.insert(after.key()) {
+                    todo.push_back(after);
                 }
             }
         }
-        assert!(seen.len() > 50 && stood_and_moved > 0, "{} states, {stood_and_moved} freed", seen.len());
+        assert!(seen.len() > 1_000 && stood_and_moved > 0 && let_go_of_silence > 0, "{} states", seen.len());
     }
 }
