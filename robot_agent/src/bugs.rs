@@ -15,4 +15,6 @@ midshift_core::seeded_bugs! {
     AnyDrainWillDo any_drain_will_do;
     /// A robot changes its software whatever it does, and stopped or not.
     ActivatesAnyway activates_anyway;
+    /// A reset takes away every stop that the robot knows, and not only the one that it names.
+    ResetClearsAll reset_clears_all;
 }

@@ -29,17 +29,21 @@ pub enum Sweep {
     Updates,
     /// The stop service, and a robot that keeps what it is told of stops, are killed at each call that changes their files: all of them, whatever the seeds.
     Latch,
+    /// Robots at work in the deterministic simulation while stops are engaged and reset, lines to the stop service are cut, and everybody is killed.
+    Stops,
     /// Twenty robots, five of them launcher and agent processes, get a good release and three bad ones: about ten minutes a seed.
     Stories,
 }
 
 impl Sweep {
-    const ALL: [Self; 6] = [Self::Kills, Self::Simulation, Self::Split, Self::Updates, Self::Latch, Self::Stories];
+    const ALL: [Self; 7] =
+        [Self::Kills, Self::Simulation, Self::Split, Self::Updates, Self::Latch, Self::Stops, Self::Stories];
 
     fn seeds(self) -> u64 {
         match self {
             Self::Kills => 20,
             Self::Simulation => 2_000,
+            Self::Stops => 100,
             Self::Split | Self::Updates | Self::Latch => 1,
             Self::Stories => 2,
         }
@@ -48,7 +52,7 @@ impl Sweep {
     /// Whether what it does comes of seeds.
     const fn draws(self) -> bool {
         match self {
-            Self::Kills | Self::Simulation | Self::Stories => true,
+            Self::Kills | Self::Simulation | Self::Stops | Self::Stories => true,
             Self::Split | Self::Updates | Self::Latch => false,
         }
     }
@@ -57,11 +61,8 @@ impl Sweep {
         match self {
             Self::Kills => each_seed(workspace, "kills", "kill::", from, seeds),
             Self::Stories => each_seed(workspace, "stories", "story::", from, seeds),
-            Self::Simulation => {
-                let mut command = test(workspace, "simulation", "many_seeds_keep_every_law");
-                command.env("MIDSHIFT_SEED_FROM", from.to_string()).env("MIDSHIFT_SEEDS", seeds.to_string());
-                counted(&mut command)
-            }
+            Self::Simulation => simulated(workspace, "many_seeds_keep_every_law", from, seeds),
+            Self::Stops => simulated(workspace, "stopped::in_cuts_and_kills", from, seeds),
             Self::Split => split(workspace, seeds),
             Self::Updates => every_site(workspace, "midshift-agent", "agent", "power::"),
             Self::Latch => Ok(every_site(workspace, "midshift-stop", "stop", "killed::")?
@@ -96,6 +97,11 @@ fn every_site(workspace: &Workspace, package: &str, target: &str, filter: &str) 
 
 fn test(workspace: &Workspace, target: &str, filter: &str) -> Command {
     workspace.cargo(&["test", "--package", "midshift-tests", "--test", target, "--", filter, "--nocapture"])
+}
+
+fn simulated(workspace: &Workspace, filter: &str, from: u64, seeds: u64) -> Result<bool> {
+    let mut command = test(workspace, "simulation", filter);
+    counted(command.env("MIDSHIFT_SEED_FROM", from.to_string()).env("MIDSHIFT_SEEDS", seeds.to_string()))
 }
 
 /// Real programs, once with each seed of `from .. from + seeds`. Ends at the first that breaks a law.

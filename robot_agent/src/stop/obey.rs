@@ -11,6 +11,7 @@ use crate::governor;
 use crate::work::{Doing, Work};
 use midshift_core::ids::{AreaId, StopId};
 use midshift_core::robot::{Lane, StopLevel};
+use midshift_core::stop::Reset;
 use midshift_core::stop::ladder::Around;
 use midshift_core::time::{LinkTime, Now, SiteDuration, SiteTime};
 use midshift_core::work::{DesiredWork, RobotEvent};
@@ -47,7 +48,14 @@ impl AgentCore {
         self.stop.as_ref().map(|stop| stop.awaiting()).unwrap_or_default()
     }
 
-    pub(crate) fn hear_stop(&mut self, now: &Now, news: StopNews) {
+    pub(crate) fn hear_stop(&mut self, now: &Now, mut news: StopNews) {
+        if let StopNews::Told { resets, .. } = &mut news
+            && self.config.bugs.reset_clears_all()
+            && let Some(reset) = resets.first().cloned()
+        {
+            let known = self.kept_stops().map(|stop| stop.stop_id.clone());
+            resets.extend(known.map(|stop_id| Reset { stop_id, ..reset.clone() }));
+        }
         if let Some(stop) = &mut self.stop {
             stop.hear(now.link, news);
         }

@@ -5,8 +5,9 @@
 use crate::body::WatchedBody;
 use crate::clock::{MachineClock, Skew, TrueTime};
 use crate::disk::RobotDisk;
-use crate::net::{Ear, SimDial, Wire};
+use crate::net::{Ear, SERVER, SimDial, Wire};
 use crate::observer::Shared;
+use crate::stops;
 use crate::worker::SlowWorker;
 use midshift_agent::body::Body;
 use midshift_agent::bugs::Bugs;
@@ -44,6 +45,8 @@ pub struct Agent {
     pub ear: Ear,
     /// Who counts what is lost.
     pub wire: Wire,
+    /// Its line to the stop service, and what it keeps of stops; none: it has no such line.
+    pub stop: Option<stops::RobotLine>,
     /// Ledger and ring.
     pub memory: RobotMemory,
     /// Its sets, and who starts them.
@@ -117,7 +120,7 @@ impl Agent {
         let updates = self.launched.updates(&self.trust, bulk.clone())?;
         let worker = SlowWorker::new(updates.worker, self.launched.clone(), &robot_id, &self.observer, number);
         let config = AgentConfig {
-            stop: None,
+            stop: self.stop.as_ref().map(|line| line.dial(machine(self.robot))),
             update: Some(Updates { worker: Box::new(worker), ..updates }),
             robot_id: robot_id.clone(),
             boot_id: format!("boot-{}-{life}", self.robot),
@@ -156,6 +159,6 @@ impl Agent {
     }
 
     fn dial(&self) -> SimDial {
-        SimDial { ear: self.ear.clone(), machine: machine(self.robot), wire: self.wire.clone() }
+        SimDial { to: SERVER, ear: self.ear.clone(), machine: machine(self.robot), wire: self.wire.clone() }
     }
 }

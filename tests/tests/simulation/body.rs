@@ -48,6 +48,9 @@ impl Body for WatchedBody {
     fn stop(&mut self, now: SiteTime, level: StopLevel) {
         self.inner.stop(now, level);
     }
+    fn obeys(&mut self, now: SiteTime, level: StopLevel) {
+        self.inner.obeys(now, level);
+    }
     fn standstill(&self, now: SiteTime) -> bool {
         self.inner.standstill(now)
     }

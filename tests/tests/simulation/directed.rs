@@ -29,6 +29,7 @@ pub fn config(seed: u64, robots: usize, naive: Naive) -> RoomConfig {
         faults: FaultRates::none(),
         naive,
         planners: 1,
+        stops: false,
         site: DEMO.to_owned(),
     }
 }

@@ -20,6 +20,8 @@ mod plan;
 mod room;
 mod run;
 mod software;
+mod stopped;
+mod stops;
 mod worker;
 
 use midshift::server::Naive as Server;

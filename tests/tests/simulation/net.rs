@@ -16,6 +16,8 @@ use turmoil::net::{TcpListener, TcpStream};
 
 /// Name of the server's machine.
 pub const SERVER: &str = "server";
+/// Name of the stop service's machine.
+pub const STOPS: &str = "stops";
 const PORT: u16 = 7420;
 
 /// How the way between the server and one machine is.
@@ -125,17 +127,19 @@ pub async fn incoming(wire: Wire) -> io::Result<ReceiverStream<io::Result<Connec
     Ok(ReceiverStream::new(accepted))
 }
 
-async fn connect(_: Uri) -> io::Result<TokioIo<TcpStream>> {
-    Ok(TokioIo::new(TcpStream::connect((SERVER, PORT)).await?))
-}
-
-fn uri() -> String {
-    format!("http://{SERVER}:{PORT}")
+fn uri(to: &str) -> String {
+    format!("http://{to}:{PORT}")
 }
 
 /// A channel of a person or program, which connects when it is used.
 pub fn channel() -> anyhow::Result<Channel> {
-    Ok(Endpoint::from_shared(uri())?.connect_with_connector_lazy(tower::service_fn(connect)))
+    channel_to(SERVER)
+}
+
+/// The same to another machine.
+pub fn channel_to(to: &'static str) -> anyhow::Result<Channel> {
+    let connect = move |_: Uri| async move { TcpStream::connect((to, PORT)).await.map(TokioIo::new) };
+    Ok(Endpoint::from_shared(uri(to))?.connect_with_connector_lazy(tower::service_fn(connect)))
 }
 
 /// What a machine reads from the network; while it is held, bytes wait and then come at once, and what the machine sends arrives.
@@ -195,6 +199,8 @@ impl AsyncWrite for Heard {
 
 /// The way of a robot.
 pub struct SimDial {
+    /// Name of the machine that it leads to.
+    pub to: &'static str,
     /// What it hears with.
     pub ear: Ear,
     /// Name of its machine.
@@ -206,15 +212,15 @@ pub struct SimDial {
 #[async_trait::async_trait]
 impl Dial for SimDial {
     async fn dial(&self) -> Result<Channel, dial::Error> {
-        let (ear, machine, wire) = (self.ear.clone(), self.machine.clone(), self.wire.clone());
+        let (to, ear, machine, wire) = (self.to, self.ear.clone(), self.machine.clone(), self.wire.clone());
         let connect = move |_: Uri| {
             let (ear, machine, wire) = (ear.clone(), machine.clone(), wire.clone());
             async move {
-                let stream = TcpStream::connect((SERVER, PORT)).await?;
+                let stream = TcpStream::connect((to, PORT)).await?;
                 Ok::<_, io::Error>(TokioIo::new(Heard { stream, ear, machine, wire }))
             }
         };
-        let connected = dial::endpoint(&uri())?.connect_with_connector(tower::service_fn(connect)).await;
+        let connected = dial::endpoint(&uri(to))?.connect_with_connector(tower::service_fn(connect)).await;
         connected.map_err(|error| dial::Error(error.into()))
     }
 }

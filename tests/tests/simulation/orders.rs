@@ -7,6 +7,8 @@ use midshift_proto::fleet::v1::DrainRobotRequest;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::ota::v1 as ota;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
+use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
+use midshift_proto::stop::v1::{EngageRequest, ResetRequest};
 use midshift_proto::task::v1::ResumeHeldRequest;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use tonic::transport::Channel;
@@ -54,6 +56,10 @@ pub enum Order {
         /// Never used again.
         request_id: String,
     },
+    /// A person stops robots. Asked again by the same request_id it is one stop.
+    Engage(Box<EngageRequest>),
+    /// A person resets a stop by its name.
+    Reset(String),
     /// What a person does about a roll-out that waits for one: goes on with one that stands still, ends one that must be judged.
     Settle(String),
 }
@@ -146,8 +152,20 @@ async fn ask(order: &Order) -> Result<(), Status> {
             };
             TaskServiceClient::new(channel).resume_held(request).await.map(drop)
         }
+        Order::Engage(request) => {
+            let mut told = stops()?.engage(*request).await?.into_inner();
+            told.message().await.map(drop)
+        }
+        Order::Reset(stop_id) => {
+            stops()?.reset(ResetRequest { stop_id, reason: "looked, is clear".to_owned() }).await.map(drop)
+        }
         Order::Settle(id) => settle(&mut client, id).await,
     }
+}
+
+fn stops() -> Result<StopServiceClient<Channel>, Status> {
+    let channel = net::channel_to(net::STOPS).map_err(|e| Status::unavailable(e.to_string()))?;
+    Ok(StopServiceClient::new(channel))
 }
 
 async fn start(client: &mut Client, rollout_id: String, supersede: bool) -> Result<(), Status> {

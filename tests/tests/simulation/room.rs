@@ -10,6 +10,7 @@ use crate::disk::{ServerDisk, ServerFrames};
 use crate::net::{self, Ear, SERVER, Wire};
 use crate::observer::Shared;
 use crate::software::Software;
+use crate::stops::Stops;
 use midshift::roles::Roles;
 use midshift::server::{Parts, Server};
 use midshift_agent::body::Body;
@@ -26,6 +27,7 @@ use midshift_sim::faults::{FaultRates, Injected};
 use midshift_sim::hall::{Hall, HallConfig};
 use midshift_sim::launched::Launched;
 use midshift_store::{FRAME_BYTES_DEFAULT, FrameLog, MemoryFrames, MemoryStore, StoreId};
+use std::path::PathBuf;
 use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Duration;
@@ -70,6 +72,8 @@ pub struct RoomConfig {
     pub naive: Naive,
     /// Planners of roll-outs on the one store; two race.
     pub planners: usize,
+    /// A stop service is beside the server, and every robot has a line to it.
+    pub stops: bool,
     /// Text of the site.
     pub site: String,
 }
@@ -92,6 +96,8 @@ pub struct Room {
     pub ears: Vec<Ear>,
     /// Ways to the robots, and what was written on broken ones.
     pub wire: Wire,
+    /// The stop service, if there is one.
+    pub stop: Option<Stops>,
     /// Releases.
     pub software: Arc<Software>,
     launched: Vec<Arc<Launched>>,
@@ -134,7 +140,9 @@ impl Room {
         let software = Arc::new(Software::make(clock.now().wall, site.site_id().clone())?);
         let keys = software.trust.directive_keys.clone();
         observer.look().changes().watch(keys, software.signed.clone(), hall.robots());
-        serve(&mut sim, &time, &site, disk.clone(), frames, config, &wire, &software);
+        let stop = if config.stops { Some(Stops::open(&mut sim, &time, &site, config.robots)?) } else { None };
+        let folder = stop.as_ref().map(Stops::folder);
+        serve(&mut sim, &time, &site, disk.clone(), frames, config, &wire, &software, folder);
         let ears: Vec<Ear> = (0..config.robots).map(|_| Ear::default()).collect();
         let launched: Vec<_> = hall.robots().iter().map(|body| Arc::new(Launched::new(None, body))).collect();
         for (robot, ear) in ears.iter().enumerate() {
@@ -147,6 +155,7 @@ impl Room {
                 skew: config.skews.get(robot).copied().unwrap_or_default(),
                 ear: ear.clone(),
                 wire: wire.clone(),
+                stop: stop.as_ref().map(|stops| stops.line(robot)),
                 memory: RobotMemory::new(),
                 launched: launched[robot].clone(),
                 trust: software.trust.clone(),
@@ -159,7 +168,7 @@ impl Room {
         let of_client = desk.clone();
         sim.host(CLIENT, move || client::run(of_client.clone()));
         let stops = vec![None; config.robots];
-        Ok(Self { sim, time, observer, hall, disk, desk, ears, wire, software, launched, stops, steps: 0 })
+        Ok(Self { sim, time, observer, hall, disk, desk, ears, wire, stop, software, launched, stops, steps: 0 })
     }
     /// True time so far, milliseconds.
     pub fn now_ms(&self) -> u64 {
@@ -256,12 +265,13 @@ fn serve(
     config: &RoomConfig,
     wire: &Wire,
     software: &Arc<Software>,
+    stops: Option<PathBuf>,
 ) {
     let (naive, planners, site_text) = (config.naive, config.planners, config.site.clone());
     let (time, site, wire, software) = (time.clone(), site.clone(), wire.clone(), software.clone());
     sim.host(SERVER, move || {
         let (time, site, disk, frames) = (time.clone(), site.clone(), disk.clone(), frames.clone());
-        let (wire, software, site_text) = (wire.clone(), software.clone(), site_text.clone());
+        let (wire, software, site_text, stops) = (wire.clone(), software.clone(), site_text.clone(), stops.clone());
         async move {
             loop {
                 let clock = MachineClock::boot(&time, Skew::default());
@@ -279,7 +289,7 @@ fn serve(
                     reader: None,
                     sim: None,
                     naive: naive.server,
-                    stops: None,
+                    stops: stops.clone(),
                     identity: None,
                     port: midshift::door::alone("business"),
                     planning: tokio::runtime::Handle::current(),

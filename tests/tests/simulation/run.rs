@@ -86,6 +86,7 @@ impl Shift {
             faults,
             naive,
             planners: 1,
+            stops: false,
             site: DEMO.to_owned(),
         };
         Ok(Self {

@@ -1,0 +1,123 @@
+//! The stop service on a machine of its own beside the server, and each robot's line to it.
+//!
+//! Invariant: its folder outlives its process, and what a robot keeps of stops outlives the robot's; everything else dies with its process.
+
+use crate::agent::machine;
+use crate::clock::{MachineClock, Skew, TrueTime};
+use crate::net::{self, Ear, STOPS, SimDial, Way, Wire};
+use midshift_agent::stop::keep::MemoryStops;
+use midshift_agent::stop::line::StopLine;
+use midshift_core::ids::StopId;
+use midshift_core::site::Site;
+use midshift_core::stop::Latch;
+use midshift_core::stop::robot::Kept;
+use midshift_stop::{Error, Parts, StopService};
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+use tempfile::TempDir;
+use tokio_util::sync::CancellationToken;
+use tonic::transport::Server;
+
+/// A service manager starts it again after this.
+const AGAIN: Duration = Duration::from_millis(200);
+
+/// One robot's line, and what it keeps.
+#[derive(Clone)]
+pub struct RobotLine {
+    kept: MemoryStops,
+    wire: Wire,
+}
+
+impl RobotLine {
+    /// For one process of the robot.
+    pub fn dial(&self, machine: String) -> StopLine {
+        let dial = SimDial { to: STOPS, ear: Ear::default(), machine, wire: self.wire.clone() };
+        StopLine { dial: Arc::new(dial), keep: Box::new(self.kept.clone()) }
+    }
+}
+
+/// The stop service, its folder and the robots' lines.
+pub struct Stops {
+    folder: TempDir,
+    lines: Vec<RobotLine>,
+    wire: Wire,
+}
+
+impl Stops {
+    /// Puts its machine into the network.
+    pub fn open(
+        sim: &mut turmoil::Sim<'static>,
+        time: &TrueTime,
+        site: &Arc<Site>,
+        robots: usize,
+    ) -> anyhow::Result<Self> {
+        let (folder, wire) = (TempDir::new()?, Wire::default());
+        let path = folder.path().join("stop");
+        let (time, site, of_service) = (time.clone(), site.clone(), wire.clone());
+        sim.host(STOPS, move || live(path.clone(), site.clone(), time.clone(), of_service.clone()));
+        let lines = (0..robots).map(|_| RobotLine { kept: MemoryStops::default(), wire: wire.clone() }).collect();
+        Ok(Self { folder, lines, wire })
+    }
+    /// Where it keeps its files.
+    pub fn folder(&self) -> PathBuf {
+        self.folder.path().join("stop")
+    }
+    /// One robot's line.
+    pub fn line(&self, robot: usize) -> RobotLine {
+        self.lines[robot].clone()
+    }
+    /// What one robot's file has.
+    pub fn kept(&self, robot: usize) -> Kept {
+        self.lines[robot].kept.kept()
+    }
+    /// What the service's file has.
+    pub fn latch(&self) -> Latch {
+        latch(&self.folder())
+    }
+    /// Messages on broken lines.
+    pub fn hits(&self) -> u64 {
+        self.wire.hits().values().sum()
+    }
+    /// Makes the line of one robot so: open or cut.
+    pub fn steer(&self, sim: &turmoil::Sim<'static>, robot: usize, way: Way) {
+        let other = machine(robot);
+        match (self.wire.set_way(&other, way), way) {
+            (Way::Open, Way::Cut) => sim.partition(STOPS, other.as_str()),
+            (Way::Cut, Way::Open) => sim.repair(STOPS, other.as_str()),
+            _ => {}
+        }
+    }
+}
+
+/// Names of what is engaged and not reset.
+pub fn effective(latch: &Latch) -> BTreeSet<StopId> {
+    latch.effective().map(|stop| stop.stop_id.clone()).collect()
+}
+
+fn latch(folder: &Path) -> Latch {
+    midshift_stop::latch(folder).expect("the latch can be read").map(|(_, latch)| latch).unwrap_or_default()
+}
+
+async fn live(folder: PathBuf, site: Arc<Site>, time: TrueTime, wire: Wire) -> turmoil::Result {
+    loop {
+        let clock = MachineClock::boot(&time, Skew::default());
+        let parts = Parts { folder: folder.clone(), site: Some(site.clone()), clock };
+        match StopService::open(parts, CancellationToken::new()) {
+            Ok(service) => {
+                let incoming = net::incoming(wire.clone()).await?;
+                let drained = service.drained().cancelled_owned();
+                let port = Server::builder()
+                    .add_service(service.grpc())
+                    .add_service(service.link())
+                    .serve_with_incoming_shutdown(incoming, drained);
+                midshift_stop::serve(service, port).await??;
+            }
+            // The process before has not let go of it yet.
+            Err(Error::Latch(_)) => {}
+            Err(error) => return Err(error.into()),
+        }
+        tokio::time::sleep(AGAIN).await;
+    }
+}
