@@ -275,6 +275,8 @@ pub const STOPS_FOR_FLEET: usize = 16;
 pub const RESETS_MAX: usize = 2_048;
 /// A reset is remembered so long, for robots that were away.
 pub const RESETS_KEPT: LinkDuration = LinkDuration::from_secs(90 * 24 * 3_600);
+/// How often the stop service looks for resets that are older than that.
+pub const RESETS_FORGOTTEN_EVERY: LinkDuration = LinkDuration::from_secs(3_600);
 /// Bytes of the mark by which a stop service knows a stop of its own again.
 pub const STOP_PROOF_BYTES: usize = 64;
 /// Boxes that tell where a stop is: some 2 KiB of a message; larger ones take the place of more.
@@ -317,13 +319,28 @@ pub const STOP_REQUESTS_MAX: usize = 1_024;
 pub const STOP_DENIALS_PER_MINUTE: u32 = 60;
 /// Records of the audit of stops that wait for the disk; of more the count is kept.
 pub const STOP_AUDIT_QUEUE: usize = 1_024;
+/// Whoever writes down for the stop service who is known says so often that it still does, also if nothing changes.
+pub const PRINCIPALS_TOLD_EVERY: LinkDuration = LinkDuration::from_secs(10);
 /// Bytes of a slot of the latch file: 2,048 resets with their stops and 256 stops with 128 boxes each, as JSON.
 pub const STOP_LATCH_BYTES: usize = 8 * 1024 * 1024;
 
 // --- the edge: what a connection may take before, and beside, what its requests may. All L.
 
-/// Connections of one port. Below the 20,000 descriptors that some systems give a process at most, with room for files.
+/// Connections of one port, if the process may have as many descriptors. Below the 20,000 that some systems give at most, with room for files.
 pub const CONNECTIONS_MAX: usize = 16_384;
+/// Descriptors of a process that no connection takes: databases, files of stops and software, and who is known.
+pub const DESCRIPTORS_KEPT: usize = 512;
+/// A port that could take fewer connections than this does not open: a handful of robots with the people beside them need as many.
+pub const CONNECTIONS_LEAST: usize = 64;
+/// Of what a port with login takes, one in so many is for whoever has not shown yet who it is: connections, and requests without a certificate or a
+/// good token.
+pub const STRANGERS_PART: usize = 4;
+/// Requests of all these under way at a time; the largest message they may send is 64 KiB, so that all of them hold 128 MiB at most.
+pub const STRANGER_REQUESTS_MAX: usize = 2_048;
+/// Bytes of a question about health: the name of a service.
+pub const HEALTH_MESSAGE_BYTES: usize = 1_024;
+/// A peer that neither takes what is sent to it nor answers the system's own probes for so long is gone: what of HTTP/1.1 has no pings.
+pub const PEER_GONE: LinkDuration = LinkDuration::from_secs(60);
 /// Of these, so many from one address (one /64 of IPv6): a quarter, for a site's robots may stand behind one router.
 pub const CONNECTIONS_PER_NETWORK_MAX: usize = 4_096;
 /// A TLS handshake is done within this: three round trips on the worst radio link, ten times over.

@@ -19,9 +19,9 @@ fn method(path: &str) -> Option<Access> {
 /// What is not declared in a .proto of ours: health, reflection, pages.
 fn foreign(path: &str) -> Option<Access> {
     let (permission, class) = match path {
-        "/ready" | "/grpc.health.v1.Health/Check" | "/grpc.health.v1.Health/Watch" => {
-            (Permission::Anybody, Class::Control)
-        }
+        "/ready" | "/grpc.health.v1.Health/Check" => (Permission::Anybody, Class::Control),
+        // It stays open for as long as its caller likes.
+        "/grpc.health.v1.Health/Watch" => (Permission::SignedIn, Class::Status),
         "/metrics" => (Permission::Read, Class::Status),
         _ if path.starts_with("/grpc.reflection.") => (Permission::SignedIn, Class::Status),
         _ if ["/metadata/", "/targets/"].iter().any(|pages| path.starts_with(pages)) => {
@@ -81,7 +81,9 @@ mod tests {
         assert_eq!(of("/midshift.task.v1.TaskService/DropAll"), None);
         assert_eq!(check(&Caller::nobody(), "/elsewhere").expect_err("nobody").kind(), Kind::Unauthenticated);
         assert!(check(&Caller::nobody(), "/grpc.health.v1.Health/Check").is_ok());
-        assert!(check(&Caller::nobody(), "/metrics").is_err());
+        for closed in ["/metrics", "/grpc.health.v1.Health/Watch"] {
+            assert!(check(&Caller::nobody(), closed).is_err(), "{closed}");
+        }
         let robot = Caller::robot(midshift_core::ids::RobotId::parse("r7").expect("an id"));
         assert_eq!(check(&robot, "/elsewhere").expect_err("a robot").kind(), Kind::Denied);
     }

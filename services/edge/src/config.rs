@@ -13,7 +13,7 @@ use std::time::Duration;
 pub struct Config {
     /// Which port this is, as metrics and logs name it.
     pub port: &'static str,
-    /// Connections, handshakes included.
+    /// Connections, handshakes included. With TLS a quarter of them, and no more, has not shown yet who it is ([`limits::STRANGERS_PART`]).
     pub connections_max: usize,
     /// Of these, from one IPv4 address or one /64 of IPv6. A proxy in front is one address.
     pub connections_per_network_max: usize,
@@ -37,7 +37,7 @@ pub struct Config {
     pub header_list_bytes: u32,
     /// How old a connection gets; none: as old as it likes.
     pub age: Option<Age>,
-    /// Requests under way, streams included.
+    /// Requests under way, streams included. A quarter of them, and no more than [`limits::STRANGER_REQUESTS_MAX`], is of nobody known.
     pub requests_max: usize,
     /// Of these, of one principal.
     pub requests_per_principal_max: usize,

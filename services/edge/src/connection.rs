@@ -1,13 +1,17 @@
 //! One connection from the handshake to its end: proven, admitted, served, asked to go, cut.
 //!
-//! Invariant: at each moment something ends it that the peer has no say in: the handshake's time, the first request's, the idle one, keep-alive
-//! pings, its age, a denial, or the stop of the port. Nothing here waits for a service.
+//! Invariant: at each moment something ends it that the peer has no say in: the handshake's time, the first request's, the idle one, its age, a denial, or
+//! the stop of the port; a dead peer is found by HTTP/2's pings, and by the probes of the system ([`crate::Listen`] of a socket) where HTTP/1.1 has none. A
+//! live one that keeps a stream of HTTP/1.1 open has it until its age. Nothing here waits for a service.
 
 use crate::activity::{Activity, Unused};
+use crate::asker::Asker;
 use crate::config::{Config, std};
 use crate::denials::Denials;
 use crate::peer::{ConnectionId, Denied, Peer, Principals};
 use crate::requests::{Door, Rules};
+use crate::seats::network;
+use crate::stranger::Stranger;
 use http::{Request, Response};
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto;
@@ -109,12 +113,18 @@ where
     S::Future: Send,
 {
     /// From the first byte to the end. Dropping it cuts the connection.
-    pub async fn run<Io>(self: Arc<Self>, io: Io, address: SocketAddr, id: ConnectionId, stop: CancellationToken) -> End
+    pub async fn run<Io>(
+        self: Arc<Self>,
+        io: Io,
+        address: SocketAddr,
+        (id, stranger): (ConnectionId, Stranger),
+        stop: CancellationToken,
+    ) -> End
     where
         Io: AsyncRead + AsyncWrite + Unpin + Send + 'static,
     {
         let Some(tls) = &self.tls else {
-            return self.serve(io, Peer::new(address, None, id), stop).await;
+            return self.serve(io, Peer::new(address, None, id), stranger, stop).await;
         };
         // What is newest now; a connection keeps it.
         let acceptor = TlsAcceptor::from(tls.borrow().clone());
@@ -132,10 +142,10 @@ where
         };
         let shown = io.get_ref().1.peer_certificates().and_then(<[_]>::first);
         let leaf = shown.map(|leaf| leaf.clone().into_owned());
-        self.serve(io, Peer::new(address, leaf, id), stop).await
+        self.serve(io, Peer::new(address, leaf, id), stranger, stop).await
     }
 
-    async fn serve<Io>(&self, io: Io, peer: Peer, stop: CancellationToken) -> End
+    async fn serve<Io>(&self, io: Io, peer: Peer, stranger: Stranger, stop: CancellationToken) -> End
     where
         Io: AsyncRead + AsyncWrite + Unpin + Send + 'static,
     {
@@ -144,12 +154,16 @@ where
         if let Err(denied) = self.principals.admit(&peer) {
             return self.denied(&peer, denied);
         }
+        if peer.certificate.is_some() {
+            stranger.is_known();
+        }
         let activity = Activity::new();
         let door = Door {
             services: self.services.clone(),
             rules: self.rules.clone(),
             activity: activity.clone(),
             peer: peer.clone(),
+            stranger,
             principals: self.principals.clone(),
             denials: self.denials.clone(),
         };
@@ -226,7 +240,15 @@ where
 
     fn denied(&self, peer: &Peer, denied: Denied) -> End {
         let (port, connection) = (self.config.port, peer.connection.0);
-        tracing::info!(port, connection, address = %peer.address, denied = %denied, "a connection was denied");
+        let asker = Asker::Stranger(network(peer.address.ip()));
+        match &self.denials {
+            Some(denials) if denials.is_fit(&asker) => {
+                tracing::info!(port, connection, address = %peer.address, denied = %denied, "a connection was denied");
+            }
+            _ => {
+                tracing::debug!(port, connection, address = %peer.address, denied = %denied, "a connection was denied")
+            }
+        }
         End::Denied
     }
 

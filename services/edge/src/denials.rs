@@ -3,8 +3,8 @@
 //! Invariant: nothing waits for it. What is handed over is limited, for each caller and for all, so that no flood of refusals fills a disk; what was left
 //! out is counted, and the count goes with the next one that is not.
 
+use crate::asker::Asker;
 use crate::rates::{Bucket, Rates};
-use crate::requests::Asker;
 use midshift_core::limits;
 use midshift_core::overload::Class;
 use midshift_core::reason::{Code, Reason};
@@ -54,16 +54,27 @@ impl Denials {
         (Self { port, sink, each, all, left_out: AtomicU64::new(0) }, told)
     }
 
-    pub(crate) fn tell(&self, asker: &Asker, actor: String, network: IpAddr, path: &str, reason: &Reason) {
+    /// Whether one more of this asker may leave a trace. It counts as one that did.
+    pub(crate) fn is_fit(&self, asker: &Asker) -> bool {
         let now = Instant::now();
-        let is_fit = self.each.take(asker, now, Class::Stop) && self.all.take(&(), now, Class::Stop);
-        let Some(place) = is_fit.then(|| self.sink.try_reserve().ok()).flatten() else {
+        self.each.take(asker, now, Class::Stop) && self.all.take(&(), now, Class::Stop)
+    }
+
+    /// Whether it was handed over.
+    pub(crate) fn tell(&self, asker: &Asker, actor: String, network: IpAddr, path: &str, reason: &Reason) -> bool {
+        let Some(place) = self.is_fit(asker).then(|| self.sink.try_reserve().ok()).flatten() else {
             self.left_out.fetch_add(1, Relaxed);
             metrics::counter!("midshift_edge_denials_left_out_total", "port" => self.port).increment(1);
-            return;
+            return false;
         };
-        let path = path.get(..path.floor_char_boundary(limits::DENIED_PATH_BYTES)).unwrap_or_default().to_owned();
+        let path = cut(path).to_owned();
         let (robot_id, code) = (reason.metadata.get("robot_id").cloned(), reason.code);
         place.send(Denial { actor, network, path, robot_id, code, left_out: self.left_out.swap(0, Relaxed) });
+        true
     }
+}
+
+/// As much of a path as is kept and shown.
+pub(crate) fn cut(path: &str) -> &str {
+    path.get(..path.floor_char_boundary(limits::DENIED_PATH_BYTES)).unwrap_or_default()
 }

@@ -11,6 +11,7 @@
 mod accept;
 mod activity;
 mod answer;
+mod asker;
 mod config;
 mod connection;
 mod deadline;
@@ -20,7 +21,9 @@ mod listen;
 mod peer;
 mod rates;
 mod requests;
+mod room;
 mod seats;
+mod stranger;
 pub mod tls;
 
 pub use config::{Age, Config, Rate};
@@ -28,17 +31,21 @@ pub use denials::{Denial, Denials};
 pub use known::{Known, robot_of, serial_of};
 pub use listen::{Incoming, Listen};
 pub use peer::{Anybody, ConnectionId, Denied, Peer, Principals};
+pub use room::{TooFew, connections_max};
 
 use accept::Accept;
 use config::std;
 use connection::{End, Port};
 use http::{Request, Response};
+use midshift_core::limits;
 use midshift_core::overload::Class;
 use requests::Rules;
 use rustls::ServerConfig;
-use seats::{Full, Seats, network};
+use seats::{Full, Seat, Seats, network};
 use std::convert::Infallible;
+use std::net::IpAddr;
 use std::sync::Arc;
+use stranger::Stranger;
 use tokio::sync::watch;
 use tokio::task::{JoinError, JoinSet};
 use tokio::time::timeout;
@@ -88,7 +95,7 @@ where
     pub async fn serve<L: Listen>(self, listener: L, stop: CancellationToken) -> Served {
         let shared = Arc::new(self.port);
         let (config, name) = (&shared.config, shared.config.port);
-        let seats = Seats::new(config.connections_max, config.connections_per_network_max);
+        let places = Places::new(config, shared.tls.is_some());
         let gauge = metrics::gauge!("midshift_edge_connections", "port" => name);
         let (mut accept, mut connections, mut last) = (Accept::new(listener, name), JoinSet::new(), 0);
         let leave = stop.child_token();
@@ -104,10 +111,11 @@ where
                 accepted = accept.next() => accepted,
             };
             let Some((io, address)) = accepted else { break };
-            match seats.take(network(address.ip()), Class::Stop) {
-                Ok(seat) => {
+            match places.take(network(address.ip())) {
+                Ok((seat, stranger)) => {
                     last += 1;
-                    let connection = shared.clone().run(io, address, ConnectionId(last), leave.clone());
+                    let who = (ConnectionId(last), stranger);
+                    let connection = shared.clone().run(io, address, who, leave.clone());
                     connections.spawn(async move {
                         let end = connection.await;
                         drop(seat);
@@ -116,7 +124,9 @@ where
                     gauge.set(connections.len() as f64);
                 }
                 // Dropped with `io`: closed at once, before a byte of it is read.
-                Err(full) => refuse(name, full),
+                Err(reason) => {
+                    metrics::counter!("midshift_edge_refused_total", "port" => name, "reason" => reason).increment(1);
+                }
             }
         }
         drop(accept);
@@ -137,12 +147,33 @@ where
     }
 }
 
-fn refuse(port: &'static str, full: Full) {
-    let reason = match full {
-        Full::Total => "connections_max",
-        Full::Kind => "connections_per_network_max",
-    };
-    metrics::counter!("midshift_edge_refused_total", "port" => port, "reason" => reason).increment(1);
+/// Places of connections: of all, and, where there is a login, of those that have not shown yet who they are. One network has the same part of what the others
+/// leave among strangers as it may have of all.
+struct Places {
+    all: Arc<Seats<IpAddr>>,
+    strangers: Option<Arc<Seats<IpAddr>>>,
+}
+
+impl Places {
+    fn new(config: &Config, has_login: bool) -> Self {
+        let (all, each) = (config.connections_max, config.connections_per_network_max);
+        let strangers = (all / limits::STRANGERS_PART).max(1);
+        Self { all: Seats::new(all, each), strangers: has_login.then(|| Seats::sharing(strangers, each, all)) }
+    }
+
+    /// One of each, or what is full, as metrics name it.
+    fn take(&self, network: IpAddr) -> Result<(Seat<IpAddr>, Stranger), &'static str> {
+        let seat = self.all.take(network, Class::Stop).map_err(|full| match full {
+            Full::Total => "connections_max",
+            Full::Kind => "connections_per_network_max",
+        })?;
+        let stranger = self.strangers.as_ref().map(|strangers| strangers.take(network, Class::Stop)).transpose();
+        let stranger = stranger.map_err(|full| match full {
+            Full::Total => "strangers_max",
+            Full::Kind => "strangers_per_network_max",
+        })?;
+        Ok((seat, Stranger::new(stranger)))
+    }
 }
 
 fn count(port: &'static str, ended: Result<End, JoinError>) {

@@ -2,6 +2,9 @@
 //!
 //! Invariant: says what the system says. No retry, no pause and no error is swallowed here.
 
+use crate::config::std;
+use midshift_core::limits;
+use rustix::net::sockopt;
 use std::io;
 use std::net::SocketAddr;
 use tokio::io::{AsyncRead, AsyncWrite};
@@ -27,8 +30,20 @@ impl Listen for TcpListener {
         let (stream, address) = TcpListener::accept(self).await?;
         // A robot's heartbeat is one small segment; it does not wait for another. A peer that is gone already is found at its first read.
         let _ = stream.set_nodelay(true);
+        find_dead(&stream);
         Ok(Some((stream, address)))
     }
+}
+
+/// A peer that is gone without a word is found by the system, also where the protocol has no pings. What a system does not have is left out.
+fn find_dead(stream: &TcpStream) {
+    let gone = std(limits::PEER_GONE);
+    let _ = sockopt::set_socket_keepalive(stream, true);
+    let _ = sockopt::set_tcp_keepidle(stream, gone / 2);
+    let _ = sockopt::set_tcp_keepintvl(stream, gone / 6);
+    let _ = sockopt::set_tcp_keepcnt(stream, 3);
+    #[cfg(target_os = "linux")]
+    let _ = sockopt::set_tcp_user_timeout(stream, u32::try_from(gone.as_millis()).unwrap_or(u32::MAX));
 }
 
 /// Connections of a stream; where each is from, its function says.

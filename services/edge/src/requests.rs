@@ -5,17 +5,19 @@
 
 use crate::activity::{Activity, OpenStream};
 use crate::answer::Speech;
+use crate::asker::Asker;
 use crate::config::{Config, std};
 use crate::deadline::{self, Bounded, Over};
-use crate::denials::Denials;
+use crate::denials::{self, Denials};
 use crate::peer::{Peer, Principals};
 use crate::rates::Rates;
 use crate::seats::{Full, Seat, Seats, network};
+use crate::stranger::Stranger;
 use http::{HeaderMap, Request, Response, Uri};
 use hyper::body::Incoming;
 use hyper::service::Service as HyperService;
-use midshift_core::identity::{Caller, TokenId, Who};
-use midshift_core::ids::RobotId;
+use midshift_core::identity::{Caller, Who};
+use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_proto::denying::Told;
 use midshift_proto::{Denying, access};
@@ -28,45 +30,28 @@ use tokio::time::{Instant, timeout_at};
 use tonic::body::Body;
 use tower::{Service, ServiceExt};
 
-/// Whom a request counts for.
-#[derive(Clone, Debug, PartialEq, Eq, Hash)]
-pub(crate) enum Asker {
-    /// A robot.
-    Robot(RobotId),
-    /// The holder of a token.
-    Token(TokenId),
-    /// Everybody else of one address.
-    Network(IpAddr),
-}
-
-impl Asker {
-    /// Whoever shows something worthless counts for its address.
-    fn of(caller: Result<&Caller, &Refusal>, peer: &Peer) -> Self {
-        match caller.map(Caller::who) {
-            Ok(Who::Robot(robot_id)) => Self::Robot(robot_id.clone()),
-            Ok(Who::Holder { token, .. }) => Self::Token(token.clone()),
-            Ok(Who::Local | Who::Nobody) | Err(_) => Self::Network(network(peer.address.ip())),
-        }
-    }
-}
-
 /// What all requests of a port share.
 pub(crate) struct Rules {
     port: &'static str,
     head: Duration,
     rates: Rates<Asker>,
     seats: Arc<Seats<Asker>>,
+    /// Of all these, those of whoever has not shown who it is.
+    strangers: Arc<Seats<Asker>>,
     /// Requests under way.
     gauge: metrics::Gauge,
 }
 
 impl Rules {
     pub fn new(config: &Config) -> Self {
+        let (all, each) = (config.requests_max, config.requests_per_principal_max);
+        let strangers = (all / limits::STRANGERS_PART).clamp(1, limits::STRANGER_REQUESTS_MAX);
         Self {
             port: config.port,
             head: std(config.head),
             rates: Rates::new(config.rate, config.rates_remembered),
-            seats: Seats::new(config.requests_max, config.requests_per_principal_max),
+            seats: Seats::new(all, each),
+            strangers: Seats::sharing(strangers, each, all),
             gauge: metrics::gauge!("midshift_edge_requests", "port" => config.port),
         }
     }
@@ -77,8 +62,12 @@ impl Rules {
         if !self.rates.take(asker, now, class) {
             return Err(Refusal::new(Kind::Exhausted, Code::TooManyRequests));
         }
-        let seat = self.seats.take(asker.clone(), class);
-        let seat = seat.map(|seat| Inside::new(&self.gauge, seat)).map_err(|full| match full {
+        let stranger = match asker {
+            Asker::Stranger(_) => self.strangers.take(asker.clone(), class).map(Some),
+            _ => Ok(None),
+        };
+        let seat = stranger.and_then(|stranger| Ok((self.seats.take(asker.clone(), class)?, stranger)));
+        let seat = seat.map(|seats| Inside::new(&self.gauge, seats)).map_err(|full| match full {
             Full::Kind => Refusal::new(Kind::Exhausted, Code::TooManyRequests),
             Full::Total => Refusal::new(
                 Kind::Exhausted,
@@ -99,16 +88,16 @@ struct Admitted {
 /// What an answer keeps until its body is gone. Fields are never read.
 type Held = (OpenStream, Option<Inside>);
 
-/// One request under way, with its seat.
+/// One request under way, with its seat among all, and among strangers.
 pub(crate) struct Inside {
     gauge: metrics::Gauge,
-    _seat: Seat<Asker>,
+    _seats: (Seat<Asker>, Option<Seat<Asker>>),
 }
 
 impl Inside {
-    fn new(gauge: &metrics::Gauge, seat: Seat<Asker>) -> Self {
+    fn new(gauge: &metrics::Gauge, seats: (Seat<Asker>, Option<Seat<Asker>>)) -> Self {
         gauge.increment(1.0);
-        Self { gauge: gauge.clone(), _seat: seat }
+        Self { gauge: gauge.clone(), _seats: seats }
     }
 }
 
@@ -124,6 +113,7 @@ pub(crate) struct Door<S> {
     pub rules: Arc<Rules>,
     pub activity: Activity,
     pub peer: Peer,
+    pub stranger: Stranger,
     pub principals: Arc<dyn Principals>,
     pub denials: Option<Arc<Denials>>,
 }
@@ -133,7 +123,10 @@ impl<S> Door<S> {
     fn admit(&self, request: &Request<Incoming>, speech: &Speech) -> Result<(Caller, Admitted), Refusal> {
         let (path, headers) = (request.uri().path(), request.headers());
         let caller = self.principals.caller(&self.peer, headers);
-        let asker = Asker::of(caller.as_ref(), &self.peer);
+        let asker = Asker::of(caller.as_ref(), self.peer.address.ip());
+        if !matches!(asker, Asker::Stranger(_)) {
+            self.stranger.is_known();
+        }
         // Before anything else is said: guessing is limited too.
         let admitted = self.rules.admit(&asker, path, headers, speech)?;
         let allowed = match &caller {
@@ -160,7 +153,7 @@ impl<S> Door<S> {
     /// For a service that denies what only it can judge.
     fn denying(&self, caller: &Caller, uri: &Uri) -> Denying {
         let Some(denials) = self.denials.clone() else { return Denying::default() };
-        let asker = Asker::of(Ok(caller), &self.peer);
+        let asker = Asker::of(Ok(caller), self.peer.address.ip());
         let (port, from, caller) = (self.rules.port, network(self.peer.address.ip()), caller.clone());
         Denying::new(Arc::new(Inward { port, denials, asker, caller, from, uri: uri.clone() }))
     }
@@ -175,10 +168,13 @@ fn tell(
     path: &str,
     refusal: &Refusal,
 ) {
-    let code = refusal.reason.code;
-    tracing::info!(port, actor, path, %code, "a request was denied");
-    if let Some(denials) = denials {
-        denials.tell(asker, actor, from, path, &refusal.reason);
+    let (code, path) = (refusal.reason.code, denials::cut(path));
+    // A flood of them fills no log either.
+    match denials {
+        Some(denials) if denials.tell(asker, actor.clone(), from, path, &refusal.reason) => {
+            tracing::info!(port, actor, path, %code, "a request was denied");
+        }
+        _ => tracing::debug!(port, actor, path, %code, "a request was denied"),
     }
 }
 

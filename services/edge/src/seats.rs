@@ -1,7 +1,7 @@
 //! How many may be inside: in total, and of one kind.
 //!
 //! Invariant: what was taken is given back when its [`Seat`] is dropped, also by a panic; a kind of which nobody is inside costs no memory.
-//! Used for connections by network, and for requests by principal.
+//! Used for connections by network, for requests by principal, and for both of who has not shown yet who it is.
 
 use midshift_core::overload::Class;
 use std::collections::HashMap;
@@ -18,6 +18,15 @@ pub(crate) enum Full {
     Kind,
 }
 
+/// How many of one kind may be inside.
+#[derive(Clone, Copy, Debug)]
+enum Each {
+    /// So many.
+    Most(usize),
+    /// This part of what the others leave, rounded up: however many one kind has, another finds room, and the more kinds there are the less each of them gets.
+    OfOthers { part: usize, of: usize },
+}
+
 #[derive(Debug)]
 struct Taken<K> {
     total: usize,
@@ -27,7 +36,7 @@ struct Taken<K> {
 #[derive(Debug)]
 pub(crate) struct Seats<K> {
     total_max: usize,
-    kind_max: usize,
+    each: Each,
     taken: Mutex<Taken<K>>,
 }
 
@@ -40,17 +49,32 @@ pub(crate) struct Seat<K: Eq + Hash> {
 
 impl<K: Eq + Hash + Clone> Seats<K> {
     pub fn new(total_max: usize, kind_max: usize) -> Arc<Self> {
+        Self::with(total_max, Each::Most(kind_max))
+    }
+
+    /// Of which one kind has no more than this part of what the others leave.
+    pub fn sharing(total_max: usize, part: usize, of: usize) -> Arc<Self> {
+        Self::with(total_max, Each::OfOthers { part: part.min(of).max(1), of: of.max(1) })
+    }
+
+    fn with(total_max: usize, each: Each) -> Arc<Self> {
         let taken = Mutex::new(Taken { total: 0, kinds: HashMap::new() });
-        Arc::new(Self { total_max, kind_max, taken })
+        Arc::new(Self { total_max, each, taken })
     }
 
     /// A seat for something of this class, or which limit is reached: the last seats, of all and of each kind, are for higher classes.
     pub fn take(self: &Arc<Self>, kind: K, class: Class) -> Result<Seat<K>, Full> {
         let mut taken = self.taken();
-        if taken.total >= class.share(self.total_max) {
+        let free = class.share(self.total_max).saturating_sub(taken.total);
+        if free == 0 {
             return Err(Full::Total);
         }
-        if taken.kinds.get(&kind).copied().unwrap_or(0) >= class.share(self.kind_max) {
+        let own = taken.kinds.get(&kind).copied().unwrap_or(0);
+        let most = match self.each {
+            Each::Most(most) => class.share(most),
+            Each::OfOthers { part, of } => (free + own).saturating_mul(part).div_ceil(of),
+        };
+        if own >= most {
             return Err(Full::Kind);
         }
         taken.total += 1;
@@ -101,6 +125,26 @@ mod tests {
         assert_eq!(seats.take("c", Class::Stop).err(), Some(Full::Total));
         drop(first);
         let _again = seats.take("a", Class::Stop).expect("a seat that was given back");
+    }
+
+    #[test]
+    fn kinds_that_share_leave_room_for_one_more_kind_however_greedy_they_are() {
+        let seats = Seats::sharing(4_096, 1, 4);
+        let mut inside = Vec::new();
+        let mut fill = |kind: u32| {
+            let before = inside.len();
+            while let Ok(seat) = seats.take(kind, Class::Stop) {
+                inside.push(seat);
+            }
+            inside.len() - before
+        };
+        assert_eq!(fill(0), 1_024, "alone it has a quarter");
+        let four: usize = (1..4).map(&mut fill).sum();
+        assert!((1_200..2_000).contains(&four), "{four}");
+        for kind in 4..24 {
+            assert!(fill(kind) > 0, "kind {kind} finds no room");
+        }
+        assert_eq!(Seats::sharing(1, 4, 16).take(0, Class::Stop).map(drop), Ok(()));
     }
 
     #[test]

@@ -21,10 +21,10 @@ const SESSION: &str = "/midshift.link.v1.LinkService/Session";
 const ENGAGE: &str = "/midshift.stop.v1.StopService/Engage";
 const HEALTH: &str = "/grpc.health.v1.Health/Check";
 
-struct Port {
+pub struct Port {
     us: Arc<AtomicU64>,
-    world: World,
-    authority: Authority,
+    pub world: World,
+    pub authority: Authority,
     known: Arc<Known>,
     denials: mpsc::Receiver<Denial>,
     _tls: watch::Sender<Arc<rustls::ServerConfig>>,
@@ -38,10 +38,10 @@ fn site() -> SiteId {
 const BEGIN: i64 = 1_000_000;
 
 impl Port {
-    async fn open() -> Self {
-        Self::open_with(Config::default()).await
+    pub async fn open() -> Self {
+        Self::with(Config::default()).await
     }
-    async fn open_with(config: Config) -> Self {
+    pub async fn with(config: Config) -> Self {
         let (authority, us) = (Authority::new(), Arc::new(AtomicU64::new(0)));
         let source = us.clone();
         let clock: Arc<dyn Clock> =
@@ -52,14 +52,14 @@ impl Port {
         let world = World::telling(config, known.clone(), Some(newest), Some(tell)).await;
         Self { us, world, authority, known, denials, _tls: tls }
     }
-    fn robot(&self, name: &str) -> Identity {
+    pub fn robot(&self, name: &str) -> Identity {
         self.authority.issue_uri(&format!("spiffe://factory/robot/{name}"))
     }
-    async fn client(&self, shown: Option<&Identity>) -> Client {
+    pub async fn client(&self, shown: Option<&Identity>) -> Client {
         Client::over(self.authority.connect(&self.world, shown).await.expect("a handshake")).await
     }
     /// Makes `secret` a token with these rights, good until that moment.
-    fn knows(&self, secret: &Secret, grants: &[&str], expires_unix_ms: i64) {
+    pub fn knows(&self, secret: &Secret, grants: &[&str], expires_unix_ms: i64) {
         let grants = grants.iter().map(|grant| grant.parse().expect("a grant")).collect();
         let digest = Digest(sha2::Sha256::digest(secret.bytes()).into());
         let token = DirectoryToken { name: "anna".into(), digest, grants, expires_unix_ms };
@@ -67,7 +67,7 @@ impl Port {
     }
 }
 
-fn secret() -> Secret {
+pub fn secret() -> Secret {
     Secret::new(TokenId::new("t1").expect("an id"), [7; 32])
 }
 
@@ -80,7 +80,7 @@ async fn asked(client: &mut Client, path: &str, authorization: Option<&str>) -> 
     whole(within(response).await.ok()?).await
 }
 
-async fn code(client: &mut Client, path: &str, authorization: Option<&str>) -> Result<String, Code> {
+pub async fn code(client: &mut Client, path: &str, authorization: Option<&str>) -> Result<String, Code> {
     let answer = asked(client, path, authorization).await.expect("an answer");
     match answer.answer().code {
         None => Ok(answer.header("principal").to_owned()),
@@ -208,7 +208,7 @@ async fn the_streams_of_a_token_that_was_taken_back_end_with_their_connection_an
 #[tokio::test]
 async fn the_streams_of_a_token_end_when_its_time_is_over_and_it_still_stops() {
     let config = Config { asked_again: LinkDuration(20), ..Config::default() };
-    let port = Port::open_with(config).await;
+    let port = Port::with(config).await;
     let secret = secret();
     port.knows(&secret, &["viewer"], BEGIN + 1_000);
     let bearer = format!("Bearer {}", secret.reveal(Secret::TOKEN));

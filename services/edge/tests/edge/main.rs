@@ -13,4 +13,5 @@ mod principals;
 mod proofs;
 mod readings;
 mod services;
+mod strangers;
 mod world;

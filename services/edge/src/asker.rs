@@ -1,0 +1,33 @@
+//! Whom a request counts for: its rate, its seats, and what is written down when it is denied.
+//!
+//! Invariant: what cannot be proven is never counted for anybody but the address that it came from.
+
+use crate::seats::network;
+use midshift_core::identity::{Caller, TokenId, Who};
+use midshift_core::ids::RobotId;
+use midshift_core::reason::Refusal;
+use std::net::IpAddr;
+
+/// Whom a request counts for.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub(crate) enum Asker {
+    /// A robot.
+    Robot(RobotId),
+    /// The holder of a token.
+    Token(TokenId),
+    /// Everybody of one address, on a port where nobody needs to say who it is.
+    Network(IpAddr),
+    /// Everybody of one address who has not shown who it is, or something worthless.
+    Stranger(IpAddr),
+}
+
+impl Asker {
+    pub fn of(caller: Result<&Caller, &Refusal>, address: IpAddr) -> Self {
+        match caller.map(Caller::who) {
+            Ok(Who::Robot(robot_id)) => Self::Robot(robot_id.clone()),
+            Ok(Who::Holder { token, .. }) => Self::Token(token.clone()),
+            Ok(Who::Local) => Self::Network(network(address)),
+            Ok(Who::Nobody) | Err(_) => Self::Stranger(network(address)),
+        }
+    }
+}
