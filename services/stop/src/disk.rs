@@ -21,6 +21,8 @@ struct Outcome {
     tried: u64,
     /// It holds this.
     kept: u64,
+    /// It refuses the audit.
+    refuses_audit: bool,
 }
 
 #[derive(Default)]
@@ -94,6 +96,10 @@ impl Disk {
     pub fn holds(&self, version: u64) -> bool {
         self.outcome.borrow().kept >= version
     }
+    /// Whether it refuses the audit.
+    pub fn refuses_audit(&self) -> bool {
+        self.outcome.borrow().refuses_audit
+    }
     fn take(&self, now: Utc) -> Vec<Note> {
         let mut queue = lock(&self.queue);
         let mut notes: Vec<Note> = queue.notes.drain(..).collect();
@@ -155,9 +161,10 @@ struct Refusing {
     audit: bool,
 }
 
-/// Writes until shutdown, and once more then.
+/// Writes until shutdown, and once more then; what was reset long ago goes at the start and each hour.
 pub async fn keep(inner: &Arc<Inner>, mut writer: Writer) {
     let mut refusing = Refusing::default();
+    let mut forget = tokio::time::interval(Duration::from_millis(limits::RESETS_FORGOTTEN_EVERY.as_ms()));
     loop {
         let is_last = inner.shutdown.is_cancelled();
         // Whatever comes from now on wakes it again.
@@ -179,6 +186,7 @@ pub async fn keep(inner: &Arc<Inner>, mut writer: Writer) {
         tokio::select! {
             () = inner.disk.wake.notified() => {}
             () = inner.shutdown.cancelled() => {}
+            _ = forget.tick() => lock(&inner.law).forget(inner.clock.now().wall),
             () = tokio::time::sleep(again), if refusing != Refusing::default() => {}
         }
     }
@@ -210,6 +218,7 @@ async fn turn(inner: &Arc<Inner>, mut writer: Writer, version: u64, is_due: bool
     acts::settle(inner, version);
     inner.disk.outcome.send_modify(|outcome| {
         outcome.tried = outcome.tried.max(version);
+        outcome.refuses_audit = refusing.audit;
         if is_due && !refusing.latch {
             outcome.kept = outcome.kept.max(version);
         }

@@ -190,6 +190,15 @@ impl Law {
         counted
     }
 
+    /// Forgets what was reset long ago, and by which request it was engaged. What is to be kept is another then, so that all copies of it go too.
+    pub fn forget(&mut self, now: Utc) {
+        if self.latch.forget(now, limits::RESETS_MAX) {
+            let latch = &self.latch;
+            self.requests.retain(|_, asked| latch.stop(&asked.stop_id).is_some());
+            self.version += 1;
+        }
+    }
+
     /// What is to be kept, with what waits for it.
     pub fn kept(&self, audit: Tail) -> Kept {
         let mut latch = self.latch.clone();
@@ -255,6 +264,25 @@ mod tests {
         assert!(!law.latch().is_effective(&id));
         let again = law.reset(Reset { reason: "again".to_owned(), ..reset(&id) });
         assert_eq!((again.was_engaged, again.is_new, again.reset.reason.as_str()), (false, false, "over"));
+    }
+
+    #[test]
+    fn what_was_reset_long_ago_goes_by_itself_and_what_is_kept_is_another_then() {
+        let mut law = Law::begin(Kept::default(), Utc(0));
+        let (old, engaged) = (law.draw(Utc(0)), law.draw(Utc(0)));
+        let asked = Asked { stop_id: old.clone(), hash: String::new(), at: Utc(1) };
+        law.engage(stop(old.clone(), Scope::Fleet), Some((RequestId::parse("once").unwrap(), asked))).unwrap();
+        law.engage(stop(engaged.clone(), Scope::Fleet), None).unwrap();
+        let resetting = law.reset(reset(&old));
+        law.settle(resetting.version, Utc(2));
+        let (version, age) = (law.version(), limits::RESETS_KEPT.as_ms());
+        law.forget(Utc(2).plus_ms(age));
+        assert_eq!(law.version(), version, "nothing is old yet");
+        law.forget(Utc(3).plus_ms(age));
+        assert_eq!(law.version(), version + 1);
+        let kept = law.kept(Tail::default());
+        assert!(kept.latch.stop(&old).is_none() && kept.requests.is_empty(), "{kept:?}");
+        assert!(kept.latch.is_effective(&engaged), "what is engaged has no age");
     }
 
     #[test]

@@ -45,7 +45,8 @@ use std::io;
 use std::net::IpAddr;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::Duration;
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
@@ -99,6 +100,8 @@ pub(crate) struct Inner {
     /// Counts what watchers may want to look at.
     changed: watch::Sender<u64>,
     watchers: Arc<Semaphore>,
+    /// When who is known was last said to be what it is; unset: nobody looks.
+    principals: OnceLock<watch::Receiver<Utc>>,
     started: LinkTime,
     /// It was asked to end.
     shutdown: CancellationToken,
@@ -168,6 +171,7 @@ impl StopService {
             disk: Disk::default(),
             changed: watch::Sender::new(0),
             watchers: Arc::new(Semaphore::new(limits::STOP_WATCHERS_MAX)),
+            principals: OnceLock::new(),
             started: now.link,
             clock,
             shutdown,
@@ -211,12 +215,18 @@ impl StopService {
         health.set_serving::<LinkFace>().await;
         let mut routes = Routes::builder();
         routes
-            .add_service(health_service)
-            .add_service(reflection().build_v1()?)
-            .add_service(reflection().build_v1alpha()?)
+            .add_service(health_service.max_decoding_message_size(limits::HEALTH_MESSAGE_BYTES))
+            .add_service(reflection().build_v1()?.max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES))
+            .add_service(reflection().build_v1alpha()?.max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES))
             .add_service(self.grpc())
             .add_service(self.link());
         Ok(routes.routes())
+    }
+
+    /// Shows when who is known was last written down, or said to be so still, as the port follows it. The first one counts.
+    pub fn show_principals(&self, told: watch::Receiver<Utc>) {
+        // A second one is a fault of whoever calls, and changes nothing.
+        let _ = self.inner.principals.set(told);
     }
 
     /// Records that the port denied somebody something, unless too many are; `left_out`: so many that the port itself did not tell of.

@@ -7,6 +7,8 @@ use crate::{Inner, blocking};
 use midshift_core::identity::Directory;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
+use midshift_core::time::Utc;
+use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, UTIME_NOW, utimensat};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::fs::{self, File, OpenOptions};
@@ -72,6 +74,22 @@ impl Principals {
     /// The disk.
     pub fn write(&self, folder: &Path) -> io::Result<()> {
         write(folder, Self::NAME, &serde_json::to_vec(self)?)
+    }
+
+    /// Says that what stands in the folder is still so.
+    ///
+    /// # Errors
+    /// The disk, or it is not there.
+    pub fn affirm(folder: &Path) -> io::Result<()> {
+        let now = Timespec { tv_sec: 0, tv_nsec: UTIME_NOW };
+        let times = Timestamps { last_access: now, last_modification: now };
+        Ok(utimensat(CWD, folder.join(Self::NAME), &times, AtFlags::empty())?)
+    }
+
+    /// When it was written, or said to be still so; none: it is not there. UTC of the machine that the folder is on.
+    pub fn told(folder: &Path) -> Option<Utc> {
+        let found = fs::metadata(folder.join(Self::NAME)).ok()?;
+        Some(Utc(found.mtime() * 1_000 + found.mtime_nsec() / 1_000_000))
     }
 
     /// What stands in the folder; none: nothing was written yet.

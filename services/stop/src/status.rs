@@ -123,7 +123,13 @@ pub fn status(inner: &Inner) -> v1::Status {
     let counts = tally.finish();
     let engaged = stops.iter().zip(counts);
     let stops = engaged.map(|((stop, _), counts)| v1::EngagedStop { stop: Some(stop.into()), counts: Some(counts) });
-    v1::Status { stops: stops.collect(), robots, durable: inner.disk.holds(version) }
+    v1::Status {
+        stops: stops.collect(),
+        robots,
+        durable: inner.disk.holds(version),
+        audit_refused: inner.disk.refuses_audit(),
+        principals_told_unix_ms: inner.principals.get().map_or(0, |told| told.borrow().0),
+    }
 }
 
 /// The same without what changes with each check-in.

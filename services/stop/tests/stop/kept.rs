@@ -1,6 +1,7 @@
 //! What is engaged stays engaged: over ends of the service, lost files and repeated calls.
 
 use crate::harness::{Folder, Robot, Server, code, eventually, fleet, halt, id_of, scope, told};
+use midshift_core::limits;
 use midshift_core::site::{DEMO, text};
 use midshift_proto::refusal_of;
 use midshift_proto::stop::v1;
@@ -240,4 +241,34 @@ async fn the_last_stops_are_left_for_the_fleet() {
     again.sort_unstable();
     engaged.sort_unstable();
     assert_eq!(again, engaged);
+}
+
+#[tokio::test]
+async fn what_was_reset_a_quarter_ago_is_forgotten_without_anybody_doing_anything() {
+    let folder = Folder::new();
+    let server = Server::start(&folder.path()).await;
+    let over = id_of(&server.engage(fleet()).await.unwrap());
+    server.reset(&over).await;
+    let stands = id_of(&server.engage(fleet()).await.unwrap());
+    server.end().await;
+    let path = folder.path().join("latch");
+    let read = || midshift_latch::read::<serde_json::Value>(&path).unwrap();
+    {
+        let none = serde_json::Value::Null;
+        let (mut file, mut kept) = midshift_latch::LatchFile::open(&path, limits::STOP_LATCH_BYTES, none).unwrap();
+        assert!(kept["latch"]["resets"][&over]["at"].is_i64(), "{kept}");
+        kept["latch"]["resets"][&over]["at"] = 1.into();
+        file.write(&kept).unwrap();
+    }
+    let (written, _) = read();
+
+    let server = Server::start(&folder.path()).await;
+    let (generation, kept) = eventually(async || {
+        let (generation, kept) = read();
+        kept["latch"]["stops"].get(&over).is_none().then_some((generation, kept))
+    })
+    .await;
+    assert!(kept["latch"]["resets"].get(&over).is_none(), "{kept}");
+    assert!(generation > written, "whoever copies it sees that it is another");
+    assert_eq!(server.engaged().await, [stands]);
 }
