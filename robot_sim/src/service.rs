@@ -10,7 +10,7 @@ use crate::oracle::Verdict;
 use crate::world::{lock, sku_of};
 use midshift_agent::body::Body as _;
 use midshift_core::ids::RobotId;
-use midshift_core::limits::{PAGE_DEFAULT, PAGE_MAX};
+use midshift_core::limits::{CONTROL_MESSAGE_BYTES, PAGE_DEFAULT, PAGE_MAX};
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::time::{Clock, Now, SiteDuration};
 use midshift_proto::convert::common::ms_of;
@@ -43,7 +43,7 @@ impl SimFace {
     }
     /// Ready to be registered.
     pub fn server(self) -> SimServiceServer<Self> {
-        SimServiceServer::new(self)
+        SimServiceServer::new(self).max_decoding_message_size(CONTROL_MESSAGE_BYTES)
     }
     fn inject(&self, request: v1::InjectFaultRequest) -> Result<(), Refusal> {
         let robot_id = RobotId::parse(&request.robot_id).map_err(|e| Refusal::field("robot_id", e.to_string()))?;

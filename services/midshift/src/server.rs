@@ -196,9 +196,9 @@ impl Server {
         let (health, health_service) = tonic_health::server::health_reporter();
         let mut routes = Routes::builder();
         routes
-            .add_service(health_service)
-            .add_service(reflection().build_v1()?)
-            .add_service(reflection().build_v1alpha()?);
+            .add_service(health_service.max_decoding_message_size(limits::HEALTH_MESSAGE_BYTES))
+            .add_service(reflection().build_v1()?.max_decoding_message_size(control))
+            .add_service(reflection().build_v1alpha()?.max_decoding_message_size(control));
         if let Some(task) = &self.task {
             let audit = AuditService::new(self.parts.store.clone(), self.parts.clock.clone(), self.shutdown.clone());
             routes
@@ -469,6 +469,8 @@ async fn tell(health: &HealthReporter, names: BTreeSet<&'static str>, mut ready:
 }
 
 #[cfg(test)]
+mod frames;
+#[cfg(test)]
 mod tests {
     use super::*;
     use crate::planning::Planning;
@@ -489,12 +491,12 @@ mod tests {
         channel: Channel,
     }
 
-    async fn world() -> anyhow::Result<World> {
+    /// A server of every role in memory, without login.
+    pub fn parts(planning: &Planning) -> anyhow::Result<Parts> {
         let loaded = site_file::load(None, None, None)?;
         let clock = clock::clock(1000);
         let store_id = StoreId(Arc::from("store-1"));
-        let planning = Planning::start()?;
-        let parts = Parts {
+        Ok(Parts {
             roles: Roles::default(),
             drain: Duration::ZERO,
             heard: None,
@@ -511,9 +513,13 @@ mod tests {
             naive: Naive::default(),
             stops: None,
             planning: planning.handle(),
-        };
+        })
+    }
+
+    async fn world() -> anyhow::Result<World> {
+        let planning = Planning::start()?;
         let shutdown = CancellationToken::new();
-        let server = Server::new(parts, shutdown.clone()).await?;
+        let server = Server::new(parts(&planning)?, shutdown.clone()).await?;
         let listener = TcpListener::bind("127.0.0.1:0").await?;
         let channel = Endpoint::from_shared(format!("http://{}", listener.local_addr()?))?.connect_lazy();
         let serving = tokio::spawn(server.serve(listener));

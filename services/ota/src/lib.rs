@@ -140,7 +140,7 @@ impl OtaService {
     }
     /// Bytes, for robots.
     pub fn chunks(&self) -> ChunkServiceServer<Hatch> {
-        ChunkServiceServer::new(self.hatch())
+        ChunkServiceServer::new(self.hatch()).max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES)
     }
     /// `/metadata/…` and `/targets/…` over plain HTTP, for clients of TUF that are not ours.
     pub fn pages(&self) -> axum::Router {
@@ -218,7 +218,7 @@ impl OtaReader {
     }
     /// Bytes, for robots.
     pub fn chunks(&self) -> ChunkServiceServer<Hatch> {
-        ChunkServiceServer::new(self.hatch.clone())
+        ChunkServiceServer::new(self.hatch.clone()).max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES)
     }
     /// `/metadata/…` and `/targets/…` over plain HTTP, for clients of TUF that are not ours.
     pub fn pages(&self) -> axum::Router {
