@@ -138,6 +138,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 no_software: false,
                 stop_listen: std::net::SocketAddr::from(([127, 0, 0, 1], midshift::stop::PORT)),
                 no_stop: true,
+                log: Default::default(),
                 site,
                 data,
                 listen,

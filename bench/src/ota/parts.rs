@@ -160,6 +160,7 @@ async fn serve(data: PathBuf, keys: PathBuf, listen: SocketAddr, stop: Cancellat
         no_software: false,
         stop_listen: std::net::SocketAddr::from(([127, 0, 0, 1], midshift::stop::PORT)),
         no_stop: true,
+        log: Default::default(),
         site: None,
         data,
         listen,

@@ -8,7 +8,7 @@ use midshift_core::ids::SiteId;
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use midshift_edge::tls::{Clients, server_config};
-use midshift_edge::{Anybody, Config, Denials, Edge, Known, Listen, Rate};
+use midshift_edge::{Anybody, Config, Denials, Edge, Known, Listen, Rate, connections_max};
 use midshift_identity::ServerProof;
 use rustls::ServerConfig;
 use rustls::pki_types::pem::PemObject;
@@ -22,9 +22,10 @@ use tonic::service::Routes;
 /// How much one peer may take of a port.
 #[derive(Clone, Copy, Debug, clap::Args)]
 pub struct Share {
-    /// Connections from one address, or one /64 of IPv6, at a time. A proxy in front is one address.
-    #[arg(long, default_value_t = limits::CONNECTIONS_PER_NETWORK_MAX)]
-    pub connections_per_address: usize,
+    /// Connections from one address, or one /64 of IPv6, at a time. A proxy in front is one address. Without it a quarter of what the port takes: 4096, or fewer
+    /// if the process may not have as many files open.
+    #[arg(long, value_name = "N")]
+    pub connections_per_address: Option<usize>,
     /// Requests that one robot, token or address may begin a second, for long; twice as many at once.
     #[arg(long, default_value = "1000")]
     pub requests_per_second: NonZeroU32,
@@ -33,18 +34,31 @@ pub struct Share {
 impl Default for Share {
     fn default() -> Self {
         const PER_SECOND: NonZeroU32 = NonZeroU32::new(limits::REQUESTS_PER_SECOND).unwrap();
-        Self { connections_per_address: limits::CONNECTIONS_PER_NETWORK_MAX, requests_per_second: PER_SECOND }
+        Self { connections_per_address: None, requests_per_second: PER_SECOND }
     }
 }
 
 impl Share {
-    /// The limits of a port with this name.
-    pub fn config(self, port: &'static str) -> Config {
+    /// The limits of a port with this name, as far as the descriptors of this process go, of which it asks for all that it may have.
+    ///
+    /// # Errors
+    /// There are too few for a port; it says what to type.
+    pub fn config(self, port: &'static str) -> anyhow::Result<Config> {
+        const PART: usize = limits::CONNECTIONS_MAX / limits::CONNECTIONS_PER_NETWORK_MAX;
+        let connections_max = connections_max()?;
+        let each = self.connections_per_address.map_or(connections_max / PART, |asked| asked.min(connections_max));
         let burst = self
             .requests_per_second
             .saturating_mul(const { NonZeroU32::new(limits::REQUESTS_BURST / limits::REQUESTS_PER_SECOND).unwrap() });
         let rate = Rate { per_second: self.requests_per_second, burst };
-        Config { port, connections_per_network_max: self.connections_per_address, rate, ..Config::default() }
+        Ok(Config { port, connections_max, connections_per_network_max: each, rate, ..Config::default() })
+    }
+
+    /// The same as arguments of a program of ours.
+    pub fn arguments(self) -> Vec<String> {
+        let Self { connections_per_address, requests_per_second } = self;
+        let connections = connections_per_address.map(|n| format!("--connections-per-address={n}"));
+        connections.into_iter().chain([format!("--requests-per-second={requests_per_second}")]).collect()
     }
 }
 

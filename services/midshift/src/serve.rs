@@ -7,8 +7,9 @@ use crate::planning::Planning;
 use crate::roles::{Role, Roles};
 use crate::server::{Naive, Parts, Server};
 use crate::storage::{Database, Storage};
-use crate::{clock, site_file, stop, stop_follower};
+use crate::{clock, logs, site_file, stop, stop_follower};
 use anyhow::{Context, bail};
+use clap::ValueEnum;
 use midshift_agent::{durable, tls};
 use midshift_core::limits;
 use midshift_core::time::Clock;
@@ -102,6 +103,9 @@ pub struct Serve {
     /// role ota keep, and this process waits a minute for it.
     #[arg(long, env = "MIDSHIFT_NO_SOFTWARE")]
     pub no_software: bool,
+    /// How log lines look, as the program was told.
+    #[arg(skip)]
+    pub log: logs::Format,
 }
 
 /// Where software of robots comes from.
@@ -139,6 +143,12 @@ impl Serve {
     /// The folder of the keys of this process.
     fn own_keys(&self) -> PathBuf {
         self.identity.clone().unwrap_or_else(|| self.data.join(IDENTITY))
+    }
+
+    /// What holds for the stop service beside it too, as arguments: its port has the same peers, and its log goes where this one's does.
+    pub fn for_stop(&self) -> Vec<String> {
+        let log = self.log.to_possible_value().map(|word| format!("--log={}", word.get_name()));
+        self.share.arguments().into_iter().chain(log).collect()
     }
 }
 
@@ -196,6 +206,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         data: args.data.clone(),
         listen: args.stop_listen,
         authority_pem: identity.as_ref().map(|identity| identity.proof().borrow().authority_pem.clone()),
+        arguments: args.for_stop(),
     };
     let mut started = None;
     if has_stop {
@@ -223,7 +234,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         naive: Naive::default(),
         stops: follows.then(|| args.data.join(stop::FOLDER)),
         port: match identity {
-            Some(_) => args.share.config("business"),
+            Some(_) => args.share.config("business")?,
             None => door::alone("business"),
         },
         identity: identity.clone(),

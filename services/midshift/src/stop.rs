@@ -13,7 +13,7 @@ use crate::{clock, server, site_file};
 use anyhow::{Context, bail};
 use axum::routing::get;
 use midshift_core::site::Site;
-use midshift_core::time::{Clock, LinkDuration};
+use midshift_core::time::{Clock, LinkDuration, Utc};
 use midshift_edge::{Config, Denial, Denials};
 use midshift_identity::ServerProof;
 use midshift_stop::{Parts, Principals, StopService};
@@ -86,13 +86,16 @@ pub async fn run(args: StopServe, shutdown: CancellationToken) -> anyhow::Result
     let clock = clock::clock(1000);
     let (config, login) = match args.insecure {
         true => (door::alone(PORT_NAME), None),
-        false => (args.share.config(PORT_NAME), Some(known(&folder, &loaded.site, &clock).await?)),
+        false => (args.share.config(PORT_NAME)?, Some(known(&folder, &loaded.site, &clock).await?)),
     };
     serve(folder, loaded.site, clock, (config, login), listener, shutdown).await
 }
 
+/// What a port with login follows, whom it denied what, and when who is known was last written down or said to be so still.
+type Followed = (Login, Receiver<Denial>, watch::Receiver<Utc>);
+
 /// Who is known, as whoever has the store wrote it down beside the latch; followed from then on.
-async fn known(folder: &Path, site: &Site, clock: &Arc<dyn Clock>) -> anyhow::Result<(Login, Receiver<Denial>)> {
+async fn known(folder: &Path, site: &Site, clock: &Arc<dyn Clock>) -> anyhow::Result<Followed> {
     let mut waited = Duration::ZERO;
     let first = loop {
         match Principals::read(folder) {
@@ -118,22 +121,33 @@ async fn known(folder: &Path, site: &Site, clock: &Arc<dyn Clock>) -> anyhow::Re
         denials,
     };
     let (folder, mut last) = (folder.to_owned(), first);
+    let said = watch::Sender::new(Principals::told(&folder).unwrap_or_default());
+    let (followed, mut is_readable) = (said.subscribe(), true);
     // As long as the port is open: it ends with the receivers.
     tokio::spawn(async move {
         while !directory.is_closed() {
             tokio::time::sleep(PRINCIPALS_EVERY).await;
-            match Principals::read(&folder) {
+            let read = Principals::read(&folder);
+            if let (Ok(Some(_)), Some(told)) = (&read, Principals::told(&folder)) {
+                said.send_replace(told);
+            }
+            match read {
                 Ok(Some(newest)) if newest != last => {
                     proof.send_replace(proof_of(&newest));
                     directory.send_replace(Arc::new(newest.directory.clone()));
                     last = newest;
                 }
-                Ok(_) => {}
-                Err(error) => tracing::warn!(%error, "who is known cannot be read; the last that could stays in force"),
+                Ok(_) => is_readable = true,
+                // Once, and not twice a second.
+                Err(error) => {
+                    if std::mem::take(&mut is_readable) {
+                        tracing::warn!(%error, "who is known cannot be read; the last that could stays in force");
+                    }
+                }
             }
         }
     });
-    Ok((login, told))
+    Ok((login, told, followed))
 }
 
 fn proof_of(principals: &Principals) -> ServerProof {
@@ -145,7 +159,7 @@ async fn serve(
     folder: PathBuf,
     site: Arc<Site>,
     clock: Arc<dyn Clock>,
-    (config, login): (Config, Option<(Login, Receiver<Denial>)>),
+    (config, login): (Config, Option<Followed>),
     listener: TcpListener,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
@@ -155,7 +169,13 @@ async fn serve(
     let pages = service.routes().await?.into_axum_router().layer(tonic_web::GrpcWebLayer::new());
     let routes = Routes::from(pages.route("/metrics", get(metrics)));
     let config = Config { keepalive_every: KEEPALIVE_EVERY, ..config };
-    let (login, denials) = login.unzip();
+    let (login, denials) = match login {
+        Some((login, denials, told)) => {
+            service.show_principals(told);
+            (Some(login), Some(denials))
+        }
+        None => (None, None),
+    };
     let port = door::serve(config, login, routes, listener, service.drained());
     let recording = record(service.clone(), denials);
     let port = async {

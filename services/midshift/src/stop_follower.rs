@@ -7,6 +7,7 @@
 use anyhow::Context;
 use midshift_core::fleet::rows::RobotControl;
 use midshift_core::ids::{RobotId, StopId};
+use midshift_core::limits;
 use midshift_core::robot::Duty;
 use midshift_core::rows::{Log, Revision, Seq, Table};
 use midshift_core::stop::Latch;
@@ -26,8 +27,8 @@ use std::time::Duration;
 const LOOK: Duration = Duration::from_millis(250);
 /// Whoever follows holds this, in the folder of the stop service; the system lets it go with the process, however that ends.
 const TURN: &str = "follower.lock";
-/// How often it is looked up which robots a person has retired, in looks: ten seconds.
-const RETIRED_EVERY: u32 = 40;
+/// How often it is looked up which robots a person has retired, and said that who is known has not changed, in looks: ten seconds.
+const NOW_AND_THEN: u32 = (limits::PRINCIPALS_TOLD_EVERY.as_ms() / LOOK.as_millis() as u64) as u32;
 
 /// Who is known, as the stop service is told.
 fn principals(identity: &IdentityService) -> Principals {
@@ -86,7 +87,7 @@ impl StopFollower {
         let _turn = self.turn(&mut look).await;
         for n in 0_u32.. {
             look.tick().await;
-            let followed = self.follow(n % RETIRED_EVERY == 0).await;
+            let followed = self.follow(n % NOW_AND_THEN == 0).await;
             if let (Err(error), false) = (&followed, self.failing) {
                 tracing::warn!(error = format!("{error:#}"), "stops are not copied into the store");
             }
@@ -121,13 +122,13 @@ impl StopFollower {
         }
     }
 
-    async fn follow(&mut self, is_retired_due: bool) -> anyhow::Result<()> {
+    async fn follow(&mut self, is_due: bool) -> anyhow::Result<()> {
         // First, and whatever the stop service is doing: it may be waiting for this.
-        self.tell_who_is_known().await?;
+        self.tell_who_is_known(is_due).await?;
         let folder = self.folder.clone();
         let read = tokio::task::spawn_blocking(move || midshift_stop::latch(&folder));
         let Some((generation, latch)) = read.await.context("reading the latch")?? else { return Ok(()) };
-        if is_retired_due {
+        if is_due {
             self.look_who_is_retired().await?;
         }
         self.look_who_attached().await?;
@@ -184,11 +185,16 @@ impl StopFollower {
         Ok(())
     }
 
-    /// Writes who is known, if that has changed.
-    async fn tell_who_is_known(&mut self) -> anyhow::Result<()> {
+    /// Writes who is known, if that has changed; now and then it says that it has not.
+    async fn tell_who_is_known(&mut self, is_due: bool) -> anyhow::Result<()> {
         let Some((identity, told)) = &mut self.identity else { return Ok(()) };
         let newest = principals(identity);
         if told.as_ref() == Some(&newest) {
+            // One that is gone is written anew at the next look.
+            if is_due && let Err(error) = Principals::affirm(&self.folder) {
+                *told = None;
+                return Err(error).context("saying that who is known has not changed");
+            }
             return Ok(());
         }
         let (folder, writing) = (self.folder.clone(), newest.clone());
@@ -216,6 +222,26 @@ impl StopFollower {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn who_is_known_is_said_to_be_so_still_without_being_written_anew() -> io::Result<()> {
+        let folder = tempfile::tempdir()?;
+        assert!(Principals::affirm(folder.path()).is_err() && Principals::told(folder.path()).is_none());
+        let principals = Principals {
+            directory: Default::default(),
+            chain_pem: "chain".to_owned(),
+            key_pem: "key".to_owned(),
+            authority_pem: "root".to_owned(),
+        };
+        principals.write(folder.path())?;
+        let path = folder.path().join(Principals::NAME);
+        File::options().write(true).open(&path)?.set_modified(std::time::UNIX_EPOCH)?;
+        assert_eq!(Principals::told(folder.path()).map(|at| at.0), Some(0));
+        Principals::affirm(folder.path())?;
+        assert!(Principals::told(folder.path()).is_some_and(|at| at.0 > 1_700_000_000_000));
+        assert!(Principals::read(folder.path())?.is_some_and(|read| read == principals));
+        Ok(())
+    }
 
     #[test]
     fn one_process_at_a_time_follows_a_stop_service_and_its_end_makes_room() -> io::Result<()> {

@@ -3,17 +3,20 @@
 mod machine;
 mod shown;
 mod site;
+mod stop;
 
 use super::client::{Call, Exit, unary};
 use super::out::{Format, Out, columns};
-use super::{released, stop};
+use super::released;
 use crate::clock;
+use crate::roles::Role;
 use midshift_bundle::freshness::{newest_targets, root_edition, stamp, targets_edition};
 use midshift_bundle::repository::TIMESTAMP_LIFE_MS;
 use midshift_core::time::Utc;
 use midshift_proto::ota::v1::{GetMetadataRequest, ListBundlesRequest, ListBundlesResponse, SoftwareRoom};
 use midshift_proto::task::v1::{ListTasksRequest, TaskFilter, TaskState};
 use midshift_proto::telemetry::v1;
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use tonic::Code;
 use tonic_health::pb::health_check_response::ServingStatus;
@@ -32,16 +35,6 @@ const FULL_PERCENT: u64 = 90;
 const ROOTS_MAX: u64 = 1_024;
 /// Milliseconds of a day.
 const DAY_MS: u64 = 24 * 3_600_000;
-
-/// Every service of a server.
-const SERVICES: [&str; 6] = [
-    "midshift.task.v1.TaskService",
-    "midshift.fleet.v1.FleetService",
-    "midshift.telemetry.v1.TelemetryService",
-    "midshift.link.v1.LinkService",
-    "midshift.ota.v1.BundleService",
-    "midshift.ota.v1.RolloutService",
-];
 
 /// What to look at.
 #[derive(Clone, Debug, clap::Args)]
@@ -79,7 +72,7 @@ pub async fn run(doctor: &Doctor, out: &Out) -> Result<(), Exit> {
     found.extend(machine::data(&doctor.data));
     match doctor.call.telemetry().await {
         Err(_) => {
-            found.push(machine::descriptors(None));
+            found.extend(machine::descriptors(&doctor.data, None));
             let at = doctor.call.address()?;
             found.push(Finding::look(
                 "server",
@@ -111,7 +104,11 @@ async fn server(doctor: &Doctor, found: &mut Vec<Finding>) -> Result<(), Exit> {
     let (call, now) = (&doctor.call, clock::wall());
     let resolved = call.resolved()?;
     let channel = call.line().await?;
-    for service in SERVICES {
+    // Without a login there is nobody to enrol and no token to make.
+    let identity = Role::Identity.services().iter().filter(|_| resolved.is_secure());
+    let others = Role::ALL.into_iter().filter(|role| *role != Role::Identity).flat_map(Role::services);
+    let services: BTreeSet<&str> = others.chain(identity).copied().collect();
+    for service in services {
         let request = tonic_health::pb::HealthCheckRequest { service: service.to_owned() };
         let status = HealthClient::new(channel.clone()).check(unary(request)).await.map(|r| r.into_inner().status());
         let good = matches!(status, Ok(ServingStatus::Serving));
@@ -119,13 +116,15 @@ async fn server(doctor: &Doctor, found: &mut Vec<Finding>) -> Result<(), Exit> {
         found.push(Finding { what: "service", good, text });
     }
     found.push(store(call).await);
-    found.extend(robots(call).await?);
+    let (robots, online) = robots(doctor).await?;
+    found.extend(robots);
     found.push(operator(call).await?);
     found.extend(releases(call).await);
     found.extend(shown::certificates(&resolved, now).await);
     found.extend(site::identities(call, &resolved, now).await);
     found.push(site::exposure(&resolved));
-    found.push(site::stop(&resolved, &stop::address(doctor.stop_server.as_deref(), &resolved)?).await);
+    let address = super::stop::address(doctor.stop_server.as_deref(), &resolved)?;
+    found.extend(stop::look(&resolved, &address, now, &online).await);
     Ok(())
 }
 
@@ -247,11 +246,13 @@ async fn store(call: &Call) -> Finding {
     Finding { what: "store", good, text }
 }
 
-async fn robots(call: &Call) -> Result<Vec<Finding>, Exit> {
+/// What is to be said of robots, and which of them are online.
+async fn robots(doctor: &Doctor) -> Result<(Vec<Finding>, Vec<String>), Exit> {
+    let call = &doctor.call;
     let request = v1::ListRobotsRequest { page_size: 1_000, ..v1::ListRobotsRequest::default() };
     let mut client = call.telemetry().await?;
     let answer = client.list_robots(unary(request.clone())).await?;
-    let server = shown::clock(answer.metadata(), clock::wall());
+    let server = shown::clock("the server", answer.metadata(), clock::wall());
     let mut page = answer.into_inner();
     let mut robots = std::mem::take(&mut page.robots);
     while !page.next_page_token.is_empty() {
@@ -259,14 +260,16 @@ async fn robots(call: &Call) -> Result<Vec<Finding>, Exit> {
         page = client.list_robots(unary(next)).await?.into_inner();
         robots.append(&mut page.robots);
     }
-    let online = robots.iter().filter(|r| r.presence() == v1::Presence::Online).count();
-    let good = online == robots.len();
-    Ok(vec![
-        machine::descriptors(Some(robots.len())),
-        Finding { what: "robots", good, text: format!("{online} of {} online", robots.len()) },
+    let online = robots.iter().filter(|r| r.presence() == v1::Presence::Online).map(|r| r.robot_id.clone());
+    let online: Vec<String> = online.collect();
+    let good = online.len() == robots.len();
+    let mut found = machine::descriptors(&doctor.data, Some(robots.len()));
+    found.extend([
+        Finding { what: "robots", good, text: format!("{} of {} online", online.len(), robots.len()) },
         server,
         clocks(&robots),
-    ])
+    ]);
+    Ok((found, online))
 }
 
 /// Clocks of robots beside the server's, as their heartbeats measure them.

@@ -55,6 +55,16 @@ struct Args {
     command: Command,
 }
 
+impl Args {
+    /// What is said once for all goes where it is needed.
+    fn spread(mut self) -> Self {
+        if let Command::Serve(serve) = &mut self.command {
+            serve.log = self.log;
+        }
+        self
+    }
+}
+
 #[derive(Subcommand)]
 enum Command {
     /// A whole factory in one process, to try things: simulated robots, in memory, loopback. Not for production.
@@ -151,7 +161,7 @@ enum AgentVerb {
 
 /// Reads the arguments, runs the command, gives the exit code.
 pub fn main() -> ExitCode {
-    let args = Args::parse();
+    let args = Args::parse().spread();
     if let Command::Launcher { arguments } = args.command {
         // Before anything that a launcher must not need: no runtime, no threads.
         return launcher::main(arguments.into_iter());
@@ -276,6 +286,8 @@ async fn migrate(data: &std::path::Path, database: &Database, out: &Out) -> Resu
     Ok(())
 }
 
+#[cfg(test)]
+mod deployed;
 #[cfg(test)]
 mod tests {
     use super::*;

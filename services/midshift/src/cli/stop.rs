@@ -18,7 +18,7 @@ use std::path::PathBuf;
 /// Stops that were not confirmed by all.
 const NOT_ALL: u8 = 13;
 /// Every robot of a site in one message.
-const ANSWER_BYTES_MAX: usize = 64 * 1024 * 1024;
+pub const ANSWER_BYTES_MAX: usize = 64 * 1024 * 1024;
 
 /// Which stop service, and as whom.
 #[derive(Clone, Debug, Args)]

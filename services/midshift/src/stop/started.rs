@@ -42,6 +42,8 @@ pub struct Started {
     pub listen: SocketAddr,
     /// The site's root; none: plain text, no login.
     pub authority_pem: Option<String>,
+    /// Further arguments of it.
+    pub arguments: Vec<String>,
 }
 
 impl Started {
@@ -86,6 +88,7 @@ impl Started {
         if self.authority_pem.is_none() {
             command.arg("--insecure");
         }
+        command.args(&self.arguments);
         // A stop service that cannot be heard is better than none.
         let said = log(&self.data.join(FOLDER)).map_or_else(|_| Stdio::null(), Stdio::from);
         // A group of its own: neither Ctrl-C at a terminal nor a kill of this group reaches it.

@@ -4,13 +4,16 @@ use super::oldest::{Oldest, look};
 use super::{Turn, audit};
 use crate::postgres_server::PostgresServer;
 use midshift_core::fleet::rows::FleetMark;
-use midshift_core::ids::{RobotId, SiteId};
+use midshift_core::ids::{RobotId, SiteId, StopId};
 use midshift_core::privacy::{self, Place, Retention};
+use midshift_core::robot::StopLevel;
 use midshift_core::rollout::rows::OtaMark;
 use midshift_core::rows::{
     Expect, Fact, Index, Item, Key, Log, Record, Revision, RowChange, Seq, Table, Write, Writer,
 };
 use midshift_core::site::text;
+use midshift_core::stop::record::{StopRecord, copy};
+use midshift_core::stop::{Latch, Reset, Scope, Stop};
 use midshift_core::task::{Phase, TaskState};
 use midshift_core::time::{Clock, Now, Utc};
 use midshift_proto::common::v1::Pose;
@@ -54,6 +57,8 @@ struct World {
     frames: Arc<dyn FrameLog>,
     task: TaskService,
     written: u64,
+    /// What a stop service would keep.
+    latch: Latch,
     marked: [Revision; 2],
 }
 
@@ -62,7 +67,7 @@ impl World {
         let site = Arc::new(text::parse(include_str!("../../../../sites/demo.site.toml")).expect("a site"));
         let parts = midshift_task::Parts { store: store.clone(), site, clock: wall.clone() };
         let task = TaskService::open(parts, CancellationToken::new()).await.expect("intake");
-        Self { wall, store, frames, task, written: 0, marked: Default::default() }
+        Self { wall, store, frames, task, written: 0, latch: Latch::default(), marked: Default::default() }
     }
     async fn commit(&self, item: Item) {
         self.store.commit(vec![item]).await.remove(0).expect("applied");
@@ -75,16 +80,23 @@ impl World {
             let write = Write::Put { body: Arc::from("{}"), index: Index { order: Some(now), ..Index::default() } };
             RowChange { key: Key::new(table, format!("row-{n}")), expect: Expect::Absent, write, kind: "row.put" }
         };
-        for table in [
-            Table::RequestKey,
-            Table::TaskRequest,
-            Table::CommandKey,
-            Table::OtaCommandKey,
-            Table::StopRecord,
-            Table::Token,
-        ] {
+        for table in [Table::RequestKey, Table::TaskRequest, Table::CommandKey, Table::OtaCommandKey, Table::Token] {
             self.commit(Item { rows: vec![row(table)], ..Item::new(table.writer(), "test") }).await;
         }
+        let stop_id = StopId::parse(&format!("STOP-{n}")).expect("an id");
+        let (at, actor, reason) = (Utc(now), "anna".to_owned(), "over".to_owned());
+        self.latch.engage(Stop {
+            stop_id: stop_id.clone(),
+            scope: Scope::Fleet,
+            level: StopLevel::Halt,
+            engaged: at,
+            actor: actor.clone(),
+            reason: String::new(),
+            region: None,
+            proof: Vec::new(),
+        });
+        self.latch.reset(Reset { stop_id, at, actor, reason });
+        self.copy_stops().await;
         let mut telemetry = Item { rows: vec![row(Table::Presence)], ..Item::new(Writer::Telemetry, "test") };
         let fact = Fact { log: Log::RobotInbox, subject: Arc::from("r1"), kind: "event", body: Arc::from("{}") };
         telemetry.facts.push(fact);
@@ -131,7 +143,20 @@ impl World {
         self.marked[at] = self.marked[at].next();
         self.commit(item).await;
     }
-    async fn purge(&self) {
+    /// As whoever follows a stop service does.
+    async fn copy_stops(&self) {
+        let snapshot = self.store.snapshot(&[Table::StopRecord]).await.expect("read");
+        let known = snapshot.rows.iter().map(|row| {
+            let record: StopRecord = row.decode().expect("a stop");
+            (record.stop.stop_id.clone(), (record, row.revision))
+        });
+        for applied in self.store.commit(copy(&self.latch, &known.collect())).await {
+            applied.expect("applied");
+        }
+    }
+    async fn purge(&mut self) {
+        self.latch.forget(self.wall.now().wall, midshift_core::limits::RESETS_MAX);
+        self.copy_stops().await;
         let (store, frames, clock) = (self.store.as_ref(), self.frames.as_ref(), self.wall.as_ref());
         Turn { store, frames, clock, task: Some(&self.task) }.take(|_| true).await;
         for (writer, _) in Table::audits() {
@@ -186,8 +211,8 @@ async fn nothing_gets_too_old(mut world: World) {
 
 #[test]
 fn every_place_that_goes_by_age_is_looked_at_or_has_its_reason() {
-    // These go with their task, or are looked after by the stop service, its follower and the robot.
-    let others = ["task_intake", "attempt", "stop_record", "stop/latch", "ledger"];
+    // These go with their task, or are looked after by the stop service and the robot.
+    let others = ["task_intake", "attempt", "stop/latch", "ledger"];
     let runtime = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
     let looked_at = runtime.block_on(async {
         let wall = Arc::new(Wall(AtomicI64::new(BEGIN)));

@@ -5,6 +5,7 @@
 use midshift_core::audit::AuditRow;
 use midshift_core::privacy::{self, DataClass, Kept, Place};
 use midshift_core::rows::{Log, Row, Seq, Table};
+use midshift_core::stop::record::StopRecord;
 use midshift_core::task::{Phase, TaskState};
 use midshift_core::time::{Clock, Now, Utc};
 use midshift_store::{Error, FrameLog, Query, Store};
@@ -22,7 +23,8 @@ pub struct Oldest {
     pub age_max_ms: u64,
 }
 
-/// Of each place that goes by age and can be asked. Attempts and intakes go with their task; files of the stop service and of robots are looked after by those.
+/// Of each place that goes by age and can be asked. Attempts, requests and intakes of tasks go in the same turn as the state of their task, after it or before it, so
+/// that the age of `task_state` is theirs; files of the stop service and of robots are looked after by those, and `stop_record` follows the first.
 ///
 /// # Errors
 /// If the store or the log of samples cannot be read.
@@ -59,6 +61,7 @@ async fn age(store: &dyn Store, frames: &dyn FrameLog, now: Now, kept: &Kept) ->
         Place::CoarseSamples => wall(frames.oldest().await?.any),
         Place::Log(log) => wall(first_entry(store, log).await?),
         Place::Table(Table::TaskState) => Some(ended(store).await?.map_or(0, |at| now.utc.ms_since(at))),
+        Place::Table(Table::StopRecord) => wall(reset(store).await?.map(|at| at.0)),
         Place::Table(table) if table.is_audit() => wall(first(store, table).await?.and_then(|row| written(&row))),
         Place::Table(Table::RequestKey | Table::TaskRequest | Table::CommandKey | Table::OtaCommandKey) => {
             let Place::Table(table) = kept.place else { return Ok(None) };
@@ -66,6 +69,13 @@ async fn age(store: &dyn Store, frames: &dyn FrameLog, now: Now, kept: &Kept) ->
         }
         Place::Table(_) | Place::Gaps | Place::Heard | Place::File(_) | Place::Robot(_) => None,
     })
+}
+
+/// When the stop was reset that was reset longest ago; one that is engaged has no age.
+async fn reset(store: &dyn Store) -> Result<Option<Utc>, Error> {
+    let snapshot = store.snapshot(&[Table::StopRecord]).await?;
+    let records = snapshot.rows.iter().filter_map(|row| row.decode::<StopRecord>().ok());
+    Ok(records.filter_map(|record| record.reset).map(|reset| reset.at).min())
 }
 
 async fn first(store: &dyn Store, table: Table) -> Result<Option<Row>, Error> {

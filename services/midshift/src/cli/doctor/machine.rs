@@ -3,43 +3,80 @@
 use super::Finding;
 use crate::serve::IDENTITY;
 use crate::stop;
+use midshift_core::limits;
+use std::collections::BTreeSet;
 use std::fs;
-use std::os::unix::fs::PermissionsExt;
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::Path;
 
 /// Descriptors a server for a thousand robots should have.
 const DESCRIPTORS_WANTED: u64 = 4_096;
-/// Connections of one robot at most: its session, bulk, and its line to the stop service.
-const CONNECTIONS_A_ROBOT: u64 = 3;
-/// Descriptors for people, programs, files and the database.
-const DESCRIPTORS_BESIDE: u64 = 512;
+/// Connections of one robot to the server at most: its session, and bulk.
+const OF_SERVER: u64 = 2;
+/// And to the stop service: its line.
+const OF_STOP: u64 = 1;
+/// Descriptors for files, the database, people and programs.
+const DESCRIPTORS_BESIDE: u64 = limits::DESCRIPTORS_KEPT as u64;
 /// A disk with less than this free wants a look, percent ...
 const FREE_PERCENT: u64 = 10;
 /// ... and bytes.
 const FREE_BYTES: u64 = 1 << 30;
 
-/// How many files may be open here, beside what the robots that are known need.
-pub fn descriptors(robots: Option<usize>) -> Finding {
-    let text = fs::read_to_string("/proc/self/limits").unwrap_or_default();
-    let limit = text
-        .lines()
-        .find(|l| l.starts_with("Max open files"))
-        .and_then(|l| l.split_whitespace().nth(3))
-        .and_then(|n| n.parse::<u64>().ok());
-    match limit {
-        None => Finding::good("descriptors", "limit unknown on this system"),
-        Some(n) => of_descriptors(n, robots.map_or(0, |robots| robots as u64)),
+/// How many files the server of this data folder and its stop service may have open, beside what the robots that are known need.
+pub fn descriptors(folder: &Path, robots: Option<usize>) -> Vec<Finding> {
+    let robots = robots.map_or(0, |robots| robots as u64);
+    let processes = [("server", folder.to_owned(), OF_SERVER), ("stop service", folder.join(stop::FOLDER), OF_STOP)];
+    let held = processes.into_iter().filter_map(|(whose, folder, each)| {
+        let limit = limit_of(&format!("/proc/{}/limits", holder(&folder)?))?;
+        Some(of_descriptors(whose, limit, robots, each))
+    });
+    let found: Vec<Finding> = held.collect();
+    if found.is_empty() {
+        let text = format!("nobody here holds {}, so that the server's limit cannot be read", folder.display());
+        return vec![Finding::good(
+            "descriptors",
+            format!("{text}; look on its machine, with --data and as its user or root"),
+        )];
+    }
+    found
+}
+
+/// The process that holds a lock of a file in this folder, as a server and a stop service do for as long as they run.
+fn holder(folder: &Path) -> Option<u32> {
+    let files: BTreeSet<u64> =
+        fs::read_dir(folder).ok()?.filter_map(|file| Some(file.ok()?.metadata().ok()?.ino())).collect();
+    holder_of(&fs::read_to_string("/proc/locks").ok()?, &files)
+}
+
+/// `locks` as in proc(5): `1: FLOCK ADVISORY WRITE 4711 08:01:131 0 EOF`.
+fn holder_of(locks: &str, files: &BTreeSet<u64>) -> Option<u32> {
+    locks.lines().find_map(|line| {
+        let mut words = line.split_whitespace().skip(1);
+        let (kind, pid, file) = (words.next()?, words.nth(2)?, words.next()?);
+        let inode = file.rsplit(':').next()?.parse().ok()?;
+        (kind == "FLOCK" && files.contains(&inode)).then(|| pid.parse().ok())?
+    })
+}
+
+fn limit_of(limits: &str) -> Option<u64> {
+    let text = fs::read_to_string(limits).ok()?;
+    let line = text.lines().find(|line| line.starts_with("Max open files"))?;
+    match line.split_whitespace().nth(3)? {
+        "unlimited" => Some(u64::MAX),
+        number => number.parse().ok(),
     }
 }
 
-fn of_descriptors(limit: u64, robots: u64) -> Finding {
-    let wanted = DESCRIPTORS_WANTED.max(robots * CONNECTIONS_A_ROBOT + DESCRIPTORS_BESIDE);
+fn of_descriptors(whose: &str, limit: u64, robots: u64, each: u64) -> Finding {
+    let wanted = DESCRIPTORS_WANTED.max(robots * each + DESCRIPTORS_BESIDE);
     let text = format!(
-        "{limit} open files allowed in this shell; a server of {robots} robots should have {wanted}, {CONNECTIONS_A_ROBOT} for each robot"
+        "the {whose} may have {limit} files open; for {robots} robots it should be {wanted}, {each} for each robot"
     );
     match limit >= wanted {
         true => Finding::good("descriptors", text),
-        false => Finding::look("descriptors", format!("{text}: LimitNOFILE= in its unit, or ulimit -n")),
+        false => {
+            Finding::look("descriptors", format!("{text}: LimitNOFILE= in its unit, or ulimit -n before it is started"))
+        }
     }
 }
 
@@ -68,7 +105,7 @@ pub fn data(folder: &Path) -> Vec<Finding> {
 /// The folder with its mode, if it is open to others.
 fn is_open(folder: &Path) -> Option<String> {
     let mode = fs::metadata(folder).ok()?.permissions().mode() & 0o777;
-    (mode & 0o007 != 0).then(|| format!("{} has mode {mode:03o}", folder.display()))
+    (mode & 0o077 != 0).then(|| format!("{} has mode {mode:03o}", folder.display()))
 }
 
 fn disk(folder: &Path) -> Finding {
@@ -101,10 +138,24 @@ mod tests {
 
     #[test]
     fn the_limit_of_open_files_is_held_against_the_robots_of_the_site() {
-        assert_eq!([of_descriptors(4_095, 12).good, of_descriptors(4_096, 12).good], [false, true]);
-        assert_eq!([of_descriptors(30_511, 10_000).good, of_descriptors(30_512, 10_000).good], [false, true]);
-        let found = of_descriptors(1_024, 12);
-        assert!(found.text.contains("should have 4096") && found.text.contains("LimitNOFILE"), "{}", found.text);
+        let good = |limit, robots| of_descriptors("server", limit, robots, 2).good;
+        assert_eq!([good(4_095, 12), good(4_096, 12)], [false, true]);
+        assert_eq!([good(20_511, 10_000), good(20_512, 10_000)], [false, true]);
+        let found = of_descriptors("stop service", 1_024, 12, 1);
+        assert!(found.text.contains("should be 4096") && found.text.contains("LimitNOFILE"), "{}", found.text);
+    }
+
+    #[test]
+    fn the_limit_is_that_of_the_process_that_holds_the_folder_and_not_of_this_shell() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let found = descriptors(folder.path(), None);
+        assert!(found.len() == 1 && found[0].text.starts_with("nobody here holds"), "{found:?}");
+        let lock = fs::File::create(folder.path().join("rows.lock")).expect("a file");
+        lock.try_lock().expect("nobody has it");
+        let found = descriptors(folder.path(), None);
+        assert!(found.len() == 1 && found[0].text.starts_with("the server may have "), "{found:?}");
+        let locks = "1: POSIX  ADVISORY  READ 17 08:01:131 0 EOF\n2: -> FLOCK ADVISORY WRITE 18 08:01:131 0 EOF\n3: FLOCK  ADVISORY  WRITE 19 08:01:131 0 EOF\n";
+        assert_eq!([holder_of(locks, &[131].into()), holder_of(locks, &[132].into())], [Some(19), None]);
     }
 
     #[test]
@@ -127,8 +178,10 @@ mod tests {
         open(&keys, 0o755);
         assert!(!told().good && told().text.contains("identity has mode 755"), "{}", told().text);
         open(&keys, 0o700);
-        open(folder.path(), 0o704);
-        assert!(!told().good);
+        for mode in [0o704, 0o750, 0o710] {
+            open(folder.path(), mode);
+            assert!(!told().good, "{mode:o}");
+        }
         assert!(data(&folder.path().join("elsewhere"))[0].text.contains("--data"));
     }
 }

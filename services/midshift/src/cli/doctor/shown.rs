@@ -18,7 +18,7 @@ pub async fn certificates(resolved: &Resolved, now: Utc) -> Vec<Finding> {
     if !resolved.is_secure() {
         return vec![Finding::good("certificates", "none: this server is asked in plain text")];
     }
-    match ends(resolved).await {
+    match ends(resolved, &resolved.server).await {
         Ok(ends) if !ends.is_empty() => {
             let what = [
                 (
@@ -38,6 +38,16 @@ pub async fn certificates(resolved: &Resolved, now: Utc) -> Vec<Finding> {
     }
 }
 
+/// When the certificate of the stop service ends, which it has of whoever tells it who is known; nothing in plain text.
+pub async fn of_stop(resolved: &Resolved, address: &str, now: Utc) -> Option<Finding> {
+    let then =
+        "it shows what was written down for it: look at the log of `midshift serve`, or of its role stop-follower";
+    match ends(resolved, address).await {
+        Ok(ends) => Some(left("the stop service's", *ends.first()?, now, SERVER_LEFT_DAYS, then)),
+        Err(error) => Some(Finding::look("certificates", format!("of the stop service: {error:#}"))),
+    }
+}
+
 /// What is said of something that ends.
 pub fn left(whose: &str, end: Utc, now: Utc, least_days: u64, then: &str) -> Finding {
     let days = end.ms_since(now) / DAY_MS;
@@ -52,8 +62,8 @@ pub fn left(whose: &str, end: Utc, now: Utc, least_days: u64, then: &str) -> Fin
     Finding::good("certificates", text)
 }
 
-async fn ends(resolved: &Resolved) -> Result<Vec<Utc>, Exit> {
-    let wire = resolved.way(&resolved.server)?.wire().await.map_err(anyhow::Error::from)?;
+async fn ends(resolved: &Resolved, address: &str) -> Result<Vec<Utc>, Exit> {
+    let wire = resolved.way(address)?.wire().await.map_err(anyhow::Error::from)?;
     let Either::Right(stream) = wire else { return Ok(Vec::new()) };
     let shown = stream.get_ref().1.peer_certificates().unwrap_or_default();
     Ok(shown.iter().filter_map(|certificate| not_after(certificate)).collect())
@@ -102,17 +112,21 @@ fn element(bytes: &[u8]) -> Option<(u8, &[u8], &[u8])> {
     Some((tag, content, rest))
 }
 
-/// What the server's clock says beside this one, from the head of an answer.
-pub fn clock(answer: &MetadataMap, now: Utc) -> Finding {
-    let said = answer.get("date").and_then(|date| date.to_str().ok()).and_then(date);
-    let Some(said) = said else { return Finding::good("clocks", "the server does not say its time") };
+/// What whoever answers takes for the time, in whole seconds, from the head of its answer.
+pub fn said(answer: &MetadataMap) -> Option<Utc> {
+    answer.get("date").and_then(|date| date.to_str().ok()).and_then(date)
+}
+
+/// What its clock says beside this one.
+pub fn clock(whose: &str, answer: &MetadataMap, now: Utc) -> Finding {
+    let Some(said) = said(answer) else { return Finding::good("clocks", format!("{whose} does not say its time")) };
     let (ahead, behind) = (said.ms_since(now), now.ms_since(said));
     if ahead.max(behind) <= AGREES_MS {
-        return Finding::good("clocks", "the server and this machine agree");
+        return Finding::good("clocks", format!("{whose} and this machine agree"));
     }
     let (seconds, way) = if ahead > behind { (ahead / 1_000, "ahead of") } else { (behind / 1_000, "behind") };
     let then = "certificates and signatures are judged by it: set both from the network (NTP)";
-    Finding::look("clocks", format!("the server is {seconds} s {way} this machine; {then}"))
+    Finding::look("clocks", format!("{whose} is {seconds} s {way} this machine; {then}"))
 }
 
 /// `Sun, 06 Nov 1994 08:49:37 GMT`.
@@ -162,9 +176,9 @@ mod tests {
     #[test]
     fn a_server_whose_clock_is_off_is_told_of_by_how_much() {
         let mut answer = MetadataMap::new();
-        assert!(clock(&answer, Utc(0)).good, "it does not say its time");
+        assert!(clock("the server", &answer, Utc(0)).good, "it does not say its time");
         answer.insert("date", "Sun, 06 Nov 1994 08:49:37 GMT".parse().expect("text"));
-        let at = |text: &str| clock(&answer, Utc::parse_rfc3339(text).expect("a time"));
+        let at = |text: &str| clock("the server", &answer, Utc::parse_rfc3339(text).expect("a time"));
         assert!(at("1994-11-06T08:49:38Z").good && at("1994-11-06T08:49:34Z").good);
         let (ahead, behind) = (at("1994-11-06T08:48:37Z"), at("1994-11-06T09:49:37Z"));
         assert!(!ahead.good && ahead.text.starts_with("the server is 60 s ahead of this machine"), "{}", ahead.text);

@@ -8,8 +8,6 @@ use midshift_core::time::Utc;
 use midshift_proto::convert::time_of;
 use midshift_proto::identity::v1::{ListRobotIdentitiesRequest, ListTokensRequest, RobotIdentity, Token};
 use std::net::IpAddr;
-use tonic_health::pb::health_check_response::ServingStatus;
-use tonic_health::pb::health_client::HealthClient;
 
 /// People are told so long before a token ends.
 const TOKEN_LEFT_DAYS: u64 = 14;
@@ -114,25 +112,6 @@ pub fn exposure(resolved: &Resolved) -> Finding {
         (false, false) => Finding::look(
             "exposure",
             "plain text without login, and not on this machine alone: whoever reaches the port commands the fleet; leave --insecure away and sign in",
-        ),
-    }
-}
-
-/// Whether the stop service answers.
-pub async fn stop(resolved: &Resolved, address: &str) -> Finding {
-    let asked = async {
-        let line = resolved.way(address)?.connect().await.map_err(anyhow::Error::from)?;
-        let service = "midshift.stop.v1.StopService".to_owned();
-        let request = tonic_health::pb::HealthCheckRequest { service };
-        Ok::<_, Exit>(HealthClient::new(line).check(unary(request)).await?.into_inner().status())
-    };
-    match asked.await {
-        Ok(ServingStatus::Serving) => Finding::good("stop", "the stop service answers"),
-        _ => Finding::look(
-            "stop",
-            format!(
-                "no stop service of this site answers at {address}: `midshift stop` reaches nobody; `midshift stop serve`, or --stop-server if it is elsewhere"
-            ),
         ),
     }
 }

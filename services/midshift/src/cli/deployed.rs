@@ -1,0 +1,62 @@
+//! What is typed for an operator in deploy/, and what one program of ours types for another, is what this program reads.
+
+use super::{Args, Command, logs};
+use clap::Parser;
+
+const UNITS: [(&str, &str); 3] = [
+    ("midshift.service", include_str!("../../../../deploy/midshift.service")),
+    ("midshift-stop.service", include_str!("../../../../deploy/midshift-stop.service")),
+    ("midshift-robot.service", include_str!("../../../../deploy/midshift-robot.service")),
+];
+
+/// Words of each ExecStart= of a unit, with what stands in the file that the unit reads.
+fn started(unit: &str) -> Vec<Vec<String>> {
+    let whole = unit.replace("\\\n", " ").replace("${ROBOT_ID}", "rbt-01").replace("${SERVER}", "fleet.local");
+    let lines = whole.lines().filter_map(|line| line.strip_prefix("ExecStart="));
+    lines.map(|line| line.split_whitespace().map(str::to_owned).collect()).collect()
+}
+
+fn read(words: &[String]) -> Args {
+    Args::try_parse_from(words).unwrap_or_else(|error| panic!("{words:?}: {error}")).spread()
+}
+
+#[test]
+fn every_unit_starts_a_command_that_there_is_with_arguments_that_it_takes() {
+    for (name, unit) in UNITS {
+        let started = started(unit);
+        assert_eq!(started.len(), 1, "{name}");
+        for words in started {
+            assert!(!words.iter().any(|word| word.contains('$')), "{name}: {words:?}");
+            if words[0].ends_with("/midshift") {
+                read(&words);
+                continue;
+            }
+            // The launcher, which gives what stands behind -- to the program there.
+            assert_eq!(words[0], "/usr/local/bin/midshift-launcher", "{name}");
+            let theirs = words.iter().position(|word| word == "--").expect("a program to start");
+            assert!(matches!(read(&words[theirs + 1..]).command, Command::Agent(_)), "{name}");
+            let own: Vec<String> =
+                ["midshift", "launcher"].map(str::to_owned).into_iter().chain(words[1..].to_vec()).collect();
+            read(&own);
+        }
+    }
+}
+
+#[test]
+fn the_stop_service_beside_a_server_takes_the_same_peers_and_logs_in_the_same_form() {
+    let told = |arguments: &[&str]| {
+        let words: Vec<String> = ["midshift"].iter().chain(arguments).map(|word| (*word).to_owned()).collect();
+        let Command::Serve(serve) = read(&words).command else { panic!("{arguments:?}") };
+        let own =
+            ["midshift", "stop", "serve"].map(str::to_owned).into_iter().chain(serve.for_stop()).collect::<Vec<_>>();
+        let args = read(&own);
+        let Command::Stop(stop) = args.command else { panic!("{own:?}") };
+        (args.log, stop.serves().expect("it serves").share)
+    };
+    let (log, share) =
+        told(&["--log", "json", "serve", "--connections-per-address", "8000", "--requests-per-second", "77"]);
+    assert_eq!(log, logs::Format::Json);
+    assert_eq!((share.connections_per_address, share.requests_per_second.get()), (Some(8_000), 77));
+    let (log, share) = told(&["serve"]);
+    assert_eq!((log, share.connections_per_address), (logs::Format::Text, None));
+}
