@@ -87,7 +87,7 @@ pub async fn play(part: Part, address: SocketAddr, stop: CancellationToken) -> a
                 listen: address,
                 insecure: false,
                 // All robots of a run come from one address.
-                share: Share { connections_per_address: CONNECTIONS_MAX, ..Share::default() },
+                share: Share { connections_per_address: Some(CONNECTIONS_MAX), ..Share::default() },
             };
             midshift::stop::run(serve, stop).await
         }
