@@ -38,7 +38,8 @@ fn paths() -> Vec<String> {
 async fn announced(routes: &Routes, path: &str, bytes: usize) -> Status {
     let head = [&[0][..], &u32::try_from(bytes).expect("a size of the wire").to_be_bytes()].concat();
     let body = tokio_stream::once(Ok::<_, std::convert::Infallible>(head)).chain(tokio_stream::pending());
-    let request = Request::post(path).header("content-type", "application/grpc");
+    // gRPC of another version of HTTP is turned away before any service.
+    let request = Request::post(path).version(http::Version::HTTP_2).header("content-type", "application/grpc");
     let request = request.body(Body::new(axum::body::Body::from_stream(body))).expect("a request");
     let answered = async {
         let (head, body) = routes.clone().oneshot(request).await.expect("never fails").into_parts();
@@ -52,7 +53,7 @@ async fn announced(routes: &Routes, path: &str, bytes: usize) -> Status {
                 return status;
             }
         }
-        Status::unknown("no status")
+        panic!("{path} ends without a status: {}", head.status)
     };
     let within = tokio::time::timeout(Duration::from_secs(20), answered).await;
     within.unwrap_or_else(|_| panic!("{path} waits for {bytes} bytes"))
@@ -85,8 +86,11 @@ async fn a_message_that_is_too_large_is_refused_when_it_is_announced_at_each_ser
             if path.starts_with("/midshift.") && is_of_stop != (name == "stop") {
                 continue;
             }
-            let status = announced(routes, &path, LARGE).await;
-            assert_ne!(status.code(), Code::Ok, "{name} {path}");
+            // Signed documents are larger, and are taken of whoever may publish.
+            let is_signed = path.starts_with("/midshift.ota.v1.BundleService/");
+            let status = announced(routes, &path, if is_signed { 4 * LARGE } else { LARGE }).await;
+            // Reflection ends its stream without a word; what counts is that it waits for nothing.
+            assert!(status.code() != Code::Ok || path.starts_with("/grpc.reflection."), "{name} {path}");
             assert_ne!(status.code(), Code::Unimplemented, "{name} {path} is not there, and nothing was tried");
             // What comes further than the head without a certificate or a token.
             if access::check(&Caller::nobody(), &path).is_ok() {
