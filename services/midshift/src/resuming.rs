@@ -37,7 +37,7 @@ pub async fn rounds(board: Arc<LiveBoard<Live>>, channel: Channel) -> Infallible
             match client.resume_held(request).await {
                 Ok(_) => tracing::info!(%stop_id, "a person looked at a robot that stood in silence, and resumed it"),
                 // The next round asks again.
-                Err(status) => tracing::debug!(%stop_id, code = ?status.code(), "a robot could not be resumed"),
+                Err(status) => tracing::debug!(%stop_id, code = status.code() as i32, "a robot could not be resumed"),
             }
         }
     }

@@ -72,6 +72,10 @@ async fn tokens(server: &Server) -> anyhow::Result<BTreeMap<(Role, Scope), Strin
     let mut tokens = BTreeMap::new();
     for role in Role::ALL {
         for scope in [Scope::Site, Scope::Area(AreaId::parse(AREAS[0])?)] {
+            // Of the whole site alone: no other token of them is given out.
+            if scope != Scope::Site && matches!(role, Role::Admin | Role::Auditor) {
+                continue;
+            }
             let grant =
                 if scope == Scope::Site { role.as_str().to_owned() } else { format!("{}@{}", role.as_str(), AREAS[0]) };
             let request = CreateTokenRequest { name: name(*role, &scope), grants: vec![grant], valid_seconds: 86_400 };

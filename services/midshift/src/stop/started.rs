@@ -23,7 +23,7 @@ use tonic_health::pb::health_client::HealthClient;
 
 /// In its folder: what a stop service says that `serve` has started.
 pub const LOG: &str = "log";
-/// One that has more than this begins anew with the next start, bytes.
+/// One that has more than this begins anew, bytes.
 const LOG_BYTES_MAX: u64 = 4 * 1024 * 1024;
 /// One that hangs is found out by a look so often, and started again after so many in vain; one that is gone is found out at once.
 const KEPT_EVERY: Duration = Duration::from_secs(2);
@@ -157,6 +157,8 @@ impl Started {
                 Ok(Ok(Some(_))) => {}
                 Ok(_) => return,
                 Err(_) => {
+                    // Of a process that runs for years too. Where it cannot be, it is said at the next start.
+                    drop(log(&self.data.join(FOLDER)));
                     let asked = client.check(HealthCheckRequest::default());
                     if !timeout(KEPT_EVERY, asked).await.is_ok_and(|answer| answer.is_ok()) {
                         return;

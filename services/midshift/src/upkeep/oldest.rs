@@ -62,7 +62,7 @@ async fn age(store: &dyn Store, frames: &dyn FrameLog, now: Now, kept: &Kept) ->
         Place::Log(log) => wall(first_entry(store, log).await?),
         Place::Table(Table::TaskState) => Some(ended(store).await?.map_or(0, |at| now.utc.ms_since(at))),
         Place::Table(Table::StopRecord) => wall(reset(store).await?.map(|at| at.0)),
-        Place::Table(table) if table.is_audit() => wall(first(store, table).await?.and_then(|row| written(&row))),
+        Place::Table(table) if table.is_audit() => wall(first_of_chain(store, table).await?),
         Place::Table(Table::RequestKey | Table::TaskRequest | Table::CommandKey | Table::OtaCommandKey) => {
             let Place::Table(table) = kept.place else { return Ok(None) };
             wall(first(store, table).await?.and_then(|row| row.index.order))
@@ -80,6 +80,12 @@ async fn reset(store: &dyn Store) -> Result<Option<Utc>, Error> {
 
 async fn first(store: &dyn Store, table: Table) -> Result<Option<Row>, Error> {
     Ok(store.list(Query { limit: 1, ..Query::all(table) }).await?.pop())
+}
+
+/// When the row was written behind which nothing goes yet: the one before it stays until it is old itself, since it may have been quoted till then.
+async fn first_of_chain(store: &dyn Store, table: Table) -> Result<Option<i64>, Error> {
+    let rows = store.list(Query { limit: 2, ..Query::all(table) }).await?;
+    Ok(rows.last().and_then(written))
 }
 
 fn written(row: &Row) -> Option<i64> {
