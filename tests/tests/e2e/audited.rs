@@ -203,7 +203,8 @@ async fn what_is_changed_to_look_as_if_it_was_old_and_cut_is_named_by_the_head_t
     sql(&file, &forged(&head).iter().map(String::as_str).collect::<Vec<_>>())?;
     server.restart().await?;
     let told = objection(&server, &["--head", noted])?;
-    let expected = format!("identity: it begins with row {}, and your note has row {}", head.n + 1, head.n);
+    // Another chain may have quoted an earlier row, which is named first.
+    let expected = format!("identity: it begins with row {}, and ", head.n + 1);
     ensure!(told.contains(&expected), "{told}");
     // An export says the same without a server.
     let file = dir.path().join("audit.jsonl").to_string_lossy().into_owned();
@@ -212,7 +213,7 @@ async fn what_is_changed_to_look_as_if_it_was_old_and_cut_is_named_by_the_head_t
     ensure!(told.contains(&expected), "{told}");
     // Nobody needs to have noted anything where other chains quote it.
     let told = objection(&server, &[])?;
-    ensure!(told.contains("identity: it begins with row ") && told.contains(" has row "), "{told}");
+    ensure!(told.contains(&expected) && !told.contains("your note"), "{told}");
     Ok(())
 }
 
