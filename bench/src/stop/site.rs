@@ -16,6 +16,8 @@ use midshift_stop::Principals;
 use midshift_store::{MemoryStore, StoreId};
 use rcgen::{CertificateParams, KeyPair};
 use serde::{Deserialize, Serialize};
+use std::fs::DirBuilder;
+use std::os::unix::fs::DirBuilderExt;
 use std::path::Path;
 use std::sync::Arc;
 use tokio_util::sync::CancellationToken;
@@ -84,7 +86,8 @@ impl Site {
     /// Writes down who is known for a stop service with this data folder.
     pub fn admit(&self, data: &Path) -> anyhow::Result<()> {
         let folder = data.join(midshift::stop::FOLDER);
-        std::fs::create_dir_all(&folder)?;
+        // A folder that others may look into is refused.
+        DirBuilder::new().recursive(true).mode(0o700).create(&folder)?;
         Ok(self.principals.write(&folder)?)
     }
     /// Writes down what these robots show.

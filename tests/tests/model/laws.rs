@@ -3,6 +3,7 @@
 use super::protocol::{Action, Asked, Holder, Protocol, State, in_flight};
 use stateright::{Checker, HasDiscoveries, Model, Property};
 use std::collections::HashMap;
+use std::fmt::Debug;
 use std::hash::Hash;
 
 pub const IN_FLIGHT: &str = "no more robots are out of work than the wave allows";
@@ -133,9 +134,26 @@ where
 /// Steps of the longest way that is looked for.
 const STEPS_MAX: usize = 30;
 
+/// The shortest way to break a law of a model without one rule has so many steps, these among them in this order.
+#[expect(clippy::print_stdout, reason = "a way that breaks a law belongs to the result")]
+pub fn assert_way<M>(model: M, naive: &dyn Debug, law: &'static str, steps: usize, among: &[M::Action])
+where
+    M: Model + Clone + Send + Sync + 'static,
+    M::State: Clone + Hash + PartialEq + Send + Sync + 'static,
+    M::Action: Clone + PartialEq + Debug,
+{
+    let way = shortest(model, law).unwrap_or_else(|| panic!("{naive:?} breaks nothing: {law}"));
+    println!("{naive:?} in {} steps: not true that {law}: {way:?}", way.len());
+    assert_eq!(way.len(), steps, "{way:?}");
+    let mut rest = way.iter();
+    for action in among {
+        assert!(rest.any(|taken| taken == action), "{action:?} is not in its place in {way:?}");
+    }
+}
+
 /// The shortest way to break a law, if there is one. One depth after the other: where several states of a block break a law, stateright
 /// tells the last that it saw.
-pub fn shortest<M>(model: M, law: &'static str) -> Option<Vec<M::Action>>
+fn shortest<M>(model: M, law: &'static str) -> Option<Vec<M::Action>>
 where
     M: Model + Clone + Send + Sync + 'static,
     M::State: Clone + Hash + PartialEq + Send + Sync + 'static,

@@ -4,7 +4,7 @@
 mod laws;
 mod parties;
 
-use super::laws::{ends_everywhere, shortest};
+use super::laws::{assert_way, ends_everywhere};
 use laws::is_end;
 use midshift_core::stop::ladder::Around;
 use parties::{Action, Naive, Parties};
@@ -55,16 +55,8 @@ fn two_robots_and_a_killed_service_come_to_the_same_stops() {
 }
 
 /// The shortest way in which the parties without one rule break a law: so many steps, these among them in this order.
-#[expect(clippy::print_stdout, reason = "a way that breaks a law belongs to the result")]
 fn assert_breaks(parties: Parties, naive: Naive, law: &'static str, steps: usize, among: &[Action]) {
-    let way = shortest(Parties { naive: Some(naive), ..parties }, law);
-    let way = way.unwrap_or_else(|| panic!("{naive:?} breaks nothing: {law}"));
-    println!("{naive:?} in {} steps: not true that {law}: {way:?}", way.len());
-    assert_eq!(way.len(), steps, "{way:?}");
-    let mut rest = way.iter();
-    for action in among {
-        assert!(rest.any(|taken| taken == action), "{action:?} is not in its place in {way:?}");
-    }
+    assert_way(Parties { naive: Some(naive), ..parties }, &naive, law, steps, among);
 }
 
 const KILL: Action = Action::Kill { written: false };
