@@ -2,6 +2,7 @@
 
 pub mod line;
 pub mod postgres;
+pub mod raw;
 pub mod released;
 pub mod rows;
 pub mod shape;

@@ -190,8 +190,8 @@ async fn serve(
 /// Records whom the port denies what in the stop service's own file, until it is dropped.
 async fn record(service: StopService, denials: Option<Receiver<Denial>>) {
     if let Some(mut denials) = denials {
-        while let Some(Denial { actor, network, path, code, left_out, robot_id: _ }) = denials.recv().await {
-            service.denied(&actor, network, &path, code, left_out);
+        while let Some(Denial { actor, network, path, robot_id, code, left_out }) = denials.recv().await {
+            service.denied(&actor, network, &path, robot_id.as_deref(), code, left_out);
         }
     }
     std::future::pending().await

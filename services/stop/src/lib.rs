@@ -228,10 +228,12 @@ impl StopService {
         let _ = self.inner.principals.set(told);
     }
 
-    /// Records that the port denied somebody something, unless too many are; `left_out`: so many that the port itself did not tell of.
-    pub fn denied(&self, actor: &str, network: IpAddr, path: &str, code: Code, left_out: u64) {
+    /// Records that the port denied somebody something, unless too many are; `robot_id`: the robot that was named, if one was; `left_out`: so many that the port itself
+    /// did not tell of.
+    pub fn denied(&self, actor: &str, network: IpAddr, path: &str, robot_id: Option<&str>, code: Code, left_out: u64) {
         let note = Note { actor: actor.to_owned(), ..Note::own(self.inner.clock.now().wall, Action::Denied) };
         let note = note.with("code", code).with("asked", path).with("network", network);
+        let note = robot_id.iter().fold(note, |note, robot_id| note.with("robot_id", robot_id));
         self.inner.disk.denied(note, left_out);
     }
 

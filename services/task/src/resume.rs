@@ -20,6 +20,9 @@ use midshift_store::{Cursor, Query, load};
 use std::collections::BTreeSet;
 use std::time::Duration;
 
+/// Tokens of all robots are read so often at most.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
+
 /// Robots that a stop holds, as fleet has written it down.
 #[derive(Default)]
 struct Held {
@@ -121,6 +124,8 @@ impl TaskService {
             }
             let woken = tokio::time::timeout_at(deadline, wake.changed()).await;
             if matches!(woken, Ok(Ok(()))) {
+                // A busy store is not read again for each of its commits.
+                tokio::time::sleep(LOOK_EVERY).await;
                 continue;
             }
             return match (is_known, is_engaged) {

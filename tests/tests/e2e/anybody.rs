@@ -7,15 +7,15 @@ use midshift_agent::dial::TcpDial;
 use midshift_agent::tls::{self, Tls};
 use midshift_core::identity::{Access, Caller};
 use midshift_proto::access;
+use midshift_tests::raw::Raw;
 use prost::Message;
-use prost::bytes::{Buf, BufMut};
+use prost::bytes::Bytes;
 use prost_reflect::{DescriptorPool, DynamicMessage, FieldDescriptor, Kind, MessageDescriptor, MethodDescriptor};
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::time::Duration;
 use tonic::client::Grpc;
-use tonic::codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder};
 use tonic::codegen::http::uri::PathAndQuery;
 use tonic::transport::Channel;
 use tonic::{Code, Request, Status};
@@ -24,43 +24,6 @@ use tonic::{Code, Request, Status};
 const LISTEN: Duration = Duration::from_secs(10);
 /// Messages within messages at most.
 const DEEP: u32 = 5;
-
-/// Messages as they are.
-#[derive(Default)]
-struct Raw;
-
-impl Codec for Raw {
-    type Encode = Vec<u8>;
-    type Decode = Vec<u8>;
-    type Encoder = Self;
-    type Decoder = Self;
-
-    fn encoder(&mut self) -> Self {
-        Self
-    }
-    fn decoder(&mut self) -> Self {
-        Self
-    }
-}
-
-impl Encoder for Raw {
-    type Item = Vec<u8>;
-    type Error = Status;
-
-    fn encode(&mut self, item: Vec<u8>, buffer: &mut EncodeBuf<'_>) -> Result<(), Status> {
-        buffer.put_slice(&item);
-        Ok(())
-    }
-}
-
-impl Decoder for Raw {
-    type Item = Vec<u8>;
-    type Error = Status;
-
-    fn decode(&mut self, buffer: &mut DecodeBuf<'_>) -> Result<Option<Vec<u8>>, Status> {
-        Ok(Some(buffer.copy_to_bytes(buffer.remaining()).to_vec()))
-    }
-}
 
 /// One method, as it is declared.
 pub struct Method {
@@ -95,8 +58,8 @@ impl Method {
         Ok(message.with_context(|| self.path.clone())?.encode_to_vec())
     }
     /// Answers as JSON, one a line.
-    pub fn read(&self, answers: &[Vec<u8>]) -> anyhow::Result<String> {
-        let read = |answer: &Vec<u8>| DynamicMessage::decode(self.is.output(), answer.as_slice());
+    pub fn read(&self, answers: &[Bytes]) -> anyhow::Result<String> {
+        let read = |answer: &Bytes| DynamicMessage::decode(self.is.output(), answer.clone());
         let read = answers.iter().map(|answer| Ok(serde_json::to_string(&read(answer)?)?));
         Ok(read.collect::<anyhow::Result<Vec<_>>>()?.join("\n"))
     }
@@ -173,10 +136,10 @@ impl Somebody {
         method: &Method,
         message: Vec<u8>,
         most: usize,
-    ) -> anyhow::Result<Result<Vec<Vec<u8>>, Status>> {
+    ) -> anyhow::Result<Result<Vec<Bytes>, Status>> {
         let mut client = Grpc::new(self.channel.clone());
         client.ready().await?;
-        let mut request = Request::new(tokio_stream::once(message));
+        let mut request = Request::new(tokio_stream::once(Bytes::from(message)));
         if let Some(token) = &self.token {
             request.metadata_mut().insert("authorization", format!("Bearer {token}").parse()?);
         }

@@ -2,6 +2,7 @@
 //!
 //! Invariant: it knows no message. What a robot or server of a later build says passes too.
 
+use midshift_tests::raw::Raw;
 use midshift_tests::wire::Frame;
 use std::collections::VecDeque;
 use std::convert::Infallible;
@@ -16,7 +17,6 @@ use tokio_stream::{Stream, StreamExt};
 use tokio_util::task::AbortOnDropHandle;
 use tonic::body::Body;
 use tonic::client::Grpc as Client;
-use tonic::codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder};
 use tonic::codegen::http::{Request as HttpRequest, Response as HttpResponse, uri::PathAndQuery};
 use tonic::codegen::{Bytes, Service};
 use tonic::server::{Grpc, NamedService, StreamingService};
@@ -115,41 +115,6 @@ impl StreamingService<Bytes> for Call {
             *response.metadata_mut() = metadata;
             Ok(response)
         })
-    }
-}
-
-/// Bytes as they are.
-#[derive(Clone, Copy, Debug, Default)]
-struct Raw;
-
-impl Codec for Raw {
-    type Encode = Bytes;
-    type Decode = Bytes;
-    type Encoder = Self;
-    type Decoder = Self;
-    fn encoder(&mut self) -> Self {
-        Self
-    }
-    fn decoder(&mut self) -> Self {
-        Self
-    }
-}
-
-impl Encoder for Raw {
-    type Item = Bytes;
-    type Error = Status;
-    fn encode(&mut self, item: Bytes, to: &mut EncodeBuf<'_>) -> Result<(), Status> {
-        prost::bytes::BufMut::put(to, item);
-        Ok(())
-    }
-}
-
-impl Decoder for Raw {
-    type Item = Bytes;
-    type Error = Status;
-    fn decode(&mut self, from: &mut DecodeBuf<'_>) -> Result<Option<Bytes>, Status> {
-        use prost::bytes::Buf;
-        Ok(Some(from.copy_to_bytes(from.remaining())))
     }
 }
 
