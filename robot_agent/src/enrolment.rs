@@ -116,6 +116,9 @@ pub struct Enrolled {
     /// What it may take as software: its trust file; empty: nothing was said.
     #[serde(default)]
     pub trust_json: String,
+    /// Name of the line that it was enrolled with; empty: nobody knows.
+    #[serde(default)]
+    pub line_id: String,
 }
 
 impl Enrolled {
@@ -150,6 +153,11 @@ impl Enrolled {
     /// Certificate and key do not fit.
     pub fn config(&self, key: &DeviceKey) -> Result<Arc<ClientConfig>, Error> {
         Ok(tls::config(&self.authority_pem, Some((&self.certificate_pem, &key.tls_pem())))?)
+    }
+
+    /// Whether this line gave it.
+    fn is_from(&self, invited: &Invitation) -> Result<bool, Error> {
+        Ok(tls::pin_of(&self.authority_pem)? == invited.pin && self.line_id == invited.secret.id().as_str())
     }
 
     fn is_due(&self, now: Utc) -> bool {
@@ -190,6 +198,7 @@ pub async fn enrol(
         authority_pem,
         expires_unix_ms: answer.expire_time.map_or(0, |time| time_of(&time).0),
         trust_json: answer.trust_json,
+        line_id: invitation.secret.id().to_string(),
     })
 }
 
@@ -228,12 +237,18 @@ impl Identity {
             }
             (Some(known), None) => known,
             // A line that was used already stays in a unit file: what it gave is there.
-            (Some(known), Some(invited)) if tls::pin_of(&known.authority_pem)? == invited.pin => known,
-            (_, Some(invited)) => {
-                let enrolled = enrol(address, robot_id, invited, &key).await?;
-                enrolled.write(folder)?;
-                enrolled
-            }
+            (Some(known), Some(invited)) if known.is_from(invited)? => known,
+            (known, Some(invited)) => match (enrol(address, robot_id, invited, &key).await, known) {
+                (Ok(enrolled), _) => {
+                    enrolled.write(folder)?;
+                    enrolled
+                }
+                (Err(error), Some(known)) if tls::pin_of(&known.authority_pem)? == invited.pin => {
+                    tracing::warn!(%robot_id, %error, "not enrolled anew: it goes on with the certificate that it has");
+                    known
+                }
+                (Err(error), _) => return Err(error),
+            },
             (None, None) => return Err(Error::NotEnrolled(robot_id.clone())),
         };
         Self::new(enrolled, key, Some(folder.to_owned()))

@@ -88,6 +88,7 @@ pub async fn play(part: Part, address: SocketAddr, stop: CancellationToken) -> a
                 insecure: false,
                 // All robots of a run come from one address.
                 share: Share { connections_per_address: Some(CONNECTIONS_MAX), ..Share::default() },
+                follows: false,
             };
             midshift::stop::run(serve, stop).await
         }

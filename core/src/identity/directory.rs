@@ -14,6 +14,9 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+/// So long after its end a token still engages stops, milliseconds.
+const STOPS_FOR_MS: i64 = limits::TOKEN_STOPS_AFTER_EXPIRY.as_ms().cast_signed();
+
 /// One token, as a port knows it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -72,10 +75,16 @@ impl Directory {
         let known = self.tokens.get(token).filter(|known| same(&known.digest, digest));
         let Some(known) = known else { return Err(Refusal::new(Kind::Unauthenticated, Code::TokenUnknown)) };
         let late_ms = now.0.saturating_sub(known.expires_unix_ms);
-        if late_ms >= limits::TOKEN_STOPS_AFTER_EXPIRY.as_ms().cast_signed() {
+        if late_ms >= STOPS_FOR_MS {
             return Err(Refusal::new(Kind::Unauthenticated, Code::TokenExpired));
         }
         Ok(Caller::holder(token.clone(), known.name.clone(), known.grants.clone(), late_ms >= 0))
+    }
+
+    /// Whether what was begun with this token may go on: it was not taken back, and its time is not over, or no longer than a stop needs if it was over when that began.
+    pub fn is_good(&self, token: &TokenId, was_expired: bool, now: Utc) -> bool {
+        let least = if was_expired { STOPS_FOR_MS } else { 0 };
+        self.tokens.get(token).is_some_and(|known| now.0.saturating_sub(known.expires_unix_ms) < least)
     }
 }
 

@@ -58,7 +58,7 @@ impl Principals for Known {
         }
         // Who shows none shows a token with each request: streams of one that was taken back or is over do not go on.
         let (directory, now) = (self.directory.borrow(), self.clock.now().wall);
-        let is_good = |token: &TokenId| directory.tokens.get(token).is_some_and(|known| known.expires_unix_ms > now.0);
+        let is_good = |token: &TokenId, was_expired| directory.is_good(token, was_expired, now);
         if peer.showed_all(is_good) { Ok(()) } else { Err(Denied::Token) }
     }
 
@@ -82,8 +82,7 @@ impl Principals for Known {
         let digest = Digest(sha2::Sha256::digest(secret.bytes()).into());
         let holder = || self.directory.borrow().holder(secret.id(), &digest, self.clock.now().wall);
         let caller = holder()?;
-        // One that only stops any more begins no stream, and its connection is left alone.
-        if !caller.is_expired() && peer.shows(secret.id()) {
+        if peer.shows(secret.id(), caller.is_expired()) {
             // Whoever was taken back in between was not asked about with this connection.
             return holder();
         }

@@ -8,7 +8,7 @@ use midshift_core::identity::{Caller, TokenId};
 use midshift_core::reason::Refusal;
 use midshift_proto::Leaving;
 use rustls::pki_types::CertificateDer;
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::fmt;
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -37,8 +37,8 @@ pub struct Peer {
     pub(crate) leaving: Leaving,
     /// Its streams end now.
     pub(crate) over: CancellationToken,
-    /// Whose requests it carried, as far as they may do more than stop: open streams are among them.
-    tokens: Arc<Mutex<BTreeSet<TokenId>>>,
+    /// Whose requests it carried, open streams among them, and whether their time was over then, so that they may only stop.
+    tokens: Arc<Mutex<BTreeMap<TokenId, bool>>>,
 }
 
 impl Peer {
@@ -51,15 +51,20 @@ impl Peer {
         Self { address, certificate: certificate.map(Arc::new), connection, leaving, over, tokens: Arc::default() }
     }
 
-    /// Remembers that it showed this token; whether that is new.
-    pub(crate) fn shows(&self, token: &TokenId) -> bool {
+    /// Remembers that it showed this token, and whether that only stops any more; whether it is the first time.
+    pub(crate) fn shows(&self, token: &TokenId, is_expired: bool) -> bool {
         let mut tokens = self.tokens.lock().unwrap_or_else(PoisonError::into_inner);
-        !tokens.contains(token) && tokens.insert(token.clone())
+        let is_new = !tokens.contains_key(token);
+        if is_new {
+            tokens.insert(token.clone(), is_expired);
+        }
+        is_new
     }
 
-    /// Whether each token that it showed is so.
-    pub(crate) fn showed_all(&self, is_so: impl FnMut(&TokenId) -> bool) -> bool {
-        self.tokens.lock().unwrap_or_else(PoisonError::into_inner).iter().all(is_so)
+    /// Whether each token that it showed is so, of which it is said whether it only stopped any more when it was shown first.
+    pub(crate) fn showed_all(&self, mut is_so: impl FnMut(&TokenId, bool) -> bool) -> bool {
+        let tokens = self.tokens.lock().unwrap_or_else(PoisonError::into_inner);
+        tokens.iter().all(|(token, was_expired)| is_so(token, *was_expired))
     }
 
     /// Resolves when the connection is about to be asked to go, for its age or because the port closes. Whoever holds a stream on it uses the

@@ -30,6 +30,8 @@ use tonic::body::Body;
 const DIAL: &str = "MIDSHIFT_TEST_ROOM_DIAL";
 const PEERS: usize = 1_000;
 const DESCRIPTORS: u64 = 1_024;
+/// What a thousand of them may cost the process, bytes: no more than a socket and what one handshake needs, each.
+const MEMORY: u64 = PEERS as u64 * 64 * 1024;
 const ASKED: &[u8] = b"GET /ready HTTP/1.1\r\nhost: edge\r\nconnection: close\r\n\r\n";
 
 #[tokio::test]
@@ -56,6 +58,13 @@ fn signed(names: Vec<SanType>, by: &CertifiedIssuer<'_, KeyPair>) -> (Certificat
     params.subject_alt_names = names;
     let leaf = params.signed_by(&key, by).expect("a certificate").der().clone();
     (leaf, PrivateKeyDer::try_from(key.serialize_der()).expect("a key"))
+}
+
+/// Memory of this process that is there, bytes.
+fn resident() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").expect("what the system says of this process");
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).expect("its memory");
+    line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number") * 1024
 }
 
 #[tokio::test]
@@ -88,6 +97,7 @@ async fn a_robot_is_served_while_a_thousand_silent_peers_want_every_descriptor()
     let (_tls, newest) = watch::channel(server);
     let serving = tokio::spawn(Edge::new(config, known, services).with_tls(newest).serve(listener, stop.clone()));
 
+    let before = resident();
     let mut peers = Command::new(std::env::current_exe().expect("this program"));
     peers.args(["--exact", "the_peers_of_the_other_test", "--nocapture"]).env(DIAL, address.to_string());
     // Their own descriptors are not what this is about.
@@ -95,6 +105,8 @@ async fn a_robot_is_served_while_a_thousand_silent_peers_want_every_descriptor()
     let said = BufReader::new(peers.stderr.take().expect("what they say"));
     let there = tokio::task::spawn_blocking(move || said.lines().any(|line| line.is_ok_and(|l| l == "all are there")));
     assert!(there.await.expect("no panic"), "the peers have come");
+    let grown = resident().saturating_sub(before);
+    assert!(grown < MEMORY, "{grown} bytes for {PEERS} peers that say nothing");
 
     let (leaf, key) = signed(vec![SanType::URI("spiffe://factory/robot/r7".try_into().expect("a name"))], &authority);
     let mut roots = RootCertStore::empty();

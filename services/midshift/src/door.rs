@@ -92,6 +92,16 @@ pub struct Login {
     pub denials: Denials,
 }
 
+impl Login {
+    /// Whether a port can prove itself now.
+    ///
+    /// # Errors
+    /// What it is to prove itself with cannot be used.
+    pub fn proves(&self) -> anyhow::Result<()> {
+        tls(&self.proof.borrow()).map(drop)
+    }
+}
+
 /// Serves `listener` until `stop`, then drains and cuts. Without a login everybody may do everything, in plain text.
 ///
 /// # Errors

@@ -19,7 +19,7 @@ use midshift_ota::folder::Owner;
 use midshift_ota::rollouts::known_bundles;
 use midshift_ota::{OtaReader, OtaService};
 use std::io::Write;
-use std::net::SocketAddr;
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -312,6 +312,7 @@ async fn greet(
             })?;
         return writeln!(new, "{token}").with_context(|| format!("writing {}", file.display()));
     }
+    let address = shown(address, &args.names);
     let pin = tls::pin_of(&identity.proof().borrow().authority_pem)?;
     let authority = args.own_keys().join(midshift_identity::PUBLIC_FILE);
     say(&format!(
@@ -322,6 +323,16 @@ async fn greet(
         authority.display()
     ));
     Ok(())
+}
+
+/// Where whoever reads this on the same machine finds the port by a name that its certificate has: one on every address of the machine is at its first name, or at the loopback.
+fn shown(address: SocketAddr, names: &[String]) -> String {
+    let loopback = if address.is_ipv6() { IpAddr::from(Ipv6Addr::LOCALHOST) } else { Ipv4Addr::LOCALHOST.into() };
+    match names.first() {
+        Some(name) if address.ip().is_unspecified() => format!("{name}:{}", address.port()),
+        None if address.ip().is_unspecified() => SocketAddr::new(loopback, address.port()).to_string(),
+        _ => address.to_string(),
+    }
 }
 
 /// Whose the folder of releases is.

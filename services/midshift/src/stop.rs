@@ -1,8 +1,9 @@
 //! `midshift stop serve`: the stop service in a process of its own; in `dev` a thread of its own; beside `serve` on one box a process that outlives it.
 //!
 //! An operational stop request, not a safety function. Invariant: nothing of the store, the task queue or the business server lies on its way. Nothing here
-//! ends a running stop service: `serve` starts one where none is, and leaves it alone for ever. The room `started` is that.
+//! ends a running stop service: `serve` starts one where none is, and leaves it alone for ever. Rooms: `started` is that, `next` how one takes the place of another.
 
+mod next;
 mod started;
 
 pub use started::{LOG, Started};
@@ -10,7 +11,7 @@ pub use started::{LOG, Started};
 use crate::door::{self, Login, Share};
 use crate::robots::uri;
 use crate::{clock, server, site_file};
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use axum::routing::get;
 use midshift_core::site::Site;
 use midshift_core::time::{Clock, LinkDuration, Utc};
@@ -18,6 +19,7 @@ use midshift_edge::{Config, Denial, Denials};
 use midshift_identity::ServerProof;
 use midshift_stop::{Parts, Principals, StopService};
 use std::net::SocketAddr;
+use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -36,6 +38,8 @@ pub const FOLDER: &str = "stop";
 /// A stop service that was started answers within this, or `serve` says that it did not.
 const UP_WITHIN: Duration = Duration::from_secs(10);
 const LOOK_EVERY: Duration = Duration::from_millis(100);
+/// How often one that follows looks whether the folder is free: nobody is answered meanwhile.
+const NEXT_EVERY: Duration = Duration::from_millis(10);
 /// Pings on a quiet connection of a watcher: one that is gone is found out twice as fast as on the business port.
 const KEEPALIVE_EVERY: LinkDuration = LinkDuration::from_secs(10);
 /// How often it is looked whether somebody else is known: with the writer's own second, two after a revocation at the latest.
@@ -65,13 +69,17 @@ pub struct StopServe {
     /// What one peer may take.
     #[command(flatten)]
     pub share: Share,
+    /// Takes the place of the stop service that has started this one, on its open port.
+    #[arg(long, hide = true)]
+    pub follows: bool,
 }
 
-/// Serves until `shutdown`.
+/// Serves until `shutdown`, or until another one that SIGUSR2 has asked for takes its place.
 ///
 /// # Errors
 /// The folder cannot be used or another process has it, the port is taken, or a part ended by itself.
 pub async fn run(args: StopServe, shutdown: CancellationToken) -> anyhow::Result<()> {
+    let asked = next::asked()?;
     if args.insecure {
         tracing::warn!(address = %args.listen, "no TLS and no login: whoever reaches this port may stop the fleet and reset stops");
     }
@@ -80,15 +88,60 @@ pub async fn run(args: StopServe, shutdown: CancellationToken) -> anyhow::Result
         midshift_identity::make_folder(&args.data).context("opening the data folder")?;
     }
     let loaded = site_file::load(args.site.as_deref(), None, None)?;
-    let listener = TcpListener::bind(args.listen).await.with_context(|| format!("listening on {}", args.listen))?;
+    let listener = match args.follows {
+        true => next::port()?,
+        false => TcpListener::bind(args.listen).await.with_context(|| format!("listening on {}", args.listen))?,
+    };
+    let port = listener.as_fd().try_clone_to_owned()?;
     let folder = args.data.join(FOLDER);
+    server::metrics_handle();
     tracing::info!(address = %listener.local_addr()?, folder = %folder.display(), "midshift stop serves: an operational stop request, not a safety function");
     let clock = clock::clock(1000);
     let (config, login) = match args.insecure {
         true => (door::alone(PORT_NAME), None),
         false => (args.share.config(PORT_NAME)?, Some(known(&folder, &loaded.site, &clock).await?)),
     };
-    serve(folder, loaded.site, clock, (config, login), listener, shutdown).await
+    let parts = Parts { folder, site: Some(loaded.site), clock };
+    let service = match args.follows {
+        true => {
+            if let Some((login, ..)) = &login {
+                login.proves()?;
+            }
+            following(&parts, &shutdown).await?
+        }
+        false => StopService::open(parts, shutdown.clone())?,
+    };
+    let leaving = service.clone();
+    let following = async {
+        tokio::select! {
+            () = shutdown.cancelled() => {}
+            () = next::begun(asked, &port, &leaving) => shutdown.cancel(),
+        }
+        // Who dials from now on is the next one's.
+        drop(port);
+        std::future::pending().await
+    };
+    tokio::select! {
+        served = serve(service, (config, login), listener) => served,
+        never = following => never,
+    }
+}
+
+/// Opens the folder as soon as the one before has let go of it, which it does when this one has read everything else.
+async fn following(parts: &Parts, shutdown: &CancellationToken) -> anyhow::Result<StopService> {
+    // One that cannot read it would stop the whole fleet.
+    let latch = midshift_stop::latch(&parts.folder).context("reading the latch")?;
+    ensure!(latch.is_some(), "there is no latch in {}", parts.folder.display());
+    next::ready()?;
+    let mut waited = Duration::ZERO;
+    loop {
+        match StopService::open(parts.clone(), shutdown.clone()) {
+            Err(error) if error.is_held() && waited < UP_WITHIN => {}
+            opened => return Ok(opened?),
+        }
+        tokio::time::sleep(NEXT_EVERY).await;
+        waited += NEXT_EVERY;
+    }
 }
 
 /// What a port with login follows, whom it denied what, and when who is known was last written down or said to be so still.
@@ -150,21 +203,28 @@ async fn known(folder: &Path, site: &Site, clock: &Arc<dyn Clock>) -> anyhow::Re
     Ok((login, told, followed))
 }
 
+/// This program as it was named when it was started, so that a link to another release leads there; else where it lies. Of one that was replaced on the disk the
+/// new one is started.
+fn program() -> anyhow::Result<PathBuf> {
+    let named = std::env::args_os().next().map(PathBuf::from);
+    if let Some(named) = named.filter(|named| named.is_absolute() && named.is_file()) {
+        return Ok(named);
+    }
+    let program = std::env::current_exe().context("finding this program")?;
+    let named = program.to_str().and_then(|name| name.strip_suffix(" (deleted)")).map(PathBuf::from);
+    Ok(named.filter(|named| named.is_file()).unwrap_or(program))
+}
+
 fn proof_of(principals: &Principals) -> ServerProof {
     let Principals { chain_pem, key_pem, authority_pem, .. } = principals.clone();
     ServerProof { chain_pem, key_pem, authority_pem }
 }
 
 async fn serve(
-    folder: PathBuf,
-    site: Arc<Site>,
-    clock: Arc<dyn Clock>,
+    service: StopService,
     (config, login): (Config, Option<Followed>),
     listener: TcpListener,
-    shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
-    server::metrics_handle();
-    let service = StopService::open(Parts { folder, site: Some(site), clock }, shutdown)?;
     let metrics = || async { server::metrics_handle().map(|handle| handle.render()).unwrap_or_default() };
     let pages = service.routes().await?.into_axum_router().layer(tonic_web::GrpcWebLayer::new());
     let routes = Routes::from(pages.route("/metrics", get(metrics)));
@@ -223,7 +283,9 @@ impl Beside {
         let work = move || {
             let served = runtime.block_on(async {
                 let listener = TcpListener::from_std(listener)?;
-                serve(folder, site, clock, (door::alone(PORT_NAME), None), listener, stop).await
+                server::metrics_handle();
+                let service = StopService::open(Parts { folder, site: Some(site), clock }, stop)?;
+                serve(service, (door::alone(PORT_NAME), None), listener).await
             });
             if let Err(error) = &served {
                 tracing::error!(%error, "the stop service ended");

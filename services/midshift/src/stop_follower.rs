@@ -123,17 +123,22 @@ impl StopFollower {
     }
 
     async fn follow(&mut self, is_due: bool) -> anyhow::Result<()> {
-        // First, and whatever the stop service is doing: it may be waiting for this.
-        self.tell_who_is_known(is_due).await?;
+        // First, and whatever the stop service is doing: it may be waiting for this. A disk that refuses it holds up no copy of a stop.
+        let told = self.tell_who_is_known(is_due).await;
+        let copied = self.copy_stops(is_due).await;
+        told.and(copied)
+    }
+
+    async fn copy_stops(&mut self, is_due: bool) -> anyhow::Result<()> {
         let folder = self.folder.clone();
         let read = tokio::task::spawn_blocking(move || midshift_stop::latch(&folder));
         let Some((generation, latch)) = read.await.context("reading the latch")?? else { return Ok(()) };
         if is_due {
             self.look_who_is_retired().await?;
         }
+        self.copy(generation, &latch).await?;
         self.look_who_attached().await?;
-        self.tell_roster().await?;
-        self.copy(generation, &latch).await
+        self.tell_roster().await
     }
 
     /// Writes what the latch has and the store has not.

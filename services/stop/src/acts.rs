@@ -13,7 +13,7 @@ use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::robot::StopLevel;
 use midshift_core::stop::latch::is_past;
 use midshift_core::stop::{Reset, Scope, Stop};
-use midshift_core::time::{Now, Utc};
+use midshift_core::time::{LinkDuration, Now, Utc};
 use std::collections::BTreeSet;
 
 /// What somebody wants stopped.
@@ -38,14 +38,28 @@ pub struct Engaged {
     pub version: u64,
 }
 
+/// This service ends, and whoever follows it is about to be there.
+pub fn ends() -> Refusal {
+    Refusal::new(Kind::Unavailable, Code::ShuttingDown).again_after(LinkDuration(0))
+}
+
+/// Asked with `fan` held: what it takes is kept.
+///
+/// # Errors
+/// This service ends: nobody would keep what it took from now on.
+pub fn is_open(inner: &Inner) -> Result<(), Refusal> {
+    if inner.shutdown.is_cancelled() { Err(ends()) } else { Ok(()) }
+}
+
 /// Engages a stop and tells all lines.
 ///
 /// # Errors
-/// No such part of the site; no room; the request was another one, or its stop was reset. Nothing is engaged then.
+/// No such part of the site; no room; the request was another one, or its stop was reset; this service ends. Nothing is engaged then.
 pub fn engage(inner: &Inner, wanted: Wanted) -> Result<Engaged, Refusal> {
     let region = inner.ground.region(&wanted.scope)?;
     let now = inner.clock.now();
     let fan = lock(&inner.fan);
+    is_open(inner)?;
     let mut law = lock(&inner.law);
     if let Some(engaged) = before(&law, &wanted)? {
         return Ok(engaged);
@@ -112,6 +126,9 @@ pub fn adopt(inner: &Inner, robot_id: &RobotId, stops: Vec<Stop>, more: Vec<Stop
         is_lost.into_iter().partition(|stop| !is_past(stop.engaged, now.wall) && inner.key.knows(stop));
     foreign.extend(others.into_iter().map(|stop| stop.stop_id));
     let _fan = lock(&inner.fan);
+    if is_open(inner).is_err() {
+        return foreign;
+    }
     for stop in own {
         let mut law = lock(&inner.law);
         if law.latch().reset_of(&stop.stop_id).is_some() {
@@ -140,9 +157,11 @@ pub fn adopt(inner: &Inner, robot_id: &RobotId, stops: Vec<Stop>, more: Vec<Stop
 /// Notes a reset. It counts after the disk's turn, see [`settle`].
 ///
 /// # Errors
-/// Whoever asks may not reset where the stop is. One that is not known may be anywhere.
+/// Whoever asks may not reset where the stop is. One that is not known may be anywhere. Or this service ends.
 pub fn reset(inner: &Inner, stop_id: StopId, reason: String, by: &Caller) -> Result<Resetting, Refusal> {
     let now = inner.clock.now();
+    let fan = lock(&inner.fan);
+    is_open(inner)?;
     let mut law = lock(&inner.law);
     let areas = law.latch().stop(&stop_id).map(|stop| inner.ground.areas(&stop.scope)).unwrap_or_default();
     if let Err(refusal) = by.needs(Permission::Reset, &areas) {
@@ -159,7 +178,7 @@ pub fn reset(inner: &Inner, stop_id: StopId, reason: String, by: &Caller) -> Res
             .disk
             .note(note.with("stop_id", stop_id).with("reason", reason).with("was_engaged", resetting.was_engaged));
     }
-    drop(law);
+    drop((law, fan));
     inner.disk.wake();
     Ok(resetting)
 }

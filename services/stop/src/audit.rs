@@ -24,6 +24,8 @@ const LINE_BYTES_MAX: u64 = 64 * 1024;
 pub enum Action {
     /// The service began.
     Started,
+    /// Another process is ready to follow this one.
+    Followed,
     /// A stop was engaged.
     Engaged,
     /// A stop was reset.

@@ -23,13 +23,24 @@ struct Outcome {
     kept: u64,
     /// It refuses the audit.
     refuses_audit: bool,
+    /// It holds so many of the records that were ever queued.
+    recorded: u64,
 }
 
 #[derive(Default)]
 struct Queue {
     notes: VecDeque<Note>,
+    /// Records that were ever queued.
+    queued: u64,
     dropped: u64,
     denials: Denials,
+}
+
+impl Queue {
+    fn push(&mut self, note: Note) {
+        self.notes.push_back(note);
+        self.queued += 1;
+    }
 }
 
 /// How many denials were recorded in this minute, and how many since the last of them were not.
@@ -53,11 +64,21 @@ impl Disk {
     pub fn note(&self, note: Note) {
         let mut queue = lock(&self.queue);
         if queue.notes.len() < limits::STOP_AUDIT_QUEUE {
-            queue.notes.push_back(note);
+            queue.push(note);
         } else {
             queue.dropped += 1;
             metrics::counter!("midshift_stop_audit_dropped_total").increment(1);
         }
+    }
+    /// Queues this record, and waits until the disk holds it and all before it, but no longer than for a stop. Whether it does.
+    pub async fn record(&self, note: Note) -> bool {
+        self.note(note);
+        let queued = lock(&self.queue).queued;
+        self.wake();
+        let mut outcome = self.outcome.subscribe();
+        let within = Duration::from_millis(limits::STOP_DURABLE_WITHIN.as_ms());
+        let turn = outcome.wait_for(|outcome| outcome.recorded >= queued);
+        matches!(tokio::time::timeout(within, turn).await, Ok(Ok(_)))
     }
     /// A denial to record, if those of this minute and half of the queue leave room: stops themselves need it more. What is left out is counted in
     /// the next one.
@@ -77,7 +98,7 @@ impl Disk {
         }
         denials.recorded += 1;
         let left_out = std::mem::take(&mut denials.left_out);
-        queue.notes.push_back(if left_out > 0 { note.with("left_out", left_out) } else { note });
+        queue.push(if left_out > 0 { note.with("left_out", left_out) } else { note });
         drop(queue);
         self.wake();
     }
@@ -100,14 +121,16 @@ impl Disk {
     pub fn refuses_audit(&self) -> bool {
         self.outcome.borrow().refuses_audit
     }
-    fn take(&self, now: Utc) -> Vec<Note> {
+    /// What is to be written, and how many were ever queued with it.
+    fn take(&self, now: Utc) -> (Vec<Note>, u64) {
         let mut queue = lock(&self.queue);
+        let queued = queue.queued;
         let mut notes: Vec<Note> = queue.notes.drain(..).collect();
         let dropped = std::mem::take(&mut queue.dropped);
         if dropped > 0 {
             notes.push(Note::own(now, Action::Dropped).with("records", dropped));
         }
-        notes
+        (notes, queued)
     }
     fn put_back(&self, notes: Vec<Note>) {
         let mut queue = lock(&self.queue);
@@ -166,9 +189,11 @@ pub async fn keep(inner: &Arc<Inner>, mut writer: Writer) {
     let mut refusing = Refusing::default();
     let mut forget = tokio::time::interval(Duration::from_millis(limits::RESETS_FORGOTTEN_EVERY.as_ms()));
     loop {
-        let is_last = inner.shutdown.is_cancelled();
-        // Whatever comes from now on wakes it again.
-        let version = lock(&inner.law).version();
+        // Whatever comes from now on wakes it again, or is refused.
+        let (is_last, version) = {
+            let _fan = lock(&inner.fan);
+            (inner.shutdown.is_cancelled(), lock(&inner.law).version())
+        };
         let is_due = !inner.disk.holds(version);
         let tail_is_due = writer.audit.tail() != &writer.known;
         if is_due || tail_is_due || !inner.disk.is_empty() {
@@ -195,7 +220,7 @@ pub async fn keep(inner: &Arc<Inner>, mut writer: Writer) {
 async fn turn(inner: &Arc<Inner>, mut writer: Writer, version: u64, is_due: bool) -> (Writer, Refusing) {
     let now = inner.clock.now().wall;
     let kept = is_due.then(|| lock(&inner.law).kept(writer.audit.tail().clone()));
-    let notes = inner.disk.take(now);
+    let (notes, queued) = inner.disk.take(now);
     let (back, turn) = blocking(move || {
         let turn = writer.turn(kept, notes, now);
         (writer, turn)
@@ -219,6 +244,9 @@ async fn turn(inner: &Arc<Inner>, mut writer: Writer, version: u64, is_due: bool
     inner.disk.outcome.send_modify(|outcome| {
         outcome.tried = outcome.tried.max(version);
         outcome.refuses_audit = refusing.audit;
+        if !refusing.audit {
+            outcome.recorded = outcome.recorded.max(queued);
+        }
         if is_due && !refusing.latch {
             outcome.kept = outcome.kept.max(version);
         }
@@ -253,13 +281,13 @@ mod tests {
         let denied = |at_ms| disk.denied(Note::own(Utc(at_ms), Action::Denied), 0);
         let most = u64::from(limits::STOP_DENIALS_PER_MINUTE);
         (0..most + 40).for_each(|_| denied(1_000));
-        assert_eq!(disk.take(Utc(1_000)).len() as u64, most);
+        assert_eq!(disk.take(Utc(1_000)).0.len() as u64, most);
         denied(61_000);
-        let next = disk.take(Utc(61_000));
+        let next = disk.take(Utc(61_000)).0;
         assert_eq!(next[0].fields.get("left_out").map(String::as_str), Some("40"));
         (0..limits::STOP_AUDIT_QUEUE / 2).for_each(|_| disk.note(Note::own(Utc(0), Action::Engaged)));
         denied(121_000);
-        let notes = disk.take(Utc(121_000));
+        let notes = disk.take(Utc(121_000)).0;
         assert!(notes.iter().all(|note| note.action == Action::Engaged), "none while stops wait for the disk");
     }
 }

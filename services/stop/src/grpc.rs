@@ -60,10 +60,12 @@ impl StopService {
         let (sender, stream) = mpsc::channel(WATCH_MAX);
         let room = inner.watchers.clone().try_acquire_owned().ok();
         tokio::spawn(async move {
-            let ends = inner.ended.clone();
+            let (ends, reader) = (inner.ended.clone(), sender.clone());
             tokio::select! {
-                () = ends.cancelled() => {}
+                // What was engaged is said, whatever follows.
+                biased;
                 () = confirm::tell(&inner, engaged.stop, durable, engaged.version, room.is_some(), sender) => {}
+                () = ends.cancelled() => goes_on_elsewhere(&reader),
             }
             drop(room);
         });
@@ -97,15 +99,20 @@ impl StopService {
         })?;
         let (sender, stream) = mpsc::channel(WATCH_MAX);
         tokio::spawn(async move {
-            let ends = inner.ended.clone();
+            let (ends, reader) = (inner.ended.clone(), sender.clone());
             tokio::select! {
-                () = ends.cancelled() => {}
+                () = ends.cancelled() => goes_on_elsewhere(&reader),
                 () = status::tell(&inner, sender) => {}
             }
             drop(room);
         });
         Ok(ReceiverStream::new(stream))
     }
+}
+
+/// A reader asks whoever follows. One that has not read what was there does so when its connection ends.
+fn goes_on_elsewhere<T>(reader: &mpsc::Sender<Result<T, Status>>) {
+    let _ = reader.try_send(Err(to_status(&acts::ends(), None)));
 }
 
 fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {

@@ -77,7 +77,15 @@ pub enum Error {
     Ended,
 }
 
+impl Error {
+    /// Another process has the folder.
+    pub fn is_held(&self) -> bool {
+        matches!(self, Self::Latch(midshift_latch::Error::Held { .. }))
+    }
+}
+
 /// What the service is built from.
+#[derive(Clone)]
 pub struct Parts {
     /// Latch, audit, key and roster; made with mode 0700. One process has it at a time.
     pub folder: PathBuf,
@@ -235,6 +243,14 @@ impl StopService {
         let note = note.with("code", code).with("asked", path).with("network", network);
         let note = robot_id.iter().fold(note, |note, robot_id| note.with("robot_id", robot_id));
         self.inner.disk.denied(note, left_out);
+    }
+
+    /// Records that another process is ready to follow this one. False: the disk does not hold that, or not all that is engaged and reset, so that this one must go on.
+    pub async fn may_be_followed(&self) -> bool {
+        let inner = &self.inner;
+        let version = lock(&inner.law).version();
+        let recorded = inner.disk.record(Note::own(inner.clock.now().wall, Action::Followed)).await;
+        recorded && inner.disk.turn(version).await
     }
 
     /// When its lines have ended, so that its port may close.

@@ -13,7 +13,7 @@ use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::stop::Stop;
 use midshift_core::stop::roster::Heard;
-use midshift_core::time::{LinkDuration, Now};
+use midshift_core::time::Now;
 use midshift_proto::convert::stop::{CheckIn, ToStop};
 use midshift_proto::stop::v1;
 use midshift_proto::{Denying, Leaving};
@@ -58,10 +58,7 @@ async fn begin(
     let attached = {
         // No change of the latch falls between: the line begins with the whole, and hears of everything after it.
         let _fan = lock(&inner.fan);
-        if inner.shutdown.is_cancelled() {
-            // Whoever follows is about to be there: nothing to wait for.
-            return Err(Refusal::new(Kind::Unavailable, Code::ShuttingDown).again_after(LinkDuration(0)));
-        }
+        acts::is_open(inner)?;
         Robots::attach(&robot, &outbox, Comes { boot_id, foreign }, now.link)
     };
     attached.map_err(|held| held_by_another(inner, &robot_id, by, held, &now))?;

@@ -2,13 +2,12 @@
 //! PostgreSQL behind the proxy.
 
 use crate::harness::{Server, until};
-use crate::robots::enrolment;
-use crate::rolled_out::{Robot, call, done, fleet};
+use crate::rolled_out::{Doors, Robot, call, done, fleet};
 use crate::room::LIMIT;
 use crate::stack::Stack;
 use midshift_core::site::DEMO;
 use std::net::SocketAddr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Robots of a factory.
 const ROBOTS: usize = 4;
@@ -28,37 +27,28 @@ impl Factory {
         let keys = samples.join("keys").display().to_string();
         done(&["bundle", "samples", &samples.display().to_string(), "--config-only"])?;
         let server = Server::start_with(dir, DEMO, &["--ota-keys", &keys]).await?;
-        let (robots, _) = fleet(dir, server.address, &samples, None, ROBOTS).await?;
+        let doors = Doors { people: server.address, robots: server.address, stops: None };
+        let (robots, _) = fleet(dir, &doors, &samples, ROBOTS).await?;
         Ok(Self { address: server.address, _one_box: Some((server, robots)), _split: None })
     }
 
     /// The same services as processes of their own, with the sample releases.
     pub async fn split(dir: &Path) -> anyhow::Result<Self> {
-        let split = with_software(dir, ROBOTS).await?;
-        Ok(Self { address: split.0.public, _one_box: None, _split: Some(split) })
+        let (stack, robots, _) = with_software(dir, ROBOTS).await?;
+        Ok(Self { address: stack.public, _one_box: None, _split: Some((stack, robots)) })
     }
 }
 
-/// A split stack that every process of knows the sample releases, with robots under launchers, `rbt-01` and so on, that believe who signed them.
-pub async fn with_software(dir: &Path, robots: usize) -> anyhow::Result<(Stack, Vec<Robot>)> {
+/// A split stack that every process of knows the sample releases, with robots under launchers, `rbt-01` and so on, that believe who signed them, and the journals
+/// of their bodies.
+pub async fn with_software(dir: &Path, robots: usize) -> anyhow::Result<(Stack, Vec<Robot>, Vec<PathBuf>)> {
     let samples = dir.join("samples");
     let keys = samples.join("keys").display().to_string();
     done(&["bundle", "samples", &samples.display().to_string()])?;
     let stack = Stack::start(dir, DEMO, &[], &["--ota-keys", &keys]).await?;
-    let (public, door) = (stack.public.to_string(), stack.robots.to_string());
-    let ids: Vec<String> = (1..=robots).map(|number| format!("rbt-{number:02}")).collect();
-    let mut launched = Vec::with_capacity(robots);
-    for (number, id) in ids.iter().enumerate() {
-        let (start, enrolment) = (format!("park-{}", number + 1), enrolment(stack.public, id).await?);
-        launched.push(Robot::launch(id, &start, &dir.join(id), &samples, &door, None, enrolment.as_deref())?);
-    }
-    done(&["bundle", "push", "--server", &public, &samples.join("repository").display().to_string()])?;
-    for id in &ids {
-        until("the robot is known", LIMIT, async || {
-            Ok(call(&["robot", "get", "--server", &public, id])?.status.success().then_some(()))
-        })
-        .await?;
-    }
+    let doors = Doors { people: stack.public, robots: stack.robots, stops: None };
+    let (launched, journals) = fleet(dir, &doors, &samples, robots).await?;
+    let public = stack.public.to_string();
     // Rows of a release are its leader's, a moment after it was published.
     until("the release is known to whoever is asked", LIMIT, async || {
         let listed = (0..4).map(|_| call(&["bundle", "ls", "--server", &public]));
@@ -66,5 +56,5 @@ pub async fn with_software(dir: &Path, robots: usize) -> anyhow::Result<(Stack, 
         Ok(listed.iter().all(|l| String::from_utf8_lossy(&l.stdout).contains("1.5.1")).then_some(()))
     })
     .await?;
-    Ok((stack, launched))
+    Ok((stack, launched, journals))
 }

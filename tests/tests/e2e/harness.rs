@@ -48,9 +48,17 @@ pub fn tool(variable: &str) -> anyhow::Result<PathBuf> {
     Ok(path.into())
 }
 
-/// What a program may write about itself, in every end-to-end test: more than it does by default.
-pub const LOG: &str = "info,midshift=debug,midshift_agent=debug,midshift_edge=debug,midshift_identity=debug,midshift_stop=debug,\
+/// What a program writes about itself, in every end-to-end test that says nothing else: more than it does by default.
+const LOG: &str = "info,midshift=debug,midshift_agent=debug,midshift_edge=debug,midshift_identity=debug,midshift_stop=debug,\
                    midshift_store=debug,midshift_telemetry=debug";
+
+/// The variable that says so.
+const LOG_LEVEL: &str = "MIDSHIFT_LOG";
+
+fn telling(command: &mut Command) -> &mut Command {
+    let is_told = command.get_envs().any(|(name, _)| name == LOG_LEVEL);
+    if is_told { command } else { command.env(LOG_LEVEL, LOG) }
+}
 
 /// A program that is killed when the test lets it go. Then its log is read: no secret of the run may be in it.
 pub struct Running {
@@ -62,13 +70,13 @@ impl Running {
     /// Starts it; what it says goes to `log`.
     pub fn start(command: &mut Command, log: &Path) -> anyhow::Result<Self> {
         let file = std::fs::OpenOptions::new().create(true).append(true).open(log)?;
-        let child = command.stdin(Stdio::null()).stdout(file.try_clone()?).stderr(file).spawn();
+        let child = telling(command).stdin(Stdio::null()).stdout(file.try_clone()?).stderr(file).spawn();
         Ok(Self { child: child.with_context(|| format!("starting {command:?}"))?, log: log.to_owned() })
     }
     /// The same for a program that is spoken to.
     pub fn start_listening(command: &mut Command, log: &Path) -> anyhow::Result<(Self, ChildStdin)> {
         let file = std::fs::OpenOptions::new().create(true).append(true).open(log)?;
-        let child = command.stdin(Stdio::piped()).stdout(file.try_clone()?).stderr(file).spawn();
+        let child = telling(command).stdin(Stdio::piped()).stdout(file.try_clone()?).stderr(file).spawn();
         let mut child = child.with_context(|| format!("starting {command:?}"))?;
         let ear = child.stdin.take().context("stdin was piped")?;
         Ok((Self { child, log: log.to_owned() }, ear))
@@ -313,7 +321,6 @@ impl Server {
         let mut command = Command::new(midshift()?);
         // Its stop service would outlive the test, on a port that all tests share.
         command
-            .env("MIDSHIFT_LOG", LOG)
             .env("MIDSHIFT_NO_STOP", "true")
             .args(["serve", "--data"])
             .arg(dir.join("data"))

@@ -4,7 +4,7 @@ use crate::harness::{Running, Server, channel, folder, midshift, sign_in, until}
 use crate::kill::{all_over, at_work, judge, submit};
 use crate::robots::{Robots, enrolment};
 use crate::rolled_out::{call, done};
-use crate::secrets::heard;
+use crate::secrets::{heard, keep_secret, secret_part};
 use crate::stopped::StopServer;
 use crate::unheard::obeyed;
 use anyhow::{Context, bail, ensure};
@@ -14,6 +14,8 @@ use midshift_agent::tls::Tls;
 use midshift_core::reason::Code;
 use midshift_core::robot::StopLevel;
 use midshift_core::site::{DEMO, Site, text};
+use midshift_proto::identity::v1::CreateEnrolmentRequest;
+use midshift_proto::identity::v1::identity_service_client::IdentityServiceClient;
 use midshift_proto::stop::v1::GetStatusRequest;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
 use midshift_proto::telemetry::v1::GetRobotRequest;
@@ -175,13 +177,15 @@ async fn a_revoked_robot_is_cut_off_from_the_stop_service_too_and_stands_by_itse
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_secret_that_enrolled_one_machine_is_refused_to_the_next() -> anyhow::Result<()> {
+async fn a_secret_that_enrolled_one_machine_is_refused_to_the_next_and_a_new_one_enrols_it_anew() -> anyhow::Result<()>
+{
     let dir = folder()?;
     let server = Server::start(dir.path()).await?;
     let site: Site = text::parse(DEMO)?;
     let secret = enrolment(server.address, "rbt-01").await?.context("a secret")?;
     let robots = Robots::waiting(dir.path(), server.address, &site, 1);
-    let _first = robots.run(0, &dir.path().join("rbt-01"), Some(&secret))?;
+    let home = dir.path().join("rbt-01");
+    let mut first = robots.run(0, &home, Some(&secret))?;
     until("the first machine", LIMIT, async || {
         Ok(presence(server.address, "rbt-01").await.ok().filter(|(_, is_heard)| *is_heard).map(drop))
     })
@@ -192,7 +196,31 @@ async fn a_secret_that_enrolled_one_machine_is_refused_to_the_next() -> anyhow::
     let said = std::fs::read_to_string(other.join("agent.log"))?;
     ensure!(said.contains("was used"), "{said}");
     ensure!(Enrolled::read(&other)?.is_none() && incidents(&server)?.is_empty(), "{said}");
-    Ok(())
+
+    // As one does whose certificate ran out while it was off.
+    first.kill()?;
+    let known = Enrolled::read(&home)?.context("it is enrolled")?;
+    let request = CreateEnrolmentRequest { robot_id: "rbt-01".to_owned(), replace: true };
+    let offered = IdentityServiceClient::new(channel(server.address)?).create_enrolment(request).await?.into_inner();
+    keep_secret("an enrolment", secret_part(&offered.secret)?);
+    let mut again = robots.run(0, &home, Some(&offered.secret))?;
+    until("another certificate", LIMIT, async || {
+        let enrolled = Enrolled::read(&home)?.filter(|enrolled| enrolled.certificate_pem != known.certificate_pem);
+        Ok(enrolled.map(drop))
+    })
+    .await?;
+    again.kill()?;
+    // The line that it was started with first is worth nothing, and it needs none.
+    let _third = robots.run(0, &home, Some(&secret))?;
+    until("it goes on with what it has", LIMIT, async || {
+        let said = std::fs::read_to_string(home.join("agent.log"))?;
+        Ok(said.contains("it goes on with the certificate that it has").then_some(()))
+    })
+    .await?;
+    until("it is heard", LIMIT, async || {
+        Ok(presence(server.address, "rbt-01").await.ok().filter(|(_, is_heard)| *is_heard).map(drop))
+    })
+    .await
 }
 
 /// The command line as the holder of this token has it.

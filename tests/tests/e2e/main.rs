@@ -18,6 +18,7 @@ mod clients;
 mod cut;
 mod engine;
 mod factory;
+mod first_start;
 mod followed;
 mod golden_cli;
 mod handed_over;

@@ -3,7 +3,7 @@
 
 use crate::harness::{Server, folder, until};
 use crate::kill::{all_over, at_work, judge_journals, submit};
-use crate::rolled_out::{Robot, begin_rollout, call, done, fleet};
+use crate::rolled_out::{Doors, Robot, begin_rollout, call, done, fleet};
 use crate::room::LIMIT;
 use anyhow::ensure;
 use midshift_agent::switch::FACTORY;
@@ -29,7 +29,8 @@ async fn a_fleet_takes_a_release_in_the_middle_of_a_shift_and_loses_no_task_thou
     let keys = samples.join("keys").display().to_string();
     let mut server = Server::start_with(dir.path(), DEMO, &["--ota-keys", &keys]).await?;
     let address = server.address.to_string();
-    let (robots, journals) = fleet(dir.path(), server.address, &samples, None, ROBOTS).await?;
+    let doors = Doors { people: server.address, robots: server.address, stops: None };
+    let (robots, journals) = fleet(dir.path(), &doors, &samples, ROBOTS).await?;
     submit(server.address, &site, 23, TASKS).await?;
     at_work(server.address, 2, &BTreeSet::new()).await?;
 
@@ -71,7 +72,8 @@ async fn a_release_that_hangs_on_probation_ends_with_its_canary_which_goes_back(
     let keys = samples.join("keys").display().to_string();
     let server = Server::start_with(dir.path(), DEMO, &["--ota-keys", &keys]).await?;
     let address = server.address.to_string();
-    let (robots, journals) = fleet(dir.path(), server.address, &samples, None, 3).await?;
+    let doors = Doors { people: server.address, robots: server.address, stops: None };
+    let (robots, journals) = fleet(dir.path(), &doors, &samples, 3).await?;
     submit(server.address, &site, 29, TASKS).await?;
     let id = format!("walk-{HANGS}");
     let watched = ["--soak", "1s", "--probation", "5s", "--exposure-tasks", "0"];

@@ -1,6 +1,6 @@
 //! Robots as programs of their own.
 
-use crate::harness::{LOG, Running, channel, has_login, midshift, sign_in, until, way};
+use crate::harness::{Running, channel, has_login, midshift, sign_in, until, way};
 use crate::secrets::{keep_key, keep_secret, secret_part};
 use crate::stack::{machines_of, tell_identity};
 use anyhow::Context;
@@ -181,7 +181,7 @@ impl Robots {
             command.args(["--enroll", secret]);
         }
         tell_identity(&mut command, &self.server);
-        Running::start(command.env("MIDSHIFT_LOG", LOG), &dir.join("agent.log"))
+        Running::start(&mut command, &dir.join("agent.log"))
     }
     /// SIGKILL.
     pub fn kill(&mut self, id: &str) -> anyhow::Result<()> {
@@ -221,7 +221,7 @@ async fn remembered(folder: &Path) -> anyhow::Result<Ledger> {
 }
 
 /// Nobody may be told the key of the machine in this folder, nor what proves its session.
-async fn keep_secrets(folder: &Path) -> anyhow::Result<()> {
+pub async fn keep_secrets(folder: &Path) -> anyhow::Result<()> {
     // A copy that is made while the machine writes may be of no use.
     let known =
         || async { Ok(remembered(folder).await.ok().filter(|known| !known.session.secret.reveal().is_empty())) };

@@ -3,7 +3,7 @@
 
 use crate::harness::{Running, Server, command, midshift, second, until};
 use crate::robots::BODY_SPEED;
-use crate::robots::enrolment;
+use crate::robots::{enrolment, keep_secrets};
 use crate::room::LIMIT;
 use crate::secrets::heard;
 use crate::stack::tell_identity;
@@ -88,28 +88,38 @@ impl Robot {
     }
 }
 
-/// `count` robots under launchers, each enrolled and with a line to the stop service at `stops`, on a server that has the releases of `samples` and knows
-/// all of them; `rbt-01` and so on, with the journals of their bodies.
+/// Where a fleet goes.
+pub struct Doors {
+    /// People and programs.
+    pub people: SocketAddr,
+    /// Robots.
+    pub robots: SocketAddr,
+    /// Their stop lines, if they have one.
+    pub stops: Option<SocketAddr>,
+}
+
+/// `count` robots under launchers, each enrolled, at a site that has the releases of `samples` and knows all of them; `rbt-01` and so on, with the journals of
+/// their bodies.
 pub async fn fleet(
     dir: &Path,
-    server: SocketAddr,
+    doors: &Doors,
     samples: &Path,
-    stops: Option<SocketAddr>,
     count: usize,
 ) -> anyhow::Result<(Vec<Robot>, Vec<PathBuf>)> {
-    let address = server.to_string();
+    let (people, door) = (doors.people.to_string(), doors.robots.to_string());
     let ids: Vec<String> = (1..=count).map(|number| format!("rbt-{number:02}")).collect();
     let mut robots = Vec::new();
     for (number, id) in ids.iter().enumerate() {
-        let (start, enrolment) = (format!("park-{}", number + 1), enrolment(server, id).await?);
-        robots.push(Robot::launch(id, &start, &dir.join(id), samples, &address, stops, enrolment.as_deref())?);
+        let (start, enrolment) = (format!("park-{}", number + 1), enrolment(doors.people, id).await?);
+        robots.push(Robot::launch(id, &start, &dir.join(id), samples, &door, doors.stops, enrolment.as_deref())?);
     }
-    done(&["bundle", "push", "--server", &address, &samples.join("repository").display().to_string()])?;
+    done(&["bundle", "push", "--server", &people, &samples.join("repository").display().to_string()])?;
     for id in &ids {
         until("the robot is known", LIMIT, async || {
-            Ok(call(&["robot", "get", "--server", &address, id])?.status.success().then_some(()))
+            Ok(call(&["robot", "get", "--server", &people, id])?.status.success().then_some(()))
         })
         .await?;
+        keep_secrets(&dir.join(id).join("data")).await?;
     }
     Ok((robots, ids.iter().map(|id| dir.join(id).join("data/journal.jsonl")).collect()))
 }

@@ -4,7 +4,7 @@
 use crate::harness::{
     Running, channel, free_port, in_states, midshift, same_site, sign_in_to, token, tool, until, way,
 };
-use crate::secrets::heard;
+use crate::secrets::{heard, keep_keys};
 use anyhow::Context;
 use midshift_proto::ota::v1::ListBundlesRequest;
 use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
@@ -120,6 +120,7 @@ impl Stack {
         ask.args(["certificate", "get", "--name", "localhost", "--store", &url, "--site"]).arg(&file);
         let got = heard(ask.arg("--out").arg(dir.join("proxy")))?;
         anyhow::ensure!(got.status.success(), "{}", String::from_utf8_lossy(&got.stderr));
+        keep_keys(dir)?;
         let proxy = proxy(dir, &members, [public, robots, machines], None)?;
         let mut stack = Self {
             dir: dir.to_owned(),

@@ -1,6 +1,6 @@
-//! A stop service by itself: it works when nobody takes what it says, and `serve` has it there again when it is gone.
+//! A stop service by itself: it works when nobody takes what it says, the next one is there before it ends, and `serve` has it there again when it is gone.
 
-use crate::harness::{Running, folder, free_port, midshift, until};
+use crate::harness::{Running, channel, folder, free_port, midshift, same_site, sign_in_to, until};
 use anyhow::{Context, ensure};
 use midshift_core::site::DEMO;
 use midshift_proto::stop::v1;
@@ -8,11 +8,15 @@ use midshift_proto::stop::v1::scope::Scope as W;
 use midshift_proto::stop::v1::stop_link_service_client::StopLinkServiceClient;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
 use std::collections::BTreeSet;
+use std::io;
 use std::net::SocketAddr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
+use tokio::net::TcpStream;
 use tokio_stream::StreamExt;
+use tokio_util::sync::CancellationToken;
+use tonic::Streaming;
 use tonic::transport::Channel;
 
 const LIMIT: Duration = Duration::from_secs(60);
@@ -25,6 +29,29 @@ async fn way(address: SocketAddr) -> anyhow::Result<Channel> {
     .await
 }
 
+/// A robot's line.
+async fn attend(channel: Channel) -> anyhow::Result<Streaming<v1::AttendResponse>> {
+    let attend = v1::Attend { robot_id: "r1".to_owned(), boot_id: "b".to_owned(), ..v1::Attend::default() };
+    let first = v1::AttendRequest { message: Some(v1::attend_request::Message::Attend(attend)) };
+    let up = tokio_stream::once(first).chain(tokio_stream::pending());
+    Ok(StopLinkServiceClient::new(channel).attend(up).await?.into_inner())
+}
+
+/// Stops the fleet, durably. Its id.
+async fn engage(people: &mut StopServiceClient<Channel>) -> anyhow::Result<String> {
+    let scope = Some(v1::Scope { scope: Some(W::Fleet(v1::Fleet {})) });
+    let mut engaged = people.engage(v1::EngageRequest { scope, ..v1::EngageRequest::default() }).await?.into_inner();
+    let engaged = engaged.message().await?.context("an answer")?;
+    ensure!(engaged.durable, "{engaged:?}");
+    Ok(engaged.stop.context("a stop")?.stop_id)
+}
+
+async fn reset(people: &mut StopServiceClient<Channel>, stop_id: &str) -> anyhow::Result<()> {
+    let request = v1::ResetRequest { stop_id: stop_id.to_owned(), reason: "all clear".to_owned() };
+    ensure!(people.reset(request).await?.into_inner().was_engaged, "it was not engaged");
+    Ok(())
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_stop_service_whose_log_takes_nothing_engages_tells_and_resets() -> anyhow::Result<()> {
     let dir = folder()?;
@@ -34,18 +61,10 @@ async fn a_stop_service_whose_log_takes_nothing_engages_tells_and_resets() -> an
     command.args(["stop", "serve", "--insecure", "--listen", &address.to_string(), "--data"]).arg(dir.path());
     let mut running = Running::start(&mut command, &dir.path().join("said.log"))?;
     let channel = way(address).await?;
-    let attend = v1::Attend { robot_id: "r1".to_owned(), boot_id: "b".to_owned(), ..v1::Attend::default() };
-    let first = v1::AttendRequest { message: Some(v1::attend_request::Message::Attend(attend)) };
-    let up = tokio_stream::once(first).chain(tokio_stream::pending());
-    let mut line = StopLinkServiceClient::new(channel.clone()).attend(up).await?.into_inner();
+    let mut line = attend(channel.clone()).await?;
     let mut people = StopServiceClient::new(channel);
-    let scope = Some(v1::Scope { scope: Some(W::Fleet(v1::Fleet {})) });
-    let mut engaged = people.engage(v1::EngageRequest { scope, ..v1::EngageRequest::default() }).await?.into_inner();
-    let engaged = engaged.message().await?.context("an answer")?;
-    ensure!(engaged.durable, "{engaged:?}");
-    let stop_id = engaged.stop.context("a stop")?.stop_id;
-    let request = v1::ResetRequest { stop_id: stop_id.clone(), reason: "all clear".to_owned() };
-    ensure!(people.reset(request).await?.into_inner().was_engaged, "it was not engaged");
+    let stop_id = engage(&mut people).await?;
+    reset(&mut people, &stop_id).await?;
     let (mut is_engaged, mut is_reset) = (false, false);
     while !is_reset {
         let message = tokio::time::timeout(LIMIT, line.message()).await??.context("the line goes on")?;
@@ -58,19 +77,28 @@ async fn a_stop_service_whose_log_takes_nothing_engages_tells_and_resets() -> an
     Ok(())
 }
 
-/// The stop services that a server has started, by process; killed when the test lets them go: they outlive the server.
-struct Children<'a>(&'a Path);
+/// Processes of stop services that were started by a server or by one before them, as these logs tell; killed when the test lets them go: they outlive both.
+struct Children(Vec<PathBuf>);
 
-impl Children<'_> {
-    fn all(&self) -> BTreeSet<u32> {
-        let said = std::fs::read_to_string(self.0).unwrap_or_default();
-        let started = said.lines().filter(|line| line.contains("a stop service was started"));
+/// What is said of each of them.
+const STARTED: &str = "a stop service was started";
+const READY: &str = "the next stop service is ready";
+
+impl Children {
+    fn all(&self, words: &str) -> BTreeSet<u32> {
+        let said: String = self.0.iter().map(|log| std::fs::read_to_string(log).unwrap_or_default()).collect();
+        let started = said.lines().filter(|line| line.contains(words));
         let named = started.filter_map(|line| line.split("process=").nth(1)?.split_whitespace().next()?.parse().ok());
         named.collect()
     }
-    async fn next(&self, before: &BTreeSet<u32>) -> anyhow::Result<u32> {
-        until("one more stop service", LIMIT, async || Ok(self.all().difference(before).next().copied())).await
+    async fn next(&self, words: &str, before: &BTreeSet<u32>) -> anyhow::Result<u32> {
+        until("one more stop service", LIMIT, async || Ok(self.all(words).difference(before).next().copied())).await
     }
+}
+
+/// Waits until something stands in a log.
+async fn says(log: &Path, words: &str) -> anyhow::Result<()> {
+    until(words, LIMIT, async || Ok(std::fs::read_to_string(log)?.contains(words).then_some(()))).await
 }
 
 fn signal(name: &str, process: u32) -> anyhow::Result<()> {
@@ -79,38 +107,117 @@ fn signal(name: &str, process: u32) -> anyhow::Result<()> {
     Ok(())
 }
 
-impl Drop for Children<'_> {
+impl Drop for Children {
     fn drop(&mut self) {
         // Those that the test has ended are gone.
-        self.all().into_iter().for_each(|process| drop(signal("KILL", process)));
+        [STARTED, READY].iter().flat_map(|words| self.all(words)).for_each(|process| drop(signal("KILL", process)));
     }
 }
 
+/// A stop service of this site, whose log tells processes.
+fn stop_service(dir: &Path, address: SocketAddr) -> anyhow::Result<(Running, Children)> {
+    std::fs::write(dir.join("site.toml"), DEMO)?;
+    let (mut command, log) = (Command::new(midshift()?), dir.join("stop.log"));
+    command.env("NO_COLOR", "1").args(["stop", "serve", "--insecure", "--listen", &address.to_string(), "--data"]);
+    command.arg(dir.join("data")).arg("--site").arg(dir.join("site.toml"));
+    Ok((Running::start(&mut command, &log)?, Children(vec![log])))
+}
+
+/// Dials as often as robots of a large site would. How often.
+async fn dial_until(is_over: CancellationToken, address: SocketAddr) -> io::Result<u32> {
+    let (mut each, mut dialed) = (tokio::time::interval(Duration::from_millis(2)), 0);
+    while !is_over.is_cancelled() {
+        each.tick().await;
+        TcpStream::connect(address).await?;
+        dialed += 1;
+    }
+    Ok(dialed)
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn serve_starts_the_stop_service_again_however_it_ended_and_what_it_said_is_in_its_folder() -> anyhow::Result<()>
-{
+async fn the_next_stop_service_takes_over_port_and_stops_and_nobody_who_dials_is_refused() -> anyhow::Result<()> {
+    let (dir, address) = (folder()?, free_port()?);
+    let (mut running, children) = stop_service(dir.path(), address)?;
+    let channel = way(address).await?;
+    let mut line = attend(channel.clone()).await?;
+    let stop_id = engage(&mut StopServiceClient::new(channel)).await?;
+    let is_over = CancellationToken::new();
+    let dialing = tokio::spawn(dial_until(is_over.clone(), address));
+    running.signal("USR2")?;
+    children.next(READY, &BTreeSet::new()).await?;
+    ensure!(running.ends().await? == Some(0), "the one before ends well");
+    let mut is_moved = false;
+    while let Some(message) = tokio::time::timeout(LIMIT, line.message()).await?.ok().flatten() {
+        is_moved |= matches!(message.message, Some(v1::attend_response::Message::MoveOver(_)));
+    }
+    ensure!(is_moved, "robots are told to dial again");
+    let mut people = StopServiceClient::new(way(address).await?);
+    is_over.cancel();
+    ensure!(dialing.await?.context("somebody was refused")? > 0, "nobody dialed");
+    reset(&mut people, &stop_id).await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_next_stop_service_that_cannot_begin_leaves_the_one_that_runs_alone() -> anyhow::Result<()> {
+    let (dir, address) = (folder()?, free_port()?);
+    let (mut running, _children) = stop_service(dir.path(), address)?;
+    let mut people = StopServiceClient::new(way(address).await?);
+    std::fs::write(dir.path().join("site.toml"), "no site")?;
+    running.signal("USR2")?;
+    says(&dir.path().join("stop.log"), "this one goes on").await?;
+    let stop_id = engage(&mut people).await?;
+    ensure!(!running.has_ended()?, "it ended");
+    // And it is asked again when that is mended.
+    std::fs::write(dir.path().join("site.toml"), DEMO)?;
+    running.signal("USR2")?;
+    ensure!(running.ends().await? == Some(0), "the one before ends well");
+    reset(&mut StopServiceClient::new(way(address).await?), &stop_id).await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn serve_starts_the_stop_service_again_unless_a_next_one_is_there_and_what_it_said_is_in_its_folder()
+-> anyhow::Result<()> {
     let dir = folder()?;
     std::fs::write(dir.path().join("site.toml"), DEMO)?;
-    let (address, stop_address) = (free_port()?.to_string(), free_port()?);
+    let (address, stop_address) = (free_port()?, free_port()?);
     let log = dir.path().join("server.log");
-    let mut command = Command::new(midshift()?);
-    command.env("NO_COLOR", "1").args(["serve", "--insecure", "--data"]).arg(dir.path().join("data"));
-    command.arg("--site").arg(dir.path().join("site.toml"));
-    command.args(["--listen", &address, "--stop-listen", &stop_address.to_string()]);
-    let children = Children(&log);
-    let _running = Running::start(&mut command, &log)?;
+    let (mut command, token) = (Command::new(midshift()?), dir.path().join("token"));
+    command.env("NO_COLOR", "1").args(["serve", "--data"]).arg(dir.path().join("data"));
+    command.arg("--site").arg(dir.path().join("site.toml")).arg("--first-token-file").arg(&token);
+    command.args(["--listen", &address.to_string(), "--stop-listen", &stop_address.to_string()]);
+    let said = dir.path().join("data/stop/log");
+    let children = Children(vec![log.clone(), said.clone()]);
+    let mut running = Running::start(&mut command, &log)?;
+    sign_in_to(address, dir.path().join("data/identity/ca.pem"), &token).await?;
+    same_site(address, stop_address)?;
+    let answers =
+        || async { Ok(StopServiceClient::new(channel(stop_address)?).get_status(v1::GetStatusRequest {}).await.ok()) };
     let mut known = BTreeSet::new();
     for name in ["KILL", "TERM"] {
-        let process = children.next(&known).await?;
+        let process = children.next(STARTED, &known).await?;
         known.insert(process);
-        way(stop_address).await?;
+        until("an answer", LIMIT, answers).await?;
         signal(name, process)?;
     }
-    children.next(&known).await?;
-    let status = StopServiceClient::new(way(stop_address).await?).get_status(v1::GetStatusRequest {}).await;
-    ensure!(status.is_ok(), "{status:?}");
-    let said = std::fs::read_to_string(dir.path().join("data/stop/log"))?;
-    ensure!(said.matches("stop service opened").count() == 3, "{said}");
+    let third = children.next(STARTED, &known).await?;
+    known.insert(third);
+    until("an answer", LIMIT, answers).await?;
+    signal("USR2", third)?;
+    says(&log, "another stop service has taken the place").await?;
+    let fourth = children.next(READY, &BTreeSet::new()).await?;
+    ensure!(children.all(STARTED) == known, "one that has a next one is not started again");
+    until("an answer", LIMIT, answers).await?;
+    // A server that is killed leaves it alone, and the next one finds it and looks after it.
+    running.kill()?;
+    until("an answer", LIMIT, answers).await?;
+    let _running = Running::start(&mut command, &log)?;
+    says(&log, "a stop service answers already and is left alone").await?;
+    signal("TERM", fourth)?;
+    known.insert(children.next(STARTED, &known).await?);
+    until("an answer", LIMIT, answers).await?;
+    ensure!(known.len() == 4, "{known:?}");
+    let said = std::fs::read_to_string(said)?;
+    ensure!(said.matches("stop service opened").count() == 5, "{said}");
     ensure!(
         !std::fs::read_to_string(&log)?.contains("stop service opened"),
         "it does not depend on the server's own log"

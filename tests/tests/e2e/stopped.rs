@@ -227,6 +227,11 @@ async fn a_stop_that_is_engaged_while_the_database_is_gone_is_recorded_and_holds
         Ok((found == "1").then_some(()))
     })
     .await?;
+    let listed = ["audit", "ls", "--server", &address.to_string(), "--service", "stop", "--action", "stop.engage"];
+    let listed = call(&[&listed[..], &["-o", "json"]].concat())?;
+    let listed = String::from_utf8(listed.stdout)?;
+    ensure!(listed.contains(&stop_id), "the audit of the site says nothing of {stop_id}: {listed}");
+    done(&["audit", "verify", "--server", &address.to_string()]).context("the audit of the site")?;
     let before = until("all tasks", LIMIT, || epochs(address)).await?;
     let new = ["task", "submit", "--server", &address.to_string(), "--from", "A01", "--to", "B03", "--sku", "SKU-1"];
     done(&[&new[..], &["--task-id", "AFTER"]].concat())?;

@@ -3,7 +3,7 @@
 
 use crate::harness::{Server, folder, until};
 use crate::kill::{all_over, at_work, submit};
-use crate::rolled_out::{Robot, begin_rollout, call, done, fleet};
+use crate::rolled_out::{Doors, Robot, begin_rollout, call, done, fleet};
 use crate::rolling::seen;
 use crate::room::LIMIT;
 use crate::stopped::{StopServer, judge_stops, resume, until_held};
@@ -47,7 +47,8 @@ async fn a_canary_of_a_bad_release_goes_back_under_a_fleet_stop_and_nobody_moves
     let stops = StopServer::start(dir.path(), server.address).await?;
     let address = server.address.to_string();
     let ids: Vec<String> = (1..=ROBOTS).map(|number| format!("rbt-{number:02}")).collect();
-    let (robots, journals) = fleet(dir.path(), server.address, &samples, Some(stops.address), ROBOTS).await?;
+    let doors = Doors { people: server.address, robots: server.address, stops: Some(stops.address) };
+    let (robots, journals) = fleet(dir.path(), &doors, &samples, ROBOTS).await?;
     submit(server.address, &site, 11, TASKS).await?;
     at_work(server.address, 2, &BTreeSet::new()).await?;
 

@@ -224,6 +224,19 @@ async fn the_streams_of_a_token_end_when_its_time_is_over_and_it_still_stops() {
 }
 
 #[tokio::test]
+async fn a_stream_that_was_begun_with_an_expired_token_ends_when_the_token_is_taken_back() {
+    let port = Port::open().await;
+    let secret = secret();
+    port.knows(&secret, &["stop-only"], 999_999);
+    let bearer = format!("Bearer {}", secret.reveal(Secret::TOKEN));
+    let mut client = port.client(None).await;
+    held(&mut client, ENGAGE, &bearer).await;
+    port.known.publish(Directory::default());
+    port.world.closed_for("denied").await;
+    assert!(asked(&mut client, ENGAGE, Some(&bearer)).await.is_none());
+}
+
+#[tokio::test]
 async fn a_certificate_whose_time_is_over_does_not_get_through_the_handshake() {
     let port = Port::open().await;
     let late = port.authority.issue_uri_until("spiffe://factory/robot/r7", (2020, 1, 1));

@@ -5,7 +5,7 @@
 use super::client::{Call, Exit, unary};
 use super::out::Out;
 use crate::way::Way;
-use anyhow::Context as _;
+use anyhow::{Context as _, ensure};
 use clap::{Args, Subcommand};
 use midshift_agent::tls;
 use midshift_core::identity::Digest;
@@ -14,7 +14,7 @@ use midshift_proto::identity::v1::identity_service_client::IdentityServiceClient
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::{IsTerminal, Read, Write};
-use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::PathBuf;
 
 /// Where the file is, if not in the usual place.
@@ -67,7 +67,11 @@ impl Contexts {
         let Ok(path) = path() else { return Ok(Self::default()) };
         let doing = || format!("reading {}", path.display());
         match std::fs::read_to_string(&path) {
-            Ok(text) => toml::from_str(&text).with_context(doing),
+            Ok(text) => {
+                let mode = std::fs::metadata(&path).with_context(doing)?.permissions().mode();
+                ensure!(mode & 0o077 == 0, "{} has tokens and is open to others: chmod 600 it", path.display());
+                toml::from_str(&text).with_context(doing)
+            }
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(Self::default()),
             Err(error) => Err(error).with_context(doing),
         }

@@ -14,6 +14,7 @@ use midshift_proto::stop::v1::scope::Scope;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+use std::time::Duration;
 
 /// Stops that were not confirmed by all.
 const NOT_ALL: u8 = 13;
@@ -212,22 +213,43 @@ async fn engage(args: Engage, out: &Out) -> Result<(), Exit> {
         Level::Halt => StopLevel::Halt,
         Level::Posture => StopLevel::ControlledStopPosture,
     };
-    let request = v1::EngageRequest {
-        scope: Some(args.whom.scope()),
-        level: level.into(),
-        reason: args.reason,
-        request_id: args.request_id,
-    };
+    // Asked again by the same name it engages nothing more.
+    let request_id =
+        if args.request_id.is_empty() { format!("cli-{:032x}", rand::random::<u128>()) } else { args.request_id };
+    let scope = Some(args.whom.scope());
+    let request = v1::EngageRequest { scope, level: level.into(), reason: args.reason, request_id };
     let mut client = args.call.client().await?;
-    let mut stream = client.engage(request).await.map_err(Exit::with_facts)?.into_inner();
-    let mut told = Told::default();
-    while let Some(message) = stream.message().await.map_err(|status| told.cut(status))? {
-        told.take(message, out)?;
-        if args.no_wait {
-            break;
+    let (mut told, mut tries) = (Told::default(), TRIES);
+    loop {
+        let lost = match told.hear(&mut client, request.clone(), args.no_wait, out).await {
+            Ok(()) => return told.end(args.no_wait, out),
+            Err(Heard::Failed(exit)) => return Err(exit),
+            Err(Heard::Lost(status)) => status,
+        };
+        if tries == 0 {
+            return Err(told.cut(lost));
         }
+        tries -= 1;
+        tokio::time::sleep(AGAIN_AFTER).await;
+        // One that is replaced is there again within moments.
+        client = args.call.client().await.unwrap_or(client);
     }
-    told.end(args.no_wait, out)
+}
+
+/// Asked so often again where a stop service has ended under a call.
+const TRIES: u32 = 10;
+const AGAIN_AFTER: Duration = Duration::from_millis(200);
+
+/// Why no more is heard.
+enum Heard {
+    /// There is nothing to be heard.
+    Failed(Exit),
+    /// The stop service has ended, or its way.
+    Lost(tonic::Status),
+}
+
+fn lost(status: tonic::Status, otherwise: impl FnOnce(tonic::Status) -> Exit) -> Heard {
+    if status.code() == tonic::Code::Unavailable { Heard::Lost(status) } else { Heard::Failed(otherwise(status)) }
 }
 
 /// What was told of one stop until now.
@@ -239,11 +261,33 @@ struct Told {
 }
 
 impl Told {
+    /// Engages the stop, unless that was done, and hears of it to the end.
+    async fn hear(
+        &mut self,
+        client: &mut StopServiceClient<Line>,
+        request: v1::EngageRequest,
+        no_wait: bool,
+        out: &Out,
+    ) -> Result<(), Heard> {
+        let asked = client.engage(request).await;
+        let mut stream = asked.map_err(|status| lost(status, Exit::with_facts))?.into_inner();
+        while let Some(message) = stream.message().await.map_err(|status| lost(status, |status| self.cut(status)))? {
+            self.take(message, out).map_err(Heard::Failed)?;
+            if no_wait {
+                return Ok(());
+            }
+        }
+        if self.stop.stop_id.is_empty() {
+            return Err(Heard::Lost(tonic::Status::unavailable("the stop service ended before it answered")));
+        }
+        Ok(())
+    }
+
     fn take(&mut self, message: v1::EngageResponse, out: &Out) -> Result<(), Exit> {
         if out.format == Format::Jsonl {
             out.json(&message)?;
         }
-        if let Some(stop) = &message.stop {
+        if let Some(stop) = message.stop.as_ref().filter(|stop| stop.stop_id != self.stop.stop_id) {
             self.stop = stop.clone();
             match out.format {
                 Format::Table => out.line(&format!("{} {} {} engaged", stop.stop_id, level(stop.level), whom(stop))),
@@ -253,7 +297,8 @@ impl Told {
         }
         for robot in &message.robots {
             // That it was told is no news, and a fleet is long.
-            if out.format == Format::Table && robot.confirmation() != v1::Confirmation::Requested {
+            let is_news = self.robots.get(&robot.robot_id) != Some(robot);
+            if is_news && out.format == Format::Table && robot.confirmation() != v1::Confirmation::Requested {
                 out.line(&confirmed(robot));
             }
             self.robots.insert(robot.robot_id.clone(), robot.clone());
@@ -426,11 +471,29 @@ fn of_robot(robot: &v1::RobotStatus) -> Vec<String> {
 }
 
 async fn watch(call: &StopCall, out: &Out) -> Result<(), Exit> {
-    let mut stream = call.client().await?.watch_status(v1::WatchStatusRequest {}).await?.into_inner();
-    while let Some(message) = stream.message().await? {
-        show(&v1::GetStatusResponse { status: message.status }, out)?;
+    let (mut client, mut tries) = (call.client().await?, TRIES);
+    loop {
+        let status = match client.watch_status(v1::WatchStatusRequest {}).await {
+            Ok(stream) => {
+                let mut stream = stream.into_inner();
+                loop {
+                    match stream.message().await {
+                        Ok(Some(message)) => show(&v1::GetStatusResponse { status: message.status }, out)?,
+                        Ok(None) => break tonic::Status::unavailable("the stop service has ended"),
+                        Err(status) => break status,
+                    }
+                    tries = TRIES;
+                }
+            }
+            Err(status) => status,
+        };
+        if status.code() != tonic::Code::Unavailable || tries == 0 {
+            return Err(status.into());
+        }
+        tries -= 1;
+        tokio::time::sleep(AGAIN_AFTER).await;
+        client = call.client().await.unwrap_or(client);
     }
-    Ok(())
 }
 
 async fn reset(call: &StopCall, request: v1::ResetRequest, out: &Out) -> Result<(), Exit> {

@@ -2,7 +2,7 @@
 //!
 //! Invariant: nothing here ends one that runs. What it says goes to a file of its own: it must not depend on where the server's own words go.
 
-use super::{FOLDER, LOOK_EVERY, UP_WITHIN};
+use super::{FOLDER, LOOK_EVERY, UP_WITHIN, program};
 use anyhow::{Context, bail};
 use midshift_agent::dial::{Dial, TcpDial};
 use midshift_agent::tls::{self, Tls};
@@ -25,9 +25,11 @@ use tonic_health::pb::health_client::HealthClient;
 pub const LOG: &str = "log";
 /// One that has more than this begins anew, bytes.
 const LOG_BYTES_MAX: u64 = 4 * 1024 * 1024;
-/// One that hangs is found out by a look so often, and started again after so many in vain; one that is gone is found out at once.
+/// One that hangs is found out when it has not answered for so long, and started again after so many times in vain; one that is gone is found out at the next look.
 const KEPT_EVERY: Duration = Duration::from_secs(2);
 const MISSES: u32 = 2;
+/// Its log is looked at so often, in looks at itself.
+const LOG_EVERY: u32 = 100;
 /// One that ended sooner than this after its start is started again after a pause, which doubles up to the longest.
 const LIVED: Duration = Duration::from_secs(10);
 const PAUSE_LONGEST: Duration = Duration::from_secs(5);
@@ -103,6 +105,11 @@ impl Started {
         loop {
             let begun = Instant::now();
             self.until_gone(&mut child).await;
+            if self.answers().await {
+                tracing::info!(address = %self.listen, "another stop service has taken the place of the one that was here");
+                child = None;
+                continue;
+            }
             pause = if begun.elapsed() >= LIVED { Duration::ZERO } else { longer(pause) };
             tracing::error!(address = %self.listen, "the stop service does not answer and is started again");
             sleep(pause).await;
@@ -134,7 +141,7 @@ impl Started {
                 let answers = self.answers().await;
                 misses = if answers { 0 } else { misses + 1 };
                 // One that only ended a connection that was old goes on.
-                sleep(if answers { KEPT_EVERY } else { LOOK_EVERY }).await;
+                sleep(LOOK_EVERY).await;
             }
         };
         tokio::select! {
@@ -143,28 +150,19 @@ impl Started {
         }
     }
 
-    /// Stays on a connection as long as that is answered. When its process ends, that is seen here at once, whoever has started it.
+    /// Stays on a connection as long as what is asked on it is answered. When its process ends, that is seen here soon, whoever has started it.
     async fn watch(&self) {
-        let begun = async {
-            let mut client = self.client().await?;
-            let service = "midshift.stop.v1.StopService".to_owned();
-            let states = client.watch(HealthCheckRequest { service }).await.ok()?.into_inner();
-            Some((client, states))
-        };
-        let Ok(Some((mut client, mut states))) = timeout(KEPT_EVERY, begun).await else { return };
-        loop {
-            match timeout(KEPT_EVERY, states.message()).await {
-                Ok(Ok(Some(_))) => {}
-                Ok(_) => return,
-                Err(_) => {
-                    // Of a process that runs for years too. Where it cannot be, it is said at the next start.
-                    drop(log(&self.data.join(FOLDER)));
-                    let asked = client.check(HealthCheckRequest::default());
-                    if !timeout(KEPT_EVERY, asked).await.is_ok_and(|answer| answer.is_ok()) {
-                        return;
-                    }
-                }
+        let Ok(Some(mut client)) = timeout(KEPT_EVERY, self.client()).await else { return };
+        for n in 0_u32.. {
+            // Of a process that runs for years too. Where it cannot be, it is said at the next start.
+            if n.is_multiple_of(LOG_EVERY) {
+                drop(log(&self.data.join(FOLDER)));
             }
+            let asked = client.check(HealthCheckRequest::default());
+            if !timeout(KEPT_EVERY, asked).await.is_ok_and(|answer| answer.is_ok()) {
+                return;
+            }
+            sleep(LOOK_EVERY).await;
         }
     }
 
@@ -194,13 +192,6 @@ impl Started {
 /// The pause before the next start of one that ends at once.
 fn longer(pause: Duration) -> Duration {
     (pause * 2).max(LOOK_EVERY).min(PAUSE_LONGEST)
-}
-
-/// This program. Of one that was replaced on the disk the new one is started.
-fn program() -> anyhow::Result<PathBuf> {
-    let program = std::env::current_exe().context("finding this program")?;
-    let named = program.to_str().and_then(|name| name.strip_suffix(" (deleted)")).map(PathBuf::from);
-    Ok(named.filter(|named| named.is_file()).unwrap_or(program))
 }
 
 /// Where it says what it says: at the end of what was said before, unless that is much.

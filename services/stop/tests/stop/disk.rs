@@ -100,3 +100,17 @@ async fn a_disk_that_refuses_the_latch_stops_robots_all_the_same_and_holds_it_la
     assert_eq!(server.engaged().await, [id]);
     server.end().await;
 }
+
+#[tokio::test]
+async fn a_service_is_followed_only_when_its_disk_holds_all_that_it_knows() {
+    let disk = Small::mount();
+    let server = Server::start(&disk.path()).await;
+    assert!(server.service.may_be_followed().await);
+    let filler = disk.fill();
+    // Each look is a record, and the audit has a block of 4 KiB that is not full at once.
+    eventually(async || (!server.service.may_be_followed().await).then_some(())).await;
+    fs::remove_file(filler).unwrap();
+    eventually(async || server.service.may_be_followed().await.then_some(())).await;
+    assert!(fs::read_to_string(disk.path().join("audit.jsonl")).unwrap().contains("FOLLOWED"));
+    server.end().await;
+}

@@ -71,6 +71,8 @@ pub struct Server {
     serving: JoinHandle<Result<(), Error>>,
     shutdown: CancellationToken,
     pub address: SocketAddr,
+    /// As whoever runs it has it.
+    pub service: StopService,
     ahead_us: Arc<AtomicU64>,
     /// What requests that come now are told of their connection.
     leaving: Arc<Mutex<Leaving>>,
@@ -110,7 +112,9 @@ impl Server {
             request.extensions_mut().insert(told.lock().unwrap().clone());
             known(request)
         };
+        let served = service.clone();
         let serving = runtime.spawn(async move {
+            let service = served;
             let (routes, drained) = (service.routes().await?, service.drained());
             let port = tonic::transport::Server::builder()
                 .accept_http1(true)
@@ -129,7 +133,7 @@ impl Server {
             };
             serve(service, port).await.map(|served| served.unwrap())
         });
-        Self { runtime: Some(runtime), serving, shutdown, address, ahead_us, leaving }
+        Self { runtime: Some(runtime), serving, shutdown, address, service, ahead_us, leaving }
     }
 
     /// All connections that there are now are old.

@@ -3,12 +3,16 @@
 use crate::harness::{Folder, Robot, Server, code, eventually, fleet, halt, id_of, scope, told};
 use midshift_core::limits;
 use midshift_core::site::{DEMO, text};
+use midshift_core::time::{ScaledClock, Utc};
 use midshift_proto::refusal_of;
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::scope::Scope as W;
+use midshift_proto::stop::v1::stop_service_server::StopService as Face;
+use midshift_stop::{Parts, StopService};
 use std::fs;
 use std::sync::Arc;
-use tonic::Code;
+use tokio_util::sync::CancellationToken;
+use tonic::{Code, Request};
 
 #[tokio::test]
 async fn what_was_answered_as_durable_is_in_the_file() {
@@ -271,4 +275,19 @@ async fn what_was_reset_a_quarter_ago_is_forgotten_without_anybody_doing_anythin
     assert!(kept["latch"]["resets"].get(&over).is_none(), "{kept}");
     assert!(generation > written, "whoever copies it sees that it is another");
     assert_eq!(server.engaged().await, [stands]);
+}
+
+#[tokio::test]
+async fn a_service_that_ends_takes_no_stop_and_no_reset_that_nobody_would_keep() {
+    let (folder, shutdown) = (Folder::new(), CancellationToken::new());
+    let clock = Arc::new(ScaledClock::new(|| 0, Utc(1_780_000_000_000), 1000));
+    let parts = Parts { folder: folder.path(), site: None, clock };
+    let service = StopService::open(parts, shutdown.clone()).unwrap();
+    shutdown.cancel();
+    let refused = Face::engage(&service, Request::new(fleet())).await.expect_err("a refusal");
+    assert_eq!(refused.code(), Code::Unavailable, "{refused}");
+    let reset = v1::ResetRequest { stop_id: "STOP-20260601-ABCDEFGHJK".to_owned(), reason: "all clear".to_owned() };
+    let refused = Face::reset(&service, Request::new(reset)).await.expect_err("a refusal");
+    assert_eq!(refused.code(), Code::Unavailable);
+    assert_eq!(service.engaged(), 0);
 }

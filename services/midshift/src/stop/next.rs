@@ -1,0 +1,157 @@
+//! The next stop service in the place of the one that runs: started by it, which ends only when the next one has read what it needs and waits for the folder.
+//!
+//! Both have the same open port, which the next one gets as its standard input: whoever dials between them waits a moment and is refused by nobody. Invariant:
+//! a next one that cannot begin costs nothing, this one goes on; two never have the folder at once.
+
+use super::{UP_WITHIN, program};
+use anyhow::{Context, anyhow, bail, ensure};
+use midshift_stop::StopService;
+use std::env;
+use std::ffi::OsStr;
+use std::fs::File;
+use std::io::{self, Write};
+use std::os::fd::{AsFd, OwnedFd};
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::ffi::OsStrExt;
+use std::os::unix::net::{SocketAddr, UnixDatagram};
+use std::process::Stdio;
+use std::time::Duration;
+use tokio::io::AsyncReadExt;
+use tokio::net::TcpListener;
+use tokio::process::{Child, Command};
+use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::time::timeout;
+
+/// What tells the next one that it is one.
+const FOLLOWS: &str = "--follows";
+/// What it says when it needs nothing more than the folder.
+const READY: u8 = b'.';
+/// Where a service manager wants to hear which process the service is, as sd_notify(3) says.
+const NOTIFY: &str = "NOTIFY_SOCKET";
+
+/// The open port of the one before.
+///
+/// # Errors
+/// The standard input is no open port: it is not started by hand.
+pub fn port() -> anyhow::Result<TcpListener> {
+    let listener = std::net::TcpListener::from(io::stdin().as_fd().try_clone_to_owned()?);
+    // Open once more, the port would stay so until this process has ended.
+    rustix::stdio::dup2_stdin(File::open("/dev/null")?)?;
+    listener.local_addr().with_context(|| format!("{FOLLOWS} is for a process that a stop service starts itself"))?;
+    listener.set_nonblocking(true)?;
+    Ok(TcpListener::from_std(listener)?)
+}
+
+/// Says to the one before that it may end.
+///
+/// # Errors
+/// Nobody hears it.
+pub fn ready() -> anyhow::Result<()> {
+    let mut out = io::stdout();
+    out.write_all(&[READY]).and_then(|()| out.flush()).context("the stop service before this one is gone")
+}
+
+/// Hears from now on who asks for a next one: unheard, SIGUSR2 would end this process.
+///
+/// # Errors
+/// The system gives no way to hear it.
+pub fn asked() -> anyhow::Result<Signal> {
+    signal(SignalKind::user_defined2()).context("hearing SIGUSR2")
+}
+
+/// Waits until one is asked for and is ready to have `port`, as often as it takes, and the disk holds all that `service` knows.
+pub async fn begun(mut asked: Signal, port: &OwnedFd, service: &StopService) {
+    while asked.recv().await.is_some() {
+        match start(port, service).await {
+            Ok(process) => {
+                tracing::info!(process, "the next stop service is ready: this one ends");
+                tell_manager(process);
+                return;
+            }
+            Err(error) => {
+                tracing::error!(error = format!("{error:#}"), "the next stop service did not begin: this one goes on");
+            }
+        }
+    }
+    std::future::pending().await
+}
+
+/// Starts one, and waits until it is ready and this one has nothing left that it alone knows. Its process.
+async fn start(port: &OwnedFd, service: &StopService) -> anyhow::Result<u32> {
+    // With it the container would end.
+    ensure!(std::process::id() != 1, "the first process of a container is replaced with its container");
+    let mut command = Command::new(program()?);
+    command.args(env::args_os().skip(1).filter(|argument| argument != FOLLOWS)).arg(FOLLOWS);
+    command.stdin(Stdio::from(port.try_clone()?)).stdout(Stdio::piped());
+    let mut child = command.spawn().context("starting it")?;
+    let ready = timeout(UP_WITHIN, until_ready(&mut child)).await;
+    let ready = ready.unwrap_or_else(|_| Err(anyhow!("it was not ready within {} s", UP_WITHIN.as_secs())));
+    let process = match ready {
+        Ok(_) if !service.may_be_followed().await => Err(anyhow!("the disk does not hold what this one knows")),
+        ready => ready,
+    };
+    if process.is_err() {
+        end(child).await;
+    }
+    process
+}
+
+async fn until_ready(child: &mut Child) -> anyhow::Result<u32> {
+    let said = child.stdout.as_mut().context("its standard output")?.read_u8().await;
+    if said.is_ok_and(|said| said == READY) {
+        return child.id().context("it ended at once");
+    }
+    bail!("it ended before it was ready; what it said is above: {}", child.wait().await?)
+}
+
+/// Ends one that is of no use.
+async fn end(mut child: Child) {
+    if let Err(error) = child.kill().await {
+        tracing::warn!(%error, "a stop service that did not begin was not ended");
+    }
+}
+
+/// Says to a service manager that waits for it which process the service is from now on.
+fn tell_manager(process: u32) {
+    let Some(address) = env::var_os(NOTIFY) else { return };
+    if let Err(error) = tell(&address, &format!("MAINPID={process}")) {
+        tracing::warn!(%error, "the service manager was not told which process this service is now");
+    }
+}
+
+fn tell(address: &OsStr, text: &str) -> io::Result<()> {
+    let address = match address.as_bytes() {
+        [b'@', name @ ..] => SocketAddr::from_abstract_name(name)?,
+        _ => SocketAddr::from_pathname(address)?,
+    };
+    let socket = UnixDatagram::unbound()?;
+    // Of one that does not listen nobody waits.
+    socket.set_write_timeout(Some(Duration::from_secs(1)))?;
+    socket.send_to_addr(text.as_bytes(), &address).map(drop)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_service_manager_is_told_by_a_path_or_an_abstract_name() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("notify");
+        let name = format!("midshift-next-{}", std::process::id());
+        let by_name = UnixDatagram::bind_addr(&SocketAddr::from_abstract_name(&name).unwrap()).unwrap();
+        let by_path = UnixDatagram::bind(&path).unwrap();
+        for (socket, address) in [(by_path, path.into_os_string()), (by_name, format!("@{name}").into())] {
+            tell(&address, "MAINPID=7").unwrap();
+            let mut heard = [0; 32];
+            let bytes = socket.recv(&mut heard).unwrap();
+            assert_eq!(&heard[..bytes], b"MAINPID=7");
+        }
+    }
+
+    #[test]
+    fn a_manager_that_is_not_there_is_an_error_and_no_wait() {
+        let dir = tempfile::tempdir().unwrap();
+        assert!(tell(dir.path().join("nobody").as_os_str(), "MAINPID=7").is_err());
+    }
+}
