@@ -115,7 +115,7 @@ pub async fn run(args: StopServe, shutdown: CancellationToken) -> anyhow::Result
     let following = async {
         tokio::select! {
             () = shutdown.cancelled() => {}
-            () = next::begun(asked, &port, &leaving) => shutdown.cancel(),
+            () = next::begun(asked, &port, &leaving) => {}
         }
         // Who dials from now on is the next one's.
         drop(port);
@@ -132,15 +132,20 @@ async fn following(parts: &Parts, shutdown: &CancellationToken) -> anyhow::Resul
     // One that cannot read it would stop the whole fleet.
     let latch = midshift_stop::latch(&parts.folder).context("reading the latch")?;
     ensure!(latch.is_some(), "there is no latch in {}", parts.folder.display());
-    next::ready()?;
     let mut waited = Duration::ZERO;
     loop {
         match StopService::open(parts.clone(), shutdown.clone()) {
             Err(error) if error.is_held() && waited < UP_WITHIN => {}
             opened => return Ok(opened?),
         }
-        tokio::time::sleep(NEXT_EVERY).await;
-        waited += NEXT_EVERY;
+        if waited.is_zero() {
+            // It could have it, but for the one before.
+            next::ready()?;
+        }
+        tokio::select! {
+            () = shutdown.cancelled() => bail!("asked to end before it began"),
+            () = tokio::time::sleep(NEXT_EVERY) => waited += NEXT_EVERY,
+        }
     }
 }
 

@@ -89,7 +89,10 @@ impl StopFollower {
             look.tick().await;
             let followed = self.follow(n % NOW_AND_THEN == 0).await;
             if let (Err(error), false) = (&followed, self.failing) {
-                tracing::warn!(error = format!("{error:#}"), "stops are not copied into the store");
+                tracing::warn!(
+                    error = format!("{error:#}"),
+                    "what the stop service and the store tell each other is not up to date"
+                );
             }
             self.failing = followed.is_err();
             metrics::gauge!("midshift_stop_follower_failing").set(f64::from(u8::from(self.failing)));

@@ -65,7 +65,7 @@ impl StopService {
                 // What was engaged is said, whatever follows.
                 biased;
                 () = confirm::tell(&inner, engaged.stop, durable, engaged.version, room.is_some(), sender) => {}
-                () = ends.cancelled() => goes_on_elsewhere(&reader),
+                () = ends.cancelled() => goes_on_elsewhere(&reader).await,
             }
             drop(room);
         });
@@ -101,7 +101,7 @@ impl StopService {
         tokio::spawn(async move {
             let (ends, reader) = (inner.ended.clone(), sender.clone());
             tokio::select! {
-                () = ends.cancelled() => goes_on_elsewhere(&reader),
+                () = ends.cancelled() => goes_on_elsewhere(&reader).await,
                 () = status::tell(&inner, sender) => {}
             }
             drop(room);
@@ -110,9 +110,9 @@ impl StopService {
     }
 }
 
-/// A reader asks whoever follows. One that has not read what was there does so when its connection ends.
-fn goes_on_elsewhere<T>(reader: &mpsc::Sender<Result<T, Status>>) {
-    let _ = reader.try_send(Err(to_status(&acts::ends(), None)));
+/// A reader asks whoever follows. One that reads nothing hears of it when its connection ends, which is soon.
+async fn goes_on_elsewhere<T>(reader: &mpsc::Sender<Result<T, Status>>) {
+    let _ = reader.send(Err(to_status(&acts::ends(), None))).await;
 }
 
 fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {

@@ -245,12 +245,22 @@ impl StopService {
         self.inner.disk.denied(note, left_out);
     }
 
-    /// Records that another process is ready to follow this one. False: the disk does not hold that, or not all that is engaged and reset, so that this one must go on.
-    pub async fn may_be_followed(&self) -> bool {
+    /// Records that another process is ready to follow this one, and ends. False: the disk does not hold that, or not all that is engaged and reset, so that this one
+    /// goes on.
+    pub async fn is_followed(&self) -> bool {
         let inner = &self.inner;
         let version = lock(&inner.law).version();
         let recorded = inner.disk.record(Note::own(inner.clock.now().wall, Action::Followed)).await;
-        recorded && inner.disk.turn(version).await
+        if !recorded || !inner.disk.turn(version).await {
+            return false;
+        }
+        // What came in between waits for the disk, and whoever asked for it for this service.
+        let _fan = lock(&inner.fan);
+        let is_kept = inner.disk.holds(lock(&inner.law).version());
+        if is_kept {
+            inner.shutdown.cancel();
+        }
+        is_kept
     }
 
     /// When its lines have ended, so that its port may close.
@@ -341,6 +351,11 @@ fn open(folder: &Path, now: Utc) -> Result<Opened, Error> {
     // Of two that begin for the first time at once, the one that holds the latch makes the key.
     let first = if is_first { Some(LatchFile::open(&path, room, Kept::default())?) } else { None };
     let is_gone = !is_first && !path.exists();
+    // Nor does anybody touch the key of one that runs.
+    let there = if is_first || is_gone { None } else { Some(LatchFile::open(&path, room, Kept::default())) };
+    if let Some(Err(error @ midshift_latch::Error::Held { .. })) = there {
+        return Err(error.into());
+    }
     let (key, found) = Key::open(folder, now).map_err(failed)?;
     let mut notes = Vec::new();
     // In the file before anything else is: an end right after this leaves the fleet stopped too.
@@ -352,10 +367,9 @@ fn open(folder: &Path, now: Utc) -> Result<Opened, Error> {
         kept.latch.engage(stop);
         kept
     };
-    let opened = match first {
-        Some(opened) => Ok(opened),
-        None if is_gone => LatchFile::open(&path, room, lose("it is gone".to_owned())),
-        None => LatchFile::open(&path, room, Kept::default()),
+    let opened = match first.map(Ok).or(there) {
+        Some(opened) => opened,
+        None => LatchFile::open(&path, room, lose("it is gone".to_owned())),
     };
     let (file, kept) = match opened {
         Err(error @ (midshift_latch::Error::Unreadable { .. } | midshift_latch::Error::Foreign { .. })) => {

@@ -12,6 +12,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::thread;
 use std::time::Duration;
 use tokio::net::TcpStream;
 use tokio_stream::StreamExt;
@@ -143,6 +144,11 @@ async fn the_next_stop_service_takes_over_port_and_stops_and_nobody_who_dials_is
     let stop_id = engage(&mut StopServiceClient::new(channel)).await?;
     let is_over = CancellationToken::new();
     let dialing = tokio::spawn(dial_until(is_over.clone(), address));
+    // Somebody stops all the while, by one or the other.
+    let mut stopping = Command::new(midshift()?);
+    stopping.args(["stop", "--all", "--reason", "in between", "--no-wait", "-o", "name", "--stop-server"]);
+    stopping.arg(address.to_string()).env("MIDSHIFT_CONTEXTS", dir.path().join("nobody"));
+    let stopped = thread::spawn(move || (0..8).map(|_| stopping.output()).collect::<Vec<_>>());
     running.signal("USR2")?;
     children.next(READY, &BTreeSet::new()).await?;
     ensure!(running.ends().await? == Some(0), "the one before ends well");
@@ -152,6 +158,12 @@ async fn the_next_stop_service_takes_over_port_and_stops_and_nobody_who_dials_is
     }
     ensure!(is_moved, "robots are told to dial again");
     let mut people = StopServiceClient::new(way(address).await?);
+    for output in stopped.join().ok().context("it panicked")? {
+        let output = output?;
+        let (id, said) = (String::from_utf8(output.stdout)?, String::from_utf8_lossy(&output.stderr));
+        ensure!(output.status.success(), "{:?}: {said}", output.status);
+        reset(&mut people, id.trim()).await.with_context(|| format!("{id}: {said}"))?;
+    }
     is_over.cancel();
     ensure!(dialing.await?.context("somebody was refused")? > 0, "nobody dialed");
     reset(&mut people, &stop_id).await

@@ -129,7 +129,11 @@ async fn a_robot_that_nobody_hears_for_twenty_seconds_works_on_and_one_among_peo
     .await?;
     let tasks = all_over(people, TASKS_AWAY).await?;
     ensure!(tasks.iter().all(|task| task.state() == TaskState::Succeeded), "{tasks:?}");
-    ensure!(since_free(&away)?.iter().all(|level| *level < StopLevel::Halt), "away: {:?}", obeyed(&away)?);
+    let stood = |entry: &journal::Entry| {
+        let obeys = matches!(entry.effect, Effect::Obeys { level, .. } if level >= StopLevel::Halt);
+        obeys && inside.contains(&entry.utc_ms)
+    };
+    ensure!(!journal::read(&away)?.iter().any(stood), "away: {:?}", obeyed(&away)?);
     ensure!(since_free(&among)?.last() >= Some(&StopLevel::Halt), "it was let go by itself: {:?}", obeyed(&among)?);
     until("the resume", LIMIT, async || {
         let resume = ["resume", "--server", &address, "--stop", &silence, "--reason", "nobody is near"];

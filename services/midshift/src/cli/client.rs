@@ -274,7 +274,7 @@ pub async fn follow<T, B>(
 }
 
 /// The connection is gone, and with it what the answer would have been.
-fn was_cut(status: &Status) -> bool {
+pub fn was_cut(status: &Status) -> bool {
     matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled | Code::Internal)
 }
 

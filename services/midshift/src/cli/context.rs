@@ -5,7 +5,7 @@
 use super::client::{Call, Exit, unary};
 use super::out::Out;
 use crate::way::Way;
-use anyhow::{Context as _, ensure};
+use anyhow::Context as _;
 use clap::{Args, Subcommand};
 use midshift_agent::tls;
 use midshift_core::identity::Digest;
@@ -62,14 +62,17 @@ impl Contexts {
     /// As they were written; empty if there is no file.
     ///
     /// # Errors
-    /// The file cannot be read, or is open to others.
+    /// The file cannot be read.
     pub fn read() -> anyhow::Result<Self> {
         let Ok(path) = path() else { return Ok(Self::default()) };
         let doing = || format!("reading {}", path.display());
         match std::fs::read_to_string(&path) {
             Ok(text) => {
-                let mode = std::fs::metadata(&path).with_context(doing)?.permissions().mode();
-                ensure!(mode & 0o077 == 0, "{} has tokens and is open to others: chmod 600 it", path.display());
+                let found = std::fs::metadata(&path).with_context(doing)?;
+                // Said, and no more: somebody may have to stop a fleet by it.
+                if found.is_file() && found.permissions().mode() & 0o077 != 0 {
+                    tracing::warn!(path = %path.display(), "it has tokens and is open to others: chmod 600 it");
+                }
                 toml::from_str(&text).with_context(doing)
             }
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(Self::default()),

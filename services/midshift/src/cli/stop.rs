@@ -2,7 +2,7 @@
 //!
 //! An operational stop request; not a safety function, no performance level. Nothing is shown as standing that a robot has not said itself.
 
-use super::client::{Exit, Login, Resolved, unary};
+use super::client::{Exit, Login, Resolved, follow, unary, was_cut};
 use super::out::{Format, Out, plain};
 use crate::stop::{FOLDER, StopServe};
 use crate::way::Line;
@@ -13,6 +13,7 @@ use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::scope::Scope;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
 use std::collections::BTreeMap;
+use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -48,7 +49,16 @@ impl StopCall {
     async fn client(&self) -> Result<StopServiceClient<Line>, Exit> {
         let resolved = self.login.resolve(self.server.as_deref())?;
         let address = address(self.stop_server.as_deref(), &resolved)?;
-        let line = resolved.way(&address)?.connect().await.map_err(|error| nobody(&address, &*error.0))?;
+        let (way, mut tries) = (resolved.way(&address)?, DIALS);
+        let line = loop {
+            tries -= 1;
+            match way.connect().await {
+                Ok(line) => break line,
+                Err(error) if tries == 0 => return Err(nobody(&address, &*error.0)),
+                // One that ends lets go of whoever has just come; the next one is there within moments.
+                Err(_) => tokio::time::sleep(AGAIN_AFTER).await,
+            }
+        };
         Ok(StopServiceClient::new(line).max_decoding_message_size(ANSWER_BYTES_MAX))
     }
 }
@@ -227,7 +237,7 @@ async fn engage(args: Engage, out: &Out) -> Result<(), Exit> {
             Err(Heard::Lost(status)) => status,
         };
         if tries == 0 {
-            return Err(told.cut(lost));
+            return Err(told.cut(lost).or_try("midshift stop status: it may be engaged all the same"));
         }
         tries -= 1;
         tokio::time::sleep(AGAIN_AFTER).await;
@@ -236,8 +246,9 @@ async fn engage(args: Engage, out: &Out) -> Result<(), Exit> {
     }
 }
 
-/// Asked so often again where a stop service has ended under a call.
+/// Asked so often again where a stop service has ended under a call; dialed so often before it is said that there is none.
 const TRIES: u32 = 10;
+const DIALS: u32 = 4;
 const AGAIN_AFTER: Duration = Duration::from_millis(200);
 
 /// Why no more is heard.
@@ -246,10 +257,6 @@ enum Heard {
     Failed(Exit),
     /// The stop service has ended, or its way.
     Lost(tonic::Status),
-}
-
-fn lost(status: tonic::Status, otherwise: impl FnOnce(tonic::Status) -> Exit) -> Heard {
-    if status.code() == tonic::Code::Unavailable { Heard::Lost(status) } else { Heard::Failed(otherwise(status)) }
 }
 
 /// What was told of one stop until now.
@@ -269,9 +276,8 @@ impl Told {
         no_wait: bool,
         out: &Out,
     ) -> Result<(), Heard> {
-        let asked = client.engage(request).await;
-        let mut stream = asked.map_err(|status| lost(status, Exit::with_facts))?.into_inner();
-        while let Some(message) = stream.message().await.map_err(|status| lost(status, |status| self.cut(status)))? {
+        let mut stream = client.engage(request).await.map_err(|status| self.lost(status))?.into_inner();
+        while let Some(message) = stream.message().await.map_err(|status| self.lost(status))? {
             self.take(message, out).map_err(Heard::Failed)?;
             if no_wait {
                 return Ok(());
@@ -305,6 +311,14 @@ impl Told {
         }
         self.last = message;
         Ok(())
+    }
+
+    fn lost(&self, status: tonic::Status) -> Heard {
+        match was_cut(&status) {
+            true => Heard::Lost(status),
+            false if self.stop.stop_id.is_empty() => Heard::Failed(Exit::with_facts(status)),
+            false => Heard::Failed(self.cut(status)),
+        }
     }
 
     /// The stream broke: the stop stands all the same.
@@ -405,7 +419,11 @@ fn confirmed(robot: &v1::RobotStop) -> String {
         0 => "nobody can tell when it stands".to_owned(),
         by => format!("stands by itself by {}", at(by)),
     };
-    format!("{}  {word} since {}, {by}", robot.robot_id, at(robot.unreachable_since_unix_ms))
+    let since = match robot.unreachable_since_unix_ms {
+        0 => "not heard yet".to_owned(),
+        since => format!("since {}", at(since)),
+    };
+    format!("{}  {word} {since}, {by}", robot.robot_id)
 }
 
 fn show(answer: &v1::GetStatusResponse, out: &Out) -> Result<(), Exit> {
@@ -471,29 +489,14 @@ fn of_robot(robot: &v1::RobotStatus) -> Vec<String> {
 }
 
 async fn watch(call: &StopCall, out: &Out) -> Result<(), Exit> {
-    let (mut client, mut tries) = (call.client().await?, TRIES);
-    loop {
-        let status = match client.watch_status(v1::WatchStatusRequest {}).await {
-            Ok(stream) => {
-                let mut stream = stream.into_inner();
-                loop {
-                    match stream.message().await {
-                        Ok(Some(message)) => show(&v1::GetStatusResponse { status: message.status }, out)?,
-                        Ok(None) => break tonic::Status::unavailable("the stop service has ended"),
-                        Err(status) => break status,
-                    }
-                    tries = TRIES;
-                }
-            }
-            Err(status) => status,
-        };
-        if status.code() != tonic::Code::Unavailable || tries == 0 {
-            return Err(status.into());
+    let open = async || Ok(call.client().await?.watch_status(v1::WatchStatusRequest {}).await?.into_inner());
+    follow(out, open, |message: Option<v1::WatchStatusResponse>| {
+        if let Some(message) = message {
+            show(&v1::GetStatusResponse { status: message.status }, out)?;
         }
-        tries -= 1;
-        tokio::time::sleep(AGAIN_AFTER).await;
-        client = call.client().await.unwrap_or(client);
-    }
+        Ok(ControlFlow::Continue(()))
+    })
+    .await
 }
 
 async fn reset(call: &StopCall, request: v1::ResetRequest, out: &Out) -> Result<(), Exit> {

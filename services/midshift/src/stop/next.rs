@@ -59,7 +59,7 @@ pub fn asked() -> anyhow::Result<Signal> {
     signal(SignalKind::user_defined2()).context("hearing SIGUSR2")
 }
 
-/// Waits until one is asked for and is ready to have `port`, as often as it takes, and the disk holds all that `service` knows.
+/// Waits until one is asked for and is ready to have `port`, as often as it takes, and `service` ends for it.
 pub async fn begun(mut asked: Signal, port: &OwnedFd, service: &StopService) {
     while asked.recv().await.is_some() {
         match start(port, service).await {
@@ -83,17 +83,26 @@ async fn start(port: &OwnedFd, service: &StopService) -> anyhow::Result<u32> {
     let mut command = Command::new(program()?);
     command.args(env::args_os().skip(1).filter(|argument| argument != FOLLOWS)).arg(FOLLOWS);
     command.stdin(Stdio::from(port.try_clone()?)).stdout(Stdio::piped());
-    let mut child = command.spawn().context("starting it")?;
-    let ready = timeout(UP_WITHIN, until_ready(&mut child)).await;
-    let ready = ready.unwrap_or_else(|_| Err(anyhow!("it was not ready within {} s", UP_WITHIN.as_secs())));
-    let process = match ready {
-        Ok(_) if !service.may_be_followed().await => Err(anyhow!("the disk does not hold what this one knows")),
-        ready => ready,
-    };
-    if process.is_err() {
-        end(child).await;
+    let mut next = Next(Some(command.spawn().context("starting it")?));
+    let Some(child) = &mut next.0 else { bail!("it is gone") };
+    let ready = timeout(UP_WITHIN, until_ready(child)).await;
+    let process = ready.unwrap_or_else(|_| Err(anyhow!("it was not ready within {} s", UP_WITHIN.as_secs())))?;
+    ensure!(child.try_wait()?.is_none(), "it ended when it was ready");
+    ensure!(service.is_followed().await, "the disk does not hold all that this one knows");
+    drop(next.0.take());
+    Ok(process)
+}
+
+/// One that is not needed any more if nobody takes it out.
+struct Next(Option<Child>);
+
+impl Drop for Next {
+    fn drop(&mut self) {
+        let ended = self.0.as_mut().map(Child::start_kill).transpose();
+        if let Err(error) = ended {
+            tracing::warn!(%error, "a stop service that did not begin was not ended");
+        }
     }
-    process
 }
 
 async fn until_ready(child: &mut Child) -> anyhow::Result<u32> {
@@ -102,13 +111,6 @@ async fn until_ready(child: &mut Child) -> anyhow::Result<u32> {
         return child.id().context("it ended at once");
     }
     bail!("it ended before it was ready; what it said is above: {}", child.wait().await?)
-}
-
-/// Ends one that is of no use.
-async fn end(mut child: Child) {
-    if let Err(error) = child.kill().await {
-        tracing::warn!(%error, "a stop service that did not begin was not ended");
-    }
 }
 
 /// Says to a service manager that waits for it which process the service is from now on.

@@ -105,12 +105,19 @@ async fn a_disk_that_refuses_the_latch_stops_robots_all_the_same_and_holds_it_la
 async fn a_service_is_followed_only_when_its_disk_holds_all_that_it_knows() {
     let disk = Small::mount();
     let server = Server::start(&disk.path()).await;
-    assert!(server.service.may_be_followed().await);
     let filler = disk.fill();
-    // Each look is a record, and the audit has a block of 4 KiB that is not full at once.
-    eventually(async || (!server.service.may_be_followed().await).then_some(())).await;
+    // The audit has a block of 4 KiB that is not full at once.
+    let recorded = || fs::read_to_string(disk.path().join("audit.jsonl")).unwrap();
+    loop {
+        let engaged = server.engage(fleet()).await.unwrap();
+        if !recorded().contains(&id_of(&engaged)) {
+            break;
+        }
+    }
+    assert!(!server.service.is_followed().await);
+    assert!(server.engage(fleet()).await.is_ok(), "it goes on");
     fs::remove_file(filler).unwrap();
-    eventually(async || server.service.may_be_followed().await.then_some(())).await;
-    assert!(fs::read_to_string(disk.path().join("audit.jsonl")).unwrap().contains("FOLLOWED"));
+    eventually(async || server.service.is_followed().await.then_some(())).await;
+    assert!(recorded().contains("FOLLOWED"));
     server.end().await;
 }
