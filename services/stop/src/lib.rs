@@ -52,6 +52,8 @@ use tonic::service::Routes;
 
 /// Messages on their way to one watcher.
 const WATCH_MAX: usize = 4;
+/// So often in a row something may come between the disk's turn and the end of a service that is followed.
+const FOLLOW_TRIES: u32 = 100;
 /// Names of the files that others look at.
 const LATCH: &str = "latch";
 
@@ -249,18 +251,22 @@ impl StopService {
     /// goes on.
     pub async fn is_followed(&self) -> bool {
         let inner = &self.inner;
-        let version = lock(&inner.law).version();
-        let recorded = inner.disk.record(Note::own(inner.clock.now().wall, Action::Followed)).await;
-        if !recorded || !inner.disk.turn(version).await {
+        if !inner.disk.record(Note::own(inner.clock.now().wall, Action::Followed)).await {
             return false;
         }
-        // What came in between waits for the disk, and whoever asked for it for this service.
-        let _fan = lock(&inner.fan);
-        let is_kept = inner.disk.holds(lock(&inner.law).version());
-        if is_kept {
-            inner.shutdown.cancel();
+        // What comes in between waits for the disk, and whoever asked for it for this service.
+        for _ in 0..FOLLOW_TRIES {
+            let version = lock(&inner.law).version();
+            if !inner.disk.turn(version).await {
+                return false;
+            }
+            let _fan = lock(&inner.fan);
+            if inner.disk.holds(lock(&inner.law).version()) {
+                inner.shutdown.cancel();
+                return true;
+            }
         }
-        is_kept
+        false
     }
 
     /// When its lines have ended, so that its port may close.

@@ -2,7 +2,7 @@
 
 use crate::engine::fresh_store;
 use crate::secrets::{keep_keys, keep_secret, secret_part, told_by_log};
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use midshift::way::{Line, Way};
 use midshift_core::site::DEMO;
 use midshift_proto::identity::v1::CreateTokenRequest;
@@ -173,6 +173,8 @@ where
                 if let Some(value) = found? {
                     return Ok(value);
                 }
+                // A look that waits for nothing is never too late by itself.
+                ensure!(Instant::now() < end, "waited {limit:?} in vain for: {what}");
             }
             Err(_) => bail!("waited {limit:?} in vain for: {what}"),
         }

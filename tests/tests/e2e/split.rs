@@ -2,7 +2,7 @@
 
 use crate::factory::with_software;
 use crate::harness::{channel, folder, in_states, until};
-use crate::kill::{TASKS, all_over, at_work, judge, judge_journals, judge_ledgers, submit};
+use crate::kill::{TASKS, all_over, at_work, judge, judge_ledgers, submit};
 use crate::robots::Robots;
 use crate::rolled_out::{begin_rollout, call, done};
 use crate::rolling::{self, Rolling};
@@ -21,9 +21,6 @@ use std::time::Duration;
 
 /// Agents of a stack at work.
 pub const ROBOTS: usize = 20;
-/// Robots under launchers, and the tasks that they have while their software is replaced.
-const LAUNCHED: usize = 4;
-const TASKS_BESIDE: usize = 30;
 /// How many instead, in few processes on a free floor; a long run for `cargo xtask torture split`.
 const MANY: &str = "MIDSHIFT_SPLIT_ROBOTS";
 /// Processes that share them, and tasks for each.
@@ -217,14 +214,10 @@ async fn a_fleet_that_was_frozen_while_another_took_over_assigns_nothing_twice()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_roll_out_in_the_middle_of_a_shift_goes_on_while_processes_of_all_its_services_are_killed()
--> anyhow::Result<()> {
+async fn a_roll_out_goes_on_while_processes_that_plan_it_sign_it_and_hand_it_out_are_killed() -> anyhow::Result<()> {
     let dir = folder()?;
-    let site = text::parse(DEMO)?;
-    let (mut stack, robots, journals) = with_software(dir.path(), LAUNCHED).await?;
+    let (mut stack, robots, _) = with_software(dir.path(), 3).await?;
     let public = stack.public.to_string();
-    submit(stack.public, &site, 37, TASKS_BESIDE).await?;
-    at_work(stack.public, 1, &BTreeSet::new()).await?;
     let begin = |id: &str| {
         let quick = ["--soak", "0s", "--probation", "1s", "--exposure-tasks", "0"];
         done(&[&["rollout", "create", "--server", &public, id, "--waves", "1,rest"][..], &quick].concat())?;
@@ -253,7 +246,7 @@ async fn a_roll_out_in_the_middle_of_a_shift_goes_on_while_processes_of_all_its_
         robot.keeps("1.5.0").await?;
     }
     let most = most.map(AtomicU32::into_inner);
-    assert!(most[0] <= 1 && most[1] <= u32::try_from(LAUNCHED - 1)?, "{most:?}: more were out of work than their wave");
+    assert!(most[0] <= 1 && most[1] <= 2, "{most:?}: more were out of work than their wave");
     begin("walk-1.6.0-bad-at-start")?;
     until("one is permitted", LIMIT, async || {
         let seen = rolling::seen(stack.public, "walk-1.6.0-bad-at-start").await?;
@@ -276,6 +269,5 @@ async fn a_roll_out_in_the_middle_of_a_shift_goes_on_while_processes_of_all_its_
     }
     let ended = rolling::seen(stack.public, "walk-1.6.0-bad-at-start").await?.context("nobody answers")?;
     assert_eq!(ended.counts.attempted, 1, "it ends at its canary");
-    let tasks = all_over(stack.public, TASKS_BESIDE).await?;
-    judge_journals(&tasks, &BTreeSet::new(), &site, &journals)
+    Ok(())
 }
