@@ -216,7 +216,7 @@ async fn a_fleet_that_was_frozen_while_another_took_over_assigns_nothing_twice()
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_roll_out_goes_on_while_processes_that_plan_it_sign_it_and_hand_it_out_are_killed() -> anyhow::Result<()> {
     let dir = folder()?;
-    let (mut stack, robots, _) = with_software(dir.path(), 3).await?;
+    let (mut stack, robots) = with_software(dir.path(), 3).await?;
     let public = stack.public.to_string();
     let begin = |id: &str| {
         let quick = ["--soak", "0s", "--probation", "1s", "--exposure-tasks", "0"];
