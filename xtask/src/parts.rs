@@ -103,8 +103,7 @@ impl Part {
                 Ok(run::succeeds(lint.arg("lint").current_dir(workspace.root.join("proto")))?
                     && fixtures::breaks_nothing(workspace, tools)?)
             }
-            // Tests too: a build without them has other features, and everything would be compiled twice.
-            Self::Build => run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins", "--tests"])),
+            Self::Build => build(workspace),
             Self::Clients => {
                 let Some(tools) = tools else { return Ok(false) };
                 clients::build(workspace, &tools.python)
@@ -121,6 +120,11 @@ impl Part {
             Self::Compose => count.one(docker::test(workspace, &workspace.midshift())),
         }
     }
+}
+
+/// Builds the programs. Tests too: a build without them has other features, and everything would be compiled twice.
+pub fn build(workspace: &Workspace) -> Result<bool> {
+    run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins", "--tests"]))
 }
 
 /// `cargo test` of these targets, which hear where the programs are.

@@ -5,7 +5,7 @@
 //! power cuts and kills at calls, `BLESS` by tests with `golden` in their name.
 
 use crate::fetch_tools::Tools;
-use crate::parts::Count;
+use crate::parts::{self, Count};
 use crate::run;
 use crate::workspace::Workspace;
 use anyhow::{Result, ensure};
@@ -64,9 +64,10 @@ impl Sweep {
             Self::Simulation => simulated(workspace, "many_seeds_keep_every_law", from, seeds),
             Self::Stops => simulated(workspace, "stopped::in_cuts_and_kills", from, seeds),
             Self::Split => split(workspace, seeds),
-            Self::Updates => every_site(workspace, "midshift-agent", "agent", "power::"),
-            Self::Latch => Ok(every_site(workspace, "midshift-stop", "stop", "killed::")?
-                && every_site(workspace, "midshift-agent", "agent", "stop_cuts::")?),
+            Self::Updates => every_site(workspace, "agent", "power::"),
+            Self::Latch => {
+                Ok(every_site(workspace, "stop", "killed::")? && every_site(workspace, "agent", "stop_cuts::")?)
+            }
         }
     }
 }
@@ -90,13 +91,13 @@ fn first_seed(sweeps: &[Sweep], from: Option<u64>) -> Result<u64> {
 }
 
 /// Tests that cut a process off at its calls: at every one.
-fn every_site(workspace: &Workspace, package: &str, target: &str, filter: &str) -> Result<bool> {
-    let arguments = ["test", "--package", package, "--test", target, "--", filter, "--nocapture"];
-    counted(workspace.cargo(&arguments).env("MIDSHIFT_SITES", "all"))
+fn every_site(workspace: &Workspace, target: &str, filter: &str) -> Result<bool> {
+    counted(test(workspace, target, filter).env("MIDSHIFT_SITES", "all"))
 }
 
+/// The workspace's one test program of this name.
 fn test(workspace: &Workspace, target: &str, filter: &str) -> Command {
-    workspace.cargo(&["test", "--package", "midshift-tests", "--test", target, "--", filter, "--nocapture"])
+    workspace.cargo(&["test", "--workspace", "--test", target, "--", filter, "--nocapture"])
 }
 
 fn simulated(workspace: &Workspace, filter: &str, from: u64, seeds: u64) -> Result<bool> {
@@ -106,7 +107,7 @@ fn simulated(workspace: &Workspace, filter: &str, from: u64, seeds: u64) -> Resu
 
 /// Real programs, once with each seed of `from .. from + seeds`. Ends at the first that breaks a law.
 fn each_seed(workspace: &Workspace, sweep: &str, filter: &str, from: u64, seeds: u64) -> Result<bool> {
-    ensure!(run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins"]))?, "the programs do not build");
+    ensure!(parts::build(workspace)?, "the programs do not build");
     for seed in from..from.saturating_add(seeds) {
         let mut command = test(workspace, "e2e", filter);
         workspace.export_programs(&mut command)?;
@@ -121,7 +122,7 @@ fn each_seed(workspace: &Workspace, sweep: &str, filter: &str, from: u64, seeds:
 
 /// As often as `seeds` says: chance is the machine's.
 fn split(workspace: &Workspace, seeds: u64) -> Result<bool> {
-    ensure!(run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins"]))?, "the programs do not build");
+    ensure!(parts::build(workspace)?, "the programs do not build");
     let tools = Tools::find(workspace)?;
     for _ in 0..seeds {
         let mut command = test(workspace, "e2e", "split::tasks_go_on");
@@ -136,7 +137,7 @@ fn split(workspace: &Workspace, seeds: u64) -> Result<bool> {
 
 /// Runs the tests that hold golden files and lets them write what they see.
 pub fn golden(workspace: &Workspace) -> Result<bool> {
-    ensure!(run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins"]))?, "the programs do not build");
+    ensure!(parts::build(workspace)?, "the programs do not build");
     let mut command = workspace.cargo(&["test", "--workspace", "--tests", "--", "golden"]);
     workspace.export_programs(&mut command)?;
     let passed = counted(command.env("BLESS", "1"))?;

@@ -2,7 +2,7 @@
 //!
 //! Invariant: level-triggered. It may be called at any moment and any number of times; what it decides is written down before it is done.
 
-use super::{Done, Failure, Job, SoftwareRow, Update, migrate};
+use super::{Done, Failure, Job, SoftwareRow, Update, again, migrate};
 use crate::core::{AgentCore, ExitReason, Output};
 use crate::sets::{Holdings, Wanted};
 use crate::store::Op;
@@ -20,8 +20,6 @@ use midshift_core::update::{DesiredUpdate, Goal, UpdateEvent, UpdateState};
 use midshift_core::work::RobotEvent;
 use std::collections::BTreeSet;
 
-/// First and longest pause after a job that may work the next time.
-const PAUSE: (LinkDuration, LinkDuration) = (LinkDuration(1_000), LinkDuration(60_000));
 /// A grant that did not come is asked for again after this.
 const ASK_AGAIN: LinkDuration = LinkDuration(10_000);
 /// A set on probation that does not reach its server for so long is gone back from.
@@ -166,9 +164,9 @@ impl AgentCore {
 
     fn put_off(&mut self, now: &Now, job: &Job, why: &str) {
         let failures = self.update.pause.map_or(0, |(_, failures)| failures) + 1;
-        let pause = PAUSE.0.as_ms().saturating_mul(1 << (failures - 1).min(6)).min(PAUSE.1.as_ms());
-        tracing::info!(robot_id = %self.config.robot_id, job = job.as_str(), why, pause_ms = pause, "update is put off");
-        self.update.pause = Some((now.link + LinkDuration(pause), failures));
+        let pause = again::pause(&self.config.robot_id, failures);
+        tracing::info!(robot_id = %self.config.robot_id, job = job.as_str(), why, pause_ms = pause.as_ms(), "update is put off");
+        self.update.pause = Some((now.link + pause, failures));
         if let Job::Migrate { due, .. } = job {
             self.not_migrated(due, why);
         }

@@ -7,7 +7,7 @@ use crate::room::LIMIT;
 use crate::stack::Stack;
 use midshift_core::site::DEMO;
 use std::net::SocketAddr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Robots of a factory.
 const ROBOTS: usize = 4;
@@ -34,19 +34,20 @@ impl Factory {
 
     /// The same services as processes of their own, with the sample releases.
     pub async fn split(dir: &Path) -> anyhow::Result<Self> {
-        let split = with_software(dir, ROBOTS).await?;
-        Ok(Self { address: split.0.public, _one_box: None, _split: Some(split) })
+        let (stack, robots, _) = with_software(dir, ROBOTS).await?;
+        Ok(Self { address: stack.public, _one_box: None, _split: Some((stack, robots)) })
     }
 }
 
-/// A split stack that every process of knows the sample releases, with robots under launchers, `rbt-01` and so on, that believe who signed them.
-pub async fn with_software(dir: &Path, robots: usize) -> anyhow::Result<(Stack, Vec<Robot>)> {
+/// A split stack that every process of knows the sample releases, with robots under launchers, `rbt-01` and so on, that believe who signed them, and the journals
+/// of their bodies.
+pub async fn with_software(dir: &Path, robots: usize) -> anyhow::Result<(Stack, Vec<Robot>, Vec<PathBuf>)> {
     let samples = dir.join("samples");
     let keys = samples.join("keys").display().to_string();
     done(&["bundle", "samples", &samples.display().to_string()])?;
     let stack = Stack::start(dir, DEMO, &[], &["--ota-keys", &keys]).await?;
     let doors = Doors { people: stack.public, robots: stack.robots, stops: None };
-    let (launched, _) = fleet(dir, &doors, &samples, robots).await?;
+    let (launched, journals) = fleet(dir, &doors, &samples, robots).await?;
     let public = stack.public.to_string();
     // Rows of a release are its leader's, a moment after it was published.
     until("the release is known to whoever is asked", LIMIT, async || {
@@ -55,5 +56,5 @@ pub async fn with_software(dir: &Path, robots: usize) -> anyhow::Result<(Stack, 
         Ok(listed.iter().all(|l| String::from_utf8_lossy(&l.stdout).contains("1.5.1")).then_some(()))
     })
     .await?;
-    Ok((stack, launched))
+    Ok((stack, launched, journals))
 }

@@ -51,3 +51,4 @@ mod story;
 mod swarm_software;
 mod tuf;
 mod unheard;
+mod watched;

@@ -16,6 +16,7 @@ use midshift_proto::ota::v1::{GetRolloutRequest, RolloutCounts};
 use midshift_sim::journal::{self, Effect};
 use midshift_store::{PostgresConfig, PostgresStore, Store};
 use std::collections::BTreeMap;
+use std::fmt::{Display, Formatter};
 use std::net::SocketAddr;
 use std::path::Path;
 use std::time::Duration;
@@ -68,6 +69,13 @@ pub struct Rolling {
     enough: CancellationToken,
 }
 
+impl Display for Seen {
+    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
+        let (attempted, kept) = (self.counts.attempted, self.counts.committed);
+        write!(f, "wave {}, {} asked, {attempted} permitted, {kept} keep it", self.wave, self.in_flight)
+    }
+}
+
 impl Rolling {
     /// Pushes the releases of `samples`, and begins with this one.
     pub async fn begin(stack: &Stack, samples: &Path, id: &'static str, robots: usize) -> anyhow::Result<Self> {
@@ -85,8 +93,7 @@ impl Rolling {
     pub async fn stands(&self) -> anyhow::Result<String> {
         ensure!(!self.looking.is_finished(), "{}: nobody looks at it any more", self.id);
         let Some(seen) = seen(self.public, self.id).await? else { return Ok("nobody says".to_owned()) };
-        let (in_flight, kept) = (seen.in_flight, seen.counts.committed);
-        Ok(format!("    {}: wave {}, {in_flight} asked, {kept} of {} keep it", self.id, seen.wave, self.robots))
+        Ok(format!("    {}, of {} robots: {seen}", self.id, self.robots))
     }
 
     /// Waits for its end with this exit code of `rollout wait`; how far it came. More robots asked than its wave has is an error.

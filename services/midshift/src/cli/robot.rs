@@ -1,6 +1,6 @@
 //! `midshift robot …`
 
-use super::client::{Call, Change, Exit, ended, unary};
+use super::client::{Call, Change, Exit, ended, follow, unary};
 use super::enrol;
 use super::out::{Format, Out, plain};
 use super::rollout;
@@ -11,6 +11,7 @@ use midshift_proto::json;
 use midshift_proto::link::v1 as link;
 use midshift_proto::ota::v1 as ota;
 use midshift_proto::telemetry::v1;
+use std::ops::ControlFlow;
 use std::time::Duration;
 
 /// Verbs of robots.
@@ -413,15 +414,22 @@ fn both(robot: &v1::Robot, control: &fleet::RobotControl) -> anyhow::Result<serd
 async fn watch(call: &Call, robot_ids: Vec<String>, period: Duration, out: &Out) -> Result<(), Exit> {
     let filter = v1::RobotFilter { robot_ids, ..v1::RobotFilter::default() };
     let period_ms = u32::try_from(period.as_millis()).unwrap_or(u32::MAX);
-    let request = v1::WatchRobotsRequest { filter: Some(filter), period_ms };
-    let mut stream = call.telemetry().await?.watch_robots(request).await?.into_inner();
-    while let Some(message) = stream.message().await? {
-        match out.format {
-            Format::Json | Format::Jsonl => out.json(&message)?,
-            Format::Table | Format::Name => message.robots.iter().for_each(|r| out.line(row(r).join("  ").trim_end())),
+    let open = async || {
+        let request = v1::WatchRobotsRequest { filter: Some(filter.clone()), period_ms };
+        Ok(call.telemetry().await?.watch_robots(request).await?.into_inner())
+    };
+    let take = |message: Option<v1::WatchRobotsResponse>| {
+        if let Some(message) = message {
+            match out.format {
+                Format::Json | Format::Jsonl => out.json(&message)?,
+                Format::Table | Format::Name => {
+                    message.robots.iter().for_each(|r| out.line(row(r).join("  ").trim_end()));
+                }
+            }
         }
-    }
-    Ok(())
+        Ok(ControlFlow::Continue(()))
+    };
+    follow(out, open, take).await
 }
 
 async fn explain(one: &One, out: &Out) -> Result<(), Exit> {

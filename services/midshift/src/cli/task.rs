@@ -1,6 +1,6 @@
 //! `midshift task …`
 
-use super::client::{Call, Change, Exit, unary};
+use super::client::{self, Call, Change, Exit, unary};
 use super::out::{Format, Out, plain};
 use crate::background::{read_list, request};
 use crate::site_file;
@@ -8,6 +8,7 @@ use clap::{Subcommand, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};
 use midshift_core::task::forms::Transport;
 use midshift_proto::task::v1::{self, watch_tasks_response::Item};
+use std::cell::RefCell;
 use std::io::IsTerminal;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
@@ -537,30 +538,34 @@ async fn explain(one: &One, out: &Out) -> Result<(), Exit> {
 
 async fn watch(call: &Call, task_ids: Vec<String>, cursor: String, out: &Out) -> Result<(), Exit> {
     let filter = v1::TaskFilter { task_ids, ..v1::TaskFilter::default() };
-    let mut stream =
-        call.task().await?.watch_tasks(v1::WatchTasksRequest { filter: Some(filter), cursor }).await?.into_inner();
-    while let Some(message) = stream.message().await? {
-        match out.format {
-            Format::Json | Format::Jsonl => out.json(&message)?,
-            Format::Table | Format::Name => {
-                let task = match &message.item {
-                    Some(Item::Existing(task)) => task,
-                    Some(Item::Change(change)) => match &change.task {
-                        Some(task) => task,
-                        None => continue,
-                    },
-                    _ => continue,
-                };
-                out.line(&format!(
-                    "{}  {:<14}  {:<8}  {}  {}",
-                    task.task_id,
-                    state(task),
-                    task.robot_id,
-                    way(task),
-                    reason(task)
-                ));
-            }
+    // A stream that was cut goes on behind what it said last.
+    let said = RefCell::new(cursor);
+    let open = async || {
+        let request = v1::WatchTasksRequest { filter: Some(filter.clone()), cursor: said.borrow().clone() };
+        Ok(call.task().await?.watch_tasks(request).await?.into_inner())
+    };
+    let take = |message: Option<v1::WatchTasksResponse>| {
+        if let Some(message) = message {
+            show_change(&message, out)?;
+            said.replace(message.cursor);
         }
+        Ok(ControlFlow::Continue(()))
+    };
+    client::follow(out, open, take).await
+}
+
+fn show_change(message: &v1::WatchTasksResponse, out: &Out) -> Result<(), Exit> {
+    if matches!(out.format, Format::Json | Format::Jsonl) {
+        return Ok(out.json(message)?);
+    }
+    let task = match &message.item {
+        Some(Item::Existing(task)) => Some(task),
+        Some(Item::Change(change)) => change.task.as_ref(),
+        Some(Item::Bookmark(_)) | None => None,
+    };
+    if let Some(task) = task {
+        let (state, way, reason) = (state(task), way(task), reason(task));
+        out.line(&format!("{}  {state:<14}  {:<8}  {way}  {reason}", task.task_id, task.robot_id));
     }
     Ok(())
 }
@@ -623,5 +628,5 @@ async fn until_over(call: &Call, task_id: &str, mut told: String, out: &Out) -> 
         let is_over = matches!(task.state(), Succeeded | Failed | Canceled | Expired | NeedsOperator);
         Ok(if is_over { ControlFlow::Break(task) } else { ControlFlow::Continue(()) })
     };
-    super::client::follow(out, open, take).await
+    client::follow(out, open, take).await
 }
