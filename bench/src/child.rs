@@ -227,7 +227,7 @@ fn take_core(number: usize) -> anyhow::Result<()> {
 
 /// Sum of the lines of a counter in this process' metrics.
 fn metric(name: &str) -> u64 {
-    let text = midshift::server::metrics_handle().map(|m| m.render()).unwrap_or_default();
+    let text = midshift::recorder::handle().map(|m| m.render()).unwrap_or_default();
     let lines = text.lines().filter(|l| l.starts_with(name));
     lines.filter_map(|l| l.rsplit(' ').next()?.parse::<f64>().ok()).sum::<f64>() as u64
 }

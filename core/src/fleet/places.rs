@@ -176,7 +176,7 @@ struct Traffic {
 
 impl Traffic {
     fn of(view: &View) -> Self {
-        let mut traffic = Self { blocked: super::stops::closed(view), ..Self::default() };
+        let mut traffic = Self { blocked: super::stopped::closed(view), ..Self::default() };
         let standing = view.site.places().iter().filter(|p| p.waypoint().is_some());
         for place in standing {
             let Some(row) = view.places.get(place.place_id.as_str()).map(|p| &p.row) else { continue };

@@ -31,7 +31,7 @@ pub fn robot(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> Resul
         Presence::Offline | Presence::Updating => return Err(Code::RobotOffline.into()),
     }
     let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
-    super::stops::screen(view, robot_id, Some(live))?;
+    super::stopped::screen(view, robot_id, Some(live))?;
     decided_by_people(view, robot_id, Some(live))?;
     reported(live)?;
     match view.authority.get(robot_id.as_str()).map(|a| &a.row.holder) {

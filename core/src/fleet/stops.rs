@@ -5,14 +5,12 @@
 
 use super::inbox::{holds_changed, touch};
 use super::rows::{HoldToken, RobotControl};
+use super::stopped::over;
 use super::view::View;
 use super::{Board, Plan, Tx, heard};
 use crate::ids::{RobotId, StopId};
 use crate::limits;
-use crate::reason::{Code, Reason};
-use crate::robot::{Presence, StopLevel};
-use crate::site::{PlaceIx, Site};
-use crate::stop::{Scope, Stop};
+use crate::robot::Presence;
 use crate::time::Now;
 use crate::work::Live;
 use std::collections::{BTreeMap, BTreeSet};
@@ -39,47 +37,6 @@ impl Hold {
         let (id, hold) = stop.or_else(|| token.strip_prefix("resume:").map(|id| (id, Self::Resume)))?;
         Some((StopId::parse(id).ok()?, hold))
     }
-}
-
-/// Stops that stand robots, as they were copied.
-fn standing(view: &View) -> impl Iterator<Item = &Stop> {
-    let effective = view.stops.values().map(|s| &s.row).filter(|record| record.is_effective());
-    effective.map(|record| &record.stop).filter(|stop| stop.level >= StopLevel::Halt)
-}
-
-/// Of these, whom a robot lies inside of.
-fn over<'v>(view: &'v View, robot_id: &'v RobotId, live: Option<&'v Live>) -> impl Iterator<Item = &'v Stop> {
-    let pose = live.and_then(|live| live.report.vitals.pose.as_ref());
-    standing(view).filter(move |stop| stop.includes(robot_id, pose))
-}
-
-/// Whether a stop keeps work from the robot, also before its token is written.
-pub(super) fn screen(view: &View, robot_id: &RobotId, live: Option<&Live>) -> Result<(), Reason> {
-    match over(view, robot_id, live).next() {
-        Some(stop) => Err(Reason::from(Code::StopEngaged).with("stop_id", &stop.stop_id).with("scope", &stop.scope)),
-        None => Ok(()),
-    }
-}
-
-/// Places that lie inside of a stop of a part of the site: nobody is let into them.
-pub(super) fn closed(view: &View) -> BTreeSet<PlaceIx> {
-    let site: &Site = &view.site;
-    let mut closed = BTreeSet::new();
-    for stop in standing(view) {
-        match &stop.scope {
-            Scope::Zone(place_id) => closed.extend(site.find_place(place_id)),
-            Scope::Area(area_id) => {
-                let area = site.find_area(area_id);
-                let places = (0..site.places().len() as u32).map(PlaceIx);
-                closed.extend(places.filter(|ix| {
-                    let at = site.place(*ix).waypoint();
-                    at.is_some_and(|at| Some(site.waypoint(at).area) == area)
-                }));
-            }
-            Scope::Robot(_) | Scope::Fleet => {}
-        }
-    }
-    closed
 }
 
 /// Puts right the tokens of every robot that a stop or its own report concerns.

@@ -11,7 +11,7 @@ use crate::work::{RoutePoint, StepKind, WorkStep};
 pub fn closed(view: &View) -> Blocked {
     let quarantined = view.places.values().filter(|p| p.row.quarantine.is_some());
     let quarantined = quarantined.filter_map(|p| view.site.find_place(&p.row.place_id));
-    Blocked::new(quarantined.chain(super::stops::closed(view)))
+    Blocked::new(quarantined.chain(super::stopped::closed(view)))
 }
 
 /// Goals of the goto steps from `from_step` on, with their step numbers.

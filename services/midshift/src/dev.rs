@@ -5,12 +5,13 @@ use crate::planning::Planning;
 use crate::report::{self, Inputs, Kind, Report};
 use crate::roles::Roles;
 use crate::scenario::{self, Release, Scenario, Sight, Stage, Story};
+use crate::serve::{self, Say};
 use crate::server::{Naive, Parts, Server};
 use crate::stop::{self, Beside};
 use crate::tally::{self, SharedTasks, Tasks};
 use crate::throwaway::Throwaway;
 use crate::under_way::{self, UnderWay};
-use crate::{clock, door, resuming, serve, site_file};
+use crate::{clock, door, resuming, site_file};
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 use midshift_agent::trust::Trust;
@@ -136,9 +137,6 @@ const WATCHED: std::ops::RangeInclusive<Duration> = Duration::from_secs(1)..=Dur
 /// Where `dev` hears beacons if nobody else does.
 const BEACONS: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 7422);
 
-/// Where `dev` talks to a person.
-pub type Say<'a> = &'a (dyn Fn(&str) + Sync);
-
 /// Runs until `stop`, Ctrl-C's token, or the end of `--for`. The report is of the whole run.
 pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Result<Report> {
     if !args.listen.ip().is_loopback() {
@@ -165,7 +163,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     let site = loaded.site.clone();
     // Journals of several processes are judged by one clock, so a story's is real and its bodies are fast.
     let clock = clock::clock(if scene.is_some() { 1000 } else { (args.speedup * 1000.0) as u32 });
-    crate::server::metrics_handle();
+    crate::recorder::handle();
     let hall_config = hall_config(&args, &site, scene.as_ref())?;
     let hall = Arc::new(Hall::open(&hall_config, &clock.now())?);
     let listener = TcpListener::bind(args.listen)

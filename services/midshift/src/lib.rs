@@ -12,7 +12,10 @@ pub mod door;
 pub mod duration;
 pub mod logs;
 pub mod machines;
+
+pub mod parts;
 pub mod planning;
+pub mod recorder;
 pub mod report;
 mod resuming;
 pub mod robots;

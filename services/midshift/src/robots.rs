@@ -3,7 +3,7 @@
 use crate::door;
 use crate::machines::Machines;
 use crate::software::{self, Software};
-use crate::way::Way;
+use crate::way::{Way, with_scheme};
 use crate::{clock, site_file, stop};
 use anyhow::{Context, bail};
 use midshift_agent::bulk::Bulk;
@@ -185,15 +185,6 @@ fn part(text: &str) -> Result<(usize, usize), String> {
     let (from, to) = text.split_once("..").ok_or_else(bad)?;
     let (from, to): (usize, usize) = (from.parse().map_err(|_| bad())?, to.parse().map_err(|_| bad())?);
     if from == 0 || to <= from { Err(bad()) } else { Ok((from - 1, to - 1)) }
-}
-
-/// The address with its scheme, for plain text.
-pub fn uri(server: &str) -> String {
-    with_scheme("http", server)
-}
-
-fn with_scheme(scheme: &str, server: &str) -> String {
-    if server.contains("://") { server.to_owned() } else { format!("{scheme}://{server}") }
 }
 
 /// Runs one agent until `stop`. Fenced twice is an error: another machine has this robot's name.

@@ -1,7 +1,6 @@
 //! `midshift serve`: everything persistent, for a real site: in one process on SQLite or PostgreSQL, or some of the services in each of several
 //! processes on one PostgreSQL database.
 
-use crate::dev::Say;
 use crate::door::{self, Share};
 use crate::planning::Planning;
 use crate::roles::{Role, Roles};
@@ -152,6 +151,9 @@ impl Serve {
     }
 }
 
+/// Where a program that runs talks to a person.
+pub type Say<'a> = &'a (dyn Fn(&str) + Sync);
+
 /// Runs until `shutdown`. The first token of a site is said, and nothing else.
 pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow::Result<()> {
     if args.insecure {
@@ -177,7 +179,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         tracing::warn!(warning, "site");
     }
     let clock = clock::clock(1000);
-    crate::server::metrics_handle();
+    crate::recorder::handle();
     let site_id = loaded.site.site_id().clone();
     let storage = args.database.open(&args.data, site_id, clock.clone()).await?;
     let folder = args.data.join("ota");

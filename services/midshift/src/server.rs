@@ -5,32 +5,27 @@
 //! whole server with it: none is served without the others. A gateway among several first says that it is not ready and lets its robots
 //! move over.
 
-use crate::denials;
 use crate::door::{self, Login};
-use crate::roles::{Role, Roles};
+pub use crate::parts::{Naive, Parts};
+use crate::roles::Role;
 use crate::stop_follower::StopFollower;
 use crate::upkeep;
+use crate::{denials, recorder};
 use anyhow::{Context, bail};
 use axum::routing::get;
 use http::StatusCode;
-use metrics_exporter_prometheus::{PrometheusBuilder, PrometheusHandle};
 use midshift_core::limits;
-use midshift_core::site::Site;
-use midshift_core::time::Clock;
 use midshift_core::work::Live;
 use midshift_edge::{Denials, Listen};
 use midshift_fleet::{FleetService, Reconciler};
-use midshift_identity::IdentityService;
 use midshift_identity::audit::AuditService;
 use midshift_ota::rollouts::{Planner, RolloutService};
-use midshift_ota::{OtaReader, OtaService};
 use midshift_proto::sim::v1::sim_service_server::{self, SimServiceServer};
 use midshift_sim::service::SimFace;
-use midshift_store::{FrameLog, HeardLog, LiveBoard, Store};
+use midshift_store::LiveBoard;
 use midshift_task::TaskService;
 use midshift_telemetry::TelemetryService;
 use std::collections::BTreeSet;
-use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 use tokio::net::UdpSocket;
@@ -41,53 +36,6 @@ use tonic::service::Routes;
 use tonic_health::ServingStatus;
 use tonic_health::pb::health_server;
 use tonic_health::server::HealthReporter;
-
-/// Naive rules of the services, for twins of tests. None by default.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Naive {
-    /// Of the link.
-    pub telemetry: midshift_telemetry::Bugs,
-    /// Of fleet.
-    pub fleet: midshift_core::fleet::bugs::Bugs,
-    /// Of roll-outs.
-    pub rollouts: midshift_core::rollout::bugs::Bugs,
-}
-
-/// What a server is built from.
-pub struct Parts {
-    /// Which services it has.
-    pub roles: Roles,
-    /// How long robots have to move to another gateway before this one ends; zero: there is no other.
-    pub drain: Duration,
-    /// The memory that services share.
-    pub store: Arc<dyn Store>,
-    /// Where STATUS is kept.
-    pub frames: Arc<dyn FrameLog>,
-    /// Where several processes share newest heartbeats, if the store is one for several.
-    pub heard: Option<Arc<dyn HeardLog>>,
-    /// The site.
-    pub site: Arc<Site>,
-    /// Its text.
-    pub site_text: String,
-    /// Clocks.
-    pub clock: Arc<dyn Clock>,
-    /// Software of robots, of a process with role ota.
-    pub ota: OtaService,
-    /// Software of robots, of a gateway beside such processes.
-    pub reader: Option<OtaReader>,
-    /// The simulator's face, if bodies live in this process.
-    pub sim: Option<SimFace>,
-    /// Naive rules for twins of tests; none outside them.
-    pub naive: Naive,
-    /// Where the stop service beside this process keeps its files, if there is one.
-    pub stops: Option<PathBuf>,
-    /// Who is who, with TLS; none: no login, plain text.
-    pub identity: Option<IdentityService>,
-    /// Limits of the port.
-    pub port: midshift_edge::Config,
-    /// Where fleet plans; see [`crate::planning`].
-    pub planning: tokio::runtime::Handle,
-}
 
 /// The services of one process, ready to be served.
 pub struct Server {
@@ -104,12 +52,6 @@ pub struct Server {
     shutdown: CancellationToken,
     /// Whether more work may be sent here.
     ready: Arc<watch::Sender<bool>>,
-}
-
-/// The one recorder of metrics of this process.
-pub fn metrics_handle() -> Option<PrometheusHandle> {
-    static HANDLE: OnceLock<Option<PrometheusHandle>> = OnceLock::new();
-    HANDLE.get_or_init(|| PrometheusBuilder::new().install_recorder().ok()).clone()
 }
 
 impl Server {
@@ -233,7 +175,7 @@ impl Server {
             let face: SimServiceServer<SimFace> = sim.server();
             routes.add_service(face);
         }
-        let handle = metrics_handle();
+        let handle = recorder::handle();
         let metrics = move || {
             let handle = handle.clone();
             async move { handle.map(|h| h.render()).unwrap_or_default() }
@@ -474,7 +416,9 @@ mod frames;
 mod tests {
     use super::*;
     use crate::planning::Planning;
+    use crate::roles::Roles;
     use crate::{clock, site_file};
+    use midshift_ota::OtaService;
     use midshift_store::{MemoryFrames, MemoryStore, StoreId};
     use tokio::net::TcpListener;
     use tokio::task::JoinHandle;

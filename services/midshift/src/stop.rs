@@ -1,16 +1,19 @@
 //! `midshift stop serve`: the stop service in a process of its own; in `dev` a thread of its own; beside `serve` on one box a process that outlives it.
 //!
 //! An operational stop request, not a safety function. Invariant: nothing of the store, the task queue or the business server lies on its way. Nothing here
-//! ends a running stop service: `serve` starts one where none is, and leaves it alone for ever. Rooms: `started` is that, `next` how one takes the place of another.
+//! ends a running stop service: `serve` starts one where none is, and leaves it alone for ever. Rooms: `started` is that, `next` how one takes the place of another,
+//! `program` which program both start.
 
 mod next;
+mod program;
 mod started;
 
+pub use program::FOLDER;
 pub use started::{LOG, Started};
 
 use crate::door::{self, Login, Share};
-use crate::robots::uri;
-use crate::{clock, server, site_file};
+use crate::way::uri;
+use crate::{clock, recorder, site_file};
 use anyhow::{Context, bail, ensure};
 use axum::routing::get;
 use midshift_core::site::Site;
@@ -18,6 +21,7 @@ use midshift_core::time::{Clock, LinkDuration, Utc};
 use midshift_edge::{Config, Denial, Denials};
 use midshift_identity::ServerProof;
 use midshift_stop::{Parts, Principals, StopService};
+use program::{LOOK_EVERY, UP_WITHIN};
 use std::net::SocketAddr;
 use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
@@ -33,11 +37,6 @@ use tonic::service::Routes;
 pub const PORT: u16 = 7421;
 /// As metrics and logs name it.
 const PORT_NAME: &str = "stop";
-/// The folder of its files below the data folder.
-pub const FOLDER: &str = "stop";
-/// A stop service that was started answers within this, or `serve` says that it did not.
-const UP_WITHIN: Duration = Duration::from_secs(10);
-const LOOK_EVERY: Duration = Duration::from_millis(100);
 /// How often one that follows looks whether the folder is free: nobody is answered meanwhile.
 const NEXT_EVERY: Duration = Duration::from_millis(10);
 /// Pings on a quiet connection of a watcher: one that is gone is found out twice as fast as on the business port.
@@ -94,7 +93,7 @@ pub async fn run(args: StopServe, shutdown: CancellationToken) -> anyhow::Result
     };
     let port = listener.as_fd().try_clone_to_owned()?;
     let folder = args.data.join(FOLDER);
-    server::metrics_handle();
+    recorder::handle();
     tracing::info!(address = %listener.local_addr()?, folder = %folder.display(), "midshift stop serves: an operational stop request, not a safety function");
     let clock = clock::clock(1000);
     let (config, login) = match args.insecure {
@@ -208,18 +207,6 @@ async fn known(folder: &Path, site: &Site, clock: &Arc<dyn Clock>) -> anyhow::Re
     Ok((login, told, followed))
 }
 
-/// This program as it was named when it was started, so that a link to another release leads there; else where it lies. Of one that was replaced on the disk the
-/// new one is started.
-fn program() -> anyhow::Result<PathBuf> {
-    let named = std::env::args_os().next().map(PathBuf::from);
-    if let Some(named) = named.filter(|named| named.is_absolute() && named.is_file()) {
-        return Ok(named);
-    }
-    let program = std::env::current_exe().context("finding this program")?;
-    let named = program.to_str().and_then(|name| name.strip_suffix(" (deleted)")).map(PathBuf::from);
-    Ok(named.filter(|named| named.is_file()).unwrap_or(program))
-}
-
 fn proof_of(principals: &Principals) -> ServerProof {
     let Principals { chain_pem, key_pem, authority_pem, .. } = principals.clone();
     ServerProof { chain_pem, key_pem, authority_pem }
@@ -230,7 +217,7 @@ async fn serve(
     (config, login): (Config, Option<Followed>),
     listener: TcpListener,
 ) -> anyhow::Result<()> {
-    let metrics = || async { server::metrics_handle().map(|handle| handle.render()).unwrap_or_default() };
+    let metrics = || async { recorder::handle().map(|handle| handle.render()).unwrap_or_default() };
     let pages = service.routes().await?.into_axum_router().layer(tonic_web::GrpcWebLayer::new());
     let routes = Routes::from(pages.route("/metrics", get(metrics)));
     let config = Config { keepalive_every: KEEPALIVE_EVERY, ..config };
@@ -288,7 +275,7 @@ impl Beside {
         let work = move || {
             let served = runtime.block_on(async {
                 let listener = TcpListener::from_std(listener)?;
-                server::metrics_handle();
+                recorder::handle();
                 let service = StopService::open(Parts { folder, site: Some(site), clock }, stop)?;
                 serve(service, (door::alone(PORT_NAME), None), listener).await
             });

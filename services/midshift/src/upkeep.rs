@@ -4,8 +4,9 @@
 
 mod oldest;
 
+use crate::parts::Parts;
+use crate::recorder;
 use crate::roles::Role;
-use crate::server::{Parts, metrics_handle};
 use metrics_exporter_prometheus::PrometheusHandle;
 use midshift_core::fleet::rows::FleetMark;
 use midshift_core::privacy::{self, Retention};
@@ -27,7 +28,7 @@ const ENTRIES_MAX: u64 = 20_000_000;
 
 /// Until it is dropped.
 pub async fn run(parts: &Parts, task: Option<TaskService>) {
-    tokio::join!(prune(parts, task), fold(metrics_handle()), keep_audit(parts));
+    tokio::join!(prune(parts, task), fold(recorder::handle()), keep_audit(parts));
 }
 
 /// Folds samples of histograms, whether or not anybody scrapes.

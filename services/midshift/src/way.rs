@@ -2,7 +2,6 @@
 //!
 //! Invariant: a token is sent over TLS alone, and never printed: nothing here has a Debug that shows it.
 
-use crate::robots::uri;
 use anyhow::Context;
 use midshift_agent::dial::{Dial, TcpDial, Wire};
 use midshift_agent::tls::{self, Tls};
@@ -16,6 +15,19 @@ use tonic::{Request, Status};
 
 /// A server that does not answer a connection within this is not there.
 const CONNECT_WITHIN: Duration = Duration::from_secs(3);
+/// A connection with a call under way on which nothing came for so long is asked for a sign of life, and is gone if none comes within [`ALIVE_WITHIN`].
+const QUIET: Duration = Duration::from_secs(30);
+const ALIVE_WITHIN: Duration = Duration::from_secs(20);
+
+/// The address with its scheme, for plain text.
+pub fn uri(server: &str) -> String {
+    with_scheme("http", server)
+}
+
+/// The address with this scheme, if it has none.
+pub fn with_scheme(scheme: &str, server: &str) -> String {
+    if server.contains("://") { server.to_owned() } else { format!("{scheme}://{server}") }
+}
 
 /// A channel that shows the token, if there is one.
 pub type Line = InterceptedService<Channel, Bearer>;
@@ -91,5 +103,6 @@ impl Way {
 
 fn dial(uri: &str) -> anyhow::Result<TcpDial> {
     let endpoint = Endpoint::from_shared(uri.to_owned()).with_context(|| format!("reading the address {uri}"))?;
-    Ok(TcpDial::over(endpoint.connect_timeout(CONNECT_WITHIN), None)?)
+    let endpoint = endpoint.connect_timeout(CONNECT_WITHIN);
+    Ok(TcpDial::over(endpoint.http2_keep_alive_interval(QUIET).keep_alive_timeout(ALIVE_WITHIN), None)?)
 }

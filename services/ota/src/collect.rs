@@ -5,7 +5,8 @@
 //! consists of, or that was not unnamed all through [`Room::unnamed_ms`] of serving time; nothing is published while files are taken
 //! away. There is no record of files beside the files: a cut leaves some of them, and the next pass goes on.
 
-use crate::content::{Content, Room, write_whole};
+use crate::content::{Content, Room};
+use crate::disk::write_whole;
 use crate::encodings::Encodings;
 use crate::repository::{Error, Repository};
 use crate::{blocking, content};

@@ -8,7 +8,8 @@ mod shared;
 pub use shared::is_worth_asking;
 
 use crate::blocking;
-use crate::content::{Content, Error, Reader, Wanted, sync_folder};
+use crate::content::{Content, Error, Reader, Wanted};
+use crate::disk::{at, sync_folder};
 use crate::folder::Gate;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding::{self, Base, Encoded};
@@ -104,11 +105,6 @@ struct Inner {
 #[derive(Clone)]
 pub struct Encodings {
     inner: Arc<Inner>,
-}
-
-fn at(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
-    let path = path.to_owned();
-    move |source| Error::Io { doing, path, source }
 }
 
 impl Shelf {

@@ -5,7 +5,7 @@
 //! a folder.
 
 use crate::blocking;
-use crate::content::{Error as Disk, sync_folder, write_whole};
+use crate::disk::{Error as Disk, at, sync_folder, write_whole};
 use midshift_core::limits;
 use midshift_store::StoreId;
 use rustix::fs::{FlockOperation, flock};
@@ -96,11 +96,6 @@ pub enum Error {
         /// The folder.
         folder: PathBuf,
     },
-}
-
-fn at(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Disk {
-    let path = path.to_owned();
-    move |source| Disk::Io { doing, path, source }
 }
 
 /// Makes a folder say that it belongs to this store, durable. The folder is made if it is not there. Blocks.

@@ -6,6 +6,7 @@
 
 mod collect;
 pub mod content;
+mod disk;
 pub mod encodings;
 #[cfg(test)]
 mod fixture;

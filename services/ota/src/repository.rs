@@ -9,7 +9,8 @@ mod documents;
 pub use documents::Documents;
 
 use crate::blocking;
-use crate::content::{self, Content, write_whole};
+use crate::content::{self, Content};
+use crate::disk::write_whole;
 use crate::folder::{self, Gate, Turn};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::freshness::{self, Edition, OnlineRole, Stamp, check_online, newest_targets, root_edition, stamp};

@@ -180,7 +180,7 @@ pub async fn submit(server: SocketAddr, site: &Site, seed: u64, count: usize) ->
     let items: Vec<SubmitTasksRequest> = (0..count)
         .map(|i| {
             let mut item = request(&workload.next_transport());
-            item.request_id = format!("kill-{i}");
+            item.request_id = format!("{seed}-{i}");
             SubmitTasksRequest { item: Some(item) }
         })
         .collect();

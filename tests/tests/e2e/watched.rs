@@ -52,10 +52,11 @@ async fn watches_of_the_command_line_go_on_after_the_server_was_killed_without_a
     }
     server.restart().await?;
     done(&["task", "cancel", "T1", "--reason", "not needed", "--server", &address])?;
-    says(&tasks, "T1", true).await?;
+    done(&["task", "submit", "--server", &address, "--task-id", "T3", "--from", "A01", "--to", "B03"])?;
+    says(&tasks, "T3", true).await?;
     says(&robots, "rbt-01", true).await?;
     let (early, late) = lines(&tasks, "T")?;
-    ensure!(early.len() == 2 && late.len() == 1, "each change once: {early:?} and then {late:?}");
-    ensure!(late[0].contains("CANCELED"), "{late:?}");
+    ensure!(early.len() == 2 && late.len() == 2, "each change once: {early:?} and then {late:?}");
+    ensure!(late[0].starts_with("T1") && late[0].contains("CANCELED"), "{late:?}");
     Ok(())
 }

@@ -228,7 +228,7 @@ fn many_seeds_keep_every_law() {
     let (broken, sums) = (broken.expect("no thread panics with it"), sums.expect("no thread panics with it"));
     assert!(
         broken.is_empty(),
-        "again: MIDSHIFT_SIM_SEED=N cargo test -p midshift-tests --test simulation one_seed; broken: {broken:?}"
+        "again: MIDSHIFT_SIM_SEED=N cargo test --workspace --test simulation one_seed; broken: {broken:?}"
     );
     sums.iter().for_each(|(name, n)| say(&format!("{n:>10} {name}")));
     let checks = sums.keys().filter_map(|name| name.strip_prefix("check "));

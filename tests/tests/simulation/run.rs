@@ -341,7 +341,7 @@ impl Shift {
 
 /// STATUS that the servers of this process took beside sessions, samples.
 fn replayed() -> u64 {
-    let metrics = midshift::server::metrics_handle().map(|handle| handle.render()).unwrap_or_default();
+    let metrics = midshift::recorder::handle().map(|handle| handle.render()).unwrap_or_default();
     let line = metrics.lines().find_map(|line| line.strip_prefix("midshift_telemetry_status_replayed_total "));
     line.and_then(|number| number.parse().ok()).unwrap_or(0)
 }

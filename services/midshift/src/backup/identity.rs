@@ -1,7 +1,7 @@
 //! The site's authority and the server's own key.
 
 use super::files::{copy, entries};
-use super::parts::{Making, Part, Said};
+use super::part::{Making, Part, Said};
 use super::{Places, blocking};
 use crate::serve::IDENTITY;
 use anyhow::ensure;

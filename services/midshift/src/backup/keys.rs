@@ -1,7 +1,7 @@
 //! Online keys.
 
 use super::files::{copy, entries};
-use super::parts::{KEYS, Making, Part, Said};
+use super::part::{KEYS, Making, Part, Said};
 use super::{Places, blocking};
 use anyhow::ensure;
 use async_trait::async_trait;

@@ -1,6 +1,6 @@
 //! A backup of a server on PostgreSQL has its rows and its releases, and becomes one store again or nothing.
 
-use super::parts::POSTGRES;
+use super::part::POSTGRES;
 use super::place::Place;
 use super::tests::{NOW, release, site};
 use super::{Places, back_up, name_all, restore, verify};

@@ -1,7 +1,7 @@
 //! Signed documents of releases, and their files.
 
 use super::files::{copy, copy_if_there, entries, must, read};
-use super::parts::{Making, Part, Said};
+use super::part::{Making, Part, Said};
 use super::{Places, blocking};
 use anyhow::ensure;
 use async_trait::async_trait;

@@ -1,7 +1,7 @@
 //! Rows and samples: two files of SQLite, or two schemas of PostgreSQL.
 
 use super::files::{must, write};
-use super::parts::{Making, POSTGRES, Part, Said};
+use super::part::{Making, POSTGRES, Part, Said};
 use super::{Places, blocking};
 use anyhow::{Context, bail};
 use async_trait::async_trait;

@@ -4,7 +4,7 @@
 //! have not heard of the reset; those that have do not obey it, and say so. It is reset by name once more. A stop that came later is brought back by robots, who keep it themselves, and taken from them because the key is the same.
 
 use super::files::{copy, copy_if_there, entries};
-use super::parts::{Making, Part, Said};
+use super::part::{Making, Part, Said};
 use super::{Places, blocking};
 use crate::stop::{FOLDER, LOG};
 use anyhow::{Context, ensure};

@@ -1,11 +1,11 @@
 //! Calls of the command line: which server, what an error means for a person and for the exit code.
 
-use crate::cli::context::Contexts;
+use super::contexts::{Contexts, Unknown};
 use crate::cli::out::Out;
 use crate::way::{Line, Way};
 use midshift_bundle::build;
 use midshift_bundle::folder::Error;
-use midshift_core::reason::{Kind, Refusal};
+use midshift_core::reason::{self, Kind, Refusal};
 use midshift_proto::convert::time_of;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::identity::v1::audit_service_client::AuditServiceClient;
@@ -25,6 +25,8 @@ use tonic_health::pb::health_client::HealthClient;
 
 /// Longest unary call.
 const CALL_WITHIN: Duration = Duration::from_secs(30);
+/// Exit code of a server that is not there.
+const NO_SERVER: u8 = 5;
 /// A server that is gone while something is followed may stay away so long.
 const AWAY_MAX: Duration = Duration::from_secs(600);
 /// Pauses between looks for it.
@@ -130,12 +132,33 @@ impl Resolved {
 pub struct Exit {
     code: u8,
     text: String,
+    remedy: Remedy,
+}
+
+/// What a program may do about an end that is not success.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Remedy {
+    /// Nothing: a person must.
+    None,
+    /// The same again later.
+    Later,
+    /// The same from the beginning: the server does not know any more where it was.
+    Anew,
 }
 
 impl Exit {
     /// With a code of the list in the README.
     pub fn new(code: u8, text: impl Into<String>) -> Self {
-        Self { code, text: text.into() }
+        let remedy = if code == NO_SERVER { Remedy::Later } else { Remedy::None };
+        Self { code, text: text.into(), remedy }
+    }
+    /// Nobody reads any more what is said: no fault, and nothing to say.
+    fn unread() -> Self {
+        Self::new(0, "")
+    }
+    /// The server does not know the place any more from which it was to go on.
+    pub fn is_of_a_lost_place(&self) -> bool {
+        self.remedy == Remedy::Anew
     }
     /// Bad arguments.
     pub fn usage(text: impl Into<String>) -> Self {
@@ -171,7 +194,9 @@ impl Exit {
     }
     /// Says why and gives the code.
     pub fn report(&self, out: &Out) -> ExitCode {
-        out.say(&format!("error: {}", self.text));
+        if self.code != 0 {
+            out.say(&format!("error: {}", self.text));
+        }
         ExitCode::from(self.code)
     }
 }
@@ -185,6 +210,12 @@ impl From<Error> for Exit {
             }
             other => Self::new(1, other.to_string()),
         }
+    }
+}
+
+impl From<Unknown> for Exit {
+    fn from(Unknown(name): Unknown) -> Self {
+        Self::new(4, format!("no context {name}\n  try: midshift context ls, or midshift login"))
     }
 }
 
@@ -223,7 +254,7 @@ impl From<Status> for Exit {
         let code = match status.code() {
             Code::InvalidArgument | Code::OutOfRange => 2,
             Code::NotFound => 4,
-            Code::Unavailable => 5,
+            Code::Unavailable => NO_SERVER,
             Code::PermissionDenied | Code::Unauthenticated => 6,
             Code::Aborted | Code::AlreadyExists | Code::FailedPrecondition => 9,
             Code::DeadlineExceeded => 10,
@@ -241,7 +272,12 @@ impl From<Status> for Exit {
         if let Some(help) = answer.help().filter(|help| answer.violations.is_empty() && !text.contains(*help)) {
             text += &format!("\n  try: {help}");
         }
-        Self::new(code, text)
+        let remedy = match answer.code {
+            Some(reason::Code::CursorExpired | reason::Code::CursorOfOtherStore) => Remedy::Anew,
+            _ if was_cut(&status) || status.code() == Code::ResourceExhausted => Remedy::Later,
+            _ => Remedy::None,
+        };
+        Self { code, text, remedy }
     }
 }
 
@@ -249,13 +285,14 @@ impl From<Status> for Exit {
 /// again what is known then. `take` is given nothing when the server ended the stream in order.
 ///
 /// # Errors
-/// What `open` says the first time; what `take` says; a refusal; a server that stays away longer than [`AWAY_MAX`].
+/// What `open` says the first time; what `take` says; a refusal; a server that stays away, or cuts each stream soon, for longer than [`AWAY_MAX`]; nobody reads what is said.
 pub async fn follow<T, B>(
     out: &Out,
     open: impl AsyncFn() -> Result<Streaming<T>, Exit>,
     mut take: impl FnMut(Option<T>) -> Result<ControlFlow<B>, Exit>,
 ) -> Result<B, Exit> {
     let mut stream = open().await?;
+    let mut away: Option<Away> = None;
     loop {
         let message = match stream.message().await {
             Ok(message) => message,
@@ -266,9 +303,15 @@ pub async fn follow<T, B>(
         if let ControlFlow::Break(end) = take(message)? {
             return Ok(end);
         }
+        if out.is_unread() {
+            return Err(Exit::unread());
+        }
         if is_cut {
-            out.say("the server ended the stream; waiting until it is back");
-            stream = again(&open).await?;
+            away = away.filter(|away| !away.is_over());
+            if away.is_none() {
+                out.say("the server ended the stream; waiting until it is back");
+            }
+            stream = away.get_or_insert_with(Away::begin).again(&open).await?;
         }
     }
 }
@@ -278,16 +321,41 @@ pub fn was_cut(status: &Status) -> bool {
     matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled | Code::Internal)
 }
 
-/// Opens a stream as soon as there is a server for it.
-async fn again<T>(open: &impl AsyncFn() -> Result<Streaming<T>, Exit>) -> Result<Streaming<T>, Exit> {
-    let begun = Instant::now();
-    let mut pause = PAUSE_MIN;
-    loop {
-        tokio::time::sleep(pause).await;
-        pause = (pause * 2).min(PAUSE_MAX);
-        match open().await {
-            Err(exit) if exit.code == 5 && begun.elapsed() < AWAY_MAX => {}
-            opened => return opened,
+/// A server that is gone while something is followed.
+struct Away {
+    begun: Instant,
+    /// Until it is asked again.
+    pause: Duration,
+    /// When it answered last.
+    answered: Option<Instant>,
+}
+
+impl Away {
+    fn begin() -> Self {
+        Self { begun: Instant::now(), pause: PAUSE_MIN, answered: None }
+    }
+
+    /// Its last stream went on for a while: a server that cuts each one soon is away all the same.
+    fn is_over(&self) -> bool {
+        self.answered.is_some_and(|at| at.elapsed() > PAUSE_MAX)
+    }
+
+    /// Opens a stream as soon as there is a server for it.
+    async fn again<T>(&mut self, open: &impl AsyncFn() -> Result<Streaming<T>, Exit>) -> Result<Streaming<T>, Exit> {
+        loop {
+            tokio::time::sleep(self.pause).await;
+            self.pause = (self.pause * 2).min(PAUSE_MAX);
+            match open().await {
+                Err(exit) if exit.remedy == Remedy::Later && self.begun.elapsed() < AWAY_MAX => {}
+                Ok(_) if self.begun.elapsed() >= AWAY_MAX => {
+                    let text = format!("the server has ended each stream at once for {AWAY_MAX:?}");
+                    return Err(Exit::new(NO_SERVER, text));
+                }
+                opened => {
+                    self.answered = Some(Instant::now());
+                    return opened;
+                }
+            }
         }
     }
 }
@@ -426,6 +494,54 @@ impl Change {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use tokio_stream::StreamExt;
+    use tonic::codec::{DecodeBuf, Decoder};
+
+    /// Streams without a message.
+    struct Nothing;
+
+    impl Decoder for Nothing {
+        type Item = ();
+        type Error = Status;
+        fn decode(&mut self, _: &mut DecodeBuf<'_>) -> Result<Option<()>, Status> {
+            Ok(None)
+        }
+    }
+
+    #[test]
+    fn what_may_pass_is_waited_for_and_a_lost_place_is_begun_anew() {
+        for code in [Code::Unavailable, Code::Unknown, Code::Internal, Code::Cancelled, Code::ResourceExhausted] {
+            assert_eq!(Exit::from(Status::new(code, "")).remedy, Remedy::Later, "{code:?}");
+        }
+        for code in [Code::PermissionDenied, Code::Unauthenticated, Code::InvalidArgument, Code::NotFound] {
+            assert_eq!(Exit::from(Status::new(code, "")).remedy, Remedy::None, "{code:?}");
+        }
+        for code in [reason::Code::CursorExpired, reason::Code::CursorOfOtherStore] {
+            let refusal = Refusal::new(Kind::Precondition, code);
+            assert!(Exit::from(midshift_proto::status(&refusal, None)).is_of_a_lost_place(), "{code:?}");
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_server_that_cuts_each_stream_at_once_is_given_up_and_one_that_goes_on_is_not() {
+        let out = Out::new(crate::cli::out::Format::Name);
+        for (lives, goes_on) in [(Duration::ZERO, false), (PAUSE_MAX * 2, true)] {
+            let open = async || {
+                let ends = tokio_stream::once(()).then(move |()| async move {
+                    tokio::time::sleep(lives).await;
+                    Ok::<_, Status>(axum::body::Bytes::new())
+                });
+                Ok(Streaming::new_empty(Nothing, axum::body::Body::from_stream(ends)))
+            };
+            let mut cuts = 0;
+            let end = follow(&out, open, |_: Option<()>| {
+                cuts += 1;
+                Ok(if cuts < 1_000 { ControlFlow::Continue(()) } else { ControlFlow::Break(()) })
+            });
+            assert_eq!(end.await.map_err(|exit| exit.code()), if goes_on { Ok(()) } else { Err(NO_SERVER) });
+            assert!(cuts > 10, "{cuts} streams");
+        }
+    }
 
     #[test]
     fn a_command_that_was_done_before_under_its_request_id_is_not_said_to_be_done_by_another_call() {

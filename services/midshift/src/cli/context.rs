@@ -1,8 +1,9 @@
-//! `midshift login`, `midshift context …`: which sites this person knows, and the token for each.
+//! `midshift login`, `midshift context …`: which sites this person knows, and who one is there.
 //!
-//! Invariant: the file is its owner's alone (0600), written whole or not at all; a token is never printed.
+//! Invariant: a token is never printed, and remembered only after it was shown to the site that its owner named.
 
 use super::client::{Call, Exit, unary};
+use super::contexts::{Context, Contexts, Unknown};
 use super::out::Out;
 use crate::way::Way;
 use anyhow::Context as _;
@@ -11,105 +12,8 @@ use midshift_agent::tls;
 use midshift_core::identity::Digest;
 use midshift_proto::identity::v1::WhoAmIRequest;
 use midshift_proto::identity::v1::identity_service_client::IdentityServiceClient;
-use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
-use std::io::{IsTerminal, Read, Write};
-use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
+use std::io::{IsTerminal, Read};
 use std::path::PathBuf;
-
-/// Where the file is, if not in the usual place.
-const FILE_VARIABLE: &str = "MIDSHIFT_CONTEXTS";
-
-/// What is known of one site.
-#[derive(Clone, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Context {
-    /// The server, host:port.
-    pub server: String,
-    /// The stop service, host:port, if it is not on port 7421 of the same host.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub stop_server: Option<String>,
-    /// The site's root, PEM.
-    pub authority_pem: String,
-    /// What is shown there.
-    pub token: String,
-}
-
-/// All of them.
-#[derive(Clone, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Contexts {
-    /// Which one is used if none is named.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub current: Option<String>,
-    /// By name.
-    #[serde(default)]
-    pub context: BTreeMap<String, Context>,
-}
-
-fn path() -> anyhow::Result<PathBuf> {
-    let set = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
-    if let Some(file) = set(FILE_VARIABLE) {
-        return Ok(file);
-    }
-    let folder = set("XDG_CONFIG_HOME").or_else(|| set("HOME").map(|home| home.join(".config")));
-    let folder =
-        folder.with_context(|| format!("neither HOME nor {FILE_VARIABLE} is set: where would sites be remembered?"))?;
-    Ok(folder.join("midshift/contexts.toml"))
-}
-
-impl Contexts {
-    /// As they were written; empty if there is no file.
-    ///
-    /// # Errors
-    /// The file cannot be read.
-    pub fn read() -> anyhow::Result<Self> {
-        let Ok(path) = path() else { return Ok(Self::default()) };
-        let doing = || format!("reading {}", path.display());
-        match std::fs::read_to_string(&path) {
-            Ok(text) => {
-                let found = std::fs::metadata(&path).with_context(doing)?;
-                // Said, and no more: somebody may have to stop a fleet by it.
-                if found.is_file() && found.permissions().mode() & 0o077 != 0 {
-                    tracing::warn!(path = %path.display(), "it has tokens and is open to others: chmod 600 it");
-                }
-                toml::from_str(&text).with_context(doing)
-            }
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(Self::default()),
-            Err(error) => Err(error).with_context(doing),
-        }
-    }
-
-    fn write(&self) -> anyhow::Result<()> {
-        let path = path()?;
-        let folder = path.parent().context("the file is in no folder")?;
-        std::fs::create_dir_all(folder).with_context(|| format!("making {}", folder.display()))?;
-        let new = path.with_extension("new");
-        let _ = std::fs::remove_file(&new);
-        let written = || -> std::io::Result<()> {
-            let mut file = std::fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(&new)?;
-            file.write_all(toml::to_string(self).map_err(std::io::Error::other)?.as_bytes())?;
-            file.sync_all()?;
-            std::fs::rename(&new, &path)
-        };
-        written().with_context(|| format!("writing {}", path.display()))
-    }
-
-    /// The one with this name, or the current one; none: nobody has signed in.
-    ///
-    /// # Errors
-    /// The name is not known.
-    pub fn pick(&self, name: Option<&str>) -> Result<Option<&Context>, Exit> {
-        match name.or(self.current.as_deref()) {
-            None => Ok(None),
-            Some(name) => self.context.get(name).map(Some).ok_or_else(|| unknown(name)),
-        }
-    }
-}
-
-fn unknown(name: &str) -> Exit {
-    Exit::new(4, format!("no context {name}\n  try: midshift context ls, or midshift login"))
-}
 
 /// `midshift login`.
 #[derive(Debug, Args)]
@@ -220,13 +124,13 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
         }
         Verb::Use { name } => {
             if !contexts.context.contains_key(&name) {
-                return Err(unknown(&name));
+                return Err(Unknown(name).into());
             }
             contexts.current = Some(name);
             Ok(contexts.write()?)
         }
         Verb::Rm { name } => {
-            contexts.context.remove(&name).ok_or_else(|| unknown(&name))?;
+            contexts.context.remove(&name).ok_or_else(|| Unknown(name.clone()))?;
             contexts.current = contexts.current.filter(|current| *current != name);
             Ok(contexts.write()?)
         }

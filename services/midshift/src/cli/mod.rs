@@ -7,6 +7,7 @@ mod bundle;
 mod certificate;
 mod client;
 mod context;
+mod contexts;
 mod doctor;
 mod enrol;
 mod explain;

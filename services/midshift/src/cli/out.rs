@@ -4,6 +4,7 @@ use clap::ValueEnum;
 use prost::{Message, Name};
 use std::borrow::Cow;
 use std::io::Write;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// How results are printed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -22,18 +23,25 @@ pub enum Format {
 pub struct Out {
     /// Asked for.
     pub format: Format,
+    unread: AtomicBool,
 }
 
 impl Out {
     /// Prints as asked.
     pub fn new(format: Format) -> Self {
-        Self { format }
+        Self { format, unread: AtomicBool::new(false) }
     }
     /// A line of data; for people without anything that their terminal would obey.
     pub fn line(&self, text: &str) {
         let text = if self.format == Format::Table { lines(text) } else { text.into() };
         // A reader that went away is no error of ours.
-        let _ = writeln!(std::io::stdout().lock(), "{text}");
+        if writeln!(std::io::stdout().lock(), "{text}").is_err() {
+            self.unread.store(true, Ordering::Relaxed);
+        }
+    }
+    /// Nobody has read the newest data: what only goes on for a reader may end.
+    pub fn is_unread(&self) -> bool {
+        self.unread.load(Ordering::Relaxed)
     }
     /// A word to the person.
     pub fn say(&self, text: &str) {

@@ -539,7 +539,7 @@ async fn explain(one: &One, out: &Out) -> Result<(), Exit> {
 async fn watch(call: &Call, task_ids: Vec<String>, cursor: String, out: &Out) -> Result<(), Exit> {
     let filter = v1::TaskFilter { task_ids, ..v1::TaskFilter::default() };
     // A stream that was cut goes on behind what it said last.
-    let said = RefCell::new(cursor);
+    let said = RefCell::new(cursor.clone());
     let open = async || {
         let request = v1::WatchTasksRequest { filter: Some(filter.clone()), cursor: said.borrow().clone() };
         Ok(call.task().await?.watch_tasks(request).await?.into_inner())
@@ -551,7 +551,16 @@ async fn watch(call: &Call, task_ids: Vec<String>, cursor: String, out: &Out) ->
         }
         Ok(ControlFlow::Continue(()))
     };
-    client::follow(out, open, take).await
+    loop {
+        match client::follow(out, &open, take).await {
+            // A place that the caller named is the caller's to mend.
+            Err(exit) if exit.is_of_a_lost_place() && *said.borrow() != cursor => {
+                out.say("the server does not know any more where this watch was: what is known now follows, and changes may be missing");
+                said.take();
+            }
+            end => return end,
+        }
+    }
 }
 
 fn show_change(message: &v1::WatchTasksResponse, out: &Out) -> Result<(), Exit> {

@@ -6,7 +6,7 @@ use crate::planning::Planning;
 use axum::body::HttpBody;
 use http::Request;
 use midshift_core::identity::Caller;
-use midshift_identity::Duty;
+use midshift_identity::{Duty, IdentityService};
 use midshift_proto::access;
 use prost_reflect::DescriptorPool;
 use std::future::poll_fn;

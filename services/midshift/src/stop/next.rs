@@ -3,7 +3,7 @@
 //! Both have the same open port, which the next one gets as its standard input: whoever dials between them waits a moment and is refused by nobody. Invariant:
 //! a next one that cannot begin costs nothing, this one goes on; two never have the folder at once.
 
-use super::{UP_WITHIN, program};
+use super::program::{UP_WITHIN, program};
 use anyhow::{Context, anyhow, bail, ensure};
 use midshift_stop::StopService;
 use std::env;

@@ -2,7 +2,7 @@
 //!
 //! Invariant: nothing here ends one that runs. What it says goes to a file of its own: it must not depend on where the server's own words go.
 
-use super::{FOLDER, LOOK_EVERY, UP_WITHIN, program};
+use super::program::{FOLDER, LOOK_EVERY, UP_WITHIN, program};
 use anyhow::{Context, bail};
 use midshift_agent::dial::{Dial, TcpDial};
 use midshift_agent::tls::{self, Tls};

@@ -4,7 +4,8 @@
 //! mark says who wrote to it last; who finds another there begins from what lies on the disk.
 
 use super::{Changed, DiskContent, Entry, Error, Hand, Inner, Mark, Part, Room, Sharing, Shelf, Whole, at};
-use super::{read_mark, remove, sync_folder, write_whole};
+use super::{read_mark, remove};
+use crate::disk::{sync_folder, write_whole};
 use midshift_bundle::digest::Digest;
 use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, UTIME_NOW, utimensat};
 use std::collections::BTreeMap;

@@ -1,0 +1,48 @@
+//! What each durable thing of a server can do for a backup, and what those that are copied or put back tell each other.
+
+use super::Places;
+use async_trait::async_trait;
+use midshift_core::time::Utc;
+use midshift_store::{PostgresRestore, StoreId};
+use std::path::Path;
+
+/// Name of the part of online keys, and of the folder where they go if nobody says where.
+pub const KEYS: &str = "ota-keys";
+/// Name of the part of rows in PostgreSQL. A backup without it has rows of SQLite.
+pub const POSTGRES: &str = "postgresql";
+
+/// What parts that were copied tell those after them.
+#[derive(Debug, Default)]
+pub struct Said {
+    /// Whose the rows are.
+    pub site_id: Option<String>,
+    /// Whose the folder of releases must be, if the rows are not beside it.
+    pub store_id: Option<StoreId>,
+    /// So many bundles the rows know, where the folder of releases may be another one.
+    pub bundles: u64,
+}
+
+/// What is being made of a backup.
+pub struct Making {
+    /// Where it goes, under names of its own until it is whole.
+    pub places: Places,
+    /// The store that it becomes.
+    pub store_id: StoreId,
+    /// The moment of the restore.
+    pub now: Utc,
+    /// Rows that a database has taken and not committed.
+    pub rows: Option<PostgresRestore>,
+}
+
+/// A durable thing of a server. `folder` is its own in a backup.
+#[async_trait]
+pub trait Part: Send + Sync {
+    /// Its name, and that of its folder.
+    fn name(&self) -> &'static str;
+    /// Copies it; false: the server has none.
+    async fn copy(&self, from: &Places, folder: &Path, said: &mut Said) -> anyhow::Result<bool>;
+    /// What is wrong with a copy.
+    async fn check(&self, folder: &Path) -> anyhow::Result<Vec<String>>;
+    /// Makes it what a server can start from.
+    async fn put_back(&self, folder: &Path, to: &mut Making) -> anyhow::Result<()>;
+}

@@ -1,0 +1,59 @@
+//! What a server is built from.
+
+use crate::roles::Roles;
+use midshift_core::site::Site;
+use midshift_core::time::Clock;
+use midshift_identity::IdentityService;
+use midshift_ota::{OtaReader, OtaService};
+use midshift_sim::service::SimFace;
+use midshift_store::{FrameLog, HeardLog, Store};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// Naive rules of the services, for twins of tests. None by default.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Naive {
+    /// Of the link.
+    pub telemetry: midshift_telemetry::Bugs,
+    /// Of fleet.
+    pub fleet: midshift_core::fleet::bugs::Bugs,
+    /// Of roll-outs.
+    pub rollouts: midshift_core::rollout::bugs::Bugs,
+}
+
+/// What a server is built from.
+pub struct Parts {
+    /// Which services it has.
+    pub roles: Roles,
+    /// How long robots have to move to another gateway before this one ends; zero: there is no other.
+    pub drain: Duration,
+    /// The memory that services share.
+    pub store: Arc<dyn Store>,
+    /// Where STATUS is kept.
+    pub frames: Arc<dyn FrameLog>,
+    /// Where several processes share newest heartbeats, if the store is one for several.
+    pub heard: Option<Arc<dyn HeardLog>>,
+    /// The site.
+    pub site: Arc<Site>,
+    /// Its text.
+    pub site_text: String,
+    /// Clocks.
+    pub clock: Arc<dyn Clock>,
+    /// Software of robots, of a process with role ota.
+    pub ota: OtaService,
+    /// Software of robots, of a gateway beside such processes.
+    pub reader: Option<OtaReader>,
+    /// The simulator's face, if bodies live in this process.
+    pub sim: Option<SimFace>,
+    /// Naive rules for twins of tests; none outside them.
+    pub naive: Naive,
+    /// Where the stop service beside this process keeps its files, if there is one.
+    pub stops: Option<PathBuf>,
+    /// Who is who, with TLS; none: no login, plain text.
+    pub identity: Option<IdentityService>,
+    /// Limits of the port.
+    pub port: midshift_edge::Config,
+    /// Where fleet plans; see [`crate::planning`].
+    pub planning: tokio::runtime::Handle,
+}
