@@ -1,6 +1,7 @@
 //! How sessions and bulk reach the server: one connection each, small buffers, and a network that a simulation can cut.
 //!
-//! Invariant: keep-alive of HTTP/2 is not liveness and is off; the agent itself gives a silent session up. Called by the shell.
+//! Invariant: keep-alive of HTTP/2 is not liveness and is off on a robot's lines, where the agent itself gives a silent session up; whoever has
+//! settings of its own says so in [`TcpDial::over`]. Called by the shell.
 
 use crate::tls::Tls;
 use async_trait::async_trait;

@@ -12,8 +12,7 @@ pub mod door;
 pub mod duration;
 pub mod logs;
 pub mod machines;
-
-pub mod parts;
+mod parts;
 pub mod planning;
 pub mod recorder;
 pub mod report;

@@ -2,7 +2,7 @@
 //!
 //! An operational stop request, not a safety function. Invariant: nothing of the store, the task queue or the business server lies on its way. Nothing here
 //! ends a running stop service: `serve` starts one where none is, and leaves it alone for ever. Rooms: `started` is that, `next` how one takes the place of another,
-//! `program` which program both start.
+//! `program` which program both start, where its files are and how long it may take.
 
 mod next;
 mod program;

@@ -25,7 +25,7 @@ pub fn uri(server: &str) -> String {
 }
 
 /// The address with this scheme, if it has none.
-pub fn with_scheme(scheme: &str, server: &str) -> String {
+pub(crate) fn with_scheme(scheme: &str, server: &str) -> String {
     if server.contains("://") { server.to_owned() } else { format!("{scheme}://{server}") }
 }
 

@@ -1,4 +1,4 @@
-//! What a disk refuses, and files that are there whole or not at all.
+//! Why a file stays as it was, and small files that are there whole or not at all.
 
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::COMPONENT_BYTES_MAX;

@@ -85,7 +85,9 @@ impl Rolling {
         done(&[&["rollout", "create", "--server", &public, id][..], &quick].concat())?;
         begin_rollout(&public, id)?;
         let (enough, address) = (CancellationToken::new(), stack.public);
-        let most = looked_at(address, id, robots, enough.clone());
+        let tenth = robots.div_ceil(10);
+        let sizes = [1, tenth, robots.saturating_sub(1 + tenth)];
+        let most = looked_at(address, id, sizes, enough.clone());
         Ok(Self { id, public: address, robots, looking: AbortOnDropHandle::new(tokio::spawn(most)), enough })
     }
 
@@ -123,10 +125,14 @@ impl Rolling {
     }
 }
 
-/// The most robots that its drains were ever asked of at once, those that still waited for the area among them. An error when they are more than its wave.
-async fn looked_at(public: SocketAddr, id: &str, robots: usize, enough: CancellationToken) -> anyhow::Result<u32> {
-    let tenth = robots.div_ceil(10);
-    let sizes = [1, tenth, robots.saturating_sub(1 + tenth)];
+/// The most robots that its drains were ever asked of at once, those that still waited for the area among them. An error when they are more than its wave, of
+/// which these are the sizes.
+pub async fn looked_at(
+    public: SocketAddr,
+    id: &str,
+    sizes: [usize; 3],
+    enough: CancellationToken,
+) -> anyhow::Result<u32> {
     let mut most = 0;
     let mut look = tokio::time::interval(LOOK);
     while enough.run_until_cancelled(look.tick()).await.is_some() {

@@ -15,6 +15,7 @@ use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::sim::v1::sim_service_client::SimServiceClient;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
+use std::io::ErrorKind;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -27,6 +28,8 @@ use tonic_health::pb::health_client::HealthClient;
 const CALL_WITHIN: Duration = Duration::from_secs(30);
 /// Exit code of a server that is not there.
 const NO_SERVER: u8 = 5;
+/// Exit code of what nobody reads any more, as of a program that SIGPIPE has ended.
+const UNREAD: u8 = 141;
 /// A server that is gone while something is followed may stay away so long.
 const AWAY_MAX: Duration = Duration::from_secs(600);
 /// Pauses between looks for it.
@@ -152,9 +155,12 @@ impl Exit {
         let remedy = if code == NO_SERVER { Remedy::Later } else { Remedy::None };
         Self { code, text: text.into(), remedy }
     }
-    /// Nobody reads any more what is said: no fault, and nothing to say.
-    fn unread() -> Self {
-        Self::new(0, "")
+    /// What was heard cannot be written. If nobody reads any more there is nobody to tell either, and the end is that of a program that wrote into a closed pipe.
+    fn unwritten(why: ErrorKind) -> Self {
+        match why {
+            ErrorKind::BrokenPipe => Self::new(UNREAD, ""),
+            other => Self::new(1, format!("writing what was heard: {other}")),
+        }
     }
     /// The server does not know the place any more from which it was to go on.
     pub fn is_of_a_lost_place(&self) -> bool {
@@ -194,7 +200,7 @@ impl Exit {
     }
     /// Says why and gives the code.
     pub fn report(&self, out: &Out) -> ExitCode {
-        if self.code != 0 {
+        if self.code != UNREAD {
             out.say(&format!("error: {}", self.text));
         }
         ExitCode::from(self.code)
@@ -285,7 +291,7 @@ impl From<Status> for Exit {
 /// again what is known then. `take` is given nothing when the server ended the stream in order.
 ///
 /// # Errors
-/// What `open` says the first time; what `take` says; a refusal; a server that stays away, or cuts each stream soon, for longer than [`AWAY_MAX`]; nobody reads what is said.
+/// What `open` says the first time; what `take` says; a refusal; a server that stays away, or cuts each stream soon, for longer than [`AWAY_MAX`]; what it heard cannot be written.
 pub async fn follow<T, B>(
     out: &Out,
     open: impl AsyncFn() -> Result<Streaming<T>, Exit>,
@@ -293,25 +299,30 @@ pub async fn follow<T, B>(
 ) -> Result<B, Exit> {
     let mut stream = open().await?;
     let mut away: Option<Away> = None;
+    // What a server said of it that cut a stream.
+    let mut why = String::new();
     loop {
         let message = match stream.message().await {
             Ok(message) => message,
-            Err(status) if was_cut(&status) => None,
+            Err(status) if was_cut(&status) => {
+                why = status.message().to_owned();
+                None
+            }
             Err(status) => return Err(Exit::with_facts(status)),
         };
         let is_cut = message.is_none();
         if let ControlFlow::Break(end) = take(message)? {
             return Ok(end);
         }
-        if out.is_unread() {
-            return Err(Exit::unread());
+        if let Some(why) = out.unwritten() {
+            return Err(Exit::unwritten(why));
         }
         if is_cut {
             away = away.filter(|away| !away.is_over());
             if away.is_none() {
                 out.say("the server ended the stream; waiting until it is back");
             }
-            stream = away.get_or_insert_with(Away::begin).again(&open).await?;
+            stream = away.get_or_insert_with(Away::begin).again(&open, &why).await?;
         }
     }
 }
@@ -341,18 +352,25 @@ impl Away {
     }
 
     /// Opens a stream as soon as there is a server for it.
-    async fn again<T>(&mut self, open: &impl AsyncFn() -> Result<Streaming<T>, Exit>) -> Result<Streaming<T>, Exit> {
+    async fn again<T>(
+        &mut self,
+        open: &impl AsyncFn() -> Result<Streaming<T>, Exit>,
+        why: &str,
+    ) -> Result<Streaming<T>, Exit> {
         loop {
             tokio::time::sleep(self.pause).await;
             self.pause = (self.pause * 2).min(PAUSE_MAX);
             match open().await {
                 Err(exit) if exit.remedy == Remedy::Later && self.begun.elapsed() < AWAY_MAX => {}
-                Ok(_) if self.begun.elapsed() >= AWAY_MAX => {
-                    let text = format!("the server has ended each stream at once for {AWAY_MAX:?}");
+                Ok(_) if self.answered.is_some() && self.begun.elapsed() >= AWAY_MAX => {
+                    let text = format!("the server has ended each stream at once for {AWAY_MAX:?}: {why}");
                     return Err(Exit::new(NO_SERVER, text));
                 }
                 opened => {
-                    self.answered = Some(Instant::now());
+                    let now = Instant::now();
+                    // However long it was away: from here on it has as long to be of use.
+                    self.begun = if self.answered.is_none() { now } else { self.begun };
+                    self.answered = Some(now);
                     return opened;
                 }
             }
@@ -536,7 +554,7 @@ mod tests {
             let mut cuts = 0;
             let end = follow(&out, open, |_: Option<()>| {
                 cuts += 1;
-                Ok(if cuts < 1_000 { ControlFlow::Continue(()) } else { ControlFlow::Break(()) })
+                Ok(if cuts < 300 { ControlFlow::Continue(()) } else { ControlFlow::Break(()) })
             });
             assert_eq!(end.await.map_err(|exit| exit.code()), if goes_on { Ok(()) } else { Err(NO_SERVER) });
             assert!(cuts > 10, "{cuts} streams");

@@ -3,8 +3,8 @@
 use clap::ValueEnum;
 use prost::{Message, Name};
 use std::borrow::Cow;
-use std::io::Write;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::io::{ErrorKind, Write};
+use std::sync::OnceLock;
 
 /// How results are printed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -23,25 +23,26 @@ pub enum Format {
 pub struct Out {
     /// Asked for.
     pub format: Format,
-    unread: AtomicBool,
+    /// Why data could not be written.
+    unwritten: OnceLock<ErrorKind>,
 }
 
 impl Out {
     /// Prints as asked.
     pub fn new(format: Format) -> Self {
-        Self { format, unread: AtomicBool::new(false) }
+        Self { format, unwritten: OnceLock::new() }
     }
     /// A line of data; for people without anything that their terminal would obey.
     pub fn line(&self, text: &str) {
         let text = if self.format == Format::Table { lines(text) } else { text.into() };
         // A reader that went away is no error of ours.
-        if writeln!(std::io::stdout().lock(), "{text}").is_err() {
-            self.unread.store(true, Ordering::Relaxed);
+        if let Err(error) = writeln!(std::io::stdout().lock(), "{text}") {
+            let _known = self.unwritten.set(error.kind());
         }
     }
-    /// Nobody has read the newest data: what only goes on for a reader may end.
-    pub fn is_unread(&self) -> bool {
-        self.unread.load(Ordering::Relaxed)
+    /// Why data could not be written: what goes on for a reader alone ends then. [`ErrorKind::BrokenPipe`]: nobody reads.
+    pub fn unwritten(&self) -> Option<ErrorKind> {
+        self.unwritten.get().copied()
     }
     /// A word to the person.
     pub fn say(&self, text: &str) {

@@ -16,6 +16,7 @@ use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::time::Duration;
+use tokio::time::Instant;
 
 /// Stops that were not confirmed by all.
 const NOT_ALL: u8 = 13;
@@ -230,14 +231,19 @@ async fn engage(args: Engage, out: &Out) -> Result<(), Exit> {
     let request = v1::EngageRequest { scope, level: level.into(), reason: args.reason, request_id };
     let mut client = args.call.client().await?;
     let (mut told, mut tries) = (Told::default(), TRIES);
+    let mut lost_since = None;
     loop {
         let lost = match told.hear(&mut client, request.clone(), args.no_wait, out).await {
             Ok(()) => return told.end(args.no_wait, out),
             Err(Heard::Failed(exit)) => return Err(exit),
             Err(Heard::Lost(status)) => status,
         };
-        if tries == 0 {
+        let lost_since: Instant = *lost_since.get_or_insert_with(Instant::now);
+        if tries == 0 || lost_since.elapsed() > ASK_WITHIN {
             return Err(told.cut(lost).or_try("midshift stop status: it may be engaged all the same"));
+        }
+        if tries == TRIES {
+            out.say("the stop service broke off before it said everything; it is asked again, for the same stop");
         }
         tries -= 1;
         tokio::time::sleep(AGAIN_AFTER).await;
@@ -248,6 +254,8 @@ async fn engage(args: Engage, out: &Out) -> Result<(), Exit> {
 
 /// Asked so often again where a stop service has ended under a call; dialed so often before it is said that there is none.
 const TRIES: u32 = 10;
+/// So long after it broke off first it is not asked again, however few times it was: a person waits.
+const ASK_WITHIN: Duration = Duration::from_secs(60);
 const DIALS: u32 = 4;
 const AGAIN_AFTER: Duration = Duration::from_millis(200);
 
