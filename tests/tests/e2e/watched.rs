@@ -52,6 +52,9 @@ async fn watches_of_the_command_line_go_on_after_the_server_was_killed_without_a
     }
     server.restart().await?;
     done(&["task", "cancel", "T1", "--reason", "not needed", "--server", &address])?;
+    // It is canceled when fleet has heard of it, which may be after the answer.
+    says(&tasks, "T1", true).await?;
+    // What is said twice is said before this.
     done(&["task", "submit", "--server", &address, "--task-id", "T3", "--from", "A01", "--to", "B03"])?;
     says(&tasks, "T3", true).await?;
     says(&robots, "rbt-01", true).await?;
