@@ -1,7 +1,7 @@
 //! What is behind the store of servers in these tests: files of SQLite, or PostgreSQL where `MIDSHIFT_TEST_ENGINE=postgres`.
 //!
 //! Invariant: each server has a database of its own and keeps it over restarts; all are on one PostgreSQL server, which ends with this
-//! program. Which tests do not run so, and why, is said by name in xtask/src/engine.rs.
+//! program. Which tests run so in the suite, and why, is said by name in xtask/src/engine.rs.
 
 use anyhow::bail;
 use midshift_tests::postgres::PostgresServer;
