@@ -23,9 +23,6 @@ const AGAIN: &[(&str, &str)] = &[
     ("watched::", "cursors of watches go on after a kill"),
 ];
 
-/// What a test has in its name, or its module, that starts PostgreSQL whatever the engine.
-const ALREADY: &[&str] = &["postgresql", "split::", "split_stack", "partition::", "while_the_database_"];
-
 /// Targets and filters of `cargo test`.
 pub fn selection() -> Vec<&'static str> {
     let mut selection = vec!["--test", "e2e", "--"];
@@ -38,8 +35,11 @@ pub fn selection() -> Vec<&'static str> {
 
 #[cfg(test)]
 mod tests {
-    use super::{AGAIN, ALREADY};
+    use super::AGAIN;
     use std::path::Path;
+
+    /// What a test has in its name, or its module, that starts PostgreSQL whatever the engine.
+    const ALREADY: &[&str] = &["postgresql", "split::", "split_stack", "partition::", "while_the_database_"];
 
     /// Names of all tests of the suite, `module::name`.
     fn names() -> Vec<String> {
