@@ -132,9 +132,9 @@ fn tests(workspace: &Workspace, tools: Option<&Tools>, targets: &[&str]) -> Resu
     let mut command = workspace.cargo(&["test", "--workspace", "--no-fail-fast"]);
     // What failed is said in a line; a hundred lines of where it was hide it.
     command.args(targets).env("RUST_BACKTRACE", "0");
-    // Most of them wait for programs that they started: two tests a core and one more keep the cores busy.
+    // Most of them wait for programs that they started: two tests a core keep the cores busy.
     let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
-    command.env("RUST_TEST_THREADS", (2 * cores + 1).to_string());
+    command.env("RUST_TEST_THREADS", (2 * cores).to_string());
     workspace.export_programs(&mut command)?;
     if let Some(tools) = tools {
         tools.export(&mut command);
