@@ -3,7 +3,3 @@
 pub mod line;
 pub mod postgres;
 pub mod raw;
-pub mod released;
-pub mod rows;
-pub mod shape;
-pub mod wire;

@@ -16,7 +16,10 @@ const AGAIN: &[(&str, &str)] = &[
     ("identity::a_copied_key_", "a session is fenced by rows, and a revoked robot is cut"),
     ("identity::a_token_that_was_revoked_", "a revocation reaches every reader by a wake"),
     ("mid_shift::a_fleet_takes_a_release_", "the server is killed while fleet and ota both write"),
-    ("minimal_robot::a_robot_from_the_proto_files_alone_outlives_", "a foreign robot's events survive kills of the server"),
+    (
+        "minimal_robot::a_robot_from_the_proto_files_alone_outlives_",
+        "a foreign robot's events survive kills of the server",
+    ),
     ("rolled_out::", "a roll-out goes on after the server was killed"),
     ("stopped::a_stopped_fleet_", "holds survive kills"),
     ("unheard::a_server_that_is_killed_", "the lease of the planner is taken over after each kill"),

@@ -9,7 +9,6 @@ mod dist;
 mod docker;
 mod engine;
 mod fetch_tools;
-mod fixtures;
 mod go;
 mod images;
 mod parts;
@@ -65,9 +64,6 @@ enum Verb {
     Stack(stack::Verb),
     /// Everything a release consists of: archives of programs and source, images, digests. Nothing is uploaded.
     Dist(dist::Options),
-    /// What a run of this version leaves, for the tests of later versions.
-    #[command(subcommand)]
-    Fixtures(fixtures::Verb),
     /// Write the golden files anew from what the code does now. Read the diff before you commit it.
     Golden,
     /// Format everything, then `golden`.
@@ -80,7 +76,6 @@ fn main() -> ExitCode {
         Verb::Torture { sweeps, seeds, from } => sweep::torture(&workspace, &sweeps, from, seeds),
         Verb::Stack(verb) => stack::run(&workspace, verb),
         Verb::Dist(options) => dist::dist(&workspace, &options),
-        Verb::Fixtures(verb) => fixtures::run(&workspace, verb),
         Verb::Golden => sweep::golden(&workspace),
         Verb::Tidy => sweep::tidy(&workspace),
     });

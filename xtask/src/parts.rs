@@ -6,7 +6,7 @@
 use crate::fetch_tools::Tools;
 use crate::stack::{self, Which};
 use crate::workspace::Workspace;
-use crate::{clients, dist, docker, engine, fixtures, run};
+use crate::{clients, dist, docker, engine, run};
 use anyhow::Result;
 use clap::ValueEnum;
 use std::process::Command;
@@ -20,7 +20,7 @@ pub enum Part {
     Clippy,
     /// The documentation builds without a warning.
     Rustdoc,
-    /// The .proto files keep buf's STANDARD rules, and break nothing that a released version says.
+    /// The .proto files keep buf's STANDARD rules.
     Buf,
     /// The programs build; tests get their paths.
     Build,
@@ -100,8 +100,7 @@ impl Part {
             Self::Buf => {
                 let Some(tools) = tools else { return Ok(false) };
                 let mut lint = workspace.command(&tools.buf);
-                Ok(run::succeeds(lint.arg("lint").current_dir(workspace.root.join("proto")))?
-                    && fixtures::breaks_nothing(workspace, tools)?)
+                run::succeeds(lint.arg("lint").current_dir(workspace.root.join("proto")))
             }
             Self::Build => build(workspace),
             Self::Clients => {
