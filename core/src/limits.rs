@@ -143,6 +143,10 @@ pub const RING_STATUS_MAX: usize = 4_096;
 pub const REMEMBER_DAYS: u64 = 7;
 /// Days that what people asked of tasks and robots is kept, to be looked up.
 pub const ASKED_DAYS: u64 = 30;
+/// Rows about what is not there any more (retired robots, replaced rings, software that a robot ran once) are kept this long, to be looked up.
+pub const GONE_KEPT: SiteDuration = SiteDuration::from_secs(30 * 86_400);
+/// Ended tasks that one pass takes away: a pass a minute keeps up with 300 ends a second, and lasts seconds.
+pub const FORGOTTEN_PER_PASS: usize = 20_000;
 /// Days that STATUS samples are kept, if there is room for them so long.
 pub const STATUS_DAYS: u64 = 30;
 /// Hours that a position is kept as it came: a day, to find out what went wrong in the last shift. Then it is made coarser.
@@ -176,6 +180,10 @@ pub const LEAD_FREE_AFTER: LinkDuration = LinkDuration::from_secs(4);
 pub const COMMAND_TRIES: u32 = 8;
 /// A process that ends lets another one plan within this, or the other one waits as if it had died. L
 pub const LEAD_LEFT_WITHIN: LinkDuration = LinkDuration::from_secs(1);
+/// A leader that reads its rows says so long that it leads. What is alive is read in far less; whoever needs longer lets another one try.
+pub const LEAD_READS_FOR: LinkDuration = LinkDuration::from_secs(30);
+/// Rows of what is over that a picture asks for by id at once.
+pub const ASKED_AT_ONCE: usize = 1_000;
 /// Open streams are cut this long after Ctrl-C.
 pub const HARD_DRAIN: LinkDuration = LinkDuration::from_secs(2);
 /// A heartbeat of the older session that arrives so long after the Hello of another machine was not on its way when that came: both are alive.

@@ -299,6 +299,18 @@ pub struct BadRow {
     source: Arc<serde_json::Error>,
 }
 
+/// Rows that a reading begins with.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Part {
+    /// A table whole: it holds only what is alive, or is bounded by count.
+    Whole(Table),
+    /// Rows of a table in one of these states, by its index of states.
+    InStates(Table, Vec<i64>),
+}
+
+/// Which rows the rows just read name. What it names is read at the same moment, and asked in turn.
+pub type Naming = fn(&[Row]) -> Vec<Key>;
+
 /// What must be true of a row for its item to be applied.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Expect {

@@ -5,18 +5,19 @@
 
 use super::rows::{
     AreaBudget, CommandKey, Drain, FleetMark, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotCounter,
-    ServiceClock, SiteRow, Timer,
+    RobotHolder, ServiceClock, SiteRow, Timer,
 };
 use crate::ids::{AttemptId, RobotId, TaskId};
+use crate::limits;
 use crate::maintenance::{DrainRelease, DrainRequest};
 use crate::picture::{Picture, Viewed};
 pub use crate::picture::{Rowed, Slot};
 use crate::policy::AreaPolicy;
-use crate::rows::{BadRow, Key, Revision, Row, Table, Writer};
+use crate::rows::{BadRow, Key, Part, Revision, Row, Seq, Table, Writer};
 use crate::site::Site;
 use crate::site::route::Router;
 use crate::stop::record::StopRecord;
-use crate::task::{Attempt, Phase, TaskIntake, TaskState};
+use crate::task::{Attempt, AttemptPhase, Phase, TaskIntake, TaskState};
 use crate::time::{Now, Utc};
 use crate::work::{DesiredPolicy, DesiredWork, LaneMark, PresenceRow, Session};
 use std::collections::{BTreeMap, BTreeSet};
@@ -52,8 +53,14 @@ pub struct View {
     pub queued: BTreeMap<(u8, u64), (TaskId, Utc)>,
     /// Tasks that began to wait since the planner last looked.
     pub fresh: BTreeSet<TaskId>,
-    /// How ended tasks ended: what `depends_on` looks at.
+    /// How tasks ended that a task waits for which has not.
     pub ended: BTreeMap<TaskId, Phase>,
+    /// How many tasks that have not ended wait for a task.
+    pub dependants: BTreeMap<TaskId, u32>,
+    /// Tasks that another one waits for, and that this picture knows nothing of: whoever keeps it asks the store.
+    pub unasked: BTreeSet<TaskId>,
+    /// Ended tasks that were let go, and how far the feed had been taken then: it says of them once more what is known.
+    pub let_go: BTreeMap<TaskId, Seq>,
     /// Attempts that are live or still hold a robot, and the last one of each task that has not ended.
     pub attempts: Slot<Attempt>,
     /// Deadlines.
@@ -92,7 +99,7 @@ pub struct View {
     pub drain_releases: Slot<DrainRelease>,
     /// Robots of areas that are out of work.
     pub budgets: Slot<AreaBudget>,
-    /// Used request_ids of commands.
+    /// Used request_ids of the commands that are being carried out: asked by id, and let go with the turn.
     pub command_keys: Slot<CommandKey>,
     /// Newest sessions (telemetry's).
     pub sessions: Slot<Session>,
@@ -111,9 +118,9 @@ pub struct View {
     /// Robots whose rules of areas must be composed again in this cycle.
     pub policy_dirty: BTreeSet<RobotId>,
     /// Last entry of the feed that was taken.
-    pub absorbed: crate::rows::Seq,
+    pub absorbed: Seq,
     /// Rows were read at this entry: what older entries say of rows is in the picture already, also that a row is gone.
-    pub read_at: crate::rows::Seq,
+    pub read_at: Seq,
     /// Reading of the clocks when fleet started: every lease counts as renewed then, and no timer fires soon after.
     pub started: Now,
     /// Reading of the clocks when the rows were read: serving time goes on from there.
@@ -135,7 +142,7 @@ pub struct View {
     /// Highest generation that a robot has applied and this store had not given: it is older than the robots. Volatile.
     pub behind: Option<u64>,
     /// Entries of the feed whose items the store refused for good: passed over. Volatile.
-    pub unusable: BTreeSet<crate::rows::Seq>,
+    pub unusable: BTreeSet<Seq>,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: super::bugs::Bugs,
     /// Distances and routes, remembered.
@@ -153,7 +160,6 @@ macro_rules! viewed {
 }
 
 viewed! {
-    TaskIntake => intakes;
     Timer => timers;
     RobotControl => control;
     RobotCounter => counters;
@@ -180,7 +186,8 @@ impl Viewed<View> for TaskState {
         if let Some(robot) = &task.robot_id {
             view.dirty.insert(robot.clone());
         }
-        if task.phase.is_terminal() {
+        view.unasked.remove(&task.task_id);
+        if task.phase.is_terminal() && view.dependants.contains_key(&task.task_id) {
             view.ended.insert(task.task_id.clone(), task.phase);
         }
         let Some(intake) = view.intakes.get(id).map(|t| &t.row) else { return };
@@ -191,6 +198,25 @@ impl Viewed<View> for TaskState {
         } else {
             view.queued.remove(&place);
         }
+    }
+}
+
+impl Viewed<View> for TaskIntake {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.intakes
+    }
+    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+        let waits_for = view.intakes.get(id).map(|i| i.row.spec.depends_on.clone()).unwrap_or_default();
+        for task_id in waits_for {
+            let known = view.tasks.get(task_id.as_str()).map(|t| t.row.phase);
+            if let Some(phase) = known.filter(|phase| phase.is_terminal()) {
+                view.ended.insert(task_id.clone(), phase);
+            } else if known.is_none() && !view.ended.contains_key(&task_id) {
+                view.unasked.insert(task_id.clone());
+            }
+            *view.dependants.entry(task_id).or_default() += 1;
+        }
+        old.into_iter().for_each(|old| view.waits_no_more(old));
     }
 }
 
@@ -292,11 +318,46 @@ impl Viewed<View> for Place {
     }
 }
 
-/// Tables that fleet's picture is made of.
-pub const TABLES: &[Table] = &[
-    Table::TaskIntake,
-    Table::TaskState,
-    Table::Attempt,
+/// What the picture begins with: all that is alive. [`named`] says what is read with it.
+pub fn alive() -> Vec<Part> {
+    let tasks = Phase::ALL.into_iter().filter(|p| !p.is_terminal()).map(Phase::number);
+    let attempts = AttemptPhase::ALL.into_iter().filter(|p| !p.is_terminal()).map(AttemptPhase::number);
+    let in_states =
+        [Part::InStates(Table::TaskState, tasks.collect()), Part::InStates(Table::Attempt, attempts.collect())];
+    WHOLE.iter().map(|table| Part::Whole(*table)).chain(in_states).collect()
+}
+
+/// What rows of the picture name: of a task that has not ended what was asked for, its newest attempt, and the tasks that it waits for; of
+/// a robot the attempt that holds it.
+pub fn named(rows: &[Row]) -> Vec<Key> {
+    let mut keys = Vec::new();
+    for row in rows {
+        match row.key.table {
+            Table::TaskState => {
+                let Ok(task) = row.decode::<TaskState>() else { continue };
+                if !task.phase.is_terminal() {
+                    keys.push(Key { table: Table::TaskIntake, id: row.key.id.clone() });
+                    keys.extend(task.attempt_id().map(|id| Key::new(Table::Attempt, id.to_string())));
+                }
+            }
+            Table::TaskIntake => {
+                let Ok(intake) = row.decode::<TaskIntake>() else { continue };
+                keys.extend(intake.spec.depends_on.iter().map(|id| Key::new(Table::TaskState, id.as_str())));
+            }
+            Table::RobotAuthority => {
+                let holder = row.decode::<RobotAuthority>().map(|a| a.holder);
+                if let Ok(RobotHolder::Attempt(id)) = holder {
+                    keys.push(Key::new(Table::Attempt, id.to_string()));
+                }
+            }
+            _ => {}
+        }
+    }
+    keys
+}
+
+/// Tables that hold only what is alive, or that are bounded by count.
+const WHOLE: &[Table] = &[
     Table::Timer,
     Table::HoldToken,
     Table::PlaceGrant,
@@ -310,7 +371,6 @@ pub const TABLES: &[Table] = &[
     Table::ServiceClock,
     Table::FleetMark,
     Table::Incident,
-    Table::CommandKey,
     Table::Drain,
     Table::DrainRequest,
     Table::DrainRelease,
@@ -332,6 +392,9 @@ impl View {
             queued: BTreeMap::new(),
             fresh: BTreeSet::new(),
             ended: BTreeMap::new(),
+            dependants: BTreeMap::new(),
+            unasked: BTreeSet::new(),
+            let_go: BTreeMap::new(),
             attempts: Slot::new(),
             timers: Slot::new(),
             holds: Slot::new(),
@@ -360,8 +423,8 @@ impl View {
             held_places: BTreeMap::new(),
             dirty: BTreeSet::new(),
             policy_dirty: BTreeSet::new(),
-            absorbed: crate::rows::Seq(0),
-            read_at: crate::rows::Seq(0),
+            absorbed: Seq(0),
+            read_at: Seq(0),
             started,
             read,
             served: ServiceClock::default(),
@@ -377,16 +440,68 @@ impl View {
         }
     }
 
-    /// Takes every row of a snapshot read at `seq`. Ended tasks keep only how they ended.
-    pub fn load(&mut self, rows: &[Row], seq: crate::rows::Seq) -> Result<(), BadRow> {
+    /// Takes what was read at `seq` by [`alive`] and [`named`].
+    ///
+    /// # Errors
+    /// A row that cannot be read.
+    pub fn load(&mut self, rows: &[Row], seq: Seq) -> Result<(), BadRow> {
         for row in rows {
             self.absorb(&row.key, row.revision, Some(row))?;
         }
         self.read_at = seq;
-        self.absorbed = self.marks.get("fleet").map_or(crate::rows::Seq(0), |m| m.row.seq);
+        self.absorbed = self.marks.get("fleet").map_or(Seq(0), |m| m.row.seq);
         self.served = self.clocks.get("fleet").map(|c| c.row).unwrap_or_default();
+        // Whatever a task waits for was asked with it.
+        self.unasked.clear();
         self.forget_ended();
+        self.let_go.clear();
         Ok(())
+    }
+
+    /// What is over and wanted all the same, and nobody has asked the store for: at most [`limits::ASKED_AT_ONCE`].
+    pub fn wanted(&self) -> Vec<Key> {
+        let ids = self.unasked.iter().take(limits::ASKED_AT_ONCE);
+        ids.map(|id| Key::new(Table::TaskState, id.as_str())).collect()
+    }
+
+    /// Takes what the store has of `keys`, which were asked by id. What it does not have, or what has not ended, is told by the feed.
+    ///
+    /// # Errors
+    /// A row that cannot be read.
+    pub fn tell(&mut self, keys: &[Key], rows: &[Row]) -> Result<(), BadRow> {
+        for key in keys.iter().filter(|key| key.table == Table::TaskState) {
+            if let Ok(id) = TaskId::parse(&key.id) {
+                self.unasked.remove(&id);
+            }
+        }
+        for row in rows {
+            match row.key.table {
+                Table::CommandKey => {
+                    crate::picture::take::<Self, CommandKey>(self, &row.key.id, row.revision, Some(row))?;
+                }
+                Table::TaskState => {
+                    let task = row.decode::<TaskState>()?;
+                    if task.phase.is_terminal() && self.dependants.contains_key(&task.task_id) {
+                        self.ended.insert(task.task_id, task.phase);
+                    }
+                }
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// A task is over, or gone: nothing is asked any more of those that it waited for alone.
+    fn waits_no_more(&mut self, intake: &TaskIntake) {
+        for task_id in &intake.spec.depends_on {
+            let Some(left) = self.dependants.get_mut(task_id) else { continue };
+            *left -= 1;
+            if *left == 0 {
+                self.dependants.remove(task_id);
+                self.ended.remove(task_id);
+                self.unasked.remove(task_id);
+            }
+        }
     }
 
     /// Takes one row as the store has it; none: deleted. What this picture already has is passed over.
@@ -431,29 +546,39 @@ impl View {
         crate::picture::take::<Self, R>(self, &key.id, revision, row)
     }
 
-    /// A row that this picture has let go on purpose: of an ended task, or an attempt that no task names any more.
+    /// A row that this picture has let go on purpose, or asks for by id alone.
     fn is_past(&self, key: &Key) -> bool {
         match key.table {
-            Table::TaskIntake | Table::TaskState => TaskId::parse(&key.id).is_ok_and(|id| self.ended.contains_key(&id)),
+            Table::TaskIntake | Table::TaskState => {
+                TaskId::parse(&key.id).is_ok_and(|id| self.let_go.contains_key(&id))
+            }
+            Table::CommandKey => true,
             _ => false,
         }
     }
 
     /// Lets go of tasks that have ended and of attempts that neither hold a robot nor are the newest of a live task.
     pub fn forget_ended(&mut self) {
-        let ended: Vec<String> =
-            self.tasks.iter().filter(|(_, t)| t.row.phase.is_terminal()).map(|(id, _)| id.clone()).collect();
-        for id in &ended {
-            self.tasks.remove(id);
-            self.intakes.remove(id);
+        // What is let go is committed after this, and comes by the feed before the feed is taken further than that.
+        let absorbed = self.absorbed;
+        self.let_go.retain(|_, at| *at >= absorbed);
+        let ended: Vec<TaskId> =
+            self.tasks.values().filter(|t| t.row.phase.is_terminal()).map(|t| t.row.task_id.clone()).collect();
+        for id in ended {
+            self.tasks.remove(id.as_str());
+            if let Some(intake) = self.intakes.remove(id.as_str()) {
+                self.waits_no_more(&intake.row);
+            }
+            self.let_go.insert(id, absorbed);
         }
+        self.command_keys.clear();
         let tasks = &self.tasks;
         let authority = &self.authority;
         self.attempts.retain(|_, a| {
             let a = &a.row;
             let holds = authority
                 .get(a.robot_id.as_str())
-                .is_some_and(|r| matches!(&r.row.holder, super::rows::RobotHolder::Attempt(id) if *id == a.attempt));
+                .is_some_and(|r| matches!(&r.row.holder, RobotHolder::Attempt(id) if *id == a.attempt));
             let newest = a
                 .attempt
                 .subject
@@ -494,7 +619,7 @@ impl View {
     /// The attempt that holds the robot.
     pub fn held_by(&self, robot: &RobotId) -> Option<&AttemptId> {
         match self.authority.get(robot.as_str()).map(|a| &a.row.holder) {
-            Some(super::rows::RobotHolder::Attempt(id)) => Some(id),
+            Some(RobotHolder::Attempt(id)) => Some(id),
             _ => None,
         }
     }

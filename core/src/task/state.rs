@@ -164,6 +164,21 @@ pub enum AttemptPhase {
 }
 
 impl AttemptPhase {
+    /// All phases.
+    pub const ALL: [AttemptPhase; 12] = [
+        Self::Offered,
+        Self::Accepted,
+        Self::Navigating,
+        Self::Executing,
+        Self::Paused,
+        Self::Stopping,
+        Self::Refused,
+        Self::OfferExpired,
+        Self::Succeeded,
+        Self::Failed,
+        Self::Aborted,
+        Self::Lost,
+    ];
     /// No way out.
     pub const fn is_terminal(self) -> bool {
         matches!(self, Self::Refused | Self::OfferExpired | Self::Succeeded | Self::Failed | Self::Aborted | Self::Lost)

@@ -5,14 +5,14 @@
 //! say so for a while reads the rows again before it does.
 
 use crate::{Look, Parts, Request};
-use midshift_core::fleet::view::{TABLES, View};
+use midshift_core::fleet::view::{self, View};
 use midshift_core::fleet::{Board, LOGS, Pace, Plan, absorb, commands, cycle, found, obeyed, objects};
 use midshift_core::lead::{FleetLeader, Own, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::once;
 use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
-use midshift_core::rows::{Entry, Item, Log, Seq, Table};
+use midshift_core::rows::{Entry, Item, Key, Log, Seq, Table};
 use midshift_core::time::Now;
 use midshift_core::work::Live;
 use midshift_store::{CommitError, Dirty, Error, follow, lead};
@@ -160,7 +160,10 @@ impl Loop {
     pub(crate) async fn rebuild(&mut self) -> Result<(), Error> {
         self.take_part().await?;
         self.own.clear();
-        let snapshot = self.parts.store.snapshot(TABLES).await?;
+        let Self { seat, parts, .. } = self;
+        let alive = view::alive();
+        let reading = parts.store.read(&alive, view::named);
+        let snapshot = lead::renewed_while(seat, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
         let place_waits = self.view.place_waits;
         let (waits, attached) = (std::mem::take(&mut self.view.waits), std::mem::take(&mut self.view.attached));
         let excused = std::mem::take(&mut self.view.excused);
@@ -242,6 +245,8 @@ impl Loop {
             .take_feed(now, &mut plan)
             .await
             .map_err(|error| tracing::warn!(%error, "fleet cannot read the feed"))?;
+        let unread = |error| tracing::warn!(%error, "fleet cannot read what is over");
+        self.ask(used_ids(&requests)).await.map_err(unread)?;
         let renewal = match self.seat.stance(now.link) {
             Stance::StepDown => {
                 // What was planned a moment ago is dropped, and with it the picture that holds it.
@@ -305,6 +310,16 @@ impl Loop {
         follow(self.parts.store.as_ref(), &mut self.seq, LOGS, take).await?;
         seen?;
         Ok(foreign)
+    }
+
+    /// Reads by id what the picture wants to know of what is over, and these rows too.
+    pub(crate) async fn ask(&mut self, mut keys: Vec<Key>) -> Result<(), Error> {
+        keys.extend(self.view.wanted());
+        if keys.is_empty() {
+            return Ok(());
+        }
+        let rows = self.parts.store.get(keys.clone()).await?;
+        Ok(self.view.tell(&keys, &rows)?)
     }
 
     fn take_requests(&mut self, requests: Vec<Request>, now: Now, plan: &mut Plan) -> Replies {
@@ -388,6 +403,15 @@ impl Loop {
         }
         trusted
     }
+}
+
+/// Rows that say whether a command with a request_id was carried out before.
+fn used_ids(requests: &[Request]) -> Vec<Key> {
+    let ids = requests.iter().filter_map(|request| match request {
+        Request::Do { request_id, .. } => request_id.as_ref(),
+        Request::Look(_) => None,
+    });
+    ids.map(|id| Key::new(Table::CommandKey, id)).collect()
 }
 
 fn kind_of(item: &Item) -> &'static str {

@@ -12,7 +12,7 @@ use midshift_core::limits;
 use midshift_core::once;
 use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Refusal};
-use midshift_core::rows::{Entry, Item, Revision};
+use midshift_core::rows::{Entry, Item, Key, Revision, Table};
 use midshift_store::{CommitError, Error, follow};
 
 /// What a person asks of fleet.
@@ -42,6 +42,7 @@ impl Loop {
             }
         };
         follow(self.parts.store.as_ref(), &mut self.seq, LOGS, take).await?;
+        self.ask(Vec::new()).await?;
         for text in unreadable {
             tracing::error!(text, "fleet passed over something it cannot read");
         }
@@ -77,7 +78,9 @@ impl Loop {
 
     /// The answer to whoever asked. An error: what came of it may not be in the picture.
     async fn carry_out(&mut self, asked: &Asked<'_>) -> Result<Result<(), Refusal>, Error> {
+        let used: Vec<Key> = asked.request_id.iter().map(|id| Key::new(Table::CommandKey, id)).collect();
         for _ in 0..limits::COMMAND_TRIES {
+            self.ask(used.clone()).await?;
             let item = match self.decide(asked) {
                 Ok(Some(item)) => item,
                 Ok(None) => return Ok(Ok(())),

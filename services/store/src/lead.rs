@@ -6,8 +6,12 @@ use crate::{CommitError, Error, Store};
 use midshift_core::lead::{LeaderRow, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::time::Clock;
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
+
+/// How often a process that reads looks whether its lease is due.
+const LOOK_EVERY: Duration = Duration::from_millis(250);
 
 /// Reads who leads, and takes over if nobody does; true: this process leads from now on. It may have stepped down, also before an error.
 ///
@@ -35,6 +39,33 @@ pub async fn take_part<R: LeaderRow>(seat: &mut Seat<R>, store: &dyn Store, cloc
             None => unreachable!("one result an item"),
         },
         Stance::Lead | Stance::Renew | Stance::StandBy => Ok(false),
+    }
+}
+
+/// Waits for a reading and says meanwhile that this process leads, if it does: a reading that takes long is no reason for another one to take
+/// over. It says so for [`limits::LEAD_READS_FOR`] at most.
+pub async fn renewed_while<R: LeaderRow, T>(
+    seat: &mut Seat<R>,
+    store: &dyn Store,
+    clock: &dyn Clock,
+    reading: impl Future<Output = T>,
+) -> T {
+    let mut reading = pin!(reading);
+    let begun = clock.now().link;
+    loop {
+        tokio::select! {
+            biased;
+            read = &mut reading => return read,
+            () = tokio::time::sleep(LOOK_EVERY) => {}
+        }
+        let now = clock.now().link;
+        if seat.stance(now) == Stance::Renew && now.since(begun) < limits::LEAD_READS_FOR {
+            let claimed = store.commit(vec![seat.claim()]).await.pop();
+            // Not written, or nobody knows: another claim finds that out, and without one the lease ends by itself.
+            if matches!(claimed, Some(Ok(_))) {
+                seat.claimed(now);
+            }
+        }
     }
 }
 

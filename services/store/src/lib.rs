@@ -13,6 +13,7 @@ mod check;
 mod frames;
 mod frames_pack;
 mod frames_queue;
+mod gather;
 mod group;
 mod heard;
 pub mod lead;
@@ -45,7 +46,7 @@ use async_trait::async_trait;
 use midshift_core::audit::Head;
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::limits;
-use midshift_core::rows::{BadRow, Entry, Item, Key, Log, Record, Revision, Row, Seq, Table, Writer};
+use midshift_core::rows::{BadRow, Entry, Item, Key, Log, Naming, Part, Record, Revision, Row, Seq, Table, Writer};
 use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::Arc;
@@ -235,7 +236,7 @@ impl Query {
     }
 }
 
-/// Some tables whole, all at one moment.
+/// Rows of some tables, all at one moment.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Snapshot {
     /// The moment: everything up to this entry is in, nothing after it. The feed goes on from here.
@@ -282,8 +283,13 @@ pub trait Store: Send + Sync + 'static {
     async fn get(&self, keys: Vec<Key>) -> Result<Vec<Row>, Error>;
     /// One page of a table.
     async fn list(&self, query: Query) -> Result<Vec<Row>, Error>;
-    /// Tables whole, at one moment.
-    async fn snapshot(&self, tables: &[Table]) -> Result<Snapshot, Error>;
+    /// Rows of `parts`, and those that they name, all at one moment. Costs what these rows cost, whatever else the tables hold.
+    async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error>;
+    /// Tables whole, at one moment: of tables that are small.
+    async fn snapshot(&self, tables: &[Table]) -> Result<Snapshot, Error> {
+        let parts: Vec<Part> = tables.iter().map(|table| Part::Whole(*table)).collect();
+        self.read(&parts, |_| Vec::new()).await
+    }
     /// Entries of `logs` after a cursor, in commit order, without holes.
     ///
     /// # Errors

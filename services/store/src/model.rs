@@ -6,6 +6,7 @@
 
 use crate::audit::{Growth, Heads};
 use crate::check::{After, decide, log_index};
+use crate::gather::Gathered;
 use crate::model_table::Rows;
 use crate::{
     Applied, CommitError, Error, FEED_PAGE_MAX, FeedPage, GET_KEYS_MAX, Query, Retention, SEQ_PLAUSIBLE_MAX, Snapshot,
@@ -14,7 +15,7 @@ use crate::{
 use async_trait::async_trait;
 use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Entry, Item, Key, Log, Row, Seq, Table, Writer};
+use midshift_core::rows::{Entry, Item, Key, Log, Naming, Part, Row, Seq, Table, Writer};
 use midshift_core::time::Clock;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -188,11 +189,27 @@ impl Store for MemoryStore {
         Ok(self.state().tables.get(&query.table).map_or_else(Vec::new, |rows| rows.list(&query)))
     }
 
-    async fn snapshot(&self, tables: &[Table]) -> Result<Snapshot, Error> {
-        let tables: BTreeSet<Table> = tables.iter().copied().collect();
+    async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error> {
         let state = self.state();
-        let rows = tables.iter().filter_map(|table| state.tables.get(table)).flat_map(Rows::iter).cloned().collect();
-        Ok(Snapshot { seq: state.head, rows })
+        let mut gathered = Gathered::new(named);
+        for part in parts {
+            match part {
+                Part::Whole(table) => gathered.take(state.tables.get(table).into_iter().flat_map(Rows::iter).cloned()),
+                Part::InStates(table, states) => {
+                    gathered.take(state.tables.get(table).into_iter().flat_map(|rows| rows.in_states(states)).cloned());
+                }
+            }
+        }
+        loop {
+            let missing = gathered.missing();
+            if missing.is_empty() {
+                return Ok(gathered.at(state.head));
+            }
+            for (table, ids) in missing {
+                let rows = ids.iter().filter_map(|id| state.tables.get(&table)?.get(id));
+                gathered.take(rows.cloned());
+            }
+        }
     }
 
     async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error> {

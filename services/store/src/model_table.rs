@@ -27,6 +27,12 @@ impl Rows {
         self.rows.values()
     }
 
+    /// Rows in one of these states, each state by its own order.
+    pub(crate) fn in_states(&self, states: &[i64]) -> impl Iterator<Item = &Row> {
+        let orders = states.iter().filter_map(|state| self.by_state.get(state));
+        orders.flatten().filter_map(|place| self.rows.get(&place.id))
+    }
+
     pub(crate) fn put(&mut self, row: Row) {
         let place = Cursor::of(&row);
         let index = row.index.clone();

@@ -7,7 +7,7 @@ use midshift_agent::memory::MemoryStore as RobotMemory;
 use midshift_agent::store::{Error as RobotError, Kept, Op, Store as RobotStore};
 use midshift_core::audit::Head;
 use midshift_core::ids::{RobotId, SiteId};
-use midshift_core::rows::{Item, Key, Log, Row, Seq, Table, Writer};
+use midshift_core::rows::{Item, Key, Log, Naming, Part, Row, Seq, Writer};
 use midshift_store::{
     Applied, Cause, Coarsen, CommitError, Error, FeedPage, Frame, FrameLog, FrameMark, FramesOldest, Gap, MemoryFrames,
     MemoryStore, Query, Retention, Snapshot, Store, StoreId, StoredFrame,
@@ -134,9 +134,9 @@ impl Store for ServerDisk {
         self.readable()?;
         self.inner.list(query).await
     }
-    async fn snapshot(&self, tables: &[Table]) -> Result<Snapshot, Error> {
+    async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error> {
         self.readable()?;
-        self.inner.snapshot(tables).await
+        self.inner.read(parts, named).await
     }
     async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error> {
         self.readable()?;

@@ -4,6 +4,7 @@
 mod harness;
 
 mod drains;
+mod ended;
 mod errands;
 mod explain;
 mod holds;

@@ -2,7 +2,7 @@
 
 use crate::harness::{Answer, World, jam, obstacle};
 use midshift_core::fleet::rows::{HolderState, Place, RobotAuthority, RobotHolder};
-use midshift_core::fleet::view::{TABLES, View};
+use midshift_core::fleet::view::{View, alive, named};
 use midshift_core::fleet::{Plan, absorb};
 use midshift_core::reason::Code;
 use midshift_core::robot::{HardwareStop, Mode};
@@ -22,7 +22,7 @@ fn slots(view: &View) -> BTreeMap<&'static str, Vec<String>> {
     macro_rules! told {
         ($($slot:ident)*) => { BTreeMap::from([$((stringify!($slot), view.$slot.iter().map(|r| format!("{r:?}")).collect())),*]) };
     }
-    told!(intakes tasks ended attempts timers holds places authority control counters sites policies desired_work
+    told!(intakes tasks ended dependants attempts timers holds places authority control counters sites policies desired_work
         desired_policy clocks marks incidents sessions presence lane_marks held_places)
 }
 
@@ -38,7 +38,7 @@ async fn pictures_agree(w: &mut World) {
     let mut last = None;
     for _ in 0..8 {
         let kept = w.fleet.look(|view, _, _| slots(view)).await.expect("the reconciler runs");
-        let snapshot = w.store.snapshot(TABLES).await.expect("a snapshot");
+        let snapshot = w.store.read(&alive(), named).await.expect("a snapshot");
         let now = w.clock.now();
         let mut view = View::new(w.site.clone(), now, now);
         view.load(&snapshot.rows, snapshot.seq).expect("readable rows");
@@ -92,7 +92,13 @@ async fn random_shift(site: &'static str, stands: &[&str], goals: &[&str], seed:
         if rng.random_range(0..3) == 0 {
             let (from, to) = (goals[rng.random_range(0..goals.len())], goals[rng.random_range(0..goals.len())]);
             let retry = RawRetry { max_retry_times: rng.random_range(0..3), ..RawRetry::default() };
-            w.submit_with(&format!("T{tasks}"), from, to, |raw| raw.retry = Some(retry)).await;
+            // One that is over, one that is not, and now and then none.
+            let waits_for = (tasks > 0 && rng.random()).then(|| format!("T{}", rng.random_range(0..tasks)));
+            w.submit_with(&format!("T{tasks}"), from, to, |raw| {
+                raw.retry = Some(retry);
+                raw.depends_on = waits_for.into_iter().collect();
+            })
+            .await;
             tasks += 1;
         }
         if tasks > 0 && rng.random_range(0..6) == 0 {
@@ -132,6 +138,11 @@ async fn all_is_well_again(w: &mut World) {
         let uncordon = v1::UncordonRobotRequest { robot_id: id, ..Default::default() };
         w.fleet.uncordon_robot(Request::new(uncordon)).await.expect("uncordoned");
     }
+    // What waits for a task that failed would wait for ever.
+    let waiting = w.seen().await.all::<TaskState>().into_iter().filter(|t| t.phase == Phase::Queued);
+    for task in waiting.collect::<Vec<_>>() {
+        w.cancel(task.task_id.as_str(), false).await;
+    }
     w.until("every task has ended or is before a person, and every robot is free", |s| {
         let over = |p: Phase| p.is_terminal() || p == Phase::NeedsOperator;
         let tasks = s.all::<TaskState>().iter().all(|t| over(t.phase));
@@ -152,7 +163,7 @@ async fn a_picture_built_from_rows_is_not_set_back_by_older_entries_and_goes_on_
     w.robot("r1", "park-a").await;
     w.submit("T1", "A", "B").await;
     w.until_phase("T1", Phase::Succeeded).await;
-    let snapshot = w.store.snapshot(TABLES).await.expect("a snapshot");
+    let snapshot = w.store.read(&alive(), named).await.expect("a snapshot");
     let now = w.clock.now();
     let mut view = View::new(w.site.clone(), now, now);
     view.load(&snapshot.rows, snapshot.seq).expect("readable rows");

@@ -30,7 +30,7 @@ use async_trait::async_trait;
 use connect::{Database, patiently};
 use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Item, Key, Log, Row, Seq, Table, Writer as Author};
+use midshift_core::rows::{Item, Key, Log, Naming, Part, Row, Seq, Writer as Author};
 use midshift_core::time::Clock;
 use sqlx::PgPool;
 use std::collections::{BTreeMap, BTreeSet};
@@ -150,9 +150,8 @@ impl Store for PostgresStore {
         patiently(async { read::list(&self.readers, &self.site_id, &query).await.map_err(unavailable) }).await
     }
 
-    async fn snapshot(&self, tables: &[Table]) -> Result<Snapshot, Error> {
-        let tables: BTreeSet<Table> = tables.iter().copied().collect();
-        patiently(async { read::snapshot(&self.readers, &self.site_id, &tables).await.map_err(unavailable) }).await
+    async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error> {
+        patiently(async { read::read(&self.readers, &self.site_id, parts, named).await.map_err(unavailable) }).await
     }
 
     async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error> {

@@ -5,11 +5,12 @@
 
 use super::write_sql::is_text;
 use crate::audit::{self, Heads};
+use crate::gather::Gathered;
 use crate::queue::unavailable;
 use crate::sql::{self, ENTRY_READ, ROW_READ, entry, row};
-use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, Query, Snapshot, page_of};
+use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, GET_KEYS_MAX, Query, Snapshot, page_of};
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Entry, Key, Log, Row, Seq, Table};
+use midshift_core::rows::{Entry, Key, Log, Naming, Part, Row, Seq, Table};
 use sqlx::postgres::PgRow;
 use sqlx::{AssertSqlSafe, PgConnection, PgPool, Postgres, Row as _, Transaction};
 use std::collections::{BTreeMap, BTreeSet};
@@ -28,7 +29,6 @@ pub(super) async fn get(readers: &PgPool, site_id: &SiteId, keys: &[Key]) -> Res
         ids.entry(key.table).or_default().push(&key.id);
     }
     let mut found: BTreeMap<Key, Row> = BTreeMap::new();
-    let select = |table: Table| format!("SELECT {ROW_READ} FROM {} WHERE site_id = $1 AND id = ANY($2)", table.name());
     let mut take = |table: Table, rows: &[PgRow]| -> Result<(), sqlx::Error> {
         for one in rows {
             let one = row(table, one)?;
@@ -39,13 +39,13 @@ pub(super) async fn get(readers: &PgPool, site_id: &SiteId, keys: &[Key]) -> Res
     if ids.len() == 1 {
         // One statement needs no transaction to be of one moment.
         for (table, ids) in ids {
-            let select = sqlx::query(AssertSqlSafe(select(table))).bind(site_id.as_str()).bind(ids);
+            let select = sqlx::query(AssertSqlSafe(by_ids(table))).bind(site_id.as_str()).bind(ids);
             take(table, &select.fetch_all(readers).await?)?;
         }
     } else if !ids.is_empty() {
         let mut transaction = begin(readers).await?;
         for (table, ids) in ids {
-            let select = sqlx::query(AssertSqlSafe(select(table))).bind(site_id.as_str()).bind(ids);
+            let select = sqlx::query(AssertSqlSafe(by_ids(table))).bind(site_id.as_str()).bind(ids);
             take(table, &select.fetch_all(&mut *transaction).await?)?;
         }
     }
@@ -90,21 +90,48 @@ async fn list_one(
     rows.iter().map(|found| row(query.table, found)).collect()
 }
 
-pub(super) async fn snapshot(
+pub(super) async fn read(
     readers: &PgPool,
     site_id: &SiteId,
-    tables: &BTreeSet<Table>,
+    parts: &[Part],
+    named: Naming,
 ) -> Result<Snapshot, sqlx::Error> {
     let mut transaction = begin(readers).await?;
     let seq = head(&mut *transaction, site_id).await?;
-    let mut rows = Vec::new();
-    for table in tables {
-        let select = sqlx::query(AssertSqlSafe(sql::whole(*table))).bind(site_id.as_str());
-        for found in select.fetch_all(&mut *transaction).await? {
-            rows.push(row(*table, &found)?);
+    let mut gathered = Gathered::new(named);
+    for part in parts {
+        let (table, selects) = match part {
+            Part::Whole(table) => (*table, vec![sqlx::query(AssertSqlSafe(sql::whole(*table))).bind(site_id.as_str())]),
+            Part::InStates(table, states) => {
+                let select = || sqlx::query(AssertSqlSafe(sql::in_state(*table))).bind(site_id.as_str());
+                (*table, states.iter().map(|state| select().bind(*state)).collect())
+            }
+        };
+        for select in selects {
+            gathered.take(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
         }
     }
-    Ok(Snapshot { seq, rows })
+    loop {
+        let missing = gathered.missing();
+        if missing.is_empty() {
+            return Ok(gathered.at(seq));
+        }
+        for (table, ids) in missing {
+            for ids in ids.chunks(GET_KEYS_MAX) {
+                let ids: Vec<&str> = ids.iter().map(|id| &**id).filter(|id| is_text(id)).collect();
+                let select = sqlx::query(AssertSqlSafe(by_ids(table))).bind(site_id.as_str()).bind(ids);
+                gathered.take(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
+            }
+        }
+    }
+}
+
+fn by_ids(table: Table) -> String {
+    format!("SELECT {ROW_READ} FROM {} WHERE site_id = $1 AND id = ANY($2)", table.name())
+}
+
+fn rows_of(table: Table, rows: &[PgRow]) -> Result<Vec<Row>, sqlx::Error> {
+    rows.iter().map(|one| row(table, one)).collect()
 }
 
 /// The newest number that is committed.

@@ -27,7 +27,7 @@ use async_trait::async_trait;
 use file::DataFile;
 use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Entry, Item, Key, Log, Row, Seq, Table, Writer as Author};
+use midshift_core::rows::{Entry, Item, Key, Log, Naming, Part, Row, Seq, Writer as Author};
 use midshift_core::time::Clock;
 use sqlx::SqlitePool;
 use std::collections::{BTreeMap, BTreeSet};
@@ -139,9 +139,8 @@ impl Store for SqliteStore {
         read::list(&self.readers, &self.site_id, &query).await.map_err(unavailable)
     }
 
-    async fn snapshot(&self, tables: &[Table]) -> Result<Snapshot, Error> {
-        let tables: BTreeSet<Table> = tables.iter().copied().collect();
-        read::snapshot(&self.readers, &self.site_id, &tables).await.map_err(unavailable)
+    async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error> {
+        read::read(&self.readers, &self.site_id, parts, named).await.map_err(unavailable)
     }
 
     async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error> {

@@ -5,11 +5,12 @@
 
 use super::write_sql::placeholders;
 use crate::audit::{self, Heads};
+use crate::gather::Gathered;
 use crate::queue::unavailable;
 use crate::sql::{self, ENTRY_READ, ROW_READ, entry, row};
 use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, Query, Snapshot, page_of};
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Entry, Key, Log, Row, Seq, Table};
+use midshift_core::rows::{Entry, Key, Log, Naming, Part, Row, Seq, Table};
 use sqlx::sqlite::{SqliteArguments, SqliteRow};
 use sqlx::{AssertSqlSafe, Row as _, Sqlite, SqliteConnection, SqlitePool};
 use std::collections::{BTreeMap, BTreeSet};
@@ -97,21 +98,44 @@ async fn list_one(
     rows.iter().map(|found| row(query.table, found)).collect()
 }
 
-pub(super) async fn snapshot(
+pub(super) async fn read(
     readers: &SqlitePool,
     site_id: &SiteId,
-    tables: &BTreeSet<Table>,
+    parts: &[Part],
+    named: Naming,
 ) -> Result<Snapshot, sqlx::Error> {
     let mut transaction = readers.begin().await?;
     let seq = super::writer::head(&mut transaction, site_id).await?;
-    let mut rows = Vec::new();
-    for table in tables {
-        let select = prepared(sql::whole(*table));
-        for found in select.bind(site_id.as_str()).fetch_all(&mut *transaction).await? {
-            rows.push(row(*table, &found)?);
+    let mut gathered = Gathered::new(named);
+    for part in parts {
+        let (table, selects) = match part {
+            Part::Whole(table) => (*table, vec![prepared(sql::whole(*table)).bind(site_id.as_str())]),
+            Part::InStates(table, states) => {
+                let one = |state: &i64| prepared(sql::in_state(*table)).bind(site_id.as_str()).bind(*state);
+                (*table, states.iter().map(one).collect())
+            }
+        };
+        for select in selects {
+            gathered.take(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
         }
     }
-    Ok(Snapshot { seq, rows })
+    loop {
+        let missing = gathered.missing();
+        if missing.is_empty() {
+            return Ok(gathered.at(seq));
+        }
+        for (table, ids) in missing {
+            for ids in ids.chunks(IDS_PER_STATEMENT) {
+                let ids: Vec<&Arc<str>> = ids.iter().collect();
+                let rows = select(site_id, table, &ids).fetch_all(&mut *transaction).await?;
+                gathered.take(rows_of(table, &rows)?);
+            }
+        }
+    }
+}
+
+fn rows_of(table: Table, rows: &[SqliteRow]) -> Result<Vec<Row>, sqlx::Error> {
+    rows.iter().map(|one| row(table, one)).collect()
 }
 
 pub(super) async fn feed(

@@ -1,7 +1,9 @@
 //! The contract of a store, the same for every engine.
 
 use crate::support::{WALL, at, indexed, item, one, put};
-use midshift_core::rows::{Expect, Fact, Index, Item, Key, Log, Revision, RowChange, Seq, Table, Write, Writer};
+use midshift_core::rows::{
+    Expect, Fact, Index, Item, Key, Log, Naming, Part, Revision, Row, RowChange, Seq, Table, Write, Writer,
+};
 use midshift_store::{CommitError, Cursor, Error, Query, Retention, Store};
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -31,6 +33,7 @@ contract! {
     an_item_over_its_limit_or_with_a_row_twice_is_refused
     a_list_pages_through_every_row_once_in_both_directions
     a_list_filters_by_state_and_parent_as_they_are_now
+    a_reading_holds_its_parts_and_what_they_name_and_nothing_else
     a_submit_between_snapshot_and_commit_does_not_spoil_the_plan
     concurrent_writers_all_make_progress_and_numbers_have_no_holes
     a_row_reads_back_as_written_in_every_table
@@ -253,6 +256,38 @@ async fn a_list_filters_by_state_and_parent_as_they_are_now(store: Arc<dyn Store
     assert_eq!(ids(all().of_parent("t1")).await, ["b", "a"]);
     assert_eq!(ids(all().of_parent("t1").in_states([3])).await, ["a"]);
     assert_eq!(ids(Query { limit: 1, newest_first: true, ..all().in_states([2, 3]) }).await, ["c"]);
+}
+
+async fn a_reading_holds_its_parts_and_what_they_name_and_nothing_else(store: Arc<dyn Store>) {
+    let state = |id: &str, state, body: &str| {
+        let index = Index { state: Some(state), ..Index::default() };
+        indexed(Table::TaskState, id, Expect::Absent, body, index)
+    };
+    // The body names what is read with it: of the task the intake, and of that another task.
+    let rows = vec![state("live", 1, "0"), state("over", 2, "0"), state("awaited", 2, "0"), state("live-too", 3, "0")];
+    one(&*store, Writer::Task, rows).await.unwrap();
+    let intake = |id: &str, body: &str| put(Table::TaskIntake, id, Expect::Absent, body);
+    let rows = vec![intake("live", "\"awaited\""), intake("live-too", "\"nobody\""), intake("over", "\"over\"")];
+    one(&*store, Writer::Task, rows).await.unwrap();
+    one(&*store, Writer::Fleet, vec![put(Table::Site, "north", Expect::Absent, "{}")]).await.unwrap();
+    let named: Naming = |rows| {
+        let of = |row: &Row| match row.key.table {
+            Table::TaskState if row.index.state != Some(2) => Some(Key::new(Table::TaskIntake, &row.key.id)),
+            Table::TaskIntake => Some(Key::new(Table::TaskState, row.body.trim_matches('"'))),
+            _ => None,
+        };
+        rows.iter().filter_map(of).collect()
+    };
+    let parts = [Part::InStates(Table::TaskState, vec![1, 3, 7]), Part::Whole(Table::Site), Part::Whole(Table::Timer)];
+    let read = store.read(&parts, named).await.unwrap();
+    let keys: Vec<(Table, &str)> = read.rows.iter().map(|row| (row.key.table, &*row.key.id)).collect();
+    let task = |id| (Table::TaskState, id);
+    let intakes = [(Table::TaskIntake, "live"), (Table::TaskIntake, "live-too")];
+    let rest = [task("awaited"), task("live"), task("live-too"), (Table::Site, "north")];
+    assert_eq!(keys, [&intakes[..], &rest[..]].concat());
+    assert_eq!(read.seq, store.snapshot(&[]).await.unwrap().seq);
+    let none = store.read(&[], named).await.unwrap();
+    assert!(none.rows.is_empty());
 }
 
 async fn a_submit_between_snapshot_and_commit_does_not_spoil_the_plan(store: Arc<dyn Store>) {

@@ -1,7 +1,7 @@
 //! A service over a store in memory, and somebody who plays fleet: either by core's own law or row by row.
 
 use midshift_core::fleet::rows::HoldToken;
-use midshift_core::fleet::{LOGS, Plan, absorb, view::TABLES, view::View};
+use midshift_core::fleet::{LOGS, Plan, absorb, view, view::View};
 use midshift_core::ids::{AttemptId, RobotId, SiteId, StopId, Subject, TaskId};
 use midshift_core::robot::StopLevel;
 use midshift_core::rows::{Item, Key, Record, Revision, Seq, Writer};
@@ -80,7 +80,7 @@ impl World {
     pub async fn fleet_turns(&self) {
         let now = At(NOON).now();
         let mut view = View::new(self.site.clone(), now, now);
-        let snapshot = self.store.snapshot(TABLES).await.expect("a snapshot");
+        let snapshot = self.store.read(&view::alive(), view::named).await.expect("a snapshot");
         view.load(&snapshot.rows, snapshot.seq).expect("rows that can be read");
         let begin = view.marks.get("fleet").map_or(NOON_SEQ, |m| m.row.seq);
         let page = self.store.feed(begin, LOGS, 5_000).await.expect("a feed");

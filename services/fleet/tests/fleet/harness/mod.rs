@@ -14,7 +14,7 @@ pub use shaky::Shaky;
 
 use midshift_core::fleet::bugs::Bugs;
 use midshift_core::ids::{RobotId, SiteId, TaskId};
-use midshift_core::rows::{Entry, Expect, Item, Record, Seq, Writer};
+use midshift_core::rows::{Entry, Expect, Item, Record, Seq, Table, Writer};
 use midshift_core::site::{Site, text};
 use midshift_core::stop::record::StopRecord;
 use midshift_core::task::forms::Transport;
@@ -405,7 +405,7 @@ impl World {
 
     /// All rows as they are now.
     pub async fn seen(&self) -> Seen {
-        let snapshot = self.store.snapshot(midshift_core::fleet::view::TABLES).await.expect("a snapshot");
+        let snapshot = self.store.snapshot(Table::ALL).await.expect("a snapshot");
         Seen::of(snapshot.rows)
     }
 

@@ -4,11 +4,12 @@
 use async_trait::async_trait;
 use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Expect, Item, Key, Log, Row, Seq, Table, Writer};
+use midshift_core::rows::{Expect, Item, Key, Log, Naming, Part, Row, Seq, Table, Writer};
 use midshift_store::{Applied, CommitError, Error, FeedPage, Query, Retention, Snapshot, Store, StoreId};
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 use tokio::sync::watch;
 
 /// Items written over another's before the store is itself again.
@@ -27,6 +28,10 @@ pub struct Shaky {
     outrun: Mutex<Option<Table>>,
     /// Items that touch this table are too large.
     narrow: Mutex<Option<Table>>,
+    /// A reading of the picture takes so long.
+    reads_for: Mutex<Duration>,
+    /// Rows and entries that were read through this handle.
+    rows_read: AtomicU64,
 }
 
 impl Shaky {
@@ -37,6 +42,8 @@ impl Shaky {
             freezes: AtomicBool::new(false),
             outrun: Mutex::new(None),
             narrow: Mutex::new(None),
+            reads_for: Mutex::new(Duration::ZERO),
+            rows_read: AtomicU64::new(0),
             inner,
             failing: AtomicBool::new(false),
             failed: AtomicU64::new(0),
@@ -62,6 +69,17 @@ impl Shaky {
     /// From now on somebody else is always faster to write rows of this table.
     pub fn outrun(&self, table: Option<Table>) {
         *self.outrun.lock().expect("not poisoned") = table;
+    }
+    /// From now on a reading of the picture takes so long.
+    pub fn read_for(&self, time: Duration) {
+        *self.reads_for.lock().expect("not poisoned") = time;
+    }
+    /// Rows and entries read through this handle since the last call.
+    pub fn rows_read(&self) -> u64 {
+        self.rows_read.swap(0, Ordering::Relaxed)
+    }
+    fn count(&self, rows: usize) {
+        self.rows_read.fetch_add(rows as u64, Ordering::Relaxed);
     }
     async fn thaws(&self) {
         // The sender is here.
@@ -162,18 +180,30 @@ impl Store for Shaky {
     }
     async fn get(&self, keys: Vec<Key>) -> Result<Vec<Row>, Error> {
         self.thaws().await;
-        self.inner.get(keys).await
+        let rows = self.inner.get(keys).await?;
+        self.count(rows.len());
+        Ok(rows)
     }
     async fn list(&self, query: Query) -> Result<Vec<Row>, Error> {
-        self.inner.list(query).await
+        let rows = self.inner.list(query).await?;
+        self.count(rows.len());
+        Ok(rows)
     }
-    async fn snapshot(&self, tables: &[Table]) -> Result<Snapshot, Error> {
+    async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error> {
         self.thaws().await;
-        self.inner.snapshot(tables).await
+        let time = *self.reads_for.lock().expect("not poisoned");
+        if !time.is_zero() {
+            tokio::time::sleep(time).await;
+        }
+        let snapshot = self.inner.read(parts, named).await?;
+        self.count(snapshot.rows.len());
+        Ok(snapshot)
     }
     async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error> {
         self.thaws().await;
-        self.inner.feed(after, logs, limit).await
+        let page = self.inner.feed(after, logs, limit).await?;
+        self.count(page.entries.len());
+        Ok(page)
     }
     async fn feed_of(&self, log: Log, subjects: &[Arc<str>], after: Seq, limit: usize) -> Result<FeedPage, Error> {
         self.inner.feed_of(log, subjects, after, limit).await
