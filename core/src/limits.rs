@@ -240,6 +240,8 @@ pub const SITE_WAYPOINTS_MAX: usize = 250_000;
 pub const SITE_LANES_MAX: usize = 1_000_000;
 /// Places of one site.
 pub const SITE_PLACES_MAX: usize = 50_000;
+/// Robots whose starting places one site names: twice what one server is built for.
+pub const SITE_ROBOTS_MAX: usize = 20_000;
 /// Areas of one site.
 pub const SITE_AREAS_MAX: usize = 1_000;
 /// Memory that a router keeps for distance fields, bytes; the least recently used go first.

@@ -116,12 +116,15 @@ impl HallConfig {
         let site = &self.site;
         let mut seats = match &self.starts {
             Some(starts) => starts.clone(),
-            None if site.source() == Source::Grid => {
+            None if site.source() == Source::Grid && site.starts().is_empty() => {
                 let mut cells: Vec<_> = (0..site.waypoints().len() as u32).map(WaypointIx).collect();
                 cells.shuffle(&mut ChaCha8Rng::seed_from_u64(self.seed ^ 0x6772_6964));
                 cells
             }
-            None => site.starting_places(self.count),
+            None => {
+                let robots = (0..self.count).map(|index| self.robot_id(index)).collect::<Result<Vec<_>, _>>()?;
+                site.starts_of(&robots)
+            }
         };
         let found = seats.len();
         if found < self.count && (!self.crowded || found == 0) {

@@ -58,6 +58,9 @@ enum Verb {
         /// `torture kills|simulation|stops|stories --from SEED --seeds 1`.
         #[arg(long)]
         from: Option<u64>,
+        /// What runs every night: whole stories with four seeds.
+        #[arg(long, conflicts_with_all = ["sweeps", "seeds"])]
+        nightly: bool,
     },
     /// The stack of a compose file as processes of this machine, without docker.
     #[command(subcommand)]
@@ -73,7 +76,10 @@ enum Verb {
 fn main() -> ExitCode {
     let outcome = workspace::Workspace::find().and_then(|workspace| match Cli::parse().verb {
         Verb::Test { install, no_docker, parts } => suite::test(&workspace, install, no_docker, &parts),
-        Verb::Torture { sweeps, seeds, from } => sweep::torture(&workspace, &sweeps, from, seeds),
+        Verb::Torture { nightly: true, from, .. } => {
+            sweep::torture(&workspace, &sweep::NIGHTLY, from, Some(sweep::NIGHTLY_SEEDS))
+        }
+        Verb::Torture { sweeps, seeds, from, .. } => sweep::torture(&workspace, &sweeps, from, seeds),
         Verb::Stack(verb) => stack::run(&workspace, verb),
         Verb::Dist(options) => dist::dist(&workspace, &options),
         Verb::Golden => sweep::golden(&workspace),

@@ -35,6 +35,10 @@ pub enum Sweep {
     Stories,
 }
 
+/// What runs every night, and with how many seeds.
+pub const NIGHTLY: [Sweep; 1] = [Sweep::Stories];
+pub const NIGHTLY_SEEDS: u64 = 4;
+
 impl Sweep {
     const ALL: [Self; 7] =
         [Self::Kills, Self::Simulation, Self::Split, Self::Updates, Self::Latch, Self::Stops, Self::Stories];

@@ -8,7 +8,7 @@ use super::pool::Candidate;
 use super::rows::{RobotControl, Timer, TimerKind};
 use super::tasks::{arm, disarm, end_attempt};
 use super::view::View;
-use super::{Board, Plan, attempts};
+use super::{Board, Plan, attempts, starts};
 use crate::ids::{AttemptId, RobotId, Subject, WaypointId};
 use crate::limits;
 use crate::reason::Reason;
@@ -121,7 +121,7 @@ fn free(
         let Some(row) = view.places.get(place.place_id.as_str()).map(|p| &p.row) else { return false };
         let coming = coming.0.get(view.site.name_of(*at)).copied().unwrap_or_default();
         row.holder(robot_id).is_some()
-            || (row.quarantine.is_none() && row.holders.len() + coming < row.capacity as usize)
+            || (row.quarantine.is_none() && starts::taken(view, ix, row, robot_id) + coming < row.capacity as usize)
     });
     view.router.nearest(here, open).map(|(at, _)| at)
 }

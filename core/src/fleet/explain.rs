@@ -1,12 +1,12 @@
 //! Why a task is not running and why a robot has no work: the planner's own filters, run again for one of them. Stores nothing.
 
 use super::view::View;
-use super::{Board, assign, screen, way};
+use super::{Board, assign, screen, starts, way};
 use crate::ids::{RobotId, TaskId};
 use crate::reason::{Code, Reason};
 use crate::task::Phase;
 use crate::time::Now;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Candidates listed one by one; the others only by reason.
 const CANDIDATES_MAX: usize = 64;
@@ -78,10 +78,29 @@ pub fn task(view: &View, board: &Board, now: &Now, task_id: &TaskId) -> Option<T
     Some(TaskExplanation { position, verdict, candidates, filtered })
 }
 
-fn place_wait(view: &View, robot_id: &RobotId) -> Option<Reason> {
+/// Which places the robot waits for, who has them, and for whom they are kept. None: it waits for none.
+pub fn place_wait(view: &View, robot_id: &RobotId) -> Option<Reason> {
     let wait = view.waits.get(robot_id)?;
+    let others = |ids: BTreeSet<&RobotId>| {
+        let others = ids.into_iter().filter(|id| *id != robot_id);
+        others.map(RobotId::as_str).collect::<Vec<_>>().join(" ")
+    };
+    let rows = wait.places.iter().filter_map(|id| view.places.get(id.as_str()));
+    let held_by = others(rows.flat_map(|place| &place.row.holders).map(|holder| &holder.robot_id).collect());
+    let known = wait.places.iter().filter_map(|id| view.site.find_place(id));
+    let kept_for = others(known.flat_map(|place| starts::awaited(view, place)).collect());
+    let message = match (held_by.is_empty(), kept_for.is_empty()) {
+        (true, false) => "waits for a place that is kept for a robot that starts there and was not heard yet",
+        _ => "waits for a place that another robot holds",
+    };
     let places = wait.places.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ");
-    Some(Reason::new(Code::PlaceBlocked, "waits for a place that another robot holds").with("places", places))
+    let mut reason = Reason::new(Code::PlaceBlocked, message).with("places", places);
+    for (key, robots) in [("held_by", held_by), ("kept_for", kept_for)] {
+        if !robots.is_empty() {
+            reason = reason.with(key, robots);
+        }
+    }
+    Some(reason)
 }
 
 /// Why one task does not go to the robot.
@@ -100,8 +119,8 @@ pub struct TaskCandidate {
 pub struct RobotExplanation {
     /// None: it may be given work.
     pub verdict: Option<Reason>,
-    /// Places it waits for.
-    pub waits_for: Vec<crate::ids::PlaceId>,
+    /// Places it waits for, and who has them. None: it waits for none.
+    pub place_wait: Option<Reason>,
     /// Waiting tasks in the order in which they are served.
     pub candidates: Vec<TaskCandidate>,
 }
@@ -125,7 +144,7 @@ pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Optio
     });
     Some(RobotExplanation {
         verdict: screen::robot(view, board, robot_id, now).err(),
-        waits_for: view.waits.get(robot_id).map(|w| w.places.clone()).unwrap_or_default(),
+        place_wait: place_wait(view, robot_id),
         candidates: candidates.collect(),
     })
 }

@@ -2,7 +2,7 @@
 //!
 //! [`cycle`] takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
 //! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `commands` (`asked`: which there are) are what happens; `tasks` moves tasks by
-//! the table; `heard`, `anchor`, `attempts` and `incidents` are what they share; `screen`, `pool` and `assign` give work; `stops` and `stopped` keep it from who is stopped; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
+//! the table; `heard`, `anchor`, `attempts` and `incidents` are what they share; `screen`, `pool` and `assign` give work; `stops` and `stopped` keep it from who is stopped; `starts` keeps places for robots that are to come; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod anchor;
@@ -27,6 +27,7 @@ pub mod repair;
 pub mod requests;
 pub mod rows;
 pub mod screen;
+pub mod starts;
 pub mod stopped;
 pub mod stops;
 pub mod tasks;

@@ -9,7 +9,7 @@ use super::anchor::next_generation;
 use super::desired::{Release, Releases};
 use super::rows::{HolderState, Place, PlaceHolder};
 use super::view::{View, Waiting};
-use super::{Board, Plan, inbox, way};
+use super::{Board, Plan, inbox, starts, way};
 use crate::ids::{AreaId, PlaceId, RobotId};
 use crate::robot::Presence;
 use crate::site::route::{Segment, segments};
@@ -170,7 +170,7 @@ fn next_segment(view: &View, robot_id: &RobotId, a: &Attempt, work: &Assignment)
 struct Traffic {
     /// Places that an earlier wish waits for.
     blocked: BTreeSet<PlaceIx>,
-    /// Robots that hold a standing place of an area.
+    /// Robots that hold a standing place of an area, or start in one.
     inside: BTreeMap<AreaIx, BTreeSet<RobotId>>,
 }
 
@@ -183,6 +183,9 @@ impl Traffic {
             for holder in &row.holders {
                 traffic.enter(view, &holder.robot_id, place);
             }
+        }
+        for (robot_id, place) in starts::all_awaited(view) {
+            traffic.enter(view, robot_id, view.site.place(place));
         }
         traffic
     }
@@ -245,7 +248,7 @@ fn kept_free(view: &View, robot_id: &RobotId, needed: &[PlaceIx], traffic: &Traf
 
 fn has_seat(view: &View, robot_id: &RobotId, ix: PlaceIx) -> bool {
     let place = view.places.get(view.site.place(ix).place_id.as_str()).map(|p| &p.row);
-    place.is_some_and(|p| p.holder(robot_id).is_some() || p.has_room())
+    place.is_some_and(|p| p.holder(robot_id).is_some() || starts::has_room(view, ix, p, robot_id))
 }
 
 /// Places on the released stretch ahead that a standing robot does not hold: a passage that its route crosses a second time, or grants that
@@ -273,7 +276,7 @@ fn grantable(view: &View, robot_id: &RobotId, needed: &[PlaceIx], traffic: &Traf
         let place = view.places.get(view.site.place(*ix).place_id.as_str()).map(|p| &p.row);
         place.is_some_and(|p| match p.holder(robot_id) {
             Some(holder) => holder.state != HolderState::Revoking,
-            None => p.has_room() && !traffic.blocked.contains(ix),
+            None => starts::has_room(view, *ix, p, robot_id) && !traffic.blocked.contains(ix),
         })
     })
 }

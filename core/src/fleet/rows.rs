@@ -55,10 +55,6 @@ impl Place {
     pub fn holder(&self, robot: &RobotId) -> Option<&PlaceHolder> {
         self.holders.iter().find(|h| h.robot_id == *robot)
     }
-    /// Whether one more may be admitted.
-    pub fn has_room(&self) -> bool {
-        self.quarantine.is_none() && self.holders.len() < self.capacity as usize
-    }
 }
 
 impl Record for Place {

@@ -4,8 +4,8 @@ use super::{
     Area, AreaDefaults, AreaIx, Inside, Kind, Lane, LaneIx, Place, PlaceIx, PlaceKind, Site, Source, Waypoint,
     WaypointIx,
 };
-use crate::ids::{AreaId, PlaceId, SiteId, WaypointId};
-use crate::limits::{SITE_AREAS_MAX, SITE_LANES_MAX, SITE_PLACES_MAX, SITE_WAYPOINTS_MAX};
+use crate::ids::{AreaId, PlaceId, RobotId, SiteId, WaypointId};
+use crate::limits::{SITE_AREAS_MAX, SITE_LANES_MAX, SITE_PLACES_MAX, SITE_ROBOTS_MAX, SITE_WAYPOINTS_MAX};
 use crate::reason::{Refusal, Violations};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -53,6 +53,13 @@ pub(super) struct DraftPassage {
     pub waypoints: Vec<String>,
 }
 
+/// A robot as read, and the waypoint where it starts.
+pub(super) struct DraftRobot {
+    pub field: String,
+    pub id: String,
+    pub at: String,
+}
+
 /// A whole site as read.
 pub(super) struct Draft {
     pub site_id: String,
@@ -65,6 +72,7 @@ pub(super) struct Draft {
     pub waypoints: Vec<DraftWaypoint>,
     pub lanes: Vec<DraftLane>,
     pub passages: Vec<DraftPassage>,
+    pub robots: Vec<DraftRobot>,
 }
 
 impl Draft {
@@ -104,8 +112,11 @@ impl Draft {
             places: passages,
             waypoint_names,
             place_names: BTreeMap::new(),
+            starts: BTreeMap::new(),
+            starting: BTreeMap::new(),
         };
         add_standing_places(v, &mut site, &capacities);
+        add_starts(v, &mut site, self.robots);
         check_count(v, "place", site.places.len(), 0, SITE_PLACES_MAX);
         check_nothing_stands_inside(v, &site);
         found.finish()?;
@@ -281,6 +292,31 @@ fn add_standing_places(v: &mut Violations, site: &mut Site, capacities: &[u32]) 
     for (at, place) in site.places.iter().enumerate() {
         if site.place_names.insert(place.place_id.clone(), PlaceIx(at as u32)).is_some() {
             v.add("passage.id", format!("two places are called {}", place.place_id));
+        }
+    }
+}
+
+/// Gives robots their starting places. Where places are reserved, each must be one, and no more robots start there than it holds.
+pub(super) fn add_starts(v: &mut Violations, site: &mut Site, robots: Vec<DraftRobot>) {
+    check_count(v, "robot", robots.len(), 0, SITE_ROBOTS_MAX);
+    for DraftRobot { field, id, at } in robots {
+        let Some(robot_id) = v.take(&format!("{field}.id"), RobotId::parse(&id)) else { continue };
+        let Some(waypoint) = find(v, &format!("{field}.at"), &site.waypoint_names, &at) else { continue };
+        if site.starts.insert(robot_id.clone(), waypoint).is_some() {
+            v.add(format!("{field}.id"), format!("robot {robot_id} is there twice"));
+            continue;
+        }
+        let Some(place) = site.standing_at(waypoint) else {
+            if site.collisions_modelled {
+                v.add(format!("{field}.at"), format!("{at} is no place to stand: a station, charger, park or hold is"));
+            }
+            continue;
+        };
+        let capacity = site.place(place).capacity;
+        let starting = site.starting.entry(place).or_default();
+        starting.push(robot_id);
+        if starting.len() > capacity as usize {
+            v.add(format!("{field}.at"), format!("{at} holds {capacity}, and more robots start there"));
         }
     }
 }

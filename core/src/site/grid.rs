@@ -128,6 +128,7 @@ pub fn parse_map(name: &str, text: &str) -> Result<Site, Refusal> {
         waypoints,
         lanes,
         passages: Vec::new(),
+        robots: Vec::new(),
     };
     draft.build(v)
 }

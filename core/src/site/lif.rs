@@ -149,6 +149,7 @@ pub fn parse(name: &str, text: &str) -> Result<Import, Refusal> {
         waypoints: reader.waypoints,
         lanes: reader.lanes,
         passages: Vec::new(),
+        robots: Vec::new(),
     };
     let site = draft.build(reader.violations)?;
     Ok(Import { site, warnings: reader.warnings })

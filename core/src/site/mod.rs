@@ -14,8 +14,9 @@ pub mod show;
 pub mod task_list;
 pub mod text;
 
-use crate::ids::{AreaId, PlaceId, SiteId, WaypointId};
+use crate::ids::{AreaId, PlaceId, RobotId, SiteId, WaypointId};
 use crate::policy::{AreaPolicy, SoftwareRules};
+use crate::reason::{Refusal, Violations};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -251,6 +252,10 @@ pub struct Site {
     places: Vec<Place>,
     waypoint_names: BTreeMap<WaypointId, WaypointIx>,
     place_names: BTreeMap<PlaceId, PlaceIx>,
+    /// Where robots start, as the site file says.
+    starts: BTreeMap<RobotId, WaypointIx>,
+    /// Robots that start in a standing place, by name.
+    starting: BTreeMap<PlaceIx, Vec<RobotId>>,
     /// `lanes` is sorted by (from, to): those from waypoint w are `leaving[w]..leaving[w + 1]`.
     leaving: Vec<u32>,
     /// Lanes sorted by (to, from) ...
@@ -410,6 +415,48 @@ impl Site {
     pub fn area_capacity(&self, area: AreaIx) -> u64 {
         let inside = self.waypoints.iter().filter(|w| w.area == area).filter_map(|w| w.standing);
         inside.map(|p| u64::from(self.place(p).capacity)).sum()
+    }
+    /// Where robots start, as the site file names them.
+    pub fn starts(&self) -> &BTreeMap<RobotId, WaypointIx> {
+        &self.starts
+    }
+    /// Robots that start in this standing place. Empty: the site file names none.
+    pub fn starting_in(&self, place: PlaceIx) -> &[RobotId] {
+        self.starting.get(&place).map_or(&[], Vec::as_slice)
+    }
+    /// The same site whose robots start here instead, and nowhere else.
+    ///
+    /// # Errors
+    /// The rules for `robot` in a site file.
+    pub fn with_starts(mut self, robots: &[(RobotId, WaypointId)]) -> Result<Self, Refusal> {
+        self.starts.clear();
+        self.starting.clear();
+        let draft = |(id, at): &(RobotId, WaypointId)| draft::DraftRobot {
+            field: "robot".to_owned(),
+            id: id.to_string(),
+            at: at.to_string(),
+        };
+        let mut violations = Violations::default();
+        draft::add_starts(&mut violations, &mut self, robots.iter().map(draft).collect());
+        violations.finish()?;
+        Ok(self)
+    }
+    /// Where each of `robots` starts: where the site file says, else in the next of [`Site::starting_places`] that it gives to nobody. May be
+    /// shorter than asked.
+    pub fn starts_of(&self, robots: &[RobotId]) -> Vec<WaypointIx> {
+        let mut named: BTreeMap<WaypointIx, usize> = BTreeMap::new();
+        for at in self.starts.values() {
+            *named.entry(*at).or_default() += 1;
+        }
+        let seats = self.starting_places(robots.len() + self.starts.len());
+        let mut free = seats.into_iter().filter(|at| match named.get_mut(at) {
+            Some(left) if *left > 0 => {
+                *left -= 1;
+                false
+            }
+            _ => true,
+        });
+        robots.iter().map_while(|robot| self.starts.get(robot).copied().or_else(|| free.next())).collect()
     }
     /// Where `robots` may stand when a site is set up from nothing: parking places first, then chargers, hold points, and
     /// last, where nothing is reserved, any waypoint; each place up to its capacity. May be shorter than asked.

@@ -19,9 +19,10 @@
 //!   { path = ["j1", "j2"], ways = "two" },                # ways: one, two (single width), wide (side by side)
 //! ]
 //! passage = [ { id = "door", rule = "exclusive", lanes = [["j1", "j2"], ["j2", "j1"]] } ]
+//! robot = [ { id = "rbt-01", at = "A01" } ]               # where it starts: kept free for it until it is heard; may be left out
 //! ```
 
-use super::draft::{Draft, DraftArea, DraftLane, DraftPassage, DraftWaypoint};
+use super::draft::{Draft, DraftArea, DraftLane, DraftPassage, DraftRobot, DraftWaypoint};
 use super::{Area, AreaDefaults, Kind, Lane, Place, PlaceKind, Site, Source, Waypoint};
 use crate::limits::SITE_FILE_BYTES;
 use crate::reason::{Refusal, Violations};
@@ -49,6 +50,8 @@ struct RawFile {
     lane: Vec<Spanned<toml::Table>>,
     #[serde(default)]
     passage: Vec<Spanned<toml::Table>>,
+    #[serde(default)]
+    robot: Vec<Spanned<toml::Table>>,
 }
 
 #[derive(Deserialize)]
@@ -120,6 +123,13 @@ struct RawPassage {
     waypoints: Vec<String>,
 }
 
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawRobot {
+    id: String,
+    at: String,
+}
+
 /// Reads a site file. Errors: every mistake, each with its line.
 pub fn parse(text: &str) -> Result<Site, Refusal> {
     if text.len() > SITE_FILE_BYTES {
@@ -138,6 +148,8 @@ pub fn parse(text: &str) -> Result<Site, Refusal> {
     }
     let raw_passages = reader.many("passage", file.passage);
     let passages = raw_passages.into_iter().map(|(f, raw)| passage(&mut reader.violations, f, raw)).collect();
+    let robots = reader.many("robot", file.robot).into_iter();
+    let robots = robots.map(|(field, RawRobot { id, at })| DraftRobot { field, id, at }).collect();
     let draft = Draft {
         site_id: file.site_id,
         name: file.name,
@@ -149,6 +161,7 @@ pub fn parse(text: &str) -> Result<Site, Refusal> {
         waypoints,
         lanes,
         passages,
+        robots,
     };
     draft.build(reader.violations)
 }
@@ -253,6 +266,14 @@ fn write_site(site: &Site, out: &mut String) -> std::fmt::Result {
     site.lanes().iter().try_for_each(|lane| write_lane(site, lane, out))?;
     writeln!(out, "]\n\npassage = [")?;
     site.places().iter().try_for_each(|place| write_passage(site, place, out))?;
+    writeln!(out, "]")?;
+    if site.starts().is_empty() {
+        return Ok(());
+    }
+    writeln!(out, "\nrobot = [")?;
+    for (robot_id, at) in site.starts() {
+        writeln!(out, "  {{ id = {}, at = {} }},", quoted(robot_id.as_str()), quoted(site.name_of(*at).as_str()))?;
+    }
     writeln!(out, "]")
 }
 
@@ -332,6 +353,7 @@ fn write_lane(site: &Site, lane: &Lane, out: &mut String) -> std::fmt::Result {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ids::{PlaceId, RobotId};
     use crate::site::{CORRIDOR, DEMO};
 
     fn text_of(lanes: &str, more: &str) -> String {
@@ -359,6 +381,34 @@ mod tests {
         let site = parse(&plain.replace("id = \"a\" ", "id = \"a\", acts_on_rates = true ")).expect("reads");
         assert!(acts(&site));
         assert_eq!(parse(&render(&site)).expect("its own text reads"), site);
+    }
+
+    #[test]
+    fn a_site_names_where_its_robots_start_and_who_has_no_name_there_starts_elsewhere() {
+        let robots = "robot = [{ id = \"rbt-02\", at = \"park-a\" }, { id = \"rbt-03\", at = \"A\" }]\n";
+        let site = parse(&format!("{CORRIDOR}\n{robots}")).expect("reads");
+        assert_eq!(parse(&render(&site)).expect("its own text reads"), site);
+        let ids = ["rbt-01", "rbt-02", "rbt-03"].map(|id| RobotId::parse(id).expect("an id"));
+        let starts = site.starts_of(&ids).into_iter().map(|at| site.name_of(at).as_str()).collect::<Vec<_>>();
+        assert_eq!(starts, ["park-b", "park-a", "A"]);
+        let park = site.find_place(&PlaceId::parse("park-a").expect("an id")).expect("a place");
+        assert_eq!(site.starting_in(park), &ids[1..2]);
+    }
+
+    #[test]
+    fn a_robot_that_cannot_start_where_the_site_says_is_a_mistake_in_its_line() {
+        let robots = "robot = [\n{ id = \"r1\", at = \"park-a\" },\n{ id = \"r2\", at = \"park-a\" },\n\
+             { id = \"r3\", at = \"a-in\" },\n{ id = \"r1\", at = \"A\" },\n{ id = \"r4\", at = \"nowhere\" },\n]";
+        let first = CORRIDOR.lines().count() + 2;
+        let refusal = parse(&format!("{CORRIDOR}{robots}")).expect_err("four mistakes");
+        let all: Vec<_> = refusal.violations.iter().map(|v| format!("{}: {}", v.field, v.description)).collect();
+        let expected = [
+            (1, "at: park-a holds 1, and more robots start there"),
+            (2, "at: a-in is no place to stand: a station, charger, park or hold is"),
+            (3, "id: robot r1 is there twice"),
+            (4, "at: there is no waypoint \"nowhere\""),
+        ];
+        assert_eq!(all, expected.map(|(line, text)| format!("robot (line {}).{text}", first + line)));
     }
 
     #[test]

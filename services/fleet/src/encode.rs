@@ -2,9 +2,9 @@
 
 use midshift_core::fleet::explain::{RobotExplanation, TaskExplanation};
 use midshift_core::fleet::rows::{Cordon, HolderState, Incident, Place, RobotControl, RobotCounter, RobotHolder};
+use midshift_core::fleet::starts;
 use midshift_core::fleet::view::View;
 use midshift_core::ids::{RobotId, TaskId};
-use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::Duty;
 use midshift_core::rows::Revision;
 use midshift_core::site::PlaceKind;
@@ -105,6 +105,8 @@ pub fn place(view: &View, row: &Place, revision: Revision) -> v1::Place {
         .map(|(r, w)| (w.since, r.to_string()))
         .collect();
     waiting.sort();
+    let ix = view.site.find_place(&row.place_id);
+    let awaited = ix.into_iter().flat_map(|ix| starts::awaited(view, ix)).map(ToString::to_string).collect();
     let area = site.and_then(|p| p.waypoint()).map(|w| view.site.area_of(w).area_id.to_string());
     v1::Place {
         place_id: row.place_id.to_string(),
@@ -128,6 +130,7 @@ pub fn place(view: &View, row: &Place, revision: Revision) -> v1::Place {
         quarantine: row.quarantine.as_ref().map(shown),
         etag: etag(revision),
         area_id: area.unwrap_or_default(),
+        awaited_robot_ids: awaited,
     }
 }
 
@@ -160,13 +163,9 @@ pub fn task_explanation(task_id: &TaskId, e: &TaskExplanation, now: Utc) -> v1::
 
 /// Why a robot has no work, or what it does.
 pub fn robot_explanation(view: &View, now: &Now, robot_id: &RobotId, e: &RobotExplanation) -> v1::RobotExplanation {
-    let waits = (!e.waits_for.is_empty()).then(|| {
-        let places = e.waits_for.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ");
-        Reason::new(Code::PlaceBlocked, "waits for a place that another robot holds").with("places", places)
-    });
     v1::RobotExplanation {
         robot_id: robot_id.to_string(),
-        verdict: waits.as_ref().or(e.verdict.as_ref()).map(shown),
+        verdict: e.place_wait.as_ref().or(e.verdict.as_ref()).map(shown),
         candidates: e
             .candidates
             .iter()

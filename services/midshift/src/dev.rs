@@ -4,14 +4,15 @@ use crate::background::{Acknowledged, Background, Pressure, Source, all_stand, r
 use crate::planning::Planning;
 use crate::report::{self, Inputs, Kind, Report};
 use crate::roles::Roles;
-use crate::scenario::{self, Release, Scenario, Sight, Stage, Story};
+use crate::scenario::{self, Launched, Release, Scenario, Sight, Stage, Story};
 use crate::serve::{self, Say};
 use crate::server::{Naive, Parts, Server};
+use crate::site_file::{self, Loaded};
 use crate::stop::{self, Beside};
 use crate::tally::{self, SharedTasks, Tasks};
 use crate::throwaway::Throwaway;
 use crate::under_way::{self, UnderWay};
-use crate::{clock, door, resuming, site_file};
+use crate::{clock, door, resuming};
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 use midshift_agent::trust::Trust;
@@ -160,11 +161,11 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     for warning in &loaded.warnings {
         tracing::warn!(warning, "site");
     }
-    let site = loaded.site.clone();
+    let site = site_of(&args, &loaded)?;
     // Journals of several processes are judged by one clock, so a story's is real and its bodies are fast.
     let clock = clock::clock(if scene.is_some() { 1000 } else { (args.speedup * 1000.0) as u32 });
     crate::recorder::handle();
-    let hall_config = hall_config(&args, &site, scene.as_ref())?;
+    let hall_config = hall_config(&args, &site, scene.as_ref());
     let hall = Arc::new(Hall::open(&hall_config, &clock.now())?);
     let listener = TcpListener::bind(args.listen)
         .await
@@ -310,7 +311,20 @@ impl Scene {
     }
 }
 
-fn hall_config(args: &Dev, site: &Arc<Site>, scene: Option<&Scene>) -> anyhow::Result<HallConfig> {
+/// The site, with a starting place for each robot of the run: nobody else is given it before the robot was heard.
+fn site_of(args: &Dev, loaded: &Loaded) -> anyhow::Result<Arc<Site>> {
+    let site = loaded.site.clone();
+    let mut config = HallConfig::new(site.clone(), args.robots, args.seed);
+    if let Some(path) = &args.agents {
+        let text = std::fs::read_to_string(path).with_context(|| format!("reading {}", path.display()))?;
+        config.starts = Some(grid::parse_starts(&site, &text)?);
+    }
+    let robot_ids = (0..args.robots).map(|index| config.robot_id(index)).collect::<Result<Vec<_>, _>>()?;
+    let starts: Vec<_> = robot_ids.into_iter().zip(config.starting_waypoints()?).collect();
+    Ok(Arc::new(Arc::unwrap_or_clone(site).with_starts(&starts)?))
+}
+
+fn hall_config(args: &Dev, site: &Arc<Site>, scene: Option<&Scene>) -> HallConfig {
     let mut config = HallConfig::new(site.clone(), args.robots, args.seed);
     config.drains = site.chargers().next().is_some();
     if let Some(scene) = scene {
@@ -322,11 +336,7 @@ fn hall_config(args: &Dev, site: &Arc<Site>, scene: Option<&Scene>) -> anyhow::R
     if args.no_faults {
         config.faults = FaultRates::none();
     }
-    if let Some(path) = &args.agents {
-        let text = std::fs::read_to_string(path).with_context(|| format!("reading {}", path.display()))?;
-        config.starts = Some(grid::parse_starts(site, &text)?);
-    }
-    Ok(config)
+    config
 }
 
 async fn stores(
@@ -491,6 +501,7 @@ impl Run {
         let _resuming = AbortOnDropHandle::new(tokio::spawn(resuming::rounds(board.clone(), channel.clone())));
         let progress = report::watch_progress(board, self.clock.clone(), no_progress_ms.clone());
         let _progress = AbortOnDropHandle::new(tokio::spawn(progress));
+        let launched = self.stage.as_ref().map(|(stage, _)| stage.launch()).transpose()?;
         // A run is measured from the moment at which there may be work.
         tokio::select! {
             _ = standing => {}
@@ -499,7 +510,7 @@ impl Run {
         }
         let begun = self.clock.now();
         let story = tokio::select! {
-            story = self.until_over(begun.site, say) => story?,
+            story = self.until_over(begun.site, launched, say) => story?,
             error = parts.first_end() => return Err(error),
         };
         // No more work, then the count, then the end: what is open stays open and is counted so.
@@ -539,9 +550,14 @@ impl Run {
     }
 
     /// Until the story or the site time of `--for` is over, or Ctrl-C; a person at a terminal sees how far it is.
-    async fn until_over(&self, begun: SiteTime, say: Say<'_>) -> anyhow::Result<Option<Story>> {
-        if let Some((stage, _)) = &self.stage {
-            return stage.play(self.stop.clone(), say).await.map(Some);
+    async fn until_over(
+        &self,
+        begun: SiteTime,
+        launched: Option<Launched>,
+        say: Say<'_>,
+    ) -> anyhow::Result<Option<Story>> {
+        if let Some(((stage, _), launched)) = self.stage.as_ref().zip(launched) {
+            return stage.play(launched, self.stop.clone(), say).await.map(Some);
         }
         let Some(run_for) = self.args.run_for else {
             self.stop.cancelled().await;

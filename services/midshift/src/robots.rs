@@ -99,8 +99,8 @@ pub struct AgentRun {
     /// The site file the body lives on. Without it the built-in demo site.
     #[arg(long)]
     pub site: Option<PathBuf>,
-    /// Where a new body stands; later starts find the body where it was left. Without it the first starting place of the site, the same
-    /// for every robot: name one each when there are several.
+    /// Where a new body stands; later starts find the body where it was left. Without it where the site file says that it starts, else the first
+    /// starting place that the file gives to nobody, the same for every such robot: name one each when there are several.
     #[arg(long)]
     pub start: Option<String>,
     /// Seed of the body.
@@ -205,7 +205,7 @@ pub async fn agent_in_hand(
     let start = match &args.start {
         Some(name) => WaypointId::parse(name)?,
         None => site
-            .starting_places(1)
+            .starts_of(std::slice::from_ref(&robot_id))
             .first()
             .map(|at| site.name_of(*at).clone())
             .context("the site has no place to start at; name one with --start")?,

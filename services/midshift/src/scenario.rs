@@ -129,19 +129,23 @@ pub struct Stage {
 }
 
 /// Launched robots; all end with this.
-struct Launched(Vec<Child>);
+pub struct Launched(Vec<Child>);
 
 impl Stage {
     fn robots(&self) -> usize {
         self.in_process + self.launched.len()
     }
 
-    /// Plays all acts.
+    /// Plays all acts with the robots that were launched, which end with it.
     ///
     /// # Errors
     /// A step that could not be taken at all; what went wrong on stage is in the story.
-    pub async fn play(&self, stop: CancellationToken, say: &(dyn Fn(&str) + Sync)) -> anyhow::Result<Story> {
-        let mut launched = self.launch()?;
+    pub async fn play(
+        &self,
+        mut launched: Launched,
+        stop: CancellationToken,
+        say: &(dyn Fn(&str) + Sync),
+    ) -> anyhow::Result<Story> {
         let story = tokio::select! {
             () = stop.cancelled() => Err(anyhow::anyhow!("ended before the story was over")),
             story = self.acts(say) => story,
@@ -171,7 +175,11 @@ impl Stage {
         Ok(story)
     }
 
-    fn launch(&self) -> anyhow::Result<Launched> {
+    /// Starts the robots that are processes of their own: before there is work, which waits for them too.
+    ///
+    /// # Errors
+    /// A process that cannot be started.
+    pub fn launch(&self) -> anyhow::Result<Launched> {
         let program = std::env::current_exe().context("finding this program")?;
         let mut launched = Launched(Vec::new());
         for (robot_id, start) in &self.launched {

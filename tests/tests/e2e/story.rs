@@ -23,10 +23,10 @@ struct Plot {
 
 /// A good release and a bad one; nothing goes wrong by itself, so that chance aborts no good release.
 const SHORT: Plot = Plot {
-    robots: 4,
-    launched: 2,
+    robots: 20,
+    launched: 5,
     bundles: &["1.5.0", "1.6.0-bad-at-start"],
-    flags: &["--robots", "4", "--speedup", "10", "--watched", "3s", "--no-faults", "--bundles", "good,bad-at-start"],
+    flags: &["--robots", "20", "--speedup", "10", "--watched", "3s", "--no-faults", "--bundles", "good,bad-at-start"],
 };
 
 /// All that a user gets without naming anything but robots and their pace.

@@ -21,6 +21,7 @@ mod retries;
 #[path = "../../../../tests/src/postgres.rs"]
 mod server;
 mod several_hosts;
+mod starts;
 mod stopping;
 mod stops;
 mod twins;

@@ -73,11 +73,12 @@ fn row(place: &v1::Place) -> Vec<String> {
         let state = h.state().as_str_name().trim_start_matches("PLACE_HOLDER_STATE_").to_lowercase();
         format!("{} {state}", h.robot_id)
     };
+    let awaited = place.awaited_robot_ids.iter().map(|robot_id| format!("{robot_id} awaited"));
     vec![
         place.place_id.clone(),
         place.kind().as_str_name().trim_start_matches("PLACE_KIND_").to_owned(),
         place.capacity.to_string(),
-        place.holders.iter().map(holder).collect::<Vec<_>>().join(", "),
+        place.holders.iter().map(holder).chain(awaited).collect::<Vec<_>>().join(", "),
         place.waiting_robot_ids.join(", "),
         place.quarantine.as_ref().map(|q| q.code.clone()).unwrap_or_default(),
         place.etag.clone(),
