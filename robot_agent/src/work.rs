@@ -392,9 +392,9 @@ impl AgentCore {
                 }
                 true
             }
+            // It goes on charging until it drives: only its errand ends.
             Doing::Charging | Doing::Parking => {
                 work.doing = Doing::Nothing;
-                self.body.charge(now.site, false);
                 true
             }
             Doing::Driving if pause == Pause::Now || work.paused => {
@@ -584,9 +584,6 @@ impl AgentCore {
     /// The attempt is over: written with its answer before anybody hears of it.
     pub(crate) fn finish(&mut self, now: &Now, state: WorkState, fault: Option<Fault>) {
         let Some(work) = self.work.take() else { return };
-        if self.body.state(now.site).charging {
-            self.body.charge(now.site, false);
-        }
         let report = AttemptReport { fault, ..self.report_of(&work, state, now) };
         let listed = self.listed(&work, state);
         self.answered.insert(report.attempt.clone());

@@ -12,6 +12,9 @@ use crate::work::{Effect, StepKind, WorkStats, WorkStep};
 /// Longest errand; a charge ends long before. Site clock.
 pub const ERRAND_TIMEOUT: SiteDuration = SiteDuration::from_secs(4 * 3600);
 
+/// Steps done of an errand whose robot stands at its goal.
+pub const AT_GOAL: u32 = 1;
+
 /// Steps of an errand: drive to its goal, then charge or park.
 pub fn steps(view: &View, a: &Attempt) -> Vec<WorkStep> {
     let Some(goal) = &a.goal else { return Vec::new() };

@@ -3,7 +3,7 @@
 //! that is tried again is still at work: it ends that task first, and gets no other.
 //!
 //! Called by `mod`, with [`super::budget`] before it. Invariant: a drain takes the robot's mutex only from none, and gives it back only from itself; it never cuts a grasp and never leaves a
-//! robot in a lane. A drain whose deadline passes is refused and the robot works on.
+//! robot in a lane: it is held in a standing place that is its own. A drain whose deadline passes is refused and the robot works on.
 
 use super::rows::{Drain, DrainState, RobotAuthority, RobotHolder};
 use super::view::View;
@@ -11,7 +11,7 @@ use super::{Board, Plan, Tx, errands, heard, load, repair, screen, way};
 use crate::ids::{DrainId, RobotId};
 use crate::maintenance::{DrainRelease, DrainRequest};
 use crate::reason::{Code, Reason};
-use crate::site::Kind;
+use crate::site::{Kind, WaypointIx};
 use crate::task::Event;
 use crate::task::state::Errand;
 use crate::time::Now;
@@ -145,13 +145,9 @@ fn further(tx: &mut Tx, drain: &Drain, board: &Board) {
                     super::tasks::happen(tx, task_id, super::tasks::News::of(Event::Suspend, Some(&why)));
                 }
             }
-            // A charge ends as it is: the robot keeps its place. A way to a park goes on.
-            None => {
-                let charges = tx.view.attempt(&id).is_some_and(|a| a.errand == Some(Errand::Charge));
-                if charges {
-                    errands::stop(tx, &drain.robot_id);
-                }
-            }
+            // A charge ends as it is: the robot keeps its place and goes on charging. A way to a charger or to a park goes on.
+            None if tx.view.attempt(&id).is_some_and(errands::is_docked) => errands::stop(tx, &drain.robot_id),
+            None => {}
         },
     }
 }
@@ -173,9 +169,17 @@ fn is_at_rest(view: &View, drain: &Drain, live: Option<&Live>) -> bool {
     let Some(live) = live else { return true };
     let Some(here) = way::find(view, live.report.vitals.waypoint.as_ref()) else { return false };
     let idle = live.report.attempts.iter().all(|a| a.state.is_over()) && live.report.vitals.speed_mm_s == 0;
-    let resting = matches!(view.site.waypoint(here).kind, Kind::Park | Kind::Hold | Kind::Charger);
-    let nowhere_better = errands::park_for(view, &drain.robot_id, here).is_none();
-    idle && heard::is_settled(view, live) && heard::is_fresh(view, live) && (resting || nowhere_better)
+    idle && heard::is_settled(view, live) && heard::is_fresh(view, live) && may_rest(view, &drain.robot_id, here)
+}
+
+/// The robot holds the standing place it is in, and nobody works there. Where bodies may drive through each other it may rest anywhere.
+fn may_rest(view: &View, robot_id: &RobotId, here: WaypointIx) -> bool {
+    if !view.site.collisions_modelled() {
+        return true;
+    }
+    let place = view.site.standing_at(here).map(|ix| view.site.place(ix).place_id.as_str());
+    let holds = place.and_then(|id| view.places.get(id)).is_some_and(|place| place.row.holder(robot_id).is_some());
+    holds && matches!(view.site.waypoint(here).kind, Kind::Park | Kind::Hold | Kind::Charger)
 }
 
 fn park(tx: &mut Tx, drain: &Drain, live: &Live, board: &Board) {

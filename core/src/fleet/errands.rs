@@ -13,8 +13,8 @@ use crate::ids::{AttemptId, RobotId, Subject, WaypointId};
 use crate::limits;
 use crate::reason::Reason;
 use crate::site::{Kind, WaypointIx};
-use crate::task::AttemptPhase;
 use crate::task::state::{Errand, Uncertain};
+use crate::task::{Attempt, AttemptPhase};
 use crate::time::Now;
 use crate::work::{AttemptReport, Session, WorkState};
 use std::collections::BTreeMap;
@@ -85,7 +85,7 @@ fn wish(
         return Some((Errand::Charge, charger));
     }
     let settled = matches!(kind, Kind::Park) || (matches!(kind, Kind::Charger | Kind::Hold) && !waiting);
-    if settled || view.site.standing_at(here).is_none() {
+    if settled || !view.site.collisions_modelled() {
         return None;
     }
     park_goal(view, coming, robot_id, here).map(|goal| (Errand::Park, goal))
@@ -93,7 +93,7 @@ fn wish(
 
 /// Where a robot that stands at `here` would park; none if it parks already or everything is taken.
 pub(super) fn park_for(view: &View, robot_id: &RobotId, here: WaypointIx) -> Option<WaypointIx> {
-    let parks = view.site.waypoint(here).kind == Kind::Park || view.site.standing_at(here).is_none();
+    let parks = view.site.waypoint(here).kind == Kind::Park || !view.site.collisions_modelled();
     if parks { None } else { park_goal(view, &Coming::of(view), robot_id, here) }
 }
 
@@ -170,6 +170,7 @@ pub fn report(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
         WorkState::Refused => AttemptPhase::Refused,
         WorkState::Succeeded => AttemptPhase::Succeeded,
         WorkState::Failed => AttemptPhase::Failed,
+        WorkState::Aborted if a.phase == AttemptPhase::Stopping && is_docked(&a) => AttemptPhase::Docked,
         WorkState::Aborted | WorkState::Suspended => AttemptPhase::Aborted,
     };
     if live.is_terminal() {
@@ -183,6 +184,11 @@ pub fn report(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
         a.phase = live;
     }
     tx.put(a, "errand.changed");
+}
+
+/// The robot has come to the charger that it was sent to.
+pub(super) fn is_docked(a: &Attempt) -> bool {
+    a.errand == Some(Errand::Charge) && a.step_index >= attempts::AT_GOAL
 }
 
 /// Asks the robot to break its errand off.

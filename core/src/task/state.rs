@@ -161,6 +161,8 @@ pub enum AttemptPhase {
     Aborted,
     /// Given up by a person while nobody knew.
     Lost,
+    /// A charge that was ended at its charger: the robot keeps its place there and goes on charging.
+    Docked,
 }
 
 impl AttemptPhase {
@@ -181,7 +183,8 @@ impl AttemptPhase {
     ];
     /// No way out.
     pub const fn is_terminal(self) -> bool {
-        matches!(self, Self::Refused | Self::OfferExpired | Self::Succeeded | Self::Failed | Self::Aborted | Self::Lost)
+        use AttemptPhase::{Aborted, Docked, Failed, Lost, OfferExpired, Refused, Succeeded};
+        matches!(self, Refused | OfferExpired | Succeeded | Failed | Aborted | Lost | Docked)
     }
     /// Number in indices and on the wire.
     pub const fn number(self) -> i64 {
@@ -190,8 +193,8 @@ impl AttemptPhase {
     /// Where a live attempt may go. LOST may still turn into the truth (a late report) while no newer epoch was granted.
     pub const fn transitions(self) -> &'static [AttemptPhase] {
         use AttemptPhase::{
-            Aborted, Accepted, Executing, Failed, Lost, Navigating, OfferExpired, Offered, Paused, Refused, Stopping,
-            Succeeded,
+            Aborted, Accepted, Docked, Executing, Failed, Lost, Navigating, OfferExpired, Offered, Paused, Refused,
+            Stopping, Succeeded,
         };
         match self {
             Offered => &[
@@ -211,9 +214,9 @@ impl AttemptPhase {
             Navigating => &[Executing, Paused, Stopping, Succeeded, Failed, Aborted, Lost],
             Executing => &[Navigating, Paused, Stopping, Succeeded, Failed, Aborted, Lost],
             Paused => &[Navigating, Executing, Stopping, Succeeded, Failed, Aborted, Lost],
-            Stopping => &[Refused, OfferExpired, Succeeded, Failed, Aborted, Lost],
+            Stopping => &[Refused, OfferExpired, Succeeded, Failed, Aborted, Lost, Docked],
             Lost => &[Succeeded, Failed, Aborted],
-            Refused | OfferExpired | Succeeded | Failed | Aborted => &[],
+            Refused | OfferExpired | Succeeded | Failed | Aborted | Docked => &[],
         }
     }
 }

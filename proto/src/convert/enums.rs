@@ -102,6 +102,7 @@ wire_enums! {
     AttemptPhase = task::v1::AttemptState {
         Offered = Offered, Accepted = Accepted, Navigating = Navigating, Executing = Executing, Paused = Paused, Stopping = Stopping,
         Refused = Refused, OfferExpired = OfferExpired, Succeeded = Succeeded, Failed = Failed, Aborted = Aborted, Lost = Lost,
+        Docked = Docked,
     }
     Resolution = task::v1::Resolution {
         Requeue = Requeue, RequeueHandedOver = RequeueHandedOver, RequeuePutBack = RequeuePutBack, Succeeded = Succeeded, Failed = Failed,

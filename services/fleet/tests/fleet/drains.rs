@@ -5,7 +5,8 @@ use midshift_core::fleet::rows::{Drain, DrainState, HolderState, RobotAuthority,
 use midshift_core::reason::Code;
 use midshift_core::robot::Load;
 use midshift_core::site::CORRIDOR;
-use midshift_core::task::Phase;
+use midshift_core::task::state::Errand;
+use midshift_core::task::{Attempt, AttemptPhase, Phase};
 use midshift_proto::convert::duration;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
@@ -166,5 +167,66 @@ async fn a_drain_that_asks_for_nonsense_is_refused_whole() {
     let told = midshift_proto::refusal_of(&refused).violations.len();
     assert_eq!((refused.code(), told), (tonic::Code::InvalidArgument, 3));
     assert_eq!(drain(&w, "r9", 60).await.expect_err("nobody").code(), tonic::Code::NotFound);
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_on_its_way_to_a_charger_goes_on_and_is_held_there_docked() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    (w.r("r1").drives, w.r("r1").works) = (false, false);
+    w.r("r1").battery_permille = 150;
+    w.beat("r1");
+    let charges = |s: &Seen| s.errand("r1").is_some_and(|(errand, _)| errand == Errand::Charge);
+    let errand = |s: &Seen| s.all::<Attempt>().into_iter().find(|a| a.errand.is_some()).expect("an errand");
+    w.until("it is on its way", |s| charges(s) && errand(s).accepted.is_some()).await;
+    drain(&w, "r1", 600).await.expect("is asked");
+    w.pass_while(10, "it goes on", |s| charges(s) && errand(s).phase != AttemptPhase::Stopping).await;
+    w.r("r1").drives = true;
+    w.until("it is held", |s| is_held(s, "r1")).await;
+    let ended = |e: &midshift_core::rows::Entry| {
+        &*e.kind == "errand.changed" && e.body.as_deref().is_some_and(|b| b.contains("docked"))
+    };
+    assert!(w.written().await.iter().any(ended), "its errand ends as docked");
+    assert_eq!(w.seen().await.holders("charge"), [("r1".to_owned(), HolderState::Inside)]);
+    undrain(&w, "r1").await;
+    w.r("r1").works = true;
+    w.until("it charges again", charges).await;
+    w.lawful().await;
+}
+
+/// The corridor with a seat for one robot in each of its bays, all taken but `left` seats.
+async fn crowded(left: usize) -> World {
+    let mut w = World::on(CORRIDOR.replace(", capacity = 2", "").leak()).await;
+    w.robot("r1", "A").await;
+    w.r("r1").answer = crate::harness::Answer::Refuse(Code::UnsupportedAction);
+    for (n, at) in ["wait-a", "wait-b", "park-b", "charge", "park-a"].iter().enumerate().skip(left) {
+        w.robot(&format!("r{}", n + 2), at).await;
+    }
+    w.pass(5).await;
+    w
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_drain_that_waits_for_a_place_to_stand_ends_by_its_deadline() {
+    let mut w = crowded(0).await;
+    drain(&w, "r1", 60).await.expect("is asked");
+    w.pass_while(50, "a station is no place to rest", |s| state(s) == Some(DrainState::Draining)).await;
+    let seen = w.until("it is given up", |s| state(s) == Some(DrainState::Refused)).await;
+    assert_eq!(seen.all::<Drain>()[0].why.as_ref().map(|r| r.code), Some(Code::SkippedBusy));
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_stands_in_a_lane_is_not_at_rest_and_drives_to_a_place_of_its_own_first() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "a-far").await;
+    w.r("r1").drives = false;
+    w.pass(2).await;
+    drain(&w, "r1", 600).await.expect("is asked");
+    w.pass_while(10, "a lane is no place to rest", |s| state(s) == Some(DrainState::Draining)).await;
+    w.r("r1").drives = true;
+    let seen = w.until("it is held", |s| is_held(s, "r1")).await;
+    assert_eq!(seen.holders("park-a"), [("r1".to_owned(), HolderState::Inside)]);
     w.lawful().await;
 }

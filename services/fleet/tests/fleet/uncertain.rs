@@ -110,6 +110,8 @@ async fn a_robot_that_does_not_know_whether_it_picked_asks_a_person_at_once() {
     let seen = w.until_phase("T1", Phase::NeedsOperator).await;
     assert_eq!(seen.reason("T1"), Some(Code::StepUnknown));
     assert!(seen.task("T1").changed.ms_since(seen.attempt("T1").accepted.expect("accepted")) < 60_000);
-    w.until("the robot may forget it and is free", |s| s.is_free("r1")).await;
+    // Free of the task: it stands in a lane, so fleet sends it to park.
+    let is_let_go = |s: &crate::harness::Seen| s.holder("r1").is_none_or(|id| id.subject.task_id().is_none());
+    w.until("the robot may forget it and is free", is_let_go).await;
     w.lawful().await;
 }
