@@ -240,6 +240,10 @@ pub const SITE_WAYPOINTS_MAX: usize = 250_000;
 pub const SITE_LANES_MAX: usize = 1_000_000;
 /// Places of one site.
 pub const SITE_PLACES_MAX: usize = 50_000;
+/// Speed where people walk and nobody set another one, millimetres per second: a slow walk.
+pub const PEOPLE_SPEED_MM_S: u32 = 600;
+/// Distance kept to people and things there if nobody set another one, millimetres: an arm's length.
+pub const PEOPLE_AVOIDANCE_MM: u32 = 500;
 /// Robots whose starting places one site names: twice what one server is built for.
 pub const SITE_ROBOTS_MAX: usize = 20_000;
 /// Areas of one site.

@@ -215,10 +215,7 @@ pub fn compose_policy(tx: &mut Tx, robot_id: &RobotId) {
         .site
         .areas()
         .iter()
-        .map(|a| {
-            let rules = tx.view.policies.get(a.area_id.as_str()).map_or_else(|| a.policy(), |p| p.row.clone());
-            AreaPolicy { without_people: !a.people, ..rules }
-        })
+        .map(|a| AreaPolicy { without_people: !a.people, ..tx.view.policy(&a.area_id) })
         .collect();
     let old = tx.view.desired_policy.get(robot_id.as_str()).map(|d| d.row.clone());
     if old.as_ref().is_some_and(|o| o.areas == areas) {

@@ -637,11 +637,15 @@ impl View {
         let from = format!("robot:{robot}:");
         self.holds.range(from.clone()..).take_while(move |(id, _)| id.starts_with(&from)).map(|(_, h)| &h.row)
     }
-    /// Rules of an area.
+    /// Rules of an area, as they are composed for robots and shown to people.
     pub fn policy(&self, area: &crate::ids::AreaId) -> AreaPolicy {
-        let of_site = || self.site.find_area(area).map(|at| self.site.area(at).policy());
-        let put = self.policies.get(area.as_str()).map(|p| p.row.clone());
-        put.or_else(of_site).unwrap_or_else(|| AreaPolicy::default_of(area.clone()))
+        let known = self.site.find_area(area).map(|at| self.site.area(at));
+        match (known, self.policies.get(area.as_str()).map(|p| p.row.clone())) {
+            (Some(known), Some(put)) => known.near_people(put),
+            (Some(known), None) => known.policy(),
+            (None, Some(put)) => put,
+            (None, None) => AreaPolicy::default_of(area.clone()),
+        }
     }
 }
 

@@ -3,7 +3,8 @@
 //! Invariant: a finding is of severity [`Severity::Error`] only for an authored site, which is refused then; imports are
 //! only warned about. Called by `map lint`, and by the binary before it serves a site.
 
-use super::{AreaIx, Kind, Lane, Place, PlaceKind, Site, Source, WaypointIx};
+use super::{Area, AreaIx, Kind, Lane, Place, PlaceKind, Site, Source, WaypointIx};
+use crate::limits;
 use serde::Serialize;
 use std::collections::BTreeSet;
 
@@ -61,6 +62,7 @@ rules! {
     StandingBelowRobots = "STANDING_BELOW_ROBOTS", Error, "The areas admit fewer robots than there are.";
     BaysBelowRobots = "BAYS_BELOW_ROBOTS", Warning, "Hold points and parking places have fewer seats than there are robots, so a robot may have to wait in a station that another needs.";
     NoBayFromStation = "NO_BAY_FROM_STATION", Error, "From this station no hold point or parking place is reached without passing another standing place, so a robot cannot make room.";
+    FastNearPeople = "FAST_NEAR_PEOPLE", Warning, "People walk here, and the file lets robots drive faster than 600 mm/s or come nearer than 500 mm. Leave both values out, or know why not.";
     NoCharger = "NO_CHARGER", Warning, "The site has no charger; robots stop when they are empty.";
     NoStation = "NO_STATION", Warning, "The site has no station, so nothing can be picked up or put down.";
     CollisionsNotModelled = "COLLISIONS_NOT_MODELLED", Warning, "On this map robots drive through each other.";
@@ -100,6 +102,7 @@ pub fn lint(site: &Site, robots: Option<u64>) -> Vec<Finding> {
     } else {
         report.add(Rule::CollisionsNotModelled, vec![String::new()]);
     }
+    near_people(&mut report);
     if site.chargers().next().is_none() {
         report.add(Rule::NoCharger, vec![String::new()]);
     }
@@ -283,6 +286,16 @@ fn areas(report: &mut Report<'_>, robots: Option<u64>) {
     }
 }
 
+fn near_people(report: &mut Report<'_>) {
+    let is_bold = |area: &&Area| {
+        let rules = area.policy();
+        let fast = rules.speed_limit_mm_s.is_some_and(|v| v > limits::PEOPLE_SPEED_MM_S);
+        area.people && (fast || rules.avoidance_distance_mm.is_some_and(|v| v < limits::PEOPLE_AVOIDANCE_MM))
+    };
+    let bold = report.site.areas().iter().filter(is_bold).map(|area| area.area_id.to_string()).collect();
+    report.add(Rule::FastNearPeople, bold);
+}
+
 fn bays(report: &mut Report<'_>) {
     let site = report.site;
     let stuck = site.stations().filter(|station| {
@@ -348,6 +361,22 @@ mod tests {
         let passage = "{ id = \"p\", rule = \"exclusive\", lanes = [[\"n\", \"x\"], [\"x\", \"n\"]] }";
         assert_eq!(rules(&ring(waypoints, lanes, passage)), [Rule::NoBayBeforePassage]);
         assert_eq!(rules(&ring(waypoints, &lanes.replace("two", "wide"), "")), []);
+    }
+
+    #[test]
+    fn an_area_where_people_walk_is_slow_and_a_file_that_lets_robots_be_faster_or_nearer_is_told() {
+        let lint = |rules: &str| {
+            let text = CORRIDOR.replace("speed_limit_mm_s = 1500", &format!("people = true{rules}"));
+            let site = text::parse(&text).expect("reads");
+            let policy = site.areas()[0].policy();
+            let rules: Vec<_> = lint(&site, None).into_iter().map(|f| (f.severity, f.rule)).collect();
+            (policy.speed_limit_mm_s, policy.avoidance_distance_mm, rules)
+        };
+        let told = vec![(Severity::Warning, Rule::FastNearPeople)];
+        assert_eq!(lint(""), (Some(600), Some(500), Vec::new()));
+        assert_eq!(lint(", speed_limit_mm_s = 300"), (Some(300), Some(500), Vec::new()));
+        assert_eq!(lint(", speed_limit_mm_s = 601"), (Some(601), Some(500), told.clone()));
+        assert_eq!(lint(", avoidance_distance_mm = 499"), (Some(600), Some(499), told));
     }
 
     #[test]

@@ -15,6 +15,7 @@ pub mod task_list;
 pub mod text;
 
 use crate::ids::{AreaId, PlaceId, RobotId, SiteId, WaypointId};
+use crate::limits;
 use crate::policy::{AreaPolicy, SoftwareRules};
 use crate::reason::{Refusal, Violations};
 use serde::{Deserialize, Serialize};
@@ -207,7 +208,7 @@ impl Area {
     pub fn policy(&self) -> AreaPolicy {
         let base = AreaPolicy::default_of(self.area_id.clone());
         let d = &self.defaults;
-        AreaPolicy {
+        self.near_people(AreaPolicy {
             speed_limit_mm_s: d.speed_limit_mm_s,
             avoidance_distance_mm: d.avoidance_distance_mm,
             charge_mandatory_permille: d.charge_mandatory_permille.unwrap_or(base.charge_mandatory_permille),
@@ -218,6 +219,18 @@ impl Area {
             charge_stop_permille: d.charge_stop_permille.unwrap_or(base.charge_stop_permille),
             software: SoftwareRules { acts_on_rates: d.acts_on_rates, ..base.software },
             ..base
+        })
+    }
+
+    /// `rules` as they hold here: where people walk, a speed and a distance that they leave open are those for people near.
+    pub fn near_people(&self, rules: AreaPolicy) -> AreaPolicy {
+        if !self.people {
+            return rules;
+        }
+        AreaPolicy {
+            speed_limit_mm_s: rules.speed_limit_mm_s.or(Some(limits::PEOPLE_SPEED_MM_S)),
+            avoidance_distance_mm: rules.avoidance_distance_mm.or(Some(limits::PEOPLE_AVOIDANCE_MM)),
+            ..rules
         }
     }
 }
@@ -366,7 +379,7 @@ impl Site {
     }
     /// The lowest limit that the lane and the areas of both its ends set, millimetres per second.
     pub fn lane_speed_limit_mm_s(&self, lane: &Lane) -> Option<u32> {
-        let area = |at| self.area_of(at).defaults.speed_limit_mm_s;
+        let area = |at| self.area_of(at).policy().speed_limit_mm_s;
         [lane.speed_limit_mm_s, area(lane.from), area(lane.to)].into_iter().flatten().min()
     }
     /// The standing place at a waypoint.

@@ -145,10 +145,9 @@ impl FleetService {
         }
         let found = self
             .look(move |view, _, _| {
-                let area = view.site.find_area(&id)?;
-                let row = view.policies.get(id.as_str());
-                let policy = row.map_or_else(|| view.site.area(area).policy(), |p| p.row.clone());
-                Some(encode_policy(&policy, row.map(|p| p.revision)))
+                view.site.find_area(&id)?;
+                let revision = view.policies.get(id.as_str()).map(|p| p.revision);
+                Some(encode_policy(&view.policy(&id), revision))
             })
             .await?;
         found.ok_or_else(|| not_found(Code::AreaNotFound, area_id))

@@ -35,6 +35,35 @@ async fn rules_put_for_an_area_reach_every_robot() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn an_area_where_people_walk_is_slow_until_a_person_puts_another_limit() {
+    let mut w = World::on(CORRIDOR.replace("speed_limit_mm_s = 1500", "people = true").leak()).await;
+    w.robot("r1", "park-a").await;
+    let limits = |s: &crate::harness::Seen| {
+        let areas = s.get::<midshift_core::work::DesiredPolicy>("r1").map(|p| p.areas).unwrap_or_default();
+        areas.first().map(|rules| (rules.speed_limit_mm_s, rules.avoidance_distance_mm))
+    };
+    w.until("the robot has them", |s| limits(s) == Some((Some(600), Some(500)))).await;
+    let get = || v1::GetAreaPolicyRequest { area_id: "rooms".to_owned() };
+    let rules = |w: &World| {
+        let fleet = w.fleet.clone();
+        async move { fleet.get_area_policy(Request::new(get())).await.expect("rules").into_inner().policy.expect("rules") }
+    };
+    let shown = rules(&w).await;
+    assert_eq!((shown.speed_limit_mm_s, shown.avoidance_distance_mm), (Some(600), Some(500)));
+    let put = async |w: &World, policy: v1::AreaPolicy| {
+        let put = v1::PutAreaPolicyRequest { policy: Some(policy), ..Default::default() };
+        w.fleet.put_area_policy(Request::new(put)).await.expect("put").into_inner().policy.expect("rules")
+    };
+    let greater = put(&w, v1::AreaPolicy { speed_limit_mm_s: Some(900), ..shown }).await;
+    assert_eq!(greater.speed_limit_mm_s, Some(900));
+    w.until("a greater one stays", |s| limits(s) == Some((Some(900), Some(500)))).await;
+    let none = v1::AreaPolicy { speed_limit_mm_s: None, avoidance_distance_mm: None, ..greater };
+    assert_eq!(put(&w, none).await.speed_limit_mm_s, Some(600));
+    w.until("none of its own is the slow one", |s| limits(s) == Some((Some(600), Some(500)))).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn charging_thresholds_of_the_site_file_hold_until_a_person_puts_others() {
     let text: &'static str = Box::leak(
         CORRIDOR
