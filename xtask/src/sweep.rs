@@ -22,6 +22,8 @@ pub enum Sweep {
     Kills,
     /// Shifts of the deterministic simulation, with roll-outs of software.
     Simulation,
+    /// Robots that behave badly beside honest ones, in the deterministic simulation.
+    Players,
     /// A process of each service of a split stack killed or replaced in turn while 200 robots work and a release goes out to them, and then a bad one; as
     /// often as --seeds says, it draws nothing.
     Split,
@@ -40,13 +42,22 @@ pub const NIGHTLY: [Sweep; 1] = [Sweep::Stories];
 pub const NIGHTLY_SEEDS: u64 = 4;
 
 impl Sweep {
-    const ALL: [Self; 7] =
-        [Self::Kills, Self::Simulation, Self::Split, Self::Updates, Self::Latch, Self::Stops, Self::Stories];
+    const ALL: [Self; 8] = [
+        Self::Kills,
+        Self::Simulation,
+        Self::Players,
+        Self::Split,
+        Self::Updates,
+        Self::Latch,
+        Self::Stops,
+        Self::Stories,
+    ];
 
     fn seeds(self) -> u64 {
         match self {
             Self::Kills => 20,
             Self::Simulation => 2_000,
+            Self::Players => 5_000,
             Self::Stops => 100,
             Self::Split | Self::Updates | Self::Latch => 1,
             Self::Stories => 2,
@@ -56,7 +67,7 @@ impl Sweep {
     /// Whether what it does comes of seeds.
     const fn draws(self) -> bool {
         match self {
-            Self::Kills | Self::Simulation | Self::Stops | Self::Stories => true,
+            Self::Kills | Self::Simulation | Self::Players | Self::Stops | Self::Stories => true,
             Self::Split | Self::Updates | Self::Latch => false,
         }
     }
@@ -66,6 +77,7 @@ impl Sweep {
             Self::Kills => each_seed(workspace, "kills", "kill::", from, seeds),
             Self::Stories => each_seed(workspace, "stories", "story::", from, seeds),
             Self::Simulation => simulated(workspace, "many_seeds_keep_every_law", from, seeds),
+            Self::Players => simulated(workspace, "played::many_seeds", from, seeds),
             Self::Stops => simulated(workspace, "stopped::in_cuts_and_kills", from, seeds),
             Self::Split => split(workspace, seeds),
             Self::Updates => every_site(workspace, "agent", "power::"),

@@ -31,6 +31,7 @@ pub fn config(seed: u64, robots: usize, naive: Naive) -> RoomConfig {
         planners: 1,
         stops: false,
         site: DEMO.to_owned(),
+        players: Vec::new(),
     }
 }
 

@@ -17,6 +17,7 @@ mod observer;
 mod old_status;
 mod orders;
 mod plan;
+mod played;
 mod room;
 mod run;
 mod software;
@@ -142,18 +143,21 @@ fn say(text: &str) {
     let _ = writeln!(std::io::stderr(), "{text}");
 }
 
-/// Runs one seed in another process; its whole output, and whether every law held.
-fn elsewhere(seed: u64, naive: &str) -> (String, bool) {
+/// The test that runs one seed of a shift with faults.
+const SHIFT: &str = "one_seed_keeps_every_law";
+
+/// Runs one seed of a test in another process; its whole output, and whether every law held.
+fn elsewhere(test: &str, seed: u64, naive: &str) -> (String, bool) {
     let program = std::env::current_exe().expect("this test is a program");
     let mut command = std::process::Command::new(program);
-    command.args(["--exact", "one_seed_keeps_every_law", "--nocapture"]);
+    command.args(["--exact", test, "--nocapture"]);
     command.env("MIDSHIFT_SIM_SEED", seed.to_string()).env("MIDSHIFT_SIM_NAIVE", naive);
     let output = command.output().expect("a test that runs can be run again");
     (String::from_utf8_lossy(&output.stderr).into_owned(), output.status.success())
 }
 
 /// Runs seeds in processes of their own, as many at once as there are cores, until one of them `ends` it. Later ones may have run.
-fn each(seeds: std::ops::Range<u64>, naive: &str, ends: impl Fn(u64, &str, bool) -> bool + Sync) {
+fn each(test: &str, seeds: std::ops::Range<u64>, naive: &str, ends: impl Fn(u64, &str, bool) -> bool + Sync) {
     let (next, over) = (AtomicU64::new(seeds.start), AtomicBool::new(false));
     let at_once = std::thread::available_parallelism().map_or(2, usize::from);
     std::thread::scope(|scope| {
@@ -164,7 +168,7 @@ fn each(seeds: std::ops::Range<u64>, naive: &str, ends: impl Fn(u64, &str, bool)
                     if seed >= seeds.end {
                         return;
                     }
-                    let (text, held) = elsewhere(seed, naive);
+                    let (text, held) = elsewhere(test, seed, naive);
                     if ends(seed, &text, held) {
                         over.store(true, Relaxed);
                     }
@@ -216,7 +220,7 @@ fn many_seeds_keep_every_law() {
     let first = number("MIDSHIFT_SEED_FROM").unwrap_or(1);
     let many = number("MIDSHIFT_SEEDS").unwrap_or(SEEDS);
     let (broken, sums) = (Mutex::new(Vec::new()), Mutex::new(BTreeMap::new()));
-    each(first..first + many, "", |seed, text, held| {
+    each(SHIFT, first..first + many, "", |seed, text, held| {
         add_up(&mut sums.lock().expect("no thread panics with it"), text);
         if !held {
             say(text);
@@ -242,7 +246,7 @@ fn many_seeds_keep_every_law() {
 fn each_naive_rule_breaks_its_law() {
     for (rule, law) in TWINS {
         let seen = AtomicBool::new(false);
-        each(1..1 + TWIN_SEEDS, rule, |seed, text, held| {
+        each(SHIFT, 1..1 + TWIN_SEEDS, rule, |seed, text, held| {
             let breaks = !held && text.contains(&format!("s: {law}"));
             if breaks {
                 say(&format!("{rule}: seed {seed} breaks {law}"));
@@ -256,7 +260,7 @@ fn each_naive_rule_breaks_its_law() {
 
 #[test]
 fn a_seed_is_the_same_run_in_another_process() {
-    let (first, again) = (elsewhere(42, ""), elsewhere(42, ""));
+    let (first, again) = (elsewhere(SHIFT, 42, ""), elsewhere(SHIFT, 42, ""));
     assert!(first.1 && again.1);
     let hash = hash_of(&first.0);
     assert!(hash.is_some() && hash == hash_of(&again.0), "{hash:?} {:?}", hash_of(&again.0));

@@ -10,7 +10,7 @@ use crate::laws::{Grants, Offers};
 use midshift_agent::store::Op;
 use midshift_agent::switch::Switch;
 use midshift_bundle::set::SetManifest;
-use midshift_core::fleet::rows::Place;
+use midshift_core::fleet::rows::{Place, PlaceHolder};
 use midshift_core::ids::{PlaceId, RobotId, Subject, TaskId};
 use midshift_core::reason::Code;
 use midshift_core::robot::Lane;
@@ -83,6 +83,8 @@ pub struct Observer {
     grants: Grants,
     within: BTreeMap<RobotId, BTreeSet<PlaceId>>,
     changes: Changes,
+    /// Robots that say what they like, whose numbers and claims are no law.
+    players: BTreeSet<RobotId>,
     trace: bool,
 }
 
@@ -147,12 +149,27 @@ impl Observer {
             grants: Grants::default(),
             within: BTreeMap::new(),
             changes: Changes::default(),
+            players: BTreeSet::new(),
             trace: std::env::var_os("MIDSHIFT_SIM_TRACE").is_some(),
         }
     }
     /// The world of items to look at when a task changes hands.
     pub fn watch_world(&mut self, world: SharedWorld) {
         self.world = Some(world);
+    }
+    /// This robot says what it likes.
+    pub fn behaves_badly(&mut self, robot_id: RobotId) {
+        self.players.insert(robot_id);
+    }
+    /// Every robot that was given this task.
+    pub fn given_to(&self, task_id: &TaskId) -> BTreeSet<RobotId> {
+        let attempts = self.attempts.get(&Subject::Task(task_id.clone()));
+        attempts.into_iter().flat_map(BTreeMap::values).map(|a| a.robot_id.clone()).collect()
+    }
+    /// Places that one of these robots holds, as the rows have it.
+    pub fn places_of(&self, robots: &BTreeSet<RobotId>) -> Vec<PlaceId> {
+        let held = self.places.values().filter(|p| p.holders.iter().any(|h| robots.contains(&h.robot_id)));
+        held.map(|p| p.place_id.clone()).collect()
     }
     /// What was found broken.
     pub fn findings(&self) -> &[String] {
@@ -199,6 +216,11 @@ impl Observer {
     /// Counts something that happened.
     pub fn count(&mut self, what: impl Into<String>) {
         *self.counts.entry(what.into()).or_insert(0) += 1;
+    }
+
+    /// How much of something there is at the end.
+    pub fn peak(&mut self, what: String) -> &mut u64 {
+        self.counts.entry(what).or_insert(0)
     }
 
     /// Looks at a law once.
@@ -368,7 +390,9 @@ impl Observer {
     }
 
     fn place(&mut self, place: Place) {
-        let granted = place.holders.iter().filter(|h| h.grant_id != 0).count();
+        // A grant that a player has is one of its own invention, or one that it says it is inside on.
+        let of_law = |h: &&PlaceHolder| h.grant_id != 0 && !self.players.contains(&h.robot_id);
+        let granted = place.holders.iter().filter(of_law).count();
         self.check("I7 grants within capacity", granted <= place.capacity as usize, || format!("{place:?}"));
         self.places.insert(place.place_id.clone(), place);
     }
@@ -408,6 +432,9 @@ impl Observer {
             InboxItem::Gap(gap) => gap.to_seq,
         };
         *last = (said.ring.clone(), seq);
+        if self.players.contains(&said.robot_id) {
+            return;
+        }
         let gap = matches!(said.what, InboxItem::Gap(_) | InboxItem::Poison { .. });
         self.check("I9 events in order, once, without gaps", seq == before + 1 && !gap, || {
             format!("{before} was followed by {said:?}")

@@ -3,8 +3,8 @@
 //! Invariant: asked twice it does the same once; "not now" is an answer like any other.
 
 use crate::net;
-use midshift_proto::fleet::v1::DrainRobotRequest;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
+use midshift_proto::fleet::v1::{ClearPlaceRequest, DrainRobotRequest, ListPlacesRequest, RetireRobotRequest};
 use midshift_proto::ota::v1 as ota;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
@@ -60,6 +60,10 @@ pub enum Order {
     Engage(Box<EngageRequest>),
     /// A person resets a stop by its name.
     Reset(String),
+    /// A person takes a robot out of the fleet.
+    Retire(String),
+    /// A person has looked: nobody is in this place.
+    Clear(String),
     /// What a person does about a roll-out that waits for one: goes on with one that stands still, ends one that must be judged.
     Settle(String),
 }
@@ -159,6 +163,12 @@ async fn ask(order: &Order) -> Result<(), Status> {
         Order::Reset(stop_id) => {
             stops()?.reset(ResetRequest { stop_id, reason: "looked, is clear".to_owned() }).await.map(drop)
         }
+        Order::Retire(robot_id) => {
+            let reason = "it behaves badly".to_owned();
+            let request = RetireRobotRequest { robot_id, reason, ..RetireRobotRequest::default() };
+            FleetServiceClient::new(channel).retire_robot(request).await.map(drop)
+        }
+        Order::Clear(place_id) => clear(FleetServiceClient::new(channel), place_id).await,
         Order::Settle(id) => settle(&mut client, id).await,
     }
 }
@@ -172,6 +182,15 @@ async fn start(client: &mut Client, rollout_id: String, supersede: bool) -> Resu
     let etag = seen(client, &rollout_id).await?.etag;
     let request = ota::StartRolloutRequest { rollout_id, etag, reason: "drawn".to_owned(), supersede };
     client.start_rollout(request).await.map(drop)
+}
+
+async fn clear(mut client: FleetServiceClient<Channel>, place_id: String) -> Result<(), Status> {
+    let request = ListPlacesRequest { in_use: true, page_size: 1_000, ..ListPlacesRequest::default() };
+    let places = client.list_places(request).await?.into_inner().places;
+    let Some(etag) = places.into_iter().find(|p| p.place_id == place_id).map(|p| p.etag) else { return Ok(()) };
+    let reason = "looked, nobody is there".to_owned();
+    let request = ClearPlaceRequest { place_id, etag, reason, ..ClearPlaceRequest::default() };
+    client.clear_place(request).await.map(drop)
 }
 
 async fn settle(client: &mut Client, id: String) -> Result<(), Status> {

@@ -7,7 +7,7 @@ use crate::agent::{Agent, machine};
 use crate::client;
 use crate::clock::{MachineClock, Skew, TrueTime};
 use crate::disk::{ServerDisk, ServerFrames};
-use crate::net::{self, Ear, SERVER, Wire};
+use crate::net::{self, Ear, SERVER, SimDial, Wire};
 use crate::observer::Shared;
 use crate::software::Software;
 use crate::stops::Stops;
@@ -27,9 +27,11 @@ use midshift_sim::faults::{FaultRates, Injected};
 use midshift_sim::hall::{Hall, HallConfig};
 use midshift_sim::launched::Launched;
 use midshift_store::{FRAME_BYTES_DEFAULT, FrameLog, MemoryFrames, MemoryStore, StoreId};
+use midshift_tests::player::Player;
+use midshift_tests::player::line::Line;
 use std::path::PathBuf;
 use std::rc::Rc;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 
@@ -76,6 +78,8 @@ pub struct RoomConfig {
     pub stops: bool,
     /// Text of the site.
     pub site: String,
+    /// Robots without a body that behave badly.
+    pub players: Vec<Arc<Mutex<Player>>>,
 }
 
 /// The room.
@@ -100,6 +104,8 @@ pub struct Room {
     pub stop: Option<Stops>,
     /// Releases.
     pub software: Arc<Software>,
+    /// The memory of the server.
+    pub store: Arc<MemoryStore>,
     launched: Vec<Arc<Launched>>,
     stops: Vec<Option<SiteTime>>,
     steps: u64,
@@ -130,7 +136,7 @@ impl Room {
         let store_id = StoreId(Arc::from(format!("store-{}", config.seed)));
         let store = Arc::new(MemoryStore::new(site.site_id().clone(), store_id, clock.clone()));
         let observer = Shared::new(time.clone(), store.clone());
-        let disk = Arc::new(ServerDisk::new(store, observer.clone(), config.seed));
+        let disk = Arc::new(ServerDisk::new(store.clone(), observer.clone(), config.seed));
         let frames = MemoryFrames::new(clock.clone(), FRAME_BYTES_DEFAULT);
         let frames: Arc<dyn FrameLog> = Arc::new(ServerFrames::new(frames, disk.clone()));
         let of_hall = HallConfig { faults: config.faults, ..HallConfig::new(site.clone(), config.robots, config.seed) };
@@ -164,11 +170,15 @@ impl Room {
             };
             run_agent(&mut sim, agent);
         }
+        for (number, player) in config.players.iter().enumerate() {
+            observer.look().behaves_badly(player.lock().expect("nobody panics with it").robot_id().clone());
+            play(&mut sim, number, player, &time, &wire);
+        }
         let desk = Rc::new(client::Desk::default());
         let of_client = desk.clone();
         sim.host(CLIENT, move || client::run(of_client.clone()));
         let stops = vec![None; config.robots];
-        Ok(Self { sim, time, observer, hall, disk, desk, ears, wire, stop, software, launched, stops, steps: 0 })
+        Ok(Self { sim, time, observer, hall, disk, desk, ears, wire, stop, software, store, launched, stops, steps: 0 })
     }
     /// True time so far, milliseconds.
     pub fn now_ms(&self) -> u64 {
@@ -327,5 +337,22 @@ fn run_agent(sim: &mut turmoil::Sim<'static>, agent: Agent) {
     sim.host(machine(agent.robot), move || {
         let agent = agent.clone();
         async move { Ok(agent.live().await?) }
+    });
+}
+
+/// Name of the machine of a player.
+pub fn player_machine(number: usize) -> String {
+    format!("player-{number}")
+}
+
+fn play(sim: &mut turmoil::Sim<'static>, number: usize, player: &Arc<Mutex<Player>>, time: &TrueTime, wire: &Wire) {
+    let (player, time, wire) = (player.clone(), time.clone(), wire.clone());
+    sim.host(player_machine(number), move || {
+        let dial = SimDial { to: SERVER, ear: Ear::default(), machine: player_machine(number), wire: wire.clone() };
+        let line = Line::new(player.clone(), Arc::new(dial), MachineClock::boot(&time, Skew::default()));
+        async move {
+            line.play().await;
+            Ok(())
+        }
     });
 }

@@ -88,6 +88,7 @@ impl Shift {
             planners: 1,
             stops: false,
             site: DEMO.to_owned(),
+            players: Vec::new(),
         };
         Ok(Self {
             room: Room::open(&config)?,

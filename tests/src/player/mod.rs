@@ -1,0 +1,365 @@
+//! A robot that behaves badly: what one seed lets it say is legal by link.v1 and may be late, repeated, contradictory or impossible.
+//!
+//! Invariant: every message can be read by the rules of the wire; only what it says is wrong. Nothing here does IO or reads a clock, so the
+//! same seed says the same in the simulation and over a socket. `habits` are what is wrong with it, `work` is what it does of its work,
+//! `line` carries its words.
+
+mod habits;
+pub mod line;
+mod work;
+
+pub use habits::Habit;
+
+use midshift_core::ids::{PlaceId, RobotId, TaskId, WaypointId};
+use midshift_core::reason::Code;
+use midshift_core::robot::{HeldPlace, Inventory, Lane, ReportedState, StopLevel, Vitals};
+use midshift_core::work::{DesiredWork, Gap, InboxItem, RobotEvent, Sample, SampleBody};
+use midshift_proto::link::v1;
+use midshift_proto::session::{
+    ClockSample, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, LanePosition, PROTOCOL_VERSION, Previous, ToRobot,
+    Uplink, Welcome,
+};
+use rand::rngs::StdRng;
+use rand::seq::{IndexedRandom, IteratorRandom};
+use rand::{RngExt, SeedableRng};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use work::Job;
+
+/// Samples that it keeps until they are acknowledged; what comes after is forgotten.
+const KEPT_MAX: usize = 512;
+/// Habits of one seed at most.
+const HABITS_MAX: usize = 5;
+
+/// What it can name: everything else it has heard of.
+#[derive(Clone, Debug, Default)]
+pub struct Around {
+    /// Waypoints of the site; the first is where it says that it stands.
+    pub waypoints: Vec<WaypointId>,
+    /// Places of the site.
+    pub places: Vec<PlaceId>,
+    /// Other robots.
+    pub robots: Vec<RobotId>,
+    /// Tasks, its own and those of others.
+    pub tasks: Vec<TaskId>,
+}
+
+/// One such robot.
+pub struct Player {
+    rng: StdRng,
+    robot_id: RobotId,
+    around: Around,
+    habits: BTreeSet<Habit>,
+    /// How often each habit really showed, by its name.
+    deeds: BTreeMap<&'static str, u64>,
+    boots: u64,
+    ring: String,
+    produced: BTreeMap<Lane, u64>,
+    kept: VecDeque<(Lane, Sample)>,
+    session: Option<(Previous, String)>,
+    /// Of the session at hand; none: there is none, or it is only watched.
+    in_charge: bool,
+    hb: u64,
+    echo: Option<ClockSample>,
+    state: ReportedState,
+    work: Option<DesiredWork>,
+    job: Option<Job>,
+    /// What it answers next and when, milliseconds.
+    answer_at: Option<u64>,
+    beat_at: u64,
+    quiet_until: u64,
+    drops: bool,
+    second: bool,
+    /// Heartbeats of machines beside it.
+    seconds: u64,
+    /// Something was noted since it last said what it keeps.
+    fresh: bool,
+}
+
+impl Player {
+    /// What `seed` makes of a robot of this name.
+    pub fn new(seed: u64, robot_id: RobotId, around: Around) -> Self {
+        let mut rng = StdRng::seed_from_u64(seed ^ 0x706c_6179);
+        let many = rng.random_range(1..=HABITS_MAX);
+        let habits = Habit::ALL.into_iter().sample(&mut rng, many).into_iter().collect();
+        Self::with(seed, robot_id, around, habits)
+    }
+    /// One with these habits.
+    pub fn with(seed: u64, robot_id: RobotId, around: Around, habits: BTreeSet<Habit>) -> Self {
+        let rng = StdRng::seed_from_u64(seed ^ 0x6261_6462);
+        let vitals = Vitals {
+            waypoint: around.waypoints.first().cloned(),
+            battery_permille: 900,
+            odometer_mm: 1,
+            ..Vitals::default()
+        };
+        Self {
+            rng,
+            ring: format!("ring-{seed}-0"),
+            robot_id,
+            around,
+            habits,
+            deeds: BTreeMap::new(),
+            boots: 0,
+            produced: BTreeMap::new(),
+            kept: VecDeque::new(),
+            session: None,
+            in_charge: false,
+            hb: 0,
+            echo: None,
+            state: ReportedState { vitals, ..ReportedState::default() },
+            work: None,
+            job: None,
+            answer_at: None,
+            beat_at: 0,
+            quiet_until: 0,
+            drops: false,
+            second: false,
+            seconds: 0,
+            fresh: false,
+        }
+    }
+    /// Its name.
+    pub fn robot_id(&self) -> &RobotId {
+        &self.robot_id
+    }
+    /// What is wrong with it.
+    pub fn habits(&self) -> &BTreeSet<Habit> {
+        &self.habits
+    }
+    /// How often each habit really showed.
+    pub fn deeds(&self) -> &BTreeMap<&'static str, u64> {
+        &self.deeds
+    }
+    /// The task whose load it last said that it has, in a heartbeat.
+    pub fn said_load(&self) -> Option<&TaskId> {
+        self.state.load.as_ref()?.task_id.as_ref()
+    }
+
+    // --- a session
+
+    /// The first word of a session.
+    pub fn hello(&mut self, unix_ms: i64) -> v1::SessionRequest {
+        (self.hb, self.in_charge, self.drops, self.beat_at) = (0, false, false, 0);
+        if self.session.is_none() || self.shows(Habit::Restarts, 0.5) {
+            self.restart();
+        }
+        let position = |(lane, last): (&Lane, &u64)| {
+            let first = self.kept.iter().find(|(kept, _)| kept == lane).map_or(last + 1, |(_, sample)| sample.seq);
+            (*lane, LanePosition { first_seq: first, next_seq: last + 1 })
+        };
+        let lanes = self.produced.iter().map(position).collect();
+        let reported = ReportedState { applied_work: 0, ..self.state.clone() };
+        let hello = Hello {
+            robot_id: self.robot_id.clone(),
+            boot_id: format!("boot-{}", self.boots),
+            previous: self.session.as_ref().map(|(previous, _)| previous.clone()),
+            inventory: inventory(),
+            reported,
+            ring: self.ring.clone(),
+            lanes,
+            store_id: self.session.as_ref().map(|(_, store)| store.clone()).unwrap_or_default(),
+            sent_unix_ms: self.stamp(unix_ms),
+            clock_rate_permille: 1_000,
+            protocol_versions: vec![PROTOCOL_VERSION],
+            installed: String::new(),
+        };
+        (&FromRobot::Hello(Box::new(hello))).into()
+    }
+    /// The process ends and another begins: some of them remember nothing.
+    fn restart(&mut self) {
+        self.boots += 1;
+        if self.boots > 1 && self.rng.random_bool(0.5) {
+            (self.job, self.answer_at) = (None, None);
+            self.state.attempts.clear();
+        }
+        if self.boots > 1 && self.rng.random_bool(0.3) {
+            self.ring = format!("{}-{}", self.robot_id, self.rng.random::<u32>());
+            (self.session, self.work) = (None, None);
+            self.produced.clear();
+            self.kept.clear();
+        }
+    }
+    /// The first word of a machine that has its name beside it.
+    pub fn second_hello(&mut self, unix_ms: i64) -> v1::SessionRequest {
+        let reported = ReportedState { hb: 0, session_epoch: 0, ..self.state.clone() };
+        let hello = Hello {
+            robot_id: self.robot_id.clone(),
+            boot_id: format!("boot-beside-{}", self.boots),
+            previous: self.session.as_ref().map(|(previous, _)| previous.clone()),
+            inventory: inventory(),
+            reported,
+            ring: format!("ring-beside-{}", self.boots),
+            lanes: BTreeMap::new(),
+            store_id: String::new(),
+            sent_unix_ms: unix_ms,
+            clock_rate_permille: 1_000,
+            protocol_versions: vec![PROTOCOL_VERSION],
+            installed: String::new(),
+        };
+        (&FromRobot::Hello(Box::new(hello))).into()
+    }
+    /// A heartbeat of that machine, which has its own idea of what the robot does.
+    pub fn second_says(&mut self, unix_ms: i64) -> v1::SessionRequest {
+        self.seconds += 1;
+        let mut reported = ReportedState { hb: self.seconds, session_epoch: 1, ..self.state.clone() };
+        self.misbehave(Habit::ForeignAttempts, 0, &mut reported);
+        let heartbeat = Heartbeat { reported, sent_unix_us: unix_ms.saturating_mul(1_000), clock: None };
+        (&FromRobot::Uplink(Uplink { heartbeat: Some(heartbeat), batches: Vec::new() })).into()
+    }
+    /// Hears one message at `now_ms` of its own clock. False: the session is over.
+    pub fn hear(&mut self, message: v1::SessionResponse, now_ms: u64) -> bool {
+        let Ok(message) = midshift_proto::parse::<ToRobot, _>(message) else { return false };
+        match message {
+            ToRobot::Welcome(welcome) => self.welcomed(welcome),
+            ToRobot::Downlink(down) => {
+                if let Some(echo) = down.echo {
+                    self.echo = Some(ClockSample { t4_us: (now_ms * 1_000) as i64, ..echo.clock });
+                }
+                down.acks.iter().for_each(|ack| self.acknowledged(ack));
+                if let Some(work) = down.work {
+                    self.asked(work, now_ms);
+                }
+            }
+            ToRobot::Close(_) => return false,
+            ToRobot::MoveOver { .. } => self.drops = true,
+        }
+        true
+    }
+    fn welcomed(&mut self, welcome: Welcome) {
+        self.in_charge = !welcome.observed;
+        if self.in_charge {
+            let previous = Previous { session_epoch: welcome.session_epoch, secret: welcome.session_secret };
+            self.session = Some((previous, welcome.store_id));
+            self.work = None;
+        }
+        welcome.acks.iter().for_each(|ack| self.acknowledged(ack));
+    }
+    fn acknowledged(&mut self, ack: &LaneAck) {
+        self.kept.retain(|(lane, sample)| *lane != ack.lane || sample.seq > ack.seq);
+        let last = self.produced.entry(ack.lane).or_default();
+        *last = (*last).max(ack.seq);
+    }
+    /// Whether it breaks its connection off now.
+    pub fn drops(&self) -> bool {
+        self.drops
+    }
+    /// Whether a machine with its name appears now.
+    pub fn has_second(&mut self) -> bool {
+        std::mem::take(&mut self.second)
+    }
+
+    // --- what it says
+
+    /// What it says at `now_ms` of its own clock.
+    pub fn say(&mut self, now_ms: u64, unix_ms: i64) -> Vec<v1::SessionRequest> {
+        if now_ms < self.quiet_until {
+            return Vec::new();
+        }
+        self.go_on(now_ms);
+        let mut said = Vec::new();
+        let beats = now_ms >= self.beat_at;
+        if beats {
+            self.beat_at = now_ms + 1_000;
+            said.push(self.heartbeat(now_ms, unix_ms));
+        }
+        if std::mem::take(&mut self.fresh) || beats {
+            let batches = self.batches(unix_ms);
+            if !batches.is_empty() {
+                said.push((&FromRobot::Uplink(Uplink { heartbeat: None, batches })).into());
+            }
+        }
+        said
+    }
+    fn heartbeat(&mut self, now_ms: u64, unix_ms: i64) -> v1::SessionRequest {
+        self.hb += 1;
+        let mut report = ReportedState {
+            hb: self.hb,
+            session_epoch: self.session.as_ref().map_or(1, |(previous, _)| previous.session_epoch),
+            applied_work: self.work.as_ref().map_or(0, |work| work.generation),
+            produced: self.produced.clone(),
+            stop_level: StopLevel::None,
+            ..self.state.clone()
+        };
+        for habit in self.habits.clone() {
+            self.misbehave(habit, now_ms, &mut report);
+        }
+        let sent_unix_us = self.stamp(unix_ms).saturating_mul(1_000);
+        let heartbeat = Heartbeat { reported: report, sent_unix_us, clock: self.echo.take() };
+        (&FromRobot::Uplink(Uplink { heartbeat: Some(heartbeat), batches: Vec::new() })).into()
+    }
+    /// What is not acknowledged, from the oldest on, in messages of their size.
+    fn batches(&mut self, unix_ms: i64) -> Vec<LaneBatch> {
+        let mut batches: Vec<LaneBatch> = Vec::new();
+        let samples: Vec<(Lane, Sample)> = self.kept.iter().take(64).cloned().collect();
+        for (lane, sample) in samples {
+            let robot_unix_ms = self.stamp(unix_ms);
+            let item = InboxItem::Sample(Sample { robot_unix_ms, ..sample });
+            match batches.iter_mut().find(|batch| batch.lane == lane) {
+                Some(batch) => batch.items.push(item),
+                None => batches.push(LaneBatch { lane, items: vec![item] }),
+            }
+        }
+        if self.shows(Habit::LosesNumbers, 0.1) {
+            self.lose_numbers(&mut batches);
+        }
+        batches
+    }
+    /// Says that some will never come, or leaves some out and says those behind them.
+    fn lose_numbers(&mut self, batches: &mut [LaneBatch]) {
+        for batch in batches.iter_mut().filter(|batch| batch.items.len() > 1) {
+            let at = self.rng.random_range(0..batch.items.len() - 1);
+            let lane = batch.lane;
+            if let (InboxItem::Sample(sample), true) = (batch.items.remove(at), self.rng.random_bool(0.5)) {
+                let (seq, reason) = (sample.seq, Code::Overflow.into());
+                batch.items.insert(at, InboxItem::Gap(Gap { lane, from_seq: seq, to_seq: seq, reason }));
+                self.kept.retain(|(kept, sample)| (*kept, sample.seq) != (lane, seq));
+            }
+        }
+    }
+    /// Notes something to be said in this lane.
+    fn produce(&mut self, lane: Lane, event: RobotEvent) {
+        let seq = self.produced.entry(lane).or_default();
+        *seq += 1;
+        let sample = Sample { seq: *seq, robot_unix_ms: 0, body: SampleBody::Event(event) };
+        // What finds no room is never said: its number goes to the next.
+        if self.kept.len() < KEPT_MAX {
+            self.kept.push_back((lane, sample));
+        } else {
+            *seq -= 1;
+        }
+        self.fresh = true;
+    }
+    fn event(&mut self, event: RobotEvent) {
+        self.produce(Lane::Event, event);
+    }
+    /// The time that it writes on something.
+    fn stamp(&mut self, unix_ms: i64) -> i64 {
+        if self.habits.contains(&Habit::WrongClocks) && self.rng.random_bool(0.5) {
+            let far = [0, -1, 1, i64::MAX / 2_000, i64::MIN / 2_000, unix_ms + 86_400_000, unix_ms - 86_400_000];
+            *self.deeds.entry(Habit::WrongClocks.name()).or_default() += 1;
+            return far.choose(&mut self.rng).copied().unwrap_or(unix_ms);
+        }
+        unix_ms
+    }
+    /// Whether it has this habit and shows it now; counted.
+    fn shows(&mut self, habit: Habit, chance: f64) -> bool {
+        let shows = self.habits.contains(&habit) && self.rng.random_bool(chance);
+        if shows {
+            *self.deeds.entry(habit.name()).or_default() += 1;
+        }
+        shows
+    }
+    fn some_place(&mut self) -> Option<PlaceId> {
+        self.around.places.choose(&mut self.rng).cloned()
+    }
+    fn holds(&mut self, place_id: &PlaceId, grant_id: u64, inside: bool) {
+        self.state.places.retain(|held| held.place_id != *place_id);
+        self.state.places.push(HeldPlace { place_id: place_id.clone(), grant_id, inside });
+    }
+}
+
+/// It can do what the simulated bodies can, so that it is given the same work.
+fn inventory() -> Inventory {
+    let capabilities = ["charge", "drop", "inspect", "park", "pick", "place", "transport"].map(str::to_owned).into();
+    Inventory { capabilities, payload_g: 60_000, software: "1.0.0".to_owned(), ..Inventory::default() }
+}
