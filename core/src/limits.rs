@@ -66,6 +66,9 @@ pub const PARAMS_BYTES_MAX: usize = 8 * 1024;
 pub const PAGE_DEFAULT: usize = 100;
 /// Largest page.
 pub const PAGE_MAX: usize = 1_000;
+/// Tasks that one call of a list looks at, about, before it answers with what it found: some 100 ms of reading. No filter that an index serves
+/// comes near it.
+pub const LIST_ROWS_READ_MAX: usize = 10_000;
 /// A control message, bytes.
 pub const CONTROL_MESSAGE_BYTES: usize = 64 * 1024;
 /// Sets that a robot lists at Hello: those that its switch record names, what is staged, and room for as many again.

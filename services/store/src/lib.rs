@@ -197,7 +197,7 @@ impl Cursor {
     }
 }
 
-/// Which rows of one table to list. Sorted by (order, id).
+/// Which rows of one table to list. Sorted by (order, id), or by id alone where the beginning of the id is asked for.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Query {
     /// The table.
@@ -206,6 +206,8 @@ pub struct Query {
     pub states: Vec<i64>,
     /// Only rows of this owner.
     pub parent: Option<Arc<str>>,
+    /// Only rows whose id begins with this, read as a range of the key. None: any.
+    pub id_prefix: Option<Arc<str>>,
     /// Only rows behind this one, in the direction of the list.
     pub after: Option<Cursor>,
     /// From the highest order downwards.
@@ -217,7 +219,15 @@ pub struct Query {
 impl Query {
     /// The first page of all rows of `table`, lowest order first.
     pub fn all(table: Table) -> Self {
-        Self { table, states: Vec::new(), parent: None, after: None, newest_first: false, limit: limits::PAGE_MAX }
+        Self {
+            table,
+            states: Vec::new(),
+            parent: None,
+            id_prefix: None,
+            after: None,
+            newest_first: false,
+            limit: limits::PAGE_MAX,
+        }
     }
     /// Only rows of `parent`.
     #[must_use]
@@ -230,6 +240,24 @@ impl Query {
     pub fn in_states(mut self, states: impl IntoIterator<Item = i64>) -> Self {
         self.states = states.into_iter().collect();
         self
+    }
+    /// Only rows whose id begins with `prefix`, by id.
+    #[must_use]
+    pub fn of_prefix(mut self, prefix: impl AsRef<str>) -> Self {
+        self.id_prefix = Some(Arc::from(prefix.as_ref()));
+        self
+    }
+    /// The first text behind all that begin with the prefix; none: there is no prefix, or nothing is behind it.
+    fn behind_prefix(&self) -> Option<String> {
+        let mut behind = self.id_prefix.as_deref()?.to_owned();
+        while let Some(last) = behind.pop() {
+            // Ids are ordered by their bytes, and UTF-8 keeps the order of characters.
+            if let Some(next) = (last..=char::MAX).nth(1) {
+                behind.push(next);
+                return Some(behind);
+            }
+        }
+        None
     }
     fn rows_max(&self) -> usize {
         self.limit.min(limits::PAGE_MAX)

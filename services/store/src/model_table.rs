@@ -80,6 +80,9 @@ impl Rows {
             (query.states.is_empty() || row.index.state.is_some_and(|s| query.states.contains(&s)))
                 && (query.parent.is_none() || row.index.parent == query.parent)
         };
+        if let Some(prefix) = &query.id_prefix {
+            return self.of_prefix(prefix, query).filter(fits).take(limit).cloned().collect();
+        }
         let empty = Order::new();
         let orders: Vec<&Order> = match &query.parent {
             Some(parent) => vec![self.by_parent.get(parent).unwrap_or(&empty)],
@@ -96,6 +99,19 @@ impl Rows {
         }
         places.sort_unstable_by(|a, b| if query.newest_first { b.0.cmp(a.0) } else { a.0.cmp(b.0) });
         places.into_iter().take(limit).map(|(_, row)| row.clone()).collect()
+    }
+
+    /// By id, in the direction of the list.
+    fn of_prefix<'a>(&'a self, prefix: &str, query: &'a Query) -> Box<dyn Iterator<Item = &'a Row> + 'a> {
+        let behind = query.behind_prefix();
+        let end = behind.as_deref().map_or(Bound::Unbounded, Bound::Excluded);
+        let rows = self.rows.range::<str, _>((Bound::Included(prefix), end)).map(|(_, row)| row);
+        let after = query.after.as_ref().map(|place| &place.id);
+        if query.newest_first {
+            Box::new(rows.rev().filter(move |row| after.is_none_or(|after| row.key.id < *after)))
+        } else {
+            Box::new(rows.filter(move |row| after.is_none_or(|after| row.key.id > *after)))
+        }
     }
 }
 

@@ -92,8 +92,8 @@ pub(crate) fn cut(table: Table) -> String {
     format!("DELETE FROM {} WHERE site_id = $1 AND ord <= $2", table.name())
 }
 
-/// One page of a table, of one state or of any. Binds in order: site, then what is asked of parent, `state`, cursor (order, id), and
-/// the limit.
+/// One page of a table, of one state or of any. Binds in order: site, then what is asked of parent, `state`, the prefix and what is
+/// behind it, the cursor (order, id; with a prefix its id alone), and the limit.
 pub(crate) fn list(query: &Query, state: Option<i64>) -> String {
     let mut sql = format!("SELECT {ROW_READ} FROM {} WHERE site_id = $1", query.table.name());
     let mut bound = 1;
@@ -107,17 +107,35 @@ pub(crate) fn list(query: &Query, state: Option<i64>) -> String {
     if state.is_some() {
         sql += &format!(" AND state = ${}", next());
     }
+    let is_by_id = query.id_prefix.is_some();
+    if is_by_id {
+        sql += &format!(" AND id >= ${}", next());
+    }
+    if query.behind_prefix().is_some() {
+        sql += &format!(" AND id < ${}", next());
+    }
     if query.after.is_some() {
         let side = if query.newest_first { '<' } else { '>' };
-        sql += &format!(" AND (ord, id) {side} (${}, ${})", next(), next());
+        sql += &match is_by_id {
+            true => format!(" AND id {side} ${}", next()),
+            false => format!(" AND (ord, id) {side} (${}, ${})", next(), next()),
+        };
     }
-    sql += if query.newest_first { " ORDER BY ord DESC, id DESC" } else { " ORDER BY ord, id" };
+    sql += match (is_by_id, query.newest_first) {
+        (true, true) => " ORDER BY id DESC",
+        (true, false) => " ORDER BY id",
+        (false, true) => " ORDER BY ord DESC, id DESC",
+        (false, false) => " ORDER BY ord, id",
+    };
     sql + &format!(" LIMIT ${}", next())
 }
 
 /// Pages of several states, merged into the page of all of them.
 pub(crate) fn merged(query: &Query, mut rows: Vec<Row>) -> Vec<Row> {
-    rows.sort_by_cached_key(Cursor::of);
+    match query.id_prefix {
+        Some(_) => rows.sort_by(|a, b| a.key.id.cmp(&b.key.id)),
+        None => rows.sort_by_cached_key(Cursor::of),
+    }
     if query.newest_first {
         rows.reverse();
     }

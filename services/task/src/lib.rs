@@ -13,6 +13,7 @@ mod prune;
 mod reach;
 mod resume;
 mod rows;
+mod search;
 mod watch;
 
 use midshift_core::reason::Refusal;

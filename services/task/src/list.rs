@@ -1,22 +1,23 @@
-//! One page of tasks, newest first. A page token is bound to its filter.
+//! One page of tasks, newest first; of those whose ids begin alike, the greatest id first. A page token is bound to its filter.
 
 use crate::TaskService;
 use crate::rows::{TaskRows, read_many, sees, unavailable};
+use crate::search::{self, Direction, Search};
 use midshift_core::identity::Caller;
 use midshift_core::ids::TaskId;
 use midshift_core::limits;
 use midshift_core::reason::{Refusal, Violations};
-use midshift_core::rows::Table;
 use midshift_proto::convert::task::TaskFilter;
 use midshift_proto::pages;
 use midshift_proto::task::v1;
-use midshift_store::{Cursor, Query};
+use midshift_store::Cursor;
 use prost::Message;
 use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Rows one call looks at; a rarer filter continues with the next page.
-const SCAN_MAX: usize = 10_000;
+/// Fewest rows that one read of the store asks for, whatever the page.
+const READ_MIN: usize = 100;
 
 fn print_of(filter: &Option<v1::TaskFilter>) -> String {
     let bytes = filter.as_ref().map(Message::encode_to_vec).unwrap_or_default();
@@ -67,6 +68,7 @@ impl TaskService {
         let place =
             |task: &TaskRows| Cursor { order: task.state.number as i64, id: task.state.task_id.as_str().into() };
         let mut found = read_many(self.store(), &ids).await?;
+        let rows_read = found.len() as u64;
         let site = &self.inner.parts.site;
         let admits = |t: &TaskRows| filter.admits(&t.intake, &t.state) && sees(site, by, &t.intake);
         found.retain(|t| admits(t) && after.as_ref().is_none_or(|after| place(t) < *after));
@@ -75,9 +77,10 @@ impl TaskService {
         found.truncate(size);
         let last = found.last().filter(|_| more).map(|task| token(print, &place(task)));
         let tasks = found.iter().map(TaskRows::encode).collect();
-        Ok(v1::ListTasksResponse { tasks, next_page_token: last.unwrap_or_default() })
+        Ok(v1::ListTasksResponse { tasks, next_page_token: last.unwrap_or_default(), rows_read })
     }
 
+    /// Tasks that must be looked for. The token is given only if there is another task, or if the call has looked at as many as one may.
     async fn page(
         &self,
         filter: &TaskFilter,
@@ -87,39 +90,33 @@ impl TaskService {
         mut after: Option<Cursor>,
     ) -> Result<v1::ListTasksResponse, Refusal> {
         let (store, site) = (self.store(), &self.inner.parts.site);
-        let mut tasks = Vec::new();
-        let mut scanned = 0;
-        loop {
-            let query = Query {
-                after: after.clone(),
-                newest_first: true,
-                limit: limits::PAGE_MAX.min(size.max(100)),
-                ..Query::all(Table::TaskState).in_states(filter.phases.iter().map(|p| p.number()))
-            };
-            let rows = store.list(query).await.map_err(unavailable)?;
+        let admits = |t: &TaskRows| filter.admits(&t.intake, &t.state) && sees(site, by, &t.intake);
+        let mut search = Search::new(filter, Direction::NewestFirst, after.clone(), (size + 1).max(READ_MIN));
+        let (mut tasks, mut rows_read) = (Vec::new(), 0);
+        let go_on = |after: Option<&Cursor>| after.map(|c| token(print, c)).unwrap_or_default();
+        while rows_read < limits::LIST_ROWS_READ_MAX {
+            let rows = search.next(store).await.map_err(unavailable)?;
             if rows.is_empty() {
-                return Ok(v1::ListTasksResponse { tasks, next_page_token: String::new() });
+                return Ok(v1::ListTasksResponse {
+                    tasks,
+                    next_page_token: String::new(),
+                    rows_read: rows_read as u64,
+                });
             }
-            scanned += rows.len();
-            let ids: Vec<TaskId> = rows.iter().filter_map(|row| TaskId::parse(&row.key.id).ok()).collect();
-            let found = read_many(store, &ids).await?;
-            let mut found =
-                found.into_iter().map(|t| (t.intake.task_id.clone(), t)).collect::<std::collections::BTreeMap<_, _>>();
+            let found = read_many(store, &search::admitted(filter, &rows)).await?;
+            let mut found: BTreeMap<_, _> = found.into_iter().map(|t| (t.intake.task_id.to_string(), t)).collect();
             for row in &rows {
-                after = Some(Cursor::of(row));
-                let task = TaskId::parse(&row.key.id).ok().and_then(|id| found.remove(&id));
-                let admits = |t: &TaskRows| filter.admits(&t.intake, &t.state) && sees(site, by, &t.intake);
-                if let Some(task) = task.filter(admits) {
+                rows_read += 1;
+                if let Some(task) = found.remove(&*row.key.id).filter(admits) {
+                    if tasks.len() == size {
+                        let (next_page_token, rows_read) = (go_on(after.as_ref()), rows_read as u64);
+                        return Ok(v1::ListTasksResponse { tasks, next_page_token, rows_read });
+                    }
                     tasks.push(task.encode());
                 }
-                if tasks.len() == size {
-                    break;
-                }
-            }
-            if tasks.len() == size || scanned >= SCAN_MAX {
-                let next_page_token = after.as_ref().map(|c| token(print, c)).unwrap_or_default();
-                return Ok(v1::ListTasksResponse { tasks, next_page_token });
+                after = Some(Cursor::of(row));
             }
         }
+        Ok(v1::ListTasksResponse { tasks, next_page_token: go_on(after.as_ref()), rows_read: rows_read as u64 })
     }
 }

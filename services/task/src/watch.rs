@@ -7,9 +7,9 @@ use crate::TaskService;
 use crate::grpc::CallId;
 use crate::images::{Image, Images};
 use crate::rows::{read_many, robot_kept, sees, unavailable};
+use crate::search::{self, Direction, Search};
 use midshift_core::fleet::requests::allowed_resolutions;
 use midshift_core::identity::Caller;
-use midshift_core::ids::TaskId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Entry, Log, Revision, Seq, Table};
@@ -18,7 +18,7 @@ use midshift_core::time::Utc;
 use midshift_proto::convert::task::{TaskFilter, TaskView, encode_task};
 use midshift_proto::convert::timestamp;
 use midshift_proto::task::v1::{self, watch_tasks_response::Item};
-use midshift_store::{Cursor, Error, Query};
+use midshift_store::Error;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 use tokio::sync::{OwnedSemaphorePermit, mpsc};
@@ -151,15 +151,13 @@ impl Watcher {
     async fn existing(&mut self) -> Result<(), Stop> {
         let store = self.service.inner.parts.store.clone();
         self.after = self.head().await?;
-        let mut after: Option<Cursor> = None;
+        let mut search = Search::new(&self.filter, Direction::OldestFirst, None, limits::PAGE_MAX);
         loop {
-            let states = self.filter.phases.iter().map(|p| p.number());
-            let query = Query { after, limit: limits::PAGE_MAX, ..Query::all(Table::TaskState).in_states(states) };
-            let rows = store.list(query).await.map_err(unavailable)?;
-            let Some(last) = rows.last() else { break };
-            after = Some(Cursor::of(last));
-            let ids: Vec<TaskId> = rows.iter().filter_map(|r| TaskId::parse(&r.key.id).ok()).collect();
-            for task in read_many(store.as_ref(), &ids).await? {
+            let rows = search.next(store.as_ref()).await.map_err(unavailable)?;
+            if rows.is_empty() {
+                break;
+            }
+            for task in read_many(store.as_ref(), &search::admitted(&self.filter, &rows)).await? {
                 let is_seen = sees(&self.service.inner.parts.site, &self.by, &task.intake);
                 if is_seen && self.filter.admits(&task.intake, &task.state) {
                     self.shown.insert(task.state.number, task.revision);

@@ -13,6 +13,12 @@ use std::io::IsTerminal;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::time::Duration;
+use tonic::Code;
+
+/// Tasks that an ambiguous beginning of an id shows.
+const CANDIDATES_SHOWN: u32 = 10;
+/// How far a long search is, is said after so many tasks each.
+const TOLD_EVERY: u64 = 100_000;
 
 /// Verbs of tasks.
 #[derive(Subcommand)]
@@ -304,22 +310,43 @@ async fn resolve(
 }
 
 impl One {
-    /// The whole id behind a prefix.
+    /// The whole id behind a prefix. A whole id is always itself, however many others begin with it.
     async fn find(&self) -> Result<String, Exit> {
+        if self.task_id.is_empty() {
+            return Err(Exit::usage("the id of a task is empty\n  try: midshift task ls"));
+        }
+        let mut client = self.call.task().await?;
+        match client.get_task(unary(v1::GetTaskRequest { task_id: self.task_id.clone() })).await {
+            Ok(_) => return Ok(self.task_id.clone()),
+            Err(status) if matches!(status.code(), Code::NotFound | Code::InvalidArgument) => {}
+            Err(status) => return Err(status.into()),
+        }
         let filter = v1::TaskFilter { task_id_prefix: self.task_id.clone(), ..v1::TaskFilter::default() };
-        let request = v1::ListTasksRequest { filter: Some(filter), page_size: 2, page_token: String::new() };
-        let tasks = self.call.task().await?.list_tasks(unary(request)).await?.into_inner().tasks;
-        match tasks.as_slice() {
-            [] => Err(Exit::new(4, format!("no task begins with {}\n  try: midshift task ls", self.task_id))),
-            [task] => Ok(task.task_id.clone()),
-            several if several.iter().any(|t| t.task_id == self.task_id) => Ok(self.task_id.clone()),
-            _ => Err(Exit::usage(format!("more than one task begins with {}; give more of its id", self.task_id))),
+        let request =
+            v1::ListTasksRequest { filter: Some(filter), page_size: CANDIDATES_SHOWN, page_token: String::new() };
+        let page = client.list_tasks(unary(request)).await?.into_inner();
+        let candidates = page.tasks.iter().map(|t| [t.task_id.as_str(), &state(t), &way(t)].join("  "));
+        match (page.tasks.as_slice(), page.next_page_token.is_empty()) {
+            ([task], true) => Ok(task.task_id.clone()),
+            (_, is_all) => Err(no_single("task", &self.task_id, candidates, is_all)),
         }
     }
     async fn read(&self) -> Result<v1::GetTaskResponse, Exit> {
         let task_id = self.find().await?;
         Ok(self.call.task().await?.get_task(unary(v1::GetTaskRequest { task_id })).await?.into_inner())
     }
+}
+
+/// What begins with `prefix` where one was meant: nothing, or these candidates.
+fn no_single(what: &str, prefix: &str, candidates: impl Iterator<Item = String>, is_all: bool) -> Exit {
+    let mut lines: String = candidates.map(|line| format!("\n  {}", line.trim_end())).collect();
+    if lines.is_empty() {
+        return Exit::new(4, format!("no {what} begins with {prefix}\n  try: midshift {what} ls"));
+    }
+    if !is_all {
+        lines += "\n  and more";
+    }
+    Exit::usage(format!("more than one {what} begins with {prefix}:{lines}\n  try: the same with more of the id"))
 }
 
 fn state(task: &v1::Task) -> String {
@@ -460,8 +487,19 @@ async fn list(args: List, out: &Out) -> Result<(), Exit> {
         external_ref: args.external_ref,
         ..v1::TaskFilter::default()
     };
-    let request = v1::ListTasksRequest { filter: Some(filter), page_size: args.limit, page_token: args.page_token };
-    let page = args.call.task().await?.list_tasks(unary(request)).await?.into_inner();
+    let mut request = v1::ListTasksRequest { filter: Some(filter), page_size: args.limit, page_token: args.page_token };
+    let mut client = args.call.task().await?;
+    let mut page = client.list_tasks(unary(request.clone())).await?.into_inner();
+    // A rare filter without an index: the server says how far it looked, and goes on from there.
+    while page.tasks.is_empty() && !page.next_page_token.is_empty() {
+        request.page_token.clone_from(&page.next_page_token);
+        let looked_at = page.rows_read;
+        page = client.list_tasks(unary(request.clone())).await?.into_inner();
+        page.rows_read += looked_at;
+        if page.rows_read / TOLD_EVERY > looked_at / TOLD_EVERY {
+            out.say(&format!("{} tasks looked at", page.rows_read));
+        }
+    }
     let row = |t: &v1::Task| vec![t.task_id.clone(), state(t), priority(t), t.robot_id.clone(), way(t), reason(t)];
     out.many(&page, &page.tasks, |t| t.task_id.clone(), &["TASK", "STATE", "PRIO", "ROBOT", "WAY", "WHY"], row)?;
     if !page.next_page_token.is_empty() {
@@ -505,7 +543,7 @@ async fn explain(one: &One, out: &Out) -> Result<(), Exit> {
     let request = midshift_proto::fleet::v1::ExplainTaskRequest { task_id: task_id.clone() };
     let answer = match one.call.fleet().await?.explain_task(unary(request)).await {
         // Fleet knows tasks that are not over; of one that is, the record says why.
-        Err(status) if status.code() == tonic::Code::NotFound => return get(one, out).await,
+        Err(status) if status.code() == Code::NotFound => return get(one, out).await,
         answer => answer?.into_inner(),
     };
     let e = answer.explanation.clone().unwrap_or_default();
@@ -638,4 +676,22 @@ async fn until_over(call: &Call, task_id: &str, mut told: String, out: &Out) -> 
         Ok(if is_over { ControlFlow::Break(task) } else { ControlFlow::Continue(()) })
     };
     client::follow(out, open, take).await
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_ambiguous_beginning_lists_its_candidates_and_says_whether_these_are_all() {
+        let two = || ["T-1  QUEUED", "T-12  RUNNING"].map(str::to_owned).into_iter();
+        let all = no_single("task", "T-1", two(), true);
+        assert_eq!(all.code(), 2);
+        let said =
+            "more than one task begins with T-1:\n  T-1  QUEUED\n  T-12  RUNNING\n  try: the same with more of the id";
+        assert_eq!(all.to_string(), said);
+        assert!(no_single("task", "T-1", two(), false).to_string().contains("\n  and more\n"));
+        let none = no_single("task", "X", std::iter::empty(), true);
+        assert_eq!((none.code(), none.to_string().as_str()), (4, "no task begins with X\n  try: midshift task ls"));
+    }
 }

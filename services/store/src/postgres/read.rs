@@ -54,7 +54,7 @@ pub(super) async fn get(readers: &PgPool, site_id: &SiteId, keys: &[Key]) -> Res
 
 /// Each state is read from its own stretch of the index and the stretches are merged, as with SQLite.
 pub(super) async fn list(readers: &PgPool, site_id: &SiteId, query: &Query) -> Result<Vec<Row>, sqlx::Error> {
-    if query.parent.as_deref().is_some_and(|parent| !is_text(parent)) {
+    if query.parent.iter().chain(&query.id_prefix).any(|text| !is_text(text)) {
         return Ok(Vec::new());
     }
     let states: BTreeSet<i64> = query.states.iter().copied().collect();
@@ -82,9 +82,16 @@ async fn list_one(
     if let Some(state) = state {
         select = select.bind(state);
     }
+    if let Some(prefix) = &query.id_prefix {
+        select = select.bind(&**prefix);
+    }
+    if let Some(behind) = query.behind_prefix() {
+        select = select.bind(behind);
+    }
     if let Some(Cursor { order, id }) = &query.after {
+        select = if query.id_prefix.is_none() { select.bind(*order) } else { select };
         // A cursor that somebody made up may have a NUL in it: what stands before that is where the list goes on.
-        select = select.bind(*order).bind(id.split('\0').next());
+        select = select.bind(id.split('\0').next());
     }
     let rows = select.bind(query.rows_max() as i64).fetch_all(connection).await?;
     rows.iter().map(|found| row(query.table, found)).collect()

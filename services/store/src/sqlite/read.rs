@@ -91,8 +91,14 @@ async fn list_one(
     if let Some(state) = state {
         select = select.bind(state);
     }
+    if let Some(prefix) = &query.id_prefix {
+        select = select.bind(prefix.clone());
+    }
+    if let Some(behind) = query.behind_prefix() {
+        select = select.bind(behind);
+    }
     if let Some(Cursor { order, id }) = &query.after {
-        select = select.bind(*order).bind(id.clone());
+        select = if query.id_prefix.is_none() { select.bind(*order) } else { select }.bind(id.clone());
     }
     let rows = select.bind(query.rows_max() as i64).fetch_all(connection).await?;
     rows.iter().map(|found| row(query.table, found)).collect()

@@ -34,6 +34,7 @@ contract! {
     a_list_pages_through_every_row_once_in_both_directions
     a_list_filters_by_state_and_parent_as_they_are_now
     a_reading_holds_its_parts_and_what_they_name_and_nothing_else
+    a_prefix_lists_by_id_the_rows_that_begin_with_it
     a_submit_between_snapshot_and_commit_does_not_spoil_the_plan
     concurrent_writers_all_make_progress_and_numbers_have_no_holes
     a_row_reads_back_as_written_in_every_table
@@ -288,6 +289,42 @@ async fn a_reading_holds_its_parts_and_what_they_name_and_nothing_else(store: Ar
     assert_eq!(read.seq, store.snapshot(&[]).await.unwrap().seq);
     let none = store.read(&[], named).await.unwrap();
     assert!(none.rows.is_empty());
+}
+
+async fn a_prefix_lists_by_id_the_rows_that_begin_with_it(store: Arc<dyn Store>) {
+    // The order runs against the ids: it must not matter.
+    let ids = ["T", "T-", "T-1", "T-1\u{7f}", "T-1\u{10ffff}", "T-1\u{10ffff}z", "T-2", "T.", "U", "t-1"];
+    let row = |(n, id): (usize, &&str)| {
+        let index = Index { state: Some(n as i64 % 2), parent: Some(Arc::from("r1")), order: Some(-(n as i64)) };
+        indexed(Table::Incident, id, Expect::Absent, "{}", index)
+    };
+    one(&*store, Writer::Fleet, ids.iter().enumerate().map(row).collect()).await.unwrap();
+    let found = async |query: Query| {
+        let rows = store.list(query).await.unwrap();
+        rows.iter().map(|row| row.key.id.to_string()).collect::<Vec<_>>()
+    };
+    let of = |prefix: &str| Query::all(Table::Incident).of_prefix(prefix);
+    assert_eq!(found(of("T-1")).await, ids[2..6]);
+    assert_eq!(found(of("T-1\u{10ffff}")).await, ids[4..6]);
+    assert_eq!(found(of("T-2")).await, ["T-2"], "a whole id is its own prefix");
+    assert_eq!(found(of("")).await, ids);
+    assert_eq!(found(of("\u{10ffff}")).await, [""; 0]);
+    assert_eq!(found(of("T\0")).await, [""; 0], "there is no such id, and to ask is no error");
+    assert_eq!(found(of("T-1").in_states([1])).await, [ids[3], ids[5]]);
+    assert_eq!(found(of("T-").in_states([0, 1]).of_parent("r1")).await, ids[1..7]);
+    assert_eq!(found(of("T-").of_parent("r2")).await, [""; 0]);
+    let mut expected: Vec<&str> = ids[1..7].to_vec();
+    for newest_first in [false, true] {
+        let (mut after, mut seen) = (None, Vec::new());
+        loop {
+            let page = store.list(Query { after, limit: 4, newest_first, ..of("T-") }).await.unwrap();
+            let Some(last) = page.last() else { break };
+            after = Some(Cursor::of(last));
+            seen.extend(page.iter().map(|row| row.key.id.to_string()));
+        }
+        assert_eq!(seen, expected);
+        expected.reverse();
+    }
 }
 
 async fn a_submit_between_snapshot_and_commit_does_not_spoil_the_plan(store: Arc<dyn Store>) {

@@ -6,6 +6,7 @@ mod errors;
 mod forms;
 mod intake;
 mod lists;
+mod lookups;
 mod prune;
 mod reach;
 mod watches;

@@ -59,6 +59,10 @@ impl World {
         let service = TaskService::open(parts, shutdown.clone()).await.expect("a store opens");
         Self { store, service, site, shutdown }
     }
+    /// The clock that stands at noon.
+    pub fn clock(&self) -> Arc<dyn Clock> {
+        Arc::new(At(NOON))
+    }
     /// The service as it is so many milliseconds after noon.
     pub async fn later(&self, ms: i64) -> TaskService {
         let clock = Arc::new(At(Utc(NOON.0 + ms)));
@@ -149,7 +153,7 @@ impl World {
     pub async fn watch(&self, filter: Option<v1::TaskFilter>, cursor: &str) -> Watch {
         let request = v1::WatchTasksRequest { filter, cursor: cursor.to_owned() };
         let stream = self.service.watch_tasks(Request::new(request)).await.expect("a watch").into_inner();
-        Watch(Box::pin(stream))
+        Watch::over(stream)
     }
 }
 
@@ -161,6 +165,10 @@ type Message = Result<v1::WatchTasksResponse, tonic::Status>;
 pub struct Watch(std::pin::Pin<Box<dyn Stream<Item = Message> + Send>>);
 
 impl Watch {
+    /// Of what a service streams.
+    pub fn over(stream: impl Stream<Item = Message> + Send + 'static) -> Self {
+        Self(Box::pin(stream))
+    }
     pub async fn message(&mut self) -> v1::WatchTasksResponse {
         self.0.next().await.expect("a message").expect("no refusal")
     }

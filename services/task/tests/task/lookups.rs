@@ -1,0 +1,223 @@
+//! Lookups in a store where far more has ended than one call may look at: what is asked for by id, by its beginning or by robot is found by
+//! an index. What counts is how many rows the store hands out.
+
+use crate::world::{Watch, World, patrol, submit};
+use midshift_core::audit::Head;
+use midshift_core::ids::{RobotId, SiteId, TaskId};
+use midshift_core::limits;
+use midshift_core::rows::{Item, Key, Log, Naming, Part, Row, Seq, Writer};
+use midshift_core::task::{Phase, TaskIntake, TaskState};
+use midshift_proto::task::v1::task_service_server::TaskService as _;
+use midshift_proto::task::v1::{self, ListTasksRequest, TaskFilter};
+use midshift_store::{
+    Applied, CommitError, Error, FeedPage, MemoryStore, Query, Retention, Snapshot, Store, StoreId, load,
+};
+use midshift_task::{Parts, TaskService};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+use tokio::sync::watch;
+use tonic::Request;
+
+/// Tasks that have ended: more than one call looks at.
+const ENDED: u64 = limits::LIST_ROWS_READ_MAX as u64 + 2_500;
+/// Rows of one item, two a task.
+const TASKS_PER_ITEM: u64 = 100;
+
+/// A store that counts the rows it hands out.
+struct Counted {
+    store: Arc<MemoryStore>,
+    rows: AtomicUsize,
+}
+
+impl Counted {
+    fn count<T>(&self, rows: &Result<Vec<T>, Error>) {
+        self.rows.fetch_add(rows.as_ref().map_or(0, Vec::len), Relaxed);
+    }
+}
+
+#[tonic::async_trait]
+impl Store for Counted {
+    fn id(&self) -> &StoreId {
+        self.store.id()
+    }
+    fn site_id(&self) -> &SiteId {
+        self.store.site_id()
+    }
+    fn is_shared(&self) -> bool {
+        self.store.is_shared()
+    }
+    async fn commit(&self, items: Vec<Item>) -> Vec<Result<Applied, CommitError>> {
+        self.store.commit(items).await
+    }
+    async fn get(&self, keys: Vec<Key>) -> Result<Vec<Row>, Error> {
+        let rows = self.store.get(keys).await;
+        self.count(&rows);
+        rows
+    }
+    async fn list(&self, query: Query) -> Result<Vec<Row>, Error> {
+        let rows = self.store.list(query).await;
+        self.count(&rows);
+        rows
+    }
+    async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error> {
+        let snapshot = self.store.read(parts, named).await;
+        self.rows.fetch_add(snapshot.as_ref().map_or(0, |snapshot| snapshot.rows.len()), Relaxed);
+        snapshot
+    }
+    async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error> {
+        self.store.feed(after, logs, limit).await
+    }
+    async fn feed_of(&self, log: Log, subjects: &[Arc<str>], after: Seq, limit: usize) -> Result<FeedPage, Error> {
+        self.store.feed_of(log, subjects, after, limit).await
+    }
+    fn wake(&self) -> watch::Receiver<Seq> {
+        self.store.wake()
+    }
+    async fn raise_head(&self, at_least: Seq) -> Result<Seq, Error> {
+        self.store.raise_head(at_least).await
+    }
+    async fn audit_heads(&self) -> Result<BTreeMap<Writer, Head>, Error> {
+        self.store.audit_heads().await
+    }
+    async fn prune(&self, keep: Retention) -> Result<u64, Error> {
+        self.store.prune(keep).await
+    }
+}
+
+/// An old site: the first task is the one that is looked for, and r-old is the only robot of nine of them; then come those that others did.
+struct Old {
+    service: TaskService,
+    counted: Arc<Counted>,
+    first: String,
+}
+
+impl Old {
+    async fn site() -> Self {
+        let world = World::new().await;
+        let first = submit(&world.service, patrol("first", &[])).await.expect("admitted").task_id;
+        let (intake, _) = load::<TaskIntake>(&*world.store, &first).await.expect("a store").expect("a task");
+        let (state, _) = world.state(&first).await;
+        for from in (1..ENDED).step_by(TASKS_PER_ITEM as usize) {
+            let mut item = Item::new(Writer::Task, "task");
+            for number in from + 1..=from + TASKS_PER_ITEM {
+                let task_id = TaskId::parse(&format!("OLD-{number:06}")).expect("an id");
+                let robot = if number <= 10 { "r-old" } else { ["r-1", "r-2"][number as usize % 2] };
+                let robot_id = Some(RobotId::parse(robot).expect("an id"));
+                let mut state = TaskState { task_id: task_id.clone(), number, robot_id, ..state.clone() };
+                state.phase = Phase::Succeeded;
+                item.create(&TaskIntake { task_id, number, ..intake.clone() }, "task.submitted");
+                item.create(&state, "task.submitted");
+            }
+            world.store.commit(vec![item]).await.remove(0).expect("applied");
+        }
+        let counted = Arc::new(Counted { store: world.store.clone(), rows: AtomicUsize::new(0) });
+        let parts = Parts { store: counted.clone(), site: world.site.clone(), clock: world.clock() };
+        let service = TaskService::open(parts, world.shutdown.clone()).await.expect("a store opens");
+        Self { service, counted, first }
+    }
+    /// What `filter` finds, and how many rows the store handed out for it.
+    async fn page(&self, filter: TaskFilter, size: u32, token: &str) -> (v1::ListTasksResponse, usize) {
+        let request = ListTasksRequest { filter: Some(filter), page_size: size, page_token: token.to_owned() };
+        self.counted.rows.store(0, Relaxed);
+        let page = self.service.list_tasks(Request::new(request)).await.expect("a page").into_inner();
+        (page, self.counted.rows.load(Relaxed))
+    }
+}
+
+fn ids(page: &v1::ListTasksResponse) -> Vec<&str> {
+    page.tasks.iter().map(|task| task.task_id.as_str()).collect()
+}
+
+#[tokio::test]
+async fn the_oldest_task_is_found_by_the_beginning_of_its_id_and_nothing_else_is_read() {
+    let old = Old::site().await;
+    let task_id_prefix = old.first[..8].to_owned();
+    let (page, rows) = old.page(TaskFilter { task_id_prefix, ..TaskFilter::default() }, 2, "").await;
+    assert_eq!((ids(&page), page.next_page_token.as_str()), (vec![old.first.as_str()], ""));
+    assert!(rows <= 4, "{rows} rows");
+    let task_id_prefix = "OLD-00001".to_owned();
+    let filter = TaskFilter { task_id_prefix, ..TaskFilter::default() };
+    let (page, rows) = old.page(filter.clone(), 8, "").await;
+    assert_eq!((ids(&page)[0], page.tasks.len()), ("OLD-000019", 8));
+    assert!(rows <= 4 * 10, "{rows} rows");
+    let (rest, _) = old.page(filter, 8, &page.next_page_token).await;
+    assert_eq!((ids(&rest), rest.next_page_token.as_str()), (vec!["OLD-000011", "OLD-000010"], ""));
+}
+
+#[tokio::test]
+async fn tasks_of_a_robot_are_found_behind_any_number_of_others_and_no_page_is_empty_with_more() {
+    let old = Old::site().await;
+    let of = |robots: &[&str]| TaskFilter {
+        robot_ids: robots.iter().map(ToString::to_string).collect(),
+        ..TaskFilter::default()
+    };
+    let (page, rows) = old.page(of(&["r-old"]), 5, "").await;
+    assert_eq!(page.tasks.iter().map(|t| t.number).collect::<Vec<_>>(), [10, 9, 8, 7, 6]);
+    assert!(rows <= 4 * 9, "{rows} rows");
+    let (rest, _) = old.page(of(&["r-old"]), 5, &page.next_page_token).await;
+    assert_eq!(rest.tasks.iter().map(|t| t.number).collect::<Vec<_>>(), [5, 4, 3, 2]);
+    assert_eq!(rest.next_page_token, "");
+    let states = vec![v1::TaskState::Running.into()];
+    let (none, rows) = old.page(TaskFilter { states, ..of(&["r-1"]) }, 5, "").await;
+    assert_eq!(
+        (none.tasks.len(), none.next_page_token.as_str(), rows),
+        (0, "", 0),
+        "live tasks are an index of their own"
+    );
+    // Several robots, page by page, are what each of them is alone, by number.
+    let (mut token, mut seen) = (String::new(), Vec::new());
+    loop {
+        let (page, _) = old.page(of(&["r-1", "r-old", "r-none"]), 1_000, &token).await;
+        seen.extend(page.tasks.iter().map(|task| task.number));
+        token = page.next_page_token;
+        if token.is_empty() {
+            break;
+        }
+        assert!(!page.tasks.is_empty());
+    }
+    let last = 1 + (ENDED - 1).div_ceil(TASKS_PER_ITEM) * TASKS_PER_ITEM;
+    let expected: Vec<u64> = (2..=last).rev().filter(|n| *n <= 10 || n % 2 == 0).collect();
+    assert_eq!(seen, expected);
+}
+
+#[tokio::test]
+async fn a_page_says_more_only_if_there_is_a_task_more_or_it_says_how_far_it_looked() {
+    let old = Old::site().await;
+    let states = vec![v1::TaskState::Queued.into()];
+    let (page, _) = old.page(TaskFilter { states, ..TaskFilter::default() }, 1, "").await;
+    assert_eq!((page.tasks.len(), page.next_page_token.as_str()), (1, ""), "a full page may be the last one");
+    let rare = TaskFilter { external_ref: "never".to_owned(), ..TaskFilter::default() };
+    let (page, _) = old.page(rare.clone(), 1, "").await;
+    assert!(page.rows_read >= limits::LIST_ROWS_READ_MAX as u64 && page.rows_read < ENDED, "{}", page.rows_read);
+    assert!(page.tasks.is_empty() && !page.next_page_token.is_empty());
+    let (rest, _) = old.page(rare, 1, &page.next_page_token).await;
+    assert!(rest.tasks.is_empty() && rest.next_page_token.is_empty());
+    assert!(page.rows_read + rest.rows_read >= ENDED, "each is looked at");
+}
+
+#[tokio::test]
+async fn a_watch_of_one_task_reads_that_one() {
+    let old = Old::site().await;
+    let filter = TaskFilter { task_ids: vec![old.first.clone()], ..TaskFilter::default() };
+    old.counted.rows.store(0, Relaxed);
+    let request = v1::WatchTasksRequest { filter: Some(filter), cursor: String::new() };
+    let stream = old.service.watch_tasks(Request::new(request)).await.expect("a watch").into_inner();
+    let mut watch = Watch::over(stream);
+    let existing = watch.message().await;
+    assert!(matches!(existing.item, Some(v1::watch_tasks_response::Item::Existing(task)) if task.task_id == old.first));
+    watch.bookmark().await;
+    let rows = old.counted.rows.load(Relaxed);
+    assert!(rows <= 8, "{rows} rows");
+}
+
+#[tokio::test]
+async fn a_task_is_shown_whatever_came_after_it() {
+    let old = Old::site().await;
+    old.counted.rows.store(0, Relaxed);
+    let request = Request::new(v1::GetTaskRequest { task_id: old.first.clone() });
+    let task = old.service.get_task(request).await.expect("a task").into_inner().task.expect("always set");
+    assert_eq!(task.task_id, old.first);
+    let rows = old.counted.rows.load(Relaxed);
+    assert!(rows <= 3, "{rows} rows");
+}
