@@ -137,6 +137,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 drain_seconds: None,
                 no_software: false,
                 stop_listen: std::net::SocketAddr::from(([127, 0, 0, 1], midshift::stop::PORT)),
+                init_stop: false,
                 no_stop: true,
                 log: Default::default(),
                 site,

@@ -90,7 +90,7 @@ text_id!(/// A set of software by its digest, or `factory`.
     SetId, "set", 64, |c| c.is_ascii_lowercase() || c.is_ascii_digit(), "must be 1-64 of [a-z0-9]");
 text_id!(/// A bundle by the digest of its manifest.
     BundleId, "bundle", 64, |c| matches!(c, '0'..='9' | 'a'..='f'), "must be 64 lower-case hexadecimal digits");
-text_id!(/// A fleet stop, `STOP-YYYYMMDD-` and 10 base-32 characters, or a robot's own name for a silence that stood it. Never used again.
+text_id!(/// A fleet stop, `STOP-YYYYMMDD-` and 10 base-32 characters (`STOP-LOST-` before the day: the stop service's own), or a robot's own name for a silence that stood it. Never used again.
     StopId, "stop_id", 128, mixed, "must be 1-128 of [A-Za-z0-9-_.]");
 text_id!(/// A client's protection against a double call.
     RequestId, "request_id", 128, |c| c.is_ascii_graphic(), "must be 1-128 printable characters without spaces");

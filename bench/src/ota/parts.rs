@@ -159,6 +159,7 @@ async fn serve(data: PathBuf, keys: PathBuf, listen: SocketAddr, stop: Cancellat
         drain_seconds: None,
         no_software: false,
         stop_listen: std::net::SocketAddr::from(([127, 0, 0, 1], midshift::stop::PORT)),
+        init_stop: false,
         no_stop: true,
         log: Default::default(),
         site: None,

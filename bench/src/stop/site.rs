@@ -12,7 +12,7 @@ use midshift_identity::{Duty, IdentityService, Parts};
 use midshift_proto::identity::v1::enrolment_service_server::EnrolmentService as _;
 use midshift_proto::identity::v1::identity_service_server::IdentityService as _;
 use midshift_proto::identity::v1::{CreateEnrolmentRequest, EnrolRequest};
-use midshift_stop::Principals;
+use midshift_stop::{Principals, announce_first_start};
 use midshift_store::{MemoryStore, StoreId};
 use rcgen::{CertificateParams, KeyPair};
 use serde::{Deserialize, Serialize};
@@ -88,6 +88,7 @@ impl Site {
         let folder = data.join(midshift::stop::FOLDER);
         // A folder that others may look into is refused.
         DirBuilder::new().recursive(true).mode(0o700).create(&folder)?;
+        announce_first_start(&folder)?;
         Ok(self.principals.write(&folder)?)
     }
     /// Writes down what these robots show.

@@ -7,10 +7,12 @@ use super::inbox::{holds_changed, touch};
 use super::rows::{HoldToken, RobotControl};
 use super::stopped::over;
 use super::view::View;
-use super::{Board, Plan, Tx, heard};
+use super::{Board, Plan, Tx, heard, incidents};
 use crate::ids::{RobotId, StopId};
 use crate::limits;
+use crate::reason::{Code, Reason};
 use crate::robot::Presence;
+use crate::stop::latch::is_memory_lost;
 use crate::time::Now;
 use crate::work::Live;
 use std::collections::{BTreeMap, BTreeSet};
@@ -42,6 +44,9 @@ impl Hold {
 /// Puts right the tokens of every robot that a stop or its own report concerns.
 pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
     let all = std::mem::take(&mut view.stops_changed);
+    if all {
+        open_incidents(view, now, plan);
+    }
     let held = view.holds.values().map(|h| &h.row).filter(|h| Hold::read(&h.token).is_some());
     let resumed = view.control.values().map(|c| &c.row).filter(|c| !c.resumed.is_empty());
     let waiting = board.iter().filter(|(_, live)| !live.report.awaiting_resume.is_empty());
@@ -52,6 +57,23 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
         let online = heard::presence(board, &robot_id, &now) == Presence::Online;
         let live = board.get(&robot_id).filter(|_| online).cloned();
         plan.decide(view, now, "stop", |tx| look(tx, &robot_id, live.as_deref()));
+    }
+}
+
+/// Opens one incident for each stop by which the stop service says that it began without its memory.
+fn open_incidents(view: &mut View, now: Now, plan: &mut Plan) {
+    let effective = view.stops.values().map(|s| &s.row).filter(|record| record.is_effective());
+    let is_told = |stop_id: &StopId| {
+        let told = view.incidents.values().map(|i| &i.row.reason).filter(|reason| reason.code == Code::StopMemoryLost);
+        told.filter_map(|reason| reason.metadata.get("stop_id")).any(|told| *told == stop_id.as_str())
+    };
+    let lost = effective.map(|record| &record.stop).filter(|stop| is_memory_lost(&stop.stop_id));
+    let lost: Vec<Reason> = lost
+        .filter(|stop| !is_told(&stop.stop_id))
+        .map(|stop| Reason::new(Code::StopMemoryLost, stop.reason.clone()).with("stop_id", &stop.stop_id))
+        .collect();
+    for reason in lost {
+        plan.decide(view, now, "stop", |tx| incidents::open(tx, reason, None, None));
     }
 }
 

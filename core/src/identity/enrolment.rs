@@ -133,6 +133,11 @@ impl RobotIdentity {
         Ok(())
     }
 
+    /// Whether a machine was ever enrolled as this robot, also one that was revoked since.
+    pub fn was_ever_enrolled(&self) -> bool {
+        self.key.is_some() || self.enrolled_unix_ms.is_some() || !self.denied.is_empty()
+    }
+
     /// Whether this key is its own, or was and was taken out: another robot with it would be the same machine, or let a denied one in.
     pub fn knows(&self, key: &Digest) -> bool {
         self.key.as_ref() == Some(key) || self.denied.iter().any(|deny| deny.key == *key)

@@ -178,6 +178,14 @@ impl Latch {
     }
 }
 
+/// How the names of stops begin by which the stop service itself stops the fleet when it begins without its memory.
+pub const MEMORY_LOST: &str = "STOP-LOST-";
+
+/// Whether the stop service engaged this stop by itself, because it began without its memory.
+pub fn is_memory_lost(stop_id: &StopId) -> bool {
+    stop_id.as_str().starts_with(MEMORY_LOST)
+}
+
 /// Whether something is so old that its name may have been forgotten by others.
 pub fn is_past(at: Utc, now: Utc) -> bool {
     now.ms_since(at) > limits::RESETS_KEPT.as_ms()

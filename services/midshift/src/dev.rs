@@ -12,7 +12,7 @@ use crate::stop::{self, Beside};
 use crate::tally::{self, SharedTasks, Tasks};
 use crate::throwaway::Throwaway;
 use crate::under_way::{self, UnderWay};
-use crate::{clock, door, resuming};
+use crate::{clock, door, resuming, stop_follower};
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 use midshift_agent::trust::Trust;
@@ -178,7 +178,8 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     };
     let run_id = format!("dev-{}-{}-", args.seed, clock.now().wall.0);
     let tasks = Arc::new(Mutex::new(Tasks::of_run(&run_id)));
-    let stops = Stops::start(&args, site.clone(), clock.clone(), address)?;
+    let (store, frames) = stores(&args, &site, &clock).await?;
+    let stops = Stops::start(&args, site.clone(), clock.clone(), (address, &*store)).await?;
     let mut swarm = SwarmConfig::tcp(hall.clone(), clock.clone(), &format!("http://{address}"), args.seed)
         .with_stop(&format!("http://{}", stops.beside.address()));
     let live = tasks.clone();
@@ -187,7 +188,6 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     let trust = software.trust(site.site_id().clone())?;
     swarm.software = Some(trust.clone());
     let swarm = Swarm::new(swarm);
-    let (store, frames) = stores(&args, &site, &clock).await?;
     let planning = Planning::start()?;
     let parts = Parts {
         roles: Roles::default(),
@@ -243,8 +243,13 @@ struct Stops {
 }
 
 impl Stops {
-    /// On the usual port, or on a free one if that is taken or the server asked for a free one too.
-    fn start(args: &Dev, site: Arc<Site>, clock: Arc<dyn Clock>, address: SocketAddr) -> anyhow::Result<Self> {
+    /// On the usual port, or on a free one if that is taken or the server asked for a free one too. With a new store it begins with nothing engaged.
+    async fn start(
+        args: &Dev,
+        site: Arc<Site>,
+        clock: Arc<dyn Clock>,
+        (address, store): (SocketAddr, &dyn Store),
+    ) -> anyhow::Result<Self> {
         let free = SocketAddr::new(address.ip(), 0);
         let usual = if args.listen.port() == 0 { free } else { SocketAddr::new(address.ip(), stop::PORT) };
         let listener = std::net::TcpListener::bind(usual).or_else(|_| std::net::TcpListener::bind(free));
@@ -256,6 +261,8 @@ impl Stops {
                 (temporary.path().join(stop::FOLDER), Some(temporary))
             }
         };
+        stop::announce(&folder, store, stop::Occasion::Start).await?;
+        stop_follower::tell_stops(&folder, store).await?;
         let beside = Beside::start(folder.clone(), site, clock, listener)?;
         Ok(Self { beside, folder, _temporary: temporary })
     }

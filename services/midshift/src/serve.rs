@@ -92,6 +92,10 @@ pub struct Serve {
     /// Start no stop service: it runs elsewhere, or under a unit of its own. With --roles none is started either; the role stop-follower belongs beside it.
     #[arg(long, env = "MIDSHIFT_NO_STOP")]
     pub no_stop: bool,
+    /// The stop service of this site never began: let it begin with nothing engaged. Refused where the store has a session, a stop or an enrolled robot. A start that makes
+    /// the store says so by itself; any other stop service that finds its folder empty begins with the fleet stopped.
+    #[arg(long)]
+    pub init_stop: bool,
     /// Where software of robots comes from.
     #[command(flatten)]
     pub software: Software,
@@ -182,6 +186,15 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
     crate::recorder::handle();
     let site_id = loaded.site.site_id().clone();
     let storage = args.database.open(&args.data, site_id, clock.clone()).await?;
+    let follows = roles.has(Role::StopFollower);
+    // Before anybody writes to the store, and before the stop service, which waits for who is known, can begin.
+    match first_start(&args, &roles) {
+        Some(occasion) => stop::announce(&args.data.join(stop::FOLDER), &*storage.store(), occasion).await?,
+        None if args.init_stop => {
+            bail!("--init-stop is for a process with role stop-follower, which has the stop service's folder")
+        }
+        None => {}
+    }
     let folder = args.data.join("ota");
     let identity = match args.insecure {
         true => None,
@@ -212,6 +225,8 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
     };
     let mut started = None;
     if has_stop {
+        let copied = stop_follower::tell_stops(&args.data.join(stop::FOLDER), &*storage.store()).await;
+        copied.context("telling the stop service what is engaged")?;
         if let Some(identity) = &identity {
             stop_follower::tell_principals(&args.data.join(stop::FOLDER), identity)
                 .context("telling the stop service who is known")?;
@@ -220,7 +235,6 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
     }
     tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), store = storage.engine(), %roles, "midshift serves");
     let planning = Planning::start()?;
-    let follows = roles.has(Role::StopFollower);
     let parts = Parts {
         roles: roles.clone(),
         drain,
@@ -258,6 +272,15 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
     };
     storage.close().await;
     served
+}
+
+/// On which occasion this process may announce a first start of the stop service beside it. None: it has not its folder.
+fn first_start(args: &Serve, roles: &Roles) -> Option<stop::Occasion> {
+    roles.has(Role::StopFollower).then_some(match (args.init_stop, roles.are_split()) {
+        (true, _) => stop::Occasion::Person,
+        (false, true) => stop::Occasion::Follower,
+        (false, false) => stop::Occasion::Start,
+    })
 }
 
 /// Who is who, with the site's authority if this process has the role, and with the certificate of this process.

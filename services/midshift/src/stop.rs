@@ -1,13 +1,15 @@
 //! `midshift stop serve`: the stop service in a process of its own; in `dev` a thread of its own; beside `serve` on one box a process that outlives it.
 //!
 //! An operational stop request, not a safety function. Invariant: nothing of the store, the task queue or the business server lies on its way. Nothing here
-//! ends a running stop service: `serve` starts one where none is, and leaves it alone for ever. Rooms: `started` is that, `next` how one takes the place of another,
+//! ends a running stop service: `serve` starts one where none is, and leaves it alone for ever. Rooms: `started` is that, `first_start` says that one may begin with nothing engaged, `next` how one takes the place of another,
 //! `program` which program both start, where its files are and how long it may take.
 
+mod first_start;
 mod next;
 mod program;
 mod started;
 
+pub use first_start::{Occasion, announce};
 pub use program::FOLDER;
 pub use started::{LOG, Started};
 

@@ -1,7 +1,7 @@
 //! Beside a stop service: copies its stops into the store, and writes for it who the robots of the site are.
 //!
 //! The stop service never sees the store, and nobody on its way waits for this: it reads the files that the stop service keeps, whatever state that is in. Invariant: a
-//! stop that was copied is taken out only after its reset was forgotten, also if the stop service has lost its folder. One process at a time follows a folder:
+//! stop that was copied is taken out only after its reset was forgotten, also if the stop service has lost its folder, to which it is written back. One process at a time follows a folder:
 //! whoever holds the lock in it.
 
 use anyhow::Context;
@@ -13,7 +13,7 @@ use midshift_core::rows::{Log, Revision, Seq, Table};
 use midshift_core::stop::Latch;
 use midshift_core::stop::record::{StopRecord, copy};
 use midshift_identity::{IdentityService, ServerProof};
-use midshift_stop::{Principals, Roster};
+use midshift_stop::{Copied, Principals, Roster};
 use midshift_store::{CommitError, Store, follow};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{DirBuilder, File, OpenOptions, TryLockError};
@@ -44,6 +44,23 @@ pub fn tell_principals(folder: &Path, identity: &IdentityService) -> io::Result<
     principals(identity).write(folder)
 }
 
+/// Stops that the store has as engaged.
+async fn engaged(store: &dyn Store) -> anyhow::Result<Copied> {
+    let snapshot = store.snapshot(&[Table::StopRecord]).await.context("reading copies of stops")?;
+    let records = snapshot.rows.iter().map(|row| row.decode::<StopRecord>()).collect::<Result<Vec<_>, _>>()?;
+    let mut stops: Vec<_> = records.into_iter().filter(StopRecord::is_effective).map(|record| record.stop).collect();
+    stops.sort_unstable();
+    Ok(Copied { stops })
+}
+
+/// Writes what the store has as engaged into the folder of a stop service that is about to be started: it takes what it has lost of it.
+///
+/// # Errors
+/// The disk, or the store.
+pub async fn tell_stops(folder: &Path, store: &dyn Store) -> anyhow::Result<()> {
+    Ok(engaged(store).await?.write(folder)?)
+}
+
 /// The turn to follow, if nobody has it; the folder is made if it is not there.
 fn turn_of(folder: &Path) -> io::Result<Option<File>> {
     DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
@@ -62,6 +79,8 @@ pub struct StopFollower {
     store: Arc<dyn Store>,
     /// Generation of the latch that was copied last.
     copied: Option<u64>,
+    /// Stops of the store as they were written down last.
+    told: Option<Copied>,
     /// Robots that have ever said hello, up to an entry of the feed.
     attached: Option<(BTreeSet<RobotId>, Seq)>,
     retired: BTreeSet<RobotId>,
@@ -76,9 +95,9 @@ pub struct StopFollower {
 impl StopFollower {
     /// Of the stop service that keeps its files in `folder`.
     pub fn new(folder: PathBuf, store: Arc<dyn Store>, identity: Option<IdentityService>) -> Self {
-        let (copied, attached, retired, roster) = (None, None, BTreeSet::new(), None);
+        let (copied, told, attached, retired, roster) = (None, None, None, BTreeSet::new(), None);
         let identity = identity.map(|identity| (identity, None));
-        Self { folder, store, copied, attached, retired, roster, identity, failing: false }
+        Self { folder, store, copied, told, attached, retired, roster, identity, failing: false }
     }
 
     /// Until it is dropped.
@@ -126,10 +145,28 @@ impl StopFollower {
     }
 
     async fn follow(&mut self, is_due: bool) -> anyhow::Result<()> {
-        // First, and whatever the stop service is doing: it may be waiting for this. A disk that refuses it holds up no copy of a stop.
+        // One that begins finds what it may have lost before it is told who is known, for which it waits.
+        let stops = self.tell_stops(is_due).await;
+        // Whatever the stop service and the store are doing. A disk that refuses it holds up no copy of a stop.
         let told = self.tell_who_is_known(is_due).await;
         let copied = self.copy_stops(is_due).await;
-        told.and(copied)
+        stops.and(told).and(copied)
+    }
+
+    /// Writes what the store has as engaged, if that may have changed and has.
+    async fn tell_stops(&mut self, is_due: bool) -> anyhow::Result<()> {
+        if self.told.is_some() && !is_due {
+            return Ok(());
+        }
+        let newest = engaged(&*self.store).await?;
+        if self.told.as_ref() == Some(&newest) && self.folder.join(Copied::NAME).exists() {
+            return Ok(());
+        }
+        let (folder, writing) = (self.folder.clone(), newest.clone());
+        let written = tokio::task::spawn_blocking(move || writing.write(&folder)).await;
+        written.context("writing what is engaged")?.context("writing what is engaged")?;
+        self.told = Some(newest);
+        Ok(())
     }
 
     async fn copy_stops(&mut self, is_due: bool) -> anyhow::Result<()> {
@@ -165,7 +202,7 @@ impl StopFollower {
             }
         }
         self.copied = is_whole.then_some(generation);
-        Ok(())
+        self.tell_stops(true).await
     }
 
     async fn look_who_is_retired(&mut self) -> anyhow::Result<()> {

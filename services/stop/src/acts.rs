@@ -110,7 +110,7 @@ pub fn was_reset(stop_id: &StopId) -> Refusal {
 pub fn adopt(inner: &Inner, robot_id: &RobotId, stops: Vec<Stop>, more: Vec<StopId>) -> BTreeSet<StopId> {
     let now = inner.clock.now();
     let mut foreign: BTreeSet<StopId> = more.into_iter().collect();
-    let (mut is_lost, mut adopted) = (Vec::new(), 0);
+    let mut is_lost = Vec::new();
     {
         let law = lock(&inner.law);
         foreign.retain(|stop_id| law.latch().stop(stop_id).is_none());
@@ -125,33 +125,49 @@ pub fn adopt(inner: &Inner, robot_id: &RobotId, stops: Vec<Stop>, more: Vec<Stop
     let (own, others): (Vec<Stop>, Vec<Stop>) =
         is_lost.into_iter().partition(|stop| !is_past(stop.engaged, now.wall) && inner.key.knows(stop));
     foreign.extend(others.into_iter().map(|stop| stop.stop_id));
+    foreign.extend(take_back(inner, own, ("robot_id", robot_id.as_str())));
+    foreign
+}
+
+/// Takes stops that the store has as engaged and this service has lost. They were copied from here, so that they need no mark; whoever writes them writes who is known too.
+pub fn take_copied(inner: &Inner, stops: Vec<Stop>) {
+    for stop_id in take_back(inner, stops, ("from", "store")) {
+        tracing::error!(%stop_id, "there is no room for a stop that the store has as engaged");
+    }
+}
+
+/// Engages again what is not known here, neither it nor its reset, and tells all lines. Those for which there is no room, or no time left, come back.
+fn take_back(inner: &Inner, stops: Vec<Stop>, from: (&str, &str)) -> Vec<StopId> {
+    let now = inner.clock.now();
     let _fan = lock(&inner.fan);
     if is_open(inner).is_err() {
-        return foreign;
+        return stops.into_iter().map(|stop| stop.stop_id).collect();
     }
-    for stop in own {
+    let (mut left, mut adopted) = (Vec::new(), 0);
+    for stop in stops {
         let mut law = lock(&inner.law);
-        if law.latch().reset_of(&stop.stop_id).is_some() {
+        if law.latch().reset_of(&stop.stop_id).is_some() || law.is_resetting(&stop.stop_id) {
             continue;
         }
-        if law.room(&stop.scope, stop.level).is_err() {
-            foreign.insert(stop.stop_id);
+        let is_known = law.latch().stop(&stop.stop_id).is_some();
+        if !is_known && law.room(&stop.scope, stop.level).is_err() {
+            left.push(stop.stop_id);
             continue;
         }
         let Some(generation) = law.engage(stop.clone(), None) else { continue };
         let engaged = note(Action::Adopted, &stop, now.wall).with("engaged_by", &stop.actor);
-        inner.disk.note(Note { actor: MIDSHIFT.to_owned(), ..engaged.with("robot_id", robot_id) });
+        inner.disk.note(Note { actor: MIDSHIFT.to_owned(), ..engaged.with(from.0, from.1) });
         drop(law);
         tell(inner, &stop, generation, &now);
         adopted += 1;
         metrics::counter!("midshift_stop_adopted_total").increment(1);
-        tracing::warn!(stop_id = %stop.stop_id, %robot_id, "a lost stop was taken from a robot");
+        tracing::warn!(stop_id = %stop.stop_id, from = from.1, "a lost stop was taken back");
     }
     if adopted > 0 {
         inner.disk.wake();
         inner.touch();
     }
-    foreign
+    left
 }
 
 /// Notes a reset. It counts after the disk's turn, see [`settle`].

@@ -17,7 +17,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// What survives the end of the service.
-#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Kept {
     /// Stops and resets.
     pub latch: Latch,
@@ -132,12 +132,7 @@ impl Law {
 
     /// A name that was never used.
     pub fn draw(&self, now: Utc) -> StopId {
-        loop {
-            let id = draw_id(now, rand::random());
-            if self.latch.stop(&id).is_none() && self.latch.reset_of(&id).is_none() {
-                return id;
-            }
-        }
+        draw_unused(&self.latch, "STOP-", now)
     }
 
     /// Adds a stop. The state of the latch with it; none: it was known.
@@ -171,6 +166,11 @@ impl Law {
         self.version += 1;
         self.pending.push(Pending { version: self.version, reset: reset.clone() });
         Resetting { reset, was_engaged, is_new: true, version: self.version }
+    }
+
+    /// Whether a reset of it waits for the disk.
+    pub fn is_resetting(&self, stop_id: &StopId) -> bool {
+        self.pending.iter().any(|pending| pending.reset.stop_id == *stop_id)
     }
 
     /// The disk had its turn with all up to `version`: resets among them count now. Each comes back with the state of the latch that has it.
@@ -228,13 +228,23 @@ impl Law {
     }
 }
 
-/// `STOP-YYYYMMDD-` and 10 base-32 characters.
-fn draw_id(utc: Utc, drawn: u64) -> StopId {
+/// A name with this beginning that this latch has never used.
+pub fn draw_unused(latch: &Latch, begins: &str, now: Utc) -> StopId {
+    loop {
+        let id = draw_id(begins, now, rand::random());
+        if latch.stop(&id).is_none() && latch.reset_of(&id).is_none() {
+            return id;
+        }
+    }
+}
+
+/// The beginning, `YYYYMMDD-` and 10 base-32 characters.
+fn draw_id(begins: &str, utc: Utc, drawn: u64) -> StopId {
     const BASE32: &[u8; 32] = b"0123456789ABCDEFGHJKMNPQRSTVWXYZ";
     let day = utc.rfc3339().get(..10).unwrap_or_default().replace('-', "");
     let tail: String = (0..10).map(|i| char::from(BASE32[(drawn >> (i * 5)) as usize & 31])).collect();
-    // Letters, digits and hyphens only, 24 of them.
-    StopId::parse(&format!("STOP-{day}-{tail}")).unwrap_or_else(|e| unreachable!("drawn id: {e}"))
+    // Letters, digits and hyphens only, 29 of them at most.
+    StopId::parse(&format!("{begins}{day}-{tail}")).unwrap_or_else(|e| unreachable!("drawn id: {e}"))
 }
 
 #[cfg(test)]
@@ -345,7 +355,7 @@ mod tests {
         let mut latch = Latch::default();
         for n in 0..limits::STOPS_MAX + limits::RESETS_MAX {
             let (actor, reason) = ("a".repeat(128), "r".repeat(limits::REASON_BYTES_MAX));
-            let id = draw_id(Utc(0), n as u64);
+            let id = draw_id("STOP-", Utc(0), n as u64);
             let (region, proof) = (region.clone(), vec![255; 64]);
             let stop = Stop { actor: actor.clone(), reason: reason.clone(), region, proof, ..stop(id, Scope::Fleet) };
             if n < limits::RESETS_MAX {

@@ -4,19 +4,21 @@
 //! integrator, whose state midshift shows and never replaces; midshift is not suitable as part of a safety system.
 //!
 //! Called by the binary: [`StopService::open`], its gRPC faces or [`StopService::routes`], [`StopService::run`] and [`serve`]. Invariant: nothing of the store, the task
-//! queue or another service lies on its way; an engage waits for no robot, and for the disk only with its answer; a folder that cannot be trusted
-//! begins with the fleet stopped. Absent on purpose: who may come in: that is the port's, and is told here only so that it can be recorded.
+//! queue or another service lies on its way; an engage waits for no robot, and for the disk only with its answer; a folder without its memory, or one that
+//! cannot be read, begins with the fleet stopped. Absent on purpose: who may come in: that is the port's, and is told here only so that it can be recorded.
 
 mod acts;
 pub mod audit;
 mod confirm;
 mod disk;
 mod face;
+mod first;
 mod frames;
 mod ground;
 mod grpc;
 mod law;
 mod line;
+mod opening;
 mod outbox;
 mod proof;
 mod robots;
@@ -24,21 +26,20 @@ mod snapshot;
 mod status;
 
 pub use face::LinkFace;
-pub use snapshot::{Principals, Roster};
+pub use first::{FIRST, announce_first_start, withdraw_first_start};
+pub use snapshot::{Copied, Principals, Roster};
 
-use audit::{Action, Audit, Broken, Note, Verified};
+use audit::{Action, Broken, Note, Verified};
 use disk::{Disk, Writer};
 use ground::Ground;
 use law::{Kept, Law};
 use midshift_core::limits;
 use midshift_core::reason::Code;
-use midshift_core::robot::StopLevel;
 use midshift_core::site::Site;
-use midshift_core::stop::{Latch, Scope, Stop};
+use midshift_core::stop::Latch;
 use midshift_core::time::{Clock, LinkTime, Now, Utc};
-use midshift_latch::LatchFile;
 use midshift_proto::stop::v1::stop_service_server::StopServiceServer;
-use proof::{Found, Key};
+use proof::Key;
 use robots::Robots;
 use std::fs::DirBuilder;
 use std::io;
@@ -169,7 +170,7 @@ impl StopService {
         let failed = |source| Error::Folder { path: folder.clone(), source };
         let now = clock.now();
         DirBuilder::new().recursive(true).mode(0o700).create(&folder).map_err(failed)?;
-        let opened = open(&folder, now.wall)?;
+        let opened = opening::open(&folder, now.wall)?;
         let ended = CancellationToken::new();
         let inner = Arc::new(Inner {
             ground: Ground::of(site.as_deref()),
@@ -186,12 +187,10 @@ impl StopService {
             shutdown,
             ended,
         });
-        let engaged = lock(&inner.law).latch().effective().count();
         opened.notes.into_iter().for_each(|note| inner.disk.note(note));
+        snapshot::look_first(&inner, &folder);
+        let engaged = lock(&inner.law).latch().effective().count();
         inner.disk.note(Note::own(now.wall, Action::Started).with("engaged", engaged));
-        if let (_, Some(roster)) = snapshot::look(&folder.join(snapshot::NAME), None) {
-            snapshot::take(&inner, roster);
-        }
         tracing::info!(engaged, "stop service opened");
         Ok(Self { inner, folder, writer: Arc::new(Mutex::new(Some(opened.writer))) })
     }
@@ -294,7 +293,7 @@ impl StopService {
         let following = async {
             tokio::select! {
                 () = shutdown.cancelled() => {}
-                () = snapshot::keep(&inner, self.folder.clone(), None) => {}
+                () = snapshot::keep(&inner, self.folder.clone()) => {}
             }
         };
         tokio::join!(disk::keep(&inner, writer), moving, following);
@@ -339,78 +338,4 @@ pub fn latch(folder: &Path) -> Result<Option<(u64, Latch)>, midshift_latch::Erro
         return Ok(None);
     }
     midshift_latch::read::<Kept>(&path).map(|(generation, kept)| Some((generation, kept.latch)))
-}
-
-struct Opened {
-    kept: Kept,
-    writer: Writer,
-    key: Key,
-    notes: Vec<Note>,
-}
-
-/// Reads what was kept. What cannot be read is moved aside, and the fleet is stopped.
-fn open(folder: &Path, now: Utc) -> Result<Opened, Error> {
-    let failed = |source| Error::Folder { path: folder.to_owned(), source };
-    let path = folder.join(LATCH);
-    let room = limits::STOP_LATCH_BYTES;
-    let is_first = !path.exists() && !folder.join(proof::NAME).exists();
-    // Of two that begin for the first time at once, the one that holds the latch makes the key.
-    let first = if is_first { Some(LatchFile::open(&path, room, Kept::default())?) } else { None };
-    let is_gone = !is_first && !path.exists();
-    // Nor does anybody touch the key of one that runs.
-    let there = if is_first || is_gone { None } else { Some(LatchFile::open(&path, room, Kept::default())) };
-    if let Some(Err(error @ midshift_latch::Error::Held { .. })) = there {
-        return Err(error.into());
-    }
-    let (key, found) = Key::open(folder, now).map_err(failed)?;
-    let mut notes = Vec::new();
-    // In the file before anything else is: an end right after this leaves the fleet stopped too.
-    let mut lose = |why: String| {
-        let mut kept = Kept::default();
-        let stop = of_lost_latch(&kept, &key, now);
-        tracing::error!(why, stop_id = %stop.stop_id, "THE LATCH COULD NOT BE READ: the whole fleet is stopped until this stop is reset by name");
-        notes.push(Note::own(now, Action::LatchLost).with("stop_id", &stop.stop_id).with("why", why));
-        kept.latch.engage(stop);
-        kept
-    };
-    let opened = match first.map(Ok).or(there) {
-        Some(opened) => opened,
-        None => LatchFile::open(&path, room, lose("it is gone".to_owned())),
-    };
-    let (file, kept) = match opened {
-        Err(error @ (midshift_latch::Error::Unreadable { .. } | midshift_latch::Error::Foreign { .. })) => {
-            let aside = audit::set_aside(&path, now).map_err(failed)?;
-            LatchFile::open(&path, room, lose(format!("{error}; moved to {}", aside.display())))?
-        }
-        opened => opened?,
-    };
-    if found == Found::Replaced {
-        tracing::error!(
-            "the key of the stop service could not be read and was moved aside; stops that robots bring back are not known again"
-        );
-        notes.push(Note::own(now, Action::KeyLost));
-    }
-    let (audit, found) = Audit::open(folder, kept.audit.clone(), now);
-    if !found.is_empty() {
-        tracing::error!("the end of the audit of stops was gone or not whole");
-    }
-    notes.extend(found);
-    let known = kept.audit.clone();
-    Ok(Opened { kept, writer: Writer { file, audit, known }, key, notes })
-}
-
-/// Nobody knows what was engaged: everything is.
-fn of_lost_latch(kept: &Kept, key: &Key, now: Utc) -> Stop {
-    let mut stop = Stop {
-        stop_id: Law::begin(kept.clone(), now).draw(now),
-        scope: Scope::Fleet,
-        level: StopLevel::Halt,
-        engaged: now,
-        actor: "midshift".to_owned(),
-        reason: "the latch could not be read, so nobody knows which stops were engaged".to_owned(),
-        region: None,
-        proof: Vec::new(),
-    };
-    key.mark(&mut stop);
-    stop
 }

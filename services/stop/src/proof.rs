@@ -2,6 +2,7 @@
 //!
 //! Invariant: what is signed is the stop as it is written on the wire, without its proof. The key never leaves the folder and is no credential of anybody.
 
+use crate::audit;
 use ed25519_dalek::pkcs8::spki::der::pem::LineEnding;
 use ed25519_dalek::pkcs8::{DecodePrivateKey, EncodePrivateKey};
 use ed25519_dalek::{Signature, Signer, SigningKey};
@@ -21,41 +22,47 @@ pub const NAME: &str = "key.pem";
 /// The key.
 pub struct Key(SigningKey);
 
-/// How it was found.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// How it is in a folder.
 pub enum Found {
-    /// Made just now.
-    Made,
-    /// It was there.
-    There,
-    /// It could not be read, was moved aside, and another one was made.
-    Replaced,
+    /// It is there.
+    There(Box<Key>),
+    /// It is there and cannot be read.
+    Torn,
+    /// It is not there.
+    Gone,
 }
 
 impl Key {
-    /// Reads the key of a folder; makes one if there is none.
-    pub fn open(folder: &Path, now: Utc) -> io::Result<(Self, Found)> {
+    /// Reads the key of a folder. Changes nothing.
+    pub fn read(folder: &Path) -> io::Result<Found> {
+        match fs::read(folder.join(NAME)) {
+            Ok(bytes) => {
+                let key = std::str::from_utf8(&bytes).ok().and_then(|text| SigningKey::from_pkcs8_pem(text).ok());
+                Ok(key.map_or(Found::Torn, |key| Found::There(Box::new(Self(key)))))
+            }
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(Found::Gone),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// A new one, of which the disk knows nothing yet.
+    pub fn draw() -> Self {
+        Self(SigningKey::from_bytes(&rand::random()))
+    }
+
+    /// Writes it into the folder; one that is there, and is another, is moved aside.
+    pub fn keep(&self, folder: &Path, now: Utc) -> io::Result<()> {
         let path = folder.join(NAME);
-        let found = match fs::read_to_string(&path) {
-            Ok(text) => match SigningKey::from_pkcs8_pem(&text) {
-                Ok(key) => return Ok((Self(key), Found::There)),
-                Err(_) => {
-                    fs::rename(&path, folder.join(format!("{NAME}.broken-{}", now.0)))?;
-                    Found::Replaced
-                }
-            },
-            Err(e) if e.kind() == io::ErrorKind::NotFound => Found::Made,
-            Err(e) => return Err(e),
-        };
-        let key = SigningKey::from_bytes(&rand::random());
-        let text = key.to_pkcs8_pem(LineEnding::LF).map_err(io::Error::other)?;
+        if path.exists() {
+            audit::set_aside(&path, now)?;
+        }
+        let text = self.0.to_pkcs8_pem(LineEnding::LF).map_err(io::Error::other)?;
         let part = folder.join(format!("{NAME}.part"));
         let mut file = OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(&part)?;
         file.write_all(text.as_bytes())?;
         file.sync_all()?;
         fs::rename(&part, &path)?;
-        File::open(folder)?.sync_all()?;
-        Ok((Self(key), found))
+        File::open(folder)?.sync_all()
     }
 
     /// Puts the mark on a stop.
@@ -97,16 +104,22 @@ mod tests {
         }
     }
 
+    fn kept(folder: &Path) -> Key {
+        assert!(matches!(Key::read(folder).unwrap(), Found::Gone));
+        let key = Key::draw();
+        key.keep(folder, Utc(0)).unwrap();
+        key
+    }
+
     #[test]
     fn a_stop_is_known_again_over_the_wire_and_not_when_anything_of_it_changed() {
         let folder = tempfile::tempdir().unwrap();
-        let (key, found) = Key::open(folder.path(), Utc(0)).unwrap();
-        assert_eq!(found, Found::Made);
+        let key = kept(folder.path());
         let mut marked = stop();
         key.mark(&mut marked);
         let back: Stop = midshift_proto::parse(v1::Stop::from(&marked)).unwrap();
-        let (key, found) = Key::open(folder.path(), Utc(0)).unwrap();
-        assert_eq!((key.knows(&back), found), (true, Found::There));
+        let Found::There(key) = Key::read(folder.path()).unwrap() else { panic!("it is there") };
+        assert!(key.knows(&back));
         for changed in [
             Stop { level: StopLevel::Slow, ..back.clone() },
             Stop { engaged: Utc(2), ..back.clone() },
@@ -117,14 +130,16 @@ mod tests {
             assert!(!key.knows(&changed), "{changed:?}");
         }
         let other = tempfile::tempdir().unwrap();
-        assert!(!Key::open(other.path(), Utc(0)).unwrap().0.knows(&back), "another service's");
+        assert!(!kept(other.path()).knows(&back), "another service's");
     }
 
     #[test]
     fn a_key_that_cannot_be_read_is_moved_aside_and_kept() {
         let folder = tempfile::tempdir().unwrap();
         fs::write(folder.path().join(NAME), "no key").unwrap();
-        assert_eq!(Key::open(folder.path(), Utc(7)).unwrap().1, Found::Replaced);
+        assert!(matches!(Key::read(folder.path()).unwrap(), Found::Torn));
+        Key::draw().keep(folder.path(), Utc(7)).unwrap();
+        assert!(matches!(Key::read(folder.path()).unwrap(), Found::There(_)));
         assert_eq!(fs::read_to_string(folder.path().join("key.pem.broken-7")).unwrap(), "no key");
     }
 }

@@ -1,14 +1,16 @@
-//! What others write beside the service's own files: who belongs to the fleet, and who is known.
+//! What others write beside the service's own files: who belongs to the fleet, who is known, and which stops the store has as engaged.
 //!
 //! Invariant: written whole under another name and renamed, so that a reader never sees half; one that cannot be read is told once, and the last good
 //! one stays in force.
 
-use crate::{Inner, blocking};
+use crate::{Inner, acts, blocking};
 use midshift_core::identity::Directory;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
+use midshift_core::stop::Stop;
 use midshift_core::time::Utc;
 use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, UTIME_NOW, utimensat};
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::fs::{self, File, OpenOptions};
@@ -18,7 +20,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// Its name in the folder.
-pub const NAME: &str = "roster.snapshot";
+const ROSTER: &str = "roster.snapshot";
 const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// Names of 64 bytes, with room.
 const BYTES_MAX: u64 = limits::STOP_ROBOTS_MAX as u64 * 80;
@@ -37,7 +39,28 @@ impl Roster {
     /// # Errors
     /// The disk.
     pub fn write(&self, folder: &Path) -> io::Result<()> {
-        write(folder, NAME, &serde_json::to_vec(self)?)
+        write(folder, ROSTER, &serde_json::to_vec(self)?)
+    }
+}
+
+/// Stops that the store has as engaged and not reset: what the service has lost of them it takes from here.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Copied {
+    /// By name, each as it was engaged.
+    pub stops: Vec<Stop>,
+}
+
+impl Copied {
+    /// Name of the file.
+    pub const NAME: &str = "stops.snapshot";
+
+    /// Writes it into the folder of a stop service, whole or not at all. Called by whoever has the store.
+    ///
+    /// # Errors
+    /// The disk.
+    pub fn write(&self, folder: &Path) -> io::Result<()> {
+        write(folder, Self::NAME, &serde_json::to_vec(self)?)
     }
 }
 
@@ -113,40 +136,67 @@ fn mark(path: &Path) -> Option<Mark> {
     Some((found.ino(), found.mtime(), found.mtime_nsec(), found.len()))
 }
 
-/// The roster of a folder, if it is another file than `before`. None inside: it cannot be read.
-pub fn look(path: &Path, before: Option<Mark>) -> (Option<Mark>, Option<Result<Roster, String>>) {
+/// What stands in a file, if it is another one than `before`; an error inside: it cannot be read.
+fn look<T: DeserializeOwned>(path: &Path, bytes_max: u64, before: Option<Mark>) -> (Option<Mark>, Option<Found<T>>) {
     let now = mark(path);
     if now == before || now.is_none() {
         return (before, None);
     }
-    let read = || -> Result<Roster, String> {
+    let read = || -> Found<T> {
         let mut text = Vec::new();
         let file = File::open(path).map_err(|e| e.to_string())?;
-        file.take(BYTES_MAX + 1).read_to_end(&mut text).map_err(|e| e.to_string())?;
-        if text.len() as u64 > BYTES_MAX {
-            return Err(format!("it has more than {BYTES_MAX} bytes"));
+        file.take(bytes_max + 1).read_to_end(&mut text).map_err(|e| e.to_string())?;
+        if text.len() as u64 > bytes_max {
+            return Err(format!("it has more than {bytes_max} bytes"));
         }
         serde_json::from_slice(&text).map_err(|e| e.to_string())
     };
     (now, Some(read()))
 }
 
-/// Follows the file until the task is ended.
-pub async fn keep(inner: &Inner, folder: PathBuf, mut known: Option<Mark>) {
-    let path = folder.join(NAME);
+type Found<T> = Result<T, String>;
+
+/// What was read of both files.
+struct Looked {
+    marks: [Option<Mark>; 2],
+    roster: Option<Found<Roster>>,
+    copied: Option<Found<Copied>>,
+}
+
+fn look_at_both(folder: &Path, marks: [Option<Mark>; 2]) -> Looked {
+    let (of_roster, roster) = look(&folder.join(ROSTER), BYTES_MAX, marks[0]);
+    let (of_copied, copied) = look(&folder.join(Copied::NAME), limits::STOP_LATCH_BYTES as u64, marks[1]);
+    Looked { marks: [of_roster, of_copied], roster, copied }
+}
+
+fn take_both(inner: &Inner, looked: Looked) -> [Option<Mark>; 2] {
+    looked.roster.into_iter().for_each(|roster| take(inner, roster));
+    match looked.copied {
+        Some(Ok(copied)) => acts::take_copied(inner, copied.stops),
+        Some(Err(error)) => tracing::error!(error, "the stops that the store has cannot be read; those here stay"),
+        None => {}
+    }
+    looked.marks
+}
+
+/// Takes over what stands in the folder now: before anybody is answered.
+pub fn look_first(inner: &Inner, folder: &Path) {
+    take_both(inner, look_at_both(folder, [None, None]));
+}
+
+/// Follows the files until the task is ended.
+pub async fn keep(inner: &Inner, folder: PathBuf) {
+    let mut known = [None, None];
     loop {
         tokio::time::sleep(LOOK_EVERY).await;
-        let (at, before) = (path.clone(), known);
-        let (found, roster) = blocking(move || look(&at, before)).await;
-        known = found;
-        if let Some(roster) = roster {
-            take(inner, roster);
-        }
+        let at = folder.clone();
+        let looked = blocking(move || look_at_both(&at, known)).await;
+        known = take_both(inner, looked);
     }
 }
 
 /// Puts a roster in force.
-pub fn take(inner: &Inner, roster: Result<Roster, String>) {
+fn take(inner: &Inner, roster: Result<Roster, String>) {
     match roster {
         Ok(roster) => {
             inner.robots.list(&roster.robots);

@@ -11,7 +11,7 @@ use midshift_core::ids::StopId;
 use midshift_core::site::Site;
 use midshift_core::stop::Latch;
 use midshift_core::stop::robot::Kept;
-use midshift_stop::{Error, Parts, StopService};
+use midshift_stop::{Error, Parts, StopService, announce_first_start};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -55,6 +55,7 @@ impl Stops {
     ) -> anyhow::Result<Self> {
         let (folder, wire) = (TempDir::new()?, Wire::default());
         let path = folder.path().join("stop");
+        announce_first_start(&path)?;
         let (time, site, of_service) = (time.clone(), site.clone(), wire.clone());
         sim.host(STOPS, move || live(path.clone(), site.clone(), time.clone(), of_service.clone()));
         let lines = (0..robots).map(|_| RobotLine { kept: MemoryStops::default(), wire: wire.clone() }).collect();

@@ -29,6 +29,20 @@ fn reset(record: StopRecord) -> StopRecord {
     StopRecord { reset: Some(reset), ..record }
 }
 
+#[tokio::test(start_paused = true)]
+async fn a_stop_service_that_began_without_its_memory_is_one_incident() {
+    let mut w = at_work().await;
+    let lost = StopRecord {
+        stop: Stop { stop_id: StopId::parse("STOP-LOST-1").expect("an id"), ..fleet_wide().stop },
+        reset: None,
+    };
+    w.stop(&lost).await;
+    w.until("a person is told", |s| s.incidents() == [Code::StopMemoryLost]).await;
+    w.stop(&fleet_wide()).await;
+    let seen = w.until("the other stop holds it too", |s| s.tokens("r1").len() == 2).await;
+    assert_eq!(seen.incidents(), [Code::StopMemoryLost], "once");
+}
+
 async fn resume_all(w: &mut World) {
     let stop_id = Some(s1().to_string());
     w.ask(Ask::ResumeHeld { stop_id, area_id: None, task_ids: Vec::new(), robot_ids: Vec::new() }).await;

@@ -9,6 +9,7 @@ use super::{Places, blocking};
 use crate::stop::{FOLDER, LOG};
 use anyhow::{Context, ensure};
 use async_trait::async_trait;
+use midshift_stop::{Copied, FIRST};
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
@@ -37,7 +38,7 @@ impl Part for Stops {
             }
             ensure!(
                 has_latch && has_key,
-                "{} has lost a file: start `midshift stop serve` once, which stops the fleet if nobody knows any more what was stopped, and take the backup then",
+                "{} has lost a file: start `midshift stop serve` once, which stops the fleet since nobody knows any more what was stopped, and take the backup then",
                 from.display()
             );
             private(&folder)?;
@@ -45,7 +46,7 @@ impl Part for Stops {
             latch(&from, &folder)?;
             for path in entries(&from)? {
                 let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-                if ![LATCH, LOG].contains(&name.as_str()) && !name.ends_with(".part") {
+                if ![LATCH, LOG, FIRST, Copied::NAME].contains(&name.as_str()) && !name.ends_with(".part") {
                     copy_if_there(&path, &folder.join(name))?;
                 }
             }

@@ -4,7 +4,7 @@
 //! given back to the disk and taken by another file.
 
 use crate::harness::{Folder, Robot, Server, eventually, fleet, id_of, told};
-use midshift_stop::verify;
+use midshift_stop::{announce_first_start, verify};
 use rustix::fs::{FallocateFlags, fallocate};
 use std::fs::{self, File, OpenOptions};
 use std::io::Write;
@@ -17,10 +17,10 @@ struct Small(Folder);
 impl Small {
     fn mount() -> Self {
         let folder = Folder::new();
-        fs::create_dir(folder.path()).unwrap();
         let mounted =
             Command::new("mount").args(["-t", "tmpfs", "-o", "size=20m", "tmpfs"]).arg(folder.path()).status();
         assert!(mounted.is_ok_and(|status| status.success()), "this test mounts a tmpfs: run it as root");
+        assert!(announce_first_start(&folder.path()).unwrap());
         Self(folder)
     }
     fn path(&self) -> PathBuf {

@@ -13,7 +13,7 @@ use midshift_proto::convert::stop::{CheckIn, FromStop, ToStop};
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::stop_link_service_client::StopLinkServiceClient;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
-use midshift_stop::{Error, Parts, StopService, serve};
+use midshift_stop::{Error, Parts, StopService, announce_first_start, serve};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -366,8 +366,11 @@ pub fn halt() -> i32 {
 pub struct Folder(tempfile::TempDir);
 
 impl Folder {
+    /// Of a site that is new.
     pub fn new() -> Self {
-        Self(tempfile::tempdir().unwrap())
+        let folder = Self(tempfile::tempdir().unwrap());
+        assert!(announce_first_start(&folder.path()).unwrap());
+        folder
     }
     pub fn path(&self) -> PathBuf {
         self.0.path().join("stop")

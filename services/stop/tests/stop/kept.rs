@@ -8,7 +8,7 @@ use midshift_proto::refusal_of;
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::scope::Scope as W;
 use midshift_proto::stop::v1::stop_service_server::StopService as Face;
-use midshift_stop::{Parts, StopService};
+use midshift_stop::{Parts, StopService, announce_first_start};
 use std::fs;
 use std::sync::Arc;
 use tokio_util::sync::CancellationToken;
@@ -134,6 +134,7 @@ async fn a_stop_of_another_make_is_shown_and_not_taken_up_and_its_reset_reaches_
     let was_told = told(&robot, &id);
     drop(server);
     fs::remove_dir_all(folder.path()).unwrap();
+    announce_first_start(&folder.path()).unwrap();
 
     // Another service, with another key; and an own stop that somebody made wider.
     let server = Server::start(&folder.path()).await;
@@ -277,12 +278,18 @@ async fn what_was_reset_a_quarter_ago_is_forgotten_without_anybody_doing_anythin
     assert_eq!(server.engaged().await, [stands]);
 }
 
-#[tokio::test]
-async fn a_service_that_ends_takes_no_stop_and_no_reset_that_nobody_would_keep() {
-    let (folder, shutdown) = (Folder::new(), CancellationToken::new());
+/// One that has opened its folder and does nothing else.
+pub fn opened(folder: &Folder) -> (StopService, CancellationToken) {
+    let shutdown = CancellationToken::new();
     let clock = Arc::new(ScaledClock::new(|| 0, Utc(1_780_000_000_000), 1000));
     let parts = Parts { folder: folder.path(), site: None, clock };
-    let service = StopService::open(parts, shutdown.clone()).unwrap();
+    (StopService::open(parts, shutdown.clone()).unwrap(), shutdown)
+}
+
+#[tokio::test]
+async fn a_service_that_ends_takes_no_stop_and_no_reset_that_nobody_would_keep() {
+    let folder = Folder::new();
+    let (service, shutdown) = opened(&folder);
     shutdown.cancel();
     let refused = Face::engage(&service, Request::new(fleet())).await.expect_err("a refusal");
     assert_eq!(refused.code(), Code::Unavailable, "{refused}");

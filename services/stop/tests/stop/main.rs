@@ -9,6 +9,7 @@ mod harness;
 mod kept;
 mod killed;
 mod lines;
+mod lost;
 mod reach;
 #[expect(dead_code, reason = "shared with the agent's tests, which ask for more")]
 #[path = "../../../../tests/src/strace.rs"]

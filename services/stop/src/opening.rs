@@ -1,0 +1,139 @@
+//! Opens the folder of a stop service: with what was kept there, with nothing at a first start that was announced, else with the whole fleet stopped.
+//!
+//! Invariant: the stop of a lost memory is in the latch before a key is written and before the service listens: an end anywhere in between leaves the fleet
+//! stopped too. What cannot be read is moved aside and kept. Nobody changes a folder that another process has.
+
+use crate::audit::{self, Action, Audit, Note};
+use crate::disk::Writer;
+use crate::first::{FIRST, withdraw_first_start};
+use crate::law::{Kept, draw_unused};
+use crate::proof::{Found, Key};
+use crate::{Error, LATCH};
+use midshift_core::limits;
+use midshift_core::robot::StopLevel;
+use midshift_core::stop::latch::{MEMORY_LOST, is_memory_lost};
+use midshift_core::stop::{Scope, Stop};
+use midshift_core::time::Utc;
+use midshift_latch::LatchFile;
+use std::path::Path;
+
+/// A folder that is open.
+pub struct Opened {
+    /// What was kept.
+    pub kept: Kept,
+    /// Its one writer.
+    pub writer: Writer,
+    /// The service's own mark.
+    pub key: Key,
+    /// What was found, for the audit.
+    pub notes: Vec<Note>,
+}
+
+/// What of the memory is lost.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Lost {
+    Folder,
+    LatchGone,
+    LatchTorn,
+    KeyGone,
+    KeyTorn,
+}
+
+impl Lost {
+    const fn action(self) -> Action {
+        match self {
+            Self::Folder | Self::LatchGone | Self::LatchTorn => Action::LatchLost,
+            Self::KeyGone | Self::KeyTorn => Action::KeyLost,
+        }
+    }
+    const fn why(self) -> &'static str {
+        match self {
+            Self::Folder => "its folder was empty and no first start was announced",
+            Self::LatchGone => "its latch was gone",
+            Self::LatchTorn => "its latch could not be read",
+            Self::KeyGone => "its key was gone",
+            Self::KeyTorn => "its key could not be read",
+        }
+    }
+}
+
+/// Opens the folder for its one process.
+///
+/// # Errors
+/// The disk, or another process has it.
+pub fn open(folder: &Path, now: Utc) -> Result<Opened, Error> {
+    let failed = |source| Error::Folder { path: folder.to_owned(), source };
+    let (path, room) = (folder.join(LATCH), limits::STOP_LATCH_BYTES);
+    let is_announced = folder.join(FIRST).exists();
+    let found = Key::read(folder).map_err(failed)?;
+    let (key, key_lost) = match found {
+        Found::There(key) => (*key, None),
+        Found::Gone => (Key::draw(), Some(Lost::KeyGone)),
+        Found::Torn => (Key::draw(), Some(Lost::KeyTorn)),
+    };
+    let is_drawn = key_lost.is_some();
+    let mut lost = match (path.exists(), key_lost) {
+        (true, _) => None,
+        (false, Some(Lost::KeyGone)) if is_announced => None,
+        (false, Some(Lost::KeyGone)) => Some(Lost::Folder),
+        (false, _) => Some(Lost::LatchGone),
+    };
+    let mut first = Kept::default();
+    if let Some(lost) = lost {
+        stop_fleet(&mut first, &key, lost, now);
+    }
+    let mut aside = None;
+    let (mut file, mut kept) = match LatchFile::open(&path, room, first) {
+        Err(midshift_latch::Error::Unreadable { .. } | midshift_latch::Error::Foreign { .. }) => {
+            aside = Some(audit::set_aside(&path, now).map_err(failed)?);
+            lost = Some(Lost::LatchTorn);
+            let mut first = Kept::default();
+            stop_fleet(&mut first, &key, Lost::LatchTorn, now);
+            LatchFile::open(&path, room, first)?
+        }
+        opened => opened?,
+    };
+    // A first start that was cut short left a latch that nobody has ever written to.
+    let is_cut = is_announced && file.generation() == 0 && kept == Kept::default();
+    let lost = lost.or(key_lost.filter(|_| !is_cut));
+    let mut notes = Vec::new();
+    if let Some(lost) = lost {
+        let stop = stop_fleet(&mut kept, &key, lost, now);
+        file.write(&kept)?;
+        tracing::error!(why = lost.why(), stop_id = %stop.stop_id, "THE MEMORY OF STOPS WAS LOST: the whole fleet is stopped until this stop is reset by name");
+        let note = Note::own(now, lost.action()).with("stop_id", &stop.stop_id).with("why", lost.why());
+        notes.push(aside.iter().fold(note, |note, aside| note.with("moved_to", aside.display())));
+    }
+    if is_drawn {
+        key.keep(folder, now).map_err(failed)?;
+    }
+    withdraw_first_start(folder).map_err(failed)?;
+    let (audit, found) = Audit::open(folder, kept.audit.clone(), now);
+    if !found.is_empty() {
+        tracing::error!("the end of the audit of stops was gone or not whole");
+    }
+    notes.extend(found);
+    let known = kept.audit.clone();
+    Ok(Opened { kept, writer: Writer { file, audit, known }, key, notes })
+}
+
+/// Nobody knows what was engaged: everything is. One such stop that nobody has reset is enough.
+fn stop_fleet(kept: &mut Kept, key: &Key, lost: Lost, now: Utc) -> Stop {
+    let is_known = |stop: &&Stop| is_memory_lost(&stop.stop_id) && stop.scope == Scope::Fleet;
+    if let Some(known) = kept.latch.effective().find(is_known) {
+        return known.clone();
+    }
+    let mut stop = Stop {
+        stop_id: draw_unused(&kept.latch, MEMORY_LOST, now),
+        scope: Scope::Fleet,
+        level: StopLevel::Halt,
+        engaged: now,
+        actor: audit::MIDSHIFT.to_owned(),
+        reason: format!("the stop service began without its memory: {}; nobody knows what was engaged", lost.why()),
+        region: None,
+        proof: Vec::new(),
+    };
+    key.mark(&mut stop);
+    kept.latch.engage(stop.clone());
+    stop
+}
