@@ -59,6 +59,18 @@ impl TaskService for Unary {
     ) -> Result<Response<v1::ResolveTaskResponse>, Status> {
         not_here()
     }
+    async fn cancel_tasks(
+        &self,
+        _: Request<v1::CancelTasksRequest>,
+    ) -> Result<Response<v1::CancelTasksResponse>, Status> {
+        not_here()
+    }
+    async fn resolve_tasks(
+        &self,
+        _: Request<v1::ResolveTasksRequest>,
+    ) -> Result<Response<v1::ResolveTasksResponse>, Status> {
+        not_here()
+    }
     async fn resume_held(&self, _: Request<v1::ResumeHeldRequest>) -> Result<Response<v1::ResumeHeldResponse>, Status> {
         not_here()
     }

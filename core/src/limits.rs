@@ -28,10 +28,12 @@ pub const UNCERTAIN_LIMIT: LinkDuration = LinkDuration::from_secs(300);
 pub const TIMER_GRACE: LinkDuration = LinkDuration::from_secs(10);
 /// No progress of a running step for this long: stall.
 pub const STALL_DEFAULT: SiteDuration = SiteDuration::from_secs(60);
-/// Default wait for a robot.
-pub const SCHEDULE_TO_START_DEFAULT: SiteDuration = SiteDuration::from_secs(15 * 60);
-/// Waiting this long promotes a task by one class.
+/// Being ready this long promotes a task by one class; a person is asked if no known robot could ever do it.
 pub const MAX_WAIT: SiteDuration = SiteDuration::from_secs(15 * 60);
+/// A task that waits for a robot this long is a backlog that people should know of, whatever its class.
+pub const BACKLOG_AGE: SiteDuration = SiteDuration::from_secs(3_600);
+/// The incident of a backlog opens again no sooner after it closed: an age that swings around the bound is one matter.
+pub const BACKLOG_PAUSE: SiteDuration = SiteDuration::from_secs(600);
 /// The agent's own start_to_close ends this much earlier than the server's, permille.
 pub const AGENT_TIMEOUT_EARLIER_PERMILLE: u64 = 50;
 /// Robot breaker: this many failed attempts ...
@@ -44,6 +46,18 @@ pub const ERRAND_PAUSE: LinkDuration = LinkDuration::from_secs(5);
 pub const REFUSALS_IN_ROW: u32 = 5;
 /// Attempts of a task that robots may drop before a person is asked, whatever retries it asked for: a restarted agent is not its fault.
 pub const DROPS_TOLERATED: u32 = 3;
+/// A turn of fleet takes no longer than this, commit included: people and their commands wait for it.
+pub const TURN: LinkDuration = LinkDuration(20);
+/// Decisions that each stage of a turn makes before the next is due: a turn of all stages commits in some 10 ms. Slower machines make fewer.
+pub const DECISIONS_PER_STAGE: usize = 256;
+/// Fewer would not make a turn shorter: the disk takes as long for one.
+pub const DECISIONS_PER_STAGE_MIN: usize = 32;
+/// Looks that take as long as one decision: at a ready task, or at a robot for it.
+pub const LOOKS_PER_DECISION: usize = 16;
+/// Entries of the feed that one turn takes: some 20 us each.
+pub const ENTRIES_PER_TURN: usize = 256;
+/// Questions and commands that one turn takes.
+pub const REQUESTS_PER_TURN: usize = 64;
 /// Steps of one task.
 pub const STEPS_MAX: usize = 64;
 /// Labels of one task or robot.

@@ -62,6 +62,7 @@ codes! {
     TaskNotFound = "TASK_NOT_FOUND", "No task has this id. Check the id, or list tasks.";
     RobotNotFound = "ROBOT_NOT_FOUND", "No robot has this id. List robots to see who has ever connected.";
     PlaceNotFound = "PLACE_NOT_FOUND", "The site has no such place. List places.";
+    PinnedRobotUnknown = "PINNED_ROBOT_UNKNOWN", "The task names a robot that is not enrolled and has never connected; it waits until it comes.";
     IncidentNotFound = "INCIDENT_NOT_FOUND", "No open incident has this id. List incidents.";
     AreaNotFound = "AREA_NOT_FOUND", "The site has no such area.";
     RequestIdReused = "REQUEST_ID_REUSED", "This request_id was used with another body. Use a new one for a new request.";
@@ -164,6 +165,7 @@ codes! {
     FaultNotRecoverable = "FAULT_NOT_RECOVERABLE", "The robot reported a fault that is never retried.";
     TaskFailed = "TASK_FAILED", "The attempt failed and the task asks for no retry.";
     ScheduleToStart = "SCHEDULE_TO_START", "No robot started it in time.";
+    NoKnownRobot = "NO_KNOWN_ROBOT", "No known robot could ever do it, by what each last said of itself. Enrol or refit one and requeue it, or cancel it.";
     StartToClose = "START_TO_CLOSE", "The attempt took longer than the task's timeout.";
     Stalled = "STALLED", "The robot made no progress for too long.";
     DeadlinePassed = "DEADLINE_PASSED", "The task's deadline passed.";
@@ -265,6 +267,7 @@ codes! {
     Poison = "POISON", "A sample could not be read; it was recorded, acknowledged and skipped.";
     CloneSeen = "CLONE_SEEN", "Two sessions with one robot id were alive at once. Find the second machine.";
     StoreBehindRobot = "STORE_BEHIND_ROBOT", "A robot knows a newer generation than the store: the store was restored from a backup.";
+    TaskBacklog = "TASK_BACKLOG", "Ready tasks wait for a robot for more than an hour. It closes by itself. `midshift task ls --state queued` lists them.";
     RobotBreakerOpened = "ROBOT_BREAKER_OPENED", "A robot failed three attempts in ten minutes.";
     PlaceQuarantined = "PLACE_QUARANTINED", "A place is kept closed until the robot inside reports or a person clears it.";
     HoldByPerson = "HOLD_BY_PERSON", "A person asked for a pause.";

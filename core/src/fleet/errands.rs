@@ -26,9 +26,12 @@ pub fn stopping(view: &View) -> usize {
 
 /// Sends robots that are still idle to charge or park.
 pub fn plan(view: &mut View, board: &Board, now: Now, idle: Vec<Candidate>, plan: &mut Plan) {
-    let waiting = plan.report.waiting.values().sum::<u64>() > 0;
+    let waiting = !view.queue.is_empty();
     let mut coming = Coming::of(view);
     for Candidate { robot_id, at: here, .. } in idle {
+        if plan.is_cut() {
+            return;
+        }
         let Some(live) = board.get(&robot_id) else { continue };
         // Whoever drains is parked by its drain.
         if view.drain_of(&robot_id).is_some() {

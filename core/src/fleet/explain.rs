@@ -1,7 +1,7 @@
 //! Why a task is not running and why a robot has no work: the planner's own filters, run again for one of them. Stores nothing.
 
 use super::view::View;
-use super::{Board, assign, screen, starts, way};
+use super::{Board, screen, starts, way};
 use crate::ids::{RobotId, TaskId};
 use crate::reason::{Code, Reason};
 use crate::task::Phase;
@@ -40,7 +40,7 @@ pub fn task(view: &View, board: &Board, now: &Now, task_id: &TaskId) -> Option<T
     let task = view.task(task_id)?;
     let intake = view.intake(task_id)?;
     let waits = matches!(task.phase, Phase::Queued | Phase::RetryWait | Phase::Suspended);
-    let position = assign::queue(view, now).position(|t| t == task_id).map(|p| p + 1);
+    let position = view.queue.position(task_id);
     let goal = intake
         .spec
         .next_goal(way::from_step(&intake.spec.steps, task.next_step) as usize)
@@ -70,12 +70,23 @@ pub fn task(view: &View, board: &Board, now: &Now, task_id: &TaskId) -> Option<T
     let own = screen::task(view, board, task, intake, now).err().filter(|_| waits);
     let verdict = match (own, waits, eligible, task.phase) {
         (Some(reason), ..) => Some(reason),
-        (None, true, false, _) => Some(Code::WaitingForRobot.into()),
-        (None, true, true, _) => Some(Code::WaitingInQueue.into()),
+        (None, true, false, _) => Some(waits_for_turn(view, task_id, now, Code::WaitingForRobot)),
+        (None, true, true, _) => Some(waits_for_turn(view, task_id, now, Code::WaitingInQueue)),
         (None, false, _, Phase::Running) => task.robot_id.as_ref().and_then(|r| place_wait(view, r)),
         (None, false, ..) => task.reason.clone(),
     };
     Some(TaskExplanation { position, verdict, candidates, filtered })
+}
+
+/// Why a ready task waits, since when, and what waiting has brought it.
+fn waits_for_turn(view: &View, task_id: &TaskId, now: &Now, code: Code) -> Reason {
+    let Some(rank) = view.queue.rank(task_id) else { return code.into() };
+    let (class, minutes) = (rank.class.as_str(), now.utc.ms_since(rank.since) / 60_000);
+    if !rank.promoted {
+        return code.into();
+    }
+    let told = format!("{} Promoted to class {class} after {minutes} min of waiting.", code.help());
+    Reason::new(code, told).with("class", class).with("ready_since", rank.since.rfc3339())
 }
 
 /// Which places the robot waits for, who has them, and for whom they are kept. None: it waits for none.
@@ -129,7 +140,7 @@ pub struct RobotExplanation {
 pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Option<RobotExplanation> {
     view.sessions.get(robot_id.as_str())?;
     let at = board.get(robot_id).and_then(|l| way::find(view, l.report.vitals.waypoint.as_ref()));
-    let candidates = assign::queue(view, now).take(CANDIDATES_MAX).filter_map(|task_id| {
+    let candidates = view.queue.ready().take(CANDIDATES_MAX).filter_map(|task_id| {
         let task = view.task(task_id)?;
         let intake = view.intake(task_id)?;
         let reason = screen::task(view, board, task, intake, now)

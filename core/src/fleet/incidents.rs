@@ -12,13 +12,19 @@ use crate::reason::Reason;
 pub fn open(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, task_id: Option<&TaskId>) {
     let of = |id: Option<String>| id.or_else(|| reason.metadata.get("rollout_id").cloned()).unwrap_or_default();
     let about = of(robot_id.map(ToString::to_string).or(task_id.map(ToString::to_string)));
+    let id = format!("{}:{about}:{}", reason.code, tx.now.wall.0);
+    open_as(tx, id, reason, robot_id, task_id);
+}
+
+/// Opens the incident of this id, also again.
+pub(super) fn open_as(tx: &mut Tx, id: String, reason: Reason, robot_id: Option<&RobotId>, task_id: Option<&TaskId>) {
     if tx.view.incidents.len() >= limits::INCIDENTS_MAX {
         let age = |i: &Incident| (i.closed.is_none(), i.opened);
         let oldest = tx.view.incidents.values().map(|i| &i.row).min_by_key(|i| age(i)).map(|i| i.id.clone());
         oldest.iter().for_each(|id| tx.delete::<Incident>(id, "incident.forgotten"));
     }
     let incident = Incident {
-        id: format!("{}:{about}:{}", reason.code, tx.now.wall.0),
+        id,
         reason,
         robot_id: robot_id.cloned(),
         task_id: task_id.cloned(),

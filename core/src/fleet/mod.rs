@@ -2,7 +2,7 @@
 //!
 //! [`cycle`] takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
 //! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `commands` (`asked`: which there are) are what happens; `tasks` moves tasks by
-//! the table; `heard`, `anchor`, `attempts` and `incidents` are what they share; `screen`, `pool` and `assign` give work; `stops` and `stopped` keep it from who is stopped; `starts` keeps places for robots that are to come; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
+//! the table; `heard`, `anchor`, `attempts` and `incidents` are what they share; `queue`, `screen`, `pool` and `assign` give work, in turns cut by `slice`; `stops` and `stopped` keep it from who is stopped; `starts` keeps places for robots that are to come; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod anchor;
@@ -23,27 +23,34 @@ pub mod load;
 pub mod objects;
 pub mod places;
 pub mod pool;
+pub mod queue;
 pub mod repair;
 pub mod requests;
 pub mod rows;
 pub mod screen;
+pub mod slice;
 pub mod starts;
 pub mod stopped;
 pub mod stops;
+pub mod sweep;
 pub mod tasks;
 pub mod timers;
 pub mod view;
 pub mod way;
 
+#[cfg(test)]
+mod tests;
+
 use crate::ids::RobotId;
 use crate::lead::Rivals;
 use crate::reason::{Code, Reason};
 use crate::rows::{BadRow, Entry, Item, Key, Log, Revision, Row, Seq, Table};
-use crate::task::{Event, Phase, TaskRequest};
+use crate::task::TaskRequest;
 use crate::time::Now;
 use crate::work::{InboxEntry, Live};
 use rows::{FleetMark, RobotAuthority, RobotControl, RobotHolder, ServiceClock, SiteRow};
-use std::collections::{BTreeMap, BTreeSet};
+pub use slice::Slice;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use view::View;
 
@@ -75,18 +82,16 @@ pub struct Report {
     pub offers: u64,
     /// Errands offered.
     pub errands: u64,
+    /// Ready tasks looked at.
+    pub looked: u64,
+    /// Something was left for the next turn.
+    pub more: bool,
     /// Waiting tasks by reason.
     pub waiting: BTreeMap<Code, u64>,
     /// Counts.
     pub tally: Tally,
     /// Rows or entries that could not be read; each was passed over and is logged.
     pub unreadable: Vec<String>,
-}
-
-impl Report {
-    fn wait(&mut self, code: Code) {
-        *self.waiting.entry(code).or_default() += 1;
-    }
 }
 
 /// Items to commit, in order, and the report.
@@ -96,19 +101,33 @@ pub struct Plan {
     pub items: Vec<Item>,
     /// What was done and why not.
     pub report: Report,
+    /// What this turn may still do.
+    pub slice: Slice,
 }
 
 impl Plan {
+    /// An empty plan of a turn that may do so much.
+    pub fn of(slice: Slice) -> Self {
+        Self { slice, ..Self::default() }
+    }
     /// Makes one decision; nothing is added if it changed nothing.
     pub fn decide(&mut self, view: &mut View, now: Now, actor: &str, decision: impl FnOnce(&mut Tx)) {
         let mut tx = Tx::new(view, now, actor);
         decision(&mut tx);
-        self.items.extend(tx.finish());
+        let item = tx.finish();
+        self.slice.decide(usize::from(item.is_some()));
+        self.items.extend(item);
+    }
+    /// Whether a stage goes on in the next turn; then the next turn comes at once.
+    fn is_cut(&mut self) -> bool {
+        let is_cut = self.slice.is_spent();
+        self.report.more |= is_cut;
+        is_cut
     }
 }
 
 /// Logs that fleet reads.
-pub const LOGS: &[Log] = &[Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox, Log::Ota, Log::Stop];
+pub const LOGS: &[Log] = &[Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox, Log::Ota, Log::Stop, Log::Identity];
 
 /// Takes entries of the feed, in commit order: rows into the view, requests and robots' events into decisions.
 pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
@@ -178,6 +197,7 @@ pub fn follow_rows(view: &mut View, now: Now, entries: &[Entry], unreadable: &mu
             view.read = now;
         }
     }
+    queue::advance(view, now.utc);
     view.rest();
 }
 
@@ -283,20 +303,34 @@ pub enum Pace {
     Sweep,
 }
 
-/// One cycle over a view that has absorbed the whole feed. Items of earlier decisions of the cycle are already in `plan`.
+/// One cycle over a view that has absorbed the whole feed. Items of earlier decisions of the cycle are already in `plan`. Each stage does as
+/// much as a slice holds, and leaves the rest for the next turn: then the report says `more`.
 pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Plan) {
     welcome(view, now, board, plan);
-    let heard = if pace == Pace::Sweep { sweep(view, now, board, plan) } else { BTreeSet::new() };
+    if pace == Pace::Sweep {
+        sweep::gather(view, now, board);
+    }
+    plan.slice.renew();
+    let heard = sweep::carry_out(view, now, board, plan);
+    plan.slice.renew();
     if pace == Pace::Sweep || view.stops_changed {
         stops::plan(view, board, now, plan);
     }
     drain::obey(view, now, plan);
     budget::plan(view, board, now, plan);
     drain::plan(view, board, now, plan);
-    let idle = assign::plan(view, board, now, pace, &heard, plan);
+    plan.slice.renew();
+    queue::settle(view, now, plan);
+    if pace == Pace::Sweep {
+        queue::tell_backlog(view, now, plan);
+    }
+    plan.slice.renew();
+    let idle = assign::plan(view, board, now, &heard, plan);
     errands::plan(view, board, now, idle, plan);
+    plan.slice.renew();
     write_down(view, now, board, &desired::Releases::default(), plan);
     let releases = places::advance(view, board, now, plan);
+    plan.slice.renew();
     write_down(view, now, board, &releases, plan);
     if !plan.items.is_empty() {
         tell_time(view, now, plan);
@@ -312,6 +346,9 @@ fn welcome(view: &mut View, now: Now, board: &Board, plan: &mut Plan) {
         .cloned()
         .collect();
     for robot_id in new {
+        if plan.is_cut() {
+            return;
+        }
         plan.decide(view, now, "fleet", |tx| {
             tx.put(RobotAuthority { robot_id: robot_id.clone(), holder: RobotHolder::None }, "robot.known");
             if !tx.view.control.contains_key(robot_id.as_str()) {
@@ -323,41 +360,20 @@ fn welcome(view: &mut View, now: Now, board: &Board, plan: &mut Plan) {
     }
 }
 
-/// Timers, and every robot that was heard or fell silent since the last one; gives back those robots.
-fn sweep(view: &mut View, now: Now, board: &Board, plan: &mut Plan) -> BTreeSet<RobotId> {
-    let (timers, late) = timers::due(view, &now);
-    for timer in timers {
-        plan.decide(view, now, "fleet", |tx| timers::fire(tx, &timer, board));
-    }
-    for task_id in late {
-        plan.decide(view, now, "fleet", |tx| timers::deadline(tx, &task_id));
-    }
-    let known = view.authority.values().map(|a| &a.row.robot_id);
-    let heard: BTreeSet<RobotId> = known.filter(|r| repair::is_due(view, r, board, &now)).cloned().collect();
-    let mut tally = plan.report.tally;
-    for robot_id in &heard {
-        plan.decide(view, now, "fleet", |tx| repair::robot(tx, robot_id, board, &mut tally));
-    }
-    plan.report.tally = tally;
-    let suspended: Vec<_> =
-        view.tasks.values().filter(|t| t.row.phase == Phase::Suspended).map(|t| t.row.task_id.clone()).collect();
-    for task_id in suspended {
-        plan.decide(view, now, "fleet", |tx| {
-            tasks::happen(tx, &task_id, tasks::News::of(Event::RetryDue, None));
-        });
-    }
-    let worn = desired::wearing(view, board);
-    view.dirty.extend(worn);
-    heard
-}
-
-/// Composes the desired state of every robot that something changed for.
+/// Composes the desired state of every robot that something changed for; first of those that were just let go further.
 fn write_down(view: &mut View, now: Now, board: &Board, releases: &desired::Releases, plan: &mut Plan) {
-    for robot_id in std::mem::take(&mut view.dirty) {
+    let mut due = std::mem::take(&mut view.dirty);
+    for robot_id in releases.0.keys() {
+        due.remove(robot_id);
+        plan.decide(view, now, "fleet", |tx| desired::compose(tx, robot_id, board, releases));
+    }
+    while let Some(robot_id) = due.first().filter(|_| !plan.is_cut()).cloned() {
+        due.remove(&robot_id);
         plan.decide(view, now, "fleet", |tx| desired::compose(tx, &robot_id, board, releases));
     }
-    view.dirty.clear();
-    for robot_id in std::mem::take(&mut view.policy_dirty) {
+    view.dirty = due;
+    while let Some(robot_id) = view.policy_dirty.first().filter(|_| !plan.is_cut()).cloned() {
+        view.policy_dirty.remove(&robot_id);
         plan.decide(view, now, "fleet", |tx| desired::compose_policy(tx, &robot_id));
     }
 }

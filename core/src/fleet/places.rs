@@ -96,6 +96,9 @@ pub fn advance(view: &mut View, board: &Board, now: Now, plan: &mut Plan) -> Rel
     let mut releases = Releases::default();
     let mut traffic = if wishes.is_empty() { Traffic::default() } else { Traffic::of(view) };
     for wish in &wishes {
+        if plan.is_cut() {
+            break;
+        }
         let Some(live) = board.get(&wish.robot_id) else { continue };
         plan.decide(view, now, "fleet", |tx| serve(tx, live, &mut releases, &mut traffic));
     }
@@ -117,7 +120,7 @@ fn bars_passage(view: &View, robot_id: &RobotId) -> bool {
 
 fn class_of(view: &View, a: &Attempt) -> Class {
     let priority = a.attempt.subject.task_id().and_then(|t| view.intake(t)).map_or(9, |i| i.spec.priority);
-    Class::of(priority, false)
+    Class::of(priority, 0)
 }
 
 /// An accepted attempt of a robot that is heard, not held and not told to stop.

@@ -4,7 +4,7 @@
 //! never on the order in which robots were met.
 
 use super::view::View;
-use super::{Board, screen, way};
+use super::{Board, Slice, screen, way};
 use crate::ids::RobotId;
 use crate::site::WaypointIx;
 use crate::task::{TaskIntake, TaskState};
@@ -46,9 +46,27 @@ impl Pool {
         self.left.is_empty()
     }
 
+    /// Who is left, in any order.
+    pub fn robots(&self) -> impl Iterator<Item = &RobotId> {
+        self.left.iter().map(|(ix, ..)| &self.all[*ix].robot_id)
+    }
+
+    /// Leaves out all but these.
+    pub fn keep(&mut self, robots: &BTreeSet<RobotId>) {
+        let all = &self.all;
+        self.left.retain(|(ix, ..)| robots.contains(&all[*ix].robot_id));
+    }
+
     /// Takes the nearest that passes every filter: another than one that failed the task, if there is one; then by distance, tasks so
-    /// far, id.
-    pub fn take(&mut self, view: &View, board: &Board, task: &TaskState, intake: &TaskIntake) -> Option<RobotId> {
+    /// far, id. Each robot that the filters look at is a look of the slice.
+    pub fn take(
+        &mut self,
+        view: &View,
+        board: &Board,
+        task: &TaskState,
+        intake: &TaskIntake,
+        slice: &mut Slice,
+    ) -> Option<RobotId> {
         if self.left.is_empty() {
             return None;
         }
@@ -59,8 +77,10 @@ impl Pool {
             let distance = field.as_ref().map_or(Some(0), |f| f.distance_mm(at))?;
             Some((failed(ix), distance, tasks, ix))
         };
-        let passes =
-            |nth: &usize| screen::pair(view, board, &self.all[self.left[*nth].0].robot_id, task, intake).is_ok();
+        let mut passes = |nth: &usize| {
+            slice.look(1);
+            screen::pair(view, board, &self.all[self.left[*nth].0].robot_id, task, intake).is_ok()
+        };
         // Nearly always the first one passes; only else are all put in order.
         let mut first = None;
         for nth in 0..self.left.len() {
@@ -68,10 +88,10 @@ impl Pool {
                 first = Some((cost, nth));
             }
         }
-        let nth = first.map(|(_, nth)| nth).filter(passes).or_else(|| {
+        let nth = first.map(|(_, nth)| nth).filter(&mut passes).or_else(|| {
             let mut by_cost: Vec<_> = (0..self.left.len()).filter_map(|nth| Some((cost(nth)?, nth))).collect();
             by_cost.sort_unstable();
-            by_cost.into_iter().map(|(_, nth)| nth).find(passes)
+            by_cost.into_iter().map(|(_, nth)| nth).find(&mut passes)
         })?;
         let (ix, ..) = self.left.swap_remove(nth);
         Some(self.all[ix].robot_id.clone())

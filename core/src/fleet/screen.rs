@@ -2,9 +2,10 @@
 //!
 //! Invariant: a filter gives a reason; nothing is ever "just not chosen".
 
+use super::queue::Wait;
 use super::rows::RobotHolder;
 use super::view::View;
-use super::{Board, heard, load, way};
+use super::{Board, Slice, heard, load, way};
 use crate::ids::{RobotId, Subject};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -14,6 +15,7 @@ use crate::task::raw::parse_version;
 use crate::task::{AttemptPhase, Phase, TaskIntake, TaskState};
 use crate::time::Now;
 use crate::work::{Live, Session};
+use std::collections::BTreeMap;
 
 /// Charge spent on a metre, thousandths of a permille: a planning figure with its margin in [`RESERVE_PERMILLE`].
 pub const ENERGY_MICRO_PER_MM: u64 = 60;
@@ -98,23 +100,10 @@ pub fn pair(
     task: &TaskState,
     intake: &TaskIntake,
 ) -> Result<(), Reason> {
-    let spec = &intake.spec;
     let Some(session) = view.sessions.get(robot_id.as_str()).map(|s| &s.row) else {
         return Err(Code::RobotOffline.into());
     };
-    if spec.robot_id.as_ref().is_some_and(|r| r != robot_id) {
-        return Err(Code::RobotPinnedElsewhere.into());
-    }
-    if task.opened.as_ref().is_some_and(|r| r != robot_id) {
-        return Err(Code::BoundElsewhere.into());
-    }
-    if task.semantic_refusers.contains(robot_id) {
-        return Err(Code::UnsupportedAction.into());
-    }
-    if spec.retry.exclude_failed_robot && task.opened.is_none() && task.failed_robots.contains(robot_id) {
-        return Err(Code::ExcludedAfterFailure.into());
-    }
-    able(session, intake)?;
+    fits(robot_id, session, task, intake)?;
     let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
     just_refused(view, live, task)?;
     if let Some(load) = &live.report.load
@@ -129,6 +118,60 @@ pub fn pair(
         return Err(Reason::from(Code::RouteTooLong).with("points_max", limits::ROUTE_POINTS_MAX));
     }
     energy(view, live, here, goals.last().copied().unwrap_or(here), work_mm)
+}
+
+/// What does not pass by itself: pin, binding, what the robot refused or failed for good, and what it said of itself at its last Hello.
+fn fits(robot_id: &RobotId, session: &Session, task: &TaskState, intake: &TaskIntake) -> Result<(), Reason> {
+    bound(robot_id, task, intake)?;
+    able(session, intake)
+}
+
+/// Whether the task itself leaves the robot out, whatever it can do.
+fn bound(robot_id: &RobotId, task: &TaskState, intake: &TaskIntake) -> Result<(), Reason> {
+    let spec = &intake.spec;
+    if spec.robot_id.as_ref().is_some_and(|r| r != robot_id) {
+        return Err(Code::RobotPinnedElsewhere.into());
+    }
+    if task.opened.as_ref().is_some_and(|r| r != robot_id) {
+        return Err(Code::BoundElsewhere.into());
+    }
+    if task.semantic_refusers.contains(robot_id) {
+        return Err(Code::UnsupportedAction.into());
+    }
+    if spec.retry.exclude_failed_robot && task.opened.is_none() && task.failed_robots.contains(robot_id) {
+        return Err(Code::ExcludedAfterFailure.into());
+    }
+    Ok(())
+}
+
+/// Whether any known robot could ever do the task; each that is looked at is a look of the slice. Of a robot that is enrolled and has never
+/// connected nobody knows what it can do. While no robot is known, nobody knows either.
+///
+/// # Errors
+/// Why not, with how many robots each reason leaves out.
+pub(super) fn could_ever(view: &View, task: &TaskState, intake: &TaskIntake, slice: &mut Slice) -> Result<(), Reason> {
+    let retired = |id: &str| view.control.get(id).is_some_and(|control| control.row.duty() == Duty::Retired);
+    let mut against: BTreeMap<Code, u64> = BTreeMap::new();
+    for session in view.sessions.iter().filter(|(id, _)| !retired(id)).map(|(_, session)| &session.row) {
+        slice.look(1);
+        match fits(&session.robot_id, session, task, intake) {
+            Ok(()) => return Ok(()),
+            Err(reason) => *against.entry(reason.code).or_default() += 1,
+        }
+    }
+    let unheard = view.enrolled.iter().filter(|(id, _)| !view.sessions.contains_key(*id) && !retired(id));
+    for robot in unheard.map(|(_, robot)| &robot.row).filter(|robot| robot.revoked.is_none()) {
+        slice.look(1);
+        match bound(&robot.robot_id, task, intake) {
+            Ok(()) => return Ok(()),
+            Err(reason) => *against.entry(reason.code).or_default() += 1,
+        }
+    }
+    if against.is_empty() {
+        return Ok(());
+    }
+    let reason = Reason::from(Code::NoKnownRobot);
+    Err(against.into_iter().fold(reason, |reason, (code, robots)| reason.with(code.as_str(), robots)))
 }
 
 /// A robot that refused this task is asked again only once it has said something newer.
@@ -226,20 +269,7 @@ pub fn task(view: &View, board: &Board, task: &TaskState, intake: &TaskIntake, n
     {
         return Err(Reason::from(Code::RobotReconciling).with("robot_id", robot_id));
     }
-    if intake.spec.not_before.is_some_and(|t| t > now.utc) {
-        return Err(Code::WaitingForTime.into());
-    }
-    if let Some(token) = task.holds.iter().next() {
-        return Err(Reason::from(Code::WaitingForHold).with("token", token));
-    }
-    for id in &intake.spec.depends_on {
-        match view.ended.get(id) {
-            Some(Phase::Succeeded) => {}
-            Some(_) => return Err(Reason::from(Code::DependencyFailed).with("task_id", id)),
-            None => return Err(Reason::from(Code::WaitingForDependency).with("task_id", id)),
-        }
-    }
-    Ok(())
+    Wait::of(task, intake, &view.ended, now.utc).reason().map_or(Ok(()), Err)
 }
 
 /// An idle-looking errand that may be broken off for a task: parking, or charging above the area's threshold.

@@ -54,6 +54,10 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
     let concerned = held.map(|h| &h.robot_id).chain(resumed.map(|c| &c.robot_id)).chain(waiting.map(|(id, _)| id));
     let concerned: BTreeSet<RobotId> = concerned.chain(known).cloned().collect();
     for robot_id in concerned.into_iter().filter(|id| view.sessions.contains_key(id.as_str())).collect::<Vec<_>>() {
+        if plan.is_cut() {
+            view.stops_changed |= all;
+            return;
+        }
         let online = heard::presence(board, &robot_id, &now) == Presence::Online;
         let live = board.get(&robot_id).filter(|_| online).cloned();
         plan.decide(view, now, "stop", |tx| look(tx, &robot_id, live.as_deref()));

@@ -359,11 +359,12 @@ fn entered(tx: &mut Tx, t: &mut TaskState, was: Phase, news: &News, intake: &Tas
     }
     match t.phase {
         Phase::Queued => {
-            t.queued_since = tx.now.utc;
-            t.reason = None;
-            if !tx.view.timers.contains_key(&Timer::id_of(TimerKind::ScheduleToStart, &waiting)) {
-                arm(tx, TimerKind::ScheduleToStart, &waiting, intake.spec.schedule_to_start_ms);
+            // Whoever was only offered to a robot has waited all along.
+            let begun = t.attempt_id().and_then(|id| tx.view.attempt(&id)).is_some_and(|a| a.accepted.is_some());
+            if begun || was == Phase::NeedsOperator {
+                t.queued_since = tx.now.utc;
             }
+            t.reason = None;
             if was == Phase::NeedsOperator {
                 t.failures = 0;
                 t.refusals_in_row = 0;

@@ -26,12 +26,16 @@ pub fn due(view: &View, now: &Now) -> (Vec<Timer>, Vec<TaskId>) {
         t.fires_at_service_ms.is_some_and(|at| at <= clock)
     };
     let timers = view.timers.values().map(|t| &t.row).filter(|t| fired(t)).cloned().collect();
-    let late = |id: &&TaskId| view.intake(id).and_then(|i| i.spec.deadline).is_some_and(|d| d <= now.utc);
-    let moves = |p: Phase, then: Option<Then>| {
-        p != Phase::NeedsOperator && !matches!(then, Some(Then::Expired | Then::Canceled))
-    };
-    let tasks = view.tasks.values().map(|t| &t.row).filter(|t| moves(t.phase, t.then)).map(|t| &t.task_id).filter(late);
-    (timers, tasks.cloned().collect())
+    let passed = view.deadlines.iter().take_while(|(at, _)| *at <= now.utc).map(|(_, task_id)| task_id);
+    (timers, passed.filter(|task_id| is_late(view, task_id, now)).cloned().collect())
+}
+
+/// Whether the deadline of a task has passed and has not had its effect. In NEEDS_OPERATOR a person decides.
+pub(super) fn is_late(view: &View, task_id: &TaskId, now: &Now) -> bool {
+    let Some((task, intake)) = view.task(task_id).zip(view.intake(task_id)) else { return false };
+    let ends = task.phase.is_terminal() || matches!(task.then, Some(Then::Expired | Then::Canceled));
+    let passed = intake.spec.deadline.is_some_and(|deadline| deadline <= now.utc);
+    passed && !ends && task.phase != Phase::NeedsOperator
 }
 
 /// Fires one timer.
@@ -86,12 +90,29 @@ pub fn deadline(tx: &mut Tx, task_id: &TaskId) {
     happen(tx, task_id, News::of(Event::Deadline, Some(&why)));
 }
 
-/// Tasks that wait get their schedule_to_start once; a suspended one queues again.
-pub fn arm_waiting(tx: &mut Tx, task_id: &TaskId) {
-    let Some(task) = tx.view.task(task_id).cloned() else { return };
-    let Some(intake) = tx.view.intake(task_id) else { return };
+/// The schedule_to_start of a task counts while it is ready, from when it began to wait, and stands still while it is not.
+pub(super) fn count_readiness(tx: &mut Tx, task_id: &TaskId) {
+    let Some(task) = tx.view.task(task_id).filter(|task| task.phase == Phase::Queued) else { return };
+    let Some(limit_ms) = tx.view.intake(task_id).and_then(|i| i.spec.schedule_to_start_ms) else { return };
+    let since = task.ready_since.map_or(tx.now.utc, |since| since.max(task.queued_since));
     let waiting = AttemptId { subject: Subject::Task(task_id.clone()), epoch: 0 };
-    let spent = tx.now.utc.ms_since(task.queued_since);
-    let after_ms = intake.spec.schedule_to_start_ms.saturating_sub(spent);
-    arm(tx, TimerKind::ScheduleToStart, &waiting, after_ms);
+    let known = tx.view.timers.get(&Timer::id_of(TimerKind::ScheduleToStart, &waiting)).map(|t| t.row.clone());
+    let served = tx.view.serving(&tx.now).site_ms;
+    let is_ready = tx.view.queue.rank(task_id).is_some();
+    match (is_ready, known) {
+        (true, None) => {
+            let spent = tx.now.utc.ms_since(since);
+            arm(tx, TimerKind::ScheduleToStart, &waiting, limit_ms.saturating_sub(spent));
+        }
+        (true, Some(mut timer)) if timer.fires_at_service_ms.is_none() => {
+            timer.fires_at_service_ms = Some(served + timer.remaining_ms);
+            tx.put(timer, "timer.changed");
+        }
+        (false, Some(mut timer)) => {
+            let Some(at) = timer.fires_at_service_ms.take() else { return };
+            timer.remaining_ms = at.saturating_sub(served);
+            tx.put(timer, "timer.changed");
+        }
+        _ => {}
+    }
 }

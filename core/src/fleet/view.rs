@@ -3,10 +3,13 @@
 //! Called by every room of `fleet`. Invariant: a row here is at the revision it has in the store, or one that an item of the
 //! running cycle will write; after a conflict the whole view is built again, never patched.
 
+use super::queue::{self, Queue};
 use super::rows::{
     AreaBudget, CommandKey, Drain, FleetMark, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotCounter,
     RobotHolder, ServiceClock, SiteRow, Timer,
 };
+use super::sweep::Agenda;
+use crate::identity::RobotIdentity;
 use crate::ids::{AttemptId, RobotId, TaskId};
 use crate::limits;
 use crate::maintenance::{DrainRelease, DrainRequest};
@@ -49,10 +52,12 @@ pub struct View {
     pub intakes: Slot<TaskIntake>,
     /// Where tasks are that have not ended.
     pub tasks: Slot<TaskState>,
-    /// Tasks that wait for a robot, by priority and admission number, and since when.
-    pub queued: BTreeMap<(u8, u64), (TaskId, Utc)>,
-    /// Tasks that began to wait since the planner last looked.
-    pub fresh: BTreeSet<TaskId>,
+    /// Tasks that wait for a robot.
+    pub queue: Queue,
+    /// Tasks that have not ended, by deadline.
+    pub deadlines: BTreeSet<(Utc, TaskId)>,
+    /// What is due by time and not done yet. Volatile.
+    pub agenda: Agenda,
     /// How tasks ended that a task waits for which has not.
     pub ended: BTreeMap<TaskId, Phase>,
     /// How many tasks that have not ended wait for a task.
@@ -101,6 +106,8 @@ pub struct View {
     pub budgets: Slot<AreaBudget>,
     /// Used request_ids of the commands that are being carried out: asked by id, and let go with the turn.
     pub command_keys: Slot<CommandKey>,
+    /// Robots that somebody enrolled or may (identity's).
+    pub enrolled: Slot<RobotIdentity>,
     /// Newest sessions (telemetry's).
     pub sessions: Slot<Session>,
     /// Presence (telemetry's).
@@ -173,6 +180,7 @@ viewed! {
     DrainRequest => drain_requests;
     DrainRelease => drain_releases;
     AreaBudget => budgets;
+    RobotIdentity => enrolled;
     PresenceRow => presence;
     LaneMark => lane_marks;
 }
@@ -182,22 +190,20 @@ impl Viewed<View> for TaskState {
         &mut view.tasks
     }
     fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
-        let Some(task) = view.tasks.get(id).map(|t| &t.row) else { return };
-        if let Some(robot) = &task.robot_id {
-            view.dirty.insert(robot.clone());
+        let Ok(task_id) = TaskId::parse(id) else { return };
+        if let Some(task) = view.tasks.get(id).map(|t| &t.row) {
+            view.dirty.extend(task.robot_id.clone());
+            view.unasked.remove(&task_id);
+            let phase = task.phase;
+            if phase.is_terminal() {
+                let deadline = view.intake(&task_id).and_then(|intake| intake.spec.deadline);
+                if let Some(at) = deadline {
+                    view.deadlines.remove(&(at, task_id.clone()));
+                }
+                queue::note_end(view, &task_id, phase);
+            }
         }
-        view.unasked.remove(&task.task_id);
-        if task.phase.is_terminal() && view.dependants.contains_key(&task.task_id) {
-            view.ended.insert(task.task_id.clone(), task.phase);
-        }
-        let Some(intake) = view.intakes.get(id).map(|t| &t.row) else { return };
-        let place = (intake.spec.priority, task.number);
-        if task.phase == Phase::Queued {
-            view.queued.insert(place, (task.task_id.clone(), task.queued_since));
-            view.fresh.insert(task.task_id.clone());
-        } else {
-            view.queued.remove(&place);
-        }
+        queue::place(view, &task_id);
     }
 }
 
@@ -217,6 +223,11 @@ impl Viewed<View> for TaskIntake {
             *view.dependants.entry(task_id).or_default() += 1;
         }
         old.into_iter().for_each(|old| view.waits_no_more(old));
+        if let Ok(task_id) = TaskId::parse(id) {
+            let deadline = view.intake(&task_id).and_then(|intake| intake.spec.deadline);
+            view.deadlines.extend(deadline.map(|at| (at, task_id.clone())));
+            queue::place(view, &task_id);
+        }
     }
 }
 
@@ -375,6 +386,7 @@ const WHOLE: &[Table] = &[
     Table::DrainRequest,
     Table::DrainRelease,
     Table::AreaBudget,
+    Table::RobotIdentity,
     Table::Session,
     Table::Presence,
     Table::LaneMark,
@@ -389,8 +401,9 @@ impl View {
             site,
             intakes: Slot::new(),
             tasks: Slot::new(),
-            queued: BTreeMap::new(),
-            fresh: BTreeSet::new(),
+            queue: Queue::new(read.utc),
+            deadlines: BTreeSet::new(),
+            agenda: Agenda::default(),
             ended: BTreeMap::new(),
             dependants: BTreeMap::new(),
             unasked: BTreeSet::new(),
@@ -415,6 +428,7 @@ impl View {
             drain_requests: Slot::new(),
             drain_releases: Slot::new(),
             budgets: Slot::new(),
+            enrolled: Slot::new(),
             sessions: Slot::new(),
             presence: Slot::new(),
             lane_marks: Slot::new(),
@@ -481,8 +495,8 @@ impl View {
                 }
                 Table::TaskState => {
                     let task = row.decode::<TaskState>()?;
-                    if task.phase.is_terminal() && self.dependants.contains_key(&task.task_id) {
-                        self.ended.insert(task.task_id, task.phase);
+                    if task.phase.is_terminal() {
+                        queue::note_end(self, &task.task_id, task.phase);
                     }
                 }
                 _ => {}
@@ -525,6 +539,7 @@ impl View {
             Table::Incident => self.take::<Incident>(key, revision, row),
             Table::Drain => self.take::<Drain>(key, revision, row),
             Table::CommandKey => self.take::<CommandKey>(key, revision, row),
+            Table::RobotIdentity => self.take::<RobotIdentity>(key, revision, row),
             Table::Session => self.take::<Session>(key, revision, row),
             Table::Presence => self.take::<PresenceRow>(key, revision, row),
             Table::LaneMark => self.take::<LaneMark>(key, revision, row),
@@ -593,7 +608,7 @@ impl View {
         self.forget_ended();
         self.dirty.clear();
         self.policy_dirty.clear();
-        self.fresh.clear();
+        self.queue.rest();
     }
 
     /// Serving time at `now`.

@@ -13,7 +13,8 @@ const VIOLATIONS_MAX: usize = 100;
 /// Columns that hold text.
 const TEXT_COLUMNS: [&str; 5] = ["task_type", "from_waypoint", "to_waypoint", "item_sku", "robot_id"];
 /// Columns that hold whole numbers.
-const NUMBER_COLUMNS: [&str; 4] = ["priority", "timeout_seconds", "max_retry_times", "retry_interval_seconds"];
+const NUMBER_COLUMNS: [&str; 5] =
+    ["priority", "timeout_seconds", "max_retry_times", "retry_interval_seconds", "schedule_to_start_seconds"];
 
 /// One task of a file, in either JSON form.
 #[derive(Clone, Debug, PartialEq)]

@@ -24,6 +24,8 @@ pub struct Transport {
     pub max_retry_times: Option<i64>,
     /// Absent: 5 s.
     pub retry_interval_ms: Option<i64>,
+    /// How long it may be ready before a robot starts. Absent: no limit.
+    pub schedule_to_start_ms: Option<i64>,
 }
 
 impl Transport {
@@ -54,6 +56,7 @@ impl Transport {
             robot_id: self.robot_id,
             steps,
             timeout_ms: self.timeout_ms,
+            schedule_to_start_ms: self.schedule_to_start_ms,
             retry,
             ..RawTask::default()
         }

@@ -31,7 +31,7 @@ pub struct RawTask {
     pub steps: Vec<RawStep>,
     /// Required.
     pub timeout_ms: Option<i64>,
-    /// Absent: 15 min.
+    /// Absent: no limit.
     pub schedule_to_start_ms: Option<i64>,
     /// Absent: 60 s.
     pub stall_ms: Option<i64>,
@@ -165,9 +165,7 @@ impl RawTask {
             selector,
             steps,
             timeout_ms,
-            schedule_to_start_ms: self
-                .schedule_to_start_ms
-                .map_or(limits::SCHEDULE_TO_START_DEFAULT.as_ms(), |v| v as u64),
+            schedule_to_start_ms: self.schedule_to_start_ms.map(|v| v as u64),
             stall_ms: self.stall_ms.map_or(limits::STALL_DEFAULT.as_ms(), |v| v as u64),
             not_before: self.not_before,
             deadline: self.deadline,
@@ -364,6 +362,7 @@ mod tests {
             timeout_ms: Some(300_000),
             max_retry_times: None,
             retry_interval_ms: None,
+            schedule_to_start_ms: None,
         }
         .into_raw()
     }

@@ -22,8 +22,8 @@ pub struct TaskSpec {
     pub steps: Vec<WorkStep>,
     /// start_to_close of one attempt, milliseconds of site time.
     pub timeout_ms: u64,
-    /// From admission (or not_before) until a robot starts, milliseconds of site time.
-    pub schedule_to_start_ms: u64,
+    /// How long it may be ready before a robot starts, milliseconds of site time. None: as long as it takes.
+    pub schedule_to_start_ms: Option<u64>,
     /// Without progress, milliseconds of site time.
     pub stall_ms: u64,
     /// Not before, UTC.
@@ -112,12 +112,25 @@ pub enum Class {
 }
 
 impl Class {
-    /// The class of a priority, one class up once it waited longer than the limit.
-    pub fn of(priority: u8, promoted: bool) -> Self {
-        match (priority, promoted) {
-            (0..=1, _) | (2..=6, true) => Self::Urgent,
-            (2..=6, false) | (_, true) => Self::Normal,
-            (_, false) => Self::Background,
+    /// As people read it.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Urgent => "urgent",
+            Self::Normal => "normal",
+            Self::Background => "background",
+        }
+    }
+    /// The class of a priority, so many classes up.
+    pub fn of(priority: u8, promotions: u64) -> Self {
+        let own = match priority {
+            0..=1 => Self::Urgent,
+            2..=6 => Self::Normal,
+            _ => Self::Background,
+        };
+        match (own, promotions) {
+            (_, 0) => own,
+            (Self::Background, 1) => Self::Normal,
+            _ => Self::Urgent,
         }
     }
 }
@@ -158,8 +171,8 @@ mod tests {
     }
 
     #[test]
-    fn waiting_promotes_by_one_class() {
-        assert_eq!((Class::of(5, false), Class::of(5, true)), (Class::Normal, Class::Urgent));
-        assert_eq!((Class::of(9, false), Class::of(9, true)), (Class::Background, Class::Normal));
+    fn each_promotion_lifts_by_one_class_up_to_urgent() {
+        assert_eq!([0, 1, 2].map(|n| Class::of(5, n)), [Class::Normal, Class::Urgent, Class::Urgent]);
+        assert_eq!([0, 1, 2].map(|n| Class::of(9, n)), [Class::Background, Class::Normal, Class::Urgent]);
     }
 }

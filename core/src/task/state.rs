@@ -28,7 +28,7 @@ pub struct TaskIntake {
     pub payload_hash: String,
     /// UTC, site clock.
     pub created: Utc,
-    /// Admission number: rises by one a task, orders lists and queues.
+    /// Admission number: rises by one a task of one process, and orders lists. Several processes may give the same one.
     pub number: u64,
 }
 
@@ -75,6 +75,9 @@ pub struct TaskState {
     pub semantic_refusers: BTreeSet<RobotId>,
     /// UTC, since when it waits (admission, hand-back, end of back-off).
     pub queued_since: Utc,
+    /// UTC, since when nothing but a robot was missing for the first time: not_before passed, dependencies met, no hold. Survives requeues.
+    /// None: it has not been ready yet.
+    pub ready_since: Option<Utc>,
     /// UTC, end of the back-off in RETRY_WAIT.
     pub retry_at: Option<Utc>,
     /// UTC, a cancel was asked for and has not ended yet.
@@ -92,6 +95,7 @@ pub struct TaskState {
 impl TaskState {
     /// QUEUED, as born with its intake.
     pub fn born(intake: &TaskIntake) -> Self {
+        let begins = intake.spec.not_before.map_or(intake.created, |t| t.max(intake.created));
         Self {
             task_id: intake.task_id.clone(),
             number: intake.number,
@@ -107,7 +111,8 @@ impl TaskState {
             refusals_in_row: 0,
             failed_robots: BTreeSet::new(),
             semantic_refusers: BTreeSet::new(),
-            queued_since: intake.spec.not_before.map_or(intake.created, |t| t.max(intake.created)),
+            queued_since: begins,
+            ready_since: intake.spec.depends_on.is_empty().then_some(begins),
             retry_at: None,
             cancel_requested: None,
             started: None,

@@ -94,6 +94,7 @@ impl Form {
             _ if self == Self::Spec => return format!("spec.{field}"),
             "type" if !nested => "task_type",
             "timeout" => "timeout_seconds",
+            "schedule_to_start_timeout" => "schedule_to_start_seconds",
             "retry.max_retry_times" if nested => "retry_strategy.max_retry_times",
             "retry.max_retry_times" => "max_retry_times",
             "retry.interval" if nested => "retry_strategy.retry_interval_seconds",
@@ -205,6 +206,7 @@ pub fn raw_flat(flat: v1::FlatTask) -> RawTask {
         timeout_ms: seconds(flat.timeout_seconds),
         max_retry_times: flat.max_retry_times.map(i64::from),
         retry_interval_ms: seconds(flat.retry_interval_seconds),
+        schedule_to_start_ms: seconds(flat.schedule_to_start_seconds),
     };
     with_created_at(transport.into_raw(), flat.created_at)
 }
@@ -223,6 +225,7 @@ pub fn raw_nested(nested: v1::NestedTask) -> RawTask {
         timeout_ms: seconds(nested.timeout_seconds),
         max_retry_times: retry.max_retry_times.map(i64::from),
         retry_interval_ms: seconds(retry.retry_interval_seconds),
+        schedule_to_start_ms: seconds(nested.schedule_to_start_seconds),
     };
     with_created_at(transport.into_raw(), nested.created_at)
 }
@@ -283,7 +286,7 @@ impl From<&TaskSpec> for v1::TaskSpec {
             selector: (spec.selector != Selector::default()).then(|| (&spec.selector).into()),
             steps: spec.steps.iter().map(Into::into).collect(),
             timeout: Some(duration(spec.timeout_ms)),
-            schedule_to_start_timeout: Some(duration(spec.schedule_to_start_ms)),
+            schedule_to_start_timeout: spec.schedule_to_start_ms.map(duration),
             stall_timeout: Some(duration(spec.stall_ms)),
             not_before: spec.not_before.map(timestamp),
             deadline: spec.deadline.map(timestamp),
@@ -337,6 +340,7 @@ pub fn encode_task(view: TaskView<'_>) -> v1::Task {
         epoch: state.epoch,
         attempt: attempt.map(Into::into),
         queued_time: Some(timestamp(state.queued_since)),
+        ready_time: state.ready_since.map(timestamp),
         retry_time: state.retry_at.map(timestamp),
         cancel_request_time: state.cancel_requested.map(timestamp),
         start_time: state.started.map(timestamp),

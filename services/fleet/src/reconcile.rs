@@ -1,21 +1,23 @@
 //! The loop: take what is new, decide, commit, publish. A conflict means that somebody else decided too: the picture is built again.
+//! Each turn is a slice of some milliseconds; between two, people are answered. A turn takes a few requests *and* a sweep that is due: neither
+//! keeps the other waiting.
 //! Of several processes on one store one leads and does all that; the others keep their picture by rows alone (`standby`).
 //!
-//! Invariant: the view has absorbed the whole feed before anything is decided on it; only a process that leads plans, and one that could not
+//! Invariant: the view has absorbed the feed up to a head of it before anything is planned on it, never a part of a commit; only a process that leads plans, and one that could not
 //! say so for a while reads the rows again before it does.
 
 use crate::{Look, Parts, Request};
 use midshift_core::fleet::view::{self, View};
-use midshift_core::fleet::{Board, LOGS, Pace, Plan, absorb, commands, cycle, found, obeyed, objects};
+use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, found, obeyed, objects};
 use midshift_core::lead::{FleetLeader, Own, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::once;
 use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
-use midshift_core::rows::{Entry, Item, Key, Log, Seq, Table};
+use midshift_core::rows::{Item, Key, Log, Seq, Table};
 use midshift_core::time::Now;
 use midshift_core::work::Live;
-use midshift_store::{CommitError, Dirty, Error, follow, lead};
+use midshift_store::{CommitError, Dirty, Error, FeedPage, Store, lead};
 use std::time::Duration;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
@@ -23,10 +25,10 @@ use tokio_util::sync::CancellationToken;
 
 /// Pause after the store failed, before everything is read again.
 const STORE_RETRY: Duration = Duration::from_millis(200);
+/// Entries that are absorbed before it is asked again whether the slice is spent.
+const ENTRIES_AT_ONCE: usize = 16;
 /// Timers are no finer than this, so a shorter turn needs no rest.
 const TIMER_GRAIN: Duration = Duration::from_millis(1);
-/// Requests taken into one cycle.
-const REQUESTS_PER_CYCLE: usize = 64;
 
 pub(crate) struct Loop {
     pub(crate) parts: Parts,
@@ -45,6 +47,16 @@ pub(crate) struct Loop {
     pub(crate) seat: Seat<FleetLeader>,
     /// What this process wrote and has not read again.
     own: Own,
+    /// When the next sweep is due.
+    sweep_due: Instant,
+    /// Head of the feed up to which this process reads before it plans; none: it has read it.
+    behind: Option<Seq>,
+    /// Others have written what no plan has seen.
+    news: bool,
+    /// A stage of the last turn was cut.
+    more: bool,
+    /// Decisions of a stage, so that a turn takes no longer than it may.
+    share: usize,
 }
 
 type Replies = Vec<(oneshot::Sender<Result<(), Refusal>>, usize)>;
@@ -78,19 +90,29 @@ pub async fn run(
         looks: Vec::new(),
         seat,
         own: Own::default(),
+        sweep_due: Instant::now(),
+        behind: None,
+        news: false,
+        more: false,
+        share: limits::DECISIONS_PER_STAGE,
     };
     this.rebuild_until_read(&shutdown).await;
-    let mut sweep = tokio::time::interval(Duration::from_millis(limits::SWEEP.as_ms()));
-    sweep.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     let mut batch = Vec::new();
     loop {
-        let pace = tokio::select! {
+        tokio::select! {
             biased;
             () = shutdown.cancelled() => break,
-            _ = sweep.tick() => Pace::Sweep,
-            n = requests.recv_many(&mut batch, REQUESTS_PER_CYCLE) => if n == 0 { break } else { Pace::Wake },
-            changed = news(&mut wake, this.rested) => if changed.is_err() { break } else { Pace::Wake },
-        };
+            n = requests.recv_many(&mut batch, limits::REQUESTS_PER_TURN) => if n == 0 { break },
+            () = tokio::time::sleep_until(this.sweep_due) => {}
+            () = tokio::task::yield_now(), if this.more || this.behind.is_some() => {}
+            changed = news(&mut wake, this.rested) => if changed.is_err() { break },
+        }
+        while batch.len() < limits::REQUESTS_PER_TURN
+            && let Ok(request) = requests.try_recv()
+        {
+            batch.push(request);
+        }
+        let pace = if Instant::now() >= this.sweep_due { Pace::Sweep } else { Pace::Wake };
         if this.turn(pace, std::mem::take(&mut batch)).await.is_err() {
             tokio::time::sleep(STORE_RETRY).await;
             this.rebuild_until_read(&shutdown).await;
@@ -106,6 +128,17 @@ pub async fn run(
 async fn news(wake: &mut watch::Receiver<Seq>, rested: Instant) -> Result<(), watch::error::RecvError> {
     tokio::time::sleep_until(rested).await;
     wake.changed().await
+}
+
+/// Entries of the feed that come next. A cursor that never read anything begins at the oldest entry that is kept.
+async fn page_after(store: &dyn Store, cursor: &mut Seq) -> Result<FeedPage, Error> {
+    match store.feed(*cursor, LOGS, limits::ENTRIES_PER_TURN).await {
+        Err(Error::CursorExpired { asked, oldest }) if asked < oldest && *cursor == Seq(0) => {
+            *cursor = oldest;
+            store.feed(oldest, LOGS, limits::ENTRIES_PER_TURN).await
+        }
+        page => page,
+    }
 }
 
 fn leads_no_more() {
@@ -183,6 +216,7 @@ impl Loop {
         self.view.unwilling = unwilling;
         self.view.place_waits = place_waits;
         self.seq = self.view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq).min(snapshot.seq);
+        (self.behind, self.news, self.more) = (None, true, false);
         metrics::counter!("midshift_fleet_rebuilds_total").increment(1);
         if !self.seat.leads() {
             self.seq = snapshot.seq;
@@ -208,6 +242,8 @@ impl Loop {
             self.rebuild().await.map_err(unreadable)?;
         }
         if !self.seat.leads() {
+            self.sweep_due = Instant::now() + Duration::from_millis(limits::SWEEP.as_ms());
+            (self.behind, self.more) = (None, false);
             let begun = Instant::now();
             self.follow_rows().await.map_err(unreadable)?;
             self.rest_after(begun.elapsed());
@@ -240,11 +276,8 @@ impl Loop {
     async fn lead(&mut self, pace: Pace, requests: Vec<Request>) -> Result<(), ()> {
         let begun = Instant::now();
         let now = self.parts.clock.now();
-        let mut plan = Plan::default();
-        let foreign = self
-            .take_feed(now, &mut plan)
-            .await
-            .map_err(|error| tracing::warn!(%error, "fleet cannot read the feed"))?;
+        let mut plan = Plan::of(Slice::of(self.share));
+        self.take_feed(now, &mut plan).await.map_err(|error| tracing::warn!(%error, "fleet cannot read the feed"))?;
         let unread = |error| tracing::warn!(%error, "fleet cannot read what is over");
         self.ask(used_ids(&requests)).await.map_err(unread)?;
         let renewal = match self.seat.stance(now.link) {
@@ -257,8 +290,14 @@ impl Loop {
             Stance::Lead | Stance::StandBy | Stance::TakeOver => None,
         };
         let replies = self.take_requests(requests, now, &mut plan);
-        if foreign || !replies.is_empty() || pace == Pace::Sweep {
+        let is_due = self.news || self.more || !replies.is_empty() || pace == Pace::Sweep;
+        if is_due && self.behind.is_none() {
+            plan.slice.renew();
             cycle(&mut self.view, now, &self.board, pace, &mut plan);
+            (self.news, self.more) = (false, plan.report.more);
+            if pace == Pace::Sweep {
+                self.sweep_due = Instant::now() + Duration::from_millis(limits::SWEEP.as_ms());
+            }
         }
         let took = begun.elapsed();
         self.rest_after(took);
@@ -278,9 +317,23 @@ impl Loop {
         for silent in plan.items.iter_mut().filter_map(|item| item.silent.as_mut()) {
             silent.position = self.heard_up_to;
         }
+        let is_cut = self.more;
         self.renew_and_commit(renewal, now, plan, replies).await?;
         self.answer(now);
+        self.fit(begun.elapsed(), is_cut);
         Ok(())
+    }
+
+    /// Gives the next turn less to do if this one took too long, and more if it was cut early.
+    fn fit(&mut self, took: Duration, is_cut: bool) {
+        metrics::histogram!("midshift_fleet_turn_seconds").record(took.as_secs_f64());
+        let most = Duration::from_millis(limits::TURN.as_ms());
+        let share = match (took > most, is_cut && took < most / 2) {
+            (true, _) => self.share / 2,
+            (false, true) => self.share + self.share / 4,
+            (false, false) => self.share,
+        };
+        self.share = share.clamp(limits::DECISIONS_PER_STAGE_MIN, limits::DECISIONS_PER_STAGE);
     }
 
     /// Answers every question from the picture, which holds only what is committed at this moment.
@@ -290,26 +343,30 @@ impl Loop {
         }
     }
 
-    /// Absorbs the feed to its head; true if something came from others. Who leads is no news for a plan.
-    async fn take_feed(&mut self, now: Now, plan: &mut Plan) -> Result<bool, Error> {
-        let mut foreign = false;
-        let mut seen = Ok(());
+    /// Absorbs a slice of the feed, on the way to the head that it had when this way began: a head is never inside of a commit. Who leads is no
+    /// news for a plan.
+    async fn take_feed(&mut self, now: Now, plan: &mut Plan) -> Result<(), Error> {
+        let page = page_after(self.parts.store.as_ref(), &mut self.seq).await?;
+        let goal = self.behind.unwrap_or(page.head);
         let clock = self.parts.clock.clone();
-        let Self { view, seat, own, .. } = self;
-        let take = |entries: &[Entry]| {
-            for entry in entries {
+        let mut next = page.next.min(goal);
+        let entries = page.entries.partition_point(|entry| entry.seq <= goal);
+        for some in page.entries[..entries].chunks(ENTRIES_AT_ONCE) {
+            for entry in some {
                 let is_lease = matches!(entry.table, Some(Table::FleetLeader | Table::OtaLeader));
-                let is_own = entry.log == Log::Fleet && own.is_own(entry.seq.0);
-                foreign |= !is_lease && !is_own;
+                let is_own = entry.log == Log::Fleet && self.own.is_own(entry.seq.0);
+                self.news |= !is_lease && !is_own;
             }
-            if seen.is_ok() {
-                seen = seat.follow(entries, clock.now().link);
+            self.seat.follow(some, clock.now().link)?;
+            absorb(&mut self.view, now, some, plan);
+            if let Some(last) = some.last().filter(|_| plan.slice.is_spent()) {
+                next = last.seq.min(next);
+                break;
             }
-            absorb(view, now, entries, plan);
-        };
-        follow(self.parts.store.as_ref(), &mut self.seq, LOGS, take).await?;
-        seen?;
-        Ok(foreign)
+        }
+        self.seq = next;
+        self.behind = (next < goal).then_some(goal);
+        Ok(())
     }
 
     /// Reads by id what the picture wants to know of what is over, and these rows too.

@@ -71,6 +71,7 @@ pub fn request(t: &Transport) -> SubmitTaskRequest {
         timeout_seconds: small(t.timeout_ms.map(|ms| ms / 1000)),
         max_retry_times: small(t.max_retry_times),
         retry_interval_seconds: small(t.retry_interval_ms.map(|ms| ms / 1000)),
+        schedule_to_start_seconds: small(t.schedule_to_start_ms.map(|ms| ms / 1000)),
         ..v1::FlatTask::default()
     };
     SubmitTaskRequest { body: Some(Body::Flat(flat)), ..SubmitTaskRequest::default() }

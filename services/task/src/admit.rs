@@ -9,10 +9,11 @@ use midshift_core::audit::Note;
 use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{RequestId, TaskId};
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violation};
-use midshift_core::rows::{Item, Table, Writer};
+use midshift_core::rows::{Item, Key, Table, Writer};
 use midshift_core::task::state::RequestKey;
 use midshift_core::task::{TaskIntake, TaskSpec, TaskState};
 use midshift_core::time::Utc;
+use midshift_proto::convert::shown;
 use midshift_proto::convert::task::{Submission, canonical, encode_checked};
 use midshift_proto::task::v1;
 use midshift_store::{Applied, CommitError, load};
@@ -254,18 +255,39 @@ impl TaskService {
         }
     }
 
+    /// What a caller should know of a task that is admitted all the same: that it names a robot that nobody knows.
+    pub async fn notes(&self, spec: &TaskSpec) -> Result<Vec<Reason>, Refusal> {
+        let Some(robot_id) = &spec.robot_id else { return Ok(Vec::new()) };
+        let keys = [Table::RobotIdentity, Table::Session].map(|table| Key::new(table, robot_id.as_str()));
+        let known = !self.store().get(keys.to_vec()).await.map_err(unavailable)?.is_empty();
+        let note = Reason::from(Code::PinnedRobotUnknown).with("robot_id", robot_id);
+        Ok(if known { Vec::new() } else { vec![note] })
+    }
+
     /// Admits one task.
-    pub async fn submit(&self, request: v1::SubmitTaskRequest, by: &Caller) -> Result<v1::Task, Refusal> {
+    pub async fn submit(&self, request: v1::SubmitTaskRequest, by: &Caller) -> Result<v1::SubmitTaskResponse, Refusal> {
+        let answer = |task, notes: Vec<Reason>| v1::SubmitTaskResponse {
+            task: Some(task),
+            notes: notes.iter().map(shown).collect(),
+        };
         if request.validate_only {
-            return Ok(encode_checked(&self.check(request, by).await?.spec));
+            let spec = self.check(request, by).await?.spec;
+            return Ok(answer(encode_checked(&spec), self.notes(&spec).await?));
         }
         let durable = match self.prepare(request, by).await? {
             Prepared::New(admission) => self.admit(*admission, by).await?,
             Prepared::Known(task_id) => Durable::Known(task_id),
         };
         match durable {
-            Durable::New(intake) => Ok(TaskRows::born(*intake).encode()),
-            Durable::Known(task_id) => Ok(read(self.store(), &task_id).await?.encode()),
+            Durable::New(intake) => {
+                let notes = self.notes(&intake.spec).await?;
+                Ok(answer(TaskRows::born(*intake).encode(), notes))
+            }
+            Durable::Known(task_id) => {
+                let task = read(self.store(), &task_id).await?;
+                let notes = self.notes(&task.intake.spec).await?;
+                Ok(answer(task.encode(), notes))
+            }
         }
     }
 

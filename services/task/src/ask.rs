@@ -245,8 +245,8 @@ impl TaskService {
         fits
     }
 
-    /// Commits a request. The key goes first, so that the number of the item is that of the request itself.
-    async fn write(&self, asked: Asked) -> Result<Seq, Refusal> {
+    /// The item of a request. The key goes first, so that the number of the item is that of the request itself.
+    pub(crate) fn item_of(&self, asked: &Asked) -> Item {
         let now = self.inner.parts.clock.now();
         let mut item = Item::new(Writer::Task, &asked.actor);
         item.request_id = asked.request_id.as_ref().map(|r| r.as_str().into());
@@ -261,9 +261,13 @@ impl TaskService {
         }
         item.audit(asked.note());
         let id = format!("{:013}-{:016x}", now.wall.0, rand::random::<u64>());
-        let Asked { ask, reason, actor, .. } = asked;
+        let (ask, reason, actor) = (asked.ask.clone(), asked.reason.clone(), asked.actor.clone());
         item.create(&TaskRequest { id, ask, reason, actor, at_unix_ms: now.wall.0 }, "task.asked");
-        match self.commit(vec![item]).await.pop().ok_or_else(no_result)? {
+        item
+    }
+
+    async fn write(&self, asked: Asked) -> Result<Seq, Refusal> {
+        match self.commit(vec![self.item_of(&asked)]).await.pop().ok_or_else(no_result)? {
             Ok(applied) => Ok(applied.seq),
             // The same call came in twice at once, or the id was used in between.
             Err(CommitError::Conflict { .. }) => {
@@ -275,7 +279,7 @@ impl TaskService {
     }
 
     /// Waits a little until fleet has consumed the log up to `place`; what it did about it is in the same commit as its mark.
-    async fn looked_at(&self, place: Seq) -> Result<bool, Refusal> {
+    pub(crate) async fn looked_at(&self, place: Seq) -> Result<bool, Refusal> {
         let mut wake = self.store().wake();
         let deadline = tokio::time::Instant::now() + Duration::from_millis(limits::CANCEL_WAIT.as_ms());
         loop {

@@ -6,9 +6,10 @@ use crate::TaskService;
 use crate::admit::{Admitted, Durable, Prepared, no_result};
 use midshift_core::identity::Caller;
 use midshift_core::limits;
-use midshift_core::reason::Refusal;
+use midshift_core::reason::{Reason, Refusal};
 use midshift_proto::Denying;
 use midshift_proto::common::v1::FieldViolation;
+use midshift_proto::convert::shown;
 use midshift_proto::task::v1::{self, submit_task_request::Body, submit_task_result::Outcome};
 use std::collections::BTreeSet;
 
@@ -80,7 +81,12 @@ impl<'a> Batch<'a> {
                 },
             };
             let outcome = outcome.inspect_err(|refusal| self.denying.tell(refusal));
-            self.results.push(result_of(request_id, outcome));
+            let notes = match &outcome {
+                // The task is durable, whether or not the rows of its robot can be read now.
+                Ok(Durable::New(intake)) => self.service.notes(&intake.spec).await.unwrap_or_default(),
+                Ok(Durable::Known(_)) | Err(_) => Vec::new(),
+            };
+            self.results.push(result_of(request_id, outcome, &notes));
         }
     }
 
@@ -105,17 +111,17 @@ fn chosen_id(request: &v1::SubmitTaskRequest) -> &str {
     }
 }
 
-fn result_of(request_id: String, outcome: Result<Durable, Refusal>) -> v1::SubmitTaskResult {
+fn result_of(request_id: String, outcome: Result<Durable, Refusal>, notes: &[Reason]) -> v1::SubmitTaskResult {
     let outcome = match outcome {
         Ok(durable) => Outcome::TaskId(durable.task_id().to_string()),
         Err(refusal) => {
             crate::count(&refusal);
             let violations = refusal.violations.into_iter();
             Outcome::Refusal(v1::SubmitTaskRefusal {
-                reason: Some(midshift_proto::convert::shown(&refusal.reason)),
+                reason: Some(shown(&refusal.reason)),
                 violations: violations.map(|v| FieldViolation { field: v.field, description: v.description }).collect(),
             })
         }
     };
-    v1::SubmitTaskResult { request_id, outcome: Some(outcome) }
+    v1::SubmitTaskResult { request_id, outcome: Some(outcome), notes: notes.iter().map(shown).collect() }
 }

@@ -68,8 +68,7 @@ impl Face for TaskService {
     async fn submit_task(&self, r: Request<v1::SubmitTaskRequest>) -> Result<Response<v1::SubmitTaskResponse>, Status> {
         let id = CallId::of(&r, &r.get_ref().request_id);
         let (by, denying) = (caller(&r), Denying::of(&r));
-        let task = self.submit(r.into_inner(), &by).await.inspect_err(|refusal| denying.tell(refusal));
-        id.answer(task.map(|task| v1::SubmitTaskResponse { task: Some(task) }))
+        id.answer(self.submit(r.into_inner(), &by).await.inspect_err(|refusal| denying.tell(refusal)))
     }
     async fn submit_tasks(
         &self,
@@ -101,6 +100,20 @@ impl Face for TaskService {
     ) -> Result<Response<v1::ResolveTaskResponse>, Status> {
         let (id, by) = (CallId::of(&r, &r.get_ref().request_id), caller(&r));
         id.answer(self.resolve(r.into_inner(), &by).await)
+    }
+    async fn cancel_tasks(
+        &self,
+        r: Request<v1::CancelTasksRequest>,
+    ) -> Result<Response<v1::CancelTasksResponse>, Status> {
+        let (id, by) = (CallId::of(&r, &r.get_ref().request_id), caller(&r));
+        id.answer(self.cancel_many(r.into_inner(), &by).await)
+    }
+    async fn resolve_tasks(
+        &self,
+        r: Request<v1::ResolveTasksRequest>,
+    ) -> Result<Response<v1::ResolveTasksResponse>, Status> {
+        let (id, by) = (CallId::of(&r, &r.get_ref().request_id), caller(&r));
+        id.answer(self.resolve_many(r.into_inner(), &by).await)
     }
     async fn resume_held(&self, r: Request<v1::ResumeHeldRequest>) -> Result<Response<v1::ResumeHeldResponse>, Status> {
         let (id, by) = (CallId::of(&r, &r.get_ref().request_id), caller(&r));

@@ -9,6 +9,7 @@ mod batch;
 mod grpc;
 mod images;
 mod list;
+mod many;
 mod prune;
 mod reach;
 mod resume;

@@ -22,7 +22,7 @@ impl TaskService {
         Ok(task)
     }
 
-    fn acts_on(&self, task: &TaskRows, by: &Caller, permission: Permission) -> Result<(), Refusal> {
+    pub(crate) fn acts_on(&self, task: &TaskRows, by: &Caller, permission: Permission) -> Result<(), Refusal> {
         if by.may_everywhere(permission) && by.may_everywhere(Permission::Read) {
             return Ok(());
         }

@@ -10,6 +10,7 @@ use crate::rows::{read_many, robot_kept, sees, unavailable};
 use crate::search::{self, Direction, Search};
 use midshift_core::fleet::requests::allowed_resolutions;
 use midshift_core::identity::Caller;
+use midshift_core::ids::TaskId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Entry, Log, Revision, Seq, Table};
@@ -44,11 +45,11 @@ pub struct Watcher {
     from_now: bool,
     after: Seq,
     images: Images,
-    /// Revisions in which existing tasks were shown, by number, until `after` has passed `shown_until`.
-    shown: BTreeMap<u64, Revision>,
+    /// Revisions in which existing tasks were shown, until `after` has passed `shown_until`.
+    shown: BTreeMap<TaskId, Revision>,
     shown_until: Seq,
-    /// Numbers of tasks that were told and have not ended: one that leaves the filter is told once more.
-    near: BTreeSet<u64>,
+    /// Tasks that were told and have not ended: one that leaves the filter is told once more.
+    near: BTreeSet<TaskId>,
     said: Instant,
     _place: OwnedSemaphorePermit,
 }
@@ -160,7 +161,7 @@ impl Watcher {
             for task in read_many(store.as_ref(), &search::admitted(&self.filter, &rows)).await? {
                 let is_seen = sees(&self.service.inner.parts.site, &self.by, &task.intake);
                 if is_seen && self.filter.admits(&task.intake, &task.state) {
-                    self.shown.insert(task.state.number, task.revision);
+                    self.shown.insert(task.state.task_id.clone(), task.revision);
                     self.keep_near(&task.state, true);
                     self.send(Item::Existing(task.encode()), None).await?;
                 }
@@ -202,9 +203,9 @@ impl Watcher {
                 return Ok(());
             }
         };
-        let said = self.shown.get(&state.number).is_some_and(|shown| entry.revision <= *shown);
+        let said = self.shown.get(&state.task_id).is_some_and(|shown| entry.revision <= *shown);
         let admitted = self.filter.admits(intake, &state);
-        let leaves = !admitted && self.near.contains(&state.number);
+        let leaves = !admitted && self.near.contains(&state.task_id);
         let is_seen = sees(&self.service.inner.parts.site, &self.by, intake);
         if said || !(admitted || leaves) || !is_seen {
             return Ok(());
@@ -227,9 +228,9 @@ impl Watcher {
 
     fn keep_near(&mut self, state: &TaskState, admitted: bool) {
         if admitted && !state.phase.is_terminal() {
-            self.near.insert(state.number);
+            self.near.insert(state.task_id.clone());
         } else {
-            self.near.remove(&state.number);
+            self.near.remove(&state.task_id);
         }
     }
 

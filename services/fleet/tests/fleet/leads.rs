@@ -161,7 +161,8 @@ async fn a_standby_answers_what_the_leader_answers() {
     w.until_phase("T0", Phase::Running).await;
     w.pass(2).await;
     let slots = |view: &midshift_core::fleet::view::View| {
-        format!("{:?} {:?} {:?} {:?} {:?}", view.tasks, view.attempts, view.places, view.authority, view.queued)
+        let ready: Vec<_> = view.queue.ready().collect();
+        format!("{:?} {:?} {:?} {:?} {ready:?}", view.tasks, view.attempts, view.places, view.authority)
     };
     let led = w.fleet.look(move |view, _, _| slots(view)).await.expect("it runs");
     let stood_by = other.look(move |view, _, _| slots(view)).await.expect("it runs");

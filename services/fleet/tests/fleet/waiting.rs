@@ -69,3 +69,23 @@ async fn the_more_urgent_task_goes_first_and_the_older_one_among_equals() {
     assert!(ended(&seen, "urgent") < ended(&seen, "older") && ended(&seen, "older") < ended(&seen, "younger"));
     w.lawful().await;
 }
+
+#[tokio::test(start_paused = true)]
+async fn tasks_that_two_processes_numbered_alike_are_all_done_also_after_a_restart() {
+    let mut w = World::on(CORRIDOR).await;
+    for id in ["T1", "T2", "X1", "X2"] {
+        if id == "X1" {
+            w.number_from(1);
+        }
+        w.submit(id, "A", "B").await;
+    }
+    let seen = w.seen().await;
+    assert_eq!((seen.task("T1").number, seen.task("T2").number), (seen.task("X1").number, seen.task("X2").number));
+    w.stop_fleet().await;
+    w.start_fleet();
+    w.robot("r1", "park-a").await;
+    for id in ["T1", "X1", "T2", "X2"] {
+        w.until_phase(id, Phase::Succeeded).await;
+    }
+    w.lawful().await;
+}

@@ -1,5 +1,7 @@
 //! `midshift task …`
 
+mod many;
+
 use super::client::{self, Call, Change, Exit, unary};
 use super::out::{Format, Out, plain};
 use crate::background::{read_list, request};
@@ -9,6 +11,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use midshift_core::task::forms::Transport;
 use midshift_proto::task::v1::{self, watch_tasks_response::Item};
 use std::cell::RefCell;
+use std::collections::BTreeMap;
 use std::io::IsTerminal;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
@@ -49,10 +52,10 @@ pub enum Verb {
     },
     /// Why a task is not running.
     Explain(One),
-    /// End a task.
+    /// End a task, or with --all every one that is meant.
     Cancel {
         #[command(flatten)]
-        one: One,
+        which: Which,
         /// Why.
         #[arg(long)]
         reason: String,
@@ -65,10 +68,10 @@ pub enum Verb {
         #[command(flatten)]
         change: Change,
     },
-    /// Answer a task that needs an operator.
+    /// Answer a task that needs an operator, or with --all every one that is meant.
     Resolve {
         #[command(flatten)]
-        one: One,
+        which: Which,
         /// How.
         #[arg(long = "as", value_enum)]
         resolution: As,
@@ -151,6 +154,65 @@ pub struct One {
     task_id: String,
 }
 
+/// One task, or many.
+#[derive(clap::Args)]
+pub struct Which {
+    #[command(flatten)]
+    pub(super) call: Call,
+    /// Its id, or a prefix that only one task has.
+    #[arg(required_unless_present = "all")]
+    task_id: Option<String>,
+    /// All tasks that the flags mean; each is asked for by itself, with the rights that it needs.
+    #[arg(long, conflicts_with_all = ["task_id", "if_match"])]
+    all: bool,
+    #[command(flatten)]
+    pub(super) meant: Meant,
+}
+
+/// Which tasks are meant.
+#[derive(clap::Args)]
+pub struct Meant {
+    /// Only these states, e.g. needs-operator.
+    #[arg(long)]
+    state: Vec<String>,
+    /// Only of these robots.
+    #[arg(long)]
+    robot: Vec<String>,
+    /// Only these types.
+    #[arg(long = "type")]
+    kind: Vec<String>,
+    /// Only of this work order.
+    #[arg(long, default_value = "")]
+    external_ref: String,
+}
+
+impl Which {
+    /// The one task; none: many are meant.
+    fn one(&self) -> Option<One> {
+        self.task_id.clone().map(|task_id| One { call: self.call.clone(), task_id })
+    }
+}
+
+impl Meant {
+    /// As the server reads it.
+    pub(super) fn filter(&self) -> Result<v1::TaskFilter, Exit> {
+        let mut states = Vec::new();
+        for text in &self.state {
+            let name = format!("TASK_STATE_{}", text.to_uppercase().replace('-', "_"));
+            let state = v1::TaskState::from_str_name(&name)
+                .ok_or_else(|| Exit::usage(format!("there is no task state {text}")))?;
+            states.push(state as i32);
+        }
+        Ok(v1::TaskFilter {
+            states,
+            robot_ids: self.robot.clone(),
+            types: self.kind.clone(),
+            external_ref: self.external_ref.clone(),
+            ..v1::TaskFilter::default()
+        })
+    }
+}
+
 /// What to submit.
 #[derive(clap::Args)]
 pub struct Submit {
@@ -171,9 +233,15 @@ pub struct Submit {
     /// Only this robot.
     #[arg(long, default_value = "")]
     robot: String,
+    /// Also if nobody knows a robot that a task names: it waits until that robot comes.
+    #[arg(long)]
+    unknown_robot: bool,
     /// How long one attempt may take.
     #[arg(long, value_parser = super::duration, default_value = "10m")]
     timeout: Duration,
+    /// How long it may be ready before a robot starts; then a person is asked. Without it as long as it takes.
+    #[arg(long, value_parser = super::duration)]
+    schedule_to_start: Option<Duration>,
     /// Attempts after the first.
     #[arg(long, default_value_t = 3)]
     retries: i64,
@@ -198,18 +266,8 @@ pub struct Submit {
 pub struct List {
     #[command(flatten)]
     call: Call,
-    /// Only these states, e.g. needs-operator.
-    #[arg(long)]
-    state: Vec<String>,
-    /// Only of these robots.
-    #[arg(long)]
-    robot: Vec<String>,
-    /// Only these types.
-    #[arg(long = "type")]
-    kind: Vec<String>,
-    /// Only of this work order.
-    #[arg(long, default_value = "")]
-    external_ref: String,
+    #[command(flatten)]
+    meant: Meant,
     /// At most so many, 1..1000.
     #[arg(long, default_value_t = 100)]
     limit: u32,
@@ -263,7 +321,8 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             follow(&one.call, &id, String::new(), timeout, out).await
         }
         Verb::Explain(one) => explain(&one, out).await,
-        Verb::Cancel { one, reason, force, if_match, change } => {
+        Verb::Cancel { which, reason, force, if_match, change } => {
+            let Some(one) = which.one() else { return many::cancel(&which, &reason, force, &change, out).await };
             let task_id = one.find().await?;
             let request = v1::CancelTaskRequest {
                 task_id: task_id.clone(),
@@ -280,7 +339,10 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             }
             Ok(())
         }
-        Verb::Resolve { one, resolution, reason, if_match, change } => {
+        Verb::Resolve { which, resolution, reason, if_match, change } => {
+            let Some(one) = which.one() else {
+                return many::resolve(&which, resolution.wire(), &reason, &change, out).await;
+            };
             resolve(one, resolution, reason, if_match, change, out).await
         }
         Verb::Resume(resume) => resume.run(out).await,
@@ -390,11 +452,13 @@ async fn submit(args: Submit, out: &Out) -> Result<(), Exit> {
         timeout_ms: i64::try_from(args.timeout.as_millis()).ok(),
         max_retry_times: Some(args.retries),
         retry_interval_ms: None,
+        schedule_to_start_ms: args.schedule_to_start.and_then(|t| i64::try_from(t.as_millis()).ok()),
     };
     let mut message = request(&transport);
     message.request_id = args.change.request_id.clone();
     message.task_id = args.task_id.clone();
     message.validate_only = args.change.dry_run;
+    robots_are_known(&args, std::iter::once(&message)).await?;
     let task = args.call.task().await?.submit_task(unary(message)).await?.into_inner().task.unwrap_or_default();
     if args.wait && !args.change.dry_run {
         let told = tell(&task.task_id, "", &task, out);
@@ -408,6 +472,41 @@ async fn submit(args: Submit, out: &Out) -> Result<(), Exit> {
         out.next(&format!("midshift task wait {}", task.task_id));
     }
     Ok(())
+}
+
+/// Refuses to send tasks for robots that the server does not know: one task of each robot is checked, and nothing is stored.
+async fn robots_are_known(args: &Submit, tasks: impl IntoIterator<Item = &v1::SubmitTaskRequest>) -> Result<(), Exit> {
+    if args.unknown_robot {
+        return Ok(());
+    }
+    let mut pinned = BTreeMap::new();
+    for task in tasks {
+        let robot = robot_of(task);
+        if !robot.is_empty() {
+            pinned.entry(robot.to_owned()).or_insert(task);
+        }
+    }
+    let mut client = args.call.task().await?;
+    for (robot, task) in pinned {
+        let check = v1::SubmitTaskRequest { validate_only: true, ..task.clone() };
+        let notes = client.submit_task(unary(check)).await?.into_inner().notes;
+        if notes.iter().any(|note| note.code == midshift_core::reason::Code::PinnedRobotUnknown.as_str()) {
+            let text = format!("nobody knows a robot {robot}: it is not enrolled and has never connected");
+            return Err(Exit::new(4, text).or_try("midshift robot ls, or --unknown-robot to submit it all the same"));
+        }
+    }
+    Ok(())
+}
+
+/// The robot that a task names; empty: none.
+fn robot_of(task: &v1::SubmitTaskRequest) -> &str {
+    use v1::submit_task_request::Body;
+    match &task.body {
+        Some(Body::Spec(spec)) => &spec.robot_id,
+        Some(Body::Flat(flat)) => &flat.robot_id,
+        Some(Body::Nested(nested)) => &nested.robot_id,
+        None => "",
+    }
 }
 
 /// Tasks of one call.
@@ -428,6 +527,7 @@ async fn submit_list(args: &Submit, path: &std::path::Path, out: &Out) -> Result
         out.say(&format!("{} tasks read; nothing was sent", list.len()));
         return Ok(());
     }
+    robots_are_known(args, &list).await?;
     let bar = if std::io::stderr().is_terminal() { ProgressBar::new(list.len() as u64) } else { ProgressBar::hidden() };
     if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} submitted") {
         bar.set_style(style);
@@ -473,20 +573,7 @@ async fn submit_list(args: &Submit, path: &std::path::Path, out: &Out) -> Result
 }
 
 async fn list(args: List, out: &Out) -> Result<(), Exit> {
-    let mut states = Vec::new();
-    for text in &args.state {
-        let name = format!("TASK_STATE_{}", text.to_uppercase().replace('-', "_"));
-        let state =
-            v1::TaskState::from_str_name(&name).ok_or_else(|| Exit::usage(format!("there is no task state {text}")))?;
-        states.push(state as i32);
-    }
-    let filter = v1::TaskFilter {
-        states,
-        robot_ids: args.robot,
-        types: args.kind,
-        external_ref: args.external_ref,
-        ..v1::TaskFilter::default()
-    };
+    let filter = args.meant.filter()?;
     let mut request = v1::ListTasksRequest { filter: Some(filter), page_size: args.limit, page_token: args.page_token };
     let mut client = args.call.task().await?;
     let mut page = client.list_tasks(unary(request.clone())).await?.into_inner();

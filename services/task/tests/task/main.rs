@@ -7,6 +7,7 @@ mod forms;
 mod intake;
 mod lists;
 mod lookups;
+mod many;
 mod prune;
 mod reach;
 mod watches;

@@ -33,20 +33,20 @@ impl Told for Heard {
     }
 }
 
-fn asked<T>(by: &Caller, message: T) -> Request<T> {
+pub fn asked<T>(by: &Caller, message: T) -> Request<T> {
     let mut request = Request::new(message);
     request.extensions_mut().insert(by.clone());
     request
 }
 
 /// Anna, with these rights.
-fn anna(grants: &[&str]) -> Caller {
+pub fn anna(grants: &[&str]) -> Caller {
     let grants = grants.iter().map(|grant| grant.parse().expect("a grant")).collect();
     Caller::holder(TokenId::new("t1").expect("an id"), "anna".into(), grants, false)
 }
 
 /// A drive to one waypoint.
-fn drive(request_id: &str, to: &str, depends_on: &[&str]) -> SubmitTaskRequest {
+pub fn drive(request_id: &str, to: &str, depends_on: &[&str]) -> SubmitTaskRequest {
     let mut request = patrol(request_id, depends_on);
     if let Some(Body::Spec(spec)) = &mut request.body {
         spec.steps[0].kind = Some(v1::step::Kind::Goto(v1::Goto { waypoint: to.into() }));

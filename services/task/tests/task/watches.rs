@@ -235,3 +235,24 @@ async fn a_task_that_leaves_the_filter_is_told_once_more_and_then_no_longer() {
     life(&world, "r2").await;
     assert_eq!(watch.changed().await.state(), TaskState::Running, "the end of the first is not told");
 }
+
+#[tokio::test(start_paused = true)]
+async fn tasks_that_two_services_numbered_alike_are_told_each_for_itself() {
+    let world = World::new().await;
+    let other = World::over(world.store.clone(), world.site.clone()).await;
+    let first = submit(&world.service, transport("r1", "B03")).await.expect("admitted").task_id;
+    let second = submit(&other.service, transport("r2", "B03")).await.expect("admitted").task_id;
+    assert_eq!(world.state(&first).await.0.number, world.state(&second).await.0.number, "both began to count at once");
+    let queued = v1::TaskFilter { states: vec![TaskState::Queued as i32], ..v1::TaskFilter::default() };
+    let mut watches = [world.watch(Some(queued.clone()), "").await, other.watch(Some(queued), "").await];
+    for watch in &mut watches {
+        watch.bookmark().await;
+    }
+    world.runs(&first, 1).await;
+    world.runs(&second, 1).await;
+    submit(&world.service, transport("r3", "B03")).await.expect("admitted");
+    for watch in &mut watches {
+        let told = [watch.changed().await.task_id, watch.changed().await.task_id];
+        assert_eq!(told, [first.clone(), second.clone()], "each is told as it leaves the filter");
+    }
+}

@@ -281,6 +281,11 @@ impl World {
         self.commit(item).await;
     }
 
+    /// What is submitted next comes from a process that began to count its admissions at `number`.
+    pub fn number_from(&mut self, number: u64) {
+        self.submitted = number - 1;
+    }
+
     /// A request as the task service stores it.
     pub async fn ask(&mut self, ask: Ask) {
         self.asked += 1;
