@@ -40,6 +40,18 @@ pub const AGENT_TIMEOUT_EARLIER_PERMILLE: u64 = 50;
 pub const BREAKER_FAILURES: usize = 3;
 /// ... within this time take the robot out of dispatch until a person says so.
 pub const BREAKER_WINDOW: SiteDuration = SiteDuration::from_secs(600);
+/// After an offer that it heard and did not answer a robot gets none for this long; it doubles with each in a row ...
+pub const UNANSWERED_PAUSE: LinkDuration = LinkDuration::from_secs(2);
+/// ... up to this.
+pub const UNANSWERED_PAUSE_MAX: LinkDuration = LinkDuration::from_secs(60);
+/// More robots than this that miss an offer ...
+pub const UNANSWERED_ROBOTS_MAX: usize = 3;
+/// ... or two and more that are a larger part of all robots, permille ...
+pub const UNANSWERED_PERMILLE_MAX: usize = 200;
+/// ... within this time are not to blame: the server or its network is.
+pub const UNANSWERED_AT_ONCE: LinkDuration = LinkDuration::from_secs(10);
+/// A robot that was told of no work and still lists an attempt that the server does not know of after this is a person's matter.
+pub const ATTEMPT_UNKNOWN_AFTER: LinkDuration = LinkDuration::from_secs(60);
 /// After an errand that a robot refused, failed or dropped it gets no other for this long.
 pub const ERRAND_PAUSE: LinkDuration = LinkDuration::from_secs(5);
 /// Refusals in a row before a person is asked: NO_ROBOT_ACCEPTS.
@@ -141,6 +153,26 @@ pub const ROLLOUTS_MAX: usize = 1_000;
 pub const INCIDENTS_MAX: usize = 10_000;
 /// Rows one item may touch, and facts it may state.
 pub const ITEM_ROWS_MAX: usize = 256;
+/// Attempts, places, stops and resumes that a robot lists in one heartbeat, of each: as many as one item may touch rows.
+pub const REPORTED_LIST_MAX: usize = 256;
+/// Hold tokens that one item changes: each costs up to 2 rows.
+pub const HOLDS_PER_ITEM: usize = 64;
+/// Hold tokens of one robot: every stop of the site, and as many that only the robot knows. One that is held by so many needs no more.
+pub const HOLDS_OF_ROBOT_MAX: usize = 2 * STOPS_MAX + STOPS_FOR_FLEET;
+/// Places that one item changes when rows are brought to what a robot reports.
+pub const PLACES_PER_ITEM: usize = 64;
+/// Places without a grant of ours that a robot is believed to be inside of: more than any body reaches into at once.
+pub const CLAIMED_PLACES_MAX: usize = 8;
+/// Of these come first whose region, and so many millimetres around it, holds the robot's pose: the longest body and the error of its pose.
+pub const CLAIMED_PLACE_MARGIN_MM: i32 = 3_000;
+/// After a restore the store does not know what it gave since the backup: for so long nothing unknown is held against a robot.
+pub const RESTORED_LATELY: SiteDuration = SiteDuration::from_secs(600);
+/// Places that one robot holds: its end takes them all back in one item, beside its timers and counters.
+pub const PLACES_OF_ROBOT_MAX: usize = 128;
+/// A decision that the store refused for good so often is put aside: the second refusal shows that trying again does not help.
+pub const REFUSALS_UNTIL_ASIDE: u32 = 2;
+/// Refused decisions that are remembered; of more the one that sorts first is forgotten.
+pub const REFUSED_REMEMBERED: usize = 1_024;
 /// Samples in one uplink message.
 pub const SAMPLES_PER_MESSAGE: usize = 256;
 /// CRITICAL and EVENT samples a robot may send a second before it summarises.

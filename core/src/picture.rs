@@ -24,7 +24,7 @@ pub struct Rowed<R> {
 pub type Slot<R> = BTreeMap<String, Rowed<R>>;
 
 /// What one service knows of the rows.
-pub trait Picture {
+pub trait Picture: 'static {
     /// Who decides on it.
     const WRITER: Writer;
 }
@@ -77,6 +77,37 @@ pub fn written<R: Record>(item: &Item) -> Option<R> {
     serde_json::from_str(body).ok()
 }
 
+/// What a decision was to change: its kind, and its rows but for marks, clocks and incidents, which are others each time.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Outline {
+    /// What happens to its first row.
+    pub kind: &'static str,
+    /// Its rows, in order.
+    pub keys: Vec<Key>,
+}
+
+impl Outline {
+    /// That of an item.
+    pub fn of(item: &Item) -> Self {
+        let is_fixed = |key: &&Key| !matches!(key.table, Table::FleetMark | Table::ServiceClock | Table::Incident);
+        let mut keys: Vec<Key> = item.rows.iter().map(|row| &row.key).filter(is_fixed).cloned().collect();
+        keys.sort();
+        Self { kind: item.rows.first().map_or("", |row| row.kind), keys }
+    }
+}
+
+/// Puts a row of a picture back to what it was.
+fn put_back<P: Picture, R: Viewed<P>>(picture: &mut P, id: &str, old: Option<Rowed<R>>) {
+    let was = match old {
+        Some(old) => R::slot(picture).insert(id.to_owned(), old),
+        None => R::slot(picture).remove(id),
+    };
+    R::changed(picture, id, was.as_ref().map(|r| &r.row));
+}
+
+/// Brings one row of a picture back to what it was.
+type Undo<P> = Box<dyn FnOnce(&mut P) + Send>;
+
 /// A decision under way.
 pub struct Tx<'a, P: Picture> {
     /// The picture it is made on.
@@ -85,12 +116,14 @@ pub struct Tx<'a, P: Picture> {
     pub now: Now,
     item: Item,
     at: BTreeMap<Key, usize>,
+    /// What brings the picture back to before it, newest last.
+    undo: Vec<Undo<P>>,
 }
 
 impl<'a, P: Picture> Tx<'a, P> {
     /// Begins a decision on behalf of `actor`.
     pub fn new(view: &'a mut P, now: Now, actor: &str) -> Self {
-        Self { view, now, item: Item::new(P::WRITER, actor), at: BTreeMap::new() }
+        Self { view, now, item: Item::new(P::WRITER, actor), at: BTreeMap::new(), undo: Vec::new() }
     }
     /// Notes the request behind it.
     pub fn on_request(mut self, request_id: Option<&str>) -> Self {
@@ -112,6 +145,7 @@ impl<'a, P: Picture> Tx<'a, P> {
         };
         let old = R::slot(self.view).insert(key.id.to_string(), Rowed { revision, row: record });
         R::changed(self.view, &key.id, old.as_ref().map(|r| &r.row));
+        self.undo.push(Box::new(move |view| put_back::<P, R>(view, &key.id, old)));
     }
     /// Guards a row that is only relied upon: if somebody else changes it first, this decision is not made.
     pub fn rely<R: Viewed<P>>(&mut self, id: &str) {
@@ -141,6 +175,8 @@ impl<'a, P: Picture> Tx<'a, P> {
         let Some(old) = R::slot(self.view).remove(id) else { return };
         self.note(Key::new(R::TABLE, id), old.revision, Write::Delete, kind);
         R::changed(self.view, id, Some(&old.row));
+        let id = id.to_owned();
+        self.undo.push(Box::new(move |view| put_back::<P, R>(view, &id, Some(old))));
     }
     /// Writes `write`, and says what the row is expected to be before this decision.
     fn note(&mut self, key: Key, known: Revision, write: Write, kind: &'static str) -> Expect {
@@ -157,6 +193,21 @@ impl<'a, P: Picture> Tx<'a, P> {
         self.at.insert(key.clone(), self.item.rows.len());
         self.item.rows.push(RowChange { key, expect, write, kind });
         expect
+    }
+    /// What it is about.
+    pub fn outline(&self) -> Outline {
+        Outline::of(&self.item)
+    }
+    /// Whether it is larger than any store takes.
+    pub fn is_too_large(&self) -> bool {
+        self.item.is_too_large()
+    }
+    /// Gives the decision up: the rows of the picture are as they were before it.
+    pub fn take_back(self) -> &'a mut P {
+        for undo in self.undo.into_iter().rev() {
+            undo(self.view);
+        }
+        self.view
     }
     /// The item, if the decision changed anything. Attempts stand before all else in it: whoever follows the feed knows the attempt
     /// when the change of its task comes.

@@ -147,6 +147,17 @@ codes! {
     BatteryLow = "BATTERY_LOW", "The charge does not reach pickup, drop and a charger with its reserve.";
     NoRoute = "NO_ROUTE", "No lane leads there.";
     EntryPassedOver = "ENTRY_PASSED_OVER", "An entry of the log could not be obeyed and was passed over; the server's log has the details.";
+    DecisionPutAside = "DECISION_PUT_ASIDE", "The store refused the same decision twice, so it is not tried again and the robot or place it is about gets no work and no grant. The server's log has the details; close the incident to try once more.";
+    ReportTooLong = "REPORT_TOO_LONG", "A list of the robot's heartbeat is longer than one may be. It is not processed, so the robot loses its authority; its maker must mend it.";
+    ReportImplausible = "REPORT_IMPLAUSIBLE", "The robot reported a step or an end that cannot be. It frees nothing and moves nothing forward; the robot gets no work while it says so. Look at the robot's software.";
+    RobotDoesNotAnswer = "ROBOT_DOES_NOT_ANSWER", "The robot heard three offers within ten minutes and answered none. It gets one offer after ten minutes; its answer ends this. Look at its software.";
+    OffersNotAnswered = "OFFERS_NOT_ANSWERED", "Many robots did not answer offers at the same time, so none of them is blamed. Look at the server and its network.";
+    AttemptUnknown = "ATTEMPT_UNKNOWN", "The robot has an attempt that this server does not know, and does not let it go. Look at the robot; once it stands still, `midshift robot disown ROBOT ATTEMPT` lets the server ignore it.";
+    PlacesImplausible = "PLACES_IMPLAUSIBLE", "The robot says that it is inside of more places without a grant than it can be. It keeps what it held, frees nothing and gets no work and no grant until it says less. Look where it is.";
+    ExclusionBroken = "EXCLUSION_BROKEN", "Two robots say that they are inside of one place that has room for one. Nobody else is let in. Look at both, move one, or clear the place.";
+    GrantUnknown = "GRANT_UNKNOWN", "The robot entered a place on a grant that this server did not give. Look at the robot's software, or for a second server.";
+    WorkUnreadable = "WORK_UNREADABLE", "The robot cannot read the work that it was sent and acts as if its authority had ended. Its software is too old for this server, or the other way round.";
+    AssignmentUnlawful = "ASSIGNMENT_UNLAWFUL", "The record of the task names a step that it does not have, so the robot was not sent it. A person must resolve the task.";
     RouteTooLong = "ROUTE_TOO_LONG", "The way through all goals of the task has more points than a robot takes. Split the task.";
     PlaceBlocked = "PLACE_BLOCKED", "A place on the way is quarantined. A person must look and clear it.";
     ExcludedAfterFailure = "EXCLUDED_AFTER_FAILURE", "The robot failed this task and the task asks for another.";

@@ -7,6 +7,7 @@
 
 use crate::audit::Note;
 use crate::ids::RobotId;
+use crate::limits;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -432,6 +433,21 @@ impl Item {
     pub fn audit(&mut self, note: Note) -> &mut Self {
         self.note = Some(Box::new(note));
         self
+    }
+    /// Bytes that count against [`limits::GROUP_COMMIT_BYTES`]: row bodies, facts, ids.
+    pub fn bytes(&self) -> usize {
+        let rows = self.rows.iter().map(|r| {
+            let body = if let Write::Put { body, .. } = &r.write { body.len() } else { 0 };
+            body + r.key.id.len()
+        });
+        let facts = self.facts.iter().map(|f| f.body.len() + f.subject.len());
+        rows.chain(facts).sum::<usize>() + self.note.as_ref().map_or(0, |note| note.bytes())
+    }
+    /// Whether it is larger than any store takes.
+    pub fn is_too_large(&self) -> bool {
+        self.rows.len() > limits::ITEM_ROWS_MAX
+            || self.facts.len() > limits::ITEM_ROWS_MAX
+            || self.bytes() > limits::GROUP_COMMIT_BYTES
     }
     /// Whether it would change anything.
     pub fn is_empty(&self) -> bool {

@@ -78,6 +78,15 @@ pub struct Assignment {
     pub speed_limit_mm_s: Option<u32>,
 }
 
+impl Assignment {
+    /// Whether its numbers lie within its steps and its route, in order: what a robot can read.
+    pub fn is_lawful(&self) -> bool {
+        let (steps, points) = (self.steps.len() as u64, self.route.len() as u64);
+        let lies = self.from_step <= self.resume_step && u64::from(self.resume_step) <= steps;
+        steps > 0 && lies && self.released_index.is_none_or(|at| u64::from(at) < points)
+    }
+}
+
 /// One step as the robot does it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct WorkStep {
@@ -237,6 +246,9 @@ pub enum PlaceNews {
     NotEntered,
 }
 
+/// What a robot says that it refused when it cannot read section work: it acts as if its authority had ended.
+pub const UNREADABLE_WORK: &str = "work";
+
 /// One fact from a robot, lanes CRITICAL and EVENT.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -267,7 +279,7 @@ pub enum RobotEvent {
     Load(Option<Load>),
     /// It refused a message for its authority.
     StaleAuthority {
-        /// What was refused: `offer`, `grant`, `resume`.
+        /// What was refused: `offer`, `grant`, `resume`, or [`UNREADABLE_WORK`].
         what: String,
         /// Why, for a person.
         detail: String,

@@ -199,6 +199,8 @@ pub struct Downlink {
     pub acks: Vec<LaneAck>,
     /// None: unchanged.
     pub work: Option<DesiredWork>,
+    /// A section work that cannot be read, and why; none: there is none. Never sent.
+    pub unreadable_work: Option<String>,
     /// None: unchanged.
     pub policy: Option<DesiredPolicy>,
     /// None: unchanged.

@@ -135,6 +135,8 @@ pub struct AgentCore {
     pub(crate) places: Places,
     pub(crate) work: Option<Work>,
     pub(crate) desired: Option<DesiredWork>,
+    /// The newest section work cannot be read: it acts as if its authority had ended.
+    pub(crate) work_unreadable: bool,
     pub(crate) sent: SentHeartbeats,
     pub(crate) mode: Mode,
     pub(crate) hardware_stop: HardwareStop,
@@ -197,6 +199,7 @@ impl AgentCore {
             places,
             throttle,
             desired: None,
+            work_unreadable: false,
             sent: SentHeartbeats::new(0, None),
             heading: None,
             echo_after: None,
@@ -439,6 +442,9 @@ impl AgentCore {
         }
         if let Some(update) = down.update {
             self.on_update(update);
+        }
+        if let Some(why) = down.unreadable_work {
+            self.cannot_read_work(&why);
         }
         if let Some(work) = down.work {
             self.on_work(now, work);

@@ -11,11 +11,16 @@ use midshift_core::ids::DrainId;
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{Lane, Mode, StopLevel};
 use midshift_core::time::Now;
-use midshift_core::work::{Assignment, AttemptReport, DesiredWork, RobotEvent, StepKind, WorkState, WorkStats};
+use midshift_core::work::{
+    Assignment, AttemptReport, DesiredWork, RobotEvent, StepKind, UNREADABLE_WORK, WorkState, WorkStats,
+};
 use std::sync::Arc;
 
 /// Refused attempts remembered beside the ledger, so that a repeat of the same desired state is not answered twice.
 const REFUSED_REMEMBERED: usize = 32;
+
+/// Characters of what is wrong with a section that are told.
+const UNREADABLE_DETAIL_CHARS: usize = 200;
 
 impl AgentCore {
     /// Obeys section work.
@@ -26,6 +31,7 @@ impl AgentCore {
             return;
         }
         applied.work = desired.generation;
+        self.work_unreadable = false;
         self.write(Op::Applied(applied), false);
         for attempt in &desired.closed {
             if self.kept.ledger.unclosed.contains_key(attempt) {
@@ -41,6 +47,15 @@ impl AgentCore {
         self.obey(now);
         self.mind_hold(now, is_held, resume);
         self.on_assignment(now, assignment);
+    }
+
+    /// The server sent work that this program cannot read: until it sends some that it can, the robot goes no further than without authority.
+    pub(crate) fn cannot_read_work(&mut self, why: &str) {
+        if !std::mem::replace(&mut self.work_unreadable, true) {
+            tracing::error!(robot_id = %self.config.robot_id, "section work cannot be read; going on as if authority had ended");
+            let detail = why.chars().take(UNREADABLE_DETAIL_CHARS).collect();
+            self.emit(Lane::Event, RobotEvent::StaleAuthority { what: UNREADABLE_WORK.to_owned(), detail });
+        }
     }
 
     /// A permission to go on counts while nothing stops the robot; it is looked at again when the stop is over.

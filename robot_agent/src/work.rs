@@ -153,7 +153,10 @@ impl AgentCore {
 
     fn has_lease(&self, now: &Now) -> bool {
         let echoed = self.echo_after.is_none_or(|after| self.sent.lease_from().is_some_and(|from| from >= after));
-        echoed && !self.is_observed() && self.lease_until().is_some_and(|until| now.link <= until)
+        echoed
+            && !self.work_unreadable
+            && !self.is_observed()
+            && self.lease_until().is_some_and(|until| now.link <= until)
     }
 
     pub(crate) fn wake_at(&mut self, link: LinkTime) {

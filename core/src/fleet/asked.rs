@@ -1,6 +1,6 @@
 //! What people ask of fleet directly, as it is kept with its request_id. What comes of it is in `commands`.
 
-use crate::ids::{PlaceId, RobotId};
+use crate::ids::{AttemptId, PlaceId, RobotId};
 use crate::once::Asked;
 use crate::policy::AreaPolicy;
 use crate::rows::Table;
@@ -27,6 +27,15 @@ pub enum Command {
         /// Whom.
         robot_id: RobotId,
         /// Why.
+        reason: String,
+    },
+    /// Ignores an attempt that the robot lists and no row knows. Frees no place and no load.
+    Disown {
+        /// Whose.
+        robot_id: RobotId,
+        /// Which.
+        attempt: AttemptId,
+        /// What the person saw.
         reason: String,
     },
     /// Out of work for maintenance: what it does ends or waits, then it parks.

@@ -6,7 +6,8 @@ use super::rows::{Cordon, HolderState, Place, PlaceHolder, RobotControl};
 use super::view::View;
 use super::{Board, drain, heard, incidents};
 use crate::audit::{self, Note};
-use crate::ids::RobotId;
+use crate::ids::{AttemptId, RobotId};
+use crate::limits;
 use crate::reason::{Code, Kind, Reason, Refusal, Violations};
 use crate::robot::Presence;
 use crate::rows::{Item, Record, Revision, Writer};
@@ -23,6 +24,7 @@ pub fn check(
         Command::Cordon { robot_id, .. }
         | Command::Uncordon { robot_id }
         | Command::Retire { robot_id, .. }
+        | Command::Disown { robot_id, .. }
         | Command::Drain { robot_id, .. }
         | Command::Undrain { robot_id } => {
             if !view.sessions.contains_key(robot_id.as_str()) {
@@ -31,6 +33,9 @@ pub fn check(
             if let (Command::Drain { .. }, Some(open)) = (command, view.drain_of(robot_id)) {
                 let reason = Reason::from(Code::RobotDraining).with("drain_id", &open.drain_id);
                 return Err(Refusal::new(Kind::Precondition, reason));
+            }
+            if let Command::Disown { attempt, .. } = command {
+                may_disown(view, board, now, robot_id, attempt)?;
             }
             view.control.get(robot_id.as_str()).map_or(Revision(0), |c| c.revision)
         }
@@ -78,6 +83,33 @@ pub fn check(
     }
 }
 
+/// An attempt is ignored only while its robot is heard, stands still, lists it as its own, and no row knows it: not right after a restore.
+fn may_disown(
+    view: &View,
+    board: &Board,
+    now: &crate::time::Now,
+    robot_id: &RobotId,
+    attempt: &AttemptId,
+) -> Result<(), Refusal> {
+    let no = |what: &str| {
+        let reason = Reason::new(Code::NotAllowedNow, what).with("robot_id", robot_id).with("attempt", attempt);
+        Err(Refusal::new(Kind::Precondition, reason))
+    };
+    let Some(live) = board.get(robot_id).filter(|_| heard::presence(board, robot_id, now) == Presence::Online) else {
+        return no("the robot is not heard");
+    };
+    let lists = live.report.attempts.iter().any(|r| r.attempt == *attempt && !r.state.is_over());
+    match () {
+        () if !lists => no("the robot does not list this attempt as its own"),
+        () if view.held_by(robot_id) == Some(attempt) => no("the server knows this attempt: cancel its task"),
+        () if live.report.vitals.speed_mm_s != 0 => no("the robot moves: stop it first"),
+        () if super::claims::is_restored_lately(view, now) => {
+            no("the store was restored a moment ago: robots are still heard out")
+        }
+        () => Ok(()),
+    }
+}
+
 /// What a command leaves in the audit.
 pub fn note(view: &View, command: &Command) -> Note {
     let of_robot = |action, robot_id: &RobotId| Note::new(action).about("robot", robot_id);
@@ -85,6 +117,9 @@ pub fn note(view: &View, command: &Command) -> Note {
         Command::Cordon { robot_id, reason } => of_robot("robot.cordon", robot_id).because(reason),
         Command::Uncordon { robot_id } => of_robot("robot.uncordon", robot_id),
         Command::Retire { robot_id, reason } => of_robot("robot.retire", robot_id).because(reason),
+        Command::Disown { robot_id, attempt, reason } => {
+            of_robot("robot.disown", robot_id).because(reason).with("attempt", attempt.to_string())
+        }
         Command::Drain { robot_id, reason, within_ms } => {
             of_robot("robot.drain", robot_id).because(reason).with("within_ms", within_ms)
         }
@@ -127,12 +162,23 @@ pub fn apply(tx: &mut Tx, command: &Command, actor: &str) {
             control.retired = None;
             control.breaker = None;
             control.failures.clear();
+            control.unanswered_since = None;
+            control.unanswered.clear();
             tx.put(control, "robot.uncordoned");
         }
         Command::Retire { robot_id, reason } => {
             let mut control = control(tx, robot_id);
             control.retired = Some(Cordon { reason: reason.clone(), actor: actor.to_owned(), since: tx.now.utc });
             tx.put(control, "robot.retired");
+        }
+        Command::Disown { robot_id, attempt, .. } => {
+            let mut control = control(tx, robot_id);
+            if !control.disowned.contains(attempt) && control.disowned.len() < limits::REPORTED_LIST_MAX {
+                control.disowned.push(attempt.clone());
+            }
+            tx.put(control, "robot.disowned");
+            tx.view.unknown.remove(robot_id);
+            incidents::close_about(tx, Code::AttemptUnknown, robot_id, "the attempt was disowned");
         }
         Command::Drain { robot_id, reason, within_ms } => drain::ask(tx, robot_id, reason, actor, *within_ms),
         Command::Undrain { robot_id } => drain::release(tx, robot_id),
@@ -142,7 +188,10 @@ pub fn apply(tx: &mut Tx, command: &Command, actor: &str) {
         Command::ClearPlace { place_id, reason } => {
             tx.tell(place_id.as_str(), "place.judged_clear", &serde_json::json!({"actor": actor, "reason": reason}));
             let Some(place) = tx.view.places.get(place_id.as_str()).map(|p| p.row.clone()) else { return };
-            tx.put(Place { holders: Vec::new(), quarantine: None, ..place }, "place.cleared");
+            let mut cleared = place.cleared.clone();
+            cleared.extend(place.holders.iter().map(|holder| holder.grant_id).filter(|id| *id != 0));
+            cleared.drain(..cleared.len().saturating_sub(limits::CLAIMED_PLACES_MAX));
+            tx.put(Place { holders: Vec::new(), quarantine: None, cleared, ..place }, "place.cleared");
         }
         Command::CloseIncident { incident_id, reason } => incidents::close(tx, incident_id, reason, actor),
     }

@@ -42,10 +42,12 @@ pub fn compose(tx: &mut Tx, robot_id: &RobotId, board: &Board, releases: &Releas
     let is_held = is_held(tx.view, robot_id);
     // A robot is let go only with a permission to move, and that needs a heartbeat to be anchored to.
     let resume = resume(tx.view, robot_id, &old, is_held, board);
+    let given = live_attempt.as_ref().and_then(|a| assign(tx.view, a, old.assignment.as_ref(), live, releases));
+    let unlawful = given.as_ref().filter(|given| !given.is_lawful()).map(|given| given.attempt.clone());
     let new = DesiredWork {
         robot_id: robot_id.clone(),
         generation: old.generation,
-        assignment: live_attempt.as_ref().and_then(|a| assign(tx.view, a, old.assignment.as_ref(), live, releases)),
+        assignment: given.filter(Assignment::is_lawful),
         grants: grants(tx.view, robot_id, &old, board),
         held: is_held || (old.held && resume.is_none()),
         resume,
@@ -56,6 +58,10 @@ pub fn compose(tx: &mut Tx, robot_id: &RobotId, board: &Board, releases: &Releas
         },
         resumed: tx.view.control.get(robot_id.as_str()).map(|c| c.row.resumed.clone()).unwrap_or_default(),
     };
+    if let Some(attempt) = unlawful {
+        let reason = crate::reason::Reason::from(crate::reason::Code::AssignmentUnlawful).with("attempt", attempt);
+        super::incidents::open_about(tx, reason, Some(robot_id), "attempt");
+    }
     let behind = session.applied_work > old.generation;
     if stands.is_some() && new == old && !behind {
         return;

@@ -3,14 +3,16 @@
 //! Invariant: a report counts only for the newest epoch of its task; older ones are fenced and counted, never obeyed.
 
 use super::Tx;
-use super::rows::{HoldToken, HolderState, PlaceHolder, RobotControl};
+use super::rows::{HoldToken, HolderState, RobotControl};
 use super::tasks::{News, event_of, happen};
-use super::{Tally, errands, tasks};
+use super::{Tally, answers, claims, errands, incidents, plausible, tasks};
 use crate::ids::{PlaceId, RobotId};
 use crate::reason::{Code, Reason};
-use crate::robot::{HardwareStop, Mode};
+use crate::robot::{HardwareStop, Load, Mode};
 use crate::task::{AttemptPhase, Event};
-use crate::work::{AttemptReport, InboxEntry, InboxItem, PlaceNews, RobotEvent, SampleBody};
+use crate::work::{
+    AttemptReport, InboxEntry, InboxItem, PlaceNews, RobotEvent, SampleBody, UNREADABLE_WORK, WorkState,
+};
 
 /// Obeys one entry of the robot inbox.
 pub fn take(tx: &mut Tx, entry: &InboxEntry, tally: &mut Tally) {
@@ -22,18 +24,29 @@ pub fn take(tx: &mut Tx, entry: &InboxEntry, tally: &mut Tally) {
         RobotEvent::Place { place_id, grant_id, news } => place(tx, robot_id, place_id, *grant_id, *news),
         RobotEvent::Mode(mode) => mode_changed(tx, robot_id, *mode),
         RobotEvent::HardwareStop(stop) => hardware_stop(tx, robot_id, *stop),
+        RobotEvent::StaleAuthority { what, .. } if what == UNREADABLE_WORK => {
+            incidents::open_about(tx, Code::WorkUnreadable.into(), Some(robot_id), "");
+        }
         RobotEvent::StaleAuthority { .. } => tally.stale_authority += 1,
+        RobotEvent::Load(Some(load)) => carries(tx, robot_id, load),
         // The rollout service reads these itself.
         RobotEvent::Update(_) => {}
         // Its heartbeat says the same, and holds come of that.
         RobotEvent::FleetStop { .. } => {}
-        RobotEvent::Fault { .. } | RobotEvent::Load(_) | RobotEvent::BatteryCritical { .. } => {}
+        RobotEvent::Fault { .. } | RobotEvent::Load(None) | RobotEvent::BatteryCritical { .. } => {}
     }
 }
 
 /// Obeys news of an attempt, from the inbox or from an inventory.
 pub fn attempt(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, tally: &mut Tally) {
     let id = &report.attempt;
+    let is_offer = tx.view.attempt(id).is_some_and(|a| a.accepted.is_none() && a.robot_id == *robot_id);
+    if is_offer && report.state != WorkState::Aborted {
+        answers::answered(tx, robot_id);
+    }
+    if let Some(why) = plausible::judge(tx.view, id, robot_id, report.state, report.step_index) {
+        return plausible::doubt(tx, robot_id, id, &why);
+    }
     let Some(task_id) = id.subject.task_id() else {
         errands::report(tx, robot_id, report);
         return;
@@ -48,6 +61,19 @@ pub fn attempt(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, tally: &
     }
     if report.state.is_over() {
         release(tx, robot_id, report);
+    }
+}
+
+/// The robot says that it carries something: an item of the task it works on opens that task, whatever else it says.
+pub fn carries(tx: &mut Tx, robot_id: &RobotId, load: &Load) {
+    let task = load.task_id.as_ref().and_then(|id| tx.view.task(id)).filter(|t| t.opened.is_none());
+    let attempt = task.and_then(|t| t.attempt_id()).filter(|id| tx.view.held_by(robot_id) == Some(id));
+    let Some((mut task, id)) = task.cloned().zip(attempt) else { return };
+    task.opened = Some(robot_id.clone());
+    tx.put(task, "task.opened");
+    if let Some(mut a) = tx.view.attempt(&id).cloned() {
+        a.opened = true;
+        tx.put(a, "attempt.changed");
     }
 }
 
@@ -70,7 +96,8 @@ pub fn place(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: u64,
     let Some(mut place) = tx.view.places.get(place_id.as_str()).map(|p| p.row.clone()) else { return };
     let Some(at) = place.holders.iter().position(|h| h.robot_id == *robot_id && h.grant_id == grant_id) else {
         if news == PlaceNews::Entered {
-            adopt(tx, robot_id, place_id.as_str(), grant_id);
+            claims::take_over(tx, robot_id, place_id, grant_id);
+            claims::entered(tx, robot_id, place_id);
         }
         return;
     };
@@ -92,21 +119,9 @@ pub fn place(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: u64,
         }
     };
     tx.put(place, kind);
-}
-
-/// A robot is where the rows do not know of it: its word is taken, whatever the capacity, before the place is given to another one.
-pub fn adopt(tx: &mut Tx, robot_id: &RobotId, place_id: &str, grant_id: u64) {
-    let Some(mut place) = tx.view.places.get(place_id).map(|p| p.row.clone()) else { return };
-    if place.holder(robot_id).is_some() {
-        return;
+    if news == PlaceNews::Entered {
+        claims::entered(tx, robot_id, place_id);
     }
-    place.holders.push(PlaceHolder {
-        robot_id: robot_id.clone(),
-        grant_id,
-        state: HolderState::Inside,
-        since: tx.now.utc,
-    });
-    tx.put(place, "place.adopted");
 }
 
 /// A person took the robot over: what it has becomes UNCERTAIN. Back in automatic mode, its heartbeat says what it still has.

@@ -6,7 +6,7 @@ use super::Tx;
 use super::rows::{Closed, Incident};
 use crate::ids::{RobotId, TaskId};
 use crate::limits;
-use crate::reason::Reason;
+use crate::reason::{Code, Reason};
 
 /// Opens an incident, once per code, subject and moment.
 pub fn open(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, task_id: Option<&TaskId>) {
@@ -35,12 +35,34 @@ pub(super) fn open_as(tx: &mut Tx, id: String, reason: Reason, robot_id: Option<
     tx.put(incident, "incident.opened");
 }
 
-/// Opens one of a machine with a robot's name, unless an open one says of the same start of a machine what this would: it attaches again and again.
-pub fn open_second(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>) {
+/// Opens an incident unless an open one says the same of the robot: what goes on is met again and again.
+pub fn open_once(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>) {
     let same = |i: &Incident| i.closed.is_none() && i.robot_id.as_ref() == robot_id && i.reason == reason;
     if !tx.view.incidents.values().any(|i| same(&i.row)) {
         open(tx, reason, robot_id, None);
     }
+}
+
+/// Opens an incident unless an open one with its code names the same robot and the same `key`; whether it did.
+pub fn open_about(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, key: &str) -> bool {
+    let same = |i: &Incident| {
+        i.closed.is_none()
+            && i.reason.code == reason.code
+            && i.robot_id.as_ref() == robot_id
+            && i.reason.metadata.get(key) == reason.metadata.get(key)
+    };
+    let is_new = !tx.view.incidents.values().any(|i| same(&i.row));
+    if is_new {
+        open(tx, reason, robot_id, None);
+    }
+    is_new
+}
+
+/// What an incident was about is over: it closes by itself.
+pub fn close_about(tx: &mut Tx, code: Code, robot_id: &RobotId, reason: &str) {
+    let is_it = |i: &Incident| i.closed.is_none() && i.reason.code == code && i.robot_id.as_ref() == Some(robot_id);
+    let open: Vec<String> = tx.view.incidents.values().filter(|i| is_it(&i.row)).map(|i| i.row.id.clone()).collect();
+    open.iter().for_each(|id| close(tx, id, reason, "fleet"));
 }
 
 /// A person has looked into it.

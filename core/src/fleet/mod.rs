@@ -1,16 +1,18 @@
 //! The law of the fleet: who gets which task, who may enter which place, what a heartbeat repairs, and why not now.
 //!
 //! [`cycle`] takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
-//! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `commands` (`asked`: which there are) are what happens; `tasks` moves tasks by
-//! the table; `heard`, `anchor`, `attempts` and `incidents` are what they share; `queue`, `screen`, `pool` and `assign` give work, in turns cut by `slice`; `stops` and `stopped` keep it from who is stopped; `starts` keeps places for robots that are to come; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
+//! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `plausible`, `claims`, `answers`, `commands` (`asked`: which there are) are what happens; `tasks` moves tasks by
+//! the table; `heard`, `anchor`, `attempts`, `incidents` and `refused` are what they share; `queue`, `screen`, `pool` and `assign` give work, in turns cut by `slice`; `stops` and `stopped` keep it from who is stopped; `starts` keeps places for robots that are to come; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod anchor;
+pub mod answers;
 pub mod asked;
 pub mod assign;
 pub mod attempts;
 pub mod budget;
 pub mod bugs;
+pub mod claims;
 pub mod commands;
 pub mod desired;
 pub mod drain;
@@ -22,8 +24,10 @@ pub mod incidents;
 pub mod load;
 pub mod objects;
 pub mod places;
+pub mod plausible;
 pub mod pool;
 pub mod queue;
+pub mod refused;
 pub mod repair;
 pub mod requests;
 pub mod rows;
@@ -110,13 +114,29 @@ impl Plan {
     pub fn of(slice: Slice) -> Self {
         Self { slice, ..Self::default() }
     }
-    /// Makes one decision; nothing is added if it changed nothing.
-    pub fn decide(&mut self, view: &mut View, now: Now, actor: &str, decision: impl FnOnce(&mut Tx)) {
+    /// Makes one decision; nothing is added if it changed nothing. False: it was given up, since the store would never take it.
+    pub fn decide(&mut self, view: &mut View, now: Now, actor: &str, decision: impl FnOnce(&mut Tx)) -> bool {
         let mut tx = Tx::new(view, now, actor);
         decision(&mut tx);
-        let item = tx.finish();
-        self.slice.decide(usize::from(item.is_some()));
-        self.items.extend(item);
+        self.keep(tx)
+    }
+
+    /// Adds a decision that was made. False: it was given up, since the store would never take it.
+    pub fn keep(&mut self, tx: Tx) -> bool {
+        let is_aside = tx.view.refused.keeps_any() && tx.view.refused.is_aside(&tx.outline());
+        if !is_aside && !tx.is_too_large() {
+            let item = tx.finish();
+            self.slice.decide(usize::from(item.is_some()));
+            self.items.extend(item);
+            return true;
+        }
+        self.slice.decide(1);
+        let outline = tx.outline();
+        let view = tx.take_back();
+        if !is_aside {
+            refused::note(view, outline);
+        }
+        false
     }
     /// Whether a stage goes on in the next turn; then the next turn comes at once.
     fn is_cut(&mut self) -> bool {
@@ -145,31 +165,40 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
             (Log::RobotInbox, None, Some(body)) => match serde_json::from_str::<InboxEntry>(body) {
                 Ok(said) => {
                     let mut tally = plan.report.tally;
-                    plan.decide(view, now, said.robot_id.as_str(), |tx| {
+                    let is_obeyed = plan.decide(view, now, said.robot_id.as_str(), |tx| {
                         inbox::take(tx, &said, &mut tally);
                         mark(tx, entry.seq);
                     });
                     plan.report.tally = tally;
+                    if !is_obeyed {
+                        plan.decide(view, now, "fleet", |tx| pass_over(tx, entry));
+                    }
                 }
                 Err(error) => plan.report.unreadable.push(format!("inbox {}: {error}", entry.seq.0)),
             },
             (Log::Task, Some(Table::TaskRequest), Some(body)) => match serde_json::from_str::<TaskRequest>(body) {
-                Ok(request) => requests::take(view, now, &request, entry, plan),
+                Ok(request) => {
+                    if !requests::take(view, now, &request, entry, plan) {
+                        plan.decide(view, now, "fleet", |tx| pass_over(tx, entry));
+                    }
+                }
                 Err(error) => plan.report.unreadable.push(format!("request {}: {error}", entry.seq.0)),
             },
-            (Log::Telemetry, None, _) if &*entry.kind == CLONE_SEEN => {
+            (Log::Telemetry, None, _) if matches!(&*entry.kind, CLONE_SEEN | REPORT_TOO_LONG) => {
                 plan.decide(view, now, "fleet", |tx| {
                     let robot_id = RobotId::parse(&entry.subject).ok();
-                    incidents::open_second(tx, clone_seen(entry), robot_id.as_ref());
+                    incidents::open_once(tx, told_by_telemetry(entry), robot_id.as_ref());
                     mark(tx, entry.seq);
                 });
             }
             (Log::Ota, None, Some(body)) if &*entry.kind == crate::maintenance::INCIDENT => {
                 match serde_json::from_str::<Reason>(body) {
-                    Ok(reason) => plan.decide(view, now, "ota", |tx| {
-                        incidents::open(tx, reason, RobotId::parse(&entry.subject).ok().as_ref(), None);
-                        mark(tx, entry.seq);
-                    }),
+                    Ok(reason) => {
+                        plan.decide(view, now, "ota", |tx| {
+                            incidents::open(tx, reason, RobotId::parse(&entry.subject).ok().as_ref(), None);
+                            mark(tx, entry.seq);
+                        });
+                    }
                     Err(error) => plan.report.unreadable.push(format!("incident {}: {error}", entry.seq.0)),
                 }
             }
@@ -184,6 +213,7 @@ fn take_row(view: &mut View, entry: &Entry, unreadable: &mut Vec<String>) {
         if let Err(error) = view.absorb(&key, entry.revision, crate::picture::row_of(entry, table).as_ref()) {
             unreadable.push(error.to_string());
         }
+        view.refused.row_changed(&key);
     }
     view.absorbed = view.absorbed.max(entry.seq);
 }
@@ -240,12 +270,16 @@ pub fn obeyed(item: &Item) -> Option<Seq> {
 /// Kind of the fact that a second machine has attached with a robot's name, stated by telemetry.
 pub const CLONE_SEEN: &str = "session.clone_seen";
 
-/// The second machine, as telemetry met it: its start, and the certificate that it showed.
-fn clone_seen(entry: &Entry) -> Reason {
+/// Kind of the fact that a heartbeat had a list longer than one may be and was not processed, stated by telemetry.
+pub const REPORT_TOO_LONG: &str = "session.report_too_long";
+
+/// What telemetry met: the start and certificate of a second machine, or the list that was too long.
+fn told_by_telemetry(entry: &Entry) -> Reason {
     let said: BTreeMap<String, serde_json::Value> =
         entry.body.as_deref().and_then(|body| serde_json::from_str(body).ok()).unwrap_or_default();
-    let known = ["boot_id", "certificate"].into_iter().filter_map(|key| Some((key, said.get(key)?.as_str()?)));
-    known.fold(Code::CloneSeen.into(), |reason: Reason, (key, value)| reason.with(key, value))
+    let code = if &*entry.kind == CLONE_SEEN { Code::CloneSeen } else { Code::ReportTooLong };
+    let known = ["boot_id", "certificate", "list"].into_iter().filter_map(|key| Some((key, said.get(key)?.as_str()?)));
+    known.fold(code.into(), |reason: Reason, (key, value)| reason.with(key, value))
 }
 
 fn mark(tx: &mut Tx, seq: Seq) {
@@ -306,6 +340,7 @@ pub enum Pace {
 /// One cycle over a view that has absorbed the whole feed. Items of earlier decisions of the cycle are already in `plan`. Each stage does as
 /// much as a slice holds, and leaves the rest for the next turn: then the report says `more`.
 pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Plan) {
+    refused::open_incidents(view, now, plan);
     welcome(view, now, board, plan);
     if pace == Pace::Sweep {
         sweep::gather(view, now, board);

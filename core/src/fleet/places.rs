@@ -9,15 +9,16 @@ use super::anchor::next_generation;
 use super::desired::{Release, Releases};
 use super::rows::{HolderState, Place, PlaceHolder};
 use super::view::{View, Waiting};
-use super::{Board, Plan, inbox, starts, way};
+use super::{Board, Plan, plausible, starts, way};
 use crate::ids::{AreaId, PlaceId, RobotId};
+use crate::limits;
 use crate::robot::Presence;
 use crate::site::route::{Segment, segments};
 use crate::site::{AreaIx, Kind, PlaceIx};
 use crate::task::spec::Class;
 use crate::task::{Attempt, AttemptPhase};
 use crate::time::{Now, SiteDuration, SiteTime};
-use crate::work::{Assignment, Live, PlaceNews};
+use crate::work::{Assignment, Live};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// A robot that blocks a place others need steps aside after this long, at once if somebody waits for it.
@@ -40,32 +41,6 @@ pub fn robots_in_area(view: &View, area: &AreaId) -> BTreeSet<RobotId> {
     view.held_places.iter().filter(|(_, ids)| ids.iter().any(|id| inside(id))).map(|(r, _)| r.clone()).collect()
 }
 
-/// Brings place rows to what a settled robot reports: entered, gone, or standing somewhere nobody knew of.
-pub fn repair(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
-    let standing_on = live.report.vitals.waypoint.as_ref().filter(|_| live.report.vitals.speed_mm_s == 0);
-    for id in super::tasks::places_of(tx, robot_id) {
-        let Some(holder) = tx.view.places.get(&id).and_then(|p| p.row.holder(robot_id).cloned()) else { continue };
-        let Ok(place_id) = PlaceId::parse(&id) else { continue };
-        match live.report.places.iter().find(|p| p.place_id == place_id) {
-            None if standing_on.is_none_or(|w| w.as_str() != id) => {
-                inbox::place(tx, robot_id, &place_id, holder.grant_id, PlaceNews::NotEntered);
-            }
-            Some(p) if p.inside && holder.state != HolderState::Inside => {
-                inbox::place(tx, robot_id, &place_id, holder.grant_id, PlaceNews::Entered);
-            }
-            _ => {}
-        }
-    }
-    let mut inside: BTreeMap<&str, u64> =
-        live.report.places.iter().filter(|p| p.inside).map(|p| (p.place_id.as_str(), p.grant_id)).collect();
-    if let Some(waypoint) = standing_on {
-        inside.entry(waypoint.as_str()).or_insert(0);
-    }
-    for (id, grant_id) in inside {
-        inbox::adopt(tx, robot_id, id, grant_id);
-    }
-}
-
 struct Wish {
     /// Nothing of its released stretch is missing, and it bars no passage.
     patient: bool,
@@ -80,7 +55,7 @@ pub fn advance(view: &mut View, board: &Board, now: Now, plan: &mut Plan) -> Rel
     for (robot_id, live) in board {
         let Some(id) = view.held_by(robot_id) else { continue };
         let Some(a) = view.attempt(id) else { continue };
-        if !may_drive(view, a, live, board, &now) {
+        if !may_drive(view, a, live, board, &now) || plausible::keeps_back(view, live).is_err() {
             continue;
         }
         let whole = missing(view, live, a).is_empty();
@@ -272,7 +247,14 @@ fn missing(view: &View, live: &Live, a: &Attempt) -> Vec<PlaceIx> {
 }
 
 fn grantable(view: &View, robot_id: &RobotId, needed: &[PlaceIx], traffic: &Traffic) -> bool {
+    let held = view.held_places.get(robot_id).map_or(0, BTreeSet::len);
+    if held + needed.len() > limits::PLACES_OF_ROBOT_MAX {
+        return false;
+    }
     needed.iter().all(|ix| {
+        if view.refused.is_place_aside(&view.site.place(*ix).place_id) {
+            return false;
+        }
         if !traffic.admits(view, robot_id, view.site.place(*ix)) {
             return false;
         }
@@ -296,6 +278,7 @@ fn grant(tx: &mut Tx, robot_id: &RobotId, needed: &[PlaceIx], traffic: &mut Traf
                 grant_id,
                 state: HolderState::Granted,
                 since: tx.now.utc,
+                claimed: false,
             });
             tx.put(place, "place.granted");
         }
@@ -372,5 +355,6 @@ pub fn fresh(place: &crate::site::Place) -> Place {
         standing: place.waypoint().is_some(),
         holders: Vec::new(),
         quarantine: None,
+        cleared: Vec::new(),
     }
 }

@@ -7,8 +7,9 @@ use super::Tx;
 use super::heard::{is_fresh, is_settled, lease_stands, presence};
 use super::tasks::{News, happen};
 use super::view::View;
-use super::{Board, Tally, errands, inbox, places, tasks};
-use crate::ids::{RobotId, TaskId};
+use super::{Board, Plan, Tally, answers, claims, errands, inbox, incidents, places, plausible, tasks};
+use crate::ids::{AttemptId, RobotId, TaskId};
+use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::robot::{HardwareStop, Mode, Presence};
 use crate::task::{Attempt, AttemptPhase, Event, Phase};
@@ -32,27 +33,50 @@ pub fn is_due(view: &View, robot_id: &RobotId, board: &Board, now: &Now) -> bool
     !online || newest.is_none() || view.compared.get(robot_id) != newest.as_ref()
 }
 
-/// Repairs one robot.
-pub fn robot(tx: &mut Tx, robot_id: &RobotId, board: &Board, tally: &mut Tally) {
-    let now = tx.now;
-    attached(tx.view, robot_id, board, &now);
-    tasks::count_hours(tx, robot_id);
-    if !lease_stands(tx.view, board, robot_id, &tx.now) {
-        lease_over(tx, robot_id, tally);
-        return;
+/// Repairs one robot, in items that each stay below their limits however long the robot's lists are.
+pub fn robot(view: &mut View, now: Now, robot_id: &RobotId, board: &Board, plan: &mut Plan) {
+    attached(view, robot_id, board, &now);
+    let mut tally = plan.report.tally;
+    plan.decide(view, now, "fleet", |tx| {
+        tasks::count_hours(tx, robot_id);
+        if !lease_stands(tx.view, board, robot_id, &now) {
+            return lease_over(tx, robot_id, &mut tally);
+        }
+        if let Some(live) = board.get(robot_id) {
+            live.report.load.iter().for_each(|load| inbox::carries(tx, robot_id, load));
+            stalled(tx, robot_id, live);
+        }
+    });
+    if let Some(live) = board.get(robot_id).filter(|_| lease_stands(view, board, robot_id, &now)) {
+        compare(view, now, live, &mut tally, plan);
     }
-    let Some(live) = board.get(robot_id).cloned() else { return };
-    stalled(tx, robot_id, &live);
-    if !is_settled(tx.view, &live) || !is_fresh(tx.view, &live) {
+    plan.report.tally = tally;
+}
+
+/// Compares the rows with a heartbeat, if its differences count.
+fn compare(view: &mut View, now: Now, live: &Live, tally: &mut Tally, plan: &mut Plan) {
+    if !is_settled(view, live) || !is_fresh(view, live) {
         tally.pending += 1;
         return;
     }
-    tx.view.compared.insert(robot_id.clone(), (live.report.session_epoch, live.report.hb));
-    inbox::hardware_stop(tx, robot_id, live.report.hardware_stop);
-    places::repair(tx, robot_id, &live);
-    attempt(tx, robot_id, &live, tally);
-    recharge(tx, robot_id, &live);
-    forget_reported(tx, robot_id, &live);
+    let robot_id = &live.robot_id;
+    view.compared.insert(robot_id.clone(), (live.report.session_epoch, live.report.hb));
+    let doubt = plausible::doubtful(view, live);
+    let stop = live.report.hardware_stop;
+    if doubt.is_none() || stop != HardwareStop::None {
+        plan.decide(view, now, "fleet", |tx| inbox::hardware_stop(tx, robot_id, stop));
+    }
+    claims::repair(view, now, live, doubt.is_none(), plan);
+    if let Some((id, why)) = doubt {
+        plan.decide(view, now, "fleet", |tx| plausible::doubt(tx, robot_id, &id, &why));
+        return;
+    }
+    plan.decide(view, now, "fleet", |tx| {
+        attempt(tx, robot_id, live, tally);
+        unknown(tx, robot_id, live);
+        recharge(tx, robot_id, live);
+        forget_reported(tx, robot_id, live);
+    });
 }
 
 /// Whether the task may wait for another robot from its next step boundary on: it runs, lets others go first, and is not opened.
@@ -136,6 +160,9 @@ fn attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
     match listed {
         None => {
             tally.repaired += 1;
+            if is_unanswered(tx.view, &a, live) {
+                answers::missed(tx, robot_id);
+            }
             inbox::attempt(tx, robot_id, &report(WorkState::Aborted), tally);
         }
         Some(l) if l.state.is_over() && l.state != WorkState::Failed => {
@@ -149,6 +176,7 @@ fn attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
             happen(tx, task_id, News { event: Event::StepUnknown, why: None, report: Some(&report) });
         }
         Some(l) if needs_sight(&a, live) => {
+            answers::answered(tx, robot_id);
             let Some(task_id) = id.subject.task_id() else { return errands::seen(tx, robot_id) };
             tally.repaired += 1;
             let report = report(l.state);
@@ -156,6 +184,54 @@ fn attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
         }
         Some(_) => {}
     }
+}
+
+/// The robot heard the offer and lists no answer: the offer stands, or was taken back only because nobody answered it.
+fn is_unanswered(view: &View, a: &Attempt, live: &Live) -> bool {
+    let task = a.attempt.subject.task_id().and_then(|id| view.task(id));
+    let ran_out = task.and_then(|t| t.reason.as_ref()).is_some_and(|r| r.code == Code::OfferNotAnswered);
+    let waits = a.phase == AttemptPhase::Offered || (a.phase == AttemptPhase::Stopping && ran_out);
+    let desired = view.desired_work.get(live.robot_id.as_str()).and_then(|d| d.row.assignment.as_ref());
+    let is_sent = desired.is_some_and(|given| given.attempt == a.attempt);
+    is_sent && waits && a.accepted.is_none() && a.offer.session_epoch == live.report.session_epoch
+}
+
+/// An attempt that the robot has and no row knows: it was told of no work; if it does not let go, a person is told.
+fn unknown(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
+    forget_disowned(tx, robot_id, live);
+    let Some(attempt) = unknown_attempt(tx.view, live).cloned() else {
+        tx.view.unknown.remove(robot_id);
+        return;
+    };
+    let since = match tx.view.unknown.get(robot_id) {
+        Some((known, since)) if *known == attempt => *since,
+        _ => tx.now.link,
+    };
+    tx.view.unknown.insert(robot_id.clone(), (attempt.clone(), since));
+    if tx.now.link.since(since) >= limits::ATTEMPT_UNKNOWN_AFTER {
+        let reason = Reason::from(Code::AttemptUnknown).with("attempt", attempt);
+        incidents::open_about(tx, reason, Some(robot_id), "attempt");
+    }
+}
+
+/// The first attempt that a robot lists as its own and that does not hold it; what a person disowned does not count.
+pub fn unknown_attempt<'l>(view: &View, live: &'l Live) -> Option<&'l AttemptId> {
+    let holder = view.held_by(&live.robot_id);
+    let disowned = view.control.get(live.robot_id.as_str()).map(|c| c.row.disowned.as_slice()).unwrap_or_default();
+    let mine = live.report.attempts.iter().filter(|r| !r.state.is_over()).map(|r| &r.attempt);
+    mine.into_iter().find(|id| holder != Some(*id) && !disowned.contains(id))
+}
+
+/// What the robot has let go is known to nobody any more.
+fn forget_disowned(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
+    let Some(control) = tx.view.control.get(robot_id.as_str()).map(|c| &c.row) else { return };
+    let is_listed = |id: &AttemptId| live.report.attempts.iter().any(|r| r.attempt == *id);
+    if control.disowned.iter().all(is_listed) {
+        return;
+    }
+    let mut control = control.clone();
+    control.disowned.retain(is_listed);
+    tx.put(control, "robot.disowned");
 }
 
 /// A robot in automatic mode lists an attempt that the record has as unanswered or UNCERTAIN.

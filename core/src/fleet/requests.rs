@@ -13,18 +13,19 @@ use crate::rows::{Entry, Seq};
 use crate::task::{Ask, Event, Phase, Resolution, TaskRequest};
 use crate::time::Now;
 
-/// Obeys one request. The mark that it was obeyed goes with the last item: what was lost on the way is done again.
-pub fn take(view: &mut View, now: Now, request: &TaskRequest, entry: &Entry, plan: &mut Plan) {
+/// Obeys one request. The mark that it was obeyed goes with the last item: what was lost on the way is done again. False: the store would
+/// never take it.
+pub fn take(view: &mut View, now: Now, request: &TaskRequest, entry: &Entry, plan: &mut Plan) -> bool {
     let resumes = match &request.ask {
         Ask::ResumeHeld { stop_id, area_id, task_ids, robot_ids } => {
             resumes(view, stop_id.as_deref(), area_id.as_ref(), task_ids, robot_ids)
         }
         Ask::Cancel { .. } | Ask::Resolve { .. } => Vec::new(),
     };
-    let mut decide = |decision: &mut dyn FnMut(&mut Tx)| {
+    let mut decide = |decision: &mut dyn FnMut(&mut Tx)| -> bool {
         let mut tx = Tx::new(view, now, &request.actor).on_request(entry.request_id.as_deref());
         decision(&mut tx);
-        plan.items.extend(tx.finish());
+        plan.keep(tx)
     };
     for some in resumes.chunks(limits::RESUMES_PER_ITEM) {
         decide(&mut |tx| {
@@ -41,7 +42,7 @@ pub fn take(view: &mut View, now: Now, request: &TaskRequest, entry: &Entry, pla
             Ask::ResumeHeld { .. } => {}
         }
         mark(tx, entry.seq);
-    });
+    })
 }
 
 fn cancel(tx: &mut Tx, task_id: &TaskId, force: bool, request: &TaskRequest) {

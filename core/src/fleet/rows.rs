@@ -33,6 +33,9 @@ pub struct PlaceHolder {
     pub state: HolderState,
     /// UTC, site clock.
     pub since: Utc,
+    /// Only the robot's word says so: we never granted it.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub claimed: bool,
 }
 
 /// A passage or a standing place: the one row that is fought over.
@@ -48,6 +51,9 @@ pub struct Place {
     pub holders: Vec<PlaceHolder>,
     /// Set: nobody enters until the robot inside reports or a person clears it.
     pub quarantine: Option<Reason>,
+    /// Grants that a person cleared away, the newest last: a robot that still says one of them was not lying.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub cleared: Vec<u64>,
 }
 
 impl Place {
@@ -118,6 +124,15 @@ pub struct RobotControl {
     pub breaker: Option<Utc>,
     /// Failed attempts within the breaker's window, UTC, site clock.
     pub failures: Vec<Utc>,
+    /// Offers that it heard and did not answer within the breaker's window, UTC, site clock.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub unanswered: Vec<Utc>,
+    /// Since when it gets no offers because it answers none, UTC, site clock: the newest that it missed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unanswered_since: Option<Utc>,
+    /// Attempts that no row knows and that a person told the server to ignore, as long as the robot lists them.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub disowned: Vec<AttemptId>,
     /// Errands asked of it so far.
     pub errands: u64,
     /// Tasks given to it so far; breaks ties between equally near robots.
@@ -136,6 +151,9 @@ impl RobotControl {
             retired: None,
             breaker: None,
             failures: Vec::new(),
+            unanswered: Vec::new(),
+            unanswered_since: None,
+            disowned: Vec::new(),
             errands: 0,
             tasks: 0,
             resumed: Vec::new(),

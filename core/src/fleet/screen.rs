@@ -5,7 +5,7 @@
 use super::queue::Wait;
 use super::rows::RobotHolder;
 use super::view::View;
-use super::{Board, Slice, heard, load, way};
+use super::{Board, Slice, claims, heard, load, plausible, way};
 use crate::ids::{RobotId, Subject};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -36,6 +36,10 @@ pub fn robot(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> Resul
     super::stopped::screen(view, robot_id, Some(live))?;
     decided_by_people(view, robot_id, Some(live))?;
     reported(live)?;
+    plausible::keeps_back(view, live)?;
+    if let Some(why) = claims::broken(view, robot_id) {
+        return Err(why);
+    }
     match view.authority.get(robot_id.as_str()).map(|a| &a.row.holder) {
         None | Some(RobotHolder::None) => {}
         Some(RobotHolder::Attempt(id)) => return Err(Reason::from(Code::RobotBusy).with("attempt", id)),
@@ -43,9 +47,16 @@ pub fn robot(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> Resul
     }
     // An older heartbeat knows neither what has ended since nor where the robot stands now.
     let current = session.session_epoch == live.report.session_epoch && heard::is_fresh(view, live);
-    if !current || live.report.attempts.iter().any(|a| !a.state.is_over()) {
+    if let Some(attempt) = super::repair::unknown_attempt(view, live) {
+        let since = view.unknown.get(robot_id).filter(|(known, _)| known == attempt).map(|(_, since)| *since);
+        let is_old = since.is_some_and(|since| now.link.since(since) >= limits::ATTEMPT_UNKNOWN_AFTER);
+        let code = if is_old { Code::AttemptUnknown } else { Code::RobotReconciling };
+        return Err(Reason::from(code).with("attempt", attempt));
+    }
+    if !current {
         return Err(Code::RobotReconciling.into());
     }
+    super::answers::screen(view, robot_id, now)?;
     if way::find(view, live.report.vitals.waypoint.as_ref()).is_none() {
         return Err(Code::RobotUnlocated.into());
     }

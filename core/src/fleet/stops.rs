@@ -60,7 +60,13 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
         }
         let online = heard::presence(board, &robot_id, &now) == Presence::Online;
         let live = board.get(&robot_id).filter(|_| online).cloned();
-        plan.decide(view, now, "stop", |tx| look(tx, &robot_id, live.as_deref()));
+        for _ in 0..=limits::HOLDS_OF_ROBOT_MAX.div_ceil(limits::HOLDS_PER_ITEM) {
+            let mut is_done = true;
+            plan.decide(view, now, "stop", |tx| is_done = look(tx, &robot_id, live.as_deref()));
+            if is_done {
+                break;
+            }
+        }
     }
 }
 
@@ -81,20 +87,29 @@ fn open_incidents(view: &mut View, now: Now, plan: &mut Plan) {
     }
 }
 
-/// Puts one robot's tokens right; `live` only while it is heard.
-fn look(tx: &mut Tx, robot_id: &RobotId, live: Option<&Live>) {
+/// Puts one robot's tokens right, as many as one item takes; `live` only while it is heard. False: there are more.
+fn look(tx: &mut Tx, robot_id: &RobotId, live: Option<&Live>) -> bool {
     let (waits, engaged): (BTreeSet<StopId>, BTreeSet<StopId>) = match live.map(|live| &live.report) {
         Some(r) => (r.awaiting_resume.iter().cloned().collect(), r.stops.iter().cloned().collect()),
         None => Default::default(),
     };
     let mut stopped: BTreeSet<StopId> = over(tx.view, robot_id, live).map(|stop| stop.stop_id.clone()).collect();
-    stopped.extend(waits.intersection(&engaged).cloned());
     let tokens: BTreeMap<StopId, Hold> = tx.view.robot_holds(robot_id).filter_map(|h| Hold::read(&h.token)).collect();
     let control = tx.view.control.get(robot_id.as_str()).map(|c| c.row.clone());
     let control = control.unwrap_or_else(|| RobotControl::new(robot_id.clone()));
     let mut wanted = tokens.clone();
     for stop_id in &stopped {
         wanted.insert(stop_id.clone(), Hold::Stop);
+    }
+    // What only the robot knows of is taken while there is room: one that is held by so many needs no more.
+    let has_room = |wanted: &BTreeMap<StopId, Hold>, id: &StopId| {
+        wanted.contains_key(id) || wanted.len() < limits::HOLDS_OF_ROBOT_MAX
+    };
+    for stop_id in waits.intersection(&engaged) {
+        if has_room(&wanted, stop_id) {
+            wanted.insert(stop_id.clone(), Hold::Stop);
+        }
+        stopped.insert(stop_id.clone());
     }
     for (stop_id, hold) in &tokens {
         // Of a robot that is not heard only the copy tells; what only the robot knew stays.
@@ -104,7 +119,9 @@ fn look(tx: &mut Tx, robot_id: &RobotId, live: Option<&Live>) {
         }
     }
     for stop_id in waits.iter().filter(|id| !control.resumed.contains(id)) {
-        wanted.entry(stop_id.clone()).or_insert(Hold::Resume);
+        if has_room(&wanted, stop_id) {
+            wanted.entry(stop_id.clone()).or_insert(Hold::Resume);
+        }
     }
     // A robot that is heard and waits no more has taken its resume; one that is stopped again needs another.
     let keeps = |id: &StopId| !wanted.contains_key(id) && (live.is_none() || waits.contains(id));
@@ -113,14 +130,14 @@ fn look(tx: &mut Tx, robot_id: &RobotId, live: Option<&Live>) {
         tx.put(RobotControl { resumed, ..control }, "robot.resumed");
         tx.view.dirty.insert(robot_id.clone());
     }
-    if wanted != tokens {
-        write(tx, robot_id, &tokens, &wanted);
-    }
+    wanted == tokens || write(tx, robot_id, &tokens, &wanted)
 }
 
-fn write(tx: &mut Tx, robot_id: &RobotId, tokens: &BTreeMap<StopId, Hold>, wanted: &BTreeMap<StopId, Hold>) {
+/// Writes what differs, as much as one item takes. False: there is more.
+fn write(tx: &mut Tx, robot_id: &RobotId, tokens: &BTreeMap<StopId, Hold>, wanted: &BTreeMap<StopId, Hold>) -> bool {
     let since = tx.now.utc;
-    for (stop_id, hold) in wanted.iter().filter(|(id, hold)| tokens.get(*id) != Some(hold)) {
+    let mut differ = wanted.iter().filter(|(id, hold)| tokens.get(*id) != Some(hold));
+    for (stop_id, hold) in differ.by_ref().take(limits::HOLDS_PER_ITEM) {
         if let Some(old) = tokens.get(stop_id) {
             tx.delete::<HoldToken>(&HoldToken::id_of(robot_id, &old.token(stop_id)), "hold.replaced");
         }
@@ -129,6 +146,7 @@ fn write(tx: &mut Tx, robot_id: &RobotId, tokens: &BTreeMap<StopId, Hold>, wante
     }
     touch(tx, robot_id);
     holds_changed(tx, robot_id);
+    differ.next().is_none()
 }
 
 /// A person took a token away: the robot hears which stop it need not wait for any more.

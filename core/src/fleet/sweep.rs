@@ -41,9 +41,7 @@ pub(super) fn carry_out(view: &mut View, now: Now, board: &Board, plan: &mut Pla
     while let Some(robot_id) = view.agenda.heard.first().filter(|_| !plan.is_cut()).cloned() {
         view.agenda.heard.remove(&robot_id);
         plan.slice.look(1);
-        let mut tally = plan.report.tally;
-        plan.decide(view, now, "fleet", |tx| repair::robot(tx, &robot_id, board, &mut tally));
-        plan.report.tally = tally;
+        repair::robot(view, now, &robot_id, board, plan);
         compared.insert(robot_id);
     }
     plan.slice.renew();

@@ -4,8 +4,8 @@
 //! `task::machine::next`.
 
 use super::Tx;
-use super::incidents;
 use super::rows::{HolderState, RobotAuthority, RobotControl, RobotCounter, RobotHolder, Timer, TimerKind};
+use super::{incidents, plausible};
 use crate::ids::{AttemptId, RobotId, Subject, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -38,6 +38,9 @@ pub fn happen(tx: &mut Tx, task_id: &TaskId, news: News) -> bool {
     let Some(task) = tx.view.task(task_id).cloned() else { return false };
     let Some(intake) = tx.view.intake(task_id).cloned() else { return false };
     let attempt = task.attempt_id().and_then(|id| tx.view.attempt(&id).cloned());
+    let passes = |r: &&AttemptReport| !r.opened && plausible::passes_irreversible(&intake, task.next_step, r);
+    let opens = news.report.filter(passes).map(|r| AttemptReport { opened: true, ..r.clone() });
+    let news = News { report: opens.as_ref().or(news.report), ..news };
     let facts = facts(tx, &task, &intake, attempt.as_ref(), &news);
     let uncertain = attempt.as_ref().is_some_and(|a| a.uncertain.is_some());
     let at = Standing { phase: task.phase, uncertain, then: task.then };

@@ -142,6 +142,10 @@ pub struct View {
     pub excused: BTreeMap<RobotId, crate::time::SiteTime>,
     /// Robots that did not want their last errand, and until when they are left alone, link clock. Volatile.
     pub unwilling: BTreeMap<RobotId, crate::time::LinkTime>,
+    /// Offers that robots did not answer. Volatile.
+    pub answers: super::answers::Answers,
+    /// The attempt that a robot lists and no row knows, and since when, link clock. Volatile.
+    pub unknown: BTreeMap<RobotId, (AttemptId, crate::time::LinkTime)>,
     /// Time in which robots were heard since it was last counted. Volatile.
     pub attached: BTreeMap<RobotId, Attached>,
     /// The newest heartbeat of each robot, as (session epoch, number), that was compared with the rows and needs no second look. Volatile.
@@ -150,6 +154,8 @@ pub struct View {
     pub behind: Option<u64>,
     /// Entries of the feed whose items the store refused for good: passed over. Volatile.
     pub unusable: BTreeSet<Seq>,
+    /// Decisions that the store refuses for good. Volatile.
+    pub refused: super::refused::Refused,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: super::bugs::Bugs,
     /// Distances and routes, remembered.
@@ -175,7 +181,6 @@ viewed! {
     DesiredPolicy => desired_policy;
     ServiceClock => clocks;
     FleetMark => marks;
-    Incident => incidents;
     CommandKey => command_keys;
     DrainRequest => drain_requests;
     DrainRelease => drain_releases;
@@ -239,6 +244,18 @@ impl Viewed<View> for AreaPolicy {
     fn changed(view: &mut View, _id: &str, _old: Option<&Self>) {
         let robots: Vec<RobotId> = view.sessions.values().map(|s| s.row.robot_id.clone()).collect();
         view.policy_dirty.extend(robots);
+    }
+}
+
+impl Viewed<View> for Incident {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.incidents
+    }
+    /// A person has looked: what was put aside is tried again.
+    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+        if let Some(closed) = view.incidents.get(id).map(|i| &i.row).filter(|i| i.closed.is_some()) {
+            view.refused.incident_closed(&closed.reason);
+        }
     }
 }
 
@@ -445,11 +462,14 @@ impl View {
             waits: BTreeMap::new(),
             excused: BTreeMap::new(),
             unwilling: BTreeMap::new(),
+            answers: super::answers::Answers::default(),
+            unknown: BTreeMap::new(),
             attached: BTreeMap::new(),
             place_waits: 0,
             compared: BTreeMap::new(),
             behind: None,
             unusable: BTreeSet::new(),
+            refused: super::refused::Refused::default(),
             bugs: super::bugs::Bugs::default(),
         }
     }

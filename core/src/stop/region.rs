@@ -100,7 +100,12 @@ impl Region {
     /// Whether a robot at this pose lies inside, or too near to be sure.
     pub fn includes(&self, pose: Option<&Pose>) -> bool {
         let Some(pose) = pose else { return true };
-        self.boxes.is_empty() || self.boxes.iter().any(|b| b.is_near(pose, limits::STOP_MARGIN_MM))
+        self.is_near(pose, limits::STOP_MARGIN_MM)
+    }
+
+    /// Whether a pose lies inside or at most `margin_mm` beside it.
+    pub fn is_near(&self, pose: &Pose, margin_mm: i32) -> bool {
+        self.boxes.is_empty() || self.boxes.iter().any(|b| b.is_near(pose, margin_mm))
     }
 }
 

@@ -211,8 +211,24 @@ impl From<&ReportedState> for v1::ReportedState {
     }
 }
 
+/// Name of the first list that is longer than a report may have.
+pub(crate) fn long_list(state: &v1::ReportedState) -> Option<&'static str> {
+    let lists = [
+        ("attempts", state.attempts.len()),
+        ("places", state.places.len()),
+        ("stops", state.stops.len()),
+        ("awaiting_resume", state.awaiting_resume.len()),
+        ("produced", state.produced.len()),
+    ];
+    lists.into_iter().find(|(_, length)| *length > limits::REPORTED_LIST_MAX).map(|(name, _)| name)
+}
+
 impl Parse<ReportedState> for v1::ReportedState {
     fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<ReportedState> {
+        if let Some(name) = long_list(&self) {
+            bad.add(at.field(name).to_string(), format!("must be at most {}", limits::REPORTED_LIST_MAX));
+            return None;
+        }
         let produced = parse_marks(self.produced, at.field("produced"), bad);
         let mode = word(self.mode, at.field("mode"), bad);
         let vitals = need(self.vitals, at.field("vitals"), bad);

@@ -234,6 +234,14 @@ impl Parse<Uplink> for v1::Uplink {
     }
 }
 
+/// Takes a heartbeat with a list that is too long out of a message, unread, and names the list: what else the message brings is read.
+pub fn drop_long_heartbeat(message: &mut v1::SessionRequest) -> Option<&'static str> {
+    let Some(v1::session_request::Message::Uplink(uplink)) = &mut message.message else { return None };
+    let list = uplink.heartbeat.as_ref()?.reported.as_ref().and_then(super::robot::long_list)?;
+    uplink.heartbeat = None;
+    Some(list)
+}
+
 impl From<&StatusReplay> for v1::ReplayStatusRequest {
     fn from(replay: &StatusReplay) -> Self {
         Self {
@@ -311,13 +319,17 @@ impl Parse<Downlink> for v1::Downlink {
     fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<Downlink> {
         let echo = maybe(self.echo, at.field("echo"), bad);
         let acks = list(self.acks, at.field("acks"), bad);
-        let work = maybe(self.work, at.field("work"), bad);
+        // A robot that cannot read its work must hear the rest all the same: echoes, acks, and what ends by them.
+        let mut of_work = Violations::default();
+        let work = maybe(self.work, at.field("work"), &mut of_work).unwrap_or_default();
+        let unreadable_work = of_work.finish().err().map(|refusal| refusal.to_string());
         let policy = maybe(self.policy, at.field("policy"), bad);
         let update = maybe(self.update, at.field("update"), bad);
         Some(Downlink {
             echo: echo?,
             acks: acks?,
-            work: work?,
+            work,
+            unreadable_work,
             policy: policy?,
             update: update?,
             status_credit_bytes: self.status_credit_bytes,

@@ -344,6 +344,7 @@ fn what_the_server_says_is_what_a_robot_hears() {
         echo: Some(Echo { hb: 812, clock: ClockSample { t4_us: 0, ..clock() } }),
         acks: vec![LaneAck { lane: Lane::Critical, seq: 0, expect: Some(1) }],
         work: Some(work()),
+        unreadable_work: None,
         policy: Some(policy()),
         status_credit_bytes: Some(0),
         update: Some(desired_update()),

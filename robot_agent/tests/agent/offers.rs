@@ -6,8 +6,9 @@ use midshift_agent::bugs::{Bugs, SeededBug};
 use midshift_agent::core::{ExitReason, Input};
 use midshift_agent::memory::MemoryStore;
 use midshift_core::robot::{Fault, FaultClass, Mode};
-use midshift_core::work::{Assignment, Effect, RobotEvent, WorkState};
-use midshift_proto::session::{Downlink, Welcome};
+use midshift_core::work::{Assignment, DesiredWork, Effect, RobotEvent, WorkState};
+use midshift_proto::link::v1;
+use midshift_proto::session::{ClockSample, Downlink, Echo, ToRobot, Welcome};
 
 fn drive(rig: &Rig, name: &str, epoch: u64) -> Assignment {
     rig.offer(name, epoch, vec![goto("B")], vec![point("A", None, false, &[]), point("B", Some(0), false, &[])])
@@ -205,6 +206,30 @@ fn an_offer_that_was_taken_back_unanswered_is_never_taken_later() {
     rig.work(rig.desired(Some(Assignment { stop: true, ..drive(&rig, "T1", 1) })));
     rig.work(rig.desired(Some(drive(&rig, "T1", 1))));
     assert_eq!(rig.refusals(), ["STALE_EPOCH"]);
+}
+
+#[test]
+fn work_that_cannot_be_read_ends_no_session_and_the_robot_says_so() {
+    let mut rig = Rig::at("A");
+    rig.connect();
+    let held = DesiredWork { assignment: Some(drive(&rig, "T1", 1)), ..rig.desired(None) };
+    let mut message = v1::SessionResponse::from(&ToRobot::Downlink(Box::new(Downlink {
+        echo: Some(Echo { hb: 1, clock: ClockSample::default() }),
+        work: Some(DesiredWork { generation: 9, ..held.clone() }),
+        ..Downlink::default()
+    })));
+    if let Some(v1::session_response::Message::Downlink(down)) = &mut message.message
+        && let Some(assignment) = down.work.as_mut().and_then(|work| work.assignment.as_mut())
+    {
+        assignment.from_step = 99;
+    }
+    let read = midshift_proto::parse(message).expect("the message is read all the same");
+    let ToRobot::Downlink(down) = read else { panic!("not a downlink") };
+    assert_eq!((down.echo.map(|echo| echo.hb), &down.work), (Some(1), &None));
+    rig.work(held.clone());
+    assert_eq!(rig.states().first(), Some(&(WorkState::Accepted, 0)));
+    rig.down(*down);
+    assert_eq!(rig.stale(), 1, "it says so");
 }
 
 #[test]

@@ -6,7 +6,7 @@ use midshift_core::fleet::objects::{sees_incident, sees_place, sees_robot, sees_
 use midshift_core::fleet::rows::Incident;
 use midshift_core::fleet::{explain, view::View};
 use midshift_core::identity::{Caller, Permission};
-use midshift_core::ids::{AreaId, PlaceId, RobotId, TaskId};
+use midshift_core::ids::{AreaId, AttemptId, PlaceId, RobotId, Subject, TaskId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::rows::Revision;
@@ -88,6 +88,24 @@ impl FleetService {
         self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
         let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
         Ok(v1::RetireRobotResponse { control: Some(control) })
+    }
+
+    async fn disown(&self, r: v1::DisownAttemptRequest, by: &Caller) -> Result<v1::DisownAttemptResponse, Refusal> {
+        let mut bad = Violations::default();
+        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        let subject = bad.take("subject", Subject::parse(&r.subject));
+        let request_id = request_id(&r.request_id, &mut bad);
+        reason_text(&r.reason, &mut bad);
+        if r.epoch == 0 {
+            bad.add("epoch", "is required, from 1");
+        }
+        bad.finish()?;
+        let (robot_id, subject) = robot_id.zip(subject).ok_or_else(internal)?;
+        let attempt = AttemptId { subject, epoch: r.epoch };
+        let command = Command::Disown { robot_id: robot_id.clone(), attempt, reason: r.reason };
+        self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
+        let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
+        Ok(v1::DisownAttemptResponse { control: Some(control) })
     }
 
     async fn drain(&self, r: v1::DrainRobotRequest, by: &Caller) -> Result<v1::DrainRobotResponse, Refusal> {
@@ -327,6 +345,13 @@ impl Face for FleetService {
     ) -> Result<Response<v1::RetireRobotResponse>, Status> {
         let by = caller(&r);
         answer(self.retire(r.into_inner(), &by).await)
+    }
+    async fn disown_attempt(
+        &self,
+        r: Request<v1::DisownAttemptRequest>,
+    ) -> Result<Response<v1::DisownAttemptResponse>, Status> {
+        let by = caller(&r);
+        answer(self.disown(r.into_inner(), &by).await)
     }
     async fn drain_robot(&self, r: Request<v1::DrainRobotRequest>) -> Result<Response<v1::DrainRobotResponse>, Status> {
         let by = caller(&r);

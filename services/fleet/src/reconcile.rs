@@ -8,11 +8,11 @@
 
 use crate::{Look, Parts, Request};
 use midshift_core::fleet::view::{self, View};
-use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, found, obeyed, objects};
+use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, found, obeyed, objects, refused};
 use midshift_core::lead::{FleetLeader, Own, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::once;
-use midshift_core::picture;
+use midshift_core::picture::{self, Outline};
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::rows::{Item, Key, Log, Seq, Table};
 use midshift_core::time::Now;
@@ -201,10 +201,12 @@ impl Loop {
         let (waits, attached) = (std::mem::take(&mut self.view.waits), std::mem::take(&mut self.view.attached));
         let excused = std::mem::take(&mut self.view.excused);
         let unwilling = std::mem::take(&mut self.view.unwilling);
+        let (answers, unknown) = (std::mem::take(&mut self.view.answers), std::mem::take(&mut self.view.unknown));
         let now = self.parts.clock.now();
         let served = self.view.serving(&now);
         let (router, unusable) = (self.view.router.clone(), std::mem::take(&mut self.view.unusable));
-        self.view = View { router, unusable, ..View::new(self.parts.site.clone(), self.started, now) };
+        let refused = std::mem::take(&mut self.view.refused);
+        self.view = View { router, unusable, refused, ..View::new(self.parts.site.clone(), self.started, now) };
         self.view.bugs = self.parts.bugs;
         self.view.load(&snapshot.rows, snapshot.seq)?;
         // The row is as old as the last commit; this process has served on since.
@@ -214,6 +216,7 @@ impl Loop {
         self.view.attached = attached;
         self.view.excused = excused;
         self.view.unwilling = unwilling;
+        (self.view.answers, self.view.unknown) = (answers, unknown);
         self.view.place_waits = place_waits;
         self.seq = self.view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq).min(snapshot.seq);
         (self.behind, self.news, self.more) = (None, true, false);
@@ -413,8 +416,11 @@ impl Loop {
                     if let Some(id) = &request_id {
                         once::remember(&mut tx, id, &*command, seen);
                     }
-                    plan.items.extend(tx.finish());
-                    replies.push((reply, plan.items.len()));
+                    if plan.keep(tx) {
+                        replies.push((reply, plan.items.len()));
+                    } else {
+                        drop(reply.send(Err(Refusal::new(Kind::Exhausted, Code::DecisionPutAside))));
+                    }
                 }
             }
         }
@@ -431,13 +437,14 @@ impl Loop {
     ) -> Result<(), ()> {
         let renews = renewal.is_some();
         let items: Vec<Item> = renewal.into_iter().chain(plan.items).collect();
-        let kinds: Vec<_> = items.iter().map(|i| (kind_of(i), obeyed(i), picture::entries_of(i))).collect();
+        let kinds: Vec<_> = items.iter().map(|i| (Outline::of(i), obeyed(i), picture::entries_of(i))).collect();
         let results = if items.is_empty() { Vec::new() } else { self.parts.store.commit(items).await };
         if renews && results.first().is_some_and(Result::is_ok) {
             self.seat.claimed(now.link);
         }
         let mut trusted = Ok(());
-        for (result, (kind, entry, entries)) in results.iter().zip(kinds) {
+        for (result, (outline, entry, entries)) in results.iter().zip(kinds) {
+            let kind = outline.kind;
             if let Ok(applied) = result {
                 self.own.wrote(applied.seq.0, entries);
             }
@@ -445,6 +452,8 @@ impl Loop {
                 if let (true, Some(seq)) = (error.is_final(), entry) {
                     tracing::error!(seq = seq.0, kind, "an entry of the log cannot be obeyed and is passed over");
                     self.view.unusable.insert(seq);
+                } else if error.is_final() {
+                    refused::note(&mut self.view, outline);
                 }
                 let conflict = matches!(error, CommitError::Conflict { .. });
                 metrics::counter!("midshift_fleet_items_lost_total", "conflict" => conflict.to_string()).increment(1);
@@ -469,10 +478,6 @@ fn used_ids(requests: &[Request]) -> Vec<Key> {
         Request::Look(_) => None,
     });
     ids.map(|id| Key::new(Table::CommandKey, id)).collect()
-}
-
-fn kind_of(item: &Item) -> &'static str {
-    item.rows.first().map_or("", |r| r.kind)
 }
 
 /// Counts and waiting reasons as metrics; nothing of it goes through the store.

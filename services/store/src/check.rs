@@ -4,27 +4,13 @@
 
 use crate::{Applied, CommitError, ID_BYTES_MAX};
 use midshift_core::audit::{By, Draft};
-use midshift_core::limits;
 use midshift_core::rows::{Entry, Expect, Fact, Index, Item, Key, Log, Revision, Row, RowChange, Seq, Table, Write};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// Bytes that count against [`limits::GROUP_COMMIT_BYTES`]: row bodies, facts, ids.
-pub(crate) fn item_bytes(item: &Item) -> usize {
-    let rows = item.rows.iter().map(|r| {
-        let body = if let Write::Put { body, .. } = &r.write { body.len() } else { 0 };
-        body + r.key.id.len()
-    });
-    let facts = item.facts.iter().map(|f| f.body.len() + f.subject.len());
-    rows.chain(facts).sum::<usize>() + item.note.as_ref().map_or(0, |note| note.bytes())
-}
-
 /// What can be said of an item without looking at any row.
 fn form(item: &Item) -> Result<(), CommitError> {
-    let over = item.rows.len() > limits::ITEM_ROWS_MAX
-        || item.facts.len() > limits::ITEM_ROWS_MAX
-        || item_bytes(item) > limits::GROUP_COMMIT_BYTES;
-    if over {
+    if item.is_too_large() {
         return Err(CommitError::TooLarge);
     }
     texts(item)?;

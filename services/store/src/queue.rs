@@ -3,7 +3,6 @@
 //! Invariant: there is no timer, and every command is answered once. What a commit does is its engine's ([`Engine`]); what its
 //! callers hear of it is decided here, so that it is the same on every engine.
 
-use crate::check::item_bytes;
 use crate::{Applied, Cause, CommitError, Error, Retention};
 use midshift_core::limits;
 use midshift_core::rows::{Item, Log, Seq};
@@ -184,7 +183,7 @@ impl Queue {
 fn slices(items: Vec<Item>) -> Vec<(Vec<Item>, usize)> {
     let mut slices: Vec<(Vec<Item>, usize)> = Vec::new();
     for item in items {
-        let bytes = item_bytes(&item);
+        let bytes = item.bytes();
         match slices.last_mut() {
             Some((slice, sum))
                 if slice.len() < limits::COMMIT_SLICE_ITEMS && *sum + bytes <= limits::COMMIT_SLICE_BYTES =>

@@ -13,10 +13,12 @@ use crate::second::Second;
 use crate::shared::{News, Shared};
 use crate::status::{self, Arrived, StatusLane};
 use crate::welcome::Begun;
+use midshift_core::fleet::REPORT_TOO_LONG;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::robot::Lane;
+use midshift_core::rows::{Fact, Item, Log, Writer};
 use midshift_core::time::{LinkDuration, SiteTime};
 use midshift_core::work::{InboxEntry, InboxItem, Live};
 use midshift_proto::Leaving;
@@ -61,6 +63,10 @@ struct Session {
     second: Option<Second>,
     events: Events,
     committing: Option<Boxed<Outcome>>,
+    /// A person is being told of a heartbeat that was too long.
+    telling: Option<Boxed<bool>>,
+    /// The list of such a heartbeat, once in a session.
+    too_long: Option<&'static str>,
     status: StatusLane,
     keeping: Option<Boxed<Option<u64>>>,
     /// Old STATUS from bulk; none: observed only.
@@ -113,6 +119,8 @@ pub async fn run(
         second,
         events: Events::new(begun.mark.0, begun.mark.1),
         committing: None,
+        telling: None,
+        too_long: None,
         status: StatusLane::new(robot_id.clone(), Arc::from(hello.ring.as_str()), begun.status),
         keeping: None,
         replays,
@@ -173,6 +181,9 @@ impl Session {
                         self.out_since = None;
                     }
                     Err(_) => return End::Gone,
+                },
+                told = poll(&mut self.telling), if self.telling.is_some() => if !told {
+                    self.too_long = None;
                 },
                 outcome = poll(&mut self.committing), if self.committing.is_some() => self.committed(outcome),
                 kept = poll(&mut self.keeping), if self.keeping.is_some() => self.status_kept(kept),
@@ -242,7 +253,10 @@ impl Session {
         out
     }
 
-    fn take(&mut self, message: v1::SessionRequest) -> Option<End> {
+    fn take(&mut self, mut message: v1::SessionRequest) -> Option<End> {
+        if let Some(list) = midshift_proto::convert::session::drop_long_heartbeat(&mut message) {
+            self.heartbeat_too_long(list);
+        }
         let read = midshift_proto::parse::<FromRobot, _>(message);
         let Ok(FromRobot::Uplink(Uplink { heartbeat, batches })) = read else {
             let detail = read.err().map(|e| e.to_string()).unwrap_or_else(|| "a second hello".to_owned());
@@ -264,6 +278,26 @@ impl Session {
             }
         }
         None
+    }
+
+    /// It is neither processed nor echoed, so that the robot's authority ends by itself.
+    fn heartbeat_too_long(&mut self, list: &'static str) {
+        metrics::counter!("midshift_telemetry_heartbeats_too_long_total").increment(1);
+        if self.in_charge.is_none() || self.too_long.replace(list).is_some() {
+            return;
+        }
+        tracing::warn!(robot_id = %self.robot_id, list, "heartbeats with a list that is too long are not processed");
+        let (inner, robot_id) = (self.inner.clone(), self.robot_id.clone());
+        self.telling = Some(Box::pin(async move {
+            let mut item = Item::new(Writer::Telemetry, robot_id.as_str());
+            item.facts.push(Fact {
+                log: Log::Telemetry,
+                subject: Arc::from(robot_id.as_str()),
+                kind: REPORT_TOO_LONG,
+                body: Arc::from(serde_json::json!({ "list": list }).to_string()),
+            });
+            matches!(inner.parts.store.commit(vec![item]).await.pop(), Some(Ok(_)))
+        }));
     }
 
     fn heartbeat(&mut self, heartbeat: Heartbeat) {

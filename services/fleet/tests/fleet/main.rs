@@ -15,6 +15,8 @@ mod picture;
 mod places;
 mod races;
 mod reach;
+mod refused;
+mod reports;
 mod restart;
 mod retries;
 #[expect(dead_code, reason = "other crates' tests use the rest of it")]

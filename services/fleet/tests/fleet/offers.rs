@@ -152,3 +152,63 @@ async fn steps_bring_places_up_to_the_next_standing_one_and_only_the_robots_word
     w.until_phase("T1", Phase::Succeeded).await;
     w.lawful().await;
 }
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_hears_and_does_not_answer_is_passed_over_at_once_and_broken_off_after_three() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("near", "park-a").await;
+    w.robot("far", "park-b").await;
+    w.pass(2).await;
+    w.r("near").answer = Answer::Ignore;
+    w.submit("T1", "A", "B").await;
+    let seen = w.until_phase("T1", Phase::Succeeded).await;
+    assert_eq!(
+        (seen.robot_of("T1").as_deref(), seen.task("T1").epoch),
+        (Some("far"), 2),
+        "the second offer went to the other"
+    );
+    w.submit_with("T2", "A", "B", |raw| raw.robot_id = "near".to_owned()).await;
+    let seen = w.until("it is broken off", |s| !s.open_incidents("ROBOT_DOES_NOT_ANSWER").is_empty()).await;
+    let epoch = seen.task("T2").epoch;
+    assert!(epoch <= 3, "{epoch} offers");
+    w.pass_while(500, "it is left alone", |s| s.task("T2").epoch <= epoch).await;
+    w.r("near").answer = Answer::Accept;
+    w.until_phase("T2", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn offers_that_never_arrived_count_against_nobody() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.pass(2).await;
+    w.r("r1").hears = false;
+    w.submit("T1", "A", "B").await;
+    w.pass(10).await;
+    w.r("r1").hears = true;
+    w.until_phase("T1", Phase::Succeeded).await;
+    assert!(w.seen().await.open_incidents("ROBOT_DOES_NOT_ANSWER").is_empty());
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn many_that_do_not_answer_at_once_blame_the_network_and_no_robot() {
+    let mut w = World::on(midshift_core::site::DEMO).await;
+    let names: Vec<String> = (1..=6).map(|n| format!("r{n}")).collect();
+    for (name, at) in names.iter().zip(["park-1", "park-1", "park-2", "park-2", "park-3", "park-3"]) {
+        w.robot(name, at).await;
+        w.r(name).answer = Answer::Ignore;
+    }
+    w.pass(2).await;
+    for (n, name) in names.iter().enumerate() {
+        w.submit_with(&format!("T{n}"), "D01", "D02", |raw| raw.robot_id.clone_from(name)).await;
+    }
+    let seen = w.until("one incident", |s| !s.open_incidents("OFFERS_NOT_ANSWERED").is_empty()).await;
+    assert_eq!(seen.open_incidents("OFFERS_NOT_ANSWERED").len(), 1);
+    assert!(seen.open_incidents("ROBOT_DOES_NOT_ANSWER").is_empty());
+    for name in &names {
+        w.r(name).answer = Answer::Accept;
+    }
+    w.until("each robot works", |s| (0..6).all(|n| s.phase(&format!("T{n}")) != Phase::Queued)).await;
+    w.lawful().await;
+}

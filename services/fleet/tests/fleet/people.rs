@@ -237,3 +237,46 @@ async fn the_hours_of_a_robot_without_work_are_counted_and_not_forgotten_by_a_re
     assert!((1_190..=1_310).contains(&heard_s), "{heard_s} s");
     w.lawful().await;
 }
+
+#[tokio::test(start_paused = true)]
+async fn a_person_lets_the_server_ignore_an_attempt_that_nobody_knows_once_its_robot_stands() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    let attempt = midshift_core::ids::AttemptId {
+        subject: midshift_core::ids::Subject::parse("T-elsewhere").expect("a subject"),
+        epoch: 3,
+    };
+    w.r("r1").lists = vec![midshift_core::robot::ReportedAttempt {
+        attempt: attempt.clone(),
+        state: midshift_core::work::WorkState::Executing,
+        step_index: 1,
+        progress: 1,
+        route_index: 0,
+        opened: false,
+    }];
+    w.until("a person is told", |s| !s.open_incidents("ATTEMPT_UNKNOWN").is_empty()).await;
+    w.submit("T1", "A", "B").await;
+    w.pass_while(10, "it gets no work", |s| s.phase("T1") == Phase::Queued).await;
+    let ask = |epoch| v1::DisownAttemptRequest {
+        robot_id: "r1".to_owned(),
+        subject: "T-elsewhere".to_owned(),
+        epoch,
+        reason: "a leftover of the old site".to_owned(),
+        ..Default::default()
+    };
+    w.fleet.disown_attempt(Request::new(ask(4))).await.expect_err("it lists no such attempt");
+    w.r("r1").speed_mm_s = 300;
+    w.pass(2).await;
+    w.fleet.disown_attempt(Request::new(ask(3))).await.expect_err("it moves");
+    w.r("r1").speed_mm_s = 0;
+    w.pass(2).await;
+    w.fleet.disown_attempt(Request::new(ask(3))).await.expect("it is ignored");
+    let seen = w.seen().await;
+    assert!(seen.open_incidents("ATTEMPT_UNKNOWN").is_empty(), "the incident is over");
+    assert!(seen.has("r1", "park-a"), "no place is freed");
+    assert_eq!(seen.control("r1").disowned, [attempt]);
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.r("r1").lists.clear();
+    w.until("it is forgotten", |s| s.control("r1").disowned.is_empty()).await;
+    w.lawful().await;
+}

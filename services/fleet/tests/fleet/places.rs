@@ -3,6 +3,7 @@
 use crate::harness::World;
 use midshift_core::fleet::rows::HolderState;
 use midshift_core::ids::PlaceId;
+use midshift_core::robot::HeldPlace;
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::Phase;
 use midshift_core::work::{PlaceNews, RobotEvent};
@@ -275,5 +276,104 @@ async fn ten_robots_on_the_demo_floor_all_get_their_work_done() {
     for n in 0..40 {
         w.until_phase(&format!("T{n}"), Phase::Succeeded).await;
     }
+    w.lawful().await;
+}
+
+fn claim(place: &str) -> HeldPlace {
+    HeldPlace { place_id: PlaceId::parse(place).expect("a place"), grant_id: 0, inside: true }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_says_it_is_everywhere_gets_eight_places_and_no_work_until_it_says_something_plausible() {
+    let mut w = World::on(DEMO).await;
+    w.robot("r1", "park-1").await;
+    w.pass(2).await;
+    let all: Vec<String> = w.site.places().iter().map(|p| p.place_id.to_string()).collect();
+    assert!(all.len() > 30);
+    w.r("r1").claims = all.iter().filter(|id| *id != "park-1").map(|id| claim(id)).collect();
+    w.pass(5).await;
+    let held = |s: &crate::harness::Seen| all.iter().filter(|id| s.has("r1", id)).count();
+    let seen = w.seen().await;
+    assert!(held(&seen) <= 8, "it holds {}", held(&seen));
+    assert_eq!(seen.open_incidents("PLACES_IMPLAUSIBLE").len(), 1);
+    w.submit_with("T1", "D01", "D02", |raw| raw.robot_id = "r1".to_owned()).await;
+    w.pass_while(30, "it gets no work", |s| s.phase("T1") == Phase::Queued).await;
+    w.r("r1").claims.clear();
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn two_robots_inside_one_place_are_one_incident_and_each_explanation_names_the_other() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.robot("r2", "park-b").await;
+    w.robot("r3", "wait-a").await;
+    w.pass(2).await;
+    w.r("r2").claims = vec![claim("park-a")];
+    let seen = w.until("they are seen", |s| !s.open_incidents("EXCLUSION_BROKEN").is_empty()).await;
+    w.submit_with("T3", "A", "park-a", |raw| (raw.robot_id, raw.stall_ms) = ("r3".to_owned(), Some(3_600_000))).await;
+    let of = |s: &crate::harness::Seen| s.open_incidents("EXCLUSION_BROKEN").len();
+    assert_eq!(of(&seen), 1);
+    w.pass_while(30, "one incident, and nobody else is let in", |s| of(s) == 1 && !s.has("r3", "park-a")).await;
+    for (robot, other) in [("r1", "r2"), ("r2", "r1")] {
+        let ask = v1::ExplainRobotRequest { robot_id: robot.to_owned() };
+        let told = w.fleet.explain_robot(Request::new(ask)).await.expect("told").into_inner();
+        let told = format!("{:?}", told.explanation.expect("told").verdict);
+        assert!(told.contains("EXCLUSION_BROKEN") && told.contains(other), "{robot}: {told}");
+    }
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_entry_on_a_grant_that_nobody_gave_is_an_incident() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.pass(600).await;
+    let place_id = PlaceId::parse("charge").expect("a place");
+    w.r("r1").says(RobotEvent::Place { place_id, grant_id: 4_711, news: PlaceNews::Entered });
+    w.pass(3).await;
+    assert_eq!(w.seen().await.open_incidents("GRANT_UNKNOWN").len(), 1);
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_waits_for_a_place_is_told_who_has_it() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.robot("r2", "park-b").await;
+    w.r("r1").works = false;
+    w.submit_with("T1", "A", "B", |raw| (raw.robot_id, raw.stall_ms) = ("r1".to_owned(), Some(3_600_000))).await;
+    w.until("r1 is in A", |s| s.holders("A") == [("r1".to_owned(), HolderState::Inside)]).await;
+    w.submit_with("T2", "A", "B", |raw| (raw.robot_id, raw.stall_ms) = ("r2".to_owned(), Some(3_600_000))).await;
+    w.pass(120).await;
+    let ask = v1::ExplainTaskRequest { task_id: "T2".to_owned() };
+    let told = w.fleet.explain_task(Request::new(ask)).await.expect("told").into_inner();
+    let verdict = told.explanation.expect("told").verdict.expect("a reason");
+    assert_eq!(verdict.metadata.get("held_by").map(String::as_str), Some("r1"), "{verdict:?}");
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_attempt_that_the_server_does_not_know_is_an_incident_after_a_minute() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.pass(600).await;
+    let subject = midshift_core::ids::Subject::Task(midshift_core::ids::TaskId::parse("T-elsewhere").expect("an id"));
+    w.r("r1").lists = vec![midshift_core::robot::ReportedAttempt {
+        attempt: midshift_core::ids::AttemptId { subject, epoch: 3 },
+        state: midshift_core::work::WorkState::Executing,
+        step_index: 1,
+        progress: 1,
+        route_index: 0,
+        opened: false,
+    }];
+    w.pass_while(55, "it may be about to let it go", |s| s.open_incidents("ATTEMPT_UNKNOWN").is_empty()).await;
+    let seen = w.until("a person is told", |s| !s.open_incidents("ATTEMPT_UNKNOWN").is_empty()).await;
+    assert!(seen.work("r1").assignment.is_none());
+    let ask = v1::ExplainRobotRequest { robot_id: "r1".to_owned() };
+    let told = w.fleet.explain_robot(Request::new(ask)).await.expect("told").into_inner();
+    let told = format!("{:?}", told.explanation.expect("told").verdict);
+    assert!(told.contains("ATTEMPT_UNKNOWN") && told.contains("T-elsewhere/3"), "{told}");
     w.lawful().await;
 }

@@ -98,6 +98,21 @@ pub enum Verb {
         #[command(flatten)]
         change: Change,
     },
+    /// Ignore an attempt that the robot lists and the server does not know. It must stand still; no place and no load is freed.
+    Disown {
+        #[command(flatten)]
+        one: One,
+        /// The attempt as `robot explain` names it: task_id/epoch or errand:robot:number/epoch.
+        attempt: String,
+        /// What you saw.
+        #[arg(long)]
+        reason: String,
+        /// Only if it is still as this etag says.
+        #[arg(long, default_value = "")]
+        if_match: String,
+        #[command(flatten)]
+        change: Change,
+    },
     /// Keep it at the software that it runs.
     Pin {
         #[command(flatten)]
@@ -222,6 +237,24 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             let answer = one.call.fleet().await?.retire_robot(unary(request)).await?.into_inner();
             control(&answer.control.unwrap_or_default(), out)?;
             out.next(&format!("midshift robot uncordon {} brings it back", one.robot_id));
+            Ok(())
+        }
+        Verb::Disown { one, attempt, reason, if_match, change } => {
+            let named = attempt.rsplit_once('/').and_then(|(subject, epoch)| Some((subject, epoch.parse().ok()?)));
+            let Some((subject, epoch)) = named else {
+                return Err(Exit::usage(format!("{attempt} is no attempt: say SUBJECT/EPOCH, as robot explain does")));
+            };
+            let request = fleet::DisownAttemptRequest {
+                robot_id: one.robot_id,
+                request_id: change.request_id,
+                etag: if_match,
+                reason,
+                validate_only: change.dry_run,
+                subject: subject.to_owned(),
+                epoch,
+            };
+            let answer = one.call.fleet().await?.disown_attempt(unary(request)).await?.into_inner();
+            control(&answer.control.unwrap_or_default(), out)?;
             Ok(())
         }
         Verb::Pin { one, reason, change } => {

@@ -204,10 +204,18 @@ async fn what_is_held_is_let_go_where_the_caller_operates() {
             state: HolderState::Inside,
             since: NOON,
             grant_id: 1,
+            claimed: false,
         };
         let place_id = PlaceId::parse(place).expect("an id");
         item.create(
-            &Place { place_id, capacity: 3, standing: true, holders: vec![holder], quarantine: None },
+            &Place {
+                place_id,
+                capacity: 3,
+                standing: true,
+                holders: vec![holder],
+                quarantine: None,
+                cleared: Vec::new(),
+            },
             "place.granted",
         );
     }

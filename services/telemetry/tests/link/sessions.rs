@@ -1,13 +1,13 @@
 //! A robot's session: welcome, acknowledgements, desired state, succession, clones.
 
 use crate::world::{Otherwise, Result, Robot, World, hello, world, world_with};
-use midshift_core::ids::RobotId;
+use midshift_core::ids::{PlaceId, RobotId};
 use midshift_core::limits;
 use midshift_core::reason::Code;
-use midshift_core::robot::Lane;
+use midshift_core::robot::{HeldPlace, Lane, Mode, ReportedState};
 use midshift_core::rows::{Expect, Item, Log, Seq, Writer};
-use midshift_core::work::{DesiredWork, Session};
-use midshift_proto::session::{ClockSample, CloseCode, Downlink};
+use midshift_core::work::{DesiredWork, InboxItem, RobotEvent, Sample, SampleBody, Session};
+use midshift_proto::session::{ClockSample, CloseCode, Downlink, Heartbeat, LaneBatch, Uplink};
 use midshift_store::load;
 use midshift_telemetry::{Bugs, SeededBug};
 
@@ -165,5 +165,35 @@ async fn a_new_session_remembers_the_clock_that_the_one_before_measured() -> Res
     second.hears(|down| down.echo).await?;
     let _third = Robot::attach(&world, Some(second.proof())).await?;
     assert_eq!(offset().await?, Some(12), "a session that measured nothing forgets nothing");
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_heartbeat_with_a_list_that_is_too_long_is_not_processed_and_its_samples_are() -> Result<()> {
+    let world = world().await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    let place =
+        |n: usize| HeldPlace { place_id: PlaceId::parse(&format!("P{n}")).expect("an id"), grant_id: 0, inside: true };
+    let session_epoch = robot.welcome.session_epoch;
+    let places = (0..257).map(place).collect();
+    let reported = ReportedState { hb: 1, session_epoch, places, ..ReportedState::default() };
+    let heartbeat = Heartbeat { reported, sent_unix_us: 0, clock: None };
+    let body = SampleBody::Event(RobotEvent::Mode(Mode::Automatic));
+    let items = vec![InboxItem::Sample(Sample { seq: 1, robot_unix_ms: 0, body })];
+    let batches = vec![LaneBatch { lane: Lane::Event, items }];
+    robot.say(Uplink { heartbeat: Some(heartbeat.clone()), batches }).await?;
+    robot.say(Uplink { heartbeat: Some(heartbeat), batches: Vec::new() }).await?;
+    robot.hears(|down| down.acks.iter().any(|ack| ack.lane == Lane::Event && ack.seq == 1).then_some(())).await?;
+    robot.hb = 1;
+    robot.beat().await?;
+    assert_eq!(
+        robot.hears(|down| down.echo.as_ref().map(|echo| echo.hb)).await?,
+        2,
+        "the first echo is of the good one"
+    );
+    let told = world.store.feed(Seq(0), &[Log::Telemetry], 1_000).await?.entries;
+    let told: Vec<_> = told.iter().filter(|e| &*e.kind == "session.report_too_long").collect();
+    assert_eq!(told.len(), 1, "a person is told once");
+    assert!(told[0].body.as_deref().is_some_and(|body| body.contains("places")));
     Ok(())
 }

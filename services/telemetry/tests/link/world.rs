@@ -165,7 +165,7 @@ pub struct Robot {
     up: mpsc::Sender<SessionRequest>,
     down: Streaming<SessionResponse>,
     pub welcome: Welcome,
-    hb: u64,
+    pub hb: u64,
 }
 
 pub fn hello(previous: Option<Previous>) -> Result<Hello> {

@@ -60,6 +60,16 @@ pub struct Robot {
     pub offered: Vec<(AttemptId, Authority)>,
     pub applied: u64,
     pub paused: bool,
+    /// How fast it says that it moves.
+    pub speed_mm_s: u32,
+    /// Attempts that it lists beside its own.
+    pub lists: Vec<ReportedAttempt>,
+    /// Places that it lists beside its own.
+    pub claims: Vec<HeldPlace>,
+    /// The step that it says of every attempt, whatever is true.
+    pub says_step: Option<u32>,
+    /// It never says that it opened a task.
+    pub hides_opened: bool,
     session_epoch: u64,
     hb: u64,
     boots: u64,
@@ -130,6 +140,11 @@ impl Robot {
             offered: Vec::new(),
             applied: 0,
             paused: false,
+            speed_mm_s: 0,
+            lists: Vec::new(),
+            claims: Vec::new(),
+            says_step: None,
+            hides_opened: false,
             session_epoch: 0,
             hb: 0,
             boots: 0,
@@ -274,6 +289,7 @@ impl Robot {
             pose: self.pose,
             waypoint: Some(self.here.clone()),
             battery_permille: self.battery_permille,
+            speed_mm_s: self.speed_mm_s,
             ..Vitals::default()
         };
         let report = ReportedState {
@@ -284,8 +300,8 @@ impl Robot {
             mode: self.mode,
             vitals,
             load: self.load.clone(),
-            attempts: self.attempts.clone(),
-            places: self.places.clone(),
+            attempts: self.listed(),
+            places: [self.places.clone(), self.claims.clone()].concat(),
             hardware_stop: self.hardware_stop,
             stop_level: if self.awaiting.is_empty() { StopLevel::None } else { StopLevel::Halt },
             stops: self.stops.clone(),
@@ -302,6 +318,15 @@ impl Robot {
             progress_at: self.progress_at,
             clock_offset_ms: None,
         }
+    }
+
+    fn listed(&self) -> Vec<ReportedAttempt> {
+        let mut listed = [self.attempts.clone(), self.lists.clone()].concat();
+        for attempt in &mut listed {
+            attempt.step_index = self.says_step.unwrap_or(attempt.step_index);
+            attempt.opened &= !self.hides_opened;
+        }
+        listed
     }
 
     // --- what it does by itself
@@ -416,6 +441,7 @@ impl Robot {
     fn tell(&mut self, attempt: &AttemptId, state: WorkState, refusal: Option<Reason>, fault: Option<Fault>) {
         self.progress += 1;
         let opened = self.load.is_some() || self.attempts.iter().any(|a| a.attempt == *attempt && a.opened);
+        let opened = opened && !self.hides_opened;
         let listed = ReportedAttempt {
             attempt: attempt.clone(),
             state,
@@ -427,8 +453,15 @@ impl Robot {
         self.attempts.retain(|a| a.attempt != *attempt);
         self.attempts.push(listed);
         let stats = WorkStats { path_mm: 1_000, duration_ms: 1_000, ..WorkStats::default() };
-        let report =
-            AttemptReport { attempt: attempt.clone(), state, step_index: self.step, opened, refusal, fault, stats };
+        let report = AttemptReport {
+            attempt: attempt.clone(),
+            state,
+            step_index: self.says_step.unwrap_or(self.step),
+            opened,
+            refusal,
+            fault,
+            stats,
+        };
         self.says(RobotEvent::Attempt(report));
     }
 

@@ -99,6 +99,11 @@ impl Seen {
     pub fn incidents(&self) -> Vec<Code> {
         self.all::<Incident>().into_iter().map(|i| i.reason.code).collect()
     }
+    /// Incidents with this code that nobody has closed.
+    pub fn open_incidents(&self, code: &str) -> Vec<Incident> {
+        let open = self.all::<Incident>().into_iter().filter(|i| i.closed.is_none());
+        open.filter(|i| i.reason.code.as_str() == code).collect()
+    }
     /// What a person who debugs a test wants to see.
     pub fn told(&self) -> String {
         let quiet = ["place_grant", "site", "desired_policy", "task_intake", "robot_counter"];

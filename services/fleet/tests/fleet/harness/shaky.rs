@@ -22,6 +22,8 @@ pub struct Shaky {
     blind: AtomicBool,
     overwritten: AtomicU64,
     conflicts: AtomicU64,
+    /// Items that the store never takes.
+    refused: AtomicU64,
     /// Whoever uses this handle stands still.
     frozen: watch::Sender<bool>,
     freezes: AtomicBool,
@@ -38,6 +40,7 @@ impl Shaky {
     pub fn over(inner: Arc<dyn Store>) -> Arc<Self> {
         Arc::new(Self {
             conflicts: AtomicU64::new(0),
+            refused: AtomicU64::new(0),
             frozen: watch::Sender::new(false),
             freezes: AtomicBool::new(false),
             outrun: Mutex::new(None),
@@ -101,6 +104,14 @@ impl Shaky {
     pub fn conflicts(&self) -> u64 {
         self.conflicts.load(Ordering::Relaxed)
     }
+    /// Items that the store will never take.
+    pub fn refused(&self) -> u64 {
+        self.refused.load(Ordering::Relaxed)
+    }
+    fn count_refused(&self, results: &[Result<Applied, CommitError>]) {
+        let refused = results.iter().filter(|r| r.as_ref().is_err_and(CommitError::is_final)).count();
+        self.refused.fetch_add(refused as u64, Ordering::Relaxed);
+    }
     /// Commits an item over whatever is there.
     async fn overwrite(&self, mut item: Item) -> Result<Applied, CommitError> {
         loop {
@@ -163,6 +174,7 @@ impl Store for Shaky {
                     self.inner.commit(vec![item]).await
                 });
             }
+            self.count_refused(&results);
             return results;
         }
         // Two writers that never lose go on for ever; some dozen wrong rows are enough.
@@ -174,6 +186,7 @@ impl Store for Shaky {
             return results;
         }
         let results = self.inner.commit(items).await;
+        self.count_refused(&results);
         let lost = results.iter().filter(|r| matches!(r, Err(CommitError::Conflict { .. }))).count();
         self.conflicts.fetch_add(lost as u64, Ordering::Relaxed);
         results

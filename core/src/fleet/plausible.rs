@@ -1,0 +1,149 @@
+//! Holds what robots report of their attempts against what an attempt can be.
+//!
+//! 1. The step lies between the first one of the attempt and the number of steps.
+//! 2. SUCCEEDED comes only with the number of steps.
+//! 3. Within an attempt the step is never lower than reported before.
+//!
+//! Invariant: a report that breaks one of these frees nothing and moves nothing forward. What it adds is taken: places and loads.
+//! Called by `inbox` for events, by `repair` for heartbeats, and by whoever gives work or places.
+
+use super::tasks::{News, happen};
+use super::view::View;
+use super::{Tx, attempts, claims, errands, heard, incidents};
+use crate::ids::{AttemptId, RobotId};
+use crate::reason::{Code, Reason};
+use crate::task::{Attempt, AttemptPhase, Event, TaskIntake};
+use crate::work::{AttemptReport, Effect, Live, WorkState};
+
+/// Steps that reports of one attempt may name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Bounds {
+    /// The first step of the attempt: where it drives to first.
+    first: u32,
+    /// Where it goes on after that drive.
+    resume: u32,
+    /// Number of steps.
+    steps: u32,
+}
+
+impl Bounds {
+    /// Those of `a`; none if nothing is known of its steps any more.
+    fn of(view: &View, a: &Attempt) -> Option<Self> {
+        let given = view.desired_work.get(a.robot_id.as_str()).and_then(|d| d.row.assignment.as_ref());
+        if let Some(given) = given.filter(|given| given.attempt == a.attempt) {
+            let steps = given.steps.len() as u32;
+            return Some(Self { first: given.from_step, resume: given.resume_step, steps });
+        }
+        // It is taken back already, or was never sent: nobody knows where it began.
+        let steps = match a.attempt.subject.task_id() {
+            Some(task_id) => view.intake(task_id)?.spec.steps.len(),
+            None => attempts::steps(view, a).len(),
+        };
+        Some(Self { first: 0, resume: steps as u32, steps: steps as u32 })
+    }
+    /// The lowest step that may be reported once `highest` was.
+    fn least(self, highest: u32) -> u32 {
+        if highest > self.resume { highest } else { self.first }
+    }
+    fn allow(self, highest: u32, state: WorkState, step_index: u32) -> bool {
+        match state {
+            // It never began.
+            WorkState::Refused => step_index <= self.steps,
+            WorkState::Succeeded => step_index == self.steps,
+            _ => (self.least(highest)..=self.steps).contains(&step_index),
+        }
+    }
+}
+
+/// Why a report of the attempt cannot be; none: it is plausible, or the attempt is over.
+pub fn judge(view: &View, id: &AttemptId, robot_id: &RobotId, state: WorkState, step_index: u32) -> Option<Reason> {
+    let a = view.attempt(id).filter(|a| a.robot_id == *robot_id)?;
+    if a.phase.is_terminal() && a.phase != AttemptPhase::Lost {
+        return None;
+    }
+    let bounds = Bounds::of(view, a)?;
+    let reason = || {
+        Reason::from(Code::ReportImplausible)
+            .with("attempt", id)
+            .with("state", format!("{state:?}"))
+            .with("step_index", step_index)
+            .with("least", bounds.least(a.step_index))
+            .with("steps", bounds.steps)
+    };
+    (!bounds.allow(a.step_index, state, step_index)).then(reason)
+}
+
+/// The first attempt that a heartbeat lists in a way that cannot be. One that is older than the robot's events tells nothing.
+pub fn doubtful(view: &View, live: &Live) -> Option<(AttemptId, Reason)> {
+    if !heard::is_fresh(view, live) {
+        return None;
+    }
+    let listed = live.report.attempts.iter();
+    let mut doubts = listed.filter_map(|r| {
+        let why = judge(view, &r.attempt, &live.robot_id, r.state, r.step_index)?;
+        Some((r.attempt.clone(), why))
+    });
+    doubts.next()
+}
+
+/// Keeps work and grants from a robot whose newest word cannot be, or whose decisions are put aside.
+///
+/// # Errors
+/// If so; the reason says what.
+pub fn keeps_back(view: &View, live: &Live) -> Result<(), Reason> {
+    view.refused.screen(&live.robot_id)?;
+    match doubtful(view, live).map(|(_, why)| why).or_else(|| claims::too_many(view, live)) {
+        Some(why) => Err(why),
+        None => Ok(()),
+    }
+}
+
+/// A report of the attempt cannot be: a person is told, and the attempt becomes UNCERTAIN, both once.
+pub fn doubt(tx: &mut Tx, robot_id: &RobotId, id: &AttemptId, why: &Reason) {
+    let is_new = incidents::open_about(tx, why.clone(), Some(robot_id), "attempt");
+    let lives = tx.view.attempt(id).is_some_and(|a| a.uncertain.is_none() && !a.phase.is_terminal());
+    if !is_new || !lives || tx.view.held_by(robot_id) != Some(id) {
+        return;
+    }
+    match id.subject.task_id() {
+        Some(task_id) => {
+            happen(tx, task_id, News::of(Event::LeaseOver, Some(why)));
+        }
+        None => errands::lease_over(tx, robot_id, why.clone()),
+    }
+}
+
+/// The report passes a step that must not be done twice, so it opens the task, whatever it says of that.
+pub fn passes_irreversible(intake: &TaskIntake, next_step: u32, report: &AttemptReport) -> bool {
+    let passed = intake.spec.steps.iter().take(report.step_index as usize).skip(next_step as usize);
+    passed.into_iter().any(|step| step.effect == Effect::AtMostOnce)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_report_is_legal_within_its_steps_and_never_goes_back() {
+        use WorkState::{Aborted, Executing, Failed, Refused, Succeeded};
+        let bounds = Bounds { first: 2, resume: 3, steps: 6 };
+        let table = [
+            (3, Executing, 1, false),
+            (3, Executing, 2, true),
+            (3, Executing, 3, true),
+            (4, Executing, 3, false),
+            (4, Executing, 4, true),
+            (4, Failed, 6, true),
+            (4, Aborted, 7, false),
+            (4, Failed, u32::MAX, false),
+            (4, Succeeded, 5, false),
+            (4, Succeeded, 6, true),
+            (4, Succeeded, 7, false),
+            (3, Refused, 0, true),
+            (3, Refused, 7, false),
+        ];
+        for (highest, state, step, legal) in table {
+            assert_eq!(bounds.allow(highest, state, step), legal, "{highest} {state:?} {step}");
+        }
+    }
+}
