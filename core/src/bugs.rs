@@ -17,17 +17,17 @@ macro_rules! seeded_bugs {
         #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
         pub struct Bugs {
             #[cfg(feature = "seeded-bugs")]
-            on: u8,
+            on: u64,
         }
 
         #[cfg(feature = "seeded-bugs")]
         impl Bugs {
             /// With these rules on.
             pub fn of(bugs: &[SeededBug]) -> Self {
-                Self { on: bugs.iter().fold(0, |on, bug| on | 1 << *bug as u8) }
+                Self { on: bugs.iter().fold(0, |on, bug| on | 1 << *bug as u64) }
             }
             fn has(self, bug: SeededBug) -> bool {
-                self.on & (1 << bug as u8) != 0
+                self.on & (1 << bug as u64) != 0
             }
         }
 
