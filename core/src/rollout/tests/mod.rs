@@ -27,7 +27,9 @@ use super::rows::{AreaBundle, Bundle, Outcome, Phase, RobotSoftware, Rollout, Ro
 use super::spec::{RolloutSpec, Wave};
 use super::view::{Slot, TABLES, View};
 use super::{Board, Order, Plan, Sign, absorb, cycle};
-use crate::fleet::rows::{DrainState, RobotAuthority, RobotControl, RobotCounter, RobotHolder};
+use crate::fleet::rows::{
+    DrainState, HolderState, Place, PlaceHolder, RobotAuthority, RobotControl, RobotCounter, RobotHolder,
+};
 use crate::fleet::{self, budget, drain};
 use crate::ids::{AreaId, BundleId, DrainId, RobotId, RolloutId, WaypointId};
 use crate::maintenance::ReleasedBy;
@@ -44,6 +46,9 @@ use std::sync::Arc;
 
 /// A directive may be taken for so long, milliseconds.
 const DIRECTIVE_LIVES_MS: u64 = 7 * 24 * 3_600_000;
+
+/// Where robots stand unless a test says otherwise.
+const BAY: &str = "park-1";
 
 /// Milliseconds since 1970 at which each test begins: a Friday morning.
 const BEGIN: i64 = 1_795_000_000_000;
@@ -193,11 +198,31 @@ impl Rig {
             idles: false,
             stop: HardwareStop::None,
             load: None,
-            at: "park-1",
+            at: BAY,
         });
         self.put(RobotAuthority { robot_id: id.clone(), holder: RobotHolder::None });
+        self.stand(&id);
         self.put(RobotControl::new(id));
         self.attach(self.robots.len() - 1, |_| {});
+    }
+
+    /// Gives the robot a place to stand in: one bay that holds them all.
+    fn stand(&mut self, robot_id: &RobotId) {
+        let (state, since) = (HolderState::Inside, self.now.utc);
+        let holder = PlaceHolder { robot_id: robot_id.clone(), grant_id: 1, state, since, claimed: false };
+        let site = &self.fleet.site;
+        let bay = site.find(&WaypointId::parse(BAY).expect("an id")).and_then(|at| site.standing_at(at));
+        let place_id = site.place(bay.expect("the demo has this bay")).place_id.clone();
+        let mut place = self.row::<Place>(place_id.as_str()).unwrap_or(Place {
+            place_id,
+            capacity: u32::MAX,
+            standing: true,
+            holders: Vec::new(),
+            quarantine: None,
+            cleared: Vec::new(),
+        });
+        place.holders.push(holder);
+        self.put(place);
     }
 
     /// A robot begins a new session, with a changed inventory.
