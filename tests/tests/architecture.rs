@@ -101,7 +101,7 @@ const LOGGED: &[(&str, &str, &str)] = &[
     ("services/ota/src/rollouts/reconcile.rs", "text", "the key of a row, and what could not be read of it"),
     ("services/ota/src/rollouts/standby.rs", "text", "the key of a row, and what could not be read of it"),
     ("services/stop/src/acts.rs", "level", "one of four words"),
-    ("services/stop/src/lib.rs", "why", "a sentence of this program"),
+    ("services/stop/src/opening.rs", "why", "a sentence of this program"),
     ("services/telemetry/src/welcome.rs", "rejection", "one of a closed list of sentences about signed documents"),
 ];
 
