@@ -30,11 +30,15 @@ const NAME_NOTHING: [(&str, &str); 2] = [
     ("FetchChunks", "names a file: what is published is for every robot"),
 ];
 /// Methods that find nothing here even of what a caller may see, and why.
-const NOTHING_HERE: [(&str, &str); 3] = [
+const NOTHING_HERE: [(&str, &str); 4] = [
+    ("DisownAttempt", "robots list only what the server knows"),
     ("ListCounters", "nobody has worked"),
     ("ListQuarantines", "no release was bad"),
     ("LiftQuarantine", "no release was bad"),
 ];
+
+/// Methods that act on what a filter admits of what the caller may act on, and pass over the rest without a word.
+const FILTERED: [(&str, &str); 2] = [("CancelTasks", "tasks"), ("ResolveTasks", "tasks")];
 
 fn is_listed(list: &[(&str, &str)], method: &Method) -> bool {
     list.iter().any(|(name, _)| *name == method.name())
@@ -125,7 +129,8 @@ async fn asked_about(
     let is_denied = matches!(code, Code::PermissionDenied | Code::Unauthenticated);
     let is_away = is_denied || (code == Code::NotFound && !is_listed(&NOTHING_HERE, method));
     let text = answer.as_deref().unwrap_or_default();
-    let is_list = method.rule.object == Object::List && method.rule.permission == Permission::Read;
+    let passes_over = method.rule.permission == Permission::Read || is_listed(&FILTERED, method);
+    let is_list = method.rule.object == Object::List && passes_over;
     let is_right = match (somebody.refused(&method.path), is_own || *scope == Some(Scope::Site)) {
         (Some(refused), _) => code == refused,
         (None, true) => !is_away,
@@ -146,6 +151,9 @@ async fn asked_for_all(all: &[Holder], methods: &[Method], things: &[Words; 2]) 
         let [own, other] = things.clone().map(|mut words| {
             if method.name() == "SubmitTasks" {
                 words.remove("validate_only");
+            }
+            if method.name() == "DisownAttempt" {
+                words.extend([("subject", words["task_id"].clone()), ("epoch", json!(1))]);
             }
             words
         });
