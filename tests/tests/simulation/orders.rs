@@ -4,7 +4,9 @@
 
 use crate::net;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
-use midshift_proto::fleet::v1::{ClearPlaceRequest, DrainRobotRequest, ListPlacesRequest, RetireRobotRequest};
+use midshift_proto::fleet::v1::{
+    ClearPlaceRequest, DrainRobotRequest, ListPlacesRequest, RetireRobotRequest, UncordonRobotRequest,
+};
 use midshift_proto::ota::v1 as ota;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
@@ -56,6 +58,8 @@ pub enum Order {
         /// Never used again.
         request_id: String,
     },
+    /// A person lets a robot work again that was broken off after it had failed too often.
+    Uncordon(String),
     /// A person stops robots. Asked again by the same request_id it is one stop.
     Engage(Box<EngageRequest>),
     /// A person resets a stop by its name.
@@ -155,6 +159,10 @@ async fn ask(order: &Order) -> Result<(), Status> {
                 ..ResumeHeldRequest::default()
             };
             TaskServiceClient::new(channel).resume_held(request).await.map(drop)
+        }
+        Order::Uncordon(robot_id) => {
+            let request = UncordonRobotRequest { robot_id, ..Default::default() };
+            FleetServiceClient::new(channel).uncordon_robot(request).await.map(drop)
         }
         Order::Engage(request) => {
             let mut told = stops()?.engage(*request).await?.into_inner();

@@ -8,6 +8,7 @@ use crate::orders::Order;
 use crate::plan::{Deed, Fault, Plan, ROBOTS};
 use crate::room::{CLIENT, Naive, Room, RoomConfig, site};
 use midshift_core::site::DEMO;
+use midshift_core::task::TaskState;
 use midshift_core::task::machine::Phase;
 use midshift_proto::ota::v1::rollout_wave::Size;
 use midshift_proto::ota::v1::{RolloutSelector, RolloutSpec, RolloutWave};
@@ -174,13 +175,25 @@ impl Shift {
         }
     }
 
-    /// A person lets robots go on that were stopped, and settles roll-outs that wait for one.
+    /// A person lets robots go on that were stopped or broken off with a task that is theirs, and settles roll-outs that wait for one.
     fn look_after(&mut self) {
         self.let_go += 1;
         for robot in self.stopped.clone() {
             let robot_id = self.room.robot_id(robot).to_string();
             self.order(Order::LetGo { robot_id, request_id: format!("go-{robot}-{}", self.let_go) });
         }
+        let waits = |t: &&TaskState| t.phase == Phase::Queued;
+        let bound: BTreeSet<String> = self
+            .room
+            .observer
+            .look()
+            .tasks()
+            .values()
+            .filter(waits)
+            .filter_map(|t| t.opened.as_ref())
+            .map(|r| r.to_string())
+            .collect();
+        bound.into_iter().for_each(|robot_id| self.order(Order::Uncordon(robot_id)));
         let rollouts: Vec<String> =
             self.room.observer.look().changes().rollouts().map(|r| r.rollout_id.to_string()).collect();
         rollouts.into_iter().for_each(|id| self.order(Order::Settle(id)));
