@@ -182,7 +182,7 @@ impl Shift {
             let robot_id = self.room.robot_id(robot).to_string();
             self.order(Order::LetGo { robot_id, request_id: format!("go-{robot}-{}", self.let_go) });
         }
-        let waits = |t: &&TaskState| t.phase == Phase::Queued;
+        let waits = |t: &&TaskState| matches!(t.phase, Phase::Queued | Phase::NeedsOperator);
         let bound: BTreeSet<String> = self
             .room
             .observer
