@@ -8,8 +8,8 @@ use crate::observer::{Observer, ready};
 use crate::orders::Order;
 use crate::plan::background;
 use crate::room::{Naive, Room, RoomConfig, player_machine, site};
-use crate::run::Outcome;
-use crate::{add_up, each, hash_of, number, say};
+use crate::run::{Outcome, outcome_of};
+use crate::{every_seed_holds, hash_of, number, report_seed};
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::rows::Table;
 use midshift_core::site::{DEMO, Site};
@@ -21,7 +21,6 @@ use midshift_tests::player::{Around, Habit, Player};
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use std::collections::{BTreeMap, BTreeSet};
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Seeds of a plain run.
@@ -63,17 +62,7 @@ struct Game {
 
 /// Runs a seed.
 pub fn run(seed: u64, naive: Naive) -> Outcome {
-    let run = catch_unwind(AssertUnwindSafe(|| Game::open(seed, naive).map(Game::run)));
-    let broken = |what: String| Outcome { findings: vec![what], ..Outcome::default() };
-    match run {
-        Ok(Ok(outcome)) => outcome,
-        Ok(Err(error)) => broken(format!("the room could not be opened: {error:#}")),
-        Err(panic) => {
-            let text = panic.downcast_ref::<String>().cloned();
-            let text = text.or_else(|| panic.downcast_ref::<&str>().map(|s| (*s).to_owned()));
-            broken(format!("panicked: {}", text.unwrap_or_default()))
-        }
-    }
+    outcome_of(|| Game::open(seed, naive).map(Game::run))
 }
 
 /// What a player of this number can name.
@@ -289,34 +278,12 @@ impl Metrics {
 fn one_seed_of_robots_that_behave_badly_keeps_every_law() {
     let seed = number("MIDSHIFT_SIM_SEED").unwrap_or(1);
     let outcome = run(seed, crate::naive_of(&std::env::var("MIDSHIFT_SIM_NAIVE").unwrap_or_default()));
-    say(&format!("seed {seed} hash {:016x} lasted {} ms", outcome.hash, outcome.lasted_ms));
-    outcome.checks.iter().for_each(|(name, n)| say(&format!("check {n} {name}")));
-    outcome.counts.iter().for_each(|(name, n)| say(&format!("count {n} {name}")));
-    outcome.hits.iter().for_each(|(name, n)| say(&format!("hit {n} {name}")));
-    outcome.planned.iter().for_each(|(name, n)| say(&format!("planned {n} {name}")));
-    assert!(outcome.findings.is_empty(), "seed {seed}: {:#?}", outcome.findings);
+    report_seed(seed, &outcome);
 }
 
 #[test]
 fn many_seeds_of_robots_that_behave_badly_keep_every_law() {
-    let first = number("MIDSHIFT_SEED_FROM").unwrap_or(1);
-    let many = number("MIDSHIFT_SEEDS").unwrap_or(SEEDS);
-    let (broken, sums) = (Mutex::new(Vec::new()), Mutex::new(BTreeMap::new()));
-    each(ONE, first..first + many, "", |seed, text, held| {
-        add_up(&mut sums.lock().expect("no thread panics with it"), text);
-        if !held {
-            say(text);
-            broken.lock().expect("no thread panics with it").push(seed);
-        }
-        false
-    });
-    let (broken, sums) = (broken.into_inner(), sums.into_inner());
-    let (broken, sums) = (broken.expect("no thread panics with it"), sums.expect("no thread panics with it"));
-    assert!(
-        broken.is_empty(),
-        "again: MIDSHIFT_SIM_SEED=N cargo test --workspace --test simulation played::one_seed; broken: {broken:?}"
-    );
-    sums.iter().for_each(|(name, n)| say(&format!("{n:>10} {name}")));
+    let (many, sums) = every_seed_holds(ONE, "played::one_seed", SEEDS);
     let looked = LAWS.iter().map(|law| format!("check {law}"));
     let met = Habit::ALL.iter().map(|habit| format!("hit {}", habit.name()));
     let never: Vec<String> = looked.chain(met).filter(|name| sums.get(name).copied().unwrap_or(0) == 0).collect();

@@ -44,7 +44,12 @@ pub struct Outcome {
 
 /// Runs a seed.
 pub fn run(seed: u64, naive: Naive) -> Outcome {
-    let run = catch_unwind(AssertUnwindSafe(|| Shift::open(seed, naive).map(Shift::run)));
+    outcome_of(|| Shift::open(seed, naive).map(Shift::run))
+}
+
+/// Plays a seed to its end; a room that does not open and a panic are findings.
+pub fn outcome_of(play: impl FnOnce() -> anyhow::Result<Outcome>) -> Outcome {
+    let run = catch_unwind(AssertUnwindSafe(play));
     let broken = |what: String| Outcome { findings: vec![what], ..Outcome::default() };
     match run {
         Ok(Ok(outcome)) => outcome,
