@@ -30,6 +30,10 @@ pub const TIMER_GRACE: LinkDuration = LinkDuration::from_secs(10);
 pub const STALL_DEFAULT: SiteDuration = SiteDuration::from_secs(60);
 /// Being ready this long promotes a task by one class; a person is asked if no known robot could ever do it.
 pub const MAX_WAIT: SiteDuration = SiteDuration::from_secs(15 * 60);
+/// What stands this long without a reason that anybody could tell is counted as unexplained. Link clock.
+pub const UNEXPLAINED_AFTER: LinkDuration = LinkDuration::from_secs(10);
+/// Robots, and as many tasks, that are looked at for that in one sweep: a few filters each, well below a millisecond.
+pub const UNEXPLAINED_LOOKS: usize = 32;
 /// A task that waits for a robot this long is a backlog that people should know of, whatever its class.
 pub const BACKLOG_AGE: SiteDuration = SiteDuration::from_secs(3_600);
 /// The incident of a backlog opens again no sooner after it closed: an age that swings around the bound is one matter.

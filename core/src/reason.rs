@@ -131,7 +131,7 @@ codes! {
     SoftwareTooOld = "SOFTWARE_TOO_OLD", "The robot's software is older than the task asks for.";
     RobotOffline = "ROBOT_OFFLINE", "No heartbeat for 31 s or never connected. Look at its network and power.";
     RobotSuspect = "ROBOT_SUSPECT", "No heartbeat for 3 s; it gets no new work until it is heard again.";
-    RobotManual = "ROBOT_MANUAL", "The robot is in manual or service mode.";
+    RobotManual = "ROBOT_MANUAL", "The robot is in manual or service mode: a person drives it. Bring it back to automatic mode at the robot.";
     RobotCordoned = "ROBOT_CORDONED", "A person took the robot out of dispatch. Uncordon it.";
     RobotBrokenOff = "ROBOT_BROKEN_OFF", "Three failed attempts in ten minutes took the robot out of dispatch. Look at it, then uncordon it.";
     RobotDraining = "ROBOT_DRAINING", "The robot is taken out of work for maintenance. It gets work again when its drain is released.";
@@ -141,7 +141,7 @@ codes! {
     RobotBusy = "ROBOT_BUSY", "The robot has other work.";
     RobotReconciling = "ROBOT_RECONCILING", "The robot's report differs from the record; it gets work once they agree.";
     RobotObserved = "ROBOT_OBSERVED", "Two sessions claim this robot id. This one is watched and gets no work.";
-    RobotLoaded = "ROBOT_LOADED", "The robot carries something that is not of this task.";
+    RobotLoaded = "ROBOT_LOADED", "The robot carries something that is not of this task. Take it off at the robot.";
     RobotFault = "ROBOT_FAULT", "The robot reports a fault that a person must look at.";
     RobotUnlocated = "ROBOT_UNLOCATED", "The robot has not reported a waypoint of this site.";
     BatteryLow = "BATTERY_LOW", "The charge does not reach pickup, drop and a charger with its reserve.";
@@ -168,6 +168,9 @@ codes! {
     WaitingForTime = "WAITING_FOR_TIME", "Its not_before lies ahead.";
     WaitingForHold = "WAITING_FOR_HOLD", "A hold token stands on the task. Resume it.";
     WaitingInQueue = "WAITING_IN_QUEUE", "Tasks of higher priority or age go first.";
+    WaitingForAnswer = "WAITING_FOR_ANSWER", "The robot was offered it and has not answered yet. Without an answer the offer ends by itself.";
+    WaitingForStop = "WAITING_FOR_STOP", "The robot was told to end it and has not confirmed that yet.";
+    WorksOnStep = "WORKS_ON_STEP", "The robot works on a step of it.";
     WaitingForRetry = "WAITING_FOR_RETRY", "It failed and waits out its back-off.";
     DependencyFailed = "DEPENDENCY_FAILED", "A task it depends on ended without success.";
     NoRobotAccepts = "NO_ROBOT_ACCEPTS", "Five robots in a row refused it.";

@@ -1,12 +1,13 @@
 //! Why a task is not running and why a robot has no work: the planner's own filters, run again for one of them. Stores nothing.
 
+use super::standing::{self, WAITS_FOR};
 use super::view::View;
-use super::{Board, screen, starts, way};
+use super::{Board, screen, way};
 use crate::ids::{RobotId, TaskId};
 use crate::reason::{Code, Reason};
-use crate::task::Phase;
+use crate::task::{Phase, TaskState};
 use crate::time::Now;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 /// Candidates listed one by one; the others only by reason.
 const CANDIDATES_MAX: usize = 64;
@@ -67,15 +68,26 @@ pub fn task(view: &View, board: &Board, now: &Now, task_id: &TaskId) -> Option<T
     });
     let eligible = candidates.iter().any(|c| c.reason.is_none());
     candidates.truncate(CANDIDATES_MAX);
-    let own = screen::task(view, board, task, intake, now).err().filter(|_| waits);
-    let verdict = match (own, waits, eligible, task.phase) {
-        (Some(reason), ..) => Some(reason),
-        (None, true, false, _) => Some(waits_for_turn(view, task_id, now, Code::WaitingForRobot)),
-        (None, true, true, _) => Some(waits_for_turn(view, task_id, now, Code::WaitingInQueue)),
-        (None, false, _, Phase::Running) => task.robot_id.as_ref().and_then(|r| place_wait(view, r)),
-        (None, false, ..) => task.reason.clone(),
-    };
+    let code = if eligible { Code::WaitingInQueue } else { Code::WaitingForRobot };
+    let turn = || waits_for_turn(view, task_id, now, code).with(WAITS_FOR, nearest(&candidates));
+    let verdict = standing::of_task(view, board, now, task, intake).or_else(|| waits.then(turn));
+    let verdict = verdict.or_else(|| task.reason.clone());
     Some(TaskExplanation { position, verdict, candidates, filtered })
+}
+
+/// How a task ended.
+pub fn ended(task: &TaskState) -> TaskExplanation {
+    let verdict = Some(standing::ended(task));
+    TaskExplanation { position: None, verdict, candidates: Vec::new(), filtered: BTreeMap::new() }
+}
+
+/// The robot that a task waits for, and what keeps that one.
+fn nearest(candidates: &[RobotCandidate]) -> String {
+    match candidates.first() {
+        Some(RobotCandidate { robot_id, reason: Some(why), .. }) => format!("robot {robot_id}: {}", why.code),
+        Some(candidate) => format!("robot {}", candidate.robot_id),
+        None => "a robot: none has connected".to_owned(),
+    }
 }
 
 /// Why a ready task waits, since when, and what waiting has brought it.
@@ -87,31 +99,6 @@ fn waits_for_turn(view: &View, task_id: &TaskId, now: &Now, code: Code) -> Reaso
     }
     let told = format!("{} Promoted to class {class} after {minutes} min of waiting.", code.help());
     Reason::new(code, told).with("class", class).with("ready_since", rank.since.rfc3339())
-}
-
-/// Which places the robot waits for, who has them, and for whom they are kept. None: it waits for none.
-pub fn place_wait(view: &View, robot_id: &RobotId) -> Option<Reason> {
-    let wait = view.waits.get(robot_id)?;
-    let others = |ids: BTreeSet<&RobotId>| {
-        let others = ids.into_iter().filter(|id| *id != robot_id);
-        others.map(RobotId::as_str).collect::<Vec<_>>().join(" ")
-    };
-    let rows = wait.places.iter().filter_map(|id| view.places.get(id.as_str()));
-    let held_by = others(rows.flat_map(|place| &place.row.holders).map(|holder| &holder.robot_id).collect());
-    let known = wait.places.iter().filter_map(|id| view.site.find_place(id));
-    let kept_for = others(known.flat_map(|place| starts::awaited(view, place)).collect());
-    let message = match (held_by.is_empty(), kept_for.is_empty()) {
-        (true, false) => "waits for a place that is kept for a robot that starts there and was not heard yet",
-        _ => "waits for a place that another robot holds",
-    };
-    let places = wait.places.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ");
-    let mut reason = Reason::new(Code::PlaceBlocked, message).with("places", places);
-    for (key, robots) in [("held_by", held_by), ("kept_for", kept_for)] {
-        if !robots.is_empty() {
-            reason = reason.with(key, robots);
-        }
-    }
-    Some(reason)
 }
 
 /// Why one task does not go to the robot.
@@ -128,10 +115,8 @@ pub struct TaskCandidate {
 /// Why a robot has no work, or what it does.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RobotExplanation {
-    /// None: it may be given work.
+    /// What it does or waits for. None: it may be given work.
     pub verdict: Option<Reason>,
-    /// Places it waits for, and who has them. None: it waits for none.
-    pub place_wait: Option<Reason>,
     /// Waiting tasks in the order in which they are served.
     pub candidates: Vec<TaskCandidate>,
 }
@@ -153,9 +138,19 @@ pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Optio
         let distance_mm = at.zip(goal).and_then(|(at, goal)| view.router.distance_mm(at, goal));
         Some(TaskCandidate { task_id: task_id.clone(), reason, distance_mm })
     });
-    Some(RobotExplanation {
-        verdict: screen::robot(view, board, robot_id, now).err(),
-        place_wait: place_wait(view, robot_id),
-        candidates: candidates.collect(),
-    })
+    let kept = || screen::robot(view, board, robot_id, now).err().or_else(|| carries(view, board, robot_id));
+    let verdict = standing::of_robot(view, board, now, robot_id).or_else(kept);
+    let verdict = verdict.map(|why| standing::about_robot(why, robot_id));
+    Some(RobotExplanation { verdict, candidates: candidates.collect() })
+}
+
+/// The robot carries what is of no task that waits for it.
+fn carries(view: &View, board: &Board, robot_id: &RobotId) -> Option<Reason> {
+    let load = board.get(robot_id)?.report.load.as_ref()?;
+    let waits = |id: &TaskId| view.task(id).is_some_and(|task| task.opened.as_ref().is_none_or(|r| r == robot_id));
+    if load.task_id.as_ref().is_some_and(waits) {
+        return None;
+    }
+    let reason = Reason::from(Code::RobotLoaded).with("item", &load.item);
+    Some(load.task_id.iter().fold(reason, |reason, task_id| reason.with("task_id", task_id)))
 }

@@ -2,7 +2,7 @@
 //!
 //! [`cycle`] takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
 //! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `plausible`, `claims`, `answers`, `commands` (`asked`: which there are) are what happens; `tasks` moves tasks by
-//! the table; `heard`, `anchor`, `attempts`, `incidents` and `refused` are what they share; `queue`, `screen`, `pool` and `assign` give work, in turns cut by `slice`; `stops` and `stopped` keep it from who is stopped; `starts` keeps places for robots that are to come; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `explain` says why not.
+//! the table; `heard`, `anchor`, `attempts`, `incidents` and `refused` are what they share; `queue`, `screen`, `pool` and `assign` give work, in turns cut by `slice`; `stops` and `stopped` keep it from who is stopped; `starts` keeps places for robots that are to come; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `standing` says what is done or waited for, `explain` tells people, `unexplained` counts what nobody can say.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod anchor;
@@ -33,12 +33,14 @@ pub mod requests;
 pub mod rows;
 pub mod screen;
 pub mod slice;
+pub mod standing;
 pub mod starts;
 pub mod stopped;
 pub mod stops;
 pub mod sweep;
 pub mod tasks;
 pub mod timers;
+pub mod unexplained;
 pub mod view;
 pub mod way;
 
@@ -94,6 +96,8 @@ pub struct Report {
     pub waiting: BTreeMap<Code, u64>,
     /// Counts.
     pub tally: Tally,
+    /// Robots and tasks that stand for long without a reason, once each; logged.
+    pub unexplained: Vec<String>,
     /// Rows or entries that could not be read; each was passed over and is logged.
     pub unreadable: Vec<String>,
 }
@@ -367,6 +371,10 @@ pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Pl
     let releases = places::advance(view, board, now, plan);
     plan.slice.renew();
     write_down(view, now, board, &releases, plan);
+    if pace == Pace::Sweep {
+        plan.slice.renew();
+        unexplained::look(view, board, now, plan);
+    }
     if !plan.items.is_empty() {
         tell_time(view, now, plan);
     }

@@ -126,6 +126,15 @@ fn is_released(view: &View, robot_id: &RobotId, a: &Attempt) -> bool {
     work.released_index.is_some_and(|r| r >= end) || next_segment(view, robot_id, a, work).is_none()
 }
 
+/// The robot stands at the end of what was released to it, and there is more that could be.
+pub fn is_out_of_route(view: &View, live: &Live, a: &Attempt) -> bool {
+    let Some(work) = assignment(view, &live.robot_id, a) else { return false };
+    let Some(listed) = live.report.attempts.iter().find(|r| r.attempt == a.attempt) else { return false };
+    let released = work.released_index.unwrap_or(0);
+    let stands = live.report.vitals.speed_mm_s == 0 && listed.route_index >= released;
+    stands && !is_released(view, &live.robot_id, a)
+}
+
 /// The next stretch to release, if it is time for it: not before the step behind the last one is done, and at most one ahead.
 fn next_segment(view: &View, robot_id: &RobotId, a: &Attempt, work: &Assignment) -> Option<Segment> {
     let route = way::indices(&view.site, &work.route)?;

@@ -5,7 +5,7 @@
 use super::queue::Wait;
 use super::rows::RobotHolder;
 use super::view::View;
-use super::{Board, Slice, claims, heard, load, plausible, way};
+use super::{Board, Slice, claims, heard, load, plausible, standing, way};
 use crate::ids::{RobotId, Subject};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -92,7 +92,10 @@ pub(super) fn reported(live: &Live) -> Result<(), Reason> {
     if r.mode != Mode::Automatic {
         return Err(Code::RobotManual.into());
     }
-    if r.hardware_stop != HardwareStop::None || r.stop_level >= StopLevel::Halt {
+    if r.hardware_stop != HardwareStop::None {
+        return Err(standing::stopped_by_itself(r.hardware_stop));
+    }
+    if r.stop_level >= StopLevel::Halt {
         return Err(Code::RobotStopped.into());
     }
     match &r.fault {

@@ -144,6 +144,8 @@ pub struct View {
     pub unwilling: BTreeMap<RobotId, crate::time::LinkTime>,
     /// Offers that robots did not answer. Volatile.
     pub answers: super::answers::Answers,
+    /// What stands without a reason. Volatile.
+    pub unexplained: super::unexplained::Unexplained,
     /// The attempt that a robot lists and no row knows, and since when, link clock. Volatile.
     pub unknown: BTreeMap<RobotId, (AttemptId, crate::time::LinkTime)>,
     /// Time in which robots were heard since it was last counted. Volatile.
@@ -464,6 +466,7 @@ impl View {
             unwilling: BTreeMap::new(),
             answers: super::answers::Answers::default(),
             unknown: BTreeMap::new(),
+            unexplained: super::unexplained::Unexplained::default(),
             attached: BTreeMap::new(),
             place_waits: 0,
             compared: BTreeMap::new(),

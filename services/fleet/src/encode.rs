@@ -165,7 +165,7 @@ pub fn task_explanation(task_id: &TaskId, e: &TaskExplanation, now: Utc) -> v1::
 pub fn robot_explanation(view: &View, now: &Now, robot_id: &RobotId, e: &RobotExplanation) -> v1::RobotExplanation {
     v1::RobotExplanation {
         robot_id: robot_id.to_string(),
-        verdict: e.place_wait.as_ref().or(e.verdict.as_ref()).map(shown),
+        verdict: e.verdict.as_ref().map(shown),
         candidates: e
             .candidates
             .iter()

@@ -9,7 +9,9 @@ use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{AreaId, AttemptId, PlaceId, RobotId, Subject, TaskId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
-use midshift_core::rows::Revision;
+use midshift_core::rows::{Key, Revision, Table};
+use midshift_core::task::{TaskIntake, TaskState};
+use midshift_core::time::Utc;
 use midshift_proto::access::caller;
 use midshift_proto::convert::fleet::encode_policy;
 use midshift_proto::convert::ms_of;
@@ -231,16 +233,39 @@ impl FleetService {
 
     async fn why_task(&self, r: v1::ExplainTaskRequest, by: &Caller) -> Result<v1::ExplainTaskResponse, Refusal> {
         let task_id = TaskId::parse(&r.task_id).map_err(|e| Refusal::field("task_id", e.to_string()))?;
-        let by = by.clone();
-        let found = self
+        let (asked, reader) = (task_id.clone(), by.clone());
+        let (found, now) = self
             .look(move |view, board, now| {
-                let mut found = explain::task(view, board, now, &task_id).filter(|_| sees_task(view, &by, &task_id))?;
-                found.candidates.retain(|c| sees_robot(view, board, &by, &c.robot_id));
-                Some(encode::task_explanation(&task_id, &found, now.utc))
+                let found = explain::task(view, board, now, &asked).filter(|_| sees_task(view, &reader, &asked));
+                let found = found.map(|mut found| {
+                    found.candidates.retain(|c| sees_robot(view, board, &reader, &c.robot_id));
+                    encode::task_explanation(&asked, &found, now.utc)
+                });
+                (found, now.utc)
             })
             .await?;
-        let explanation = found.ok_or_else(|| not_found(Code::TaskNotFound, &r.task_id))?;
+        let explanation = match found {
+            Some(found) => found,
+            None => self.why_ended(&task_id, by, now).await?,
+        };
         Ok(v1::ExplainTaskResponse { explanation: Some(explanation) })
+    }
+
+    /// How a task ended: the picture has let it go, the store has not.
+    async fn why_ended(&self, task_id: &TaskId, by: &Caller, now: Utc) -> Result<v1::TaskExplanation, Refusal> {
+        let missing = || not_found(Code::TaskNotFound, task_id);
+        let keys = [Table::TaskState, Table::TaskIntake].map(|table| Key::new(table, task_id.as_str()));
+        let unread = |_| Refusal::new(Kind::Unavailable, Code::StoreUnavailable);
+        let rows = self.store.get(keys.to_vec()).await.map_err(unread)?;
+        let of = |table| rows.iter().find(|row| row.key.table == table).ok_or_else(missing);
+        let task: TaskState = of(Table::TaskState)?.decode().map_err(|_| internal())?;
+        let intake: TaskIntake = of(Table::TaskIntake)?.decode().map_err(|_| internal())?;
+        let areas = self.site.areas_of_task(&intake.spec);
+        let sees = by.may_everywhere(Permission::Read) || by.may_over(Permission::Read, &areas);
+        if !sees || !task.phase.is_terminal() {
+            return Err(missing());
+        }
+        Ok(encode::task_explanation(task_id, &explain::ended(&task), now))
     }
 
     async fn why_robot(&self, r: v1::ExplainRobotRequest, by: &Caller) -> Result<v1::ExplainRobotResponse, Refusal> {

@@ -67,6 +67,8 @@ enum Request {
 #[derive(Clone)]
 pub struct FleetService {
     requests: mpsc::Sender<Request>,
+    store: Arc<dyn Store>,
+    site: Arc<Site>,
 }
 
 /// The part that runs.
@@ -79,7 +81,8 @@ impl FleetService {
     /// The face and the part that runs behind it.
     pub fn new(parts: Parts) -> (Self, Reconciler) {
         let (sender, requests) = mpsc::channel(REQUESTS_MAX);
-        (Self { requests: sender }, Reconciler { parts, requests })
+        let (store, site) = (parts.store.clone(), parts.site.clone());
+        (Self { requests: sender, store, site }, Reconciler { parts, requests })
     }
     /// The gRPC face.
     pub fn grpc(&self) -> FleetServiceServer<Self> {

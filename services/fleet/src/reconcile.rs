@@ -488,6 +488,10 @@ fn publish(plan: &Plan, view: &View, pace: Pace) {
     metrics::counter!("midshift_fleet_fenced_reports_total").increment(report.tally.fenced);
     metrics::counter!("midshift_fleet_stale_authority_total").increment(report.tally.stale_authority);
     metrics::counter!("midshift_fleet_repairs_total").increment(report.tally.repaired);
+    metrics::counter!("midshift_fleet_unexplained_total").increment(report.unexplained.len() as u64);
+    for what in &report.unexplained {
+        tracing::error!(what, "nobody can say why this does not move on");
+    }
     for text in &report.unreadable {
         tracing::error!(text, "fleet passed over something it cannot read");
     }

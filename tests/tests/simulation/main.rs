@@ -8,8 +8,10 @@ mod body;
 mod changes;
 mod client;
 mod clock;
+mod counted;
 mod directed;
 mod disk;
+mod incidents;
 mod laws;
 mod naive;
 mod net;
@@ -69,7 +71,9 @@ const COUNTS: [&str; 12] = [
     "program hung",
 ];
 /// Every law, by the name under which it is looked at.
-const LAWS: [&str; 34] = [
+const LAWS: [&str; 36] = [
+    counted::TOLD,
+    incidents::NOT_BLAMED,
     "I1 no client is refused",
     "I1 one task a request",
     "I2 epochs rise",

@@ -4,6 +4,8 @@
 //! holds in all of it; of players only what robots are free to say is left out.
 
 use crate::client::Wish;
+use crate::counted::{self, Counted, TOLD};
+use crate::incidents::{self, ASKED};
 use crate::observer::{Observer, ready};
 use crate::orders::Order;
 use crate::plan::background;
@@ -39,11 +41,12 @@ const END_WITHIN_MS: u64 = 400_000;
 const LOOK_AFTER_MS: u64 = 10_000;
 
 /// Laws beyond those of the witness, by the name under which each is looked at.
-const LAWS: [&str; 4] = [GOES_ON, BUILT_ANEW, REFUSED, BOUNDED];
+const LAWS: [&str; 7] = [GOES_ON, BUILT_ANEW, REFUSED, BOUNDED, TOLD, ASKED, ONCE];
 const GOES_ON: &str = "honest robots' tasks go on";
 const BUILT_ANEW: &str = "the planner is built anew only after a conflict";
 const REFUSED: &str = "what the store refuses for good is not composed again";
 const BOUNDED: &str = "memory is bounded";
+const ONCE: &str = "nobody's work is given twice";
 /// Laws that do not hold yet. They are looked at and counted as `open`, and are asserted once what is missing is there.
 ///
 /// Missing: fleet builds its picture anew when the store refuses an item, up to twice for one decision, before it puts the decision aside.
@@ -144,7 +147,11 @@ impl Game {
 
     fn play(&mut self) -> anyhow::Result<()> {
         let play_ms = self.play_ms;
-        self.room.until("the game to be over", 2 * play_ms, |room| room.now_ms() >= play_ms)?;
+        while self.room.now_ms() < play_ms {
+            let round_ms = (self.room.now_ms() + LOOK_AFTER_MS).min(play_ms);
+            self.room.until("one round of the game", 2 * LOOK_AFTER_MS, |room| room.now_ms() >= round_ms)?;
+            incidents::are_open(&self.room.store, &mut self.room.observer.look());
+        }
         for number in 0..self.players.len() {
             self.room.sim.crash(player_machine(number));
         }
@@ -165,6 +172,7 @@ impl Game {
                 is_over = room.desk.is_empty() && all_over;
                 is_over || room.now_ms() >= round_ms
             })?;
+            incidents::are_open(&self.room.store, &mut self.room.observer.look());
             if is_over {
                 return Ok(());
             }
@@ -212,7 +220,7 @@ impl Game {
     fn judge(&self) {
         let verdict = self.room.hall.verdict();
         let drops = midshift_sim::world::lock(&self.room.hall.worlds()[0]).oracle().drops_by_task();
-        let metrics = Metrics::now();
+        let metrics = Counted::now();
         let mut seen = self.room.observer.look();
         match verdict {
             Ok(verdict) => {
@@ -233,6 +241,10 @@ impl Game {
         let conflicts = metrics.sum("midshift_fleet_items_lost_total", "conflict=\"true\"");
         let rebuilds = metrics.sum("midshift_fleet_rebuilds_total", "");
         look(&mut seen, BUILT_ANEW, rebuilds <= 1 + conflicts, || format!("{rebuilds} times, {conflicts} conflicts"));
+        for (task_id, times) in &drops {
+            look(&mut seen, ONCE, *times <= 1, || format!("the item of {task_id} was put down {times} times"));
+        }
+        counted::nothing_stands_unexplained(&mut seen);
         for (table, rows) in self.rows() {
             look(&mut seen, BOUNDED, rows <= ROWS_MAX, || format!("{table} has {rows} rows"));
             *seen.peak(format!("rows of {table}")) = rows as u64;
@@ -257,21 +269,6 @@ fn look(seen: &mut Observer, law: &'static str, holds: bool, what: impl FnOnce()
         return seen.count(format!("open: {law}"));
     }
     seen.check(law, holds, what);
-}
-
-/// What the server counted of itself.
-struct Metrics(String);
-
-impl Metrics {
-    fn now() -> Self {
-        Self(midshift::recorder::handle().map(|handle| handle.render()).unwrap_or_default())
-    }
-    /// Sum over all labels that have `label`.
-    fn sum(&self, name: &str, label: &str) -> u64 {
-        let of_name = |line: &&str| line.starts_with(name) && !line.starts_with('#') && line.contains(label);
-        let value = |line: &str| line.rsplit(' ').next().and_then(|n| n.parse::<f64>().ok()).unwrap_or(0.0) as u64;
-        self.0.lines().filter(of_name).map(value).sum()
-    }
 }
 
 #[test]

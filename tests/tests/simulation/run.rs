@@ -2,7 +2,9 @@
 
 use crate::agent::machine;
 use crate::client::Wish;
+use crate::counted;
 use crate::disk::Mood;
+use crate::incidents;
 use crate::net::{SERVER, Way};
 use crate::orders::Order;
 use crate::plan::{Deed, Fault, Plan, ROBOTS};
@@ -82,6 +84,8 @@ struct Shift {
 
 impl Shift {
     fn open(seed: u64, naive: Naive) -> anyhow::Result<Self> {
+        // Counters are counted from the first on.
+        midshift::recorder::handle();
         let plan = Plan::draw(seed, &*site()?)?;
         let faults = FaultRates { jam_per_action: 0.0, silence_per_hour: 0.0, ..FaultRates::default() };
         let config = RoomConfig {
@@ -225,6 +229,8 @@ impl Shift {
         let refused = self.room.desk.refused.borrow();
         let drops = midshift_sim::world::lock(&self.room.hall.worlds()[0]).oracle().drops_by_task();
         let mut seen = self.room.observer.look();
+        counted::nothing_stands_unexplained(&mut seen);
+        incidents::nobody_is_blamed(&self.room.store, &mut seen);
         seen.check("I8 every task ends", true, String::new);
         seen.changes_ended();
         seen.check("I3 items are conserved", verdict.items_conserved(), || format!("{verdict:?}"));

@@ -2,11 +2,13 @@
 
 mod backlog;
 mod order;
+mod unexplained;
 
 use super::view::{Rowed, View};
 use super::{Board, Pace, Plan, cycle};
-use crate::ids::{RobotId, TaskId, WaypointId};
-use crate::robot::{Inventory, ReportedState, Vitals};
+use crate::ids::{AttemptId, RobotId, TaskId, WaypointId};
+use crate::reason::Reason;
+use crate::robot::{Inventory, ReportedAttempt, ReportedState, Vitals, WorkState};
 use crate::rows::{Item, Record, Revision, Row, Write};
 use crate::site::{CORRIDOR, text};
 use crate::task::forms::Transport;
@@ -134,6 +136,20 @@ impl Rig {
         let mut plan = Plan::default();
         cycle(&mut self.view, self.now, &self.board, pace, &mut plan);
         plan
+    }
+
+    /// The robot lists an attempt, at a step and a point of its route.
+    fn says(&mut self, robot_id: &RobotId, attempt: &AttemptId, state: WorkState, step_index: u32, route_index: u32) {
+        let live = Arc::make_mut(self.board.get_mut(robot_id).expect("a robot"));
+        let attempt = attempt.clone();
+        let listed = ReportedAttempt { attempt, state, step_index, progress: 1, route_index, opened: false };
+        live.report.attempts = vec![listed];
+    }
+
+    /// Why a task is where it is.
+    fn why(&self, task_id: &TaskId) -> Option<Reason> {
+        let (task, intake) = self.view.task(task_id).zip(self.view.intake(task_id)).expect("a task");
+        super::standing::of_task(&self.view, &self.board, &self.now, task, intake)
     }
 
     fn task(&self, id: &str) -> &TaskState {

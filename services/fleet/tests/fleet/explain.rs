@@ -3,9 +3,10 @@
 use crate::harness::World;
 use midshift_core::fleet::rows::HolderState;
 use midshift_core::reason::Code;
-use midshift_core::robot::Load;
+use midshift_core::robot::{HardwareStop, Load, Mode};
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;
+use midshift_proto::common::v1::Reason;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
 use tonic::Request;
@@ -85,10 +86,103 @@ async fn the_robot_has_too_little_charge_or_a_person_drives_it() {
     w.submit("T1", "A", "B").await;
     w.pass(3).await;
     assert_eq!(why(&w, "T1").await, codes(Code::WaitingForRobot, "BATTERY_LOW"));
-    let ask = v1::ExplainRobotRequest { robot_id: "r1".to_owned() };
+    assert_eq!(of_robot(&w, "r1").await.code, "WORKS_ON_STEP", "it charges");
+}
+
+/// The verdict of a robot.
+async fn of_robot(w: &World, robot_id: &str) -> Reason {
+    let ask = v1::ExplainRobotRequest { robot_id: robot_id.to_owned() };
     let told = w.fleet.explain_robot(Request::new(ask)).await.expect("an explanation").into_inner();
-    let verdict = told.explanation.expect("an explanation").verdict.expect("a verdict").code;
-    assert_eq!(verdict, "ROBOT_BUSY", "it charges");
+    told.explanation.expect("an explanation").verdict.expect("a verdict")
+}
+
+/// The verdict of a task.
+async fn of_task(w: &World, task_id: &str) -> Reason {
+    let ask = v1::ExplainTaskRequest { task_id: task_id.to_owned() };
+    let told = w.fleet.explain_task(Request::new(ask)).await.expect("an explanation").into_inner();
+    told.explanation.expect("an explanation").verdict.expect("a verdict")
+}
+
+/// The code of both verdicts, which agree, and what both wait for.
+async fn of_both(w: &World, task_id: &str, robot_id: &str) -> (String, String) {
+    let (task, robot) = (of_task(w, task_id).await, of_robot(w, robot_id).await);
+    let told = |reason: &Reason| (reason.code.clone(), reason.metadata.get("waits_for").cloned().unwrap_or_default());
+    assert_eq!(told(&task), told(&robot), "{task:?} {robot:?}");
+    told(&task)
+}
+
+fn pair(code: &str, waits_for: &str) -> (String, String) {
+    (code.to_owned(), waits_for.to_owned())
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_attempt_is_told_as_its_robot_answers_works_is_stopped_and_driven_by_hand() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").works = false;
+    w.submit("T1", "A", "B").await;
+    w.until_phase("T1", Phase::Running).await;
+    w.pass(2).await;
+    assert_eq!(of_both(&w, "T1", "r1").await.0, "WORKS_ON_STEP");
+    w.r("r1").set_hardware_stop(HardwareStop::Manual);
+    w.pass(3).await;
+    assert_eq!(of_both(&w, "T1", "r1").await.1, "a person at robot r1");
+    assert!(of_task(&w, "T1").await.message.contains("own safety system"), "{:?}", of_task(&w, "T1").await);
+    w.r("r1").set_hardware_stop(HardwareStop::None);
+    w.pass(3).await;
+    assert_eq!(of_both(&w, "T1", "r1").await.1, "a person's resume");
+    w.resume("r1").await;
+    w.r("r1").set_mode(Mode::Manual);
+    w.pass(3).await;
+    assert_eq!(of_both(&w, "T1", "r1").await, pair("MANUAL_MODE", "a person at robot r1"));
+    w.r("r1").set_mode(Mode::Automatic);
+    w.pass(3).await;
+    w.r("r1").cut();
+    w.pass(5).await;
+    assert_eq!(of_both(&w, "T1", "r1").await, pair("ROBOT_SUSPECT", "robot r1"));
+    w.pass(40).await;
+    let (code, waits_for) = of_both(&w, "T1", "r1").await;
+    assert_eq!((code.as_str(), waits_for.as_str()), ("LEASE_OVER", "robot r1"));
+    assert!(of_task(&w, "T1").await.metadata.contains_key("uncertain_since"));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_task_that_ended_is_told_with_how_and_when_and_by_whom() {
+    let mut w = World::on(CORRIDOR).await;
+    w.submit("T1", "A", "B").await;
+    w.pass(1).await;
+    w.cancel("T1", false).await;
+    w.until_phase("T1", Phase::Canceled).await;
+    w.pass(2).await;
+    let told = of_task(&w, "T1").await;
+    assert_eq!((told.code.as_str(), told.metadata["state"].as_str()), ("TASK_ENDED", "CANCELED"));
+    assert_eq!(told.metadata["cause"], "CANCELED_BY_USER");
+    assert!(!told.metadata["end_time"].is_empty() && told.metadata.contains_key("actor"), "{told:?}");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_with_a_load_of_nobody_waits_for_a_person() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").load = Some(Load { task_id: None, item: "a box of somebody".to_owned() });
+    w.pass(10).await;
+    let told = of_robot(&w, "r1").await;
+    assert_eq!((told.code.as_str(), told.metadata["waits_for"].as_str()), ("ROBOT_LOADED", "a person at robot r1"));
+    assert_eq!(told.metadata["item"], "a box of somebody");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_waits_for_a_place_names_its_holder() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "B").await;
+    w.robot("r2", "park-a").await;
+    w.r("r1").drives = false;
+    w.submit_with("T2", "A", "B", |raw| raw.robot_id = "r2".to_owned()).await;
+    w.until("r2 is in A", |s| s.holders("A") == [("r2".to_owned(), HolderState::Inside)]).await;
+    w.pass(15).await;
+    let (code, waits_for) = of_both(&w, "T2", "r2").await;
+    assert_eq!(code, "PLACE_BLOCKED");
+    assert!(waits_for.contains("B") && waits_for.contains("r1"), "{waits_for}");
 }
 
 #[tokio::test(start_paused = true)]

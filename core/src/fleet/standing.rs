@@ -1,0 +1,301 @@
+//! Says of tasks, attempts and robots what they do, or what they wait for.
+//!
+//! Invariants:
+//! 1. A reason that waits has the fact [`WAITS_FOR`]: a place with its holder, a robot, a person, a task, a stop, or a time.
+//! 2. A reason without it has the code [`Code::WorksOnStep`].
+//!
+//! Called by `explain` for people, and by `unexplained`, which counts what has no reason.
+
+use super::queue::Wait;
+use super::rows::RobotHolder;
+use super::stops::Hold;
+use super::view::View;
+use super::{Board, claims, heard, places, plausible, screen, starts, stopped};
+use crate::ids::{PlaceId, RobotId};
+use crate::reason::{Code, Reason};
+use crate::robot::{HardwareStop, Mode, Presence, WorkState};
+use crate::task::{Attempt, AttemptPhase, Phase, TaskIntake, TaskState};
+use crate::time::{Now, Utc};
+use crate::work::Live;
+use std::collections::BTreeSet;
+
+/// The fact of a reason that names what is waited for.
+pub const WAITS_FOR: &str = "waits_for";
+
+/// Whether a reason says what is done, or names what it waits for.
+pub fn is_told(reason: &Reason) -> bool {
+    reason.code == Code::WorksOnStep || reason.metadata.get(WAITS_FOR).is_some_and(|what| !what.is_empty())
+}
+
+/// Why a task that has not ended is where it is. None: nothing is in its way but the choice of a robot, or nobody can say.
+pub fn of_task(view: &View, board: &Board, now: &Now, task: &TaskState, intake: &TaskIntake) -> Option<Reason> {
+    match task.phase {
+        Phase::Queued => queued(view, board, now, task, intake),
+        Phase::RetryWait => {
+            let until = task.retry_at.map_or_else(|| "its back-off".to_owned(), |at| at.rfc3339());
+            Some(Reason::from(Code::WaitingForRetry).with(WAITS_FOR, until))
+        }
+        Phase::NeedsOperator => {
+            let why = task.reason.clone().unwrap_or_else(|| Code::NotAllowedNow.into());
+            Some(why.with(WAITS_FOR, "a person: midshift task resolve"))
+        }
+        Phase::Suspended => task.reason.clone().map(|why| why.with(WAITS_FOR, "its return to the queue")),
+        Phase::Held if !task.holds.is_empty() => task.holds.first().map(|token| held(Code::WaitingForHold, token)),
+        Phase::Assigned | Phase::Running | Phase::Held | Phase::Stopping => {
+            let a = task.attempt_id().and_then(|id| view.attempt(&id))?;
+            of_attempt(view, board, now, a)
+        }
+        Phase::Succeeded | Phase::Failed | Phase::Canceled | Phase::Expired => Some(ended(task)),
+    }
+}
+
+fn queued(view: &View, board: &Board, now: &Now, task: &TaskState, intake: &TaskIntake) -> Option<Reason> {
+    let why = screen::task(view, board, task, intake, now).err()?;
+    let what = match Wait::of(task, intake, &view.ended, now.utc) {
+        Wait::Time(at) => at.rfc3339(),
+        Wait::Hold(token) => return Some(held(why.code, &token)),
+        Wait::Dependency(id) | Wait::Failed(id) => format!("task {id}"),
+        Wait::Turn(_) | Wait::Mark => task.robot_id.as_ref().map(|r| format!("robot {r}")).unwrap_or_default(),
+    };
+    Some(why.with(WAITS_FOR, what))
+}
+
+/// How a task ended, when, on which robot, and by whom if it was a person's word.
+pub fn ended(task: &TaskState) -> Reason {
+    let why = task.reason.clone();
+    let said = why.as_ref().map_or_else(String::new, |why| format!(" {}", why.text()));
+    let at = task.ended.map(Utc::rfc3339).unwrap_or_default();
+    let by = task.robot_id.as_ref().map(|r| format!(" on {r}")).unwrap_or_default();
+    let told = format!("It ended as {} at {at}{by}.{said}", task.phase.as_str());
+    let actor = why.as_ref().and_then(|why| why.metadata.get("actor")).cloned();
+    let mut reason = Reason::new(Code::TaskEnded, told).with("state", task.phase.as_str()).with("end_time", at);
+    for (key, value) in [("robot_id", task.robot_id.as_ref().map(ToString::to_string)), ("actor", actor)] {
+        reason = value.into_iter().fold(reason, |reason, value| reason.with(key, value));
+    }
+    why.iter().fold(reason, |reason, why| reason.with("cause", why.code)).with(WAITS_FOR, "nothing: it is over")
+}
+
+/// What a robot does with an attempt, or what both wait for. None: nobody can say.
+pub fn of_attempt(view: &View, board: &Board, now: &Now, a: &Attempt) -> Option<Reason> {
+    let robot_id = &a.robot_id;
+    if view.held_by(robot_id) != Some(&a.attempt) {
+        return None;
+    }
+    let live = board.get(robot_id);
+    if let Some(why) = unknown(a, live) {
+        return Some(why);
+    }
+    if let Err(why) = kept(view, board, now, robot_id) {
+        return Some(about_robot(why, robot_id));
+    }
+    if let Some(why) = place_wait(view, robot_id) {
+        return Some(why);
+    }
+    let robot = format!("robot {robot_id}");
+    let live = live?;
+    let listed = live.report.attempts.iter().find(|r| r.attempt == a.attempt);
+    match (a.phase, listed) {
+        (AttemptPhase::Offered, _) => Some(Reason::from(Code::WaitingForAnswer).with(WAITS_FOR, robot)),
+        (AttemptPhase::Stopping, _) => Some(Reason::from(Code::WaitingForStop).with(WAITS_FOR, robot)),
+        (phase, _) if phase.is_terminal() => Some(Reason::from(Code::Forced).with(WAITS_FOR, robot)),
+        (_, None) => Some(Reason::from(Code::RobotReconciling).with(WAITS_FOR, robot)),
+        (_, Some(listed)) if listed.state == WorkState::Navigating && places::is_out_of_route(view, live, a) => None,
+        (_, Some(listed)) => {
+            let since = Utc(now.utc.0 - i64::try_from(now.site.since(live.progress_at).as_ms()).unwrap_or(0));
+            let steps = a.attempt.subject.task_id().and_then(|id| view.intake(id)).map(|i| i.spec.steps.len());
+            let step = listed.step_index;
+            let told = format!("{robot_id} works on step {step} of the attempt since {}.", since.rfc3339());
+            let reason = Reason::new(Code::WorksOnStep, told).with("robot_id", robot_id).with("step", step);
+            let reason = reason.with("since", since.rfc3339()).with("attempt", &a.attempt);
+            Some(steps.into_iter().fold(reason, |reason, steps| reason.with("steps", steps)))
+        }
+    }
+}
+
+/// The attempt is UNCERTAIN.
+fn unknown(a: &Attempt, live: Option<&std::sync::Arc<Live>>) -> Option<Reason> {
+    let (robot_id, uncertain) = (&a.robot_id, a.uncertain.as_ref()?);
+    let is_manual = live.is_some_and(|live| live.report.mode != Mode::Automatic);
+    let (what, way_out) = match uncertain.cause.code {
+        Code::ReportImplausible => (
+            format!("a person at robot {robot_id}"),
+            "It is known again once the robot reports what can be; else answer with `midshift task resolve`.",
+        ),
+        Code::ManualMode if is_manual => (
+            format!("a person at robot {robot_id}"),
+            "It is known again once the robot is back in automatic mode and reports it.",
+        ),
+        _ => (
+            format!("robot {robot_id}"),
+            "It is known again once the robot is heard; after five minutes a person is asked.",
+        ),
+    };
+    let since = uncertain.since.rfc3339();
+    let told = format!("Nobody knows since {since} what {robot_id} does with it: {} {way_out}", uncertain.cause.text());
+    let reason = Reason { message: told, ..uncertain.cause.clone() };
+    Some(reason.with("uncertain_since", since).with(WAITS_FOR, what))
+}
+
+/// What keeps a robot that has work from going on, apart from places.
+fn kept(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Result<(), Reason> {
+    match heard::presence(board, robot_id, now) {
+        Presence::Online => {}
+        Presence::Suspect => return Err(Code::RobotSuspect.into()),
+        Presence::Offline | Presence::Updating => return Err(Code::RobotOffline.into()),
+    }
+    let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
+    stopped::screen(view, robot_id, Some(live))?;
+    if let Some(hold) = view.robot_holds(robot_id).next() {
+        return Err(held(Code::RobotHeld, &hold.token));
+    }
+    screen::reported(live)?;
+    plausible::keeps_back(view, live)?;
+    claims::broken(view, robot_id).map_or(Ok(()), Err)
+}
+
+/// A hold token in words: whose it is, and who takes it away.
+pub fn held(code: Code, token: &str) -> Reason {
+    let (told, what) = match (Hold::read(token), token.split_once(":body:")) {
+        (Some((stop_id, Hold::Stop)), _) => (
+            format!("Stop {stop_id} stands it. Reset it with `midshift stop reset {stop_id}`, then resume it."),
+            format!("the reset of stop {stop_id}"),
+        ),
+        (Some((stop_id, Hold::Resume)), _) => (
+            format!("Stop {stop_id} is over and nobody has resumed it: `midshift resume --stop {stop_id}`."),
+            "a person's resume".to_owned(),
+        ),
+        (None, Some(("stop", robot_id))) => (
+            format!("The own safety system of {robot_id} stopped it. Reset that at the robot, then resume it."),
+            format!("a person at robot {robot_id}"),
+        ),
+        (None, Some((_, robot_id))) => (
+            format!("The own safety system of {robot_id} let go: `midshift resume --robot {robot_id}`."),
+            "a person's resume".to_owned(),
+        ),
+        (None, None) => (String::new(), "a person's resume".to_owned()),
+    };
+    Reason::new(code, told).with("token", token).with(WAITS_FOR, what)
+}
+
+/// A reason that stands against a robot, with whom it waits for.
+pub fn about_robot(reason: Reason, robot_id: &RobotId) -> Reason {
+    if is_told(&reason) {
+        return reason;
+    }
+    let fact = |key: &str| reason.metadata.get(key).cloned().unwrap_or_default();
+    let what = match reason.code {
+        Code::StopEngaged => format!("the reset of stop {}", fact("stop_id")),
+        Code::RobotDraining => format!("drain {}", fact("drain_id")),
+        Code::RobotHeld => return held(reason.code, &fact("token")),
+        Code::ExclusionBroken => {
+            format!("a person at place {} with {} and {robot_id}", fact("place_id"), fact("other"))
+        }
+        Code::DecisionPutAside | Code::SkippedRetired | Code::RobotCordoned | Code::RobotBrokenOff => {
+            format!("a person who looks at robot {robot_id}")
+        }
+        Code::RobotManual
+        | Code::RobotStopped
+        | Code::RobotFault
+        | Code::RobotLoaded
+        | Code::RobotUnlocated
+        | Code::ReportImplausible
+        | Code::PlacesImplausible
+        | Code::AttemptUnknown => format!("a person at robot {robot_id}"),
+        _ => format!("robot {robot_id}"),
+    };
+    reason.with(WAITS_FOR, what)
+}
+
+/// What a robot's own safety system says, in words.
+pub fn stopped_by_itself(stop: HardwareStop) -> Reason {
+    let told = match stop {
+        HardwareStop::AutoAck => {
+            "The robot's own safety system stopped it; that ends by itself once its field is free."
+        }
+        HardwareStop::Remote => "The robot's own safety system was stopped from a remote device. Reset it there.",
+        HardwareStop::Manual | HardwareStop::None => {
+            "The robot's own safety system stopped it. Look at the robot and reset it there."
+        }
+    };
+    Reason::new(Code::RobotStopped, told).with("hardware_stop", format!("{stop:?}"))
+}
+
+/// Why a robot that was given away, to an attempt or a drain, does not go on, or what it does. None: it has no work, or nobody can say.
+pub fn of_robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Option<Reason> {
+    match &view.authority.get(robot_id.as_str())?.row.holder {
+        RobotHolder::None => None,
+        RobotHolder::Attempt(id) => of_attempt(view, board, now, view.attempt(id)?),
+        RobotHolder::Maintenance(drain_id) => {
+            let reason = Reason::from(Code::RobotDraining).with("drain_id", drain_id);
+            Some(reason.with(WAITS_FOR, format!("drain {drain_id}")))
+        }
+    }
+}
+
+/// Which places the robot waits for, and what is in the way: holders, robots that start there, a stop, a quarantine, whoever came first, or
+/// an area that is full. None: it waits for none.
+pub fn place_wait(view: &View, robot_id: &RobotId) -> Option<Reason> {
+    let wait = view.waits.get(robot_id)?;
+    let mut reason = Reason::from(Code::PlaceBlocked);
+    for (key, told, who) in in_the_way(view, robot_id, &wait.places) {
+        if who.is_empty() {
+            continue;
+        }
+        let names = who.iter().map(String::as_str).collect::<Vec<_>>();
+        if reason.message.is_empty() {
+            reason.message = told.to_owned();
+            let places = wait.places.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+            reason = reason.with(WAITS_FOR, format!("{places}: {} {}", key.replace('_', " "), names.join(", ")));
+        }
+        reason = reason.with(key, names.join(" "));
+    }
+    let places = wait.places.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ");
+    Some(reason.with("places", places))
+}
+
+/// What may be in the way of a robot to places, by the fact that names it: the first that is there is told.
+fn in_the_way(
+    view: &View,
+    robot_id: &RobotId,
+    places: &[PlaceId],
+) -> [(&'static str, &'static str, BTreeSet<String>); 6] {
+    let rows = || places.iter().filter_map(|id| view.places.get(id.as_str())).map(|p| &p.row);
+    let known = || places.iter().filter_map(|id| view.site.find_place(id));
+    let others = |id: &&RobotId| *id != robot_id;
+    let names = |ids: &mut dyn Iterator<Item = &RobotId>| ids.filter(others).map(ToString::to_string).collect();
+    let mine = view.waits.get(robot_id).map(|w| w.since).unwrap_or_default();
+    let wants = |other: &PlaceId| places.contains(other);
+    let earlier = view.waits.iter().filter(|(_, w)| w.since <= mine && w.places.iter().any(wants)).map(|(id, _)| id);
+    let areas = known().filter_map(|ix| view.site.place(ix).waypoint()).map(|at| &view.site.area_of(at).area_id);
+    let inside: BTreeSet<RobotId> = areas.flat_map(|area| places::robots_in_area(view, area)).collect();
+    let closed = stopped::closed(view);
+    let is_shut = |p: &&super::rows::Place| p.quarantine.is_some() || view.refused.is_place_aside(&p.place_id);
+    [
+        (
+            "held_by",
+            "waits for a place that another robot holds",
+            names(&mut rows().flat_map(|p| &p.holders).map(|h| &h.robot_id)),
+        ),
+        (
+            "kept_for",
+            "waits for a place that is kept for a robot that starts there and was not heard yet",
+            names(&mut known().flat_map(|ix| starts::awaited(view, ix))),
+        ),
+        (
+            "quarantined",
+            "waits for a place that is closed until a person clears it",
+            rows().filter(is_shut).map(|p| p.place_id.to_string()).collect(),
+        ),
+        (
+            "stopped",
+            "waits for a place that lies inside of a fleet stop",
+            known().filter(|ix| closed.contains(ix)).map(|ix| view.site.place(ix).place_id.to_string()).collect(),
+        ),
+        ("first", "waits for a place that another robot waits for since earlier", names(&mut { earlier })),
+        (
+            "area_full_of",
+            "waits for a place in an area that has as many robots as can move there",
+            names(&mut inside.iter()),
+        ),
+    ]
+}

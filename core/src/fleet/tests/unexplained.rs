@@ -1,0 +1,87 @@
+//! What stands without a reason is counted; what has one is not.
+
+use super::Rig;
+use crate::fleet::rows::Cordon;
+use crate::fleet::view::Rowed;
+use crate::fleet::{Pace, Plan, standing, unexplained};
+use crate::ids::{RobotId, TaskId};
+use crate::reason::{Code, Reason};
+use crate::robot::WorkState;
+use crate::rows::Revision;
+use crate::task::AttemptPhase;
+
+/// What is counted in so many seconds in which nobody plans.
+fn counted(rig: &mut Rig, secs: u64) -> Vec<String> {
+    let mut plan = Plan::default();
+    for _ in 0..secs {
+        rig.pass(1_000);
+        unexplained::look(&mut rig.view, &rig.board, rig.now, &mut plan);
+    }
+    plan.report.unexplained
+}
+
+#[test]
+fn a_task_that_an_idle_robot_could_take_is_counted_once_if_nobody_offers_it() {
+    let mut rig = Rig::new();
+    rig.robot("r1", "park-a");
+    rig.submit("T1", |_| {});
+    assert_eq!(counted(&mut rig, 10), Vec::<String>::new());
+    assert_eq!(counted(&mut rig, 30), ["task T1"]);
+}
+
+#[test]
+fn a_task_whose_robots_all_have_a_reason_against_them_is_not_counted() {
+    let mut rig = Rig::new();
+    rig.robot("r1", "park-a");
+    rig.submit("T1", |raw| raw.capabilities = vec!["weld".into()]);
+    rig.submit("T2", |_| {});
+    rig.cycle(Pace::Sweep);
+    let robot_id = RobotId::parse("r1").expect("an id");
+    let mut control = rig.view.control["r1"].row.clone();
+    control.cordon = Some(Cordon { reason: "a wheel".into(), actor: "me".into(), since: rig.now.utc });
+    rig.view.control.insert("r1".into(), Rowed { revision: Revision(9), row: control });
+    assert_eq!(counted(&mut rig, 40), Vec::<String>::new());
+    let told = crate::fleet::explain::robot(&rig.view, &rig.board, &rig.now, &robot_id).expect("known").verdict;
+    assert!(told.as_ref().is_some_and(standing::is_told), "{told:?}");
+}
+
+#[test]
+fn an_attempt_of_a_robot_that_was_given_away_without_a_record_is_counted() {
+    let mut rig = Rig::new();
+    rig.robot("r1", "park-a");
+    rig.submit("T1", |_| {});
+    rig.cycle(Pace::Sweep);
+    assert_eq!(rig.task("T1").robot_id.as_ref().map(RobotId::as_str), Some("r1"));
+    assert_eq!(counted(&mut rig, 40), Vec::<String>::new(), "it waits for the answer of its robot");
+    rig.view.attempts.clear();
+    let mut found = counted(&mut rig, 40);
+    found.sort();
+    assert_eq!(found, ["robot r1", "task T1"]);
+}
+
+#[test]
+fn each_reason_against_a_robot_names_whom_it_waits_for() {
+    let robot_id = RobotId::parse("r1").expect("an id");
+    for code in Code::ALL {
+        let told = standing::about_robot(Reason::from(*code), &robot_id);
+        assert!(standing::is_told(&told), "{told:?}");
+    }
+}
+
+#[test]
+fn a_robot_at_the_end_of_its_released_route_that_waits_for_no_place_has_no_reason() {
+    let mut rig = Rig::new();
+    rig.robot("r1", "park-a");
+    rig.submit("T1", |_| {});
+    rig.cycle(Pace::Sweep);
+    let task_id = TaskId::parse("T1").expect("an id");
+    let id = rig.task("T1").attempt_id().expect("given");
+    let mut attempt = rig.view.attempts.remove(&id.to_string()).expect("a row");
+    attempt.row.phase = AttemptPhase::Navigating;
+    rig.view.attempts.insert(id.to_string(), attempt);
+    let robot_id = RobotId::parse("r1").expect("an id");
+    rig.says(&robot_id, &id, WorkState::Navigating, 0, 1_000);
+    assert_eq!(rig.why(&task_id), None);
+    rig.says(&robot_id, &id, WorkState::Executing, 0, 1_000);
+    assert_eq!(rig.why(&task_id).map(|why| why.code), Some(Code::WorksOnStep));
+}
