@@ -346,6 +346,10 @@ pub const RESETS_KEPT: LinkDuration = LinkDuration::from_secs(90 * 24 * 3_600);
 pub const RESETS_FORGOTTEN_EVERY: LinkDuration = LinkDuration::from_secs(3_600);
 /// Bytes of the mark by which a stop service knows a stop of its own again.
 pub const STOP_PROOF_BYTES: usize = 64;
+/// Bytes of the public key of these marks.
+pub const STOP_KEY_BYTES: usize = 32;
+/// Resets that a session of a robot begins with: the newest. One that was away for more of them hears the rest on its stop line.
+pub const LINK_RESETS_MAX: usize = 256;
 /// Boxes that tell where a stop is: some 2 KiB of a message; larger ones take the place of more.
 pub const REGION_BOXES_MAX: usize = 128;
 /// A robot this near to a stopped part lies inside, millimetres: how wrong its pose may be, how large it is, and how far it rolls on from 1.5 m/s.

@@ -6,6 +6,7 @@ use midshift_core::identity::SessionSecret;
 use midshift_core::ids::RobotId;
 use midshift_core::reason::Reason;
 use midshift_core::robot::{Inventory, Lane, ReportedState};
+use midshift_core::stop::{Reset, Stop};
 use midshift_core::update::DesiredUpdate;
 use midshift_core::work::{DesiredPolicy, DesiredWork, InboxItem};
 use std::collections::BTreeMap;
@@ -207,6 +208,19 @@ pub struct Downlink {
     pub update: Option<DesiredUpdate>,
     /// None: unchanged.
     pub status_credit_bytes: Option<u32>,
+    /// None: nothing new.
+    pub stops: Option<StopFacts>,
+    /// Facts of stops that cannot be read, and why; none: there are none. Never sent.
+    pub unreadable_stops: Option<String>,
+}
+
+/// Stops and resets that add up, at most [`midshift_core::limits::STOPS_MAX`] of each.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct StopFacts {
+    /// Engaged and not reset.
+    pub stops: Vec<Stop>,
+    /// Reset.
+    pub resets: Vec<Reset>,
 }
 
 /// Answer to a heartbeat.

@@ -239,8 +239,10 @@ impl AgentCore {
         }
         self.elapse(&now);
         self.take_news(&now);
-        if let Input::Stop(news) = &input {
-            self.hear_stop(&now, StopNews::clone(news));
+        match &input {
+            Input::Stop(news) => self.hear_stop(&now, StopNews::clone(news)),
+            Input::Down(down) => self.hear_stop_beside(&now, down),
+            _ => {}
         }
         self.obey(&now);
         match input {

@@ -9,7 +9,7 @@ use super::{fan, site};
 use anyhow::{Context, bail};
 use midshift_agent::dial::{Dial, TcpDial};
 use midshift_core::limits;
-use midshift_proto::link::v1::StopLevel;
+use midshift_proto::common::v1::StopLevel;
 use midshift_proto::stop::v1::attend_request::Message as Up;
 use midshift_proto::stop::v1::attend_response::Message as Down;
 use midshift_proto::stop::v1::stop_link_service_client::StopLinkServiceClient;

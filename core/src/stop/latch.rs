@@ -77,6 +77,9 @@ pub struct Reset {
     pub actor: String,
     /// Why, in a person's words.
     pub reason: String,
+    /// The stop service's own mark on it, by which a robot believes it when it comes by another way than from the service itself. Empty: it counts there alone.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub proof: Vec<u8>,
 }
 
 /// Named stops minus named resets.
@@ -215,7 +218,13 @@ mod tests {
     }
 
     fn reset(n: u8) -> Reset {
-        Reset { stop_id: id(n), at: Utc(100 + i64::from(n)), actor: "bert".to_owned(), reason: "over".to_owned() }
+        Reset {
+            stop_id: id(n),
+            at: Utc(100 + i64::from(n)),
+            actor: "bert".to_owned(),
+            reason: "over".to_owned(),
+            proof: Vec::new(),
+        }
     }
 
     #[derive(Clone, Debug)]

@@ -113,7 +113,7 @@ mod tests {
 
     fn reset(name: &str) -> Reset {
         let stop_id = StopId::parse(name).expect("an id");
-        Reset { stop_id, at: Utc(2), actor: "bert".to_owned(), reason: "clear".to_owned() }
+        Reset { stop_id, at: Utc(2), actor: "bert".to_owned(), reason: "clear".to_owned(), proof: Vec::new() }
     }
 
     fn latch(stops: &[&str], resets: &[&str]) -> Latch {

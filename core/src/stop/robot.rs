@@ -21,6 +21,9 @@ pub struct Kept {
     pub latch: Latch,
     /// What stood it and was not resumed: stops, reset or not, and silences among people.
     pub awaiting: BTreeSet<StopId>,
+    /// Public key of the stop service's marks, as the service said it. Empty: it has not said it yet.
+    #[serde(default)]
+    pub key: Vec<u8>,
 }
 
 /// What a robot does about stops at one moment.
@@ -83,7 +86,29 @@ impl RobotStop {
     /// It has said something since. Whether it is new.
     pub fn told(&mut self, stops: Vec<Stop>, resets: Vec<Reset>) -> bool {
         let engaged = stops.into_iter().fold(false, |new, stop| self.kept.latch.engage(stop) | new);
-        resets.into_iter().fold(engaged, |new, reset| self.kept.latch.reset(reset) | new)
+        // Whoever keeps it needs its mark no more.
+        let resets = resets.into_iter().map(|reset| Reset { proof: Vec::new(), ..reset });
+        resets.fold(engaged, |new, reset| self.kept.latch.reset(reset) | new)
+    }
+
+    /// The stop service has said the key of its marks; empty: it says nothing new. Whether it is another one.
+    pub fn marked_by(&mut self, key: Vec<u8>) -> bool {
+        let is_new = !key.is_empty() && key != self.kept.key;
+        if is_new {
+            self.kept.key = key;
+        }
+        is_new
+    }
+
+    /// Somebody beside the stop service has said what it knows. Stops count whoever says them. A reset counts if it `is_marked` by the stop service and not
+    /// older than its stop. What is not said is not over, and nothing of it says that all was told. Whether it is new.
+    pub fn told_beside(&mut self, stops: Vec<Stop>, resets: Vec<Reset>, is_marked: impl Fn(&Reset) -> bool) -> bool {
+        let engaged = self.told(stops, Vec::new());
+        let latch = &self.kept.latch;
+        let is_older = |reset: &Reset| latch.stop(&reset.stop_id).is_some_and(|stop| reset.at < stop.engaged);
+        let counts = |reset: &Reset| latch.reset_of(&reset.stop_id).is_none() && !is_older(reset) && is_marked(reset);
+        let resets: Vec<Reset> = resets.into_iter().filter(counts).collect();
+        self.told(Vec::new(), resets) || engaged
     }
 
     /// The check-in that was sent at `sent` has its answer.
@@ -93,7 +118,7 @@ impl RobotStop {
 
     /// People resumed these. One whose stop is still effective here waits for its reset. Whether anything changed.
     pub fn resumed(&mut self, stop_ids: &BTreeSet<StopId>) -> bool {
-        let Kept { latch, awaiting } = &mut self.kept;
+        let Kept { latch, awaiting, .. } = &mut self.kept;
         let before = awaiting.len();
         awaiting.retain(|id| !stop_ids.contains(id) || latch.is_effective(id));
         awaiting.len() < before
@@ -175,7 +200,7 @@ mod tests {
     }
 
     fn reset(n: u8) -> Reset {
-        Reset { stop_id: id(n), at: Utc(2), actor: String::new(), reason: String::new() }
+        Reset { stop_id: id(n), at: Utc(2), actor: String::new(), reason: String::new(), proof: Vec::new() }
     }
 
     fn at(ms: u64) -> Now {
@@ -212,6 +237,22 @@ mod tests {
         (60..63).for_each(|s| robot.answered(LinkTime(s * 1000)));
         assert_eq!(robot.look(&at(62_500), None, Around::People).level, StopLevel::None);
         assert!(robot.kept().awaiting.is_empty());
+    }
+
+    #[test]
+    fn what_another_than_the_stop_service_says_stops_and_frees_nothing_without_a_mark() {
+        let mut robot = free();
+        assert!(robot.told_beside(vec![stop(1, StopLevel::Halt)], vec![], |_| true));
+        assert!(!robot.told_beside(vec![stop(1, StopLevel::Halt)], vec![], |_| true), "twice is once");
+        assert_eq!(robot.look(&at(3_100), None, Around::Robots).level, StopLevel::Halt);
+        let older = Reset { at: Utc(0), ..reset(1) };
+        assert!(!robot.told_beside(vec![], vec![reset(1)], |_| false), "not marked");
+        assert!(!robot.told_beside(vec![], vec![older], |_| true), "older than its stop");
+        assert!(!robot.told_beside(vec![], vec![], |_| true), "absence");
+        assert!(robot.kept().latch.is_effective(&id(1)));
+        assert!(robot.told_beside(vec![], vec![Reset { proof: vec![1], ..reset(1) }], |_| true));
+        assert_eq!(robot.kept().latch.reset_of(&id(1)), Some(&reset(1)), "its mark is not kept");
+        assert_eq!(robot.look(&at(3_200), None, Around::Robots).level, StopLevel::Halt, "it waits for a person");
     }
 
     #[test]

@@ -303,6 +303,7 @@ impl From<&Downlink> for v1::Downlink {
             policy: downlink.policy.as_ref().map(Into::into),
             update: downlink.update.as_ref().map(Into::into),
             status_credit_bytes: downlink.status_credit_bytes,
+            stops: downlink.stops.as_ref().map(Into::into),
         }
     }
 }
@@ -320,9 +321,8 @@ impl Parse<Downlink> for v1::Downlink {
         let echo = maybe(self.echo, at.field("echo"), bad);
         let acks = list(self.acks, at.field("acks"), bad);
         // A robot that cannot read its work must hear the rest all the same: echoes, acks, and what ends by them.
-        let mut of_work = Violations::default();
-        let work = maybe(self.work, at.field("work"), &mut of_work).unwrap_or_default();
-        let unreadable_work = of_work.finish().err().map(|refusal| refusal.to_string());
+        let (work, unreadable_work) = apart(self.work, at.field("work"));
+        let (stops, unreadable_stops) = apart(self.stops, at.field("stops"));
         let policy = maybe(self.policy, at.field("policy"), bad);
         let update = maybe(self.update, at.field("update"), bad);
         Some(Downlink {
@@ -333,8 +333,17 @@ impl Parse<Downlink> for v1::Downlink {
             policy: policy?,
             update: update?,
             status_credit_bytes: self.status_credit_bytes,
+            stops,
+            unreadable_stops,
         })
     }
+}
+
+/// A part of a message that is refused by itself, with why; the rest of the message is read.
+fn apart<T, W: Parse<T>>(part: Option<W>, at: At<'_>) -> (Option<T>, Option<String>) {
+    let mut bad = Violations::default();
+    let read = maybe(part, at, &mut bad).unwrap_or_default();
+    (read, bad.finish().err().map(|refusal| refusal.to_string()))
 }
 
 impl From<&Close> for v1::Close {

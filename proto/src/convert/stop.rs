@@ -1,6 +1,8 @@
 //! Stops, resets and what a robot says of them.
 
 use super::{At, Parse, WireEnum, counted, id, list, need, text, word};
+use crate::link::v1 as link;
+use crate::session::StopFacts;
 use crate::stop::v1;
 use midshift_core::ids::{AreaId, PlaceId, RobotId, StopId};
 use midshift_core::limits;
@@ -10,6 +12,8 @@ use midshift_core::stop::ladder::{Around, Stage};
 use midshift_core::stop::region::Bounds;
 use midshift_core::stop::{Region, Reset, Scope, Stop};
 use midshift_core::time::Utc;
+use prost::Message;
+use std::collections::VecDeque;
 
 /// The name of who engaged or reset one, bytes.
 const ACTOR_BYTES_MAX: usize = 128;
@@ -123,8 +127,17 @@ impl From<&Reset> for v1::Reset {
             at_unix_ms: reset.at.0,
             actor: reset.actor.clone(),
             reason: reset.reason.clone(),
+            proof: reset.proof.clone(),
         }
     }
+}
+
+/// What the stop service signs of a reset: all of it but the mark itself.
+pub fn signed_reset(reset: &Reset) -> Vec<u8> {
+    let wire = v1::Reset { proof: Vec::new(), ..reset.into() };
+    let mut bytes = b"midshift reset 1\0".to_vec();
+    bytes.extend(wire.encode_to_vec());
+    bytes
 }
 
 impl Parse<Reset> for v1::Reset {
@@ -132,7 +145,67 @@ impl Parse<Reset> for v1::Reset {
         let stop_id = id(&self.stop_id, StopId::parse, at.field("stop_id"), bad);
         let actor = text(self.actor, ACTOR_BYTES_MAX, at.field("actor"), bad);
         let reason = text(self.reason, limits::REASON_BYTES_MAX, at.field("reason"), bad);
-        Some(Reset { stop_id: stop_id?, at: Utc(self.at_unix_ms), actor: actor?, reason: reason? })
+        let is_mark = self.proof.len() <= limits::STOP_PROOF_BYTES;
+        if !is_mark {
+            bad.add(at.field("proof").to_string(), format!("must be at most {}", limits::STOP_PROOF_BYTES));
+        }
+        let proof = is_mark.then_some(self.proof);
+        Some(Reset { stop_id: stop_id?, at: Utc(self.at_unix_ms), actor: actor?, reason: reason?, proof: proof? })
+    }
+}
+
+impl From<&StopFacts> for link::StopFacts {
+    fn from(facts: &StopFacts) -> Self {
+        Self {
+            stops: facts.stops.iter().map(Into::into).collect(),
+            resets: facts.resets.iter().map(Into::into).collect(),
+        }
+    }
+}
+
+impl StopFacts {
+    /// All of these, in as many parts as they need: none of more than [`limits::STOP_TOLD_BYTES`] or [`limits::STOPS_MAX`] of a kind.
+    pub fn parts<'a>(
+        stops: impl IntoIterator<Item = &'a Stop>,
+        resets: impl IntoIterator<Item = &'a Reset>,
+    ) -> VecDeque<Self> {
+        // A tag and a length come before each.
+        const FRAME: usize = 8;
+        let (mut full, mut part, mut room) = (VecDeque::new(), Self::default(), limits::STOP_TOLD_BYTES);
+        let mut room_for = |bytes: usize, part: &mut Self| {
+            if bytes + FRAME > room || part.stops.len().max(part.resets.len()) == limits::STOPS_MAX {
+                full.push_back(std::mem::take(part));
+                room = limits::STOP_TOLD_BYTES;
+            }
+            room = room.saturating_sub(bytes + FRAME);
+        };
+        for stop in stops {
+            room_for(v1::Stop::from(stop).encoded_len(), &mut part);
+            part.stops.push(stop.clone());
+        }
+        for reset in resets {
+            room_for(v1::Reset::from(reset).encoded_len(), &mut part);
+            part.resets.push(reset.clone());
+        }
+        full.extend((part != Self::default()).then_some(part));
+        full
+    }
+}
+
+impl Parse<StopFacts> for link::StopFacts {
+    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<StopFacts> {
+        let lengths = [("stops", self.stops.len()), ("resets", self.resets.len())];
+        let mut is_short = true;
+        for (name, length) in lengths.into_iter().filter(|(_, length)| *length > limits::STOPS_MAX) {
+            bad.add(at.field(name).to_string(), format!("must be at most {}, not {length}", limits::STOPS_MAX));
+            is_short = false;
+        }
+        if !is_short {
+            return None;
+        }
+        let stops = list(self.stops, at.field("stops"), bad);
+        let resets = list(self.resets, at.field("resets"), bad);
+        Some(StopFacts { stops: stops?, resets: resets? })
     }
 }
 
@@ -268,6 +341,8 @@ pub enum FromStop {
     Synced {
         /// State of the latch.
         generation: u64,
+        /// Public key of the service's marks. Empty: the one that was said before.
+        key: Vec<u8>,
     },
     /// The answer to a check-in.
     CheckedIn {
@@ -292,8 +367,13 @@ impl Parse<FromStop> for v1::AttendResponse {
                 Some(FromStop::Told { stops: stops?, resets: resets?, generation: generation? })
             }
             Some(W::Synced(synced)) => {
-                let generation = counted(synced.generation, at.field("synced").field("generation"), bad)?;
-                Some(FromStop::Synced { generation })
+                let at = at.field("synced");
+                let generation = counted(synced.generation, at.field("generation"), bad);
+                if !matches!(synced.key.len(), 0 | limits::STOP_KEY_BYTES) {
+                    bad.add(at.field("key").to_string(), format!("must be {} bytes", limits::STOP_KEY_BYTES));
+                    return None;
+                }
+                Some(FromStop::Synced { generation: generation?, key: synced.key })
             }
             Some(W::CheckedIn(answer)) => {
                 let generation = counted(answer.generation, at.field("checked_in").field("generation"), bad)?;
@@ -329,7 +409,13 @@ mod tests {
     #[test]
     fn a_stop_and_its_reset_read_back() {
         assert_eq!(parse::<Stop, _>(v1::Stop::from(&stop())), Ok(stop()));
-        let reset = Reset { stop_id: stop().stop_id, at: Utc(7), actor: "bert".to_owned(), reason: "clear".to_owned() };
+        let reset = Reset {
+            stop_id: stop().stop_id,
+            at: Utc(7),
+            actor: "bert".to_owned(),
+            reason: "clear".to_owned(),
+            proof: Vec::new(),
+        };
         assert_eq!(parse::<Reset, _>(v1::Reset::from(&reset)), Ok(reset));
         for scope in [Scope::Fleet, Scope::Robot(RobotId::parse("r1").expect("an id"))] {
             assert_eq!(parse::<Scope, _>(v1::Scope::from(&scope)), Ok(scope));

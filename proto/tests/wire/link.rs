@@ -11,6 +11,8 @@ use midshift_core::robot::{
     Fault, FaultClass, HardwareStop, HeldPlace, Inventory, Lane, Load, Mode, Pose, ReportedAttempt, ReportedState,
     StopLevel, Vitals,
 };
+use midshift_core::stop::{Reset, Scope, Stop};
+use midshift_core::time::Utc;
 use midshift_core::update::{ActivationGrant, DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState};
 use midshift_core::work::{
     Assignment, AttemptReport, DesiredPolicy, DesiredWork, Effect, Gap, GrantedPlace, InboxItem, PlaceNews, RobotEvent,
@@ -20,7 +22,7 @@ use midshift_proto::link::v1;
 use midshift_proto::parse;
 use midshift_proto::session::{
     ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, LanePosition,
-    Previous, StatusReplay, ToRobot, Uplink, Welcome,
+    Previous, StatusReplay, StopFacts, ToRobot, Uplink, Welcome,
 };
 use proptest::prelude::*;
 use prost::Message;
@@ -348,6 +350,8 @@ fn what_the_server_says_is_what_a_robot_hears() {
         policy: Some(policy()),
         status_credit_bytes: Some(0),
         update: Some(desired_update()),
+        stops: Some(stop_facts()),
+        unreadable_stops: None,
     };
     let idle = DesiredWork { assignment: None, grants: vec![], held: false, resume: None, closed: vec![], ..work() };
     let close = Close {
@@ -365,6 +369,22 @@ fn what_the_server_says_is_what_a_robot_hears() {
     for message in &messages {
         assert_eq!(down(message).as_ref(), Ok(message));
     }
+}
+
+fn stop_facts() -> StopFacts {
+    let (stop_id, actor, reason) =
+        (StopId::parse("STOP-1").expect("id"), "anna".to_owned(), "a pallet fell".to_owned());
+    let stop = Stop {
+        stop_id: stop_id.clone(),
+        scope: Scope::Fleet,
+        level: StopLevel::Halt,
+        engaged: Utc(5),
+        actor: actor.clone(),
+        reason: reason.clone(),
+        region: None,
+        proof: vec![1; 64],
+    };
+    StopFacts { stops: vec![stop], resets: vec![Reset { stop_id, at: Utc(6), actor, reason, proof: vec![2; 64] }] }
 }
 
 #[test]

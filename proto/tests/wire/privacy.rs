@@ -17,7 +17,9 @@ const BYTES: &[(&str, usize, &str)] = &[
     ("midshift.ota.v1.PublishRepositoryRequest.roots", limits::SIGNED_DOCUMENT_BYTES, "ota_bundles/src/trust.rs"),
     ("midshift.ota.v1.PublishRepositoryRequest.targets", limits::SIGNED_DOCUMENT_BYTES, "ota_bundles/src/trust.rs"),
     ("midshift.ota.v1.UploadTargetRequest.data", limits::UPLOAD_PIECE_BYTES, "services/ota/src/grpc.rs"),
+    ("midshift.stop.v1.Reset.proof", limits::STOP_PROOF_BYTES, "proto/src/convert/stop.rs"),
     ("midshift.stop.v1.Stop.proof", limits::STOP_PROOF_BYTES, "proto/src/convert/stop.rs"),
+    ("midshift.stop.v1.Synced.key", limits::STOP_KEY_BYTES, "proto/src/convert/stop.rs"),
 ];
 
 /// Fields that could be filled with anything: lists of numbers or of points, and parameters of no fixed form. Each with its limit and where that is enforced.
@@ -417,6 +419,10 @@ fn with_secrets(planted: &str) -> Vec<(&'static str, String)> {
         (
             "midshift.link.v1.ReplayStatusRequest",
             format!("{:?}", link::ReplayStatusRequest { session_secret: text(), ..Default::default() }),
+        ),
+        (
+            "midshift.stop.v1.Reset",
+            format!("{:?} {planted:?}", stop::Reset { proof: planted.as_bytes().to_vec(), ..Default::default() }),
         ),
         (
             "midshift.stop.v1.Stop",

@@ -162,5 +162,5 @@ fn effective(kept: &Kept) -> Kept {
     kept.latch.effective().cloned().for_each(|stop| {
         latch.engage(stop);
     });
-    Kept { latch, awaiting: kept.awaiting.clone() }
+    Kept { latch, ..kept.clone() }
 }

@@ -170,10 +170,10 @@ impl Line {
             Said::Heard(None) => self.lost("the line ended"),
             Said::Heard(Some(message)) => match parse(*message) {
                 Ok(FromStop::Told { stops, resets, generation }) => Some(StopNews::Told { stops, resets, generation }),
-                Ok(FromStop::Synced { generation }) => {
+                Ok(FromStop::Synced { generation, key }) => {
                     self.failures = 0;
                     self.refused.clear();
-                    Some(StopNews::Synced { generation })
+                    Some(StopNews::Synced { generation, key })
                 }
                 Ok(FromStop::CheckedIn { nonce, generation }) => Some(StopNews::CheckedIn { nonce, generation }),
                 Ok(FromStop::MoveOver) => {

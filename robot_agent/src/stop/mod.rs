@@ -2,7 +2,7 @@
 //!
 //! Rooms: here what it knows and when it must say something; `obey` is what the body does about it; `line` is the shell's connection to the
 //! stop service; `keep` the file. Invariant: it is obeyed before it is written or answered; a stop that cannot be written is obeyed all the same and
-//! said to be not durable. Nothing of the link, of bulk or of the ledger is on its path. Called by the core.
+//! said to be not durable. Nothing of the link, of bulk or of the ledger is on its path; what the link says of stops is added to it. Called by the core.
 
 pub mod keep;
 pub mod line;
@@ -10,6 +10,7 @@ mod obey;
 
 use crate::core::Output;
 use keep::Loaded;
+use midshift_bundle::keys::PublicKey;
 use midshift_core::ids::{AreaId, RobotId, StopId, WaypointId};
 use midshift_core::limits;
 use midshift_core::robot::{Pose, StopLevel};
@@ -17,6 +18,8 @@ use midshift_core::stop::ladder::{Around, Stage};
 use midshift_core::stop::robot::{Kept, Obeyed, RobotStop};
 use midshift_core::stop::{Latch, Reset, Stop};
 use midshift_core::time::{LinkDuration, LinkTime, Now, SiteTime};
+use midshift_proto::convert::stop::signed_reset;
+use midshift_proto::session::StopFacts;
 use std::collections::{BTreeSet, VecDeque};
 
 /// Check-ins whose answer is still taken; older ones fed nothing any more anyway.
@@ -47,6 +50,8 @@ pub enum StopNews {
     Synced {
         /// State of the latch.
         generation: u64,
+        /// Public key of the service's marks. Empty: the one that was said before.
+        key: Vec<u8>,
     },
     /// The answer to one check-in.
     CheckedIn {
@@ -231,8 +236,9 @@ impl Stops {
                     line.knows(generation);
                 }
             }
-            StopNews::Synced { generation } => {
+            StopNews::Synced { generation, key } => {
                 let is_changed = self.robot.told_all(Latch::default());
+                let is_changed = self.robot.marked_by(key) || is_changed;
                 self.changed(is_changed);
                 if let Some(line) = &mut self.line {
                     line.is_synced = true;
@@ -254,6 +260,13 @@ impl Stops {
                 }
             }
         }
+    }
+
+    /// Adds what the link brings of stops: the second way, for one whose own line is cut. It feeds no ladder and ends no wait for the first words on that line.
+    pub(crate) fn hear_beside(&mut self, facts: StopFacts) {
+        let key = self.kept().key.clone();
+        let is_changed = self.robot.told_beside(facts.stops, facts.resets, |reset| is_marked(&key, reset));
+        self.changed(is_changed);
     }
 
     /// What is to be said and written now.
@@ -302,6 +315,11 @@ impl Stops {
         let line = self.line.as_ref().map(Attending::next_at);
         [write, line, self.robot.silence_at(self.around)].into_iter().flatten().min()
     }
+}
+
+/// Whether the stop service with this key has marked the reset. Before it has said its key nobody can tell.
+fn is_marked(key: &[u8], reset: &Reset) -> bool {
+    PublicKey::from_bytes(key).is_some_and(|key| key.verifies(&signed_reset(reset), &reset.proof))
 }
 
 impl Attending {

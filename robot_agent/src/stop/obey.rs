@@ -15,6 +15,7 @@ use midshift_core::stop::Reset;
 use midshift_core::stop::ladder::Around;
 use midshift_core::time::{LinkTime, Now, SiteDuration, SiteTime};
 use midshift_core::work::{DesiredWork, RobotEvent};
+use midshift_proto::session::{Downlink, StopFacts};
 
 /// A robot that drives while a part of the site is stopped looks this often where it is: 150 mm at its fastest.
 const LOOK: SiteDuration = SiteDuration(100);
@@ -58,6 +59,20 @@ impl AgentCore {
         }
         if let Some(stop) = &mut self.stop {
             stop.hear(now.link, news);
+        }
+    }
+
+    /// What the link says of stops; one that has no stop line obeys none.
+    pub(crate) fn hear_stop_beside(&mut self, now: &Now, down: &Downlink) {
+        if let Some(why) = &down.unreadable_stops {
+            tracing::error!(robot_id = %self.config.robot_id, why, "stops on the link cannot be read: what is latched stays");
+        }
+        let Some(facts) = down.stops.clone() else { return };
+        if self.config.bugs.reset_clears_all() {
+            let StopFacts { stops, resets } = facts;
+            self.hear_stop(now, StopNews::Told { stops, resets, generation: 0 });
+        } else if let Some(stop) = &mut self.stop {
+            stop.hear_beside(facts);
         }
     }
 

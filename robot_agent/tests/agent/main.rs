@@ -25,6 +25,7 @@ mod stop_cuts;
 mod stop_line;
 mod stop_software;
 mod stops;
+mod stops_beside;
 #[path = "../../../tests/src/strace.rs"]
 mod strace;
 mod told_time;

@@ -49,8 +49,13 @@ fn stop(name: &str, scope: Scope, level: StopLevel) -> News {
 
 fn reset(names: &[&str]) -> News {
     let (actor, reason) = ("who", "all clear");
-    let reset =
-        |name: &&str| Reset { stop_id: id(name), at: Utc(6), actor: actor.to_owned(), reason: reason.to_owned() };
+    let reset = |name: &&str| Reset {
+        stop_id: id(name),
+        at: Utc(6),
+        actor: actor.to_owned(),
+        reason: reason.to_owned(),
+        proof: Vec::new(),
+    };
     News::Told(Vec::new(), names.iter().map(reset).collect())
 }
 

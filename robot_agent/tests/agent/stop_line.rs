@@ -66,7 +66,7 @@ impl Seen {
         self.say(v1::attend_response::Message::Told(v1::Told { stops, resets: vec![], generation })).await;
     }
     async fn synced(&self, generation: u64) {
-        self.say(v1::attend_response::Message::Synced(v1::Synced { generation })).await;
+        self.say(v1::attend_response::Message::Synced(v1::Synced { generation, ..Default::default() })).await;
     }
     async fn answer(&self, check_in: &v1::CheckIn, generation: u64) {
         let nonce = check_in.nonce;
@@ -186,7 +186,7 @@ impl Bench {
 const HALT: i32 = v1_halt();
 
 const fn v1_halt() -> i32 {
-    midshift_proto::link::v1::StopLevel::Halt as i32
+    midshift_proto::common::v1::StopLevel::Halt as i32
 }
 
 #[tokio::test(start_paused = true)]

@@ -31,7 +31,13 @@ pub fn stop(n: u64, level: StopLevel) -> Stop {
 }
 
 pub fn reset(n: u64) -> Reset {
-    Reset { stop_id: stop_id(n), at: Utc(1_700_000_000_001), actor: "bert".into(), reason: "clear".into() }
+    Reset {
+        stop_id: stop_id(n),
+        at: Utc(1_700_000_000_001),
+        actor: "bert".into(),
+        reason: "clear".into(),
+        proof: Vec::new(),
+    }
 }
 
 /// Generation of the latch with the `n`-th message.
@@ -53,7 +59,7 @@ pub fn told(rig: &mut Rig, stops: Vec<Stop>, resets: Vec<Reset>) {
 pub fn attend(rig: &mut Rig) {
     let nonce = rig.ms * 1_000;
     hear(rig, StopNews::Attended { nonce });
-    hear(rig, StopNews::Synced { generation: SYNCED });
+    hear(rig, StopNews::Synced { generation: SYNCED, key: Vec::new() });
 }
 
 /// Every check-in that waits is answered.
@@ -80,12 +86,12 @@ fn stop_silence(rig: &mut Rig, ms: u64) {
     }
 }
 
-fn level(rig: &Rig) -> StopLevel {
+pub fn level(rig: &Rig) -> StopLevel {
     let at = crate::rig::now_at(rig.ms);
     rig.core.reported(&at).stop_level
 }
 
-fn awaiting(rig: &Rig) -> Vec<String> {
+pub fn awaiting(rig: &Rig) -> Vec<String> {
     let at = crate::rig::now_at(rig.ms);
     rig.core.reported(&at).awaiting_resume.iter().map(ToString::to_string).collect()
 }
@@ -207,7 +213,7 @@ fn in_whatever_order_and_however_often_it_is_told_it_obeys_the_same() {
         |rig| told(rig, vec![stop(1, StopLevel::Halt)], vec![]),
         |rig| told(rig, vec![], vec![reset(1)]),
         |rig| told(rig, vec![stop(2, StopLevel::Halt)], vec![]),
-        |rig| hear(rig, StopNews::Synced { generation: SYNCED }),
+        |rig| hear(rig, StopNews::Synced { generation: SYNCED, key: Vec::new() }),
     ];
     let mut orders = 0;
     for order in 0..256 {

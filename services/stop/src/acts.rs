@@ -186,7 +186,9 @@ pub fn reset(inner: &Inner, stop_id: StopId, reason: String, by: &Caller) -> Res
         inner.disk.denied(note, 0);
         return Err(refusal);
     }
-    let resetting = law.reset(Reset { stop_id, at: now.wall, actor: by.to_string(), reason });
+    let mut reset = Reset { stop_id, at: now.wall, actor: by.to_string(), reason, proof: Vec::new() };
+    inner.key.mark_reset(&mut reset);
+    let resetting = law.reset(reset);
     if resetting.is_new {
         let Reset { stop_id, actor, reason, .. } = &resetting.reset;
         let note = Note { actor: actor.clone(), ..Note::own(now.wall, Action::Reset) };

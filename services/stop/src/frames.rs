@@ -46,8 +46,8 @@ pub fn told<'a>(
 }
 
 /// All that is effective was said.
-pub fn synced(generation: u64) -> Bytes {
-    encoded(W::Synced(v1::Synced { generation }))
+pub fn synced(generation: u64, key: &[u8]) -> Bytes {
+    encoded(W::Synced(v1::Synced { generation, key: key.to_vec() }))
 }
 
 /// The answer to a check-in.

@@ -258,7 +258,13 @@ mod tests {
     }
 
     fn reset(stop_id: &StopId) -> Reset {
-        Reset { stop_id: stop_id.clone(), at: Utc(2), actor: "a".to_owned(), reason: "over".to_owned() }
+        Reset {
+            stop_id: stop_id.clone(),
+            at: Utc(2),
+            actor: "a".to_owned(),
+            reason: "over".to_owned(),
+            proof: Vec::new(),
+        }
     }
 
     #[test]
@@ -359,7 +365,7 @@ mod tests {
             let (region, proof) = (region.clone(), vec![255; 64]);
             let stop = Stop { actor: actor.clone(), reason: reason.clone(), region, proof, ..stop(id, Scope::Fleet) };
             if n < limits::RESETS_MAX {
-                latch.reset(Reset { actor, reason, ..reset(&stop.stop_id) });
+                latch.reset(Reset { actor, reason, proof: vec![255; 64], ..reset(&stop.stop_id) });
             }
             latch.engage(stop);
         }

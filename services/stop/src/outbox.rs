@@ -189,7 +189,7 @@ impl Waiting {
             let resets = resets.iter().filter_map(|id| law.latch().reset_of(id));
             self.whole.extend(frames::told([], resets, 0));
             self.sent = law.generation();
-            self.whole.push_back(frames::synced(self.sent));
+            self.whole.push_back(frames::synced(self.sent, &inner.key.public()));
             return self.whole.pop_front();
         }
         while let Some(frame) = self.frames.pop_front() {
@@ -282,7 +282,7 @@ mod tests {
         let (reset, generation) = lock(&inner.law).settle(resetting.version, Utc(1_000)).remove(0);
         outbox.answer(1, generation, LinkTime(5));
         outbox.answer(2, generation, LinkTime(5));
-        let synced = frames::synced(generation);
+        let synced = frames::synced(generation, &inner.key.public());
         assert!(heard().contains(&synced), "it is told the whole");
         let bytes = frames::told([], [&reset], generation).remove(0);
         outbox.tell(&Frame { generation, bytes: bytes.clone(), resets: [reset.stop_id].into() }, LinkTime(5));

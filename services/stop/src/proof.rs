@@ -1,4 +1,5 @@
-//! The service's own mark on a stop: a signature by a key in its folder, so that it knows a stop of its own again that a robot brings back.
+//! The service's own mark on stops and resets: a signature by a key in its folder. By it the service knows a stop of its own again that a robot brings back, and
+//! a robot believes a reset that comes by another way than its stop line.
 //!
 //! Invariant: what is signed is the stop as it is written on the wire, without its proof. The key never leaves the folder and is no credential of anybody.
 
@@ -6,8 +7,10 @@ use crate::audit;
 use ed25519_dalek::pkcs8::spki::der::pem::LineEnding;
 use ed25519_dalek::pkcs8::{DecodePrivateKey, EncodePrivateKey};
 use ed25519_dalek::{Signature, Signer, SigningKey};
-use midshift_core::stop::Stop;
+use midshift_core::limits;
+use midshift_core::stop::{Reset, Stop};
 use midshift_core::time::Utc;
+use midshift_proto::convert::stop::signed_reset;
 use midshift_proto::stop::v1;
 use prost::Message;
 use std::fs::{self, File, OpenOptions};
@@ -68,6 +71,16 @@ impl Key {
     /// Puts the mark on a stop.
     pub fn mark(&self, stop: &mut Stop) {
         stop.proof = self.0.sign(&told(stop)).to_bytes().to_vec();
+    }
+
+    /// Puts the mark on a reset.
+    pub fn mark_reset(&self, reset: &mut Reset) {
+        reset.proof = self.0.sign(&signed_reset(reset)).to_bytes().to_vec();
+    }
+
+    /// Its public half, by which robots know a marked reset.
+    pub fn public(&self) -> [u8; limits::STOP_KEY_BYTES] {
+        self.0.verifying_key().to_bytes()
     }
 
     /// Whether this stop, as it is, was marked with this key.
@@ -131,6 +144,23 @@ mod tests {
         }
         let other = tempfile::tempdir().unwrap();
         assert!(!kept(other.path()).knows(&back), "another service's");
+    }
+
+    #[test]
+    fn a_marked_reset_is_believed_by_the_public_key_over_the_wire() {
+        let folder = tempfile::tempdir().unwrap();
+        let key = kept(folder.path());
+        let (actor, reason, stop_id) = ("bert".to_owned(), "clear".to_owned(), stop().stop_id);
+        let mut reset = Reset { stop_id, at: Utc(2), actor, reason, proof: Vec::new() };
+        key.mark_reset(&mut reset);
+        let back: Reset = midshift_proto::parse(v1::Reset::from(&reset)).unwrap();
+        let public = ed25519_dalek::VerifyingKey::from_bytes(&key.public()).unwrap();
+        let knows = |reset: &Reset| {
+            let mark = Signature::from_slice(&reset.proof).unwrap();
+            public.verify_strict(&signed_reset(reset), &mark).is_ok()
+        };
+        assert!(knows(&back));
+        assert!(!knows(&Reset { at: Utc(3), ..back }));
     }
 
     #[test]

@@ -18,6 +18,7 @@ mod second;
 mod session;
 mod shared;
 mod status;
+mod stops;
 mod welcome;
 
 pub use bugs::Bugs;

@@ -3,10 +3,12 @@
 //! Invariant: telemetry only composes and sends desired state; it never changes or re-dates it.
 
 use crate::Inner;
+use crate::stops::SiteStops;
 use midshift_core::fleet::rows::SiteRow;
-use midshift_core::ids::{AreaId, RobotId};
+use midshift_core::ids::{AreaId, RobotId, StopId};
 use midshift_core::rows::{BadRow, Seq, Table};
 use midshift_core::site::{Site, text};
+use midshift_core::stop::record::StopRecord;
 use midshift_core::update::DesiredUpdate;
 use midshift_core::work::{DesiredPolicy, DesiredWork, LaneMark, Live, PresenceRow, Session};
 use midshift_store::{Change, Dirty, Error, Fold, LiveBoard, Projection};
@@ -44,6 +46,7 @@ pub struct Rows {
     /// Highest durable STATUS number by (robot, ring).
     pub status: BTreeMap<(RobotId, Arc<str>), u64>,
     desired: BTreeMap<RobotId, Sections>,
+    stops: Arc<SiteStops>,
     /// The map, as fleet keeps it; none: every robot is somewhere on the site.
     site: Option<Arc<Site>>,
 }
@@ -60,6 +63,7 @@ impl Rows {
 pub struct Picture {
     rows: RwLock<Rows>,
     watchers: Mutex<BTreeMap<RobotId, watch::Sender<Sections>>>,
+    stops: watch::Sender<Arc<SiteStops>>,
     ready: watch::Sender<bool>,
     /// Up to where the feed has been taken.
     absorbed: watch::Sender<Seq>,
@@ -91,6 +95,19 @@ impl Picture {
         let sections = self.rows().desired.get(robot_id).cloned().unwrap_or_default();
         let sender = watchers.entry(robot_id.clone()).or_insert_with(|| watch::Sender::new(sections));
         sender.subscribe()
+    }
+    /// The copy of the site's stops.
+    pub fn watch_stops(&self) -> watch::Receiver<Arc<SiteStops>> {
+        self.stops.subscribe()
+    }
+    /// Hands the copy of the stops to sessions, if it has changed: never half of one that is read anew.
+    fn publish_stops(&self) {
+        let newest = self.rows().stops.clone();
+        self.stops.send_if_modified(|old| {
+            let is_new = *old != newest;
+            *old = newest;
+            is_new
+        });
     }
     /// Waits until the store was read once.
     pub async fn ready(&self) {
@@ -138,6 +155,7 @@ impl Fold for Keeper {
             Table::Presence,
             Table::LaneMark,
             Table::Site,
+            Table::StopRecord,
         ]
     }
     fn reset(&mut self) {
@@ -151,6 +169,12 @@ impl Fold for Keeper {
             return Ok(());
         }
         let id = change.key.id.to_string();
+        if change.key.table == Table::StopRecord {
+            let Ok(stop_id) = StopId::parse(&id) else { return Ok(()) };
+            let record = change.decode::<StopRecord>()?.map(Arc::new);
+            put(Arc::make_mut(&mut self.0.picture.rows_mut().stops), stop_id, record);
+            return Ok(());
+        }
         let Ok(robot_id) = RobotId::parse(id.split('/').next().unwrap_or_default()) else { return Ok(()) };
         let mut rows = self.0.picture.rows_mut();
         match change.key.table {
@@ -202,6 +226,7 @@ pub async fn keep(inner: &Arc<Inner>) -> Result<(), Error> {
         wake.mark_unchanged();
         match projection.advance(inner.parts.store.as_ref()).await {
             Ok(_) => {
+                inner.picture.publish_stops();
                 inner.picture.absorbed.send_replace(projection.seq());
                 inner.picture.ready.send_if_modified(|ready| !std::mem::replace(ready, true));
             }

@@ -12,6 +12,7 @@ use crate::replay::{Replay, overloaded};
 use crate::second::Second;
 use crate::shared::{News, Shared};
 use crate::status::{self, Arrived, StatusLane};
+use crate::stops::StopNews;
 use crate::welcome::Begun;
 use midshift_core::fleet::REPORT_TOO_LONG;
 use midshift_core::ids::RobotId;
@@ -79,6 +80,7 @@ struct Session {
     unechoed: VecDeque<Echo>,
     /// What becomes of them.
     kept: (mpsc::Sender<News>, mpsc::Receiver<News>),
+    stops: StopNews,
     out: Downlink,
     out_since: Option<Instant>,
 }
@@ -129,6 +131,7 @@ pub async fn run(
         progress: (0, now.site),
         unechoed: VecDeque::new(),
         kept: mpsc::channel(UNECHOED_MAX),
+        stops: StopNews::new(inner.picture.watch_stops()),
         out: Downlink::default(),
         out_since: None,
         robot_id: robot_id.clone(),
@@ -182,6 +185,9 @@ impl Session {
                     }
                     Err(_) => return End::Gone,
                 },
+                facts = self.stops.next(&self.robot_id), if self.out.stops.is_none() => {
+                    self.say(|out| out.stops = Some(facts));
+                }
                 told = poll(&mut self.telling), if self.telling.is_some() => if !told {
                     self.too_long = None;
                 },

@@ -10,7 +10,7 @@ use crate::stopped::StopServer;
 use anyhow::{Context, ensure};
 use midshift_core::robot::StopLevel;
 use midshift_core::site::{DEMO, text};
-use midshift_proto::link::v1::StopLevel as Shown;
+use midshift_proto::common::v1::StopLevel as Shown;
 use midshift_proto::stop::v1::GetStatusRequest;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
 use midshift_proto::task::v1::TaskState;

@@ -266,6 +266,30 @@ fn a_reset_takes_one_stop_away_everywhere_and_no_other_and_a_rule_that_clears_al
 }
 
 #[test]
+fn a_stop_that_is_engaged_while_a_line_is_cut_reaches_its_robot_by_the_link() {
+    let mut stopped = Stopped::open(72, Naive::default());
+    stopped.scene.work(8);
+    stopped.pass(8_000);
+    stopped.line(0, Way::Cut);
+    stopped.engage(fleet());
+    stopped.until("the stop at every robot", |room| {
+        (0..ROBOTS).all(|robot| effective(&stops(room).kept(robot).latch).len() == 1)
+    });
+    assert_eq!(stopped.silences(), 0, "nobody stands by silence");
+    stopped.pass(BRAKES_MS + 2_000);
+    assert!(stopped.watch.broken.is_empty(), "{:#?}", stopped.watch.broken);
+    let stop_id = stopped.effective().pop_first().expect("one is engaged");
+    stopped.reset(&stop_id);
+    stopped.until("its reset at every robot", |room| {
+        (0..ROBOTS).all(|robot| effective(&stops(room).kept(robot).latch).is_empty())
+    });
+    stopped.line(0, Way::Open);
+    stopped.pass(HEALED_MS);
+    stopped.let_all_go();
+    stopped.assert_agrees();
+}
+
+#[test]
 fn silence_of_the_stop_service_stands_robots_among_people_within_its_bound_and_restarts_of_the_server_do_not() {
     let mut stopped = Stopped::open(71, Naive::default());
     stopped.pass(4_000);

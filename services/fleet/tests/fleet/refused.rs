@@ -49,8 +49,13 @@ async fn hundreds_of_stops_that_are_reset_at_once_all_wait_for_a_resume() {
     }
     w.until("all of them hold it", |s| s.tokens("r1").len() == 200).await;
     for stop_id in names(200) {
-        let reset =
-            Reset { stop_id: stop_id.clone(), at: crate::harness::BEGIN, actor: "bert".into(), reason: "clear".into() };
+        let reset = Reset {
+            stop_id: stop_id.clone(),
+            at: crate::harness::BEGIN,
+            actor: "bert".into(),
+            reason: "clear".into(),
+            proof: Vec::new(),
+        };
         w.stop(&record(stop_id, Some(reset))).await;
     }
     w.pass(5).await;

@@ -25,7 +25,8 @@ fn fleet_wide() -> StopRecord {
 }
 
 fn reset(record: StopRecord) -> StopRecord {
-    let reset = Reset { stop_id: s1(), at: BEGIN, actor: "bert".to_owned(), reason: "clear".to_owned() };
+    let reset =
+        Reset { stop_id: s1(), at: BEGIN, actor: "bert".to_owned(), reason: "clear".to_owned(), proof: Vec::new() };
     StopRecord { reset: Some(reset), ..record }
 }
 

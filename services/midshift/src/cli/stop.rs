@@ -8,7 +8,7 @@ use crate::stop::{FOLDER, StopServe};
 use crate::way::Line;
 use clap::{Args, Subcommand, ValueEnum};
 use midshift_core::time::Utc;
-use midshift_proto::link::v1::StopLevel;
+use midshift_proto::common::v1::StopLevel;
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::scope::Scope;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;

@@ -95,7 +95,7 @@ impl World {
             region: None,
             proof: Vec::new(),
         });
-        self.latch.reset(Reset { stop_id, at, actor, reason });
+        self.latch.reset(Reset { stop_id, at, actor, reason, proof: Vec::new() });
         self.copy_stops().await;
         let mut telemetry = Item { rows: vec![row(Table::Presence)], ..Item::new(Writer::Telemetry, "test") };
         let fact = Fact { log: Log::RobotInbox, subject: Arc::from("r1"), kind: "event", body: Arc::from("{}") };

@@ -287,7 +287,7 @@ impl Robot {
                 }
                 self.generation = self.generation.max(generation);
             }
-            FromStop::Synced { generation } => {
+            FromStop::Synced { generation, .. } => {
                 self.generation = self.generation.max(generation);
                 self.is_synced = true;
             }

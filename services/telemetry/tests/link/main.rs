@@ -9,4 +9,5 @@ mod robots;
 mod second;
 mod sessions;
 mod status;
+mod stops;
 mod world;

@@ -220,7 +220,7 @@ fn names<'a>(ids: impl Iterator<Item = &'a StopId>) -> Names {
 }
 
 fn reset_of(stop: usize) -> Reset {
-    Reset { stop_id: name(0, stop), at: Utc(0), actor: String::new(), reason: String::new() }
+    Reset { stop_id: name(0, stop), at: Utc(0), actor: String::new(), reason: String::new(), proof: Vec::new() }
 }
 
 fn facts_of(latch: &Latch) -> Facts {
@@ -284,7 +284,7 @@ impl Parties {
     }
 
     fn kept(&self, robot: usize, known: Known) -> Kept {
-        Kept { latch: self.latch(known.facts), awaiting: self.ids(robot, known.awaiting) }
+        Kept { latch: self.latch(known.facts), awaiting: self.ids(robot, known.awaiting), ..Kept::default() }
     }
 
     fn ids(&self, robot: usize, names: Names) -> BTreeSet<StopId> {

@@ -1,0 +1,53 @@
+//! Fleet stops by their second way: what a session says of the site's copy of them.
+
+use crate::world::{Result, Robot, World, world};
+use midshift_core::ids::{RobotId, StopId};
+use midshift_core::robot::StopLevel;
+use midshift_core::rows::{Expect, Item, Revision, Writer};
+use midshift_core::stop::record::StopRecord;
+use midshift_core::stop::{Reset, Scope, Stop};
+use midshift_core::time::Utc;
+use midshift_proto::session::StopFacts;
+
+fn record(n: u8, scope: Scope) -> Result<StopRecord> {
+    let stop = Stop {
+        stop_id: StopId::parse(&format!("STOP-{n}"))?,
+        scope,
+        level: StopLevel::Halt,
+        engaged: Utc(1),
+        actor: "anna".to_owned(),
+        reason: "a pallet fell".to_owned(),
+        region: None,
+        proof: vec![7; 64],
+    };
+    Ok(StopRecord { stop, reset: None })
+}
+
+async fn copied(world: &World, record: &StopRecord, expect: Expect) {
+    let mut item = Item::new(Writer::Stop, "stop");
+    item.put(record, expect, "stop.engaged");
+    assert!(world.store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
+}
+
+async fn hears(robot: &mut Robot) -> Result<StopFacts> {
+    robot.hears(|down| down.stops.clone()).await
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_stop_of_the_copy_goes_down_every_session_whole_and_once_with_its_reset() -> Result<()> {
+    let world = world().await?;
+    let first = record(1, Scope::Fleet)?;
+    copied(&world, &first, Expect::Absent).await;
+    let mut robot = Robot::attach(&world, None).await?;
+    assert_eq!(hears(&mut robot).await?, StopFacts { stops: vec![first.stop.clone()], resets: vec![] });
+    // While the session stands: one for another robot alone is not said, and nothing is said twice.
+    copied(&world, &record(2, Scope::Robot(RobotId::parse("r2")?))?, Expect::Absent).await;
+    let third = record(3, Scope::Robot(RobotId::parse("r1")?))?;
+    copied(&world, &third, Expect::Absent).await;
+    assert_eq!(hears(&mut robot).await?, StopFacts { stops: vec![third.stop], resets: vec![] });
+    let (actor, reason) = ("bert".to_owned(), "clear".to_owned());
+    let reset = Reset { stop_id: first.stop.stop_id.clone(), at: Utc(2), actor, reason, proof: vec![8; 64] };
+    copied(&world, &StopRecord { reset: Some(reset.clone()), ..first }, Expect::At(Revision(1))).await;
+    assert_eq!(hears(&mut robot).await?, StopFacts { stops: vec![], resets: vec![reset] });
+    Ok(())
+}
