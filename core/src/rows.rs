@@ -3,7 +3,7 @@
 //! Invariant: each table has one writing service; the single exception is declared in [`Table::born_by`]. The store refuses
 //! any other write at run time, and the architecture test holds this list against `docs/rows.md`.
 //! A revision counts the writes of one row, from 1. Ids of rows that can be deleted are never used again, so
-//! a revision never means two things.
+//! a revision never means two things; or only after [`limits::GONE_KEPT`] ([`Table::OF_A_ROBOT`]), when nobody remembers the first.
 
 use crate::audit::Note;
 use crate::ids::RobotId;
@@ -123,6 +123,19 @@ const AUDITS: &[(Writer, Table)] = &[
 ];
 
 impl Table {
+    /// Rows of one robot, by its id, that go when it was retired long ago. Its `robot_control` stays: it says that it was retired, and how many
+    /// errands it had, so that no id is given twice.
+    pub const OF_A_ROBOT: &[Self] = &[
+        Self::RobotAuthority,
+        Self::DesiredWork,
+        Self::DesiredPolicy,
+        Self::Session,
+        Self::Presence,
+        Self::DesiredUpdate,
+        Self::RobotSoftware,
+    ];
+    /// Rows of which a robot may have several, which go with those of [`Table::OF_A_ROBOT`].
+    pub const OWNED_BY_A_ROBOT: &[Self] = &[Self::RobotCounter, Self::HoldToken, Self::LaneMark, Self::Quarantine];
     /// Who may create a row. `task_state` is born with its `task_intake`: the one declared exception.
     pub const fn born_by(self) -> Writer {
         match self {

@@ -442,6 +442,16 @@ pub struct LaneMark {
     pub critical: u64,
     /// Highest EVENT number stored.
     pub event: u64,
+    /// When it was written last, UTC of the wall, unix ms; 0: before this was noted.
+    #[serde(default)]
+    pub at_unix_ms: i64,
+}
+
+impl LaneMark {
+    /// Of a ring of which nothing is stored.
+    pub fn fresh(robot_id: RobotId, ring: &str) -> Self {
+        Self { robot_id, ring: ring.to_owned(), critical: 0, event: 0, at_unix_ms: 0 }
+    }
 }
 
 impl Record for LaneMark {
@@ -450,7 +460,7 @@ impl Record for LaneMark {
         format!("{}/{}", self.robot_id, self.ring)
     }
     fn index(&self) -> Index {
-        Index { parent: Some(self.robot_id.as_str().into()), ..Index::default() }
+        Index { parent: Some(self.robot_id.as_str().into()), order: Some(self.at_unix_ms), ..Index::default() }
     }
 }
 

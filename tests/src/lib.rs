@@ -1,6 +1,7 @@
 //! The one integration suite of midshift: its tests are in `tests/tests`, over real programs and real parts.
 
 pub mod line;
+pub mod old_site;
 pub mod player;
 pub mod postgres;
 pub mod raw;

@@ -287,6 +287,9 @@ pub struct RobotCounter {
     pub stats: WorkStats,
     /// Milliseconds of site time in which it was heard, counted at the end of each attempt.
     pub attached_ms: u64,
+    /// When it was counted last, UTC, site clock; 0: before this was noted.
+    #[serde(default)]
+    pub counted: Utc,
 }
 
 impl Record for RobotCounter {
@@ -295,7 +298,7 @@ impl Record for RobotCounter {
         format!("{}@{}", self.robot_id, self.software)
     }
     fn index(&self) -> Index {
-        Index { parent: Some(self.robot_id.as_str().into()), ..Index::default() }
+        Index { parent: Some(self.robot_id.as_str().into()), order: Some(self.counted.0), ..Index::default() }
     }
 }
 

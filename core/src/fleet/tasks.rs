@@ -213,7 +213,9 @@ fn counter(tx: &mut Tx, robot_id: &RobotId, software: &str) -> RobotCounter {
         failures: std::collections::BTreeMap::new(),
         stats: crate::work::WorkStats::default(),
         attached_ms: 0,
+        counted: tx.now.utc,
     });
+    counter.counted = tx.now.utc;
     counter.attached_ms += tx.view.attached.get_mut(robot_id).map_or(0, |heard| std::mem::take(&mut heard.ms));
     counter
 }

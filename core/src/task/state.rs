@@ -282,6 +282,11 @@ pub struct Attempt {
     pub software: String,
 }
 
+impl Attempt {
+    /// Attempts of errands are ordered behind this, by the moment of their offer; those of tasks before it, by their epoch.
+    pub const ERRANDS_BEHIND: i64 = 1 << 32;
+}
+
 impl Record for Attempt {
     const TABLE: Table = Table::Attempt;
     fn id(&self) -> String {
@@ -289,7 +294,11 @@ impl Record for Attempt {
     }
     fn index(&self) -> Index {
         let parent = Some(self.attempt.subject.to_string().as_str().into());
-        Index { state: Some(self.phase.number()), parent, order: Some(self.attempt.epoch as i64) }
+        let order = match &self.attempt.subject {
+            Subject::Task(_) => self.attempt.epoch as i64,
+            Subject::Errand { .. } => self.offered.0.max(Self::ERRANDS_BEHIND + 1),
+        };
+        Index { state: Some(self.phase.number()), parent, order: Some(order) }
     }
 }
 

@@ -84,12 +84,14 @@ impl Turn<'_> {
             }
         }
         if has(Role::Ota)
-            && let Some(before) = privacy::of(Table::OtaCommandKey).before(clock.now().wall)
-            && let Err(error) = aged::take_away(store, Table::OtaCommandKey, before.0, "command.forgotten").await
+            && let Err(error) = prune_ota(store, clock).await
         {
             tracing::warn!(%error, "old requests about software could not be taken away");
         }
         if has(Role::Telemetry) {
+            if let Err(error) = midshift_telemetry::prune(store, clock).await {
+                tracing::warn!(%error, "rows of rings and robots that are gone could not be taken away");
+            }
             if let Err(error) = frames.prune().await {
                 tracing::warn!(%error, "old status could not be taken away");
             }
@@ -119,6 +121,15 @@ async fn keep_audit(parts: &Parts) {
         }
         tokio::time::sleep(PRUNE_EVERY).await;
     }
+}
+
+/// Used request_ids, and what robots ran that were retired long ago.
+async fn prune_ota(store: &dyn Store, clock: &dyn Clock) -> Result<(), midshift_store::Error> {
+    let now = clock.now();
+    if let Some(before) = privacy::of(Table::OtaCommandKey).before(now.wall) {
+        aged::take_away(store, Table::OtaCommandKey, before.0, "command.forgotten").await?;
+    }
+    aged::forget_robots(store, Writer::Ota, now.utc).await.map(drop)
 }
 
 async fn prune_entries(store: &dyn Store, clock: &dyn Clock) -> Result<(), midshift_store::Error> {

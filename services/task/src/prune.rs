@@ -4,10 +4,12 @@
 //! that is sent again after its row has gone is a new request.
 
 use crate::TaskService;
+use midshift_core::limits;
 use midshift_core::privacy;
 use midshift_core::rows::{Item, Key, Row, Table, Writer};
 use midshift_core::task::TaskIntake;
-use midshift_store::{Error, Query, aged};
+use midshift_store::{Cursor, Error, Query, aged};
+use std::collections::BTreeSet;
 
 /// Rows of one item, which others' commits pass between.
 const SLICE: usize = 200;
@@ -34,15 +36,27 @@ impl TaskService {
         let Some(before) = privacy::of(Table::TaskIntake).before(self.inner.parts.clock.now().utc) else {
             return Ok(0);
         };
-        let rows = self.store().list(Query { limit: SLICE, ..Query::all(Table::TaskIntake) }).await?;
-        let old = |row: &Row| row.decode::<TaskIntake>().is_ok_and(|intake| intake.created < before);
-        let rows: Vec<Row> = rows.into_iter().take_while(old).collect();
-        let states = self.store().get(rows.iter().map(|row| Key::new(Table::TaskState, &row.key.id)).collect()).await?;
-        let stays = |row: &Row| states.iter().any(|state| state.key.id == row.key.id);
-        let mut item = Item::new(Writer::Task, "task");
-        for row in rows.into_iter().filter(|row| !stays(row)) {
-            item.delete(row.key, row.revision, "task.intake_forgotten");
+        let (mut after, mut gone) = (None, 0);
+        while gone < limits::FORGOTTEN_PER_PASS as u64 {
+            let page = self.store().list(Query { after, limit: SLICE, ..Query::all(Table::TaskIntake) }).await?;
+            let Some(last) = page.last().map(Cursor::of) else { break };
+            after = Some(last);
+            let read = page.len();
+            let old = |row: &Row| row.decode::<TaskIntake>().is_ok_and(|intake| intake.created < before);
+            let rows: Vec<Row> = page.into_iter().take_while(old).collect();
+            let is_last = rows.len() < read;
+            let tasks = rows.iter().map(|row| Key::new(Table::TaskState, &row.key.id)).collect();
+            // The task of one that stays shields none behind it.
+            let stay: BTreeSet<_> = self.store().get(tasks).await?.into_iter().map(|state| state.key.id).collect();
+            let mut item = Item::new(Writer::Task, "task");
+            for row in rows.into_iter().filter(|row| !stay.contains(&row.key.id)) {
+                item.delete(row.key, row.revision, "task.intake_forgotten");
+            }
+            gone += aged::commit(self.store(), item).await?;
+            if is_last {
+                break;
+            }
         }
-        aged::commit(self.store(), item).await
+        Ok(gone)
     }
 }

@@ -147,20 +147,21 @@ impl Watcher {
         Ok(self.service.store().snapshot(&[Table::FleetMark]).await.map_err(unavailable)?.seq)
     }
 
-    /// The matching tasks as they are. The cursor is taken first, so that no change is lost between them; what a task already
+    /// The matching tasks as they are, as [`begins_with`] says. The cursor is taken first, so that no change is lost between them; what a task already
     /// showed of the changes after it is not said again.
     async fn existing(&mut self) -> Result<(), Stop> {
         let store = self.service.inner.parts.store.clone();
         self.after = self.head().await?;
-        let mut search = Search::new(&self.filter, Direction::OldestFirst, None, limits::PAGE_MAX);
+        let begin = begins_with(&self.filter);
+        let mut search = Search::new(&begin, Direction::OldestFirst, None, limits::PAGE_MAX);
         loop {
             let rows = search.next(store.as_ref()).await.map_err(unavailable)?;
             if rows.is_empty() {
                 break;
             }
-            for task in read_many(store.as_ref(), &search::admitted(&self.filter, &rows)).await? {
+            for task in read_many(store.as_ref(), &search::admitted(&begin, &rows)).await? {
                 let is_seen = sees(&self.service.inner.parts.site, &self.by, &task.intake);
-                if is_seen && self.filter.admits(&task.intake, &task.state) {
+                if is_seen && begin.admits(&task.intake, &task.state) {
                     self.shown.insert(task.state.task_id.clone(), task.revision);
                     self.keep_near(&task.state, true);
                     self.send(Item::Existing(task.encode()), None).await?;
@@ -245,4 +246,13 @@ impl Watcher {
         self.said = Instant::now();
         Ok(())
     }
+}
+
+/// Which tasks a watch begins with: what is over is told only where tasks or states are named, so that a beginning costs what is alive.
+fn begins_with(filter: &TaskFilter) -> TaskFilter {
+    let mut begin = filter.clone();
+    if begin.phases.is_empty() && begin.task_ids.is_empty() && begin.task_id_prefix.is_empty() {
+        begin.phases = Phase::ALL.into_iter().filter(|phase| !phase.is_terminal()).collect();
+    }
+    begin
 }

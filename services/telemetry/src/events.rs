@@ -7,6 +7,7 @@ use crate::Inner;
 use midshift_core::ids::RobotId;
 use midshift_core::robot::Lane;
 use midshift_core::rows::{Expect, Fact, Item, Log, Revision, Writer};
+use midshift_core::time::Utc;
 use midshift_core::work::{InboxEntry, InboxItem, LaneMark};
 use midshift_proto::session::{LaneAck, LaneBatch};
 use midshift_store::{CommitError, load};
@@ -103,12 +104,12 @@ impl Events {
         }
         Arrived { expect: None, known }
     }
-    /// The next item to commit; none if nothing waits.
-    pub fn next_batch(&mut self, robot_id: &RobotId) -> Option<Batch> {
+    /// The next item to commit, at this moment of the wall; none if nothing waits.
+    pub fn next_batch(&mut self, robot_id: &RobotId, wall: Utc) -> Option<Batch> {
         if self.waiting.is_empty() {
             return None;
         }
-        let mut mark = self.durable.clone();
+        let mut mark = LaneMark { at_unix_ms: wall.0, ..self.durable.clone() };
         let mut item = Item::new(Writer::Telemetry, robot_id.as_str());
         for entry in self.waiting.drain(..self.waiting.len().min(FACTS_PER_ITEM)) {
             let (_, last) = numbers(&entry.what);
@@ -189,7 +190,7 @@ mod tests {
         RobotId::parse("r1").expect("a valid id")
     }
     fn fresh() -> Events {
-        let mark = LaneMark { robot_id: robot(), ring: "ring".into(), critical: 0, event: 0 };
+        let mark = LaneMark::fresh(robot(), "ring");
         Events::new(mark, Revision(0))
     }
     fn sample(seq: u64) -> InboxItem {
@@ -211,7 +212,7 @@ mod tests {
         events.arrive(LaneBatch { lane: Lane::Event, items }, entry)
     }
     fn stored(events: &mut Events) -> usize {
-        events.next_batch(&robot()).map_or(0, |batch| {
+        events.next_batch(&robot(), Utc(0)).map_or(0, |batch| {
             let facts = batch.item.facts.len();
             events.done(batch.mark);
             facts
@@ -244,14 +245,13 @@ mod tests {
     fn nothing_is_acknowledged_before_its_commit_and_a_lost_one_is_asked_for_again() {
         let mut events = fresh();
         arrive(&mut events, vec![sample(1), sample(2)]);
-        let batch = events.next_batch(&robot()).expect("two samples wait");
+        let batch = events.next_batch(&robot(), Utc(0)).expect("two samples wait");
         assert_eq!(events.acks()[1].seq, 0);
         drop(batch);
         events.forget_taken();
         assert_eq!(arrive(&mut events, vec![sample(1), sample(2)]).expect, None);
         assert_eq!(stored(&mut events), 2);
-        let asked =
-            events.reset(LaneMark { robot_id: robot(), ring: "ring".into(), critical: 0, event: 1 }, Revision(1));
+        let asked = events.reset(LaneMark { event: 1, ..LaneMark::fresh(robot(), "ring") }, Revision(1));
         assert_eq!(asked[1], LaneAck { lane: Lane::Event, seq: 1, expect: Some(2) });
     }
 

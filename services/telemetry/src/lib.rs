@@ -14,6 +14,7 @@ pub mod precision;
 mod presence;
 mod registry;
 mod replay;
+mod retention;
 mod second;
 mod session;
 mod shared;
@@ -24,6 +25,7 @@ mod welcome;
 pub use bugs::Bugs;
 #[cfg(feature = "seeded-bugs")]
 pub use bugs::SeededBug;
+pub use retention::prune;
 
 use midshift_core::time::Clock;
 use midshift_core::work::Live;

@@ -425,7 +425,7 @@ impl Session {
     /// Begins the writes that wait, at most one of each kind at a time.
     fn start_writes(&mut self) {
         if self.committing.is_none()
-            && let Some(batch) = self.events.next_batch(&self.robot_id)
+            && let Some(batch) = self.events.next_batch(&self.robot_id, self.inner.parts.clock.now().wall)
         {
             self.committing = Some(self.commit(batch));
         }

@@ -106,7 +106,7 @@ pub async fn begin(inner: &Inner, hello: &Hello, by: &Caller) -> Result<Begun, R
 }
 
 async fn mark_of(inner: &Inner, hello: &Hello) -> Result<(LaneMark, Revision), Refusal> {
-    let fresh = LaneMark { robot_id: hello.robot_id.clone(), ring: hello.ring.clone(), critical: 0, event: 0 };
+    let fresh = LaneMark::fresh(hello.robot_id.clone(), &hello.ring);
     let found = load::<LaneMark>(inner.parts.store.as_ref(), &fresh.id()).await.map_err(unavailable)?;
     Ok(found.unwrap_or((fresh, Revision(0))))
 }

@@ -19,7 +19,7 @@ impl Rig {
         };
         let body = serde_json::to_string(&entry).expect("plain fields");
         self.entry(Log::RobotInbox, None, id.as_str().into(), Some(body.into()), "robot.said");
-        self.put(LaneMark { robot_id: id, ring: "ring".into(), critical: 0, event: seq });
+        self.put(LaneMark { event: seq, ..LaneMark::fresh(id, "ring") });
     }
 
     /// A robot's update is in this state from now on.
@@ -183,6 +183,7 @@ impl Rig {
             failures: BTreeMap::new(),
             stats: WorkStats::default(),
             attached_ms: 0,
+            counted: Default::default(),
         });
         if well {
             row.succeeded += 1;

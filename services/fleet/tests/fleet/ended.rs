@@ -1,15 +1,13 @@
 //! What is over costs nothing: a start and a takeover read what is alive, and ask by id for the few that somebody waits for.
 
 use crate::harness::{Shaky, World};
+use crate::old_site::OldSite;
 use midshift_core::fleet::bugs::Bugs;
-use midshift_core::fleet::rows::FleetMark;
-use midshift_core::ids::{RobotId, SiteId, TaskId};
+use midshift_core::ids::TaskId;
 use midshift_core::lead::FleetLeader;
 use midshift_core::reason::Code;
-use midshift_core::rows::{Expect, Item, Seq, Writer};
-use midshift_core::site::{CORRIDOR, text};
-use midshift_core::task::forms::Transport;
-use midshift_core::task::{Phase, TaskIntake, TaskState};
+use midshift_core::site::CORRIDOR;
+use midshift_core::task::Phase;
 use midshift_core::time::Clock;
 use midshift_fleet::FleetService;
 use midshift_store::{MemoryStore, Store, StoreId};
@@ -17,46 +15,18 @@ use std::sync::Arc;
 use std::time::Duration;
 
 /// Tasks that ended before anybody looks.
-const ENDED: u64 = 2_000;
-
-/// A store in which so many tasks have ended: every third has failed. Fleet has read all of its log.
-async fn old(ended: u64, site_id: SiteId, clock: Arc<dyn Clock>) -> Arc<dyn Store> {
-    let store = MemoryStore::new(site_id, StoreId(Arc::from("old")), clock.clone()).shared();
-    let site = text::parse(CORRIDOR).expect("a site");
-    let transport = Transport {
-        kind: "transport".to_owned(),
-        from_waypoint: "A".to_owned(),
-        to_waypoint: "B".to_owned(),
-        timeout_ms: Some(3_600_000),
-        ..Transport::default()
-    };
-    let spec = transport.into_raw().check("task", &|w| site.find(w).is_some()).expect("a good task");
-    for number in 1..=ended {
-        let intake = TaskIntake {
-            task_id: TaskId::parse(&format!("old-{number}")).expect("an id"),
-            spec: spec.clone(),
-            actor: "tests".to_owned(),
-            request_id: String::new(),
-            payload_hash: String::new(),
-            created: clock.now().utc,
-            number: number + 1_000,
-        };
-        let phase = if number % 3 == 0 { Phase::Failed } else { Phase::Succeeded };
-        let robot_id = RobotId::parse("gone").ok();
-        let state = TaskState { phase, robot_id, ended: Some(clock.now().utc), ..TaskState::born(&intake) };
-        let mut item = Item::new(Writer::Task, "tests");
-        item.create(&intake, "task.admitted").create(&state, "task.succeeded");
-        store.commit(vec![item]).await.remove(0).expect("a task");
-    }
-    let head = *store.wake().borrow();
-    let mut read = Item::new(Writer::Fleet, "tests");
-    read.put(&FleetMark { seq: Seq(head.0) }, Expect::Absent, "fleet.consumed");
-    store.commit(vec![read]).await.remove(0).expect("a mark");
-    Arc::new(store)
-}
+const ENDED: u64 = 100_000;
+/// Where it does not matter how many they are.
+const FEW: u64 = 300;
 
 async fn world(ended: u64) -> World {
-    World::over(CORRIDOR, Bugs::default(), async |site_id, clock| old(ended, site_id, clock).await).await
+    World::over(CORRIDOR, Bugs::default(), async |site_id, clock: Arc<dyn Clock>| {
+        let store = MemoryStore::new(site_id, StoreId(Arc::from("old")), clock.clone()).shared();
+        OldSite::of(ended, clock.now().utc).write(&store).await;
+        let store: Arc<dyn Store> = Arc::new(store);
+        store
+    })
+    .await
 }
 
 /// The reconciler that is there is gone, and another process leads. Rows and entries that this one read.
@@ -85,7 +55,7 @@ async fn a_start_and_a_takeover_read_no_more_rows_when_thousands_of_tasks_have_e
 
 #[tokio::test(start_paused = true)]
 async fn only_those_ended_tasks_are_known_that_a_task_waits_for() {
-    let mut w = world(ENDED).await;
+    let mut w = world(FEW).await;
     let (other, _way) = w.other_process();
     w.pass(11).await;
     w.robot("r1", "park-a").await;

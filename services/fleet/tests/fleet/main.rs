@@ -10,6 +10,9 @@ mod explain;
 mod holds;
 mod leads;
 mod offers;
+#[expect(dead_code, reason = "other crates' tests use the rest of it")]
+#[path = "../../../../tests/src/old_site.rs"]
+mod old_site;
 mod people;
 mod picture;
 mod places;
@@ -18,6 +21,7 @@ mod reach;
 mod refused;
 mod reports;
 mod restart;
+mod retention;
 mod retries;
 #[expect(dead_code, reason = "other crates' tests use the rest of it")]
 #[path = "../../../../tests/src/postgres.rs"]

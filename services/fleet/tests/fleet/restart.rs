@@ -1,11 +1,9 @@
 //! The reconciler ends and begins again on the same rows.
 
 use crate::harness::{Answer, World};
-use midshift_core::fleet::rows::RobotControl;
-use midshift_core::ids::{AttemptId, Subject};
 use midshift_core::reason::Code;
 use midshift_core::site::CORRIDOR;
-use midshift_core::task::{Attempt, AttemptPhase, Phase, TaskState, Then};
+use midshift_core::task::{Attempt, Phase, TaskState, Then};
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
 use std::time::Duration;
@@ -163,7 +161,11 @@ async fn a_task_that_ended_a_month_ago_is_forgotten_with_its_attempts_and_one_th
     tokio::time::advance(29 * day).await;
     assert_eq!(midshift_fleet::prune(&*w.store, &*w.clock).await.expect("prunes"), 0);
     tokio::time::advance(2 * day).await;
-    assert_eq!(midshift_fleet::prune(&*w.store, &*w.clock).await.expect("prunes"), 2, "the task and its attempt");
+    assert_eq!(
+        midshift_fleet::prune(&*w.store, &*w.clock).await.expect("prunes"),
+        3,
+        "the task, its attempt, and the way to park"
+    );
     w.step().await;
     let seen = w.seen().await;
     let tasks: Vec<_> = seen.all::<TaskState>().into_iter().map(|t| t.task_id.to_string()).collect();
@@ -173,27 +175,6 @@ async fn a_task_that_ended_a_month_ago_is_forgotten_with_its_attempts_and_one_th
     w.start_fleet();
     w.step().await;
     w.lawful().await;
-}
-
-#[tokio::test(start_paused = true)]
-async fn only_the_newest_errands_of_a_robot_are_kept() {
-    let mut w = World::on(CORRIDOR).await;
-    w.robot("r1", "B").await;
-    let done = |s: &crate::harness::Seen| s.all::<Attempt>().into_iter().find(|a| a.phase == AttemptPhase::Succeeded);
-    let errand = done(&w.until("it has parked", |s| done(s).is_some()).await).expect("an errand");
-    w.stop_fleet().await;
-    let robot_id = errand.robot_id.clone();
-    let older = |number: u64| {
-        let subject = Subject::Errand { robot_id: robot_id.clone(), number };
-        Attempt { attempt: AttemptId { subject, epoch: 1 }, ..errand.clone() }
-    };
-    w.left_behind(&(2..=150).map(older).collect::<Vec<_>>()).await;
-    let known = w.seen().await.get::<RobotControl>("r1").expect("known");
-    assert_eq!(known.errands, 1);
-    w.changed(&RobotControl { errands: 150, ..known }).await;
-    assert_eq!(midshift_fleet::prune(&*w.store, &*w.clock).await.expect("prunes"), 49);
-    let left = w.seen().await.all::<Attempt>().len();
-    assert_eq!(left, 101, "number 50 to 150");
 }
 
 #[tokio::test(start_paused = true)]

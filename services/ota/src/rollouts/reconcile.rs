@@ -172,7 +172,9 @@ impl Loop {
     pub(super) async fn rebuild(&mut self) -> Result<(), Error> {
         self.take_part().await?;
         self.own.clear();
-        let snapshot = self.parts.store.snapshot(TABLES).await?;
+        let Self { seat, parts, .. } = self;
+        let reading = parts.store.snapshot(TABLES);
+        let snapshot = lead::renewed_while(seat, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
         let now = self.parts.clock.now();
         let served = self.view.served_ms(&now);
         let (unusable, contacts) = (std::mem::take(&mut self.view.unusable), std::mem::take(&mut self.view.contacts));

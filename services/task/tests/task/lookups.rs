@@ -221,3 +221,24 @@ async fn a_task_is_shown_whatever_came_after_it() {
     let rows = old.counted.rows.load(Relaxed);
     assert!(rows <= 3, "{rows} rows");
 }
+
+#[tokio::test]
+async fn a_watch_without_a_filter_begins_with_what_is_alive_and_reads_nothing_else() {
+    let old = Old::site().await;
+    let first = async |filter: Option<TaskFilter>| {
+        old.counted.rows.store(0, Relaxed);
+        let request = v1::WatchTasksRequest { filter, cursor: String::new() };
+        let stream = old.service.watch_tasks(Request::new(request)).await.expect("a watch").into_inner();
+        let mut watch = Watch::over(stream);
+        let mut told = Vec::new();
+        while let Some(v1::watch_tasks_response::Item::Existing(task)) = watch.message().await.item {
+            told.push(task.task_id);
+        }
+        (told, old.counted.rows.load(Relaxed))
+    };
+    let (told, rows) = first(None).await;
+    assert_eq!(told, [old.first.as_str()], "the only one that is alive");
+    assert!(rows <= 8, "{rows} rows");
+    let named = TaskFilter { task_ids: vec!["OLD-000002".into()], ..TaskFilter::default() };
+    assert_eq!(first(Some(named)).await.0, ["OLD-000002"], "what is over is told where it is named");
+}

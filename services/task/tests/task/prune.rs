@@ -73,6 +73,23 @@ async fn what_was_asked_for_is_kept_as_long_as_its_task_and_goes_with_it() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn what_was_asked_of_tasks_that_are_still_there_shields_none_behind_it() {
+    let world = World::new().await;
+    // More than one slice of tasks that nobody resolves, and one behind them that is gone.
+    for _ in 0..450 {
+        submit(&world.service, transport("", "B03")).await.expect("admitted");
+    }
+    let gone = submit(&world.service, transport("", "B03")).await.expect("admitted").task_id;
+    let (_, revision) = world.state(&gone).await;
+    let mut item = Item::new(Writer::Fleet, "fleet");
+    item.delete(Key::new(Table::TaskState, &gone), revision, "task.forgotten");
+    world.store.commit(vec![item]).await.remove(0).expect("applied");
+    let after = world.later(31 * DAY_MS).await;
+    assert_eq!(after.prune().await.expect("pruned"), 1);
+    assert_eq!(world.store.get(vec![Key::new(Table::TaskIntake, &gone)]).await.expect("rows").len(), 0);
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_request_id_used_again_after_it_was_forgotten_waits_for_its_own_request() {
     let world = World::new().await;
     let [one, two] = ["B03", "B02"].map(|to| transport("", to));

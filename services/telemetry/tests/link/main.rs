@@ -5,6 +5,7 @@ mod gateways;
 mod machines;
 mod reach;
 mod replay;
+mod retention;
 mod robots;
 mod second;
 mod sessions;

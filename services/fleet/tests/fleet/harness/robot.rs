@@ -273,7 +273,7 @@ impl Robot {
         }
     }
     pub(super) fn lane_mark(&self) -> LaneMark {
-        LaneMark { robot_id: self.id.clone(), ring: "ring".to_owned(), critical: 0, event: 0 }
+        LaneMark::fresh(self.id.clone(), "ring")
     }
     pub(super) fn undelivered(&mut self) -> Vec<(u64, InboxEntry)> {
         std::mem::take(&mut self.outbox)
