@@ -20,7 +20,8 @@ pub fn hold(entries: &[Entry]) {
     let mut ledger = Ledger::default();
     for entry in entries {
         // Deleted only for its age.
-        let is_forgotten = entry.body.is_none() && &*entry.kind == "task.forgotten";
+        let by_age = ["task.forgotten", "errand.forgotten", "robot.forgotten"];
+        let is_forgotten = entry.body.is_none() && by_age.contains(&&*entry.kind);
         match entry.table.filter(|_| !is_forgotten) {
             Some(Table::Attempt) => ledger.attempt(&row(entry)),
             Some(Table::TaskState) => ledger.task(row(entry)),
