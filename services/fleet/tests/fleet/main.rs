@@ -10,7 +10,6 @@ mod explain;
 mod holds;
 mod leads;
 mod offers;
-#[expect(dead_code, reason = "other crates' tests use the rest of it")]
 #[path = "../../../../tests/src/old_site.rs"]
 mod old_site;
 mod people;

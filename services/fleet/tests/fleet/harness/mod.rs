@@ -329,14 +329,6 @@ impl World {
         }
     }
 
-    /// One of fleet's rows, as an earlier fleet has changed it.
-    pub async fn changed<R: midshift_core::rows::Record>(&self, row: &R) {
-        let found = midshift_store::load::<R>(&*self.store, &row.id()).await.expect("a store").expect("a row");
-        let mut item = Item::new(Writer::Fleet, "tests");
-        item.update(row, found.1, "tests.left_behind");
-        self.commit(item).await;
-    }
-
     async fn commit(&self, item: Item) {
         for result in self.store.commit(vec![item]).await {
             result.expect("an item of nobody else's rows");
