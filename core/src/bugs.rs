@@ -32,7 +32,8 @@ macro_rules! seeded_bugs {
         }
 
         impl Bugs {
-            $(pub(crate) fn $question(self) -> bool {
+            $($(#[$doc])*
+            pub fn $question(self) -> bool {
                 #[cfg(feature = "seeded-bugs")]
                 {
                     self.has(SeededBug::$bug)

@@ -77,6 +77,11 @@ pub fn written<R: Record>(item: &Item) -> Option<R> {
     serde_json::from_str(body).ok()
 }
 
+/// What happens to the first row of an item.
+pub fn kind_of(item: &Item) -> &'static str {
+    item.rows.first().map_or("", |row| row.kind)
+}
+
 /// What a decision was to change: its kind, and its rows but for marks, clocks and incidents, which are others each time.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Outline {
@@ -89,10 +94,14 @@ pub struct Outline {
 impl Outline {
     /// That of an item.
     pub fn of(item: &Item) -> Self {
+        Self::new(kind_of(item), item.rows.iter().map(|row| &row.key))
+    }
+    /// That of a decision of this kind on these rows.
+    pub fn new<'a>(kind: &'static str, keys: impl Iterator<Item = &'a Key>) -> Self {
         let is_fixed = |key: &&Key| !matches!(key.table, Table::FleetMark | Table::ServiceClock | Table::Incident);
-        let mut keys: Vec<Key> = item.rows.iter().map(|row| &row.key).filter(is_fixed).cloned().collect();
+        let mut keys: Vec<Key> = keys.filter(is_fixed).cloned().collect();
         keys.sort();
-        Self { kind: item.rows.first().map_or("", |row| row.kind), keys }
+        Self { kind, keys }
     }
 }
 

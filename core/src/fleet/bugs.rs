@@ -11,4 +11,12 @@ crate::seeded_bugs! {
     BudgetIsForgotten budget_is_forgotten;
     /// Every process plans, whoever leads: two that decide the same conflict for ever.
     EverybodyLeads everybody_leads;
+    /// What a robot says of an attempt counts for its task, whoever has been given the task since.
+    LateReportsCount late_reports_count;
+    /// A place takes everybody who asks for it.
+    CapacityIsForgotten capacity_is_forgotten;
+    /// Of the places of a stretch each is granted as soon as it is free, and kept until the others are.
+    GrantsOneByOne grants_one_by_one;
+    /// No task is promoted, however long it waits.
+    NobodyIsPromoted nobody_is_promoted;
 }

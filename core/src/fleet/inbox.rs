@@ -52,8 +52,9 @@ pub fn attempt(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, tally: &
         return;
     };
     let newest = tx.view.task(task_id).and_then(|t| t.attempt_id());
-    let ours =
-        newest.as_ref() == Some(id) && tx.view.task(task_id).is_some_and(|t| t.robot_id.as_ref() == Some(robot_id));
+    let ours = (newest.as_ref() == Some(id)
+        && tx.view.task(task_id).is_some_and(|t| t.robot_id.as_ref() == Some(robot_id)))
+        || tx.view.bugs.late_reports_count();
     let moved = ours
         && happen(tx, task_id, News { event: event_of(report), why: report.refusal.as_ref(), report: Some(report) });
     if !moved {

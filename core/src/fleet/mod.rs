@@ -50,7 +50,7 @@ mod tests;
 use crate::ids::RobotId;
 use crate::lead::Rivals;
 use crate::reason::{Code, Reason};
-use crate::rows::{BadRow, Entry, Item, Key, Log, Revision, Row, Seq, Table};
+use crate::rows::{BadRow, Entry, Item, Key, Log, Row, Seq, Table};
 use crate::task::TaskRequest;
 use crate::time::Now;
 use crate::work::{InboxEntry, Live};
@@ -240,14 +240,22 @@ pub fn follow_rows(view: &mut View, now: Now, entries: &[Entry], unreadable: &mu
 /// # Errors
 /// A row that cannot be read.
 pub fn reread(view: &mut View, keys: &[Key], rows: &[Row]) -> Result<(), BadRow> {
-    for key in keys {
-        view.absorb(key, Revision(u64::MAX), None)?;
-        if let Some(row) = rows.iter().find(|row| row.key == *key) {
-            view.absorb(key, row.revision, Some(row))?;
-        }
-    }
+    put_right(view, keys, rows)?;
     view.rest();
     Ok(())
+}
+
+/// Puts rows as they were just read over what was to become of `keys`; other rows are those that [`view::named`] names, which this picture
+/// may have let go.
+///
+/// # Errors
+/// A row that cannot be read.
+pub fn put_right(view: &mut View, keys: &[Key], rows: &[Row]) -> Result<(), BadRow> {
+    let found: BTreeMap<&Key, &Row> = rows.iter().map(|row| (&row.key, row)).collect();
+    for key in keys {
+        view.put_right(key, found.get(key).copied())?;
+    }
+    rows.iter().try_for_each(|row| view.absorb(&row.key, row.revision, Some(row)))
 }
 
 /// Who else may plan on a store that other processes open too, or not.
@@ -345,6 +353,7 @@ pub enum Pace {
 /// much as a slice holds, and leaves the rest for the next turn: then the report says `more`.
 pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Plan) {
     refused::open_incidents(view, now, plan);
+    refused::try_again(view);
     welcome(view, now, board, plan);
     if pace == Pace::Sweep {
         sweep::gather(view, now, board);

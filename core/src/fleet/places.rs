@@ -199,6 +199,11 @@ fn serve(tx: &mut Tx, live: &Live, releases: &mut Releases, traffic: &mut Traffi
         Some(segment) => (segment.places(), Some(segment.end as u32)),
         None => return,
     };
+    if tx.view.bugs.grants_one_by_one() {
+        let free = needed.iter().copied().filter(|ix| grantable(tx.view, robot_id, &[*ix], traffic));
+        let free: Vec<PlaceIx> = free.collect();
+        grant(tx, robot_id, &free, traffic);
+    }
     if grantable(tx.view, robot_id, &needed, traffic) {
         grant(tx, robot_id, &needed, traffic);
         tx.view.waits.remove(robot_id);

@@ -16,6 +16,10 @@ use crate::task::{Event, Phase, TaskIntake, TaskState};
 use crate::time::{Now, Utc};
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Bound;
+use std::sync::OnceLock;
+
+/// Ready tasks from one milestone to the next: what a question about a position counts at most.
+const MILESTONE: usize = 64;
 
 /// Where a ready task stands. The smallest is served first.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -40,6 +44,13 @@ impl Rank {
         let promoted = class != Class::of(intake.spec.priority, 0);
         let priority = if promoted { 0 } else { intake.spec.priority };
         Self { class, promoted, priority, since, number: task.number, task_id: task.task_id.clone() }
+    }
+}
+
+impl Rank {
+    /// As if it had not waited.
+    fn unpromoted(self, priority: u8) -> Self {
+        Self { class: Class::of(priority, 0), promoted: false, priority, ..self }
     }
 }
 
@@ -134,6 +145,8 @@ pub struct Queue {
     now: Utc,
     waiting: BTreeMap<TaskId, Waiting>,
     ready: BTreeSet<Rank>,
+    /// Every [`MILESTONE`]th ready task, counted at the first question after the queue changed.
+    milestones: OnceLock<Vec<Rank>>,
     /// When time changes what a task waits for, or its rank.
     due: BTreeSet<(Utc, TaskId)>,
     /// Tasks by the one whose end they wait for.
@@ -189,9 +202,18 @@ impl Queue {
             _ => None,
         }
     }
-    /// How many ready tasks are served up to a task, itself included; none: it is not ready.
+    /// How many ready tasks are served up to a task, itself included; none: it is not ready. However long the queue is, a question counts
+    /// [`MILESTONE`] tasks at most.
     pub fn position(&self, task_id: &TaskId) -> Option<usize> {
-        self.rank(task_id).map(|rank| self.ready.range(..=rank).count())
+        let rank = self.rank(task_id)?;
+        let milestones = self.milestones();
+        let passed = milestones.partition_point(|milestone| milestone <= rank);
+        let last = passed.checked_sub(1).map_or(Bound::Unbounded, |at| Bound::Excluded(&milestones[at]));
+        Some(passed * MILESTONE + self.ready.range((last, Bound::Included(rank))).count())
+    }
+    fn milestones(&self) -> &Vec<Rank> {
+        let every = || self.ready.iter().skip(MILESTONE - 1).step_by(MILESTONE).cloned().collect();
+        self.milestones.get_or_init(every)
     }
     /// Tasks that wait, by what for.
     pub fn counts(&self) -> impl Iterator<Item = (Code, u64)> {
@@ -258,6 +280,7 @@ impl Queue {
         };
         match &new.wait {
             Wait::Turn(rank) => {
+                self.milestones.take();
                 self.ready.insert(rank.clone());
                 self.news.insert(rank.clone());
             }
@@ -276,6 +299,7 @@ impl Queue {
     fn take_out(&mut self, task_id: &TaskId, old: &Waiting) {
         match &old.wait {
             Wait::Turn(rank) => {
+                self.milestones.take();
                 self.ready.remove(rank);
                 self.news.remove(rank);
             }
@@ -310,7 +334,13 @@ impl Queue {
 /// Puts a task where its rows say that it stands: out of the queue, if it waits for no robot.
 pub(super) fn place(view: &mut View, task_id: &TaskId) {
     let rows = view.task(task_id).filter(|task| task.phase == Phase::Queued).zip(view.intake(task_id));
-    let wait = rows.map(|(task, intake)| (Wait::of(task, intake, &view.ended, view.queue.now), task.queued_since));
+    let wait = rows.map(|(task, intake)| {
+        let wait = match Wait::of(task, intake, &view.ended, view.queue.now) {
+            Wait::Turn(rank) if view.bugs.nobody_is_promoted() => Wait::Turn(rank.unpromoted(intake.spec.priority)),
+            wait => wait,
+        };
+        (wait, task.queued_since)
+    });
     view.queue.put(task_id, wait);
 }
 
@@ -321,6 +351,19 @@ pub(super) fn note_end(view: &mut View, task_id: &TaskId, phase: Phase) {
     }
     view.ended.insert(task_id.clone(), phase);
     for dependent in view.queue.dependents.get(task_id).cloned().unwrap_or_default() {
+        place(view, &dependent);
+    }
+}
+
+/// A task that was taken for ended goes on: those that depend on it wait for it again.
+pub(super) fn note_open(view: &mut View, task_id: &TaskId) {
+    if view.ended.remove(task_id).is_none() {
+        return;
+    }
+    let intakes = view.intakes.values().map(|intake| &intake.row);
+    let dependents: Vec<TaskId> =
+        intakes.filter(|intake| intake.spec.depends_on.contains(task_id)).map(|i| i.task_id.clone()).collect();
+    for dependent in dependents {
         place(view, &dependent);
     }
 }
@@ -405,5 +448,36 @@ pub(super) fn tell_backlog(view: &mut View, now: Now, plan: &mut Plan) {
             plan.decide(view, now, "fleet", |tx| incidents::open_as(tx, id, reason, None, None));
         }
         (None, _) => {}
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rank(n: u64) -> Rank {
+        let task_id = TaskId::parse(&format!("T{n:04}")).expect("an id");
+        Rank { class: Class::of(5, 0), promoted: false, priority: 5, since: Utc(0), number: n, task_id }
+    }
+
+    #[test]
+    fn positions_are_counted_from_what_was_prepared_at_the_first_question_and_again_once_the_queue_changed() {
+        for many in [0, 1, 63, 64, 65, 1_000] {
+            let mut queue = Queue::new(Utc(0));
+            for n in 0..many {
+                queue.put(&rank(n).task_id, Some((Wait::Turn(rank(n)), Utc(0))));
+            }
+            let prepared = queue.milestones().as_ptr();
+            for n in 0..many {
+                assert_eq!(queue.position(&rank(n).task_id), Some(n as usize + 1), "of {many}");
+            }
+            assert_eq!(queue.milestones().as_ptr(), prepared, "nothing was prepared anew");
+            assert!(queue.milestones().len() == many as usize / MILESTONE);
+            assert_eq!(queue.position(&rank(many).task_id), None);
+            if many > 1 {
+                queue.put(&rank(0).task_id, None);
+                assert_eq!(queue.position(&rank(many - 1).task_id), Some(many as usize - 1));
+            }
+        }
     }
 }

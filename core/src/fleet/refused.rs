@@ -31,6 +31,8 @@ struct Known {
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Refused {
     known: BTreeMap<Outline, Known>,
+    /// Robots of decisions that are tried again.
+    again: BTreeSet<RobotId>,
 }
 
 impl Refused {
@@ -59,15 +61,21 @@ impl Refused {
     }
     /// A row changed: what is about it is tried again. Of the robots' rows a session counts too.
     pub fn row_changed(&mut self, key: &Key) {
-        for (outline, known) in self.known.iter_mut().filter(|(_, known)| known.is_aside) {
+        self.try_those(|outline, known| {
             let is_session = || key.table == Table::Session && known.robots.iter().any(|r| r.as_str() == &*key.id);
-            known.is_aside = !(outline.keys.contains(key) || is_session());
-        }
+            outline.keys.contains(key) || is_session()
+        });
     }
     /// A person closed an incident: the decision that it was about is tried again.
     pub fn incident_closed(&mut self, told: &Reason) {
+        self.try_those(|outline, _| reason(outline) == *told);
+    }
+    fn try_those(&mut self, are_meant: impl Fn(&Outline, &Known) -> bool) {
         for (outline, known) in self.known.iter_mut().filter(|(_, known)| known.is_aside) {
-            known.is_aside = reason(outline) != *told;
+            if are_meant(outline, known) {
+                known.is_aside = false;
+                self.again.extend(known.robots.iter().cloned());
+            }
         }
     }
     fn aside(&self) -> impl Iterator<Item = (&Outline, &Known)> {
@@ -88,6 +96,20 @@ pub fn note(view: &mut View, outline: Outline) {
     if known.times >= limits::REFUSALS_UNTIL_ASIDE && !known.is_aside {
         (known.is_aside, known.is_untold) = (true, true);
     }
+}
+
+/// The store refused a decision for good: it is noted, and what it was about is looked at again.
+pub fn undone(view: &mut View, outline: Outline) {
+    view.refused.again.extend(robots_of(view, &outline));
+    note(view, outline);
+}
+
+/// Looks again at robots of decisions that were undone, or are not aside any more.
+pub(super) fn try_again(view: &mut View) {
+    let robots = std::mem::take(&mut view.refused.again);
+    view.compared.retain(|robot_id, _| !robots.contains(robot_id));
+    view.dirty.extend(robots.iter().cloned());
+    view.policy_dirty.extend(robots);
 }
 
 /// Tells people of every decision that was put aside since.

@@ -1,7 +1,7 @@
 //! Fleet's picture of the rows: built from a snapshot, kept by the feed, and already holding what fleet itself is about to commit.
 //!
 //! Called by every room of `fleet`. Invariant: a row here is at the revision it has in the store, or one that an item of the
-//! running cycle will write; after a conflict the whole view is built again, never patched.
+//! running cycle will write. After a conflict the whole view is built again; after a refusal only the rows of what was refused are read again.
 
 use super::queue::{self, Queue};
 use super::rows::{
@@ -9,6 +9,7 @@ use super::rows::{
     RobotHolder, ServiceClock, SiteRow, Timer,
 };
 use super::sweep::Agenda;
+use super::way;
 use crate::identity::RobotIdentity;
 use crate::ids::{AttemptId, RobotId, TaskId};
 use crate::limits;
@@ -18,13 +19,13 @@ pub use crate::picture::{Rowed, Slot};
 use crate::policy::AreaPolicy;
 use crate::rows::{BadRow, Key, Part, Revision, Row, Seq, Table, Writer};
 use crate::site::Site;
-use crate::site::route::Router;
+use crate::site::route::{Blocked, Router};
 use crate::stop::record::StopRecord;
 use crate::task::{Attempt, AttemptPhase, Phase, TaskIntake, TaskState};
 use crate::time::{Now, Utc};
 use crate::work::{DesiredPolicy, DesiredWork, LaneMark, PresenceRow, Session};
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 /// Time in which a robot was heard and that no counter has yet.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -148,6 +149,8 @@ pub struct View {
     pub unexplained: super::unexplained::Unexplained,
     /// The attempt that a robot lists and no row knows, and since when, link clock. Volatile.
     pub unknown: BTreeMap<RobotId, (AttemptId, crate::time::LinkTime)>,
+    /// Places that no route may lead into now: found once, until a place or a stop changes. Read by [`View::closed`]. Volatile.
+    pub closed_places: OnceLock<Blocked>,
     /// Time in which robots were heard since it was last counted. Volatile.
     pub attached: BTreeMap<RobotId, Attached>,
     /// The newest heartbeat of each robot, as (session epoch, number), that was compared with the rows and needs no second look. Volatile.
@@ -202,7 +205,9 @@ impl Viewed<View> for TaskState {
             view.dirty.extend(task.robot_id.clone());
             view.unasked.remove(&task_id);
             let phase = task.phase;
-            if phase.is_terminal() {
+            if !phase.is_terminal() {
+                queue::note_open(view, &task_id);
+            } else {
                 let deadline = view.intake(&task_id).and_then(|intake| intake.spec.deadline);
                 if let Some(at) = deadline {
                     view.deadlines.remove(&(at, task_id.clone()));
@@ -266,6 +271,7 @@ impl Viewed<View> for StopRecord {
         &mut view.stops
     }
     fn changed(view: &mut View, _id: &str, _old: Option<&Self>) {
+        view.closed_places.take();
         view.stops_changed = true;
     }
 }
@@ -333,6 +339,7 @@ impl Viewed<View> for Place {
         &mut view.places
     }
     fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+        view.closed_places.take();
         for robot in old.into_iter().flat_map(|p| &p.holders).map(|h| &h.robot_id) {
             view.dirty.insert(robot.clone());
             if let Some(places) = view.held_places.get_mut(robot) {
@@ -468,6 +475,7 @@ impl View {
             unknown: BTreeMap::new(),
             unexplained: super::unexplained::Unexplained::default(),
             attached: BTreeMap::new(),
+            closed_places: OnceLock::new(),
             place_waits: 0,
             compared: BTreeMap::new(),
             behind: None,
@@ -574,6 +582,19 @@ impl View {
         }
     }
 
+    /// Puts a row as the store has it over what this picture had made of it. None: there is no such row.
+    ///
+    /// # Errors
+    /// A row that cannot be read.
+    pub fn put_right(&mut self, key: &Key, row: Option<&Row>) -> Result<(), BadRow> {
+        if let (Table::TaskState, Ok(task_id)) = (key.table, TaskId::parse(&key.id)) {
+            self.let_go.remove(&task_id);
+            queue::note_open(self, &task_id);
+        }
+        self.absorb(key, Revision(u64::MAX), None)?;
+        row.map_or(Ok(()), |row| self.absorb(key, row.revision, Some(row)))
+    }
+
     fn take<R: Viewed<View>>(&mut self, key: &Key, revision: Revision, row: Option<&Row>) -> Result<(), BadRow> {
         if let (Table::TaskState, None, Ok(task_id)) = (key.table, row, TaskId::parse(&key.id)) {
             self.ended.remove(&task_id);
@@ -674,6 +695,10 @@ impl View {
     pub fn robot_holds(&self, robot: &RobotId) -> impl Iterator<Item = &HoldToken> {
         let from = format!("robot:{robot}:");
         self.holds.range(from.clone()..).take_while(move |(id, _)| id.starts_with(&from)).map(|(_, h)| &h.row)
+    }
+    /// Places that no route may lead into now.
+    pub fn closed(&self) -> &Blocked {
+        self.closed_places.get_or_init(|| way::closed(self))
     }
     /// Rules of an area, as they are composed for robots and shown to people.
     pub fn policy(&self, area: &crate::ids::AreaId) -> AreaPolicy {

@@ -1,4 +1,4 @@
-//! The loop: take what is new, decide, commit, publish. A conflict means that somebody else decided too: the picture is built again.
+//! The loop: take what is new, decide, commit (`commit`), publish. A conflict means that somebody else decided too: the picture is built again.
 //! Each turn is a slice of some milliseconds; between two, people are answered. A turn takes a few requests *and* a sweep that is due: neither
 //! keeps the other waiting.
 //! Of several processes on one store one leads and does all that; the others keep their picture by rows alone (`standby`).
@@ -8,16 +8,16 @@
 
 use crate::{Look, Parts, Request};
 use midshift_core::fleet::view::{self, View};
-use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, found, obeyed, objects, refused};
+use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, found, objects};
 use midshift_core::lead::{FleetLeader, Own, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::once;
-use midshift_core::picture::{self, Outline};
-use midshift_core::reason::{Code, Kind, Reason, Refusal};
-use midshift_core::rows::{Item, Key, Log, Seq, Table};
+use midshift_core::picture;
+use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::rows::{Key, Log, Seq, Table};
 use midshift_core::time::Now;
 use midshift_core::work::Live;
-use midshift_store::{CommitError, Dirty, Error, FeedPage, Store, lead};
+use midshift_store::{Dirty, Error, FeedPage, Store, lead};
 use std::time::Duration;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
@@ -46,20 +46,21 @@ pub(crate) struct Loop {
     /// Whether this process leads.
     pub(crate) seat: Seat<FleetLeader>,
     /// What this process wrote and has not read again.
-    own: Own,
+    pub(crate) own: Own,
     /// When the next sweep is due.
     sweep_due: Instant,
     /// Head of the feed up to which this process reads before it plans; none: it has read it.
-    behind: Option<Seq>,
+    pub(crate) behind: Option<Seq>,
     /// Others have written what no plan has seen.
-    news: bool,
+    pub(crate) news: bool,
     /// A stage of the last turn was cut.
     more: bool,
     /// Decisions of a stage, so that a turn takes no longer than it may.
     share: usize,
 }
 
-type Replies = Vec<(oneshot::Sender<Result<(), Refusal>>, usize)>;
+/// Who is answered once so many items of a plan are committed.
+pub(crate) type Replies = Vec<(oneshot::Sender<Result<(), Refusal>>, usize)>;
 
 /// Runs until `shutdown`.
 pub async fn run(
@@ -425,49 +426,6 @@ impl Loop {
             }
         }
         replies
-    }
-
-    /// Commits the plan, and before it that this process still leads, if it is time to say so.
-    async fn renew_and_commit(
-        &mut self,
-        renewal: Option<Item>,
-        now: Now,
-        plan: Plan,
-        replies: Replies,
-    ) -> Result<(), ()> {
-        let renews = renewal.is_some();
-        let items: Vec<Item> = renewal.into_iter().chain(plan.items).collect();
-        let kinds: Vec<_> = items.iter().map(|i| (Outline::of(i), obeyed(i), picture::entries_of(i))).collect();
-        let results = if items.is_empty() { Vec::new() } else { self.parts.store.commit(items).await };
-        if renews && results.first().is_some_and(Result::is_ok) {
-            self.seat.claimed(now.link);
-        }
-        let mut trusted = Ok(());
-        for (result, (outline, entry, entries)) in results.iter().zip(kinds) {
-            let kind = outline.kind;
-            if let Ok(applied) = result {
-                self.own.wrote(applied.seq.0, entries);
-            }
-            if let Err(error) = result {
-                if let (true, Some(seq)) = (error.is_final(), entry) {
-                    tracing::error!(seq = seq.0, kind, "an entry of the log cannot be obeyed and is passed over");
-                    self.view.unusable.insert(seq);
-                } else if error.is_final() {
-                    refused::note(&mut self.view, outline);
-                }
-                let conflict = matches!(error, CommitError::Conflict { .. });
-                metrics::counter!("midshift_fleet_items_lost_total", "conflict" => conflict.to_string()).increment(1);
-                tracing::warn!(%error, kind, "fleet's item was not applied; planning again");
-                trusted = Err(());
-            }
-        }
-        for (reply, upto) in replies {
-            let lost = results.iter().skip(usize::from(renews)).take(upto).any(Result::is_err);
-            let answer =
-                if lost { Err(Refusal::new(Kind::Unavailable, Reason::from(Code::CommitUnknown))) } else { Ok(()) };
-            drop(reply.send(answer));
-        }
-        trusted
     }
 }
 

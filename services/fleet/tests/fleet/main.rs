@@ -29,6 +29,7 @@ mod several_hosts;
 mod starts;
 mod stopping;
 mod stops;
+mod turns;
 mod twins;
 mod uncertain;
 mod waiting;

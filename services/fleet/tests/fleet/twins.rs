@@ -4,6 +4,7 @@ use crate::harness::World;
 use midshift_core::fleet::bugs::{Bugs, SeededBug};
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::Phase;
+use midshift_core::work::WorkState;
 
 async fn world(bugs: &[SeededBug]) -> World {
     let mut w = World::with(CORRIDOR, Bugs::of(bugs)).await;
@@ -122,4 +123,105 @@ async fn two_planners(blind: bool) -> bool {
 async fn two_planners_give_no_robot_two_holders_and_a_store_where_the_last_writer_wins_does() {
     assert!(two_planners(false).await);
     assert!(!two_planners(true).await);
+}
+
+/// A robot says that it is done with a task that was given to another one since. What the task is then.
+async fn told_done_by_the_robot_before(bugs: &[SeededBug]) -> Phase {
+    let mut w = world(bugs).await;
+    w.robot("r1", "park-a").await;
+    w.robot("r2", "park-b").await;
+    w.r("r1").drives = false;
+    w.submit("T1", "A", "B").await;
+    let seen = w.until_phase("T1", Phase::Running).await;
+    let old = seen.task("T1").attempt_id().expect("an attempt");
+    w.r("r1").forgets_its_work();
+    w.r("r2").works = false;
+    w.until("another has it", |s| s.phase("T1") == Phase::Running && s.task("T1").epoch == 2).await;
+    w.r("r1").reports(old, WorkState::Succeeded);
+    w.pass(5).await;
+    w.seen().await.phase("T1")
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_late_completion_ends_nothing_and_where_it_counts_a_task_is_done_that_nobody_did() {
+    assert_eq!(told_done_by_the_robot_before(&[]).await, Phase::Running);
+    assert_eq!(told_done_by_the_robot_before(&[SeededBug::LateReportsCount]).await, Phase::Succeeded);
+}
+
+/// Two robots want the same station. Whether it is ever given to more than it holds.
+async fn two_for_one_station(bugs: &[SeededBug]) -> bool {
+    let mut w = world(bugs).await;
+    w.robot("r1", "wait-a").await;
+    w.robot("r2", "wait-a").await;
+    // Nobody drives: what is looked at is what is given.
+    for robot in ["r1", "r2"] {
+        w.r(robot).drives = false;
+        w.submit_with(&format!("T-{robot}"), "A", "B", |raw| raw.robot_id = robot.to_owned()).await;
+    }
+    w.pass(20).await;
+    let station = w.seen().await.place("A");
+    assert!(!station.holders.is_empty(), "it is given");
+    station.holders.len() > station.capacity as usize
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_place_is_given_to_as_many_as_it_holds_and_a_rule_that_forgets_that_gives_it_twice() {
+    assert!(!two_for_one_station(&[]).await);
+    assert!(two_for_one_station(&[SeededBug::CapacityIsForgotten]).await);
+}
+
+/// A robot wants through the corridor to the station of one that wants through it the other way, and that waits behind two that do. Whether
+/// one of these two gets away within half an hour.
+async fn one_against_three(bugs: &[SeededBug]) -> bool {
+    let mut w = world(bugs).await;
+    // Nobody has another place to go to.
+    let stand = [("r1", "wait-a"), ("r2", "wait-b"), ("r3", "wait-b"), ("r4", "B"), ("r5", "park-a"), ("r6", "park-b")];
+    for (robot, at) in stand {
+        w.robot(robot, at).await;
+    }
+    let lasts = Some(24 * 3_600_000);
+    for (robot, from, to) in [("r1", "B", "A"), ("r2", "A", "B"), ("r3", "A", "B"), ("r4", "A", "B")] {
+        w.submit_with(robot, from, to, |raw| {
+            (raw.robot_id, raw.stall_ms, raw.timeout_ms) = (robot.to_owned(), lasts, lasts);
+        })
+        .await;
+        w.pass(3).await;
+    }
+    for _ in 0..180 {
+        w.pass(10).await;
+        let seen = w.seen().await;
+        if ["r2", "r3"].iter().any(|robot| !seen.has(robot, "wait-b")) {
+            return true;
+        }
+    }
+    false
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_stretch_is_granted_whole_and_where_places_are_granted_one_by_one_robots_wait_for_each_other_for_ever() {
+    assert!(one_against_three(&[]).await);
+    assert!(!one_against_three(&[SeededBug::GrantsOneByOne]).await);
+}
+
+/// Whether a task of the lowest class comes first at last though a more urgent one comes every ten minutes and goes first.
+async fn comes_first_at_last(bugs: &[SeededBug]) -> bool {
+    let mut w = world(bugs).await;
+    w.submit_with("old", "A", "B", |raw| raw.priority = Some(9)).await;
+    for n in 0..12 {
+        w.submit_with(&format!("new-{n}"), "A", "B", |raw| raw.priority = Some(2)).await;
+        w.pass(600).await;
+        let first = w.fleet.look(|view, _, _| view.queue.ready().next().cloned()).await;
+        let first = first.expect("an answer").expect("a task that is ready");
+        if first.as_str() == "old" {
+            return true;
+        }
+        w.cancel(first.as_str(), false).await;
+    }
+    false
+}
+
+#[tokio::test(start_paused = true)]
+async fn nobody_starves_behind_more_urgent_work_and_without_promotion_somebody_does() {
+    assert!(comes_first_at_last(&[]).await);
+    assert!(!comes_first_at_last(&[SeededBug::NobodyIsPromoted]).await);
 }

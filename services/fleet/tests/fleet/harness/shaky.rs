@@ -32,8 +32,12 @@ pub struct Shaky {
     narrow: Mutex<Option<Table>>,
     /// A reading of the picture takes so long.
     reads_for: Mutex<Duration>,
+    /// A reading of the feed takes so long.
+    feeds_for: Mutex<Duration>,
     /// Rows and entries that were read through this handle.
     rows_read: AtomicU64,
+    /// Whole pictures that were read through this handle.
+    pictures_read: AtomicU64,
 }
 
 impl Shaky {
@@ -46,7 +50,9 @@ impl Shaky {
             outrun: Mutex::new(None),
             narrow: Mutex::new(None),
             reads_for: Mutex::new(Duration::ZERO),
+            feeds_for: Mutex::new(Duration::ZERO),
             rows_read: AtomicU64::new(0),
+            pictures_read: AtomicU64::new(0),
             inner,
             failing: AtomicBool::new(false),
             failed: AtomicU64::new(0),
@@ -77,9 +83,17 @@ impl Shaky {
     pub fn read_for(&self, time: Duration) {
         *self.reads_for.lock().expect("not poisoned") = time;
     }
+    /// From now on a reading of the feed takes so long.
+    pub fn feed_for(&self, time: Duration) {
+        *self.feeds_for.lock().expect("not poisoned") = time;
+    }
     /// Rows and entries read through this handle since the last call.
     pub fn rows_read(&self) -> u64 {
         self.rows_read.swap(0, Ordering::Relaxed)
+    }
+    /// Whole pictures read through this handle.
+    pub fn pictures_read(&self) -> u64 {
+        self.pictures_read.load(Ordering::Relaxed)
     }
     fn count(&self, rows: usize) {
         self.rows_read.fetch_add(rows as u64, Ordering::Relaxed);
@@ -130,6 +144,13 @@ impl Shaky {
     /// Commits that failed.
     pub fn failed(&self) -> u64 {
         self.failed.load(Ordering::Relaxed)
+    }
+}
+
+async fn takes(time: &Mutex<Duration>) {
+    let time = *time.lock().expect("not poisoned");
+    if !time.is_zero() {
+        tokio::time::sleep(time).await;
     }
 }
 
@@ -204,16 +225,15 @@ impl Store for Shaky {
     }
     async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error> {
         self.thaws().await;
-        let time = *self.reads_for.lock().expect("not poisoned");
-        if !time.is_zero() {
-            tokio::time::sleep(time).await;
-        }
+        takes(&self.reads_for).await;
         let snapshot = self.inner.read(parts, named).await?;
+        self.pictures_read.fetch_add(1, Ordering::Relaxed);
         self.count(snapshot.rows.len());
         Ok(snapshot)
     }
     async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error> {
         self.thaws().await;
+        takes(&self.feeds_for).await;
         let page = self.inner.feed(after, logs, limit).await?;
         self.count(page.entries.len());
         Ok(page)

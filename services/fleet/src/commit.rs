@@ -1,0 +1,137 @@
+//! Commits a plan, and makes good what the store did not take of it.
+//!
+//! Invariants:
+//! 1. What the store refuses for good costs that one decision and those made on top of it: their rows are read again, and no others.
+//! 2. After a conflict, or where nobody knows what came of an item, the picture is not trusted any more.
+
+use crate::reconcile::{Loop, Replies};
+use midshift_core::fleet::view::named;
+use midshift_core::fleet::{Plan, obeyed, put_right, refused};
+use midshift_core::picture::{self, Outline};
+use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::rows::{Item, Key, Row, Seq, Table};
+use midshift_core::time::Now;
+use midshift_store::{Applied, CommitError, Error, GET_KEYS_MAX, Store};
+use std::collections::BTreeSet;
+
+/// What is known of an item once it is with the store.
+struct Sent {
+    kind: &'static str,
+    /// Rows that it touches.
+    keys: Vec<Key>,
+    /// The entry of the feed that it obeys.
+    obeys: Option<Seq>,
+    /// Entries that it leaves.
+    entries: u64,
+}
+
+impl Sent {
+    fn of(item: &Item) -> Self {
+        let keys = item.rows.iter().map(|row| row.key.clone()).collect();
+        Self { kind: picture::kind_of(item), keys, obeys: obeyed(item), entries: picture::entries_of(item) }
+    }
+}
+
+impl Loop {
+    /// Commits the plan, and before it that this process still leads, if it is time to say so. An error: the picture can no longer be trusted.
+    pub(crate) async fn renew_and_commit(
+        &mut self,
+        renewal: Option<Item>,
+        now: Now,
+        plan: Plan,
+        replies: Replies,
+    ) -> Result<(), ()> {
+        let renews = renewal.is_some();
+        let items: Vec<Item> = renewal.into_iter().chain(plan.items).collect();
+        let sent: Vec<Sent> = items.iter().map(Sent::of).collect();
+        let mut results = if items.is_empty() { Vec::new() } else { self.parts.store.commit(items).await };
+        if renews && results.first().is_some_and(Result::is_ok) {
+            self.seat.claimed(now.link);
+        }
+        let lost = self.count(&results, &sent, renews);
+        let mut plan_results = results.split_off(usize::from(renews)).into_iter().map(|result| result.is_ok());
+        let committed = plan_results.by_ref().take_while(|is_ok| *is_ok).count();
+        for (reply, upto) in replies {
+            let is_lost = upto > committed;
+            drop(reply.send(if is_lost { Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)) } else { Ok(()) }));
+        }
+        match lost {
+            Some(keys) if keys.is_empty() => Ok(()),
+            Some(keys) => {
+                self.take_back(keys).await.map_err(|error| tracing::warn!(%error, "fleet cannot read the store"))
+            }
+            None => Err(()),
+        }
+    }
+
+    /// Counts what was applied and what was not. Rows of decisions that have to be taken back; none: more than these may be wrong.
+    fn count(
+        &mut self,
+        results: &[Result<Applied, CommitError>],
+        sent: &[Sent],
+        renews: bool,
+    ) -> Option<BTreeSet<Key>> {
+        let mut lost = Some(BTreeSet::new());
+        for (n, (result, sent)) in results.iter().zip(sent).enumerate() {
+            let error = match result {
+                Ok(applied) => {
+                    self.own.wrote(applied.seq.0, sent.entries);
+                    continue;
+                }
+                Err(error) => error,
+            };
+            let taken_back = lost.as_ref().is_some_and(|keys| follows(error, keys));
+            let is_conflict = matches!(error, CommitError::Conflict { .. }) && !taken_back;
+            metrics::counter!("midshift_fleet_items_lost_total", "conflict" => is_conflict.to_string()).increment(1);
+            tracing::warn!(%error, kind = sent.kind, "fleet's item was not applied; planning again");
+            let is_renewal = renews && n == 0;
+            if error.is_final() && !is_renewal {
+                self.note_refusal(sent);
+            }
+            lost = lost.filter(|_| !is_renewal && (error.is_final() || taken_back));
+            lost.iter_mut().for_each(|keys| keys.extend(sent.keys.iter().cloned()));
+        }
+        lost
+    }
+
+    fn note_refusal(&mut self, sent: &Sent) {
+        if let Some(seq) = sent.obeys {
+            tracing::error!(seq = seq.0, sent.kind, "an entry of the log cannot be obeyed and is passed over");
+            self.view.unusable.insert(seq);
+        } else {
+            refused::undone(&mut self.view, Outline::new(sent.kind, sent.keys.iter()));
+        }
+    }
+
+    /// Puts rows back to what the store has. Entries of the feed that were obeyed by what was lost are taken again.
+    async fn take_back(&mut self, lost: BTreeSet<Key>) -> Result<(), Error> {
+        metrics::counter!("midshift_fleet_decisions_taken_back_total").increment(1);
+        let keys: Vec<Key> = lost.iter().cloned().collect();
+        let mut rows = rows_of(self.parts.store.as_ref(), &keys).await?;
+        let more: BTreeSet<Key> = named(&rows).into_iter().filter(|key| !lost.contains(key)).collect();
+        rows.extend(rows_of(self.parts.store.as_ref(), &Vec::from_iter(more)).await?);
+        put_right(&mut self.view, &keys, &rows)?;
+        if keys.iter().any(|key| key.table == Table::FleetMark) {
+            let consumed = self.view.marks.get("fleet").map_or(Seq(0), |mark| mark.row.seq);
+            // Their rows are in the picture already; only what they ask for is not done.
+            self.view.read_at = self.view.read_at.max(self.view.absorbed);
+            self.seq = self.seq.min(consumed);
+            self.behind = None;
+        }
+        self.news = true;
+        Ok(())
+    }
+}
+
+async fn rows_of(store: &dyn Store, keys: &[Key]) -> Result<Vec<Row>, Error> {
+    let mut rows = Vec::new();
+    for some in keys.chunks(GET_KEYS_MAX) {
+        rows.extend(store.get(some.to_vec()).await?);
+    }
+    Ok(rows)
+}
+
+/// Whether an item was lost only because one before it was: it expected what that one was to write.
+fn follows(error: &CommitError, lost: &BTreeSet<Key>) -> bool {
+    matches!(error, CommitError::Conflict { key, .. } if lost.contains(key))
+}
