@@ -6,6 +6,7 @@
 pub mod audit;
 pub mod authority;
 pub mod bugs;
+pub mod energy;
 pub mod fleet;
 pub mod gates;
 pub mod identity;

@@ -1,22 +1,13 @@
 //! What work costs a body: its battery and the heat of its joints, in closed form over a stretch of constant work.
 //!
-//! Called by [`crate::body`]. Invariant: without energy flowing in, the charge never rises.
+//! The figures are those of [`midshift_core::energy`], by which work is given. Called by [`crate::body`]. Invariant: without energy flowing in, the charge never rises.
 
+use midshift_core::energy::{ACT_W, CAPACITY_MWH, DRIVE_MWH_PER_M, IDLE_W, LOADED_FACTOR};
 use midshift_core::time::SiteDuration;
 use serde::{Deserialize, Serialize};
 
-/// What the battery holds when full, milliwatt-hours.
-pub const CAPACITY_MWH: f64 = 1_200_000.0;
-/// Standing, watts.
-const IDLE_W: f64 = 80.0;
 /// Standing in the parking posture, watts.
 const PARKED_W: f64 = 40.0;
-/// Driving, on top of standing, milliwatt-hours per metre.
-const DRIVE_MWH_PER_M: f64 = 120.0;
-/// How much more a metre costs with a load.
-const LOADED_FACTOR: f64 = 1.3;
-/// Acting, on top of standing, watts: about half a watt-hour for a pick of 4 s.
-const ACT_W: f64 = 450.0;
 /// Into the battery at a charger, watts: from empty to full in 40 minutes.
 const CHARGE_W: f64 = CAPACITY_MWH / 1000.0 * 60.0 / 40.0;
 /// Air of the hall, degrees Celsius.

@@ -160,7 +160,8 @@ fn rest_ms(view: &View, task_id: &crate::ids::TaskId, live: &Live) -> u64 {
     let actions = steps.iter().skip(done).filter(|s| !matches!(s.kind, StepKind::Goto { .. })).count() as u64;
     let goals: Option<Vec<_>> = intake.spec.goals(done).map(|goal| view.site.find(goal)).collect();
     let here = way::find(view, live.report.vitals.waypoint.as_ref());
-    let way_mm = here.zip(goals).and_then(|(here, goals)| way::length_mm(view, here, &goals)).unwrap_or(0);
+    let way_mm =
+        here.zip(goals).and_then(|(here, goals)| way::legs_mm(view, here, &goals)).map_or(0, |legs| legs.iter().sum());
     way_mm * 1_000 / PLANNED_MM_S + actions * PLANNED_ACTION_MS
 }
 

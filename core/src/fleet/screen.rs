@@ -6,6 +6,7 @@ use super::queue::Wait;
 use super::rows::RobotHolder;
 use super::view::View;
 use super::{Board, Slice, claims, heard, load, plausible, standing, way};
+use crate::energy::Trip;
 use crate::ids::{RobotId, Subject};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -14,12 +15,10 @@ use crate::site::WaypointIx;
 use crate::task::raw::parse_version;
 use crate::task::{AttemptPhase, Phase, TaskIntake, TaskState};
 use crate::time::Now;
-use crate::work::{Live, Session};
+use crate::work::{Live, Session, StepKind};
 use std::collections::BTreeMap;
 
-/// Charge spent on a metre, thousandths of a permille: a planning figure with its margin in [`RESERVE_PERMILLE`].
-pub const ENERGY_MICRO_PER_MM: u64 = 60;
-/// Charge that must be left at the charger, permille.
+/// Charge that must be left at the charger, permille: an hour and a half of waiting on the way.
 pub const RESERVE_PERMILLE: u64 = 100;
 
 /// Whether the robot can be given any work at all now.
@@ -127,11 +126,20 @@ pub fn pair(
     }
     let (here, goals) = journey(view, live, task, intake)?;
     place(view, here, &goals)?;
-    let work_mm = way::length_mm(view, here, &goals).ok_or(Code::NoRoute)?;
-    if way::is_too_long(view, here, &goals, work_mm) {
+    let legs_mm = way::legs_mm(view, here, &goals).ok_or(Code::NoRoute)?;
+    if way::is_too_long(view, here, &goals, legs_mm.iter().sum()) {
         return Err(Reason::from(Code::RouteTooLong).with("points_max", limits::ROUTE_POINTS_MAX));
     }
-    energy(view, live, here, goals.last().copied().unwrap_or(here), work_mm)
+    let from = way::from_step(&intake.spec.steps, task.next_step) as usize;
+    let mut trip = Trip::new(live.report.load.is_some(), intake.spec.speed_limit_mm_s);
+    let mut legs_mm = legs_mm.into_iter();
+    for step in intake.spec.steps.iter().skip(from) {
+        match &step.kind {
+            StepKind::Goto { .. } => trip.drive(legs_mm.next().unwrap_or(0)),
+            step => trip.act(step),
+        }
+    }
+    energy(view, live, here, goals.last().copied().unwrap_or(here), trip)
 }
 
 /// What does not pass by itself: pin, binding, what the robot refused or failed for good, and what it said of itself at its last Hello.
@@ -238,13 +246,13 @@ fn journey(
 
 /// No closed place may bar the way to a goal, nor be one.
 fn place(view: &View, here: WaypointIx, goals: &[WaypointIx]) -> Result<(), Reason> {
-    let closed = way::closed(view);
+    let closed = view.closed();
     if closed.is_empty() {
         return Ok(());
     }
     let mut at = here;
     for goal in goals {
-        if view.router.field_around(*goal, &closed).distance_mm(at).is_none() {
+        if view.router.field_around(*goal, closed).distance_mm(at).is_none() {
             return Err(Reason::from(Code::PlaceBlocked).with("goal", view.site.name_of(*goal)));
         }
         at = *goal;
@@ -252,13 +260,14 @@ fn place(view: &View, here: WaypointIx, goals: &[WaypointIx]) -> Result<(), Reas
     Ok(())
 }
 
-/// The charge must reach pickup, every other goal and the nearest charger, with its reserve.
-fn energy(view: &View, live: &Live, here: WaypointIx, last: WaypointIx, work_mm: u64) -> Result<(), Reason> {
+/// The charge must last for all steps and the way from the last goal to the nearest charger, with its reserve.
+fn energy(view: &View, live: &Live, here: WaypointIx, last: WaypointIx, mut trip: Trip) -> Result<(), Reason> {
     let home_mm = match view.site.chargers().next() {
         Some(_) => view.site.chargers().filter_map(|c| view.router.distance_mm(last, c)).min().unwrap_or(0),
         None => return Ok(()),
     };
-    let needed = (work_mm + home_mm) * ENERGY_MICRO_PER_MM / 1_000_000 + RESERVE_PERMILLE;
+    trip.drive(home_mm);
+    let needed = trip.needed_permille() + RESERVE_PERMILLE;
     let has = u64::from(live.report.vitals.battery_permille);
     let mandatory = u64::from(view.policy(&view.site.area_of(here).area_id).charge_mandatory_permille);
     if has < needed.max(mandatory) {

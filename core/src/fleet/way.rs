@@ -7,8 +7,8 @@ use crate::site::route::Blocked;
 use crate::site::{Site, WaypointIx};
 use crate::work::{RoutePoint, StepKind, WorkStep};
 
-/// Places that no route may lead into now.
-pub fn closed(view: &View) -> Blocked {
+/// Finds the places that no route may lead into now; [`View::closed`] remembers them.
+pub(super) fn closed(view: &View) -> Blocked {
     let quarantined = view.places.values().filter(|p| p.row.quarantine.is_some());
     let quarantined = quarantined.filter_map(|p| view.site.find_place(&p.row.place_id));
     Blocked::new(quarantined.chain(super::stopped::closed(view)))
@@ -38,12 +38,12 @@ pub fn route(
     goals: &[(u32, WaypointIx)],
 ) -> Option<Vec<RoutePoint>> {
     let site = &view.site;
-    let blocked = closed(view);
+    let blocked = view.closed();
     let mut points = vec![point(site, None, start)];
     let mut at = start;
     let legs = via.map(|v| (None, v)).into_iter().chain(goals.iter().map(|(step, goal)| (Some(*step), *goal)));
     for (step, goal) in legs {
-        let way = view.router.route_around(at, goal, &blocked).or_else(|| view.router.route(at, goal))?;
+        let way = view.router.route_around(at, goal, blocked).or_else(|| view.router.route(at, goal))?;
         if way.len() == 1 && (step.is_some() && points.last().is_some_and(|p| p.ends_step.is_some())) {
             points.push(point(site, None, goal));
         }
@@ -88,15 +88,10 @@ pub fn indices(site: &Site, route: &[RoutePoint]) -> Option<Vec<WaypointIx>> {
     route.iter().map(|p| site.find(&p.waypoint)).collect()
 }
 
-/// Millimetres through all goals in order.
-pub fn length_mm(view: &View, start: WaypointIx, goals: &[WaypointIx]) -> Option<u64> {
-    let mut at = start;
-    let mut sum = 0;
-    for goal in goals {
-        sum += view.router.distance_mm(at, *goal)?;
-        at = *goal;
-    }
-    Some(sum)
+/// Millimetres to each of the goals from the one before it, in order.
+pub fn legs_mm(view: &View, start: WaypointIx, goals: &[WaypointIx]) -> Option<Vec<u64>> {
+    let starts = std::iter::once(&start).chain(goals);
+    starts.zip(goals).map(|(at, goal)| view.router.distance_mm(*at, *goal)).collect()
 }
 
 /// Index of a waypoint by name.

@@ -4,15 +4,11 @@ use super::{Order, Phase, RECENT_MAX, SimBody};
 use crate::faults;
 use crate::world::{UNNAMED_SKU, lock, sku_of};
 use midshift_agent::body::BodyNews;
+use midshift_core::energy::{ACTION_VARIES_PERMILLE, HANDLE, INSPECT};
 use midshift_core::robot::{Fault, Load};
 use midshift_core::time::{SiteDuration, SiteTime};
 use midshift_core::work::StepKind;
 use rand::RngExt;
-
-/// A pick or a place takes this long, give or take a fifth.
-const HANDLE: SiteDuration = SiteDuration::from_secs(4);
-/// An inspection takes this long, give or take a fifth.
-const INSPECT: SiteDuration = SiteDuration::from_secs(3);
 
 /// What is done.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -73,7 +69,8 @@ impl SimBody {
         }
         let rates = self.rates();
         let usual_ms = usual.as_ms();
-        let left = SiteDuration(self.rng.random_range(usual_ms * 4 / 5..=usual_ms * 6 / 5));
+        let varies_ms = usual_ms * ACTION_VARIES_PERMILLE / 1_000;
+        let left = SiteDuration(self.rng.random_range(usual_ms - varies_ms..=usual_ms + varies_ms));
         let jams = self.rng.random_bool(rates.jam_per_action.clamp(0.0, 1.0));
         let missed = self.rng.random_bool(rates.gripper_per_pick.clamp(0.0, 1.0));
         let made_to = deed == Deed::Pick && self.misses_next > 0;
