@@ -20,9 +20,23 @@ pub enum Class {
     Stop,
 }
 
+/// Naive rules, for twins of tests. Only with the feature `seeded-bugs`.
+pub mod bugs {
+    crate::seeded_bugs! {
+        /// Every class is the highest one.
+        ClassesAreAlike classes_are_alike;
+    }
+}
+
 impl Class {
     /// All, lowest first.
     pub const ALL: [Self; 5] = [Self::Bulk, Self::Status, Self::Events, Self::Control, Self::Stop];
+
+    /// The class that counts.
+    #[must_use]
+    pub fn with(self, bugs: bugs::Bugs) -> Self {
+        if bugs.classes_are_alike() { Self::Stop } else { self }
+    }
 
     /// How many of `whole` may be taken when this class asks for one more; what is left over is for the classes above it. Each class above keeps
     /// [`limits::CLASS_KEPT_PERMILLE`] for itself, rounded down: what is too small to be divided is for everybody.

@@ -17,4 +17,14 @@ midshift_core::seeded_bugs! {
     ActivatesAnyway activates_anyway;
     /// A reset takes away every stop that the robot knows, and not only the one that it names.
     ResetClearsAll reset_clears_all;
+    /// A stop that comes while the ledger is being written is left for the next message.
+    StopYieldsToDisk stop_yields_to_disk;
+    /// A task's speed counts instead of the lower one of its lane and area.
+    LastWordIsTheLimit last_word_is_the_limit;
+    /// A directive is taken whether or not a release lists its bundle.
+    UnlistedIsFine unlisted_is_fine;
+    /// A directive is taken whichever came before it.
+    ReplaysAreTaken replays_are_taken;
+    /// Work that cannot be read is passed over, and the robot goes on as before.
+    NewerWorkIsIgnored newer_work_is_ignored;
 }

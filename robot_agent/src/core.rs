@@ -239,8 +239,9 @@ impl AgentCore {
         }
         self.elapse(&now);
         self.take_news(&now);
+        let yields = self.config.bugs.stop_yields_to_disk() && self.writes.in_flight.is_some();
         match &input {
-            Input::Stop(news) => self.hear_stop(&now, StopNews::clone(news)),
+            Input::Stop(news) if !yields => self.hear_stop(&now, StopNews::clone(news)),
             Input::Down(down) => self.hear_stop_beside(&now, down),
             _ => {}
         }

@@ -94,7 +94,10 @@ impl AgentCore {
             waypoint: p.waypoint.clone(),
             x_mm: p.x_mm,
             y_mm: p.y_mm,
-            speed_mm_s: governor::speed_mm_s(&self.limits, policy, order.speed_limit_mm_s, stop, p),
+            speed_mm_s: match order.speed_limit_mm_s.filter(|_| self.config.bugs.last_word_is_the_limit()) {
+                Some(speed_mm_s) => speed_mm_s,
+                None => governor::speed_mm_s(&self.limits, policy, order.speed_limit_mm_s, stop, p),
+            },
             keep_off_mm: governor::keep_off_mm(policy, p),
         };
         order.route[next..=limit].iter().map(point).collect()

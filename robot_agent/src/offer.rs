@@ -51,6 +51,9 @@ impl AgentCore {
 
     /// The server sent work that this program cannot read: until it sends some that it can, the robot goes no further than without authority.
     pub(crate) fn cannot_read_work(&mut self, why: &str) {
+        if self.config.bugs.newer_work_is_ignored() {
+            return;
+        }
         if !std::mem::replace(&mut self.work_unreadable, true) {
             tracing::error!(robot_id = %self.config.robot_id, "section work cannot be read; going on as if authority had ended");
             let detail = why.chars().take(UNREADABLE_DETAIL_CHARS).collect();

@@ -3,6 +3,7 @@
 //! `raw` is what a caller sent, `spec` what it means once every rule holds, `forms` the short forms callers may use,
 //! `machine` the table of transitions, `state` the rows. Services never decide a transition by themselves.
 
+pub mod bugs;
 pub mod forms;
 pub mod machine;
 pub mod raw;

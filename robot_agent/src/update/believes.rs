@@ -134,9 +134,11 @@ impl AgentCore {
 
     fn open(&self, desired: &DesiredUpdate, now: Utc) -> Result<Directive, Reason> {
         let refused = |text: String| Reason::new(Code::DirectiveRefused, text);
-        let opened = self.opened(desired, self.kept.ledger.software.directive, now);
+        let bugs = self.config.bugs;
+        let newest = if bugs.replays_are_taken() { 0 } else { self.kept.ledger.software.directive };
+        let opened = self.opened(desired, newest, now);
         let directive = opened.map_err(|rejection| refused(rejection.to_string()))?;
-        if self.lists(&directive.manifest, directive.manifest_length) {
+        if self.lists(&directive.manifest, directive.manifest_length) || bugs.unlisted_is_fine() {
             Ok(directive)
         } else {
             Err(refused("no release lists its bundle".to_owned()))

@@ -30,5 +30,6 @@ mod stops_beside;
 mod strace;
 mod told_time;
 mod trusts;
+mod twins;
 mod updates;
 mod ways;

@@ -325,6 +325,11 @@ impl Rig {
     pub fn stoppable(name: &str, stop: StopDesk) -> Self {
         Self::new(TestBody::at(name), MemoryStore::new(), Bugs::default(), None, START_MS, stop)
     }
+    /// One that stands at A, has a stop line and can change its software, with naive rules.
+    pub fn naive(releases: &Releases, bugs: Bugs) -> Self {
+        let stop = StopDesk { is_there: true, ..StopDesk::default() };
+        Self::new(TestBody::at("A"), MemoryStore::new(), bugs, Some(Updates::of(releases)), START_MS, stop)
+    }
     fn new(body: TestBody, store: MemoryStore, bugs: Bugs, updates: Option<Updates>, ms: u64, stop: StopDesk) -> Self {
         let kept = store.load_now("ring-1");
         let update = updates.as_ref().map(|u| u.releases.config());

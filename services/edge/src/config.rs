@@ -4,6 +4,7 @@
 //! link clock.
 
 use midshift_core::limits;
+use midshift_core::overload::bugs::Bugs;
 use midshift_core::time::LinkDuration;
 use std::num::NonZeroU32;
 use std::time::Duration;
@@ -49,6 +50,8 @@ pub struct Config {
     pub head: LinkDuration,
     /// What is still open so long after the stop is cut.
     pub drain: LinkDuration,
+    /// Naive rules for twins of tests; none outside them.
+    pub bugs: Bugs,
 }
 
 impl Default for Config {
@@ -73,6 +76,7 @@ impl Default for Config {
             rates_remembered: limits::RATES_REMEMBERED,
             head: limits::UNARY_DEADLINE,
             drain: limits::HARD_DRAIN,
+            bugs: Bugs::default(),
         }
     }
 }

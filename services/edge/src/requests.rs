@@ -18,6 +18,7 @@ use hyper::body::Incoming;
 use hyper::service::Service as HyperService;
 use midshift_core::identity::{Caller, Who};
 use midshift_core::limits;
+use midshift_core::overload::bugs::Bugs;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_proto::denying::Told;
 use midshift_proto::{Denying, access};
@@ -40,6 +41,7 @@ pub(crate) struct Rules {
     strangers: Arc<Seats<Asker>>,
     /// Requests under way.
     gauge: metrics::Gauge,
+    bugs: Bugs,
 }
 
 impl Rules {
@@ -53,12 +55,13 @@ impl Rules {
             seats: Seats::new(all, each),
             strangers: Seats::sharing(strangers, each, all),
             gauge: metrics::gauge!("midshift_edge_requests", "port" => config.port),
+            bugs: config.bugs,
         }
     }
 
     /// Its seat and its caller's own deadline, or why it goes no further.
     fn admit(&self, asker: &Asker, path: &str, headers: &HeaderMap, speech: &Speech) -> Result<Admitted, Refusal> {
-        let (class, now) = (access::class(path), Instant::now());
+        let (class, now) = (access::class(path).with(self.bugs), Instant::now());
         if !self.rates.take(asker, now, class) {
             return Err(Refusal::new(Kind::Exhausted, Code::TooManyRequests));
         }

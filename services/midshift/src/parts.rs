@@ -18,6 +18,8 @@ pub struct Naive {
     pub telemetry: midshift_telemetry::Bugs,
     /// Of fleet.
     pub fleet: midshift_core::fleet::bugs::Bugs,
+    /// Of the intake.
+    pub task: midshift_core::task::bugs::Bugs,
     /// Of roll-outs.
     pub rollouts: midshift_core::rollout::bugs::Bugs,
 }

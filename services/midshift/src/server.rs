@@ -264,8 +264,12 @@ impl Server {
 }
 
 async fn open_task(parts: &Parts, shutdown: &CancellationToken) -> anyhow::Result<TaskService> {
-    let task =
-        midshift_task::Parts { store: parts.store.clone(), site: parts.site.clone(), clock: parts.clock.clone() };
+    let task = midshift_task::Parts {
+        store: parts.store.clone(),
+        site: parts.site.clone(),
+        clock: parts.clock.clone(),
+        bugs: parts.naive.task,
+    };
     TaskService::open(task, shutdown.clone()).await.context("opening task intake")
 }
 

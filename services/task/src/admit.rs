@@ -147,7 +147,7 @@ impl TaskService {
         };
         let mut item = Item::new(Writer::Task, &actor);
         item.request_id = wanted.request_id.as_ref().map(|id| id.as_str().into());
-        if let Some(request_id) = &wanted.request_id {
+        if let Some(request_id) = wanted.request_id.as_ref().filter(|_| !self.inner.parts.bugs.forgets_requests()) {
             let key = RequestKey {
                 id: request_id.to_string(),
                 payload_hash: wanted.hash.clone(),

@@ -21,6 +21,7 @@ use midshift_core::reason::Refusal;
 use midshift_core::rows::{Item, Table};
 use midshift_core::site::Site;
 use midshift_core::task::TaskIntake;
+use midshift_core::task::bugs::Bugs;
 use midshift_core::time::Clock;
 use midshift_proto::task::v1::task_service_server::TaskServiceServer;
 use midshift_store::{Applied, CommitError, Error, Query, Store};
@@ -41,6 +42,8 @@ pub struct Parts {
     pub site: Arc<Site>,
     /// Clocks.
     pub clock: Arc<dyn Clock>,
+    /// Naive rules for twins of tests; none outside them.
+    pub bugs: Bugs,
 }
 
 struct Inner {

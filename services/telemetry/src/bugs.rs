@@ -5,4 +5,6 @@ midshift_core::seeded_bugs! {
     AckBeforeCommit ack_before_commit;
     /// Every session of a robot has work, whether or not it proved its succession.
     NoCloneFence no_clone_fence;
+    /// STATUS is acknowledged when it arrives, before it is written.
+    StatusAckBeforeWrite status_ack_before_write;
 }

@@ -391,6 +391,10 @@ impl Session {
     fn status(&mut self, batch: &LaneBatch) -> Option<End> {
         self.in_charge.as_ref()?;
         match self.arrive(batch) {
+            Arrived::Taken if self.inner.parts.bugs.status_ack_before_write() => {
+                let seq = batch.items.iter().map(|item| status::numbers(item).1).max().unwrap_or(0);
+                self.say(|out| out.acks.push(LaneAck { lane: Lane::Status, seq, expect: None }));
+            }
             Arrived::Taken => {}
             Arrived::Known => self.ack_status(),
             Arrived::Expect(ack) => self.say(|out| out.acks.push(ack)),

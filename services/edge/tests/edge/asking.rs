@@ -3,6 +3,7 @@
 use crate::frames::{dial, until_closed};
 use crate::principals::Register;
 use crate::world::{HERE, SOON, THERE, World, within};
+use midshift_core::overload::bugs::{Bugs, SeededBug};
 use midshift_core::reason::Code as Reason;
 use midshift_edge::{Config, Rate};
 use midshift_proto::status::RETRY_AFTER;
@@ -127,6 +128,24 @@ async fn a_full_port_sheds_the_lowest_first_and_serves_all_again_by_itself() {
     }
     drop(open);
     while flood.asked(FETCH).await.status.code() != Code::Ok {}
+}
+
+/// Whether a stop is engaged while a port is as full as it gets of what can wait.
+async fn stops_a_full_port(bugs: Bugs) -> bool {
+    let world = named(Config { requests_max: 10, bugs, ..Config::default() }).await;
+    let mut flood = world.client().await;
+    let mut open = Vec::new();
+    while let Some(head) = flood.held(FETCH).await {
+        open.push(head);
+    }
+    let mut other = world.client_from(THERE).await;
+    other.asked(ENGAGE).await.answer().grpc == Code::Ok
+}
+
+#[tokio::test]
+async fn a_stop_finds_room_in_a_full_port_and_where_classes_are_alike_it_does_not() {
+    assert!(stops_a_full_port(Bugs::default()).await);
+    assert!(!stops_a_full_port(Bugs::of(&[SeededBug::ClassesAreAlike])).await);
 }
 
 #[tokio::test]

@@ -65,7 +65,7 @@ struct World {
 impl World {
     async fn new(wall: Arc<Wall>, store: Arc<dyn Store>, frames: Arc<dyn FrameLog>) -> Self {
         let site = Arc::new(text::parse(include_str!("../../../../sites/demo.site.toml")).expect("a site"));
-        let parts = midshift_task::Parts { store: store.clone(), site, clock: wall.clone() };
+        let parts = midshift_task::Parts { store: store.clone(), site, clock: wall.clone(), bugs: Default::default() };
         let task = TaskService::open(parts, CancellationToken::new()).await.expect("intake");
         Self { wall, store, frames, task, written: 0, latch: Latch::default(), marked: Default::default() }
     }

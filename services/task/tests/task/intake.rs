@@ -1,6 +1,7 @@
 //! Task intake over the in-memory store: every violation at once, idempotency, batches, pages, cancels, watches that resume.
 
 use crate::world::{World, count, submit, transport};
+use midshift_core::task::bugs::{Bugs, SeededBug};
 use midshift_proto::task::v1::task_service_server::TaskService as _;
 use midshift_proto::task::v1::watch_tasks_response::Item;
 use midshift_proto::task::v1::{self, SubmitTaskRequest, submit_task_request::Body};
@@ -37,6 +38,22 @@ async fn the_same_request_is_one_task_and_another_body_is_refused() {
     let taken = submit(&service, chosen).await.expect_err("the id is taken");
     assert_eq!(midshift_proto::refusal_of(&taken).reason, "TASK_ID_TAKEN");
     assert_eq!(count(&service).await, 1);
+}
+
+/// Tasks that one request is after it was sent twice.
+async fn sent_twice(bugs: Bugs) -> usize {
+    let world = World::new().await;
+    let service = World::with(world.store, world.site, bugs).await.service;
+    for _ in 0..2 {
+        submit(&service, transport("r1", "B03")).await.expect("admitted");
+    }
+    count(&service).await
+}
+
+#[tokio::test]
+async fn a_request_that_is_sent_again_is_the_same_task_and_without_its_key_it_is_another_one() {
+    assert_eq!(sent_twice(Bugs::default()).await, 1);
+    assert_eq!(sent_twice(Bugs::of(&[SeededBug::ForgetsRequests])).await, 2);
 }
 
 #[tokio::test]

@@ -112,7 +112,8 @@ impl Old {
             world.store.commit(vec![item]).await.remove(0).expect("applied");
         }
         let counted = Arc::new(Counted { store: world.store.clone(), rows: AtomicUsize::new(0) });
-        let parts = Parts { store: counted.clone(), site: world.site.clone(), clock: world.clock() };
+        let parts =
+            Parts { store: counted.clone(), site: world.site.clone(), clock: world.clock(), bugs: Default::default() };
         let service = TaskService::open(parts, world.shutdown.clone()).await.expect("a store opens");
         Self { service, counted, first }
     }

@@ -8,6 +8,7 @@ use midshift_core::rows::{Item, Key, Record, Revision, Seq, Writer};
 use midshift_core::site::{DEMO, Site, text};
 use midshift_core::stop::record::StopRecord;
 use midshift_core::stop::{Reset, Scope, Stop};
+use midshift_core::task::bugs::Bugs;
 use midshift_core::task::{Attempt, AttemptPhase, Phase, TaskState};
 use midshift_core::time::{Clock, Now, SiteTime, Utc};
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
@@ -54,8 +55,12 @@ impl World {
     }
     /// The service started anew over a store, with a site.
     pub async fn over(store: Arc<MemoryStore>, site: Arc<Site>) -> Self {
+        Self::with(store, site, Bugs::default()).await
+    }
+    /// As [`World::over`], with naive rules.
+    pub async fn with(store: Arc<MemoryStore>, site: Arc<Site>, bugs: Bugs) -> Self {
         let shutdown = CancellationToken::new();
-        let parts = Parts { store: store.clone(), site: site.clone(), clock: Arc::new(At(NOON)) };
+        let parts = Parts { store: store.clone(), site: site.clone(), clock: Arc::new(At(NOON)), bugs };
         let service = TaskService::open(parts, shutdown.clone()).await.expect("a store opens");
         Self { store, service, site, shutdown }
     }
@@ -66,7 +71,7 @@ impl World {
     /// The service as it is so many milliseconds after noon.
     pub async fn later(&self, ms: i64) -> TaskService {
         let clock = Arc::new(At(Utc(NOON.0 + ms)));
-        let parts = Parts { store: self.store.clone(), site: self.site.clone(), clock };
+        let parts = Parts { store: self.store.clone(), site: self.site.clone(), clock, bugs: Bugs::default() };
         TaskService::open(parts, self.shutdown.clone()).await.expect("a store opens")
     }
     /// A client that calls the service in this process, through its codec.

@@ -8,6 +8,7 @@ use midshift_core::robot::Lane;
 use midshift_core::work::{Gap, InboxItem};
 use midshift_proto::session::{CloseCode, Downlink};
 use midshift_store::{FrameLog, MemoryFrames};
+use midshift_telemetry::{Bugs, SeededBug};
 use std::sync::Arc;
 
 fn disk() -> Arc<Disk> {
@@ -82,5 +83,30 @@ async fn what_was_lost_while_the_disk_refused_is_written_down_as_a_gap_before_it
     let gaps = disk.gaps(None, 10).await?;
     let said: Vec<_> = gaps.iter().map(|g| (&*g.lane, g.from_seq, g.to_seq, &*g.reason)).collect();
     assert_eq!(said, [("STATUS", 1, 2, "OVERFLOW")]);
+    Ok(())
+}
+
+/// STATUS that is acknowledged while the disk stands still.
+async fn acked_without_a_disk(bugs: Bugs) -> Result<bool> {
+    let disk = disk();
+    let world = world_with(Otherwise { bugs, ..otherwise(&disk) }).await?;
+    disk.stick(true);
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.status(samples(1..=100)).await?;
+    robot.beat().await?;
+    // What it hears before the echo was said before it.
+    let acked = std::cell::Cell::new(false);
+    let listen = |down: &Downlink| {
+        acked.set(acked.get() || self::acked(down).is_some());
+        down.echo
+    };
+    robot.hears(listen).await?;
+    Ok(acked.get())
+}
+
+#[tokio::test(start_paused = true)]
+async fn status_is_acknowledged_once_it_is_written_and_a_rule_that_does_so_on_arrival_would_lose_it() -> Result<()> {
+    assert!(!acked_without_a_disk(Bugs::default()).await?);
+    assert!(acked_without_a_disk(Bugs::of(&[SeededBug::StatusAckBeforeWrite])).await?);
     Ok(())
 }
