@@ -14,6 +14,7 @@ pub mod ids;
 pub mod lead;
 pub mod limits;
 pub mod maintenance;
+pub mod nearest;
 pub mod once;
 pub mod overload;
 pub mod picture;

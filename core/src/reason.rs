@@ -98,6 +98,8 @@ codes! {
     LastAdmin = "LAST_ADMIN", "It is the last token that may administer the site. Make another one first.";
     // --- fleet stop
     StopsFull = "STOPS_FULL", "As many stops are engaged as there may be; the last ones are kept for the whole fleet. Engage the whole fleet, or reset what is over.";
+    OtherSite = "OTHER_SITE", "This is the stop service of another site than the one that was meant; nothing was stopped or reset. Name the right one with --stop-server, or \
+        sign in to the site that you mean.";
     StopNotFound = "STOP_NOT_FOUND", "Nothing is known of this stop. `midshift stop status` says which are engaged; a robot that stands says what it waits for.";
     StopWasReset = "STOP_WAS_RESET", "The stop was reset, so nobody obeys it any more. Engage another one with a new request_id.";
     StopMemoryLost = "STOP_MEMORY_LOST", "The stop service began without its latch or its key, so it stopped the whole fleet. Look at the floor and at `midshift stop status`, find out who removed its files, then reset that stop by name.";

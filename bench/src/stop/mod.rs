@@ -260,7 +260,7 @@ impl Stage {
         drop(answers);
         self.until(STAND, TURN_WITHIN).await?;
         let turn = self.turn(TAKE, begun_ns, known_ns)?;
-        self.client.reset(ResetRequest { stop_id, reason: "measured".to_owned() }).await?;
+        self.client.reset(ResetRequest { stop_id, reason: "measured".to_owned(), ..ResetRequest::default() }).await?;
         self.until(FREE, TURN_WITHIN).await?;
         Ok(turn)
     }

@@ -203,6 +203,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         sim: Some(SimFace::new(hall.clone(), clock.clone(), swarm.crash())),
         naive: Naive::default(),
         stops: Some(stops.folder.clone()),
+        stop_port: Some(stops.beside.address().port()),
         identity: None,
         port: door::alone("business"),
         planning: planning.handle(),

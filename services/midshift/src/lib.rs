@@ -23,6 +23,7 @@ pub mod samples;
 pub mod scenario;
 pub mod serve;
 pub mod server;
+mod site_answer;
 pub mod site_file;
 mod software;
 pub mod stop;

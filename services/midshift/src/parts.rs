@@ -52,6 +52,8 @@ pub struct Parts {
     pub naive: Naive,
     /// Where the stop service beside this process keeps its files, if there is one.
     pub stops: Option<PathBuf>,
+    /// The port of the stop service, if it is on this host.
+    pub stop_port: Option<u16>,
     /// Who is who, with TLS; none: no login, plain text.
     pub identity: Option<IdentityService>,
     /// Limits of the port.

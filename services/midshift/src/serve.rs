@@ -210,7 +210,12 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         false => None,
     };
     let drain = Duration::from_secs(args.drain_seconds.unwrap_or(if roles.are_split() { DRAIN_DEFAULT_S } else { 0 }));
-    let listener = TcpListener::bind(args.listen).await.with_context(|| format!("listening on {}", args.listen))?;
+    let listener = TcpListener::bind(args.listen).await.with_context(|| {
+        format!(
+            "listening on {}; if another server has the port, end it or name another one with --listen",
+            args.listen
+        )
+    })?;
     let beacons = match args.beacon_listen {
         Some(address) => Some(hear(address).await?),
         None => None,
@@ -249,6 +254,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         sim: None,
         naive: Naive::default(),
         stops: follows.then(|| args.data.join(stop::FOLDER)),
+        stop_port: has_stop.then(|| args.stop_listen.port()),
         port: match identity {
             Some(_) => args.share.config("business")?,
             None => door::alone("business"),

@@ -8,6 +8,7 @@
 use crate::door::{self, Login};
 pub use crate::parts::{Naive, Parts};
 use crate::roles::Role;
+use crate::site_answer::SiteAnswer;
 use crate::stop_follower::StopFollower;
 use crate::upkeep;
 use crate::{denials, recorder};
@@ -32,7 +33,7 @@ use tokio::net::UdpSocket;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
-use tonic::service::Routes;
+use tonic::service::{LayerExt, Routes};
 use tonic_health::ServingStatus;
 use tonic_health::pb::health_server;
 use tonic_health::server::HealthReporter;
@@ -136,9 +137,11 @@ impl Server {
             names.iter().fold(builder, |builder, name| builder.with_service_name(*name))
         };
         let (health, health_service) = tonic_health::server::health_reporter();
+        let health_service = health_service.max_decoding_message_size(limits::HEALTH_MESSAGE_BYTES);
+        let site_id = self.parts.site.site_id().to_string();
         let mut routes = Routes::builder();
         routes
-            .add_service(health_service.max_decoding_message_size(limits::HEALTH_MESSAGE_BYTES))
+            .add_service(SiteAnswer { site_id, stop_port: self.parts.stop_port }.layer().named_layer(health_service))
             .add_service(reflection().build_v1()?.max_decoding_message_size(control))
             .add_service(reflection().build_v1alpha()?.max_decoding_message_size(control));
         if let Some(task) = &self.task {
@@ -460,6 +463,7 @@ mod tests {
             sim: None,
             naive: Naive::default(),
             stops: None,
+            stop_port: None,
             planning: planning.handle(),
         })
     }

@@ -48,8 +48,13 @@ const PRINCIPALS_EVERY: Duration = Duration::from_millis(500);
 
 /// The stop service on the host of a server: host:port. None: `server` names no host.
 pub fn beside(server: &str) -> Option<String> {
+    beside_on(server, PORT)
+}
+
+/// The same where it has another port.
+pub fn beside_on(server: &str, port: u16) -> Option<String> {
     let uri: http::Uri = uri(server).parse().ok()?;
-    Some(format!("{}:{PORT}", uri.host()?))
+    Some(format!("{}:{port}", uri.host()?))
 }
 
 /// What `stop serve` was asked for.

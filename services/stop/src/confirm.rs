@@ -6,6 +6,7 @@ use crate::acts::was_reset;
 use crate::{Inner, Times, lock};
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
+use midshift_core::nearest::nearest;
 use midshift_core::reason::Refusal;
 use midshift_core::robot::StopLevel;
 use midshift_core::stop::roster::{Confirmation, confirmation};
@@ -98,6 +99,21 @@ impl Watching<'_> {
         Ok(seen)
     }
 
+    /// What is said in the first message only.
+    fn begins(&self, stop: v1::Stop) -> v1::EngageResponse {
+        let site_id = self.inner.site_id.as_ref().map(ToString::to_string).unwrap_or_default();
+        let mut first = v1::EngageResponse { stop: Some(stop), site_id, ..v1::EngageResponse::default() };
+        if let Scope::Robot(robot_id) = &self.stop.scope {
+            let known = self.inner.robots.all();
+            first.robot_unknown = known.iter().all(|robot| robot.robot_id != *robot_id);
+            if first.robot_unknown {
+                let names = known.iter().map(|robot| robot.robot_id.as_str());
+                first.nearest_robot_ids = nearest(robot_id.as_str(), names).map(str::to_owned).collect();
+            }
+        }
+        first
+    }
+
     /// A robot that is not heard stands by its own silence by now. One that was never heard was answered by nobody since this process began.
     fn has_stood_by_itself(&self, confirmation: Confirmation, now: &Now) -> bool {
         match confirmation {
@@ -136,8 +152,9 @@ pub async fn tell(
         let was_durable = durable;
         durable |= inner.disk.holds(version);
         if first.is_some() || !seen.news.is_empty() || durable != was_durable {
-            let (stop, robots, counts) = (first.take(), seen.news, Some(seen.counts));
-            if sender.send(Ok(v1::EngageResponse { stop, robots, counts, durable })).await.is_err() {
+            let (robots, counts) = (seen.news, Some(seen.counts));
+            let begins = first.take().map(|stop| watching.begins(stop)).unwrap_or_default();
+            if sender.send(Ok(v1::EngageResponse { robots, counts, durable, ..begins })).await.is_err() {
                 return;
             }
         }

@@ -42,19 +42,34 @@ fn wanted(r: v1::EngageRequest, by: &Caller) -> Result<Wanted, Refusal> {
     bad.finish()?;
     let scope = scope.ok_or_else(|| Refusal::field("scope", "cannot be read"))?;
     let level = level.filter(|level| *level != StopLevel::None).unwrap_or(StopLevel::Halt);
-    let asked = v1::EngageRequest { level: level.to_wire(), request_id: String::new(), ..r.clone() };
+    let asked =
+        v1::EngageRequest { level: level.to_wire(), request_id: String::new(), site_id: String::new(), ..r.clone() };
     let hash: String = Sha256::digest(asked.encode_to_vec()).iter().map(|byte| format!("{byte:02x}")).collect();
     let request = request_id.map(|id| (id, hash));
     Ok(Wanted { scope, level, reason: r.reason, request, actor: by.to_string() })
 }
 
 impl StopService {
+    /// Whoever names a site means its robots and no others.
+    fn is_meant(&self, site_id: &str) -> Result<(), Refusal> {
+        match &self.inner.site_id {
+            Some(own) if !site_id.is_empty() && own.as_str() != site_id => {
+                let text =
+                    format!("this is the stop service of site {own}, not of {site_id}; nothing was stopped or reset");
+                let reason = Reason::new(Code::OtherSite, text).with("site_id", own);
+                Err(Refusal::new(Kind::Precondition, reason))
+            }
+            _ => Ok(()),
+        }
+    }
+
     async fn engage_now(
         &self,
         r: v1::EngageRequest,
         by: &Caller,
     ) -> Result<ReceiverStream<Result<v1::EngageResponse, Status>>, Refusal> {
         let inner = self.inner.clone();
+        self.is_meant(&r.site_id)?;
         let engaged = acts::engage(&inner, wanted(r, by)?)?;
         let durable = inner.disk.turn(engaged.version).await;
         let (sender, stream) = mpsc::channel(WATCH_MAX);
@@ -73,6 +88,7 @@ impl StopService {
     }
 
     async fn take_back(&self, r: v1::ResetRequest, by: &Caller) -> Result<v1::ResetResponse, Refusal> {
+        self.is_meant(&r.site_id)?;
         let mut bad = Violations::default();
         let stop_id = bad.take("stop_id", StopId::parse(&r.stop_id));
         if r.reason.trim().is_empty() || r.reason.len() > limits::REASON_BYTES_MAX {

@@ -33,6 +33,7 @@ use audit::{Action, Broken, Note, Verified};
 use disk::{Disk, Writer};
 use ground::Ground;
 use law::{Kept, Law};
+use midshift_core::ids::SiteId;
 use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::site::Site;
@@ -100,6 +101,8 @@ pub struct Parts {
 
 pub(crate) struct Inner {
     clock: Arc<dyn Clock>,
+    /// Which site's; none: there is no site file.
+    site_id: Option<SiteId>,
     ground: Ground,
     key: Key,
     /// Taken before `law` by whoever changes it: lines hear of changes in their order.
@@ -173,6 +176,7 @@ impl StopService {
         let opened = opening::open(&folder, now.wall)?;
         let ended = CancellationToken::new();
         let inner = Arc::new(Inner {
+            site_id: site.as_deref().map(|site| site.site_id().clone()),
             ground: Ground::of(site.as_deref()),
             key: opened.key,
             fan: Mutex::new(()),

@@ -129,6 +129,7 @@ pub fn status(inner: &Inner) -> v1::Status {
         durable: inner.disk.holds(version),
         audit_refused: inner.disk.refuses_audit(),
         principals_told_unix_ms: inner.principals.get().map_or(0, |told| told.borrow().0),
+        site_id: inner.site_id.as_ref().map(ToString::to_string).unwrap_or_default(),
     }
 }
 

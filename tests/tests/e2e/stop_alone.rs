@@ -48,7 +48,8 @@ async fn engage(people: &mut StopServiceClient<Channel>) -> anyhow::Result<Strin
 }
 
 async fn reset(people: &mut StopServiceClient<Channel>, stop_id: &str) -> anyhow::Result<()> {
-    let request = v1::ResetRequest { stop_id: stop_id.to_owned(), reason: "all clear".to_owned() };
+    let request =
+        v1::ResetRequest { stop_id: stop_id.to_owned(), reason: "all clear".to_owned(), site_id: String::new() };
     ensure!(people.reset(request).await?.into_inner().was_engaged, "it was not engaged");
     Ok(())
 }

@@ -168,9 +168,10 @@ async fn ask(order: &Order) -> Result<(), Status> {
             let mut told = stops()?.engage(*request).await?.into_inner();
             told.message().await.map(drop)
         }
-        Order::Reset(stop_id) => {
-            stops()?.reset(ResetRequest { stop_id, reason: "looked, is clear".to_owned() }).await.map(drop)
-        }
+        Order::Reset(stop_id) => stops()?
+            .reset(ResetRequest { stop_id, reason: "looked, is clear".to_owned(), ..ResetRequest::default() })
+            .await
+            .map(drop),
         Order::Retire(robot_id) => {
             let reason = "it behaves badly".to_owned();
             let request = RetireRobotRequest { robot_id, reason, ..RetireRobotRequest::default() };

@@ -287,6 +287,7 @@ fn serve(
                 let clock = MachineClock::boot(&time, Skew::default());
                 let ota = software.open(clock.clone()).await?;
                 let parts = Parts {
+                    stop_port: None,
                     roles: Roles::default(),
                     drain: Duration::ZERO,
                     heard: None,

@@ -98,7 +98,8 @@ impl Stopped {
     fn engage(&mut self, scope: v1::scope::Scope) {
         self.asked += 1;
         let (scope, request_id) = (Some(v1::Scope { scope: Some(scope) }), format!("stop-{}", self.asked));
-        let request = v1::EngageRequest { scope, level: 0, reason: "drawn".to_owned(), request_id };
+        let request =
+            v1::EngageRequest { scope, reason: "drawn".to_owned(), request_id, ..v1::EngageRequest::default() };
         self.scene.order(Order::Engage(Box::new(request)));
     }
     fn reset(&mut self, stop_id: &StopId) {

@@ -1,7 +1,9 @@
 //! Calls of the command line: which server, what an error means for a person and for the exit code.
 
 use super::contexts::{Contexts, Unknown};
+use super::door::Found;
 use crate::cli::out::Out;
+use crate::site_answer::SiteAnswer;
 use crate::way::{Line, Way};
 use midshift_bundle::build;
 use midshift_bundle::folder::Error;
@@ -22,6 +24,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 use tokio::time::Instant;
 use tonic::{Code, Request, Status, Streaming};
+use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_client::HealthClient;
 
 /// Longest unary call.
@@ -37,8 +40,12 @@ const PAUSE_MIN: Duration = Duration::from_millis(250);
 const PAUSE_MAX: Duration = Duration::from_secs(5);
 
 /// What a server says to a call that it does not know.
-const NOT_THERE: &str = "this server does not know the call\n  try: faults and worlds are with `midshift dev` or `midshift sim run --listen`; \
-     for anything else look at the server's version";
+const NOT_THERE: &str = "this server does not know the call\n  try: look at the port: stops are at 7421, everything else is at 7420. Faults and worlds are with `midshift dev` or \
+     `midshift sim run --listen`; for anything else look at the server's version";
+
+/// What is said of a server that takes a call and does not answer.
+const LATE: &str = "the server took the connection and has not answered in time\n  try: look at that process: it may hang, or be no midshift at all. What was asked may have been done: ask \
+     again with the same --request-id";
 
 /// What a connection says that ended before anything was answered.
 const BROKE_OFF: &str = "the server broke the connection off before it answered\n  try: sign in, if it speaks TLS: midshift login SERVER --pin DIGEST, with the \
@@ -78,6 +85,10 @@ pub struct Resolved {
     pub server: String,
     /// The stop service, host:port, if the context names one.
     pub stop_server: Option<String>,
+    /// The site, if the context says so.
+    pub site_id: Option<String>,
+    /// A context stands behind these.
+    pub from_context: bool,
     authority_pem: Option<String>,
     token: Option<String>,
 }
@@ -104,6 +115,8 @@ impl Login {
         Ok(Resolved {
             server: server.unwrap_or_else(|| SERVER.to_owned()),
             stop_server: known.and_then(|known| known.stop_server.clone()),
+            site_id: known.and_then(|known| known.site_id.clone()),
+            from_context: known.is_some(),
             authority_pem,
             token,
         })
@@ -114,11 +127,16 @@ impl Resolved {
     /// A server in plain text, without a context.
     #[cfg(test)]
     pub fn plain(server: &str) -> Self {
-        Self { server: server.to_owned(), stop_server: None, authority_pem: None, token: None }
+        let (stop_server, site_id, authority_pem, token) = (None, None, None, None);
+        Self { server: server.to_owned(), stop_server, site_id, from_context: false, authority_pem, token }
     }
     /// Whether a root is known.
     pub const fn is_secure(&self) -> bool {
         self.authority_pem.is_some()
+    }
+    /// What the server says of its site; none: it does not answer, or says nothing. Waits for as long as a call may take.
+    pub async fn site(&self) -> Option<SiteAnswer> {
+        site_of(self.way(&self.server).ok()?.connect().await.ok()?).await
     }
     /// The way to `address` of this site.
     pub fn way(&self, address: &str) -> Result<Way, Exit> {
@@ -128,6 +146,12 @@ impl Resolved {
         };
         way.map_err(|error| Exit::usage(format!("{error:#}")))
     }
+}
+
+/// What the server at the other end says of its site; none: it says nothing.
+pub async fn site_of(line: Line) -> Option<SiteAnswer> {
+    let answer = HealthClient::new(line).check(unary(HealthCheckRequest::default())).await.ok()?;
+    SiteAnswer::read(answer.metadata())
 }
 
 /// An end that is not success.
@@ -264,13 +288,15 @@ impl From<Status> for Exit {
             Code::PermissionDenied | Code::Unauthenticated => 6,
             Code::Aborted | Code::AlreadyExists | Code::FailedPrecondition => 9,
             Code::DeadlineExceeded => 10,
+            _ if is_late(&status) => 10,
+            _ if has_broken_off(&status) => NO_SERVER,
             _ => 1,
         };
         let violations = answer.violations.iter().map(|v| (v.field.as_str(), v.description.as_str()));
         let mut text = broken_rules(violations).unwrap_or_else(|| match status.message() {
             _ if status.code() == Code::Unimplemented => NOT_THERE.to_owned(),
-            // What plain text hears of a port that speaks TLS.
-            message if message.starts_with("h2 protocol error") => BROKE_OFF.to_owned(),
+            _ if is_late(&status) => LATE.to_owned(),
+            _ if has_broken_off(&status) => BROKE_OFF.to_owned(),
             "" => status.code().to_string(),
             message => message.to_owned(),
         });
@@ -325,6 +351,16 @@ pub async fn follow<T, B>(
             stream = away.get_or_insert_with(Away::begin).again(&open, &why).await?;
         }
     }
+}
+
+/// The server took the call and has not answered: the deadline was this program's own.
+fn is_late(status: &Status) -> bool {
+    status.code() == Code::Cancelled && status.message() == "Timeout expired"
+}
+
+/// What plain text hears of a port that speaks TLS.
+fn has_broken_off(status: &Status) -> bool {
+    status.message().starts_with("h2 protocol error") || status.message() == "operation was canceled"
 }
 
 /// The connection is gone, and with it what the answer would have been.
@@ -435,22 +471,19 @@ impl Call {
     }
 }
 
-/// Why nothing stands: nobody is there, it is of another site, or it speaks TLS and we do not.
-fn no_server(resolved: &Resolved, error: &dyn std::error::Error) -> Exit {
-    let server = &resolved.server;
-    let mut causes = std::iter::successors(error.source(), |cause| cause.source());
-    let is_tls = causes.any(|cause| cause.to_string().contains("certificate"));
-    Exit::new(
-        5,
-        match is_tls {
-            true => format!(
-                "the server at {server} is not of the site that you signed in to\n  try: midshift login {server} --pin DIGEST, with the digest that this server printed"
-            ),
-            false => {
-                format!("no server at {server}\n  try: start one with `midshift dev`, or name another with --server")
-            }
-        },
-    )
+/// Why nothing stands: nobody is there, it is of another site, or it is another door.
+fn no_server(resolved: &Resolved, error: &midshift_agent::dial::Error) -> Exit {
+    let (server, found) = (&resolved.server, Found::by(&*error.0));
+    let text = match (found, found.help()) {
+        (Found::OtherSite, _) => format!(
+            "the server at {server} is not of the site that you signed in to\n  try: midshift login {server} --pin DIGEST, with the digest that this server printed"
+        ),
+        (_, Some(help)) => format!("no server of this site at {server}: {help}"),
+        (_, None) => {
+            format!("no server at {server}\n  try: start one with `midshift dev`, or name another with --server")
+        }
+    };
+    Exit::new(found.exit_code(), text)
 }
 
 /// A unary request with its deadline on the wire.
@@ -538,6 +571,18 @@ mod tests {
             let refusal = Refusal::new(Kind::Precondition, code);
             assert!(Exit::from(midshift_proto::status(&refusal, None)).is_of_a_lost_place(), "{code:?}");
         }
+    }
+
+    #[test]
+    fn a_server_that_does_not_answer_in_time_and_a_port_that_speaks_tls_have_their_own_words_and_exit_codes() {
+        let late = Exit::from(Status::cancelled("Timeout expired"));
+        assert_eq!((late.code(), late.to_string()), (10, LATE.to_owned()));
+        for message in ["h2 protocol error: http2 error", "operation was canceled"] {
+            let broken = Exit::from(Status::unknown(message));
+            assert_eq!((broken.code(), broken.to_string()), (NO_SERVER, BROKE_OFF.to_owned()));
+        }
+        let canceled = Exit::from(Status::cancelled("by whoever asked"));
+        assert_eq!((canceled.code(), canceled.to_string().as_str()), (1, "by whoever asked"));
     }
 
     #[tokio::test(start_paused = true)]

@@ -2,8 +2,9 @@
 //!
 //! Invariant: a token is never printed, and remembered only after it was shown to the site that its owner named.
 
-use super::client::{Call, Exit, unary};
+use super::client::{Call, Exit, site_of, unary};
 use super::contexts::{Context, Contexts, Unknown};
+use super::door::Found;
 use super::out::Out;
 use crate::way::Way;
 use anyhow::Context as _;
@@ -91,13 +92,15 @@ pub async fn login(args: Login, out: &Out) -> Result<(), Exit> {
     };
     let token = token(args.token_file.as_ref(), out)?;
     let way = Way::secure(&args.server, &authority_pem, Some(&token))?;
-    let line = way
-        .connect()
-        .await
-        .map_err(|error| Exit::new(5, format!("no server of this site at {}: {error}", args.server)))?;
-    let me = IdentityServiceClient::new(line).who_am_i(unary(WhoAmIRequest {})).await?.into_inner();
+    let line = way.connect().await.map_err(|error| no_server(&args.server, &error))?;
+    let me = IdentityServiceClient::new(line.clone()).who_am_i(unary(WhoAmIRequest {})).await?.into_inner();
     let mut contexts = Contexts::read()?;
-    let context = Context { server: args.server, stop_server: args.stop_server, authority_pem, token };
+    let stop_server = match args.stop_server {
+        None => site_of(line).await.and_then(|said| said.unusual_stop_server(&args.server)),
+        named => named,
+    };
+    let site_id = Some(me.site_id.clone());
+    let context = Context { server: args.server, stop_server, site_id, authority_pem, token };
     contexts.context.insert(args.name.clone(), context);
     contexts.current = Some(args.name.clone());
     contexts.write()?;
@@ -109,6 +112,22 @@ pub async fn login(args: Login, out: &Out) -> Result<(), Exit> {
         args.name
     ));
     Ok(())
+}
+
+/// What was found where the server should be.
+fn no_server(server: &str, error: &midshift_agent::dial::Error) -> Exit {
+    let found = Found::by(&*error.0);
+    let why = match (found, found.help()) {
+        (_, Some(help)) => help.to_owned(),
+        (Found::Nothing, None) => {
+            "nothing listens there\n  try: look at the address and at whether the server runs".to_owned()
+        }
+        (Found::OtherSite, None) => {
+            "it has another root\n  try: the digest that this server printed, with --pin".to_owned()
+        }
+        (_, None) => error.to_string(),
+    };
+    Exit::new(found.exit_code(), format!("no server of this site at {server}: {why}"))
 }
 
 /// Runs a verb.

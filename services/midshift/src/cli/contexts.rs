@@ -21,6 +21,9 @@ pub struct Context {
     /// The stop service, host:port, if it is not on port 7421 of the same host.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stop_server: Option<String>,
+    /// The site. None: it was remembered by hand.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub site_id: Option<String>,
     /// The site's root, PEM.
     pub authority_pem: String,
     /// What is shown there.

@@ -2,6 +2,7 @@
 
 use super::client::{Call, Exit, unary};
 use super::out::Out;
+use crate::stop;
 use midshift_proto::convert::time_of;
 use midshift_proto::identity::v1;
 
@@ -9,18 +10,32 @@ use midshift_proto::identity::v1;
 pub async fn offer(call: &Call, robot_id: String, replace: bool, out: &Out) -> Result<(), Exit> {
     let asked = v1::CreateEnrolmentRequest { robot_id: robot_id.clone(), replace };
     let offered = call.identity().await?.create_enrolment(unary(asked)).await?.into_inner();
-    let (server, stop_server) = (call.address()?, call.resolved()?.stop_server);
+    let (server, mut stop_server) = (call.address()?, call.resolved()?.stop_server);
+    if stop_server.is_none() {
+        stop_server = call.resolved()?.site().await.and_then(|said| said.unusual_stop_server(&server));
+    }
     out.one(&offered, &offered.secret, || line(&robot_id, &server, stop_server.as_deref(), &offered.secret))?;
     let until = offered.expire_time.as_ref().map_or_else(String::new, |time| time_of(time).rfc3339());
+    if is_loopback(&server) {
+        out.say(&format!(
+            "warning: {server} is this machine; on another one put an address there under which it finds the server"
+        ));
+    }
     out.next(&format!("run it on the robot, once, before {until}; the secret is shown once"));
     Ok(())
 }
 
-/// What is run on the robot. Where stops are is said if it is not the usual port of the server.
+/// Whether a server is only found from its own machine.
+fn is_loopback(server: &str) -> bool {
+    let host = stop::beside(server).unwrap_or_default();
+    host.starts_with("127.") || host.starts_with("localhost:") || host.starts_with("[::1]")
+}
+
+/// What is run on the robot by a shell: the secret goes by the environment, where other users of the machine do not see it. Where stops are is said if it is not the usual port of the server.
 fn line(robot_id: &str, server: &str, stop_server: Option<&str>, secret: &str) -> String {
     let stops = stop_server.map_or_else(String::new, |address| format!(" --stop-server {address}"));
     format!(
-        "midshift agent run --robot-id {robot_id} --server {server}{stops} --data /var/lib/midshift-agent --enroll {secret}"
+        "MIDSHIFT_ENROLL={secret} midshift agent run --robot-id {robot_id} --server {server}{stops} --data midshift-{robot_id}"
     )
 }
 
@@ -66,6 +81,21 @@ pub async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
 #[cfg(test)]
 mod tests {
     use super::line;
+    use crate::robots::AgentRun;
+    use clap::{Args, FromArgMatches};
+
+    #[test]
+    fn the_line_of_a_robot_is_taken_as_it_is_printed() {
+        let printed = line("r7", "hub:7420", Some("hub:18421"), "mse.ID.SECRET.DIGEST");
+        let (secret, words) = printed.split_once(" midshift agent run ").expect("an assignment and a command");
+        let command = AgentRun::augment_args(clap::Command::new("run"));
+        let variable = command.get_arguments().find(|a| a.get_id() == "enroll").and_then(clap::Arg::get_env);
+        assert_eq!(variable.and_then(|name| name.to_str()), secret.strip_suffix("=mse.ID.SECRET.DIGEST"));
+        let taken = command.try_get_matches_from(["run"].into_iter().chain(words.split(' ')));
+        let taken = AgentRun::from_arg_matches(&taken.expect("words that are known")).expect("its arguments");
+        assert_eq!((taken.robot_id.as_str(), taken.server.as_str()), ("r7", "hub:7420"));
+        assert_eq!(taken.stop.stop_server.as_deref(), Some("hub:18421"));
+    }
 
     #[test]
     fn the_line_of_a_robot_says_where_stops_are_if_its_site_has_them_elsewhere() {

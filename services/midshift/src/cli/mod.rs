@@ -9,6 +9,7 @@ mod client;
 mod context;
 mod contexts;
 mod doctor;
+mod door;
 mod enrol;
 mod explain;
 mod health;

@@ -2,7 +2,11 @@
 //!
 //! An operational stop request; not a safety function, no performance level. Nothing is shown as standing that a robot has not said itself.
 
-use super::client::{Exit, Login, Resolved, follow, unary, was_cut};
+mod target;
+
+pub use target::address;
+
+use super::client::{Exit, follow, unary, was_cut};
 use super::out::{Format, Out, plain};
 use crate::stop::{FOLDER, StopServe};
 use crate::way::Line;
@@ -16,63 +20,13 @@ use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::time::Duration;
+use target::{AGAIN_AFTER, StopCall, Target};
 use tokio::time::Instant;
 
 /// Stops that were not confirmed by all.
 const NOT_ALL: u8 = 13;
 /// Every robot of a site in one message.
 pub const ANSWER_BYTES_MAX: usize = 64 * 1024 * 1024;
-
-/// Which stop service, and as whom.
-#[derive(Clone, Debug, Args)]
-pub struct StopCall {
-    /// The business server, host:port: its host has the stop service on port 7421. Without it that of the context, or 127.0.0.1:7420.
-    #[arg(long, env = "MIDSHIFT_SERVER")]
-    server: Option<String>,
-    /// The stop service, host:port, if it is elsewhere.
-    #[arg(long, env = "MIDSHIFT_STOP_SERVER", value_name = "HOST:PORT")]
-    stop_server: Option<String>,
-    /// As whom.
-    #[command(flatten)]
-    login: Login,
-}
-
-/// Where the stop service of a site is: as it was named, or on the host of its server.
-pub fn address(named: Option<&str>, resolved: &Resolved) -> Result<String, Exit> {
-    if let Some(stop_server) = named.or(resolved.stop_server.as_deref()) {
-        return Ok(stop_server.to_owned());
-    }
-    let server = &resolved.server;
-    crate::stop::beside(server).ok_or_else(|| Exit::usage(format!("--server {server} names no host")))
-}
-
-impl StopCall {
-    async fn client(&self) -> Result<StopServiceClient<Line>, Exit> {
-        let resolved = self.login.resolve(self.server.as_deref())?;
-        let address = address(self.stop_server.as_deref(), &resolved)?;
-        let (way, mut tries) = (resolved.way(&address)?, DIALS);
-        let line = loop {
-            tries -= 1;
-            match way.connect().await {
-                Ok(line) => break line,
-                Err(error) if tries == 0 => return Err(nobody(&address, &*error.0)),
-                // One that ends lets go of whoever has just come; the next one is there within moments.
-                Err(_) => tokio::time::sleep(AGAIN_AFTER).await,
-            }
-        };
-        Ok(StopServiceClient::new(line).max_decoding_message_size(ANSWER_BYTES_MAX))
-    }
-}
-
-/// There is no way to it, and why: nothing listens, a certificate that is not of the site, plain text where TLS is spoken.
-fn nobody(address: &str, error: &dyn std::error::Error) -> Exit {
-    let causes = std::iter::successors(error.source(), |cause| cause.source());
-    let why = causes.last().map_or_else(|| error.to_string(), ToString::to_string);
-    let text = format!(
-        "no stop service at {address} ({why}): nothing was stopped or reset. Use the robots' own emergency stops if you must\n  try: name it with --stop-server, or start one with `midshift stop serve`"
-    );
-    Exit::new(5, text)
-}
 
 /// What robots do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -190,11 +144,15 @@ pub async fn run(stop: Stop, out: &Out) -> Result<(), Exit> {
     match stop.verb {
         None => engage(stop.engage, out).await,
         Some(Verb::Status { call, watch: false }) => {
-            let answer = call.client().await?.get_status(unary(v1::GetStatusRequest {})).await?.into_inner();
-            show(&answer, out)
+            let target = call.target(out).await?;
+            let answer = call.client(&target).await?.get_status(unary(v1::GetStatusRequest {})).await?.into_inner();
+            show(&target, &answer, out)
         }
         Some(Verb::Status { call, .. }) => watch(&call, out).await,
-        Some(Verb::Reset { call, stop_id, reason }) => reset(&call, v1::ResetRequest { stop_id, reason }, out).await,
+        Some(Verb::Reset { call, stop_id, reason }) => {
+            let target = call.target(out).await?;
+            reset(call.client(&target).await?, v1::ResetRequest { stop_id, reason, site_id: target.site_id }, out).await
+        }
         Some(Verb::Verify { data }) => {
             let folder = data.join(FOLDER);
             let verified = midshift_stop::verify(&folder).map_err(|broken| {
@@ -228,8 +186,10 @@ async fn engage(args: Engage, out: &Out) -> Result<(), Exit> {
     let request_id =
         if args.request_id.is_empty() { format!("cli-{:032x}", rand::random::<u128>()) } else { args.request_id };
     let scope = Some(args.whom.scope());
-    let request = v1::EngageRequest { scope, level: level.into(), reason: args.reason, request_id };
-    let mut client = args.call.client().await?;
+    let target = args.call.target(out).await?;
+    let site_id = target.site_id.clone();
+    let request = v1::EngageRequest { scope, level: level.into(), reason: args.reason, request_id, site_id };
+    let mut client = args.call.client(&target).await?;
     let (mut told, mut tries) = (Told::default(), TRIES);
     let mut lost_since = None;
     loop {
@@ -248,16 +208,14 @@ async fn engage(args: Engage, out: &Out) -> Result<(), Exit> {
         tries -= 1;
         tokio::time::sleep(AGAIN_AFTER).await;
         // One that is replaced is there again within moments.
-        client = args.call.client().await.unwrap_or(client);
+        client = args.call.client(&target).await.unwrap_or(client);
     }
 }
 
-/// Asked so often again where a stop service has ended under a call; dialed so often before it is said that there is none.
+/// Asked so often again where a stop service has ended under a call.
 const TRIES: u32 = 10;
 /// So long after it broke off first it is not asked again, however few times it was: a person waits.
 const ASK_WITHIN: Duration = Duration::from_secs(60);
-const DIALS: u32 = 4;
-const AGAIN_AFTER: Duration = Duration::from_millis(200);
 
 /// Why no more is heard.
 enum Heard {
@@ -287,7 +245,8 @@ impl Told {
         let mut stream = client.engage(request).await.map_err(|status| self.lost(status))?.into_inner();
         while let Some(message) = stream.message().await.map_err(|status| self.lost(status))? {
             self.take(message, out).map_err(Heard::Failed)?;
-            if no_wait {
+            // Nobody is waited for of whom nobody knows.
+            if no_wait || self.last.robot_unknown {
                 return Ok(());
             }
         }
@@ -297,14 +256,17 @@ impl Told {
         Ok(())
     }
 
-    fn take(&mut self, message: v1::EngageResponse, out: &Out) -> Result<(), Exit> {
+    fn take(&mut self, mut message: v1::EngageResponse, out: &Out) -> Result<(), Exit> {
         if out.format == Format::Jsonl {
             out.json(&message)?;
         }
         if let Some(stop) = message.stop.as_ref().filter(|stop| stop.stop_id != self.stop.stop_id) {
             self.stop = stop.clone();
             match out.format {
-                Format::Table => out.line(&format!("{} {} {} engaged", stop.stop_id, level(stop.level), whom(stop))),
+                Format::Table => {
+                    let site = in_site(&message.site_id);
+                    out.line(&format!("{} {} {} engaged{site}", stop.stop_id, level(stop.level), whom(stop)));
+                }
                 Format::Name => out.line(&stop.stop_id),
                 Format::Json | Format::Jsonl => {}
             }
@@ -316,6 +278,12 @@ impl Told {
                 out.line(&confirmed(robot));
             }
             self.robots.insert(robot.robot_id.clone(), robot.clone());
+        }
+        // What the first message alone says stays.
+        let before = std::mem::take(&mut self.last);
+        if message.stop.is_none() {
+            (message.site_id, message.robot_unknown) = (before.site_id, before.robot_unknown);
+            message.nearest_robot_ids = before.nearest_robot_ids;
         }
         self.last = message;
         Ok(())
@@ -349,6 +317,15 @@ impl Told {
         }
     }
 
+    /// That the stop is for a robot that the stop service does not know, and which ones it knows by nearly that name.
+    fn unknown(&self) -> Option<String> {
+        let robot = self.last.robot_unknown.then(|| whom(&self.stop))?;
+        Some(match self.last.nearest_robot_ids.as_slice() {
+            [] => format!("no {robot} is known: nobody has confirmed it"),
+            nearest => format!("no {robot} is known: nobody has confirmed it. There is {}", nearest.join(", ")),
+        })
+    }
+
     fn end(self, no_wait: bool, out: &Out) -> Result<(), Exit> {
         let stop_id = &self.stop.stop_id;
         if out.format == Format::Json {
@@ -359,6 +336,10 @@ impl Told {
             out.say("warning: the stop service's disk refused it; robots were told and keep it, and it is written as soon as it can be");
         }
         out.next(&format!("midshift stop status; when it is over: midshift stop reset {stop_id} --reason TEXT"));
+        if let Some(unknown) = self.unknown() {
+            return Err(Exit::new(NOT_ALL, format!("{stop_id} is engaged, and {unknown}"))
+                .or_try("if another one is meant, engage a stop for it; then reset this one"));
+        }
         if no_wait {
             return Ok(());
         }
@@ -393,6 +374,11 @@ fn summary(counts: &v1::Counts) -> String {
         "{} stand, {} acknowledged, {} are elsewhere, {} requested, {} unreachable",
         counts.standstill_confirmed, counts.acked, counts.outside, counts.requested, counts.unreachable
     )
+}
+
+/// Where, if the stop service says so.
+fn in_site(site_id: &str) -> String {
+    if site_id.is_empty() { String::new() } else { format!(" at site {site_id}") }
 }
 
 fn level(number: i32) -> &'static str {
@@ -434,8 +420,9 @@ fn confirmed(robot: &v1::RobotStop) -> String {
     format!("{}  {word} {since}, {by}", robot.robot_id)
 }
 
-fn show(answer: &v1::GetStatusResponse, out: &Out) -> Result<(), Exit> {
+fn show(target: &Target, answer: &v1::GetStatusResponse, out: &Out) -> Result<(), Exit> {
     let status = answer.status.clone().unwrap_or_default();
+    target::is_of(target, &status)?;
     match out.format {
         Format::Json | Format::Jsonl => out.json(answer)?,
         Format::Name => status.stops.iter().flat_map(|s| &s.stop).for_each(|stop| out.line(&stop.stop_id)),
@@ -454,7 +441,7 @@ fn table(status: &v1::Status, out: &Out) {
         out.say("warning: the stop service's disk refuses what is engaged; robots keep it");
     }
     if status.stops.is_empty() {
-        out.line("nothing is engaged");
+        out.line(&format!("nothing is engaged{}", in_site(&status.site_id)));
     } else {
         let row = |engaged: &v1::EngagedStop| {
             let stop = engaged.stop.clone().unwrap_or_default();
@@ -497,18 +484,19 @@ fn of_robot(robot: &v1::RobotStatus) -> Vec<String> {
 }
 
 async fn watch(call: &StopCall, out: &Out) -> Result<(), Exit> {
-    let open = async || Ok(call.client().await?.watch_status(v1::WatchStatusRequest {}).await?.into_inner());
+    let target = call.target(out).await?;
+    let open = async || Ok(call.client(&target).await?.watch_status(v1::WatchStatusRequest {}).await?.into_inner());
     follow(out, open, |message: Option<v1::WatchStatusResponse>| {
         if let Some(message) = message {
-            show(&v1::GetStatusResponse { status: message.status }, out)?;
+            show(&target, &v1::GetStatusResponse { status: message.status }, out)?;
         }
         Ok(ControlFlow::Continue(()))
     })
     .await
 }
 
-async fn reset(call: &StopCall, request: v1::ResetRequest, out: &Out) -> Result<(), Exit> {
-    let answer = call.client().await?.reset(unary(request)).await?.into_inner();
+async fn reset(mut client: StopServiceClient<Line>, request: v1::ResetRequest, out: &Out) -> Result<(), Exit> {
+    let answer = client.reset(unary(request)).await?.into_inner();
     let reset = answer.reset.clone().unwrap_or_default();
     out.one(&answer, &reset.stop_id, || {
         let was =
@@ -534,18 +522,6 @@ async fn reset(call: &StopCall, request: v1::ResetRequest, out: &Out) -> Result<
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn call(server: &str, stop_server: Option<&str>) -> String {
-        address(stop_server, &Resolved::plain(server)).expect("an address")
-    }
-
-    #[test]
-    fn the_stop_service_is_on_the_host_of_the_server_unless_it_is_named() {
-        assert_eq!(call("127.0.0.1:7420", None), "127.0.0.1:7421");
-        assert_eq!(call("http://fleet.local:9000", None), "fleet.local:7421");
-        assert_eq!(call("[::1]:7420", None), "[::1]:7421");
-        assert_eq!(call("fleet.local:7420", Some("other:1")), "other:1");
-    }
 
     #[derive(clap::Parser)]
     struct Line {
@@ -584,13 +560,22 @@ mod tests {
     }
 
     #[test]
-    fn why_there_is_no_way_to_a_stop_service_is_told() {
-        let cause = std::io::Error::other("invalid peer certificate: UnknownIssuer");
-        let error = anyhow::Error::from(cause).context("transport error").into_boxed_dyn_error();
-        let said = nobody("host:7421", &*error).to_string();
-        assert!(said.contains("at host:7421 (invalid peer certificate: UnknownIssuer): nothing"), "{said}");
-        let said = nobody("host:7421", &std::io::Error::other("refused")).to_string();
-        assert!(said.contains("(refused)"), "{said}");
+    fn a_stop_of_an_unknown_robot_ends_with_13_and_the_nearest_names_also_where_nobody_waits() {
+        let scope = Some(v1::Scope { scope: Some(Scope::RobotId("rbt-4".to_owned())) });
+        let stop = v1::Stop { stop_id: "STOP-1".to_owned(), scope, ..v1::Stop::default() };
+        let nearest_robot_ids = vec!["rbt-04".to_owned(), "rbt-14".to_owned()];
+        let first =
+            v1::EngageResponse { stop: Some(stop), robot_unknown: true, nearest_robot_ids, ..Default::default() };
+        let out = Out::new(Format::Name);
+        for no_wait in [true, false] {
+            let mut told = Told::default();
+            told.take(first.clone(), &out).unwrap_or_else(|exit| panic!("{exit}"));
+            told.take(v1::EngageResponse::default(), &out).unwrap_or_else(|exit| panic!("{exit}"));
+            let exit = told.end(no_wait, &out).expect_err("nobody has confirmed it");
+            assert_eq!(exit.code(), NOT_ALL);
+            let said = exit.to_string();
+            assert!(said.contains("no robot rbt-4 is known") && said.contains("There is rbt-04, rbt-14"), "{said}");
+        }
     }
 
     #[test]

@@ -185,7 +185,11 @@ impl Server {
     }
 
     pub async fn reset(&self, stop_id: &str) -> v1::ResetResponse {
-        let request = v1::ResetRequest { stop_id: stop_id.to_owned(), reason: "looked, is clear".to_owned() };
+        let request = v1::ResetRequest {
+            stop_id: stop_id.to_owned(),
+            reason: "looked, is clear".to_owned(),
+            site_id: String::new(),
+        };
         self.client().await.reset(request).await.unwrap().into_inner()
     }
 }
@@ -204,7 +208,7 @@ pub fn fleet() -> v1::EngageRequest {
 
 pub fn scope(scope: v1::scope::Scope) -> v1::EngageRequest {
     let scope = Some(v1::Scope { scope: Some(scope) });
-    v1::EngageRequest { scope, level: 0, reason: "drill".to_owned(), request_id: String::new() }
+    v1::EngageRequest { scope, reason: "drill".to_owned(), ..v1::EngageRequest::default() }
 }
 
 pub fn id_of(answer: &v1::EngageResponse) -> String {

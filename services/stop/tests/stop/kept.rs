@@ -208,17 +208,49 @@ async fn what_cannot_be_engaged_is_refused_with_every_reason_and_nothing_is_enga
     let folder = Folder::new();
     let site = Arc::new(text::parse(DEMO).unwrap());
     let server = Server::with_site(&folder.path(), Some(site)).await;
-    let bad =
-        v1::EngageRequest { scope: None, level: 99, reason: "x".repeat(257), request_id: "with spaces".to_owned() };
+    let (reason, request_id) = ("x".repeat(257), "with spaces".to_owned());
+    let bad = v1::EngageRequest { level: 99, reason, request_id, ..v1::EngageRequest::default() };
     let answer = refusal_of(&server.engage(bad).await.unwrap_err());
     let fields: Vec<&str> = answer.violations.iter().map(|v| v.field.as_str()).collect();
     assert_eq!(fields, ["level", "reason", "request_id", "scope"]);
     let refused = server.engage(scope(W::Zone("nowhere".to_owned()))).await.unwrap_err();
     assert_eq!(refused.code(), Code::NotFound);
     assert!(refused.message().contains("A01"), "{}", refused.message());
-    let request = v1::ResetRequest { stop_id: "STOP-1".to_owned(), reason: "  ".to_owned() };
+    let request = v1::ResetRequest { stop_id: "STOP-1".to_owned(), reason: "  ".to_owned(), site_id: String::new() };
     assert_eq!(code(server.client().await.reset(request).await), Code::InvalidArgument);
     assert!(server.engaged().await.is_empty());
+}
+
+#[tokio::test]
+async fn nothing_is_engaged_or_reset_for_whoever_means_another_site() {
+    let folder = Folder::new();
+    let site = Arc::new(text::parse(DEMO).unwrap());
+    let own = site.site_id().to_string();
+    let server = Server::with_site(&folder.path(), Some(site)).await;
+    let other = v1::EngageRequest { site_id: "elsewhere".to_owned(), ..fleet() };
+    let refused = server.engage(other).await.unwrap_err();
+    assert_eq!(refused.code(), Code::FailedPrecondition);
+    assert!(refused.message().contains(&format!("of site {own}, not of elsewhere")), "{}", refused.message());
+    assert!(server.engaged().await.is_empty());
+    let engaged = server.engage(v1::EngageRequest { site_id: own.clone(), ..fleet() }).await.unwrap();
+    assert_eq!((engaged.site_id.as_str(), server.status().await.site_id.as_str()), (own.as_str(), own.as_str()));
+    let stop_id = id_of(&engaged);
+    let (reason, site_id) = ("all clear".to_owned(), "elsewhere".to_owned());
+    let reset = v1::ResetRequest { stop_id: stop_id.clone(), reason, site_id };
+    assert_eq!(code(server.client().await.reset(reset).await), Code::FailedPrecondition);
+    assert_eq!(server.engaged().await, [stop_id]);
+}
+
+#[tokio::test]
+async fn a_stop_of_an_unknown_robot_is_engaged_and_says_which_robots_may_be_meant() {
+    let folder = Folder::new();
+    let server = Server::start(&folder.path()).await;
+    let _robot = Robot::dial(&server, "rbt-04", Vec::new()).await.synced().await;
+    let engaged = server.engage(scope(W::RobotId("rbt-4".to_owned()))).await.unwrap();
+    assert!(engaged.robot_unknown && engaged.nearest_robot_ids == ["rbt-04"], "{engaged:?}");
+    assert_eq!(server.engaged().await, [id_of(&engaged)]);
+    let engaged = server.engage(scope(W::RobotId("rbt-04".to_owned()))).await.unwrap();
+    assert!(!engaged.robot_unknown && engaged.nearest_robot_ids.is_empty(), "{engaged:?}");
 }
 
 #[tokio::test]
@@ -293,7 +325,8 @@ async fn a_service_that_ends_takes_no_stop_and_no_reset_that_nobody_would_keep()
     shutdown.cancel();
     let refused = Face::engage(&service, Request::new(fleet())).await.expect_err("a refusal");
     assert_eq!(refused.code(), Code::Unavailable, "{refused}");
-    let reset = v1::ResetRequest { stop_id: "STOP-20260601-ABCDEFGHJK".to_owned(), reason: "all clear".to_owned() };
+    let stop_id = "STOP-20260601-ABCDEFGHJK".to_owned();
+    let reset = v1::ResetRequest { stop_id, reason: "all clear".to_owned(), site_id: String::new() };
     let refused = Face::reset(&service, Request::new(reset)).await.expect_err("a refusal");
     assert_eq!(refused.code(), Code::Unavailable);
     assert_eq!(service.engaged(), 0);

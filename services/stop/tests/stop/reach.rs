@@ -24,7 +24,8 @@ async fn engage(server: &Server, who: &str, request: v1::EngageRequest) -> v1::E
 }
 
 async fn reset(server: &Server, who: &str, stop_id: &str) -> Result<v1::ResetResponse, Status> {
-    let request = v1::ResetRequest { stop_id: stop_id.to_owned(), reason: "looked, is clear".to_owned() };
+    let request =
+        v1::ResetRequest { stop_id: stop_id.to_owned(), reason: "looked, is clear".to_owned(), site_id: String::new() };
     Ok(server.client().await.reset(asked_as(who, request)).await?.into_inner())
 }
 
