@@ -1,6 +1,7 @@
 //! Batches: items are committed in slices, each item stands for itself, answers keep the order.
 //!
 //! Invariant: an item is checked after everything sent before it that it depends on was committed, wherever slices end.
+//! A batch is read on while a slice is committed: many small frames that nobody reads end a connection of HTTP/2.
 
 use crate::TaskService;
 use crate::admit::{Admitted, Durable, Prepared, no_result};
@@ -11,7 +12,23 @@ use midshift_proto::Denying;
 use midshift_proto::common::v1::FieldViolation;
 use midshift_proto::convert::shown;
 use midshift_proto::task::v1::{self, submit_task_request::Body, submit_task_result::Outcome};
+use prost::Message;
 use std::collections::BTreeSet;
+use std::sync::Arc;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio_stream::{Stream, StreamExt};
+use tonic::Status;
+
+/// Why a batch ends before its last item.
+pub enum Broken {
+    /// Its stream broke.
+    Stream(Status),
+    /// It breaks a rule of batches.
+    Refused(Refusal),
+}
+
+/// A message that was read, with its share of the room for messages that wait.
+type Waiting = (v1::SubmitTasksRequest, OwnedSemaphorePermit);
 
 /// A batch under way.
 pub struct Batch<'a> {
@@ -30,10 +47,37 @@ impl<'a> Batch<'a> {
         Self { service, by, denying, slice: Vec::new(), chosen: BTreeSet::new(), results: Vec::new() }
     }
 
-    /// Takes the next item; what came before is committed first if the slice is full or the item depends on it.
-    pub async fn take(&mut self, request: v1::SubmitTaskRequest) -> Result<(), Refusal> {
-        if self.results.len() + self.slice.len() >= limits::SUBMIT_ITEMS_MAX {
+    /// Reads `stream` to its end and commits every item; one result an item.
+    ///
+    /// # Errors
+    /// The first one, after what was sent before it is committed.
+    pub async fn run(
+        mut self,
+        stream: impl Stream<Item = Result<v1::SubmitTasksRequest, Status>> + Unpin,
+    ) -> Result<Vec<v1::SubmitTaskResult>, Broken> {
+        let (queue, waiting) = mpsc::channel(limits::SUBMIT_ITEMS_MAX);
+        let commits = async {
+            let outcome = self.commit_each(waiting).await;
             self.flush().await;
+            outcome
+        };
+        let (read, committed) = tokio::join!(read_ahead(stream, queue), commits);
+        committed.map_err(Broken::Refused)?;
+        read.map_err(Broken::Stream)?;
+        Ok(self.results)
+    }
+
+    async fn commit_each(&mut self, mut waiting: mpsc::Receiver<Waiting>) -> Result<(), Refusal> {
+        while let Some((message, room)) = waiting.recv().await {
+            drop(room);
+            self.take(message.item.unwrap_or_default()).await?;
+        }
+        Ok(())
+    }
+
+    /// Takes the next item; what came before is committed first if the slice is full or the item depends on it.
+    async fn take(&mut self, request: v1::SubmitTaskRequest) -> Result<(), Refusal> {
+        if self.results.len() + self.slice.len() >= limits::SUBMIT_ITEMS_MAX {
             return Err(Refusal::field("item", "at most 10000 a call; what came before was admitted"));
         }
         let depends =
@@ -46,12 +90,6 @@ impl<'a> Batch<'a> {
         Ok(())
     }
 
-    /// Commits what is left; one result an item.
-    pub async fn finish(mut self) -> Vec<v1::SubmitTaskResult> {
-        self.flush().await;
-        self.results
-    }
-
     async fn flush(&mut self) {
         self.chosen.clear();
         let slice = std::mem::take(&mut self.slice);
@@ -59,6 +97,8 @@ impl<'a> Batch<'a> {
         let mut prepared = Vec::with_capacity(slice.len());
         for request in slice {
             prepared.push(self.prepare(request).await);
+            // The reader of this batch runs between two items, even where no read of the store waits.
+            tokio::task::consume_budget().await;
         }
         let items = prepared.iter().filter_map(|p| match p {
             Ok(Prepared::New(admission)) => Some(admission.item.clone()),
@@ -99,6 +139,22 @@ impl<'a> Batch<'a> {
         }
         self.service.prepare(request, self.by).await
     }
+}
+
+/// Reads messages until the stream ends or breaks, at most [`limits::SUBMIT_AHEAD_BYTES`] ahead of what is committed.
+async fn read_ahead(
+    mut stream: impl Stream<Item = Result<v1::SubmitTasksRequest, Status>> + Unpin,
+    queue: mpsc::Sender<Waiting>,
+) -> Result<(), Status> {
+    let room = Arc::new(Semaphore::new(limits::SUBMIT_AHEAD_BYTES as usize));
+    while let Some(message) = stream.next().await.transpose()? {
+        let bytes = u32::try_from(message.encoded_len()).unwrap_or(u32::MAX).min(limits::SUBMIT_AHEAD_BYTES);
+        let Ok(permit) = room.clone().acquire_many_owned(bytes).await else { break };
+        if queue.send((message, permit)).await.is_err() {
+            break;
+        }
+    }
+    Ok(())
 }
 
 /// The id a request asks for; empty: none.

@@ -1,6 +1,6 @@
 //! The gRPC face of task intake: decode, call, encode.
 
-use crate::batch::Batch;
+use crate::batch::{Batch, Broken};
 use crate::{TaskService, rows};
 use midshift_core::identity::Caller;
 use midshift_core::ids::{RequestId, Subject, TaskId};
@@ -75,12 +75,11 @@ impl Face for TaskService {
         r: Request<Streaming<v1::SubmitTasksRequest>>,
     ) -> Result<Response<v1::SubmitTasksResponse>, Status> {
         let (id, by, denying) = (CallId::of(&r, ""), caller(&r), Denying::of(&r));
-        let mut stream = r.into_inner();
-        let mut batch = Batch::new(self, &by, denying);
-        while let Some(message) = stream.message().await? {
-            batch.take(message.item.unwrap_or_default()).await.map_err(|refusal| id.status(&refusal))?;
-        }
-        Ok(Response::new(v1::SubmitTasksResponse { results: batch.finish().await }))
+        let results = Batch::new(self, &by, denying).run(r.into_inner()).await.map_err(|broken| match broken {
+            Broken::Stream(status) => status,
+            Broken::Refused(refusal) => id.status(&refusal),
+        })?;
+        Ok(Response::new(v1::SubmitTasksResponse { results }))
     }
     async fn get_task(&self, r: Request<v1::GetTaskRequest>) -> Result<Response<v1::GetTaskResponse>, Status> {
         let (id, by) = (CallId::of(&r, ""), caller(&r));

@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 #[derive(Clone, Copy, Debug)]
-enum Language {
+pub enum Language {
     Python,
     Go,
     TypeScript,
@@ -58,6 +58,14 @@ impl Language {
             Self::Python => self.run("tests/endure.py", &[]),
             Self::Go => self.run("bin/endure", &[]),
             Self::TypeScript => self.run("dist/test/endure.js", &[]),
+        }
+    }
+    /// A batch of many small items.
+    pub fn batch(self, arguments: &[&str]) -> anyhow::Result<Command> {
+        match self {
+            Self::Python => self.run("tests/batch.py", arguments),
+            Self::Go => self.run("bin/batch", arguments),
+            Self::TypeScript => anyhow::bail!("no program sends a batch"),
         }
     }
     fn run(self, program: &str, arguments: &[&str]) -> anyhow::Result<Command> {

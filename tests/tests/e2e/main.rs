@@ -13,6 +13,7 @@ macro_rules! say {
 mod anybody;
 mod areas;
 mod audited;
+mod batches;
 mod begin_and_end;
 mod clients;
 mod cut;
