@@ -81,6 +81,12 @@ pub(crate) struct Port<S> {
     pub http: auto::Builder<TokioExecutor>,
 }
 
+/// Bytes of one stream that may wait unread. HTTP/2 ends a connection on which unread frames of less than 256 bytes lack more than half
+/// of its window in sum: with these two, frames of 28 bytes and more never do on one stream, however fast they come.
+const STREAM_WINDOW_BYTES: u32 = 64 * 1024;
+/// Bytes of all streams of one connection that may wait unread.
+const CONNECTION_WINDOW_BYTES: u32 = 1024 * 1024;
+
 /// HTTP/2 and HTTP/1.1 within the limits of `config`.
 pub(crate) fn http(config: &Config) -> auto::Builder<TokioExecutor> {
     let mut builder = auto::Builder::new(TokioExecutor::new());
@@ -89,6 +95,8 @@ pub(crate) fn http(config: &Config) -> auto::Builder<TokioExecutor> {
         .timer(TokioTimer::new())
         .max_concurrent_streams(config.streams_per_connection)
         .max_header_list_size(config.header_list_bytes)
+        .initial_stream_window_size(STREAM_WINDOW_BYTES)
+        .initial_connection_window_size(CONNECTION_WINDOW_BYTES)
         .keep_alive_interval(std(config.keepalive_every))
         .keep_alive_timeout(std(config.keepalive_within));
     builder
