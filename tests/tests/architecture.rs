@@ -77,6 +77,11 @@ const LOGGED: &[(&str, &str, &str)] = &[
     ("robot_agent/src/core.rs", "replayed", "numbers of samples"),
     ("robot_agent/src/session.rs", "why", "what the transport said, and sentences of this program"),
     ("robot_agent/src/stop/line.rs", "why", "what the transport said, and sentences of this program"),
+    (
+        "robot_agent/src/stop/obey.rs",
+        "why",
+        "which field of the link's stops breaks a rule, in the words of the decoder",
+    ),
     ("robot_agent/src/stop/obey.rs", "level", "one of four words"),
     ("robot_agent/src/stop/obey.rs", "stops", "ids"),
     ("robot_agent/src/stop/obey.rs", "awaiting_resume", "ids"),

@@ -102,8 +102,16 @@ async fn the_first_mends_before_others_come_and_each_has_a_number_of_its_own() {
     assert!(!second.is_first);
     assert_ne!(first.number, second.number);
     drop((first, second));
-    let third = Presence::come(dir.path(), &owner).await.expect("alone again").expect("asked");
-    assert!(third.is_first && third.number > 2);
+    // A program that another test starts in this moment has our locks until it runs its own code.
+    let third = loop {
+        let came = Presence::come(dir.path(), &owner).await.expect("let in").expect("asked");
+        if came.is_first {
+            break came;
+        }
+        drop(came);
+        tokio::task::yield_now().await;
+    };
+    assert!(third.number > 2);
 }
 
 #[tokio::test]
