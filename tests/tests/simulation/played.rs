@@ -11,7 +11,7 @@ use crate::orders::Order;
 use crate::plan::background;
 use crate::room::{Naive, Room, RoomConfig, player_machine, site};
 use crate::run::{Outcome, outcome_of};
-use crate::{every_seed_holds, hash_of, number, report_seed};
+use crate::{every_seed_holds, hash_of, report_seed};
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::rows::Table;
 use midshift_core::site::{DEMO, Site};
@@ -260,7 +260,7 @@ impl Game {
 
 #[test]
 fn one_seed_of_robots_that_behave_badly_keeps_every_law() {
-    let seed = number("MIDSHIFT_SIM_SEED").unwrap_or(1);
+    let Some(seed) = crate::own_seed(ONE) else { return };
     let outcome = run(seed, crate::naive_of(&std::env::var("MIDSHIFT_SIM_NAIVE").unwrap_or_default()));
     report_seed(seed, &outcome);
 }

@@ -73,7 +73,7 @@ mod tests {
     async fn found_over_tls(address: std::net::SocketAddr) -> Found {
         let root = rcgen::generate_simple_self_signed(["midshift".to_owned()]).expect("a root").cert.pem();
         let way = Way::secure(&address.to_string(), &root, None).expect("a way");
-        Found::by(&*way.connect().await.err().expect("no server of the site").0)
+        Found::by(&*way.connect().await.expect_err("no server of the site").0)
     }
 
     #[tokio::test]
