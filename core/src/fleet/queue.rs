@@ -203,7 +203,7 @@ impl Queue {
         }
     }
     /// How many ready tasks are served up to a task, itself included; none: it is not ready. However long the queue is, a question counts
-    /// [`MILESTONE`] tasks at most.
+    /// `MILESTONE` tasks at most.
     pub fn position(&self, task_id: &TaskId) -> Option<usize> {
         let rank = self.rank(task_id)?;
         let milestones = self.milestones();
