@@ -178,7 +178,7 @@ kept! {
     Place::Table(Table::PlaceGrant) => [Operations, Position] Operate Newest;
     Place::Table(Table::RobotAuthority) => [Operations] Operate Newest;
     Place::Table(Table::RobotControl) => [Operations, Person] Operate Standing;
-    Place::Table(Table::RobotCounter) => [Machine, Software] Diagnose Standing;
+    Place::Table(Table::RobotCounter) => [Machine, Software] Diagnose Month;
     Place::Table(Table::Site) => [Site] Operate Standing;
     Place::Table(Table::AreaPolicy) => [Site] Operate Standing;
     Place::Table(Table::DesiredWork) => [Operations] Operate Newest;
@@ -192,7 +192,7 @@ kept! {
     Place::Table(Table::FleetLeader) => [None] Operate Newest;
     Place::Table(Table::Session) => [Machine, Position, Software, Credential] Operate Newest;
     Place::Table(Table::Presence) => [Machine] Operate Newest;
-    Place::Table(Table::LaneMark) => [Machine] Operate Newest;
+    Place::Table(Table::LaneMark) => [Machine] Operate Month;
     Place::Table(Table::Bundle) => [Software] Update Standing;
     Place::Table(Table::Rollout) => [Software, Person] Update Counted;
     Place::Table(Table::RolloutRobot) => [Software, Machine] Update Counted;

@@ -45,7 +45,7 @@ pub struct OldSite {
 
 impl OldSite {
     /// `ended` tasks of the 29 days before `now`, done by fifty robots; eight more were retired.
-    pub fn of(ended: u64, now: Utc) -> Self {
+    pub fn with_ended(ended: u64, now: Utc) -> Self {
         Self { ended, robots: 50, retired: 8, from: Utc(now.0 - 29 * DAY_MS), until: Utc(now.0 - 1) }
     }
 

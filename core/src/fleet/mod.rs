@@ -382,7 +382,7 @@ pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Pl
     write_down(view, now, board, &releases, plan);
     if pace == Pace::Sweep {
         plan.slice.renew();
-        unexplained::look(view, board, now, plan);
+        unexplained::count_unexplained(view, board, now, plan);
     }
     if !plan.items.is_empty() {
         tell_time(view, now, plan);

@@ -22,7 +22,7 @@ pub struct Unexplained {
 }
 
 /// Looks at the next robots and tasks.
-pub(super) fn look(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
+pub(super) fn count_unexplained(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
     let mut found: Vec<(String, bool)> = Vec::new();
     let robots = next(&view.authority, &view.unexplained.robot);
     for id in &robots {

@@ -147,7 +147,13 @@ async fn read_ahead(
     queue: mpsc::Sender<Waiting>,
 ) -> Result<(), Status> {
     let room = Arc::new(Semaphore::new(limits::SUBMIT_AHEAD_BYTES as usize));
-    while let Some(message) = stream.next().await.transpose()? {
+    loop {
+        let message = tokio::select! {
+            message = stream.next() => message.transpose()?,
+            // The batch was refused: nobody waits for what its sender may still say.
+            () = queue.closed() => break,
+        };
+        let Some(message) = message else { break };
         let bytes = u32::try_from(message.encoded_len()).unwrap_or(u32::MAX).min(limits::SUBMIT_AHEAD_BYTES);
         let Ok(permit) = room.clone().acquire_many_owned(bytes).await else { break };
         if queue.send((message, permit)).await.is_err() {

@@ -15,7 +15,7 @@ fn counted(rig: &mut Rig, secs: u64) -> Vec<String> {
     let mut plan = Plan::default();
     for _ in 0..secs {
         rig.pass(1_000);
-        unexplained::look(&mut rig.view, &rig.board, rig.now, &mut plan);
+        unexplained::count_unexplained(&mut rig.view, &rig.board, rig.now, &mut plan);
     }
     plan.report.unexplained
 }

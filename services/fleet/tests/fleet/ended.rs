@@ -22,7 +22,7 @@ const FEW: u64 = 300;
 async fn world(ended: u64) -> World {
     World::over(CORRIDOR, Bugs::default(), async |site_id, clock: Arc<dyn Clock>| {
         let store = MemoryStore::new(site_id, StoreId(Arc::from("old")), clock.clone()).shared();
-        OldSite::of(ended, clock.now().utc).write(&store).await;
+        OldSite::with_ended(ended, clock.now().utc).write(&store).await;
         let store: Arc<dyn Store> = Arc::new(store);
         store
     })

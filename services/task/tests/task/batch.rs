@@ -4,6 +4,8 @@ use crate::world::{World, count, patrol, transport};
 use midshift_core::limits;
 use midshift_proto::task::v1::{self, SubmitTaskRequest, submit_task_result::Outcome};
 use std::collections::BTreeSet;
+use std::time::Duration;
+use tokio_stream::StreamExt;
 use tonic::{Code, Status};
 
 async fn send(world: &World, items: Vec<SubmitTaskRequest>) -> Result<Vec<v1::SubmitTaskResult>, Status> {
@@ -75,4 +77,15 @@ async fn a_batch_over_its_limit_is_refused_after_what_came_before_was_admitted()
     let last = send(&world, vec![transport("r9999", "B03")]).await.expect("a batch");
     let number = world.get(&shown(&last[0])).await.number;
     assert_eq!(number, limits::SUBMIT_ITEMS_MAX as u64, "it was the last one admitted then, not a new one");
+}
+
+#[tokio::test]
+async fn a_batch_over_its_limit_is_refused_while_its_sender_still_holds_the_stream_open() {
+    let world = World::new().await;
+    let items = (0..=limits::SUBMIT_ITEMS_MAX).map(|i| transport(&format!("r{i}"), "B03"));
+    let messages = items.map(|item| v1::SubmitTasksRequest { item: Some(item) });
+    let stream = tokio_stream::iter(messages).chain(tokio_stream::pending());
+    let mut client = world.client();
+    let answer = tokio::time::timeout(Duration::from_secs(60), client.submit_tasks(stream)).await;
+    assert_eq!(answer.expect("an answer").expect_err("10001 items").code(), Code::InvalidArgument);
 }
