@@ -1,5 +1,6 @@
 //! The one integration suite of midshift: its tests are in `tests/tests`, over real programs and real parts.
 
+pub mod counted;
 pub mod line;
 pub mod old_site;
 pub mod player;

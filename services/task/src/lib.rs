@@ -48,6 +48,7 @@ pub struct Parts {
 
 struct Inner {
     parts: Parts,
+    /// The last admission number that was given.
     number: AtomicU64,
     /// Drawn at the start, so that two processes do not draw the same ids.
     salt: u64,
@@ -90,9 +91,12 @@ impl TaskService {
         metrics::histogram!("midshift_task_commit_seconds").record(begun.elapsed().as_secs_f64());
         results
     }
-    /// The next admission number.
+    /// The next admission number: above the last one of this process, and above the newest entry it has heard of. An admission writes more entries than
+    /// it takes numbers, so that of two processes none falls behind what the other has admitted.
     fn next_number(&self) -> u64 {
-        self.inner.number.fetch_add(1, Relaxed) + 1
+        let head = self.store().wake().borrow().0;
+        let next = |last: u64| last.max(head) + 1;
+        self.inner.number.fetch_update(Relaxed, Relaxed, |last| Some(next(last))).map_or(head + 1, next)
     }
 }
 

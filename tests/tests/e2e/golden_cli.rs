@@ -19,9 +19,10 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
 /// Keys whose values no program may read anything into.
-const OPAQUE: [&str; 12] = [
+const OPAQUE: [&str; 13] = [
     "age",
     "workGeneration",
+    "number",
     "seq",
     "etag",
     "cursor",

@@ -15,38 +15,58 @@ async fn numbers(world: &World, filter: TaskFilter) -> Vec<u64> {
     page(world, filter, 0, "").await.tasks.iter().map(|t| t.number).collect()
 }
 
+fn ids(page: &v1::ListTasksResponse) -> Vec<&str> {
+    page.tasks.iter().map(|task| task.task_id.as_str()).collect()
+}
+
 #[tokio::test]
 async fn every_filter_holds_and_they_hold_together() {
     let world = World::new().await;
     let first = submit(&world.service, transport("r1", "B03")).await.expect("admitted");
-    submit(&world.service, patrol("r2", &[])).await.expect("admitted");
+    let second = submit(&world.service, patrol("r2", &[])).await.expect("admitted");
     let third = submit(&world.service, transport("r3", "B01")).await.expect("admitted");
     world.runs(&third.task_id, 1).await;
     let types = |t: &str| TaskFilter { types: vec![t.into()], ..TaskFilter::default() };
-    assert_eq!(numbers(&world, TaskFilter::default()).await, [3, 2, 1]);
-    assert_eq!(numbers(&world, types("transport")).await, [3, 1]);
+    assert_eq!(numbers(&world, TaskFilter::default()).await, [third.number, second.number, first.number]);
+    assert_eq!(numbers(&world, types("transport")).await, [third.number, first.number]);
     let states = vec![v1::TaskState::Running.into()];
-    assert_eq!(numbers(&world, TaskFilter { states, ..types("transport") }).await, [3]);
+    assert_eq!(numbers(&world, TaskFilter { states, ..types("transport") }).await, [third.number]);
     let robot_ids = vec!["rbt-01".to_owned()];
     assert_eq!(numbers(&world, TaskFilter { robot_ids, ..types("patrol") }).await, [0u64; 0]);
     let task_id_prefix = first.task_id.clone();
-    assert_eq!(numbers(&world, TaskFilter { task_id_prefix, ..TaskFilter::default() }).await, [1]);
+    assert_eq!(numbers(&world, TaskFilter { task_id_prefix, ..TaskFilter::default() }).await, [first.number]);
 }
 
 #[tokio::test]
 async fn tasks_named_by_id_come_in_pages_newest_first_and_unknown_ones_are_left_out() {
     let world = World::new().await;
-    let mut task_ids = vec!["TASK-X".to_owned()];
+    let mut admitted = Vec::new();
     for i in 0..4 {
-        task_ids.push(submit(&world.service, transport(&format!("r{i}"), "B03")).await.expect("admitted").task_id);
+        admitted.push(submit(&world.service, transport(&format!("r{i}"), "B03")).await.expect("admitted").task_id);
     }
-    task_ids.remove(2);
+    let task_ids = vec!["TASK-X".to_owned(), admitted[0].clone(), admitted[2].clone(), admitted[3].clone()];
     let filter = TaskFilter { task_ids, ..TaskFilter::default() };
     let first = page(&world, filter.clone(), 2, "").await;
-    assert_eq!(first.tasks.iter().map(|t| t.number).collect::<Vec<_>>(), [4, 3]);
+    assert_eq!(ids(&first), [admitted[3].as_str(), &admitted[2]]);
     let last = page(&world, filter, 2, &first.next_page_token).await;
-    assert_eq!(last.tasks.iter().map(|t| t.number).collect::<Vec<_>>(), [1]);
+    assert_eq!(ids(&last), [admitted[0].as_str()]);
     assert!(last.next_page_token.is_empty());
+}
+
+#[tokio::test]
+async fn tasks_of_two_services_are_listed_newest_first_by_either_and_a_page_of_one_goes_on_at_the_other() {
+    let world = World::new().await;
+    let other = World::over(world.store.clone(), world.site.clone()).await;
+    let mut admitted = Vec::new();
+    // One of them admits most.
+    for (i, service) in [&world.service; 5].into_iter().chain([&other.service, &world.service]).enumerate() {
+        admitted.push(submit(service, transport(&format!("r{i}"), "B03")).await.expect("admitted").task_id);
+    }
+    admitted.reverse();
+    let first = page(&other, TaskFilter::default(), 3, "").await;
+    let rest = page(&world, TaskFilter::default(), 10, &first.next_page_token).await;
+    assert_eq!([ids(&first), ids(&rest)].concat(), admitted);
+    assert_eq!(page(&other, TaskFilter::default(), 10, "").await, page(&world, TaskFilter::default(), 10, "").await);
 }
 
 #[tokio::test]

@@ -1,89 +1,23 @@
 //! Lookups in a store where far more has ended than one call may look at: what is asked for by id, by its beginning or by robot is found by
 //! an index. What counts is how many rows the store hands out.
 
+use crate::counted::Counted;
 use crate::world::{Watch, World, patrol, submit};
-use midshift_core::audit::Head;
-use midshift_core::ids::{RobotId, SiteId, TaskId};
+use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::limits;
-use midshift_core::rows::{Item, Key, Log, Naming, Part, Row, Seq, Writer};
+use midshift_core::rows::{Item, Writer};
 use midshift_core::task::{Phase, TaskIntake, TaskState};
 use midshift_proto::task::v1::task_service_server::TaskService as _;
 use midshift_proto::task::v1::{self, ListTasksRequest, TaskFilter};
-use midshift_store::{
-    Applied, CommitError, Error, FeedPage, MemoryStore, Query, Retention, Snapshot, Store, StoreId, load,
-};
+use midshift_store::{Store, load};
 use midshift_task::{Parts, TaskService};
-use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
-use tokio::sync::watch;
 use tonic::Request;
 
 /// Tasks that have ended: more than one call looks at.
 const ENDED: u64 = limits::LIST_ROWS_READ_MAX as u64 + 2_500;
 /// Rows of one item, two a task.
 const TASKS_PER_ITEM: u64 = 100;
-
-/// A store that counts the rows it hands out.
-struct Counted {
-    store: Arc<MemoryStore>,
-    rows: AtomicUsize,
-}
-
-impl Counted {
-    fn count<T>(&self, rows: &Result<Vec<T>, Error>) {
-        self.rows.fetch_add(rows.as_ref().map_or(0, Vec::len), Relaxed);
-    }
-}
-
-#[tonic::async_trait]
-impl Store for Counted {
-    fn id(&self) -> &StoreId {
-        self.store.id()
-    }
-    fn site_id(&self) -> &SiteId {
-        self.store.site_id()
-    }
-    fn is_shared(&self) -> bool {
-        self.store.is_shared()
-    }
-    async fn commit(&self, items: Vec<Item>) -> Vec<Result<Applied, CommitError>> {
-        self.store.commit(items).await
-    }
-    async fn get(&self, keys: Vec<Key>) -> Result<Vec<Row>, Error> {
-        let rows = self.store.get(keys).await;
-        self.count(&rows);
-        rows
-    }
-    async fn list(&self, query: Query) -> Result<Vec<Row>, Error> {
-        let rows = self.store.list(query).await;
-        self.count(&rows);
-        rows
-    }
-    async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error> {
-        let snapshot = self.store.read(parts, named).await;
-        self.rows.fetch_add(snapshot.as_ref().map_or(0, |snapshot| snapshot.rows.len()), Relaxed);
-        snapshot
-    }
-    async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error> {
-        self.store.feed(after, logs, limit).await
-    }
-    async fn feed_of(&self, log: Log, subjects: &[Arc<str>], after: Seq, limit: usize) -> Result<FeedPage, Error> {
-        self.store.feed_of(log, subjects, after, limit).await
-    }
-    fn wake(&self) -> watch::Receiver<Seq> {
-        self.store.wake()
-    }
-    async fn raise_head(&self, at_least: Seq) -> Result<Seq, Error> {
-        self.store.raise_head(at_least).await
-    }
-    async fn audit_heads(&self) -> Result<BTreeMap<Writer, Head>, Error> {
-        self.store.audit_heads().await
-    }
-    async fn prune(&self, keep: Retention) -> Result<u64, Error> {
-        self.store.prune(keep).await
-    }
-}
 
 /// An old site: the first task is the one that is looked for, and r-old is the only robot of nine of them; then come those that others did.
 struct Old {
@@ -111,7 +45,7 @@ impl Old {
             }
             world.store.commit(vec![item]).await.remove(0).expect("applied");
         }
-        let counted = Arc::new(Counted { store: world.store.clone(), rows: AtomicUsize::new(0) });
+        let counted = Counted::over(world.store.clone());
         let parts =
             Parts { store: counted.clone(), site: world.site.clone(), clock: world.clock(), bugs: Default::default() };
         let service = TaskService::open(parts, world.shutdown.clone()).await.expect("a store opens");
@@ -120,9 +54,9 @@ impl Old {
     /// What `filter` finds, and how many rows the store handed out for it.
     async fn page(&self, filter: TaskFilter, size: u32, token: &str) -> (v1::ListTasksResponse, usize) {
         let request = ListTasksRequest { filter: Some(filter), page_size: size, page_token: token.to_owned() };
-        self.counted.rows.store(0, Relaxed);
+        self.counted.take();
         let page = self.service.list_tasks(Request::new(request)).await.expect("a page").into_inner();
-        (page, self.counted.rows.load(Relaxed))
+        (page, self.counted.take())
     }
 }
 
@@ -201,25 +135,25 @@ async fn a_page_says_more_only_if_there_is_a_task_more_or_it_says_how_far_it_loo
 async fn a_watch_of_one_task_reads_that_one() {
     let old = Old::site().await;
     let filter = TaskFilter { task_ids: vec![old.first.clone()], ..TaskFilter::default() };
-    old.counted.rows.store(0, Relaxed);
+    old.counted.take();
     let request = v1::WatchTasksRequest { filter: Some(filter), cursor: String::new() };
     let stream = old.service.watch_tasks(Request::new(request)).await.expect("a watch").into_inner();
     let mut watch = Watch::over(stream);
     let existing = watch.message().await;
     assert!(matches!(existing.item, Some(v1::watch_tasks_response::Item::Existing(task)) if task.task_id == old.first));
     watch.bookmark().await;
-    let rows = old.counted.rows.load(Relaxed);
+    let rows = old.counted.take();
     assert!(rows <= 8, "{rows} rows");
 }
 
 #[tokio::test]
 async fn a_task_is_shown_whatever_came_after_it() {
     let old = Old::site().await;
-    old.counted.rows.store(0, Relaxed);
+    old.counted.take();
     let request = Request::new(v1::GetTaskRequest { task_id: old.first.clone() });
     let task = old.service.get_task(request).await.expect("a task").into_inner().task.expect("always set");
     assert_eq!(task.task_id, old.first);
-    let rows = old.counted.rows.load(Relaxed);
+    let rows = old.counted.take();
     assert!(rows <= 3, "{rows} rows");
 }
 
@@ -227,7 +161,7 @@ async fn a_task_is_shown_whatever_came_after_it() {
 async fn a_watch_without_a_filter_begins_with_what_is_alive_and_reads_nothing_else() {
     let old = Old::site().await;
     let first = async |filter: Option<TaskFilter>| {
-        old.counted.rows.store(0, Relaxed);
+        old.counted.take();
         let request = v1::WatchTasksRequest { filter, cursor: String::new() };
         let stream = old.service.watch_tasks(Request::new(request)).await.expect("a watch").into_inner();
         let mut watch = Watch::over(stream);
@@ -235,7 +169,7 @@ async fn a_watch_without_a_filter_begins_with_what_is_alive_and_reads_nothing_el
         while let Some(v1::watch_tasks_response::Item::Existing(task)) = watch.message().await.item {
             told.push(task.task_id);
         }
-        (told, old.counted.rows.load(Relaxed))
+        (told, old.counted.take())
     };
     let (told, rows) = first(None).await;
     assert_eq!(told, [old.first.as_str()], "the only one that is alive");

@@ -2,6 +2,8 @@
 
 mod asks;
 mod batch;
+#[path = "../../../../tests/src/counted.rs"]
+mod counted;
 mod errors;
 mod forms;
 mod intake;

@@ -1,8 +1,11 @@
 //! Watches: every change once, with state and attempt of its moment, from any cursor.
 
 use crate::world::{World, reason, submit, transport};
-use midshift_core::task::{AttemptPhase, Phase};
+use midshift_core::ids::TaskId;
+use midshift_core::rows::{self, Writer};
+use midshift_core::task::{AttemptPhase, Phase, TaskIntake};
 use midshift_proto::task::v1::{self, AttemptState, TaskState, watch_tasks_response::Item};
+use midshift_store::{Store, load};
 use tonic::Code;
 
 type Seen = (TaskState, Option<AttemptState>);
@@ -241,8 +244,14 @@ async fn tasks_that_two_services_numbered_alike_are_told_each_for_itself() {
     let world = World::new().await;
     let other = World::over(world.store.clone(), world.site.clone()).await;
     let first = submit(&world.service, transport("r1", "B03")).await.expect("admitted").task_id;
-    let second = submit(&other.service, transport("r2", "B03")).await.expect("admitted").task_id;
-    assert_eq!(world.state(&first).await.0.number, world.state(&second).await.0.number, "both began to count at once");
+    // Another process that has not heard of it yet admits this one.
+    let (intake, _) = load::<TaskIntake>(&*world.store, &first).await.expect("a store").expect("a task");
+    let second = format!("{first}-2");
+    let twin = TaskIntake { task_id: TaskId::parse(&second).expect("an id"), ..intake };
+    let mut item = rows::Item::new(Writer::Task, "wms");
+    item.create(&twin, "task.admitted").create(&midshift_core::task::TaskState::born(&twin), "task.born");
+    world.store.commit(vec![item]).await.remove(0).expect("applied");
+    assert_eq!(world.state(&first).await.0.number, world.state(&second).await.0.number, "admitted at the same moment");
     let queued = v1::TaskFilter { states: vec![TaskState::Queued as i32], ..v1::TaskFilter::default() };
     let mut watches = [world.watch(Some(queued.clone()), "").await, other.watch(Some(queued), "").await];
     for watch in &mut watches {
