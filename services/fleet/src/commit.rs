@@ -2,15 +2,19 @@
 //!
 //! Invariants:
 //! 1. What the store refuses for good costs that one decision and those made on top of it: their rows are read again, and no others.
-//! 2. After a conflict, or where nobody knows what came of an item, the picture is not trusted any more.
+//! 2. A command whose rows others have changed meanwhile is decided anew, as it is by a process that does not lead.
+//! 3. After a conflict, or where nobody knows what came of an item, the picture is not trusted any more.
 
 use crate::reconcile::{Loop, Replies};
+use crate::{Asked, Request};
 use midshift_core::fleet::view::named;
 use midshift_core::fleet::{Plan, obeyed, put_right, refused};
+use midshift_core::limits;
 use midshift_core::picture::{self, Outline};
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Item, Key, Row, Seq, Table};
 use midshift_core::time::Now;
+use midshift_store::lead::{self, Settled};
 use midshift_store::{Applied, CommitError, Error, GET_KEYS_MAX, Store};
 use std::collections::BTreeSet;
 
@@ -49,11 +53,9 @@ impl Loop {
             self.seat.claimed(now.link);
         }
         let lost = self.count(&results, &sent, renews);
-        let mut plan_results = results.split_off(usize::from(renews)).into_iter().map(|result| result.is_ok());
-        let committed = plan_results.by_ref().take_while(|is_ok| *is_ok).count();
-        for (reply, upto) in replies {
-            let is_lost = upto > committed;
-            drop(reply.send(if is_lost { Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)) } else { Ok(()) }));
+        let results = results.split_off(usize::from(renews));
+        for (asked, items) in replies {
+            self.settle(asked, results.get(items));
         }
         match lost {
             Some(keys) if keys.is_empty() => Ok(()),
@@ -62,6 +64,22 @@ impl Loop {
             }
             None => Err(()),
         }
+    }
+
+    /// Answers a command of which these items were committed, or decides it anew.
+    fn settle(&mut self, mut asked: Box<Asked>, results: Option<&[Result<Applied, CommitError>]>) {
+        asked.lost += 1;
+        let answer = match results.map(lead::settled) {
+            Some(Settled::Done) => Ok(()),
+            Some(Settled::Moved) if asked.lost < limits::COMMAND_TRIES => {
+                metrics::counter!("midshift_fleet_commands_again_total").increment(1);
+                self.again.push(Request::Do(asked));
+                return;
+            }
+            Some(Settled::Moved) => Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile)),
+            Some(Settled::Unknown) | None => Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)),
+        };
+        drop(asked.reply.send(answer));
     }
 
     /// Counts what was applied and what was not. Rows of decisions that have to be taken back; none: more than these may be wrong.

@@ -52,16 +52,21 @@ type Look = Box<dyn FnOnce(&View, &Board, &Now) + Send>;
 /// Something a person asks of the reconciler.
 enum Request {
     /// Change something; answered after the commit.
-    Do {
-        command: Box<Command>,
-        seen: Option<Revision>,
-        validate_only: bool,
-        by: Caller,
-        request_id: Option<String>,
-        reply: oneshot::Sender<Result<(), Refusal>>,
-    },
+    Do(Box<Asked>),
     /// Look at something.
     Look(Look),
+}
+
+/// A command, until it is answered.
+struct Asked {
+    command: Command,
+    seen: Option<Revision>,
+    validate_only: bool,
+    by: Caller,
+    request_id: Option<String>,
+    reply: oneshot::Sender<Result<(), Refusal>>,
+    /// How often it was decided and lost, because what it is about had been changed meanwhile.
+    lost: u32,
 }
 
 /// The service. Cheap to clone: all clones talk to one reconciler.
@@ -124,8 +129,8 @@ impl FleetService {
         request_id: Option<String>,
     ) -> Result<(), Refusal> {
         let (reply, answer) = oneshot::channel();
-        let (command, by) = (Box::new(command), by.clone());
-        self.send(Request::Do { command, seen, validate_only, by, request_id, reply }).await?;
+        let asked = Asked { command, seen, validate_only, by: by.clone(), request_id, reply, lost: 0 };
+        self.send(Request::Do(Box::new(asked))).await?;
         answer.await.map_err(|_| Refusal::new(Kind::Unavailable, Code::CommitUnknown))?
     }
 }

@@ -6,7 +6,7 @@
 //! Invariant: the view has absorbed the feed up to a head of it before anything is planned on it, never a part of a commit; only a process that leads plans, and one that could not
 //! say so for a while reads the rows again before it does.
 
-use crate::{Look, Parts, Request};
+use crate::{Asked, Look, Parts, Request};
 use midshift_core::fleet::view::{self, View};
 use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, found, objects};
 use midshift_core::lead::{FleetLeader, Own, Seat, Stance};
@@ -18,8 +18,9 @@ use midshift_core::rows::{Key, Log, Seq, Table};
 use midshift_core::time::Now;
 use midshift_core::work::Live;
 use midshift_store::{Dirty, Error, FeedPage, Store, lead};
+use std::ops::Range;
 use std::time::Duration;
-use tokio::sync::{mpsc, oneshot, watch};
+use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
@@ -57,10 +58,12 @@ pub(crate) struct Loop {
     more: bool,
     /// Decisions of a stage, so that a turn takes no longer than it may.
     share: usize,
+    /// Commands that the next turn decides anew.
+    pub(crate) again: Vec<Request>,
 }
 
-/// Who is answered once so many items of a plan are committed.
-pub(crate) type Replies = Vec<(oneshot::Sender<Result<(), Refusal>>, usize)>;
+/// Commands, and the items of a plan that must be committed before each is answered.
+pub(crate) type Replies = Vec<(Box<Asked>, Range<usize>)>;
 
 /// Runs until `shutdown`.
 pub async fn run(
@@ -96,6 +99,7 @@ pub async fn run(
         news: false,
         more: false,
         share: limits::DECISIONS_PER_STAGE,
+        again: Vec::new(),
     };
     this.rebuild_until_read(&shutdown).await;
     let mut batch = Vec::new();
@@ -105,7 +109,7 @@ pub async fn run(
             () = shutdown.cancelled() => break,
             n = requests.recv_many(&mut batch, limits::REQUESTS_PER_TURN) => if n == 0 { break },
             () = tokio::time::sleep_until(this.sweep_due) => {}
-            () = tokio::task::yield_now(), if this.more || this.behind.is_some() => {}
+            () = tokio::task::yield_now(), if this.more || this.behind.is_some() || !this.again.is_empty() => {}
             changed = news(&mut wake, this.rested) => if changed.is_err() { break },
         }
         while batch.len() < limits::REQUESTS_PER_TURN
@@ -239,6 +243,8 @@ impl Loop {
 
     /// One turn. An error: the picture can no longer be trusted.
     async fn turn(&mut self, pace: Pace, requests: Vec<Request>) -> Result<(), ()> {
+        let again = std::mem::take(&mut self.again);
+        let requests = again.into_iter().chain(requests).collect();
         self.hear();
         let unreadable = |error| tracing::warn!(%error, "fleet cannot read the store");
         // What the clock says comes first: a process that was away decides nothing before it has read who leads.
@@ -388,39 +394,43 @@ impl Loop {
         for request in requests {
             match request {
                 Request::Look(look) => self.looks.push(look),
-                Request::Do { command, seen, validate_only, by, request_id, reply } => {
-                    let permitted = objects::permit(&self.view, &self.board, &by, &command);
-                    let repeat = permitted.and_then(|()| match &request_id {
-                        Some(id) => once::is_repeat(&self.view.command_keys, id, &*command, seen),
+                Request::Do(asked) => {
+                    let Asked { command, seen, validate_only, by, request_id, .. } = &*asked;
+                    let permitted = objects::permit(&self.view, &self.board, by, command);
+                    let repeat = permitted.and_then(|()| match request_id {
+                        Some(id) => once::is_repeat(&self.view.command_keys, id, command, *seen),
                         None => Ok(false),
                     });
                     let actor = by.to_string();
                     let is_repeat = matches!(repeat, Ok(true));
-                    let check = || commands::check(&self.view, &self.board, &now, &command, seen);
+                    let check = || commands::check(&self.view, &self.board, &now, command, *seen);
                     let checked = repeat.and_then(|known| if known { Ok(()) } else { check() });
-                    if let (Err(refusal), false) = (&checked, validate_only) {
+                    if let (Err(refusal), false) = (&checked, *validate_only) {
                         let request_id = request_id.as_deref();
-                        plan.items.extend(commands::refusal(&self.view, &command, &actor, request_id, refusal));
+                        plan.items.extend(commands::refusal(&self.view, command, &actor, request_id, refusal));
                     }
-                    if checked.is_err() || validate_only {
-                        drop(reply.send(checked));
+                    if checked.is_err() || *validate_only {
+                        drop(asked.reply.send(checked));
                         continue;
                     }
                     // What was asked before is in the store, or in an item before this one.
+                    let before = plan.items.len();
                     if is_repeat {
-                        replies.push((reply, plan.items.len()));
+                        replies.push((asked, 0..before));
                         continue;
                     }
                     let mut tx =
                         midshift_core::fleet::Tx::new(&mut self.view, now, &actor).on_request(request_id.as_deref());
-                    commands::apply(&mut tx, &command, &actor);
-                    if let Some(id) = &request_id {
-                        once::remember(&mut tx, id, &*command, seen);
+                    commands::apply(&mut tx, command, &actor);
+                    if let Some(id) = request_id {
+                        once::remember(&mut tx, id, command, *seen);
                     }
                     if plan.keep(tx) {
-                        replies.push((reply, plan.items.len()));
+                        let after = plan.items.len();
+                        // What changes nothing rests on what came before it.
+                        replies.push((asked, if after > before { before..after } else { 0..after }));
                     } else {
-                        drop(reply.send(Err(Refusal::new(Kind::Exhausted, Code::DecisionPutAside))));
+                        drop(asked.reply.send(Err(Refusal::new(Kind::Exhausted, Code::DecisionPutAside))));
                     }
                 }
             }
@@ -432,7 +442,7 @@ impl Loop {
 /// Rows that say whether a command with a request_id was carried out before.
 fn used_ids(requests: &[Request]) -> Vec<Key> {
     let ids = requests.iter().filter_map(|request| match request {
-        Request::Do { request_id, .. } => request_id.as_ref(),
+        Request::Do(asked) => asked.request_id.as_ref(),
         Request::Look(_) => None,
     });
     ids.map(|id| Key::new(Table::CommandKey, id)).collect()

@@ -3,26 +3,16 @@
 //! Invariant: it decides nothing but commands. Each is decided on the picture, committed on the condition that nothing of it has changed,
 //! and decided anew if something has; the process that leads obeys what is written.
 
-use crate::Request;
 use crate::reconcile::Loop;
-use midshift_core::fleet::commands::{self, Command};
+use crate::{Asked, Request};
+use midshift_core::fleet::commands;
 use midshift_core::fleet::{LOGS, Tx, follow_rows, objects, reread};
-use midshift_core::identity::Caller;
 use midshift_core::limits;
 use midshift_core::once;
 use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Refusal};
-use midshift_core::rows::{Entry, Item, Key, Revision, Table};
+use midshift_core::rows::{Entry, Item, Key, Table};
 use midshift_store::{CommitError, Error, follow};
-
-/// What a person asks of fleet.
-pub(crate) struct Asked<'a> {
-    command: &'a Command,
-    seen: Option<Revision>,
-    validate_only: bool,
-    by: &'a Caller,
-    request_id: Option<&'a str>,
-}
 
 impl Loop {
     /// Comes up to the head of the feed.
@@ -55,9 +45,7 @@ impl Loop {
         for request in requests {
             match request {
                 Request::Look(look) => self.looks.push(look),
-                Request::Do { command, seen, validate_only, by, request_id, reply } => {
-                    let request_id = request_id.as_deref();
-                    let asked = Asked { command: &command, seen, validate_only, by: &by, request_id };
+                Request::Do(asked) => {
                     let answer = match trusted {
                         Ok(()) => self.carry_out(&asked).await,
                         Err(()) => Ok(Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile))),
@@ -67,7 +55,7 @@ impl Loop {
                         trusted = Err(());
                         Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown))
                     });
-                    drop(reply.send(answer));
+                    drop(asked.reply.send(answer));
                 }
             }
         }
@@ -77,7 +65,7 @@ impl Loop {
     }
 
     /// The answer to whoever asked. An error: what came of it may not be in the picture.
-    async fn carry_out(&mut self, asked: &Asked<'_>) -> Result<Result<(), Refusal>, Error> {
+    async fn carry_out(&mut self, asked: &Asked) -> Result<Result<(), Refusal>, Error> {
         let used: Vec<Key> = asked.request_id.iter().map(|id| Key::new(Table::CommandKey, id)).collect();
         for _ in 0..limits::COMMAND_TRIES {
             self.ask(used.clone()).await?;
@@ -107,18 +95,18 @@ impl Loop {
     }
 
     /// What a refusal leaves in the audit.
-    fn refused(&self, asked: &Asked<'_>, refusal: &Refusal) -> Vec<Item> {
+    fn refused(&self, asked: &Asked, refusal: &Refusal) -> Vec<Item> {
         let Asked { command, validate_only, by, request_id, .. } = asked;
-        let item = commands::refusal(&self.view, command, &by.to_string(), *request_id, refusal);
+        let item = commands::refusal(&self.view, command, &by.to_string(), request_id.as_deref(), refusal);
         item.into_iter().filter(|_| !validate_only).collect()
     }
 
     /// What has to be written; none: nothing has.
     fn decide(&mut self, asked: &Asked) -> Result<Option<Item>, Refusal> {
-        let Asked { command, seen, validate_only, by, request_id } = asked;
+        let Asked { command, seen, validate_only, by, request_id, .. } = asked;
         objects::permit(&self.view, &self.board, by, command)?;
         if let Some(id) = request_id
-            && once::is_repeat(&self.view.command_keys, id, *command, *seen)?
+            && once::is_repeat(&self.view.command_keys, id, command, *seen)?
         {
             return Ok(None);
         }
@@ -128,10 +116,10 @@ impl Loop {
             return Ok(None);
         }
         let actor = by.to_string();
-        let mut tx = Tx::new(&mut self.view, now, &actor).on_request(*request_id);
+        let mut tx = Tx::new(&mut self.view, now, &actor).on_request(request_id.as_deref());
         commands::apply(&mut tx, command, &actor);
         if let Some(id) = request_id {
-            once::remember(&mut tx, id, *command, *seen);
+            once::remember(&mut tx, id, command, *seen);
         }
         let item = tx.finish();
         self.view.rest();

@@ -2,7 +2,7 @@
 //!
 //! Invariant: what was read counts from after the reading, since an answer may take long; what was claimed counts from before the claim.
 
-use crate::{CommitError, Error, Store};
+use crate::{Applied, CommitError, Error, Store};
 use midshift_core::lead::{LeaderRow, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::time::Clock;
@@ -76,4 +76,25 @@ pub async fn hand_over<R: LeaderRow>(seat: &mut Seat<R>, store: &dyn Store) -> O
     let left = tokio::time::timeout(within, store.commit(vec![item])).await;
     seat.step_down();
     Some(left.is_ok_and(|results| results.iter().all(Result::is_ok)))
+}
+
+/// What became of items that were committed together.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Settled {
+    /// All of them are in the store.
+    Done,
+    /// Others changed rows that they are about, so that some are not in the store: decide anew.
+    Moved,
+    /// Something else is the matter with some of them.
+    Unknown,
+}
+
+/// What became of items with these results.
+pub fn settled(results: &[Result<Applied, CommitError>]) -> Settled {
+    let is_conflict = |error: &CommitError| matches!(error, CommitError::Conflict { .. });
+    match results.iter().filter_map(|result| result.as_ref().err()).map(is_conflict).min() {
+        None => Settled::Done,
+        Some(true) => Settled::Moved,
+        Some(false) => Settled::Unknown,
+    }
 }

@@ -137,6 +137,26 @@ async fn a_command_sent_to_the_standby_is_done_once_and_the_leader_obeys_it() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_command_sent_to_both_processes_at_once_is_done_once_and_both_say_so() {
+    let (mut w, other, _way) = two(DEMO).await;
+    w.robot("r1", "park-1").await;
+    w.pass(2).await;
+    w.shaky.freeze_next_commit();
+    let leader = w.fleet.clone();
+    let asked = tokio::spawn(async move { leader.cordon_robot(cordon("r1", "ask-1")).await });
+    while !w.shaky.is_frozen() {
+        tokio::task::yield_now().await;
+    }
+    other.cordon_robot(cordon("r1", "ask-1")).await.expect("cordoned");
+    let written = w.seen().await.revision("robot_control", "r1");
+    w.shaky.freeze(false);
+    let control = asked.await.expect("it ends").expect("it is decided anew").into_inner().control.expect("a robot");
+    assert!(control.cordon.is_some() && w.shaky.conflicts() > 0, "both decided it");
+    assert_eq!(w.seen().await.revision("robot_control", "r1"), written, "written once");
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn rules_that_the_standby_put_reach_every_robot() {
     let (mut w, other, _way) = two(CORRIDOR).await;
     w.robot("r1", "park-a").await;

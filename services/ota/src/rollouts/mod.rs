@@ -58,9 +58,17 @@ type Look = Box<dyn FnOnce(&View, &Board, &Now) + Send>;
 /// Something a person asks of the planner.
 enum Request {
     /// Change something; answered after the commit.
-    Do { ask: Box<Ask>, reply: oneshot::Sender<Result<Taken, Refusal>> },
+    Do(Box<Asked>),
     /// Look at something.
     Look(Look),
+}
+
+/// A command, until it is answered.
+struct Asked {
+    ask: Ask,
+    reply: oneshot::Sender<Result<Taken, Refusal>>,
+    /// How often it was decided and lost, because what it is about had been changed meanwhile.
+    lost: u32,
 }
 
 /// The service. Cheap to clone: all clones talk to one planner.
@@ -139,7 +147,7 @@ impl RolloutService {
     ) -> Result<Taken, Refusal> {
         let (reply, answer) = oneshot::channel();
         let ask = Ask { command, seen, check_only, request_id, by: by.clone() };
-        self.send(Request::Do { ask: Box::new(ask), reply }).await?;
+        self.send(Request::Do(Box::new(Asked { ask, reply, lost: 0 }))).await?;
         answer.await.map_err(|_| Refusal::new(Kind::Unavailable, Code::CommitUnknown))?
     }
 }

@@ -5,7 +5,7 @@
 //! signs, and one that could not say so for a while reads the rows again before it does.
 
 use super::directives::Signer;
-use super::{Look, Parts, Planner, Request, releases};
+use super::{Asked, Look, Parts, Planner, Request, releases};
 use crate::collect::Named;
 use midshift_core::ids::RobotId;
 use midshift_core::lead::{OtaLeader, Own, Seat, Stance};
@@ -19,10 +19,12 @@ use midshift_core::rollout::{Board, LOGS, Plan, Sign, absorb, commands, cycle, o
 use midshift_core::rows::{Entry, Item, Log, Seq, Table};
 use midshift_core::time::Now;
 use midshift_core::work::Live;
-use midshift_store::{CommitError, Dirty, Error, follow, lead};
+use midshift_store::lead::{self, Settled};
+use midshift_store::{Applied, CommitError, Dirty, Error, follow};
 use std::collections::BTreeSet;
+use std::ops::Range;
 use std::time::Duration;
-use tokio::sync::{oneshot, watch};
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 /// Pause after the store failed, before everything is read again.
@@ -48,9 +50,12 @@ pub(super) struct Loop {
     pub(super) seat: Seat<OtaLeader>,
     /// What this process wrote and has not read again.
     own: Own,
+    /// Commands that the next turn decides anew.
+    again: Vec<Request>,
 }
 
-type Replies = Vec<(oneshot::Sender<Result<Taken, Refusal>>, Taken, usize)>;
+/// Commands, what is answered, and the items of a plan that must be committed before.
+type Replies = Vec<(Box<Asked>, Taken, Range<usize>)>;
 
 /// Runs until `shutdown`.
 pub async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Error> {
@@ -83,6 +88,7 @@ pub async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Er
         looks: Vec::new(),
         seat,
         own: Own::default(),
+        again: Vec::new(),
     };
     this.rebuild_until_read(&shutdown).await;
     let mut sweep = tokio::time::interval(Duration::from_millis(limits::SWEEP.as_ms()));
@@ -95,9 +101,10 @@ pub async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Er
             () = shutdown.cancelled() => break,
             n = requests.recv_many(&mut batch, REQUESTS_PER_CYCLE) => if n == 0 { break },
             _ = sweep.tick(), if !more => {}
-            () = tokio::task::yield_now(), if more => {}
+            () = tokio::task::yield_now(), if more || !this.again.is_empty() => {}
         }
-        match this.turn(std::mem::take(&mut batch)).await {
+        let again = std::mem::take(&mut this.again);
+        match this.turn(again.into_iter().chain(batch.drain(..)).collect()).await {
             Ok(unfinished) => more = unfinished,
             Err(()) => {
                 tokio::time::sleep(STORE_RETRY).await;
@@ -309,19 +316,36 @@ impl Loop {
         for request in requests {
             match request {
                 Request::Look(look) => self.looks.push(look),
-                Request::Do { ask, reply } => {
-                    let taken = commands::take(&mut self.view, &self.board, now, &ask, plan);
+                Request::Do(asked) => {
+                    let before = plan.items.len();
+                    let taken = commands::take(&mut self.view, &self.board, now, &asked.ask, plan);
+                    let after = plan.items.len();
                     match taken {
-                        // What was asked before is in the store, or in an item before this one.
-                        Ok(taken) if ask.check_only == CheckOnly::No => {
-                            replies.push((reply, taken, plan.items.len()));
+                        Ok(taken) if asked.ask.check_only == CheckOnly::No => {
+                            // What was asked before is in the store, or in an item before this one.
+                            replies.push((asked, taken, if after > before { before..after } else { 0..after }));
                         }
-                        taken => drop(reply.send(taken)),
+                        taken => drop(asked.reply.send(taken)),
                     }
                 }
             }
         }
         replies
+    }
+
+    /// Answers a command of which these items were committed, or decides it anew.
+    fn settle(&mut self, mut asked: Box<Asked>, taken: Taken, results: Option<&[Result<Applied, CommitError>]>) {
+        asked.lost += 1;
+        let answer = match results.map(lead::settled) {
+            Some(Settled::Done) => Ok(taken),
+            Some(Settled::Moved) if asked.lost < limits::COMMAND_TRIES => {
+                self.again.push(Request::Do(asked));
+                return;
+            }
+            Some(Settled::Moved) => Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile)),
+            Some(Settled::Unknown) | None => Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)),
+        };
+        drop(asked.reply.send(answer));
     }
 
     /// Commits the plan, and before it that this process still leads, if it is time to say so.
@@ -363,10 +387,9 @@ impl Loop {
                 }
             }
         }
-        for (reply, taken, upto) in replies {
-            let lost = results.iter().skip(usize::from(renews)).take(upto).any(Result::is_err);
-            let answer = if lost { Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)) } else { Ok(taken) };
-            drop(reply.send(answer));
+        let of_plan = results.get(usize::from(renews)..).unwrap_or_default();
+        for (asked, taken, items) in replies {
+            self.settle(asked, taken, of_plan.get(items));
         }
         if let Some(seq) = newest {
             self.changed.send_replace(seq);

@@ -46,9 +46,9 @@ impl Loop {
         for request in requests {
             match request {
                 Request::Look(look) => self.looks.push(look),
-                Request::Do { ask, reply } => {
+                Request::Do(asked) => {
                     let answer = match trusted {
-                        Ok(()) => self.carry_out(&ask).await,
+                        Ok(()) => self.carry_out(&asked.ask).await,
                         Err(()) => Ok(Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile))),
                     };
                     let answer = answer.unwrap_or_else(|error| {
@@ -56,7 +56,7 @@ impl Loop {
                         trusted = Err(());
                         Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown))
                     });
-                    drop(reply.send(answer));
+                    drop(asked.reply.send(answer));
                 }
             }
         }

@@ -272,6 +272,25 @@ async fn a_process_that_takes_over_without_a_current_directive_key_says_so_and_g
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_roll_out_that_is_created_at_both_processes_at_once_is_written_once_and_both_say_so() {
+    let world = World::new();
+    let leader = world.process().await;
+    release(&leader.ota, &files("walk", "1.0.0")).await;
+    secs(2).await;
+    let standby = world.process().await;
+    secs(2).await;
+    let bundle = world.bundles().await[0].bundle.to_string();
+    for n in 0..8 {
+        let id = format!("r-{n}");
+        let (first, second) = tokio::join!(leader.create(&id, &bundle), standby.create(&id, &bundle));
+        let [first, second] = [first, second].map(|made| made.expect("created"));
+        assert_eq!(first.etag, second.etag, "written once");
+    }
+    leader.end().await;
+    standby.end().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_bundle_is_taken_back_once_for_a_request_id_whichever_process_is_asked_and_a_check_takes_nothing_back() {
     let world = World::new();
     let leader = world.process().await;
