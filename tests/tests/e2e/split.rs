@@ -37,12 +37,13 @@ const CROWDS: usize = 3;
 const TASKS_EACH: usize = 3;
 
 /// What happens to the stack, one after the other, and what a line says of it.
-const BLOWS: [(&str, Blow); 16] = [
+const BLOWS: [(&str, Blow); 18] = [
     ("kill -9 of identity", Blow::Kill("identity", 0)),
     ("kill -9 of a fleet", Blow::Kill("fleet", 0)),
     ("kill -9 of the other fleet", Blow::Kill("fleet", 1)),
     ("kill -9 of a gateway", Blow::Kill("telemetry", 0)),
-    ("kill -9 of the task intake", Blow::Kill("task", 0)),
+    ("kill -9 of a task intake", Blow::Kill("task", 0)),
+    ("kill -9 of the other task intake", Blow::Kill("task", 1)),
     ("kill -9 of an ota", Blow::Kill("ota", 0)),
     ("kill -9 of the other ota", Blow::Kill("ota", 1)),
     ("the end of whoever listens for commits", Blow::Deafen),
@@ -51,7 +52,8 @@ const BLOWS: [(&str, Blow); 16] = [
     ("a fleet is asked to end", Blow::Ask("fleet", 0)),
     // One of the two led.
     ("the other fleet is asked to end", Blow::Ask("fleet", 1)),
-    ("the task intake is asked to end", Blow::Ask("task", 0)),
+    ("a task intake is asked to end", Blow::Ask("task", 0)),
+    ("the other task intake is asked to end", Blow::Ask("task", 1)),
     ("an ota is asked to end", Blow::Ask("ota", 0)),
     ("PostgreSQL ends at once, and starts again", Blow::Cut),
     ("PostgreSQL stays away until gateways let their robots go", Blow::Outage),
@@ -111,7 +113,7 @@ async fn tasks_go_on_while_every_process_of_a_split_stack_is_killed_or_replaced_
     let mut old_proxies = Vec::new();
     for (nth, (what, blow)) in BLOWS.into_iter().enumerate() {
         // So early that there is work left to assign after the last of them.
-        at_work(stack.public, (4 + 4 * nth) * tasks / 100, &BTreeSet::new()).await.context(what)?;
+        at_work(stack.public, (4 + 7 * nth / 2) * tasks / 100, &BTreeSet::new()).await.context(what)?;
         let begun = clock(1000).now().wall.0;
         match blow {
             Blow::Kill(role, nth) => {

@@ -19,7 +19,7 @@ use std::time::Duration;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
 /// Processes of a stack.
-const ROLES: [&str; 8] = ["identity", "task", "fleet", "fleet", "telemetry", "telemetry", "ota", "ota"];
+const ROLES: [&str; 9] = ["identity", "task", "task", "fleet", "fleet", "telemetry", "telemetry", "ota", "ota"];
 /// The proxy is one address, and a test one token.
 const OF_ONE_ADDRESS: [&str; 4] = ["--connections-per-address", "16000", "--requests-per-second", "100000"];
 
@@ -88,7 +88,7 @@ pub struct Stack {
 }
 
 impl Stack {
-    /// One task intake, and two of each of the others, on a site of text or of a grid; `flags` are for every process, `of_ota` for those with software as well.
+    /// One identity, which is the site's authority, and two of each of the others, on a site of text or of a grid; `flags` are for every process, `of_ota` for those with software as well.
     pub async fn start(dir: &Path, site: &str, flags: &[&str], of_ota: &[&str]) -> anyhow::Result<Self> {
         let name = if site.starts_with("type octile") { "site.map" } else { "site.toml" };
         let file = dir.join(name);
