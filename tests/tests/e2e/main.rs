@@ -30,6 +30,7 @@ mod kill;
 mod languages;
 mod launched;
 mod ledger_cuts;
+mod many;
 mod measured;
 mod mid_shift;
 mod minimal_robot;
