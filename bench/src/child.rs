@@ -149,6 +149,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 root_file: None,
                 identity: None,
                 spare_token: false,
+                force_map: false,
                 share: Default::default(),
                 trust: None,
                 database: midshift::storage::Database { store },

@@ -80,7 +80,7 @@ fn cycle_ms(site: &Arc<Site>, router: &Arc<Router>, robots: usize, seed: u64) ->
     view.router = router.clone();
     // One slice for all: what the whole fleet costs, however many turns it is cut into.
     let mut plan = Plan::of(Slice::of(2 * robots));
-    found(&mut view, now, "", &mut plan);
+    found(&mut view, now, "", &Default::default(), &mut plan);
     let begun = instant();
     cycle(&mut view, now, &board, Pace::Wake, &mut plan);
     let took = begun.elapsed().as_secs_f64() * 1e3;

@@ -248,6 +248,8 @@ pub const CLONE_SURE_AFTER: LinkDuration = LinkDuration::from_secs(2);
 pub const FENCED_RETRY: LinkDuration = LinkDuration::from_secs(60);
 /// Bytes of one site, map or layout file.
 pub const SITE_FILE_BYTES: usize = 64 * 1024 * 1024;
+/// Bytes of the version of a map.
+pub const MAP_VERSION_BYTES: usize = 64;
 /// Bytes of one message that brings software to the server.
 pub const UPLOAD_PIECE_BYTES: usize = 1024 * 1024;
 /// Bytes of one signed document that says which software there is.

@@ -149,6 +149,9 @@ codes! {
     BatteryLow = "BATTERY_LOW", "The charge does not reach pickup, drop and a charger with its reserve.";
     NoRoute = "NO_ROUTE", "No lane leads there.";
     EntryPassedOver = "ENTRY_PASSED_OVER", "An entry of the log could not be obeyed and was passed over; the server's log has the details.";
+    MapNotTaken = "MAP_NOT_TAKEN", "The site file has changed, and tasks, robots or held places are in the way of it, so the stored map goes on. Start the server again once they are not, or with --force-map.";
+    MapForced = "MAP_FORCED", "A changed map was forced upon work that it does not fit. Look at the task, robot or place, and at what stands there.";
+    MapDiffers = "MAP_DIFFERS", "The robot drives by another version of the site's map than the server plans on, so it gets no work. Give it the map of the server, or start the server with the new one.";
     DecisionPutAside = "DECISION_PUT_ASIDE", "The store refused the same decision twice, so it is not tried again and the robot or place it is about gets no work and no grant. The server's log has the details; close the incident to try once more.";
     ReportTooLong = "REPORT_TOO_LONG", "A list of the robot's heartbeat is longer than one may be. It is not processed, so the robot loses its authority; its maker must mend it.";
     ReportImplausible = "REPORT_IMPLAUSIBLE", "The robot reported a step or an end that cannot be. It frees nothing and moves nothing forward; the robot gets no work while it says so. Look at the robot's software.";

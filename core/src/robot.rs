@@ -293,6 +293,9 @@ pub struct ReportedState {
     /// Fleet stops and silences that stood it and that nobody has resumed: it does not move before.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub awaiting_resume: Vec<StopId>,
+    /// Version of the site's map that its body drives by. Empty: it goes by points alone, or has said it before in its session.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub map_version: String,
     /// Maker's safety system.
     pub hardware_stop: HardwareStop,
     /// Maker's protective field is violated.

@@ -144,6 +144,10 @@ pub trait Body: Send {
     fn hardware_stop(&self) -> HardwareStop;
     /// Who drives.
     fn mode(&self) -> Mode;
+    /// Version of the site's map that it drives by; empty: it goes by the points of its orders alone.
+    fn map_version(&self) -> String {
+        String::new()
+    }
     /// Waypoints it stands on or reaches into now, as far as it knows, e.g. after a restart.
     fn stands_on(&self) -> Vec<WaypointId>;
 }

@@ -110,6 +110,8 @@ struct Session {
     epoch: u64,
     hb: u64,
     observed: bool,
+    /// The map that its heartbeats have told; empty: none yet.
+    told_map: String,
 }
 
 /// Writes under way and waiting.
@@ -309,6 +311,7 @@ impl AgentCore {
             stop_level: self.stop_level(),
             stops: self.stops_inside(),
             awaiting_resume: self.stops_awaiting(),
+            map_version: self.body.map_version(),
             hardware_stop: self.hardware_stop,
             field_violation: self.body.state(now.site).field_violation,
             fault: self.unfit.as_ref().or(self.standing_fault.as_ref()).cloned(),
@@ -387,7 +390,8 @@ impl AgentCore {
 
     fn connected(&mut self, now: &Now, welcome: Welcome) {
         self.sent = SentHeartbeats::new(welcome.session_epoch, self.sent.lease_from());
-        self.session = Some(Session { epoch: welcome.session_epoch, hb: 0, observed: welcome.observed });
+        self.session =
+            Some(Session { epoch: welcome.session_epoch, hb: 0, observed: welcome.observed, told_map: String::new() });
         let old = &self.kept.ledger.session;
         if old.store_id != welcome.store_id {
             self.answered.clear();
@@ -717,6 +721,10 @@ impl AgentCore {
         if self.desired.is_none() {
             // Grants are not on the ledger: until the server has said them again, what is not listed here proves nothing.
             reported.applied_work = 0;
+        }
+        match self.session.as_mut().filter(|session| session.told_map != reported.map_version) {
+            Some(session) => session.told_map.clone_from(&reported.map_version),
+            None => reported.map_version.clear(),
         }
         Some(Heartbeat { reported, sent_unix_us: now.wall.0 * 1000, clock: self.clock.take() })
     }

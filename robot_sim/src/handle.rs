@@ -108,6 +108,9 @@ impl Body for SimHandle {
     fn mode(&self) -> Mode {
         self.lock().mode()
     }
+    fn map_version(&self) -> String {
+        Body::map_version(&*self.lock())
+    }
     fn stands_on(&self) -> Vec<WaypointId> {
         self.lock().stands_on()
     }

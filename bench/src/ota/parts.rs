@@ -171,6 +171,7 @@ async fn serve(data: PathBuf, keys: PathBuf, listen: SocketAddr, stop: Cancellat
         root_file: None,
         identity: None,
         spare_token: false,
+        force_map: false,
         share: Default::default(),
         trust: None,
         beacon_listen: None,

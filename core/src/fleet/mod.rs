@@ -22,6 +22,7 @@ pub mod heard;
 pub mod inbox;
 pub mod incidents;
 pub mod load;
+pub mod maps;
 pub mod objects;
 pub mod places;
 pub mod plausible;
@@ -299,7 +300,8 @@ fn mark(tx: &mut Tx, seq: Seq) {
 }
 
 /// Rows every start makes sure of: the site, its places, and serving time.
-pub fn found(view: &mut View, now: Now, site_text: &str, plan: &mut Plan) {
+pub fn found(view: &mut View, now: Now, site_text: &str, map: &maps::MapChange, plan: &mut Plan) {
+    maps::tell(view, now, map, plan);
     let site = view.site.clone();
     plan.decide(view, now, "fleet", |tx| {
         let row = SiteRow {

@@ -7,7 +7,7 @@ use super::Tx;
 use super::heard::{is_fresh, is_settled, lease_stands, presence};
 use super::tasks::{News, happen};
 use super::view::View;
-use super::{Board, Plan, Tally, answers, claims, errands, inbox, incidents, places, plausible, tasks};
+use super::{Board, Plan, Tally, answers, claims, errands, inbox, incidents, maps, places, plausible, tasks};
 use crate::ids::{AttemptId, RobotId, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -76,6 +76,7 @@ fn compare(view: &mut View, now: Now, live: &Live, tally: &mut Tally, plan: &mut
         unknown(tx, robot_id, live);
         recharge(tx, robot_id, live);
         forget_reported(tx, robot_id, live);
+        maps::compare(tx, live);
     });
 }
 

@@ -5,7 +5,7 @@
 use super::queue::Wait;
 use super::rows::RobotHolder;
 use super::view::View;
-use super::{Board, Slice, claims, heard, load, plausible, standing, way};
+use super::{Board, Slice, claims, heard, load, maps, plausible, standing, way};
 use crate::energy::Trip;
 use crate::ids::{RobotId, Subject};
 use crate::limits;
@@ -36,6 +36,9 @@ pub fn robot(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> Resul
     decided_by_people(view, robot_id, Some(live))?;
     reported(live)?;
     plausible::keeps_back(view, live)?;
+    if let Some(why) = maps::differs(view, live) {
+        return Err(why);
+    }
     if let Some(why) = claims::broken(view, robot_id) {
         return Err(why);
     }

@@ -5,7 +5,9 @@ use super::{
     WaypointIx,
 };
 use crate::ids::{AreaId, PlaceId, RobotId, SiteId, WaypointId};
-use crate::limits::{SITE_AREAS_MAX, SITE_LANES_MAX, SITE_PLACES_MAX, SITE_ROBOTS_MAX, SITE_WAYPOINTS_MAX};
+use crate::limits::{
+    MAP_VERSION_BYTES, SITE_AREAS_MAX, SITE_LANES_MAX, SITE_PLACES_MAX, SITE_ROBOTS_MAX, SITE_WAYPOINTS_MAX,
+};
 use crate::reason::{Refusal, Violations};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -82,7 +84,7 @@ impl Draft {
         let site_id = v.take("site_id", SiteId::parse(&self.site_id));
         check_text(v, "name", &self.name, 200);
         check_text(v, "map_id", &self.map_id, 64);
-        check_text(v, "map_version", &self.map_version, 64);
+        check_text(v, "map_version", &self.map_version, MAP_VERSION_BYTES);
         check_count(v, "area", self.areas.len(), 1, SITE_AREAS_MAX);
         check_count(v, "waypoint", self.waypoints.len(), 1, SITE_WAYPOINTS_MAX);
         check_count(v, "lane", self.lanes.len(), 0, SITE_LANES_MAX);

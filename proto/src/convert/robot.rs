@@ -1,7 +1,7 @@
 //! What a robot says of itself: inventory, heartbeat, vitals, attempts, places.
 
 use super::stop::{names, stop_ids};
-use super::{At, Parse, WireEnum, counted, from_one, id, list, maybe, maybe_id, need, permille, word};
+use super::{At, Parse, WireEnum, counted, from_one, id, list, maybe, maybe_id, need, permille, text, word};
 use crate::link::v1;
 use midshift_core::ids::{AttemptId, PlaceId, Subject, TaskId, WaypointId};
 use midshift_core::limits;
@@ -207,6 +207,7 @@ impl From<&ReportedState> for v1::ReportedState {
             update: state.update.as_ref().map(Into::into),
             stops: names(&state.stops),
             awaiting_resume: names(&state.awaiting_resume),
+            map_version: state.map_version.clone(),
         }
     }
 }
@@ -241,6 +242,10 @@ impl Parse<ReportedState> for v1::ReportedState {
         let update = maybe(self.update, at.field("update"), bad);
         let stops = stop_ids(&self.stops, at.field("stops"), bad);
         let awaiting_resume = stop_ids(&self.awaiting_resume, at.field("awaiting_resume"), bad);
+        let map_version = match self.map_version.is_empty() {
+            true => Some(String::new()),
+            false => text(self.map_version, limits::MAP_VERSION_BYTES, at.field("map_version"), bad),
+        };
         let applied_update = counted(self.applied_update, at.field("applied_update"), bad);
         let hb = counted(self.hb, at.field("hb"), bad);
         let session_epoch = counted(self.session_epoch, at.field("session_epoch"), bad);
@@ -261,6 +266,7 @@ impl Parse<ReportedState> for v1::ReportedState {
             stop_level: stop_level?,
             stops: stops?,
             awaiting_resume: awaiting_resume?,
+            map_version: map_version?,
             hardware_stop: hardware_stop?,
             field_violation: self.field_violation,
             fault: fault?,

@@ -94,6 +94,7 @@ fn reported() -> ReportedState {
         stop_level: StopLevel::ControlledStopPosture,
         stops: vec![stop_id()],
         awaiting_resume: vec![stop_id(), stop_id()],
+        map_version: "2026-11".to_owned(),
         hardware_stop: HardwareStop::Remote,
         field_violation: true,
         applied_update: 3,

@@ -168,6 +168,9 @@ impl Body for SimBody {
     fn mode(&self) -> Mode {
         self.mode
     }
+    fn map_version(&self) -> String {
+        self.site.map_version().to_owned()
+    }
     fn stands_on(&self) -> Vec<WaypointId> {
         self.touching.clone().into_iter().collect()
     }

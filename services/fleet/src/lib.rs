@@ -14,6 +14,7 @@ pub use retention::prune;
 
 use midshift_core::fleet::Board;
 use midshift_core::fleet::commands::Command;
+use midshift_core::fleet::maps::MapChange;
 use midshift_core::fleet::view::View;
 use midshift_core::identity::Caller;
 use midshift_core::reason::{Code, Kind, Refusal};
@@ -40,6 +41,8 @@ pub struct Parts {
     pub site: Arc<Site>,
     /// Its text, kept in the store.
     pub site_text: String,
+    /// What became of the map that this process was started with.
+    pub map: MapChange,
     /// Clocks.
     pub clock: Arc<dyn Clock>,
     /// Naive rules for twins of tests; none outside them.

@@ -232,7 +232,7 @@ impl Loop {
             return Ok(());
         }
         let mut plan = Plan::default();
-        found(&mut self.view, self.parts.clock.now(), &self.parts.site_text, &mut plan);
+        found(&mut self.view, self.parts.clock.now(), &self.parts.site_text, &self.parts.map, &mut plan);
         let entries: Vec<u64> = plan.items.iter().map(picture::entries_of).collect();
         for (result, entries) in self.parts.store.commit(plan.items).await.into_iter().zip(entries) {
             let applied = result.map_err(|error| Error::Unavailable(std::sync::Arc::new(error)))?;

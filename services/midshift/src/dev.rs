@@ -197,6 +197,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         frames,
         site: site.clone(),
         site_text: loaded.text,
+        map: Default::default(),
         clock: clock.clone(),
         ota,
         reader: None,

@@ -4,6 +4,7 @@
 
 pub mod background;
 pub mod backup;
+mod changed_map;
 pub mod cli;
 pub mod clock;
 mod denials;

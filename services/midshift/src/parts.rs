@@ -1,6 +1,7 @@
 //! What a server is built from.
 
 use crate::roles::Roles;
+use midshift_core::fleet::maps::MapChange;
 use midshift_core::site::Site;
 use midshift_core::time::Clock;
 use midshift_identity::IdentityService;
@@ -40,6 +41,8 @@ pub struct Parts {
     pub site: Arc<Site>,
     /// Its text.
     pub site_text: String,
+    /// What became of the map that this process was started with.
+    pub map: MapChange,
     /// Clocks.
     pub clock: Arc<dyn Clock>,
     /// Software of robots, of a process with role ota.

@@ -1,6 +1,7 @@
 //! `midshift serve`: everything persistent, for a real site: in one process on SQLite or PostgreSQL, or some of the services in each of several
 //! processes on one PostgreSQL database.
 
+use crate::changed_map;
 use crate::door::{self, Share};
 use crate::planning::Planning;
 use crate::roles::{Role, Roles};
@@ -79,6 +80,10 @@ pub struct Serve {
     /// Make one more token that may do everything, for whoever has lost the first one.
     #[arg(long, conflicts_with = "insecure")]
     pub spare_token: bool,
+    /// Take a changed site file whatever is in its way: each task, robot and held place that does not fit it is an incident. Without it the stored map goes on
+    /// until a start finds nothing in the way.
+    #[arg(long)]
+    pub force_map: bool,
     /// What one peer may take.
     #[command(flatten)]
     pub share: Share,
@@ -186,6 +191,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
     crate::recorder::handle();
     let site_id = loaded.site.site_id().clone();
     let storage = args.database.open(&args.data, site_id, clock.clone()).await?;
+    let (loaded, map) = changed_map::choose(&*storage.store(), loaded, args.force_map, clock.now()).await?;
     let follows = roles.has(Role::StopFollower);
     // Before anybody writes to the store, and before the stop service, which waits for who is known, can begin.
     match first_start(&args, &roles) {
@@ -248,6 +254,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         heard: storage.heard(),
         site: loaded.site,
         site_text: loaded.text,
+        map,
         clock,
         ota,
         reader,

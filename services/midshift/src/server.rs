@@ -70,6 +70,7 @@ impl Server {
                 board: board.clone(),
                 site: parts.site.clone(),
                 site_text: parts.site_text.clone(),
+                map: parts.map.clone(),
                 clock: parts.clock.clone(),
                 bugs: parts.naive.fleet,
             })
@@ -455,6 +456,7 @@ mod tests {
             frames: Arc::new(MemoryFrames::new(clock.clone(), 1 << 20)),
             site: loaded.site,
             site_text: loaded.text,
+            map: Default::default(),
             clock,
             ota: OtaService::without_keys(),
             identity: None,

@@ -76,6 +76,8 @@ struct Session {
     replaying: Option<(u64, oneshot::Sender<Result<LaneAck, Refusal>>)>,
     offset: Offset,
     progress: (u64, SiteTime),
+    /// The map that the robot said last.
+    map_version: String,
     /// Heartbeats that are not where other processes read them yet, with the answer they get then.
     unechoed: VecDeque<Echo>,
     /// What becomes of them.
@@ -129,6 +131,7 @@ pub async fn run(
         replaying: None,
         offset: Offset::default(),
         progress: (0, now.site),
+        map_version: hello.reported.map_version.clone(),
         unechoed: VecDeque::new(),
         kept: mpsc::channel(UNECHOED_MAX),
         stops: StopNews::new(inner.picture.watch_stops()),
@@ -314,6 +317,11 @@ impl Session {
         }
         let mut report = heartbeat.reported;
         report.session_epoch = self.epoch;
+        if report.map_version.is_empty() {
+            report.map_version.clone_from(&self.map_version);
+        } else {
+            self.map_version.clone_from(&report.map_version);
+        }
         let hb = report.hb;
         let progress = report.progress();
         if progress != self.progress.0 {

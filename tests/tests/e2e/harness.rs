@@ -358,6 +358,16 @@ impl Server {
         self.running = Self::run(&self.dir, self.address, &self.flags)?;
         self.answers().await
     }
+    /// The same with flags of this start alone.
+    pub async fn restart_with(&mut self, flags: &[&str]) -> anyhow::Result<()> {
+        let flags: Vec<String> = self.flags.iter().cloned().chain(flags.iter().map(|f| (*f).to_owned())).collect();
+        self.running = Self::run(&self.dir, self.address, &flags)?;
+        self.answers().await
+    }
+    /// Changes the site file, which the next start reads.
+    pub fn change_site(&self, site: &str) -> anyhow::Result<()> {
+        Ok(std::fs::write(self.dir.join(SITE_FILE), site)?)
+    }
     async fn answers(&self) -> anyhow::Result<()> {
         until("the server's first answer", Duration::from_secs(30), || async {
             let mut client = TaskServiceClient::new(self.channel()?);

@@ -15,6 +15,7 @@ mod areas;
 mod audited;
 mod batches;
 mod begin_and_end;
+mod changed_map;
 mod clients;
 mod cut;
 mod engine;

@@ -84,6 +84,9 @@ impl Body for WatchedBody {
     fn mode(&self) -> Mode {
         self.inner.mode()
     }
+    fn map_version(&self) -> String {
+        self.inner.map_version()
+    }
     fn stands_on(&self) -> Vec<WaypointId> {
         self.inner.stands_on()
     }

@@ -295,6 +295,7 @@ fn serve(
                     frames: frames.clone(),
                     site: site.clone(),
                     site_text: site_text.clone(),
+                    map: Default::default(),
                     clock,
                     ota,
                     reader: None,

@@ -197,3 +197,21 @@ async fn a_heartbeat_with_a_list_that_is_too_long_is_not_processed_and_its_sampl
     assert!(told[0].body.as_deref().is_some_and(|body| body.contains("places")));
     Ok(())
 }
+
+#[tokio::test(start_paused = true)]
+async fn the_map_that_a_robot_drives_by_is_the_one_that_it_said_last() -> Result<()> {
+    let world = world().await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    let robot_id = RobotId::parse("r1")?;
+    for (said, known) in [("", ""), ("7", "7"), ("", "7"), ("8", "8"), ("", "8")] {
+        robot.hb += 1;
+        let (hb, session_epoch, map_version) = (robot.hb, robot.welcome.session_epoch, said.to_owned());
+        let reported = ReportedState { hb, session_epoch, map_version, ..ReportedState::default() };
+        let heartbeat = Heartbeat { reported, sent_unix_us: 0, clock: None };
+        robot.say(Uplink { heartbeat: Some(heartbeat), batches: Vec::new() }).await?;
+        robot.hears(|down| down.echo.as_ref().filter(|echo| echo.hb == hb).map(|_| ())).await?;
+        let live = world.board.get(&robot_id).ok_or("it is heard")?;
+        assert_eq!(live.report.map_version, known, "after {said:?}");
+    }
+    Ok(())
+}

@@ -4,7 +4,7 @@ use midshift_core::identity::{Caller, TokenId};
 use midshift_core::ids::{RobotId, SiteId, WaypointId};
 use midshift_core::robot::{Inventory, Lane, Mode, ReportedState, Vitals};
 use midshift_core::time::{Clock, ScaledClock, Utc};
-use midshift_core::work::{InboxItem, RobotEvent, Sample, SampleBody};
+use midshift_core::work::{InboxItem, Live, RobotEvent, Sample, SampleBody};
 use midshift_proto::Leaving;
 use midshift_proto::link::v1::link_service_client::LinkServiceClient;
 use midshift_proto::link::v1::{SessionRequest, SessionResponse};
@@ -28,6 +28,7 @@ pub struct World {
     pub store: Arc<dyn Store>,
     pub channel: Channel,
     pub service: TelemetryService,
+    pub board: Arc<LiveBoard<Live>>,
     leaving: Leavings,
     pipes: Pipes,
 }
@@ -101,7 +102,7 @@ pub async fn serve(parts: Parts) -> Result<World> {
 
 /// The same, of a service that has read nothing before `read`.
 pub async fn serve_after(parts: Parts, read: impl Future<Output = ()> + Send + 'static) -> Result<World> {
-    let store = parts.store.clone();
+    let (store, board) = (parts.store.clone(), parts.board.clone());
     let service = TelemetryService::new(parts, CancellationToken::new());
     let running = service.clone();
     tokio::spawn(async move {
@@ -119,7 +120,7 @@ pub async fn serve_after(parts: Parts, read: impl Future<Output = ()> + Send + '
     let server = port.add_service(service.link()).add_service(service.replay()).add_service(service.grpc());
     tokio::spawn(server.serve_with_incoming(ReceiverStream::new(incoming)));
     let channel = dial(pipes.clone()).await?;
-    Ok(World { store, channel, service, leaving, pipes })
+    Ok(World { store, channel, service, board, leaving, pipes })
 }
 
 /// Header in which a test says who asks; without it nobody is asked.

@@ -13,6 +13,7 @@ pub use seen::Seen;
 pub use shaky::Shaky;
 
 use midshift_core::fleet::bugs::Bugs;
+use midshift_core::fleet::maps::MapChange;
 use midshift_core::ids::{RobotId, SiteId, TaskId};
 use midshift_core::rows::{Entry, Expect, Item, Record, Seq, Table, Writer};
 use midshift_core::site::{Site, text};
@@ -52,6 +53,8 @@ pub struct World {
     pub clock: Arc<dyn Clock>,
     pub site: Arc<Site>,
     pub fleet: FleetService,
+    /// What became of the map when fleet starts next.
+    pub map: MapChange,
     text: &'static str,
     bugs: Bugs,
     robots: BTreeMap<String, Robot>,
@@ -102,6 +105,7 @@ impl World {
             board: board.clone(),
             site: site.clone(),
             site_text: site_text.to_owned(),
+            map: MapChange::Taken,
             clock: clock.clone(),
             bugs,
         };
@@ -109,7 +113,21 @@ impl World {
         let robots = BTreeMap::new();
         let running = vec![running];
         let (text, submitted, asked) = (site_text, 0, 0);
-        let mut world = Self { store, shaky, board, clock, site, fleet, text, bugs, robots, running, submitted, asked };
+        let mut world = Self {
+            store,
+            shaky,
+            board,
+            clock,
+            site,
+            fleet,
+            map: MapChange::Taken,
+            text,
+            bugs,
+            robots,
+            running,
+            submitted,
+            asked,
+        };
         world.step().await;
         world
     }
@@ -120,6 +138,7 @@ impl World {
             board: self.board.clone(),
             site: self.site.clone(),
             site_text: self.text.to_owned(),
+            map: self.map.clone(),
             clock: self.clock.clone(),
             bugs: self.bugs,
         }

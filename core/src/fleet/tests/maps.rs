@@ -1,0 +1,54 @@
+//! What is in the way of a changed map.
+
+use super::*;
+use crate::fleet::maps::{Obstacle, in_the_way};
+use crate::reason::Code;
+
+fn moved(waypoint: &str, from: &str, to: &str) -> crate::site::Site {
+    let place = |at: &str| format!("id = \"{waypoint}\", at = [{at}]");
+    assert!(CORRIDOR.contains(&place(from)));
+    text::parse(&CORRIDOR.replace(&place(from), &place(to))).expect("a site")
+}
+
+#[test]
+fn goals_that_move_are_in_the_way_and_so_are_robots_whose_route_leads_there() {
+    let mut rig = Rig::new();
+    rig.robot("r1", "park-a");
+    rig.submit("T1", |_| {});
+    rig.cycle(Pace::Sweep);
+    rig.cycle(Pace::Sweep);
+    assert!(rig.view.desired_work.values().any(|desired| desired.row.assignment.is_some()), "it has work");
+    assert_eq!(in_the_way(&rig.view, &text::parse(CORRIDOR).expect("a site")), []);
+    assert_eq!(in_the_way(&rig.view, &moved("charge", "20000, -1000", "20000, -1500")), [], "nobody goes there");
+    let task = Obstacle::Task(TaskId::parse("T1").expect("an id"));
+    let robot = Obstacle::Robot(RobotId::parse("r1").expect("an id"));
+    assert_eq!(in_the_way(&rig.view, &moved("B", "18000, 3000", "18000, 4000")), [task, robot.clone()]);
+    assert_eq!(in_the_way(&rig.view, &moved("c-1", "7000, 1000", "7000, 1500")), [robot], "on its way");
+}
+
+#[test]
+fn a_robot_that_drives_by_another_map_gets_no_work_until_it_has_ours_and_a_person_is_told_once() {
+    let mut rig = Rig::new();
+    rig.robot("r1", "park-a");
+    let robot_id = RobotId::parse("r1").expect("an id");
+    let drives_by = |rig: &mut Rig, map: &str| {
+        let live = Arc::make_mut(rig.board.get_mut(&robot_id).expect("heard"));
+        live.report.map_version = map.to_owned();
+        rig.pass(1_000);
+        rig.cycle(Pace::Sweep);
+        rig.cycle(Pace::Sweep);
+    };
+    let told = |rig: &Rig| {
+        let of_map = rig.view.incidents.values().map(|i| &i.row).filter(|i| i.reason.code == Code::MapDiffers);
+        of_map.map(|i| i.closed.is_none()).collect::<Vec<_>>()
+    };
+    rig.submit("T1", |_| {});
+    drives_by(&mut rig, "0");
+    assert_eq!(rig.view.held_by(&robot_id), None, "it gets no work");
+    assert_eq!(told(&rig), [true]);
+    drives_by(&mut rig, "");
+    assert!(rig.view.held_by(&robot_id).is_some(), "one that goes by points alone works");
+    assert_eq!(told(&rig), [false]);
+    drives_by(&mut rig, "1");
+    assert_eq!(told(&rig), [false]);
+}
