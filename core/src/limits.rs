@@ -395,6 +395,14 @@ pub const STOP_REQUESTS_MAX: usize = 1_024;
 pub const STOP_DENIALS_PER_MINUTE: u32 = 60;
 /// Records of the audit of stops that wait for the disk; of more the count is kept.
 pub const STOP_AUDIT_QUEUE: usize = 1_024;
+/// Whoever looks after a stop service on one box looks again after this, and waits no longer for an answer.
+pub const STOP_LOOK_WITHIN: LinkDuration = LinkDuration::from_secs(1);
+/// A look that began or ended later than this after its time counts for nothing: the checker itself was held up.
+pub const STOP_LOOK_LATE: LinkDuration = LinkDuration(250);
+/// So many looks in a row in vain, and the process is ended: with its start anew this is less than what stands a robot among people.
+pub const STOP_LOOKS_MISSED: u32 = 3;
+/// A process of a stop service is ended at most so often: one that hangs again at once needs a person.
+pub const STOP_KILL_EVERY: LinkDuration = LinkDuration::from_secs(30);
 /// Whoever writes down for the stop service who is known says so often that it still does, also if nothing changes.
 pub const PRINCIPALS_TOLD_EVERY: LinkDuration = LinkDuration::from_secs(10);
 /// Bytes of a slot of the latch file: 2,048 resets with their stops and 256 stops with 128 boxes each, as JSON.

@@ -103,6 +103,7 @@ codes! {
     StopNotFound = "STOP_NOT_FOUND", "Nothing is known of this stop. `midshift stop status` says which are engaged; a robot that stands says what it waits for.";
     StopWasReset = "STOP_WAS_RESET", "The stop was reset, so nobody obeys it any more. Engage another one with a new request_id.";
     StopMemoryLost = "STOP_MEMORY_LOST", "The stop service began without its latch or its key, so it stopped the whole fleet. Look at the floor and at `midshift stop status`, find out who removed its files, then reset that stop by name.";
+    StopServiceHung = "STOP_SERVICE_HUNG", "The stop service answers nothing and was not replaced. Robots stand by its silence. Look at its log and at its machine; end its process by hand, and it is started again.";
     LineReplaced = "LINE_REPLACED", "A newer line of this robot took the place of this one. If two machines use one robot id, find the second.";
     LineHeld = "LINE_HELD", "Another start of this robot is heard on its line to the stop service, so this one is not let in. It dials again by itself and is let in when the other has ended. If two machines use one robot id, find the second and revoke the key.";
     // --- software on the server

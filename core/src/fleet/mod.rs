@@ -196,10 +196,11 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
                     mark(tx, entry.seq);
                 });
             }
-            (Log::Ota, None, Some(body)) if &*entry.kind == crate::maintenance::INCIDENT => {
+            (Log::Ota | Log::Stop, None, Some(body)) if &*entry.kind == crate::maintenance::INCIDENT => {
                 match serde_json::from_str::<Reason>(body) {
                     Ok(reason) => {
-                        plan.decide(view, now, "ota", |tx| {
+                        let by = if entry.log == Log::Stop { "stop" } else { "ota" };
+                        plan.decide(view, now, by, |tx| {
                             incidents::open(tx, reason, RobotId::parse(&entry.subject).ok().as_ref(), None);
                             mark(tx, entry.seq);
                         });

@@ -7,6 +7,7 @@
 //! Invariant: nothing here makes a robot move that stood. A reset takes a stop away and leaves `resume:<id>`; only a person's resume ends that.
 //! Absent on purpose: the store, the task queue, a level that cuts power.
 
+pub mod hung;
 pub mod ladder;
 pub mod latch;
 pub mod record;

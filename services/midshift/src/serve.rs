@@ -275,7 +275,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
     let server = Server::new(parts, shutdown).await?.hearing(beacons);
     let kept = async {
         match has_stop {
-            true => beside.keep(started).await,
+            true => beside.keep(started, &*storage.store()).await,
             false => std::future::pending().await,
         }
     };

@@ -1,10 +1,11 @@
 //! `midshift stop serve`: the stop service in a process of its own; in `dev` a thread of its own; beside `serve` on one box a process that outlives it.
 //!
-//! An operational stop request, not a safety function. Invariant: nothing of the store, the task queue or the business server lies on its way. Nothing here
-//! ends a running stop service: `serve` starts one where none is, and leaves it alone for ever. Rooms: `started` is that, `first_start` says that one may begin with nothing engaged, `next` how one takes the place of another,
+//! An operational stop request, not a safety function. Invariant: nothing of the store, the task queue or the business server lies on its way. `serve`
+//! starts one where none is, leaves one that answers alone, and replaces one that hangs. Rooms: `started` is that, `manager` what a service manager hears, `first_start` says that one may begin with nothing engaged, `next` how one takes the place of another,
 //! `program` which program both start, where its files are and how long it may take.
 
 mod first_start;
+mod manager;
 mod next;
 mod program;
 mod started;
@@ -27,7 +28,7 @@ use program::{LOOK_EVERY, UP_WITHIN};
 use std::net::SocketAddr;
 use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio::sync::mpsc::Receiver;
@@ -85,6 +86,18 @@ pub struct StopServe {
 /// # Errors
 /// The folder cannot be used or another process has it, the port is taken, or a part ended by itself.
 pub async fn run(args: StopServe, shutdown: CancellationToken) -> anyhow::Result<()> {
+    let opened = OnceLock::new();
+    tokio::select! {
+        served = run_watched(args, shutdown, &opened) => served,
+        () = manager::is_watched(&opened) => Ok(()),
+    }
+}
+
+async fn run_watched(
+    args: StopServe,
+    shutdown: CancellationToken,
+    opened: &OnceLock<StopService>,
+) -> anyhow::Result<()> {
     let asked = next::asked()?;
     if args.insecure {
         tracing::warn!(address = %args.listen, "no TLS and no login: whoever reaches this port may stop the fleet and reset stops");
@@ -117,11 +130,11 @@ pub async fn run(args: StopServe, shutdown: CancellationToken) -> anyhow::Result
         }
         false => StopService::open(parts, shutdown.clone())?,
     };
-    let leaving = service.clone();
+    let leaving = opened.get_or_init(|| service.clone());
     let following = async {
         tokio::select! {
             () = shutdown.cancelled() => {}
-            () = next::begun(asked, &port, &leaving) => {}
+            () = next::begun(asked, &port, leaving) => {}
         }
         // Who dials from now on is the next one's.
         drop(port);

@@ -6,10 +6,11 @@
 
 use anyhow::Context;
 use midshift_core::fleet::rows::RobotControl;
+use midshift_core::identity::RobotIdentity;
 use midshift_core::ids::{RobotId, StopId};
 use midshift_core::limits;
 use midshift_core::robot::Duty;
-use midshift_core::rows::{Log, Revision, Seq, Table};
+use midshift_core::rows::{BadRow, Log, Revision, Row, Seq, Table};
 use midshift_core::stop::Latch;
 use midshift_core::stop::record::{StopRecord, copy};
 use midshift_identity::{IdentityService, ServerProof};
@@ -83,7 +84,8 @@ pub struct StopFollower {
     told: Option<Copied>,
     /// Robots that have ever said hello, up to an entry of the feed.
     attached: Option<(BTreeSet<RobotId>, Seq)>,
-    retired: BTreeSet<RobotId>,
+    /// Retired or revoked: nobody waits for their word any more.
+    gone: BTreeSet<RobotId>,
     /// As it was written last.
     roster: Option<BTreeSet<RobotId>>,
     /// Who is known, and what that was when it was written last.
@@ -95,9 +97,9 @@ pub struct StopFollower {
 impl StopFollower {
     /// Of the stop service that keeps its files in `folder`.
     pub fn new(folder: PathBuf, store: Arc<dyn Store>, identity: Option<IdentityService>) -> Self {
-        let (copied, told, attached, retired, roster) = (None, None, None, BTreeSet::new(), None);
+        let (copied, told, attached, gone, roster) = (None, None, None, BTreeSet::new(), None);
         let identity = identity.map(|identity| (identity, None));
-        Self { folder, store, copied, told, attached, retired, roster, identity, failing: false }
+        Self { folder, store, copied, told, attached, gone, roster, identity, failing: false }
     }
 
     /// Until it is dropped.
@@ -174,7 +176,7 @@ impl StopFollower {
         let read = tokio::task::spawn_blocking(move || midshift_stop::latch(&folder));
         let Some((generation, latch)) = read.await.context("reading the latch")?? else { return Ok(()) };
         if is_due {
-            self.look_who_is_retired().await?;
+            self.look_who_is_gone().await?;
         }
         self.copy(generation, &latch).await?;
         self.look_who_attached().await?;
@@ -205,10 +207,9 @@ impl StopFollower {
         self.tell_stops(true).await
     }
 
-    async fn look_who_is_retired(&mut self) -> anyhow::Result<()> {
-        let snapshot = self.store.snapshot(&[Table::RobotControl]).await.context("reading who is retired")?;
-        let controls = snapshot.rows.iter().map(|row| row.decode::<RobotControl>()).collect::<Result<Vec<_>, _>>()?;
-        self.retired = controls.into_iter().filter(|c| c.duty() == Duty::Retired).map(|c| c.robot_id).collect();
+    async fn look_who_is_gone(&mut self) -> anyhow::Result<()> {
+        let snapshot = self.store.snapshot(&[Table::RobotControl, Table::RobotIdentity]).await;
+        self.gone = who_is_gone(&snapshot.context("reading who is retired or revoked")?.rows)?;
         Ok(())
     }
 
@@ -252,7 +253,7 @@ impl StopFollower {
     /// Writes who the robots are, if that has changed.
     async fn tell_roster(&mut self) -> anyhow::Result<()> {
         let Some((attached, _)) = &self.attached else { return Ok(()) };
-        let robots: BTreeSet<RobotId> = attached.difference(&self.retired).cloned().collect();
+        let robots: BTreeSet<RobotId> = attached.difference(&self.gone).cloned().collect();
         if self.roster.as_ref() == Some(&robots) {
             return Ok(());
         }
@@ -264,9 +265,49 @@ impl StopFollower {
     }
 }
 
+/// Robots that are retired, and those that were revoked and not enrolled again since.
+fn who_is_gone(rows: &[Row]) -> Result<BTreeSet<RobotId>, BadRow> {
+    let mut gone = BTreeSet::new();
+    for row in rows {
+        gone.extend(match row.key.table {
+            Table::RobotControl => Some(row.decode::<RobotControl>()?)
+                .filter(|control| control.duty() == Duty::Retired)
+                .map(|control| control.robot_id),
+            _ => {
+                Some(row.decode::<RobotIdentity>()?).filter(|robot| robot.revoked.is_some()).map(|robot| robot.robot_id)
+            }
+        });
+    }
+    Ok(gone)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use midshift_core::ids::SiteId;
+    use midshift_core::rows::{Expect, Item, Writer};
+    use midshift_core::time::Utc;
+    use midshift_store::{MemoryStore, StoreId};
+
+    #[tokio::test]
+    async fn one_that_was_revoked_is_on_the_roster_no_more_until_it_is_enrolled_again() -> anyhow::Result<()> {
+        let store = MemoryStore::new(SiteId::parse("demo")?, StoreId::fresh(), crate::clock::clock(1000));
+        let robot_id = RobotId::parse("r1")?;
+        let mut robot = RobotIdentity::new(robot_id.clone());
+        let gone = async |robot: &RobotIdentity, expect: Expect| {
+            let mut item = Item::new(Writer::Identity, "anna");
+            item.put(robot, expect, "robot.changed");
+            assert!(store.commit(vec![item]).await.iter().all(Result::is_ok));
+            let snapshot = store.snapshot(&[Table::RobotControl, Table::RobotIdentity]).await?;
+            anyhow::Ok(who_is_gone(&snapshot.rows)?)
+        };
+        assert!(gone(&robot, Expect::Absent).await?.is_empty());
+        robot.revoke("anna", Utc(5));
+        assert_eq!(gone(&robot, Expect::At(Revision(1))).await?, [robot_id].into());
+        robot.revoked = None;
+        assert!(gone(&robot, Expect::At(Revision(2))).await?.is_empty());
+        Ok(())
+    }
 
     #[test]
     fn who_is_known_is_said_to_be_so_still_without_being_written_anew() -> io::Result<()> {

@@ -90,7 +90,8 @@ impl Watching<'_> {
         }
         for (robot_id, (confirmation, obeys)) in &found {
             count(&mut seen.counts, *confirmation);
-            seen.is_over &= confirmation.is_settled(&self.stop) || self.has_stood_by_itself(*confirmation, now);
+            let is_over = || confirmation.is_settled(&self.stop) || self.has_stood_by_itself(*confirmation, now);
+            seen.is_over &= !may_mean(&self.stop, robot_id) || is_over();
             if self.told.get(robot_id) != Some(&(*confirmation, *obeys)) {
                 seen.news.push(encode(robot_id, *confirmation, *obeys, now));
             }
@@ -124,6 +125,11 @@ impl Watching<'_> {
             _ => false,
         }
     }
+}
+
+/// A robot may lie inside of this stop as far as anybody else knows, so that its word is waited for. Where one is that is not heard, nobody knows.
+fn may_mean(stop: &Stop, robot_id: &RobotId) -> bool {
+    !matches!(&stop.scope, Scope::Robot(id) if id != robot_id)
 }
 
 /// Tells of a stop until nothing more is to come, or the reader leaves. `may_stay`: there is room for one more reader; else it is told once.

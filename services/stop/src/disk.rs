@@ -4,6 +4,7 @@
 //! each second and with each change. Records that wait are bounded, and those left out are counted.
 
 use crate::audit::{Action, Audit, Note, Tail};
+use crate::holder::Holder;
 use crate::law::Kept;
 use crate::{Inner, acts, blocking, lock};
 use midshift_core::limits;
@@ -149,6 +150,8 @@ impl Disk {
 
 /// The files.
 pub struct Writer {
+    /// Says which process has the folder; let go of before the latch.
+    pub _holder: Holder,
     /// The latch.
     pub file: LatchFile,
     /// The audit.

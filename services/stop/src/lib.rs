@@ -16,6 +16,7 @@ mod first;
 mod frames;
 mod ground;
 mod grpc;
+mod holder;
 mod law;
 mod line;
 mod opening;
@@ -27,6 +28,7 @@ mod status;
 
 pub use face::LinkFace;
 pub use first::{FIRST, announce_first_start, withdraw_first_start};
+pub use holder::{HOLDER, NotEnded, end_holder, is_held};
 pub use snapshot::{Copied, Principals, Roster};
 
 use audit::{Action, Broken, Note, Verified};
@@ -248,6 +250,12 @@ impl StopService {
         let note = note.with("code", code).with("asked", path).with("network", network);
         let note = robot_id.iter().fold(note, |note, robot_id| note.with("robot_id", robot_id));
         self.inner.disk.denied(note, left_out);
+    }
+
+    /// Looks at what every stop and every check-in needs. One that hangs does not come back from here.
+    pub fn look(&self) {
+        drop(lock(&self.inner.fan));
+        drop(lock(&self.inner.law));
     }
 
     /// Records that another process is ready to follow this one, and ends. False: the disk does not hold that, or not all that is engaged and reset, so that this one

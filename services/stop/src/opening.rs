@@ -6,6 +6,7 @@
 use crate::audit::{self, Action, Audit, Note};
 use crate::disk::Writer;
 use crate::first::{FIRST, withdraw_first_start};
+use crate::holder::Holder;
 use crate::law::{Kept, draw_unused};
 use crate::proof::{Found, Key};
 use crate::{Error, LATCH};
@@ -114,7 +115,8 @@ pub fn open(folder: &Path, now: Utc) -> Result<Opened, Error> {
     }
     notes.extend(found);
     let known = kept.audit.clone();
-    Ok(Opened { kept, writer: Writer { file, audit, known }, key, notes })
+    let _holder = Holder::take(folder).map_err(failed)?;
+    Ok(Opened { kept, writer: Writer { _holder, file, audit, known }, key, notes })
 }
 
 /// Nobody knows what was engaged: everything is. One such stop that nobody has reset is enough.

@@ -30,6 +30,8 @@ pub struct Said {
     pub boot_id: String,
     /// It stands in the snapshot.
     pub is_listed: bool,
+    /// It stands in the snapshot no more: it was retired or revoked. By then its own silence has stood it, and it leaves.
+    pub leaves: Option<LinkTime>,
     /// Its line.
     pub line: Option<Arc<Outbox>>,
     /// When its line was begun.
@@ -62,6 +64,22 @@ impl Said {
         let heard = self.heard.as_ref().map_or(self.begun, |heard| heard.at.max(self.begun));
         let silent = now.since(heard);
         (silent < limits::CHECK_IN_MISSED).then(|| LinkDuration(limits::CHECK_IN_MISSED.as_ms() - silent.as_ms()))
+    }
+}
+
+impl Said {
+    /// When its own silence has stood it at the latest. Of one that was never heard: as if it had been until now.
+    fn stands_by(&self, now: LinkTime) -> LinkTime {
+        match &self.heard {
+            Some(heard) => heard.at + heard.around.patience().1,
+            None => now + limits::SILENCE_STAND + limits::CHECK_IN,
+        }
+    }
+
+    /// Nobody speaks of it any more, and by itself it stands.
+    fn is_gone(&self, now: LinkTime) -> bool {
+        let stands = self.heard.as_ref().is_none_or(|heard| now >= heard.at + heard.around.patience().1);
+        self.line.is_none() && stands && self.leaves.is_some_and(|at| now >= at)
     }
 }
 
@@ -109,14 +127,18 @@ impl Robots {
         Ok(map.entry(robot_id.clone()).or_insert_with(robot).clone())
     }
 
-    /// Takes over who is listed. One that is listed no more stays as long as it has been heard.
-    pub fn list(&self, listed: &BTreeSet<RobotId>) {
+    /// Takes over who is listed. One that is listed no more stays, not reachable, until its own silence has stood it.
+    pub fn list(&self, listed: &BTreeSet<RobotId>, now: LinkTime) {
         let mut map = self.0.write().unwrap_or_else(PoisonError::into_inner);
-        map.retain(|robot_id, robot| {
+        for (robot_id, robot) in map.iter() {
             let mut said = robot.said();
-            said.is_listed = listed.contains(robot_id);
-            said.is_listed || said.line.is_some() || said.heard.is_some()
-        });
+            let was_listed = std::mem::replace(&mut said.is_listed, listed.contains(robot_id));
+            if said.is_listed {
+                said.leaves = None;
+            } else if was_listed {
+                said.leaves = Some(said.stands_by(now));
+            }
+        }
         for robot_id in listed {
             if map.len() >= limits::STOP_ROBOTS_MAX {
                 break;
@@ -125,6 +147,16 @@ impl Robots {
             let robot = || Arc::new(Robot { robot_id: robot_id.clone(), said: said() });
             map.entry(robot_id.clone()).or_insert_with(robot);
         }
+    }
+
+    /// Lets those go that nobody lists any more and whose silence has stood them. Whether anybody went.
+    pub fn let_go(&self, now: LinkTime) -> bool {
+        if !self.read().values().any(|robot| robot.said().is_gone(now)) {
+            return false;
+        }
+        let mut map = self.0.write().unwrap_or_else(PoisonError::into_inner);
+        map.retain(|_, robot| !robot.said().is_gone(now));
+        true
     }
 
     /// Tells all lines of a change.
@@ -190,6 +222,37 @@ fn is_stray(robot: &Robot) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use midshift_core::robot::StopLevel;
+    use midshift_core::stop::ladder::{Around, Stage};
+
+    fn heard(at: LinkTime, around: Around) -> Heard {
+        let (inside, awaiting) = (BTreeSet::new(), BTreeSet::new());
+        let (level, stage) = (StopLevel::None, Stage::Heard);
+        Heard { at, generation: 1, is_durable: true, level, is_still: false, inside, stage, around, awaiting }
+    }
+
+    #[test]
+    fn one_that_is_listed_no_more_leaves_when_its_own_silence_has_stood_it_and_not_before() {
+        let robots = Robots::default();
+        let names = |robots: &Robots| robots.all().iter().map(|r| r.robot_id.to_string()).collect::<Vec<_>>().join(" ");
+        robots.list(&[1, 2, 3].map(id).into(), LinkTime(0));
+        robots.of(&id(1)).unwrap().said().heard = Some(heard(LinkTime(9_000), Around::People));
+        robots.of(&id(2)).unwrap().said().heard = Some(heard(LinkTime(9_000), Around::Robots));
+        // One that nobody ever listed: it has a line before it has a session.
+        robots.of(&id(4)).unwrap().said().heard = Some(heard(LinkTime(9_000), Around::People));
+        robots.list(&BTreeSet::new(), LinkTime(10_000));
+        for (ms, left) in
+            [(14_999, "r1 r2 r3 r4"), (15_000, "r2 r3 r4"), (39_000, "r3 r4"), (40_999, "r3 r4"), (41_000, "r4")]
+        {
+            robots.let_go(LinkTime(ms));
+            assert_eq!(names(&robots), left, "at {ms} ms");
+        }
+        // Listed again in time it stays.
+        robots.list(&[1].map(id).into(), LinkTime(50_000));
+        robots.list(&BTreeSet::new(), LinkTime(51_000));
+        robots.list(&[1].map(id).into(), LinkTime(52_000));
+        assert!(!robots.let_go(LinkTime(200_000)));
+    }
 
     fn id(n: usize) -> RobotId {
         RobotId::parse(&format!("r{n}")).unwrap()
@@ -198,7 +261,7 @@ mod tests {
     #[test]
     fn the_roster_is_bounded_and_who_nobody_lists_goes_first() {
         let robots = Robots::default();
-        robots.list(&(1..limits::STOP_ROBOTS_MAX).map(id).collect());
+        robots.list(&(1..limits::STOP_ROBOTS_MAX).map(id).collect(), LinkTime(0));
         robots.of(&id(0)).unwrap();
         robots.of(&id(99_999)).unwrap();
         assert_eq!(robots.all().len(), limits::STOP_ROBOTS_MAX);

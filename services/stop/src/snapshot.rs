@@ -192,6 +192,9 @@ pub async fn keep(inner: &Inner, folder: PathBuf) {
         let at = folder.clone();
         let looked = blocking(move || look_at_both(&at, known)).await;
         known = take_both(inner, looked);
+        if inner.robots.let_go(inner.clock.now().link) {
+            inner.touch();
+        }
     }
 }
 
@@ -199,7 +202,7 @@ pub async fn keep(inner: &Inner, folder: PathBuf) {
 fn take(inner: &Inner, roster: Result<Roster, String>) {
     match roster {
         Ok(roster) => {
-            inner.robots.list(&roster.robots);
+            inner.robots.list(&roster.robots, inner.clock.now().link);
             metrics::gauge!("midshift_stop_roster").set(roster.robots.len() as f64);
             tracing::info!(robots = roster.robots.len(), "roster taken over");
             inner.touch();

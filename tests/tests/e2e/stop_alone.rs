@@ -2,7 +2,10 @@
 
 use crate::harness::{Running, channel, folder, free_port, midshift, same_site, sign_in_to, until};
 use anyhow::{Context, ensure};
+use midshift_core::reason::Code;
 use midshift_core::site::DEMO;
+use midshift_proto::fleet::v1::ListIncidentsRequest;
+use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::scope::Scope as W;
 use midshift_proto::stop::v1::stop_link_service_client::StopLinkServiceClient;
@@ -236,4 +239,55 @@ async fn serve_starts_the_stop_service_again_unless_a_next_one_is_there_and_what
         "it does not depend on the server's own log"
     );
     Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stop_service_that_hangs_is_replaced_with_what_is_engaged_and_a_person_is_told_if_the_next_one_hangs_too()
+-> anyhow::Result<()> {
+    let dir = folder()?;
+    std::fs::write(dir.path().join("site.toml"), DEMO)?;
+    let (address, stop_address) = (free_port()?, free_port()?);
+    let log = dir.path().join("server.log");
+    let (mut command, token) = (Command::new(midshift()?), dir.path().join("token"));
+    command.env("NO_COLOR", "1").args(["serve", "--data"]).arg(dir.path().join("data"));
+    command.arg("--site").arg(dir.path().join("site.toml")).arg("--first-token-file").arg(&token);
+    command.args(["--listen", &address.to_string(), "--stop-listen", &stop_address.to_string()]);
+    let children = Children(vec![log.clone(), dir.path().join("data/stop/log")]);
+    let _running = Running::start(&mut command, &log)?;
+    sign_in_to(address, dir.path().join("data/identity/ca.pem"), &token).await?;
+    same_site(address, stop_address)?;
+    let first = children.next(STARTED, &BTreeSet::new()).await?;
+    let stop_id = engage(&mut StopServiceClient::new(channel(stop_address)?)).await?;
+    signal("STOP", first)?;
+    let second = children.next(STARTED, &BTreeSet::from([first])).await?;
+    says(&log, "its process is ended").await?;
+    let engaged = until("an answer of the next one", LIMIT, async || {
+        let asked = StopServiceClient::new(channel(stop_address)?).get_status(v1::GetStatusRequest {}).await.ok();
+        Ok(asked.and_then(|answer| answer.into_inner().status))
+    })
+    .await?;
+    let engaged: Vec<_> = engaged.stops.into_iter().filter_map(|engaged| Some(engaged.stop?.stop_id)).collect();
+    ensure!(engaged == [stop_id.clone()], "{engaged:?}");
+    // Within half a minute it is not ended once more.
+    signal("STOP", second)?;
+    until("the incident", LIMIT, async || {
+        let mut client = FleetServiceClient::new(channel(address)?);
+        let answer = client.list_incidents(ListIncidentsRequest::default()).await?.into_inner();
+        let codes = answer.incidents.into_iter().filter_map(|incident| Some(incident.reason?.code));
+        Ok(codes.into_iter().any(|code| code == Code::StopServiceHung.as_str()).then_some(()))
+    })
+    .await?;
+    let known = BTreeSet::from([first, second]);
+    ensure!(children.all(STARTED) == known, "{:?}", children.all(STARTED));
+    signal("CONT", second)?;
+    reset(&mut StopServiceClient::new(way_to(stop_address).await?), &stop_id).await
+}
+
+/// The way to one with login, as soon as it answers.
+async fn way_to(address: SocketAddr) -> anyhow::Result<Channel> {
+    until("an answer", LIMIT, async || {
+        let asked = StopServiceClient::new(channel(address)?).get_status(v1::GetStatusRequest {}).await;
+        Ok(asked.is_ok().then_some(channel(address)?))
+    })
+    .await
 }

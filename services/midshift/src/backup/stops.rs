@@ -9,7 +9,7 @@ use super::{Places, blocking};
 use crate::stop::{FOLDER, LOG};
 use anyhow::{Context, ensure};
 use async_trait::async_trait;
-use midshift_stop::{Copied, FIRST};
+use midshift_stop::{Copied, FIRST, HOLDER};
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
@@ -46,7 +46,7 @@ impl Part for Stops {
             latch(&from, &folder)?;
             for path in entries(&from)? {
                 let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-                if ![LATCH, LOG, FIRST, Copied::NAME].contains(&name.as_str()) && !name.ends_with(".part") {
+                if ![LATCH, LOG, FIRST, HOLDER, Copied::NAME].contains(&name.as_str()) && !name.ends_with(".part") {
                     copy_if_there(&path, &folder.join(name))?;
                 }
             }

@@ -3,19 +3,15 @@
 //! Both have the same open port, which the next one gets as its standard input: whoever dials between them waits a moment and is refused by nobody. Invariant:
 //! a next one that cannot begin costs nothing, this one goes on; two never have the folder at once.
 
+use super::manager;
 use super::program::{UP_WITHIN, program};
 use anyhow::{Context, anyhow, bail, ensure};
 use midshift_stop::StopService;
 use std::env;
-use std::ffi::OsStr;
 use std::fs::File;
 use std::io::{self, Write};
 use std::os::fd::{AsFd, OwnedFd};
-use std::os::linux::net::SocketAddrExt;
-use std::os::unix::ffi::OsStrExt;
-use std::os::unix::net::{SocketAddr, UnixDatagram};
 use std::process::Stdio;
-use std::time::Duration;
 use tokio::io::AsyncReadExt;
 use tokio::net::TcpListener;
 use tokio::process::{Child, Command};
@@ -26,8 +22,6 @@ use tokio::time::timeout;
 const FOLLOWS: &str = "--follows";
 /// What it says when it needs nothing more than the folder.
 const READY: u8 = b'.';
-/// Where a service manager wants to hear which process the service is, as sd_notify(3) says.
-const NOTIFY: &str = "NOTIFY_SOCKET";
 
 /// The open port of the one before.
 ///
@@ -65,7 +59,7 @@ pub async fn begun(mut asked: Signal, port: &OwnedFd, service: &StopService) {
         match start(port, service).await {
             Ok(process) => {
                 tracing::info!(process, "the next stop service is ready: this one ends");
-                tell_manager(process);
+                manager::is_now(process);
                 return;
             }
             Err(error) => {
@@ -111,49 +105,4 @@ async fn until_ready(child: &mut Child) -> anyhow::Result<u32> {
         return child.id().context("it ended at once");
     }
     bail!("it ended before it was ready; what it said is above: {}", child.wait().await?)
-}
-
-/// Says to a service manager that waits for it which process the service is from now on.
-fn tell_manager(process: u32) {
-    let Some(address) = env::var_os(NOTIFY) else { return };
-    if let Err(error) = tell(&address, &format!("MAINPID={process}")) {
-        tracing::warn!(%error, "the service manager was not told which process this service is now");
-    }
-}
-
-fn tell(address: &OsStr, text: &str) -> io::Result<()> {
-    let address = match address.as_bytes() {
-        [b'@', name @ ..] => SocketAddr::from_abstract_name(name)?,
-        _ => SocketAddr::from_pathname(address)?,
-    };
-    let socket = UnixDatagram::unbound()?;
-    // Of one that does not listen nobody waits.
-    socket.set_write_timeout(Some(Duration::from_secs(1)))?;
-    socket.send_to_addr(text.as_bytes(), &address).map(drop)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_service_manager_is_told_by_a_path_or_an_abstract_name() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("notify");
-        let name = format!("midshift-next-{}", std::process::id());
-        let by_name = UnixDatagram::bind_addr(&SocketAddr::from_abstract_name(&name).unwrap()).unwrap();
-        let by_path = UnixDatagram::bind(&path).unwrap();
-        for (socket, address) in [(by_path, path.into_os_string()), (by_name, format!("@{name}").into())] {
-            tell(&address, "MAINPID=7").unwrap();
-            let mut heard = [0; 32];
-            let bytes = socket.recv(&mut heard).unwrap();
-            assert_eq!(&heard[..bytes], b"MAINPID=7");
-        }
-    }
-
-    #[test]
-    fn a_manager_that_is_not_there_is_an_error_and_no_wait() {
-        let dir = tempfile::tempdir().unwrap();
-        assert!(tell(dir.path().join("nobody").as_os_str(), "MAINPID=7").is_err());
-    }
 }

@@ -1,11 +1,20 @@
 //! The stop service beside a server on one box: started as a process that outlives the server, and started again as soon as it is gone.
 //!
-//! Invariant: nothing here ends one that runs. What it says goes to a file of its own: it must not depend on where the server's own words go.
+//! Invariant: only one that answered nothing three times is ended, the process that holds the folder, once in 30 s; beyond that a person is told. What it says goes to a file of its own: it must not depend on where the server's own words go.
 
 use super::program::{FOLDER, LOOK_EVERY, UP_WITHIN, program};
+use crate::clock;
 use anyhow::{Context, bail};
 use midshift_agent::dial::{Dial, TcpDial};
 use midshift_agent::tls::{self, Tls};
+use midshift_core::limits;
+use midshift_core::maintenance::INCIDENT;
+use midshift_core::reason::{Code, Reason};
+use midshift_core::rows::{Fact, Item, Log, Writer};
+use midshift_core::stop::hung::{Answer, Hung, Look, Verdict};
+use midshift_core::time::{Clock, LinkTime};
+use midshift_stop::NotEnded;
+use midshift_store::Store;
 use std::fs::{DirBuilder, File, OpenOptions};
 use std::future::pending;
 use std::io;
@@ -13,6 +22,7 @@ use std::net::SocketAddr;
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
+use std::sync::Arc;
 use std::time::Duration;
 use tokio::process::{Child, Command};
 use tokio::time::{Instant, sleep, timeout};
@@ -25,9 +35,10 @@ use tonic_health::pb::health_client::HealthClient;
 pub const LOG: &str = "log";
 /// One that has more than this begins anew, bytes.
 const LOG_BYTES_MAX: u64 = 4 * 1024 * 1024;
-/// One that hangs is found out when it has not answered for so long, and started again after so many times in vain; one that is gone is found out at the next look.
-const KEPT_EVERY: Duration = Duration::from_secs(2);
-const MISSES: u32 = 2;
+/// One that hangs is found out when it has not answered for so long, time after time; one that is gone is found out at the next look.
+const WITHIN: Duration = Duration::from_millis(limits::STOP_LOOK_WITHIN.as_ms());
+/// A process that was ended lets go of the folder within this.
+const GONE_WITHIN: Duration = Duration::from_secs(2);
 /// Its log is looked at so often, in looks at itself.
 const LOG_EVERY: u32 = 100;
 /// One that ended sooner than this after its start is started again after a pause, which doubles up to the longest.
@@ -100,11 +111,11 @@ impl Started {
 
     /// Looks after it until the task is ended: one that is gone is started again, before robots among people slow down for want of an answer. `child`: what
     /// [`Started::start`] has started.
-    pub async fn keep(&self, mut child: Option<Child>) {
-        let mut pause = Duration::ZERO;
+    pub async fn keep(&self, mut child: Option<Child>, store: &dyn Store) {
+        let (mut pause, mut watch) = (Duration::ZERO, Watch::default());
         loop {
             let begun = Instant::now();
-            self.until_gone(&mut child).await;
+            self.until_gone(&mut child, &mut watch, store).await;
             if self.answers().await {
                 tracing::info!(address = %self.listen, "another stop service has taken the place of the one that was here");
                 child = None;
@@ -123,8 +134,8 @@ impl Started {
         }
     }
 
-    /// Until its process has ended, or nobody listens any more, or nothing was answered for a while.
-    async fn until_gone(&self, child: &mut Option<Child>) {
+    /// Until its process has ended, or nobody listens any more. One that hangs is ended.
+    async fn until_gone(&self, child: &mut Option<Child>, watch: &mut Watch, store: &dyn Store) {
         let ended = async {
             match child {
                 Some(child) => drop(child.wait().await),
@@ -132,16 +143,20 @@ impl Started {
             }
         };
         let silent = async {
-            let mut misses = 0;
-            while misses < MISSES {
-                self.watch().await;
-                if !self.is_listening().await {
-                    return;
+            loop {
+                if watch.due.is_none() {
+                    self.watch().await;
                 }
-                let answers = self.answers().await;
-                misses = if answers { 0 } else { misses + 1 };
-                // One that only ended a connection that was old goes on.
-                sleep(LOOK_EVERY).await;
+                let (verdict, is_refused) = tokio::join!(watch.look(self.serves()), self.is_refused());
+                match verdict {
+                    _ if is_refused => return,
+                    Verdict::Leave => {}
+                    Verdict::Kill => match self.end().await {
+                        Ok(()) => return,
+                        Err(error) => watch.tell(store, &error.to_string()).await,
+                    },
+                    Verdict::Tell => watch.tell(store, "it hangs again within 30 s after it was replaced").await,
+                }
             }
         };
         tokio::select! {
@@ -150,25 +165,37 @@ impl Started {
         }
     }
 
+    /// Ends the process that holds the folder, so that another can have it.
+    async fn end(&self) -> Result<(), NotEnded> {
+        let folder = self.data.join(FOLDER);
+        let process = midshift_stop::end_holder(&folder)?;
+        tracing::error!(process, "the stop service answered nothing three times: its process is ended");
+        let begun = Instant::now();
+        while midshift_stop::is_held(&folder) && begun.elapsed() < GONE_WITHIN {
+            sleep(LOOK_EVERY).await;
+        }
+        Ok(())
+    }
+
     /// Stays on a connection as long as what is asked on it is answered. When its process ends, that is seen here soon, whoever has started it.
     async fn watch(&self) {
-        let Ok(Some(mut client)) = timeout(KEPT_EVERY, self.client()).await else { return };
+        let Ok(Some(mut client)) = timeout(WITHIN, self.client()).await else { return };
         for n in 0_u32.. {
             // Of a process that runs for years too. Where it cannot be, it is said at the next start.
             if n.is_multiple_of(LOG_EVERY) {
                 drop(log(&self.data.join(FOLDER)));
             }
             let asked = client.check(HealthCheckRequest::default());
-            if !timeout(KEPT_EVERY, asked).await.is_ok_and(|answer| answer.is_ok()) {
+            if !timeout(WITHIN, asked).await.is_ok_and(|answer| answer.is_ok()) {
                 return;
             }
             sleep(LOOK_EVERY).await;
         }
     }
 
-    /// Whether anything listens there.
-    async fn is_listening(&self) -> bool {
-        timeout(KEPT_EVERY, tokio::net::TcpStream::connect(self.listen)).await.is_ok_and(|connected| connected.is_ok())
+    /// Whether nothing listens there. Of a process that hangs the system still takes connections, or lets them wait.
+    async fn is_refused(&self) -> bool {
+        timeout(WITHIN, tokio::net::TcpStream::connect(self.listen)).await.is_ok_and(|connected| connected.is_err())
     }
 
     async fn client(&self) -> Option<HealthClient<Channel>> {
@@ -180,12 +207,65 @@ impl Started {
 
     /// Whether a stop service of this site serves there.
     async fn answers(&self) -> bool {
+        timeout(WITHIN, self.serves()).await.unwrap_or(false)
+    }
+
+    async fn serves(&self) -> bool {
         let asked = async {
             let service = "midshift.stop.v1.StopService".to_owned();
             self.client().await?.check(HealthCheckRequest { service }).await.ok()
         };
-        let answer = timeout(LOOK_EVERY * 10, asked).await;
-        answer.is_ok_and(|answer| answer.is_some_and(|answer| answer.get_ref().status() == ServingStatus::Serving))
+        asked.await.is_some_and(|answer| answer.get_ref().status() == ServingStatus::Serving)
+    }
+}
+
+/// What was seen of the service at this address.
+struct Watch {
+    hung: Hung,
+    clock: Arc<dyn Clock>,
+    due: Option<LinkTime>,
+    is_told: bool,
+}
+
+impl Default for Watch {
+    fn default() -> Self {
+        Self { hung: Hung::default(), clock: clock::clock(1000), due: None, is_told: false }
+    }
+}
+
+impl Watch {
+    /// Looks once, when it is time to: right away, and each second as long as nothing is answered.
+    async fn look(&mut self, serves: impl Future<Output = bool>) -> Verdict {
+        let now = self.clock.now().link;
+        let due = self.due.unwrap_or(now);
+        sleep(Duration::from_millis(due.since(now).as_ms())).await;
+        let begun = self.clock.now().link;
+        let answer = match timeout(WITHIN, serves).await {
+            Ok(true) => Answer::Heard,
+            Ok(false) | Err(_) => Answer::None,
+        };
+        let ended = self.clock.now().link;
+        self.due = (answer == Answer::None).then_some(begun + limits::STOP_LOOK_WITHIN);
+        self.is_told &= answer == Answer::None;
+        self.hung.saw(Look { due, begun, ended, answer })
+    }
+
+    /// Tells a person, once until it answers again; what the store does not take in time is told at the next look.
+    async fn tell(&mut self, store: &dyn Store, why: &str) {
+        if self.is_told {
+            return;
+        }
+        tracing::error!(why, "the stop service answers nothing and is not replaced");
+        let reason = Reason::from(Code::StopServiceHung).with("why", why);
+        let mut item = Item::new(Writer::Stop, "midshift");
+        item.facts.push(Fact {
+            log: Log::Stop,
+            subject: Arc::from("stop"),
+            kind: INCIDENT,
+            body: serde_json::to_string(&reason).unwrap_or_default().into(),
+        });
+        let kept = timeout(WITHIN, store.commit(vec![item])).await;
+        self.is_told = kept.is_ok_and(|done| done.iter().all(Result::is_ok));
     }
 }
 
