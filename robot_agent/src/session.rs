@@ -410,8 +410,16 @@ impl Agent {
     }
 
     fn failed(&mut self, why: &str) {
-        tracing::debug!(robot_id = %self.config.robot_id, why, "no session");
+        self.tell_once(why);
         self.wait_to_dial(None);
+    }
+
+    /// Once for each reason: it is tried again for as long as it takes.
+    fn tell_once(&mut self, why: &str) {
+        if self.refused != why {
+            tracing::warn!(robot_id = %self.config.robot_id, why, "no session");
+            why.clone_into(&mut self.refused);
+        }
     }
 
     fn wait_to_dial(&mut self, at_least: Option<Duration>) {
@@ -480,11 +488,7 @@ impl Agent {
     }
 
     fn greeting_failed(&mut self, why: &str, again_after: Option<Duration>) {
-        // Once: it is tried again for as long as it takes.
-        if self.refused != why {
-            tracing::warn!(robot_id = %self.config.robot_id, why, "no session");
-            why.clone_into(&mut self.refused);
-        }
+        self.tell_once(why);
         // As the server asks, and apart from others that it asked the same; a server cannot send it away for long.
         let asked = again_after.map(|after| after.min(RETRY.end) + self.soon());
         let own = self.retry.next().unwrap_or(RETRY.end);

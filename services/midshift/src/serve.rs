@@ -179,6 +179,13 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
             "--identity is for processes without role identity: the site's authority is in the folder identity of --data, where a backup finds it"
         );
     }
+    // Before anything is opened: whoever finds the port taken leaves no trace.
+    let listener = TcpListener::bind(args.listen).await.with_context(|| {
+        format!(
+            "listening on {}; if another server has the port, end it or name another one with --listen",
+            args.listen
+        )
+    })?;
     if !args.insecure {
         // The databases have secrets of sessions, whichever process of the site they are of.
         midshift_identity::make_folder(&args.data).context("opening the data folder")?;
@@ -216,12 +223,6 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         false => None,
     };
     let drain = Duration::from_secs(args.drain_seconds.unwrap_or(if roles.are_split() { DRAIN_DEFAULT_S } else { 0 }));
-    let listener = TcpListener::bind(args.listen).await.with_context(|| {
-        format!(
-            "listening on {}; if another server has the port, end it or name another one with --listen",
-            args.listen
-        )
-    })?;
     let beacons = match args.beacon_listen {
         Some(address) => Some(hear(address).await?),
         None => None,

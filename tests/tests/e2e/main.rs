@@ -18,6 +18,7 @@ mod begin_and_end;
 mod changed_map;
 mod clients;
 mod cut;
+mod doors;
 mod engine;
 mod factory;
 mod first_start;

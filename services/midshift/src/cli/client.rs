@@ -29,6 +29,8 @@ use tonic_health::pb::health_client::HealthClient;
 
 /// Longest unary call.
 const CALL_WITHIN: Duration = Duration::from_secs(30);
+/// A server that says nothing for so long on a new connection hangs, or is none.
+const SAID_WITHIN: Duration = Duration::from_secs(5);
 /// Exit code of a server that is not there.
 const NO_SERVER: u8 = 5;
 /// Exit code of what nobody reads any more, as of a program that SIGPIPE has ended.
@@ -284,7 +286,7 @@ impl From<Status> for Exit {
         let code = match status.code() {
             Code::InvalidArgument | Code::OutOfRange => 2,
             Code::NotFound => 4,
-            Code::Unavailable => NO_SERVER,
+            Code::Unavailable | Code::Unimplemented => NO_SERVER,
             Code::PermissionDenied | Code::Unauthenticated => 6,
             Code::Aborted | Code::AlreadyExists | Code::FailedPrecondition => 9,
             Code::DeadlineExceeded => 10,
@@ -431,7 +433,11 @@ impl Call {
     pub async fn line(&self) -> Result<Line, Exit> {
         let resolved = self.resolved()?;
         let way = resolved.way(&resolved.server)?;
-        way.connect().await.map_err(|error| no_server(&resolved, &error))
+        let line = way.connect().await.map_err(|error| no_server(&resolved, &*error.0))?;
+        if !resolved.is_secure() {
+            says_something(line.clone()).await.map_err(|error| no_server(&resolved, &error))?;
+        }
+        Ok(line)
     }
     /// Who is who.
     pub async fn identity(&self) -> Result<IdentityServiceClient<Line>, Exit> {
@@ -471,9 +477,18 @@ impl Call {
     }
 }
 
+/// Waits for any word. In plain text a connection stands as soon as the system has taken it, whether a program looks at it or not.
+async fn says_something(line: Line) -> std::io::Result<()> {
+    let asked = HealthClient::new(line).check(HealthCheckRequest::default());
+    match tokio::time::timeout(SAID_WITHIN, asked).await {
+        Ok(_) => Ok(()),
+        Err(_) => Err(ErrorKind::TimedOut.into()),
+    }
+}
+
 /// Why nothing stands: nobody is there, it is of another site, or it is another door.
-fn no_server(resolved: &Resolved, error: &midshift_agent::dial::Error) -> Exit {
-    let (server, found) = (&resolved.server, Found::by(&*error.0));
+fn no_server(resolved: &Resolved, error: &(dyn std::error::Error + 'static)) -> Exit {
+    let (server, found) = (&resolved.server, Found::by(error));
     let text = match (found, found.help()) {
         (Found::OtherSite, _) => format!(
             "the server at {server} is not of the site that you signed in to\n  try: midshift login {server} --pin DIGEST, with the digest that this server printed"

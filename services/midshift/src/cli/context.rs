@@ -9,6 +9,7 @@ use super::out::Out;
 use crate::way::Way;
 use anyhow::Context as _;
 use clap::{Args, Subcommand};
+use console::Term;
 use midshift_agent::tls;
 use midshift_core::identity::Digest;
 use midshift_proto::identity::v1::WhoAmIRequest;
@@ -71,9 +72,11 @@ fn token(file: Option<&PathBuf>, out: &Out) -> Result<String, Exit> {
         return Ok(token.trim().to_owned());
     }
     if std::io::stdin().is_terminal() {
-        out.say("The token, then Enter:");
-        let mut line = String::new();
-        std::io::stdin().read_line(&mut line).context("reading the token")?;
+        out.say("The token, then Enter (it is not shown):");
+        let line = Term::stderr().read_secure_line().context("reading the token")?;
+        if line.trim().is_empty() {
+            return Err(Exit::usage("no token was typed; --token-file and MIDSHIFT_TOKEN need no terminal"));
+        }
         return Ok(line.trim().to_owned());
     }
     let mut text = String::new();
