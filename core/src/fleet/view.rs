@@ -145,6 +145,8 @@ pub struct View {
     pub unwilling: BTreeMap<RobotId, crate::time::LinkTime>,
     /// Offers that robots did not answer. Volatile.
     pub answers: super::answers::Answers,
+    /// What robots say of themselves that only a person ends. Volatile.
+    pub lasting: super::lasting::Lasting,
     /// What stands without a reason. Volatile.
     pub unexplained: super::unexplained::Unexplained,
     /// The attempt that a robot lists and no row knows, and since when, link clock. Volatile.
@@ -473,6 +475,7 @@ impl View {
             unwilling: BTreeMap::new(),
             answers: super::answers::Answers::default(),
             unknown: BTreeMap::new(),
+            lasting: super::lasting::Lasting::new(),
             unexplained: super::unexplained::Unexplained::default(),
             attached: BTreeMap::new(),
             closed_places: OnceLock::new(),

@@ -326,7 +326,7 @@ fn control_line(control: &fleet::RobotControl) -> String {
 }
 
 /// Columns of a robot.
-const HEADER: [&str; 9] = ["ROBOT", "PRESENCE", "SOFTWARE", "AT", "BATTERY", "LOAD", "WORK", "SPEED", "AGE"];
+const HEADER: [&str; 10] = ["ROBOT", "PRESENCE", "STATE", "SOFTWARE", "AT", "BATTERY", "LOAD", "WORK", "SPEED", "AGE"];
 
 fn row(robot: &v1::Robot) -> Vec<String> {
     let reported = robot.reported.clone().unwrap_or_default();
@@ -342,6 +342,7 @@ fn row(robot: &v1::Robot) -> Vec<String> {
     vec![
         robot.robot_id.clone(),
         presence(robot),
+        state(&reported),
         robot.inventory.as_ref().map(|inventory| inventory.software.clone()).unwrap_or_default(),
         vitals.waypoint.clone(),
         format!("{:.0} %{}", f64::from(vitals.battery_permille) / 10.0, if vitals.charging { " +" } else { "" }),
@@ -350,6 +351,25 @@ fn row(robot: &v1::Robot) -> Vec<String> {
         format!("{:.1} m/s", f64::from(vitals.speed_mm_s) / 1000.0),
         age,
     ]
+}
+
+/// What a robot says of itself that keeps it from work, the gravest first; `ok` if nothing.
+fn state(reported: &link::ReportedState) -> String {
+    let word = |name: &str, prefix: &str| name.trim_start_matches(prefix).to_lowercase().replace('_', "-");
+    let fault = reported.fault.as_ref().map(|fault| format!("fault {}", fault.code));
+    let stop = reported.hardware_stop();
+    let stopped = stop > link::HardwareStop::None;
+    let stopped = stopped.then(|| format!("own stop {}", word(stop.as_str_name(), "HARDWARE_STOP_")));
+    let level = reported.stop_level();
+    let halted = level > link::StopLevel::None;
+    let halted = halted.then(|| format!("stop {}", word(level.as_str_name(), "STOP_LEVEL_")));
+    let mode = reported.mode();
+    let driven = mode > link::Mode::Automatic;
+    let driven = driven.then(|| word(mode.as_str_name(), "MODE_"));
+    let waits = !reported.awaiting_resume.is_empty();
+    let waits = waits.then(|| "awaits resume".to_owned());
+    let all: Vec<String> = [fault, stopped, halted, driven, waits].into_iter().flatten().collect();
+    if all.is_empty() { "ok".to_owned() } else { all.join(", ") }
 }
 
 /// Whether it is heard; with a star if only its launcher is, which nobody proves.
@@ -490,4 +510,26 @@ async fn explain(one: &One, out: &Out) -> Result<(), Exit> {
         text
     })?;
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_robot_is_listed_with_its_fault_its_stops_and_its_mode() {
+        assert_eq!(state(&link::ReportedState::default()), "ok");
+        let fault = midshift_proto::common::v1::Fault { code: 2001, ..Default::default() };
+        let reported = link::ReportedState {
+            fault: Some(fault),
+            hardware_stop: link::HardwareStop::Remote as i32,
+            stop_level: link::StopLevel::Halt as i32,
+            mode: link::Mode::Manual as i32,
+            awaiting_resume: vec!["STOP-1".to_owned()],
+            ..link::ReportedState::default()
+        };
+        assert_eq!(state(&reported), "fault 2001, own stop remote, stop halt, manual, awaits resume");
+        let robot = v1::Robot { reported: Some(reported), ..v1::Robot::default() };
+        assert_eq!(row(&robot).len(), HEADER.len());
+    }
 }

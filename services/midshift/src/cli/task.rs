@@ -296,6 +296,11 @@ pub enum As {
 }
 
 impl As {
+    /// The word for an answer on the wire, as `--as` takes it.
+    fn word(answer: v1::Resolution) -> Option<String> {
+        let known = Self::value_variants().iter().find(|word| word.wire() == answer)?;
+        Some(known.to_possible_value()?.get_name().to_owned())
+    }
     fn wire(self) -> v1::Resolution {
         match self {
             Self::Requeue => v1::Resolution::Requeue,
@@ -603,12 +608,9 @@ async fn get(one: &One, out: &Out) -> Result<(), Exit> {
         if let Some(reason) = &task.reason {
             text += &format!("  {}: {}\n", reason.code, plain(&reason.message));
         }
-        let done = task
-            .allowed_resolutions()
-            .map(|r| r.as_str_name().trim_start_matches("RESOLUTION_").to_lowercase().replace('_', "-"));
-        let allowed = done.collect::<Vec<_>>().join(", ");
+        let allowed = task.allowed_resolutions().filter_map(As::word).collect::<Vec<_>>().join(", ");
         if !allowed.is_empty() {
-            text += &format!("  a person may answer: {allowed}\n");
+            text += &format!("  a person may answer: midshift task resolve {} --as {allowed}\n", task.task_id);
         }
         for attempt in &answer.attempts {
             let name = attempt.state().as_str_name().trim_start_matches("ATTEMPT_STATE_");
@@ -768,6 +770,16 @@ async fn until_over(call: &Call, task_id: &str, mut told: String, out: &Out) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn each_answer_that_a_task_allows_is_told_by_the_word_that_the_command_takes() {
+        use clap::ValueEnum;
+        for number in 1.. {
+            let Ok(answer) = super::v1::Resolution::try_from(number) else { break };
+            let word = super::As::word(answer).expect("a word");
+            assert_eq!(super::As::from_str(&word, false).map(super::As::wire), Ok(answer), "{word}");
+        }
+    }
 
     #[test]
     fn an_ambiguous_beginning_lists_its_candidates_and_says_whether_these_are_all() {
