@@ -13,7 +13,7 @@ use midshift_agent::enrolment::Enrolled;
 use midshift_agent::tls::Tls;
 use midshift_core::reason::Code;
 use midshift_core::robot::StopLevel;
-use midshift_core::site::{DEMO, Site, text};
+use midshift_core::site::{CORRIDOR, DEMO, Site, text};
 use midshift_proto::identity::v1::CreateEnrolmentRequest;
 use midshift_proto::identity::v1::identity_service_client::IdentityServiceClient;
 use midshift_proto::stop::v1::GetStatusRequest;
@@ -24,6 +24,7 @@ use midshift_sim::journal::{self, Effect};
 use serde_json::Value;
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
+use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Command, Output};
 use std::time::Duration;
@@ -326,4 +327,30 @@ async fn doctor_looks_at_certificates_tokens_rights_and_for_the_stop_service() -
     let [(false, stop)] = of("stop")[..] else { anyhow::bail!("{found:?}") };
     ensure!(stop.contains("midshift stop serve"), "{stop}");
     Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_line_that_enrolls_a_robot_makes_a_machine_that_robot_as_a_shell_reads_it() -> anyhow::Result<()> {
+    let dir = folder()?;
+    let server = Server::start_on(dir.path(), CORRIDOR).await?;
+    let (address, site) = (server.address.to_string(), dir.path().join("a site.toml"));
+    std::fs::write(&site, CORRIDOR)?;
+    let site = site.to_str().context("a plain path")?;
+    let warned = call(&["robot", "enroll", "rbt-02", "--server", &address])?;
+    let warned = String::from_utf8_lossy(&warned.stderr).into_owned();
+    ensure!(warned.contains("corridor") && warned.contains("--site FILE"), "{warned}");
+    let output = call(&["robot", "enroll", "rbt-01", "--server", &address, "--site", site])?;
+    let printed = String::from_utf8(output.stdout)?;
+    let program = midshift()?;
+    let programs = program.parent().context("a folder")?;
+    let path = format!("{}:{}", programs.display(), std::env::var("PATH")?);
+    let mut shell = Command::new("sh");
+    shell.current_dir(dir.path()).env("PATH", path).args(["-c", printed.trim()]).process_group(0);
+    let robot = Running::start(&mut shell, &dir.path().join("robot.log"))?;
+    let heard = until("the robot", LIMIT, async || {
+        Ok(presence(server.address, "rbt-01").await.ok().filter(|(_, is_heard)| *is_heard).map(drop))
+    })
+    .await;
+    robot.signal_group("KILL")?;
+    heard
 }

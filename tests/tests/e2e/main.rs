@@ -10,6 +10,7 @@ macro_rules! say {
     }};
 }
 
+mod addressed;
 mod anybody;
 mod areas;
 mod audited;

@@ -3,18 +3,45 @@
 use super::client::{Call, Exit, unary};
 use super::out::Out;
 use crate::stop;
+use midshift_core::site::{self, text};
 use midshift_proto::convert::time_of;
 use midshift_proto::identity::v1;
 
+/// Which machine is to be which robot.
+#[derive(clap::Args)]
+pub struct Machine {
+    #[command(flatten)]
+    call: Call,
+    /// Its name.
+    robot_id: String,
+    /// Where robots dial in, host:port, if not at the server that is asked: of a site in several processes the door of robots.
+    #[arg(long, value_name = "ADDR")]
+    link_server: Option<String>,
+    /// Where machines are enrolled, host:port, if not at the server that is asked.
+    #[arg(long, value_name = "ADDR")]
+    identity_server: Option<String>,
+    /// The site file on the robot's machine, on which a simulated body lives. Without it the built-in demo site.
+    #[arg(long, value_name = "FILE")]
+    site: Option<String>,
+}
+
 /// Hands out a secret, and the line that uses it.
-pub async fn offer(call: &Call, robot_id: String, replace: bool, out: &Out) -> Result<(), Exit> {
-    let asked = v1::CreateEnrolmentRequest { robot_id: robot_id.clone(), replace };
+pub async fn offer(machine: Machine, replace: bool, out: &Out) -> Result<(), Exit> {
+    let call = &machine.call;
+    let asked = v1::CreateEnrolmentRequest { robot_id: machine.robot_id.clone(), replace };
     let offered = call.identity().await?.create_enrolment(unary(asked)).await?.into_inner();
-    let (server, mut stop_server) = (call.address()?, call.resolved()?.stop_server);
-    if stop_server.is_none() {
-        stop_server = call.resolved()?.site().await.and_then(|said| said.unusual_stop_server(&server));
+    let resolved = call.resolved()?;
+    let (server, said) = (call.address()?, resolved.site().await);
+    let unusual = || said.as_ref().and_then(|said| said.unusual_stop_server(&server));
+    let stop_server = resolved.stop_server.clone().or_else(unusual);
+    let line = || machine.line(&server, stop_server.as_deref(), &offered.secret);
+    out.one(&offered, &offered.secret, line)?;
+    let other_site = said.map(|said| said.site_id).filter(|site_id| machine.site.is_none() && !is_demo(site_id));
+    if let Some(site_id) = other_site {
+        out.say(&format!(
+            "warning: a simulated body lives on the built-in demo site, and this one is {site_id}; --site FILE puts its file into the line"
+        ));
     }
-    out.one(&offered, &offered.secret, || line(&robot_id, &server, stop_server.as_deref(), &offered.secret))?;
     let until = offered.expire_time.as_ref().map_or_else(String::new, |time| time_of(time).rfc3339());
     if is_loopback(&server) {
         out.say(&format!(
@@ -31,12 +58,32 @@ fn is_loopback(server: &str) -> bool {
     host.starts_with("127.") || host.starts_with("localhost:") || host.starts_with("[::1]")
 }
 
-/// What is run on the robot by a shell: the secret goes by the environment, where other users of the machine do not see it. Where stops are is said if it is not the usual port of the server.
-fn line(robot_id: &str, server: &str, stop_server: Option<&str>, secret: &str) -> String {
-    let stops = stop_server.map_or_else(String::new, |address| format!(" --stop-server {address}"));
-    format!(
-        "MIDSHIFT_ENROLL={secret} midshift agent run --robot-id {robot_id} --server {server}{stops} --data midshift-{robot_id}"
-    )
+fn is_demo(site_id: &str) -> bool {
+    text::parse(site::DEMO).is_ok_and(|demo| demo.site_id().as_str() == site_id)
+}
+
+impl Machine {
+    /// What is run on the robot by a shell: the secret goes by the environment, where other users of the machine do not see it. Where stops are is said if it is not
+    /// the usual port of the server, and where identities are if robots dial in elsewhere.
+    fn line(&self, server: &str, stop_server: Option<&str>, secret: &str) -> String {
+        let robot_id = &self.robot_id;
+        let link = self.link_server.as_deref().unwrap_or(server);
+        let identity = self.identity_server.as_deref().unwrap_or(server);
+        let identity = (identity != link).then_some(identity);
+        let more = [("--identity-server", identity), ("--stop-server", stop_server), ("--site", self.site.as_deref())];
+        let more: String =
+            more.iter().filter_map(|(flag, word)| Some(format!(" {flag} {}", quoted((*word)?)))).collect();
+        let link = quoted(link);
+        format!(
+            "MIDSHIFT_ENROLL={secret} midshift agent run --robot-id {robot_id} --server {link}{more} --data midshift-{robot_id}"
+        )
+    }
+}
+
+/// A word as a shell takes it.
+fn quoted(word: &str) -> String {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./:@[]".contains(c);
+    if word.chars().all(is_plain) { word.to_owned() } else { format!("'{}'", word.replace('\'', r"'\''")) }
 }
 
 /// Takes a robot's key out.
@@ -80,26 +127,44 @@ pub async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
 
 #[cfg(test)]
 mod tests {
-    use super::line;
+    use super::{Call, Machine, quoted};
     use crate::robots::AgentRun;
     use clap::{Args, FromArgMatches};
 
+    fn machine() -> Machine {
+        let call = Call::to("hub:7420".to_owned());
+        Machine { call, robot_id: "r7".to_owned(), link_server: None, identity_server: None, site: None }
+    }
+
     #[test]
     fn the_line_of_a_robot_is_taken_as_it_is_printed() {
-        let printed = line("r7", "hub:7420", Some("hub:18421"), "mse.ID.SECRET.DIGEST");
+        let machine =
+            Machine { link_server: Some("hub:7401".to_owned()), site: Some("/etc/hall.toml".to_owned()), ..machine() };
+        let printed = machine.line("hub:7402", Some("hub:18421"), "mse.ID.SECRET.DIGEST");
         let (secret, words) = printed.split_once(" midshift agent run ").expect("an assignment and a command");
         let command = AgentRun::augment_args(clap::Command::new("run"));
         let variable = command.get_arguments().find(|a| a.get_id() == "enroll").and_then(clap::Arg::get_env);
         assert_eq!(variable.and_then(|name| name.to_str()), secret.strip_suffix("=mse.ID.SECRET.DIGEST"));
         let taken = command.try_get_matches_from(["run"].into_iter().chain(words.split(' ')));
         let taken = AgentRun::from_arg_matches(&taken.expect("words that are known")).expect("its arguments");
-        assert_eq!((taken.robot_id.as_str(), taken.server.as_str()), ("r7", "hub:7420"));
+        assert_eq!((taken.robot_id.as_str(), taken.server.as_str()), ("r7", "hub:7401"));
+        assert_eq!(taken.identity.identity_server.as_deref(), Some("hub:7402"));
+        assert_eq!(taken.site, Some("/etc/hall.toml".into()));
         assert_eq!(taken.stop.stop_server.as_deref(), Some("hub:18421"));
     }
 
     #[test]
     fn the_line_of_a_robot_says_where_stops_are_if_its_site_has_them_elsewhere() {
-        assert!(!line("r7", "hub:7420", None, "s").contains("--stop-server"));
-        assert!(line("r7", "hub:7420", Some("hub:18421"), "s").contains(" --server hub:7420 --stop-server hub:18421 "));
+        assert!(!machine().line("hub:7420", None, "s").contains("--stop-server"));
+        let printed = machine().line("hub:7420", Some("hub:18421"), "s");
+        assert!(printed.contains(" --server hub:7420 --stop-server hub:18421 "), "{printed}");
+    }
+
+    #[test]
+    fn a_word_with_a_blank_or_a_quote_is_one_word_of_the_shell() {
+        for word in ["plain-1.toml", "my hall.toml", "it's", "$HOME"] {
+            let echoed = std::process::Command::new("sh").args(["-c", &format!("printf %s {}", quoted(word))]).output();
+            assert_eq!(echoed.expect("a shell").stdout, word.as_bytes(), "{word}");
+        }
     }
 }

@@ -1,7 +1,7 @@
 //! `midshift robot …`
 
 use super::client::{Call, Change, Exit, ended, follow, unary};
-use super::enrol;
+use super::enrol::{self, Machine};
 use super::out::{Format, Out, plain};
 use super::rollout;
 use clap::Subcommand;
@@ -131,9 +131,9 @@ pub enum Verb {
         change: Change,
     },
     /// Let a machine become this robot: prints the line to run on it, with a secret for one use within an hour.
-    Enroll(One),
+    Enroll(Machine),
     /// Let another machine take this robot's place: the old one's key is worth nothing as soon as the new one is enrolled.
-    Replace(One),
+    Replace(Machine),
     /// Take the robot's key out: it is cut off, and let in nowhere until it is enrolled anew.
     Revoke(One),
     /// Which robots are enrolled, and until when their certificates are good.
@@ -172,8 +172,8 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Get(one) => get(&one, out).await,
         Verb::Watch { call, ids, period } => watch(&call, ids, period, out).await,
         Verb::Explain(one) => explain(&one, out).await,
-        Verb::Enroll(one) => enrol::offer(&one.call, one.robot_id, false, out).await,
-        Verb::Replace(one) => enrol::offer(&one.call, one.robot_id, true, out).await,
+        Verb::Enroll(machine) => enrol::offer(machine, false, out).await,
+        Verb::Replace(machine) => enrol::offer(machine, true, out).await,
         Verb::Revoke(one) => enrol::revoke(&one.call, one.robot_id, out).await,
         Verb::Identities { call } => enrol::list(&call, out).await,
         Verb::Cordon { one, reason, if_match, change } => {
