@@ -479,8 +479,8 @@ impl Call {
 
 /// Waits for any word. In plain text a connection stands as soon as the system has taken it, whether a program looks at it or not.
 async fn says_something(line: Line) -> std::io::Result<()> {
-    let asked = HealthClient::new(line).check(HealthCheckRequest::default());
-    match tokio::time::timeout(SAID_WITHIN, asked).await {
+    let mut health = HealthClient::new(line);
+    match tokio::time::timeout(SAID_WITHIN, health.check(HealthCheckRequest::default())).await {
         Ok(_) => Ok(()),
         Err(_) => Err(ErrorKind::TimedOut.into()),
     }

@@ -6,6 +6,7 @@ use super::out::{Format, Out, plain};
 use super::rollout;
 use clap::Subcommand;
 use midshift_core::time::Utc;
+use midshift_proto::common::v1::StopLevel;
 use midshift_proto::fleet::v1 as fleet;
 use midshift_proto::json;
 use midshift_proto::link::v1 as link;
@@ -358,10 +359,10 @@ fn state(reported: &link::ReportedState) -> String {
     let word = |name: &str, prefix: &str| name.trim_start_matches(prefix).to_lowercase().replace('_', "-");
     let fault = reported.fault.as_ref().map(|fault| format!("fault {}", fault.code));
     let stop = reported.hardware_stop();
-    let stopped = stop > link::HardwareStop::None;
+    let stopped = stop > link::HardwareStop::Unspecified;
     let stopped = stopped.then(|| format!("own stop {}", word(stop.as_str_name(), "HARDWARE_STOP_")));
     let level = reported.stop_level();
-    let halted = level > link::StopLevel::None;
+    let halted = level > StopLevel::Unspecified;
     let halted = halted.then(|| format!("stop {}", word(level.as_str_name(), "STOP_LEVEL_")));
     let mode = reported.mode();
     let driven = mode > link::Mode::Automatic;
@@ -523,7 +524,7 @@ mod tests {
         let reported = link::ReportedState {
             fault: Some(fault),
             hardware_stop: link::HardwareStop::Remote as i32,
-            stop_level: link::StopLevel::Halt as i32,
+            stop_level: StopLevel::Halt as i32,
             mode: link::Mode::Manual as i32,
             awaiting_resume: vec!["STOP-1".to_owned()],
             ..link::ReportedState::default()
