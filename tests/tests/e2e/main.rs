@@ -55,5 +55,6 @@ mod stopped_release;
 mod story;
 mod swarm_software;
 mod tuf;
+mod two_of_each;
 mod unheard;
 mod watched;

@@ -1,6 +1,7 @@
 //! A stop service by itself: it works when nobody takes what it says, the next one is there before it ends, and `serve` has it there again when it is gone.
 
 use crate::harness::{Running, channel, folder, free_port, midshift, same_site, sign_in_to, until};
+use crate::rolled_out::call;
 use anyhow::{Context, ensure};
 use midshift_core::reason::Code;
 use midshift_core::site::DEMO;
@@ -257,7 +258,14 @@ async fn a_stop_service_that_hangs_is_replaced_with_what_is_engaged_and_a_person
     sign_in_to(address, dir.path().join("data/identity/ca.pem"), &token).await?;
     same_site(address, stop_address)?;
     let first = children.next(STARTED, &BTreeSet::new()).await?;
-    let stop_id = engage(&mut StopServiceClient::new(channel(stop_address)?)).await?;
+    let at = stop_address.to_string();
+    let printed = until("an answer", LIMIT, async || {
+        let engage = ["stop", "--all", "--stop-server", &at, "--reason", "drill", "--no-wait", "-o", "name"];
+        let printed = String::from_utf8(tokio::task::block_in_place(|| call(&engage))?.stdout)?;
+        Ok((!printed.trim().is_empty()).then_some(printed))
+    })
+    .await?;
+    let stop_id = printed.trim().to_owned();
     signal("STOP", first)?;
     let second = children.next(STARTED, &BTreeSet::from([first])).await?;
     says(&log, "its process is ended").await?;
@@ -280,14 +288,9 @@ async fn a_stop_service_that_hangs_is_replaced_with_what_is_engaged_and_a_person
     let known = BTreeSet::from([first, second]);
     ensure!(children.all(STARTED) == known, "{:?}", children.all(STARTED));
     signal("CONT", second)?;
-    reset(&mut StopServiceClient::new(way_to(stop_address).await?), &stop_id).await
-}
-
-/// The way to one with login, as soon as it answers.
-async fn way_to(address: SocketAddr) -> anyhow::Result<Channel> {
-    until("an answer", LIMIT, async || {
-        let asked = StopServiceClient::new(channel(address)?).get_status(v1::GetStatusRequest {}).await;
-        Ok(asked.is_ok().then_some(channel(address)?))
+    until("it to be reset", LIMIT, async || {
+        let reset = ["stop", "reset", &stop_id, "--stop-server", &at, "--reason", "all clear"];
+        Ok(tokio::task::block_in_place(|| call(&reset))?.status.success().then_some(()))
     })
     .await
 }
