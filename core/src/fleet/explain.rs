@@ -159,13 +159,22 @@ pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Optio
     Some(RobotExplanation { verdict, candidates: candidates.collect() })
 }
 
-/// The robot carries what is of no task that waits for it.
+/// The robot carries what is of no task that waits for it, or of one that waits for a person.
 fn carries(view: &View, board: &Board, robot_id: &RobotId) -> Option<Reason> {
     let load = board.get(robot_id)?.report.load.as_ref()?;
-    let waits = |id: &TaskId| view.task(id).is_some_and(|task| task.opened.as_ref().is_none_or(|r| r == robot_id));
-    if load.task_id.as_ref().is_some_and(waits) {
+    let task = load.task_id.as_ref().and_then(|id| view.task(id));
+    let asks = task.is_some_and(|task| task.phase == Phase::NeedsOperator);
+    if !asks && task.is_some_and(|task| task.opened.as_ref().is_none_or(|r| r == robot_id)) {
         return None;
     }
-    let reason = Reason::from(Code::RobotLoaded).with("item", &load.item);
+    let reason = match task.filter(|_| asks) {
+        Some(task) => {
+            let told = format!("The robot carries an item of task {}, which waits for a person's word.", task.task_id);
+            let resolve = format!("a person: midshift task resolve {}", task.task_id);
+            Reason::new(Code::RobotLoaded, told).with(WAITS_FOR, resolve)
+        }
+        None => Reason::from(Code::RobotLoaded),
+    };
+    let reason = reason.with("item", &load.item);
     Some(load.task_id.iter().fold(reason, |reason, task_id| reason.with("task_id", task_id)))
 }

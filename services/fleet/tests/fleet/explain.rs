@@ -1,6 +1,6 @@
 //! Why not: each case has a reason that names what is in the way.
 
-use crate::harness::World;
+use crate::harness::{World, jam};
 use midshift_core::fleet::rows::HolderState;
 use midshift_core::reason::Code;
 use midshift_core::robot::{HardwareStop, Load, Mode};
@@ -169,6 +169,21 @@ async fn a_robot_with_a_load_of_nobody_waits_for_a_person() {
     let told = of_robot(&w, "r1").await;
     assert_eq!((told.code.as_str(), told.metadata["waits_for"].as_str()), ("ROBOT_LOADED", "a person at robot r1"));
     assert_eq!(told.metadata["item"], "a box of somebody");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_with_an_item_of_a_task_that_needs_a_person_waits_for_that_word() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").fails = Some((2, jam()));
+    w.submit("T1", "A", "B").await;
+    w.until_phase("T1", Phase::NeedsOperator).await;
+    let uncordon = v1::UncordonRobotRequest { robot_id: "r1".to_owned(), ..Default::default() };
+    w.fleet.uncordon_robot(Request::new(uncordon)).await.expect("uncordoned");
+    w.pass(10).await;
+    let told = of_robot(&w, "r1").await;
+    let waits_for = told.metadata["waits_for"].as_str();
+    assert_eq!((told.code.as_str(), waits_for), ("ROBOT_LOADED", "a person: midshift task resolve T1"));
 }
 
 #[tokio::test(start_paused = true)]
