@@ -34,6 +34,7 @@ fn a_robot_that_drives_by_another_map_gets_no_work_until_it_has_ours_and_a_perso
     let drives_by = |rig: &mut Rig, map: &str| {
         let live = Arc::make_mut(rig.board.get_mut(&robot_id).expect("heard"));
         live.report.map_version = map.to_owned();
+        live.report.applied_work = rig.view.desired_work.get("r1").map_or(0, |desired| desired.row.generation);
         rig.pass(1_000);
         rig.cycle(Pace::Sweep);
         rig.cycle(Pace::Sweep);
@@ -46,9 +47,18 @@ fn a_robot_that_drives_by_another_map_gets_no_work_until_it_has_ours_and_a_perso
     drives_by(&mut rig, "0");
     assert_eq!(rig.view.held_by(&robot_id), None, "it gets no work");
     assert_eq!(told(&rig), [true]);
-    drives_by(&mut rig, "");
-    assert!(rig.view.held_by(&robot_id).is_some(), "one that goes by points alone works");
-    assert_eq!(told(&rig), [false]);
+    drives_by(&mut rig, "1");
+    assert!(rig.view.held_by(&robot_id).is_some(), "it works");
     drives_by(&mut rig, "1");
     assert_eq!(told(&rig), [false]);
+}
+
+#[test]
+fn a_robot_that_goes_by_points_alone_works_and_nobody_is_told() {
+    let mut rig = Rig::new();
+    rig.robot("r1", "park-a");
+    rig.submit("T1", |_| {});
+    rig.cycle(Pace::Sweep);
+    assert!(rig.view.held_by(&RobotId::parse("r1").expect("an id")).is_some());
+    assert!(rig.view.incidents.is_empty());
 }
