@@ -13,6 +13,7 @@ use crate::reason::{Code, Reason};
 use crate::site::{Site, WaypointIx};
 use crate::time::Now;
 use crate::work::{Live, RoutePoint};
+use std::collections::BTreeMap;
 
 /// Names of one kind that an incident lists; of more it says how many.
 const LISTED_MAX: usize = 16;
@@ -26,6 +27,17 @@ pub enum Obstacle {
     Robot(RobotId),
     /// It is held, and the map has it elsewhere, smaller, or not at all.
     Place(PlaceId),
+}
+
+impl Obstacle {
+    /// Its kind and its name.
+    fn named(&self) -> (&'static str, String) {
+        match self {
+            Self::Task(id) => ("tasks", id.to_string()),
+            Self::Robot(id) => ("robots", id.to_string()),
+            Self::Place(id) => ("places", id.to_string()),
+        }
+    }
 }
 
 /// What became of the map that a process was started with.
@@ -134,20 +146,15 @@ pub(super) fn tell(view: &mut View, now: Now, change: &MapChange, plan: &mut Pla
 
 fn not_taken(stored: &Site, version: &str, obstacles: &[Obstacle]) -> Reason {
     let reason = Reason::from(Code::MapNotTaken).with("map_version", version).with("stored", stored.map_version());
-    let kinds: [(&str, fn(&Obstacle) -> Option<String>); 3] = [
-        ("tasks", |o| if let Obstacle::Task(id) = o { Some(id.to_string()) } else { None }),
-        ("robots", |o| if let Obstacle::Robot(id) = o { Some(id.to_string()) } else { None }),
-        ("places", |o| if let Obstacle::Place(id) = o { Some(id.to_string()) } else { None }),
-    ];
-    kinds.into_iter().fold(reason, |reason, (kind, name)| {
-        let names: Vec<String> = obstacles.iter().filter_map(name).collect();
-        match names.len() {
-            0 => reason,
-            many if many > LISTED_MAX => {
-                reason.with(kind, format!("{} and {} more", names[..LISTED_MAX].join(" "), many - LISTED_MAX))
-            }
-            _ => reason.with(kind, names.join(" ")),
-        }
+    let mut named: BTreeMap<&str, Vec<String>> = BTreeMap::new();
+    for obstacle in obstacles {
+        let (kind, name) = obstacle.named();
+        named.entry(kind).or_default().push(name);
+    }
+    named.into_iter().fold(reason, |reason, (kind, names)| {
+        let more = names.len().saturating_sub(LISTED_MAX);
+        let listed = names.into_iter().take(LISTED_MAX).collect::<Vec<_>>().join(" ");
+        reason.with(kind, if more == 0 { listed } else { format!("{listed} and {more} more") })
     })
 }
 

@@ -7,6 +7,9 @@ use crate::reason::Code;
 use crate::robot::{FAULT_JAM, Fault, FaultClass, HardwareStop, Mode, ReportedState};
 use std::sync::Arc;
 
+/// A change of what a robot says.
+type Change<'a> = &'a dyn Fn(&mut ReportedState);
+
 /// Open incidents after so many seconds.
 fn open_after(rig: &mut Rig, secs: u64) -> Vec<Code> {
     let mut plan = Plan::default();
@@ -21,7 +24,7 @@ fn open_after(rig: &mut Rig, secs: u64) -> Vec<Code> {
 #[test]
 fn a_stop_manual_mode_and_a_jam_that_last_a_minute_are_incidents_until_they_are_over() {
     let jam = Fault { code: FAULT_JAM, class: FaultClass::Mechanical, message: String::new() };
-    let says: [(Code, &dyn Fn(&mut ReportedState)); 3] = [
+    let says: [(Code, Change<'_>); 3] = [
         (Code::RobotStopped, &|report| report.hardware_stop = HardwareStop::Manual),
         (Code::RobotManual, &|report| report.mode = Mode::Manual),
         (Code::RobotFault, &|report| report.fault = Some(jam.clone())),
