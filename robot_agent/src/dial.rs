@@ -38,6 +38,15 @@ const UNSENT_BYTES: u32 = 16 * 1024;
 #[error("dialing the server: {0}")]
 pub struct Error(pub Box<dyn std::error::Error + Send + Sync>);
 
+impl Error {
+    /// Every cause, the outermost first.
+    pub fn causes(&self) -> String {
+        let first: &(dyn std::error::Error + 'static) = &*self.0;
+        let all = std::iter::successors(Some(first), |error| (*error).source());
+        all.map(ToString::to_string).collect::<Vec<_>>().join(": ")
+    }
+}
+
 /// Makes connections to the server. Implemented here over TCP, and by simulations over their own network.
 #[async_trait]
 pub trait Dial: Send + Sync {

@@ -433,7 +433,7 @@ impl Agent {
 
     fn dial_now(&mut self) {
         let dial = self.lines.link.clone();
-        self.way = Way::Dialing(Box::pin(async move { dial.dial().await.map_err(|e| e.to_string()) }));
+        self.way = Way::Dialing(Box::pin(async move { dial.dial().await.map_err(|e| e.causes()) }));
     }
 
     fn greet(&mut self, channel: Channel) {

@@ -16,7 +16,7 @@ fn moved() -> anyhow::Result<String> {
 /// Incidents that are open, as the command line prints them.
 async fn incidents(server: &Server) -> anyhow::Result<String> {
     let address = server.address.to_string();
-    let output = call(&["incident", "ls", "--server", &address])?;
+    let output = call(&["incident", "ls", "--server", &address, "-o", "json"])?;
     ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     Ok(String::from_utf8_lossy(&output.stdout).into_owned())
 }

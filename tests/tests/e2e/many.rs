@@ -45,7 +45,7 @@ async fn lists_flags_and_verbs_of_many_tasks_do_what_they_say() -> anyhow::Resul
     let flagged = at(&["task", "submit", "--to", "A01", "--task-id", "FLAGGED", "--schedule-to-start", "90m"]);
     done(&words(&flagged))?;
     let read = printed(&words(&at(&["task", "get", "FLAGGED"])))?;
-    ensure!(read["spec"]["scheduleToStartTimeout"] == "5400s", "{read}");
+    ensure!(read["task"]["spec"]["scheduleToStartTimeout"] == "5400s", "{read}");
 
     // The one that may wait for a second goes to a person; the others wait on.
     let asks = crate::harness::until("a person to be asked", crate::room::LIMIT, async || {
