@@ -128,11 +128,7 @@ impl Plan {
     }
 
     /// Adds a decision that was made. False: it was given up, since the store would never take it.
-    pub fn keep(&mut self, mut tx: Tx) -> bool {
-        if tx.is_unknown() {
-            tx.take_back();
-            return false;
-        }
+    pub fn keep(&mut self, tx: Tx) -> bool {
         let is_aside = tx.view.refused.keeps_any() && tx.view.refused.is_aside(&tx.outline());
         if !is_aside && !tx.is_too_large() {
             let item = tx.finish();
@@ -322,7 +318,7 @@ pub fn found(view: &mut View, now: Now, site_text: &str, map: &maps::MapChange, 
     for chunk in site.places().chunks(128) {
         plan.decide(view, now, "fleet", |tx| {
             for place in chunk {
-                if site_has(tx.view, place) || tx.view.unknown_rows.is_place_aside(&place.place_id) {
+                if site_has(tx.view, place) {
                     continue;
                 }
                 let known = tx.view.places.get(place.place_id.as_str()).map(|p| p.row.clone());

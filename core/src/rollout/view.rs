@@ -18,7 +18,6 @@ use crate::robot::{Duty, Lane, Presence};
 use crate::rows::{BadRow, Key, Revision, Row, Seq, Table, Writer};
 use crate::site::Site;
 use crate::time::{LinkTime, Now};
-use crate::unknown_rows::UnknownRows;
 use crate::update::DesiredUpdate;
 use crate::work::{LaneMark, Live, Session};
 use std::collections::{BTreeMap, BTreeSet};
@@ -92,8 +91,6 @@ pub struct View {
     pub contacts: BTreeMap<RobotId, Contact>,
     /// Nothing can be signed for robots at this moment. Volatile: known where directives are signed, at the last cycle.
     pub keyless: bool,
-    /// Rows with a value of a newer version.
-    pub unknown_rows: UnknownRows,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: super::bugs::Bugs,
 }
@@ -109,9 +106,6 @@ pub struct Contact {
 
 impl Picture for View {
     const WRITER: Writer = Writer::Ota;
-    fn unknown_rows(&mut self) -> &mut UnknownRows {
-        &mut self.unknown_rows
-    }
 }
 
 macro_rules! viewed {
@@ -288,7 +282,6 @@ impl View {
             served: OtaClock::default(),
             contacts: BTreeMap::new(),
             keyless: false,
-            unknown_rows: UnknownRows::default(),
             bugs: super::bugs::Bugs::default(),
         }
     }

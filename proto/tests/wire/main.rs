@@ -8,4 +8,3 @@ mod link;
 mod privacy;
 mod task;
 mod telemetry;
-mod unknown;

@@ -33,5 +33,4 @@ mod stops;
 mod turns;
 mod twins;
 mod uncertain;
-mod unknown;
 mod waiting;
