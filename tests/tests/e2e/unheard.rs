@@ -6,7 +6,7 @@ use crate::kill::{all_over, at_work, judge, submit};
 use crate::proxy::Proxy;
 use crate::robots::Robots;
 use crate::rolled_out::{call, done};
-use crate::stopped::{StopServer, judge_stops, until_held};
+use crate::stopped::StopServer;
 use anyhow::{Context, ensure};
 use midshift_core::robot::StopLevel;
 use midshift_core::site::{DEMO, text};
@@ -14,8 +14,6 @@ use midshift_proto::common::v1::StopLevel as Shown;
 use midshift_proto::stop::v1::GetStatusRequest;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
 use midshift_proto::task::v1::TaskState;
-use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
-use midshift_proto::telemetry::v1::{ListRobotsRequest, Robot as RobotView};
 use midshift_sim::journal::{self, Effect};
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -143,34 +141,4 @@ async fn a_robot_that_nobody_hears_for_twenty_seconds_works_on_and_one_among_peo
     })
     .await?;
     until("it is let go", LIMIT, async || Ok((obeyed(&among)?.last() == Some(&StopLevel::None)).then_some(()))).await
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn robots_whose_stop_line_is_cut_hear_of_a_stop_by_their_sessions_and_stand_until_they_are_resumed()
--> anyhow::Result<()> {
-    let dir = folder()?;
-    let site = text::parse(DEMO)?;
-    let server = Server::start(dir.path()).await?;
-    let stops = StopServer::start(dir.path(), server.address).await?;
-    let (line, address) = (Proxy::before(stops.address).await?, server.address);
-    let robots = Robots::start_beside(dir.path(), address, address, Some(line.address), &site, 2).await?;
-    submit(address, &site, 7, TASKS).await?;
-    at_work(address, 1, &BTreeSet::new()).await?;
-    line.sever();
-    // Nobody can confirm it on a line; fleet hears of it from the robots' sessions.
-    let engage = ["stop", "--all", "--stop-server", &stops.address.to_string(), "--reason", "drill", "--no-wait"];
-    let output = tokio::task::block_in_place(|| call(&[&engage[..], &["-o", "name"]].concat()))?;
-    let stop_id = String::from_utf8(output.stdout)?.trim().to_owned();
-    until("the stop in what every robot says", LIMIT, async || {
-        let mut client = TelemetryServiceClient::new(channel(address)?);
-        let robots = client.list_robots(ListRobotsRequest::default()).await?.into_inner().robots;
-        let says = |robot: &RobotView| robot.reported.as_ref().is_some_and(|said| said.stops.contains(&stop_id));
-        Ok((robots.len() == 2 && robots.iter().all(says)).then_some(()))
-    })
-    .await?;
-    until_held(address, &robots.ids(), &format!("stop:{stop_id}")).await?;
-    judge_stops(robots.journals())?;
-    stops.reset(&stop_id)?;
-    line.mend();
-    until_held(address, &robots.ids(), &format!("resume:{stop_id}")).await
 }

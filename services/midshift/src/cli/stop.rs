@@ -308,8 +308,14 @@ impl Told {
             .or_try("midshift stop status")
     }
 
+    /// Whether nobody waits for this robot's word any more: a stop of one robot waits for that one alone.
     fn is_settled(&self, robot: &v1::RobotStop) -> bool {
         use v1::Confirmation as C;
+        if let Some(v1::scope::Scope::RobotId(meant)) = self.stop.scope.as_ref().and_then(|s| s.scope.as_ref())
+            && *meant != robot.robot_id
+        {
+            return true;
+        }
         match robot.confirmation() {
             C::StandstillConfirmed | C::Outside => true,
             C::Acked => self.stop.level() == StopLevel::Slow,
