@@ -362,7 +362,8 @@ fn is_late(status: &Status) -> bool {
 
 /// What plain text hears of a port that speaks TLS.
 fn has_broken_off(status: &Status) -> bool {
-    status.message().starts_with("h2 protocol error") || status.message() == "operation was canceled"
+    let said = status.message();
+    said.starts_with("h2 protocol error") || ["operation was canceled", "transport error"].contains(&said)
 }
 
 /// The connection is gone, and with it what the answer would have been.

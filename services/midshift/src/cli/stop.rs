@@ -311,7 +311,7 @@ impl Told {
     /// Whether nobody waits for this robot's word any more: a stop of one robot waits for that one alone.
     fn is_settled(&self, robot: &v1::RobotStop) -> bool {
         use v1::Confirmation as C;
-        if let Some(v1::scope::Scope::RobotId(meant)) = self.stop.scope.as_ref().and_then(|s| s.scope.as_ref())
+        if let Some(Scope::RobotId(meant)) = self.stop.scope.as_ref().and_then(|s| s.scope.as_ref())
             && *meant != robot.robot_id
         {
             return true;
