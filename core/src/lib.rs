@@ -28,5 +28,6 @@ pub mod site;
 pub mod stop;
 pub mod task;
 pub mod time;
+pub mod unknown_rows;
 pub mod update;
 pub mod work;

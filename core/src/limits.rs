@@ -93,6 +93,8 @@ pub const SUBMIT_SLICE: usize = 500;
 /// Bytes of one SubmitTasks call that are read ahead of what is committed. HTTP/2 ends a connection with some 2,600 unread frames
 /// of less than 256 bytes each; 10,000 such items fit here, larger ones are held back by flow control.
 pub const SUBMIT_AHEAD_BYTES: u32 = 4 * 1024 * 1024;
+/// Name of a reason code that comes in a message, bytes: twice the longest of ours, since a newer version may have longer ones.
+pub const CODE_BYTES_MAX: usize = 64;
 /// A reason given by a person, bytes.
 pub const REASON_BYTES_MAX: usize = 256;
 /// Parameters of one action as JSON, bytes.
@@ -160,6 +162,8 @@ pub const ROLLOUTS_OPEN_MAX: usize = 64;
 pub const ROLLOUTS_MAX: usize = 1_000;
 /// Incidents kept; the oldest go first, closed ones before open ones.
 pub const INCIDENTS_MAX: usize = 10_000;
+/// Open incidents with one code that the words of one robot make.
+pub const INCIDENTS_OF_ROBOT_MAX: usize = 8;
 /// Rows one item may touch, and facts it may state.
 pub const ITEM_ROWS_MAX: usize = 256;
 /// Attempts, places, stops and resumes that a robot lists in one heartbeat, of each: as many as one item may touch rows.

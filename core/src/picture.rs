@@ -9,6 +9,7 @@ use crate::rows::{
     BadRow, Entry, Expect, Fact, Item, Key, Log, Record, Revision, Row, RowChange, Silent, Table, Write, Writer,
 };
 use crate::time::Now;
+use crate::unknown_rows::UnknownRows;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// A row with its revision.
@@ -27,6 +28,8 @@ pub type Slot<R> = BTreeMap<String, Rowed<R>>;
 pub trait Picture: 'static {
     /// Who decides on it.
     const WRITER: Writer;
+    /// Rows with a value of a newer version, which stand aside.
+    fn unknown_rows(&mut self) -> &mut UnknownRows;
 }
 
 /// A record that a picture keeps.
@@ -37,21 +40,30 @@ pub trait Viewed<P: Picture>: Record {
     fn changed(_picture: &mut P, _id: &str, _old: Option<&Self>) {}
 }
 
-/// Takes one row as the store has it; none: deleted. What the picture already has is passed over.
+/// Takes one row as the store has it; none: deleted. What the picture already has is passed over; a row with a value that is not known is kept
+/// aside.
 ///
 /// # Errors
-/// A body that is not what its table holds.
+/// A body that is damaged.
 pub fn take<P: Picture, R: Viewed<P>>(
     picture: &mut P,
     id: &str,
     revision: Revision,
     row: Option<&Row>,
 ) -> Result<(), BadRow> {
-    if R::slot(picture).get(id).is_some_and(|known| known.revision >= revision) {
+    let key = Key::new(R::TABLE, id);
+    let is_known = R::slot(picture).get(id).is_some_and(|known| known.revision >= revision);
+    if is_known || picture.unknown_rows().has(&key, revision) {
         return Ok(());
     }
-    let old = match row {
-        Some(row) => R::slot(picture).insert(id.to_owned(), Rowed { revision, row: row.decode()? }),
+    picture.unknown_rows().forget(&key);
+    let old = match row.map(|row| (row, row.decode())) {
+        Some((_, Ok(row))) => R::slot(picture).insert(id.to_owned(), Rowed { revision, row }),
+        Some((row, Err(error))) if error.is_unknown() => {
+            picture.unknown_rows().keep(row, &error);
+            R::slot(picture).remove(id)
+        }
+        Some((_, Err(error))) => return Err(error),
         None => R::slot(picture).remove(id),
     };
     R::changed(picture, id, old.as_ref().map(|r| &r.row));
@@ -206,6 +218,11 @@ impl<'a, P: Picture> Tx<'a, P> {
     /// What it is about.
     pub fn outline(&self) -> Outline {
         Outline::of(&self.item)
+    }
+    /// Whether it touches a row that is kept aside.
+    pub fn is_unknown(&mut self) -> bool {
+        let rows = self.item.rows.iter().map(|row| &row.key);
+        self.view.unknown_rows().touches(rows)
     }
     /// Whether it is larger than any store takes.
     pub fn is_too_large(&self) -> bool {

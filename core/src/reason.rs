@@ -37,9 +37,9 @@ pub enum Kind {
 macro_rules! codes {
     ($($variant:ident = $text:literal, $help:literal;)*) => {
         /// One reason, UPPER_SNAKE on the wire.
-        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
         pub enum Code {
-            $(#[doc = $help] #[serde(rename = $text)] $variant,)*
+            $(#[doc = $help] $variant,)*
         }
         impl Code {
             /// Every code.
@@ -57,6 +57,8 @@ macro_rules! codes {
 }
 
 codes! {
+    // --- of a newer version
+    Unknown = "UNKNOWN", "A newer version of midshift gave this reason. Its name is shown; that version's `midshift explain-error` explains it.";
     // --- answers to a caller
     InvalidRequest = "INVALID_REQUEST", "The request broke one or more rules; each is listed. Mend them all and send it again.";
     TaskNotFound = "TASK_NOT_FOUND", "No task has this id. Check the id, or list tasks.";
@@ -153,6 +155,7 @@ codes! {
     MapNotTaken = "MAP_NOT_TAKEN", "The site file has changed, and tasks, robots or held places are in the way of it, so the stored map goes on. Start the server again once they are not, or with --force-map.";
     MapForced = "MAP_FORCED", "A changed map was forced upon work that it does not fit. Look at the task, robot or place, and at what stands there.";
     MapDiffers = "MAP_DIFFERS", "The robot drives by another version of the site's map than the server plans on, so it gets no work. Give it the map of the server, or start the server with the new one.";
+    RowUnknown = "ROW_UNKNOWN", "A row holds a value of a newer version of midshift. It is left as it is, and what it is about is not acted on. Start that version again; what it wrote is whole.";
     DecisionPutAside = "DECISION_PUT_ASIDE", "The store refused the same decision twice, so it is not tried again and the robot or place it is about gets no work and no grant. The server's log has the details; close the incident to try once more.";
     ReportTooLong = "REPORT_TOO_LONG", "A list of the robot's heartbeat is longer than one may be. It is not processed, so the robot loses its authority; its maker must mend it.";
     ReportImplausible = "REPORT_IMPLAUSIBLE", "The robot reported a step or an end that cannot be. It frees nothing and moves nothing forward; the robot gets no work while it says so. Look at the robot's software.";
@@ -308,29 +311,67 @@ impl std::str::FromStr for Code {
     }
 }
 
-/// A code, a sentence and the facts behind it.
+/// A code, a sentence and the facts behind it. A code that this build does not know keeps its name in rows and on the wire.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "StoredReason", into = "StoredReason")]
 pub struct Reason {
-    /// The code.
+    /// The code; [`Code::Unknown`] for one of a newer version.
     pub code: Code,
     /// One plain sentence; empty means the code's help text.
-    #[serde(default, skip_serializing_if = "String::is_empty")]
     pub message: String,
     /// Ids, measured values, limits; at most 16.
-    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub metadata: BTreeMap<String, String>,
+    /// None: `code` names it.
+    unknown: Option<Box<UnknownCode>>,
+}
+
+/// Name of a code that this build does not know. Boxed: nearly every reason is without one, and each refusal carries a reason.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct UnknownCode(String);
+
+/// A reason as rows hold it.
+#[derive(Serialize, Deserialize)]
+struct StoredReason {
+    code: String,
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    message: String,
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    metadata: BTreeMap<String, String>,
+}
+
+impl From<StoredReason> for Reason {
+    fn from(stored: StoredReason) -> Self {
+        Self { message: stored.message, metadata: stored.metadata, ..Self::named(&stored.code) }
+    }
+}
+
+impl From<Reason> for StoredReason {
+    fn from(reason: Reason) -> Self {
+        Self { code: reason.name().to_owned(), message: reason.message, metadata: reason.metadata }
+    }
 }
 
 impl From<Code> for Reason {
     fn from(code: Code) -> Self {
-        Self { code, message: String::new(), metadata: BTreeMap::new() }
+        Self { code, message: String::new(), metadata: BTreeMap::new(), unknown: None }
     }
 }
 
 impl Reason {
     /// With a sentence of its own.
     pub fn new(code: Code, message: impl Into<String>) -> Self {
-        Self { code, message: message.into(), metadata: BTreeMap::new() }
+        Self { message: message.into(), ..Self::from(code) }
+    }
+    /// With the code of this name; a name that this build does not know is kept.
+    pub fn named(name: &str) -> Self {
+        match name.parse::<Code>() {
+            Ok(code) => code.into(),
+            Err(()) => Self { unknown: Some(Box::new(UnknownCode(name.to_owned()))), ..Code::Unknown.into() },
+        }
+    }
+    /// Name of the code as it was given: what is shown, stored and passed on.
+    pub fn name(&self) -> &str {
+        self.unknown.as_ref().map_or(self.code.as_str(), |unknown| &unknown.0)
     }
     /// Adds one fact.
     #[must_use]
@@ -374,7 +415,7 @@ impl Violations {
 
 /// The answer to a caller that did not get what it asked for.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{}: {}", reason.code, reason.text())]
+#[error("{}: {}", reason.name(), reason.text())]
 pub struct Refusal {
     /// Why.
     pub reason: Reason,
@@ -423,5 +464,14 @@ mod tests {
             assert!(code.help().ends_with('.'), "{code}");
             assert_eq!(code.as_str().parse(), Ok(*code));
         }
+    }
+
+    #[test]
+    fn a_row_with_a_reason_of_a_newer_version_is_read_shown_and_written_back_whole() {
+        let row = r#"{"code":"GRAVITY_LOST","message":"it floats","metadata":{"robot_id":"rbt-01"}}"#;
+        let reason: Reason = serde_json::from_str(row).expect("a reason");
+        assert_eq!((reason.code, reason.name(), reason.text()), (Code::Unknown, "GRAVITY_LOST", "it floats"));
+        assert_eq!(serde_json::to_string(&reason).expect("a row"), row);
+        assert_eq!(Refusal::new(Kind::Precondition, reason).to_string(), "GRAVITY_LOST: it floats");
     }
 }

@@ -114,6 +114,9 @@ pub enum FaultClass {
     Stop,
     /// The work cannot be done as asked. Never retried on this robot.
     Semantic,
+    /// One of a newer version, by its number on the wire. Never retried.
+    #[serde(untagged)]
+    Unknown(i32),
 }
 
 /// A numbered fault as the robot's maker reports it.
@@ -174,6 +177,9 @@ pub enum WorkState {
     Suspended,
     /// Restarted inside a step that must not be done twice: nobody knows.
     StepUnknown,
+    /// One of a newer version, by its number on the wire: it is not over, and nothing moves forward by it.
+    #[serde(untagged)]
+    Unknown(i32),
 }
 
 impl WorkState {

@@ -313,6 +313,19 @@ pub struct BadRow {
     source: Arc<serde_json::Error>,
 }
 
+impl BadRow {
+    /// Whether the row is whole and holds a value that this build does not know; else its text is damaged.
+    pub fn is_unknown(&self) -> bool {
+        self.source.is_data()
+    }
+    /// What is not known of it, in a few words.
+    pub fn value(&self) -> String {
+        let told = self.source.to_string();
+        let end = told.find(", expected").or_else(|| told.find(" at line")).unwrap_or(told.len());
+        told[..end].chars().take(128).collect()
+    }
+}
+
 /// Rows that a reading begins with.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Part {

@@ -44,7 +44,7 @@ pub fn status(refusal: &Refusal, request_id: Option<&str>) -> Status {
     let hidden = kind == Kind::Internal;
     let metadata: HashMap<String, String> =
         if hidden { HashMap::new() } else { reason.metadata.iter().map(|(k, v)| (k.clone(), v.clone())).collect() };
-    let mut details = ErrorDetails::with_error_info(reason.code.as_str(), DOMAIN, metadata);
+    let mut details = ErrorDetails::with_error_info(reason.name(), DOMAIN, metadata);
     let text = if hidden { INTERNAL_TEXT } else { reason.text() };
     match kind {
         Kind::Invalid => {
@@ -53,7 +53,7 @@ pub fn status(refusal: &Refusal, request_id: Option<&str>) -> Status {
             }
         }
         Kind::Precondition => {
-            details.add_precondition_failure_violation(reason.code.as_str(), subject(&reason.metadata), cut(text));
+            details.add_precondition_failure_violation(reason.name(), subject(&reason.metadata), cut(text));
         }
         Kind::Exhausted | Kind::Unavailable => {
             let own = refusal.again_after.map(|after| Duration::from_millis(after.as_ms()));

@@ -218,7 +218,7 @@ impl AgentCore {
 
     fn tell_refusal(&mut self, assignment: &Assignment, why: Reason) {
         let attempt = assignment.attempt.clone();
-        tracing::info!(robot_id = %self.config.robot_id, %attempt, reason = why.code.as_str(), "refused");
+        tracing::info!(robot_id = %self.config.robot_id, %attempt, reason = why.name(), "refused");
         if self.refused.len() == REFUSED_REMEMBERED {
             self.refused.pop_front();
         }

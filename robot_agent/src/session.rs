@@ -512,14 +512,14 @@ impl Agent {
             }
             Ok(ToRobot::Welcome(_)) => self.lost("a second welcome"),
             Err(refusal) => {
-                tracing::error!(robot_id = %self.config.robot_id, code = refusal.reason.code.as_str(), "message cannot be read");
+                tracing::error!(robot_id = %self.config.robot_id, code = refusal.reason.name(), "message cannot be read");
                 self.lost("a message cannot be read");
             }
         }
     }
 
     fn closed(&mut self, close: &Close) {
-        tracing::info!(robot_id = %self.config.robot_id, code = ?close.code, reason = close.reason.code.as_str(), "closed by server");
+        tracing::info!(robot_id = %self.config.robot_id, code = ?close.code, reason = close.reason.name(), "closed by server");
         let had_next = !matches!(self.way, Way::Idle);
         self.leave_session();
         if close.code == CloseCode::Fenced && had_next {

@@ -72,7 +72,7 @@ pub fn compose(tx: &mut Tx, robot_id: &RobotId, board: &Board, releases: &Releas
         tx.view.behind = tx.view.behind.max(Some(session.applied_work));
         let reason = crate::reason::Reason::from(crate::reason::Code::StoreBehindRobot)
             .with("applied_work", session.applied_work);
-        super::incidents::open(tx, reason, Some(robot_id), None);
+        super::incidents::open_about(tx, reason, Some(robot_id), "");
     }
 }
 

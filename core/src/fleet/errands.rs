@@ -167,7 +167,9 @@ pub fn report(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
         WorkState::Accepted => AttemptPhase::Accepted,
         WorkState::Navigating => AttemptPhase::Navigating,
         WorkState::Executing => AttemptPhase::Executing,
-        WorkState::Paused | WorkState::Stopping | WorkState::StepUnknown => AttemptPhase::Paused,
+        WorkState::Paused | WorkState::Stopping | WorkState::StepUnknown | WorkState::Unknown(_) => {
+            AttemptPhase::Paused
+        }
         // Refused after it was accepted: the robot has lost its memory of it.
         WorkState::Refused if a.accepted.is_some() => AttemptPhase::Aborted,
         WorkState::Refused => AttemptPhase::Refused,

@@ -38,6 +38,9 @@ pub struct TaskExplanation {
 
 /// Explains one task; none if it is not known or has ended.
 pub fn task(view: &View, board: &Board, now: &Now, task_id: &TaskId) -> Option<TaskExplanation> {
+    if let Some(reason) = view.unknown_rows.of_task(task_id) {
+        return Some(unknown(reason.clone()));
+    }
     let task = view.task(task_id)?;
     let intake = view.intake(task_id)?;
     let waits = matches!(task.phase, Phase::Queued | Phase::RetryWait | Phase::Suspended);
@@ -78,6 +81,12 @@ pub fn task(view: &View, board: &Board, now: &Now, task_id: &TaskId) -> Option<T
 /// How a task ended.
 pub fn ended(task: &TaskState) -> TaskExplanation {
     let verdict = Some(standing::ended(task));
+    TaskExplanation { position: None, verdict, candidates: Vec::new(), filtered: BTreeMap::new() }
+}
+
+/// A task one of whose rows holds a value of a newer version.
+pub fn unknown(reason: Reason) -> TaskExplanation {
+    let verdict = Some(reason.with(WAITS_FOR, "the newer version of the server"));
     TaskExplanation { position: None, verdict, candidates: Vec::new(), filtered: BTreeMap::new() }
 }
 
@@ -123,7 +132,13 @@ pub struct RobotExplanation {
 
 /// Explains one robot; none if it never connected.
 pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Option<RobotExplanation> {
-    view.sessions.get(robot_id.as_str())?;
+    if !view.unknown_rows.names(robot_id) {
+        view.sessions.get(robot_id.as_str())?;
+    }
+    if let Err(unread) = view.unknown_rows.screen(robot_id) {
+        let verdict = Some(standing::about_robot(unread, robot_id));
+        return Some(RobotExplanation { verdict, candidates: Vec::new() });
+    }
     let at = board.get(robot_id).and_then(|l| way::find(view, l.report.vitals.waypoint.as_ref()));
     let candidates = view.queue.ready().take(CANDIDATES_MAX).filter_map(|task_id| {
         let task = view.task(task_id)?;

@@ -7,6 +7,7 @@ use super::rows::{Closed, Incident};
 use crate::ids::{RobotId, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
+use std::cmp::Ordering;
 
 /// Opens an incident, once per code, subject and moment.
 pub fn open(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, task_id: Option<&TaskId>) {
@@ -43,19 +44,23 @@ pub fn open_once(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>) {
     }
 }
 
-/// Opens an incident unless an open one with its code names the same robot and the same `key`; whether it did.
+/// Opens an incident unless an open one with its code names the same robot and the same `key`; whether none does. What a robot says is endless, what
+/// people read is not: the last of [`limits::INCIDENTS_OF_ROBOT_MAX`] with one code stands for all that come.
 pub fn open_about(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, key: &str) -> bool {
-    let same = |i: &Incident| {
-        i.closed.is_none()
-            && i.reason.code == reason.code
-            && i.robot_id.as_ref() == robot_id
-            && i.reason.metadata.get(key) == reason.metadata.get(key)
-    };
-    let is_new = !tx.view.incidents.values().any(|i| same(&i.row));
-    if is_new {
-        open(tx, reason, robot_id, None);
+    let alike = |i: &&Incident| i.closed.is_none() && i.reason.code == reason.code && i.robot_id.as_ref() == robot_id;
+    let open_ones = tx.view.incidents.values().map(|i| &i.row).filter(alike);
+    let about: Vec<Option<&String>> = open_ones.map(|i| i.reason.metadata.get(key)).collect();
+    if about.contains(&reason.metadata.get(key)) {
+        return false;
     }
-    is_new
+    match (about.len() + 1).cmp(&limits::INCIDENTS_OF_ROBOT_MAX) {
+        Ordering::Less => open(tx, reason, robot_id, None),
+        Ordering::Equal => {
+            open(tx, reason.with("further", "not told one by one until some of these are closed"), robot_id, None)
+        }
+        Ordering::Greater => {}
+    }
+    true
 }
 
 /// What an incident was about is over: it closes by itself.

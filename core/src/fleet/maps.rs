@@ -1,8 +1,8 @@
 //! Changed maps: what stands in the way of one (tasks that are to go where it has nothing, robots under way there, places that are held), and
 //! robots that drive by another one.
 //!
-//! Called at a start, before anybody plans, and with each heartbeat that is compared. Invariant: a map is taken only if what the rows say of the floor is true of it too, or if a person
-//! forces it; then each thing in the way is an incident.
+//! Called at a start, before anybody plans, and with each heartbeat that is compared. Invariant: a map is taken only if what the rows say of
+//! the floor is true of it too, or if a person forces it; then each thing in the way is an incident.
 
 use super::incidents;
 use super::rows::Place;
@@ -125,7 +125,7 @@ pub(super) fn compare(tx: &mut Tx, live: &Live) {
 }
 
 /// Tells people of what became of the map.
-pub(super) fn tell(view: &mut View, now: Now, change: &MapChange, plan: &mut Plan) {
+pub(super) fn tell_of_change(view: &mut View, now: Now, change: &MapChange, plan: &mut Plan) {
     let id = format!("{}:{}", Code::MapNotTaken, view.site.site_id());
     let open = view.incidents.get(&id).map(|i| &i.row).filter(|i| i.closed.is_none()).map(|i| i.reason.clone());
     if let MapChange::NotTaken { version, obstacles } = change {
@@ -140,7 +140,7 @@ pub(super) fn tell(view: &mut View, now: Now, change: &MapChange, plan: &mut Pla
     }
     let MapChange::Forced { obstacles } = change else { return };
     for obstacle in obstacles {
-        plan.decide(view, now, "fleet", |tx| forced(tx, obstacle));
+        plan.decide(view, now, "fleet", |tx| open_forced(tx, obstacle));
     }
 }
 
@@ -158,14 +158,17 @@ fn not_taken(stored: &Site, version: &str, obstacles: &[Obstacle]) -> Reason {
     })
 }
 
-fn forced(tx: &mut Tx, obstacle: &Obstacle) {
+/// Opens the incident of a thing that a forced map does not fit: once in a start of the process, however often it reads the rows anew.
+fn open_forced(tx: &mut Tx, obstacle: &Obstacle) {
+    let (kind, name) = obstacle.named();
+    let id = format!("{}:{kind}:{name}:{}", Code::MapForced, tx.view.started.wall.0);
+    if tx.view.incidents.get(&id).is_some() {
+        return;
+    }
     let reason = Reason::from(Code::MapForced);
     match obstacle {
-        Obstacle::Task(task_id) => incidents::open(tx, reason, None, Some(task_id)),
-        Obstacle::Robot(robot_id) => incidents::open(tx, reason, Some(robot_id), None),
-        Obstacle::Place(place_id) => {
-            let id = format!("{}:{place_id}:{}", reason.code, tx.now.wall.0);
-            incidents::open_as(tx, id, reason.with("place_id", place_id), None, None);
-        }
+        Obstacle::Task(task_id) => incidents::open_as(tx, id, reason, None, Some(task_id)),
+        Obstacle::Robot(robot_id) => incidents::open_as(tx, id, reason, Some(robot_id), None),
+        Obstacle::Place(place_id) => incidents::open_as(tx, id, reason.with("place_id", place_id), None, None),
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! [`cycle`] takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
 //! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `plausible`, `claims`, `answers`, `commands` (`asked`: which there are) are what happens; `tasks` moves tasks by
-//! the table; `heard`, `anchor`, `attempts`, `incidents` and `refused` are what they share; `queue`, `screen`, `pool` and `assign` give work, in turns cut by `slice`; `stops` and `stopped` keep it from who is stopped; `starts` keeps places for robots that are to come; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `standing` says what is done or waited for, `explain` tells people, `unexplained` counts what nobody can say, `lasting` opens incidents of robots that stand for long.
+//! the table; `heard`, `anchor`, `attempts`, `incidents` and `refused` are what they share; `queue`, `screen`, `pool` and `assign` give work, in turns cut by `slice`; `stops` and `stopped` keep it from who is stopped; `starts` keeps places for robots that are to come; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `standing` says what is done or waited for, `explain` tells people, `unexplained` counts what nobody can say, `lasting` opens incidents of robots that stand for long; `maps` says what a changed map waits for.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod anchor;
@@ -128,7 +128,11 @@ impl Plan {
     }
 
     /// Adds a decision that was made. False: it was given up, since the store would never take it.
-    pub fn keep(&mut self, tx: Tx) -> bool {
+    pub fn keep(&mut self, mut tx: Tx) -> bool {
+        if tx.is_unknown() {
+            tx.take_back();
+            return false;
+        }
         let is_aside = tx.view.refused.keeps_any() && tx.view.refused.is_aside(&tx.outline());
         if !is_aside && !tx.is_too_large() {
             let item = tx.finish();
@@ -303,7 +307,7 @@ fn mark(tx: &mut Tx, seq: Seq) {
 
 /// Rows every start makes sure of: the site, its places, and serving time.
 pub fn found(view: &mut View, now: Now, site_text: &str, map: &maps::MapChange, plan: &mut Plan) {
-    maps::tell(view, now, map, plan);
+    maps::tell_of_change(view, now, map, plan);
     let site = view.site.clone();
     plan.decide(view, now, "fleet", |tx| {
         let row = SiteRow {
@@ -318,7 +322,7 @@ pub fn found(view: &mut View, now: Now, site_text: &str, map: &maps::MapChange, 
     for chunk in site.places().chunks(128) {
         plan.decide(view, now, "fleet", |tx| {
             for place in chunk {
-                if site_has(tx.view, place) {
+                if site_has(tx.view, place) || tx.view.unknown_rows.is_place_aside(&place.place_id) {
                     continue;
                 }
                 let known = tx.view.places.get(place.place_id.as_str()).map(|p| p.row.clone());

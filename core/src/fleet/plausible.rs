@@ -3,6 +3,7 @@
 //! 1. The step lies between the first one of the attempt and the number of steps.
 //! 2. SUCCEEDED comes only with the number of steps.
 //! 3. Within an attempt the step is never lower than reported before.
+//! 4. The state is one that this build knows.
 //!
 //! Invariant: a report that breaks one of these frees nothing and moves nothing forward. What it adds is taken: places and loads.
 //! Called by `inbox` for events, by `repair` for heartbeats, and by whoever gives work or places.
@@ -47,6 +48,7 @@ impl Bounds {
     }
     fn allow(self, highest: u32, state: WorkState, step_index: u32) -> bool {
         match state {
+            WorkState::Unknown(_) => false,
             // It never began.
             WorkState::Refused => step_index <= self.steps,
             WorkState::Succeeded => step_index == self.steps,
@@ -91,6 +93,7 @@ pub fn doubtful(view: &View, live: &Live) -> Option<(AttemptId, Reason)> {
 /// # Errors
 /// If so; the reason says what.
 pub fn keeps_back(view: &View, live: &Live) -> Result<(), Reason> {
+    view.unknown_rows.screen(&live.robot_id)?;
     view.refused.screen(&live.robot_id)?;
     match doubtful(view, live).map(|(_, why)| why).or_else(|| claims::too_many(view, live)) {
         Some(why) => Err(why),
@@ -125,7 +128,7 @@ mod tests {
 
     #[test]
     fn a_report_is_legal_within_its_steps_and_never_goes_back() {
-        use WorkState::{Aborted, Executing, Failed, Refused, Succeeded};
+        use WorkState::{Aborted, Executing, Failed, Refused, Succeeded, Unknown};
         let bounds = Bounds { first: 2, resume: 3, steps: 6 };
         let table = [
             (3, Executing, 1, false),
@@ -141,6 +144,7 @@ mod tests {
             (4, Succeeded, 7, false),
             (3, Refused, 0, true),
             (3, Refused, 7, false),
+            (3, Unknown(99), 4, false),
         ];
         for (highest, state, step, legal) in table {
             assert_eq!(bounds.allow(highest, state, step), legal, "{highest} {state:?} {step}");

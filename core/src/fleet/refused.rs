@@ -112,11 +112,12 @@ pub(super) fn try_again(view: &mut View) {
     view.policy_dirty.extend(robots);
 }
 
-/// Tells people of every decision that was put aside since.
+/// Tells people of every decision, and of every row of a newer version, that was put aside since.
 pub fn open_incidents(view: &mut View, now: Now, plan: &mut Plan) {
     let untold = |known: &mut Known| std::mem::take(&mut known.is_untold);
     let known = view.refused.known.iter_mut();
-    let untold: Vec<_> = known.filter_map(|(o, k)| untold(k).then(|| (reason(o), k.robots.first().cloned()))).collect();
+    let known = known.filter_map(|(o, k)| untold(k).then(|| (reason(o), k.robots.first().cloned())));
+    let untold: Vec<_> = known.chain(view.unknown_rows.take_untold()).collect();
     for (reason, robot_id) in untold {
         plan.decide(view, now, "fleet", |tx| incidents::open_once(tx, reason, robot_id.as_ref()));
     }

@@ -132,7 +132,8 @@ fn unknown(a: &Attempt, live: Option<&std::sync::Arc<Live>>) -> Option<Reason> {
     };
     let since = uncertain.since.rfc3339();
     let told = format!("Nobody knows since {since} what {robot_id} does with it: {} {way_out}", uncertain.cause.text());
-    let reason = Reason { message: told, ..uncertain.cause.clone() };
+    let mut reason = uncertain.cause.clone();
+    reason.message = told;
     Some(reason.with("uncertain_since", since).with(WAITS_FOR, what))
 }
 
@@ -190,6 +191,7 @@ pub fn about_robot(reason: Reason, robot_id: &RobotId) -> Reason {
         Code::ExclusionBroken => {
             format!("a person at place {} with {} and {robot_id}", fact("place_id"), fact("other"))
         }
+        Code::RowUnknown => "the newer version of the server".to_owned(),
         Code::DecisionPutAside | Code::SkippedRetired | Code::RobotCordoned | Code::RobotBrokenOff => {
             format!("a person who looks at robot {robot_id}")
         }

@@ -468,7 +468,12 @@ pub fn event_of(report: &AttemptReport) -> Event {
     match report.state {
         WorkState::Accepted => Event::Accepted,
         WorkState::Refused => Event::Refused,
-        WorkState::Navigating | WorkState::Executing | WorkState::Paused | WorkState::Stopping => Event::Progress,
+        // One that is not known comes here for attempts that are over only: `plausible` judges those that live.
+        WorkState::Navigating
+        | WorkState::Executing
+        | WorkState::Paused
+        | WorkState::Stopping
+        | WorkState::Unknown(_) => Event::Progress,
         WorkState::Succeeded => Event::Succeeded,
         WorkState::Failed => match report.fault.as_ref().map(|f| f.class) {
             Some(FaultClass::Recoverable) => Event::FailedRecoverable,

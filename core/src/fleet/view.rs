@@ -23,6 +23,7 @@ use crate::site::route::{Blocked, Router};
 use crate::stop::record::StopRecord;
 use crate::task::{Attempt, AttemptPhase, Phase, TaskIntake, TaskState};
 use crate::time::{Now, Utc};
+use crate::unknown_rows::UnknownRows;
 use crate::work::{DesiredPolicy, DesiredWork, LaneMark, PresenceRow, Session};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, OnceLock};
@@ -163,6 +164,8 @@ pub struct View {
     pub unusable: BTreeSet<Seq>,
     /// Decisions that the store refuses for good. Volatile.
     pub refused: super::refused::Refused,
+    /// Rows with a value of a newer version.
+    pub unknown_rows: UnknownRows,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: super::bugs::Bugs,
     /// Distances and routes, remembered.
@@ -171,6 +174,9 @@ pub struct View {
 
 impl Picture for View {
     const WRITER: Writer = Writer::Fleet;
+    fn unknown_rows(&mut self) -> &mut UnknownRows {
+        &mut self.unknown_rows
+    }
 }
 
 macro_rules! viewed {
@@ -484,6 +490,7 @@ impl View {
             behind: None,
             unusable: BTreeSet::new(),
             refused: super::refused::Refused::default(),
+            unknown_rows: UnknownRows::default(),
             bugs: super::bugs::Bugs::default(),
         }
     }
@@ -528,9 +535,11 @@ impl View {
                     crate::picture::take::<Self, CommandKey>(self, &row.key.id, row.revision, Some(row))?;
                 }
                 Table::TaskState => {
-                    let task = row.decode::<TaskState>()?;
-                    if task.phase.is_terminal() {
-                        queue::note_end(self, &task.task_id, task.phase);
+                    match row.decode::<TaskState>() {
+                        Ok(task) if task.phase.is_terminal() => queue::note_end(self, &task.task_id, task.phase),
+                        Err(error) if !error.is_unknown() => return Err(error),
+                        // It has not ended, as far as anybody here knows.
+                        _ => {}
                     }
                 }
                 _ => {}

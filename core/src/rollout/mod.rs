@@ -92,10 +92,14 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// Makes one decision; nothing is added if it changed nothing.
+    /// Makes one decision; nothing is added if it changed nothing, or if it touches a row of a newer version.
     pub fn decide(&mut self, view: &mut View, now: Now, actor: &str, decision: impl FnOnce(&mut Tx)) {
         let mut tx = Tx::new(view, now, actor);
         decision(&mut tx);
+        if tx.is_unknown() {
+            tx.take_back();
+            return;
+        }
         self.items.extend(tx.finish());
     }
 }

@@ -18,6 +18,7 @@ use crate::robot::{Duty, Lane, Presence};
 use crate::rows::{BadRow, Key, Revision, Row, Seq, Table, Writer};
 use crate::site::Site;
 use crate::time::{LinkTime, Now};
+use crate::unknown_rows::UnknownRows;
 use crate::update::DesiredUpdate;
 use crate::work::{LaneMark, Live, Session};
 use std::collections::{BTreeMap, BTreeSet};
@@ -91,6 +92,8 @@ pub struct View {
     pub contacts: BTreeMap<RobotId, Contact>,
     /// Nothing can be signed for robots at this moment. Volatile: known where directives are signed, at the last cycle.
     pub keyless: bool,
+    /// Rows with a value of a newer version.
+    pub unknown_rows: UnknownRows,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: super::bugs::Bugs,
 }
@@ -106,6 +109,9 @@ pub struct Contact {
 
 impl Picture for View {
     const WRITER: Writer = Writer::Ota;
+    fn unknown_rows(&mut self) -> &mut UnknownRows {
+        &mut self.unknown_rows
+    }
 }
 
 macro_rules! viewed {
@@ -282,6 +288,7 @@ impl View {
             served: OtaClock::default(),
             contacts: BTreeMap::new(),
             keyless: false,
+            unknown_rows: UnknownRows::default(),
             bugs: super::bugs::Bugs::default(),
         }
     }

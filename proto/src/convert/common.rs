@@ -3,6 +3,7 @@
 use super::{At, Parse, WireEnum, from_one, need, word};
 use crate::common::v1;
 use midshift_core::authority::Authority;
+use midshift_core::limits;
 use midshift_core::reason::{Reason, Violation, Violations};
 use midshift_core::robot::{Fault, Pose};
 use midshift_core::time::Utc;
@@ -36,11 +37,7 @@ impl Parse<Pose> for v1::Pose {
 
 impl From<&Reason> for v1::Reason {
     fn from(reason: &Reason) -> Self {
-        Self {
-            code: reason.code.as_str().to_owned(),
-            message: reason.message.clone(),
-            metadata: reason.metadata.clone(),
-        }
+        Self { code: reason.name().to_owned(), message: reason.message.clone(), metadata: reason.metadata.clone() }
     }
 }
 
@@ -55,11 +52,14 @@ impl Parse<Reason> for v1::Reason {
             bad.add(at.field("metadata").to_string(), "must be at most 16 entries");
             return None;
         }
-        let Ok(code) = self.code.parse() else {
-            bad.add(at.field("code").to_string(), format!("{:?} is not a known code", self.code));
+        let is_name = |c: u8| c.is_ascii_uppercase() || c.is_ascii_digit() || c == b'_';
+        if !(1..=limits::CODE_BYTES_MAX).contains(&self.code.len()) || !self.code.bytes().all(is_name) {
+            bad.add(at.field("code").to_string(), format!("must be 1-{} of [A-Z0-9_]", limits::CODE_BYTES_MAX));
             return None;
-        };
-        Some(Reason { code, message: self.message, metadata: self.metadata })
+        }
+        let mut reason = Reason::named(&self.code);
+        (reason.message, reason.metadata) = (self.message, self.metadata);
+        Some(reason)
     }
 }
 

@@ -15,20 +15,21 @@ use midshift_core::work::{Effect, PlaceNews, WorkState};
 pub trait WireEnum: Sized {
     /// Its number.
     fn to_wire(self) -> i32;
-    /// None for UNSPECIFIED (unless the .proto gives it a meaning) and for numbers this build does not know.
+    /// None for UNSPECIFIED (unless the .proto gives it a meaning), and for numbers this build does not know where core has no `Unknown`.
     fn from_wire(number: i32) -> Option<Self>;
 }
 
 macro_rules! wire_enums {
-    ($($core:ident = $wire:path { $($a:ident = $b:ident),* $(,)? })*) => {
+    ($($core:ident = $wire:path { $($a:ident = $b:ident),* $(,)? } $(=> $unknown:ident)?)*) => {
         $(impl WireEnum for $core {
             fn to_wire(self) -> i32 {
                 use $wire as W;
-                match self { $(Self::$a => W::$b as i32),* }
+                match self { $(Self::$a => W::$b as i32,)* $(Self::$unknown(number) => number)? }
             }
             fn from_wire(number: i32) -> Option<Self> {
                 use $wire as W;
                 $(if number == W::$b as i32 { return Some(Self::$a); })*
+                $(if number != 0 { return Some(Self::$unknown(number)); })?
                 None
             }
         })*
@@ -42,8 +43,11 @@ macro_rules! wire_enums {
                     $(assert_eq!($core::from_wire($core::$a.to_wire()), Some($core::$a));)*
                     for number in 1..32 {
                         use $wire as W;
-                        assert_eq!(W::try_from(number).is_ok(), $core::from_wire(number).is_some(), "{} {number}", stringify!($core));
+                        let read = $core::from_wire(number);
+                        $(let read = read.filter(|value| !matches!(value, $core::$unknown(_)));)?
+                        assert_eq!(W::try_from(number).is_ok(), read.is_some(), "{} {number}", stringify!($core));
                     }
+                    $(assert_eq!($core::from_wire(99).map(WireEnum::to_wire), Some(99), "{}", stringify!($unknown));)?
                 )*
             }
         }
@@ -51,7 +55,7 @@ macro_rules! wire_enums {
 }
 
 wire_enums! {
-    FaultClass = common::v1::FaultClass { Recoverable = Recoverable, Mechanical = Mechanical, Stop = Stop, Semantic = Semantic }
+    FaultClass = common::v1::FaultClass { Recoverable = Recoverable, Mechanical = Mechanical, Stop = Stop, Semantic = Semantic } => Unknown
     Lane = link::v1::Lane { Critical = Critical, Event = Event, Status = Status }
     Mode = link::v1::Mode { Automatic = Automatic, Manual = Manual, Service = Service }
     StopLevel = common::v1::StopLevel { None = Unspecified, Slow = Slow, Halt = Halt, ControlledStopPosture = ControlledStopPosture }
@@ -60,7 +64,7 @@ wire_enums! {
     WorkState = link::v1::WorkState {
         Accepted = Accepted, Refused = Refused, Navigating = Navigating, Executing = Executing, Paused = Paused, Stopping = Stopping,
         Succeeded = Succeeded, Failed = Failed, Aborted = Aborted, Suspended = Suspended, StepUnknown = StepUnknown,
-    }
+    } => Unknown
     PlaceNews = link::v1::PlaceNews { Entered = Entered, Left = Left, NotEntered = NotEntered }
     Effect = link::v1::WorkEffect { Repeatable = Repeatable, CheckFirst = CheckFirst, AtMostOnce = AtMostOnce }
     Goal = link::v1::UpdateGoal { None = Unspecified, Stage = Stage, Activate = Activate, Commit = Commit, Revert = Revert }

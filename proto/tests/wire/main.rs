@@ -8,3 +8,4 @@ mod link;
 mod privacy;
 mod task;
 mod telemetry;
+mod unknown;

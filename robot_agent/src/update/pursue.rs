@@ -206,7 +206,7 @@ impl AgentCore {
             tracing::error!(?from, to = ?update.state, "no step of an update");
             return;
         }
-        tracing::info!(robot_id = %self.config.robot_id, bundle = %update.bundle, state = ?update.state, reason = update.reason.as_ref().map(|reason| reason.code.as_str()), "update");
+        tracing::info!(robot_id = %self.config.robot_id, bundle = %update.bundle, state = ?update.state, reason = update.reason.as_ref().map(|reason| reason.name()), "update");
         self.update.collected = false;
         self.put_software(SoftwareRow { update: Some(update), ..self.kept.ledger.software.clone() });
         if let Some(report) = self.update_report() {
@@ -340,7 +340,7 @@ impl AgentCore {
     /// The newest directive is not taken; it is not looked at again.
     pub(super) fn refuse_directive(&mut self, reason: Reason) {
         let Some(desired) = &self.update.desired else { return };
-        tracing::warn!(robot_id = %self.config.robot_id, reason = reason.code.as_str(), "directive refused");
+        tracing::warn!(robot_id = %self.config.robot_id, reason = reason.name(), "directive refused");
         self.update.judged = Some(desired.directive.clone());
         let refused = UpdateEvent::DirectiveRefused { generation: desired.generation, reason };
         self.emit(Lane::Event, RobotEvent::Update(refused));

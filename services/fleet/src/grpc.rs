@@ -12,6 +12,7 @@ use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::rows::{Key, Revision, Table};
 use midshift_core::task::{TaskIntake, TaskState};
 use midshift_core::time::Utc;
+use midshift_core::unknown_rows;
 use midshift_proto::access::caller;
 use midshift_proto::convert::fleet::encode_policy;
 use midshift_proto::convert::ms_of;
@@ -258,11 +259,21 @@ impl FleetService {
         let unread = |_| Refusal::new(Kind::Unavailable, Code::StoreUnavailable);
         let rows = self.store.get(keys.to_vec()).await.map_err(unread)?;
         let of = |table| rows.iter().find(|row| row.key.table == table).ok_or_else(missing);
-        let task: TaskState = of(Table::TaskState)?.decode().map_err(|_| internal())?;
-        let intake: TaskIntake = of(Table::TaskIntake)?.decode().map_err(|_| internal())?;
-        let areas = self.site.areas_of_task(&intake.spec);
-        let sees = by.may_everywhere(Permission::Read) || by.may_over(Permission::Read, &areas);
-        if !sees || !task.phase.is_terminal() {
+        let intake = of(Table::TaskIntake)?.decode::<TaskIntake>().ok();
+        let areas = intake.map(|intake| self.site.areas_of_task(&intake.spec));
+        if !by.may_everywhere(Permission::Read) && !areas.is_some_and(|a| by.may_over(Permission::Read, &a)) {
+            return Err(missing());
+        }
+        let row = of(Table::TaskState)?;
+        let task: TaskState = match row.decode() {
+            Ok(task) => task,
+            Err(error) if error.is_unknown() => {
+                let found = explain::unknown(unknown_rows::reason(row, &error));
+                return Ok(encode::task_explanation(task_id, &found, now));
+            }
+            Err(_) => return Err(internal()),
+        };
+        if !task.phase.is_terminal() {
             return Err(missing());
         }
         Ok(encode::task_explanation(task_id, &explain::ended(&task), now))

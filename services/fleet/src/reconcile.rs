@@ -207,6 +207,7 @@ impl Loop {
         let excused = std::mem::take(&mut self.view.excused);
         let unwilling = std::mem::take(&mut self.view.unwilling);
         let (answers, unknown) = (std::mem::take(&mut self.view.answers), std::mem::take(&mut self.view.unknown));
+        let lasting = std::mem::take(&mut self.view.lasting);
         let now = self.parts.clock.now();
         let served = self.view.serving(&now);
         let (router, unusable) = (self.view.router.clone(), std::mem::take(&mut self.view.unusable));
@@ -222,6 +223,7 @@ impl Loop {
         self.view.excused = excused;
         self.view.unwilling = unwilling;
         (self.view.answers, self.view.unknown) = (answers, unknown);
+        self.view.lasting = lasting;
         self.view.place_waits = place_waits;
         self.seq = self.view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq).min(snapshot.seq);
         (self.behind, self.news, self.more) = (None, true, false);

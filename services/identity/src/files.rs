@@ -4,7 +4,7 @@
 
 use crate::Error;
 use std::fs::{DirBuilder, File, OpenOptions, Permissions};
-use std::io::{self, Write};
+use std::io::{self, Read, Write};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
 use std::path::Path;
 
@@ -38,12 +38,20 @@ pub fn make_folder(folder: &Path) -> Result<(), Error> {
     std::fs::set_permissions(folder, Permissions::from_mode(0o700)).map_err(at)
 }
 
-/// The text of a file; none if there is none.
+/// The text of a file of its owner's alone; none if there is none. One that others may read is refused, in whatever folder it lies.
 pub fn read(folder: &Path, name: &str) -> Result<Option<String>, Error> {
     let path = folder.join(name);
-    match std::fs::read_to_string(&path) {
-        Ok(text) => Ok(Some(text)),
-        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+    let read = || {
+        let mut file = File::open(&path)?;
+        let mode = file.metadata()?.permissions().mode() & 0o777;
+        let mut text = String::new();
+        file.read_to_string(&mut text)?;
+        Ok((mode, text))
+    };
+    match read() {
+        Ok((mode, _)) if mode & OTHERS != 0 => Err(Error::Open { path, mode }),
+        Ok((_, text)) => Ok(Some(text)),
+        Err(error) if io::Error::kind(&error) == io::ErrorKind::NotFound => Ok(None),
         Err(source) => Err(Error::Folder { path, source }),
     }
 }
@@ -88,7 +96,22 @@ mod tests {
         assert_eq!(mode(&at("volume")), 0o700);
         std::fs::write(at("used/control.db"), "rows").expect("written");
         let refused = make_folder(&at("used")).expect_err("others may look into it").to_string();
-        assert!(refused.contains("(mode 755)") && refused.contains(&format!("chmod 700 {}", at("used").display())));
+        assert!(refused.contains("(mode 755)") && refused.contains(&format!("chmod go= {}", at("used").display())));
         assert_eq!(mode(&at("used")), 0o755, "that is for a person to decide");
+    }
+
+    #[test]
+    fn a_key_file_that_others_may_read_is_refused_by_its_name_though_its_folder_is_closed() {
+        let dir = tempfile::tempdir().expect("a folder");
+        write(dir.path(), "server.key", "secret", PRIVATE).expect("written");
+        assert_eq!(read(dir.path(), "server.key").expect("its owner's alone").as_deref(), Some("secret"));
+        assert_eq!(read(dir.path(), "other.key").expect("none"), None);
+        for mode in [0o640, 0o604, 0o660] {
+            let path = dir.path().join("server.key");
+            std::fs::set_permissions(&path, Permissions::from_mode(mode)).expect("open");
+            let refused = read(dir.path(), "server.key").expect_err("others may read it").to_string();
+            assert!(refused.contains(&format!("(mode {mode:03o})")) && refused.contains("chmod go= "), "{refused}");
+            assert!(refused.contains("server.key") && !refused.contains("secret"), "{refused}");
+        }
     }
 }

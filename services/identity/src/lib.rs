@@ -49,8 +49,8 @@ pub enum Error {
         /// Why.
         source: std::io::Error,
     },
-    /// A folder with keys or other secrets that others may look into.
-    #[error("{path} has keys or other secrets and is open to others (mode {mode:03o}): type `chmod 700 {path}`, after asking who may have read it", path = path.display())]
+    /// A folder or file with keys or other secrets that others may look into.
+    #[error("{path} has keys or other secrets and is open to others (mode {mode:03o}): type `chmod go= {path}`, after asking who may have read it", path = path.display())]
     Open {
         /// Which.
         path: PathBuf,

@@ -47,7 +47,7 @@ impl Holder {
     ///
     /// # Errors
     /// The disk, or another process holds it.
-    pub fn take(folder: &Path) -> io::Result<Self> {
+    pub fn of_folder(folder: &Path) -> io::Result<Self> {
         let mut options = OpenOptions::new();
         let path = folder.join(HOLDER);
         let mut file = options.read(true).write(true).create(true).truncate(false).mode(0o600).open(path)?;
@@ -82,7 +82,7 @@ pub enum NotEnded {
     /// The system says no.
     #[error("ending process {pid}: {source}")]
     Refused {
-        /// Which.
+        /// Which process.
         pid: i32,
         /// Why not.
         source: io::Error,
@@ -145,7 +145,7 @@ mod tests {
     fn whoever_holds_the_lock_is_known_by_what_it_wrote_and_by_nothing_that_was_left() {
         let folder = tempfile::tempdir().unwrap();
         assert!(matches!(holder(folder.path()), Err(NotEnded::Nobody)) && !is_held(folder.path()));
-        let held = Holder::take(folder.path()).unwrap();
+        let held = Holder::of_folder(folder.path()).unwrap();
         assert_eq!(holder(folder.path()).unwrap(), Process::own());
         drop(held);
         assert!(folder.path().join(HOLDER).exists(), "the file stays");
@@ -155,7 +155,7 @@ mod tests {
     #[test]
     fn a_process_of_another_machine_or_container_is_not_ended() {
         let folder = tempfile::tempdir().unwrap();
-        let _held = Holder::take(folder.path()).unwrap();
+        let _held = Holder::of_folder(folder.path()).unwrap();
         let own = Process::own();
         for elsewhere in [
             Process { namespace: "pid:[1]".to_owned(), ..own.clone() },

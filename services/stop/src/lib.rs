@@ -253,7 +253,7 @@ impl StopService {
     }
 
     /// Looks at what every stop and every check-in needs. One that hangs does not come back from here.
-    pub fn look(&self) {
+    pub fn look_at_locks(&self) {
         drop(lock(&self.inner.fan));
         drop(lock(&self.inner.law));
     }

@@ -115,7 +115,7 @@ pub fn open(folder: &Path, now: Utc) -> Result<Opened, Error> {
     }
     notes.extend(found);
     let known = kept.audit.clone();
-    let _holder = Holder::take(folder).map_err(failed)?;
+    let _holder = Holder::of_folder(folder).map_err(failed)?;
     Ok(Opened { kept, writer: Writer { _holder, file, audit, known }, key, notes })
 }
 

@@ -15,7 +15,7 @@ use midshift_proto::stop::v1;
 use prost::Message;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
-use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::Path;
 
 const DOMAIN: &[u8] = b"midshift stop 1\0";
@@ -36,16 +36,24 @@ pub enum Found {
 }
 
 impl Key {
-    /// Reads the key of a folder. Changes nothing.
+    /// Reads the key of a folder. Changes nothing. One that others may read is refused: whoever has it can mark resets.
     pub fn read(folder: &Path) -> io::Result<Found> {
-        match fs::read(folder.join(NAME)) {
-            Ok(bytes) => {
-                let key = std::str::from_utf8(&bytes).ok().and_then(|text| SigningKey::from_pkcs8_pem(text).ok());
-                Ok(key.map_or(Found::Torn, |key| Found::There(Box::new(Self(key)))))
-            }
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(Found::Gone),
-            Err(error) => Err(error),
+        let path = folder.join(NAME);
+        let bytes = match fs::read(&path) {
+            Ok(bytes) => bytes,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Found::Gone),
+            Err(error) => return Err(error),
+        };
+        let key = std::str::from_utf8(&bytes).ok().and_then(|text| SigningKey::from_pkcs8_pem(text).ok());
+        let Some(key) = key else { return Ok(Found::Torn) };
+        let mode = fs::metadata(&path)?.permissions().mode() & 0o777;
+        if mode & 0o077 != 0 {
+            return Err(io::Error::other(format!(
+                "the key is open to others (mode {mode:03o}): type `chmod go= {}`, after asking who may have read it",
+                path.display()
+            )));
         }
+        Ok(Found::There(Box::new(Self(key))))
     }
 
     /// A new one, of which the disk knows nothing yet.
@@ -161,6 +169,15 @@ mod tests {
         };
         assert!(knows(&back));
         assert!(!knows(&Reset { at: Utc(3), ..back }));
+    }
+
+    #[test]
+    fn a_key_that_others_may_read_is_refused_with_what_to_type() {
+        let folder = tempfile::tempdir().unwrap();
+        kept(folder.path());
+        fs::set_permissions(folder.path().join(NAME), fs::Permissions::from_mode(0o640)).unwrap();
+        let Err(refused) = Key::read(folder.path()) else { panic!("it was read") };
+        assert!(refused.to_string().contains("(mode 640): type `chmod go= "), "{refused}");
     }
 
     #[test]

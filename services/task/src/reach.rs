@@ -43,9 +43,15 @@ impl TaskService {
         area_id.iter().try_for_each(|area_id| by.needs(operate, [area_id]))?;
         // With a task the robot goes on that works on it, wherever that stands.
         let mut robots: BTreeSet<RobotId> = robot_ids.iter().cloned().collect();
-        for task in read_many(self.store(), task_ids).await? {
-            self.acts_on(&task, by, operate)?;
-            robots.extend(task.state.robot_id);
+        let tasks = read_many(self.store(), task_ids).await?;
+        for task in &tasks {
+            self.acts_on(task, by, operate)?;
+            robots.extend(task.state.robot_id.clone());
+        }
+        // One that does not exist is answered as one that the caller may not see.
+        let is_there = |id: &&TaskId| tasks.iter().any(|task| task.state.task_id == **id);
+        if let Some(missing) = task_ids.iter().find(|id| !is_there(id)) {
+            return Err(not_found(missing));
         }
         if robots.is_empty() {
             return Ok(());

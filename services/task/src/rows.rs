@@ -5,9 +5,10 @@ use midshift_core::fleet::rows::{RobotAuthority, RobotHolder};
 use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::TaskId;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
-use midshift_core::rows::{BadRow, Key, Revision, Row, Table};
+use midshift_core::rows::{BadRow, Key, Record, Revision, Row, Table};
 use midshift_core::site::Site;
 use midshift_core::task::{Attempt, Resolution, TaskIntake, TaskState};
+use midshift_core::unknown_rows;
 use midshift_proto::convert::task::{TaskView, encode_task};
 use midshift_proto::task::v1;
 use midshift_store::{Error, Store, load};
@@ -70,10 +71,15 @@ pub fn sees(site: &Site, by: &Caller, intake: &TaskIntake) -> bool {
 
 /// One task.
 pub async fn read(store: &dyn Store, task_id: &TaskId) -> Result<TaskRows, Refusal> {
-    read_many(store, std::slice::from_ref(task_id)).await?.pop().ok_or_else(|| not_found(task_id))
+    if let Some(task) = read_many(store, std::slice::from_ref(task_id)).await?.pop() {
+        return Ok(task);
+    }
+    let rows = store.get(vec![Key::new(Table::TaskState, task_id.as_str())]).await.map_err(unavailable)?;
+    let unread = rows.iter().find_map(|row| Some(unknown_rows::reason(row, &row.decode::<TaskState>().err()?)));
+    Err(unread.map_or_else(|| not_found(task_id), |reason| Refusal::new(Kind::Precondition, reason)))
 }
 
-/// These tasks, in this order; those that do not exist are left out.
+/// These tasks, in this order. Left out: those that do not exist, and those with a value of a newer version.
 pub async fn read_many(store: &dyn Store, ids: &[TaskId]) -> Result<Vec<TaskRows>, Refusal> {
     join(store, ids).await.map_err(unavailable)
 }
@@ -85,14 +91,27 @@ async fn by_id(store: &dyn Store, keys: Vec<Key>) -> Result<BTreeMap<String, Row
     Ok(store.get(keys).await?.into_iter().map(|row| (row.key.id.to_string(), row)).collect())
 }
 
+/// What a row holds; none: a value of a newer version.
+fn known<R: Record>(row: &Row) -> Result<Option<R>, BadRow> {
+    match row.decode() {
+        Ok(record) => Ok(Some(record)),
+        Err(error) if error.is_unknown() => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
 async fn join(store: &dyn Store, ids: &[TaskId]) -> Result<Vec<TaskRows>, Error> {
     let keys = |table| ids.iter().map(move |id| Key::new(table, id.as_str()));
     let mut intakes = BTreeMap::new();
     let mut states = BTreeMap::new();
     for row in store.get(keys(Table::TaskIntake).chain(keys(Table::TaskState)).collect()).await? {
         match row.key.table {
-            Table::TaskIntake => drop(intakes.insert(row.key.id.to_string(), row.decode::<TaskIntake>()?)),
-            _ => drop(states.insert(row.key.id.to_string(), (row.decode::<TaskState>()?, row.revision))),
+            Table::TaskIntake => {
+                drop(known::<TaskIntake>(&row)?.map(|intake| intakes.insert(row.key.id.to_string(), intake)))
+            }
+            _ => drop(
+                known::<TaskState>(&row)?.map(|state| states.insert(row.key.id.to_string(), (state, row.revision))),
+            ),
         }
     }
     let wanted = states.values().filter_map(|(s, _)| s.attempt_id()).map(|a| Key::new(Table::Attempt, a.to_string()));
@@ -106,17 +125,15 @@ async fn join(store: &dyn Store, ids: &[TaskId]) -> Result<Vec<TaskRows>, Error>
         let (Some(intake), Some((state, revision))) = (intakes.remove(id.as_str()), states.remove(id.as_str())) else {
             continue;
         };
-        let attempt = state
-            .attempt_id()
-            .and_then(|a| attempts.get(&a.to_string()))
-            .map(|row| row.decode::<Attempt>())
-            .transpose()?;
+        let attempt =
+            state.attempt_id().and_then(|a| attempts.get(&a.to_string())).map(known::<Attempt>).transpose()?.flatten();
         let holder = state
             .robot_id
             .as_ref()
             .and_then(|r| authority.get(r.as_str()))
-            .map(|row| row.decode::<RobotAuthority>())
-            .transpose()?;
+            .map(known::<RobotAuthority>)
+            .transpose()?
+            .flatten();
         let kept = holder.is_some_and(|h| keeps(&h, &state));
         let allowed = allowed_resolutions(state.phase, state.opened.is_some(), kept);
         tasks.push(TaskRows { intake, state, revision, attempt, allowed });

@@ -136,7 +136,7 @@ impl StatusLane {
             lane: Arc::from("STATUS"),
             from_seq,
             to_seq,
-            reason: Arc::from(reason.code.as_str()),
+            reason: Arc::from(reason.name()),
             at_unix_ms: now.0,
         }
     }

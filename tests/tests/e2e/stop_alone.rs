@@ -191,17 +191,23 @@ async fn a_next_stop_service_that_cannot_begin_leaves_the_one_that_runs_alone() 
     reset(&mut StopServiceClient::new(way(address).await?), &stop_id).await
 }
 
+/// A `serve` of the demo site in `dir` with a stop service beside it.
+fn serving(dir: &Path, address: SocketAddr, stop_address: SocketAddr) -> anyhow::Result<Command> {
+    std::fs::write(dir.join("site.toml"), DEMO)?;
+    let mut command = Command::new(midshift()?);
+    command.env("NO_COLOR", "1").args(["serve", "--data"]).arg(dir.join("data"));
+    command.arg("--site").arg(dir.join("site.toml")).arg("--first-token-file").arg(dir.join("token"));
+    command.args(["--listen", &address.to_string(), "--stop-listen", &stop_address.to_string()]);
+    Ok(command)
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn serve_starts_the_stop_service_again_unless_a_next_one_is_there_and_what_it_said_is_in_its_folder()
 -> anyhow::Result<()> {
     let dir = folder()?;
-    std::fs::write(dir.path().join("site.toml"), DEMO)?;
     let (address, stop_address) = (free_port()?, free_port()?);
-    let log = dir.path().join("server.log");
-    let (mut command, token) = (Command::new(midshift()?), dir.path().join("token"));
-    command.env("NO_COLOR", "1").args(["serve", "--data"]).arg(dir.path().join("data"));
-    command.arg("--site").arg(dir.path().join("site.toml")).arg("--first-token-file").arg(&token);
-    command.args(["--listen", &address.to_string(), "--stop-listen", &stop_address.to_string()]);
+    let (log, token) = (dir.path().join("server.log"), dir.path().join("token"));
+    let mut command = serving(dir.path(), address, stop_address)?;
     let said = dir.path().join("data/stop/log");
     let children = Children(vec![log.clone(), said.clone()]);
     let mut running = Running::start(&mut command, &log)?;
@@ -246,13 +252,9 @@ async fn serve_starts_the_stop_service_again_unless_a_next_one_is_there_and_what
 async fn a_stop_service_that_hangs_is_replaced_with_what_is_engaged_and_a_person_is_told_if_the_next_one_hangs_too()
 -> anyhow::Result<()> {
     let dir = folder()?;
-    std::fs::write(dir.path().join("site.toml"), DEMO)?;
     let (address, stop_address) = (free_port()?, free_port()?);
-    let log = dir.path().join("server.log");
-    let (mut command, token) = (Command::new(midshift()?), dir.path().join("token"));
-    command.env("NO_COLOR", "1").args(["serve", "--data"]).arg(dir.path().join("data"));
-    command.arg("--site").arg(dir.path().join("site.toml")).arg("--first-token-file").arg(&token);
-    command.args(["--listen", &address.to_string(), "--stop-listen", &stop_address.to_string()]);
+    let (log, token) = (dir.path().join("server.log"), dir.path().join("token"));
+    let mut command = serving(dir.path(), address, stop_address)?;
     let children = Children(vec![log.clone(), dir.path().join("data/stop/log")]);
     let _running = Running::start(&mut command, &log)?;
     sign_in_to(address, dir.path().join("data/identity/ca.pem"), &token).await?;

@@ -33,4 +33,5 @@ mod stops;
 mod turns;
 mod twins;
 mod uncertain;
+mod unknown;
 mod waiting;

@@ -3,6 +3,7 @@
 use crate::harness::World;
 use midshift_core::fleet::maps::{MapChange, Obstacle};
 use midshift_core::ids::{PlaceId, RobotId, TaskId};
+use midshift_core::robot::Mode;
 use midshift_core::site::CORRIDOR;
 
 fn obstacles() -> Vec<Obstacle> {
@@ -40,7 +41,15 @@ async fn a_map_that_is_not_taken_is_one_incident_which_closes_once_it_is() {
 #[tokio::test(start_paused = true)]
 async fn a_map_that_is_forced_is_an_incident_of_each_thing_that_was_in_its_way() {
     let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
     started_with(&mut w, MapChange::Forced { obstacles: obstacles() }).await;
+    // The picture is read anew after an outage: nobody is told again.
+    w.shaky.fail(true);
+    w.r("r1").set_mode(Mode::Manual);
+    w.pass(2).await;
+    assert!(w.shaky.failed() > 0, "the fault happened");
+    w.shaky.fail(false);
+    w.pass(2).await;
     let open = w.seen().await.open_incidents("MAP_FORCED");
     assert_eq!(open.len(), 3);
     assert!(open.iter().any(|i| i.task_id.is_some()) && open.iter().any(|i| i.robot_id.is_some()));

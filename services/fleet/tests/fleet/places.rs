@@ -338,6 +338,22 @@ async fn an_entry_on_a_grant_that_nobody_gave_is_an_incident() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_robot_that_invents_grants_without_end_opens_a_few_incidents_the_last_of_which_stands_for_the_rest() {
+    let mut w = World::on(DEMO).await;
+    w.robot("r1", "park-1").await;
+    w.pass(600).await;
+    let all: Vec<PlaceId> = w.site.places().iter().map(|p| p.place_id.clone()).collect();
+    for (n, place_id) in (4_711..).zip(all) {
+        w.r("r1").says(RobotEvent::Place { place_id, grant_id: n, news: PlaceNews::Entered });
+    }
+    w.pass(3).await;
+    let open = w.seen().await.open_incidents("GRANT_UNKNOWN");
+    assert_eq!(open.len(), 8);
+    assert_eq!(open.iter().filter(|i| i.reason.metadata.contains_key("further")).count(), 1);
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_robot_that_waits_for_a_place_is_told_who_has_it() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;

@@ -2,6 +2,7 @@
 
 use crate::harness::{Answer, World};
 use midshift_core::reason::Code;
+use midshift_core::robot::Mode;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::{Attempt, Phase, TaskState, Then};
 use midshift_proto::fleet::v1;
@@ -192,4 +193,21 @@ async fn questions_are_answered_though_the_store_takes_nothing() {
     w.shaky.fail(false);
     w.until_phase("T1", Phase::Succeeded).await;
     w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_lasts_is_told_though_the_picture_is_read_anew_again_and_again() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    for _ in 0..8 {
+        let failed = w.shaky.failed();
+        w.shaky.fail(true);
+        // An event of it is to be taken over.
+        w.r("r1").set_mode(Mode::Manual);
+        w.pass(2).await;
+        assert!(w.shaky.failed() > failed, "the fault happened");
+        w.shaky.fail(false);
+        w.pass(8).await;
+    }
+    assert_eq!(w.seen().await.open_incidents("ROBOT_MANUAL").len(), 1);
 }

@@ -23,7 +23,7 @@ const WORDS: u32 = 3;
 /// Says which process the service is from now on.
 pub fn is_now(process: u32) {
     let Some(address) = env::var_os(NOTIFY) else { return };
-    if let Err(error) = tell(&address, &format!("MAINPID={process}")) {
+    if let Err(error) = notify(&address, &format!("MAINPID={process}")) {
         tracing::warn!(%error, "the service manager was not told which process this service is now");
     }
 }
@@ -37,10 +37,10 @@ pub async fn is_watched(service: &OnceLock<StopService>) {
     loop {
         each.tick().await;
         if let Some(service) = service.get() {
-            service.look();
+            service.look_at_locks();
         }
         let to = address.clone();
-        let told = tokio::task::spawn_blocking(move || tell(&to, "WATCHDOG=1")).await;
+        let told = tokio::task::spawn_blocking(move || notify(&to, "WATCHDOG=1")).await;
         let hears = matches!(told, Ok(Ok(())));
         if is_heard && !hears {
             tracing::warn!("the service manager does not hear that this service thinks still");
@@ -49,7 +49,7 @@ pub async fn is_watched(service: &OnceLock<StopService>) {
     }
 }
 
-fn tell(address: &OsStr, text: &str) -> io::Result<()> {
+fn notify(address: &OsStr, text: &str) -> io::Result<()> {
     let address = match address.as_bytes() {
         [b'@', name @ ..] => SocketAddr::from_abstract_name(name)?,
         _ => SocketAddr::from_pathname(address)?,
@@ -72,7 +72,7 @@ mod tests {
         let by_name = UnixDatagram::bind_addr(&SocketAddr::from_abstract_name(&name).unwrap()).unwrap();
         let by_path = UnixDatagram::bind(&path).unwrap();
         for (socket, address) in [(by_path, path.into_os_string()), (by_name, format!("@{name}").into())] {
-            tell(&address, "MAINPID=7").unwrap();
+            notify(&address, "MAINPID=7").unwrap();
             let mut heard = [0; 32];
             let bytes = socket.recv(&mut heard).unwrap();
             assert_eq!(&heard[..bytes], b"MAINPID=7");
@@ -82,6 +82,6 @@ mod tests {
     #[test]
     fn a_manager_that_is_not_there_is_an_error_and_no_wait() {
         let dir = tempfile::tempdir().unwrap();
-        assert!(tell(dir.path().join("nobody").as_os_str(), "MAINPID=7").is_err());
+        assert!(notify(dir.path().join("nobody").as_os_str(), "MAINPID=7").is_err());
     }
 }

@@ -1,6 +1,7 @@
 //! The stop service beside a server on one box: started as a process that outlives the server, and started again as soon as it is gone.
 //!
-//! Invariant: only one that answered nothing three times is ended, the process that holds the folder, once in 30 s; beyond that a person is told. What it says goes to a file of its own: it must not depend on where the server's own words go.
+//! Invariant: only one that answered nothing three times is ended, the process that holds the folder, once in 30 s; beyond that a person is told.
+//! What it says goes to a file of its own: it must not depend on where the server's own words go.
 
 use super::program::{FOLDER, LOOK_EVERY, UP_WITHIN, program};
 use crate::clock;
@@ -116,7 +117,7 @@ impl Started {
         loop {
             let begun = Instant::now();
             self.until_gone(&mut child, &mut watch, store).await;
-            if self.answers().await {
+            if self.is_followed().await {
                 tracing::info!(address = %self.listen, "another stop service has taken the place of the one that was here");
                 child = None;
                 continue;
@@ -147,15 +148,15 @@ impl Started {
                 if watch.due.is_none() {
                     self.watch().await;
                 }
-                let (verdict, is_refused) = tokio::join!(watch.look(self.serves()), self.is_refused());
+                let (verdict, is_refused) = tokio::join!(watch.look_at_service(self.serves()), self.is_refused());
                 match verdict {
                     _ if is_refused => return,
                     Verdict::Leave => {}
                     Verdict::Kill => match self.end().await {
                         Ok(()) => return,
-                        Err(error) => watch.tell(store, &error.to_string()).await,
+                        Err(error) => watch.tell_person(store, &error.to_string()).await,
                     },
-                    Verdict::Tell => watch.tell(store, "it hangs again within 30 s after it was replaced").await,
+                    Verdict::Tell => watch.tell_person(store, "it hangs again within 30 s after it was replaced").await,
                 }
             }
         };
@@ -191,6 +192,19 @@ impl Started {
             }
             sleep(LOOK_EVERY).await;
         }
+    }
+
+    /// Whether another answers where one has ended. One that listens is given as long as one that hangs: it may be busy beginning.
+    async fn is_followed(&self) -> bool {
+        for _ in 0..limits::STOP_LOOKS_MISSED {
+            if self.answers().await {
+                return true;
+            }
+            if self.is_refused().await {
+                return false;
+            }
+        }
+        false
     }
 
     /// Whether nothing listens there. Of a process that hangs the system still takes connections, or lets them wait.
@@ -235,7 +249,7 @@ impl Default for Watch {
 
 impl Watch {
     /// Looks once, when it is time to: right away, and each second as long as nothing is answered.
-    async fn look(&mut self, serves: impl Future<Output = bool>) -> Verdict {
+    async fn look_at_service(&mut self, serves: impl Future<Output = bool>) -> Verdict {
         let now = self.clock.now().link;
         let due = self.due.unwrap_or(now);
         sleep(Duration::from_millis(due.since(now).as_ms())).await;
@@ -251,7 +265,7 @@ impl Watch {
     }
 
     /// Tells a person, once until it answers again; what the store does not take in time is told at the next look.
-    async fn tell(&mut self, store: &dyn Store, why: &str) {
+    async fn tell_person(&mut self, store: &dyn Store, why: &str) {
         if self.is_told {
             return;
         }

@@ -144,7 +144,7 @@ pub fn rollout(view: &View, now: &Now, row: &Rollout) -> v1::Rollout {
         count(&mut counts, r);
         count(waves.entry(r.wave).or_default(), r);
         if let (Step::Skipped, Some(why)) = (r.step, &r.why) {
-            *skipped.entry(why.code.as_str().to_owned()).or_default() += 1;
+            *skipped.entry(why.name().to_owned()).or_default() += 1;
         }
     }
     let served = view.served_ms(now);

@@ -236,6 +236,11 @@ async fn what_is_held_is_let_go_where_the_caller_operates() {
     for (task, expected) in [("in-hall", Code::Ok), ("in-quality", denied), ("in-both", denied)] {
         assert_eq!(resume(&anna, &|r| r.task_ids = vec![task.into()]).await, expected, "{task}");
     }
+    let blind = self::anna(&["operator@hall"]);
+    for hidden in ["in-quality", "never"] {
+        let both = |r: &mut v1::ResumeHeldRequest| r.task_ids = vec!["in-hall".into(), hidden.into()];
+        assert_eq!(resume(&blind, &both).await, Code::NotFound, "{hidden}");
+    }
     for (robot, expected) in [("r1", Code::Ok), ("r2", denied), ("r3", denied)] {
         assert_eq!(resume(&anna, &|r| r.robot_ids = vec![robot.into()]).await, expected, "{robot}");
     }

@@ -271,15 +271,21 @@ async fn a_process_that_takes_over_without_a_current_directive_key_says_so_and_g
     next.end().await;
 }
 
-#[tokio::test(start_paused = true)]
-async fn a_roll_out_that_is_created_at_both_processes_at_once_is_written_once_and_both_say_so() {
-    let world = World::new();
+/// A process that leads, one that follows it, and the bundle of a release that both know.
+async fn with_a_release(world: &World) -> (Process, Process, String) {
     let leader = world.process().await;
     release(&leader.ota, &files("walk", "1.0.0")).await;
     secs(2).await;
     let standby = world.process().await;
     secs(2).await;
     let bundle = world.bundles().await[0].bundle.to_string();
+    (leader, standby, bundle)
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_roll_out_that_is_created_at_both_processes_at_once_is_written_once_and_both_say_so() {
+    let world = World::new();
+    let (leader, standby, bundle) = with_a_release(&world).await;
     for n in 0..8 {
         let id = format!("r-{n}");
         let (first, second) = tokio::join!(leader.create(&id, &bundle), standby.create(&id, &bundle));
@@ -293,12 +299,7 @@ async fn a_roll_out_that_is_created_at_both_processes_at_once_is_written_once_an
 #[tokio::test(start_paused = true)]
 async fn a_bundle_is_taken_back_once_for_a_request_id_whichever_process_is_asked_and_a_check_takes_nothing_back() {
     let world = World::new();
-    let leader = world.process().await;
-    release(&leader.ota, &files("walk", "1.0.0")).await;
-    secs(2).await;
-    let standby = world.process().await;
-    secs(2).await;
-    let bundle = world.bundles().await[0].bundle.to_string();
+    let (leader, standby, bundle) = with_a_release(&world).await;
     let revoke = async |process: &Process, reason: &str, validate_only: bool| {
         let (bundle, reason, request_id) = (bundle.clone(), reason.to_owned(), "r-1".to_owned());
         let request = v1::RevokeBundleRequest { bundle, reason, request_id, validate_only };

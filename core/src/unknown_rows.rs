@@ -1,0 +1,108 @@
+//! Keeps aside rows that hold a value of a newer version, such as a state that this build does not know.
+//!
+//! Called by [`crate::picture`] for every row that a picture takes. Invariants:
+//! 1. Such a row is not in the picture, and no decision that touches it reaches the store: it stays as the newer version wrote it.
+//! 2. What it is about is not acted on, and whoever asks is told the row and the value.
+//! 3. It is read anew whenever it changes.
+
+use crate::ids::{PlaceId, RobotId, TaskId};
+use crate::reason::{Code, Reason};
+use crate::rows::{BadRow, Key, Revision, Row, Table};
+use serde_json::Value;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// What is known of one row kept aside.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Kept {
+    revision: Revision,
+    reason: Reason,
+    robots: BTreeSet<RobotId>,
+    tasks: BTreeSet<TaskId>,
+    /// No person was told yet.
+    is_untold: bool,
+}
+
+/// Rows kept aside, by key.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct UnknownRows(BTreeMap<Key, Kept>);
+
+impl UnknownRows {
+    /// Keeps a row aside that could not be read for this reason.
+    pub(crate) fn keep(&mut self, row: &Row, error: &BadRow) {
+        let name = format!("{}/{}", row.key.table.name(), row.key.id);
+        let body = serde_json::from_str(&row.body).unwrap_or_default();
+        let kept = Kept {
+            revision: row.revision,
+            reason: Reason::from(Code::RowUnknown).with("row", name).with("value", error.value()),
+            robots: robots_of(&row.key, &body),
+            tasks: tasks_of(&row.key, &body),
+            is_untold: true,
+        };
+        self.0.insert(row.key.clone(), kept);
+    }
+    /// The row can be read again, or is gone.
+    pub(crate) fn forget(&mut self, key: &Key) {
+        self.0.remove(key);
+    }
+    /// Whether the row is aside as of this revision or a newer one.
+    pub(crate) fn has(&self, key: &Key, revision: Revision) -> bool {
+        self.0.get(key).is_some_and(|kept| kept.revision >= revision)
+    }
+    /// Whether one of these rows is aside: what touches it is not decided.
+    pub fn touches<'a>(&self, mut keys: impl Iterator<Item = &'a Key>) -> bool {
+        !self.0.is_empty() && keys.any(|key| self.0.contains_key(key))
+    }
+    /// Keeps work from a robot that a row aside is about. A stop or a rule of an area that cannot be read is about all of them.
+    ///
+    /// # Errors
+    /// If there is one; the reason names it.
+    pub fn screen(&self, robot_id: &RobotId) -> Result<(), Reason> {
+        let is_about = |key: &Key, kept: &Kept| {
+            kept.robots.contains(robot_id) || matches!(key.table, Table::StopRecord | Table::AreaPolicy)
+        };
+        match self.0.iter().find(|(key, kept)| is_about(key, kept)) {
+            Some((_, kept)) => Err(kept.reason.clone()),
+            None => Ok(()),
+        }
+    }
+    /// Whether a row aside is about this robot alone.
+    pub fn names(&self, robot_id: &RobotId) -> bool {
+        self.0.values().any(|kept| kept.robots.contains(robot_id))
+    }
+    /// Why a task is not acted on; none: no row aside is about it.
+    pub fn of_task(&self, task_id: &TaskId) -> Option<&Reason> {
+        self.0.values().find(|kept| kept.tasks.contains(task_id)).map(|kept| &kept.reason)
+    }
+    /// Whether the row of a place is aside.
+    pub fn is_place_aside(&self, place_id: &PlaceId) -> bool {
+        !self.0.is_empty() && self.0.contains_key(&Key::new(Table::PlaceGrant, place_id.as_str()))
+    }
+    /// What no person was told of yet, each once, with a robot that it is about.
+    pub fn take_untold(&mut self) -> Vec<(Reason, Option<RobotId>)> {
+        let untold = self.0.values_mut().filter_map(|kept| std::mem::take(&mut kept.is_untold).then_some(kept));
+        untold.map(|kept| (kept.reason.clone(), kept.robots.first().cloned())).collect()
+    }
+}
+
+/// Why a row cannot be read, for whoever reads it by itself.
+pub fn reason(row: &Row, error: &BadRow) -> Reason {
+    let mut rows = UnknownRows::default();
+    rows.keep(row, error);
+    rows.take_untold().pop().map_or_else(|| Code::RowUnknown.into(), |(reason, _)| reason)
+}
+
+fn robots_of(key: &Key, body: &Value) -> BTreeSet<RobotId> {
+    let holders = body["holders"].as_array().into_iter().flatten().map(|holder| &holder["robot_id"]);
+    let named = holders.chain([&body["robot_id"]]).filter_map(Value::as_str);
+    let own = match key.table {
+        Table::RobotAuthority | Table::RobotControl | Table::Session | Table::Presence => Some(&*key.id),
+        _ => None,
+    };
+    named.chain(own).filter_map(|id| RobotId::parse(id).ok()).collect()
+}
+
+fn tasks_of(key: &Key, body: &Value) -> BTreeSet<TaskId> {
+    let own = matches!(key.table, Table::TaskState | Table::TaskIntake).then_some(&*key.id);
+    let named = body["task_id"].as_str();
+    own.into_iter().chain(named).filter_map(|id| TaskId::parse(id).ok()).collect()
+}
