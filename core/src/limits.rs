@@ -106,6 +106,12 @@ pub const PAGE_MAX: usize = 1_000;
 /// Tasks that one call of a list looks at, about, before it answers with what it found: some 100 ms of reading. No filter that an index serves
 /// comes near it.
 pub const LIST_ROWS_READ_MAX: usize = 10_000;
+/// Parameters of all actions of one task as JSON, bytes: 4 of the largest, or 512 bytes for each of 64 steps.
+pub const PARAMS_OF_TASK_BYTES_MAX: usize = 32 * 1024;
+/// A message to the task service, bytes: the largest legal task. Lists of numbers are 5.5 times as large on the wire as in JSON.
+pub const TASK_MESSAGE_BYTES: usize = 256 * 1024;
+/// Calls of SubmitTasks at once over one connection. HTTP/2 ends a connection for unread small frames; so many batches never meet that.
+pub const BATCHES_PER_CONNECTION_MAX: usize = 6;
 /// A control message, bytes.
 pub const CONTROL_MESSAGE_BYTES: usize = 64 * 1024;
 /// Sets that a robot lists at Hello: those that its switch record names, what is staged, and room for as many again.

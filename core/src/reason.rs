@@ -155,6 +155,7 @@ codes! {
     MapNotTaken = "MAP_NOT_TAKEN", "The site file has changed, and tasks, robots or held places are in the way of it, so the stored map goes on. Start the server again once they are not, or with --force-map.";
     MapForced = "MAP_FORCED", "A changed map was forced upon work that it does not fit. Look at the task, robot or place, and at what stands there.";
     MapDiffers = "MAP_DIFFERS", "The robot drives by another version of the site's map than the server plans on, so it gets no work. Give it the map of the server, or start the server with the new one.";
+    MessageTooLarge = "MESSAGE_TOO_LARGE", "The message has more bytes than the port takes. The text says how many; split it, or leave out what is not needed.";
     RowUnknown = "ROW_UNKNOWN", "A row holds a value of a newer version of midshift. It is left as it is, and what it is about is not acted on. Start that version again; what it wrote is whole.";
     DecisionPutAside = "DECISION_PUT_ASIDE", "The store refused the same decision twice, so it is not tried again and the robot or place it is about gets no work and no grant. The server's log has the details; close the incident to try once more.";
     ReportTooLong = "REPORT_TOO_LONG", "A list of the robot's heartbeat is longer than one may be. It is not processed, so the robot loses its authority; its maker must mend it.";

@@ -37,6 +37,11 @@ pub fn class(path: &str) -> Class {
     of(path).map_or(Class::Bulk, |access| access.class)
 }
 
+/// Whether a call of that path may bring thousands of small messages up.
+pub fn is_batch(path: &str) -> bool {
+    path == "/midshift.task.v1.TaskService/SubmitTasks"
+}
+
 /// Whether this caller may ask for that path at all.
 ///
 /// # Errors

@@ -3,7 +3,7 @@
 //! Invariant: no handler makes a status by hand. The text of an internal fault stays here; its request_id is shown instead.
 //! Details travel in a header, so violations are cut at a size that every HTTP/2 peer takes; what is cut is counted.
 
-use midshift_core::reason::{Code, Kind, Refusal, Violation};
+use midshift_core::reason::{Code, Kind, Reason, Refusal, Violation};
 use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
 use tonic::Status;
@@ -57,7 +57,10 @@ pub fn status(refusal: &Refusal, request_id: Option<&str>) -> Status {
         }
         Kind::Exhausted | Kind::Unavailable => {
             let own = refusal.again_after.map(|after| Duration::from_millis(after.as_ms()));
-            details.set_retry_info(Some(own.unwrap_or(RETRY_AFTER)));
+            // The same message is as large the next time.
+            if reason.code != Code::MessageTooLarge {
+                details.set_retry_info(Some(own.unwrap_or(RETRY_AFTER)));
+            }
         }
         _ => {}
     }
@@ -71,6 +74,18 @@ pub fn status(refusal: &Refusal, request_id: Option<&str>) -> Status {
 fn subject(metadata: &BTreeMap<String, String>) -> String {
     let keys = ["task_id", "robot_id", "place_id", "area_id"];
     keys.iter().find_map(|key| metadata.get(*key)).cloned().unwrap_or_default()
+}
+
+/// The refusal of a message that was announced with more bytes than a port takes; none: the status is about something else.
+pub fn too_large(status: &Status) -> Option<Refusal> {
+    let told = status.message();
+    if status.code() != tonic::Code::OutOfRange || !told.contains("message length too large") {
+        return None;
+    }
+    let mut numbers = told.split(|c: char| !c.is_ascii_digit()).filter(|word| !word.is_empty());
+    let (bytes, most) = (numbers.next().unwrap_or("too many"), numbers.next().unwrap_or("fewer"));
+    let reason = Reason::new(Code::MessageTooLarge, format!("the message has {bytes} bytes; at most {most} are taken"));
+    Some(Refusal::new(Kind::Exhausted, reason))
 }
 
 /// The first bytes of a text, at most [`MESSAGE_BYTES_MAX`].

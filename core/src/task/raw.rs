@@ -262,6 +262,13 @@ fn check_steps(
     if !(1..=limits::STEPS_MAX).contains(&raw.len()) {
         bad.add(format!("{field}.steps"), "must be 1..64 steps");
     }
+    let params = raw.iter().map(|step| match &step.kind {
+        Some(RawStepKind::Action(_, params)) => serde_json::to_string(params).map_or(0, |s| s.len()),
+        _ => 0,
+    });
+    if params.sum::<usize>() > limits::PARAMS_OF_TASK_BYTES_MAX {
+        bad.add(format!("{field}.steps"), "must have parameters of at most 32 KiB in all, as JSON");
+    }
     raw.iter()
         .enumerate()
         .filter_map(|(i, step)| check_step(step, &format!("{field}.steps[{i}]"), knows, bad))

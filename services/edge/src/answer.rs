@@ -7,6 +7,7 @@ use http::header::{CONTENT_TYPE, RETRY_AFTER};
 use http::{HeaderMap, HeaderValue, Response, StatusCode};
 use midshift_core::reason::{Kind, Refusal};
 use midshift_proto::status;
+use tonic::Status;
 use tonic::body::Body;
 
 /// What a request speaks.
@@ -29,6 +30,14 @@ impl Speech {
             }
             Some(bytes) if bytes.starts_with(b"application/grpc") => Self::Grpc,
             _ => Self::Http,
+        }
+    }
+
+    /// An answer of a service; a message that tonic found too large is refused with its reason.
+    pub fn reasoned(&self, response: Response<Body>) -> Response<Body> {
+        match Status::from_header_map(response.headers()).and_then(|status| status::too_large(&status)) {
+            Some(refusal) => self.refuse(&refusal),
+            None => response,
         }
     }
 

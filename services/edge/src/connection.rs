@@ -23,7 +23,7 @@ use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite};
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 use tokio::time::{sleep, timeout};
 use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
@@ -84,8 +84,9 @@ pub(crate) struct Port<S> {
 /// Bytes of one stream that may wait unread. HTTP/2 ends a connection on which unread frames of less than 256 bytes lack more than half
 /// of its window in sum: with these two, frames of 28 bytes and more never do on one stream, however fast they come.
 const STREAM_WINDOW_BYTES: u32 = 64 * 1024;
-/// Bytes of all streams of one connection that may wait unread.
-const CONNECTION_WINDOW_BYTES: u32 = 1024 * 1024;
+/// Bytes of all streams of one connection that may wait unread: half of it is room for [`limits::BATCHES_PER_CONNECTION_MAX`] streams of
+/// the smallest frames.
+const CONNECTION_WINDOW_BYTES: u32 = 8 * 1024 * 1024;
 
 /// HTTP/2 and HTTP/1.1 within the limits of `config`.
 pub(crate) fn http(config: &Config) -> auto::Builder<TokioExecutor> {
@@ -174,6 +175,7 @@ where
             stranger,
             principals: self.principals.clone(),
             denials: self.denials.clone(),
+            batches: Arc::new(Semaphore::new(limits::BATCHES_PER_CONNECTION_MAX)),
         };
         let mut served = pin!(self.http.serve_connection(TokioIo::new(io), door));
         let reason = tokio::select! {

@@ -27,6 +27,7 @@ use std::net::IpAddr;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Instant, timeout_at};
 use tonic::body::Body;
 use tower::{Service, ServiceExt};
@@ -95,12 +96,14 @@ type Held = (OpenStream, Option<Inside>);
 pub(crate) struct Inside {
     gauge: metrics::Gauge,
     _seats: (Seat<Asker>, Option<Seat<Asker>>),
+    /// Its place among the batches of its connection. Never read.
+    batch: Option<OwnedSemaphorePermit>,
 }
 
 impl Inside {
     fn new(gauge: &metrics::Gauge, seats: (Seat<Asker>, Option<Seat<Asker>>)) -> Self {
         gauge.increment(1.0);
-        Self { gauge: gauge.clone(), _seats: seats }
+        Self { gauge: gauge.clone(), _seats: seats, batch: None }
     }
 }
 
@@ -119,9 +122,24 @@ pub(crate) struct Door<S> {
     pub stranger: Stranger,
     pub principals: Arc<dyn Principals>,
     pub denials: Option<Arc<Denials>>,
+    /// Room for batches of this connection.
+    pub batches: Arc<Semaphore>,
 }
 
 impl<S> Door<S> {
+    /// Its place among the batches of this connection, if it is one.
+    fn batch(&self, path: &str) -> Result<Option<OwnedSemaphorePermit>, Refusal> {
+        if !access::is_batch(path) {
+            return Ok(None);
+        }
+        self.batches.clone().try_acquire_owned().map(Some).map_err(|_| {
+            let most = limits::BATCHES_PER_CONNECTION_MAX;
+            let text =
+                format!("{most} batches are under way over this connection; wait for one, or open another connection");
+            Refusal::new(Kind::Exhausted, Reason::new(Code::TooManyRequests, text))
+        })
+    }
+
     /// Who asks, and what it holds for that; or why it goes no further.
     fn admit(&self, request: &Request<Incoming>, speech: &Speech) -> Result<(Caller, Admitted), Refusal> {
         let (path, headers) = (request.uri().path(), request.headers());
@@ -131,7 +149,7 @@ impl<S> Door<S> {
             self.stranger.is_known();
         }
         // Before anything else is said: guessing is limited too.
-        let admitted = self.rules.admit(&asker, path, headers, speech)?;
+        let mut admitted = self.rules.admit(&asker, path, headers, speech)?;
         let allowed = match &caller {
             Ok(caller) => access::check(caller, path),
             Err(worthless) => Err(worthless.clone()),
@@ -140,6 +158,7 @@ impl<S> Door<S> {
             self.denied(&asker, caller.as_ref().ok(), path, refusal);
         }
         allowed?;
+        admitted.seat.batch = self.batch(path)?;
         Ok((caller?, admitted))
     }
 
@@ -237,6 +256,7 @@ where
                 let late = speech.refuse(&deadline::over());
                 return Ok(late.map(|body| Bounded::new(body, None, over, speech, (stream, Some(seat)))));
             };
+            let response = speech.reasoned(response);
             Ok(response.map(|body| Bounded::new(body, deadline, over, speech, (stream, Some(seat)))))
         })
     }

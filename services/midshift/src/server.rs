@@ -148,7 +148,7 @@ impl Server {
         if let Some(task) = &self.task {
             let audit = AuditService::new(self.parts.store.clone(), self.parts.clock.clone(), self.shutdown.clone());
             routes
-                .add_service(task.grpc().max_decoding_message_size(control))
+                .add_service(task.grpc().max_decoding_message_size(limits::TASK_MESSAGE_BYTES))
                 .add_service(audit.grpc().max_decoding_message_size(control));
         }
         if let Some((fleet, _)) = &self.fleet {

@@ -27,6 +27,7 @@ use midshift_proto::link::v1;
 use midshift_proto::session::{
     ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, ToRobot, Uplink,
 };
+use midshift_proto::status::too_large;
 use std::collections::VecDeque;
 use std::future::Future;
 use std::pin::Pin;
@@ -202,7 +203,8 @@ impl Session {
                             return end;
                         }
                     }
-                    Ok(None) | Err(_) => return End::Gone,
+                    Ok(None) => return End::Gone,
+                    Err(status) => return self.broken(&status),
                 },
                 replay = next(&mut self.replays), if self.replaying.is_none() => self.replay(replay),
                 changed = desired.changed(), if self.in_charge.is_some() => {
@@ -234,6 +236,13 @@ impl Session {
                 }
             }
         }
+    }
+
+    /// What the robot sent cannot be read: it hears why if it was too large.
+    fn broken(&self, status: &Status) -> End {
+        let Some(refusal) = too_large(status) else { return End::Gone };
+        tracing::warn!(robot_id = %self.robot_id, code = Code::MessageTooLarge.as_str(), "session ended by a message that is too large");
+        End::Close(Close { code: CloseCode::Protocol, reason: refusal.reason, retry_after_ms: 1_000 })
     }
 
     /// Asks the robot for its next session.

@@ -31,6 +31,7 @@ mod held;
 mod identity;
 mod kill;
 mod languages;
+mod largest;
 mod launched;
 mod ledger_cuts;
 mod many;

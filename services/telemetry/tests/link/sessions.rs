@@ -70,6 +70,17 @@ async fn a_proven_succession_ends_the_older_session() -> Result<()> {
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_robot_whose_message_is_too_large_hears_so_before_its_session_ends() -> Result<()> {
+    let world = world().await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.events(1..=200_000).await?;
+    let close = robot.closes().await?;
+    assert_eq!((close.code, close.reason.code), (CloseCode::Protocol, Code::MessageTooLarge));
+    assert!(close.reason.text().ends_with("at most 1048576 are taken"), "{}", close.reason.text());
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
 async fn without_the_fence_a_clone_takes_over_a_robot_that_is_heard() -> Result<()> {
     let world = world_with(Otherwise { bugs: Bugs::of(&[SeededBug::NoCloneFence]), frames: None }).await?;
     let mut first = Robot::attach(&world, None).await?;
