@@ -1,6 +1,6 @@
 //! Children: this same program started again in one role, so that a server's CPU and memory are its own, and the kernel can say them.
 //!
-//! Invariant: a child lives no longer than its parent: it ends when its stdin does. Called by every measurement but `plan`.
+//! Invariant: a child lives no longer than its parent: it ends when its stdin does. Called by every measurement.
 
 use crate::questions::answer_questions;
 use crate::sink::Seen;
@@ -359,6 +359,14 @@ impl Child {
     /// CPU spent since then, seconds; less than a clock tick counts as one.
     pub fn cpu_since_s(&self, then_s: f64) -> anyhow::Result<f64> {
         Ok((self.cpu_s()? - then_s).max(tick_s()))
+    }
+
+    /// Lets it end as one that is asked to.
+    pub fn end(mut self) -> anyhow::Result<()> {
+        drop(self.process.stdin.take());
+        let status = self.process.wait()?;
+        ensure!(status.success(), "a child did not end well: {status}");
+        Ok(())
     }
 
     /// Memory in RAM, KiB.

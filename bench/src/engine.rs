@@ -2,7 +2,7 @@
 //! single commit by itself and rows by COPY.
 //!
 //! Invariant: each round has a directory or a database of its own, taken away with it. PostgreSQL keeps its promises: `fsync` is on and
-//! a commit waits for its log. Called by `submit`, `offer`, `link` and `stop`.
+//! a commit waits for its log. Called by `plan`, `submit`, `offer`, `link` and `stop`.
 
 use crate::child::{Child, cpu_of_ended_s, cpu_of_s};
 use crate::fsync::{Disk, place};
@@ -159,7 +159,8 @@ impl Bed<'_> {
     pub fn path(&self) -> &Path {
         self.dir.path()
     }
-    fn url(&self) -> Option<&str> {
+    /// Address of the database, if it is not files in the server's directory.
+    pub fn url(&self) -> Option<&str> {
         self.database.as_ref().map(|(_, url)| url.as_str())
     }
     /// A server of midshift here, once it listens.

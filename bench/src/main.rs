@@ -12,6 +12,7 @@ mod hall;
 mod link;
 mod listen;
 mod offer;
+mod old_store;
 mod ota;
 mod plan;
 mod questions;
@@ -28,8 +29,8 @@ use std::path::PathBuf;
 /// What can be measured.
 #[derive(Clone, Debug, Subcommand)]
 enum Name {
-    /// One planning cycle at three sizes of fleet.
-    Plan,
+    /// One planning cycle of several fleets; and of a server at a site where much is over: its start, a takeover, and answers beside its plans.
+    Plan(plan::PlanArgs),
     /// Durable submits, many at once.
     Submit(submit::SubmitArgs),
     /// From a submit to the offer at an idle robot.
@@ -66,7 +67,7 @@ fn main() -> anyhow::Result<()> {
     let args = Args::parse();
     let mut failed = Vec::new();
     let figures = match args.name {
-        Name::Plan => plan::run()?,
+        Name::Plan(args) => wait(plan::run(args, &note))?,
         Name::Submit(args) => wait(submit::run(args, &note))?,
         Name::Offer(args) => wait(offer::run(args, &note))?,
         Name::Link(args) => wait(link::run(args, &note))?,

@@ -6,6 +6,7 @@ use crate::hall;
 use crate::robot::{self, Ear, Voice};
 use crate::submit::transports;
 use anyhow::{Context, ensure};
+use midshift_core::ids::WaypointId;
 use midshift_core::limits;
 use midshift_core::site::grid;
 use midshift_core::work::{Assignment, AttemptReport, RobotEvent, WorkState, WorkStats};
@@ -51,9 +52,7 @@ async fn on(args: &OfferArgs, engine: &Engine) -> anyhow::Result<Vec<Figure>> {
     let requests = transports(&site, args.submits * args.rounds)?;
     let server = bed.serve(Some(&map), None).await?;
     let here = site.waypoints().first().context("an empty site")?.waypoint_id.clone();
-    let (voice, ear, _) = robot::attach(&server.address.to_string(), "rbt-1", Some(here)).await?;
-    let mut robot = Idle { voice, ear };
-    robot.known_idle().await?;
+    let mut robot = Idle::attach(&server.address.to_string(), "rbt-1", here).await?;
     let mut client = TaskServiceClient::new(server.channel().await?);
     let (mut offered, mut durable, mut raws) = (Vec::new(), Vec::new(), Vec::new());
     let mut raw = bed.raw().await?;
@@ -86,7 +85,7 @@ async fn on(args: &OfferArgs, engine: &Engine) -> anyhow::Result<Vec<Figure>> {
 }
 
 /// Submits one task and lets the robot do it: milliseconds until the robot had its offer, and until the client had its answer.
-async fn one(
+pub async fn one(
     client: &mut TaskServiceClient<Channel>,
     robot: &mut Idle,
     request: SubmitTaskRequest,
@@ -109,12 +108,26 @@ async fn one(
 }
 
 /// A robot that does everything in no time.
-struct Idle {
+pub struct Idle {
     voice: Voice,
     ear: Ear,
 }
 
 impl Idle {
+    /// A new one at a waypoint, which the server knows to be idle.
+    pub async fn attach(server: &str, name: &str, here: WaypointId) -> anyhow::Result<Self> {
+        let (voice, ear, _) = robot::attach(server, name, Some(here)).await?;
+        let mut robot = Self { voice, ear };
+        robot.known_idle().await?;
+        Ok(robot)
+    }
+    /// Does whatever it is given, until the session is over.
+    pub async fn work(mut self) -> anyhow::Result<()> {
+        loop {
+            let assignment = self.offered().await?;
+            self.finish(assignment).await?;
+        }
+    }
     /// Waits for work, beating; says when it came.
     async fn offered(&mut self) -> anyhow::Result<Assignment> {
         let mut beat = interval(Duration::from_millis(limits::HEARTBEAT.as_ms()));

@@ -2,15 +2,16 @@
 //! whole; a server cuts it into turns.
 
 use crate::figure::{Figure, percentile};
+use crate::old_store::{self, OldArgs};
 use midshift_core::fleet::view::{Rowed, View};
 use midshift_core::fleet::{Board, Pace, Plan, Slice, cycle, found};
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::robot::{Inventory, ReportedState, Vitals};
 use midshift_core::rows::{Record, Revision, Row};
 use midshift_core::site::route::Router;
-use midshift_core::site::{Site, grid};
+use midshift_core::site::{Site, grid, text};
 use midshift_core::task::forms::Transport;
-use midshift_core::task::{TaskIntake, TaskState};
+use midshift_core::task::{RawTask, TaskIntake, TaskState};
 use midshift_core::time::{LinkTime, Now, SiteTime, Utc};
 use midshift_core::work::{Live, Session};
 use std::sync::Arc;
@@ -18,30 +19,100 @@ use std::time::Instant;
 
 /// Cells of a side of the free grid that robots and tasks are spread over.
 const SIDE: usize = 120;
-/// Cycles measured per size.
-const CYCLES: usize = 15;
+/// Side of the floor with one charger.
+const CHARGED_SIDE: usize = 60;
+/// Sizes of fleet, robots.
+const SIZES: [usize; 3] = [100, 1_000, 10_000];
+/// Of what is planned at one moment: how many tasks there are for each robot that nothing can be done about now.
+const BLOCKED_EACH: usize = 10;
+/// Battery that is enough for the way to a charger and for no task, permille.
+const LOW_PERMILLE: u16 = 120;
 /// Steps of the reference loop.
 const REFERENCE_STEPS: u64 = 20_000_000;
 
-/// Plans at three sizes of fleet, each with half as many tasks again as robots.
-pub fn run() -> anyhow::Result<Vec<Figure>> {
+/// What to measure.
+#[derive(Clone, Debug, clap::Args)]
+pub struct PlanArgs {
+    /// Cycles of each fleet.
+    #[arg(long, default_value_t = 15)]
+    cycles: usize,
+    /// Largest fleet of a cycle, robots.
+    #[arg(long, default_value_t = 10_000)]
+    largest: usize,
+    /// Of a server.
+    #[command(flatten)]
+    pub old: OldArgs,
+}
+
+/// Which robots and tasks a cycle finds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Fleet {
+    /// Idle robots, and half as many tasks again.
+    Idle,
+    /// Robots with too little charge for any task, on a floor with one charger.
+    LowBattery,
+    /// Idle robots, and tasks whose time has not come.
+    Blocked,
+}
+
+/// Plans for fleets of several sizes in this process, then asks servers.
+pub async fn run(args: PlanArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figure>> {
+    let mut figures = cycles(&args)?;
+    figures.extend(old_store::run(&args.old, say).await?);
+    Ok(figures)
+}
+
+/// A free floor, and a square of junctions with lanes both ways and one charger in a corner.
+fn floors() -> anyhow::Result<[Arc<Site>; 2]> {
     let map =
         format!("type octile\nheight {SIDE}\nwidth {SIDE}\nmap\n{}", format!("{}\n", ".".repeat(SIDE)).repeat(SIDE));
-    let site = Arc::new(grid::parse_map("bench", &map)?);
+    let (mut waypoints, mut lanes) = (String::new(), String::new());
+    for row in 0..CHARGED_SIDE {
+        for column in 0..CHARGED_SIDE {
+            let kind = if row + column == 0 { ", kind = \"charger\"" } else { "" };
+            waypoints +=
+                &format!("  {{ id = \"w{row}-{column}\", at = [{}, {}]{kind} }},\n", column * 1_000, row * 1_000);
+            for (there, is_there) in
+                [((row, column + 1), column + 1 < CHARGED_SIDE), ((row + 1, column), row + 1 < CHARGED_SIDE)]
+            {
+                if is_there {
+                    let (here, there) = (format!("w{row}-{column}"), format!("w{}-{}", there.0, there.1));
+                    lanes += &format!("  {{ path = [\"{here}\", \"{there}\", \"{here}\"] }},\n");
+                }
+            }
+        }
+    }
+    let text = format!(
+        "site_id = \"charged\"\nname = \"One charger\"\nmap_id = \"charged\"\nmap_version = \"1\"\n\
+         area = [{{ id = \"hall\", speed_limit_mm_s = 1500 }}]\nwaypoint = [\n{waypoints}]\nlane = [\n{lanes}]\n"
+    );
+    Ok([Arc::new(grid::parse_map("bench", &map)?), Arc::new(text::parse(&text)?)])
+}
+
+fn cycles(args: &PlanArgs) -> anyhow::Result<Vec<Figure>> {
+    let [site, charged] = floors()?;
     let mut figures = Vec::new();
-    for robots in [100, 1_000, 10_000] {
+    for robots in SIZES.into_iter().filter(|robots| *robots <= args.largest) {
         let (mut known, mut new, mut reference) = (Vec::new(), Vec::new(), Vec::new());
-        for round in 0..CYCLES as u64 {
+        let (mut low, mut blocked) = (Vec::new(), Vec::new());
+        for round in 0..args.cycles as u64 {
             reference.push(reference_ms());
             let router = Arc::new(Router::new(site.clone()));
-            new.push(cycle_ms(&site, &router, robots, round));
-            known.push(cycle_ms(&site, &router, robots, round));
+            new.push(cycle_ms(&site, &router, Fleet::Idle, robots, round));
+            known.push(cycle_ms(&site, &router, Fleet::Idle, robots, round));
+            blocked.push(cycle_ms(&site, &router, Fleet::Blocked, robots, round));
+            let router = Arc::new(Router::new(charged.clone()));
+            low.push(cycle_ms(&charged, &router, Fleet::LowBattery, robots, round));
         }
         let beside: Option<(&str, &[f64])> = Some(("fixed reference loop", &reference));
         let what = format!("whole cycle, {robots} idle robots, {} tasks", waiting(robots));
         figures.push(Figure::of("P6", format!("{what}, p50"), "ms", &known, beside));
         figures.push(Figure::of("P6", format!("{what}, p99"), "ms", &[percentile(&known, 0.99)], beside));
         figures.push(Figure::of("P6", format!("{what}, no way known yet"), "ms", &new, beside));
+        let what = format!("whole cycle, {robots} robots of low charge, one charger, {} tasks", waiting(robots));
+        figures.push(Figure::of("P6", what, "ms", &low, beside));
+        let what = format!("whole cycle, {robots} idle robots, {} tasks whose time is later", robots * BLOCKED_EACH);
+        figures.push(Figure::of("P6", what, "ms", &blocked, beside));
     }
     Ok(figures)
 }
@@ -69,14 +140,14 @@ fn instant() -> Instant {
     Instant::now()
 }
 
-fn cycle_ms(site: &Arc<Site>, router: &Arc<Router>, robots: usize, seed: u64) -> f64 {
+fn cycle_ms(site: &Arc<Site>, router: &Arc<Router>, kind: Fleet, robots: usize, seed: u64) -> f64 {
     let now = Now {
         site: SiteTime(60_000),
         link: LinkTime(60_000),
         utc: Utc(1_800_000_000_000),
         wall: Utc(1_800_000_000_000),
     };
-    let (mut view, board) = fleet(site, robots, waiting(robots), seed, now);
+    let (mut view, board) = fleet(site, kind, robots, seed, now);
     view.router = router.clone();
     // One slice for all: what the whole fleet costs, however many turns it is cut into.
     let mut plan = Plan::of(Slice::of(2 * robots));
@@ -84,15 +155,16 @@ fn cycle_ms(site: &Arc<Site>, router: &Arc<Router>, robots: usize, seed: u64) ->
     let begun = instant();
     cycle(&mut view, now, &board, Pace::Wake, &mut plan);
     let took = begun.elapsed().as_secs_f64() * 1e3;
-    assert!(
-        plan.report.offers as usize >= robots * 9 / 10,
-        "a benchmark of a planner that assigned nothing: {:?}",
-        plan.report
-    );
+    let offers = plan.report.offers as usize;
+    let is_meant = if kind == Fleet::Idle { offers >= robots * 9 / 10 } else { offers == 0 };
+    assert!(is_meant, "a benchmark of another plan than is meant, {kind:?}: {:?}", plan.report);
     took
 }
 
-fn fleet(site: &Arc<Site>, robots: usize, tasks: usize, seed: u64, now: Now) -> (View, Board) {
+fn fleet(site: &Arc<Site>, kind: Fleet, robots: usize, seed: u64, now: Now) -> (View, Board) {
+    let tasks = if kind == Fleet::Blocked { robots * BLOCKED_EACH } else { waiting(robots) };
+    let not_before = (kind == Fleet::Blocked).then_some(Utc(now.utc.0 + 3_600_000));
+    let battery_permille = if kind == Fleet::LowBattery { LOW_PERMILLE } else { 900 };
     let mut view = View::new(site.clone(), Now::default(), Now::default());
     let mut board = Board::new();
     let mut x = seed.wrapping_mul(0x2545_f491_4f6c_dd1d) | 1;
@@ -126,7 +198,7 @@ fn fleet(site: &Arc<Site>, robots: usize, tasks: usize, seed: u64, now: Now) -> 
         };
         view.sessions.insert(session.id(), Rowed { revision: Revision(1), row: session });
         let waypoint = Some(site.waypoints()[draw(cells)].waypoint_id.clone());
-        let vitals = Vitals { waypoint, battery_permille: 900, ..Vitals::default() };
+        let vitals = Vitals { waypoint, battery_permille, ..Vitals::default() };
         let live = Live {
             robot_id: robot_id.clone(),
             report: ReportedState { hb: 60, session_epoch: 1, vitals, ..ReportedState::default() },
@@ -149,7 +221,7 @@ fn fleet(site: &Arc<Site>, robots: usize, tasks: usize, seed: u64, now: Now) -> 
         };
         let intake = TaskIntake {
             task_id: TaskId::parse(&format!("TASK-{i:06}")).expect("a valid id"),
-            spec: form.into_raw().check("task", &|_| true).expect("a valid task"),
+            spec: RawTask { not_before, ..form.into_raw() }.check("task", &|_| true).expect("a valid task"),
             actor: String::new(),
             request_id: String::new(),
             payload_hash: String::new(),

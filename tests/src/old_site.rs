@@ -18,7 +18,7 @@ use midshift_core::task::state::RequestKey;
 use midshift_core::task::{Attempt, AttemptPhase, Phase, TaskIntake, TaskSpec, TaskState};
 use midshift_core::time::Utc;
 use midshift_core::work::{InboxEntry, InboxItem, LaneMark, PresenceRow, Session, WorkStats};
-use midshift_store::Store;
+use midshift_store::{Retention, Store};
 use std::sync::Arc;
 
 /// Milliseconds of a day.
@@ -27,6 +27,8 @@ pub const DAY_MS: i64 = 86_400_000;
 const TASKS_PER_ITEM: u64 = 50;
 /// Items of one commit.
 const ITEMS_PER_COMMIT: usize = 64;
+/// Entries that each log still has: older ones went, as they do at a site.
+const ENTRIES_KEPT: u64 = 20_000;
 
 /// What an old site is made of.
 #[derive(Clone, Copy, Debug)]
@@ -71,10 +73,11 @@ impl OldSite {
             items.extend(self.tasks(numbers, &spec));
             if items.len() >= ITEMS_PER_COMMIT {
                 commit(store, std::mem::take(&mut items)).await;
+                forget(store).await;
             }
         }
         commit(store, items).await;
-        let head = Seq(store.wake().borrow().0);
+        let head = forget(store).await;
         let mut fleet = Item::new(Writer::Fleet, "fleet");
         fleet.put(&FleetMark { seq: head }, Expect::Absent, "fleet.consumed");
         let mut ota = Item::new(Writer::Ota, "ota");
@@ -232,6 +235,14 @@ fn event(robot_id: &str, seq: u64) -> Fact {
     };
     let body = serde_json::to_string(&entry).expect("plain data");
     Fact { log: Log::RobotInbox, subject: Arc::from(robot_id), kind: "robot.poison", body: Arc::from(body) }
+}
+
+/// Lets all entries go but the newest; the head.
+async fn forget(store: &dyn Store) -> Seq {
+    let floor = *store.wake().borrow();
+    let keep = Retention { before_unix_ms: i64::MIN, entries_max: ENTRIES_KEPT, floor };
+    store.prune(keep).await.expect("prunes");
+    floor
 }
 
 /// Writes items into a store that has none of their rows.

@@ -155,14 +155,23 @@ impl PostgresServer {
         self.database_from("template0")
     }
 
-    /// A copy of `template`, a database of this server that nobody uses.
+    /// A copy of `template`, a small database of this server that nobody uses.
     pub fn database_from(&self, template: &str) -> String {
-        self.create(template, &format!("test_{}", self.databases.fetch_add(1, Ordering::Relaxed)))
+        self.create(template, &self.new_name(), "wal_log")
+    }
+
+    /// The same of a large one: its files are copied.
+    pub fn large_database_from(&self, template: &str) -> String {
+        self.create(template, &self.new_name(), "file_copy")
+    }
+
+    fn new_name(&self) -> String {
+        format!("test_{}", self.databases.fetch_add(1, Ordering::Relaxed))
     }
 
     /// A new empty database of this name, as a URL; it can be the template of others once nobody uses it.
     pub fn database_named(&self, name: &str) -> String {
-        self.create("template0", name)
+        self.create("template0", name, "wal_log")
     }
 
     /// Drops a database, whoever uses it, and makes an empty one of the same name.
@@ -178,10 +187,10 @@ impl PostgresServer {
         let _ended = drop.args(["--force", "--if-exists", name]).stdout(Stdio::null()).stderr(Stdio::null()).status();
     }
 
-    fn create(&self, template: &str, name: &str) -> String {
+    /// A log of the copy is cheaper than the two checkpoints of the other way, if the template is small.
+    fn create(&self, template: &str, name: &str, strategy: &str) -> String {
         let mut create = self.client("createdb");
-        // A log of the copy is cheaper than the two checkpoints of the other way.
-        run(create.args(["-T", template, "--strategy=wal_log"]).arg(name));
+        run(create.args(["-T", template, "--strategy", strategy]).arg(name));
         self.url(name)
     }
 

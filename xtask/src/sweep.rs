@@ -1,8 +1,8 @@
 //! Long sweeps and golden files: calls of `cargo test` with an environment variable that the tests read.
 //!
 //! Invariant: a sweep that ran no test fails. `MIDSHIFT_SEED` is read by the test that kills programs and by stories, `MIDSHIFT_STORY` by
-//! stories, `MIDSHIFT_SEEDS` and `MIDSHIFT_SEED_FROM` by the simulation, `MIDSHIFT_SPLIT_ROBOTS` by the split stack, `MIDSHIFT_SITES` by the
-//! power cuts and kills at calls, `BLESS` by tests with `golden` in their name.
+//! stories, `MIDSHIFT_SEEDS` and `MIDSHIFT_SEED_FROM` by the simulation, `MIDSHIFT_SPLIT_ROBOTS` by the split stack, `MIDSHIFT_OLD_TASKS` by
+//! old sites, `MIDSHIFT_SITES` by the power cuts and kills at calls, `BLESS` by tests with `golden` in their name.
 
 use crate::fetch_tools::Tools;
 use crate::parts::{self, Count};
@@ -14,6 +14,8 @@ use std::process::Command;
 
 /// Robots of a split stack under load.
 const SPLIT_ROBOTS: &str = "200";
+/// Tasks that are over at an old site.
+const OLD_TASKS: &str = "1000000";
 
 /// One kind of fault sweep.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -35,14 +37,16 @@ pub enum Sweep {
     Stops,
     /// Twenty robots, five of them launcher and agent processes, get a good release and three bad ones: about ten minutes a seed.
     Stories,
+    /// Starts, takeovers, lists, pruning and backups at a site where a million tasks are over, on both engines; it draws nothing.
+    OldSites,
 }
 
 /// What runs every night, and with how many seeds.
-pub const NIGHTLY: [Sweep; 1] = [Sweep::Stories];
+pub const NIGHTLY: [Sweep; 2] = [Sweep::Stories, Sweep::OldSites];
 pub const NIGHTLY_SEEDS: u64 = 4;
 
 impl Sweep {
-    const ALL: [Self; 8] = [
+    const ALL: [Self; 9] = [
         Self::Kills,
         Self::Simulation,
         Self::Players,
@@ -51,6 +55,7 @@ impl Sweep {
         Self::Latch,
         Self::Stops,
         Self::Stories,
+        Self::OldSites,
     ];
 
     fn seeds(self) -> u64 {
@@ -59,7 +64,7 @@ impl Sweep {
             Self::Simulation => 2_000,
             Self::Players => 5_000,
             Self::Stops => 100,
-            Self::Split | Self::Updates | Self::Latch => 1,
+            Self::Split | Self::Updates | Self::Latch | Self::OldSites => 1,
             Self::Stories => 2,
         }
     }
@@ -68,7 +73,7 @@ impl Sweep {
     const fn draws(self) -> bool {
         match self {
             Self::Kills | Self::Simulation | Self::Players | Self::Stops | Self::Stories => true,
-            Self::Split | Self::Updates | Self::Latch => false,
+            Self::Split | Self::Updates | Self::Latch | Self::OldSites => false,
         }
     }
 
@@ -80,6 +85,7 @@ impl Sweep {
             Self::Players => simulated(workspace, "played::many_seeds", from, seeds),
             Self::Stops => simulated(workspace, "stopped::in_cuts_and_kills", from, seeds),
             Self::Split => split(workspace, seeds),
+            Self::OldSites => counted(test(workspace, "e2e", "old_site::").env("MIDSHIFT_OLD_TASKS", OLD_TASKS)),
             Self::Updates => every_site(workspace, "agent", "power::"),
             Self::Latch => {
                 Ok(every_site(workspace, "stop", "killed::")? && every_site(workspace, "agent", "stop_cuts::")?)

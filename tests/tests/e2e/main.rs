@@ -38,6 +38,7 @@ mod many;
 mod measured;
 mod mid_shift;
 mod minimal_robot;
+mod old_site;
 mod partition;
 mod proxy;
 mod public_address;
