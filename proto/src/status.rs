@@ -76,16 +76,21 @@ fn subject(metadata: &BTreeMap<String, String>) -> String {
     keys.iter().find_map(|key| metadata.get(*key)).cloned().unwrap_or_default()
 }
 
-/// The refusal of a message that was announced with more bytes than a port takes; none: the status is about something else.
+/// The refusal of a message with more bytes than a port takes, as it is or decompressed; none: the status is about something else.
 pub fn too_large(status: &Status) -> Option<Refusal> {
     let told = status.message();
-    if status.code() != tonic::Code::OutOfRange || !told.contains("message length too large") {
-        return None;
-    }
     let mut numbers = told.split(|c: char| !c.is_ascii_digit()).filter(|word| !word.is_empty());
-    let (bytes, most) = (numbers.next().unwrap_or("too many"), numbers.next().unwrap_or("fewer"));
-    let reason = Reason::new(Code::MessageTooLarge, format!("the message has {bytes} bytes; at most {most} are taken"));
-    Some(Refusal::new(Kind::Exhausted, reason))
+    let mut next = || numbers.next().unwrap_or("some");
+    let text = match status.code() {
+        tonic::Code::OutOfRange if told.contains("message length too large") => {
+            format!("the message has {} bytes; at most {} are taken", next(), next())
+        }
+        tonic::Code::ResourceExhausted if told.contains("exceeded while decompressing") => {
+            format!("the message has more than {} bytes once it is decompressed; no more are taken", next())
+        }
+        _ => return None,
+    };
+    Some(Refusal::new(Kind::Exhausted, Reason::new(Code::MessageTooLarge, text)))
 }
 
 /// The first bytes of a text, at most [`MESSAGE_BYTES_MAX`].

@@ -27,6 +27,7 @@ use midshift_store::{LiveBoard, Store};
 use std::sync::Arc;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
+use tonic::codec::CompressionEncoding;
 
 /// Requests that may wait for the reconciler; one more is told to come back.
 const REQUESTS_MAX: usize = 256;
@@ -95,7 +96,7 @@ impl FleetService {
     }
     /// The gRPC face.
     pub fn grpc(&self) -> FleetServiceServer<Self> {
-        FleetServiceServer::new(self.clone())
+        FleetServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip)
     }
 
     /// How often a robot began to wait for a place since the start.

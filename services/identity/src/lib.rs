@@ -32,6 +32,7 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
+use tonic::codec::CompressionEncoding;
 
 /// Rows are looked at so often although nobody woke us, link clock: time alone changes who is known.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
@@ -221,11 +222,11 @@ impl IdentityService {
     }
     /// Rights and robots, of a process with the authority.
     pub fn identity(&self) -> IdentityServiceServer<Self> {
-        IdentityServiceServer::new(self.clone())
+        IdentityServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip)
     }
     /// Enrolment, of a process with the authority.
     pub fn enrolment(&self) -> EnrolmentServiceServer<Self> {
-        EnrolmentServiceServer::new(self.clone())
+        EnrolmentServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip)
     }
 
     /// The first token of a site that has none: may do everything. None if there is one.

@@ -44,6 +44,7 @@ use std::time::Duration;
 use tokio::runtime::RuntimeFlavor;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
+use tonic::codec::CompressionEncoding;
 
 /// How often the age of what was signed is looked at. By the wall, which may jump: so not once in half a day.
 const LOOK_EVERY: Duration = Duration::from_secs(60);
@@ -137,11 +138,15 @@ impl OtaService {
     }
     /// Releases, for people and programs.
     pub fn bundles(&self) -> BundleServiceServer<Self> {
-        BundleServiceServer::new(self.clone()).max_decoding_message_size(MESSAGE_BYTES)
+        BundleServiceServer::new(self.clone())
+            .accept_compressed(CompressionEncoding::Gzip)
+            .max_decoding_message_size(MESSAGE_BYTES)
     }
     /// Bytes, for robots.
     pub fn chunks(&self) -> ChunkServiceServer<Hatch> {
-        ChunkServiceServer::new(self.hatch()).max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES)
+        ChunkServiceServer::new(self.hatch())
+            .accept_compressed(CompressionEncoding::Gzip)
+            .max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES)
     }
     /// `/metadata/…` and `/targets/…` over plain HTTP, for clients of TUF that are not ours.
     pub fn pages(&self) -> axum::Router {
@@ -215,11 +220,15 @@ impl OtaReader {
     }
     /// Documents, for robots: nothing else of releases is answered here.
     pub fn bundles(&self) -> BundleServiceServer<Hatch> {
-        BundleServiceServer::new(self.hatch.clone()).max_decoding_message_size(MESSAGE_BYTES)
+        BundleServiceServer::new(self.hatch.clone())
+            .accept_compressed(CompressionEncoding::Gzip)
+            .max_decoding_message_size(MESSAGE_BYTES)
     }
     /// Bytes, for robots.
     pub fn chunks(&self) -> ChunkServiceServer<Hatch> {
-        ChunkServiceServer::new(self.hatch.clone()).max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES)
+        ChunkServiceServer::new(self.hatch.clone())
+            .accept_compressed(CompressionEncoding::Gzip)
+            .max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES)
     }
     /// `/metadata/…` and `/targets/…` over plain HTTP, for clients of TUF that are not ours.
     pub fn pages(&self) -> axum::Router {

@@ -52,6 +52,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
+use tonic::codec::CompressionEncoding;
 use tonic::service::Routes;
 
 /// Messages on their way to one watcher.
@@ -203,7 +204,9 @@ impl StopService {
 
     /// The people's and programs' face.
     pub fn grpc(&self) -> StopServiceServer<Self> {
-        StopServiceServer::new(self.clone()).max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES)
+        StopServiceServer::new(self.clone())
+            .accept_compressed(CompressionEncoding::Gzip)
+            .max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES)
     }
 
     /// Stops that are engaged now.

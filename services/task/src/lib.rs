@@ -30,6 +30,7 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use tokio::sync::Semaphore;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
+use tonic::codec::CompressionEncoding;
 
 /// Watchers at a time. Each reads the feed for itself: about 100 KB and one read a commit.
 pub const WATCHERS_MAX: usize = 1_000;
@@ -79,7 +80,7 @@ impl TaskService {
     }
     /// The gRPC face.
     pub fn grpc(&self) -> TaskServiceServer<Self> {
-        TaskServiceServer::new(self.clone())
+        TaskServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip)
     }
     fn store(&self) -> &dyn Store {
         self.inner.parts.store.as_ref()

@@ -38,6 +38,7 @@ use registry::Registry;
 use std::sync::Arc;
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
+use tonic::codec::CompressionEncoding;
 
 /// What the service is built from.
 pub struct Parts {
@@ -85,15 +86,19 @@ impl TelemetryService {
     }
     /// The robots' face.
     pub fn link(&self) -> LinkServiceServer<Self> {
-        LinkServiceServer::new(self.clone()).max_decoding_message_size(midshift_core::limits::TELEMETRY_BATCH_BYTES)
+        LinkServiceServer::new(self.clone())
+            .accept_compressed(CompressionEncoding::Gzip)
+            .max_decoding_message_size(midshift_core::limits::TELEMETRY_BATCH_BYTES)
     }
     /// The robots' face beside their sessions, for old STATUS.
     pub fn replay(&self) -> ReplayServiceServer<Self> {
-        ReplayServiceServer::new(self.clone()).max_decoding_message_size(midshift_core::limits::TELEMETRY_BATCH_BYTES)
+        ReplayServiceServer::new(self.clone())
+            .accept_compressed(CompressionEncoding::Gzip)
+            .max_decoding_message_size(midshift_core::limits::TELEMETRY_BATCH_BYTES)
     }
     /// The people's and programs' face.
     pub fn grpc(&self) -> TelemetryServiceServer<Self> {
-        TelemetryServiceServer::new(self.clone())
+        TelemetryServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip)
     }
     /// Whether the database that several processes share has not been reached for long, so that no session is held here; it may come back.
     /// None: this process needs nobody else.

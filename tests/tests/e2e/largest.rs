@@ -12,6 +12,7 @@ use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Status;
+use tonic::codec::CompressionEncoding;
 
 /// Parameters of about so many bytes as JSON, in the form that is largest on the wire: a list of numbers.
 fn params(bytes: usize) -> Struct {
@@ -61,6 +62,19 @@ async fn the_largest_legal_task_is_taken_and_a_larger_message_hears_why_it_is_no
     let items = tokio_stream::iter([SubmitTasksRequest { item: Some(largest(20 * limits::PARAMS_BYTES_MAX)) }]);
     let told = tasks.submit_tasks(items).await.expect_err("too large");
     assert_eq!(exhausted(&told), Some(Code::MessageTooLarge));
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_message_in_gzip_is_taken_and_one_that_grows_too_large_hears_why_it_is_not() -> anyhow::Result<()> {
+    let dir = tempfile::tempdir()?;
+    let server = Server::start(dir.path()).await?;
+    let mut tasks = server.tasks()?.send_compressed(CompressionEncoding::Gzip);
+    let task = tasks.submit_task(largest(limits::PARAMS_BYTES_MAX)).await?.into_inner().task;
+    assert_eq!(task.context("a task")?.spec.map(|spec| spec.steps.len()), Some(limits::STEPS_MAX));
+    let told = tasks.submit_task(largest(20 * limits::PARAMS_BYTES_MAX)).await.expect_err("too large");
+    assert_eq!(exhausted(&told), Some(Code::MessageTooLarge));
+    assert!(told.message().contains("once it is decompressed"), "{told}");
     Ok(())
 }
 

@@ -17,6 +17,7 @@ use midshift_store::{Cursor, Error, Query, Store};
 use std::sync::Arc;
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
+use tonic::codec::CompressionEncoding;
 
 /// Exports and verifications at a time: each reads everything there is.
 const READERS_MAX: usize = 4;
@@ -37,7 +38,7 @@ impl AuditService {
     }
     /// The gRPC face.
     pub fn grpc(&self) -> AuditServiceServer<Self> {
-        AuditServiceServer::new(self.clone())
+        AuditServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip)
     }
 }
 

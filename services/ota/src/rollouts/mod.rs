@@ -32,6 +32,7 @@ use midshift_store::{LiveBoard, Store};
 use std::sync::Arc;
 use tokio::sync::{mpsc, oneshot, watch as channel};
 use tokio_util::sync::CancellationToken;
+use tonic::codec::CompressionEncoding;
 
 /// Requests that may wait for the planner; one more is told to come back.
 const REQUESTS_MAX: usize = 256;
@@ -110,7 +111,7 @@ impl RolloutService {
     }
     /// The gRPC face.
     pub fn grpc(&self) -> RolloutServiceServer<Self> {
-        RolloutServiceServer::new(self.clone())
+        RolloutServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip)
     }
     async fn send(&self, request: Request) -> Result<(), Refusal> {
         self.ota.opened()?;
