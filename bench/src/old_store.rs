@@ -22,7 +22,6 @@ use tokio::task::JoinSet;
 use tokio::time::Instant;
 
 #[expect(clippy::expect_used, reason = "shared with the tests, which fail by panicking")]
-#[expect(dead_code, reason = "shared with the tests, which ask for more")]
 #[path = "../../tests/src/old_site.rs"]
 mod old_site;
 use old_site::OldSite;

@@ -7,7 +7,6 @@ use super::rows::{Closed, Incident};
 use crate::ids::{RobotId, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
-use std::cmp::Ordering;
 
 /// Opens an incident, once per code, subject and moment.
 pub fn open(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, task_id: Option<&TaskId>) {
@@ -53,13 +52,18 @@ pub fn open_about(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, key: 
     if about.contains(&reason.metadata.get(key)) {
         return false;
     }
-    match (about.len() + 1).cmp(&limits::INCIDENTS_OF_ROBOT_MAX) {
-        Ordering::Less => open(tx, reason, robot_id, None),
-        Ordering::Equal => {
-            open(tx, reason.with("further", "not told one by one until some of these are closed"), robot_id, None)
-        }
-        Ordering::Greater => {}
+    let nth = about.len() + 1;
+    if nth > limits::INCIDENTS_OF_ROBOT_MAX {
+        return true;
     }
+    // Several may come of one message, at one moment.
+    let what = reason.metadata.get(key).map_or_else(String::new, |what| format!(":{}", what.replace(' ', "/")));
+    let subject = robot_id.map(ToString::to_string).unwrap_or_default();
+    let id = format!("{}:{subject}{what}:{}", reason.code, tx.now.wall.0);
+    let is_last = nth == limits::INCIDENTS_OF_ROBOT_MAX;
+    let further = "not told one by one until some of these are closed";
+    let reason = if is_last { reason.with("further", further) } else { reason };
+    open_as(tx, id, reason, robot_id, None);
     true
 }
 

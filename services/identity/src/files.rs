@@ -103,15 +103,15 @@ mod tests {
     #[test]
     fn a_key_file_that_others_may_read_is_refused_by_its_name_though_its_folder_is_closed() {
         let dir = tempfile::tempdir().expect("a folder");
-        write(dir.path(), "server.key", "secret", PRIVATE).expect("written");
-        assert_eq!(read(dir.path(), "server.key").expect("its owner's alone").as_deref(), Some("secret"));
+        write(dir.path(), "server.key", "hush", PRIVATE).expect("written");
+        assert_eq!(read(dir.path(), "server.key").expect("its owner's alone").as_deref(), Some("hush"));
         assert_eq!(read(dir.path(), "other.key").expect("none"), None);
         for mode in [0o640, 0o604, 0o660] {
             let path = dir.path().join("server.key");
             std::fs::set_permissions(&path, Permissions::from_mode(mode)).expect("open");
             let refused = read(dir.path(), "server.key").expect_err("others may read it").to_string();
             assert!(refused.contains(&format!("(mode {mode:03o})")) && refused.contains("chmod go= "), "{refused}");
-            assert!(refused.contains("server.key") && !refused.contains("secret"), "{refused}");
+            assert!(refused.contains("server.key") && !refused.contains("hush"), "{refused}");
         }
     }
 }

@@ -25,7 +25,7 @@ use midshift_proto::task::v1::{
     FlatTask, GetTaskRequest, ListTasksRequest, SubmitTaskRequest, TaskFilter, WatchTasksRequest,
     submit_task_request::Body,
 };
-use midshift_store::{Query, Store, load};
+use midshift_store::{Query, load};
 use midshift_tests::counted::Counted;
 use midshift_tests::old_site::{DAY_MS, OldSite, task_id};
 use midshift_tests::postgres::PostgresServer;
@@ -194,6 +194,7 @@ impl Serving {
             stops: None,
             stop_port: None,
             planning: planning.handle(),
+            map: Default::default(),
         };
         let server = Server::new(parts, stop.clone()).await?;
         let listener = TcpListener::bind("127.0.0.1:0").await?;
