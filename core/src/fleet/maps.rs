@@ -162,7 +162,7 @@ fn not_taken(stored: &Site, version: &str, obstacles: &[Obstacle]) -> Reason {
 fn open_forced(tx: &mut Tx, obstacle: &Obstacle) {
     let (kind, name) = obstacle.named();
     let id = format!("{}:{kind}:{name}:{}", Code::MapForced, tx.view.started.wall.0);
-    if tx.view.incidents.get(&id).is_some() {
+    if tx.view.incidents.contains_key(&id) {
         return;
     }
     let reason = Reason::from(Code::MapForced);

@@ -263,10 +263,12 @@ fn check_steps(
         bad.add(format!("{field}.steps"), "must be 1..64 steps");
     }
     let params = raw.iter().map(|step| match &step.kind {
-        Some(RawStepKind::Action(_, params)) => serde_json::to_string(params).map_or(0, |s| s.len()),
+        Some(RawStepKind::Action(_, params)) if !params.is_empty() => {
+            serde_json::to_string(params).map_or(usize::MAX, |s| s.len())
+        }
         _ => 0,
     });
-    if params.sum::<usize>() > limits::PARAMS_OF_TASK_BYTES_MAX {
+    if params.fold(0, usize::saturating_add) > limits::PARAMS_OF_TASK_BYTES_MAX {
         bad.add(format!("{field}.steps"), "must have parameters of at most 32 KiB in all, as JSON");
     }
     raw.iter()
