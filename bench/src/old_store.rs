@@ -16,10 +16,13 @@ use midshift_core::site::{Site, grid};
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::fleet::v1::{CordonRobotRequest, ExplainRobotRequest, ExplainTaskRequest, UncordonRobotRequest};
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
-use midshift_proto::task::v1::{SubmitTaskRequest, SubmitTasksRequest, submit_task_result::Outcome};
+use midshift_proto::task::v1::{
+    CancelTasksRequest, SubmitTaskRequest, SubmitTasksRequest, submit_task_result::Outcome,
+};
 use std::path::{Path, PathBuf};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
+use tonic::transport::Channel;
 
 #[expect(clippy::expect_used, reason = "shared with the tests, which fail by panicking")]
 #[path = "../../tests/src/old_site.rs"]
@@ -221,5 +224,19 @@ async fn asked(args: &OldArgs, server: &Child, site: &Site, round: usize) -> any
         }
         took_ms[2].push(begun.elapsed().as_secs_f64() * 1e3);
     }
+    cancel_all(&mut tasks).await?;
     Ok(took_ms)
+}
+
+/// Takes back what is left, so that the next robot is offered what is submitted for it.
+async fn cancel_all(tasks: &mut TaskServiceClient<Channel>) -> anyhow::Result<()> {
+    let mut page_token = String::new();
+    loop {
+        let reason = "the measurement is over".to_owned();
+        let request = CancelTasksRequest { reason, force: true, page_token, ..CancelTasksRequest::default() };
+        page_token = tasks.cancel_tasks(request).await?.into_inner().outcome.context("no outcome")?.next_page_token;
+        if page_token.is_empty() {
+            return Ok(());
+        }
+    }
 }
