@@ -5,6 +5,7 @@
 
 use crate::audit::Note;
 use crate::ids::RobotId;
+use crate::reason::Reason;
 use crate::rows::{
     BadRow, Entry, Expect, Fact, Item, Key, Log, Record, Revision, Row, RowChange, Silent, Table, Write, Writer,
 };
@@ -40,8 +41,8 @@ pub trait Viewed<P: Picture>: Record {
     fn changed(_picture: &mut P, _id: &str, _old: Option<&Self>) {}
 }
 
-/// Takes one row as the store has it; none: deleted. What the picture already has is passed over; a row with a value that is not known is kept
-/// aside.
+/// Takes one row as the store has it; none: deleted. What the picture already has is passed over. A row with a value that this build does
+/// not know is kept aside.
 ///
 /// # Errors
 /// A body that is damaged.
@@ -60,7 +61,7 @@ pub fn take<P: Picture, R: Viewed<P>>(
     let old = match row.map(|row| (row, row.decode())) {
         Some((_, Ok(row))) => R::slot(picture).insert(id.to_owned(), Rowed { revision, row }),
         Some((row, Err(error))) if error.is_unknown() => {
-            picture.unknown_rows().keep(row, &error);
+            picture.unknown_rows().keep_aside(row, &error);
             R::slot(picture).remove(id)
         }
         Some((_, Err(error))) => return Err(error),
@@ -219,10 +220,10 @@ impl<'a, P: Picture> Tx<'a, P> {
     pub fn outline(&self) -> Outline {
         Outline::of(&self.item)
     }
-    /// Whether it touches a row that is kept aside.
-    pub fn is_unknown(&mut self) -> bool {
+    /// Why it is not decided: it touches a row that is kept aside.
+    pub fn unknown_row(&mut self) -> Option<Reason> {
         let rows = self.item.rows.iter().map(|row| &row.key);
-        self.view.unknown_rows().touches(rows)
+        self.view.unknown_rows().refusal_of(rows).cloned()
     }
     /// Whether it is larger than any store takes.
     pub fn is_too_large(&self) -> bool {

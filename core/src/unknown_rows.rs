@@ -28,7 +28,7 @@ pub struct UnknownRows(BTreeMap<Key, Kept>);
 
 impl UnknownRows {
     /// Keeps a row aside that could not be read for this reason.
-    pub(crate) fn keep(&mut self, row: &Row, error: &BadRow) {
+    pub(crate) fn keep_aside(&mut self, row: &Row, error: &BadRow) {
         let name = format!("{}/{}", row.key.table.name(), row.key.id);
         let body = serde_json::from_str(&row.body).unwrap_or_default();
         let kept = Kept {
@@ -48,9 +48,12 @@ impl UnknownRows {
     pub(crate) fn has(&self, key: &Key, revision: Revision) -> bool {
         self.0.get(key).is_some_and(|kept| kept.revision >= revision)
     }
-    /// Whether one of these rows is aside: what touches it is not decided.
-    pub fn touches<'a>(&self, mut keys: impl Iterator<Item = &'a Key>) -> bool {
-        !self.0.is_empty() && keys.any(|key| self.0.contains_key(key))
+    /// Why nothing is decided that touches these rows; none: none of them is aside.
+    pub fn refusal_of<'a>(&self, mut keys: impl Iterator<Item = &'a Key>) -> Option<&Reason> {
+        if self.0.is_empty() {
+            return None;
+        }
+        keys.find_map(|key| self.0.get(key)).map(|kept| &kept.reason)
     }
     /// Keeps work from a robot that a row aside is about. A stop or a rule of an area that cannot be read is about all of them.
     ///
@@ -87,7 +90,7 @@ impl UnknownRows {
 /// Why a row cannot be read, for whoever reads it by itself.
 pub fn reason(row: &Row, error: &BadRow) -> Reason {
     let mut rows = UnknownRows::default();
-    rows.keep(row, error);
+    rows.keep_aside(row, error);
     rows.take_untold().pop().map_or_else(|| Code::RowUnknown.into(), |(reason, _)| reason)
 }
 

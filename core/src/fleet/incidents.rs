@@ -7,12 +7,21 @@ use super::rows::{Closed, Incident};
 use crate::ids::{RobotId, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
+use std::cmp::Ordering;
 
-/// Opens an incident, once per code, subject and moment.
+/// What the last incident of a kind says of those that come after it.
+const FURTHER: &str = "not told one by one until some of these are closed";
+
+/// Opens an incident, once per reason, subject and moment: several of one code may come of one message.
 pub fn open(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, task_id: Option<&TaskId>) {
     let of = |id: Option<String>| id.or_else(|| reason.metadata.get("rollout_id").cloned()).unwrap_or_default();
     let about = of(robot_id.map(ToString::to_string).or(task_id.map(ToString::to_string)));
-    let id = format!("{}:{about}:{}", reason.code, tx.now.wall.0);
+    let (first, mut nth) = (format!("{}:{about}:{}", reason.code, tx.now.wall.0), 1);
+    let mut id = first.clone();
+    while tx.view.incidents.get(&id).is_some_and(|known| known.row.reason != reason) {
+        nth += 1;
+        id = format!("{first}:{nth}");
+    }
     open_as(tx, id, reason, robot_id, task_id);
 }
 
@@ -43,8 +52,8 @@ pub fn open_once(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>) {
     }
 }
 
-/// Opens an incident unless an open one with its code names the same robot and the same `key`; whether none does. What a robot says is endless, what
-/// people read is not: the last of [`limits::INCIDENTS_OF_ROBOT_MAX`] with one code stands for all that come.
+/// Opens an incident unless an open one with its code names the same robot and the same `key`. Returns whether there was none. The words of
+/// one robot open [`limits::INCIDENTS_OF_ROBOT_MAX`] of a code at most; the last of them says that it stands for further ones.
 pub fn open_about(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, key: &str) -> bool {
     let alike = |i: &&Incident| i.closed.is_none() && i.reason.code == reason.code && i.robot_id.as_ref() == robot_id;
     let open_ones = tx.view.incidents.values().map(|i| &i.row).filter(alike);
@@ -52,18 +61,11 @@ pub fn open_about(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, key: 
     if about.contains(&reason.metadata.get(key)) {
         return false;
     }
-    let nth = about.len() + 1;
-    if nth > limits::INCIDENTS_OF_ROBOT_MAX {
-        return true;
+    match (about.len() + 1).cmp(&limits::INCIDENTS_OF_ROBOT_MAX) {
+        Ordering::Less => open(tx, reason, robot_id, None),
+        Ordering::Equal => open(tx, reason.with("further", FURTHER), robot_id, None),
+        Ordering::Greater => {}
     }
-    // Several may come of one message, at one moment.
-    let what = reason.metadata.get(key).map_or_else(String::new, |what| format!(":{}", what.replace(' ', "/")));
-    let subject = robot_id.map(ToString::to_string).unwrap_or_default();
-    let id = format!("{}:{subject}{what}:{}", reason.code, tx.now.wall.0);
-    let is_last = nth == limits::INCIDENTS_OF_ROBOT_MAX;
-    let further = "not told one by one until some of these are closed";
-    let reason = if is_last { reason.with("further", further) } else { reason };
-    open_as(tx, id, reason, robot_id, None);
     true
 }
 

@@ -124,12 +124,13 @@ impl Plan {
     pub fn decide(&mut self, view: &mut View, now: Now, actor: &str, decision: impl FnOnce(&mut Tx)) -> bool {
         let mut tx = Tx::new(view, now, actor);
         decision(&mut tx);
-        self.keep(tx)
+        self.keep_decision(tx)
     }
 
-    /// Adds a decision that was made. False: it was given up, since the store would never take it.
-    pub fn keep(&mut self, mut tx: Tx) -> bool {
-        if tx.is_unknown() {
+    /// Adds a decision that was made. False: it was given up, since the store would never take it, or since it touches a row of a newer
+    /// version.
+    pub fn keep_decision(&mut self, mut tx: Tx) -> bool {
+        if tx.unknown_row().is_some() {
             tx.take_back();
             return false;
         }

@@ -25,7 +25,7 @@ pub fn take(view: &mut View, now: Now, request: &TaskRequest, entry: &Entry, pla
     let mut decide = |decision: &mut dyn FnMut(&mut Tx)| -> bool {
         let mut tx = Tx::new(view, now, &request.actor).on_request(entry.request_id.as_deref());
         decision(&mut tx);
-        plan.keep(tx)
+        plan.keep_decision(tx)
     };
     for some in resumes.chunks(limits::RESUMES_PER_ITEM) {
         decide(&mut |tx| {

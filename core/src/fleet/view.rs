@@ -26,6 +26,7 @@ use crate::time::{Now, Utc};
 use crate::unknown_rows::UnknownRows;
 use crate::work::{DesiredPolicy, DesiredWork, LaneMark, PresenceRow, Session};
 use std::collections::{BTreeMap, BTreeSet};
+use std::mem::take;
 use std::sync::{Arc, OnceLock};
 
 /// Time in which a robot was heard and that no counter has yet.
@@ -511,6 +512,23 @@ impl View {
         self.forget_ended();
         self.let_go.clear();
         Ok(())
+    }
+
+    /// Takes over what only this process knows from the picture before it, ahead of the rows. What is not named here begins anew with each
+    /// reading.
+    pub fn carry_over(&mut self, before: &mut Self) {
+        self.router = before.router.clone();
+        self.place_waits = before.place_waits;
+        self.waits = take(&mut before.waits);
+        self.attached = take(&mut before.attached);
+        self.excused = take(&mut before.excused);
+        self.unwilling = take(&mut before.unwilling);
+        self.answers = take(&mut before.answers);
+        self.unknown = take(&mut before.unknown);
+        self.lasting = take(&mut before.lasting);
+        self.unexplained = take(&mut before.unexplained);
+        self.unusable = take(&mut before.unusable);
+        self.refused = take(&mut before.refused);
     }
 
     /// What is over and wanted all the same, and nobody has asked the store for: at most [`limits::ASKED_AT_ONCE`].

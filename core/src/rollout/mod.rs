@@ -96,7 +96,7 @@ impl Plan {
     pub fn decide(&mut self, view: &mut View, now: Now, actor: &str, decision: impl FnOnce(&mut Tx)) {
         let mut tx = Tx::new(view, now, actor);
         decision(&mut tx);
-        if tx.is_unknown() {
+        if tx.unknown_row().is_some() {
             tx.take_back();
             return;
         }

@@ -253,6 +253,11 @@ fn check_labels(labels: &BTreeMap<String, String>, field: &str, bad: &mut Violat
     }
 }
 
+/// Size of parameters as JSON.
+fn json_bytes(params: &serde_json::Map<String, serde_json::Value>) -> usize {
+    serde_json::to_string(params).map_or(usize::MAX, |json| json.len())
+}
+
 fn check_steps(
     raw: &[RawStep],
     field: &str,
@@ -263,9 +268,7 @@ fn check_steps(
         bad.add(format!("{field}.steps"), "must be 1..64 steps");
     }
     let params = raw.iter().map(|step| match &step.kind {
-        Some(RawStepKind::Action(_, params)) if !params.is_empty() => {
-            serde_json::to_string(params).map_or(usize::MAX, |s| s.len())
-        }
+        Some(RawStepKind::Action(_, params)) if !params.is_empty() => json_bytes(params),
         _ => 0,
     });
     if params.fold(0, usize::saturating_add) > limits::PARAMS_OF_TASK_BYTES_MAX {
@@ -303,7 +306,7 @@ fn check_step(step: &RawStep, at: &str, knows: &dyn Fn(&WaypointId) -> bool, bad
             if !name_ok(name) {
                 bad.add(format!("{at}.action.name"), "is required, 1-64 of [a-z0-9-_]");
             }
-            if serde_json::to_string(params).map_or(usize::MAX, |s| s.len()) > limits::PARAMS_BYTES_MAX {
+            if json_bytes(params) > limits::PARAMS_BYTES_MAX {
                 bad.add(format!("{at}.action.params"), "must be at most 8 KiB");
             }
             let effect =

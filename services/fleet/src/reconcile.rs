@@ -202,29 +202,16 @@ impl Loop {
         let alive = view::alive();
         let reading = parts.store.read(&alive, view::named);
         let snapshot = lead::renewed_while(seat, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
-        let place_waits = self.view.place_waits;
-        let (waits, attached) = (std::mem::take(&mut self.view.waits), std::mem::take(&mut self.view.attached));
-        let excused = std::mem::take(&mut self.view.excused);
-        let unwilling = std::mem::take(&mut self.view.unwilling);
-        let (answers, unknown) = (std::mem::take(&mut self.view.answers), std::mem::take(&mut self.view.unknown));
-        let lasting = std::mem::take(&mut self.view.lasting);
         let now = self.parts.clock.now();
         let served = self.view.serving(&now);
-        let (router, unusable) = (self.view.router.clone(), std::mem::take(&mut self.view.unusable));
-        let refused = std::mem::take(&mut self.view.refused);
-        self.view = View { router, unusable, refused, ..View::new(self.parts.site.clone(), self.started, now) };
-        self.view.bugs = self.parts.bugs;
+        let mut next = View::new(self.parts.site.clone(), self.started, now);
+        next.bugs = self.parts.bugs;
+        next.carry_over(&mut self.view);
+        self.view = next;
         self.view.load(&snapshot.rows, snapshot.seq)?;
         // The row is as old as the last commit; this process has served on since.
         self.view.served.site_ms = self.view.served.site_ms.max(served.site_ms);
         self.view.served.link_ms = self.view.served.link_ms.max(served.link_ms);
-        self.view.waits = waits;
-        self.view.attached = attached;
-        self.view.excused = excused;
-        self.view.unwilling = unwilling;
-        (self.view.answers, self.view.unknown) = (answers, unknown);
-        self.view.lasting = lasting;
-        self.view.place_waits = place_waits;
         self.seq = self.view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq).min(snapshot.seq);
         (self.behind, self.news, self.more) = (None, true, false);
         metrics::counter!("midshift_fleet_rebuilds_total").increment(1);
@@ -427,12 +414,15 @@ impl Loop {
                     if let Some(id) = request_id {
                         once::remember(&mut tx, id, command, *seen);
                     }
-                    if plan.keep(tx) {
+                    let unknown = tx.unknown_row();
+                    if plan.keep_decision(tx) {
                         let after = plan.items.len();
                         // What changes nothing rests on what came before it.
                         replies.push((asked, if after > before { before..after } else { 0..after }));
                     } else {
-                        drop(asked.reply.send(Err(Refusal::new(Kind::Exhausted, Code::DecisionPutAside))));
+                        let aside = || Refusal::new(Kind::Exhausted, Code::DecisionPutAside);
+                        let refusal = unknown.map_or_else(aside, |why| Refusal::new(Kind::Precondition, why));
+                        drop(asked.reply.send(Err(refusal)));
                     }
                 }
             }

@@ -41,7 +41,7 @@ pub fn make_folder(folder: &Path) -> Result<(), Error> {
 /// The text of a file of its owner's alone; none if there is none. One that others may read is refused, in whatever folder it lies.
 pub fn read(folder: &Path, name: &str) -> Result<Option<String>, Error> {
     let path = folder.join(name);
-    let read = || {
+    let read = || -> io::Result<(u32, String)> {
         let mut file = File::open(&path)?;
         let mode = file.metadata()?.permissions().mode() & 0o777;
         let mut text = String::new();
@@ -51,7 +51,7 @@ pub fn read(folder: &Path, name: &str) -> Result<Option<String>, Error> {
     match read() {
         Ok((mode, _)) if mode & OTHERS != 0 => Err(Error::Open { path, mode }),
         Ok((_, text)) => Ok(Some(text)),
-        Err(error) if io::Error::kind(&error) == io::ErrorKind::NotFound => Ok(None),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
         Err(source) => Err(Error::Folder { path, source }),
     }
 }

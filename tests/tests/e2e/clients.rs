@@ -99,6 +99,7 @@ pub fn grpcurl_passes(address: SocketAddr) -> anyhow::Result<()> {
 
 const CLIENT: &str = r#"
 import os, sys, grpc
+from google.protobuf.duration_pb2 import Duration
 from midshift.task.v1 import task_pb2, task_service_pb2, task_service_pb2_grpc
 if "MIDSHIFT_CA" in os.environ:
     tls = grpc.ssl_channel_credentials(open(os.environ["MIDSHIFT_CA"], "rb").read())
@@ -111,6 +112,10 @@ flat = task_pb2.FlatTask(task_type="transport", priority=0, from_waypoint="A02",
 task = client.SubmitTask(task_service_pb2.SubmitTaskRequest(request_id="py-1", flat=flat), timeout=10).task
 again = client.SubmitTask(task_service_pb2.SubmitTaskRequest(request_id="py-1", flat=flat), timeout=10).task
 assert task.task_id == again.task_id, (task.task_id, again.task_id)
+steps = [task_pb2.Step(goto=task_pb2.Goto(waypoint="A02"))] * 20
+spec = task_pb2.TaskSpec(type="patrol", steps=steps, timeout=Duration(seconds=600))
+checked = task_service_pb2.SubmitTaskRequest(request_id="py-2", spec=spec, validate_only=True)
+client.SubmitTask(checked, timeout=10, compression=grpc.Compression.Gzip)
 watch = task_service_pb2.WatchTasksRequest(filter=task_service_pb2.TaskFilter(task_ids=[task.task_id]))
 seen = []
 for message in client.WatchTasks(watch, timeout=60):

@@ -136,12 +136,9 @@ async fn made_in_postgresql() -> anyhow::Result<()> {
     let url = tokio::task::block_in_place(|| server.database_named(TEMPLATE));
     let site = site()?;
     make(&open(Path::new(""), Some(url.clone()), &site).await?).await?;
-    tokio::task::block_in_place(|| {
-        // As the server itself does it at a site that grew for weeks.
-        server.ask(&url, "VACUUM (FULL, ANALYZE)");
-        until_alone(server, &url);
-    });
-    Ok(())
+    // As the server itself does it at a site that grew for weeks.
+    tokio::task::block_in_place(|| server.ask(&url, "VACUUM (FULL, ANALYZE)"));
+    until_alone(server, &url).await
 }
 
 async fn make(storage: &Storage) -> anyhow::Result<()> {
@@ -154,11 +151,10 @@ async fn make(storage: &Storage) -> anyhow::Result<()> {
 }
 
 /// Waits until nobody else uses a database.
-fn until_alone(server: &PostgresServer, url: &str) {
+async fn until_alone(server: &PostgresServer, url: &str) -> anyhow::Result<()> {
     let others = "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database() AND pid <> pg_backend_pid()";
-    while server.ask(url, others) != "0" {
-        std::thread::yield_now();
-    }
+    let ask = || tokio::task::block_in_place(|| server.ask(url, others));
+    until("nobody else uses the database", LIMIT, async || Ok((ask() == "0").then_some(()))).await
 }
 
 /// A whole server over a store whose reads are counted, without login.
@@ -289,12 +285,9 @@ async fn starts_and_answers(engine: Engine) -> anyhow::Result<()> {
     if let Some(url) = &old.url {
         let server = PostgresServer::shared();
         let sql = "SELECT sum(seq_tup_read + coalesce(idx_tup_fetch, 0)) FROM pg_stat_user_tables";
-        let scanned: usize = tokio::task::block_in_place(|| {
-            // Whoever ends tells first what it has looked at.
-            until_alone(server, url);
-            server.ask(url, sql)
-        })
-        .parse()?;
+        // A process tells what it has looked at as it ends.
+        until_alone(server, url).await?;
+        let scanned: usize = tokio::task::block_in_place(|| server.ask(url, sql)).parse()?;
         say!("PostgreSQL looked at {scanned} rows");
         ensure!(scanned > 0 && scanned <= SCANNED, "PostgreSQL looked at {scanned} rows");
     }

@@ -2,11 +2,13 @@
 
 use crate::explain::why;
 use crate::harness::World;
+use midshift_core::reason::Code;
 use midshift_core::rows::{Expect, Item, Key, RowChange, Table, Write, Writer};
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
+use midshift_proto::refusal_of;
 use tonic::Request;
 
 /// A newer version writes `new` for `old` into a row; its state becomes one that no build here lists.
@@ -52,6 +54,21 @@ async fn a_task_in_a_state_of_a_newer_version_is_left_as_it_is_and_explained_and
     w.stop_fleet().await;
     w.start_fleet();
     w.until_phase("T1", Phase::Succeeded).await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_command_about_a_row_of_a_newer_version_is_refused_with_the_row_and_leaves_it_as_it_is() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    let cordon = || v1::CordonRobotRequest { robot_id: "r1".into(), reason: "look".into(), ..Default::default() };
+    w.fleet.cordon_robot(Request::new(cordon())).await.expect("cordoned");
+    rewritten(&w, Table::RobotControl, "r1", ("\"robot_id\":\"r1\"", "\"robot_id\":7"), None).await;
+    let kept = body(&w, Table::RobotControl, "r1").await;
+    w.pass(2).await;
+    let uncordon = v1::UncordonRobotRequest { robot_id: "r1".into(), ..Default::default() };
+    let refused = w.fleet.uncordon_robot(Request::new(uncordon)).await.expect_err("nobody may change it");
+    assert_eq!(refusal_of(&refused).code, Some(Code::RowUnknown), "{refused}");
+    assert_eq!(body(&w, Table::RobotControl, "r1").await, kept);
 }
 
 #[tokio::test(start_paused = true)]
