@@ -5,7 +5,7 @@
 //! *sent* that heartbeat, and stands when no echo has renewed it for [`limits::AUTHORITY`]. The server gives the same thing to another
 //! only when [`limits::LEASE`] has passed since it *processed* the robot's last heartbeat. Processed is never before sent and the lease
 //! is longer by more than two clocks drift apart, so the robot's clock always ends first. No wall clock takes part.
-//! Called by the agent (refuse, go on) and by fleet (grant, grant again).
+//! Called by the agent (refuse, go on), by fleet (grant, grant again) and by roll-outs (what was not used in its life).
 
 use crate::limits;
 use crate::time::{LinkDuration, LinkTime};
@@ -21,6 +21,16 @@ pub struct Authority {
     pub hb: u64,
     /// Milliseconds of link time from the robot's sending of that heartbeat.
     pub valid_ms: u64,
+}
+
+/// How fast the slower of two link clocks runs at least, in percent of the other.
+const SLOWEST_PERCENT: u64 = 98;
+
+impl Authority {
+    /// How long it may still be used, by anybody's clock: the robot's own, 2 % slower, refuses it from then on.
+    pub const fn life_ms(&self) -> u64 {
+        (self.valid_ms + 1) * 100 / SLOWEST_PERCENT + 1
+    }
 }
 
 /// Why the robot refused authority.
@@ -153,10 +163,27 @@ mod tests {
             let mut sent = SentHeartbeats::new(1, None);
             sent.sent(1, LinkTime(0));
             sent.echoed(1);
-            // Real time from sending until the server may grant again, read on a robot clock that runs `drift` permille slow or fast.
-            let real = (LinkTime(up) + limits::LEASE).0;
-            let robot = real * 1_000u64.saturating_add_signed(drift) / 1_000;
-            prop_assert!(sent.lease_until().is_some_and(|end| end < LinkTime(robot)));
+            let robot = on_a_clock((LinkTime(up) + limits::LEASE).0, drift);
+            prop_assert!(sent.lease_until().is_some_and(|end| end < robot));
         }
+        /// Also at the end of what one message gives, whatever its validity.
+        #[test]
+        fn what_a_message_gives_is_refused_when_its_life_is_over(valid_ms in 1u64..60_000, drift in -20i64..=20) {
+            let authority = Authority { session_epoch: 1, hb: 1, valid_ms };
+            let mut sent = SentHeartbeats::new(1, None);
+            sent.sent(1, LinkTime(0));
+            prop_assert!(sent.check(&authority, on_a_clock(authority.life_ms(), drift)).is_err());
+        }
+    }
+
+    /// Milliseconds of real time, read on a clock that runs `drift` permille fast.
+    fn on_a_clock(real: u64, drift: i64) -> LinkTime {
+        LinkTime(real * 1_000u64.saturating_add_signed(drift) / 1_000)
+    }
+
+    #[test]
+    fn a_short_validity_on_the_slowest_clock_is_over_with_its_life() {
+        let authority = Authority { session_epoch: 1, hb: 1, valid_ms: 687 };
+        assert!(on_a_clock(authority.life_ms(), -20) > LinkTime(687));
     }
 }

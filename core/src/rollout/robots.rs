@@ -385,7 +385,7 @@ fn unused(
     given: &Given,
     state: Option<UpdateState>,
 ) -> Option<Move> {
-    let life_ms = given.authority.valid_ms * 102 / 100 + 1;
+    let life_ms = given.authority.life_ms();
     if view.bugs.time_releases_drain() {
         let over = r.moments.granted_link.is_some_and(|at| now.wall.ms_since(at.wall) > life_ms);
         return over.then_some(Move::NotUsed);
