@@ -68,7 +68,7 @@ mod tests {
     use super::*;
     use crate::way::Way;
     use tokio::io::AsyncWriteExt;
-    use tokio::net::TcpListener;
+    use tokio::net::{TcpListener, TcpSocket};
 
     async fn found_over_tls(address: std::net::SocketAddr) -> Found {
         let root = rcgen::generate_simple_self_signed(["midshift".to_owned()]).expect("a root").cert.pem();
@@ -87,8 +87,12 @@ mod tests {
         };
         let (found, _stream) = tokio::join!(found_over_tls(address), answering);
         assert_eq!((found, found.exit_code()), (Found::PlainText, 5));
-        drop(listener);
-        assert_eq!(found_over_tls(address).await, Found::Nothing);
+
+        // Bound, so that nobody else gets the port; nothing listens on it.
+        let socket = TcpSocket::new_v4().expect("a socket");
+        socket.bind("127.0.0.1:0".parse().expect("an address")).expect("a port");
+        let dead = socket.local_addr().expect("its address");
+        assert_eq!(found_over_tls(dead).await, Found::Nothing);
     }
 
     #[tokio::test]
