@@ -31,6 +31,9 @@ async fn named(config: Config) -> World {
     World::with(config, Arc::new(Register::default()), None).await
 }
 
+/// Goes on, as `/stream` does.
+const WATCH: &str = "/midshift.task.v1.TaskService/WatchTasks";
+
 #[tokio::test]
 async fn who_floods_is_told_when_to_come_back_and_another_is_served() {
     let world = named(Config { rate: three_at_once(), ..Config::default() }).await;
@@ -80,6 +83,30 @@ async fn calls_that_stay_open_are_counted_for_their_principal_until_they_end() {
     assert_eq!(other.asked("/who").await.status.code(), Code::Ok);
     drop(open);
     while client.asked("/who").await.status.code() != Code::Ok {}
+}
+
+#[tokio::test]
+async fn watches_are_counted_for_their_principal_and_no_other_call_is() {
+    let world = named(Config { watches_per_principal_max: 1, ..Config::default() }).await;
+    let mut client = world.client().await;
+    let open = within(client.begin(WATCH, None).await.expect("a stream")).await.expect("its head");
+    assert_eq!(client.asked(WATCH).await.answer().code, Some(Reason::TooManyRequests));
+    assert_eq!(client.asked("/who").await.status.code(), Code::Ok);
+    let mut other = world.client_from(THERE).await;
+    let also = within(other.begin(WATCH, None).await.expect("a stream")).await.expect("its head");
+    assert!(!also.headers().contains_key("grpc-status"), "it goes on");
+    drop(open);
+    let mut again = || client.begin(WATCH, None);
+    while within(again().await.expect("a stream")).await.expect("its head").headers().contains_key("grpc-status") {}
+}
+
+#[tokio::test]
+async fn a_port_with_as_many_watches_as_it_takes_says_so() {
+    let world = named(Config { watches_max: 1, ..Config::default() }).await;
+    let mut client = world.client().await;
+    let _open = within(client.begin(WATCH, None).await.expect("a stream")).await.expect("its head");
+    let answer = world.client_from(THERE).await.asked(WATCH).await.answer();
+    assert_eq!((answer.grpc, answer.code), (Code::ResourceExhausted, Some(Reason::Overloaded)));
 }
 
 #[tokio::test]
