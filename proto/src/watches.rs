@@ -27,7 +27,7 @@ struct Between<T> {
 
 struct Shared<T> {
     between: Mutex<Between<T>>,
-    /// The reader asks, or has gone.
+    /// The reader asks, or has gone. Heard by all who wait: one for the question, another for the end.
     moved: Notify,
 }
 
@@ -131,7 +131,7 @@ impl<T> Stream for Reader<T> {
         between.reader = Some(context.waker().clone());
         between.is_asked = true;
         drop(between);
-        self.0.moved.notify_one();
+        self.0.moved.notify_waiters();
         Poll::Pending
     }
 }
@@ -147,7 +147,7 @@ impl<T> Drop for Reader<T> {
         let mut between = self.0.lock();
         (between.has_reader, between.message) = (false, None);
         drop(between);
-        self.0.moved.notify_one();
+        self.0.moved.notify_waiters();
     }
 }
 
@@ -187,6 +187,28 @@ mod tests {
         let why = reader.next().await.expect("a last word").expect_err("a refusal");
         assert_eq!(refusal_of(&why).code, Some(Code::WatchUnread));
         assert!(reader.next().await.is_none());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_question_is_heard_also_while_somebody_else_waits_for_the_end() {
+        let (teller, mut reader) = watch();
+        let telling = tokio::spawn(async move {
+            let two = async {
+                for n in 0..2 {
+                    teller.asked().await.expect("a reader");
+                    teller.tell(n);
+                }
+            };
+            tokio::select! {
+                biased;
+                () = teller.gone() => panic!("nobody has gone"),
+                () = two => {}
+            }
+        });
+        tokio::task::yield_now().await;
+        assert_eq!(reader.next().await.expect("a message").expect("no refusal"), 0);
+        assert_eq!(reader.next().await.expect("a message").expect("no refusal"), 1);
+        telling.await.expect("no panic");
     }
 
     #[tokio::test(start_paused = true)]

@@ -55,7 +55,7 @@ async fn answer(request: Request<Body>, poked: Arc<Notify>) -> Response<Body> {
     }
     match path.as_str() {
         "/hang" => std::future::pending().await,
-        "/stream" | "/midshift.task.v1.TaskService/WatchTasks" => {
+        "/stream" | "/midshift.telemetry.v1.TelemetryService/WatchRobots" => {
             grpc(Body::new(Silent { _request: request.into_body() }))
         }
         "/pulse" => {
