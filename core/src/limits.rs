@@ -399,6 +399,12 @@ pub const STOP_CONFIRM_EVERY: LinkDuration = LinkDuration(50);
 pub const STOP_STATUS_EVERY: LinkDuration = LinkDuration(100);
 /// Who engaged a stop is told of robots for so long at most.
 pub const STOP_CONFIRM_FOR: LinkDuration = LinkDuration::from_secs(120);
+/// Watches of one process.
+pub const WATCHES_MAX: usize = 4_096;
+/// Of these, of one robot or token. Where nobody needs to say who it is, there is no such limit.
+pub const WATCHES_PER_PRINCIPAL_MAX: usize = 256;
+/// A watch that has news and is not read ends after this. Link clock.
+pub const WATCH_UNREAD: LinkDuration = LinkDuration::from_secs(30);
 /// Streams that tell of robots at a time. A stop is engaged also when there is no room for one more; its stream then says how it is, and ends.
 pub const STOP_WATCHERS_MAX: usize = 256;
 /// Request ids of stops that are remembered, the newest.

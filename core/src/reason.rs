@@ -286,6 +286,7 @@ codes! {
     ClockRateMismatch = "CLOCK_RATE_MISMATCH", "The robot's clock rate differs from the server's.";
     ShuttingDown = "SHUTTING_DOWN", "The server is stopping; come back soon.";
     MoveOver = "MOVE_OVER", "The session is old; open the next one before this one closes.";
+    WatchUnread = "WATCH_UNREAD", "The watch had news and was not read for 30 s, so it has ended. Watch again, and read what comes.";
     Overflow = "OVERFLOW", "The robot's ring was full and thinned its oldest status.";
     FreedAfterAck = "FREED_AFTER_ACK", "The robot freed this range after it was acknowledged.";
     Poison = "POISON", "A sample could not be read; it was recorded, acknowledged and skipped.";

@@ -37,6 +37,11 @@ pub fn class(path: &str) -> Class {
     of(path).map_or(Class::Bulk, |access| access.class)
 }
 
+/// Whether an answer to that path goes on for as long as its caller likes.
+pub fn is_watch(path: &str) -> bool {
+    path.rsplit('/').next().is_some_and(|method| method.starts_with("Watch"))
+}
+
 /// Whether a call of that path may bring thousands of small messages up.
 pub fn is_batch(path: &str) -> bool {
     path == "/midshift.task.v1.TaskService/SubmitTasks"

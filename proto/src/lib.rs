@@ -12,6 +12,7 @@ pub mod leaving;
 pub mod pages;
 pub mod session;
 pub mod status;
+pub mod watches;
 
 /// `Debug` of messages with a secret: everything but it. Made from the options of their fields, as no message can be forgotten that way.
 mod secrets {

@@ -42,6 +42,10 @@ pub struct Config {
     pub requests_max: usize,
     /// Of these, of one principal.
     pub requests_per_principal_max: usize,
+    /// Watches, which go on for as long as their caller likes.
+    pub watches_max: usize,
+    /// Of these, of one principal.
+    pub watches_per_principal_max: usize,
     /// How fast one principal may ask.
     pub rate: Rate,
     /// Principals whose rate is remembered.
@@ -72,6 +76,8 @@ impl Default for Config {
             age: Some(Age::after(limits::CONNECTION_AGE)),
             requests_max: limits::REQUESTS_MAX,
             requests_per_principal_max: limits::REQUESTS_PER_PRINCIPAL_MAX,
+            watches_max: limits::WATCHES_MAX,
+            watches_per_principal_max: limits::WATCHES_PER_PRINCIPAL_MAX,
             rate: Rate::default(),
             rates_remembered: limits::RATES_REMEMBERED,
             head: limits::UNARY_DEADLINE,

@@ -18,6 +18,7 @@ use hyper::body::Incoming;
 use hyper::service::Service as HyperService;
 use midshift_core::identity::{Caller, Who};
 use midshift_core::limits;
+use midshift_core::overload::Class;
 use midshift_core::overload::bugs::Bugs;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_proto::denying::Told;
@@ -40,6 +41,7 @@ pub(crate) struct Rules {
     seats: Arc<Seats<Asker>>,
     /// Of all these, those of whoever has not shown who it is.
     strangers: Arc<Seats<Asker>>,
+    watches: Arc<Seats<Asker>>,
     /// Requests under way.
     gauge: metrics::Gauge,
     bugs: Bugs,
@@ -55,6 +57,7 @@ impl Rules {
             rates: Rates::new(config.rate, config.rates_remembered),
             seats: Seats::new(all, each),
             strangers: Seats::sharing(strangers, each, all),
+            watches: Seats::new(config.watches_max, config.watches_per_principal_max),
             gauge: metrics::gauge!("midshift_edge_requests", "port" => config.port),
             bugs: config.bugs,
         }
@@ -71,17 +74,23 @@ impl Rules {
             _ => Ok(None),
         };
         let seat = stranger.and_then(|stranger| Ok((self.seats.take(asker.clone(), class)?, stranger)));
-        let seat = seat.map(|seats| Inside::new(&self.gauge, seats)).map_err(|full| match full {
-            Full::Kind => Refusal::new(Kind::Exhausted, Code::TooManyRequests),
-            Full::Total => Refusal::new(
-                Kind::Exhausted,
-                Reason::new(Code::Overloaded, "as many requests are under way as this port takes of such"),
-            ),
-        })?;
+        let seats = seat.map_err(|full| refused(full, "requests are under way"))?;
+        let watch = access::is_watch(path).then(|| self.watches.take(asker.clone(), Class::Stop)).transpose();
+        let watch = watch.map_err(|full| refused(full, "watches go on"))?;
+        let seat = Inside::new(&self.gauge, seats, watch);
         let given = if *speech == Speech::Http { None } else { deadline::given(headers)? };
         // A time that no clock reaches is none.
         Ok(Admitted { seat, deadline: given.and_then(|given| now.checked_add(given)) })
     }
+}
+
+/// No room, as this asker's share or the port's is used up.
+fn refused(full: Full, what: &str) -> Refusal {
+    let reason = match full {
+        Full::Kind => Reason::new(Code::TooManyRequests, format!("as many {what} as one caller has room for here")),
+        Full::Total => Reason::new(Code::Overloaded, format!("as many {what} as this port takes of such")),
+    };
+    Refusal::new(Kind::Exhausted, reason)
 }
 
 struct Admitted {
@@ -96,14 +105,15 @@ type Held = (OpenStream, Option<Inside>);
 pub(crate) struct Inside {
     gauge: metrics::Gauge,
     _seats: (Seat<Asker>, Option<Seat<Asker>>),
+    _watch: Option<Seat<Asker>>,
     /// Its place among the batches of its connection. Never read.
     batch: Option<OwnedSemaphorePermit>,
 }
 
 impl Inside {
-    fn new(gauge: &metrics::Gauge, seats: (Seat<Asker>, Option<Seat<Asker>>)) -> Self {
+    fn new(gauge: &metrics::Gauge, seats: (Seat<Asker>, Option<Seat<Asker>>), watch: Option<Seat<Asker>>) -> Self {
         gauge.increment(1.0);
-        Self { gauge: gauge.clone(), _seats: seats, batch: None }
+        Self { gauge: gauge.clone(), _seats: seats, _watch: watch, batch: None }
     }
 }
 

@@ -71,6 +71,7 @@ pub fn alone(port: &'static str) -> Config {
         port,
         connections_per_network_max: limits::CONNECTIONS_MAX,
         requests_per_principal_max,
+        watches_per_principal_max: limits::WATCHES_MAX,
         rate,
         // Programs of the same machine dial long before they ask.
         first_request: limits::CONNECTION_IDLE,

@@ -11,14 +11,11 @@ use midshift_core::task::Attempt;
 use midshift_proto::Denying;
 use midshift_proto::access::caller;
 use midshift_proto::task::v1::{self, task_service_server::TaskService as Face};
+use midshift_proto::watches::{self, Reader};
 use midshift_store::Query;
-use tokio::sync::mpsc;
-use tokio_stream::wrappers::ReceiverStream;
 use tonic::metadata::MetadataMap;
 use tonic::{Request, Response, Status, Streaming};
 
-/// Messages on their way to one watcher.
-const WATCH_MAX: usize = 64;
 /// Where a caller may name its call, for errors; a request_id in the body goes before it.
 const REQUEST_ID_HEADER: &str = "x-request-id";
 
@@ -63,7 +60,7 @@ impl TaskService {
 
 #[tonic::async_trait]
 impl Face for TaskService {
-    type WatchTasksStream = ReceiverStream<Result<v1::WatchTasksResponse, Status>>;
+    type WatchTasksStream = Reader<v1::WatchTasksResponse>;
 
     async fn submit_task(&self, r: Request<v1::SubmitTaskRequest>) -> Result<Response<v1::SubmitTaskResponse>, Status> {
         let id = CallId::of(&r, &r.get_ref().request_id);
@@ -120,9 +117,9 @@ impl Face for TaskService {
     }
     async fn watch_tasks(&self, r: Request<v1::WatchTasksRequest>) -> Result<Response<Self::WatchTasksStream>, Status> {
         let (id, by) = (CallId::of(&r, ""), caller(&r));
-        let (sender, stream) = mpsc::channel(WATCH_MAX);
-        let watcher = self.watcher(r.into_inner(), by, sender).map_err(|refusal| id.status(&refusal))?;
+        let (teller, reader) = watches::watch();
+        let watcher = self.watcher(r.into_inner(), by, teller).map_err(|refusal| id.status(&refusal))?;
         tokio::spawn(watcher.run(id));
-        Ok(Response::new(ReceiverStream::new(stream)))
+        Ok(Response::new(reader))
     }
 }

@@ -27,13 +27,9 @@ use midshift_proto::task::v1::task_service_server::TaskServiceServer;
 use midshift_store::{Applied, CommitError, Error, Query, Store};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-use tokio::sync::Semaphore;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 use tonic::codec::CompressionEncoding;
-
-/// Watchers at a time. Each reads the feed for itself: about 100 KB and one read a commit.
-pub const WATCHERS_MAX: usize = 1_000;
 
 /// What the service is built from.
 pub struct Parts {
@@ -53,7 +49,6 @@ struct Inner {
     number: AtomicU64,
     /// Drawn at the start, so that two processes do not draw the same ids.
     salt: u64,
-    watchers: Arc<Semaphore>,
     shutdown: CancellationToken,
 }
 
@@ -75,8 +70,8 @@ impl TaskService {
             Some(row) => row.decode::<TaskIntake>()?.number,
             None => 0,
         };
-        let (number, watchers) = (AtomicU64::new(number), Arc::new(Semaphore::new(WATCHERS_MAX)));
-        Ok(Self { inner: Arc::new(Inner { parts, number, salt: rand::random(), watchers, shutdown }) })
+        let number = AtomicU64::new(number);
+        Ok(Self { inner: Arc::new(Inner { parts, number, salt: rand::random(), shutdown }) })
     }
     /// The gRPC face.
     pub fn grpc(&self) -> TaskServiceServer<Self> {

@@ -19,20 +19,17 @@ use midshift_core::time::Utc;
 use midshift_proto::convert::task::{TaskFilter, TaskView, encode_task};
 use midshift_proto::convert::timestamp;
 use midshift_proto::task::v1::{self, watch_tasks_response::Item};
+use midshift_proto::watches::Teller;
 use midshift_store::Error;
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 use std::time::Duration;
-use tokio::sync::{OwnedSemaphorePermit, mpsc};
 use tokio::time::Instant;
-use tonic::Status;
 
 /// A watcher hears from us at least this often.
 const BOOKMARK_EVERY: Duration = Duration::from_secs(15);
 /// Entries read at a time.
 const PAGE: usize = 1_000;
-
-/// Where messages go.
-pub type Sender = mpsc::Sender<Result<v1::WatchTasksResponse, Status>>;
 
 /// One watcher.
 pub struct Watcher {
@@ -40,7 +37,7 @@ pub struct Watcher {
     filter: TaskFilter,
     /// Who watches: it is told of nothing that it may not see.
     by: Caller,
-    sender: Sender,
+    teller: Arc<Teller<v1::WatchTasksResponse>>,
     /// Begins with the tasks as they are.
     from_now: bool,
     after: Seq,
@@ -51,7 +48,6 @@ pub struct Watcher {
     /// Tasks that were told and have not ended: one that leaves the filter is told once more.
     near: BTreeSet<TaskId>,
     said: Instant,
-    _place: OwnedSemaphorePermit,
 }
 
 enum Stop {
@@ -67,15 +63,19 @@ impl From<Refusal> for Stop {
 
 impl TaskService {
     /// A watcher at `cursor`, or at the beginning of now.
-    pub fn watcher(&self, r: v1::WatchTasksRequest, by: Caller, sender: Sender) -> Result<Watcher, Refusal> {
+    pub fn watcher(
+        &self,
+        r: v1::WatchTasksRequest,
+        by: Caller,
+        teller: Teller<v1::WatchTasksResponse>,
+    ) -> Result<Watcher, Refusal> {
         let filter: TaskFilter = midshift_proto::parse_field(Some(r.filter.unwrap_or_default()), "filter")?;
         let after = self.position(&r.cursor)?;
-        let place = self.inner.watchers.clone().try_acquire_owned();
         Ok(Watcher {
             service: self.clone(),
             filter,
             by,
-            sender,
+            teller: Arc::new(teller),
             from_now: r.cursor.is_empty(),
             after,
             images: Images::default(),
@@ -83,7 +83,6 @@ impl TaskService {
             shown_until: Seq(0),
             near: BTreeSet::new(),
             said: Instant::now(),
-            _place: place.map_err(|_| Refusal::new(Kind::Exhausted, Code::Overloaded))?,
         })
     }
 
@@ -104,21 +103,15 @@ impl TaskService {
 impl Watcher {
     /// Runs until the watcher is gone, the service stops, or the cursor cannot be served.
     pub async fn run(mut self, id: CallId) {
-        let shutdown = self.service.inner.shutdown.clone();
-        let sender = self.sender.clone();
-        tokio::select! {
-            () = shutdown.cancelled() => {
-                let refusal = Refusal::new(Kind::Unavailable, Code::ShuttingDown);
-                // A watcher without room ends without the word.
-                drop(sender.try_send(Err(id.status(&refusal))));
-            }
+        let (shutdown, teller) = (self.service.inner.shutdown.clone(), self.teller.clone());
+        let stop = tokio::select! {
+            () = shutdown.cancelled() => Err(Refusal::new(Kind::Unavailable, Code::ShuttingDown).into()),
             // One that waits for changes which its filter keeps away would not notice that nobody listens.
-            () = sender.closed() => {}
-            stop = self.follow() => {
-                if let Err(Stop::Refused(refusal)) = stop {
-                    drop(sender.send(Err(id.status(&refusal))).await);
-                }
-            }
+            () = teller.gone() => Err(Stop::Gone),
+            stop = self.follow() => stop,
+        };
+        if let Err(Stop::Refused(refusal)) = stop {
+            teller.end(id.status(&refusal));
         }
     }
 
@@ -242,7 +235,8 @@ impl Watcher {
     async fn send(&mut self, item: Item, seq: Option<Seq>) -> Result<(), Stop> {
         let cursor = seq.map(|seq| format!("{}:{}", self.service.store().id(), seq.0)).unwrap_or_default();
         let message = v1::WatchTasksResponse { item: Some(item), cursor };
-        self.sender.send(Ok(message)).await.map_err(|_| Stop::Gone)?;
+        self.teller.asked().await.map_err(|_| Stop::Gone)?;
+        self.teller.tell(message);
         self.said = Instant::now();
         Ok(())
     }

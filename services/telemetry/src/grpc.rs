@@ -14,18 +14,15 @@ use midshift_proto::convert::WireEnum;
 use midshift_proto::convert::telemetry::{RobotView, encode_event, encode_robot};
 use midshift_proto::pages;
 use midshift_proto::telemetry::v1::{self, telemetry_service_server::TelemetryService as Face};
+use midshift_proto::watches::{self, Reader, Teller};
 use midshift_store::{Dirty, Error};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::sync::mpsc;
-use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
 
 /// Robots of one message of a watch.
-const ROBOTS_PER_MESSAGE: usize = 256;
-/// Messages on their way to one watcher.
-const WATCH_MAX: usize = 4;
+const ROBOTS_PER_MESSAGE: usize = 32;
 /// Milliseconds between two messages of a watch, by default and allowed.
 const PERIOD_DEFAULT_MS: u32 = 1_000;
 const PERIOD_MS: std::ops::RangeInclusive<u32> = 50..=60_000;
@@ -195,7 +192,7 @@ fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {
 
 #[tonic::async_trait]
 impl Face for TelemetryService {
-    type WatchRobotsStream = ReceiverStream<Result<v1::WatchRobotsResponse, Status>>;
+    type WatchRobotsStream = Reader<v1::WatchRobotsResponse>;
 
     async fn list_robots(&self, r: Request<v1::ListRobotsRequest>) -> Result<Response<v1::ListRobotsResponse>, Status> {
         let by = caller(&r);
@@ -223,16 +220,16 @@ impl Face for TelemetryService {
         if let Err(refusal) = bad.finish() {
             return Err(midshift_proto::status(&refusal, None));
         }
-        let (sender, stream) = mpsc::channel(WATCH_MAX);
+        let (teller, reader) = watches::watch();
         let inner = self.inner.clone();
         tokio::spawn(async move {
             let shutdown = inner.shutdown.clone();
             tokio::select! {
                 () = shutdown.cancelled() => {}
-                () = watch(&inner, filter, Duration::from_millis(u64::from(period_ms)), sender) => {}
+                () = watch(&inner, filter, Duration::from_millis(u64::from(period_ms)), &teller) => {}
             }
         });
-        Ok(Response::new(ReceiverStream::new(stream)))
+        Ok(Response::new(reader))
     }
 }
 
@@ -247,7 +244,7 @@ struct Watching<'a> {
 
 impl Watching<'_> {
     /// Robots to tell of `ids`: those that match, and once more those that did and no longer do.
-    fn news(&mut self, ids: BTreeSet<RobotId>) -> Vec<v1::Robot> {
+    fn news(&mut self, ids: Vec<RobotId>) -> Vec<v1::Robot> {
         let mut robots = Vec::new();
         for id in ids {
             let matches = admits(self.inner, &self.filter, &id);
@@ -264,47 +261,40 @@ impl Watching<'_> {
         }
         robots
     }
-    /// The whole.
-    fn first(&mut self) -> Vec<v1::Robot> {
+    /// All robots.
+    fn first(&mut self) -> Vec<RobotId> {
         self.beats.take();
         self.touched.take();
-        let known = self.inner.picture.rows().sessions.keys().cloned().collect();
-        self.news(known)
+        self.inner.picture.rows().sessions.keys().cloned().collect()
     }
-    /// What changed since the last call.
-    fn changed(&mut self) -> Vec<v1::Robot> {
+    /// Those that changed since the last call.
+    fn changed(&mut self) -> Vec<RobotId> {
         let beats = self.beats.take().into_iter().map(|(id, _)| id);
-        let ids = beats.chain(self.touched.take().into_iter().map(|(id, _)| id)).collect();
-        self.news(ids)
+        let ids: BTreeSet<RobotId> = beats.chain(self.touched.take().into_iter().map(|(id, _)| id)).collect();
+        ids.into_iter().collect()
     }
 }
 
 /// The whole, then what changed, newest only, at the watcher's pace; a slow watcher lowers only its own rate.
-async fn watch(
-    inner: &Inner,
-    filter: Filter,
-    period: Duration,
-    sender: mpsc::Sender<Result<v1::WatchRobotsResponse, Status>>,
-) {
+async fn watch(inner: &Inner, filter: Filter, period: Duration, teller: &Teller<v1::WatchRobotsResponse>) {
     let (beats, touched) = (inner.parts.board.watch(), inner.picture.touched());
     let mut watching = Watching { inner, filter, beats, touched, shown: BTreeSet::new() };
-    let mut robots = watching.first();
+    let mut ids = watching.first();
     let mut snapshot_complete = false;
-    loop {
-        let rest = robots.split_off(robots.len().min(ROBOTS_PER_MESSAGE));
-        let last = rest.is_empty();
-        snapshot_complete |= last;
-        let message = v1::WatchRobotsResponse { robots, snapshot_complete };
-        if sender.send(Ok(message)).await.is_err() {
-            return;
+    while teller.asked().await.is_ok() {
+        let rest = ids.split_off(ids.len().min(ROBOTS_PER_MESSAGE));
+        let robots = watching.news(ids);
+        ids = rest;
+        // The end of the whole is told, also where nothing of it is shown.
+        if !robots.is_empty() || (ids.is_empty() && !snapshot_complete) {
+            snapshot_complete |= ids.is_empty();
+            teller.tell(v1::WatchRobotsResponse { robots, snapshot_complete });
         }
-        robots = rest;
-        while robots.is_empty() {
-            tokio::time::sleep(period).await;
-            if sender.is_closed() {
-                return;
+        while ids.is_empty() {
+            tokio::select! {
+                () = teller.gone() => return,
+                () = tokio::time::sleep(period) => ids = watching.changed(),
             }
-            robots = watching.changed();
         }
     }
 }

@@ -55,6 +55,7 @@ mod stop_alone;
 mod stopped;
 mod stopped_release;
 mod story;
+mod swallowed;
 mod swarm_software;
 mod tuf;
 mod two_of_each;

@@ -27,7 +27,7 @@ use tonic::transport::Channel;
 const LIMIT: Duration = Duration::from_secs(60);
 
 /// A way to it, when there is one.
-async fn way(address: SocketAddr) -> anyhow::Result<Channel> {
+pub async fn way(address: SocketAddr) -> anyhow::Result<Channel> {
     until("the stop service", LIMIT, async || {
         Ok(Channel::from_shared(format!("http://{address}"))?.connect().await.ok())
     })
@@ -84,7 +84,7 @@ async fn a_stop_service_whose_log_takes_nothing_engages_tells_and_resets() -> an
 }
 
 /// Processes of stop services that were started by a server or by one before them, as these logs tell; killed when the test lets them go: they outlive both.
-struct Children(Vec<PathBuf>);
+pub struct Children(Vec<PathBuf>);
 
 /// What is said of each of them.
 const STARTED: &str = "a stop service was started";
@@ -121,7 +121,7 @@ impl Drop for Children {
 }
 
 /// A stop service of this site, whose log tells processes.
-fn stop_service(dir: &Path, address: SocketAddr) -> anyhow::Result<(Running, Children)> {
+pub fn stop_service(dir: &Path, address: SocketAddr) -> anyhow::Result<(Running, Children)> {
     std::fs::write(dir.join("site.toml"), DEMO)?;
     let (mut command, log) = (Command::new(midshift()?), dir.join("stop.log"));
     command.env("NO_COLOR", "1").args(["stop", "serve", "--insecure", "--listen", &address.to_string(), "--data"]);

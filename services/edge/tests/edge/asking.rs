@@ -18,6 +18,8 @@ const ENGAGE: &str = "/midshift.stop.v1.StopService/Engage";
 const CANCEL: &str = "/midshift.task.v1.TaskService/CancelTask";
 const LIST: &str = "/midshift.task.v1.TaskService/ListTasks";
 const WATCH: &str = "/midshift.task.v1.TaskService/WatchTasks";
+/// Goes on until it is let go.
+const OPEN: &str = "/midshift.telemetry.v1.TelemetryService/WatchRobots";
 const FETCH: &str = "/midshift.ota.v1.ChunkService/FetchChunks";
 
 const PAGE: &str = "GET /ready HTTP/1.1\r\nhost: edge\r\n\r\n";
@@ -80,6 +82,34 @@ async fn calls_that_stay_open_are_counted_for_their_principal_until_they_end() {
     assert_eq!(other.asked("/who").await.status.code(), Code::Ok);
     drop(open);
     while client.asked("/who").await.status.code() != Code::Ok {}
+}
+
+#[tokio::test]
+async fn watches_are_counted_for_their_principal_and_no_other_call_is() {
+    let world = named(Config { watches_per_principal_max: 1, ..Config::default() }).await;
+    let mut client = world.client().await;
+    let open = within(client.begin(OPEN, None).await.expect("a stream")).await.expect("its head");
+    assert_eq!(client.asked(OPEN).await.answer().code, Some(Reason::TooManyRequests));
+    assert_eq!(client.asked("/who").await.status.code(), Code::Ok);
+    let mut other = world.client_from(THERE).await;
+    let also = within(other.begin(OPEN, None).await.expect("a stream")).await.expect("its head");
+    assert!(!also.headers().contains_key("grpc-status"), "it goes on");
+    drop(open);
+    loop {
+        let again = within(client.begin(OPEN, None).await.expect("a stream")).await.expect("its head");
+        if !again.headers().contains_key("grpc-status") {
+            break;
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_port_with_as_many_watches_as_it_takes_says_so() {
+    let world = named(Config { watches_max: 1, ..Config::default() }).await;
+    let mut client = world.client().await;
+    let _open = within(client.begin(OPEN, None).await.expect("a stream")).await.expect("its head");
+    let answer = world.client_from(THERE).await.asked(OPEN).await.answer();
+    assert_eq!((answer.grpc, answer.code), (Code::ResourceExhausted, Some(Reason::Overloaded)));
 }
 
 #[tokio::test]

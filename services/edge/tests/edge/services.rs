@@ -55,7 +55,9 @@ async fn answer(request: Request<Body>, poked: Arc<Notify>) -> Response<Body> {
     }
     match path.as_str() {
         "/hang" => std::future::pending().await,
-        "/stream" => grpc(Body::new(Silent { _request: request.into_body() })),
+        "/stream" | "/midshift.telemetry.v1.TelemetryService/WatchRobots" => {
+            grpc(Body::new(Silent { _request: request.into_body() }))
+        }
         "/pulse" => {
             let (sender, said) = mpsc::channel(1);
             tokio::spawn(async move {

@@ -21,8 +21,10 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::time::Duration;
 use target::{AGAIN_AFTER, StopCall, Target};
-use tokio::time::Instant;
+use tokio::time::{Instant, timeout};
 
+/// Whether the stop is engaged is not known, as of any call that nobody has answered in time.
+const NOT_KNOWN: u8 = 10;
 /// Stops that were not confirmed by all.
 const NOT_ALL: u8 = 13;
 /// Every robot of a site in one message.
@@ -177,6 +179,17 @@ pub async fn run(stop: Stop, out: &Out) -> Result<(), Exit> {
 }
 
 async fn engage(args: Engage, out: &Out) -> Result<(), Exit> {
+    if !args.no_wait {
+        return ask(args, out).await;
+    }
+    let nothing = || {
+        let text = format!("no answer within {} s: nobody knows whether the stop is engaged", NO_WAIT.as_secs());
+        Exit::new(NOT_KNOWN, text).or_try("midshift stop status, or the same without --no-wait, which goes on asking")
+    };
+    timeout(NO_WAIT, ask(args, out)).await.unwrap_or_else(|_| Err(nothing()))
+}
+
+async fn ask(args: Engage, out: &Out) -> Result<(), Exit> {
     let level = match args.level {
         Level::Slow => StopLevel::Slow,
         Level::Halt => StopLevel::Halt,
@@ -212,6 +225,11 @@ async fn engage(args: Engage, out: &Out) -> Result<(), Exit> {
     }
 }
 
+/// Whoever does not wait has its answer within this, or is told that there is none.
+const NO_WAIT: Duration = Duration::from_secs(2);
+/// An answer that has not begun after this is asked for again, over a connection of its own; sooner where nobody waits.
+const BEGUN_WITHIN: Duration = Duration::from_millis(2_500);
+const BEGUN_SOON: Duration = Duration::from_millis(800);
 /// Asked so often again where a stop service has ended under a call.
 const TRIES: u32 = 10;
 /// So long after it broke off first it is not asked again, however few times it was: a person waits.
@@ -242,13 +260,23 @@ impl Told {
         no_wait: bool,
         out: &Out,
     ) -> Result<(), Heard> {
-        let mut stream = client.engage(request).await.map_err(|status| self.lost(status))?.into_inner();
-        while let Some(message) = stream.message().await.map_err(|status| self.lost(status))? {
+        let begun = async {
+            let mut stream = client.engage(request).await?.into_inner();
+            let first = stream.message().await?;
+            Ok::<_, tonic::Status>((stream, first))
+        };
+        let within = if no_wait { BEGUN_SOON } else { BEGUN_WITHIN };
+        let (mut stream, mut next) = match timeout(within, begun).await {
+            Ok(begun) => begun.map_err(|status| self.lost(status))?,
+            Err(_) => return Err(Heard::Lost(tonic::Status::deadline_exceeded("the stop service says nothing"))),
+        };
+        while let Some(message) = next {
             self.take(message, out).map_err(Heard::Failed)?;
             // Nobody is waited for of whom nobody knows.
             if no_wait || self.last.robot_unknown {
                 return Ok(());
             }
+            next = stream.message().await.map_err(|status| self.lost(status))?;
         }
         if self.stop.stop_id.is_empty() {
             return Err(Heard::Lost(tonic::Status::unavailable("the stop service ended before it answered")));

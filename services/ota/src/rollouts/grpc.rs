@@ -17,18 +17,15 @@ use midshift_proto::convert::timestamp;
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::rollout_service_server::RolloutService as Face;
 use midshift_proto::pages;
+use midshift_proto::watches::{self, Reader};
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::sync::mpsc;
 use tokio::time::Instant;
-use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
 
 /// So long a caller waits for the row of a bundle that is published: the process that plans writes it within a second, and another takes over within 5.
 const ROWS_COME: Duration = Duration::from_secs(8);
 const ROWS_LOOK: Duration = Duration::from_millis(50);
-/// Messages that wait for a watcher.
-const WATCH_MAX: usize = 4;
 
 fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {
     result.map(Response::new).map_err(|refusal| {
@@ -349,7 +346,7 @@ impl RolloutService {
 
 #[tonic::async_trait]
 impl Face for RolloutService {
-    type WatchRolloutStream = ReceiverStream<Result<v1::WatchRolloutResponse, Status>>;
+    type WatchRolloutStream = Reader<v1::WatchRolloutResponse>;
 
     async fn create_rollout(
         &self,
@@ -515,16 +512,16 @@ impl Face for RolloutService {
     ) -> Result<Response<Self::WatchRolloutStream>, Status> {
         let by = caller(&r);
         let rollout_id = named(&r.into_inner().rollout_id).map_err(|refusal| midshift_proto::status(&refusal, None))?;
-        let (sender, stream) = mpsc::channel(WATCH_MAX);
+        let (teller, reader) = watches::watch();
         let service = self.clone();
         tokio::spawn(async move {
             let shutdown = service.shutdown.clone();
             tokio::select! {
                 () = shutdown.cancelled() => {}
-                () = watch::watch(service, rollout_id, by, sender) => {}
+                () = watch::watch(service, rollout_id, by, &teller) => {}
             }
         });
-        Ok(Response::new(ReceiverStream::new(stream)))
+        Ok(Response::new(reader))
     }
 }
 

@@ -9,10 +9,9 @@ use midshift_core::rollout::{Board, objects};
 use midshift_core::rows::Revision;
 use midshift_core::time::Now;
 use midshift_proto::ota::v1;
+use midshift_proto::watches::Teller;
 use std::collections::BTreeMap;
 use std::time::Duration;
-use tokio::sync::mpsc;
-use tonic::Status;
 
 /// Messages to one watcher come no faster.
 const PACE: Duration = Duration::from_millis(500);
@@ -59,12 +58,7 @@ impl Told {
 }
 
 /// Watches until the roll-out has ended, the watcher goes, or the server stops.
-pub async fn watch(
-    service: RolloutService,
-    id: RolloutId,
-    by: Caller,
-    sender: mpsc::Sender<Result<v1::WatchRolloutResponse, Status>>,
-) {
+pub async fn watch(service: RolloutService, id: RolloutId, by: Caller, teller: &Teller<v1::WatchRolloutResponse>) {
     let mut told = Told::default();
     let mut changed = service.changed.clone();
     loop {
@@ -80,22 +74,22 @@ pub async fn watch(
         let (after, (message, is_over)) = match next {
             Ok(next) => next,
             Err(refusal) => {
-                // Whoever has gone needs no answer.
-                let _ = sender.send(Err(midshift_proto::status(&refusal, None))).await;
+                teller.end(midshift_proto::status(&refusal, None));
                 return;
             }
         };
         told = after;
-        if let Some(message) = message
-            && sender.send(Ok(message)).await.is_err()
-        {
-            return;
+        if let Some(message) = message {
+            if teller.asked().await.is_err() {
+                return;
+            }
+            teller.tell(message);
         }
         if is_over {
             return;
         }
         tokio::select! {
-            () = sender.closed() => return,
+            () = teller.gone() => return,
             news = changed.changed() => if news.is_err() { return },
         }
         tokio::time::sleep(PACE).await;

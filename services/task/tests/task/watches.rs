@@ -207,23 +207,6 @@ async fn a_watcher_that_does_not_read_holds_up_nobody_and_all_end_at_shutdown() 
 }
 
 #[tokio::test(start_paused = true)]
-async fn there_is_a_limit_of_watchers_and_one_that_leaves_makes_room() {
-    let world = World::new().await;
-    let mut open = Vec::new();
-    for _ in 0..midshift_task::WATCHERS_MAX {
-        open.push(world.watch(None, "").await);
-    }
-    let mut client = world.client();
-    let refused = client.watch_tasks(v1::WatchTasksRequest::default()).await.expect_err("one too many");
-    assert_eq!((refused.code(), reason(&refused).as_str()), (Code::ResourceExhausted, "OVERLOADED"));
-    drop(open.pop());
-    submit(&world.service, transport("r1", "B03")).await.expect("admitted");
-    while client.watch_tasks(v1::WatchTasksRequest::default()).await.is_err() {
-        tokio::task::yield_now().await;
-    }
-}
-
-#[tokio::test(start_paused = true)]
 async fn a_task_that_leaves_the_filter_is_told_once_more_and_then_no_longer() {
     let world = World::new().await;
     let running = v1::TaskFilter { states: vec![TaskState::Running as i32], ..v1::TaskFilter::default() };
