@@ -15,39 +15,34 @@ use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
 
-/// Frames of HTTP/2 that begin or end an answer.
+/// The frame of HTTP/2 that begins an answer.
 const HEADERS: u8 = 1;
-/// Of the first answer of a connection, which says that the service is there.
-const FIRST: usize = 2;
 
-/// Passes on what the server says, frame by frame, up to this many heads of answers; then nothing more.
-async fn carry(mut from: OwnedReadHalf, mut to: OwnedWriteHalf, mut heads: Option<usize>) -> io::Result<()> {
+/// Passes on what the server says, frame by frame; if it `swallows` answers, then nothing more once one begins.
+async fn carry(mut from: OwnedReadHalf, mut to: OwnedWriteHalf, swallows: bool) -> io::Result<()> {
     loop {
         let mut frame = vec![0; 9];
         from.read_exact(&mut frame).await?;
         let bytes = u32::from_be_bytes([0, frame[0], frame[1], frame[2]]) as usize;
         frame.resize(9 + bytes, 0);
         from.read_exact(&mut frame[9..]).await?;
-        if frame[3] == HEADERS
-            && let Some(left) = &mut heads
-        {
-            let Some(less) = left.checked_sub(1) else { return std::future::pending().await };
-            *left = less;
+        if swallows && frame[3] == HEADERS {
+            return std::future::pending().await;
         }
         to.write_all(&frame).await?;
     }
 }
 
-/// Stands before `server` and swallows what it says to the first connection after its first answer. How many connections came.
+/// Stands before `server` and swallows each answer to the first connection. How many connections came.
 async fn swallows(listener: TcpListener, server: SocketAddr, came: Arc<AtomicUsize>) -> io::Result<()> {
     let mut ways = JoinSet::new();
     loop {
         let (client, _) = listener.accept().await?;
         let (mut said, client) = client.into_split();
         let (server, mut to) = TcpStream::connect(server).await?.into_split();
-        let heads = (came.fetch_add(1, Ordering::Relaxed) == 0).then_some(FIRST);
+        let is_first = came.fetch_add(1, Ordering::Relaxed) == 0;
         ways.spawn(async move { tokio::io::copy(&mut said, &mut to).await.map(drop) });
-        ways.spawn(carry(server, client, heads));
+        ways.spawn(carry(server, client, is_first));
     }
 }
 
