@@ -35,7 +35,7 @@ impl<T> Shared<T> {
     fn lock(&self) -> MutexGuard<'_, Between<T>> {
         self.between.lock().unwrap_or_else(PoisonError::into_inner)
     }
-    fn put(&self, message: Result<T, Status>) {
+    fn put_message(&self, message: Result<T, Status>) {
         let mut between = self.lock();
         if between.has_reader {
             between.message = Some(message);
@@ -90,12 +90,12 @@ impl<T> Teller<T> {
         })
     }
     /// Tells what was asked for.
-    pub fn tell(&self, message: T) {
-        self.0.put(Ok(message));
+    pub fn tell_message(&self, message: T) {
+        self.0.put_message(Ok(message));
     }
     /// The last word, in the place of whatever was not read.
     pub fn end(&self, why: Status) {
-        self.0.put(Err(why));
+        self.0.put_message(Err(why));
     }
     /// Waits until the watcher has gone.
     pub async fn gone(&self) {
@@ -164,7 +164,7 @@ mod tests {
         let telling = tokio::spawn(async move {
             for n in 0..3 {
                 teller.asked().await.expect("a reader");
-                teller.tell(n);
+                teller.tell_message(n);
             }
         });
         let mut read = Vec::new();
@@ -180,7 +180,7 @@ mod tests {
         let (teller, mut reader) = watch::<Arc<str>>();
         let message: Arc<str> = "news".into();
         let held: Weak<str> = Arc::downgrade(&message);
-        teller.tell(message);
+        teller.tell_message(message);
         assert_eq!(teller.asked().await, Err(Gone));
         assert!(held.upgrade().is_none(), "the message is given back");
         drop(teller);
@@ -196,7 +196,7 @@ mod tests {
             let two = async {
                 for n in 0..2 {
                     teller.asked().await.expect("a reader");
-                    teller.tell(n);
+                    teller.tell_message(n);
                 }
             };
             tokio::select! {

@@ -75,6 +75,7 @@ impl Rules {
         };
         let seat = stranger.and_then(|stranger| Ok((self.seats.take(asker.clone(), class)?, stranger)));
         let seats = seat.map_err(|full| refused(full, "requests are under way"))?;
+        // None goes before another: each may have the last seat.
         let watch = access::is_watch(path).then(|| self.watches.take(asker.clone(), Class::Stop)).transpose();
         let watch = watch.map_err(|full| refused(full, "watches go on"))?;
         let seat = Inside::new(&self.gauge, seats, watch);

@@ -19,7 +19,7 @@ use midshift_core::time::Utc;
 use midshift_proto::convert::task::{TaskFilter, TaskView, encode_task};
 use midshift_proto::convert::timestamp;
 use midshift_proto::task::v1::{self, watch_tasks_response::Item};
-use midshift_proto::watches::Teller;
+use midshift_proto::watches::{Gone, Teller};
 use midshift_store::Error;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -58,6 +58,12 @@ enum Stop {
 impl From<Refusal> for Stop {
     fn from(refusal: Refusal) -> Self {
         Self::Refused(refusal)
+    }
+}
+
+impl From<Gone> for Stop {
+    fn from(_: Gone) -> Self {
+        Self::Gone
     }
 }
 
@@ -157,7 +163,8 @@ impl Watcher {
                 if is_seen && begin.admits(&task.intake, &task.state) {
                     self.shown.insert(task.state.task_id.clone(), task.revision);
                     self.keep_near(&task.state, true);
-                    self.send(Item::Existing(task.encode()), None).await?;
+                    self.teller.asked().await?;
+                    self.tell_item(Item::Existing(task.encode()), None);
                 }
             }
         }
@@ -204,6 +211,7 @@ impl Watcher {
         if said || !(admitted || leaves) || !is_seen {
             return Ok(());
         }
+        self.teller.asked().await?;
         // What may be answered is about now: the robot's row as it is.
         let asks = state.phase == Phase::NeedsOperator && state.opened.is_some();
         let kept = asks && robot_kept(self.service.store(), &state).await.map_err(unavailable)?;
@@ -217,7 +225,8 @@ impl Watcher {
             actor: entry.actor.to_string(),
             change_time: Some(timestamp(Utc(entry.at_unix_ms))),
         };
-        self.send(Item::Change(change), Some(entry.seq)).await
+        self.tell_item(Item::Change(change), Some(entry.seq));
+        Ok(())
     }
 
     fn keep_near(&mut self, state: &TaskState, admitted: bool) {
@@ -229,16 +238,16 @@ impl Watcher {
     }
 
     async fn bookmark(&mut self) -> Result<(), Stop> {
-        self.send(Item::Bookmark(v1::Bookmark {}), Some(self.after)).await
+        self.teller.asked().await?;
+        self.tell_item(Item::Bookmark(v1::Bookmark {}), Some(self.after));
+        Ok(())
     }
 
-    async fn send(&mut self, item: Item, seq: Option<Seq>) -> Result<(), Stop> {
+    fn tell_item(&mut self, item: Item, seq: Option<Seq>) {
         let cursor = seq.map(|seq| format!("{}:{}", self.service.store().id(), seq.0)).unwrap_or_default();
         let message = v1::WatchTasksResponse { item: Some(item), cursor };
-        self.teller.asked().await.map_err(|_| Stop::Gone)?;
-        self.teller.tell(message);
+        self.teller.tell_message(message);
         self.said = Instant::now();
-        Ok(())
     }
 }
 

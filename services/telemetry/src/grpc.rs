@@ -288,7 +288,7 @@ async fn watch(inner: &Inner, filter: Filter, period: Duration, teller: &Teller<
         // The end of the whole is told, also where nothing of it is shown.
         if !robots.is_empty() || (ids.is_empty() && !snapshot_complete) {
             snapshot_complete |= ids.is_empty();
-            teller.tell(v1::WatchRobotsResponse { robots, snapshot_complete });
+            teller.tell_message(v1::WatchRobotsResponse { robots, snapshot_complete });
         }
         while ids.is_empty() {
             tokio::select! {

@@ -61,7 +61,7 @@ impl Told {
 pub async fn watch(service: RolloutService, id: RolloutId, by: Caller, teller: &Teller<v1::WatchRolloutResponse>) {
     let mut told = Told::default();
     let mut changed = service.changed.clone();
-    loop {
+    while teller.asked().await.is_ok() {
         changed.mark_unchanged();
         let (asked, by) = (id.clone(), by.clone());
         let looked = service
@@ -80,10 +80,7 @@ pub async fn watch(service: RolloutService, id: RolloutId, by: Caller, teller: &
         };
         told = after;
         if let Some(message) = message {
-            if teller.asked().await.is_err() {
-                return;
-            }
-            teller.tell(message);
+            teller.tell_message(message);
         }
         if is_over {
             return;
