@@ -98,18 +98,23 @@ pub fn of_attempt(view: &View, board: &Board, now: &Now, a: &Attempt) -> Option<
         (AttemptPhase::Offered, _) => Some(Reason::from(Code::WaitingForAnswer).with(WAITS_FOR, robot)),
         (AttemptPhase::Stopping, _) => Some(Reason::from(Code::WaitingForStop).with(WAITS_FOR, robot)),
         (phase, _) if phase.is_terminal() => Some(Reason::from(Code::Forced).with(WAITS_FOR, robot)),
+        // The heartbeat is older than what the robot said since as events, of which the row knows.
+        (_, None) if !heard::is_fresh(view, live) => Some(works(view, now, a, live, a.step_index)),
         (_, None) => Some(Reason::from(Code::RobotReconciling).with(WAITS_FOR, robot)),
         (_, Some(listed)) if listed.state == WorkState::Navigating && places::is_out_of_route(view, live, a) => None,
-        (_, Some(listed)) => {
-            let since = Utc(now.utc.0 - i64::try_from(now.site.since(live.progress_at).as_ms()).unwrap_or(0));
-            let steps = a.attempt.subject.task_id().and_then(|id| view.intake(id)).map(|i| i.spec.steps.len());
-            let step = listed.step_index;
-            let told = format!("{robot_id} works on step {step} of the attempt since {}.", since.rfc3339());
-            let reason = Reason::new(Code::WorksOnStep, told).with("robot_id", robot_id).with("step", step);
-            let reason = reason.with("since", since.rfc3339()).with("attempt", &a.attempt);
-            Some(steps.into_iter().fold(reason, |reason, steps| reason.with("steps", steps)))
-        }
+        (_, Some(listed)) => Some(works(view, now, a, live, listed.step_index)),
     }
+}
+
+/// The robot works on this step of the attempt.
+fn works(view: &View, now: &Now, a: &Attempt, live: &Live, step: u32) -> Reason {
+    let robot_id = &a.robot_id;
+    let since = Utc(now.utc.0 - i64::try_from(now.site.since(live.progress_at).as_ms()).unwrap_or(0));
+    let steps = a.attempt.subject.task_id().and_then(|id| view.intake(id)).map(|i| i.spec.steps.len());
+    let told = format!("{robot_id} works on step {step} of the attempt since {}.", since.rfc3339());
+    let reason = Reason::new(Code::WorksOnStep, told).with("robot_id", robot_id).with("step", step);
+    let reason = reason.with("since", since.rfc3339()).with("attempt", &a.attempt);
+    steps.into_iter().fold(reason, |reason, steps| reason.with("steps", steps))
 }
 
 /// The attempt is UNCERTAIN.

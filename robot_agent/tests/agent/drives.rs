@@ -199,6 +199,25 @@ fn without_an_echo_for_thirty_seconds_the_robot_goes_to_the_next_standing_place_
 }
 
 #[test]
+fn a_robot_that_cannot_read_its_newer_work_goes_to_the_next_standing_place_it_holds_and_keeps_its_session() {
+    let mut rig = under_way(Rig::at("A"));
+    rig.body.reach();
+    let unreadable = || Downlink { unreadable_work: Some("step 7 of kind 12".to_owned()), ..Downlink::default() };
+    rig.down(unreadable());
+    rig.pass(500);
+    assert_eq!(rig.body.goes_to(), ["C", "D"], "no further than as if its authority had ended");
+    rig.body.reach();
+    rig.body.reach();
+    rig.down(unreadable());
+    rig.pass(60_000);
+    assert_eq!((rig.body.goes_to().len(), rig.body.log().waypoint), (0, Some(crate::rig::waypoint("D"))));
+    assert_eq!((rig.states().last(), rig.stale()), (Some(&(WorkState::Paused, 0)), 1));
+    assert!(rig.exit.is_none(), "its session goes on");
+    again(&mut rig, |rig| vec![rig.grant("E", 13)]);
+    assert_eq!(rig.body.goes_to(), ["E"], "work that it can read again");
+}
+
+#[test]
 fn a_hold_ends_only_with_a_fresh_word() {
     let mut rig = under_way(Rig::at("A"));
     let held =

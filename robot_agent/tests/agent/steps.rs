@@ -180,6 +180,24 @@ fn an_errand_charges_until_the_threshold_and_parks() {
 }
 
 #[test]
+fn an_errand_that_is_broken_off_at_the_charger_says_how_far_it_came() {
+    let steps = || vec![goto("B"), action("charge", Effect::Repeatable)];
+    let route = || vec![point("A", None, false, &[]), point("B", Some(0), false, &[])];
+    let mut rig = Rig::at("A");
+    rig.connect();
+    let offer = rig.offer("T1", 1, steps(), route());
+    rig.work(rig.desired(Some(offer.clone())));
+    assert_eq!(rig.body.goes_to(), ["B"], "a robot on its way to a charger goes on");
+    rig.body.reach();
+    rig.pass(500);
+    assert!(rig.body.log().charging);
+    rig.work(rig.desired(Some(Assignment { stop: true, ..offer })));
+    rig.pass(1_000);
+    assert_eq!(rig.states().last(), Some(&(WorkState::Aborted, 1)), "at its goal, which fleet calls DOCKED");
+    assert!(!rig.body.log().charging);
+}
+
+#[test]
 fn a_battery_that_becomes_critical_is_said_once() {
     let mut rig = Rig::at("A");
     rig.connect();

@@ -116,6 +116,15 @@ fn pair(code: &str, waits_for: &str) -> (String, String) {
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_robot_that_has_said_that_it_works_is_believed_before_its_next_heartbeat() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.submit("T1", "A", "B").await;
+    w.until_phase("T1", Phase::Running).await;
+    assert_eq!(of_both(&w, "T1", "r1").await.0, "WORKS_ON_STEP");
+}
+
+#[tokio::test(start_paused = true)]
 async fn an_attempt_is_told_as_its_robot_answers_works_is_stopped_and_driven_by_hand() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;
