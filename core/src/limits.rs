@@ -74,6 +74,8 @@ pub const DECISIONS_PER_STAGE_MIN: usize = 32;
 pub const LOOKS_PER_DECISION: usize = 16;
 /// Entries of the feed that one turn takes: some 20 us each.
 pub const ENTRIES_PER_TURN: usize = 256;
+/// Robots that the questions of one turn are about, together: an explanation looks at each for some microseconds.
+pub const ROBOTS_ASKED_PER_TURN: usize = 4_096;
 /// Questions and commands that one turn takes.
 pub const REQUESTS_PER_TURN: usize = 64;
 /// Steps of one task.
@@ -99,6 +101,9 @@ pub const CODE_BYTES_MAX: usize = 64;
 pub const REASON_BYTES_MAX: usize = 256;
 /// Parameters of one action as JSON, bytes.
 pub const PARAMS_BYTES_MAX: usize = 8 * 1024;
+/// Lists and objects within each other in the parameters of one action: readers of messages give up at 100 levels, and each of these takes
+/// two of them.
+pub const PARAMS_DEPTH_MAX: usize = 16;
 /// Page size if none is asked, and at most.
 pub const PAGE_DEFAULT: usize = 100;
 /// Largest page.

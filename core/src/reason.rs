@@ -160,11 +160,11 @@ codes! {
     DecisionPutAside = "DECISION_PUT_ASIDE", "The store refused the same decision twice, so it is not tried again and the robot or place it is about gets no work and no grant. The server's log has the details; close the incident to try once more.";
     ReportTooLong = "REPORT_TOO_LONG", "A list of the robot's heartbeat is longer than one may be. It is not processed, so the robot loses its authority; its maker must mend it.";
     ReportImplausible = "REPORT_IMPLAUSIBLE", "The robot reported a step or an end that cannot be. It frees nothing and moves nothing forward; the robot gets no work while it says so. Look at the robot's software.";
-    RobotDoesNotAnswer = "ROBOT_DOES_NOT_ANSWER", "The robot heard three offers within ten minutes and answered none. It gets one offer after ten minutes; its answer ends this. Look at its software.";
+    RobotDoesNotAnswer = "ROBOT_DOES_NOT_ANSWER", "The robot heard three offers within ten minutes and answered none, or refused five in a row. It gets one offer after ten minutes; if it takes that, this ends. Look at its software.";
     OffersNotAnswered = "OFFERS_NOT_ANSWERED", "Many robots did not answer offers at the same time, so none of them is blamed. Look at the server and its network.";
     AttemptUnknown = "ATTEMPT_UNKNOWN", "The robot has an attempt that this server does not know, and does not let it go. Look at the robot; once it stands still, `midshift robot disown ROBOT ATTEMPT` lets the server ignore it.";
     PlacesImplausible = "PLACES_IMPLAUSIBLE", "The robot says that it is inside of more places without a grant than it can be. It keeps what it held, frees nothing and gets no work and no grant until it says less. Look where it is.";
-    ExclusionBroken = "EXCLUSION_BROKEN", "Two robots say that they are inside of one place that has room for one. Nobody else is let in. Look at both, move one, or clear the place.";
+    ExclusionBroken = "EXCLUSION_BROKEN", "Two robots say that they are inside of one place that has no room for both. Nobody else is let in. Look at both, move one, or clear the place.";
     GrantUnknown = "GRANT_UNKNOWN", "The robot entered a place on a grant that this server did not give. Look at the robot's software, or for a second server.";
     WorkUnreadable = "WORK_UNREADABLE", "The robot cannot read the work that it was sent and acts as if its authority had ended. Its software is too old for this server, or the other way round.";
     AssignmentUnlawful = "ASSIGNMENT_UNLAWFUL", "The record of the task names a step that it does not have, so the robot was not sent it. A person must resolve the task.";
@@ -183,7 +183,7 @@ codes! {
     WorksOnStep = "WORKS_ON_STEP", "The robot works on a step of it.";
     WaitingForRetry = "WAITING_FOR_RETRY", "It failed and waits out its back-off.";
     DependencyFailed = "DEPENDENCY_FAILED", "A task it depends on ended without success.";
-    NoRobotAccepts = "NO_ROBOT_ACCEPTS", "Five robots in a row refused it.";
+    NoRobotAccepts = "NO_ROBOT_ACCEPTS", "It was offered five times in a row and refused each time.";
     NoRobotCan = "NO_ROBOT_CAN", "Every candidate refused it for its content; it cannot be done as asked.";
     AttemptsSpent = "ATTEMPTS_SPENT", "Every allowed attempt failed.";
     FaultNotRecoverable = "FAULT_NOT_RECOVERABLE", "The robot reported a fault that is never retried.";

@@ -1,8 +1,10 @@
-//! Robots that hear an offer and do not answer it: passed over for a while, then out of dispatch until they answer a probe.
+//! Robots that hear offers and take none: passed over for a while, then out of dispatch until they take a probe.
 //!
-//! 1. An offer counts only if a later heartbeat of its session has applied it and lists no answer: the robot heard it.
-//! 2. Each such offer doubles the time in which the robot gets no other; an answer ends that.
-//! 3. Three within ten minutes open a breaker. After ten minutes it gets one offer; an answer closes the breaker, silence opens it anew.
+//! 1. An offer is missed only if a later heartbeat of its session has applied it and lists no answer: the robot heard it.
+//! 2. Each offer that is missed or refused doubles the time in which the robot gets no other; one that it takes ends that. A refusal for what
+//!    the task asks for is an answer.
+//! 3. Three that were missed within ten minutes, or five that were refused in a row, open a breaker. After ten minutes the robot gets one
+//!    offer; if it takes that, the breaker closes, else it opens anew.
 //! 4. When many robots miss an offer at once, none is to blame: one incident names the server and its network.
 //!
 //! Called by `repair` and `inbox` for what robots say, and by `screen`. Robots that are not heard are no matter of this room.
@@ -14,6 +16,7 @@ use crate::ids::RobotId;
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::time::{LinkDuration, LinkTime, Now};
+use crate::work::AttemptReport;
 use std::collections::BTreeMap;
 
 /// What is remembered of offers that were not answered. Volatile.
@@ -43,6 +46,28 @@ pub fn missed(tx: &mut Tx, robot_id: &RobotId) {
     count(tx, robot_id);
 }
 
+/// A robot refused an offer. For what the task asks for, which is the task's matter, or for its own sake: then it is passed over, so that it
+/// uses up no patience of tasks that others could take.
+pub fn refused(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
+    let code = report.refusal.as_ref().map(|why| why.code);
+    if code == Some(Code::UnsupportedAction) {
+        return answered(tx, robot_id);
+    }
+    let in_row = tx.view.answers.backed_off.get(robot_id).map_or(1, |(n, _)| n.saturating_add(1));
+    back_off(tx, robot_id, in_row);
+    if in_row >= limits::REFUSALS_IN_ROW {
+        let why = code.map_or_else(|| "none given".to_owned(), |code| code.to_string());
+        break_off(tx, robot_id, Reason::from(Code::RobotDoesNotAnswer).with("refusal", why));
+    }
+}
+
+fn break_off(tx: &mut Tx, robot_id: &RobotId, reason: Reason) {
+    let since = Some(tx.now.utc);
+    let broken = RobotControl { unanswered_since: since, unanswered: Vec::new(), ..control(tx, robot_id) };
+    tx.put(broken, "robot.broken_off");
+    incidents::open_about(tx, reason, Some(robot_id), "");
+}
+
 /// Whether so many of a fleet missed an offer at once that the robots cannot be to blame. One alone is never many.
 fn are_many(missed: usize, robots: usize) -> bool {
     missed > limits::UNANSWERED_ROBOTS_MAX || (missed > 1 && missed * 1000 > robots * limits::UNANSWERED_PERMILLE_MAX)
@@ -64,13 +89,11 @@ fn count(tx: &mut Tx, robot_id: &RobotId) {
     let (mut control, now) = (control(tx, robot_id), tx.now.utc);
     control.unanswered.retain(|at| now.ms_since(*at) <= limits::BREAKER_WINDOW.as_ms());
     control.unanswered.push(now);
-    if control.unanswered_since.is_some() || control.unanswered.len() >= limits::BREAKER_FAILURES {
-        control.unanswered_since = Some(now);
-        control.unanswered.clear();
-        let reason = Reason::from(Code::RobotDoesNotAnswer);
-        incidents::open_about(tx, reason, Some(robot_id), "");
-    }
+    let is_broken = control.unanswered_since.is_some() || control.unanswered.len() >= limits::BREAKER_FAILURES;
     tx.put(control, "robot.missed_offer");
+    if is_broken {
+        break_off(tx, robot_id, Code::RobotDoesNotAnswer.into());
+    }
 }
 
 /// Takes back what was counted a moment ago.
@@ -86,7 +109,7 @@ fn excuse(tx: &mut Tx, robot_id: &RobotId) {
     }
 }
 
-/// The robot answered an offer, with whatever.
+/// The robot took an offer, or refused it for what the task asks for.
 pub fn answered(tx: &mut Tx, robot_id: &RobotId) {
     tx.view.answers.missed.remove(robot_id);
     tx.view.answers.backed_off.remove(robot_id);

@@ -4,6 +4,7 @@ use super::standing::{self, WAITS_FOR};
 use super::view::View;
 use super::{Board, screen, way};
 use crate::ids::{RobotId, TaskId};
+use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::task::{Phase, TaskState};
 use crate::time::Now;
@@ -51,10 +52,9 @@ pub fn task(view: &View, board: &Board, now: &Now, task_id: &TaskId) -> Option<T
         .and_then(|g| view.site.find(g));
     let mut candidates = Vec::new();
     let mut filtered = BTreeMap::new();
-    for session in view.sessions.values().filter(|_| waits) {
-        let robot_id = &session.row.robot_id;
-        let pair = screen::pair(view, board, robot_id, task, intake);
-        let reason = pair.and_then(|()| screen::robot(view, board, robot_id, now)).err();
+    let robots = waits.then(|| screened(view, board, now));
+    for (robot_id, against) in robots.into_iter().flatten() {
+        let reason = screen::pair(view, board, robot_id, task, intake).err().or_else(|| against.clone());
         if let Some(reason) = &reason {
             *filtered.entry(reason.code).or_default() += 1;
         }
@@ -70,12 +70,28 @@ pub fn task(view: &View, board: &Board, now: &Now, task_id: &TaskId) -> Option<T
         ))
     });
     let eligible = candidates.iter().any(|c| c.reason.is_none());
+    let awaited = match &intake.spec.robot_id {
+        Some(pinned) => candidates.iter().find(|c| c.robot_id == *pinned).map_or_else(|| absent(pinned), awaited),
+        None => candidates.first().map_or_else(|| "a robot: none has connected".to_owned(), awaited),
+    };
     candidates.truncate(CANDIDATES_MAX);
     let code = if eligible { Code::WaitingInQueue } else { Code::WaitingForRobot };
-    let turn = || waits_for_turn(view, task_id, now, code).with(WAITS_FOR, nearest(&candidates));
+    let turn = || waits_for_turn(view, task_id, now, code).with(WAITS_FOR, awaited);
     let verdict = standing::of_task(view, board, now, task, intake).or_else(|| waits.then(turn));
     let verdict = verdict.or_else(|| task.reason.clone());
     Some(TaskExplanation { position, verdict, candidates, filtered })
+}
+
+/// Why each robot with a session gets no work, looked at once for all explanations of a turn.
+fn screened<'v>(view: &'v View, board: &Board, now: &Now) -> &'v BTreeMap<RobotId, Option<Reason>> {
+    let against = |robot_id: &RobotId| screen::robot(view, board, robot_id, now).err();
+    let robots = || view.sessions.values().map(|session| session.row.robot_id.clone());
+    view.screened.get_or_init(|| robots().map(|robot_id| (robot_id.clone(), against(&robot_id))).collect())
+}
+
+/// Questions that one turn answers where there are so many robots: at least one, however many.
+pub fn per_turn(robots: usize) -> usize {
+    (limits::ROBOTS_ASKED_PER_TURN / robots.max(1)).max(1)
 }
 
 /// How a task ended.
@@ -91,12 +107,15 @@ pub fn unknown(reason: Reason) -> TaskExplanation {
 }
 
 /// The robot that a task waits for, and what keeps that one.
-fn nearest(candidates: &[RobotCandidate]) -> String {
-    match candidates.first() {
-        Some(RobotCandidate { robot_id, reason: Some(why), .. }) => format!("robot {robot_id}: {}", why.code),
-        Some(candidate) => format!("robot {}", candidate.robot_id),
-        None => "a robot: none has connected".to_owned(),
+fn awaited(candidate: &RobotCandidate) -> String {
+    match candidate {
+        RobotCandidate { robot_id, reason: Some(why), .. } => format!("robot {robot_id}: {}", why.code),
+        candidate => format!("robot {}", candidate.robot_id),
     }
+}
+
+fn absent(robot_id: &RobotId) -> String {
+    format!("robot {robot_id}: it has not connected")
 }
 
 /// Why a ready task waits, since when, and what waiting has brought it.

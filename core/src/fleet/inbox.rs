@@ -41,7 +41,9 @@ pub fn take(tx: &mut Tx, entry: &InboxEntry, tally: &mut Tally) {
 pub fn attempt(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, tally: &mut Tally) {
     let id = &report.attempt;
     let is_offer = tx.view.attempt(id).is_some_and(|a| a.accepted.is_none() && a.robot_id == *robot_id);
-    if is_offer && report.state != WorkState::Aborted {
+    if is_offer && report.state == WorkState::Refused {
+        answers::refused(tx, robot_id, report);
+    } else if is_offer && report.state != WorkState::Aborted {
         answers::answered(tx, robot_id);
     }
     if let Some(why) = plausible::judge(tx.view, id, robot_id, report.state, report.step_index) {

@@ -361,6 +361,7 @@ pub enum Pace {
 /// One cycle over a view that has absorbed the whole feed. Items of earlier decisions of the cycle are already in `plan`. Each stage does as
 /// much as a slice holds, and leaves the rest for the next turn: then the report says `more`.
 pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Plan) {
+    view.screened.take();
     refused::open_incidents(view, now, plan);
     refused::try_again(view);
     welcome(view, now, board, plan);

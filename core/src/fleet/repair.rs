@@ -183,6 +183,13 @@ fn attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
             let report = report(l.state);
             happen(tx, task_id, News { event: Event::SeenRunning, why: None, report: Some(&report) });
         }
+        // The event that told of it was lost for good: what a robot says only adds.
+        Some(l) if l.step_index > a.step_index || (l.opened && !a.opened) => {
+            let Some(task_id) = id.subject.task_id() else { return };
+            tally.repaired += 1;
+            let report = report(l.state);
+            happen(tx, task_id, News { event: Event::Progress, why: None, report: Some(&report) });
+        }
         Some(_) => {}
     }
 }

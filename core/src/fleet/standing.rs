@@ -97,7 +97,7 @@ pub fn of_attempt(view: &View, board: &Board, now: &Now, a: &Attempt) -> Option<
     match (a.phase, listed) {
         (AttemptPhase::Offered, _) => Some(Reason::from(Code::WaitingForAnswer).with(WAITS_FOR, robot)),
         (AttemptPhase::Stopping, _) => Some(Reason::from(Code::WaitingForStop).with(WAITS_FOR, robot)),
-        (phase, _) if phase.is_terminal() => Some(Reason::from(Code::Forced).with(WAITS_FOR, robot)),
+        (phase, _) if phase.is_terminal() => Some(let_go(view, a).with(WAITS_FOR, robot)),
         // The heartbeat is older than what the robot said since as events, of which the row knows.
         (_, None) if !heard::is_fresh(view, live) => Some(works(view, now, a, live, a.step_index)),
         (_, None) => Some(Reason::from(Code::RobotReconciling).with(WAITS_FOR, robot)),
@@ -106,10 +106,18 @@ pub fn of_attempt(view: &View, board: &Board, now: &Now, a: &Attempt) -> Option<
     }
 }
 
+/// Why the record has let an attempt go that its robot may still have.
+fn let_go(view: &View, a: &Attempt) -> Reason {
+    let task = a.attempt.subject.task_id().and_then(|id| view.task(id));
+    let newest = task.filter(|task| task.attempt_id().as_ref() == Some(&a.attempt));
+    newest.and_then(|task| task.reason.clone()).unwrap_or_else(|| Code::Forced.into())
+}
+
 /// The robot works on this step of the attempt.
 fn works(view: &View, now: &Now, a: &Attempt, live: &Live, step: u32) -> Reason {
     let robot_id = &a.robot_id;
     let since = Utc(now.utc.0 - i64::try_from(now.site.since(live.progress_at).as_ms()).unwrap_or(0));
+    let since = a.accepted.map_or(since, |accepted| since.max(accepted));
     let steps = a.attempt.subject.task_id().and_then(|id| view.intake(id)).map(|i| i.spec.steps.len());
     let told = format!("{robot_id} works on step {step} of the attempt since {}.", since.rfc3339());
     let reason = Reason::new(Code::WorksOnStep, told).with("robot_id", robot_id).with("step", step);
@@ -124,7 +132,14 @@ fn unknown(a: &Attempt, live: Option<&std::sync::Arc<Live>>) -> Option<Reason> {
     let (what, way_out) = match uncertain.cause.code {
         Code::ReportImplausible => (
             format!("a person at robot {robot_id}"),
-            "It is known again once the robot reports what can be; else answer with `midshift task resolve`.",
+            match a.attempt.subject.task_id() {
+                Some(_) => {
+                    "It is known again once the robot reports what can be; else answer with `midshift task resolve`."
+                }
+                None => {
+                    "It is known again once the robot reports what can be; else look at its software and start it anew."
+                }
+            },
         ),
         Code::ManualMode if is_manual => (
             format!("a person at robot {robot_id}"),

@@ -9,10 +9,14 @@ use crate::stop::{Scope, Stop};
 use crate::work::Live;
 use std::collections::BTreeSet;
 
-/// Stops that stand robots, as they were copied.
+/// Stops that are engaged, as they were copied. What was reset is not looked at.
+pub(super) fn engaged(view: &View) -> impl Iterator<Item = &Stop> {
+    view.engaged.iter().filter_map(|id| view.stops.get(id)).map(|record| &record.row.stop)
+}
+
+/// Those that stand robots.
 fn standing(view: &View) -> impl Iterator<Item = &Stop> {
-    let effective = view.stops.values().map(|s| &s.row).filter(|record| record.is_effective());
-    effective.map(|record| &record.stop).filter(|stop| stop.level >= StopLevel::Halt)
+    engaged(view).filter(|stop| stop.level >= StopLevel::Halt)
 }
 
 /// Of these, whom a robot lies inside of.

@@ -5,7 +5,7 @@
 
 use super::inbox::{holds_changed, touch};
 use super::rows::{HoldToken, RobotControl};
-use super::stopped::over;
+use super::stopped::{self, over};
 use super::view::View;
 use super::{Board, Plan, Tx, heard, incidents};
 use crate::ids::{RobotId, StopId};
@@ -72,12 +72,11 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
 
 /// Opens one incident for each stop by which the stop service says that it began without its memory.
 fn open_incidents(view: &mut View, now: Now, plan: &mut Plan) {
-    let effective = view.stops.values().map(|s| &s.row).filter(|record| record.is_effective());
     let is_told = |stop_id: &StopId| {
         let told = view.incidents.values().map(|i| &i.row.reason).filter(|reason| reason.code == Code::StopMemoryLost);
         told.filter_map(|reason| reason.metadata.get("stop_id")).any(|told| *told == stop_id.as_str())
     };
-    let lost = effective.map(|record| &record.stop).filter(|stop| is_memory_lost(&stop.stop_id));
+    let lost = stopped::engaged(view).filter(|stop| is_memory_lost(&stop.stop_id));
     let lost: Vec<Reason> = lost
         .filter(|stop| !is_told(&stop.stop_id))
         .map(|stop| Reason::new(Code::StopMemoryLost, stop.reason.clone()).with("stop_id", &stop.stop_id))

@@ -64,12 +64,19 @@ fn facts(tx: &Tx, task: &TaskState, intake: &TaskIntake, attempt: Option<&Attemp
         drops_left: task.failures < intake.spec.retry.max_retry_times.max(limits::DROPS_TOLERATED),
         opened,
         begun_repeatable: begun.into_iter().all(|s| s.effect == Effect::Repeatable),
-        refusals_spent: task.refusals_in_row + 1 >= limits::REFUSALS_IN_ROW,
+        refusals_spent: task.refusals_in_row + 1 >= limits::REFUSALS_IN_ROW && are_enough(tx, task),
         refused_by_all: semantic_refusal && refusers >= tx.view.sessions.len(),
         semantic: news.report.and_then(|r| r.fault.as_ref()).is_some_and(|f| f.class == FaultClass::Semantic),
         held: is_held(tx, task),
         accepted: attempt.is_some_and(|a| a.accepted.is_some()),
     }
+}
+
+/// Whether so many different robots have refused it, with the one that does now, that a person is asked: five, or all where there are fewer. One
+/// robot alone must not send the work of others to people.
+fn are_enough(tx: &Tx, task: &TaskState) -> bool {
+    let last = task.robot_id.iter().filter(|robot_id| !task.refusers.contains(*robot_id)).count();
+    task.refusers.len() + last >= tx.view.sessions.len().min(limits::REFUSALS_IN_ROW as usize)
 }
 
 /// Whether a token of the task or of its robot stands.
@@ -100,7 +107,7 @@ fn move_attempt(tx: &mut Tx, mut a: Attempt, step: Next, news: &News, intake: &T
         a.refusal = report.refusal.clone().or(a.refusal);
     }
     let live = matches!(news.event, Event::Accepted | Event::Progress | Event::SeenRunning);
-    if live && a.accepted.is_none() {
+    if live && a.accepted.is_none() && !a.phase.is_terminal() {
         a.accepted = Some(tx.now.utc);
         disarm(tx, TimerKind::OfferAck, &a.attempt);
         arm(tx, TimerKind::StartToClose, &a.attempt, intake.spec.timeout_ms);
@@ -319,6 +326,7 @@ fn move_task(tx: &mut Tx, mut t: TaskState, a: Option<&Attempt>, step: Next, new
 fn count_end(t: &mut TaskState, a: &Attempt, news: &News, step: Next) {
     if a.phase == AttemptPhase::Refused {
         t.refusals_in_row += 1;
+        t.refusers.insert(a.robot_id.clone());
         let code = a.refusal.as_ref().map(|r| r.code);
         if code == Some(Code::UnsupportedAction) {
             t.semantic_refusers.insert(a.robot_id.clone());
@@ -326,6 +334,7 @@ fn count_end(t: &mut TaskState, a: &Attempt, news: &News, step: Next) {
         return;
     }
     t.refusals_in_row = 0;
+    t.refusers.clear();
     let failed = matches!(news.event, Event::FailedRecoverable | Event::FailedFinal) || step.phase == Phase::RetryWait;
     if failed && a.accepted.is_some() {
         t.failures += 1;
@@ -373,6 +382,7 @@ fn entered(tx: &mut Tx, t: &mut TaskState, was: Phase, news: &News, intake: &Tas
             if was == Phase::NeedsOperator {
                 t.failures = 0;
                 t.refusals_in_row = 0;
+                t.refusers.clear();
                 t.semantic_refusers.clear();
                 t.failed_robots.clear();
             }

@@ -17,6 +17,7 @@ use crate::maintenance::{DrainRelease, DrainRequest};
 use crate::picture::{Picture, Viewed};
 pub use crate::picture::{Rowed, Slot};
 use crate::policy::AreaPolicy;
+use crate::reason::Reason;
 use crate::rows::{BadRow, Key, Part, Revision, Row, Seq, Table, Writer};
 use crate::site::Site;
 use crate::site::route::{Blocked, Router};
@@ -119,6 +120,8 @@ pub struct View {
     pub lane_marks: Slot<LaneMark>,
     /// Copies of fleet stops (stop's).
     pub stops: Slot<StopRecord>,
+    /// Those of them that are engaged, by the id of their row: copies of what was reset stay for a quarter.
+    pub engaged: BTreeSet<String>,
     /// A stop was engaged or reset since tokens were last put right.
     pub stops_changed: bool,
     /// Places a robot holds: robot → place ids.
@@ -155,6 +158,8 @@ pub struct View {
     pub unknown: BTreeMap<RobotId, (AttemptId, crate::time::LinkTime)>,
     /// Places that no route may lead into now: found once, until a place or a stop changes. Read by [`View::closed`]. Volatile.
     pub closed_places: OnceLock<Blocked>,
+    /// Why each robot gets no work; none: it may. Found at the first explanation of a turn, for all of them. Volatile.
+    pub screened: OnceLock<BTreeMap<RobotId, Option<Reason>>>,
     /// Time in which robots were heard since it was last counted. Volatile.
     pub attached: BTreeMap<RobotId, Attached>,
     /// The newest heartbeat of each robot, as (session epoch, number), that was compared with the rows and needs no second look. Volatile.
@@ -279,9 +284,13 @@ impl Viewed<View> for StopRecord {
     fn slot(view: &mut View) -> &mut Slot<Self> {
         &mut view.stops
     }
-    fn changed(view: &mut View, _id: &str, _old: Option<&Self>) {
+    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
         view.closed_places.take();
         view.stops_changed = true;
+        match view.stops.get(id).is_some_and(|record| record.row.is_effective()) {
+            true => view.engaged.insert(id.to_owned()),
+            false => view.engaged.remove(id),
+        };
     }
 }
 
@@ -468,6 +477,7 @@ impl View {
             presence: Slot::new(),
             lane_marks: Slot::new(),
             stops: Slot::new(),
+            engaged: BTreeSet::new(),
             stops_changed: false,
             held_places: BTreeMap::new(),
             dirty: BTreeSet::new(),
@@ -486,6 +496,7 @@ impl View {
             unexplained: super::unexplained::Unexplained::default(),
             attached: BTreeMap::new(),
             closed_places: OnceLock::new(),
+            screened: OnceLock::new(),
             place_waits: 0,
             compared: BTreeMap::new(),
             behind: None,

@@ -446,7 +446,8 @@ fn needs_operator(at: Standing, event: Event) -> Option<Next> {
     match event {
         Event::Succeeded => go(Phase::Succeeded, Fate::End),
         Event::StopConfirmed => Some(Next { fate: Fate::End, ..stay(at)? }),
-        Event::Deadline | Event::SeenRunning | Event::Hold | Event::LastHoldGone => stay(at),
+        // What its robot goes on to say of steps and of opening is kept: a person's answer depends on it.
+        Event::Deadline | Event::Progress | Event::SeenRunning | Event::Hold | Event::LastHoldGone => stay(at),
         Event::Cancel | Event::CancelForce | Event::ResolveCanceled => go(Phase::Canceled, Fate::Keep),
         Event::ResolveRequeue => go(Phase::Queued, Fate::Keep),
         Event::ResolveSucceeded => go(Phase::Succeeded, Fate::Keep),

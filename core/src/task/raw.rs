@@ -253,6 +253,15 @@ fn check_labels(labels: &BTreeMap<String, String>, field: &str, bad: &mut Violat
     }
 }
 
+/// Lists and objects within each other.
+fn depth(value: &serde_json::Value) -> usize {
+    match value {
+        serde_json::Value::Array(items) => 1 + items.iter().map(depth).max().unwrap_or(0),
+        serde_json::Value::Object(fields) => 1 + fields.values().map(depth).max().unwrap_or(0),
+        _ => 0,
+    }
+}
+
 /// Size of parameters as JSON.
 fn json_bytes(params: &serde_json::Map<String, serde_json::Value>) -> usize {
     serde_json::to_string(params).map_or(usize::MAX, |json| json.len())
@@ -308,6 +317,9 @@ fn check_step(step: &RawStep, at: &str, knows: &dyn Fn(&WaypointId) -> bool, bad
             }
             if json_bytes(params) > limits::PARAMS_BYTES_MAX {
                 bad.add(format!("{at}.action.params"), "must be at most 8 KiB");
+            }
+            if params.values().map(depth).max().unwrap_or(0) > limits::PARAMS_DEPTH_MAX {
+                bad.add(format!("{at}.action.params"), "must have at most 16 lists and objects within each other");
             }
             let effect =
                 if matches!(name.as_str(), "pick" | "place") { Effect::AtMostOnce } else { Effect::CheckFirst };
@@ -417,5 +429,19 @@ mod tests {
                 "spec.coalesce_key"
             ]
         );
+    }
+
+    #[test]
+    fn parameters_that_lie_too_deep_for_readers_are_refused() {
+        let nested = |levels| (0..levels).fold(serde_json::Value::Null, |inner, _| serde_json::json!([inner]));
+        let check = |levels| {
+            let params = serde_json::Map::from_iter([("p".to_owned(), nested(levels))]);
+            let step = RawStep { kind: Some(RawStepKind::Action("inspect".into(), params)), ..RawStep::default() };
+            RawTask { steps: vec![step], ..transport() }.check("spec", &|_| true)
+        };
+        assert!(check(limits::PARAMS_DEPTH_MAX).is_ok());
+        let refusal = check(limits::PARAMS_DEPTH_MAX + 1).expect_err("too deep");
+        let fields: Vec<_> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
+        assert_eq!(fields, ["spec.steps[0].action.params"]);
     }
 }

@@ -69,6 +69,9 @@ pub struct TaskState {
     pub failures: u32,
     /// Offers refused in a row.
     pub refusals_in_row: u32,
+    /// Robots that refused it since it was last taken, at most as many as there are refusals.
+    #[serde(default, skip_serializing_if = "BTreeSet::is_empty")]
+    pub refusers: BTreeSet<RobotId>,
     /// Robots whose attempt failed.
     pub failed_robots: BTreeSet<RobotId>,
     /// Robots that refused it for its content.
@@ -111,6 +114,7 @@ impl TaskState {
             refusals_in_row: 0,
             failed_robots: BTreeSet::new(),
             semantic_refusers: BTreeSet::new(),
+            refusers: BTreeSet::new(),
             queued_since: begins,
             ready_since: intake.spec.depends_on.is_empty().then_some(begins),
             retry_at: None,

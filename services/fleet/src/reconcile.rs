@@ -8,7 +8,7 @@
 
 use crate::{Asked, Look, Parts, Request};
 use midshift_core::fleet::view::{self, View};
-use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, found, objects};
+use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, explain, found, objects};
 use midshift_core::lead::{FleetLeader, Own, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::once;
@@ -104,15 +104,17 @@ pub async fn run(
     this.rebuild_until_read(&shutdown).await;
     let mut batch = Vec::new();
     loop {
+        // Questions that wait for their turn leave others less room.
+        let room = limits::REQUESTS_PER_TURN.saturating_sub(this.looks.len());
         tokio::select! {
             biased;
             () = shutdown.cancelled() => break,
-            n = requests.recv_many(&mut batch, limits::REQUESTS_PER_TURN) => if n == 0 { break },
+            n = requests.recv_many(&mut batch, room), if room > 0 => if n == 0 { break },
             () = tokio::time::sleep_until(this.sweep_due) => {}
-            () = tokio::task::yield_now(), if this.more || this.behind.is_some() || !this.again.is_empty() => {}
+            () = tokio::task::yield_now(), if this.is_not_done() => {}
             changed = news(&mut wake, this.rested) => if changed.is_err() { break },
         }
-        while batch.len() < limits::REQUESTS_PER_TURN
+        while batch.len() < room
             && let Ok(request) = requests.try_recv()
         {
             batch.push(request);
@@ -160,6 +162,11 @@ impl Loop {
                 () = tokio::time::sleep(STORE_RETRY) => {}
             }
         }
+    }
+
+    /// The last turn has left something for the next one, which comes at once.
+    fn is_not_done(&self) -> bool {
+        self.more || self.behind.is_some() || !self.again.is_empty() || !self.looks.is_empty()
     }
 
     /// Reads who leads, and takes over if nobody does.
@@ -318,8 +325,8 @@ impl Loop {
         }
         let is_cut = self.more;
         self.renew_and_commit(renewal, now, plan, replies).await?;
-        self.answer(now);
         self.fit(begun.elapsed(), is_cut);
+        self.answer(now);
         Ok(())
     }
 
@@ -335,9 +342,12 @@ impl Loop {
         self.share = share.clamp(limits::DECISIONS_PER_STAGE_MIN, limits::DECISIONS_PER_STAGE);
     }
 
-    /// Answers every question from the picture, which holds only what is committed at this moment.
+    /// Answers as many questions as a turn has time for from the picture, which holds only what is committed at this moment. What it finds of
+    /// robots on the way serves all of them.
     pub(crate) fn answer(&mut self, now: Now) {
-        for look in std::mem::take(&mut self.looks) {
+        self.view.screened.take();
+        let some = self.looks.len().min(explain::per_turn(self.view.sessions.len()));
+        for look in self.looks.drain(..some) {
             look(&self.view, &self.board, &now);
         }
     }

@@ -1,13 +1,16 @@
 //! What stands without a reason is counted; what has one is not.
 
-use super::Rig;
+use super::{BEGIN, Rig};
 use crate::fleet::rows::Cordon;
 use crate::fleet::view::Rowed;
 use crate::fleet::{Pace, Plan, standing, unexplained};
-use crate::ids::{RobotId, TaskId};
+use crate::ids::{RobotId, StopId, TaskId};
 use crate::reason::{Code, Reason};
-use crate::robot::WorkState;
-use crate::rows::Revision;
+use crate::robot::{StopLevel, WorkState};
+use crate::rows::{Record, Revision, Row};
+use crate::stop::Scope;
+use crate::stop::latch::{Reset, Stop};
+use crate::stop::record::StopRecord;
 use crate::task::AttemptPhase;
 
 /// What is counted in so many seconds in which nobody plans.
@@ -84,4 +87,56 @@ fn a_robot_at_the_end_of_its_released_route_that_waits_for_no_place_has_no_reaso
     assert_eq!(rig.why(&task_id), None);
     rig.says(&robot_id, &id, WorkState::Executing, 0, 1_000);
     assert_eq!(rig.why(&task_id).map(|why| why.code), Some(Code::WorksOnStep));
+}
+
+#[test]
+fn what_a_turn_found_of_robots_serves_all_its_explanations_and_none_of_the_next() {
+    let mut rig = Rig::new();
+    rig.robot("r1", "park-a");
+    for id in ["T1", "T2"] {
+        rig.submit(id, |raw| raw.not_before = Some(BEGIN.plus_ms(3_600_000)));
+    }
+    rig.cycle(Pace::Sweep);
+    let against = |rig: &Rig, id: &str| {
+        let told = crate::fleet::explain::task(&rig.view, &rig.board, &rig.now, &rig.task(id).task_id);
+        told.expect("a task").candidates[0].reason.as_ref().map(|reason| reason.code)
+    };
+    assert_eq!(against(&rig, "T1"), None);
+    let mut control = rig.view.control["r1"].row.clone();
+    control.cordon = Some(Cordon { reason: "a wheel".into(), actor: "me".into(), since: rig.now.utc });
+    rig.view.control.insert("r1".into(), Rowed { revision: Revision(9), row: control });
+    assert_eq!(against(&rig, "T2"), None, "the robot is not looked at again");
+    rig.cycle(Pace::Wake);
+    assert_eq!(against(&rig, "T2"), Some(Code::RobotCordoned));
+}
+
+#[test]
+fn a_turn_answers_fewer_questions_the_more_robots_there_are_and_one_at_least() {
+    use crate::fleet::explain::per_turn;
+    assert!(per_turn(0) >= crate::limits::REQUESTS_PER_TURN && per_turn(50) >= crate::limits::REQUESTS_PER_TURN);
+    assert_eq!((per_turn(1_000), per_turn(1_000_000)), (4, 1));
+}
+
+#[test]
+fn a_stop_that_was_reset_is_not_looked_at_again() {
+    let mut rig = Rig::new();
+    let stop_id = StopId::parse("STOP-1").expect("an id");
+    let stop = Stop {
+        stop_id: stop_id.clone(),
+        scope: Scope::Fleet,
+        level: StopLevel::Halt,
+        engaged: rig.now.utc,
+        actor: "me".into(),
+        reason: String::new(),
+        region: None,
+        proof: Vec::new(),
+    };
+    let mut record = StopRecord { stop, reset: None };
+    rig.absorb(&record);
+    assert_eq!(rig.view.engaged.len(), 1);
+    let reason = "all clear".to_owned();
+    record.reset = Some(Reset { stop_id, at: rig.now.utc, actor: "me".into(), reason, proof: Vec::new() });
+    let row = Row { key: record.key(), revision: Revision(2), index: record.index(), body: record.body() };
+    rig.view.absorb(&row.key, row.revision, Some(&row)).expect("a row of ours");
+    assert_eq!((rig.view.engaged.len(), rig.view.stops.len()), (0, 1));
 }

@@ -1,6 +1,6 @@
 //! An offer, its answers and its end.
 
-use crate::harness::{Answer, World};
+use crate::harness::{Answer, Seen, World};
 use midshift_core::fleet::rows::HolderState;
 use midshift_core::reason::Code;
 use midshift_core::site::CORRIDOR;
@@ -210,5 +210,40 @@ async fn many_that_do_not_answer_at_once_blame_the_network_and_no_robot() {
         w.r(name).answer = Answer::Accept;
     }
     w.until("each robot works", |s| (0..6).all(|n| s.phase(&format!("T{n}")) != Phase::Queued)).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_refuses_every_offer_keeps_no_task_from_the_others() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.robot("r2", "park-b").await;
+    w.r("r1").answer = Answer::Refuse(Code::RobotFault);
+    let tasks: Vec<String> = (0..8).map(|n| format!("T{n}")).collect();
+    for id in &tasks {
+        w.submit(id, "A", "B").await;
+    }
+    w.until("all are done", |s| tasks.iter().all(|id| s.phase(id) == Phase::Succeeded)).await;
+    w.pass(60).await;
+    let seen = w.seen().await;
+    let offered: u64 = tasks.iter().map(|id| seen.task(id).epoch - 1).sum();
+    assert!((1..=6).contains(&offered), "{offered} offers were refused");
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_has_refused_five_offers_in_a_row_is_an_incident_until_it_takes_one() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").answer = Answer::Refuse(Code::AnotherHolder);
+    for id in ["T1", "T2", "T3"] {
+        w.submit(id, "A", "B").await;
+    }
+    w.until("a person is told", |s| !s.open_incidents("ROBOT_DOES_NOT_ANSWER").is_empty()).await;
+    let asked = |s: &Seen| ["T1", "T2", "T3"].iter().filter(|id| s.phase(id) == Phase::NeedsOperator).count();
+    w.pass_while(300, "the others wait", |s| asked(s) <= 1).await;
+    w.r("r1").answer = Answer::Accept;
+    let taken = |s: &Seen| s.phase("T3") == Phase::Succeeded && s.open_incidents("ROBOT_DOES_NOT_ANSWER").is_empty();
+    w.until("it takes its probe", taken).await;
     w.lawful().await;
 }

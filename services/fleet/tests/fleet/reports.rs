@@ -117,3 +117,15 @@ async fn a_load_that_the_heartbeat_alone_tells_binds_its_task() {
     assert_eq!(seen.task("T1").opened.map(|r| r.to_string()).as_deref(), Some("r1"));
     w.lawful().await;
 }
+
+#[tokio::test(start_paused = true)]
+async fn a_step_that_the_heartbeat_alone_tells_as_opened_keeps_the_task_from_a_second_robot() {
+    let (mut w, attempt) = at_the_pick().await;
+    w.robot("r2", "park-b").await;
+    w.r("r1").lists_alone(&attempt, 2, true);
+    w.until("it is kept", |s| s.attempt("T1").opened && s.attempt("T1").step_index == 2).await;
+    w.r("r1").forgets_its_work();
+    let seen = w.until_phase("T1", Phase::NeedsOperator).await;
+    assert_eq!(seen.task("T1").opened.map(|r| r.to_string()).as_deref(), Some("r1"), "nobody else gets it");
+    w.lawful().await;
+}

@@ -2,6 +2,7 @@
 
 use super::client::{Call, Change, Exit, ended, follow, unary};
 use super::enrol::{self, Machine};
+use super::explain::verdict;
 use super::out::{Format, Out, plain};
 use super::rollout;
 use clap::Subcommand;
@@ -492,10 +493,7 @@ async fn explain(one: &One, out: &Out) -> Result<(), Exit> {
     let e = answer.explanation.clone().unwrap_or_default();
     out.one(&answer, &one.robot_id, || {
         let mut text = control_line(&e.control.clone().unwrap_or_default());
-        match &e.verdict {
-            Some(reason) => text += &format!("\n  {}: {}\n", reason.code, plain(&reason.message)),
-            None => text += "\n  nothing keeps it from work\n",
-        }
+        text += &verdict(e.verdict.as_ref(), "nothing keeps it from work");
         let rows: Vec<Vec<String>> = e
             .candidates
             .iter()

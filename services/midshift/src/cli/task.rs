@@ -3,6 +3,7 @@
 mod many;
 
 use super::client::{self, Call, Change, Exit, unary};
+use super::explain::verdict;
 use super::out::{Format, Out, plain};
 use crate::background::{read_list, request};
 use crate::site_file;
@@ -641,10 +642,7 @@ async fn explain(one: &One, out: &Out) -> Result<(), Exit> {
         if let Some(position) = e.position {
             text += &format!("  number {position} in the queue");
         }
-        match &e.verdict {
-            Some(reason) => text += &format!("\n  {}: {}\n", reason.code, plain(&reason.message)),
-            None => text += "\n  nothing holds it\n",
-        }
+        text += &verdict(e.verdict.as_ref(), "nothing holds it");
         let rows: Vec<Vec<String>> = e
             .candidates
             .iter()

@@ -225,6 +225,12 @@ impl Robot {
             self.tell(&job.attempt, WorkState::StepUnknown, None, None);
         }
     }
+    /// Its next heartbeat says how far it is, and no event does.
+    pub fn lists_alone(&mut self, attempt: &AttemptId, step_index: u32, opened: bool) {
+        for listed in self.attempts.iter_mut().filter(|listed| listed.attempt == *attempt) {
+            (listed.step_index, listed.opened) = (step_index, opened);
+        }
+    }
     /// It restarted and lost everything it knew of its work.
     pub fn forgets_its_work(&mut self) {
         self.job = None;
