@@ -104,7 +104,8 @@ pub fn take_over(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: 
     if place.holder(robot_id).is_some() {
         return;
     }
-    if grant_id != 0 && !place.cleared.contains(&grant_id) && !is_ahead(tx.view, robot_id, &tx.now) {
+    let is_blamed = grant_id != 0 || tx.view.bugs.claims_are_blamed();
+    if is_blamed && !place.cleared.contains(&grant_id) && !is_ahead(tx.view, robot_id, &tx.now) {
         let reason = Reason::from(Code::GrantUnknown).with("place_id", place_id).with("grant_id", grant_id);
         incidents::open_about(tx, reason, Some(robot_id), "place_id");
     }

@@ -100,6 +100,7 @@ pub fn of_attempt(view: &View, board: &Board, now: &Now, a: &Attempt) -> Option<
         (phase, _) if phase.is_terminal() => Some(Reason::from(Code::Forced).with(WAITS_FOR, robot)),
         (_, None) => Some(Reason::from(Code::RobotReconciling).with(WAITS_FOR, robot)),
         (_, Some(listed)) if listed.state == WorkState::Navigating && places::is_out_of_route(view, live, a) => None,
+        (_, Some(_)) if view.bugs.steps_are_not_told() => None,
         (_, Some(listed)) => {
             let since = Utc(now.utc.0 - i64::try_from(now.site.since(live.progress_at).as_ms()).unwrap_or(0));
             let steps = a.attempt.subject.task_id().and_then(|id| view.intake(id)).map(|i| i.spec.steps.len());
