@@ -139,6 +139,8 @@ pub const COMMIT_SLICE_ITEMS: usize = 256;
 pub const COMMIT_SLICE_BYTES: usize = GROUP_COMMIT_BYTES / 4;
 /// Largest generation, epoch or sequence number that is believed: 2^52 unix milliseconds are 142,000 years, and what is made of it fits 64 bits.
 pub const COUNTED_MAX: u64 = 1 << 52;
+/// Largest generation of a robot that the server goes on from: half of what is believed, so that what it gives afterwards can be reported too.
+pub const GENERATION_FOLLOWED_MAX: u64 = COUNTED_MAX / 2;
 /// Points of one route: with the steps of a task it fits an item and a message. A longer task is split by whoever asks for it.
 pub const ROUTE_POINTS_MAX: usize = 2_048;
 /// Robots or tasks let go by one item of a resume: each costs up to 8 rows.
@@ -189,7 +191,7 @@ pub const PLACES_PER_ITEM: usize = 64;
 pub const CLAIMED_PLACES_MAX: usize = 8;
 /// Of these come first whose region, and so many millimetres around it, holds the robot's pose: the longest body and the error of its pose.
 pub const CLAIMED_PLACE_MARGIN_MM: i32 = 3_000;
-/// After a restore the store does not know what it gave since the backup: for so long nothing unknown is held against a robot.
+/// After a restore the store does not know what it gave since the backup: for so long nothing unknown is held against a robot that knows more.
 pub const RESTORED_LATELY: SiteDuration = SiteDuration::from_secs(600);
 /// Places that one robot holds: its end takes them all back in one item, beside its timers and counters.
 pub const PLACES_OF_ROBOT_MAX: usize = 128;

@@ -291,7 +291,7 @@ codes! {
     FreedAfterAck = "FREED_AFTER_ACK", "The robot freed this range after it was acknowledged.";
     Poison = "POISON", "A sample could not be read; it was recorded, acknowledged and skipped.";
     CloneSeen = "CLONE_SEEN", "Two sessions with one robot id were alive at once. Find the second machine.";
-    StoreBehindRobot = "STORE_BEHIND_ROBOT", "A robot knows a newer generation than the store: the store was restored from a backup.";
+    StoreBehindRobot = "STORE_BEHIND_ROBOT", "The robot says that it has applied a newer generation than this store gave: the store was restored from a backup, or the robot errs.";
     TaskBacklog = "TASK_BACKLOG", "Ready tasks wait for a robot for more than an hour. It closes by itself. `midshift task ls --state queued` lists them.";
     RobotBreakerOpened = "ROBOT_BREAKER_OPENED", "A robot failed three attempts in ten minutes.";
     PlaceQuarantined = "PLACE_QUARANTINED", "A place is kept closed until the robot inside reports or a person clears it.";

@@ -406,6 +406,22 @@ pub struct Session {
     pub device_key_changed: bool,
 }
 
+impl Session {
+    /// The generation of section work that the server goes on from: none beyond what any server could have given.
+    pub fn followed_work(&self) -> u64 {
+        followed(self.applied_work)
+    }
+    /// The same of section update.
+    pub fn followed_update(&self) -> u64 {
+        followed(self.applied_update)
+    }
+}
+
+/// What a robot says it has applied, as far as it is believed: whoever followed the largest number could never be answered with it again.
+fn followed(said: u64) -> u64 {
+    if said > crate::limits::GENERATION_FOLLOWED_MAX { 0 } else { said }
+}
+
 impl Record for Session {
     const TABLE: Table = Table::Session;
     fn id(&self) -> String {

@@ -2,6 +2,7 @@
 
 pub mod counted;
 pub mod line;
+pub mod metrics;
 pub mod old_site;
 pub mod player;
 pub mod postgres;

@@ -1,7 +1,7 @@
 //! Long sweeps and golden files: calls of `cargo test` with an environment variable that the tests read.
 //!
 //! Invariant: a sweep that ran no test fails. `MIDSHIFT_SEED` is read by the test that kills programs and by stories, `MIDSHIFT_STORY` by
-//! stories, `MIDSHIFT_SEEDS` and `MIDSHIFT_SEED_FROM` by the simulation, `MIDSHIFT_SPLIT_ROBOTS` by the split stack, `MIDSHIFT_OLD_TASKS` by
+//! stories, `MIDSHIFT_SEEDS` and `MIDSHIFT_SEED_FROM` by the simulation and by players over sockets, `MIDSHIFT_SPLIT_ROBOTS` by the split stack, `MIDSHIFT_OLD_TASKS` by
 //! old sites, `MIDSHIFT_SITES` by the power cuts and kills at calls, `BLESS` by tests with `golden` in their name.
 
 use crate::fetch_tools::Tools;
@@ -26,6 +26,8 @@ pub enum Sweep {
     Simulation,
     /// Robots that behave badly beside honest ones, in the deterministic simulation.
     Players,
+    /// The same over real sockets against real servers.
+    Sockets,
     /// A process of each service of a split stack killed or replaced in turn while 200 robots work and a release goes out to them, and then a bad one; as
     /// often as --seeds says, it draws nothing.
     Split,
@@ -46,10 +48,11 @@ pub const NIGHTLY: [Sweep; 2] = [Sweep::Stories, Sweep::OldSites];
 pub const NIGHTLY_SEEDS: u64 = 4;
 
 impl Sweep {
-    const ALL: [Self; 9] = [
+    const ALL: [Self; 10] = [
         Self::Kills,
         Self::Simulation,
         Self::Players,
+        Self::Sockets,
         Self::Split,
         Self::Updates,
         Self::Latch,
@@ -63,6 +66,7 @@ impl Sweep {
             Self::Kills => 20,
             Self::Simulation => 2_000,
             Self::Players => 5_000,
+            Self::Sockets => 1_000,
             Self::Stops => 100,
             Self::Split | Self::Updates | Self::Latch | Self::OldSites => 1,
             Self::Stories => 2,
@@ -72,7 +76,7 @@ impl Sweep {
     /// Whether what it does comes of seeds.
     const fn draws(self) -> bool {
         match self {
-            Self::Kills | Self::Simulation | Self::Players | Self::Stops | Self::Stories => true,
+            Self::Kills | Self::Simulation | Self::Players | Self::Sockets | Self::Stops | Self::Stories => true,
             Self::Split | Self::Updates | Self::Latch | Self::OldSites => false,
         }
     }
@@ -83,6 +87,7 @@ impl Sweep {
             Self::Stories => each_seed(workspace, "stories", "story::", from, seeds),
             Self::Simulation => simulated(workspace, "many_seeds_keep_every_law", from, seeds),
             Self::Players => simulated(workspace, "played::many_seeds", from, seeds),
+            Self::Sockets => over_sockets(workspace, from, seeds),
             Self::Stops => simulated(workspace, "stopped::in_cuts_and_kills", from, seeds),
             Self::Split => split(workspace, seeds),
             Self::OldSites => counted(test(workspace, "e2e", "old_site::").env("MIDSHIFT_OLD_TASKS", OLD_TASKS)),
@@ -120,6 +125,14 @@ fn every_site(workspace: &Workspace, target: &str, filter: &str) -> Result<bool>
 /// The workspace's one test program of this name.
 fn test(workspace: &Workspace, target: &str, filter: &str) -> Command {
     workspace.cargo(&["test", "--workspace", "--test", target, "--", filter, "--nocapture"])
+}
+
+/// Real programs, seeds beside each other.
+fn over_sockets(workspace: &Workspace, from: u64, seeds: u64) -> Result<bool> {
+    ensure!(parts::build(workspace)?, "the programs do not build");
+    let mut command = test(workspace, "e2e", "played::");
+    workspace.export_programs(&mut command)?;
+    counted(command.env("MIDSHIFT_SEED_FROM", from.to_string()).env("MIDSHIFT_SEEDS", seeds.to_string()))
 }
 
 fn simulated(workspace: &Workspace, filter: &str, from: u64, seeds: u64) -> Result<bool> {

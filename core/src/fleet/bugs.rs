@@ -19,4 +19,10 @@ crate::seeded_bugs! {
     GrantsOneByOne grants_one_by_one;
     /// No task is promoted, however long it waits.
     NobodyIsPromoted nobody_is_promoted;
+    /// Nobody is told of a report that cannot be.
+    DoubtIsKeptQuiet doubt_is_kept_quiet;
+    /// What a robot works on is no reason.
+    StepsAreNotTold steps_are_not_told;
+    /// A robot that stands where nobody sent it is blamed for it, with a grant or without.
+    ClaimsAreBlamed claims_are_blamed;
 }

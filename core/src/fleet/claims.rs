@@ -7,7 +7,7 @@
 //!
 //! Called by `inbox` for events and by `repair` for heartbeats. Invariant: no word of a robot frees the place of another.
 
-use super::rows::{HolderState, Place, PlaceHolder};
+use super::rows::{HolderState, Incident, Place, PlaceHolder};
 use super::view::View;
 use super::{Plan, Tx, inbox, incidents};
 use crate::ids::{PlaceId, RobotId};
@@ -104,7 +104,8 @@ pub fn take_over(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: 
     if place.holder(robot_id).is_some() {
         return;
     }
-    if grant_id != 0 && !place.cleared.contains(&grant_id) && !is_restored_lately(tx.view, &tx.now) {
+    let is_blamed = grant_id != 0 || tx.view.bugs.claims_are_blamed();
+    if is_blamed && !place.cleared.contains(&grant_id) && !is_ahead(tx.view, robot_id, &tx.now) {
         let reason = Reason::from(Code::GrantUnknown).with("place_id", place_id).with("grant_id", grant_id);
         incidents::open_about(tx, reason, Some(robot_id), "place_id");
     }
@@ -116,10 +117,26 @@ pub fn take_over(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: 
     tx.put(place, "place.adopted");
 }
 
-/// The store turned out a moment ago to be older than a robot: it does not know what it gave.
-pub fn is_restored_lately(view: &View, now: &Now) -> bool {
-    let behind = view.incidents.values().map(|i| &i.row).filter(|i| i.reason.code == Code::StoreBehindRobot);
-    behind.into_iter().any(|i| now.utc.ms_since(i.opened) <= limits::RESTORED_LATELY.as_ms())
+/// The robot says that it has applied a newer generation than this store gave: a restore, or an error of the robot. Of the store itself its
+/// word moves nothing but the next number, and that no further than the clock.
+pub fn outran(tx: &mut Tx, robot_id: &RobotId, applied_work: u64, is_followed: bool) {
+    if is_followed {
+        let clock = tx.now.wall.0.max(0).cast_unsigned();
+        tx.view.behind = tx.view.behind.max(Some(applied_work.min(clock)));
+    }
+    let reason = Reason::from(Code::StoreBehindRobot).with("applied_work", applied_work);
+    let reason = if is_followed { reason } else { reason.with("most", limits::GENERATION_FOLLOWED_MAX) };
+    incidents::open_about(tx, reason, Some(robot_id), "");
+}
+
+/// The store turned out a moment ago to be older than this robot: it does not know what it gave it. What one robot says excuses no other:
+/// whatever a store gave and forgot has raised the generation of the robot that has it.
+pub fn is_ahead(view: &View, robot_id: &RobotId, now: &Now) -> bool {
+    let is_it = |i: &Incident| i.reason.code == Code::StoreBehindRobot && i.robot_id.as_ref() == Some(robot_id);
+    let told = view.incidents.values().map(|i| &i.row).filter(|i| is_it(i));
+    let given = view.desired_work.get(robot_id.as_str()).map_or(0, |d| d.row.generation);
+    view.sessions.get(robot_id.as_str()).is_some_and(|s| s.row.followed_work() > given)
+        || told.into_iter().any(|i| now.utc.ms_since(i.opened) <= limits::RESTORED_LATELY.as_ms())
 }
 
 /// A robot is inside of the place now: with more inside than it holds, people are told of each pair that it makes.

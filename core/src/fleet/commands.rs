@@ -83,7 +83,8 @@ pub fn check(
     }
 }
 
-/// An attempt is ignored only while its robot is heard, stands still, lists it as its own, and no row knows it: not right after a restore.
+/// An attempt is ignored only while its robot is heard, stands still, lists it as its own, and no row knows it: not right after it turned out to
+/// know more than a restored store.
 fn may_disown(
     view: &View,
     board: &Board,
@@ -103,8 +104,8 @@ fn may_disown(
         () if !lists => no("the robot does not list this attempt as its own"),
         () if view.held_by(robot_id) == Some(attempt) => no("the server knows this attempt: cancel its task"),
         () if live.report.vitals.speed_mm_s != 0 => no("the robot moves: stop it first"),
-        () if super::claims::is_restored_lately(view, now) => {
-            no("the store was restored a moment ago: robots are still heard out")
+        () if super::claims::is_ahead(view, robot_id, now) => {
+            no("the robot knows more than the store, which was restored: it is still heard out")
         }
         () => Ok(()),
     }

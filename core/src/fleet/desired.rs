@@ -8,7 +8,7 @@ use super::anchor::{anchor, is_worn, next_generation};
 use super::attempts;
 use super::rows::{HolderState, RobotHolder};
 use super::view::{View, held};
-use super::{Board, way};
+use super::{Board, claims, way};
 use crate::authority::Authority;
 use crate::ids::{AttemptId, RobotId};
 use crate::limits;
@@ -62,18 +62,16 @@ pub fn compose(tx: &mut Tx, robot_id: &RobotId, board: &Board, releases: &Releas
         let reason = crate::reason::Reason::from(crate::reason::Code::AssignmentUnlawful).with("attempt", attempt);
         super::incidents::open_about(tx, reason, Some(robot_id), "attempt");
     }
-    let behind = session.applied_work > old.generation;
+    let followed = session.followed_work();
+    let behind = followed > old.generation;
+    if session.applied_work > old.generation {
+        claims::outran(tx, robot_id, session.applied_work, behind);
+    }
     if stands.is_some() && new == old && !behind {
         return;
     }
-    let generation = next_generation(tx.view, robot_id, &tx.now).max(session.applied_work + 1);
+    let generation = next_generation(tx.view, robot_id, &tx.now).max(followed + 1);
     tx.put(DesiredWork { generation, ..new }, "work.desired");
-    if behind {
-        tx.view.behind = tx.view.behind.max(Some(session.applied_work));
-        let reason = crate::reason::Reason::from(crate::reason::Code::StoreBehindRobot)
-            .with("applied_work", session.applied_work);
-        super::incidents::open_about(tx, reason, Some(robot_id), "");
-    }
 }
 
 /// A robot nobody has asked anything of.

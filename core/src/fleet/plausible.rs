@@ -103,7 +103,8 @@ pub fn keeps_back(view: &View, live: &Live) -> Result<(), Reason> {
 
 /// A report of the attempt cannot be: a person is told, and the attempt becomes UNCERTAIN, both once.
 pub fn doubt(tx: &mut Tx, robot_id: &RobotId, id: &AttemptId, why: &Reason) {
-    let is_new = incidents::open_about(tx, why.clone(), Some(robot_id), "attempt");
+    let quiet = tx.view.bugs.doubt_is_kept_quiet();
+    let is_new = quiet || incidents::open_about(tx, why.clone(), Some(robot_id), "attempt");
     let lives = tx.view.attempt(id).is_some_and(|a| a.uncertain.is_none() && !a.phase.is_terminal());
     if !is_new || !lives || tx.view.held_by(robot_id) != Some(id) {
         return;

@@ -102,6 +102,7 @@ pub fn of_attempt(view: &View, board: &Board, now: &Now, a: &Attempt) -> Option<
         (_, None) if !heard::is_fresh(view, live) => Some(works(view, now, a, live, a.step_index)),
         (_, None) => Some(Reason::from(Code::RobotReconciling).with(WAITS_FOR, robot)),
         (_, Some(listed)) if listed.state == WorkState::Navigating && places::is_out_of_route(view, live, a) => None,
+        (_, Some(_)) if view.bugs.steps_are_not_told() => None,
         (_, Some(listed)) => Some(works(view, now, a, live, listed.step_index)),
     }
 }

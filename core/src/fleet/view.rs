@@ -164,7 +164,7 @@ pub struct View {
     pub attached: BTreeMap<RobotId, Attached>,
     /// The newest heartbeat of each robot, as (session epoch, number), that was compared with the rows and needs no second look. Volatile.
     pub compared: BTreeMap<RobotId, (u64, u64)>,
-    /// Highest generation that a robot has applied and this store had not given: it is older than the robots. Volatile.
+    /// Number that the store is to go on above, since a robot has applied a generation that it had not given. Volatile.
     pub behind: Option<u64>,
     /// Entries of the feed whose items the store refused for good: passed over. Volatile.
     pub unusable: BTreeSet<Seq>,

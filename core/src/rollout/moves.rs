@@ -256,7 +256,7 @@ fn order_back(tx: &mut Tx, sign: &dyn Sign, rollout: &Rollout, r: &mut RolloutRo
 
 fn next_generation(view: &View, robot_id: &RobotId, now: &Now) -> u64 {
     let last = view.desired.get(robot_id.as_str()).map_or(0, |d| d.row.generation);
-    let reported = view.sessions.get(robot_id.as_str()).map_or(0, |s| s.row.applied_update);
+    let reported = view.sessions.get(robot_id.as_str()).map_or(0, |s| s.row.followed_update());
     (last.max(reported) + 1).max(now.wall.0.max(0) as u64)
 }
 

@@ -1,7 +1,7 @@
 //! Samples, gaps and events of the lanes. A sample that cannot be read becomes a poison entry: recorded, acknowledged, never looped on.
 
 use super::stop::{names, stop_ids};
-use super::{At, Parse, WireEnum, from_one, id, maybe, need, permille, text, word};
+use super::{At, Parse, WireEnum, counted, from_one, id, maybe, need, permille, text, word};
 use crate::link::v1;
 use crate::session::LaneBatch;
 use midshift_core::ids::PlaceId;
@@ -153,12 +153,13 @@ impl From<&Gap> for v1::Gap {
 impl Parse<(u64, u64, Reason)> for v1::Gap {
     fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<(u64, u64, Reason)> {
         let from_seq = from_one(self.from_seq, at.field("from_seq"), bad);
+        let to_seq = counted(self.to_seq, at.field("to_seq"), bad);
         let reason = need(self.reason, at.field("reason"), bad);
         if self.to_seq < self.from_seq {
             bad.add(at.field("to_seq").to_string(), "must not be below from_seq");
             return None;
         }
-        Some((from_seq?, self.to_seq, reason?))
+        Some((from_seq?, to_seq?, reason?))
     }
 }
 

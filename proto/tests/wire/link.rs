@@ -440,6 +440,17 @@ fn samples_and_gaps_of_a_batch_are_read_in_the_order_of_their_numbers() {
 }
 
 #[test]
+fn a_gap_ends_where_numbers_can_be_counted_on() {
+    let to = |to_seq| {
+        let gap = Gap { lane: Lane::Event, from_seq: 1, to_seq, reason: Code::Overflow.into() };
+        up(&uplink(Lane::Event, vec![InboxItem::Gap(gap)]))
+    };
+    assert!(to(limits::COUNTED_MAX).is_ok());
+    let refusal = to(u64::MAX).expect_err("no number comes after it");
+    assert_eq!(refusal.violations[0].field, "uplink.batches[0].gaps[0].to_seq");
+}
+
+#[test]
 fn a_session_that_breaks_the_shape_hears_every_field() {
     let wrong = v1::Hello {
         inventory: Some(v1::Inventory { capabilities: vec!["Pick up".into()], ..Default::default() }),

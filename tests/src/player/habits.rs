@@ -4,13 +4,13 @@ use super::Player;
 use super::work::report_of;
 use midshift_core::ids::{AttemptId, BundleId, StopId, Subject};
 use midshift_core::limits;
-use midshift_core::reason::Code;
+use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{
     Fault, FaultClass, HardwareStop, HeldPlace, Lane, Load, Mode, Pose, ReportedAttempt, ReportedState, StopLevel,
     WorkState,
 };
 use midshift_core::update::{UpdateEvent, UpdateReport, UpdateState};
-use midshift_core::work::{AttemptReport, PlaceNews, RobotEvent, WorkStats};
+use midshift_core::work::{AttemptReport, PlaceNews, RobotEvent, SampleBody, UNREADABLE_WORK, WorkStats};
 use rand::RngExt;
 use rand::seq::{IndexedRandom, IteratorRandom};
 
@@ -78,8 +78,16 @@ habits! {
     NeverEnds "never ends";
     /// It says that its software changes.
     ClaimsUpdates "claims updates";
+    /// Texts as long as a message takes.
+    EndlessTexts "endless texts";
+    /// STATUS without end, of absurd values.
+    FloodsStatus "floods STATUS";
 }
 
+/// Bytes of a text that is as long as makes sense for nobody: four of them fit a message.
+const TEXT_BYTES: usize = 8_000;
+/// Samples of STATUS at once.
+const FLOOD: usize = 32;
 /// A number that is far from what others say, and believed by the wire.
 const FAR: [u64; 5] = [0, 1, 1 << 20, limits::COUNTED_MAX - 1, limits::COUNTED_MAX];
 
@@ -93,7 +101,7 @@ impl Player {
             }
             Habit::WrongClocks | Habit::LosesNumbers => return,
             Habit::FallsSilent | Habit::Restarts | Habit::StartsTwice => 0.05,
-            Habit::EndlessLists | Habit::ClaimsUpdates => 0.1,
+            Habit::EndlessLists | Habit::ClaimsUpdates | Habit::EndlessTexts | Habit::FloodsStatus => 0.1,
             _ => 0.3,
         };
         if !self.shows(habit, chance) {
@@ -112,13 +120,21 @@ impl Player {
             Habit::Restarts => self.drops = true,
             Habit::WrongGenerations => {
                 let far = |player: &mut Self| FAR.choose(&mut player.rng).copied().unwrap_or(0);
-                (report.applied_work, report.applied_policy) = (far(self), far(self));
-                report.produced.insert(Lane::Event, far(self));
+                // A day beyond what it was given: as if the server had been restored from a backup.
+                let ahead = self.applied + 86_400_000;
+                let is_ahead = self.rng.random_bool(0.5);
+                report.applied_work = if is_ahead { ahead } else { far(self) };
+                (report.applied_policy, report.applied_update) = (far(self), far(self));
+                if self.rng.random_bool(0.5) {
+                    report.produced.insert(Lane::Event, far(self));
+                }
             }
             Habit::Flickers => self.flicker(report),
             Habit::Wanders => self.wander(report),
             Habit::Forgets => report.attempts.clear(),
             Habit::ClaimsUpdates => self.claim_update(report),
+            Habit::EndlessTexts => self.talk_endlessly(report),
+            Habit::FloodsStatus => self.flood(report),
             _ => {}
         }
     }
@@ -308,15 +324,15 @@ impl Player {
                 report.mode = mode;
             }
             1 => {
-                self.produce(Lane::Critical, RobotEvent::HardwareStop(stop));
+                self.alarm(RobotEvent::HardwareStop(stop));
                 report.hardware_stop = stop;
             }
             2 => {
-                self.produce(Lane::Critical, RobotEvent::Fault { fault: fault.clone(), cleared: false });
+                self.alarm(RobotEvent::Fault { fault: fault.clone(), cleared: false });
                 report.fault = Some(fault);
             }
             3 => (report.stop_level, report.field_violation) = (StopLevel::ControlledStopPosture, true),
-            _ => self.produce(Lane::Critical, RobotEvent::BatteryCritical { battery_permille: 0 }),
+            _ => self.alarm(RobotEvent::BatteryCritical { battery_permille: 0 }),
         }
     }
 
@@ -329,6 +345,32 @@ impl Player {
         vitals.odometer_mm = [0, 1, u64::MAX].choose(&mut self.rng).copied().unwrap_or(0);
         let far = [0, i32::MIN, i32::MAX].choose(&mut self.rng).copied().unwrap_or(0);
         vitals.pose = self.rng.random_bool(0.5).then_some(Pose { x_mm: far, y_mm: far, theta_mrad: far });
+    }
+
+    fn talk_endlessly(&mut self, report: &mut ReportedState) {
+        let text = "and so on ".repeat(TEXT_BYTES / 10);
+        match self.rng.random_range(0..4) {
+            0 => report.load = Some(Load { task_id: None, item: text }),
+            1 => report.fault = Some(Fault { message: text, ..self.some_fault() }),
+            2 => {
+                let what = ["offer", UNREADABLE_WORK].choose(&mut self.rng).copied().unwrap_or_default().to_owned();
+                self.event(RobotEvent::StaleAuthority { what, detail: text });
+            }
+            _ => {
+                let Some(attempt) = self.own() else { return };
+                let why = Reason::new(Code::UnsupportedAction, text.clone()).with("said", text);
+                let refused = report_of(&attempt, WorkState::Refused, 0, false);
+                self.event(RobotEvent::Attempt(AttemptReport { refusal: Some(why), ..refused }));
+            }
+        }
+    }
+
+    fn flood(&mut self, report: &mut ReportedState) {
+        for _ in 0..FLOOD {
+            let mut said = report.clone();
+            self.wander(&mut said);
+            self.produce(Lane::Status, SampleBody::Status(said.vitals));
+        }
     }
 
     fn claim_update(&mut self, report: &mut ReportedState) {

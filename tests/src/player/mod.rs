@@ -11,14 +11,17 @@ mod work;
 pub use habits::Habit;
 
 use midshift_core::ids::{PlaceId, RobotId, TaskId, WaypointId};
-use midshift_core::reason::Code;
+use midshift_core::limits;
+use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{HeldPlace, Inventory, Lane, ReportedState, StopLevel, Vitals};
+use midshift_core::site::Site;
 use midshift_core::work::{DesiredWork, Gap, InboxItem, RobotEvent, Sample, SampleBody};
 use midshift_proto::link::v1;
 use midshift_proto::session::{
     ClockSample, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, LanePosition, PROTOCOL_VERSION, Previous, ToRobot,
     Uplink, Welcome,
 };
+use prost::Message;
 use rand::rngs::StdRng;
 use rand::seq::{IndexedRandom, IteratorRandom};
 use rand::{RngExt, SeedableRng};
@@ -27,6 +30,10 @@ use work::Job;
 
 /// Samples that it keeps until they are acknowledged; what comes after is forgotten.
 const KEPT_MAX: usize = 512;
+/// Bytes of samples in one message: a control message takes 64 KiB.
+const MESSAGE_BYTES: usize = 40 * 1024;
+/// Starting places of a site that it may stand on: honest robots begin at the other end.
+const SEATS: usize = 30;
 /// Habits of one seed at most.
 const HABITS_MAX: usize = 5;
 
@@ -41,6 +48,44 @@ pub struct Around {
     pub robots: Vec<RobotId>,
     /// Tasks, its own and those of others.
     pub tasks: Vec<TaskId>,
+}
+
+impl Around {
+    /// Everything of `site`, of one that stands on its last starting place but `number`.
+    pub fn of_site(site: &Site, number: usize, robots: Vec<RobotId>, tasks: Vec<TaskId>) -> Self {
+        let seats = site.starting_places(SEATS);
+        let home = seats.iter().rev().cycle().nth(number).map(|at| site.name_of(*at).clone());
+        Self {
+            waypoints: home.into_iter().chain(site.waypoints().iter().map(|w| w.waypoint_id.clone())).collect(),
+            places: site.places().iter().map(|place| place.place_id.clone()).collect(),
+            robots,
+            tasks,
+        }
+    }
+}
+
+/// How a session of it ended.
+#[derive(Clone, Debug)]
+pub enum End {
+    /// By its own will, or with the network.
+    Own,
+    /// The server said why, in its last message.
+    Closed(Reason),
+    /// A status ended the stream, with the name of a reason; empty: with none.
+    Status(String),
+    /// What the server said cannot be read.
+    Unread(String),
+}
+
+impl End {
+    /// Whether the server gave a reason where it ended the session.
+    pub fn is_told(&self) -> bool {
+        match self {
+            Self::Own | Self::Closed(_) => true,
+            Self::Status(reason) => !reason.is_empty(),
+            Self::Unread(_) => false,
+        }
+    }
 }
 
 /// One such robot.
@@ -62,6 +107,8 @@ pub struct Player {
     echo: Option<ClockSample>,
     state: ReportedState,
     work: Option<DesiredWork>,
+    /// Highest generation of its work that it has applied.
+    applied: u64,
     job: Option<Job>,
     /// What it answers next and when, milliseconds.
     answer_at: Option<u64>,
@@ -76,6 +123,10 @@ pub struct Player {
 }
 
 impl Player {
+    /// The player of this number in the game of `seed`.
+    pub fn of_seed(seed: u64, number: usize, robot_id: RobotId, around: Around) -> Self {
+        Self::new(seed.wrapping_mul(8).wrapping_add(number as u64), robot_id, around)
+    }
     /// What `seed` makes of a robot of this name.
     pub fn new(seed: u64, robot_id: RobotId, around: Around) -> Self {
         let mut rng = StdRng::seed_from_u64(seed ^ 0x706c_6179);
@@ -108,6 +159,7 @@ impl Player {
             echo: None,
             state: ReportedState { vitals, ..ReportedState::default() },
             work: None,
+            applied: 0,
             job: None,
             answer_at: None,
             beat_at: 0,
@@ -143,12 +195,16 @@ impl Player {
         if self.session.is_none() || self.shows(Habit::Restarts, 0.5) {
             self.restart();
         }
+        let mut reported = ReportedState { applied_work: self.applied, ..self.state.clone() };
+        let lasting = |habit: &Habit| !matches!(habit, Habit::FallsSilent | Habit::StartsTwice | Habit::Restarts);
+        for habit in self.habits.clone().into_iter().filter(lasting) {
+            self.misbehave(habit, 0, &mut reported);
+        }
         let position = |(lane, last): (&Lane, &u64)| {
             let first = self.kept.iter().find(|(kept, _)| kept == lane).map_or(last + 1, |(_, sample)| sample.seq);
             (*lane, LanePosition { first_seq: first, next_seq: last + 1 })
         };
         let lanes = self.produced.iter().map(position).collect();
-        let reported = ReportedState { applied_work: 0, ..self.state.clone() };
         let hello = Hello {
             robot_id: self.robot_id.clone(),
             boot_id: format!("boot-{}", self.boots),
@@ -173,10 +229,8 @@ impl Player {
             self.state.attempts.clear();
         }
         if self.boots > 1 && self.rng.random_bool(0.3) {
-            self.ring = format!("{}-{}", self.robot_id, self.rng.random::<u32>());
-            (self.session, self.work) = (None, None);
-            self.produced.clear();
-            self.kept.clear();
+            self.format();
+            (self.session, self.work, self.applied) = (None, None, 0);
         }
     }
     /// The first word of a machine that has its name beside it.
@@ -206,9 +260,12 @@ impl Player {
         let heartbeat = Heartbeat { reported, sent_unix_us: unix_ms.saturating_mul(1_000), clock: None };
         (&FromRobot::Uplink(Uplink { heartbeat: Some(heartbeat), batches: Vec::new() })).into()
     }
-    /// Hears one message at `now_ms` of its own clock. False: the session is over.
-    pub fn hear(&mut self, message: v1::SessionResponse, now_ms: u64) -> bool {
-        let Ok(message) = midshift_proto::parse::<ToRobot, _>(message) else { return false };
+    /// Hears one message at `now_ms` of its own clock. An error: the session is over.
+    ///
+    /// # Errors
+    /// How the server ended it.
+    pub fn hear(&mut self, message: v1::SessionResponse, now_ms: u64) -> Result<(), End> {
+        let message = midshift_proto::parse::<ToRobot, _>(message).map_err(|bad| End::Unread(format!("{bad:?}")))?;
         match message {
             ToRobot::Welcome(welcome) => self.welcomed(welcome),
             ToRobot::Downlink(down) => {
@@ -220,10 +277,10 @@ impl Player {
                     self.asked(work, now_ms);
                 }
             }
-            ToRobot::Close(_) => return false,
+            ToRobot::Close(close) => return Err(End::Closed(close.reason)),
             ToRobot::MoveOver { .. } => self.drops = true,
         }
-        true
+        Ok(())
     }
     fn welcomed(&mut self, welcome: Welcome) {
         self.in_charge = !welcome.observed;
@@ -238,6 +295,17 @@ impl Player {
         self.kept.retain(|(lane, sample)| *lane != ack.lane || sample.seq > ack.seq);
         let last = self.produced.entry(ack.lane).or_default();
         *last = (*last).max(ack.seq);
+        // It has said itself that no number comes any more: it goes on in another ring.
+        if *last >= limits::COUNTED_MAX {
+            self.drops = true;
+            self.format();
+        }
+    }
+    /// Forgets what it has said, in a new ring.
+    fn format(&mut self) {
+        self.ring = format!("{}-{}", self.robot_id, self.rng.random::<u32>());
+        self.produced.clear();
+        self.kept.clear();
     }
     /// Whether it breaks its connection off now.
     pub fn drops(&self) -> bool {
@@ -275,7 +343,7 @@ impl Player {
         let mut report = ReportedState {
             hb: self.hb,
             session_epoch: self.session.as_ref().map_or(1, |(previous, _)| previous.session_epoch),
-            applied_work: self.work.as_ref().map_or(0, |work| work.generation),
+            applied_work: self.applied,
             produced: self.produced.clone(),
             stop_level: StopLevel::None,
             ..self.state.clone()
@@ -290,7 +358,15 @@ impl Player {
     /// What is not acknowledged, from the oldest on, in messages of their size.
     fn batches(&mut self, unix_ms: i64) -> Vec<LaneBatch> {
         let mut batches: Vec<LaneBatch> = Vec::new();
-        let samples: Vec<(Lane, Sample)> = self.kept.iter().take(64).cloned().collect();
+        let mut room = MESSAGE_BYTES;
+        let fits = |sample: &Sample| {
+            let bytes = v1::Sample::from(sample).encoded_len();
+            let fits = bytes <= room;
+            room = room.saturating_sub(bytes);
+            fits
+        };
+        let next = self.kept.iter().take(64).scan(fits, |fits, one| fits(&one.1).then(|| one.clone()));
+        let samples: Vec<(Lane, Sample)> = next.collect();
         for (lane, sample) in samples {
             let robot_unix_ms = self.stamp(unix_ms);
             let item = InboxItem::Sample(Sample { robot_unix_ms, ..sample });
@@ -311,16 +387,17 @@ impl Player {
             let lane = batch.lane;
             if let (InboxItem::Sample(sample), true) = (batch.items.remove(at), self.rng.random_bool(0.5)) {
                 let (seq, reason) = (sample.seq, Code::Overflow.into());
-                batch.items.insert(at, InboxItem::Gap(Gap { lane, from_seq: seq, to_seq: seq, reason }));
-                self.kept.retain(|(kept, sample)| (*kept, sample.seq) != (lane, seq));
+                let to_seq = if self.rng.random_bool(0.05) { limits::COUNTED_MAX } else { seq };
+                batch.items.insert(at, InboxItem::Gap(Gap { lane, from_seq: seq, to_seq, reason }));
+                self.kept.retain(|(kept, sample)| *kept != lane || !(seq..=to_seq).contains(&sample.seq));
             }
         }
     }
     /// Notes something to be said in this lane.
-    fn produce(&mut self, lane: Lane, event: RobotEvent) {
+    fn produce(&mut self, lane: Lane, body: SampleBody) {
         let seq = self.produced.entry(lane).or_default();
         *seq += 1;
-        let sample = Sample { seq: *seq, robot_unix_ms: 0, body: SampleBody::Event(event) };
+        let sample = Sample { seq: *seq, robot_unix_ms: 0, body };
         // What finds no room is never said: its number goes to the next.
         if self.kept.len() < KEPT_MAX {
             self.kept.push_back((lane, sample));
@@ -330,7 +407,10 @@ impl Player {
         self.fresh = true;
     }
     fn event(&mut self, event: RobotEvent) {
-        self.produce(Lane::Event, event);
+        self.produce(Lane::Event, SampleBody::Event(event));
+    }
+    fn alarm(&mut self, event: RobotEvent) {
+        self.produce(Lane::Critical, SampleBody::Event(event));
     }
     /// The time that it writes on something.
     fn stamp(&mut self, unix_ms: i64) -> i64 {

@@ -39,6 +39,7 @@ impl Player {
                 self.holds(&grant.place_id, grant.grant_id, false);
             }
         }
+        self.applied = self.applied.max(work.generation);
         self.wanted(work.assignment.clone(), now_ms);
         self.work = Some(work);
     }

@@ -349,6 +349,14 @@ impl Server {
     pub fn kill(&mut self) -> anyhow::Result<()> {
         self.running.kill()
     }
+    /// Its process id.
+    pub fn id(&self) -> u32 {
+        self.running.id()
+    }
+    /// Whether its process has ended by itself.
+    pub fn has_ended(&mut self) -> anyhow::Result<bool> {
+        self.running.has_ended()
+    }
     /// Its data directory.
     pub fn data(&self) -> PathBuf {
         self.dir.join("data")

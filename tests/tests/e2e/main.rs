@@ -13,6 +13,7 @@ macro_rules! say {
 mod addressed;
 mod anybody;
 mod areas;
+mod arena;
 mod audited;
 mod batches;
 mod begin_and_end;
@@ -40,6 +41,7 @@ mod mid_shift;
 mod minimal_robot;
 mod old_site;
 mod partition;
+mod played;
 mod proxy;
 mod public_address;
 mod restored;

@@ -277,7 +277,7 @@ pub async fn is_ready(address: SocketAddr) -> Option<bool> {
 }
 
 /// A page over HTTP/1.1; none: nobody answers.
-async fn page(address: SocketAddr, path: &str) -> Option<String> {
+pub async fn page(address: SocketAddr, path: &str) -> Option<String> {
     let asked = async {
         let mut wire = way(address).ok()?.wire().await.ok()?;
         let who = token(address).map_or_else(String::new, |token| format!("Authorization: Bearer {token}\r\n"));

@@ -465,6 +465,10 @@ impl Observer {
 
     // --- what the server keeps of STATUS
 
+    /// Whether a robot says what it likes: the gaps that it announces are its own.
+    pub fn is_player(&self, robot_id: &RobotId) -> bool {
+        self.players.contains(robot_id)
+    }
     fn stored(&mut self, frames: &[Frame]) {
         for frame in frames {
             let status = self.status.entry(frame.robot_id.clone()).or_default();

@@ -338,6 +338,48 @@ async fn an_entry_on_a_grant_that_nobody_gave_is_an_incident() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_robot_that_lies_about_its_generation_excuses_no_other_robot() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("liar", "park-a").await;
+    w.robot("r2", "park-b").await;
+    w.pass(5).await;
+    w.r("liar").applied = w.clock.now().wall.0 as u64 + 86_400_000;
+    w.connect("liar").await;
+    w.until("it is noticed", |s| !s.open_incidents("STORE_BEHIND_ROBOT").is_empty()).await;
+    for (robot, place) in [("liar", "charge"), ("r2", "wait-b")] {
+        let place_id = PlaceId::parse(place).expect("a place");
+        w.r(robot).says(RobotEvent::Place { place_id, grant_id: 4_711, news: PlaceNews::Entered });
+    }
+    let attempt = elsewhere();
+    w.r("r2").lists = vec![attempt.clone()];
+    w.pass(3).await;
+    let blamed: Vec<_> = w.seen().await.open_incidents("GRANT_UNKNOWN").into_iter().map(|i| i.robot_id).collect();
+    assert_eq!(blamed, [Some(w.r("r2").id.clone())]);
+    let disown = v1::DisownAttemptRequest {
+        robot_id: "r2".to_owned(),
+        subject: attempt.attempt.subject.to_string(),
+        epoch: attempt.attempt.epoch,
+        reason: "I looked".to_owned(),
+        ..Default::default()
+    };
+    w.fleet.disown_attempt(Request::new(disown)).await.expect("it is no robot that knows more than the store");
+    w.lawful().await;
+}
+
+/// An attempt that nobody gave here.
+fn elsewhere() -> midshift_core::robot::ReportedAttempt {
+    let task_id = midshift_core::ids::TaskId::parse("T-elsewhere").expect("an id");
+    midshift_core::robot::ReportedAttempt {
+        attempt: midshift_core::ids::AttemptId { subject: midshift_core::ids::Subject::Task(task_id), epoch: 3 },
+        state: midshift_core::work::WorkState::Executing,
+        step_index: 1,
+        progress: 1,
+        route_index: 0,
+        opened: false,
+    }
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_robot_that_invents_grants_without_end_opens_a_few_incidents_the_last_of_which_stands_for_the_rest() {
     let mut w = World::on(DEMO).await;
     w.robot("r1", "park-1").await;
@@ -375,15 +417,7 @@ async fn an_attempt_that_the_server_does_not_know_is_an_incident_after_a_minute(
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;
     w.pass(600).await;
-    let subject = midshift_core::ids::Subject::Task(midshift_core::ids::TaskId::parse("T-elsewhere").expect("an id"));
-    w.r("r1").lists = vec![midshift_core::robot::ReportedAttempt {
-        attempt: midshift_core::ids::AttemptId { subject, epoch: 3 },
-        state: midshift_core::work::WorkState::Executing,
-        step_index: 1,
-        progress: 1,
-        route_index: 0,
-        opened: false,
-    }];
+    w.r("r1").lists = vec![elsewhere()];
     w.pass_while(55, "it may be about to let it go", |s| s.open_incidents("ATTEMPT_UNKNOWN").is_empty()).await;
     let seen = w.until("a person is told", |s| !s.open_incidents("ATTEMPT_UNKNOWN").is_empty()).await;
     assert!(seen.work("r1").assignment.is_none());

@@ -141,11 +141,50 @@ async fn a_store_behind_the_robot_raises_its_generation_and_says_so() {
     w.connect("r1").await;
     let seen = w.until("the generation is raised", |s| s.work("r1").generation > ahead).await;
     assert_eq!(seen.incidents(), [Code::StoreBehindRobot]);
-    let head = w.written().await.last().expect("entries").seq.0;
-    assert!(head > ahead, "numbers of the store go on above what the robot has seen");
     w.submit("T1", "A", "B").await;
     w.until_phase("T1", Phase::Succeeded).await;
     assert_eq!(w.seen().await.incidents().len(), 1);
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn numbers_of_a_store_that_is_behind_go_on_above_what_a_robot_has_seen_but_never_beyond_the_clock() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.pass(600).await;
+    let seen = w.clock.now().wall.0 as u64 - 60_000;
+    let head = |entries: Vec<midshift_core::rows::Entry>| entries.last().expect("entries").seq.0;
+    assert!(head(w.written().await) < seen, "numbers do not follow the clock by themselves");
+    w.r("r1").applied = seen;
+    w.connect("r1").await;
+    w.until("the generation is raised", |s| s.work("r1").generation > seen).await;
+    w.submit("T1", "A", "B").await;
+    w.until_phase("T1", Phase::Succeeded).await;
+    assert!(head(w.written().await) > seen);
+    w.r("r1").applied = w.clock.now().wall.0 as u64 + 86_400_000_000;
+    w.connect("r1").await;
+    w.submit("T2", "A", "B").await;
+    w.until_phase("T2", Phase::Succeeded).await;
+    let now = w.clock.now().wall.0 as u64;
+    let head = head(w.written().await);
+    assert!(head < now + 10_000, "{} beyond the clock", head - now);
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_generation_that_no_server_ever_gave_is_told_to_people_and_not_followed() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.pass(2).await;
+    let before = w.seen().await.work("r1").generation;
+    w.r("r1").applied = midshift_core::limits::COUNTED_MAX;
+    w.connect("r1").await;
+    w.submit("T1", "A", "B").await;
+    let seen = w.until("a person is told", |s| !s.open_incidents("STORE_BEHIND_ROBOT").is_empty()).await;
+    assert!(seen.work("r1").generation < before + 86_400_000, "its next machine can say what it has applied");
+    w.r("r1").applied = before;
+    w.connect("r1").await;
+    w.until_phase("T1", Phase::Succeeded).await;
     w.lawful().await;
 }
 
