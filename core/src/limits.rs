@@ -30,8 +30,13 @@ pub const TIMER_GRACE: LinkDuration = LinkDuration::from_secs(10);
 pub const STALL_DEFAULT: SiteDuration = SiteDuration::from_secs(60);
 /// Being ready this long promotes a task by one class; a person is asked if no known robot could ever do it.
 pub const MAX_WAIT: SiteDuration = SiteDuration::from_secs(15 * 60);
-/// A robot that says this long that its own safety system stopped it, that a person drives it or that it has a fault is an incident. Link clock.
+/// A robot that says this long that its own safety system stopped it, that a person drives it or that it has a fault, or whose breaker is open
+/// this long, is an incident, unless the rules of its area say another time. Link clock.
 pub const LASTS_BEFORE_INCIDENT: LinkDuration = LinkDuration::from_secs(60);
+/// What the rules of an area may say instead, milliseconds: a second, up to a day.
+pub const INCIDENT_AFTER_MS: std::ops::RangeInclusive<u64> = 1_000..=24 * 3_600_000;
+/// What a robot says is kept anew after this long for people who ask before it is heard again: some hundred rows a day and robot.
+pub const LAST_HEARD_EVERY: LinkDuration = LinkDuration::from_secs(300);
 /// What stands this long without a reason that anybody could tell is counted as unexplained. Link clock.
 pub const UNEXPLAINED_AFTER: LinkDuration = LinkDuration::from_secs(10);
 /// Robots, and as many tasks, that are looked at for that in one sweep: a few filters each, well below a millisecond.

@@ -1,6 +1,7 @@
 //! Live rules of one area: speed, distance to people and things, charging. Put by a person, pushed to the robots in it.
 
 use crate::ids::AreaId;
+use crate::limits;
 use crate::reason::Violations;
 use crate::rows::{Record, Table};
 use crate::time::Utc;
@@ -130,9 +131,16 @@ pub struct AreaPolicy {
     /// No people walk here, as its site says: a robot bears the silence of the stop service longer. Set by fleet for robots; no person puts it.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub without_people: bool,
+    /// Milliseconds of link time after which what a robot says of itself, and an open breaker, is an incident: see [`crate::fleet::lasting`].
+    #[serde(default = "incident_after_ms")]
+    pub incident_after_ms: u64,
     /// What roll-outs of software must keep to.
     #[serde(default)]
     pub software: SoftwareRules,
+}
+
+const fn incident_after_ms() -> u64 {
+    limits::LASTS_BEFORE_INCIDENT.as_ms()
 }
 
 impl AreaPolicy {
@@ -147,6 +155,7 @@ impl AreaPolicy {
             charge_stop_permille: 900,
             charge_preemptible_permille: 350,
             without_people: false,
+            incident_after_ms: incident_after_ms(),
             software: SoftwareRules::default(),
         }
     }
@@ -172,6 +181,9 @@ impl AreaPolicy {
                     format!("must be {least}..1000 permille (mandatory <= preemptible <= opportunistic <= stop)"),
                 );
             }
+        }
+        if !limits::INCIDENT_AFTER_MS.contains(&self.incident_after_ms) {
+            violations.add(format!("{field}.incident_after"), "must be 1 s to 24 h");
         }
         self.software.check(&format!("{field}.software"), violations);
     }

@@ -319,6 +319,32 @@ impl ReportedState {
         let moved = |sum: u64, a: &ReportedAttempt| sum.wrapping_add(a.progress).wrapping_add(u64::from(a.step_index));
         self.attempts.iter().fold(self.vitals.odometer_mm, moved)
     }
+
+    /// What keeps it from work by its own word, in words, the gravest first: a fault, its own stop, a fleet stop, who drives, a missing
+    /// resume.
+    pub fn conditions(&self) -> Vec<String> {
+        let fault = self.fault.as_ref().map(|fault| format!("fault {}", fault.code));
+        let own_stop = match self.hardware_stop {
+            HardwareStop::None => None,
+            HardwareStop::Manual => Some("own stop manual"),
+            HardwareStop::AutoAck => Some("own stop auto-ack"),
+            HardwareStop::Remote => Some("own stop remote"),
+        };
+        let stop = match self.stop_level {
+            StopLevel::None => None,
+            StopLevel::Slow => Some("stop slow"),
+            StopLevel::Halt => Some("stop halt"),
+            StopLevel::ControlledStopPosture => Some("stop controlled-stop-posture"),
+        };
+        let mode = match self.mode {
+            Mode::Automatic => None,
+            Mode::Manual => Some("manual"),
+            Mode::Service => Some("service"),
+        };
+        let waits = (!self.awaiting_resume.is_empty()).then_some("awaits resume");
+        let words = [own_stop, stop, mode, waits].into_iter().flatten().map(str::to_owned);
+        fault.into_iter().chain(words).collect()
+    }
 }
 
 /// What a robot says of itself that does not change within a session.

@@ -7,7 +7,7 @@ use crate::authority::Authority;
 use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, StopId, WaypointId};
 use crate::reason::Reason;
 pub use crate::robot::WorkState;
-use crate::robot::{Fault, HardwareStop, HeldPlace, Lane, Load, Mode, StopLevel, Vitals};
+use crate::robot::{Fault, HardwareStop, HeldPlace, Lane, Load, Mode, Presence, StopLevel, Vitals};
 use crate::rows::{Index, Record, Table};
 use crate::update::UpdateEvent;
 use serde::{Deserialize, Serialize};
@@ -435,9 +435,73 @@ pub struct PresenceRow {
     /// Whose.
     pub robot_id: RobotId,
     /// Heard or not.
-    pub presence: crate::robot::Presence,
+    pub presence: Presence,
     /// UTC of the wall, since when.
     pub since_unix_ms: i64,
+    /// What kept it from work by its own word when it was heard last, the gravest first: [`crate::robot::ReportedState::conditions`].
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub conditions: Vec<Condition>,
+    /// What it said when this row was written; none: it was never heard since rows keep that.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub last_heard: Option<LastHeard>,
+}
+
+/// One thing that keeps a robot from work by its own word.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Condition {
+    /// In words.
+    pub what: String,
+    /// UTC of the wall, receipt of the first heartbeat that said so.
+    pub since_unix_ms: i64,
+}
+
+/// What is kept of a heartbeat, for people, until the robot is heard again.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LastHeard {
+    /// UTC of the wall, its receipt.
+    pub at_unix_ms: i64,
+    /// State of charge.
+    pub battery_permille: u16,
+    /// Where it was. None: it did not know.
+    pub waypoint: Option<WaypointId>,
+}
+
+impl PresenceRow {
+    /// Of a robot that this store knows nothing else of.
+    pub fn new(robot_id: RobotId, presence: Presence, since_unix_ms: i64) -> Self {
+        Self { robot_id, presence, since_unix_ms, conditions: Vec::new(), last_heard: None }
+    }
+    /// The row of a robot after this one, at `wall`. `live`: its newest heartbeat; none: this server has not heard it.
+    pub fn next(&self, presence: Presence, live: Option<&Live>, wall: crate::time::Utc) -> Self {
+        let Some(live) = live else {
+            let since_unix_ms = self.unheard_since_unix_ms();
+            return Self { presence, since_unix_ms, ..self.clone() };
+        };
+        let since_unix_ms = if presence == self.presence { self.since_unix_ms } else { wall.0 };
+        Self {
+            robot_id: self.robot_id.clone(),
+            presence,
+            since_unix_ms,
+            conditions: self.conditions_of(live),
+            last_heard: Some(LastHeard {
+                at_unix_ms: live.received_unix_ms,
+                battery_permille: live.report.vitals.battery_permille,
+                waypoint: live.report.vitals.waypoint.clone(),
+            }),
+        }
+    }
+    /// What keeps the robot from work by its newest heartbeat, since when as far as this row knows.
+    pub fn conditions_of(&self, live: &Live) -> Vec<Condition> {
+        let since =
+            |what: &str| self.conditions.iter().find(|known| known.what == what).map(|known| known.since_unix_ms);
+        let words = live.report.conditions().into_iter();
+        words.map(|what| Condition { since_unix_ms: since(&what).unwrap_or(live.received_unix_ms), what }).collect()
+    }
+    /// Since when nobody has heard the robot, where nobody who runs now has: at the earliest since it was noted last that it was heard.
+    pub fn unheard_since_unix_ms(&self) -> i64 {
+        let heard = self.last_heard.as_ref().filter(|_| self.presence != Presence::Offline);
+        heard.map_or(self.since_unix_ms, |heard| heard.at_unix_ms)
+    }
 }
 
 impl Record for PresenceRow {

@@ -163,8 +163,7 @@ impl OldSite {
             counted: if is_retired { self.from } else { self.until },
         };
         fleet.create(&control, "robot.retired").create(&counter, "robot.counted");
-        let presence =
-            PresenceRow { robot_id: robot_id.clone(), presence: Presence::Offline, since_unix_ms: self.from.0 };
+        let presence = PresenceRow::new(robot_id.clone(), Presence::Offline, self.from.0);
         let mark = LaneMark { event: 1, at_unix_ms: self.until.0, ..LaneMark::fresh(robot_id.clone(), "ring") };
         telemetry.create(&presence, "presence.offline").create(&mark, "lane.durable");
         telemetry.create(&session(robot_id, self.from), "session.begun");

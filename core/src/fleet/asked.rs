@@ -38,6 +38,13 @@ pub enum Command {
         /// What the person saw.
         reason: String,
     },
+    /// A person's word that the robot carries nothing: holds until the robot says something newer.
+    SettleLoad {
+        /// Whose.
+        robot_id: RobotId,
+        /// What the person saw.
+        reason: String,
+    },
     /// Out of work for maintenance: what it does ends or waits, then it parks.
     Drain {
         /// Whom.

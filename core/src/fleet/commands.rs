@@ -1,10 +1,11 @@
-//! What people ask of fleet directly: cordon, uncordon and retire, rules of an area, clearing a place, closing an incident. Each is one item, answered after its commit.
+//! What people ask of fleet directly: cordon, uncordon and retire, a word about a load, rules of an area, clearing a place, closing an
+//! incident. Each is one item, answered after its commit.
 
 use super::Tx;
 pub use super::asked::Command;
-use super::rows::{Cordon, HolderState, Place, PlaceHolder, RobotControl};
+use super::rows::{Cordon, HolderState, LoadSettled, Place, PlaceHolder, RobotControl};
 use super::view::View;
-use super::{Board, drain, heard, incidents};
+use super::{Board, drain, heard, incidents, load};
 use crate::audit::{self, Note};
 use crate::ids::{AttemptId, RobotId};
 use crate::limits;
@@ -25,6 +26,7 @@ pub fn check(
         | Command::Uncordon { robot_id }
         | Command::Retire { robot_id, .. }
         | Command::Disown { robot_id, .. }
+        | Command::SettleLoad { robot_id, .. }
         | Command::Drain { robot_id, .. }
         | Command::Undrain { robot_id } => {
             if !view.sessions.contains_key(robot_id.as_str()) {
@@ -36,6 +38,9 @@ pub fn check(
             }
             if let Command::Disown { attempt, .. } = command {
                 may_disown(view, board, now, robot_id, attempt)?;
+            }
+            if let Command::SettleLoad { .. } = command {
+                load::may_settle(view, board, now, robot_id)?;
             }
             view.control.get(robot_id.as_str()).map_or(Revision(0), |c| c.revision)
         }
@@ -121,6 +126,7 @@ pub fn note(view: &View, command: &Command) -> Note {
         Command::Disown { robot_id, attempt, reason } => {
             of_robot("robot.disown", robot_id).because(reason).with("attempt", attempt.to_string())
         }
+        Command::SettleLoad { robot_id, reason } => of_robot("robot.settle_load", robot_id).because(reason),
         Command::Drain { robot_id, reason, within_ms } => {
             of_robot("robot.drain", robot_id).because(reason).with("within_ms", within_ms)
         }
@@ -149,7 +155,7 @@ pub fn refusal(view: &View, command: &Command, actor: &str, request_id: Option<&
 }
 
 /// Carries out a command that passed its check.
-pub fn apply(tx: &mut Tx, command: &Command, actor: &str) {
+pub fn apply(tx: &mut Tx, board: &Board, command: &Command, actor: &str) {
     tx.audit(note(tx.view, command));
     match command {
         Command::Cordon { robot_id, reason } => {
@@ -180,6 +186,13 @@ pub fn apply(tx: &mut Tx, command: &Command, actor: &str) {
             tx.put(control, "robot.disowned");
             tx.view.unknown.remove(robot_id);
             incidents::close_about(tx, Code::AttemptUnknown, robot_id, "the attempt was disowned");
+        }
+        Command::SettleLoad { robot_id, reason } => {
+            let mut control = control(tx, robot_id);
+            let (session_epoch, hb) = load::newest_word(tx.view, board, robot_id);
+            let (reason, actor, since) = (reason.clone(), actor.to_owned(), tx.now.utc);
+            control.load_settled = Some(LoadSettled { reason, actor, since, session_epoch, hb });
+            tx.put(control, "robot.load_settled");
         }
         Command::Drain { robot_id, reason, within_ms } => drain::ask(tx, robot_id, reason, actor, *within_ms),
         Command::Undrain { robot_id } => drain::release(tx, robot_id),

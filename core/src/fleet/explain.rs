@@ -2,7 +2,7 @@
 
 use super::standing::{self, WAITS_FOR};
 use super::view::View;
-use super::{Board, screen, way};
+use super::{Board, load, screen, way};
 use crate::ids::{RobotId, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -180,7 +180,7 @@ pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Optio
 
 /// The robot carries what is of no task that waits for it, or of one that waits for a person.
 fn carries(view: &View, board: &Board, robot_id: &RobotId) -> Option<Reason> {
-    let load = board.get(robot_id)?.report.load.as_ref()?;
+    let load = load::carried(view, board.get(robot_id)?)?;
     let task = load.task_id.as_ref().and_then(|id| view.task(id));
     let asks = task.is_some_and(|task| task.phase == Phase::NeedsOperator);
     if !asks && task.is_some_and(|task| task.opened.as_ref().is_none_or(|r| r == robot_id)) {

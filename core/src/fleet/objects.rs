@@ -74,6 +74,7 @@ pub fn permit(view: &View, board: &Board, by: &Caller, command: &Command) -> Res
         | Command::Uncordon { robot_id }
         | Command::Retire { robot_id, .. }
         | Command::Disown { robot_id, .. }
+        | Command::SettleLoad { robot_id, .. }
         | Command::Drain { robot_id, .. }
         | Command::Undrain { robot_id } => {
             if !view.sessions.contains_key(robot_id.as_str()) {

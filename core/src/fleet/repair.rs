@@ -7,7 +7,7 @@ use super::Tx;
 use super::heard::{is_fresh, is_settled, lease_stands, presence};
 use super::tasks::{News, happen};
 use super::view::View;
-use super::{Board, Plan, Tally, answers, claims, errands, inbox, incidents, maps, places, plausible, tasks};
+use super::{Board, Plan, Tally, answers, claims, errands, inbox, incidents, load, maps, places, plausible, tasks};
 use crate::ids::{AttemptId, RobotId, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -43,7 +43,9 @@ pub fn robot(view: &mut View, now: Now, robot_id: &RobotId, board: &Board, plan:
             return lease_over(tx, robot_id, &mut tally);
         }
         if let Some(live) = board.get(robot_id) {
-            live.report.load.iter().for_each(|load| inbox::carries(tx, robot_id, load));
+            if let Some(load) = load::carried(tx.view, live) {
+                inbox::carries(tx, robot_id, load);
+            }
             stalled(tx, robot_id, live);
         }
     });
@@ -87,7 +89,7 @@ pub fn may_suspend(view: &View, task_id: &TaskId, live: &Live) -> bool {
     };
     let opened = task.attempt_id().and_then(|id| view.attempt(&id)).is_none_or(|a| a.opened);
     let preemptible = view.intake(task_id).is_some_and(|i| i.spec.preemptible);
-    !opened && preemptible && live.report.load.is_none()
+    !opened && preemptible && load::carried(view, live).is_none()
 }
 
 /// A robot at work must charge: a preemptible task that it has not opened waits, at a step boundary.

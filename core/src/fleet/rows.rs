@@ -110,6 +110,21 @@ pub struct Cordon {
     pub since: Utc,
 }
 
+/// A person's word that a robot carries nothing, against what it had said by then.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LoadSettled {
+    /// What the person saw.
+    pub reason: String,
+    /// Who.
+    pub actor: String,
+    /// UTC, site clock.
+    pub since: Utc,
+    /// Session of the newest heartbeat that the word holds against.
+    pub session_epoch: u64,
+    /// Its number; the highest there is: of all of that session.
+    pub hb: u64,
+}
+
 /// What people and the breaker decided about a robot.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RobotControl {
@@ -133,6 +148,9 @@ pub struct RobotControl {
     /// Attempts that no row knows and that a person told the server to ignore, as long as the robot lists them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub disowned: Vec<AttemptId>,
+    /// A person's word about its load. Read by [`super::load`].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub load_settled: Option<LoadSettled>,
     /// Errands asked of it so far.
     pub errands: u64,
     /// Tasks given to it so far; breaks ties between equally near robots.
@@ -154,6 +172,7 @@ impl RobotControl {
             unanswered: Vec::new(),
             unanswered_since: None,
             disowned: Vec::new(),
+            load_settled: None,
             errands: 0,
             tasks: 0,
             resumed: Vec::new(),

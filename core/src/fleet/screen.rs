@@ -122,7 +122,8 @@ pub fn pair(
     fits(robot_id, session, task, intake)?;
     let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
     just_refused(view, live, task)?;
-    if let Some(load) = &live.report.load
+    let load = load::carried(view, live);
+    if let Some(load) = load
         && load.task_id.as_ref() != Some(&task.task_id)
     {
         return Err(Reason::from(Code::RobotLoaded).with("item", &load.item));
@@ -134,7 +135,7 @@ pub fn pair(
         return Err(Reason::from(Code::RouteTooLong).with("points_max", limits::ROUTE_POINTS_MAX));
     }
     let from = way::from_step(&intake.spec.steps, task.next_step) as usize;
-    let mut trip = Trip::new(live.report.load.is_some(), intake.spec.speed_limit_mm_s);
+    let mut trip = Trip::new(load.is_some(), intake.spec.speed_limit_mm_s);
     let mut legs_mm = legs_mm.into_iter();
     for step in intake.spec.steps.iter().skip(from) {
         match &step.kind {

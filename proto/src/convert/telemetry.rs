@@ -3,12 +3,12 @@
 use super::robot::lane_marks;
 use super::{WireEnum, timestamp};
 use crate::telemetry::v1;
-use midshift_core::ids::RobotId;
+use midshift_core::ids::{AreaId, RobotId};
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{Lane, Presence};
-use midshift_core::time::{LinkTime, Utc};
+use midshift_core::time::{Now, Utc};
 use midshift_core::update::{Installed, InstalledSet};
-use midshift_core::work::{InboxEntry, InboxItem, Live, PresenceRow, Session};
+use midshift_core::work::{Condition, InboxEntry, InboxItem, LastHeard, Live, PresenceRow, Session};
 use std::collections::BTreeMap;
 
 /// What is known of one robot.
@@ -22,26 +22,40 @@ pub struct RobotView<'a> {
     pub session: Option<&'a Session>,
     /// Its newest heartbeat.
     pub live: Option<&'a Live>,
+    /// The area in which it is, or was when it was heard last; none: not known.
+    pub area_id: Option<&'a AreaId>,
     /// Highest durable number of each lane of its ring.
     pub durable: &'a BTreeMap<Lane, u64>,
     /// Since when another machine is attached under its name and only observed; none: there is none.
     pub observed_since: Option<Utc>,
 }
 
+/// Whether a robot is heard: what a row says of one that this server has not heard is of another time.
+pub fn shown_presence(row: Option<&PresenceRow>, live: Option<&Live>) -> Presence {
+    live.and(row).map_or(Presence::Offline, |row| row.presence)
+}
+
 /// A robot as callers see it at `now`.
-pub fn encode_robot(view: RobotView<'_>, now: LinkTime) -> v1::Robot {
-    let RobotView { robot_id, presence, session, live, durable, observed_since } = view;
+pub fn encode_robot(view: RobotView<'_>, now: Now) -> v1::Robot {
+    let RobotView { robot_id, presence, session, live, area_id, durable, observed_since } = view;
+    let since_unix_ms = presence.map(|row| live.map_or(row.unheard_since_unix_ms(), |_| row.since_unix_ms));
+    let conditions = match (presence, live) {
+        (Some(row), Some(live)) => row.conditions_of(live),
+        (Some(row), None) => row.conditions.clone(),
+        (None, _) => Vec::new(),
+    };
+    let last_heard = presence.filter(|_| live.is_none()).and_then(|row| row.last_heard.as_ref());
     // The live board measures; the row keeps what was known at Hello.
     let measured = live.and_then(|l| l.clock_offset_ms);
     let offset = measured.map(|(offset, _)| offset).or_else(|| session.and_then(|s| s.clock_offset_ms));
     v1::Robot {
         robot_id: robot_id.to_string(),
-        presence: presence.map_or(Presence::Offline, |p| p.presence).to_wire(),
-        presence_since: presence.map(|p| timestamp(Utc(p.since_unix_ms))),
+        presence: shown_presence(presence, live).to_wire(),
+        presence_since: since_unix_ms.map(|since| timestamp(Utc(since))),
         inventory: session.map(|s| (&s.inventory).into()),
         reported: live.map(|l| (&l.report).into()),
         receive_time: live.map(|l| timestamp(Utc(l.received_unix_ms))),
-        age: live.map(|l| super::duration(now.since(l.processed_at).as_ms())),
+        age: live.map(|l| super::duration(now.link.since(l.processed_at).as_ms())),
         session_epoch: session.map(|s| s.session_epoch).unwrap_or_default(),
         clock_offset_ms: offset,
         clock_error_ms: measured.map(|(_, error)| error),
@@ -54,6 +68,25 @@ pub fn encode_robot(view: RobotView<'_>, now: LinkTime) -> v1::Robot {
         installed: session.and_then(|s| s.installed.as_ref()).map(Into::into),
         device_key: session.and_then(|s| s.device_key.clone()).unwrap_or_default(),
         device_key_changed: session.is_some_and(|s| s.device_key_changed),
+        area_id: area_id.map(ToString::to_string).unwrap_or_default(),
+        conditions: conditions.iter().map(Into::into).collect(),
+        last_heard: last_heard.map(|last| encode_last_heard(last, now.wall)),
+    }
+}
+
+impl From<&Condition> for v1::Condition {
+    fn from(condition: &Condition) -> Self {
+        Self { what: condition.what.clone(), since: Some(timestamp(Utc(condition.since_unix_ms))) }
+    }
+}
+
+fn encode_last_heard(last: &LastHeard, wall: Utc) -> v1::LastHeard {
+    let at = Utc(last.at_unix_ms);
+    v1::LastHeard {
+        receive_time: Some(timestamp(at)),
+        age: Some(super::duration(wall.ms_since(at))),
+        battery_permille: u32::from(last.battery_permille),
+        waypoint: last.waypoint.as_ref().map(ToString::to_string).unwrap_or_default(),
     }
 }
 

@@ -6,7 +6,7 @@ use super::{
 };
 use crate::link::v1;
 use midshift_core::ids::{AreaId, DrainId, PlaceId, RobotId, WaypointId};
-use midshift_core::policy::{AreaPolicy, SoftwareRules};
+use midshift_core::policy::AreaPolicy;
 use midshift_core::reason::Violations;
 use midshift_core::work::{Assignment, DesiredPolicy, DesiredWork, GrantedPlace, RoutePoint, StepKind, WorkStep};
 
@@ -240,7 +240,6 @@ impl Parse<AreaPolicy> for v1::AreaRules {
         let stop = permille(self.charge_stop_permille, at.field("charge_stop_permille"), bad);
         let preemptible = permille(self.charge_preemptible_permille, at.field("charge_preemptible_permille"), bad);
         Some(AreaPolicy {
-            area_id: area_id?,
             speed_limit_mm_s: self.speed_limit_mm_s,
             avoidance_distance_mm: self.avoidance_distance_mm,
             charge_mandatory_permille: mandatory?,
@@ -248,8 +247,8 @@ impl Parse<AreaPolicy> for v1::AreaRules {
             charge_stop_permille: stop?,
             charge_preemptible_permille: preemptible?,
             without_people: self.without_people,
-            // What roll-outs keep to is no robot's matter.
-            software: SoftwareRules::default(),
+            // When people are told and what roll-outs keep to is no robot's matter.
+            ..AreaPolicy::default_of(area_id?)
         })
     }
 }

@@ -3,7 +3,7 @@
 use midshift_core::ids::{RobotId, SetId};
 use midshift_core::reason::Code;
 use midshift_core::robot::{Inventory, Lane, Mode, Presence, ReportedState};
-use midshift_core::time::{LinkTime, SiteTime, Utc};
+use midshift_core::time::{LinkTime, Now, SiteTime, Utc};
 use midshift_core::update::{Installed, InstalledSet};
 use midshift_core::work::{Gap, InboxEntry, InboxItem, Live, PresenceRow, Session};
 use midshift_proto::convert::telemetry::{RobotView, encode_event, encode_robot};
@@ -54,7 +54,7 @@ fn a_robot_shows_how_old_its_report_is_and_the_measured_clock_before_the_remembe
         device_key: Some("ab".repeat(32)),
         device_key_changed: true,
     };
-    let presence = PresenceRow { robot_id: robot(), presence: Presence::Suspect, since_unix_ms: 4_000 };
+    let presence = PresenceRow::new(robot(), Presence::Suspect, 4_000);
     let live = Live {
         robot_id: robot(),
         report: ReportedState { hb: 9, mode: Mode::Manual, ..ReportedState::default() },
@@ -71,10 +71,12 @@ fn a_robot_shows_how_old_its_report_is_and_the_measured_clock_before_the_remembe
         presence: Some(&presence),
         session: Some(&session),
         live: Some(&live),
+        area_id: None,
         durable: &durable,
         observed_since: Some(Utc(2_000)),
     };
-    let wire = encode_robot(view, LinkTime(5_250));
+    let now = Now { link: LinkTime(5_250), ..Now::default() };
+    let wire = encode_robot(view, now);
     assert_eq!((wire.presence(), wire.session_epoch, wire.observed), (v1::Presence::Suspect, 7, true));
     assert_eq!(wire.observed_since.as_ref().map(|t| t.seconds), Some(2));
     assert_eq!(wire.age.as_ref().map(ms_of), Some(4_250));
@@ -87,7 +89,7 @@ fn a_robot_shows_how_old_its_report_is_and_the_measured_clock_before_the_remembe
     assert_eq!((wire.device_key.len(), wire.device_key_changed), (64, true));
     assert!(!format!("{wire:?}").contains("s3cret"), "the secret of a session is shown to nobody");
 
-    let wire = encode_robot(RobotView { live: None, presence: None, observed_since: None, ..view }, LinkTime(5_250));
+    let wire = encode_robot(RobotView { live: None, presence: None, observed_since: None, ..view }, now);
     assert_eq!((wire.presence(), wire.clock_offset_ms, wire.observed), (v1::Presence::Offline, Some(-3), false));
     assert!(wire.reported.is_none() && wire.age.is_none());
 }

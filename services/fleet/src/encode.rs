@@ -1,9 +1,11 @@
 //! Rows and explanations as their messages. Nothing is decided here.
 
 use midshift_core::fleet::explain::{RobotExplanation, TaskExplanation};
-use midshift_core::fleet::rows::{Cordon, HolderState, Incident, Place, RobotControl, RobotCounter, RobotHolder};
-use midshift_core::fleet::starts;
+use midshift_core::fleet::rows::{
+    Cordon, HoldToken, HolderState, Incident, Place, RobotControl, RobotCounter, RobotHolder,
+};
 use midshift_core::fleet::view::View;
+use midshift_core::fleet::{Board, load, starts};
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::robot::Duty;
 use midshift_core::rows::Revision;
@@ -16,7 +18,7 @@ use midshift_proto::convert::{shown, timestamp};
 use midshift_proto::fleet::v1;
 
 /// What people and the breaker decided about a robot, and what it is taken by.
-pub fn control(view: &View, robot_id: &RobotId) -> v1::RobotControl {
+pub fn control(view: &View, board: &Board, robot_id: &RobotId) -> v1::RobotControl {
     let rowed = view.control.get(robot_id.as_str());
     let row = rowed.map_or_else(|| RobotControl::new(robot_id.clone()), |c| c.row.clone());
     let holder = match view.authority.get(robot_id.as_str()).map(|a| &a.row.holder) {
@@ -25,6 +27,9 @@ pub fn control(view: &View, robot_id: &RobotId) -> v1::RobotControl {
         _ => String::new(),
     };
     let errand = view.held_by(robot_id).and_then(|id| view.attempt(id)).and_then(|a| a.errand);
+    let live = board.get(robot_id).map(AsRef::as_ref);
+    let load_settled = load::settled(view, robot_id, live);
+    let hold = |h: &HoldToken| v1::Hold { token: h.token.clone(), since: Some(timestamp(h.since)) };
     v1::RobotControl {
         robot_id: robot_id.to_string(),
         duty: match row.duty() {
@@ -44,6 +49,12 @@ pub fn control(view: &View, robot_id: &RobotId) -> v1::RobotControl {
             Some(Errand::Park) => v1::Errand::Park,
         } as i32,
         hold_tokens: view.robot_holds(robot_id).map(|h| h.token.clone()).collect(),
+        holds: view.robot_holds(robot_id).map(hold).collect(),
+        load_settled: load_settled.map(|word| v1::LoadSettled {
+            reason: word.reason.clone(),
+            since: Some(timestamp(word.since)),
+            actor: word.actor.clone(),
+        }),
         etag: etag(rowed.map_or(Revision(0), |c| c.revision)),
         drain: drain(view, robot_id),
         work_generation: view.desired_work.get(robot_id.as_str()).map_or(0, |d| d.row.generation),
@@ -162,7 +173,13 @@ pub fn task_explanation(task_id: &TaskId, e: &TaskExplanation, now: Utc) -> v1::
 }
 
 /// Why a robot has no work, or what it does.
-pub fn robot_explanation(view: &View, now: &Now, robot_id: &RobotId, e: &RobotExplanation) -> v1::RobotExplanation {
+pub fn robot_explanation(
+    view: &View,
+    board: &Board,
+    now: &Now,
+    robot_id: &RobotId,
+    e: &RobotExplanation,
+) -> v1::RobotExplanation {
     v1::RobotExplanation {
         robot_id: robot_id.to_string(),
         verdict: e.verdict.as_ref().map(shown),
@@ -176,7 +193,7 @@ pub fn robot_explanation(view: &View, now: &Now, robot_id: &RobotId, e: &RobotEx
             })
             .collect(),
         explain_time: Some(timestamp(now.utc)),
-        control: Some(control(view, robot_id)),
+        control: Some(control(view, board, robot_id)),
     }
 }
 

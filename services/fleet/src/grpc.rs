@@ -15,8 +15,8 @@ use midshift_core::time::Utc;
 use midshift_core::unknown_rows;
 use midshift_proto::access::caller;
 use midshift_proto::convert::fleet::encode_policy;
-use midshift_proto::convert::ms_of;
 use midshift_proto::convert::task::revision_of;
+use midshift_proto::convert::{ms_of, timestamp};
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService as Face;
 use midshift_proto::pages;
@@ -58,7 +58,7 @@ impl FleetService {
         let robot_id = robot_id.ok_or_else(internal)?;
         let command = Command::Cordon { robot_id: robot_id.clone(), reason: r.reason };
         self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
-        let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
+        let control = self.look(move |view, board, _| encode::control(view, board, &robot_id)).await?;
         Ok(v1::CordonRobotResponse { control: Some(control) })
     }
 
@@ -76,7 +76,7 @@ impl FleetService {
             request_id,
         )
         .await?;
-        let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
+        let control = self.look(move |view, board, _| encode::control(view, board, &robot_id)).await?;
         Ok(v1::UncordonRobotResponse { control: Some(control) })
     }
 
@@ -89,7 +89,7 @@ impl FleetService {
         let robot_id = robot_id.ok_or_else(internal)?;
         let command = Command::Retire { robot_id: robot_id.clone(), reason: r.reason };
         self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
-        let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
+        let control = self.look(move |view, board, _| encode::control(view, board, &robot_id)).await?;
         Ok(v1::RetireRobotResponse { control: Some(control) })
     }
 
@@ -107,8 +107,25 @@ impl FleetService {
         let attempt = AttemptId { subject, epoch: r.epoch };
         let command = Command::Disown { robot_id: robot_id.clone(), attempt, reason: r.reason };
         self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
-        let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
+        let control = self.look(move |view, board, _| encode::control(view, board, &robot_id)).await?;
         Ok(v1::DisownAttemptResponse { control: Some(control) })
+    }
+
+    async fn settle_load(
+        &self,
+        r: v1::SettleRobotLoadRequest,
+        by: &Caller,
+    ) -> Result<v1::SettleRobotLoadResponse, Refusal> {
+        let mut bad = Violations::default();
+        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        let request_id = request_id(&r.request_id, &mut bad);
+        reason_text(&r.reason, &mut bad);
+        bad.finish()?;
+        let robot_id = robot_id.ok_or_else(internal)?;
+        let command = Command::SettleLoad { robot_id: robot_id.clone(), reason: r.reason };
+        self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
+        let control = self.look(move |view, board, _| encode::control(view, board, &robot_id)).await?;
+        Ok(v1::SettleRobotLoadResponse { control: Some(control) })
     }
 
     async fn drain(&self, r: v1::DrainRobotRequest, by: &Caller) -> Result<v1::DrainRobotResponse, Refusal> {
@@ -125,7 +142,7 @@ impl FleetService {
         let (within_ms, reason) = (within_ms.unsigned_abs(), r.reason);
         let command = Command::Drain { robot_id: robot_id.clone(), reason, within_ms };
         self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
-        let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
+        let control = self.look(move |view, board, _| encode::control(view, board, &robot_id)).await?;
         Ok(v1::DrainRobotResponse { control: Some(control) })
     }
 
@@ -137,7 +154,7 @@ impl FleetService {
         let robot_id = robot_id.ok_or_else(internal)?;
         let command = Command::Undrain { robot_id: robot_id.clone() };
         self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
-        let control = self.look(move |view, _, _| encode::control(view, &robot_id)).await?;
+        let control = self.look(move |view, board, _| encode::control(view, board, &robot_id)).await?;
         Ok(v1::UndrainRobotResponse { control: Some(control) })
     }
 
@@ -152,11 +169,30 @@ impl FleetService {
             .look(move |view, board, _| {
                 let is_there = view.sessions.contains_key(robot_id.as_str());
                 let is_seen = is_there && sees_robot(view, board, &by, &robot_id);
-                is_seen.then(|| encode::control(view, &robot_id))
+                is_seen.then(|| encode::control(view, board, &robot_id))
             })
             .await?;
         let control = found.ok_or_else(|| not_found(Code::RobotNotFound, &r.robot_id))?;
         Ok(v1::GetRobotControlResponse { control: Some(control) })
+    }
+
+    async fn controls(
+        &self,
+        r: v1::ListRobotControlsRequest,
+        by: &Caller,
+    ) -> Result<v1::ListRobotControlsResponse, Refusal> {
+        let mut bad = Violations::default();
+        let size = pages::size(r.page_size, &mut bad);
+        bad.finish()?;
+        let by = by.clone();
+        self.look(move |view: &View, board, now| {
+            let robots = view.sessions.values().map(|session| &session.row.robot_id);
+            let robots = robots.filter(|robot_id| sees_robot(view, board, &by, robot_id));
+            let (robots, next_page_token) = pages::page(robots.map(|id| (id.to_string(), id)), &r.page_token, size);
+            let controls = robots.into_iter().map(|robot_id| encode::control(view, board, robot_id)).collect();
+            v1::ListRobotControlsResponse { controls, next_page_token, list_time: Some(timestamp(now.utc)) }
+        })
+        .await
     }
 
     async fn policy(&self, area_id: AreaId, by: &Caller) -> Result<v1::AreaPolicy, Refusal> {
@@ -287,7 +323,7 @@ impl FleetService {
                 let found = explain::robot(view, board, now, &robot_id);
                 let mut found = found.filter(|_| sees_robot(view, board, &by, &robot_id))?;
                 found.candidates.retain(|c| sees_task(view, &by, &c.task_id));
-                Some(encode::robot_explanation(view, now, &robot_id, &found))
+                Some(encode::robot_explanation(view, board, now, &robot_id, &found))
             })
             .await?;
         let explanation = found.ok_or_else(|| not_found(Code::RobotNotFound, &r.robot_id))?;
@@ -406,6 +442,20 @@ impl Face for FleetService {
     ) -> Result<Response<v1::GetRobotControlResponse>, Status> {
         let by = caller(&r);
         answer(self.control(r.into_inner(), &by).await)
+    }
+    async fn list_robot_controls(
+        &self,
+        r: Request<v1::ListRobotControlsRequest>,
+    ) -> Result<Response<v1::ListRobotControlsResponse>, Status> {
+        let by = caller(&r);
+        answer(self.controls(r.into_inner(), &by).await)
+    }
+    async fn settle_robot_load(
+        &self,
+        r: Request<v1::SettleRobotLoadRequest>,
+    ) -> Result<Response<v1::SettleRobotLoadResponse>, Status> {
+        let by = caller(&r);
+        answer(self.settle_load(r.into_inner(), &by).await)
     }
     async fn get_area_policy(
         &self,

@@ -420,7 +420,7 @@ impl Loop {
                     }
                     let mut tx =
                         midshift_core::fleet::Tx::new(&mut self.view, now, &actor).on_request(request_id.as_deref());
-                    commands::apply(&mut tx, command, &actor);
+                    commands::apply(&mut tx, &self.board, command, &actor);
                     if let Some(id) = request_id {
                         once::remember(&mut tx, id, command, *seen);
                     }

@@ -117,7 +117,7 @@ impl Loop {
         }
         let actor = by.to_string();
         let mut tx = Tx::new(&mut self.view, now, &actor).on_request(request_id.as_deref());
-        commands::apply(&mut tx, command, &actor);
+        commands::apply(&mut tx, &self.board, command, &actor);
         if let Some(id) = request_id {
             once::remember(&mut tx, id, command, *seen);
         }

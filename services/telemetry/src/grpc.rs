@@ -11,7 +11,7 @@ use midshift_core::time::Utc;
 use midshift_core::work::{InboxEntry, InboxItem, Live, RobotEvent, SampleBody};
 use midshift_proto::access::caller;
 use midshift_proto::convert::WireEnum;
-use midshift_proto::convert::telemetry::{RobotView, encode_event, encode_robot};
+use midshift_proto::convert::telemetry::{RobotView, encode_event, encode_robot, shown_presence};
 use midshift_proto::pages;
 use midshift_proto::telemetry::v1::{self, telemetry_service_server::TelemetryService as Face};
 use midshift_proto::watches::{self, Reader, Teller};
@@ -67,11 +67,13 @@ fn encode(inner: &Inner, robot_id: &RobotId, live: Option<&Live>) -> Option<v1::
         }
     }
     let presence = rows.presence.get(robot_id);
+    let last_heard = presence.and_then(|row| row.last_heard.as_ref());
+    let area_id = rows.area_of(live).or_else(|| rows.area_at(last_heard?.waypoint.as_ref()).filter(|_| live.is_none()));
     let observed_since = inner.registry.observed_since(robot_id);
-    let view = RobotView { robot_id, presence, session, live, durable: &durable, observed_since };
+    let view = RobotView { robot_id, presence, session, live, area_id, durable: &durable, observed_since };
     let now = inner.parts.clock.now();
     let beacon = inner.ear.hint(robot_id, live.map(|live| live.processed_at), &now);
-    Some(v1::Robot { beacon, ..encode_robot(view, now.link) })
+    Some(v1::Robot { beacon, ..encode_robot(view, now) })
 }
 
 /// Whether a caller may see a robot: where it is now, by its newest heartbeat.
@@ -87,7 +89,7 @@ fn admits(inner: &Inner, filter: &Filter, robot_id: &RobotId) -> bool {
         return false;
     }
     let rows = inner.picture.rows();
-    let presence = rows.presence.get(robot_id).map_or(Presence::Offline, |p| p.presence);
+    let presence = shown_presence(rows.presence.get(robot_id), inner.parts.board.get(robot_id).as_deref());
     let labels = rows.sessions.get(robot_id).map(|s| &s.inventory.labels);
     (filter.robot_ids.is_empty() || filter.robot_ids.contains(robot_id.as_str()))
         && (filter.presences.is_empty() || filter.presences.contains(&presence))

@@ -5,7 +5,7 @@
 use crate::Inner;
 use crate::stops::SiteStops;
 use midshift_core::fleet::rows::SiteRow;
-use midshift_core::ids::{AreaId, RobotId, StopId};
+use midshift_core::ids::{AreaId, RobotId, StopId, WaypointId};
 use midshift_core::rows::{BadRow, Seq, Table};
 use midshift_core::site::{Site, text};
 use midshift_core::stop::record::StopRecord;
@@ -55,6 +55,10 @@ impl Rows {
     /// The area in which a robot is by its newest heartbeat; none: not known.
     pub fn area_of(&self, live: Option<&Live>) -> Option<&AreaId> {
         live?.area(self.site.as_ref()?)
+    }
+    /// The area in which a waypoint lies; none: not known.
+    pub fn area_at(&self, waypoint: Option<&WaypointId>) -> Option<&AreaId> {
+        self.site.as_ref()?.area_at(waypoint)
     }
 }
 

@@ -8,10 +8,11 @@ use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::robot::Presence;
 use midshift_core::rows::{Expect, Item, Record, Revision, Writer};
-use midshift_core::time::{LinkDuration, LinkTime};
-use midshift_core::work::PresenceRow;
+use midshift_core::time::{LinkDuration, LinkTime, Utc};
+use midshift_core::work::{Live, PresenceRow};
 use midshift_store::{Query, Store};
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Duration;
 
 /// How often presence is looked at.
@@ -71,8 +72,7 @@ pub async fn keep(inner: &Inner) {
 /// Writes what changed; false: the rows must be read again.
 async fn write(inner: &Inner, known: &mut Known, stood: &mut Stood, started: LinkTime) -> bool {
     let now = inner.parts.clock.now();
-    let heard: BTreeMap<RobotId, LinkTime> =
-        inner.parts.board.all().into_iter().map(|(id, live)| (id, live.processed_at)).collect();
+    let heard: BTreeMap<RobotId, Arc<Live>> = inner.parts.board.all().into_iter().collect();
     // After a start nobody is called offline before the time that it takes to come back.
     let young = now.link.since(started) <= limits::OFFLINE_AFTER;
     let robots: Vec<RobotId> =
@@ -80,14 +80,21 @@ async fn write(inner: &Inner, known: &mut Known, stood: &mut Stood, started: Lin
     let changed: Vec<(PresenceRow, Revision)> = robots
         .into_iter()
         .filter_map(|robot_id| {
-            let presence = of(heard.get(&robot_id).copied(), now.link);
+            let live = heard.get(&robot_id).map(AsRef::as_ref);
+            let presence = of(live.map(|live| live.processed_at), now.link);
             let old = known.get(&robot_id);
-            let same = old.is_some_and(|(row, _)| row.presence == presence);
-            let too_early = young && !heard.contains_key(&robot_id);
-            if same || too_early || is_others(inner, &robot_id, (presence, now.link), stood) {
+            let is_ours = inner.shared.is_none() || inner.registry.is_home(&robot_id);
+            let told =
+                |row: &PresenceRow| row.presence == presence && !(is_ours && live.is_some_and(|l| is_news(row, l)));
+            let too_early = young && live.is_none();
+            if old.is_some_and(|(row, _)| told(row))
+                || too_early
+                || is_others(inner, &robot_id, (presence, now.link), stood)
+            {
                 return None;
             }
-            let row = PresenceRow { robot_id, presence, since_unix_ms: now.wall.0 };
+            let fresh = || PresenceRow::new(robot_id.clone(), Presence::Offline, now.wall.0);
+            let row = old.map_or_else(fresh, |(row, _)| row.clone()).next(presence, live, now.wall);
             Some((row, old.map_or(Revision(0), |(_, revision)| *revision)))
         })
         .collect();
@@ -108,6 +115,14 @@ async fn write(inner: &Inner, known: &mut Known, stood: &mut Stood, started: Lin
         known.insert(row.robot_id.clone(), (row, revision.next()));
     }
     applied
+}
+
+/// Whether a heartbeat says what the row does not: something else keeps the robot from work, or what was kept of it is old.
+fn is_news(row: &PresenceRow, live: &Live) -> bool {
+    let is_old = row.last_heard.as_ref().is_none_or(|last| {
+        Utc(live.received_unix_ms).ms_since(Utc(last.at_unix_ms)) >= limits::LAST_HEARD_EVERY.as_ms()
+    });
+    is_old || row.conditions_of(live) != row.conditions
 }
 
 /// Whether another gateway writes it, or has.

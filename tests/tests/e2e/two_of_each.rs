@@ -371,7 +371,7 @@ async fn rollouts_are_alike(otas: Both) -> anyhow::Result<()> {
             Ok((!listed.is_empty()).then_some(listed))
         });
         ensure!(rollouts.await?.len() == 1, "one roll-out");
-        let request = WatchRolloutRequest { rollout_id: ROLLOUT.to_owned() };
+        let request = WatchRolloutRequest { rollout_id: ROLLOUT.to_owned(), ..Default::default() };
         Ok(Watch::over(client.watch_rollout(request).await?.into_inner()))
     })
     .await?;

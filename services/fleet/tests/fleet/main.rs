@@ -9,6 +9,7 @@ mod errands;
 mod explain;
 mod holds;
 mod leads;
+mod loads;
 mod maps;
 mod offers;
 #[path = "../../../../tests/src/old_site.rs"]

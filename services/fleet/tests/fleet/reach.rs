@@ -69,6 +69,27 @@ async fn a_robot_is_taken_out_of_work_by_whoever_operates_where_it_stands_and_un
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_list_of_what_was_decided_about_robots_shows_each_caller_its_own_in_pages() {
+    let w = world().await;
+    w.fleet.cordon_robot(asked(&anna(&["operator"]), cordon("r2"))).await.expect("the site's");
+    let list = async |grants: &[&str], page_size, page_token: &str| {
+        let request = v1::ListRobotControlsRequest { page_size, page_token: page_token.to_owned() };
+        w.fleet.list_robot_controls(asked(&anna(grants), request)).await.expect("a list").into_inner()
+    };
+    let ids =
+        |page: &v1::ListRobotControlsResponse| page.controls.iter().map(|c| c.robot_id.clone()).collect::<Vec<_>>();
+    let first = list(&["viewer"], 1, "").await;
+    assert_eq!((ids(&first), first.next_page_token.as_str()), (vec!["r1".to_owned()], "r1"));
+    let second = list(&["viewer"], 1, "r1").await;
+    assert_eq!((ids(&second), second.next_page_token.as_str()), (vec!["r2".to_owned()], ""));
+    let since = second.controls[0].cordon.as_ref().and_then(|cordon| cordon.since).expect("since when");
+    assert!(second.list_time.is_some_and(|now| (now.seconds, now.nanos) >= (since.seconds, since.nanos)));
+    assert_eq!(ids(&list(&["viewer@hall"], 0, "").await), ["r1"]);
+    assert!(ids(&list(&["viewer@packing"], 0, "").await).is_empty());
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_process_that_does_not_lead_asks_the_same_of_a_caller() {
     let mut w = World::shared(DEMO).await;
     w.robot("r1", "park-1").await;

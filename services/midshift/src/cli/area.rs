@@ -6,6 +6,7 @@ use super::client::{Call, Change, Exit, unary};
 use super::out::Out;
 use clap::Subcommand;
 use midshift_proto::fleet::v1;
+use std::time::Duration;
 
 /// Verbs of areas.
 #[derive(Subcommand)]
@@ -41,6 +42,9 @@ pub enum Verb {
         /// Above this a charging robot may be called to work, percent.
         #[arg(long)]
         charge_callable_above: Option<u32>,
+        /// A robot that says so long that it is stopped, driven by a person or faulty, or that the breaker took out, is an incident. Link time.
+        #[arg(long, value_parser = super::duration)]
+        incident_after: Option<Duration>,
         #[command(flatten)]
         software: software::Rules,
         #[command(flatten)]
@@ -66,6 +70,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             charge_idle_below,
             charge_to,
             charge_callable_above,
+            incident_after,
             software,
             change,
         } => {
@@ -80,6 +85,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
                 charge_opportunistic_permille: permille(charge_idle_below).or(old.charge_opportunistic_permille),
                 charge_stop_permille: permille(charge_to).or(old.charge_stop_permille),
                 charge_preemptible_permille: permille(charge_callable_above).or(old.charge_preemptible_permille),
+                incident_after: incident_after.map(milliseconds).or(old.incident_after),
                 software: Some(software.over(old.software.unwrap_or_default())),
                 ..old
             };
@@ -96,19 +102,24 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     }
 }
 
+fn milliseconds(time: Duration) -> prost_types::Duration {
+    midshift_proto::convert::duration(u64::try_from(time.as_millis()).unwrap_or(u64::MAX))
+}
+
 fn show(policy: &v1::AreaPolicy, out: &Out) -> Result<(), Exit> {
     let or_none = |v: Option<u32>, unit: &str| v.map_or_else(|| "none".to_owned(), |v| format!("{v} {unit}"));
     let percent = |v: Option<u32>| v.map_or_else(|| "default".to_owned(), |v| format!("{} %", f64::from(v) / 10.0));
     out.one(policy, &policy.area_id, || {
         format!(
-            "{}  speed limit {}  avoidance {}  charge: must below {}, may below {}, to {}, may be called above {}",
+            "{}  speed limit {}  avoidance {}  charge: must below {}, may below {}, to {}, may be called above {}  incident after {}",
             policy.area_id,
             or_none(policy.speed_limit_mm_s, "mm/s"),
             or_none(policy.avoidance_distance_mm, "mm"),
             percent(policy.charge_mandatory_permille),
             percent(policy.charge_opportunistic_permille),
             percent(policy.charge_stop_permille),
-            percent(policy.charge_preemptible_permille)
+            percent(policy.charge_preemptible_permille),
+            policy.incident_after.as_ref().map(|after| format!("{} s", after.seconds)).unwrap_or_default()
         ) + &software::shown(&policy.software.clone().unwrap_or_default())
     })?;
     Ok(())

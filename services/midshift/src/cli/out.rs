@@ -64,6 +64,15 @@ impl Out {
         self.line(&text);
         Ok(())
     }
+    /// Columns for people; a terminal that is too narrow for all goes without those of `spare`, in that order.
+    pub fn table(&self, header: &[&str], rows: &[Vec<String>], spare: &[&str]) {
+        let width = console::Term::stdout().size_checked().map(|(_, columns)| usize::from(columns));
+        let (text, left_out) = fitting(width, header, rows, spare);
+        self.line(text.trim_end());
+        if !left_out.is_empty() {
+            self.say(&format!("not shown, the terminal is narrow: {}", left_out.join(" ")));
+        }
+    }
     /// One object: a message, or its name, or lines for people.
     pub fn one<M: Message + Name>(
         &self,
@@ -146,9 +155,54 @@ pub fn columns(header: &[&str], rows: &[Vec<String>]) -> String {
     text
 }
 
+/// Columns in lines of at most `width` characters, and which of `spare` had to go for that. No width: all of them.
+fn fitting<'s>(
+    width: Option<usize>,
+    header: &[&str],
+    rows: &[Vec<String>],
+    spare: &[&'s str],
+) -> (String, Vec<&'s str>) {
+    let is_wide = |text: &str| width.is_some_and(|width| text.lines().any(|line| line.chars().count() > width));
+    let mut left_out = Vec::new();
+    let mut text = columns(header, rows);
+    for name in spare {
+        if !is_wide(&text) {
+            break;
+        }
+        left_out.push(*name);
+        let is_kept = |at: &usize| !header.get(*at).is_some_and(|h| left_out.contains(h));
+        let kept: Vec<usize> = (0..header.len()).filter(is_kept).collect();
+        let narrow: Vec<&str> = kept.iter().filter_map(|at| header.get(*at).copied()).collect();
+        let cells = |row: &Vec<String>| kept.iter().filter_map(|at| row.get(*at).cloned()).collect();
+        text = columns(&narrow, &rows.iter().map(cells).collect::<Vec<_>>());
+    }
+    (text, left_out)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_narrow_terminal_goes_without_the_columns_that_matter_least() {
+        let rows = [vec!["r1".into(), "manual (3 min)".into(), "1.4.0".into(), "2.0 m/s".into()]];
+        let header = ["ROBOT", "STATE", "SOFTWARE", "SPEED"];
+        let spare = ["SOFTWARE", "SPEED"];
+        let all = columns(&header, &rows);
+        assert_eq!(fitting(None, &header, &rows, &spare), (all.clone(), vec![]));
+        assert_eq!(fitting(Some(80), &header, &rows, &spare), (all, vec![]));
+        let (text, left_out) = fitting(Some(30), &header, &rows, &spare);
+        assert_eq!(
+            (text.as_str(), left_out),
+            ("ROBOT  STATE           SPEED\nr1     manual (3 min)  2.0 m/s", vec!["SOFTWARE"])
+        );
+        let (text, left_out) = fitting(Some(10), &header, &rows, &spare);
+        assert_eq!(
+            (text.lines().next(), left_out.len()),
+            (Some("ROBOT  STATE"), 2),
+            "the rest is wrapped by the terminal"
+        );
+    }
 
     #[test]
     fn columns_line_up_and_end_without_spaces() {

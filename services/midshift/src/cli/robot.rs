@@ -1,5 +1,7 @@
 //! `midshift robot …`
 
+mod table;
+
 use super::client::{Call, Change, Exit, ended, follow, unary};
 use super::enrol::{self, Machine};
 use super::explain::verdict;
@@ -7,10 +9,8 @@ use super::out::{Format, Out, plain};
 use super::rollout;
 use clap::Subcommand;
 use midshift_core::time::Utc;
-use midshift_proto::common::v1::StopLevel;
 use midshift_proto::fleet::v1 as fleet;
 use midshift_proto::json;
-use midshift_proto::link::v1 as link;
 use midshift_proto::ota::v1 as ota;
 use midshift_proto::telemetry::v1;
 use std::ops::ControlFlow;
@@ -115,6 +115,22 @@ pub enum Verb {
         #[command(flatten)]
         change: Change,
     },
+    /// Settle by your word that it carries nothing, until it says something newer. Refused while it is heard and says itself that it does.
+    Load {
+        #[command(flatten)]
+        one: One,
+        /// It carries nothing.
+        #[arg(long, required = true)]
+        none: bool,
+        /// What you saw.
+        #[arg(long)]
+        reason: String,
+        /// Only if it is still as this etag says.
+        #[arg(long, default_value = "")]
+        if_match: String,
+        #[command(flatten)]
+        change: Change,
+    },
     /// Keep it at the software that it runs.
     Pin {
         #[command(flatten)]
@@ -170,7 +186,7 @@ pub struct One {
 /// Runs one verb.
 pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     match verb {
-        Verb::Ls { call } => list(&call, out).await,
+        Verb::Ls { call } => table::list(&call, out).await,
         Verb::Get(one) => get(&one, out).await,
         Verb::Watch { call, ids, period } => watch(&call, ids, period, out).await,
         Verb::Explain(one) => explain(&one, out).await,
@@ -259,6 +275,18 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             control(&answer.control.unwrap_or_default(), out)?;
             Ok(())
         }
+        Verb::Load { one, none: _, reason, if_match, change } => {
+            let request = fleet::SettleRobotLoadRequest {
+                robot_id: one.robot_id,
+                request_id: change.request_id,
+                etag: if_match,
+                reason,
+                validate_only: change.dry_run,
+            };
+            let answer = one.call.fleet().await?.settle_robot_load(unary(request)).await.map_err(Exit::with_facts)?;
+            control(&answer.into_inner().control.unwrap_or_default(), out)?;
+            Ok(())
+        }
         Verb::Pin { one, reason, change } => {
             let only = change.only();
             let request = ota::PinRobotRequest {
@@ -324,62 +352,10 @@ fn control_line(control: &fleet::RobotControl) -> String {
     } else {
         format!("  held by {}", control.hold_tokens.join(" "))
     };
-    format!("{}  {duty}{why}  {holder}{holds}", control.robot_id)
-}
-
-/// Columns of a robot.
-const HEADER: [&str; 10] = ["ROBOT", "PRESENCE", "STATE", "SOFTWARE", "AT", "BATTERY", "LOAD", "WORK", "SPEED", "AGE"];
-
-fn row(robot: &v1::Robot) -> Vec<String> {
-    let reported = robot.reported.clone().unwrap_or_default();
-    let vitals = reported.vitals.clone().unwrap_or_default();
-    let work = reported.attempts.iter().find(|a| a.state() < link::WorkState::Succeeded).map(|a| {
-        let id = a.attempt.as_ref().map(|i| i.subject.clone()).unwrap_or_default();
-        format!("{id} {}", a.state().as_str_name().trim_start_matches("WORK_STATE_"))
-    });
-    let age = robot
-        .age
-        .as_ref()
-        .map_or_else(|| "-".to_owned(), |a| format!("{:.1} s", a.seconds as f64 + f64::from(a.nanos) / 1e9));
-    vec![
-        robot.robot_id.clone(),
-        presence(robot),
-        state(&reported),
-        robot.inventory.as_ref().map(|inventory| inventory.software.clone()).unwrap_or_default(),
-        vitals.waypoint.clone(),
-        format!("{:.0} %{}", f64::from(vitals.battery_permille) / 10.0, if vitals.charging { " +" } else { "" }),
-        reported.load.as_ref().map(|l| l.item.clone()).unwrap_or_default(),
-        work.unwrap_or_default(),
-        format!("{:.1} m/s", f64::from(vitals.speed_mm_s) / 1000.0),
-        age,
-    ]
-}
-
-/// What a robot says of itself that keeps it from work, the gravest first; `ok` if nothing.
-fn state(reported: &link::ReportedState) -> String {
-    let word = |name: &str, prefix: &str| name.trim_start_matches(prefix).to_lowercase().replace('_', "-");
-    let fault = reported.fault.as_ref().map(|fault| format!("fault {}", fault.code));
-    let stop = reported.hardware_stop();
-    let stopped = stop > link::HardwareStop::Unspecified;
-    let stopped = stopped.then(|| format!("own stop {}", word(stop.as_str_name(), "HARDWARE_STOP_")));
-    let level = reported.stop_level();
-    let halted = level > StopLevel::Unspecified;
-    let halted = halted.then(|| format!("stop {}", word(level.as_str_name(), "STOP_LEVEL_")));
-    let mode = reported.mode();
-    let driven = mode > link::Mode::Automatic;
-    let driven = driven.then(|| word(mode.as_str_name(), "MODE_"));
-    let waits = !reported.awaiting_resume.is_empty();
-    let waits = waits.then(|| "awaits resume".to_owned());
-    let all: Vec<String> = [fault, stopped, halted, driven, waits].into_iter().flatten().collect();
-    if all.is_empty() { "ok".to_owned() } else { all.join(", ") }
-}
-
-/// Whether it is heard; with a star if only its launcher is, which nobody proves.
-fn presence(robot: &v1::Robot) -> String {
-    match robot.beacon {
-        Some(_) => "UPDATING*".to_owned(),
-        None => robot.presence().as_str_name().trim_start_matches("PRESENCE_").to_owned(),
-    }
+    let by_word =
+        |word: &fleet::LoadSettled| format!("  carries nothing, says {} ({})", plain(&word.actor), plain(&word.reason));
+    let load = control.load_settled.as_ref().map(by_word).unwrap_or_default();
+    format!("{}  {duty}{why}  {holder}{holds}{load}", control.robot_id)
 }
 
 /// What its launcher says.
@@ -392,23 +368,6 @@ fn beacon_line(beacon: &v1::Beacon) -> String {
     )
 }
 
-async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
-    let mut client = call.telemetry().await?;
-    let mut whole = v1::ListRobotsResponse::default();
-    loop {
-        let request =
-            v1::ListRobotsRequest { filter: None, page_size: 1_000, page_token: whole.next_page_token.clone() };
-        let page = client.list_robots(unary(request)).await?.into_inner();
-        whole.robots.extend(page.robots);
-        whole.next_page_token = page.next_page_token;
-        if whole.next_page_token.is_empty() {
-            break;
-        }
-    }
-    out.many(&whole, &whole.robots, |r| r.robot_id.clone(), &HEADER, row)?;
-    Ok(())
-}
-
 async fn get(one: &One, out: &Out) -> Result<(), Exit> {
     let request = v1::GetRobotRequest { robot_id: one.robot_id.clone() };
     let answer = one.call.telemetry().await?.get_robot(unary(request)).await?.into_inner();
@@ -418,7 +377,7 @@ async fn get(one: &One, out: &Out) -> Result<(), Exit> {
         one.call.fleet().await?.get_robot_control(unary(request)).await?.into_inner().control.unwrap_or_default();
     match out.format {
         Format::Table => {
-            out.line(&super::out::columns(&HEADER, &[row(&robot)]));
+            table::show(&[table::row(&robot, Some(&control), None)], out);
             robot.beacon.iter().for_each(|beacon| out.line(&beacon_line(beacon)));
             if robot.observed {
                 out.line("another machine is attached under this name; it gets no work");
@@ -478,7 +437,7 @@ async fn watch(call: &Call, robot_ids: Vec<String>, period: Duration, out: &Out)
             match out.format {
                 Format::Json | Format::Jsonl => out.json(&message)?,
                 Format::Table | Format::Name => {
-                    message.robots.iter().for_each(|r| out.line(row(r).join("  ").trim_end()));
+                    message.robots.iter().for_each(|r| out.line(table::row(r, None, None).join("  ").trim_end()));
                 }
             }
         }
@@ -509,26 +468,4 @@ async fn explain(one: &One, out: &Out) -> Result<(), Exit> {
         text
     })?;
     Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_robot_is_listed_with_its_fault_its_stops_and_its_mode() {
-        assert_eq!(state(&link::ReportedState::default()), "ok");
-        let fault = midshift_proto::common::v1::Fault { code: 2001, ..Default::default() };
-        let reported = link::ReportedState {
-            fault: Some(fault),
-            hardware_stop: link::HardwareStop::Remote as i32,
-            stop_level: StopLevel::Halt as i32,
-            mode: link::Mode::Manual as i32,
-            awaiting_resume: vec!["STOP-1".to_owned()],
-            ..link::ReportedState::default()
-        };
-        assert_eq!(state(&reported), "fault 2001, own stop remote, stop halt, manual, awaits resume");
-        let robot = v1::Robot { reported: Some(reported), ..v1::Robot::default() };
-        assert_eq!(row(&robot).len(), HEADER.len());
-    }
 }

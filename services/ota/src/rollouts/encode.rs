@@ -188,7 +188,6 @@ pub fn robot(view: &View, board: &Board, now: &Now, row: &Rollout, r: &RolloutRo
     let m = &r.moments;
     let span = |from: Option<Utc>, to: Option<Utc>| from.zip(to).map(|(from, to)| duration(to.ms_since(from)));
     let on_link = |from: Option<Stamp>, to: Option<Stamp>| from.zip(to).map(|(from, to)| duration(to.ms_since(&from)));
-    let progress = board.get(&r.robot_id).and_then(|live| live.report.update.as_ref());
     v1::RolloutRobot {
         rollout_id: r.rollout_id.to_string(),
         robot_id: r.robot_id.to_string(),
@@ -202,7 +201,7 @@ pub fn robot(view: &View, board: &Board, now: &Now, row: &Rollout, r: &RolloutRo
         attempted: r.attempted,
         failure: r.failure.as_ref().map(shown),
         why: r.why.as_ref().map(shown),
-        progress_permille: progress.map_or(0, |u| u32::from(u.progress_permille)),
+        progress_permille: progress_permille(board, r),
         trial: Some(tally(verdict::exposure_of(view, row, r))),
         off_work: Some(v1::OffWork {
             drain_wait: span(m.asked, m.draining),
@@ -213,6 +212,12 @@ pub fn robot(view: &View, board: &Board, now: &Now, row: &Rollout, r: &RolloutRo
         }),
         drain_id: text(r.drain_id.as_ref()),
     }
+}
+
+/// How much of its bundle a robot has downloaded, as it said last.
+pub fn progress_permille(board: &Board, r: &RolloutRobot) -> u32 {
+    let update = board.get(&r.robot_id).and_then(|live| live.report.update.as_ref());
+    update.map_or(0, |u| u32::from(u.progress_permille))
 }
 
 /// What a roll-out would do.

@@ -1,5 +1,6 @@
 //! The gRPC face of roll-outs: decode, call, encode.
 
+use super::watch::Countdowns;
 use super::{RolloutService, decode, encode, watch};
 use crate::repository::Release;
 use midshift_core::identity::{Caller, Permission};
@@ -510,15 +511,16 @@ impl Face for RolloutService {
         &self,
         r: Request<v1::WatchRolloutRequest>,
     ) -> Result<Response<Self::WatchRolloutStream>, Status> {
-        let by = caller(&r);
-        let rollout_id = named(&r.into_inner().rollout_id).map_err(|refusal| midshift_proto::status(&refusal, None))?;
+        let (by, r) = (caller(&r), r.into_inner());
+        let countdowns = if r.counts_down { Countdowns::Followed } else { Countdowns::WithChanges };
+        let rollout_id = named(&r.rollout_id).map_err(|refusal| midshift_proto::status(&refusal, None))?;
         let (teller, reader) = watches::watch();
         let service = self.clone();
         tokio::spawn(async move {
             let shutdown = service.shutdown.clone();
             tokio::select! {
                 () = shutdown.cancelled() => {}
-                () = watch::watch(service, rollout_id, by, &teller) => {}
+                () = watch::watch(service, rollout_id, countdowns, by, &teller) => {}
             }
         });
         Ok(Response::new(reader))

@@ -1,11 +1,15 @@
 //! A roll-out as it goes: now, and with each change, until it has ended.
+//!
+//! What is told changes with rows, with tasks that end on trial, with what robots say of their downloads, and with time. Rows of this service
+//! wake a watcher; for the rest it looks again each second.
 
 use super::{RolloutService, encode};
+use midshift_core::gates::TaskTally;
 use midshift_core::identity::Caller;
 use midshift_core::ids::RolloutId;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::rollout::view::View;
-use midshift_core::rollout::{Board, objects};
+use midshift_core::rollout::{Board, objects, verdict};
 use midshift_core::rows::Revision;
 use midshift_core::time::Now;
 use midshift_proto::ota::v1;
@@ -15,14 +19,28 @@ use std::time::Duration;
 
 /// Messages to one watcher come no faster.
 const PACE: Duration = Duration::from_millis(500);
+/// What no row of this service tells is looked at so often.
+const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// Robots in one message.
 const ROBOTS_MAX: usize = 1_000;
 
+/// Whether somebody watches the time that is left, too.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Countdowns {
+    /// It is told with each other change.
+    WithChanges,
+    /// It is told each second.
+    Followed,
+}
+
+/// What may change of a robot: its row, the tasks that it ended on trial, and how much it has downloaded, permille.
+type Shown = (Revision, TaskTally, u32);
+
 /// What a watcher was told last, and what it is told next.
-#[derive(Default)]
 struct Told {
-    rollout: Option<Revision>,
-    robots: BTreeMap<String, Revision>,
+    countdowns: Countdowns,
+    rollout: Option<v1::Rollout>,
+    robots: BTreeMap<String, Shown>,
 }
 
 impl Told {
@@ -42,24 +60,46 @@ impl Told {
         let (from, to) = (format!("{id}/"), format!("{id}0"));
         let mut robots = Vec::new();
         for (key, r) in view.robots.range(from..to) {
-            let known = self.robots.get(key) == Some(&r.revision);
+            let shown: Shown =
+                (r.revision, verdict::exposure_of(view, &rowed.row, &r.row), encode::progress_permille(board, &r.row));
+            let known = self.robots.get(key) == Some(&shown);
             if !known && robots.len() < ROBOTS_MAX {
-                self.robots.insert(key.clone(), r.revision);
+                self.robots.insert(key.clone(), shown);
                 if !first || !r.row.step.is_over() {
                     robots.push(encode::robot(view, board, now, &rowed.row, &r.row));
                 }
             }
         }
-        let is_new = self.rollout != Some(rowed.revision) || !robots.is_empty();
-        self.rollout = Some(rowed.revision);
-        let message = v1::WatchRolloutResponse { rollout: Some(encode::rollout(view, now, &rowed.row)), robots };
+        let rollout = encode::rollout(view, now, &rowed.row);
+        let is_new = !robots.is_empty() || !self.has_told(&rollout);
+        if is_new {
+            self.rollout = Some(rollout.clone());
+        }
+        let message = v1::WatchRolloutResponse { rollout: Some(rollout), robots };
         Ok((is_new.then_some(message), rowed.row.phase.is_over()))
+    }
+
+    /// Whether a watcher knows this already. Time that passes is news only to one that follows it.
+    fn has_told(&self, rollout: &v1::Rollout) -> bool {
+        let Some(told) = &self.rollout else { return false };
+        if self.countdowns == Countdowns::Followed {
+            return told == rollout;
+        }
+        let begun = |rollout: &v1::Rollout| (rollout.soak_left.is_some(), rollout.exposure_left.is_some());
+        let (soak_left, exposure_left) = (told.soak_left, told.exposure_left);
+        begun(told) == begun(rollout) && *told == v1::Rollout { soak_left, exposure_left, ..rollout.clone() }
     }
 }
 
 /// Watches until the roll-out has ended, the watcher goes, or the server stops.
-pub async fn watch(service: RolloutService, id: RolloutId, by: Caller, teller: &Teller<v1::WatchRolloutResponse>) {
-    let mut told = Told::default();
+pub async fn watch(
+    service: RolloutService,
+    id: RolloutId,
+    countdowns: Countdowns,
+    by: Caller,
+    teller: &Teller<v1::WatchRolloutResponse>,
+) {
+    let mut told = Told { countdowns, rollout: None, robots: BTreeMap::new() };
     let mut changed = service.changed.clone();
     while teller.asked().await.is_ok() {
         changed.mark_unchanged();
@@ -88,7 +128,11 @@ pub async fn watch(service: RolloutService, id: RolloutId, by: Caller, teller: &
         tokio::select! {
             () = teller.gone() => return,
             news = changed.changed() => if news.is_err() { return },
+            () = tokio::time::sleep(LOOK_EVERY) => {}
         }
         tokio::time::sleep(PACE).await;
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,10 +1,18 @@
 //! The picture of robots that people and programs see.
 
-use crate::world::{Result, Robot, World, world};
+use crate::world::{Result, Robot, World, clock, serve, world};
+use midshift_core::ids::SiteId;
+use midshift_core::robot::{Mode, ReportedState, Vitals};
+use midshift_core::time::Clock;
+use midshift_proto::convert::{ms_of, time_of};
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
 use midshift_proto::telemetry::v1::{
     self, GetRobotRequest, Presence, RobotFilter, WatchRobotsRequest, WatchRobotsResponse,
 };
+use midshift_store::{LiveBoard, MemoryFrames, MemoryStore, Store, StoreId};
+use midshift_telemetry::{Bugs, Parts};
+use std::sync::Arc;
+use std::time::Duration;
 use tonic::Streaming;
 
 struct Watcher(Streaming<WatchRobotsResponse>);
@@ -87,6 +95,77 @@ async fn get(world: &World) -> Result<v1::Robot> {
     let request = GetRobotRequest { robot_id: "r1".to_owned() };
     let answer = TelemetryServiceClient::new(world.channel.clone()).get_robot(request).await?.into_inner();
     answer.robot.ok_or_else(|| "no robot".into())
+}
+
+/// A server that begins on what another one left.
+async fn begin(store: &Arc<dyn Store>, clock: &Arc<dyn Clock>) -> Result<World> {
+    let frames = Arc::new(MemoryFrames::new(clock.clone(), 1 << 20));
+    let (store, clock, bugs) = (store.clone(), clock.clone(), Bugs::default());
+    serve(Parts { store, frames, board: LiveBoard::new(), heard: None, clock, bugs }).await
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_is_offline_after_a_start_with_what_was_known_of_it_until_it_is_heard() -> Result<()> {
+    let clock = clock();
+    let store: Arc<dyn Store> =
+        Arc::new(MemoryStore::new(SiteId::parse("s")?, StoreId(Arc::from("store-1")), clock.clone()));
+    let first = begin(&store, &clock).await?;
+    let mut robot = Robot::attach(&first, None).await?;
+    let mut watcher = Watcher::of(&first, &[]).await?;
+    let vitals = Vitals { battery_permille: 640, ..Vitals::default() };
+    let manual = || ReportedState { mode: Mode::Manual, vitals: vitals.clone(), ..ReportedState::default() };
+    robot.beat_saying(manual(), None).await?;
+    assert_eq!(watcher.after(Presence::Offline).await?, Presence::Online);
+    let before = get(&first).await?;
+    assert_eq!(before.conditions.iter().map(|c| c.what.as_str()).collect::<Vec<_>>(), ["manual"]);
+    assert_eq!(before.last_heard, None);
+    let proof = robot.proof();
+    first.end.cancel();
+
+    tokio::time::advance(Duration::from_secs(20)).await;
+    let second = begin(&store, &clock).await?;
+    let mut watcher = Watcher::of(&second, &[]).await?;
+    assert_eq!(watcher.presence().await?, Presence::Offline);
+    let shown = get(&second).await?;
+    assert_eq!((shown.presence(), &shown.reported, &shown.age), (Presence::Offline, &None, &None));
+    assert_eq!(shown.presence_since, before.receive_time, "it was heard then");
+    let last = shown.last_heard.ok_or("nothing is known")?;
+    assert_eq!((last.battery_permille, last.receive_time), (640, before.receive_time));
+    assert!(last.age.as_ref().map(ms_of) >= Some(20_000), "{:?}", last.age);
+    assert_eq!(shown.conditions, before.conditions, "as it was heard last");
+    let mut online = Watcher::of(&second, &[Presence::Online]).await?;
+    assert!(online.next().await?.robots.is_empty());
+
+    let mut robot = Robot::attach(&second, Some(proof)).await?;
+    robot.beat_saying(manual(), None).await?;
+    assert_eq!(watcher.after(Presence::Offline).await?, Presence::Online);
+    let heard = get(&second).await?;
+    assert_eq!((&heard.last_heard, &heard.conditions), (&None, &before.conditions), "it never said otherwise");
+    assert!(heard.reported.is_some());
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_keeps_a_robot_from_work_is_told_with_since_when_it_says_so() -> Result<()> {
+    let world = world().await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.beat_saying(ReportedState { mode: Mode::Manual, ..ReportedState::default() }, None).await?;
+    let mut watcher = Watcher::of(&world, &[]).await?;
+    watcher.after(Presence::Offline).await?;
+    let manual = get(&world).await?;
+    tokio::time::advance(Duration::from_secs(2)).await;
+    let stop_level = midshift_core::robot::StopLevel::Halt;
+    robot.beat_saying(ReportedState { mode: Mode::Manual, stop_level, ..ReportedState::default() }, None).await?;
+    while watcher.next().await?.robots.iter().all(|r| r.conditions.len() < 2) {}
+    let both = get(&world).await?;
+    let since = |robot: &v1::Robot, what: &str| {
+        let found = robot.conditions.iter().find(|c| c.what == what);
+        found.and_then(|c| c.since.as_ref()).map(time_of)
+    };
+    assert_eq!(both.conditions.iter().map(|c| c.what.as_str()).collect::<Vec<_>>(), ["stop halt", "manual"]);
+    assert_eq!(since(&both, "manual"), since(&manual, "manual"), "it goes on since then");
+    assert_eq!(since(&both, "stop halt"), both.receive_time.as_ref().map(time_of));
+    Ok(())
 }
 
 #[tokio::test(start_paused = true)]

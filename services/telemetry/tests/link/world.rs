@@ -29,6 +29,8 @@ pub struct World {
     pub channel: Channel,
     pub service: TelemetryService,
     pub board: Arc<LiveBoard<Live>>,
+    /// Ends the service.
+    pub end: CancellationToken,
     leaving: Leavings,
     pipes: Pipes,
 }
@@ -103,7 +105,8 @@ pub async fn serve(parts: Parts) -> Result<World> {
 /// The same, of a service that has read nothing before `read`.
 pub async fn serve_after(parts: Parts, read: impl Future<Output = ()> + Send + 'static) -> Result<World> {
     let (store, board) = (parts.store.clone(), parts.board.clone());
-    let service = TelemetryService::new(parts, CancellationToken::new());
+    let end = CancellationToken::new();
+    let service = TelemetryService::new(parts, end.clone());
     let running = service.clone();
     tokio::spawn(async move {
         read.await;
@@ -120,7 +123,7 @@ pub async fn serve_after(parts: Parts, read: impl Future<Output = ()> + Send + '
     let server = port.add_service(service.link()).add_service(service.replay()).add_service(service.grpc());
     tokio::spawn(server.serve_with_incoming(ReceiverStream::new(incoming)));
     let channel = dial(pipes.clone()).await?;
-    Ok(World { store, channel, service, board, leaving, pipes })
+    Ok(World { store, channel, service, board, end, leaving, pipes })
 }
 
 /// Header in which a test says who asks; without it nobody is asked.
@@ -229,11 +232,14 @@ impl Robot {
     }
     /// A heartbeat from a waypoint.
     pub async fn beat_at(&mut self, waypoint: Option<&str>, clock: Option<ClockSample>) -> Result<()> {
-        self.hb += 1;
         let waypoint = waypoint.map(WaypointId::parse).transpose()?;
         let vitals = Vitals { waypoint, ..Vitals::default() };
-        let session_epoch = self.welcome.session_epoch;
-        let reported = ReportedState { hb: self.hb, session_epoch, vitals, ..ReportedState::default() };
+        self.beat_saying(ReportedState { vitals, ..ReportedState::default() }, clock).await
+    }
+    /// A heartbeat that says this; its number and session are put in.
+    pub async fn beat_saying(&mut self, reported: ReportedState, clock: Option<ClockSample>) -> Result<()> {
+        self.hb += 1;
+        let reported = ReportedState { hb: self.hb, session_epoch: self.welcome.session_epoch, ..reported };
         self.say(Uplink { heartbeat: Some(Heartbeat { reported, sent_unix_us: 0, clock }), batches: Vec::new() }).await
     }
     pub async fn events(&self, seqs: std::ops::RangeInclusive<u64>) -> Result<()> {

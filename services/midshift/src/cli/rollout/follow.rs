@@ -19,6 +19,13 @@ const REVIEW: u8 = 11;
 /// Exit code: it did not stay.
 const WENT_BACK: u8 = 12;
 
+/// Whether the time that is left is shown as it passes.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Countdowns {
+    Shown,
+    NotShown,
+}
+
 /// A roll-out as it was told last.
 #[derive(Default)]
 pub struct Picture {
@@ -39,6 +46,9 @@ impl Picture {
             let known = self.robots.get(&robot.robot_id);
             if known.is_none_or(|k| k.step != robot.step || k.failure != robot.failure) {
                 news.push(line(robot.since.as_ref(), &text::robot(&robot)));
+            } else if known.is_some_and(|k| k.trial != robot.trial) {
+                // Of a task nobody says here when it ended.
+                news.push(line(None, &text::robot(&robot)).trim_start().to_owned());
             }
             self.robots.insert(robot.robot_id.clone(), robot);
         }
@@ -100,8 +110,9 @@ pub fn end(rollout: &v1::Rollout, until: Until) -> Option<Result<(), Exit>> {
     }
 }
 
-async fn messages(one: &One) -> Result<Streaming<v1::WatchRolloutResponse>, Exit> {
-    let request = v1::WatchRolloutRequest { rollout_id: one.rollout_id.clone() };
+async fn messages(one: &One, countdowns: Countdowns) -> Result<Streaming<v1::WatchRolloutResponse>, Exit> {
+    let counts_down = countdowns == Countdowns::Shown;
+    let request = v1::WatchRolloutRequest { rollout_id: one.rollout_id.clone(), counts_down };
     Ok(one.call.rollouts().await?.watch_rollout(request).await.map_err(Exit::with_facts)?.into_inner())
 }
 
@@ -109,6 +120,7 @@ async fn messages(one: &One) -> Result<Streaming<v1::WatchRolloutResponse>, Exit
 pub async fn watch(one: &One, out: &Out) -> Result<(), Exit> {
     let mut picture = Picture::default();
     let is_live = out.format == Format::Table && std::io::stdout().is_terminal();
+    let countdowns = if is_live { Countdowns::Shown } else { Countdowns::NotShown };
     let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::hidden());
     if is_live {
         bar.set_draw_target(ProgressDrawTarget::stdout());
@@ -116,7 +128,7 @@ pub async fn watch(one: &One, out: &Out) -> Result<(), Exit> {
     }
     let end = follow(
         out,
-        async || messages(one).await,
+        async || messages(one, countdowns).await,
         |message| {
             let Some(message) = message else {
                 return Ok(end(&picture.rollout, Until::Ended).map_or(ControlFlow::Continue(()), ControlFlow::Break));
@@ -159,5 +171,5 @@ async fn until_end(one: &One, until: Until, out: &Out) -> Result<(v1::Rollout, R
         let rollout = message.and_then(|m| m.rollout).unwrap_or_default();
         Ok(end(&rollout, until).map_or(ControlFlow::Continue(()), |end| ControlFlow::Break((rollout, end))))
     };
-    follow(out, async || messages(one).await, take).await
+    follow(out, async || messages(one, Countdowns::NotShown).await, take).await
 }

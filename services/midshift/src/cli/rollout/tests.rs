@@ -249,7 +249,15 @@ fn a_watch_tells_each_change_once() {
     );
     // The same again, and a countdown: nothing to tell.
     let counted = v1::Rollout { soak_left: Some(duration(1)), ..before };
-    assert_eq!(picture.take(message(counted, vec![draining()])), Vec::<String>::new());
+    assert_eq!(picture.take(message(counted.clone(), vec![draining()])), Vec::<String>::new());
+    // A task that ends on trial is told, once.
+    let works = |succeeded| {
+        let trial = Some(v1::TaskTally { succeeded, failed: 0 });
+        v1::RolloutRobot { trial, ..robot("rbt-07", 1, RolloutStep::Trial) }
+    };
+    assert_eq!(picture.take(message(counted.clone(), vec![works(0)])).len(), 1);
+    assert_eq!(picture.take(message(counted.clone(), vec![works(1)])), ["rbt-07  TRIAL, 1 tasks done, 0 failed"]);
+    assert_eq!(picture.take(message(counted, vec![works(1)])), Vec::<String>::new());
     let news = picture.take(message(rollout(), vec![robot("rbt-04", 1, RolloutStep::Activating)]));
     assert_eq!(news.len(), 3, "{news:?}");
     assert!(news[1].contains("PROMOTED_UNPROVEN") && news[1].contains("fewer than 95.0 % fail"), "{}", news[1]);

@@ -106,7 +106,7 @@ async fn nobody_watches_a_roll_out_that_it_may_not_see() {
     let create = v1::CreateRolloutRequest { rollout_id: "quality".to_owned(), spec: spec(&["quality"]) };
     Face::create_rollout(&process.face, Request::new(create)).await.expect("everything");
     let first = async |by: &Caller| {
-        let request = v1::WatchRolloutRequest { rollout_id: "quality".to_owned() };
+        let request = v1::WatchRolloutRequest { rollout_id: "quality".to_owned(), ..Default::default() };
         let mut stream = Face::watch_rollout(&process.face, asked(by, request)).await.expect("a stream").into_inner();
         tokio_stream::StreamExt::next(&mut stream).await.expect("a message").map_err(|status| status.code())
     };
