@@ -119,7 +119,7 @@ pub fn take_over(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: 
 /// The store turned out a moment ago to be older than a robot: it does not know what it gave.
 pub fn is_restored_lately(view: &View, now: &Now) -> bool {
     let behind = view.incidents.values().map(|i| &i.row).filter(|i| i.reason.code == Code::StoreBehindRobot);
-    behind.into_iter().any(|i| now.utc.ms_since(i.opened) <= limits::RESTORED_LATELY.as_ms())
+    behind.into_iter().any(|i| now.ms_since(i.opened) <= limits::RESTORED_LATELY.as_ms())
 }
 
 /// A robot is inside of the place now: with more inside than it holds, people are told of each pair that it makes.
