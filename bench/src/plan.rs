@@ -146,6 +146,7 @@ fn cycle_ms(site: &Arc<Site>, router: &Arc<Router>, kind: Fleet, robots: usize, 
         link: LinkTime(60_000),
         utc: Utc(1_800_000_000_000),
         wall: Utc(1_800_000_000_000),
+        jump: None,
     };
     let (mut view, board) = fleet(site, kind, robots, seed, now);
     view.router = router.clone();

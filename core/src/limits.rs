@@ -494,6 +494,16 @@ pub const REQUESTS_BURST: u32 = 2_000;
 pub const CLASS_KEPT_PERMILLE: usize = 100;
 /// How often a connection without a certificate is looked at for tokens that have ended: a stream goes on no longer than that behind its token.
 pub const CONNECTION_ASKED_AGAIN: LinkDuration = LinkDuration::from_secs(5);
+/// Frames of HTTP/2 that ask for nothing (SETTINGS, PRIORITY, PING, WINDOW_UPDATE and such) that one connection may send at once beyond those that it
+/// earned: browsers begin with some dozens.
+pub const CONTROL_FRAMES_BURST: u64 = 1_024;
+/// The same for long: a peer that pings each second, and a hundred times more.
+pub const CONTROL_FRAMES_PER_SECOND: u64 = 128;
+/// What one frame of an answer, or one request, lets in more: a WINDOW_UPDATE for the stream, one for the connection, a ping that measures the line, and
+/// a reset.
+pub const CONTROL_FRAMES_PER_ANSWER: u64 = 4;
+/// So many that were earned are remembered: a client that was held up reads a full window of small messages at once.
+pub const CONTROL_FRAMES_EARNED_MAX: u64 = 1 << 18;
 /// Usual age at which a connection is asked to go, a tenth more or less. With notice and grace it ends within an hour: a certificate that was renewed is
 /// soon the one in use, and connections spread anew over the processes behind a proxy.
 pub const CONNECTION_AGE: LinkDuration = LinkDuration::from_secs(54 * 60);
@@ -518,6 +528,26 @@ pub const DENIALS_QUEUED_MAX: usize = 256;
 pub const DENIED_PATH_BYTES: usize = 128;
 /// Principals whose rate is remembered; the one heard longest ago is forgotten first, and begins anew.
 pub const RATES_REMEMBERED: usize = 16_384;
+
+// --- logs
+
+/// So many lines of one kind about one peer are written before they are only counted: a robot that comes and goes a few times is seen each time.
+pub const FLOOD_LINES: u32 = 4;
+/// How often what was only counted is said.
+pub const FLOOD_COUNTED_EVERY: LinkDuration = LinkDuration::from_secs(60);
+/// Peers that are counted each for itself; more than robots of a site that come at once, twice over.
+pub const FLOOD_PEERS_MAX: usize = 1_024;
+
+// --- clocks
+
+/// The wall clock jumped if it is so far from where the monotonic clock expects it: more than NTP steps a clock that it keeps.
+pub const CLOCK_JUMP: LinkDuration = LinkDuration::from_secs(5);
+/// A jump of more than this is no correction of a clock that ran: a machine slept, or somebody set it.
+pub const CLOCK_JUMP_LARGE: LinkDuration = LinkDuration::from_secs(3_600);
+/// Connections that stand at a large jump ahead stay for so long though their tokens are over by it: time to look and to set the clock right.
+pub const CLOCK_JUMP_STANDING: LinkDuration = LinkDuration::from_secs(600);
+/// The wall may drift by one part of so many without a jump: twice what Linux slews.
+pub const CLOCK_SLEW_PART: u64 = 1_000;
 
 // --- identity
 

@@ -4,7 +4,7 @@ use crate::ids::AreaId;
 use crate::limits;
 use crate::reason::Violations;
 use crate::rows::{Record, Table};
-use crate::time::Utc;
+use crate::time::{Now, Utc};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -29,19 +29,31 @@ pub struct Window {
 }
 
 impl Window {
-    /// Whether it is open. A zone that nobody knows is never open.
-    pub fn is_open(&self, at: Utc) -> bool {
-        let Ok(zone) = jiff::tz::TimeZone::get(&self.zone) else { return false };
-        let Ok(stamp) = jiff::Timestamp::from_millisecond(at.0) else { return false };
-        let local = stamp.to_zoned(zone);
+    /// When the stretch of it began in which `at` lies; none: it is not open then. A zone that nobody knows is never open.
+    pub fn began(&self, at: Utc) -> Option<Utc> {
+        let zone = jiff::tz::TimeZone::get(&self.zone).ok()?;
+        let local = jiff::Timestamp::from_millisecond(at.0).ok()?.to_zoned(zone.clone());
         let today = local.weekday().to_monday_one_offset() as u8;
         let yesterday = if today == 1 { 7 } else { today - 1 };
         let minute = u16::from(local.hour() as u8) * 60 + u16::from(local.minute() as u8);
         let begins_on = |day: u8| self.days.is_empty() || self.days.contains(&day);
-        if self.from_minute < self.to_minute {
-            return begins_on(today) && (self.from_minute..self.to_minute).contains(&minute);
-        }
-        (begins_on(today) && minute >= self.from_minute) || (begins_on(yesterday) && minute < self.to_minute)
+        let is_in_a_day = self.from_minute < self.to_minute;
+        let date = if begins_on(today) && minute >= self.from_minute && !(is_in_a_day && minute >= self.to_minute) {
+            local.date()
+        } else if !is_in_a_day && begins_on(yesterday) && minute < self.to_minute {
+            local.date().yesterday().ok()?
+        } else {
+            return None;
+        };
+        let (hour, minute) = (i8::try_from(self.from_minute / 60).ok()?, i8::try_from(self.from_minute % 60).ok()?);
+        let began = date.at(hour, minute, 0, 0).to_zoned(zone).ok()?;
+        Some(Utc(began.timestamp().as_millisecond()))
+    }
+
+    /// Whether it is open now, and not because the wall jumped into it: such a stretch stays closed to its end.
+    pub fn is_open(&self, now: &Now) -> bool {
+        let jumped_into = |began| now.jump.is_some_and(|jump| jump.opened(began, self.began(jump.from)));
+        self.began(now.utc).is_some_and(|began| !jumped_into(began))
     }
 }
 
@@ -75,8 +87,8 @@ impl Default for SoftwareRules {
 
 impl SoftwareRules {
     /// Whether drains may begin.
-    pub fn is_open(&self, at: Utc) -> bool {
-        !self.frozen && (self.windows.is_empty() || self.windows.iter().any(|w| w.is_open(at)))
+    pub fn is_open(&self, now: &Now) -> bool {
+        !self.frozen && (self.windows.is_empty() || self.windows.iter().any(|w| w.is_open(now)))
     }
     /// Robots that may be out of work at once, of so many in the area.
     pub fn off_work_max(&self, robots: usize) -> usize {
@@ -199,9 +211,23 @@ impl Record for AreaPolicy {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::time::LinkTime;
+    use crate::wall::Jump;
 
     fn at(text: &str) -> Utc {
         Utc(text.parse::<jiff::Timestamp>().expect("a time").as_millisecond())
+    }
+
+    fn now(text: &str) -> Now {
+        Now { utc: at(text), wall: at(text), ..Now::default() }
+    }
+
+    fn window(from_minute: u16, to_minute: u16) -> Window {
+        Window { days: BTreeSet::new(), from_minute, to_minute, zone: "UTC".to_owned() }
+    }
+
+    fn jump(from: &str, to: &str) -> Jump {
+        Jump { from: at(from), to: at(to), at: LinkTime(0), skipped_ms: at(to).ms_since(at(from)) }
     }
 
     #[test]
@@ -217,17 +243,38 @@ mod tests {
             ("2026-11-20T03:00:00Z", false),
             ("2026-11-21T22:00:00Z", false),
         ] {
-            assert_eq!(friday_night.is_open(at(text)), open, "{text}");
+            assert_eq!(friday_night.is_open(&now(text)), open, "{text}");
         }
         // In summer two hours.
-        assert!(friday_night.is_open(at("2026-07-03T20:00:00Z")));
+        assert!(friday_night.is_open(&now("2026-07-03T20:00:00Z")));
+    }
+
+    #[test]
+    fn a_window_that_the_wall_jumped_into_stays_closed_to_its_end_and_opens_the_next_time() {
+        let night = window(22 * 60, 5 * 60);
+        let jumped = |from, to, text| Now { jump: Some(jump(from, to)), ..now(text) };
+        let (noon, midnight) = ("2026-11-20T12:00:00Z", "2026-11-21T00:00:00Z");
+        assert!(night.is_open(&now(midnight)), "the naive rule lets software in at noon");
+        for (text, open) in [
+            ("2026-11-21T00:00:00Z", false),
+            ("2026-11-21T04:59:00Z", false),
+            ("2026-11-21T21:59:00Z", false),
+            ("2026-11-21T22:00:00Z", true),
+            ("2026-11-22T04:59:00Z", true),
+        ] {
+            assert_eq!(night.is_open(&jumped(noon, midnight, text)), open, "{text}");
+        }
+        assert!(night.is_open(&jumped("2026-11-20T22:30:00Z", midnight, midnight)), "it was open before");
+        assert!(!night.is_open(&jumped("2026-11-20T04:00:00Z", midnight, midnight)), "not in this night");
+        let (morning, night_before) = ("2026-11-20T06:00:00Z", "2026-11-20T04:00:00Z");
+        assert!(!night.is_open(&jumped(morning, night_before, night_before)), "nor by a jump back");
     }
 
     #[test]
     fn a_frozen_area_is_closed_and_one_without_windows_is_open() {
         let rules = SoftwareRules::default();
-        assert!(rules.is_open(Utc(0)));
-        assert!(!SoftwareRules { frozen: true, ..rules.clone() }.is_open(Utc(0)));
+        assert!(rules.is_open(&Now::default()));
+        assert!(!SoftwareRules { frozen: true, ..rules.clone() }.is_open(&Now::default()));
         assert_eq!([6, 20, 60].map(|n| rules.off_work_max(n)), [1, 2, 6]);
     }
 

@@ -3,6 +3,7 @@
 //! `Site*` is the time of the work (motion, battery, task timeouts, back-off); `midshift dev --speedup` scales it.
 //! `Link*` is monotonic and never scaled (heartbeats, authority, resend, commits). A service reads both from a [`Clock`].
 
+use crate::wall::Jump;
 use serde::{Deserialize, Serialize};
 use std::ops::{Add, Sub};
 
@@ -97,6 +98,8 @@ pub struct Now {
     pub utc: Utc,
     /// UTC of the wall. Generations, session epochs, store sequence.
     pub wall: Utc,
+    /// What the wall jumped in this run by more than an hour; none: it did not, or the site clock is a simulation's own.
+    pub jump: Option<Jump>,
 }
 
 /// Where a service or an agent reads the time. Implemented by the binary over tokio's clock, so that a simulation can own it.
@@ -105,9 +108,14 @@ pub trait Clock: Send + Sync + 'static {
     fn now(&self) -> Now;
     /// How fast the site clock runs, thousandths; 1000 is real time.
     fn rate_permille(&self) -> u32;
+    /// The newest jump of the wall against the link clock in this run, however large.
+    fn last_jump(&self) -> Option<Jump> {
+        None
+    }
 }
 
-/// The one implementation of [`Clock`]: a monotonic source in microseconds, a UTC base, and a rate.
+/// Clocks of a simulation: a monotonic source in microseconds, a UTC base, and a rate. Their wall never jumps; that of a machine may, see
+/// [`crate::wall::WallClock`].
 ///
 /// Scaled site time is advanced by reading it. If nobody read it for more than 2 s of site time the loop has fallen
 /// behind, and the site clock slows instead of jumping: [`ScaledClock::site_elapsed_ms`] against the link clock gives the rate
@@ -146,6 +154,7 @@ impl<F: Fn() -> u64 + Send + Sync + 'static> Clock for ScaledClock<F> {
             link: LinkTime(mono_us / 1000),
             utc: self.utc_base.plus_ms(site_ms),
             wall: self.utc_base.plus_ms(mono_us / 1000),
+            jump: None,
         }
     }
     fn rate_permille(&self) -> u32 {

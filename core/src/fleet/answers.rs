@@ -126,8 +126,8 @@ pub fn answered(tx: &mut Tx, robot_id: &RobotId) {
 /// If so.
 pub fn screen(view: &View, robot_id: &RobotId, now: &Now) -> Result<(), Reason> {
     let since = view.control.get(robot_id.as_str()).and_then(|c| c.row.unanswered_since);
-    if let Some(since) = since.filter(|since| now.utc.ms_since(*since) < limits::BREAKER_WINDOW.as_ms()) {
-        let left_ms = limits::BREAKER_WINDOW.as_ms() - now.utc.ms_since(since);
+    if let Some(since) = since.filter(|since| now.ms_since(*since) < limits::BREAKER_WINDOW.as_ms()) {
+        let left_ms = limits::BREAKER_WINDOW.as_ms() - now.ms_since(since);
         return Err(Reason::from(Code::RobotDoesNotAnswer).with("probe_in_ms", left_ms));
     }
     match view.answers.backed_off.get(robot_id) {

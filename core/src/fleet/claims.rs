@@ -136,7 +136,7 @@ pub fn is_ahead(view: &View, robot_id: &RobotId, now: &Now) -> bool {
     let told = view.incidents.values().map(|i| &i.row).filter(|i| is_it(i));
     let given = view.desired_work.get(robot_id.as_str()).map_or(0, |d| d.row.generation);
     view.sessions.get(robot_id.as_str()).is_some_and(|s| s.row.followed_work() > given)
-        || told.into_iter().any(|i| now.utc.ms_since(i.opened) <= limits::RESTORED_LATELY.as_ms())
+        || told.into_iter().any(|i| now.ms_since(i.opened) <= limits::RESTORED_LATELY.as_ms())
 }
 
 /// A robot is inside of the place now: with more inside than it holds, people are told of each pair that it makes.

@@ -115,7 +115,7 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
 }
 
 fn further(tx: &mut Tx, drain: &Drain, board: &Board) {
-    let left_ms = drain.within_ms.saturating_sub(tx.now.utc.ms_since(drain.since));
+    let left_ms = drain.within_ms.saturating_sub(tx.now.ms_since(drain.since));
     let holder = tx.view.authority.get(drain.robot_id.as_str()).map(|a| a.row.holder.clone()).unwrap_or_default();
     let live = board.get(&drain.robot_id).cloned();
     match holder {

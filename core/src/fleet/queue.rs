@@ -432,14 +432,14 @@ fn check_robots(view: &mut View, now: Now, plan: &mut Plan) {
 pub(super) fn tell_backlog(view: &mut View, now: Now, plan: &mut Plan) {
     let id = format!("{}:{}", Code::TaskBacklog, view.site.site_id());
     let known = view.incidents.get(&id).map(|incident| &incident.row);
-    let old = view.queue.oldest().filter(|(since, _)| now.utc.ms_since(*since) > limits::BACKLOG_AGE.as_ms());
+    let old = view.queue.oldest().filter(|(since, _)| now.ms_since(*since) > limits::BACKLOG_AGE.as_ms());
     match (old, known.map(|incident| &incident.closed)) {
         (None, Some(None)) => {
             let why = "no task waits longer than an hour";
             plan.decide(view, now, "fleet", |tx| incidents::close(tx, &id, why, "fleet"));
         }
         (Some((since, task_id)), closed) => {
-            let rested = |at: Utc| now.utc.ms_since(at) >= limits::BACKLOG_PAUSE.as_ms();
+            let rested = |at: Utc| now.ms_since(at) >= limits::BACKLOG_PAUSE.as_ms();
             if closed.is_some_and(|closed| closed.as_ref().is_none_or(|closed| !rested(closed.at))) {
                 return;
             }

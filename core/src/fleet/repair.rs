@@ -265,7 +265,7 @@ fn stalled(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
     let Some(intake) = tx.view.intake(&task_id) else { return };
     let uncertain = tx.view.held_by(robot_id).and_then(|a| tx.view.attempt(a)).is_some_and(|a| a.uncertain.is_some());
     let accepted = tx.view.held_by(robot_id).and_then(|a| tx.view.attempt(a)).and_then(|a| a.accepted);
-    let young = accepted.is_none_or(|at| tx.now.utc.ms_since(at) <= intake.spec.stall_ms);
+    let young = accepted.is_none_or(|at| tx.now.ms_since(at) <= intake.spec.stall_ms);
     let excused = places::waits(tx.view, robot_id)
         || live.report.mode != Mode::Automatic
         || live.report.hardware_stop != HardwareStop::None

@@ -101,7 +101,7 @@ pub(super) fn count_readiness(tx: &mut Tx, task_id: &TaskId) {
     let is_ready = tx.view.queue.rank(task_id).is_some();
     match (is_ready, known) {
         (true, None) => {
-            let spent = tx.now.utc.ms_since(since);
+            let spent = tx.now.ms_since(since);
             arm(tx, TimerKind::ScheduleToStart, &waiting, limit_ms.saturating_sub(spent));
         }
         (true, Some(mut timer)) if timer.fires_at_service_ms.is_none() => {

@@ -42,7 +42,8 @@ pub struct Directory {
 }
 
 impl Directory {
-    /// Of these rows, as of `now`.
+    /// Of these rows, without what is over at `now`. That is a moment without jumps of the wall ([`crate::time::Now::steady_wall`]): none of them gives a
+    /// key back, or takes a token from streams that stand.
     pub fn of<'a>(
         tokens: impl IntoIterator<Item = &'a TokenRecord>,
         robots: impl IntoIterator<Item = &'a RobotIdentity>,

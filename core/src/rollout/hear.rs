@@ -133,7 +133,7 @@ fn stopped(tx: &mut Tx, robot_id: &RobotId) {
     // What it said just before this may not have been acted upon yet.
     let says_so = says_trial(tx.view, robot_id);
     let Some(robot) = on_trial(tx.view, robot_id).filter(|r| r.step == Step::Trial || says_so) else { return };
-    let since_ms = robot.moments.switched.map_or(0, |at| tx.now.utc.ms_since(at));
+    let since_ms = robot.moments.switched.map_or(0, |at| tx.now.ms_since(at));
     if since_ms <= limits::HARDWARE_STOP_COUNTS.as_ms() {
         fail(tx, &robot, Code::HardwareStopOnTrial.into());
     }

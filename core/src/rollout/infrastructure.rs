@@ -31,7 +31,7 @@ fn heard(view: &View, board: &Board, robot_id: &RobotId) -> LinkTime {
 /// Whether a heartbeat of the robot came since then, UTC on the site clock.
 pub fn is_heard_since(board: &Board, now: &Now, robot_id: &RobotId, since: Utc) -> bool {
     let silent = board.get(robot_id).map(|live| now.site.since(live.processed_site));
-    silent.is_some_and(|silent| silent.as_ms() <= now.utc.ms_since(since))
+    silent.is_some_and(|silent| silent.as_ms() <= now.ms_since(since))
 }
 
 /// The gate of its wave has not closed.

@@ -30,6 +30,6 @@ pub fn named(view: &View, now: &Now) -> BTreeSet<BundleId> {
 /// It is open, something is still due for one of its robots, or it ended not long ago. A clock that went back says nothing of its end.
 fn names(view: &View, rollout: &Rollout, now: &Now) -> bool {
     !rollout.phase.is_over()
-        || now.utc.ms_since(rollout.since) < limits::ROLLOUT_NAMES_DAYS * DAY_MS
+        || now.ms_since(rollout.since) < limits::ROLLOUT_NAMES_DAYS * DAY_MS
         || view.robots_of(&rollout.rollout_id).any(|r| !r.step.is_over())
 }

@@ -117,7 +117,7 @@ fn prefetching(tx: &mut Tx, board: &Board, mut rollout: Rollout) {
     if rollout.supersedes.iter().any(waits_for) || assigns_missing(tx, board, &rollout) {
         return;
     }
-    let late = tx.now.utc.ms_since(rollout.since) >= limits::STAGED_WITHIN.as_ms();
+    let late = tx.now.ms_since(rollout.since) >= limits::STAGED_WITHIN.as_ms();
     let now = tx.now;
     let has_it = |r: &RolloutRobot| r.step >= Step::Staged || is_offline(tx.view, board, &now, r);
     if late || verdict::wave(tx.view, &rollout.rollout_id, 0).all(has_it) {
@@ -151,7 +151,7 @@ fn assigns_missing(tx: &mut Tx, board: &Board, rollout: &Rollout) -> bool {
 /// way. It keeps its drain, and nobody is told that it came through.
 fn is_given_up(now: &Now, rollout: &Rollout, r: &RolloutRobot) -> bool {
     let longest = rollout.spec.probation_ms + limits::STAGED_WITHIN.as_ms();
-    r.failure.is_some() || (r.grant.is_some() && now.utc.ms_since(r.since) >= longest)
+    r.failure.is_some() || (r.grant.is_some() && now.ms_since(r.since) >= longest)
 }
 
 fn applying(tx: &mut Tx, board: &Board, rollout: Rollout) {
@@ -321,7 +321,7 @@ fn aborting(tx: &mut Tx, rollout: Rollout) {
     let alive = |r: &RolloutRobot| r.grant.is_some() && r.moments.switched.is_none() && r.step == Step::Activating;
     let now = Stamp::new(&tx.now, &tx.view.started);
     let latched = rollout.abort.as_ref().and_then(|abort| abort.link);
-    let waited_ms = latched.map_or_else(|| tx.now.utc.ms_since(rollout.since), |latched| now.ms_since(&latched));
+    let waited_ms = latched.map_or_else(|| tx.now.ms_since(rollout.since), |latched| now.ms_since(&latched));
     if !tx.view.robots_of(&rollout.rollout_id).any(alive) || waited_ms >= ABORT_WAITS_MS {
         enter(tx, rollout, Phase::RollingBack, "rollout.rolling_back");
     }

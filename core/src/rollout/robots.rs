@@ -255,7 +255,7 @@ pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rol
     }
     let area = board.get(&r.robot_id).and_then(|live| view.area_of(live));
     let area = area.or_else(|| view.software.get(r.robot_id.as_str()).and_then(|s| s.row.area.clone()));
-    if let Some(area) = area.filter(|area| !view.policy(area).software.is_open(now.utc)) {
+    if let Some(area) = area.filter(|area| !view.policy(area).software.is_open(now)) {
         return Some(Reason::from(Code::BlockedByWindow).with("area_id", area));
     }
     let most = in_flight_max(view, rollout);
@@ -351,7 +351,7 @@ fn activating(
         }
         None if r.ready && may_grant(view, board, now, r) => Some(Move::Grant),
         None => {
-            let held = r.moments.held.map_or(0, |at| now.utc.ms_since(at));
+            let held = r.moments.held.map_or(0, |at| now.ms_since(at));
             let late = held >= limits::READY_WITHIN.as_ms();
             late.then(|| {
                 let why = report.and_then(|r| r.reason.as_ref()).map(|why| why.text().to_owned());
@@ -471,7 +471,7 @@ fn trial(
         return Some(Move::Fail(Code::BreakerOnTrial.into()));
     }
     let promoted = if is_newcomer(rollout, r) {
-        let soaked = r.moments.on_trial.is_some_and(|at| now.utc.ms_since(at) >= rollout.spec.soak_ms);
+        let soaked = r.moments.on_trial.is_some_and(|at| now.ms_since(at) >= rollout.spec.soak_ms);
         soaked && verdict::exposure_of(view, rollout, r).ended() >= rollout.spec.exposure_tasks
     } else {
         r.wave < rollout.promoted

@@ -30,7 +30,7 @@ pub fn is_retried(r: &RolloutRobot) -> bool {
 
 /// The robot's turn came long ago. The time in which the roll-out stood still does not count.
 pub fn is_late(now: &Now, rollout: &Rollout, r: &RolloutRobot) -> bool {
-    now.utc.ms_since(turn_came(rollout, r)) >= limits::STAGED_WITHIN.as_ms()
+    now.ms_since(turn_came(rollout, r)) >= limits::STAGED_WITHIN.as_ms()
 }
 
 /// When the robot's turn came, or the roll-out went on after that.

@@ -204,7 +204,7 @@ mod tests {
     }
 
     fn at(ms: u64) -> Now {
-        Now { site: SiteTime(ms), link: LinkTime(ms), utc: Utc(ms as i64), wall: Utc(ms as i64) }
+        Now { site: SiteTime(ms), link: LinkTime(ms), utc: Utc(ms as i64), wall: Utc(ms as i64), jump: None }
     }
 
     /// Told of nothing, and answered in each second up to and with the third.

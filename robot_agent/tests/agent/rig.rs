@@ -567,7 +567,13 @@ pub fn welcome() -> Welcome {
 }
 
 pub fn now_at(ms: u64) -> Now {
-    Now { site: SiteTime(ms), link: LinkTime(ms), utc: Utc(ms as i64), wall: Utc(1_700_000_000_000 + ms as i64) }
+    Now {
+        site: SiteTime(ms),
+        link: LinkTime(ms),
+        utc: Utc(ms as i64),
+        wall: Utc(1_700_000_000_000 + ms as i64),
+        jump: None,
+    }
 }
 pub fn ack(lane: Lane, seq: u64) -> LaneAck {
     LaneAck { lane, seq, expect: None }

@@ -80,7 +80,7 @@ fn all_news() -> Vec<News> {
 
 /// One robot that hears; whether there is something to keep.
 fn hear(robot: &mut RobotStop, news: &News) -> bool {
-    let now = Now { link: LinkTime(10), site: SiteTime(10), utc: Utc(1_000), wall: Utc(1_000) };
+    let now = Now { link: LinkTime(10), site: SiteTime(10), utc: Utc(1_000), wall: Utc(1_000), jump: None };
     let is_new = match news {
         News::Told(stops, resets) => robot.told(stops.clone(), resets.clone()),
         News::Resumed(stop_id) => robot.resumed(&[stop_id.clone()].into()),

@@ -66,7 +66,8 @@ impl<L: Listen> Accept<L> {
 
     fn worked(&mut self) {
         if self.failures > 0 {
-            tracing::info!(port = self.port, failures = self.failures, "connections are accepted again");
+            let (port, failures) = (self.port, self.failures);
+            tracing::info!(port, peer = "any", failures, "connections are accepted again");
             self.failures = 0;
         }
     }
@@ -79,7 +80,8 @@ impl<L: Listen> Accept<L> {
             return;
         }
         if self.failures == 0 {
-            tracing::warn!(port = self.port, %error, "connections cannot be accepted; trying again, ever more slowly");
+            let port = self.port;
+            tracing::warn!(port, peer = "any", %error, "connections cannot be accepted; trying again, ever more slowly");
         }
         self.failures = self.failures.saturating_add(1);
         self.paused_until = Some(Instant::now() + pause(self.failures));

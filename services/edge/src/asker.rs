@@ -6,6 +6,7 @@ use crate::seats::network;
 use midshift_core::identity::{Caller, TokenId, Who};
 use midshift_core::ids::RobotId;
 use midshift_core::reason::Refusal;
+use std::fmt;
 use std::net::IpAddr;
 
 /// Whom a request counts for.
@@ -28,6 +29,16 @@ impl Asker {
             Ok(Who::Holder { token, .. }) => Self::Token(token.clone()),
             Ok(Who::Local) => Self::Network(network(address)),
             Ok(Who::Nobody) | Err(_) => Self::Stranger(network(address)),
+        }
+    }
+}
+
+impl fmt::Display for Asker {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Robot(robot_id) => write!(f, "robot:{robot_id}"),
+            Self::Token(token) => write!(f, "token:{token}"),
+            Self::Network(network) | Self::Stranger(network) => network.fmt(f),
         }
     }
 }

@@ -5,9 +5,9 @@
 //! live one that keeps a stream of HTTP/1.1 open has it until its age. Nothing here waits for a service.
 
 use crate::activity::{Activity, Unused};
-use crate::asker::Asker;
 use crate::config::{Config, std};
 use crate::denials::Denials;
+use crate::frame_heads::{Counted, Flooded};
 use crate::peer::{ConnectionId, Denied, Peer, Principals};
 use crate::requests::{Door, Rules};
 use crate::seats::network;
@@ -49,6 +49,8 @@ pub(crate) enum End {
     Old,
     /// Its peer may not be connected, or no longer.
     Denied,
+    /// It sent more control frames than a peer has a use for.
+    FrameFlood,
     /// The port closed.
     Stopped,
 }
@@ -65,6 +67,7 @@ impl End {
             Self::Idle => "idle",
             Self::Old => "old",
             Self::Denied => "denied",
+            Self::FrameFlood => "frame_flood",
             Self::Stopped => "stopped",
         }
     }
@@ -143,10 +146,14 @@ where
             done = handshake => match done {
                 Ok(Ok(io)) => io,
                 Ok(Err(error)) => {
-                    tracing::debug!(port = self.config.port, connection = id.0, %error, "a TLS handshake failed");
+                    failed_handshake(self.config.port, address, id, &error);
                     return End::HandshakeFailed;
                 }
-                Err(_) => return End::HandshakeSlow,
+                Err(_) => {
+                    let (port, from) = (self.config.port, network(address.ip()));
+                    tracing::info!(port, peer = %from, connection = id.0, %address, "a TLS handshake took too long");
+                    return End::HandshakeSlow;
+                }
             },
         };
         let shown = io.get_ref().1.peer_certificates().and_then(<[_]>::first);
@@ -177,7 +184,9 @@ where
             denials: self.denials.clone(),
             batches: Arc::new(Semaphore::new(limits::BATCHES_PER_CONNECTION_MAX)),
         };
-        let mut served = pin!(self.http.serve_connection(TokioIo::new(io), door));
+        let flooded = Flooded::default();
+        let io = TokioIo::new(Counted::new(io, flooded.clone()));
+        let mut served = pin!(self.http.serve_connection(io, door));
         let reason = tokio::select! {
             // First, so that no request is taken before its time is counted.
             biased;
@@ -185,7 +194,7 @@ where
             denied = self.asked_again(&peer, &mut changed) => Reason::Denied(denied),
             () = stop.cancelled() => Reason::Stop,
             () = self.grows_old(&peer) => Reason::Old,
-            done = served.as_mut() => return self.ended(&peer, done),
+            done = served.as_mut() => return self.ended(&peer, done, &flooded),
         };
         let (end, time) = match reason {
             Reason::Denied(Denied::Token) => {
@@ -249,22 +258,30 @@ where
     }
 
     fn denied(&self, peer: &Peer, denied: Denied) -> End {
-        let (port, connection) = (self.config.port, peer.connection.0);
-        let asker = Asker::Stranger(network(peer.address.ip()));
-        match &self.denials {
-            Some(denials) if denials.is_fit(&asker) => {
-                tracing::info!(port, connection, address = %peer.address, denied = %denied, "a connection was denied");
-            }
-            _ => {
-                tracing::debug!(port, connection, address = %peer.address, denied = %denied, "a connection was denied")
-            }
-        }
+        let (port, connection, from) = (self.config.port, peer.connection.0, network(peer.address.ip()));
+        tracing::info!(port, peer = %from, connection, address = %peer.address, %denied, "a connection was denied");
         End::Denied
     }
 
-    fn ended(&self, peer: &Peer, done: Result<(), Box<dyn std::error::Error + Send + Sync>>) -> End {
+    fn ended(&self, peer: &Peer, done: Result<(), Box<dyn std::error::Error + Send + Sync>>, flooded: &Flooded) -> End {
+        let (port, from) = (self.config.port, network(peer.address.ip()));
+        if flooded.is_set() {
+            let (connection, address) = (peer.connection.0, peer.address);
+            tracing::info!(port, peer = %from, connection, %address, "a connection was cut for a flood of control frames");
+            return End::FrameFlood;
+        }
         let Err(error) = done else { return End::Closed };
-        tracing::debug!(port = self.config.port, connection = peer.connection.0, %error, "a connection broke");
+        tracing::debug!(port, peer = %from, connection = peer.connection.0, %error, "a connection broke");
         End::Broken
+    }
+}
+
+/// One that closed before it said anything looked whether the port is there, as proxies do.
+fn failed_handshake(port: &'static str, address: SocketAddr, id: ConnectionId, error: &std::io::Error) {
+    let (peer, connection) = (network(address.ip()), id.0);
+    if error.kind() == std::io::ErrorKind::UnexpectedEof {
+        tracing::debug!(port, %peer, connection, %error, "a TLS handshake failed");
+    } else {
+        tracing::info!(port, %peer, connection, %address, %error, "a TLS handshake failed");
     }
 }

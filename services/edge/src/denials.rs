@@ -55,22 +55,21 @@ impl Denials {
     }
 
     /// Whether one more of this asker may leave a trace. It counts as one that did.
-    pub(crate) fn is_fit(&self, asker: &Asker) -> bool {
+    fn is_fit(&self, asker: &Asker) -> bool {
         let now = Instant::now();
         self.each.take(asker, now, Class::Stop) && self.all.take(&(), now, Class::Stop)
     }
 
-    /// Whether it was handed over.
-    pub(crate) fn tell(&self, asker: &Asker, actor: String, network: IpAddr, path: &str, reason: &Reason) -> bool {
+    /// Hands it over, if one more of this asker may leave a trace.
+    pub(crate) fn tell(&self, asker: &Asker, actor: String, network: IpAddr, path: &str, reason: &Reason) {
         let Some(place) = self.is_fit(asker).then(|| self.sink.try_reserve().ok()).flatten() else {
             self.left_out.fetch_add(1, Relaxed);
             metrics::counter!("midshift_edge_denials_left_out_total", "port" => self.port).increment(1);
-            return false;
+            return;
         };
         let path = cut(path).to_owned();
         let (robot_id, code) = (reason.metadata.get("robot_id").cloned(), reason.code);
         place.send(Denial { actor, network, path, robot_id, code, left_out: self.left_out.swap(0, Relaxed) });
-        true
     }
 }
 

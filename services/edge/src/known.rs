@@ -57,7 +57,8 @@ impl Principals for Known {
             return self.robot(leaf).map(drop);
         }
         // Who shows none shows a token with each request: streams of one that was taken back or is over do not go on.
-        let (directory, now) = (self.directory.borrow(), self.clock.now().wall);
+        // A wall that jumped far ahead ends none of them before somebody could look.
+        let (directory, now) = (self.directory.borrow(), self.clock.now().standing_wall());
         let is_good = |token: &TokenId, was_expired| directory.is_good(token, was_expired, now);
         if peer.showed_all(is_good) { Ok(()) } else { Err(Denied::Token) }
     }
@@ -109,4 +110,45 @@ pub fn robot_of(leaf: &CertificateDer<'_>, site_id: &SiteId) -> Option<(RobotId,
     }
     let key = sha2::Sha256::digest(certificate.subject_public_key_info());
     Some((robot_id, Digest(key.into())))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::peer::ConnectionId;
+    use midshift_core::identity::DirectoryToken;
+    use midshift_core::limits;
+    use midshift_core::time::Utc;
+    use midshift_core::wall::WallClock;
+    use std::collections::BTreeMap;
+    use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+
+    #[test]
+    fn what_a_token_began_stands_for_ten_minutes_after_the_wall_jumped_past_its_end() {
+        const HOUR_MS: u64 = 3_600_000;
+        let (us, stepped_ms) = (Arc::<AtomicU64>::default(), Arc::<AtomicU64>::default());
+        let (mono, beside, ahead) = (us.clone(), us.clone(), stepped_ms.clone());
+        let wall = move || Utc(1_000_000).plus_ms(beside.load(Relaxed) / 1000 + ahead.load(Relaxed));
+        let clock = Arc::new(WallClock::new(move || mono.load(Relaxed), wall, |_| {}));
+        let known = Known::new(SiteId::parse("factory").expect("a site"), clock);
+        let id = TokenId::new("t1").expect("an id");
+        let expires_unix_ms = 1_000_000 + HOUR_MS.cast_signed();
+        let token =
+            DirectoryToken { name: "anna".into(), digest: Digest([7; 32]), grants: Arc::from([]), expires_unix_ms };
+        let directory = Directory { tokens: [(id.clone(), token)].into(), denied: BTreeMap::new() };
+        known.publish(directory.clone());
+        let peer = Peer::new(([127, 0, 0, 1], 1).into(), None, ConnectionId(1));
+        peer.shows(&id, false);
+        assert_eq!(known.admit(&peer), Ok(()));
+        stepped_ms.store(2 * HOUR_MS, Relaxed);
+        assert_eq!(known.admit(&peer), Ok(()));
+        let standing_us = limits::CLOCK_JUMP_STANDING.as_ms() * 1_000;
+        us.store(standing_us - 1_000, Relaxed);
+        assert_eq!(known.admit(&peer), Ok(()));
+        known.publish(Directory::default());
+        assert_eq!(known.admit(&peer), Err(Denied::Token), "taken back, whatever the clock says");
+        known.publish(directory);
+        us.store(standing_us, Relaxed);
+        assert_eq!(known.admit(&peer), Err(Denied::Token));
+    }
 }

@@ -16,6 +16,7 @@ mod config;
 mod connection;
 mod deadline;
 mod denials;
+mod frame_heads;
 mod known;
 mod listen;
 mod peer;
@@ -125,6 +126,7 @@ where
                 }
                 // Dropped with `io`: closed at once, before a byte of it is read.
                 Err(reason) => {
+                    tracing::info!(port = name, peer = %network(address.ip()), reason, "a connection was refused");
                     metrics::counter!("midshift_edge_refused_total", "port" => name, "reason" => reason).increment(1);
                 }
             }
@@ -180,7 +182,7 @@ fn count(port: &'static str, ended: Result<End, JoinError>) {
     let reason = match ended {
         Ok(end) => end.as_str(),
         Err(error) => {
-            tracing::error!(port, %error, "a connection's task ended with a fault");
+            tracing::error!(port, peer = "any", %error, "a connection's task ended with a fault");
             "fault"
         }
     };

@@ -160,7 +160,11 @@ impl<S> Door<S> {
             self.stranger.is_known();
         }
         // Before anything else is said: guessing is limited too.
-        let mut admitted = self.rules.admit(&asker, path, headers, speech)?;
+        let admitted = self.rules.admit(&asker, path, headers, speech);
+        let mut admitted = admitted.inspect_err(|refusal| {
+            let (port, code) = (self.rules.port, refusal.reason.code);
+            tracing::info!(port, peer = %asker, path = denials::cut(path), %code, "a request was refused");
+        })?;
         let allowed = match &caller {
             Ok(caller) => access::check(caller, path),
             Err(worthless) => Err(worthless.clone()),
@@ -202,12 +206,9 @@ fn tell(
     refusal: &Refusal,
 ) {
     let (code, path) = (refusal.reason.code, denials::cut(path));
-    // A flood of them fills no log either.
-    match denials {
-        Some(denials) if denials.tell(asker, actor.clone(), from, path, &refusal.reason) => {
-            tracing::info!(port, actor, path, %code, "a request was denied");
-        }
-        _ => tracing::debug!(port, actor, path, %code, "a request was denied"),
+    tracing::info!(port, peer = %asker, actor, path, %code, "a request was denied");
+    if let Some(denials) = denials {
+        denials.tell(asker, actor, from, path, &refusal.reason);
     }
 }
 

@@ -1,15 +1,22 @@
 //! TLS of a port: version 1.3, one provider, and who must show a certificate.
 //!
 //! Invariant: each connection proves its certificate anew; there are no tickets and no early data, so neither a revocation nor an expiry can
-//! be slept through. The provider is named here and never installed for the process: a second one would make rustls panic.
+//! be slept through. The provider is named here and never installed for the process: a second one would make rustls panic. A wall clock that jumped far
+//! ahead ends no certificate of a robot: it counts for as long as it would have without the jump.
 
+use midshift_core::time::Clock;
+use rustls::client::danger::HandshakeSignatureValid;
 use rustls::crypto::aws_lc_rs;
-use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use rustls::pki_types::{CertificateDer, PrivateKeyDer, UnixTime};
 use rustls::server::WebPkiClientVerifier;
-use rustls::server::danger::ClientCertVerifier;
+use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
 use rustls::version::TLS13;
-use rustls::{RootCertStore, ServerConfig};
+use rustls::{
+    CertificateError, DigitallySignedStruct, DistinguishedName, RootCertStore, ServerConfig, SignatureScheme,
+};
+use std::fmt;
 use std::sync::Arc;
+use std::time::Duration;
 
 /// HTTP/2 for gRPC; HTTP/1.1 for gRPC-Web, metrics and pages.
 const PROTOCOLS: [&[u8]; 2] = [b"h2", b"http/1.1"];
@@ -39,7 +46,8 @@ pub enum Clients {
     Required(Vec<CertificateDer<'static>>),
 }
 
-/// What a port proves itself with, as rustls takes it. Sent to an edge again with another certificate, new connections take that one.
+/// What a port proves itself with, as rustls takes it. Sent to an edge again with another certificate, new connections take that one. `clock` says
+/// whether the wall jumped.
 ///
 /// # Errors
 /// If certificate and key do not fit each other, or a root is none.
@@ -47,6 +55,7 @@ pub fn server_config(
     chain: Vec<CertificateDer<'static>>,
     key: PrivateKeyDer<'static>,
     clients: Clients,
+    clock: &Arc<dyn Clock>,
 ) -> Result<Arc<ServerConfig>, Error> {
     let provider = Arc::new(aws_lc_rs::default_provider());
     let builder = ServerConfig::builder_with_provider(provider.clone())
@@ -54,8 +63,8 @@ pub fn server_config(
         .map_err(Error::Certificate)?;
     let builder = match clients {
         Clients::NotAsked => builder.with_no_client_auth(),
-        Clients::Asked(roots) => builder.with_client_cert_verifier(verifier(roots, provider, false)?),
-        Clients::Required(roots) => builder.with_client_cert_verifier(verifier(roots, provider, true)?),
+        Clients::Asked(roots) => builder.with_client_cert_verifier(verifier(roots, provider, false, clock)?),
+        Clients::Required(roots) => builder.with_client_cert_verifier(verifier(roots, provider, true, clock)?),
     };
     let mut config = builder.with_single_cert(chain, key).map_err(Error::Certificate)?;
     config.alpn_protocols = PROTOCOLS.map(<[u8]>::to_vec).into();
@@ -68,6 +77,7 @@ fn verifier(
     certificates: Vec<CertificateDer<'static>>,
     provider: Arc<rustls::crypto::CryptoProvider>,
     required: bool,
+    clock: &Arc<dyn Clock>,
 ) -> Result<Arc<dyn ClientCertVerifier>, Error> {
     let mut roots = RootCertStore::empty();
     for certificate in certificates {
@@ -75,5 +85,70 @@ fn verifier(
     }
     let builder = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider);
     let builder = if required { builder } else { builder.allow_unauthenticated() };
-    builder.build().map_err(Error::Clients)
+    let verifier = builder.build().map_err(Error::Clients)?;
+    Ok(Arc::new(SteadyVerifier { verifier, clock: clock.clone() }))
+}
+
+/// Verifies certificates of clients as rustls does, except that a jump of the wall makes none expire.
+struct SteadyVerifier {
+    verifier: Arc<dyn ClientCertVerifier>,
+    clock: Arc<dyn Clock>,
+}
+
+impl fmt::Debug for SteadyVerifier {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.verifier.fmt(f)
+    }
+}
+
+impl ClientCertVerifier for SteadyVerifier {
+    fn verify_client_cert(
+        &self,
+        leaf: &CertificateDer<'_>,
+        between: &[CertificateDer<'_>],
+        now: UnixTime,
+    ) -> Result<ClientCertVerified, rustls::Error> {
+        let verified = self.verifier.verify_client_cert(leaf, between, now);
+        let skipped_ms = self.clock.now().jump.map_or(0, |jump| jump.skipped_ms);
+        match verified {
+            Err(error) if skipped_ms > 0 && is_expired(&error) => {
+                let steady = Duration::from_secs(now.as_secs()).saturating_sub(Duration::from_millis(skipped_ms));
+                self.verifier.verify_client_cert(leaf, between, UnixTime::since_unix_epoch(steady))
+            }
+            verified => verified,
+        }
+    }
+    fn offer_client_auth(&self) -> bool {
+        self.verifier.offer_client_auth()
+    }
+    fn client_auth_mandatory(&self) -> bool {
+        self.verifier.client_auth_mandatory()
+    }
+    fn root_hint_subjects(&self) -> &[DistinguishedName] {
+        self.verifier.root_hint_subjects()
+    }
+    fn verify_tls12_signature(
+        &self,
+        message: &[u8],
+        leaf: &CertificateDer<'_>,
+        signed: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, rustls::Error> {
+        self.verifier.verify_tls12_signature(message, leaf, signed)
+    }
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        leaf: &CertificateDer<'_>,
+        signed: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, rustls::Error> {
+        self.verifier.verify_tls13_signature(message, leaf, signed)
+    }
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        self.verifier.supported_verify_schemes()
+    }
+}
+
+fn is_expired(error: &rustls::Error) -> bool {
+    use CertificateError::{Expired, ExpiredContext};
+    matches!(error, rustls::Error::InvalidCertificate(Expired | ExpiredContext { .. }))
 }

@@ -4,7 +4,7 @@
 
 use midshift_core::ids::SiteId;
 use midshift_core::limits;
-use midshift_core::time::{LinkDuration, ScaledClock, Utc};
+use midshift_core::time::{Clock, LinkDuration, ScaledClock, Utc};
 use midshift_edge::tls::{Clients, server_config};
 use midshift_edge::{Config, Edge, Known, connections_max};
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair, SanType};
@@ -80,7 +80,8 @@ async fn a_robot_is_served_while_a_thousand_silent_peers_want_every_descriptor()
     params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
     let authority = CertifiedIssuer::self_signed(params, KeyPair::generate().expect("a key")).expect("a root");
     let (leaf, key) = signed(vec![SanType::DnsName("edge".try_into().expect("a name"))], &authority);
-    let server = server_config(vec![leaf], key, Clients::Asked(vec![authority.der().clone()])).expect("TLS");
+    let clock: Arc<dyn Clock> = Arc::new(ScaledClock::new(|| 0, Utc(1_000_000), 1000));
+    let server = server_config(vec![leaf], key, Clients::Asked(vec![authority.der().clone()]), &clock).expect("TLS");
     let config = Config {
         connections_max: room,
         connections_per_network_max: room / 4,
@@ -88,7 +89,6 @@ async fn a_robot_is_served_while_a_thousand_silent_peers_want_every_descriptor()
         tls_handshake: LinkDuration::from_secs(600),
         ..Config::default()
     };
-    let clock = Arc::new(ScaledClock::new(|| 0, Utc(1_000_000), 1000));
     let known = Arc::new(Known::new(SiteId::parse("factory").expect("a site"), clock));
     let services =
         tower::service_fn(async |_: http::Request<Body>| Ok::<_, Infallible>(http::Response::new(Body::empty())));

@@ -30,11 +30,12 @@ const TASKS_AT_ONCE: usize = 200;
 /// If the store does not answer.
 pub async fn prune(store: &dyn Store, clock: &dyn Clock) -> Result<u64, Error> {
     let now = clock.now();
-    let tasks = prune_tasks(store, now.utc).await?;
-    let errands = prune_errands(store, now.utc).await?;
-    let counters = prune_counters(store, now.utc).await?;
-    let robots = aged::forget_robots(store, Writer::Fleet, now.utc).await?;
-    Ok(tasks + errands + counters + robots + prune_commands(store, now.wall).await?)
+    let utc = now.steady_utc();
+    let tasks = prune_tasks(store, utc).await?;
+    let errands = prune_errands(store, utc).await?;
+    let counters = prune_counters(store, utc).await?;
+    let robots = aged::forget_robots(store, Writer::Fleet, utc).await?;
+    Ok(tasks + errands + counters + robots + prune_commands(store, now.steady_wall()).await?)
 }
 
 /// A used request_id goes with the commands after it; where there are none, here.

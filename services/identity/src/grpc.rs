@@ -28,7 +28,7 @@ fn robot_of(text: &str) -> Result<RobotId, Refusal> {
 }
 
 fn hidden(error: &Error) -> Refusal {
-    tracing::error!(%error, "a certificate was not signed");
+    tracing::error!(peer = "any", %error, "a certificate was not signed");
     Refusal::new(Kind::Internal, Code::Internal)
 }
 

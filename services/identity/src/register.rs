@@ -96,7 +96,7 @@ impl Register {
         rows.advance(&*self.store).await?;
         let view = rows.fold();
         let (tokens, robots) = (view.tokens.values().map(|(t, _)| t), view.robots.values().map(|(r, _)| r));
-        let directory = Directory::of(tokens, robots, self.clock.now().wall);
+        let directory = Directory::of(tokens, robots, self.clock.now().steady_wall());
         self.directory.send_if_modified(|known| {
             let differs = **known != directory;
             if differs {

@@ -1,6 +1,7 @@
-//! The process' clocks: tokio's monotonic clock, so that a simulation can own it, and the wall's UTC read once at the start.
+//! The process' clocks: tokio's monotonic clock, so that a simulation can own it, and the wall's UTC, read whenever the time is asked for.
 
 use midshift_core::time::{Clock, ScaledClock, Utc};
+use midshift_core::wall::{Jump, WallClock};
 use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 use tokio::time::Instant;
@@ -12,14 +13,18 @@ pub fn wall() -> Utc {
     Utc(i64::try_from(since.as_millis()).unwrap_or(i64::MAX))
 }
 
-/// Clocks that start now; the site clock runs `rate_permille` thousandths of real time.
+/// Clocks that start now; the site clock runs `rate_permille` thousandths of real time. One that is not real is a simulation's own, with its wall.
 pub fn clock(rate_permille: u32) -> Arc<dyn Clock> {
-    at(wall(), rate_permille)
-}
-
-/// Clocks whose UTC is `utc` now.
-pub fn at(utc: Utc, rate_permille: u32) -> Arc<dyn Clock> {
     let started = Instant::now();
     let micros = move || u64::try_from(started.elapsed().as_micros()).unwrap_or(u64::MAX);
-    Arc::new(ScaledClock::new(micros, utc, rate_permille))
+    match rate_permille {
+        1000 => Arc::new(WallClock::new(micros, wall, log)),
+        _ => Arc::new(ScaledClock::new(micros, wall(), rate_permille)),
+    }
+}
+
+fn log(jump: &Jump) {
+    let (step_ms, from, to) = (jump.step_ms(), jump.from.rfc3339(), jump.to.rfc3339());
+    metrics::counter!("midshift_clock_jumps_total").increment(1);
+    tracing::warn!(step_ms, from, to, "the wall clock jumped");
 }

@@ -83,7 +83,7 @@ pub fn alone(port: &'static str) -> Config {
 pub struct Login {
     /// Which site's robots.
     pub site_id: SiteId,
-    /// For the expiry of tokens.
+    /// For the expiry of tokens and of robots' certificates.
     pub clock: Arc<dyn Clock>,
     /// Who is known.
     pub directory: watch::Receiver<Arc<Directory>>,
@@ -99,7 +99,7 @@ impl Login {
     /// # Errors
     /// What it is to prove itself with cannot be used.
     pub fn proves(&self) -> anyhow::Result<()> {
-        tls(&self.proof.borrow()).map(drop)
+        tls(&self.proof.borrow(), &self.clock).map(drop)
     }
 }
 
@@ -119,9 +119,9 @@ pub async fn serve<L: Listen>(
         return Ok(());
     };
     let Login { site_id, clock, mut directory, mut proof, denials } = login;
-    let known = Arc::new(Known::new(site_id, clock));
+    let known = Arc::new(Known::new(site_id, clock.clone()));
     known.publish((**directory.borrow_and_update()).clone());
-    let tls = watch::Sender::new(tls(&proof.borrow_and_update().clone())?);
+    let tls = watch::Sender::new(tls(&proof.borrow_and_update().clone(), &clock)?);
     let edge = Edge::new(config, known.clone(), services).with_tls(tls.subscribe()).with_denials(denials);
     let following = async {
         while directory.changed().await.is_ok() {
@@ -132,7 +132,7 @@ pub async fn serve<L: Listen>(
     let renewing = async {
         while proof.changed().await.is_ok() {
             let newest = proof.borrow_and_update().clone();
-            match self::tls(&newest) {
+            match self::tls(&newest, &clock) {
                 Ok(newest) => drop(tls.send_replace(newest)),
                 Err(error) => tracing::error!(
                     error = format!("{error:#}"),
@@ -149,14 +149,14 @@ pub async fn serve<L: Listen>(
     }
 }
 
-fn tls(proof: &ServerProof) -> anyhow::Result<Arc<ServerConfig>> {
+fn tls(proof: &ServerProof, clock: &Arc<dyn Clock>) -> anyhow::Result<Arc<ServerConfig>> {
     let certificates = |pem: &str| -> anyhow::Result<Vec<CertificateDer<'static>>> {
         Ok(CertificateDer::pem_slice_iter(pem.as_bytes()).collect::<Result<_, _>>()?)
     };
     let chain = certificates(&proof.chain_pem).context("reading the server's certificate")?;
     let key = PrivateKeyDer::from_pem_slice(proof.key_pem.as_bytes()).context("reading the server's key")?;
     let roots = certificates(&proof.authority_pem).context("reading the site's root")?;
-    server_config(chain, key, Clients::Asked(roots)).context("what the server proves itself with")
+    server_config(chain, key, Clients::Asked(roots), clock).context("what the server proves itself with")
 }
 
 #[cfg(test)]

@@ -1,7 +1,21 @@
 //! Logs to stderr: one format, UTC, JSON if asked; the level by `MIDSHIFT_LOG`.
+//!
+//! A line that a peer can cause as often as it likes has a field `peer`, which says who; left empty, its `robot_id` does. Such a line is
+//! written a few times and then counted ([`midshift_core::flood`]), so that no flood of requests is a flood of lines.
 
 use clap::ValueEnum;
-use tracing_subscriber::EnvFilter;
+use midshift_core::flood::{Count, Floods};
+use midshift_core::limits;
+use midshift_core::time::LinkTime;
+use std::fmt;
+use std::sync::{Mutex, OnceLock, PoisonError};
+use std::time::Duration;
+use tokio::time::Instant;
+use tracing::field::{Field, Visit};
+use tracing::{Event, Level, Subscriber};
+use tracing_subscriber::layer::{Context, SubscriberExt};
+use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{EnvFilter, Layer};
 
 /// How log lines look.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
@@ -22,7 +36,107 @@ pub fn start(format: Format, default: &str) {
     let lines = lines.log_internal_errors(false);
     // A second start in one process (tests) keeps the first.
     let _ = match format {
-        Format::Text => lines.with_ansi(colour).try_init(),
-        Format::Json => lines.json().flatten_event(true).try_init(),
+        Format::Text => lines.with_ansi(colour).finish().with(Throttle(counted())).try_init(),
+        Format::Json => lines.json().flatten_event(true).finish().with(Throttle(counted())).try_init(),
     };
 }
+
+/// Says once a minute how often lines were left out, until it is dropped.
+pub async fn count_floods() {
+    let mut tick = tokio::time::interval(Duration::from_millis(limits::FLOOD_COUNTED_EVERY.as_ms()) / 4);
+    loop {
+        tick.tick().await;
+        counted().counts().iter().for_each(say);
+    }
+}
+
+/// What is counted in this process.
+fn counted() -> &'static Counted {
+    static COUNTED: OnceLock<Counted> = OnceLock::new();
+    COUNTED.get_or_init(Counted::new)
+}
+
+/// A line: its level and its message, which is constant.
+type Line = (Level, String);
+
+/// Floods of this process, by its monotonic clock.
+struct Counted {
+    begun: Instant,
+    floods: Mutex<Floods<Line>>,
+}
+
+impl Counted {
+    fn new() -> Self {
+        Self { begun: Instant::now(), floods: Mutex::default() }
+    }
+
+    fn now(&self) -> LinkTime {
+        LinkTime(u64::try_from(self.begun.elapsed().as_millis()).unwrap_or(u64::MAX))
+    }
+
+    fn is_written(&self, line: Line, peer: String) -> bool {
+        self.floods.lock().unwrap_or_else(PoisonError::into_inner).is_written(line, peer, self.now())
+    }
+
+    fn counts(&self) -> Vec<Count<Line>> {
+        self.floods.lock().unwrap_or_else(PoisonError::into_inner).counts(self.now())
+    }
+}
+
+fn say(count: &Count<Line>) {
+    let Count { line: (level, line), peer, times } = count;
+    let (again, of) = ("more of these in the last minute", peer.as_deref().unwrap_or("many"));
+    match *level {
+        Level::ERROR => tracing::error!(times, line, of, "{again}"),
+        Level::WARN => tracing::warn!(times, line, of, "{again}"),
+        Level::INFO => tracing::info!(times, line, of, "{again}"),
+        _ => tracing::debug!(times, line, of, "{again}"),
+    }
+}
+
+/// Leaves out the lines of a flood.
+struct Throttle(&'static Counted);
+
+impl<S: Subscriber> Layer<S> for Throttle {
+    fn event_enabled(&self, event: &Event<'_>, _: Context<'_, S>) -> bool {
+        let metadata = event.metadata();
+        if metadata.fields().field("peer").is_none() {
+            return true;
+        }
+        let mut said = Said::default();
+        event.record(&mut said);
+        let peer = said.peer.or(said.robot_id).unwrap_or_default();
+        self.0.is_written((*metadata.level(), said.message), peer)
+    }
+}
+
+/// What a line says that tells it from others.
+#[derive(Default)]
+struct Said {
+    message: String,
+    peer: Option<String>,
+    robot_id: Option<String>,
+}
+
+impl Said {
+    fn take(&mut self, field: &Field, value: fmt::Arguments<'_>) {
+        match field.name() {
+            "message" => self.message = value.to_string(),
+            "peer" => self.peer = Some(value.to_string()),
+            "robot_id" => self.robot_id = Some(value.to_string()),
+            _ => {}
+        }
+    }
+}
+
+impl Visit for Said {
+    fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
+        self.take(field, format_args!("{value:?}"));
+    }
+    fn record_str(&mut self, field: &Field, value: &str) {
+        self.take(field, format_args!("{value}"));
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -139,10 +139,10 @@ impl Server {
         };
         let (health, health_service) = tonic_health::server::health_reporter();
         let health_service = health_service.max_decoding_message_size(limits::HEALTH_MESSAGE_BYTES);
-        let site_id = self.parts.site.site_id().to_string();
+        let said = SiteAnswer { site_id: self.parts.site.site_id().to_string(), stop_port: self.parts.stop_port };
         let mut routes = Routes::builder();
         routes
-            .add_service(SiteAnswer { site_id, stop_port: self.parts.stop_port }.layer().named_layer(health_service))
+            .add_service(said.layer(self.parts.clock.clone()).named_layer(health_service))
             .add_service(reflection().build_v1()?.max_decoding_message_size(control))
             .add_service(reflection().build_v1alpha()?.max_decoding_message_size(control));
         if let Some(task) = &self.task {

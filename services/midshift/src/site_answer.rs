@@ -1,15 +1,19 @@
-//! Says in each answer to a health check of which site a server is and where its stop service listens; reads that on the other side.
+//! Says in each answer to a health check of which site a server is, where its stop service listens and what its wall clock jumped; reads that on the
+//! other side.
 //!
 //! Whoever may ask for health may ask for this: nobody has to sign in for it, and it is needed most where nobody has.
 
 use crate::stop;
 use http::{HeaderValue, Response};
+use midshift_core::time::{Clock, Utc};
+use std::sync::Arc;
 use tonic::body::Body;
 use tonic::metadata::MetadataMap;
 use tower::util::MapResponseLayer;
 
 const SITE: &str = "midshift-site";
 const STOP_PORT: &str = "midshift-stop-port";
+const CLOCK_JUMP: &str = "midshift-clock-jump";
 
 /// What a server says of its site.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -33,16 +37,47 @@ impl SiteAnswer {
         Some(Self { site_id: text(SITE)?.to_owned(), stop_port: text(STOP_PORT).and_then(|port| port.parse().ok()) })
     }
 
-    /// Adds it to each answer of a service.
-    pub fn layer(self) -> MapResponseLayer<impl Fn(Response<Body>) -> Response<Body> + Clone + Send + Sync + 'static> {
+    /// Adds it, and the newest jump of the wall, to each answer of a service.
+    pub fn layer(
+        self,
+        clock: Arc<dyn Clock>,
+    ) -> MapResponseLayer<impl Fn(Response<Body>) -> Response<Body> + Clone + Send + Sync + 'static> {
         // The name of a site is letters, digits and dashes.
         let site = HeaderValue::from_str(&self.site_id).ok();
         let port = self.stop_port.map(HeaderValue::from);
         MapResponseLayer::new(move |mut response: Response<Body>| {
-            let said = [(SITE, &site), (STOP_PORT, &port)];
-            let said = said.into_iter().filter_map(|(name, value)| Some((name, value.clone()?)));
+            let jump = clock.last_jump().and_then(|jump| said_jump(jump.step_ms(), jump.to).parse().ok());
+            let said = [(SITE, site.clone()), (STOP_PORT, port.clone()), (CLOCK_JUMP, jump)];
+            let said = said.into_iter().filter_map(|(name, value)| Some((name, value?)));
             said.for_each(|(name, value)| drop(response.headers_mut().insert(name, value)));
             response
         })
+    }
+}
+
+fn said_jump(step_ms: i64, to: Utc) -> String {
+    format!("{step_ms} {}", to.0)
+}
+
+/// Milliseconds that the wall clock of a server jumped ahead at last (negative: back), and UTC when it had.
+pub fn clock_jump(metadata: &MetadataMap) -> Option<(i64, Utc)> {
+    let (step_ms, to) = metadata.get(CLOCK_JUMP)?.to_str().ok()?.split_once(' ')?;
+    Some((step_ms.parse().ok()?, Utc(to.parse().ok()?)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_jump_is_read_as_it_was_said() {
+        let mut answer = MetadataMap::new();
+        assert_eq!(clock_jump(&answer), None);
+        for jump in [(7_200_000, Utc(1_800_000_000_000)), (-6_000, Utc(5))] {
+            answer.insert(CLOCK_JUMP, said_jump(jump.0, jump.1).parse().expect("text"));
+            assert_eq!(clock_jump(&answer), Some(jump));
+        }
+        answer.insert(CLOCK_JUMP, "soon".parse().expect("text"));
+        assert_eq!(clock_jump(&answer), None);
     }
 }

@@ -126,16 +126,16 @@ async fn keep_audit(parts: &Parts) {
 /// Used request_ids, and what robots ran that were retired long ago.
 async fn prune_ota(store: &dyn Store, clock: &dyn Clock) -> Result<(), midshift_store::Error> {
     let now = clock.now();
-    if let Some(before) = privacy::of(Table::OtaCommandKey).before(now.wall) {
+    if let Some(before) = privacy::of(Table::OtaCommandKey).before(now.steady_wall()) {
         aged::take_away(store, Table::OtaCommandKey, before.0, "command.forgotten").await?;
     }
-    aged::forget_robots(store, Writer::Ota, now.utc).await.map(drop)
+    aged::forget_robots(store, Writer::Ota, now.steady_utc()).await.map(drop)
 }
 
 async fn prune_entries(store: &dyn Store, clock: &dyn Clock) -> Result<(), midshift_store::Error> {
     // Until fleet has consumed something nothing may go.
     let Some((mark, _)) = midshift_store::load::<FleetMark>(store, "fleet").await? else { return Ok(()) };
-    let Some(before) = Retention::Week.before(clock.now().wall) else { return Ok(()) };
+    let Some(before) = Retention::Week.before(clock.now().steady_wall()) else { return Ok(()) };
     let ota = midshift_store::load::<OtaMark>(store, "ota").await?.map_or(mark.seq, |(mark, _)| mark.seq);
     let floor = mark.seq.min(ota);
     let keep = EntriesKept { before_unix_ms: before.0, entries_max: ENTRIES_MAX, floor };

@@ -21,6 +21,7 @@ use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 use tonic::{Response, Status, Streaming};
+use tracing::field::Empty;
 
 /// Reads who comes, and begins the line. A robot comes by its own certificate alone.
 pub async fn attend(
@@ -38,7 +39,7 @@ pub async fn attend(
         hold(&inner, &robot, &outbox, &leaving, up).await;
         Robots::detach(&robot, &outbox);
         metrics::gauge!("midshift_stop_lines").decrement(1);
-        tracing::info!(robot_id = %robot.robot_id, "stop line ended");
+        tracing::info!(peer = Empty, robot_id = %robot.robot_id, "stop line ended");
     });
     Ok(Response::new(down))
 }
@@ -63,7 +64,7 @@ async fn begin(
     };
     attached.map_err(|held| held_by_another(inner, &robot_id, by, held, &now))?;
     metrics::gauge!("midshift_stop_lines").increment(1);
-    tracing::info!(%robot_id, "stop line begun");
+    tracing::info!(peer = Empty, %robot_id, "stop line begun");
     inner.touch();
     Ok((robot, outbox))
 }
@@ -72,7 +73,7 @@ async fn begin(
 fn held_by_another(inner: &Inner, robot_id: &RobotId, by: &Caller, held: Held, now: &Now) -> Refusal {
     metrics::counter!("midshift_stop_lines_contested_total").increment(1);
     if held.is_news {
-        tracing::warn!(%robot_id, "another start of this robot was not let in while one is heard");
+        tracing::warn!(peer = Empty, %robot_id, "another start of this robot was not let in while one is heard");
         let note = Note { actor: by.to_string(), ..Note::own(now.wall, Action::Denied) };
         let note = note.with("code", Code::LineHeld).with("asked", "stop.attend").with("robot_id", robot_id);
         let certificate = by.certificate();
@@ -131,7 +132,7 @@ async fn hold(
         };
         let unread = || (outbox.unread_for(now.link) >= limits::STOP_LINE_SILENT).then(|| late("nothing is read"));
         if let Some(refusal) = over.or_else(unread) {
-            tracing::warn!(robot_id = %robot.robot_id, code = %refusal.reason.code, "stop line closed");
+            tracing::warn!(peer = Empty, robot_id = %robot.robot_id, code = %refusal.reason.code, "stop line closed");
             return outbox.end(End::Refused(refusal), now.link);
         }
     }

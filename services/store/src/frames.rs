@@ -264,7 +264,7 @@ impl FrameLog for MemoryFrames {
     }
 
     async fn prune(&self) -> Result<u64, Error> {
-        let now = self.clock.now().wall;
+        let now = self.clock.now().steady_wall();
         let mut state = self.state();
         let aged = state.frames.iter().take_while(|f| now.ms_since(Utc(f.at_unix_ms)) >= DAYS_MS).count();
         let freed: u64 = state.frames.drain(..aged).map(|f| f.frame.bytes.len() as u64).sum();
@@ -273,7 +273,7 @@ impl FrameLog for MemoryFrames {
     }
 
     async fn coarsen(&self, coarsen: Coarsen) -> Result<u64, Error> {
-        let now = self.clock.now().wall;
+        let now = self.clock.now().steady_wall();
         let mut guard = self.state();
         let state = &mut *guard;
         let mut changed = 0;

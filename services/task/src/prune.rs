@@ -22,7 +22,7 @@ impl TaskService {
     /// # Errors
     /// If the store cannot be read or written; what is left goes another time.
     pub async fn prune(&self) -> Result<u64, Error> {
-        let (mut gone, now) = (0, self.inner.parts.clock.now().wall);
+        let (mut gone, now) = (0, self.inner.parts.clock.now().steady_wall());
         for (table, kind) in KEPT {
             if let Some(before) = privacy::of(table).before(now) {
                 gone += aged::take_away(self.store(), table, before.0, kind).await?;
@@ -33,7 +33,7 @@ impl TaskService {
 
     /// What was asked for goes after its task: fleet takes the state of a task away when it ended long ago.
     async fn prune_intakes(&self) -> Result<u64, Error> {
-        let Some(before) = privacy::of(Table::TaskIntake).before(self.inner.parts.clock.now().utc) else {
+        let Some(before) = privacy::of(Table::TaskIntake).before(self.inner.parts.clock.now().steady_utc()) else {
             return Ok(0);
         };
         let (mut after, mut gone) = (None, 0);

@@ -168,7 +168,7 @@ mod tests {
     }
 
     fn now(ms: u64) -> Now {
-        Now { site: SiteTime(0), link: LinkTime(ms), utc: Utc(0), wall: Utc(1_000_000) }
+        Now { site: SiteTime(0), link: LinkTime(ms), utc: Utc(0), wall: Utc(1_000_000), jump: None }
     }
 
     fn hears(ear: &Ear, text: &str, ms: u64) -> bool {

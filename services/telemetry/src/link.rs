@@ -15,6 +15,7 @@ use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
+use tracing::field::Empty;
 
 /// A stream without a Hello ends after this.
 const HELLO_WITHIN: Duration = Duration::from_secs(5);
@@ -72,7 +73,7 @@ impl TelemetryService {
         self.inner.picture.ready().await;
         let begun = welcome::begin(&self.inner, &hello, by).await?;
         drop(room);
-        tracing::info!(robot_id = %hello.robot_id, session_epoch = begun.welcome.session_epoch, observed = begun.welcome.observed, "session begun");
+        tracing::info!(peer = Empty, robot_id = %hello.robot_id, session_epoch = begun.welcome.session_epoch, observed = begun.welcome.observed, "session begun");
         let (robot_id, epoch) = (hello.robot_id.clone(), begun.welcome.session_epoch);
         // Also if this future is dropped in the middle: the robot is no longer attached here.
         let observed = begun.part.is_err().then(|| self.inner.parts.clock.now().wall);
@@ -86,7 +87,7 @@ impl TelemetryService {
             return Ok(());
         }
         session::run(self.inner.clone(), &hello, begun, leaving, up, down).await;
-        tracing::info!(%robot_id, session_epoch = epoch, "session ended");
+        tracing::info!(peer = Empty, %robot_id, session_epoch = epoch, "session ended");
         Ok(())
     }
 }

@@ -15,7 +15,8 @@ use midshift_store::{Cursor, Error, Query, Store, aged, load};
 /// If the store does not answer.
 pub async fn prune(store: &dyn Store, clock: &dyn Clock) -> Result<u64, Error> {
     let now = clock.now();
-    Ok(prune_marks(store, now.wall).await? + aged::forget_robots(store, Writer::Telemetry, now.utc).await?)
+    Ok(prune_marks(store, now.steady_wall()).await?
+        + aged::forget_robots(store, Writer::Telemetry, now.steady_utc()).await?)
 }
 
 async fn prune_marks(store: &dyn Store, wall: Utc) -> Result<u64, Error> {

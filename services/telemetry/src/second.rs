@@ -14,6 +14,7 @@ use midshift_core::time::LinkTime;
 use midshift_proto::session::Hello;
 use std::sync::Arc;
 use std::time::Duration;
+use tracing::field::Empty;
 
 /// Such a machine.
 pub struct Second {
@@ -28,7 +29,7 @@ impl Second {
     /// Whoever said this Hello, now.
     pub fn new(inner: &Inner, hello: &Hello, by: &Caller) -> Self {
         let (robot_id, boot_id) = (hello.robot_id.clone(), hello.boot_id.clone());
-        tracing::info!(%robot_id, boot_id, "second session without proof of succession, observed until the older one is silent");
+        tracing::info!(peer = Empty, %robot_id, boot_id, "second session without proof of succession, observed until the older one is silent");
         Self { robot_id, boot_id, certificate: by.certificate().cloned(), since: inner.parts.clock.now().link }
     }
 
@@ -60,7 +61,7 @@ impl Second {
     async fn tell(&self, inner: &Inner) -> bool {
         let Self { robot_id, boot_id, certificate, .. } = self;
         let certificate = certificate.as_deref();
-        tracing::warn!(%robot_id, boot_id, certificate, "two machines with the name of one robot are alive: the second is observed only");
+        tracing::warn!(peer = Empty, %robot_id, boot_id, certificate, "two machines with the name of one robot are alive: the second is observed only");
         let body = serde_json::json!({
             "robot_id": robot_id, "boot_id": boot_id, "certificate": certificate, "code": Code::CloneSeen.as_str(),
         });
@@ -77,7 +78,7 @@ impl Second {
                 true
             }
             Some(Err(error)) => {
-                tracing::warn!(%error, "a second machine could not be recorded yet");
+                tracing::warn!(peer = %robot_id, %error, "a second machine could not be recorded yet");
                 false
             }
             None => false,

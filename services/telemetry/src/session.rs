@@ -37,6 +37,7 @@ use std::time::Duration;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
 use tonic::{Status, Streaming};
+use tracing::field::Empty;
 
 /// A robot that does not read what is sent is let go after this.
 const UNREAD_MAX: Duration = Duration::from_secs(10);
@@ -241,7 +242,7 @@ impl Session {
     /// What the robot sent cannot be read: it hears why if it was too large.
     fn broken(&self, status: &Status) -> End {
         let Some(refusal) = too_large(status) else { return End::Gone };
-        tracing::warn!(robot_id = %self.robot_id, code = Code::MessageTooLarge.as_str(), "session ended by a message that is too large");
+        tracing::warn!(peer = Empty, robot_id = %self.robot_id, code = Code::MessageTooLarge.as_str(), "session ended by a message that is too large");
         End::Close(Close { code: CloseCode::Protocol, reason: refusal.reason, retry_after_ms: 1_000 })
     }
 
@@ -278,7 +279,7 @@ impl Session {
         let read = midshift_proto::parse::<FromRobot, _>(message);
         let Ok(FromRobot::Uplink(Uplink { heartbeat, batches })) = read else {
             let detail = read.err().map(|e| e.to_string()).unwrap_or_else(|| "a second hello".to_owned());
-            tracing::warn!(robot_id = %self.robot_id, code = Code::ProtocolError.as_str(), "session ended by a message that breaks its rules");
+            tracing::warn!(peer = Empty, robot_id = %self.robot_id, code = Code::ProtocolError.as_str(), "session ended by a message that breaks its rules");
             let reason = Reason::new(Code::ProtocolError, detail);
             return Some(End::Close(Close { code: CloseCode::Protocol, reason, retry_after_ms: 1_000 }));
         };
@@ -304,7 +305,7 @@ impl Session {
         if self.in_charge.is_none() || self.too_long.replace(list).is_some() {
             return;
         }
-        tracing::warn!(robot_id = %self.robot_id, list, "heartbeats with a list that is too long are not processed");
+        tracing::warn!(peer = Empty, robot_id = %self.robot_id, list, "heartbeats with a list that is too long are not processed");
         let (inner, robot_id) = (self.inner.clone(), self.robot_id.clone());
         self.telling = Some(Box::pin(async move {
             let mut item = Item::new(Writer::Telemetry, robot_id.as_str());
@@ -416,7 +417,7 @@ impl Session {
             Arrived::Known => self.ack_status(),
             Arrived::Expect(ack) => self.say(|out| out.acks.push(ack)),
             Arrived::OverCredit => {
-                tracing::warn!(robot_id = %self.robot_id, "session ended by status beyond its credit");
+                tracing::warn!(peer = Empty, robot_id = %self.robot_id, "session ended by status beyond its credit");
                 return Some(close(CloseCode::TooSlow, Code::Overloaded, LinkDuration(1_000)));
             }
         }

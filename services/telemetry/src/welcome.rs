@@ -16,6 +16,7 @@ use midshift_proto::session::{Hello, LaneAck, PROTOCOL_VERSION, Previous, Welcom
 use midshift_store::{CommitError, load};
 use std::sync::Arc;
 use tokio::sync::mpsc;
+use tracing::field::Empty;
 
 /// Tries to write the session row against other writers of it.
 const TRIES: usize = 3;
@@ -161,11 +162,11 @@ fn told(hello: &Hello, said: &Said) {
     if let Some(other_key) = &said.other_key {
         metrics::counter!("midshift_telemetry_device_keys_changed_total").increment(1);
         let device_key = said.device_key.as_deref().unwrap_or_default();
-        tracing::warn!(%robot_id, device_key, other_key, "another machine's key signed what this robot says it has installed: not believed");
+        tracing::warn!(peer = Empty, %robot_id, device_key, other_key, "another machine's key signed what this robot says it has installed: not believed");
     }
     if let Some(rejection) = &said.rejection {
         metrics::counter!("midshift_telemetry_installed_rejected_total").increment(1);
-        tracing::warn!(%robot_id, %rejection, "what this robot says it has installed is not believed");
+        tracing::warn!(peer = Empty, %robot_id, %rejection, "what this robot says it has installed is not believed");
     }
 }
 

@@ -1,12 +1,15 @@
 //! Wrong doors: what people, a second server and a robot are told where no server of their site answers.
 
-use crate::harness::{Running, Server, folder, free_port, has_login, midshift, token, tool, until};
+use crate::harness::{Running, Server, folder, free_port, has_login, midshift, sign_in, token, tool, until};
 use crate::room::LIMIT;
 use crate::stopped::StopServer;
 use anyhow::{Context, ensure};
 use std::net::{SocketAddr, TcpListener};
 use std::path::Path;
 use std::process::{Command, Output};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+use tokio_util::task::AbortOnDropHandle;
 
 /// A command of somebody who is signed in nowhere.
 fn stranger(dir: &Path, arguments: &[&str]) -> anyhow::Result<Output> {
@@ -34,12 +37,71 @@ async fn each_wrong_door_says_what_it_is_and_what_to_try() -> anyhow::Result<()>
     asked(dir.path(), silent.local_addr()?, 10, &["says nothing", "it may hang"])?;
 
     let server = Server::start(dir.path()).await?;
-    asked(dir.path(), server.address, 5, &["midshift login"])?;
+    asked(dir.path(), server.address, 5, &["it speaks TLS", "midshift login"])?;
     let stops = StopServer::start(dir.path(), server.address).await?;
     let wrong = crate::harness::command(&["task", "ls", "--server", &stops.address.to_string()])?.output()?;
     let said = String::from_utf8_lossy(&wrong.stderr);
     ensure!(wrong.status.code() == Some(5) && said.contains("stops are at 7421"), "{:?} {said}", wrong.status);
     Ok(())
+}
+
+/// The first bytes that a port says to a request of HTTP/1.1 in plain text.
+async fn first_bytes(address: SocketAddr, path: &str) -> anyhow::Result<Vec<u8>> {
+    let mut stream = TcpStream::connect(address).await?;
+    stream.write_all(format!("GET {path} HTTP/1.1\r\nhost: site\r\nconnection: close\r\n\r\n").as_bytes()).await?;
+    let mut said = Vec::new();
+    // Closed with bytes unread it is a reset: closed all the same.
+    let _ = stream.read_to_end(&mut said).await;
+    Ok(said)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn tls_and_plain_text_each_say_what_the_other_is_and_so_does_a_port_of_metrics() -> anyhow::Result<()> {
+    let dir = folder()?;
+    let server = Server::start(dir.path()).await?;
+    ensure!(has_login(server.address), "a site with login");
+    let said = first_bytes(server.address, "/metrics").await?;
+    ensure!(said.first() == Some(&0x15), "TLS says that this is none: {said:?}");
+
+    // The same commands, signed in, at a server without a login.
+    let (plain, data) = (free_port()?, dir.path().join("plain"));
+    let mut command = Command::new(midshift()?);
+    command.args(["serve", "--insecure", "--no-stop", "--listen", &plain.to_string(), "--data"]).arg(&data);
+    let _plain = Running::start(&mut command, &dir.path().join("plain.log"))?;
+    until("a page of metrics in plain text", LIMIT, async || {
+        let Ok(said) = first_bytes(plain, "/metrics").await else { return Ok(None) };
+        Ok(said.starts_with(b"HTTP/1.1 200").then_some(()))
+    })
+    .await?;
+    let signed_in = |address: SocketAddr| {
+        let mut command = Command::new(midshift()?);
+        sign_in(&mut command, server.address);
+        command.args(["task", "ls", "--server", &address.to_string()]);
+        tokio::task::block_in_place(|| Ok::<_, anyhow::Error>(command.output()?))
+    };
+    let output = signed_in(plain)?;
+    let said = String::from_utf8_lossy(&output.stderr);
+    ensure!(output.status.code() == Some(5) && said.contains("it speaks plain text"), "{:?} {said}", output.status);
+
+    // Over TLS a hung server is told as well.
+    let silent = TcpListener::bind("127.0.0.1:0")?;
+    let output = signed_in(silent.local_addr()?)?;
+    let said = String::from_utf8_lossy(&output.stderr);
+    ensure!(output.status.code() == Some(10) && said.contains("it may hang"), "{:?} {said}", output.status);
+
+    // Metrics of another program: HTTP/1.1 and nothing else.
+    let page = tokio::net::TcpListener::bind("127.0.0.1:0").await?;
+    let address = page.local_addr()?;
+    let _page = AbortOnDropHandle::new(tokio::spawn(async move {
+        loop {
+            let Ok((mut stream, _)) = page.accept().await else { return };
+            let mut asked = [0; 16];
+            if stream.read_exact(&mut asked).await.is_ok() {
+                let _ = stream.write_all(b"HTTP/1.1 400 Bad Request\r\ncontent-length: 0\r\n\r\n").await;
+            }
+        }
+    }));
+    asked(dir.path(), address, 5, &["HTTP/1.1 and no gRPC", "7420"])
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

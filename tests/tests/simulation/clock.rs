@@ -66,6 +66,7 @@ impl Clock for MachineClock {
             link: LinkTime(link_us.unsigned_abs() / 1000 + 1_000),
             utc,
             wall: Utc(utc.0 + self.skew.wall_ms),
+            jump: None,
         }
     }
     fn rate_permille(&self) -> u32 {

@@ -38,7 +38,7 @@ impl Rig {
         let site = Arc::new(text::parse(CORRIDOR).expect("a site"));
         let begun = Now { utc: Utc(BEGIN.0 - SERVED_MS as i64), wall: BEGIN, ..Now::default() };
         let view = View::new(site, begun, begun);
-        let now = Now { site: SiteTime(SERVED_MS), link: LinkTime(SERVED_MS), utc: BEGIN, wall: BEGIN };
+        let now = Now { site: SiteTime(SERVED_MS), link: LinkTime(SERVED_MS), utc: BEGIN, wall: BEGIN, jump: None };
         Self { view, board: Board::new(), now, number: 0 }
     }
 

@@ -153,7 +153,7 @@ impl Rig {
     /// So many robots, parked in the hall, of which all may be out of work at once, and bundles 1, 2 and 3.
     fn new(count: usize) -> Self {
         let site: Arc<Site> = Arc::new(crate::site::text::parse(DEMO).expect("the demo reads"));
-        let now = Now { site: SiteTime(0), link: LinkTime(1_000_000), utc: Utc(BEGIN), wall: Utc(BEGIN) };
+        let now = Now { site: SiteTime(0), link: LinkTime(1_000_000), utc: Utc(BEGIN), wall: Utc(BEGIN), jump: None };
         let mut rig = Self {
             now,
             seq: 0,

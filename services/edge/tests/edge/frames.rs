@@ -6,10 +6,12 @@ use tokio::net::{TcpSocket, TcpStream};
 
 pub const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 pub const HEADERS: u8 = 1;
+pub const PRIORITY: u8 = 2;
 pub const RST_STREAM: u8 = 3;
 pub const SETTINGS: u8 = 4;
 pub const PING: u8 = 6;
 pub const GOAWAY: u8 = 7;
+pub const WINDOW_UPDATE: u8 = 8;
 pub const END_STREAM: u8 = 1;
 pub const ACK: u8 = 1;
 const END_HEADERS: u8 = 4;
@@ -37,6 +39,14 @@ pub async fn until_closed(io: &mut (impl AsyncRead + Unpin)) -> Vec<u8> {
     said
 }
 
+pub fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
+    let mut frame = (payload.len() as u32).to_be_bytes()[1..].to_vec();
+    frame.extend([kind, flags]);
+    frame.extend(stream.to_be_bytes());
+    frame.extend(payload);
+    frame
+}
+
 pub struct Raw<Io>(pub Io);
 
 impl Raw<TcpStream> {
@@ -51,11 +61,7 @@ impl Raw<TcpStream> {
 
 impl<Io: AsyncRead + AsyncWrite + Unpin> Raw<Io> {
     pub async fn write(&mut self, kind: u8, flags: u8, stream: u32, payload: &[u8]) {
-        let mut frame = (payload.len() as u32).to_be_bytes()[1..].to_vec();
-        frame.extend([kind, flags]);
-        frame.extend(stream.to_be_bytes());
-        frame.extend(payload);
-        self.0.write_all(&frame).await.expect("written");
+        self.0.write_all(&frame(kind, flags, stream, payload)).await.expect("written");
     }
 
     /// Begins a gRPC call whose body goes on.

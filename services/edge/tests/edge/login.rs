@@ -6,7 +6,8 @@ use http::Request;
 use midshift_core::identity::{Digest, Directory, DirectoryToken, Secret, TokenId};
 use midshift_core::ids::SiteId;
 use midshift_core::reason::Code;
-use midshift_core::time::{Clock, LinkDuration, ScaledClock, Utc};
+use midshift_core::time::{Clock, LinkDuration, Utc};
+use midshift_core::wall::WallClock;
 use midshift_edge::tls::Clients;
 use midshift_edge::{Config, Denial, Denials, Known, robot_of};
 use sha2::Digest as _;
@@ -23,6 +24,8 @@ const HEALTH: &str = "/grpc.health.v1.Health/Check";
 
 pub struct Port {
     us: Arc<AtomicU64>,
+    /// How far the wall stepped ahead.
+    stepped_ms: Arc<AtomicU64>,
     pub world: World,
     pub authority: Authority,
     known: Arc<Known>,
@@ -42,15 +45,16 @@ impl Port {
         Self::with(Config::default()).await
     }
     pub async fn with(config: Config) -> Self {
-        let (authority, us) = (Authority::new(), Arc::new(AtomicU64::new(0)));
-        let source = us.clone();
-        let clock: Arc<dyn Clock> =
-            Arc::new(ScaledClock::new(move || source.load(Ordering::Relaxed), Utc(BEGIN), 1000));
-        let known = Arc::new(Known::new(site(), clock));
-        let (tls, newest) = watch::channel(authority.server(Clients::Asked(vec![authority.root()])));
+        let (authority, us, stepped_ms) = (Authority::new(), Arc::<AtomicU64>::default(), Arc::<AtomicU64>::default());
+        let (source, beside, ahead) = (us.clone(), us.clone(), stepped_ms.clone());
+        let wall =
+            move || Utc(BEGIN).plus_ms(beside.load(Ordering::Relaxed) / 1000).plus_ms(ahead.load(Ordering::Relaxed));
+        let clock: Arc<dyn Clock> = Arc::new(WallClock::new(move || source.load(Ordering::Relaxed), wall, |_| {}));
+        let known = Arc::new(Known::new(site(), clock.clone()));
+        let (tls, newest) = watch::channel(authority.server_by(Clients::Asked(vec![authority.root()]), &clock));
         let (tell, denials) = Denials::new("business");
         let world = World::telling(config, known.clone(), Some(newest), Some(tell)).await;
-        Self { us, world, authority, known, denials, _tls: tls }
+        Self { us, stepped_ms, world, authority, known, denials, _tls: tls }
     }
     pub fn robot(&self, name: &str) -> Identity {
         self.authority.issue_uri(&format!("spiffe://factory/robot/{name}"))
@@ -247,6 +251,26 @@ async fn a_certificate_whose_time_is_over_does_not_get_through_the_handshake() {
     let good = port.authority.issue_uri_until("spiffe://factory/robot/r7", (4000, 1, 1));
     let mut robot = port.client(Some(&good)).await;
     assert!(code(&mut robot, SESSION, None).await.is_ok());
+}
+
+#[tokio::test]
+async fn a_wall_that_jumped_ends_no_certificate_of_a_robot_and_a_token_at_its_next_request() {
+    const YEAR_MS: u64 = 365 * 24 * 3_600_000;
+    let port = Port::open().await;
+    let secret = secret();
+    port.knows(&secret, &["viewer"], BEGIN + 1_000_000);
+    let bearer = format!("Bearer {}", secret.reveal(Secret::TOKEN));
+    // The handshake's own clock is the machine's: this certificate is over, and was not before a jump of fifty years.
+    let late = port.authority.issue_uri_until("spiffe://factory/robot/r7", (2020, 1, 1));
+    port.stepped_ms.store(50 * YEAR_MS, Ordering::Relaxed);
+    let mut robot = port.client(Some(&late)).await;
+    assert_eq!(code(&mut robot, SESSION, None).await, Ok("robot:r7".to_owned()));
+    let mut client = port.client(None).await;
+    assert_eq!(code(&mut client, LIST, Some(&bearer)).await, Err(Code::TokenExpired));
+    // Whoever was taken out stays out.
+    let (_, key) = robot_of(&late.leaf, &site()).expect("a robot");
+    port.known.publish(Directory { tokens: BTreeMap::new(), denied: [(key, i64::MAX)].into() });
+    port.world.closed_for("denied").await;
 }
 
 #[tokio::test]

@@ -5,6 +5,7 @@
 
 mod asking;
 mod crowds;
+mod frame_floods;
 mod frames;
 mod hostile;
 mod leaving;

@@ -2,6 +2,7 @@
 
 use crate::frames::{PREFACE, dial, until_closed};
 use crate::world::{Client, HERE, SOON, World, within};
+use midshift_core::time::{Clock, ScaledClock, Utc};
 use midshift_edge::tls::{Clients, server_config};
 use midshift_edge::{Anybody, Config, ConnectionId, Edge, Incoming, Peer};
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair, SanType};
@@ -63,8 +64,12 @@ impl Authority {
     }
 
     pub fn server(&self, clients: Clients) -> Arc<ServerConfig> {
+        self.server_by(clients, &(Arc::new(ScaledClock::new(|| 0, Utc(0), 1000)) as Arc<dyn Clock>))
+    }
+
+    pub fn server_by(&self, clients: Clients, clock: &Arc<dyn Clock>) -> Arc<ServerConfig> {
         let Identity { leaf, key } = self.issue("edge");
-        server_config(vec![leaf], key, clients).expect("a server's TLS")
+        server_config(vec![leaf], key, clients, clock).expect("a server's TLS")
     }
 
     /// A client that believes this authority and shows `identity`.

@@ -162,6 +162,10 @@ impl Client {
         Self { sender: Some(sender), connection: tokio::spawn(connection) }
     }
 
+    pub fn of(sender: SendRequest<Bytes>, connection: JoinHandle<Result<(), h2::Error>>) -> Self {
+        Self { sender: Some(sender), connection }
+    }
+
     /// Sends the head of a call, `grpc-timeout` included; the body is whole and empty.
     pub async fn begin(&mut self, path: &str, timeout: Option<&str>) -> Option<h2::client::ResponseFuture> {
         let mut request = Request::post(format!("http://edge{path}")).header("content-type", "application/grpc");

@@ -436,7 +436,7 @@ impl Call {
         let way = resolved.way(&resolved.server)?;
         let line = way.connect().await.map_err(|error| no_server(&resolved, &*error.0))?;
         if !resolved.is_secure() {
-            says_something(line.clone()).await.map_err(|error| no_server(&resolved, &error))?;
+            answers(&way, line.clone()).await.map_err(|found| at_wrong_door(&resolved, found))?;
         }
         Ok(line)
     }
@@ -478,18 +478,26 @@ impl Call {
     }
 }
 
-/// Waits for any word. In plain text a connection stands as soon as the system has taken it, whether a program looks at it or not.
-async fn says_something(line: Line) -> std::io::Result<()> {
+/// Waits for any answer. In plain text a connection stands as soon as the system has taken it, whether a program looks at it or not.
+async fn answers(way: &Way, line: Line) -> Result<(), Found> {
     let mut health = HealthClient::new(line);
     match tokio::time::timeout(SAID_WITHIN, health.check(HealthCheckRequest::default())).await {
+        Err(_) => Err(Found::Silence),
+        Ok(Err(status)) if has_broken_off(&status) => match Found::by_probe(way).await {
+            Found::Unknown => Ok(()),
+            found => Err(found),
+        },
         Ok(_) => Ok(()),
-        Err(_) => Err(ErrorKind::TimedOut.into()),
     }
 }
 
 /// Why nothing stands: nobody is there, it is of another site, or it is another door.
 fn no_server(resolved: &Resolved, error: &(dyn std::error::Error + 'static)) -> Exit {
-    let (server, found) = (&resolved.server, Found::by(error));
+    at_wrong_door(resolved, Found::by(error))
+}
+
+fn at_wrong_door(resolved: &Resolved, found: Found) -> Exit {
+    let server = &resolved.server;
     let text = match (found, found.help()) {
         (Found::OtherSite, _) => format!(
             "the server at {server} is not of the site that you signed in to\n  try: midshift login {server} --pin DIGEST, with the digest that this server printed"

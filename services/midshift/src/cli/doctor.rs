@@ -8,8 +8,9 @@ mod stop;
 use super::client::{Call, Exit, unary};
 use super::out::{Format, Out, columns};
 use super::released;
-use crate::clock;
 use crate::roles::Role;
+use crate::way::Line;
+use crate::{clock, site_answer};
 use midshift_bundle::freshness::{newest_targets, root_edition, stamp, targets_edition};
 use midshift_bundle::repository::TIMESTAMP_LIFE_MS;
 use midshift_core::time::Utc;
@@ -19,6 +20,7 @@ use midshift_proto::telemetry::v1;
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 use tonic::Code;
+use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
@@ -109,12 +111,13 @@ async fn server(doctor: &Doctor, found: &mut Vec<Finding>) -> Result<(), Exit> {
     let others = Role::ALL.into_iter().filter(|role| *role != Role::Identity).flat_map(Role::services);
     let services: BTreeSet<&str> = others.chain(identity).copied().collect();
     for service in services {
-        let request = tonic_health::pb::HealthCheckRequest { service: service.to_owned() };
+        let request = HealthCheckRequest { service: service.to_owned() };
         let status = HealthClient::new(channel.clone()).check(unary(request)).await.map(|r| r.into_inner().status());
         let good = matches!(status, Ok(ServingStatus::Serving));
         let text = format!("{service} {}", if good { "serves" } else { "does not serve" });
         found.push(Finding { what: "service", good, text });
     }
+    found.extend(jump(&channel, now).await);
     found.push(store(call).await);
     let (robots, online) = robots(doctor).await?;
     found.extend(robots);
@@ -126,6 +129,13 @@ async fn server(doctor: &Doctor, found: &mut Vec<Finding>) -> Result<(), Exit> {
     let address = super::stop::address(doctor.stop_server.as_deref(), &resolved)?;
     found.extend(stop::look(&resolved, &address, now, &online).await);
     Ok(())
+}
+
+/// What the server's wall clock jumped while it ran, which it says in each answer to a health check; none: it did not.
+async fn jump(channel: &Line, now: Utc) -> Option<Finding> {
+    let answer = HealthClient::new(channel.clone()).check(unary(HealthCheckRequest::default())).await.ok()?;
+    let (step_ms, at) = site_answer::clock_jump(answer.metadata())?;
+    Some(shown::jump(step_ms, at, now))
 }
 
 /// When what was signed ends: root and targets, which people sign, and the timestamp, which the server signs.

@@ -1,8 +1,14 @@
 //! Says what was found at an address where no server of the site answers, by what the connection has said.
 
+use crate::way::Way;
 use std::error::Error;
 use std::io::ErrorKind;
 use std::iter::successors;
+use std::time::Duration;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+
+/// Whatever breaks a gRPC call off is asked in HTTP/1.1 what it is, and answers within this or is not told.
+const PROBED_WITHIN: Duration = Duration::from_secs(1);
 
 /// What was found instead of a server of the site.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -13,6 +19,10 @@ pub enum Found {
     Silence,
     /// It speaks plain text, and TLS was spoken to it.
     PlainText,
+    /// It speaks TLS, and plain text was spoken to it.
+    Tls,
+    /// It speaks HTTP/1.1 alone: a page, or metrics of another program.
+    Page,
     /// It has proven itself as a server of another site.
     OtherSite,
     /// The connection ended, and nobody knows why.
@@ -41,6 +51,30 @@ impl Found {
         }
     }
 
+    /// What a server in plain text is that broke a call of gRPC off, by its first words to a request of HTTP/1.1.
+    pub async fn by_probe(way: &Way) -> Self {
+        let probe = async {
+            let mut wire = way.wire().await?;
+            wire.write_all(b"GET / HTTP/1.1\r\nhost: midshift\r\nconnection: close\r\n\r\n").await?;
+            let mut said = [0; 5];
+            wire.read_exact(&mut said).await?;
+            Ok::<_, std::io::Error>(said)
+        };
+        match tokio::time::timeout(PROBED_WITHIN, probe).await {
+            Ok(Ok(said)) => Self::by_first_words(said),
+            _ => Self::Unknown,
+        }
+    }
+
+    const fn by_first_words(said: [u8; 5]) -> Self {
+        match &said {
+            b"HTTP/" => Self::Page,
+            // An alert of TLS, of whichever version.
+            [0x15, 3, _, 0, 2] => Self::Tls,
+            _ => Self::Unknown,
+        }
+    }
+
     /// The exit code of a command that has found this.
     pub const fn exit_code(self) -> u8 {
         match self {
@@ -56,6 +90,12 @@ impl Found {
             Self::Silence => Some(
                 "whatever is there takes no connection, or takes it and says nothing\n  try: look at that process: it may hang, or be no midshift at all",
             ),
+            Self::Tls => Some(
+                "it speaks TLS, and plain text was spoken to it\n  try: sign in: midshift login SERVER --pin DIGEST, with the digest that it printed at its first start",
+            ),
+            Self::Page => Some(
+                "it speaks HTTP/1.1 and no gRPC: a page, or metrics of another program\n  try: look at the port: midshift serves everything, its /metrics too, at 7420, and stops at 7421",
+            ),
             Self::PlainText => Some(
                 "it speaks plain text, and TLS was spoken to it\n  try: leave out --ca and the context if it is a server without login (`midshift dev`, --insecure); else look at the port",
             ),
@@ -66,8 +106,6 @@ impl Found {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::way::Way;
-    use tokio::io::AsyncWriteExt;
     use tokio::net::{TcpListener, TcpSocket};
 
     async fn found_over_tls(address: std::net::SocketAddr) -> Found {
@@ -93,6 +131,12 @@ mod tests {
         socket.bind("127.0.0.1:0".parse().expect("an address")).expect("a port");
         let dead = socket.local_addr().expect("its address");
         assert_eq!(found_over_tls(dead).await, Found::Nothing);
+    }
+
+    #[test]
+    fn what_breaks_a_call_off_is_told_by_its_first_words() {
+        let found = [*b"HTTP/", [0x15, 3, 3, 0, 2], [0x15, 3, 1, 0, 2], *b"220 m"].map(Found::by_first_words);
+        assert_eq!(found, [Found::Page, Found::Tls, Found::Tls, Found::Unknown]);
     }
 
     #[tokio::test]

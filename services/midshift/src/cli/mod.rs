@@ -179,7 +179,12 @@ pub fn main() -> ExitCode {
         Ok(runtime) => runtime,
         Err(error) => return Exit::from(anyhow::anyhow!("starting the runtime: {error}")).report(&out),
     };
-    let result = runtime.block_on(run(args.command, &out));
+    let result = runtime.block_on(async {
+        tokio::select! {
+            result = run(args.command, &out) => result,
+            () = logs::count_floods(), if serves => unreachable!("it counts for as long as it is let"),
+        }
+    });
     runtime.shutdown_timeout(Duration::from_secs(2));
     match result {
         Ok(()) => ExitCode::SUCCESS,

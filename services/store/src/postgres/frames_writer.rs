@@ -113,11 +113,11 @@ impl FramesEngine for FramesWriter {
     }
 
     async fn prune(&mut self) -> Result<u64, Error> {
-        self.transaction(&Work::Prune { bytes_max: self.bytes_max, now: self.clock.now().wall }).await
+        self.transaction(&Work::Prune { bytes_max: self.bytes_max, now: self.clock.now().steady_wall() }).await
     }
 
     async fn coarsen(&mut self, coarsen: Coarsen) -> Result<u64, Error> {
-        self.transaction(&Work::Coarsen { coarsen, now: self.clock.now().wall }).await
+        self.transaction(&Work::Coarsen { coarsen, now: self.clock.now().steady_wall() }).await
     }
 
     async fn oldest(&mut self) -> Result<FramesOldest, Error> {

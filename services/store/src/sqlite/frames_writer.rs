@@ -78,7 +78,7 @@ impl FramesWriter {
         let rows = oldest.fetch_all(&mut open.connection).await?;
         let sizes = rows.iter().map(|row| Ok((row.try_get(0)?, row.try_get(1)?, row.try_get(2)?)));
         let sizes = sizes.collect::<Result<Vec<_>, sqlx::Error>>()?;
-        Ok(surplus(&sizes, open.bytes, self.bytes_max, self.clock.now().wall))
+        Ok(surplus(&sizes, open.bytes, self.bytes_max, self.clock.now().steady_wall()))
     }
 
     async fn write_marks(&mut self) -> Result<(), Error> {
@@ -149,7 +149,7 @@ impl FramesEngine for FramesWriter {
     }
 
     async fn coarsen(&mut self, coarsen: Coarsen) -> Result<u64, Error> {
-        let now = self.clock.now().wall;
+        let now = self.clock.now().steady_wall();
         self.ready().await?;
         let Some(mut open) = self.open.take() else { return Ok(0) };
         let next = precise(&mut open.connection, &self.site_id).await.map_err(unavailable)?;

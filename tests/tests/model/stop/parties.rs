@@ -193,7 +193,7 @@ fn robot_id(robot: usize) -> RobotId {
 }
 
 fn now(ms: u64, wall: u8) -> Now {
-    Now { site: SiteTime(ms), link: LinkTime(ms), utc: Utc(0), wall: Utc(wall.into()) }
+    Now { site: SiteTime(ms), link: LinkTime(ms), utc: Utc(0), wall: Utc(wall.into()), jump: None }
 }
 
 /// Silences are named by the robot, after its wall.

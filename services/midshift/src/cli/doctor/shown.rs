@@ -129,6 +129,18 @@ pub fn clock(whose: &str, answer: &MetadataMap, now: Utc) -> Finding {
     Finding::look("clocks", format!("{whose} is {seconds} s {way} this machine; {then}"))
 }
 
+/// What its wall clock jumped while it ran: a person looks for a day, and sees it for as long as it runs.
+pub fn jump(step_ms: i64, at: Utc, now: Utc) -> Finding {
+    let way = if step_ms < 0 { "back" } else { "ahead" };
+    let text = format!("the server's jumped {} s {way} at {}", step_ms.unsigned_abs() / 1_000, at.rfc3339());
+    if now.ms_since(at) > DAY_MS {
+        return Finding::good("clocks", text);
+    }
+    let then =
+        "tokens and times of tasks follow it; if it is wrong now, set it right (NTP): see docs/runbooks/clock.md";
+    Finding::look("clocks", format!("{text}; {then}"))
+}
+
 /// `Sun, 06 Nov 1994 08:49:37 GMT`.
 fn date(text: &str) -> Option<Utc> {
     const MONTHS: [&str; 12] = ["Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec"];
@@ -171,6 +183,23 @@ mod tests {
         assert_eq!([found(30).good, found(29).good, found(0).good], [true, false, false]);
         assert_eq!(found(29).text, "the server's ends 1970-01-30T00:00:00.000Z, in 29 days; look at the log");
         assert_eq!(found(0).text, "the server's ENDED 1970-01-01T00:00:00.000Z; look at the log");
+    }
+
+    #[test]
+    fn a_jump_of_the_servers_clock_wants_a_look_for_a_day() {
+        let at = Utc(1_800_000_000_000);
+        let found = jump(7_200_500, at, at.plus_ms(DAY_MS));
+        assert!(!found.good, "{}", found.text);
+        assert!(
+            found.text.starts_with("the server's jumped 7200 s ahead at 2027-01-15T08:00:00.000Z;"),
+            "{}",
+            found.text
+        );
+        let later = jump(-6_000, at, at.plus_ms(DAY_MS + 1));
+        assert_eq!(
+            (later.good, later.text.as_str()),
+            (true, "the server's jumped 6 s back at 2027-01-15T08:00:00.000Z")
+        );
     }
 
     #[test]
