@@ -376,6 +376,7 @@ impl AgentCore {
             floors: self.kept.ledger.software.floors.clone(),
             floor: update.rollback_floor,
             allows_safety_related: config.is_some_and(|c| c.allows_safety_related),
+            bugs: midshift_bundle::bugs::Bugs::default(),
         };
         let set = match current.with(wanted.digest, manifest, &fit) {
             Ok(set) => set,
