@@ -32,6 +32,9 @@ macro_rules! seeded_bugs {
         }
 
         impl Bugs {
+            /// Whether this build has naive rules that could be switched on.
+            pub const ARE_BUILT_IN: bool = cfg!(feature = "seeded-bugs");
+
             $($(#[$doc])*
             pub fn $question(self) -> bool {
                 #[cfg(feature = "seeded-bugs")]

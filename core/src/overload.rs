@@ -25,6 +25,8 @@ pub mod bugs {
     crate::seeded_bugs! {
         /// Every class is the highest one.
         ClassesAreAlike classes_are_alike;
+        /// Each request leaves a seat taken behind it.
+        SeatsAreKept seats_are_kept;
     }
 }
 

@@ -3,6 +3,7 @@
 //! Invariant: a directive chooses among what release people signed and can neither add to it nor go below a robot's floor; nothing
 //! of an envelope is believed before its signature was checked over exactly the bytes that are read.
 
+use crate::bugs::Bugs;
 use crate::digest::Digest;
 use crate::dsse::{self, Unreadable};
 use crate::keys::{KeyId, PublicKey, SecretKey};
@@ -81,6 +82,8 @@ pub struct Expected<'a> {
     pub generation: u64,
     /// The latest moment it is sure of: its clock if that is synced, never before its time floor.
     pub now: Utc,
+    /// Naive rules, for twins of tests.
+    pub bugs: Bugs,
 }
 
 impl From<Unreadable> for Rejection {
@@ -106,10 +109,12 @@ impl Directive {
     /// # Errors
     /// The first reason not to take it.
     pub fn open(envelope: &[u8], expected: &Expected) -> Result<Self, Rejection> {
-        let opened = dsse::open(envelope, ENVELOPE_BYTES_MAX, PAYLOAD_TYPE)?;
+        let most = if expected.bugs.length_is_forgotten() { usize::MAX } else { ENVELOPE_BYTES_MAX };
+        let opened = dsse::open(envelope, most, PAYLOAD_TYPE)?;
         let signer = opened
             .signers()
-            .find(|id| expected.keys.get(id).is_some_and(|key| key.id() == *id && opened.is_signed_by(key)));
+            .find(|id| expected.keys.get(id).is_some_and(|key| key.id() == *id && opened.is_signed_by(key)))
+            .or_else(|| opened.signers().next().filter(|_| expected.bugs.strangers_sign()));
         let signer = signer.ok_or(Rejection::NotSigned)?;
         let directive: Self = serde_json::from_slice(&opened.payload).map_err(|_| Rejection::Malformed)?;
         directive.check(signer, expected).map(|()| directive)
@@ -119,13 +124,13 @@ impl Directive {
         if self.key_id != signer {
             return Err(Rejection::OtherKey);
         }
-        if self.robot_id != *expected.robot_id {
+        if self.robot_id != *expected.robot_id && !expected.bugs.any_robot_will_do() {
             return Err(Rejection::OtherRobot);
         }
         if self.generation <= expected.generation {
             return Err(Rejection::Replayed);
         }
-        if self.expires <= expected.now {
+        if self.expires <= expected.now && !expected.bugs.directives_live_for_ever() {
             return Err(Rejection::Expired);
         }
         Ok(())

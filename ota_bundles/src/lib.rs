@@ -4,6 +4,7 @@
 //! `encoding` makes files shorter on their way; `freshness` is what a server must know of documents that others signed; `trust` is what a robot believes.
 //! Called by the command line, by the rollout service and by agents. Invariant: nothing here runs, installs or downloads anything.
 
+pub mod bugs;
 pub mod build;
 pub mod digest;
 pub mod directive;

@@ -4,6 +4,7 @@
 //! the rollout service for its dry run, so that both refuse for the same reasons.
 //! Invariant: a set that [`SetManifest::with`] gave has everything its components require and nothing they exclude.
 
+use crate::bugs::Bugs;
 use crate::digest::Digest;
 use crate::manifest::{Component, ComponentKind, Manifest, SafetyClass};
 use midshift_core::task::raw::parse_version;
@@ -36,6 +37,8 @@ pub struct Fit {
     pub floor: u64,
     /// The site lets components that bear on a safety function in. To validate them is the integrator's duty, not midshift's.
     pub allows_safety_related: bool,
+    /// Naive rules, for twins of tests.
+    pub bugs: Bugs,
 }
 
 /// Why a bundle does not fit a robot.
@@ -197,7 +200,7 @@ fn admissible(component: &Component, robot: &Fit) -> Vec<Unfit> {
         unfit.push(Unfit::Hardware { component: name(), model: robot.model.clone() });
     }
     let floor = robot.floors.get(&component.name).copied().unwrap_or(0).max(robot.floor);
-    if component.rollback_index < floor {
+    if component.rollback_index < floor && !robot.bugs.floor_is_forgotten() {
         unfit.push(Unfit::BelowFloor { component: name(), index: component.rollback_index, floor });
     }
     if component.safety_class != SafetyClass::None && !robot.allows_safety_related {

@@ -1,6 +1,10 @@
 //! Holds the tree to its own pages: who imports whom (ARCHITECTURE.md), who writes which rows (docs/rows.md), what may not be there.
 //!
-//! Invariant: reads files only; nothing is built or run. Each rule is a function of text, tried on a text that breaks it.
+//! Invariant: reads files only; nothing is built, and nothing is run but cargo that is asked what it would build. Each rule is a function of text, tried on a
+//! text that breaks it.
+
+#[path = "architecture/twins.rs"]
+mod twins;
 
 use midshift_core::rows::{Log, Table};
 use std::collections::{BTreeMap, BTreeSet};
@@ -599,74 +603,7 @@ fn a_place_or_a_text_in_the_log_is_found_however_it_is_given() {
     assert_eq!(found(fine), Vec::<String>::new());
 }
 
-// --- naive rules of tests
-
-const NAIVE: &str = "seeded-bugs";
-
-/// Features of `section` that a dependency is asked for by name, whichever way it is written.
-fn asked_features(dependency: &toml::Value) -> Vec<String> {
-    let listed = dependency.get("features").and_then(toml::Value::as_array);
-    listed.into_iter().flatten().filter_map(|f| f.as_str()).map(str::to_owned).collect()
-}
-
-/// Where a program that is built for use could have a naive rule switched on: a dependency that is not for tests alone asks for the feature,
-/// or a feature brings it along.
-fn naive_rules_of_programs(manifests: &[toml::Table]) -> Vec<String> {
-    let mut found = Vec::new();
-    for manifest in manifests {
-        let name = manifest.get("package").map_or_else(|| "the workspace".to_owned(), |_| package(manifest));
-        let sections = [manifest.get("dependencies"), manifest.get("build-dependencies")];
-        let shared = manifest.get("workspace").and_then(|w| w.get("dependencies"));
-        for (to, dependency) in sections.into_iter().chain([shared]).flatten().filter_map(|s| s.as_table()).flatten() {
-            if asked_features(dependency).iter().any(|feature| feature == NAIVE) {
-                found.push(format!("{name} builds {to} with {NAIVE}"));
-            }
-        }
-        for (feature, brings) in manifest.get("features").and_then(|f| f.as_table()).into_iter().flatten() {
-            let brings = brings.as_array().into_iter().flatten().filter_map(|f| f.as_str());
-            for brought in brings.filter(|b| b.split('/').next_back() == Some(NAIVE)) {
-                found.push(format!("feature {feature} of {name} brings {brought}"));
-            }
-        }
-    }
-    found
-}
-
-#[test]
-fn no_program_that_is_built_for_use_has_a_naive_rule_in_it() {
-    let workspace: toml::Table = read("Cargo.toml").parse().expect("a manifest");
-    let manifests: Vec<toml::Table> = manifests().into_iter().chain([workspace]).collect();
-    let has = |manifest: &&toml::Table| manifest.get("features").is_some_and(|f| f.get(NAIVE).is_some());
-    assert!(manifests.iter().filter(has).count() >= 3, "crates with naive rules");
-    assert_eq!(naive_rules_of_programs(&manifests), Vec::<String>::new());
-    // Nor is anything built for use with every feature there is.
-    for file in files("xtask/src", "rs").into_iter().chain(files("deploy", "Dockerfile")) {
-        assert!(!read(&file).contains("--all-features") && !read(&file).contains(NAIVE), "{file}");
-    }
-}
-
-#[test]
-fn a_program_with_a_naive_rule_is_found_however_it_comes_in() {
-    let manifest = |text: &str| text.parse::<toml::Table>().expect("a manifest");
-    let bad = [
-        manifest(
-            "[package]\nname='midshift'\n[dependencies]\nmidshift-core = {workspace=true, features=['seeded-bugs']}",
-        ),
-        manifest("[package]\nname='midshift-fleet'\n[features]\ndefault=['midshift-core/seeded-bugs']"),
-        manifest("[workspace.dependencies]\nmidshift-core = {path='core', features=['seeded-bugs']}"),
-    ];
-    let found = naive_rules_of_programs(&bad);
-    assert_eq!(
-        found,
-        [
-            "midshift builds midshift-core with seeded-bugs",
-            "feature default of midshift-fleet brings midshift-core/seeded-bugs",
-            "the workspace builds midshift-core with seeded-bugs",
-        ]
-    );
-    let good = "[package]\nname='midshift-fleet'\n[dev-dependencies]\nmidshift-core={workspace=true, features=['seeded-bugs']}";
-    assert_eq!(naive_rules_of_programs(&[manifest(good)]), Vec::<String>::new());
-}
+// --- words of a newer version
 
 /// What this build does with a word of a newer version where such an enum is read.
 const WORDS: &[(&str, &[&str])] = &[

@@ -61,7 +61,11 @@ pub fn dist(workspace: &Workspace, options: &Options) -> Result<bool> {
     let programs = workspace.target.join("dist");
     archives(workspace, &version, &programs, &temporary.path, &made)?;
     let archive = made.join(format!("{}.tar.gz", name_of(&version)));
-    ensure!(starts(&archive, &temporary.path, &version)?, "what is in the archive does not start");
+    let said = starts(&archive, &temporary.path)?;
+    ensure!(
+        is_for_use(&said, &version),
+        "programs of a release say their version and nothing else; these say {said:?}"
+    );
     if !options.no_image {
         let bases = if options.machine_bases { images::Bases::OfThisMachine } else { images::Bases::AsWritten };
         let program = programs.join(PROGRAMS[0]);
@@ -84,7 +88,8 @@ pub fn dist(workspace: &Workspace, options: &Options) -> Result<bool> {
     Ok(true)
 }
 
-/// The archives of the debug programs, twice: the same bytes, whole by their digests, and what is in them starts. Whether all of that holds.
+/// The archives of the debug programs, twice: the same bytes, whole by their digests, and what is in them starts and is not taken for a release, since
+/// programs of tests have naive rules in them. Whether all of that holds.
 pub fn test(workspace: &Workspace) -> Result<bool> {
     let (version, temporary) = (workspace.version()?, Temporary::new()?);
     let programs = temporary.path.join("programs");
@@ -105,22 +110,32 @@ pub fn test(workspace: &Workspace) -> Result<bool> {
     ensure!(first == second, "the same programs give two archives:\n{first}{second}");
     ensure!(first.lines().count() == 2, "not the archives that a release has:\n{first}");
     let whole = run::succeeds(Command::new("sha256sum").args(["-c", "SHA256SUMS"]).current_dir(&made[0]))?;
-    Ok(whole && starts(&made[0].join(format!("{}.tar.gz", name_of(&version))), &temporary.path, &version)?)
+    let said = starts(&made[0].join(format!("{}.tar.gz", name_of(&version))), &temporary.path)?;
+    ensure!(said[0].starts_with(&format!("midshift {version} with seeded bugs")), "the program of tests says {said:?}");
+    Ok(whole && !is_for_use(&said, &version))
 }
 
-/// Whether what is in an archive of programs starts and finds what lies beside it.
-fn starts(archive: &Path, temporary: &Path, version: &str) -> Result<bool> {
+/// Whether programs that say this are of that version, and nothing is in them that is for tests alone.
+fn is_for_use(said: &[String], version: &str) -> bool {
+    said.iter().eq(PROGRAMS.map(|name| format!("{name} {version}")).iter())
+}
+
+/// What the programs of an archive say of their version. They start, and the first one finds what lies beside it.
+fn starts(archive: &Path, temporary: &Path) -> Result<Vec<String>> {
     let folder = temporary.join("unpacked");
     std::fs::create_dir_all(&folder).context("making a folder")?;
     ensure!(run::succeeds(Command::new("tar").arg("-xzf").arg(archive).arg("-C").arg(&folder))?, "it does not unpack");
-    let root = folder.join(name_of(version));
+    let root =
+        folder.join(archive.file_name().and_then(|name| name.to_str()?.strip_suffix(".tar.gz")).context("no archive")?);
+    let mut all = Vec::new();
     for name in PROGRAMS {
         let said = run::output(Command::new(root.join("bin").join(name)).arg("--version"));
-        let said = said.with_context(|| format!("{name} does not say its version"))?;
-        ensure!(said.contains(version), "{name} says that it is {}", said.trim());
+        all.push(said.with_context(|| format!("{name} does not say its version"))?.trim().to_owned());
     }
-    let lint = ["map", "lint", "sites/demo.site.toml"];
-    run::succeeds(Command::new(root.join("bin").join(PROGRAMS[0])).args(lint).current_dir(&root))
+    let mut lint = Command::new(root.join("bin").join(PROGRAMS[0]));
+    lint.args(["map", "lint", "sites/demo.site.toml"]).current_dir(&root);
+    ensure!(run::succeeds(&mut lint)?, "it does not find what lies beside it");
+    Ok(all)
 }
 
 fn archives(workspace: &Workspace, version: &str, programs: &Path, temporary: &Path, to: &Path) -> Result<()> {
@@ -232,12 +247,20 @@ impl Drop for Temporary {
 
 #[cfg(test)]
 mod tests {
-    use super::is_told;
+    use super::{is_for_use, is_told};
 
     #[test]
     fn a_release_needs_a_heading_of_its_own_version() {
         let notes = "# Changelog\n\n## Unreleased\n\n- 0.2.0\n\n## 0.1.0 (2026-11-22)\n";
         assert!(is_told(notes, "0.1.0") && is_told("## 0.2.0\n", "0.2.0"));
         assert!(!is_told(notes, "0.2.0") && !is_told(notes, "0.1") && !is_told("## 0.1.01", "0.1.0"));
+    }
+
+    #[test]
+    fn a_program_that_says_more_than_its_version_is_not_released() {
+        let said = |midshift: &str| [midshift, "midshift-launcher 0.2.0"].map(str::to_owned);
+        assert!(is_for_use(&said("midshift 0.2.0"), "0.2.0"));
+        assert!(!is_for_use(&said("midshift 0.2.0 with seeded bugs, for tests only"), "0.2.0"));
+        assert!(!is_for_use(&said("midshift 0.1.0"), "0.2.0"));
     }
 }

@@ -63,6 +63,9 @@ pub fn judge(view: &View, id: &AttemptId, robot_id: &RobotId, state: WorkState, 
     if a.phase.is_terminal() && a.phase != AttemptPhase::Lost {
         return None;
     }
+    if matches!(state, WorkState::Unknown(_)) && view.bugs.unknown_states_are_taken() {
+        return None;
+    }
     let bounds = Bounds::of(view, a)?;
     let reason = || {
         Reason::from(Code::ReportImplausible)
@@ -93,7 +96,9 @@ pub fn doubtful(view: &View, live: &Live) -> Option<(AttemptId, Reason)> {
 /// # Errors
 /// If so; the reason says what.
 pub fn keeps_back(view: &View, live: &Live) -> Result<(), Reason> {
-    view.unknown_rows.screen(&live.robot_id)?;
+    if !view.bugs.unknown_rows_are_passed_over() {
+        view.unknown_rows.screen(&live.robot_id)?;
+    }
     view.refused.screen(&live.robot_id)?;
     match doubtful(view, live).map(|(_, why)| why).or_else(|| claims::too_many(view, live)) {
         Some(why) => Err(why),

@@ -1,6 +1,7 @@
 //! Directives that a robot takes, and every other one. Each test is named by the attack.
 
 use crate::shelf::{START, key};
+use midshift_bundle::bugs::Bugs;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::directive::{Directive, ENVELOPE_BYTES_MAX, Expected, LIFE_MS, Rejection};
 use midshift_bundle::keys::{KeyId, PublicKey};
@@ -8,11 +9,11 @@ use midshift_core::ids::RobotId;
 use midshift_core::time::Utc;
 use std::collections::BTreeMap;
 
-fn robot(id: &str) -> RobotId {
+pub fn robot(id: &str) -> RobotId {
     RobotId::parse(id).expect("a robot")
 }
 
-fn directive() -> Directive {
+pub fn directive() -> Directive {
     Directive {
         robot_id: robot("rbt-01"),
         key_id: key(7).public().id(),
@@ -27,9 +28,13 @@ fn directive() -> Directive {
 }
 
 fn open(envelope: &[u8], generation: u64, now: Utc) -> Result<Directive, Rejection> {
+    open_naively(envelope, generation, now, Bugs::default())
+}
+
+pub fn open_naively(envelope: &[u8], generation: u64, now: Utc, bugs: Bugs) -> Result<Directive, Rejection> {
     let keys: BTreeMap<KeyId, PublicKey> = [key(7).public()].into_iter().map(|k| (k.id(), k)).collect();
     let robot_id = robot("rbt-01");
-    Directive::open(envelope, &Expected { robot_id: &robot_id, keys: &keys, generation, now })
+    Directive::open(envelope, &Expected { robot_id: &robot_id, keys: &keys, generation, now, bugs })
 }
 
 #[test]

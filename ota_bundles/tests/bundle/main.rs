@@ -10,3 +10,4 @@ mod releasing;
 mod says;
 mod sets;
 mod shelf;
+mod twins;

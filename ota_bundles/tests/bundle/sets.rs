@@ -24,7 +24,7 @@ fn component(name: &str, version: &str, kind: ComponentKind, rollback_index: u64
     }
 }
 
-fn gait(version: &str) -> Component {
+pub fn gait(version: &str) -> Component {
     component("gait", version, ComponentKind::Process, 3)
 }
 
@@ -44,11 +44,11 @@ fn bundle(components: Vec<Component>) -> Manifest {
     }
 }
 
-fn robot() -> Fit {
+pub fn robot() -> Fit {
     Fit { model: "h1".to_owned(), ..Fit::default() }
 }
 
-fn onto(base: &SetManifest, components: Vec<Component>, robot: &Fit) -> Result<SetManifest, Vec<&'static str>> {
+pub fn onto(base: &SetManifest, components: Vec<Component>, robot: &Fit) -> Result<SetManifest, Vec<&'static str>> {
     let fitted = base.with(Digest::of(b"walk"), &bundle(components), robot);
     fitted.map_err(|unfit| unfit.iter().map(midshift_bundle::set::Unfit::code).collect())
 }

@@ -6,6 +6,7 @@
 use super::{HeldKeys, Job, SoftwareRow, Update};
 use crate::core::AgentCore;
 use crate::store::Op;
+use midshift_bundle::bugs::Bugs;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::directive::{Directive, Expected, Rejection};
 use midshift_bundle::key_set::Current;
@@ -147,7 +148,8 @@ impl AgentCore {
 
     pub(super) fn opened(&self, desired: &DesiredUpdate, generation: u64, now: Utc) -> Result<Directive, Rejection> {
         let keys = &self.directive_keys().keys;
-        let expected = Expected { robot_id: &self.config.robot_id, keys, generation, now };
+        let (robot_id, bugs) = (&self.config.robot_id, Bugs::default());
+        let expected = Expected { robot_id, keys, generation, now, bugs };
         Directive::open(desired.directive.as_bytes(), &expected)
     }
 

@@ -25,6 +25,14 @@ pub struct Naive {
     pub rollouts: midshift_core::rollout::bugs::Bugs,
 }
 
+impl Naive {
+    /// Whether this program has any naive rule in it, be it of a service, of robots or of bundles. Without a test none can be switched on.
+    pub const ARE_BUILT_IN: bool = midshift_core::task::bugs::Bugs::ARE_BUILT_IN
+        || midshift_telemetry::Bugs::ARE_BUILT_IN
+        || midshift_agent::bugs::Bugs::ARE_BUILT_IN
+        || midshift_bundle::bugs::Bugs::ARE_BUILT_IN;
+}
+
 /// What a server is built from.
 pub struct Parts {
     /// Which services it has.

@@ -4,6 +4,7 @@
 //! acknowledgement leaves only after the commit; a poison sample is recorded, acknowledged and skipped.
 
 use crate::Inner;
+use crate::bugs::Bugs;
 use midshift_core::ids::RobotId;
 use midshift_core::robot::Lane;
 use midshift_core::rows::{Expect, Fact, Item, Log, Revision, Writer};
@@ -82,7 +83,7 @@ impl Events {
         })
     }
     /// Takes a batch of one lane.
-    pub fn arrive(&mut self, batch: LaneBatch, entry: impl Fn(InboxItem) -> InboxEntry) -> Arrived {
+    pub fn arrive(&mut self, batch: LaneBatch, bugs: Bugs, entry: impl Fn(InboxItem) -> InboxEntry) -> Arrived {
         let Some(at) = index(batch.lane) else { return Arrived::default() };
         let mut known = true;
         for item in batch.items {
@@ -91,7 +92,8 @@ impl Events {
                 continue;
             }
             known = false;
-            if first > self.taken[at] + 1 || self.waiting.len() >= WAITING_MAX {
+            let is_hole = first > self.taken[at] + 1 && !bugs.holes_are_taken();
+            if is_hole || self.waiting.len() >= WAITING_MAX {
                 metrics::counter!("midshift_telemetry_expects_total").increment(1);
                 let seq = if at == 0 { self.durable.critical } else { self.durable.event };
                 return Arrived {
@@ -209,7 +211,7 @@ mod tests {
             what,
             stamp_in_future: false,
         };
-        events.arrive(LaneBatch { lane: Lane::Event, items }, entry)
+        events.arrive(LaneBatch { lane: Lane::Event, items }, Bugs::default(), entry)
     }
     fn stored(events: &mut Events) -> usize {
         events.next_batch(&robot(), Utc(0)).map_or(0, |batch| {

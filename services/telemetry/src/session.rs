@@ -389,7 +389,8 @@ impl Session {
         let (robot_id, ring, lane, epoch) = (&self.robot_id, &self.ring, batch.lane, self.epoch);
         let ahead_ms = self.offset.estimate().map_or(limits::SKEW_ALERT_MS, |(offset, error)| offset + error as i64);
         let wall = self.inner.parts.clock.now().wall.0;
-        let arrived = self.events.arrive(batch, |what| InboxEntry {
+        let bugs = self.inner.parts.bugs;
+        let arrived = self.events.arrive(batch, bugs, |what| InboxEntry {
             robot_id: robot_id.clone(),
             session_epoch: epoch,
             ring: ring.to_string(),
@@ -397,7 +398,7 @@ impl Session {
             stamp_in_future: matches!(&what, InboxItem::Sample(s) if s.robot_unix_ms > wall + ahead_ms),
             what,
         });
-        let naive = self.inner.parts.bugs.ack_before_commit().then(|| self.events.taken());
+        let naive = bugs.ack_before_commit().then(|| self.events.taken());
         let known = arrived.known.then(|| self.events.acks());
         let acks: Vec<LaneAck> =
             arrived.expect.into_iter().chain(naive.into_iter().flatten()).chain(known.into_iter().flatten()).collect();

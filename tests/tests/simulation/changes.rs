@@ -7,6 +7,7 @@ use midshift_agent::body::Body;
 use midshift_agent::ledger::Holder;
 use midshift_agent::switch::{FACTORY, Switch};
 use midshift_agent::update::SoftwareRow;
+use midshift_bundle::bugs::Bugs;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::directive::{Directive, Expected};
 use midshift_bundle::keys::{KeyId, PublicKey};
@@ -144,7 +145,8 @@ impl Changes {
     /// A robot was told something.
     pub fn put_desired(&mut self, row: &DesiredUpdate) -> Vec<Look> {
         let keys = self.keys.clone();
-        let expected = Expected { robot_id: &row.robot_id, keys: &keys, generation: 0, now: Utc(0) };
+        let expected =
+            Expected { robot_id: &row.robot_id, keys: &keys, generation: 0, now: Utc(0), bugs: Bugs::default() };
         let opened = Directive::open(row.directive.as_bytes(), &expected);
         let robot = self.robot(&row.robot_id);
         if let Ok(directive) = opened

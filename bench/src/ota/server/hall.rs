@@ -5,6 +5,7 @@ use crate::child::{Child, SESSIONS};
 use crate::fsync::place;
 use crate::ota::release::People;
 use anyhow::{Context, ensure};
+use midshift_bundle::bugs::Bugs;
 use midshift_bundle::directive::{Directive, Expected};
 use midshift_core::ids::SiteId;
 use midshift_core::rollout::rows::{RolloutRobot, Step};
@@ -139,7 +140,7 @@ impl Rows {
             let id = &desired.robot_id;
             ensure!(*id == robot.robot_id && *revision == Revision(1), "{id} was assigned {} times", revision.0);
             ensure!(robot.step == Step::Staging && robot.directive == desired.generation, "{id} is {:?}", robot.step);
-            let expected = Expected { robot_id: id, keys: &keys, generation: 0, now };
+            let expected = Expected { robot_id: id, keys: &keys, generation: 0, now, bugs: Bugs::default() };
             let said = Directive::open(desired.directive.as_bytes(), &expected)?;
             ensure!(said.generation == desired.generation, "{id} has a directive of another generation");
             let at = crate::ota::hearers::index(id.as_str()).context("a robot of another name")?;

@@ -178,6 +178,29 @@ async fn a_stop_finds_room_in_a_full_port_and_where_classes_are_alike_it_does_no
     assert!(!stops_a_full_port(Bugs::of(&[SeededBug::ClassesAreAlike])).await);
 }
 
+/// Whether a port that was full serves again when all that filled it has ended.
+async fn serves_again(bugs: Bugs) -> bool {
+    let world = named(Config { requests_max: 10, bugs, ..Config::default() }).await;
+    let mut flood = world.client().await;
+    let mut open = Vec::new();
+    while let Some(head) = flood.held(FETCH).await {
+        open.push(head);
+    }
+    assert!(!open.is_empty(), "it was served before");
+    drop(open);
+    while world.requests_open() > 0 {
+        tokio::task::yield_now().await;
+    }
+    let mut other = world.client_from(THERE).await;
+    other.asked(FETCH).await.answer().grpc == Code::Ok
+}
+
+#[tokio::test]
+async fn a_port_that_was_full_serves_again_and_where_seats_are_kept_it_never_does() {
+    assert!(serves_again(Bugs::default()).await);
+    assert!(!serves_again(Bugs::of(&[SeededBug::SeatsAreKept])).await);
+}
+
 #[tokio::test]
 async fn a_caller_that_floods_with_what_can_wait_can_still_stop() {
     let ten = NonZeroU32::MIN.saturating_add(9);

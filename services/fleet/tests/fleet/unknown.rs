@@ -12,7 +12,7 @@ use midshift_proto::refusal_of;
 use tonic::Request;
 
 /// A newer version writes `new` for `old` into a row; its state becomes one that no build here lists.
-async fn rewritten(w: &World, table: Table, id: &str, (old, new): (&str, &str), state: Option<i64>) {
+pub async fn rewritten(w: &World, table: Table, id: &str, (old, new): (&str, &str), state: Option<i64>) {
     let row = w.store.get(vec![Key::new(table, id)]).await.expect("a store").pop().expect("the row");
     assert!(row.body.contains(old), "{}", row.body);
     let mut index = row.index.clone();

@@ -29,6 +29,7 @@ mod zone;
 
 use crate::dev::Dev;
 use crate::duration::duration;
+use crate::parts::Naive;
 use crate::robots::AgentRun;
 use crate::serve::Serve;
 use crate::storage::Database;
@@ -43,9 +44,16 @@ use std::process::ExitCode;
 use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 
+/// What it says of itself. A program that was built for tests has their naive rules in it and says so: none is ever released.
+const VERSION: &str = if Naive::ARE_BUILT_IN {
+    concat!(env!("CARGO_PKG_VERSION"), " with seeded bugs, for tests only")
+} else {
+    env!("CARGO_PKG_VERSION")
+};
+
 /// A control plane for fleets of working robots. Not a safety function.
 #[derive(Parser)]
-#[command(name = "midshift", version, arg_required_else_help = true)]
+#[command(name = "midshift", version = VERSION, arg_required_else_help = true)]
 struct Args {
     /// How results are printed.
     #[arg(short, long, global = true, value_enum, default_value_t = Format::Table)]

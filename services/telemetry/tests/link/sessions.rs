@@ -7,7 +7,7 @@ use midshift_core::reason::Code;
 use midshift_core::robot::{HeldPlace, Lane, Mode, ReportedState};
 use midshift_core::rows::{Expect, Item, Log, Seq, Writer};
 use midshift_core::work::{DesiredWork, InboxItem, RobotEvent, Sample, SampleBody, Session};
-use midshift_proto::session::{ClockSample, CloseCode, Downlink, Heartbeat, LaneBatch, Uplink};
+use midshift_proto::session::{ClockSample, CloseCode, Downlink, Heartbeat, LaneAck, LaneBatch, Uplink};
 use midshift_store::load;
 use midshift_telemetry::{Bugs, SeededBug};
 
@@ -30,6 +30,23 @@ async fn events_are_durable_when_they_are_acknowledged_and_stored_once() -> Resu
     assert_eq!(inbox(&world).await?, 4);
     robot.events(6..=6).await?;
     assert_eq!(robot.hears(|down| down.acks.iter().find_map(|a| a.expect)).await?, 5);
+    Ok(())
+}
+
+/// What a robot hears that sent the events 1 to 2 and 5, since 3 and 4 were lost on the way: an acknowledgement of all, or which one is missing.
+async fn lost_on_the_way(bugs: Bugs) -> Result<(u64, Option<u64>)> {
+    let world = world_with(Otherwise { bugs, frames: None }).await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.events(1..=2).await?;
+    robot.events(5..=5).await?;
+    let told = |ack: &LaneAck| ack.lane == Lane::Event && (ack.seq == 5 || ack.expect.is_some());
+    robot.hears(|down| down.acks.iter().find(|ack| told(ack)).map(|ack| (ack.seq, ack.expect))).await
+}
+
+#[tokio::test(start_paused = true)]
+async fn events_that_were_lost_on_the_way_are_missed_and_a_rule_that_takes_holes_acknowledges_them() -> Result<()> {
+    assert_eq!(lost_on_the_way(Bugs::default()).await?.1, Some(3));
+    assert_eq!(lost_on_the_way(Bugs::of(&[SeededBug::HolesAreTaken])).await?, (5, None));
     Ok(())
 }
 
