@@ -25,6 +25,7 @@ use tokio::time::Instant;
 use tonic::transport::Channel;
 
 #[expect(clippy::expect_used, reason = "shared with the tests, which fail by panicking")]
+#[expect(dead_code, reason = "shared with the tests, which commit old sites whole too")]
 #[path = "../../tests/src/old_site.rs"]
 mod old_site;
 #[path = "../../tests/src/old_tables.rs"]

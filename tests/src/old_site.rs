@@ -4,7 +4,7 @@
 //! 1. Each row is a record of `core`, in an item of its own service: an old site reads back as one that grew.
 //! 2. The same shape makes the same rows, whatever the engine.
 //!
-//! [`OldSite::write`] commits all of them. `old_tables` puts most tasks straight into the tables of a database, which is a hundred times as fast.
+//! [`OldSite::write`] commits all of them. `old_tables` puts most tasks straight into the tables of a database, which is faster.
 //!
 //! Uses nothing but `core` and `store`, so that any crate's tests can include this file.
 
@@ -14,7 +14,9 @@ use midshift_core::fleet::rows::{Cordon, FleetMark, RobotControl, RobotCounter};
 use midshift_core::gates::TaskTally;
 use midshift_core::ids::{AttemptId, BundleId, RobotId, RolloutId, Subject, TaskId};
 use midshift_core::robot::{Inventory, Lane, Presence};
-use midshift_core::rollout::rows::{Act, Bundle, OtaMark, Phase as RolloutPhase, RobotSoftware, Rollout, RolloutRobot, Step};
+use midshift_core::rollout::rows::{
+    Act, Bundle, OtaMark, Phase as RolloutPhase, RobotSoftware, Rollout, RolloutRobot, Step,
+};
 use midshift_core::rollout::spec::RolloutSpec;
 use midshift_core::rows::{Expect, Fact, Item, Log, Seq, Writer};
 use midshift_core::task::forms::Transport;

@@ -183,8 +183,7 @@ async fn copy(connection: &mut PgConnection, table: Table, site_id: &SiteId, row
         let body = row.body.replace('\\', "\\\\");
         writeln!(text, "{site_id}\t{}\t1\t{state}\t{parent}\t{}\t{body}", row.id, row.order())?;
     }
-    let mut copying =
-        connection.copy_in_raw(&format!("COPY control.{} ({COLUMNS}) FROM STDIN", table.name())).await?;
+    let mut copying = connection.copy_in_raw(&format!("COPY control.{} ({COLUMNS}) FROM STDIN", table.name())).await?;
     copying.send(text.into_bytes()).await?;
     copying.finish().await?;
     Ok(())

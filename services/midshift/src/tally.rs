@@ -1,6 +1,7 @@
 //! The tasks of a run as their rows say it: those of the run's own client, and beside them those of everybody else.
 //!
-//! Invariants: nothing here is counted from what was sent or planned; what was over before the run began is neither read nor counted.
+//! Invariants: nothing here is counted from what was sent or planned.
+//! What was over before the run began is neither read nor counted.
 //! Called by `dev`, for its client and its report.
 
 use midshift_core::ids::TaskId;
@@ -32,7 +33,8 @@ struct Asked {
 }
 
 impl Tasks {
-    /// None yet, of a run whose client's request ids begin with `run`, and which began when `before` was the number of the newest task.
+    /// None yet, of a run whose client's request ids begin with `run`.
+    /// It began when `before` was the number of the newest task.
     pub fn of_run(run: &str, before: u64) -> Self {
         Self { run: run.to_owned(), before, ..Self::default() }
     }
@@ -116,7 +118,8 @@ pub async fn newest(store: &dyn Store) -> Result<u64, Error> {
     Ok(store.list(query).await?.first().map_or(Ok(0), |row| row.decode::<TaskIntake>().map(|intake| intake.number))?)
 }
 
-/// Reads the tasks anew: those that are alive, and all that were admitted since the run began. Tasks that were over by then cost nothing.
+/// Reads the tasks anew: those that are alive, and all that were admitted since the run began.
+/// Tasks that were over by then cost nothing.
 /// Returns where the feed goes on.
 async fn read(store: &dyn Store, tasks: &SharedTasks) -> Result<Seq, Error> {
     let live = Phase::ALL.into_iter().filter(|phase| !phase.is_terminal()).map(Phase::number).collect();

@@ -38,7 +38,8 @@ async fn a_robot_and_a_stop_are_meant_by_a_beginning_that_only_they_have() -> an
     let engage = || named(&["stop", "--all", "--no-wait", "--reason", "tried", "--stop-server", &stop_at]);
     let (first, second) = (engage()?, engage()?);
     let common = first.bytes().zip(second.bytes()).take_while(|(a, b)| a == b).count();
-    let reset = |typed: &str| ["stop", "reset", typed, "--reason", "tried", "--stop-server", &stop_at].map(str::to_owned);
+    let reset =
+        |typed: &str| ["stop", "reset", typed, "--reason", "tried", "--stop-server", &stop_at].map(str::to_owned);
     fn words(line: &[String]) -> Vec<&str> {
         line.iter().map(String::as_str).collect()
     }

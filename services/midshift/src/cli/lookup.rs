@@ -19,7 +19,12 @@ pub struct Found {
 
 impl Found {
     /// One page of a list, in the order of ids.
-    pub fn page<T>(rows: &[T], next_page_token: &str, id: impl Fn(&T) -> &str, row: impl Fn(&T) -> Vec<String>) -> Self {
+    pub fn page<T>(
+        rows: &[T],
+        next_page_token: &str,
+        id: impl Fn(&T) -> &str,
+        row: impl Fn(&T) -> Vec<String>,
+    ) -> Self {
         let candidate = |one: &T| {
             let (id, mut words) = (id(one).to_owned(), row(one));
             words.retain(|word| *word != id && !word.is_empty());
@@ -45,7 +50,9 @@ impl Found {
         if !self.is_all {
             lines += "\n  and more";
         }
-        Err(Exit::usage(format!("more than one {what} begins with {typed}:{lines}\n  try: the same with more of the id")))
+        Err(Exit::usage(format!(
+            "more than one {what} begins with {typed}:{lines}\n  try: the same with more of the id"
+        )))
     }
 }
 
@@ -91,7 +98,8 @@ mod tests {
         assert_eq!(found(&[], "").single("task", "T-1").expect("none"), None);
         let several = found(&["T-10", "T-11"], "").single("task", "T-1").expect_err("it may be either");
         assert_eq!(several.code(), 2);
-        let text = "more than one task begins with T-1:\n  T-10  OPEN\n  T-11  OPEN\n  try: the same with more of the id";
+        let text =
+            "more than one task begins with T-1:\n  T-10  OPEN\n  T-11  OPEN\n  try: the same with more of the id";
         assert_eq!(several.to_string(), text);
         let more = found(&["T-10"], "T-10").single("task", "T-1").expect_err("there are more");
         assert!(more.to_string().contains("\n  and more\n"), "{more}");

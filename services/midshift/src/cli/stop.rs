@@ -536,7 +536,8 @@ async fn watch(call: &StopCall, out: &Out) -> Result<(), Exit> {
 async fn find(client: &mut StopServiceClient<Line>, typed: &str) -> Result<String, Exit> {
     let listed = async {
         let status = client.get_status(unary(v1::GetStatusRequest {})).await?.into_inner().status;
-        let stops: Vec<v1::Stop> = status.into_iter().flat_map(|s| s.stops).filter_map(|engaged| engaged.stop).collect();
+        let stops: Vec<v1::Stop> =
+            status.into_iter().flat_map(|s| s.stops).filter_map(|engaged| engaged.stop).collect();
         Ok(engaged(&stops, typed))
     };
     whole_id("stop", typed, listed).await
