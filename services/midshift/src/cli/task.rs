@@ -755,8 +755,6 @@ async fn until_over(call: &Call, task_id: &str, mut told: String, out: &Out) -> 
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-
     #[test]
     fn each_answer_that_a_task_allows_is_told_by_the_word_that_the_command_takes() {
         use clap::ValueEnum;
