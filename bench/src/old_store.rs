@@ -10,7 +10,7 @@ use crate::hall;
 use crate::offer::{Idle, one};
 use crate::submit::transports;
 use anyhow::{Context, ensure};
-use midshift::clock::{clock, wall};
+use midshift::clock::wall;
 use midshift::storage::Database;
 use midshift_core::site::{Site, grid};
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
@@ -25,8 +25,11 @@ use tokio::time::Instant;
 use tonic::transport::Channel;
 
 #[expect(clippy::expect_used, reason = "shared with the tests, which fail by panicking")]
+#[expect(dead_code, reason = "shared with the tests, which commit old sites whole too")]
 #[path = "../../tests/src/old_site.rs"]
 mod old_site;
+#[path = "../../tests/src/old_tables.rs"]
+mod old_tables;
 use old_site::OldSite;
 
 /// Side of the free grid that robots stand on.
@@ -113,9 +116,8 @@ async fn rounds(args: &OldArgs, engine: &Engine, ended: u64, say: &dyn Fn(&str))
     if ended > 0 {
         let begun = Instant::now();
         let database = Database { store: bed.url().map(str::to_owned) };
-        let storage = database.open(&data(&bed, 0), loaded.site.site_id().clone(), clock(1000)).await?;
-        OldSite::with_ended(ended, wall()).write(&*storage.store()).await;
-        storage.close().await;
+        let old = OldSite::with_ended(ended, wall());
+        old_tables::make(&old, &database, &data(&bed, 0), loaded.site.site_id()).await?;
         say(&format!("{ended} ended tasks{} written in {:.1} s", engine.suffix(), begun.elapsed().as_secs_f64()));
     }
     let mut rounds = Rounds::default();

@@ -4,6 +4,7 @@ pub mod counted;
 pub mod line;
 pub mod metrics;
 pub mod old_site;
+pub mod old_tables;
 pub mod player;
 pub mod postgres;
 pub mod raw;

@@ -1,17 +1,23 @@
 //! Makes old sites: stores in which much is over, with the rows that the services would have left behind.
 //!
 //! Invariants:
-//! 1. Each row is a record of `core`, written by its own service through the store's items: an old site reads back as one that grew.
+//! 1. Each row is a record of `core`, in an item of its own service: an old site reads back as one that grew.
 //! 2. The same shape makes the same rows, whatever the engine.
+//!
+//! [`OldSite::write`] commits all of them. `old_tables` puts most tasks straight into the tables of a database, which is faster.
 //!
 //! Uses nothing but `core` and `store`, so that any crate's tests can include this file.
 
 use midshift_core::audit::Note;
 use midshift_core::authority::Authority;
 use midshift_core::fleet::rows::{Cordon, FleetMark, RobotControl, RobotCounter};
-use midshift_core::ids::{AttemptId, RobotId, Subject, TaskId};
+use midshift_core::gates::TaskTally;
+use midshift_core::ids::{AttemptId, BundleId, RobotId, RolloutId, Subject, TaskId};
 use midshift_core::robot::{Inventory, Lane, Presence};
-use midshift_core::rollout::rows::OtaMark;
+use midshift_core::rollout::rows::{
+    Act, Bundle, OtaMark, Phase as RolloutPhase, RobotSoftware, Rollout, RolloutRobot, Step,
+};
+use midshift_core::rollout::spec::RolloutSpec;
 use midshift_core::rows::{Expect, Fact, Item, Log, Seq, Writer};
 use midshift_core::task::forms::Transport;
 use midshift_core::task::state::RequestKey;
@@ -19,6 +25,7 @@ use midshift_core::task::{Attempt, AttemptPhase, Phase, TaskIntake, TaskSpec, Ta
 use midshift_core::time::Utc;
 use midshift_core::work::{InboxEntry, InboxItem, LaneMark, PresenceRow, Session, WorkStats};
 use midshift_store::{Retention, Store};
+use std::ops::{Range, RangeInclusive};
 use std::sync::Arc;
 
 /// Milliseconds of a day.
@@ -28,7 +35,9 @@ const TASKS_PER_ITEM: u64 = 50;
 /// Items of one commit.
 const ITEMS_PER_COMMIT: usize = 64;
 /// Entries that each log still has: older ones went, as they do at a site.
-const ENTRIES_KEPT: u64 = 20_000;
+pub const ENTRIES_KEPT: u64 = 20_000;
+/// Roll-outs that are over, one every two days or so: each robot that works kept the bundle of each.
+pub const ROLLOUTS: u64 = 12;
 
 /// What an old site is made of.
 #[derive(Clone, Copy, Debug)]
@@ -63,13 +72,23 @@ impl OldSite {
     /// # Panics
     /// If the store refuses a row.
     pub async fn write(&self, store: &dyn Store) {
+        self.begin(store).await;
+        self.write_tasks(store, 1..=self.ended).await;
+        self.finish(store).await;
+    }
+
+    /// Writes robots, and what they once got of software.
+    pub async fn begin(&self, store: &dyn Store) {
+        let mut items: Vec<Item> = (1..=self.robots + self.retired).flat_map(|robot| self.robot(robot)).collect();
+        items.extend((1..=ROLLOUTS).map(|number| self.rollout(number)));
+        commit(store, items).await;
+    }
+
+    /// Writes these tasks, as services do: with their entries in the logs, in the audit and in the inbox.
+    pub async fn write_tasks(&self, store: &dyn Store, numbers: RangeInclusive<u64>) {
         let spec = spec();
         let mut items = Vec::new();
-        for robot in 1..=self.robots + self.retired {
-            items.extend(self.robot(robot));
-        }
-        for from in (1..=self.ended).step_by(TASKS_PER_ITEM as usize) {
-            let numbers = from..(from + TASKS_PER_ITEM).min(self.ended + 1);
+        for numbers in Self::slices(numbers) {
             items.extend(self.tasks(numbers, &spec));
             if items.len() >= ITEMS_PER_COMMIT {
                 commit(store, std::mem::take(&mut items)).await;
@@ -77,6 +96,10 @@ impl OldSite {
             }
         }
         commit(store, items).await;
+    }
+
+    /// Lets old entries go. Fleet and ota have read what is left.
+    pub async fn finish(&self, store: &dyn Store) {
         let head = forget(store).await;
         let mut fleet = Item::new(Writer::Fleet, "fleet");
         fleet.put(&FleetMark { seq: head }, Expect::Absent, "fleet.consumed");
@@ -85,11 +108,22 @@ impl OldSite {
         commit(store, vec![fleet, ota]).await;
     }
 
-    /// An item of intake, and one of each service that had to do with these tasks: fifty at most.
-    pub fn tasks(&self, numbers: std::ops::Range<u64>, spec: &TaskSpec) -> Vec<Item> {
+    /// Tasks of one item each.
+    pub fn slices(numbers: RangeInclusive<u64>) -> impl Iterator<Item = Range<u64>> {
+        let end = numbers.end() + 1;
+        numbers.step_by(TASKS_PER_ITEM as usize).map(move |from| from..(from + TASKS_PER_ITEM).min(end))
+    }
+
+    /// An item of each service that had to do with these tasks: fifty at most.
+    pub fn tasks(&self, numbers: Range<u64>, spec: &TaskSpec) -> Vec<Item> {
+        let [mut task, fleet] = self.rows(numbers.clone(), spec);
+        task.audit(submitted());
+        vec![task, fleet, self.inbox(numbers)]
+    }
+
+    /// The rows of intake and of fleet of these tasks.
+    pub fn rows(&self, numbers: Range<u64>, spec: &TaskSpec) -> [Item; 2] {
         let [mut task, mut fleet] = [Writer::Task, Writer::Fleet].map(|writer| Item::new(writer, writer.as_str()));
-        let mut telemetry = Item::new(Writer::Telemetry, "telemetry");
-        task.audit(Note::new("task.submit"));
         for number in numbers {
             let at = self.ended_at(number);
             let intake = intake(number, at, spec);
@@ -97,8 +131,6 @@ impl OldSite {
             for epoch in 1..=state.epoch {
                 fleet.create(&self.attempt(&state, epoch, at), "attempt.succeeded");
             }
-            let robot = state.robot_id.as_ref().map_or("", RobotId::as_str);
-            telemetry.facts.push(event(robot, number));
             let key = RequestKey {
                 id: format!("submit:{}", intake.request_id),
                 payload_hash: String::new(),
@@ -107,7 +139,41 @@ impl OldSite {
             };
             task.create(&intake, "task.admitted").create(&state, "task.admitted").create(&key, "request.answered");
         }
-        vec![task, fleet, telemetry]
+        [task, fleet]
+    }
+
+    /// What the robots of these tasks told.
+    pub fn inbox(&self, numbers: Range<u64>) -> Item {
+        let mut telemetry = Item::new(Writer::Telemetry, "telemetry");
+        telemetry.facts = numbers.map(|number| event(self.robot_of(number).as_str(), number)).collect();
+        telemetry
+    }
+
+    fn robot_of(&self, number: u64) -> RobotId {
+        robot_id(1 + number % self.robots.max(1))
+    }
+
+    /// A roll-out by which each robot that works got its bundle; the last one's is what they run.
+    pub fn rollout(&self, number: u64) -> Item {
+        let at = Utc(self.from.0 + 2 * DAY_MS * number as i64);
+        let act = Act { actor: "anna".to_owned(), reason: String::new(), at };
+        let bundle = bundle(number);
+        let rollout_id = RolloutId::parse(&format!("old-rollout-{number}")).expect("an id");
+        let mut ota = Item::new(Writer::Ota, "ota");
+        ota.create(&release(bundle.clone(), number, at), "bundle.published");
+        ota.create(&completed(&rollout_id, &bundle, act), "rollout.completed");
+        for place in 1..=self.robots {
+            ota.create(&committed(&rollout_id, robot_id(place), place, at), "rollout_robot.committed");
+            if number == ROLLOUTS {
+                let mut software = RobotSoftware::new(robot_id(place));
+                software.committed = Some(bundle.clone());
+                software.previous = Some(self::bundle(number - 1));
+                software.version = version(number);
+                software.since = at;
+                ota.create(&software, "software.reported");
+            }
+        }
+        ota
     }
 
     fn state(&self, intake: &TaskIntake, at: Utc) -> TaskState {
@@ -115,7 +181,7 @@ impl OldSite {
         TaskState {
             phase: if has_failed { Phase::Failed } else { Phase::Succeeded },
             epoch: if has_failed { 2 } else { 1 },
-            robot_id: Some(robot_id(1 + intake.number % self.robots.max(1))),
+            robot_id: Some(self.robot_of(intake.number)),
             next_step: if has_failed { 0 } else { intake.spec.steps.len() as u32 },
             ended: Some(at),
             changed: at,
@@ -191,6 +257,93 @@ pub fn spec() -> TaskSpec {
         ..Transport::default()
     };
     transport.into_raw().check("task", &|_| true).expect("a good task")
+}
+
+/// What intake notes of a request that admits tasks.
+pub fn submitted() -> Note {
+    Note::new("task.submit")
+}
+
+fn bundle(number: u64) -> BundleId {
+    BundleId::parse(&format!("{number:064x}")).expect("an id")
+}
+
+fn version(number: u64) -> String {
+    format!("1.{number}.0")
+}
+
+fn release(bundle: BundleId, number: u64, at: Utc) -> Bundle {
+    Bundle {
+        bundle,
+        name: "agent".to_owned(),
+        version: version(number),
+        manifest_length: 1_000,
+        length: 1_000_000,
+        hardware: Default::default(),
+        needs: "restart".to_owned(),
+        hard_stop_codes: Default::default(),
+        is_irreversible: false,
+        has_base: false,
+        requires: Default::default(),
+        listed: false,
+        revoked: None,
+        published: at,
+    }
+}
+
+fn completed(rollout_id: &RolloutId, bundle: &BundleId, act: Act) -> Rollout {
+    Rollout {
+        rollout_id: rollout_id.clone(),
+        spec: Arc::new(RolloutSpec::new(bundle.clone())),
+        phase: RolloutPhase::Completed,
+        wave: 2,
+        pauses: Default::default(),
+        version: 9,
+        generation: 1,
+        in_flight: 0,
+        soak: None,
+        exposure: None,
+        sizes: Vec::new(),
+        promoted: 3,
+        verdicts: Vec::new(),
+        abort: None,
+        second_pass: false,
+        revert_of: None,
+        supersedes: Default::default(),
+        superseded_by: None,
+        tasks: Default::default(),
+        counted: Default::default(),
+        created: act.clone(),
+        approved: Some(act.clone()),
+        started: Some(act.at),
+        resumed: None,
+        since: act.at,
+    }
+}
+
+fn committed(rollout_id: &RolloutId, robot_id: RobotId, place: u64, at: Utc) -> RolloutRobot {
+    RolloutRobot {
+        rollout_id: rollout_id.clone(),
+        robot_id,
+        wave: 2,
+        place,
+        step: Step::Committed,
+        since: at,
+        from_version: String::new(),
+        directive: 1,
+        signed: at,
+        way_back: Default::default(),
+        drain_id: None,
+        ready: false,
+        grant: None,
+        not_used: false,
+        attempted: true,
+        failure: None,
+        why: None,
+        again: false,
+        before: TaskTally::default(),
+        moments: Default::default(),
+    }
 }
 
 fn intake(number: u64, ended: Utc, spec: &TaskSpec) -> TaskIntake {

@@ -341,7 +341,9 @@ impl FleetService {
                 let wanted = |i: &Incident| {
                     (r.include_closed || i.closed.is_none()) && (robot_id.is_none() || i.robot_id == robot_id)
                 };
-                let rows = view.incidents.iter().filter(|(_, i)| wanted(&i.row));
+                let prefix = &r.incident_id_prefix;
+                let rows = view.incidents.range(prefix.clone()..).take_while(|(id, _)| id.starts_with(prefix));
+                let rows = rows.filter(|(_, i)| wanted(&i.row));
                 let rows = rows.filter(|(_, i)| sees_incident(view, board, &by, &i.row));
                 pages::page(rows.map(|(id, i)| (id.clone(), encode::incident(&i.row, i.revision))), &r.page_token, size)
             })

@@ -124,8 +124,9 @@ impl IdentityService {
         let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
         let page = self.0.register.look(|view| {
-            let rows = view.robots.values().map(|(robot, _)| (robot.robot_id.to_string(), encode::robot(robot)));
-            pages::page(rows, &r.page_token, size)
+            let robots = view.robots.values().map(|(robot, _)| robot);
+            let begin = robots.filter(|robot| robot.robot_id.as_str().starts_with(&r.robot_id_prefix));
+            pages::page(begin.map(|robot| (robot.robot_id.to_string(), encode::robot(robot))), &r.page_token, size)
         });
         let (robots, next_page_token) = page.await.map_err(|_| unavailable())?;
         Ok(v1::ListRobotIdentitiesResponse { robots, next_page_token })

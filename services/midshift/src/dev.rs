@@ -177,8 +177,9 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         None => serve::hear(BEACONS).await.ok(),
     };
     let run_id = format!("dev-{}-{}-", args.seed, clock.now().wall.0);
-    let tasks = Arc::new(Mutex::new(Tasks::of_run(&run_id)));
     let (store, frames) = stores(&args, &site, &clock).await?;
+    let before = tally::newest(&*store).await?;
+    let tasks = Arc::new(Mutex::new(Tasks::of_run(&run_id, before)));
     let stops = Stops::start(&args, site.clone(), clock.clone(), (address, &*store)).await?;
     let mut swarm = SwarmConfig::tcp(hall.clone(), clock.clone(), &format!("http://{address}"), args.seed)
         .with_stop(&format!("http://{}", stops.beside.address()));
@@ -226,6 +227,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         clock,
         hall,
         run_id,
+        before,
         tasks,
         store,
         stop,
@@ -409,6 +411,8 @@ struct Run {
     clock: Arc<dyn Clock>,
     hall: Arc<Hall>,
     run_id: String,
+    /// Number of the newest task when the run began.
+    before: u64,
     tasks: SharedTasks,
     store: Arc<dyn Store>,
     stop: CancellationToken,
@@ -538,7 +542,7 @@ impl Run {
         under_way::ended(parts.following).await?;
         under_way::ended(parts.serving).await?;
         let acknowledged = std::mem::take(&mut *acknowledged.lock().unwrap_or_else(PoisonError::into_inner));
-        let tasks = tally::settle(self.store.clone(), &self.run_id).await?;
+        let tasks = tally::settle(self.store.clone(), &self.run_id, self.before).await?;
         let report = Report::of(Inputs {
             kind: self.args.kind(),
             seed: self.args.seed,

@@ -95,7 +95,7 @@ pub struct Report {
     pub lost: u64,
     /// Tasks of the client's requests that it was not acknowledged for.
     pub unacknowledged: u64,
-    /// Tasks that somebody else submitted. They are in no other number here.
+    /// Tasks that somebody else submitted, of those that are alive or came during the run. They are in no other number here.
     pub of_others: u64,
     /// The client's tasks by state, each state counted by itself from the rows.
     pub succeeded: usize,

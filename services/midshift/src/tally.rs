@@ -1,12 +1,14 @@
 //! The tasks of a run as their rows say it: those of the run's own client, and beside them those of everybody else.
 //!
-//! Invariant: nothing here is counted from what was sent or planned. Called by `dev`, for its client and its report.
+//! Invariants: nothing here is counted from what was sent or planned.
+//! What was over before the run began is neither read nor counted.
+//! Called by `dev`, for its client and its report.
 
 use midshift_core::ids::TaskId;
-use midshift_core::rows::{BadRow, Table};
+use midshift_core::rows::{BadRow, Key, Log, Part, Row, Seq, Table};
 use midshift_core::task::{Phase, TaskIntake, TaskState};
 use midshift_core::time::Utc;
-use midshift_store::{Change, Error, Fold, Projection, Store};
+use midshift_store::{Cursor, Error, FEED_PAGE_MAX, Query, Store};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
 use tokio_util::sync::CancellationToken;
@@ -16,6 +18,8 @@ use tokio_util::sync::CancellationToken;
 pub struct Tasks {
     /// How request ids of the run's own client begin.
     run: String,
+    /// Number of the newest task when the run began.
+    before: u64,
     asked: BTreeMap<TaskId, Asked>,
     states: BTreeMap<TaskId, (Phase, Option<Utc>)>,
     /// Tasks of the run with both their rows.
@@ -30,8 +34,9 @@ struct Asked {
 
 impl Tasks {
     /// None yet, of a run whose client's request ids begin with `run`.
-    pub fn of_run(run: &str) -> Self {
-        Self { run: run.to_owned(), ..Self::default() }
+    /// It began when `before` was the number of the newest task.
+    pub fn of_run(run: &str, before: u64) -> Self {
+        Self { run: run.to_owned(), before, ..Self::default() }
     }
     /// How many of the run's tasks are in one of these phases.
     pub fn count(&self, wanted: impl Fn(Phase) -> bool) -> usize {
@@ -45,7 +50,7 @@ impl Tasks {
     pub fn own_count(&self) -> usize {
         self.own.len()
     }
-    /// How many tasks are not the run's.
+    /// How many tasks are not the run's, of those that are alive or came since it began.
     pub fn of_others(&self) -> usize {
         self.states.len() - self.own.len()
     }
@@ -72,6 +77,20 @@ impl Tasks {
         took.sort_by(f64::total_cmp);
         took
     }
+    /// Takes a row as it became. Tasks are never deleted while a run lasts.
+    fn take(&mut self, row: &Row) -> Result<(), BadRow> {
+        if row.key.table == Table::TaskIntake {
+            let intake = row.decode::<TaskIntake>()?;
+            let is_own = !self.run.is_empty() && intake.request_id.starts_with(&self.run);
+            self.asked.insert(intake.task_id.clone(), Asked { created: intake.created, is_own });
+            self.meet(&intake.task_id);
+        } else {
+            let state = row.decode::<TaskState>()?;
+            self.states.insert(state.task_id.clone(), (state.phase, state.ended));
+            self.meet(&state.task_id);
+        }
+        Ok(())
+    }
     fn meet(&mut self, id: &TaskId) {
         if self.states.contains_key(id) && self.asked.get(id).is_some_and(|a| a.is_own) {
             self.own.insert(id.clone());
@@ -87,39 +106,73 @@ pub fn look<T>(tasks: &SharedTasks, f: impl FnOnce(&Tasks) -> T) -> T {
     f(&tasks.lock().unwrap_or_else(PoisonError::into_inner))
 }
 
-struct Keeper(SharedTasks);
+/// What the run looks at.
+const TABLES: [Table; 2] = [Table::TaskIntake, Table::TaskState];
 
-impl Fold for Keeper {
-    fn tables() -> &'static [Table] {
-        &[Table::TaskIntake, Table::TaskState]
+/// The number of the newest task; what is admitted later has a higher one. 0: there is none.
+///
+/// # Errors
+/// If the store cannot be read.
+pub async fn newest(store: &dyn Store) -> Result<u64, Error> {
+    let query = Query { newest_first: true, limit: 1, ..Query::all(Table::TaskIntake) };
+    Ok(store.list(query).await?.first().map_or(Ok(0), |row| row.decode::<TaskIntake>().map(|intake| intake.number))?)
+}
+
+/// Reads the tasks anew: those that are alive, and all that were admitted since the run began.
+/// Tasks that were over by then cost nothing.
+/// Returns where the feed goes on.
+async fn read(store: &dyn Store, tasks: &SharedTasks) -> Result<Seq, Error> {
+    let live = Phase::ALL.into_iter().filter(|phase| !phase.is_terminal()).map(Phase::number).collect();
+    let alive = store.read(&[Part::InStates(Table::TaskState, live)], |_| Vec::new()).await?;
+    let (run, before) = look(tasks, |tasks| (tasks.run.clone(), tasks.before));
+    let mut fresh = Tasks::of_run(&run, before);
+    for row in &alive.rows {
+        fresh.take(row)?;
     }
-    fn reset(&mut self) {
-        let mut tasks = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        *tasks = Tasks::of_run(&tasks.run);
-    }
-    fn apply(&mut self, change: Change) -> Result<(), BadRow> {
-        let mut tasks = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if change.key.table == Table::TaskIntake {
-            if let Some(intake) = change.decode::<TaskIntake>()? {
-                let is_own = !tasks.run.is_empty() && intake.request_id.starts_with(&tasks.run);
-                tasks.asked.insert(intake.task_id.clone(), Asked { created: intake.created, is_own });
-                tasks.meet(&intake.task_id);
-            }
-        } else if let Some(state) = change.decode::<TaskState>()? {
-            tasks.states.insert(state.task_id.clone(), (state.phase, state.ended));
-            tasks.meet(&state.task_id);
+    let mut after = Some(Cursor { order: before.saturating_add(1).cast_signed(), id: Arc::from("") });
+    while after.is_some() {
+        let intakes = store.list(Query { after, ..Query::all(Table::TaskIntake) }).await?;
+        let states = intakes.iter().map(|row| Key { table: Table::TaskState, id: row.key.id.clone() }).collect();
+        for row in intakes.iter().chain(&store.get(states).await?) {
+            fresh.take(row)?;
         }
-        Ok(())
+        after = intakes.last().map(Cursor::of);
+    }
+    *tasks.lock().unwrap_or_else(PoisonError::into_inner) = fresh;
+    Ok(alive.seq)
+}
+
+/// Takes what the feed holds after `seq`; returns where it goes on.
+async fn advance(store: &dyn Store, tasks: &SharedTasks, mut seq: Seq) -> Result<Seq, Error> {
+    let logs = [Log::Task, Log::Fleet];
+    loop {
+        let page = match store.feed(seq, &logs, FEED_PAGE_MAX).await {
+            Err(Error::CursorExpired { .. }) => return read(store, tasks).await,
+            page => page?,
+        };
+        for entry in page.entries.into_iter().filter(|entry| entry.table.is_some_and(|of| TABLES.contains(&of))) {
+            let Some((table, body)) = entry.table.zip(entry.body) else { continue };
+            let key = Key { table, id: entry.subject };
+            let row = Row { key, revision: entry.revision, index: entry.index, body };
+            tasks.lock().unwrap_or_else(PoisonError::into_inner).take(&row)?;
+        }
+        seq = page.next;
+        if page.next >= page.head {
+            return Ok(seq);
+        }
     }
 }
 
 /// Keeps `tasks` as the rows are, until `stop`.
+///
+/// # Errors
+/// If the store cannot be read.
 pub async fn follow(store: Arc<dyn Store>, tasks: SharedTasks, stop: CancellationToken) -> Result<(), Error> {
-    let mut projection = Projection::new(Keeper(tasks));
     let mut wake = store.wake();
+    let mut seq = read(store.as_ref(), &tasks).await?;
     loop {
         wake.mark_unchanged();
-        projection.advance(store.as_ref()).await?;
+        seq = advance(store.as_ref(), &tasks, seq).await?;
         tokio::select! {
             () = stop.cancelled() => return Ok(()),
             changed = wake.changed() => if changed.is_err() { return Ok(()) },
@@ -127,10 +180,13 @@ pub async fn follow(store: Arc<dyn Store>, tasks: SharedTasks, stop: Cancellatio
     }
 }
 
-/// Reads all rows once more, for the run of this client.
-pub async fn settle(store: Arc<dyn Store>, run: &str) -> Result<Tasks, Error> {
-    let tasks = Arc::new(Mutex::new(Tasks::of_run(run)));
-    Projection::new(Keeper(tasks.clone())).advance(store.as_ref()).await?;
+/// Reads the rows once more, for the run of this client, which began when `before` was the newest task.
+///
+/// # Errors
+/// If the store cannot be read.
+pub async fn settle(store: Arc<dyn Store>, run: &str, before: u64) -> Result<Tasks, Error> {
+    let tasks = Arc::new(Mutex::new(Tasks::of_run(run, before)));
+    read(store.as_ref(), &tasks).await?;
     let mut tasks = tasks.lock().unwrap_or_else(PoisonError::into_inner);
     Ok(std::mem::take(&mut *tasks))
 }

@@ -31,6 +31,7 @@ const PERIOD_MS: std::ops::RangeInclusive<u32> = 50..=60_000;
 struct Filter {
     by: Caller,
     robot_ids: BTreeSet<String>,
+    robot_id_prefix: String,
     presences: BTreeSet<Presence>,
     labels: BTreeMap<String, String>,
 }
@@ -47,7 +48,8 @@ fn filter(wire: Option<v1::RobotFilter>, by: Caller, bad: &mut Violations) -> Fi
     if wire.robot_ids.len() > limits::PAGE_MAX {
         bad.add("filter.robot_ids", "must be at most 1000");
     }
-    Filter { by, robot_ids: wire.robot_ids.into_iter().collect(), presences, labels: wire.labels.into_iter().collect() }
+    let (robot_ids, labels) = (wire.robot_ids.into_iter().collect(), wire.labels.into_iter().collect());
+    Filter { by, robot_ids, robot_id_prefix: wire.robot_id_prefix, presences, labels }
 }
 
 fn encode(inner: &Inner, robot_id: &RobotId, live: Option<&Live>) -> Option<v1::Robot> {
@@ -85,7 +87,7 @@ fn sees(inner: &Inner, by: &Caller, robot_id: &RobotId) -> bool {
 }
 
 fn admits(inner: &Inner, filter: &Filter, robot_id: &RobotId) -> bool {
-    if !sees(inner, &filter.by, robot_id) {
+    if !robot_id.as_str().starts_with(&filter.robot_id_prefix) || !sees(inner, &filter.by, robot_id) {
         return false;
     }
     let rows = inner.picture.rows();

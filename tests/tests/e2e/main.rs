@@ -35,6 +35,7 @@ mod languages;
 mod largest;
 mod launched;
 mod ledger_cuts;
+mod looked_up;
 mod many;
 mod measured;
 mod mid_shift;

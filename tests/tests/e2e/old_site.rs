@@ -1,4 +1,4 @@
-//! A site at which tens of thousands of tasks are over, in files of SQLite and in a database of PostgreSQL: starts, takeovers, lists, lookups,
+//! A site at which a hundred thousand tasks are over, in files of SQLite and in a database of PostgreSQL: starts, takeovers, lists, lookups,
 //! pruning and backups cost what is alive, or what is asked for. What counts is how many rows are read.
 //!
 //! Each old store is made once for this program and copied for each test. `MIDSHIFT_OLD_TASKS` says how many tasks instead.
@@ -13,11 +13,12 @@ use midshift::planning::Planning;
 use midshift::roles::Roles;
 use midshift::server::{Naive, Parts, Server};
 use midshift::storage::{Database, Storage};
+use midshift::tally;
+use midshift::throwaway::Throwaway;
 use midshift_core::rows::Table;
 use midshift_core::site::{CORRIDOR, Site, text};
 use midshift_core::task::TaskState;
 use midshift_core::time::{Clock, Utc};
-use midshift_ota::OtaService;
 use midshift_proto::fleet::v1::ExplainTaskRequest;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::task::v1::watch_tasks_response::Item;
@@ -28,6 +29,7 @@ use midshift_proto::task::v1::{
 use midshift_store::{Query, load};
 use midshift_tests::counted::Counted;
 use midshift_tests::old_site::{DAY_MS, OldSite, task_id};
+use midshift_tests::old_tables;
 use midshift_tests::postgres::PostgresServer;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -40,7 +42,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
 
 /// Tasks that are over, unless the environment says how many.
-const ENDED: u64 = 20_000;
+const ENDED: u64 = 100_000;
 const VARIABLE: &str = "MIDSHIFT_OLD_TASKS";
 /// Rows that one call, and what a server does beside it, may read; a list reads a hundred tasks at a time, each of them several rows.
 const READ_BY_A_CALL: usize = 1_000;
@@ -127,26 +129,24 @@ async fn made_in_files() -> anyhow::Result<PathBuf> {
     if dir.exists() {
         std::fs::remove_dir_all(&dir)?;
     }
-    make(&open(&dir, None, &*site()?).await?).await?;
+    make(None, &dir).await?;
     Ok(dir)
 }
 
 async fn made_in_postgresql() -> anyhow::Result<()> {
     let server = PostgresServer::shared();
     let url = tokio::task::block_in_place(|| server.database_named(TEMPLATE));
-    let site = site()?;
-    make(&open(Path::new(""), Some(url.clone()), &site).await?).await?;
+    make(Some(url.clone()), Path::new("")).await?;
     // As the server itself does it at a site that grew for weeks.
-    tokio::task::block_in_place(|| server.ask(&url, "VACUUM (FULL, ANALYZE)"));
+    tokio::task::block_in_place(|| server.ask(&url, "VACUUM (ANALYZE)"));
     until_alone(server, &url).await
 }
 
-async fn make(storage: &Storage) -> anyhow::Result<()> {
-    let ended = ended()?;
+async fn make(store: Option<String>, data: &Path) -> anyhow::Result<()> {
+    let (ended, engine) = (ended()?, if store.is_some() { "PostgreSQL" } else { "files" });
     let begun = tokio::time::Instant::now();
-    OldSite::with_ended(ended, wall()).write(&*storage.store()).await;
-    storage.close().await;
-    say!("{ended} ended tasks in {} took {:?}", storage.engine(), begun.elapsed());
+    old_tables::make(&OldSite::with_ended(ended, wall()), &Database { store }, data, site()?.site_id()).await?;
+    say!("{ended} ended tasks in {engine} took {:?}", begun.elapsed());
     Ok(())
 }
 
@@ -165,6 +165,8 @@ struct Serving {
     stop: CancellationToken,
     serving: AbortOnDropHandle<anyhow::Result<()>>,
     _planning: Planning,
+    /// Keys, with which roll-outs are planned too.
+    _software: Throwaway,
 }
 
 impl Serving {
@@ -172,6 +174,7 @@ impl Serving {
         let storage = old.open().await?;
         let counted = Counted::over(storage.store());
         let (planning, stop) = (Planning::start()?, CancellationToken::new());
+        let (software, ota) = Throwaway::make(clock(1000)).await?;
         let parts = Parts {
             roles: Roles::default(),
             drain: Duration::ZERO,
@@ -181,7 +184,7 @@ impl Serving {
             site: old.site.clone(),
             site_text: CORRIDOR.to_owned(),
             clock: clock(1000),
-            ota: OtaService::without_keys(),
+            ota,
             identity: None,
             port: door::alone("business"),
             reader: None,
@@ -196,7 +199,7 @@ impl Serving {
         let listener = TcpListener::bind("127.0.0.1:0").await?;
         let address = listener.local_addr()?;
         let serving = AbortOnDropHandle::new(tokio::spawn(server.serve(listener)));
-        Ok(Self { address, counted, storage, stop, serving, _planning: planning })
+        Ok(Self { address, counted, storage, stop, serving, _planning: planning, _software: software })
     }
 
     /// Waits until a new task was planned: it waits for its turn, and why it has no robot is known.
@@ -266,8 +269,18 @@ async fn is_looked_up_by_index(serving: &Serving) -> anyhow::Result<()> {
     }
     ensure!(existing == 1, "a watch begins with what is alive, not with {existing}");
     let watched = serving.counted.take();
-    let read =
-        [("all", all.1), ("a robot's", of_robot.1), ("a prefix", prefixed.1), ("one", one.1), ("watch", watched)];
+    let before = tally::newest(&*serving.counted).await?;
+    let of_others = tally::settle(serving.counted.clone(), "dev-", before).await?.of_others();
+    ensure!(of_others == 1, "a run's client knows of what is alive, not of {of_others}");
+    let tallied = serving.counted.take();
+    let read = [
+        ("all", all.1),
+        ("a robot's", of_robot.1),
+        ("a prefix", prefixed.1),
+        ("one", one.1),
+        ("watch", watched),
+        ("tally", tallied),
+    ];
     say!("rows read: {read:?}");
     ensure!(read.iter().all(|(_, rows)| *rows <= READ_BY_A_CALL), "rows read: {read:?}");
     Ok(())

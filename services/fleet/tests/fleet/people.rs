@@ -224,6 +224,45 @@ async fn an_incident_is_listed_until_a_person_has_looked_into_it() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn an_incident_is_found_by_the_beginning_of_its_id_open_or_closed() {
+    let mut w = World::on(CORRIDOR).await;
+    for (robot, place) in [("r1", "park-a"), ("r2", "park-b")] {
+        w.robot(robot, place).await;
+        w.clone_seen(robot).await;
+    }
+    w.until("a person is told of both", |s| s.incidents().len() == 2).await;
+    let begin = |prefix: &str, include_closed: bool| {
+        let request = v1::ListIncidentsRequest {
+            incident_id_prefix: prefix.to_owned(),
+            include_closed,
+            ..v1::ListIncidentsRequest::default()
+        };
+        let fleet = w.fleet.clone();
+        async move {
+            let page = fleet.list_incidents(Request::new(request)).await.expect("a list").into_inner();
+            page.incidents.into_iter().map(|incident| incident.incident_id).collect::<Vec<_>>()
+        }
+    };
+    let all = begin("", false).await;
+    let [first, second] = all.as_slice() else { panic!("{all:?}") };
+    let common = first.bytes().zip(second.bytes()).take_while(|(a, b)| a == b).count();
+    assert_eq!(begin(&first[..common], false).await, all);
+    for id in [first, second] {
+        assert_eq!(begin(&id[..=common], false).await, [id.clone()]);
+    }
+    assert_eq!(begin("~", false).await, Vec::<String>::new());
+    let close = v1::CloseIncidentRequest {
+        incident_id: first.clone(),
+        reason: "a spare part".to_owned(),
+        ..v1::CloseIncidentRequest::default()
+    };
+    w.fleet.close_incident(Request::new(close)).await.expect("is closed");
+    assert_eq!(begin(first, false).await, Vec::<String>::new());
+    assert_eq!(begin(&first[..=common], true).await, [first.clone()]);
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn the_hours_of_a_robot_without_work_are_counted_and_not_forgotten_by_a_restart() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;

@@ -21,6 +21,23 @@ async fn robot(identity: &IdentityService, robot_id: &str) -> RobotIdentity {
     all.into_iter().find(|robot| robot.robot_id == robot_id).expect("a robot")
 }
 
+#[tokio::test]
+async fn robots_are_listed_by_the_beginning_of_their_id_whether_or_not_they_were_ever_heard() {
+    let world = World::new();
+    let identity = world.open().await.expect("opened");
+    for id in ["r7", "r70", "r8"] {
+        secret(&identity, id, false).await.expect("a secret");
+    }
+    let begin = async |prefix: &str| {
+        let request = ListRobotIdentitiesRequest { robot_id_prefix: prefix.to_owned(), ..Default::default() };
+        let page = identity.list_robot_identities(Request::new(request)).await.expect("a list").into_inner();
+        page.robots.into_iter().map(|robot| robot.robot_id).collect::<Vec<_>>()
+    };
+    assert_eq!(begin("r7").await, ["r7", "r70"]);
+    assert_eq!(begin("").await, ["r7", "r70", "r8"]);
+    assert_eq!(begin("r9").await, Vec::<String>::new());
+}
+
 fn denies(identity: &IdentityService, key: &str) -> bool {
     let key: Digest = key.parse().expect("a digest");
     identity.directory().borrow().denies(&key)

@@ -1,6 +1,7 @@
 //! `midshift robot enroll|replace|revoke|identities`: which machine is which robot.
 
 use super::client::{Call, Exit, unary};
+use super::lookup::{self, Found, whole_id};
 use super::out::Out;
 use crate::stop;
 use midshift_core::site::{self, text};
@@ -87,7 +88,8 @@ fn quoted(word: &str) -> String {
 }
 
 /// Takes a robot's key out.
-pub async fn revoke(call: &Call, robot_id: String, out: &Out) -> Result<(), Exit> {
+pub async fn revoke(call: &Call, typed: &str, out: &Out) -> Result<(), Exit> {
+    let robot_id = find(call, typed).await?;
     let revoked = call.identity().await?.revoke_robot(unary(v1::RevokeRobotRequest { robot_id })).await?.into_inner();
     let robot = revoked.robot.clone().unwrap_or_default();
     out.one(&revoked, &robot.robot_id, || format!("{} is let in nowhere until it is enrolled anew", robot.robot_id))?;
@@ -95,6 +97,28 @@ pub async fn revoke(call: &Call, robot_id: String, out: &Out) -> Result<(), Exit
         "it stands when its silence ladder says so; its places stay taken until it reports or a person clears them",
     );
     Ok(())
+}
+
+/// The whole id of a robot that may be enrolled, whether or not it was ever heard.
+async fn find(call: &Call, typed: &str) -> Result<String, Exit> {
+    let mut client = call.identity().await?;
+    let listed = async {
+        let (page_size, robot_id_prefix) = (lookup::SHOWN, typed.to_owned());
+        let request = v1::ListRobotIdentitiesRequest { page_size, robot_id_prefix, page_token: String::new() };
+        let page = client.list_robot_identities(unary(request)).await?.into_inner();
+        Ok(Found::page(&page.robots, &page.next_page_token, |r| &r.robot_id, |robot| vec![state(robot)]))
+    };
+    whole_id("robot", typed, listed).await
+}
+
+fn state(robot: &v1::RobotIdentity) -> String {
+    match (robot.key_sha256.is_empty(), &robot.revoke_time, &robot.enrolment_expire_time) {
+        (false, _, Some(_)) => "enrolled, replacement open".to_owned(),
+        (false, _, None) => "enrolled".to_owned(),
+        (true, _, Some(_)) => "waits for its machine".to_owned(),
+        (true, Some(_), None) => format!("revoked by {}", robot.revoked_by),
+        (true, None, None) => "never enrolled".to_owned(),
+    }
 }
 
 /// Lists who is enrolled.
@@ -113,14 +137,7 @@ pub async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
     let at =
         |time: &Option<prost_types::Timestamp>| time.as_ref().map_or_else(|| "-".to_owned(), |t| time_of(t).rfc3339());
     let row = |robot: &v1::RobotIdentity| {
-        let state = match (robot.key_sha256.is_empty(), &robot.revoke_time, &robot.enrolment_expire_time) {
-            (false, _, Some(_)) => "enrolled, replacement open".to_owned(),
-            (false, _, None) => "enrolled".to_owned(),
-            (true, _, Some(_)) => "waits for its machine".to_owned(),
-            (true, Some(_), None) => format!("revoked by {}", robot.revoked_by),
-            (true, None, None) => "never enrolled".to_owned(),
-        };
-        vec![robot.robot_id.clone(), state, at(&robot.enrol_time), at(&robot.expire_time)]
+        vec![robot.robot_id.clone(), state(robot), at(&robot.enrol_time), at(&robot.expire_time)]
     };
     Ok(out.many(&all, &all.robots, |r| r.robot_id.clone(), &["ROBOT", "STATE", "SINCE", "CERTIFICATE UNTIL"], row)?)
 }

@@ -1,6 +1,7 @@
 //! `midshift incident …`: what a person should look into.
 
 use super::client::{Call, Change, Exit, unary};
+use super::lookup::{self, Found, whole_id};
 use super::out::{Out, plain};
 use clap::Subcommand;
 use midshift_proto::convert::time_of;
@@ -24,14 +25,14 @@ pub enum Verb {
     Get {
         #[command(flatten)]
         call: Call,
-        /// Which.
+        /// Its id, or a prefix that only one incident has.
         incident_id: String,
     },
     /// You have looked into it.
     Close {
         #[command(flatten)]
         call: Call,
-        /// Which.
+        /// Its id, or a prefix that only one incident has.
         incident_id: String,
         /// What you found.
         #[arg(long)]
@@ -56,6 +57,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
                     robot_id: robot.clone(),
                     page_size: 1_000,
                     page_token: whole.next_page_token.clone(),
+                    incident_id_prefix: String::new(),
                 };
                 let page = client.list_incidents(unary(request)).await?.into_inner();
                 whole.incidents.extend(page.incidents);
@@ -69,13 +71,13 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             Ok(())
         }
         Verb::Get { call, incident_id } => {
-            let request = v1::GetIncidentRequest { incident_id };
+            let request = v1::GetIncidentRequest { incident_id: find(&call, &incident_id).await? };
             let incident = call.fleet().await?.get_incident(unary(request)).await?.into_inner().incident;
             show(&incident.unwrap_or_default(), out)
         }
         Verb::Close { call, incident_id, reason, if_match, change } => {
             let request = v1::CloseIncidentRequest {
-                incident_id,
+                incident_id: find(&call, &incident_id).await?,
                 request_id: change.request_id,
                 etag: if_match,
                 reason,
@@ -85,6 +87,22 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             show(&incident.unwrap_or_default(), out)
         }
     }
+}
+
+/// The whole id, of an incident that is open or closed.
+async fn find(call: &Call, typed: &str) -> Result<String, Exit> {
+    let mut client = call.fleet().await?;
+    let listed = async {
+        let request = v1::ListIncidentsRequest {
+            include_closed: true,
+            page_size: lookup::SHOWN,
+            incident_id_prefix: typed.to_owned(),
+            ..v1::ListIncidentsRequest::default()
+        };
+        let page = client.list_incidents(unary(request)).await?.into_inner();
+        Ok(Found::page(&page.incidents, &page.next_page_token, |i| &i.incident_id, row))
+    };
+    whole_id("incident", typed, listed).await
 }
 
 fn show(incident: &v1::Incident, out: &Out) -> Result<(), Exit> {

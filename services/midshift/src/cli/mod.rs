@@ -14,6 +14,7 @@ mod enrol;
 mod explain;
 mod health;
 mod incident;
+mod lookup;
 mod map;
 mod out;
 mod push;

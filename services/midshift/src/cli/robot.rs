@@ -5,6 +5,7 @@ mod table;
 use super::client::{Call, Change, Exit, ended, follow, unary};
 use super::enrol::{self, Machine};
 use super::explain::verdict;
+use super::lookup::{self, Found, whole_id};
 use super::out::{Format, Out, plain};
 use super::rollout;
 use clap::Subcommand;
@@ -30,7 +31,7 @@ pub enum Verb {
     Watch {
         #[command(flatten)]
         call: Call,
-        /// Only these robots.
+        /// Only these robots, each by its id or a prefix that only one robot has.
         ids: Vec<String>,
         /// Time between two pictures.
         #[arg(long, value_parser = super::duration, default_value = "1s")]
@@ -179,20 +180,57 @@ pub enum Verb {
 pub struct One {
     #[command(flatten)]
     call: Call,
-    /// Its id.
+    /// Its id, or a prefix that only one robot has.
     robot_id: String,
 }
 
+impl Verb {
+    /// The one robot that it is about, of those that the server has heard of.
+    fn one(&mut self) -> Option<&mut One> {
+        match self {
+            Self::Get(one) | Self::Explain(one) => Some(one),
+            Self::Cordon { one, .. } | Self::Uncordon { one, .. } | Self::Drain { one, .. } => Some(one),
+            Self::Undrain { one, .. } | Self::Retire { one, .. } | Self::Disown { one, .. } => Some(one),
+            Self::Pin { one, .. } | Self::Unpin { one, .. } | Self::Exclude { one, .. } => Some(one),
+            Self::Load { one, .. } => Some(one),
+            // A robot that is enrolled needs not have been heard.
+            Self::Revoke(_) | Self::Enroll(_) | Self::Replace(_) => None,
+            Self::Ls { .. } | Self::Watch { .. } | Self::Identities { .. } => None,
+        }
+    }
+}
+
+/// The whole id of a robot that the server has heard of.
+pub async fn find(call: &Call, typed: &str) -> Result<String, Exit> {
+    let mut client = call.telemetry().await?;
+    let listed = async {
+        let filter = Some(v1::RobotFilter { robot_id_prefix: typed.to_owned(), ..v1::RobotFilter::default() });
+        let request = v1::ListRobotsRequest { filter, page_size: lookup::SHOWN, page_token: String::new() };
+        let page = client.list_robots(unary(request)).await?.into_inner();
+        let row = |robot: &v1::Robot| vec![presence(robot)];
+        Ok(Found::page(&page.robots, &page.next_page_token, |r| &r.robot_id, row))
+    };
+    whole_id("robot", typed, listed).await
+}
+
 /// Runs one verb.
-pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
+pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
+    if let Some(one) = verb.one() {
+        one.robot_id = find(&one.call, &one.robot_id).await?;
+    }
     match verb {
         Verb::Ls { call } => table::list(&call, out).await,
         Verb::Get(one) => get(&one, out).await,
-        Verb::Watch { call, ids, period } => watch(&call, ids, period, out).await,
+        Verb::Watch { call, mut ids, period } => {
+            for id in &mut ids {
+                *id = find(&call, id).await?;
+            }
+            watch(&call, ids, period, out).await
+        }
         Verb::Explain(one) => explain(&one, out).await,
         Verb::Enroll(machine) => enrol::offer(machine, false, out).await,
         Verb::Replace(machine) => enrol::offer(machine, true, out).await,
-        Verb::Revoke(one) => enrol::revoke(&one.call, one.robot_id, out).await,
+        Verb::Revoke(one) => enrol::revoke(&one.call, &one.robot_id, out).await,
         Verb::Identities { call } => enrol::list(&call, out).await,
         Verb::Cordon { one, reason, if_match, change } => {
             let request = fleet::CordonRobotRequest {
@@ -315,6 +353,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             Ok(())
         }
         Verb::Exclude { one, from, reason, change } => {
+            let from = rollout::find(&one.call, &from).await?;
             rollout::exclude(&one.call, from, one.robot_id, reason, change, out).await
         }
     }

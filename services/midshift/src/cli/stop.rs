@@ -7,6 +7,7 @@ mod target;
 pub use target::address;
 
 use super::client::{Exit, follow, unary, was_cut};
+use super::lookup::{Found, whole_id};
 use super::out::{Format, Out, plain};
 use crate::stop::{FOLDER, StopServe};
 use crate::way::Line;
@@ -115,7 +116,7 @@ enum Verb {
     Reset {
         #[command(flatten)]
         call: StopCall,
-        /// Its name.
+        /// Its name, or a prefix that only one engaged stop has.
         stop_id: String,
         /// What you saw that makes it right.
         #[arg(long)]
@@ -153,7 +154,9 @@ pub async fn run(stop: Stop, out: &Out) -> Result<(), Exit> {
         Some(Verb::Status { call, .. }) => watch(&call, out).await,
         Some(Verb::Reset { call, stop_id, reason }) => {
             let target = call.target(out).await?;
-            reset(call.client(&target).await?, v1::ResetRequest { stop_id, reason, site_id: target.site_id }, out).await
+            let mut client = call.client(&target).await?;
+            let stop_id = find(&mut client, &stop_id).await?;
+            reset(client, v1::ResetRequest { stop_id, reason, site_id: target.site_id }, out).await
         }
         Some(Verb::Verify { data }) => {
             let folder = data.join(FOLDER);
@@ -529,6 +532,23 @@ async fn watch(call: &StopCall, out: &Out) -> Result<(), Exit> {
     .await
 }
 
+/// The whole name of an engaged stop. What none of them begins with stays as it is: also a stop that this service does not know is reset.
+async fn find(client: &mut StopServiceClient<Line>, typed: &str) -> Result<String, Exit> {
+    let listed = async {
+        let status = client.get_status(unary(v1::GetStatusRequest {})).await?.into_inner().status;
+        let stops: Vec<v1::Stop> =
+            status.into_iter().flat_map(|s| s.stops).filter_map(|engaged| engaged.stop).collect();
+        Ok(engaged(&stops, typed))
+    };
+    whole_id("stop", typed, listed).await
+}
+
+/// Which of these begin with what was typed.
+fn engaged(stops: &[v1::Stop], typed: &str) -> Found {
+    let begin: Vec<&v1::Stop> = stops.iter().filter(|stop| stop.stop_id.starts_with(typed)).collect();
+    Found::page(&begin, "", |stop| &stop.stop_id, |stop| vec![level(stop.level).to_owned(), whom(stop)])
+}
+
 async fn reset(mut client: StopServiceClient<Line>, request: v1::ResetRequest, out: &Out) -> Result<(), Exit> {
     let answer = client.reset(unary(request)).await?.into_inner();
     let reset = answer.reset.clone().unwrap_or_default();
@@ -561,6 +581,17 @@ mod tests {
     struct Line {
         #[command(flatten)]
         stop: Stop,
+    }
+
+    #[test]
+    fn an_engaged_stop_is_meant_by_the_beginning_of_its_name_and_one_that_is_not_engaged_by_its_whole_name() {
+        let stop = |id: &str| v1::Stop { stop_id: id.to_owned(), ..v1::Stop::default() };
+        let stops = [stop("STOP-aa1"), stop("STOP-aa2"), stop("STOP-b")];
+        assert_eq!(engaged(&stops, "STOP-b").single("stop", "STOP-b").expect("one").as_deref(), Some("STOP-b"));
+        assert_eq!(engaged(&stops, "STOP-aa2").single("stop", "STOP-aa2").expect("one").as_deref(), Some("STOP-aa2"));
+        assert_eq!(engaged(&stops, "STOP-c").single("stop", "STOP-c").expect("none"), None);
+        let several = engaged(&stops, "STOP-a").single("stop", "STOP-a").expect_err("it may be either");
+        assert!(several.to_string().contains("\n  STOP-aa1") && !several.to_string().contains("STOP-b"), "{several}");
     }
 
     #[test]

@@ -4,6 +4,7 @@ mod many;
 
 use super::client::{self, Call, Change, Exit, unary};
 use super::explain::verdict;
+use super::lookup::{self, Found};
 use super::out::{Format, Out, plain};
 use crate::background::{read_list, request};
 use crate::site_file;
@@ -19,8 +20,6 @@ use std::path::PathBuf;
 use std::time::Duration;
 use tonic::Code;
 
-/// Tasks that an ambiguous beginning of an id shows.
-const CANDIDATES_SHOWN: u32 = 10;
 /// How far a long search is, is said after so many tasks each.
 const TOLD_EVERY: u64 = 100_000;
 
@@ -391,30 +390,17 @@ impl One {
         }
         let filter = v1::TaskFilter { task_id_prefix: self.task_id.clone(), ..v1::TaskFilter::default() };
         let request =
-            v1::ListTasksRequest { filter: Some(filter), page_size: CANDIDATES_SHOWN, page_token: String::new() };
+            v1::ListTasksRequest { filter: Some(filter), page_size: lookup::SHOWN, page_token: String::new() };
         let page = client.list_tasks(unary(request)).await?.into_inner();
-        let candidates = page.tasks.iter().map(|t| [t.task_id.as_str(), &state(t), &way(t)].join("  "));
-        match (page.tasks.as_slice(), page.next_page_token.is_empty()) {
-            ([task], true) => Ok(task.task_id.clone()),
-            (_, is_all) => Err(no_single("task", &self.task_id, candidates, is_all)),
-        }
+        let row = |task: &v1::Task| vec![state(task), way(task)];
+        let found = Found::page(&page.tasks, &page.next_page_token, |task| &task.task_id, row);
+        let nothing = || Exit::new(4, format!("no task begins with {}\n  try: midshift task ls", self.task_id));
+        found.single("task", &self.task_id)?.ok_or_else(nothing)
     }
     async fn read(&self) -> Result<v1::GetTaskResponse, Exit> {
         let task_id = self.find().await?;
         Ok(self.call.task().await?.get_task(unary(v1::GetTaskRequest { task_id })).await?.into_inner())
     }
-}
-
-/// What begins with `prefix` where one was meant: nothing, or these candidates.
-fn no_single(what: &str, prefix: &str, candidates: impl Iterator<Item = String>, is_all: bool) -> Exit {
-    let mut lines: String = candidates.map(|line| format!("\n  {}", line.trim_end())).collect();
-    if lines.is_empty() {
-        return Exit::new(4, format!("no {what} begins with {prefix}\n  try: midshift {what} ls"));
-    }
-    if !is_all {
-        lines += "\n  and more";
-    }
-    Exit::usage(format!("more than one {what} begins with {prefix}:{lines}\n  try: the same with more of the id"))
 }
 
 fn state(task: &v1::Task) -> String {
@@ -767,8 +753,6 @@ async fn until_over(call: &Call, task_id: &str, mut told: String, out: &Out) -> 
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-
     #[test]
     fn each_answer_that_a_task_allows_is_told_by_the_word_that_the_command_takes() {
         use clap::ValueEnum;
@@ -777,18 +761,5 @@ mod tests {
             let word = super::As::word(answer).expect("a word");
             assert_eq!(super::As::from_str(&word, false).map(super::As::wire), Ok(answer), "{word}");
         }
-    }
-
-    #[test]
-    fn an_ambiguous_beginning_lists_its_candidates_and_says_whether_these_are_all() {
-        let two = || ["T-1  QUEUED", "T-12  RUNNING"].map(str::to_owned).into_iter();
-        let all = no_single("task", "T-1", two(), true);
-        assert_eq!(all.code(), 2);
-        let said =
-            "more than one task begins with T-1:\n  T-1  QUEUED\n  T-12  RUNNING\n  try: the same with more of the id";
-        assert_eq!(all.to_string(), said);
-        assert!(no_single("task", "T-1", two(), false).to_string().contains("\n  and more\n"));
-        let none = no_single("task", "X", std::iter::empty(), true);
-        assert_eq!((none.code(), none.to_string().as_str()), (4, "no task begins with X\n  try: midshift task ls"));
     }
 }

@@ -75,7 +75,7 @@ async fn report(kind: Kind, site_ms: u64, store: Arc<dyn Store>, acknowledged: V
         kind,
         seed: 1,
         acknowledged,
-        tasks: settle(store, RUN).await?,
+        tasks: settle(store, RUN, 0).await?,
         bodies: bodies()?,
         place_waits: 0,
         no_progress_ms: 0,

@@ -208,10 +208,15 @@ impl RolloutService {
         bad.finish()?;
         let by = by.clone();
         self.look(move |view, _, now| {
-            // The newest first.
-            let key = |r: &Rollout| format!("{:020}/{}", i64::MAX - r.created.at.0, r.rollout_id);
-            let mut all: Vec<_> =
-                view.rollouts.values().filter(|r| objects::sees(&by, &r.row)).map(|r| (key(&r.row), r)).collect();
+            let prefix = &r.rollout_id_prefix;
+            let key = |id: &str, r: &Rollout| match prefix.is_empty() {
+                // The newest first.
+                true => format!("{:020}/{id}", i64::MAX - r.created.at.0),
+                false => id.to_owned(),
+            };
+            let rows = view.rollouts.range(prefix.clone()..).take_while(|(id, _)| id.starts_with(prefix));
+            let rows = rows.filter(|(_, r)| objects::sees(&by, &r.row));
+            let mut all: Vec<_> = rows.map(|(id, r)| (key(id, &r.row), r)).collect();
             all.sort_by(|a, b| a.0.cmp(&b.0));
             let (rows, next_page_token) = pages::page(all.into_iter(), &r.page_token, size);
             let rollouts = rows.into_iter().map(|r| encode::rollout(view, now, &r.row)).collect();

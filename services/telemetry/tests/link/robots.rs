@@ -7,7 +7,7 @@ use midshift_core::time::Clock;
 use midshift_proto::convert::{ms_of, time_of};
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
 use midshift_proto::telemetry::v1::{
-    self, GetRobotRequest, Presence, RobotFilter, WatchRobotsRequest, WatchRobotsResponse,
+    self, GetRobotRequest, ListRobotsRequest, Presence, RobotFilter, WatchRobotsRequest, WatchRobotsResponse,
 };
 use midshift_store::{LiveBoard, MemoryFrames, MemoryStore, Store, StoreId};
 use midshift_telemetry::{Bugs, Parts};
@@ -45,6 +45,20 @@ impl Watcher {
             }
         }
     }
+}
+
+#[tokio::test(start_paused = true)]
+async fn robots_are_listed_by_the_beginning_of_their_id() -> Result<()> {
+    let world = world().await?;
+    let _robot = Robot::attach(&world, None).await?;
+    for (prefix, expected) in [("", true), ("r", true), ("r1", true), ("r10", false), ("s", false)] {
+        let filter = Some(RobotFilter { robot_id_prefix: prefix.to_owned(), ..RobotFilter::default() });
+        let request = ListRobotsRequest { filter, ..ListRobotsRequest::default() };
+        let mut client = TelemetryServiceClient::new(world.channel.clone());
+        let robots = client.list_robots(request).await?.into_inner().robots;
+        assert_eq!(robots.iter().any(|robot| robot.robot_id == "r1"), expected, "{prefix}");
+    }
+    Ok(())
 }
 
 #[tokio::test(start_paused = true)]

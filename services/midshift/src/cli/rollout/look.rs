@@ -16,7 +16,8 @@ pub async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
     let mut client = call.rollouts().await?;
     let mut whole = v1::ListRolloutsResponse::default();
     loop {
-        let request = v1::ListRolloutsRequest { page_size: 1_000, page_token: whole.next_page_token };
+        let (page_size, page_token) = (1_000, whole.next_page_token);
+        let request = v1::ListRolloutsRequest { page_size, page_token, ..v1::ListRolloutsRequest::default() };
         let page = client.list_rollouts(unary(request)).await?.into_inner();
         whole.rollouts.extend(page.rollouts);
         whole.next_page_token = page.next_page_token;

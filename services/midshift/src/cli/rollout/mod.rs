@@ -11,7 +11,9 @@ mod tests;
 mod text;
 
 use super::client::{Call, Change, Exit, ended, unary};
+use super::lookup::{self, Found, whole_id};
 use super::out::Out;
+use super::robot;
 use crate::way::Line;
 use clap::{Subcommand, ValueEnum};
 use midshift_proto::ota::v1;
@@ -127,8 +129,35 @@ pub enum Until {
 pub struct One {
     #[command(flatten)]
     call: Call,
-    /// Its id.
+    /// Its id, or a prefix that only one roll-out has.
     rollout_id: String,
+}
+
+impl Verb {
+    /// The one roll-out that it is about, and the one robot in it.
+    fn named(&mut self) -> (Option<&mut One>, Option<&mut String>) {
+        match self {
+            Self::Exclude { one, robot_id, .. } | Self::Explain { one, robot_id } => (Some(one), Some(robot_id)),
+            Self::Submit(said) | Self::Approve(said) | Self::Pause(said) => (Some(&mut said.one), None),
+            Self::Start { said, .. } | Self::Retry { said, .. } => (Some(&mut said.one), None),
+            Self::Resume(seen) | Self::Promote(seen) | Self::Abort(seen) => (Some(&mut seen.said.one), None),
+            Self::Rollback { one, .. } | Self::Get { one, .. } | Self::Wait { one, .. } => (Some(one), None),
+            Self::Robots(one) | Self::History(one) | Self::Watch(one) => (Some(one), None),
+            Self::Create(_) | Self::Ls { .. } => (None, None),
+        }
+    }
+}
+
+/// The whole id of a roll-out.
+pub async fn find(call: &Call, typed: &str) -> Result<String, Exit> {
+    let mut client = call.rollouts().await?;
+    let listed = async {
+        let (page_size, rollout_id_prefix) = (lookup::SHOWN, typed.to_owned());
+        let request = v1::ListRolloutsRequest { page_size, rollout_id_prefix, page_token: String::new() };
+        let page = client.list_rollouts(unary(request)).await?.into_inner();
+        Ok(Found::page(&page.rollouts, &page.next_page_token, |r| &r.rollout_id, look::row))
+    };
+    whole_id("rollout", typed, listed).await
 }
 
 /// One roll-out and why.
@@ -200,7 +229,13 @@ impl One {
 }
 
 /// Runs one verb.
-pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
+pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
+    if let (Some(one), robot_id) = verb.named() {
+        one.rollout_id = find(&one.call, &one.rollout_id).await?;
+        if let Some(robot_id) = robot_id {
+            *robot_id = robot::find(&one.call, robot_id).await?;
+        }
+    }
     match verb {
         Verb::Create(args) => create::run(*args, out).await,
         Verb::Submit(said) => act(&said, Ask::Submit, out).await,

@@ -68,6 +68,13 @@ async fn roll_outs_are_written_seen_and_approved_by_whoever_may_where_they_are_f
         };
         assert_eq!(listed(&anna).await, ["hall", "quality"]);
         assert_eq!(listed(&blind).await, ["hall"]);
+        let begins = async |by: &Caller, prefix: &str| {
+            let request = v1::ListRolloutsRequest { rollout_id_prefix: prefix.to_owned(), ..Default::default() };
+            let page = Face::list_rollouts(&process.face, asked(by, request)).await.expect("a page").into_inner();
+            page.rollouts.into_iter().map(|rollout| rollout.rollout_id).collect::<Vec<_>>()
+        };
+        assert_eq!(begins(&anna, "q").await, ["quality"], "by the beginning of the id");
+        assert_eq!(begins(&blind, "q").await, Vec::<String>::new(), "and nobody sees more by it");
         for (id, expected) in [("hall", Code::Ok), ("quality", Code::NotFound)] {
             let rollout_id = id.to_owned();
             let get = v1::GetRolloutRequest { rollout_id: rollout_id.clone() };

@@ -1,0 +1,117 @@
+//! Finds the one thing that a person means by an id or by the beginning of one.
+//!
+//! Invariant: a whole id is always itself, however many others begin with it.
+
+use super::client::Exit;
+use tonic::{Code, Status};
+
+/// Candidates that are asked for, and shown where they are several.
+pub const SHOWN: u32 = 10;
+
+/// What begins with what was typed.
+#[derive(Debug, Default)]
+pub struct Found {
+    /// Id of each, and how it is shown.
+    pub candidates: Vec<(String, String)>,
+    /// There are no more.
+    pub is_all: bool,
+}
+
+impl Found {
+    /// One page of a list, in the order of ids.
+    pub fn page<T>(
+        rows: &[T],
+        next_page_token: &str,
+        id: impl Fn(&T) -> &str,
+        row: impl Fn(&T) -> Vec<String>,
+    ) -> Self {
+        let candidate = |one: &T| {
+            let (id, mut words) = (id(one).to_owned(), row(one));
+            words.retain(|word| *word != id && !word.is_empty());
+            (id.clone(), [vec![id], words].concat().join("  "))
+        };
+        Self { candidates: rows.iter().map(candidate).collect(), is_all: next_page_token.is_empty() }
+    }
+
+    /// The id that is meant; none: nothing begins with it.
+    ///
+    /// # Errors
+    /// If several begin with it: they are listed.
+    pub fn single(self, what: &str, typed: &str) -> Result<Option<String>, Exit> {
+        if self.candidates.iter().any(|(id, _)| id == typed) {
+            return Ok(Some(typed.to_owned()));
+        }
+        let mut lines: String = self.candidates.iter().map(|(_, line)| format!("\n  {}", line.trim_end())).collect();
+        let mut ids = self.candidates.into_iter().map(|(id, _)| id);
+        let first = ids.next();
+        if ids.next().is_none() && self.is_all {
+            return Ok(first);
+        }
+        if !self.is_all {
+            lines += "\n  and more";
+        }
+        Err(Exit::usage(format!(
+            "more than one {what} begins with {typed}:{lines}\n  try: the same with more of the id"
+        )))
+    }
+}
+
+/// The whole id behind what was typed, by what the server lists. What nothing begins with stays as it is: the call that follows says
+/// that there is no such thing. So does what a caller names that may not list.
+///
+/// # Errors
+/// If several begin with it, or the server does not answer.
+pub async fn whole_id(
+    what: &str,
+    typed: &str,
+    listed: impl Future<Output = Result<Found, Status>>,
+) -> Result<String, Exit> {
+    if typed.is_empty() {
+        return Err(Exit::usage(format!("the id of a {what} is empty\n  try: midshift {what} --help")));
+    }
+    match listed.await {
+        Ok(found) => Ok(found.single(what, typed)?.unwrap_or_else(|| typed.to_owned())),
+        Err(status) if matches!(status.code(), Code::PermissionDenied | Code::Unimplemented) => Ok(typed.to_owned()),
+        Err(status) => Err(status.into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn found(ids: &[&str], next_page_token: &str) -> Found {
+        Found::page(ids, next_page_token, |id| id, |id| vec!["OPEN".to_owned(), (*id).to_owned(), String::new()])
+    }
+
+    #[test]
+    fn a_whole_id_is_itself_however_many_others_begin_with_it() {
+        for next in ["", "more"] {
+            let one = found(&["T-1", "T-10", "T-11"], next).single("task", "T-1");
+            assert_eq!(one.expect("itself").as_deref(), Some("T-1"));
+        }
+    }
+
+    #[test]
+    fn a_beginning_that_only_one_has_is_that_one_and_of_several_each_is_listed() {
+        assert_eq!(found(&["T-10"], "").single("task", "T-1").expect("one").as_deref(), Some("T-10"));
+        assert_eq!(found(&[], "").single("task", "T-1").expect("none"), None);
+        let several = found(&["T-10", "T-11"], "").single("task", "T-1").expect_err("it may be either");
+        assert_eq!(several.code(), 2);
+        let text =
+            "more than one task begins with T-1:\n  T-10  OPEN\n  T-11  OPEN\n  try: the same with more of the id";
+        assert_eq!(several.to_string(), text);
+        let more = found(&["T-10"], "T-10").single("task", "T-1").expect_err("there are more");
+        assert!(more.to_string().contains("\n  and more\n"), "{more}");
+    }
+
+    #[tokio::test]
+    async fn who_may_not_list_may_name_a_whole_id_and_a_server_that_is_away_is_told() {
+        let answered = |code| async move { Err(Status::new(code, "")) };
+        assert_eq!(whole_id("robot", "r1", answered(Code::PermissionDenied)).await.expect("as it is"), "r1");
+        assert!(whole_id("robot", "r1", answered(Code::Unavailable)).await.is_err());
+        let nothing = whole_id("robot", "r1", async { Ok(Found { candidates: Vec::new(), is_all: true }) }).await;
+        assert_eq!(nothing.expect("as it is"), "r1");
+        assert_eq!(whole_id("robot", "", answered(Code::Unavailable)).await.expect_err("nothing").code(), 2);
+    }
+}
