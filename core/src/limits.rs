@@ -509,6 +509,10 @@ pub const CONTROL_FRAMES_EARNED_MAX: u64 = 1 << 18;
 pub const CONNECTION_AGE: LinkDuration = LinkDuration::from_secs(54 * 60);
 /// What streams of an old connection are ended with is on its way for so long before the connection is cut.
 pub const CONNECTION_LAST: LinkDuration = LinkDuration::from_secs(1);
+/// A connection whose certificate is denied is told why for so long, then cut.
+pub const DENIED_LAST: LinkDuration = LinkDuration::from_secs(3);
+/// A robot that hears that its key was taken out dials again after so long: nothing but a person changes that.
+pub const REVOKED_RETRY: LinkDuration = LinkDuration::from_secs(60);
 /// Hellos of robots that one process carries out at a time; each is a write, and writes of so many are one or two groups. Further ones are told when to
 /// come again, so that a storm of ten thousand is over in seconds and none of them waits until it gives up.
 pub const HELLOS_MAX: usize = 512;
@@ -567,6 +571,8 @@ pub const ENROLMENT_VALID: LinkDuration = LinkDuration::from_secs(3_600);
 pub const TOKEN_STOPS_AFTER_EXPIRY: LinkDuration = LinkDuration::from_secs(30 * 24 * 3_600);
 /// Longest life of a token, link clock.
 pub const TOKEN_VALID_MAX: LinkDuration = LinkDuration::from_secs(366 * 24 * 3_600);
+/// A token that was rotated is good for so much longer at most: programs on several machines get the new one meanwhile.
+pub const TOKEN_OVERLAP_MAX: LinkDuration = LinkDuration::from_secs(7 * 24 * 3_600);
 /// Tokens of a site that were not revoked.
 pub const TOKENS_MAX: usize = 10_000;
 /// Grants of one token.

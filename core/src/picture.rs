@@ -4,6 +4,7 @@
 //! running cycle will write; a row written twice in one decision stands in its item once, with the first expectation and the last body.
 
 use crate::audit::Note;
+use crate::identity::Actor;
 use crate::ids::RobotId;
 use crate::reason::Reason;
 use crate::rows::{
@@ -144,7 +145,7 @@ pub struct Tx<'a, P: Picture> {
 
 impl<'a, P: Picture> Tx<'a, P> {
     /// Begins a decision on behalf of `actor`.
-    pub fn new(view: &'a mut P, now: Now, actor: &str) -> Self {
+    pub fn new(view: &'a mut P, now: Now, actor: impl Into<Actor>) -> Self {
         Self { view, now, item: Item::new(P::WRITER, actor), at: BTreeMap::new(), undo: Vec::new() }
     }
     /// Notes the request behind it.

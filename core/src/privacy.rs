@@ -208,6 +208,7 @@ kept! {
     Place::Table(Table::OtaLeader) => [None] Update Newest;
     Place::Table(Table::StopRecord) => [Operations, Person, Credential] Stop Quarter;
     Place::Table(Table::Token) => [Person, Credential] Identify Standing;
+    Place::Table(Table::TokenName) => [Person] Identify Standing;
     Place::Table(Table::RobotIdentity) => [Machine, Credential, Person] Identify Standing;
     Place::Table(Table::Authority) => [Machine] Identify Standing;
     Place::Table(Table::ServerCertificate) => [Machine] Identify Standing;

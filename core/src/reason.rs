@@ -97,6 +97,7 @@ codes! {
     EnrolmentExpired = "ENROLMENT_EXPIRED", "The secret was good for an hour. Enrol the robot again and use the new line.";
     KeyDenied = "KEY_DENIED", "The key of this machine was revoked or replaced, or is not the robot's. Remove its identity folder and enrol it anew.";
     TokenNotFound = "TOKEN_NOT_FOUND", "No token has this id. List tokens.";
+    TokenNameTaken = "TOKEN_NAME_TAKEN", "A token of this name stands, and names are unique among those that do. Choose another name, or replace it with `midshift token rotate NAME`; of several of one name that an older release made, revoke those that nobody uses by their ids.";
     LastAdmin = "LAST_ADMIN", "It is the last token that may administer the site. Make another one first.";
     // --- fleet stop
     StopsFull = "STOPS_FULL", "As many stops are engaged as there may be; the last ones are kept for the whole fleet. Engage the whole fleet, or reset what is over.";

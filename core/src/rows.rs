@@ -6,6 +6,7 @@
 //! a revision never means two things; or only after [`limits::GONE_KEPT`] ([`Table::OF_A_ROBOT`]), when nobody remembers the first.
 
 use crate::audit::Note;
+use crate::identity::{Actor, TokenId};
 use crate::ids::RobotId;
 use crate::limits;
 use serde::de::DeserializeOwned;
@@ -103,6 +104,7 @@ tables! {
     OtaLeader "ota_leader" Ota, "Which process of ota plans and signs; renewed each second where there may be several.";
     StopRecord "stop_record" Stop, "A copy of one fleet stop and of its reset. id = stop_id, order = when it was engaged.";
     Token "token" Identity, "A token of a person or a program: digest, rights, expiry. id = token_id, order = creation.";
+    TokenName "token_name" Identity, "The newest token of a name, so that no two are made of one. id = name.";
     RobotIdentity "robot_identity" Identity, "A robot's key, the newest secret that enrols it, keys that were taken out. id = robot_id.";
     Authority "authority" Identity, "The root certificate of the site. id = site_id.";
     ServerCertificate "server_certificate" Identity, "What one server process asked to prove itself with, and the answer. id = digest of its key.";
@@ -396,6 +398,8 @@ pub struct Item {
     pub writer: Writer,
     /// On whose behalf: a principal, a robot, or the service itself.
     pub actor: Arc<str>,
+    /// The token that was shown for it; none: none was. Stands in the audit beside the actor.
+    pub token: Option<TokenId>,
     /// The request behind it, if any.
     pub request_id: Option<Arc<str>>,
     /// Rows with their conditions, each key at most once.
@@ -420,10 +424,12 @@ pub struct Silent {
 
 impl Item {
     /// An empty item of `writer` on behalf of `actor`.
-    pub fn new(writer: Writer, actor: impl AsRef<str>) -> Self {
+    pub fn new(writer: Writer, actor: impl Into<Actor>) -> Self {
+        let actor = actor.into();
         Self {
             writer,
-            actor: Arc::from(actor.as_ref()),
+            token: actor.token().cloned(),
+            actor: actor.name().clone(),
             request_id: None,
             rows: Vec::new(),
             facts: Vec::new(),

@@ -17,6 +17,7 @@ use rcgen::{CertificateParams, KeyPair};
 use rustls::ClientConfig;
 use serde::{Deserialize, Serialize};
 use std::io;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;
@@ -53,6 +54,14 @@ pub enum Error {
         path: PathBuf,
         /// Why.
         source: io::Error,
+    },
+    /// A file with a secret that others may read.
+    #[error("{path} has a secret and is open to others (mode {mode:03o}): enrol the robot again, and type `chmod go= {path}` before the new secret is in it", path = path.display())]
+    Open {
+        /// Which.
+        path: PathBuf,
+        /// Its mode.
+        mode: u32,
     },
     /// The machine's key.
     #[error("using the machine's key: {0}")]
@@ -91,6 +100,22 @@ impl FromStr for Invitation {
         let (secret, pin) = text.trim().rsplit_once('.').ok_or(Error::NoLine)?;
         let secret = Secret::read(Secret::ENROLMENT, secret).ok_or(Error::NoLine)?;
         Ok(Self { secret, pin: pin.parse().map_err(|_| Error::NoLine)? })
+    }
+}
+
+impl Invitation {
+    /// Reads the line from a file of its owner's alone.
+    ///
+    /// # Errors
+    /// The file, that others may read it, or that it holds no such line.
+    pub fn read(path: &Path) -> Result<Self, Error> {
+        let file = |source| Error::File { path: path.to_owned(), source };
+        let text = std::fs::read_to_string(path).map_err(file)?;
+        let mode = path.metadata().map_err(file)?.permissions().mode() & 0o777;
+        if mode & 0o077 != 0 {
+            return Err(Error::Open { path: path.to_owned(), mode });
+        }
+        text.parse()
     }
 }
 
@@ -299,5 +324,32 @@ impl Identity {
         self.config.send_replace(config);
         tracing::info!(robot_id = %self.enrolled.robot_id, "the certificate was renewed");
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_secret_in_a_file_is_taken_if_its_owner_alone_may_read_it_and_is_never_shown() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let path = dir.path().join("enroll");
+        let digits = "5a".repeat(32);
+        std::fs::write(&path, format!("mse.k3f9.{digits}.{digits}\n")).expect("written");
+        let close = |mode| std::fs::set_permissions(&path, std::fs::Permissions::from_mode(mode)).expect("a mode");
+        close(0o600);
+        let read = Invitation::read(&path).expect("its owner's alone");
+        assert_eq!((read.secret.id().as_str(), read.pin.to_string()), ("k3f9", digits.clone()));
+        for mode in [0o640, 0o604, 0o660] {
+            close(mode);
+            let refused = Invitation::read(&path).expect_err("others may read it").to_string();
+            assert!(refused.contains(&format!("(mode {mode:03o})")) && refused.contains("chmod go= "), "{refused}");
+            assert!(!refused.contains(&digits), "{refused}");
+        }
+        close(0o600);
+        std::fs::write(&path, "something else").expect("written");
+        assert!(matches!(Invitation::read(&path), Err(Error::NoLine)));
+        assert!(matches!(Invitation::read(&dir.path().join("none")), Err(Error::File { .. })));
     }
 }

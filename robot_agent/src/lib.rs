@@ -21,6 +21,7 @@ pub mod memory;
 mod offer;
 pub mod places;
 pub mod pulse;
+mod repeats;
 pub mod replay;
 pub mod ring;
 pub mod session;

@@ -10,6 +10,7 @@ use crate::bulk::Bulk;
 use crate::core::{AgentCore, CoreConfig, ExitReason, Input, Output};
 use crate::device::DeviceKey;
 use crate::dial::{Dial, SmallCodec};
+use crate::repeats::Repeats;
 use crate::replay::Replayed;
 use crate::sets::Holdings;
 use crate::stop::keep::unreadable;
@@ -21,6 +22,7 @@ use crate::update::{Done, Job, UpdateConfig};
 use backon::{BackoffBuilder, ExponentialBackoff, ExponentialBuilder};
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
+use midshift_core::reason::Code;
 use midshift_core::robot::{Lane, ReportedState};
 use midshift_core::time::{Clock, LinkDuration, LinkTime, Now};
 use midshift_proto::convert::parse;
@@ -130,6 +132,8 @@ enum Greeted {
     Failed(String),
     /// The server said no, and perhaps when to ask again.
     Refused(String, Option<Duration>),
+    /// The key of this machine lets nobody in any more.
+    Revoked(String),
 }
 
 /// What ended a wait.
@@ -157,7 +161,7 @@ pub struct Agent {
     way: Way,
     retry: ExponentialBackoff,
     /// Why there is no session, as the log was told.
-    refused: String,
+    refused: Repeats,
     rng: rand::rngs::StdRng,
     store: Option<Box<dyn Store>>,
     batch: u64,
@@ -204,7 +208,7 @@ pub async fn run(
     }
     let agent = Agent {
         retry: retries(config.seed),
-        refused: String::new(),
+        refused: Repeats::default(),
         rng: rand::rngs::StdRng::seed_from_u64(config.seed),
         core,
         clock,
@@ -410,15 +414,14 @@ impl Agent {
     }
 
     fn failed(&mut self, why: &str) {
-        self.tell_once(why);
+        self.tell(why);
         self.wait_to_dial(None);
     }
 
-    /// Once for each reason: it is tried again for as long as it takes.
-    fn tell_once(&mut self, why: &str) {
-        if self.refused != why {
-            tracing::warn!(robot_id = %self.config.robot_id, why, "no session");
-            why.clone_into(&mut self.refused);
+    /// It is tried again for as long as it takes, and told about once a minute.
+    fn tell(&mut self, why: &str) {
+        if let Some(times) = self.refused.count(why) {
+            tracing::warn!(robot_id = %self.config.robot_id, why, times, "no session");
         }
     }
 
@@ -476,7 +479,7 @@ impl Agent {
                 let (open, welcome) = *welcome;
                 tracing::info!(robot_id = %self.config.robot_id, session_epoch = welcome.session_epoch, "session open");
                 self.leave_session();
-                self.refused.clear();
+                self.refused.forget();
                 self.open = Some(open);
                 self.retry = retries(self.rng.random());
                 self.step(Input::Connected(welcome));
@@ -484,11 +487,21 @@ impl Agent {
             Greeted::Closed(close) => self.closed(&close),
             Greeted::Failed(why) => self.greeting_failed(&why, None),
             Greeted::Refused(why, again_after) => self.greeting_failed(&why, again_after),
+            Greeted::Revoked(why) => self.revoked(&why),
         }
     }
 
+    /// Only a person can change that, and this program will hear of it with another key: there is no hurry.
+    fn revoked(&mut self, why: &str) {
+        if let Some(times) = self.refused.count(why) {
+            tracing::error!(robot_id = %self.config.robot_id, why, times, "this robot was revoked");
+        }
+        let pause = Duration::from_millis(limits::REVOKED_RETRY.as_ms()) + self.soon();
+        self.wait_to_dial(Some(pause));
+    }
+
     fn greeting_failed(&mut self, why: &str, again_after: Option<Duration>) {
-        self.tell_once(why);
+        self.tell(why);
         // As the server asks, and apart from others that it asked the same; a server cannot send it away for long.
         let asked = again_after.map(|after| after.min(RETRY.end) + self.soon());
         let own = self.retry.next().unwrap_or(RETRY.end);
@@ -542,8 +555,13 @@ impl Agent {
 async fn greet(channel: Channel, hello: v1::SessionRequest, clock: Arc<dyn Clock>) -> Greeted {
     let (up, queue) = mpsc::channel(OUTBOUND);
     let failed = |what: &str, detail: &dyn std::fmt::Display| Greeted::Failed(format!("{what}: {detail}"));
-    let refused =
-        |what: &str, status: &Status| Greeted::Refused(format!("{what}: {status}"), refusal_of(status).retry_after);
+    let refused = |what: &str, status: &Status| {
+        let answer = refusal_of(status);
+        match answer.code {
+            Some(Code::KeyDenied) => Greeted::Revoked(status.message().to_owned()),
+            _ => Greeted::Refused(format!("{what}: {status}"), answer.retry_after),
+        }
+    };
     if up.try_send(hello).is_err() {
         return Greeted::Failed("the way up is closed".to_owned());
     }

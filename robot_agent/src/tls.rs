@@ -45,6 +45,15 @@ pub enum Error {
     /// The server was not reached, or is none of this site.
     #[error("the server did not prove that it is of the site: {0}")]
     NotShown(#[source] io::Error),
+    /// The server is of another site than the digest.
+    #[error(
+        "the server at {address} is of another site than the secret or digest that was given: its root has another key. \
+         Look at the address, or take the whole line anew from `midshift robot enroll` where you are signed in to that site"
+    )]
+    OtherRoot {
+        /// The server.
+        address: String,
+    },
 }
 
 /// The newest way to speak TLS; clones are the same.
@@ -134,8 +143,18 @@ pub async fn authority_of(address: &str, pin: Digest) -> Result<String, Error> {
         root.ok_or_else(|| io::Error::other("the root is gone"))
     };
     let late = |_| Error::NotShown(io::ErrorKind::TimedOut.into());
-    let root = timeout(SHOWN_WITHIN, shown).await.map_err(late)?.map_err(Error::NotShown)?;
+    let not_shown = |error: io::Error| match is_other_root(&error) {
+        true => Error::OtherRoot { address: address.to_owned() },
+        false => Error::NotShown(error),
+    };
+    let root = timeout(SHOWN_WITHIN, shown).await.map_err(late)?.map_err(not_shown)?;
     Ok(pem("CERTIFICATE", &root))
+}
+
+/// Whether a handshake failed since the server's root has another key than the pinned one.
+fn is_other_root(error: &io::Error) -> bool {
+    let inner = error.get_ref().and_then(|inner| inner.downcast_ref::<rustls::Error>());
+    matches!(inner, Some(rustls::Error::InvalidCertificate(CertificateError::UnknownIssuer)))
 }
 
 fn pem(label: &str, der: &[u8]) -> String {
@@ -206,5 +225,52 @@ impl ServerCertVerifier for Pinned {
     }
     fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
         self.provider.signature_verification_algorithms.supported_schemes()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
+    use tokio::net::TcpListener;
+    use tokio_rustls::TlsAcceptor;
+
+    #[tokio::test]
+    async fn a_server_of_another_site_than_the_secret_is_told_as_such_and_not_as_a_matter_of_issuers() {
+        let mut params = CertificateParams::new(Vec::new()).expect("parameters");
+        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        let root = CertifiedIssuer::self_signed(params, KeyPair::generate().expect("a key")).expect("a root");
+        let key = KeyPair::generate().expect("a key");
+        let leaf = CertificateParams::new(vec![SERVER_NAME.to_owned()]).expect("parameters");
+        let leaf = leaf.signed_by(&key, &root).expect("a certificate").der().clone();
+        let config = rustls::ServerConfig::builder_with_provider(Arc::new(aws_lc_rs::default_provider()))
+            .with_protocol_versions(&[&TLS13])
+            .expect("TLS 1.3")
+            .with_no_client_auth()
+            .with_single_cert(
+                vec![leaf, root.der().clone()],
+                PrivateKeyDer::try_from(key.serialize_der()).expect("a key"),
+            );
+        let mut config = config.expect("a server's TLS");
+        config.alpn_protocols = vec![b"h2".to_vec()];
+        let (acceptor, listener) = (TlsAcceptor::from(Arc::new(config)), TcpListener::bind("127.0.0.1:0").await);
+        let listener = listener.expect("a port");
+        let address = listener.local_addr().expect("an address").to_string();
+        let serve = async {
+            loop {
+                let (stream, _) = listener.accept().await.expect("a connection");
+                drop(acceptor.accept(stream).await);
+            }
+        };
+        let own = digest_of(root.der()).expect("a key");
+        let asked = async { (authority_of(&address, own).await, authority_of(&address, Digest([7; 32])).await) };
+        let (right, wrong) = tokio::select! {
+            () = serve => unreachable!("it goes on"),
+            asked = asked => asked,
+        };
+        assert_eq!(pin_of(&right.expect("its own site")).expect("a root"), own);
+        let wrong = wrong.expect_err("another site");
+        assert!(matches!(&wrong, Error::OtherRoot { address: told } if *told == address), "{wrong:?}");
+        assert!(wrong.to_string().contains("another site") && !wrong.to_string().contains("UnknownIssuer"), "{wrong}");
     }
 }

@@ -201,7 +201,7 @@ async fn agent(
         now.wall.0.unsigned_abs()
     })?;
     let run = AgentRun {
-        enroll: None,
+        enroll_file: None,
         robot_id: robot,
         server,
         data: home.join("data"),

@@ -1,6 +1,7 @@
 """Who a machine is at its site: the chapter "Who it is" of docs/robot-protocol.md as a program, for minimal_robot.py."""
 
 import argparse
+import os
 import sys
 import time
 
@@ -20,9 +21,10 @@ class Identity:
     def __init__(self, args: argparse.Namespace, memory) -> None:
         self.server, self.robot_id, self.memory = args.server, args.robot_id, memory
         if args.ca and not memory["identity"]:
-            if not args.enroll:
-                sys.exit(f"not enrolled: run `midshift robot enroll {args.robot_id}` and give its line with --enroll")
-            self._enrol(args.ca.read_bytes(), args.enroll)
+            line = os.environ.get("MIDSHIFT_ENROLL")
+            if not line:
+                sys.exit(f"not enrolled: run `midshift robot enroll {args.robot_id}` and give its secret with MIDSHIFT_ENROLL")
+            self._enrol(args.ca.read_bytes(), line)
 
     def channel(self) -> grpc.Channel:
         """A new connection, on which this machine shows who it is; in plain text where the site has no login."""
@@ -50,7 +52,7 @@ class Identity:
         digest = hashes.Hash(hashes.SHA256())
         digest.update(x509.load_pem_x509_certificate(authority_pem).public_key().public_bytes(*spki))
         if digest.finalize().hex() != pin:
-            sys.exit("the file of --ca is not the root of the site that the line of --enroll came from")
+            sys.exit("the file of --ca is not the root of the site that the secret of MIDSHIFT_ENROLL came from")
         key = ec.generate_private_key(ec.SECP256R1())
         pem = (serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
         asked = enrolment.EnrolRequest(robot_id=self.robot_id, secret=secret, request_pem=self._request(key))

@@ -2,9 +2,9 @@
 
     python minimal_robot.py --server 127.0.0.1:7420 --robot-id rbt-py --data robot.json --journal effects.txt --at park-a 0 3000
 
-Against a server with TLS it also needs the site's root and, once, the line that `midshift robot enroll rbt-py` prints:
+Against a server with TLS it also needs the site's root and, once, the secret that `midshift robot enroll rbt-py` prints:
 
-    python minimal_robot.py ... --ca midshift-data/identity/ca.pem --enroll mse.ID.SECRET.DIGEST
+    MIDSHIFT_ENROLL=mse.ID.SECRET.DIGEST python minimal_robot.py ... --ca midshift-data/identity/ca.pem
 
 It needs the generated stubs, `cryptography` for its key (minimal_identity.py), and nothing else of midshift: one thread reads the session, everything
 else happens in `Robot.tick`.
@@ -747,7 +747,6 @@ def main() -> None:
     parser.add_argument("--server", required=True)
     parser.add_argument("--robot-id", required=True)
     parser.add_argument("--ca", type=pathlib.Path, help="the site's root, PEM; without it everything is plain text")
-    parser.add_argument("--enroll", help="what `midshift robot enroll` printed, needed once")
     parser.add_argument("--data", required=True, type=pathlib.Path)
     parser.add_argument("--journal", required=True, type=pathlib.Path)
     parser.add_argument("--at", required=True, nargs=3, metavar=("WAYPOINT", "X_MM", "Y_MM"))

@@ -7,6 +7,7 @@ mod verify;
 
 pub use verify::{Broken, Chain, Ends, Export, Held, Mark, Verified};
 
+use crate::identity::{Actor, TokenId};
 use crate::reason::{self, Code, Refusal};
 use crate::rows::{Index, Item, Key, Record, Revision, Row, Table, Writer};
 use serde::{Deserialize, Serialize};
@@ -167,6 +168,8 @@ impl Note {
 pub struct By {
     /// Who.
     pub actor: Arc<str>,
+    /// The token that was shown; none: none was.
+    pub token: Option<TokenId>,
     /// The request behind it.
     pub request_id: Option<Arc<str>>,
     /// UTC of the wall when committed, unix ms.
@@ -175,7 +178,13 @@ pub struct By {
 
 /// An item that says alone that something was refused as things are. None: what is wrong in form, or is about nothing that there is, is no
 /// decision.
-pub fn refusal(writer: Writer, actor: &str, request_id: Option<&str>, note: Note, why: &Refusal) -> Option<Item> {
+pub fn refusal(
+    writer: Writer,
+    actor: impl Into<Actor>,
+    request_id: Option<&str>,
+    note: Note,
+    why: &Refusal,
+) -> Option<Item> {
     let is_decision = matches!(why.kind(), reason::Kind::Precondition | reason::Kind::Conflict | reason::Kind::Denied);
     let mut item = Item::new(writer, actor);
     item.request_id = request_id.map(Into::into);
@@ -203,7 +212,8 @@ impl Draft {
             && theirs.crowd == Crowd::Shared
             && (note.action, note.refused, &note.reason) == (theirs.action, theirs.refused, &theirs.reason)
             && note.with.keys().eq(theirs.with.keys())
-            && (&self.by.actor, self.by.at_unix_ms) == (&other.by.actor, other.by.at_unix_ms)
+            && (&self.by.actor, &self.by.token, self.by.at_unix_ms)
+                == (&other.by.actor, &other.by.token, other.by.at_unix_ms)
             && self.by.request_id.is_some() == other.by.request_id.is_some()
             && note.about.len() + theirs.about.len() <= CROWD_MAX;
         if !alike {
@@ -232,6 +242,9 @@ pub struct AuditRow {
     pub at_unix_ms: i64,
     /// Who.
     pub actor: String,
+    /// Which token was shown; empty: none was, or an older release wrote the row.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub token_id: String,
     /// Dotted word.
     pub action: String,
     /// What it is about, as `robot:r7`.
@@ -328,6 +341,7 @@ pub fn append(heads: &mut BTreeMap<Writer, Head>, writer: Writer, note: &Note, b
         n: before.n + 1,
         at_unix_ms: by.at_unix_ms,
         actor: by.actor.to_string(),
+        token_id: by.token.as_ref().map(ToString::to_string).unwrap_or_default(),
         action: note.action.to_owned(),
         about: note.about.clone(),
         with: note.with.iter().map(|(name, value)| ((*name).to_owned(), value.clone())).collect(),

@@ -4,7 +4,7 @@ use crate::time::Utc;
 use proptest::prelude::*;
 
 fn by(actor: &str, at_unix_ms: i64) -> By {
-    By { actor: actor.into(), request_id: Some("req-1".into()), at_unix_ms }
+    By { actor: actor.into(), token: None, request_id: Some("req-1".into()), at_unix_ms }
 }
 
 /// Rows of a chain of fleet, behind whatever is in `heads`.

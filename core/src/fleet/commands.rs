@@ -7,6 +7,7 @@ use super::rows::{Cordon, HolderState, LoadSettled, Place, PlaceHolder, RobotCon
 use super::view::View;
 use super::{Board, drain, heard, incidents, load};
 use crate::audit::{self, Note};
+use crate::identity::Caller;
 use crate::ids::{AttemptId, RobotId};
 use crate::limits;
 use crate::reason::{Code, Kind, Reason, Refusal, Violations};
@@ -150,8 +151,8 @@ pub fn note(view: &View, command: &Command) -> Note {
 }
 
 /// What a command that was refused leaves in the audit, if anything.
-pub fn refusal(view: &View, command: &Command, actor: &str, request_id: Option<&str>, why: &Refusal) -> Option<Item> {
-    audit::refusal(Writer::Fleet, actor, request_id, note(view, command), why)
+pub fn refusal(view: &View, command: &Command, by: &Caller, request_id: Option<&str>, why: &Refusal) -> Option<Item> {
+    audit::refusal(Writer::Fleet, by, request_id, note(view, command), why)
 }
 
 /// Carries out a command that passed its check.

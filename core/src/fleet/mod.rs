@@ -49,6 +49,7 @@ pub mod way;
 #[cfg(test)]
 mod tests;
 
+use crate::identity::Actor;
 use crate::ids::RobotId;
 use crate::lead::Rivals;
 use crate::reason::{Code, Reason};
@@ -121,7 +122,13 @@ impl Plan {
         Self { slice, ..Self::default() }
     }
     /// Makes one decision; nothing is added if it changed nothing. False: it was given up, since the store would never take it.
-    pub fn decide(&mut self, view: &mut View, now: Now, actor: &str, decision: impl FnOnce(&mut Tx)) -> bool {
+    pub fn decide(
+        &mut self,
+        view: &mut View,
+        now: Now,
+        actor: impl Into<Actor>,
+        decision: impl FnOnce(&mut Tx),
+    ) -> bool {
         let mut tx = Tx::new(view, now, actor);
         decision(&mut tx);
         self.keep_decision(tx)

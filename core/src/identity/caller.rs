@@ -33,20 +33,24 @@ pub struct Caller {
     /// Its token's time is over, for less than [`crate::limits::TOKEN_STOPS_AFTER_EXPIRY`]: it may engage stops and nothing else.
     expired: bool,
     certificate: Option<Arc<str>>,
+    person: Option<Arc<str>>,
 }
 
 impl Caller {
     /// Somebody who showed nothing.
     pub fn nobody() -> Self {
-        Self { who: Who::Nobody, grants: Arc::default(), expired: false, certificate: None }
+        Self::without_grants(Who::Nobody)
     }
     /// Whoever may do everything.
     pub fn local() -> Self {
-        Self { who: Who::Local, grants: Arc::default(), expired: false, certificate: None }
+        Self::without_grants(Who::Local)
     }
     /// A robot.
     pub fn robot(robot_id: RobotId) -> Self {
-        Self { who: Who::Robot(robot_id), grants: Arc::default(), expired: false, certificate: None }
+        Self::without_grants(Who::Robot(robot_id))
+    }
+    fn without_grants(who: Who) -> Self {
+        Self { who, grants: Arc::default(), expired: false, certificate: None, person: None }
     }
     /// The same with the serial number of the certificate that it showed, in hex.
     #[must_use]
@@ -55,7 +59,20 @@ impl Caller {
     }
     /// The holder of a token; of one that is `expired`, it may still engage stops.
     pub fn holder(token: TokenId, name: Arc<str>, grants: Arc<[Grant]>, expired: bool) -> Self {
-        Self { who: Who::Holder { token, name }, grants, expired, certificate: None }
+        Self { grants, expired, ..Self::without_grants(Who::Holder { token, name }) }
+    }
+    /// The same as one person's, who may have several tokens. None: its name stands for itself.
+    #[must_use]
+    pub fn with_person(self, person: Option<Arc<str>>) -> Self {
+        Self { person, ..self }
+    }
+    /// The person that its token was made for; none: none was named.
+    pub const fn named_person(&self) -> Option<&Arc<str>> {
+        self.person.as_ref()
+    }
+    /// Who stands behind it: what two of them are compared by where a second person is asked for.
+    pub fn person(&self) -> String {
+        self.person.as_ref().map_or_else(|| self.to_string(), ToString::to_string)
     }
     /// Who it is.
     pub const fn who(&self) -> &Who {

@@ -17,12 +17,15 @@ use std::sync::Arc;
 /// So long after its end a token still engages stops, milliseconds.
 const STOPS_FOR_MS: i64 = limits::TOKEN_STOPS_AFTER_EXPIRY.as_ms().cast_signed();
 
-/// One token, as a port knows it.
+/// One token, as a port knows it. A field of a newer version is passed over: the stop service may be older than the
+/// writer of its snapshot.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct DirectoryToken {
     /// Who it stands for.
     pub name: Arc<str>,
+    /// The person who has it; none: none was named.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub person: Option<Arc<str>>,
     /// Digest of its secret.
     pub digest: Digest,
     /// Its rights.
@@ -33,7 +36,6 @@ pub struct DirectoryToken {
 
 /// Tokens that were not revoked, and keys that were.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Directory {
     /// By id. Those of which even the time to stop is over are left out.
     pub tokens: BTreeMap<TokenId, DirectoryToken>,
@@ -50,11 +52,13 @@ impl Directory {
         now: Utc,
     ) -> Self {
         let stops_until = |expires: i64| expires.saturating_add_unsigned(limits::TOKEN_STOPS_AFTER_EXPIRY.as_ms());
-        let live = tokens.into_iter().filter(|t| t.revoked.is_none() && stops_until(t.expires_unix_ms) > now.0);
+        let live = tokens.into_iter().filter(|t| !t.is_revoked(now) && stops_until(t.expires_unix_ms) > now.0);
         let tokens = live.map(|t| {
-            let grants = t.grants.iter().cloned().collect();
-            let name = t.name.as_str().into();
-            (t.token_id.clone(), DirectoryToken { name, digest: t.digest, grants, expires_unix_ms: t.expires_unix_ms })
+            let (grants, name, person) = (t.grants.iter().cloned().collect(), t.name.as_str().into(), t.person.clone());
+            // One that was rotated ends by itself at every port, also where nobody hears that it went.
+            let ends = t.revoked.as_ref().map_or(i64::MAX, |act| act.at_unix_ms);
+            let expires_unix_ms = t.expires_unix_ms.min(ends);
+            (t.token_id.clone(), DirectoryToken { name, person, digest: t.digest, grants, expires_unix_ms })
         });
         let denied = robots.into_iter().flat_map(|robot| &robot.denied).filter(|deny| deny.until_unix_ms > now.0);
         Self {
@@ -79,7 +83,8 @@ impl Directory {
         if late_ms >= STOPS_FOR_MS {
             return Err(Refusal::new(Kind::Unauthenticated, Code::TokenExpired));
         }
-        Ok(Caller::holder(token.clone(), known.name.clone(), known.grants.clone(), late_ms >= 0))
+        let caller = Caller::holder(token.clone(), known.name.clone(), known.grants.clone(), late_ms >= 0);
+        Ok(caller.with_person(known.person.clone()))
     }
 
     /// Whether what was begun with this token may go on: it was not taken back, and its time is not over, or no longer than a stop needs if it was over when that began.
@@ -105,7 +110,8 @@ mod tests {
     fn directory() -> (TokenId, Directory) {
         let id = TokenId::new("t1").expect("an id");
         let grants = Arc::from(["operator".parse().expect("a grant")]);
-        let token = DirectoryToken { name: "anna".into(), digest: Digest([7; 32]), grants, expires_unix_ms: DAY_MS };
+        let (name, digest, person) = ("anna".into(), Digest([7; 32]), None);
+        let token = DirectoryToken { name, person, digest, grants, expires_unix_ms: DAY_MS };
         (id.clone(), Directory { tokens: [(id, token)].into(), denied: BTreeMap::new() })
     }
 
@@ -141,12 +147,14 @@ mod tests {
         let record = |id: &str, revoked| TokenRecord {
             token_id: TokenId::new(id).expect("an id"),
             name: "anna".to_owned(),
+            person: None,
             digest: Digest([7; 32]),
             grants: vec!["viewer".parse().expect("a grant")],
             created_unix_ms: 0,
             created_by: "bert".to_owned(),
             expires_unix_ms: DAY_MS,
             revoked,
+            rotation: None,
         };
         let tokens = [record("t1", None), record("t2", Some(crate::identity::Act::new("bert", 5)))];
         let denied = vec![
@@ -159,5 +167,37 @@ mod tests {
         assert!(directory.denies(&Digest([2; 32])) && !directory.denies(&Digest([1; 32])));
         let text = serde_json::to_string(&directory).expect("text");
         assert_eq!(serde_json::from_str::<Directory>(&text).expect("a directory"), directory);
+    }
+
+    #[test]
+    fn a_token_that_was_rotated_is_good_until_its_moment_and_then_at_most_stops_where_nobody_hears_that_it_went() {
+        let (id, directory) = directory();
+        let record = TokenRecord {
+            token_id: id.clone(),
+            name: "anna".to_owned(),
+            person: Some("anna".into()),
+            digest: Digest([7; 32]),
+            grants: directory.tokens[&id].grants.to_vec(),
+            created_unix_ms: 0,
+            created_by: "bert".to_owned(),
+            expires_unix_ms: DAY_MS,
+            revoked: Some(crate::identity::Act::new("bert", 1_000)),
+            rotation: None,
+        };
+        assert!(record.stands(Utc(999)) && !record.stands(Utc(1_000)));
+        let told = Directory::of([&record], [], Utc(0));
+        let at = |ms: i64| told.holder(&id, &Digest([7; 32]), Utc(ms)).expect("known").is_expired();
+        assert!(!at(999) && at(1_000));
+        assert_eq!(told.holder(&id, &Digest([7; 32]), Utc(0)).expect("known").person(), "anna");
+        assert!(Directory::of([&record], [], Utc(1_000)).tokens.is_empty(), "whoever hears it knows it no more");
+    }
+
+    #[test]
+    fn what_a_newer_version_says_of_a_token_is_passed_over() {
+        let (id, directory) = directory();
+        let mut text = serde_json::to_value(&directory).expect("JSON");
+        text["tokens"][id.as_str()]["more"] = "new".into();
+        text["more"] = "new".into();
+        assert_eq!(serde_json::from_value::<Directory>(text).expect("a directory"), directory);
     }
 }

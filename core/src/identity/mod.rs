@@ -3,6 +3,7 @@
 //! Invariant: rights are never merged. A right holds where the one grant that gives it says, and a caller without a grant may do nothing.
 //! Secrets are never here, only their digests. Called by the edge of every port, by identity, and by services for each object.
 
+mod actor;
 mod caller;
 mod directory;
 mod enrolment;
@@ -11,10 +12,11 @@ mod rows;
 mod session;
 mod token;
 
+pub use actor::Actor;
 pub use caller::{Caller, Who};
 pub use directory::{Directory, DirectoryToken};
 pub use enrolment::{Deny, EnrolmentState, Replace, RobotIdentity};
 pub use grant::{Access, Grant, Object, Permission, Role, Scope};
-pub use rows::{Act, Authority, ServerCertificate, TokenRecord};
+pub use rows::{Act, Authority, Rotation, ServerCertificate, TokenName, TokenRecord};
 pub use session::SessionSecret;
 pub use token::{Digest, Secret, TokenId};

@@ -3,7 +3,9 @@
 use super::grant::Grant;
 use super::token::{Digest, TokenId};
 use crate::rows::{Index, Record, Table};
+use crate::time::Utc;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// Who did something, and when.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -26,8 +28,12 @@ impl Act {
 pub struct TokenRecord {
     /// Which.
     pub token_id: TokenId,
-    /// Who it stands for, as an actor; one person may have several.
+    /// Who it stands for, as an actor. Of those that stand no two have one name, but for one that was rotated and its
+    /// successor, and those of an old store.
     pub name: String,
+    /// The person who has it, who may have several; none: the name stands for itself.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub person: Option<Arc<str>>,
     /// Of its secret.
     pub digest: Digest,
     /// Its rights.
@@ -38,8 +44,51 @@ pub struct TokenRecord {
     pub created_by: String,
     /// UTC, unix ms. There is no token without.
     pub expires_unix_ms: i64,
-    /// Who took it back; none: it is good until it expires.
+    /// Who took it back, and from when on; none: it is good until it expires. A moment that is to come: it was rotated,
+    /// and is good until then.
     pub revoked: Option<Act>,
+    /// What made it out of another one of its name; none: it was created.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rotation: Option<Rotation>,
+}
+
+impl TokenRecord {
+    /// Whether it lets its holder in.
+    pub fn stands(&self, now: Utc) -> bool {
+        self.expires_unix_ms > now.0 && !self.is_revoked(now)
+    }
+    /// Whether it was taken back, and the moment of that is here.
+    pub fn is_revoked(&self, now: Utc) -> bool {
+        self.revoked.as_ref().is_some_and(|act| act.at_unix_ms <= now.0)
+    }
+}
+
+/// How a token took the place of another one of its name.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Rotation {
+    /// Of which.
+    pub of: TokenId,
+    /// The request that asked for it; empty: none was named.
+    pub request_id: String,
+    /// What it asked for, so that the same id with something else is told.
+    pub asked: String,
+}
+
+/// The token that has a name: whoever makes another one of that name must find this row as it was read. It goes with
+/// its token; one that only expired leaves it to the next.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TokenName {
+    /// The name.
+    pub name: String,
+    /// The newest token of that name.
+    pub token_id: TokenId,
+}
+
+impl Record for TokenName {
+    const TABLE: Table = Table::TokenName;
+    fn id(&self) -> String {
+        self.name.clone()
+    }
 }
 
 impl Record for TokenRecord {

@@ -14,7 +14,7 @@ use super::view::View;
 use super::{Board, Plan, Tx, assign, moves, objects, phases, robots, verdict};
 use crate::audit::{self, Note};
 use crate::gates::FailureEvidence;
-use crate::identity::Caller;
+use crate::identity::{Actor, Caller};
 use crate::ids::{BundleId, RobotId, RolloutId};
 use crate::limits;
 use crate::once;
@@ -151,7 +151,7 @@ pub enum Taken {
 /// Why not; whoever asks may not; a request_id that was used for something else.
 pub fn take(view: &mut View, board: &Board, now: Now, ask: &Ask, plan: &mut Plan) -> Result<Taken, Refusal> {
     let Ask { command, seen, check_only, request_id, by } = ask;
-    let actor = &by.to_string();
+    let actor = &Actor::from(by);
     // For the audit, also if whoever asks may not. What it may not even see is about nothing that there is, and leaves nothing.
     let mut refused = |refusal: Refusal| {
         if *check_only == CheckOnly::No {
@@ -353,7 +353,7 @@ fn overlapping<'a>(view: &View, rollout: &Rollout, robots: impl Iterator<Item = 
 }
 
 /// Carries out a command that passed its check: one item for most, many for a start.
-pub fn apply(view: &mut View, board: &Board, now: Now, command: &Command, actor: &str, plan: &mut Plan) {
+pub fn apply(view: &mut View, board: &Board, now: Now, command: &Command, actor: &Actor, plan: &mut Plan) {
     match command {
         Command::Do { rollout_id, verb: Verb::Start { supersede }, .. } => {
             start(view, board, now, rollout_id, *supersede, actor, plan);
@@ -368,11 +368,12 @@ pub fn apply(view: &mut View, board: &Board, now: Now, command: &Command, actor:
     }
 }
 
-fn act(tx: &Tx, actor: &str, reason: &str) -> Act {
-    Act { actor: actor.to_owned(), reason: reason.to_owned(), at: tx.now.utc }
+fn act(tx: &Tx, actor: &Actor, reason: &str) -> Act {
+    let person = actor.person().map(ToString::to_string);
+    Act { actor: actor.to_string(), person, reason: reason.to_owned(), at: tx.now.utc }
 }
 
-fn apply_one(tx: &mut Tx, board: &Board, command: &Command, actor: &str) {
+fn apply_one(tx: &mut Tx, board: &Board, command: &Command, actor: &Actor) {
     match command {
         Command::Create { rollout_id, spec } => {
             let row = draft(tx, rollout_id, spec.clone(), actor);
@@ -414,7 +415,7 @@ fn apply_one(tx: &mut Tx, board: &Board, command: &Command, actor: &str) {
     }
 }
 
-fn draft(tx: &Tx, rollout_id: &RolloutId, spec: Arc<RolloutSpec>, actor: &str) -> Rollout {
+fn draft(tx: &Tx, rollout_id: &RolloutId, spec: Arc<RolloutSpec>, actor: &Actor) -> Rollout {
     Rollout {
         rollout_id: rollout_id.clone(),
         spec,
@@ -444,7 +445,7 @@ fn draft(tx: &Tx, rollout_id: &RolloutId, spec: Arc<RolloutSpec>, actor: &str) -
     }
 }
 
-fn verb_one(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor: &str, reason: &str) {
+fn verb_one(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor: &Actor, reason: &str) {
     let Some(mut rollout) = tx.view.rollout(id).cloned() else { return };
     let why = |code: Code| Reason::new(code, reason).with("actor", actor);
     match verb {
@@ -471,9 +472,9 @@ fn verb_one(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor: &str
             let seen = verdict::see_wave(tx.view, board, &tx.now, &rollout);
             let verdict =
                 verdict::of(&rollout, &seen, Outcome::PromotedByPerson, why(Code::PromotedByUser), tx.now.utc);
-            phases::promote(tx, rollout, Verdict { actor: Some(actor.to_owned()), ..verdict });
+            phases::promote(tx, rollout, Verdict { actor: Some(actor.to_string()), ..verdict });
         }
-        Verb::Abort => phases::abort(tx, rollout, why(Code::AbortedByUser), false, None, Some(actor.to_owned())),
+        Verb::Abort => phases::abort(tx, rollout, why(Code::AbortedByUser), false, None, Some(actor.to_string())),
         Verb::Exclude(robot_id) => {
             let row = RolloutRobot::id_of(id, robot_id);
             moves::make(tx, &super::NoSign, board, &row, robots::Move::Skip(why(Code::SkippedExcluded)));
@@ -482,7 +483,7 @@ fn verb_one(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor: &str
     }
 }
 
-fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bool, actor: &str, plan: &mut Plan) {
+fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bool, actor: &Actor, plan: &mut Plan) {
     let Some(rollout) = view.rollout(id).cloned() else { return };
     let Ok((robots, sizes)) = members(view, board, &rollout) else { return };
     let others = overlapping(view, &rollout, robots.iter().map(|(id, ..)| id));
@@ -499,7 +500,7 @@ fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bo
                 if old.phase.goes_back() {
                     tx.put(old, "rollout.superseded");
                 } else {
-                    phases::abort(tx, old, reason, false, None, Some(actor.to_owned()));
+                    phases::abort(tx, old, reason, false, None, Some(actor.to_string()));
                 }
             });
         }
@@ -528,7 +529,7 @@ fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bo
     }
 }
 
-fn retry_failed(view: &mut View, now: Now, id: &RolloutId, actor: &str, reason: &str, plan: &mut Plan) {
+fn retry_failed(view: &mut View, now: Now, id: &RolloutId, actor: &Actor, reason: &str, plan: &mut Plan) {
     let Some(rollout) = view.rollout(id).cloned() else { return };
     let wave = rollout.spec.waves.len() as u32 + 1;
     let robots: Vec<RolloutRobot> = view.robots_of(id).filter(|r| is_to_retry(r)).cloned().collect();

@@ -34,6 +34,7 @@ pub mod view;
 mod tests;
 
 pub use crate::fleet::Board;
+use crate::identity::Actor;
 use crate::ids::{BundleId, RobotId, RolloutId};
 use crate::lead::Rivals;
 use crate::reason::{Code, Reason};
@@ -93,7 +94,7 @@ pub struct Plan {
 
 impl Plan {
     /// Makes one decision; nothing is added if it changed nothing, or if it touches a row of a newer version.
-    pub fn decide(&mut self, view: &mut View, now: Now, actor: &str, decision: impl FnOnce(&mut Tx)) {
+    pub fn decide(&mut self, view: &mut View, now: Now, actor: impl Into<Actor>, decision: impl FnOnce(&mut Tx)) {
         let mut tx = Tx::new(view, now, actor);
         decision(&mut tx);
         if tx.unknown_row().is_some() {

@@ -1,6 +1,6 @@
 //! Whether somebody may do what is asked about a roll-out, or about the software of a robot.
 //!
-//! Invariant: nobody approves what it wrote itself; what a caller may not see is for it as if it were not there, and what is not there is refused by nobody here.
+//! Invariant: no person approves what it wrote itself, by whatever token; what a caller may not see is for it as if it were not there, and what is not there is refused by nobody here.
 
 use super::Board;
 use super::commands::{Command, Verb, superseded};
@@ -91,7 +91,7 @@ fn of_robot(view: &View, board: &Board, by: &Caller, robot_id: &RobotId, code: C
 /// Where nobody signs in there is nobody else.
 fn another(view: &View, by: &Caller, rollout_id: &RolloutId) -> Result<(), Refusal> {
     let Some(rollout) = view.rollout(rollout_id) else { return Ok(()) };
-    if matches!(by.who(), Who::Local) || rollout.created.actor != by.to_string() {
+    if matches!(by.who(), Who::Local) || rollout.created.person() != by.person() {
         return Ok(());
     }
     Err(Refusal::new(Kind::Denied, Reason::from(Code::NotYourOwn).with("rollout_id", rollout_id)))

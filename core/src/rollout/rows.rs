@@ -29,10 +29,20 @@ impl Record for DesiredUpdate {
 pub struct Act {
     /// Who.
     pub actor: String,
+    /// The person whose token it was; none: none was named, and the actor stands for itself.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub person: Option<String>,
     /// Why; may be empty.
     pub reason: String,
     /// UTC, site clock.
     pub at: Utc,
+}
+
+impl Act {
+    /// Who stands behind it.
+    pub fn person(&self) -> &str {
+        self.person.as_deref().unwrap_or(&self.actor)
+    }
 }
 
 /// A bundle of a published release.

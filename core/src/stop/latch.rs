@@ -6,6 +6,7 @@
 
 use super::region::Region;
 use super::scope::Scope;
+use crate::identity::TokenId;
 use crate::ids::{RobotId, StopId};
 use crate::limits;
 use crate::robot::{Pose, StopLevel};
@@ -33,6 +34,9 @@ pub struct Stop {
     /// The stop service's own mark on it, so that it knows a stop of its own again that a robot brings back. Robots keep it and do not read it.
     #[serde(default)]
     pub proof: Vec<u8>,
+    /// The token that was shown for it, which stands in the audit; none: none was, or it came over the wire.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub token_id: Option<TokenId>,
 }
 
 impl Stop {
@@ -61,6 +65,7 @@ impl Stop {
             actor: self.actor.max(other.actor),
             reason: self.reason.max(other.reason),
             proof: self.proof.max(other.proof),
+            token_id: self.token_id.max(other.token_id),
             stop_id: self.stop_id,
         }
     }
@@ -80,6 +85,9 @@ pub struct Reset {
     /// The stop service's own mark on it, by which a robot believes it when it comes by another way than from the service itself. Empty: it counts there alone.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub proof: Vec<u8>,
+    /// The token that was shown for it, which stands in the audit; none: none was, or it came over the wire.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub token_id: Option<TokenId>,
 }
 
 /// Named stops minus named resets.
@@ -214,6 +222,7 @@ mod tests {
             reason: "drill".to_owned(),
             region: None,
             proof: Vec::new(),
+            token_id: None,
         }
     }
 
@@ -224,6 +233,7 @@ mod tests {
             actor: "bert".to_owned(),
             reason: "over".to_owned(),
             proof: Vec::new(),
+            token_id: None,
         }
     }
 

@@ -3,6 +3,7 @@
 use super::latch::{Latch, Reset, Stop};
 use super::scope::Scope;
 use crate::audit::Note;
+use crate::identity::Actor;
 use crate::ids::StopId;
 use crate::rows::{Expect, Index, Item, Record, Revision, Table, Writer};
 use serde::{Deserialize, Serialize};
@@ -24,6 +25,16 @@ impl StopRecord {
     }
 }
 
+impl StopRecord {
+    /// Takes over the tokens that a copy knows: a stop or reset that came back from a robot has none, and is the same.
+    fn keep_tokens_of(&mut self, known: &Self) {
+        self.stop.token_id = self.stop.token_id.take().or_else(|| known.stop.token_id.clone());
+        if let (Some(reset), Some(known)) = (&mut self.reset, &known.reset) {
+            reset.token_id = reset.token_id.take().or_else(|| known.token_id.clone());
+        }
+    }
+}
+
 impl Record for StopRecord {
     const TABLE: Table = Table::StopRecord;
     fn id(&self) -> String {
@@ -39,7 +50,10 @@ impl Record for StopRecord {
 pub fn copy(latch: &Latch, copied: &BTreeMap<StopId, (StopRecord, Revision)>) -> Vec<Item> {
     let mut items = Vec::new();
     for stop in latch.stops() {
-        let record = StopRecord { stop: stop.clone(), reset: latch.reset_of(&stop.stop_id).cloned() };
+        let mut record = StopRecord { stop: stop.clone(), reset: latch.reset_of(&stop.stop_id).cloned() };
+        if let Some((known, _)) = copied.get(&stop.stop_id) {
+            record.keep_tokens_of(known);
+        }
         match copied.get(&stop.stop_id) {
             // Engaged by one and reset by another in between: each leaves its own row in the audit.
             None => {
@@ -72,12 +86,14 @@ fn write(record: &StopRecord, expect: Expect) -> Item {
     let stop = &record.stop;
     let (actor, fact, note) = match &record.reset {
         Some(reset) => {
-            (&reset.actor, "stop.reset", Note::new("stop.reset").because(&reset.reason).with("at_unix_ms", reset.at.0))
+            let actor = Actor::new(&reset.actor, reset.token_id.clone());
+            (actor, "stop.reset", Note::new("stop.reset").because(&reset.reason).with("at_unix_ms", reset.at.0))
         }
         None => {
             let level = format!("{:?}", stop.level);
             let note = Note::new("stop.engage").because(&stop.reason).with("level", level).with("scope", &stop.scope);
-            (&stop.actor, "stop.engaged", note.with("at_unix_ms", stop.engaged.0))
+            let actor = Actor::new(&stop.actor, stop.token_id.clone());
+            (actor, "stop.engaged", note.with("at_unix_ms", stop.engaged.0))
         }
     };
     let note = note.about("stop", &stop.stop_id);
@@ -108,12 +124,20 @@ mod tests {
             reason: String::new(),
             region: None,
             proof: Vec::new(),
+            token_id: None,
         }
     }
 
     fn reset(name: &str) -> Reset {
         let stop_id = StopId::parse(name).expect("an id");
-        Reset { stop_id, at: Utc(2), actor: "bert".to_owned(), reason: "clear".to_owned(), proof: Vec::new() }
+        Reset {
+            stop_id,
+            at: Utc(2),
+            actor: "bert".to_owned(),
+            reason: "clear".to_owned(),
+            proof: Vec::new(),
+            token_id: None,
+        }
     }
 
     fn latch(stops: &[&str], resets: &[&str]) -> Latch {
@@ -170,5 +194,18 @@ mod tests {
     fn a_stop_that_was_reset_and_forgotten_leaves_the_copy() {
         let forgotten = [("S1".to_owned(), "bert".to_owned(), None)];
         assert_eq!(said(&copy(&latch(&[], &[]), &copied(&[("S1", true)]))), forgotten);
+    }
+
+    #[test]
+    fn the_token_of_a_stop_is_in_the_audit_and_stays_in_the_copy_when_the_stop_came_back_without_it() {
+        let token_id = crate::identity::TokenId::new("t1");
+        let mut known = Latch::default();
+        known.engage(Stop { token_id: token_id.clone(), ..stop("S1") });
+        known.reset(Reset { token_id: token_id.clone(), ..reset("S1") });
+        let items = copy(&known, &BTreeMap::new());
+        assert!(items.len() == 2 && items.iter().all(|item| item.token == token_id), "{items:?}");
+        let record = crate::picture::written::<StopRecord>(&items[1]).expect("a record");
+        let copied = BTreeMap::from([(record.stop.stop_id.clone(), (record, Revision(2)))]);
+        assert_eq!(copy(&latch(&["S1"], &["S1"]), &copied), [], "a robot brought it back: it is the same");
     }
 }

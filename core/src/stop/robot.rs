@@ -196,11 +196,19 @@ mod tests {
             reason: String::new(),
             region: None,
             proof: Vec::new(),
+            token_id: None,
         }
     }
 
     fn reset(n: u8) -> Reset {
-        Reset { stop_id: id(n), at: Utc(2), actor: String::new(), reason: String::new(), proof: Vec::new() }
+        Reset {
+            stop_id: id(n),
+            at: Utc(2),
+            actor: String::new(),
+            reason: String::new(),
+            proof: Vec::new(),
+            token_id: None,
+        }
     }
 
     fn at(ms: u64) -> Now {

@@ -116,6 +116,7 @@ mod tests {
             reason: String::new(),
             region: None,
             proof: Vec::new(),
+            token_id: None,
         }
     }
 

@@ -115,6 +115,7 @@ impl Parse<Stop> for v1::Stop {
             reason: self.reason,
             region,
             proof: self.proof,
+            token_id: None,
         };
         (bad.0.len() == before).then_some(stop)
     }
@@ -150,7 +151,14 @@ impl Parse<Reset> for v1::Reset {
             bad.add(at.field("proof").to_string(), format!("must be at most {}", limits::STOP_PROOF_BYTES));
         }
         let proof = is_mark.then_some(self.proof);
-        Some(Reset { stop_id: stop_id?, at: Utc(self.at_unix_ms), actor: actor?, reason: reason?, proof: proof? })
+        Some(Reset {
+            stop_id: stop_id?,
+            at: Utc(self.at_unix_ms),
+            actor: actor?,
+            reason: reason?,
+            proof: proof?,
+            token_id: None,
+        })
     }
 }
 
@@ -403,6 +411,7 @@ mod tests {
             reason: "a pallet fell".to_owned(),
             region: Some(Region::of_box(0, 0, 10, 10)),
             proof: vec![1, 2],
+            token_id: None,
         }
     }
 
@@ -415,6 +424,7 @@ mod tests {
             actor: "bert".to_owned(),
             reason: "clear".to_owned(),
             proof: Vec::new(),
+            token_id: None,
         };
         assert_eq!(parse::<Reset, _>(v1::Reset::from(&reset)), Ok(reset));
         for scope in [Scope::Fleet, Scope::Robot(RobotId::parse("r1").expect("an id"))] {

@@ -384,8 +384,12 @@ fn stop_facts() -> StopFacts {
         reason: reason.clone(),
         region: None,
         proof: vec![1; 64],
+        token_id: None,
     };
-    StopFacts { stops: vec![stop], resets: vec![Reset { stop_id, at: Utc(6), actor, reason, proof: vec![2; 64] }] }
+    StopFacts {
+        stops: vec![stop],
+        resets: vec![Reset { stop_id, at: Utc(6), actor, reason, proof: vec![2; 64], token_id: None }],
+    }
 }
 
 #[test]

@@ -6,8 +6,10 @@
 use super::keep::{self, KeepStops, Loaded};
 use super::{CheckIn, StopNews};
 use crate::dial::{Dial, SmallCodec};
+use crate::repeats::Repeats;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
+use midshift_core::reason::Code;
 use midshift_core::stop::Stop;
 use midshift_core::stop::ladder::Stage;
 use midshift_core::stop::robot::Kept;
@@ -67,14 +69,18 @@ pub(crate) struct NoLine {
     why: String,
     /// What the stop service asks for.
     again_after: Option<Duration>,
+    /// The key of this machine lets nobody in any more, which only a person changes.
+    is_revoked: bool,
 }
 
 impl NoLine {
     fn failed(why: impl Display) -> Self {
-        Self { why: why.to_string(), again_after: None }
+        Self { why: why.to_string(), again_after: None, is_revoked: false }
     }
     fn refused(status: &Status) -> Self {
-        Self { again_after: refusal_of(status).retry_after, ..Self::failed(status) }
+        let answer = refusal_of(status);
+        let is_revoked = answer.code == Some(Code::KeyDenied);
+        Self { again_after: answer.retry_after, is_revoked, ..Self::failed(status) }
     }
 }
 
@@ -107,7 +113,7 @@ pub(crate) struct Line {
     /// Since when there is no line that works.
     without: Instant,
     /// Why there is no line, as the log was told.
-    refused: String,
+    refused: Repeats,
     keeper: Option<Box<dyn KeepStops>>,
     keeping: Option<Boxed<Written>>,
 }
@@ -124,7 +130,7 @@ impl Line {
             way: Way::Waiting(Box::pin(tokio::time::sleep(Duration::ZERO))),
             failures: 0,
             without: Instant::now(),
-            refused: String::new(),
+            refused: Repeats::default(),
             keeper: Some(keep),
             keeping: None,
         };
@@ -162,9 +168,13 @@ impl Line {
                 // A number that was never used before, in any life of this robot.
                 Some(StopNews::Attended { nonce: self.rng.random::<u64>() ^ rand::random::<u64>() })
             }
-            Said::Dialed(Err(NoLine { why, again_after })) => {
+            Said::Dialed(Err(NoLine { why, again_after, is_revoked })) => {
                 self.tell(robot_id, &why);
-                self.wait_to_dial(again_after);
+                if is_revoked {
+                    self.wait(limits::REVOKED_RETRY.as_ms());
+                } else {
+                    self.wait_to_dial(again_after);
+                }
                 None
             }
             Said::Heard(None) => self.lost("the line ended"),
@@ -172,7 +182,7 @@ impl Line {
                 Ok(FromStop::Told { stops, resets, generation }) => Some(StopNews::Told { stops, resets, generation }),
                 Ok(FromStop::Synced { generation, key }) => {
                     self.failures = 0;
-                    self.refused.clear();
+                    self.refused.forget();
                     Some(StopNews::Synced { generation, key })
                 }
                 Ok(FromStop::CheckedIn { nonce, generation }) => Some(StopNews::CheckedIn { nonce, generation }),
@@ -227,7 +237,9 @@ impl Line {
 
     /// This line does not work: another one.
     pub(crate) fn redial(&mut self, why: &str) {
-        tracing::warn!(why, "stop line given up");
+        if let Some(times) = self.refused.count(why) {
+            tracing::warn!(why, times, "stop line given up");
+        }
         if self.failures == 0 {
             self.without = Instant::now();
         }
@@ -252,11 +264,10 @@ impl Line {
         Some(StopNews::LineLost)
     }
 
-    /// Says once why there is no line: it is tried again for as long as it takes.
+    /// Says why there is no line, about once a minute: it is tried again for as long as it takes.
     fn tell(&mut self, robot_id: &RobotId, why: &str) {
-        if self.refused != why {
-            tracing::warn!(%robot_id, why, "no stop line");
-            why.clone_into(&mut self.refused);
+        if let Some(times) = self.refused.count(why) {
+            tracing::warn!(%robot_id, why, times, "no stop line");
         }
     }
 

@@ -42,8 +42,17 @@ fn id(name: &str) -> StopId {
 
 fn stop(name: &str, scope: Scope, level: StopLevel) -> News {
     let (actor, reason) = ("who".to_owned(), "why".to_owned());
-    let stop =
-        Stop { stop_id: id(name), scope, level, engaged: Utc(5), actor, reason, region: None, proof: vec![9; 64] };
+    let stop = Stop {
+        stop_id: id(name),
+        scope,
+        level,
+        engaged: Utc(5),
+        actor,
+        reason,
+        region: None,
+        proof: vec![9; 64],
+        token_id: None,
+    };
     News::Told(vec![stop], Vec::new())
 }
 
@@ -55,6 +64,7 @@ fn reset(names: &[&str]) -> News {
         actor: actor.to_owned(),
         reason: reason.to_owned(),
         proof: Vec::new(),
+        token_id: None,
     };
     News::Told(Vec::new(), names.iter().map(reset).collect())
 }

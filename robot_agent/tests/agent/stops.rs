@@ -27,6 +27,7 @@ pub fn stop(n: u64, level: StopLevel) -> Stop {
         reason: "a pallet fell".into(),
         region: None,
         proof: Vec::new(),
+        token_id: None,
     }
 }
 
@@ -37,6 +38,7 @@ pub fn reset(n: u64) -> Reset {
         actor: "bert".into(),
         reason: "clear".into(),
         proof: Vec::new(),
+        token_id: None,
     }
 }
 

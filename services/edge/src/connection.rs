@@ -167,23 +167,23 @@ where
     {
         // Before asking, so that no change falls in between.
         let mut changed = self.principals.changed();
-        if let Err(denied) = self.principals.admit(&peer) {
-            return self.denied(&peer, denied);
-        }
-        if peer.certificate.is_some() {
-            stranger.is_known();
-        }
         let activity = Activity::new();
         let door = Door {
             services: self.services.clone(),
             rules: self.rules.clone(),
             activity: activity.clone(),
             peer: peer.clone(),
-            stranger,
+            stranger: stranger.clone(),
             principals: self.principals.clone(),
             denials: self.denials.clone(),
             batches: Arc::new(Semaphore::new(limits::BATCHES_PER_CONNECTION_MAX)),
         };
+        if let Err(denied) = self.principals.admit(&peer) {
+            return self.turn_away(io, door, denied).await;
+        }
+        if peer.certificate.is_some() {
+            stranger.is_known();
+        }
         let flooded = Flooded::default();
         let io = TokioIo::new(Counted::new(io, flooded.clone()));
         let mut served = pin!(self.http.serve_connection(io, door));
@@ -229,6 +229,23 @@ where
                 end
             }
         }
+    }
+
+    /// Answers whatever is asked for a moment with why the certificate is denied, so that a robot can say so; then cuts.
+    /// Its requests are judged as any others are: its certificate gives it no caller, so that no service hears of them.
+    async fn turn_away<Io>(&self, io: Io, mut door: Door<S>, denied: Denied) -> End
+    where
+        Io: AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    {
+        let end = self.denied(&door.peer, denied);
+        if door.peer.certificate.is_some() {
+            // That a connection was denied is told already.
+            door.denials = None;
+            let io = TokioIo::new(Counted::new(io, Flooded::default()));
+            let served = self.http.serve_connection(io, door);
+            let _ = timeout(std(limits::DENIED_LAST), served).await;
+        }
+        end
     }
 
     /// Resolves when the peer may not be connected any longer.

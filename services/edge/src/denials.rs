@@ -5,6 +5,7 @@
 
 use crate::asker::Asker;
 use crate::rates::{Bucket, Rates};
+use midshift_core::identity::Actor;
 use midshift_core::limits;
 use midshift_core::overload::Class;
 use midshift_core::reason::{Code, Reason};
@@ -17,8 +18,8 @@ use tokio::time::Instant;
 /// One request that was denied for who asked.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Denial {
-    /// Who; `nobody`: it showed something worthless.
-    pub actor: String,
+    /// Who, by which token; `nobody`: it showed something worthless.
+    pub actor: Actor,
     /// The IPv4 address, or the /64 of IPv6, that it came from.
     pub network: IpAddr,
     /// What it asked for; cut at [`limits::DENIED_PATH_BYTES`].
@@ -61,7 +62,7 @@ impl Denials {
     }
 
     /// Hands it over, if one more of this asker may leave a trace.
-    pub(crate) fn tell(&self, asker: &Asker, actor: String, network: IpAddr, path: &str, reason: &Reason) {
+    pub(crate) fn tell(&self, asker: &Asker, actor: Actor, network: IpAddr, path: &str, reason: &Reason) {
         let Some(place) = self.is_fit(asker).then(|| self.sink.try_reserve().ok()).flatten() else {
             self.left_out.fetch_add(1, Relaxed);
             metrics::counter!("midshift_edge_denials_left_out_total", "port" => self.port).increment(1);

@@ -8,7 +8,7 @@ use http::HeaderMap;
 use http::header::AUTHORIZATION;
 use midshift_core::identity::{Caller, Digest, Directory, Secret, TokenId};
 use midshift_core::ids::{RobotId, SiteId};
-use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::time::Clock;
 use rustls::pki_types::CertificateDer;
 use sha2::Digest as _;
@@ -49,6 +49,25 @@ impl Known {
         let (robot_id, key) = robot_of(leaf, &self.site_id).ok_or(Denied::Unknown)?;
         if self.directory.borrow().denies(&key) { Err(Denied::Revoked) } else { Ok(robot_id) }
     }
+
+    /// What whoever shows a certificate that is denied is told.
+    fn refusal(&self, leaf: &CertificateDer<'_>, denied: Denied) -> Refusal {
+        let reason = match (denied, robot_of(leaf, &self.site_id)) {
+            (Denied::Revoked, Some((robot_id, _))) => {
+                let text = format!(
+                    "{robot_id} was revoked or replaced, and the key of this machine lets nobody in any more; `midshift robot \
+                     identities` says by whom and when. To let the machine in again: `midshift robot enroll {robot_id}`, and \
+                     start the agent with the line that it prints and an empty --data folder"
+                );
+                Reason::new(Code::KeyDenied, text).with("robot_id", robot_id)
+            }
+            _ => {
+                let text = format!("the certificate of this machine names no robot of site {}", self.site_id);
+                Reason::new(Code::KeyDenied, text)
+            }
+        };
+        Refusal::new(Kind::Unauthenticated, reason)
+    }
 }
 
 impl Principals for Known {
@@ -69,8 +88,7 @@ impl Principals for Known {
 
     fn caller(&self, peer: &Peer, headers: &HeaderMap) -> Result<Caller, Refusal> {
         if let Some(leaf) = &peer.certificate {
-            let unknown = |_| Refusal::new(Kind::Unauthenticated, Code::KeyDenied);
-            let robot = self.robot(leaf).map(Caller::robot).map_err(unknown)?;
+            let robot = self.robot(leaf).map(Caller::robot).map_err(|denied| self.refusal(leaf, denied))?;
             return Ok(robot.with_certificate(serial_of(leaf)));
         }
         let Some(shown) = headers.get(AUTHORIZATION) else { return Ok(Caller::nobody()) };

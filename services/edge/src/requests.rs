@@ -16,7 +16,7 @@ use crate::stranger::Stranger;
 use http::{HeaderMap, Request, Response, Uri};
 use hyper::body::Incoming;
 use hyper::service::Service as HyperService;
-use midshift_core::identity::{Caller, Who};
+use midshift_core::identity::{Actor, Caller, Who};
 use midshift_core::limits;
 use midshift_core::overload::Class;
 use midshift_core::overload::bugs::Bugs;
@@ -185,8 +185,7 @@ impl<S> Door<S> {
         if caller.is_some_and(|caller| matches!(caller.who(), Who::Nobody)) {
             return;
         }
-        let (actor, from) = (caller.map(ToString::to_string), network(self.peer.address.ip()));
-        let actor = actor.unwrap_or_else(|| Caller::nobody().to_string());
+        let (actor, from) = (Actor::from(caller.unwrap_or(&Caller::nobody())), network(self.peer.address.ip()));
         tell(self.rules.port, self.denials.as_deref(), asker, actor, from, path, refusal);
     }
 
@@ -203,13 +202,13 @@ fn tell(
     port: &'static str,
     denials: Option<&Denials>,
     asker: &Asker,
-    actor: String,
+    actor: Actor,
     from: IpAddr,
     path: &str,
     refusal: &Refusal,
 ) {
     let (code, path) = (refusal.reason.code, denials::cut(path));
-    tracing::info!(port, peer = %asker, actor, path, %code, "a request was denied");
+    tracing::info!(port, peer = %asker, %actor, path, %code, "a request was denied");
     if let Some(denials) = denials {
         denials.tell(asker, actor, from, path, &refusal.reason);
     }
@@ -230,7 +229,7 @@ impl Told for Inward {
         let (port, reason) = (self.port, refusal.reason.code.as_str());
         metrics::counter!("midshift_edge_requests_denied_inside_total", "port" => port, "reason" => reason)
             .increment(1);
-        let actor = self.caller.to_string();
+        let actor = Actor::from(&self.caller);
         tell(port, Some(&*self.denials), &self.asker, actor, self.from, self.uri.path(), refusal);
     }
 }

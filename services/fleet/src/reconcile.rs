@@ -9,6 +9,7 @@
 use crate::{Asked, Look, Parts, Request};
 use midshift_core::fleet::view::{self, View};
 use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, explain, found, objects};
+use midshift_core::identity::Actor;
 use midshift_core::lead::{FleetLeader, Own, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::once;
@@ -400,13 +401,13 @@ impl Loop {
                         Some(id) => once::is_repeat(&self.view.command_keys, id, command, *seen),
                         None => Ok(false),
                     });
-                    let actor = by.to_string();
+                    let actor = Actor::from(by);
                     let is_repeat = matches!(repeat, Ok(true));
                     let check = || commands::check(&self.view, &self.board, &now, command, *seen);
                     let checked = repeat.and_then(|known| if known { Ok(()) } else { check() });
                     if let (Err(refusal), false) = (&checked, *validate_only) {
                         let request_id = request_id.as_deref();
-                        plan.items.extend(commands::refusal(&self.view, command, &actor, request_id, refusal));
+                        plan.items.extend(commands::refusal(&self.view, command, by, request_id, refusal));
                     }
                     if checked.is_err() || *validate_only {
                         drop(asked.reply.send(checked));
@@ -420,7 +421,7 @@ impl Loop {
                     }
                     let mut tx =
                         midshift_core::fleet::Tx::new(&mut self.view, now, &actor).on_request(request_id.as_deref());
-                    commands::apply(&mut tx, &self.board, command, &actor);
+                    commands::apply(&mut tx, &self.board, command, actor.name());
                     if let Some(id) = request_id {
                         once::remember(&mut tx, id, command, *seen);
                     }

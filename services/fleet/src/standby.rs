@@ -7,6 +7,7 @@ use crate::reconcile::Loop;
 use crate::{Asked, Request};
 use midshift_core::fleet::commands;
 use midshift_core::fleet::{LOGS, Tx, follow_rows, objects, reread};
+use midshift_core::identity::Actor;
 use midshift_core::limits;
 use midshift_core::once;
 use midshift_core::picture;
@@ -97,7 +98,7 @@ impl Loop {
     /// What a refusal leaves in the audit.
     fn refused(&self, asked: &Asked, refusal: &Refusal) -> Vec<Item> {
         let Asked { command, validate_only, by, request_id, .. } = asked;
-        let item = commands::refusal(&self.view, command, &by.to_string(), request_id.as_deref(), refusal);
+        let item = commands::refusal(&self.view, command, by, request_id.as_deref(), refusal);
         item.into_iter().filter(|_| !validate_only).collect()
     }
 
@@ -115,9 +116,9 @@ impl Loop {
         if *validate_only {
             return Ok(None);
         }
-        let actor = by.to_string();
+        let actor = Actor::from(by);
         let mut tx = Tx::new(&mut self.view, now, &actor).on_request(request_id.as_deref());
-        commands::apply(&mut tx, &self.board, command, &actor);
+        commands::apply(&mut tx, &self.board, command, actor.name());
         if let Some(id) = request_id {
             once::remember(&mut tx, id, command, *seen);
         }

@@ -16,6 +16,8 @@ pub fn token(record: &TokenRecord) -> v1::Token {
         expire_time: Some(timestamp(Utc(record.expires_unix_ms))),
         revoke_time: record.revoked.as_ref().map(|act| timestamp(Utc(act.at_unix_ms))),
         revoked_by: record.revoked.as_ref().map(|act| act.actor.clone()).unwrap_or_default(),
+        person: record.person.as_ref().map(ToString::to_string).unwrap_or_default(),
+        rotated_from: record.rotation.as_ref().map(|rotation| rotation.of.to_string()).unwrap_or_default(),
     }
 }
 

@@ -1,8 +1,8 @@
 //! The two faces: decode, decide, encode.
 
 use crate::authority::{Authority, Signed, asked};
-use crate::register::{decided, written};
-use crate::tokens::{self, Wanted};
+use crate::register::decided;
+use crate::tokens::{self, Turn, Wanted};
 use crate::{Error, IdentityService, encode};
 use midshift_core::audit::Note;
 use midshift_core::identity::{Caller, Replace, RobotIdentity, Secret, TokenId, Who};
@@ -48,9 +48,16 @@ impl IdentityService {
     }
 
     async fn make_token(&self, r: v1::CreateTokenRequest, actor: &Caller) -> Result<v1::CreateTokenResponse, Refusal> {
-        let wanted = Wanted::check(&r.name, &r.grants, r.valid_seconds)?;
-        let (record, secret) = tokens::create(&self.0.register, &wanted, &actor.to_string(), self.now()).await?;
+        let wanted = Wanted::check(&r)?;
+        let (record, secret) = tokens::create(&self.0.register, &wanted, &actor.into(), self.now()).await?;
         Ok(v1::CreateTokenResponse { token: Some(encode::token(&record)), secret: secret.reveal(Secret::TOKEN) })
+    }
+
+    async fn turn_token(&self, r: v1::RotateTokenRequest, actor: &Caller) -> Result<v1::RotateTokenResponse, Refusal> {
+        let turn = Turn::check(&r)?;
+        let (record, secret) = tokens::rotate(&self.0.register, &turn, &actor.into(), self.now()).await?;
+        let secret = secret.map(|secret| secret.reveal(Secret::TOKEN)).unwrap_or_default();
+        Ok(v1::RotateTokenResponse { token: Some(encode::token(&record)), secret })
     }
 
     async fn tokens(&self, r: v1::ListTokensRequest) -> Result<v1::ListTokensResponse, Refusal> {
@@ -69,7 +76,7 @@ impl IdentityService {
     ) -> Result<v1::RevokeTokenResponse, Refusal> {
         let token_id =
             TokenId::new(&r.token_id).ok_or_else(|| Refusal::field("token_id", "must be 1-32 of [a-z0-9]"))?;
-        let record = tokens::revoke(&self.0.register, &token_id, &actor.to_string(), self.now()).await?;
+        let record = tokens::revoke(&self.0.register, &token_id, &actor.into(), self.now()).await?;
         Ok(v1::RevokeTokenResponse { token: Some(encode::token(&record)) })
     }
 
@@ -82,11 +89,11 @@ impl IdentityService {
         let pin = self.authority()?.pin();
         let (secret, now) = (tokens::draw(), self.now());
         let (replace, offer) = if r.replace { (Replace::Yes, "robot.replace") } else { (Replace::No, "robot.enroll") };
-        let (actor, note) = (actor.to_string(), Note::new(offer).about("robot", &robot_id));
-        let offered = self.0.register.decide_for(&actor, note.clone(), |view| {
+        let note = Note::new(offer).about("robot", &robot_id);
+        let offered = self.0.register.decide_for(actor, note.clone(), |view| {
             let (mut robot, at) = known(view.robots.get(&robot_id), &robot_id);
             robot.offer(secret.id().clone(), tokens::digest(&secret), replace, now)?;
-            Ok((Some(decided(&robot, at, &actor, "robot.enrolment_offered", note.clone())), robot))
+            Ok((Some(decided(&robot, at, actor, "robot.enrolment_offered", note.clone())), robot))
         });
         let robot = offered.await?;
         let expires = robot.enrolment.map_or(now, |open| Utc(open.expires_unix_ms));
@@ -109,7 +116,7 @@ impl IdentityService {
                 Some(decided(
                     &robot,
                     Some(*at),
-                    &actor.to_string(),
+                    actor,
                     "robot.revoked",
                     Note::new("robot.revoke").about("robot", &robot_id),
                 )),
@@ -162,7 +169,7 @@ impl IdentityService {
                     Some(decided(
                         &robot,
                         at,
-                        &format!("robot:{robot_id}"),
+                        format!("robot:{robot_id}").as_str(),
                         "robot.enrolled",
                         Note::new("robot.enrolled").about("robot", &robot_id).with("key", key),
                     )),
@@ -196,7 +203,8 @@ impl IdentityService {
             .decide(|view| {
                 let (mut robot, at) = known(view.robots.get(&robot_id), &robot_id);
                 robot.renew(&key, expires)?;
-                Ok((Some(written(&robot, at, &caller.to_string(), "robot.certificate_renewed")), ()))
+                let note = Note::new("robot.renew").about("robot", &robot_id).with("key", key);
+                Ok((Some(decided(&robot, at, caller, "robot.certificate_renewed", note)), ()))
             })
             .await
             .map_err(|refusal| about(refusal, &robot_id))?;
@@ -238,6 +246,7 @@ impl IdentityFace for IdentityService {
             token_id,
             grants: caller.grants().iter().map(ToString::to_string).collect(),
             site_id: self.0.site_id.to_string(),
+            person: caller.named_person().map(ToString::to_string).unwrap_or_default(),
         }))
     }
     async fn create_token(
@@ -246,6 +255,13 @@ impl IdentityFace for IdentityService {
     ) -> Result<Response<v1::CreateTokenResponse>, Status> {
         let actor = caller(&request);
         answered(self.make_token(request.into_inner(), &actor).await)
+    }
+    async fn rotate_token(
+        &self,
+        request: Request<v1::RotateTokenRequest>,
+    ) -> Result<Response<v1::RotateTokenResponse>, Status> {
+        let actor = caller(&request);
+        answered(self.turn_token(request.into_inner(), &actor).await)
     }
     async fn list_tokens(
         &self,

@@ -17,6 +17,7 @@ pub use files::make_folder;
 pub use proof::ServerProof;
 
 use authority::{Authority, asked};
+use midshift_core::audit::Note;
 use midshift_core::identity::{Authority as AuthorityRow, Directory, Secret, ServerCertificate};
 use midshift_core::ids::SiteId;
 use midshift_core::limits;
@@ -26,7 +27,7 @@ use midshift_proto::identity::v1::enrolment_service_server::EnrolmentServiceServ
 use midshift_proto::identity::v1::identity_service_server::IdentityServiceServer;
 use midshift_store::Store;
 use proof::OwnKey;
-use register::{Register, written};
+use register::{Register, decided, written};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -287,7 +288,9 @@ async fn answer(authority: &Authority, register: &Register, now: Utc) -> Result<
         register
             .decide(|view| match view.servers.get(&row.key.to_string()) {
                 Some((known, at)) if *known == row => {
-                    Ok((Some(written(&answered, Some(*at), "midshift", "server.certified")), ()))
+                    let names = answered.names.join(" ");
+                    let note = Note::new("server.certify").about("server", answered.key).with("names", names);
+                    Ok((Some(decided(&answered, Some(*at), "midshift", "server.certified", note)), ()))
                 }
                 _ => Ok((None, ())),
             })

@@ -3,7 +3,9 @@
 //! Invariant: a decision is told to the ports of this process before its answer leaves; other processes hear of it with the store's wake.
 
 use midshift_core::audit::{self, Note};
-use midshift_core::identity::{Authority, Directory, RobotIdentity, ServerCertificate, TokenId, TokenRecord};
+use midshift_core::identity::{
+    Actor, Authority, Directory, RobotIdentity, ServerCertificate, TokenId, TokenName, TokenRecord,
+};
 use midshift_core::ids::RobotId;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{BadRow, Expect, Item, Record, Revision, Table, Writer};
@@ -21,6 +23,8 @@ const TRIES: usize = 8;
 pub struct View {
     /// Tokens.
     pub tokens: BTreeMap<TokenId, (TokenRecord, Revision)>,
+    /// The newest token of each name.
+    pub names: BTreeMap<String, (TokenName, Revision)>,
     /// Robots.
     pub robots: BTreeMap<RobotId, (RobotIdentity, Revision)>,
     /// Certificates of servers, by the digest of the key.
@@ -31,7 +35,7 @@ pub struct View {
 
 impl Fold for View {
     fn tables() -> &'static [Table] {
-        &[Table::Token, Table::RobotIdentity, Table::ServerCertificate, Table::Authority]
+        &[Table::Token, Table::TokenName, Table::RobotIdentity, Table::ServerCertificate, Table::Authority]
     }
     fn reset(&mut self) {
         *self = Self::default();
@@ -44,6 +48,10 @@ impl Fold for View {
                     self.tokens.insert(token.token_id.clone(), (token, revision));
                 }
             }
+            Table::TokenName => match change.decode::<TokenName>()? {
+                Some(name) => drop(self.names.insert(name.id(), (name, revision))),
+                None => drop(self.names.remove(&*change.key.id)),
+            },
             Table::RobotIdentity => {
                 if let Some(robot) = change.decode::<RobotIdentity>()? {
                     self.robots.insert(robot.robot_id.clone(), (robot, revision));
@@ -153,7 +161,7 @@ impl Register {
     /// The same.
     pub async fn decide_for<T>(
         &self,
-        actor: &str,
+        actor: impl Into<Actor>,
         note: Note,
         decide: impl FnMut(&View) -> Result<Decision<T>, Refusal>,
     ) -> Result<T, Refusal> {
@@ -167,14 +175,20 @@ impl Register {
 }
 
 /// An item that writes one record: new, or over the one that was looked at.
-pub fn written<R: Record>(record: &R, at: Option<Revision>, actor: &str, kind: &'static str) -> Item {
+pub fn written<R: Record>(record: &R, at: Option<Revision>, actor: impl Into<Actor>, kind: &'static str) -> Item {
     let mut item = Item::new(Writer::Identity, actor);
     item.put(record, at.map_or(Expect::Absent, Expect::At), kind);
     item
 }
 
 /// The same as somebody's decision, with what it leaves in the audit.
-pub fn decided<R: Record>(record: &R, at: Option<Revision>, actor: &str, kind: &'static str, note: Note) -> Item {
+pub fn decided<R: Record>(
+    record: &R,
+    at: Option<Revision>,
+    actor: impl Into<Actor>,
+    kind: &'static str,
+    note: Note,
+) -> Item {
     let mut item = written(record, at, actor, kind);
     item.audit(note);
     item

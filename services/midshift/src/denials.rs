@@ -60,6 +60,7 @@ fn chain(path: &str) -> Writer {
 mod tests {
     use super::*;
     use midshift_core::audit::AuditRow;
+    use midshift_core::identity::{Actor, TokenId};
     use midshift_core::ids::SiteId;
     use midshift_core::reason::Code;
     use midshift_core::rows::Table;
@@ -76,7 +77,7 @@ mod tests {
         let store = MemoryStore::new(SiteId::parse("s").expect("a site"), StoreId("store-1".into()), clock);
         let (sender, denials) = mpsc::channel(1);
         let path = "/midshift.task.v1.TaskService/SubmitTask".to_owned();
-        let (actor, network) = ("anna".to_owned(), Ipv4Addr::LOCALHOST.into());
+        let (actor, network) = (Actor::new("anna", TokenId::new("t1")), Ipv4Addr::LOCALHOST.into());
         let robot_id = Some("r7".to_owned());
         let denial = Denial { actor, network, path, robot_id, code: Code::NotPermitted, left_out: 7 };
         sender.send(denial).await.expect("there is room");
@@ -96,6 +97,7 @@ mod tests {
         let row: AuditRow = serde_json::from_str(&rows[0].body).expect("a row");
         let with = |name: &str| row.with.get(name).map(String::as_str);
         assert_eq!((rows.len(), row.actor.as_str(), row.action.as_str()), (1, "anna", ACTION));
+        assert_eq!(row.token_id, "t1");
         assert_eq!((row.outcome.as_str(), row.about.as_slice()), ("NOT_PERMITTED", &["robot:r7".to_owned()][..]));
         assert_eq!(with("path"), Some("/midshift.task.v1.TaskService/SubmitTask"));
         assert_eq!((with("network"), with("left_out")), (Some("127.0.0.1"), Some("7")));

@@ -93,9 +93,11 @@ pub struct AgentRun {
     /// Where the ledger, the body and its journal are kept: a killed agent does not teleport its body or lose its load.
     #[arg(long)]
     pub data: PathBuf,
-    /// What `midshift robot enroll` printed, once: this machine becomes the robot, and keeps its certificate in --data.
-    #[arg(long, env = "MIDSHIFT_ENROLL", hide_env_values = true, value_name = "SECRET", value_parser = invitation)]
-    pub enroll: Option<Arc<Invitation>>,
+    /// A file of its owner's alone with the secret that `midshift robot enroll` printed: this machine becomes the robot, once, and keeps its
+    /// certificate in --data. Without it the secret is taken from the variable MIDSHIFT_ENROLL, if that is set; never from the command line,
+    /// which other users of a machine can read.
+    #[arg(long, env = "MIDSHIFT_ENROLL_FILE", value_name = "FILE")]
+    pub enroll_file: Option<PathBuf>,
     /// The site file the body lives on. Without it the built-in demo site.
     #[arg(long)]
     pub site: Option<PathBuf>,
@@ -176,8 +178,16 @@ pub struct SimRun {
     pub stop: StopFlags,
 }
 
-fn invitation(text: &str) -> Result<Arc<Invitation>, enrolment::Error> {
-    text.parse().map(Arc::new)
+/// Variable with the secret that enrols a robot.
+pub const ENROLL: &str = "MIDSHIFT_ENROLL";
+
+/// What this machine was given to enrol with; none: nothing.
+fn invitation(file: Option<&Path>) -> Result<Option<Invitation>, enrolment::Error> {
+    match (file, std::env::var(ENROLL)) {
+        (Some(file), _) => Invitation::read(file).map(Some),
+        (None, Ok(text)) if !text.is_empty() => text.parse().map(Some),
+        (None, _) => Ok(None),
+    }
 }
 
 fn part(text: &str) -> Result<(usize, usize), String> {
@@ -215,7 +225,7 @@ pub async fn agent_in_hand(
     }
     let mut store: Box<dyn Store> = Box::new(SqliteStore::open(&args.data.join(AGENT_FILE)).await?);
     let new_ring_id = format!("{:032x}", rand::random::<u128>());
-    let identity = match &args.enroll {
+    let identity = match invitation(args.enroll_file.as_deref())? {
         None if Enrolled::read(&args.data)?.is_none() => {
             tracing::warn!(
                 server = args.server,
@@ -226,7 +236,7 @@ pub async fn agent_in_hand(
         invitation => {
             let key = device::key_of(&mut *store, &new_ring_id).await?;
             let address = args.identity.address(&args.server);
-            Some(Identity::open(&args.data, &robot_id, key, address, invitation.as_deref()).await?)
+            Some(Identity::open(&args.data, &robot_id, key, address, invitation.as_ref()).await?)
         }
     };
     let tls = identity.as_ref().map(Identity::tls);

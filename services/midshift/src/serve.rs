@@ -1,12 +1,12 @@
 //! `midshift serve`: everything persistent, for a real site: in one process on SQLite or PostgreSQL, or some of the services in each of several
 //! processes on one PostgreSQL database.
 
-use crate::changed_map;
 use crate::door::{self, Share};
 use crate::planning::Planning;
 use crate::roles::{Role, Roles};
 use crate::server::{Naive, Parts, Server};
 use crate::storage::{Database, Storage};
+use crate::{backup, changed_map};
 use crate::{clock, logs, site_file, stop, stop_follower};
 use anyhow::{Context, bail};
 use clap::ValueEnum;
@@ -280,9 +280,11 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
             false => std::future::pending().await,
         }
     };
+    let rows = storage.store();
     let served = tokio::select! {
         served = server.serve(listener) => served,
         () = kept => Ok(()),
+        () = backup::told::run(&args.data, &*rows) => Ok(()),
     };
     storage.close().await;
     served

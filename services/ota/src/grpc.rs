@@ -79,7 +79,7 @@ impl OtaService {
         by: &Caller,
     ) -> Result<v1::PublishRepositoryResponse, Refusal> {
         let opened = self.opened()?;
-        let act = Act { by: by.to_string(), at: opened.now() };
+        let act = Act { by: by.into(), at: opened.now() };
         let newest = opened.repository.publish(r.roots, r.targets, r.expected_targets_version, act).await?;
         let (root_version, targets_version) = (newest.root.edition.version, newest.targets.edition.version);
         tracing::info!(root_version, targets_version, bundles = newest.releases.len(), "a release was published");

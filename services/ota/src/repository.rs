@@ -18,6 +18,7 @@ use midshift_bundle::key_set::KeySet;
 use midshift_bundle::keys::{self, SecretKey};
 use midshift_bundle::manifest::Manifest;
 use midshift_bundle::repository::{self as people, FileTarget, Online, TIMESTAMP_LIFE_MS, listed, sign_online};
+use midshift_core::identity::{Actor, TokenId};
 use midshift_core::reason::{Code, Reason, Refusal};
 use midshift_core::time::Utc;
 use serde::{Deserialize, Serialize};
@@ -257,7 +258,7 @@ pub struct Release {
 #[derive(Clone, Debug)]
 pub struct Act {
     /// Who.
-    pub by: String,
+    pub by: Actor,
     /// When.
     pub at: Utc,
 }
@@ -266,7 +267,7 @@ pub struct Act {
 impl Act {
     /// Of whoever makes releases in tests.
     pub fn of_release(at: Utc) -> Self {
-        Self { by: "release".to_owned(), at }
+        Self { by: "release".into(), at }
     }
 }
 
@@ -276,26 +277,35 @@ impl Act {
 pub struct By {
     /// The newest targets document.
     newest: Option<String>,
+    /// The token that was shown for it.
+    newest_token: Option<TokenId>,
     /// Each bundle of it, since it was listed.
     bundles: BTreeMap<Digest, String>,
+    /// The token that was shown for each of them.
+    tokens: BTreeMap<Digest, TokenId>,
 }
 
 impl By {
     /// After a publication of these.
-    fn after(mut self, by: String, releases: &[Release]) -> Self {
-        self.bundles.retain(|digest, _| releases.iter().any(|release| release.digest == *digest));
-        for release in releases {
-            self.bundles.entry(release.digest).or_insert_with(|| by.clone());
+    fn after(mut self, by: &Actor, releases: &[Release]) -> Self {
+        let is_listed = |digest: &Digest| releases.iter().any(|release| release.digest == *digest);
+        self.bundles.retain(|digest, _| is_listed(digest));
+        self.tokens.retain(|digest, _| is_listed(digest));
+        for release in releases.iter().filter(|release| !self.bundles.contains_key(&release.digest)) {
+            self.tokens.extend(by.token().map(|token| (release.digest, token.clone())));
         }
-        Self { newest: Some(by), ..self }
+        for release in releases {
+            self.bundles.entry(release.digest).or_insert_with(|| by.to_string());
+        }
+        Self { newest: Some(by.to_string()), newest_token: by.token().cloned(), ..self }
     }
     /// Who published the newest document.
-    pub fn newest(&self) -> Option<&str> {
-        self.newest.as_deref()
+    pub fn newest(&self) -> Option<Actor> {
+        self.newest.as_ref().map(|name| Actor::new(name, self.newest_token.clone()))
     }
     /// Who listed this bundle.
-    pub fn bundle(&self, digest: &Digest) -> Option<&str> {
-        self.bundles.get(digest).map(String::as_str)
+    pub fn bundle(&self, digest: &Digest) -> Option<Actor> {
+        self.bundles.get(digest).map(|name| Actor::new(name, self.tokens.get(digest).cloned()))
     }
 }
 
@@ -608,7 +618,7 @@ impl Repository {
             (first_root..).map(|version| file(version, "root")).zip(roots).collect();
         let seen = serde_json::to_vec(&seen).unwrap_or_else(|e| unreachable!("plain fields: {e}"));
         writes.push((SEEN.to_owned(), seen));
-        let by = self.by().await?.after(by, &releases);
+        let by = self.by().await?.after(&by, &releases);
         writes.push((BY.to_owned(), serde_json::to_vec(&by).unwrap_or_else(|e| unreachable!("plain fields: {e}"))));
         writes.push((file(targets.edition.version, "targets"), targets.bytes.clone()));
         writes.push((file(stamp.snapshot_version, "snapshot"), online.snapshot));

@@ -7,7 +7,7 @@ use crate::audit::{Action, MIDSHIFT, Note};
 use crate::law::{Asked, Law, Resetting};
 use crate::outbox::Frame;
 use crate::{Inner, frames, lock};
-use midshift_core::identity::{Caller, Permission};
+use midshift_core::identity::{Actor, Caller, Permission};
 use midshift_core::ids::{RequestId, RobotId, StopId};
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::robot::StopLevel;
@@ -27,7 +27,7 @@ pub struct Wanted {
     /// Protects against a double call, with the hash of the request.
     pub request: Option<(RequestId, String)>,
     /// Who.
-    pub actor: String,
+    pub actor: Actor,
 }
 
 /// A stop that is engaged.
@@ -65,10 +65,19 @@ pub fn engage(inner: &Inner, wanted: Wanted) -> Result<Engaged, Refusal> {
         return Ok(engaged);
     }
     law.room(&wanted.scope, wanted.level)?;
-    let (actor, reason) = (wanted.actor, wanted.reason);
+    let (actor, token_id, reason) = (wanted.actor.to_string(), wanted.actor.token().cloned(), wanted.reason);
     let (scope, level) = (wanted.scope, wanted.level);
-    let mut stop =
-        Stop { stop_id: law.draw(now.wall), scope, level, engaged: now.wall, actor, reason, region, proof: Vec::new() };
+    let mut stop = Stop {
+        stop_id: law.draw(now.wall),
+        scope,
+        level,
+        engaged: now.wall,
+        actor,
+        reason,
+        region,
+        proof: Vec::new(),
+        token_id,
+    };
     inner.key.mark(&mut stop);
     let request_id = wanted.request.as_ref().map(|(id, _)| id.to_string());
     let asked = wanted.request.map(|(id, hash)| (id, Asked { stop_id: stop.stop_id.clone(), hash, at: now.wall }));
@@ -181,17 +190,19 @@ pub fn reset(inner: &Inner, stop_id: StopId, reason: String, by: &Caller) -> Res
     let mut law = lock(&inner.law);
     let areas = law.latch().stop(&stop_id).map(|stop| inner.ground.areas(&stop.scope)).unwrap_or_default();
     if let Err(refusal) = by.needs(Permission::Reset, &areas) {
-        let note = Note { actor: by.to_string(), ..Note::own(now.wall, Action::Denied) };
+        let note = Note::of(now.wall, Action::Denied, &by.into());
         let note = note.with("code", refusal.reason.code).with("asked", "stop.reset").with("stop_id", stop_id);
         inner.disk.denied(note, 0);
         return Err(refusal);
     }
-    let mut reset = Reset { stop_id, at: now.wall, actor: by.to_string(), reason, proof: Vec::new() };
+    let by = Actor::from(by);
+    let (actor, token_id) = (by.to_string(), by.token().cloned());
+    let mut reset = Reset { stop_id, at: now.wall, actor, reason, proof: Vec::new(), token_id };
     inner.key.mark_reset(&mut reset);
     let resetting = law.reset(reset);
     if resetting.is_new {
-        let Reset { stop_id, actor, reason, .. } = &resetting.reset;
-        let note = Note { actor: actor.clone(), ..Note::own(now.wall, Action::Reset) };
+        let Reset { stop_id, reason, .. } = &resetting.reset;
+        let note = Note::of(now.wall, Action::Reset, &by);
         inner
             .disk
             .note(note.with("stop_id", stop_id).with("reason", reason).with("was_engaged", resetting.was_engaged));
@@ -227,7 +238,7 @@ fn tell(inner: &Inner, stop: &Stop, generation: u64, now: &Now) -> usize {
 }
 
 fn note(action: Action, stop: &Stop, at: Utc) -> Note {
-    let Stop { stop_id, scope, level, actor, reason, .. } = stop;
-    let note = Note { actor: actor.clone(), ..Note::own(at, action) };
+    let Stop { stop_id, scope, level, reason, .. } = stop;
+    let note = Note::of(at, action, &Actor::new(&stop.actor, stop.token_id.clone()));
     note.with("stop_id", stop_id).with("scope", scope).with("level", format!("{level:?}")).with("reason", reason)
 }

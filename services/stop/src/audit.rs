@@ -3,6 +3,7 @@
 //! Invariant: nothing of it is ever changed or taken away by the service; where it had to leave records out it says how many. The hash of the last
 //! record is also kept in the latch file, so that a file whose end was cut off shows. Called by the one writer of the folder, and by `verify`.
 
+use midshift_core::identity::Actor;
 use midshift_core::time::Utc;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -57,6 +58,8 @@ pub struct Note {
     pub fields: BTreeMap<String, String>,
 }
 
+/// Field of the token that was shown.
+const TOKEN: &str = "token_id";
 /// What the service does by itself is done under this name.
 pub const MIDSHIFT: &str = "midshift";
 
@@ -64,6 +67,11 @@ impl Note {
     /// Of the service itself.
     pub fn own(at: Utc, action: Action) -> Self {
         Self { at, actor: MIDSHIFT.to_owned(), action, fields: BTreeMap::new() }
+    }
+    /// Of somebody, with the token that was shown.
+    pub fn of(at: Utc, action: Action, by: &Actor) -> Self {
+        let note = Self { actor: by.to_string(), ..Self::own(at, action) };
+        by.token().iter().fold(note, |note, token| note.with(TOKEN, token))
     }
     /// With one more field.
     pub fn with(mut self, name: &str, value: impl ToString) -> Self {

@@ -46,7 +46,7 @@ fn wanted(r: v1::EngageRequest, by: &Caller) -> Result<Wanted, Refusal> {
         v1::EngageRequest { level: level.to_wire(), request_id: String::new(), site_id: String::new(), ..r.clone() };
     let hash: String = Sha256::digest(asked.encode_to_vec()).iter().map(|byte| format!("{byte:02x}")).collect();
     let request = request_id.map(|id| (id, hash));
-    Ok(Wanted { scope, level, reason: r.reason, request, actor: by.to_string() })
+    Ok(Wanted { scope, level, reason: r.reason, request, actor: by.into() })
 }
 
 impl StopService {

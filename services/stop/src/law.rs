@@ -254,7 +254,17 @@ mod tests {
 
     fn stop(id: StopId, scope: Scope) -> Stop {
         let (actor, reason) = (String::new(), String::new());
-        Stop { stop_id: id, scope, level: StopLevel::Halt, engaged: Utc(1), actor, reason, region: None, proof: vec![] }
+        Stop {
+            stop_id: id,
+            scope,
+            level: StopLevel::Halt,
+            engaged: Utc(1),
+            actor,
+            reason,
+            region: None,
+            proof: vec![],
+            token_id: None,
+        }
     }
 
     fn reset(stop_id: &StopId) -> Reset {
@@ -264,6 +274,7 @@ mod tests {
             actor: "a".to_owned(),
             reason: "over".to_owned(),
             proof: Vec::new(),
+            token_id: None,
         }
     }
 

@@ -35,6 +35,7 @@ use audit::{Action, Broken, Note, Verified};
 use disk::{Disk, Writer};
 use ground::Ground;
 use law::{Kept, Law};
+use midshift_core::identity::Actor;
 use midshift_core::ids::SiteId;
 use midshift_core::limits;
 use midshift_core::reason::Code;
@@ -248,8 +249,16 @@ impl StopService {
 
     /// Records that the port denied somebody something, unless too many are; `robot_id`: the robot that was named, if one was; `left_out`: so many that the port itself
     /// did not tell of.
-    pub fn denied(&self, actor: &str, network: IpAddr, path: &str, robot_id: Option<&str>, code: Code, left_out: u64) {
-        let note = Note { actor: actor.to_owned(), ..Note::own(self.inner.clock.now().wall, Action::Denied) };
+    pub fn denied(
+        &self,
+        actor: &Actor,
+        network: IpAddr,
+        path: &str,
+        robot_id: Option<&str>,
+        code: Code,
+        left_out: u64,
+    ) {
+        let note = Note::of(self.inner.clock.now().wall, Action::Denied, actor);
         let note = note.with("code", code).with("asked", path).with("network", network);
         let note = robot_id.iter().fold(note, |note, robot_id| note.with("robot_id", robot_id));
         self.inner.disk.denied(note, left_out);

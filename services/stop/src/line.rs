@@ -74,7 +74,7 @@ fn held_by_another(inner: &Inner, robot_id: &RobotId, by: &Caller, held: Held, n
     metrics::counter!("midshift_stop_lines_contested_total").increment(1);
     if held.is_news {
         tracing::warn!(peer = Empty, %robot_id, "another start of this robot was not let in while one is heard");
-        let note = Note { actor: by.to_string(), ..Note::own(now.wall, Action::Denied) };
+        let note = Note::of(now.wall, Action::Denied, &by.into());
         let note = note.with("code", Code::LineHeld).with("asked", "stop.attend").with("robot_id", robot_id);
         let certificate = by.certificate();
         inner.disk.denied(certificate.iter().fold(note, |note, serial| note.with("certificate", serial)), 0);

@@ -134,6 +134,7 @@ fn stop_fleet(kept: &mut Kept, key: &Key, lost: Lost, now: Utc) -> Stop {
         reason: format!("the stop service began without its memory: {}; nobody knows what was engaged", lost.why()),
         region: None,
         proof: Vec::new(),
+        token_id: None,
     };
     key.mark(&mut stop);
     kept.latch.engage(stop.clone());

@@ -270,7 +270,7 @@ mod tests {
             level: StopLevel::Halt,
             reason: String::new(),
             request: None,
-            actor: String::new(),
+            actor: "anna".into(),
         };
         let stop_id = acts::engage(&inner, wanted).unwrap().stop.stop_id;
         let outbox = Outbox::new(BTreeSet::new());

@@ -122,6 +122,7 @@ mod tests {
             reason: "drill".to_owned(),
             region: Some(Region::of_box(1, 2, 3, 4)),
             proof: Vec::new(),
+            token_id: None,
         }
     }
 
@@ -159,7 +160,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let key = kept(folder.path());
         let (actor, reason, stop_id) = ("bert".to_owned(), "clear".to_owned(), stop().stop_id);
-        let mut reset = Reset { stop_id, at: Utc(2), actor, reason, proof: Vec::new() };
+        let mut reset = Reset { stop_id, at: Utc(2), actor, reason, proof: Vec::new(), token_id: None };
         key.mark_reset(&mut reset);
         let back: Reset = midshift_proto::parse(v1::Reset::from(&reset)).unwrap();
         let public = ed25519_dalek::VerifyingKey::from_bytes(&key.public()).unwrap();

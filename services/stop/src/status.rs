@@ -185,7 +185,20 @@ mod tests {
             1 => Scope::Robot(RobotId::parse("r1").unwrap()),
             _ => Scope::Fleet,
         };
-        (Stop { stop_id: id(n), scope, level, engaged: Utc(0), actor, reason, region: None, proof: vec![] }, n)
+        (
+            Stop {
+                stop_id: id(n),
+                scope,
+                level,
+                engaged: Utc(0),
+                actor,
+                reason,
+                region: None,
+                proof: vec![],
+                token_id: None,
+            },
+            n,
+        )
     }
 
     #[test]

@@ -102,9 +102,9 @@ pub(crate) fn decide(
 ) -> Result<Decided, CommitError> {
     form(&item)?;
     expectations(&item, found)?;
-    let Item { writer, actor, request_id, rows, facts, note, silent: _ } = item;
-    let by = || By { actor: actor.clone(), request_id: request_id.clone(), at_unix_ms };
-    let audited = note.map(|note| Draft { writer, note, by: by() });
+    let Item { writer, actor, token, request_id, rows, facts, note, silent: _ } = item;
+    let by = By { actor: actor.clone(), token, request_id: request_id.clone(), at_unix_ms };
+    let audited = note.map(|note| Draft { writer, note, by });
     let applied = Applied { seq: head, revisions: Vec::new() };
     let mut decided = Decided { rows: Vec::new(), entries: Vec::new(), audited, applied };
     let entry = |seq: &mut Seq, log, subject, kind: &str, body| {

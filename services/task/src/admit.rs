@@ -139,13 +139,13 @@ impl TaskService {
         let intake = TaskIntake {
             task_id: task_id.clone(),
             spec: wanted.spec.clone(),
-            actor: actor.clone(),
+            actor,
             request_id: wanted.request_id.as_ref().map(ToString::to_string).unwrap_or_default(),
             payload_hash: wanted.hash.clone(),
             created: now.utc,
             number,
         };
-        let mut item = Item::new(Writer::Task, &actor);
+        let mut item = Item::new(Writer::Task, by);
         item.request_id = wanted.request_id.as_ref().map(|id| id.as_str().into());
         if let Some(request_id) = wanted.request_id.as_ref().filter(|_| !self.inner.parts.bugs.forgets_requests()) {
             let key = RequestKey {

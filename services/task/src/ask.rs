@@ -8,7 +8,7 @@ use crate::admit::no_result;
 use crate::rows::{TaskRows, read, unavailable};
 use midshift_core::audit::{self, Note};
 use midshift_core::fleet::rows::FleetMark;
-use midshift_core::identity::{Caller, Permission};
+use midshift_core::identity::{Actor, Caller, Permission};
 use midshift_core::ids::{RequestId, RobotId, TaskId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
@@ -32,7 +32,7 @@ pub(crate) struct Asked {
     pub(crate) reason: String,
     pub(crate) request_id: Option<RequestId>,
     pub(crate) hash: String,
-    pub(crate) actor: String,
+    pub(crate) actor: Actor,
     /// The robot that has the task.
     pub(crate) robot_id: Option<RobotId>,
 }
@@ -111,7 +111,7 @@ impl TaskService {
         };
         let fits = if earlier.is_none() { fits() } else { Ok(()) };
         let (ask, robot_id) = (Ask::Cancel { task_id: task_id.clone(), force: r.force }, task.state.robot_id.clone());
-        let asked = Asked { ask, reason: r.reason, request_id, hash, actor: by.to_string(), robot_id };
+        let asked = Asked { ask, reason: r.reason, request_id, hash, actor: by.into(), robot_id };
         if r.validate_only {
             return fits.map(|()| v1::CancelTaskResponse { task: Some(task.encode()), pending: false });
         }
@@ -160,7 +160,7 @@ impl TaskService {
         };
         let fits = if earlier.is_none() { fits() } else { Ok(()) };
         let (ask, robot_id) = (Ask::Resolve { task_id: task_id.clone(), resolution }, task.state.robot_id.clone());
-        let asked = Asked { ask, reason: r.reason, request_id, hash, actor: by.to_string(), robot_id };
+        let asked = Asked { ask, reason: r.reason, request_id, hash, actor: by.into(), robot_id };
         if r.validate_only {
             return fits.map(|()| v1::ResolveTaskResponse { task: Some(task.encode()), pending: false });
         }
@@ -230,7 +230,7 @@ impl TaskService {
         if refusal.kind() != Kind::Denied {
             return refusal;
         }
-        let asked = Asked { ask, reason, request_id, hash: String::new(), actor: by.to_string(), robot_id: None };
+        let asked = Asked { ask, reason, request_id, hash: String::new(), actor: by.into(), robot_id: None };
         let noted = self.noted(&asked, Err(refusal)).await;
         noted.err().unwrap_or_else(internal)
     }
@@ -261,7 +261,7 @@ impl TaskService {
         }
         item.audit(asked.note());
         let id = format!("{:013}-{:016x}", now.wall.0, rand::random::<u64>());
-        let (ask, reason, actor) = (asked.ask.clone(), asked.reason.clone(), asked.actor.clone());
+        let (ask, reason, actor) = (asked.ask.clone(), asked.reason.clone(), asked.actor.to_string());
         item.create(&TaskRequest { id, ask, reason, actor, at_unix_ms: now.wall.0 }, "task.asked");
         item
     }

@@ -204,7 +204,7 @@ impl TaskService {
                 reason: bulk.reason.clone(),
                 request_id: own_id.and_then(|id| RequestId::parse(&id).ok()),
                 hash: bulk.hash.clone(),
-                actor: by.to_string(),
+                actor: by.into(),
                 robot_id: task.state.robot_id.clone(),
             };
             match refusal {

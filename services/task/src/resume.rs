@@ -88,7 +88,7 @@ impl TaskService {
         let hash = hash("resume", &same);
         let earlier = self.asked_before(request_id.as_ref(), &hash).await?;
         let named = Named::of(&ask).filter(|_| earlier.is_none());
-        let asked = Asked { ask, reason: r.reason, request_id, hash, actor: by.to_string(), robot_id: None };
+        let asked = Asked { ask, reason: r.reason, request_id, hash, actor: by.into(), robot_id: None };
         let held = match &named {
             None => None,
             Some(named) => match self.until_over(named).await {

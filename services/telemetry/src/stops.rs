@@ -79,9 +79,16 @@ mod tests {
     fn record(n: usize, scope: Scope, is_reset: bool) -> StopRecord {
         let (actor, reason, region) = ("anna".to_owned(), "a pallet fell".to_owned(), Some(Region::of_box(0, 0, 9, 9)));
         let (level, engaged, proof) = (StopLevel::Halt, Utc(1), vec![7; 64]);
-        let stop = Stop { stop_id: id(n), scope, level, engaged, actor: actor.clone(), reason, region, proof };
-        let reset =
-            || Reset { stop_id: id(n), at: Utc(n as i64), actor, reason: "clear".to_owned(), proof: vec![8; 64] };
+        let stop =
+            Stop { stop_id: id(n), scope, level, engaged, actor: actor.clone(), reason, region, proof, token_id: None };
+        let reset = || Reset {
+            stop_id: id(n),
+            at: Utc(n as i64),
+            actor,
+            reason: "clear".to_owned(),
+            proof: vec![8; 64],
+            token_id: None,
+        };
         StopRecord { stop, reset: is_reset.then(reset) }
     }
 

@@ -218,7 +218,7 @@ pub async fn sign_in_to(address: SocketAddr, authority: PathBuf, token: &Path) -
     let way = Way::secure(&address.to_string(), &std::fs::read_to_string(&authority)?, Some(&token))?;
     let identity = IdentityServiceClient::new(way.lazy());
     let grants = vec!["ota-approver".to_owned()];
-    let request = CreateTokenRequest { name: "second".to_owned(), grants, valid_seconds: 86_400 };
+    let request = CreateTokenRequest { name: "second".to_owned(), grants, valid_seconds: 86_400, ..Default::default() };
     let second = until("a second token", Duration::from_secs(30), || {
         let (mut identity, request) = (identity.clone(), request.clone());
         async move { Ok(identity.create_token(request).await.ok().map(|made| made.into_inner().secret)) }

@@ -115,6 +115,11 @@ async fn a_copied_key_is_observed_with_an_incident_while_the_original_works_and_
     until("both are cut off", LIMIT, async || Ok((presence(address, "rbt-01").await? == (false, false)).then_some(())))
         .await?;
     ensure!(attach(&server, &elsewhere).await.is_err(), "a revoked key was let in");
+    until("it says why, and what to try", LIMIT, async || {
+        let said = std::fs::read_to_string(elsewhere.join("agent.log"))?;
+        Ok((said.contains("this robot was revoked") && said.contains("midshift robot enroll rbt-01")).then_some(()))
+    })
+    .await?;
     for other in robots.ids().iter().skip(1) {
         ensure!(presence(address, other).await? == (false, true), "{other} is not concerned");
     }

@@ -97,7 +97,7 @@ pub async fn minimal_robot(name: &str, server: SocketAddr, dir: &Path) -> anyhow
     let arguments = ["--server", &server, "--robot-id", name, "--data", &memory, "--journal", &journal];
     let mut command = Language::Python.run("examples/minimal_robot.py", &arguments)?;
     command.args(["--at", "park-a", "0", "3000", "--speed-mm-s", "5000", "--act-ms", "1500"]);
-    command.args(["--enroll", &line]).arg("--ca").arg(authority);
+    command.env("MIDSHIFT_ENROLL", &line).arg("--ca").arg(authority);
     Ok(command)
 }
 

@@ -82,7 +82,12 @@ async fn tokens(server: &Server) -> anyhow::Result<BTreeMap<(Role, Scope), Strin
             }
             let grant =
                 if scope == Scope::Site { role.as_str().to_owned() } else { format!("{}@{}", role.as_str(), AREAS[0]) };
-            let request = CreateTokenRequest { name: name(*role, &scope), grants: vec![grant], valid_seconds: 86_400 };
+            let request = CreateTokenRequest {
+                name: name(*role, &scope),
+                grants: vec![grant],
+                valid_seconds: 86_400,
+                ..Default::default()
+            };
             tokens.insert((*role, scope), identity.create_token(request).await?.into_inner().secret);
         }
     }
@@ -242,7 +247,11 @@ fn nothing_was_done(dir: &Path, server: &Server, engaged: &[String; 2]) -> anyho
         row["outcome"] == "DONE"
             && row["actor"].as_str().is_some_and(|actor| actor.starts_with("may-") || actor.ends_with(ASKS))
     };
-    let deeds: Vec<_> = rows.iter().filter(is_deed).filter(|row| row["action"] != "robot.enrolled").collect();
+    let deeds: Vec<_> = rows
+        .iter()
+        .filter(is_deed)
+        .filter(|row| !["robot.enrolled", "audit.export"].contains(&row["action"].as_str().unwrap_or_default()))
+        .collect();
     ensure!(rows.len() > 20 && deeds.is_empty(), "{} rows: {deeds:?}", rows.len());
     let audit = std::fs::read_to_string(dir.join("data/stop/audit.jsonl"))?;
     let acts: Vec<&str> =

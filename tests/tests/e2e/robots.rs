@@ -178,7 +178,7 @@ impl Robots {
             None => command.arg("--no-stop"),
         };
         if let Some(secret) = enrolment {
-            command.args(["--enroll", secret]);
+            command.env("MIDSHIFT_ENROLL", secret);
         }
         tell_identity(&mut command, &self.server);
         Running::start(&mut command, &dir.join("agent.log"))

@@ -134,7 +134,7 @@ impl Software {
         }
         let keys = OnlineKeys::read(&self.keys())?;
         let repository = Repository::open(&self.folder().join("metadata"), keys, Arc::new(content)).await?;
-        let act = Act { by: "release".to_owned(), at: now };
+        let act = Act { by: "release".into(), at: now };
         repository.publish(vec![root], targets, 0, act).await?;
         Ok(())
     }

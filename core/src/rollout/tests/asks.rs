@@ -68,7 +68,7 @@ impl Rig {
         self.ota_turn();
         let done = commands::check(&self.ota, &self.board, command, None)?;
         if !done {
-            self.ota_plan(|rig, plan| commands::apply(&mut rig.ota, &rig.board, rig.now, command, "ana", plan));
+            self.ota_plan(|rig, plan| commands::apply(&mut rig.ota, &rig.board, rig.now, command, &"ana".into(), plan));
         }
         Ok(done)
     }

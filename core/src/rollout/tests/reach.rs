@@ -94,6 +94,25 @@ fn whoever_wrote_a_roll_out_does_not_approve_it_and_where_nobody_signs_in_everyb
 }
 
 #[test]
+fn a_person_does_not_approve_by_one_token_what_it_wrote_by_another() {
+    let mut rig = Rig::rooms();
+    let both = ["ota-author", "ota-approver"];
+    let of = |name: &str, person: &str| holder(name, &both).with_person(Some(person.into()));
+    let laptop = of("laptop", "anna");
+    rig.by(&laptop, &create("ro", &[])).expect("she is an author");
+    rig.by(&laptop, &verb("ro", Verb::Submit)).expect("she is an author");
+    let approve = verb("ro", Verb::Approve);
+    // A token without a person is a person of its name.
+    for own in [&of("phone", "anna"), &holder("anna", &both)] {
+        assert_eq!(rig.by(own, &approve), Err((Kind::Denied, Code::NotYourOwn)));
+    }
+    rig.by(&of("anna-s-desk", "ben"), &approve).expect("another person");
+    let Rollout { created, approved, .. } = rig.rollout("ro");
+    assert_eq!((created.actor.as_str(), created.person()), ("laptop", "anna"));
+    assert_eq!(approved.map(|act| act.person().to_owned()).as_deref(), Some("ben"));
+}
+
+#[test]
 fn a_roll_out_is_for_whoever_may_in_all_areas_that_it_is_for() {
     let mut rig = Rig::rooms();
     let anna = holder("anna", &["ota-author@hall", "viewer@quality"]);

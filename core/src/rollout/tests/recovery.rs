@@ -66,7 +66,7 @@ fn a_start_that_was_cut_short_reaches_all_robots_all_the_same() {
     let command =
         Command::Do { rollout_id: rollout_id("ro"), verb: Verb::Start { supersede: false }, reason: String::new() };
     let mut plan = Plan::default();
-    commands::apply(&mut rig.ota, &rig.board, rig.now, &command, "ana", &mut plan);
+    commands::apply(&mut rig.ota, &rig.board, rig.now, &command, &"ana".into(), &mut plan);
     assert_eq!(plan.items.len(), 2, "the second was never written");
     plan.items.truncate(1);
     rig.commit(plan.items);

@@ -3,7 +3,7 @@
 use crate::proofs::{Authority, Identity};
 use crate::world::{Client, Whole, World, whole, within};
 use http::Request;
-use midshift_core::identity::{Digest, Directory, DirectoryToken, Secret, TokenId};
+use midshift_core::identity::{Actor, Digest, Directory, DirectoryToken, Secret, TokenId};
 use midshift_core::ids::SiteId;
 use midshift_core::reason::Code;
 use midshift_core::time::{Clock, LinkDuration, Utc};
@@ -66,7 +66,7 @@ impl Port {
     pub fn knows(&self, secret: &Secret, grants: &[&str], expires_unix_ms: i64) {
         let grants = grants.iter().map(|grant| grant.parse().expect("a grant")).collect();
         let digest = Digest(sha2::Sha256::digest(secret.bytes()).into());
-        let token = DirectoryToken { name: "anna".into(), digest, grants, expires_unix_ms };
+        let token = DirectoryToken { name: "anna".into(), person: None, digest, grants, expires_unix_ms };
         self.known.publish(Directory { tokens: [(secret.id().clone(), token)].into(), denied: BTreeMap::new() });
     }
 }
@@ -112,7 +112,8 @@ async fn a_certificate_that_names_no_robot_of_this_site_is_not_let_in() {
     ];
     for stranger in &strangers {
         if let Ok(stream) = port.authority.connect(&port.world, Some(stranger)).await {
-            assert!(asked(&mut Client::over(stream).await, HEALTH, None).await.is_none());
+            let refused = code(&mut Client::over(stream).await, HEALTH, None).await;
+            assert_eq!(refused, Err(Code::KeyDenied), "it hears why");
         }
     }
     port.world.closed_times("denied", strangers.len() as u64).await;
@@ -128,9 +129,13 @@ async fn a_revoked_robot_is_cut_and_does_not_come_back_while_another_works_on() 
     port.known.publish(Directory { tokens: BTreeMap::new(), denied: [(key, i64::MAX)].into() });
     port.world.closed_for("denied").await;
     assert!(asked(&mut goes, SESSION, None).await.is_none());
-    if let Ok(stream) = port.authority.connect(&port.world, Some(&revoked)).await {
-        assert!(asked(&mut Client::over(stream).await, SESSION, None).await.is_none());
-    }
+    let stream = port.authority.connect(&port.world, Some(&revoked)).await.expect("a handshake");
+    let mut again = Client::over(stream).await;
+    let answer = asked(&mut again, SESSION, None).await.expect("it hears why");
+    assert_eq!(answer.answer().code, Some(Code::KeyDenied));
+    assert!(answer.status.message().contains("r7 was revoked"), "{}", answer.status.message());
+    port.world.closed_times("denied", 2).await;
+    assert!(asked(&mut again, SESSION, None).await.is_none(), "and is cut a moment later");
     assert_eq!(code(&mut stays, SESSION, None).await, Ok("robot:r8".to_owned()));
 }
 
@@ -192,7 +197,7 @@ async fn the_streams_of_a_token_that_was_taken_back_end_with_their_connection_an
         let token = |secret: &&Secret| {
             let digest = Digest(sha2::Sha256::digest(secret.bytes()).into());
             let grants = ["viewer".parse().expect("a grant")].into();
-            let token = DirectoryToken { name: "anna".into(), digest, grants, expires_unix_ms: i64::MAX };
+            let token = DirectoryToken { name: "anna".into(), person: None, digest, grants, expires_unix_ms: i64::MAX };
             (secret.id().clone(), token)
         };
         port.known.publish(Directory { tokens: secrets.iter().map(token).collect(), denied: BTreeMap::new() });
@@ -289,7 +294,8 @@ async fn what_a_service_denies_behind_the_port_is_told_of_as_what_the_port_denie
 
 fn said(actor: &str, path: &str, code: Code) -> Denial {
     let network = std::net::Ipv4Addr::LOCALHOST.into();
-    Denial { actor: actor.to_owned(), network, path: path.to_owned(), robot_id: None, code, left_out: 0 }
+    let actor = Actor::new(actor, (actor == "anna").then(|| TokenId::new("t1").expect("an id")));
+    Denial { actor, network, path: path.to_owned(), robot_id: None, code, left_out: 0 }
 }
 
 #[tokio::test]
@@ -342,5 +348,5 @@ async fn a_flood_of_guesses_is_told_of_a_few_times_and_counted() {
     let mut robot = port.client(Some(&port.robot("r7"))).await;
     assert_eq!(code(&mut robot, LIST, None).await, Err(Code::NotPermitted));
     let next = port.denials.try_recv().expect("told");
-    assert_eq!((next.actor.as_str(), next.left_out), ("robot:r7", left_out));
+    assert_eq!((&**next.actor.name(), next.left_out), ("robot:r7", left_out));
 }

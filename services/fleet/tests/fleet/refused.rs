@@ -41,7 +41,8 @@ async fn hundreds_of_stops_that_are_reset_at_once_all_wait_for_a_resume() {
         let (actor, reason) = ("anna".to_owned(), "a drill".to_owned());
         let engaged = crate::harness::BEGIN;
         let (scope, level) = (Scope::Fleet, StopLevel::Halt);
-        let stop = Stop { stop_id, scope, level, engaged, actor, reason, region: None, proof: Vec::new() };
+        let stop =
+            Stop { stop_id, scope, level, engaged, actor, reason, region: None, proof: Vec::new(), token_id: None };
         StopRecord { stop, reset }
     };
     for stop_id in names(200) {
@@ -55,6 +56,7 @@ async fn hundreds_of_stops_that_are_reset_at_once_all_wait_for_a_resume() {
             actor: "bert".into(),
             reason: "clear".into(),
             proof: Vec::new(),
+            token_id: None,
         };
         w.stop(&record(stop_id, Some(reset))).await;
     }

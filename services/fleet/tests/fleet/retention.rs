@@ -189,6 +189,7 @@ const STANDING: &[Table] = &[
     Table::OtaLeader,
     Table::StopRecord,
     Table::Token,
+    Table::TokenName,
     Table::RobotIdentity,
     Table::Authority,
     Table::ServerCertificate,

@@ -1,9 +1,12 @@
-//! The audit as lines: what it is of and where its chains end, then each row byte for byte as stored.
+//! Exports the audit as lines: what it is of and where its chains end, then each row byte for byte as stored.
+//!
+//! Invariant: whoever takes the audit away stands in it: the row of an export is written before the export begins, and is in it.
 
 use super::{AuditService, page, unavailable};
-use midshift_core::audit::Export;
+use midshift_core::audit::{Export, Note};
+use midshift_core::identity::Actor;
 use midshift_core::reason::{Code, Kind, Refusal};
-use midshift_core::rows::Table;
+use midshift_core::rows::{Item, Table, Writer};
 use midshift_proto::identity::v1;
 use midshift_store::Cursor;
 use tokio::sync::mpsc;
@@ -16,7 +19,8 @@ type Sender = mpsc::Sender<Result<v1::ExportAuditResponse, Status>>;
 
 impl AuditService {
     /// Sends all of it, up to the rows that are the newest now.
-    pub(super) async fn export(&self, sender: &Sender) -> Result<(), Refusal> {
+    pub(super) async fn export(&self, by: &Actor, sender: &Sender) -> Result<(), Refusal> {
+        self.note_export(by).await?;
         let heads = self.store.audit_heads().await.map_err(unavailable)?;
         let first = Export {
             format: Export::FORMAT.to_owned(),
@@ -51,6 +55,18 @@ impl AuditService {
             }
         }
         if lines.is_empty() { Ok(()) } else { send(sender, lines).await }
+    }
+
+    async fn note_export(&self, by: &Actor) -> Result<(), Refusal> {
+        let mut item = Item::new(Writer::Identity, by);
+        item.audit(Note::new("audit.export"));
+        match self.store.commit(vec![item]).await.pop() {
+            Some(Err(error)) => {
+                tracing::warn!(%error, "an export of the audit was not begun: its row cannot be written");
+                Err(Refusal::new(Kind::Unavailable, Code::StoreUnavailable))
+            }
+            _ => Ok(()),
+        }
     }
 }
 

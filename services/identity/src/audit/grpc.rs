@@ -1,7 +1,9 @@
 //! The gRPC face of the audit: decode, call, encode.
 
 use super::{AuditService, verify};
+use midshift_core::identity::Actor;
 use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_proto::access::caller;
 use midshift_proto::identity::v1;
 use midshift_proto::identity::v1::audit_service_server::AuditService as Face;
 use tokio::sync::{OwnedSemaphorePermit, mpsc};
@@ -32,12 +34,12 @@ impl Face for AuditService {
     }
     async fn export_audit(
         &self,
-        _: Request<v1::ExportAuditRequest>,
+        request: Request<v1::ExportAuditRequest>,
     ) -> Result<Response<Self::ExportAuditStream>, Status> {
         let (sender, stream) = mpsc::channel(AHEAD);
-        let (service, permit) = (self.clone(), self.permit()?);
+        let (service, permit, by) = (self.clone(), self.permit()?, Actor::from(&caller(&request)));
         tokio::spawn(async move {
-            let export = service.shutdown.run_until_cancelled(service.export(&sender)).await;
+            let export = service.shutdown.run_until_cancelled(service.export(&by, &sender)).await;
             if let Some(Err(refusal)) = export {
                 drop(sender.send(Err(status(&refusal))).await);
             } else if export.is_none() {

@@ -169,6 +169,7 @@ fn encode(row: AuditRow) -> v1::AuditRow {
         n: row.n,
         time: Some(timestamp(midshift_core::time::Utc(row.at_unix_ms))),
         actor: row.actor,
+        token_id: row.token_id,
         action: row.action,
         about: row.about,
         with: row.with,

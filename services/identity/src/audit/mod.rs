@@ -1,7 +1,7 @@
 //! The audit of all services: looked through, exported whole, and verified.
 //!
-//! Invariant: reads only. What is written is written by each service in the item of its decision, and by [`upkeep`] for what nobody decides:
-//! rows that quote the other chains, and rows that say that old ones went.
+//! Invariant: reads only, but for one row before each export. What else is written is written by each service in the item of its decision, and by
+//! [`upkeep`] for what nobody decides: rows that quote the other chains, and rows that say that old ones went.
 
 mod export;
 mod grpc;

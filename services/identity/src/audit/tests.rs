@@ -67,7 +67,7 @@ impl World {
     }
     async fn export(&self) -> Vec<String> {
         let (sender, mut messages) = mpsc::channel(1_000);
-        self.service.export(&sender).await.unwrap_or_else(|e| panic!("{e}"));
+        self.service.export(&"anna".into(), &sender).await.unwrap_or_else(|e| panic!("{e}"));
         drop(sender);
         let mut lines = Vec::new();
         while let Some(message) = messages.recv().await {
@@ -215,7 +215,10 @@ async fn an_export_holds_by_itself_and_has_the_heads_that_verify_says() {
         world.keep(writer).await;
     }
     let lines = world.export().await;
-    assert_eq!(lines.len(), 1 + 301 + 1);
+    assert_eq!(lines.len(), 1 + 301 + 1 + 1);
+    let own = world.rows(Writer::Identity).await.pop().unwrap_or_else(|| panic!("its own row"));
+    assert_eq!((own.action.as_str(), own.actor.as_str()), ("audit.export", "anna"));
+    assert!(lines[1..].iter().any(|line| line.contains("audit.export")), "it is in the export");
     let export = midshift_core::audit::Export::parse(&lines[0]).unwrap_or_else(|| panic!("an export"));
     let quoted: Vec<Mark> = lines[1..].iter().flat_map(|line| Mark::in_line(line)).collect();
     let mut held = Held::new(&export, &quoted, Utc(BEGIN));

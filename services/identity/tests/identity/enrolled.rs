@@ -180,6 +180,9 @@ async fn a_robot_renews_its_own_certificate_for_its_own_key_and_no_other() {
         asked_by(own(), RenewCertificateRequest { robot_id: robot_id.to_owned(), request_pem: machine.request() })
     };
     identity.renew_certificate(renew("r7", &machines[0])).await.expect("renewed");
+    let row = world.audited().await.pop().expect("a row");
+    assert_eq!((row.actor.as_str(), row.action.as_str()), ("robot:r7", "robot.renew"));
+    assert!(row.is_about("robot:r7") && row.with.contains_key("key"));
     let another = identity.renew_certificate(renew("r8", &machines[1])).await.expect_err("another robot");
     assert_eq!(code(&another), Some(Code::NotThisRobot));
     let key = identity.renew_certificate(renew("r7", &machines[1])).await.expect_err("another key");

@@ -2,5 +2,6 @@
 
 mod authority;
 mod enrolled;
+mod rotated;
 mod tokens;
 mod world;

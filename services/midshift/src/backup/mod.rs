@@ -14,6 +14,7 @@ mod place;
 mod releases;
 mod rows;
 mod stops;
+pub mod told;
 
 use anyhow::{Context, bail, ensure};
 use files::write;

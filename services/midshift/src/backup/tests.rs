@@ -164,7 +164,7 @@ pub async fn release(dir: &Path, data: &Path, version: u64) -> std::path::PathBu
     assert_eq!(content.settle(file).await.expect("asked"), Held::Whole);
     let key = SecretKey::read(&keys.join("targets-1.pem")).expect("a key");
     let targets = sign_targets(None, &[target], &[], NOW.plus_ms(PEOPLE_LIFE_MS), &[&key]).expect("signed");
-    let act = Act { by: "release".to_owned(), at: NOW };
+    let act = Act { by: "release".into(), at: NOW };
     repository.publish(vec![root], targets, 0, act).await.expect("published");
     keys
 }

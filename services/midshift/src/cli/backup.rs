@@ -50,6 +50,10 @@ pub async fn take(args: &Take, out: &Out) -> Result<(), Exit> {
     let from = Places { data: args.data.clone(), ota_keys: args.ota_keys.clone(), store: args.database.postgres()? };
     let summary = backup::back_up(&from, &args.to, clock::clock(1000).now().wall).await?;
     show(&summary, out)?;
+    // The backup is whole, whether or not that can be said.
+    if let Err(error) = backup::told::tell(&from.data, &summary, &args.to) {
+        out.say(&format!("warning: the audit will have no row of this backup: {error:#}"));
+    }
     out.next(&format!("midshift restore --verify --from {}", word(&args.to.to_string_lossy())));
     Ok(())
 }

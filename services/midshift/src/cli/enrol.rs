@@ -3,6 +3,7 @@
 use super::client::{Call, Exit, unary};
 use super::lookup::{self, Found, whole_id};
 use super::out::Out;
+use crate::robots::ENROLL;
 use crate::stop;
 use midshift_core::site::{self, text};
 use midshift_proto::convert::time_of;
@@ -76,7 +77,7 @@ impl Machine {
             more.iter().filter_map(|(flag, word)| Some(format!(" {flag} {}", quoted((*word)?)))).collect();
         let link = quoted(link);
         format!(
-            "MIDSHIFT_ENROLL={secret} midshift agent run --robot-id {robot_id} --server {link}{more} --data midshift-{robot_id}"
+            "{ENROLL}={secret} midshift agent run --robot-id {robot_id} --server {link}{more} --data midshift-{robot_id}"
         )
     }
 }
@@ -116,7 +117,7 @@ fn state(robot: &v1::RobotIdentity) -> String {
         (false, _, Some(_)) => "enrolled, replacement open".to_owned(),
         (false, _, None) => "enrolled".to_owned(),
         (true, _, Some(_)) => "waits for its machine".to_owned(),
-        (true, Some(_), None) => format!("revoked by {}", robot.revoked_by),
+        (true, Some(at), None) => format!("revoked by {} at {}", robot.revoked_by, time_of(at).rfc3339()),
         (true, None, None) => "never enrolled".to_owned(),
     }
 }
@@ -144,7 +145,7 @@ pub async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
 
 #[cfg(test)]
 mod tests {
-    use super::{Call, Machine, quoted};
+    use super::{Call, ENROLL, Machine, quoted};
     use crate::robots::AgentRun;
     use clap::{Args, FromArgMatches};
 
@@ -160,8 +161,9 @@ mod tests {
         let printed = machine.line("hub:7402", Some("hub:18421"), "mse.ID.SECRET.DIGEST");
         let (secret, words) = printed.split_once(" midshift agent run ").expect("an assignment and a command");
         let command = AgentRun::augment_args(clap::Command::new("run"));
-        let variable = command.get_arguments().find(|a| a.get_id() == "enroll").and_then(clap::Arg::get_env);
-        assert_eq!(variable.and_then(|name| name.to_str()), secret.strip_suffix("=mse.ID.SECRET.DIGEST"));
+        assert_eq!(secret, format!("{ENROLL}=mse.ID.SECRET.DIGEST"));
+        let argument = command.clone().try_get_matches_from(["run", "--enroll", "mse.ID.SECRET.DIGEST"]);
+        assert!(argument.is_err(), "other users of a machine see what stands on a command line");
         let taken = command.try_get_matches_from(["run"].into_iter().chain(words.split(' ')));
         let taken = AgentRun::from_arg_matches(&taken.expect("words that are known")).expect("its arguments");
         assert_eq!((taken.robot_id.as_str(), taken.server.as_str()), ("r7", "hub:7401"));

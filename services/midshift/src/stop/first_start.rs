@@ -62,6 +62,7 @@ const TABLES: &[Table] = &[
     Table::Authority,
     Table::ServerCertificate,
     Table::Token,
+    Table::TokenName,
     Table::Site,
     Table::ServiceClock,
     Table::FleetMark,
@@ -112,6 +113,7 @@ mod tests {
             reason: String::new(),
             region: None,
             proof: Vec::new(),
+            token_id: None,
         };
         let mut item = Item::new(Writer::Stop, "anna");
         item.create(&StopRecord { stop, reset: None }, "stop.copied");

@@ -94,8 +94,9 @@ impl World {
             reason: String::new(),
             region: None,
             proof: Vec::new(),
+            token_id: None,
         });
-        self.latch.reset(Reset { stop_id, at, actor, reason, proof: Vec::new() });
+        self.latch.reset(Reset { stop_id, at, actor, reason, proof: Vec::new(), token_id: None });
         self.copy_stops().await;
         let mut telemetry = Item { rows: vec![row(Table::Presence)], ..Item::new(Writer::Telemetry, "test") };
         let fact = Fact { log: Log::RobotInbox, subject: Arc::from("r1"), kind: "event", body: Arc::from("{}") };

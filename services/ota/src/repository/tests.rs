@@ -136,10 +136,10 @@ async fn an_expired_root_is_refused() {
 async fn who_published_each_bundle_is_known_also_after_a_start() {
     let (room, first) = published().await;
     let second = targets(Some(&first), &[], SEEDS.targets);
-    let act = Act { by: "anna".to_owned(), at: START };
+    let act = Act { by: "anna".into(), at: START };
     let newest = room.repository.publish(Vec::new(), second, 1, act).await.expect("the second");
     let old = newest.releases[0].digest;
-    let known = |by: &By| (by.newest().map(str::to_owned), by.bundle(&old).map(str::to_owned));
+    let known = |by: &By| (by.newest().map(|by| by.to_string()), by.bundle(&old).map(|by| by.to_string()));
     let expected = (Some("anna".to_owned()), Some("release".to_owned()));
     assert_eq!(known(&newest.by), expected);
     let again = room.restarted().await.repository.newest().expect("a release");

@@ -6,6 +6,7 @@ use crate::repository::{By, Newest};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::{ComponentKind, Manifest, Migration};
 use midshift_core::audit::Note;
+use midshift_core::identity::Actor;
 use midshift_core::ids::BundleId;
 use midshift_core::limits;
 use midshift_core::rollout::Plan;
@@ -45,13 +46,13 @@ pub fn take(view: &mut View, now: Now, newest: Option<&Newest>, plan: &mut Plan)
     listed.extend(unread.filter_map(|digest| BundleId::parse(&digest.to_string()).ok()));
     let gone = view.bundles.values().map(|b| &b.row).filter(|b| b.listed && !listed.contains(&b.bundle));
     changed.extend(gone.map(|b| Bundle { listed: false, ..b.clone() }));
-    let mut by_whom: BTreeMap<&str, Vec<Bundle>> = BTreeMap::new();
+    let mut by_whom: BTreeMap<Actor, Vec<Bundle>> = BTreeMap::new();
     for row in changed {
         by_whom.entry(publisher(newest, &row)).or_default().push(row);
     }
     for (actor, changed) in by_whom {
         for rows in changed.chunks(limits::ITEM_ROWS_MAX) {
-            plan.decide(view, now, actor, |tx| {
+            plan.decide(view, now, &actor, |tx| {
                 let about = |listed| rows.iter().filter(move |row| row.listed == listed).map(|row| &row.bundle);
                 let (listed, unlisted) = (about(true), about(false).map(ToString::to_string).collect::<Vec<_>>());
                 let note = listed.fold(Note::new("bundle.publish"), |note, bundle| note.about("bundle", bundle));
@@ -66,14 +67,14 @@ pub fn take(view: &mut View, now: Now, newest: Option<&Newest>, plan: &mut Plan)
 }
 
 /// Who listed a bundle, or published the release that lists it no more. Of a release that an older version of midshift took nobody knows.
-fn publisher<'a>(newest: Option<&'a Newest>, row: &Bundle) -> &'a str {
+fn publisher(newest: Option<&Newest>, row: &Bundle) -> Actor {
     let by = newest.map(|newest| &newest.by);
     let digest = row.bundle.as_str().parse::<Digest>().ok();
     let whom = match row.listed {
         true => digest.and_then(|digest| by?.bundle(&digest)),
         false => by.and_then(By::newest),
     };
-    whom.unwrap_or("ota")
+    whom.unwrap_or_else(|| "ota".into())
 }
 
 fn fresh(bundle: BundleId, manifest: &Manifest, manifest_length: u64, published: midshift_core::time::Utc) -> Bundle {

@@ -64,6 +64,7 @@ async fn a_robot_that_knows_of_a_reset_which_the_service_has_lost_is_not_shown_a
         actor: "a".into(),
         reason: "over".into(),
         proof: Vec::new(),
+        token_id: None,
     };
     robot.latch.reset(reset);
     let said = robot.obeying(false);

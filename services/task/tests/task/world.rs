@@ -133,10 +133,20 @@ impl World {
             actor: actor.clone(),
             reason: "clear".to_owned(),
             proof: Vec::new(),
+            token_id: None,
         };
         let (level, reason) = (StopLevel::Halt, "a drill".to_owned());
-        let stop =
-            Stop { stop_id, scope: Scope::Fleet, level, engaged: NOON, actor, reason, region: None, proof: Vec::new() };
+        let stop = Stop {
+            stop_id,
+            scope: Scope::Fleet,
+            level,
+            engaged: NOON,
+            actor,
+            reason,
+            region: None,
+            proof: Vec::new(),
+            token_id: None,
+        };
         let mut item = Item::new(Writer::Stop, "stop-follower");
         item.create(&StopRecord { stop, reset: is_reset.then_some(reset) }, "stop.copied");
         self.store.commit(vec![item]).await.pop().expect("a result").expect("applied");

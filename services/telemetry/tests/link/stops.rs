@@ -19,6 +19,7 @@ fn record(n: u8, scope: Scope) -> Result<StopRecord> {
         reason: "a pallet fell".to_owned(),
         region: None,
         proof: vec![7; 64],
+        token_id: None,
     };
     Ok(StopRecord { stop, reset: None })
 }
@@ -46,7 +47,8 @@ async fn a_stop_of_the_copy_goes_down_every_session_whole_and_once_with_its_rese
     copied(&world, &third, Expect::Absent).await;
     assert_eq!(hears(&mut robot).await?, StopFacts { stops: vec![third.stop], resets: vec![] });
     let (actor, reason) = ("bert".to_owned(), "clear".to_owned());
-    let reset = Reset { stop_id: first.stop.stop_id.clone(), at: Utc(2), actor, reason, proof: vec![8; 64] };
+    let reset =
+        Reset { stop_id: first.stop.stop_id.clone(), at: Utc(2), actor, reason, proof: vec![8; 64], token_id: None };
     copied(&world, &StopRecord { reset: Some(reset.clone()), ..first }, Expect::At(Revision(1))).await;
     assert_eq!(hears(&mut robot).await?, StopFacts { stops: vec![], resets: vec![reset] });
     Ok(())

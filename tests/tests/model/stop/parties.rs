@@ -220,7 +220,14 @@ fn names<'a>(ids: impl Iterator<Item = &'a StopId>) -> Names {
 }
 
 fn reset_of(stop: usize) -> Reset {
-    Reset { stop_id: name(0, stop), at: Utc(0), actor: String::new(), reason: String::new(), proof: Vec::new() }
+    Reset {
+        stop_id: name(0, stop),
+        at: Utc(0),
+        actor: String::new(),
+        reason: String::new(),
+        proof: Vec::new(),
+        token_id: None,
+    }
 }
 
 fn facts_of(latch: &Latch) -> Facts {
@@ -262,6 +269,7 @@ impl Parties {
             reason: String::new(),
             region: None,
             proof: Vec::new(),
+            token_id: None,
         }
     }
 

@@ -80,17 +80,29 @@ fn of_tokens(tokens: &[Token], now: Utc) -> Finding {
     let wide = good.iter().filter(is_wide).count();
     let soon: Vec<&str> =
         good.iter().filter(|t| end(t).ms_since(now) < TOKEN_LEFT_DAYS * DAY_MS).map(|t| t.name.as_str()).collect();
-    let text = format!("{} tokens are good, {wide} of them with a role for the whole site (no @AREA)", good.len());
-    match soon.is_empty() {
-        true => Finding::good("tokens", text),
-        false => Finding::look(
-            "tokens",
-            format!(
-                "{text}; within {TOKEN_LEFT_DAYS} days end: {}; make new ones in time: midshift token create",
-                names(&soon)
-            ),
-        ),
+    let mut text = format!("{} tokens are good, {wide} of them with a role for the whole site (no @AREA)", good.len());
+    let twins = twins(&good);
+    if !soon.is_empty() {
+        let soon = names(&soon);
+        text +=
+            &format!("; within {TOKEN_LEFT_DAYS} days end: {soon}; replace them in time: midshift token rotate NAME");
     }
+    if !twins.is_empty() {
+        let twins = names(&twins);
+        text += &format!(
+            "; more than one is good of the name: {twins}; revoke those that nobody uses: midshift token revoke TOKEN_ID"
+        );
+    }
+    if soon.is_empty() && twins.is_empty() { Finding::good("tokens", text) } else { Finding::look("tokens", text) }
+}
+
+/// Names that more than one good token has: an older release made them.
+fn twins<'a>(good: &[&'a Token]) -> Vec<&'a str> {
+    let mut all: Vec<&str> = good.iter().map(|token| token.name.as_str()).collect();
+    all.sort_unstable();
+    let mut twins: Vec<&str> = all.windows(2).filter(|two| two[0] == two[1]).map(|two| two[0]).collect();
+    twins.dedup();
+    twins
 }
 
 fn names(all: &[&str]) -> String {
@@ -168,6 +180,9 @@ mod tests {
         );
         let found = of_tokens(&[token("wall", &["stop-only"], 13)], NOW);
         assert!(!found.good && found.text.contains("within 14 days end: wall;"), "{}", found.text);
+        let twins = [token("anna", &["viewer"], 90), token("bert", &["viewer"], 90), token("anna", &["viewer"], 90)];
+        let found = of_tokens(&twins, NOW);
+        assert!(!found.good && found.text.contains("more than one is good of the name: anna;"), "{}", found.text);
         assert_eq!(names(&["a", "b", "c", "d", "e", "f", "g"]), "a, b, c, d, e and 2 more");
     }
 

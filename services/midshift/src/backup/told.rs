@@ -1,0 +1,165 @@
+//! Tells the server of a data directory that a backup of it was made, and leaves the row of the audit for it.
+//!
+//! Invariant: whoever copies files writes no rows: the store belongs to the server. The backup leaves a small file in the data directory, and a server
+//! with it, now or at its next start, writes the row and then takes the file away. A row is never lost, and comes once in each life of a server at most.
+//! The name of whoever made the backup is the one of the operating system: nobody signed in for it.
+
+use super::Summary;
+use anyhow::Context;
+use midshift_agent::durable;
+use midshift_core::audit::Note;
+use midshift_core::rows::{Item, Writer};
+use midshift_core::time::Utc;
+use midshift_store::{CommitError, Store};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// Folder of the data directory.
+pub const FOLDER: &str = "backups-made";
+/// What it is called in the audit.
+const ACTION: &str = "backup.make";
+/// How often a server looks, real time.
+const LOOK_EVERY: Duration = Duration::from_secs(2);
+/// Bytes of such a file at most.
+const BYTES_MAX: u64 = 16 * 1024;
+
+/// A backup that was made.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+struct Made {
+    /// Who, as the operating system knows it: `os:UID`.
+    by: String,
+    /// Where to, as it was asked for.
+    to: String,
+    /// When it was begun, unix ms.
+    begun_unix_ms: i64,
+    /// Names of its parts.
+    parts: Vec<String>,
+}
+
+/// Leaves the file for the server of `data`.
+///
+/// # Errors
+/// The disk.
+pub fn tell(data: &Path, summary: &Summary, to: &Path) -> anyhow::Result<()> {
+    let folder = data.join(FOLDER);
+    durable::make_folder(&folder).with_context(|| format!("making {}", folder.display()))?;
+    let Utc(begun_unix_ms) = summary.begun;
+    let by = format!("os:{}", rustix::process::getuid().as_raw());
+    let parts = summary.parts.iter().map(|(name, ..)| name.clone()).collect();
+    let made = Made { by, to: to.display().to_string(), begun_unix_ms, parts };
+    let path = folder.join(format!("{begun_unix_ms}-{:08x}.json", rand::random::<u32>()));
+    durable::replace(&path, &serde_json::to_vec(&made)?).with_context(|| format!("writing {}", path.display()))?;
+    // Whoever made the backup may be another user than the server; the data directory is closed to others.
+    fs::set_permissions(&path, fs::Permissions::from_mode(0o644)).with_context(|| format!("opening {}", path.display()))
+}
+
+/// Writes rows of backups that were made, until it is dropped.
+pub async fn run(data: &Path, store: &dyn Store) {
+    let (mut failing, mut written) = (false, BTreeSet::new());
+    // Its own, so that it may take away what another user put there.
+    if let Err(error) = durable::make_folder(&data.join(FOLDER)) {
+        tracing::warn!(%error, "there is no folder for the word of backups");
+    }
+    loop {
+        let taken = take_all(data, store, &mut written).await;
+        if let (Err(error), false) = (&taken, failing) {
+            tracing::warn!(error = format!("{error:#}"), "a backup that was made is not in the audit yet");
+        }
+        failing = taken.is_err();
+        tokio::time::sleep(LOOK_EVERY).await;
+    }
+}
+
+/// Writes a row for each file that lies there and is not among those `written`, and takes the file away.
+///
+/// # Errors
+/// The disk or the store; what is left is done another time.
+async fn take_all(data: &Path, store: &dyn Store, written: &mut BTreeSet<PathBuf>) -> anyhow::Result<()> {
+    for path in super::files::entries(&data.join(FOLDER))? {
+        if path.extension().is_none_or(|ending| ending != "json") {
+            continue;
+        }
+        if !written.contains(&path) {
+            match store.commit(vec![row(&path)]).await.pop() {
+                Some(Err(error @ (CommitError::Unavailable(_) | CommitError::Unknown(_)))) => {
+                    return Err(error).context("writing the row of a backup");
+                }
+                Some(Err(error)) => tracing::error!(%error, "a row of the audit was composed wrongly"),
+                _ => {}
+            }
+            written.insert(path.clone());
+        }
+        fs::remove_file(&path).with_context(|| format!("removing {}", path.display()))?;
+        written.remove(&path);
+    }
+    Ok(())
+}
+
+/// The row for a file.
+fn row(path: &Path) -> Item {
+    let (by, note) = match made(path) {
+        Ok(Made { by, to, begun_unix_ms, parts }) => {
+            let note = Note::new(ACTION).with("to", to).with("parts", parts.join(" "));
+            (by, note.with("begun_unix_ms", begun_unix_ms))
+        }
+        Err(error) => {
+            tracing::warn!(error = format!("{error:#}"), path = %path.display(), "this is no word of a backup");
+            ("os:unknown".to_owned(), Note::new(ACTION).with("unreadable", true))
+        }
+    };
+    let mut item = Item::new(Writer::Identity, &by);
+    item.audit(note);
+    item
+}
+
+fn made(path: &Path) -> anyhow::Result<Made> {
+    let bytes = path.metadata()?.len();
+    anyhow::ensure!(bytes <= BYTES_MAX, "it has {bytes} bytes");
+    Ok(serde_json::from_slice(&fs::read(path)?)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use midshift_core::audit::AuditRow;
+    use midshift_core::ids::SiteId;
+    use midshift_core::rows::Table;
+    use midshift_core::time::ScaledClock;
+    use midshift_store::{MemoryStore, Query, StoreId};
+    use std::sync::Arc;
+
+    #[tokio::test]
+    async fn a_backup_of_files_is_one_row_of_the_audit_once_a_server_has_the_folder() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let clock = Arc::new(ScaledClock::new(|| 0, Utc(1_000_000), 1000));
+        let store = MemoryStore::new(SiteId::parse("s").expect("a site"), StoreId("store-1".into()), clock);
+        let mut written = BTreeSet::new();
+        take_all(dir.path(), &store, &mut written).await.expect("nothing lies there");
+        let parts = vec![("rows".to_owned(), 1, 2), ("stops".to_owned(), 1, 2)];
+        let summary = Summary { site_id: "s".to_owned(), begun: Utc(5), parts };
+        tell(dir.path(), &summary, Path::new("/mnt/backup")).expect("told");
+        fs::write(dir.path().join(FOLDER).join("torn.json"), "{").expect("written");
+        for _ in 0..2 {
+            take_all(dir.path(), &store, &mut written).await.expect("written");
+        }
+        let rows = store.list(Query::all(Table::IdentityAudit)).await.expect("rows");
+        let rows: Vec<AuditRow> = rows.iter().map(|row| serde_json::from_str(&row.body).expect("a row")).collect();
+        assert_eq!(rows.len(), 2, "each once; what cannot be read is told too");
+        let (row, with) = (&rows[0], |name: &str| rows[0].with.get(name).map(String::as_str));
+        assert_eq!(
+            (row.action.as_str(), with("to"), with("parts")),
+            ("backup.make", Some("/mnt/backup"), Some("rows stops"))
+        );
+        assert_eq!((with("begun_unix_ms"), row.actor.starts_with("os:")), (Some("5"), true));
+        assert_eq!(fs::read_dir(dir.path().join(FOLDER)).expect("a folder").count(), 0);
+        // A file that cannot be taken away leaves no second row.
+        fs::write(dir.path().join(FOLDER).join("stays.json"), "{}").expect("written");
+        written.insert(dir.path().join(FOLDER).join("stays.json"));
+        take_all(dir.path(), &store, &mut written).await.expect("taken away");
+        assert_eq!(store.list(Query::all(Table::IdentityAudit)).await.expect("rows").len(), 2);
+    }
+}
