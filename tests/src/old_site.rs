@@ -156,7 +156,7 @@ impl OldSite {
     /// A roll-out by which each robot that works got its bundle; the last one's is what they run.
     pub fn rollout(&self, number: u64) -> Item {
         let at = Utc(self.from.0 + 2 * DAY_MS * number as i64);
-        let act = Act { actor: "anna".to_owned(), reason: String::new(), at };
+        let act = Act { actor: "anna".to_owned(), person: None, reason: String::new(), at };
         let bundle = bundle(number);
         let rollout_id = RolloutId::parse(&format!("old-rollout-{number}")).expect("an id");
         let mut ota = Item::new(Writer::Ota, "ota");

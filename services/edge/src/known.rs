@@ -151,8 +151,8 @@ mod tests {
         let known = Known::new(SiteId::parse("factory").expect("a site"), clock);
         let id = TokenId::new("t1").expect("an id");
         let expires_unix_ms = 1_000_000 + HOUR_MS.cast_signed();
-        let token =
-            DirectoryToken { name: "anna".into(), digest: Digest([7; 32]), grants: Arc::from([]), expires_unix_ms };
+        let (name, digest, person) = ("anna".into(), Digest([7; 32]), None);
+        let token = DirectoryToken { name, person, digest, grants: Arc::from([]), expires_unix_ms };
         let directory = Directory { tokens: [(id.clone(), token)].into(), denied: BTreeMap::new() };
         known.publish(directory.clone());
         let peer = Peer::new(([127, 0, 0, 1], 1).into(), None, ConnectionId(1));

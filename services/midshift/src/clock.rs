@@ -15,12 +15,20 @@ pub fn wall() -> Utc {
 
 /// Clocks that start now; the site clock runs `rate_permille` thousandths of real time. One that is not real is a simulation's own, with its wall.
 pub fn clock(rate_permille: u32) -> Arc<dyn Clock> {
-    let started = Instant::now();
-    let micros = move || u64::try_from(started.elapsed().as_micros()).unwrap_or(u64::MAX);
     match rate_permille {
-        1000 => Arc::new(WallClock::new(micros, wall, log)),
-        _ => Arc::new(ScaledClock::new(micros, wall(), rate_permille)),
+        1000 => Arc::new(WallClock::new(micros(), wall, log)),
+        _ => at(wall(), rate_permille),
     }
+}
+
+/// Clocks whose UTC is `utc` now, whatever the wall says later.
+pub fn at(utc: Utc, rate_permille: u32) -> Arc<dyn Clock> {
+    Arc::new(ScaledClock::new(micros(), utc, rate_permille))
+}
+
+fn micros() -> impl Fn() -> u64 + Send + Sync {
+    let started = Instant::now();
+    move || u64::try_from(started.elapsed().as_micros()).unwrap_or(u64::MAX)
 }
 
 fn log(jump: &Jump) {

@@ -58,8 +58,11 @@ struct Players {
     playing: BTreeSet<String>,
     gone: BTreeSet<String>,
     deeds: BTreeMap<&'static str, u64>,
-    ends: Vec<(String, BTreeMap<String, (u64, bool)>)>,
+    ends: Vec<(String, Ends)>,
 }
+
+/// Attempts that a player ended, by name: how often, and whether as done.
+type Ends = BTreeMap<String, (u64, bool)>;
 
 type Shared = Arc<Mutex<Players>>;
 

@@ -130,12 +130,14 @@ fn a_stop_that_was_reset_is_not_looked_at_again() {
         reason: String::new(),
         region: None,
         proof: Vec::new(),
+        token_id: None,
     };
     let mut record = StopRecord { stop, reset: None };
     rig.absorb(&record);
     assert_eq!(rig.view.engaged.len(), 1);
     let reason = "all clear".to_owned();
-    record.reset = Some(Reset { stop_id, at: rig.now.utc, actor: "me".into(), reason, proof: Vec::new() });
+    record.reset =
+        Some(Reset { stop_id, at: rig.now.utc, actor: "me".into(), reason, proof: Vec::new(), token_id: None });
     let row = Row { key: record.key(), revision: Revision(2), index: record.index(), body: record.body() };
     rig.view.absorb(&row.key, row.revision, Some(&row)).expect("a row of ours");
     assert_eq!((rig.view.engaged.len(), rig.view.stops.len()), (0, 1));

@@ -248,7 +248,7 @@ async fn an_incident_is_found_by_the_beginning_of_its_id_open_or_closed() {
     let common = first.bytes().zip(second.bytes()).take_while(|(a, b)| a == b).count();
     assert_eq!(begin(&first[..common], false).await, all);
     for id in [first, second] {
-        assert_eq!(begin(&id[..=common], false).await, [id.clone()]);
+        assert_eq!(begin(&id[..=common], false).await, std::slice::from_ref(id));
     }
     assert_eq!(begin("~", false).await, Vec::<String>::new());
     let close = v1::CloseIncidentRequest {
@@ -258,7 +258,7 @@ async fn an_incident_is_found_by_the_beginning_of_its_id_open_or_closed() {
     };
     w.fleet.close_incident(Request::new(close)).await.expect("is closed");
     assert_eq!(begin(first, false).await, Vec::<String>::new());
-    assert_eq!(begin(&first[..=common], true).await, [first.clone()]);
+    assert_eq!(begin(&first[..=common], true).await, std::slice::from_ref(first));
     w.lawful().await;
 }
 

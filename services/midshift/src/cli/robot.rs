@@ -207,7 +207,7 @@ pub async fn find(call: &Call, typed: &str) -> Result<String, Exit> {
         let filter = Some(v1::RobotFilter { robot_id_prefix: typed.to_owned(), ..v1::RobotFilter::default() });
         let request = v1::ListRobotsRequest { filter, page_size: lookup::SHOWN, page_token: String::new() };
         let page = client.list_robots(unary(request)).await?.into_inner();
-        let row = |robot: &v1::Robot| vec![presence(robot)];
+        let row = |robot: &v1::Robot| vec![table::presence(robot)];
         Ok(Found::page(&page.robots, &page.next_page_token, |r| &r.robot_id, row))
     };
     whole_id("robot", typed, listed).await

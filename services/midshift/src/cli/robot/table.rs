@@ -112,7 +112,7 @@ fn decided(control: &fleet::RobotControl, now: Option<Utc>) -> Vec<String> {
 }
 
 /// Whether it is heard, and if not since when; with a star if only its launcher is, which nobody proves.
-fn presence(robot: &v1::Robot) -> String {
+pub fn presence(robot: &v1::Robot) -> String {
     if robot.beacon.is_some() {
         return "UPDATING*".to_owned();
     }

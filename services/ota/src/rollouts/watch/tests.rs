@@ -63,7 +63,7 @@ fn soaking(bundle: BundleId) -> Rollout {
         superseded_by: None,
         tasks: FailureEvidence::default(),
         counted: Arc::default(),
-        created: Act { actor: "ana".into(), reason: String::new(), at: Utc(0) },
+        created: Act { person: None, actor: "ana".into(), reason: String::new(), at: Utc(0) },
         approved: None,
         started: Some(Utc(0)),
         resumed: None,
