@@ -373,8 +373,11 @@ pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Pl
     if pace == Pace::Sweep || view.stops_changed {
         stops::plan(view, board, now, plan);
     }
+    plan.slice.renew();
     drain::obey(view, now, plan);
+    plan.slice.renew();
     budget::plan(view, board, now, plan);
+    plan.slice.renew();
     drain::plan(view, board, now, plan);
     plan.slice.renew();
     queue::settle(view, now, plan);
