@@ -161,7 +161,7 @@ impl Plan {
 pub const LOGS: &[Log] = &[Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox, Log::Ota, Log::Stop, Log::Identity];
 
 /// Takes entries of the feed, in commit order: rows into the view, requests and robots' events into decisions.
-pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
+pub fn absorb(view: &mut View, now: Now, board: &Board, entries: &[Entry], plan: &mut Plan) {
     let consumed = view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq);
     for entry in entries {
         take_row(view, entry, &mut plan.report.unreadable);
@@ -177,7 +177,7 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
                 Ok(said) => {
                     let mut tally = plan.report.tally;
                     let is_obeyed = plan.decide(view, now, said.robot_id.as_str(), |tx| {
-                        inbox::take(tx, &said, &mut tally);
+                        inbox::take(tx, &said, board, &mut tally);
                         mark(tx, entry.seq);
                     });
                     plan.report.tally = tally;

@@ -374,7 +374,7 @@ impl Loop {
                 self.news |= !is_lease && !is_own;
             }
             self.seat.follow(some, clock.now().link)?;
-            absorb(&mut self.view, now, some, plan);
+            absorb(&mut self.view, now, &self.board, some, plan);
             if let Some(last) = some.last().filter(|_| plan.slice.is_spent()) {
                 next = last.seq.min(next);
                 break;
