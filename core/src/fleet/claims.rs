@@ -87,10 +87,13 @@ fn is_near(view: &View, live: &Live, place_id: &PlaceId) -> bool {
     Region::of_zone(&view.site, place_id).is_some_and(|region| region.is_near(pose, limits::CLAIMED_PLACE_MARGIN_MM))
 }
 
-/// The robot's event says that it entered a place which it does not hold, and it does not stand near: what its heartbeat says comes first.
+/// The robot's event says that it entered a place which it does not hold, and by the pose of this session it does not stand near: what its
+/// next heartbeat says comes first.
 pub fn waits_for_heartbeat(view: &View, board: &Board, robot_id: &RobotId, place_id: &PlaceId) -> bool {
     let is_held = view.places.get(place_id.as_str()).is_some_and(|place| place.row.holder(robot_id).is_some());
-    let live = board.get(robot_id).filter(|live| live.report.vitals.pose.is_some());
+    let session = view.sessions.get(robot_id.as_str()).map(|s| s.row.session_epoch);
+    let live = board.get(robot_id).filter(|live| Some(live.report.session_epoch) == session);
+    let live = live.filter(|live| live.report.vitals.pose.is_some());
     live.is_some_and(|live| !is_held && !is_near(view, live, place_id))
 }
 
