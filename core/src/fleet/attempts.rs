@@ -52,6 +52,7 @@ pub fn fresh_attempt(tx: &Tx, attempt: AttemptId, robot_id: &RobotId, offer: cra
         uncertain: None,
         offer,
         step_index: 0,
+        reported: None,
         opened: false,
         offered: tx.now.utc,
         accepted: None,
@@ -61,6 +62,12 @@ pub fn fresh_attempt(tx: &Tx, attempt: AttemptId, robot_id: &RobotId, offer: cra
         stats: WorkStats::default(),
         software,
     }
+}
+
+/// Notes how far the robot's report says that the attempt is.
+pub(super) fn note_step(a: &mut Attempt, step_index: u32) {
+    a.step_index = a.step_index.max(step_index);
+    a.reported = a.reported.max(Some(step_index));
 }
 
 /// Takes the robot's mutex for an attempt: the update of one row that two planners cannot both make.

@@ -79,6 +79,9 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
     keep_rows(view, now, &areas, plan);
     waiting.sort_by_cached_key(|d| (!d.urgent, cost(view, &d.robot_id), d.since, d.drain_id.clone()));
     for drain in waiting {
+        if plan.is_cut() {
+            return;
+        }
         let here = objects::area_of(view, board, &drain.robot_id);
         let why = match (&here, view.drain_of(&drain.robot_id)) {
             (_, Some(other)) => Some(Reason::from(Code::RobotDraining).with("drain_id", &other.drain_id)),
@@ -123,6 +126,9 @@ fn keep_rows(view: &mut View, now: Now, areas: &BTreeMap<AreaId, Area>, plan: &m
     let none = Area::default();
     let known: Vec<AreaId> = view.budgets.values().map(|b| b.row.area_id.clone()).collect();
     for area_id in known {
+        if plan.is_cut() {
+            return;
+        }
         let area = areas.get(&area_id).unwrap_or(&none);
         let row = row_of(view, &area_id, area);
         if view.budgets.get(area_id.as_str()).is_some_and(|b| b.row != row) {

@@ -1,22 +1,27 @@
 //! What robots say of places: whose word is taken, and how far.
 //!
 //! 1. A place that we granted to a robot always counts as held once it says so.
-//! 2. Of places without a grant of ours at most [`limits::CLAIMED_PLACES_MAX`] are taken over: those near its pose first.
-//! 3. A robot that says more is believed no further, frees nothing, and gets no work and no grant until it says less.
+//! 2. Of places without a grant of ours at most [`limits::CLAIMED_PLACES_MAX`] are taken over: those near its pose first, so one that only an
+//!    event tells and that is not near waits for the next heartbeat.
+//! 3. A robot that says more is believed no further, frees nothing, and gets no work and no grant until it says less, or until a person has
+//!    closed the incident that names these places.
 //! 4. Two robots inside one exclusive place are an incident for each pair; nobody else is let in.
 //!
 //! Called by `inbox` for events and by `repair` for heartbeats. Invariant: no word of a robot frees the place of another.
 
 use super::rows::{HolderState, Incident, Place, PlaceHolder};
 use super::view::View;
-use super::{Plan, Tx, inbox, incidents};
+use super::{Board, Plan, Tx, inbox, incidents};
 use crate::ids::{PlaceId, RobotId};
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::stop::Region;
 use crate::time::Now;
 use crate::work::{Live, PlaceNews};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// What an incident calls the places that a robot says it is inside of.
+const PLACES: &str = "places";
 
 /// One difference: the place, the grant, and what the robot says happened.
 type Difference = (PlaceId, u64, PlaceNews);
@@ -24,7 +29,7 @@ type Difference = (PlaceId, u64, PlaceNews);
 /// Brings place rows to what a settled robot reports: entered, gone, or standing somewhere nobody knew of. What is not `sound` frees nothing.
 pub fn repair(view: &mut View, now: Now, live: &Live, sound: bool, plan: &mut Plan) {
     let robot_id = &live.robot_id;
-    let excess = too_many(view, live);
+    let excess = excess(view, live);
     let mut changes = differences(view, live);
     changes.retain(|(_, _, news)| (sound && excess.is_none()) || *news == PlaceNews::Entered);
     for some in changes.chunks(limits::PLACES_PER_ITEM) {
@@ -34,7 +39,8 @@ pub fn repair(view: &mut View, now: Now, live: &Live, sound: bool, plan: &mut Pl
             }
         });
     }
-    if let Some(why) = excess {
+    if let Some(claims) = excess {
+        let why = implausible().with(PLACES, Vec::from_iter(claims).join(" "));
         plan.decide(view, now, "fleet", |tx| {
             incidents::open_about(tx, why, Some(robot_id), "");
         });
@@ -81,35 +87,58 @@ fn is_near(view: &View, live: &Live, place_id: &PlaceId) -> bool {
     Region::of_zone(&view.site, place_id).is_some_and(|region| region.is_near(pose, limits::CLAIMED_PLACE_MARGIN_MM))
 }
 
+/// The robot's event says that it entered a place which it does not hold, and by the pose of this session it does not stand near: what its
+/// next heartbeat says comes first.
+pub fn waits_for_heartbeat(view: &View, board: &Board, robot_id: &RobotId, place_id: &PlaceId) -> bool {
+    let is_held = view.places.get(place_id.as_str()).is_some_and(|place| place.row.holder(robot_id).is_some());
+    let session = view.sessions.get(robot_id.as_str()).map(|s| s.row.session_epoch);
+    let live = board.get(robot_id).filter(|live| Some(live.report.session_epoch) == session);
+    let live = live.filter(|live| live.report.vitals.pose.is_some());
+    live.is_some_and(|live| !is_held && !is_near(view, live, place_id))
+}
+
 /// Places without a grant of ours that the robot holds already.
 fn taken_over(view: &View, robot_id: &RobotId) -> usize {
     super::view::held(view, robot_id).filter(|(_, holder)| holder.claimed).count()
 }
 
-/// The robot says that it is inside of more places without a grant than it can be.
+/// The robot says that it is inside of more places without a grant than it can be, and no person has looked at that.
 pub fn too_many(view: &View, live: &Live) -> Option<Reason> {
+    excess(view, live).map(|_| implausible())
+}
+
+fn implausible() -> Reason {
+    Reason::from(Code::PlacesImplausible).with("most", limits::CLAIMED_PLACES_MAX)
+}
+
+/// Places without a grant that the robot says it is inside of, if they are more than it can be inside of and no person has looked at that.
+fn excess<'l>(view: &View, live: &'l Live) -> Option<BTreeSet<&'l str>> {
     let robot_id = &live.robot_id;
     let is_claim = |id: &PlaceId| {
         let place = view.places.get(id.as_str()).map(|place| &place.row);
         place.is_some_and(|place| place.holder(robot_id).is_none_or(|holder| holder.claimed))
     };
-    let claims = live.report.places.iter().filter(|p| p.inside && is_claim(&p.place_id)).count();
-    let reason = || Reason::from(Code::PlacesImplausible).with("most", limits::CLAIMED_PLACES_MAX);
-    (claims > limits::CLAIMED_PLACES_MAX).then(reason)
+    let inside = live.report.places.iter().filter(|p| p.inside).map(|p| &p.place_id);
+    let claims: BTreeSet<&str> = inside.filter(|id| is_claim(id)).map(PlaceId::as_str).collect();
+    (claims.len() > limits::CLAIMED_PLACES_MAX && !is_looked_at(view, robot_id, &claims)).then_some(claims)
+}
+
+/// A person closed an incident that names all of these places.
+fn is_looked_at(view: &View, robot_id: &RobotId, claims: &BTreeSet<&str>) -> bool {
+    let is_closed = |i: &&Incident| {
+        i.closed.is_some() && i.reason.code == Code::PlacesImplausible && i.robot_id.as_ref() == Some(robot_id)
+    };
+    view.incidents.values().map(|i| &i.row).filter(is_closed).any(|incident| {
+        let named = incident.reason.metadata.get(PLACES).map(|places| places.split(' ').collect::<BTreeSet<_>>());
+        named.is_some_and(|named| claims.is_subset(&named))
+    })
 }
 
 /// A robot is where the rows do not know of it: its word is taken, whatever the capacity, before the place is given to another one.
 pub fn take_over(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: u64) {
+    check_grant(tx, robot_id, place_id, grant_id);
     let Some(mut place) = tx.view.places.get(place_id.as_str()).map(|p| p.row.clone()) else { return };
-    if place.holder(robot_id).is_some() {
-        return;
-    }
-    let is_blamed = grant_id != 0 || tx.view.bugs.claims_are_blamed();
-    if is_blamed && !place.cleared.contains(&grant_id) && !is_ahead(tx.view, robot_id, &tx.now) {
-        let reason = Reason::from(Code::GrantUnknown).with("place_id", place_id).with("grant_id", grant_id);
-        incidents::open_about(tx, reason, Some(robot_id), "place_id");
-    }
-    if taken_over(tx.view, robot_id) >= limits::CLAIMED_PLACES_MAX {
+    if place.holder(robot_id).is_some() || taken_over(tx.view, robot_id) >= limits::CLAIMED_PLACES_MAX {
         return;
     }
     let (robot_id, since) = (robot_id.clone(), tx.now.utc);
@@ -137,6 +166,18 @@ pub fn is_ahead(view: &View, robot_id: &RobotId, now: &Now) -> bool {
     let given = view.desired_work.get(robot_id.as_str()).map_or(0, |d| d.row.generation);
     view.sessions.get(robot_id.as_str()).is_some_and(|s| s.row.followed_work() > given)
         || told.into_iter().any(|i| now.ms_since(i.opened) <= limits::RESTORED_LATELY.as_ms())
+}
+
+/// A robot entered on a grant that nobody gave it, of a place that it holds or not: people are told.
+pub fn check_grant(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: u64) {
+    let Some(place) = tx.view.places.get(place_id.as_str()).map(|p| &p.row) else { return };
+    let is_held = place.holder(robot_id).is_some_and(|holder| holder.grant_id == grant_id);
+    let is_blamed = grant_id != 0 || tx.view.bugs.claims_are_blamed();
+    if !is_blamed || is_held || place.cleared.contains(&grant_id) || is_ahead(tx.view, robot_id, &tx.now) {
+        return;
+    }
+    let reason = Reason::from(Code::GrantUnknown).with("place_id", place_id).with("grant_id", grant_id);
+    incidents::open_about(tx, reason, Some(robot_id), "place_id");
 }
 
 /// A robot is inside of the place now: with more inside than it holds, people are told of each pair that it makes.

@@ -71,6 +71,9 @@ pub fn obey(view: &mut View, now: Now, plan: &mut Plan) {
         .map(|d| (d.row.robot_id.clone(), d.row.drain_id.clone()))
         .collect();
     for (robot_id, drain_id) in released {
+        if plan.is_cut() {
+            return;
+        }
         plan.decide(view, now, "ota", |tx| {
             tx.rely::<DrainRelease>(drain_id.as_str());
             give_back(tx, &robot_id, &drain_id);
@@ -80,6 +83,9 @@ pub fn obey(view: &mut View, now: Now, plan: &mut Plan) {
     let asked: Vec<DrainRequest> =
         view.drain_requests.iter().filter(|(id, _)| is_new(id)).map(|(_, r)| r.row.clone()).collect();
     for request in asked {
+        if plan.is_cut() {
+            return;
+        }
         plan.decide(view, now, "ota", |tx| {
             tx.rely::<DrainRequest>(request.drain_id.as_str());
             tx.rely::<DrainRelease>(request.drain_id.as_str());
@@ -107,6 +113,9 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
     let open: Vec<Drain> =
         view.drains.values().map(|d| &d.row).filter(|d| d.state == DrainState::Draining).cloned().collect();
     for drain in open {
+        if plan.is_cut() {
+            return;
+        }
         if view.drain_of(&drain.robot_id).is_some_and(|first| first.drain_id != drain.drain_id) {
             continue;
         }

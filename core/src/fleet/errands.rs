@@ -152,7 +152,7 @@ pub fn report(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
         return;
     }
     let Some(mut a) = tx.view.attempt(&report.attempt).cloned() else { return };
-    a.step_index = a.step_index.max(report.step_index);
+    attempts::note_step(&mut a, report.step_index);
     a.stats = report.stats;
     a.fault = report.fault.clone().or(a.fault);
     a.refusal = report.refusal.clone().or(a.refusal);

@@ -5,7 +5,7 @@
 use super::Tx;
 use super::rows::{HoldToken, HolderState, RobotControl};
 use super::tasks::{News, event_of, happen};
-use super::{Tally, answers, claims, errands, incidents, plausible, tasks};
+use super::{Board, Tally, answers, claims, errands, incidents, plausible, tasks};
 use crate::ids::{PlaceId, RobotId};
 use crate::reason::{Code, Reason};
 use crate::robot::{HardwareStop, Load, Mode};
@@ -15,12 +15,17 @@ use crate::work::{
 };
 
 /// Obeys one entry of the robot inbox.
-pub fn take(tx: &mut Tx, entry: &InboxEntry, tally: &mut Tally) {
+pub fn take(tx: &mut Tx, entry: &InboxEntry, board: &Board, tally: &mut Tally) {
     let InboxItem::Sample(sample) = &entry.what else { return };
     let SampleBody::Event(event) = &sample.body else { return };
     let robot_id = &entry.robot_id;
     match event {
         RobotEvent::Attempt(report) => attempt(tx, robot_id, report, tally),
+        RobotEvent::Place { place_id, grant_id, news: PlaceNews::Entered }
+            if claims::waits_for_heartbeat(tx.view, board, robot_id, place_id) =>
+        {
+            claims::check_grant(tx, robot_id, place_id, *grant_id);
+        }
         RobotEvent::Place { place_id, grant_id, news } => place(tx, robot_id, place_id, *grant_id, *news),
         RobotEvent::Mode(mode) => mode_changed(tx, robot_id, *mode),
         RobotEvent::HardwareStop(stop) => hardware_stop(tx, robot_id, *stop),

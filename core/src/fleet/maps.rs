@@ -1,7 +1,7 @@
 //! Changed maps: what stands in the way of one (tasks that are to go where it has nothing, robots under way there, places that are held), and
 //! robots that drive by another one.
 //!
-//! Called at a start, before anybody plans, and with each heartbeat that is compared. Invariant: a map is taken only if what the rows say of
+//! Called at a start, before a process begins to plan, and with each heartbeat that is compared. Invariant: a map is taken only if what the rows say of
 //! the floor is true of it too, or if a person forces it; then each thing in the way is an incident.
 
 use super::incidents;
@@ -10,7 +10,7 @@ use super::view::View;
 use super::{Plan, Tx};
 use crate::ids::{PlaceId, RobotId, TaskId, WaypointId};
 use crate::reason::{Code, Reason};
-use crate::site::{Site, WaypointIx};
+use crate::site::{Site, WaypointIx, read_stored};
 use crate::time::Now;
 use crate::work::{Live, RoutePoint};
 use std::collections::BTreeMap;
@@ -60,9 +60,33 @@ pub enum MapChange {
     },
 }
 
-/// What is in the way of `new` by the rows of `view`, which stands on the stored map.
-pub fn in_the_way(view: &View, new: &Site) -> Vec<Obstacle> {
-    let stored = &view.site;
+impl MapChange {
+    /// What a person has taken into account.
+    fn forced(&self) -> &[Obstacle] {
+        match self {
+            Self::Forced { obstacles } => obstacles,
+            Self::Taken | Self::NotTaken { .. } => &[],
+        }
+    }
+}
+
+/// Why a process that begins to plan must not write its map, which `view` stands on, over the stored one: this is another one than at its
+/// start, or something is in the way now that was not when it chose. It chooses anew in its next start.
+pub fn outdated(view: &View, site_text: &str, at_start: Option<&str>, change: &MapChange) -> Option<Reason> {
+    let stored = view.sites.get(view.site.site_id().as_str()).map(|s| &s.row).filter(|row| row.text != site_text)?;
+    let reason = |obstacles: &[Obstacle]| not_taken(&stored.map_version, view.site.map_version(), obstacles);
+    if at_start != Some(stored.text.as_str()) {
+        return Some(reason(&[]));
+    }
+    // Of a text that is no site nobody can say what is in the way.
+    let stored_site = read_stored(stored.site_id.as_str(), &stored.text).ok()?;
+    let obstacles = in_the_way(view, &stored_site, &view.site);
+    let is_new = |obstacle: &Obstacle| !change.forced().contains(obstacle);
+    obstacles.iter().any(is_new).then(|| reason(&obstacles))
+}
+
+/// What is in the way of `new` by the rows of `view`, which were written by the stored map.
+pub fn in_the_way(view: &View, stored: &Site, new: &Site) -> Vec<Obstacle> {
     let differs = |name: &WaypointId| point(stored, name) != point(new, name);
     let goes_there = |id: &TaskId| view.intake(id).is_some_and(|intake| intake.spec.goals(0).any(differs));
     let live = view.tasks.values().map(|task| &task.row).filter(|task| !task.phase.is_terminal());
@@ -129,7 +153,7 @@ pub(super) fn tell_of_change(view: &mut View, now: Now, change: &MapChange, plan
     let id = format!("{}:{}", Code::MapNotTaken, view.site.site_id());
     let open = view.incidents.get(&id).map(|i| &i.row).filter(|i| i.closed.is_none()).map(|i| i.reason.clone());
     if let MapChange::NotTaken { version, obstacles } = change {
-        let reason = not_taken(&view.site, version, obstacles);
+        let reason = not_taken(view.site.map_version(), version, obstacles);
         if open.as_ref() != Some(&reason) {
             plan.decide(view, now, "fleet", |tx| incidents::open_as(tx, id, reason, None, None));
         }
@@ -144,8 +168,8 @@ pub(super) fn tell_of_change(view: &mut View, now: Now, change: &MapChange, plan
     }
 }
 
-fn not_taken(stored: &Site, version: &str, obstacles: &[Obstacle]) -> Reason {
-    let reason = Reason::from(Code::MapNotTaken).with("map_version", version).with("stored", stored.map_version());
+fn not_taken(stored: &str, version: &str, obstacles: &[Obstacle]) -> Reason {
+    let reason = Reason::from(Code::MapNotTaken).with("map_version", version).with("stored", stored);
     let mut named: BTreeMap<&str, Vec<String>> = BTreeMap::new();
     for obstacle in obstacles {
         let (kind, name) = obstacle.named();

@@ -168,7 +168,7 @@ impl Plan {
 pub const LOGS: &[Log] = &[Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox, Log::Ota, Log::Stop, Log::Identity];
 
 /// Takes entries of the feed, in commit order: rows into the view, requests and robots' events into decisions.
-pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
+pub fn absorb(view: &mut View, now: Now, board: &Board, entries: &[Entry], plan: &mut Plan) {
     let consumed = view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq);
     for entry in entries {
         take_row(view, entry, &mut plan.report.unreadable);
@@ -184,7 +184,7 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
                 Ok(said) => {
                     let mut tally = plan.report.tally;
                     let is_obeyed = plan.decide(view, now, said.robot_id.as_str(), |tx| {
-                        inbox::take(tx, &said, &mut tally);
+                        inbox::take(tx, &said, board, &mut tally);
                         mark(tx, entry.seq);
                     });
                     plan.report.tally = tally;
@@ -381,8 +381,11 @@ pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Pl
     if pace == Pace::Sweep || view.stops_changed {
         stops::plan(view, board, now, plan);
     }
+    plan.slice.renew();
     drain::obey(view, now, plan);
+    plan.slice.renew();
     budget::plan(view, board, now, plan);
+    plan.slice.renew();
     drain::plan(view, board, now, plan);
     plan.slice.renew();
     queue::settle(view, now, plan);

@@ -42,17 +42,18 @@ impl Bounds {
         };
         Some(Self { first: 0, resume: steps as u32, steps: steps as u32 })
     }
-    /// The lowest step that may be reported once `highest` was.
-    fn least(self, highest: u32) -> u32 {
-        if highest > self.resume { highest } else { self.first }
+    /// The lowest step that may be reported of an attempt whose row says that `done` steps are done and that `reported` was reported. A row of
+    /// an older version does not say what was reported: its steps were once they are more than those it began with.
+    fn least(self, reported: Option<u32>, done: u32) -> u32 {
+        reported.or((done > self.resume).then_some(done)).unwrap_or(0).max(self.first)
     }
-    fn allow(self, highest: u32, state: WorkState, step_index: u32) -> bool {
+    fn allow(self, least: u32, state: WorkState, step_index: u32) -> bool {
         match state {
             WorkState::Unknown(_) => false,
             // It never began.
             WorkState::Refused => step_index <= self.steps,
             WorkState::Succeeded => step_index == self.steps,
-            _ => (self.least(highest)..=self.steps).contains(&step_index),
+            _ => (least..=self.steps).contains(&step_index),
         }
     }
 }
@@ -67,15 +68,16 @@ pub fn judge(view: &View, id: &AttemptId, robot_id: &RobotId, state: WorkState, 
         return None;
     }
     let bounds = Bounds::of(view, a)?;
+    let least = bounds.least(a.reported, a.step_index);
     let reason = || {
         Reason::from(Code::ReportImplausible)
             .with("attempt", id)
             .with("state", format!("{state:?}"))
             .with("step_index", step_index)
-            .with("least", bounds.least(a.step_index))
+            .with("least", least)
             .with("steps", bounds.steps)
     };
-    (!bounds.allow(a.step_index, state, step_index)).then(reason)
+    (!bounds.allow(least, state, step_index)).then(reason)
 }
 
 /// The first attempt that a heartbeat lists in a way that cannot be. One that is older than the robot's events tells nothing.
@@ -137,23 +139,34 @@ mod tests {
         use WorkState::{Aborted, Executing, Failed, Refused, Succeeded, Unknown};
         let bounds = Bounds { first: 2, resume: 3, steps: 6 };
         let table = [
-            (3, Executing, 1, false),
-            (3, Executing, 2, true),
-            (3, Executing, 3, true),
-            (4, Executing, 3, false),
-            (4, Executing, 4, true),
-            (4, Failed, 6, true),
-            (4, Aborted, 7, false),
-            (4, Failed, u32::MAX, false),
-            (4, Succeeded, 5, false),
-            (4, Succeeded, 6, true),
-            (4, Succeeded, 7, false),
-            (3, Refused, 0, true),
-            (3, Refused, 7, false),
-            (3, Unknown(99), 4, false),
+            (None, Executing, 1, false),
+            (None, Executing, 2, true),
+            (None, Executing, 3, true),
+            (Some(2), Executing, 2, true),
+            (Some(3), Executing, 2, false),
+            (Some(3), Executing, 3, true),
+            (Some(4), Executing, 3, false),
+            (Some(4), Executing, 4, true),
+            (Some(4), Failed, 6, true),
+            (Some(4), Aborted, 7, false),
+            (Some(4), Failed, u32::MAX, false),
+            (Some(4), Succeeded, 5, false),
+            (Some(4), Succeeded, 6, true),
+            (Some(4), Succeeded, 7, false),
+            (None, Refused, 0, true),
+            (None, Refused, 7, false),
+            (None, Unknown(99), 4, false),
         ];
-        for (highest, state, step, legal) in table {
-            assert_eq!(bounds.allow(highest, state, step), legal, "{highest} {state:?} {step}");
+        for (reported, state, step, legal) in table {
+            // The row began with the step that it goes on with.
+            let least = bounds.least(reported, reported.unwrap_or(0).max(3));
+            assert_eq!(bounds.allow(least, state, step), legal, "{reported:?} {state:?} {step}");
         }
+    }
+
+    #[test]
+    fn a_row_of_an_older_version_says_what_was_reported_by_the_steps_that_are_done() {
+        let bounds = Bounds { first: 2, resume: 3, steps: 6 };
+        assert_eq!([3, 4, 6].map(|done| bounds.least(None, done)), [2, 4, 6]);
     }
 }

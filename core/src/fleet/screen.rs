@@ -264,13 +264,15 @@ fn place(view: &View, here: WaypointIx, goals: &[WaypointIx]) -> Result<(), Reas
     Ok(())
 }
 
-/// The charge must last for all steps and the way from the last goal to the nearest charger, with its reserve.
+/// The charge must last for all steps and the way from the last goal to the nearest charger, with its reserve; no goal may be one from which
+/// no charger can be reached. A site without chargers has no way home.
 fn energy(view: &View, live: &Live, here: WaypointIx, last: WaypointIx, mut trip: Trip) -> Result<(), Reason> {
-    let home_mm = match view.site.chargers().next() {
-        Some(_) => view.site.chargers().filter_map(|c| view.router.distance_mm(last, c)).min().unwrap_or(0),
-        None => return Ok(()),
-    };
-    trip.drive(home_mm);
+    if view.site.chargers().next().is_none() {
+        return Ok(());
+    }
+    let home_mm = view.site.chargers().filter_map(|charger| view.router.distance_mm(last, charger)).min();
+    let no_way = || Reason::from(Code::NoRoute).with("goal", view.site.name_of(last)).with("to", "a charger");
+    trip.drive(home_mm.ok_or_else(no_way)?);
     let needed = trip.needed_permille() + RESERVE_PERMILLE;
     let has = u64::from(live.report.vitals.battery_permille);
     let mandatory = u64::from(view.policy(&view.site.area_of(here).area_id).charge_mandatory_permille);

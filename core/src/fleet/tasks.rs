@@ -5,7 +5,7 @@
 
 use super::Tx;
 use super::rows::{HolderState, RobotAuthority, RobotControl, RobotCounter, RobotHolder, Timer, TimerKind};
-use super::{incidents, plausible};
+use super::{attempts, incidents, plausible};
 use crate::ids::{AttemptId, RobotId, Subject, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -100,7 +100,7 @@ fn phase_of(event: Event, report: Option<&AttemptReport>) -> Option<AttemptPhase
 
 fn move_attempt(tx: &mut Tx, mut a: Attempt, step: Next, news: &News, intake: &TaskIntake) -> Attempt {
     if let Some(report) = news.report {
-        a.step_index = a.step_index.max(report.step_index);
+        attempts::note_step(&mut a, report.step_index);
         a.opened |= report.opened;
         a.stats = report.stats;
         a.fault = report.fault.clone().or(a.fault);

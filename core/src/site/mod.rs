@@ -26,6 +26,17 @@ pub const DEMO: &str = include_str!("../../../sites/demo.site.toml");
 /// A small site of two stations and one corridor, for tests.
 pub const CORRIDOR: &str = include_str!("../../../sites/corridor.site.toml");
 
+/// Reads the text of a site that was stored, whichever form the file had that it came from.
+///
+/// # Errors
+/// It has none of these forms.
+pub fn read_stored(site_id: &str, body: &str) -> Result<Site, Refusal> {
+    let as_site = text::parse(body);
+    let as_lif = || lif::parse(site_id, body).map(|import| import.site).ok();
+    let as_grid = || grid::parse_map(site_id, body).ok();
+    as_site.or_else(|refusal| as_lif().or_else(as_grid).ok_or(refusal))
+}
+
 macro_rules! index {
     ($(#[$doc:meta])* $name:ident) => {
         $(#[$doc])*

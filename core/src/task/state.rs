@@ -268,6 +268,10 @@ pub struct Attempt {
     pub offer: Authority,
     /// Steps done so far.
     pub step_index: u32,
+    /// The highest step that its robot reported: no later report of it may name a lower one. None: nothing was reported, or before this was
+    /// noted.
+    #[serde(default)]
+    pub reported: Option<u32>,
     /// Its first irreversible step is done or unknown.
     pub opened: bool,
     /// UTC.

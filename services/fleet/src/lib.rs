@@ -17,13 +17,14 @@ use midshift_core::fleet::commands::Command;
 use midshift_core::fleet::maps::MapChange;
 use midshift_core::fleet::view::View;
 use midshift_core::identity::Caller;
-use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::rows::Revision;
 use midshift_core::site::Site;
 use midshift_core::time::{Clock, Now};
 use midshift_core::work::Live;
 use midshift_proto::fleet::v1::fleet_service_server::FleetServiceServer;
 use midshift_store::{LiveBoard, Store};
+use std::fmt;
 use std::sync::Arc;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
@@ -49,6 +50,23 @@ pub struct Parts {
     /// Naive rules for twins of tests; none outside them.
     pub bugs: midshift_core::fleet::bugs::Bugs,
 }
+
+/// The reconciler began to lead, and the map that its process chose at its start is none to plan on any more: another one was stored since,
+/// or something came in its way. The process chooses anew when it is started again.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct MapOutdated(pub Reason);
+
+impl fmt::Display for MapOutdated {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "the map that was chosen at the start is outdated, start again: {} {:?}",
+            self.0.code, self.0.metadata
+        )
+    }
+}
+
+impl std::error::Error for MapOutdated {}
 
 /// A question about the picture as it is now.
 type Look = Box<dyn FnOnce(&View, &Board, &Now) + Send>;
@@ -140,8 +158,11 @@ impl FleetService {
 }
 
 impl Reconciler {
-    /// Runs until `shutdown`. Ends early only if the store's rows cannot be read at all.
-    pub async fn run(self, shutdown: CancellationToken) -> Result<(), midshift_store::Error> {
+    /// Runs until `shutdown`.
+    ///
+    /// # Errors
+    /// It ends early because its map is outdated.
+    pub async fn run(self, shutdown: CancellationToken) -> Result<(), MapOutdated> {
         reconcile::run(self.parts, self.requests, shutdown).await
     }
 }

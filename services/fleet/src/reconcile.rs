@@ -6,9 +6,9 @@
 //! Invariant: the view has absorbed the feed up to a head of it before anything is planned on it, never a part of a commit; only a process that leads plans, and one that could not
 //! say so for a while reads the rows again before it does.
 
-use crate::{Asked, Look, Parts, Request};
+use crate::{Asked, Look, MapOutdated, Parts, Request};
 use midshift_core::fleet::view::{self, View};
-use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, explain, found, objects};
+use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, explain, found, maps, objects};
 use midshift_core::identity::Actor;
 use midshift_core::lead::{FleetLeader, Own, Seat, Stance};
 use midshift_core::limits;
@@ -20,6 +20,7 @@ use midshift_core::time::Now;
 use midshift_core::work::Live;
 use midshift_store::{Dirty, Error, FeedPage, Store, lead};
 use std::ops::Range;
+use std::sync::OnceLock;
 use std::time::Duration;
 use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
@@ -61,6 +62,10 @@ pub(crate) struct Loop {
     share: usize,
     /// Commands that the next turn decides anew.
     pub(crate) again: Vec<Request>,
+    /// Text of the map that was stored when this process began.
+    at_start: OnceLock<Option<String>>,
+    /// Why this process must not plan on its map; then it ends.
+    outdated: Option<MapOutdated>,
 }
 
 /// Commands, and the items of a plan that must be committed before each is answered.
@@ -71,7 +76,7 @@ pub async fn run(
     parts: Parts,
     mut requests: mpsc::Receiver<Request>,
     shutdown: CancellationToken,
-) -> Result<(), Error> {
+) -> Result<(), MapOutdated> {
     let mut wake = parts.store.wake();
     let started = parts.clock.now();
     let dirty = parts.board.watch();
@@ -101,10 +106,12 @@ pub async fn run(
         more: false,
         share: limits::DECISIONS_PER_STAGE,
         again: Vec::new(),
+        at_start: OnceLock::new(),
+        outdated: None,
     };
     this.rebuild_until_read(&shutdown).await;
     let mut batch = Vec::new();
-    loop {
+    while this.outdated.is_none() {
         // Questions that wait for their turn leave others less room.
         let room = limits::REQUESTS_PER_TURN.saturating_sub(this.looks.len());
         tokio::select! {
@@ -129,7 +136,7 @@ pub async fn run(
         }
     }
     this.hand_over().await;
-    Ok(())
+    this.outdated.map_or(Ok(()), Err)
 }
 
 /// Something was written, and it is time to look.
@@ -202,7 +209,7 @@ impl Loop {
         leads_no_more();
     }
 
-    /// Builds the picture from nothing and takes what was not consumed yet.
+    /// Builds the picture from nothing and takes what was not consumed yet. A process that leads makes sure that it may plan on its map.
     pub(crate) async fn rebuild(&mut self) -> Result<(), Error> {
         self.take_part().await?;
         self.own.clear();
@@ -223,7 +230,13 @@ impl Loop {
         self.seq = self.view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq).min(snapshot.seq);
         (self.behind, self.news, self.more) = (None, true, false);
         metrics::counter!("midshift_fleet_rebuilds_total").increment(1);
-        if !self.seat.leads() {
+        let stored = self.view.sites.get(self.parts.site.site_id().as_str()).map(|s| &s.row.text);
+        let at_start = self.at_start.get_or_init(|| stored.cloned());
+        let Parts { site_text, map, .. } = &self.parts;
+        if self.seat.leads() {
+            self.outdated = maps::outdated(&self.view, site_text, at_start.as_deref(), map).map(MapOutdated);
+        }
+        if !self.seat.leads() || self.outdated.is_some() {
             self.seq = snapshot.seq;
             self.view.rest();
             return Ok(());
@@ -257,6 +270,10 @@ impl Loop {
             if self.seat.stance(self.parts.clock.now().link) == Stance::TakeOver {
                 self.rebuild().await.map_err(unreadable)?;
             }
+        }
+        if self.outdated.is_some() {
+            // Whoever asked hears that this process ends.
+            return Ok(());
         }
         if self.seat.leads() { self.lead(pace, requests).await } else { self.assist(requests).await }
     }
@@ -368,7 +385,7 @@ impl Loop {
                 self.news |= !is_lease && !is_own;
             }
             self.seat.follow(some, clock.now().link)?;
-            absorb(&mut self.view, now, some, plan);
+            absorb(&mut self.view, now, &self.board, some, plan);
             if let Some(last) = some.last().filter(|_| plan.slice.is_spent()) {
                 next = last.seq.min(next);
                 break;

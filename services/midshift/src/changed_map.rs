@@ -1,12 +1,13 @@
 //! Which map a server goes on with when its site file has changed: the new one, or the stored one while something is in the way of the new.
 //!
-//! Called by `serve` before any service begins. Invariant: nothing is written here; fleet tells people, and stores the map that is taken.
+//! Called by `serve`, and by `dev` for data that it keeps, before any service begins. Invariant: nothing is written here; fleet tells people, and stores the map that is taken.
 
-use crate::site_file::{self, Loaded};
+use crate::site_file::Loaded;
 use anyhow::Context;
 use midshift_core::fleet::maps::{MapChange, in_the_way};
 use midshift_core::fleet::rows::SiteRow;
 use midshift_core::fleet::view::{View, alive, named};
+use midshift_core::site::{Site, read_stored};
 use midshift_core::time::Now;
 use midshift_store::{Store, load};
 use std::sync::Arc;
@@ -18,19 +19,11 @@ pub async fn choose(
     is_forced: bool,
     now: Now,
 ) -> anyhow::Result<(Loaded, MapChange)> {
-    let row = load::<SiteRow>(store, loaded.site.site_id().as_str()).await.context("reading the stored map")?;
-    let Some((row, _)) = row.filter(|(row, _)| row.text != loaded.text) else { return Ok((loaded, MapChange::Taken)) };
-    let stored = match site_file::stored(row.site_id.as_str(), &row.text) {
-        Ok(stored) => Arc::new(stored),
-        Err(error) => {
-            tracing::warn!(%error, "the stored map is no site file, so nobody can say what is in the way of the new one: it is taken");
-            return Ok((loaded, MapChange::Taken));
-        }
-    };
+    let Some((row, stored)) = other_stored(store, &loaded).await? else { return Ok((loaded, MapChange::Taken)) };
     let snapshot = store.read(&alive(), named).await.context("reading what is in the way of the changed map")?;
     let mut view = View::new(stored.clone(), now, now);
     view.load(&snapshot.rows, snapshot.seq).context("reading what is in the way of the changed map")?;
-    let obstacles = in_the_way(&view, &loaded.site);
+    let obstacles = in_the_way(&view, &stored, &loaded.site);
     let (version, count) = (loaded.site.map_version().to_owned(), obstacles.len());
     if obstacles.is_empty() {
         tracing::info!(map_version = version, stored = row.map_version, "the changed map is taken");
@@ -48,6 +41,27 @@ pub async fn choose(
     );
     let goes_on = Loaded { site: stored, text: row.text, warnings: Vec::new() };
     Ok((goes_on, MapChange::NotTaken { version, obstacles }))
+}
+
+/// The map of a process that does not plan: the stored one, which fleet plans on, whatever its own file says.
+pub async fn follow(store: &dyn Store, loaded: Loaded) -> anyhow::Result<Loaded> {
+    let Some((row, stored)) = other_stored(store, &loaded).await? else { return Ok(loaded) };
+    let (version, stored_version) = (loaded.site.map_version(), &row.map_version);
+    tracing::info!(map_version = version, stored = stored_version, "the stored map goes on, whatever the file says");
+    Ok(Loaded { site: stored, text: row.text, warnings: Vec::new() })
+}
+
+/// The stored map, if it is another one than that of the file and can be read.
+async fn other_stored(store: &dyn Store, loaded: &Loaded) -> anyhow::Result<Option<(SiteRow, Arc<Site>)>> {
+    let row = load::<SiteRow>(store, loaded.site.site_id().as_str()).await.context("reading the stored map")?;
+    let Some((row, _)) = row.filter(|(row, _)| row.text != loaded.text) else { return Ok(None) };
+    match read_stored(row.site_id.as_str(), &row.text) {
+        Ok(stored) => Ok(Some((row, Arc::new(stored)))),
+        Err(error) => {
+            tracing::warn!(%error, "the stored map is no site file, so nobody can say what is in the way of the file's: that is taken");
+            Ok(None)
+        }
+    }
 }
 
 #[cfg(test)]
@@ -112,5 +126,13 @@ mod tests {
         let not_taken = MapChange::NotTaken { version: "2".to_owned(), obstacles: obstacles.clone() };
         assert_eq!(choose(under_it.clone(), false).await, ("1".to_owned(), not_taken));
         assert_eq!(choose(under_it, true).await, ("2".to_owned(), MapChange::Forced { obstacles }));
+    }
+
+    #[tokio::test]
+    async fn a_process_that_does_not_plan_goes_by_the_stored_map_whatever_its_file_says() {
+        let store = store().await;
+        let elsewhere = loaded(moved("park-b", "20000, 3000", "21000, 3000"));
+        let taken = follow(&store, elsewhere).await.expect("readable");
+        assert_eq!((taken.site.map_version(), taken.text.as_str()), ("1", CORRIDOR));
     }
 }

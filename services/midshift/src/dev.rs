@@ -12,7 +12,7 @@ use crate::stop::{self, Beside};
 use crate::tally::{self, SharedTasks, Tasks};
 use crate::throwaway::Throwaway;
 use crate::under_way::{self, UnderWay};
-use crate::{clock, door, resuming, stop_follower};
+use crate::{changed_map, clock, door, resuming, stop_follower};
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 use midshift_agent::trust::Trust;
@@ -178,6 +178,8 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     };
     let run_id = format!("dev-{}-{}-", args.seed, clock.now().wall.0);
     let (store, frames) = stores(&args, &site, &clock).await?;
+    // Its floor is made anew at each start, so what is kept of another one is only told.
+    let (loaded, map) = changed_map::choose(&*store, loaded, true, clock.now()).await?;
     let before = tally::newest(&*store).await?;
     let tasks = Arc::new(Mutex::new(Tasks::of_run(&run_id, before)));
     let stops = Stops::start(&args, site.clone(), clock.clone(), (address, &*store)).await?;
@@ -198,7 +200,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         frames,
         site: site.clone(),
         site_text: loaded.text,
-        map: Default::default(),
+        map,
         clock: clock.clone(),
         ota,
         reader: None,

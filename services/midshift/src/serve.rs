@@ -198,7 +198,10 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
     crate::recorder::handle();
     let site_id = loaded.site.site_id().clone();
     let storage = args.database.open(&args.data, site_id, clock.clone()).await?;
-    let (loaded, map) = changed_map::choose(&*storage.store(), loaded, args.force_map, clock.now()).await?;
+    let (loaded, map) = match roles.has(Role::Fleet) {
+        true => changed_map::choose(&*storage.store(), loaded, args.force_map, clock.now()).await?,
+        false => (changed_map::follow(&*storage.store(), loaded).await?, Default::default()),
+    };
     let follows = roles.has(Role::StopFollower);
     // Before anybody writes to the store, and before the stop service, which waits for who is known, can begin.
     match first_start(&args, &roles) {

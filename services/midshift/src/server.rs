@@ -290,12 +290,6 @@ impl Running<'_> {
     /// Until shutdown, or until one of them ends by itself.
     async fn run(self, shutdown: &CancellationToken) -> anyhow::Result<()> {
         let planning = &self.parts.planning;
-        let spawned = |name, service: Option<AbortOnDropHandle<_>>| async move {
-            match service {
-                Some(service) => until(shutdown, name, async { Ok(service.await??) }).await,
-                None => Ok(()),
-            }
-        };
         let fleet = self.fleet.map(|r| AbortOnDropHandle::new(planning.spawn(r.run(shutdown.clone()))));
         let planner = self.planner.map(|p| AbortOnDropHandle::new(planning.spawn(p.run(shutdown.clone()))));
         let telemetry = async {
@@ -346,7 +340,8 @@ impl Running<'_> {
             }
             Ok(())
         };
-        let planners = async { tokio::try_join!(spawned("fleet", fleet), spawned("rollouts", planner)) };
+        let planners =
+            async { tokio::try_join!(spawned(shutdown, "fleet", fleet), spawned(shutdown, "rollouts", planner)) };
         tokio::try_join!(planners, telemetry, ear, ota, reader, stops, identity).map(drop)
     }
 }
@@ -403,6 +398,18 @@ async fn until(
         bail!("{name} ended while it was needed");
     }
     Ok(())
+}
+
+/// As [`until`], of what runs elsewhere, if it does.
+async fn spawned<E: std::error::Error + Send + Sync + 'static>(
+    shutdown: &CancellationToken,
+    name: &'static str,
+    service: Option<AbortOnDropHandle<Result<(), E>>>,
+) -> anyhow::Result<()> {
+    match service {
+        Some(service) => until(shutdown, name, async { Ok(service.await??) }).await,
+        None => Ok(()),
+    }
 }
 
 /// Keeps health as the process is ready or not, for each of its services.

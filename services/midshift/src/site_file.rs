@@ -2,7 +2,6 @@
 
 use anyhow::{Context, bail};
 use midshift_core::limits;
-use midshift_core::reason::Refusal;
 use midshift_core::site::{self, Site, Source, grid, lif, lint, text};
 use std::path::Path;
 use std::sync::Arc;
@@ -45,14 +44,6 @@ pub fn read(path: &Path, robots: Option<u64>) -> anyhow::Result<Loaded> {
         anyhow::anyhow!("{} is not a site that can be used:\n{}", path.display(), lines.join("\n"))
     })?;
     finish(site, body, warnings, robots)
-}
-
-/// Reads the text of a site that was stored, whichever form the file had that it came from.
-pub fn stored(site_id: &str, body: &str) -> Result<Site, Refusal> {
-    let as_site = text::parse(body);
-    let as_lif = || lif::parse(site_id, body).map(|import| import.site).ok();
-    let as_grid = || grid::parse_map(site_id, body).ok();
-    as_site.or_else(|refusal| as_lif().or_else(as_grid).ok_or(refusal))
 }
 
 fn finish(site: Site, text: String, mut warnings: Vec<String>, robots: Option<u64>) -> anyhow::Result<Loaded> {

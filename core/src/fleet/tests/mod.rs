@@ -1,6 +1,8 @@
 //! A picture with robots that stand idle and tasks that wait, for tests of one cycle.
 
 mod backlog;
+mod drains;
+mod energy;
 mod incidents;
 mod lasting;
 mod maps;
@@ -35,7 +37,11 @@ struct Rig {
 
 impl Rig {
     fn new() -> Self {
-        let site = Arc::new(text::parse(CORRIDOR).expect("a site"));
+        Self::on(CORRIDOR)
+    }
+
+    fn on(site_text: &str) -> Self {
+        let site = Arc::new(text::parse(site_text).expect("a site"));
         let begun = Now { utc: Utc(BEGIN.0 - SERVED_MS as i64), wall: BEGIN, ..Now::default() };
         let view = View::new(site, begun, begun);
         let now = Now { site: SiteTime(SERVED_MS), link: LinkTime(SERVED_MS), utc: BEGIN, wall: BEGIN, jump: None };

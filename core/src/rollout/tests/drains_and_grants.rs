@@ -316,6 +316,7 @@ fn charge(id: &crate::ids::AttemptId, errand: crate::task::state::Errand) -> cra
         uncertain: None,
         offer: crate::authority::Authority { session_epoch: 2, hb: 1, valid_ms: 5_000 },
         step_index: 0,
+        reported: None,
         opened: false,
         offered: Utc(BEGIN),
         accepted: None,

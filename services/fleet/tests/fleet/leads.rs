@@ -1,6 +1,7 @@
 //! Several processes of fleet over one store: one plans, the others stand by and carry out what people ask.
 
 use crate::harness::{Shaky, World};
+use midshift_core::fleet::rows::SiteRow;
 use midshift_core::lead::FleetLeader;
 use midshift_core::reason::Code;
 use midshift_core::rows::Table;
@@ -231,4 +232,37 @@ async fn a_leader_that_was_frozen_steps_down_and_nothing_of_what_it_wanted_is_do
         assert_eq!(seen.task(task).epoch, 1, "assigned once");
     }
     w.lawful().await;
+}
+
+/// Version of the map that is stored.
+async fn stored_map(w: &World) -> String {
+    let row = midshift_store::load::<SiteRow>(&*w.store, w.site.site_id().as_str()).await.expect("a store");
+    row.expect("a map").0.map_version
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_standby_with_another_map_writes_it_when_it_leads_and_ends_instead_if_something_is_in_its_way_by_then() {
+    let (before, after) = ("id = \"B\", at = [18000, 3000]", "id = \"B\", at = [18000, 4000]");
+    let changed = CORRIDOR.replace(before, after).replace("map_version = \"1\"", "map_version = \"2\"");
+    for is_busy in [false, true] {
+        let mut w = World::shared(CORRIDOR).await;
+        w.other_process_by(&changed);
+        w.pass(2).await;
+        if is_busy {
+            w.robot("r1", "park-a").await;
+            w.r("r1").works = false;
+            w.submit("T1", "A", "B").await;
+            w.until_phase("T1", Phase::Running).await;
+        }
+        w.kill_first().await;
+        w.pass(10).await;
+        if is_busy {
+            let outdated = w.last_outdated().await;
+            assert_eq!(outdated.0.code, Code::MapNotTaken);
+            assert_eq!(outdated.0.metadata.get("tasks").map(String::as_str), Some("T1"));
+            assert_eq!(holder(&w).await, "", "another process may lead at once");
+        }
+        assert_eq!(stored_map(&w).await, if is_busy { "1" } else { "2" });
+        w.lawful().await;
+    }
 }

@@ -3,6 +3,7 @@
 
 mod harness;
 
+mod claims;
 mod drains;
 mod ended;
 mod errands;

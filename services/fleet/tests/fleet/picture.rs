@@ -3,7 +3,7 @@
 use crate::harness::{Answer, World, jam, obstacle};
 use midshift_core::fleet::rows::{HolderState, Place, RobotAuthority, RobotHolder};
 use midshift_core::fleet::view::{View, alive, named};
-use midshift_core::fleet::{Plan, absorb};
+use midshift_core::fleet::{Board, Plan, absorb};
 use midshift_core::reason::Code;
 use midshift_core::robot::{HardwareStop, Mode};
 use midshift_core::rows::{Log, Seq, Table};
@@ -175,7 +175,7 @@ async fn a_picture_built_from_rows_is_not_set_back_by_older_entries_and_goes_on_
     assert!(gone > 0, "there were timers that are gone now");
     for entry in entries {
         let mut plan = Plan::default();
-        absorb(&mut view, now, &[entry], &mut plan);
+        absorb(&mut view, now, &Board::new(), &[entry], &mut plan);
         assert_eq!(slots(&view), before);
     }
     w.lawful().await;

@@ -1,7 +1,7 @@
 //! A service over a store in memory, and somebody who plays fleet: either by core's own law or row by row.
 
 use midshift_core::fleet::rows::HoldToken;
-use midshift_core::fleet::{LOGS, Plan, absorb, view, view::View};
+use midshift_core::fleet::{Board, LOGS, Plan, absorb, view, view::View};
 use midshift_core::ids::{AttemptId, RobotId, SiteId, StopId, Subject, TaskId};
 use midshift_core::robot::StopLevel;
 use midshift_core::rows::{Item, Key, Record, Revision, Seq, Writer};
@@ -94,7 +94,7 @@ impl World {
         let begin = view.marks.get("fleet").map_or(NOON_SEQ, |m| m.row.seq);
         let page = self.store.feed(begin, LOGS, 5_000).await.expect("a feed");
         let mut plan = Plan::default();
-        absorb(&mut view, now, &page.entries, &mut plan);
+        absorb(&mut view, now, &Board::new(), &page.entries, &mut plan);
         for applied in self.store.commit(plan.items).await {
             applied.expect("fleet is alone here");
         }
@@ -238,6 +238,7 @@ pub fn attempt(task_id: &TaskId, epoch: u64, phase: AttemptPhase) -> Attempt {
         uncertain: None,
         offer: midshift_core::authority::Authority { session_epoch: 1, hb: 1, valid_ms: 5_000 },
         step_index: 0,
+        reported: None,
         opened: false,
         offered: NOON,
         accepted: Some(NOON),

@@ -22,7 +22,7 @@ use midshift_core::task::forms::Transport;
 use midshift_core::task::{Ask, Phase, RawTask, TaskIntake, TaskRequest, TaskState};
 use midshift_core::time::{Clock, ScaledClock, Utc};
 use midshift_core::work::{LaneMark, Live, Session};
-use midshift_fleet::{FleetService, Parts};
+use midshift_fleet::{FleetService, MapOutdated, Parts};
 use midshift_store::{LiveBoard, MemoryStore, Store, StoreId};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -42,7 +42,7 @@ struct Running {
     /// A reconciler whose face is gone ends.
     _face: FleetService,
     shutdown: CancellationToken,
-    task: JoinHandle<()>,
+    task: JoinHandle<Result<(), MapOutdated>>,
 }
 
 pub struct World {
@@ -155,6 +155,15 @@ impl World {
         self.other_process_on(self.store.clone())
     }
 
+    /// As [`World::other_process`], started with another map than this world's.
+    pub fn other_process_by(&mut self, site_text: &str) -> (FleetService, Arc<Shaky>) {
+        let (site, site_text) = (Arc::new(text::parse(site_text).expect("a site")), site_text.to_owned());
+        let shaky = Shaky::over(self.store.clone());
+        let (fleet, running) = start(Parts { store: shaky.clone(), site, site_text, ..self.parts() });
+        self.running.push(running);
+        (fleet, shaky)
+    }
+
     /// As [`World::other_process`], on a handle of its own.
     pub fn other_process_on(&mut self, store: Arc<dyn Store>) -> (FleetService, Arc<Shaky>) {
         let shaky = Shaky::over(store);
@@ -174,14 +183,20 @@ impl World {
     pub async fn end_first(&mut self) {
         let running = self.running.remove(0);
         running.shutdown.cancel();
-        running.task.await.expect("the reconciler ends");
+        running.task.await.expect("the reconciler ends").expect("as it was asked to");
+    }
+
+    /// The newest reconciler has ended by itself: why.
+    pub async fn last_outdated(&mut self) -> MapOutdated {
+        let running = self.running.pop().expect("a reconciler");
+        running.task.await.expect("it ends").expect_err("nobody asked it to")
     }
 
     /// Ends every reconciler; rows stay, the picture goes.
     pub async fn stop_fleet(&mut self) {
         for running in self.running.drain(..) {
             running.shutdown.cancel();
-            running.task.await.expect("the reconciler ends");
+            running.task.await.expect("the reconciler ends").expect("as it was asked to");
         }
     }
 
@@ -468,8 +483,6 @@ fn start(parts: Parts) -> (FleetService, Running) {
     let (fleet, reconciler) = FleetService::new(parts);
     let shutdown = CancellationToken::new();
     let token = shutdown.clone();
-    let task = tokio::spawn(async move {
-        reconciler.run(token).await.expect("readable rows");
-    });
+    let task = tokio::spawn(reconciler.run(token));
     (fleet.clone(), Running { _face: fleet, shutdown, task })
 }
