@@ -405,6 +405,8 @@ pub const WATCHES_MAX: usize = 4_096;
 pub const WATCHES_PER_PRINCIPAL_MAX: usize = 256;
 /// A watch that has news and is not read ends after this. Link clock.
 pub const WATCH_UNREAD: LinkDuration = LinkDuration::from_secs(30);
+/// Rows or entries that a watch of tasks reads at a time: it holds them while its reader asks for nothing.
+pub const WATCH_PAGE: usize = 64;
 /// Streams that tell of robots at a time. A stop is engaged also when there is no room for one more; its stream then says how it is, and ends.
 pub const STOP_WATCHERS_MAX: usize = 256;
 /// Request ids of stops that are remembered, the newest.
@@ -455,6 +457,9 @@ pub const HTTP1_HEAD_WITHIN: LinkDuration = LinkDuration::from_secs(30);
 pub const HTTP1_HEAD_BYTES: usize = 64 * 1024;
 /// Bytes of the header list of an HTTP/2 request, as HTTP/2 counts them: what peers take by default.
 pub const HEADER_LIST_BYTES: u32 = 16 * 1024;
+/// Bytes of one HTTP/2 stream that are composed ahead of a peer that does not read them, however large its window: one frame of the
+/// size that every peer takes.
+pub const STREAM_SEND_BYTES: usize = 16 * 1024;
 /// A connection without a stream for so long is closed. Longer than what people and programs pause between two calls.
 pub const CONNECTION_IDLE: LinkDuration = LinkDuration::from_secs(300);
 /// A quiet HTTP/2 connection is pinged so often: shorter than what routers forget a connection after.
