@@ -27,7 +27,7 @@ use midshift_proto::link::v1;
 use midshift_proto::session::{
     ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, ToRobot, Uplink,
 };
-use midshift_proto::status::too_large;
+use midshift_proto::status::unreadable;
 use std::collections::VecDeque;
 use std::future::Future;
 use std::pin::Pin;
@@ -238,10 +238,11 @@ impl Session {
         }
     }
 
-    /// What the robot sent cannot be read: it hears why if it was too large.
+    /// What the robot sent cannot be read: it hears why, if there still is a stream.
     fn broken(&self, status: &Status) -> End {
-        let Some(refusal) = too_large(status) else { return End::Gone };
-        tracing::warn!(robot_id = %self.robot_id, code = Code::MessageTooLarge.as_str(), "session ended by a message that is too large");
+        let Some(refusal) = unreadable(status) else { return End::Gone };
+        let code = refusal.reason.code.as_str();
+        tracing::warn!(robot_id = %self.robot_id, code, "session ended by a message that cannot be read");
         End::Close(Close { code: CloseCode::Protocol, reason: refusal.reason, retry_after_ms: 1_000 })
     }
 

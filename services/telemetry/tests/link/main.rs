@@ -11,4 +11,5 @@ mod second;
 mod sessions;
 mod status;
 mod stops;
+mod unreadable;
 mod world;
