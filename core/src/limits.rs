@@ -8,6 +8,9 @@ pub const HEARTBEAT: LinkDuration = LinkDuration::from_secs(1);
 pub const SUSPECT_AFTER: LinkDuration = LinkDuration::from_secs(3);
 /// No heartbeat for this long: OFFLINE. One second past the robot's own authority, so the robot always ends first.
 pub const OFFLINE_AFTER: LinkDuration = LinkDuration::from_secs(31);
+/// Heartbeats with a list that is too long are told of again after this, if there was none that could be read: a person may have closed
+/// what was told of them.
+pub const REPORT_TOO_LONG_TOLD_EVERY: LinkDuration = LinkDuration::from_secs(600);
 /// Robot side: authority to go on with an attempt after sending the newest heartbeat that was echoed.
 pub const AUTHORITY: LinkDuration = LinkDuration::from_secs(30);
 /// Server side: the lease over the same authority; 2 % and more above [`AUTHORITY`] for clock drift.
