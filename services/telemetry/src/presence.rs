@@ -33,7 +33,8 @@ const LEFT_TO_OTHERS: LinkDuration = LinkDuration::from_secs(2);
 
 /// What is not ours to write yet, and since when.
 type Stood = BTreeMap<RobotId, (Presence, LinkTime)>;
-type Known = BTreeMap<RobotId, (PresenceRow, Revision)>;
+/// Rows as they are; one that cannot be read is of a newer version, and that one's to write.
+type Known = BTreeMap<RobotId, (Option<PresenceRow>, Revision)>;
 
 async fn read(store: &dyn Store) -> Option<Known> {
     let mut known = Known::new();
@@ -43,8 +44,8 @@ async fn read(store: &dyn Store) -> Option<Known> {
         let Some(last) = rows.last() else { return Some(known) };
         query.after = Some(midshift_store::Cursor::of(last));
         for row in &rows {
-            if let Ok(presence) = row.decode::<PresenceRow>() {
-                known.insert(presence.robot_id.clone(), (presence, row.revision));
+            if let Ok(robot_id) = RobotId::parse(&row.key.id) {
+                known.insert(robot_id, (row.decode::<PresenceRow>().ok(), row.revision));
             }
         }
     }
@@ -82,7 +83,7 @@ async fn write(inner: &Inner, known: &mut Known, stood: &mut Stood, started: Lin
         .filter_map(|robot_id| {
             let presence = of(heard.get(&robot_id).copied(), now.link);
             let old = known.get(&robot_id);
-            let same = old.is_some_and(|(row, _)| row.presence == presence);
+            let same = old.is_some_and(|(row, _)| row.as_ref().is_none_or(|row| row.presence == presence));
             let too_early = young && !heard.contains_key(&robot_id);
             if same || too_early || is_others(inner, &robot_id, (presence, now.link), stood) {
                 return None;
@@ -105,7 +106,7 @@ async fn write(inner: &Inner, known: &mut Known, stood: &mut Stood, started: Lin
     }
     let applied = inner.parts.store.commit(items).await.iter().all(Result::is_ok);
     for (row, revision) in changed {
-        known.insert(row.robot_id.clone(), (row, revision.next()));
+        known.insert(row.robot_id.clone(), (Some(row), revision.next()));
     }
     applied
 }

@@ -3,6 +3,7 @@
 mod disk;
 mod gateways;
 mod machines;
+mod newer;
 mod reach;
 mod replay;
 mod retention;
