@@ -8,6 +8,9 @@ pub const HEARTBEAT: LinkDuration = LinkDuration::from_secs(1);
 pub const SUSPECT_AFTER: LinkDuration = LinkDuration::from_secs(3);
 /// No heartbeat for this long: OFFLINE. One second past the robot's own authority, so the robot always ends first.
 pub const OFFLINE_AFTER: LinkDuration = LinkDuration::from_secs(31);
+/// Heartbeats with a list that is too long are told of again after this, if there was none that could be read: a person may have closed
+/// what was told of them.
+pub const REPORT_TOO_LONG_TOLD_EVERY: LinkDuration = LinkDuration::from_secs(600);
 /// Robot side: authority to go on with an attempt after sending the newest heartbeat that was echoed.
 pub const AUTHORITY: LinkDuration = LinkDuration::from_secs(30);
 /// Server side: the lease over the same authority; 2 % and more above [`AUTHORITY`] for clock drift.
@@ -417,6 +420,8 @@ pub const WATCHES_MAX: usize = 4_096;
 pub const WATCHES_PER_PRINCIPAL_MAX: usize = 256;
 /// A watch that has news and is not read ends after this. Link clock.
 pub const WATCH_UNREAD: LinkDuration = LinkDuration::from_secs(30);
+/// Rows or entries that a watch of tasks reads at a time: it holds them while its reader asks for nothing.
+pub const WATCH_PAGE: usize = 64;
 /// Streams that tell of robots at a time. A stop is engaged also when there is no room for one more; its stream then says how it is, and ends.
 pub const STOP_WATCHERS_MAX: usize = 256;
 /// Request ids of stops that are remembered, the newest.
@@ -467,6 +472,9 @@ pub const HTTP1_HEAD_WITHIN: LinkDuration = LinkDuration::from_secs(30);
 pub const HTTP1_HEAD_BYTES: usize = 64 * 1024;
 /// Bytes of the header list of an HTTP/2 request, as HTTP/2 counts them: what peers take by default.
 pub const HEADER_LIST_BYTES: u32 = 16 * 1024;
+/// Bytes of one HTTP/2 stream that are composed ahead of a peer that does not read them, however large its window: one frame of the
+/// size that every peer takes.
+pub const STREAM_SEND_BYTES: usize = 16 * 1024;
 /// A connection without a stream for so long is closed. Longer than what people and programs pause between two calls.
 pub const CONNECTION_IDLE: LinkDuration = LinkDuration::from_secs(300);
 /// A quiet HTTP/2 connection is pinged so often: shorter than what routers forget a connection after.

@@ -5,6 +5,7 @@
 
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violation};
 use std::collections::{BTreeMap, HashMap};
+use std::error::Error;
 use std::time::Duration;
 use tonic::Status;
 use tonic_types::{ErrorDetails, StatusExt};
@@ -91,6 +92,16 @@ pub fn too_large(status: &Status) -> Option<Refusal> {
         _ => return None,
     };
     Some(Refusal::new(Kind::Exhausted, Reason::new(Code::MessageTooLarge, text)))
+}
+
+/// The refusal of a message of a stream that cannot be read: it is too large, or its bytes are no message. None: the stream itself broke.
+pub fn unreadable(status: &Status) -> Option<Refusal> {
+    too_large(status).or_else(|| {
+        // What a connection says of its end has a source; what a decoder says has none.
+        let is_decoders = status.code() == tonic::Code::Internal && status.source().is_none();
+        let text = || format!("a message cannot be read: {}", status.message());
+        is_decoders.then(|| Refusal::new(Kind::Invalid, Reason::new(Code::ProtocolError, text())))
+    })
 }
 
 /// The first bytes of a text, at most [`MESSAGE_BYTES_MAX`].
@@ -185,6 +196,16 @@ mod tests {
             (failure.violations[0].r#type.as_str(), failure.violations[0].subject.as_str()),
             ("ROBOT_CORDONED", "rbt-01")
         );
+    }
+
+    #[test]
+    fn bytes_that_are_no_message_are_refused_and_a_stream_that_broke_is_none_of_them() {
+        let refusal = unreadable(&Status::internal("invalid wire type")).expect("a decoder says so");
+        assert_eq!((refusal.kind(), refusal.reason.code), (Kind::Invalid, Code::ProtocolError));
+        assert_eq!(refusal.reason.text(), "a message cannot be read: invalid wire type");
+        let broken: Box<dyn Error + Send + Sync> = std::io::Error::other("reset").into();
+        assert!(unreadable(&Status::from_error(broken)).is_none());
+        assert!(unreadable(&Status::cancelled("gone")).is_none());
     }
 
     #[test]

@@ -100,6 +100,16 @@ pub fn confirmation(
     }
 }
 
+/// Whether nobody waits for more of a robot that is not heard: it said last that it knows this stop and does not lie inside, so that it obeys it wherever it
+/// drives, and its own silence has not stood it yet.
+pub fn is_elsewhere(stop: &Stop, generation: u64, robot_id: &RobotId, robot: Option<&Heard>, now: LinkTime) -> bool {
+    robot.is_some_and(|heard| {
+        now.since(heard.at) >= limits::CHECK_IN_MISSED
+            && now < heard.at + heard.around.patience().1
+            && confirmation(stop, generation, robot_id, robot, heard.at) == Confirmation::Outside
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -164,6 +174,20 @@ mod tests {
         assert_eq!(with(Scope::Robot(robot("r1"))), Confirmation::Requested);
         assert_eq!(with(Scope::Robot(robot("r2"))), Confirmation::Outside);
         assert_eq!(with(Scope::Area(AreaId::parse("hall").expect("an id"))), Confirmation::Outside);
+    }
+
+    #[test]
+    fn nobody_waits_for_one_that_said_it_lies_elsewhere_until_its_silence_has_stood_it() {
+        let area = Stop { scope: Scope::Area(AreaId::parse("hall").expect("an id")), ..stop(StopLevel::Halt) };
+        let there = Heard { inside: BTreeSet::new(), ..standing() };
+        let waits_not = |stop: &Stop, heard: &Heard, ms: u64| {
+            is_elsewhere(stop, 7, &robot("r1"), Some(heard), LinkTime(10_000 + ms))
+        };
+        assert_eq!([2_999, 3_000, 5_999, 6_000].map(|ms| waits_not(&area, &there, ms)), [false, true, true, false]);
+        assert!(!waits_not(&area, &standing(), 3_000), "it lies inside");
+        assert!(!waits_not(&area, &Heard { generation: 6, ..there.clone() }, 3_000), "it does not know the stop");
+        assert!(!waits_not(&stop(StopLevel::Halt), &there, 3_000), "there is no elsewhere");
+        assert!(!is_elsewhere(&area, 7, &robot("r1"), None, LinkTime(13_000)), "nobody knows where it is");
     }
 
     #[test]

@@ -101,6 +101,7 @@ pub(crate) fn http(config: &Config) -> auto::Builder<TokioExecutor> {
         .max_header_list_size(config.header_list_bytes)
         .initial_stream_window_size(STREAM_WINDOW_BYTES)
         .initial_connection_window_size(CONNECTION_WINDOW_BYTES)
+        .max_send_buf_size(limits::STREAM_SEND_BYTES)
         .keep_alive_interval(std(config.keepalive_every))
         .keep_alive_timeout(std(config.keepalive_within));
     builder
@@ -300,5 +301,51 @@ fn failed_handshake(port: &'static str, address: SocketAddr, id: ConnectionId, e
         tracing::debug!(port, %peer, connection, %error, "a TLS handshake failed");
     } else {
         tracing::info!(port, %peer, connection, %address, %error, "a TLS handshake failed");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use bytes::Bytes;
+    use http_body::Frame;
+    use http_body_util::StreamBody;
+    use hyper::body::Incoming;
+    use hyper::service::service_fn;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+    use tokio::io::AsyncWriteExt;
+    use tokio_stream::StreamExt;
+
+    const CHUNK: &[u8] = &[0; 1024];
+
+    #[tokio::test]
+    async fn little_is_composed_for_a_peer_with_a_large_window_that_reads_nothing() {
+        let composed = Arc::new(AtomicUsize::new(0));
+        let counted = composed.clone();
+        let service = service_fn(move |_: Request<Incoming>| {
+            let counted = counted.clone();
+            let chunks = tokio_stream::iter(0..4096).map(move |_| {
+                counted.fetch_add(CHUNK.len(), Ordering::Relaxed);
+                Ok::<_, Infallible>(Frame::data(Bytes::from_static(CHUNK)))
+            });
+            async move { Ok::<_, Infallible>(Response::new(StreamBody::new(chunks))) }
+        });
+        let (mut peer, served) = tokio::io::duplex(CHUNK.len());
+        tokio::spawn(async move { http(&Config::default()).serve_connection(TokioIo::new(served), service).await });
+        let mut said = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".to_vec();
+        // Windows of nearly 2 GiB: of each stream by SETTINGS, of the connection by WINDOW_UPDATE. Then GET /.
+        said.extend([0, 0, 6, 4, 0, 0, 0, 0, 0, 0, 4, 0x7f, 0xff, 0xff, 0xff]);
+        said.extend([0, 0, 4, 8, 0, 0, 0, 0, 0, 0x7f, 0, 0, 0]);
+        said.extend([0, 0, 6, 1, 5, 0, 0, 0, 1, 0x82, 0x86, 0x84, 0x41, 1, b'e']);
+        peer.write_all(&said).await.expect("written");
+        // Until the server has gone on for nothing for long: nothing here waits for anything but the peer.
+        let (mut seen, mut quiet) = (0, 0);
+        while quiet < 100 {
+            tokio::task::yield_now().await;
+            let now = composed.load(Ordering::Relaxed);
+            quiet = if now > 0 && now == seen { quiet + 1 } else { 0 };
+            seen = now;
+        }
+        assert!(seen < 8 * limits::STREAM_SEND_BYTES, "{seen} bytes of {}", 4096 * CHUNK.len());
     }
 }

@@ -328,11 +328,10 @@ impl Running<'_> {
             }
             Ok(())
         };
-        let stops = self
-            .parts
-            .stops
-            .clone()
-            .map(|folder| StopFollower::new(folder, self.parts.store.clone(), self.parts.identity.clone()));
+        let stops = self.parts.stops.clone().map(|folder| {
+            let parts = &self.parts;
+            StopFollower::new(folder, parts.store.clone(), parts.identity.clone(), parts.clock.clone())
+        });
         let stops = async {
             if let Some(follower) = stops {
                 // It ends with the others.

@@ -9,13 +9,13 @@ use midshift_core::fleet::rows::RobotControl;
 use midshift_core::identity::RobotIdentity;
 use midshift_core::ids::{RobotId, StopId};
 use midshift_core::limits;
-use midshift_core::robot::Duty;
 use midshift_core::rows::{BadRow, Log, Revision, Row, Seq, Table};
 use midshift_core::stop::Latch;
 use midshift_core::stop::record::{StopRecord, copy};
+use midshift_core::time::{Clock, Now, Utc};
 use midshift_identity::{IdentityService, ServerProof};
 use midshift_stop::{Copied, Principals, Roster};
-use midshift_store::{CommitError, Store, follow};
+use midshift_store::{CommitError, LeftOut, Store, follow};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{DirBuilder, File, OpenOptions, TryLockError};
 use std::io;
@@ -46,10 +46,13 @@ pub fn tell_principals(folder: &Path, identity: &IdentityService) -> io::Result<
 }
 
 /// Stops that the store has as engaged.
-async fn engaged(store: &dyn Store) -> anyhow::Result<Copied> {
+async fn engaged(store: &dyn Store, left_out: &mut LeftOut) -> anyhow::Result<Copied> {
     let snapshot = store.snapshot(&[Table::StopRecord]).await.context("reading copies of stops")?;
-    let records = snapshot.rows.iter().map(|row| row.decode::<StopRecord>()).collect::<Result<Vec<_>, _>>()?;
-    let mut stops: Vec<_> = records.into_iter().filter(StopRecord::is_effective).map(|record| record.stop).collect();
+    let mut stops = Vec::new();
+    for row in &snapshot.rows {
+        let record = left_out.read::<StopRecord>(row)?.filter(StopRecord::is_effective);
+        stops.extend(record.map(|record| record.stop));
+    }
     stops.sort_unstable();
     Ok(Copied { stops })
 }
@@ -59,7 +62,7 @@ async fn engaged(store: &dyn Store) -> anyhow::Result<Copied> {
 /// # Errors
 /// The disk, or the store.
 pub async fn tell_stops(folder: &Path, store: &dyn Store) -> anyhow::Result<()> {
-    Ok(engaged(store).await?.write(folder)?)
+    Ok(engaged(store, &mut LeftOut::default()).await?.write(folder)?)
 }
 
 /// The turn to follow, if nobody has it; the folder is made if it is not there.
@@ -78,6 +81,7 @@ fn turn_of(folder: &Path) -> io::Result<Option<File>> {
 pub struct StopFollower {
     folder: PathBuf,
     store: Arc<dyn Store>,
+    clock: Arc<dyn Clock>,
     /// Generation of the latch that was copied last.
     copied: Option<u64>,
     /// Stops of the store as they were written down last.
@@ -90,16 +94,24 @@ pub struct StopFollower {
     roster: Option<BTreeSet<RobotId>>,
     /// Who is known, and what that was when it was written last.
     identity: Option<(IdentityService, Option<Principals>)>,
+    /// Rows of a newer version, which nothing here is done by.
+    left_out: LeftOut,
     /// As the log was told.
     failing: bool,
 }
 
 impl StopFollower {
     /// Of the stop service that keeps its files in `folder`.
-    pub fn new(folder: PathBuf, store: Arc<dyn Store>, identity: Option<IdentityService>) -> Self {
+    pub fn new(
+        folder: PathBuf,
+        store: Arc<dyn Store>,
+        identity: Option<IdentityService>,
+        clock: Arc<dyn Clock>,
+    ) -> Self {
         let (copied, told, attached, gone, roster) = (None, None, None, BTreeSet::new(), None);
         let identity = identity.map(|identity| (identity, None));
-        Self { folder, store, copied, told, attached, gone, roster, identity, failing: false }
+        let left_out = LeftOut::default();
+        Self { folder, store, clock, copied, told, attached, gone, roster, identity, left_out, failing: false }
     }
 
     /// Until it is dropped.
@@ -160,7 +172,7 @@ impl StopFollower {
         if self.told.is_some() && !is_due {
             return Ok(());
         }
-        let newest = engaged(&*self.store).await?;
+        let newest = engaged(&*self.store, &mut self.left_out).await?;
         if self.told.as_ref() == Some(&newest) && self.folder.join(Copied::NAME).exists() {
             return Ok(());
         }
@@ -190,12 +202,19 @@ impl StopFollower {
         }
         let snapshot = self.store.snapshot(&[Table::StopRecord]).await.context("reading copies of stops")?;
         let mut copied: BTreeMap<StopId, (StopRecord, Revision)> = BTreeMap::new();
+        // Copies of a newer version: that one's to write.
+        let mut others = BTreeSet::new();
         for row in &snapshot.rows {
-            let record: StopRecord = row.decode()?;
-            copied.insert(record.stop.stop_id.clone(), (record, row.revision));
+            if let Some(record) = self.left_out.read::<StopRecord>(row)? {
+                copied.insert(record.stop.stop_id.clone(), (record, row.revision));
+            } else {
+                others.insert(&row.key);
+            }
         }
+        let mut items = copy(latch, &copied);
+        items.retain(|item| !item.rows.iter().any(|row| others.contains(&row.key)));
         let mut is_whole = true;
-        for result in self.store.commit(copy(latch, &copied)).await {
+        for result in self.store.commit(items).await {
             match result {
                 Ok(_) => {}
                 // Another follower was faster: looked at again.
@@ -209,7 +228,8 @@ impl StopFollower {
 
     async fn look_who_is_gone(&mut self) -> anyhow::Result<()> {
         let snapshot = self.store.snapshot(&[Table::RobotControl, Table::RobotIdentity]).await;
-        self.gone = who_is_gone(&snapshot.context("reading who is retired or revoked")?.rows)?;
+        let rows = snapshot.context("reading who is retired or revoked")?.rows;
+        self.gone = who_is_gone(&rows, &mut self.left_out, &self.clock.now())?;
         Ok(())
     }
 
@@ -265,18 +285,28 @@ impl StopFollower {
     }
 }
 
-/// Robots that are retired, and those that were revoked and not enrolled again since.
-fn who_is_gone(rows: &[Row]) -> Result<BTreeSet<RobotId>, BadRow> {
+/// Whether a robot that nobody lets in since `at` stands by its own silence. A moment much later than `now` was read from another clock: it counts as long ago.
+fn stands_by_itself(at: Utc, now: Utc) -> bool {
+    at.0.abs_diff(now.0) >= limits::SILENCE_STAND.as_ms() + limits::CHECK_IN.as_ms()
+}
+
+/// Robots that were retired, and those that were revoked and not enrolled again since: each once it stands by itself, so that a stop service that begins anew
+/// meanwhile still lists it.
+fn who_is_gone(rows: &[Row], left_out: &mut LeftOut, now: &Now) -> Result<BTreeSet<RobotId>, BadRow> {
     let mut gone = BTreeSet::new();
     for row in rows {
-        gone.extend(match row.key.table {
-            Table::RobotControl => Some(row.decode::<RobotControl>()?)
-                .filter(|control| control.duty() == Duty::Retired)
-                .map(|control| control.robot_id),
-            _ => {
-                Some(row.decode::<RobotIdentity>()?).filter(|robot| robot.revoked.is_some()).map(|robot| robot.robot_id)
+        let (robot_id, is_gone) = match row.key.table {
+            Table::RobotControl => {
+                let Some(control) = left_out.read::<RobotControl>(row)? else { continue };
+                (control.robot_id, control.retired.is_some_and(|act| stands_by_itself(act.since, now.utc)))
             }
-        });
+            _ => {
+                let Some(robot) = left_out.read::<RobotIdentity>(row)? else { continue };
+                let is_gone = robot.revoked.is_some_and(|act| stands_by_itself(Utc(act.at_unix_ms), now.wall));
+                (robot.robot_id, is_gone)
+            }
+        };
+        gone.extend(is_gone.then_some(robot_id));
     }
     Ok(gone)
 }
@@ -285,8 +315,10 @@ fn who_is_gone(rows: &[Row]) -> Result<BTreeSet<RobotId>, BadRow> {
 mod tests {
     use super::*;
     use midshift_core::ids::SiteId;
-    use midshift_core::rows::{Expect, Item, Writer};
-    use midshift_core::time::Utc;
+    use midshift_core::robot::StopLevel;
+    use midshift_core::rows::{Expect, Index, Item, Key, Record, RowChange, Write, Writer};
+    use midshift_core::stop::{Scope, Stop};
+    use midshift_core::time::{LinkTime, SiteTime};
     use midshift_store::{MemoryStore, StoreId};
 
     #[tokio::test]
@@ -294,18 +326,84 @@ mod tests {
         let store = MemoryStore::new(SiteId::parse("demo")?, StoreId::fresh(), crate::clock::clock(1000));
         let robot_id = RobotId::parse("r1")?;
         let mut robot = RobotIdentity::new(robot_id.clone());
-        let gone = async |robot: &RobotIdentity, expect: Expect| {
+        let gone = async |robot: &RobotIdentity, expect: Expect, ms: i64| {
             let mut item = Item::new(Writer::Identity, "anna");
             item.put(robot, expect, "robot.changed");
             assert!(store.commit(vec![item]).await.iter().all(Result::is_ok));
             let snapshot = store.snapshot(&[Table::RobotControl, Table::RobotIdentity]).await?;
-            anyhow::Ok(who_is_gone(&snapshot.rows)?)
+            let now = Now { site: SiteTime(0), link: LinkTime(0), utc: Utc(ms), wall: Utc(ms) };
+            anyhow::Ok(who_is_gone(&snapshot.rows, &mut LeftOut::default(), &now)?)
         };
-        assert!(gone(&robot, Expect::Absent).await?.is_empty());
+        assert!(gone(&robot, Expect::Absent, 50_000).await?.is_empty());
         robot.revoke("anna", Utc(5));
-        assert_eq!(gone(&robot, Expect::At(Revision(1))).await?, [robot_id].into());
+        // It may drive until its own silence stands it.
+        assert!(gone(&robot, Expect::At(Revision(1)), 31_004).await?.is_empty());
+        assert_eq!(gone(&robot, Expect::At(Revision(2)), 31_005).await?, [robot_id].into());
         robot.revoked = None;
-        assert!(gone(&robot, Expect::At(Revision(2))).await?.is_empty());
+        assert!(gone(&robot, Expect::At(Revision(3)), 50_000).await?.is_empty());
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn one_that_was_revoked_is_listed_by_whoever_begins_anew_until_it_stands_by_itself() -> anyhow::Result<()> {
+        let store = Arc::new(MemoryStore::new(SiteId::parse("demo")?, StoreId::fresh(), crate::clock::clock(1000)));
+        let mut robot = RobotIdentity::new(RobotId::parse("r1")?);
+        robot.revoke("anna", Utc(1_000_000));
+        let mut revoked = Item::new(Writer::Identity, "anna");
+        revoked.put(&robot, Expect::Absent, "robot.revoked");
+        let write = Write::Put { index: Index::default(), body: "{}".into() };
+        let key = Key::new(Table::Session, "r1");
+        let mut attached = Item::new(Writer::Telemetry, "tests");
+        attached.rows.push(RowChange { key, expect: Expect::Absent, write, kind: "session.begun" });
+        assert!(store.commit(vec![revoked, attached]).await.iter().all(Result::is_ok));
+        let folder = tempfile::tempdir()?;
+        for (ms, is_listed) in [(1_001_000, true), (1_020_000, true), (1_100_000, false)] {
+            let clock = crate::clock::at(Utc(ms), 1000);
+            let mut follower = StopFollower::new(folder.path().to_owned(), store.clone(), None, clock);
+            follower.look_who_is_gone().await?;
+            follower.look_who_attached().await?;
+            follower.tell_roster().await?;
+            // What a stop service reads that begins now.
+            let roster = std::fs::read_to_string(folder.path().join("roster.snapshot"))?;
+            assert_eq!(roster.contains("r1"), is_listed, "{roster} at {ms}");
+        }
+        Ok(())
+    }
+
+    fn stop(name: &str) -> anyhow::Result<Stop> {
+        Ok(Stop {
+            stop_id: StopId::parse(name)?,
+            scope: Scope::Fleet,
+            level: StopLevel::Halt,
+            engaged: Utc(1),
+            actor: "anna".to_owned(),
+            reason: String::new(),
+            region: None,
+            proof: Vec::new(),
+        })
+    }
+
+    #[tokio::test]
+    async fn a_copy_of_a_newer_version_is_left_as_it_is_and_stops_the_copying_of_no_other() -> anyhow::Result<()> {
+        let store = Arc::new(MemoryStore::new(SiteId::parse("demo")?, StoreId::fresh(), crate::clock::clock(1000)));
+        let record = StopRecord { stop: stop("S1")?, reset: None };
+        let body = record.body().replace("\"halt\"", "\"hover\"");
+        let write = Write::Put { index: record.index(), body: body.as_str().into() };
+        let mut item = Item::new(Writer::Stop, "tests");
+        item.rows.push(RowChange { key: record.key(), expect: Expect::Absent, write, kind: "stop.engaged" });
+        assert!(store.commit(vec![item]).await.iter().all(Result::is_ok));
+        let mut latch = Latch::default();
+        latch.engage(stop("S1")?);
+        latch.engage(stop("S2")?);
+        let folder = tempfile::tempdir()?;
+        let mut follower = StopFollower::new(folder.path().to_owned(), store.clone(), None, crate::clock::clock(1000));
+        follower.copy(1, &latch).await?;
+        let rows = store.snapshot(&[Table::StopRecord]).await?.rows;
+        let kept: Vec<_> = rows.iter().filter(|row| &*row.key.id == "S1").map(|row| &*row.body).collect();
+        assert_eq!(kept, [body.as_str()]);
+        assert!(rows.iter().any(|row| row.decode::<StopRecord>().is_ok_and(|copy| copy.stop.stop_id.as_str() == "S2")));
+        assert_eq!(follower.copied, Some(1), "it is not tried again at each look");
+        assert_eq!(follower.told.map(|told| told.stops), Some(vec![stop("S2")?]));
         Ok(())
     }
 

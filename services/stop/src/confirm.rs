@@ -9,7 +9,7 @@ use midshift_core::limits;
 use midshift_core::nearest::nearest;
 use midshift_core::reason::Refusal;
 use midshift_core::robot::StopLevel;
-use midshift_core::stop::roster::{Confirmation, confirmation};
+use midshift_core::stop::roster::{Confirmation, confirmation, is_elsewhere};
 use midshift_core::stop::{Scope, Stop};
 use midshift_core::time::Now;
 use midshift_proto::convert::WireEnum;
@@ -33,9 +33,17 @@ pub fn count(counts: &mut v1::Counts, confirmation: Confirmation) {
     } += 1;
 }
 
-fn encode(robot_id: &RobotId, confirmation: Confirmation, obeys: StopLevel, now: &Now) -> v1::RobotStop {
+/// How one robot is with the stop.
+#[derive(Clone, Copy, PartialEq, Eq)]
+struct Found {
+    confirmation: Confirmation,
+    obeys: StopLevel,
+    is_elsewhere: bool,
+}
+
+fn encode(robot_id: &RobotId, found: &Found, now: &Now) -> v1::RobotStop {
     use v1::Confirmation as W;
-    let (word, since, by) = match confirmation {
+    let (word, since, by) = match found.confirmation {
         Confirmation::Requested => (W::Requested, None, None),
         Confirmation::Acked => (W::Acked, None, None),
         Confirmation::Outside => (W::Outside, None, None),
@@ -47,7 +55,8 @@ fn encode(robot_id: &RobotId, confirmation: Confirmation, obeys: StopLevel, now:
         confirmation: word.into(),
         unreachable_since_unix_ms: since.map_or(0, |at| now.wall_at(at).0),
         self_stop_by_unix_ms: by.map_or(0, |at| now.wall_at(at).0),
-        obeys: obeys.to_wire(),
+        obeys: found.obeys.to_wire(),
+        elsewhere: found.is_elsewhere,
     }
 }
 
@@ -62,7 +71,7 @@ struct Seen {
 struct Watching<'a> {
     inner: &'a Inner,
     stop: Stop,
-    told: BTreeMap<RobotId, (Confirmation, StopLevel)>,
+    told: BTreeMap<RobotId, Found>,
 }
 
 impl Watching<'_> {
@@ -80,20 +89,25 @@ impl Watching<'_> {
         for robot in &robots {
             let said = robot.said();
             let heard = said.heard.as_ref();
-            let confirmation = confirmation(&self.stop, since, &robot.robot_id, heard, now.link);
-            found.insert(robot.robot_id.clone(), (confirmation, heard.map(|h| h.level).unwrap_or_default()));
+            let one = Found {
+                confirmation: confirmation(&self.stop, since, &robot.robot_id, heard, now.link),
+                obeys: heard.map(|h| h.level).unwrap_or_default(),
+                is_elsewhere: is_elsewhere(&self.stop, since, &robot.robot_id, heard, now.link),
+            };
+            found.insert(robot.robot_id.clone(), one);
         }
         if let Scope::Robot(robot_id) = &self.stop.scope {
             // One that nobody knows of: nobody knows either whether it stands.
-            let unknown = (confirmation(&self.stop, since, robot_id, None, now.link), StopLevel::None);
+            let confirmation = confirmation(&self.stop, since, robot_id, None, now.link);
+            let unknown = Found { confirmation, obeys: StopLevel::None, is_elsewhere: false };
             found.entry(robot_id.clone()).or_insert(unknown);
         }
-        for (robot_id, (confirmation, obeys)) in &found {
-            count(&mut seen.counts, *confirmation);
-            let is_over = || confirmation.is_settled(&self.stop) || self.has_stood_by_itself(*confirmation, now);
-            seen.is_over &= !may_mean(&self.stop, robot_id) || is_over();
-            if self.told.get(robot_id) != Some(&(*confirmation, *obeys)) {
-                seen.news.push(encode(robot_id, *confirmation, *obeys, now));
+        for (robot_id, one) in &found {
+            count(&mut seen.counts, one.confirmation);
+            let is_over = || one.confirmation.is_settled(&self.stop) || self.has_stood_by_itself(one.confirmation, now);
+            seen.is_over &= !may_mean(&self.stop, robot_id) || one.is_elsewhere || is_over();
+            if self.told.get(robot_id) != Some(one) {
+                seen.news.push(encode(robot_id, one, now));
             }
         }
         self.told = found;
@@ -127,7 +141,8 @@ impl Watching<'_> {
     }
 }
 
-/// A robot may lie inside of this stop as far as anybody else knows, so that its word is waited for. Where one is that is not heard, nobody knows.
+/// A robot may lie inside of this stop as far as anybody else knows, so that its word is waited for. Where one is that is not heard, nobody knows but itself
+/// ([`is_elsewhere`]).
 fn may_mean(stop: &Stop, robot_id: &RobotId) -> bool {
     !matches!(&stop.scope, Scope::Robot(id) if id != robot_id)
 }

@@ -17,6 +17,7 @@ mod gather;
 mod group;
 mod heard;
 pub mod lead;
+mod left_out;
 mod migrations;
 mod model;
 mod model_table;
@@ -32,6 +33,7 @@ pub use frames::{
     Coarsen, FRAME_BYTES_DEFAULT, Frame, FrameLog, FrameMark, FramesOldest, GAPS_MAX, Gap, MemoryFrames, StoredFrame,
 };
 pub use heard::{Heard, HeardLog, Kept, MemoryHeard, follow_heard};
+pub use left_out::LeftOut;
 pub use migrations::Migrated;
 pub use model::MemoryStore;
 pub use open_error::OpenError;

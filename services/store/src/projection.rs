@@ -27,8 +27,13 @@ impl Change {
     /// # Errors
     /// If the body is not what its table holds.
     pub fn decode<R: Record>(&self) -> Result<Option<R>, BadRow> {
-        let Some(body) = self.body.clone() else { return Ok(None) };
-        Row { key: self.key.clone(), revision: self.revision, index: self.index.clone(), body }.decode().map(Some)
+        self.row().map(|row| row.decode()).transpose()
+    }
+
+    /// The row; none if it was deleted.
+    pub(crate) fn row(&self) -> Option<Row> {
+        let (key, index, body) = (self.key.clone(), self.index.clone(), self.body.clone()?);
+        Some(Row { key, revision: self.revision, index, body })
     }
 
     fn of_row(row: Row) -> Self {

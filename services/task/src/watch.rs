@@ -28,8 +28,6 @@ use tokio::time::Instant;
 
 /// A watcher hears from us at least this often.
 const BOOKMARK_EVERY: Duration = Duration::from_secs(15);
-/// Entries read at a time.
-const PAGE: usize = 1_000;
 
 /// One watcher.
 pub struct Watcher {
@@ -152,7 +150,7 @@ impl Watcher {
         let store = self.service.inner.parts.store.clone();
         self.after = self.head().await?;
         let begin = begins_with(&self.filter);
-        let mut search = Search::new(&begin, Direction::OldestFirst, None, limits::PAGE_MAX);
+        let mut search = Search::new(&begin, Direction::OldestFirst, None, limits::WATCH_PAGE);
         loop {
             let rows = search.next(store.as_ref()).await.map_err(unavailable)?;
             if rows.is_empty() {
@@ -175,7 +173,7 @@ impl Watcher {
     async fn changes(&mut self) -> Result<(), Stop> {
         let store = self.service.inner.parts.store.clone();
         loop {
-            let page = match store.feed(self.after, &[Log::Task, Log::Fleet], PAGE).await {
+            let page = match store.feed(self.after, &[Log::Task, Log::Fleet], limits::WATCH_PAGE).await {
                 Err(Error::CursorExpired { .. }) => {
                     return Err(Refusal::new(Kind::Precondition, Code::CursorExpired).into());
                 }

@@ -9,7 +9,7 @@ use midshift_core::time::{LinkDuration, Utc};
 use midshift_proto::access::caller;
 use midshift_proto::link::v1::{self, link_service_server::LinkService};
 use midshift_proto::session::{FromRobot, Hello, ToRobot};
-use midshift_proto::status::too_large;
+use midshift_proto::status::unreadable;
 use midshift_proto::{Denying, Leaving};
 use std::time::Duration;
 use tokio::sync::mpsc;
@@ -126,7 +126,7 @@ impl Drop for Leave<'_> {
 async fn hello(up: &mut Streaming<v1::SessionRequest>) -> Result<Hello, Refusal> {
     let first = tokio::time::timeout(HELLO_WITHIN, up.message()).await;
     if let Ok(Err(status)) = &first
-        && let Some(refusal) = too_large(status)
+        && let Some(refusal) = unreadable(status)
     {
         return Err(refusal);
     }

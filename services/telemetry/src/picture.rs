@@ -11,7 +11,7 @@ use midshift_core::site::{Site, text};
 use midshift_core::stop::record::StopRecord;
 use midshift_core::update::DesiredUpdate;
 use midshift_core::work::{DesiredPolicy, DesiredWork, LaneMark, Live, PresenceRow, Session};
-use midshift_store::{Change, Dirty, Error, Fold, LiveBoard, Projection};
+use midshift_store::{Change, Dirty, Error, Fold, LeftOut, LiveBoard, Projection};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 use std::time::Duration;
@@ -143,7 +143,11 @@ impl Picture {
     }
 }
 
-struct Keeper(Arc<Inner>);
+struct Keeper {
+    inner: Arc<Inner>,
+    /// Rows with a word of a newer version: what they are about gets nothing new, and everything else goes on.
+    left_out: LeftOut,
+}
 
 fn sections<'a>(rows: &'a mut Rows, robot_id: &RobotId) -> &'a mut Sections {
     rows.desired.entry(robot_id.clone()).or_default()
@@ -163,42 +167,49 @@ impl Fold for Keeper {
         ]
     }
     fn reset(&mut self) {
-        let mut rows = self.0.picture.rows_mut();
+        let mut rows = self.inner.picture.rows_mut();
         let status = std::mem::take(&mut rows.status);
         *rows = Rows { status, ..Rows::default() };
     }
     fn apply(&mut self, change: Change) -> Result<(), BadRow> {
         if change.key.table == Table::Site {
-            self.0.picture.rows_mut().site = change.decode::<SiteRow>()?.and_then(|row| map_of(&row));
+            self.inner.picture.rows_mut().site =
+                self.left_out.read_change::<SiteRow>(&change)?.and_then(|row| map_of(&row));
             return Ok(());
         }
         let id = change.key.id.to_string();
         if change.key.table == Table::StopRecord {
             let Ok(stop_id) = StopId::parse(&id) else { return Ok(()) };
-            let record = change.decode::<StopRecord>()?.map(Arc::new);
-            put(Arc::make_mut(&mut self.0.picture.rows_mut().stops), stop_id, record);
+            let record = self.left_out.read_change::<StopRecord>(&change)?.map(Arc::new);
+            put(Arc::make_mut(&mut self.inner.picture.rows_mut().stops), stop_id, record);
             return Ok(());
         }
         let Ok(robot_id) = RobotId::parse(id.split('/').next().unwrap_or_default()) else { return Ok(()) };
-        let mut rows = self.0.picture.rows_mut();
+        let mut rows = self.inner.picture.rows_mut();
         match change.key.table {
-            Table::DesiredWork => sections(&mut rows, &robot_id).work = change.decode()?.map(Arc::new),
-            Table::DesiredPolicy => sections(&mut rows, &robot_id).policy = change.decode()?.map(Arc::new),
-            Table::DesiredUpdate => sections(&mut rows, &robot_id).update = change.decode()?.map(Arc::new),
-            Table::Session => put(&mut rows.sessions, robot_id.clone(), change.decode()?),
-            Table::Presence => put(&mut rows.presence, robot_id.clone(), change.decode()?),
-            Table::LaneMark => put(&mut rows.marks, id, change.decode()?),
+            Table::DesiredWork => {
+                sections(&mut rows, &robot_id).work = self.left_out.read_change(&change)?.map(Arc::new)
+            }
+            Table::DesiredPolicy => {
+                sections(&mut rows, &robot_id).policy = self.left_out.read_change(&change)?.map(Arc::new)
+            }
+            Table::DesiredUpdate => {
+                sections(&mut rows, &robot_id).update = self.left_out.read_change(&change)?.map(Arc::new)
+            }
+            Table::Session => put(&mut rows.sessions, robot_id.clone(), self.left_out.read_change(&change)?),
+            Table::Presence => put(&mut rows.presence, robot_id.clone(), self.left_out.read_change(&change)?),
+            Table::LaneMark => put(&mut rows.marks, id, self.left_out.read_change(&change)?),
             _ => {}
         }
         drop(rows);
         match change.key.table {
-            Table::DesiredWork | Table::DesiredPolicy | Table::DesiredUpdate => self.0.picture.publish(&robot_id),
+            Table::DesiredWork | Table::DesiredPolicy | Table::DesiredUpdate => self.inner.picture.publish(&robot_id),
             Table::Session => {
-                let newest = self.0.picture.rows().sessions.get(&robot_id).map(|s| s.session_epoch);
-                self.0.registry.fence(&robot_id, newest.unwrap_or(0));
-                self.0.picture.touch(&robot_id);
+                let newest = self.inner.picture.rows().sessions.get(&robot_id).map(|s| s.session_epoch);
+                self.inner.registry.fence(&robot_id, newest.unwrap_or(0));
+                self.inner.picture.touch(&robot_id);
             }
-            Table::Presence => self.0.picture.touch(&robot_id),
+            Table::Presence => self.inner.picture.touch(&robot_id),
             _ => {}
         }
         Ok(())
@@ -225,7 +236,7 @@ pub async fn keep(inner: &Arc<Inner>) -> Result<(), Error> {
     let mut wake = inner.parts.store.wake();
     load_status(inner).await;
     let mut read_marks = Instant::now();
-    let mut projection = Projection::new(Keeper(inner.clone()));
+    let mut projection = Projection::new(Keeper { inner: inner.clone(), left_out: LeftOut::default() });
     loop {
         wake.mark_unchanged();
         match projection.advance(inner.parts.store.as_ref()).await {

@@ -34,7 +34,8 @@ const LEFT_TO_OTHERS: LinkDuration = LinkDuration::from_secs(2);
 
 /// What is not ours to write yet, and since when.
 type Stood = BTreeMap<RobotId, (Presence, LinkTime)>;
-type Known = BTreeMap<RobotId, (PresenceRow, Revision)>;
+/// Rows as they are; one that cannot be read is of a newer version, and that one's to write.
+type Known = BTreeMap<RobotId, (Option<PresenceRow>, Revision)>;
 
 async fn read(store: &dyn Store) -> Option<Known> {
     let mut known = Known::new();
@@ -44,8 +45,8 @@ async fn read(store: &dyn Store) -> Option<Known> {
         let Some(last) = rows.last() else { return Some(known) };
         query.after = Some(midshift_store::Cursor::of(last));
         for row in &rows {
-            if let Ok(presence) = row.decode::<PresenceRow>() {
-                known.insert(presence.robot_id.clone(), (presence, row.revision));
+            if let Ok(robot_id) = RobotId::parse(&row.key.id) {
+                known.insert(robot_id, (row.decode::<PresenceRow>().ok(), row.revision));
             }
         }
     }
@@ -84,17 +85,15 @@ async fn write(inner: &Inner, known: &mut Known, stood: &mut Stood, started: Lin
             let presence = of(live.map(|live| live.processed_at), now.link);
             let old = known.get(&robot_id);
             let is_ours = inner.shared.is_none() || inner.registry.is_home(&robot_id);
-            let told =
-                |row: &PresenceRow| row.presence == presence && !(is_ours && live.is_some_and(|l| is_news(row, l)));
+            let is_news = |row: &PresenceRow| is_ours && live.is_some_and(|live| is_news(row, live));
+            let is_told = |row: &PresenceRow| row.presence == presence && !is_news(row);
+            let same = old.is_some_and(|(row, _)| row.as_ref().is_none_or(is_told));
             let too_early = young && live.is_none();
-            if old.is_some_and(|(row, _)| told(row))
-                || too_early
-                || is_others(inner, &robot_id, (presence, now.link), stood)
-            {
+            if same || too_early || is_others(inner, &robot_id, (presence, now.link), stood) {
                 return None;
             }
             let fresh = || PresenceRow::new(robot_id.clone(), Presence::Offline, now.wall.0);
-            let row = old.map_or_else(fresh, |(row, _)| row.clone()).next(presence, live, now.wall);
+            let row = old.and_then(|(row, _)| row.clone()).unwrap_or_else(fresh).next(presence, live, now.wall);
             Some((row, old.map_or(Revision(0), |(_, revision)| *revision)))
         })
         .collect();
@@ -112,7 +111,7 @@ async fn write(inner: &Inner, known: &mut Known, stood: &mut Stood, started: Lin
     }
     let applied = inner.parts.store.commit(items).await.iter().all(Result::is_ok);
     for (row, revision) in changed {
-        known.insert(row.robot_id.clone(), (row, revision.next()));
+        known.insert(row.robot_id.clone(), (Some(row), revision.next()));
     }
     applied
 }

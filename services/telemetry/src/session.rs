@@ -27,7 +27,7 @@ use midshift_proto::link::v1;
 use midshift_proto::session::{
     ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, ToRobot, Uplink,
 };
-use midshift_proto::status::too_large;
+use midshift_proto::status::unreadable;
 use std::collections::VecDeque;
 use std::future::Future;
 use std::pin::Pin;
@@ -68,8 +68,8 @@ struct Session {
     committing: Option<Boxed<Outcome>>,
     /// A person is being told of a heartbeat that was too long.
     telling: Option<Boxed<bool>>,
-    /// The list of such a heartbeat, once in a session.
-    too_long: Option<&'static str>,
+    /// When a person was told of such a heartbeat; none: of none since one that could be read.
+    too_long: Option<Instant>,
     status: StatusLane,
     keeping: Option<Boxed<Option<u64>>>,
     /// Old STATUS from bulk; none: observed only.
@@ -239,10 +239,11 @@ impl Session {
         }
     }
 
-    /// What the robot sent cannot be read: it hears why if it was too large.
+    /// What the robot sent cannot be read: it hears why, if there still is a stream.
     fn broken(&self, status: &Status) -> End {
-        let Some(refusal) = too_large(status) else { return End::Gone };
-        tracing::warn!(peer = Empty, robot_id = %self.robot_id, code = Code::MessageTooLarge.as_str(), "session ended by a message that is too large");
+        let Some(refusal) = unreadable(status) else { return End::Gone };
+        let code = refusal.reason.code.as_str();
+        tracing::warn!(peer = Empty, robot_id = %self.robot_id, code, "session ended by a message that cannot be read");
         End::Close(Close { code: CloseCode::Protocol, reason: refusal.reason, retry_after_ms: 1_000 })
     }
 
@@ -284,6 +285,7 @@ impl Session {
             return Some(End::Close(Close { code: CloseCode::Protocol, reason, retry_after_ms: 1_000 }));
         };
         if let Some(heartbeat) = heartbeat {
+            self.too_long = None;
             self.heartbeat(heartbeat);
         }
         for batch in batches {
@@ -302,9 +304,12 @@ impl Session {
     /// It is neither processed nor echoed, so that the robot's authority ends by itself.
     fn heartbeat_too_long(&mut self, list: &'static str) {
         metrics::counter!("midshift_telemetry_heartbeats_too_long_total").increment(1);
-        if self.in_charge.is_none() || self.too_long.replace(list).is_some() {
+        let (now, every) = (Instant::now(), Duration::from_millis(limits::REPORT_TOO_LONG_TOLD_EVERY.as_ms()));
+        let is_told = self.too_long.is_some_and(|told| now < told + every);
+        if self.in_charge.is_none() || is_told || self.telling.is_some() {
             return;
         }
+        self.too_long = Some(now);
         tracing::warn!(peer = Empty, robot_id = %self.robot_id, list, "heartbeats with a list that is too long are not processed");
         let (inner, robot_id) = (self.inner.clone(), self.robot_id.clone());
         self.telling = Some(Box::pin(async move {

@@ -339,7 +339,7 @@ impl Told {
             .or_try("midshift stop status")
     }
 
-    /// Whether nobody waits for this robot's word any more: a stop of one robot waits for that one alone.
+    /// Whether nobody waits for this robot's word any more: a stop of one robot waits for that one alone, and no stop for one that said it lies elsewhere.
     fn is_settled(&self, robot: &v1::RobotStop) -> bool {
         use v1::Confirmation as C;
         if let Some(Scope::RobotId(meant)) = self.stop.scope.as_ref().and_then(|s| s.scope.as_ref())
@@ -350,7 +350,8 @@ impl Told {
         match robot.confirmation() {
             C::StandstillConfirmed | C::Outside => true,
             C::Acked => self.stop.level() == StopLevel::Slow,
-            C::Requested | C::Unreachable | C::Unspecified => false,
+            C::Unreachable => robot.elsewhere,
+            C::Requested | C::Unspecified => false,
         }
     }
 
@@ -661,6 +662,8 @@ mod tests {
             !settled(StopLevel::Halt, v1::Confirmation::Acked) && settled(StopLevel::Slow, v1::Confirmation::Acked)
         );
         assert!(!settled(StopLevel::Halt, v1::Confirmation::Unreachable));
+        let elsewhere = v1::RobotStop { elsewhere: true, ..robot(v1::Confirmation::Unreachable) };
+        assert!(told(StopLevel::Halt).is_settled(&elsewhere), "it said so, and obeys the stop wherever it drives");
         let text = confirmed(&v1::RobotStop {
             unreachable_since_unix_ms: 1_000,
             self_stop_by_unix_ms: 7_000,

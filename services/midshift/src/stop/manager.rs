@@ -32,14 +32,22 @@ pub fn is_now(process: u32) {
 pub async fn is_watched(service: &OnceLock<StopService>) {
     let within = env::var(WATCHDOG).ok().and_then(|micros| micros.parse().ok()).map(Duration::from_micros);
     let (Some(address), Some(within)) = (env::var_os(NOTIFY), within) else { return pending().await };
+    let look = || {
+        if let Some(service) = service.get() {
+            service.look_at_locks();
+        }
+    };
+    say_alive(&address, within, look).await;
+}
+
+/// Says so for ever, each time after `look` has come back.
+async fn say_alive(address: &OsStr, within: Duration, look: impl Fn()) {
     let mut each = tokio::time::interval((within / WORDS).max(Duration::from_millis(1)));
     let mut is_heard = true;
     loop {
         each.tick().await;
-        if let Some(service) = service.get() {
-            service.look_at_locks();
-        }
-        let to = address.clone();
+        look();
+        let to = address.to_owned();
         let told = tokio::task::spawn_blocking(move || notify(&to, "WATCHDOG=1")).await;
         let hears = matches!(told, Ok(Ok(())));
         if is_heard && !hears {
@@ -63,6 +71,9 @@ fn notify(address: &OsStr, text: &str) -> io::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::sync::{Arc, Mutex, mpsc};
+    use std::thread;
+    use tokio::sync::oneshot;
 
     #[test]
     fn a_service_manager_is_told_by_a_path_or_an_abstract_name() {
@@ -77,6 +88,42 @@ mod tests {
             let bytes = socket.recv(&mut heard).unwrap();
             assert_eq!(&heard[..bytes], b"MAINPID=7");
         }
+    }
+
+    #[test]
+    fn a_service_manager_hears_nothing_while_what_every_stop_needs_is_held() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("notify");
+        let manager = UnixDatagram::bind(&path).unwrap();
+        let needed = Arc::new(Mutex::new(()));
+        let held = needed.lock().unwrap();
+        let (looks, looked) = mpsc::sync_channel(1);
+        let (ends, ended) = oneshot::channel::<()>();
+        let locks = needed.clone();
+        let service = thread::spawn(move || {
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap();
+            runtime.block_on(async {
+                let look = || {
+                    // Only the first is waited for.
+                    let _ = looks.try_send(());
+                    drop(locks.lock().unwrap());
+                };
+                tokio::select! {
+                    () = say_alive(path.as_os_str(), Duration::from_millis(3), look) => {}
+                    _ = ended => {}
+                }
+            });
+        });
+        looked.recv().unwrap();
+        let mut heard = [0; 32];
+        manager.set_nonblocking(true).unwrap();
+        assert_eq!(manager.recv(&mut heard).map_err(|error| error.kind()), Err(io::ErrorKind::WouldBlock));
+        manager.set_nonblocking(false).unwrap();
+        drop(held);
+        let bytes = manager.recv(&mut heard).unwrap();
+        assert_eq!(&heard[..bytes], b"WATCHDOG=1");
+        ends.send(()).unwrap();
+        service.join().unwrap();
     }
 
     #[test]

@@ -3,7 +3,9 @@
 use crate::harness::{Folder, Robot, Server, eventually, fleet, id_of, scope, within};
 use midshift_core::ids::{RobotId, StopId};
 use midshift_core::robot::StopLevel;
+use midshift_core::site::{DEMO, text};
 use midshift_core::stop::Reset;
+use midshift_core::stop::ladder::Around;
 use midshift_core::time::Utc;
 use midshift_proto::convert::stop::CheckIn;
 use midshift_proto::stop::v1;
@@ -11,6 +13,7 @@ use midshift_proto::stop::v1::Confirmation as C;
 use midshift_proto::stop::v1::scope::Scope as W;
 use midshift_stop::Roster;
 use std::fs;
+use std::sync::Arc;
 use tonic::{Code, Streaming};
 
 /// Reads until a robot is shown so.
@@ -137,6 +140,36 @@ async fn a_stop_of_one_robot_waits_for_the_word_of_no_other() {
     }
     let counts = v1::Counts { acked: 1, unreachable: 1, ..v1::Counts::default() };
     assert_eq!(last, Some(counts), "it is over, and the other is shown as it is");
+}
+
+#[tokio::test]
+async fn a_stop_of_an_area_waits_for_no_robot_that_said_it_lies_elsewhere_and_for_one_that_said_nothing() {
+    let folder = Folder::new();
+    let site = Arc::new(text::parse(DEMO).unwrap());
+    let hall = site.areas()[0].area_id.to_string();
+    let server = Server::with_site(&folder.path(), Some(site)).await;
+    let mut here = Robot::dial(&server, "here", vec![]).await.synced().await;
+    let mut there = Robot::dial(&server, "there", vec![]).await.synced().await;
+    let mut stream = server.client().await.engage(scope(W::AreaId(hall))).await.unwrap().into_inner();
+    let id = id_of(&stream.message().await.unwrap().unwrap());
+    for robot in [&mut here, &mut there] {
+        robot.until(|robot| robot.knows(&id)).await;
+    }
+    let (level, around) = (StopLevel::None, Around::Robots);
+    let said = CheckIn { inside: vec![], awaiting: vec![], level, around, ..there.obeying(false) };
+    there.check_in(said).await;
+    until(&mut stream, "there", C::Outside).await;
+    server.ahead(3_000);
+    let silent = until(&mut stream, "there", C::Unreachable).await;
+    assert!(silent.elsewhere, "it obeys the stop wherever it drives");
+    // Nobody has heard of the other one where it is: its word is waited for, and ends the stream.
+    let said = here.obeying(true);
+    here.check_in(said).await;
+    let mut last = None;
+    while let Some(message) = within(stream.message()).await.unwrap() {
+        last = message.counts;
+    }
+    assert_eq!(last, Some(v1::Counts { standstill_confirmed: 1, unreachable: 1, ..v1::Counts::default() }));
 }
 
 #[tokio::test]

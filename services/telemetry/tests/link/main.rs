@@ -3,6 +3,7 @@
 mod disk;
 mod gateways;
 mod machines;
+mod newer;
 mod reach;
 mod replay;
 mod retention;
@@ -11,4 +12,5 @@ mod second;
 mod sessions;
 mod status;
 mod stops;
+mod unreadable;
 mod world;

@@ -1,6 +1,7 @@
 //! A robot's session: welcome, acknowledgements, desired state, succession, clones.
 
 use crate::world::{Otherwise, Result, Robot, World, hello, world, world_with};
+use midshift_core::fleet::REPORT_TOO_LONG;
 use midshift_core::ids::{PlaceId, RobotId};
 use midshift_core::limits;
 use midshift_core::reason::Code;
@@ -10,6 +11,7 @@ use midshift_core::work::{DesiredWork, InboxItem, RobotEvent, Sample, SampleBody
 use midshift_proto::session::{ClockSample, CloseCode, Downlink, Heartbeat, LaneAck, LaneBatch, Uplink};
 use midshift_store::load;
 use midshift_telemetry::{Bugs, SeededBug};
+use std::time::Duration;
 
 async fn inbox(world: &World) -> Result<usize> {
     Ok(world.store.feed(Seq(0), &[Log::RobotInbox], 1_000).await?.entries.len())
@@ -162,7 +164,7 @@ async fn of_a_storm_of_robots_some_are_put_off_with_a_time_and_all_come_in() -> 
     let refused = refused.downcast_ref::<tonic::Status>().ok_or("no status")?;
     let answer = midshift_proto::refusal_of(refused);
     assert_eq!((answer.grpc, answer.code), (tonic::Code::ResourceExhausted, Some(Code::Overloaded)));
-    let least = std::time::Duration::from_millis(limits::HELLO_AGAIN.as_ms());
+    let least = Duration::from_millis(limits::HELLO_AGAIN.as_ms());
     assert!(answer.retry_after.is_some_and(|after| (least..=2 * least).contains(&after)), "{answer:?}");
     read.send(()).map_err(|()| "it ended")?;
     let mut welcome = 0;
@@ -196,16 +198,59 @@ async fn a_new_session_remembers_the_clock_that_the_one_before_measured() -> Res
     Ok(())
 }
 
-#[tokio::test(start_paused = true)]
-async fn a_heartbeat_with_a_list_that_is_too_long_is_not_processed_and_its_samples_are() -> Result<()> {
-    let world = world().await?;
-    let mut robot = Robot::attach(&world, None).await?;
+/// A heartbeat with a list that is too long.
+fn too_long(robot: &Robot, hb: u64) -> Heartbeat {
     let place =
         |n: usize| HeldPlace { place_id: PlaceId::parse(&format!("P{n}")).expect("an id"), grant_id: 0, inside: true };
     let session_epoch = robot.welcome.session_epoch;
     let places = (0..257).map(place).collect();
-    let reported = ReportedState { hb: 1, session_epoch, places, ..ReportedState::default() };
-    let heartbeat = Heartbeat { reported, sent_unix_us: 0, clock: None };
+    let reported = ReportedState { hb, session_epoch, places, ..ReportedState::default() };
+    Heartbeat { reported, sent_unix_us: 0, clock: None }
+}
+
+/// Waits until a person was told of such heartbeats so many times.
+async fn told_of_too_long(world: &World, times: usize) -> Result<()> {
+    let mut wake = world.store.wake();
+    let told = async {
+        loop {
+            wake.mark_unchanged();
+            let entries = world.store.feed(Seq(0), &[Log::Telemetry], 1_000).await?.entries;
+            let told = entries.iter().filter(|entry| &*entry.kind == REPORT_TOO_LONG).count();
+            if told >= times {
+                assert_eq!(told, times);
+                return Ok(());
+            }
+            wake.changed().await?;
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(5), told).await?
+}
+
+#[tokio::test(start_paused = true)]
+async fn heartbeats_that_are_too_long_are_told_again_after_one_that_was_not_and_when_they_go_on() -> Result<()> {
+    let world = world().await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    let says = async |robot: &mut Robot| {
+        robot.hb += 1;
+        let heartbeat = Some(too_long(robot, robot.hb));
+        robot.say(Uplink { heartbeat, batches: Vec::new() }).await
+    };
+    says(&mut robot).await?;
+    told_of_too_long(&world, 1).await?;
+    robot.beat().await?;
+    robot.hears(|down| down.echo).await?;
+    says(&mut robot).await?;
+    told_of_too_long(&world, 2).await?;
+    tokio::time::advance(Duration::from_millis(limits::REPORT_TOO_LONG_TOLD_EVERY.as_ms())).await;
+    says(&mut robot).await?;
+    told_of_too_long(&world, 3).await
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_heartbeat_with_a_list_that_is_too_long_is_not_processed_and_its_samples_are() -> Result<()> {
+    let world = world().await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    let heartbeat = too_long(&robot, 1);
     let body = SampleBody::Event(RobotEvent::Mode(Mode::Automatic));
     let items = vec![InboxItem::Sample(Sample { seq: 1, robot_unix_ms: 0, body })];
     let batches = vec![LaneBatch { lane: Lane::Event, items }];

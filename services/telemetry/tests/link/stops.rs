@@ -9,7 +9,7 @@ use midshift_core::stop::{Reset, Scope, Stop};
 use midshift_core::time::Utc;
 use midshift_proto::session::StopFacts;
 
-fn record(n: u8, scope: Scope) -> Result<StopRecord> {
+pub fn record(n: u8, scope: Scope) -> Result<StopRecord> {
     let stop = Stop {
         stop_id: StopId::parse(&format!("STOP-{n}"))?,
         scope,
@@ -24,13 +24,13 @@ fn record(n: u8, scope: Scope) -> Result<StopRecord> {
     Ok(StopRecord { stop, reset: None })
 }
 
-async fn copied(world: &World, record: &StopRecord, expect: Expect) {
+pub async fn copied(world: &World, record: &StopRecord, expect: Expect) {
     let mut item = Item::new(Writer::Stop, "stop");
     item.put(record, expect, "stop.engaged");
     assert!(world.store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
 }
 
-async fn hears(robot: &mut Robot) -> Result<StopFacts> {
+pub async fn hears(robot: &mut Robot) -> Result<StopFacts> {
     robot.hears(|down| down.stops.clone()).await
 }
 

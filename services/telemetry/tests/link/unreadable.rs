@@ -1,0 +1,107 @@
+//! Bytes of a robot that are no message: it hears so before anything ends.
+
+use crate::world::{Result, World, hello, world};
+use midshift_core::reason::Code;
+use midshift_core::robot::ReportedState;
+use midshift_proto::link::v1::{SessionRequest, SessionResponse};
+use midshift_proto::session::{Close, CloseCode, FromRobot, Heartbeat, ToRobot, Uplink};
+use prost::Message;
+use prost::bytes::BufMut;
+use tonic::client::Grpc;
+use tonic::codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder};
+use tonic::codegen::http::uri::PathAndQuery;
+use tonic::{Request, Status, Streaming};
+
+/// Says bytes as they are, and reads messages.
+struct Raw;
+
+impl Codec for Raw {
+    type Encode = Vec<u8>;
+    type Decode = SessionResponse;
+    type Encoder = Self;
+    type Decoder = Self;
+
+    fn encoder(&mut self) -> Self {
+        Self
+    }
+    fn decoder(&mut self) -> Self {
+        Self
+    }
+}
+
+impl Encoder for Raw {
+    type Item = Vec<u8>;
+    type Error = Status;
+
+    fn encode(&mut self, item: Vec<u8>, to: &mut EncodeBuf<'_>) -> std::result::Result<(), Status> {
+        to.put_slice(&item);
+        Ok(())
+    }
+}
+
+impl Decoder for Raw {
+    type Item = SessionResponse;
+    type Error = Status;
+
+    fn decode(&mut self, from: &mut DecodeBuf<'_>) -> std::result::Result<Option<SessionResponse>, Status> {
+        SessionResponse::decode(from).map(Some).map_err(|error| Status::internal(error.to_string()))
+    }
+}
+
+fn bytes_of(message: &FromRobot) -> Vec<u8> {
+    SessionRequest::from(message).encode_to_vec()
+}
+
+/// A session in which these bytes are said, one message each.
+async fn says(world: &World, messages: Vec<Vec<u8>>) -> Result<Streaming<SessionResponse>> {
+    let mut link = Grpc::new(world.channel.clone());
+    link.ready().await?;
+    let path = PathAndQuery::from_static("/midshift.link.v1.LinkService/Session");
+    Ok(link.streaming(Request::new(tokio_stream::iter(messages)), path, Raw).await?.into_inner())
+}
+
+/// The last word of a session that has begun; behind it the stream ends without an error.
+async fn last_word(mut down: Streaming<SessionResponse>) -> Result<Close> {
+    let mut last = None;
+    while let Some(message) = down.message().await? {
+        last = Some(midshift_proto::parse::<ToRobot, _>(message)?);
+    }
+    match last {
+        Some(ToRobot::Close(close)) => Ok(close),
+        other => Err(format!("the last word was {other:?}").into()),
+    }
+}
+
+/// A heartbeat with one byte that is no text.
+fn heartbeat_of_no_text() -> Result<Vec<u8>> {
+    let reported = ReportedState { hb: 1, map_version: "~~~~".to_owned(), ..ReportedState::default() };
+    let heartbeat = Some(Heartbeat { reported, sent_unix_us: 0, clock: None });
+    let mut bytes = bytes_of(&FromRobot::Uplink(Uplink { heartbeat, batches: Vec::new() }));
+    let at = bytes.windows(4).position(|four| four == b"~~~~").ok_or("its map is in it")?;
+    bytes[at] = 0xff;
+    Ok(bytes)
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_whose_message_cannot_be_read_hears_so_before_its_session_ends() -> Result<()> {
+    let world = world().await?;
+    for broken in [vec![0xff; 8], heartbeat_of_no_text()?] {
+        let hello = bytes_of(&FromRobot::Hello(Box::new(hello(None)?)));
+        let close = last_word(says(&world, vec![hello, broken]).await?).await?;
+        assert_eq!((close.code, close.reason.code), (CloseCode::Protocol, Code::ProtocolError));
+        assert!(close.reason.text().starts_with("a message cannot be read: "), "{}", close.reason.text());
+    }
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_hello_that_cannot_be_read_is_an_argument_that_is_invalid() -> Result<()> {
+    let world = world().await?;
+    for broken in [vec![0xff; 8], heartbeat_of_no_text()?] {
+        let status = says(&world, vec![broken]).await?.message().await.expect_err("nothing began");
+        let answer = midshift_proto::refusal_of(&status);
+        assert_eq!((answer.grpc, answer.code), (tonic::Code::InvalidArgument, Some(Code::ProtocolError)));
+        assert!(answer.message.starts_with("a message cannot be read: "), "{}", answer.message);
+    }
+    Ok(())
+}
