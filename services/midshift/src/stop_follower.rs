@@ -318,7 +318,6 @@ mod tests {
     use midshift_core::robot::StopLevel;
     use midshift_core::rows::{Expect, Index, Item, Key, Record, RowChange, Write, Writer};
     use midshift_core::stop::{Scope, Stop};
-    use midshift_core::time::{LinkTime, SiteTime};
     use midshift_store::{MemoryStore, StoreId};
 
     #[tokio::test]
@@ -331,7 +330,7 @@ mod tests {
             item.put(robot, expect, "robot.changed");
             assert!(store.commit(vec![item]).await.iter().all(Result::is_ok));
             let snapshot = store.snapshot(&[Table::RobotControl, Table::RobotIdentity]).await?;
-            let now = Now { site: SiteTime(0), link: LinkTime(0), utc: Utc(ms), wall: Utc(ms) };
+            let now = Now { utc: Utc(ms), wall: Utc(ms), ..Now::default() };
             anyhow::Ok(who_is_gone(&snapshot.rows, &mut LeftOut::default(), &now)?)
         };
         assert!(gone(&robot, Expect::Absent, 50_000).await?.is_empty());
@@ -380,6 +379,7 @@ mod tests {
             reason: String::new(),
             region: None,
             proof: Vec::new(),
+            token_id: None,
         })
     }
 

@@ -38,7 +38,7 @@ fn work(robot_id: &RobotId) -> DesiredWork {
 async fn goes_on() -> Result<()> {
     let world = world().await?;
     let (first, other) = (RobotId::parse("r1")?, RobotId::parse("r2")?);
-    let presence = PresenceRow { robot_id: other.clone(), presence: Presence::Online, since_unix_ms: 1 };
+    let presence = PresenceRow::new(other.clone(), Presence::Online, 1);
     newer(&world, Writer::Telemetry, &presence, ("\"online\"", "\"dreaming\"")).await;
     newer(&world, Writer::Fleet, &work(&other), ("\"held\":true", "\"held\":\"hovering\"")).await;
     newer(&world, Writer::Stop, &record(1, Scope::Fleet)?, ("\"halt\"", "\"hover\"")).await;
