@@ -123,12 +123,50 @@ fn a_paused_body_stands_keeps_its_order_and_goes_on() {
     let mut body = body("c-1");
     body.start(SiteTime(0), drive(&["c-2"])).expect("starts");
     body.pause(SiteTime(2_000));
-    assert!(body.standstill(SiteTime(2_000)));
+    let stands = [2_000, 2_666, 2_667].map(|at| body.standstill(SiteTime(at)));
+    assert_eq!(stands, [false, false, true], "from 1 m/s it brakes for two thirds of a second");
     assert_eq!(run(&mut body, SiteTime(2_000), SiteTime(50_000)), []);
-    assert_eq!(body.state(SiteTime(50_000)).pose.x_mm, 9_000);
+    assert_eq!(body.state(SiteTime(50_000)).pose.x_mm, 9_333);
     body.resume(SiteTime(50_000));
     let heard = run(&mut body, SiteTime(50_000), SiteTime(99_000));
-    assert_eq!(heard.last(), Some(&(54_000, BodyNews::Done)));
+    assert_eq!(heard.last(), Some(&(53_667, BodyNews::Done)));
+}
+
+#[test]
+fn a_body_that_is_let_go_while_it_brakes_drives_on_from_there() {
+    let mut body = body("c-1");
+    body.start(SiteTime(0), drive(&["c-2"])).expect("starts");
+    body.pause(SiteTime(2_000));
+    body.resume(SiteTime(2_300));
+    assert_eq!(body.state(SiteTime(2_301)).speed_mm_s, 1_000);
+    assert_eq!(run(&mut body, SiteTime(2_300), SiteTime(60_000)).last(), Some(&(6_068, BodyNews::Done)));
+}
+
+#[test]
+fn a_body_that_is_stopped_shortly_before_a_waypoint_stands_there_and_enters_nothing_behind_it() {
+    for is_kept in [true, false] {
+        let mut body = body("a-out");
+        body.start(SiteTime(0), drive(&["wait-a", "c-1", "c-2"])).expect("starts");
+        assert_eq!(run(&mut body, SiteTime(0), SiteTime(800)), [], "200 mm before wait-a, and it needs 333");
+        if is_kept {
+            body.pause(SiteTime(800))
+        } else {
+            body.stop(SiteTime(800), StopLevel::Halt)
+        }
+        assert_eq!(run(&mut body, SiteTime(800), SiteTime(60_000)), []);
+        let inside: Vec<&str> = body.inside().iter().map(|place| place.as_str()).collect();
+        assert_eq!((body.standstill(SiteTime(60_000)), inside), (true, vec!["wait-a"]));
+        if is_kept {
+            body.resume(SiteTime(60_000));
+        } else {
+            body.start(SiteTime(60_000), drive(&["wait-a"])).expect("goes on");
+        }
+        assert_eq!(
+            reached(&run(&mut body, SiteTime(60_000), SiteTime(60_001))),
+            ["wait-a"],
+            "it arrives when it goes on"
+        );
+    }
 }
 
 #[test]
@@ -138,8 +176,8 @@ fn a_stop_drops_the_order_and_slow_only_slows() {
     body.stop(SiteTime(1_000), StopLevel::Slow);
     assert_eq!(body.state(SiteTime(1_001)).speed_mm_s, 300);
     body.stop(SiteTime(2_000), StopLevel::Halt);
-    assert!(body.standstill(SiteTime(2_000)));
-    assert_eq!(body.state(SiteTime(9_000)).pose.x_mm, 8_300);
+    assert_eq!([2_199, 2_200].map(|at| body.standstill(SiteTime(at))), [false, true]);
+    assert_eq!(body.state(SiteTime(9_000)).pose.x_mm, 8_330);
     assert_eq!(ended(&run(&mut body, SiteTime(2_000), SiteTime(90_000))), [] as [&BodyNews; 0]);
 }
 
@@ -201,7 +239,7 @@ fn while_a_person_drives_it_takes_no_order_and_goes_on_with_the_old_one_afterwar
     assert!(body.start(SiteTime(2_000), drive(&["c-2"])).is_err());
     let heard = run(&mut body, SiteTime(2_000), SiteTime(99_000));
     assert_eq!(heard.first(), Some(&(31_000, BodyNews::Mode(Mode::Automatic))));
-    assert_eq!(heard.last(), Some(&(36_000, BodyNews::Done)));
+    assert_eq!(heard.last(), Some(&(35_667, BodyNews::Done)));
 }
 
 #[test]

@@ -43,11 +43,11 @@ fn a_halt_keeps_its_order_and_its_journal_says_where_it_stood() {
     body.start(SiteTime(0), BodyOrder::Drive(vec![target])).expect("drives");
     body.obeys(SiteTime(1_000), StopLevel::Halt);
     body.pause(SiteTime(1_000));
-    assert_eq!((body.standstill(SiteTime(9_000)), body.state(SiteTime(9_000)).odometer_mm), (true, 1_000));
+    assert_eq!((body.standstill(SiteTime(9_000)), body.state(SiteTime(9_000)).odometer_mm), (true, 1_333));
     body.obeys(SiteTime(9_000), StopLevel::None);
     body.resume(SiteTime(9_000));
-    assert_eq!(body.state(SiteTime(9_500)).odometer_mm, 1_500);
-    assert_eq!(stops(&world), ["obeys Halt 1000", "stood 1000", "obeys None 1000"]);
+    assert_eq!(body.state(SiteTime(9_500)).odometer_mm, 1_833);
+    assert_eq!(stops(&world), ["obeys Halt 1000", "stood 1333", "obeys None 1333"]);
 }
 
 #[test]
@@ -56,8 +56,8 @@ fn a_body_that_is_driven_while_it_is_stopped_says_so() {
     body.obeys(SiteTime(0), StopLevel::Halt);
     body.start(SiteTime(1_000), BodyOrder::Drive(vec![target])).expect("drives");
     body.stop(SiteTime(1_500), StopLevel::Halt);
-    body.obeys(SiteTime(2_000), StopLevel::None);
-    assert_eq!(stops(&world), ["obeys Halt 0", "stood 0", "moved 0", "stood 500", "obeys None 500"]);
+    body.obeys(SiteTime(3_000), StopLevel::None);
+    assert_eq!(stops(&world), ["obeys Halt 0", "stood 0", "moved 0", "stood 833", "obeys None 833"]);
 }
 
 #[test]
@@ -81,8 +81,8 @@ fn a_posture_drops_the_order() {
     body.obeys(SiteTime(1_000), StopLevel::ControlledStopPosture);
     body.stop(SiteTime(1_000), StopLevel::ControlledStopPosture);
     body.resume(SiteTime(2_000));
-    assert_eq!(body.state(SiteTime(9_000)).odometer_mm, 1_000);
-    assert_eq!(stops(&world), ["obeys ControlledStopPosture 1000", "stood 1000"]);
+    assert_eq!(body.state(SiteTime(9_000)).odometer_mm, 1_333);
+    assert_eq!(stops(&world), ["obeys ControlledStopPosture 1000", "stood 1333"]);
 }
 
 #[test]

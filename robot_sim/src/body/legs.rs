@@ -1,6 +1,6 @@
 //! Legs of a path: setting out, standing still on the way, arriving, and what the contour touches meanwhile.
 //!
-//! Invariant: a leg begins where the body is, so no new path, speed or pause moves it.
+//! Invariant: a leg begins where the body is, so no new path, speed or pause moves it; one that brakes enters nothing that its leg does not lead to.
 
 use super::{Block, CONTOUR_MM, Order, Phase, SPEED_FLOOR_MM_S, SPEED_MAX_MM_S, SimBody};
 use crate::faults::{self, draw_secs};
@@ -15,15 +15,23 @@ use rand::RngExt;
 use std::collections::BTreeSet;
 
 impl SimBody {
+    /// It saw the obstacle from afar and stands before it, as at the end of its way.
     pub(super) fn meet_obstacle(&mut self, now: SiteTime, lasts: SiteDuration) {
-        self.halt(now);
+        self.interrupt(now);
         self.block = None;
         self.counts.obstacles += 1;
         let patience = lasts.min(faults::OBSTACLE_PATIENCE);
         self.phase = Phase::Blocked { until: now + patience, gives_up: lasts > faults::OBSTACLE_PATIENCE };
     }
-    /// Stands still where it is and keeps what is left of its order.
+    /// Comes to a standstill and keeps what is left of its order: at once, or by braking if it drives.
     pub(super) fn halt(&mut self, now: SiteTime) {
+        match &mut self.phase {
+            Phase::Leg { leg, .. } if leg.speed_mm_s(now) > 0 => leg.brake(now),
+            _ => self.interrupt(now),
+        }
+    }
+    /// Ends what it does where it is and keeps what is left of its order.
+    pub(super) fn interrupt(&mut self, now: SiteTime) {
         self.settle(now);
         match std::mem::replace(&mut self.phase, Phase::Still) {
             Phase::Still => {}
@@ -46,9 +54,11 @@ impl SimBody {
     }
     /// Goes on with its order if nothing keeps it.
     pub(super) fn go(&mut self, now: SiteTime) {
-        if self.is_kept() || !matches!(self.phase, Phase::Still) {
+        let brakes = matches!(&self.phase, Phase::Leg { leg, .. } if leg.is_braking());
+        if self.is_kept() || self.order.is_none() || !(brakes || matches!(self.phase, Phase::Still)) {
             return;
         }
+        self.interrupt(now);
         match &self.order {
             None => {}
             Some(Order::Act(act)) => self.phase = Phase::Acting { until: now + act.left },
@@ -72,7 +82,7 @@ impl SimBody {
         let contour_mm = CONTOUR_MM.min(leg.length_mm() / 2.0);
         let out_mm = (self.touching.is_some() && !returns).then(|| (contour_mm - from_touched_mm).max(0.0));
         let in_mm = (!returns).then(|| leg.length_mm() - contour_mm);
-        self.phase = Phase::Leg { leg, out_mm, in_mm };
+        self.phase = Phase::Leg { leg, to: point.waypoint, out_mm, in_mm };
         self.occupy(now);
     }
     pub(super) fn draw_block(&mut self, length_mm: f64) -> Option<Block> {

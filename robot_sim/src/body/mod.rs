@@ -95,7 +95,7 @@ impl BodyConfig {
 /// What a body did and suffered since this process made it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counts {
-    /// Milliseconds driving or turning.
+    /// Milliseconds driving, turning or braking.
     pub driving_ms: u64,
     /// Milliseconds acting or waiting as a step asks.
     pub acting_ms: u64,
@@ -147,7 +147,7 @@ enum Order {
 #[derive(Clone, Debug)]
 enum Phase {
     Still,
-    Leg { leg: Leg, out_mm: Option<f64>, in_mm: Option<f64> },
+    Leg { leg: Leg, to: WaypointId, out_mm: Option<f64>, in_mm: Option<f64> },
     Blocked { until: SiteTime, gives_up: bool },
     Acting { until: SiteTime },
 }
@@ -323,7 +323,9 @@ impl SimBody {
     pub fn inject(&mut self, now: SiteTime, what: Injected) {
         self.advance(now);
         match what {
-            Injected::Obstacle(lasts) if matches!(self.phase, Phase::Leg { .. }) => self.meet_obstacle(now, lasts),
+            Injected::Obstacle(lasts) if matches!(&self.phase, Phase::Leg { leg, .. } if !leg.is_braking()) => {
+                self.meet_obstacle(now, lasts);
+            }
             Injected::Obstacle(lasts) => self.pending_block = Some(lasts),
             Injected::GripperMissed(times) => self.misses_next = times.max(1),
             Injected::Jam => self.jam(now),
@@ -404,9 +406,9 @@ impl SimBody {
     fn next_event(&self) -> Option<SiteTime> {
         let phase = match &self.phase {
             Phase::Still => None,
-            Phase::Leg { leg, out_mm, in_mm } => {
+            Phase::Leg { leg, out_mm, in_mm, .. } => {
                 let block_mm = self.block.map(|b| b.after_mm).filter(|mm| *mm <= leg.length_mm());
-                let marks = [*out_mm, *in_mm, block_mm].into_iter().flatten().map(|mm| leg.when_driven(mm));
+                let marks = [*out_mm, *in_mm, block_mm].into_iter().flatten().filter_map(|mm| leg.when_driven(mm));
                 Some(marks.fold(leg.end(), SiteTime::min))
             }
             Phase::Blocked { until, .. } | Phase::Acting { until } => Some(*until),
@@ -451,20 +453,20 @@ impl SimBody {
     fn happen_in_phase(&mut self, now: SiteTime) {
         match &mut self.phase {
             Phase::Still => {}
-            Phase::Leg { leg, out_mm, in_mm } => {
-                let due = |mm: Option<f64>| mm.is_some_and(|mm| leg.when_driven(mm) <= now);
+            Phase::Leg { leg, to, out_mm, in_mm } => {
+                let due = |mm: Option<f64>| mm.and_then(|mm| leg.when_driven(mm)).is_some_and(|at| at <= now);
                 if due(*out_mm) {
                     *out_mm = None;
                     self.touching = None;
                     self.occupy(now);
                 } else if due(*in_mm) {
                     *in_mm = None;
-                    self.touching = self.target().map(|p| p.waypoint.clone());
+                    self.touching = Some(to.clone());
                     self.occupy(now);
-                } else if let Some(block) = self.block.filter(|b| due(Some(b.after_mm))) {
+                } else if let Some(block) = self.block.filter(|b| !leg.is_braking() && due(Some(b.after_mm))) {
                     self.meet_obstacle(now, block.lasts);
-                } else if leg.end() <= now {
-                    self.arrive(now);
+                } else if leg.end() <= now || self.block.is_some_and(|b| due(Some(b.after_mm))) {
+                    if leg.is_braking() { self.interrupt(now) } else { self.arrive(now) }
                 }
             }
             Phase::Blocked { until, gives_up } if *until <= now => {
@@ -618,7 +620,6 @@ impl SimBody {
     fn drop_order(&mut self, now: SiteTime) {
         self.order = None;
         self.paused = false;
-        self.phase = Phase::Still;
         self.idle_since = now;
     }
 }

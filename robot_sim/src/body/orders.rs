@@ -50,13 +50,13 @@ impl Body for SimBody {
                 if path.is_empty() {
                     return Err(faults::semantic("the path has no points"));
                 }
-                self.halt(now);
+                self.interrupt(now);
                 let path = self.without_passed(path.into());
                 self.order = Some(Order::Drive(path));
             }
             BodyOrder::Act(step) => {
                 let act = self.read_act(&step)?;
-                self.halt(now);
+                self.interrupt(now);
                 self.parked = false;
                 self.order = Some(Order::Act(act));
             }
@@ -101,8 +101,13 @@ impl Body for SimBody {
         lock(&self.world).stop(now, &self.config.robot_id, Effect::Obeys { level, odometer_mm });
         self.note_motion(now);
     }
-    fn standstill(&self, _now: SiteTime) -> bool {
-        matches!(self.phase, Phase::Still) && (self.order.is_none() || self.is_kept())
+    fn standstill(&self, now: SiteTime) -> bool {
+        let stands = match &self.phase {
+            Phase::Still => true,
+            Phase::Leg { leg, .. } => leg.is_braking() && leg.end() <= now,
+            Phase::Blocked { .. } | Phase::Acting { .. } => false,
+        };
+        stands && (self.order.is_none() || self.is_kept())
     }
     fn park(&mut self, now: SiteTime) {
         self.advance(now);
@@ -180,8 +185,8 @@ impl SimBody {
     /// Its joints and wheels go slowly, or as fast as they are asked to again.
     fn slow_down(&mut self, now: SiteTime, is_slow: bool) {
         let changes = std::mem::replace(&mut self.slow, is_slow) != is_slow;
-        if changes && matches!(self.phase, Phase::Leg { .. }) {
-            self.halt(now);
+        if changes && matches!(&self.phase, Phase::Leg { leg, .. } if !leg.is_braking()) {
+            self.interrupt(now);
             self.go(now);
         }
     }

@@ -50,9 +50,7 @@ fn each_moves(scene: &mut Scene, what: &str, robots: &[usize]) {
 
 /// From the stop of every canary to the end of the roll-out, and to work again.
 fn stopped_canaries_go_back(scene: &mut Scene, canaries: &[usize], first: First) -> Rollout {
-    for canary in canaries {
-        scene.room.stop_body(*canary, STOP_MS);
-    }
+    scene.stop_hard(canaries, STOP_MS);
     let stands = driven(scene, canaries);
     if first == First::Person {
         scene.order(Order::Abort("bad".to_owned()));

@@ -8,6 +8,7 @@ use crate::orders::Order;
 use crate::room::{Naive, Room, RoomConfig};
 use crate::run::{spec, steer};
 use crate::software::{BAD_AT_START, GOOD, HANGS};
+use midshift_agent::body::Body as _;
 use midshift_core::reason::Code;
 use midshift_core::rollout::bugs;
 use midshift_core::rollout::rows::{Outcome, Pause, Phase, Rollout};
@@ -87,6 +88,14 @@ impl Scene {
     }
     pub fn answered(&mut self) {
         self.until("an answer", |room| room.desk.is_empty());
+    }
+    /// Their own safety systems stop these bodies, and they brake until they stand.
+    pub fn stop_hard(&mut self, robots: &[usize], lasts_ms: u64) {
+        robots.iter().for_each(|robot| self.room.stop_body(*robot, lasts_ms));
+        self.until("the stopped bodies to stand", |room| {
+            let now = room.time.site();
+            robots.iter().all(|robot| room.hall.robots()[*robot].standstill(now))
+        });
     }
     /// Lets a robot go on that was stopped.
     pub fn let_go(&mut self, robot: usize) {
@@ -216,7 +225,7 @@ fn robots_that_their_own_safety_system_stopped_go_back_and_nothing_moves_until_a
     scene.begin("bad", GOOD[0], |spec| spec.soak = Some(prost_types::Duration { seconds: 600, nanos: 0 }));
     scene.comes_to("bad", Phase::Soaking);
     let canary = scene.some_is_in(UpdateState::Trial);
-    scene.room.stop_body(canary, 120_000);
+    scene.stop_hard(&[canary], 120_000);
     let stands = scene.room.hall.robots()[canary].lock().odometers_mm();
     // A hardware stop on trial ends the roll-out by itself, before any person does.
     let row = scene.ends("bad");
