@@ -158,7 +158,7 @@ mod tests {
             assert!((stands_mm - told_mm - ramp_mm).abs() < 1e-6, "{speed_mm_s} mm/s: {stands_mm} mm");
             assert_eq!(leg.driven_mm(leg.end() + SiteDuration(9_000)), stands_mm);
             assert_eq!((leg.speed_mm_s(told), leg.speed_mm_s(leg.end())), (speed_mm_s, 0));
-            assert_eq!((leg.when_driven(stands_mm + 1.0), leg.when_driven(told_mm - 1.0) < Some(told)), (None, true));
+            assert_eq!((leg.when_driven(stands_mm + 1.0), leg.when_driven(told_mm - 10.0) < Some(told)), (None, true));
         }
         let mut leg = ahead(1_500);
         leg.brake(SiteTime(2_500));

@@ -15,8 +15,6 @@ crate::seeded_bugs! {
     LateReportsCount late_reports_count;
     /// A state of an attempt that this build does not know moves its task forward like any other.
     UnknownStatesAreTaken unknown_states_are_taken;
-    /// A robot of which a row cannot be read is given work as if there were no such row.
-    UnknownRowsArePassedOver unknown_rows_are_passed_over;
     /// A place takes everybody who asks for it.
     CapacityIsForgotten capacity_is_forgotten;
     /// Of the places of a stretch each is granted as soon as it is free, and kept until the others are.

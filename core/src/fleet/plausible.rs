@@ -98,9 +98,7 @@ pub fn doubtful(view: &View, live: &Live) -> Option<(AttemptId, Reason)> {
 /// # Errors
 /// If so; the reason says what.
 pub fn keeps_back(view: &View, live: &Live) -> Result<(), Reason> {
-    if !view.bugs.unknown_rows_are_passed_over() {
-        view.unknown_rows.screen(&live.robot_id)?;
-    }
+    view.unknown_rows.screen(&live.robot_id)?;
     view.refused.screen(&live.robot_id)?;
     match doubtful(view, live).map(|(_, why)| why).or_else(|| claims::too_many(view, live)) {
         Some(why) => Err(why),

@@ -409,6 +409,10 @@ fn with_secrets(planted: &str) -> Vec<(&'static str, String)> {
             format!("{:?}", identity::CreateTokenResponse { secret: text(), ..Default::default() }),
         ),
         (
+            "midshift.identity.v1.RotateTokenResponse",
+            format!("{:?}", identity::RotateTokenResponse { secret: text(), ..Default::default() }),
+        ),
+        (
             "midshift.identity.v1.CreateEnrolmentResponse",
             format!("{:?}", identity::CreateEnrolmentResponse { secret: text(), ..Default::default() }),
         ),

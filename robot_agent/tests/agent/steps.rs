@@ -194,7 +194,7 @@ fn an_errand_that_is_broken_off_at_the_charger_says_how_far_it_came() {
     rig.work(rig.desired(Some(Assignment { stop: true, ..offer })));
     rig.pass(1_000);
     assert_eq!(rig.states().last(), Some(&(WorkState::Aborted, 1)), "at its goal, which fleet calls DOCKED");
-    assert!(!rig.body.log().charging);
+    assert!(rig.body.log().charging, "docked, it goes on charging");
 }
 
 #[test]

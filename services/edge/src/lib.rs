@@ -126,7 +126,7 @@ where
                 }
                 // Dropped with `io`: closed at once, before a byte of it is read.
                 Err(reason) => {
-                    tracing::info!(port = name, peer = %network(address.ip()), reason, "a connection was refused");
+                    tracing::info!(port = name, peer = %network(address.ip()), limit = reason, "a connection was refused");
                     metrics::counter!("midshift_edge_refused_total", "port" => name, "reason" => reason).increment(1);
                 }
             }

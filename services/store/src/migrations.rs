@@ -109,6 +109,7 @@ pub(crate) const CONTROL: &[Migration] = migrations!["control":
     "0087_stop_audit_by_ord",
     "0088_identity_audit",
     "0089_identity_audit_by_ord",
+    "0090_token_name",
 ];
 
 /// Of `telemetry.db`.

@@ -47,7 +47,9 @@ const TWINS: &[(&str, &[Twin])] = &[
             ("NobodyIsPromoted", 8, FLEET),
             ("BudgetIsForgotten", 17, ROLLOUTS),
             ("UnknownStatesAreTaken", 24, FLEET),
-            ("UnknownRowsArePassedOver", 24, FLEET),
+            ("StepsAreNotTold", 8, SEEDS),
+            ("DoubtIsKeptQuiet", 8, SEEDS),
+            ("ClaimsAreBlamed", 7, SEEDS),
         ],
     ),
     (

@@ -1,15 +1,10 @@
 //! Why the rules are as they are: each scenario is played with the rule, which holds, and with the naive one, which does not.
 
 use crate::harness::World;
-use crate::unknown::rewritten;
 use midshift_core::fleet::bugs::{Bugs, SeededBug};
-use midshift_core::rows::Table;
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::Phase;
 use midshift_core::work::WorkState;
-use midshift_proto::fleet::v1::CordonRobotRequest;
-use midshift_proto::fleet::v1::fleet_service_server::FleetService as _;
-use tonic::Request;
 
 async fn world(bugs: &[SeededBug]) -> World {
     let mut w = World::with(CORRIDOR, Bugs::of(bugs)).await;
@@ -248,23 +243,4 @@ async fn said_in_a_newer_word(bugs: &[SeededBug]) -> bool {
 async fn a_state_of_a_newer_version_is_told_to_a_person_and_a_rule_that_takes_it_acts_upon_it() {
     assert!(said_in_a_newer_word(&[]).await);
     assert!(!said_in_a_newer_word(&[SeededBug::UnknownStatesAreTaken]).await);
-}
-
-/// A person keeps a robot from work, and a newer version writes that down in a way that this build cannot read. Whether the robot gets work.
-async fn kept_from_work_in_a_row_of_a_newer_version(bugs: &[SeededBug]) -> bool {
-    let mut w = world(bugs).await;
-    w.robot("r1", "park-a").await;
-    let cordon = CordonRobotRequest { robot_id: "r1".into(), reason: "look".into(), ..CordonRobotRequest::default() };
-    w.fleet.cordon_robot(Request::new(cordon)).await.expect("cordoned");
-    rewritten(&w, Table::RobotControl, "r1", ("\"robot_id\":\"r1\"", "\"robot_id\":7"), None).await;
-    w.pass(2).await;
-    w.submit("T1", "A", "B").await;
-    w.pass(30).await;
-    w.seen().await.phase("T1") != Phase::Queued
-}
-
-#[tokio::test(start_paused = true)]
-async fn a_robot_of_which_a_row_cannot_be_read_gets_no_work_and_where_the_row_is_passed_over_it_does() {
-    assert!(!kept_from_work_in_a_row_of_a_newer_version(&[]).await);
-    assert!(kept_from_work_in_a_row_of_a_newer_version(&[SeededBug::UnknownRowsArePassedOver]).await);
 }
