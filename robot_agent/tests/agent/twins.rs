@@ -73,9 +73,10 @@ fn fetched_without_room(bugs: &[SeededBug]) -> u64 {
     let (mut rig, releases) = rig(bugs);
     let bundle = releases.release("1.1.0");
     rig.updates.as_ref().expect("has them").sets.limit(bundle.length + 1_000);
+    let before = releases.served();
     want(&mut rig, Order::new(releases.directive(&bundle, 1)).to(Goal::Stage));
     assert_eq!(why(&rig), Some(Code::NoRoom));
-    releases.served() - bundle.length
+    releases.served() - before - bundle.length
 }
 
 #[test]

@@ -79,7 +79,7 @@ impl Rules {
         let watch = access::is_watch(path).then(|| self.watches.take(asker.clone(), Class::Stop)).transpose();
         let watch = watch.map_err(|full| refused(full, "watches go on"))?;
         if self.bugs.seats_are_kept() {
-            std::mem::forget(self.seats.take(asker.clone(), class));
+            std::mem::forget(self.seats.take(asker.clone(), Class::Stop));
         }
         let seat = Inside::new(&self.gauge, seats, watch);
         let given = if *speech == Speech::Http { None } else { deadline::given(headers)? };

@@ -685,6 +685,17 @@ CREATE TABLE token (
     UNIQUE (site_id, id)
 );
 
+CREATE TABLE token_name (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE INDEX attempt_by_parent ON attempt (site_id, parent, ord, id);
 
 CREATE INDEX attempt_by_state ON attempt (site_id, state, ord, id);

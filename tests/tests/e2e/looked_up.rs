@@ -33,7 +33,7 @@ async fn a_robot_and_a_stop_are_meant_by_a_beginning_that_only_they_have() -> an
         ensure!(named(&["robot", verb, typed, "--server", &at])? == "rbt-01", "{verb} {typed}");
     }
     let (code, said) = refused(&["robot", "get", "rbt-01x", "--server", &at])?;
-    ensure!(code == Some(4) && said.contains("rbt-01x"), "{code:?} {said}");
+    ensure!(code == Some(4) && said.contains("No robot has this id"), "{code:?} {said}");
 
     let engage = || named(&["stop", "--all", "--no-wait", "--reason", "tried", "--stop-server", &stop_at]);
     let (first, second) = (engage()?, engage()?);
