@@ -23,8 +23,6 @@ midshift_core::seeded_bugs! {
     LastWordIsTheLimit last_word_is_the_limit;
     /// A directive is taken whether or not a release lists its bundle.
     UnlistedIsFine unlisted_is_fine;
-    /// A bundle is fetched whether or not there is room for it.
-    RoomIsForgotten room_is_forgotten;
     /// A directive is taken whichever came before it.
     ReplaysAreTaken replays_are_taken;
     /// Work that cannot be read is passed over, and the robot goes on as before.

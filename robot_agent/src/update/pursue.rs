@@ -401,7 +401,7 @@ impl AgentCore {
         }
         let base = set.base().filter(|_| set.changes_base(&current)).map_or(0, |base| base.length);
         let needed: u64 = manifest.components.iter().map(|c| c.length).sum::<u64>() + base;
-        if needed > holdings.free_bytes && !self.config.bugs.room_is_forgotten() {
+        if needed > holdings.free_bytes {
             let reason =
                 Reason::from(Code::NoRoom).with("needed_bytes", needed).with("free_bytes", holdings.free_bytes);
             return self.move_to(UpdateState::Refused, Some(reason));

@@ -3,9 +3,8 @@
 use crate::release::Releases;
 use crate::rig::{Rig, goto, point};
 use crate::stops::{freed, moves, serve, stop, told};
-use crate::updates::{Order, state, want, why};
+use crate::updates::{Order, state, want};
 use midshift_agent::bugs::{Bugs, SeededBug};
-use midshift_core::reason::Code;
 use midshift_core::robot::StopLevel;
 use midshift_core::update::{Goal, UpdateState};
 use midshift_core::work::{Assignment, RoutePoint, UNREADABLE_WORK};
@@ -66,23 +65,6 @@ fn told_to_take_what_nobody_released(bugs: &[SeededBug]) -> Option<UpdateState> 
 fn software_that_nobody_released_is_not_taken_and_a_rule_that_asks_no_release_takes_it() {
     assert_eq!(told_to_take_what_nobody_released(&[]), None);
     assert!(told_to_take_what_nobody_released(&[SeededBug::UnlistedIsFine]).is_some());
-}
-
-/// Bytes of components that a robot fetches of a bundle that it has no room for.
-fn fetched_without_room(bugs: &[SeededBug]) -> u64 {
-    let (mut rig, releases) = rig(bugs);
-    let bundle = releases.release("1.1.0");
-    rig.updates.as_ref().expect("has them").sets.limit(bundle.length + 1_000);
-    let before = releases.served();
-    want(&mut rig, Order::new(releases.directive(&bundle, 1)).to(Goal::Stage));
-    assert_eq!(why(&rig), Some(Code::NoRoom));
-    releases.served() - before - bundle.length
-}
-
-#[test]
-fn a_bundle_that_is_too_large_is_refused_before_it_is_fetched_and_a_rule_that_forgets_the_room_fetches_it() {
-    assert_eq!(fetched_without_room(&[]), 0);
-    assert!(fetched_without_room(&[SeededBug::RoomIsForgotten]) > 0);
 }
 
 /// Whether an order that a robot had before is obeyed again once a newer one has come.

@@ -93,7 +93,6 @@ const TWINS: &[(&str, &[Twin])] = &[
             ("PatientSession", 13, "tests/tests/e2e/held.rs"),
             ("LastWordIsTheLimit", 14, AGENT),
             ("UnlistedIsFine", 16, AGENT),
-            ("RoomIsForgotten", 16, AGENT),
             ("ActivatesAnyway", 19, ROLLOUTS),
             ("AnyDrainWillDo", 19, ROLLOUTS),
             ("ReplaysAreTaken", 20, AGENT),
