@@ -5,7 +5,8 @@
 //!    event tells and that is not near waits for the next heartbeat.
 //! 3. A robot that says more is believed no further, frees nothing, and gets no work and no grant until it says less, or until a person has
 //!    closed the incident that names these places.
-//! 4. Two robots inside one exclusive place are an incident for each pair; nobody else is let in.
+//! 4. A place that a robot has entered is not free because it lists it no more, while its own pose lies in it.
+//! 5. Two robots inside one exclusive place are an incident for each pair; nobody else is let in.
 //!
 //! Called by `inbox` for events and by `repair` for heartbeats. Invariant: no word of a robot frees the place of another.
 
@@ -55,6 +56,8 @@ fn differences(view: &View, live: &Live) -> Vec<Difference> {
     for (place, holder) in super::view::held(view, robot_id) {
         let place_id = &place.place_id;
         match live.report.places.iter().find(|p| p.place_id == *place_id) {
+            // It entered and does not say that it left: a robot that lost its memory is still where its pose is.
+            None if holder.state == HolderState::Inside && lies_inside(view, live, place_id) => {}
             None if standing_on.is_none_or(|w| w.as_str() != place_id.as_str()) => {
                 changes.push((place_id.clone(), holder.grant_id, PlaceNews::NotEntered));
             }
@@ -83,8 +86,17 @@ fn differences(view: &View, live: &Live) -> Vec<Difference> {
 
 /// Whether the robot's pose lies in the place or near it.
 fn is_near(view: &View, live: &Live, place_id: &PlaceId) -> bool {
+    is_within(view, live, place_id, limits::CLAIMED_PLACE_MARGIN_MM)
+}
+
+/// Whether the robot's pose lies in the place.
+fn lies_inside(view: &View, live: &Live, place_id: &PlaceId) -> bool {
+    is_within(view, live, place_id, 0)
+}
+
+fn is_within(view: &View, live: &Live, place_id: &PlaceId, margin_mm: i32) -> bool {
     let Some(pose) = &live.report.vitals.pose else { return false };
-    Region::of_zone(&view.site, place_id).is_some_and(|region| region.is_near(pose, limits::CLAIMED_PLACE_MARGIN_MM))
+    Region::of_zone(&view.site, place_id).is_some_and(|region| region.is_near(pose, margin_mm))
 }
 
 /// The robot's event says that it entered a place which it does not hold, and by the pose of this session it does not stand near: what its

@@ -160,3 +160,24 @@ async fn for_ten_minutes_after_a_restore_unknown_grants_are_no_incident_and_no_a
     w.fleet.disown_attempt(Request::new(ask)).await.expect("it is ignored");
     w.lawful().await;
 }
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_lost_its_memory_inside_a_passage_keeps_it_until_its_pose_lies_elsewhere() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    let passage = w.site.places().iter().find(|place| place.waypoint().is_none()).expect("a passage").place_id.clone();
+    let region = Region::of_zone(&w.site, &passage).expect("a region");
+    let mm = |at: i64| i32::try_from(at).expect("a site's size");
+    let poses = w.site.waypoints().iter().map(|at| Pose { x_mm: mm(at.x_mm), y_mm: mm(at.y_mm), theta_mrad: 0 });
+    let (inside, outside): (Vec<Pose>, Vec<Pose>) = poses.partition(|pose| region.is_near(pose, 0));
+    w.r("r1").pose = Some(inside[0]);
+    let told = [passage.to_string()];
+    tell(&mut w, "r1", &told, false);
+    w.pass(3).await;
+    assert_eq!(held(&w.seen().await, "r1", &told), 1, "it is inside");
+    w.r("r1").claims.clear();
+    w.pass_while(10, "it is there by its own pose", |seen| held(seen, "r1", &told) == 1).await;
+    w.r("r1").pose = Some(outside[0]);
+    w.until("it has driven away", |seen| held(seen, "r1", &told) == 0).await;
+    w.lawful().await;
+}
