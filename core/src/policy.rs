@@ -211,8 +211,8 @@ impl Record for AreaPolicy {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::time::Jump;
     use crate::time::LinkTime;
-    use crate::wall::Jump;
 
     fn at(text: &str) -> Utc {
         Utc(text.parse::<jiff::Timestamp>().expect("a time").as_millisecond())

@@ -3,7 +3,6 @@
 //! `Site*` is the time of the work (motion, battery, task timeouts, back-off); `midshift dev --speedup` scales it.
 //! `Link*` is monotonic and never scaled (heartbeats, authority, resend, commits). A service reads both from a [`Clock`].
 
-use crate::wall::Jump;
 use serde::{Deserialize, Serialize};
 use std::ops::{Add, Sub};
 
@@ -85,6 +84,19 @@ impl Utc {
     pub fn rfc3339(self) -> String {
         jiff::Timestamp::from_millisecond(self.0).map_or_else(|_| self.0.to_string(), |t| format!("{t:.3}"))
     }
+}
+
+/// One step of the wall clock against the monotonic one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Jump {
+    /// UTC at which the wall would have been without it.
+    pub from: Utc,
+    /// UTC of the wall when it was seen.
+    pub to: Utc,
+    /// When it was seen.
+    pub at: LinkTime,
+    /// Milliseconds that the wall passed over; zero for a jump back.
+    pub skipped_ms: u64,
 }
 
 /// One reading of all clocks, taken once per decision so that a decision sees one moment.

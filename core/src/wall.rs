@@ -7,21 +7,8 @@
 //! 3. Several large jumps of one run count as one, from before the first to after the last: what follows is stricter than either.
 
 use crate::limits;
-use crate::time::{Clock, LinkTime, Now, SiteTime, Utc};
+use crate::time::{Clock, Jump, LinkTime, Now, SiteTime, Utc};
 use std::sync::{Mutex, PoisonError};
-
-/// One step of the wall clock against the monotonic one.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Jump {
-    /// UTC at which the wall would have been without it.
-    pub from: Utc,
-    /// UTC of the wall when it was seen.
-    pub to: Utc,
-    /// When it was seen.
-    pub at: LinkTime,
-    /// Milliseconds that the wall passed over; zero for a jump back.
-    pub skipped_ms: u64,
-}
 
 impl Jump {
     /// Milliseconds that the wall stepped ahead; negative: back.

@@ -58,7 +58,7 @@ pub enum Error {
     /// A file with a secret that others may read.
     #[error("{path} has a secret and is open to others (mode {mode:03o}): enrol the robot again, and type `chmod go= {path}` before the new secret is in it", path = path.display())]
     Open {
-        /// Which.
+        /// The file with the secret.
         path: PathBuf,
         /// Its mode.
         mode: u32,

@@ -40,7 +40,7 @@ pub enum Command {
     },
     /// A person's word that the robot carries nothing: holds until the robot says something newer.
     SettleLoad {
-        /// Whose.
+        /// The robot that carries nothing.
         robot_id: RobotId,
         /// What the person saw.
         reason: String,

@@ -115,7 +115,7 @@ pub struct Cordon {
 pub struct LoadSettled {
     /// What the person saw.
     pub reason: String,
-    /// Who.
+    /// The person or program that said so, by its token's name.
     pub actor: String,
     /// UTC, site clock.
     pub since: Utc,

@@ -1,7 +1,7 @@
 //! The process' clocks: tokio's monotonic clock, so that a simulation can own it, and the wall's UTC, read whenever the time is asked for.
 
-use midshift_core::time::{Clock, ScaledClock, Utc};
-use midshift_core::wall::{Jump, WallClock};
+use midshift_core::time::{Clock, Jump, ScaledClock, Utc};
+use midshift_core::wall::WallClock;
 use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 use tokio::time::Instant;

@@ -1,5 +1,6 @@
 //! Which stop service `midshift stop` addresses, with two sites on one machine.
 
+use crate::doors::TERMINAL;
 use crate::harness::{Running, Server, authority, folder, free_port, midshift, sign_in, token, tool};
 use crate::secrets::heard;
 use crate::stop_alone::way;
@@ -91,22 +92,6 @@ async fn a_stop_needs_no_word_of_a_server_that_hangs_or_is_gone() -> anyhow::Res
     ensure!(code == Some(4) && said.contains("no area hall; it has "), "the stop service alone: {code:?} {said}");
     Ok(())
 }
-
-/// Runs a command on a terminal and prints what that has shown.
-const TERMINAL: &str = r"
-import os, pty, sys
-child, terminal = pty.fork()
-if child == 0:
-    os.execv(sys.argv[1], sys.argv[1:])
-shown = b''
-try:
-    while part := os.read(terminal, 1024):
-        shown += part
-except OSError:
-    pass
-print(shown.decode())
-sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-";
 
 /// An address of this machine alone, whose usual port of a stop service no other test has.
 fn own_host() -> Ipv4Addr {

@@ -134,18 +134,19 @@ async fn a_robot_at_a_dead_port_says_that_nobody_is_there() -> anyhow::Result<()
     .await
 }
 
-/// Types a token as soon as nothing that is typed is shown any more, and prints what the terminal has shown.
-const TYPIST: &str = r"
+/// Runs a command on a terminal and prints what that has shown. What is to be typed is typed once it is asked for and not shown any more.
+pub const TERMINAL: &str = r"
 import os, pty, sys, termios
 child, terminal = pty.fork()
 if child == 0:
     os.execv(sys.argv[1], sys.argv[1:])
 shown = b''
-while b'Enter' not in shown:
-    shown += os.read(terminal, 1024)
-while termios.tcgetattr(terminal)[3] & termios.ECHO:
-    pass
-os.write(terminal, os.environ['TYPED'].encode() + b'\n')
+if 'TYPED' in os.environ:
+    while b'Enter' not in shown:
+        shown += os.read(terminal, 1024)
+    while termios.tcgetattr(terminal)[3] & termios.ECHO:
+        pass
+    os.write(terminal, os.environ['TYPED'].encode() + b'\n')
 try:
     while part := os.read(terminal, 1024):
         shown += part
@@ -163,7 +164,7 @@ async fn a_token_that_is_typed_is_not_shown() -> anyhow::Result<()> {
     let secret = token(server.address).context("a token")?;
     let mut typist = Command::new(tool("MIDSHIFT_TEST_PYTHON")?);
     typist.env_remove("MIDSHIFT_TOKEN").env("MIDSHIFT_CONTEXTS", dir.path().join("contexts.toml"));
-    typist.env("TYPED", &secret).args(["-c", TYPIST]).arg(midshift()?);
+    typist.env("TYPED", &secret).args(["-c", TERMINAL]).arg(midshift()?);
     typist.args(["login", &server.address.to_string(), "--ca"]).arg(server.data().join("identity/ca.pem"));
     let output = tokio::task::block_in_place(|| typist.output())?;
     let shown = String::from_utf8_lossy(&output.stdout);

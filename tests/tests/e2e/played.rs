@@ -22,7 +22,7 @@ use tokio::task::JoinSet;
 const SEEDS: u64 = 100;
 /// Runs with so many must have met every habit and looked at every law.
 const ENOUGH: u64 = 100;
-/// Servers.
+/// Servers that the seeds are spread over.
 const ARENAS: u64 = 4;
 /// Players of one server at once.
 const SEATS: usize = 5;

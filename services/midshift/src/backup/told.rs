@@ -44,7 +44,7 @@ struct Made {
 ///
 /// # Errors
 /// The disk.
-pub fn tell(data: &Path, summary: &Summary, to: &Path) -> anyhow::Result<()> {
+pub fn leave_note(data: &Path, summary: &Summary, to: &Path) -> anyhow::Result<()> {
     let folder = data.join(FOLDER);
     durable::make_folder(&folder).with_context(|| format!("making {}", folder.display()))?;
     let Utc(begun_unix_ms) = summary.begun;
@@ -141,7 +141,7 @@ mod tests {
         take_all(dir.path(), &store, &mut written).await.expect("nothing lies there");
         let parts = vec![("rows".to_owned(), 1, 2), ("stops".to_owned(), 1, 2)];
         let summary = Summary { site_id: "s".to_owned(), begun: Utc(5), parts };
-        tell(dir.path(), &summary, Path::new("/mnt/backup")).expect("told");
+        leave_note(dir.path(), &summary, Path::new("/mnt/backup")).expect("told");
         fs::write(dir.path().join(FOLDER).join("torn.json"), "{").expect("written");
         for _ in 0..2 {
             take_all(dir.path(), &store, &mut written).await.expect("written");

@@ -51,7 +51,7 @@ pub async fn take(args: &Take, out: &Out) -> Result<(), Exit> {
     let summary = backup::back_up(&from, &args.to, clock::clock(1000).now().wall).await?;
     show(&summary, out)?;
     // The backup is whole, whether or not that can be said.
-    if let Err(error) = backup::told::tell(&from.data, &summary, &args.to) {
+    if let Err(error) = backup::told::leave_note(&from.data, &summary, &args.to) {
         out.say(&format!("warning: the audit will have no row of this backup: {error:#}"));
     }
     out.next(&format!("midshift restore --verify --from {}", word(&args.to.to_string_lossy())));
