@@ -14,6 +14,11 @@ use std::fs::{File, OpenOptions, TryLockError};
 use std::io;
 use std::os::unix::fs::{FileExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// Tries of a lock that somebody has, and the pause between two: a program that is being started runs within milliseconds.
+const LOCK_TRIES: u32 = 20;
+const LOCK_PAUSE: Duration = Duration::from_millis(25);
 
 /// What keeps a value from being kept or read.
 #[derive(Debug, thiserror::Error)]
@@ -76,7 +81,7 @@ impl LatchFile {
         }
         let doing = "opening";
         let file = OpenOptions::new().read(true).write(true).open(path).map_err(|e| io_error(doing, path, e))?;
-        match file.try_lock() {
+        match lock(&file) {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => return Err(Error::Held { path: path.to_owned() }),
             Err(TryLockError::Error(source)) => return Err(io_error("locking", path, source)),
@@ -101,6 +106,29 @@ impl LatchFile {
     pub fn generation(&self) -> u64 {
         self.generation
     }
+}
+
+/// Locks a file for its one writer, within half a second. A program that the last writer was just starting has the lock too until it runs, so one
+/// that is let go may be held for a moment longer.
+///
+/// # Errors
+/// Somebody has it, or the system says no.
+#[expect(
+    clippy::disallowed_methods,
+    reason = "a pause of milliseconds while a file is opened, and only if somebody has it"
+)]
+pub fn lock(file: &File) -> Result<(), TryLockError> {
+    lock_by(|| file.try_lock(), || std::thread::sleep(LOCK_PAUSE))
+}
+
+fn lock_by(mut attempt: impl FnMut() -> Result<(), TryLockError>, mut pause: impl FnMut()) -> Result<(), TryLockError> {
+    for _ in 1..LOCK_TRIES {
+        match attempt() {
+            Err(TryLockError::WouldBlock) => pause(),
+            done => return done,
+        }
+    }
+    attempt()
 }
 
 /// The newest value and its generation, for whoever only reads. A file in which the writer is at work is read again.
@@ -222,6 +250,20 @@ mod tests {
         let (path, _file) = made(folder.path());
         assert_eq!(newest(&path).unwrap(), "first");
         assert!(!folder.path().join("latch.part").exists());
+    }
+
+    #[test]
+    fn a_lock_that_a_program_being_started_still_has_is_waited_for_and_one_that_stays_is_not_for_long() {
+        let locked = |free_after: u32| {
+            let (mut attempts, mut pauses) = (0, 0);
+            let attempt = || {
+                attempts += 1;
+                if attempts > free_after { Ok(()) } else { Err(TryLockError::WouldBlock) }
+            };
+            (lock_by(attempt, || pauses += 1).is_ok(), pauses)
+        };
+        assert_eq!((locked(0), locked(3)), ((true, 0), (true, 3)));
+        assert_eq!(locked(u32::MAX), (false, LOCK_TRIES - 1));
     }
 
     proptest! {

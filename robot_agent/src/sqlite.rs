@@ -252,7 +252,7 @@ fn lock(path: &Path) -> Result<File, Error> {
     let wrong = |detail: String| Error::WrongMode(detail);
     let name = path.with_extension("lock");
     let file = File::create(&name).map_err(|e| wrong(format!("making {}: {e}", name.display())))?;
-    file.try_lock().map_err(|e| wrong(format!("another agent uses {}: {e}", path.display())))?;
+    midshift_latch::lock(&file).map_err(|e| wrong(format!("another agent uses {}: {e}", path.display())))?;
     Ok(file)
 }
 
