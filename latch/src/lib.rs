@@ -3,7 +3,7 @@
 //! Two slots of fixed size, made and filled when the file is made. A write goes to the slot that does not hold the newest value and is durable when it
 //! returns; whoever reads takes the whole slot with the higher generation. So no write needs a new block, a name or a second file, and a write that is cut
 //! anywhere leaves the value before it. Invariant: one writer at a time, held by a lock on the file; readers beside it need none.
-//! Used by the stop service and by robots for what must not be forgotten: which stops are engaged. Absent on purpose: everything else.
+//! [`lock`] is for other files with one writer too. Used by the stop service and by robots for what must not be forgotten: which stops are engaged. Absent on purpose: everything else.
 
 mod slot;
 
@@ -17,8 +17,8 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// Tries of a lock that somebody has, and the pause between two: a program that is being started runs within milliseconds.
-const LOCK_TRIES: u32 = 20;
-const LOCK_PAUSE: Duration = Duration::from_millis(25);
+const LOCK_TRIES: u32 = 100;
+const LOCK_PAUSE: Duration = Duration::from_millis(10);
 
 /// What keeps a value from being kept or read.
 #[derive(Debug, thiserror::Error)]
@@ -108,7 +108,7 @@ impl LatchFile {
     }
 }
 
-/// Locks a file for its one writer, within half a second. A program that the last writer was just starting has the lock too until it runs, so one
+/// Locks a file for its one writer, within a second. A program that the last writer was just starting has the lock too until it runs, so one
 /// that is let go may be held for a moment longer.
 ///
 /// # Errors

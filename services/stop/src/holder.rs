@@ -9,13 +9,9 @@ use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
-use std::time::Duration;
 
 /// Its name in the folder. In no backup: it speaks of a process of this machine.
 pub const HOLDER: &str = "holder";
-/// Whoever looks at the lock has it for a moment; one that begins tries so often, after so long each.
-const TRIES: u32 = 100;
-const TRY_EVERY: Duration = Duration::from_millis(10);
 
 /// The process that has a folder.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -51,23 +47,11 @@ impl Holder {
         let mut options = OpenOptions::new();
         let path = folder.join(HOLDER);
         let mut file = options.read(true).write(true).create(true).truncate(false).mode(0o600).open(path)?;
-        lock(&file)?;
+        midshift_latch::lock(&file).map_err(io::Error::from)?;
         file.set_len(0)?;
         file.write_all(&serde_json::to_vec(&Process::own())?)?;
         Ok(Self { _file: file })
     }
-}
-
-#[expect(clippy::disallowed_methods, reason = "before anything is served; whoever looks has the lock for microseconds")]
-fn lock(file: &File) -> io::Result<()> {
-    for _ in 1..TRIES {
-        match file.try_lock() {
-            Ok(()) => return Ok(()),
-            Err(TryLockError::WouldBlock) => std::thread::sleep(TRY_EVERY),
-            Err(TryLockError::Error(error)) => return Err(error),
-        }
-    }
-    file.try_lock().map_err(io::Error::from)
 }
 
 /// Why a stop service was not ended.
