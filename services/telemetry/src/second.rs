@@ -1,7 +1,9 @@
 //! A machine that attaches with the name of a robot that is attached already, and does not prove that it is the same: it is watched, until it is clear which it is.
 //!
 //! Either the older session falls silent: then this was its robot, started anew, and comes back to take charge. Or the older one is heard on: then both machines are
-//! alive, and people are told. Invariant: nobody is told of a robot that restarted or moved, and none of the two is told apart by what it could have copied.
+//! alive, and people are told. One with another ring has not the memory of the robot that was heard: it takes charge only when that one's authority has ended, for
+//! until then that robot may still work, in its places, behind a gap in the network.
+//! Invariant: nobody is told of a robot that restarted or moved, and none of the two is told apart by what it could have copied.
 
 use crate::Inner;
 use midshift_core::fleet::CLONE_SEEN;
@@ -23,14 +25,17 @@ pub struct Second {
     /// Serial number of the certificate that it showed.
     certificate: Option<Arc<str>>,
     since: LinkTime,
+    /// Its ring is not that of the older session.
+    has_other_ring: bool,
 }
 
 impl Second {
     /// Whoever said this Hello, now.
-    pub fn new(inner: &Inner, hello: &Hello, by: &Caller) -> Self {
+    pub fn new(inner: &Inner, hello: &Hello, by: &Caller, has_other_ring: bool) -> Self {
         let (robot_id, boot_id) = (hello.robot_id.clone(), hello.boot_id.clone());
         tracing::info!(peer = Empty, %robot_id, boot_id, "second session without proof of succession, observed until the older one is silent");
-        Self { robot_id, boot_id, certificate: by.certificate().cloned(), since: inner.parts.clock.now().link }
+        let certificate = by.certificate().cloned();
+        Self { robot_id, boot_id, certificate, since: inner.parts.clock.now().link, has_other_ring }
     }
 
     /// Waits until the session in charge is gone or silent; then this robot may come back and take charge. Tells people once if both are alive.
@@ -47,14 +52,14 @@ impl Second {
 
     /// When the older session was heard last; none: it is gone, here or at another gateway, or has been silent for long.
     fn older_heard(&self, inner: &Inner) -> Option<LinkTime> {
-        let now = inner.parts.clock.now().link;
-        let Some(older) = inner.registry.get(&self.robot_id) else { return heard_elsewhere(inner, &self.robot_id) };
-        if now.since(older.heard()) <= limits::SUSPECT_AFTER {
-            return Some(older.heard());
+        if let Some(older) = inner.registry.get(&self.robot_id) {
+            if inner.parts.clock.now().link.since(older.heard()) <= limits::SUSPECT_AFTER {
+                return Some(older.heard());
+            }
+            older.fenced.cancel();
+            inner.registry.leave(&self.robot_id, older.session_epoch);
         }
-        older.fenced.cancel();
-        inner.registry.leave(&self.robot_id, older.session_epoch);
-        None
+        heard_elsewhere(inner, &self.robot_id).or_else(|| in_gap(inner, &self.robot_id).filter(|_| self.has_other_ring))
     }
 
     /// Whether it is on record, for fleet to make an incident of it.
@@ -92,4 +97,10 @@ pub fn heard_elsewhere(inner: &Inner, robot_id: &RobotId) -> Option<LinkTime> {
     let silent = inner.parts.clock.now().link.since(live.processed_at);
     let is_heard = silent <= limits::SUSPECT_AFTER && !inner.registry.has_left(robot_id, live.report.session_epoch);
     is_heard.then_some(live.processed_at)
+}
+
+/// When the robot was heard last, if whoever it was may still have authority.
+pub fn in_gap(inner: &Inner, robot_id: &RobotId) -> Option<LinkTime> {
+    let live = inner.parts.board.get(robot_id)?;
+    (inner.parts.clock.now().link.since(live.processed_at) <= limits::LEASE).then_some(live.processed_at)
 }

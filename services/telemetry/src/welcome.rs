@@ -3,7 +3,7 @@
 use crate::Inner;
 use crate::registry::InCharge;
 use crate::replay::Replay;
-use crate::second::{Second, heard_elsewhere};
+use crate::second::{Second, heard_elsewhere, in_gap};
 use midshift_bundle::installed::{self, Rejection};
 use midshift_core::identity::{Caller, SessionSecret};
 use midshift_core::limits;
@@ -72,14 +72,17 @@ pub async fn begin(inner: &Inner, hello: &Hello, by: &Caller) -> Result<Begun, R
             hello.boot_id == row.boot_id && hello.previous.as_ref().is_some_and(known)
         });
         let here = inner.registry.get(&hello.robot_id).is_some();
-        let is_held = here || heard_elsewhere(inner, &hello.robot_id).is_some();
+        let has_other_ring = row.as_ref().is_some_and(|(row, _)| row.ring != hello.ring);
+        let is_held = here
+            || heard_elsewhere(inner, &hello.robot_id).is_some()
+            || (has_other_ring && in_gap(inner, &hello.robot_id).is_some());
         let now = inner.parts.clock.now();
         let last = row.as_ref().map_or(0, |(r, _)| r.session_epoch);
         let session_epoch = (last + 1).max(now.wall.0.max(0) as u64);
         if is_held && !proven && !inner.parts.bugs.no_clone_fence() {
             // Its epoch and secret are in no row: they prove nothing later.
             let welcome = welcome(inner, session_epoch, draw_secret(), &mark.0, status, true);
-            return Ok(Begun { part: Err(Second::new(inner, hello, by)), welcome, mark, status });
+            return Ok(Begun { part: Err(Second::new(inner, hello, by, has_other_ring)), welcome, mark, status });
         }
         let live = inner.parts.board.get(&hello.robot_id);
         let measured = live.and_then(|live| live.clock_offset_ms).map(|(offset, _)| offset);

@@ -106,3 +106,24 @@ async fn an_observed_machine_takes_charge_when_the_other_one_is_silent() -> Resu
     assert!(!Robot::attach_saying(&world, started("boot-2", None)?).await?.welcome.observed);
     Ok(())
 }
+
+#[tokio::test(start_paused = true)]
+async fn a_machine_without_the_robots_memory_takes_charge_only_when_the_robots_authority_has_ended() -> Result<()> {
+    let world = world().await?;
+    let mut robot = Robot::attach_saying(&world, started("boot-1", None)?).await?;
+    a_second_passes(&mut robot).await?;
+    drop(robot);
+    while world.service.sessions() > 0 {
+        tokio::task::yield_now().await;
+    }
+    let other = Hello { ring: "another".to_owned(), ..started("boot-2", None)? };
+    let mut second = Robot::attach_saying(&world, other.clone()).await?;
+    assert!(second.welcome.observed, "the robot may be driving behind a gap in the network");
+    let from = tokio::time::Instant::now();
+    assert_eq!(second.closes().await?.code, CloseCode::MoveOver);
+    let silent = from.elapsed();
+    assert!(silent >= Duration::from_millis(limits::AUTHORITY.as_ms()), "{silent:?}");
+    assert!(!Robot::attach_saying(&world, other).await?.welcome.observed);
+    assert_eq!(told(&world).await?, [json!(null); 0], "one machine at a time");
+    Ok(())
+}
