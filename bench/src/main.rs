@@ -21,6 +21,7 @@ mod robot;
 mod sink;
 mod stop;
 mod submit;
+mod watch;
 
 use clap::{Parser, Subcommand};
 use std::future::Future;
@@ -45,6 +46,8 @@ enum Name {
     Stop(stop::StopArgs),
     /// What slow, half-open, broken and flooding peers cost a client that does no harm, and what becomes of them.
     Edge(edge::EdgeArgs),
+    /// Memory of a server with thousands of watches that nobody reads.
+    Watch(watch::WatchArgs),
     /// What the other names start: this program in one role.
     #[command(hide = true)]
     Child(child::ChildArgs),
@@ -87,6 +90,7 @@ fn main() -> anyhow::Result<()> {
             failed = told.failed;
             told.figures
         }
+        Name::Watch(args) => wait(watch::run(args, &note))?,
         Name::Child(args) => return child::play(args),
     };
     print!("{}", figure::table(&figures));
