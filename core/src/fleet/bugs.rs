@@ -27,4 +27,10 @@ crate::seeded_bugs! {
     StepsAreNotTold steps_are_not_told;
     /// A robot that stands where nobody sent it is blamed for it, with a grant or without.
     ClaimsAreBlamed claims_are_blamed;
+    /// Whatever stops a robot says hold it are one decision.
+    HoldsComeAtOnce holds_come_at_once;
+    /// Each word of a robot that people are told of opens an incident of its own.
+    EachWordIsTold each_word_is_told;
+    /// After a report that counts for nothing everything is read anew.
+    FencedReportsRebuild fenced_reports_rebuild;
 }

@@ -135,8 +135,9 @@ fn look(tx: &mut Tx, robot_id: &RobotId, live: Option<&Live>) -> bool {
 /// Writes what differs, as much as one item takes. False: there is more.
 fn write(tx: &mut Tx, robot_id: &RobotId, tokens: &BTreeMap<StopId, Hold>, wanted: &BTreeMap<StopId, Hold>) -> bool {
     let since = tx.now.utc;
+    let most = if tx.view.bugs.holds_come_at_once() { usize::MAX } else { limits::HOLDS_PER_ITEM };
     let mut differ = wanted.iter().filter(|(id, hold)| tokens.get(*id) != Some(hold));
-    for (stop_id, hold) in differ.by_ref().take(limits::HOLDS_PER_ITEM) {
+    for (stop_id, hold) in differ.by_ref().take(most) {
         if let Some(old) = tokens.get(stop_id) {
             tx.delete::<HoldToken>(&HoldToken::id_of(robot_id, &old.token(stop_id)), "hold.replaced");
         }

@@ -342,7 +342,11 @@ impl Loop {
             silent.position = self.heard_up_to;
         }
         let is_cut = self.more;
+        let is_doubted = self.parts.bugs.fenced_reports_rebuild() && plan.report.tally.fenced > 0;
         self.renew_and_commit(renewal, now, plan, replies).await?;
+        if is_doubted {
+            return Err(());
+        }
         self.fit(begun.elapsed(), is_cut);
         self.answer(now);
         Ok(())

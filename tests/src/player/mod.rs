@@ -10,10 +10,10 @@ mod work;
 
 pub use habits::Habit;
 
-use midshift_core::ids::{PlaceId, RobotId, TaskId, WaypointId};
+use midshift_core::ids::{AttemptId, PlaceId, RobotId, TaskId, WaypointId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Reason};
-use midshift_core::robot::{HeldPlace, Inventory, Lane, ReportedState, StopLevel, Vitals};
+use midshift_core::robot::{HeldPlace, Inventory, Lane, ReportedAttempt, ReportedState, StopLevel, Vitals, WorkState};
 use midshift_core::site::Site;
 use midshift_core::work::{DesiredWork, Gap, InboxItem, RobotEvent, Sample, SampleBody};
 use midshift_proto::link::v1;
@@ -110,6 +110,8 @@ pub struct Player {
     /// Highest generation of its work that it has applied.
     applied: u64,
     job: Option<Job>,
+    /// Attempts of tasks that it spoke of without having them, or as over, or that it did not list while it had them.
+    disowned: BTreeSet<AttemptId>,
     /// What it answers next and when, milliseconds.
     answer_at: Option<u64>,
     beat_at: u64,
@@ -161,6 +163,7 @@ impl Player {
             work: None,
             applied: 0,
             job: None,
+            disowned: BTreeSet::new(),
             answer_at: None,
             beat_at: 0,
             quiet_until: 0,
@@ -182,6 +185,15 @@ impl Player {
     pub fn deeds(&self) -> &BTreeMap<&'static str, u64> {
         &self.deeds
     }
+    /// It has this habit too from now on.
+    pub fn take_up(&mut self, habit: Habit) {
+        self.habits.insert(habit);
+    }
+    /// Whether it has this attempt and never said anything else of it.
+    pub fn keeps(&self, attempt: &AttemptId) -> bool {
+        let has = self.job.as_ref().is_some_and(|job| job.assignment.attempt == *attempt);
+        has && !self.disowned.contains(attempt)
+    }
     /// The task whose load it last said that it has, in a heartbeat.
     pub fn said_load(&self) -> Option<&TaskId> {
         self.state.load.as_ref()?.task_id.as_ref()
@@ -200,6 +212,7 @@ impl Player {
         for habit in self.habits.clone().into_iter().filter(lasting) {
             self.misbehave(habit, 0, &mut reported);
         }
+        self.lists(&reported.attempts);
         let position = |(lane, last): (&Lane, &u64)| {
             let first = self.kept.iter().find(|(kept, _)| kept == lane).map_or(last + 1, |(_, sample)| sample.seq);
             (*lane, LanePosition { first_seq: first, next_seq: last + 1 })
@@ -236,6 +249,7 @@ impl Player {
     /// The first word of a machine that has its name beside it.
     pub fn second_hello(&mut self, unix_ms: i64) -> v1::SessionRequest {
         let reported = ReportedState { hb: 0, session_epoch: 0, ..self.state.clone() };
+        self.lists(&reported.attempts);
         let hello = Hello {
             robot_id: self.robot_id.clone(),
             boot_id: format!("boot-beside-{}", self.boots),
@@ -257,6 +271,7 @@ impl Player {
         self.seconds += 1;
         let mut reported = ReportedState { hb: self.seconds, session_epoch: 1, ..self.state.clone() };
         self.misbehave(Habit::ForeignAttempts, 0, &mut reported);
+        self.lists(&reported.attempts);
         let heartbeat = Heartbeat { reported, sent_unix_us: unix_ms.saturating_mul(1_000), clock: None };
         (&FromRobot::Uplink(Uplink { heartbeat: Some(heartbeat), batches: Vec::new() })).into()
     }
@@ -351,6 +366,7 @@ impl Player {
         for habit in self.habits.clone() {
             self.misbehave(habit, now_ms, &mut report);
         }
+        self.lists(&report.attempts);
         let sent_unix_us = self.stamp(unix_ms).saturating_mul(1_000);
         let heartbeat = Heartbeat { reported: report, sent_unix_us, clock: self.echo.take() };
         (&FromRobot::Uplink(Uplink { heartbeat: Some(heartbeat), batches: Vec::new() })).into()
@@ -407,7 +423,24 @@ impl Player {
         self.fresh = true;
     }
     fn event(&mut self, event: RobotEvent) {
+        if let RobotEvent::Attempt(report) = &event {
+            self.says_of(&report.attempt, report.state);
+        }
         self.produce(Lane::Event, SampleBody::Event(event));
+    }
+    /// Notes what it says of an attempt.
+    fn says_of(&mut self, attempt: &AttemptId, state: WorkState) {
+        let has = self.job.as_ref().is_some_and(|job| job.assignment.attempt == *attempt);
+        let lives = !state.is_over() && state != WorkState::StepUnknown;
+        if attempt.subject.task_id().is_some() && !(has && lives) {
+            self.disowned.insert(attempt.clone());
+        }
+    }
+    /// Notes what it says of its attempts together.
+    fn lists(&mut self, attempts: &[ReportedAttempt]) {
+        attempts.iter().for_each(|listed| self.says_of(&listed.attempt, listed.state));
+        let at_hand = self.job.as_ref().map(|job| job.assignment.attempt.clone());
+        self.disowned.extend(at_hand.filter(|id| attempts.iter().all(|listed| listed.attempt != *id)));
     }
     fn alarm(&mut self, event: RobotEvent) {
         self.produce(Lane::Critical, SampleBody::Event(event));

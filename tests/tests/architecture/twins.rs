@@ -50,6 +50,9 @@ const TWINS: &[(&str, &[Twin])] = &[
             ("StepsAreNotTold", 8, SEEDS),
             ("DoubtIsKeptQuiet", 8, SEEDS),
             ("ClaimsAreBlamed", 7, SEEDS),
+            ("HoldsComeAtOnce", 8, SEEDS),
+            ("EachWordIsTold", 23, SEEDS),
+            ("FencedReportsRebuild", 8, SEEDS),
         ],
     ),
     (

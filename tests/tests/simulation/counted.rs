@@ -7,8 +7,8 @@ use midshift_tests::metrics::Metrics;
 pub const TOLD: &str = "what does not move is explained";
 
 /// Looks at that law: the server counts what it cannot explain itself.
-pub fn nothing_stands_unexplained(seen: &mut Observer) {
-    let unexplained = counted().sum("midshift_fleet_unexplained_total", "");
+pub fn nothing_stands_unexplained(counted: &Metrics, seen: &mut Observer) {
+    let unexplained = counted.sum("midshift_fleet_unexplained_total", "");
     seen.check(TOLD, unexplained == 0, || format!("{unexplained} robots and tasks"));
 }
 

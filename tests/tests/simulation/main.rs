@@ -132,6 +132,10 @@ fn naive_of(name: &str) -> room::Naive {
         "doubt_is_kept_quiet" => fleet(Fleet::DoubtIsKeptQuiet),
         "steps_are_not_told" => fleet(Fleet::StepsAreNotTold),
         "claims_are_blamed" => fleet(Fleet::ClaimsAreBlamed),
+        "late_reports_count" => fleet(Fleet::LateReportsCount),
+        "holds_come_at_once" => fleet(Fleet::HoldsComeAtOnce),
+        "each_word_is_told" => fleet(Fleet::EachWordIsTold),
+        "fenced_reports_rebuild" => fleet(Fleet::FencedReportsRebuild),
         "authority_from_receipt" => agent(SeededBug::AuthorityFromReceipt),
         "grant_from_receipt" => agent(SeededBug::GrantFromReceipt),
         "ack_before_commit" => {

@@ -7,6 +7,7 @@
 use crate::changes::{Changes, Look};
 use crate::clock::TrueTime;
 use crate::laws::{Grants, Offers};
+use crate::played::{GOES_ON, ONCE};
 use midshift_agent::store::Op;
 use midshift_agent::switch::Switch;
 use midshift_bundle::set::SetManifest;
@@ -17,12 +18,13 @@ use midshift_core::robot::Lane;
 use midshift_core::rollout::rows::Rollout;
 use midshift_core::rows::{Entry, Log, Record, Seq, Table};
 use midshift_core::task::machine::Phase;
-use midshift_core::task::{Attempt, TaskIntake, TaskState};
+use midshift_core::task::{Attempt, AttemptPhase, TaskIntake, TaskState};
 use midshift_core::update::{DesiredUpdate, UpdateEvent};
 use midshift_core::work::{DesiredWork, InboxEntry, InboxItem, RobotEvent, SampleBody, StepKind, WorkState};
 use midshift_sim::handle::SimHandle;
 use midshift_sim::world::{SharedWorld, lock};
 use midshift_store::{Frame, MemoryStore, Store};
+use midshift_tests::player::Player;
 use std::collections::{BTreeMap, BTreeSet};
 use std::future::Future;
 use std::pin::pin;
@@ -84,7 +86,7 @@ pub struct Observer {
     within: BTreeMap<RobotId, BTreeSet<PlaceId>>,
     changes: Changes,
     /// Robots that say what they like, whose numbers and claims are no law.
-    players: BTreeSet<RobotId>,
+    players: BTreeMap<RobotId, Arc<Mutex<Player>>>,
     trace: bool,
 }
 
@@ -149,7 +151,7 @@ impl Observer {
             grants: Grants::default(),
             within: BTreeMap::new(),
             changes: Changes::default(),
-            players: BTreeSet::new(),
+            players: BTreeMap::new(),
             trace: std::env::var_os("MIDSHIFT_SIM_TRACE").is_some(),
         }
     }
@@ -158,8 +160,9 @@ impl Observer {
         self.world = Some(world);
     }
     /// This robot says what it likes.
-    pub fn behaves_badly(&mut self, robot_id: RobotId) {
-        self.players.insert(robot_id);
+    pub fn behaves_badly(&mut self, player: Arc<Mutex<Player>>) {
+        let robot_id = player.lock().unwrap_or_else(PoisonError::into_inner).robot_id().clone();
+        self.players.insert(robot_id, player);
     }
     /// Every robot that was given this task.
     pub fn given_to(&self, task_id: &TaskId) -> BTreeSet<RobotId> {
@@ -342,6 +345,9 @@ impl Observer {
     }
 
     fn attempt(&mut self, attempt: Attempt) {
+        if !self.players.is_empty() && attempt.attempt.subject.task_id().is_some() {
+            self.stays_with_its_robot(&attempt);
+        }
         let (subject, epoch) = (attempt.attempt.subject.clone(), attempt.attempt.epoch);
         let known = self.attempts.entry(subject.clone()).or_default();
         let highest = known.keys().next_back().copied().unwrap_or(0);
@@ -370,6 +376,35 @@ impl Observer {
         });
     }
 
+    /// Beside players a robot has its work until it says itself that it is over: nobody else ends it, and nobody is given it before. What a
+    /// person gives up is LOST.
+    fn stays_with_its_robot(&mut self, new: &Attempt) {
+        let of_task = self.attempts.get(&new.attempt.subject).cloned().unwrap_or_default();
+        let old = of_task.get(&new.attempt.epoch);
+        let ran = old.is_some_and(|old| old.accepted.is_some() && !old.phase.is_terminal());
+        let ends = new.phase.is_terminal() && new.phase != AttemptPhase::Lost;
+        let is_taken_away = ran && ends && self.keeps(new);
+        if self.players.contains_key(&new.robot_id) {
+            self.check(ONCE, !is_taken_away, || format!("its robot has it still: {new:?}"));
+        } else {
+            let goes_on = !is_taken_away && new.uncertain.is_none();
+            self.check(GOES_ON, goes_on, || format!("its robot works on it: {new:?}"));
+        }
+        if old.is_none() {
+            let has = |a: &&Attempt| !a.phase.is_terminal() || (a.accepted.is_some() && self.keeps(a));
+            let before = of_task.values().find(has);
+            self.check(ONCE, before.is_none(), || format!("{new:?} after {before:?}"));
+        }
+    }
+    /// Whether its robot has it: an honest one by its ledger, a player if it never said otherwise.
+    fn keeps(&self, a: &Attempt) -> bool {
+        if let Some(player) = self.players.get(&a.robot_id) {
+            return player.lock().unwrap_or_else(PoisonError::into_inner).keeps(&a.attempt);
+        }
+        let holder = self.ledgers.get(&a.robot_id).and_then(|ledger| ledger.holder.as_ref());
+        holder.is_some_and(|(subject, epoch)| *subject == a.attempt.subject && *epoch == a.attempt.epoch)
+    }
+
     /// What must hold of all rows together after a commit.
     fn hold_together(&mut self) {
         let mut robots: BTreeMap<RobotId, String> = BTreeMap::new();
@@ -391,7 +426,7 @@ impl Observer {
 
     fn place(&mut self, place: Place) {
         // A grant that a player has is one of its own invention, or one that it says it is inside on.
-        let of_law = |h: &&PlaceHolder| h.grant_id != 0 && !self.players.contains(&h.robot_id);
+        let of_law = |h: &&PlaceHolder| h.grant_id != 0 && !self.players.contains_key(&h.robot_id);
         let granted = place.holders.iter().filter(of_law).count();
         self.check("I7 grants within capacity", granted <= place.capacity as usize, || format!("{place:?}"));
         self.places.insert(place.place_id.clone(), place);
@@ -432,7 +467,7 @@ impl Observer {
             InboxItem::Gap(gap) => gap.to_seq,
         };
         *last = (said.ring.clone(), seq);
-        if self.players.contains(&said.robot_id) {
+        if self.players.contains_key(&said.robot_id) {
             return;
         }
         let gap = matches!(said.what, InboxItem::Gap(_) | InboxItem::Poison { .. });
@@ -467,7 +502,7 @@ impl Observer {
 
     /// Whether a robot says what it likes: the gaps that it announces are its own.
     pub fn is_player(&self, robot_id: &RobotId) -> bool {
-        self.players.contains(robot_id)
+        self.players.contains_key(robot_id)
     }
     fn stored(&mut self, frames: &[Frame]) {
         for frame in frames {

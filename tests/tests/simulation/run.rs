@@ -229,7 +229,7 @@ impl Shift {
         let refused = self.room.desk.refused.borrow();
         let drops = midshift_sim::world::lock(&self.room.hall.worlds()[0]).oracle().drops_by_task();
         let mut seen = self.room.observer.look();
-        counted::nothing_stands_unexplained(&mut seen);
+        counted::nothing_stands_unexplained(&counted::counted(), &mut seen);
         incidents::nobody_is_blamed(&self.room.store, &mut seen);
         seen.check("I8 every task ends", true, String::new);
         seen.changes_ended();
