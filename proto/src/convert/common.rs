@@ -16,6 +16,8 @@ use serde_json::{Map, Value};
 const FAULT_MESSAGE_BYTES: usize = 200;
 /// Facts behind one reason.
 const METADATA_MAX: usize = 16;
+/// Bytes of an object's key in the path of a violation.
+const KEY_SHOWN_BYTES: usize = 64;
 /// Integers beyond this lose digits in a double.
 const EXACT: f64 = 9_007_199_254_740_992.0;
 
@@ -163,21 +165,36 @@ fn to_value(value: &Value) -> prost_types::Value {
     prost_types::Value { kind: Some(kind) }
 }
 
-/// A JSON object from the well-known type. A double without a fraction becomes an integer; one that JSON cannot say becomes null.
-pub fn from_struct(value: Struct) -> Map<String, Value> {
-    value.fields.into_iter().map(|(k, v)| (k, from_value(v))).collect()
+/// Reads a JSON object; absent: an empty one. A double without a fraction becomes an integer. The first number that JSON
+/// cannot say is a violation.
+pub(crate) fn from_struct(wire: Option<Struct>, at: At<'_>, bad: &mut Violations) -> Option<Map<String, Value>> {
+    let fields = wire.unwrap_or_default().fields.into_iter();
+    fields
+        .map(|(key, value)| {
+            let shown = &key[..key.floor_char_boundary(KEY_SHOWN_BYTES)];
+            let value = from_value(value, at.field(shown), bad)?;
+            Some((key, value))
+        })
+        .collect()
 }
 
-fn from_value(value: prost_types::Value) -> Value {
-    match value.kind {
+fn from_value(wire: prost_types::Value, at: At<'_>, bad: &mut Violations) -> Option<Value> {
+    Some(match wire.kind {
         None | Some(Kind::NullValue(_)) => Value::Null,
         Some(Kind::BoolValue(b)) => Value::Bool(b),
+        Some(Kind::NumberValue(n)) if !n.is_finite() => {
+            bad.add(at.to_string(), format!("{n} is not a number of JSON"));
+            return None;
+        }
         Some(Kind::NumberValue(n)) if n.fract() == 0.0 && n.abs() < EXACT => Value::from(n as i64),
         Some(Kind::NumberValue(n)) => Value::from(n),
         Some(Kind::StringValue(s)) => Value::String(s),
-        Some(Kind::ListValue(list)) => Value::Array(list.values.into_iter().map(from_value).collect()),
-        Some(Kind::StructValue(map)) => Value::Object(from_struct(map)),
-    }
+        Some(Kind::ListValue(list)) => {
+            let items = list.values.into_iter().enumerate();
+            Value::Array(items.map(|(i, item)| from_value(item, at.index(i), bad)).collect::<Option<_>>()?)
+        }
+        Some(Kind::StructValue(map)) => Value::Object(from_struct(Some(map), at, bad)?),
+    })
 }
 
 /// Reads an authority that must be there.
@@ -206,6 +223,25 @@ mod tests {
     fn a_json_object_reads_back() {
         let text = r#"{"a":[1,-2.5,null,true,{"b":"c"}],"item":"SKU-1","n":9007199254740991}"#;
         let Value::Object(map) = serde_json::from_str(text).expect("json") else { panic!("not an object") };
-        assert_eq!(from_struct(to_struct(&map)), map);
+        let mut bad = Violations::default();
+        assert_eq!(from_struct(Some(to_struct(&map)), At::top("params"), &mut bad), Some(map));
+        assert_eq!(from_struct(None, At::top("params"), &mut bad), Some(Map::new()));
+        assert_eq!(bad.finish(), Ok(()));
+    }
+
+    #[test]
+    fn a_number_that_json_cannot_say_is_refused_by_its_path() {
+        let value = |kind| prost_types::Value { kind: Some(kind) };
+        let object = |key: &str, inner| Struct { fields: [(key.to_owned(), inner)].into() };
+        for (number, shown) in [(f64::NAN, "NaN"), (f64::INFINITY, "inf"), (f64::NEG_INFINITY, "-inf")] {
+            let values = vec![value(Kind::BoolValue(true)), value(Kind::NumberValue(number))];
+            let list = object("weights", value(Kind::ListValue(ListValue { values })));
+            let mut bad = Violations::default();
+            let wire = object("é".repeat(40).as_str(), value(Kind::StructValue(list)));
+            assert_eq!(from_struct(Some(wire), At::top("params"), &mut bad), None);
+            let field = format!("params.{}.weights[1]", "é".repeat(32));
+            let description = format!("{shown} is not a number of JSON");
+            assert_eq!(bad.0, [Violation { field, description }]);
+        }
     }
 }

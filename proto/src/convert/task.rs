@@ -49,7 +49,7 @@ impl Submission {
         let top = At::top("");
         let request_id = maybe_id(&request.request_id, RequestId::parse, top.field("request_id"), &mut bad).flatten();
         let (form, own_id, raw) = match request.body {
-            Some(Body::Spec(spec)) => (Form::Spec, String::new(), raw_task(spec)),
+            Some(Body::Spec(spec)) => (Form::Spec, String::new(), raw_task(spec, At::top("spec"), &mut bad)),
             Some(Body::Flat(flat)) => (Form::Flat, flat.task_id.clone(), raw_flat(flat)),
             Some(Body::Nested(nested)) => (Form::Nested, nested.task_id.clone(), raw_nested(nested)),
             None => (Form::Missing, String::new(), RawTask::default()),
@@ -121,9 +121,10 @@ fn ms(value: Option<prost_types::Duration>) -> Option<i64> {
     value.as_ref().map(ms_of)
 }
 
-/// A spec as it was sent.
-pub fn raw_task(spec: v1::TaskSpec) -> RawTask {
+/// A spec as it was sent. What cannot be read is a violation, and absent.
+fn raw_task(spec: v1::TaskSpec, at: At<'_>, bad: &mut Violations) -> RawTask {
     let selector = spec.selector.unwrap_or_default();
+    let steps = spec.steps.into_iter().enumerate();
     RawTask {
         kind: spec.r#type,
         priority: spec.priority.map(i64::from),
@@ -132,7 +133,7 @@ pub fn raw_task(spec: v1::TaskSpec) -> RawTask {
         capabilities: selector.capabilities,
         minimum_software: selector.minimum_software,
         payload_g: selector.payload_g,
-        steps: spec.steps.into_iter().map(raw_step).collect(),
+        steps: steps.map(|(i, step)| raw_step(step, at.field("steps").index(i), bad)).collect(),
         timeout_ms: ms(spec.timeout),
         schedule_to_start_ms: ms(spec.schedule_to_start_timeout),
         stall_ms: ms(spec.stall_timeout),
@@ -150,11 +151,14 @@ pub fn raw_task(spec: v1::TaskSpec) -> RawTask {
     }
 }
 
-fn raw_step(step: v1::Step) -> RawStep {
+fn raw_step(step: v1::Step, at: At<'_>, bad: &mut Violations) -> RawStep {
     use v1::step::Kind;
     let kind = step.kind.map(|kind| match kind {
         Kind::Goto(goto) => RawStepKind::Goto(goto.waypoint),
-        Kind::Action(action) => RawStepKind::Action(action.name, action.params.map(from_struct).unwrap_or_default()),
+        Kind::Action(action) => {
+            let params = from_struct(action.params, at.field("action").field("params"), bad);
+            RawStepKind::Action(action.name, params.unwrap_or_default())
+        }
         Kind::Wait(wait) => RawStepKind::Wait(ms(wait.duration).unwrap_or(0)),
     });
     let on_fail = |number| match v1::OnFail::try_from(number) {
@@ -195,7 +199,7 @@ fn with_created_at(mut raw: RawTask, created_at: String) -> RawTask {
 }
 
 /// A flat task as it was sent.
-pub fn raw_flat(flat: v1::FlatTask) -> RawTask {
+fn raw_flat(flat: v1::FlatTask) -> RawTask {
     let transport = Transport {
         kind: flat.task_type,
         priority: flat.priority.map(i64::from),
@@ -212,7 +216,7 @@ pub fn raw_flat(flat: v1::FlatTask) -> RawTask {
 }
 
 /// A nested task as it was sent.
-pub fn raw_nested(nested: v1::NestedTask) -> RawTask {
+fn raw_nested(nested: v1::NestedTask) -> RawTask {
     let content = nested.content.unwrap_or_default();
     let retry = nested.retry_strategy.unwrap_or_default();
     let transport = Transport {
