@@ -11,6 +11,7 @@ use midshift_core::work::WorkStats;
 use prost_types::value::Kind;
 use prost_types::{Duration, ListValue, Struct, Timestamp};
 use serde_json::{Map, Value};
+use std::ops::RangeInclusive;
 
 /// Longest text of a fault, bytes.
 const FAULT_MESSAGE_BYTES: usize = 200;
@@ -18,6 +19,12 @@ const FAULT_MESSAGE_BYTES: usize = 200;
 const METADATA_MAX: usize = 16;
 /// Bytes of an object's key in the path of a violation.
 const KEY_SHOWN_BYTES: usize = 64;
+/// Seconds that a timestamp may have: those of the years 1 to 9999.
+const TIME_SECONDS: RangeInclusive<i64> = -62_135_596_800..=253_402_300_799;
+/// Seconds that a duration may have: those of 10,000 years.
+const DURATION_SECONDS: RangeInclusive<i64> = -315_576_000_000..=315_576_000_000;
+/// A second has one more.
+const NANOS_MAX: i32 = 999_999_999;
 /// Integers beyond this lose digits in a double.
 const EXACT: f64 = 9_007_199_254_740_992.0;
 
@@ -128,17 +135,38 @@ impl From<&Violation> for v1::FieldViolation {
     }
 }
 
+/// Reads UTC; absent: none. What is below a millisecond is cut off.
+pub fn parse_time(wire: Option<&Timestamp>, at: At<'_>, bad: &mut Violations) -> Option<Utc> {
+    let wire = wire?;
+    if !TIME_SECONDS.contains(&wire.seconds) || !(0..=NANOS_MAX).contains(&wire.nanos) {
+        bad.add(at.to_string(), format!("must be of the years 1 .. 9999, with nanos of 0 .. {NANOS_MAX}"));
+        return None;
+    }
+    Some(time_of(wire))
+}
+
+/// Reads the milliseconds of a duration; absent: none. What is below one is cut off.
+pub fn parse_ms(wire: Option<&Duration>, at: At<'_>, bad: &mut Violations) -> Option<i64> {
+    let wire = wire?;
+    let are_in_range = DURATION_SECONDS.contains(&wire.seconds) && (-NANOS_MAX..=NANOS_MAX).contains(&wire.nanos);
+    if !are_in_range || wire.seconds.signum() * i64::from(wire.nanos.signum()) < 0 {
+        bad.add(at.to_string(), format!("must be within 10000 years, with nanos of its sign up to {NANOS_MAX}"));
+        return None;
+    }
+    Some(ms_of(wire))
+}
+
 /// UTC as the well-known type.
 pub fn timestamp(utc: Utc) -> Timestamp {
     Timestamp { seconds: utc.0.div_euclid(1000), nanos: (utc.0.rem_euclid(1000) * 1_000_000) as i32 }
 }
 
-/// UTC from the well-known type; what is below a millisecond is cut off.
+/// UTC from the well-known type, as it was answered; [`parse_time`] reads what was asked.
 pub fn time_of(timestamp: &Timestamp) -> Utc {
     Utc(timestamp.seconds.saturating_mul(1000).saturating_add(i64::from(timestamp.nanos.div_euclid(1_000_000))))
 }
 
-/// Milliseconds of a duration; what is below one is cut off, what does not fit is the largest.
+/// Milliseconds of a duration, as it was answered; [`parse_ms`] reads what was asked.
 pub fn ms_of(duration: &Duration) -> i64 {
     duration.seconds.saturating_mul(1000).saturating_add(i64::from(duration.nanos / 1_000_000))
 }
@@ -216,6 +244,45 @@ mod tests {
         #[test]
         fn a_duration_reads_back(ms in 0u64..1_000_000_000_000) {
             prop_assert_eq!(ms_of(&duration(ms)), ms as i64);
+        }
+    }
+
+    #[test]
+    fn a_time_that_is_none_is_refused() {
+        let time = |seconds, nanos| Timestamp { seconds, nanos };
+        for wire in [time(-62_135_596_800, 0), time(253_402_300_799, 999_999_999)] {
+            let mut bad = Violations::default();
+            assert_eq!(parse_time(Some(&wire), At::top("deadline"), &mut bad), Some(time_of(&wire)));
+            assert_eq!(bad.finish(), Ok(()));
+        }
+        let years = [time(-62_135_596_801, 0), time(253_402_300_800, 0), time(i64::MAX, 0), time(i64::MIN, 0)];
+        let nanos = [time(0, 1_000_000_000), time(0, -1), time(0, i32::MIN)];
+        for wire in years.into_iter().chain(nanos) {
+            let mut bad = Violations::default();
+            assert_eq!(parse_time(Some(&wire), At::top("deadline"), &mut bad), None, "{wire:?}");
+            assert_eq!(bad.0[0].field, "deadline");
+        }
+    }
+
+    #[test]
+    fn a_duration_that_is_none_is_refused() {
+        let span = |seconds, nanos| Duration { seconds, nanos };
+        let good = [
+            (span(-1, -999_999_999), -1_999),
+            (span(0, -1_000_000), -1),
+            (span(315_576_000_000, 0), 315_576_000_000_000),
+        ];
+        for (wire, ms) in good {
+            let mut bad = Violations::default();
+            assert_eq!(parse_ms(Some(&wire), At::top("timeout"), &mut bad), Some(ms));
+            assert_eq!(bad.finish(), Ok(()));
+        }
+        let seconds = [span(315_576_000_001, 0), span(i64::MAX, 0), span(i64::MIN, 0)];
+        let nanos = [span(0, 1_000_000_000), span(0, i32::MIN), span(1, -1), span(-1, 1)];
+        for wire in seconds.into_iter().chain(nanos) {
+            let mut bad = Violations::default();
+            assert_eq!(parse_ms(Some(&wire), At::top("timeout"), &mut bad), None, "{wire:?}");
+            assert_eq!(bad.0[0].field, "timeout");
         }
     }
 

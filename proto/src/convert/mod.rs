@@ -20,7 +20,7 @@ use midshift_core::reason::{Refusal, Violations};
 use std::fmt;
 
 pub(crate) use common::from_struct;
-pub use common::{duration, ms_of, shown, time_of, timestamp, to_struct};
+pub use common::{duration, ms_of, parse_ms, parse_time, shown, time_of, timestamp, to_struct};
 pub use enums::WireEnum;
 
 /// Where in a message a reader stands. Costs nothing until a violation is written.

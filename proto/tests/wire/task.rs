@@ -79,6 +79,36 @@ fn a_parameter_that_json_cannot_say_is_refused_by_its_path() {
 }
 
 #[test]
+fn times_that_are_none_are_each_refused_once_by_their_field() {
+    let mut request: SubmitTaskRequest = from_json(json!({ "spec": full_spec() })).expect("json");
+    let Some(Body::Spec(spec)) = &mut request.body else { panic!("a spec") };
+    // Each would be within its bounds if its nanos were counted, or if it were cut off.
+    let span = Some(prost_types::Duration { seconds: 1, nanos: 2_000_000_000 });
+    let time = Some(prost_types::Timestamp { seconds: 1_780_300_800, nanos: -1 });
+    (spec.timeout, spec.schedule_to_start_timeout, spec.stall_timeout) = (span, span, span);
+    (spec.not_before, spec.deadline) = (time, time);
+    let retry = spec.retry.get_or_insert_default();
+    (retry.interval, retry.max_interval) = (span, span);
+    spec.steps[1].timeout = span;
+    spec.steps[2].kind = Some(v1::step::Kind::Wait(v1::Wait { duration: span }));
+    let refusal = Submission::read(request).check(&|_| true).expect_err("invalid");
+    let mut fields: Vec<_> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
+    fields.sort_unstable();
+    let names = [
+        "deadline",
+        "not_before",
+        "retry.interval",
+        "retry.max_interval",
+        "schedule_to_start_timeout",
+        "stall_timeout",
+        "steps[1].timeout",
+        "steps[2].wait.duration",
+        "timeout",
+    ];
+    assert_eq!(fields, names.map(|name| format!("spec.{name}")));
+}
+
+#[test]
 fn requests_are_the_same_whatever_their_request_id_and_differ_with_their_body() {
     let request = |id: &str, kind: &str| -> SubmitTaskRequest {
         from_json(json!({"request_id": id, "spec": {"type": kind, "labels": {"b": "2", "a": "1"}}})).expect("json")
@@ -146,6 +176,10 @@ fn a_filter_admits_only_what_meets_all_its_fields() {
     for (value, wanted) in cases {
         assert_eq!(filter(value.clone()).admits(&intake, &state), wanted, "{value}");
     }
-    let wire = from_json::<v1::TaskFilter>(json!({"states": [0]})).expect("json");
-    assert!(midshift_proto::parse::<TaskFilter, _>(wire).is_err());
+    let mut wire = from_json::<v1::TaskFilter>(json!({"states": [0]})).expect("json");
+    let time = Some(prost_types::Timestamp { seconds: 0, nanos: 1_000_000_000 });
+    (wire.created_after, wire.created_before) = (time, time);
+    let refusal = midshift_proto::parse::<TaskFilter, _>(wire).expect_err("invalid");
+    let fields: Vec<_> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
+    assert_eq!(fields, ["states[0]", "created_after", "created_before"]);
 }
