@@ -186,6 +186,8 @@ pub const ROLLOUTS_MAX: usize = 1_000;
 pub const INCIDENTS_MAX: usize = 10_000;
 /// Open incidents with one code that the words of one robot make.
 pub const INCIDENTS_OF_ROBOT_MAX: usize = 8;
+/// Robots that the incident of an overfull place names; of the others it says how many they are.
+pub const CROWD_NAMED_MAX: usize = 8;
 /// Rows one item may touch, and facts it may state.
 pub const ITEM_ROWS_MAX: usize = 256;
 /// Attempts, places, stops and resumes that a robot lists in one heartbeat, of each: as many as one item may touch rows.
