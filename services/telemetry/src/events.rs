@@ -1,7 +1,8 @@
 //! EVENT and CRITICAL of one session: numbers are checked on arrival, kept in one item with their mark, acknowledged after its commit.
 //!
 //! Laws: a batch is taken iff its first number is at most one past the last; a known prefix is dropped; a hole is answered with `expect`; an
-//! acknowledgement leaves only after the commit; a poison sample is recorded, acknowledged and skipped.
+//! acknowledgement leaves only after the commit; a poison sample is recorded, acknowledged and skipped; what finds no room
+//! to wait is passed over, and asked for again once there is some.
 
 use crate::Inner;
 use crate::bugs::Bugs;
