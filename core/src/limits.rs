@@ -186,6 +186,8 @@ pub const ROLLOUTS_MAX: usize = 1_000;
 pub const INCIDENTS_MAX: usize = 10_000;
 /// Open incidents with one code that the words of one robot make.
 pub const INCIDENTS_OF_ROBOT_MAX: usize = 8;
+/// Robots that the incident of an overfull place names; of the others it says how many they are.
+pub const CROWD_NAMED_MAX: usize = 8;
 /// Rows one item may touch, and facts it may state.
 pub const ITEM_ROWS_MAX: usize = 256;
 /// Attempts, places, stops and resumes that a robot lists in one heartbeat, of each: as many as one item may touch rows.
@@ -210,8 +212,10 @@ pub const REFUSALS_UNTIL_ASIDE: u32 = 2;
 pub const REFUSED_REMEMBERED: usize = 1_024;
 /// Samples in one uplink message.
 pub const SAMPLES_PER_MESSAGE: usize = 256;
-/// CRITICAL and EVENT samples a robot may send a second before it summarises.
+/// CRITICAL and EVENT samples a robot may send a second before it summarises, and that a server keeps a second of one that sends more.
 pub const EVENTS_PER_SECOND: u32 = 50;
+/// Of a robot that sent few, so many are kept at once: an outage of five minutes at the full rate, of hours at that of usual work.
+pub const EVENTS_BURST: u32 = 300 * EVENTS_PER_SECOND;
 /// Unacknowledged STATUS a robot may have under way, bytes.
 pub const STATUS_IN_FLIGHT_BYTES: usize = 64 * 1024;
 /// Old STATUS samples that a robot sends on its session; more go over its bulk connection: a server that was away for a moment is not

@@ -165,7 +165,7 @@ codes! {
     OffersNotAnswered = "OFFERS_NOT_ANSWERED", "Many robots did not answer offers at the same time, so none of them is blamed. Look at the server and its network.";
     AttemptUnknown = "ATTEMPT_UNKNOWN", "The robot has an attempt that this server does not know, and does not let it go. Look at the robot; once it stands still, `midshift robot disown ROBOT ATTEMPT` lets the server ignore it.";
     PlacesImplausible = "PLACES_IMPLAUSIBLE", "The robot says that it is inside of more places without a grant than it can be. It keeps what it held, frees nothing and gets no work and no grant until it says less or the incident, which names the places, is closed. Look where it is.";
-    ExclusionBroken = "EXCLUSION_BROKEN", "Two robots say that they are inside of one place that has no room for both. Nobody else is let in. Look at both, move one, or clear the place.";
+    ExclusionBroken = "EXCLUSION_BROKEN", "More robots say that they are inside of one place than it has room for. Nobody else is let in. Look at them, move some away, or clear the place.";
     GrantUnknown = "GRANT_UNKNOWN", "The robot entered a place on a grant that this server did not give. Look at the robot's software, or for a second server.";
     WorkUnreadable = "WORK_UNREADABLE", "The robot cannot read the work that it was sent and acts as if its authority had ended. Its software is too old for this server, or the other way round.";
     AssignmentUnlawful = "ASSIGNMENT_UNLAWFUL", "The record of the task names a step that it does not have, so the robot was not sent it. A person must resolve the task.";

@@ -1,7 +1,7 @@
 //! The shell around the core: dials, says hello, carries messages both ways, keeps what must be kept, and waits.
 //!
 //! Invariant: it decides nothing about work. What comes in is always taken in, whatever the way up does; every queue is bounded; a
-//! session that is silent for ten seconds is given up. One task a robot, whose only timer is the next thing that is due.
+//! session that is silent for ten seconds is given up, one that is only observed for longer. One task a robot, whose only timer is the next thing that is due.
 //! Called by the binary (one robot a process) and by swarms (thousands in one).
 
 use crate::body::Body;
@@ -90,6 +90,8 @@ pub enum Error {
 
 /// No word from the server for this long: the session is given up. A heartbeat is answered each second.
 const SILENCE: LinkDuration = LinkDuration::from_secs(10);
+/// The longest silence of a session that is only observed and so never answered: its end says that this robot may take charge.
+const OBSERVED_SILENCE_MAX: LinkDuration = LinkDuration::from_secs(60);
 /// Messages that may wait for the wire; a robot whose network is stuck this long gives the session up.
 const OUTBOUND: usize = 64;
 /// Shortest and longest pause between attempts to connect, real time.
@@ -112,6 +114,8 @@ struct Open {
     up: mpsc::Sender<v1::SessionRequest>,
     down: Streaming<v1::SessionResponse>,
     heard: LinkTime,
+    /// How long it may be silent.
+    patience: LinkDuration,
 }
 
 /// On the way to a session.
@@ -160,6 +164,8 @@ pub struct Agent {
     open: Option<Open>,
     way: Way,
     retry: ExponentialBackoff,
+    /// How long the next session may be silent if it is only observed.
+    patience: LinkDuration,
     /// Why there is no session, as the log was told.
     refused: Repeats,
     rng: rand::rngs::StdRng,
@@ -208,6 +214,7 @@ pub async fn run(
     }
     let agent = Agent {
         retry: retries(config.seed),
+        patience: SILENCE,
         refused: Repeats::default(),
         rng: rand::rngs::StdRng::seed_from_u64(config.seed),
         core,
@@ -321,7 +328,7 @@ impl Agent {
     fn due(&mut self) {
         let now = self.clock.now();
         let patient = self.config.bugs.patient_session();
-        if !patient && self.open.as_ref().is_some_and(|o| now.link.since(o.heard) > SILENCE) {
+        if !patient && self.open.as_ref().is_some_and(|o| now.link.since(o.heard) > o.patience) {
             self.lost("the server is silent");
         }
         if now.link.since(self.pulsed) >= limits::HEARTBEAT {
@@ -476,7 +483,11 @@ impl Agent {
     fn greeted(&mut self, greeted: Greeted) {
         match greeted {
             Greeted::Welcome(welcome) => {
-                let (open, welcome) = *welcome;
+                let (mut open, welcome) = *welcome;
+                // The server ends an observed session once its robot may take charge: what is held dials no sooner than that.
+                open.patience = if welcome.observed { self.patience } else { SILENCE };
+                let next_ms = if welcome.observed { 2 * open.patience.as_ms() } else { SILENCE.as_ms() };
+                self.patience = LinkDuration(next_ms.min(OBSERVED_SILENCE_MAX.as_ms()));
                 tracing::info!(robot_id = %self.config.robot_id, session_epoch = welcome.session_epoch, "session open");
                 self.leave_session();
                 self.refused.forget();
@@ -579,7 +590,7 @@ async fn greet(channel: Channel, hello: v1::SessionRequest, clock: Arc<dyn Clock
         Ok(Some(first)) => match parse(first) {
             Ok(ToRobot::Welcome(welcome)) => {
                 let heard = clock.now().link;
-                Greeted::Welcome(Box::new((Open { up, down, heard }, welcome)))
+                Greeted::Welcome(Box::new((Open { up, down, heard, patience: SILENCE }, welcome)))
             }
             Ok(ToRobot::Close(close)) => Greeted::Closed(close),
             Ok(_) => Greeted::Failed("the first message was no welcome".to_owned()),

@@ -11,9 +11,9 @@ use crate::world::{lock, sku_of};
 use midshift_agent::body::Body as _;
 use midshift_core::ids::RobotId;
 use midshift_core::limits::{CONTROL_MESSAGE_BYTES, PAGE_DEFAULT, PAGE_MAX};
-use midshift_core::reason::{Code, Kind, Reason, Refusal};
+use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::time::{Clock, Now, SiteDuration};
-use midshift_proto::convert::common::ms_of;
+use midshift_proto::convert::{At, parse_ms};
 use midshift_proto::sim::v1;
 use midshift_proto::sim::v1::inject_fault_request::Fault;
 use midshift_proto::sim::v1::sim_service_server::{SimService, SimServiceServer};
@@ -113,9 +113,14 @@ fn unknown(robot_id: &RobotId) -> Refusal {
 
 /// A fault of the wire as an injection; none: a crash of the agent. Link time becomes site time by the clock's rate.
 fn read(fault: Fault, rate_permille: u32) -> Result<Option<Injected>, Refusal> {
-    let site = |name: &str, duration: Option<prost_types::Duration>| match duration.as_ref().map(ms_of) {
-        Some(ms) if ms > 0 => Ok(SiteDuration(ms as u64)),
-        _ => Err(Refusal::field(name, "is required and must be above 0")),
+    let site = |name: &str, duration: Option<prost_types::Duration>| -> Result<SiteDuration, Refusal> {
+        let mut bad = Violations::default();
+        let ms = parse_ms(duration.as_ref(), At::top(name), &mut bad);
+        bad.finish()?;
+        match ms {
+            Some(ms) if ms > 0 => Ok(SiteDuration(ms as u64)),
+            _ => Err(Refusal::field(name, "is required and must be above 0")),
+        }
     };
     let link = |name: &str, duration| {
         let asked: SiteDuration = site(name, duration)?;

@@ -128,11 +128,13 @@ async fn a_bad_injection_is_refused_with_its_reason() {
     let hall = Arc::new(Hall::open(&config(site(CORRIDOR), 2), &at(0)).expect("opens"));
     let jam = Some(Fault::Jam(v1::JamFault {}));
     let crash = || Some(Fault::Crash(v1::CrashFault {}));
-    let timeless = Some(Fault::Manual(v1::ManualFault { duration: None }));
+    let manual = |duration| Some(Fault::Manual(v1::ManualFault { duration }));
+    let too_many_nanos = Some(prost_types::Duration { seconds: 1, nanos: i32::MAX });
     let cases = [
         (request("rbt-09", jam), Code::NotFound),
         (request("rbt-01", None), Code::InvalidArgument),
-        (request("rbt-01", timeless), Code::InvalidArgument),
+        (request("rbt-01", manual(None)), Code::InvalidArgument),
+        (request("rbt-01", manual(too_many_nanos)), Code::InvalidArgument),
         (request("rbt-02", crash()), Code::FailedPrecondition),
     ];
     for (request, code) in cases {

@@ -33,6 +33,7 @@ EVENT = link.LANE_EVENT
 HEARTBEATS_REMEMBERED = 64
 SAMPLES_PER_MESSAGE = 256
 SILENCE_MS = 10_000
+OBSERVED_SILENCE_MS = 60_000
 HELLO_MS = 10_000
 FENCED_MS = 60_000
 TICK_S = 0.02
@@ -108,6 +109,7 @@ class Session:
         self.up.put(link.SessionRequest(hello=hello))
         self.call = link_pb2_grpc.LinkServiceStub(self.channel).Session(iter(self.up.get, None))
         self.heard_ms = now_ms()
+        self.patience_ms = HELLO_MS
         self.epoch = 0
         self.hb = 0
         self.observed = False
@@ -143,6 +145,7 @@ class Robot:
         self.session: Session | None = None
         self.dial_at_ms = 0.0
         self.pause_ms = 200.0
+        self.patience_ms = SILENCE_MS
         self.fences = 0
         # Authority: when each of the last heartbeats of this session was sent, and the newest sending that was echoed.
         self.sent: dict[int, float] = {}
@@ -230,7 +233,7 @@ class Robot:
         self.work()
         if self.session is None and now >= self.dial_at_ms:
             self.dial()
-        elif self.session and now - self.session.heard_ms > (SILENCE_MS if self.session.epoch else HELLO_MS):
+        elif self.session and now - self.session.heard_ms > self.session.patience_ms:
             self.lost("the server is silent")
         self.memory.save()
         self.send(now)
@@ -286,6 +289,9 @@ class Robot:
 
     def welcome(self, welcome: link.Welcome) -> None:
         self.session.epoch, self.session.observed = welcome.session_epoch, welcome.observed
+        # An observed session is silent until its end says that this robot may take charge: it is held, each in a row for longer.
+        self.session.patience_ms = self.patience_ms if welcome.observed else SILENCE_MS
+        self.patience_ms = min(2 * self.session.patience_ms, OBSERVED_SILENCE_MS) if welcome.observed else SILENCE_MS
         self.session.period_ms = welcome.heartbeat_period_ms
         self.session.beat_at_ms = now_ms()
         self.sent = {}  # what is anchored to an older session is stale; the lease is carried on

@@ -6,7 +6,7 @@
 //! 3. A robot that says more is believed no further, frees nothing, and gets no work and no grant until it says less, or until a person has
 //!    closed the incident that names these places.
 //! 4. A place that a robot has entered is not free because it lists it no more, while its own pose lies in it.
-//! 5. Two robots inside one exclusive place are an incident for each pair; nobody else is let in.
+//! 5. More robots inside one place than it has room for are one incident of that place; nobody else is let in.
 //!
 //! Called by `inbox` for events and by `repair` for heartbeats. Invariant: no word of a robot frees the place of another.
 
@@ -192,31 +192,34 @@ pub fn check_grant(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id
     incidents::open_about(tx, reason, Some(robot_id), "place_id");
 }
 
-/// A robot is inside of the place now: with more inside than it holds, people are told of each pair that it makes.
+/// A robot is inside of the place now: with more inside than it has room for, people are told of all of them.
 pub fn entered(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId) {
     let Some(place) = tx.view.places.get(place_id.as_str()).map(|p| &p.row) else { return };
-    let others: Vec<RobotId> = others_inside(place, robot_id).cloned().collect();
-    for other in others {
-        let (a, b) = if *robot_id < other { (robot_id, &other) } else { (&other, robot_id) };
-        let reason = broken_exclusion(place_id, b).with("pair", format!("{place_id} {a} {b}"));
-        incidents::open_about(tx, reason, Some(a), "pair");
+    let crowd = crowd(place);
+    if !crowd.contains(&robot_id) {
+        return;
     }
+    let named: Vec<&str> = crowd.iter().take(limits::CROWD_NAMED_MAX).map(|r| r.as_str()).collect();
+    let reason = broken_exclusion(place_id).with("robots", named.join(" ")).with("inside", crowd.len());
+    incidents::tell_of_place(tx, reason, place_id);
 }
 
-/// Robots that are inside beside this one where there is no room for them; so many are named.
-fn others_inside<'p>(place: &'p Place, robot_id: &'p RobotId) -> impl Iterator<Item = &'p RobotId> {
+/// Robots inside of a place that has no room for all of them, in the order in which they entered; empty: it has.
+fn crowd(place: &Place) -> Vec<&RobotId> {
     let inside = place.holders.iter().filter(|h| h.state == HolderState::Inside).map(|h| &h.robot_id);
-    let is_broken = inside.clone().count() > place.capacity as usize && inside.clone().any(|r| r == robot_id);
-    inside.filter(move |other| is_broken && *other != robot_id).take(limits::CLAIMED_PLACES_MAX)
+    let inside: Vec<&RobotId> = inside.collect();
+    if inside.len() > place.capacity as usize { inside } else { Vec::new() }
 }
 
 /// Another robot is where there is room for this one only.
 pub fn broken(view: &View, robot_id: &RobotId) -> Option<Reason> {
     super::view::held(view, robot_id).find_map(|(place, _)| {
-        others_inside(place, robot_id).next().map(|other| broken_exclusion(&place.place_id, other))
+        let crowd = crowd(place);
+        let other = crowd.iter().find(|other| **other != robot_id).filter(|_| crowd.contains(&robot_id))?;
+        Some(broken_exclusion(&place.place_id).with("other", other))
     })
 }
 
-fn broken_exclusion(place_id: &PlaceId, other: &RobotId) -> Reason {
-    Reason::from(Code::ExclusionBroken).with("place_id", place_id).with("other", other)
+fn broken_exclusion(place_id: &PlaceId) -> Reason {
+    Reason::from(Code::ExclusionBroken).with("place_id", place_id)
 }

@@ -4,7 +4,7 @@
 
 use super::Tx;
 use super::rows::{Closed, Incident};
-use crate::ids::{RobotId, TaskId};
+use crate::ids::{PlaceId, RobotId, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
 use std::cmp::Ordering;
@@ -71,6 +71,20 @@ pub fn open_about(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, key: 
         Ordering::Greater => {}
     }
     true
+}
+
+/// Opens an incident of a place; an open one of the same code is told anew and stays as old as it is.
+pub fn tell_of_place(tx: &mut Tx, reason: Reason, place_id: &PlaceId) {
+    let is_it = |i: &&Incident| {
+        let of_place = i.reason.metadata.get("place_id").is_some_and(|id| *id == place_id.as_str());
+        of_place && i.closed.is_none() && i.reason.code == reason.code
+    };
+    let known = tx.view.incidents.values().map(|i| &i.row).find(is_it).cloned();
+    match known {
+        None => open(tx, reason, None, None),
+        Some(known) if known.reason == reason => {}
+        Some(known) => tx.put(Incident { reason, robot_id: None, ..known }, "incident.changed"),
+    }
 }
 
 /// What an incident was about is over: it closes by itself.

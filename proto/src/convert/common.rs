@@ -11,11 +11,20 @@ use midshift_core::work::WorkStats;
 use prost_types::value::Kind;
 use prost_types::{Duration, ListValue, Struct, Timestamp};
 use serde_json::{Map, Value};
+use std::ops::RangeInclusive;
 
 /// Longest text of a fault, bytes.
 const FAULT_MESSAGE_BYTES: usize = 200;
 /// Facts behind one reason.
 const METADATA_MAX: usize = 16;
+/// Bytes of an object's key in the path of a violation.
+const KEY_SHOWN_BYTES: usize = 64;
+/// Seconds that a timestamp may have: those of the years 1 to 9999.
+const TIME_SECONDS: RangeInclusive<i64> = -62_135_596_800..=253_402_300_799;
+/// Seconds that a duration may have: those of 10,000 years.
+const DURATION_SECONDS: RangeInclusive<i64> = -315_576_000_000..=315_576_000_000;
+/// A second has one more.
+const NANOS_MAX: i32 = 999_999_999;
 /// Integers beyond this lose digits in a double.
 const EXACT: f64 = 9_007_199_254_740_992.0;
 
@@ -126,17 +135,38 @@ impl From<&Violation> for v1::FieldViolation {
     }
 }
 
+/// Reads UTC; absent: none. What is below a millisecond is cut off.
+pub fn parse_time(wire: Option<&Timestamp>, at: At<'_>, bad: &mut Violations) -> Option<Utc> {
+    let wire = wire?;
+    if !TIME_SECONDS.contains(&wire.seconds) || !(0..=NANOS_MAX).contains(&wire.nanos) {
+        bad.add(at.to_string(), format!("must be of the years 1 .. 9999, with nanos of 0 .. {NANOS_MAX}"));
+        return None;
+    }
+    Some(time_of(wire))
+}
+
+/// Reads the milliseconds of a duration; absent: none. What is below one is cut off.
+pub fn parse_ms(wire: Option<&Duration>, at: At<'_>, bad: &mut Violations) -> Option<i64> {
+    let wire = wire?;
+    let are_in_range = DURATION_SECONDS.contains(&wire.seconds) && (-NANOS_MAX..=NANOS_MAX).contains(&wire.nanos);
+    if !are_in_range || wire.seconds.signum() * i64::from(wire.nanos.signum()) < 0 {
+        bad.add(at.to_string(), format!("must be within 10000 years, with nanos of its sign up to {NANOS_MAX}"));
+        return None;
+    }
+    Some(ms_of(wire))
+}
+
 /// UTC as the well-known type.
 pub fn timestamp(utc: Utc) -> Timestamp {
     Timestamp { seconds: utc.0.div_euclid(1000), nanos: (utc.0.rem_euclid(1000) * 1_000_000) as i32 }
 }
 
-/// UTC from the well-known type; what is below a millisecond is cut off.
+/// UTC from the well-known type, as it was answered; [`parse_time`] reads what was asked.
 pub fn time_of(timestamp: &Timestamp) -> Utc {
     Utc(timestamp.seconds.saturating_mul(1000).saturating_add(i64::from(timestamp.nanos.div_euclid(1_000_000))))
 }
 
-/// Milliseconds of a duration; what is below one is cut off, what does not fit is the largest.
+/// Milliseconds of a duration, as it was answered; [`parse_ms`] reads what was asked.
 pub fn ms_of(duration: &Duration) -> i64 {
     duration.seconds.saturating_mul(1000).saturating_add(i64::from(duration.nanos / 1_000_000))
 }
@@ -163,21 +193,36 @@ fn to_value(value: &Value) -> prost_types::Value {
     prost_types::Value { kind: Some(kind) }
 }
 
-/// A JSON object from the well-known type. A double without a fraction becomes an integer; one that JSON cannot say becomes null.
-pub fn from_struct(value: Struct) -> Map<String, Value> {
-    value.fields.into_iter().map(|(k, v)| (k, from_value(v))).collect()
+/// Reads a JSON object; absent: an empty one. A double without a fraction becomes an integer. The first number that JSON
+/// cannot say is a violation.
+pub(crate) fn from_struct(wire: Option<Struct>, at: At<'_>, bad: &mut Violations) -> Option<Map<String, Value>> {
+    let fields = wire.unwrap_or_default().fields.into_iter();
+    fields
+        .map(|(key, value)| {
+            let shown = &key[..key.floor_char_boundary(KEY_SHOWN_BYTES)];
+            let value = from_value(value, at.field(shown), bad)?;
+            Some((key, value))
+        })
+        .collect()
 }
 
-fn from_value(value: prost_types::Value) -> Value {
-    match value.kind {
+fn from_value(wire: prost_types::Value, at: At<'_>, bad: &mut Violations) -> Option<Value> {
+    Some(match wire.kind {
         None | Some(Kind::NullValue(_)) => Value::Null,
         Some(Kind::BoolValue(b)) => Value::Bool(b),
+        Some(Kind::NumberValue(n)) if !n.is_finite() => {
+            bad.add(at.to_string(), format!("{n} is not a number of JSON"));
+            return None;
+        }
         Some(Kind::NumberValue(n)) if n.fract() == 0.0 && n.abs() < EXACT => Value::from(n as i64),
         Some(Kind::NumberValue(n)) => Value::from(n),
         Some(Kind::StringValue(s)) => Value::String(s),
-        Some(Kind::ListValue(list)) => Value::Array(list.values.into_iter().map(from_value).collect()),
-        Some(Kind::StructValue(map)) => Value::Object(from_struct(map)),
-    }
+        Some(Kind::ListValue(list)) => {
+            let items = list.values.into_iter().enumerate();
+            Value::Array(items.map(|(i, item)| from_value(item, at.index(i), bad)).collect::<Option<_>>()?)
+        }
+        Some(Kind::StructValue(map)) => Value::Object(from_struct(Some(map), at, bad)?),
+    })
 }
 
 /// Reads an authority that must be there.
@@ -203,9 +248,67 @@ mod tests {
     }
 
     #[test]
+    fn a_time_that_is_none_is_refused() {
+        let time = |seconds, nanos| Timestamp { seconds, nanos };
+        for wire in [time(-62_135_596_800, 0), time(253_402_300_799, 999_999_999)] {
+            let mut bad = Violations::default();
+            assert_eq!(parse_time(Some(&wire), At::top("deadline"), &mut bad), Some(time_of(&wire)));
+            assert_eq!(bad.finish(), Ok(()));
+        }
+        let years = [time(-62_135_596_801, 0), time(253_402_300_800, 0), time(i64::MAX, 0), time(i64::MIN, 0)];
+        let nanos = [time(0, 1_000_000_000), time(0, -1), time(0, i32::MIN)];
+        for wire in years.into_iter().chain(nanos) {
+            let mut bad = Violations::default();
+            assert_eq!(parse_time(Some(&wire), At::top("deadline"), &mut bad), None, "{wire:?}");
+            assert_eq!(bad.0[0].field, "deadline");
+        }
+    }
+
+    #[test]
+    fn a_duration_that_is_none_is_refused() {
+        let span = |seconds, nanos| Duration { seconds, nanos };
+        let good = [
+            (span(-1, -999_999_999), -1_999),
+            (span(0, -1_000_000), -1),
+            (span(315_576_000_000, 0), 315_576_000_000_000),
+        ];
+        for (wire, ms) in good {
+            let mut bad = Violations::default();
+            assert_eq!(parse_ms(Some(&wire), At::top("timeout"), &mut bad), Some(ms));
+            assert_eq!(bad.finish(), Ok(()));
+        }
+        let seconds = [span(315_576_000_001, 0), span(i64::MAX, 0), span(i64::MIN, 0)];
+        let nanos = [span(0, 1_000_000_000), span(0, i32::MIN), span(1, -1), span(-1, 1)];
+        for wire in seconds.into_iter().chain(nanos) {
+            let mut bad = Violations::default();
+            assert_eq!(parse_ms(Some(&wire), At::top("timeout"), &mut bad), None, "{wire:?}");
+            assert_eq!(bad.0[0].field, "timeout");
+        }
+    }
+
+    #[test]
     fn a_json_object_reads_back() {
         let text = r#"{"a":[1,-2.5,null,true,{"b":"c"}],"item":"SKU-1","n":9007199254740991}"#;
         let Value::Object(map) = serde_json::from_str(text).expect("json") else { panic!("not an object") };
-        assert_eq!(from_struct(to_struct(&map)), map);
+        let mut bad = Violations::default();
+        assert_eq!(from_struct(Some(to_struct(&map)), At::top("params"), &mut bad), Some(map));
+        assert_eq!(from_struct(None, At::top("params"), &mut bad), Some(Map::new()));
+        assert_eq!(bad.finish(), Ok(()));
+    }
+
+    #[test]
+    fn a_number_that_json_cannot_say_is_refused_by_its_path() {
+        let value = |kind| prost_types::Value { kind: Some(kind) };
+        let object = |key: &str, inner| Struct { fields: [(key.to_owned(), inner)].into() };
+        for (number, shown) in [(f64::NAN, "NaN"), (f64::INFINITY, "inf"), (f64::NEG_INFINITY, "-inf")] {
+            let values = vec![value(Kind::BoolValue(true)), value(Kind::NumberValue(number))];
+            let list = object("weights", value(Kind::ListValue(ListValue { values })));
+            let mut bad = Violations::default();
+            let wire = object("é".repeat(40).as_str(), value(Kind::StructValue(list)));
+            assert_eq!(from_struct(Some(wire), At::top("params"), &mut bad), None);
+            let field = format!("params.{}.weights[1]", "é".repeat(32));
+            let description = format!("{shown} is not a number of JSON");
+            assert_eq!(bad.0, [Violation { field, description }]);
+        }
     }
 }

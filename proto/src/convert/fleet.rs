@@ -1,6 +1,6 @@
 //! The rules of areas. What else fleet answers is composed from its view, in its service.
 
-use super::{At, Parse, duration, id, ms_of, permille, task::etag};
+use super::{At, Parse, duration, id, parse_ms, permille, task::etag};
 use crate::fleet::v1;
 use midshift_core::ids::AreaId;
 use midshift_core::policy::{AreaPolicy, SoftwareRules, Window};
@@ -100,10 +100,8 @@ impl Parse<AreaPolicy> for v1::AreaPolicy {
             charge_opportunistic_permille: opportunistic?,
             charge_stop_permille: stop?,
             charge_preemptible_permille: preemptible?,
-            incident_after_ms: self
-                .incident_after
-                .as_ref()
-                .map_or(default.incident_after_ms, |after| u64::try_from(ms_of(after)).unwrap_or(0)),
+            incident_after_ms: parse_ms(self.incident_after.as_ref(), at.field("incident_after"), bad)
+                .map_or(default.incident_after_ms, |ms| u64::try_from(ms).unwrap_or(0)),
             software: self.software.map(parse_rules).unwrap_or_default(),
             ..default
         };

@@ -19,32 +19,30 @@ use midshift_core::limits;
 use midshift_core::reason::{Refusal, Violations};
 use std::fmt;
 
-pub use common::{duration, from_struct, ms_of, shown, time_of, timestamp, to_struct};
+pub(crate) use common::from_struct;
+pub use common::{duration, ms_of, parse_ms, parse_time, shown, time_of, timestamp, to_struct};
 pub use enums::WireEnum;
 
 /// Where in a message a reader stands. Costs nothing until a violation is written.
 #[derive(Clone, Copy)]
 pub struct At<'a> {
     above: Option<&'a At<'a>>,
-    step: Step,
+    step: Step<'a>,
 }
 
 #[derive(Clone, Copy)]
-enum Step {
-    Name(&'static str),
+enum Step<'a> {
+    Name(&'a str),
     Index(usize),
 }
 
-impl At<'static> {
+impl<'a> At<'a> {
     /// The top: the message as a whole, or the field its caller calls it.
-    pub const fn top(name: &'static str) -> Self {
+    pub const fn top(name: &'a str) -> Self {
         Self { above: None, step: Step::Name(name) }
     }
-}
-
-impl<'a> At<'a> {
     /// A field of this.
-    pub const fn field(&'a self, name: &'static str) -> At<'a> {
+    pub const fn field(&'a self, name: &'a str) -> At<'a> {
         At { above: Some(self), step: Step::Name(name) }
     }
     /// An item of this.

@@ -1,6 +1,8 @@
 //! Tasks: what callers send becomes a raw task, what the rows say becomes a `Task`.
 
-use super::{At, WireEnum, duration, from_struct, id, maybe_id, ms_of, shown, time_of, timestamp, to_struct, word};
+use super::{
+    At, WireEnum, duration, from_struct, id, maybe_id, parse_ms, parse_time, shown, timestamp, to_struct, word,
+};
 use crate::task::v1;
 use midshift_core::ids::{RequestId, RobotId, TaskId, WaypointId};
 use midshift_core::limits;
@@ -49,7 +51,7 @@ impl Submission {
         let top = At::top("");
         let request_id = maybe_id(&request.request_id, RequestId::parse, top.field("request_id"), &mut bad).flatten();
         let (form, own_id, raw) = match request.body {
-            Some(Body::Spec(spec)) => (Form::Spec, String::new(), raw_task(spec)),
+            Some(Body::Spec(spec)) => (Form::Spec, String::new(), raw_task(spec, At::top("spec"), &mut bad)),
             Some(Body::Flat(flat)) => (Form::Flat, flat.task_id.clone(), raw_flat(flat)),
             Some(Body::Nested(nested)) => (Form::Nested, nested.task_id.clone(), raw_nested(nested)),
             None => (Form::Missing, String::new(), RawTask::default()),
@@ -66,7 +68,7 @@ impl Submission {
     /// Checks every rule. `knows` answers whether the site has a waypoint.
     pub fn check(self, knows: &dyn Fn(&WaypointId) -> bool) -> Result<TaskSpec, Refusal> {
         let mut bad = self.bad;
-        let (form, has_from) = (self.form, self.raw.steps.len() > 1);
+        let (form, has_from, unread) = (self.form, self.raw.steps.len() > 1, bad.0.len());
         if form == Form::Missing {
             bad.add("body", "is required: one of spec, flat, nested");
             return Err(Refusal::invalid(bad.0));
@@ -75,8 +77,9 @@ impl Submission {
         if let Err(refusal) = &checked {
             for violation in &refusal.violations {
                 let field = form.name_of(violation.field.strip_prefix("spec.").unwrap_or(&violation.field), has_from);
-                // Both legs of a short form break the rules of one parameter: said once.
-                if !bad.0.iter().any(|v| v.field == field) || form == Form::Spec {
+                // Said once: what cannot be read, and a parameter of both legs of a short form.
+                let said = if form == Form::Spec { unread } else { bad.0.len() };
+                if !bad.0[..said].iter().any(|v| v.field == field) {
                     bad.add(field, violation.description.clone());
                 }
             }
@@ -117,13 +120,10 @@ pub fn canonical(request: &v1::SubmitTaskRequest) -> Vec<u8> {
     v1::SubmitTaskRequest { request_id: String::new(), validate_only: false, ..request.clone() }.encode_to_vec()
 }
 
-fn ms(value: Option<prost_types::Duration>) -> Option<i64> {
-    value.as_ref().map(ms_of)
-}
-
-/// A spec as it was sent.
-pub fn raw_task(spec: v1::TaskSpec) -> RawTask {
+/// A spec as it was sent. What cannot be read is a violation, and absent.
+fn raw_task(spec: v1::TaskSpec, at: At<'_>, bad: &mut Violations) -> RawTask {
     let selector = spec.selector.unwrap_or_default();
+    let steps = spec.steps.into_iter().enumerate();
     RawTask {
         kind: spec.r#type,
         priority: spec.priority.map(i64::from),
@@ -132,13 +132,17 @@ pub fn raw_task(spec: v1::TaskSpec) -> RawTask {
         capabilities: selector.capabilities,
         minimum_software: selector.minimum_software,
         payload_g: selector.payload_g,
-        steps: spec.steps.into_iter().map(raw_step).collect(),
-        timeout_ms: ms(spec.timeout),
-        schedule_to_start_ms: ms(spec.schedule_to_start_timeout),
-        stall_ms: ms(spec.stall_timeout),
-        not_before: spec.not_before.as_ref().map(time_of),
-        deadline: spec.deadline.as_ref().map(time_of),
-        retry: spec.retry.map(raw_retry),
+        steps: steps.map(|(i, step)| raw_step(step, at.field("steps").index(i), bad)).collect(),
+        timeout_ms: parse_ms(spec.timeout.as_ref(), at.field("timeout"), bad),
+        schedule_to_start_ms: parse_ms(
+            spec.schedule_to_start_timeout.as_ref(),
+            at.field("schedule_to_start_timeout"),
+            bad,
+        ),
+        stall_ms: parse_ms(spec.stall_timeout.as_ref(), at.field("stall_timeout"), bad),
+        not_before: parse_time(spec.not_before.as_ref(), at.field("not_before"), bad),
+        deadline: parse_time(spec.deadline.as_ref(), at.field("deadline"), bad),
+        retry: spec.retry.map(|retry| raw_retry(retry, at.field("retry"), bad)),
         preemptible: spec.preemptible,
         depends_on: spec.depends_on,
         coalesce_key: spec.coalesce_key,
@@ -150,12 +154,18 @@ pub fn raw_task(spec: v1::TaskSpec) -> RawTask {
     }
 }
 
-fn raw_step(step: v1::Step) -> RawStep {
+fn raw_step(step: v1::Step, at: At<'_>, bad: &mut Violations) -> RawStep {
     use v1::step::Kind;
     let kind = step.kind.map(|kind| match kind {
         Kind::Goto(goto) => RawStepKind::Goto(goto.waypoint),
-        Kind::Action(action) => RawStepKind::Action(action.name, action.params.map(from_struct).unwrap_or_default()),
-        Kind::Wait(wait) => RawStepKind::Wait(ms(wait.duration).unwrap_or(0)),
+        Kind::Action(action) => {
+            let params = from_struct(action.params, at.field("action").field("params"), bad);
+            RawStepKind::Action(action.name, params.unwrap_or_default())
+        }
+        Kind::Wait(wait) => {
+            let ms = parse_ms(wait.duration.as_ref(), at.field("wait").field("duration"), bad);
+            RawStepKind::Wait(ms.unwrap_or(0))
+        }
     });
     let on_fail = |number| match v1::OnFail::try_from(number) {
         Ok(v1::OnFail::Stop) => Some(false),
@@ -167,17 +177,17 @@ fn raw_step(step: v1::Step) -> RawStep {
         effect: step.effect.map(Effect::from_wire),
         pause_allowed: step.pause_allowed,
         cancel_allowed: step.cancel_allowed,
-        timeout_ms: ms(step.timeout),
+        timeout_ms: parse_ms(step.timeout.as_ref(), at.field("timeout"), bad),
         continue_on_fail: step.on_fail.map(on_fail),
     }
 }
 
-fn raw_retry(retry: v1::RetryPolicy) -> RawRetry {
+fn raw_retry(retry: v1::RetryPolicy, at: At<'_>, bad: &mut Violations) -> RawRetry {
     RawRetry {
         max_retry_times: i64::from(retry.max_retry_times),
-        interval_ms: ms(retry.interval),
+        interval_ms: parse_ms(retry.interval.as_ref(), at.field("interval"), bad),
         factor: retry.factor,
-        max_interval_ms: ms(retry.max_interval),
+        max_interval_ms: parse_ms(retry.max_interval.as_ref(), at.field("max_interval"), bad),
         jitter: retry.jitter,
         exclude_failed_robot: retry.exclude_failed_robot,
     }
@@ -195,7 +205,7 @@ fn with_created_at(mut raw: RawTask, created_at: String) -> RawTask {
 }
 
 /// A flat task as it was sent.
-pub fn raw_flat(flat: v1::FlatTask) -> RawTask {
+fn raw_flat(flat: v1::FlatTask) -> RawTask {
     let transport = Transport {
         kind: flat.task_type,
         priority: flat.priority.map(i64::from),
@@ -212,7 +222,7 @@ pub fn raw_flat(flat: v1::FlatTask) -> RawTask {
 }
 
 /// A nested task as it was sent.
-pub fn raw_nested(nested: v1::NestedTask) -> RawTask {
+fn raw_nested(nested: v1::NestedTask) -> RawTask {
     let content = nested.content.unwrap_or_default();
     let retry = nested.retry_strategy.unwrap_or_default();
     let transport = Transport {
@@ -447,14 +457,16 @@ impl super::Parse<TaskFilter> for v1::TaskFilter {
             robots.filter_map(|(i, r)| id(r, RobotId::parse, at.field("robot_ids").index(i), bad)).collect();
         let tasks = self.task_ids.iter().enumerate();
         let task_ids = tasks.filter_map(|(i, t)| id(t, TaskId::parse, at.field("task_ids").index(i), bad)).collect();
+        let created_after = parse_time(self.created_after.as_ref(), at.field("created_after"), bad);
+        let created_before = parse_time(self.created_before.as_ref(), at.field("created_before"), bad);
         (bad.0.len() == before).then_some(TaskFilter {
             phases,
             robot_ids,
             kinds: self.types.into_iter().collect(),
             labels: self.labels,
             external_ref: self.external_ref,
-            created_after: self.created_after.as_ref().map(time_of),
-            created_before: self.created_before.as_ref().map(time_of),
+            created_after,
+            created_before,
             task_ids,
             task_id_prefix: self.task_id_prefix,
         })

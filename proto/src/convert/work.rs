@@ -41,8 +41,10 @@ impl Parse<WorkStep> for v1::WorkStep {
                 id(&name, WaypointId::parse, at.field("goto_waypoint"), bad).map(|waypoint| StepKind::Goto { waypoint })
             }
             Some(W::Action(action)) => {
-                let name = super::text(action.name, 64, at.field("action").field("name"), bad);
-                name.map(|name| StepKind::Action { name, params: action.params.map(from_struct).unwrap_or_default() })
+                let at = at.field("action");
+                let name = super::text(action.name, 64, at.field("name"), bad);
+                let params = from_struct(action.params, at.field("params"), bad);
+                name.zip(params).map(|(name, params)| StepKind::Action { name, params })
             }
             Some(W::WaitMs(duration_ms)) => Some(StepKind::Wait { duration_ms }),
             None => {

@@ -36,10 +36,12 @@ fn what_roll_outs_must_keep_to_comes_back_whole() {
 #[test]
 fn a_policy_hears_every_rule_it_breaks() {
     let wire = json!({"areaId": "hall", "speedLimitMmS": 1, "avoidanceDistanceMm": 10_001, "chargeStopPermille": 100});
-    let refusal =
-        parse_field::<AreaPolicy, v1::AreaPolicy>(Some(from_json(wire).expect("json")), "policy").expect_err("invalid");
+    let mut wire: v1::AreaPolicy = from_json(wire).expect("json");
+    wire.incident_after = Some(prost_types::Duration { seconds: -1, nanos: 1 });
+    let refusal = parse_field::<AreaPolicy, v1::AreaPolicy>(Some(wire), "policy").expect_err("invalid");
     let fields: Vec<_> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
-    assert_eq!(fields, ["policy.speed_limit_mm_s", "policy.avoidance_distance_mm", "policy.charge_stop_permille"]);
+    let broken = ["incident_after", "speed_limit_mm_s", "avoidance_distance_mm", "charge_stop_permille"];
+    assert_eq!(fields, broken.map(|field| format!("policy.{field}")));
     let refusal = parse_field::<AreaPolicy, v1::AreaPolicy>(None, "policy").expect_err("invalid");
     assert_eq!(refusal.violations[0].field, "policy");
 }

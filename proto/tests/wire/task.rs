@@ -1,13 +1,13 @@
 //! Tasks there and back, and what makes two requests the same.
 
-use midshift_core::ids::{TaskId, WaypointId};
+use midshift_core::ids::TaskId;
 use midshift_core::reason::{Code, Reason};
 use midshift_core::rows::Revision;
 use midshift_core::task::{Phase, Resolution, TaskIntake, TaskSpec, TaskState};
 use midshift_core::time::Utc;
-use midshift_proto::convert::task::{Submission, TaskFilter, TaskView, canonical, encode_task, raw_task, revision_of};
+use midshift_proto::convert::task::{Submission, TaskFilter, TaskView, canonical, encode_task, revision_of};
 use midshift_proto::json::from_json;
-use midshift_proto::task::v1::{self, SubmitTaskRequest};
+use midshift_proto::task::v1::{self, SubmitTaskRequest, submit_task_request::Body};
 use serde_json::json;
 
 fn full_spec() -> serde_json::Value {
@@ -35,7 +35,9 @@ fn spec_of(value: serde_json::Value) -> TaskSpec {
 #[test]
 fn a_spec_comes_back_as_it_was_understood() {
     let spec = spec_of(full_spec());
-    let again = raw_task(v1::TaskSpec::from(&spec)).check("spec", &|_: &WaypointId| true).expect("valid");
+    let body = Some(Body::Spec(v1::TaskSpec::from(&spec)));
+    let again = Submission::read(SubmitTaskRequest { body, ..SubmitTaskRequest::default() });
+    let again = again.check(&|_| true).expect("valid");
     assert_eq!(again, spec);
     assert_eq!(
         (spec.steps[2].effect, spec.steps[1].timeout_ms, spec.not_before),
@@ -62,6 +64,48 @@ fn ids_and_rules_are_refused_in_one_answer() {
     assert_eq!(fields, ["request_id", "task_id", "spec.timeout", "spec.steps"]);
     let refusal = Submission::read(SubmitTaskRequest::default()).check(&|_| true).expect_err("invalid");
     assert_eq!(refusal.violations[0].field, "body");
+}
+
+#[test]
+fn a_parameter_that_json_cannot_say_is_refused_by_its_path() {
+    let mut request: SubmitTaskRequest = from_json(json!({ "spec": full_spec() })).expect("json");
+    let Some(Body::Spec(spec)) = &mut request.body else { panic!("a spec") };
+    let Some(v1::step::Kind::Action(action)) = &mut spec.steps[1].kind else { panic!("an action") };
+    let number = Some(prost_types::value::Kind::NumberValue(f64::NAN));
+    action.params.get_or_insert_default().fields.insert("f".to_owned(), prost_types::Value { kind: number });
+    let refusal = Submission::read(request).check(&|_| true).expect_err("invalid");
+    let fields: Vec<_> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
+    assert_eq!(fields, ["spec.steps[1].action.params.f"]);
+}
+
+#[test]
+fn times_that_are_none_are_each_refused_once_by_their_field() {
+    let mut request: SubmitTaskRequest = from_json(json!({ "spec": full_spec() })).expect("json");
+    let Some(Body::Spec(spec)) = &mut request.body else { panic!("a spec") };
+    // Each would be within its bounds if its nanos were counted, or if it were cut off.
+    let span = Some(prost_types::Duration { seconds: 1, nanos: 2_000_000_000 });
+    let time = Some(prost_types::Timestamp { seconds: 1_780_300_800, nanos: -1 });
+    (spec.timeout, spec.schedule_to_start_timeout, spec.stall_timeout) = (span, span, span);
+    (spec.not_before, spec.deadline) = (time, time);
+    let retry = spec.retry.get_or_insert_default();
+    (retry.interval, retry.max_interval) = (span, span);
+    spec.steps[1].timeout = span;
+    spec.steps[2].kind = Some(v1::step::Kind::Wait(v1::Wait { duration: span }));
+    let refusal = Submission::read(request).check(&|_| true).expect_err("invalid");
+    let mut fields: Vec<_> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
+    fields.sort_unstable();
+    let names = [
+        "deadline",
+        "not_before",
+        "retry.interval",
+        "retry.max_interval",
+        "schedule_to_start_timeout",
+        "stall_timeout",
+        "steps[1].timeout",
+        "steps[2].wait.duration",
+        "timeout",
+    ];
+    assert_eq!(fields, names.map(|name| format!("spec.{name}")));
 }
 
 #[test]
@@ -132,6 +176,10 @@ fn a_filter_admits_only_what_meets_all_its_fields() {
     for (value, wanted) in cases {
         assert_eq!(filter(value.clone()).admits(&intake, &state), wanted, "{value}");
     }
-    let wire = from_json::<v1::TaskFilter>(json!({"states": [0]})).expect("json");
-    assert!(midshift_proto::parse::<TaskFilter, _>(wire).is_err());
+    let mut wire = from_json::<v1::TaskFilter>(json!({"states": [0]})).expect("json");
+    let time = Some(prost_types::Timestamp { seconds: 0, nanos: 1_000_000_000 });
+    (wire.created_after, wire.created_before) = (time, time);
+    let refusal = midshift_proto::parse::<TaskFilter, _>(wire).expect_err("invalid");
+    let fields: Vec<_> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
+    assert_eq!(fields, ["states[0]", "created_after", "created_before"]);
 }

@@ -97,12 +97,11 @@ impl Seen {
         self.down.send(Ok(v1::SessionResponse::from(&message))).await.expect("the robot listens");
     }
     pub async fn welcome(&self, session_epoch: u64) {
-        self.say(ToRobot::Welcome(Welcome {
-            session_epoch,
-            session_secret: format!("s{session_epoch}").into(),
-            ..welcome()
-        }))
-        .await;
+        self.welcome_as(session_epoch, false).await;
+    }
+    async fn welcome_as(&self, session_epoch: u64, observed: bool) {
+        let session_secret = format!("s{session_epoch}").into();
+        self.say(ToRobot::Welcome(Welcome { session_epoch, session_secret, observed, ..welcome() })).await;
     }
     async fn close(&self, code: CloseCode) {
         self.say(ToRobot::Close(Close { code, reason: Code::Fenced.into(), retry_after_ms: 0 })).await;
@@ -273,6 +272,37 @@ async fn a_server_that_falls_silent_is_given_up_and_dialed_again() {
     let waited = begin.elapsed().as_secs();
     assert!((10..25).contains(&waited), "{waited} s");
     assert!(second.hello().await.previous.is_some());
+    bench.end().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_is_only_observed_dials_ever_more_rarely_and_soon_when_it_may_take_charge() {
+    let mut bench = Bench::new(Box::new(MemoryStore::new()));
+    let mut held = vec![bench.session().await];
+    let mut waits = Vec::new();
+    for epoch in 5..10 {
+        let session = held.last_mut().expect("a session");
+        session.hello().await;
+        session.welcome_as(epoch, true).await;
+        let begin = tokio::time::Instant::now();
+        held.push(bench.session().await);
+        waits.push(begin.elapsed().as_secs());
+    }
+    let is_about = |(waited, wanted): (&u64, u64)| (wanted..wanted + 3).contains(waited);
+    assert!(waits.iter().zip([10, 20, 40, 60, 60]).all(is_about), "{waits:?}");
+    let session = held.last_mut().expect("a session");
+    session.hello().await;
+    session.welcome_as(10, true).await;
+    session.close(CloseCode::MoveOver).await;
+    let begin = tokio::time::Instant::now();
+    let mut in_charge = bench.session().await;
+    assert!(begin.elapsed() < Duration::from_secs(2), "{:?}", begin.elapsed());
+    in_charge.hello().await;
+    in_charge.welcome(11).await;
+    in_charge.beat().await;
+    let begin = tokio::time::Instant::now();
+    bench.session().await;
+    assert!(begin.elapsed() < Duration::from_secs(15), "one that is in charge hears silence as soon as ever");
     bench.end().await;
 }
 

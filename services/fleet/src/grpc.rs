@@ -16,7 +16,7 @@ use midshift_core::unknown_rows;
 use midshift_proto::access::caller;
 use midshift_proto::convert::fleet::encode_policy;
 use midshift_proto::convert::task::revision_of;
-use midshift_proto::convert::{ms_of, timestamp};
+use midshift_proto::convert::{At, parse_ms, timestamp};
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService as Face;
 use midshift_proto::pages;
@@ -133,7 +133,7 @@ impl FleetService {
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
         let request_id = request_id(&r.request_id, &mut bad);
         reason_text(&r.reason, &mut bad);
-        let within_ms = r.within.as_ref().map_or(DRAIN_WITHIN_MS, ms_of);
+        let within_ms = parse_ms(r.within.as_ref(), At::top("within"), &mut bad).unwrap_or(DRAIN_WITHIN_MS);
         if !DRAIN_MS.contains(&within_ms) {
             bad.add("within", "must be 1 s to 24 h");
         }
@@ -216,7 +216,7 @@ impl FleetService {
         let wire = r.policy.unwrap_or_default();
         let seen = revision_of(&wire.etag);
         let policy: Option<midshift_core::policy::AreaPolicy> =
-            midshift_proto::Parse::parse_at(wire, midshift_proto::convert::At::top("policy"), &mut bad);
+            midshift_proto::Parse::parse_at(wire, At::top("policy"), &mut bad);
         bad.finish()?;
         let policy = policy.ok_or_else(|| Refusal::field("policy", "is required"))?;
         let area_id = policy.area_id.clone();

@@ -1,7 +1,8 @@
 //! A robot's line: who comes, what it keeps, and each check-in answered after a look at the latch.
 //!
-//! Invariant: a check-in is heard only from the robot's newest line, and a generation that was not told on this line is none. A line on which nothing
-//! comes up, or nothing is read, is closed: the robot's own silence does the rest.
+//! Invariant: a check-in is heard only from the robot's newest line, and a generation that was not told on this line is
+//! none. A line on which nothing comes up, nothing is read or a message breaks the rules ends with a status that says so:
+//! the robot's own silence does the rest.
 
 use crate::audit::{Action, Note};
 use crate::outbox::{Down, End, Outbox};
@@ -15,6 +16,7 @@ use midshift_core::stop::Stop;
 use midshift_core::stop::roster::Heard;
 use midshift_core::time::Now;
 use midshift_proto::convert::stop::{CheckIn, ToStop};
+use midshift_proto::status::unreadable;
 use midshift_proto::stop::v1;
 use midshift_proto::{Denying, Leaving};
 use std::pin::pin;
@@ -92,7 +94,13 @@ struct First {
 
 async fn first(up: &mut Streaming<v1::AttendRequest>) -> Result<First, Refusal> {
     let within = Duration::from_millis(limits::STOP_ATTEND_WITHIN.as_ms());
-    let Ok(Ok(Some(message))) = tokio::time::timeout(within, up.message()).await else {
+    let first = tokio::time::timeout(within, up.message()).await;
+    if let Ok(Err(status)) = &first
+        && let Some(refusal) = unreadable(status)
+    {
+        return Err(refusal);
+    }
+    let Ok(Ok(Some(message))) = first else {
         return Err(Refusal::new(Kind::Deadline, Reason::new(Code::ProtocolError, "nobody said who comes")));
     };
     match midshift_proto::parse(message)? {
@@ -127,7 +135,11 @@ async fn hold(
         let now = inner.clock.now();
         let over = match message {
             Ok(Ok(Some(message))) => take(inner, robot, outbox, message, &now).err(),
-            Ok(Ok(None) | Err(_)) => return outbox.end(End::Done, now.link),
+            Ok(Ok(None)) => return outbox.end(End::Done, now.link),
+            Ok(Err(status)) => match unreadable(&status) {
+                None => return outbox.end(End::Done, now.link),
+                refusal => refusal,
+            },
             Err(_) => Some(late("nothing came up this line")),
         };
         let unread = || (outbox.unread_for(now.link) >= limits::STOP_LINE_SILENT).then(|| late("nothing is read"));

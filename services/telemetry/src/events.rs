@@ -1,7 +1,8 @@
 //! EVENT and CRITICAL of one session: numbers are checked on arrival, kept in one item with their mark, acknowledged after its commit.
 //!
 //! Laws: a batch is taken iff its first number is at most one past the last; a known prefix is dropped; a hole is answered with `expect`; an
-//! acknowledgement leaves only after the commit; a poison sample is recorded, acknowledged and skipped.
+//! acknowledgement leaves only after the commit; a poison sample is recorded, acknowledged and skipped; what finds no room
+//! to wait is passed over, and asked for again once there is some.
 
 use crate::Inner;
 use crate::bugs::Bugs;
@@ -15,7 +16,7 @@ use midshift_store::{CommitError, load};
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-/// Facts that wait for the commit under way; one more is asked for again.
+/// Facts that wait for the commit under way or for their rate; what comes beyond is asked for again once half of them are kept.
 const WAITING_MAX: usize = 1_024;
 /// Facts of one item.
 const FACTS_PER_ITEM: usize = 200;
@@ -37,6 +38,8 @@ pub struct Events {
     /// Highest numbers taken, durable or not.
     taken: [u64; 2],
     waiting: VecDeque<InboxEntry>,
+    /// Of which lanes something found no room to wait: the rest of it is passed over until it is asked for again.
+    owed: [bool; 2],
 }
 
 fn index(lane: Lane) -> Option<usize> {
@@ -64,7 +67,8 @@ pub struct Batch {
 impl Events {
     /// From what is durable.
     pub fn new(durable: LaneMark, revision: Revision) -> Self {
-        Self { taken: [durable.critical, durable.event], durable, revision, waiting: VecDeque::new() }
+        let taken = [durable.critical, durable.event];
+        Self { taken, durable, revision, waiting: VecDeque::new(), owed: [false; 2] }
     }
     /// Durable numbers as acknowledgements.
     pub fn acks(&self) -> [LaneAck; 2] {
@@ -92,28 +96,45 @@ impl Events {
                 continue;
             }
             known = false;
-            let is_hole = first > self.taken[at] + 1 && !bugs.holes_are_taken();
-            if is_hole || self.waiting.len() >= WAITING_MAX {
-                metrics::counter!("midshift_telemetry_expects_total").increment(1);
-                let seq = if at == 0 { self.durable.critical } else { self.durable.event };
-                return Arrived {
-                    expect: Some(LaneAck { lane: batch.lane, seq, expect: Some(self.taken[at] + 1) }),
-                    known,
-                };
+            self.owed[at] |= self.waiting.len() >= WAITING_MAX;
+            if self.owed[at] {
+                break;
+            }
+            if first > self.taken[at] + 1 && !bugs.holes_are_taken() {
+                return Arrived { expect: Some(self.expect(at)), known };
             }
             self.taken[at] = last;
             self.waiting.push_back(entry(item));
         }
         Arrived { expect: None, known }
     }
-    /// The next item to commit, at this moment of the wall; none if nothing waits.
-    pub fn next_batch(&mut self, robot_id: &RobotId, wall: Utc) -> Option<Batch> {
-        if self.waiting.is_empty() {
+    /// The robot is to send a lane again from behind what was taken.
+    fn expect(&self, at: usize) -> LaneAck {
+        metrics::counter!("midshift_telemetry_expects_total").increment(1);
+        let [critical, event] = self.acks();
+        LaneAck { expect: Some(self.taken[at] + 1), ..if at == 0 { critical } else { event } }
+    }
+    /// What is asked for again, now that there is room for it: a robot that is asked sooner sends in vain.
+    pub fn ask_again(&mut self) -> Vec<LaneAck> {
+        if self.owed == [false; 2] || self.waiting.len() > WAITING_MAX / 2 {
+            return Vec::new();
+        }
+        let owed = std::mem::take(&mut self.owed);
+        (0..owed.len()).filter(|at| owed[*at]).map(|at| self.expect(at)).collect()
+    }
+    /// Facts that wait for a commit.
+    pub fn waiting(&self) -> usize {
+        self.waiting.len()
+    }
+    /// The next item to commit, of `allowed` facts at most, at this moment of the wall; none if nothing waits or is allowed.
+    pub fn next_batch(&mut self, robot_id: &RobotId, wall: Utc, allowed: usize) -> Option<Batch> {
+        let many = self.waiting.len().min(FACTS_PER_ITEM).min(allowed);
+        if many == 0 {
             return None;
         }
         let mut mark = LaneMark { at_unix_ms: wall.0, ..self.durable.clone() };
         let mut item = Item::new(Writer::Telemetry, robot_id.as_str());
-        for entry in self.waiting.drain(..self.waiting.len().min(FACTS_PER_ITEM)) {
+        for entry in self.waiting.drain(..many) {
             let (_, last) = numbers(&entry.what);
             match entry.lane {
                 Lane::Critical => mark.critical = last,
@@ -132,8 +153,7 @@ impl Events {
     }
     /// Nobody can say what became of the batch: everything since the durable numbers must come again.
     pub fn forget_taken(&mut self) {
-        self.taken = [self.durable.critical, self.durable.event];
-        self.waiting.clear();
+        *self = Self::new(self.durable.clone(), self.revision);
     }
     /// The batch is not: go on from what the store has, and ask for the rest again.
     pub fn reset(&mut self, durable: LaneMark, revision: Revision) -> [LaneAck; 2] {
@@ -157,8 +177,8 @@ fn fact(robot_id: &RobotId, entry: &InboxEntry) -> Fact {
 
 /// What came of a commit.
 pub enum Outcome {
-    /// Durable.
-    Done(LaneMark),
+    /// Durable: so many facts, up to these numbers.
+    Done(LaneMark, usize),
     /// Not, or nobody knows: this is what the store has.
     Again(LaneMark, Revision),
     /// The store does not answer.
@@ -168,8 +188,9 @@ pub enum Outcome {
 /// Commits a batch; after any failure reads what the store has, since every error is an unknown outcome.
 pub async fn commit(inner: Arc<Inner>, batch: Batch) -> Outcome {
     let id = midshift_core::rows::Record::id(&batch.mark);
+    let facts = batch.item.facts.len();
     match inner.parts.store.commit(vec![batch.item]).await.pop() {
-        Some(Ok(_)) => return Outcome::Done(batch.mark),
+        Some(Ok(_)) => return Outcome::Done(batch.mark, facts),
         Some(Err(CommitError::Conflict { .. })) => {}
         Some(Err(error)) => tracing::warn!(%error, "robot events were not stored"),
         None => {}
@@ -214,7 +235,7 @@ mod tests {
         events.arrive(LaneBatch { lane: Lane::Event, items }, Bugs::default(), entry)
     }
     fn stored(events: &mut Events) -> usize {
-        events.next_batch(&robot(), Utc(0)).map_or(0, |batch| {
+        events.next_batch(&robot(), Utc(0), usize::MAX).map_or(0, |batch| {
             let facts = batch.item.facts.len();
             events.done(batch.mark);
             facts
@@ -247,7 +268,7 @@ mod tests {
     fn nothing_is_acknowledged_before_its_commit_and_a_lost_one_is_asked_for_again() {
         let mut events = fresh();
         arrive(&mut events, vec![sample(1), sample(2)]);
-        let batch = events.next_batch(&robot(), Utc(0)).expect("two samples wait");
+        let batch = events.next_batch(&robot(), Utc(0), usize::MAX).expect("two samples wait");
         assert_eq!(events.acks()[1].seq, 0);
         drop(batch);
         events.forget_taken();
@@ -258,10 +279,31 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_is_bounded_and_asked_for_again() {
+    fn a_flood_is_bounded_and_asked_for_again_once_there_is_room() {
         let mut events = fresh();
-        let many = (1..=WAITING_MAX as u64 + 1).map(sample).collect();
-        assert_eq!(arrive(&mut events, many).expect.and_then(|ack| ack.expect), Some(WAITING_MAX as u64 + 1));
-        assert_eq!(stored(&mut events), FACTS_PER_ITEM);
+        let first = WAITING_MAX as u64 + 1;
+        arrive(&mut events, (1..=first).map(sample).collect());
+        // Said at once it would be sent again at once, in vain.
+        assert_eq!(arrive(&mut events, vec![sample(first), sample(first + 1)]), Arrived::default());
+        while events.waiting() > WAITING_MAX / 2 {
+            assert_eq!((events.waiting().min(FACTS_PER_ITEM), events.ask_again()), (FACTS_PER_ITEM, vec![]));
+            assert_eq!(stored(&mut events), FACTS_PER_ITEM);
+        }
+        let asked = events.ask_again();
+        let seq = events.acks()[1].seq;
+        assert_eq!(asked, [LaneAck { lane: Lane::Event, seq, expect: Some(first) }]);
+        assert!(events.ask_again().is_empty(), "once");
+        arrive(&mut events, (first..first + 10).map(sample).collect());
+        while stored(&mut events) > 0 {}
+        assert_eq!(events.acks()[1].seq, first + 9);
+    }
+
+    #[test]
+    fn no_more_is_kept_at_once_than_is_allowed() {
+        let mut events = fresh();
+        arrive(&mut events, (1..=9).map(sample).collect());
+        assert!(events.next_batch(&robot(), Utc(0), 0).is_none());
+        let batch = events.next_batch(&robot(), Utc(0), 4).expect("some are allowed");
+        assert_eq!((batch.item.facts.len(), batch.mark.event, events.waiting()), (4, 4, 5));
     }
 }

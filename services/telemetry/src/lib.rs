@@ -5,6 +5,7 @@
 
 mod bugs;
 mod ear;
+mod event_rate;
 mod events;
 mod grpc;
 mod link;
@@ -60,6 +61,7 @@ pub(crate) struct Inner {
     pub parts: Parts,
     pub picture: Picture,
     pub registry: Registry,
+    pub event_rates: event_rate::EventRates,
     pub ear: ear::Ear,
     pub shared: Option<shared::Shared>,
     /// Room for robots that say hello.
@@ -81,7 +83,8 @@ impl TelemetryService {
         let (picture, registry, ear) = (Picture::default(), Registry::default(), ear::Ear::default());
         let shared = parts.heard.clone().map(shared::Shared::new);
         let hellos = Arc::new(Semaphore::new(midshift_core::limits::HELLOS_MAX));
-        let inner = Inner { parts, picture, registry, ear, shared, hellos, moving: CancellationToken::new(), shutdown };
+        let (event_rates, moving) = (event_rate::EventRates::default(), CancellationToken::new());
+        let inner = Inner { parts, picture, registry, event_rates, ear, shared, hellos, moving, shutdown };
         Self { inner: Arc::new(inner) }
     }
     /// The robots' face.

@@ -13,6 +13,7 @@ use midshift_proto::status::unreadable;
 use midshift_proto::{Denying, Leaving};
 use std::time::Duration;
 use tokio::sync::mpsc;
+use tokio::time::Instant;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
 use tracing::field::Empty;
@@ -113,6 +114,7 @@ struct Leave<'a> {
 impl Drop for Leave<'_> {
     fn drop(&mut self) {
         let inner = &self.service.inner;
+        inner.event_rates.leave(self.robot_id, Instant::now());
         match self.observed {
             Some(since) => {
                 inner.registry.lose_sight(self.robot_id, since);

@@ -4,6 +4,7 @@
 //! Invariant: the stream is always drained; what is on its way to the store never holds up an echo.
 
 use crate::Inner;
+use crate::event_rate::{self, lock};
 use crate::events::{Batch, Events, Outcome, commit};
 use crate::offset::Offset;
 use crate::picture::Sections;
@@ -65,6 +66,7 @@ struct Session {
     /// What it is observed as; none: it is in charge.
     second: Option<Second>,
     events: Events,
+    rate: event_rate::SharedRate,
     committing: Option<Boxed<Outcome>>,
     /// A person is being told of a heartbeat that was too long.
     telling: Option<Boxed<bool>>,
@@ -124,6 +126,7 @@ pub async fn run(
         in_charge,
         second,
         events: Events::new(begun.mark.0, begun.mark.1),
+        rate: inner.event_rates.rate_of(&robot_id, Instant::now()),
         committing: None,
         telling: None,
         too_long: None,
@@ -174,7 +177,7 @@ impl Session {
             self.start_writes();
             let waits = self.out != Downlink::default();
             let unread_at = self.out_since.map(|since| since + UNREAD_MAX);
-            let ack_at = self.status.ack_at();
+            let (ack_at, rate_at) = (self.status.ack_at(), self.rate_at());
             tokio::select! {
                 biased;
                 () = shutdown.cancelled() => return close(CloseCode::Shutdown, Code::ShuttingDown, LinkDuration(500)),
@@ -227,6 +230,7 @@ impl Session {
                 }
                 () = at(unread_at) => return close(CloseCode::TooSlow, Code::Overloaded, LinkDuration(1_000)),
                 () = at(ack_at) => self.ack_status(),
+                () = at(rate_at) => {}
                 () = at(moves_until) => return close(CloseCode::MoveOver, Code::MoveOver, LinkDuration(0)),
                 () = &mut moves, if moves_until.is_none() => {
                     moves_until = Some(Instant::now() + MOVE_OVER_WITHIN);
@@ -453,9 +457,13 @@ impl Session {
     /// Begins the writes that wait, at most one of each kind at a time.
     fn start_writes(&mut self) {
         if self.committing.is_none()
-            && let Some(batch) = self.events.next_batch(&self.robot_id, self.inner.parts.clock.now().wall)
+            && let Some(batch) = self.next_events()
         {
             self.committing = Some(self.commit(batch));
+        }
+        let asked = self.events.ask_again();
+        if !asked.is_empty() {
+            self.say(|out| out.acks.extend(asked));
         }
         if self.keeping.is_none()
             && let Some(write) = self.status.next_write()
@@ -464,12 +472,38 @@ impl Session {
         }
     }
 
+    /// The next events to keep, as many as the robot's rate allows.
+    fn next_events(&mut self) -> Option<Batch> {
+        let waiting = self.events.waiting();
+        if waiting == 0 {
+            return None;
+        }
+        let now = Instant::now();
+        let mut rate = lock(&self.rate);
+        let allowed = rate.allowed(waiting, now);
+        if rate.is_told(now) {
+            tracing::warn!(peer = Empty, robot_id = %self.robot_id, waiting, "more events than the robot may send are kept and acknowledged later");
+        }
+        drop(rate);
+        let batch = self.events.next_batch(&self.robot_id, self.inner.parts.clock.now().wall, allowed)?;
+        if allowed < waiting {
+            metrics::counter!("midshift_telemetry_commits_slowed_total").increment(1);
+        }
+        Some(batch)
+    }
+
+    /// When some of the events that wait are allowed; none: none waits, or some are being kept.
+    fn rate_at(&self) -> Option<Instant> {
+        let waiting = self.events.waiting();
+        (waiting > 0 && self.committing.is_none()).then(|| lock(&self.rate).next_at(waiting))
+    }
+
     fn commit(&self, batch: Batch) -> Boxed<Outcome> {
         let inner = self.inner.clone();
         Box::pin(async move {
             let begun = Instant::now();
             let outcome = commit(inner, batch).await;
-            if !matches!(outcome, Outcome::Done(_)) {
+            if !matches!(outcome, Outcome::Done(..)) {
                 tokio::time::sleep(COMMIT_RETRY).await;
             }
             metrics::histogram!("midshift_telemetry_event_commit_seconds").record(begun.elapsed().as_secs_f64());
@@ -479,7 +513,8 @@ impl Session {
 
     fn committed(&mut self, outcome: Outcome) {
         match outcome {
-            Outcome::Done(mark) => {
+            Outcome::Done(mark, facts) => {
+                lock(&self.rate).spend(facts);
                 self.events.done(mark);
                 let acks = self.events.acks();
                 self.say(|out| out.acks.extend(acks));

@@ -166,6 +166,18 @@ async fn a_drain_that_asks_for_nonsense_is_refused_whole() {
     let refused = w.fleet.drain_robot(Request::new(bad)).await.expect_err("is refused");
     let told = midshift_proto::refusal_of(&refused).violations.len();
     assert_eq!((refused.code(), told), (tonic::Code::InvalidArgument, 3));
+    // If its nanos were counted it would be two minutes.
+    let mut within = duration(118_000);
+    within.nanos = 2_000_000_000;
+    let bad = v1::DrainRobotRequest {
+        robot_id: "r1".to_owned(),
+        reason: "new wheels".to_owned(),
+        within: Some(within),
+        ..Default::default()
+    };
+    let refused = w.fleet.drain_robot(Request::new(bad)).await.expect_err("is refused");
+    let told = midshift_proto::refusal_of(&refused).violations;
+    assert_eq!(told.iter().map(|v| v.field.as_str()).collect::<Vec<_>>(), ["within"]);
     assert_eq!(drain(&w, "r9", 60).await.expect_err("nobody").code(), tonic::Code::NotFound);
     w.lawful().await;
 }

@@ -327,6 +327,21 @@ async fn two_robots_inside_one_place_are_one_incident_and_each_explanation_names
 }
 
 #[tokio::test(start_paused = true)]
+async fn robots_that_all_say_that_they_are_in_one_place_are_one_incident() {
+    let mut w = World::on(CORRIDOR).await;
+    for n in 1..=12 {
+        w.robot(&format!("r{n}"), "park-a").await;
+    }
+    let seen = w.until("all are seen", |s| s.holders("park-a").len() == 12).await;
+    let open = seen.open_incidents("EXCLUSION_BROKEN");
+    assert_eq!(open.len(), 1, "{open:?}");
+    let facts = &open[0].reason.metadata;
+    assert_eq!((facts["place_id"].as_str(), facts["inside"].as_str()), ("park-a", "12"));
+    assert_eq!(facts["robots"].split(' ').count(), 8);
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn an_entry_on_a_grant_that_nobody_gave_is_an_incident() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;

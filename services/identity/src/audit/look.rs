@@ -9,7 +9,7 @@ use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::{Refusal, Violations};
 use midshift_core::rows::{Table, Writer};
-use midshift_proto::convert::{time_of, timestamp};
+use midshift_proto::convert::{At, parse_time, timestamp};
 use midshift_proto::identity::v1;
 use midshift_proto::pages;
 use midshift_store::{Cursor, Query, Store};
@@ -117,14 +117,16 @@ impl AuditService {
         let size = pages::size(r.page_size, &mut bad);
         let robot = if r.robot_id.is_empty() { None } else { bad.take("robot_id", RobotId::parse(&r.robot_id)) };
         let mut chains = chains(&r.service, &r.page_token, &mut bad);
+        let since = parse_time(r.since.as_ref(), At::top("since"), &mut bad);
+        let until = parse_time(r.until.as_ref(), At::top("until"), &mut bad);
         bad.finish()?;
         let wanted = Wanted {
             actor: r.actor,
             robot: robot.map(|id| format!("robot:{id}")),
             subject: r.subject,
             action: r.action_prefix,
-            since_unix_ms: r.since.as_ref().map(|t| time_of(t).0),
-            until_unix_ms: r.until.as_ref().map(|t| time_of(t).0),
+            since_unix_ms: since.map(|utc| utc.0),
+            until_unix_ms: until.map(|utc| utc.0),
         };
         let (mut rows, mut read, mut bytes) = (Vec::new(), 0, 0);
         while rows.len() < size && read < limits::AUDIT_LOOK_ROWS && bytes < PAGE_BYTES {

@@ -135,10 +135,11 @@ async fn what_is_asked_for_is_found_by_who_what_and_when() {
     let noon = Some(timestamp(Utc(BEGIN + DAY_MS / 2)));
     assert_eq!(found(v1::ListAuditRequest { since: noon, ..all() }).await.len(), 2);
     assert_eq!(found(v1::ListAuditRequest { until: noon, ..all() }).await, ["fleet:1"]);
-    let wrong = v1::ListAuditRequest { service: "nobody".to_owned(), page_token: "x".to_owned(), ..all() };
+    let until = Some(prost_types::Timestamp { seconds: 0, nanos: -1 });
+    let wrong = v1::ListAuditRequest { service: "nobody".to_owned(), page_token: "x".to_owned(), until, ..all() };
     let refused = world.service.list(wrong).await.map_or_else(|refusal| refusal, |_| panic!("it is wrong"));
     let fields: BTreeSet<&str> = refused.violations.iter().map(|v| v.field.as_str()).collect();
-    assert_eq!(fields, BTreeSet::from(["page_token", "service"]));
+    assert_eq!(fields, BTreeSet::from(["page_token", "service", "until"]));
 }
 
 #[tokio::test]

@@ -118,8 +118,9 @@ fn show(incident: &v1::Incident, out: &Out) -> Result<(), Exit> {
 }
 
 fn row(incident: &v1::Incident) -> Vec<String> {
-    let rollout_id = incident.reason.as_ref().and_then(|r| r.metadata.get("rollout_id")).cloned().unwrap_or_default();
-    let about = [&incident.robot_id, &incident.task_id, &incident.area_id, &rollout_id];
+    let fact = |key: &str| incident.reason.as_ref().and_then(|r| r.metadata.get(key)).cloned().unwrap_or_default();
+    let (rollout_id, place_id) = (fact("rollout_id"), fact("place_id"));
+    let about = [&incident.robot_id, &incident.task_id, &incident.area_id, &rollout_id, &place_id];
     vec![
         incident.open_time.as_ref().map(|t| time_of(t).rfc3339()).unwrap_or_default(),
         incident.reason.as_ref().map(|r| r.code.clone()).unwrap_or_default(),

@@ -4,7 +4,7 @@ use midshift_core::ids::{AreaId, BundleId, RobotId};
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::rollout::spec::{RolloutSpec, Selector, Wave};
 use midshift_core::rollout::view::View;
-use midshift_proto::convert::{WireEnum, ms_of};
+use midshift_proto::convert::{At, WireEnum, parse_ms};
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::rollout_wave::Size;
 use prost_types::Duration;
@@ -28,12 +28,17 @@ pub fn bundle(view: &View, text: &str) -> Result<BundleId, Refusal> {
 /// A spec as a caller wrote it, with every default in its place; that of the probation is the server's, in milliseconds of site time.
 pub fn spec(wire: &v1::RolloutSpec, bundle: BundleId, probation_ms: u64, bad: &mut Violations) -> RolloutSpec {
     let default = RolloutSpec { probation_ms, ..RolloutSpec::new(bundle) };
-    let mut ms = |field: &str, duration: &Option<Duration>, default: u64| match duration.as_ref().map(ms_of) {
-        None => default,
-        Some(ms) => u64::try_from(ms).unwrap_or_else(|_| {
-            bad.add(format!("spec.{field}"), "must not be negative");
-            default
-        }),
+    let at = At::top("spec");
+    let mut ms = |field: &str, duration: &Option<Duration>, default: u64| {
+        let at = at.field(field);
+        match parse_ms(duration.as_ref(), at, bad).map(u64::try_from) {
+            None => default,
+            Some(Ok(ms)) => ms,
+            Some(Err(_)) => {
+                bad.add(at.to_string(), "must not be negative");
+                default
+            }
+        }
     };
     let drain_within_ms = ms("drain_within", &wire.drain_within, default.drain_within_ms);
     let probation_ms = ms("probation", &wire.probation, default.probation_ms);
@@ -104,4 +109,25 @@ fn selector(wire: &v1::RolloutSelector, bad: &mut Violations) -> Selector {
         selector.areas.extend(bad.take(&format!("spec.selector.area_ids[{ix}]"), AreaId::parse(id)));
     }
     selector
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_duration_that_is_none_is_refused_by_its_field() {
+        let span = |seconds, nanos| Some(Duration { seconds, nanos });
+        let wire = v1::RolloutSpec {
+            drain_within: span(60, 1_000_000_000),
+            probation: span(60, 0),
+            soak: span(-60, 0),
+            exposure_within: span(i64::MAX, 0),
+            ..v1::RolloutSpec::default()
+        };
+        let mut bad = Violations::default();
+        spec(&wire, BundleId::parse(&"0".repeat(64)).expect("an id"), 1_000, &mut bad);
+        let fields: Vec<_> = bad.0.iter().map(|v| v.field.as_str()).collect();
+        assert_eq!(fields, ["spec.drain_within", "spec.soak", "spec.exposure_within"]);
+    }
 }

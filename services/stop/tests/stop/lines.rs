@@ -5,18 +5,23 @@ use midshift_core::ids::StopId;
 use midshift_core::site::grid;
 use midshift_proto::convert::stop::ToStop;
 use midshift_proto::refusal_of;
+use midshift_proto::status::Answer;
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::scope::Scope as W;
 use midshift_proto::stop::v1::stop_link_service_client::StopLinkServiceClient;
 use midshift_stop::{Error, Parts, StopService};
+use prost::Message;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
-use tonic::Code;
+use tonic::client::Grpc;
+use tonic::codegen::http::uri::PathAndQuery;
+use tonic::{Code, Request};
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_client::HealthClient;
+use tonic_prost::ProstCodec;
 
 #[tokio::test]
 async fn a_check_in_is_answered_with_its_number_and_what_was_told() {
@@ -166,6 +171,52 @@ async fn a_line_that_does_not_begin_with_attend_or_breaks_its_rules_is_refused()
         let mut client = StopLinkServiceClient::new(server.channel().await);
         assert_eq!(code(client.attend(ReceiverStream::new(sent)).await), Code::InvalidArgument);
     }
+}
+
+/// `AttendRequest` as it is on the wire, with any bytes for a message.
+#[derive(Clone, PartialEq, prost::Message)]
+struct Said {
+    #[prost(bytes = "vec", tag = "1")]
+    attend: Vec<u8>,
+    #[prost(bytes = "vec", tag = "2")]
+    check_in: Vec<u8>,
+}
+
+/// The status with which a line ends on which this is said.
+async fn status_at_the_end(server: &Server, said: Vec<Said>) -> Answer {
+    let mut client = Grpc::new(server.channel().await);
+    client.ready().await.unwrap();
+    let path = PathAndQuery::from_static("/midshift.stop.v1.StopLinkService/Attend");
+    let codec = ProstCodec::<Said, v1::AttendResponse>::default();
+    let status = match within(client.streaming(Request::new(tokio_stream::iter(said)), path, codec)).await {
+        Err(status) => status,
+        Ok(begun) => {
+            let mut down = begun.into_inner();
+            loop {
+                match within(down.message()).await {
+                    Ok(message) => assert!(message.is_some(), "the line ended without a reason"),
+                    Err(status) => break status,
+                }
+            }
+        }
+    };
+    refusal_of(&status)
+}
+
+#[tokio::test]
+async fn a_line_on_which_a_rule_is_broken_or_nothing_can_be_read_ends_with_the_reason() {
+    let folder = Folder::new();
+    let server = Server::start(&folder.path()).await;
+    let attend = v1::Attend { robot_id: "r1".to_owned(), boot_id: "boot".to_owned(), ..v1::Attend::default() };
+    let attend = Said { attend: attend.encode_to_vec(), check_in: vec![] };
+    let garbage = Said { attend: vec![], check_in: vec![0xff; 8] };
+    for said in [vec![garbage.clone()], vec![attend.clone(), garbage]] {
+        let answer = status_at_the_end(&server, said).await;
+        assert_eq!((answer.grpc, answer.reason.as_str()), (Code::InvalidArgument, "PROTOCOL_ERROR"));
+        assert!(answer.message.starts_with("a message cannot be read: "), "{}", answer.message);
+    }
+    let twice = status_at_the_end(&server, vec![attend.clone(), attend]).await;
+    assert_eq!((twice.grpc, twice.violations[0].field.as_str()), (Code::InvalidArgument, "message"));
 }
 
 /// Eighty stops of 2 KiB are more than a connection holds for a robot that reads nothing.

@@ -2,7 +2,7 @@
 
 use crate::world::{World, count, patrol, transport};
 use midshift_core::limits;
-use midshift_proto::task::v1::{self, SubmitTaskRequest, submit_task_result::Outcome};
+use midshift_proto::task::v1::{self, SubmitTaskRequest, submit_task_request::Body, submit_task_result::Outcome};
 use std::collections::BTreeSet;
 use std::time::Duration;
 use tokio_stream::StreamExt;
@@ -42,6 +42,23 @@ async fn each_item_stands_for_itself_and_answers_come_in_order() {
     let invalid = "INVALID_REQUEST";
     assert_eq!(outcomes, ["T1", invalid, "T1", "REQUEST_ID_REUSED", invalid, "TASK_ID_TAKEN", invalid, "T5"]);
     assert_eq!(count(&world.service).await, 2);
+}
+
+#[tokio::test]
+async fn an_item_whose_parameters_are_no_json_is_refused_by_their_path_and_the_others_are_admitted() {
+    let world = World::new().await;
+    let mut broken = patrol("r1", &[]);
+    let Some(Body::Spec(spec)) = &mut broken.body else { panic!("a spec") };
+    let number = prost_types::Value { kind: Some(prost_types::value::Kind::NumberValue(f64::INFINITY)) };
+    let params = Some(prost_types::Struct { fields: [("weight".to_owned(), number)].into() });
+    let inspect = v1::step::Kind::Action(v1::Action { name: "inspect".to_owned(), params });
+    spec.steps.push(v1::Step { kind: Some(inspect), ..v1::Step::default() });
+    let results = send(&world, vec![broken, patrol("r2", &[])]).await.expect("a batch");
+    let Some(Outcome::Refusal(refusal)) = &results[0].outcome else { panic!("{results:?}") };
+    let fields: Vec<_> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
+    assert_eq!(fields, ["spec.steps[1].action.params.weight"]);
+    assert!(matches!(results[1].outcome, Some(Outcome::TaskId(_))), "{results:?}");
+    assert_eq!(count(&world.service).await, 1);
 }
 
 #[tokio::test]
