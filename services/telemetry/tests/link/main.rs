@@ -4,6 +4,8 @@ mod disk;
 mod gateways;
 mod machines;
 mod newer;
+#[path = "../../../../tests/src/raw.rs"]
+mod raw;
 mod reach;
 mod replay;
 mod retention;
