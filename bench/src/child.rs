@@ -2,11 +2,12 @@
 //!
 //! Invariant: a child lives no longer than its parent: it ends when its stdin does. Called by every measurement.
 
+use crate::ota::parts::insecure_server;
 use crate::questions::answer_questions;
 use crate::sink::Seen;
 use anyhow::{Context, bail, ensure};
 use midshift::robots::{IdentityFlags, SimRun, StopFlags};
-use midshift::serve::Software;
+use midshift::serve::Serve;
 use std::io::{BufRead, BufReader, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -132,30 +133,8 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
         Role::Serve { data, site, listen, store, ota_keys } => {
             let listen = listen.unwrap_or(address);
             answer_questions(listen, stop.clone(), metric)?;
-            let serve = midshift::serve::Serve {
-                roles: Vec::new(),
-                drain_seconds: None,
-                no_software: false,
-                stop_listen: std::net::SocketAddr::from(([127, 0, 0, 1], midshift::stop::PORT)),
-                init_stop: false,
-                no_stop: true,
-                log: Default::default(),
-                site,
-                data,
-                listen,
-                insecure: true,
-                names: Vec::new(),
-                first_token_file: None,
-                root_file: None,
-                identity: None,
-                spare_token: false,
-                force_map: false,
-                share: Default::default(),
-                trust: None,
-                database: midshift::storage::Database { store },
-                beacon_listen: None,
-                software: Software { ota_keys, ota_quota_gib: 1, ota_spare_gib: 0, ota_keep_days: 7 },
-            };
+            let database = midshift::storage::Database { store };
+            let serve = Serve { site, database, ..insecure_server(data, listen, ota_keys, 1) };
             midshift::serve::run(serve, stop, &|_| ()).await
         }
         Role::Unary { answer } => {

@@ -182,21 +182,7 @@ fn fleet(site: &Arc<Site>, kind: Fleet, robots: usize, seed: u64, now: Now) -> (
         let robot_id = RobotId::parse(&format!("rbt-{i:05}")).expect("a valid id");
         let inventory =
             Inventory { capabilities: vec!["pick".into(), "place".into()], payload_g: 10_000, ..Inventory::default() };
-        let session = Session {
-            robot_id: robot_id.clone(),
-            session_epoch: 1,
-            secret: Default::default(),
-            boot_id: String::new(),
-            ring: String::new(),
-            inventory,
-            applied_work: 0,
-            applied_update: 0,
-            places: Vec::new(),
-            clock_offset_ms: None,
-            installed: None,
-            device_key: None,
-            device_key_changed: false,
-        };
+        let session = Session::new(robot_id.clone(), 1, inventory);
         view.sessions.insert(session.id(), Rowed { revision: Revision(1), row: session });
         let waypoint = Some(site.waypoints()[draw(cells)].waypoint_id.clone());
         let vitals = Vitals { waypoint, battery_permille, ..Vitals::default() };

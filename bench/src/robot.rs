@@ -11,7 +11,6 @@ use midshift_proto::link::v1::link_service_client::LinkServiceClient;
 use midshift_proto::link::v1::{self, SessionRequest, SessionResponse};
 use midshift_proto::session::{Downlink, FromRobot, Heartbeat, Hello, LaneBatch, ToRobot, Uplink, Welcome};
 use prost::Message;
-use std::collections::BTreeMap;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Streaming;
@@ -34,18 +33,10 @@ pub fn hello(name: &str, waypoint: Option<WaypointId>) -> anyhow::Result<Hello> 
     let vitals = Vitals { waypoint, battery_permille: 1_000, ..Vitals::default() };
     let capabilities = ["pick", "place", "charge", "park"].map(str::to_owned).to_vec();
     Ok(Hello {
-        boot_id: format!("{name}-boot"),
-        previous: None,
         inventory: Inventory { capabilities, payload_g: 10_000, ..Inventory::default() },
         reported: ReportedState { vitals, ..ReportedState::default() },
-        ring: format!("{name}-ring"),
-        lanes: BTreeMap::new(),
-        store_id: String::new(),
         sent_unix_ms: midshift::clock::wall().0,
-        clock_rate_permille: 1000,
-        protocol_versions: vec![midshift_proto::session::PROTOCOL_VERSION],
-        installed: String::new(),
-        robot_id: RobotId::parse(name)?,
+        ..Hello::new(RobotId::parse(name)?, format!("{name}-boot"), format!("{name}-ring"))
     })
 }
 

@@ -35,11 +35,11 @@ pub enum Kind {
 }
 
 macro_rules! codes {
-    ($($variant:ident = $text:literal, $help:literal;)*) => {
+    ($($variant:ident = $text:literal, $meaning:literal $(=> $next_step:literal)?;)*) => {
         /// One reason, UPPER_SNAKE on the wire.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
         pub enum Code {
-            $(#[doc = $help] $variant,)*
+            $(#[doc = $meaning] $variant,)*
         }
         impl Code {
             /// Every code.
@@ -48,9 +48,13 @@ macro_rules! codes {
             pub const fn as_str(self) -> &'static str {
                 match self { $(Self::$variant => $text),* }
             }
-            /// What it means and what to try, for a person.
+            /// What it means and what to try, for a person: it ends with [`Self::next_step`].
             pub const fn help(self) -> &'static str {
-                match self { $(Self::$variant => $help),* }
+                match self { $(Self::$variant => concat!($meaning $(, " ", $next_step)?)),* }
+            }
+            /// What a caller tries next that got this for an answer; empty: it says all that there is to say.
+            pub const fn next_step(self) -> &'static str {
+                match self { $(Self::$variant => concat!($($next_step)?)),* }
             }
         }
     };
@@ -58,77 +62,126 @@ macro_rules! codes {
 
 codes! {
     // --- of a newer version
-    Unknown = "UNKNOWN", "A newer version of midshift gave this reason. Its name is shown; that version's `midshift explain-error` explains it.";
+    Unknown = "UNKNOWN", "A newer version of midshift gave this reason."
+        => "Its name is shown; that version's `midshift explain-error` explains it.";
     // --- answers to a caller
-    InvalidRequest = "INVALID_REQUEST", "The request broke one or more rules; each is listed. Mend them all and send it again.";
-    TaskNotFound = "TASK_NOT_FOUND", "No task has this id. Check the id, or list tasks.";
-    RobotNotFound = "ROBOT_NOT_FOUND", "No robot has this id. List robots to see who has ever connected.";
-    PlaceNotFound = "PLACE_NOT_FOUND", "The site has no such place. List places.";
-    PinnedRobotUnknown = "PINNED_ROBOT_UNKNOWN", "The task names a robot that is not enrolled and has never connected; it waits until it comes.";
-    IncidentNotFound = "INCIDENT_NOT_FOUND", "No open incident has this id. List incidents.";
-    AreaNotFound = "AREA_NOT_FOUND", "The site has no such area.";
-    RequestIdReused = "REQUEST_ID_REUSED", "This request_id was used with another body. Use a new one for a new request.";
-    TaskIdTaken = "TASK_ID_TAKEN", "A task with this id exists with another body. Choose another id or leave it empty.";
-    EtagMismatch = "ETAG_MISMATCH", "The object changed since you read it. Read it again and decide again.";
-    NotSupportedYet = "NOT_SUPPORTED_YET", "This field is reserved and does nothing yet, so it is refused rather than ignored. Leave it out.";
-    TaskEnded = "TASK_ENDED", "The task is over and cannot be changed.";
-    NotAllowedNow = "NOT_ALLOWED_NOW", "The state of the object does not allow this now. Read it again.";
-    ResolutionNotAllowed = "RESOLUTION_NOT_ALLOWED", "This resolution is not among the task's allowed resolutions.";
-    PlaceNotClear = "PLACE_NOT_CLEAR", "A robot reports that it stands in this place; move it out first.";
-    CursorExpired = "CURSOR_EXPIRED", "The cursor is older than what is kept. Start again without one.";
-    CursorOfOtherStore = "CURSOR_OF_OTHER_STORE", "The cursor comes from another store. Start again without one.";
-    StoreUnavailable = "STORE_UNAVAILABLE", "The store does not answer. Nothing was decided; try again.";
-    CommitUnknown = "COMMIT_UNKNOWN", "Nobody knows whether it was committed. Send it again with the same request_id.";
-    MovedMeanwhile = "MOVED_MEANWHILE", "What the request is about was changed each time it was to be written. Nothing was done; send it again.";
-    Overloaded = "OVERLOADED", "A queue is full. Try again later.";
-    TooManyRequests = "TOO_MANY_REQUESTS", "One caller has more requests open, or begins more a second, than it may. Wait as long as the answer says, and send many things in one batch or over one stream.";
-    DeadlineExceeded = "DEADLINE_EXCEEDED", "The call took longer than its deadline. The outcome is unknown; ask again with the same request_id.";
-    Internal = "INTERNAL", "A fault of midshift. The request_id is in the log.";
+    InvalidRequest = "INVALID_REQUEST", "The request broke one or more rules; each is listed."
+        => "Mend them all and send it again.";
+    TaskNotFound = "TASK_NOT_FOUND", "No task has this id." => "`midshift task ls` lists those that there are.";
+    RobotNotFound = "ROBOT_NOT_FOUND", "No robot has this id."
+        => "`midshift robot ls` lists those that have ever connected, `midshift robot identities` those that are enrolled.";
+    PlaceNotFound = "PLACE_NOT_FOUND", "The site has no such place." => "`midshift zone ls` lists its places.";
+    PinnedRobotUnknown = "PINNED_ROBOT_UNKNOWN", "The task names a robot that is not enrolled and has never connected; it waits until it comes."
+        => "`midshift robot ls` lists those that are known.";
+    IncidentNotFound = "INCIDENT_NOT_FOUND", "No open incident has this id." => "`midshift incident ls` lists them.";
+    AreaNotFound = "AREA_NOT_FOUND", "The site has no such area." => "Its areas are named in the site file.";
+    RequestIdReused = "REQUEST_ID_REUSED", "This request_id was used with another body."
+        => "Use a new one for a new request.";
+    TaskIdTaken = "TASK_ID_TAKEN", "A task with this id exists with another body."
+        => "Choose another id or leave it empty.";
+    EtagMismatch = "ETAG_MISMATCH", "The object changed since you read it." => "Read it again and decide again.";
+    NotSupportedYet = "NOT_SUPPORTED_YET", "This field is reserved and does nothing yet, so it is refused rather than ignored."
+        => "Leave it out.";
+    TaskEnded = "TASK_ENDED", "The task is over and cannot be changed." => "Submit another one.";
+    NotAllowedNow = "NOT_ALLOWED_NOW", "The state of the object does not allow this now." => "Read it again.";
+    ResolutionNotAllowed = "RESOLUTION_NOT_ALLOWED", "This resolution is not among the task's allowed resolutions."
+        => "`midshift task get TASK` lists those.";
+    PlaceNotClear = "PLACE_NOT_CLEAR", "A robot reports that it stands in this place." => "Move it out first.";
+    CursorExpired = "CURSOR_EXPIRED", "The cursor is older than what is kept." => "Start again without one.";
+    CursorOfOtherStore = "CURSOR_OF_OTHER_STORE", "The cursor comes from another store." => "Start again without one.";
+    StoreUnavailable = "STORE_UNAVAILABLE", "The store does not answer. Nothing was decided." => "Try again.";
+    CommitUnknown = "COMMIT_UNKNOWN", "Nobody knows whether it was committed."
+        => "Send it again with the same request_id.";
+    MovedMeanwhile = "MOVED_MEANWHILE", "What the request is about was changed each time it was to be written. Nothing was done."
+        => "Send it again.";
+    Overloaded = "OVERLOADED", "A queue is full." => "Try again later.";
+    TooManyRequests = "TOO_MANY_REQUESTS", "One caller has more requests open, or begins more a second, than it may."
+        => "Wait as long as the answer says, and send many things in one batch or over one stream.";
+    DeadlineExceeded = "DEADLINE_EXCEEDED", "The call took longer than its deadline. The outcome is unknown."
+        => "Ask again with the same request_id.";
+    Internal = "INTERNAL", "A fault of midshift." => "Look for the request_id in the server's log.";
     // --- who asks, and what it may
-    SignInNeeded = "SIGN_IN_NEEDED", "Nobody knows who asks. Sign in with `midshift login`, or send the header authorization: Bearer TOKEN.";
-    TokenUnknown = "TOKEN_UNKNOWN", "The token is none of this site, or it was revoked. Ask whoever runs the site for another one.";
-    TokenExpired = "TOKEN_EXPIRED", "The token's time is over. It may still engage stops for 30 days. Ask whoever runs the site for another one.";
-    NotPermitted = "NOT_PERMITTED", "No role that you were given permits this here. `midshift context show` says which you have; whoever runs the site can give more.";
-    NotThisRobot = "NOT_THIS_ROBOT", "A robot speaks for itself alone, by its own certificate. Enrol the machine under the name it uses.";
-    NotYourOwn = "NOT_YOUR_OWN", "Whoever wrote a roll-out does not approve it. Ask somebody else with role ota-approver.";
-    RobotEnrolled = "ROBOT_ENROLLED", "The robot is enrolled with another machine. Replace it, or revoke it first.";
-    EnrolmentUnknown = "ENROLMENT_UNKNOWN", "The secret is none that was handed out last for this robot. Enrol it again and use the new line.";
-    EnrolmentUsed = "ENROLMENT_USED", "The secret was used by another machine. If that was not you, revoke the robot; then enrol it again.";
-    EnrolmentExpired = "ENROLMENT_EXPIRED", "The secret was good for an hour. Enrol the robot again and use the new line.";
-    KeyDenied = "KEY_DENIED", "The key of this machine was revoked or replaced, or is not the robot's. Remove its identity folder and enrol it anew.";
-    TokenNotFound = "TOKEN_NOT_FOUND", "No token has this id. List tokens.";
-    TokenNameTaken = "TOKEN_NAME_TAKEN", "A token of this name stands, and names are unique among those that do. Choose another name, or replace it with `midshift token rotate NAME`; of several of one name that an older release made, revoke those that nobody uses by their ids.";
-    LastAdmin = "LAST_ADMIN", "It is the last token that may administer the site. Make another one first.";
+    SignInNeeded = "SIGN_IN_NEEDED", "Nobody knows who asks."
+        => "Sign in with `midshift login`, or send the header authorization: Bearer TOKEN.";
+    TokenUnknown = "TOKEN_UNKNOWN", "The token is none of this site, or it was revoked."
+        => "Ask whoever runs the site for another one.";
+    TokenExpired = "TOKEN_EXPIRED", "The token's time is over. It may still engage stops for 30 days."
+        => "Ask whoever runs the site for another one.";
+    NotPermitted = "NOT_PERMITTED", "No role that you were given permits this here."
+        => "`midshift context show` says which you have; whoever runs the site can give more.";
+    NotThisRobot = "NOT_THIS_ROBOT", "A robot speaks for itself alone, by its own certificate."
+        => "Enrol the machine under the name it uses.";
+    NotYourOwn = "NOT_YOUR_OWN", "Whoever wrote a roll-out does not approve it."
+        => "Ask somebody else with role ota-approver.";
+    RobotEnrolled = "ROBOT_ENROLLED", "The robot is enrolled with another machine."
+        => "`midshift robot replace ROBOT` lets another take its place; `midshift robot revoke ROBOT` takes its key out.";
+    EnrolmentUnknown = "ENROLMENT_UNKNOWN", "The secret is none that was handed out last for this robot."
+        => "Enrol it again and use the new line.";
+    EnrolmentUsed = "ENROLMENT_USED", "The secret was used by another machine."
+        => "If that was not you, revoke the robot; then enrol it again.";
+    EnrolmentExpired = "ENROLMENT_EXPIRED", "The secret was good for an hour."
+        => "Enrol the robot again and use the new line.";
+    KeyDenied = "KEY_DENIED", "The key of this machine was revoked or replaced, or is not the robot's."
+        => "Remove its identity folder and enrol it anew.";
+    TokenNotFound = "TOKEN_NOT_FOUND", "No token has this id." => "`midshift token ls` lists them.";
+    TokenNameTaken = "TOKEN_NAME_TAKEN", "A token of this name stands, and names are unique among those that do."
+        => "Choose another name, or replace it with `midshift token rotate NAME`; of several of one name that an older release made, revoke those that nobody uses by their ids.";
+    LastAdmin = "LAST_ADMIN", "It is the last token that may administer the site." => "Make another one first.";
     // --- fleet stop
-    StopsFull = "STOPS_FULL", "As many stops are engaged as there may be; the last ones are kept for the whole fleet. Engage the whole fleet, or reset what is over.";
-    OtherSite = "OTHER_SITE", "This is the stop service of another site than the one that was meant; nothing was stopped or reset. Name the right one with --stop-server, or \
+    StopsFull = "STOPS_FULL", "As many stops are engaged as there may be; the last ones are kept for the whole fleet."
+        => "Engage the whole fleet, or reset what is over.";
+    OtherSite = "OTHER_SITE", "This is the stop service of another site than the one that was meant; nothing was stopped or reset."
+        => "Name the right one with --stop-server, or \
         sign in to the site that you mean.";
-    StopNotFound = "STOP_NOT_FOUND", "Nothing is known of this stop. `midshift stop status` says which are engaged; a robot that stands says what it waits for.";
-    StopWasReset = "STOP_WAS_RESET", "The stop was reset, so nobody obeys it any more. Engage another one with a new request_id.";
-    StopMemoryLost = "STOP_MEMORY_LOST", "The stop service began without its latch or its key, so it stopped the whole fleet. Look at the floor and at `midshift stop status`, find out who removed its files, then reset that stop by name.";
-    StopServiceHung = "STOP_SERVICE_HUNG", "The stop service answers nothing and was not replaced. Robots stand by its silence. Look at its log and at its machine; end its process by hand, and it is started again.";
-    LineReplaced = "LINE_REPLACED", "A newer line of this robot took the place of this one. If two machines use one robot id, find the second.";
-    LineHeld = "LINE_HELD", "Another start of this robot is heard on its line to the stop service, so this one is not let in. It dials again by itself and is let in when the other has ended. If two machines use one robot id, find the second and revoke the key.";
+    StopNotFound = "STOP_NOT_FOUND", "Nothing is known of this stop."
+        => "`midshift stop status` says which are engaged; a robot that stands says what it waits for.";
+    StopWasReset = "STOP_WAS_RESET", "The stop was reset, so nobody obeys it any more."
+        => "Engage another one with a new request_id.";
+    StopMemoryLost = "STOP_MEMORY_LOST", "The stop service began without its latch or its key, so it stopped the whole fleet."
+        => "Look at the floor and at `midshift stop status`, find out who removed its files, then reset that stop by name.";
+    StopServiceHung = "STOP_SERVICE_HUNG", "The stop service answers nothing and was not replaced. Robots stand by its silence."
+        => "Look at its log and at its machine; end its process by hand, and it is started again.";
+    LineReplaced = "LINE_REPLACED", "A newer line of this robot took the place of this one."
+        => "If two machines use one robot id, find the second.";
+    LineHeld = "LINE_HELD", "Another start of this robot is heard on its line to the stop service, so this one is not let in. It dials again by itself and is let in when the other has ended."
+        => "If two machines use one robot id, find the second and revoke the key.";
     // --- software on the server
-    SoftwareNotFound = "SOFTWARE_NOT_FOUND", "No signed release lists this file, or no document has this name. List bundles.";
-    NoOnlineKeys = "NO_ONLINE_KEYS", "The server has no keys that may say which release is the newest. Start it with --ota-keys and the folder that holds them.";
-    ServedElsewhere = "SERVED_ELSEWHERE", "This process is a gateway: releases are brought to, and listed by, processes with role ota. Ask at the public address.";
-    UploadTooLarge = "UPLOAD_TOO_LARGE", "A file of a release has at most 8 GiB. Split it into several components.";
-    UploadMoved = "UPLOAD_MOVED", "The file goes on at another byte than this piece. Ask GetUpload and go on from there.";
-    UploadCorrupt = "UPLOAD_CORRUPT", "What was brought is not what its digest says, and was thrown away. Bring it again.";
-    SoftwareFull = "SOFTWARE_FULL", "The room for software on the server is used up. Withdraw bundles that nobody needs with bundle withdraw and push that, give it more with --ota-quota-gib, or a larger disk.";
-    ReleaseMoved = "RELEASE_MOVED", "Somebody else published. Take the server's newest documents, sign on top of them and push again.";
-    FilesMissing = "FILES_MISSING", "The release lists files that the server does not have. Bring them, then publish again.";
-    BundleNotFound = "BUNDLE_NOT_FOUND", "No published release has this bundle. List bundles.";
-    BundleRevoked = "BUNDLE_REVOKED", "The bundle was taken back, or the newest release lists it no more. No robot gets it.";
-    RolloutNotFound = "ROLLOUT_NOT_FOUND", "No roll-out has this id. List roll-outs.";
-    RolloutIdTaken = "ROLLOUT_ID_TAKEN", "A roll-out with this id exists with another body. Choose another id.";
-    RolloutOverlap = "ROLLOUT_OVERLAP", "Another roll-out has some of these robots. Wait until it has ended, abort it, or start this one with supersede.";
-    RolloutMatchesNobody = "ROLLOUT_MATCHES_NOBODY", "No robot fits what was selected. The dry run tells the reasons, robot by robot.";
-    RolloutFullPush = "ROLLOUT_FULL_PUSH", "The first wave has more than one robot and more than a tenth of all. Make it smaller, or say allow_full_push.";
-    BudgetImpossible = "BUDGET_IMPOSSIBLE", "The area's rules keep so many robots in work that none can be taken out. Change the rules of the area.";
-    NothingToRevert = "NOTHING_TO_REVERT", "No robot keeps what this roll-out brought.";
-    QuarantineNotFound = "QUARANTINE_NOT_FOUND", "This robot has no such bundle in quarantine.";
+    SoftwareNotFound = "SOFTWARE_NOT_FOUND", "No signed release lists this file, or no document has this name."
+        => "`midshift bundle ls` lists what is published.";
+    NoOnlineKeys = "NO_ONLINE_KEYS", "The server has no keys that may say which release is the newest."
+        => "Start it with --ota-keys and the folder that holds them.";
+    ServedElsewhere = "SERVED_ELSEWHERE", "This process is a gateway: releases are brought to, and listed by, processes with role ota."
+        => "Ask at the public address.";
+    UploadTooLarge = "UPLOAD_TOO_LARGE", "A file of a release has at most 8 GiB."
+        => "Split it into several components.";
+    UploadMoved = "UPLOAD_MOVED", "The file goes on at another byte than this piece."
+        => "Ask GetUpload and go on from there.";
+    UploadCorrupt = "UPLOAD_CORRUPT", "What was brought is not what its digest says, and was thrown away."
+        => "Bring it again.";
+    SoftwareFull = "SOFTWARE_FULL", "The room for software on the server is used up."
+        => "Withdraw bundles that nobody needs with bundle withdraw and push that, give it more with --ota-quota-gib, or a larger disk.";
+    ReleaseMoved = "RELEASE_MOVED", "Somebody else published."
+        => "Take the server's newest documents, sign on top of them and push again.";
+    FilesMissing = "FILES_MISSING", "The release lists files that the server does not have."
+        => "Bring them, then publish again.";
+    BundleNotFound = "BUNDLE_NOT_FOUND", "No published release has this bundle."
+        => "`midshift bundle ls` lists what is published.";
+    BundleRevoked = "BUNDLE_REVOKED", "The bundle was taken back, or the newest release lists it no more. No robot gets it."
+        => "Choose another one: `midshift bundle ls` lists them.";
+    RolloutNotFound = "ROLLOUT_NOT_FOUND", "No roll-out has this id." => "`midshift rollout ls` lists them.";
+    RolloutIdTaken = "ROLLOUT_ID_TAKEN", "A roll-out with this id exists with another body." => "Choose another id.";
+    RolloutOverlap = "ROLLOUT_OVERLAP", "Another roll-out has some of these robots."
+        => "Wait until it has ended, abort it, or start this one with supersede.";
+    RolloutMatchesNobody = "ROLLOUT_MATCHES_NOBODY", "No robot fits what was selected."
+        => "Select others, or mend what keeps these out: the answer counts them by reason, and `midshift explain-error REASON` explains one.";
+    RolloutFullPush = "ROLLOUT_FULL_PUSH", "The first wave has more than one robot and more than a tenth of all."
+        => "Make it smaller, or say allow_full_push.";
+    BudgetImpossible = "BUDGET_IMPOSSIBLE", "The area's rules keep so many robots in work that none can be taken out."
+        => "`midshift area put AREA` changes them.";
+    NothingToRevert = "NOTHING_TO_REVERT", "No robot keeps what this roll-out brought."
+        => "`midshift rollout get ROLLOUT --robots` says how far each of its robots is.";
+    QuarantineNotFound = "QUARANTINE_NOT_FOUND", "This robot has no such bundle in quarantine."
+        => "`midshift quarantine ls` lists them.";
     // --- why a robot does not get a task
     RobotPinnedElsewhere = "ROBOT_PINNED_ELSEWHERE", "The task names another robot.";
     MissingCapability = "MISSING_CAPABILITY", "The robot cannot do one of the task's actions or lacks a required capability.";
@@ -140,14 +193,17 @@ codes! {
     RobotManual = "ROBOT_MANUAL", "The robot is in manual or service mode: a person drives it. Bring it back to automatic mode at the robot.";
     RobotCordoned = "ROBOT_CORDONED", "A person took the robot out of dispatch. Uncordon it.";
     RobotBrokenOff = "ROBOT_BROKEN_OFF", "Three failed attempts in ten minutes took the robot out of dispatch. Look at it, then uncordon it.";
-    RobotDraining = "ROBOT_DRAINING", "The robot is taken out of work for maintenance. It gets work again when its drain is released.";
+    RobotDraining = "ROBOT_DRAINING", "The robot is taken out of work for maintenance."
+        => "It gets work again when its drain is released, with `midshift robot undrain ROBOT`.";
     RobotHeld = "ROBOT_HELD", "A hold token stands on the robot. Resume it.";
-    StopEngaged = "STOP_ENGAGED", "A fleet stop is engaged over the robot. `midshift stop status` says which; reset it, then resume.";
+    StopEngaged = "STOP_ENGAGED", "A fleet stop is engaged over the robot."
+        => "`midshift stop status` says which; reset it, then resume.";
     RobotStopped = "ROBOT_STOPPED", "The robot reports a stop: of its own safety system, a fleet stop, or because it does not hear the stop service.";
     RobotBusy = "ROBOT_BUSY", "The robot has other work.";
     RobotReconciling = "ROBOT_RECONCILING", "The robot's report differs from the record; it gets work once they agree.";
     RobotObserved = "ROBOT_OBSERVED", "Two sessions claim this robot id. This one is watched and gets no work.";
-    RobotLoaded = "ROBOT_LOADED", "The robot carries something that is not of this task. Take it off at the robot.";
+    RobotLoaded = "ROBOT_LOADED", "The robot carries something that is not of this task."
+        => "Take it off at the robot.";
     RobotFault = "ROBOT_FAULT", "The robot reports a fault that a person must look at.";
     RobotUnlocated = "ROBOT_UNLOCATED", "The robot has not reported a waypoint of this site.";
     BatteryLow = "BATTERY_LOW", "The charge does not reach pickup, drop and a charger with its reserve.";
@@ -156,9 +212,12 @@ codes! {
     MapNotTaken = "MAP_NOT_TAKEN", "The site file has changed, and tasks, robots or held places are in the way of it, so the stored map goes on. Start the server again once they are not, or with --force-map.";
     MapForced = "MAP_FORCED", "A changed map was forced upon work that it does not fit. Look at the task, robot or place, and at what stands there.";
     MapDiffers = "MAP_DIFFERS", "The robot drives by another version of the site's map than the server plans on, so it gets no work. Give it the map of the server, or start the server with the new one.";
-    MessageTooLarge = "MESSAGE_TOO_LARGE", "The message has more bytes than the port takes. The text says how many; split it, or leave out what is not needed.";
-    RowUnknown = "ROW_UNKNOWN", "A row holds a value of a newer version of midshift. It is left as it is, and what it is about is not acted on. Start that version again; what it wrote is whole.";
-    DecisionPutAside = "DECISION_PUT_ASIDE", "The store refused the same decision twice, so it is not tried again and the robot or place it is about gets no work and no grant. The server's log has the details; close the incident to try once more.";
+    MessageTooLarge = "MESSAGE_TOO_LARGE", "The message has more bytes than the port takes."
+        => "The text says how many; split it, or leave out what is not needed.";
+    RowUnknown = "ROW_UNKNOWN", "A row holds a value of a newer version of midshift. It is left as it is, and what it is about is not acted on."
+        => "Start that version again; what it wrote is whole.";
+    DecisionPutAside = "DECISION_PUT_ASIDE", "The store refused the same decision twice, so it is not tried again and the robot or place it is about gets no work and no grant."
+        => "The server's log has the details; close the incident to try once more.";
     ReportTooLong = "REPORT_TOO_LONG", "A list of the robot's heartbeat is longer than one may be. It is not processed, so the robot loses its authority; its maker must mend it.";
     ReportImplausible = "REPORT_IMPLAUSIBLE", "The robot reported a step or an end that cannot be. It frees nothing and moves nothing forward; the robot gets no work while it says so. Look at the robot's software.";
     RobotDoesNotAnswer = "ROBOT_DOES_NOT_ANSWER", "The robot heard three offers within ten minutes and answered none, or refused five in a row. It gets one offer after ten minutes; if it takes that, this ends. Look at its software.";
@@ -285,13 +344,14 @@ codes! {
     Fenced = "FENCED", "A newer session of this robot proved its succession.";
     ProtocolError = "PROTOCOL_ERROR", "A message broke the session's rules.";
     ClockRateMismatch = "CLOCK_RATE_MISMATCH", "The robot's clock rate differs from the server's.";
-    ShuttingDown = "SHUTTING_DOWN", "The server is stopping; come back soon.";
+    ShuttingDown = "SHUTTING_DOWN", "The server is stopping." => "Come back soon.";
     MoveOver = "MOVE_OVER", "The session is old; open the next one before this one closes.";
-    WatchUnread = "WATCH_UNREAD", "The watch had news and was not read for 30 s, so it has ended. Watch again, and read what comes.";
+    WatchUnread = "WATCH_UNREAD", "The watch had news and was not read for 30 s, so it has ended."
+        => "Watch again, and read what comes.";
     Overflow = "OVERFLOW", "The robot's ring was full and thinned its oldest status.";
     FreedAfterAck = "FREED_AFTER_ACK", "The robot freed this range after it was acknowledged.";
     Poison = "POISON", "A sample could not be read; it was recorded, acknowledged and skipped.";
-    CloneSeen = "CLONE_SEEN", "Two sessions with one robot id were alive at once. Find the second machine.";
+    CloneSeen = "CLONE_SEEN", "Two sessions with one robot id were alive at once." => "Find the second machine.";
     StoreBehindRobot = "STORE_BEHIND_ROBOT", "The robot says that it has applied a newer generation than this store gave: the store was restored from a backup, or the robot errs.";
     TaskBacklog = "TASK_BACKLOG", "Ready tasks wait for a robot for more than an hour. It closes by itself. `midshift task ls --state queued` lists them.";
     RobotBreakerOpened = "ROBOT_BREAKER_OPENED", "A robot failed three attempts in ten minutes.";
@@ -466,6 +526,25 @@ mod tests {
             assert!(seen.insert(code.as_str()), "{code} twice");
             assert!(code.help().ends_with('.'), "{code}");
             assert_eq!(code.as_str().parse(), Ok(*code));
+        }
+    }
+
+    #[test]
+    fn every_answer_to_a_caller_says_what_to_try_next() {
+        let reasons = [
+            Code::RobotDraining,
+            Code::RobotLoaded,
+            Code::StopEngaged,
+            Code::MessageTooLarge,
+            Code::RowUnknown,
+            Code::DecisionPutAside,
+            Code::ShuttingDown,
+            Code::WatchUnread,
+        ];
+        // The reasons why a robot does not get a task begin behind the answers.
+        let answers = Code::ALL.iter().copied().take_while(|code| *code != Code::RobotPinnedElsewhere);
+        for code in answers.chain(reasons) {
+            assert!(!code.next_step().is_empty() && code.help().ends_with(code.next_step()), "{code}");
         }
     }
 

@@ -98,7 +98,7 @@ fn robots_of(key: &Key, body: &Value) -> BTreeSet<RobotId> {
     let holders = body["holders"].as_array().into_iter().flatten().map(|holder| &holder["robot_id"]);
     let named = holders.chain([&body["robot_id"]]).filter_map(Value::as_str);
     let own = match key.table {
-        Table::RobotAuthority | Table::RobotControl | Table::Session | Table::Presence => Some(&*key.id),
+        Table::RobotAuthority | Table::RobotControl | Table::Session => Some(&*key.id),
         _ => None,
     };
     named.chain(own).filter_map(|id| RobotId::parse(id).ok()).collect()

@@ -407,6 +407,24 @@ pub struct Session {
 }
 
 impl Session {
+    /// One whose robot has said nothing but what it is.
+    pub fn new(robot_id: RobotId, session_epoch: u64, inventory: crate::robot::Inventory) -> Self {
+        Self {
+            robot_id,
+            session_epoch,
+            secret: Default::default(),
+            boot_id: String::new(),
+            ring: String::new(),
+            inventory,
+            applied_work: 0,
+            applied_update: 0,
+            places: Vec::new(),
+            clock_offset_ms: None,
+            installed: None,
+            device_key: None,
+            device_key_changed: false,
+        }
+    }
     /// The generation of section work that the server goes on from: none beyond what any server could have given.
     pub fn followed_work(&self) -> u64 {
         followed(self.applied_work)

@@ -200,6 +200,26 @@ pub struct Component {
 }
 
 impl Component {
+    /// One with this content that says nothing more of itself: it asks for no other component, promises nothing, and a robot that
+    /// changes to it starts its program again.
+    pub fn new(name: &str, version: &str, kind: ComponentKind, content: &[u8]) -> Self {
+        Self {
+            name: name.to_owned(),
+            version: version.to_owned(),
+            kind,
+            hardware: BTreeSet::new(),
+            capabilities: BTreeSet::new(),
+            requires: BTreeMap::new(),
+            conflicts: BTreeMap::new(),
+            task_schema: first_schema(),
+            rollback_index: 0,
+            safety_class: SafetyClass::None,
+            needs: Needs::Restart,
+            data_migration: Migration::None,
+            digest: Digest::of(content),
+            length: content.len() as u64,
+        }
+    }
     /// Its name in the repository: flat, and unique by version.
     pub fn target(&self) -> String {
         format!("{}-{}.component", self.name, self.version)

@@ -69,6 +69,26 @@ pub struct Hello {
     pub installed: String,
 }
 
+impl Hello {
+    /// Of a robot that had no session before, has nothing to tell, and whose clock goes as fast as ours.
+    pub fn new(robot_id: RobotId, boot_id: impl Into<String>, ring: impl Into<String>) -> Self {
+        Self {
+            robot_id,
+            boot_id: boot_id.into(),
+            previous: None,
+            inventory: Inventory::default(),
+            reported: ReportedState::default(),
+            ring: ring.into(),
+            lanes: BTreeMap::new(),
+            store_id: String::new(),
+            sent_unix_ms: 0,
+            clock_rate_permille: 1_000,
+            protocol_versions: vec![PROTOCOL_VERSION],
+            installed: String::new(),
+        }
+    }
+}
+
 /// The session before this one.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Previous {

@@ -19,7 +19,7 @@ const VIOLATION_BYTES_MAX: usize = 4 * 1024;
 /// Bytes of the message, which is percent-encoded.
 const MESSAGE_BYTES_MAX: usize = 1024;
 /// What a caller hears of our own faults.
-const INTERNAL_TEXT: &str = "a fault of midshift; look for the request_id in its log";
+const INTERNAL_TEXT: &str = Code::Internal.help();
 
 const fn grpc_code(kind: Kind, code: Code) -> tonic::Code {
     match (kind, code) {
@@ -146,13 +146,6 @@ pub struct Answer {
     pub request_id: String,
     /// Do not try again sooner.
     pub retry_after: Option<Duration>,
-}
-
-impl Answer {
-    /// What to try, for a person; none if the reason is not ours.
-    pub fn help(&self) -> Option<&'static str> {
-        self.code.map(Code::help)
-    }
 }
 
 /// Reads a status. Never fails: what is not there is empty.

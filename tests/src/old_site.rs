@@ -360,20 +360,12 @@ fn intake(number: u64, ended: Utc, spec: &TaskSpec) -> TaskIntake {
 }
 
 fn session(robot_id: RobotId, from: Utc) -> Session {
+    let inventory = Inventory { software: "1.0.0".to_owned(), ..Inventory::default() };
     Session {
-        robot_id,
-        session_epoch: from.0.unsigned_abs(),
         secret: "secret".into(),
         boot_id: "boot".to_owned(),
         ring: "ring".to_owned(),
-        inventory: Inventory { software: "1.0.0".to_owned(), ..Inventory::default() },
-        applied_work: 0,
-        applied_update: 0,
-        places: Vec::new(),
-        clock_offset_ms: None,
-        installed: None,
-        device_key: None,
-        device_key_changed: false,
+        ..Session::new(robot_id, from.0.unsigned_abs(), inventory)
     }
 }
 

@@ -170,10 +170,10 @@ fn split(workspace: &Workspace, seeds: u64) -> Result<bool> {
     Ok(true)
 }
 
-/// Runs the tests that hold golden files and lets them write what they see.
+/// Runs the tests that hold golden files, in every test program whatever fails, and lets them write what they see.
 pub fn golden(workspace: &Workspace) -> Result<bool> {
     ensure!(parts::build(workspace)?, "the programs do not build");
-    let mut command = workspace.cargo(&["test", "--workspace", "--tests", "--", "golden"]);
+    let mut command = workspace.cargo(&["test", "--workspace", "--tests", "--no-fail-fast", "--", "golden"]);
     workspace.export_programs(&mut command)?;
     let passed = counted(command.env("BLESS", "1"))?;
     run::say("next: git diff, and read it before you commit it");

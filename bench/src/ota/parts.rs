@@ -149,16 +149,13 @@ pub async fn play(part: Part, address: SocketAddr, stop: CancellationToken) -> a
     }
 }
 
-async fn serve(data: PathBuf, keys: PathBuf, listen: SocketAddr, stop: CancellationToken) -> anyhow::Result<()> {
-    let free = std::net::TcpListener::bind(listen).with_context(|| format!("listening on {listen}"))?;
-    let listen = free.local_addr()?;
-    drop(free);
-    answer_questions(listen, stop.clone(), |_| 0)?;
-    let serve = Serve {
+/// A server of everything but stops, in plain text, with room for so much software.
+pub fn insecure_server(data: PathBuf, listen: SocketAddr, ota_keys: Option<PathBuf>, ota_quota_gib: u64) -> Serve {
+    Serve {
         roles: Vec::new(),
         drain_seconds: None,
         no_software: false,
-        stop_listen: std::net::SocketAddr::from(([127, 0, 0, 1], midshift::stop::PORT)),
+        stop_listen: SocketAddr::from(([127, 0, 0, 1], midshift::stop::PORT)),
         init_stop: false,
         no_stop: true,
         log: Default::default(),
@@ -174,11 +171,18 @@ async fn serve(data: PathBuf, keys: PathBuf, listen: SocketAddr, stop: Cancellat
         force_map: false,
         share: Default::default(),
         trust: None,
-        beacon_listen: None,
-        software: Software { ota_keys: Some(keys), ota_quota_gib: 64, ota_spare_gib: 0, ota_keep_days: 7 },
         database: Default::default(),
-    };
-    midshift::serve::run(serve, stop, &|_| ()).await
+        beacon_listen: None,
+        software: Software { ota_keys, ota_quota_gib, ota_spare_gib: 0, ota_keep_days: 7 },
+    }
+}
+
+async fn serve(data: PathBuf, keys: PathBuf, listen: SocketAddr, stop: CancellationToken) -> anyhow::Result<()> {
+    let free = std::net::TcpListener::bind(listen).with_context(|| format!("listening on {listen}"))?;
+    let listen = free.local_addr()?;
+    drop(free);
+    answer_questions(listen, stop.clone(), |_| 0)?;
+    midshift::serve::run(insecure_server(data, listen, Some(keys), 64), stop, &|_| ()).await
 }
 
 async fn agent(

@@ -25,7 +25,7 @@ use crate::stop::record::StopRecord;
 use crate::task::{Attempt, AttemptPhase, Phase, TaskIntake, TaskState};
 use crate::time::{Now, Utc};
 use crate::unknown_rows::UnknownRows;
-use crate::work::{DesiredPolicy, DesiredWork, LaneMark, PresenceRow, Session};
+use crate::work::{DesiredPolicy, DesiredWork, LaneMark, Session};
 use std::collections::{BTreeMap, BTreeSet};
 use std::mem::take;
 use std::sync::{Arc, OnceLock};
@@ -114,8 +114,6 @@ pub struct View {
     pub enrolled: Slot<RobotIdentity>,
     /// Newest sessions (telemetry's).
     pub sessions: Slot<Session>,
-    /// Presence (telemetry's).
-    pub presence: Slot<PresenceRow>,
     /// Durable lane numbers (telemetry's).
     pub lane_marks: Slot<LaneMark>,
     /// Copies of fleet stops (stop's).
@@ -205,7 +203,6 @@ viewed! {
     DrainRelease => drain_releases;
     AreaBudget => budgets;
     RobotIdentity => enrolled;
-    PresenceRow => presence;
     LaneMark => lane_marks;
 }
 
@@ -432,7 +429,6 @@ const WHOLE: &[Table] = &[
     Table::AreaBudget,
     Table::RobotIdentity,
     Table::Session,
-    Table::Presence,
     Table::LaneMark,
     Table::StopRecord,
 ];
@@ -474,7 +470,6 @@ impl View {
             budgets: Slot::new(),
             enrolled: Slot::new(),
             sessions: Slot::new(),
-            presence: Slot::new(),
             lane_marks: Slot::new(),
             stops: Slot::new(),
             engaged: BTreeSet::new(),
@@ -613,7 +608,6 @@ impl View {
             Table::CommandKey => self.take::<CommandKey>(key, revision, row),
             Table::RobotIdentity => self.take::<RobotIdentity>(key, revision, row),
             Table::Session => self.take::<Session>(key, revision, row),
-            Table::Presence => self.take::<PresenceRow>(key, revision, row),
             Table::LaneMark => self.take::<LaneMark>(key, revision, row),
             Table::StopRecord => self.take::<StopRecord>(key, revision, row),
             Table::DrainRequest => self.take::<DrainRequest>(key, revision, row),

@@ -40,6 +40,21 @@ pub struct Stop {
 }
 
 impl Stop {
+    /// One of which nothing more is known: nobody has signed it, given a reason, or said where it is.
+    pub fn new(stop_id: StopId, scope: Scope, level: StopLevel, engaged: Utc) -> Self {
+        Self {
+            stop_id,
+            scope,
+            level,
+            engaged,
+            actor: String::new(),
+            reason: String::new(),
+            region: None,
+            proof: Vec::new(),
+            token_id: None,
+        }
+    }
+
     /// Whether a robot lies inside. One that does not know where it is, lies inside.
     pub fn includes(&self, robot_id: &RobotId, pose: Option<&Pose>) -> bool {
         match &self.scope {
@@ -88,6 +103,13 @@ pub struct Reset {
     /// The token that was shown for it, which stands in the audit; none: none was, or it came over the wire.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub token_id: Option<TokenId>,
+}
+
+impl Reset {
+    /// One of which nothing more is known: nobody has signed it or given a reason.
+    pub fn new(stop_id: StopId, at: Utc) -> Self {
+        Self { stop_id, at, actor: String::new(), reason: String::new(), proof: Vec::new(), token_id: None }
+    }
 }
 
 /// Named stops minus named resets.
@@ -213,28 +235,11 @@ mod tests {
     }
 
     fn stop(n: u8) -> Stop {
-        Stop {
-            stop_id: id(n),
-            scope: Scope::Fleet,
-            level: StopLevel::Halt,
-            engaged: Utc(i64::from(n)),
-            actor: "anna".to_owned(),
-            reason: "drill".to_owned(),
-            region: None,
-            proof: Vec::new(),
-            token_id: None,
-        }
+        Stop::new(id(n), Scope::Fleet, StopLevel::Halt, Utc(i64::from(n)))
     }
 
     fn reset(n: u8) -> Reset {
-        Reset {
-            stop_id: id(n),
-            at: Utc(100 + i64::from(n)),
-            actor: "bert".to_owned(),
-            reason: "over".to_owned(),
-            proof: Vec::new(),
-            token_id: None,
-        }
+        Reset::new(id(n), Utc(100 + i64::from(n)))
     }
 
     #[derive(Clone, Debug)]

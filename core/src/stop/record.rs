@@ -115,29 +115,13 @@ mod tests {
     use crate::time::Utc;
 
     fn stop(name: &str) -> Stop {
-        Stop {
-            stop_id: StopId::parse(name).expect("an id"),
-            scope: Scope::Fleet,
-            level: StopLevel::Halt,
-            engaged: Utc(1),
-            actor: "anna".to_owned(),
-            reason: String::new(),
-            region: None,
-            proof: Vec::new(),
-            token_id: None,
-        }
+        let stop_id = StopId::parse(name).expect("an id");
+        Stop { actor: "anna".to_owned(), ..Stop::new(stop_id, Scope::Fleet, StopLevel::Halt, Utc(1)) }
     }
 
     fn reset(name: &str) -> Reset {
         let stop_id = StopId::parse(name).expect("an id");
-        Reset {
-            stop_id,
-            at: Utc(2),
-            actor: "bert".to_owned(),
-            reason: "clear".to_owned(),
-            proof: Vec::new(),
-            token_id: None,
-        }
+        Reset { actor: "bert".to_owned(), reason: "clear".to_owned(), ..Reset::new(stop_id, Utc(2)) }
     }
 
     fn latch(stops: &[&str], resets: &[&str]) -> Latch {

@@ -187,28 +187,11 @@ mod tests {
     }
 
     fn stop(n: u8, level: StopLevel) -> Stop {
-        Stop {
-            stop_id: id(n),
-            scope: Scope::Fleet,
-            level,
-            engaged: Utc(1),
-            actor: String::new(),
-            reason: String::new(),
-            region: None,
-            proof: Vec::new(),
-            token_id: None,
-        }
+        Stop::new(id(n), Scope::Fleet, level, Utc(1))
     }
 
     fn reset(n: u8) -> Reset {
-        Reset {
-            stop_id: id(n),
-            at: Utc(2),
-            actor: String::new(),
-            reason: String::new(),
-            proof: Vec::new(),
-            token_id: None,
-        }
+        Reset::new(id(n), Utc(2))
     }
 
     fn at(ms: u64) -> Now {

@@ -117,17 +117,7 @@ mod tests {
     use crate::time::Utc;
 
     fn stop(level: StopLevel) -> Stop {
-        Stop {
-            stop_id: StopId::parse("STOP-1").expect("an id"),
-            scope: Scope::Fleet,
-            level,
-            engaged: Utc(0),
-            actor: String::new(),
-            reason: String::new(),
-            region: None,
-            proof: Vec::new(),
-            token_id: None,
-        }
+        Stop::new(StopId::parse("STOP-1").expect("an id"), Scope::Fleet, level, Utc(0))
     }
 
     fn standing() -> Heard {

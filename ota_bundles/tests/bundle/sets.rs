@@ -1,27 +1,13 @@
 //! What fits a robot, and every reason why something does not.
 
 use midshift_bundle::digest::Digest;
-use midshift_bundle::manifest::{Component, ComponentKind, FORMAT, Manifest, Migration, Needs, SafetyClass};
+use midshift_bundle::manifest::{Component, ComponentKind, FORMAT, Manifest, SafetyClass};
 use midshift_bundle::set::{Fit, SetManifest, raised};
 use std::collections::BTreeMap;
 
 fn component(name: &str, version: &str, kind: ComponentKind, rollback_index: u64) -> Component {
-    Component {
-        name: name.to_owned(),
-        version: version.to_owned(),
-        kind,
-        hardware: ["h1".to_owned()].into(),
-        capabilities: Default::default(),
-        requires: BTreeMap::new(),
-        conflicts: BTreeMap::new(),
-        task_schema: (1, 1),
-        rollback_index,
-        safety_class: SafetyClass::None,
-        needs: Needs::Restart,
-        data_migration: Migration::None,
-        digest: Digest::of(version.as_bytes()),
-        length: 1,
-    }
+    let plain = Component::new(name, version, kind, version.as_bytes());
+    Component { hardware: ["h1".to_owned()].into(), rollback_index, ..plain }
 }
 
 pub fn gait(version: &str) -> Component {

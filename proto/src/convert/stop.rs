@@ -402,30 +402,22 @@ mod tests {
     use crate::parse;
 
     fn stop() -> Stop {
+        let stop_id = StopId::parse("STOP-20260601-ABCDEFGHJK").expect("an id");
+        let hall = Scope::Area(AreaId::parse("hall").expect("an id"));
         Stop {
-            stop_id: StopId::parse("STOP-20260601-ABCDEFGHJK").expect("an id"),
-            scope: Scope::Area(AreaId::parse("hall").expect("an id")),
-            level: StopLevel::Halt,
-            engaged: Utc(5),
             actor: "anna".to_owned(),
             reason: "a pallet fell".to_owned(),
             region: Some(Region::of_box(0, 0, 10, 10)),
             proof: vec![1, 2],
-            token_id: None,
+            ..Stop::new(stop_id, hall, StopLevel::Halt, Utc(5))
         }
     }
 
     #[test]
     fn a_stop_and_its_reset_read_back() {
         assert_eq!(parse::<Stop, _>(v1::Stop::from(&stop())), Ok(stop()));
-        let reset = Reset {
-            stop_id: stop().stop_id,
-            at: Utc(7),
-            actor: "bert".to_owned(),
-            reason: "clear".to_owned(),
-            proof: Vec::new(),
-            token_id: None,
-        };
+        let (actor, reason) = ("bert".to_owned(), "clear".to_owned());
+        let reset = Reset { actor, reason, ..Reset::new(stop().stop_id, Utc(7)) };
         assert_eq!(parse::<Reset, _>(v1::Reset::from(&reset)), Ok(reset));
         for scope in [Scope::Fleet, Scope::Robot(RobotId::parse("r1").expect("an id"))] {
             assert_eq!(parse::<Scope, _>(v1::Scope::from(&scope)), Ok(scope));

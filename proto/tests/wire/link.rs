@@ -375,21 +375,10 @@ fn what_the_server_says_is_what_a_robot_hears() {
 fn stop_facts() -> StopFacts {
     let (stop_id, actor, reason) =
         (StopId::parse("STOP-1").expect("id"), "anna".to_owned(), "a pallet fell".to_owned());
-    let stop = Stop {
-        stop_id: stop_id.clone(),
-        scope: Scope::Fleet,
-        level: StopLevel::Halt,
-        engaged: Utc(5),
-        actor: actor.clone(),
-        reason: reason.clone(),
-        region: None,
-        proof: vec![1; 64],
-        token_id: None,
-    };
-    StopFacts {
-        stops: vec![stop],
-        resets: vec![Reset { stop_id, at: Utc(6), actor, reason, proof: vec![2; 64], token_id: None }],
-    }
+    let engaged = Stop::new(stop_id.clone(), Scope::Fleet, StopLevel::Halt, Utc(5));
+    let stop = Stop { actor: actor.clone(), reason: reason.clone(), proof: vec![1; 64], ..engaged };
+    let reset = Reset { actor, reason, proof: vec![2; 64], ..Reset::new(stop_id, Utc(6)) };
+    StopFacts { stops: vec![stop], resets: vec![reset] }
 }
 
 #[test]

@@ -109,30 +109,15 @@ impl AgentCore {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use midshift_bundle::digest::Digest;
-    use midshift_bundle::manifest::{Component, ComponentKind, Needs, SafetyClass};
-    use std::collections::{BTreeMap, BTreeSet};
+    use midshift_bundle::manifest::{Component, ComponentKind};
     use std::fs;
     use std::path::PathBuf;
     use tempfile::TempDir;
 
     fn component(name: &str, version: &str, data_migration: Migration) -> Component {
-        Component {
-            name: name.to_owned(),
-            version: version.to_owned(),
-            kind: if name == "gait" { ComponentKind::Process } else { ComponentKind::Config },
-            hardware: BTreeSet::new(),
-            capabilities: BTreeSet::new(),
-            requires: BTreeMap::new(),
-            conflicts: BTreeMap::new(),
-            task_schema: (1, 1),
-            rollback_index: 0,
-            safety_class: SafetyClass::None,
-            needs: Needs::Restart,
-            data_migration,
-            digest: Digest::of(format!("{name} {version}").as_bytes()),
-            length: 1,
-        }
+        let kind = if name == "gait" { ComponentKind::Process } else { ComponentKind::Config };
+        let content = format!("{name} {version}");
+        Component { data_migration, ..Component::new(name, version, kind, content.as_bytes()) }
     }
 
     fn set(components: &[Component]) -> SetManifest {

@@ -5,20 +5,17 @@
 
 use crate::remote::Shop;
 use crate::rig::TestBody;
-use crate::session::{Desk, Pipes, Seen};
+use crate::session::{Desk, Pipes, Seen, clock, config};
 use async_trait::async_trait;
 use midshift_agent::body::BodyNews;
-use midshift_agent::bugs::Bugs;
 use midshift_agent::bulk::Bulk;
 use midshift_agent::dial::{self, Dial};
 use midshift_agent::memory::MemoryStore;
-use midshift_agent::session::{AgentConfig, Lines, Updates, run};
+use midshift_agent::session::{Lines, Updates, run};
 use midshift_agent::sets::memory::MemorySets;
 use midshift_agent::update::io::UpdateWorker;
 use midshift_agent::update::remote::GrpcRemote;
-use midshift_core::ids::RobotId;
 use midshift_core::robot::{Fault, FaultClass, Lane};
-use midshift_core::time::{Clock, ScaledClock};
 use midshift_core::update::{DesiredUpdate, Goal, UpdateState};
 use midshift_core::work::InboxItem;
 use midshift_proto::link::v1::link_service_server::LinkServiceServer;
@@ -109,20 +106,8 @@ async fn beside_a_download(is_shared: bool) -> Carried {
     }
     let lines = Lines { bulk: Bulk::new(dial.clone()), link: dial };
     let worker = UpdateWorker::new(Box::new(MemorySets::new()), Arc::new(GrpcRemote::new(lines.bulk.clone())));
-    let robot_id = RobotId::parse("rbt-01").expect("a name");
-    let config = AgentConfig {
-        stop: None,
-        update: Some(Updates { config: shop.releases.config(), worker: Box::new(worker) }),
-        robot_id: robot_id.clone(),
-        boot_id: "boot-1".into(),
-        new_ring_id: "ring-1".into(),
-        seed: 7,
-        bugs: Bugs::default(),
-        pulse: None,
-    };
-    let start = tokio::time::Instant::now();
-    let micros = move || start.elapsed().as_micros() as u64;
-    let clock: Arc<dyn Clock> = Arc::new(ScaledClock::new(micros, crate::release::SIGNED, 1_000));
+    let config = config(Some(Updates { config: shop.releases.config(), worker: Box::new(worker) }));
+    let (robot_id, clock) = (config.robot_id.clone(), clock(crate::release::SIGNED));
     let (store, stop) = (Box::new(MemoryStore::new()), CancellationToken::new());
     let agent = tokio::spawn(run(config, Box::new(body.clone()), store, clock, lines, stop.clone()));
     let mut session = sessions.recv().await.expect("the robot dials");

@@ -8,7 +8,7 @@ use midshift_bundle::digest::Digest;
 use midshift_bundle::directive::{Directive, LIFE_MS};
 use midshift_bundle::key_set::KeySet;
 use midshift_bundle::keys::SecretKey;
-use midshift_bundle::manifest::{Component, ComponentKind, FORMAT, Manifest, Migration, Needs, SafetyClass};
+use midshift_bundle::manifest::{Component, ComponentKind, FORMAT, Manifest, Migration, Needs};
 use midshift_bundle::repository::{
     FileTarget, PEOPLE_LIFE_MS, RootDraft, Signers, sign_online, sign_root, sign_targets,
 };
@@ -65,22 +65,7 @@ pub struct Bundle {
 }
 
 pub fn component(name: &str, version: &str, kind: ComponentKind, content: &[u8]) -> Component {
-    Component {
-        name: name.to_owned(),
-        version: version.to_owned(),
-        kind,
-        hardware: [MODEL.to_owned()].into(),
-        capabilities: BTreeSet::new(),
-        requires: BTreeMap::new(),
-        conflicts: BTreeMap::new(),
-        task_schema: (1, 1),
-        rollback_index: 0,
-        safety_class: SafetyClass::None,
-        needs: Needs::Restart,
-        data_migration: Migration::None,
-        digest: Digest::of(content),
-        length: content.len() as u64,
-    }
+    Component { hardware: [MODEL.to_owned()].into(), ..Component::new(name, version, kind, content) }
 }
 
 impl Releases {

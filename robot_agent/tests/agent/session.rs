@@ -183,6 +183,26 @@ struct Bench {
     agent: JoinHandle<Result<ExitReason, Error>>,
 }
 
+/// The agent of `rbt-01`, with no line to a stop service.
+pub fn config(update: Option<Updates>) -> AgentConfig {
+    AgentConfig {
+        stop: None,
+        update,
+        robot_id: RobotId::parse("rbt-01").expect("a name"),
+        boot_id: "boot-1".into(),
+        new_ring_id: "ring-1".into(),
+        seed: 7,
+        bugs: Bugs::default(),
+        pulse: None,
+    }
+}
+
+/// A clock that goes with tokio's time and shows this now.
+pub fn clock(now: Utc) -> Arc<dyn Clock> {
+    let start = tokio::time::Instant::now();
+    Arc::new(ScaledClock::new(move || start.elapsed().as_micros() as u64, now, 1_000))
+}
+
 impl Bench {
     fn new(store: Box<dyn Store>) -> Self {
         Self::with(store, None)
@@ -195,19 +215,7 @@ impl Bench {
         let (desk, shelf) = (LinkServiceServer::new(Desk(seen)), ReplayServiceServer::new(Shelf(asked)));
         let server = Server::builder().add_service(desk).add_service(shelf);
         tokio::spawn(server.serve_with_incoming(ReceiverStream::new(incoming)));
-        let config = AgentConfig {
-            stop: None,
-            update,
-            robot_id: RobotId::parse("rbt-01").expect("a name"),
-            boot_id: "boot-1".into(),
-            new_ring_id: "ring-1".into(),
-            seed: 7,
-            bugs: Bugs::default(),
-            pulse: None,
-        };
-        let start = tokio::time::Instant::now();
-        let micros = move || start.elapsed().as_micros() as u64;
-        let clock: Arc<dyn Clock> = Arc::new(ScaledClock::new(micros, Utc(1_700_000_000_000), 1_000));
+        let (config, clock) = (config(update), clock(Utc(1_700_000_000_000)));
         let (body, shutdown) = (TestBody::at("A"), CancellationToken::new());
         let link = Arc::new(Pipes { ends, network: up });
         let lines = Lines { bulk: Bulk::new(link.clone()), link };

@@ -7,7 +7,7 @@ use midshift_agent::sets::{CHUNK_BYTES, CHUNKS_UNSYNCED_MAX, Error, Sets, Wanted
 use midshift_agent::switch::Switch;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding;
-use midshift_bundle::manifest::{Component, ComponentKind, Migration, Needs, SafetyClass};
+use midshift_bundle::manifest::{Component, ComponentKind};
 use midshift_bundle::set::SetManifest;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -101,22 +101,7 @@ pub fn put(sets: &mut dyn Sets, content: &[u8]) -> Wanted {
 }
 
 pub fn component(name: &str, kind: ComponentKind, content: &[u8]) -> Component {
-    Component {
-        name: name.to_owned(),
-        version: "1.0.0".to_owned(),
-        kind,
-        hardware: BTreeSet::new(),
-        capabilities: BTreeSet::new(),
-        requires: BTreeMap::new(),
-        conflicts: BTreeMap::new(),
-        task_schema: (1, 1),
-        rollback_index: 0,
-        safety_class: SafetyClass::None,
-        needs: Needs::Restart,
-        data_migration: Migration::None,
-        digest: Digest::of(content),
-        length: content.len() as u64,
-    }
+    Component::new(name, "1.0.0", kind, content)
 }
 
 pub fn set(version: &str, program: &[u8], settings: &[u8]) -> SetManifest {

@@ -42,29 +42,14 @@ fn id(name: &str) -> StopId {
 
 fn stop(name: &str, scope: Scope, level: StopLevel) -> News {
     let (actor, reason) = ("who".to_owned(), "why".to_owned());
-    let stop = Stop {
-        stop_id: id(name),
-        scope,
-        level,
-        engaged: Utc(5),
-        actor,
-        reason,
-        region: None,
-        proof: vec![9; 64],
-        token_id: None,
-    };
+    let stop = Stop { actor, reason, proof: vec![9; 64], ..Stop::new(id(name), scope, level, Utc(5)) };
     News::Told(vec![stop], Vec::new())
 }
 
 fn reset(names: &[&str]) -> News {
-    let (actor, reason) = ("who", "all clear");
-    let reset = |name: &&str| Reset {
-        stop_id: id(name),
-        at: Utc(6),
-        actor: actor.to_owned(),
-        reason: reason.to_owned(),
-        proof: Vec::new(),
-        token_id: None,
+    let reset = |name: &&str| {
+        let (actor, reason) = ("who".to_owned(), "all clear".to_owned());
+        Reset { actor, reason, ..Reset::new(id(name), Utc(6)) }
     };
     News::Told(Vec::new(), names.iter().map(reset).collect())
 }

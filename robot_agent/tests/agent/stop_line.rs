@@ -1,10 +1,9 @@
 //! The line to the stop service, over pipes in memory and tokio's paused clock, and over loopback; and the file of stops.
 
 use crate::rig::TestBody;
-use crate::session::Pipes;
+use crate::session::{Pipes, clock, config};
 use crate::stops::{reset, stop, stop_id};
 use async_trait::async_trait;
-use midshift_agent::bugs::Bugs;
 use midshift_agent::bulk::Bulk;
 use midshift_agent::core::ExitReason;
 use midshift_agent::dial::{self, Dial, TcpDial};
@@ -19,7 +18,7 @@ use midshift_core::robot::StopLevel;
 use midshift_core::stop::region::Bounds;
 use midshift_core::stop::robot::Kept;
 use midshift_core::stop::{Region, Scope, Stop};
-use midshift_core::time::{Clock, ScaledClock, Utc};
+use midshift_core::time::Utc;
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::stop_link_service_server::{StopLinkService, StopLinkServiceServer};
 use std::collections::BTreeSet;
@@ -147,19 +146,8 @@ impl Bench {
         Self::over(dial, lines, store, keep)
     }
     fn over(dial: Arc<dyn Dial>, lines: mpsc::Receiver<Seen>, store: Box<dyn Store>, keep: Box<dyn KeepStops>) -> Self {
-        let config = AgentConfig {
-            stop: Some(StopLine { dial, keep }),
-            update: None,
-            robot_id: robot(),
-            boot_id: "boot-1".into(),
-            new_ring_id: "ring-1".into(),
-            seed: 7,
-            bugs: Bugs::default(),
-            pulse: None,
-        };
-        let start = Instant::now();
-        let micros = move || start.elapsed().as_micros() as u64;
-        let clock: Arc<dyn Clock> = Arc::new(ScaledClock::new(micros, Utc(1_700_000_000_000), 1_000));
+        let config = AgentConfig { stop: Some(StopLine { dial, keep }), ..config(None) };
+        let clock = clock(Utc(1_700_000_000_000));
         let (body, shutdown) = (TestBody::at("A"), CancellationToken::new());
         // The link and bulk are as bad as they can be in all of these.
         let lines_of_work = Lines { bulk: Bulk::new(Arc::new(Nowhere)), link: Arc::new(Nowhere) };

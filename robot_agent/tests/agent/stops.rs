@@ -18,28 +18,12 @@ pub fn stop_id(n: u64) -> StopId {
 }
 
 pub fn stop(n: u64, level: StopLevel) -> Stop {
-    Stop {
-        stop_id: stop_id(n),
-        scope: Scope::Fleet,
-        level,
-        engaged: Utc(1_700_000_000_000),
-        actor: "anna".into(),
-        reason: "a pallet fell".into(),
-        region: None,
-        proof: Vec::new(),
-        token_id: None,
-    }
+    let engaged = Stop::new(stop_id(n), Scope::Fleet, level, Utc(1_700_000_000_000));
+    Stop { actor: "anna".into(), reason: "a pallet fell".into(), ..engaged }
 }
 
 pub fn reset(n: u64) -> Reset {
-    Reset {
-        stop_id: stop_id(n),
-        at: Utc(1_700_000_000_001),
-        actor: "bert".into(),
-        reason: "clear".into(),
-        proof: Vec::new(),
-        token_id: None,
-    }
+    Reset { actor: "bert".into(), reason: "clear".into(), ..Reset::new(stop_id(n), Utc(1_700_000_000_001)) }
 }
 
 /// Generation of the latch with the `n`-th message.

@@ -2,18 +2,16 @@
 
 use crate::release::{Releases, SIGNED};
 use crate::rig::{Rig, TestBody};
-use crate::session::{Desk, Seen};
+use crate::session::{Desk, Seen, clock, config};
 use crate::trusts::Metadata;
-use midshift_agent::bugs::Bugs;
 use midshift_agent::bulk::Bulk;
 use midshift_agent::dial::TcpDial;
 use midshift_agent::memory::MemoryStore;
-use midshift_agent::session::{AgentConfig, Lines, run};
+use midshift_agent::session::{Lines, run};
 use midshift_agent::store::{Op, Store};
 use midshift_agent::tls::{self, Tls};
 use midshift_bundle::trust::{Reading, Trusted};
-use midshift_core::ids::RobotId;
-use midshift_core::time::{Clock, ScaledClock, Utc};
+use midshift_core::time::Utc;
 use midshift_proto::link::v1::link_service_server::LinkServiceServer;
 use midshift_proto::session::{ClockSample, Downlink, Echo, ToRobot};
 use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
@@ -98,19 +96,7 @@ async fn floor_after(link: TcpDial, mut sessions: mpsc::Receiver<Seen>, told: Ut
     let mut store = MemoryStore::new();
     store.load("ring-1").await.expect("loads");
     store.commit(&[Op::Trusted(trusted().await)]).await.expect("commits");
-    let config = AgentConfig {
-        stop: None,
-        update: None,
-        robot_id: RobotId::parse("rbt-01").expect("a name"),
-        boot_id: "boot-1".into(),
-        new_ring_id: "ring-1".into(),
-        seed: 7,
-        bugs: Bugs::default(),
-        pulse: None,
-    };
-    let start = tokio::time::Instant::now();
-    let micros = move || start.elapsed().as_micros() as u64;
-    let clock: Arc<dyn Clock> = Arc::new(ScaledClock::new(micros, Utc(1_600_000_000_000), 1_000));
+    let (config, clock) = (config(None), clock(Utc(1_600_000_000_000)));
     let (link, shutdown) = (Arc::new(link), CancellationToken::new());
     let lines = Lines { bulk: Bulk::new(link.clone()), link };
     let agent =

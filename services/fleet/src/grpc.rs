@@ -48,67 +48,72 @@ fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {
     result.map(Response::new).map_err(|refusal| midshift_proto::status(&refusal, None))
 }
 
+/// The robot and the request_id of a command about one robot, or everything that is wrong with the request.
+/// `reason`: none where the command asks for none.
+fn robot_and_request(
+    robot_id: &str,
+    request: &str,
+    reason: Option<&str>,
+    mut bad: Violations,
+) -> Result<(RobotId, Option<String>), Refusal> {
+    let robot_id = bad.take("robot_id", RobotId::parse(robot_id));
+    let request_id = request_id(request, &mut bad);
+    if let Some(reason) = reason {
+        reason_text(reason, &mut bad);
+    }
+    bad.finish()?;
+    Ok((robot_id.ok_or_else(internal)?, request_id))
+}
+
 impl FleetService {
+    /// Carries out a command about `robot_id`. What it is under then.
+    async fn act_on_robot(
+        &self,
+        robot_id: RobotId,
+        command: Command,
+        by: &Caller,
+        etag: &str,
+        validate_only: bool,
+        request_id: Option<String>,
+    ) -> Result<Option<v1::RobotControl>, Refusal> {
+        self.act(command, by, revision_of(etag), validate_only, request_id).await?;
+        self.look(move |view, board, _| Some(encode::control(view, board, &robot_id))).await
+    }
+
     async fn cordon(&self, r: v1::CordonRobotRequest, by: &Caller) -> Result<v1::CordonRobotResponse, Refusal> {
-        let mut bad = Violations::default();
-        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
-        let request_id = request_id(&r.request_id, &mut bad);
-        reason_text(&r.reason, &mut bad);
-        bad.finish()?;
-        let robot_id = robot_id.ok_or_else(internal)?;
+        let bad = Violations::default();
+        let (robot_id, request_id) = robot_and_request(&r.robot_id, &r.request_id, Some(&r.reason), bad)?;
         let command = Command::Cordon { robot_id: robot_id.clone(), reason: r.reason };
-        self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
-        let control = self.look(move |view, board, _| encode::control(view, board, &robot_id)).await?;
-        Ok(v1::CordonRobotResponse { control: Some(control) })
+        let control = self.act_on_robot(robot_id, command, by, &r.etag, r.validate_only, request_id).await?;
+        Ok(v1::CordonRobotResponse { control })
     }
 
     async fn uncordon(&self, r: v1::UncordonRobotRequest, by: &Caller) -> Result<v1::UncordonRobotResponse, Refusal> {
-        let mut bad = Violations::default();
-        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
-        let request_id = request_id(&r.request_id, &mut bad);
-        bad.finish()?;
-        let robot_id = robot_id.ok_or_else(internal)?;
-        self.act(
-            Command::Uncordon { robot_id: robot_id.clone() },
-            by,
-            revision_of(&r.etag),
-            r.validate_only,
-            request_id,
-        )
-        .await?;
-        let control = self.look(move |view, board, _| encode::control(view, board, &robot_id)).await?;
-        Ok(v1::UncordonRobotResponse { control: Some(control) })
+        let (robot_id, request_id) = robot_and_request(&r.robot_id, &r.request_id, None, Violations::default())?;
+        let command = Command::Uncordon { robot_id: robot_id.clone() };
+        let control = self.act_on_robot(robot_id, command, by, &r.etag, r.validate_only, request_id).await?;
+        Ok(v1::UncordonRobotResponse { control })
     }
 
     async fn retire(&self, r: v1::RetireRobotRequest, by: &Caller) -> Result<v1::RetireRobotResponse, Refusal> {
-        let mut bad = Violations::default();
-        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
-        let request_id = request_id(&r.request_id, &mut bad);
-        reason_text(&r.reason, &mut bad);
-        bad.finish()?;
-        let robot_id = robot_id.ok_or_else(internal)?;
+        let bad = Violations::default();
+        let (robot_id, request_id) = robot_and_request(&r.robot_id, &r.request_id, Some(&r.reason), bad)?;
         let command = Command::Retire { robot_id: robot_id.clone(), reason: r.reason };
-        self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
-        let control = self.look(move |view, board, _| encode::control(view, board, &robot_id)).await?;
-        Ok(v1::RetireRobotResponse { control: Some(control) })
+        let control = self.act_on_robot(robot_id, command, by, &r.etag, r.validate_only, request_id).await?;
+        Ok(v1::RetireRobotResponse { control })
     }
 
     async fn disown(&self, r: v1::DisownAttemptRequest, by: &Caller) -> Result<v1::DisownAttemptResponse, Refusal> {
         let mut bad = Violations::default();
-        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
         let subject = bad.take("subject", Subject::parse(&r.subject));
-        let request_id = request_id(&r.request_id, &mut bad);
-        reason_text(&r.reason, &mut bad);
         if r.epoch == 0 {
             bad.add("epoch", "is required, from 1");
         }
-        bad.finish()?;
-        let (robot_id, subject) = robot_id.zip(subject).ok_or_else(internal)?;
-        let attempt = AttemptId { subject, epoch: r.epoch };
+        let (robot_id, request_id) = robot_and_request(&r.robot_id, &r.request_id, Some(&r.reason), bad)?;
+        let attempt = AttemptId { subject: subject.ok_or_else(internal)?, epoch: r.epoch };
         let command = Command::Disown { robot_id: robot_id.clone(), attempt, reason: r.reason };
-        self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
-        let control = self.look(move |view, board, _| encode::control(view, board, &robot_id)).await?;
-        Ok(v1::DisownAttemptResponse { control: Some(control) })
+        let control = self.act_on_robot(robot_id, command, by, &r.etag, r.validate_only, request_id).await?;
+        Ok(v1::DisownAttemptResponse { control })
     }
 
     async fn settle_load(
@@ -116,46 +121,31 @@ impl FleetService {
         r: v1::SettleRobotLoadRequest,
         by: &Caller,
     ) -> Result<v1::SettleRobotLoadResponse, Refusal> {
-        let mut bad = Violations::default();
-        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
-        let request_id = request_id(&r.request_id, &mut bad);
-        reason_text(&r.reason, &mut bad);
-        bad.finish()?;
-        let robot_id = robot_id.ok_or_else(internal)?;
+        let bad = Violations::default();
+        let (robot_id, request_id) = robot_and_request(&r.robot_id, &r.request_id, Some(&r.reason), bad)?;
         let command = Command::SettleLoad { robot_id: robot_id.clone(), reason: r.reason };
-        self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
-        let control = self.look(move |view, board, _| encode::control(view, board, &robot_id)).await?;
-        Ok(v1::SettleRobotLoadResponse { control: Some(control) })
+        let control = self.act_on_robot(robot_id, command, by, &r.etag, r.validate_only, request_id).await?;
+        Ok(v1::SettleRobotLoadResponse { control })
     }
 
     async fn drain(&self, r: v1::DrainRobotRequest, by: &Caller) -> Result<v1::DrainRobotResponse, Refusal> {
         let mut bad = Violations::default();
-        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
-        let request_id = request_id(&r.request_id, &mut bad);
-        reason_text(&r.reason, &mut bad);
         let within_ms = parse_ms(r.within.as_ref(), At::top("within"), &mut bad).unwrap_or(DRAIN_WITHIN_MS);
         if !DRAIN_MS.contains(&within_ms) {
             bad.add("within", "must be 1 s to 24 h");
         }
-        bad.finish()?;
-        let robot_id = robot_id.ok_or_else(internal)?;
-        let (within_ms, reason) = (within_ms.unsigned_abs(), r.reason);
-        let command = Command::Drain { robot_id: robot_id.clone(), reason, within_ms };
-        self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
-        let control = self.look(move |view, board, _| encode::control(view, board, &robot_id)).await?;
-        Ok(v1::DrainRobotResponse { control: Some(control) })
+        let (robot_id, request_id) = robot_and_request(&r.robot_id, &r.request_id, Some(&r.reason), bad)?;
+        let within_ms = within_ms.unsigned_abs();
+        let command = Command::Drain { robot_id: robot_id.clone(), reason: r.reason, within_ms };
+        let control = self.act_on_robot(robot_id, command, by, &r.etag, r.validate_only, request_id).await?;
+        Ok(v1::DrainRobotResponse { control })
     }
 
     async fn undrain(&self, r: v1::UndrainRobotRequest, by: &Caller) -> Result<v1::UndrainRobotResponse, Refusal> {
-        let mut bad = Violations::default();
-        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
-        let request_id = request_id(&r.request_id, &mut bad);
-        bad.finish()?;
-        let robot_id = robot_id.ok_or_else(internal)?;
+        let (robot_id, request_id) = robot_and_request(&r.robot_id, &r.request_id, None, Violations::default())?;
         let command = Command::Undrain { robot_id: robot_id.clone() };
-        self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
-        let control = self.look(move |view, board, _| encode::control(view, board, &robot_id)).await?;
-        Ok(v1::UndrainRobotResponse { control: Some(control) })
+        let control = self.act_on_robot(robot_id, command, by, &r.etag, r.validate_only, request_id).await?;
+        Ok(v1::UndrainRobotResponse { control })
     }
 
     async fn control(

@@ -370,17 +370,8 @@ mod tests {
     }
 
     fn stop(name: &str) -> anyhow::Result<Stop> {
-        Ok(Stop {
-            stop_id: StopId::parse(name)?,
-            scope: Scope::Fleet,
-            level: StopLevel::Halt,
-            engaged: Utc(1),
-            actor: "anna".to_owned(),
-            reason: String::new(),
-            region: None,
-            proof: Vec::new(),
-            token_id: None,
-        })
+        let stop = Stop::new(StopId::parse(name)?, Scope::Fleet, StopLevel::Halt, Utc(1));
+        Ok(Stop { actor: "anna".to_owned(), ..stop })
     }
 
     #[tokio::test]

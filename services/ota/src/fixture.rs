@@ -9,11 +9,11 @@ use bytes::Bytes;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::key_set::KeySet;
 use midshift_bundle::keys::SecretKey;
-use midshift_bundle::manifest::{Component, ComponentKind, FORMAT, Manifest, Migration, Needs, SafetyClass};
+use midshift_bundle::manifest::{Component, ComponentKind, FORMAT, Manifest};
 use midshift_bundle::repository::{FileTarget, PEOPLE_LIFE_MS, RootDraft, Signers, sign_root, sign_targets};
 use midshift_bundle::trust::{Error, Reading, Refreshed, Source, Trusted};
 use midshift_core::time::{ScaledClock, Utc};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use tempfile::TempDir;
@@ -61,20 +61,8 @@ pub fn first_root() -> Vec<u8> {
 pub fn bundle(name: &str, version: &str) -> (Manifest, Vec<u8>) {
     let content = format!("{name} {version} walks").into_bytes();
     let component = Component {
-        name: format!("{name}-gait"),
-        version: version.to_owned(),
-        kind: ComponentKind::Process,
         hardware: BTreeSet::from(["h1".to_owned()]),
-        capabilities: BTreeSet::new(),
-        requires: BTreeMap::new(),
-        conflicts: BTreeMap::new(),
-        task_schema: (1, 1),
-        rollback_index: 0,
-        safety_class: SafetyClass::None,
-        needs: Needs::Restart,
-        data_migration: Migration::None,
-        digest: Digest::of(&content),
-        length: content.len() as u64,
+        ..Component::new(&format!("{name}-gait"), version, ComponentKind::Process, &content)
     };
     let manifest = Manifest {
         format: FORMAT,

@@ -66,18 +66,8 @@ pub fn engage(inner: &Inner, wanted: Wanted) -> Result<Engaged, Refusal> {
     }
     law.room(&wanted.scope, wanted.level)?;
     let (actor, token_id, reason) = (wanted.actor.to_string(), wanted.actor.token().cloned(), wanted.reason);
-    let (scope, level) = (wanted.scope, wanted.level);
-    let mut stop = Stop {
-        stop_id: law.draw(now.wall),
-        scope,
-        level,
-        engaged: now.wall,
-        actor,
-        reason,
-        region,
-        proof: Vec::new(),
-        token_id,
-    };
+    let bare = Stop::new(law.draw(now.wall), wanted.scope, wanted.level, now.wall);
+    let mut stop = Stop { actor, reason, region, token_id, ..bare };
     inner.key.mark(&mut stop);
     let request_id = wanted.request.as_ref().map(|(id, _)| id.to_string());
     let asked = wanted.request.map(|(id, hash)| (id, Asked { stop_id: stop.stop_id.clone(), hash, at: now.wall }));
@@ -197,7 +187,7 @@ pub fn reset(inner: &Inner, stop_id: StopId, reason: String, by: &Caller) -> Res
     }
     let by = Actor::from(by);
     let (actor, token_id) = (by.to_string(), by.token().cloned());
-    let mut reset = Reset { stop_id, at: now.wall, actor, reason, proof: Vec::new(), token_id };
+    let mut reset = Reset { actor, reason, token_id, ..Reset::new(stop_id, now.wall) };
     inner.key.mark_reset(&mut reset);
     let resetting = law.reset(reset);
     if resetting.is_new {

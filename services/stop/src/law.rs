@@ -253,29 +253,11 @@ mod tests {
     use midshift_core::ids::RobotId;
 
     fn stop(id: StopId, scope: Scope) -> Stop {
-        let (actor, reason) = (String::new(), String::new());
-        Stop {
-            stop_id: id,
-            scope,
-            level: StopLevel::Halt,
-            engaged: Utc(1),
-            actor,
-            reason,
-            region: None,
-            proof: vec![],
-            token_id: None,
-        }
+        Stop::new(id, scope, StopLevel::Halt, Utc(1))
     }
 
     fn reset(stop_id: &StopId) -> Reset {
-        Reset {
-            stop_id: stop_id.clone(),
-            at: Utc(2),
-            actor: "a".to_owned(),
-            reason: "over".to_owned(),
-            proof: Vec::new(),
-            token_id: None,
-        }
+        Reset { actor: "a".to_owned(), reason: "over".to_owned(), ..Reset::new(stop_id.clone(), Utc(2)) }
     }
 
     #[test]

@@ -125,16 +125,11 @@ fn stop_fleet(kept: &mut Kept, key: &Key, lost: Lost, now: Utc) -> Stop {
     if let Some(known) = kept.latch.effective().find(is_known) {
         return known.clone();
     }
+    let stop_id = draw_unused(&kept.latch, MEMORY_LOST, now);
     let mut stop = Stop {
-        stop_id: draw_unused(&kept.latch, MEMORY_LOST, now),
-        scope: Scope::Fleet,
-        level: StopLevel::Halt,
-        engaged: now,
         actor: audit::MIDSHIFT.to_owned(),
         reason: format!("the stop service began without its memory: {}; nobody knows what was engaged", lost.why()),
-        region: None,
-        proof: Vec::new(),
-        token_id: None,
+        ..Stop::new(stop_id, Scope::Fleet, StopLevel::Halt, now)
     };
     key.mark(&mut stop);
     kept.latch.engage(stop.clone());

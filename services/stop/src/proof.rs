@@ -114,15 +114,10 @@ mod tests {
 
     fn stop() -> Stop {
         Stop {
-            stop_id: StopId::parse("STOP-1").unwrap(),
-            scope: Scope::Fleet,
-            level: StopLevel::Halt,
-            engaged: Utc(1),
             actor: "anna".to_owned(),
             reason: "drill".to_owned(),
             region: Some(Region::of_box(1, 2, 3, 4)),
-            proof: Vec::new(),
-            token_id: None,
+            ..Stop::new(StopId::parse("STOP-1").unwrap(), Scope::Fleet, StopLevel::Halt, Utc(1))
         }
     }
 
@@ -159,8 +154,8 @@ mod tests {
     fn a_marked_reset_is_believed_by_the_public_key_over_the_wire() {
         let folder = tempfile::tempdir().unwrap();
         let key = kept(folder.path());
-        let (actor, reason, stop_id) = ("bert".to_owned(), "clear".to_owned(), stop().stop_id);
-        let mut reset = Reset { stop_id, at: Utc(2), actor, reason, proof: Vec::new(), token_id: None };
+        let (actor, reason) = ("bert".to_owned(), "clear".to_owned());
+        let mut reset = Reset { actor, reason, ..Reset::new(stop().stop_id, Utc(2)) };
         key.mark_reset(&mut reset);
         let back: Reset = midshift_proto::parse(v1::Reset::from(&reset)).unwrap();
         let public = ed25519_dalek::VerifyingKey::from_bytes(&key.public()).unwrap();

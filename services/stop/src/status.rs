@@ -179,26 +179,12 @@ mod tests {
 
     /// Of the fleet, of an area, and of one robot.
     fn stop(n: u64, level: StopLevel) -> (Stop, u64) {
-        let (actor, reason) = (String::new(), String::new());
         let scope = match n % 4 {
             0 => Scope::Area(AreaId::parse("hall").unwrap()),
             1 => Scope::Robot(RobotId::parse("r1").unwrap()),
             _ => Scope::Fleet,
         };
-        (
-            Stop {
-                stop_id: id(n),
-                scope,
-                level,
-                engaged: Utc(0),
-                actor,
-                reason,
-                region: None,
-                proof: vec![],
-                token_id: None,
-            },
-            n,
-        )
+        (Stop::new(id(n), scope, level, Utc(0)), n)
     }
 
     #[test]

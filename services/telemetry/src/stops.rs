@@ -78,16 +78,11 @@ mod tests {
 
     fn record(n: usize, scope: Scope, is_reset: bool) -> StopRecord {
         let (actor, reason, region) = ("anna".to_owned(), "a pallet fell".to_owned(), Some(Region::of_box(0, 0, 9, 9)));
-        let (level, engaged, proof) = (StopLevel::Halt, Utc(1), vec![7; 64]);
-        let stop =
-            Stop { stop_id: id(n), scope, level, engaged, actor: actor.clone(), reason, region, proof, token_id: None };
-        let reset = || Reset {
-            stop_id: id(n),
-            at: Utc(n as i64),
-            actor,
-            reason: "clear".to_owned(),
-            proof: vec![8; 64],
-            token_id: None,
+        let bare = Stop::new(id(n), scope, StopLevel::Halt, Utc(1));
+        let stop = Stop { actor: actor.clone(), reason, region, proof: vec![7; 64], ..bare };
+        let reset = || {
+            let (reason, proof) = ("clear".to_owned(), vec![8; 64]);
+            Reset { actor, reason, proof, ..Reset::new(id(n), Utc(n as i64)) }
         };
         StopRecord { stop, reset: is_reset.then(reset) }
     }

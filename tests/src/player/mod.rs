@@ -18,8 +18,7 @@ use midshift_core::site::Site;
 use midshift_core::work::{DesiredWork, Gap, InboxItem, RobotEvent, Sample, SampleBody};
 use midshift_proto::link::v1;
 use midshift_proto::session::{
-    ClockSample, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, LanePosition, PROTOCOL_VERSION, Previous, ToRobot,
-    Uplink, Welcome,
+    ClockSample, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, LanePosition, Previous, ToRobot, Uplink, Welcome,
 };
 use prost::Message;
 use rand::rngs::StdRng;
@@ -219,18 +218,13 @@ impl Player {
         };
         let lanes = self.produced.iter().map(position).collect();
         let hello = Hello {
-            robot_id: self.robot_id.clone(),
-            boot_id: format!("boot-{}", self.boots),
             previous: self.session.as_ref().map(|(previous, _)| previous.clone()),
             inventory: inventory(),
             reported,
-            ring: self.ring.clone(),
             lanes,
             store_id: self.session.as_ref().map(|(_, store)| store.clone()).unwrap_or_default(),
             sent_unix_ms: self.stamp(unix_ms),
-            clock_rate_permille: 1_000,
-            protocol_versions: vec![PROTOCOL_VERSION],
-            installed: String::new(),
+            ..Hello::new(self.robot_id.clone(), format!("boot-{}", self.boots), self.ring.clone())
         };
         (&FromRobot::Hello(Box::new(hello))).into()
     }
@@ -250,19 +244,13 @@ impl Player {
     pub fn second_hello(&mut self, unix_ms: i64) -> v1::SessionRequest {
         let reported = ReportedState { hb: 0, session_epoch: 0, ..self.state.clone() };
         self.lists(&reported.attempts);
+        let (boot_id, ring) = (format!("boot-beside-{}", self.boots), format!("ring-beside-{}", self.boots));
         let hello = Hello {
-            robot_id: self.robot_id.clone(),
-            boot_id: format!("boot-beside-{}", self.boots),
             previous: self.session.as_ref().map(|(previous, _)| previous.clone()),
             inventory: inventory(),
             reported,
-            ring: format!("ring-beside-{}", self.boots),
-            lanes: BTreeMap::new(),
-            store_id: String::new(),
             sent_unix_ms: unix_ms,
-            clock_rate_permille: 1_000,
-            protocol_versions: vec![PROTOCOL_VERSION],
-            installed: String::new(),
+            ..Hello::new(self.robot_id.clone(), boot_id, ring)
         };
         (&FromRobot::Hello(Box::new(hello))).into()
     }

@@ -9,13 +9,12 @@ use midshift_agent::tls::Tls;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::Code;
-use midshift_core::robot::{Inventory, ReportedState};
+use midshift_core::robot::ReportedState;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::fleet::v1::{Incident, ListIncidentsRequest};
 use midshift_proto::link::v1::link_service_client::LinkServiceClient;
 use midshift_proto::link::v1::{SessionRequest, SessionResponse};
 use midshift_proto::session::{CloseCode, FromRobot, Heartbeat, Hello, Previous, ToRobot, Uplink, Welcome};
-use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::time::Duration;
 use tokio::sync::mpsc;
@@ -45,20 +44,7 @@ impl Session {
         boot_id: &str,
         previous: Option<Previous>,
     ) -> anyhow::Result<Self> {
-        let hello = Hello {
-            robot_id: robot_id.clone(),
-            boot_id: boot_id.to_owned(),
-            previous,
-            inventory: Inventory::default(),
-            reported: ReportedState::default(),
-            ring: "ring".to_owned(),
-            lanes: BTreeMap::new(),
-            store_id: String::new(),
-            sent_unix_ms: 0,
-            clock_rate_permille: 1_000,
-            protocol_versions: vec![1],
-            installed: String::new(),
-        };
+        let hello = Hello { previous, ..Hello::new(robot_id.clone(), boot_id, "ring") };
         let (up, outbound) = mpsc::channel(4);
         up.send((&FromRobot::Hello(Box::new(hello))).into()).await?;
         let mut client = LinkServiceClient::new(dial.dial().await?);

@@ -13,7 +13,7 @@ use midshift_agent::trust::Trust;
 use midshift_agent::update::{SoftwareRow, Update};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::keys::SecretKey;
-use midshift_bundle::manifest::{Component, ComponentKind, Migration, Needs, SafetyClass};
+use midshift_bundle::manifest::{Component, ComponentKind};
 use midshift_bundle::repository::{RootDraft, Signers, sign_root};
 use midshift_bundle::set::SetManifest;
 use midshift_core::ids::SiteId;
@@ -23,7 +23,6 @@ use midshift_core::update::UpdateState;
 use midshift_proto::telemetry::v1::GetRobotRequest;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
 use midshift_sim::swarm::AGENT_FILE;
-use std::collections::{BTreeMap, BTreeSet};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -71,22 +70,7 @@ impl Machine {
         sets.write(&wanted, 0, behaviour.as_bytes())?;
         sets.sync(&wanted)?;
         sets.seal(&wanted)?;
-        let component = Component {
-            name: "behaviour".to_owned(),
-            version: version.to_owned(),
-            kind: ComponentKind::Config,
-            hardware: BTreeSet::new(),
-            capabilities: BTreeSet::new(),
-            requires: BTreeMap::new(),
-            conflicts: BTreeMap::new(),
-            task_schema: (1, 1),
-            rollback_index: 0,
-            safety_class: SafetyClass::None,
-            needs: Needs::Restart,
-            data_migration: Migration::None,
-            digest: wanted.digest,
-            length: wanted.length,
-        };
+        let component = Component::new("behaviour", version, ComponentKind::Config, behaviour.as_bytes());
         let set = SetManifest {
             bundle: Some(Digest::of(version.as_bytes())),
             version: format!("walk {version}"),

@@ -7,7 +7,7 @@ use midshift::samples::{NAME, SAMPLES};
 use midshift_agent::trust::Trust;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::keys::{PublicKey, SecretKey};
-use midshift_bundle::manifest::{Component, ComponentKind, FORMAT, Manifest, Migration, Needs, SafetyClass};
+use midshift_bundle::manifest::{Component, ComponentKind, FORMAT, Manifest};
 use midshift_bundle::repository::{FileTarget, PEOPLE_LIFE_MS, RootDraft, Signers, sign_root, sign_targets};
 use midshift_core::ids::{BundleId, SiteId};
 use midshift_core::limits;
@@ -52,20 +52,8 @@ fn key(seed: u8) -> SecretKey {
 
 fn manifest_of(version: &str, content: &[u8]) -> Manifest {
     let component = Component {
-        name: COMPONENT.to_owned(),
-        version: version.to_owned(),
-        kind: ComponentKind::Config,
         hardware: BTreeSet::from([MODEL.to_owned()]),
-        capabilities: BTreeSet::new(),
-        requires: BTreeMap::new(),
-        conflicts: BTreeMap::new(),
-        task_schema: (1, 1),
-        rollback_index: 0,
-        safety_class: SafetyClass::None,
-        needs: Needs::Restart,
-        data_migration: Migration::None,
-        digest: Digest::of(content),
-        length: content.len() as u64,
+        ..Component::new(COMPONENT, version, ComponentKind::Config, content)
     };
     Manifest {
         format: FORMAT,

@@ -53,21 +53,7 @@ impl Rig {
         let robot_id = RobotId::parse(id).expect("an id");
         let inventory =
             Inventory { capabilities: vec!["pick".into(), "place".into()], payload_g: 10_000, ..Inventory::default() };
-        let session = Session {
-            robot_id: robot_id.clone(),
-            session_epoch: 1,
-            secret: Default::default(),
-            boot_id: String::new(),
-            ring: String::new(),
-            inventory,
-            applied_work: 0,
-            applied_update: 0,
-            places: Vec::new(),
-            clock_offset_ms: None,
-            installed: None,
-            device_key: None,
-            device_key_changed: false,
-        };
+        let session = Session::new(robot_id.clone(), 1, inventory);
         self.view.sessions.insert(session.id(), Rowed { revision: Revision(1), row: session });
         let vitals = Vitals { waypoint: WaypointId::parse(waypoint).ok(), battery_permille: 900, ..Vitals::default() };
         let live = Live {

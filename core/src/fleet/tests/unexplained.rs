@@ -121,23 +121,11 @@ fn a_turn_answers_fewer_questions_the_more_robots_there_are_and_one_at_least() {
 fn a_stop_that_was_reset_is_not_looked_at_again() {
     let mut rig = Rig::new();
     let stop_id = StopId::parse("STOP-1").expect("an id");
-    let stop = Stop {
-        stop_id: stop_id.clone(),
-        scope: Scope::Fleet,
-        level: StopLevel::Halt,
-        engaged: rig.now.utc,
-        actor: "me".into(),
-        reason: String::new(),
-        region: None,
-        proof: Vec::new(),
-        token_id: None,
-    };
+    let stop = Stop::new(stop_id.clone(), Scope::Fleet, StopLevel::Halt, rig.now.utc);
     let mut record = StopRecord { stop, reset: None };
     rig.absorb(&record);
     assert_eq!(rig.view.engaged.len(), 1);
-    let reason = "all clear".to_owned();
-    record.reset =
-        Some(Reset { stop_id, at: rig.now.utc, actor: "me".into(), reason, proof: Vec::new(), token_id: None });
+    record.reset = Some(Reset::new(stop_id, rig.now.utc));
     let row = Row { key: record.key(), revision: Revision(2), index: record.index(), body: record.body() };
     rig.view.absorb(&row.key, row.revision, Some(&row)).expect("a row of ours");
     assert_eq!((rig.view.engaged.len(), rig.view.stops.len()), (0, 1));

@@ -240,21 +240,7 @@ impl Rig {
         robot.hb = 0;
         inventory.software.clone_from(&robot.version);
         change(&mut inventory);
-        let row = Session {
-            robot_id: robot.id.clone(),
-            session_epoch: robot.epoch,
-            secret: Default::default(),
-            boot_id: String::new(),
-            ring: "ring".into(),
-            inventory,
-            applied_work: 0,
-            applied_update: 0,
-            places: Vec::new(),
-            clock_offset_ms: None,
-            installed: None,
-            device_key: None,
-            device_key_changed: false,
-        };
+        let row = Session { ring: "ring".into(), ..Session::new(robot.id.clone(), robot.epoch, inventory) };
         self.put(row);
     }
 

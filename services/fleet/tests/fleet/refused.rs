@@ -38,11 +38,7 @@ async fn hundreds_of_stops_that_are_reset_at_once_all_wait_for_a_resume() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;
     let record = |stop_id: StopId, reset| {
-        let (actor, reason) = ("anna".to_owned(), "a drill".to_owned());
-        let engaged = crate::harness::BEGIN;
-        let (scope, level) = (Scope::Fleet, StopLevel::Halt);
-        let stop =
-            Stop { stop_id, scope, level, engaged, actor, reason, region: None, proof: Vec::new(), token_id: None };
+        let stop = Stop::new(stop_id, Scope::Fleet, StopLevel::Halt, crate::harness::BEGIN);
         StopRecord { stop, reset }
     };
     for stop_id in names(200) {
@@ -50,14 +46,7 @@ async fn hundreds_of_stops_that_are_reset_at_once_all_wait_for_a_resume() {
     }
     w.until("all of them hold it", |s| s.tokens("r1").len() == 200).await;
     for stop_id in names(200) {
-        let reset = Reset {
-            stop_id: stop_id.clone(),
-            at: crate::harness::BEGIN,
-            actor: "bert".into(),
-            reason: "clear".into(),
-            proof: Vec::new(),
-            token_id: None,
-        };
+        let reset = Reset::new(stop_id.clone(), crate::harness::BEGIN);
         w.stop(&record(stop_id, Some(reset))).await;
     }
     w.pass(5).await;

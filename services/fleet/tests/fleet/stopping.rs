@@ -93,8 +93,8 @@ async fn a_forced_cancel_ends_the_record_and_keeps_the_robot_until_it_reports() 
     w.lawful().await;
 }
 
-#[tokio::test(start_paused = true)]
-async fn a_canceled_task_whose_robot_comes_back_from_the_unknown_is_still_canceled() {
+/// A task that was canceled while nobody knew what its robot did; the robot can be heard again, and has not been.
+async fn canceled_while_nobody_knew() -> World {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;
     w.r("r1").drives = false;
@@ -105,6 +105,12 @@ async fn a_canceled_task_whose_robot_comes_back_from_the_unknown_is_still_cancel
     w.cancel("T1", false).await;
     w.until("the wish is kept", |s| s.task("T1").then == Some(Then::Canceled)).await;
     w.r("r1").mend();
+    w
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_canceled_task_whose_robot_comes_back_from_the_unknown_is_still_canceled() {
+    let mut w = canceled_while_nobody_knew().await;
     w.connect("r1").await;
     let seen = w.until_phase("T1", Phase::Canceled).await;
     assert_eq!(seen.reason("T1"), Some(Code::CanceledByUser));
@@ -113,16 +119,7 @@ async fn a_canceled_task_whose_robot_comes_back_from_the_unknown_is_still_cancel
 
 #[tokio::test(start_paused = true)]
 async fn a_stop_wished_for_while_nobody_knew_ends_also_if_the_robot_never_confirms_it() {
-    let mut w = World::on(CORRIDOR).await;
-    w.robot("r1", "park-a").await;
-    w.r("r1").drives = false;
-    w.submit("T1", "A", "B").await;
-    w.until_phase("T1", Phase::Running).await;
-    w.r("r1").cut();
-    w.until("nobody knows", |s| s.is_uncertain("T1")).await;
-    w.cancel("T1", false).await;
-    w.until("the wish is kept", |s| s.task("T1").then == Some(Then::Canceled)).await;
-    w.r("r1").mend();
+    let mut w = canceled_while_nobody_knew().await;
     w.r("r1").confirms = false;
     w.connect("r1").await;
     w.until_phase("T1", Phase::Stopping).await;

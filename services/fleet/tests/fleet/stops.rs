@@ -15,10 +15,7 @@ fn s1() -> StopId {
 }
 
 fn engaged(scope: Scope, level: StopLevel, region: Option<Region>) -> StopRecord {
-    let (actor, reason) = ("anna".to_owned(), "a drill".to_owned());
-    let stop =
-        Stop { stop_id: s1(), scope, level, engaged: BEGIN, actor, reason, region, proof: Vec::new(), token_id: None };
-    StopRecord { stop, reset: None }
+    StopRecord { stop: Stop { region, ..Stop::new(s1(), scope, level, BEGIN) }, reset: None }
 }
 
 fn fleet_wide() -> StopRecord {
@@ -26,15 +23,7 @@ fn fleet_wide() -> StopRecord {
 }
 
 fn reset(record: StopRecord) -> StopRecord {
-    let reset = Reset {
-        stop_id: s1(),
-        at: BEGIN,
-        actor: "bert".to_owned(),
-        reason: "clear".to_owned(),
-        proof: Vec::new(),
-        token_id: None,
-    };
-    StopRecord { reset: Some(reset), ..record }
+    StopRecord { reset: Some(Reset::new(s1(), BEGIN)), ..record }
 }
 
 #[tokio::test(start_paused = true)]

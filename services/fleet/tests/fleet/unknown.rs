@@ -3,7 +3,7 @@
 use crate::explain::why;
 use crate::harness::World;
 use midshift_core::reason::Code;
-use midshift_core::rows::{Expect, Item, Key, RowChange, Table, Write, Writer};
+use midshift_core::rows::{Expect, Index, Item, Key, RowChange, Table, Write, Writer};
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;
 use midshift_proto::fleet::v1;
@@ -89,5 +89,19 @@ async fn a_robot_with_a_row_of_a_newer_version_gets_no_work_and_says_which_row_a
     assert_eq!(w.seen().await.open_incidents("ROW_UNKNOWN").len(), 1);
     assert_eq!(body(&w, Table::RobotAuthority, "r1").await, kept);
     rewritten(&w, Table::RobotAuthority, "r1", ("\"adrift\"", "\"none\""), None).await;
+    w.until_phase("T1", Phase::Succeeded).await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_presence_of_a_newer_version_keeps_no_robot_from_work() {
+    let mut w = World::on(CORRIDOR).await;
+    let body = r#"{"robot_id":"r1","presence":"dreaming","since_unix_ms":1}"#;
+    let write = Write::Put { index: Index::default(), body: body.into() };
+    let key = Key::new(Table::Presence, "r1");
+    let mut item = Item::new(Writer::Telemetry, "tests");
+    item.rows.push(RowChange { key, expect: Expect::Absent, write, kind: "tests.written" });
+    w.store.commit(vec![item]).await.pop().expect("a result").expect("applied");
+    w.robot("r1", "park-a").await;
+    w.submit("T1", "A", "B").await;
     w.until_phase("T1", Phase::Succeeded).await;
 }

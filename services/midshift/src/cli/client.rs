@@ -302,9 +302,16 @@ impl From<Status> for Exit {
             "" => status.code().to_string(),
             message => message.to_owned(),
         });
-        // What to try next, unless the message said it already.
-        if let Some(help) = answer.help().filter(|help| answer.violations.is_empty() && !text.contains(*help)) {
-            text += &format!("\n  try: {help}");
+        // A broken rule says by itself what to mend.
+        let next_step = answer.code.filter(|_| answer.violations.is_empty()).map_or("", reason::Code::next_step);
+        // The help of a code ends with it.
+        let told = text.strip_suffix(next_step).unwrap_or(&text).trim_end().len();
+        text.truncate(told);
+        if answer.code == Some(reason::Code::Internal) && !answer.request_id.is_empty() {
+            text += &format!("\n  request_id: {}", answer.request_id);
+        }
+        if !next_step.is_empty() {
+            text += &format!("\n  try: {next_step}");
         }
         let remedy = match answer.code {
             Some(reason::Code::CursorExpired | reason::Code::CursorOfOtherStore) => Remedy::Anew,
@@ -595,6 +602,22 @@ mod tests {
             let refusal = Refusal::new(Kind::Precondition, code);
             assert!(Exit::from(midshift_proto::status(&refusal, None)).is_of_a_lost_place(), "{code:?}");
         }
+    }
+
+    #[test]
+    fn an_error_says_what_it_means_and_then_what_to_try() {
+        let told = |kind, reason: reason::Reason| {
+            Exit::from(midshift_proto::status(&Refusal::new(kind, reason), Some("r-77"))).to_string()
+        };
+        let nobody = told(Kind::NotFound, reason::Code::RobotNotFound.into());
+        assert_eq!(nobody, format!("No robot has this id.\n  try: {}", reason::Code::RobotNotFound.next_step()));
+        let own = told(Kind::Denied, reason::Reason::new(reason::Code::NotPermitted, "it takes the role viewer"));
+        assert_eq!(own, format!("it takes the role viewer\n  try: {}", reason::Code::NotPermitted.next_step()));
+        let fault = told(Kind::Internal, reason::Code::Internal.into());
+        assert_eq!(
+            fault,
+            "A fault of midshift.\n  request_id: r-77\n  try: Look for the request_id in the server's log."
+        );
     }
 
     #[test]

@@ -1,4 +1,5 @@
-//! What is typed for an operator in deploy/, and what one program of ours types for another, is what this program reads.
+//! What operators type by deploy/ and the runbooks, and what one program of ours types for another, is what this program
+//! reads.
 
 use super::{Args, Command, logs};
 use clap::Parser;
@@ -8,6 +9,35 @@ const UNITS: [(&str, &str); 3] = [
     ("midshift-stop.service", include_str!("../../../../deploy/midshift-stop.service")),
     ("midshift-robot.service", include_str!("../../../../deploy/midshift-robot.service")),
 ];
+
+const PAGES: [(&str, &str); 6] = [
+    ("docs/audit.md", include_str!("../../../../docs/audit.md")),
+    ("docs/runbooks/backup.md", include_str!("../../../../docs/runbooks/backup.md")),
+    ("docs/runbooks/keys.md", include_str!("../../../../docs/runbooks/keys.md")),
+    ("docs/runbooks/split.md", include_str!("../../../../docs/runbooks/split.md")),
+    ("deploy/README.md", include_str!("../../../../deploy/README.md")),
+    ("ota_bundles/README.md", include_str!("../../../../ota_bundles/README.md")),
+];
+
+/// Words of each line in a block of code that starts this program, up to a comment or to what the shell does with it.
+fn typed(page: &str) -> Vec<Vec<String>> {
+    let ends = |word: &&str| ["#", "|", "&&", ">"].contains(word);
+    let mut is_fenced = false;
+    let mut typed = Vec::new();
+    for line in page.lines() {
+        is_fenced ^= line.starts_with("```");
+        if !is_fenced && !line.starts_with("    ") {
+            continue;
+        }
+        let line = line.trim_start();
+        // A digest that a page cuts short.
+        let line = line.strip_prefix("sudo ").unwrap_or(line).replace("9f3c…", &"9f3c".repeat(16));
+        if line.starts_with("midshift ") {
+            typed.push(line.split_whitespace().take_while(|word| !ends(word)).map(str::to_owned).collect());
+        }
+    }
+    typed
+}
 
 /// Words of each ExecStart= of a unit, with what stands in the file that the unit reads.
 fn started(unit: &str) -> Vec<Vec<String>> {
@@ -38,6 +68,17 @@ fn every_unit_starts_a_command_that_there_is_with_arguments_that_it_takes() {
             let own: Vec<String> =
                 ["midshift", "launcher"].map(str::to_owned).into_iter().chain(words[1..].to_vec()).collect();
             read(&own);
+        }
+    }
+}
+
+#[test]
+fn every_command_on_a_page_for_operators_is_one_that_there_is_with_arguments_that_it_takes() {
+    for (name, page) in PAGES {
+        let typed = typed(page);
+        assert!(!typed.is_empty(), "{name}");
+        for words in typed {
+            read(&words);
         }
     }
 }

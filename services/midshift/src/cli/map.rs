@@ -56,7 +56,10 @@ fn check(file: Option<&Path>, robots: Option<u64>, out: &Out) -> Result<(), Exit
     let (name, body) = match file {
         None => ("demo".to_owned(), midshift_core::site::DEMO.to_owned()),
         Some(path) => {
-            let body = std::fs::read_to_string(path).map_err(|e| Exit::new(4, format!("{}: {e}", path.display())))?;
+            let unread = |error: std::io::Error| {
+                Exit::new(4, format!("{}: {error}", path.display())).or_try("a site file: .toml, .map or .json")
+            };
+            let body = std::fs::read_to_string(path).map_err(unread)?;
             (path.display().to_string(), body)
         }
     };

@@ -2,7 +2,6 @@
 
 use super::*;
 use midshift_core::ids::RobotId;
-use midshift_core::robot::{Inventory, ReportedState};
 use midshift_core::time::{LinkDuration, ScaledClock, Utc};
 use midshift_edge::Age;
 use midshift_proto::convert::stop::{FromStop, ToStop};
@@ -12,7 +11,6 @@ use midshift_proto::session::{FromRobot, Hello, Previous, ToRobot, Welcome};
 use midshift_proto::stop::v1::stop_link_service_client::StopLinkServiceClient;
 use midshift_store::{LiveBoard, MemoryFrames, MemoryStore, StoreId};
 use midshift_telemetry::TelemetryService;
-use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::time::Duration;
 use tokio::net::TcpListener;
@@ -48,20 +46,7 @@ async fn session(
     address: SocketAddr,
     previous: Option<Previous>,
 ) -> (Welcome, Streaming<midshift_proto::link::v1::SessionResponse>, mpsc::Sender<SessionRequest>) {
-    let hello = Hello {
-        robot_id: RobotId::parse("r1").expect("an id"),
-        boot_id: "boot".into(),
-        previous,
-        inventory: Inventory::default(),
-        reported: ReportedState::default(),
-        ring: "ring".into(),
-        lanes: BTreeMap::new(),
-        store_id: String::new(),
-        sent_unix_ms: 0,
-        clock_rate_permille: 1000,
-        protocol_versions: vec![1],
-        installed: String::new(),
-    };
+    let hello = Hello { previous, ..Hello::new(RobotId::parse("r1").expect("an id"), "boot", "ring") };
     let (up, said) = mpsc::channel(4);
     up.send((&FromRobot::Hello(Box::new(hello))).into()).await.expect("there is room");
     let mut client = LinkServiceClient::new(dial(address).await);

@@ -104,17 +104,8 @@ mod tests {
     }
 
     fn stopped() -> Item {
-        let stop = Stop {
-            stop_id: StopId::parse("STOP-1").expect("an id"),
-            scope: Scope::Fleet,
-            level: StopLevel::Halt,
-            engaged: Utc(1),
-            actor: "anna".to_owned(),
-            reason: String::new(),
-            region: None,
-            proof: Vec::new(),
-            token_id: None,
-        };
+        let stop_id = StopId::parse("STOP-1").expect("an id");
+        let stop = Stop::new(stop_id, Scope::Fleet, StopLevel::Halt, Utc(1));
         let mut item = Item::new(Writer::Stop, "anna");
         item.create(&StopRecord { stop, reset: None }, "stop.copied");
         item

@@ -84,19 +84,10 @@ impl World {
             self.commit(Item { rows: vec![row(table)], ..Item::new(table.writer(), "test") }).await;
         }
         let stop_id = StopId::parse(&format!("STOP-{n}")).expect("an id");
-        let (at, actor, reason) = (Utc(now), "anna".to_owned(), "over".to_owned());
-        self.latch.engage(Stop {
-            stop_id: stop_id.clone(),
-            scope: Scope::Fleet,
-            level: StopLevel::Halt,
-            engaged: at,
-            actor: actor.clone(),
-            reason: String::new(),
-            region: None,
-            proof: Vec::new(),
-            token_id: None,
-        });
-        self.latch.reset(Reset { stop_id, at, actor, reason, proof: Vec::new(), token_id: None });
+        let (at, actor) = (Utc(now), "anna".to_owned());
+        let stop = Stop::new(stop_id.clone(), Scope::Fleet, StopLevel::Halt, at);
+        self.latch.engage(Stop { actor: actor.clone(), ..stop });
+        self.latch.reset(Reset { actor, ..Reset::new(stop_id, at) });
         self.copy_stops().await;
         let mut telemetry = Item { rows: vec![row(Table::Presence)], ..Item::new(Writer::Telemetry, "test") };
         let fact = Fact { log: Log::RobotInbox, subject: Arc::from("r1"), kind: "event", body: Arc::from("{}") };

@@ -61,15 +61,7 @@ async fn a_robot_that_knows_of_a_reset_which_the_service_has_lost_is_not_shown_a
     let server = Server::start(&folder.path()).await;
     let id = id_of(&server.engage(fleet()).await.unwrap());
     let mut robot = Robot::dial(&server, "r1", vec![]).await.synced().await;
-    let reset = Reset {
-        stop_id: StopId::parse(&id).unwrap(),
-        at: Utc(2),
-        actor: "a".into(),
-        reason: "over".into(),
-        proof: Vec::new(),
-        token_id: None,
-    };
-    robot.latch.reset(reset);
+    robot.latch.reset(Reset::new(StopId::parse(&id).unwrap(), Utc(2)));
     let said = robot.obeying(false);
     assert!(said.inside.is_empty());
     robot.check_in(said).await;

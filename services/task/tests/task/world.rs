@@ -126,27 +126,9 @@ impl World {
     }
     /// The copy of a fleet stop that was engaged, and reset if so.
     pub async fn copies_stop(&self, stop_id: &str, is_reset: bool) {
-        let (stop_id, actor) = (StopId::parse(stop_id).expect("an id"), "anna".to_owned());
-        let reset = Reset {
-            stop_id: stop_id.clone(),
-            at: NOON,
-            actor: actor.clone(),
-            reason: "clear".to_owned(),
-            proof: Vec::new(),
-            token_id: None,
-        };
-        let (level, reason) = (StopLevel::Halt, "a drill".to_owned());
-        let stop = Stop {
-            stop_id,
-            scope: Scope::Fleet,
-            level,
-            engaged: NOON,
-            actor,
-            reason,
-            region: None,
-            proof: Vec::new(),
-            token_id: None,
-        };
+        let stop_id = StopId::parse(stop_id).expect("an id");
+        let reset = Reset::new(stop_id.clone(), NOON);
+        let stop = Stop::new(stop_id, Scope::Fleet, StopLevel::Halt, NOON);
         let mut item = Item::new(Writer::Stop, "stop-follower");
         item.create(&StopRecord { stop, reset: is_reset.then_some(reset) }, "stop.copied");
         self.store.commit(vec![item]).await.pop().expect("a result").expect("applied");

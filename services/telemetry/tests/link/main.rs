@@ -5,6 +5,8 @@ mod flood;
 mod gateways;
 mod machines;
 mod newer;
+#[path = "../../../../tests/src/raw.rs"]
+mod raw;
 mod reach;
 mod replay;
 mod retention;

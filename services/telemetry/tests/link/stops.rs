@@ -10,18 +10,9 @@ use midshift_core::time::Utc;
 use midshift_proto::session::StopFacts;
 
 pub fn record(n: u8, scope: Scope) -> Result<StopRecord> {
-    let stop = Stop {
-        stop_id: StopId::parse(&format!("STOP-{n}"))?,
-        scope,
-        level: StopLevel::Halt,
-        engaged: Utc(1),
-        actor: "anna".to_owned(),
-        reason: "a pallet fell".to_owned(),
-        region: None,
-        proof: vec![7; 64],
-        token_id: None,
-    };
-    Ok(StopRecord { stop, reset: None })
+    let bare = Stop::new(StopId::parse(&format!("STOP-{n}"))?, scope, StopLevel::Halt, Utc(1));
+    let (actor, reason) = ("anna".to_owned(), "a pallet fell".to_owned());
+    Ok(StopRecord { stop: Stop { actor, reason, proof: vec![7; 64], ..bare }, reset: None })
 }
 
 pub async fn copied(world: &World, record: &StopRecord, expect: Expect) {
@@ -47,8 +38,8 @@ async fn a_stop_of_the_copy_goes_down_every_session_whole_and_once_with_its_rese
     copied(&world, &third, Expect::Absent).await;
     assert_eq!(hears(&mut robot).await?, StopFacts { stops: vec![third.stop], resets: vec![] });
     let (actor, reason) = ("bert".to_owned(), "clear".to_owned());
-    let reset =
-        Reset { stop_id: first.stop.stop_id.clone(), at: Utc(2), actor, reason, proof: vec![8; 64], token_id: None };
+    let bare = Reset::new(first.stop.stop_id.clone(), Utc(2));
+    let reset = Reset { actor, reason, proof: vec![8; 64], ..bare };
     copied(&world, &StopRecord { reset: Some(reset.clone()), ..first }, Expect::At(Revision(1))).await;
     assert_eq!(hears(&mut robot).await?, StopFacts { stops: vec![], resets: vec![reset] });
     Ok(())

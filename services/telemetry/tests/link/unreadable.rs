@@ -1,70 +1,35 @@
 //! Bytes of a robot that are no message: it hears so before anything ends.
 
+use crate::raw::Raw;
 use crate::world::{Result, World, hello, world};
 use midshift_core::reason::Code;
 use midshift_core::robot::ReportedState;
 use midshift_proto::link::v1::{SessionRequest, SessionResponse};
 use midshift_proto::session::{Close, CloseCode, FromRobot, Heartbeat, ToRobot, Uplink};
 use prost::Message;
-use prost::bytes::BufMut;
+use prost::bytes::Bytes;
 use tonic::client::Grpc;
-use tonic::codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder};
 use tonic::codegen::http::uri::PathAndQuery;
-use tonic::{Request, Status, Streaming};
-
-/// Says bytes as they are, and reads messages.
-struct Raw;
-
-impl Codec for Raw {
-    type Encode = Vec<u8>;
-    type Decode = SessionResponse;
-    type Encoder = Self;
-    type Decoder = Self;
-
-    fn encoder(&mut self) -> Self {
-        Self
-    }
-    fn decoder(&mut self) -> Self {
-        Self
-    }
-}
-
-impl Encoder for Raw {
-    type Item = Vec<u8>;
-    type Error = Status;
-
-    fn encode(&mut self, item: Vec<u8>, to: &mut EncodeBuf<'_>) -> std::result::Result<(), Status> {
-        to.put_slice(&item);
-        Ok(())
-    }
-}
-
-impl Decoder for Raw {
-    type Item = SessionResponse;
-    type Error = Status;
-
-    fn decode(&mut self, from: &mut DecodeBuf<'_>) -> std::result::Result<Option<SessionResponse>, Status> {
-        SessionResponse::decode(from).map(Some).map_err(|error| Status::internal(error.to_string()))
-    }
-}
+use tonic::{Request, Streaming};
 
 fn bytes_of(message: &FromRobot) -> Vec<u8> {
     SessionRequest::from(message).encode_to_vec()
 }
 
 /// A session in which these bytes are said, one message each.
-async fn says(world: &World, messages: Vec<Vec<u8>>) -> Result<Streaming<SessionResponse>> {
+async fn says(world: &World, messages: Vec<Vec<u8>>) -> Result<Streaming<Bytes>> {
     let mut link = Grpc::new(world.channel.clone());
     link.ready().await?;
     let path = PathAndQuery::from_static("/midshift.link.v1.LinkService/Session");
-    Ok(link.streaming(Request::new(tokio_stream::iter(messages)), path, Raw).await?.into_inner())
+    let messages = tokio_stream::iter(messages.into_iter().map(Bytes::from));
+    Ok(link.streaming(Request::new(messages), path, Raw).await?.into_inner())
 }
 
 /// The last word of a session that has begun; behind it the stream ends without an error.
-async fn last_word(mut down: Streaming<SessionResponse>) -> Result<Close> {
+async fn last_word(mut down: Streaming<Bytes>) -> Result<Close> {
     let mut last = None;
     while let Some(message) = down.message().await? {
-        last = Some(midshift_proto::parse::<ToRobot, _>(message)?);
+        last = Some(midshift_proto::parse::<ToRobot, _>(SessionResponse::decode(message)?)?);
     }
     match last {
         Some(ToRobot::Close(close)) => Ok(close),

@@ -2,7 +2,7 @@
 
 use midshift_core::identity::{Caller, TokenId};
 use midshift_core::ids::{RobotId, SiteId, WaypointId};
-use midshift_core::robot::{Inventory, Lane, Mode, ReportedState, Vitals};
+use midshift_core::robot::{Lane, Mode, ReportedState, Vitals};
 use midshift_core::time::{Clock, ScaledClock, Utc};
 use midshift_core::work::{InboxItem, Live, RobotEvent, Sample, SampleBody};
 use midshift_proto::Leaving;
@@ -13,7 +13,6 @@ use midshift_proto::session::{
 };
 use midshift_store::{FrameLog, LiveBoard, MemoryFrames, MemoryStore, Store, StoreId};
 use midshift_telemetry::{Bugs, Parts, TelemetryService};
-use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -173,20 +172,7 @@ pub struct Robot {
 }
 
 pub fn hello(previous: Option<Previous>) -> Result<Hello> {
-    Ok(Hello {
-        robot_id: RobotId::parse("r1")?,
-        boot_id: "boot".into(),
-        previous,
-        inventory: Inventory::default(),
-        reported: ReportedState::default(),
-        ring: "ring".into(),
-        lanes: BTreeMap::new(),
-        store_id: String::new(),
-        sent_unix_ms: 0,
-        clock_rate_permille: 1000,
-        protocol_versions: vec![1],
-        installed: String::new(),
-    })
+    Ok(Hello { previous, ..Hello::new(RobotId::parse("r1")?, "boot", "ring") })
 }
 
 impl Robot {

@@ -220,14 +220,7 @@ fn names<'a>(ids: impl Iterator<Item = &'a StopId>) -> Names {
 }
 
 fn reset_of(stop: usize) -> Reset {
-    Reset {
-        stop_id: name(0, stop),
-        at: Utc(0),
-        actor: String::new(),
-        reason: String::new(),
-        proof: Vec::new(),
-        token_id: None,
-    }
+    Reset::new(name(0, stop), Utc(0))
 }
 
 fn facts_of(latch: &Latch) -> Facts {
@@ -260,17 +253,7 @@ impl Parties {
 
     fn stop_of(&self, stop: usize) -> Stop {
         let scope = self.stops[stop].map_or(Scope::Fleet, |robot| Scope::Robot(robot_id(robot)));
-        Stop {
-            stop_id: name(0, stop),
-            scope,
-            level: StopLevel::Halt,
-            engaged: Utc(0),
-            actor: String::new(),
-            reason: String::new(),
-            region: None,
-            proof: Vec::new(),
-            token_id: None,
-        }
+        Stop::new(name(0, stop), scope, StopLevel::Halt, Utc(0))
     }
 
     /// Stops over a robot.

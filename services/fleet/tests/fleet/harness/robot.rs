@@ -263,19 +263,12 @@ impl Robot {
     }
     pub(super) fn session(&self) -> Session {
         Session {
-            robot_id: self.id.clone(),
-            session_epoch: self.session_epoch,
             secret: "secret".into(),
             boot_id: format!("boot-{}", self.boots),
             ring: "ring".to_owned(),
-            inventory: self.inventory.clone(),
             applied_work: self.applied,
-            applied_update: 0,
             places: self.places.clone(),
-            clock_offset_ms: None,
-            installed: None,
-            device_key: None,
-            device_key_changed: false,
+            ..Session::new(self.id.clone(), self.session_epoch, self.inventory.clone())
         }
     }
     pub(super) fn lane_mark(&self) -> LaneMark {

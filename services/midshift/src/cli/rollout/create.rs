@@ -158,7 +158,7 @@ impl Create {
     fn refused(&self, status: tonic::Status) -> Exit {
         let exit = Exit::with_facts(status);
         if self.bundle.is_none() && exit.code() == NOT_FOUND {
-            return exit.or_try("midshift bundle ls, then name one with --bundle");
+            return exit.or_try("name one of them with --bundle");
         }
         exit
     }
