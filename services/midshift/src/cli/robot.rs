@@ -2,6 +2,8 @@
 
 mod table;
 
+pub use table::controls;
+
 use super::client::{Call, Change, Exit, ended, follow, unary};
 use super::enrol::{self, Machine};
 use super::explain::verdict;

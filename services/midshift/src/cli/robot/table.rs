@@ -4,14 +4,17 @@
 
 use crate::cli::client::{Call, Exit, unary};
 use crate::cli::out::{Format, Out};
+use crate::way::Line;
 use midshift_core::time::Utc;
 use midshift_proto::convert::{ms_of, time_of};
 use midshift_proto::fleet::v1 as fleet;
+use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::json::to_json;
 use midshift_proto::link::v1 as link;
 use midshift_proto::telemetry::v1;
 use prost_types::Timestamp;
 use std::collections::BTreeMap;
+use tonic::Status;
 
 /// Columns of a robot.
 const HEADER: [&str; 11] =
@@ -125,7 +128,7 @@ pub fn presence(robot: &v1::Robot) -> String {
 /// Lists all robots.
 pub async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
     let robots = robots(call).await?;
-    let (controls, now) = controls(call).await?;
+    let (controls, now) = controls(&mut call.fleet().await?).await?;
     let control = |robot: &v1::Robot| controls.get(&robot.robot_id);
     match out.format {
         Format::Table => {
@@ -170,8 +173,9 @@ async fn robots(call: &Call) -> Result<Vec<v1::Robot>, Exit> {
 }
 
 /// What was decided about robots, by robot, and the moment on the site clock at which that was looked at.
-async fn controls(call: &Call) -> Result<(BTreeMap<String, fleet::RobotControl>, Option<Utc>), Exit> {
-    let mut client = call.fleet().await?;
+pub async fn controls(
+    client: &mut FleetServiceClient<Line>,
+) -> Result<(BTreeMap<String, fleet::RobotControl>, Option<Utc>), Status> {
     let (mut controls, mut page_token) = (BTreeMap::new(), String::new());
     loop {
         let request = fleet::ListRobotControlsRequest { page_size: 1_000, page_token };
