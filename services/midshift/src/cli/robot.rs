@@ -118,7 +118,7 @@ pub enum Verb {
         #[command(flatten)]
         change: Change,
     },
-    /// Settle by your word that it carries nothing, until it says something newer. Refused while it is heard and says itself that it does.
+    /// Settle by your word that it carries nothing. A robot that knows its load by memory alone forgets it; one that feels it is believed.
     Load {
         #[command(flatten)]
         one: One,
@@ -393,8 +393,10 @@ fn control_line(control: &fleet::RobotControl) -> String {
     } else {
         format!("  held by {}", control.hold_tokens.join(" "))
     };
-    let by_word =
-        |word: &fleet::LoadSettled| format!("  carries nothing, says {} ({})", plain(&word.actor), plain(&word.reason));
+    let by_word = |word: &fleet::LoadSettled| {
+        let is_empty = if word.is_told { "is told that it carries nothing" } else { "carries nothing" };
+        format!("  {is_empty}, says {} ({})", plain(&word.actor), plain(&word.reason))
+    };
     let load = control.load_settled.as_ref().map(by_word).unwrap_or_default();
     format!("{}  {duty}{why}  {holder}{holds}{load}", control.robot_id)
 }
