@@ -161,20 +161,15 @@ async fn a_robot_is_offline_after_a_start_with_what_was_known_of_it_until_it_is_
     Ok(())
 }
 
-/// Rows of a robot that was heard three days ago, as a backup of that moment has them; when that was, unix milliseconds.
-async fn restore(store: &dyn Store, clock: &dyn Clock) -> Result<i64> {
-    let heard_unix_ms = clock.now().wall.0 - 3 * 86_400_000;
-    let robot_id = RobotId::parse("r1")?;
-    let last_heard = LastHeard { at_unix_ms: heard_unix_ms, battery_permille: 640, waypoint: None };
-    let online = midshift_core::robot::Presence::Online;
-    let presence = PresenceRow::new(robot_id.clone(), online, heard_unix_ms - 1_000);
-    let session = Session {
-        robot_id,
+/// A session that a robot had once.
+fn session(id: &str, inventory: Inventory) -> Result<Session> {
+    Ok(Session {
+        robot_id: RobotId::parse(id)?,
         session_epoch: 7,
         secret: "secret".into(),
         boot_id: "b-1".to_owned(),
         ring: "ring".to_owned(),
-        inventory: Inventory::default(),
+        inventory,
         applied_work: 0,
         applied_update: 0,
         places: Vec::new(),
@@ -182,9 +177,63 @@ async fn restore(store: &dyn Store, clock: &dyn Clock) -> Result<i64> {
         installed: None,
         device_key: None,
         device_key_changed: false,
-    };
+    })
+}
+
+/// Pages of two robots each that a filter admits: none is empty while there are more.
+async fn paged(world: &World, filter: RobotFilter) -> Result<Vec<String>> {
+    let mut client = TelemetryServiceClient::new(world.channel.clone());
+    let (mut ids, mut page_token) = (Vec::new(), String::new());
+    loop {
+        let request = ListRobotsRequest { filter: Some(filter.clone()), page_size: 2, page_token };
+        let page = client.list_robots(request).await?.into_inner();
+        assert!(page.next_page_token.is_empty() || page.robots.len() == 2, "{filter:?}: {ids:?}");
+        ids.extend(page.robots.into_iter().map(|robot| robot.robot_id));
+        page_token = page.next_page_token;
+        if page_token.is_empty() {
+            return Ok(ids);
+        }
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn pages_of_robots_are_full_as_long_as_more_match_and_the_last_one_says_so() -> Result<()> {
+    let clock = clock();
+    let store: Arc<dyn Store> =
+        Arc::new(MemoryStore::new(SiteId::parse("s")?, StoreId(Arc::from("store-1")), clock.clone()));
     let mut item = Item::new(Writer::Telemetry, "tests");
-    item.create(&session, "session.opened");
+    for n in 1..=12 {
+        let line = if n % 5 == 0 { "b" } else { "a" };
+        let labels = [("line".to_owned(), line.to_owned())].into();
+        item.create(&session(&format!("r{n}"), Inventory { labels, ..Inventory::default() })?, "session.opened");
+    }
+    assert!(store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
+    let world = begin(&store, &clock).await?;
+    assert_eq!(Watcher::of(&world, &[]).await?.presence().await?, Presence::Offline);
+    let all = ["r1", "r10", "r11", "r12", "r2", "r3", "r4", "r5", "r6", "r7", "r8", "r9"];
+    assert_eq!(paged(&world, RobotFilter::default()).await?, all);
+    let labels = [("line".to_owned(), "b".to_owned())].into();
+    assert_eq!(paged(&world, RobotFilter { labels, ..RobotFilter::default() }).await?, ["r10", "r5"]);
+    let robot_ids = ["r9", "r2", "R!", "r99", "r11"].map(str::to_owned).to_vec();
+    assert_eq!(paged(&world, RobotFilter { robot_ids, ..RobotFilter::default() }).await?, ["r11", "r2", "r9"]);
+    for (prefix, begin) in [("r1", &all[..4]), ("r12", &all[3..4]), ("r13", &all[..0]), ("R!", &all[..0])] {
+        let filter = RobotFilter { robot_id_prefix: prefix.to_owned(), ..RobotFilter::default() };
+        assert_eq!(paged(&world, filter).await?, begin, "{prefix}");
+    }
+    let presences = vec![Presence::Online.into()];
+    assert!(paged(&world, RobotFilter { presences, ..RobotFilter::default() }).await?.is_empty());
+    Ok(())
+}
+
+/// Rows of a robot that was heard three days ago, as a backup of that moment has them; when that was, unix milliseconds.
+async fn restore(store: &dyn Store, clock: &dyn Clock) -> Result<i64> {
+    let heard_unix_ms = clock.now().wall.0 - 3 * 86_400_000;
+    let robot_id = RobotId::parse("r1")?;
+    let last_heard = LastHeard { at_unix_ms: heard_unix_ms, battery_permille: 640, waypoint: None };
+    let online = midshift_core::robot::Presence::Online;
+    let presence = PresenceRow::new(robot_id, online, heard_unix_ms - 1_000);
+    let mut item = Item::new(Writer::Telemetry, "tests");
+    item.create(&session("r1", Inventory::default())?, "session.opened");
     item.create(&PresenceRow { last_heard: Some(last_heard), ..presence }, "presence.changed");
     assert!(store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
     Ok(heard_unix_ms)
