@@ -317,14 +317,19 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
         }
         Verb::Load { one, none: _, reason, if_match, change } => {
             let request = fleet::SettleRobotLoadRequest {
-                robot_id: one.robot_id,
+                robot_id: one.robot_id.clone(),
                 request_id: change.request_id,
                 etag: if_match,
                 reason,
                 validate_only: change.dry_run,
             };
             let answer = one.call.fleet().await?.settle_robot_load(unary(request)).await.map_err(Exit::with_facts)?;
-            control(&answer.into_inner().control.unwrap_or_default(), out)?;
+            let settled = answer.into_inner().control.unwrap_or_default();
+            control(&settled, out)?;
+            if settled.load_settled.is_some_and(|word| word.is_told) {
+                // It says within a heartbeat or two that it has forgotten it.
+                out.next(&format!("midshift robot get {}", one.robot_id));
+            }
             Ok(())
         }
         Verb::Pin { one, reason, change } => {
