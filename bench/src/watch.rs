@@ -12,7 +12,7 @@ use midshift_proto::telemetry::v1::{WatchRobotsRequest, WatchRobotsResponse};
 use std::time::Duration;
 use tokio::time::{Instant, sleep, timeout};
 use tonic::Streaming;
-use tonic::transport::Channel;
+use tonic::transport::{Channel, Endpoint};
 
 /// Robots are attached by then.
 const ATTACH_WITHIN: Duration = Duration::from_secs(60);
@@ -20,6 +20,9 @@ const ATTACH_WITHIN: Duration = Duration::from_secs(60);
 const LOOK_EVERY: Duration = Duration::from_millis(200);
 /// Before the first look: what a server does once is done.
 const SETTLE: Duration = Duration::from_secs(5);
+
+/// Bytes that a client takes unread, of a watch and of a connection: HTTP/2's own default, RFC 9113 section 6.9.2.
+const WINDOW: u32 = 65_535;
 
 /// What to measure.
 #[derive(Clone, Debug, clap::Args)]
@@ -89,7 +92,7 @@ async fn round(args: &WatchArgs, engine: &Engine, memory: &mut Memory) -> anyhow
         sleep(LOOK_EVERY).await;
     }
     memory.most.push(most_kib);
-    sleep(SETTLE * 2).await;
+    sleep(SETTLE * 4).await;
     memory.after.push(server.rss_kib()?);
     for watch in &mut watches {
         timeout(SETTLE, ends(watch)).await.context("a watch that nobody read goes on")?;
@@ -108,7 +111,9 @@ async fn open(server: &Child, watches: usize) -> anyhow::Result<Vec<Streaming<Wa
     let mut client: Option<TelemetryServiceClient<Channel>> = None;
     for nth in 0..watches {
         if nth % limits::STREAMS_PER_CONNECTION as usize == 0 {
-            client = Some(TelemetryServiceClient::new(server.channel().await?));
+            let endpoint = Endpoint::from_shared(format!("http://{}", server.address))?;
+            let endpoint = endpoint.initial_stream_window_size(WINDOW).initial_connection_window_size(WINDOW);
+            client = Some(TelemetryServiceClient::new(endpoint.connect().await?));
         }
         let client = client.as_mut().context("no connection")?;
         open.push(client.watch_robots(WatchRobotsRequest::default()).await?.into_inner());

@@ -203,7 +203,7 @@ codes! {
     RobotReconciling = "ROBOT_RECONCILING", "The robot's report differs from the record; it gets work once they agree.";
     RobotObserved = "ROBOT_OBSERVED", "Two sessions claim this robot id. This one is watched and gets no work.";
     RobotLoaded = "ROBOT_LOADED", "The robot carries something that is not of this task."
-        => "Take it off at the robot.";
+        => "Take it off at the robot; if nothing is there, `midshift robot load ROBOT --none` says so.";
     RobotFault = "ROBOT_FAULT", "The robot reports a fault that a person must look at.";
     RobotUnlocated = "ROBOT_UNLOCATED", "The robot has not reported a waypoint of this site.";
     BatteryLow = "BATTERY_LOW", "The charge does not reach pickup, drop and a charger with its reserve.";

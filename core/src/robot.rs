@@ -362,4 +362,7 @@ pub struct Inventory {
     pub agent_version: String,
     /// Maker's model name.
     pub model: String,
+    /// It cannot feel what it carries: it knows that by its own memory, and forgets it by a person's word ([`crate::work::LoadWord`]).
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub load_by_memory: bool,
 }

@@ -36,6 +36,18 @@ pub struct DesiredWork {
     /// Stops that people resumed for it, as long as it says that it waits for that. One whose reset it has not heard of waits on.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub resumed: Vec<StopId>,
+    /// A person's word that it carries nothing, while it says that it does and knows that by its memory alone.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub load_word: Option<LoadWord>,
+}
+
+/// A person has looked: a load that this heartbeat listed, and that has not changed since, is not on the robot.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LoadWord {
+    /// Session of the heartbeat.
+    pub session_epoch: u64,
+    /// Its number.
+    pub hb: u64,
 }
 
 impl Record for DesiredWork {

@@ -135,6 +135,9 @@ pub trait Body: Send {
     fn state(&self, now: SiteTime) -> BodyState;
     /// What it carries.
     fn load(&self) -> Option<Load>;
+    /// A person has looked: it carries nothing. Asked only of a body whose [`Inventory`] says that it knows its load by memory alone. From
+    /// then on [`Body::load`] is none, and its next news says so. A body that feels what it carries ignores it.
+    fn forget_load(&mut self, _now: SiteTime) {}
     /// Whether a step that may have been under way at a restart was done. `task_id` names whose step it was.
     fn check(&self, step: &StepKind, task_id: Option<&midshift_core::ids::TaskId>) -> Checked;
     /// The maker's own test, asked for once when the agent starts and the body stands; an error says what is broken. Until the body says

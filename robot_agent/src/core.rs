@@ -7,6 +7,7 @@ use crate::body::{Body, BodyLimits};
 use crate::bugs::Bugs;
 use crate::lanes::{STATUS_SAMPLE_BYTES, Sender};
 use crate::ledger::SessionMemory;
+use crate::load::ListedLoad;
 use crate::places::Places;
 use crate::replay::{Pace, Replayed};
 use crate::stop::{CheckIn, StopNews, Stops};
@@ -155,6 +156,7 @@ pub struct AgentCore {
     /// None: it has no line to a stop service, and obeys none.
     pub(crate) stop: Option<Box<Stops>>,
     pub(crate) authority: LinkDuration,
+    pub(crate) listed_load: ListedLoad,
     session: Option<Session>,
     sender: Sender,
     pace: Pace,
@@ -214,6 +216,7 @@ impl AgentCore {
             wake_site: None,
             stop: None,
             authority: limits::AUTHORITY,
+            listed_load: ListedLoad::default(),
             session: None,
             pace: Pace::default(),
             writes: Writes::default(),
@@ -392,6 +395,7 @@ impl AgentCore {
         self.sent = SentHeartbeats::new(welcome.session_epoch, self.sent.lease_from());
         self.session =
             Some(Session { epoch: welcome.session_epoch, hb: 0, observed: welcome.observed, told_map: String::new() });
+        self.listed_load.clear();
         let old = &self.kept.ledger.session;
         if old.store_id != welcome.store_id {
             self.answered.clear();
@@ -487,6 +491,11 @@ impl AgentCore {
 
     pub(crate) fn is_observed(&self) -> bool {
         self.session.as_ref().is_some_and(|s| s.observed)
+    }
+
+    /// The session at hand.
+    pub(crate) fn session_epoch(&self) -> Option<u64> {
+        self.session.as_ref().map(|s| s.epoch)
     }
 
     /// Applies an operation and queues it for the store. Not urgent: it may wait for the next second's group.
@@ -718,6 +727,7 @@ impl AgentCore {
         session.hb += 1;
         self.sent.sent(session.hb, now.link);
         let mut reported = self.reported(now);
+        self.listed_load.note(reported.hb, reported.load.as_ref());
         if self.desired.is_none() {
             // Grants are not on the ledger: until the server has said them again, what is not listed here proves nothing.
             reported.applied_work = 0;

@@ -17,6 +17,7 @@ mod installed;
 pub mod lanes;
 pub mod launcher;
 pub mod ledger;
+mod load;
 pub mod memory;
 mod offer;
 pub mod places;

@@ -42,6 +42,7 @@ impl AgentCore {
         given_back.into_iter().for_each(|e| self.emit(Lane::Event, e));
         let (is_held, resume) = (desired.held, desired.resume);
         self.mind_maintenance(desired.maintenance.clone());
+        self.obey_load_word(now, desired.load_word);
         let assignment = desired.assignment.clone();
         self.desired = Some(desired);
         self.obey(now);

@@ -215,7 +215,10 @@ impl AgentCore {
                     self.echo_after = Some(now.link);
                 }
             }
-            BodyNews::Load(load) => self.emit(Lane::Event, RobotEvent::Load(load)),
+            BodyNews::Load(load) => {
+                self.listed_load.clear();
+                self.emit(Lane::Event, RobotEvent::Load(load));
+            }
             BodyNews::Fault(fault, stands) => self.fault_changed(fault, stands),
         }
     }

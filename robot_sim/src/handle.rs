@@ -96,6 +96,9 @@ impl Body for SimHandle {
     fn load(&self) -> Option<Load> {
         self.lock().load()
     }
+    fn forget_load(&mut self, now: SiteTime) {
+        self.lock().forget_load(now);
+    }
     fn check(&self, step: &StepKind, task_id: Option<&TaskId>) -> Checked {
         self.lock().check(step, task_id)
     }

@@ -116,6 +116,7 @@ class Session:
         self.cursor = 0  # EVENT numbers up to here were sent in this session
         self.period_ms = 1000
         self.beat_at_ms = 0.0
+        self.load_since = 0  # the heartbeat from which on each one lists the load at hand; 0: none
         threading.Thread(target=self._read, args=(inbox,), daemon=True).start()
 
     def _read(self, inbox: queue.Queue) -> None:
@@ -244,7 +245,13 @@ class Robot:
             robot_id=self.args.robot_id,
             boot_id=self.boot_id,
             previous=old and link.PreviousSession(session_epoch=old["epoch"], secret=old["secret"]),
-            inventory=link.Inventory(capabilities=CAPABILITIES, payload_g=20_000, software="1.0.0", model="minimal"),
+            inventory=link.Inventory(
+                capabilities=CAPABILITIES,
+                payload_g=20_000,
+                software="1.0.0",
+                model="minimal",
+                load_by_memory=True,
+            ),
             reported=self.reported(),
             ring=self.memory["ring"],
             store_id=old["store_id"] if old else "",
@@ -353,6 +360,8 @@ class Robot:
         if now >= self.session.beat_at_ms:
             self.session.beat_at_ms = now + self.session.period_ms
             self.session.hb += 1
+            if self.memory["load"] and not self.session.load_since:
+                self.session.load_since = self.session.hb
             uplink.heartbeat.reported.CopyFrom(self.reported())
             uplink.heartbeat.sent_unix_us = int(time.time() * 1e6)
             if self.clock:
@@ -429,6 +438,8 @@ class Robot:
             if not used and (on == 0 or (on is None and not grant.HasField("entry"))):
                 self.put("inside", grant.place_id, grant.grant_id)
         self.memory["used"] = [grant_id for grant_id in self.memory["used"] if grant_id in listed]
+        if desired.HasField("load_word"):
+            self.forget_load(desired.load_word)
         if not self.memory["holder"]:
             self.resume_needed = False
         elif desired.held:
@@ -436,6 +447,11 @@ class Robot:
         elif self.resume_needed and desired.HasField("resume") and not self.stale(desired.resume):
             self.resume_needed = False
         self.assigned(desired.assignment if desired.HasField("assignment") else None)
+
+    def forget_load(self, word: link.LoadWord) -> None:
+        """A person has looked: what that heartbeat listed, and what has not changed since, is not there."""
+        if word.session_epoch == self.session.epoch and 0 < self.session.load_since <= word.hb:
+            self.carries("nothing", "", "")
 
     def give_back(self, grant: link.GrantedPlace) -> None:
         """A grant that was not used and will not be."""
@@ -719,6 +735,8 @@ class Robot:
 
     def carries(self, action: str, subject: str, item: str) -> None:
         self.memory["load"] = {"task_id": subject, "item": item} if action == "pick" else None
+        if self.session:
+            self.session.load_since = 0
         self.emit(load=link.LoadReport(load=self.memory["load"] and link.Load(**self.memory["load"])))
 
     def was_done(self, holder: dict) -> bool:

@@ -3,7 +3,7 @@
 
 use super::Tx;
 pub use super::asked::Command;
-use super::rows::{Cordon, HolderState, LoadSettled, Place, PlaceHolder, RobotControl};
+use super::rows::{Cordon, HolderState, Place, PlaceHolder, RobotControl};
 use super::view::View;
 use super::{Board, drain, heard, incidents, load};
 use crate::audit::{self, Note};
@@ -190,9 +190,7 @@ pub fn apply(tx: &mut Tx, board: &Board, command: &Command, actor: &str) {
         }
         Command::SettleLoad { robot_id, reason } => {
             let mut control = control(tx, robot_id);
-            let (session_epoch, hb) = load::newest_word(tx.view, board, robot_id);
-            let (reason, actor, since) = (reason.clone(), actor.to_owned(), tx.now.utc);
-            control.load_settled = Some(LoadSettled { reason, actor, since, session_epoch, hb });
+            control.load_settled = Some(load::settle(tx, board, robot_id, reason, actor));
             tx.put(control, "robot.load_settled");
         }
         Command::Drain { robot_id, reason, within_ms } => drain::ask(tx, robot_id, reason, actor, *within_ms),

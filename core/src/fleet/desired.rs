@@ -8,7 +8,7 @@ use super::anchor::{anchor, is_worn, next_generation};
 use super::attempts;
 use super::rows::{HolderState, RobotHolder};
 use super::view::{View, held};
-use super::{Board, claims, way};
+use super::{Board, claims, load, way};
 use crate::authority::Authority;
 use crate::ids::{AttemptId, RobotId};
 use crate::limits;
@@ -57,6 +57,7 @@ pub fn compose(tx: &mut Tx, robot_id: &RobotId, board: &Board, releases: &Releas
             _ => None,
         },
         resumed: tx.view.control.get(robot_id.as_str()).map(|c| c.row.resumed.clone()).unwrap_or_default(),
+        load_word: live.and_then(|live| load::word_for(tx.view, live)),
     };
     if let Some(attempt) = unlawful {
         let reason = crate::reason::Reason::from(crate::reason::Code::AssignmentUnlawful).with("attempt", attempt);
@@ -86,6 +87,7 @@ pub fn empty(robot_id: &RobotId) -> DesiredWork {
         closed: Vec::new(),
         maintenance: None,
         resumed: Vec::new(),
+        load_word: None,
     }
 }
 

@@ -178,22 +178,25 @@ pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Optio
     Some(RobotExplanation { verdict, candidates: candidates.collect() })
 }
 
-/// The robot carries what is of no task that waits for it, or of one that waits for a person.
+/// The robot carries what is of no task that waits for it, or of one that waits for a person, or what a person has put back.
 fn carries(view: &View, board: &Board, robot_id: &RobotId) -> Option<Reason> {
     let load = load::carried(view, board.get(robot_id)?)?;
     let task = load.task_id.as_ref().and_then(|id| view.task(id));
     let asks = task.is_some_and(|task| task.phase == Phase::NeedsOperator);
-    if !asks && task.is_some_and(|task| task.opened.as_ref().is_none_or(|r| r == robot_id)) {
+    let is_its_own = |task: &TaskState| {
+        let is_item = view.intake(&task.task_id).is_some_and(|intake| load::is_item_of(load, task, intake));
+        is_item && task.opened.as_ref().is_none_or(|r| r == robot_id)
+    };
+    if !asks && task.is_some_and(is_its_own) {
         return None;
     }
     let reason = match task.filter(|_| asks) {
         Some(task) => {
             let told = format!("The robot carries an item of task {}, which waits for a person's word.", task.task_id);
             let resolve = format!("a person: midshift task resolve {}", task.task_id);
-            Reason::new(Code::RobotLoaded, told).with(WAITS_FOR, resolve)
+            Reason::new(Code::RobotLoaded, told).with("item", &load.item).with(WAITS_FOR, resolve)
         }
-        None => Reason::from(Code::RobotLoaded),
+        None => load::explain_load(view, robot_id, load),
     };
-    let reason = reason.with("item", &load.item);
     Some(load.task_id.iter().fold(reason, |reason, task_id| reason.with("task_id", task_id)))
 }

@@ -43,6 +43,7 @@ pub fn robot(view: &mut View, now: Now, robot_id: &RobotId, board: &Board, plan:
             return lease_over(tx, robot_id, &mut tally);
         }
         if let Some(live) = board.get(robot_id) {
+            load::end_word(tx, live);
             if let Some(load) = load::carried(tx.view, live) {
                 inbox::carries(tx, robot_id, load);
             }

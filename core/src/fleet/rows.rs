@@ -123,6 +123,9 @@ pub struct LoadSettled {
     pub session_epoch: u64,
     /// Its number; the highest there is: of all of that session.
     pub hb: u64,
+    /// The robot was heard and said by its memory that it carries something: it is told, and counts as loaded until it says otherwise.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub is_told: bool,
 }
 
 /// What people and the breaker decided about a robot.

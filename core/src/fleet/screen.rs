@@ -124,9 +124,9 @@ pub fn pair(
     just_refused(view, live, task)?;
     let load = load::carried(view, live);
     if let Some(load) = load
-        && load.task_id.as_ref() != Some(&task.task_id)
+        && !load::is_item_of(load, task, intake)
     {
-        return Err(Reason::from(Code::RobotLoaded).with("item", &load.item));
+        return Err(load::explain_load(view, robot_id, load));
     }
     let (here, goals) = journey(view, live, task, intake)?;
     place(view, here, &goals)?;

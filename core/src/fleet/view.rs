@@ -191,7 +191,6 @@ macro_rules! viewed {
 
 viewed! {
     Timer => timers;
-    RobotControl => control;
     RobotCounter => counters;
     SiteRow => sites;
     DesiredWork => desired_work;
@@ -337,6 +336,20 @@ impl Viewed<View> for RobotAuthority {
     }
     fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
         view.dirty.extend(view.authority.get(id).map(|a| a.row.robot_id.clone()));
+    }
+}
+
+impl Viewed<View> for RobotControl {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.control
+    }
+    /// A person's word about its load goes to the robot, whichever process took it.
+    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+        let word = |control: &Self| control.load_settled.clone();
+        let new = view.control.get(id).map(|c| &c.row);
+        if new.and_then(word) != old.and_then(word) {
+            view.dirty.extend(new.map(|control| control.robot_id.clone()));
+        }
     }
 }
 

@@ -35,6 +35,7 @@ impl From<&Inventory> for v1::Inventory {
             software: inventory.software.clone(),
             agent_version: inventory.agent_version.clone(),
             model: inventory.model.clone(),
+            load_by_memory: inventory.load_by_memory,
         }
     }
 }
@@ -67,6 +68,7 @@ impl Parse<Inventory> for v1::Inventory {
             software: self.software,
             agent_version: self.agent_version,
             model: self.model,
+            load_by_memory: self.load_by_memory,
         })
     }
 }

@@ -8,7 +8,9 @@ use crate::link::v1;
 use midshift_core::ids::{AreaId, DrainId, PlaceId, RobotId, WaypointId};
 use midshift_core::policy::AreaPolicy;
 use midshift_core::reason::Violations;
-use midshift_core::work::{Assignment, DesiredPolicy, DesiredWork, GrantedPlace, RoutePoint, StepKind, WorkStep};
+use midshift_core::work::{
+    Assignment, DesiredPolicy, DesiredWork, GrantedPlace, LoadWord, RoutePoint, StepKind, WorkStep,
+};
 
 impl From<&WorkStep> for v1::WorkStep {
     fn from(step: &WorkStep) -> Self {
@@ -190,6 +192,7 @@ impl From<&DesiredWork> for v1::DesiredWork {
             closed: work.closed.iter().map(Into::into).collect(),
             maintenance: work.maintenance.as_ref().map(ToString::to_string).unwrap_or_default(),
             resumed: names(&work.resumed),
+            load_word: work.load_word.map(|LoadWord { session_epoch, hb }| v1::LoadWord { session_epoch, hb }),
         }
     }
 }
@@ -204,6 +207,7 @@ impl Parse<DesiredWork> for v1::DesiredWork {
         let closed = list(self.closed, at.field("closed"), bad);
         let maintenance = maybe_id(&self.maintenance, DrainId::parse, at.field("maintenance"), bad);
         let resumed = stop_ids(&self.resumed, at.field("resumed"), bad);
+        let load_word = maybe(self.load_word, at.field("load_word"), bad);
         Some(DesiredWork {
             robot_id: robot_id?,
             generation: generation?,
@@ -214,7 +218,16 @@ impl Parse<DesiredWork> for v1::DesiredWork {
             closed: closed?,
             maintenance: maintenance?,
             resumed: resumed?,
+            load_word: load_word?,
         })
+    }
+}
+
+impl Parse<LoadWord> for v1::LoadWord {
+    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<LoadWord> {
+        let session_epoch = from_one(self.session_epoch, at.field("session_epoch"), bad);
+        let hb = from_one(self.hb, at.field("hb"), bad);
+        Some(LoadWord { session_epoch: session_epoch?, hb: hb? })
     }
 }
 

@@ -15,8 +15,8 @@ use midshift_core::stop::{Reset, Scope, Stop};
 use midshift_core::time::Utc;
 use midshift_core::update::{ActivationGrant, DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState};
 use midshift_core::work::{
-    Assignment, AttemptReport, DesiredPolicy, DesiredWork, Effect, Gap, GrantedPlace, InboxItem, PlaceNews, RobotEvent,
-    RoutePoint, Sample, SampleBody, StepKind, WorkState, WorkStats, WorkStep,
+    Assignment, AttemptReport, DesiredPolicy, DesiredWork, Effect, Gap, GrantedPlace, InboxItem, LoadWord, PlaceNews,
+    RobotEvent, RoutePoint, Sample, SampleBody, StepKind, WorkState, WorkStats, WorkStep,
 };
 use midshift_proto::link::v1;
 use midshift_proto::parse;
@@ -230,6 +230,7 @@ fn work() -> DesiredWork {
         closed: vec![attempt(), errand()],
         maintenance: Some(drain()),
         resumed: vec![stop_id(), stop_id()],
+        load_word: Some(LoadWord { session_epoch: 7, hb: 40 }),
     }
 }
 
@@ -259,6 +260,7 @@ fn hello() -> Hello {
             software: "1.4.0".into(),
             agent_version: "0.1.0".into(),
             model: "h-1".into(),
+            load_by_memory: true,
         },
         reported: ReportedState { hb: 0, session_epoch: 0, ..reported() },
         ring: "ring-a".into(),

@@ -10,6 +10,7 @@ mod forward;
 mod full;
 mod key_sets;
 mod lanes;
+mod loads;
 mod offers;
 mod power;
 mod release;

@@ -38,6 +38,8 @@ pub struct BodyLog {
     pub waypoint: Option<WaypointId>,
     pub pose: Pose,
     pub load: Option<Load>,
+    /// It knows its load by memory alone.
+    pub load_by_memory: bool,
     /// Levels that it was told, in order.
     pub levels: Vec<StopLevel>,
     pub mode: Mode,
@@ -65,6 +67,7 @@ impl TestBody {
             waypoint: Some(waypoint(name)),
             pose: Pose { x_mm: x_of(name), ..Pose::default() },
             load: None,
+            load_by_memory: false,
             levels: Vec::new(),
             mode: Mode::Automatic,
             hardware_stop: HardwareStop::None,
@@ -120,7 +123,8 @@ impl TestBody {
 impl Body for TestBody {
     fn capabilities(&self) -> Inventory {
         let capabilities = vec!["pick".into(), "place".into()];
-        Inventory { capabilities, model: crate::release::MODEL.to_owned(), ..Inventory::default() }
+        let (model, load_by_memory) = (crate::release::MODEL.to_owned(), self.lock().load_by_memory);
+        Inventory { capabilities, model, load_by_memory, ..Inventory::default() }
     }
     fn limits(&self) -> BodyLimits {
         BodyLimits { speed_mm_s: 1_500, floor_speed_mm_s: 50, battery_critical_permille: 100 }
@@ -189,6 +193,9 @@ impl Body for TestBody {
     }
     fn load(&self) -> Option<Load> {
         self.lock().load.clone()
+    }
+    fn forget_load(&mut self, _: SiteTime) {
+        self.says(BodyNews::Load(None));
     }
     fn check(&self, _: &StepKind, _: Option<&TaskId>) -> Checked {
         self.lock().checked
@@ -493,6 +500,7 @@ impl Rig {
             closed: Vec::new(),
             maintenance: None,
             resumed: Vec::new(),
+            load_word: None,
         }
     }
     /// Sends desired work with the next generation.

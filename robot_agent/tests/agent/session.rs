@@ -420,6 +420,7 @@ async fn a_robot_on_its_file_takes_work_over_the_wire_and_does_it() {
         closed: Vec::new(),
         maintenance: None,
         resumed: Vec::new(),
+        load_word: None,
     };
     session.say(ToRobot::Downlink(Box::new(Downlink { work: Some(work), ..Downlink::default() }))).await;
     let mut states = Vec::new();

@@ -25,6 +25,7 @@ impl Body for SimBody {
             software: self.config.software.clone(),
             agent_version: String::new(),
             model: MODEL.to_owned(),
+            load_by_memory: false,
         }
     }
     fn limits(&self) -> BodyLimits {

@@ -28,7 +28,7 @@ pub fn control(view: &View, board: &Board, robot_id: &RobotId) -> v1::RobotContr
     };
     let errand = view.held_by(robot_id).and_then(|id| view.attempt(id)).and_then(|a| a.errand);
     let live = board.get(robot_id).map(AsRef::as_ref);
-    let load_settled = load::settled(view, robot_id, live);
+    let load_settled = load::standing_word(view, robot_id, live);
     let hold = |h: &HoldToken| v1::Hold { token: h.token.clone(), since: Some(timestamp(h.since)) };
     v1::RobotControl {
         robot_id: robot_id.to_string(),
@@ -54,6 +54,7 @@ pub fn control(view: &View, board: &Board, robot_id: &RobotId) -> v1::RobotContr
             reason: word.reason.clone(),
             since: Some(timestamp(word.since)),
             actor: word.actor.clone(),
+            is_told: word.is_told,
         }),
         etag: etag(rowed.map_or(Revision(0), |c| c.revision)),
         drain: drain(view, robot_id),

@@ -8,7 +8,7 @@ use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::robot::{Lane, Presence};
 use midshift_core::rows::{Log, Seq};
 use midshift_core::time::Utc;
-use midshift_core::work::{InboxEntry, InboxItem, Live, RobotEvent, SampleBody};
+use midshift_core::work::{InboxEntry, InboxItem, Live, RobotEvent, SampleBody, Session};
 use midshift_proto::access::caller;
 use midshift_proto::convert::WireEnum;
 use midshift_proto::convert::telemetry::{RobotView, encode_event, encode_robot, shown_presence};
@@ -34,6 +34,25 @@ struct Filter {
     robot_id_prefix: String,
     presences: BTreeSet<Presence>,
     labels: BTreeMap<String, String>,
+}
+
+impl Filter {
+    /// Ids of robots that may match, in order, behind the token of a page: those that are named, or those that begin so. Each is then held against
+    /// the rest of the filter ([`admits`]) in memory, so a list costs by the number of robots that there are, and by nothing that is over.
+    fn candidates(&self, sessions: &BTreeMap<RobotId, Session>, after: &str) -> Vec<RobotId> {
+        let is_behind = |id: &&RobotId| id.as_str() > after;
+        let begins = |id: &&RobotId| id.as_str().starts_with(&self.robot_id_prefix);
+        if !self.robot_ids.is_empty() {
+            let named = self.robot_ids.iter().filter_map(|id| RobotId::parse(id).ok());
+            return named.filter(|id| is_behind(&id) && sessions.contains_key(id)).collect();
+        }
+        if self.robot_id_prefix.is_empty() {
+            return sessions.keys().filter(is_behind).cloned().collect();
+        }
+        // What is no beginning of an id begins none.
+        let Ok(first) = RobotId::parse(&self.robot_id_prefix) else { return Vec::new() };
+        sessions.range(first..).map(|(id, _)| id).take_while(begins).filter(is_behind).cloned().collect()
+    }
 }
 
 fn filter(wire: Option<v1::RobotFilter>, by: Caller, bad: &mut Violations) -> Filter {
@@ -105,11 +124,11 @@ impl TelemetryService {
         let filter = filter(r.filter, by, &mut bad);
         bad.finish()?;
         let inner = &self.inner;
-        let ids: Vec<RobotId> = inner.picture.rows().sessions.keys().cloned().collect();
-        let found = ids.iter().filter(|id| admits(inner, &filter, id)).map(|id| (id.to_string(), id));
-        let (found, next_page_token) = pages::page(found, &r.page_token, size);
-        let robots =
-            found.into_iter().filter_map(|id| encode(inner, id, inner.parts.board.get(id).as_deref())).collect();
+        let ids = filter.candidates(&inner.picture.rows().sessions, &r.page_token);
+        let shown = |id: &RobotId| encode(inner, id, inner.parts.board.get(id).as_deref());
+        let found = ids.iter().filter(|id| admits(inner, &filter, id));
+        let found = found.filter_map(|id| Some((id.to_string(), shown(id)?)));
+        let (robots, next_page_token) = pages::page(found, "", size);
         Ok(v1::ListRobotsResponse { robots, next_page_token })
     }
 

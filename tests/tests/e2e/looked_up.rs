@@ -3,7 +3,7 @@
 use crate::harness::{Server, folder};
 use crate::robots::Robots;
 use crate::rolled_out::call;
-use crate::stopped::StopServer;
+use crate::stopped::{StopServer, until_held};
 use anyhow::ensure;
 use midshift_core::site::{DEMO, Site, text};
 
@@ -28,7 +28,8 @@ async fn a_robot_and_a_stop_are_meant_by_a_beginning_that_only_they_have() -> an
     let server = Server::start(dir.path()).await?;
     let stops = StopServer::start(dir.path(), server.address).await?;
     let (at, stop_at) = (server.address.to_string(), stops.address.to_string());
-    let _robot = Robots::start(dir.path(), server.address, server.address, &site, 1).await?;
+    let beside = Some(stops.address);
+    let robot = Robots::start_beside(dir.path(), server.address, server.address, beside, &site, 1).await?;
     for (verb, typed) in [("get", "rbt-01"), ("get", "r"), ("explain", "rbt"), ("uncordon", "rbt-0")] {
         ensure!(named(&["robot", verb, typed, "--server", &at])? == "rbt-01", "{verb} {typed}");
     }
@@ -37,6 +38,9 @@ async fn a_robot_and_a_stop_are_meant_by_a_beginning_that_only_they_have() -> an
 
     let engage = || named(&["stop", "--all", "--no-wait", "--reason", "tried", "--stop-server", &stop_at]);
     let (first, second) = (engage()?, engage()?);
+    for stop_id in [&first, &second] {
+        until_held(server.address, &robot.ids(), &format!("stop:{stop_id}")).await?;
+    }
     let common = first.bytes().zip(second.bytes()).take_while(|(a, b)| a == b).count();
     let reset =
         |typed: &str| ["stop", "reset", typed, "--reason", "tried", "--stop-server", &stop_at].map(str::to_owned);
@@ -49,5 +53,16 @@ async fn a_robot_and_a_stop_are_meant_by_a_beginning_that_only_they_have() -> an
     ensure!(named(&words(&reset(&first[..=common])))? == first, "by its beginning");
     ensure!(named(&words(&reset(&second)))? == second, "by its name");
     ensure!(stops.engaged().await?.is_empty(), "both are reset");
+
+    for stop_id in [&first, &second] {
+        until_held(server.address, &robot.ids(), &format!("resume:{stop_id}")).await?;
+    }
+    let resume = |typed: &str| ["resume", "--stop", typed, "--reason", "tried", "--server", &at].map(str::to_owned);
+    let (code, said) = refused(&words(&resume(&first[..common])))?;
+    ensure!(code == Some(2) && said.contains(&first) && said.contains(&second), "{code:?} {said}");
+    let (code, said) = refused(&words(&resume("STOP-1999")))?;
+    ensure!(code == Some(4) && said.contains("Nothing is known of this stop"), "{code:?} {said}");
+    named(&words(&resume(&first[..=common])))?;
+    named(&words(&resume(&second)))?;
     Ok(())
 }

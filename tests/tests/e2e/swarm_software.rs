@@ -314,6 +314,7 @@ impl Bench {
             closed: Vec::new(),
             maintenance: drain_id.filter(|_| !works),
             resumed: Vec::new(),
+            load_word: None,
         };
         let echo = Some(Echo { hb, clock: ClockSample::default() });
         let down = Downlink { echo, acks, work: Some(work), update: Some(update), ..Downlink::default() };

@@ -382,6 +382,41 @@ async fn rollouts_are_alike(otas: Both) -> anyhow::Result<()> {
     }
     etags.dedup();
     ensure!(etags.len() == 1, "both tell the same one: {etags:?}");
+    watches_go_forward(otas).await
+}
+
+/// The version of a roll-out that a process answers to a command with.
+async fn acted(at: SocketAddr, words: &[&str]) -> anyhow::Result<u64> {
+    let at = at.to_string();
+    let said = tokio::task::block_in_place(|| call(&[words, &["--server", &at, "-o", "json"]].concat()))?;
+    ensure!(said.status.success(), "{words:?}: {}", String::from_utf8_lossy(&said.stderr));
+    let answer: serde_json::Value = serde_json::from_slice(&said.stdout)?;
+    Ok(answer["etag"].as_str().context("an etag")?.parse()?)
+}
+
+/// Watches that begin one after the other tell first nothing older than `newest`, or than what was told before; the last version.
+async fn told_forward(rollout_id: &str, mut newest: u64, watched: [SocketAddr; 3]) -> anyhow::Result<u64> {
+    for at in watched {
+        let request = WatchRolloutRequest { rollout_id: rollout_id.to_owned(), ..Default::default() };
+        let mut watch = RolloutServiceClient::new(channel(at)?).watch_rollout(request).await?.into_inner();
+        let told = watch.message().await?.and_then(|told| told.rollout).context("a roll-out")?;
+        let told: u64 = told.etag.parse()?;
+        ensure!(told >= newest, "{at} tells {told} of {rollout_id} after {newest}");
+        newest = told;
+    }
+    Ok(newest)
+}
+
+/// Whoever has the answer of one process, or was told by its watch, and goes on at the other is told nothing older there.
+async fn watches_go_forward(otas: Both) -> anyhow::Result<()> {
+    for (nth, [here, there]) in [otas, [otas[1], otas[0]]].into_iter().enumerate() {
+        let id = &format!("forward-{nth}");
+        let made = acted(here, &["rollout", "create", id, "--bundle", "walk-1.5.0", "--waves", "1,rest"]).await?;
+        let told = told_forward(id, made, [there, here, there]).await?;
+        let aborted = acted(there, &["rollout", "abort", id, "--reason", "tried"]).await?;
+        ensure!(aborted > told, "it was changed: {aborted} after {told}");
+        told_forward(id, aborted, [here, there, here]).await?;
+    }
     Ok(())
 }
 

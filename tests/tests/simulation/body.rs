@@ -72,6 +72,9 @@ impl Body for WatchedBody {
     fn load(&self) -> Option<Load> {
         self.inner.load()
     }
+    fn forget_load(&mut self, now: SiteTime) {
+        self.inner.forget_load(now);
+    }
     fn check(&self, step: &StepKind, task_id: Option<&TaskId>) -> Checked {
         self.inner.check(step, task_id)
     }

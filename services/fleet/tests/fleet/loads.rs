@@ -58,6 +58,77 @@ async fn a_person_settles_what_a_robot_carries_unless_the_robot_or_a_task_says_o
     w.lawful().await;
 }
 
+/// r1 has broken down with the item of T1 and is heard; a person has put the item back and lets it work again.
+async fn put_back(load_by_memory: bool) -> World {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").inventory.load_by_memory = load_by_memory;
+    w.connect("r1").await;
+    w.r("r1").fails = Some((2, jam()));
+    w.submit("T1", "A", "B").await;
+    w.until_phase("T1", Phase::NeedsOperator).await;
+    let uncordon = v1::UncordonRobotRequest { robot_id: "r1".to_owned(), ..Default::default() };
+    w.fleet.uncordon_robot(Request::new(uncordon)).await.expect("uncordoned");
+    let task_id = TaskId::parse("T1").expect("an id");
+    w.ask(Ask::Resolve { task_id, resolution: Resolution::RequeuePutBack }).await;
+    w.until("the item is on the shelf", |s| s.phase("T1") == Phase::Queued && s.task("T1").opened.is_none()).await;
+    w
+}
+
+/// What T1 waits for.
+async fn task_waits_for(w: &World) -> String {
+    let ask = v1::ExplainTaskRequest { task_id: "T1".to_owned() };
+    let told = w.fleet.explain_task(Request::new(ask)).await.expect("an explanation").into_inner();
+    let verdict = told.explanation.expect("an explanation").verdict.expect("a verdict");
+    verdict.metadata.get("waits_for").cloned().unwrap_or_default()
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_says_that_it_carries_an_item_that_was_put_back_is_not_given_its_task() {
+    let mut w = put_back(false).await;
+    w.pass_while(60, "its hand is full", |s| s.phase("T1") == Phase::Queued && s.task("T1").opened.is_none()).await;
+    assert_eq!(explained(&w).await, ("ROBOT_LOADED".to_owned(), false));
+    assert_eq!(task_waits_for(&w).await, "robot r1: ROBOT_LOADED", "both say so");
+    assert_eq!(settle(&w).await, Err("ROBOT_LOADED".to_owned()), "it feels it");
+    w.r("r1").load = None;
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_load_that_a_robot_only_remembers_is_settled_by_a_persons_word_while_it_is_heard() {
+    let mut w = put_back(true).await;
+    w.pass_while(10, "its hand is full, it thinks", |s| s.phase("T1") == Phase::Queued).await;
+    w.r("r1").hears = false;
+    let told = settle(&w).await.expect("it is told").load_settled.expect("a word");
+    assert!(told.is_told);
+    w.pass_while(10, "it has not heard of it", |s| s.phase("T1") == Phase::Queued && s.task("T1").opened.is_none())
+        .await;
+    let seen = w.seen().await;
+    let word = seen.work("r1").load_word.expect("a word for the robot");
+    assert_eq!(word.session_epoch, w.r("r1").session_epoch());
+    w.r("r1").hears = true;
+    w.until_phase("T1", Phase::Succeeded).await;
+    let seen = w.seen().await;
+    assert!(seen.control("r1").load_settled.is_none() && seen.work("r1").load_word.is_none(), "it is over");
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_word_that_a_robot_was_told_does_not_reach_into_its_next_session() {
+    let mut w = put_back(true).await;
+    w.r("r1").hears = false;
+    settle(&w).await.expect("it is told");
+    w.pass(2).await;
+    w.connect("r1").await;
+    w.r("r1").hears = true;
+    w.pass_while(60, "its hand is full, it thinks", |s| s.phase("T1") == Phase::Queued).await;
+    assert_eq!(explained(&w).await, ("ROBOT_LOADED".to_owned(), false));
+    settle(&w).await.expect("it is told again");
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
 #[tokio::test(start_paused = true)]
 async fn a_word_about_a_load_holds_for_the_process_that_plans_next() {
     let mut w = World::on(CORRIDOR).await;

@@ -1,10 +1,14 @@
 //! The reconciler ends and begins again on the same rows.
 
+use crate::explain::why;
 use crate::harness::{Answer, World};
+use midshift_core::ids::RobotId;
 use midshift_core::reason::Code;
-use midshift_core::robot::Mode;
+use midshift_core::robot::{Mode, Presence};
+use midshift_core::rows::{Item, Writer};
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::{Attempt, Phase, TaskState, Then};
+use midshift_core::work::PresenceRow;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
 use std::time::Duration;
@@ -27,6 +31,25 @@ async fn a_restart_loses_nothing_and_repeats_nothing() {
         let seen = w.until_phase(&format!("T{n}"), Phase::Succeeded).await;
         assert_eq!(seen.task(&format!("T{n}")).epoch, 1, "nothing was redone");
     }
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_a_backup_has_as_heard_gets_no_work_before_it_is_heard() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.pass(2).await;
+    let row = PresenceRow::new(RobotId::parse("r1").expect("an id"), Presence::Online, 0);
+    let mut item = Item::new(Writer::Telemetry, "tests");
+    item.create(&row, "presence.changed");
+    w.store.commit(vec![item]).await.pop().expect("a result").expect("applied");
+    w.restore().await;
+    w.submit("T1", "A", "B").await;
+    w.pass_while(60, "there is nobody to do it", |s| s.phase("T1") == Phase::Queued).await;
+    assert_eq!(why(&w, "T1").await, ("WAITING_FOR_ROBOT".to_owned(), "ROBOT_OFFLINE".to_owned()));
+    w.r("r1").mend();
+    w.connect("r1").await;
+    w.until_phase("T1", Phase::Succeeded).await;
     w.lawful().await;
 }
 

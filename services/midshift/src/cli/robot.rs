@@ -2,6 +2,8 @@
 
 mod table;
 
+pub use table::controls;
+
 use super::client::{Call, Change, Exit, ended, follow, unary};
 use super::enrol::{self, Machine};
 use super::explain::verdict;
@@ -116,7 +118,7 @@ pub enum Verb {
         #[command(flatten)]
         change: Change,
     },
-    /// Settle by your word that it carries nothing, until it says something newer. Refused while it is heard and says itself that it does.
+    /// Settle by your word that it carries nothing. A robot that knows its load by memory alone forgets it; one that feels it is believed.
     Load {
         #[command(flatten)]
         one: One,
@@ -315,14 +317,19 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
         }
         Verb::Load { one, none: _, reason, if_match, change } => {
             let request = fleet::SettleRobotLoadRequest {
-                robot_id: one.robot_id,
+                robot_id: one.robot_id.clone(),
                 request_id: change.request_id,
                 etag: if_match,
                 reason,
                 validate_only: change.dry_run,
             };
             let answer = one.call.fleet().await?.settle_robot_load(unary(request)).await.map_err(Exit::with_facts)?;
-            control(&answer.into_inner().control.unwrap_or_default(), out)?;
+            let settled = answer.into_inner().control.unwrap_or_default();
+            control(&settled, out)?;
+            if settled.load_settled.is_some_and(|word| word.is_told) {
+                // It says within a heartbeat or two that it has forgotten it.
+                out.next(&format!("midshift robot get {}", one.robot_id));
+            }
             Ok(())
         }
         Verb::Pin { one, reason, change } => {
@@ -391,8 +398,10 @@ fn control_line(control: &fleet::RobotControl) -> String {
     } else {
         format!("  held by {}", control.hold_tokens.join(" "))
     };
-    let by_word =
-        |word: &fleet::LoadSettled| format!("  carries nothing, says {} ({})", plain(&word.actor), plain(&word.reason));
+    let by_word = |word: &fleet::LoadSettled| {
+        let is_empty = if word.is_told { "is told that it carries nothing" } else { "carries nothing" };
+        format!("  {is_empty}, says {} ({})", plain(&word.actor), plain(&word.reason))
+    };
     let load = control.load_settled.as_ref().map(by_word).unwrap_or_default();
     format!("{}  {duty}{why}  {holder}{holds}{load}", control.robot_id)
 }

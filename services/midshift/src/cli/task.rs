@@ -1,6 +1,9 @@
 //! `midshift task …`
 
 mod many;
+mod resume;
+
+pub use resume::Resume;
 
 use super::client::{self, Call, Change, Exit, unary};
 use super::explain::verdict;
@@ -86,63 +89,6 @@ pub enum Verb {
     },
     /// Let held tasks and robots go on: the same as `midshift resume`.
     Resume(Resume),
-}
-
-/// Who goes on.
-#[derive(clap::Args)]
-pub struct Resume {
-    #[command(flatten)]
-    call: Call,
-    /// The stop that stood them. It must be reset first.
-    #[arg(long = "stop", visible_alias = "stop-id", value_name = "ID", default_value = "")]
-    stop_id: String,
-    /// Everything in this area.
-    #[arg(long, default_value = "")]
-    area: String,
-    /// These robots.
-    #[arg(long)]
-    robot: Vec<String>,
-    /// These tasks.
-    task_ids: Vec<String>,
-    /// Why.
-    #[arg(long)]
-    reason: String,
-    #[command(flatten)]
-    change: Change,
-}
-
-impl Resume {
-    /// Asks for it.
-    pub async fn run(self, out: &Out) -> Result<(), Exit> {
-        let Self { call, stop_id, area, robot, task_ids, reason, change } = self;
-        let request = v1::ResumeHeldRequest {
-            stop_id,
-            area_id: area,
-            task_ids,
-            robot_ids: robot,
-            request_id: change.request_id,
-            reason,
-            validate_only: change.dry_run,
-        };
-        let answer = call.task().await?.resume_held(unary(request)).await?.into_inner();
-        out.one(&answer, "", || resumed(&answer))?;
-        if !answer.still_stopped.is_empty() {
-            let text = format!("not resumed: {}", answer.still_stopped.join(", "));
-            return Err(Exit::new(9, text).or_try("the same again when they are heard: midshift robot ls"));
-        }
-        out.next("midshift task ls --state held");
-        Ok(())
-    }
-}
-
-fn resumed(answer: &v1::ResumeHeldResponse) -> String {
-    match (answer.robots, answer.pending) {
-        (Some(0), _) => "nothing waited for it".to_owned(),
-        (Some(1), false) => "1 robot resumed".to_owned(),
-        (Some(robots), false) => format!("{robots} robots resumed"),
-        (_, true) => "resume asked for; fleet has not looked at it yet".to_owned(),
-        (None, false) => "resumed".to_owned(),
-    }
 }
 
 /// One task.

@@ -2,6 +2,9 @@
 //!
 //! What is told changes with rows, with tasks that end on trial, with what robots say of their downloads, and with time. Rows of this service
 //! wake a watcher; for the rest it looks again each second.
+//!
+//! Invariant: each look is answered from a picture that has come up to the head of the feed since it was asked for, whether the process leads
+//! or not, and holds committed rows alone. So a client that goes on at another process is told no older row than it was told before.
 
 use super::{RolloutService, encode};
 use midshift_core::gates::TaskTally;

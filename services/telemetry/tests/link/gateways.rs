@@ -63,6 +63,7 @@ fn work() -> DesiredWork {
         closed: Vec::new(),
         maintenance: None,
         resumed: Vec::new(),
+        load_word: None,
     }
 }
 

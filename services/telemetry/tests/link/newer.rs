@@ -32,6 +32,7 @@ fn work(robot_id: &RobotId) -> DesiredWork {
         closed: Vec::new(),
         maintenance: None,
         resumed: Vec::new(),
+        load_word: None,
     }
 }
 

@@ -1,9 +1,11 @@
 //! The picture of robots that people and programs see.
 
 use crate::world::{Result, Robot, World, clock, serve, world};
-use midshift_core::ids::SiteId;
-use midshift_core::robot::{Mode, ReportedState, Vitals};
+use midshift_core::ids::{RobotId, SiteId};
+use midshift_core::robot::{Inventory, Mode, ReportedState, Vitals};
+use midshift_core::rows::{Item, Writer};
 use midshift_core::time::Clock;
+use midshift_core::work::{LastHeard, PresenceRow, Session};
 use midshift_proto::convert::{ms_of, time_of};
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
 use midshift_proto::telemetry::v1::{
@@ -157,6 +159,123 @@ async fn a_robot_is_offline_after_a_start_with_what_was_known_of_it_until_it_is_
     assert_eq!((&heard.last_heard, &heard.conditions), (&None, &before.conditions), "it never said otherwise");
     assert!(heard.reported.is_some());
     Ok(())
+}
+
+/// A session that a robot had once.
+fn session(id: &str, inventory: Inventory) -> Result<Session> {
+    Ok(Session {
+        robot_id: RobotId::parse(id)?,
+        session_epoch: 7,
+        secret: "secret".into(),
+        boot_id: "b-1".to_owned(),
+        ring: "ring".to_owned(),
+        inventory,
+        applied_work: 0,
+        applied_update: 0,
+        places: Vec::new(),
+        clock_offset_ms: None,
+        installed: None,
+        device_key: None,
+        device_key_changed: false,
+    })
+}
+
+/// Pages of two robots each that a filter admits: none is empty while there are more.
+async fn paged(world: &World, filter: RobotFilter) -> Result<Vec<String>> {
+    let mut client = TelemetryServiceClient::new(world.channel.clone());
+    let (mut ids, mut page_token) = (Vec::new(), String::new());
+    loop {
+        let request = ListRobotsRequest { filter: Some(filter.clone()), page_size: 2, page_token };
+        let page = client.list_robots(request).await?.into_inner();
+        assert!(page.next_page_token.is_empty() || page.robots.len() == 2, "{filter:?}: {ids:?}");
+        ids.extend(page.robots.into_iter().map(|robot| robot.robot_id));
+        page_token = page.next_page_token;
+        if page_token.is_empty() {
+            return Ok(ids);
+        }
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn pages_of_robots_are_full_as_long_as_more_match_and_the_last_one_says_so() -> Result<()> {
+    let clock = clock();
+    let store: Arc<dyn Store> =
+        Arc::new(MemoryStore::new(SiteId::parse("s")?, StoreId(Arc::from("store-1")), clock.clone()));
+    let mut item = Item::new(Writer::Telemetry, "tests");
+    for n in 1..=12 {
+        let line = if n % 5 == 0 { "b" } else { "a" };
+        let labels = [("line".to_owned(), line.to_owned())].into();
+        item.create(&session(&format!("r{n}"), Inventory { labels, ..Inventory::default() })?, "session.opened");
+    }
+    assert!(store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
+    let world = begin(&store, &clock).await?;
+    assert_eq!(Watcher::of(&world, &[]).await?.presence().await?, Presence::Offline);
+    let all = ["r1", "r10", "r11", "r12", "r2", "r3", "r4", "r5", "r6", "r7", "r8", "r9"];
+    assert_eq!(paged(&world, RobotFilter::default()).await?, all);
+    let labels = [("line".to_owned(), "b".to_owned())].into();
+    assert_eq!(paged(&world, RobotFilter { labels, ..RobotFilter::default() }).await?, ["r10", "r5"]);
+    let robot_ids = ["r9", "r2", "R!", "r99", "r11"].map(str::to_owned).to_vec();
+    assert_eq!(paged(&world, RobotFilter { robot_ids, ..RobotFilter::default() }).await?, ["r11", "r2", "r9"]);
+    for (prefix, begin) in [("r1", &all[..4]), ("r12", &all[3..4]), ("r13", &all[..0]), ("R!", &all[..0])] {
+        let filter = RobotFilter { robot_id_prefix: prefix.to_owned(), ..RobotFilter::default() };
+        assert_eq!(paged(&world, filter).await?, begin, "{prefix}");
+    }
+    let presences = vec![Presence::Online.into()];
+    assert!(paged(&world, RobotFilter { presences, ..RobotFilter::default() }).await?.is_empty());
+    Ok(())
+}
+
+/// Rows of a robot that was heard three days ago, as a backup of that moment has them; when that was, unix milliseconds.
+async fn restore(store: &dyn Store, clock: &dyn Clock) -> Result<i64> {
+    let heard_unix_ms = clock.now().wall.0 - 3 * 86_400_000;
+    let robot_id = RobotId::parse("r1")?;
+    let last_heard = LastHeard { at_unix_ms: heard_unix_ms, battery_permille: 640, waypoint: None };
+    let online = midshift_core::robot::Presence::Online;
+    let presence = PresenceRow::new(robot_id, online, heard_unix_ms - 1_000);
+    let mut item = Item::new(Writer::Telemetry, "tests");
+    item.create(&session("r1", Inventory::default())?, "session.opened");
+    item.create(&PresenceRow { last_heard: Some(last_heard), ..presence }, "presence.changed");
+    assert!(store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
+    Ok(heard_unix_ms)
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_of_a_backup_is_listed_as_offline_since_it_was_heard_and_never_as_it_was_then() -> Result<()> {
+    let clock = clock();
+    let store: Arc<dyn Store> =
+        Arc::new(MemoryStore::new(SiteId::parse("s")?, StoreId(Arc::from("store-1")), clock.clone()));
+    let heard_unix_ms = restore(&*store, &*clock).await?;
+    let world = begin(&store, &clock).await?;
+    assert_eq!(Watcher::of(&world, &[]).await?.presence().await?, Presence::Offline);
+    let mut client = TelemetryServiceClient::new(world.channel.clone());
+    for (presences, shown) in
+        [(vec![], 1), (vec![Presence::Online, Presence::Suspect], 0), (vec![Presence::Offline], 1)]
+    {
+        let presences = presences.into_iter().map(i32::from).collect();
+        let filter = Some(RobotFilter { presences, ..RobotFilter::default() });
+        let request = ListRobotsRequest { filter, ..ListRobotsRequest::default() };
+        let page = client.list_robots(request).await?.into_inner();
+        assert_eq!((page.robots.len(), page.next_page_token.as_str()), (shown, ""));
+        for robot in page.robots {
+            assert_eq!((robot.presence(), robot.reported, robot.age), (Presence::Offline, None, None));
+            assert_eq!(robot.presence_since.as_ref().map(time_of).map(|at| at.0), Some(heard_unix_ms));
+            let age_ms = robot.last_heard.and_then(|last| last.age).as_ref().map(ms_of);
+            assert!(age_ms >= Some(3 * 86_400_000), "{age_ms:?}");
+        }
+    }
+    // Nor does the row say so for ever.
+    let kept = async || -> Result<_> {
+        let row = midshift_store::load::<PresenceRow>(&*store, "r1").await?;
+        Ok(row.map(|(row, _)| (row.presence, row.since_unix_ms)))
+    };
+    let offline = Some((midshift_core::robot::Presence::Offline, heard_unix_ms));
+    for _ in 0..60 {
+        if kept().await? == offline {
+            return Ok(());
+        }
+        tokio::time::sleep(Duration::from_secs(1)).await;
+    }
+    Err(format!("{:?}", kept().await?).into())
 }
 
 #[tokio::test(start_paused = true)]

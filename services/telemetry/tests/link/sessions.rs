@@ -68,6 +68,7 @@ async fn a_heartbeat_is_echoed_and_new_desired_work_is_pushed() -> Result<()> {
         closed: Vec::new(),
         maintenance: None,
         resumed: Vec::new(),
+        load_word: None,
     };
     let mut item = Item::new(Writer::Fleet, "fleet");
     item.put(&work, Expect::Absent, "work.desired");

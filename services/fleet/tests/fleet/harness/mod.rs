@@ -206,6 +206,14 @@ impl World {
         self.running.push(running);
     }
 
+    /// As on another machine, from a backup of this moment: nobody is heard, and no robot has come yet.
+    pub async fn restore(&mut self) {
+        self.stop_fleet().await;
+        self.robots.values_mut().for_each(Robot::cut);
+        self.board = LiveBoard::new();
+        self.start_fleet();
+    }
+
     // --- robots and telemetry
 
     /// A robot that stands at `waypoint`, is heard, and does what it is told.

@@ -346,6 +346,10 @@ impl Robot {
     fn apply(&mut self, desired: DesiredWork, now: &Now) {
         self.applied = desired.generation;
         self.awaiting.retain(|id| !desired.resumed.contains(id));
+        if desired.load_word.is_some_and(|word| word.session_epoch == self.session_epoch) {
+            assert!(self.inventory.load_by_memory, "whoever feels its load is not told");
+            self.load = None;
+        }
         self.obey_holds(&desired, now);
         self.take_grants(&desired, now);
         self.attempts.retain(|a| !desired.closed.contains(&a.attempt));

@@ -4,14 +4,17 @@
 
 use crate::cli::client::{Call, Exit, unary};
 use crate::cli::out::{Format, Out};
+use crate::way::Line;
 use midshift_core::time::Utc;
 use midshift_proto::convert::{ms_of, time_of};
 use midshift_proto::fleet::v1 as fleet;
+use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::json::to_json;
 use midshift_proto::link::v1 as link;
 use midshift_proto::telemetry::v1;
 use prost_types::Timestamp;
 use std::collections::BTreeMap;
+use tonic::Status;
 
 /// Columns of a robot.
 const HEADER: [&str; 11] =
@@ -40,7 +43,7 @@ pub fn row(robot: &v1::Robot, control: Option<&fleet::RobotControl>, now: Option
     let battery_permille = last.map_or(vitals.battery_permille, |last| last.battery_permille);
     let charging = if vitals.charging { " +" } else { "" };
     let battery = format!("{:.0} %{charging}", f64::from(battery_permille) / 10.0);
-    let is_empty = control.is_some_and(|control| control.load_settled.is_some());
+    let is_empty = control.and_then(|control| control.load_settled.as_ref()).is_some_and(|word| !word.is_told);
     let load = reported.load.as_ref().filter(|_| !is_empty).map(|l| l.item.clone());
     let age_ms = robot.age.as_ref().or(last.and_then(|last| last.age.as_ref())).map(ms_of);
     vec![
@@ -125,7 +128,7 @@ pub fn presence(robot: &v1::Robot) -> String {
 /// Lists all robots.
 pub async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
     let robots = robots(call).await?;
-    let (controls, now) = controls(call).await?;
+    let (controls, now) = controls(&mut call.fleet().await?).await?;
     let control = |robot: &v1::Robot| controls.get(&robot.robot_id);
     match out.format {
         Format::Table => {
@@ -170,8 +173,9 @@ async fn robots(call: &Call) -> Result<Vec<v1::Robot>, Exit> {
 }
 
 /// What was decided about robots, by robot, and the moment on the site clock at which that was looked at.
-async fn controls(call: &Call) -> Result<(BTreeMap<String, fleet::RobotControl>, Option<Utc>), Exit> {
-    let mut client = call.fleet().await?;
+pub async fn controls(
+    client: &mut FleetServiceClient<Line>,
+) -> Result<(BTreeMap<String, fleet::RobotControl>, Option<Utc>), Status> {
     let (mut controls, mut page_token) = (BTreeMap::new(), String::new());
     loop {
         let request = fleet::ListRobotControlsRequest { page_size: 1_000, page_token };
@@ -270,5 +274,8 @@ mod tests {
         assert_eq!(cell(&row(&robot, None, None), "LOAD"), "(crate)");
         let control = fleet::RobotControl { load_settled: Some(fleet::LoadSettled::default()), ..Default::default() };
         assert_eq!(cell(&row(&robot, Some(&control), None), "LOAD"), "");
+        let told = fleet::LoadSettled { is_told: true, ..fleet::LoadSettled::default() };
+        let control = fleet::RobotControl { load_settled: Some(told), ..Default::default() };
+        assert_eq!(cell(&row(&robot, Some(&control), None), "LOAD"), "(crate)", "it has not forgotten it yet");
     }
 }
