@@ -1,6 +1,6 @@
 //! What every process takes care of now and then: old rows, entries and frames of its roles, the chains of the audit, and samples of histograms.
 //!
-//! Which of it goes when is in [`privacy::KEPT`]. Called by [`crate::server`]. Invariant: nothing goes that a service has not consumed.
+//! Which of it goes when is in [`midshift_core::privacy::KEPT`]. Called by [`crate::server`]. Invariant: nothing goes that a service has not consumed.
 
 mod oldest;
 
@@ -9,12 +9,12 @@ use crate::recorder;
 use crate::roles::Role;
 use metrics_exporter_prometheus::PrometheusHandle;
 use midshift_core::fleet::rows::FleetMark;
-use midshift_core::privacy::{self, Retention};
+use midshift_core::privacy::Retention;
 use midshift_core::rollout::rows::OtaMark;
-use midshift_core::rows::{Table, Writer};
+use midshift_core::rows::Writer;
 use midshift_core::time::Clock;
 use midshift_identity::audit::upkeep as audit;
-use midshift_store::{FrameLog, Retention as EntriesKept, Store, aged};
+use midshift_store::{FrameLog, Retention as EntriesKept, Store};
 use midshift_task::TaskService;
 use midshift_telemetry::precision;
 use std::time::Duration;
@@ -84,9 +84,9 @@ impl Turn<'_> {
             }
         }
         if has(Role::Ota)
-            && let Err(error) = prune_ota(store, clock).await
+            && let Err(error) = midshift_ota::prune(store, clock).await
         {
-            tracing::warn!(%error, "old requests about software could not be taken away");
+            tracing::warn!(%error, "what is past its time about software could not be taken away");
         }
         if has(Role::Telemetry) {
             if let Err(error) = midshift_telemetry::prune(store, clock).await {
@@ -121,15 +121,6 @@ async fn keep_audit(parts: &Parts) {
         }
         tokio::time::sleep(PRUNE_EVERY).await;
     }
-}
-
-/// Used request_ids, and what robots ran that were retired long ago.
-async fn prune_ota(store: &dyn Store, clock: &dyn Clock) -> Result<(), midshift_store::Error> {
-    let now = clock.now();
-    if let Some(before) = privacy::of(Table::OtaCommandKey).before(now.steady_wall()) {
-        aged::take_away(store, Table::OtaCommandKey, before.0, "command.forgotten").await?;
-    }
-    aged::forget_robots(store, Writer::Ota, now.steady_utc()).await.map(drop)
 }
 
 async fn prune_entries(store: &dyn Store, clock: &dyn Clock) -> Result<(), midshift_store::Error> {

@@ -14,8 +14,8 @@ use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::commands::{CheckOnly, Taken};
 use midshift_core::rollout::named::named;
-use midshift_core::rollout::view::{TABLES, View};
-use midshift_core::rollout::{Board, LOGS, Plan, Sign, absorb, commands, cycle, obeyed};
+use midshift_core::rollout::view::View;
+use midshift_core::rollout::{Board, LOGS, Plan, Sign, absorb, commands, cycle, obeyed, past};
 use midshift_core::rows::{Entry, Item, Log, Seq, Table};
 use midshift_core::time::Now;
 use midshift_core::work::Live;
@@ -180,7 +180,8 @@ impl Loop {
         self.take_part().await?;
         self.own.clear();
         let Self { seat, parts, .. } = self;
-        let reading = parts.store.snapshot(TABLES);
+        let parts_read = past::alive();
+        let reading = parts.store.read(&parts_read, past::named);
         let snapshot = lead::renewed_while(seat, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
         let now = self.parts.clock.now();
         let served = self.view.served_ms(&now);
@@ -199,7 +200,8 @@ impl Loop {
             self.say_at_ms = self.view.served_ms(&now) + limits::COLLECT_EVERY_MS;
         }
         metrics::counter!("midshift_ota_rebuilds_total").increment(1);
-        Ok(())
+        // Questions that are still open are answered from this picture.
+        self.ask(&[]).await
     }
 
     /// One turn; true: there is more to do at once. An error: the picture can no longer be trusted.
@@ -212,6 +214,7 @@ impl Loop {
         }
         if !self.seat.leads() {
             self.follow_rows().await.map_err(unreadable)?;
+            self.view.let_go();
             if self.seat.stance(self.parts.clock.now().link) == Stance::TakeOver {
                 self.rebuild().await.map_err(unreadable)?;
             }
@@ -263,6 +266,10 @@ impl Loop {
         let mut plan = Plan::default();
         let unreadable = |error| tracing::warn!(%error, "roll-outs cannot read the feed");
         let foreign = self.take_feed(now, &mut plan).await.map_err(unreadable)?;
+        if plan.items.is_empty() {
+            self.view.let_go();
+        }
+        self.ask(&requests).await.map_err(unreadable)?;
         let renewal = match self.seat.stance(now.link) {
             Stance::StepDown => {
                 // What was planned a moment ago is dropped, and with it the picture that holds it.
@@ -307,7 +314,7 @@ impl Loop {
     /// Answers every question from the picture, which holds only what is committed at this moment.
     pub(super) fn answer(&mut self, now: Now) {
         for look in std::mem::take(&mut self.looks) {
-            look(&self.view, &self.board, &now);
+            (look.answer)(&self.view, &self.board, &now);
         }
     }
 

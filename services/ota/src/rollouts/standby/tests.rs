@@ -1,5 +1,6 @@
 //! Two processes of the rollout service over one store and one folder: one plans and signs, the other carries out what people ask.
 
+mod past;
 mod reach;
 
 use crate::content::Room;
@@ -60,13 +61,17 @@ impl World {
     }
 
     async fn process(&self) -> Process {
+        self.process_over(self.store.clone()).await
+    }
+
+    async fn process_over(&self, store: Arc<dyn Store>) -> Process {
         let (folder, keys) = (self.dir.path().join("ota"), self.dir.path().join("keys"));
         let owner = Owner::Shared { store_id: self.store.id().clone(), known_bundles: 0 };
         let ota = OtaParts { folder, keys, room: Room::of(1 << 20), clock: self.clock.clone(), owner };
         let ota = OtaService::open(ota).await.expect("a service");
         let shutdown = CancellationToken::new();
         let parts = Parts {
-            store: self.store.clone(),
+            store,
             board: LiveBoard::new(),
             site: self.site.clone(),
             clock: self.clock.clone(),
