@@ -88,6 +88,11 @@ impl Turn<'_> {
         {
             tracing::warn!(%error, "what is past its time about software could not be taken away");
         }
+        if has(Role::Identity)
+            && let Err(error) = midshift_identity::prune(store, clock).await
+        {
+            tracing::warn!(%error, "what is past its time about tokens and identities could not be taken away");
+        }
         if has(Role::Telemetry) {
             if let Err(error) = midshift_telemetry::prune(store, clock).await {
                 tracing::warn!(%error, "rows of rings and robots that are gone could not be taken away");
