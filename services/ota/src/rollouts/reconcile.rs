@@ -20,7 +20,7 @@ use midshift_core::rows::{Entry, Item, Log, Seq, Table};
 use midshift_core::time::Now;
 use midshift_core::work::Live;
 use midshift_store::lead::{self, Settled};
-use midshift_store::{Applied, CommitError, Dirty, Error, follow};
+use midshift_store::{Applied, CommitError, Dirty, Error, Store, follow};
 use std::collections::BTreeSet;
 use std::ops::Range;
 use std::time::Duration;
@@ -118,6 +118,18 @@ pub async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Er
     Ok(())
 }
 
+/// From where the log can be read on: `after`, or its oldest entry if what stands between went while no process of roll-outs was there. Rows say
+/// what became of it, and robots say again how they are.
+async fn reachable(store: &dyn Store, after: Seq) -> Result<Seq, Error> {
+    match store.feed(after, LOGS, 1).await {
+        Err(Error::CursorExpired { asked, oldest }) if asked < oldest => {
+            tracing::info!(asked = asked.0, oldest = oldest.0, "roll-outs begin at the oldest entry of the log");
+            Ok(oldest)
+        }
+        page => page.map(|_| after),
+    }
+}
+
 impl Loop {
     async fn rebuild_until_read(&mut self, shutdown: &CancellationToken) {
         while let Err(error) = self.rebuild().await {
@@ -195,9 +207,12 @@ impl Loop {
         if !self.seat.leads() {
             self.seq = snapshot.seq;
             self.view.arrived.clear();
-        } else if self.say_at_ms == 0 {
-            // Not before robots could say what they run.
-            self.say_at_ms = self.view.served_ms(&now) + limits::COLLECT_EVERY_MS;
+        } else {
+            self.seq = reachable(self.parts.store.as_ref(), self.seq).await?;
+            if self.say_at_ms == 0 {
+                // Not before robots could say what they run.
+                self.say_at_ms = self.view.served_ms(&now) + limits::COLLECT_EVERY_MS;
+            }
         }
         metrics::counter!("midshift_ota_rebuilds_total").increment(1);
         // Questions that are still open are answered from this picture.

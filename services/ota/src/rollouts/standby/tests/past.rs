@@ -5,7 +5,6 @@ use crate::counted::Counted;
 use crate::old_site::{DAY_MS, OldSite, ROLLOUTS, robot_id};
 use midshift_core::reason::Code;
 use midshift_core::rollout::rows::{RolloutRobot, Step};
-use midshift_core::rows::{Item, Writer};
 use midshift_core::time::Utc;
 
 /// Robots that each roll-out reached.
