@@ -54,7 +54,7 @@ pub fn named(rows: &[Row]) -> Vec<Key> {
                 robot.map(|r| r.rollout_id).into_iter().collect()
             }
             Table::AreaBundle => {
-                row.decode::<AreaBundle>().map_or_else(|_| Vec::new(), |a| a.rollouts.into_values().collect())
+                row.decode::<AreaBundle>().map(|a| a.rollouts.into_values().collect()).unwrap_or_default()
             }
             _ => continue,
         };
