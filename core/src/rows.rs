@@ -335,6 +335,15 @@ pub enum Part {
     Whole(Table),
     /// Rows of a table in one of these states, by its index of states.
     InStates(Table, Vec<i64>),
+    /// Rows by their keys; what is not there is left out.
+    Rows(Vec<Key>),
+    /// Rows of a table, by its index of parents, of each row of another table that is read or named.
+    OfParents {
+        /// Of which rows are read.
+        table: Table,
+        /// Where their parents are.
+        parents: Table,
+    },
 }
 
 /// Which rows the rows just read name. What it names is read at the same moment, and asked in turn.

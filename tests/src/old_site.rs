@@ -289,6 +289,7 @@ fn release(bundle: BundleId, number: u64, at: Utc) -> Bundle {
         listed: false,
         revoked: None,
         published: at,
+        ended: Some(at),
     }
 }
 

@@ -138,6 +138,14 @@ impl RobotIdentity {
         self.key.is_some() || self.enrolled_unix_ms.is_some() || !self.denied.is_empty()
     }
 
+    /// Whether nothing of it lets a machine in, or has to keep one out: no certificate can be genuine, and no secret is open.
+    pub fn is_spent(&self, now: Utc) -> bool {
+        let is_over = |until_unix_ms: i64| until_unix_ms <= now.0;
+        let certificates = self.key.is_none() || self.expires_unix_ms.is_some_and(is_over);
+        let secret = self.enrolment.as_ref().is_none_or(|open| is_over(open.expires_unix_ms));
+        certificates && secret && self.denied.iter().all(|deny| is_over(deny.until_unix_ms))
+    }
+
     /// Whether this key is its own, or was and was taken out: another robot with it would be the same machine, or let a denied one in.
     pub fn knows(&self, key: &Digest) -> bool {
         self.key.as_ref() == Some(key) || self.denied.iter().any(|deny| deny.key == *key)

@@ -2,6 +2,7 @@
 
 use super::grant::Grant;
 use super::token::{Digest, TokenId};
+use crate::limits;
 use crate::rows::{Index, Record, Table};
 use crate::time::Utc;
 use serde::{Deserialize, Serialize};
@@ -60,6 +61,12 @@ impl TokenRecord {
     /// Whether it was taken back, and the moment of that is here.
     pub fn is_revoked(&self, now: Utc) -> bool {
         self.revoked.as_ref().is_some_and(|act| act.at_unix_ms <= now.0)
+    }
+    /// Whether its row may go: its time, and the time in which it would still stop robots, have been over for as long as something that is gone is
+    /// kept. That it was revoked makes this no earlier.
+    pub fn is_past(&self, now: Utc) -> bool {
+        let kept_ms = limits::TOKEN_STOPS_AFTER_EXPIRY.as_ms() + limits::GONE_KEPT.as_ms();
+        now.ms_since(Utc(self.expires_unix_ms)) > kept_ms
     }
 }
 

@@ -107,6 +107,17 @@ pub enum Command {
     },
 }
 
+impl Command {
+    /// The roll-outs that it names: whoever decides on it must have them.
+    pub fn rollouts(&self) -> Vec<&RolloutId> {
+        match self {
+            Self::Create { rollout_id, .. } | Self::Do { rollout_id, .. } => vec![rollout_id],
+            Self::Rollback { of, rollout_id } => vec![of, rollout_id],
+            Self::Revoke { .. } | Self::Pin { .. } | Self::Unpin { .. } | Self::LiftQuarantine { .. } => Vec::new(),
+        }
+    }
+}
+
 impl once::Asked for Command {
     const KEYS: Table = Table::OtaCommandKey;
 }

@@ -3,8 +3,8 @@
 //! [`cycle`] takes what happened and gives items to commit; the service around it only reads, signs, commits and publishes.
 //! Rooms: `spec` is what is asked for, `rows` and `view` are what is known; `hear` and `commands` are what happens; `matching` says who and `dry_run` what it would come to, `robots`
 //! says what is due for each (`turns`: whose turn it is) and `moves` writes it, `phases` the whole, `newcomers` who comes later (`served`: what they get; `assign`: how
-//! anybody comes in), `named` which bundles are still needed; `verdict` and `infrastructure` judge; `explain` says what a robot waits for. Rooms name each
-//! other in one direction only.
+//! anybody comes in), `named` which bundles are still needed, `past` what the picture holds of what has ended; `verdict` and `infrastructure` judge; `explain` says
+//! what a robot waits for. Rooms name each other in one direction only.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod assign;
@@ -20,6 +20,7 @@ pub mod named;
 pub mod newcomers;
 mod noted;
 pub mod objects;
+pub mod past;
 pub mod phases;
 pub mod robots;
 pub mod rows;
@@ -149,7 +150,8 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
 }
 
 fn take_row(view: &mut View, entry: &Entry, unreadable: &mut Vec<String>) {
-    if let Some(table) = entry.table.filter(|_| entry.seq > view.read_at) {
+    let table = entry.table.filter(|_| entry.seq > view.read_at);
+    if let Some(table) = table.filter(|table| !past::is_elsewhere(view, entry, *table)) {
         let key = Key { table, id: entry.subject.clone() };
         if let Err(error) = view.absorb(&key, entry.revision, crate::picture::row_of(entry, table).as_ref()) {
             unreadable.push(error.to_string());
@@ -269,9 +271,6 @@ fn plan_all(
         plan.decide(view, now, "ota", |tx| phases::further(tx, board, &id));
     }
     plan.decide(view, now, "ota", moves::forget_drains);
-    if view.rollouts.len() > crate::limits::ROLLOUTS_MAX {
-        plan.decide(view, now, "ota", phases::forget_oldest);
-    }
     false
 }
 

@@ -7,17 +7,21 @@ use super::rows::{RobotSoftware, Rollout};
 use super::view::View;
 use crate::ids::BundleId;
 use crate::limits;
-use crate::time::Now;
+use crate::time::{Now, Utc};
 use std::collections::BTreeSet;
 
 /// Milliseconds of a day.
 const DAY_MS: u64 = 24 * 3_600_000;
 
-/// Bundles that a roll-out, a rule for newcomers or a robot names.
+/// Bundles that a roll-out, one that ended not long ago, a rule for newcomers or a robot names.
 pub fn named(view: &View, now: &Now) -> BTreeSet<BundleId> {
-    let rollouts = view.rollouts.values().map(|r| &r.row).filter(|r| names(view, r, now));
+    let rollouts = view.rollouts.values().map(|r| &r.row).filter(|r| names(view, r));
     let served = view.area_bundles.values().flat_map(|a| a.row.rollouts.values()).filter_map(|id| view.rollout(id));
     let mut named: BTreeSet<BundleId> = rollouts.chain(served).map(|r| r.spec.bundle.clone()).collect();
+    // A clock that went back says nothing of an end.
+    let lately = |ended: Utc| now.ms_since(ended) < limits::ROLLOUT_NAMES_DAYS * DAY_MS;
+    let ended = view.bundles.values().map(|b| &b.row).filter(|b| b.ended.is_some_and(lately));
+    named.extend(ended.map(|b| b.bundle.clone()));
     let retired = |s: &RobotSoftware| view.control.get(s.robot_id.as_str()).is_some_and(|c| c.row.retired.is_some());
     for robot in view.software.values().map(|s| &s.row).filter(|s| !retired(s)) {
         let update = robot.report.as_ref().filter(|report| !report.state.is_over()).map(|report| &report.bundle);
@@ -27,9 +31,7 @@ pub fn named(view: &View, now: &Now) -> BTreeSet<BundleId> {
     named
 }
 
-/// It is open, something is still due for one of its robots, or it ended not long ago. A clock that went back says nothing of its end.
-fn names(view: &View, rollout: &Rollout, now: &Now) -> bool {
-    !rollout.phase.is_over()
-        || now.ms_since(rollout.since) < limits::ROLLOUT_NAMES_DAYS * DAY_MS
-        || view.robots_of(&rollout.rollout_id).any(|r| !r.step.is_over())
+/// It is open, or something is still due for one of its robots.
+fn names(view: &View, rollout: &Rollout) -> bool {
+    !rollout.phase.is_over() || view.robots_of(&rollout.rollout_id).any(|r| !r.step.is_over())
 }

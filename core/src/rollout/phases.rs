@@ -4,8 +4,8 @@
 //! stuck and unreachable robots never keep a fleet waiting.
 
 use super::robots::{is_gone, is_irreversible, is_keyless};
-use super::rows::{AreaBundle, Countdown, Outcome, Pause, Phase, Rollout, RolloutRobot, Step, Verdict};
-use super::served::{forget_area_bundles, is_served};
+use super::rows::{AreaBundle, Bundle, Countdown, Outcome, Pause, Phase, Rollout, RolloutRobot, Step, Verdict};
+use super::served::forget_area_bundles;
 use super::stamp::Stamp;
 use super::turns::{is_newcomer, is_retried};
 use super::verdict;
@@ -47,8 +47,12 @@ pub fn further(tx: &mut Tx, board: &Board, id: &RolloutId) {
     }
 }
 
-/// Comes to a phase.
+/// Comes to a phase. Of one that ends its bundle remembers when: the roll-out itself may be let go of.
 pub fn enter(tx: &mut Tx, rollout: Rollout, phase: Phase, kind: &'static str) {
+    let bundle = tx.view.bundles.get(rollout.spec.bundle.as_str()).filter(|_| phase.is_over());
+    if let Some(bundle) = bundle.map(|b| b.row.clone()) {
+        tx.put(Bundle { ended: Some(tx.now.utc), ..bundle }, "bundle.rollout_ended");
+    }
     tx.put(Rollout { phase, since: tx.now.utc, version: rollout.version + 1, ..rollout }, kind);
 }
 
@@ -300,20 +304,6 @@ fn complete(tx: &mut Tx, rollout: Rollout) {
         forget_area_bundles(tx, of);
     }
     enter(tx, rollout, Phase::Completed, "rollout.completed");
-}
-
-/// The oldest that has ended goes, with its robots, while there are too many. One that robots still have to come back from stays.
-pub fn forget_oldest(tx: &mut Tx) {
-    let named = |id: &RolloutId| is_served(tx.view, id);
-    let over = tx.view.rollouts.values().map(|r| &r.row).filter(|r| r.phase.is_over());
-    let free = over.filter(|r| !named(&r.rollout_id) && tx.view.robots_of(&r.rollout_id).all(|r| r.step.is_over()));
-    let Some(id) = free.min_by_key(|r| (r.since, r.rollout_id.clone())).map(|r| r.rollout_id.clone()) else { return };
-    let robots: Vec<String> =
-        tx.view.robots_of(&id).map(crate::rows::Record::id).take(limits::ITEM_ROWS_MAX / 2).collect();
-    robots.iter().for_each(|robot| tx.delete::<RolloutRobot>(robot, "robot.forgotten"));
-    if tx.view.robots_of(&id).next().is_none() {
-        tx.delete::<Rollout>(id.as_str(), "rollout.forgotten");
-    }
 }
 
 /// Waits until nobody can activate it any more.

@@ -77,6 +77,9 @@ pub struct Bundle {
     pub revoked: Option<Act>,
     /// UTC of the wall when it was first published here.
     pub published: Utc,
+    /// UTC, site clock, when a roll-out of it ended last. None: none has.
+    #[serde(default)]
+    pub ended: Option<Utc>,
 }
 
 impl Bundle {
@@ -383,6 +386,21 @@ pub enum Step {
 }
 
 impl Step {
+    /// All of them.
+    pub const ALL: [Self; 12] = [
+        Self::Waiting,
+        Self::Staging,
+        Self::Staged,
+        Self::Draining,
+        Self::Activating,
+        Self::Trial,
+        Self::Committing,
+        Self::Reverting,
+        Self::Committed,
+        Self::RolledBack,
+        Self::Skipped,
+        Self::Stuck,
+    ];
     /// Nothing is asked of it any more.
     pub const fn is_over(self) -> bool {
         matches!(self, Self::Committed | Self::RolledBack | Self::Skipped)

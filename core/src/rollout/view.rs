@@ -1,6 +1,9 @@
 //! The rollout service's picture of the rows: built from a snapshot, kept by the feed, and already holding what it is about to commit.
 //!
-//! Called by every room of `rollout`. Invariant: as [`crate::picture`] says; after a conflict the whole view is built again, never patched.
+//! Called by every room of `rollout`. Invariants:
+//! 1. As [`crate::picture`] says; after a conflict the whole view is built again, never patched.
+//! 2. A roll-out is here with all its robots, or not at all. Of those that have ended only what is still named is here ([`past`](super::past)),
+//!    and used request_ids are those that were just asked for.
 
 use super::rows::{
     AreaBundle, Bundle, CommandKey, OtaClock, OtaMark, Quarantine, RobotSoftware, Rollout, RolloutRobot,
@@ -30,7 +33,7 @@ pub struct View {
     pub site: Arc<Site>,
     /// Bundles of releases.
     pub bundles: Slot<Bundle>,
-    /// Roll-outs.
+    /// Roll-outs: those that have not ended, and what is named of the others.
     pub rollouts: Slot<Rollout>,
     /// Robots in them.
     pub robots: Slot<RolloutRobot>,
@@ -50,7 +53,7 @@ pub struct View {
     pub marks: Slot<OtaMark>,
     /// Serving time and numbers.
     pub clocks: Slot<OtaClock>,
-    /// Used request_ids.
+    /// Used request_ids that were asked for.
     pub command_keys: Slot<CommandKey>,
     /// Drains (fleet's).
     pub drains: Slot<Drain>,
@@ -70,6 +73,10 @@ pub struct View {
     pub of_robot: BTreeMap<RobotId, BTreeSet<RolloutId>>,
     /// Ids of robots' rows that something may still be due for.
     pub open: BTreeSet<String>,
+    /// Roll-outs that the feed spoke of while they were not here. Volatile.
+    pub spoken_of: BTreeSet<RolloutId>,
+    /// Roll-outs that are named and that the store does not have. Volatile.
+    pub absent: BTreeSet<RolloutId>,
     /// Robots of each wave.
     pub wave_sizes: BTreeMap<(RolloutId, u32), u32>,
     /// Robots that came or changed since they were last looked at as newcomers. Volatile.
@@ -143,8 +150,13 @@ impl Viewed<View> for RolloutRobot {
     fn changed(view: &mut View, id: &str, old: Option<&Self>) {
         let new = view.robots.get(id).map(|r| &r.row);
         let size = |sizes: &mut BTreeMap<(RolloutId, u32), u32>, row: &Self, by: i32| {
-            let size = sizes.entry((row.rollout_id.clone(), row.wave)).or_default();
-            *size = size.saturating_add_signed(by);
+            let wave = (row.rollout_id.clone(), row.wave);
+            let size = sizes.get(&wave).copied().unwrap_or_default().saturating_add_signed(by);
+            if size > 0 {
+                sizes.insert(wave, size)
+            } else {
+                sizes.remove(&wave)
+            };
         };
         if let Some(old) = old {
             size(&mut view.wave_sizes, old, -1);
@@ -228,11 +240,9 @@ impl Viewed<View> for Session {
     }
 }
 
-/// Tables that the picture is made of.
-pub const TABLES: &[Table] = &[
+/// Tables that hold only what is there now, or that are bounded by count.
+pub const WHOLE: &[Table] = &[
     Table::Bundle,
-    Table::Rollout,
-    Table::RolloutRobot,
     Table::DrainRequest,
     Table::DrainRelease,
     Table::DesiredUpdate,
@@ -241,7 +251,6 @@ pub const TABLES: &[Table] = &[
     Table::AreaBundle,
     Table::OtaMark,
     Table::OtaClock,
-    Table::OtaCommandKey,
     Table::Drain,
     Table::RobotAuthority,
     Table::RobotControl,
@@ -277,6 +286,8 @@ impl View {
             lane_marks: Slot::new(),
             of_robot: BTreeMap::new(),
             open: BTreeSet::new(),
+            spoken_of: BTreeSet::new(),
+            absent: BTreeSet::new(),
             wave_sizes: BTreeMap::new(),
             arrived: BTreeSet::new(),
             absorbed: Seq(0),

@@ -10,11 +10,13 @@ mod files;
 mod grpc;
 mod proof;
 mod register;
+mod retention;
 mod tokens;
 
 pub use authority::PUBLIC_FILE;
 pub use files::make_folder;
 pub use proof::ServerProof;
+pub use retention::prune;
 
 use authority::{Authority, asked};
 use midshift_core::audit::Note;

@@ -1,6 +1,8 @@
 //! Who is known, in memory: carried forward from the rows, changed by decisions of core, told to the ports.
 //!
-//! Invariant: a decision is told to the ports of this process before its answer leaves; other processes hear of it with the store's wake.
+//! Invariants:
+//! 1. A decision is told to the ports of this process before its answer leaves; other processes hear of it with the store's wake.
+//! 2. A row that goes is gone here too, whichever process took it away.
 
 use midshift_core::audit::{self, Note};
 use midshift_core::identity::{
@@ -43,20 +45,18 @@ impl Fold for View {
     fn apply(&mut self, change: Change) -> Result<(), BadRow> {
         let revision = change.revision;
         match change.key.table {
-            Table::Token => {
-                if let Some(token) = change.decode::<TokenRecord>()? {
-                    self.tokens.insert(token.token_id.clone(), (token, revision));
-                }
-            }
+            Table::Token => match change.decode::<TokenRecord>()? {
+                Some(token) => drop(self.tokens.insert(token.token_id.clone(), (token, revision))),
+                None => drop(TokenId::new(&change.key.id).and_then(|id| self.tokens.remove(&id))),
+            },
             Table::TokenName => match change.decode::<TokenName>()? {
                 Some(name) => drop(self.names.insert(name.id(), (name, revision))),
                 None => drop(self.names.remove(&*change.key.id)),
             },
-            Table::RobotIdentity => {
-                if let Some(robot) = change.decode::<RobotIdentity>()? {
-                    self.robots.insert(robot.robot_id.clone(), (robot, revision));
-                }
-            }
+            Table::RobotIdentity => match change.decode::<RobotIdentity>()? {
+                Some(robot) => drop(self.robots.insert(robot.robot_id.clone(), (robot, revision))),
+                None => drop(RobotId::parse(&change.key.id).ok().and_then(|id| self.robots.remove(&id))),
+            },
             Table::ServerCertificate => match change.decode::<ServerCertificate>()? {
                 Some(server) => drop(self.servers.insert(server.id(), (server, revision))),
                 None => drop(self.servers.remove(&*change.key.id)),
@@ -197,4 +197,63 @@ pub fn decided<R: Record>(
 fn unavailable(error: impl std::error::Error) -> Refusal {
     tracing::warn!(%error, "the store does not answer");
     Refusal::new(Kind::Unavailable, Code::StoreUnavailable)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use midshift_core::identity::{Act, Deny, Digest};
+    use midshift_core::ids::SiteId;
+    use midshift_core::rows::Key;
+    use midshift_core::time::{ScaledClock, Utc};
+    use midshift_store::SqliteStore;
+
+    const NOW: Utc = Utc(1_800_000_000_000);
+
+    fn token(id: &str) -> TokenRecord {
+        TokenRecord {
+            token_id: TokenId::new(id).expect("an id"),
+            name: id.to_owned(),
+            person: None,
+            digest: Digest([7; 32]),
+            grants: Vec::new(),
+            created_unix_ms: NOW.0,
+            created_by: "anna".to_owned(),
+            expires_unix_ms: NOW.0 + 1_000,
+            revoked: None,
+            rotation: None,
+        }
+    }
+
+    fn robot(id: &str) -> RobotIdentity {
+        let deny = Deny { key: Digest([9; 32]), until_unix_ms: NOW.0 + 1_000 };
+        let robot = RobotIdentity::new(RobotId::parse(id).expect("an id"));
+        RobotIdentity { denied: vec![deny], revoked: Some(Act::new("anna", NOW.0)), ..robot }
+    }
+
+    #[tokio::test]
+    async fn rows_that_another_process_took_away_are_gone_here_and_at_the_ports() {
+        let clock: Arc<dyn Clock> = Arc::new(ScaledClock::new(|| 0, NOW, 1000));
+        let dir = tempfile::tempdir().expect("a folder");
+        let site = SiteId::parse("factory").expect("an id");
+        let store = SqliteStore::open(dir.path(), site, clock.clone()).await.expect("a new store");
+        let store: Arc<dyn Store> = Arc::new(store);
+        let mut item = Item::new(Writer::Identity, "elsewhere");
+        item.create(&token("t1"), "made").create(&token("t2"), "made");
+        item.create(&robot("r1"), "made").create(&robot("r2"), "made");
+        store.commit(vec![item]).await.remove(0).expect("applied");
+        let register = Register::new(store.clone(), clock);
+        let directory = register.directory();
+        let known = async || register.look(|view| (view.tokens.len(), view.robots.len())).await.expect("rows");
+        assert_eq!(known().await, (2, 2));
+        assert_eq!(directory.borrow().tokens.len(), 2);
+        let mut item = Item::new(Writer::Identity, "elsewhere");
+        for (table, id) in [(Table::Token, "t1"), (Table::RobotIdentity, "r1"), (Table::RobotIdentity, "r2")] {
+            item.delete(Key::new(table, id), Revision(1), "gone");
+        }
+        store.commit(vec![item]).await.remove(0).expect("applied");
+        assert_eq!(known().await, (1, 0));
+        let directory = directory.borrow();
+        assert_eq!((directory.tokens.len(), directory.denied.len()), (1, 0));
+    }
 }

@@ -1,6 +1,7 @@
 //! What every process takes care of now and then: old rows, entries and frames of its roles, the chains of the audit, and samples of histograms.
 //!
-//! Which of it goes when is in [`privacy::KEPT`]. Called by [`crate::server`]. Invariant: nothing goes that a service has not consumed.
+//! Which of it goes when is in [`midshift_core::privacy::KEPT`]. Called by [`crate::server`]. Invariant: nothing goes that a service has not consumed,
+//! unless it has not been there for a month.
 
 mod oldest;
 
@@ -9,12 +10,13 @@ use crate::recorder;
 use crate::roles::Role;
 use metrics_exporter_prometheus::PrometheusHandle;
 use midshift_core::fleet::rows::FleetMark;
-use midshift_core::privacy::{self, Retention};
+use midshift_core::limits;
+use midshift_core::privacy::Retention;
 use midshift_core::rollout::rows::OtaMark;
-use midshift_core::rows::{Table, Writer};
-use midshift_core::time::Clock;
+use midshift_core::rows::{Log, Seq, Writer};
+use midshift_core::time::{Clock, Utc};
 use midshift_identity::audit::upkeep as audit;
-use midshift_store::{FrameLog, Retention as EntriesKept, Store, aged};
+use midshift_store::{Error, FrameLog, Retention as EntriesKept, Store};
 use midshift_task::TaskService;
 use midshift_telemetry::precision;
 use std::time::Duration;
@@ -84,9 +86,14 @@ impl Turn<'_> {
             }
         }
         if has(Role::Ota)
-            && let Err(error) = prune_ota(store, clock).await
+            && let Err(error) = midshift_ota::prune(store, clock).await
         {
-            tracing::warn!(%error, "old requests about software could not be taken away");
+            tracing::warn!(%error, "what is past its time about software could not be taken away");
+        }
+        if has(Role::Identity)
+            && let Err(error) = midshift_identity::prune(store, clock).await
+        {
+            tracing::warn!(%error, "what is past its time about tokens and identities could not be taken away");
         }
         if has(Role::Telemetry) {
             if let Err(error) = midshift_telemetry::prune(store, clock).await {
@@ -123,23 +130,28 @@ async fn keep_audit(parts: &Parts) {
     }
 }
 
-/// Used request_ids, and what robots ran that were retired long ago.
-async fn prune_ota(store: &dyn Store, clock: &dyn Clock) -> Result<(), midshift_store::Error> {
-    let now = clock.now();
-    if let Some(before) = privacy::of(Table::OtaCommandKey).before(now.steady_wall()) {
-        aged::take_away(store, Table::OtaCommandKey, before.0, "command.forgotten").await?;
-    }
-    aged::forget_robots(store, Writer::Ota, now.steady_utc()).await.map(drop)
-}
-
-async fn prune_entries(store: &dyn Store, clock: &dyn Clock) -> Result<(), midshift_store::Error> {
+async fn prune_entries(store: &dyn Store, clock: &dyn Clock) -> Result<(), Error> {
     // Until fleet has consumed something nothing may go.
-    let Some((mark, _)) = midshift_store::load::<FleetMark>(store, "fleet").await? else { return Ok(()) };
-    let Some(before) = Retention::Week.before(clock.now().steady_wall()) else { return Ok(()) };
-    let ota = midshift_store::load::<OtaMark>(store, "ota").await?.map_or(mark.seq, |(mark, _)| mark.seq);
-    let floor = mark.seq.min(ota);
+    let Some((fleet, _)) = midshift_store::load::<FleetMark>(store, "fleet").await? else { return Ok(()) };
+    let wall = clock.now().steady_wall();
+    let Some(before) = Retention::Week.before(wall) else { return Ok(()) };
+    let floor = match midshift_store::load::<OtaMark>(store, "ota").await? {
+        Some((ota, _)) if !is_abandoned(store, ota.seq, wall).await? => fleet.seq.min(ota.seq),
+        _ => fleet.seq,
+    };
     let keep = EntriesKept { before_unix_ms: before.0, entries_max: ENTRIES_MAX, floor };
     store.prune(keep).await.map(drop)
+}
+
+/// Whether whoever moved this mark is gone, or will not read on from it: the first entry behind it is older than anything about what is gone is
+/// kept, or gone itself. A process of roll-outs that comes back reads the rows, and the log from its oldest entry on.
+async fn is_abandoned(store: &dyn Store, mark: Seq, wall: Utc) -> Result<bool, Error> {
+    let page = match store.feed(mark, &Log::ALL, 1).await {
+        Err(Error::CursorExpired { asked, oldest }) => return Ok(asked < oldest),
+        page => page?,
+    };
+    let is_old = |at_unix_ms: i64| wall.ms_since(Utc(at_unix_ms)) > limits::GONE_KEPT.as_ms();
+    Ok(page.entries.first().is_some_and(|entry| is_old(entry.at_unix_ms)))
 }
 
 #[cfg(test)]

@@ -6,6 +6,9 @@
 
 mod collect;
 pub mod content;
+#[cfg(test)]
+#[path = "../../../tests/src/counted.rs"]
+mod counted;
 mod disk;
 pub mod encodings;
 #[cfg(test)]
@@ -14,13 +17,20 @@ pub mod folder;
 mod grpc;
 mod hatch;
 mod http1;
+#[cfg(test)]
+#[expect(dead_code, reason = "shared with tests that need tasks too")]
+#[path = "../../../tests/src/old_site.rs"]
+mod old_site;
 mod pages;
 mod refusal;
 pub mod repository;
+mod retention;
 pub mod rollouts;
 #[cfg(test)]
 #[path = "together/tests.rs"]
 mod together;
+
+pub use retention::prune;
 
 use collect::{Collector, Named};
 use content::{Content, DiskContent, Room, Sharing};

@@ -1,9 +1,9 @@
-//! Gathers the rows of one reading, and asks what they name until they name nothing new.
+//! Gathers the rows of one reading, and asks what they name and what belongs to them until they name nothing new.
 //!
 //! Invariant: no key is read twice, however often it is named. Called by each engine, within the one moment that it reads.
 
 use crate::Snapshot;
-use midshift_core::rows::{Key, Naming, Row, Seq, Table};
+use midshift_core::rows::{Key, Naming, Part, Row, Seq, Table};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -15,11 +15,26 @@ pub(crate) struct Gathered {
     known: BTreeSet<Key>,
     /// Rows before this one were asked what they name.
     asked: usize,
+    /// Keys that the reading itself asks for, until they were.
+    wanted: Vec<Key>,
+    /// Tables whose rows are read with their parents, and where those are.
+    of_parents: Vec<(Table, Table)>,
+    /// Rows before this one were looked at as parents.
+    parented: usize,
 }
 
 impl Gathered {
-    pub(crate) fn new(named: Naming) -> Self {
-        Self { named, rows: Vec::new(), known: BTreeSet::new(), asked: 0 }
+    /// Takes of `parts` what is asked by key or by parent.
+    pub(crate) fn new(parts: &[Part], named: Naming) -> Self {
+        let (mut wanted, mut of_parents) = (Vec::new(), Vec::new());
+        for part in parts {
+            match part {
+                Part::Rows(keys) => wanted.extend(keys.iter().cloned()),
+                Part::OfParents { table, parents } => of_parents.push((*table, *parents)),
+                Part::Whole(_) | Part::InStates(..) => {}
+            }
+        }
+        Self { named, rows: Vec::new(), known: BTreeSet::new(), asked: 0, wanted, of_parents, parented: 0 }
     }
 
     pub(crate) fn take(&mut self, rows: impl IntoIterator<Item = Row>) {
@@ -33,13 +48,25 @@ impl Gathered {
     /// What rows named that were read since the last call, and that nobody has read; empty: there is no more.
     pub(crate) fn missing(&mut self) -> BTreeMap<Table, Vec<Arc<str>>> {
         let mut missing: BTreeMap<Table, BTreeSet<Arc<str>>> = BTreeMap::new();
-        for key in (self.named)(&self.rows[self.asked..]) {
+        let wanted = std::mem::take(&mut self.wanted);
+        for key in wanted.into_iter().chain((self.named)(&self.rows[self.asked..])) {
             if !self.known.contains(&key) {
                 missing.entry(key.table).or_default().insert(key.id);
             }
         }
         self.asked = self.rows.len();
         missing.into_iter().map(|(table, ids)| (table, ids.into_iter().collect())).collect()
+    }
+
+    /// Tables and parents of which rows are to be read, for rows that were read since the last call.
+    pub(crate) fn parents(&mut self) -> Vec<(Table, Arc<str>)> {
+        let mut found = Vec::new();
+        for row in &self.rows[self.parented..] {
+            let tables = self.of_parents.iter().filter(|(_, parents)| *parents == row.key.table);
+            found.extend(tables.map(|(table, _)| (*table, row.key.id.clone())));
+        }
+        self.parented = self.rows.len();
+        found
     }
 
     /// All of it, by key.

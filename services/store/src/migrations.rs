@@ -110,6 +110,8 @@ pub(crate) const CONTROL: &[Migration] = migrations!["control":
     "0088_identity_audit",
     "0089_identity_audit_by_ord",
     "0090_token_name",
+    "0091_rollout_by_state",
+    "0092_rollout_robot_by_state",
 ];
 
 /// Of `telemetry.db`.

@@ -191,18 +191,25 @@ impl Store for MemoryStore {
 
     async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error> {
         let state = self.state();
-        let mut gathered = Gathered::new(named);
+        let mut gathered = Gathered::new(parts, named);
         for part in parts {
             match part {
                 Part::Whole(table) => gathered.take(state.tables.get(table).into_iter().flat_map(Rows::iter).cloned()),
                 Part::InStates(table, states) => {
                     gathered.take(state.tables.get(table).into_iter().flat_map(|rows| rows.in_states(states)).cloned());
                 }
+                Part::Rows(_) | Part::OfParents { .. } => {}
             }
         }
         loop {
+            let parents = gathered.parents();
+            let is_whole = parents.is_empty();
+            for (table, parent) in parents {
+                let rows = state.tables.get(&table).into_iter().flat_map(|rows| rows.of_parent(&parent));
+                gathered.take(rows.cloned());
+            }
             let missing = gathered.missing();
-            if missing.is_empty() {
+            if missing.is_empty() && is_whole {
                 return Ok(gathered.at(state.head));
             }
             for (table, ids) in missing {

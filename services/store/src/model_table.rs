@@ -33,6 +33,11 @@ impl Rows {
         orders.flatten().filter_map(|place| self.rows.get(&place.id))
     }
 
+    /// Rows of one parent, by their order.
+    pub(crate) fn of_parent(&self, parent: &str) -> impl Iterator<Item = &Row> {
+        self.by_parent.get(parent).into_iter().flatten().filter_map(|place| self.rows.get(&place.id))
+    }
+
     pub(crate) fn put(&mut self, row: Row) {
         let place = Cursor::of(&row);
         let index = row.index.clone();

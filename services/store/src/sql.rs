@@ -72,6 +72,11 @@ pub(crate) fn in_state(table: Table) -> String {
     format!("SELECT {ROW_READ} FROM {} WHERE site_id = $1 AND state = $2 ORDER BY ord, id", table.name())
 }
 
+/// Rows of a table whose parent is `$2`.
+pub(crate) fn of_parent(table: Table) -> String {
+    format!("SELECT {ROW_READ} FROM {} WHERE site_id = $1 AND parent = $2 ORDER BY ord, id", table.name())
+}
+
 /// How many entries a log holds.
 pub(crate) fn count(log: Log) -> String {
     format!("SELECT COUNT(*) FROM {} WHERE site_id = $1", log.name())

@@ -11,6 +11,7 @@ mod keyless;
 mod named;
 mod newcomers_and_pins;
 mod once;
+mod past;
 mod people;
 mod reach;
 mod recovery;
@@ -25,7 +26,7 @@ mod ways_back;
 use super::commands::{self, Command, Verb};
 use super::rows::{AreaBundle, Bundle, Outcome, Phase, RobotSoftware, Rollout, RolloutRobot, Step};
 use super::spec::{RolloutSpec, Wave};
-use super::view::{Slot, TABLES, View};
+use super::view::{Slot, View, WHOLE};
 use super::{Board, Order, Plan, Sign, absorb, cycle};
 use crate::fleet::rows::{
     DrainState, HolderState, Place, PlaceHolder, RobotAuthority, RobotControl, RobotCounter, RobotHolder,
@@ -36,7 +37,7 @@ use crate::maintenance::ReleasedBy;
 use crate::policy::AreaPolicy;
 use crate::reason::{Code, Reason, Refusal};
 use crate::robot::{Fault, HardwareStop, Inventory, Lane, Load, ReportedState, Vitals};
-use crate::rows::{Entry, Expect, Item, Key, Log, Record, Revision, Row, Seq, Write};
+use crate::rows::{Entry, Expect, Item, Key, Log, Record, Revision, Row, Seq, Table, Write};
 use crate::site::{DEMO, Site};
 use crate::time::{LinkTime, Now, SiteTime, Utc};
 use crate::update::{DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState};
@@ -433,7 +434,10 @@ impl Rig {
 
     fn rebuilt(&self) -> View {
         let mut view = View::new(self.ota.site.clone(), self.ota.started, self.now);
-        let rows: Vec<Row> = self.rows.values().filter(|row| TABLES.contains(&row.key.table)).cloned().collect();
+        let is_read = |table| {
+            WHOLE.contains(&table) || matches!(table, Table::Rollout | Table::RolloutRobot | Table::OtaCommandKey)
+        };
+        let rows: Vec<Row> = self.rows.values().filter(|row| is_read(row.key.table)).cloned().collect();
         view.load(&rows, Seq(self.seq)).expect("rows read");
         view
     }
@@ -515,6 +519,7 @@ fn bundle(n: u32) -> Bundle {
         listed: true,
         revoked: None,
         published: Utc(BEGIN),
+        ended: None,
     }
 }
 

@@ -76,40 +76,6 @@ fn a_start_that_was_cut_short_reaches_all_robots_all_the_same() {
 }
 
 #[test]
-fn roll_outs_beyond_the_limit_are_forgotten_and_none_that_robots_still_come_back_from() {
-    let mut rig = Rig::new(2);
-    rig.checks_rebuild = false;
-    rig.start(spec());
-    rig.until(400, |r| r.phase() == Phase::Completed);
-    let over = rig.rollout("ro");
-    let mut open = rig.of("ro", 0);
-    for n in 0..=crate::limits::ROLLOUTS_MAX {
-        let id = rollout_id(&format!("old-{n}"));
-        rig.put(Rollout {
-            rollout_id: id.clone(),
-            since: Utc(n as i64),
-            phase: Phase::Superseded,
-            abort: over.abort.clone(),
-            ..over.clone()
-        });
-        if n == 0 {
-            open = RolloutRobot { rollout_id: id, step: Step::Stuck, drain_id: None, ..open.clone() };
-            rig.put(open.clone());
-        }
-    }
-    let mut plan = Plan::default();
-    let entries = rig.feed[rig.ota_at..].to_vec();
-    rig.ota_at = rig.feed.len();
-    absorb(&mut rig.ota, rig.now, &entries, &mut plan);
-    for _ in 0..10 {
-        cycle(&mut rig.ota, rig.now, &rig.board, &BTreeSet::new(), Some(&Plain), &mut plan);
-    }
-    assert_eq!(rig.ota.rollouts.len(), crate::limits::ROLLOUTS_MAX);
-    assert!(rig.ota.rollouts.contains_key("ro") && rig.ota.rollouts.contains_key("old-0"));
-    assert!(!rig.ota.rollouts.contains_key("old-1"));
-}
-
-#[test]
 fn an_entry_that_the_store_never_takes_is_passed_over_once_and_a_person_is_told() {
     let mut rig = Rig::new(3);
     rig.start(RolloutSpec { waves: vec![Wave::Count(1), Wave::Rest], ..spec() });

@@ -1,7 +1,8 @@
-//! Identity over a store in memory and real files: the site's authority, enrolment, tokens.
+//! Identity over a store in memory and real files: the site's authority, enrolment, tokens, and what goes after its time.
 
 mod authority;
 mod enrolled;
+mod retained;
 mod rotated;
 mod tokens;
 mod world;

@@ -12,7 +12,7 @@ use midshift_proto::identity::v1::enrolment_service_server::EnrolmentService as 
 use midshift_proto::identity::v1::identity_service_server::IdentityService as _;
 use midshift_proto::identity::v1::{CreateEnrolmentRequest, EnrolRequest, EnrolResponse};
 use midshift_proto::refusal_of;
-use midshift_store::{MemoryStore, Query, Store, StoreId};
+use midshift_store::{MemoryStore, Query, SqliteStore, Store, StoreId};
 use rcgen::{CertificateParams, KeyPair};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -37,6 +37,13 @@ impl World {
         let site = SiteId::parse("factory").expect("a site");
         let store = Arc::new(MemoryStore::new(site, StoreId::fresh(), clock.clone()));
         Self { store, clock, us, dir: TempDir::new().expect("a folder") }
+    }
+    /// The same over a store in files.
+    pub async fn in_files() -> Self {
+        let mut world = Self::new();
+        let (site, clock) = (world.store.site_id().clone(), world.clock.clone());
+        world.store = Arc::new(SqliteStore::open(world.dir.path(), site, clock).await.expect("a new store"));
+        world
     }
     pub fn pass_ms(&self, ms: u64) {
         self.us.fetch_add(ms * 1000, Ordering::Relaxed);

@@ -19,7 +19,7 @@ use midshift_core::time::{Clock, Now, Utc};
 use midshift_proto::common::v1::Pose;
 use midshift_proto::link::v1::{LaneBatch, Sample, Vitals, sample};
 use midshift_store::{
-    Frame, FrameLog, MemoryFrames, MemoryStore, PostgresConfig, PostgresFrames, PostgresStore, SqliteFrames,
+    Error, Frame, FrameLog, MemoryFrames, MemoryStore, PostgresConfig, PostgresFrames, PostgresStore, SqliteFrames,
     SqliteStore, Store, StoreId,
 };
 use midshift_task::TaskService;
@@ -199,6 +199,38 @@ async fn nothing_gets_too_old(mut world: World) {
     let looked_at: BTreeSet<&str> = world.ages().await.iter().map(|o| o.place.as_str()).collect();
     assert_eq!(too_old, looked_at, "each of them was too old before a purge, or this proves nothing");
     assert!(coarse > 5 && precise > 5, "{coarse} {precise}");
+}
+
+/// Entries that the inbox of robots has.
+async fn told(world: &World) -> usize {
+    let page = async |after| world.store.feed(after, &[Log::RobotInbox], 100).await;
+    let page = match page(Seq(0)).await {
+        Err(Error::CursorExpired { oldest, .. }) => page(oldest).await,
+        first => first,
+    };
+    page.expect("read").entries.len()
+}
+
+#[tokio::test]
+async fn a_mark_that_nobody_moves_any_more_holds_entries_back_for_a_month_and_no_longer() {
+    let wall = Arc::new(Wall(AtomicI64::new(BEGIN)));
+    let dir = tempfile::tempdir().expect("a folder");
+    let store = SqliteStore::open(dir.path(), site(), wall.clone()).await.expect("a store");
+    let frames = MemoryFrames::new(wall.clone(), u64::MAX);
+    let mut world = World::new(wall, Arc::new(store), Arc::new(frames)).await;
+    world.write().await;
+    world.consume_all().await;
+    // From here on only fleet reads on.
+    let mut left = Vec::new();
+    for hours in [0, 24 * 8, 24 * 23] {
+        world.wall.0.fetch_add(hours * HOUR_MS, Ordering::Relaxed);
+        world.write().await;
+        let mark = Seq(world.store.wake().borrow().0);
+        world.consume(Writer::Fleet, &FleetMark { seq: mark }, 0).await;
+        world.purge().await;
+        left.push(told(&world).await);
+    }
+    assert_eq!(left, [2, 2, 1], "what both have read, then what roll-outs have not read for a month");
 }
 
 #[test]

@@ -115,6 +115,25 @@ fn abort(abort: &Abort) -> v1::RolloutAbort {
     }
 }
 
+/// How many robots of a roll-out are how far.
+#[derive(Default)]
+pub struct Counts {
+    all: v1::RolloutCounts,
+    waves: BTreeMap<u32, v1::RolloutCounts>,
+    skipped_by_reason: BTreeMap<String, u32>,
+}
+
+impl Counts {
+    /// Counts one more.
+    pub fn add(&mut self, r: &RolloutRobot) {
+        count(&mut self.all, r);
+        count(self.waves.entry(r.wave).or_default(), r);
+        if let (Step::Skipped, Some(why)) = (r.step, &r.why) {
+            *self.skipped_by_reason.entry(why.name().to_owned()).or_default() += 1;
+        }
+    }
+}
+
 fn count(counts: &mut v1::RolloutCounts, r: &RolloutRobot) {
     let slot = match r.step {
         Step::Waiting => &mut counts.waiting,
@@ -135,18 +154,16 @@ fn count(counts: &mut v1::RolloutCounts, r: &RolloutRobot) {
     counts.attempted += u32::from(r.attempted);
 }
 
-/// A roll-out with its counts.
+/// A roll-out of the picture.
 pub fn rollout(view: &View, now: &Now, row: &Rollout) -> v1::Rollout {
-    let mut counts = v1::RolloutCounts::default();
-    let mut waves: BTreeMap<u32, v1::RolloutCounts> = BTreeMap::new();
-    let mut skipped: BTreeMap<String, u32> = BTreeMap::new();
-    for r in view.robots_of(&row.rollout_id) {
-        count(&mut counts, r);
-        count(waves.entry(r.wave).or_default(), r);
-        if let (Step::Skipped, Some(why)) = (r.step, &r.why) {
-            *skipped.entry(why.name().to_owned()).or_default() += 1;
-        }
-    }
+    let mut counts = Counts::default();
+    view.robots_of(&row.rollout_id).for_each(|r| counts.add(r));
+    counted(view, now, row, counts)
+}
+
+/// A roll-out whose robots were counted.
+pub fn counted(view: &View, now: &Now, row: &Rollout, counts: Counts) -> v1::Rollout {
+    let Counts { all, waves, skipped_by_reason } = counts;
     let served = view.served_ms(now);
     let left = |c: Option<midshift_core::rollout::rows::Countdown>| c.map(|c| duration(c.left(served)));
     v1::Rollout {
@@ -164,12 +181,12 @@ pub fn rollout(view: &View, now: &Now, row: &Rollout) -> v1::Rollout {
         abort: row.abort.as_ref().map(abort),
         revert_of: text(row.revert_of.as_ref()),
         superseded_by: text(row.superseded_by.as_ref()),
-        counts: Some(counts),
+        counts: Some(all),
         waves: waves
             .into_iter()
             .map(|(wave, counts)| v1::RolloutWaveState { wave, counts: Some(counts), promoted: wave < row.promoted })
             .collect(),
-        skipped_by_reason: skipped,
+        skipped_by_reason,
         created: Some(act(&row.created)),
         approved: row.approved.as_ref().map(act),
         start_time: row.started.map(timestamp),

@@ -76,7 +76,10 @@ struct About<'a> {
 impl RolloutService {
     async fn shown(&self, rollout_id: RolloutId, by: &Caller) -> Result<v1::Rollout, Refusal> {
         let by = by.clone();
-        self.look(move |view, _, now| Ok(encode::rollout(view, now, objects::seen(view, &by, &rollout_id)?))).await?
+        self.look_about(vec![rollout_id.clone()], move |view, _, now| {
+            Ok(encode::rollout(view, now, objects::seen(view, &by, &rollout_id)?))
+        })
+        .await?
     }
 
     async fn verb(&self, about: About<'_>, verb: Verb, needs_etag: bool) -> Result<Option<v1::Rollout>, Refusal> {
@@ -158,8 +161,8 @@ impl RolloutService {
         if let Some(spec) = &r.spec {
             self.bundle(&spec.bundle).await?;
         }
-        let (probation_ms, by) = (self.probation_ms, by.clone());
-        self.look(move |view, board, _| {
+        let (probation_ms, by, about) = (self.probation_ms, by.clone(), vec![rollout_id.clone()]);
+        self.look_about(about, move |view, board, _| {
             let spec = match r.spec {
                 Some(wire) => {
                     let bundle = decode::bundle(view, &wire.bundle)?;
@@ -202,29 +205,6 @@ impl RolloutService {
         Ok(v1::RollBackRolloutResponse { rollout: Some(self.shown(rollout_id, by).await?) })
     }
 
-    async fn list(&self, r: v1::ListRolloutsRequest, by: &Caller) -> Result<v1::ListRolloutsResponse, Refusal> {
-        let mut bad = Violations::default();
-        let size = pages::size(r.page_size, &mut bad);
-        bad.finish()?;
-        let by = by.clone();
-        self.look(move |view, _, now| {
-            let prefix = &r.rollout_id_prefix;
-            let key = |id: &str, r: &Rollout| match prefix.is_empty() {
-                // The newest first.
-                true => format!("{:020}/{id}", i64::MAX - r.created.at.0),
-                false => id.to_owned(),
-            };
-            let rows = view.rollouts.range(prefix.clone()..).take_while(|(id, _)| id.starts_with(prefix));
-            let rows = rows.filter(|(_, r)| objects::sees(&by, &r.row));
-            let mut all: Vec<_> = rows.map(|(id, r)| (key(id, &r.row), r)).collect();
-            all.sort_by(|a, b| a.0.cmp(&b.0));
-            let (rows, next_page_token) = pages::page(all.into_iter(), &r.page_token, size);
-            let rollouts = rows.into_iter().map(|r| encode::rollout(view, now, &r.row)).collect();
-            v1::ListRolloutsResponse { rollouts, next_page_token }
-        })
-        .await
-    }
-
     async fn robots(
         &self,
         r: v1::ListRolloutRobotsRequest,
@@ -235,7 +215,7 @@ impl RolloutService {
         let rollout_id = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
         bad.finish()?;
         let (rollout_id, by) = (rollout_id.ok_or_else(internal)?, by.clone());
-        self.look(move |view, board, now| {
+        self.look_about(vec![rollout_id.clone()], move |view, board, now| {
             let row = objects::seen(view, &by, &rollout_id)?;
             let asked = |id: &RobotId| r.robot_id.is_empty() || id.as_str() == r.robot_id;
             let rows = view.robots_of(&rollout_id).filter(|r| asked(&r.robot_id));

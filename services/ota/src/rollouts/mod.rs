@@ -7,6 +7,8 @@ mod decode;
 mod directives;
 mod encode;
 mod grpc;
+mod list;
+mod past;
 mod reconcile;
 mod releases;
 mod standby;
@@ -17,6 +19,7 @@ pub use releases::known_bundles;
 
 use crate::OtaService;
 use midshift_core::identity::Caller;
+use midshift_core::ids::RolloutId;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::Board;
 use midshift_core::rollout::bugs::Bugs;
@@ -54,7 +57,11 @@ pub struct Parts {
 }
 
 /// A question about the picture as it is now.
-type Look = Box<dyn FnOnce(&View, &Board, &Now) + Send>;
+struct Look {
+    /// Roll-outs that it is about: they are in the picture when it is answered, if they are there.
+    about: Vec<RolloutId>,
+    answer: Box<dyn FnOnce(&View, &Board, &Now) + Send>,
+}
 
 /// Something a person asks of the planner.
 enum Request {
@@ -76,6 +83,8 @@ struct Asked {
 #[derive(Clone)]
 pub struct RolloutService {
     requests: mpsc::Sender<Request>,
+    /// Where lists of roll-outs are read: most of them have ended.
+    store: Arc<dyn Store>,
     /// Position up to which the picture is committed; changes with it.
     changed: channel::Receiver<Seq>,
     shutdown: CancellationToken,
@@ -102,7 +111,8 @@ impl RolloutService {
             parts.ota.lead(false);
         }
         let probation_ms = PROBATION_DEFAULT_MS;
-        let service = Self { requests: sender, changed: receiver, shutdown, ota, probation_ms };
+        let store = parts.store.clone();
+        let service = Self { requests: sender, store, changed: receiver, shutdown, ota, probation_ms };
         (service, Planner { parts, requests, changed })
     }
     /// Roll-outs that name no probation have this one instead of [`PROBATION_DEFAULT_MS`], milliseconds of site time.
@@ -120,7 +130,7 @@ impl RolloutService {
             mpsc::error::TrySendError::Closed(_) => Refusal::new(Kind::Unavailable, Code::ShuttingDown),
         })
     }
-    /// Runs `look` on the picture and gives its answer.
+    /// Runs `look` on the picture and gives its answer. Of roll-outs that have ended the picture has only what something names.
     ///
     /// # Errors
     /// If the planner does not run.
@@ -128,9 +138,20 @@ impl RolloutService {
         &self,
         look: impl FnOnce(&View, &Board, &Now) -> T + Send + 'static,
     ) -> Result<T, Refusal> {
+        self.look_about(Vec::new(), look).await
+    }
+    /// The same, of a picture that has these roll-outs, ended or not.
+    ///
+    /// # Errors
+    /// If the planner does not run.
+    pub async fn look_about<T: Send + 'static>(
+        &self,
+        about: Vec<RolloutId>,
+        look: impl FnOnce(&View, &Board, &Now) -> T + Send + 'static,
+    ) -> Result<T, Refusal> {
         let (reply, answer) = oneshot::channel();
         let look = move |view: &View, board: &Board, now: &Now| drop(reply.send(look(view, board, now)));
-        self.send(Request::Look(Box::new(look))).await?;
+        self.send(Request::Look(Look { about, answer: Box::new(look) })).await?;
         answer.await.map_err(|_| Refusal::new(Kind::Unavailable, Code::ShuttingDown))
     }
     /// Carries out a command and waits for its commit.

@@ -14,13 +14,13 @@ use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::commands::{CheckOnly, Taken};
 use midshift_core::rollout::named::named;
-use midshift_core::rollout::view::{TABLES, View};
-use midshift_core::rollout::{Board, LOGS, Plan, Sign, absorb, commands, cycle, obeyed};
+use midshift_core::rollout::view::View;
+use midshift_core::rollout::{Board, LOGS, Plan, Sign, absorb, commands, cycle, obeyed, past};
 use midshift_core::rows::{Entry, Item, Log, Seq, Table};
 use midshift_core::time::Now;
 use midshift_core::work::Live;
 use midshift_store::lead::{self, Settled};
-use midshift_store::{Applied, CommitError, Dirty, Error, follow};
+use midshift_store::{Applied, CommitError, Dirty, Error, Store, follow};
 use std::collections::BTreeSet;
 use std::ops::Range;
 use std::time::Duration;
@@ -118,6 +118,18 @@ pub async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Er
     Ok(())
 }
 
+/// From where the log can be read on: `after`, or its oldest entry if what stands between went while no process of roll-outs was there. Rows say
+/// what became of it, and robots say again how they are.
+async fn reachable(store: &dyn Store, after: Seq) -> Result<Seq, Error> {
+    match store.feed(after, LOGS, 1).await {
+        Err(Error::CursorExpired { asked, oldest }) if asked < oldest => {
+            tracing::info!(asked = asked.0, oldest = oldest.0, "roll-outs begin at the oldest entry of the log");
+            Ok(oldest)
+        }
+        page => page.map(|_| after),
+    }
+}
+
 impl Loop {
     async fn rebuild_until_read(&mut self, shutdown: &CancellationToken) {
         while let Err(error) = self.rebuild().await {
@@ -180,7 +192,8 @@ impl Loop {
         self.take_part().await?;
         self.own.clear();
         let Self { seat, parts, .. } = self;
-        let reading = parts.store.snapshot(TABLES);
+        let parts_read = past::alive();
+        let reading = parts.store.read(&parts_read, past::named);
         let snapshot = lead::renewed_while(seat, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
         let now = self.parts.clock.now();
         let served = self.view.served_ms(&now);
@@ -194,12 +207,16 @@ impl Loop {
         if !self.seat.leads() {
             self.seq = snapshot.seq;
             self.view.arrived.clear();
-        } else if self.say_at_ms == 0 {
-            // Not before robots could say what they run.
-            self.say_at_ms = self.view.served_ms(&now) + limits::COLLECT_EVERY_MS;
+        } else {
+            self.seq = reachable(self.parts.store.as_ref(), self.seq).await?;
+            if self.say_at_ms == 0 {
+                // Not before robots could say what they run.
+                self.say_at_ms = self.view.served_ms(&now) + limits::COLLECT_EVERY_MS;
+            }
         }
         metrics::counter!("midshift_ota_rebuilds_total").increment(1);
-        Ok(())
+        // Questions that are still open are answered from this picture.
+        self.ask(&[]).await
     }
 
     /// One turn; true: there is more to do at once. An error: the picture can no longer be trusted.
@@ -212,6 +229,7 @@ impl Loop {
         }
         if !self.seat.leads() {
             self.follow_rows().await.map_err(unreadable)?;
+            self.view.let_go();
             if self.seat.stance(self.parts.clock.now().link) == Stance::TakeOver {
                 self.rebuild().await.map_err(unreadable)?;
             }
@@ -263,6 +281,10 @@ impl Loop {
         let mut plan = Plan::default();
         let unreadable = |error| tracing::warn!(%error, "roll-outs cannot read the feed");
         let foreign = self.take_feed(now, &mut plan).await.map_err(unreadable)?;
+        if plan.items.is_empty() {
+            self.view.let_go();
+        }
+        self.ask(&requests).await.map_err(unreadable)?;
         let renewal = match self.seat.stance(now.link) {
             Stance::StepDown => {
                 // What was planned a moment ago is dropped, and with it the picture that holds it.
@@ -307,7 +329,7 @@ impl Loop {
     /// Answers every question from the picture, which holds only what is committed at this moment.
     pub(super) fn answer(&mut self, now: Now) {
         for look in std::mem::take(&mut self.looks) {
-            look(&self.view, &self.board, &now);
+            (look.answer)(&self.view, &self.board, &now);
         }
     }
 

@@ -1,6 +1,7 @@
 //! Bundles of the newest release as rows: what the planner knows of them.
 //!
-//! Invariant: a row is never deleted, so that a roll-out always knows what it is of; a bundle that the release lists no more is unlisted.
+//! Invariant: nothing is deleted here: a bundle that the release lists no more is unlisted, and its row stays as long as something names it
+//! ([`crate::retention`]).
 
 use crate::repository::{By, Newest};
 use midshift_bundle::digest::Digest;
@@ -36,9 +37,9 @@ pub fn take(view: &mut View, now: Now, newest: Option<&Newest>, plan: &mut Plan)
         listed.insert(bundle.clone());
         let known = view.bundles.get(bundle.as_str()).map(|b| &b.row);
         if known.is_none_or(|known| !known.listed) {
-            let revoked = known.and_then(|k| k.revoked.clone());
+            let (revoked, ended) = (known.and_then(|k| k.revoked.clone()), known.and_then(|k| k.ended));
             let length = release.manifest.to_bytes().len() as u64;
-            changed.push(Bundle { revoked, ..fresh(bundle, &release.manifest, length, release.seen) });
+            changed.push(Bundle { revoked, ended, ..fresh(bundle, &release.manifest, length, release.seen) });
         }
     }
     // What the disk does not give at the moment is not unlisted for that.
@@ -93,6 +94,7 @@ fn fresh(bundle: BundleId, manifest: &Manifest, manifest_length: u64, published:
         listed: true,
         revoked: None,
         published,
+        ended: None,
     }
 }
 

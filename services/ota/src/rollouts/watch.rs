@@ -108,7 +108,7 @@ pub async fn watch(
         changed.mark_unchanged();
         let (asked, by) = (id.clone(), by.clone());
         let looked = service
-            .look(move |view, board, now| {
+            .look_about(vec![id.clone()], move |view, board, now| {
                 let next = told.next(view, board, now, &asked, &by);
                 (told, next)
             })

@@ -105,7 +105,7 @@ pub(super) async fn read(
 ) -> Result<Snapshot, sqlx::Error> {
     let mut transaction = begin(readers).await?;
     let seq = head(&mut *transaction, site_id).await?;
-    let mut gathered = Gathered::new(named);
+    let mut gathered = Gathered::new(parts, named);
     for part in parts {
         let (table, selects) = match part {
             Part::Whole(table) => (*table, vec![sqlx::query(AssertSqlSafe(sql::whole(*table))).bind(site_id.as_str())]),
@@ -113,14 +113,21 @@ pub(super) async fn read(
                 let select = || sqlx::query(AssertSqlSafe(sql::in_state(*table))).bind(site_id.as_str());
                 (*table, states.iter().map(|state| select().bind(*state)).collect())
             }
+            Part::Rows(_) | Part::OfParents { .. } => continue,
         };
         for select in selects {
             gathered.take(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
         }
     }
     loop {
+        let parents = gathered.parents();
+        let is_whole = parents.is_empty();
+        for (table, parent) in parents {
+            let select = sqlx::query(AssertSqlSafe(sql::of_parent(table))).bind(site_id.as_str()).bind(&*parent);
+            gathered.take(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
+        }
         let missing = gathered.missing();
-        if missing.is_empty() {
+        if missing.is_empty() && is_whole {
             return Ok(gathered.at(seq));
         }
         for (table, ids) in missing {

@@ -112,7 +112,7 @@ pub(super) async fn read(
 ) -> Result<Snapshot, sqlx::Error> {
     let mut transaction = readers.begin().await?;
     let seq = super::writer::head(&mut transaction, site_id).await?;
-    let mut gathered = Gathered::new(named);
+    let mut gathered = Gathered::new(parts, named);
     for part in parts {
         let (table, selects) = match part {
             Part::Whole(table) => (*table, vec![prepared(sql::whole(*table)).bind(site_id.as_str())]),
@@ -120,14 +120,21 @@ pub(super) async fn read(
                 let one = |state: &i64| prepared(sql::in_state(*table)).bind(site_id.as_str()).bind(*state);
                 (*table, states.iter().map(one).collect())
             }
+            Part::Rows(_) | Part::OfParents { .. } => continue,
         };
         for select in selects {
             gathered.take(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
         }
     }
     loop {
+        let parents = gathered.parents();
+        let is_whole = parents.is_empty();
+        for (table, parent) in parents {
+            let select = prepared(sql::of_parent(table)).bind(site_id.as_str()).bind(parent);
+            gathered.take(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
+        }
         let missing = gathered.missing();
-        if missing.is_empty() {
+        if missing.is_empty() && is_whole {
             return Ok(gathered.at(seq));
         }
         for (table, ids) in missing {

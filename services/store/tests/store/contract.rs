@@ -34,6 +34,7 @@ contract! {
     a_list_pages_through_every_row_once_in_both_directions
     a_list_filters_by_state_and_parent_as_they_are_now
     a_reading_holds_its_parts_and_what_they_name_and_nothing_else
+    a_reading_holds_rows_by_key_and_what_belongs_to_each_that_it_holds
     a_prefix_lists_by_id_the_rows_that_begin_with_it
     a_submit_between_snapshot_and_commit_does_not_spoil_the_plan
     concurrent_writers_all_make_progress_and_numbers_have_no_holes
@@ -289,6 +290,32 @@ async fn a_reading_holds_its_parts_and_what_they_name_and_nothing_else(store: Ar
     assert_eq!(read.seq, store.snapshot(&[]).await.unwrap().seq);
     let none = store.read(&[], named).await.unwrap();
     assert!(none.rows.is_empty());
+}
+
+async fn a_reading_holds_rows_by_key_and_what_belongs_to_each_that_it_holds(store: Arc<dyn Store>) {
+    let in_phase = |id: &str, phase| {
+        let index = Index { state: Some(phase), ..Index::default() };
+        indexed(Table::Rollout, id, Expect::Absent, "{}", index)
+    };
+    let rows = vec![in_phase("open", 1), in_phase("over", 2), in_phase("asked", 2), in_phase("named", 2)];
+    one(&*store, Writer::Ota, rows).await.unwrap();
+    let of = |id: &str| {
+        let index = Index { parent: id.split('/').next().map(Arc::from), ..Index::default() };
+        indexed(Table::RolloutRobot, id, Expect::Absent, "{}", index)
+    };
+    let robots = ["open/r1", "open/r2", "over/r1", "asked/r1", "named/r1"];
+    one(&*store, Writer::Ota, robots.map(of).into()).await.unwrap();
+    // What belongs to a row that is read may name another, whose rows are read too.
+    let named: Naming = |rows| {
+        let is_first = rows.iter().any(|row| &*row.key.id == "asked/r1");
+        is_first.then(|| Key::new(Table::Rollout, "named")).into_iter().collect()
+    };
+    let asked = Part::Rows(vec![Key::new(Table::Rollout, "asked"), Key::new(Table::Rollout, "nobody")]);
+    let of_parents = Part::OfParents { table: Table::RolloutRobot, parents: Table::Rollout };
+    let parts = [Part::InStates(Table::Rollout, vec![1]), of_parents, asked];
+    let read = store.read(&parts, named).await.unwrap();
+    let keys: Vec<&str> = read.rows.iter().map(|row| &*row.key.id).collect();
+    assert_eq!(keys, ["asked", "named", "open", "asked/r1", "named/r1", "open/r1", "open/r2"]);
 }
 
 async fn a_prefix_lists_by_id_the_rows_that_begin_with_it(store: Arc<dyn Store>) {

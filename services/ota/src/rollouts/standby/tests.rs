@@ -1,6 +1,7 @@
 //! Two processes of the rollout service over one store and one folder: one plans and signs, the other carries out what people ask.
 
 mod moves;
+mod past;
 mod reach;
 
 use crate::content::Room;
@@ -10,17 +11,18 @@ use crate::repository::FRESHEN_AFTER_MS;
 use crate::rollouts::{Parts, RolloutService};
 use crate::{OtaService, Parts as OtaParts};
 use midshift_bundle::digest::Digest;
+use midshift_core::fleet::rows::FleetMark;
 use midshift_core::ids::RolloutId;
 use midshift_core::lead::OtaLeader;
 use midshift_core::rollout::bugs::Bugs;
-use midshift_core::rollout::rows::{Bundle, Phase, Rollout};
-use midshift_core::rows::{Record, Revision, Table};
+use midshift_core::rollout::rows::{Bundle, OtaMark, Phase, Rollout};
+use midshift_core::rows::{Item, Log, Record, Revision, Table, Writer};
 use midshift_core::site::{DEMO, Site, text};
 use midshift_core::time::{Clock, ScaledClock};
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::bundle_service_server::BundleService as Bundles;
 use midshift_proto::ota::v1::rollout_service_server::RolloutService as Face;
-use midshift_store::{LiveBoard, MemoryStore, Store, StoreId};
+use midshift_store::{Error, LiveBoard, MemoryStore, Retention, Store, StoreId};
 use std::sync::Arc;
 use std::time::Duration;
 use tempfile::TempDir;
@@ -61,13 +63,17 @@ impl World {
     }
 
     async fn process(&self) -> Process {
+        self.process_over(self.store.clone()).await
+    }
+
+    async fn process_over(&self, store: Arc<dyn Store>) -> Process {
         let (folder, keys) = (self.dir.path().join("ota"), self.dir.path().join("keys"));
         let owner = Owner::Shared { store_id: self.store.id().clone(), known_bundles: 0 };
         let ota = OtaParts { folder, keys, room: Room::of(1 << 20), clock: self.clock.clone(), owner };
         let ota = OtaService::open(ota).await.expect("a service");
         let shutdown = CancellationToken::new();
         let parts = Parts {
-            store: self.store.clone(),
+            store,
             board: LiveBoard::new(),
             site: self.site.clone(),
             clock: self.clock.clone(),
@@ -270,6 +276,28 @@ async fn a_process_that_takes_over_without_a_current_directive_key_says_so_and_g
     secs(2).await;
     assert!(!keyless(&next).await);
     next.end().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn whoever_comes_back_after_its_place_in_the_log_went_reads_the_rows_and_goes_on() {
+    let world = World::new();
+    let process = world.process().await;
+    release(&process.ota, &files("walk", "1.0.0")).await;
+    secs(2).await;
+    process.end().await;
+    let mark = world.row::<OtaMark>("ota").await.expect("it has read something").0.seq;
+    let mut fleet = Item::new(Writer::Fleet, "tests");
+    fleet.create(&FleetMark { seq: mark }, "fleet.consumed");
+    world.store.commit(vec![fleet]).await.remove(0).expect("applied");
+    let floor = *world.store.wake().borrow();
+    let keep = Retention { before_unix_ms: i64::MAX, entries_max: 0, floor };
+    assert!(world.store.prune(keep).await.expect("pruned") > 0);
+    let expired = world.store.feed(mark, &Log::ALL, 1).await;
+    assert!(matches!(expired, Err(Error::CursorExpired { .. })), "{expired:?}");
+    let process = world.process().await;
+    let bundle = world.bundles().await[0].bundle.to_string();
+    process.create("r-1", &bundle).await.expect("created");
+    process.end().await;
 }
 
 /// A process that leads, one that follows it, and the bundle of a release that both know.

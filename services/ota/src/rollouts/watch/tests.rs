@@ -37,6 +37,7 @@ fn bundle(bundle: BundleId) -> Bundle {
         listed: true,
         revoked: None,
         published: Utc(0),
+        ended: None,
     }
 }
 
