@@ -56,11 +56,14 @@ pub struct Parts {
     pub bugs: Bugs,
 }
 
+/// What is made of the picture for whoever asked.
+type Answer = Box<dyn FnOnce(&View, &Board, &Now) + Send>;
+
 /// A question about the picture as it is now.
 struct Look {
     /// Roll-outs that it is about: they are in the picture when it is answered, if they are there.
     about: Vec<RolloutId>,
-    answer: Box<dyn FnOnce(&View, &Board, &Now) + Send>,
+    answer: Answer,
 }
 
 /// Something a person asks of the planner.

@@ -10,10 +10,17 @@ use midshift_core::rows::{Key, Part, Table};
 use midshift_store::Error;
 use std::collections::BTreeSet;
 
+/// What is to be read.
+pub(super) struct Wanted {
+    /// Roll-outs that the picture names.
+    named: BTreeSet<RolloutId>,
+    keys: Vec<Key>,
+}
+
 impl Loop {
-    /// Reads what the picture, `requests` and open questions want to know and is not in the picture.
-    pub(super) async fn ask(&mut self, requests: &[Request]) -> Result<(), Error> {
-        let wanted = self.view.wanted();
+    /// What the picture, `requests` and open questions want to know and is not in the picture.
+    pub(super) fn wanted(&self, requests: &[Request]) -> Wanted {
+        let named = self.view.wanted();
         let mut ids: BTreeSet<RolloutId> = self.looks.iter().flat_map(|look| &look.about).cloned().collect();
         let mut keys = Vec::new();
         for request in requests {
@@ -26,11 +33,15 @@ impl Loop {
             }
         }
         ids.retain(|id| !self.view.rollouts.contains_key(id.as_str()));
-        keys.extend(ids.union(&wanted).map(|id| Key::new(Table::Rollout, id.as_str())));
+        keys.extend(ids.union(&named).map(|id| Key::new(Table::Rollout, id.as_str())));
+        Wanted { named, keys }
+    }
+    /// Reads it into the picture.
+    pub(super) async fn ask(&mut self, Wanted { named, keys }: Wanted) -> Result<(), Error> {
         if keys.is_empty() {
             return Ok(());
         }
         let snapshot = self.parts.store.read(&[Part::Rows(keys), past::robots()], past::named).await?;
-        Ok(self.view.tell(wanted, &snapshot.rows)?)
+        Ok(self.view.tell(named, &snapshot.rows)?)
     }
 }

@@ -216,7 +216,8 @@ impl Loop {
         }
         metrics::counter!("midshift_ota_rebuilds_total").increment(1);
         // Questions that are still open are answered from this picture.
-        self.ask(&[]).await
+        let wanted = self.wanted(&[]);
+        self.ask(wanted).await
     }
 
     /// One turn; true: there is more to do at once. An error: the picture can no longer be trusted.
@@ -284,7 +285,8 @@ impl Loop {
         if plan.items.is_empty() {
             self.view.let_go();
         }
-        self.ask(&requests).await.map_err(unreadable)?;
+        let wanted = self.wanted(&requests);
+        self.ask(wanted).await.map_err(unreadable)?;
         let renewal = match self.seat.stance(now.link) {
             Stance::StepDown => {
                 // What was planned a moment ago is dropped, and with it the picture that holds it.

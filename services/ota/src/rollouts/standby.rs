@@ -43,7 +43,8 @@ impl Loop {
     /// Answers, and carries out what people ask. An error: the picture can no longer be trusted.
     pub(super) async fn assist(&mut self, requests: Vec<Request>) -> Result<(), ()> {
         let unread = |error| tracing::warn!(%error, "roll-outs cannot read what has ended");
-        self.ask(&requests).await.map_err(unread)?;
+        let wanted = self.wanted(&requests);
+        self.ask(wanted).await.map_err(unread)?;
         let mut trusted = Ok(());
         for request in requests {
             match request {
