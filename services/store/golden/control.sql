@@ -726,7 +726,11 @@ CREATE INDEX robot_last_by_position ON robot_last (site_id, position);
 
 CREATE INDEX rollout_by_ord ON rollout (site_id, ord, id);
 
+CREATE INDEX rollout_by_state ON rollout (site_id, state, ord, id);
+
 CREATE INDEX rollout_robot_by_parent ON rollout_robot (site_id, parent, ord, id);
+
+CREATE INDEX rollout_robot_by_state ON rollout_robot (site_id, state, ord, id);
 
 CREATE INDEX stop_audit_by_ord ON stop_audit (site_id, ord, id);
 

@@ -328,15 +328,21 @@ async fn two_robots_inside_one_place_are_one_incident_and_each_explanation_names
 
 #[tokio::test(start_paused = true)]
 async fn robots_that_all_say_that_they_are_in_one_place_are_one_incident() {
-    let mut w = World::on(CORRIDOR).await;
-    for n in 1..=12 {
-        w.robot(&format!("r{n}"), "park-a").await;
+    let mut w = World::on(DEMO).await;
+    let seats = w.site.starting_places(12);
+    let names: Vec<String> = seats.iter().map(|seat| w.site.name_of(*seat).to_string()).collect();
+    for (n, waypoint) in names.iter().enumerate() {
+        w.robot(&format!("r{n}"), waypoint).await;
     }
-    let seen = w.until("all are seen", |s| s.holders("park-a").len() == 12).await;
+    w.pass(2).await;
+    for n in 1..names.len() {
+        w.r(&format!("r{n}")).claims = vec![claim(&names[0])];
+    }
+    let seen = w.until("all are seen", |s| s.holders(&names[0]).len() == names.len()).await;
     let open = seen.open_incidents("EXCLUSION_BROKEN");
     assert_eq!(open.len(), 1, "{open:?}");
     let facts = &open[0].reason.metadata;
-    assert_eq!((facts["place_id"].as_str(), facts["inside"].as_str()), ("park-a", "12"));
+    assert_eq!((facts["place_id"].as_str(), facts["inside"].as_str()), (names[0].as_str(), "12"));
     assert_eq!(facts["robots"].split(' ').count(), 8);
     w.lawful().await;
 }
