@@ -232,7 +232,9 @@ impl Player {
     fn restart(&mut self) {
         self.boots += 1;
         if self.boots > 1 && self.rng.random_bool(0.5) {
-            (self.job, self.answer_at) = (None, None);
+            // Also if it takes that work up again, of which it has nothing then.
+            self.disowned.extend(self.job.take().map(|job| job.assignment.attempt));
+            self.answer_at = None;
             self.state.attempts.clear();
         }
         if self.boots > 1 && self.rng.random_bool(0.3) {
