@@ -188,10 +188,11 @@ impl Player {
     pub fn take_up(&mut self, habit: Habit) {
         self.habits.insert(habit);
     }
-    /// Whether it has this attempt and never said anything else of it.
+    /// Whether it has this attempt and never said anything else of it. Who says that it has applied what comes, and lists none of it, says so of
+    /// all that comes.
     pub fn keeps(&self, attempt: &AttemptId) -> bool {
         let has = self.job.as_ref().is_some_and(|job| job.assignment.attempt == *attempt);
-        has && !self.disowned.contains(attempt)
+        has && !self.disowned.contains(attempt) && !self.deeds.contains_key(Habit::WrongGenerations.name())
     }
     /// The task whose load it last said that it has, in a heartbeat.
     pub fn said_load(&self) -> Option<&TaskId> {
