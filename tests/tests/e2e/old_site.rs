@@ -3,7 +3,7 @@
 //!
 //! Each old store is made once for this program and copied for each test. `MIDSHIFT_OLD_TASKS` says how many tasks instead.
 
-use crate::harness::{channel, tasks, until};
+use crate::harness::{channel, free_port, tasks, until};
 use crate::room::LIMIT;
 use anyhow::{Context, ensure};
 use midshift::backup::{Places, back_up, restore, verify};
@@ -196,8 +196,9 @@ impl Serving {
             map: Default::default(),
         };
         let server = Server::new(parts, stop.clone()).await?;
-        let listener = TcpListener::bind("127.0.0.1:0").await?;
-        let address = listener.local_addr()?;
+        // No port that a site with a login had in this program.
+        let address = free_port()?;
+        let listener = TcpListener::bind(address).await?;
         let serving = AbortOnDropHandle::new(tokio::spawn(server.serve(listener)));
         Ok(Self { address, counted, storage, stop, serving, _planning: planning, _software: software })
     }
