@@ -10,6 +10,7 @@ use midshift_core::limits;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
 use midshift_proto::telemetry::v1::{WatchRobotsRequest, WatchRobotsResponse};
 use std::time::Duration;
+use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep, timeout};
 use tonic::Streaming;
 use tonic::transport::{Channel, Endpoint};
@@ -21,6 +22,8 @@ const LOOK_EVERY: Duration = Duration::from_millis(200);
 /// Before the first look: what a server does once is done.
 const SETTLE: Duration = Duration::from_secs(5);
 
+/// Watches that were not read are read to their end by then.
+const ENDS_WITHIN: Duration = Duration::from_secs(20);
 /// Bytes that a client takes unread, of a watch and of a connection: HTTP/2's own default, RFC 9113 section 6.9.2.
 const WINDOW: u32 = 65_535;
 
@@ -84,7 +87,7 @@ async fn round(args: &WatchArgs, engine: &Engine, memory: &mut Memory) -> anyhow
     }
     sleep(SETTLE).await;
     memory.without.push(server.rss_kib()?);
-    let mut watches = open(&server, args.watches).await?;
+    let watches = open(&server, args.watches).await?;
     let end = Instant::now() + Duration::from_millis(limits::WATCH_UNREAD.as_ms());
     let mut most_kib = 0.0_f64;
     while Instant::now() < end {
@@ -94,14 +97,15 @@ async fn round(args: &WatchArgs, engine: &Engine, memory: &mut Memory) -> anyhow
     memory.most.push(most_kib);
     sleep(SETTLE * 4).await;
     memory.after.push(server.rss_kib()?);
-    for watch in &mut watches {
-        timeout(SETTLE, ends(watch)).await.context("a watch that nobody read goes on")?;
-    }
+    // All at once: what one has not read takes the room of the others of its connection.
+    let mut reading: JoinSet<()> = watches.into_iter().map(ends).collect();
+    let all = async { while reading.join_next().await.is_some() {} };
+    timeout(ENDS_WITHIN, all).await.context("a watch that nobody read goes on")?;
     server.end()
 }
 
 /// Reads a watch to its end.
-async fn ends(watch: &mut Streaming<WatchRobotsResponse>) {
+async fn ends(mut watch: Streaming<WatchRobotsResponse>) {
     while watch.message().await.is_ok_and(|message| message.is_some()) {}
 }
 

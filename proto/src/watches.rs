@@ -20,6 +20,8 @@ use tonic::Status;
 struct Between<T> {
     message: Option<Result<T, Status>>,
     is_asked: bool,
+    /// The reader has just taken a message.
+    is_taken: bool,
     has_teller: bool,
     has_reader: bool,
     reader: Option<Waker>,
@@ -68,7 +70,8 @@ pub struct Reader<T>(Arc<Shared<T>>);
 
 /// A watch: who tells, and what is read of it.
 pub fn watch<T>() -> (Teller<T>, Reader<T>) {
-    let between = Between { message: None, is_asked: false, has_teller: true, has_reader: true, reader: None };
+    let between =
+        Between { message: None, is_asked: false, is_taken: false, has_teller: true, has_reader: true, reader: None };
     let shared = Arc::new(Shared { between: Mutex::new(between), moved: Notify::new() });
     (Teller(shared.clone()), Reader(shared))
 }
@@ -123,10 +126,16 @@ impl<T> Stream for Reader<T> {
     fn poll_next(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         let mut between = self.0.lock();
         if let Some(message) = between.message.take() {
+            between.is_taken = true;
             return Poll::Ready(Some(message));
         }
         if !between.has_teller {
             return Poll::Ready(None);
+        }
+        // An encoder looks for a second message to send with the first. It asks when it comes again, which is when there is room to send.
+        if std::mem::take(&mut between.is_taken) {
+            context.waker().wake_by_ref();
+            return Poll::Pending;
         }
         between.reader = Some(context.waker().clone());
         between.is_asked = true;
@@ -156,6 +165,8 @@ mod tests {
     use super::*;
     use crate::refusal_of;
     use std::sync::Weak;
+    use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+    use std::task::Wake;
     use tokio_stream::StreamExt;
 
     #[tokio::test(start_paused = true)]
@@ -187,6 +198,31 @@ mod tests {
         let why = reader.next().await.expect("a last word").expect_err("a refusal");
         assert_eq!(refusal_of(&why).code, Some(Code::WatchUnread));
         assert!(reader.next().await.is_none());
+    }
+
+    /// How often it was woken.
+    #[derive(Default)]
+    struct Woken(AtomicU32);
+
+    impl Wake for Woken {
+        fn wake(self: Arc<Self>) {
+            self.0.fetch_add(1, Relaxed);
+        }
+    }
+
+    #[test]
+    fn who_has_just_taken_a_message_asks_for_the_next_one_when_it_comes_again() {
+        let (teller, mut reader) = watch();
+        let woken = Arc::new(Woken::default());
+        let waker = Waker::from(woken.clone());
+        let mut context = Context::from_waker(&waker);
+        let is_asked = || teller.0.lock().is_asked;
+        teller.tell_message(1);
+        assert!(Pin::new(&mut reader).poll_next(&mut context).is_ready());
+        assert!(Pin::new(&mut reader).poll_next(&mut context).is_pending());
+        assert_eq!((is_asked(), woken.0.load(Relaxed)), (false, 1), "the message may lie in a buffer: it comes again");
+        assert!(Pin::new(&mut reader).poll_next(&mut context).is_pending());
+        assert_eq!((is_asked(), woken.0.load(Relaxed)), (true, 1));
     }
 
     #[tokio::test(start_paused = true)]
