@@ -112,7 +112,7 @@ impl View {
     ///
     /// # Errors
     /// A row that cannot be read.
-    pub fn tell(&mut self, wanted: BTreeSet<RolloutId>, rows: &[Row]) -> Result<(), BadRow> {
+    pub fn absorb_past(&mut self, wanted: BTreeSet<RolloutId>, rows: &[Row]) -> Result<(), BadRow> {
         // A robot of a roll-out that ended is no newcomer for having been read.
         let arrived = std::mem::take(&mut self.arrived);
         for row in rows {

@@ -51,7 +51,7 @@ fn one_that_the_feed_speaks_of_is_not_taken_in_part_and_comes_back_whole() {
     assert!(rig.ota.robots.is_empty(), "one robot of four");
     assert_eq!(wanted(&rig), [rollout_id("ro")]);
     let rows = read(&rig, "ro");
-    rig.ota.tell(rig.ota.wanted(), &rows).expect("rows read");
+    rig.ota.absorb_past(rig.ota.wanted(), &rows).expect("rows read");
     assert_eq!((rig.ota.rollouts.len(), rig.ota.robots.len(), rig.ota.open.len()), (1, 4, 1));
     rig.ota.let_go();
     assert_eq!(rig.ota.robots.len(), 4, "something is due for one of them");
@@ -82,7 +82,7 @@ fn one_that_is_named_and_is_not_there_is_asked_for_once() {
     rig.put(AreaBundle { area_id: AreaId::parse("quality").expect("an id"), rollouts });
     rig.ota_turn();
     assert_eq!(wanted(&rig), [rollout_id("gone")]);
-    rig.ota.tell(rig.ota.wanted(), &[]).expect("nothing to read");
+    rig.ota.absorb_past(rig.ota.wanted(), &[]).expect("nothing to read");
     assert!(wanted(&rig).is_empty());
 }
 

@@ -37,11 +37,11 @@ impl Loop {
         Wanted { named, keys }
     }
     /// Reads it into the picture.
-    pub(super) async fn ask(&mut self, Wanted { named, keys }: Wanted) -> Result<(), Error> {
+    pub(super) async fn read_wanted(&mut self, Wanted { named, keys }: Wanted) -> Result<(), Error> {
         if keys.is_empty() {
             return Ok(());
         }
         let snapshot = self.parts.store.read(&[Part::Rows(keys), past::robots()], past::named).await?;
-        Ok(self.view.tell(named, &snapshot.rows)?)
+        Ok(self.view.absorb_past(named, &snapshot.rows)?)
     }
 }

@@ -217,7 +217,7 @@ impl Loop {
         metrics::counter!("midshift_ota_rebuilds_total").increment(1);
         // Questions that are still open are answered from this picture.
         let wanted = self.wanted(&[]);
-        self.ask(wanted).await
+        self.read_wanted(wanted).await
     }
 
     /// One turn; true: there is more to do at once. An error: the picture can no longer be trusted.
@@ -286,7 +286,7 @@ impl Loop {
             self.view.let_go();
         }
         let wanted = self.wanted(&requests);
-        self.ask(wanted).await.map_err(unreadable)?;
+        self.read_wanted(wanted).await.map_err(unreadable)?;
         let renewal = match self.seat.stance(now.link) {
             Stance::StepDown => {
                 // What was planned a moment ago is dropped, and with it the picture that holds it.

@@ -44,7 +44,7 @@ impl Loop {
     pub(super) async fn assist(&mut self, requests: Vec<Request>) -> Result<(), ()> {
         let unread = |error| tracing::warn!(%error, "roll-outs cannot read what has ended");
         let wanted = self.wanted(&requests);
-        self.ask(wanted).await.map_err(unread)?;
+        self.read_wanted(wanted).await.map_err(unread)?;
         let mut trusted = Ok(());
         for request in requests {
             match request {

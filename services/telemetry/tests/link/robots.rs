@@ -164,19 +164,10 @@ async fn a_robot_is_offline_after_a_start_with_what_was_known_of_it_until_it_is_
 /// A session that a robot had once.
 fn session(id: &str, inventory: Inventory) -> Result<Session> {
     Ok(Session {
-        robot_id: RobotId::parse(id)?,
-        session_epoch: 7,
         secret: "secret".into(),
         boot_id: "b-1".to_owned(),
         ring: "ring".to_owned(),
-        inventory,
-        applied_work: 0,
-        applied_update: 0,
-        places: Vec::new(),
-        clock_offset_ms: None,
-        installed: None,
-        device_key: None,
-        device_key_changed: false,
+        ..Session::new(RobotId::parse(id)?, 7, inventory)
     })
 }
 
