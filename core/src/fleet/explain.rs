@@ -94,9 +94,10 @@ pub fn per_turn(robots: usize) -> usize {
     (limits::ROBOTS_ASKED_PER_TURN / robots.max(1)).max(1)
 }
 
-/// How a task ended.
-pub fn ended(task: &TaskState) -> TaskExplanation {
-    let verdict = Some(standing::ended(task));
+/// A task that is not in the picture: how it ended, or that the planner has not read it yet.
+pub fn stored(task: &TaskState) -> TaskExplanation {
+    let unread = || Reason::from(Code::WaitingInQueue).with(WAITS_FOR, "the planner: it has not read the task yet");
+    let verdict = Some(if task.phase.is_terminal() { standing::ended(task) } else { unread() });
     TaskExplanation { position: None, verdict, candidates: Vec::new(), filtered: BTreeMap::new() }
 }
 

@@ -273,13 +273,13 @@ impl FleetService {
             .await?;
         let explanation = match found {
             Some(found) => found,
-            None => self.why_ended(&task_id, by, now).await?,
+            None => self.why_stored(&task_id, by, now).await?,
         };
         Ok(v1::ExplainTaskResponse { explanation: Some(explanation) })
     }
 
-    /// How a task ended: the picture has let it go, the store has not.
-    async fn why_ended(&self, task_id: &TaskId, by: &Caller, now: Utc) -> Result<v1::TaskExplanation, Refusal> {
+    /// What the store says of a task that is not in the picture: it has ended, or was accepted a moment ago.
+    async fn why_stored(&self, task_id: &TaskId, by: &Caller, now: Utc) -> Result<v1::TaskExplanation, Refusal> {
         let missing = || not_found(Code::TaskNotFound, task_id);
         let keys = [Table::TaskState, Table::TaskIntake].map(|table| Key::new(table, task_id.as_str()));
         let unread = |_| Refusal::new(Kind::Unavailable, Code::StoreUnavailable);
@@ -299,10 +299,7 @@ impl FleetService {
             }
             Err(_) => return Err(internal()),
         };
-        if !task.phase.is_terminal() {
-            return Err(missing());
-        }
-        Ok(encode::task_explanation(task_id, &explain::ended(&task), now))
+        Ok(encode::task_explanation(task_id, &explain::stored(&task), now))
     }
 
     async fn why_robot(&self, r: v1::ExplainRobotRequest, by: &Caller) -> Result<v1::ExplainRobotResponse, Refusal> {

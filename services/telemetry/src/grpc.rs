@@ -14,15 +14,16 @@ use midshift_proto::convert::WireEnum;
 use midshift_proto::convert::telemetry::{RobotView, encode_event, encode_robot, shown_presence};
 use midshift_proto::pages;
 use midshift_proto::telemetry::v1::{self, telemetry_service_server::TelemetryService as Face};
-use midshift_proto::watches::{self, Reader, Teller};
+use midshift_proto::watches::{self, Gone, Reader, Teller};
 use midshift_store::{Dirty, Error};
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Bound;
 use std::sync::Arc;
 use std::time::Duration;
 use tonic::{Request, Response, Status};
 
 /// Robots of one message of a watch.
-const ROBOTS_PER_MESSAGE: usize = 32;
+const ROBOTS_PER_MESSAGE: usize = 24;
 /// Milliseconds between two messages of a watch, by default and allowed.
 const PERIOD_DEFAULT_MS: u32 = 1_000;
 const PERIOD_MS: std::ops::RangeInclusive<u32> = 50..=60_000;
@@ -249,7 +250,7 @@ impl Face for TelemetryService {
             let shutdown = inner.shutdown.clone();
             tokio::select! {
                 () = shutdown.cancelled() => {}
-                () = watch(&inner, filter, Duration::from_millis(u64::from(period_ms)), &teller) => {}
+                _ = watch(&inner, filter, Duration::from_millis(u64::from(period_ms)), &teller) => {}
             }
         });
         Ok(Response::new(reader))
@@ -284,11 +285,43 @@ impl Watching<'_> {
         }
         robots
     }
-    /// All robots.
-    fn first(&mut self) -> Vec<RobotId> {
-        self.beats.take();
-        self.touched.take();
-        self.inner.picture.rows().sessions.keys().cloned().collect()
+    /// Robots of the whole behind one, as many as a message takes: an unread watch holds none of the others.
+    fn of_the_whole(&self, behind: Bound<RobotId>) -> Vec<RobotId> {
+        let rows = self.inner.picture.rows();
+        rows.sessions.range((behind, Bound::Unbounded)).map(|(id, _)| id).take(ROBOTS_PER_MESSAGE).cloned().collect()
+    }
+    async fn tell_whole(&mut self, teller: &Teller<v1::WatchRobotsResponse>) -> Result<(), Gone> {
+        let (mut behind, mut snapshot_complete) = (Bound::Unbounded, false);
+        while !snapshot_complete {
+            teller.asked().await?;
+            let ids = self.of_the_whole(behind.clone());
+            snapshot_complete = ids.len() < ROBOTS_PER_MESSAGE;
+            behind = ids.last().cloned().map_or(behind, Bound::Excluded);
+            let robots = self.news(ids);
+            // The end of the whole is told, also where nothing of it is shown.
+            if !robots.is_empty() || snapshot_complete {
+                teller.tell_message(v1::WatchRobotsResponse { robots, snapshot_complete });
+            }
+        }
+        Ok(())
+    }
+    async fn tell_changes(&mut self, period: Duration, teller: &Teller<v1::WatchRobotsResponse>) -> Result<(), Gone> {
+        let mut ids = Vec::new();
+        loop {
+            while ids.is_empty() {
+                tokio::select! {
+                    () = teller.gone() => return Err(Gone),
+                    () = tokio::time::sleep(period) => ids = self.changed(),
+                }
+            }
+            teller.asked().await?;
+            let rest = ids.split_off(ids.len().min(ROBOTS_PER_MESSAGE));
+            let robots = self.news(ids);
+            ids = rest;
+            if !robots.is_empty() {
+                teller.tell_message(v1::WatchRobotsResponse { robots, snapshot_complete: true });
+            }
+        }
     }
     /// Those that changed since the last call.
     fn changed(&mut self) -> Vec<RobotId> {
@@ -299,25 +332,16 @@ impl Watching<'_> {
 }
 
 /// The whole, then what changed, newest only, at the watcher's pace; a slow watcher lowers only its own rate.
-async fn watch(inner: &Inner, filter: Filter, period: Duration, teller: &Teller<v1::WatchRobotsResponse>) {
+async fn watch(
+    inner: &Inner,
+    filter: Filter,
+    period: Duration,
+    teller: &Teller<v1::WatchRobotsResponse>,
+) -> Result<(), Gone> {
     let (beats, touched) = (inner.parts.board.watch(), inner.picture.touched());
     let mut watching = Watching { inner, filter, beats, touched, shown: BTreeSet::new() };
-    let mut ids = watching.first();
-    let mut snapshot_complete = false;
-    while teller.asked().await.is_ok() {
-        let rest = ids.split_off(ids.len().min(ROBOTS_PER_MESSAGE));
-        let robots = watching.news(ids);
-        ids = rest;
-        // The end of the whole is told, also where nothing of it is shown.
-        if !robots.is_empty() || (ids.is_empty() && !snapshot_complete) {
-            snapshot_complete |= ids.is_empty();
-            teller.tell_message(v1::WatchRobotsResponse { robots, snapshot_complete });
-        }
-        while ids.is_empty() {
-            tokio::select! {
-                () = teller.gone() => return,
-                () = tokio::time::sleep(period) => ids = watching.changed(),
-            }
-        }
-    }
+    // What is there already is part of the whole.
+    let _ = watching.changed();
+    watching.tell_whole(teller).await?;
+    watching.tell_changes(period, teller).await
 }
