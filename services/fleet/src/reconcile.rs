@@ -300,7 +300,10 @@ impl Loop {
     async fn lead(&mut self, pace: Pace, requests: Vec<Request>) -> Result<(), ()> {
         let begun = Instant::now();
         let now = self.parts.clock.now();
-        let mut plan = Plan::of(Slice::of(self.share));
+        // People come first: what is planned beside a command is the least that goes on.
+        let has_command = requests.iter().any(|request| matches!(request, Request::Do(_)));
+        let share = if has_command { limits::DECISIONS_PER_STAGE_MIN } else { self.share };
+        let mut plan = Plan::of(Slice::of(share));
         self.take_feed(now, &mut plan).await.map_err(|error| tracing::warn!(%error, "fleet cannot read the feed"))?;
         let unread = |error| tracing::warn!(%error, "fleet cannot read what is over");
         self.ask(used_ids(&requests)).await.map_err(unread)?;
@@ -347,7 +350,9 @@ impl Loop {
         if is_doubted {
             return Err(());
         }
-        self.fit(begun.elapsed(), is_cut);
+        if !has_command {
+            self.fit(begun.elapsed(), is_cut);
+        }
         self.answer(now);
         Ok(())
     }
