@@ -311,7 +311,7 @@ async fn a_token_that_acts_outside_its_area_is_denied_and_that_stands_in_the_aud
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn doctor_looks_at_certificates_tokens_rights_and_for_the_stop_service() -> anyhow::Result<()> {
     let dir = folder()?;
-    let server = Server::start(dir.path()).await?;
+    let mut server = Server::start(dir.path()).await?;
     let _secret = enrolment(server.address, "rbt-01").await?;
     let (address, data) = (server.address.to_string(), server.data().display().to_string());
     let nobody = "127.0.0.1:1";
@@ -332,6 +332,14 @@ async fn doctor_looks_at_certificates_tokens_rights_and_for_the_stop_service() -
     ensure!(of("disk").len() == 1 && of("clocks")[0] == (true, "the server and this machine agree"), "{found:?}");
     let [(false, stop)] = of("stop")[..] else { anyhow::bail!("{found:?}") };
     ensure!(stop.contains("midshift stop serve"), "{stop}");
+
+    // What the clock jumped before the server was started again is told too.
+    let kept = serde_json::json!({ "step_ms": -7_200_000, "to_unix_ms": midshift::clock::wall().0 });
+    std::fs::write(server.data().join("clock-jump.json"), kept.to_string())?;
+    server.kill_and_restart().await?;
+    let output = call(&["doctor", "--server", &address, "--data", &data, "--stop-server", nobody])?;
+    let told = String::from_utf8(output.stdout)?;
+    ensure!(told.contains("the server's jumped 7200 s back at "), "{told}");
     Ok(())
 }
 
