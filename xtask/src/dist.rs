@@ -60,12 +60,7 @@ pub fn dist(workspace: &Workspace, options: &Options) -> Result<bool> {
     let made = temporary.path.join("made");
     let programs = workspace.target.join("dist");
     archives(workspace, &version, &programs, &temporary.path, &made)?;
-    let archive = made.join(format!("{}.tar.gz", name_of(&version)));
-    let said = starts(&archive, &temporary.path)?;
-    ensure!(
-        is_for_use(&said, &version),
-        "programs of a release say their version and nothing else; these say {said:?}"
-    );
+    check_archive(&made.join(format!("{}.tar.gz", name_of(&version))), &temporary.path, &version)?;
     if !options.no_image {
         let bases = if options.machine_bases { images::Bases::OfThisMachine } else { images::Bases::AsWritten };
         let program = programs.join(PROGRAMS[0]);
@@ -88,7 +83,7 @@ pub fn dist(workspace: &Workspace, options: &Options) -> Result<bool> {
     Ok(true)
 }
 
-/// The archives of the debug programs, twice: the same bytes, whole by their digests, and what is in them starts and is not taken for a release, since
+/// The archives of the debug programs, twice: the same bytes, whole by their digests, and what is in them starts and is refused as a release, since
 /// programs of tests have naive rules in them. Whether all of that holds.
 pub fn test(workspace: &Workspace) -> Result<bool> {
     let (version, temporary) = (workspace.version()?, Temporary::new()?);
@@ -110,14 +105,19 @@ pub fn test(workspace: &Workspace) -> Result<bool> {
     ensure!(first == second, "the same programs give two archives:\n{first}{second}");
     ensure!(first.lines().count() == 2, "not the archives that a release has:\n{first}");
     let whole = run::succeeds(Command::new("sha256sum").args(["-c", "SHA256SUMS"]).current_dir(&made[0]))?;
-    let said = starts(&made[0].join(format!("{}.tar.gz", name_of(&version))), &temporary.path)?;
-    ensure!(said[0].starts_with(&format!("midshift {version} with seeded bugs")), "the program of tests says {said:?}");
-    Ok(whole && !is_for_use(&said, &version))
+    let archive = made[0].join(format!("{}.tar.gz", name_of(&version)));
+    let refused = check_archive(&archive, &temporary.path, &version).err().map(|error| format!("{error:#}"));
+    let names_them = |refused: &String| refused.contains(&format!("midshift {version} with seeded bugs"));
+    ensure!(refused.as_ref().is_some_and(names_them), "programs of tests are not refused as such: {refused:?}");
+    Ok(whole)
 }
 
-/// Whether programs that say this are of that version, and nothing is in them that is for tests alone.
-fn is_for_use(said: &[String], version: &str) -> bool {
-    said.iter().eq(PROGRAMS.map(|name| format!("{name} {version}")).iter())
+/// Refuses an archive whose programs do not start, are not of that version, or say anything beside it: what is for tests alone says so.
+fn check_archive(archive: &Path, temporary: &Path, version: &str) -> Result<()> {
+    let said = starts(archive, temporary)?;
+    let wanted = PROGRAMS.map(|name| format!("{name} {version}"));
+    ensure!(said == wanted, "programs of a release say their version and nothing else; these say {said:?}");
+    Ok(())
 }
 
 /// What the programs of an archive say of their version. They start, and the first one finds what lies beside it.
@@ -185,7 +185,8 @@ fn save(
     let said = run::output(docker().args(["run", "--rm", "--network", "none", "--read-only", &midshift, "--version"]));
     let said =
         said.context("the image does not start: were its programs built for newer libraries than its base has?")?;
-    ensure!(said.contains(version), "the image says that it is {}", said.trim());
+    let is_it = said.trim() == format!("{} {version}", PROGRAMS[0]);
+    ensure!(is_it, "an image of a release says its version and nothing else; this one says {:?}", said.trim());
     let mut check = docker();
     check.args(["run", "--rm", "--network", "none", "--entrypoint", "haproxy", &proxy, "-v"]);
     ensure!(run::succeeds(&mut check)?, "the image of the proxy does not start");
@@ -247,7 +248,12 @@ impl Drop for Temporary {
 
 #[cfg(test)]
 mod tests {
-    use super::{is_for_use, is_told};
+    use super::{PROGRAMS, Temporary, check_archive, is_told};
+    use anyhow::{Context, Result, ensure};
+    use std::fs::Permissions;
+    use std::os::unix::fs::PermissionsExt;
+    use std::path::Path;
+    use std::process::Command;
 
     #[test]
     fn a_release_needs_a_heading_of_its_own_version() {
@@ -256,11 +262,34 @@ mod tests {
         assert!(!is_told(notes, "0.2.0") && !is_told(notes, "0.1") && !is_told("## 0.1.01", "0.1.0"));
     }
 
+    /// Whether an archive would be released whose programs say this.
+    fn judge(folder: &Path, said: [&str; 2]) -> Result<()> {
+        let bin = folder.join("it/bin");
+        std::fs::create_dir_all(&bin)?;
+        for (name, said) in PROGRAMS.into_iter().zip(said) {
+            std::fs::write(bin.join(name), format!("#!/bin/sh\necho '{said}'\n"))?;
+            std::fs::set_permissions(bin.join(name), Permissions::from_mode(0o755))?;
+        }
+        let archive = folder.join("it.tar.gz");
+        let packed = Command::new("tar").arg("-czf").arg(&archive).arg("-C").arg(folder).arg("it").status();
+        ensure!(packed.context("tar")?.success(), "tar failed");
+        check_archive(&archive, folder, "0.2.0")
+    }
+
     #[test]
-    fn a_program_that_says_more_than_its_version_is_not_released() {
-        let said = |midshift: &str| [midshift, "midshift-launcher 0.2.0"].map(str::to_owned);
-        assert!(is_for_use(&said("midshift 0.2.0"), "0.2.0"));
-        assert!(!is_for_use(&said("midshift 0.2.0 with seeded bugs, for tests only"), "0.2.0"));
-        assert!(!is_for_use(&said("midshift 0.1.0"), "0.2.0"));
+    fn an_archive_is_refused_whose_programs_say_more_or_less_than_their_version() {
+        let temporary = Temporary::new().expect("a folder");
+        let (launcher, seeded) = ("midshift-launcher 0.2.0", "midshift 0.2.0 with seeded bugs, for tests only");
+        judge(&temporary.path.join("good"), ["midshift 0.2.0", launcher]).expect("it is a release");
+        let bad = [
+            [seeded, launcher],
+            ["midshift 0.1.0", launcher],
+            ["midshift 0.2.0", "midshift-launcher 0.2.0 with seeded bugs, for tests only"],
+            ["midshift 0.2.0", ""],
+        ];
+        for (nth, said) in bad.into_iter().enumerate() {
+            let refused = judge(&temporary.path.join(nth.to_string()), said).expect_err("it is no release").to_string();
+            assert!(refused.contains(&format!("{said:?}")), "{refused}");
+        }
     }
 }

@@ -193,8 +193,8 @@ fn to_value(value: &Value) -> prost_types::Value {
     prost_types::Value { kind: Some(kind) }
 }
 
-/// Reads a JSON object; absent: an empty one. A double without a fraction becomes an integer. The first number that JSON
-/// cannot say is a violation.
+/// Reads a JSON object; absent: an empty one. A double without a fraction becomes an integer. The first value without a kind, and the first number
+/// that JSON cannot say, is a violation.
 pub(crate) fn from_struct(wire: Option<Struct>, at: At<'_>, bad: &mut Violations) -> Option<Map<String, Value>> {
     let fields = wire.unwrap_or_default().fields.into_iter();
     fields
@@ -208,7 +208,11 @@ pub(crate) fn from_struct(wire: Option<Struct>, at: At<'_>, bad: &mut Violations
 
 fn from_value(wire: prost_types::Value, at: At<'_>, bad: &mut Violations) -> Option<Value> {
     Some(match wire.kind {
-        None | Some(Kind::NullValue(_)) => Value::Null,
+        None => {
+            bad.add(at.to_string(), "is a value without a kind; null has one too");
+            return None;
+        }
+        Some(Kind::NullValue(_)) => Value::Null,
         Some(Kind::BoolValue(b)) => Value::Bool(b),
         Some(Kind::NumberValue(n)) if !n.is_finite() => {
             bad.add(at.to_string(), format!("{n} is not a number of JSON"));
@@ -310,5 +314,22 @@ mod tests {
             let description = format!("{shown} is not a number of JSON");
             assert_eq!(bad.0, [Violation { field, description }]);
         }
+    }
+
+    #[test]
+    fn a_value_without_a_kind_is_refused_by_its_path_and_null_is_read() {
+        let null = prost_types::Value { kind: Some(Kind::NullValue(0)) };
+        let read = |value: prost_types::Value| {
+            let values = vec![null.clone(), value];
+            let list = prost_types::Value { kind: Some(Kind::ListValue(ListValue { values })) };
+            let mut bad = Violations::default();
+            let object = Struct { fields: [("weights".to_owned(), list)].into() };
+            let read = from_struct(Some(object), At::top("params"), &mut bad);
+            (read.and_then(|mut map| map.remove("weights")), bad.0)
+        };
+        assert_eq!(read(null.clone()), (Some(Value::Array(vec![Value::Null, Value::Null])), Vec::new()));
+        let (nothing, bad) = read(prost_types::Value { kind: None });
+        assert_eq!(nothing, None);
+        assert_eq!(bad.iter().map(|one| one.field.as_str()).collect::<Vec<_>>(), ["params.weights[1]"]);
     }
 }

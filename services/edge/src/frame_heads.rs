@@ -316,6 +316,58 @@ mod tests {
         assert!(counted.came(&settings).is_err() && counted.flooded.is_set());
     }
 
+    /// What a client sends of itself: when it begins a watch, at each message of it, and every 10 s to see that the line stands.
+    struct Client {
+        name: &'static str,
+        begin: Vec<Vec<u8>>,
+        message: Vec<Vec<u8>>,
+        alive: Vec<Vec<u8>>,
+    }
+
+    /// With `keepalive_time` of 10 s and all else as it is by default. What grpcio 1.85 and grpc-js 1.14 send was read off a line; what grpc-go sends, of which
+    /// grpcurl is made, is the most that its transport can.
+    fn clients() -> [Client; 3] {
+        let settings = |bytes| [frame(SETTINGS, 0, bytes), frame(SETTINGS, 1, 0)].concat();
+        let request = [frame(HEADERS, 4, 199), frame(DATA, END_STREAM, 10)].concat();
+        let (window, ping) = (|| frame(8, 0, 4), || frame(6, 0, 8));
+        [
+            Client {
+                name: "grpcio",
+                begin: vec![settings(36), window(), request.clone(), window(), window()],
+                message: vec![window(), window(), ping()],
+                alive: vec![window(), window(), ping()],
+            },
+            Client { name: "grpc-js", begin: vec![settings(6), request.clone()], message: vec![], alive: vec![ping()] },
+            Client {
+                name: "grpc-go",
+                begin: vec![settings(0), request],
+                message: vec![window(), window(), ping(), window()],
+                alive: vec![ping()],
+            },
+        ]
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn clients_that_see_each_10_s_that_the_line_stands_are_cut_neither_in_an_idle_watch_nor_in_a_fast_one() {
+        for Client { name, begin, message, alive } in clients() {
+            let mut counted = Counted::new((), Flooded::default());
+            counted.came(&[PREFACE, &begin.concat()].concat()).expect(name);
+            counted.went(&[frame(SETTINGS, 0, 12), frame(HEADERS, 4, 20), frame(DATA, 0, 50)].concat());
+            let (answers_to_us, our_answer) = (frame(6, 1, 8), frame(6, 1, 8));
+            // A day in which nothing happens, with pings of ours too.
+            for _ in 0..24 * 360 {
+                tokio::time::advance(Duration::from_secs(10)).await;
+                counted.came(&[alive.concat(), answers_to_us.clone()].concat()).expect(name);
+                counted.went(&our_answer);
+            }
+            for _ in 0..100_000 {
+                counted.went(&frame(DATA, 0, 200));
+                counted.came(&message.concat()).expect(name);
+            }
+            assert!(!counted.flooded.is_set(), "{name}");
+        }
+    }
+
     #[test]
     fn what_is_earned_is_bounded() {
         let mut budget = Budget::new(Instant::now());

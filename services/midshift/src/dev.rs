@@ -208,6 +208,7 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
         naive: Naive::default(),
         stops: Some(stops.folder.clone()),
         stop_port: Some(stops.beside.address().port()),
+        jumped_before: None,
         identity: None,
         port: door::alone("business"),
         planning: planning.handle(),

@@ -3,7 +3,7 @@
 use crate::roles::Roles;
 use midshift_core::fleet::maps::MapChange;
 use midshift_core::site::Site;
-use midshift_core::time::Clock;
+use midshift_core::time::{Clock, Utc};
 use midshift_identity::IdentityService;
 use midshift_ota::{OtaReader, OtaService};
 use midshift_sim::service::SimFace;
@@ -53,6 +53,8 @@ pub struct Parts {
     pub map: MapChange,
     /// Clocks.
     pub clock: Arc<dyn Clock>,
+    /// What the wall jumped at last before this run, milliseconds ahead, and UTC when it had; see [`crate::clock_jump`].
+    pub jumped_before: Option<(i64, Utc)>,
     /// Software of robots, of a process with role ota.
     pub ota: OtaService,
     /// Software of robots, of a gateway beside such processes.

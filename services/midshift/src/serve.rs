@@ -6,7 +6,7 @@ use crate::planning::Planning;
 use crate::roles::{Role, Roles};
 use crate::server::{Naive, Parts, Server};
 use crate::storage::{Database, Storage};
-use crate::{backup, changed_map};
+use crate::{backup, changed_map, clock_jump};
 use crate::{clock, logs, site_file, stop, stop_follower};
 use anyhow::{Context, bail};
 use clap::ValueEnum;
@@ -259,7 +259,8 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         site: loaded.site,
         site_text: loaded.text,
         map,
-        clock,
+        jumped_before: clock_jump::before(&args.data, clock.now().wall),
+        clock: clock.clone(),
         ota,
         reader,
         sim: None,
@@ -288,6 +289,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         served = server.serve(listener) => served,
         () = kept => Ok(()),
         () = backup::told::run(&args.data, &*rows) => Ok(()),
+        () = clock_jump::keep(&args.data, &*clock) => Ok(()),
     };
     storage.close().await;
     served

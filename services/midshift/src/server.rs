@@ -142,7 +142,7 @@ impl Server {
         let said = SiteAnswer { site_id: self.parts.site.site_id().to_string(), stop_port: self.parts.stop_port };
         let mut routes = Routes::builder();
         routes
-            .add_service(said.layer(self.parts.clock.clone()).named_layer(health_service))
+            .add_service(said.layer(self.parts.clock.clone(), self.parts.jumped_before).named_layer(health_service))
             .add_service(reflection().build_v1()?.max_decoding_message_size(control))
             .add_service(reflection().build_v1alpha()?.max_decoding_message_size(control));
         if let Some(task) = &self.task {
@@ -472,6 +472,7 @@ mod tests {
             naive: Naive::default(),
             stops: None,
             stop_port: None,
+            jumped_before: None,
             planning: planning.handle(),
         })
     }

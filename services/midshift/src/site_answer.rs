@@ -37,16 +37,18 @@ impl SiteAnswer {
         Some(Self { site_id: text(SITE)?.to_owned(), stop_port: text(STOP_PORT).and_then(|port| port.parse().ok()) })
     }
 
-    /// Adds it, and the newest jump of the wall, to each answer of a service.
+    /// Adds it, and the newest jump of the wall, to each answer of a service; `before` is that of the run before.
     pub fn layer(
         self,
         clock: Arc<dyn Clock>,
+        before: Option<(i64, Utc)>,
     ) -> MapResponseLayer<impl Fn(Response<Body>) -> Response<Body> + Clone + Send + Sync + 'static> {
         // The name of a site is letters, digits and dashes.
         let site = HeaderValue::from_str(&self.site_id).ok();
         let port = self.stop_port.map(HeaderValue::from);
         MapResponseLayer::new(move |mut response: Response<Body>| {
-            let jump = clock.last_jump().and_then(|jump| said_jump(jump.step_ms(), jump.to).parse().ok());
+            let jump = clock.last_jump().map(|jump| (jump.step_ms(), jump.to)).or(before);
+            let jump = jump.and_then(|(step_ms, to)| said_jump(step_ms, to).parse().ok());
             let said = [(SITE, site.clone()), (STOP_PORT, port.clone()), (CLOCK_JUMP, jump)];
             let said = said.into_iter().filter_map(|(name, value)| Some((name, value?)));
             said.for_each(|(name, value)| drop(response.headers_mut().insert(name, value)));

@@ -96,7 +96,7 @@ impl Turn<'_> {
             tracing::warn!(%error, "what is past its time about tokens and identities could not be taken away");
         }
         if has(Role::Telemetry) {
-            if let Err(error) = midshift_telemetry::prune(store, clock).await {
+            if let Err(error) = midshift_telemetry::prune(store, frames, clock).await {
                 tracing::warn!(%error, "rows of rings and robots that are gone could not be taken away");
             }
             if let Err(error) = frames.prune().await {

@@ -121,6 +121,7 @@ pub fn status(inner: &Inner) -> v1::Status {
         });
     }
     let counts = tally.finish();
+    let jump = inner.clock.last_jump();
     let engaged = stops.iter().zip(counts);
     let stops = engaged.map(|((stop, _), counts)| v1::EngagedStop { stop: Some(stop.into()), counts: Some(counts) });
     v1::Status {
@@ -130,6 +131,8 @@ pub fn status(inner: &Inner) -> v1::Status {
         audit_refused: inner.disk.refuses_audit(),
         principals_told_unix_ms: inner.principals.get().map_or(0, |told| told.borrow().0),
         site_id: inner.site_id.as_ref().map(ToString::to_string).unwrap_or_default(),
+        clock_jump_ms: jump.map_or(0, |jump| jump.step_ms()),
+        clock_jumped_unix_ms: jump.map_or(0, |jump| jump.to.0),
     }
 }
 

@@ -106,6 +106,8 @@ pub trait FrameLog: Send + Sync + 'static {
         let marks = self.marks().await?;
         Ok(marks.iter().find(|m| m.robot_id == *robot_id && *m.ring == *ring).map_or(0, |m| m.seq))
     }
+    /// Forgets how far rings have come, each only if its mark is still as it was read. Returns how many were forgotten.
+    async fn forget(&self, marks: Vec<FrameMark>) -> Result<u64, Error>;
     /// Frames after a position, whole groups, until `bytes_max` is passed. Empty: there is nothing newer.
     async fn read(&self, after: u64, bytes_max: usize) -> Result<Vec<StoredFrame>, Error>;
     /// Writes gaps down; durable on return.
@@ -161,6 +163,16 @@ impl Marks {
     pub(crate) fn raise(&mut self, robot_id: &RobotId, ring: &Arc<str>, seq: u64) {
         let mark = self.0.entry((robot_id.clone(), ring.clone())).or_default();
         *mark = seq.max(*mark);
+    }
+
+    /// Takes a mark out that is still as it was read; whether it was.
+    pub(crate) fn forget(&mut self, mark: &FrameMark) -> bool {
+        let key = (mark.robot_id.clone(), mark.ring.clone());
+        let is_as_read = self.0.get(&key) == Some(&mark.seq);
+        if is_as_read {
+            self.0.remove(&key);
+        }
+        is_as_read
     }
 
     pub(crate) fn list(&self) -> Vec<FrameMark> {
@@ -232,6 +244,11 @@ impl FrameLog for MemoryFrames {
 
     async fn marks(&self) -> Result<Vec<FrameMark>, Error> {
         Ok(self.state().marks.list())
+    }
+
+    async fn forget(&self, marks: Vec<FrameMark>) -> Result<u64, Error> {
+        let mut state = self.state();
+        Ok(marks.iter().filter(|mark| state.marks.forget(mark)).count() as u64)
     }
 
     async fn read(&self, after: u64, bytes_max: usize) -> Result<Vec<StoredFrame>, Error> {

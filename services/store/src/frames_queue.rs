@@ -29,6 +29,7 @@ type Reply<T> = oneshot::Sender<Result<T, Error>>;
 pub(crate) enum Command {
     Append { frames: Vec<Frame>, reply: Reply<()> },
     Marks { reply: Reply<Vec<FrameMark>> },
+    Forget { marks: Vec<FrameMark>, reply: Reply<u64> },
     Gaps { gaps: Vec<Gap>, reply: Reply<()> },
     Prune { reply: Reply<u64> },
     Coarsen { coarsen: Coarsen, reply: Reply<u64> },
@@ -42,6 +43,8 @@ pub(crate) trait FramesEngine: Send + 'static {
     fn append(&mut self, frames: &[Frame], rows: &[Packed]) -> impl Future<Output = Result<(), Error>> + Send;
     /// As [`crate::FrameLog::marks`].
     fn marks(&mut self) -> impl Future<Output = Result<Vec<FrameMark>, Error>> + Send;
+    /// As [`crate::FrameLog::forget`].
+    fn forget(&mut self, marks: &[FrameMark]) -> impl Future<Output = Result<u64, Error>> + Send;
     /// As [`crate::FrameLog::report_gaps`].
     fn gaps(&mut self, gaps: &[Gap]) -> impl Future<Output = Result<(), Error>> + Send;
     /// Takes a slice of the oldest rows out; returns the bytes freed, 0 when the kept ones are within their limit.
@@ -83,6 +86,7 @@ pub(crate) async fn run(mut engine: impl FramesEngine, mut queue: mpsc::Receiver
                 replies.into_iter().for_each(|reply| drop(reply.send(outcome.clone())));
             }
             Command::Marks { reply } => drop(reply.send(engine.marks().await)),
+            Command::Forget { marks, reply } => drop(reply.send(engine.forget(&marks).await)),
             Command::Gaps { gaps, reply } => drop(reply.send(engine.gaps(&gaps).await)),
             Command::Prune { reply } => drop(reply.send(engine.prune().await)),
             Command::Coarsen { coarsen, reply } => drop(reply.send(engine.coarsen(coarsen).await)),

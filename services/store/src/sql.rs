@@ -56,6 +56,9 @@ pub(crate) const FRAMES_OLDEST: &str = "SELECT \
 pub(crate) const FRAME_INSERT: &str =
     "INSERT INTO frame_log (site_id, position, at_unix_ms, size, body) VALUES ($1, $2, $3, $4, $5)";
 pub(crate) const FRAME_MARKS: &str = "SELECT robot_id, ring, seq FROM frame_mark WHERE site_id = $1";
+/// One mark, if it is still `$4`.
+pub(crate) const FRAME_MARK_FORGET: &str =
+    "DELETE FROM frame_mark WHERE site_id = $1 AND robot_id = $2 AND ring = $3 AND seq = $4";
 pub(crate) const GAPS: &str = "SELECT robot_id, ring, lane, from_seq, to_seq, reason, at_unix_ms FROM gap \
      WHERE site_id = $1 ORDER BY position DESC LIMIT $2";
 pub(crate) const GAPS_OF_ROBOT: &str = "SELECT robot_id, ring, lane, from_seq, to_seq, reason, at_unix_ms FROM gap \

@@ -5,6 +5,7 @@ use crate::kill::{all_over, at_work, judge, submit};
 use crate::robots::{Robots, enrolment};
 use crate::rolled_out::{call, done};
 use crate::secrets::{heard, keep_secret, secret_part};
+use crate::stack::{Stack, machines_of};
 use crate::stopped::StopServer;
 use crate::unheard::obeyed;
 use anyhow::{Context, bail, ensure};
@@ -310,7 +311,7 @@ async fn a_token_that_acts_outside_its_area_is_denied_and_that_stands_in_the_aud
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn doctor_looks_at_certificates_tokens_rights_and_for_the_stop_service() -> anyhow::Result<()> {
     let dir = folder()?;
-    let server = Server::start(dir.path()).await?;
+    let mut server = Server::start(dir.path()).await?;
     let _secret = enrolment(server.address, "rbt-01").await?;
     let (address, data) = (server.address.to_string(), server.data().display().to_string());
     let nobody = "127.0.0.1:1";
@@ -331,7 +332,35 @@ async fn doctor_looks_at_certificates_tokens_rights_and_for_the_stop_service() -
     ensure!(of("disk").len() == 1 && of("clocks")[0] == (true, "the server and this machine agree"), "{found:?}");
     let [(false, stop)] = of("stop")[..] else { anyhow::bail!("{found:?}") };
     ensure!(stop.contains("midshift stop serve"), "{stop}");
+
+    // What the clock jumped before the server was started again is told too.
+    let kept = serde_json::json!({ "step_ms": -7_200_000, "to_unix_ms": midshift::clock::wall().0 });
+    std::fs::write(server.data().join("clock-jump.json"), kept.to_string())?;
+    server.kill_and_restart().await?;
+    let output = call(&["doctor", "--server", &address, "--data", &data, "--stop-server", nobody])?;
+    let told = String::from_utf8(output.stdout)?;
+    ensure!(told.contains("the server's jumped 7200 s back at "), "{told}");
     Ok(())
+}
+
+/// Has a shell read the line that `robot enroll` prints, as it is printed, until the server hears the robot.
+async fn joins_as_printed(dir: &Path, server: SocketAddr, flags: &[&str]) -> anyhow::Result<()> {
+    let address = server.to_string();
+    let output = call(&[&["robot", "enroll", "rbt-01", "--server", &address][..], flags].concat())?;
+    ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let printed = String::from_utf8(output.stdout)?;
+    let program = midshift()?;
+    let programs = program.parent().context("a folder")?;
+    let path = format!("{}:{}", programs.display(), std::env::var("PATH")?);
+    let mut shell = Command::new("sh");
+    shell.current_dir(dir).env("PATH", path).args(["-c", &printed]).process_group(0);
+    let robot = Running::start(&mut shell, &dir.join("robot.log"))?;
+    let heard = until("the robot", LIMIT, async || {
+        Ok(presence(server, "rbt-01").await.ok().filter(|(_, is_heard)| *is_heard).map(drop))
+    })
+    .await;
+    robot.signal_group("KILL")?;
+    heard
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -340,22 +369,20 @@ async fn the_line_that_enrolls_a_robot_makes_a_machine_that_robot_as_a_shell_rea
     let server = Server::start_on(dir.path(), CORRIDOR).await?;
     let (address, site) = (server.address.to_string(), dir.path().join("a site.toml"));
     std::fs::write(&site, CORRIDOR)?;
-    let site = site.to_str().context("a plain path")?;
     let warned = call(&["robot", "enroll", "rbt-02", "--server", &address])?;
     let warned = String::from_utf8_lossy(&warned.stderr).into_owned();
     ensure!(warned.contains("corridor") && warned.contains("--site FILE"), "{warned}");
-    let output = call(&["robot", "enroll", "rbt-01", "--server", &address, "--site", site])?;
-    let printed = String::from_utf8(output.stdout)?;
-    let program = midshift()?;
-    let programs = program.parent().context("a folder")?;
-    let path = format!("{}:{}", programs.display(), std::env::var("PATH")?);
-    let mut shell = Command::new("sh");
-    shell.current_dir(dir.path()).env("PATH", path).args(["-c", printed.trim()]).process_group(0);
-    let robot = Running::start(&mut shell, &dir.path().join("robot.log"))?;
-    let heard = until("the robot", LIMIT, async || {
-        Ok(presence(server.address, "rbt-01").await.ok().filter(|(_, is_heard)| *is_heard).map(drop))
-    })
-    .await;
-    robot.signal_group("KILL")?;
-    heard
+    joins_as_printed(dir.path(), server.address, &["--site", site.to_str().context("a plain path")?]).await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_line_that_enrolls_a_robot_of_a_split_site_leads_it_through_both_doors_of_machines() -> anyhow::Result<()> {
+    let dir = folder()?;
+    let stack = Stack::start(dir.path(), DEMO, &["--no-software"], &[]).await?;
+    let doors = [stack.robots, machines_of(stack.robots)].map(|door| door.to_string());
+    ensure!(doors[0] != doors[1] && !doors.contains(&stack.public.to_string()), "three doors: {doors:?}");
+    let flags = ["--link-server", &doors[0], "--identity-server", &doors[1]];
+    joins_as_printed(dir.path(), stack.public, &flags)
+        .await
+        .with_context(|| std::fs::read_to_string(dir.path().join("robot.log")).unwrap_or_default())
 }

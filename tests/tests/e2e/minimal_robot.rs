@@ -1,12 +1,16 @@
 //! A robot that was written from docs/robot-protocol.md: its server is killed in the middle of a task, it is cut off in the middle of another
-//! and killed in the middle of a third, and it takes no offer that lay in a buffer. Its own journal of effects is the judge.
+//! and killed in the middle of a third, and it takes no offer that lay in a buffer. Its own journal of effects is the judge. What it carries by its
+//! memory alone it forgets by a person's word.
 
 use crate::harness::{Running, until};
 use crate::languages::minimal_robot;
 use crate::proxy::Proxy;
+use crate::rolled_out::done;
 use crate::room::{LIMIT, Room};
 use anyhow::{Context, ensure};
 use midshift_core::site::CORRIDOR;
+use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
+use midshift_proto::fleet::v1::{ExplainRobotRequest, RobotExplanation};
 use midshift_proto::link::v1::robot_event::Event as Said;
 use midshift_proto::link::v1::{AttemptReport, Lane, WorkState};
 use midshift_proto::task::v1::{GetTaskRequest, TaskState};
@@ -166,4 +170,49 @@ async fn a_robot_from_the_proto_files_alone_refuses_an_offer_that_lay_in_a_buffe
     let refusals = reports(&said, "T1").into_iter().filter_map(|r| r.refusal.clone()).map(|reason| reason.code);
     assert!(refusals.clone().any(|code| code == "STALE_AUTHORITY"), "{:?}", refusals.collect::<Vec<_>>());
     Ok(())
+}
+
+/// Why it has no work.
+async fn explained(room: &Room) -> anyhow::Result<RobotExplanation> {
+    let request = ExplainRobotRequest { robot_id: NAME.to_owned() };
+    let answer = FleetServiceClient::new(room.server.channel()?).explain_robot(request).await?;
+    answer.into_inner().explanation.context("an explanation")
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_robot_from_the_proto_files_alone_forgets_a_load_by_a_persons_word_and_works() -> anyhow::Result<()> {
+    let room = Room::open_on(&CORRIDOR.replace("speed_limit_mm_s = 1500", "speed_limit_mm_s = 5000")).await?;
+    let dir = room.dir.path();
+    // It remembers what somebody took off while it was switched off.
+    std::fs::write(dir.join("robot.json"), r#"{"load": {"task_id": "", "item": "SKU-9"}}"#)?;
+    let mut command = minimal_robot(NAME, room.server.address, dir).await?;
+    let _robot = Running::start(&mut command, &dir.join("robot.log"))?;
+    room.until_held("park-a", NAME, true).await?;
+    room.submit("T1", NAME).await?;
+    let waits_for = until("its load keeps it from work", LIMIT, async || {
+        let verdict = explained(&room).await?.verdict.filter(|verdict| verdict.code == "ROBOT_LOADED");
+        let item = |metadata: &str| verdict.as_ref().and_then(|verdict| verdict.metadata.get(metadata).cloned());
+        Ok(item("item").filter(|item| item == "SKU-9").and(item("waits_for")))
+    })
+    .await?;
+    ensure!(waits_for.ends_with(&format!("midshift robot load {NAME} --none")), "{waits_for}");
+    let server = room.server.address.to_string();
+    done(&["robot", "load", NAME, "--none", "--reason", "I took it off", "--server", &server])?;
+    room.until_state("T1", TaskState::Succeeded).await?;
+    let loads: Vec<_> = room
+        .said(NAME)
+        .await?
+        .into_iter()
+        .filter_map(|said| match said {
+            Said::Load(report) => Some(report.load.map(|load| load.task_id)),
+            _ => None,
+        })
+        .collect();
+    assert_eq!(loads, [None, Some("T1".to_owned()), None], "first it forgets what it was told of");
+    assert_eq!(lines(&dir.join("effects")), ["pick T1 1 found", "place T1 3 found"]);
+    until("the word is over", LIMIT, async || {
+        let control = explained(&room).await?.control.context("what fleet holds")?;
+        Ok(control.load_settled.is_none().then_some(()))
+    })
+    .await
 }

@@ -192,6 +192,7 @@ impl Serving {
             naive: Naive::default(),
             stops: None,
             stop_port: None,
+            jumped_before: None,
             planning: planning.handle(),
             map: Default::default(),
         };

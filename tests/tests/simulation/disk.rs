@@ -190,6 +190,9 @@ impl FrameLog for ServerFrames {
     async fn marks(&self) -> Result<Vec<FrameMark>, Error> {
         self.inner.marks().await
     }
+    async fn forget(&self, marks: Vec<FrameMark>) -> Result<u64, Error> {
+        self.inner.forget(marks).await
+    }
     async fn read(&self, after: u64, bytes_max: usize) -> Result<Vec<StoredFrame>, Error> {
         self.inner.read(after, bytes_max).await
     }

@@ -288,6 +288,7 @@ fn serve(
                 let ota = software.open(clock.clone()).await?;
                 let parts = Parts {
                     stop_port: None,
+                    jumped_before: None,
                     roles: Roles::default(),
                     drain: Duration::ZERO,
                     heard: None,

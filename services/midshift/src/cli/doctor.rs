@@ -135,7 +135,7 @@ async fn server(doctor: &Doctor, found: &mut Vec<Finding>) -> Result<(), Exit> {
 async fn jump(channel: &Line, now: Utc) -> Option<Finding> {
     let answer = HealthClient::new(channel.clone()).check(unary(HealthCheckRequest::default())).await.ok()?;
     let (step_ms, at) = site_answer::clock_jump(answer.metadata())?;
-    Some(shown::jump(step_ms, at, now))
+    Some(shown::jump("the server's", step_ms, at, now))
 }
 
 /// When what was signed ends: root and targets, which people sign, and the timestamp, which the server signs.

@@ -6,15 +6,19 @@ use midshift_core::robot::StopLevel;
 use midshift_core::site::{DEMO, text};
 use midshift_core::stop::Reset;
 use midshift_core::stop::ladder::Around;
-use midshift_core::time::Utc;
+use midshift_core::time::{Jump, Utc};
+use midshift_core::wall::WallClock;
 use midshift_proto::convert::stop::CheckIn;
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::Confirmation as C;
 use midshift_proto::stop::v1::scope::Scope as W;
-use midshift_stop::Roster;
+use midshift_proto::stop::v1::stop_service_server::StopService as Face;
+use midshift_stop::{Parts, Roster, StopService};
 use std::fs;
 use std::sync::Arc;
-use tonic::{Code, Streaming};
+use std::sync::atomic::{AtomicI64, Ordering::Relaxed};
+use tokio_util::sync::CancellationToken;
+use tonic::{Code, Request, Streaming};
 
 /// Reads until a robot is shown so.
 async fn until(stream: &mut Streaming<v1::EngageResponse>, robot_id: &str, shown: C) -> v1::RobotStop {
@@ -242,4 +246,22 @@ async fn whoever_watches_the_whole_hears_of_each_change() {
     while status().await.robots.first().is_none_or(|robot| !robot.standstill) {}
     server.reset(&id).await;
     while !status().await.stops.is_empty() {}
+}
+
+#[tokio::test]
+async fn a_jump_of_the_wall_clock_of_the_stop_service_itself_is_shown() {
+    const BEGIN: i64 = 1_780_000_000_000;
+    let (folder, wall) = (Folder::new(), Arc::new(AtomicI64::new(BEGIN)));
+    let set = wall.clone();
+    let clock = Arc::new(WallClock::new(|| 0, move || Utc(wall.load(Relaxed)), |_: &Jump| {}));
+    let parts = Parts { folder: folder.path(), site: None, clock };
+    let service = StopService::open(parts, CancellationToken::new()).unwrap();
+    let shown = async || {
+        let answer = Face::get_status(&service, Request::new(v1::GetStatusRequest {})).await.unwrap();
+        let status = answer.into_inner().status.unwrap();
+        (status.clock_jump_ms, status.clock_jumped_unix_ms)
+    };
+    assert_eq!(shown().await, (0, 0));
+    set.store(BEGIN - 7_200_000, Relaxed);
+    assert_eq!(shown().await, (-7_200_000, BEGIN - 7_200_000));
 }

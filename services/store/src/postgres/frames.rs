@@ -92,6 +92,10 @@ impl FrameLog for PostgresFrames {
         self.commands.ask(|reply| Command::Marks { reply }).await
     }
 
+    async fn forget(&self, marks: Vec<FrameMark>) -> Result<u64, Error> {
+        self.commands.ask(|reply| Command::Forget { marks, reply }).await
+    }
+
     async fn mark(&self, robot_id: &RobotId, ring: &str) -> Result<u64, Error> {
         let select = sqlx::query("SELECT seq FROM frame_mark WHERE site_id = $1 AND robot_id = $2 AND ring = $3")
             .bind(self.site_id.as_str())

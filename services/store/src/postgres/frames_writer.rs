@@ -32,6 +32,7 @@ pub(super) struct FramesWriter {
 /// What one transaction does.
 enum Work<'w> {
     Append { rows: &'w [Packed], marks: Vec<FrameMark>, at_unix_ms: i64 },
+    Forget(&'w [FrameMark]),
     Gaps(&'w [Gap]),
     Prune { bytes_max: u64, now: Utc },
     Coarsen { coarsen: Coarsen, now: Utc },
@@ -108,6 +109,10 @@ impl FramesEngine for FramesWriter {
         Ok(marks)
     }
 
+    async fn forget(&mut self, marks: &[FrameMark]) -> Result<u64, Error> {
+        self.transaction(&Work::Forget(marks)).await
+    }
+
     async fn gaps(&mut self, gaps: &[Gap]) -> Result<(), Error> {
         self.transaction(&Work::Gaps(gaps)).await.map(drop)
     }
@@ -146,6 +151,7 @@ async fn once(connection: &mut PgConnection, site_id: &SiteId, work: &Work<'_>) 
             raise_marks(connection, site_id, marks).await?;
             0
         }
+        Work::Forget(marks) => forget_marks(connection, site_id, marks).await?,
         Work::Gaps(gaps) => {
             report(connection, site_id, gaps).await?;
             0
@@ -192,6 +198,23 @@ async fn raise_marks(connection: &mut PgConnection, site_id: &SiteId, marks: &[F
     .execute(connection)
     .await
     .map(drop)
+}
+
+async fn forget_marks(
+    connection: &mut PgConnection,
+    site_id: &SiteId,
+    marks: &[FrameMark],
+) -> Result<u64, sqlx::Error> {
+    let mut gone = 0;
+    for mark in marks {
+        let delete = sqlx::query(sql::FRAME_MARK_FORGET)
+            .bind(site_id.as_str())
+            .bind(mark.robot_id.as_str())
+            .bind(&*mark.ring)
+            .bind(mark.seq.cast_signed());
+        gone += delete.execute(&mut *connection).await?.rows_affected();
+    }
+    Ok(gone)
 }
 
 async fn report(connection: &mut PgConnection, site_id: &SiteId, gaps: &[Gap]) -> Result<(), sqlx::Error> {

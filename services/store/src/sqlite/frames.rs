@@ -64,6 +64,10 @@ impl FrameLog for SqliteFrames {
         self.commands.ask(|reply| Command::Marks { reply }).await
     }
 
+    async fn forget(&self, marks: Vec<FrameMark>) -> Result<u64, Error> {
+        self.commands.ask(|reply| Command::Forget { marks, reply }).await
+    }
+
     async fn read(&self, after: u64, bytes_max: usize) -> Result<Vec<StoredFrame>, Error> {
         let mut transaction = self.readers.begin().await.map_err(unavailable)?;
         let (mut page, mut bytes, mut after) = (Vec::new(), 0, after.cast_signed());

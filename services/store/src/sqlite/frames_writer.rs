@@ -115,6 +115,16 @@ impl FramesEngine for FramesWriter {
         Ok(self.open.as_ref().map_or_else(Vec::new, |open| open.marks.list()))
     }
 
+    async fn forget(&mut self, marks: &[FrameMark]) -> Result<u64, Error> {
+        // What is not written down would be folded from the log's tail again.
+        self.write_marks().await?;
+        let Some(mut open) = self.open.take() else { return Ok(0) };
+        let gone: Vec<&FrameMark> = marks.iter().filter(|mark| open.marks.forget(mark)).collect();
+        forget_marks(&mut open.connection, &self.site_id, &gone).await.map_err(unavailable)?;
+        self.open = Some(open);
+        Ok(gone.len() as u64)
+    }
+
     async fn close(mut self) -> Result<(), Error> {
         let outcome = self.write_marks().await;
         if let Some(open) = self.open.take() {
@@ -234,6 +244,24 @@ async fn save_marks(
     .execute(connection)
     .await?;
     Ok(())
+}
+
+async fn forget_marks(
+    connection: &mut SqliteConnection,
+    site_id: &SiteId,
+    marks: &[&FrameMark],
+) -> Result<(), sqlx::Error> {
+    let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
+    for mark in marks {
+        sqlx::query(sql::FRAME_MARK_FORGET)
+            .bind(site_id.as_str())
+            .bind(mark.robot_id.as_str())
+            .bind(mark.ring.clone())
+            .bind(mark.seq.cast_signed())
+            .execute(&mut *transaction)
+            .await?;
+    }
+    transaction.commit().await
 }
 
 async fn write_gaps(open: &mut Open, site_id: &SiteId, gaps: &[Gap]) -> Result<(), sqlx::Error> {

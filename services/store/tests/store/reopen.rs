@@ -140,6 +140,31 @@ async fn frames_on_postgresql_keep_the_contract_for_every_process_that_has_them_
     assert!(log.append(vec![frame("a", 6, 6, 1)]).await.is_err());
 }
 
+/// The mark of one ring is forgotten as it was read, and that of another has moved since.
+async fn forgets(log: &dyn FrameLog) {
+    log.append(vec![frame("a", 1, 3, 10), frame("b", 1, 9, 10)]).await.unwrap();
+    let read = log.marks().await.unwrap();
+    log.append(vec![frame("b", 10, 12, 10)]).await.unwrap();
+    assert_eq!(log.forget(read.clone()).await.unwrap(), 1);
+    assert_eq!(marks(log).await, [("b".to_owned(), 12)]);
+    assert_eq!(log.mark(&RobotId::parse("a").unwrap(), "ring").await.unwrap(), 0);
+    assert_eq!(log.forget(read).await.unwrap(), 0, "once");
+    assert_eq!(log.read(0, usize::MAX).await.unwrap().len(), 3, "frames stay");
+}
+
+#[tokio::test]
+async fn a_mark_is_forgotten_on_every_engine_also_over_a_start_unless_it_has_moved_since() {
+    forgets(&MemoryFrames::new(clock(), 1_000_000)).await;
+    let config = crate::support::database().await;
+    forgets(&PostgresFrames::open(&config, site(), clock(), 1_000_000).await.unwrap()).await;
+    let dir = tempfile::tempdir().unwrap();
+    let open = async || SqliteFrames::open(dir.path(), site(), clock(), 1_000_000).await.unwrap();
+    let log = open().await;
+    forgets(&log).await;
+    drop(log);
+    assert_eq!(marks(&open().await).await, [("b".to_owned(), 12)], "it is not folded from the log's tail again");
+}
+
 #[tokio::test]
 async fn frames_on_disk_keep_the_contract_and_their_marks_over_a_start() {
     let dir = tempfile::tempdir().unwrap();

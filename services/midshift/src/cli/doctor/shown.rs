@@ -130,9 +130,9 @@ pub fn clock(whose: &str, answer: &MetadataMap, now: Utc) -> Finding {
 }
 
 /// What its wall clock jumped while it ran: a person looks for a day, and sees it for as long as it runs.
-pub fn jump(step_ms: i64, at: Utc, now: Utc) -> Finding {
+pub fn jump(whose: &str, step_ms: i64, at: Utc, now: Utc) -> Finding {
     let way = if step_ms < 0 { "back" } else { "ahead" };
-    let text = format!("the server's jumped {} s {way} at {}", step_ms.unsigned_abs() / 1_000, at.rfc3339());
+    let text = format!("{whose} jumped {} s {way} at {}", step_ms.unsigned_abs() / 1_000, at.rfc3339());
     if now.ms_since(at) > DAY_MS {
         return Finding::good("clocks", text);
     }
@@ -188,14 +188,14 @@ mod tests {
     #[test]
     fn a_jump_of_the_servers_clock_wants_a_look_for_a_day() {
         let at = Utc(1_800_000_000_000);
-        let found = jump(7_200_500, at, at.plus_ms(DAY_MS));
+        let found = jump("the server's", 7_200_500, at, at.plus_ms(DAY_MS));
         assert!(!found.good, "{}", found.text);
         assert!(
             found.text.starts_with("the server's jumped 7200 s ahead at 2027-01-15T08:00:00.000Z;"),
             "{}",
             found.text
         );
-        let later = jump(-6_000, at, at.plus_ms(DAY_MS + 1));
+        let later = jump("the server's", -6_000, at, at.plus_ms(DAY_MS + 1));
         assert_eq!(
             (later.good, later.text.as_str()),
             (true, "the server's jumped 6 s back at 2027-01-15T08:00:00.000Z")

@@ -74,6 +74,10 @@ fn of_status(status: &Status, now: Utc, online: &[String]) -> Vec<Finding> {
         let then = "somebody who was revoked since then is still let in there; start `midshift serve` or its role stop-follower on the same data folder";
         found.push(Finding::look("stop", format!("{text} {}; {then}", told.rfc3339())));
     }
+    if status.clock_jump_ms != 0 {
+        let at = Utc(status.clock_jumped_unix_ms);
+        found.push(shown::jump("the stop service's", status.clock_jump_ms, at, now));
+    }
     let is_heard = |heard: i64| heard != 0 && now.ms_since(Utc(heard)) < LINE_SILENT_MS;
     let heard: BTreeSet<&str> =
         status.robots.iter().filter(|r| is_heard(r.heard_unix_ms)).map(|r| r.robot_id.as_str()).collect();
@@ -126,6 +130,13 @@ mod tests {
         let found = bad(&old, &[]);
         assert!(found.len() == 1 && found[0].contains("revoked since then"), "{found:?}");
         assert_eq!(bad(&Status { principals_told_unix_ms: 0, ..well() }, &[]), Vec::<String>::new(), "no login");
+    }
+
+    #[test]
+    fn a_jump_of_the_clock_of_the_stop_service_is_told_of() {
+        let jumped = Status { clock_jump_ms: -6_000, clock_jumped_unix_ms: NOW.0 - 1_000, ..well() };
+        let found = bad(&jumped, &[]);
+        assert!(found.len() == 1 && found[0].starts_with("the stop service's jumped 6 s back at "), "{found:?}");
     }
 
     #[test]
