@@ -315,6 +315,8 @@ codes! {
     SupersededBy = "SUPERSEDED_BY", "Another roll-out takes its place.";
     NewcomerFailed = "NEWCOMER_FAILED", "A robot that came after the roll-out was completed went back from its bundle. Robots that come later do not get it; roll it out anew, or retry the robot.";
     RolloutAborted = "ROLLOUT_ABORTED", "A roll-out was aborted. Its verdict has the numbers.";
+    RolloutIncomplete = "ROLLOUT_INCOMPLETE", "A roll-out ended, and fewer of its robots have the bundle than its policy asks. Robots that come later do not get it. `midshift rollout report ID` says why; `midshift rollout retry ID --failed` tries the others again.";
+    ContentRefused = "CONTENT_REFUSED", "Robots refused the bytes or the documents of a bundle, so its roll-out stands still; nothing bad runs. Look at the server's files and the repository, push what is damaged again, then resume the roll-out.";
     // --- a robot's refusals and session answers
     StaleAuthority = "STALE_AUTHORITY", "The message reached the robot after its authority had ended, or was anchored to another session.";
     StaleEpoch = "STALE_EPOCH", "The robot has passed this epoch.";
@@ -323,6 +325,7 @@ codes! {
     // --- software of a robot
     MetadataRefused = "METADATA_REFUSED", "What the repository says of its releases does not hold. Nothing was installed; look at the repository and its keys.";
     DirectiveRefused = "DIRECTIVE_REFUSED", "The robot did not take the order to change its software. Nothing was installed.";
+    BadSignature = "BAD_SIGNATURE", "No key that the robot trusts has signed the order. Nothing was installed; look at the server's directive key and the set that names it.";
     BundleUnfit = "BUNDLE_UNFIT", "The bundle does not fit the robot: hardware, floor, what it needs or what it excludes.";
     BundleCorrupt = "BUNDLE_CORRUPT", "What was downloaded is not what was signed.";
     NoRoom = "NO_ROOM", "The robot has too little room on its disk for one more set.";

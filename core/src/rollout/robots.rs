@@ -8,7 +8,7 @@ use super::hear::{is_hard, is_old, report_of};
 use super::rows::{Given, Pause, Phase, Rollout, RolloutRobot, Step};
 use super::turns::{is_late, is_newcomer, is_on, is_retried};
 use super::view::View;
-use super::{Board, infrastructure, matching, served, verdict};
+use super::{Board, infrastructure, matching, refusals, served, verdict};
 use crate::authority::Authority;
 use crate::fleet::rows::DrainState;
 use crate::ids::{RobotId, RolloutId};
@@ -195,10 +195,9 @@ fn staging(
     })
 }
 
-/// Why the robot refused what it was told.
+/// Why a robot is left out that refused what it was told.
 fn refused(report: Option<&UpdateReport>) -> Reason {
-    let why = report.and_then(|r| r.reason.clone()).unwrap_or_else(|| Code::BundleUnfit.into());
-    Reason::new(Code::SkippedIncompatible, why.text()).with("because", why.code)
+    refusals::skip_reason(report.and_then(|r| r.reason.as_ref()))
 }
 
 /// Its turn came long ago, and it has not fetched the bundle.

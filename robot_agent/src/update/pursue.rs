@@ -2,6 +2,7 @@
 //!
 //! Invariant: level-triggered. It may be called at any moment and any number of times; what it decides is written down before it is done.
 
+use super::believes::refusal_of;
 use super::{Done, Failure, Job, SoftwareRow, Update, again, migrate};
 use crate::core::{AgentCore, ExitReason, Output};
 use crate::sets::{Holdings, Wanted};
@@ -303,11 +304,10 @@ impl AgentCore {
             self.update.asks_for_keys = true;
             return true;
         }
-        let opened = opened.map_err(|rejection| Reason::new(Code::DirectiveRefused, rejection.to_string()));
         let directive = match opened {
             Ok(directive) => directive,
-            Err(reason) => {
-                self.refuse_directive(reason);
+            Err(rejection) => {
+                self.refuse_directive(refusal_of(&rejection));
                 return false;
             }
         };

@@ -1,6 +1,6 @@
 //! `midshift rollout …`: signed software to robots at work, in waves.
 //!
-//! Exit codes of `watch` and `wait` beside the usual ones: 11 held for review, 12 aborted, rolled back or superseded.
+//! Exit codes of `watch` and `wait` beside the usual ones: 11 held for review, 12 aborted, rolled back or superseded, 14 ended for too few.
 
 mod create;
 mod follow;

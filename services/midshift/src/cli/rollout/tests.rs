@@ -5,7 +5,9 @@ use super::{Until, create, look, parse, text};
 use clap::Parser;
 use midshift_core::reason::{Code, Reason};
 use midshift_proto::convert::{duration, shown};
-use midshift_proto::ota::v1::{self, RolloutOutcome, RolloutPause, RolloutPhase, RolloutStep, Suspicion};
+use midshift_proto::ota::v1::{
+    self, RolloutEnding, RolloutOutcome, RolloutPause, RolloutPhase, RolloutStep, Suspicion,
+};
 use prost_types::Timestamp;
 
 fn at(seconds: i64) -> Option<Timestamp> {
@@ -265,6 +267,8 @@ fn a_watch_tells_each_change_once() {
     let news = picture.take(message(paused.clone(), Vec::new()));
     assert!(news[0].contains("SOAKING, paused (OPERATOR)"), "{news:?}");
     assert_eq!(text::next(&paused), "midshift rollout resume walk-1.5.0");
+    let held = v1::Rollout { pauses: vec![RolloutPause::Content as i32], ..rollout() };
+    assert!(text::next(&held).ends_with("midshift rollout resume walk-1.5.0"), "{}", text::next(&held));
     assert!(picture.lines().last().unwrap().starts_with("last verdict: wave 1/3  PROMOTED_UNPROVEN"));
 }
 
@@ -287,6 +291,8 @@ fn a_wait_ends_with_the_code_of_its_end() {
     let both = |rollout: &v1::Rollout| [code(rollout, Until::Completed), code(rollout, Until::Ended)];
     assert_eq!(both(&rollout()), [None, None]);
     assert_eq!(both(&of(RolloutPhase::Completed)), [Some(0), Some(0)]);
+    let short = v1::Rollout { outcome: RolloutEnding::Incomplete as i32, ..of(RolloutPhase::Completed) };
+    assert_eq!(both(&short), [Some(14), Some(14)]);
     assert_eq!(both(&of(RolloutPhase::Review)), [Some(11), None]);
     assert_eq!(both(&aborted(RolloutPhase::Aborting)), [Some(12), None]);
     assert_eq!(both(&aborted(RolloutPhase::RollingBack)), [Some(12), None]);
@@ -345,7 +351,8 @@ fn flags_become_the_spec_and_what_no_flag_says_is_left_to_the_server() {
     assert_eq!(plain, v1::RolloutSpec { bundle: "walk-1.5.0".into(), ..Default::default() });
     let flags = "create trial --bundle walk-1.5.0 --waves 1,25%,rest --soak 10s --probation 1m --drain-within 2h --exposure-tasks 0 \
         --exposure-within 90s --max-in-flight 2 --area hall,dock --robot r1 --robot r2 --label site=north --model h1 --from-version 1.4.0 \
-        --small-wave review --small-wave-failure review --abort-scope trial --allow-full-push --rate 5MiB --acts-on-rates";
+        --small-wave review --small-wave-failure review --abort-scope trial --allow-full-push --rate 5MiB --acts-on-rates \
+        --complete-percent 75";
     let spec = Line::parse_from(flags.split_whitespace()).create.spec();
     let expected = v1::RolloutSpec {
         bundle: "walk-1.5.0".into(),
@@ -369,6 +376,7 @@ fn flags_become_the_spec_and_what_no_flag_says_is_left_to_the_server() {
         allow_full_push: true,
         rate_bytes_s: 5 << 20,
         acts_on_rates: true,
+        complete_percent: Some(75),
     };
     assert_eq!(spec, expected);
 }
