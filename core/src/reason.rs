@@ -317,6 +317,7 @@ codes! {
     RolloutAborted = "ROLLOUT_ABORTED", "A roll-out was aborted. Its verdict has the numbers.";
     RolloutIncomplete = "ROLLOUT_INCOMPLETE", "A roll-out ended, and fewer of its robots have the bundle than its policy asks. Robots that come later do not get it. `midshift rollout report ID` says why; `midshift rollout retry ID --failed` tries the others again.";
     ContentRefused = "CONTENT_REFUSED", "Robots refused the bytes or the documents of a bundle, so its roll-out stands still; nothing bad runs. Look at the server's files and the repository, push what is damaged again, then resume the roll-out.";
+    SoftwareDamaged = "SOFTWARE_DAMAGED", "A signed file on the server's disk was not what its release says, so it was handed out to nobody. Look at the disk, and push the release again.";
     // --- a robot's refusals and session answers
     StaleAuthority = "STALE_AUTHORITY", "The message reached the robot after its authority had ended, or was anchored to another session.";
     StaleEpoch = "STALE_EPOCH", "The robot has passed this epoch.";

@@ -114,6 +114,12 @@ fn incident(tx: &mut Tx, robot_id: Option<&RobotId>, reason: &Reason) {
     tx.tell(robot_id.map_or("", RobotId::as_str), crate::maintenance::INCIDENT, reason);
 }
 
+/// States that a signed file is damaged on the server's disk.
+pub fn tell_damaged(view: &mut View, now: Now, digest: &str, plan: &mut Plan) {
+    let reason = Reason::from(Code::SoftwareDamaged).with("digest", digest);
+    plan.decide(view, now, "ota", |tx| incident(tx, None, &reason));
+}
+
 /// Entry of the log that an item obeys, if it obeys one.
 pub fn obeyed(item: &Item) -> Option<Seq> {
     crate::picture::written::<OtaMark>(item).map(|mark| mark.seq)
