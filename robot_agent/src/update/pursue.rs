@@ -23,6 +23,8 @@ use std::collections::BTreeSet;
 
 /// A grant that did not come is asked for again after this.
 const ASK_AGAIN: LinkDuration = LinkDuration(10_000);
+/// Without an update under way the disk is looked at so often: the room on it is told to the server.
+const LOOK_EVERY: LinkDuration = LinkDuration(60_000);
 /// A set on probation that does not reach its server for so long is gone back from.
 const LOST_SERVER: LinkDuration = LinkDuration(600_000);
 
@@ -245,6 +247,9 @@ impl AgentCore {
         }
         if !self.update.collected {
             self.ask_for(Job::Collect(self.needed()));
+        } else if now.link.since(*self.update.looked.get_or_insert(now.link)) >= LOOK_EVERY {
+            self.update.looked = Some(now.link);
+            self.ask_for(Job::Look);
         }
         None
     }
