@@ -297,6 +297,7 @@ codes! {
     RobotWentBack = "ROBOT_WENT_BACK", "The robot went back from the bundle by itself.";
     RollbackFailed = "ROLLBACK_FAILED", "The robot could not go back, and stays out of work. Mend its software by hand; if it does not say by itself then that it is back, retire it and uncordon it.";
     BreakerOnTrial = "BREAKER_ON_TRIAL", "The robot failed three attempts in ten minutes with the bundle.";
+    JammedOnTrial = "JAMMED_ON_TRIAL", "The robot has work and has stood for five minutes with the bundle, while most others got on with theirs.";
     HardStopCode = "HARD_STOP_CODE", "A robot with the bundle reported a fault that its manifest names as one that ends the roll-out.";
     HardwareStopOnTrial = "HARDWARE_STOP_ON_TRIAL", "The maker's safety system stopped a robot within ten minutes of its change.";
     // --- verdicts on a roll-out

@@ -4,8 +4,8 @@
 //! Rooms: `spec` is what is asked for, `rows` and `view` are what is known; `hear` and `commands` are what happens (`refusals`: what robots
 //! would not take); `matching` says who and `dry_run` what it would come to, `robots` says what is due for each (`turns`: whose turn it is)
 //! and `moves` writes it, `phases` the whole, `ending` whether enough have it at the end, `newcomers` who comes later (`served`: what they
-//! get; `assign`: how anybody comes in), `named` which bundles are still needed, `past` what the picture holds of what has ended; `verdict`
-//! and `infrastructure` judge; `explain` says what a robot waits for. Rooms name each other in one direction only.
+//! get; `assign`: how anybody comes in), `named` which bundles are still needed, `past` what the picture holds of what has ended; `verdict`,
+//! `jams` and `infrastructure` judge; `explain` says what a robot waits for. Rooms name each other in one direction only.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod assign;
@@ -16,6 +16,7 @@ pub mod ending;
 pub mod explain;
 pub mod hear;
 pub mod infrastructure;
+pub mod jams;
 pub mod matching;
 pub mod moves;
 pub mod named;

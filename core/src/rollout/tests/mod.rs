@@ -8,6 +8,7 @@ mod agents;
 mod asks;
 mod drains_and_grants;
 mod endings;
+mod jams;
 mod keyless;
 mod named;
 mod newcomers_and_pins;
