@@ -9,6 +9,9 @@ use crate::reason::{Code, Reason};
 use crate::time::{Now, Utc};
 use crate::update::UpdateState;
 
+/// Robots that a reason names.
+const NAMED_MAX: usize = 8;
+
 /// Why nothing happens to a robot at this moment.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Blocked {
@@ -32,7 +35,8 @@ pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rol
         Step::Committed | Step::RolledBack | Step::Skipped => return None,
         Step::Waiting if !(rollout.phase.runs() || rollout.phase == Phase::Completed) => Code::BlockedByWave.into(),
         Step::Waiting | Step::Staged => {
-            robots::blocked(view, board, now, rollout, r).unwrap_or_else(|| Code::BlockedByWave.into())
+            let by = robots::blocked(view, board, now, rollout, r).unwrap_or_else(|| Code::BlockedByWave.into());
+            name_others(view, rollout, by)
         }
         Step::Staging => {
             deadline =
@@ -79,6 +83,18 @@ pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rol
         Step::Stuck => Code::RollbackFailed.into(),
     };
     Some(Blocked { by, since, deadline })
+}
+
+/// Names robots that are waited for: those out of work where there is no place, those of the present wave where that is not over.
+fn name_others(view: &View, rollout: &Rollout, by: Reason) -> Reason {
+    let is_waited_for = |r: &&RolloutRobot| match by.code {
+        Code::BlockedByPlaceInWave => r.drain_id.is_some(),
+        Code::BlockedByWave => r.wave == rollout.wave && !r.step.is_over(),
+        _ => false,
+    };
+    let robots = view.robots_of(&rollout.rollout_id).filter(is_waited_for).take(NAMED_MAX);
+    let names: Vec<&str> = robots.map(|r| r.robot_id.as_str()).collect();
+    if names.is_empty() { by } else { by.with("robot_ids", names.join(" ")) }
 }
 
 /// When a drain that has begun must be over.

@@ -91,12 +91,12 @@ pub enum Verb {
     },
     /// List its robots: how far each is and what it waits for.
     Robots(One),
-    /// What one robot waits for in it, since when and until when; or why it was left out.
+    /// What each robot waits for in it, since when, until when, and what a person can do; of one robot also why it was left out.
     Explain {
         #[command(flatten)]
         one: One,
-        /// Whom.
-        robot_id: String,
+        /// Only this robot.
+        robot_id: Option<String>,
     },
     /// What happened, in order: what people did, what gates said, where each robot came to last.
     History(One),
@@ -137,7 +137,8 @@ impl Verb {
     /// The one roll-out that it is about, and the one robot in it.
     fn named(&mut self) -> (Option<&mut One>, Option<&mut String>) {
         match self {
-            Self::Exclude { one, robot_id, .. } | Self::Explain { one, robot_id } => (Some(one), Some(robot_id)),
+            Self::Exclude { one, robot_id, .. } => (Some(one), Some(robot_id)),
+            Self::Explain { one, robot_id } => (Some(one), robot_id.as_mut()),
             Self::Submit(said) | Self::Approve(said) | Self::Pause(said) => (Some(&mut said.one), None),
             Self::Start { said, .. } | Self::Retry { said, .. } => (Some(&mut said.one), None),
             Self::Resume(seen) | Self::Promote(seen) | Self::Abort(seen) => (Some(&mut seen.said.one), None),
@@ -253,7 +254,8 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Ls { call } => look::list(&call, out).await,
         Verb::Get { one, robots } => look::get(&one, robots, out).await,
         Verb::Robots(one) => look::robots(&one, out).await,
-        Verb::Explain { one, robot_id } => look::explain(&one, &robot_id, out).await,
+        Verb::Explain { one, robot_id: Some(robot_id) } => look::explain(&one, &robot_id, out).await,
+        Verb::Explain { one, robot_id: None } => look::explain_all(&one, out).await,
         Verb::History(one) => look::history(&one, out).await,
         Verb::Watch(one) => follow::watch(&one, out).await,
         Verb::Wait { one, until, timeout } => follow::wait(&one, until, timeout, out).await,
