@@ -198,6 +198,8 @@ pub fn counted(view: &View, now: &Now, row: &Rollout, counts: Counts) -> v1::Rol
             _ => Vec::new(),
         },
         outcome: row.outcome.map_or(0, WireEnum::to_wire),
+        trial: Some(tally(row.tasks.trial)).filter(|tally| *tally != v1::TaskTally::default()),
+        control: Some(tally(row.tasks.control)).filter(|tally| *tally != v1::TaskTally::default()),
     }
 }
 

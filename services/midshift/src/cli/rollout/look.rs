@@ -47,7 +47,11 @@ pub fn row(rollout: &v1::Rollout) -> Vec<String> {
 }
 
 /// All robots of one, or only one of them.
-async fn members(client: &mut Client, rollout_id: &str, robot_id: &str) -> Result<v1::ListRolloutRobotsResponse, Exit> {
+pub async fn members(
+    client: &mut Client,
+    rollout_id: &str,
+    robot_id: &str,
+) -> Result<v1::ListRolloutRobotsResponse, Exit> {
     let mut whole = v1::ListRolloutRobotsResponse::default();
     loop {
         let request = v1::ListRolloutRobotsRequest {

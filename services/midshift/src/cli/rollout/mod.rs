@@ -6,6 +6,7 @@ mod create;
 mod follow;
 mod look;
 mod parse;
+mod report;
 #[cfg(test)]
 mod tests;
 mod text;
@@ -100,6 +101,8 @@ pub enum Verb {
     },
     /// What happened, in order: what people did, what gates said, where each robot came to last.
     History(One),
+    /// Its whole record as one document, with -o json or -o html: who, what, when, verdicts, each robot's outcome, tasks done meanwhile.
+    Report(One),
     /// Follow it to its end: a live picture on a terminal, else a line for each change.
     Watch(One),
     /// Wait until it has ended, or needs a person.
@@ -143,9 +146,13 @@ impl Verb {
             Self::Start { said, .. } | Self::Retry { said, .. } => (Some(&mut said.one), None),
             Self::Resume(seen) | Self::Promote(seen) | Self::Abort(seen) => (Some(&mut seen.said.one), None),
             Self::Rollback { one, .. } | Self::Get { one, .. } | Self::Wait { one, .. } => (Some(one), None),
-            Self::Robots(one) | Self::History(one) | Self::Watch(one) => (Some(one), None),
+            Self::Robots(one) | Self::History(one) | Self::Report(one) | Self::Watch(one) => (Some(one), None),
             Self::Create(_) | Self::Ls { .. } => (None, None),
         }
+    }
+    /// Whether its answer can be a page.
+    pub fn makes_page(&self) -> bool {
+        matches!(self, Self::Report(_))
     }
 }
 
@@ -257,6 +264,7 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Explain { one, robot_id: Some(robot_id) } => look::explain(&one, &robot_id, out).await,
         Verb::Explain { one, robot_id: None } => look::explain_all(&one, out).await,
         Verb::History(one) => look::history(&one, out).await,
+        Verb::Report(one) => report::run(&one, out).await,
         Verb::Watch(one) => follow::watch(&one, out).await,
         Verb::Wait { one, until, timeout } => follow::wait(&one, until, timeout, out).await,
     }

@@ -1,7 +1,7 @@
 //! Words about fixed messages, and what a wait comes to.
 
 use super::follow::{Picture, end};
-use super::{Until, create, look, parse, text};
+use super::{Until, create, look, parse, report, text};
 use clap::Parser;
 use midshift_core::reason::{Code, Reason};
 use midshift_proto::convert::{duration, shown};
@@ -308,6 +308,57 @@ fn history_is_in_order_and_says_who_did_what() {
     assert_eq!(whats, ["created", "approved", "started", "robot", "verdict", "phase", "aborted"]);
     assert_eq!(events[1].text, "approved by anonymous (tried at home)");
     assert!(events[6].text.starts_with("aborted at once: ROLLOUT_ABORTED: "), "{}", events[6].text);
+}
+
+/// A roll-out that ended early, by somebody who types what a page would obey, and its robots.
+fn reported() -> (v1::Rollout, [v1::RolloutRobot; 2]) {
+    let (trial, control) = (tally(3, 1), tally(40, 2));
+    let approved = by("eve", "<script>alert(1)</script> & \"so\"", 5);
+    let rollout = v1::Rollout { trial, control, approved, ..aborted(RolloutPhase::Aborted) };
+    let failed = v1::RolloutRobot { failure: Some(shown(&Reason::from(Code::RobotLost))), ..on_trial() };
+    (rollout, [failed, robot("rbt-09", 1, RolloutStep::Skipped)])
+}
+
+fn tally(succeeded: u64, failed: u64) -> Option<v1::TaskTally> {
+    Some(v1::TaskTally { succeeded, failed })
+}
+
+#[test]
+fn a_report_is_one_document_with_people_verdicts_robots_tasks_and_what_happened() {
+    let (rollout, robots) = reported();
+    let document = report::document(&rollout, &robots).unwrap();
+    let said =
+        |pointer: &str| document.pointer(pointer).map(|v| v.as_str().map_or_else(|| v.to_string(), str::to_owned));
+    for (pointer, expected) in [
+        ("/rollout/approved/actor", "eve"),
+        ("/rollout/verdicts/0/clean", "1"),
+        ("/rollout/abort/reason/code", "ROLLOUT_ABORTED"),
+        ("/rollout/control/succeeded", "40"),
+        ("/robots/0/robotId", "rbt-02"),
+        ("/robots/0/failure/code", "ROBOT_LOST"),
+        ("/events/0/what", "created"),
+    ] {
+        assert_eq!(said(pointer).as_deref(), Some(expected), "{pointer}");
+    }
+}
+
+#[test]
+fn a_page_says_the_same_and_what_somebody_typed_is_text_in_it() {
+    let (rollout, robots) = reported();
+    let page = report::page(&rollout, &robots);
+    for part in [
+        "<h1>Roll-out walk-1.5.0</h1>",
+        "approved by eve",
+        "&lt;script&gt;alert(1)&lt;/script&gt; &amp; &quot;so&quot;",
+        "<td>PROMOTED_UNPROVEN</td><td>1</td><td>1</td><td>0</td>",
+        "<td>rbt-02</td><td>wave 2/3</td><td>TRIAL</td>",
+        "<td>rbt-09</td><td>wave 2/3</td><td>SKIPPED</td>",
+        "on trial 3 done, 1 failed; beside it 40 done, 2 failed",
+        "aborted at once: ROLLOUT_ABORTED",
+    ] {
+        assert!(page.contains(part), "{part} in {page}");
+    }
+    assert!(!page.contains("<script"), "{page}");
 }
 
 #[test]
