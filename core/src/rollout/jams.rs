@@ -52,7 +52,7 @@ fn others_get_on(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &R
         others.filter_map(|id| Some((id, stood(view, board, now, id)?))).collect();
     let near: Vec<SiteDuration> =
         working.iter().filter(|(id, _)| area(id) == area(&r.robot_id)).map(|(_, stood)| *stood).collect();
-    let controls = match near.len() < limits::CONTROLS_MIN {
+    let controls: Vec<SiteDuration> = match near.len() < limits::CONTROLS_MIN {
         true => working.into_iter().map(|(_, stood)| stood).collect(),
         false => near,
     };

@@ -29,7 +29,7 @@ pub fn serve(tx: &mut Tx, rollout: &Rollout) {
         let known = tx.view.area_bundles.get(area_id.as_str()).map(|a| a.row.clone());
         let mut row = known.unwrap_or_else(|| AreaBundle { area_id, rollouts: BTreeMap::new() });
         let is_newer = |known: &RolloutId| tx.view.rollout(known).is_some_and(|known| known.since > rollout.since);
-        let models = models.into_iter().filter(|model| !row.rollouts.get(model).is_some_and(is_newer));
+        let models = models.into_iter().filter(|model| row.rollouts.get(model).is_none_or(|known| !is_newer(known)));
         let models: Vec<(String, RolloutId)> = models.map(|model| (model, id.clone())).collect();
         row.rollouts.extend(models);
         tx.put(row, "area.bundle_set");

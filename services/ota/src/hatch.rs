@@ -126,6 +126,9 @@ impl Hatch {
         opened.encodings.follow().await?;
         let encoded = opened.encodings.found(digest).filter(|(key, _)| opened.lists(key.target));
         let length = match encoded {
+            Some(_) if !opened.integrity.holds_way(&opened.encodings, digest).await? => {
+                return Err(Refusal::new(Kind::NotFound, Code::SoftwareNotFound));
+            }
             Some((_, length)) => length,
             None => self.listed(digest).await?.length,
         };

@@ -1,11 +1,13 @@
-//! Hashes signed files before their bytes are handed out: the first time since the start, and again after a day.
+//! Hashes signed files and shorter ways to them before their bytes are handed out: the first time since the start, and again after a day.
 //!
 //! Called by the hatch. Invariant: a file whose bytes are not what its name says is handed out by nobody; where this process keeps the folder
-//! it is taken away, so that it can be pushed again.
+//! it is taken away, so that it can be pushed again, or made again.
 
 use crate::blocking;
 use crate::content::{Content, Error};
+use crate::encodings::Encodings;
 use midshift_bundle::digest::Digest;
+use midshift_bundle::encoding::Base;
 use midshift_bundle::manifest::COMPONENT_BYTES_MAX;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -27,9 +29,18 @@ struct Hashed {
 }
 
 impl Hashed {
+    fn now(is_whole: bool) -> Self {
+        Self { at: Instant::now(), is_whole }
+    }
     fn counts(&self) -> bool {
         self.at.elapsed() < if self.is_whole { EVERY } else { AGAIN }
     }
+}
+
+async fn is_whole(digest: Digest, mut file: Box<dyn Base>) -> Result<bool, Error> {
+    let found = blocking(move || Digest::of_reader(&mut file, COMPONENT_BYTES_MAX)).await;
+    let path = digest.to_string().into();
+    Ok(found.map_err(|source| Error::Io { doing: "hashing", path, source })?.0 == digest)
 }
 
 /// One file. Who asks for it meanwhile waits until it is hashed.
@@ -65,22 +76,33 @@ impl Integrity {
         if let Some(hashed) = last.filter(Hashed::counts) {
             return Ok(hashed.is_whole);
         }
-        let Some(mut file) = content.open(digest).await? else { return Ok(false) };
-        let found = blocking(move || Digest::of_reader(&mut file, COMPONENT_BYTES_MAX)).await;
-        let path = digest.to_string().into();
-        let (found, _) = found.map_err(|source| Error::Io { doing: "hashing", path, source })?;
-        let is_whole = found == digest;
-        *last = Some(Hashed { at: Instant::now(), is_whole });
-        if !is_whole {
-            tracing::error!(%digest, %found, "a signed file is damaged on the disk: push its release again");
-            self.damaged().insert(digest);
-            // Where others keep the folder they find it too.
-            if let Err(error) = content.remove(digest).await {
-                tracing::info!(%digest, %error, "the damaged file stays");
-            } else {
-                *last = None;
-            }
+        let Some(file) = content.open(digest).await? else { return Ok(false) };
+        let is_whole = is_whole(digest, file).await?;
+        if is_whole {
+            *last = Some(Hashed::now(true));
+            return Ok(true);
         }
+        tracing::error!(%digest, "a signed file is damaged on the disk: push its release again");
+        self.damaged().insert(digest);
+        // Where others keep the folder it stays, and they find it too.
+        *last = content.remove(digest).await.is_err().then(|| Hashed::now(false));
+        Ok(false)
+    }
+
+    /// Whether a shorter way that is here holds the bytes that its name says.
+    ///
+    /// # Errors
+    /// The disk's.
+    pub async fn holds_way(&self, encodings: &Encodings, digest: Digest) -> Result<bool, Error> {
+        let check = self.check(digest);
+        let mut last = check.lock().await;
+        if let Some(hashed) = last.filter(Hashed::counts) {
+            return Ok(hashed.is_whole);
+        }
+        let Some(file) = encodings.whole(digest).await? else { return Ok(false) };
+        let is_whole = is_whole(digest, file).await?;
+        let stays = is_whole || !encodings.discard(digest).await;
+        *last = stays.then(|| Hashed::now(is_whole));
         Ok(is_whole)
     }
 
