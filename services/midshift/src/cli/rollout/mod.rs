@@ -1,6 +1,7 @@
 //! `midshift rollout …`: signed software to robots at work, in waves.
 //!
-//! Exit codes of `watch` and `wait` beside the usual ones: 11 held for review, 12 aborted, rolled back or superseded, 14 ended for too few.
+//! Exit codes of `watch` and `wait` beside the usual ones: 11 held for review, 12 aborted, rolled back or superseded,
+//! 14 ended, and too few robots have it.
 
 mod create;
 mod follow;

@@ -1,6 +1,8 @@
-//! `midshift rollout report`: the whole record of one roll-out as one document: who, what, when, verdicts, each robot's outcome, tasks meanwhile.
+//! `midshift rollout report`: the whole record of one roll-out as one document. It says who did what and when, what gates said,
+//! what became of each robot, and which tasks ended meanwhile.
 //!
-//! Invariant: pure functions of messages, apart from [`run`]. A page names nothing outside itself, and what anybody typed is text in it.
+//! Invariant: pure functions of messages, apart from [`run`]. A page names nothing outside itself, and what anybody typed is
+//! text in it.
 
 use super::look::{events, members, whole_text};
 use super::{One, text};
