@@ -36,7 +36,7 @@ pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rol
         Step::Waiting if !(rollout.phase.runs() || rollout.phase == Phase::Completed) => Code::BlockedByWave.into(),
         Step::Waiting | Step::Staged => {
             let by = robots::blocked(view, board, now, rollout, r).unwrap_or_else(|| Code::BlockedByWave.into());
-            name_others(view, rollout, by)
+            name_wave(view, rollout, by)
         }
         Step::Staging => {
             deadline =
@@ -85,14 +85,13 @@ pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rol
     Some(Blocked { by, since, deadline })
 }
 
-/// Names robots that are waited for: those out of work where there is no place, those of the present wave where that is not over.
-fn name_others(view: &View, rollout: &Rollout, by: Reason) -> Reason {
-    let is_waited_for = |r: &&RolloutRobot| match by.code {
-        Code::BlockedByPlaceInWave => r.drain_id.is_some(),
-        Code::BlockedByWave => r.wave == rollout.wave && !r.step.is_over(),
-        _ => false,
-    };
-    let robots = view.robots_of(&rollout.rollout_id).filter(is_waited_for).take(NAMED_MAX);
+/// A reason that waits for a wave names robots of the present one that are not decided.
+fn name_wave(view: &View, rollout: &Rollout, by: Reason) -> Reason {
+    if by.code != Code::BlockedByWave {
+        return by;
+    }
+    let open = |r: &&RolloutRobot| r.wave == rollout.wave && !r.step.is_over();
+    let robots = view.robots_of(&rollout.rollout_id).filter(open).take(NAMED_MAX);
     let names: Vec<&str> = robots.map(|r| r.robot_id.as_str()).collect();
     if names.is_empty() { by } else { by.with("robot_ids", names.join(" ")) }
 }
