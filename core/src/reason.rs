@@ -277,26 +277,43 @@ codes! {
     SkippedCurrent = "SKIPPED_CURRENT", "The robot keeps this bundle already.";
     RolloutEnded = "ROLLOUT_ENDED", "The roll-out ended before the robot's turn came.";
     // --- what a robot of a roll-out waits for
-    BlockedByBudget = "BUDGET", "As many robots of the area as its rules allow are out of work.";
-    BlockedByWindow = "WINDOW_CLOSED", "The area's maintenance window is closed, or the area is frozen.";
-    BlockedByWave = "WAITING_FOR_WAVE", "Its wave has not begun.";
-    BlockedByPlaceInWave = "WAITING_FOR_PLACE_IN_WAVE", "As many robots as the roll-out allows are out of work for it.";
-    BlockedByPause = "ROLLOUT_PAUSED", "The roll-out stands still. Resume it.";
-    NoDirectiveKey = "NO_DIRECTIVE_KEY", "The server has no directive key of the newest set, so robots would refuse its orders and it signs none. Put a directive-*.pem that the set names into its folder of --ota-keys, or push a next set that names one it has; see docs/runbooks/keys.md.";
-    BlockedByRollout = "WAITING_FOR_ROLLOUT", "Another roll-out has the robot.";
-    BlockedByDownload = "WAITING_FOR_DOWNLOAD", "The robot fetches the bundle while it works.";
-    BlockedByDrain = "WAITING_FOR_DRAIN", "The robot ends its work and parks.";
-    BlockedByRobot = "WAITING_FOR_ROBOT_READY", "The robot is parked and has not asked to activate: its charge, its temperature, a stop or its link.";
-    BlockedBySwitch = "WAITING_FOR_SWITCH", "The robot changes its software.";
-    BlockedByProbation = "ON_PROBATION", "The robot runs the bundle and gets no work until its probation is over.";
-    BlockedByGate = "WAITING_FOR_GATE", "The robot works with the bundle; its wave has not been judged.";
-    BlockedByCommit = "WAITING_FOR_COMMIT", "The robot was told to keep the bundle and has not answered.";
-    BlockedByRevert = "REVERT_PENDING", "The robot is to go back, and does before it works again.";
+    BlockedByBudget = "BUDGET", "As many robots of the area as its rules allow are out of work."
+        => "It goes on once one of them is back; the rules of the area may allow more.";
+    BlockedByWindow = "WINDOW_CLOSED", "The area's maintenance window is closed, or the area is frozen."
+        => "It goes on when the window opens; the rules of the area may open it now.";
+    BlockedByWave = "WAITING_FOR_WAVE", "Its wave has not begun."
+        => "It begins once the wave before is kept; `midshift rollout get` shows what that one does.";
+    BlockedByPlaceInWave = "WAITING_FOR_PLACE_IN_WAVE", "As many robots as the roll-out allows are out of work for it."
+        => "It goes on once one of them is decided.";
+    BlockedByPause = "ROLLOUT_PAUSED", "The roll-out stands still."
+        => "Resume it.";
+    NoDirectiveKey = "NO_DIRECTIVE_KEY", "The server has no directive key of the newest set, so robots would refuse its orders and it signs none."
+        => "Put a directive-*.pem that the set names into its folder of --ota-keys, or push a next set that names one it has; see docs/runbooks/keys.md.";
+    BlockedByRollout = "WAITING_FOR_ROLLOUT", "Another roll-out has the robot."
+        => "It goes on once that one has decided the robot; abort it to go on now.";
+    BlockedByDownload = "WAITING_FOR_DOWNLOAD", "The robot fetches the bundle while it works."
+        => "Look at its link and its rate if the download does not move on.";
+    BlockedByDrain = "WAITING_FOR_DRAIN", "The robot ends its work and parks."
+        => "`midshift robot explain` says what it does; after its time it works on and is passed over.";
+    BlockedByRobot = "WAITING_FOR_ROBOT_READY", "The robot is parked and has not asked to activate: its charge, its temperature, a stop or its link."
+        => "Look at the robot; after its time it works on and is passed over.";
+    BlockedBySwitch = "WAITING_FOR_SWITCH", "The robot changes its software."
+        => "Look at the robot if it is not heard again.";
+    BlockedByProbation = "ON_PROBATION", "The robot runs the bundle and gets no work until its probation is over."
+        => "It works then, or goes back by itself.";
+    BlockedByGate = "WAITING_FOR_GATE", "The robot works with the bundle; its wave has not been judged."
+        => "Give the wave work, or judge it: `midshift rollout promote` or `midshift rollout abort`.";
+    BlockedByCommit = "WAITING_FOR_COMMIT", "The robot was told to keep the bundle and has not answered."
+        => "Look at its link.";
+    BlockedByRevert = "REVERT_PENDING", "The robot is to go back, and does before it works again."
+        => "Look at the robot if it stands and does not.";
     // --- what counts against a bundle
     RobotLost = "ROBOT_LOST", "The robot was not heard again after it was given the bundle, and most others were.";
     RobotWentBack = "ROBOT_WENT_BACK", "The robot went back from the bundle by itself.";
-    RollbackFailed = "ROLLBACK_FAILED", "The robot could not go back, and stays out of work. Mend its software by hand; if it does not say by itself then that it is back, retire it and uncordon it.";
+    RollbackFailed = "ROLLBACK_FAILED", "The robot could not go back, and stays out of work."
+        => "Mend its software by hand; if it does not say by itself then that it is back, retire it and uncordon it.";
     BreakerOnTrial = "BREAKER_ON_TRIAL", "The robot failed three attempts in ten minutes with the bundle.";
+    JammedOnTrial = "JAMMED_ON_TRIAL", "The robot has work and has stood for five minutes with the bundle, while most others got on with theirs.";
     HardStopCode = "HARD_STOP_CODE", "A robot with the bundle reported a fault that its manifest names as one that ends the roll-out.";
     HardwareStopOnTrial = "HARDWARE_STOP_ON_TRIAL", "The maker's safety system stopped a robot within ten minutes of its change.";
     // --- verdicts on a roll-out
@@ -315,6 +332,9 @@ codes! {
     SupersededBy = "SUPERSEDED_BY", "Another roll-out takes its place.";
     NewcomerFailed = "NEWCOMER_FAILED", "A robot that came after the roll-out was completed went back from its bundle. Robots that come later do not get it; roll it out anew, or retry the robot.";
     RolloutAborted = "ROLLOUT_ABORTED", "A roll-out was aborted. Its verdict has the numbers.";
+    RolloutIncomplete = "ROLLOUT_INCOMPLETE", "A roll-out ended, and fewer of its robots have the bundle than its policy asks. Robots that come later do not get it. `midshift rollout report ID` says why; `midshift rollout retry ID --failed` tries the others again.";
+    ContentRefused = "CONTENT_REFUSED", "Robots refused the bytes or the documents of a bundle, so its roll-out stands still; nothing bad runs. Look at the server's files and the repository, push what is damaged again, then resume the roll-out.";
+    SoftwareDamaged = "SOFTWARE_DAMAGED", "A signed file on the server's disk was not what its release says, so it was handed out to nobody. Look at the disk, and push the release again.";
     // --- a robot's refusals and session answers
     StaleAuthority = "STALE_AUTHORITY", "The message reached the robot after its authority had ended, or was anchored to another session.";
     StaleEpoch = "STALE_EPOCH", "The robot has passed this epoch.";
@@ -323,6 +343,7 @@ codes! {
     // --- software of a robot
     MetadataRefused = "METADATA_REFUSED", "What the repository says of its releases does not hold. Nothing was installed; look at the repository and its keys.";
     DirectiveRefused = "DIRECTIVE_REFUSED", "The robot did not take the order to change its software. Nothing was installed.";
+    BadSignature = "BAD_SIGNATURE", "No key that the robot trusts has signed the order. Nothing was installed; look at the server's directive key and the set that names it.";
     BundleUnfit = "BUNDLE_UNFIT", "The bundle does not fit the robot: hardware, floor, what it needs or what it excludes.";
     BundleCorrupt = "BUNDLE_CORRUPT", "What was downloaded is not what was signed.";
     NoRoom = "NO_ROOM", "The robot has too little room on its disk for one more set.";

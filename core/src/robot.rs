@@ -302,6 +302,9 @@ pub struct ReportedState {
     /// Version of the site's map that its body drives by. Empty: it goes by points alone, or has said it before in its session.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub map_version: String,
+    /// Bytes of room for software when it last looked. None: it is not known, or was said before in its session.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub free_bytes: Option<u64>,
     /// Maker's safety system.
     pub hardware_stop: HardwareStop,
     /// Maker's protective field is violated.

@@ -113,6 +113,18 @@ struct Session {
     observed: bool,
     /// The map that its heartbeats have told; empty: none yet.
     told_map: String,
+    /// The room for software that its heartbeats have told; none: none yet.
+    told_room: Option<u64>,
+}
+
+impl Session {
+    /// The room for software, if that is news: it was not told yet, or has changed by a tenth.
+    fn room_to_tell(&mut self, free_bytes: Option<u64>) -> Option<u64> {
+        let is_news = |now: &u64| self.told_room.is_none_or(|told| *now != told && now.abs_diff(told) >= told / 10);
+        let news = free_bytes.filter(is_news);
+        self.told_room = news.or(self.told_room);
+        news
+    }
 }
 
 /// Writes under way and waiting.
@@ -315,6 +327,7 @@ impl AgentCore {
             stops: self.stops_inside(),
             awaiting_resume: self.stops_awaiting(),
             map_version: self.body.map_version(),
+            free_bytes: self.holdings().map(|holdings| holdings.free_bytes),
             hardware_stop: self.hardware_stop,
             field_violation: self.body.state(now.site).field_violation,
             fault: self.unfit.as_ref().or(self.standing_fault.as_ref()).cloned(),
@@ -393,8 +406,13 @@ impl AgentCore {
 
     fn connected(&mut self, now: &Now, welcome: Welcome) {
         self.sent = SentHeartbeats::new(welcome.session_epoch, self.sent.lease_from());
-        self.session =
-            Some(Session { epoch: welcome.session_epoch, hb: 0, observed: welcome.observed, told_map: String::new() });
+        self.session = Some(Session {
+            epoch: welcome.session_epoch,
+            hb: 0,
+            observed: welcome.observed,
+            told_map: String::new(),
+            told_room: None,
+        });
         self.listed_load.clear();
         let old = &self.kept.ledger.session;
         if old.store_id != welcome.store_id {
@@ -736,6 +754,7 @@ impl AgentCore {
             Some(session) => session.told_map.clone_from(&reported.map_version),
             None => reported.map_version.clear(),
         }
+        reported.free_bytes = self.session.as_mut().and_then(|session| session.room_to_tell(reported.free_bytes));
         Some(Heartbeat { reported, sent_unix_us: now.wall.0 * 1000, clock: self.clock.take() })
     }
 

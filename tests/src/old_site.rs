@@ -320,6 +320,8 @@ fn completed(rollout_id: &RolloutId, bundle: &BundleId, act: Act) -> Rollout {
         started: Some(act.at),
         resumed: None,
         since: act.at,
+        outcome: None,
+        refusals_passed: 0,
     }
 }
 

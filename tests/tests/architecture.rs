@@ -618,6 +618,7 @@ const WORDS: &[(&str, &[&str])] = &[
             "DrainState",
             "Duty",
             "Effect",
+            "Ending",
             "Errand",
             "Goal",
             "HardwareStop",

@@ -11,7 +11,7 @@ use super::rows::{
 };
 use super::spec::{RolloutSpec, Wave};
 use super::view::View;
-use super::{Board, Plan, Tx, assign, moves, objects, phases, robots, verdict};
+use super::{Board, Plan, Tx, assign, moves, objects, phases, refusals, robots, verdict};
 use crate::audit::{self, Note};
 use crate::gates::FailureEvidence;
 use crate::identity::{Actor, Caller};
@@ -305,7 +305,10 @@ fn verb_fits(view: &View, board: &Board, rollout: &Rollout, verb: &Verb) -> Resu
             phase.runs() && !rollout.pauses.contains(&Pause::Operator),
             rollout.pauses.contains(&Pause::Operator),
         ),
-        Verb::Resume => now_is(rollout.pauses.contains(&Pause::Operator), phase.runs() && rollout.pauses.is_empty()),
+        Verb::Resume => {
+            let by_person = [Pause::Operator, Pause::Content].iter().any(|pause| rollout.pauses.contains(pause));
+            now_is(by_person, phase.runs() && rollout.pauses.is_empty())
+        }
         // What stands still is resumed first: a wave is not kept while nobody may be told so.
         Verb::Promote => {
             now_is(matches!(phase, Phase::Soaking | Phase::Gate | Phase::Review) && rollout.pauses.is_empty(), false)
@@ -453,6 +456,8 @@ fn draft(tx: &Tx, rollout_id: &RolloutId, spec: Arc<RolloutSpec>, actor: &Actor)
         started: None,
         resumed: None,
         since: tx.now.utc,
+        outcome: None,
+        refusals_passed: 0,
     }
 }
 
@@ -467,17 +472,15 @@ fn verb_one(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor: &Act
         }
         Verb::Pause | Verb::Resume => {
             let mut pauses = rollout.pauses.clone();
-            if *verb == Verb::Pause {
-                pauses.insert(Pause::Operator)
+            let kind = if *verb == Verb::Pause {
+                pauses.insert(Pause::Operator);
+                "rollout.paused"
             } else {
-                pauses.remove(&Pause::Operator)
+                pauses.retain(|pause| !matches!(pause, Pause::Operator | Pause::Content));
+                rollout.refusals_passed = refusals::of_content(tx.view, &rollout).count() as u32;
+                "rollout.resumed"
             };
-            phases::set_pauses(
-                tx,
-                rollout,
-                pauses,
-                if *verb == Verb::Pause { "rollout.paused" } else { "rollout.resumed" },
-            );
+            phases::set_pauses(tx, rollout, pauses, kind);
         }
         Verb::Promote => {
             let seen = verdict::see_wave(tx.view, board, &tx.now, &rollout);

@@ -74,7 +74,7 @@ pub fn dry_run(view: &View, board: &Board, id: &RolloutId, spec: &RolloutSpec) -
         return Err(Refusal::new(Kind::Precondition, reason));
     }
     budgets(view, &matching)?;
-    let caveats = caveats(view, spec, bundle, &matching);
+    let caveats = caveats(view, board, spec, bundle, &matching);
     Ok(DryRun { least_ms: least_ms(view, spec, &matching), bytes: bundle.length, matching, caveats })
 }
 
@@ -116,7 +116,7 @@ fn least_ms(view: &View, spec: &RolloutSpec, matching: &Matching) -> u64 {
     (0..).zip(matching.sizes(spec.waves.len())).filter(|(_, size)| *size > 0).map(|(ix, size)| wave(ix, size)).sum()
 }
 
-fn caveats(view: &View, spec: &RolloutSpec, bundle: &Bundle, matching: &Matching) -> Vec<String> {
+fn caveats(view: &View, board: &Board, spec: &RolloutSpec, bundle: &Bundle, matching: &Matching) -> Vec<String> {
     let mut caveats = Vec::new();
     if spec.probation_ms < SHORT_PROBATION_MS {
         caveats.push(format!(
@@ -161,8 +161,10 @@ fn caveats(view: &View, spec: &RolloutSpec, bundle: &Bundle, matching: &Matching
         let rest = if more > 0 { format!(" and {more} more") } else { String::new() };
         (!ids.is_empty()).then(|| format!("{}{rest}", ids[..ids.len().min(NAMED_MAX)].join(", ")))
     };
-    if let Some(robots) = named(&|i| i.free_bytes < bundle.length) {
-        caveats.push(format!("less room than its {} bytes, when last attached: {robots}", bundle.length));
+    // Heartbeats tell what has changed since.
+    let room = |i: &Installed| board.get(&i.robot_id).and_then(|l| l.report.free_bytes).unwrap_or(i.free_bytes);
+    if let Some(robots) = named(&|i| room(i) < bundle.length) {
+        caveats.push(format!("less room than its {} bytes, as said last: {robots}", bundle.length));
     }
     for (name, version) in &bundle.requires {
         if let Some(robots) = named(&|i| lacks(i, name, version)) {

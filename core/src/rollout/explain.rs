@@ -9,6 +9,9 @@ use crate::reason::{Code, Reason};
 use crate::time::{Now, Utc};
 use crate::update::UpdateState;
 
+/// Robots that a reason names.
+const NAMED_MAX: usize = 8;
+
 /// Why nothing happens to a robot at this moment.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Blocked {
@@ -32,7 +35,8 @@ pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rol
         Step::Committed | Step::RolledBack | Step::Skipped => return None,
         Step::Waiting if !(rollout.phase.runs() || rollout.phase == Phase::Completed) => Code::BlockedByWave.into(),
         Step::Waiting | Step::Staged => {
-            robots::blocked(view, board, now, rollout, r).unwrap_or_else(|| Code::BlockedByWave.into())
+            let by = robots::blocked(view, board, now, rollout, r).unwrap_or_else(|| Code::BlockedByWave.into());
+            name_wave(view, rollout, by)
         }
         Step::Staging => {
             deadline =
@@ -79,6 +83,17 @@ pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rol
         Step::Stuck => Code::RollbackFailed.into(),
     };
     Some(Blocked { by, since, deadline })
+}
+
+/// A reason that waits for a wave names robots of the present one that are not decided.
+fn name_wave(view: &View, rollout: &Rollout, by: Reason) -> Reason {
+    if by.code != Code::BlockedByWave {
+        return by;
+    }
+    let open = |r: &&RolloutRobot| r.wave == rollout.wave && !r.step.is_over();
+    let robots = view.robots_of(&rollout.rollout_id).filter(open).take(NAMED_MAX);
+    let names: Vec<&str> = robots.map(|r| r.robot_id.as_str()).collect();
+    if names.is_empty() { by } else { by.with("robot_ids", names.join(" ")) }
 }
 
 /// When a drain that has begun must be over.

@@ -5,7 +5,7 @@
 
 use super::rows::{Quarantine, RobotSoftware, RolloutRobot, Step};
 use super::view::View;
-use super::{Board, Tx};
+use super::{Board, Tx, refusals};
 use crate::ids::{DrainId, RobotId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -79,8 +79,8 @@ fn directive_refused(tx: &mut Tx, robot_id: &RobotId, generation: u64, reason: &
     // One that lay too long says nothing against the robot: it is signed anew.
     let old = |r: &RolloutRobot| r.step == Step::Staging && is_old(&tx.now, r.signed);
     if let Some(row) = row.filter(|r| newest && !old(r)) {
-        let why = Reason::new(Code::SkippedIncompatible, reason.text()).with("because", reason.code);
-        tx.put(RolloutRobot { step: Step::Skipped, since: tx.now.utc, why: Some(why), ..row }, "robot.skipped");
+        let why = Some(refusals::skip_reason(Some(reason)));
+        tx.put(RolloutRobot { step: Step::Skipped, since: tx.now.utc, why, ..row }, "robot.skipped");
     }
 }
 

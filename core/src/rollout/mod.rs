@@ -1,19 +1,22 @@
 //! The law of roll-outs: which robot gets which bundle when, what counts for and against it, and the way back.
 //!
 //! [`cycle`] takes what happened and gives items to commit; the service around it only reads, signs, commits and publishes.
-//! Rooms: `spec` is what is asked for, `rows` and `view` are what is known; `hear` and `commands` are what happens; `matching` says who and `dry_run` what it would come to, `robots`
-//! says what is due for each (`turns`: whose turn it is) and `moves` writes it, `phases` the whole, `newcomers` who comes later (`served`: what they get; `assign`: how
-//! anybody comes in), `named` which bundles are still needed, `past` what the picture holds of what has ended; `verdict` and `infrastructure` judge; `explain` says
-//! what a robot waits for. Rooms name each other in one direction only.
+//! Rooms: `spec` is what is asked for, `rows` and `view` are what is known; `hear` and `commands` are what happens (`refusals`: what robots
+//! would not take); `matching` says who and `dry_run` what it would come to, `robots` says what is due for each (`turns`: whose turn it is)
+//! and `moves` writes it, `phases` the whole, `ending` whether enough have it at the end, `newcomers` who comes later (`served`: what they
+//! get; `assign`: how anybody comes in), `named` which bundles are still needed, `past` what the picture holds of what has ended; `verdict`,
+//! `jams` and `infrastructure` judge; `explain` says what a robot waits for. Rooms name each other in one direction only.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod assign;
 pub mod bugs;
 pub mod commands;
 pub mod dry_run;
+pub mod ending;
 pub mod explain;
 pub mod hear;
 pub mod infrastructure;
+pub mod jams;
 pub mod matching;
 pub mod moves;
 pub mod named;
@@ -22,6 +25,7 @@ mod noted;
 pub mod objects;
 pub mod past;
 pub mod phases;
+pub mod refusals;
 pub mod robots;
 pub mod rows;
 pub mod served;
@@ -109,6 +113,12 @@ impl Plan {
 /// States that a person should look into something.
 fn incident(tx: &mut Tx, robot_id: Option<&RobotId>, reason: &Reason) {
     tx.tell(robot_id.map_or("", RobotId::as_str), crate::maintenance::INCIDENT, reason);
+}
+
+/// States that a signed file is damaged on the server's disk.
+pub fn tell_damaged(view: &mut View, now: Now, digest: &str, plan: &mut Plan) {
+    let reason = Reason::from(Code::SoftwareDamaged).with("digest", digest);
+    plan.decide(view, now, "ota", |tx| incident(tx, None, &reason));
 }
 
 /// Entry of the log that an item obeys, if it obeys one.

@@ -10,7 +10,7 @@ use super::rows::{Given, Rollout, RolloutRobot, Step, WayBack};
 use super::stamp::Stamp;
 use super::turns::is_retried;
 use super::view::View;
-use super::{Board, Order, Sign, Tx, newcomers, verdict};
+use super::{Board, Order, Sign, Tx, ending, newcomers, verdict};
 use crate::ids::{DrainId, RobotId, RolloutId};
 use crate::limits;
 use crate::maintenance::{DrainRelease, DrainRequest, ReleasedBy};
@@ -103,7 +103,10 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Commit, None, None));
             step(tx, r, Step::Committing, "robot.committing");
         }
-        Move::Committed => step(tx, r, Step::Committed, "robot.committed"),
+        Move::Committed => {
+            step(tx, r, Step::Committed, "robot.committed");
+            ending::reconsider(tx, &rollout.rollout_id);
+        }
         Move::Revert => {
             let hard = rollout.abort.as_ref().is_some_and(|a| a.hard) || r.failure.is_some();
             // A robot that is not heard goes back before it works again.
@@ -202,6 +205,7 @@ fn rolled_back(tx: &mut Tx, rollout: &Rollout, mut r: RolloutRobot, why: Reason)
     r.why = Some(rollout.abort.as_ref().map_or(back, |a| a.reason.clone()));
     leave_drain(tx, &mut r, ReleasedBy::Reported);
     step(tx, r, Step::RolledBack, "robot.rolled_back");
+    ending::reconsider(tx, &rollout.rollout_id);
 }
 
 fn stage(tx: &mut Tx, sign: &dyn Sign, rollout: &Rollout, mut r: RolloutRobot) {

@@ -4,18 +4,18 @@
 //! stuck and unreachable robots never keep a fleet waiting.
 
 use super::robots::{is_gone, is_irreversible, is_keyless};
-use super::rows::{AreaBundle, Bundle, Countdown, Outcome, Pause, Phase, Rollout, RolloutRobot, Step, Verdict};
+use super::rows::{Bundle, Countdown, Outcome, Pause, Phase, Rollout, RolloutRobot, Step, Verdict};
 use super::served::forget_area_bundles;
 use super::stamp::Stamp;
 use super::turns::{is_newcomer, is_retried};
 use super::verdict;
 use super::view::View;
-use super::{Board, Tx, assign, incident, infrastructure, matching};
-use crate::ids::{AreaId, RolloutId};
+use super::{Board, Tx, assign, ending, incident, infrastructure, matching, refusals};
+use crate::ids::RolloutId;
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::time::Now;
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 
 /// Stops a roll-out that must not go on as it is, before any robot is brought further.
 pub fn guard(tx: &mut Tx, board: &Board, id: &RolloutId) {
@@ -62,14 +62,27 @@ fn pauses(tx: &mut Tx, board: &Board, rollout: &Rollout) {
     let gone = is_gone(tx.view, rollout).then_some(Pause::Revoked);
     let network = infrastructure::pause(tx.view, board, &tx.now, rollout);
     let keyless = is_keyless(tx.view, rollout).then_some(Pause::Keyless);
-    let pauses = asked.into_iter().chain(gone).chain(network).chain(keyless).collect();
+    let content = refusals::pause(tx.view, rollout);
+    let pauses: BTreeSet<Pause> = asked.into_iter().chain(gone).chain(network).chain(keyless).chain(content).collect();
     if pauses != rollout.pauses {
+        if content.is_some() && !rollout.pauses.contains(&Pause::Content) {
+            tell_refusals(tx, rollout);
+        }
         set_pauses(tx, rollout.clone(), pauses, "rollout.pauses_changed");
     }
 }
 
+/// Names robots that refused the content of a roll-out.
+fn tell_refusals(tx: &mut Tx, rollout: &Rollout) {
+    let robots: Vec<&str> =
+        refusals::of_content(tx.view, rollout).map(|r| r.robot_id.as_str()).take(verdict::NAMED_MAX).collect();
+    let told = Reason::from(Code::ContentRefused).with("rollout_id", &rollout.rollout_id);
+    let told = told.with("robot_ids", robots.join(" "));
+    incident(tx, None, &told);
+}
+
 /// Stands still for these reasons, or goes on if there is none. Permissions of before are not given any more.
-pub fn set_pauses(tx: &mut Tx, mut rollout: Rollout, pauses: std::collections::BTreeSet<Pause>, kind: &'static str) {
+pub fn set_pauses(tx: &mut Tx, mut rollout: Rollout, pauses: BTreeSet<Pause>, kind: &'static str) {
     let served = tx.view.served_ms(&tx.now);
     let runs = pauses.is_empty();
     for countdown in [&mut rollout.soak, &mut rollout.exposure] {
@@ -285,25 +298,12 @@ fn next_wave(tx: &mut Tx, mut rollout: Rollout) {
 }
 
 fn complete(tx: &mut Tx, rollout: Rollout) {
-    let id = rollout.rollout_id.clone();
-    let mut by_area: BTreeMap<AreaId, Vec<String>> = BTreeMap::new();
-    for r in tx.view.robots_of(&id).filter(|r| matches!(r.step, Step::Trial | Step::Committing | Step::Committed)) {
-        let area = tx.view.software.get(r.robot_id.as_str()).and_then(|s| s.row.area.clone());
-        let model = tx.view.sessions.get(r.robot_id.as_str()).map(|s| s.row.inventory.model.clone());
-        if let Some((area, model)) = area.zip(model) {
-            by_area.entry(area).or_default().push(model);
-        }
-    }
-    for (area_id, models) in by_area {
-        let known = tx.view.area_bundles.get(area_id.as_str()).map(|a| a.row.clone());
-        let mut row = known.unwrap_or_else(|| AreaBundle { area_id, rollouts: BTreeMap::new() });
-        row.rollouts.extend(models.into_iter().map(|model| (model, id.clone())));
-        tx.put(row, "area.bundle_set");
-    }
+    let rollout = Rollout { since: tx.now.utc, ..rollout };
+    let outcome = Some(ending::decide(tx, &rollout));
     if let Some(of) = &rollout.revert_of {
         forget_area_bundles(tx, of);
     }
-    enter(tx, rollout, Phase::Completed, "rollout.completed");
+    enter(tx, Rollout { outcome, ..rollout }, Phase::Completed, "rollout.completed");
 }
 
 /// Waits until nobody can activate it any more.

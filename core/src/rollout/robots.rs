@@ -8,7 +8,7 @@ use super::hear::{is_hard, is_old, report_of};
 use super::rows::{Given, Pause, Phase, Rollout, RolloutRobot, Step};
 use super::turns::{is_late, is_newcomer, is_on, is_retried};
 use super::view::View;
-use super::{Board, infrastructure, matching, served, verdict};
+use super::{Board, infrastructure, jams, matching, refusals, served, verdict};
 use crate::authority::Authority;
 use crate::fleet::rows::DrainState;
 use crate::ids::{RobotId, RolloutId};
@@ -195,10 +195,9 @@ fn staging(
     })
 }
 
-/// Why the robot refused what it was told.
+/// Why a robot is left out that refused what it was told.
 fn refused(report: Option<&UpdateReport>) -> Reason {
-    let why = report.and_then(|r| r.reason.clone()).unwrap_or_else(|| Code::BundleUnfit.into());
-    Reason::new(Code::SkippedIncompatible, why.text()).with("because", why.code)
+    refusals::skip_reason(report.and_then(|r| r.reason.as_ref()))
 }
 
 /// Its turn came long ago, and it has not fetched the bundle.
@@ -469,6 +468,9 @@ fn trial(
     let broken = view.control.get(r.robot_id.as_str()).and_then(|c| c.row.breaker);
     if broken.is_some_and(|since| r.moments.on_trial.is_some_and(|at| since >= at)) {
         return Some(Move::Fail(Code::BreakerOnTrial.into()));
+    }
+    if jams::is_blamed(view, board, now, rollout, r) {
+        return Some(Move::Fail(Code::JammedOnTrial.into()));
     }
     let promoted = if is_newcomer(rollout, r) {
         let soaked = r.moments.on_trial.is_some_and(|at| now.ms_since(at) >= rollout.spec.soak_ms);

@@ -180,6 +180,18 @@ pub enum Pause {
     Revoked,
     /// The server has no key whose orders robots take: none could be told anything, nor be ordered back anew.
     Keyless,
+    /// Robots refused its bytes or its documents. A person resumes it.
+    Content,
+}
+
+/// How a roll-out ended that nothing ended early.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Ending {
+    /// As many robots as its spec asks have its bundle, or went back if it takes one back.
+    Complete,
+    /// Fewer do.
+    Incomplete,
 }
 
 /// A stretch of serving time on the site clock that can stand still.
@@ -336,6 +348,12 @@ pub struct Rollout {
     pub resumed: Option<Utc>,
     /// UTC, site clock, when it came to its phase.
     pub since: Utc,
+    /// How it ended. None: it is not completed, or was before that was kept.
+    #[serde(default)]
+    pub outcome: Option<Ending>,
+    /// Robots that had refused its content when a person resumed it last: they hold it no more.
+    #[serde(default)]
+    pub refusals_passed: u32,
 }
 
 impl Rollout {

@@ -16,6 +16,8 @@ const NAMED_MAX: usize = 1_000;
 const LIMIT_MS: RangeInclusive<u64> = 1_000..=30 * 24 * 3_600_000;
 /// Probation of a roll-out that names none, milliseconds of site time.
 pub const PROBATION_DEFAULT_MS: u64 = 180_000;
+/// Robots of a hundred that a roll-out which names no share must end with on its bundle.
+const COMPLETE_PERCENT_DEFAULT: u32 = 90;
 /// Probation, milliseconds of site time.
 const PROBATION_MS: RangeInclusive<u64> = 1_000..=24 * 3_600_000;
 
@@ -122,6 +124,14 @@ pub struct RolloutSpec {
     /// The gate on rates of task failures ends the roll-out too; else it is only shown, unless rules of an area say otherwise:
     /// [`super::verdict::acts_on_rates`].
     pub acts_on_rates: bool,
+    /// So many of a hundred robots that were offered the bundle must have it at the end, or the outcome is INCOMPLETE. 1..100.
+    #[serde(default = "complete_percent_default")]
+    pub complete_percent: u32,
+}
+
+/// The share of roll-outs that were written down before there was one.
+const fn complete_percent_default() -> u32 {
+    COMPLETE_PERCENT_DEFAULT
 }
 
 impl RolloutSpec {
@@ -143,6 +153,7 @@ impl RolloutSpec {
             allow_full_push: false,
             rate_bytes_s: 0,
             acts_on_rates: false,
+            complete_percent: COMPLETE_PERCENT_DEFAULT,
         }
     }
 
@@ -179,6 +190,9 @@ impl RolloutSpec {
         }
         if self.max_in_flight == Some(0) {
             bad.add("max_in_flight", "must be at least 1");
+        }
+        if !(1..=100).contains(&self.complete_percent) {
+            bad.add("complete_percent", "must be 1..100 percent");
         }
         let s = &self.selector;
         let named = [
@@ -226,6 +240,7 @@ mod tests {
             drain_within_ms: 0,
             max_in_flight: Some(0),
             exposure_tasks: 10_001,
+            complete_percent: 0,
             ..spec()
         };
         let expected = [
@@ -237,8 +252,10 @@ mod tests {
             "probation_ms",
             "exposure_tasks",
             "max_in_flight",
+            "complete_percent",
         ];
         assert_eq!(fields(&bad), expected);
+        assert_eq!(fields(&RolloutSpec { complete_percent: 101, ..spec() }), ["complete_percent"]);
         assert_eq!(fields(&RolloutSpec { waves: vec![Wave::Rest], ..spec() }), ["waves"]);
         assert_eq!(
             fields(&RolloutSpec { waves: vec![Wave::Rest], allow_full_push: true, ..spec() }),

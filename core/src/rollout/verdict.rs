@@ -20,8 +20,8 @@ use crate::time::{Now, Utc};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Robots named in an abort.
-const NAMED_MAX: usize = 16;
+/// Robots named in an abort or an incident.
+pub const NAMED_MAX: usize = 16;
 
 /// Robots of a roll-out as its gates count them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

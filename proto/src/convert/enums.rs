@@ -3,7 +3,7 @@
 use crate::{common, fleet, link, ota, stop, task, telemetry};
 use midshift_core::fleet::rows::{DrainState, HolderState};
 use midshift_core::robot::{Duty, FaultClass, HardwareStop, Lane, Mode, Presence, StopLevel};
-use midshift_core::rollout::rows::{Outcome, Pause, Phase as RolloutPhase, Step as RolloutStep};
+use midshift_core::rollout::rows::{Ending, Outcome, Pause, Phase as RolloutPhase, Step as RolloutStep};
 use midshift_core::rollout::spec::{AbortScope, SmallWave, SmallWaveFailure};
 use midshift_core::stop::ladder::Stage;
 use midshift_core::task::state::Errand;
@@ -80,8 +80,9 @@ wire_enums! {
     }
     Pause = ota::v1::RolloutPause {
         Operator = Operator, Infrastructure = Infrastructure, InfrastructureUnknown = InfrastructureUnknown, Revoked = Revoked,
-        Keyless = Keyless,
+        Keyless = Keyless, Content = Content,
     }
+    Ending = ota::v1::RolloutEnding { Complete = Complete, Incomplete = Incomplete }
     Outcome = ota::v1::RolloutOutcome {
         Promoted = Promoted, PromotedUnproven = PromotedUnproven, PromotedByPerson = PromotedByPerson, Review = Review, Aborted = Aborted,
     }

@@ -210,6 +210,7 @@ impl From<&ReportedState> for v1::ReportedState {
             stops: names(&state.stops),
             awaiting_resume: names(&state.awaiting_resume),
             map_version: state.map_version.clone(),
+            free_bytes: state.free_bytes,
         }
     }
 }
@@ -269,6 +270,7 @@ impl Parse<ReportedState> for v1::ReportedState {
             stops: stops?,
             awaiting_resume: awaiting_resume?,
             map_version: map_version?,
+            free_bytes: self.free_bytes,
             hardware_stop: hardware_stop?,
             field_violation: self.field_violation,
             fault: fault?,

@@ -65,7 +65,10 @@ pub fn encode_robot(view: RobotView<'_>, now: Now) -> v1::Robot {
         observed_since: observed_since.map(timestamp),
         // No part of what is known of it: whoever listens for beacons adds it.
         beacon: None,
-        installed: session.and_then(|s| s.installed.as_ref()).map(Into::into),
+        installed: session.and_then(|s| s.installed.as_ref()).map(|installed| v1::InstalledSoftware {
+            free_bytes: live.and_then(|l| l.report.free_bytes).unwrap_or(installed.free_bytes),
+            ..installed.into()
+        }),
         device_key: session.and_then(|s| s.device_key.clone()).unwrap_or_default(),
         device_key_changed: session.is_some_and(|s| s.device_key_changed),
         area_id: area_id.map(ToString::to_string).unwrap_or_default(),

@@ -95,6 +95,7 @@ fn reported() -> ReportedState {
         stops: vec![stop_id()],
         awaiting_resume: vec![stop_id(), stop_id()],
         map_version: "2026-11".to_owned(),
+        free_bytes: Some(64 << 30),
         hardware_stop: HardwareStop::Remote,
         field_violation: true,
         applied_update: 3,

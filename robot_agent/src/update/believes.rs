@@ -17,6 +17,15 @@ use midshift_core::update::{DesiredUpdate, UpdateState};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+/// Why a directive is not taken, for the server.
+pub(super) fn refusal_of(rejection: &Rejection) -> Reason {
+    let code = match rejection {
+        Rejection::NotSigned => Code::BadSignature,
+        _ => Code::DirectiveRefused,
+    };
+    Reason::new(code, rejection.to_string())
+}
+
 impl AgentCore {
     pub(super) fn reading(&self, now: &Now) -> Reading {
         let is_synced = self.update.config.as_ref().is_some_and(|c| c.clock_synced);
@@ -134,15 +143,13 @@ impl AgentCore {
     }
 
     fn open(&self, desired: &DesiredUpdate, now: Utc) -> Result<Directive, Reason> {
-        let refused = |text: String| Reason::new(Code::DirectiveRefused, text);
         let bugs = self.config.bugs;
         let newest = if bugs.replays_are_taken() { 0 } else { self.kept.ledger.software.directive };
-        let opened = self.opened(desired, newest, now);
-        let directive = opened.map_err(|rejection| refused(rejection.to_string()))?;
+        let directive = self.opened(desired, newest, now).map_err(|rejection| refusal_of(&rejection))?;
         if self.lists(&directive.manifest, directive.manifest_length) || bugs.unlisted_is_fine() {
             Ok(directive)
         } else {
-            Err(refused("no release lists its bundle".to_owned()))
+            Err(Reason::new(Code::DirectiveRefused, "no release lists its bundle"))
         }
     }
 

@@ -269,6 +269,8 @@ pub(crate) struct Updater {
     pub(crate) dropping: bool,
     /// Garbage was collected since the last end of an update.
     pub(crate) collected: bool,
+    /// When the disk was looked at last without an update under way.
+    pub(crate) looked: Option<LinkTime>,
 }
 
 impl AgentCore {

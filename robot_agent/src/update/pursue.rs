@@ -2,6 +2,7 @@
 //!
 //! Invariant: level-triggered. It may be called at any moment and any number of times; what it decides is written down before it is done.
 
+use super::believes::refusal_of;
 use super::{Done, Failure, Job, SoftwareRow, Update, again, migrate};
 use crate::core::{AgentCore, ExitReason, Output};
 use crate::sets::{Holdings, Wanted};
@@ -22,6 +23,8 @@ use std::collections::BTreeSet;
 
 /// A grant that did not come is asked for again after this.
 const ASK_AGAIN: LinkDuration = LinkDuration(10_000);
+/// Without an update under way the disk is looked at so often: the room on it is told to the server.
+const LOOK_EVERY: LinkDuration = LinkDuration(60_000);
 /// A set on probation that does not reach its server for so long is gone back from.
 const LOST_SERVER: LinkDuration = LinkDuration(600_000);
 
@@ -244,6 +247,9 @@ impl AgentCore {
         }
         if !self.update.collected {
             self.ask_for(Job::Collect(self.needed()));
+        } else if now.link.since(*self.update.looked.get_or_insert(now.link)) >= LOOK_EVERY {
+            self.update.looked = Some(now.link);
+            self.ask_for(Job::Look);
         }
         None
     }
@@ -303,11 +309,10 @@ impl AgentCore {
             self.update.asks_for_keys = true;
             return true;
         }
-        let opened = opened.map_err(|rejection| Reason::new(Code::DirectiveRefused, rejection.to_string()));
         let directive = match opened {
             Ok(directive) => directive,
-            Err(reason) => {
-                self.refuse_directive(reason);
+            Err(rejection) => {
+                self.refuse_directive(refusal_of(&rejection));
                 return false;
             }
         };

@@ -284,6 +284,25 @@ fn a_robot_without_room_says_so_and_keeps_what_it_has() {
 }
 
 #[test]
+fn the_room_for_software_is_told_when_it_has_changed_by_a_tenth() {
+    let (mut rig, _releases) = connected();
+    let told = |rig: &Rig| -> Vec<u64> {
+        rig.messages.iter().filter_map(|m| m.heartbeat.as_ref()?.reported.free_bytes).collect()
+    };
+    let becomes = |rig: &mut Rig, room: u64| {
+        rig.updates.as_ref().expect("has them").sets.limit(room);
+        rig.pass(130_000);
+    };
+    becomes(&mut rig, 1_000);
+    assert_eq!(told(&rig).last(), Some(&1_000));
+    let before = told(&rig).len();
+    becomes(&mut rig, 950);
+    assert_eq!(told(&rig).len(), before, "a twentieth less is no news");
+    becomes(&mut rig, 890);
+    assert_eq!(told(&rig)[before..], [890]);
+}
+
+#[test]
 fn bytes_that_are_not_what_was_signed_are_refused_and_the_next_good_ones_taken() {
     let (mut rig, releases) = connected();
     let bundle = releases.release("1.1.0");

@@ -234,6 +234,26 @@ impl Encodings {
         Ok(opened.map(|file| -> Reader { Box::new(tokio::fs::File::from_std(file).take(length)) }))
     }
 
+    /// A whole way, to be read from any place; none: it is not here.
+    ///
+    /// # Errors
+    /// The disk's.
+    pub async fn whole(&self, digest: Digest) -> Result<Option<Box<dyn Base>>, Error> {
+        let inner = self.inner.clone();
+        let opened = blocking(move || inner.open_at(digest, 0)).await?;
+        Ok(opened.map(|file| -> Box<dyn Base> { Box::new(file) }))
+    }
+
+    /// Takes a damaged way away, so that it is made anew when it is asked for. Whether it is gone: where others make ways it stays.
+    pub async fn discard(&self, digest: Digest) -> bool {
+        let inner = self.inner.clone();
+        blocking(move || {
+            let key = inner.shelf().by_digest.get(&digest).copied();
+            !matches!(inner.hand, Hand::Reading) && key.is_none_or(|key| inner.take_away(key).is_some())
+        })
+        .await
+    }
+
     /// Takes ways away, the one unused longest first, until `bytes` more are free. Whether so many became free. One that the disk holds
     /// on to is passed over.
     pub async fn make_room(&self, bytes: u64) -> bool {

@@ -5,6 +5,7 @@
 use crate::content::{Content, Wanted};
 use crate::encodings::{Encodings, Way};
 use crate::grpc::{answer, status};
+use crate::integrity::Integrity;
 use crate::repository::Documents;
 use midshift_bundle::digest::Digest;
 use midshift_core::limits;
@@ -13,6 +14,7 @@ use midshift_proto::chunk;
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::bundle_service_server::BundleService as BundleFace;
 use midshift_proto::ota::v1::chunk_service_server::ChunkService as ChunkFace;
+use std::collections::BTreeSet;
 use std::pin::Pin;
 use std::sync::Arc;
 use tokio_stream::{Stream, StreamExt};
@@ -24,6 +26,7 @@ pub struct Shown {
     pub(crate) content: Arc<dyn Content>,
     pub(crate) encodings: Encodings,
     pub(crate) documents: Documents,
+    integrity: Integrity,
 }
 
 /// The hatch. Cheap to clone. One of a server without keys says so to everybody.
@@ -41,7 +44,13 @@ impl Shown {
 
 impl Hatch {
     pub(crate) fn new(content: Arc<dyn Content>, encodings: Encodings, documents: Documents) -> Self {
-        Self { shown: Some(Arc::new(Shown { content, encodings, documents })) }
+        let shown = Shown { content, encodings, documents, integrity: Integrity::default() };
+        Self { shown: Some(Arc::new(shown)) }
+    }
+
+    /// Signed files that were found damaged since this was asked last.
+    pub(crate) fn take_damaged(&self) -> BTreeSet<Digest> {
+        self.shown.as_ref().map(|shown| shown.integrity.take_damaged()).unwrap_or_default()
     }
 
     pub(crate) fn shown(&self) -> Result<&Shown, Refusal> {
@@ -60,7 +69,7 @@ impl Hatch {
         Ok(v1::GetMetadataResponse { document })
     }
 
-    /// Which file is meant and how long it is, if a signed release lists it.
+    /// Which file is meant and how long it is, if a signed release lists it and it is here whole.
     pub(crate) async fn listed(&self, digest: Digest) -> Result<Wanted, Refusal> {
         let shown = self.shown()?;
         let not_found = || Refusal::new(Kind::NotFound, Code::SoftwareNotFound);
@@ -72,6 +81,9 @@ impl Hatch {
             }
         }
         let length = shown.content.length(digest).await?.ok_or_else(not_found)?;
+        if !shown.integrity.holds(shown.content.as_ref(), digest).await? {
+            return Err(not_found());
+        }
         Ok(Wanted { digest, length })
     }
 
@@ -114,6 +126,9 @@ impl Hatch {
         opened.encodings.follow().await?;
         let encoded = opened.encodings.found(digest).filter(|(key, _)| opened.lists(key.target));
         let length = match encoded {
+            Some(_) if !opened.integrity.holds_way(&opened.encodings, digest).await? => {
+                return Err(Refusal::new(Kind::NotFound, Code::SoftwareNotFound));
+            }
             Some((_, length)) => length,
             None => self.listed(digest).await?.length,
         };

@@ -17,6 +17,7 @@ pub mod folder;
 mod grpc;
 mod hatch;
 mod http1;
+mod integrity;
 #[cfg(test)]
 #[expect(dead_code, reason = "shared with tests that need tasks too")]
 #[path = "../../../tests/src/old_site.rs"]

@@ -82,6 +82,8 @@ struct Session {
     progress: (u64, SiteTime),
     /// The map that the robot said last.
     map_version: String,
+    /// The room for software that it said last.
+    free_bytes: Option<u64>,
     /// Heartbeats that are not where other processes read them yet, with the answer they get then.
     unechoed: VecDeque<Echo>,
     /// What becomes of them.
@@ -137,6 +139,7 @@ pub async fn run(
         offset: Offset::default(),
         progress: (0, now.site),
         map_version: hello.reported.map_version.clone(),
+        free_bytes: hello.reported.free_bytes,
         unechoed: VecDeque::new(),
         kept: mpsc::channel(UNECHOED_MAX),
         stops: StopNews::new(inner.picture.watch_stops()),
@@ -341,6 +344,8 @@ impl Session {
         } else {
             self.map_version.clone_from(&report.map_version);
         }
+        report.free_bytes = report.free_bytes.or(self.free_bytes);
+        self.free_bytes = report.free_bytes;
         let hb = report.hb;
         let progress = report.progress();
         if progress != self.progress.0 {

@@ -306,6 +306,7 @@ async fn rollouts(room: &Room, t: &mut Transcript, address: SocketAddr) -> anyho
     t.note(&["rollout", "get", "walk-1.5.0", "--robots", "-o", "json"])?;
     t.note(&["rollout", "explain", "walk-1.5.0", "r2"])?;
     t.note(&["rollout", "explain", "walk-1.5.0", "r9"])?;
+    t.note(&["rollout", "explain", "walk-1.5.0"])?;
     t.note_stream(&["rollout", "watch", "walk-1.5.0", "-o", "json"], 1)?;
     t.note(&[&["rollout", "resume", "walk-1.5.0", "-o", "name"][..], &said].concat())?;
     t.note(&[&["rollout", "promote", "walk-1.5.0"][..], &said].concat())?;
@@ -318,6 +319,9 @@ async fn rollouts(room: &Room, t: &mut Transcript, address: SocketAddr) -> anyho
     t.note(&["rollout", "wait", "walk-1.5.0", "--for", "ended"])?;
     t.note(&["rollout", "watch", "walk-1.5.0"])?;
     t.note(&["rollout", "history", "walk-1.5.0", "-o", "json"])?;
+    t.note(&["rollout", "report", "walk-1.5.0", "-o", "json"])?;
+    t.note(&["rollout", "report", "walk-1.5.0", "-o", "html"])?;
+    t.note(&["rollout", "ls", "-o", "html"])?;
     t.note(&["rollout", "rollback", "walk-1.5.0", "--as", "back"])?;
     t.note(&["quarantine", "ls"])?;
     t.note(&["quarantine", "ls", "-o", "json"])?;

@@ -206,7 +206,7 @@ async fn settle(client: &mut Client, id: String) -> Result<(), Status> {
     use ota::{RolloutPause, RolloutPhase};
     let shown = seen(client, &id).await?;
     let mut client = client.clone();
-    if shown.pauses().any(|pause| pause == RolloutPause::Operator) {
+    if shown.pauses().any(|pause| matches!(pause, RolloutPause::Operator | RolloutPause::Content)) {
         return verb!(client, resume_rollout, ResumeRolloutRequest, id);
     }
     match shown.phase() {

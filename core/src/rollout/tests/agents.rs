@@ -79,12 +79,15 @@ impl Rig {
                 self.tell(n, fresh_report(UpdateState::Committed, &bundle, generation));
             }
             if matches!(desired.goal, Goal::Stage | Goal::Activate) {
-                let state = match robot.fate {
-                    Fate::NoBytes => UpdateState::Downloading,
-                    Fate::Unfit => UpdateState::Refused,
-                    _ => UpdateState::Staged,
+                let (state, why) = match robot.fate {
+                    Fate::NoBytes => (UpdateState::Downloading, None),
+                    Fate::Unfit => (UpdateState::Refused, None),
+                    Fate::Corrupt => (UpdateState::Refused, Some(Code::BundleCorrupt)),
+                    Fate::Full => (UpdateState::Refused, Some(Code::NoRoom)),
+                    _ => (UpdateState::Staged, None),
                 };
-                self.tell(n, fresh_report(state, &bundle, generation));
+                let reason = why.map(Reason::from);
+                self.tell(n, UpdateReport { reason, ..fresh_report(state, &bundle, generation) });
             }
             return;
         }

@@ -7,6 +7,8 @@ mod aborts;
 mod agents;
 mod asks;
 mod drains_and_grants;
+mod endings;
+mod jams;
 mod keyless;
 mod named;
 mod newcomers_and_pins;
@@ -15,6 +17,7 @@ mod past;
 mod people;
 mod reach;
 mod recovery;
+mod refusals;
 mod reverts_and_second_pass;
 mod sequences;
 mod staging;
@@ -72,6 +75,10 @@ enum Fate {
     NoBytes,
     /// It does not take the bundle.
     Unfit,
+    /// Its bytes come to it as others than were signed.
+    Corrupt,
+    /// It has no room for the bundle.
+    Full,
     /// It takes permissions and does not use them.
     Dawdles,
     /// It gave up what it kept.

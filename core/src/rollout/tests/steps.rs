@@ -142,6 +142,16 @@ fn after_an_abort_no_step_but_a_stuck_one_keeps_the_bundle_whatever_is_reported(
 }
 
 #[test]
+fn whoever_waits_for_a_wave_is_told_which_robots_of_it_are_not_decided() {
+    let (rig, rollout) = applying();
+    let order = rig.order();
+    let r = rig.of("ro", order[2]);
+    let by = super::super::explain::blocked(&rig.ota, &rig.board, &rig.now, &rollout, &r).expect("it waits").by;
+    let named = by.metadata.get("robot_ids").map(String::as_str);
+    assert_eq!((by.code, named), (Code::BlockedByWave, Some(robot_id(order[0]).as_str())));
+}
+
+#[test]
 fn each_waiting_robot_has_one_reason_and_who_is_done_has_none() {
     let (mut rig, rollout) = applying();
     for step in STEPS {
@@ -150,7 +160,7 @@ fn each_waiting_robot_has_one_reason_and_who_is_done_has_none() {
         let blocked = super::super::explain::blocked(&rig.ota, &board, &rig.now, &rollout, &r);
         assert_eq!(blocked.is_none(), step.is_over(), "{step:?}");
         if let Some(blocked) = blocked {
-            assert!(!blocked.by.code.help().is_empty());
+            assert!(!blocked.by.code.next_step().is_empty(), "{step:?}: what a person can do");
         }
     }
 }

@@ -106,8 +106,16 @@ fn a_dry_run_tells_who_has_too_little_room_and_who_lacks_what_the_bundle_needs()
     // The fourth robot said nothing: nothing is held against it.
     let (room, needs) =
         (run.caveats.iter().find(|c| c.contains("room")), run.caveats.iter().find(|c| c.contains("map")));
-    assert!(room.is_some_and(|c| c.ends_with("attached: r000")), "{:?}", run.caveats);
+    assert!(room.is_some_and(|c| c.ends_with("said last: r000")), "{:?}", run.caveats);
     assert!(needs.is_some_and(|c| c.ends_with("seen on: r001, r002")), "{:?}", run.caveats);
+    let live = rig.board.get_mut(&robot_id(1)).expect("it is heard");
+    Arc::make_mut(live).report.free_bytes = Some(10);
+    let run = dry_run(&rig.ota, &rig.board, &rollout_id("ro"), &spec()).expect("it may run");
+    assert!(
+        run.caveats.iter().any(|c| c.ends_with("said last: r000, r001")),
+        "what heartbeats say counts: {:?}",
+        run.caveats
+    );
 }
 
 fn installed(n: usize, free_bytes: u64, map: Option<&str>) -> Installed {

@@ -39,7 +39,7 @@ use clap::{Parser, Subcommand};
 use client::Exit;
 use midshift_agent::core::ExitReason;
 use midshift_agent::launcher::{self, SWITCHED};
-use out::{Format, Out};
+use out::{Format, Out, Output};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
@@ -57,8 +57,8 @@ const VERSION: &str = if Naive::ARE_BUILT_IN {
 #[command(name = "midshift", version = VERSION, arg_required_else_help = true)]
 struct Args {
     /// How results are printed.
-    #[arg(short, long, global = true, value_enum, default_value_t = Format::Table)]
-    output: Format,
+    #[arg(short, long, global = true, value_enum, default_value_t = Output::Table)]
+    output: Output,
     /// How log lines look (stderr); their level by MIDSHIFT_LOG.
     #[arg(long, global = true, value_enum, default_value_t = logs::Format::Text)]
     log: logs::Format,
@@ -183,7 +183,11 @@ pub fn main() -> ExitCode {
         _ => false,
     };
     logs::start(args.log, if serves { "info" } else { "warn" });
-    let out = Out::new(args.output);
+    let out = Out::of(args.output);
+    let makes_page = matches!(&args.command, Command::Rollout(verb) if verb.makes_page());
+    if out.is_page() && !makes_page {
+        return Exit::usage("only `midshift rollout report` makes a page\n  try: -o json").report(&out);
+    }
     let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(error) => return Exit::from(anyhow::anyhow!("starting the runtime: {error}")).report(&out),

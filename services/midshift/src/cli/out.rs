@@ -6,8 +6,23 @@ use std::borrow::Cow;
 use std::io::{ErrorKind, Write};
 use std::sync::OnceLock;
 
-/// How results are printed.
+/// How results may be asked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Output {
+    /// Columns for people.
+    Table,
+    /// One JSON document: proto3-JSON, the stable contract.
+    Json,
+    /// One JSON object a line.
+    Jsonl,
+    /// Only ids, one a line.
+    Name,
+    /// One HTML page. Only `rollout report` makes one.
+    Html,
+}
+
+/// How results are printed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
     /// Columns for people.
     Table,
@@ -23,6 +38,8 @@ pub enum Format {
 pub struct Out {
     /// Asked for.
     pub format: Format,
+    /// A page is asked for.
+    page: bool,
     /// Why data could not be written.
     unwritten: OnceLock<ErrorKind>,
 }
@@ -30,7 +47,21 @@ pub struct Out {
 impl Out {
     /// Prints as asked.
     pub fn new(format: Format) -> Self {
-        Self { format, unwritten: OnceLock::new() }
+        Self { format, page: false, unwritten: OnceLock::new() }
+    }
+    /// Prints as asked for.
+    pub fn of(output: Output) -> Self {
+        let format = match output {
+            Output::Table | Output::Html => Format::Table,
+            Output::Json => Format::Json,
+            Output::Jsonl => Format::Jsonl,
+            Output::Name => Format::Name,
+        };
+        Self { page: output == Output::Html, ..Self::new(format) }
+    }
+    /// A page is asked for.
+    pub fn is_page(&self) -> bool {
+        self.page
     }
     /// A line of data; for people without anything that their terminal would obey.
     pub fn line(&self, text: &str) {

@@ -60,6 +60,7 @@ pub fn spec(wire: &v1::RolloutSpec, bundle: BundleId, probation_ms: u64, bad: &m
         allow_full_push: wire.allow_full_push,
         rate_bytes_s: wire.rate_bytes_s,
         acts_on_rates: wire.acts_on_rates,
+        complete_percent: wire.complete_percent.unwrap_or(default.complete_percent),
         bundle: default.bundle,
     }
 }

@@ -70,6 +70,7 @@ fn spec(spec: &RolloutSpec) -> v1::RolloutSpec {
         allow_full_push: spec.allow_full_push,
         rate_bytes_s: spec.rate_bytes_s,
         acts_on_rates: spec.acts_on_rates,
+        complete_percent: Some(spec.complete_percent),
     }
 }
 
@@ -196,6 +197,9 @@ pub fn counted(view: &View, now: &Now, row: &Rollout, counts: Counts) -> v1::Rol
             Some(ActsOnRates::Areas(areas)) => areas.iter().map(ToString::to_string).collect(),
             _ => Vec::new(),
         },
+        outcome: row.outcome.map_or(0, WireEnum::to_wire),
+        trial: Some(tally(row.tasks.trial)).filter(|tally| *tally != v1::TaskTally::default()),
+        control: Some(tally(row.tasks.control)).filter(|tally| *tally != v1::TaskTally::default()),
     }
 }
 

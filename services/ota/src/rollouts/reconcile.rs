@@ -15,7 +15,7 @@ use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::commands::{CheckOnly, Taken};
 use midshift_core::rollout::named::named;
 use midshift_core::rollout::view::View;
-use midshift_core::rollout::{Board, LOGS, Plan, Sign, absorb, commands, cycle, obeyed, past};
+use midshift_core::rollout::{Board, LOGS, Plan, Sign, absorb, commands, cycle, obeyed, past, tell_damaged};
 use midshift_core::rows::{Entry, Item, Log, Seq, Table};
 use midshift_core::time::Now;
 use midshift_core::work::Live;
@@ -301,6 +301,9 @@ impl Loop {
         // Rows that another process committed from what it published are not undone.
         opened.repository.documents().look_if_possible().await;
         releases::take(&mut self.view, now, opened.repository.newest().as_deref(), &mut plan);
+        for digest in opened.hatch.take_damaged() {
+            tell_damaged(&mut self.view, now, &digest.to_string(), &mut plan);
+        }
         let replies = self.take_requests(requests, now, &mut plan);
         // The service looks for one each second.
         let key = opened.repository.directive_key().ok();

@@ -90,7 +90,10 @@ impl Told {
         }
         let begun = |rollout: &v1::Rollout| (rollout.soak_left.is_some(), rollout.exposure_left.is_some());
         let (soak_left, exposure_left) = (told.soak_left, told.exposure_left);
-        begun(told) == begun(rollout) && *told == v1::Rollout { soak_left, exposure_left, ..rollout.clone() }
+        // Tasks are told with the robots that ended them.
+        let (trial, control) = (told.trial, told.control);
+        let same = v1::Rollout { soak_left, exposure_left, trial, control, ..rollout.clone() };
+        begun(told) == begun(rollout) && *told == same
     }
 }
 

@@ -289,3 +289,19 @@ async fn the_map_that_a_robot_drives_by_is_the_one_that_it_said_last() -> Result
     }
     Ok(())
 }
+
+#[tokio::test(start_paused = true)]
+async fn the_room_that_a_robot_has_for_software_is_what_it_said_last() -> Result<()> {
+    let world = world().await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    let robot_id = RobotId::parse("r1")?;
+    for (free_bytes, known) in [(None, None), (Some(7), Some(7)), (None, Some(7)), (Some(0), Some(0)), (None, Some(0))]
+    {
+        robot.beat_saying(ReportedState { free_bytes, ..ReportedState::default() }, None).await?;
+        let hb = robot.hb;
+        robot.hears(|down| down.echo.as_ref().filter(|echo| echo.hb == hb).map(|_| ())).await?;
+        let live = world.board.get(&robot_id).ok_or("it is heard")?;
+        assert_eq!(live.report.free_bytes, known, "after {free_bytes:?}");
+    }
+    Ok(())
+}

@@ -77,6 +77,9 @@ pub struct Create {
     /// A suspicion from rates of task failures ends it too. Without it that is only shown.
     #[arg(long)]
     acts_on_rates: bool,
+    /// So many percent of the robots that were offered it must have it at the end, or its outcome is INCOMPLETE. Without it 90.
+    #[arg(long, value_name = "PERCENT")]
+    complete_percent: Option<u32>,
     /// Only tell what it would do now: whom it reaches, who is left out and why. Nothing is written.
     #[arg(long, conflicts_with_all = ["start", "supersede"])]
     dry_run: bool,
@@ -151,6 +154,7 @@ impl Create {
             allow_full_push: self.allow_full_push,
             rate_bytes_s: self.rate.unwrap_or_default(),
             acts_on_rates: self.acts_on_rates,
+            complete_percent: self.complete_percent,
         }
     }
 

@@ -6,7 +6,7 @@ use super::{One, Until, text};
 use crate::cli::client::{Exit, follow};
 use crate::cli::out::{Format, Out};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use midshift_proto::ota::v1::{self, RolloutPhase};
+use midshift_proto::ota::v1::{self, RolloutEnding, RolloutPhase};
 use prost_types::Timestamp;
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
@@ -18,6 +18,9 @@ use tonic::Streaming;
 const REVIEW: u8 = 11;
 /// Exit code: it did not stay.
 const WENT_BACK: u8 = 12;
+
+/// Exit code: it ended, and too few robots have it.
+const INCOMPLETE: u8 = 14;
 
 /// Whether the time that is left is shown as it passes.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -94,8 +97,13 @@ pub fn end(rollout: &v1::Rollout, until: Until) -> Option<Result<(), Exit>> {
     };
     let exit =
         |code, what: String| Some(Err(Exit::new(code, format!("{id} {what}\n  try: midshift rollout get {id}"))));
+    let is_incomplete = rollout.outcome() == RolloutEnding::Incomplete;
     let judge = format!("midshift rollout promote {id}, or midshift rollout abort {id}");
     match phase {
+        RolloutPhase::Completed if is_incomplete => {
+            let retry = format!("midshift rollout report {id}, then midshift rollout retry {id} --failed");
+            Some(Err(Exit::new(INCOMPLETE, format!("{id} is {}\n  try: {retry}", text::incomplete(rollout)))))
+        }
         RolloutPhase::Completed => Some(Ok(())),
         RolloutPhase::Superseded => exit(WENT_BACK, format!("was superseded by {}", rollout.superseded_by)),
         _ if phase == RolloutPhase::Aborted || (goes_back && until == Until::Completed) => {

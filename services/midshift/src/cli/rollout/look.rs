@@ -47,7 +47,11 @@ pub fn row(rollout: &v1::Rollout) -> Vec<String> {
 }
 
 /// All robots of one, or only one of them.
-async fn members(client: &mut Client, rollout_id: &str, robot_id: &str) -> Result<v1::ListRolloutRobotsResponse, Exit> {
+pub async fn members(
+    client: &mut Client,
+    rollout_id: &str,
+    robot_id: &str,
+) -> Result<v1::ListRolloutRobotsResponse, Exit> {
     let mut whole = v1::ListRolloutRobotsResponse::default();
     loop {
         let request = v1::ListRolloutRobotsRequest {
@@ -153,6 +157,22 @@ pub async fn explain(one: &One, robot_id: &str, out: &Out) -> Result<(), Exit> {
     Ok(())
 }
 
+/// What each robot waits for that waits for anything.
+pub async fn explain_all(one: &One, out: &Out) -> Result<(), Exit> {
+    let rollout = one.read().await?;
+    let mut whole = members(&mut one.call.rollouts().await?, &one.rollout_id, "").await?;
+    whole.robots.retain(|robot| robot.blocked_by.is_some());
+    match out.format {
+        Format::Table => {
+            text::header(&rollout).iter().for_each(|line| out.line(line));
+            whole.robots.iter().for_each(|robot| out.line(&explanation(&rollout, robot)));
+        }
+        _ => out.many(&whole, &whole.robots, |r| r.robot_id.clone(), &HEADER, member)?,
+    }
+    out.next(&text::next(&rollout));
+    Ok(())
+}
+
 /// What one robot waits for, for people.
 pub fn explanation(rollout: &v1::Rollout, robot: &v1::RolloutRobot) -> String {
     let waves = text::waves_of(rollout);
@@ -167,6 +187,7 @@ pub fn explanation(rollout: &v1::Rollout, robot: &v1::RolloutRobot) -> String {
                 None => "as long as it takes".to_owned(),
             };
             lines.push(format!("  waits for {}", text::reason(by)));
+            lines.extend(by.metadata.get("robot_ids").map(|robots| format!("  for its turn after {}", plain(robots))));
             lines.push(format!("  since {}, {until}", text::time(robot.blocked_since.as_ref())));
         }
         None => lines.push("  waits for nothing".to_owned()),

@@ -1,11 +1,13 @@
 //! `midshift rollout …`: signed software to robots at work, in waves.
 //!
-//! Exit codes of `watch` and `wait` beside the usual ones: 11 held for review, 12 aborted, rolled back or superseded.
+//! Exit codes of `watch` and `wait` beside the usual ones: 11 held for review, 12 aborted, rolled back or superseded,
+//! 14 ended, and too few robots have it.
 
 mod create;
 mod follow;
 mod look;
 mod parse;
+mod report;
 #[cfg(test)]
 mod tests;
 mod text;
@@ -91,15 +93,17 @@ pub enum Verb {
     },
     /// List its robots: how far each is and what it waits for.
     Robots(One),
-    /// What one robot waits for in it, since when and until when; or why it was left out.
+    /// What each robot waits for in it, since when, until when, and what a person can do; of one robot also why it was left out.
     Explain {
         #[command(flatten)]
         one: One,
-        /// Whom.
-        robot_id: String,
+        /// Only this robot.
+        robot_id: Option<String>,
     },
     /// What happened, in order: what people did, what gates said, where each robot came to last.
     History(One),
+    /// Its whole record as one document, with -o json or -o html: who, what, when, verdicts, each robot's outcome, tasks done meanwhile.
+    Report(One),
     /// Follow it to its end: a live picture on a terminal, else a line for each change.
     Watch(One),
     /// Wait until it has ended, or needs a person.
@@ -137,14 +141,19 @@ impl Verb {
     /// The one roll-out that it is about, and the one robot in it.
     fn named(&mut self) -> (Option<&mut One>, Option<&mut String>) {
         match self {
-            Self::Exclude { one, robot_id, .. } | Self::Explain { one, robot_id } => (Some(one), Some(robot_id)),
+            Self::Exclude { one, robot_id, .. } => (Some(one), Some(robot_id)),
+            Self::Explain { one, robot_id } => (Some(one), robot_id.as_mut()),
             Self::Submit(said) | Self::Approve(said) | Self::Pause(said) => (Some(&mut said.one), None),
             Self::Start { said, .. } | Self::Retry { said, .. } => (Some(&mut said.one), None),
             Self::Resume(seen) | Self::Promote(seen) | Self::Abort(seen) => (Some(&mut seen.said.one), None),
             Self::Rollback { one, .. } | Self::Get { one, .. } | Self::Wait { one, .. } => (Some(one), None),
-            Self::Robots(one) | Self::History(one) | Self::Watch(one) => (Some(one), None),
+            Self::Robots(one) | Self::History(one) | Self::Report(one) | Self::Watch(one) => (Some(one), None),
             Self::Create(_) | Self::Ls { .. } => (None, None),
         }
+    }
+    /// Whether its answer can be a page.
+    pub fn makes_page(&self) -> bool {
+        matches!(self, Self::Report(_))
     }
 }
 
@@ -253,8 +262,10 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Ls { call } => look::list(&call, out).await,
         Verb::Get { one, robots } => look::get(&one, robots, out).await,
         Verb::Robots(one) => look::robots(&one, out).await,
-        Verb::Explain { one, robot_id } => look::explain(&one, &robot_id, out).await,
+        Verb::Explain { one, robot_id: Some(robot_id) } => look::explain(&one, &robot_id, out).await,
+        Verb::Explain { one, robot_id: None } => look::explain_all(&one, out).await,
         Verb::History(one) => look::history(&one, out).await,
+        Verb::Report(one) => report::run(&one, out).await,
         Verb::Watch(one) => follow::watch(&one, out).await,
         Verb::Wait { one, until, timeout } => follow::wait(&one, until, timeout, out).await,
     }

@@ -1,11 +1,13 @@
 //! Words about fixed messages, and what a wait comes to.
 
 use super::follow::{Picture, end};
-use super::{Until, create, look, parse, text};
+use super::{Until, create, look, parse, report, text};
 use clap::Parser;
 use midshift_core::reason::{Code, Reason};
 use midshift_proto::convert::{duration, shown};
-use midshift_proto::ota::v1::{self, RolloutOutcome, RolloutPause, RolloutPhase, RolloutStep, Suspicion};
+use midshift_proto::ota::v1::{
+    self, RolloutEnding, RolloutOutcome, RolloutPause, RolloutPhase, RolloutStep, Suspicion,
+};
 use prost_types::Timestamp;
 
 fn at(seconds: i64) -> Option<Timestamp> {
@@ -265,6 +267,8 @@ fn a_watch_tells_each_change_once() {
     let news = picture.take(message(paused.clone(), Vec::new()));
     assert!(news[0].contains("SOAKING, paused (OPERATOR)"), "{news:?}");
     assert_eq!(text::next(&paused), "midshift rollout resume walk-1.5.0");
+    let held = v1::Rollout { pauses: vec![RolloutPause::Content as i32], ..rollout() };
+    assert!(text::next(&held).ends_with("midshift rollout resume walk-1.5.0"), "{}", text::next(&held));
     assert!(picture.lines().last().unwrap().starts_with("last verdict: wave 1/3  PROMOTED_UNPROVEN"));
 }
 
@@ -287,6 +291,8 @@ fn a_wait_ends_with_the_code_of_its_end() {
     let both = |rollout: &v1::Rollout| [code(rollout, Until::Completed), code(rollout, Until::Ended)];
     assert_eq!(both(&rollout()), [None, None]);
     assert_eq!(both(&of(RolloutPhase::Completed)), [Some(0), Some(0)]);
+    let short = v1::Rollout { outcome: RolloutEnding::Incomplete as i32, ..of(RolloutPhase::Completed) };
+    assert_eq!(both(&short), [Some(14), Some(14)]);
     assert_eq!(both(&of(RolloutPhase::Review)), [Some(11), None]);
     assert_eq!(both(&aborted(RolloutPhase::Aborting)), [Some(12), None]);
     assert_eq!(both(&aborted(RolloutPhase::RollingBack)), [Some(12), None]);
@@ -302,6 +308,57 @@ fn history_is_in_order_and_says_who_did_what() {
     assert_eq!(whats, ["created", "approved", "started", "robot", "verdict", "phase", "aborted"]);
     assert_eq!(events[1].text, "approved by anonymous (tried at home)");
     assert!(events[6].text.starts_with("aborted at once: ROLLOUT_ABORTED: "), "{}", events[6].text);
+}
+
+/// A roll-out that ended early, by somebody who types what a page would obey, and its robots.
+fn reported() -> (v1::Rollout, [v1::RolloutRobot; 2]) {
+    let (trial, control) = (tally(3, 1), tally(40, 2));
+    let approved = by("eve", "<script>alert(1)</script> & \"so\"", 5);
+    let rollout = v1::Rollout { trial, control, approved, ..aborted(RolloutPhase::Aborted) };
+    let failed = v1::RolloutRobot { failure: Some(shown(&Reason::from(Code::RobotLost))), ..on_trial() };
+    (rollout, [failed, robot("rbt-09", 1, RolloutStep::Skipped)])
+}
+
+fn tally(succeeded: u64, failed: u64) -> Option<v1::TaskTally> {
+    Some(v1::TaskTally { succeeded, failed })
+}
+
+#[test]
+fn a_report_is_one_document_with_people_verdicts_robots_tasks_and_what_happened() {
+    let (rollout, robots) = reported();
+    let document = report::document(&rollout, &robots).unwrap();
+    let said =
+        |pointer: &str| document.pointer(pointer).map(|v| v.as_str().map_or_else(|| v.to_string(), str::to_owned));
+    for (pointer, expected) in [
+        ("/rollout/approved/actor", "eve"),
+        ("/rollout/verdicts/0/clean", "1"),
+        ("/rollout/abort/reason/code", "ROLLOUT_ABORTED"),
+        ("/rollout/control/succeeded", "40"),
+        ("/robots/0/robotId", "rbt-02"),
+        ("/robots/0/failure/code", "ROBOT_LOST"),
+        ("/events/0/what", "created"),
+    ] {
+        assert_eq!(said(pointer).as_deref(), Some(expected), "{pointer}");
+    }
+}
+
+#[test]
+fn a_page_says_the_same_and_what_somebody_typed_is_text_in_it() {
+    let (rollout, robots) = reported();
+    let page = report::page(&rollout, &robots);
+    for part in [
+        "<h1>Roll-out walk-1.5.0</h1>",
+        "approved by eve",
+        "&lt;script&gt;alert(1)&lt;/script&gt; &amp; &quot;so&quot;",
+        "<td>PROMOTED_UNPROVEN</td><td>1</td><td>1</td><td>0</td>",
+        "<td>rbt-02</td><td>wave 2/3</td><td>TRIAL</td>",
+        "<td>rbt-09</td><td>wave 2/3</td><td>SKIPPED</td>",
+        "on trial 3 done, 1 failed; beside it 40 done, 2 failed",
+        "aborted at once: ROLLOUT_ABORTED",
+    ] {
+        assert!(page.contains(part), "{part} in {page}");
+    }
+    assert!(!page.contains("<script"), "{page}");
 }
 
 #[test]
@@ -345,7 +402,8 @@ fn flags_become_the_spec_and_what_no_flag_says_is_left_to_the_server() {
     assert_eq!(plain, v1::RolloutSpec { bundle: "walk-1.5.0".into(), ..Default::default() });
     let flags = "create trial --bundle walk-1.5.0 --waves 1,25%,rest --soak 10s --probation 1m --drain-within 2h --exposure-tasks 0 \
         --exposure-within 90s --max-in-flight 2 --area hall,dock --robot r1 --robot r2 --label site=north --model h1 --from-version 1.4.0 \
-        --small-wave review --small-wave-failure review --abort-scope trial --allow-full-push --rate 5MiB --acts-on-rates";
+        --small-wave review --small-wave-failure review --abort-scope trial --allow-full-push --rate 5MiB --acts-on-rates \
+        --complete-percent 75";
     let spec = Line::parse_from(flags.split_whitespace()).create.spec();
     let expected = v1::RolloutSpec {
         bundle: "walk-1.5.0".into(),
@@ -369,6 +427,7 @@ fn flags_become_the_spec_and_what_no_flag_says_is_left_to_the_server() {
         allow_full_push: true,
         rate_bytes_s: 5 << 20,
         acts_on_rates: true,
+        complete_percent: Some(75),
     };
     assert_eq!(spec, expected);
 }

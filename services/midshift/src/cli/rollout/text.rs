@@ -64,11 +64,27 @@ pub fn pauses(rollout: &v1::Rollout) -> String {
     words.collect::<Vec<_>>().join(" ")
 }
 
-/// Phase, and why it stands still if it does.
+/// Phase, and why it stands still if it does, or that it ended for too few.
 pub fn state(rollout: &v1::Rollout) -> String {
     let pauses = pauses(rollout);
     let phase = phase(rollout.phase());
-    if pauses.is_empty() { phase.to_owned() } else { format!("{phase}, paused ({pauses})") }
+    match rollout.outcome() {
+        v1::RolloutEnding::Incomplete => format!("{phase}, INCOMPLETE"),
+        _ if pauses.is_empty() => phase.to_owned(),
+        _ => format!("{phase}, paused ({pauses})"),
+    }
+}
+
+/// That it ended for too few, and what was asked.
+pub fn incomplete(rollout: &v1::Rollout) -> String {
+    let counts = rollout.counts.unwrap_or_default();
+    let asked = rollout.spec.as_ref().and_then(|s| s.complete_percent).unwrap_or_default();
+    let did = if rollout.revert_of.is_empty() {
+        format!("{} of {} have its bundle", counts.committed + counts.committing + counts.trial, robots(total(&counts)))
+    } else {
+        format!("{} of {} went back", counts.rolled_back, robots(total(&counts)))
+    };
+    format!("INCOMPLETE: {did}, {asked} % of those it was offered to were asked")
 }
 
 /// Waves that were asked for.
@@ -161,6 +177,9 @@ pub fn header(rollout: &v1::Rollout) -> Vec<String> {
     }
     lines.push(format!("  {}", facts.join(", ")));
     lines.extend(acts_on_rates(rollout).map(|line| format!("  {line}")));
+    if rollout.outcome() == v1::RolloutEnding::Incomplete {
+        lines.push(format!("  {}", incomplete(rollout)));
+    }
     let of = [("takes back", &rollout.revert_of), ("its place took", &rollout.superseded_by)];
     lines.extend(of.iter().filter(|(_, id)| !id.is_empty()).map(|(what, id)| format!("  {what} {id}")));
     lines.extend(rollout.abort.as_ref().map(|a| format!("  {}  {}", time(a.time.as_ref()), abort(a))));
@@ -388,6 +407,9 @@ pub fn next(rollout: &v1::Rollout) -> String {
         RolloutPhase::Aborted => "midshift quarantine ls; midshift incident ls".to_owned(),
         RolloutPhase::Superseded => format!("midshift rollout get {}", rollout.superseded_by),
         _ if rollout.pauses().any(|p| p == v1::RolloutPause::Operator) => format!("midshift rollout resume {id}"),
+        _ if rollout.pauses().any(|p| p == v1::RolloutPause::Content) => {
+            format!("midshift incident ls; once its files are whole, midshift rollout resume {id}")
+        }
         _ => format!("midshift rollout watch {id}"),
     }
 }

@@ -69,6 +69,8 @@ fn soaking(bundle: BundleId) -> Rollout {
         started: Some(Utc(0)),
         resumed: None,
         since: Utc(0),
+        outcome: None,
+        refusals_passed: 0,
     }
 }
 

@@ -1,0 +1,81 @@
+//! Says how a roll-out ended that nothing ended early: with its bundle on as many robots as its spec asks, or not.
+//!
+//! Invariants:
+//! 1. An incomplete roll-out serves nobody who comes later.
+//! 2. Robots that are tried again, or come back, can complete it; nothing makes it incomplete afterwards.
+
+use super::Tx;
+use super::rows::{Ending, Phase, Rollout, RolloutRobot, Step};
+use super::served::serve;
+use super::turns::is_newcomer;
+use super::view::View;
+use crate::ids::RolloutId;
+use crate::reason::{Code, Reason};
+
+/// Robots of a roll-out as its ending counts them.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Share {
+    /// Robots that the bundle was offered to. Whom a person kept from it is not among them.
+    pub offered: u32,
+    /// Of these, robots that keep it, or are about to. Where a roll-out takes one back: robots that went back.
+    pub reached: u32,
+}
+
+/// Counts robots.
+pub fn share(view: &View, rollout: &Rollout) -> Share {
+    let mut share = Share::default();
+    for r in view.robots_of(&rollout.rollout_id).filter(|r| is_offered(rollout, r)) {
+        share.offered += 1;
+        share.reached += u32::from(is_reached(rollout, r));
+    }
+    share
+}
+
+fn is_offered(rollout: &Rollout, r: &RolloutRobot) -> bool {
+    let by_person = [Code::SkippedExcluded, Code::SkippedPinned, Code::SkippedRetired];
+    let kept_out = r.step == Step::Skipped && r.why.as_ref().is_some_and(|why| by_person.contains(&why.code));
+    let came_later = is_newcomer(rollout, r) && !r.again;
+    !kept_out && !came_later
+}
+
+fn is_reached(rollout: &Rollout, r: &RolloutRobot) -> bool {
+    match r.step {
+        Step::RolledBack => rollout.revert_of.is_some(),
+        Step::Committed | Step::Committing => rollout.revert_of.is_none(),
+        // Its wave is kept: it is told so next.
+        Step::Trial => r.failure.is_none() && r.wave < rollout.promoted,
+        _ => false,
+    }
+}
+
+/// How a roll-out ends, or would as things are.
+pub fn of(view: &View, rollout: &Rollout) -> Ending {
+    let Share { offered, reached } = share(view, rollout);
+    let enough = u64::from(reached) * 100 >= u64::from(offered) * u64::from(rollout.spec.complete_percent);
+    if enough { Ending::Complete } else { Ending::Incomplete }
+}
+
+/// Decides how it ends: who comes later is served by it, or a person is told.
+pub fn decide(tx: &mut Tx, rollout: &Rollout) -> Ending {
+    let ending = of(tx.view, rollout);
+    match ending {
+        Ending::Complete => serve(tx, rollout),
+        Ending::Incomplete => {
+            let Share { offered, reached } = share(tx.view, rollout);
+            let told = Reason::from(Code::RolloutIncomplete).with("rollout_id", &rollout.rollout_id);
+            let told = told.with("offered", offered).with("reached", reached);
+            super::incident(tx, None, &told.with("complete_percent", rollout.spec.complete_percent));
+        }
+    }
+    ending
+}
+
+/// Completes one that ended incomplete, once enough robots have come after all.
+pub fn reconsider(tx: &mut Tx, id: &RolloutId) {
+    let Some(rollout) = tx.view.rollout(id).cloned() else { return };
+    let was_short = rollout.phase == Phase::Completed && rollout.outcome == Some(Ending::Incomplete);
+    if was_short && of(tx.view, &rollout) == Ending::Complete {
+        serve(tx, &rollout);
+        tx.put(Rollout { outcome: Some(Ending::Complete), ..rollout }, "rollout.complete_after_all");
+    }
+}

@@ -1,0 +1,34 @@
+//! Sorts what robots refuse: the content of a bundle, room for it, an order, or the bundle itself.
+//!
+//! Invariant: what robots refused runs nowhere, so refusals hold a roll-out and never end it.
+
+use super::rows::{Pause, Rollout, RolloutRobot, Step};
+use super::view::View;
+use crate::reason::{Code, Reason};
+
+/// So many robots hold a roll-out by refusing its content; in the first wave one does.
+const REFUSALS_HOLD: usize = 2;
+
+/// Why a robot that refused something is left out. What a person mends at the server or on the robot's disk keeps its own code; with
+/// everything else the bundle does not fit the robot.
+pub fn skip_reason(said: Option<&Reason>) -> Reason {
+    let said = said.cloned().unwrap_or_else(|| Code::BundleUnfit.into());
+    match said.code {
+        Code::BundleCorrupt | Code::MetadataRefused | Code::NoRoom | Code::BadSignature => said,
+        _ => Reason::new(Code::SkippedIncompatible, said.text()).with("because", said.name()),
+    }
+}
+
+/// Robots that refused the bytes or the documents of a roll-out.
+pub fn of_content<'a>(view: &'a View, rollout: &'a Rollout) -> impl Iterator<Item = &'a RolloutRobot> {
+    let is_content = |why: &Reason| matches!(why.code, Code::BundleCorrupt | Code::MetadataRefused);
+    view.robots_of(&rollout.rollout_id)
+        .filter(move |r| r.step == Step::Skipped && r.why.as_ref().is_some_and(is_content))
+}
+
+/// Why a roll-out has to stand still: robots refused its content, and one more than a person has seen.
+pub fn pause(view: &View, rollout: &Rollout) -> Option<Pause> {
+    let refused: Vec<&RolloutRobot> = of_content(view, rollout).collect();
+    let holds = refused.len() >= REFUSALS_HOLD || refused.iter().any(|r| r.wave == 0);
+    (holds && refused.len() > rollout.refusals_passed as usize).then_some(Pause::Content)
+}

@@ -1,0 +1,79 @@
+//! How roll-outs end that nothing ended early: with their bundle on as many robots as was asked, or not.
+
+use super::super::rows::Ending;
+use super::*;
+
+fn outcome(rig: &Rig, id: &str) -> Option<Ending> {
+    rig.rollout(id).outcome
+}
+
+/// A completed roll-out to five robots, of which one refuses the bundle.
+fn four_of_five(complete_percent: u32) -> (Rig, usize) {
+    let mut rig = Rig::new(5);
+    rig.start(RolloutSpec { complete_percent, ..spec() });
+    let n = rig.order()[4];
+    rig.robots[n].fate = Fate::Unfit;
+    rig.until(400, |r| r.phase() == Phase::Completed);
+    rig.ticks(4);
+    (rig, n)
+}
+
+#[test]
+fn a_roll_out_that_updated_nobody_is_incomplete_and_serves_nobody() {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    assert_eq!(outcome(&rig, "ro"), None);
+    rig.fates(Fate::Unfit);
+    rig.until(400, |r| r.phase() == Phase::Completed);
+    assert_eq!(outcome(&rig, "ro"), Some(Ending::Incomplete));
+    assert_eq!(rig.incidents(), [Code::RolloutIncomplete]);
+    rig.arrive();
+    rig.ticks(20);
+    assert_eq!(rig.robots[4].version, "0.9.0");
+}
+
+#[test]
+fn the_share_that_makes_it_complete_is_what_was_asked_for() {
+    assert_eq!(outcome(&four_of_five(80).0, "ro"), Some(Ending::Complete));
+    assert_eq!(outcome(&four_of_five(81).0, "ro"), Some(Ending::Incomplete));
+}
+
+#[test]
+fn whom_a_person_keeps_out_was_not_offered_it() {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    let n = rig.order()[3];
+    rig.must("ro", Verb::Exclude(robot_id(n)));
+    rig.until(400, |r| r.phase() == Phase::Completed);
+    assert_eq!((rig.step(n), outcome(&rig, "ro")), (Step::Skipped, Some(Ending::Complete)));
+}
+
+#[test]
+fn robots_that_are_tried_again_complete_it_and_then_newcomers_get_it() {
+    let (mut rig, n) = four_of_five(90);
+    assert_eq!(outcome(&rig, "ro"), Some(Ending::Incomplete));
+    rig.robots[n].fate = Fate::Good;
+    rig.must("ro", Verb::RetryFailed);
+    rig.until(100, |r| r.step(n) == Step::Committed);
+    assert_eq!(outcome(&rig, "ro"), Some(Ending::Complete));
+    rig.arrive();
+    rig.until(100, |r| r.robots[5].kept == "2.0.0");
+}
+
+#[test]
+fn one_that_takes_another_back_is_complete_once_enough_went_back() {
+    let mut rig = Rig::new(5);
+    rig.start(spec());
+    rig.until(400, |r| r.phase() == Phase::Completed);
+    rig.ticks(4);
+    rig.ask(&Command::Rollback { of: rollout_id("ro"), rollout_id: rollout_id("back") }).expect("allowed");
+    for verb in [Verb::Submit, Verb::Approve, Verb::Start { supersede: false }] {
+        rig.must("back", verb);
+    }
+    rig.robots[3].is_off = true;
+    rig.until(200, |r| r.rollout("back").phase == Phase::Completed);
+    assert_eq!(outcome(&rig, "back"), Some(Ending::Incomplete));
+    rig.robots[3].is_off = false;
+    rig.until(60, |r| r.of("back", 3).step == Step::RolledBack);
+    assert_eq!(outcome(&rig, "back"), Some(Ending::Complete));
+}

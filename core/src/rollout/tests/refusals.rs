@@ -1,0 +1,65 @@
+//! What robots refuse: each refusal keeps its meaning, and content that is not what was signed holds a roll-out.
+
+use super::super::rows::Pause;
+use super::*;
+
+fn is_held(rig: &Rig) -> bool {
+    rig.rollout("ro").pauses.contains(&Pause::Content)
+}
+
+fn why(rig: &Rig, n: usize) -> Code {
+    rig.of("ro", n).why.expect("a reason").code
+}
+
+/// A robot that has the bundle finds that its bytes changed on its disk.
+fn finds_other_bytes(rig: &mut Rig, n: usize) {
+    let report = rig.robots[n].report.clone().expect("an update");
+    let reason = Some(Code::BundleCorrupt.into());
+    rig.tell(n, UpdateReport { state: UpdateState::Refused, reason, ..report });
+}
+
+#[test]
+fn what_is_mended_elsewhere_keeps_its_code_and_all_else_does_not_fit() {
+    let mut rig = Rig::new(5);
+    rig.start(spec());
+    let (full, unfit) = (rig.order()[3], rig.order()[4]);
+    (rig.robots[full].fate, rig.robots[unfit].fate) = (Fate::Full, Fate::Unfit);
+    rig.until(400, |r| r.phase() == Phase::Completed);
+    assert_eq!((why(&rig, full), why(&rig, unfit)), (Code::NoRoom, Code::SkippedIncompatible));
+    assert!(!rig.incidents().contains(&Code::ContentRefused), "neither speaks of the content");
+}
+
+#[test]
+fn a_canary_that_gets_other_bytes_holds_the_roll_out_until_a_person_resumes_it_and_ends_nothing() {
+    let mut rig = Rig::new(6);
+    rig.start(spec());
+    let n = rig.order()[0];
+    rig.robots[n].fate = Fate::Corrupt;
+    rig.ticks(60);
+    let rollout = rig.rollout("ro");
+    assert!(is_held(&rig) && rollout.phase.runs() && rollout.abort.is_none(), "{rollout:?}");
+    assert_eq!((why(&rig, n), rig.ota.robots.values().any(|r| r.row.attempted)), (Code::BundleCorrupt, false));
+    assert_eq!(rig.incidents(), [Code::ContentRefused], "it is told once");
+    rig.must("ro", Verb::Resume);
+    rig.until(400, |r| r.phase() == Phase::Completed);
+    assert_eq!(rig.robots.iter().filter(|r| r.version == "2.0.0").count(), 5);
+}
+
+#[test]
+fn behind_the_first_wave_two_robots_hold_it_and_after_a_resume_only_one_more_does() {
+    let mut rig = Rig::new(6);
+    rig.start(RolloutSpec { soak_ms: 600_000, ..spec() });
+    let order = rig.order();
+    rig.robots[order[3]].fate = Fate::Corrupt;
+    rig.until(60, |r| r.phase() == Phase::Soaking);
+    assert_eq!((why(&rig, order[3]), is_held(&rig)), (Code::BundleCorrupt, false));
+    finds_other_bytes(&mut rig, order[4]);
+    rig.tick();
+    assert!(is_held(&rig));
+    rig.must("ro", Verb::Resume);
+    rig.ticks(3);
+    assert!(!is_held(&rig), "a person has seen these two");
+    finds_other_bytes(&mut rig, order[5]);
+    rig.tick();
+    assert!(is_held(&rig));
+}

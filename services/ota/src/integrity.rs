@@ -1,0 +1,116 @@
+//! Hashes signed files and shorter ways to them before their bytes are handed out: the first time since the start, and again after a day.
+//!
+//! Called by the hatch. Invariant: a file whose bytes are not what its name says is handed out by nobody; where this process keeps the folder
+//! it is taken away, so that it can be pushed again, or made again.
+
+use crate::blocking;
+use crate::content::{Content, Error};
+use crate::encodings::Encodings;
+use midshift_bundle::digest::Digest;
+use midshift_bundle::encoding::Base;
+use midshift_bundle::manifest::COMPONENT_BYTES_MAX;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+use tokio::time::Instant;
+
+/// A whole file is hashed again after this.
+const EVERY: Duration = Duration::from_secs(24 * 3_600);
+/// A damaged one that could not be taken away is hashed again after this: somebody may have mended it.
+const AGAIN: Duration = Duration::from_secs(60);
+/// Files of which it is remembered when they were hashed. With more of them all are hashed again.
+const FILES_MAX: usize = 4_096;
+
+/// When a file was hashed, and what came of it.
+#[derive(Clone, Copy)]
+struct Hashed {
+    at: Instant,
+    is_whole: bool,
+}
+
+impl Hashed {
+    fn now(is_whole: bool) -> Self {
+        Self { at: Instant::now(), is_whole }
+    }
+    fn counts(&self) -> bool {
+        self.at.elapsed() < if self.is_whole { EVERY } else { AGAIN }
+    }
+}
+
+async fn is_whole(digest: Digest, mut file: Box<dyn Base>) -> Result<bool, Error> {
+    let found = blocking(move || Digest::of_reader(&mut file, COMPONENT_BYTES_MAX)).await;
+    let path = digest.to_string().into();
+    Ok(found.map_err(|source| Error::Io { doing: "hashing", path, source })?.0 == digest)
+}
+
+/// One file. Who asks for it meanwhile waits until it is hashed.
+type Check = Arc<tokio::sync::Mutex<Option<Hashed>>>;
+
+/// What is known of the files of a folder.
+#[derive(Default)]
+pub struct Integrity {
+    checks: Mutex<BTreeMap<Digest, Check>>,
+    damaged: Mutex<BTreeSet<Digest>>,
+}
+
+impl Integrity {
+    fn check(&self, digest: Digest) -> Check {
+        let mut checks = self.checks.lock().unwrap_or_else(PoisonError::into_inner);
+        if checks.len() >= FILES_MAX && !checks.contains_key(&digest) {
+            checks.clear();
+        }
+        checks.entry(digest).or_default().clone()
+    }
+
+    fn damaged(&self) -> MutexGuard<'_, BTreeSet<Digest>> {
+        self.damaged.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Whether a file that is here holds the bytes that its name says.
+    ///
+    /// # Errors
+    /// The disk's.
+    pub async fn holds(&self, content: &dyn Content, digest: Digest) -> Result<bool, Error> {
+        let check = self.check(digest);
+        let mut last = check.lock().await;
+        if let Some(hashed) = last.filter(Hashed::counts) {
+            return Ok(hashed.is_whole);
+        }
+        let Some(file) = content.open(digest).await? else { return Ok(false) };
+        let is_whole = is_whole(digest, file).await?;
+        if is_whole {
+            *last = Some(Hashed::now(true));
+            return Ok(true);
+        }
+        tracing::error!(%digest, "a signed file is damaged on the disk: push its release again");
+        self.damaged().insert(digest);
+        // Where others keep the folder it stays, and they find it too.
+        *last = content.remove(digest).await.is_err().then(|| Hashed::now(false));
+        Ok(false)
+    }
+
+    /// Whether a shorter way that is here holds the bytes that its name says.
+    ///
+    /// # Errors
+    /// The disk's.
+    pub async fn holds_way(&self, encodings: &Encodings, digest: Digest) -> Result<bool, Error> {
+        let check = self.check(digest);
+        let mut last = check.lock().await;
+        if let Some(hashed) = last.filter(Hashed::counts) {
+            return Ok(hashed.is_whole);
+        }
+        let Some(file) = encodings.whole(digest).await? else { return Ok(false) };
+        let is_whole = is_whole(digest, file).await?;
+        let stays = is_whole || !encodings.discard(digest).await;
+        *last = stays.then(|| Hashed::now(is_whole));
+        Ok(is_whole)
+    }
+
+    /// Files that were found damaged since this was asked last.
+    pub fn take_damaged(&self) -> BTreeSet<Digest> {
+        std::mem::take(&mut *self.damaged())
+    }
+}
+
+#[cfg(test)]
+mod tests;
