@@ -16,7 +16,7 @@ use midshift_core::reason::{Refusal, Violations};
 use midshift_core::time::Utc;
 use std::collections::BTreeSet;
 use std::fs::{self, File};
-use std::io::{self, Write};
+use std::io;
 use std::path::{Path, PathBuf};
 
 /// A targets document that is not signed by enough people yet.
@@ -52,18 +52,6 @@ pub enum Error {
 fn io(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
     let path = path.to_owned();
     move |source| Error::Io { doing, path, source }
-}
-
-fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let folder = path.parent().unwrap_or(Path::new("."));
-    let mut name = path.file_name().unwrap_or_default().to_owned();
-    name.push(".new");
-    let beside = folder.join(name);
-    let mut file = File::create(&beside)?;
-    file.write_all(bytes)?;
-    file.sync_all()?;
-    fs::rename(&beside, path)?;
-    File::open(folder)?.sync_all()
 }
 
 /// What signing came to.
@@ -173,7 +161,7 @@ impl Folder {
     /// A document, whole or not at all.
     fn write(&self, name: &str, document: &[u8]) -> Result<(), Error> {
         let path = self.metadata().join(name);
-        write_whole(&path, document).map_err(io("writing", &path))
+        midshift_durable::replace(&path, document).map_err(io("writing", &path))
     }
     /// Newest document of a role that has numbers.
     fn newest(&self, role: &str) -> Result<Option<(u64, Vec<u8>)>, Error> {
@@ -268,7 +256,7 @@ impl Folder {
         let add = std::slice::from_ref(&file);
         let signed = sign_targets(previous.as_deref(), add, &[], now.plus_ms(PEOPLE_LIFE_MS), keys)?;
         let path = self.file(&file.name, file.digest);
-        write_whole(&path, envelope).map_err(io("writing", &path))?;
+        midshift_durable::replace(&path, envelope).map_err(io("writing", &path))?;
         Ok((set, self.put(&signed)?))
     }
 
@@ -310,9 +298,8 @@ impl Folder {
         let beside = to.with_extension("new");
         let copy = || {
             fs::copy(from, &beside)?;
-            File::open(&beside)?.sync_all()?;
-            fs::rename(&beside, to)?;
-            File::open(self.targets())?.sync_all()
+            midshift_durable::sync_file(&beside)?;
+            midshift_durable::rename(&beside, to)
         };
         copy().map_err(io("writing", to))
     }

@@ -12,8 +12,8 @@ use async_trait::async_trait;
 use midshift_core::time::Utc;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::fs::{self, File};
-use std::io::{self, Write};
+use std::fs;
+use std::io;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use tough::schema::{RoleType, Root, Signed, Timestamp};
@@ -198,20 +198,12 @@ impl Trusted {
             Err(e) => Err(store(e)),
         }
     }
-    /// Writes it whole or not at all: a new file beside, synced, put in place, and its folder synced.
+    /// Writes it whole or not at all.
     ///
     /// # Errors
     /// If it could not be written; what was there is there still, or this is.
     pub fn save(&self, path: &Path) -> Result<(), Error> {
-        let write = || {
-            let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-            let beside = path.with_extension("new");
-            let mut file = File::create(&beside)?;
-            file.write_all(&serde_json::to_vec(self)?)?;
-            file.sync_all()?;
-            fs::rename(&beside, path)?;
-            File::open(folder)?.sync_all()
-        };
+        let write = || midshift_durable::replace(path, &serde_json::to_vec(self)?);
         write().map_err(|source| Error::Store { doing: "writing", source })
     }
 

@@ -5,8 +5,8 @@
 //! Invariant: the good slot is never written to; a slot is named as holding a base only once all of it is durable. Written by the agent, and
 //! by the launcher while no agent runs.
 
-use crate::durable::replace;
 use crate::switch::{FACTORY, is_set_name};
+use midshift_durable::replace;
 use std::fs;
 use std::io;
 use std::path::Path;

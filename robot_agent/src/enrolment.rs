@@ -5,7 +5,7 @@
 
 use crate::device::DeviceKey;
 use crate::dial::{self, Dial, TcpDial};
-use crate::{durable, tls};
+use crate::tls;
 use midshift_core::identity::{Digest, Secret};
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
@@ -168,7 +168,8 @@ impl Enrolled {
     pub fn write(&self, folder: &Path) -> Result<(), Error> {
         let path = folder.join(FILE);
         let text = serde_json::to_vec_pretty(self).map_err(io::Error::from);
-        let written = durable::make_folder(folder).and(text).and_then(|text| durable::replace(&path, &text));
+        let written =
+            midshift_durable::make_folder(folder).and(text).and_then(|text| midshift_durable::replace(&path, &text));
         written.map_err(|source| Error::File { path, source })
     }
 

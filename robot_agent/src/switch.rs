@@ -4,7 +4,7 @@
 //! Invariant: `current` is the set committed last and `previous` the one before it; only [`Switch::commit`] changes either, so the way
 //! back from a trial always leads to a set that was good; [`Switch::forget_previous`] may give up `previous`, never `current`. Written by the agent, and by the launcher while no agent runs.
 
-use crate::durable::replace;
+use midshift_durable::replace;
 use std::fs;
 use std::io;
 use std::path::Path;

@@ -15,7 +15,6 @@
 use super::content::{Part, remove};
 use super::{CHUNK_BYTES, Error, Holdings, Sets, Wanted, base_name};
 use crate::boot::BASE;
-use crate::durable;
 use crate::launcher::{PROGRAM, SWITCH};
 use crate::starts::TRIES_MAX;
 use crate::switch::Switch;
@@ -65,7 +64,7 @@ impl DiskSets {
     /// # Errors
     /// The disk's.
     pub fn open(folder: &Path) -> Result<Self, Error> {
-        durable::make_folder(&folder.join(CONTENT)).map_err(io_error("making the folder of sets"))?;
+        midshift_durable::make_folder(&folder.join(CONTENT)).map_err(io_error("making the folder of sets"))?;
         Ok(Self { folder: folder.to_owned(), part: None, overtaken: None })
     }
 
@@ -167,8 +166,7 @@ impl DiskSets {
         }
         let name = || {
             out.get_ref().sync_all()?;
-            fs::rename(&beside, to)?;
-            durable::sync_folder_of(to)?;
+            midshift_durable::rename(&beside, to)?;
             remove(&to.with_extension("map"))?;
             remove(&to.with_extension("part"))?;
             remove(&to.with_extension("plain"))
@@ -206,23 +204,22 @@ impl DiskSets {
             let content = self.content(&program.digest);
             // A program that lost its mode with the power could not be started.
             fs::set_permissions(&content, Permissions::from_mode(0o755))?;
-            File::open(&content)?.sync_all()?;
+            midshift_durable::sync_file(&content)?;
             fs::hard_link(content, beside.join(PROGRAM))?;
         }
         if set.base().is_some() {
-            durable::write(&beside.join(BASE), base_name(set).as_bytes())?;
+            midshift_durable::write(&beside.join(BASE), base_name(set).as_bytes())?;
         }
-        durable::write(&beside.join(SET_FILE), &set.to_bytes())?;
-        durable::sync_folder(&beside)?;
-        fs::rename(&beside, folder)?;
-        durable::sync_folder_of(folder)
+        midshift_durable::write(&beside.join(SET_FILE), &set.to_bytes())?;
+        midshift_durable::sync_folder(&beside)?;
+        midshift_durable::rename(&beside, folder)
     }
 }
 
 /// Deletes the folder of a set. Its page goes first and for good: without it the folder is no set, whatever else of it is left.
 fn delete_set(folder: &Path) -> io::Result<()> {
     remove(&folder.join(SET_FILE))?;
-    durable::sync_folder(folder)?;
+    midshift_durable::sync_folder(folder)?;
     fs::remove_dir_all(folder)
 }
 
@@ -274,7 +271,7 @@ impl Sets for DiskSets {
 
     fn fetch_as_it_is(&mut self, wanted: &Wanted) -> Result<(), Error> {
         let note = self.content(&wanted.digest).with_extension("plain");
-        File::create(&note).and_then(|_| durable::sync_folder_of(&note)).map_err(io_error("noting a way"))
+        File::create(&note).and_then(|_| midshift_durable::sync_folder_of(&note)).map_err(io_error("noting a way"))
     }
 
     fn is_fetched_as_it_is(&mut self, wanted: &Wanted) -> Result<bool, Error> {
