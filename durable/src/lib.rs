@@ -1,9 +1,11 @@
-//! Files and folders that stay when the power goes.
+//! Files and folders that stay when the power goes; [`record`] is for small records that also outlive the loss of one file.
 //!
 //! Standard library only: the launcher uses it, and nothing that an update replaces is needed to start a robot. Invariant: when a verb
 //! returned, what it wrote and the name that it has are on the disk; bytes are synced by the handle that wrote them, so that an error of the
 //! disk is told to whoever wrote. Used by everybody who writes a file. Absent on purpose: files that are written a piece at a time (a download,
 //! an audit, a latch); they sync their own handle.
+
+pub mod record;
 
 use std::ffi::OsString;
 use std::fs::{self, File, OpenOptions};

@@ -3,6 +3,7 @@
 //! ```text
 //! switch            which set runs (crate::switch)
 //! boot              which base the machine starts from (crate::boot); base-a and base-b are its slots
+//! switch.copy, boot.copy  the second copies of both
 //! content/DIGEST    bytes that were checked; DIGEST.part and DIGEST.map while they come, DIGEST.made while they are made of a shorter
 //!                   way, DIGEST.plain if no such way is to be tried
 //! SET/NAME          hard link to a component's content; SET is the set's id
@@ -14,7 +15,7 @@
 
 use super::content::{Part, remove};
 use super::{CHUNK_BYTES, Error, Holdings, Sets, Wanted, base_name};
-use crate::boot::BASE;
+use crate::boot::{BASE, BOOT};
 use crate::launcher::{PROGRAM, SWITCH};
 use crate::starts::TRIES_MAX;
 use crate::switch::Switch;
@@ -22,6 +23,7 @@ use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding::{self, Base};
 use midshift_bundle::manifest::{COMPONENT_BYTES_MAX, MANIFEST_BYTES_MAX};
 use midshift_bundle::set::SetManifest;
+use midshift_durable::record;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, OpenOptions, Permissions};
 use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
@@ -321,6 +323,10 @@ impl Sets for DiskSets {
     fn collect(&mut self, keep: &BTreeSet<Digest>) -> Result<(), Error> {
         let switch = self.switch()?;
         self.settle(&switch)?;
+        // Both copies name the same sets before anything is deleted.
+        for name in [SWITCH, BOOT] {
+            record::mend(&self.folder.join(name)).map_err(io_error("mending a record"))?;
+        }
         let mut named: BTreeSet<Digest> = keep.clone();
         for (id, set) in self.sets()? {
             // The record on the disk names it still.
