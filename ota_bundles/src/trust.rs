@@ -10,7 +10,7 @@ use crate::digest::Digest;
 use crate::repository::{ISSUED_AT, role_keys};
 use async_trait::async_trait;
 use midshift_core::time::Utc;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use std::collections::BTreeMap;
 use std::fs;
 use std::io;
@@ -41,9 +41,8 @@ pub trait Source: std::fmt::Debug + Send + Sync {
     async fn fetch(&self, name: &str) -> io::Result<Option<Vec<u8>>>;
 }
 
-/// What a robot believes.
+/// What a robot believes. Fields and roles of a newer version, which a robot may have gone back from, are not looked at.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Trusted {
     /// The newest root, as it was signed.
     root: String,
@@ -51,6 +50,7 @@ pub struct Trusted {
     snapshot: Option<String>,
     targets: Option<String>,
     /// Lowest version of each role that may be believed.
+    #[serde(deserialize_with = "known_roles")]
     versions: BTreeMap<Kept, u64>,
     /// It is at least this late, UTC ms.
     time_floor: Utc,
@@ -67,6 +67,20 @@ enum Kept {
     Timestamp,
     Snapshot,
     Targets,
+}
+
+impl Kept {
+    const ALL: [(Self, &'static str); 4] = [
+        (Self::Root, "root"),
+        (Self::Timestamp, "timestamp"),
+        (Self::Snapshot, "snapshot"),
+        (Self::Targets, "targets"),
+    ];
+}
+
+fn known_roles<'de, D: Deserializer<'de>>(from: D) -> Result<BTreeMap<Kept, u64>, D::Error> {
+    let mut named = BTreeMap::<String, u64>::deserialize(from)?;
+    Ok(Kept::ALL.into_iter().filter_map(|(role, name)| Some((role, named.remove(name)?))).collect())
 }
 
 /// Why nothing new is believed.

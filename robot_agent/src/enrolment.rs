@@ -126,9 +126,8 @@ impl std::fmt::Debug for Invitation {
     }
 }
 
-/// What a machine has of its site.
+/// What a machine has of its site. A newer version's fields are not looked at: it may have renewed the certificate before it was gone back from.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Enrolled {
     /// Who it is there.
     pub robot_id: RobotId,

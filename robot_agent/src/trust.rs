@@ -53,9 +53,8 @@ pub enum Error {
     },
 }
 
-/// The file as it stands there.
+/// The file as it stands there. A newer version's fields are not looked at: the server may be one.
 #[derive(Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 struct Page {
     /// A TUF root document.
     root: serde_json::Value,

@@ -343,7 +343,8 @@ impl Sets for DiskSets {
                 let entry = entry?;
                 let name = entry.file_name().to_string_lossy().into_owned();
                 let half = name.strip_suffix(".new").is_some_and(|name| name.parse::<Digest>().is_ok());
-                if half || name.parse::<Digest>().is_ok_and(|id| !named.contains(&id)) {
+                // A set that the record names stays, also if its page cannot be read.
+                if half || name.parse::<Digest>().is_ok_and(|id| !named.contains(&id) && !switch.names(&name)) {
                     delete_set(&entry.path())?;
                 }
             }
