@@ -54,6 +54,20 @@ fn io(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
     move |source| Error::Io { doing, path, source }
 }
 
+/// Copies a file that is not there yet.
+fn copy(from: &Path, to: &Path) -> Result<(), Error> {
+    if to.exists() {
+        return Ok(());
+    }
+    let beside = to.with_extension("new");
+    let copy = || {
+        fs::copy(from, &beside)?;
+        midshift_durable::sync_file(&beside)?;
+        midshift_durable::rename(&beside, to)
+    };
+    copy().map_err(io("writing", to))
+}
+
 /// What signing came to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Signed {
@@ -205,7 +219,7 @@ impl Folder {
         let previous = self.newest("targets")?.map(|(_, document)| document);
         let signed = sign_targets(previous.as_deref(), &files, &[], now.plus_ms(PEOPLE_LIFE_MS), keys)?;
         for file in &files {
-            self.copy(&bundle.join(&file.name), &self.file(&file.name, file.digest))?;
+            copy(&bundle.join(&file.name), &self.file(&file.name, file.digest))?;
         }
         Ok((manifest, self.put(&signed)?))
     }
@@ -289,19 +303,6 @@ impl Folder {
             fs::remove_file(&pending).map_err(io("removing", &pending))?;
         }
         Ok(Signed::Published(version))
-    }
-
-    fn copy(&self, from: &Path, to: &Path) -> Result<(), Error> {
-        if to.exists() {
-            return Ok(());
-        }
-        let beside = to.with_extension("new");
-        let copy = || {
-            fs::copy(from, &beside)?;
-            midshift_durable::sync_file(&beside)?;
-            midshift_durable::rename(&beside, to)
-        };
-        copy().map_err(io("writing", to))
     }
 
     /// Holds everything against everything: each root against the one before, targets against the root, every file against its digest.

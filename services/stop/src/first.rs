@@ -18,10 +18,10 @@ const TEXT: &[u8] = b"The store of this site is new: the stop service may begin 
 /// Announces the first start of the stop service with this folder; durable when it returns. False: there is a latch or a key, so that it was no first start.
 ///
 /// # Errors
-/// The disk.
+/// The disk: what cannot be looked at may be a latch.
 pub fn announce_first_start(folder: &Path) -> io::Result<bool> {
     DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
-    if folder.join(LATCH).exists() || folder.join(proof::NAME).exists() {
+    if folder.join(LATCH).try_exists()? || folder.join(proof::NAME).try_exists()? {
         return Ok(false);
     }
     midshift_durable::replace_with(&folder.join(FIRST), TEXT, midshift_durable::PRIVATE)?;

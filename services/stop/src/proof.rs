@@ -64,7 +64,7 @@ impl Key {
     /// Writes it into the folder; one that is there, and is another, is moved aside.
     pub fn keep(&self, folder: &Path, now: Utc) -> io::Result<()> {
         let path = folder.join(NAME);
-        if path.exists() {
+        if path.try_exists()? {
             audit::set_aside(&path, now)?;
         }
         let text = self.0.to_pkcs8_pem(LineEnding::LF).map_err(io::Error::other)?;
