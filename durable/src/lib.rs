@@ -1,9 +1,11 @@
-//! Files and folders that stay when the power goes; [`record`] is for small records that also outlive the loss of one file.
+//! Files and folders that stay when the power goes; [`record`] is for small records that also outlive the loss of one
+//! file.
 //!
-//! Standard library only: the launcher uses it, and nothing that an update replaces is needed to start a robot. Invariant: when a verb
-//! returned, what it wrote and the name that it has are on the disk; bytes are synced by the handle that wrote them, so that an error of the
-//! disk is told to whoever wrote. Used by everybody who writes a file. Absent on purpose: files that are written a piece at a time (a download,
-//! an audit, a latch); they sync their own handle.
+//! Standard library only: the launcher uses it, and nothing that an update replaces is needed to start a robot.
+//! Invariant: when a verb returned, what it wrote and the name that it has are on the disk; bytes are synced by the
+//! handle that wrote them, so that an error of the disk is told to whoever wrote. Used by everybody who writes a file.
+//! Absent on purpose: files that are written a piece at a time (a download, an audit, a latch); they sync their own
+//! handle.
 
 pub mod record;
 
@@ -18,7 +20,8 @@ pub const OPEN: u32 = 0o666;
 /// Mode of a file with a secret: its owner reads and writes, nobody else.
 pub const PRIVATE: u32 = 0o600;
 
-/// Puts a small file in place of another, whole or not at all: a new file beside it, synced, renamed, and its folder synced.
+/// Puts a small file in place of another, whole or not at all: a new file beside it, synced, renamed, and its folder
+/// synced.
 ///
 /// # Errors
 /// If it could not be written: the old one or this is there.
@@ -34,7 +37,8 @@ pub fn replace_with(path: &Path, bytes: &[u8], mode: u32) -> io::Result<()> {
     rename(&put_beside(path, bytes, mode)?, path)
 }
 
-/// Makes a file of this mode that is not there yet, whole or not at all as far as the process goes on; a power cut may leave half of it.
+/// Makes a file of this mode that is not there yet, whole or not at all as far as the process goes on; a power cut may
+/// leave half of it.
 ///
 /// # Errors
 /// `AlreadyExists`, and what is there stays; or it could not be written, and nothing is there.
@@ -123,7 +127,8 @@ fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
-/// Writes what is to become `path`, durable, beside it. What was left there by a writer that did not come to its end goes.
+/// Writes what is to become `path`, durable, beside it. What was left there by a writer that did not come to its end
+/// goes.
 fn put_beside(path: &Path, bytes: &[u8], mode: u32) -> io::Result<PathBuf> {
     let beside = with_ending(path, ".new");
     let file = match create_new(&beside, mode) {

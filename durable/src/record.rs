@@ -1,8 +1,9 @@
 //! A small text that is kept twice, each time with its checksum.
 //!
-//! Invariant: the second copy counts only where the first is missing or torn, and it is never older than the first: it goes for good before the
-//! first is replaced, and is written when that is durable. A file that cannot be read is an error, never one that is not there. Called for
-//! what a robot cannot be started without: the switch record and the boot record.
+//! Invariant: the second copy counts only where the first is missing or torn, and it is never older than the first: it
+//! goes for good before the first is replaced, and is written when that is durable. A file that cannot be read is an
+//! error, never one that is not there. Called for what a robot cannot be started without: the switch record and the
+//! boot record.
 
 use crate::{OPEN, put_beside, remove, rename, replace, with_ending};
 use std::fs;
@@ -37,11 +38,18 @@ pub fn read(path: &Path) -> io::Result<Option<String>> {
     }
 }
 
-/// Writes a record: `text` is lines, each ended. A copy that cannot be written is no error, since the record holds: [`mend`] writes it.
+/// Writes a record: `text` is lines, each ended. A copy that cannot be written is no error, since the record holds:
+/// [`mend`] writes it.
 ///
 /// # Errors
-/// If it could not be written: the old one or this is there.
+/// If it could not be written: the old one or this is there. As [`read`]: what is damaged is not written over.
 pub fn write(path: &Path, text: &str) -> io::Result<()> {
+    // The copy may be the only whole one: it does not go before the first is whole.
+    if !matches!(look(path)?, Found::Whole(_))
+        && let Some(before) = read(path)?
+    {
+        replace(path, seal(&before).as_bytes())?;
+    }
     let (sealed, copy) = (seal(text), copy_of(path));
     let beside = put_beside(path, sealed.as_bytes(), OPEN)?;
     remove(&copy)?;
@@ -177,7 +185,7 @@ mod tests {
         }
         fs::remove_file(&copy).expect("removes");
         assert_eq!(read(&path).expect_err("is damaged").kind(), io::ErrorKind::InvalidData);
-        assert!(mend(&path).is_err());
+        assert!(mend(&path).is_err() && write(&path, NEW).is_err());
         fs::remove_file(&path).expect("removes");
         fs::write(&copy, "number").expect("writes");
         assert_eq!(read(&path).expect_err("is damaged").kind(), io::ErrorKind::InvalidData, "something was there");

@@ -412,6 +412,29 @@ fn what_a_launcher_relies_on_was_synced_before_it_starts_a_program() {
 }
 
 #[test]
+fn wherever_the_power_goes_while_a_torn_switch_record_is_written_anew_it_can_be_read() {
+    if let Some(folder) = std::env::var_os(UPDATE_IN) {
+        let path = Path::new(&folder).join(SWITCH);
+        return Switch::read(&path).expect("its copy is whole").write(&path).expect("writes");
+    }
+    let test = "wherever_the_power_goes_while_a_torn_switch_record_is_written_anew_it_can_be_read";
+    let torn = || {
+        let folder = tempfile::tempdir().expect("a folder");
+        robot(folder.path());
+        fs::write(folder.path().join(SWITCH), "midshift-switch 1\n").expect("tears");
+        folder
+    };
+    let folder = torn();
+    let Sites { calls, paths } = at(test, "", folder.path(), sites);
+    assert!(calls.len() > 10, "{calls:?}");
+    for site in &calls {
+        let folder = torn();
+        at(test, "", folder.path(), |victim| killed_at(victim, &paths, site));
+        assert_bootable(folder.path(), &format!("killed at {site:?}"));
+    }
+}
+
+#[test]
 fn twin_a_switch_record_that_is_written_where_it_lies_is_lost_with_the_power() {
     if let Some(folder) = std::env::var_os(UPDATE_IN) {
         let path = Path::new(&folder).join(SWITCH);
