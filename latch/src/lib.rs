@@ -12,7 +12,7 @@ use serde::de::DeserializeOwned;
 use slot::Slot;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io;
-use std::os::unix::fs::{FileExt, OpenOptionsExt};
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -76,10 +76,10 @@ impl LatchFile {
     /// Opens the file for its one writer, with its newest value. A file that is not there is made with `first`, in slots of `room` bytes; one that is there
     /// keeps the slots it has.
     pub fn open<T: Serialize + DeserializeOwned>(path: &Path, room: usize, first: T) -> Result<(Self, T), Error> {
-        if !path.exists() {
+        let doing = "opening";
+        if !path.try_exists().map_err(|e| io_error(doing, path, e))? {
             make(path, room, &first)?;
         }
-        let doing = "opening";
         let file = OpenOptions::new().read(true).write(true).open(path).map_err(|e| io_error(doing, path, e))?;
         match lock(&file) {
             Ok(()) => {}
@@ -141,16 +141,9 @@ pub fn read<T: DeserializeOwned>(path: &Path) -> Result<(u64, T), Error> {
 
 /// Makes the file whole or not at all: under another name first, which one that was left behind gives way to.
 fn make<T: Serialize>(path: &Path, room: usize, first: &T) -> Result<(), Error> {
-    let part = path.with_extension("part");
-    let failed = |source| io_error("making", path, source);
     let mut all = Slot { generation: 0, payload: json(first, path)? }.encode(room)?;
     all.resize(2 * room, 0);
-    let mut options = OpenOptions::new();
-    let file = options.write(true).create(true).truncate(true).mode(0o600).open(&part).map_err(failed)?;
-    file.write_all_at(&all, 0).and_then(|()| file.sync_all()).map_err(failed)?;
-    std::fs::rename(&part, path).map_err(failed)?;
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    File::open(folder).and_then(|folder| folder.sync_all()).map_err(failed)
+    midshift_durable::replace_with(path, &all, midshift_durable::PRIVATE).map_err(|e| io_error("making", path, e))
 }
 
 /// Size of a slot, and the newer whole one.
@@ -246,10 +239,10 @@ mod tests {
     #[test]
     fn what_was_left_behind_while_it_was_made_gives_way() {
         let folder = tempfile::tempdir().unwrap();
-        fs::write(folder.path().join("latch.part"), "half").unwrap();
+        fs::write(folder.path().join("latch.new"), "half").unwrap();
         let (path, _file) = made(folder.path());
         assert_eq!(newest(&path).unwrap(), "first");
-        assert!(!folder.path().join("latch.part").exists());
+        assert!(!folder.path().join("latch.new").exists());
     }
 
     #[test]

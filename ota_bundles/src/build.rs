@@ -76,11 +76,9 @@ pub fn build(folder: &Path, out: &Path, progress: &mut dyn FnMut(u64)) -> Result
     let manifest = manifest(&draft, |i| written[i]);
     manifest.check()?;
     let path = staging.path().join(manifest.target());
-    write_synced(&path, &manifest.to_bytes()).map_err(io("writing", &path))?;
-    sync_folder(staging.path()).map_err(io("writing", staging.path()))?;
-    let staged = staging.keep();
-    fs::rename(&staged, out).map_err(io("making", out))?;
-    sync_folder(parent).map_err(io("writing", parent))?;
+    midshift_durable::write(&path, &manifest.to_bytes()).map_err(io("writing", &path))?;
+    midshift_durable::sync_folder(staging.path()).map_err(io("writing", staging.path()))?;
+    midshift_durable::rename(&staging.keep(), out).map_err(io("making", out))?;
     Ok(manifest)
 }
 
@@ -147,16 +145,6 @@ fn copy(from: &Path, to: &Path, progress: &mut dyn FnMut(u64)) -> Result<(Digest
     let found = Digest::of_reader(&mut tee, COMPONENT_BYTES_MAX).map_err(io("reading", from))?;
     tee.to.sync_all().map_err(io("writing", to))?;
     Ok(found)
-}
-
-fn write_synced(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let mut file = File::create_new(path)?;
-    file.write_all(bytes)?;
-    file.sync_all()
-}
-
-fn sync_folder(path: &Path) -> io::Result<()> {
-    File::open(path)?.sync_all()
 }
 
 /// Reads the manifest in a built folder and holds every component against it.

@@ -16,7 +16,7 @@ use midshift_core::reason::{Refusal, Violations};
 use midshift_core::time::Utc;
 use std::collections::BTreeSet;
 use std::fs::{self, File};
-use std::io::{self, Write};
+use std::io;
 use std::path::{Path, PathBuf};
 
 /// A targets document that is not signed by enough people yet.
@@ -54,16 +54,18 @@ fn io(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
     move |source| Error::Io { doing, path, source }
 }
 
-fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let folder = path.parent().unwrap_or(Path::new("."));
-    let mut name = path.file_name().unwrap_or_default().to_owned();
-    name.push(".new");
-    let beside = folder.join(name);
-    let mut file = File::create(&beside)?;
-    file.write_all(bytes)?;
-    file.sync_all()?;
-    fs::rename(&beside, path)?;
-    File::open(folder)?.sync_all()
+/// Copies a file that is not there yet.
+fn copy(from: &Path, to: &Path) -> Result<(), Error> {
+    if to.exists() {
+        return Ok(());
+    }
+    let beside = to.with_extension("new");
+    let copy = || {
+        fs::copy(from, &beside)?;
+        midshift_durable::sync_file(&beside)?;
+        midshift_durable::rename(&beside, to)
+    };
+    copy().map_err(io("writing", to))
 }
 
 /// What signing came to.
@@ -173,7 +175,7 @@ impl Folder {
     /// A document, whole or not at all.
     fn write(&self, name: &str, document: &[u8]) -> Result<(), Error> {
         let path = self.metadata().join(name);
-        write_whole(&path, document).map_err(io("writing", &path))
+        midshift_durable::replace(&path, document).map_err(io("writing", &path))
     }
     /// Newest document of a role that has numbers.
     fn newest(&self, role: &str) -> Result<Option<(u64, Vec<u8>)>, Error> {
@@ -217,7 +219,7 @@ impl Folder {
         let previous = self.newest("targets")?.map(|(_, document)| document);
         let signed = sign_targets(previous.as_deref(), &files, &[], now.plus_ms(PEOPLE_LIFE_MS), keys)?;
         for file in &files {
-            self.copy(&bundle.join(&file.name), &self.file(&file.name, file.digest))?;
+            copy(&bundle.join(&file.name), &self.file(&file.name, file.digest))?;
         }
         Ok((manifest, self.put(&signed)?))
     }
@@ -268,7 +270,7 @@ impl Folder {
         let add = std::slice::from_ref(&file);
         let signed = sign_targets(previous.as_deref(), add, &[], now.plus_ms(PEOPLE_LIFE_MS), keys)?;
         let path = self.file(&file.name, file.digest);
-        write_whole(&path, envelope).map_err(io("writing", &path))?;
+        midshift_durable::replace(&path, envelope).map_err(io("writing", &path))?;
         Ok((set, self.put(&signed)?))
     }
 
@@ -301,20 +303,6 @@ impl Folder {
             fs::remove_file(&pending).map_err(io("removing", &pending))?;
         }
         Ok(Signed::Published(version))
-    }
-
-    fn copy(&self, from: &Path, to: &Path) -> Result<(), Error> {
-        if to.exists() {
-            return Ok(());
-        }
-        let beside = to.with_extension("new");
-        let copy = || {
-            fs::copy(from, &beside)?;
-            File::open(&beside)?.sync_all()?;
-            fs::rename(&beside, to)?;
-            File::open(self.targets())?.sync_all()
-        };
-        copy().map_err(io("writing", to))
     }
 
     /// Holds everything against everything: each root against the one before, targets against the root, every file against its digest.

@@ -165,9 +165,8 @@ pub struct Draft {
     pub components: Vec<DraftComponent>,
 }
 
-/// One component of a checked bundle.
+/// One component of a checked bundle. [`Manifest::from_bytes`] refuses fields that it does not know; on a ledger they are not looked at.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Component {
     /// Unique in its bundle.
     pub name: String,
@@ -267,8 +266,20 @@ impl Manifest {
         }
         let manifest: Self =
             serde_json::from_slice(bytes).map_err(|e| Refusal::field("manifest", format!("is not one: {e}")))?;
+        if let Some(field) = manifest.left_unread(bytes) {
+            return Err(Refusal::field("manifest", format!("is not one: unknown field `{field}`")));
+        }
         manifest.check()?;
         Ok(manifest)
+    }
+    /// A field of a component in `bytes` that is not in what was read of them: it may ask for something that nobody here would see to.
+    fn left_unread(&self, bytes: &[u8]) -> Option<String> {
+        let given: serde_json::Value = serde_json::from_slice(bytes).ok()?;
+        let fields = |component: &serde_json::Value| component.as_object().cloned().unwrap_or_default();
+        given.get("components")?.as_array()?.iter().zip(&self.components).find_map(|(given, read)| {
+            let known = fields(&serde_json::to_value(read).ok()?);
+            fields(given).into_iter().map(|(name, _)| name).find(|name| !known.contains_key(name))
+        })
     }
     /// Models that every component runs on.
     pub fn hardware(&self) -> BTreeSet<&str> {

@@ -14,9 +14,8 @@ use std::collections::BTreeMap;
 /// Schema of tasks that this build of midshift speaks.
 pub const TASK_SCHEMA: u32 = 1;
 
-/// One whole set.
+/// One whole set. A newer version's fields are not looked at where it stands on a ledger; on a disk its digest is its name.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct SetManifest {
     /// Manifest of the bundle taken last; none: what the robot came with.
     pub bundle: Option<Digest>,

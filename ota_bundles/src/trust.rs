@@ -10,10 +10,10 @@ use crate::digest::Digest;
 use crate::repository::{ISSUED_AT, role_keys};
 use async_trait::async_trait;
 use midshift_core::time::Utc;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use std::collections::BTreeMap;
-use std::fs::{self, File};
-use std::io::{self, Write};
+use std::fs;
+use std::io;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use tough::schema::{RoleType, Root, Signed, Timestamp};
@@ -41,9 +41,8 @@ pub trait Source: std::fmt::Debug + Send + Sync {
     async fn fetch(&self, name: &str) -> io::Result<Option<Vec<u8>>>;
 }
 
-/// What a robot believes.
+/// What a robot believes. Fields and roles of a newer version, which a robot may have gone back from, are not looked at.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Trusted {
     /// The newest root, as it was signed.
     root: String,
@@ -51,6 +50,7 @@ pub struct Trusted {
     snapshot: Option<String>,
     targets: Option<String>,
     /// Lowest version of each role that may be believed.
+    #[serde(deserialize_with = "known_roles")]
     versions: BTreeMap<Kept, u64>,
     /// It is at least this late, UTC ms.
     time_floor: Utc,
@@ -67,6 +67,20 @@ enum Kept {
     Timestamp,
     Snapshot,
     Targets,
+}
+
+impl Kept {
+    const ALL: [(Self, &'static str); 4] = [
+        (Self::Root, "root"),
+        (Self::Timestamp, "timestamp"),
+        (Self::Snapshot, "snapshot"),
+        (Self::Targets, "targets"),
+    ];
+}
+
+fn known_roles<'de, D: Deserializer<'de>>(from: D) -> Result<BTreeMap<Kept, u64>, D::Error> {
+    let mut named = BTreeMap::<String, u64>::deserialize(from)?;
+    Ok(Kept::ALL.into_iter().filter_map(|(role, name)| Some((role, named.remove(name)?))).collect())
 }
 
 /// Why nothing new is believed.
@@ -198,20 +212,12 @@ impl Trusted {
             Err(e) => Err(store(e)),
         }
     }
-    /// Writes it whole or not at all: a new file beside, synced, put in place, and its folder synced.
+    /// Writes it whole or not at all.
     ///
     /// # Errors
     /// If it could not be written; what was there is there still, or this is.
     pub fn save(&self, path: &Path) -> Result<(), Error> {
-        let write = || {
-            let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-            let beside = path.with_extension("new");
-            let mut file = File::create(&beside)?;
-            file.write_all(&serde_json::to_vec(self)?)?;
-            file.sync_all()?;
-            fs::rename(&beside, path)?;
-            File::open(folder)?.sync_all()
-        };
+        let write = || midshift_durable::replace(path, &serde_json::to_vec(self)?);
         write().map_err(|source| Error::Store { doing: "writing", source })
     }
 

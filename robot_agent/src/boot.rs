@@ -1,13 +1,13 @@
 //! The boot record of a robot's machine: two slots for its operating system, the base, and which of them it starts from.
 //!
 //! The boot loader is simulated: [`Boot::start`] is what it does whenever the machine starts, and the launcher is what starts the machine.
-//! Standard library only, as the launcher. One small file, replaced whole.
+//! Standard library only, as the launcher. One small file, replaced whole, with its checksum, and a second copy of it beside
+//! ([`midshift_durable::record`]). A newer version adds lines, which an older one does not look at.
 //! Invariant: the good slot is never written to; a slot is named as holding a base only once all of it is durable. Written by the agent, and
 //! by the launcher while no agent runs.
 
-use crate::durable::replace;
-use crate::switch::{FACTORY, is_set_name};
-use std::fs;
+use crate::switch::{FACTORY, is_set_name, lines};
+use midshift_durable::record;
 use std::io;
 use std::path::Path;
 
@@ -152,17 +152,13 @@ impl Boot {
         }
     }
 
-    /// Reads a record. No file: a machine as it came.
+    /// Reads a record, or its copy where it is missing or torn. Neither is there: a machine as it came.
     ///
     /// # Errors
     /// A file that cannot be read, or is none of ours: it is not taken for a new machine's.
     pub fn read(path: &Path) -> io::Result<Self> {
-        match fs::read_to_string(path) {
-            Ok(text) => Self::parse(&text)
-                .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, "the boot record is damaged")),
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(Self::default()),
-            Err(error) => Err(error),
-        }
+        let Some(text) = record::read(path)? else { return Ok(Self::default()) };
+        Self::parse(&text).ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, "it is no boot record of ours"))
     }
 
     /// Writes it with the next number, whole or not at all, if it is another than `before`.
@@ -174,7 +170,7 @@ impl Boot {
             return Ok(());
         }
         self.number += 1;
-        replace(path, self.text().as_bytes())
+        record::write(path, &self.text())
     }
 
     fn text(&self) -> String {
@@ -182,7 +178,7 @@ impl Boot {
             |slot| self.image(slot).map_or("-".to_owned(), |image: &Image| format!("{} {}", image.name, image.length));
         let trying = self.trying.map_or("-".to_owned(), |t| format!("{} {}", t.slot.letter(), t.tries));
         format!(
-            "{FORMAT}\nnumber {}\na {}\nb {}\ngood {}\ntrying {trying}\nbooted {}\nend\n",
+            "{FORMAT}\nnumber {}\na {}\nb {}\ngood {}\ntrying {trying}\nbooted {}\n",
             self.number,
             image(Slot::A),
             image(Slot::B),
@@ -192,21 +188,18 @@ impl Boot {
     }
 
     fn parse(text: &str) -> Option<Self> {
-        let mut lines = text.lines();
-        let mut field = |name: &str| lines.next()?.strip_prefix(name);
-        field(FORMAT).filter(|rest| rest.is_empty())?;
-        let number = field("number ")?.parse().ok()?;
-        let images = [image(field("a ")?)?, image(field("b ")?)?];
-        let good = Slot::parse(field("good ")?)?;
-        let trying = match field("trying ")? {
+        let lines = lines(text, FORMAT)?;
+        let number = lines.get("number")?.parse().ok()?;
+        let images = [image(lines.get("a")?)?, image(lines.get("b")?)?];
+        let good = Slot::parse(lines.get("good")?)?;
+        let trying = match *lines.get("trying")? {
             "-" => None,
             text => {
                 let (slot, tries) = text.split_once(' ')?;
                 Some(Trying { slot: Slot::parse(slot)?, tries: tries.parse().ok()? })
             }
         };
-        let booted = Slot::parse(field("booted ")?)?;
-        field("end").filter(|rest| rest.is_empty())?;
+        let booted = Slot::parse(lines.get("booted")?)?;
         Some(Self { number, images, good, trying, booted })
     }
 }
@@ -223,6 +216,7 @@ fn image(text: &str) -> Option<Option<Image>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs;
 
     fn base(name: &str) -> Option<Image> {
         Some(Image { name: name.to_owned(), length: 7 })
@@ -315,13 +309,26 @@ mod tests {
         boot.write_over(&before, &path).expect("writes");
         assert_eq!(Boot::read(&path).expect("reads"), boot);
         let text = boot.text();
-        for length in 0..text.len() - 1 {
-            fs::write(&path, &text[..length]).expect("writes");
-            assert!(Boot::read(&path).is_err(), "{length} bytes of it are a record");
-        }
+        let newer = format!("{text}mood curious\n");
+        assert_eq!(Boot::parse(&newer).as_ref(), Some(&boot), "a newer version has added a line");
         for wrong in [text.replace("v1", "../v1"), text.replace("boot 1", "boot 2"), text.replace("good a", "good c")] {
-            fs::write(&path, &wrong).expect("writes");
+            record::write(&path, &wrong).expect("writes");
             assert!(Boot::read(&path).is_err(), "{wrong}");
+        }
+        record::write(&path, &text).expect("writes");
+        for length in 0..text.len() {
+            fs::write(&path, &text[..length]).expect("writes");
+            assert_eq!(Boot::read(&path).expect("its copy is whole"), boot, "{length} bytes of it");
+        }
+        fs::remove_file(&path).expect("removes");
+        assert_eq!(Boot::read(&path).expect("its copy is whole"), boot);
+        fs::create_dir(&path).expect("makes");
+        assert!(Boot::read(&path).is_err(), "it is there, whatever it says");
+        fs::remove_dir(&path).expect("removes");
+        for length in 0..text.len() {
+            fs::write(&path, &text[..length]).expect("writes");
+            fs::write(record::copy_of(&path), &text[..length]).expect("writes");
+            assert!(Boot::read(&path).is_err(), "{length} bytes of it are a record");
         }
     }
 }

@@ -5,7 +5,7 @@
 
 use crate::device::DeviceKey;
 use crate::dial::{self, Dial, TcpDial};
-use crate::{durable, tls};
+use crate::tls;
 use midshift_core::identity::{Digest, Secret};
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
@@ -126,9 +126,8 @@ impl std::fmt::Debug for Invitation {
     }
 }
 
-/// What a machine has of its site.
+/// What a machine has of its site. A newer version's fields are not looked at: it may have renewed the certificate before it was gone back from.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Enrolled {
     /// Who it is there.
     pub robot_id: RobotId,
@@ -168,7 +167,8 @@ impl Enrolled {
     pub fn write(&self, folder: &Path) -> Result<(), Error> {
         let path = folder.join(FILE);
         let text = serde_json::to_vec_pretty(self).map_err(io::Error::from);
-        let written = durable::make_folder(folder).and(text).and_then(|text| durable::replace(&path, &text));
+        let written =
+            midshift_durable::make_folder(folder).and(text).and_then(|text| midshift_durable::replace(&path, &text));
         written.map_err(|source| Error::File { path, source })
     }
 

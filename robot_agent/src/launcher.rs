@@ -19,7 +19,6 @@ mod beacon;
 mod choose;
 mod orders;
 
-use crate::durable;
 use crate::starts::{self, Tries};
 use beacon::{BEACON_EVERY, Beacon};
 use choose::{Start, Unwritten, choose, is_trusted, machine_starts, number};
@@ -248,7 +247,7 @@ fn keep_tries(record: &Path, tries: &Tries) {
 
 /// On the disk when this returns.
 fn write_tries(record: &Path, tries: &Tries) -> io::Result<()> {
-    durable::replace(record, tries.text().as_bytes())
+    midshift_durable::replace(record, tries.text().as_bytes())
 }
 
 fn pass_on(line: &[u8]) -> io::Result<()> {

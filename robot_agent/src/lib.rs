@@ -10,7 +10,6 @@ pub mod core;
 pub mod device;
 pub mod dial;
 mod drive;
-pub mod durable;
 pub mod enrolment;
 pub mod governor;
 mod installed;

@@ -1,12 +1,16 @@
 //! The store of a robot: ledger and ring in one SQLite file (WAL, `synchronous = FULL`), each batch one transaction.
 //!
 //! Invariant: a batch is durable when its commit returned, or nothing of it is; two processes never open one file; a file
-//! that is not in the right mode, or is of a newer version, is not opened. Called by the shell alone.
+//! that is not in the right mode is not opened. What a newer version has added (a fact, a table, a column, a field) is left where it is and not
+//! looked at, since a robot that goes back to its kept set opens what the other one wrote (record 0095): so each statement names its columns,
+//! and no row is put in place of another. Called by the shell alone.
 
 use crate::ledger::SubjectRow;
+use crate::ring::LaneKept;
 use crate::store::{Error, Kept, Op, Store};
 use async_trait::async_trait;
 use midshift_core::ids::Subject;
+use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{Lane, ReportedAttempt};
 use midshift_core::work::{Gap, Sample};
 use serde::Serialize;
@@ -22,7 +26,7 @@ use std::time::Duration;
 
 /// How long a start waits for the file of a process that is just ending.
 const BUSY: Duration = Duration::from_secs(5);
-/// Version of the tables below.
+/// Version of the tables below. It rises only with what an older version must not open: never before COMMIT, nor while a way back leads there.
 const VERSION: i64 = 1;
 
 /// Mode of the file: its owner reads and writes, nobody else.
@@ -88,7 +92,8 @@ impl SqliteStore {
                 "software" => ledger.software = read(&key, &value)?,
                 "trusted" => ledger.trusted = Some(Arc::new(read(&key, &value)?)),
                 "device" => ledger.device = Some(read(&key, &value)?),
-                _ => return Err(unreadable(&key, "not a known fact")),
+                // A newer version's.
+                _ => {}
             }
         }
         Ok(())
@@ -98,7 +103,8 @@ impl SqliteStore {
         let all = "SELECT subject, epoch, at_unix_ms, report FROM subject";
         for row in sqlx::query(all).fetch_all(&mut self.connection).await? {
             let name: String = row.try_get(0)?;
-            let subject = Subject::parse(&name).map_err(|e| unreadable("subject", e))?;
+            // Of a kind that nobody here can be asked for.
+            let Ok(subject) = Subject::parse(&name) else { continue };
             let report: Option<String> = row.try_get(3)?;
             let report = report.map(|text| read("report", &text)).transpose()?.map(Arc::new);
             let epoch = row.try_get::<i64, _>(1)? as u64;
@@ -113,18 +119,27 @@ impl SqliteStore {
 
     async fn lanes(&mut self, kept: &mut Kept) -> Result<(), Error> {
         for row in sqlx::query("SELECT lane, produced, acked FROM lane").fetch_all(&mut self.connection).await? {
-            let lane = kept.ring.lane_mut(lane_of(row.try_get(0)?)?);
+            let Some(lane) = lane_of(row.try_get(0)?) else { continue };
+            let lane = kept.ring.lane_mut(lane);
             (lane.produced, lane.acked) = (row.try_get::<i64, _>(1)? as u64, row.try_get::<i64, _>(2)? as u64);
         }
-        let samples = "SELECT lane, value FROM sample ORDER BY lane, seq";
+        let samples = "SELECT lane, value, seq FROM sample ORDER BY lane, seq";
         for row in sqlx::query(samples).fetch_all(&mut self.connection).await? {
-            let sample: Sample = read("sample", row.try_get::<String, _>(1)?.as_str())?;
-            kept.ring.lane_mut(lane_of(row.try_get(0)?)?).samples.push_back(Arc::new(sample));
+            let Some(lane) = lane_of(row.try_get(0)?) else { continue };
+            let kept = kept.ring.lane_mut(lane);
+            match serde_json::from_str::<Sample>(row.try_get::<String, _>(1)?.as_str()) {
+                Ok(sample) => kept.samples.push_back(Arc::new(sample)),
+                Err(error) => set_aside(kept, lane, row.try_get::<i64, _>(2)? as u64, &error),
+            }
         }
         let gaps = "SELECT lane, value FROM gap ORDER BY lane, from_seq";
         for row in sqlx::query(gaps).fetch_all(&mut self.connection).await? {
+            let Some(lane) = lane_of(row.try_get(0)?) else { continue };
             let gap: Gap = read("gap", row.try_get::<String, _>(1)?.as_str())?;
-            kept.ring.lane_mut(lane_of(row.try_get(0)?)?).gaps.push_back(gap);
+            kept.ring.lane_mut(lane).gaps.push_back(gap);
+        }
+        for lane in Lane::ALL {
+            kept.ring.lane_mut(lane).gaps.make_contiguous().sort_by_key(|gap| gap.from_seq);
         }
         Ok(())
     }
@@ -133,7 +148,8 @@ impl SqliteStore {
 #[async_trait]
 impl Store for SqliteStore {
     async fn load(&mut self, new_ring_id: &str) -> Result<Kept, Error> {
-        let ring = sqlx::query("INSERT INTO fact VALUES ('ring', $1) ON CONFLICT DO NOTHING").bind(new_ring_id);
+        let ring = sqlx::query("INSERT INTO fact (key, value) VALUES ('ring', $1) ON CONFLICT DO NOTHING");
+        let ring = ring.bind(new_ring_id);
         ring.execute(&mut self.connection).await?;
         let mut kept = Kept::new(new_ring_id);
         self.facts(&mut kept).await?;
@@ -187,8 +203,9 @@ async fn write(on: &mut SqliteConnection, op: &Op) -> Result<(), Error> {
                 .bind(*at_unix_ms)
                 .bind(text(report.as_ref())?);
             run(on, query).await?;
-            let listing = sqlx::query("INSERT OR REPLACE INTO unclosed VALUES ($1, $2)");
-            run(on, listing.bind(attempt.to_string()).bind(text(listed)?)).await
+            let listing = "INSERT INTO unclosed (attempt, value) VALUES ($1, $2)
+                ON CONFLICT (attempt) DO UPDATE SET value = excluded.value";
+            run(on, sqlx::query(listing).bind(attempt.to_string()).bind(text(listed)?)).await
         }
         Op::Closed(attempt) => {
             run(on, sqlx::query("DELETE FROM unclosed WHERE attempt = $1").bind(attempt.to_string())).await
@@ -204,14 +221,15 @@ async fn write_lane(on: &mut SqliteConnection, op: &Op) -> Result<(), Error> {
     match op {
         Op::Append(lane, sample) => {
             let seq = sample.seq as i64;
-            let insert = sqlx::query("INSERT INTO sample VALUES ($1, $2, $3)").bind(*lane as i64).bind(seq);
+            let insert =
+                sqlx::query("INSERT INTO sample (lane, seq, value) VALUES ($1, $2, $3)").bind(*lane as i64).bind(seq);
             run(on, insert.bind(text(sample.as_ref())?)).await?;
-            let produced = "INSERT INTO lane VALUES ($1, $2, 0)
+            let produced = "INSERT INTO lane (lane, produced, acked) VALUES ($1, $2, 0)
                 ON CONFLICT (lane) DO UPDATE SET produced = excluded.produced";
             run(on, sqlx::query(produced).bind(*lane as i64).bind(seq)).await
         }
         Op::Free(lane, seq) => {
-            let acked = "INSERT INTO lane VALUES ($1, $2, $2)
+            let acked = "INSERT INTO lane (lane, produced, acked) VALUES ($1, $2, $2)
                 ON CONFLICT (lane) DO UPDATE SET acked = max(acked, excluded.acked)";
             run(on, sqlx::query(acked).bind(*lane as i64).bind(*seq as i64)).await?;
             for sql in
@@ -229,14 +247,15 @@ async fn write_lane(on: &mut SqliteConnection, op: &Op) -> Result<(), Error> {
             ] {
                 run(on, sqlx::query(sql).bind(lane).bind(from).bind(to)).await?;
             }
-            let insert = sqlx::query("INSERT INTO gap VALUES ($1, $2, $3, $4)").bind(lane).bind(from).bind(to);
-            run(on, insert.bind(text(gap)?)).await
+            let insert = sqlx::query("INSERT INTO gap (lane, from_seq, to_seq, value) VALUES ($1, $2, $3, $4)");
+            run(on, insert.bind(lane).bind(from).bind(to).bind(text(gap)?)).await
         }
         Op::Jump(lane, watermark) => {
             for sql in ["DELETE FROM sample WHERE lane = $1", "DELETE FROM gap WHERE lane = $1"] {
                 run(on, sqlx::query(sql).bind(*lane as i64)).await?;
             }
-            let set = "INSERT OR REPLACE INTO lane VALUES ($1, $2, $2)";
+            let set = "INSERT INTO lane (lane, produced, acked) VALUES ($1, $2, $2)
+                ON CONFLICT (lane) DO UPDATE SET produced = excluded.produced, acked = excluded.acked";
             run(on, sqlx::query(set).bind(*lane as i64).bind(*watermark as i64)).await
         }
         _ => Ok(()),
@@ -244,8 +263,8 @@ async fn write_lane(on: &mut SqliteConnection, op: &Op) -> Result<(), Error> {
 }
 
 async fn fact<T: Serialize + Sync>(on: &mut SqliteConnection, key: &'static str, value: &T) -> Result<(), Error> {
-    let value = text(value)?;
-    run(on, sqlx::query("INSERT OR REPLACE INTO fact VALUES ($1, $2)").bind(key).bind(value)).await
+    let upsert = "INSERT INTO fact (key, value) VALUES ($1, $2) ON CONFLICT (key) DO UPDATE SET value = excluded.value";
+    run(on, sqlx::query(upsert).bind(key).bind(text(value)?)).await
 }
 
 fn lock(path: &Path) -> Result<File, Error> {
@@ -262,9 +281,20 @@ fn keep_private(path: &Path) -> io::Result<()> {
     file.set_permissions(Permissions::from_mode(PRIVATE))
 }
 
-fn lane_of(number: i64) -> Result<Lane, Error> {
-    let lane = Lane::ALL.into_iter().find(|lane| *lane as i64 == number);
-    lane.ok_or_else(|| unreadable("lane", format!("{number} is not a lane")))
+/// None: a lane of a newer version.
+fn lane_of(number: i64) -> Option<Lane> {
+    Lane::ALL.into_iter().find(|lane| *lane as i64 == number)
+}
+
+/// A sample of a newer version is said to the server as missing, never in silence; its row stays until that is acknowledged.
+fn set_aside(kept: &mut LaneKept, lane: Lane, seq: u64, error: &serde_json::Error) {
+    if let Some(gap) = kept.gaps.back_mut().filter(|gap| gap.to_seq + 1 == seq) {
+        gap.to_seq = seq;
+        return;
+    }
+    tracing::warn!(lane = lane.as_str(), seq, %error, "samples of a newer version are told as missing");
+    let reason = Reason::from(Code::RowUnknown).with("row", format!("sample/{seq}"));
+    kept.gaps.push_back(Gap { lane, from_seq: seq, to_seq: seq, reason });
 }
 
 fn text<T: Serialize>(value: &T) -> Result<String, Error> {

@@ -31,10 +31,10 @@ impl Tries {
     pub fn of(&self, set: &str) -> u32 {
         if self.set == set { self.count } else { 0 }
     }
-    /// From its text. One that is none counts nothing.
+    /// From its text. One that is none counts nothing; lines of a newer version are not looked at.
     pub fn parse(text: &str) -> Self {
         let read = || {
-            let (count, set) = text.trim().strip_prefix("tries ")?.split_once(" of ")?;
+            let (count, set) = text.lines().next()?.trim().strip_prefix("tries ")?.split_once(" of ")?;
             Some(Self::new(set, count.parse().ok()?))
         };
         read().unwrap_or_default()
@@ -93,6 +93,7 @@ mod tests {
     fn a_record_is_read_back_and_a_damaged_one_counts_nothing() {
         let tries = Tries::new("v1", 3);
         assert_eq!(Tries::parse(&tries.text()), tries);
+        assert_eq!(Tries::parse(&format!("{}mood curious\n", tries.text())), tries);
         assert_eq!((tries.of("v1"), tries.of("v2")), (3, 0));
         assert_eq!((tries.plus_one("v1").of("v1"), tries.plus_one("v2").of("v2")), (4, 1));
         for text in ["", "tries", "tries x of v1", "tries 3"] {

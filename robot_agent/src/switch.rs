@@ -1,11 +1,12 @@
 //! The switch record: which set of software a robot runs, which it goes back to, and which one is on trial.
 //!
-//! Standard library only: the launcher reads it before anything that an update replaces has run. One small file, replaced whole.
+//! Standard library only: the launcher reads it before anything that an update replaces has run. One small file, replaced whole, with its
+//! checksum, and a second copy of it beside ([`midshift_durable::record`]). A newer version adds lines, which an older one does not look at.
 //! Invariant: `current` is the set committed last and `previous` the one before it; only [`Switch::commit`] changes either, so the way
 //! back from a trial always leads to a set that was good; [`Switch::forget_previous`] may give up `previous`, never `current`. Written by the agent, and by the launcher while no agent runs.
 
-use crate::durable::replace;
-use std::fs;
+use midshift_durable::record;
+use std::collections::BTreeMap;
 use std::io;
 use std::path::Path;
 
@@ -106,17 +107,13 @@ impl Switch {
         self.fallen = self.trial.take().map(|trial| Fallen { set: trial.set, tries });
     }
 
-    /// Reads a record. No file: what a robot came with.
+    /// Reads a record, or its copy where it is missing or torn. Neither is there: what a robot came with.
     ///
     /// # Errors
     /// A file that cannot be read, or is none of ours: it is not taken for a new robot's.
     pub fn read(path: &Path) -> io::Result<Self> {
-        match fs::read_to_string(path) {
-            Ok(text) => Self::parse(&text)
-                .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, "the switch record is damaged")),
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(Self::default()),
-            Err(error) => Err(error),
-        }
+        let Some(text) = record::read(path)? else { return Ok(Self::default()) };
+        Self::parse(&text).ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, "it is no switch record of ours"))
     }
 
     /// Writes it with the next number, whole or not at all.
@@ -125,7 +122,7 @@ impl Switch {
     /// If it could not be written: the old one or this is there.
     pub fn write(&mut self, path: &Path) -> io::Result<()> {
         self.number += 1;
-        replace(path, self.text().as_bytes())
+        record::write(path, &self.text())
     }
 
     fn text(&self) -> String {
@@ -136,7 +133,7 @@ impl Switch {
             .map_or("-".to_owned(), |t| format!("{} {}", t.set, if t.is_proven { "proven" } else { "on probation" }));
         let fallen = self.fallen.as_ref().map_or("-".to_owned(), |f| format!("{} {}", f.set, f.tries));
         format!(
-            "{FORMAT}\nnumber {}\ncurrent {}\nprevious {}\ntrial {trial}\nfallen {fallen}\nend\n",
+            "{FORMAT}\nnumber {}\ncurrent {}\nprevious {}\ntrial {trial}\nfallen {fallen}\n",
             self.number,
             self.current,
             or_dash(self.previous.as_deref())
@@ -144,28 +141,27 @@ impl Switch {
     }
 
     fn parse(text: &str) -> Option<Self> {
-        let mut lines = text.lines();
-        let mut field = |name: &str| lines.next()?.strip_prefix(name);
-        field(FORMAT).filter(|rest| rest.is_empty())?;
-        let number = field("number ")?.parse().ok()?;
-        let current = set_name(field("current ")?)?;
-        let previous = optional(field("previous ")?, set_name)?;
-        let trial = optional(field("trial ")?, |text| {
+        let lines = lines(text, FORMAT)?;
+        let number = lines.get("number")?.parse().ok()?;
+        let current = set_name(lines.get("current")?)?;
+        let previous = optional(lines.get("previous")?, set_name)?;
+        let trial = optional(lines.get("trial")?, |text| {
             let (set, stage) = text.split_once(' ')?;
-            let is_proven = match stage {
-                "proven" => true,
-                "on probation" => false,
-                _ => return None,
-            };
-            Some(Trial { set: set_name(set)?, is_proven })
+            // A stage that nobody here knows has proven nothing.
+            Some(Trial { set: set_name(set)?, is_proven: stage == "proven" })
         })?;
-        let fallen = optional(field("fallen ")?, |text| {
+        let fallen = optional(lines.get("fallen")?, |text| {
             let (set, tries) = text.split_once(' ')?;
             Some(Fallen { set: set_name(set)?, tries: tries.parse().ok()? })
         })?;
-        field("end").filter(|rest| rest.is_empty())?;
         Some(Self { number, current, previous, trial, fallen })
     }
+}
+
+/// The lines of a record of this format, by their first word.
+pub(crate) fn lines<'a>(text: &'a str, format: &str) -> Option<BTreeMap<&'a str, &'a str>> {
+    let lines = text.strip_prefix(format)?.strip_prefix('\n')?;
+    Some(lines.lines().filter_map(|line| line.split_once(' ')).collect())
 }
 
 fn optional<T>(text: &str, read: impl Fn(&str) -> Option<T>) -> Option<Option<T>> {
@@ -184,6 +180,7 @@ pub fn is_set_name(text: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs;
 
     /// What may happen to a robot's software.
     #[derive(Clone, Copy, Debug)]
@@ -265,15 +262,39 @@ mod tests {
         switch.write(&path).expect("writes");
         assert_eq!(Switch::read(&path).expect("reads"), switch);
         let text = switch.text();
-        for length in 0..text.len() - 1 {
-            fs::write(&path, &text[..length]).expect("writes");
-            assert!(Switch::read(&path).is_err(), "{length} bytes of it are a record");
-        }
         for wrong in
-            [text.replace("v1", "../v1"), text.replace("switch 1", "switch 2"), text.replace("on probation", "x")]
+            [text.replace("v1", "../v1"), text.replace("switch 1", "switch 2"), text.replace("v1 on probation", "v1")]
         {
-            fs::write(&path, &wrong).expect("writes");
+            record::write(&path, &wrong).expect("writes");
             assert!(Switch::read(&path).is_err(), "{wrong}");
         }
+        for length in 0..text.len() {
+            fs::write(&path, &text[..length]).expect("writes");
+            fs::write(record::copy_of(&path), &text[..length]).expect("writes");
+            assert!(Switch::read(&path).is_err(), "{length} bytes of it are a record");
+        }
+    }
+
+    #[test]
+    fn a_record_that_is_torn_or_gone_is_read_from_its_copy_and_one_that_cannot_be_read_is_not() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("switch");
+        let mut switch = Switch::default();
+        switch.try_out("v1");
+        switch.write(&path).expect("writes");
+        fs::write(&path, &switch.text()[..20]).expect("writes");
+        assert_eq!(Switch::read(&path).expect("reads"), switch);
+        fs::remove_file(&path).expect("removes");
+        assert_eq!(Switch::read(&path).expect("reads"), switch);
+        fs::create_dir(&path).expect("makes");
+        assert!(Switch::read(&path).is_err(), "it is there, whatever it says");
+    }
+
+    #[test]
+    fn lines_and_words_of_a_newer_version_start_no_other_set_and_prove_nothing() {
+        let mut switch = Switch::default();
+        switch.try_out("v1");
+        let newer = switch.text().replace("trial v1 on probation", "trial v1 half proven\nmood v2 curious");
+        assert_eq!(Switch::parse(&newer), Some(switch));
     }
 }

@@ -3,7 +3,6 @@
 //! Invariant: a file that breaks a rule is refused whole with all its broken rules; nothing of it is believed. Written once, by `dev` and
 //! by whoever enrols robots, and read by the binary at each start.
 
-use crate::durable;
 use crate::update::UpdateConfig;
 use midshift_bundle::keys::{KeyId, PublicKey};
 use midshift_bundle::repository::check_root;
@@ -54,9 +53,8 @@ pub enum Error {
     },
 }
 
-/// The file as it stands there.
+/// The file as it stands there. A newer version's fields are not looked at: the server may be one.
 #[derive(Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 struct Page {
     /// A TUF root document.
     root: serde_json::Value,
@@ -88,7 +86,11 @@ impl Trust {
         let refused = |refusal| Error::Refused { path: path.to_owned(), refusal: Box::new(refusal) };
         let bytes = self.to_bytes().map_err(refused)?;
         Self::from_bytes(&bytes).map_err(refused)?;
-        durable::replace(path, &bytes).map_err(|source| Error::Io { doing: "writing", path: path.to_owned(), source })
+        midshift_durable::replace(path, &bytes).map_err(|source| Error::Io {
+            doing: "writing",
+            path: path.to_owned(),
+            source,
+        })
     }
 
     /// From the bytes of a file.

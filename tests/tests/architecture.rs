@@ -35,6 +35,27 @@ const SPAWNS: &[(&str, &str)] = &[
     ("services/midshift/src/cli/mod.rs", "the binary listens for Ctrl-C"),
 ];
 
+/// Files are made durable, and given their names, by the crate `durable`. Elsewhere only here, each for a reason.
+const SYNCED_BY_HAND: &[(&str, &str)] = &[
+    ("latch/src/lib.rs", "a slot is written where it lies"),
+    ("ota_bundles/src/build.rs", "a component goes through its hash as it is copied"),
+    ("robot_agent/src/sets/content.rs", "a download comes a piece at a time"),
+    ("robot_agent/src/sets/disk.rs", "content is made a piece at a time and read back by the same handle"),
+    ("robot_agent/src/sets/slots.rs", "a slot stands for a partition, which has no other beside it"),
+    ("robot_sim/src/body/kept.rs", "a simulated body notes where it stands at each turn of its way"),
+    ("services/midshift/src/backup/place.rs", "a name that may not stay is taken back"),
+    ("services/midshift/src/cli/audit.rs", "an export comes a record at a time"),
+    ("services/midshift/src/samples.rs", "a second name for a file that is there"),
+    ("services/ota/src/content.rs", "an upload comes a piece at a time"),
+    ("services/ota/src/encodings.rs", "an encoding is made a piece at a time"),
+    ("services/ota/src/fixture.rs", "a test puts a file aside and back"),
+    ("services/stop/src/audit.rs", "a line at a time"),
+    (
+        "services/store/src/sqlite/copy.rs",
+        "SQLite writes the copy; only its bytes are made durable, and its folder by whoever asked",
+    ),
+];
+
 /// Words that say nothing, and the names that may have them.
 const EMPTY_WORDS: [&str; 6] = ["Manager", "Helper", "Util", "Common", "Data", "Info"];
 const NAMES_KEPT: &[(&str, &str)] = &[
@@ -408,6 +429,26 @@ fn tasks_are_spawned_where_a_service_runs_and_nowhere_else() {
         ] {
             assert!(!text.contains(word), "{path} has {word}: core decides, it does not act");
         }
+    }
+}
+
+#[test]
+fn files_are_made_durable_by_one_crate() {
+    let words = ["fs::rename(", ".sync_all()", ".sync_data()"];
+    let by_hand = |path: &str| {
+        let text = code(&read(path));
+        words.iter().find(|word| text.contains(**word)).copied()
+    };
+    let rooms =
+        ["core/src", "proto/src", "services", "robot_agent/src", "robot_sim/src", "ota_bundles/src", "latch/src"];
+    let all = rooms.into_iter().flat_map(|room| files(room, "rs"));
+    for path in all.filter(|path| path.contains("src/") && !path.contains("/tests")) {
+        let found = by_hand(&path);
+        let may = SYNCED_BY_HAND.iter().any(|(known, _)| *known == path);
+        assert!(found.is_none() || may, "{path} has {found:?}: use `durable`, or say in this test why not");
+    }
+    for (known, _) in SYNCED_BY_HAND {
+        assert!(by_hand(known).is_some(), "{known} makes nothing durable any more: strike it here");
     }
 }
 

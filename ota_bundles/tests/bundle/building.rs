@@ -120,7 +120,11 @@ fn a_manifest_with_a_field_that_nobody_knows_is_refused() {
     let out = draft(folder.path(), DRAFT);
     let built = build(folder.path(), &out, &mut |_| {}).expect("built");
     let text = String::from_utf8(built.to_bytes()).expect("text");
-    for (from, to) in [("\"format\": 1", "\"format\": 1, \"surprise\": true"), ("\"format\": 1", "\"format\": 2")] {
+    for (from, to) in [
+        ("\"format\": 1", "\"format\": 1, \"surprise\": true"),
+        ("\"kind\": \"weights\"", "\"kind\": \"weights\", \"surprise\": true"),
+        ("\"format\": 1", "\"format\": 2"),
+    ] {
         let changed = text.replace(from, to);
         assert_ne!(changed, text);
         assert!(Manifest::from_bytes(changed.as_bytes()).is_err(), "{to}");

@@ -210,7 +210,7 @@ fn what_is_believed_is_on_the_disk_whole_or_refused() {
     robot.save(&path).expect("written");
     assert_eq!(Trusted::load(&path).expect("read"), Some(robot.clone()));
     // Power went while the next one was written beside it.
-    std::fs::write(path.with_extension("new"), b"{\"root\":").expect("torn");
+    std::fs::write(path.with_extension("json.new"), b"{\"root\":").expect("torn");
     assert_eq!(Trusted::load(&path).expect("read"), Some(robot));
     let whole = std::fs::read(&path).expect("bytes");
     for length in [0, 1, whole.len() / 2, whole.len() - 1] {

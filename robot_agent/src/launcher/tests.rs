@@ -66,6 +66,7 @@ fn on_trial_by(set: &str, beside: &Path) {
     let mut switch = Switch::default();
     switch.try_out(set);
     switch.write(&elsewhere).expect("writes");
+    fs::remove_file(midshift_durable::record::copy_of(&elsewhere)).expect("removes");
     fs::rename(elsewhere, beside.with_extension("")).expect("moves");
 }
 

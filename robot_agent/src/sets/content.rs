@@ -3,7 +3,6 @@
 //! Invariant: a chunk is marked only after its bytes were synced, so a mark that survived a power cut tells the truth.
 
 use super::{CHUNK_BYTES, CHUNKS_UNSYNCED_MAX, Error, Wanted};
-use crate::durable;
 use midshift_bundle::digest::Digest;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Seek, SeekFrom, Write};
@@ -133,7 +132,7 @@ impl Part {
             return Ok(());
         }
         self.file.sync_data().map_err(io_error("syncing a download"))?;
-        durable::replace(&self.map, &self.marks.bits).map_err(io_error("marking a download"))?;
+        midshift_durable::replace(&self.map, &self.marks.bits).map_err(io_error("marking a download"))?;
         self.unsynced = 0;
         Ok(())
     }
@@ -149,8 +148,7 @@ impl Part {
             if self.unsynced > 0 {
                 self.file.sync_data()?;
             }
-            fs::rename(&self.path, to)?;
-            durable::sync_folder_of(to)?;
+            midshift_durable::rename(&self.path, to)?;
             remove(&self.map)
         };
         name().map_err(io_error("naming content"))
@@ -173,7 +171,7 @@ impl Part {
         let discard = || {
             remove(&self.map)?;
             remove(&self.path)?;
-            durable::sync_folder_of(&self.path)
+            midshift_durable::sync_folder_of(&self.path)
         };
         discard().map_err(io_error("throwing a download away"))
     }

@@ -3,6 +3,7 @@
 //! ```text
 //! switch            which set runs (crate::switch)
 //! boot              which base the machine starts from (crate::boot); base-a and base-b are its slots
+//! switch.copy, boot.copy  the second copies of both
 //! content/DIGEST    bytes that were checked; DIGEST.part and DIGEST.map while they come, DIGEST.made while they are made of a shorter
 //!                   way, DIGEST.plain if no such way is to be tried
 //! SET/NAME          hard link to a component's content; SET is the set's id
@@ -14,8 +15,7 @@
 
 use super::content::{Part, remove};
 use super::{CHUNK_BYTES, Error, Holdings, Sets, Wanted, base_name};
-use crate::boot::BASE;
-use crate::durable;
+use crate::boot::{BASE, BOOT};
 use crate::launcher::{PROGRAM, SWITCH};
 use crate::starts::TRIES_MAX;
 use crate::switch::Switch;
@@ -23,6 +23,7 @@ use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding::{self, Base};
 use midshift_bundle::manifest::{COMPONENT_BYTES_MAX, MANIFEST_BYTES_MAX};
 use midshift_bundle::set::SetManifest;
+use midshift_durable::record;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, OpenOptions, Permissions};
 use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
@@ -65,7 +66,7 @@ impl DiskSets {
     /// # Errors
     /// The disk's.
     pub fn open(folder: &Path) -> Result<Self, Error> {
-        durable::make_folder(&folder.join(CONTENT)).map_err(io_error("making the folder of sets"))?;
+        midshift_durable::make_folder(&folder.join(CONTENT)).map_err(io_error("making the folder of sets"))?;
         Ok(Self { folder: folder.to_owned(), part: None, overtaken: None })
     }
 
@@ -167,8 +168,7 @@ impl DiskSets {
         }
         let name = || {
             out.get_ref().sync_all()?;
-            fs::rename(&beside, to)?;
-            durable::sync_folder_of(to)?;
+            midshift_durable::rename(&beside, to)?;
             remove(&to.with_extension("map"))?;
             remove(&to.with_extension("part"))?;
             remove(&to.with_extension("plain"))
@@ -206,23 +206,22 @@ impl DiskSets {
             let content = self.content(&program.digest);
             // A program that lost its mode with the power could not be started.
             fs::set_permissions(&content, Permissions::from_mode(0o755))?;
-            File::open(&content)?.sync_all()?;
+            midshift_durable::sync_file(&content)?;
             fs::hard_link(content, beside.join(PROGRAM))?;
         }
         if set.base().is_some() {
-            durable::write(&beside.join(BASE), base_name(set).as_bytes())?;
+            midshift_durable::write(&beside.join(BASE), base_name(set).as_bytes())?;
         }
-        durable::write(&beside.join(SET_FILE), &set.to_bytes())?;
-        durable::sync_folder(&beside)?;
-        fs::rename(&beside, folder)?;
-        durable::sync_folder_of(folder)
+        midshift_durable::write(&beside.join(SET_FILE), &set.to_bytes())?;
+        midshift_durable::sync_folder(&beside)?;
+        midshift_durable::rename(&beside, folder)
     }
 }
 
 /// Deletes the folder of a set. Its page goes first and for good: without it the folder is no set, whatever else of it is left.
 fn delete_set(folder: &Path) -> io::Result<()> {
     remove(&folder.join(SET_FILE))?;
-    durable::sync_folder(folder)?;
+    midshift_durable::sync_folder(folder)?;
     fs::remove_dir_all(folder)
 }
 
@@ -274,7 +273,7 @@ impl Sets for DiskSets {
 
     fn fetch_as_it_is(&mut self, wanted: &Wanted) -> Result<(), Error> {
         let note = self.content(&wanted.digest).with_extension("plain");
-        File::create(&note).and_then(|_| durable::sync_folder_of(&note)).map_err(io_error("noting a way"))
+        File::create(&note).and_then(|_| midshift_durable::sync_folder_of(&note)).map_err(io_error("noting a way"))
     }
 
     fn is_fetched_as_it_is(&mut self, wanted: &Wanted) -> Result<bool, Error> {
@@ -324,6 +323,10 @@ impl Sets for DiskSets {
     fn collect(&mut self, keep: &BTreeSet<Digest>) -> Result<(), Error> {
         let switch = self.switch()?;
         self.settle(&switch)?;
+        // Both copies name the same sets before anything is deleted.
+        for name in [SWITCH, BOOT] {
+            record::mend(&self.folder.join(name)).map_err(io_error("mending a record"))?;
+        }
         let mut named: BTreeSet<Digest> = keep.clone();
         for (id, set) in self.sets()? {
             // The record on the disk names it still.
@@ -340,7 +343,8 @@ impl Sets for DiskSets {
                 let entry = entry?;
                 let name = entry.file_name().to_string_lossy().into_owned();
                 let half = name.strip_suffix(".new").is_some_and(|name| name.parse::<Digest>().is_ok());
-                if half || name.parse::<Digest>().is_ok_and(|id| !named.contains(&id)) {
+                // A set that the record names stays, also if its page cannot be read.
+                if half || name.parse::<Digest>().is_ok_and(|id| !named.contains(&id) && !switch.names(&name)) {
                     delete_set(&entry.path())?;
                 }
             }

@@ -176,7 +176,7 @@ pub trait Sets: Send {
     /// # Errors
     /// The disk's: the old one or this is there.
     fn write_switch(&mut self, switch: &mut Switch) -> Result<(), Error>;
-    /// Deletes sets and content that neither the switch record nor `keep` names.
+    /// Deletes sets and content that neither the switch record nor `keep` names, once both copies of the records agree.
     ///
     /// # Errors
     /// The disk's.

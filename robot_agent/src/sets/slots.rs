@@ -5,7 +5,6 @@
 use super::disk::{DiskSets, io_error, optional};
 use super::{Error, base_name};
 use crate::boot::{BOOT, Boot, Image, Slot};
-use crate::durable;
 use crate::launcher::SWITCH;
 use crate::switch::{FACTORY, Switch};
 use midshift_bundle::digest::Digest;
@@ -74,7 +73,7 @@ impl DiskSets {
             let mut to = File::create(&slot)?;
             io::copy(&mut File::open(self.content(&base.digest))?, &mut to)?;
             to.sync_all()?;
-            if is_new { durable::sync_folder_of(&slot) } else { Ok(()) }
+            if is_new { midshift_durable::sync_folder_of(&slot) } else { Ok(()) }
         };
         copy().map_err(io_error("writing a base"))?;
         self.verify_slot(spare, base)?;

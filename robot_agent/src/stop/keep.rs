@@ -129,7 +129,7 @@ impl OnDisk {
         let failed = |error: &dyn std::fmt::Display| Error(error.to_string());
         let beside = |ending: &str| self.path.with_extension(format!("latch.{ending}"));
         let (broken, new) = (beside("broken"), beside("new"));
-        let copied = std::fs::copy(&self.path, &broken).and_then(|_| std::fs::File::open(&broken)?.sync_all());
+        let copied = std::fs::copy(&self.path, &broken).and_then(|_| midshift_durable::sync_file(&broken));
         copied.map_err(|e| failed(&e))?;
         if let Err(error) = std::fs::remove_file(&new)
             && error.kind() != std::io::ErrorKind::NotFound
@@ -137,8 +137,7 @@ impl OnDisk {
             return Err(failed(&error));
         }
         LatchFile::open(&new, ROOM, first.clone()).map_err(|e| failed(&e))?;
-        let placed = std::fs::rename(&new, &self.path).and_then(|()| crate::durable::sync_folder_of(&self.path));
-        placed.map_err(|e| failed(&e))
+        midshift_durable::rename(&new, &self.path).map_err(|e| failed(&e))
     }
 
     fn keep(&mut self, kept: &Kept) -> Result<(), Error> {

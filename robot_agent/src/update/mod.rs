@@ -256,6 +256,8 @@ pub(crate) struct Updater {
     pub(crate) pause: Option<(LinkTime, u32)>,
     /// When a grant was last asked for.
     pub(crate) asked: Option<(DrainId, LinkTime)>,
+    /// When the grant ends by which the switch began.
+    pub(crate) granted_until: Option<LinkTime>,
     /// Newest grant that came too late.
     pub(crate) stale_grant: u64,
     /// When this process began.

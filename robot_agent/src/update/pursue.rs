@@ -63,7 +63,7 @@ impl AgentCore {
 
     /// Decides what is next, if nothing is under way.
     pub(crate) fn pursue_update(&mut self, now: &Now) -> Option<ExitReason> {
-        self.take_switch_back();
+        self.take_switch_back(now);
         if self.update.config.is_none() || self.update.next.is_some() {
             return None;
         }
@@ -87,7 +87,7 @@ impl AgentCore {
             UpdateState::Directed => self.directed(&update),
             UpdateState::Downloading => self.downloading(&update),
             UpdateState::Staged => self.staged(now, update),
-            UpdateState::Switching => return self.switching(&update, &holdings),
+            UpdateState::Switching => return self.switching(now, &update, &holdings),
             UpdateState::Probation => self.probation(now, update, &holdings),
             UpdateState::Trial => self.trial(update, &holdings),
             UpdateState::Committing => self.committing(now, update, &holdings),
@@ -487,6 +487,7 @@ impl AgentCore {
         }
         match grant {
             Some(grant) => {
+                self.update.granted_until = self.sent.ends(&grant.authority);
                 let row = SoftwareRow { grant_id: grant.grant_id, ..self.kept.ledger.software.clone() };
                 self.put_software(row);
                 self.put_update(Update {
@@ -560,23 +561,32 @@ impl AgentCore {
         row.inside.keys().chain(row.committed.keys()).any(|place| !standing(place))
     }
 
-    /// A switch that waits for the disk does not wait for the end of a stop.
-    fn take_switch_back(&mut self) {
-        let state = self.kept.ledger.software.update.as_ref().map(|u| u.state);
+    /// Whether what let the switch begin holds still: its grant lives, and nothing came between.
+    fn may_switch(&self, now: &Now, update: &Update) -> Result<(), Reason> {
+        let blocked = |what: &str| Reason::from(Code::ActivationBlocked).with("by", what);
+        self.may_activate(now, update.drain_id.as_ref().ok_or_else(|| blocked("drain"))?)?;
+        let lives = self.update.granted_until.is_some_and(|until| now.link <= until);
+        if lives || self.config.bugs.authority_from_receipt() { Ok(()) } else { Err(blocked("grant")) }
+    }
+
+    /// A switch that waits for the disk is not made once something came between.
+    fn take_switch_back(&mut self, now: &Now) {
+        let update = self.kept.ledger.software.update.as_ref().filter(|u| u.state == UpdateState::Switching);
         let waits = matches!(self.update.next, Some((Job::Write(_), _)));
-        if waits && state == Some(UpdateState::Switching) && self.is_stopped() {
+        if waits && update.is_some_and(|update| self.may_switch(now, update).is_err()) {
             self.update.next = None;
         }
     }
 
-    fn switching(&mut self, update: &Update, holdings: &Holdings) -> Option<ExitReason> {
+    fn switching(&mut self, now: &Now, update: &Update, holdings: &Holdings) -> Option<ExitReason> {
         let name = update.set_name()?;
         if holdings.switch.running() == name {
             return Some(ExitReason::Switched);
         }
-        if self.is_stopped() {
-            // It was stopped before the record was written: the grant was not used.
-            self.move_to(UpdateState::Staged, Some(Reason::from(Code::ActivationBlocked).with("by", "stop")));
+        if let Err(reason) = self.may_switch(now, update) {
+            // The record was not written. Its grant counts as used, so that another is asked for at once.
+            self.update.asked = None;
+            self.move_to(UpdateState::Staged, Some(reason));
             return None;
         }
         let mut switch = holdings.switch.clone();

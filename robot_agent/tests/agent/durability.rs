@@ -13,6 +13,8 @@ pub const CALLS: &str = "open,openat,creat,write,pwrite64,writev,pwritev,copy_fi
                          rename,renameat,renameat2,link,linkat,unlink,unlinkat,rmdir,mkdir,mkdirat,chmod,fchmod,fchmodat,execve";
 /// Page of a set: without it the folder is none.
 const PAGE: &str = "set.json";
+/// Ends the name of a record's second copy.
+const COPY: &str = ".copy";
 
 /// What a call did.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -165,6 +167,8 @@ struct Disk {
     unsure: BTreeMap<String, BTreeSet<String>>,
     /// Folders of sets whose page went and may come back.
     undead: BTreeSet<String>,
+    /// Second copies that went and may come back: older than what they are copies of, once that is replaced.
+    going: BTreeSet<String>,
     /// The name given last, whose folder must be synced before anything else is done.
     named: Option<String>,
     count: usize,
@@ -191,6 +195,7 @@ impl Disk {
         self.files.remove(path);
         self.unsure.remove(path);
         self.undead.remove(path);
+        self.going.remove(path);
         if let Some(names) = self.unsure.get_mut(folder) {
             names.remove(name);
         }
@@ -239,6 +244,7 @@ impl Disk {
                 }
                 self.unsure.remove(path);
                 self.undead.remove(path);
+                self.going.retain(|copy| split(copy).0 != path);
                 self.named.take_if(|name| split(name).0 == path);
             }
             Event::Changed(path) => {
@@ -271,6 +277,9 @@ impl Disk {
                     self.holes.push(format!("{path} goes: {folder} is not synced since its page went"));
                 }
                 self.take(path);
+                if path.ends_with(COPY) {
+                    self.going.insert(path.clone());
+                }
                 if let Some(database) = path.strip_suffix("-wal").filter(|database| !self.is_synced(database)) {
                     self.holes.push(format!("{path} goes: {database} is not synced"));
                 }
@@ -287,6 +296,9 @@ impl Disk {
         let what = format!("{old} becomes {}", split(new).1);
         self.must_be_named(&what);
         self.must_stay(&what, (old, new));
+        if self.going.contains(&format!("{new}{COPY}")) {
+            self.holes.push(format!("{what}: its copy of before may come back"));
+        }
         let below = format!("{old}/");
         let moved = |path: &str| path.strip_prefix(&below).map(|rest| format!("{new}/{rest}"));
         let files: Vec<(String, usize)> =
@@ -352,6 +364,18 @@ fn a_record_that_is_replaced_whole_stays_and_one_that_misses_a_sync_does_not() {
     let failed =
         REPLACED.replace("fsync(3</r/switch.new>) = 0", "fsync(3</r/switch.new>) = -1 EIO (Input/output error)");
     assert_eq!(judge(&events(&failed, "/r"), &BTreeSet::new())[0], unsynced, "a sync that failed is none");
+}
+
+#[test]
+fn an_older_copy_is_gone_for_good_before_its_record_is_replaced() {
+    let removed = "7 unlink(\"/r/switch.copy\") = 0\n7 fsync(3</r>) = 0\n";
+    let all = |removed: &str| {
+        let there = ["/r", "/r/switch", "/r/switch.copy"].map(str::to_owned);
+        judge(&events(&REPLACED.replace("7 rename", &format!("{removed}7 rename")), "/r"), &there.into())
+    };
+    assert_eq!(all(removed), Vec::<String>::new());
+    let hole = "/r/switch.new becomes switch: its copy of before may come back";
+    assert_eq!(all("7 unlink(\"/r/switch.copy\") = 0\n"), [hole]);
 }
 
 #[test]

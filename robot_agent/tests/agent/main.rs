@@ -29,6 +29,7 @@ mod stops;
 mod stops_beside;
 #[path = "../../../tests/src/strace.rs"]
 mod strace;
+mod successor;
 mod told_time;
 mod trusts;
 mod twins;

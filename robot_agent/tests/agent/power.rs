@@ -8,7 +8,6 @@ use crate::durability::{self, Event, events, judge, names};
 use crate::sets::{bytes, component, noise, patch, put, set, wanted};
 use crate::strace::{Sites, Victim, killed_at, run, sites, strace, traced};
 use midshift_agent::boot::{BASE, BOOT, Boot};
-use midshift_agent::durable::make_folder;
 use midshift_agent::launcher::SWITCH;
 use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::sets::{CHUNK_BYTES, Sets};
@@ -20,6 +19,7 @@ use midshift_agent::update::SoftwareRow;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::ComponentKind;
 use midshift_bundle::set::SetManifest;
+use midshift_durable::{make_folder, record};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand::seq::SliceRandom;
@@ -28,6 +28,8 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
+/// The records of a robot's software and their second copies.
+const RECORDS: [&str; 4] = ["switch", "switch.copy", "boot", "boot.copy"];
 /// Names the folder to the process that is to be killed.
 const UPDATE_IN: &str = "MIDSHIFT_TEST_UPDATE_IN";
 /// Names what it is to go through.
@@ -244,7 +246,8 @@ fn assert_ended(course: Course, folder: &Path, kept: &SetManifest, when: &str) {
         let entries = fs::read_dir(folder).expect("is there").map(|entry| entry.expect("an entry").file_name());
         entries.map(|name| name.to_string_lossy().into_owned()).collect()
     };
-    let mut there: BTreeSet<String> = ["switch", "content", "boot", "base-a", "base-b"].map(str::to_owned).into();
+    let mut there: BTreeSet<String> =
+        RECORDS.into_iter().chain(["content", "base-a", "base-b"]).map(str::to_owned).collect();
     there.extend(ids.into_iter().flatten());
     assert_eq!(names(folder), there, "{when}");
     let components = current.components.values().chain(previous.iter().flat_map(|set| set.components.values()));
@@ -409,11 +412,34 @@ fn what_a_launcher_relies_on_was_synced_before_it_starts_a_program() {
 }
 
 #[test]
+fn wherever_the_power_goes_while_a_torn_switch_record_is_written_anew_it_can_be_read() {
+    if let Some(folder) = std::env::var_os(UPDATE_IN) {
+        let path = Path::new(&folder).join(SWITCH);
+        return Switch::read(&path).expect("its copy is whole").write(&path).expect("writes");
+    }
+    let test = "wherever_the_power_goes_while_a_torn_switch_record_is_written_anew_it_can_be_read";
+    let torn = || {
+        let folder = tempfile::tempdir().expect("a folder");
+        robot(folder.path());
+        fs::write(folder.path().join(SWITCH), "midshift-switch 1\n").expect("tears");
+        folder
+    };
+    let folder = torn();
+    let Sites { calls, paths } = at(test, "", folder.path(), sites);
+    assert!(calls.len() > 10, "{calls:?}");
+    for site in &calls {
+        let folder = torn();
+        at(test, "", folder.path(), |victim| killed_at(victim, &paths, site));
+        assert_bootable(folder.path(), &format!("killed at {site:?}"));
+    }
+}
+
+#[test]
 fn twin_a_switch_record_that_is_written_where_it_lies_is_lost_with_the_power() {
     if let Some(folder) = std::env::var_os(UPDATE_IN) {
         let path = Path::new(&folder).join(SWITCH);
         let text = fs::read_to_string(&path).expect("is there");
-        return fs::write(&path, text.replace("number 2", "number 3")).expect("writes");
+        return fs::write(&path, text).expect("writes");
     }
     let twin = "twin_a_switch_record_that_is_written_where_it_lies_is_lost_with_the_power";
     let folder = tempfile::tempdir().expect("a folder");
@@ -422,5 +448,7 @@ fn twin_a_switch_record_that_is_written_where_it_lies_is_lost_with_the_power() {
     let [write] = &calls[..] else { panic!("{calls:?}") };
     assert_bootable(folder.path(), "without a cut");
     at(twin, "", folder.path(), |victim| killed_at(victim, &paths, write));
+    assert_bootable(folder.path(), "torn, and its copy is whole");
+    fs::remove_file(record::copy_of(&folder.path().join(SWITCH))).expect("removes");
     assert!(DiskSets::open(folder.path()).expect("opens").holdings().is_err(), "the naive way is good enough");
 }

@@ -300,6 +300,35 @@ fn a_damaged_switch_record_is_an_error_and_deletes_nothing() {
 }
 
 #[test]
+fn a_record_that_was_torn_or_lost_is_mended_before_anything_is_deleted_and_one_that_cannot_be_mended_keeps_everything()
+{
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut sets = DiskSets::open(folder.path()).expect("opens");
+    let set = staged(&mut sets, "v1", b"program", b"settings");
+    let spare = staged(&mut sets, "v0", b"older program", b"older settings");
+    let mut switch = sets.holdings().expect("tells").switch;
+    switch.try_out(&set.id().to_string());
+    sets.write_switch(&mut switch).expect("writes");
+    let [path, copy] = [SWITCH, "switch.copy"].map(|name| folder.path().join(name));
+    let whole = fs::read(&path).expect("is there");
+    for (broken, other) in [(&path, &copy), (&copy, &path)] {
+        fs::write(broken, &whole[..20]).expect("tears");
+        assert_eq!(sets.holdings().expect("tells").switch, switch);
+        // Nobody can write it anew: in its place would be put what lies beside it.
+        let beside = folder.path().join(format!("{}.new", broken.file_name().unwrap_or_default().to_string_lossy()));
+        fs::create_dir(&beside).expect("makes");
+        assert!(sets.collect(&BTreeSet::new()).is_err());
+        sets.verify(&spare.id()).expect("nothing was deleted");
+        fs::remove_dir(&beside).expect("removes");
+        sets.collect(&BTreeSet::from([spare.id()])).expect("collects");
+        assert_eq!(fs::read(broken).expect("reads"), fs::read(other).expect("reads"));
+    }
+    sets.collect(&BTreeSet::new()).expect("collects");
+    assert!(sets.verify(&spare.id()).is_err(), "nobody needs it");
+    sets.verify(&set.id()).expect("is whole");
+}
+
+#[test]
 fn no_room_is_told_from_other_errors() {
     let sets = MemorySets::new();
     sets.limit(100);

@@ -61,7 +61,7 @@ fn a_file_is_refused_with_all_that_is_wrong_with_it() {
         }
     };
     let key = |seed: u8| SecretKey::of_seed([seed; 32]).public().tuf();
-    assert_eq!(fields(&|page| page["more"] = json!(1)), ["trust"]);
+    assert_eq!(fields(&|page| page["site"] = json!(1)), ["trust"]);
     assert_eq!(fields(&|page| page["root"]["signed"]["version"] = json!(2)), ["root"]);
     assert_eq!(fields(&|page| page["directive_keys"] = json!([])), ["directive_keys"]);
     assert_eq!(fields(&|page| page["directive_keys"] = (1..=9).map(key).collect()), ["directive_keys"]);

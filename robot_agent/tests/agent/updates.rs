@@ -3,6 +3,7 @@
 use crate::bases::{a_day_passes, migrations};
 use crate::release::{Bundle, Releases};
 use crate::rig::{Rig, action, place_id};
+use midshift_agent::body::BodyNews;
 use midshift_agent::core::{ExitReason, Input};
 use midshift_agent::sets::Sets;
 use midshift_agent::switch::Switch;
@@ -10,7 +11,7 @@ use midshift_agent::update::Job;
 use midshift_bundle::manifest::{Migration, SafetyClass};
 use midshift_core::ids::DrainId;
 use midshift_core::reason::Code;
-use midshift_core::robot::{Fault, FaultClass, HardwareStop, Load};
+use midshift_core::robot::{Fault, FaultClass, HardwareStop, Load, Mode};
 use midshift_core::update::{ActivationGrant, DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState};
 use midshift_core::work::{Effect, RobotEvent};
 use midshift_proto::session::Downlink;
@@ -347,11 +348,11 @@ fn nothing_is_activated_with_work_a_load_a_stop_or_out_of_its_drain() {
     rig.body.set(|b| b.load = Some(Load { task_id: None, item: "box".into() }));
     maintain(&mut rig, Some(&drain("drain-1")));
     assert_eq!(tried(&mut rig, &mut order).as_deref(), Some("load"));
-    rig.body.says(midshift_agent::body::BodyNews::HardwareStop(HardwareStop::Manual));
+    rig.body.says(BodyNews::HardwareStop(HardwareStop::Manual));
     rig.body.set(|b| b.load = None);
     assert_eq!(tried(&mut rig, &mut order).as_deref(), Some("stop"));
     rig.body.set(|b| b.battery_permille = 150);
-    rig.body.says(midshift_agent::body::BodyNews::HardwareStop(HardwareStop::None));
+    rig.body.says(BodyNews::HardwareStop(HardwareStop::None));
     assert_eq!(tried(&mut rig, &mut order).as_deref(), Some("battery"));
     rig.body.set(|b| b.battery_permille = 700);
     grant(&mut rig, &mut order, 5_000);
@@ -477,7 +478,7 @@ fn a_stopped_robot_goes_back_where_it_stands_and_nothing_moves() {
     want(&mut rig, order.to(Goal::Revert));
     assert_eq!((state(&rig), rig.exit), (Some(UpdateState::RollingBack), None), "it works");
     rig.body.set(|b| b.acting = None);
-    rig.body.says(midshift_agent::body::BodyNews::HardwareStop(HardwareStop::Manual));
+    rig.body.says(BodyNews::HardwareStop(HardwareStop::Manual));
     rig.pass(1_000);
     let acts = rig.body.log().acts;
     let mut rig = relaunch(rig);
@@ -732,6 +733,37 @@ fn what_was_asked_of_the_disk_is_on_the_ledger_first() {
     rig.put(Input::Tick);
     assert_eq!(rig.exit, Some(ExitReason::Switched));
     assert!(switch(&rig).trial.is_some());
+}
+
+#[test]
+fn a_switch_that_waits_for_the_disk_is_not_made_once_its_grant_has_ended_or_something_came_between() {
+    let changes: [(&str, fn(&mut Rig)); 5] = [
+        ("grant", |rig| rig.silence(6_000)),
+        ("stop", |rig| rig.body.says(BodyNews::HardwareStop(HardwareStop::Manual))),
+        ("mode", |rig| rig.body.says(BodyNews::Mode(Mode::Manual))),
+        ("load", |rig| rig.body.set(|b| b.load = Some(Load { task_id: None, item: "box".into() }))),
+        ("", |rig| rig.silence(3_000)),
+    ];
+    for (by, change) in changes {
+        let (mut rig, releases) = connected();
+        let bundle = releases.release("1.1.0");
+        let mut order = stage(&mut rig, &releases, &bundle, 1);
+        order.drain_id = Some(drain("drain-1"));
+        maintain(&mut rig, Some(&drain("drain-1")));
+        rig.slow_disk = true;
+        grant(&mut rig, &mut order, 5_000);
+        change(&mut rig);
+        rig.put(Input::Tick);
+        rig.flush();
+        rig.put(Input::Tick);
+        if by.is_empty() {
+            assert_eq!(rig.exit, Some(ExitReason::Switched), "nothing came between");
+            continue;
+        }
+        let told = report(&rig).and_then(|r| r.reason).and_then(|r| r.metadata.get("by").cloned());
+        assert_eq!((state(&rig), rig.exit, told.as_deref()), (Some(UpdateState::Staged), None, Some(by)));
+        assert_eq!(switch(&rig), Switch::default(), "{by}: what runs is untouched");
+    }
 }
 
 #[test]

@@ -3,13 +3,13 @@
 //! Invariant: a key is never in a file that anybody but its owner may read, not even for a moment.
 
 use crate::Error;
-use std::fs::{DirBuilder, File, OpenOptions, Permissions};
-use std::io::{self, Read, Write};
-use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
+use std::fs::{DirBuilder, File, Permissions};
+use std::io::{self, Read};
+use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 use std::path::Path;
 
 /// Owner alone.
-pub const PRIVATE: u32 = 0o600;
+pub const PRIVATE: u32 = midshift_durable::PRIVATE;
 /// Everybody reads.
 pub const PUBLIC: u32 = 0o644;
 /// What nobody but the owner may have of a folder with keys.
@@ -58,19 +58,8 @@ pub fn read(folder: &Path, name: &str) -> Result<Option<String>, Error> {
 
 /// Writes a file under its name once it is whole and durable.
 pub fn write(folder: &Path, name: &str, text: &str, mode: u32) -> Result<(), Error> {
-    let (path, new) = (folder.join(name), folder.join(format!(".{name}.new")));
-    let written = || {
-        match std::fs::remove_file(&new) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
-            _ => {}
-        }
-        let mut file = OpenOptions::new().write(true).create_new(true).mode(mode).open(&new)?;
-        file.write_all(text.as_bytes())?;
-        file.sync_all()?;
-        std::fs::rename(&new, &path)?;
-        File::open(folder)?.sync_all()
-    };
-    written().map_err(|source| Error::Folder { path: path.clone(), source })
+    let path = folder.join(name);
+    midshift_durable::replace_with(&path, text.as_bytes(), mode).map_err(|source| Error::Folder { path, source })
 }
 
 #[cfg(test)]

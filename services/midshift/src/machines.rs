@@ -79,7 +79,7 @@ async fn machine(
     let key = match &folder {
         None => DeviceKey::draw(),
         Some(folder) => {
-            midshift_agent::durable::make_folder(folder).with_context(|| format!("making {}", folder.display()))?;
+            midshift_durable::make_folder(folder).with_context(|| format!("making {}", folder.display()))?;
             let mut ledger = SqliteStore::open(&folder.join(AGENT_FILE)).await?;
             device::key_of(&mut ledger, &format!("{:032x}", rand::random::<u128>())).await?
         }

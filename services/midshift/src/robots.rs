@@ -10,7 +10,6 @@ use midshift_agent::bulk::Bulk;
 use midshift_agent::core::ExitReason;
 use midshift_agent::device;
 use midshift_agent::dial::TcpDial;
-use midshift_agent::durable;
 use midshift_agent::enrolment::{self, Enrolled, Identity, Invitation};
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::stop::keep::{FileStops, STOP_FILE};
@@ -210,7 +209,7 @@ pub async fn agent_in_hand(
 ) -> anyhow::Result<ExitReason> {
     let robot_id = RobotId::parse(&args.robot_id)?;
     let site = site_file::load(args.site.as_deref(), None, None)?.site;
-    durable::make_folder(&args.data).with_context(|| format!("making {}", args.data.display()))?;
+    midshift_durable::make_folder(&args.data).with_context(|| format!("making {}", args.data.display()))?;
     let clock = clock::clock(1000);
     let start = match &args.start {
         Some(name) => WaypointId::parse(name)?,
@@ -309,7 +308,7 @@ fn trust_of_site(data: &Path, identity: Option<&Identity>) -> anyhow::Result<Opt
         return Ok(None);
     };
     let path = data.join("trust.json");
-    durable::replace(&path, text.as_bytes()).with_context(|| format!("writing {}", path.display()))?;
+    midshift_durable::replace(&path, text.as_bytes()).with_context(|| format!("writing {}", path.display()))?;
     Ok(Some(path))
 }
 

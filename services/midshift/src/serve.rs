@@ -10,7 +10,7 @@ use crate::{backup, changed_map, clock_jump};
 use crate::{clock, logs, site_file, stop, stop_follower};
 use anyhow::{Context, bail};
 use clap::ValueEnum;
-use midshift_agent::{durable, tls};
+use midshift_agent::tls;
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use midshift_identity::{Duty, IdentityService};
@@ -18,9 +18,7 @@ use midshift_ota::content::Room;
 use midshift_ota::folder::Owner;
 use midshift_ota::rollouts::known_bundles;
 use midshift_ota::{OtaReader, OtaService};
-use std::io::Write;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
-use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -330,7 +328,7 @@ async fn identity(
     let identity = IdentityService::open(parts, shutdown).await.context("opening identity")?;
     if let Some(file) = &args.root_file {
         let root = identity.proof().borrow().authority_pem.clone();
-        durable::replace(file, root.as_bytes()).with_context(|| format!("writing {}", file.display()))?;
+        midshift_durable::replace(file, root.as_bytes()).with_context(|| format!("writing {}", file.display()))?;
     }
     Ok(identity)
 }
@@ -352,11 +350,10 @@ async fn greet(
         None => return Ok(()),
     };
     if let Some(file) = &args.first_token_file {
-        let mut new =
-            std::fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(file).with_context(|| {
-                format!("writing the token to {}; it is lost: start again with --spare-token", file.display())
-            })?;
-        return writeln!(new, "{token}").with_context(|| format!("writing {}", file.display()));
+        let line = format!("{token}\n");
+        return midshift_durable::create(file, line.as_bytes(), midshift_durable::PRIVATE).with_context(|| {
+            format!("writing the token to {}; it is lost: start again with --spare-token", file.display())
+        });
     }
     let address = shown(address, &args.names);
     let pin = tls::pin_of(&identity.proof().borrow().authority_pem)?;

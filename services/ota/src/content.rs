@@ -641,8 +641,7 @@ impl Inner {
             return Err(Error::WrongBytes { found });
         }
         let (path, whole) = (self.part(digest), self.whole(digest));
-        fs::rename(&path, &whole).map_err(at("naming", &whole))?;
-        sync_folder(&self.path)?;
+        midshift_durable::rename(&path, &whole).map_err(at("naming", &whole))?;
         let mut shelf = self.shelf();
         shelf.turn += 1;
         let touched = shelf.turn;

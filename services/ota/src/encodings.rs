@@ -9,7 +9,7 @@ pub use shared::is_worth_asking;
 
 use crate::blocking;
 use crate::content::{Content, Error, Reader, Wanted};
-use crate::disk::{at, sync_folder};
+use crate::disk::at;
 use crate::folder::Gate;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding::{self, Base, Encoded};
@@ -468,8 +468,7 @@ impl Inner {
             return fs::remove_file(&beside).map_err(at("removing", &beside));
         };
         let path = self.folder.join(key.name(&encoded.digest));
-        fs::rename(&beside, &path).map_err(at("naming", &path))?;
-        sync_folder(&self.folder)?;
+        midshift_durable::rename(&beside, &path).map_err(at("naming", &path))?;
         self.shelf().keep(key, encoded);
         tracing::info!(target = %key.target, base = ?key.base, length, encoded = encoded.length, "a shorter way was made");
         Ok(())

@@ -317,7 +317,7 @@ pub fn set_aside(path: &Path, now: Utc) -> io::Result<PathBuf> {
     let mut name = path.file_name().unwrap_or_default().to_owned();
     name.push(format!(".broken-{}", now.0));
     let aside = path.with_file_name(name);
-    fs::rename(path, &aside)?;
+    midshift_durable::rename(path, &aside)?;
     Ok(aside)
 }
 

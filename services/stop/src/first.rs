@@ -5,9 +5,9 @@
 
 use crate::LATCH;
 use crate::proof;
-use std::fs::{self, DirBuilder, File, OpenOptions};
-use std::io::{self, Write};
-use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
+use std::fs::DirBuilder;
+use std::io;
+use std::os::unix::fs::DirBuilderExt;
 use std::path::Path;
 
 /// Its name in the folder.
@@ -18,16 +18,13 @@ const TEXT: &[u8] = b"The store of this site is new: the stop service may begin 
 /// Announces the first start of the stop service with this folder; durable when it returns. False: there is a latch or a key, so that it was no first start.
 ///
 /// # Errors
-/// The disk.
+/// The disk: what cannot be looked at may be a latch.
 pub fn announce_first_start(folder: &Path) -> io::Result<bool> {
     DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
-    if folder.join(LATCH).exists() || folder.join(proof::NAME).exists() {
+    if folder.join(LATCH).try_exists()? || folder.join(proof::NAME).try_exists()? {
         return Ok(false);
     }
-    let mut file = OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(folder.join(FIRST))?;
-    file.write_all(TEXT)?;
-    file.sync_all()?;
-    sync(folder)?;
+    midshift_durable::replace_with(&folder.join(FIRST), TEXT, midshift_durable::PRIVATE)?;
     Ok(true)
 }
 
@@ -36,13 +33,5 @@ pub fn announce_first_start(folder: &Path) -> io::Result<bool> {
 /// # Errors
 /// The disk.
 pub fn withdraw_first_start(folder: &Path) -> io::Result<bool> {
-    match fs::remove_file(folder.join(FIRST)) {
-        Ok(()) => sync(folder).map(|()| true),
-        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
-        Err(error) => Err(error),
-    }
-}
-
-fn sync(folder: &Path) -> io::Result<()> {
-    File::open(folder)?.sync_all()
+    midshift_durable::remove(&folder.join(FIRST))
 }

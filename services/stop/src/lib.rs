@@ -358,7 +358,8 @@ pub fn verify(folder: &Path) -> Result<Verified, Broken> {
 /// The latch cannot be read.
 pub fn latch(folder: &Path) -> Result<Option<(u64, Latch)>, midshift_latch::Error> {
     let path = folder.join(LATCH);
-    if !path.exists() {
+    let there = path.try_exists();
+    if !there.map_err(|source| midshift_latch::Error::Io { doing: "looking for", path: path.clone(), source })? {
         return Ok(None);
     }
     midshift_latch::read::<Kept>(&path).map(|(generation, kept)| Some((generation, kept.latch)))

@@ -13,9 +13,9 @@ use midshift_core::time::Utc;
 use midshift_proto::convert::stop::signed_reset;
 use midshift_proto::stop::v1;
 use prost::Message;
-use std::fs::{self, File, OpenOptions};
-use std::io::{self, Write};
-use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
+use std::fs;
+use std::io;
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
 const DOMAIN: &[u8] = b"midshift stop 1\0";
@@ -64,16 +64,11 @@ impl Key {
     /// Writes it into the folder; one that is there, and is another, is moved aside.
     pub fn keep(&self, folder: &Path, now: Utc) -> io::Result<()> {
         let path = folder.join(NAME);
-        if path.exists() {
+        if path.try_exists()? {
             audit::set_aside(&path, now)?;
         }
         let text = self.0.to_pkcs8_pem(LineEnding::LF).map_err(io::Error::other)?;
-        let part = folder.join(format!("{NAME}.part"));
-        let mut file = OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(&part)?;
-        file.write_all(text.as_bytes())?;
-        file.sync_all()?;
-        fs::rename(&part, &path)?;
-        File::open(folder)?.sync_all()
+        midshift_durable::replace_with(&path, text.as_bytes(), midshift_durable::PRIVATE)
     }
 
     /// Puts the mark on a stop.

@@ -73,10 +73,10 @@ fn sync_tree(folder: &Path) -> anyhow::Result<()> {
         if path.is_dir() {
             sync_tree(&path)?;
         } else {
-            File::open(&path)?.sync_all().with_context(|| format!("syncing {}", path.display()))?;
+            midshift_durable::sync_file(&path).with_context(|| format!("syncing {}", path.display()))?;
         }
     }
-    File::open(folder)?.sync_all().with_context(|| format!("syncing {}", folder.display()))
+    midshift_durable::sync_folder(folder).with_context(|| format!("syncing {}", folder.display()))
 }
 
 #[cfg(test)]

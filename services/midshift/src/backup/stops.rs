@@ -46,7 +46,7 @@ impl Part for Stops {
             latch(&from, &folder)?;
             for path in entries(&from)? {
                 let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-                if ![LATCH, LOG, FIRST, HOLDER, Copied::NAME].contains(&name.as_str()) && !name.ends_with(".part") {
+                if ![LATCH, LOG, FIRST, HOLDER, Copied::NAME].contains(&name.as_str()) && !name.ends_with(".new") {
                     copy_if_there(&path, &folder.join(name))?;
                 }
             }

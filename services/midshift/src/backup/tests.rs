@@ -254,7 +254,7 @@ async fn a_backup_has_the_files_of_a_stop_service_that_runs_and_none_of_one_that
     let parts = midshift_stop::Parts { folder: folder.clone(), site: None, clock: clock::clock(1000) };
     let _service = midshift_stop::StopService::open(parts, Default::default()).expect("opened");
     fs::write(folder.join(crate::stop::LOG), b"what it said").expect("written");
-    fs::write(folder.join("roster.snapshot.part"), b"half").expect("written");
+    fs::write(folder.join("roster.snapshot.new"), b"half").expect("written");
     let backup = used.backed_up().await;
     let summary = verify(&backup).await.expect("it is good");
     assert!(summary.has("stop"), "{summary:?}");
@@ -267,7 +267,7 @@ async fn a_backup_has_the_files_of_a_stop_service_that_runs_and_none_of_one_that
         assert_eq!(fs::read(restored.join(name)).expect("it is there"), fs::read(folder.join(name)).expect("as here"));
         assert_eq!(fs::metadata(restored.join(name)).expect("a file").permissions().mode() & 0o777, 0o600);
     }
-    assert!(!restored.join("roster.snapshot.part").exists(), "what is being written is in no backup");
+    assert!(!restored.join("roster.snapshot.new").exists(), "what is being written is in no backup");
 
     fs::write(backup.join("stop/latch"), b"nothing").expect("written");
     let error = verify(&backup).await.expect_err("it is broken").to_string();

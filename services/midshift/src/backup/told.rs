@@ -6,7 +6,6 @@
 
 use super::Summary;
 use anyhow::Context;
-use midshift_agent::durable;
 use midshift_core::audit::Note;
 use midshift_core::rows::{Item, Writer};
 use midshift_core::time::Utc;
@@ -46,13 +45,14 @@ struct Made {
 /// The disk.
 pub fn leave_note(data: &Path, summary: &Summary, to: &Path) -> anyhow::Result<()> {
     let folder = data.join(FOLDER);
-    durable::make_folder(&folder).with_context(|| format!("making {}", folder.display()))?;
+    midshift_durable::make_folder(&folder).with_context(|| format!("making {}", folder.display()))?;
     let Utc(begun_unix_ms) = summary.begun;
     let by = format!("os:{}", rustix::process::getuid().as_raw());
     let parts = summary.parts.iter().map(|(name, ..)| name.clone()).collect();
     let made = Made { by, to: to.display().to_string(), begun_unix_ms, parts };
     let path = folder.join(format!("{begun_unix_ms}-{:08x}.json", rand::random::<u32>()));
-    durable::replace(&path, &serde_json::to_vec(&made)?).with_context(|| format!("writing {}", path.display()))?;
+    midshift_durable::replace(&path, &serde_json::to_vec(&made)?)
+        .with_context(|| format!("writing {}", path.display()))?;
     // Whoever made the backup may be another user than the server; the data directory is closed to others.
     fs::set_permissions(&path, fs::Permissions::from_mode(0o644)).with_context(|| format!("opening {}", path.display()))
 }
@@ -61,7 +61,7 @@ pub fn leave_note(data: &Path, summary: &Summary, to: &Path) -> anyhow::Result<(
 pub async fn run(data: &Path, store: &dyn Store) {
     let (mut failing, mut written) = (false, BTreeSet::new());
     // Its own, so that it may take away what another user put there.
-    if let Err(error) = durable::make_folder(&data.join(FOLDER)) {
+    if let Err(error) = midshift_durable::make_folder(&data.join(FOLDER)) {
         tracing::warn!(%error, "there is no folder for the word of backups");
     }
     loop {

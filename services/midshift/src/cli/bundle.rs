@@ -14,7 +14,7 @@ use midshift_bundle::keys::{PublicKey, SecretKey};
 use midshift_bundle::manifest::Manifest;
 use midshift_bundle::repository::Profile;
 use std::fs::File;
-use std::io::{IsTerminal, Read, Write};
+use std::io::{IsTerminal, Read};
 use std::path::{Path, PathBuf};
 
 /// Verbs of bundles.
@@ -251,12 +251,8 @@ fn rekey(by: &Path, keys: &[PathBuf], number: u64, into: &Path, out: &Out) -> Re
         set.keys.push(PublicKey::read(path).or_else(|_| public()).map_err(Error::from)?);
     }
     let envelope = set.sign(&by).map_err(Error::from)?;
-    let write = || {
-        let mut file = File::options().write(true).create_new(true).open(into)?;
-        file.write_all(&envelope)?;
-        file.sync_all()
-    };
-    write().map_err(|source| Error::Io { doing: "writing", path: into.to_owned(), source })?;
+    let written = midshift_durable::create(into, &envelope, midshift_durable::OPEN);
+    written.map_err(|source| Error::Io { doing: "writing", path: into.to_owned(), source })?;
     let ids: Vec<String> = set.keys.iter().map(|key| key.id().to_string()).collect();
     told(&serde_json::json!({"number": number, "keys": ids, "file": into}), out);
     out.say(&format!("set {number} of directive keys in {}: it has no secrets", into.display()));

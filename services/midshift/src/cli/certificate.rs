@@ -10,15 +10,12 @@ use crate::storage::Database;
 use crate::{clock, site_file};
 use anyhow::Context;
 use clap::Subcommand;
-use midshift_agent::durable;
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use midshift_identity::{Duty, IdentityService, PUBLIC_FILE, Parts};
 use rcgen::{
     BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
 };
-use std::io::Write;
-use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use tokio_util::sync::CancellationToken;
@@ -97,7 +94,7 @@ fn pair(args: &Pair, out: &Out) -> anyhow::Result<()> {
     client.distinguished_name = named(&args.user);
     client.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
     for folder in [&args.server_out, &args.client_out] {
-        durable::make_folder(folder).with_context(|| format!("making {}", folder.display()))?;
+        midshift_durable::make_folder(folder).with_context(|| format!("making {}", folder.display()))?;
     }
     let sign = |params: CertificateParams| -> Result<(String, String), rcgen::Error> {
         let key = KeyPair::generate()?;
@@ -136,16 +133,8 @@ fn named(common: &str) -> DistinguishedName {
 
 /// Writes a file anew; what was left there by a call that did not come to its end goes.
 fn put(path: &Path, text: &str, mode: u32) -> anyhow::Result<()> {
-    let written = || {
-        match std::fs::remove_file(path) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(error),
-            _ => {}
-        }
-        let mut file = std::fs::OpenOptions::new().write(true).create_new(true).mode(mode).open(path)?;
-        file.write_all(text.as_bytes())?;
-        file.sync_all()
-    };
-    written().with_context(|| format!("writing {}", path.display()))
+    let written = midshift_durable::replace_with(path, text.as_bytes(), mode);
+    written.with_context(|| format!("writing {}", path.display()))
 }
 
 /// Asks, waits for the answer, and writes it; nothing changes while more than half of the life of the last one is left.

@@ -5,8 +5,7 @@
 use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::io::Write;
-use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
+use std::os::unix::fs::PermissionsExt;
 use std::path::PathBuf;
 
 /// Where the file is, if not in the usual place.
@@ -83,15 +82,9 @@ impl Contexts {
         let path = path()?;
         let folder = path.parent().context("the file is in no folder")?;
         std::fs::create_dir_all(folder).with_context(|| format!("making {}", folder.display()))?;
-        let new = path.with_extension("new");
-        let _ = std::fs::remove_file(&new);
-        let written = || -> std::io::Result<()> {
-            let mut file = std::fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(&new)?;
-            file.write_all(toml::to_string(self).map_err(std::io::Error::other)?.as_bytes())?;
-            file.sync_all()?;
-            std::fs::rename(&new, &path)
-        };
-        written().with_context(|| format!("writing {}", path.display()))
+        let text = toml::to_string(self).with_context(|| format!("writing {}", path.display()))?;
+        midshift_durable::replace_with(&path, text.as_bytes(), midshift_durable::PRIVATE)
+            .with_context(|| format!("writing {}", path.display()))
     }
 
     /// The one with this name, or the current one; none: nobody has signed in.
