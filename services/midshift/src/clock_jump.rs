@@ -4,7 +4,6 @@
 //! does not wait for the disk.
 
 use anyhow::Context;
-use midshift_agent::durable;
 use midshift_core::time::{Clock, Jump, Utc};
 use serde::{Deserialize, Serialize};
 use std::fs;
@@ -50,7 +49,7 @@ pub async fn keep(data: &Path, clock: &dyn Clock) {
 
 fn write(data: &Path, jump: &Jump) -> anyhow::Result<()> {
     let (path, kept) = (data.join(FILE), Kept { step_ms: jump.step_ms(), to_unix_ms: jump.to.0 });
-    durable::replace(&path, &serde_json::to_vec(&kept)?).with_context(|| format!("writing {}", path.display()))
+    midshift_durable::replace(&path, &serde_json::to_vec(&kept)?).with_context(|| format!("writing {}", path.display()))
 }
 
 #[cfg(test)]

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
-use std::fs::{self, File, OpenOptions};
+use std::fs::{File, OpenOptions};
 use std::io::{self, BufRead, BufReader};
 use std::os::unix::fs::{FileExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
@@ -324,6 +324,7 @@ pub fn set_aside(path: &Path, now: Utc) -> io::Result<PathBuf> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs;
 
     fn notes(n: u64) -> Vec<Note> {
         (0..n).map(|i| Note::own(Utc(i as i64), Action::Engaged).with("stop_id", format!("STOP-{i}"))).collect()
