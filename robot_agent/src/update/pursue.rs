@@ -588,7 +588,10 @@ impl AgentCore {
         let Some(name) = update.set_name() else { return };
         let runs = switch.trial.as_ref().is_some_and(|t| t.set == name);
         let fallen = switch.fallen.as_ref().filter(|f| f.set == name);
-        let active = matches!(update.state, UpdateState::Switching | UpdateState::Probation | UpdateState::Trial);
+        let active = matches!(
+            update.state,
+            UpdateState::Switching | UpdateState::Probation | UpdateState::Trial | UpdateState::Committing
+        );
         if let Some(fallen) = fallen.filter(|_| active) {
             let reason = Reason::from(Code::ProgramCrashed).with("tries", fallen.tries);
             let (state, tries) = (UpdateState::RolledBack, fallen.tries);
@@ -654,11 +657,16 @@ impl AgentCore {
         self.prove(holdings);
     }
 
+    /// Floors rise and migrations become due only once the switch record names the set as committed.
     fn committing(&mut self, now: &Now, update: Update, holdings: &Holdings) {
-        if holdings.switch.trial.is_some() {
+        let name = update.set_name();
+        if holdings.switch.trial.as_ref().is_some_and(|trial| Some(&trial.set) == name.as_ref()) {
             let mut switch = holdings.switch.clone();
             switch.commit();
             return self.ask_for(Job::Write(switch));
+        }
+        if holdings.switch.trial.is_some() || Some(&holdings.switch.current) != name.as_ref() {
+            return self.move_to(UpdateState::RolledBack, Some(Reason::from(Code::SetPutAway)));
         }
         let kept = holdings.switch.kept().and_then(|kept| holdings.set(kept)).unwrap_or_default();
         let mut row = SoftwareRow { committed_at: Some(now.utc), ..self.kept.ledger.software.clone() };

@@ -27,7 +27,7 @@ pub fn drain(name: &str) -> DrainId {
 pub struct Order {
     directive: String,
     pub generation: u64,
-    drain_id: Option<DrainId>,
+    pub drain_id: Option<DrainId>,
     granted: u64,
 }
 
@@ -448,6 +448,31 @@ fn what_the_launcher_put_away_is_told_and_not_tried_again() {
 }
 
 #[test]
+fn a_set_that_was_put_away_while_it_was_being_committed_is_fallen_and_moves_no_floor_and_no_data() {
+    let (rig, releases) = connected();
+    let bundle = releases.release_as("1.1.0", |m| {
+        m.components[0].rollback_index = 3;
+        m.components[0].data_migration = Migration::Reversible;
+    });
+    let (rig, mut order) = on_trial(rig, &releases, &bundle, 1);
+    // The power went before the switch record was written, and the launcher put the set away.
+    let mut software = rig.store.kept().expect("loaded").ledger.software;
+    software.update.as_mut().expect("an update").state = UpdateState::Committing;
+    rig.store.commit_now(&[midshift_agent::store::Op::Software(Box::new(software))]);
+    rig.updates.as_ref().expect("has them").sets.fall_back(2);
+    let mut rig = rig.restart();
+    rig.connect();
+    want(&mut rig, order.to(Goal::Commit));
+    rig.pass(5_000);
+    let told = report(&rig).expect("a report");
+    let why = told.reason.map(|reason| reason.code);
+    assert_eq!((told.state, told.tries, why), (UpdateState::RolledBack, 2, Some(Code::ProgramCrashed)));
+    let software = rig.store.kept().expect("loaded").ledger.software;
+    assert_eq!((software.floors.len(), software.due.len(), software.committed_at), (0, 0, None));
+    assert_eq!((migrations(&rig), switch(&rig).running()), (vec![], "factory"));
+}
+
+#[test]
 fn a_stopped_robot_goes_back_where_it_stands_and_nothing_moves() {
     let (rig, releases) = connected();
     let bundle = releases.release("1.1.0");
@@ -606,97 +631,6 @@ fn a_robot_that_is_not_set_up_for_it_leaves_its_software_alone() {
     want(&mut rig, order.to(Goal::Stage));
     rig.pass(5_000);
     assert_eq!((state(&rig), releases.served()), (None, 0));
-}
-
-// --- the power
-
-/// What the server would say now, whatever was lost: level-triggered.
-fn server_says(rig: &mut Rig, order: &mut Order, grants: &mut u64, back: bool) {
-    let at = state(rig);
-    order.generation += 10;
-    let idle = matches!(at, Some(UpdateState::Trial | UpdateState::Committed | UpdateState::RolledBack));
-    order.drain_id = Some(drain("drain-1"));
-    maintain(rig, order.drain_id.as_ref().filter(|_| !idle));
-    let goal = match at {
-        Some(UpdateState::Trial) if back => Goal::Revert,
-        Some(UpdateState::RollingBack) => Goal::Revert,
-        Some(UpdateState::Trial | UpdateState::Committing) => Goal::Commit,
-        _ => Goal::Activate,
-    };
-    let mut desired = order.to(goal);
-    if at == Some(UpdateState::Staged) {
-        *grants += 1;
-        let (grant_id, authority) = (*grants, rig.authority(5_000));
-        desired.grant = Some(ActivationGrant { grant_id, drain_id: drain("drain-1"), authority });
-    }
-    want(rig, desired);
-}
-
-/// One update to its end, with the power going at one of its effects. Gives back how it ended and how many effects there were.
-fn with_power_cut(at: Option<usize>, last_is_done: bool, back: bool, bases: bool) -> (UpdateState, usize) {
-    let (rig, releases) = connected();
-    let release = |version| if bases { releases.release_base(version) } else { releases.release(version) };
-    let first = release("1.1.0");
-    let mut rig = committed(rig, &releases, &first, 1);
-    a_day_passes(&mut rig, &releases);
-    let second = release("1.2.0");
-    let (good, mut grants) = (name_of(&rig), 1_000_000);
-    let mut order = Order::new(releases.directive(&second, 2));
-    order.generation = 10_000;
-    let updates = rig.updates.as_mut().expect("has them");
-    let before = updates.effects;
-    (updates.cut_at, updates.last_is_done) = (at.map(|at| before + at), last_is_done);
-    for _ in 0..200 {
-        server_says(&mut rig, &mut order, &mut grants, back);
-        rig.pass(2_000);
-        let updates = rig.updates.as_ref().expect("has them");
-        if updates.dark {
-            updates.sets.lose_power();
-        }
-        if updates.dark || rig.exit == Some(ExitReason::Switched) {
-            boots_something_whole(&rig, &good);
-            rig = rig.restart();
-            rig.connect();
-        }
-        let told = report(&rig).filter(|r| r.bundle.as_str() == second.digest.to_string());
-        let ended = |r: &UpdateReport| matches!(r.state, UpdateState::Committed | UpdateState::RolledBack);
-        let migrates = !rig.store.kept().expect("loaded").ledger.software.due.is_empty();
-        if let Some(told) = told.filter(ended).filter(|_| !migrates) {
-            let migrated = migrations(&rig);
-            assert_eq!(migrated.contains(&"1.2.0".to_owned()), bases && !back, "{migrated:?}");
-            boots_something_whole(&rig, &good);
-            return (told.state, rig.updates.as_ref().map_or(0, |u| u.effects) - before);
-        }
-    }
-    panic!("never ended: power went at {at:?}, {:?}", report(&rig));
-}
-
-/// Whatever the launcher would start now is whole.
-fn boots_something_whole(rig: &Rig, good: &str) {
-    let mut sets = rig.updates.as_ref().expect("has them").sets.clone();
-    let record = sets.holdings().expect("a record").switch;
-    let running = record.running().parse().expect("a set, not the factory's");
-    sets.verify(&running).expect("is whole");
-    if record.trial.is_some() {
-        assert_eq!(record.current, good, "what is gone back to is the set committed last");
-        sets.verify(&good.parse().expect("a set")).expect("is whole");
-    }
-}
-
-#[test]
-fn the_power_may_go_at_every_effect_of_an_update_and_it_still_ends() {
-    let ends = [(false, UpdateState::Committed), (true, UpdateState::RolledBack)];
-    for (back, end, bases) in ends.into_iter().flat_map(|(back, end)| [(back, end, false), (back, end, true)]) {
-        let (undisturbed, effects) = with_power_cut(None, false, back, bases);
-        assert_eq!(undisturbed, end);
-        assert!(effects > 20, "only {effects} effects");
-        for at in 1..=effects {
-            for last_is_done in [false, true] {
-                let (ended, _) = with_power_cut(Some(at), last_is_done, back, bases);
-                assert_eq!(ended, end, "the power went at {at} of {effects}, done: {last_is_done}, bases: {bases}");
-            }
-        }
-    }
 }
 
 #[test]
