@@ -12,6 +12,7 @@ pub mod dial;
 mod drive;
 pub mod durable;
 pub mod enrolment;
+pub mod environment;
 pub mod governor;
 mod installed;
 pub mod lanes;
