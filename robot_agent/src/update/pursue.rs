@@ -24,6 +24,8 @@ use std::collections::BTreeSet;
 const ASK_AGAIN: LinkDuration = LinkDuration(10_000);
 /// A set on probation that does not reach its server for so long is gone back from.
 const LOST_SERVER: LinkDuration = LinkDuration(600_000);
+/// At the end of a probation the server must have answered within this, or within half of the probation where that is less.
+const REACHED_WITHIN: LinkDuration = LinkDuration(30_000);
 
 impl AgentCore {
     /// Takes section `update` in.
@@ -618,14 +620,18 @@ impl AgentCore {
             return self.go_back(update, Reason::from(Code::RevertAsked));
         }
         let Some((link, site)) = self.update.begun else { return };
-        if !self.update.server_reached {
-            if now.link.since(link) >= LOST_SERVER {
-                return self.go_back(update, Reason::from(Code::LostServer));
-            }
-            return self.wake_at(link + LOST_SERVER);
+        let lost_at = self.update.server_reached.unwrap_or(link) + LOST_SERVER;
+        if now.link >= lost_at {
+            return self.go_back(update, Reason::from(Code::LostServer));
         }
+        self.wake_at(lost_at);
         if now.site.since(site) < SiteDuration(update.probation_ms) {
             self.wake_site = Some(site + SiteDuration(update.probation_ms));
+            return;
+        }
+        // An answer of long ago proves nothing of what runs now: the next one is waited for.
+        let recent = REACHED_WITHIN.min(LinkDuration(update.probation_ms / 2));
+        if !self.update.server_reached.is_some_and(|at| now.link.since(at) <= recent) {
             return;
         }
         self.move_to(UpdateState::Trial, None);
