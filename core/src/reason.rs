@@ -269,7 +269,7 @@ codes! {
     // --- why a robot is left out of a roll-out
     SkippedOffline = "SKIPPED_OFFLINE", "The robot was not heard when its turn came. It is tried once more at the end.";
     SkippedStuck = "SKIPPED_STUCK", "The robot did not get as far as it should in time: its download, or what it needs to activate. It is tried once more at the end.";
-    SkippedIncompatible = "SKIPPED_INCOMPATIBLE", "The bundle does not fit the robot, or the robot refused it.";
+    SkippedIncompatible = "SKIPPED_INCOMPATIBLE", "The bundle is not for a robot of this model.";
     SkippedPinned = "SKIPPED_PINNED", "A person keeps the robot at what it runs. Unpin it.";
     SkippedExcluded = "SKIPPED_EXCLUDED", "A person left the robot out of this roll-out.";
     SkippedQuarantined = "SKIPPED_QUARANTINED", "The robot went back from this bundle before. Lift the quarantine.";

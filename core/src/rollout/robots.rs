@@ -195,10 +195,9 @@ fn staging(
     })
 }
 
-/// Why the robot refused what it was told.
+/// Why the robot refused what it was told, in its own words.
 fn refused(report: Option<&UpdateReport>) -> Reason {
-    let why = report.and_then(|r| r.reason.clone()).unwrap_or_else(|| Code::BundleUnfit.into());
-    Reason::new(Code::SkippedIncompatible, why.text()).with("because", why.code)
+    report.and_then(|r| r.reason.clone()).unwrap_or_else(|| Code::BundleUnfit.into())
 }
 
 /// Its turn came long ago, and it has not fetched the bundle.

@@ -389,6 +389,9 @@ impl AgentCore {
                 return self.move_to(UpdateState::Refused, Some(reason));
             }
         };
+        if set.id() == current.id() {
+            return self.move_to(UpdateState::Refused, Some(Reason::from(Code::SkippedCurrent)));
+        }
         if let Some(component) = manifest.components.iter().find(|c| !self.lists(&c.digest, c.length)) {
             let reason = Reason::from(Code::BundleUnfit).with("unlisted", &component.name);
             return self.move_to(UpdateState::Refused, Some(reason));

@@ -79,12 +79,13 @@ impl Rig {
                 self.tell(n, fresh_report(UpdateState::Committed, &bundle, generation));
             }
             if matches!(desired.goal, Goal::Stage | Goal::Activate) {
-                let state = match robot.fate {
-                    Fate::NoBytes => UpdateState::Downloading,
-                    Fate::Unfit => UpdateState::Refused,
-                    _ => UpdateState::Staged,
+                let (state, reason) = match robot.fate {
+                    Fate::NoBytes => (UpdateState::Downloading, None),
+                    Fate::Unfit => (UpdateState::Refused, None),
+                    Fate::Refuses(code) => (UpdateState::Refused, Some(code.into())),
+                    _ => (UpdateState::Staged, None),
                 };
-                self.tell(n, fresh_report(state, &bundle, generation));
+                self.tell(n, UpdateReport { reason, ..fresh_report(state, &bundle, generation) });
             }
             return;
         }

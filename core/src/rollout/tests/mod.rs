@@ -72,6 +72,8 @@ enum Fate {
     NoBytes,
     /// It does not take the bundle.
     Unfit,
+    /// It does not take the bundle for this reason.
+    Refuses(Code),
     /// It takes permissions and does not use them.
     Dawdles,
     /// It gave up what it kept.
