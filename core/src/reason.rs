@@ -84,6 +84,7 @@ codes! {
         => "Leave it out.";
     TaskEnded = "TASK_ENDED", "The task is over and cannot be changed." => "Submit another one.";
     NotAllowedNow = "NOT_ALLOWED_NOW", "The state of the object does not allow this now." => "Read it again.";
+    NotStuck = "NOT_STUCK", "The robot is not stuck on its way back from a bundle." => "`midshift robot explain ROBOT` says what it waits for.";
     ResolutionNotAllowed = "RESOLUTION_NOT_ALLOWED", "This resolution is not among the task's allowed resolutions."
         => "`midshift task get TASK` lists those.";
     PlaceNotClear = "PLACE_NOT_CLEAR", "A robot reports that it stands in this place." => "Move it out first.";
@@ -295,7 +296,8 @@ codes! {
     // --- what counts against a bundle
     RobotLost = "ROBOT_LOST", "The robot was not heard again after it was given the bundle, and most others were.";
     RobotWentBack = "ROBOT_WENT_BACK", "The robot went back from the bundle by itself.";
-    RollbackFailed = "ROLLBACK_FAILED", "The robot could not go back, and stays out of work. Mend its software by hand; if it does not say by itself then that it is back, retire it and uncordon it.";
+    RollbackFailed = "ROLLBACK_FAILED", "The robot could not go back, and stays out of work."
+        => "Mend its software, then `midshift robot unstick ROBOT --reason TEXT`; one that cannot be mended: retire it.";
     BreakerOnTrial = "BREAKER_ON_TRIAL", "The robot failed three attempts in ten minutes with the bundle.";
     HardStopCode = "HARD_STOP_CODE", "A robot with the bundle reported a fault that its manifest names as one that ends the roll-out.";
     HardwareStopOnTrial = "HARDWARE_STOP_ON_TRIAL", "The maker's safety system stopped a robot within ten minutes of its change.";

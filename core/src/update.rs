@@ -121,7 +121,9 @@ impl UpdateState {
             Self::RollingBack => &[Self::RolledBack, Self::Stuck],
             // A committed set may be reverted as long as the one before it is kept.
             Self::Committed => &[Self::RollingBack],
-            Self::RolledBack | Self::Refused | Self::Stuck => &[],
+            // By a newer order, once a person mended what kept it.
+            Self::Stuck => &[Self::RollingBack],
+            Self::RolledBack | Self::Refused => &[],
         }
     }
 

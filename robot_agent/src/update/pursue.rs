@@ -286,11 +286,13 @@ impl AgentCore {
         if self.is_observed() || self.names(&desired) {
             return false;
         }
-        if holdings.switch.kept().is_none() {
+        let software = self.kept.ledger.software.clone();
+        let stuck = software.update.clone().filter(|update| update.state == UpdateState::Stuck);
+        let is_back = stuck.as_ref().and_then(Update::set_name).is_some_and(|set| set != holdings.switch.running());
+        if holdings.switch.kept().is_none() && !is_back {
             self.refuse_way_back();
             return false;
         }
-        let software = self.kept.ledger.software.clone();
         let trusted = match self.trusted() {
             Ok(trusted) => trusted,
             Err(reason) => {
@@ -313,6 +315,15 @@ impl AgentCore {
                 return false;
             }
         };
+        if let Some(update) = stuck.filter(|update| update.bundle == directive.manifest) {
+            // A person mended what kept it: it is gone back from once more.
+            self.update.judged = Some(desired.directive.clone());
+            self.put_software(software.with(&directive, &desired));
+            let (state, reason) = (UpdateState::RollingBack, Some(Reason::from(Code::RevertAsked)));
+            let drain_id = desired.drain_id.or(update.drain_id);
+            self.put_update(Update { state, drain_id, reason, ..update });
+            return true;
+        }
         let set = holdings.set(&holdings.switch.current).filter(|set| set.bundle == Some(directive.manifest));
         let Some(set) = set else {
             self.refuse_directive(Reason::new(Code::DirectiveRefused, "another bundle is the committed one"));

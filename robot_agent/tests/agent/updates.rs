@@ -431,6 +431,65 @@ fn software_that_does_not_reach_its_server_goes_back_and_one_that_does_is_proven
 }
 
 #[test]
+fn an_answer_at_the_beginning_of_a_probation_does_not_end_it() {
+    let (mut rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let mut order = stage(&mut rig, &releases, &bundle, 1);
+    activate(&mut rig, &mut order, "drain-1");
+    let mut rig = relaunch(rig);
+    rig.silence(PROBATION_MS + 1_000);
+    assert_eq!(state(&rig), Some(UpdateState::Probation), "it was heard, and not since");
+    rig.echo();
+    assert_eq!(state(&rig), Some(UpdateState::Trial));
+}
+
+#[test]
+fn an_order_for_the_set_that_runs_already_is_answered_and_changes_nothing() {
+    let (rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let mut rig = committed(rig, &releases, &bundle, 1);
+    let (before, served) = (switch(&rig), releases.served());
+    let mut order = stage(&mut rig, &releases, &bundle, 2);
+    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::Refused), Some(Code::SkippedCurrent)));
+    assert!(releases.served() <= served + bundle.length, "only its manifest came");
+    for goal in [Goal::Activate, Goal::Revert] {
+        want(&mut rig, order.to(goal));
+        rig.pass(5_000);
+        assert_eq!((switch(&rig), state(&rig), rig.exit), (before.clone(), Some(UpdateState::Refused), None));
+    }
+}
+
+#[test]
+fn a_stuck_robot_goes_back_by_a_newer_order_once_its_kept_set_is_whole_again() {
+    let (rig, releases) = connected();
+    let (first, second) = (releases.release("1.1.0"), releases.release("1.2.0"));
+    let rig = committed(rig, &releases, &first, 1);
+    let kept = name_of(&rig);
+    let (mut rig, mut order) = on_trial(rig, &releases, &second, 2);
+    let sets = rig.updates.as_ref().expect("has them").sets.clone();
+    // The second time its byte is as it was.
+    let rot = || sets.rot(&first.manifest.components[0].digest);
+    rot();
+    want(&mut rig, order.to(Goal::Revert));
+    assert_eq!(state(&rig), Some(UpdateState::Stuck));
+    let order_back = |rig: &mut Rig, generation: u64| {
+        let mut order = Order::new(releases.directive(&second, generation));
+        order.generation = generation * 100_000;
+        want(rig, order.to(Goal::Revert));
+    };
+    order_back(&mut rig, 3);
+    let told = report(&rig).map(|told| (told.state, told.directive));
+    assert_eq!((told, rig.exit), (Some((UpdateState::Stuck, 3)), None), "it looked, and nothing was mended");
+    rot();
+    rig.pass(5_000);
+    assert_eq!(state(&rig), Some(UpdateState::Stuck), "nobody has said so");
+    order_back(&mut rig, 4);
+    let mut rig = relaunch(rig);
+    rig.pass(1_000);
+    assert_eq!((state(&rig), switch(&rig).running()), (Some(UpdateState::RolledBack), kept.as_str()));
+}
+
+#[test]
 fn what_the_launcher_put_away_is_told_and_not_tried_again() {
     let (mut rig, releases) = connected();
     let bundle = releases.release("1.1.0");
