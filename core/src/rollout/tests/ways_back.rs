@@ -101,7 +101,7 @@ fn what_a_stuck_robot_said_before_it_was_mended_does_not_make_it_stuck_again() {
     rig.ask(&unstick(n)).expect("it is stuck");
     rig.ota_turn();
     assert_eq!((rig.step(n), stuck(&rig).len()), (Step::Reverting, 1));
-    rig.until(60, |r| r.step(n) == Step::RolledBack);
+    rig.until(200, |r| r.step(n) == Step::RolledBack);
     assert_eq!(stuck(&rig).len(), 1);
 }
 
