@@ -3,11 +3,11 @@
 //! Invariant: silent unless the launcher asked for it in the environment. Called by binaries that run one agent.
 
 use crate::launcher::{PULSE_ASKED, PULSE_LINE};
-use rustix::process::{Signal, set_parent_process_death_signal};
+use rustix::process::{Signal, getpid, kill_process, set_parent_process_death_signal};
 use std::io::{self, Write};
 
-/// Asks for SIGTERM at the death of the launcher, if one asked for the pulse. To be called by the first thread before there are others. A
-/// program between the two, as a shell that waits, is signalled in its place.
+/// Asks for SIGTERM at the death of the launcher, if one asked for the pulse. To be called by the first thread before there are others. Where
+/// another program stands between the two, as a shell that waits, the next pulse finds that nobody reads it, and does the same.
 ///
 /// # Errors
 /// The signal is not to be had, or the launcher died before it was asked for: nobody reads the pulse.
@@ -23,8 +23,10 @@ pub fn follow_launcher() -> io::Result<()> {
 pub fn for_launcher() -> Option<Box<dyn FnMut() + Send>> {
     is_asked().then(|| {
         Box::new(|| {
-            // A launcher that is gone has sent its signal: the agent ends in order, not inside this line.
-            let _ = beat();
+            if beat().is_err_and(|error| error.kind() == io::ErrorKind::BrokenPipe) {
+                // The launcher is gone: the agent ends in order, as if it had been told to. It cannot be told twice too often.
+                let _ = kill_process(getpid(), Signal::TERM);
+            }
         }) as Box<dyn FnMut() + Send>
     })
 }
