@@ -84,6 +84,7 @@ codes! {
         => "Leave it out.";
     TaskEnded = "TASK_ENDED", "The task is over and cannot be changed." => "Submit another one.";
     NotAllowedNow = "NOT_ALLOWED_NOW", "The state of the object does not allow this now." => "Read it again.";
+    NotStuck = "NOT_STUCK", "The robot is not stuck on its way back from a bundle." => "`midshift robot explain ROBOT` says what it waits for.";
     ResolutionNotAllowed = "RESOLUTION_NOT_ALLOWED", "This resolution is not among the task's allowed resolutions."
         => "`midshift task get TASK` lists those.";
     PlaceNotClear = "PLACE_NOT_CLEAR", "A robot reports that it stands in this place." => "Move it out first.";
@@ -269,7 +270,7 @@ codes! {
     // --- why a robot is left out of a roll-out
     SkippedOffline = "SKIPPED_OFFLINE", "The robot was not heard when its turn came. It is tried once more at the end.";
     SkippedStuck = "SKIPPED_STUCK", "The robot did not get as far as it should in time: its download, or what it needs to activate. It is tried once more at the end.";
-    SkippedIncompatible = "SKIPPED_INCOMPATIBLE", "The bundle does not fit the robot, or the robot refused it.";
+    SkippedIncompatible = "SKIPPED_INCOMPATIBLE", "The bundle is not for a robot of this model.";
     SkippedPinned = "SKIPPED_PINNED", "A person keeps the robot at what it runs. Unpin it.";
     SkippedExcluded = "SKIPPED_EXCLUDED", "A person left the robot out of this roll-out.";
     SkippedQuarantined = "SKIPPED_QUARANTINED", "The robot went back from this bundle before. Lift the quarantine.";
@@ -311,7 +312,7 @@ codes! {
     RobotLost = "ROBOT_LOST", "The robot was not heard again after it was given the bundle, and most others were.";
     RobotWentBack = "ROBOT_WENT_BACK", "The robot went back from the bundle by itself.";
     RollbackFailed = "ROLLBACK_FAILED", "The robot could not go back, and stays out of work."
-        => "Mend its software by hand; if it does not say by itself then that it is back, retire it and uncordon it.";
+        => "Mend its software, then `midshift robot unstick ROBOT --reason TEXT`; one that cannot be mended: retire it.";
     BreakerOnTrial = "BREAKER_ON_TRIAL", "The robot failed three attempts in ten minutes with the bundle.";
     JammedOnTrial = "JAMMED_ON_TRIAL", "The robot has work and has stood for five minutes with the bundle, while most others got on with theirs.";
     HardStopCode = "HARD_STOP_CODE", "A robot with the bundle reported a fault that its manifest names as one that ends the roll-out.";

@@ -116,11 +116,14 @@ impl UpdateState {
             Self::Switching => &[Self::Probation, Self::Staged, Self::RollingBack, Self::RolledBack, Self::Refused],
             Self::Probation => &[Self::Trial, Self::RollingBack, Self::RolledBack],
             Self::Trial => &[Self::Committing, Self::RollingBack, Self::RolledBack],
-            Self::Committing => &[Self::Committed],
+            // Put away by the launcher before the switch record named it as committed.
+            Self::Committing => &[Self::Committed, Self::RolledBack],
             Self::RollingBack => &[Self::RolledBack, Self::Stuck],
             // A committed set may be reverted as long as the one before it is kept.
             Self::Committed => &[Self::RollingBack],
-            Self::RolledBack | Self::Refused | Self::Stuck => &[],
+            // By a newer order, once a person mended what kept it.
+            Self::Stuck => &[Self::RollingBack],
+            Self::RolledBack | Self::Refused => &[],
         }
     }
 

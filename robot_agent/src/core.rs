@@ -454,7 +454,7 @@ impl AgentCore {
         if let Some(echo) = down.echo {
             if !observed {
                 self.sent.echoed(echo.hb);
-                self.update.server_reached = true;
+                self.update.server_reached = Some(now.link);
             }
             self.clock = Some(ClockSample { t4_us: now.wall.0 * 1000, ..echo.clock });
             self.told_the_time(Utc(echo.clock.t3_us / 1000));

@@ -6,29 +6,32 @@
 //! Standard library only: nothing that the agent's updates replace is needed to start the agent. The number of tries since the
 //! program last ran well stands in FILE and is on the disk before each start, so that a machine that loses its power while it
 //! starts still counts. The program's pulse is one marked line a second on its standard output; all other lines pass through.
-//! Rooms: here a child is run, watched and started again; `orders` is the command line, `choose` what starts next, `beacon` the sign of life.
+//! Rooms: here a child is run, watched and started again; `orders` is the command line, `choose` what starts next, `beacon` the sign of life,
+//! `lock` keeps a second launcher of the same robot away.
 //! With `--sets` the program is the one of the set that the switch record names, and PROGRAM for a set that brings none. For a set with
 //! another base it starts the machine again, as far as there is one: the boot loader is simulated.
 //! Invariant: at most one child at a time; the switch record is written only while no child runs; a record that cannot be written, on a
 //! full disk, keeps no robot from being started: what would be in it holds for this launcher, which tries again. Ended by a signal, the launcher
-//! leaves the child to whoever sent it: a service manager signals the whole group.
+//! leaves the child to whoever sent it: a service manager signals the whole group, and an agent of ours asks for a signal at its parent's death.
 
 #![expect(clippy::disallowed_methods, reason = "a program of its own without a runtime and without simulated time")]
 
 mod beacon;
 mod choose;
+mod lock;
 mod orders;
 
-use crate::starts::{self, Tries};
+use crate::starts::{self, Environment, Tries};
 use beacon::{BEACON_EVERY, Beacon};
-use choose::{Start, Unwritten, choose, is_trusted, machine_starts, number};
+use choose::{Start, Unwritten, choose, is_trusted, machine_starts, number, write_held};
+use lock::LauncherLock;
 use orders::Orders;
 use std::fs;
 use std::io::{self, BufRead, BufReader, Write};
 use std::path::Path;
 use std::process::{Child, Command, ExitCode, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
-use std::time::{Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 /// Environment variable that names the set to the program that is started.
 pub const SET: &str = "MIDSHIFT_SET";
@@ -38,6 +41,9 @@ pub const PROGRAM: &str = "set.program";
 pub const SWITCH: &str = "switch";
 /// The program ends with this to be started again at once: it has written the switch record.
 pub const SWITCHED: u8 = 75;
+/// The program ends with this when its environment failed it: a lock that is taken, a full disk, a device that is missing. No try of a set is
+/// counted for it.
+pub const ENVIRONMENT: u8 = 74;
 /// Environment variable that asks the program for its pulse.
 pub const PULSE_ASKED: &str = "MIDSHIFT_PULSE";
 /// The pulse.
@@ -60,6 +66,8 @@ enum Ending {
     Finished,
     /// By itself, to be started again from the switch record.
     Switched,
+    /// Its environment failed it: no fault of its set.
+    Environment(String),
     /// By itself, otherwise.
     Failed(String),
     /// Killed: no pulse.
@@ -100,19 +108,27 @@ fn of_itself(first: &str) -> Option<&'static str> {
 }
 
 fn keep_running(orders: &Orders) -> io::Result<()> {
+    let _lock = LauncherLock::take(orders)?;
+    let begun = Instant::now();
     let mut beacon = Beacon::new(orders);
     if let Some(sets) = &orders.sets {
         machine_starts(sets)?;
     }
     let mut tries = read_tries(&orders.record);
     let mut unwritten = Unwritten::default();
+    let mut environment = Environment::default();
     loop {
-        let start = choose(orders, &tries, &mut unwritten)?;
-        tries = start.tries.clone();
+        let start = choose(orders, &tries, &mut unwritten, &mut environment, begun.elapsed())?;
+        let before = std::mem::replace(&mut tries, start.tries.clone());
         keep_tries(&orders.record, &tries);
         beacon.begins(&start, now_unix_s());
-        match run_once(orders, &start, &mut tries, &mut beacon)? {
+        let ending = run_once(orders, &start, &mut tries, &mut environment, &mut beacon)?;
+        if !matches!(ending, Ending::Environment(_)) {
+            environment.passed();
+        }
+        let pause = match ending {
             Ending::Finished => {
+                write_held(orders, &mut unwritten)?;
                 // A set on probation has proven nothing by ending.
                 if is_trusted(orders, &start) {
                     tries.clear();
@@ -125,20 +141,43 @@ fn keep_running(orders: &Orders) -> io::Result<()> {
                 keep_tries(&orders.record, &tries);
                 continue;
             }
-            Ending::Switched => say(&format!("{} of set {} ended to switch and did not", start.program, start.set)),
-            Ending::Failed(how) => say(&format!("{} of set {} ended: {how}", start.program, start.set)),
-            Ending::Hung => {
-                say(&format!("{} gave no sign for {} s and was killed", start.program, orders.hang.as_secs()))
+            Ending::Environment(how) => {
+                if environment.failed(begun.elapsed()) {
+                    unwritten.forget();
+                }
+                if tries == start.tries {
+                    tries = before;
+                    keep_tries(&orders.record, &tries);
+                }
+                say(&format!("set {} was failed by its environment ({how}): no try is counted", start.set));
+                environment.pause()
             }
-        }
-        let pause = tries.pause();
-        say(&format!("try {} in {} ms", tries.plus_one(&start.set).of(&start.set), pause.as_millis()));
+            Ending::Switched => next_try(&start, &tries, "ended to switch and did not"),
+            Ending::Failed(how) => next_try(&start, &tries, &format!("ended: {how}")),
+            Ending::Hung => {
+                next_try(&start, &tries, &format!("gave no sign for {} s and was killed", orders.hang.as_secs()))
+            }
+        };
         beacon.pause(pause);
     }
 }
 
+/// Says how a start ended that counts as a try; the time before the next one.
+fn next_try(start: &Start, tries: &Tries, how: &str) -> Duration {
+    let pause = tries.pause();
+    say(&format!("{} of set {} {how}", start.program, start.set));
+    say(&format!("try {} in {} ms", tries.plus_one(&start.set).of(&start.set), pause.as_millis()));
+    pause
+}
+
 /// Runs the program until it ends or hangs.
-fn run_once(orders: &Orders, start: &Start, tries: &mut Tries, beacon: &mut Beacon) -> io::Result<Ending> {
+fn run_once(
+    orders: &Orders,
+    start: &Start,
+    tries: &mut Tries,
+    environment: &mut Environment,
+    beacon: &mut Beacon,
+) -> io::Result<Ending> {
     let started = Command::new(&start.program)
         .args(&orders.arguments)
         .env(PULSE_ASKED, "1")
@@ -148,7 +187,11 @@ fn run_once(orders: &Orders, start: &Start, tries: &mut Tries, beacon: &mut Beac
         .spawn();
     let mut child = match started {
         Ok(child) => Kept(child),
-        Err(error) => return Ok(Ending::Failed(format!("cannot be started: {error}"))),
+        Err(error) => {
+            let how = format!("cannot be started: {error}");
+            let is_environment = starts::is_of_environment(&error);
+            return Ok(if is_environment { Ending::Environment(how) } else { Ending::Failed(how) });
+        }
     };
     let Some(output) = child.0.stdout.take() else { return Ok(Ending::Failed("has no output".to_owned())) };
     let (signs, heard) = sync_channel(16);
@@ -164,7 +207,7 @@ fn run_once(orders: &Orders, start: &Start, tries: &mut Tries, beacon: &mut Beac
         // The other end is gone only if the program was already given up.
         let _ = signs.send(Sign::Ended);
     });
-    let ending = watch(&mut child.0, &heard, orders, start, tries, beacon)?;
+    let ending = watch(&mut child.0, &heard, orders, start, tries, environment, beacon)?;
     drop(heard);
     drop(child);
     // A grandchild may keep the pipe open; it is not waited for.
@@ -178,6 +221,7 @@ fn watch(
     orders: &Orders,
     start: &Start,
     tries: &mut Tries,
+    environment: &mut Environment,
     beacon: &mut Beacon,
 ) -> io::Result<Ending> {
     let mut pulses = 0;
@@ -188,9 +232,12 @@ fn watch(
             Ok(Sign::Pulse) => {
                 pulses += 1;
                 sign_by = Instant::now() + orders.hang;
-                if starts::is_well(pulses) && is_trusted(orders, start) {
-                    tries.clear();
-                    keep_tries(&orders.record, tries);
+                if starts::is_well(pulses) {
+                    environment.passed();
+                    if is_trusted(orders, start) {
+                        tries.clear();
+                        keep_tries(&orders.record, tries);
+                    }
                 }
             }
             Ok(Sign::Ended) | Err(RecvTimeoutError::Disconnected) => return Ok(how_it_ended(child.wait()?)),
@@ -218,6 +265,7 @@ fn how_it_ended(status: ExitStatus) -> Ending {
     match status.code() {
         Some(0) => Ending::Finished,
         Some(code) if code == i32::from(SWITCHED) => Ending::Switched,
+        Some(code) if code == i32::from(ENVIRONMENT) => Ending::Environment(status.to_string()),
         _ => Ending::Failed(status.to_string()),
     }
 }

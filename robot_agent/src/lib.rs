@@ -11,6 +11,7 @@ pub mod device;
 pub mod dial;
 mod drive;
 pub mod enrolment;
+pub mod environment;
 pub mod governor;
 mod installed;
 pub mod lanes;

@@ -53,7 +53,7 @@ impl SqliteStore {
     /// Opens or makes the file, which only its owner may read: it holds secrets. Its folder must exist.
     pub async fn open(path: &Path) -> Result<Self, Error> {
         let lock = lock(path)?;
-        keep_private(path).map_err(|e| Error::WrongMode(format!("keeping {} private: {e}", path.display())))?;
+        keep_private(path).map_err(io_error(format!("keeping {} private", path.display())))?;
         let mut connection = SqliteConnectOptions::new()
             .filename(path)
             .create_if_missing(true)
@@ -268,11 +268,15 @@ async fn fact<T: Serialize + Sync>(on: &mut SqliteConnection, key: &'static str,
 }
 
 fn lock(path: &Path) -> Result<File, Error> {
-    let wrong = |detail: String| Error::WrongMode(detail);
     let name = path.with_extension("lock");
-    let file = File::create(&name).map_err(|e| wrong(format!("making {}: {e}", name.display())))?;
-    midshift_latch::lock(&file).map_err(|e| wrong(format!("another agent uses {}: {e}", path.display())))?;
+    let file = File::create(&name).map_err(io_error(format!("making {}", name.display())))?;
+    let held = midshift_latch::lock(&file).map_err(io::Error::from);
+    held.map_err(io_error(format!("locking {} against another agent", path.display())))?;
     Ok(file)
+}
+
+fn io_error(doing: String) -> impl FnOnce(io::Error) -> Error {
+    move |source| Error::Io { doing, source }
 }
 
 /// An empty file is a new database; the files that SQLite makes beside it have the same mode.

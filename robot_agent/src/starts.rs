@@ -4,10 +4,13 @@
 //! Called by [`crate::launcher`], and by a swarm in one process, whose agents have no launcher.
 
 use crate::switch::Switch;
+use std::io;
 use std::time::Duration;
 
 /// A set on trial is put away after so many starts that did not run well.
 pub const TRIES_MAX: u32 = 2;
+/// Failures of its environment in a row are waited out so long before the kept set shows whether they are a trial's own.
+pub const ENVIRONMENT_WAIT: Duration = Duration::from_secs(600);
 /// Without a pulse for so many seconds a program hangs.
 pub const HANG_SECONDS: u64 = 15;
 /// After so many pulses a program runs well and its tries count from 0 again.
@@ -53,9 +56,55 @@ impl Tries {
     }
     /// Time before the next start.
     pub fn pause(&self) -> Duration {
-        let (first, longest) = PAUSE_MS;
-        Duration::from_millis(first.saturating_mul(1 << self.count.saturating_sub(1).min(16)).min(longest))
+        pause_after(self.count)
     }
+}
+
+/// The pause after so many failures in a row.
+fn pause_after(failures: u32) -> Duration {
+    let (first, longest) = PAUSE_MS;
+    Duration::from_millis(first.saturating_mul(1 << failures.saturating_sub(1).min(16)).min(longest))
+}
+
+/// Starts in a row that their environment failed: a lock that is taken, a full disk, a device that is missing. They are tries of no set.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Environment {
+    /// When the first one of the set on trial failed, on the launcher's own clock.
+    since: Option<Duration>,
+    /// All of them.
+    count: u32,
+    /// The kept set was started in place of the one on trial.
+    asks_kept: bool,
+}
+
+impl Environment {
+    /// A start was failed by it. True: it was the kept set's, so the one on trial is not to blame, and is tried as long once more.
+    pub fn failed(&mut self, now: Duration) -> bool {
+        let asked = std::mem::take(&mut self.asks_kept);
+        self.count = self.count.saturating_add(1);
+        self.since = if asked { None } else { self.since.or(Some(now)) };
+        asked
+    }
+    /// A program ran well, or ended in another way.
+    pub fn passed(&mut self) {
+        *self = Self::default();
+    }
+    /// Whether the kept set is started now in place of the one on trial, which was failed for `patience`.
+    pub fn asks_kept(&mut self, switch: &Switch, patience: Duration, now: Duration) -> bool {
+        let is_long = self.since.is_some_and(|since| now.saturating_sub(since) >= patience);
+        self.asks_kept = switch.trial.is_some() && is_long;
+        self.asks_kept
+    }
+    /// Time before the next start.
+    pub fn pause(&self) -> Duration {
+        pause_after(self.count)
+    }
+}
+
+/// Whether an error of the system is one of the environment, which no set is to blame for.
+pub fn is_of_environment(error: &io::Error) -> bool {
+    use io::ErrorKind::{OutOfMemory, QuotaExceeded, ReadOnlyFilesystem, ResourceBusy, StorageFull, WouldBlock};
+    matches!(error.kind(), OutOfMemory | QuotaExceeded | ReadOnlyFilesystem | ResourceBusy | StorageFull | WouldBlock)
 }
 
 /// Puts a set on trial that has had its tries away: `current` runs next. Gives its tries; none: nothing changed.
@@ -115,6 +164,28 @@ mod tests {
         assert!(is_trusted(&switch));
         switch.commit();
         assert_eq!(put_away(&mut switch, &Tries::new("v2", 40)), None);
+    }
+
+    #[test]
+    fn the_kept_set_is_asked_after_ten_minutes_of_failures_in_a_row_and_a_trial_that_shares_them_waits_as_long_again() {
+        let mut switch = Switch::default();
+        let second = Duration::from_secs;
+        let mut environment = Environment::default();
+        assert!(!environment.failed(second(5)));
+        assert!(!environment.asks_kept(&switch, ENVIRONMENT_WAIT, second(9_000)), "nothing is on trial");
+        switch.try_out("v1");
+        assert!(!environment.asks_kept(&switch, ENVIRONMENT_WAIT, second(604)));
+        assert!(!environment.failed(second(604)));
+        assert!(environment.asks_kept(&switch, ENVIRONMENT_WAIT, second(605)));
+        assert!(environment.failed(second(606)), "it was the kept set's");
+        assert!(!environment.asks_kept(&switch, ENVIRONMENT_WAIT, second(9_000)), "the trial has not failed since");
+        assert!(!environment.failed(second(610)));
+        assert!(!environment.asks_kept(&switch, ENVIRONMENT_WAIT, second(1_209)));
+        assert!(environment.asks_kept(&switch, ENVIRONMENT_WAIT, second(1_210)));
+        environment.passed();
+        assert!(!environment.asks_kept(&switch, ENVIRONMENT_WAIT, second(9_000)));
+        assert!(!environment.failed(second(9_001)), "they are counted anew");
+        assert!(!environment.asks_kept(&switch, ENVIRONMENT_WAIT, second(9_600)));
     }
 
     #[test]

@@ -14,6 +14,7 @@ use midshift_core::ids::{AttemptId, DrainId, Subject};
 use midshift_core::policy::AreaPolicy;
 use midshift_core::robot::{Lane, ReportedAttempt};
 use midshift_core::work::{AttemptReport, Gap, Sample};
+use std::io;
 use std::sync::Arc;
 
 /// A store that could not keep or give back.
@@ -29,6 +30,14 @@ pub enum Error {
         what: String,
         /// What was wrong.
         detail: String,
+    },
+    /// Its file, or the lock against a second agent, could not be had.
+    #[error("{doing}: {source}")]
+    Io {
+        /// What was being done.
+        doing: String,
+        /// Why not.
+        source: io::Error,
     },
     /// The file is in a mode that would lose data.
     #[error("opening the robot's database: {0}")]

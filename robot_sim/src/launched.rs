@@ -142,6 +142,16 @@ impl Launched {
         self.kept.open()?.holdings()
     }
 
+    /// The set that runs has had its tries: one on trial is put away at the next start.
+    ///
+    /// # Errors
+    /// Sets that cannot be read.
+    pub fn use_up_tries(&self) -> Result<(), sets::Error> {
+        let holdings = self.holdings()?;
+        *lock(&self.tries) = Tries::new(holdings.switch.running(), starts::TRIES_MAX);
+        Ok(())
+    }
+
     /// The power goes: what was not synced is gone. A folder on a real disk knows no such thing.
     pub fn lose_power(&self) {
         if let Kept::Memory(sets) = &self.kept {

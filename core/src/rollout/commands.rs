@@ -1,5 +1,5 @@
 //! What people ask of roll-outs: write one down, check it, stand for it, begin, stand still, go on, judge, end, take back; and of robots: pin,
-//! leave out, lift a quarantine.
+//! leave out, lift a quarantine, go back once more.
 //!
 //! Invariant: a command is checked against the whole picture before anything of it is written; asked twice it does the same once.
 
@@ -8,10 +8,11 @@ use super::matching::{self, Members, keeps};
 use super::noted::{note, note_of_verb};
 use super::rows::{
     Act, Bundle, Counted, Outcome, Pause, Phase, Quarantine, RobotSoftware, Rollout, RolloutRobot, Step, Verdict,
+    WayBack,
 };
 use super::spec::{RolloutSpec, Wave};
 use super::view::View;
-use super::{Board, Plan, Tx, assign, moves, objects, phases, refusals, robots, verdict};
+use super::{Board, Plan, Tx, assign, hear, moves, objects, phases, refusals, robots, verdict};
 use crate::audit::{self, Note};
 use crate::gates::FailureEvidence;
 use crate::identity::{Actor, Caller};
@@ -98,6 +99,13 @@ pub enum Command {
         /// Whom.
         robot_id: RobotId,
     },
+    /// A person mended what kept the robot from going back: it is told to go back once more.
+    Unstick {
+        /// Whom.
+        robot_id: RobotId,
+        /// What was done.
+        reason: String,
+    },
     /// A person has looked: the robot may have the bundle again.
     LiftQuarantine {
         /// Whom.
@@ -113,7 +121,8 @@ impl Command {
         match self {
             Self::Create { rollout_id, .. } | Self::Do { rollout_id, .. } => vec![rollout_id],
             Self::Rollback { of, rollout_id } => vec![of, rollout_id],
-            Self::Revoke { .. } | Self::Pin { .. } | Self::Unpin { .. } | Self::LiftQuarantine { .. } => Vec::new(),
+            Self::Revoke { .. } | Self::Pin { .. } | Self::Unpin { .. } => Vec::new(),
+            Self::Unstick { .. } | Self::LiftQuarantine { .. } => Vec::new(),
         }
     }
 }
@@ -257,11 +266,27 @@ pub fn check(view: &View, board: &Board, command: &Command, seen: Option<Revisio
             let pinned = view.software_of(robot_id).pin.is_some();
             Ok(pinned == matches!(command, Command::Pin { .. }))
         }
+        Command::Unstick { robot_id, .. } => {
+            if !view.sessions.contains_key(robot_id.as_str()) {
+                return Err(not_found(Code::RobotNotFound, "robot_id", robot_id));
+            }
+            if stuck(view, robot_id).next().is_some() {
+                return Ok(false);
+            }
+            let reason = || Reason::from(Code::NotStuck).with("robot_id", robot_id);
+            let is_told = hear::rows_of(view, robot_id).any(|r| r.step == Step::Reverting && r.way_back.unstuck);
+            if is_told { Ok(true) } else { Err(Refusal::new(Kind::Precondition, reason())) }
+        }
         Command::LiftQuarantine { robot_id, bundle } => {
             let known = view.quarantines.contains_key(&Quarantine::id_of(robot_id, bundle));
             if known { Ok(false) } else { Err(not_found(Code::QuarantineNotFound, "robot_id", robot_id)) }
         }
     }
+}
+
+/// The robot in each roll-out that it could not go back from.
+fn stuck<'a>(view: &'a View, robot_id: &'a RobotId) -> impl Iterator<Item = &'a RolloutRobot> {
+    hear::rows_of(view, robot_id).filter(|r| r.step == Step::Stuck)
 }
 
 fn room(view: &View) -> Result<bool, Refusal> {
@@ -422,6 +447,13 @@ fn apply_one(tx: &mut Tx, board: &Board, command: &Command, actor: &Actor) {
             let row = tx.view.software_of(robot_id);
             tx.put(RobotSoftware { pin: None, ..row }, "robot.unpinned");
             tx.view.arrived.insert(robot_id.clone());
+        }
+        Command::Unstick { robot_id, .. } => {
+            let rows: Vec<RolloutRobot> = stuck(tx.view, robot_id).cloned().collect();
+            for row in rows {
+                let way_back = WayBack { unstuck: true, ..WayBack::default() };
+                tx.put(RolloutRobot { step: Step::Reverting, since: tx.now.utc, way_back, ..row }, "robot.unstuck");
+            }
         }
         Command::LiftQuarantine { robot_id, bundle } => {
             tx.delete::<Quarantine>(&Quarantine::id_of(robot_id, bundle), "quarantine.lifted");

@@ -5,7 +5,7 @@
 
 use super::rows::{Quarantine, RobotSoftware, RolloutRobot, Step};
 use super::view::View;
-use super::{Board, Tx, refusals};
+use super::{Board, Tx};
 use crate::ids::{DrainId, RobotId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -49,6 +49,11 @@ fn changed(tx: &mut Tx, robot_id: &RobotId, report: &UpdateReport) {
             }
             software.on_trial = None;
         }
+        // It keeps the bundle, which the rows did not know: a store that was restored has forgotten it.
+        UpdateState::Refused if report.reason.as_ref().is_some_and(|why| why.code == Code::SkippedCurrent) => {
+            software.committed = bundle;
+            software.on_trial = None;
+        }
         _ => {}
     }
     software.report = Some(report.clone());
@@ -79,7 +84,7 @@ fn directive_refused(tx: &mut Tx, robot_id: &RobotId, generation: u64, reason: &
     // One that lay too long says nothing against the robot: it is signed anew.
     let old = |r: &RolloutRobot| r.step == Step::Staging && is_old(&tx.now, r.signed);
     if let Some(row) = row.filter(|r| newest && !old(r)) {
-        let why = Some(refusals::skip_reason(Some(reason)));
+        let why = Some(reason.clone());
         tx.put(RolloutRobot { step: Step::Skipped, since: tx.now.utc, why, ..row }, "robot.skipped");
     }
 }

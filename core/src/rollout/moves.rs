@@ -112,7 +112,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             // A robot that is not heard goes back before it works again.
             let urgent = hard || !tx.view.is_heard(board, &tx.now, &r.robot_id);
             r.attempted |= rollout.revert_of.is_some();
-            r.way_back = WayBack::default();
+            r.way_back = WayBack { unstuck: r.way_back.unstuck, ..WayBack::default() };
             if r.drain_id.is_none() {
                 ask_drain(tx, &rollout, &mut r, urgent);
             }
@@ -160,11 +160,11 @@ pub fn is_signed(view: &View, rollout: &Rollout, r: &RolloutRobot, due: &Move) -
     }
 }
 
-/// It was told something else since, and has left it: only a directive of its own leads back from what it kept.
+/// It was told something else since, and has left it, or it was stuck: only a directive of its own leads back from what it kept.
 fn must_be_ordered_back(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
     let said = view.software_of(&r.robot_id).report.map(|report| report.bundle);
     let left = rollout.revert_of.is_some() && said.as_ref() != Some(&rollout.spec.bundle);
-    left || !view.desired.contains_key(r.robot_id.as_str())
+    left || r.way_back.unstuck || !view.desired.contains_key(r.robot_id.as_str())
 }
 
 /// Why a drain without a permission that may be alive may end.
@@ -255,7 +255,7 @@ fn order_back(tx: &mut Tx, sign: &dyn Sign, rollout: &Rollout, r: &mut RolloutRo
     let Some(generation) = direct(tx, sign, rollout, &r.robot_id, Goal::Revert, r.drain_id.clone()) else { return };
     let old = r.way_back.signed.is_some_and(|signed| is_old(&tx.now, signed));
     let again = r.way_back.refused.is_some() && !old;
-    r.way_back = WayBack { generation, signed: Some(tx.now.wall), refused: None, again };
+    r.way_back = WayBack { generation, signed: Some(tx.now.wall), refused: None, again, ..r.way_back };
 }
 
 fn next_generation(view: &View, robot_id: &RobotId, now: &Now) -> u64 {

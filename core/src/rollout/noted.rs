@@ -17,6 +17,7 @@ pub(super) fn note(command: &Command) -> Note {
         Command::Revoke { bundle, reason } => Note::new("bundle.revoke").about("bundle", bundle).because(reason),
         Command::Pin { robot_id, reason } => Note::new("robot.pin").about("robot", robot_id).because(reason),
         Command::Unpin { robot_id } => Note::new("robot.unpin").about("robot", robot_id),
+        Command::Unstick { robot_id, reason } => Note::new("robot.unstick").about("robot", robot_id).because(reason),
         Command::LiftQuarantine { robot_id, bundle } => {
             Note::new("quarantine.lift").about("robot", robot_id).about("bundle", bundle)
         }

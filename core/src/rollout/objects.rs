@@ -68,7 +68,7 @@ pub fn permit(view: &View, board: &Board, by: &Caller, command: &Command) -> Res
             }
         }
         Command::Revoke { .. } => by.needs(author, []),
-        Command::Pin { robot_id, .. } | Command::Unpin { robot_id } => {
+        Command::Pin { robot_id, .. } | Command::Unpin { robot_id } | Command::Unstick { robot_id, .. } => {
             if !view.sessions.contains_key(robot_id.as_str()) {
                 return Ok(());
             }

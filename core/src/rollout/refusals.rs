@@ -9,16 +9,6 @@ use crate::reason::{Code, Reason};
 /// So many robots hold a roll-out by refusing its content; in the first wave one does.
 const REFUSALS_HOLD: usize = 2;
 
-/// Why a robot that refused something is left out. What a person mends at the server or on the robot's disk keeps its own code; with
-/// everything else the bundle does not fit the robot.
-pub fn skip_reason(said: Option<&Reason>) -> Reason {
-    let said = said.cloned().unwrap_or_else(|| Code::BundleUnfit.into());
-    match said.code {
-        Code::BundleCorrupt | Code::MetadataRefused | Code::NoRoom | Code::BadSignature => said,
-        _ => Reason::new(Code::SkippedIncompatible, said.text()).with("because", said.name()),
-    }
-}
-
 /// Robots that refused the bytes or the documents of a roll-out.
 pub fn of_content<'a>(view: &'a View, rollout: &'a Rollout) -> impl Iterator<Item = &'a RolloutRobot> {
     let is_content = |why: &Reason| matches!(why.code, Code::BundleCorrupt | Code::MetadataRefused);

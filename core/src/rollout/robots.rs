@@ -8,7 +8,7 @@ use super::hear::{is_hard, is_old, report_of};
 use super::rows::{Given, Pause, Phase, Rollout, RolloutRobot, Step};
 use super::turns::{is_late, is_newcomer, is_on, is_retried};
 use super::view::View;
-use super::{Board, infrastructure, jams, matching, refusals, served, verdict};
+use super::{Board, infrastructure, jams, matching, served, verdict};
 use crate::authority::Authority;
 use crate::fleet::rows::DrainState;
 use crate::ids::{RobotId, RolloutId};
@@ -195,9 +195,9 @@ fn staging(
     })
 }
 
-/// Why a robot is left out that refused what it was told.
+/// Why the robot refused what it was told, in its own words.
 fn refused(report: Option<&UpdateReport>) -> Reason {
-    refusals::skip_reason(report.and_then(|r| r.reason.as_ref()))
+    report.and_then(|r| r.reason.clone()).unwrap_or_else(|| Code::BundleUnfit.into())
 }
 
 /// Its turn came long ago, and it has not fetched the bundle.
@@ -491,6 +491,8 @@ fn committing(view: &View, rollout: &Rollout, r: &RolloutRobot, report: Option<&
 }
 
 fn reverting(view: &View, board: &Board, now: &Now, r: &RolloutRobot, report: Option<&UpdateReport>) -> Option<Move> {
+    // What it said before a person mended it is no answer to the order that follows.
+    let report = report.filter(|said| said.state != UpdateState::Stuck || r.way_back.is_answered_by(said));
     if let Some(over) = ended(r, report) {
         return Some(over);
     }
@@ -503,7 +505,8 @@ fn reverting(view: &View, board: &Board, now: &Now, r: &RolloutRobot, report: Op
     let Some(drain_id) = &r.drain_id else { return Some(Move::Revert) };
     // In this drain: in another it was told to go back from something else.
     let told = view.desired.get(r.robot_id.as_str()).and_then(|d| d.row.drain_id.as_ref());
-    if wants(view, r, Goal::Revert) && told == Some(drain_id) {
+    let is_unsaid = r.way_back.unstuck && r.way_back.generation == 0;
+    if wants(view, r, Goal::Revert) && told == Some(drain_id) && !is_unsaid {
         // What it took does not end; what it did not take yet does.
         let taken = report.is_some_and(|report| report.directive >= r.way_back.generation);
         let old = r.way_back.signed.is_some_and(|signed| is_old(now, signed));

@@ -476,6 +476,16 @@ pub struct WayBack {
     pub refused: Option<Reason>,
     /// The robot did not take the one before it either, though that one was not too old to be taken.
     pub again: bool,
+    /// A person mended what kept the robot from going back: only an answer to an order of its own counts from then on.
+    #[serde(default)]
+    pub unstuck: bool,
+}
+
+impl WayBack {
+    /// Whether what a robot says of its update comes after the order that it was given.
+    pub const fn is_answered_by(&self, report: &UpdateReport) -> bool {
+        !self.unstuck || (self.generation > 0 && report.directive >= self.generation)
+    }
 }
 
 /// One robot in one roll-out.

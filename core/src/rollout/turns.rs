@@ -22,10 +22,20 @@ pub fn is_newcomer(rollout: &Rollout, r: &RolloutRobot) -> bool {
     r.wave > rollout.spec.waves.len() as u32
 }
 
+/// Reasons that may have passed by the end of a roll-out: the server's, and those of a robot that refused.
+const PASSING: [Code; 7] = [
+    Code::SkippedOffline,
+    Code::SkippedBusy,
+    Code::SkippedStuck,
+    Code::NoRoom,
+    Code::BaseTooSoon,
+    Code::MetadataRefused,
+    Code::DirectiveRefused,
+];
+
 /// Whether a robot that was skipped is tried once more at the end.
 pub fn is_retried(r: &RolloutRobot) -> bool {
-    let codes = [Code::SkippedOffline, Code::SkippedBusy, Code::SkippedStuck];
-    r.why.as_ref().is_some_and(|why| codes.contains(&why.code))
+    r.why.as_ref().is_some_and(|why| PASSING.contains(&why.code))
 }
 
 /// The robot's turn came long ago. The time in which the roll-out stood still does not count.

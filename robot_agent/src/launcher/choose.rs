@@ -6,11 +6,12 @@
 use super::orders::Orders;
 use super::{PROGRAM, SWITCH, say};
 use crate::boot::{BASE, BOOT, Boot, Image, Slot};
-use crate::starts::{self, Tries};
+use crate::starts::{self, Environment, Tries};
 use crate::switch::{self, Switch};
 use std::fs;
 use std::io;
 use std::path::Path;
+use std::time::Duration;
 
 /// What is started next.
 #[derive(Debug, PartialEq, Eq)]
@@ -23,7 +24,7 @@ pub(super) struct Start {
     pub(super) number: u64,
 }
 
-/// A switch record that this launcher could not write: it holds as long as the one on the disk is the one that it was to follow.
+/// A switch record that this launcher could not write, or does not yet: it holds as long as the one on the disk is the one that it was to follow.
 #[derive(Default)]
 pub(super) struct Unwritten(Option<Switch>);
 
@@ -45,10 +46,25 @@ impl Unwritten {
         self.0 = Some(switch.clone());
         before
     }
+    /// Keeps a record that follows `switch`, to be written before the next start.
+    fn hold(&mut self, switch: &Switch) {
+        self.0 = Some(Switch { number: switch.number + 1, ..switch.clone() });
+    }
+    /// The record on the disk holds again.
+    pub(super) fn forget(&mut self) {
+        self.0 = None;
+    }
 }
 
-/// The set that the record names; one on trial that has had its tries is put away first.
-pub(super) fn choose(orders: &Orders, tries: &Tries, unwritten: &mut Unwritten) -> io::Result<Start> {
+/// The set that the record names. One on trial that has had its tries is put away first; one that its environment has failed for long stands
+/// back for the kept set, and is put away only if that one is not failed the same way.
+pub(super) fn choose(
+    orders: &Orders,
+    tries: &Tries,
+    unwritten: &mut Unwritten,
+    environment: &mut Environment,
+    now: Duration,
+) -> io::Result<Start> {
     let Some(sets) = &orders.sets else {
         let set = switch::FACTORY.to_owned();
         return Ok(Start { tries: tries.plus_one(&set), program: orders.program.clone(), set, number: 0 });
@@ -61,6 +77,11 @@ pub(super) fn choose(orders: &Orders, tries: &Tries, unwritten: &mut Unwritten) 
         number = unwritten.write(&mut switch, &path);
     }
     let had = tries.of(switch.running());
+    if environment.asks_kept(&switch, orders.patience, now) {
+        say(&format!("set {} is failed by its environment: is {} too?", switch.running(), switch.current));
+        switch.fall_back(had.max(1));
+        unwritten.hold(&switch);
+    }
     if !boot_into(sets, &switch, had)? {
         if switch.trial.is_some() {
             say(&format!("set {} has a base that does not start; back to {}", switch.running(), switch.current));
@@ -76,6 +97,11 @@ pub(super) fn choose(orders: &Orders, tries: &Tries, unwritten: &mut Unwritten) 
     let own = sets.join(&set).join(PROGRAM);
     let program = if own.exists() { own.to_string_lossy().into_owned() } else { orders.program.clone() };
     Ok(Start { tries: tries.plus_one(&set), program, set, number })
+}
+
+/// Writes a record that was held back, before the launcher ends.
+pub(super) fn write_held(orders: &Orders, unwritten: &mut Unwritten) -> io::Result<()> {
+    orders.sets.as_ref().map_or(Ok(()), |sets| unwritten.read(&sets.join(SWITCH)).map(drop))
 }
 
 /// Number of the switch record; it rises with each change.

@@ -2,7 +2,7 @@
 //!
 //! Invariant: it is read whole or refused. Called by the launcher when it begins.
 
-use crate::starts::HANG_SECONDS;
+use crate::starts::{ENVIRONMENT_WAIT, HANG_SECONDS};
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -12,6 +12,8 @@ pub(super) struct Orders {
     pub(super) record: PathBuf,
     pub(super) sets: Option<PathBuf>,
     pub(super) hang: Duration,
+    /// So long a set on trial may be failed by its environment before the kept set is started in its place.
+    pub(super) patience: Duration,
     pub(super) beacon: Option<(String, String)>,
     pub(super) program: String,
     pub(super) arguments: Vec<String>,
@@ -43,6 +45,7 @@ impl Orders {
                         record: record.ok_or("--record is required")?,
                         sets,
                         hang: Duration::from_secs(hang),
+                        patience: ENVIRONMENT_WAIT,
                         beacon,
                         program: arguments.next().ok_or("a program is required after --")?,
                         arguments: arguments.collect(),

@@ -7,7 +7,6 @@ use crate::starts::TRIES_MAX;
 use crate::switch::{self, Switch};
 use std::net::UdpSocket;
 use std::path::PathBuf;
-use std::time::Duration;
 use tempfile::TempDir;
 
 fn given(text: &str) -> Result<Orders, String> {
@@ -23,6 +22,7 @@ fn robot(script: &str) -> (TempDir, Orders) {
         sets: None,
         // Longer than a shell may take to begin on a machine that is busy.
         hang: Duration::from_secs(60),
+        patience: starts::ENVIRONMENT_WAIT,
         beacon: None,
         program: "sh".to_owned(),
         arguments,
@@ -72,7 +72,8 @@ fn on_trial_by(set: &str, beside: &Path) {
 
 /// What a launcher that has just begun starts.
 fn chosen(orders: &Orders) -> Start {
-    choose(orders, &read_tries(&orders.record), &mut Unwritten::default()).expect("chooses")
+    let (mut unwritten, mut environment) = (Unwritten::default(), Environment::default());
+    choose(orders, &read_tries(&orders.record), &mut unwritten, &mut environment, Duration::ZERO).expect("chooses")
 }
 
 fn record(orders: &Orders) -> Switch {
@@ -121,10 +122,9 @@ fn a_program_without_a_pulse_is_killed() {
     let (_folder, mut orders) = robot("echo a line is no pulse; exec sleep 600");
     orders.hang = Duration::from_secs(1);
     let start = chosen(&orders);
-    assert_eq!(
-        run_once(&orders, &start, &mut start.tries.clone(), &mut Beacon::new(&orders)).expect("runs"),
-        Ending::Hung
-    );
+    let (mut tries, mut environment, mut beacon) = (start.tries.clone(), Environment::default(), Beacon::new(&orders));
+    let ending = run_once(&orders, &start, &mut tries, &mut environment, &mut beacon).expect("runs");
+    assert_eq!(ending, Ending::Hung);
 }
 
 #[test]
@@ -178,6 +178,59 @@ fn a_set_on_probation_that_ends_well_or_to_switch_and_changes_nothing_is_put_awa
     }
     assert_eq!(ran(&folder), ["v1", "v1", "factory"]);
     assert_eq!(record(&orders).trial, None);
+}
+
+#[test]
+fn a_second_launcher_of_a_robot_starts_nothing_while_the_first_one_lives() {
+    let (folder, orders) = with_sets(&[]);
+    let (_alone, without_sets) = robot("exit 0");
+    for orders in [&orders, &without_sets] {
+        let first = LauncherLock::take(orders).expect("is free");
+        let error = keep_running(orders).expect_err("is refused");
+        assert_eq!(error.kind(), io::ErrorKind::WouldBlock, "{error}");
+        drop(first);
+    }
+    assert_eq!(ran(&folder), [] as [&str; 0]);
+    keep_running(&orders).expect("runs");
+    assert_eq!(ran(&folder), ["factory"]);
+}
+
+#[test]
+fn a_program_that_its_environment_failed_has_had_no_try() {
+    let (folder, orders) = with_sets(&[("v1", "test $(wc -l < ${0%/*}/../../ran) -ge 3 && exit 1; exit 74")]);
+    on_trial(&orders, "v1");
+    keep_running(&orders).expect("runs");
+    assert_eq!(
+        ran(&folder),
+        ["v1", "v1", "v1", "v1", "factory"],
+        "two failures of its own after two of its environment"
+    );
+}
+
+#[test]
+fn a_set_whose_environment_fails_it_alone_is_put_away() {
+    let (folder, mut orders) = with_sets(&[("v1", "exit 74")]);
+    orders.patience = Duration::ZERO;
+    on_trial(&orders, "v1");
+    keep_running(&orders).expect("runs");
+    assert_eq!(ran(&folder), ["v1", "factory"]);
+    let after = record(&orders);
+    let fallen = after.fallen.as_ref().map(|fallen| fallen.set.as_str());
+    assert_eq!((after.running(), fallen), ("factory", Some("v1")));
+}
+
+#[test]
+fn a_set_on_trial_is_not_blamed_for_an_environment_that_fails_the_kept_set_too() {
+    let (folder, mut orders) = with_sets(&[("v1", "test -e ${0%/*}/../../broken && exit 74; exit 0")]);
+    orders.patience = Duration::ZERO;
+    let broken = folder.path().join("broken");
+    fs::write(&broken, "").expect("writes");
+    orders.arguments[1] = format!("echo $MIDSHIFT_SET >> $0; rm {} && exit 74; exit 0", broken.display());
+    on_trial(&orders, "v1");
+    let before = record(&orders);
+    keep_running(&orders).expect("runs");
+    assert_eq!(ran(&folder), ["v1", "factory", "v1"]);
+    assert_eq!(record(&orders), before, "it is still on trial");
 }
 
 #[test]

@@ -262,8 +262,8 @@ pub(crate) struct Updater {
     pub(crate) stale_grant: u64,
     /// When this process began.
     pub(crate) begun: Option<(LinkTime, SiteTime)>,
-    /// The server has answered a heartbeat of this process.
-    pub(crate) server_reached: bool,
+    /// When the server last answered a heartbeat of this process.
+    pub(crate) server_reached: Option<LinkTime>,
     /// The switch back was written by this process.
     pub(crate) went_back: bool,
     /// The download under way is to be left, and that was said.

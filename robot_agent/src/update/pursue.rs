@@ -27,6 +27,8 @@ const ASK_AGAIN: LinkDuration = LinkDuration(10_000);
 const LOOK_EVERY: LinkDuration = LinkDuration(60_000);
 /// A set on probation that does not reach its server for so long is gone back from.
 const LOST_SERVER: LinkDuration = LinkDuration(600_000);
+/// At the end of a probation the server must have answered within this, or within half of the probation where that is less.
+const REACHED_WITHIN: LinkDuration = LinkDuration(30_000);
 
 impl AgentCore {
     /// Takes section `update` in.
@@ -290,11 +292,13 @@ impl AgentCore {
         if self.is_observed() || self.names(&desired) {
             return false;
         }
-        if holdings.switch.kept().is_none() {
+        let software = self.kept.ledger.software.clone();
+        let stuck = software.update.clone().filter(|update| update.state == UpdateState::Stuck);
+        let is_back = stuck.as_ref().and_then(Update::set_name).is_some_and(|set| set != holdings.switch.running());
+        if holdings.switch.kept().is_none() && !is_back {
             self.refuse_way_back();
             return false;
         }
-        let software = self.kept.ledger.software.clone();
         let trusted = match self.trusted() {
             Ok(trusted) => trusted,
             Err(reason) => {
@@ -316,6 +320,15 @@ impl AgentCore {
                 return false;
             }
         };
+        if let Some(update) = stuck.filter(|update| update.bundle == directive.manifest) {
+            // A person mended what kept it: it is gone back from once more.
+            self.update.judged = Some(desired.directive.clone());
+            self.put_software(software.with(&directive, &desired));
+            let (state, reason) = (UpdateState::RollingBack, Some(Reason::from(Code::RevertAsked)));
+            let drain_id = desired.drain_id.or(update.drain_id);
+            self.put_update(Update { state, drain_id, reason, ..update });
+            return true;
+        }
         let set = holdings.set(&holdings.switch.current).filter(|set| set.bundle == Some(directive.manifest));
         let Some(set) = set else {
             self.refuse_directive(Reason::new(Code::DirectiveRefused, "another bundle is the committed one"));
@@ -392,6 +405,9 @@ impl AgentCore {
                 return self.move_to(UpdateState::Refused, Some(reason));
             }
         };
+        if set.id() == current.id() {
+            return self.move_to(UpdateState::Refused, Some(Reason::from(Code::SkippedCurrent)));
+        }
         if let Some(component) = manifest.components.iter().find(|c| !self.lists(&c.digest, c.length)) {
             let reason = Reason::from(Code::BundleUnfit).with("unlisted", &component.name);
             return self.move_to(UpdateState::Refused, Some(reason));
@@ -603,7 +619,10 @@ impl AgentCore {
         let Some(name) = update.set_name() else { return };
         let runs = switch.trial.as_ref().is_some_and(|t| t.set == name);
         let fallen = switch.fallen.as_ref().filter(|f| f.set == name);
-        let active = matches!(update.state, UpdateState::Switching | UpdateState::Probation | UpdateState::Trial);
+        let active = matches!(
+            update.state,
+            UpdateState::Switching | UpdateState::Probation | UpdateState::Trial | UpdateState::Committing
+        );
         if let Some(fallen) = fallen.filter(|_| active) {
             let reason = Reason::from(Code::ProgramCrashed).with("tries", fallen.tries);
             let (state, tries) = (UpdateState::RolledBack, fallen.tries);
@@ -630,14 +649,18 @@ impl AgentCore {
             return self.go_back(update, Reason::from(Code::RevertAsked));
         }
         let Some((link, site)) = self.update.begun else { return };
-        if !self.update.server_reached {
-            if now.link.since(link) >= LOST_SERVER {
-                return self.go_back(update, Reason::from(Code::LostServer));
-            }
-            return self.wake_at(link + LOST_SERVER);
+        let lost_at = self.update.server_reached.unwrap_or(link) + LOST_SERVER;
+        if now.link >= lost_at {
+            return self.go_back(update, Reason::from(Code::LostServer));
         }
+        self.wake_at(lost_at);
         if now.site.since(site) < SiteDuration(update.probation_ms) {
             self.wake_site = Some(site + SiteDuration(update.probation_ms));
+            return;
+        }
+        // An answer of long ago proves nothing of what runs now: the next one is waited for.
+        let recent = REACHED_WITHIN.min(LinkDuration(update.probation_ms / 2));
+        if self.update.server_reached.is_none_or(|at| now.link.since(at) > recent) {
             return;
         }
         self.move_to(UpdateState::Trial, None);
@@ -669,11 +692,16 @@ impl AgentCore {
         self.prove(holdings);
     }
 
+    /// Floors rise and migrations become due only once the switch record names the set as committed.
     fn committing(&mut self, now: &Now, update: Update, holdings: &Holdings) {
-        if holdings.switch.trial.is_some() {
+        let name = update.set_name();
+        if holdings.switch.trial.as_ref().is_some_and(|trial| Some(&trial.set) == name.as_ref()) {
             let mut switch = holdings.switch.clone();
             switch.commit();
             return self.ask_for(Job::Write(switch));
+        }
+        if holdings.switch.trial.is_some() || Some(&holdings.switch.current) != name.as_ref() {
+            return self.move_to(UpdateState::RolledBack, Some(Reason::from(Code::SetPutAway)));
         }
         let kept = holdings.switch.kept().and_then(|kept| holdings.set(kept)).unwrap_or_default();
         let mut row = SoftwareRow { committed_at: Some(now.utc), ..self.kept.ledger.software.clone() };

@@ -49,7 +49,7 @@ fn on_a_full_disk_the_launcher_starts_the_kept_set_and_says_what_it_could_not_wr
     assert_eq!(fs::read_to_string(&ran).expect("it was started"), format!("{FACTORY}\n"));
     let full =
         fs::read_to_string(&trace).expect("a trace").matches("ENOSPC (No space left on device) (INJECTED)").count();
-    assert_eq!(full, 5, "two tries of {name}, the switch record, the start of the kept set and its end: {said}");
+    assert_eq!(full, 6, "two tries of {name}, the switch record twice, the start of the kept set and its end: {said}");
     assert!(said.contains(&format!("set {name} did not live in {TRIES_MAX} tries; back to {FACTORY}")), "{said}");
     let why = format!("{} cannot be written: No space left on device", sets.join(SWITCH).display());
     assert!(said.contains(&why), "{said}");

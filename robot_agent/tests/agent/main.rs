@@ -3,6 +3,7 @@
 mod bases;
 mod beside;
 mod chaos;
+mod cuts;
 mod device;
 mod drives;
 mod durability;

@@ -28,7 +28,7 @@ pub fn drain(name: &str) -> DrainId {
 pub struct Order {
     directive: String,
     pub generation: u64,
-    drain_id: Option<DrainId>,
+    pub drain_id: Option<DrainId>,
     granted: u64,
 }
 
@@ -451,6 +451,65 @@ fn software_that_does_not_reach_its_server_goes_back_and_one_that_does_is_proven
 }
 
 #[test]
+fn an_answer_at_the_beginning_of_a_probation_does_not_end_it() {
+    let (mut rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let mut order = stage(&mut rig, &releases, &bundle, 1);
+    activate(&mut rig, &mut order, "drain-1");
+    let mut rig = relaunch(rig);
+    rig.silence(PROBATION_MS + 1_000);
+    assert_eq!(state(&rig), Some(UpdateState::Probation), "it was heard, and not since");
+    rig.echo();
+    assert_eq!(state(&rig), Some(UpdateState::Trial));
+}
+
+#[test]
+fn an_order_for_the_set_that_runs_already_is_answered_and_changes_nothing() {
+    let (rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let mut rig = committed(rig, &releases, &bundle, 1);
+    let (before, served) = (switch(&rig), releases.served());
+    let mut order = stage(&mut rig, &releases, &bundle, 2);
+    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::Refused), Some(Code::SkippedCurrent)));
+    assert!(releases.served() <= served + bundle.length, "only its manifest came");
+    for goal in [Goal::Activate, Goal::Revert] {
+        want(&mut rig, order.to(goal));
+        rig.pass(5_000);
+        assert_eq!((switch(&rig), state(&rig), rig.exit), (before.clone(), Some(UpdateState::Refused), None));
+    }
+}
+
+#[test]
+fn a_stuck_robot_goes_back_by_a_newer_order_once_its_kept_set_is_whole_again() {
+    let (rig, releases) = connected();
+    let (first, second) = (releases.release("1.1.0"), releases.release("1.2.0"));
+    let rig = committed(rig, &releases, &first, 1);
+    let kept = name_of(&rig);
+    let (mut rig, mut order) = on_trial(rig, &releases, &second, 2);
+    let sets = rig.updates.as_ref().expect("has them").sets.clone();
+    // The second time its byte is as it was.
+    let rot = || sets.rot(&first.manifest.components[0].digest);
+    rot();
+    want(&mut rig, order.to(Goal::Revert));
+    assert_eq!(state(&rig), Some(UpdateState::Stuck));
+    let order_back = |rig: &mut Rig, generation: u64| {
+        let mut order = Order::new(releases.directive(&second, generation));
+        order.generation = generation * 100_000;
+        want(rig, order.to(Goal::Revert));
+    };
+    order_back(&mut rig, 3);
+    let told = report(&rig).map(|told| (told.state, told.directive));
+    assert_eq!((told, rig.exit), (Some((UpdateState::Stuck, 3)), None), "it looked, and nothing was mended");
+    rot();
+    rig.pass(5_000);
+    assert_eq!(state(&rig), Some(UpdateState::Stuck), "nobody has said so");
+    order_back(&mut rig, 4);
+    let mut rig = relaunch(rig);
+    rig.pass(1_000);
+    assert_eq!((state(&rig), switch(&rig).running()), (Some(UpdateState::RolledBack), kept.as_str()));
+}
+
+#[test]
 fn what_the_launcher_put_away_is_told_and_not_tried_again() {
     let (mut rig, releases) = connected();
     let bundle = releases.release("1.1.0");
@@ -465,6 +524,31 @@ fn what_the_launcher_put_away_is_told_and_not_tried_again() {
     want(&mut rig, order.to(Goal::Stage));
     rig.pass(60_000);
     assert_eq!(state(&rig), Some(UpdateState::RolledBack), "the same directive is over");
+}
+
+#[test]
+fn a_set_that_was_put_away_while_it_was_being_committed_is_fallen_and_moves_no_floor_and_no_data() {
+    let (rig, releases) = connected();
+    let bundle = releases.release_as("1.1.0", |m| {
+        m.components[0].rollback_index = 3;
+        m.components[0].data_migration = Migration::Reversible;
+    });
+    let (rig, mut order) = on_trial(rig, &releases, &bundle, 1);
+    // The power went before the switch record was written, and the launcher put the set away.
+    let mut software = rig.store.kept().expect("loaded").ledger.software;
+    software.update.as_mut().expect("an update").state = UpdateState::Committing;
+    rig.store.commit_now(&[midshift_agent::store::Op::Software(Box::new(software))]);
+    rig.updates.as_ref().expect("has them").sets.fall_back(2);
+    let mut rig = rig.restart();
+    rig.connect();
+    want(&mut rig, order.to(Goal::Commit));
+    rig.pass(5_000);
+    let told = report(&rig).expect("a report");
+    let why = told.reason.map(|reason| reason.code);
+    assert_eq!((told.state, told.tries, why), (UpdateState::RolledBack, 2, Some(Code::ProgramCrashed)));
+    let software = rig.store.kept().expect("loaded").ledger.software;
+    assert_eq!((software.floors.len(), software.due.len(), software.committed_at), (0, 0, None));
+    assert_eq!((migrations(&rig), switch(&rig).running()), (vec![], "factory"));
 }
 
 #[test]
@@ -628,97 +712,6 @@ fn a_robot_that_is_not_set_up_for_it_leaves_its_software_alone() {
     assert_eq!((state(&rig), releases.served()), (None, 0));
 }
 
-// --- the power
-
-/// What the server would say now, whatever was lost: level-triggered.
-fn server_says(rig: &mut Rig, order: &mut Order, grants: &mut u64, back: bool) {
-    let at = state(rig);
-    order.generation += 10;
-    let idle = matches!(at, Some(UpdateState::Trial | UpdateState::Committed | UpdateState::RolledBack));
-    order.drain_id = Some(drain("drain-1"));
-    maintain(rig, order.drain_id.as_ref().filter(|_| !idle));
-    let goal = match at {
-        Some(UpdateState::Trial) if back => Goal::Revert,
-        Some(UpdateState::RollingBack) => Goal::Revert,
-        Some(UpdateState::Trial | UpdateState::Committing) => Goal::Commit,
-        _ => Goal::Activate,
-    };
-    let mut desired = order.to(goal);
-    if at == Some(UpdateState::Staged) {
-        *grants += 1;
-        let (grant_id, authority) = (*grants, rig.authority(5_000));
-        desired.grant = Some(ActivationGrant { grant_id, drain_id: drain("drain-1"), authority });
-    }
-    want(rig, desired);
-}
-
-/// One update to its end, with the power going at one of its effects. Gives back how it ended and how many effects there were.
-fn with_power_cut(at: Option<usize>, last_is_done: bool, back: bool, bases: bool) -> (UpdateState, usize) {
-    let (rig, releases) = connected();
-    let release = |version| if bases { releases.release_base(version) } else { releases.release(version) };
-    let first = release("1.1.0");
-    let mut rig = committed(rig, &releases, &first, 1);
-    a_day_passes(&mut rig, &releases);
-    let second = release("1.2.0");
-    let (good, mut grants) = (name_of(&rig), 1_000_000);
-    let mut order = Order::new(releases.directive(&second, 2));
-    order.generation = 10_000;
-    let updates = rig.updates.as_mut().expect("has them");
-    let before = updates.effects;
-    (updates.cut_at, updates.last_is_done) = (at.map(|at| before + at), last_is_done);
-    for _ in 0..200 {
-        server_says(&mut rig, &mut order, &mut grants, back);
-        rig.pass(2_000);
-        let updates = rig.updates.as_ref().expect("has them");
-        if updates.dark {
-            updates.sets.lose_power();
-        }
-        if updates.dark || rig.exit == Some(ExitReason::Switched) {
-            boots_something_whole(&rig, &good);
-            rig = rig.restart();
-            rig.connect();
-        }
-        let told = report(&rig).filter(|r| r.bundle.as_str() == second.digest.to_string());
-        let ended = |r: &UpdateReport| matches!(r.state, UpdateState::Committed | UpdateState::RolledBack);
-        let migrates = !rig.store.kept().expect("loaded").ledger.software.due.is_empty();
-        if let Some(told) = told.filter(ended).filter(|_| !migrates) {
-            let migrated = migrations(&rig);
-            assert_eq!(migrated.contains(&"1.2.0".to_owned()), bases && !back, "{migrated:?}");
-            boots_something_whole(&rig, &good);
-            return (told.state, rig.updates.as_ref().map_or(0, |u| u.effects) - before);
-        }
-    }
-    panic!("never ended: power went at {at:?}, {:?}", report(&rig));
-}
-
-/// Whatever the launcher would start now is whole.
-fn boots_something_whole(rig: &Rig, good: &str) {
-    let mut sets = rig.updates.as_ref().expect("has them").sets.clone();
-    let record = sets.holdings().expect("a record").switch;
-    let running = record.running().parse().expect("a set, not the factory's");
-    sets.verify(&running).expect("is whole");
-    if record.trial.is_some() {
-        assert_eq!(record.current, good, "what is gone back to is the set committed last");
-        sets.verify(&good.parse().expect("a set")).expect("is whole");
-    }
-}
-
-#[test]
-fn the_power_may_go_at_every_effect_of_an_update_and_it_still_ends() {
-    let ends = [(false, UpdateState::Committed), (true, UpdateState::RolledBack)];
-    for (back, end, bases) in ends.into_iter().flat_map(|(back, end)| [(back, end, false), (back, end, true)]) {
-        let (undisturbed, effects) = with_power_cut(None, false, back, bases);
-        assert_eq!(undisturbed, end);
-        assert!(effects > 20, "only {effects} effects");
-        for at in 1..=effects {
-            for last_is_done in [false, true] {
-                let (ended, _) = with_power_cut(Some(at), last_is_done, back, bases);
-                assert_eq!(ended, end, "the power went at {at} of {effects}, done: {last_is_done}, bases: {bases}");
-            }
-        }
-    }
-}
-
 #[test]
 fn what_was_asked_of_the_disk_is_on_the_ledger_first() {
     let (mut rig, releases) = connected();
@@ -737,7 +730,8 @@ fn what_was_asked_of_the_disk_is_on_the_ledger_first() {
 
 #[test]
 fn a_switch_that_waits_for_the_disk_is_not_made_once_its_grant_has_ended_or_something_came_between() {
-    let changes: [(&str, fn(&mut Rig)); 5] = [
+    type Change = fn(&mut Rig);
+    let changes: [(&str, Change); 5] = [
         ("grant", |rig| rig.silence(6_000)),
         ("stop", |rig| rig.body.says(BodyNews::HardwareStop(HardwareStop::Manual))),
         ("mode", |rig| rig.body.says(BodyNews::Mode(Mode::Manual))),

@@ -23,6 +23,7 @@ use midshift_core::update::UpdateState;
 use midshift_proto::telemetry::v1::GetRobotRequest;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
 use midshift_sim::swarm::AGENT_FILE;
+use std::fs::File;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -108,8 +109,12 @@ impl Machine {
     }
     /// The launcher with an agent that dials `server`; what the robot came with ends at once and well.
     fn launch(&self, server: &str, enrolment: Option<&str>) -> anyhow::Result<Launched> {
+        self.launch_by("exec ", server, enrolment)
+    }
+    /// As [`Machine::launch`], by a shell that becomes the agent, or waits for it.
+    fn launch_by(&self, exec: &str, server: &str, enrolment: Option<&str>) -> anyhow::Result<Launched> {
         let midshift = midshift()?;
-        let script = format!("test $MIDSHIFT_SET = {FACTORY} || exec \"$0\" \"$@\"");
+        let script = format!("test $MIDSHIFT_SET = {FACTORY} || {exec}\"$0\" \"$@\"; exit $?");
         let mut command = Command::new(&midshift);
         if let Some(secret) = enrolment {
             command.env("MIDSHIFT_ENROLL", secret);
@@ -183,6 +188,31 @@ async fn a_launched_robot_says_the_version_of_the_set_it_runs() -> anyhow::Resul
         Ok(asked.ok().and_then(|robot| robot.into_inner().robot?.inventory).map(|inventory| inventory.software))
     });
     assert_eq!(version.await?, "1.5.0", "{}", text_of(&machine.log()));
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_agent_ends_when_its_launcher_is_killed_and_a_second_launcher_is_refused() -> anyhow::Result<()> {
+    for exec in ["exec ", ""] {
+        let machine = Machine::new()?;
+        let set = machine.stage("1.5.0", "speed_permille = 900\n")?;
+        machine.switch(|switch| {
+            switch.try_out(&set.id().to_string());
+            switch.commit();
+        })?;
+        let mut launched = machine.launch_by(exec, "127.0.0.1:1", None)?;
+        // Who has the lock of its data folder lives.
+        let lock = machine.path("data").join(AGENT_FILE).with_extension("lock");
+        let is_free = || Ok::<_, anyhow::Error>(File::open(&lock)?.try_lock().is_ok());
+        until("the agent to run", LIMIT, || async { Ok((lock.exists() && !is_free()?).then_some(())) }).await?;
+        let mut second = machine.launch("127.0.0.1:1", None)?;
+        assert_eq!(second.0.ends().await?, Some(1));
+        launched.0.signal("KILL")?;
+        launched.0.ends().await?;
+        until("the agent to end", LIMIT, || async { Ok(is_free()?.then_some(())) }).await?;
+        let said = text_of(&machine.log());
+        assert!(said.contains("another launcher of this robot runs"), "{said}");
+    }
     Ok(())
 }
 

@@ -58,13 +58,19 @@ struct Cut {
     step: UpdateState,
     /// The step is on the disk and nothing of it is done; else at what is made durable next: the switch record, or the ledger again.
     at_once: bool,
+    /// A set that was on trial at the kill ends at each start from then on: the launcher puts it away.
+    dies: bool,
 }
 
 impl Cut {
-    /// Both moments of each step.
+    /// Both moments of each step, and once more with a set that dies where one is on trial.
     fn all() -> VecDeque<Self> {
         let steps = KEPT.into_iter().chain(BACK);
-        steps.flat_map(|step| [true, false].map(|at_once| Self { step, at_once })).collect()
+        let moments = steps.flat_map(|step| [true, false].map(|at_once| Self { step, at_once, dies: false }));
+        moments
+            .flat_map(|cut| [Some(cut), cut.step.is_active().then_some(Self { dies: true, ..cut })])
+            .flatten()
+            .collect()
     }
     fn goes_back(self) -> bool {
         BACK.contains(&self.step)
@@ -94,7 +100,8 @@ fn script(home: &Path) -> String {
     let (home, strace) = (home.display(), strace.display());
     let durable = "fsync,fdatasync,rename";
     format!(
-        "cd {home}; echo $MIDSHIFT_SET >> starts; echo $$ > plain; test -e armed || exec \"$@\"
+        "cd {home}; echo $MIDSHIFT_SET >> starts; grep -qsx $MIDSHIFT_SET dying && exit 1
+         echo $$ > plain; test -e armed || exec \"$@\"
          exec {strace} -f -qq -o trace -P {home}/data/{AGENT_FILE}-wal -P {home}/sets/{SWITCH}.new \
          -e trace={durable} -e inject={durable}:signal=SIGSTOP sh -c 'echo $$ > pid; exec \"$@\"' sh \"$@\""
     )
@@ -187,27 +194,30 @@ impl Station {
         let all = ["--bundle", &bundle, "--waves", "rest", "--allow-full-push", "--soak", soak, "--probation", "1s"];
         done(&[&["rollout", "create", "--server", &address, &id, "--exposure-tasks", "0"][..], &all].concat())?;
         begin_rollout(&address, &id)?;
-        let starts = self.killed_at(cut, version, &id).await?;
+        let (starts, falls) = self.killed_at(cut, version, &id).await?;
         // What is started now is whole.
         let name = until("the launcher to start the agent again", LIMIT, async || {
             Ok(self.said("starts").lines().nth(starts).map(str::to_owned))
         })
         .await?;
-        let names = [Some(name), Some(before.current.clone()), self.switch()?.kept().map(str::to_owned)];
+        // One that dies may have been put away and deleted since.
+        let started = Some(name).filter(|_| !falls);
+        let names = [started, Some(before.current.clone()), self.switch()?.kept().map(str::to_owned)];
         for set in names.into_iter().flatten().filter(|name| name != FACTORY) {
-            let id: Digest = set.parse().map_err(|e| anyhow::anyhow!("{set}: {e:?}"))?;
-            DiskSets::open(&self.path("sets"))?.verify(&id).with_context(|| format!("{set} cannot be started"))?;
+            self.is_whole(&set)?;
         }
         let waited = call(&["rollout", "wait", "--server", &address, &id, "--for", "ended", "--timeout", "90s"])?;
-        let code = if cut.goes_back() { 12 } else { 0 };
-        ensure!(waited.status.code() == Some(code), "{}", String::from_utf8_lossy(&waited.stderr));
+        // A set may fall after its wave was judged: then the roll-out was completed with it.
+        let codes = if falls { [Some(12), Some(0)] } else { [Some(if cut.goes_back() { 12 } else { 0 }); 2] };
+        ensure!(codes.contains(&waited.status.code()), "{}", String::from_utf8_lossy(&waited.stderr));
         until("the switch record to be that of the end", LIMIT, async || {
             Ok(self.switch()?.trial.is_none().then_some(()))
         })
         .await?;
         let after = self.switch()?;
         let now = self.version(&after.current)?;
-        if cut.goes_back() {
+        let end = if cut.goes_back() || falls { UpdateState::RolledBack } else { UpdateState::Committed };
+        if end == UpdateState::RolledBack {
             ensure!(
                 (&after.current, &after.previous) == (&before.current, &before.previous),
                 "{before:?} became {after:?}"
@@ -216,7 +226,30 @@ impl Station {
             ensure!(now.as_deref() == Some(version), "{version} was to be kept and {now:?} is");
             ensure!(after.previous.as_ref() == Some(&before.current), "{before:?} became {after:?}");
         }
+        if after.current != FACTORY {
+            self.is_whole(&after.current)?;
+        }
+        until("the ledger to say what the server was told", LIMIT, async || {
+            // The agent runs: a copy that is torn is made again.
+            Ok((self.state(version).await.ok().flatten() == Some(end)).then_some(()))
+        })
+        .await?;
+        if falls {
+            fs::remove_file(self.path("dying"))?;
+        }
+        if falls && !cut.goes_back() {
+            // It counts against the bundle, which this robot would not be given again.
+            until("the quarantine to be lifted", LIMIT, async || {
+                let lifted = call(&["quarantine", "lift", "--server", &address, "rbt-01", &bundle])?;
+                Ok(lifted.status.success().then_some(()))
+            })
+            .await?;
+        }
         Ok(())
+    }
+    fn is_whole(&self, set: &str) -> anyhow::Result<()> {
+        let id: Digest = set.parse().map_err(|e| anyhow::anyhow!("{set}: {e:?}"))?;
+        DiskSets::open(&self.path("sets"))?.verify(&id).with_context(|| format!("{set} cannot be started"))
     }
     /// The agent that runs without it is killed, and its launcher starts it under strace.
     fn begins_under_strace(&self) -> anyhow::Result<()> {
@@ -224,8 +257,8 @@ impl Station {
         fs::write(self.path("armed"), "")?;
         kill("KILL", self.said("plain").trim().parse()?)
     }
-    /// Lets the agent go on from stop to stop up to the cut; how often it had been started then.
-    async fn killed_at(&self, cut: Cut, version: &str, id: &str) -> anyhow::Result<usize> {
+    /// Lets the agent go on from stop to stop up to the cut; how often it had been started then, and whether its set dies from then on.
+    async fn killed_at(&self, cut: Cut, version: &str, id: &str) -> anyhow::Result<(usize, bool)> {
         let (mut at, mut is_there, mut is_aborted, mut has_begun) = ((0, 0), false, false, false);
         loop {
             at = self.stands(at).await?;
@@ -245,8 +278,12 @@ impl Station {
         }
         let starts = self.said("starts").lines().count();
         fs::remove_file(self.path("armed"))?;
+        let trial = self.switch()?.trial.filter(|_| cut.dies);
+        if let Some(trial) = &trial {
+            fs::write(self.path("dying"), format!("{}\n", trial.set))?;
+        }
         kill("KILL", at.0)?;
-        Ok(starts)
+        Ok((starts, trial.is_some()))
     }
 }
 

@@ -62,6 +62,17 @@ impl Robot {
     fn state(&self) -> Option<UpdateState> {
         self.software.update.as_ref().map(|u| u.state)
     }
+    /// Where its update is over, its switch record says the same.
+    fn agrees(&self) -> bool {
+        let Some(update) = &self.software.update else { return true };
+        let name = update.set_name();
+        let is_current = name.as_ref() == Some(&self.switch.current) && self.switch.trial.is_none();
+        match update.state {
+            UpdateState::Committed => is_current,
+            UpdateState::RolledBack => !is_current && self.switch.trial.is_none(),
+            _ => true,
+        }
+    }
     /// It changes to something new and is not yet believed.
     fn goes_forward(&self) -> bool {
         matches!(self.state(), Some(UpdateState::Switching | UpdateState::Probation))
@@ -339,6 +350,8 @@ impl Changes {
         for (robot_id, robot) in &self.robots {
             let what = format!("{robot_id} is held by {:?}", robot.maintenance);
             looks.push(("I8 every drain is released", robot.maintenance.is_none(), what));
+            let what = format!("{robot_id} says {:?} and runs by {:?}", robot.software.update, robot.switch);
+            looks.push(("I15 ledger and switch record agree", robot.agrees(), what));
             let Some((rollout, kept)) = &robot.touched else { continue };
             let Some(seen) = self.rollouts.get(rollout) else { continue };
             let scope = seen.row.spec.abort_scope == AbortScope::All;

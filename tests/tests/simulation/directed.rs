@@ -346,6 +346,34 @@ fn a_server_that_is_killed_at_any_step_of_a_robot_ends_the_roll_out_as_without()
 }
 
 #[test]
+fn a_set_that_dies_after_a_power_cut_at_any_step_leaves_ledger_and_switch_record_of_one_mind() {
+    use UpdateState::{Committing, Probation, RollingBack, Switching, Trial};
+    let mut fell = 0;
+    for (seed, step) in (60..).zip([Switching, Probation, Trial, Committing, RollingBack]) {
+        let mut scene = Scene::open(seed, 3);
+        scene.begin("cut", GOOD[0], |_| {});
+        if step == RollingBack {
+            scene.some_is_in(Probation);
+            scene.order(Order::Abort("cut".to_owned()));
+        }
+        let robot = scene.some_is_in(step);
+        scene.room.crash_agent(robot, true);
+        scene.room.launched[robot].use_up_tries().expect("its sets are read");
+        let tried = scene.room.launched[robot].holdings().expect("are read").switch.trial.map(|trial| trial.set);
+        scene.room.restart_agent(robot);
+        scene.ends("cut");
+        scene.comes_to_rest();
+        let switch = scene.room.launched[robot].holdings().expect("are read").switch;
+        if let Some(tried) = tried {
+            fell += 1;
+            assert_ne!(switch.running(), tried, "it does not live: {step:?}");
+        }
+        assert_eq!(scene.findings(), [] as [String; 0], "{step:?}");
+    }
+    assert!(fell >= 2, "a set was on trial at {fell} cuts");
+}
+
+#[test]
 fn an_access_point_that_is_lost_in_probation_stands_the_roll_out_still_and_burns_no_bundle() {
     let mut scene = Scene::open(30, 6);
     scene.begin("unlucky", GOOD[0], |spec| spec.probation = Some(prost_types::Duration { seconds: 10, nanos: 0 }));

@@ -71,7 +71,7 @@ const COUNTS: [&str; 12] = [
     "program hung",
 ];
 /// Every law, by the name under which it is looked at.
-const LAWS: [&str; 36] = [
+const LAWS: [&str; 37] = [
     counted::TOLD,
     incidents::NOT_BLAMED,
     "I1 no client is refused",
@@ -97,6 +97,7 @@ const LAWS: [&str; 36] = [
     "I9 events in order, once, without gaps",
     "I9 status in order, once, without gaps",
     "I9 what is acknowledged is kept",
+    "I15 ledger and switch record agree",
     "I15 the kept set is the one committed last",
     "I15 who was touched by what was aborted is back on what it kept",
     "I16 only signed software runs that the robot was told to",

@@ -106,7 +106,8 @@ pub struct Room {
     pub software: Arc<Software>,
     /// The memory of the server.
     pub store: Arc<MemoryStore>,
-    launched: Vec<Arc<Launched>>,
+    /// The launcher of each robot.
+    pub launched: Vec<Arc<Launched>>,
     stops: Vec<Option<SiteTime>>,
     steps: u64,
 }

@@ -79,14 +79,12 @@ impl Rig {
                 self.tell(n, fresh_report(UpdateState::Committed, &bundle, generation));
             }
             if matches!(desired.goal, Goal::Stage | Goal::Activate) {
-                let (state, why) = match robot.fate {
+                let (state, reason) = match robot.fate {
                     Fate::NoBytes => (UpdateState::Downloading, None),
                     Fate::Unfit => (UpdateState::Refused, None),
-                    Fate::Corrupt => (UpdateState::Refused, Some(Code::BundleCorrupt)),
-                    Fate::Full => (UpdateState::Refused, Some(Code::NoRoom)),
+                    Fate::Refuses(code) => (UpdateState::Refused, Some(code.into())),
                     _ => (UpdateState::Staged, None),
                 };
-                let reason = why.map(Reason::from);
                 self.tell(n, UpdateReport { reason, ..fresh_report(state, &bundle, generation) });
             }
             return;

@@ -75,10 +75,8 @@ enum Fate {
     NoBytes,
     /// It does not take the bundle.
     Unfit,
-    /// Its bytes come to it as others than were signed.
-    Corrupt,
-    /// It has no room for the bundle.
-    Full,
+    /// It does not take the bundle for this reason.
+    Refuses(Code),
     /// It takes permissions and does not use them.
     Dawdles,
     /// It gave up what it kept.

@@ -162,6 +162,10 @@ fn software_of_a_robot_is_for_whoever_may_where_it_stands() {
     rig.by(&anna, &pin(0)).expect("her area");
     assert_eq!(rig.ota.software_of(&robot_id(0)).pin.map(|pin| pin.actor), Some("anna".to_owned()));
     assert_eq!(rig.by(&blind, &Command::Unpin { robot_id: robot_id(5) }), missing);
+    let unstick = |n: usize| Command::Unstick { robot_id: robot_id(n), reason: "mended".into() };
+    let not_stuck = Err((Kind::Precondition, Code::NotStuck));
+    assert_eq!([rig.by(&anna, &unstick(5)), rig.by(&anna, &unstick(0))], [DENIED, not_stuck]);
+    assert_eq!(rig.by(&blind, &unstick(5)), missing);
     let sees = |by: &Caller, n: usize| objects::sees_robot(&rig.ota, &rig.board, by, &robot_id(n));
     assert_eq!([sees(&blind, 0), sees(&blind, 5), sees(&anna, 5)], [true, false, true]);
     let revoke = Command::Revoke { bundle: bundle_id(3), reason: "leaks".into() };

@@ -19,13 +19,13 @@ fn finds_other_bytes(rig: &mut Rig, n: usize) {
 }
 
 #[test]
-fn what_is_mended_elsewhere_keeps_its_code_and_all_else_does_not_fit() {
+fn a_refusal_keeps_its_code_and_holds_nothing_unless_it_speaks_of_the_content() {
     let mut rig = Rig::new(5);
     rig.start(spec());
     let (full, unfit) = (rig.order()[3], rig.order()[4]);
-    (rig.robots[full].fate, rig.robots[unfit].fate) = (Fate::Full, Fate::Unfit);
+    (rig.robots[full].fate, rig.robots[unfit].fate) = (Fate::Refuses(Code::NoRoom), Fate::Unfit);
     rig.until(400, |r| r.phase() == Phase::Completed);
-    assert_eq!((why(&rig, full), why(&rig, unfit)), (Code::NoRoom, Code::SkippedIncompatible));
+    assert_eq!((why(&rig, full), why(&rig, unfit)), (Code::NoRoom, Code::BundleUnfit));
     assert!(!rig.incidents().contains(&Code::ContentRefused), "neither speaks of the content");
 }
 
@@ -34,7 +34,7 @@ fn a_canary_that_gets_other_bytes_holds_the_roll_out_until_a_person_resumes_it_a
     let mut rig = Rig::new(6);
     rig.start(spec());
     let n = rig.order()[0];
-    rig.robots[n].fate = Fate::Corrupt;
+    rig.robots[n].fate = Fate::Refuses(Code::BundleCorrupt);
     rig.ticks(60);
     let rollout = rig.rollout("ro");
     assert!(is_held(&rig) && rollout.phase.runs() && rollout.abort.is_none(), "{rollout:?}");
@@ -50,7 +50,7 @@ fn behind_the_first_wave_two_robots_hold_it_and_after_a_resume_only_one_more_doe
     let mut rig = Rig::new(6);
     rig.start(RolloutSpec { soak_ms: 600_000, ..spec() });
     let order = rig.order();
-    rig.robots[order[3]].fate = Fate::Corrupt;
+    rig.robots[order[3]].fate = Fate::Refuses(Code::BundleCorrupt);
     rig.until(60, |r| r.phase() == Phase::Soaking);
     assert_eq!((why(&rig, order[3]), is_held(&rig)), (Code::BundleCorrupt, false));
     finds_other_bytes(&mut rig, order[4]);

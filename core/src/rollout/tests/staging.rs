@@ -80,8 +80,42 @@ fn a_robot_that_refuses_the_bundle_is_left_out_and_not_tried_again() {
     }
     rig.until(400, |r| r.phase() == Phase::Completed);
     let r = rig.of("ro", 2);
-    assert_eq!((r.step, r.why.expect("a reason").code, r.again), (Step::Skipped, Code::SkippedIncompatible, false));
+    assert_eq!((r.step, r.why.expect("a reason").code, r.again), (Step::Skipped, Code::BundleUnfit, false));
     assert!(!rig.rollout("ro").second_pass);
+}
+
+/// A roll-out whose robot 2 refuses for this reason, at its end.
+fn refused_for(code: Code) -> Rig {
+    let mut rig = Rig::new(5);
+    rig.create("ro", spec());
+    rig.robots[2].fate = Fate::Refuses(code);
+    for verb in [Verb::Submit, Verb::Approve, Verb::Start { supersede: false }] {
+        rig.must("ro", verb);
+    }
+    rig.until(400, |r| r.phase() == Phase::Completed);
+    let r = rig.of("ro", 2);
+    assert_eq!((r.step, r.why.map(|why| why.code), r.attempted), (Step::Skipped, Some(code), false));
+    rig
+}
+
+#[test]
+fn a_refusal_keeps_its_own_reason_and_one_that_may_pass_is_asked_once_more_at_the_end() {
+    for code in [Code::NoRoom, Code::BaseTooSoon, Code::MetadataRefused] {
+        let rig = refused_for(code);
+        assert_eq!((rig.rollout("ro").second_pass, rig.of("ro", 2).again), (true, true), "{code:?}");
+    }
+    for code in [Code::BundleUnfit, Code::BundleCorrupt] {
+        let rig = refused_for(code);
+        assert_eq!((rig.rollout("ro").second_pass, rig.of("ro", 2).again), (false, false), "{code:?}");
+    }
+}
+
+#[test]
+fn a_robot_that_has_the_bundle_already_is_left_alone_and_known_to_have_it() {
+    let rig = refused_for(Code::SkippedCurrent);
+    assert!(!rig.rollout("ro").second_pass);
+    assert_eq!(rig.of("ro", 2).moments.asked, None, "it was not taken out of work");
+    assert_eq!(rig.ota.software_of(&robot_id(2)).committed, Some(bundle_id(2)));
 }
 
 #[test]

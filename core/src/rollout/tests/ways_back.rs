@@ -69,6 +69,42 @@ fn a_robot_that_keeps_nothing_is_stuck_and_its_abort_comes_to_its_end() {
     assert_eq!((rig.step(n), rig.rollout("ro").in_flight), (Step::Skipped, 0), "a person has looked");
 }
 
+fn unstick(n: usize) -> Command {
+    Command::Unstick { robot_id: robot_id(n), reason: "its disk was put back".into() }
+}
+
+#[test]
+fn a_robot_that_kept_nothing_and_was_mended_is_ordered_back_once_more() {
+    let mut rig = half();
+    let [n, other] = [rig.order()[0], rig.order()[1]];
+    rig.robots[n].fate = Fate::KeepsNothing;
+    rig.must("ro", Verb::Abort);
+    rig.until(100, |r| r.phase() == Phase::Aborted);
+    assert_eq!(rig.step(n), Step::Stuck);
+    assert!(rig.ask(&unstick(other)).is_err(), "that one is back");
+    let before = section(&rig, n).generation;
+    rig.robots[n].fate = Fate::Good;
+    assert!(!rig.ask(&unstick(n)).expect("it is stuck"));
+    assert!(rig.ask(&unstick(n)).expect("it was told so"), "asked twice it is done once");
+    rig.until(30, |r| r.step(n) == Step::RolledBack);
+    assert!(section(&rig, n).generation > before, "by an order of its own");
+    assert_eq!((rig.robots[n].version.as_str(), rig.rollout("ro").in_flight), ("0.9.0", 0));
+}
+
+#[test]
+fn what_a_stuck_robot_said_before_it_was_mended_does_not_make_it_stuck_again() {
+    let mut rig = half();
+    let n = rig.order()[0];
+    rig.report(n, UpdateState::Stuck);
+    rig.must("ro", Verb::Abort);
+    rig.until(60, |r| r.step(n) == Step::Stuck);
+    rig.ask(&unstick(n)).expect("it is stuck");
+    rig.ota_turn();
+    assert_eq!((rig.step(n), stuck(&rig).len()), (Step::Reverting, 1));
+    rig.until(200, |r| r.step(n) == Step::RolledBack);
+    assert_eq!(stuck(&rig).len(), 1);
+}
+
 #[test]
 fn an_order_to_go_back_that_is_refused_is_signed_anew_once() {
     for stubborn in [false, true] {

@@ -38,7 +38,8 @@ use crate::{dev, logs, robots, serve};
 use clap::{Parser, Subcommand};
 use client::Exit;
 use midshift_agent::core::ExitReason;
-use midshift_agent::launcher::{self, SWITCHED};
+use midshift_agent::launcher::{self, ENVIRONMENT, SWITCHED};
+use midshift_agent::{environment, pulse};
 use out::{Format, Out, Output};
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -177,6 +178,13 @@ pub fn main() -> ExitCode {
         // Before anything that a launcher must not need: no runtime, no threads.
         return launcher::main(arguments.into_iter());
     }
+    if let Command::Agent(_) = &args.command
+        && let Err(error) = pulse::follow_launcher()
+    {
+        // Nobody would start this agent again, or kill it if it hung.
+        let gone = Exit::new(ENVIRONMENT, format!("the launcher that started this agent is not there: {error}"));
+        return gone.report(&Out::of(args.output));
+    }
     let serves = match &args.command {
         Command::Serve(_) | Command::Agent(_) | Command::Sim(sim::Verb::Run { .. }) => true,
         Command::Stop(stop) => stop.serves().is_some(),
@@ -230,9 +238,11 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Migrate { data, database } => migrate(&data.unwrap_or_default(), &database, out).await,
         Command::Backup(args) => backup::take(&args, out).await,
         Command::Restore(args) => backup::restore(&args, out).await,
-        Command::Agent(AgentVerb::Run(args)) => match robots::agent(args, interrupts()).await? {
-            ExitReason::Switched => Err(Exit::new(SWITCHED, "another set of software is to be started")),
-            ExitReason::Shutdown | ExitReason::FencedTwice => Ok(()),
+        Command::Agent(AgentVerb::Run(args)) => match robots::agent(args, interrupts()).await {
+            Ok(ExitReason::Switched) => Err(Exit::new(SWITCHED, "another set of software is to be started")),
+            Ok(ExitReason::Shutdown | ExitReason::FencedTwice) => Ok(()),
+            Err(error) if environment::is_to_blame(&*error) => Err(Exit::new(ENVIRONMENT, format!("{error:#}"))),
+            Err(error) => Err(error.into()),
         },
         Command::Launcher { .. } => unreachable!("runs before the runtime"),
         Command::Sim(verb) => sim::run(verb, out, interrupts()).await,

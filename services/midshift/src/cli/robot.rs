@@ -151,6 +151,16 @@ pub enum Verb {
         #[command(flatten)]
         change: Change,
     },
+    /// Tell a robot that could not go back from a bundle to do so once more: you mended what kept it.
+    Unstick {
+        #[command(flatten)]
+        one: One,
+        /// What you mended.
+        #[arg(long)]
+        reason: String,
+        #[command(flatten)]
+        change: Change,
+    },
     /// Let a machine become this robot: prints the line to run on it, with a secret for one use within an hour.
     Enroll(Machine),
     /// Let another machine take this robot's place: the old one's key is worth nothing as soon as the new one is enrolled.
@@ -194,7 +204,7 @@ impl Verb {
             Self::Cordon { one, .. } | Self::Uncordon { one, .. } | Self::Drain { one, .. } => Some(one),
             Self::Undrain { one, .. } | Self::Retire { one, .. } | Self::Disown { one, .. } => Some(one),
             Self::Pin { one, .. } | Self::Unpin { one, .. } | Self::Exclude { one, .. } => Some(one),
-            Self::Load { one, .. } => Some(one),
+            Self::Load { one, .. } | Self::Unstick { one, .. } => Some(one),
             // A robot that is enrolled needs not have been heard.
             Self::Revoke(_) | Self::Enroll(_) | Self::Replace(_) => None,
             Self::Ls { .. } | Self::Watch { .. } | Self::Identities { .. } => None,
@@ -357,6 +367,20 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
             let answer = answer.into_inner();
             software(&answer.software.unwrap_or_default(), out)?;
             ended(answer.done_before.as_ref(), only, "", out);
+            Ok(())
+        }
+        Verb::Unstick { one, reason, change } => {
+            let only = change.only();
+            let request = ota::UnstickRobotRequest {
+                robot_id: one.robot_id.clone(),
+                reason,
+                request_id: change.request_id,
+                validate_only: change.dry_run,
+            };
+            let answer = one.call.rollouts().await?.unstick_robot(unary(request)).await.map_err(Exit::with_facts)?;
+            let answer = answer.into_inner();
+            software(&answer.software.unwrap_or_default(), out)?;
+            ended(answer.done_before.as_ref(), only, &format!("midshift robot get {}", one.robot_id), out);
             Ok(())
         }
         Verb::Exclude { one, from, reason, change } => {

@@ -274,6 +274,19 @@ impl RolloutService {
         Ok(v1::UnpinRobotResponse { software, done_before: done_before(taken) })
     }
 
+    async fn unstick(&self, r: v1::UnstickRobotRequest, by: &Caller) -> Result<v1::UnstickRobotResponse, Refusal> {
+        let mut bad = Violations::default();
+        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        let request_id = request_id(&r.request_id, &mut bad);
+        required_reason(&r.reason, &mut bad);
+        bad.finish()?;
+        let robot_id = robot_id.ok_or_else(internal)?;
+        let command = Command::Unstick { robot_id: robot_id.clone(), reason: r.reason };
+        let taken = self.act_once(command, by, None, check_only(r.validate_only), request_id).await?;
+        let software = self.software_of(robot_id).await?;
+        Ok(v1::UnstickRobotResponse { software, done_before: done_before(taken) })
+    }
+
     async fn software(
         &self,
         r: v1::ListRobotSoftwareRequest,
@@ -462,6 +475,13 @@ impl Face for RolloutService {
     async fn unpin_robot(&self, r: Request<v1::UnpinRobotRequest>) -> Result<Response<v1::UnpinRobotResponse>, Status> {
         let by = caller(&r);
         answer(self.unpin(r.into_inner(), &by).await)
+    }
+    async fn unstick_robot(
+        &self,
+        r: Request<v1::UnstickRobotRequest>,
+    ) -> Result<Response<v1::UnstickRobotResponse>, Status> {
+        let by = caller(&r);
+        answer(self.unstick(r.into_inner(), &by).await)
     }
     async fn list_robot_software(
         &self,
