@@ -106,7 +106,7 @@ async fn floor_after(link: TcpDial, mut sessions: mpsc::Receiver<Seen>, told: Ut
     session.welcome(5).await;
     session.next().await.expect("a heartbeat");
     let clock = ClockSample { t3_us: told.0 * 1000, ..ClockSample::default() };
-    let echo = Some(Echo { hb: 1, clock });
+    let echo = Some(Echo { hb: 1, clock, is_clock_doubted: false });
     session.say(ToRobot::Downlink(Box::new(Downlink { echo, ..Downlink::default() }))).await;
     // What it was told is decided on before its next heartbeat leaves.
     session.next().await.expect("a heartbeat");
@@ -138,7 +138,7 @@ fn the_floor_rises_within_two_days_of_the_newest_signature_and_never_falls() {
     let (mut rig, releases): (Rig, Releases) = crate::updates::connected();
     let floor_at = |rig: &mut Rig, hours: u64| {
         let clock = ClockSample { t3_us: SIGNED.plus_ms(hours * HOUR_MS).0 * 1000, ..ClockSample::default() };
-        rig.down(Downlink { echo: Some(Echo { hb: 1, clock }), ..Downlink::default() });
+        rig.down(Downlink { echo: Some(Echo { hb: 1, clock, is_clock_doubted: false }), ..Downlink::default() });
         // It is written with what comes next.
         rig.pass(2_000);
         rig.store.kept().expect("loaded").ledger.trusted.map(|t| (t.time_floor().0 - SIGNED.0) / 3_600_000)
