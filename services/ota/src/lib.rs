@@ -29,6 +29,8 @@ pub mod rollouts;
 #[cfg(test)]
 #[path = "together/tests.rs"]
 mod together;
+#[cfg(test)]
+mod wrong_clock;
 
 pub use retention::prune;
 
