@@ -190,6 +190,26 @@ async fn a_robot_renews_its_own_certificate_for_its_own_key_and_no_other() {
 }
 
 #[tokio::test]
+async fn no_certificate_is_signed_by_a_wall_in_doubt_and_the_old_one_counts_on() {
+    let world = World::new();
+    let identity = world.open().await.expect("opened");
+    let (machine, month_ms) = (Machine::new(), 30 * 24 * 3_600_000);
+    let line = secret(&identity, "r7", false).await.expect("a secret");
+    world.set_ms(month_ms);
+    let refused = enrol(&identity, "r7", &line, &machine).await.expect_err("it would begin in a month");
+    assert_eq!(code(&refused), Some(Code::ClockDoubted));
+    world.set_ms(-month_ms);
+    enrol(&identity, "r7", &line, &machine).await.expect("the secret was not used up");
+    let own = Caller::robot(RobotId::parse("r7").expect("an id"));
+    let request = || RenewCertificateRequest { robot_id: "r7".to_owned(), request_pem: machine.request() };
+    world.set_ms(month_ms);
+    let refused = identity.renew_certificate(asked_by(own.clone(), request())).await.expect_err("likewise");
+    assert_eq!(code(&refused), Some(Code::ClockDoubted));
+    world.clock.accept_wall();
+    identity.renew_certificate(asked_by(own, request())).await.expect("a person says that it is right");
+}
+
+#[tokio::test]
 async fn what_is_no_signing_request_is_refused_and_uses_no_secret_up() {
     let world = World::new();
     let identity = world.open().await.expect("opened");
