@@ -7,6 +7,7 @@ pub mod backup;
 mod changed_map;
 pub mod cli;
 pub mod clock;
+pub mod clock_doubt;
 mod denials;
 pub mod dev;
 pub mod door;

@@ -7,7 +7,7 @@ use crate::roles::{Role, Roles};
 use crate::server::{Naive, Parts, Server};
 use crate::storage::{Database, Storage};
 use crate::{backup, changed_map};
-use crate::{clock, logs, site_file, stop, stop_follower};
+use crate::{clock, clock_doubt, logs, site_file, stop, stop_follower};
 use anyhow::{Context, bail};
 use clap::ValueEnum;
 use midshift_agent::{durable, tls};
@@ -198,6 +198,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
     crate::recorder::handle();
     let site_id = loaded.site.site_id().clone();
     let storage = args.database.open(&args.data, site_id, clock.clone()).await?;
+    clock_doubt::check_start(&*clock, &*storage.store()).await?;
     let (loaded, map) = match roles.has(Role::Fleet) {
         true => changed_map::choose(&*storage.store(), loaded, args.force_map, clock.now()).await?,
         false => (changed_map::follow(&*storage.store(), loaded).await?, Default::default()),
@@ -250,6 +251,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
     }
     tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), store = storage.engine(), %roles, "midshift serves");
     let planning = Planning::start()?;
+    let by = clock.clone();
     let parts = Parts {
         roles: roles.clone(),
         drain,
@@ -288,6 +290,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         served = server.serve(listener) => served,
         () = kept => Ok(()),
         () = backup::told::run(&args.data, &*rows) => Ok(()),
+        () = clock_doubt::run(&args.data, &*by, &*rows) => Ok(()),
     };
     storage.close().await;
     served
