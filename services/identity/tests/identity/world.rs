@@ -8,6 +8,7 @@ use midshift_core::rows::Table;
 use midshift_core::time::{Clock, Utc};
 use midshift_core::wall::WallClock;
 use midshift_identity::{Duty, Error, IdentityService, Parts};
+use midshift_proto::access::local;
 use midshift_proto::denying::Told;
 use midshift_proto::identity::v1::enrolment_service_server::EnrolmentService as _;
 use midshift_proto::identity::v1::identity_service_server::IdentityService as _;
@@ -115,7 +116,7 @@ pub fn code(status: &Status) -> Option<Code> {
 
 pub async fn secret(identity: &IdentityService, robot_id: &str, replace: bool) -> Result<String, Status> {
     let request = CreateEnrolmentRequest { robot_id: robot_id.to_owned(), replace };
-    Ok(identity.create_enrolment(Request::new(request)).await?.into_inner().secret)
+    Ok(identity.create_enrolment(local(request)).await?.into_inner().secret)
 }
 
 /// What of the line is the secret's own.
