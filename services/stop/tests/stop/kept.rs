@@ -72,9 +72,9 @@ async fn the_first_reset_is_answered_and_one_that_comes_before_its_stop_counts()
     let was_told = told(&robot, &id);
     let first = server.reset(&id).await;
     let again = server.reset(&id).await;
-    assert_eq!((again.was_engaged, again.reset), (false, first.reset));
+    assert_eq!((again.was_engaged, again.is_unknown, again.reset), (false, false, first.reset));
     let unknown = server.reset("STOP-OF-ANOTHER").await;
-    assert!(!unknown.was_engaged && unknown.durable);
+    assert!(unknown.is_unknown && !unknown.was_engaged && unknown.durable, "it is taken all the same");
     let known_by_a_robot_only = midshift_core::stop::Stop { stop_id: "STOP-OF-ANOTHER".parse().unwrap(), ..was_told };
     let robot = Robot::dial(&server, "r2", vec![known_by_a_robot_only]).await.synced().await;
     assert!(robot.effective().is_empty());

@@ -180,6 +180,9 @@ async fn a_resume_before_the_reset_is_refused_and_is_not_kept_for_later() {
     let call = async |request| world.service.resume_held(local(request)).await.map(|a| a.into_inner());
     let unknown = call(resume("STOP-9")).await.expect_err("nobody knows of it");
     assert_eq!((unknown.code(), reason(&unknown).as_str()), (Code::NotFound, "STOP_NOT_FOUND"));
+    let beside = ResumeHeldRequest { task_ids: vec!["T1".into()], ..resume("STOP-9") };
+    let unknown = call(beside).await.expect_err("nor beside a task");
+    assert_eq!((unknown.code(), reason(&unknown).as_str()), (Code::NotFound, "STOP_NOT_FOUND"));
     world.copies_stop("STOP-1", false).await;
     world.fleet_holds(None, "stop:STOP-1").await;
     for validate_only in [false, true] {
