@@ -112,7 +112,8 @@ enum Verb {
         #[arg(long)]
         watch: bool,
     },
-    /// Take one stop away. Robots that stood stay where they are until they are resumed.
+    /// Take one stop away. Robots that stood stay where they are until they are resumed. Exit code 9: nobody knows that stop; the reset is kept for a robot
+    /// that was away.
     Reset {
         #[command(flatten)]
         call: StopCall,
