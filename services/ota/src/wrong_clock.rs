@@ -5,7 +5,7 @@ use crate::fixture::{SEEDS, START, files, release, robot, targets, write_keys};
 use crate::folder::Owner;
 use crate::repository::{Act, Error, FRESHEN_AFTER_MS, Keyless};
 use crate::{Opened, OtaService, Parts};
-use midshift_bundle::trust::{Reading, Source, Trusted};
+use midshift_bundle::trust::{self, Reading, Source, Trusted};
 use midshift_core::time::{Clock, Utc};
 use midshift_core::wall::WallClock;
 use std::sync::Arc;
@@ -53,10 +53,12 @@ impl Site {
     fn version(&self) -> u64 {
         self.opened().repository.newest().expect("published").stamp.version
     }
-    /// What a robot believes once it asked; its clock is set, or not.
-    async fn shown_to(&self, robot: &Trusted, clock: Reading) -> Trusted {
+    /// What a robot believes once it was told the time by an echo, as far as the server stands by it, and asked; its clock is set, or not.
+    async fn shown_to(&self, robot: &Trusted, clock: Reading) -> Result<Trusted, trust::Error> {
+        let own = &self.opened().clock;
+        let told = if own.doubt().is_some() { None } else { robot.told(own.now().wall) };
         let source = Arc::new(Shown(self.service.clone()));
-        robot.refresh(source, clock).await.expect("it takes software").trusted
+        told.as_ref().unwrap_or(robot).refresh(source, clock).await.map(|refreshed| refreshed.trusted)
     }
     /// A release beside the first.
     async fn publish(&self, first: &[u8], version: &str, expected: u64) -> Result<Vec<u8>, Error> {
@@ -98,29 +100,36 @@ async fn a_wall_that_was_thirty_days_ahead_for_a_minute_stops_no_update_afterwar
     release(&site.service, &first).await;
     let first = targets(None, &first, SEEDS.targets);
     let (set, unset) = (|at| Reading { utc: at, is_synced: true }, Reading { utc: Utc(0), is_synced: false });
-    let mut robots = [site.shown_to(&robot(), set(START)).await, site.shown_to(&robot(), unset).await];
+    let new = robot();
+    let mut robots =
+        [site.shown_to(&new, set(START)).await.expect("believed"), site.shown_to(&new, unset).await.expect("believed")];
 
     site.set(MONTH_MS).await;
     assert_eq!(site.version(), 1, "it was due by that wall, and nothing was signed");
     let error = site.publish(&first, "1.1.0", 1).await.expect_err("nor is a release");
     assert!(matches!(error, Error::Clock(doubt) if doubt.step_ms == MONTH_MS), "{error}");
     assert_eq!(site.opened().repository.directive_key().err(), Some(Keyless::Clock));
+    let naive = robots[1].told(site.opened().now()).expect("one that goes by any echo");
     site.pass(MINUTE_MS).await;
-    for (robot, clock) in robots.iter_mut().zip([set(START.plus_ms(MINUTE_MS)), unset]) {
-        *robot = site.shown_to(robot, clock).await;
+    let later = START.plus_ms(MINUTE_MS);
+    for (robot, clock) in robots.iter_mut().zip([set(later), unset]) {
+        *robot = site.shown_to(robot, clock).await.expect("it takes software meanwhile");
     }
 
     site.set(-MONTH_MS).await;
     assert!(site.opened().repository.directive_key().is_ok(), "orders are signed at once");
     site.publish(&first, "1.1.0", 1).await.expect("and releases");
-    for (robot, clock) in robots.iter_mut().zip([set(START.plus_ms(MINUTE_MS)), unset]) {
-        *robot = site.shown_to(robot, clock).await;
-        assert!(robot.time_floor() <= START.plus_ms(MINUTE_MS), "{}", robot.time_floor().rfc3339());
+    for (robot, clock) in robots.iter_mut().zip([set(later), unset]) {
+        *robot = site.shown_to(robot, clock).await.expect("it takes software");
+        assert!(robot.time_floor() <= later, "{}", robot.time_floor().rfc3339());
     }
+    let error = site.shown_to(&naive, unset).await.expect_err("it waits for two days");
+    assert!(matches!(error, trust::Error::Expired { .. }), "{error}");
     site.pass(FRESHEN_AFTER_MS).await;
     assert_eq!(site.version(), 3);
     for robot in &robots {
-        site.shown_to(robot, set(START.plus_ms(MINUTE_MS + FRESHEN_AFTER_MS))).await;
+        let clock = set(later.plus_ms(FRESHEN_AFTER_MS));
+        site.shown_to(robot, clock).await.expect("it takes software half a day later");
     }
 }
 
