@@ -158,9 +158,12 @@ impl IdentityService {
         all.extend(names.into_iter().filter(|name| !NAMES.contains(&name.as_str())));
         all.truncate(limits::SERVER_NAMES_MAX);
         let own = OwnKey::open(&folder, all)?;
-        own.ask(&register, clock.now().wall).await?;
-        if let Some(authority) = &authority {
-            answer(authority, &register, clock.now().wall).await?;
+        // By a wall in doubt an old certificate is better than a new one; without any there is nothing to serve with.
+        if clock.doubt().is_none() || own.proof(&register).await?.is_none() {
+            own.ask(&register, clock.now().wall).await?;
+            if let Some(authority) = &authority {
+                answer(authority, &register, clock.now().wall).await?;
+            }
         }
         let proof = waited_for(&own, &register, &*store, shutdown).await?;
         files::write(&folder, PUBLIC_FILE, &proof.authority_pem, files::PUBLIC)?;
