@@ -56,7 +56,7 @@ impl LinkService for Sink {
         self.seen.sessions.fetch_add(1, Relaxed);
         let clock = ClockSample { t1_us: 1_800_000_000_000_000, ..ClockSample::default() };
         let clock = ClockSample { t2_us: clock.t1_us, t3_us: clock.t1_us, ..clock };
-        let echo = Downlink { echo: Some(Echo { hb: 1_000, clock }), ..Downlink::default() };
+        let echo = Downlink { echo: Some(Echo { hb: 1_000, clock, is_clock_doubted: false }), ..Downlink::default() };
         let answer = self.answers.then(|| v1::SessionResponse::from(&ToRobot::Downlink(Box::new(echo))));
         Ok(Response::new(Drain { up: request.into_inner(), word, welcomed: false, answer, seen: self.seen.clone() }))
     }

@@ -151,6 +151,8 @@ codes! {
         => "`midshift bundle ls` lists what is published.";
     NoOnlineKeys = "NO_ONLINE_KEYS", "The server has no keys that may say which release is the newest."
         => "Start it with --ota-keys and the folder that holds them.";
+    ClockDoubted = "CLOCK_IN_DOUBT", "The server's clock jumped, or began far past what it wrote before. It signs nothing by it: no order to robots, no timestamp, no certificate."
+        => "Set the clock of its machine from the network (NTP); or, if it is right, run there `midshift doctor --accept-clock`. See docs/runbooks/clock.md.";
     ServedElsewhere = "SERVED_ELSEWHERE", "This process is a gateway: releases are brought to, and listed by, processes with role ota."
         => "Ask at the public address.";
     UploadTooLarge = "UPLOAD_TOO_LARGE", "A file of a release has at most 8 GiB."

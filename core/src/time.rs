@@ -99,6 +99,15 @@ pub struct Jump {
     pub skipped_ms: u64,
 }
 
+/// Why nothing is signed by the wall.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Doubt {
+    /// Milliseconds that it is ahead of where it should be; negative: behind.
+    pub step_ms: i64,
+    /// UTC of the wall when that was seen.
+    pub at: Utc,
+}
+
 /// One reading of all clocks, taken once per decision so that a decision sees one moment.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Now {
@@ -124,6 +133,14 @@ pub trait Clock: Send + Sync + 'static {
     fn last_jump(&self) -> Option<Jump> {
         None
     }
+    /// Why nothing may be signed by the wall now, and no time told that robots believe. None: it may.
+    fn doubt(&self) -> Option<Doubt> {
+        None
+    }
+    /// Holds the wall of a start against the newest time that was written down before it.
+    fn check_start(&self, _newest: Utc) {}
+    /// A person says that the wall is right.
+    fn accept_wall(&self) {}
 }
 
 /// Clocks of a simulation: a monotonic source in microseconds, a UTC base, and a rate. Their wall never jumps; that of a machine may, see

@@ -5,10 +5,12 @@
 //! 2. After a large jump ([`limits::CLOCK_JUMP_LARGE`]) no duration is over, and no update window open, because of it
 //!    ([`Now::ms_since`], [`Jump::opened`]). What is over at a moment of the wall (tokens, resets, tasks' own times) follows at once.
 //! 3. Several large jumps of one run count as one, from before the first to after the last: what follows is stricter than either.
+//! 4. A wall that stepped by more than [`limits::CLOCK_DOUBT`], or began more than [`limits::CLOCK_DOUBT_START`] past what was written down, is in doubt until
+//!    it is set back, the network sets it, or a person accepts it ([`Clock::doubt`]).
 
 use crate::limits;
-use crate::time::{Clock, Jump, LinkTime, Now, SiteTime, Utc};
-use std::sync::{Mutex, PoisonError};
+use crate::time::{Clock, Doubt, Jump, LinkTime, Now, SiteTime, Utc};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 impl Jump {
     /// Milliseconds that the wall stepped ahead; negative: back.
@@ -102,12 +104,67 @@ impl Judge {
     }
 }
 
+/// What the wall stepped since it was last known to be right.
+#[derive(Clone, Copy, Debug, Default)]
+struct Steps {
+    /// Milliseconds, as one.
+    off_ms: i64,
+    doubted: Option<Doubted>,
+}
+
+/// A wall in doubt.
+#[derive(Clone, Copy, Debug)]
+struct Doubted {
+    doubt: Doubt,
+    /// It is over when the wall is no further off than this, milliseconds.
+    most_ms: u64,
+    /// When the network had set the wall last at that time.
+    synced: Option<Utc>,
+}
+
+impl Steps {
+    /// The wall is `step_ms` further ahead than it should be.
+    fn add(&mut self, step_ms: i64, most_ms: u64, at: Utc, synced: impl FnOnce() -> Option<Utc>) {
+        self.off_ms = self.off_ms.saturating_add(step_ms);
+        let most_ms = self.doubted.map_or(most_ms, |doubted| doubted.most_ms);
+        if self.off_ms.unsigned_abs() > most_ms {
+            let doubt = Doubt { step_ms: self.off_ms, at };
+            let synced = self.doubted.map_or_else(synced, |doubted| doubted.synced);
+            self.doubted = Some(Doubted { doubt, most_ms, synced });
+        } else if self.doubted.is_some() {
+            *self = Self::default();
+        }
+    }
+
+    /// Why the wall is in doubt; over if the network has set it since.
+    fn doubt(&mut self, synced: impl FnOnce() -> Option<Utc>) -> Option<Doubt> {
+        let doubted = self.doubted?;
+        if synced().is_some_and(|at| doubted.synced != Some(at)) {
+            *self = Self::default();
+            return None;
+        }
+        Some(doubted.doubt)
+    }
+}
+
+/// What was read so far.
+#[derive(Clone, Copy, Debug, Default)]
+struct State {
+    mono_us: u64,
+    judge: Judge,
+    steps: Steps,
+}
+
+/// When the network set the wall last, by the wall; none: not since the machine started.
+type Synced = Box<dyn Fn() -> Option<Utc> + Send + Sync>;
+
 /// Clocks at real rate: the link clock from a monotonic source, and UTC from the wall at each reading.
 pub struct WallClock<M, W, T> {
     monotonic_us: M,
     wall: W,
     told: T,
-    state: Mutex<(u64, Judge)>,
+    synced: Synced,
+    state: Mutex<State>,
 }
 
 impl<M, W, T> WallClock<M, W, T>
@@ -118,10 +175,20 @@ where
 {
     /// `monotonic_us` counts microseconds from an arbitrary start; `wall` is the machine's UTC; `told` hears each jump once.
     pub fn new(monotonic_us: M, wall: W, told: T) -> Self {
-        let clock = Self { monotonic_us, wall, told, state: Mutex::default() };
+        let clock = Self { monotonic_us, wall, told, synced: Box::new(|| None), state: Mutex::default() };
         // What a jump is measured against.
         clock.now();
         clock
+    }
+
+    /// `synced` says when the network set the wall last, by the wall; none: not since the machine started, or nobody knows.
+    #[must_use]
+    pub fn with_synced(self, synced: impl Fn() -> Option<Utc> + Send + Sync + 'static) -> Self {
+        Self { synced: Box::new(synced), ..self }
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -133,13 +200,16 @@ where
 {
     fn now(&self) -> Now {
         let (now, jump) = {
-            let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-            let mono_us = (self.monotonic_us)().max(state.0);
+            let mut state = self.state();
+            let mono_us = (self.monotonic_us)().max(state.mono_us);
             let wall = (self.wall)();
-            let jump = state.1.read(mono_us, wall);
-            state.0 = mono_us;
+            let jump = state.judge.read(mono_us, wall);
+            if let Some(jump) = &jump {
+                state.steps.add(jump.step_ms(), limits::CLOCK_DOUBT.as_ms(), wall, &self.synced);
+            }
+            state.mono_us = mono_us;
             let ms = mono_us / 1000;
-            (Now { site: SiteTime(ms), link: LinkTime(ms), utc: wall, wall, jump: state.1.large }, jump)
+            (Now { site: SiteTime(ms), link: LinkTime(ms), utc: wall, wall, jump: state.judge.large }, jump)
         };
         if let Some(jump) = jump {
             (self.told)(&jump);
@@ -152,7 +222,26 @@ where
     }
 
     fn last_jump(&self) -> Option<Jump> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner).1.last
+        self.state().judge.last
+    }
+
+    fn doubt(&self) -> Option<Doubt> {
+        // A step that nobody has read yet counts too.
+        self.now();
+        self.state().steps.doubt(&self.synced)
+    }
+
+    fn check_start(&self, newest: Utc) {
+        let (wall, most_ms) = (self.now().wall, limits::CLOCK_DOUBT_START.as_ms());
+        let ahead_ms = wall.ms_since(newest);
+        if ahead_ms > most_ms && (self.synced)().is_none() {
+            let ahead_ms = i64::try_from(ahead_ms).unwrap_or(i64::MAX);
+            self.state().steps.add(ahead_ms, most_ms, wall, || None);
+        }
+    }
+
+    fn accept_wall(&self) {
+        self.state().steps = Steps::default();
     }
 }
 

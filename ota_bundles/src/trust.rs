@@ -2,8 +2,8 @@
 //!
 //! `tough` checks signatures and the chain; its disk, clock and downloads are not used. What was believed goes in as one value and comes
 //! out as one value, so that it is on the disk whole or not at all.
-//! Invariant: versions never go back unless a new root has changed the keys of that role; expiry is judged by a time that never runs
-//! backwards and rises from signed documents only.
+//! Invariant: versions never go back unless a new root has changed the keys of that role; expiry is judged by a time floor that never falls. It rises with
+//! signed times and with what a proven server tells, each signed document at most two days past what the robot knows of the time by itself.
 
 use crate::bugs::Bugs;
 use crate::digest::Digest;
@@ -26,9 +26,9 @@ use url::Url;
 pub const METADATA_BYTES_MAX: u64 = midshift_core::limits::SIGNED_DOCUMENT_BYTES as u64;
 /// New roots taken in one refresh.
 const ROOTS_MAX: u64 = 64;
-/// So far may the time that a server tells lie beyond the newest signed one. More than the day that a timestamp lives, so that one that is withheld is seen to have
-/// expired; not much more, so that a server whose clock is years ahead keeps a robot from its updates for two days at most.
-const TOLD_AHEAD_MS: u64 = 2 * 24 * 3_600 * 1_000;
+/// So far may the time that a server tells lie beyond the newest signed one, and a signed time beyond what the robot knows by itself. More than the day that a timestamp
+/// lives, so that one that is withheld is seen to have expired; not much more, so that a clock that was years ahead keeps a robot from its updates for two days at most.
+const AHEAD_MS: u64 = 2 * 24 * 3_600 * 1_000;
 /// A floor that rises by less is not worth a write.
 const TOLD_STEP_MS: i64 = 3_600 * 1_000;
 /// Nothing is fetched from here: it gives documents their names.
@@ -54,6 +54,9 @@ pub struct Trusted {
     versions: BTreeMap<Kept, u64>,
     /// It is at least this late, UTC ms.
     time_floor: Utc,
+    /// It is about this late, as the robot knows by itself; 0: it knows nothing.
+    #[serde(skip)]
+    own_time: Utc,
     /// Naive rules, for twins of tests.
     #[serde(skip)]
     bugs: Bugs,
@@ -170,6 +173,7 @@ impl Trusted {
             targets: None,
             versions: BTreeMap::from([(Kept::Root, parsed.signed.version.get())]),
             time_floor: Utc(0),
+            own_time: Utc(0),
             bugs: Bugs::default(),
         })
     }
@@ -177,6 +181,12 @@ impl Trusted {
     #[must_use]
     pub fn with(self, bugs: Bugs) -> Self {
         Self { bugs, ..self }
+    }
+    /// With what the robot knows of the time by itself: its floor and its own monotonic time since, or what a proven server told. It bounds how far a signed
+    /// time raises the floor, and is not kept.
+    #[must_use]
+    pub fn knowing(self, own_time: Utc) -> Self {
+        Self { own_time, ..self }
     }
     /// It is at least this late.
     pub fn time_floor(&self) -> Utc {
@@ -191,12 +201,24 @@ impl Trusted {
             return None;
         }
         let timestamp: Signed<Timestamp> = serde_json::from_str(self.timestamp.as_deref()?).ok()?;
-        let time_floor = time.min(issued_at(&timestamp.signed)?.plus_ms(TOLD_AHEAD_MS));
+        let time_floor = time.min(issued_at(&timestamp.signed)?.plus_ms(AHEAD_MS));
         is_later(time_floor).then(|| Self { time_floor, ..self.clone() })
     }
     /// The moment that expiry is held against.
     pub fn now(&self, clock: Reading) -> Utc {
         if clock.is_synced { clock.utc.max(self.time_floor) } else { self.time_floor }
+    }
+    /// The floor once a timestamp that was signed at `issued` is believed. The first time that a robot hears of counts whole; after that it is at most two days
+    /// past what the robot knows, once for each timestamp: one that was believed before raises nothing.
+    fn raised(&self, issued: Utc, is_new: bool, clock: Reading) -> Utc {
+        let synced = if clock.is_synced { clock.utc } else { Utc(0) };
+        let known = self.time_floor.max(self.own_time).max(synced);
+        let most = match (known, is_new) {
+            (Utc(0), _) => issued,
+            (_, true) => known.plus_ms(AHEAD_MS),
+            (_, false) => self.time_floor,
+        };
+        self.time_floor.max(issued.min(most))
     }
     /// Reads what was believed; none: nothing was ever written there.
     ///
@@ -278,7 +300,10 @@ impl Trusted {
             (Kept::Snapshot, "snapshot", snapshot.signed.version.get(), snapshot.signed.expires),
             (Kept::Targets, "targets", targets.signed.version.get(), targets.signed.expires),
         ];
-        let time_floor = self.time_floor.max(issued_at(&timestamp.signed).unwrap_or(Utc(0)));
+        let text = |name: String| heard.get(&name).map(|bytes| String::from_utf8_lossy(bytes).into_owned());
+        let stamp = text("timestamp.json".to_owned());
+        let is_new = stamp.as_ref() != self.timestamp.as_ref();
+        let time_floor = self.raised(issued_at(&timestamp.signed).unwrap_or(Utc(0)), is_new, clock);
         let now = Self { time_floor, ..self.clone() }.now(clock);
         let mut versions = BTreeMap::new();
         for (kept, role, version, expires) in offered {
@@ -291,14 +316,14 @@ impl Trusted {
             }
             versions.insert(kept, version);
         }
-        let text = |name: String| heard.get(&name).map(|bytes| String::from_utf8_lossy(bytes).into_owned());
         let trusted = Self {
             root: text(format!("{}.root.json", root.signed.version)).unwrap_or_else(|| self.root.clone()),
-            timestamp: text("timestamp.json".to_owned()),
+            timestamp: stamp,
             snapshot: text(format!("{}.snapshot.json", snapshot.signed.version)),
             targets: text(format!("{}.targets.json", targets.signed.version)),
             versions,
             time_floor,
+            own_time: Utc(0),
             bugs: self.bugs,
         };
         let listed = targets.signed.targets.iter().filter_map(|(name, target)| {

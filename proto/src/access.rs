@@ -66,9 +66,16 @@ pub fn check(caller: &Caller, path: &str) -> Result<(), Refusal> {
     }
 }
 
-/// Who asks, as the port found out; a request that never came through a port is of this process.
+/// Who asks, as the port found out. A request of which nobody says so is nobody's.
 pub fn caller<T>(request: &tonic::Request<T>) -> Caller {
-    request.extensions().get::<Caller>().cloned().unwrap_or_else(Caller::local)
+    request.extensions().get::<Caller>().cloned().unwrap_or_else(Caller::nobody)
+}
+
+/// A request of this process itself, which may do everything.
+pub fn local<T>(message: T) -> tonic::Request<T> {
+    let mut request = tonic::Request::new(message);
+    request.extensions_mut().insert(Caller::local());
+    request
 }
 
 #[cfg(test)]
@@ -84,6 +91,14 @@ mod tests {
         let path = |m: &prost_reflect::MethodDescriptor| format!("/{}/{}", m.parent_service().full_name(), m.name());
         let without: Vec<String> = methods.iter().map(path).filter(|path| method(path).is_none()).collect();
         assert_eq!(without, Vec::<String>::new());
+    }
+
+    #[test]
+    fn a_request_of_which_nobody_says_who_asks_is_nobodys() {
+        let unsaid = tonic::Request::new(());
+        assert_eq!(caller(&unsaid), Caller::nobody());
+        assert!(check(&caller(&unsaid), "/midshift.task.v1.TaskService/SubmitTask").is_err());
+        assert_eq!(caller(&local(())), Caller::local());
     }
 
     #[test]

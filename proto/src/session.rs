@@ -250,6 +250,8 @@ pub struct Echo {
     pub hb: u64,
     /// `t1` of that heartbeat, `t2` and `t3` of the server.
     pub clock: ClockSample,
+    /// The server doubts its own wall: the time that it tells is nothing to go by.
+    pub is_clock_doubted: bool,
 }
 
 /// The end of a session.

@@ -457,7 +457,9 @@ impl AgentCore {
                 self.update.server_reached = Some(now.link);
             }
             self.clock = Some(ClockSample { t4_us: now.wall.0 * 1000, ..echo.clock });
-            self.told_the_time(Utc(echo.clock.t3_us / 1000));
+            if !echo.is_clock_doubted {
+                self.told_the_time(Utc(echo.clock.t3_us / 1000));
+            }
         }
         for ack in &down.acks {
             self.acked(ack);

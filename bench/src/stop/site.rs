@@ -5,10 +5,10 @@
 use anyhow::Context;
 use midshift::way::Way;
 use midshift_agent::tls::{self, Tls};
-use midshift_core::identity::Caller;
 use midshift_core::ids::SiteId;
 use midshift_core::time::Clock;
 use midshift_identity::{Duty, IdentityService, Parts};
+use midshift_proto::access::local;
 use midshift_proto::identity::v1::enrolment_service_server::EnrolmentService as _;
 use midshift_proto::identity::v1::identity_service_server::IdentityService as _;
 use midshift_proto::identity::v1::{CreateEnrolmentRequest, EnrolRequest};
@@ -21,7 +21,6 @@ use std::os::unix::fs::DirBuilderExt;
 use std::path::Path;
 use std::sync::Arc;
 use tokio_util::sync::CancellationToken;
-use tonic::Request;
 
 /// As the built-in demo site is named: the stop service of the measurement serves it.
 const SITE: &str = "demo";
@@ -45,12 +44,6 @@ impl Proof {
         let text = std::fs::read(robots).with_context(|| format!("reading {}", robots.display()))?;
         Ok(serde_json::from_slice(&text)?)
     }
-}
-
-fn of_us<T>(message: T) -> Request<T> {
-    let mut request = Request::new(message);
-    request.extensions_mut().insert(Caller::local());
-    request
 }
 
 /// Name of a robot of a run, from 0.
@@ -104,12 +97,12 @@ impl Site {
 
 async fn enrolled(identity: &IdentityService, robot_id: String) -> anyhow::Result<Proof> {
     let asked = CreateEnrolmentRequest { robot_id: robot_id.clone(), replace: false };
-    let offered = identity.create_enrolment(of_us(asked)).await?.into_inner();
+    let offered = identity.create_enrolment(local(asked)).await?.into_inner();
     // Without the digest of the root, which whoever is in this process need not hold against anything.
     let secret = offered.secret.rsplit_once('.').context("a secret without a root")?.0.to_owned();
     let key = KeyPair::generate()?;
     let request_pem = CertificateParams::default().serialize_request(&key)?.pem()?;
-    let answer = identity.enrol(of_us(EnrolRequest { robot_id, secret, request_pem })).await?.into_inner();
+    let answer = identity.enrol(local(EnrolRequest { robot_id, secret, request_pem })).await?.into_inner();
     Ok(Proof {
         certificate_pem: answer.certificate_pem,
         key_pem: key.serialize_pem(),

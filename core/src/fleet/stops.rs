@@ -13,6 +13,7 @@ use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::robot::Presence;
 use crate::stop::latch::is_memory_lost;
+use crate::stop::robot::is_silence;
 use crate::time::Now;
 use crate::work::Live;
 use std::collections::{BTreeMap, BTreeSet};
@@ -117,7 +118,9 @@ fn look(tx: &mut Tx, robot_id: &RobotId, live: Option<&Live>) -> bool {
             wanted.insert(stop_id.clone(), Hold::Resume);
         }
     }
-    for stop_id in waits.iter().filter(|id| !control.resumed.contains(id)) {
+    // Stops first: what has no room is a silence.
+    let (silences, stops): (Vec<&StopId>, Vec<&StopId>) = waits.iter().partition(|id| is_silence(id));
+    for stop_id in stops.into_iter().chain(silences).filter(|id| !control.resumed.contains(id)) {
         if has_room(&wanted, stop_id) {
             wanted.entry(stop_id.clone()).or_insert(Hold::Resume);
         }

@@ -12,7 +12,7 @@ use std::sync::Arc;
 pub enum Who {
     /// Somebody who showed nothing.
     Nobody,
-    /// Whoever reaches a port without login (`dev`), or code of the same process: may do everything.
+    /// Whoever reaches a port without login (`dev`), or code of the same process that says so: may do everything.
     Local,
     /// A robot, by its certificate.
     Robot(RobotId),

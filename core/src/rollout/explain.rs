@@ -27,9 +27,11 @@ pub struct Blocked {
 pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Blocked> {
     let mut since = r.since;
     let mut deadline = None;
-    let due = if view.keyless { robots::next(view, board, now, rollout, r) } else { None };
-    if due.is_some_and(|due| moves::is_signed(view, rollout, r, &due)) {
-        return Some(Blocked { by: Code::NoDirectiveKey.into(), since, deadline });
+    if let Some(code) = view.keyless
+        && let Some(due) = robots::next(view, board, now, rollout, r)
+        && moves::is_signed(view, rollout, r, &due)
+    {
+        return Some(Blocked { by: code.into(), since, deadline });
     }
     let by = match r.step {
         Step::Committed | Step::RolledBack | Step::Skipped => return None,

@@ -210,18 +210,18 @@ pub fn rivals(is_shared: bool, bugs: bugs::Bugs) -> Rivals {
 const MOVES_PER_CYCLE: usize = 1_024;
 
 /// One cycle over a view that has absorbed the whole feed. Items of earlier decisions of the cycle are already in `plan`. `heard`: robots with
-/// a new heartbeat. `sign`: none if there is no key whose orders robots take; then roll-outs stand still, and nobody is told what would have to
-/// be signed. True: there is more to do at once.
+/// a new heartbeat. `sign`: or why nothing can be signed that robots take; then roll-outs stand still, and nobody is told what would have to be
+/// signed. True: there is more to do at once.
 pub fn cycle(
     view: &mut View,
     now: Now,
     board: &Board,
     heard: &BTreeSet<RobotId>,
-    sign: Option<&dyn Sign>,
+    sign: Result<&dyn Sign, Code>,
     plan: &mut Plan,
 ) -> bool {
     let first = plan.items.len();
-    view.keyless = sign.is_none();
+    view.keyless = sign.err();
     let more = plan_all(view, now, board, heard, sign.unwrap_or(&NoSign), plan);
     if plan.items.len() > first {
         pass(view, now, first, plan);
@@ -269,7 +269,7 @@ fn plan_all(
         let Some(row) = view.robots.get(&id).map(|r| &r.row) else { continue };
         let Some(rollout) = view.rollout(&row.rollout_id) else { continue };
         let due = robots::next(view, board, &now, rollout, row);
-        if let Some(due) = due.filter(|due| !(view.keyless && moves::is_signed(view, rollout, row, due))) {
+        if let Some(due) = due.filter(|due| !(view.keyless.is_some() && moves::is_signed(view, rollout, row, due))) {
             if moves == MOVES_PER_CYCLE {
                 return true;
             }

@@ -241,7 +241,7 @@ fn staged(
 /// Why a robot that has the bundle is not taken out of work now.
 pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Reason> {
     if rollout.pauses.contains(&Pause::Keyless) || is_keyless(view, rollout) {
-        return Some(Code::NoDirectiveKey.into());
+        return Some(view.keyless.unwrap_or(Code::NoDirectiveKey).into());
     }
     if !rollout.pauses.is_empty() {
         return Some(Reason::from(Code::BlockedByPause).with("pauses", pauses(rollout)));
@@ -310,7 +310,7 @@ fn stands_still(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
 /// Nobody can sign what its robots take, whatever its phase: newcomers of one that is completed wait too. Who goes back was told already
 /// with what it goes back from.
 pub fn is_keyless(view: &View, rollout: &Rollout) -> bool {
-    view.keyless && rollout.revert_of.is_none()
+    view.keyless.is_some() && rollout.revert_of.is_none()
 }
 
 fn activating(

@@ -17,6 +17,7 @@ use crate::maintenance::{DrainRelease, DrainRequest};
 use crate::picture::{Picture, Viewed};
 pub use crate::picture::{Rowed, Slot};
 use crate::policy::AreaPolicy;
+use crate::reason::Code;
 use crate::robot::{Duty, Lane, Presence};
 use crate::rows::{BadRow, Key, Revision, Row, Seq, Table, Writer};
 use crate::site::Site;
@@ -97,8 +98,8 @@ pub struct View {
     pub served: OtaClock,
     /// How long robots are in contact without a break. Volatile: it begins anew with the process.
     pub contacts: BTreeMap<RobotId, Contact>,
-    /// Nothing can be signed for robots at this moment. Volatile: known where directives are signed, at the last cycle.
-    pub keyless: bool,
+    /// Why nothing can be signed for robots at this moment. Volatile: known where directives are signed, at the last cycle.
+    pub keyless: Option<Code>,
     /// Rows with a value of a newer version.
     pub unknown_rows: UnknownRows,
     /// Naive rules for twins of tests; none outside them.
@@ -298,7 +299,7 @@ impl View {
             read,
             served: OtaClock::default(),
             contacts: BTreeMap::new(),
-            keyless: false,
+            keyless: None,
             unknown_rows: UnknownRows::default(),
             bugs: super::bugs::Bugs::default(),
         }

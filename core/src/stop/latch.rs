@@ -117,6 +117,13 @@ impl Reset {
 pub struct Latch {
     stops: BTreeMap<StopId, Stop>,
     resets: BTreeMap<StopId, Reset>,
+    /// When the newest of those was engaged that were forgotten with their reset; 0: none was.
+    #[serde(default, skip_serializing_if = "is_never")]
+    forgotten: Utc,
+}
+
+fn is_never(at: &Utc) -> bool {
+    *at == Utc(0)
 }
 
 impl Latch {
@@ -149,6 +156,7 @@ impl Latch {
 
     /// Adds all that another knows. Whether anything is new.
     pub fn merge(&mut self, other: Self) -> bool {
+        self.forgotten = self.forgotten.max(other.forgotten);
         let stops = other.stops.into_values().fold(false, |new, stop| self.engage(stop) | new);
         other.resets.into_values().fold(stops, |new, reset| self.reset(reset) | new)
     }
@@ -183,6 +191,11 @@ impl Latch {
         self.resets.values()
     }
 
+    /// Up to when stops were engaged of which this may have forgotten a reset. One that is not known and not newer may have been reset.
+    pub const fn forgotten(&self) -> Utc {
+        self.forgotten
+    }
+
     /// Effective stops that a robot lies inside of.
     pub fn over(&self, robot_id: &RobotId, pose: Option<&Pose>) -> impl Iterator<Item = &Stop> {
         self.effective().filter(move |stop| stop.includes(robot_id, pose))
@@ -194,7 +207,7 @@ impl Latch {
     }
 
     /// Forgets resets that are older than [`limits::RESETS_KEPT`], with their stops; and of the rest as many of the oldest as there are more than
-    /// `resets_max`. Never a stop that is not reset. Whether anything was forgotten.
+    /// `resets_max`. Never a stop that is not reset. [`Latch::forgotten`] says up to where. Whether anything was forgotten.
     pub fn forget(&mut self, now: Utc, resets_max: usize) -> bool {
         let old = self.resets.values().filter(|reset| is_past(reset.at, now)).count();
         let surplus = self.resets.len().saturating_sub(resets_max).max(old);
@@ -203,9 +216,11 @@ impl Latch {
         }
         let mut by_age: Vec<_> = self.resets.values().map(|reset| (reset.at, reset.stop_id.clone())).collect();
         by_age.sort_unstable();
-        for (_, stop_id) in by_age.into_iter().take(surplus) {
+        for (reset, stop_id) in by_age.into_iter().take(surplus) {
             self.resets.remove(&stop_id);
-            self.stops.remove(&stop_id);
+            // Of a stop that was never known all that is sure is that it came before its reset.
+            let engaged = self.stops.remove(&stop_id).map_or(reset, |stop| stop.engaged);
+            self.forgotten = self.forgotten.max(engaged);
         }
         true
     }
@@ -355,5 +370,26 @@ mod tests {
         latch.reset(reset(3));
         assert!(latch.forget(Utc(0), 1), "the oldest go when there are too many");
         assert!(latch.reset_of(&id(1)).is_none() && latch.reset_of(&id(3)).is_some());
+    }
+
+    #[test]
+    fn what_is_forgotten_leaves_a_mark_that_only_rises() {
+        let mut latch = Latch::default();
+        latch.engage(stop(5));
+        latch.reset(reset(5));
+        assert_eq!(latch.forgotten(), Utc(0), "nothing is forgotten yet");
+        assert!(latch.forget(Utc(0), 0));
+        assert_eq!(latch.forgotten(), Utc(5), "when it was engaged");
+        latch.engage(stop(2));
+        latch.reset(reset(2));
+        assert!(latch.forget(Utc(0), 0));
+        assert_eq!(latch.forgotten(), Utc(5));
+        latch.reset(reset(7));
+        assert!(latch.forget(Utc(0), 0));
+        assert_eq!(latch.forgotten(), Utc(107), "of a stop that was never known: when it was reset");
+        let text = serde_json::to_string(&latch).expect("a latch");
+        assert_eq!(serde_json::from_str::<Latch>(&text).expect("a latch"), latch);
+        let older: Latch = serde_json::from_str(r#"{"stops":{},"resets":{}}"#).expect("of an older version");
+        assert_eq!(merged(&older, &latch).forgotten(), Utc(107));
     }
 }

@@ -67,6 +67,12 @@ impl RobotStop {
         self.is_told
     }
 
+    /// What waits for a person, at most `most`: a list that is cut loses silences before it loses a stop.
+    pub fn awaiting(&self, most: usize) -> Vec<StopId> {
+        let (silences, stops): (Vec<&StopId>, Vec<&StopId>) = self.kept.awaiting.iter().partition(|id| is_silence(id));
+        stops.into_iter().chain(silences).take(most).cloned().collect()
+    }
+
     /// When the silence comes further if nothing is answered before. None: it is as far as it gets.
     pub fn silence_at(&self, around: Around) -> Option<LinkTime> {
         self.ladder.next_at(around)
@@ -149,13 +155,15 @@ impl RobotStop {
         Obeyed { level, inside: over.into_iter().map(|(id, _)| id).collect(), stage, is_changed }
     }
 
-    /// A silence that stood it among people is a person's to end; at its beginning nobody was heard yet, and it did not stand for people.
+    /// A silence that stood it among people is a person's to end; at its beginning nobody was heard yet, and it did not stand for people. While one waits for that,
+    /// further ones add no name: a silence that is resumed while another goes on gives that one its name.
     fn silent(&mut self, stage: Stage, around: Around, wall: Utc) -> bool {
         if stage != Stage::Stand {
             self.silence = None;
             return false;
         }
-        if !self.is_told || !self.was_heard || around == Around::Robots || self.silence.is_some() {
+        let has_name = self.silence.is_some() || self.kept.awaiting.iter().any(is_silence);
+        if !self.is_told || !self.was_heard || around == Around::Robots || has_name {
             return false;
         }
         let named = format!("{SILENCE}{}-{}", self.robot_id, wall.0);
@@ -283,6 +291,57 @@ mod tests {
             robot.resumed(&silences);
             assert_eq!(robot.look(&at(62_100), None, around).level, StopLevel::None);
         }
+    }
+
+    /// It is silent for so long, and answered again.
+    fn silence(robot: &mut RobotStop, at_s: u64) {
+        robot.look(&at(at_s * 1_000), None, Around::People);
+        (at_s..at_s + 3).for_each(|s| robot.answered(LinkTime(s * 1_000)));
+        robot.look(&at(at_s * 1_000 + 2_500), None, Around::People);
+    }
+
+    #[test]
+    fn while_one_silence_waits_for_a_resume_further_ones_add_no_name_and_the_next_has_a_new_one() {
+        let mut robot = free();
+        silence(&mut robot, 60);
+        let first = robot.kept().awaiting.clone();
+        (2..20).for_each(|n| silence(&mut robot, n * 60));
+        assert_eq!((first.len(), &robot.kept().awaiting), (1, &first));
+        robot.resumed(&first);
+        assert_eq!(robot.look(&at(1_200_000 - 57_000), None, Around::People).level, StopLevel::None);
+        silence(&mut robot, 1_200);
+        let second = robot.kept().awaiting.clone();
+        assert!(second.len() == 1 && second.is_disjoint(&first), "{second:?}");
+        // The first is resumed while the next one goes on: nobody has seen that one.
+        let mut robot = free();
+        silence(&mut robot, 60);
+        robot.look(&at(120_000), None, Around::People);
+        robot.resumed(&first);
+        robot.look(&at(120_100), None, Around::People);
+        let next = robot.kept().awaiting.clone();
+        assert!(next.len() == 1 && next.is_disjoint(&first), "{next:?}");
+        robot.resumed(&next);
+        robot.look(&at(120_200), None, Around::People);
+        assert!(robot.kept().awaiting.is_empty(), "a person saw that one");
+    }
+
+    #[test]
+    fn a_latch_full_of_silences_or_stops_takes_a_stop_and_names_it_before_every_silence() {
+        let silences = (0..2 * limits::STOPS_MAX).map(|n| StopId::parse(&format!("{SILENCE}r1-{n}")).expect("an id"));
+        let kept = Kept { awaiting: silences.collect(), ..Kept::default() };
+        let mut full_of_silences = RobotStop::begin(robot(), kept, LinkTime(0));
+        full_of_silences.told(vec![stop(1, StopLevel::Halt)], vec![]);
+        let obeyed = full_of_silences.look(&at(100), None, Around::Robots);
+        assert_eq!((obeyed.inside, full_of_silences.awaiting(limits::STOPS_MAX)[0].clone()), (vec![id(1)], id(1)));
+        let mut full_of_stops = free();
+        let named = |n: usize| StopId::parse(&format!("STOP-A{n}")).expect("an id");
+        let many = (0..2 * limits::STOPS_MAX).map(|n| Stop { stop_id: named(n), ..stop(0, StopLevel::Halt) });
+        full_of_stops.told(many.collect(), vec![]);
+        full_of_stops.look(&at(3_100), None, Around::Robots);
+        full_of_stops.told(vec![stop(2, StopLevel::ControlledStopPosture)], vec![]);
+        let obeyed = full_of_stops.look(&at(3_200), None, Around::Robots);
+        assert_eq!((obeyed.level, &obeyed.inside[0]), (StopLevel::ControlledStopPosture, &id(2)));
+        assert!(full_of_stops.kept().awaiting.contains(&id(2)));
     }
 
     #[test]

@@ -14,6 +14,8 @@ struct Machine {
     us: Arc<AtomicU64>,
     ahead_ms: Arc<AtomicI64>,
     told: Arc<Mutex<Vec<i64>>>,
+    /// When the network set the wall last; 0: never.
+    synced_ms: Arc<AtomicI64>,
     clock: Box<dyn Clock>,
 }
 
@@ -24,8 +26,11 @@ impl Machine {
         let (mono, beside, ahead, heard) = (us.clone(), us.clone(), ahead_ms.clone(), told.clone());
         let wall = move || Utc(ahead.load(Relaxed)).plus_ms(beside.load(Relaxed) / 1000);
         let hear = move |jump: &Jump| heard.lock().expect("not poisoned").push(jump.step_ms());
-        let clock = Box::new(WallClock::new(move || mono.load(Relaxed), wall, hear));
-        Self { us, ahead_ms, told, clock }
+        let synced_ms = Arc::<AtomicI64>::default();
+        let set = synced_ms.clone();
+        let synced = move || Some(Utc(set.load(Relaxed))).filter(|at| at.0 > 0);
+        let clock = Box::new(WallClock::new(move || mono.load(Relaxed), wall, hear).with_synced(synced));
+        Self { us, ahead_ms, told, synced_ms, clock }
     }
     fn pass(&self, ms: u64) -> Now {
         self.us.fetch_add(ms * 1000, Relaxed);
@@ -34,6 +39,9 @@ impl Machine {
     fn step(&self, ms: i64) -> Now {
         self.ahead_ms.fetch_add(ms, Relaxed);
         self.clock.now()
+    }
+    fn is_doubted(&self) -> bool {
+        self.clock.doubt().is_some()
     }
     fn told(&self) -> Vec<i64> {
         self.told.lock().expect("not poisoned").clone()
@@ -126,4 +134,59 @@ fn what_stands_is_judged_without_a_large_jump_for_ten_minutes() {
     assert_eq!(over.standing_wall(), over.wall);
     let back = machine.step(-HOUR - 1);
     assert_eq!(back.standing_wall(), Utc(back.wall.0 - HOUR + 1), "half of it was taken back");
+}
+
+#[test]
+fn a_wall_that_stepped_more_than_five_minutes_is_in_doubt_until_it_is_set_back() {
+    let machine = Machine::new();
+    machine.step(5 * 60_000);
+    assert!(!machine.is_doubted());
+    machine.ahead_ms.fetch_add(6_000, Relaxed);
+    assert_eq!(machine.clock.doubt(), Some(Doubt { step_ms: 306_000, at: Utc(BEGIN + 306_000) }), "steps add up");
+    machine.step(30 * 24 * HOUR);
+    machine.pass(60_000);
+    assert!(machine.is_doubted());
+    machine.step(-30 * 24 * HOUR);
+    assert!(machine.is_doubted(), "what it stepped before is not taken back");
+    machine.step(-306_000);
+    assert!(!machine.is_doubted());
+    machine.step(-HOUR);
+    assert_eq!(machine.clock.doubt().map(|doubt| doubt.step_ms), Some(-HOUR));
+}
+
+#[test]
+fn a_doubt_is_over_once_the_network_sets_the_wall_or_a_person_accepts_it() {
+    let machine = Machine::new();
+    machine.synced_ms.store(BEGIN - 1_000, Relaxed);
+    machine.step(HOUR);
+    assert!(machine.is_doubted(), "it was set before that step");
+    machine.synced_ms.store(BEGIN + HOUR + 1_000, Relaxed);
+    assert!(!machine.is_doubted());
+    machine.step(HOUR);
+    assert!(machine.is_doubted());
+    machine.clock.accept_wall();
+    assert!(!machine.is_doubted());
+    machine.step(HOUR);
+    assert!(machine.is_doubted(), "a word counts for what was before it");
+}
+
+#[test]
+fn a_start_far_past_what_was_written_down_is_in_doubt_unless_the_network_set_the_wall() {
+    let newest = Utc(BEGIN - 30 * 24 * HOUR);
+    let begins = |synced_ms: i64, newest: Utc| {
+        let machine = Machine::new();
+        machine.synced_ms.store(synced_ms, Relaxed);
+        machine.clock.check_start(newest);
+        machine
+    };
+    assert!(!begins(0, Utc(BEGIN - 7 * 24 * HOUR)).is_doubted(), "a week of holidays");
+    assert!(!begins(BEGIN - 1_000, newest).is_doubted(), "the network says so");
+    assert!(!begins(0, Utc(BEGIN + HOUR)).is_doubted(), "behind what was written down");
+    let machine = begins(0, newest);
+    assert!(machine.is_doubted());
+    machine.step(-29 * 24 * HOUR);
+    assert!(!machine.is_doubted(), "as one that starts so");
+    let machine = begins(0, newest);
+    machine.synced_ms.store(BEGIN, Relaxed);
+    assert!(!machine.is_doubted());
 }

@@ -246,3 +246,38 @@ async fn a_timestamp_that_is_withheld_is_seen_to_expire_by_the_time_that_a_prove
         "no signed time"
     );
 }
+
+/// A server whose clock is far ahead signs, and what follows for a robot that fetches it again and again.
+#[tokio::test]
+async fn a_signed_time_raises_the_floor_two_days_past_what_a_robot_knows_and_each_only_once() {
+    let shelf = Shelf::new();
+    let unsynced = Reading { utc: Utc(0), is_synced: false };
+    let shown = async |shelf: &Shelf, robot: &Trusted| {
+        robot.refresh(Arc::new(shelf.documents.clone()), unsynced).await.map(|refreshed| refreshed.trusted)
+    };
+    let robot = shown(&shelf, &shelf.robot()).await.expect("the first time that it hears counts whole");
+    assert_eq!(robot.time_floor(), shelf.now);
+    let ahead = |days: u64| {
+        let mut ahead = shelf.clone();
+        ahead.now = shelf.now.plus_ms(days * DAY_MS);
+        ahead.freshen();
+        ahead
+    };
+    let wrong = ahead(30);
+    let fooled = shown(&wrong, &robot).await.expect("believed");
+    assert_eq!(fooled.time_floor(), shelf.now.plus_ms(2 * DAY_MS));
+    let again = shown(&wrong, &fooled).await.expect("believed");
+    assert_eq!(again.time_floor(), fooled.time_floor(), "one signature raises it once");
+    // What it counted itself, or was told by a proven server, or reads off a clock that is set, is no doubt of the signature's.
+    let knows = robot.clone().knowing(shelf.now.plus_ms(29 * DAY_MS));
+    assert_eq!(shown(&wrong, &knows).await.expect("believed").time_floor(), wrong.now);
+    let synced = Reading { utc: shelf.now.plus_ms(10 * DAY_MS), is_synced: true };
+    let synced = robot.refresh(Arc::new(wrong.documents.clone()), synced).await.expect("believed").trusted;
+    assert_eq!(synced.time_floor(), shelf.now.plus_ms(12 * DAY_MS));
+    // The clock is right again: it goes on as soon as what is honest is not older than two days.
+    let mut honest = wrong.clone();
+    honest.now = shelf.now.plus_ms(DAY_MS + DAY_MS / 2);
+    honest.freshen();
+    let healed = shown(&honest, &again).await.expect("two days, not thirty");
+    assert_eq!(healed.time_floor(), fooled.time_floor());
+}

@@ -297,7 +297,11 @@ impl Parse<LaneAck> for v1::ReplayStatusResponse {
 impl From<&Downlink> for v1::Downlink {
     fn from(downlink: &Downlink) -> Self {
         Self {
-            echo: downlink.echo.as_ref().map(|e| v1::HeartbeatEcho { hb: e.hb, clock: Some((&e.clock).into()) }),
+            echo: downlink.echo.as_ref().map(|e| v1::HeartbeatEcho {
+                hb: e.hb,
+                clock: Some((&e.clock).into()),
+                is_clock_doubted: e.is_clock_doubted,
+            }),
             acks: downlink.acks.iter().map(Into::into).collect(),
             work: downlink.work.as_ref().map(Into::into),
             policy: downlink.policy.as_ref().map(Into::into),
@@ -312,7 +316,7 @@ impl Parse<Echo> for v1::HeartbeatEcho {
     fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<Echo> {
         let hb = from_one(self.hb, at.field("hb"), bad);
         let clock = need(self.clock, at.field("clock"), bad);
-        Some(Echo { hb: hb?, clock: clock? })
+        Some(Echo { hb: hb?, clock: clock?, is_clock_doubted: self.is_clock_doubted })
     }
 }
 

@@ -347,7 +347,7 @@ fn what_the_server_says_is_what_a_robot_hears() {
         observed: true,
     };
     let full = Downlink {
-        echo: Some(Echo { hb: 812, clock: ClockSample { t4_us: 0, ..clock() } }),
+        echo: Some(Echo { hb: 812, clock: ClockSample { t4_us: 0, ..clock() }, is_clock_doubted: true }),
         acks: vec![LaneAck { lane: Lane::Critical, seq: 0, expect: Some(1) }],
         work: Some(work()),
         unreadable_work: None,

@@ -182,7 +182,7 @@ impl Stops {
 
     /// What waits for a person, at most [`limits::STOPS_MAX`].
     pub(crate) fn awaiting(&self) -> Vec<StopId> {
-        self.kept().awaiting.iter().take(limits::STOPS_MAX).cloned().collect()
+        self.robot.awaiting(limits::STOPS_MAX)
     }
 
     /// Effective stops that it lies inside of, at most [`limits::STOPS_MAX`].

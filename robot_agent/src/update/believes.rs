@@ -40,12 +40,29 @@ impl AgentCore {
         Trusted::new(root).map_err(|e| Reason::new(Code::MetadataRefused, e.to_string()))
     }
 
+    /// Notes since when the time floor is what it is, by the robot's own clock.
+    pub(super) fn note_floor(&mut self, now: &Now) {
+        let floor = self.kept.ledger.trusted.as_ref().map_or(Utc(0), |trusted| trusted.time_floor());
+        if self.update.floor.is_none_or(|(known, _)| known != floor) {
+            self.update.floor = Some((floor, now.link));
+        }
+    }
+
+    /// What it knows of the time by itself: its floor and its own clock since, or what a proven server told last. 0: nothing.
+    fn own_time(&self, now: &Now) -> Utc {
+        let told = self.update.told.unwrap_or(Utc(0));
+        match self.update.floor {
+            Some((floor, since)) if floor > Utc(0) => floor.plus_ms(now.link.since(since).as_ms()).max(told),
+            _ => told,
+        }
+    }
+
     /// The server told the time with the echo of a heartbeat: what it proved itself for raises the floor, within bounds.
     pub(crate) fn told_the_time(&mut self, time: Utc) {
         if !self.config.server_is_proven {
             return;
         }
-        self.update.told = self.update.told.max(Some(time));
+        self.update.told = Some(time);
         if let Some(trusted) = self.kept.ledger.trusted.as_ref().and_then(|trusted| trusted.told(time)) {
             self.write(Op::Trusted(Arc::new(trusted)), false);
         }
@@ -79,18 +96,19 @@ impl AgentCore {
         self.put_software(SoftwareRow { keys: Some(held), ..self.kept.ledger.software.clone() });
     }
 
-    pub(super) fn ask_to_refresh(&mut self, trusted: Trusted, clock: Reading) {
+    pub(super) fn ask_to_refresh(&mut self, now: &Now, trusted: Trusted, clock: Reading) {
+        let trusted = trusted.knowing(self.own_time(now));
         let keys_after = self.directive_keys().number;
         self.update.asks_for_keys = false;
         self.ask_for(Job::Refresh { trusted: Box::new(trusted), clock, keys_after });
     }
 
-    pub(super) fn refresh_again(&mut self) {
+    pub(super) fn refresh_again(&mut self, now: &Now) {
         match self.trusted() {
             Ok(trusted) => {
                 let is_synced = false;
                 let clock = Reading { utc: trusted.time_floor(), is_synced };
-                self.ask_to_refresh(trusted, clock);
+                self.ask_to_refresh(now, trusted, clock);
             }
             Err(reason) => self.move_to(UpdateState::Refused, Some(reason)),
         }

@@ -244,8 +244,10 @@ pub(crate) struct Updater {
     pub(crate) keys_asked: Option<String>,
     /// The repository is asked for newer keys alone.
     pub(crate) asks_for_keys: bool,
-    /// The latest time that a proven server told.
+    /// The time that a proven server told last.
     pub(crate) told: Option<Utc>,
+    /// The time floor, and since when it is that by the robot's own clock.
+    pub(crate) floor: Option<(Utc, LinkTime)>,
     /// Generation of the section whose order to go back was refused because nothing is kept.
     pub(crate) no_way_back: Option<u64>,
     /// Content that is known to be there.

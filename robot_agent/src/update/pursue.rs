@@ -66,6 +66,7 @@ impl AgentCore {
     /// Decides what is next, if nothing is under way.
     pub(crate) fn pursue_update(&mut self, now: &Now) -> Option<ExitReason> {
         self.take_switch_back(now);
+        self.note_floor(now);
         if self.update.config.is_none() || self.update.next.is_some() {
             return None;
         }
@@ -86,7 +87,7 @@ impl AgentCore {
             return self.without_update(now, &holdings);
         };
         match update.state {
-            UpdateState::Directed => self.directed(&update),
+            UpdateState::Directed => self.directed(now, &update),
             UpdateState::Downloading => self.downloading(&update),
             UpdateState::Staged => self.staged(now, update),
             UpdateState::Switching => return self.switching(now, &update, &holdings),
@@ -276,7 +277,7 @@ impl AgentCore {
         }
         match self.trusted() {
             Ok(trusted) => {
-                self.ask_to_refresh(trusted, self.reading(now));
+                self.ask_to_refresh(now, trusted, self.reading(now));
                 true
             }
             Err(reason) => {
@@ -309,7 +310,7 @@ impl AgentCore {
         let opened = self.opened(&desired, software.directive, trusted.now(self.reading(now)));
         if opened == Err(Rejection::NotSigned) && self.update.keys_asked.as_ref() != Some(&desired.directive) {
             // The server may sign with a key that came since.
-            self.ask_to_refresh(trusted, self.reading(now));
+            self.ask_to_refresh(now, trusted, self.reading(now));
             self.update.asks_for_keys = true;
             return true;
         }
@@ -375,10 +376,10 @@ impl AgentCore {
 
     // --- bytes
 
-    fn directed(&mut self, update: &Update) {
+    fn directed(&mut self, now: &Now, update: &Update) {
         if self.update.listed.is_none() {
             // After a restart: what the repository lists is asked for again, and the directive is not.
-            return self.refresh_again();
+            return self.refresh_again(now);
         }
         self.ask_for(Job::Manifest { wanted: Wanted { digest: update.bundle, length: update.manifest_length } });
     }

@@ -75,7 +75,8 @@ async fn carry(session: &mut Seen, body: &TestBody) -> Carried {
             carried.is_fault_told |= batch.lane == Lane::Critical;
         }
         if let Some(heartbeat) = uplink.heartbeat {
-            down.echo = Some(Echo { hb: heartbeat.reported.hb, clock: ClockSample::default() });
+            down.echo =
+                Some(Echo { hb: heartbeat.reported.hb, clock: ClockSample::default(), is_clock_doubted: false });
             let loads = heartbeat.reported.update.is_some_and(|u| u.state == UpdateState::Downloading);
             carried.beats += usize::from(loads);
             carried.with_code += usize::from(heartbeat.reported.fault.is_some());

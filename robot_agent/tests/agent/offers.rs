@@ -214,7 +214,7 @@ fn work_that_cannot_be_read_ends_no_session_and_the_robot_says_so() {
     rig.connect();
     let held = DesiredWork { assignment: Some(drive(&rig, "T1", 1)), ..rig.desired(None) };
     let mut message = v1::SessionResponse::from(&ToRobot::Downlink(Box::new(Downlink {
-        echo: Some(Echo { hb: 1, clock: ClockSample::default() }),
+        echo: Some(Echo { hb: 1, clock: ClockSample::default(), is_clock_doubted: false }),
         work: Some(DesiredWork { generation: 9, ..held.clone() }),
         ..Downlink::default()
     })));

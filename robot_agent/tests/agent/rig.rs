@@ -468,7 +468,7 @@ impl Rig {
     }
     /// The server has processed the newest heartbeat.
     pub fn echo(&mut self) {
-        let echo = Some(Echo { hb: self.hb, clock: ClockSample::default() });
+        let echo = Some(Echo { hb: self.hb, clock: ClockSample::default(), is_clock_doubted: false });
         self.down(Downlink { echo, ..Downlink::default() });
     }
     /// Time passes without a word from the server.

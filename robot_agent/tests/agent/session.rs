@@ -74,7 +74,7 @@ impl Seen {
         loop {
             if let Some(heartbeat) = self.uplink().await.heartbeat {
                 let hb = heartbeat.reported.hb;
-                let echo = Some(Echo { hb, clock: ClockSample::default() });
+                let echo = Some(Echo { hb, clock: ClockSample::default(), is_clock_doubted: false });
                 self.say(ToRobot::Downlink(Box::new(Downlink { echo, ..Downlink::default() }))).await;
                 return hb;
             }

@@ -102,7 +102,7 @@ fn before_the_stop_service_has_said_its_key_no_reset_on_the_link_counts() {
 fn a_list_beyond_its_limit_is_refused_by_itself_and_what_is_latched_stays() {
     let mut rig = halted();
     let resets = (0..=limits::STOPS_MAX as u64).map(|n| marked(reset(n), &service())).collect();
-    let echo = Some(Echo { hb: rig.hb, clock: ClockSample::default() });
+    let echo = Some(Echo { hb: rig.hb, clock: ClockSample::default(), is_clock_doubted: false });
     let stops = Some(StopFacts { stops: vec![stop(5, StopLevel::Slow)], resets });
     let down = ToRobot::Downlink(Box::new(Downlink { echo, stops, ..Downlink::default() }));
     let wire = midshift_proto::link::v1::SessionResponse::from(&down);

@@ -106,7 +106,7 @@ async fn floor_after(link: TcpDial, mut sessions: mpsc::Receiver<Seen>, told: Ut
     session.welcome(5).await;
     session.next().await.expect("a heartbeat");
     let clock = ClockSample { t3_us: told.0 * 1000, ..ClockSample::default() };
-    let echo = Some(Echo { hb: 1, clock });
+    let echo = Some(Echo { hb: 1, clock, is_clock_doubted: false });
     session.say(ToRobot::Downlink(Box::new(Downlink { echo, ..Downlink::default() }))).await;
     // What it was told is decided on before its next heartbeat leaves.
     session.next().await.expect("a heartbeat");
@@ -136,18 +136,20 @@ async fn in_plain_text_anybody_could_tell_a_time_and_the_floor_stays() {
 #[test]
 fn the_floor_rises_within_two_days_of_the_newest_signature_and_never_falls() {
     let (mut rig, releases): (Rig, Releases) = crate::updates::connected();
-    let floor_at = |rig: &mut Rig, hours: u64| {
+    let floor_after = |rig: &mut Rig, hours: u64, is_clock_doubted: bool| {
         let clock = ClockSample { t3_us: SIGNED.plus_ms(hours * HOUR_MS).0 * 1000, ..ClockSample::default() };
-        rig.down(Downlink { echo: Some(Echo { hb: 1, clock }), ..Downlink::default() });
+        rig.down(Downlink { echo: Some(Echo { hb: 1, clock, is_clock_doubted }), ..Downlink::default() });
         // It is written with what comes next.
         rig.pass(2_000);
         rig.store.kept().expect("loaded").ledger.trusted.map(|t| (t.time_floor().0 - SIGNED.0) / 3_600_000)
     };
+    let floor_at = |rig: &mut Rig, hours: u64| floor_after(rig, hours, false);
     assert_eq!(floor_at(&mut rig, 9), None, "nothing signed has said any time yet");
     let bundle = releases.release("1.0.0");
     crate::updates::stage(&mut rig, &releases, &bundle, 1);
     assert_eq!(floor_at(&mut rig, 9), Some(9));
     assert_eq!(floor_at(&mut rig, 5), Some(9), "a server whose clock is behind");
+    assert_eq!(floor_after(&mut rig, 24 * 30, true), Some(9), "a server that doubts its own clock");
     assert_eq!(floor_at(&mut rig, 24 * 365), Some(48), "a server whose clock is far ahead");
     assert_eq!(floor_at(&mut rig, 24 * 3650), Some(48));
     // It is on the ledger: a restart forgets nothing.

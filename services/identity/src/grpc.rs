@@ -47,6 +47,14 @@ impl IdentityService {
         self.0.authority.as_ref().ok_or_else(|| Refusal::new(Kind::Precondition, elsewhere()))
     }
 
+    /// The authority, if it may sign by the wall of this machine: what it signs has its beginning and its end by it.
+    fn signing(&self) -> Result<&Authority, Refusal> {
+        match self.0.clock.doubt() {
+            Some(_) => Err(Refusal::new(Kind::Unavailable, Code::ClockDoubted)),
+            None => self.authority(),
+        }
+    }
+
     async fn make_token(&self, r: v1::CreateTokenRequest, actor: &Caller) -> Result<v1::CreateTokenResponse, Refusal> {
         let wanted = Wanted::check(&r)?;
         let (record, secret) = tokens::create(&self.0.register, &wanted, &actor.into(), self.now()).await?;
@@ -150,7 +158,7 @@ impl IdentityService {
         let (Some(robot_id), Some(secret)) = (robot_id, secret) else {
             return Err(Refusal::field("secret", "is required"));
         };
-        let (authority, asked, now) = (self.authority()?, asked(&r.request_pem)?, self.now());
+        let (authority, asked, now) = (self.signing()?, asked(&r.request_pem)?, self.now());
         let (key, digest) = (asked.key, tokens::digest(&secret));
         let expires = Utc(now.0.saturating_add_unsigned(limits::ROBOT_CERTIFICATE_VALID.as_ms()));
         // One at a time: whether a key is another robot's is decided over all of them.
@@ -195,7 +203,7 @@ impl IdentityService {
     ) -> Result<v1::RenewCertificateResponse, Refusal> {
         let robot_id = robot_of(&r.robot_id)?;
         caller.is_robot(&robot_id)?;
-        let (authority, asked, now) = (self.authority()?, asked(&r.request_pem)?, self.now());
+        let (authority, asked, now) = (self.signing()?, asked(&r.request_pem)?, self.now());
         let key = asked.key;
         let expires = Utc(now.0.saturating_add_unsigned(limits::ROBOT_CERTIFICATE_VALID.as_ms()));
         self.0

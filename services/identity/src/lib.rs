@@ -158,9 +158,12 @@ impl IdentityService {
         all.extend(names.into_iter().filter(|name| !NAMES.contains(&name.as_str())));
         all.truncate(limits::SERVER_NAMES_MAX);
         let own = OwnKey::open(&folder, all)?;
-        own.ask(&register, clock.now().wall).await?;
-        if let Some(authority) = &authority {
-            answer(authority, &register, clock.now().wall).await?;
+        // By a wall in doubt an old certificate is better than a new one; without any there is nothing to serve with.
+        if clock.doubt().is_none() || own.proof(&register).await?.is_none() {
+            own.ask(&register, clock.now().wall).await?;
+            if let Some(authority) = &authority {
+                answer(authority, &register, clock.now().wall).await?;
+            }
         }
         let proof = waited_for(&own, &register, &*store, shutdown).await?;
         files::write(&folder, PUBLIC_FILE, &proof.authority_pem, files::PUBLIC)?;
@@ -201,9 +204,12 @@ impl IdentityService {
         let inner = &*self.0;
         let now = inner.clock.now().wall;
         inner.register.refresh().await.map_err(Error::Store)?;
-        inner.own.ask(&inner.register, now).await?;
-        if let Some(authority) = &inner.authority {
-            answer(authority, &inner.register, now).await?;
+        // A certificate that begins and ends by a wrong wall is none once the wall is right.
+        if inner.clock.doubt().is_none() {
+            inner.own.ask(&inner.register, now).await?;
+            if let Some(authority) = &inner.authority {
+                answer(authority, &inner.register, now).await?;
+            }
         }
         if let Some(proof) = inner.own.proof(&inner.register).await? {
             inner.proof.send_if_modified(|known| {

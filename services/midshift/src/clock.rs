@@ -2,9 +2,14 @@
 
 use midshift_core::time::{Clock, Jump, ScaledClock, Utc};
 use midshift_core::wall::WallClock;
+use std::fs;
 use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 use tokio::time::Instant;
+
+/// systemd touches it when the clock of the machine was set from the network. The kernel is not asked: the system call filter of our own unit ends a
+/// process that calls adjtimex, also one that only reads.
+const SYNCED: &str = "/run/systemd/timesync/synchronized";
 
 /// UTC of the machine, unix ms.
 #[expect(clippy::disallowed_methods, reason = "the one place where the machine's wall clock is read")]
@@ -16,7 +21,7 @@ pub fn wall() -> Utc {
 /// Clocks that start now; the site clock runs `rate_permille` thousandths of real time. One that is not real is a simulation's own, with its wall.
 pub fn clock(rate_permille: u32) -> Arc<dyn Clock> {
     match rate_permille {
-        1000 => Arc::new(WallClock::new(micros(), wall, log)),
+        1000 => Arc::new(WallClock::new(micros(), wall, log).with_synced(synced)),
         _ => at(wall(), rate_permille),
     }
 }
@@ -24,6 +29,13 @@ pub fn clock(rate_permille: u32) -> Arc<dyn Clock> {
 /// Clocks whose UTC is `utc` now, whatever the wall says later.
 pub fn at(utc: Utc, rate_permille: u32) -> Arc<dyn Clock> {
     Arc::new(ScaledClock::new(micros(), utc, rate_permille))
+}
+
+/// When the network set the clock of this machine last; none: not since the machine started, or nothing here says so.
+fn synced() -> Option<Utc> {
+    let touched = fs::metadata(SYNCED).and_then(|file| file.modified()).ok()?;
+    let since = touched.duration_since(UNIX_EPOCH).ok()?;
+    Some(Utc(i64::try_from(since.as_millis()).unwrap_or(i64::MAX)))
 }
 
 fn micros() -> impl Fn() -> u64 + Send + Sync {

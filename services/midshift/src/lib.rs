@@ -7,6 +7,7 @@ pub mod backup;
 mod changed_map;
 pub mod cli;
 pub mod clock;
+pub mod clock_doubt;
 mod clock_jump;
 mod denials;
 pub mod dev;

@@ -6,8 +6,8 @@ use crate::planning::Planning;
 use crate::roles::{Role, Roles};
 use crate::server::{Naive, Parts, Server};
 use crate::storage::{Database, Storage};
-use crate::{backup, changed_map, clock_jump};
-use crate::{clock, logs, site_file, stop, stop_follower};
+use crate::{backup, changed_map};
+use crate::{clock, clock_doubt, clock_jump, logs, site_file, stop, stop_follower};
 use anyhow::{Context, bail};
 use clap::ValueEnum;
 use midshift_agent::tls;
@@ -196,6 +196,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
     crate::recorder::handle();
     let site_id = loaded.site.site_id().clone();
     let storage = args.database.open(&args.data, site_id, clock.clone()).await?;
+    clock_doubt::check_start(&*clock, &*storage.store()).await?;
     let (loaded, map) = match roles.has(Role::Fleet) {
         true => changed_map::choose(&*storage.store(), loaded, args.force_map, clock.now()).await?,
         false => (changed_map::follow(&*storage.store(), loaded).await?, Default::default()),
@@ -288,6 +289,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         () = kept => Ok(()),
         () = backup::told::run(&args.data, &*rows) => Ok(()),
         () = clock_jump::keep(&args.data, &*clock) => Ok(()),
+        () = clock_doubt::run(&args.data, &*clock, &*rows) => Ok(()),
     };
     storage.close().await;
     served

@@ -1,5 +1,5 @@
-//! Says in each answer to a health check of which site a server is, where its stop service listens and what its wall clock jumped; reads that on the
-//! other side.
+//! Says in each answer to a health check of which site a server is, where its stop service listens, what its wall clock jumped and whether that is in doubt; reads it on
+//! the other side.
 //!
 //! Whoever may ask for health may ask for this: nobody has to sign in for it, and it is needed most where nobody has.
 
@@ -14,6 +14,7 @@ use tower::util::MapResponseLayer;
 const SITE: &str = "midshift-site";
 const STOP_PORT: &str = "midshift-stop-port";
 const CLOCK_JUMP: &str = "midshift-clock-jump";
+const CLOCK_DOUBT: &str = "midshift-clock-doubt";
 
 /// What a server says of its site.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -37,7 +38,7 @@ impl SiteAnswer {
         Some(Self { site_id: text(SITE)?.to_owned(), stop_port: text(STOP_PORT).and_then(|port| port.parse().ok()) })
     }
 
-    /// Adds it, and the newest jump of the wall, to each answer of a service; `before` is that of the run before.
+    /// Adds it, the newest jump of the wall and a doubt about it to each answer of a service; `before` is the jump of the run before.
     pub fn layer(
         self,
         clock: Arc<dyn Clock>,
@@ -49,7 +50,8 @@ impl SiteAnswer {
         MapResponseLayer::new(move |mut response: Response<Body>| {
             let jump = clock.last_jump().map(|jump| (jump.step_ms(), jump.to)).or(before);
             let jump = jump.and_then(|(step_ms, to)| said_jump(step_ms, to).parse().ok());
-            let said = [(SITE, site.clone()), (STOP_PORT, port.clone()), (CLOCK_JUMP, jump)];
+            let doubt = clock.doubt().and_then(|doubt| said_jump(doubt.step_ms, doubt.at).parse().ok());
+            let said = [(SITE, site.clone()), (STOP_PORT, port.clone()), (CLOCK_JUMP, jump), (CLOCK_DOUBT, doubt)];
             let said = said.into_iter().filter_map(|(name, value)| Some((name, value?)));
             said.for_each(|(name, value)| drop(response.headers_mut().insert(name, value)));
             response
@@ -63,7 +65,16 @@ fn said_jump(step_ms: i64, to: Utc) -> String {
 
 /// Milliseconds that the wall clock of a server jumped ahead at last (negative: back), and UTC when it had.
 pub fn clock_jump(metadata: &MetadataMap) -> Option<(i64, Utc)> {
-    let (step_ms, to) = metadata.get(CLOCK_JUMP)?.to_str().ok()?.split_once(' ')?;
+    step(metadata, CLOCK_JUMP)
+}
+
+/// Milliseconds that the wall clock of a server is ahead of where it should be (negative: behind), and UTC when that was seen: it signs nothing by it.
+pub fn clock_doubt(metadata: &MetadataMap) -> Option<(i64, Utc)> {
+    step(metadata, CLOCK_DOUBT)
+}
+
+fn step(metadata: &MetadataMap, name: &str) -> Option<(i64, Utc)> {
+    let (step_ms, to) = metadata.get(name)?.to_str().ok()?.split_once(' ')?;
     Some((step_ms.parse().ok()?, Utc(to.parse().ok()?)))
 }
 

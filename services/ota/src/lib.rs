@@ -30,6 +30,8 @@ pub mod rollouts;
 #[cfg(test)]
 #[path = "together/tests.rs"]
 mod together;
+#[cfg(test)]
+mod wrong_clock;
 
 pub use retention::prune;
 
@@ -138,6 +140,7 @@ impl OtaService {
         } else {
             Repository::open(&metadata, keys, content.clone()).await?
         };
+        let repository = repository.with_clock(clock.clone());
         let hatch = Hatch::new(content.clone(), encodings.clone(), repository.documents().clone());
         let (named, leads) = (watch::Sender::new(None), watch::Sender::new(true));
         let opened = Opened { content, encodings, repository, collector, named, leads, clock, hatch, presence };

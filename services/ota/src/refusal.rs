@@ -61,6 +61,7 @@ impl From<repository::Error> for Refusal {
                     Reason::new(Code::NoOnlineKeys, text).with("root_version", root_version).with("role", role);
                 Self::new(Kind::Precondition, reason)
             }
+            Error::Clock(_) => Self::new(Kind::Unavailable, Reason::new(Code::ClockDoubted, text)),
             Error::Moved { newest, expected } => {
                 let reason = Reason::new(Code::ReleaseMoved, text).with("newest", newest).with("expected", expected);
                 Self::new(Kind::Conflict, reason)

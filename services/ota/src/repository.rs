@@ -20,7 +20,7 @@ use midshift_bundle::manifest::Manifest;
 use midshift_bundle::repository::{self as people, FileTarget, Online, TIMESTAMP_LIFE_MS, listed, sign_online};
 use midshift_core::identity::{Actor, TokenId};
 use midshift_core::reason::{Code, Reason, Refusal};
-use midshift_core::time::Utc;
+use midshift_core::time::{Clock, Doubt, Utc};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -88,6 +88,9 @@ pub enum Error {
     /// Files are listed that are not here.
     #[error("{} listed files are not here, the first is {}", .0.len(), .0.first().map_or("", |f| f.name.as_str()))]
     Missing(Vec<FileTarget>),
+    /// The wall is in doubt, and everything that is signed has its time.
+    #[error("nothing is signed by a clock that is {step_ms} ms off", step_ms = .0.step_ms)]
+    Clock(Doubt),
     /// What lies on the disk does not hang together.
     #[error("{folder}: {text}")]
     Damaged {
@@ -110,6 +113,8 @@ pub enum Keyless {
     Unknown,
     /// The newest set is listed, and its file is gone or damaged. It is tried again each second.
     Lost(SetLost),
+    /// The wall of this machine is in doubt: what is signed by it would end too early or too late.
+    Clock,
 }
 
 /// The newest set of directive keys is listed, and its file is gone or damaged.
@@ -125,6 +130,7 @@ impl Keyless {
         match self {
             Self::Ended { number } => Reason::from(Code::NoDirectiveKey).with("set", number),
             Self::Unknown => Reason::from(Code::NoDirectiveKey).with("set", "unreadable"),
+            Self::Clock => Reason::from(Code::ClockDoubted),
             Self::Lost(SetLost { number }) => {
                 Reason::from(Code::NoDirectiveKey).with("set", number).with("file", "gone or damaged")
             }
@@ -143,6 +149,7 @@ impl Keyless {
             Self::Lost(_) => {
                 "put the file of the newest set, N.directive-keys, back into the folder `content` under its SHA-256, from a backup or from the repository that was pushed"
             }
+            Self::Clock => Code::ClockDoubted.next_step(),
         }
     }
 }
@@ -362,6 +369,8 @@ pub struct Repository {
     keys: Arc<OnlineKeys>,
     content: Arc<dyn Content>,
     documents: Documents,
+    /// Says whether its wall may be signed by. None: times are given by whoever asks, and hold.
+    clock: Option<Arc<dyn Clock>>,
     /// What was said last of why no order may be signed.
     told: Mutex<Option<Keyless>>,
     /// One publication or signature at a time. Held to the end of its writes, whoever still waits for them.
@@ -407,7 +416,17 @@ impl Repository {
         let is_shared = lock.is_some();
         let documents = Documents::open(folder, content.clone(), is_shared).await?;
         let (folder, writing) = (folder.to_owned(), Gate::new(lock));
-        Ok(Self { folder, keys: Arc::new(keys), content, documents, told: Mutex::default(), writing, floor })
+        let (clock, told) = (None, Mutex::default());
+        Ok(Self { folder, keys: Arc::new(keys), content, documents, clock, told, writing, floor })
+    }
+
+    /// Signs nothing while the wall of this clock is in doubt.
+    pub fn with_clock(self, clock: Arc<dyn Clock>) -> Self {
+        Self { clock: Some(clock), ..self }
+    }
+
+    fn doubt(&self) -> Option<Doubt> {
+        self.clock.as_ref().and_then(|clock| clock.doubt())
     }
 
     /// That nobody else publishes or signs, here or elsewhere, and what is the newest then.
@@ -421,9 +440,12 @@ impl Repository {
     /// name.
     ///
     /// # Errors
-    /// Robots take no orders of any key that is here, so none may be signed.
+    /// Robots take no orders of any key that is here, or the wall is in doubt; so none may be signed.
     pub fn directive_key(&self) -> Result<Arc<SecretKey>, Keyless> {
-        self.keys.directive(self.newest().as_deref())
+        match self.doubt() {
+            Some(_) => Err(Keyless::Clock),
+            None => self.keys.directive(self.newest().as_deref()),
+        }
     }
 
     /// As [`Repository::directive_key`], for one who asks now and then. If there is none, the folder of keys is looked at again; that there is none is said once until
@@ -448,9 +470,9 @@ impl Repository {
             Some(keyless) if before != Some(keyless) => tracing::error!(
                 why = ?keyless,
                 advice = keyless.advice(),
-                "this process has no directive key that is current, so it signs no orders to robots"
+                "this process may sign with no directive key, so it signs no orders to robots"
             ),
-            None if before.is_some() => tracing::info!("this process has a directive key that is current again"),
+            None if before.is_some() => tracing::info!("this process signs orders to robots again"),
             _ => {}
         }
         found
@@ -630,6 +652,9 @@ impl Repository {
     fn sign(&self, before: Option<&Newest>, root: &Kept, targets: &[u8], now: Utc) -> Result<(Online, Stamp), Error> {
         let (snapshot, timestamp) = before.map_or((1, 1), |b| (b.stamp.snapshot_version + 1, b.stamp.version + 1));
         let versions = (snapshot.max(self.floor), timestamp.max(self.floor));
+        if let Some(doubt) = self.doubt() {
+            return Err(Error::Clock(doubt));
+        }
         let online = self.keys.sign(root, targets, versions, now)?;
         let stamp = stamp(&online.timestamp)?;
         Ok((online, stamp))

@@ -110,7 +110,7 @@ pub fn adopt(inner: &Inner, robot_id: &RobotId, stops: Vec<Stop>, more: Vec<Stop
     let now = inner.clock.now();
     let mut foreign: BTreeSet<StopId> = more.into_iter().collect();
     let mut is_lost = Vec::new();
-    {
+    let forgotten = {
         let law = lock(&inner.law);
         foreign.retain(|stop_id| law.latch().stop(stop_id).is_none());
         for stop in stops {
@@ -119,10 +119,13 @@ pub fn adopt(inner: &Inner, robot_id: &RobotId, stops: Vec<Stop>, more: Vec<Stop
                 is_lost.push(stop);
             }
         }
-    }
+        law.latch().forgotten()
+    };
     // Outside of the lock: a signature takes its time.
+    // What is not newer than what was forgotten may have been reset: it stops the robot that brings it, and nobody else.
+    let is_young = |stop: &Stop| stop.engaged > forgotten && !is_past(stop.engaged, now.wall);
     let (own, others): (Vec<Stop>, Vec<Stop>) =
-        is_lost.into_iter().partition(|stop| !is_past(stop.engaged, now.wall) && inner.key.knows(stop));
+        is_lost.into_iter().partition(|stop| is_young(stop) && inner.key.knows(stop));
     foreign.extend(others.into_iter().map(|stop| stop.stop_id));
     foreign.extend(take_back(inner, own, ("robot_id", robot_id.as_str())));
     foreign
@@ -231,4 +234,43 @@ fn note(action: Action, stop: &Stop, at: Utc) -> Note {
     let Stop { stop_id, scope, level, reason, .. } = stop;
     let note = Note::of(at, action, &Actor::new(&stop.actor, stop.token_id.clone()));
     note.with("stop_id", stop_id).with("scope", scope).with("level", format!("{level:?}")).with("reason", reason)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Parts, StopService};
+    use midshift_core::time::ScaledClock;
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+    use tokio_util::sync::CancellationToken;
+
+    #[test]
+    fn a_stop_that_may_have_been_reset_and_forgotten_is_not_taken_back_from_a_robot() {
+        let (folder, us) = (tempfile::tempdir().unwrap(), Arc::<AtomicU64>::default());
+        let mono = us.clone();
+        let clock = Arc::new(ScaledClock::new(move || mono.load(Relaxed), Utc(1_780_000_000_000), 1000));
+        let parts = Parts { folder: folder.path().join("stop"), site: None, clock };
+        let inner = StopService::open(parts, CancellationToken::new()).unwrap().inner;
+        let stop_and_reset = || {
+            us.fetch_add(1_000_000, Relaxed);
+            let (scope, level) = (Scope::Fleet, StopLevel::Halt);
+            let wanted = Wanted { scope, level, reason: String::new(), request: None, actor: "anna".into() };
+            let stop = engage(&inner, wanted).unwrap().stop;
+            let resetting = reset(&inner, stop.stop_id.clone(), "over".to_owned(), &Caller::local());
+            lock(&inner.law).settle(resetting.unwrap().version, inner.clock.now().wall);
+            stop
+        };
+        let (old, newer) = (stop_and_reset(), stop_and_reset());
+        lock(&inner.law).shorten(inner.clock.now().wall);
+        assert!(lock(&inner.law).latch().stop(&old.stop_id).is_none(), "it is forgotten with its reset");
+        let lost_id = StopId::parse("STOP-LATER").unwrap();
+        let mut lost = Stop::new(lost_id.clone(), Scope::Fleet, StopLevel::Halt, newer.engaged);
+        inner.key.mark(&mut lost);
+        let robot_id = RobotId::parse("r1").unwrap();
+        let foreign = adopt(&inner, &robot_id, vec![old.clone(), lost], Vec::new());
+        assert_eq!(foreign, [old.stop_id.clone()].into(), "it is shown, and stops nobody else");
+        let law = lock(&inner.law);
+        assert!(!law.latch().is_effective(&old.stop_id) && law.latch().is_effective(&lost_id));
+    }
 }

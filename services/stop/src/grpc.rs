@@ -100,11 +100,13 @@ impl StopService {
         bad.finish()?;
         let stop_id = stop_id.ok_or_else(|| Refusal::field("stop_id", "cannot be read"))?;
         let resetting = acts::reset(&self.inner, stop_id, r.reason, by)?;
+        // Before robots hear of it.
+        let is_unknown = !resetting.is_known && !self.inner.robots.knows(&resetting.reset.stop_id);
         let durable = self.inner.disk.turn(resetting.version).await;
         // A disk that does not answer holds up nobody who has looked and says that it is over.
         acts::settle(&self.inner, resetting.version);
         let reset = Some((&resetting.reset).into());
-        Ok(v1::ResetResponse { reset, durable, was_engaged: resetting.was_engaged })
+        Ok(v1::ResetResponse { reset, durable, was_engaged: resetting.was_engaged, is_unknown })
     }
 
     fn watch(&self) -> Result<ReceiverStream<Result<v1::WatchStatusResponse, Status>>, Refusal> {

@@ -58,6 +58,8 @@ pub struct Resetting {
     pub was_engaged: bool,
     /// There was none before.
     pub is_new: bool,
+    /// The stop is known here, or was reset here before.
+    pub is_known: bool,
     /// What the disk must have had its turn with.
     pub version: u64,
 }
@@ -160,12 +162,12 @@ impl Law {
         let pending = self.pending.iter().find(|p| p.reset.stop_id == *stop_id);
         if let Some(known) = known.or_else(|| pending.map(|p| p.reset.clone())) {
             let version = pending.map_or(self.version, |p| p.version);
-            return Resetting { reset: known, was_engaged: false, is_new: false, version };
+            return Resetting { reset: known, was_engaged: false, is_new: false, is_known: true, version };
         }
-        let was_engaged = self.latch.is_effective(stop_id);
+        let (was_engaged, is_known) = (self.latch.is_effective(stop_id), self.latch.stop(stop_id).is_some());
         self.version += 1;
         self.pending.push(Pending { version: self.version, reset: reset.clone() });
-        Resetting { reset, was_engaged, is_new: true, version: self.version }
+        Resetting { reset, was_engaged, is_new: true, is_known, version: self.version }
     }
 
     /// Whether a reset of it waits for the disk.

@@ -149,6 +149,15 @@ impl Robots {
         }
     }
 
+    /// Whether a robot has said that it keeps this stop, lies inside of it or waits for its resume.
+    pub fn knows(&self, stop_id: &StopId) -> bool {
+        self.read().values().any(|robot| {
+            let said = robot.said();
+            let says = |heard: &Heard| heard.inside.contains(stop_id) || heard.awaiting.contains(stop_id);
+            said.foreign.contains(stop_id) || said.heard.as_ref().is_some_and(says)
+        })
+    }
+
     /// Lets those go that nobody lists any more and whose silence has stood them. Whether anybody went.
     pub fn let_go(&self, now: LinkTime) -> bool {
         if !self.read().values().any(|robot| robot.said().is_gone(now)) {

@@ -46,6 +46,12 @@ impl Named {
         let stop_id = StopId::parse(stop_id).ok()?;
         task_ids.is_empty().then(|| Self { stop_id, robot_ids: robot_ids.clone() })
     }
+    /// A fleet stop that is named beside an area or tasks.
+    fn beside(ask: &Ask) -> Option<Self> {
+        let Ask::ResumeHeld { stop_id: Some(stop_id), area_id, task_ids, .. } = ask else { return None };
+        let stop_id = StopId::parse(stop_id).ok().filter(|_| area_id.is_some() || !task_ids.is_empty())?;
+        Some(Self { stop_id, robot_ids: Vec::new() })
+    }
     fn not_found(&self) -> Refusal {
         Refusal::new(Kind::NotFound, Reason::from(Code::StopNotFound).with("stop_id", &self.stop_id))
     }
@@ -87,6 +93,9 @@ impl TaskService {
         let same = v1::ResumeHeldRequest { request_id: String::new(), validate_only: false, ..r.clone() };
         let hash = hash("resume", &same);
         let earlier = self.asked_before(request_id.as_ref(), &hash).await?;
+        if let Some(named) = Named::beside(&ask).filter(|_| earlier.is_none()) {
+            self.must_be_known(&named).await?;
+        }
         let named = Named::of(&ask).filter(|_| earlier.is_none());
         let asked = Asked { ask, reason: r.reason, request_id, hash, actor: by.into(), robot_id: None };
         let held = match &named {
@@ -103,6 +112,14 @@ impl TaskService {
         let stopped = held.map(|held| held.stopped).unwrap_or_default();
         let still_stopped = stopped.iter().take(limits::PAGE_MAX).map(ToString::to_string).collect();
         Ok(v1::ResumeHeldResponse { pending, robots, still_stopped })
+    }
+
+    /// Nobody means a stop that neither the copy of the stops nor any robot knows.
+    async fn must_be_known(&self, named: &Named) -> Result<(), Refusal> {
+        let record = load::<StopRecord>(self.store(), named.stop_id.as_str()).await.map_err(unavailable)?;
+        let held = self.held(named).await?;
+        let is_known = record.is_some() || !held.waiting.is_empty() || !held.stopped.is_empty();
+        if is_known { Ok(()) } else { Err(named.not_found()) }
     }
 
     /// Waits a little until a stop is over everywhere, and says whom it holds.

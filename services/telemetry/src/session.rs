@@ -365,7 +365,8 @@ impl Session {
         };
         let live = Arc::new(live);
         let clock = ClockSample { t1_us: heartbeat.sent_unix_us, t2_us, t3_us: t2_us, t4_us: 0 };
-        let echo = Echo { hb, clock };
+        let is_clock_doubted = self.inner.parts.clock.doubt().is_some();
+        let echo = Echo { hb, clock, is_clock_doubted };
         match &self.inner.shared {
             None => {
                 self.inner.parts.board.put(&self.robot_id, live);

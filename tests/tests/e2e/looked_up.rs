@@ -53,6 +53,8 @@ async fn a_robot_and_a_stop_are_meant_by_a_beginning_that_only_they_have() -> an
     ensure!(named(&words(&reset(&first[..=common])))? == first, "by its beginning");
     ensure!(named(&words(&reset(&second)))? == second, "by its name");
     ensure!(stops.engaged().await?.is_empty(), "both are reset");
+    let (code, said) = refused(&words(&reset("STOP-1998")))?;
+    ensure!(code == Some(9) && said.contains("nobody knows a stop STOP-1998"), "{code:?} {said}");
 
     for stop_id in [&first, &second] {
         until_held(server.address, &robot.ids(), &format!("resume:{stop_id}")).await?;

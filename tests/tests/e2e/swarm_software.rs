@@ -316,7 +316,7 @@ impl Bench {
             resumed: Vec::new(),
             load_word: None,
         };
-        let echo = Some(Echo { hb, clock: ClockSample::default() });
+        let echo = Some(Echo { hb, clock: ClockSample::default(), is_clock_doubted: false });
         let down = Downlink { echo, acks, work: Some(work), update: Some(update), ..Downlink::default() };
         self.say(ToRobot::Downlink(Box::new(down))).await
     }

@@ -7,6 +7,7 @@ use crate::clock::{MachineClock, Skew, TrueTime};
 use crate::net::{self, Ear, STOPS, SimDial, Way, Wire};
 use midshift_agent::stop::keep::MemoryStops;
 use midshift_agent::stop::line::StopLine;
+use midshift_core::identity::Caller;
 use midshift_core::ids::StopId;
 use midshift_core::site::Site;
 use midshift_core::stop::Latch;
@@ -18,7 +19,9 @@ use std::sync::Arc;
 use std::time::Duration;
 use tempfile::TempDir;
 use tokio_util::sync::CancellationToken;
+use tonic::service::InterceptorLayer;
 use tonic::transport::Server;
+use tonic::{Request, Status};
 
 /// A service manager starts it again after this.
 const AGAIN: Duration = Duration::from_millis(200);
@@ -109,7 +112,13 @@ async fn live(folder: PathBuf, site: Arc<Site>, time: TrueTime, wire: Wire) -> t
             Ok(service) => {
                 let incoming = net::incoming(wire.clone()).await?;
                 let drained = service.drained().cancelled_owned();
+                // As a port without login.
+                let everybody = InterceptorLayer::new(|mut request: Request<()>| {
+                    request.extensions_mut().insert(Caller::local());
+                    Ok::<_, Status>(request)
+                });
                 let port = Server::builder()
+                    .layer(everybody)
                     .add_service(service.grpc())
                     .add_service(service.link())
                     .serve_with_incoming_shutdown(incoming, drained);

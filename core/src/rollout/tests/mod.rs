@@ -401,7 +401,7 @@ impl Rig {
         absorb(&mut self.ota, self.now, &entries, &mut plan);
         ask(self, &mut plan);
         let heard = std::mem::take(&mut self.heard);
-        let sign: Option<&dyn Sign> = if self.keyless { None } else { Some(&Plain) };
+        let sign: Result<&dyn Sign, Code> = if self.keyless { Err(Code::NoDirectiveKey) } else { Ok(&Plain) };
         cycle(&mut self.ota, self.now, &self.board, &heard, sign, &mut plan);
         assert_eq!(plan.unreadable, Vec::<String>::new());
         self.commit(plan.items);

@@ -11,9 +11,9 @@ use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::stop::Region;
 use midshift_core::task::Phase;
 use midshift_core::work::{PlaceNews, RobotEvent, WorkState};
+use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
-use tonic::Request;
 
 /// Every place of the site but the one that the robot stands in.
 fn elsewhere(w: &World, stands: &str) -> Vec<String> {
@@ -108,7 +108,7 @@ async fn a_robot_works_once_a_person_has_closed_the_incident_until_it_says_that_
     w.pass_while(10, "it gets no work", |s| s.phase("T1") == Phase::Queued).await;
     let (incident_id, reason) = (open(&seen)[0].id(), "a wrong map in it, and it stands in park-1".to_owned());
     let close = v1::CloseIncidentRequest { incident_id, reason, ..Default::default() };
-    w.fleet.close_incident(Request::new(close)).await.expect("closed");
+    w.fleet.close_incident(local(close)).await.expect("closed");
     w.until("it gets work", |s| s.phase("T1") != Phase::Queued).await;
     w.pass_while(10, "nobody is told again", |s| open(s).is_empty()).await;
     tell(&mut w, "r1", others, false);
@@ -150,14 +150,14 @@ async fn for_ten_minutes_after_a_restore_unknown_grants_are_no_incident_and_no_a
         reason: "a leftover".to_owned(),
         ..Default::default()
     };
-    let refused = w.fleet.disown_attempt(Request::new(ask.clone())).await.expect_err("it may be ours");
+    let refused = w.fleet.disown_attempt(local(ask.clone())).await.expect_err("it may be ours");
     assert!(refused.message().contains("restored"), "{refused}");
     assert!(w.seen().await.open_incidents("GRANT_UNKNOWN").is_empty());
     w.pass(600).await;
     enters(&mut w, "r1", "charge", 4_712);
     w.pass(3).await;
     assert_eq!(w.seen().await.open_incidents("GRANT_UNKNOWN").len(), 1);
-    w.fleet.disown_attempt(Request::new(ask)).await.expect("it is ignored");
+    w.fleet.disown_attempt(local(ask)).await.expect("it is ignored");
     w.lawful().await;
 }
 

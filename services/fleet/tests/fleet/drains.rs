@@ -7,10 +7,10 @@ use midshift_core::robot::Load;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::state::Errand;
 use midshift_core::task::{Attempt, AttemptPhase, Phase};
+use midshift_proto::access::local;
 use midshift_proto::convert::duration;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
-use tonic::Request;
 
 async fn drain(w: &World, robot: &str, within_s: u64) -> Result<v1::RobotControl, tonic::Status> {
     let request = v1::DrainRobotRequest {
@@ -19,12 +19,12 @@ async fn drain(w: &World, robot: &str, within_s: u64) -> Result<v1::RobotControl
         within: Some(duration(within_s * 1_000)),
         ..Default::default()
     };
-    Ok(w.fleet.drain_robot(Request::new(request)).await?.into_inner().control.expect("a control"))
+    Ok(w.fleet.drain_robot(local(request)).await?.into_inner().control.expect("a control"))
 }
 
 async fn undrain(w: &World, robot: &str) {
     let request = v1::UndrainRobotRequest { robot_id: robot.to_owned(), ..Default::default() };
-    w.fleet.undrain_robot(Request::new(request)).await.expect("is released");
+    w.fleet.undrain_robot(local(request)).await.expect("is released");
 }
 
 fn state(s: &Seen) -> Option<DrainState> {
@@ -163,7 +163,7 @@ async fn a_drain_that_asks_for_nonsense_is_refused_whole() {
     w.robot("r1", "park-a").await;
     w.pass(2).await;
     let bad = v1::DrainRobotRequest { robot_id: "R 1".to_owned(), within: Some(duration(5)), ..Default::default() };
-    let refused = w.fleet.drain_robot(Request::new(bad)).await.expect_err("is refused");
+    let refused = w.fleet.drain_robot(local(bad)).await.expect_err("is refused");
     let told = midshift_proto::refusal_of(&refused).violations.len();
     assert_eq!((refused.code(), told), (tonic::Code::InvalidArgument, 3));
     // If its nanos were counted it would be two minutes.
@@ -175,7 +175,7 @@ async fn a_drain_that_asks_for_nonsense_is_refused_whole() {
         within: Some(within),
         ..Default::default()
     };
-    let refused = w.fleet.drain_robot(Request::new(bad)).await.expect_err("is refused");
+    let refused = w.fleet.drain_robot(local(bad)).await.expect_err("is refused");
     let told = midshift_proto::refusal_of(&refused).violations;
     assert_eq!(told.iter().map(|v| v.field.as_str()).collect::<Vec<_>>(), ["within"]);
     assert_eq!(drain(&w, "r9", 60).await.expect_err("nobody").code(), tonic::Code::NotFound);

@@ -5,6 +5,7 @@ use midshift_core::reason::Code;
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::Phase;
 use midshift_core::task::state::Errand;
+use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
 
@@ -111,7 +112,7 @@ async fn a_cordoned_robot_that_charges_is_not_called_back_for_work_it_may_not_ha
     let charges = |s: &crate::harness::Seen| s.errand("r1").is_some_and(|(e, _)| e == Errand::Charge);
     w.until("it charges", charges).await;
     let request = v1::CordonRobotRequest { robot_id: "r1".into(), reason: "a look".into(), ..Default::default() };
-    w.fleet.cordon_robot(tonic::Request::new(request)).await.expect("is cordoned");
+    w.fleet.cordon_robot(local(request)).await.expect("is cordoned");
     w.r("r1").battery_permille = 800;
     w.submit("T1", "A", "B").await;
     w.pass_while(60, "it goes on charging", charges).await;

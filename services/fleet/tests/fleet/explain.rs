@@ -6,15 +6,15 @@ use midshift_core::reason::Code;
 use midshift_core::robot::{HardwareStop, Load, Mode};
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;
+use midshift_proto::access::local;
 use midshift_proto::common::v1::Reason;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
-use tonic::Request;
 
 /// The verdict's code, and the reason against `r1`.
 pub async fn why(w: &World, task_id: &str) -> (String, String) {
     let ask = v1::ExplainTaskRequest { task_id: task_id.to_owned() };
-    let told = w.fleet.explain_task(Request::new(ask)).await.expect("an explanation").into_inner();
+    let told = w.fleet.explain_task(local(ask)).await.expect("an explanation").into_inner();
     let told = told.explanation.expect("an explanation");
     let of_robot = told.candidates.iter().find(|c| c.robot_id == "r1").and_then(|c| c.reason.clone());
     (told.verdict.map(|r| r.code).unwrap_or_default(), of_robot.map(|r| r.code).unwrap_or_default())
@@ -60,7 +60,7 @@ async fn the_pinned_robot_is_cordoned() {
     w.robot("r2", "park-b").await;
     let cordon = v1::CordonRobotRequest { robot_id: "r1".to_owned(), reason: "wheel".to_owned(), ..Default::default() };
     w.pass(1).await;
-    w.fleet.cordon_robot(Request::new(cordon)).await.expect("cordoned");
+    w.fleet.cordon_robot(local(cordon)).await.expect("cordoned");
     w.submit_with("T1", "A", "B", |raw| raw.robot_id = "r1".to_owned()).await;
     w.pass(2).await;
     assert_eq!(why(&w, "T1").await, codes(Code::WaitingForRobot, "ROBOT_CORDONED"));
@@ -101,14 +101,14 @@ async fn the_robot_has_too_little_charge_or_a_person_drives_it() {
 /// The verdict of a robot.
 async fn of_robot(w: &World, robot_id: &str) -> Reason {
     let ask = v1::ExplainRobotRequest { robot_id: robot_id.to_owned() };
-    let told = w.fleet.explain_robot(Request::new(ask)).await.expect("an explanation").into_inner();
+    let told = w.fleet.explain_robot(local(ask)).await.expect("an explanation").into_inner();
     told.explanation.expect("an explanation").verdict.expect("a verdict")
 }
 
 /// The verdict of a task.
 async fn of_task(w: &World, task_id: &str) -> Reason {
     let ask = v1::ExplainTaskRequest { task_id: task_id.to_owned() };
-    let told = w.fleet.explain_task(Request::new(ask)).await.expect("an explanation").into_inner();
+    let told = w.fleet.explain_task(local(ask)).await.expect("an explanation").into_inner();
     told.explanation.expect("an explanation").verdict.expect("a verdict")
 }
 
@@ -197,7 +197,7 @@ async fn a_robot_with_an_item_of_a_task_that_needs_a_person_waits_for_that_word(
     w.submit("T1", "A", "B").await;
     w.until_phase("T1", Phase::NeedsOperator).await;
     let uncordon = v1::UncordonRobotRequest { robot_id: "r1".to_owned(), ..Default::default() };
-    w.fleet.uncordon_robot(Request::new(uncordon)).await.expect("uncordoned");
+    w.fleet.uncordon_robot(local(uncordon)).await.expect("uncordoned");
     w.pass(10).await;
     let told = of_robot(&w, "r1").await;
     let waits_for = told.metadata["waits_for"].as_str();

@@ -9,6 +9,7 @@ use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::Phase;
 use midshift_core::work::DesiredPolicy;
 use midshift_fleet::FleetService;
+use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService as Face;
 use std::sync::Arc;
@@ -33,7 +34,7 @@ async fn two(site: &'static str) -> (World, FleetService, Arc<Shaky>) {
 
 fn cordon(id: &str, request_id: &str) -> Request<v1::CordonRobotRequest> {
     let (robot_id, reason, request_id) = (id.to_owned(), "wheel".to_owned(), request_id.to_owned());
-    Request::new(v1::CordonRobotRequest { robot_id, reason, request_id, ..Default::default() })
+    local(v1::CordonRobotRequest { robot_id, reason, request_id, ..Default::default() })
 }
 
 #[tokio::test(start_paused = true)]
@@ -122,7 +123,7 @@ async fn a_command_sent_to_the_standby_is_done_once_and_the_leader_obeys_it() {
     w.fleet.cordon_robot(cordon("r1", "ask-1")).await.expect("done already");
     other.cordon_robot(cordon("r1", "ask-1")).await.expect("done already");
     assert_eq!(w.seen().await.revision("robot_control", "r1"), before, "written once");
-    let refused = other.uncordon_robot(Request::new(v1::UncordonRobotRequest {
+    let refused = other.uncordon_robot(local(v1::UncordonRobotRequest {
         robot_id: "r1".to_owned(),
         request_id: "ask-1".to_owned(),
         ..Default::default()
@@ -131,7 +132,7 @@ async fn a_command_sent_to_the_standby_is_done_once_and_the_leader_obeys_it() {
     w.submit("T1", "A01", "D01").await;
     w.pass_while(20, "the leader obeys", |s| s.phase("T1") == Phase::Queued).await;
     let uncordon = v1::UncordonRobotRequest { robot_id: "r1".to_owned(), ..Default::default() };
-    other.uncordon_robot(Request::new(uncordon)).await.expect("uncordoned");
+    other.uncordon_robot(local(uncordon)).await.expect("uncordoned");
     w.until_phase("T1", Phase::Succeeded).await;
     assert_eq!((w.shaky.conflicts(), way.conflicts()), (0, 0));
     w.lawful().await;
@@ -163,10 +164,10 @@ async fn rules_that_the_standby_put_reach_every_robot() {
     w.robot("r1", "park-a").await;
     w.until("it has the site's rules", |s| s.get::<DesiredPolicy>("r1").is_some()).await;
     let get = v1::GetAreaPolicyRequest { area_id: "rooms".to_owned() };
-    let mut policy = other.get_area_policy(Request::new(get)).await.expect("rules").into_inner().policy.expect("rules");
+    let mut policy = other.get_area_policy(local(get)).await.expect("rules").into_inner().policy.expect("rules");
     policy.speed_limit_mm_s = Some(600);
     let put = v1::PutAreaPolicyRequest { policy: Some(policy), ..Default::default() };
-    other.put_area_policy(Request::new(put)).await.expect("put");
+    other.put_area_policy(local(put)).await.expect("put");
     w.until("it has the new ones", |s| s.policy("r1").areas[0].speed_limit_mm_s == Some(600)).await;
     w.lawful().await;
 }

@@ -4,16 +4,16 @@ use crate::harness::{World, jam};
 use midshift_core::ids::TaskId;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::{Ask, Phase, Resolution};
+use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
 use midshift_proto::refusal_of;
-use tonic::Request;
 
 /// A person says that r1 carries nothing; why that was refused, or the robot after it.
 async fn settle(w: &World) -> Result<v1::RobotControl, String> {
     let reason = "I put it back on the shelf".to_owned();
     let request = v1::SettleRobotLoadRequest { robot_id: "r1".to_owned(), reason, ..Default::default() };
-    match w.fleet.settle_robot_load(Request::new(request)).await {
+    match w.fleet.settle_robot_load(local(request)).await {
         Ok(answer) => Ok(answer.into_inner().control.expect("a robot")),
         Err(status) => Err(refusal_of(&status).reason),
     }
@@ -22,7 +22,7 @@ async fn settle(w: &World) -> Result<v1::RobotControl, String> {
 /// What r1 waits for, and whether a person's word about its load stands.
 async fn explained(w: &World) -> (String, bool) {
     let ask = v1::ExplainRobotRequest { robot_id: "r1".to_owned() };
-    let told = w.fleet.explain_robot(Request::new(ask)).await.expect("an explanation").into_inner();
+    let told = w.fleet.explain_robot(local(ask)).await.expect("an explanation").into_inner();
     let told = told.explanation.expect("an explanation");
     let is_settled = told.control.is_some_and(|control| control.load_settled.is_some());
     (told.verdict.map(|verdict| verdict.code).unwrap_or_default(), is_settled)
@@ -68,7 +68,7 @@ async fn put_back(load_by_memory: bool) -> World {
     w.submit("T1", "A", "B").await;
     w.until_phase("T1", Phase::NeedsOperator).await;
     let uncordon = v1::UncordonRobotRequest { robot_id: "r1".to_owned(), ..Default::default() };
-    w.fleet.uncordon_robot(Request::new(uncordon)).await.expect("uncordoned");
+    w.fleet.uncordon_robot(local(uncordon)).await.expect("uncordoned");
     let task_id = TaskId::parse("T1").expect("an id");
     w.ask(Ask::Resolve { task_id, resolution: Resolution::RequeuePutBack }).await;
     w.until("the item is on the shelf", |s| s.phase("T1") == Phase::Queued && s.task("T1").opened.is_none()).await;
@@ -78,7 +78,7 @@ async fn put_back(load_by_memory: bool) -> World {
 /// What T1 waits for.
 async fn task_waits_for(w: &World) -> String {
     let ask = v1::ExplainTaskRequest { task_id: "T1".to_owned() };
-    let told = w.fleet.explain_task(Request::new(ask)).await.expect("an explanation").into_inner();
+    let told = w.fleet.explain_task(local(ask)).await.expect("an explanation").into_inner();
     let verdict = told.explanation.expect("an explanation").verdict.expect("a verdict");
     verdict.metadata.get("waits_for").cloned().unwrap_or_default()
 }

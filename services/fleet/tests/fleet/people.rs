@@ -4,9 +4,9 @@ use crate::harness::{World, jam};
 use midshift_core::ids::TaskId;
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::{Ask, Phase, Resolution};
+use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
-use tonic::Request;
 
 #[tokio::test(start_paused = true)]
 async fn rules_put_for_an_area_reach_every_robot() {
@@ -18,12 +18,11 @@ async fn rules_put_for_an_area_reach_every_robot() {
     })
     .await;
     let get = v1::GetAreaPolicyRequest { area_id: "rooms".to_owned() };
-    let mut policy =
-        w.fleet.get_area_policy(Request::new(get)).await.expect("rules").into_inner().policy.expect("rules");
+    let mut policy = w.fleet.get_area_policy(local(get)).await.expect("rules").into_inner().policy.expect("rules");
     assert_eq!(policy.speed_limit_mm_s, Some(1_500));
     policy.speed_limit_mm_s = Some(600);
     let put = v1::PutAreaPolicyRequest { policy: Some(policy), ..Default::default() };
-    w.fleet.put_area_policy(Request::new(put)).await.expect("put");
+    w.fleet.put_area_policy(local(put)).await.expect("put");
     let before = w.seen().await;
     let limit = |s: &crate::harness::Seen, r: &str| s.policy(r).areas[0].speed_limit_mm_s;
     w.until("both have the new rules", |s| ["r1", "r2"].iter().all(|r| limit(s, r) == Some(600))).await;
@@ -46,13 +45,13 @@ async fn an_area_where_people_walk_is_slow_until_a_person_puts_another_limit() {
     let get = || v1::GetAreaPolicyRequest { area_id: "rooms".to_owned() };
     let rules = |w: &World| {
         let fleet = w.fleet.clone();
-        async move { fleet.get_area_policy(Request::new(get())).await.expect("rules").into_inner().policy.expect("rules") }
+        async move { fleet.get_area_policy(local(get())).await.expect("rules").into_inner().policy.expect("rules") }
     };
     let shown = rules(&w).await;
     assert_eq!((shown.speed_limit_mm_s, shown.avoidance_distance_mm), (Some(600), Some(500)));
     let put = async |w: &World, policy: v1::AreaPolicy| {
         let put = v1::PutAreaPolicyRequest { policy: Some(policy), ..Default::default() };
-        w.fleet.put_area_policy(Request::new(put)).await.expect("put").into_inner().policy.expect("rules")
+        w.fleet.put_area_policy(local(put)).await.expect("put").into_inner().policy.expect("rules")
     };
     let greater = put(&w, v1::AreaPolicy { speed_limit_mm_s: Some(900), ..shown }).await;
     assert_eq!(greater.speed_limit_mm_s, Some(900));
@@ -88,12 +87,12 @@ async fn a_cordoned_robot_finishes_its_work_and_gets_no_more() {
     w.submit("T1", "A01", "D01").await;
     w.until_phase("T1", Phase::Running).await;
     let cordon = v1::CordonRobotRequest { robot_id: "r1".to_owned(), reason: "wheel".to_owned(), ..Default::default() };
-    w.fleet.cordon_robot(Request::new(cordon)).await.expect("cordoned");
+    w.fleet.cordon_robot(local(cordon)).await.expect("cordoned");
     w.submit("T2", "A01", "D01").await;
     w.until_phase("T1", Phase::Succeeded).await;
     w.pass_while(60, "it is out of dispatch", |s| s.phase("T2") == Phase::Queued).await;
     let uncordon = v1::UncordonRobotRequest { robot_id: "r1".to_owned(), ..Default::default() };
-    w.fleet.uncordon_robot(Request::new(uncordon)).await.expect("uncordoned");
+    w.fleet.uncordon_robot(local(uncordon)).await.expect("uncordoned");
     w.until_phase("T2", Phase::Succeeded).await;
     w.lawful().await;
 }
@@ -115,7 +114,7 @@ async fn a_person_who_answers_ends_the_question() {
         w.until_phase(&id, Phase::NeedsOperator).await;
         w.ask(Ask::Resolve { task_id: TaskId::parse(&id).expect("an id"), resolution }).await;
         let uncordon = v1::UncordonRobotRequest { robot_id: "r1".to_owned(), ..Default::default() };
-        w.fleet.uncordon_robot(Request::new(uncordon)).await.expect("uncordoned");
+        w.fleet.uncordon_robot(local(uncordon)).await.expect("uncordoned");
         w.until_phase(&id, end).await;
     }
     w.lawful().await;
@@ -151,16 +150,16 @@ async fn a_command_is_carried_out_once_whatever_is_lost_of_its_answer() {
         reason: reason.to_owned(),
         ..Default::default()
     };
-    w.fleet.cordon_robot(Request::new(cordon("a wheel"))).await.expect("is done");
+    w.fleet.cordon_robot(local(cordon("a wheel"))).await.expect("is done");
     let uncordon = v1::UncordonRobotRequest { robot_id: "r1".to_owned(), ..Default::default() };
-    w.fleet.uncordon_robot(Request::new(uncordon)).await.expect("is done");
-    let again = w.fleet.cordon_robot(Request::new(cordon("a wheel"))).await.expect("was done").into_inner();
+    w.fleet.uncordon_robot(local(uncordon)).await.expect("is done");
+    let again = w.fleet.cordon_robot(local(cordon("a wheel"))).await.expect("was done").into_inner();
     assert_eq!(again.control.expect("a control").duty, v1::Duty::InWork as i32, "and not done again");
     w.stop_fleet().await;
     w.start_fleet();
-    let again = w.fleet.cordon_robot(Request::new(cordon("a wheel"))).await.expect("was done").into_inner();
+    let again = w.fleet.cordon_robot(local(cordon("a wheel"))).await.expect("was done").into_inner();
     assert_eq!(again.control.expect("a control").duty, v1::Duty::InWork as i32, "nor after a restart");
-    let other = w.fleet.cordon_robot(Request::new(cordon("an arm"))).await.expect_err("says something else");
+    let other = w.fleet.cordon_robot(local(cordon("an arm"))).await.expect_err("says something else");
     assert_eq!(other.code(), tonic::Code::AlreadyExists);
     w.lawful().await;
 }
@@ -172,7 +171,7 @@ async fn of_two_that_ask_the_same_at_once_neither_is_told_that_it_is_done_before
     w.pass(2).await;
     let cordon = || {
         let request_id = "cordon-1".to_owned();
-        w.fleet.cordon_robot(Request::new(v1::CordonRobotRequest {
+        w.fleet.cordon_robot(local(v1::CordonRobotRequest {
             robot_id: "r1".to_owned(),
             request_id,
             reason: "a wheel".to_owned(),
@@ -199,7 +198,7 @@ async fn an_incident_is_listed_until_a_person_has_looked_into_it() {
         let fleet = w.fleet.clone();
         async move {
             let request = v1::ListIncidentsRequest { include_closed, ..Default::default() };
-            fleet.list_incidents(Request::new(request)).await.expect("a list").into_inner().incidents
+            fleet.list_incidents(local(request)).await.expect("a list").into_inner().incidents
         }
     };
     let open = list(false).await;
@@ -212,13 +211,13 @@ async fn an_incident_is_listed_until_a_person_has_looked_into_it() {
         etag: incident.etag.clone(),
         ..Default::default()
     };
-    let refused = w.fleet.close_incident(Request::new(close(""))).await.expect_err("without a reason");
+    let refused = w.fleet.close_incident(local(close(""))).await.expect_err("without a reason");
     assert_eq!(refused.code(), tonic::Code::InvalidArgument);
-    w.fleet.close_incident(Request::new(close("a spare part"))).await.expect("is closed");
+    w.fleet.close_incident(local(close("a spare part"))).await.expect("is closed");
     assert_eq!(list(false).await, []);
     let all = list(true).await;
     assert_eq!(all[0].closed.as_ref().map(|c| c.reason.as_str()), Some("a spare part"));
-    let again = w.fleet.close_incident(Request::new(close("twice"))).await.expect_err("is closed already");
+    let again = w.fleet.close_incident(local(close("twice"))).await.expect_err("is closed already");
     assert_eq!(again.code(), tonic::Code::NotFound);
     w.lawful().await;
 }
@@ -239,7 +238,7 @@ async fn an_incident_is_found_by_the_beginning_of_its_id_open_or_closed() {
         };
         let fleet = w.fleet.clone();
         async move {
-            let page = fleet.list_incidents(Request::new(request)).await.expect("a list").into_inner();
+            let page = fleet.list_incidents(local(request)).await.expect("a list").into_inner();
             page.incidents.into_iter().map(|incident| incident.incident_id).collect::<Vec<_>>()
         }
     };
@@ -256,7 +255,7 @@ async fn an_incident_is_found_by_the_beginning_of_its_id_open_or_closed() {
         reason: "a spare part".to_owned(),
         ..v1::CloseIncidentRequest::default()
     };
-    w.fleet.close_incident(Request::new(close)).await.expect("is closed");
+    w.fleet.close_incident(local(close)).await.expect("is closed");
     assert_eq!(begin(first, false).await, Vec::<String>::new());
     assert_eq!(begin(&first[..=common], true).await, std::slice::from_ref(first));
     w.lawful().await;
@@ -271,7 +270,7 @@ async fn the_hours_of_a_robot_without_work_are_counted_and_not_forgotten_by_a_re
     w.start_fleet();
     w.pass(1).await;
     let request = v1::ListCountersRequest::default();
-    let counters = w.fleet.list_counters(Request::new(request)).await.expect("a list").into_inner().counters;
+    let counters = w.fleet.list_counters(local(request)).await.expect("a list").into_inner().counters;
     let heard_s = counters[0].attached_ms / 1_000;
     assert!((1_190..=1_310).contains(&heard_s), "{heard_s} s");
     w.lawful().await;
@@ -303,13 +302,13 @@ async fn a_person_lets_the_server_ignore_an_attempt_that_nobody_knows_once_its_r
         reason: "a leftover of the old site".to_owned(),
         ..Default::default()
     };
-    w.fleet.disown_attempt(Request::new(ask(4))).await.expect_err("it lists no such attempt");
+    w.fleet.disown_attempt(local(ask(4))).await.expect_err("it lists no such attempt");
     w.r("r1").speed_mm_s = 300;
     w.pass(2).await;
-    w.fleet.disown_attempt(Request::new(ask(3))).await.expect_err("it moves");
+    w.fleet.disown_attempt(local(ask(3))).await.expect_err("it moves");
     w.r("r1").speed_mm_s = 0;
     w.pass(2).await;
-    w.fleet.disown_attempt(Request::new(ask(3))).await.expect("it is ignored");
+    w.fleet.disown_attempt(local(ask(3))).await.expect("it is ignored");
     let seen = w.seen().await;
     assert!(seen.open_incidents("ATTEMPT_UNKNOWN").is_empty(), "the incident is over");
     assert!(seen.has("r1", "park-a"), "no place is freed");

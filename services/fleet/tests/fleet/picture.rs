@@ -10,12 +10,12 @@ use midshift_core::rows::{Log, Seq, Table};
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::raw::RawRetry;
 use midshift_core::task::{Phase, TaskState};
+use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use std::collections::BTreeMap;
-use tonic::Request;
 
 /// Every slot as text, a line a row.
 fn slots(view: &View) -> BTreeMap<&'static str, Vec<String>> {
@@ -136,7 +136,7 @@ async fn all_is_well_again(w: &mut World) {
         w.pass(3).await;
         w.resume(&id).await;
         let uncordon = v1::UncordonRobotRequest { robot_id: id, ..Default::default() };
-        w.fleet.uncordon_robot(Request::new(uncordon)).await.expect("uncordoned");
+        w.fleet.uncordon_robot(local(uncordon)).await.expect("uncordoned");
     }
     // What waits for a task that failed would wait for ever.
     let waiting = w.seen().await.all::<TaskState>().into_iter().filter(|t| t.phase == Phase::Queued);

@@ -7,9 +7,9 @@ use midshift_core::robot::HeldPlace;
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::Phase;
 use midshift_core::work::{PlaceNews, RobotEvent};
+use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
-use tonic::Request;
 
 #[tokio::test(start_paused = true)]
 async fn the_second_robot_waits_before_an_exclusive_passage_and_goes_when_the_first_has_left() {
@@ -27,7 +27,7 @@ async fn the_second_robot_waits_before_an_exclusive_passage_and_goes_when_the_fi
     w.until("r2 stands before it", |s| s.holders("wait-b") == [("r2".to_owned(), HolderState::Inside)]).await;
     w.pass_while(100, "one robot at a time", |s| s.has("r1", "corridor") && !s.has("r2", "corridor")).await;
     let waits = v1::ListPlacesRequest { in_use: true, ..Default::default() };
-    let listed = w.fleet.list_places(Request::new(waits)).await.expect("places").into_inner().places;
+    let listed = w.fleet.list_places(local(waits)).await.expect("places").into_inner().places;
     let corridor = listed.iter().find(|p| p.place_id == "corridor").expect("the corridor");
     assert!(!corridor.holders.is_empty() && format!("{corridor:?}").contains("r2"), "{corridor:?}");
     w.r("r1").drives = true;
@@ -173,17 +173,17 @@ async fn a_place_nobody_reports_is_cleared_by_a_person_and_not_while_a_heard_rob
     let etag = |w: &World| {
         let fleet = w.fleet.clone();
         async move {
-            let listed = fleet.list_places(Request::new(v1::ListPlacesRequest::default())).await.expect("places");
+            let listed = fleet.list_places(local(v1::ListPlacesRequest::default())).await.expect("places");
             listed.into_inner().places.into_iter().find(|p| p.place_id == "A").expect("A").etag
         }
     };
     let seen = etag(&w).await;
-    let refused = w.fleet.clear_place(Request::new(clear(seen))).await.expect_err("a robot stands in it");
+    let refused = w.fleet.clear_place(local(clear(seen))).await.expect_err("a robot stands in it");
     assert_eq!(refused.code(), tonic::Code::FailedPrecondition);
     w.r("r1").cut();
     w.until("nobody knows", |s| s.is_uncertain("T1")).await;
     let seen = etag(&w).await;
-    w.fleet.clear_place(Request::new(clear(seen))).await.expect("a person may");
+    w.fleet.clear_place(local(clear(seen))).await.expect("a person may");
     assert!(w.seen().await.holders("A").is_empty());
     w.lawful().await;
 }
@@ -201,7 +201,7 @@ async fn a_place_that_a_robot_may_still_enter_is_not_cleared_before_its_permissi
         let (place_id, reason) = ("A".to_owned(), "I looked".to_owned());
         async move {
             let request = v1::ClearPlaceRequest { place_id, reason, etag, ..Default::default() };
-            fleet.clear_place(Request::new(request)).await.map_err(|status| status.code())
+            fleet.clear_place(local(request)).await.map_err(|status| status.code())
         }
     };
     let etag = |s: &crate::harness::Seen| s.revision("place_grant", "A");
@@ -319,7 +319,7 @@ async fn two_robots_inside_one_place_are_one_incident_and_each_explanation_names
     w.pass_while(30, "one incident, and nobody else is let in", |s| of(s) == 1 && !s.has("r3", "park-a")).await;
     for (robot, other) in [("r1", "r2"), ("r2", "r1")] {
         let ask = v1::ExplainRobotRequest { robot_id: robot.to_owned() };
-        let told = w.fleet.explain_robot(Request::new(ask)).await.expect("told").into_inner();
+        let told = w.fleet.explain_robot(local(ask)).await.expect("told").into_inner();
         let told = format!("{:?}", told.explanation.expect("told").verdict);
         assert!(told.contains("EXCLUSION_BROKEN") && told.contains(other), "{robot}: {told}");
     }
@@ -384,7 +384,7 @@ async fn a_robot_that_lies_about_its_generation_excuses_no_other_robot() {
         reason: "I looked".to_owned(),
         ..Default::default()
     };
-    w.fleet.disown_attempt(Request::new(disown)).await.expect("it is no robot that knows more than the store");
+    w.fleet.disown_attempt(local(disown)).await.expect("it is no robot that knows more than the store");
     w.lawful().await;
 }
 
@@ -428,7 +428,7 @@ async fn a_robot_that_waits_for_a_place_is_told_who_has_it() {
     w.submit_with("T2", "A", "B", |raw| (raw.robot_id, raw.stall_ms) = ("r2".to_owned(), Some(3_600_000))).await;
     w.pass(120).await;
     let ask = v1::ExplainTaskRequest { task_id: "T2".to_owned() };
-    let told = w.fleet.explain_task(Request::new(ask)).await.expect("told").into_inner();
+    let told = w.fleet.explain_task(local(ask)).await.expect("told").into_inner();
     let verdict = told.explanation.expect("told").verdict.expect("a reason");
     assert_eq!(verdict.metadata.get("held_by").map(String::as_str), Some("r1"), "{verdict:?}");
     w.lawful().await;
@@ -444,7 +444,7 @@ async fn an_attempt_that_the_server_does_not_know_is_an_incident_after_a_minute(
     let seen = w.until("a person is told", |s| !s.open_incidents("ATTEMPT_UNKNOWN").is_empty()).await;
     assert!(seen.work("r1").assignment.is_none());
     let ask = v1::ExplainRobotRequest { robot_id: "r1".to_owned() };
-    let told = w.fleet.explain_robot(Request::new(ask)).await.expect("told").into_inner();
+    let told = w.fleet.explain_robot(local(ask)).await.expect("told").into_inner();
     let told = format!("{:?}", told.explanation.expect("told").verdict);
     assert!(told.contains("ATTEMPT_UNKNOWN") && told.contains("T-elsewhere/3"), "{told}");
     w.lawful().await;

@@ -9,9 +9,9 @@ use midshift_core::site::CORRIDOR;
 use midshift_core::stop::record::StopRecord;
 use midshift_core::stop::{Reset, Scope, Stop};
 use midshift_core::task::Phase;
+use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
-use tonic::Request;
 
 fn names(count: usize) -> Vec<StopId> {
     (0..count).map(|n| StopId::parse(&format!("STOP-{n}")).expect("an id")).collect()
@@ -134,5 +134,5 @@ async fn an_event_that_cannot_be_obeyed_is_passed_over_and_those_after_it_are_ob
 async fn close(w: &World, incident: &Incident) {
     let request =
         v1::CloseIncidentRequest { incident_id: incident.id(), reason: "looked".to_owned(), ..Default::default() };
-    w.fleet.close_incident(Request::new(request)).await.expect("closed");
+    w.fleet.close_incident(local(request)).await.expect("closed");
 }

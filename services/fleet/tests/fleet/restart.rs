@@ -9,10 +9,10 @@ use midshift_core::rows::{Item, Writer};
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::{Attempt, Phase, TaskState, Then};
 use midshift_core::work::PresenceRow;
+use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
 use std::time::Duration;
-use tonic::Request;
 
 #[tokio::test(start_paused = true)]
 async fn a_restart_loses_nothing_and_repeats_nothing() {
@@ -249,7 +249,7 @@ async fn questions_are_answered_though_the_store_takes_nothing() {
     w.submit("T1", "A", "B").await;
     w.pass(2).await;
     assert!(w.shaky.failed() > 0, "the fault happened");
-    let asked = w.fleet.list_places(Request::new(v1::ListPlacesRequest::default()));
+    let asked = w.fleet.list_places(local(v1::ListPlacesRequest::default()));
     let listed = tokio::time::timeout(Duration::from_secs(30), asked).await.expect("in time").expect("places");
     assert!(!listed.into_inner().places.is_empty());
     w.shaky.fail(false);

@@ -6,9 +6,9 @@ use midshift_core::robot::Duty;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;
 use midshift_core::task::raw::RawRetry;
+use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
-use tonic::Request;
 
 fn twice() -> Option<RawRetry> {
     Some(RawRetry { max_retry_times: 2, interval_ms: Some(10_000), jitter: Some(0.0), ..RawRetry::default() })
@@ -91,7 +91,7 @@ async fn three_failures_in_ten_minutes_take_a_robot_out_of_dispatch_until_a_pers
     w.submit("T4", "A", "B").await;
     w.pass_while(700, "it gets no work, however long ago", |s| s.phase("T4") == Phase::Queued).await;
     let uncordon = v1::UncordonRobotRequest { robot_id: "r1".to_owned(), ..Default::default() };
-    w.fleet.uncordon_robot(Request::new(uncordon)).await.expect("uncordoned");
+    w.fleet.uncordon_robot(local(uncordon)).await.expect("uncordoned");
     w.until_phase("T4", Phase::Succeeded).await;
     w.lawful().await;
 }

@@ -8,11 +8,11 @@ use midshift_core::lead::FleetLeader;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;
 use midshift_core::time::Clock;
+use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService as Face;
 use midshift_store::{PostgresConfig, PostgresStore, Store, migrate_postgres};
 use std::sync::Arc;
-use tonic::Request;
 
 async fn open(config: &PostgresConfig, site_id: SiteId, clock: Arc<dyn Clock>) -> Arc<dyn Store> {
     Arc::new(PostgresStore::open(config, site_id, clock).await.expect("a store"))
@@ -42,8 +42,8 @@ async fn on_postgresql_one_of_two_processes_plans_and_the_other_goes_on_after_it
         request_id: "ask-1".to_owned(),
         ..Default::default()
     };
-    other.cordon_robot(Request::new(cordon("r1"))).await.expect("the other one writes it");
-    w.fleet.cordon_robot(Request::new(cordon("r1"))).await.expect("and the first one knows");
+    other.cordon_robot(local(cordon("r1"))).await.expect("the other one writes it");
+    w.fleet.cordon_robot(local(cordon("r1"))).await.expect("and the first one knows");
     assert_eq!(lease(&w).await, first);
     w.kill_first().await;
     w.robot("r2", "park-b").await;

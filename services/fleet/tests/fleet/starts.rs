@@ -5,9 +5,9 @@ use midshift_core::fleet::rows::HolderState;
 use midshift_core::reason::Code;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;
+use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
-use tonic::Request;
 
 /// The corridor, where these robots start.
 fn site(robots: &[(&str, &str)]) -> &'static str {
@@ -16,7 +16,7 @@ fn site(robots: &[(&str, &str)]) -> &'static str {
 }
 
 async fn awaited(w: &World, place: &str) -> Vec<String> {
-    let listed = w.fleet.list_places(Request::new(v1::ListPlacesRequest::default())).await.expect("places");
+    let listed = w.fleet.list_places(local(v1::ListPlacesRequest::default())).await.expect("places");
     let mut places = listed.into_inner().places.into_iter();
     places.find(|p| p.place_id == place).expect("a place").awaited_robot_ids
 }
@@ -45,7 +45,7 @@ async fn a_robot_waits_for_a_place_that_is_kept_for_another_and_explain_says_for
     .await;
     w.until("r1 has its item", |s| s.task("T1").opened.is_some()).await;
     w.pass_while(100, "the charger is not given", |s| s.holders("charge").is_empty()).await;
-    let told = w.fleet.explain_task(Request::new(v1::ExplainTaskRequest { task_id: "T1".to_owned() })).await;
+    let told = w.fleet.explain_task(local(v1::ExplainTaskRequest { task_id: "T1".to_owned() })).await;
     let verdict = told.expect("an explanation").into_inner().explanation.and_then(|e| e.verdict).expect("a verdict");
     assert_eq!(verdict.code, Code::PlaceBlocked.as_str());
     assert_eq!(verdict.metadata.get("kept_for").map(String::as_str), Some("r2"), "{verdict:?}");

@@ -6,10 +6,10 @@ use midshift_core::reason::Code;
 use midshift_core::rows::{Expect, Index, Item, Key, RowChange, Table, Write, Writer};
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;
+use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
 use midshift_proto::refusal_of;
-use tonic::Request;
 
 /// A newer version writes `new` for `old` into a row; its state becomes one that no build here lists.
 pub async fn rewritten(w: &World, table: Table, id: &str, (old, new): (&str, &str), state: Option<i64>) {
@@ -61,12 +61,12 @@ async fn a_command_about_a_row_of_a_newer_version_is_refused_with_the_row_and_le
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;
     let cordon = || v1::CordonRobotRequest { robot_id: "r1".into(), reason: "look".into(), ..Default::default() };
-    w.fleet.cordon_robot(Request::new(cordon())).await.expect("cordoned");
+    w.fleet.cordon_robot(local(cordon())).await.expect("cordoned");
     rewritten(&w, Table::RobotControl, "r1", ("\"robot_id\":\"r1\"", "\"robot_id\":7"), None).await;
     let kept = body(&w, Table::RobotControl, "r1").await;
     w.pass(2).await;
     let uncordon = v1::UncordonRobotRequest { robot_id: "r1".into(), ..Default::default() };
-    let refused = w.fleet.uncordon_robot(Request::new(uncordon)).await.expect_err("nobody may change it");
+    let refused = w.fleet.uncordon_robot(local(uncordon)).await.expect_err("nobody may change it");
     assert_eq!(refusal_of(&refused).code, Some(Code::RowUnknown), "{refused}");
     assert_eq!(body(&w, Table::RobotControl, "r1").await, kept);
 }
@@ -82,7 +82,7 @@ async fn a_robot_with_a_row_of_a_newer_version_gets_no_work_and_says_which_row_a
     w.pass(30).await;
     assert_eq!(w.seen().await.phase("T1"), Phase::Queued);
     let ask = v1::ExplainRobotRequest { robot_id: "r1".into() };
-    let told = w.fleet.explain_robot(Request::new(ask)).await.expect("an explanation").into_inner();
+    let told = w.fleet.explain_robot(local(ask)).await.expect("an explanation").into_inner();
     let why = told.explanation.and_then(|e| e.verdict).expect("a reason");
     assert_eq!((why.code.as_str(), why.metadata["row"].as_str()), ("ROW_UNKNOWN", "robot_authority/r1"));
     assert_eq!(why.metadata["value"], "unknown variant `adrift`");

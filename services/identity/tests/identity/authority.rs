@@ -64,3 +64,15 @@ async fn a_server_renews_its_certificate_at_half_of_its_life_and_keeps_its_key()
     assert_eq!(first.key_pem, later.key_pem);
     assert_ne!(first.chain_pem, later.chain_pem);
 }
+
+#[tokio::test]
+async fn a_server_that_starts_with_a_wall_in_doubt_keeps_the_certificate_that_it_has() {
+    let world = World::new();
+    let chain = async || world.open().await.expect("opened").proof().borrow().chain_pem.clone();
+    let first = chain().await;
+    let valid_ms = midshift_core::limits::SERVER_CERTIFICATE_VALID.as_ms().cast_signed();
+    world.set_ms(valid_ms);
+    assert_eq!(chain().await, first, "a new one would begin when the wall is wrong no more");
+    world.clock.accept_wall();
+    assert_ne!(chain().await, first);
+}

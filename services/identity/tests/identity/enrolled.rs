@@ -7,16 +7,16 @@ use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_identity::IdentityService;
 use midshift_proto::Denying;
+use midshift_proto::access::local;
 use midshift_proto::identity::v1::enrolment_service_server::EnrolmentService as _;
 use midshift_proto::identity::v1::identity_service_server::IdentityService as _;
 use midshift_proto::identity::v1::{
     ListRobotIdentitiesRequest, RenewCertificateRequest, RevokeRobotRequest, RobotIdentity,
 };
 use std::sync::Arc;
-use tonic::Request;
 
 async fn robot(identity: &IdentityService, robot_id: &str) -> RobotIdentity {
-    let request = Request::new(ListRobotIdentitiesRequest::default());
+    let request = local(ListRobotIdentitiesRequest::default());
     let all = identity.list_robot_identities(request).await.expect("a list").into_inner().robots;
     all.into_iter().find(|robot| robot.robot_id == robot_id).expect("a robot")
 }
@@ -30,7 +30,7 @@ async fn robots_are_listed_by_the_beginning_of_their_id_whether_or_not_they_were
     }
     let begin = async |prefix: &str| {
         let request = ListRobotIdentitiesRequest { robot_id_prefix: prefix.to_owned(), ..Default::default() };
-        let page = identity.list_robot_identities(Request::new(request)).await.expect("a list").into_inner();
+        let page = identity.list_robot_identities(local(request)).await.expect("a list").into_inner();
         page.robots.into_iter().map(|robot| robot.robot_id).collect::<Vec<_>>()
     };
     assert_eq!(begin("r7").await, ["r7", "r70"]);
@@ -86,7 +86,7 @@ async fn a_machine_is_one_robot_and_its_key_lets_no_other_one_in_also_after_it_w
     let refused = enrol(&identity, "r8", &other, &machine).await.expect_err("it is r7");
     assert_eq!(code(&refused), Some(Code::KeyDenied));
     let revoke = RevokeRobotRequest { robot_id: "r7".to_owned() };
-    identity.revoke_robot(Request::new(revoke)).await.expect("revoked");
+    identity.revoke_robot(local(revoke)).await.expect("revoked");
     let refused = enrol(&identity, "r8", &other, &machine).await.expect_err("it was r7");
     assert_eq!(code(&refused), Some(Code::KeyDenied));
     enrol(&identity, "r8", &other, &Machine::new()).await.expect("the secret is as good as before");
@@ -156,7 +156,7 @@ async fn a_revoked_robot_is_denied_at_once_and_gets_no_new_certificate() {
     let (line, machine) = (secret(&identity, "r7", false).await.expect("a secret"), Machine::new());
     enrol(&identity, "r7", &line, &machine).await.expect("enrolled");
     let key = robot(&identity, "r7").await.key_sha256;
-    let revoke = || Request::new(RevokeRobotRequest { robot_id: "r7".to_owned() });
+    let revoke = || local(RevokeRobotRequest { robot_id: "r7".to_owned() });
     identity.revoke_robot(revoke()).await.expect("revoked");
     assert!(denies(&identity, &key), "before the answer left");
     identity.revoke_robot(revoke()).await.expect("again: the same answer");
@@ -190,6 +190,26 @@ async fn a_robot_renews_its_own_certificate_for_its_own_key_and_no_other() {
 }
 
 #[tokio::test]
+async fn no_certificate_is_signed_by_a_wall_in_doubt_and_the_old_one_counts_on() {
+    let world = World::new();
+    let identity = world.open().await.expect("opened");
+    let (machine, month_ms) = (Machine::new(), 30 * 24 * 3_600_000);
+    let line = secret(&identity, "r7", false).await.expect("a secret");
+    world.set_ms(month_ms);
+    let refused = enrol(&identity, "r7", &line, &machine).await.expect_err("it would begin in a month");
+    assert_eq!(code(&refused), Some(Code::ClockDoubted));
+    world.set_ms(-month_ms);
+    enrol(&identity, "r7", &line, &machine).await.expect("the secret was not used up");
+    let own = Caller::robot(RobotId::parse("r7").expect("an id"));
+    let request = || RenewCertificateRequest { robot_id: "r7".to_owned(), request_pem: machine.request() };
+    world.set_ms(month_ms);
+    let refused = identity.renew_certificate(asked_by(own.clone(), request())).await.expect_err("likewise");
+    assert_eq!(code(&refused), Some(Code::ClockDoubted));
+    world.clock.accept_wall();
+    identity.renew_certificate(asked_by(own, request())).await.expect("a person says that it is right");
+}
+
+#[tokio::test]
 async fn what_is_no_signing_request_is_refused_and_uses_no_secret_up() {
     let world = World::new();
     let identity = world.open().await.expect("opened");
@@ -202,7 +222,7 @@ async fn what_is_no_signing_request_is_refused_and_uses_no_secret_up() {
             secret: crate::world::shown(&line),
             request_pem: request_pem.to_owned(),
         };
-        let refused = identity.enrol(Request::new(request)).await.expect_err("no request");
+        let refused = identity.enrol(local(request)).await.expect_err("no request");
         assert_eq!(code(&refused), Some(Code::InvalidRequest));
     }
     enrol(&identity, "r7", &line, &Machine::new()).await.expect("the secret is as good as before");

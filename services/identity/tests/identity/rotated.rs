@@ -6,11 +6,12 @@ use midshift_core::identity::{Caller, Digest, TokenId, TokenRecord, Who};
 use midshift_core::reason::Code;
 use midshift_core::rows::{Item, Writer};
 use midshift_identity::IdentityService;
+use midshift_proto::access::local;
 use midshift_proto::identity::v1::identity_service_server::IdentityService as _;
 use midshift_proto::identity::v1::{
     CreateTokenRequest, RevokeTokenRequest, RotateTokenRequest, RotateTokenResponse, WhoAmIRequest,
 };
-use tonic::{Request, Status};
+use tonic::Status;
 
 const DAY_S: u64 = 24 * 3_600;
 
@@ -19,7 +20,7 @@ fn turn(name: &str) -> RotateTokenRequest {
 }
 
 async fn rotate(identity: &IdentityService, request: RotateTokenRequest) -> Result<RotateTokenResponse, Status> {
-    Ok(identity.rotate_token(Request::new(request)).await?.into_inner())
+    Ok(identity.rotate_token(local(request)).await?.into_inner())
 }
 
 #[tokio::test]
@@ -47,7 +48,7 @@ async fn a_rotated_token_has_the_rights_and_the_person_of_the_old_one_which_ends
         valid_seconds: 3 * DAY_S,
         person: "anna".to_owned(),
     };
-    let old = identity.create_token(Request::new(asked)).await.expect("made").into_inner();
+    let old = identity.create_token(local(asked)).await.expect("made").into_inner();
     world.pass_ms(DAY_S * 1_000);
     let new = rotate(&identity, turn("laptop")).await.expect("rotated");
     let (was, token) = (old.token.expect("a token"), new.token.expect("a token"));

@@ -4,11 +4,12 @@ use crate::world::{World, code};
 use midshift_core::identity::{Caller, Digest, Secret};
 use midshift_core::reason::{Code, Refusal};
 use midshift_identity::IdentityService;
+use midshift_proto::access::local;
 use midshift_proto::identity::v1::identity_service_server::IdentityService as _;
 use midshift_proto::identity::v1::{CreateTokenRequest, ListTokensRequest, RevokeTokenRequest, Token};
 use midshift_proto::refusal_of;
 use sha2::Digest as _;
-use tonic::{Request, Status};
+use tonic::Status;
 
 const DAY_S: u64 = 24 * 3_600;
 
@@ -20,16 +21,16 @@ pub async fn create(
 ) -> Result<(Token, String), Status> {
     let grants = grants.iter().map(|grant| (*grant).to_owned()).collect();
     let request = CreateTokenRequest { name: name.to_owned(), grants, valid_seconds, ..Default::default() };
-    let made = identity.create_token(Request::new(request)).await?.into_inner();
+    let made = identity.create_token(local(request)).await?.into_inner();
     Ok((made.token.expect("a token"), made.secret))
 }
 
 pub async fn revoke(identity: &IdentityService, token_id: &str) -> Result<(), Status> {
-    identity.revoke_token(Request::new(RevokeTokenRequest { token_id: token_id.to_owned() })).await.map(drop)
+    identity.revoke_token(local(RevokeTokenRequest { token_id: token_id.to_owned() })).await.map(drop)
 }
 
 pub async fn list(identity: &IdentityService) -> Vec<Token> {
-    identity.list_tokens(Request::new(ListTokensRequest::default())).await.expect("a list").into_inner().tokens
+    identity.list_tokens(local(ListTokensRequest::default())).await.expect("a list").into_inner().tokens
 }
 
 /// Who shows this, as a port of this process answers.

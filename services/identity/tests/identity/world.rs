@@ -5,8 +5,10 @@ use midshift_core::identity::Caller;
 use midshift_core::ids::SiteId;
 use midshift_core::reason::{Code, Refusal};
 use midshift_core::rows::Table;
-use midshift_core::time::{Clock, ScaledClock, Utc};
+use midshift_core::time::{Clock, Utc};
+use midshift_core::wall::WallClock;
 use midshift_identity::{Duty, Error, IdentityService, Parts};
+use midshift_proto::access::local;
 use midshift_proto::denying::Told;
 use midshift_proto::identity::v1::enrolment_service_server::EnrolmentService as _;
 use midshift_proto::identity::v1::identity_service_server::IdentityService as _;
@@ -15,7 +17,7 @@ use midshift_proto::refusal_of;
 use midshift_store::{MemoryStore, Query, SqliteStore, Store, StoreId};
 use rcgen::{CertificateParams, KeyPair};
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use tempfile::TempDir;
 use tokio_util::sync::CancellationToken;
@@ -25,18 +27,19 @@ pub struct World {
     pub store: Arc<dyn Store>,
     pub clock: Arc<dyn Clock>,
     us: Arc<AtomicU64>,
+    ahead_ms: Arc<AtomicI64>,
     pub dir: TempDir,
 }
 
 impl World {
     pub fn new() -> Self {
-        let us = Arc::new(AtomicU64::new(0));
-        let source = us.clone();
-        let clock: Arc<dyn Clock> =
-            Arc::new(ScaledClock::new(move || source.load(Ordering::Relaxed), Utc(1_800_000_000_000), 1000));
+        let (us, ahead_ms) = (Arc::<AtomicU64>::default(), Arc::new(AtomicI64::new(1_800_000_000_000)));
+        let (source, beside, ahead) = (us.clone(), us.clone(), ahead_ms.clone());
+        let wall = move || Utc(ahead.load(Ordering::Relaxed)).plus_ms(beside.load(Ordering::Relaxed) / 1000);
+        let clock: Arc<dyn Clock> = Arc::new(WallClock::new(move || source.load(Ordering::Relaxed), wall, |_| {}));
         let site = SiteId::parse("factory").expect("a site");
         let store = Arc::new(MemoryStore::new(site, StoreId::fresh(), clock.clone()));
-        Self { store, clock, us, dir: TempDir::new().expect("a folder") }
+        Self { store, clock, us, ahead_ms, dir: TempDir::new().expect("a folder") }
     }
     /// The same over a store in files.
     pub async fn in_files() -> Self {
@@ -47,6 +50,10 @@ impl World {
     }
     pub fn pass_ms(&self, ms: u64) {
         self.us.fetch_add(ms * 1000, Ordering::Relaxed);
+    }
+    /// Somebody sets the wall.
+    pub fn set_ms(&self, ms: i64) {
+        self.ahead_ms.fetch_add(ms, Ordering::Relaxed);
     }
     /// Rows of the audit, the oldest first.
     pub async fn audited(&self) -> Vec<AuditRow> {
@@ -109,7 +116,7 @@ pub fn code(status: &Status) -> Option<Code> {
 
 pub async fn secret(identity: &IdentityService, robot_id: &str, replace: bool) -> Result<String, Status> {
     let request = CreateEnrolmentRequest { robot_id: robot_id.to_owned(), replace };
-    Ok(identity.create_enrolment(Request::new(request)).await?.into_inner().secret)
+    Ok(identity.create_enrolment(local(request)).await?.into_inner().secret)
 }
 
 /// What of the line is the secret's own.

@@ -10,7 +10,7 @@ use super::out::{Format, Out, columns};
 use super::released;
 use crate::roles::Role;
 use crate::way::Line;
-use crate::{clock, site_answer};
+use crate::{clock, clock_doubt, site_answer};
 use midshift_bundle::freshness::{newest_targets, root_edition, stamp, targets_edition};
 use midshift_bundle::repository::TIMESTAMP_LIFE_MS;
 use midshift_core::time::Utc;
@@ -49,6 +49,9 @@ pub struct Doctor {
     /// The server's data folder, if this is its machine.
     #[arg(long, default_value = "midshift-data")]
     data: PathBuf,
+    /// Say to the server of --data that the clock of this machine is right though it jumped, so that it signs by it again. Nothing else is looked for.
+    #[arg(long)]
+    accept_clock: bool,
 }
 
 #[derive(Debug)]
@@ -70,6 +73,12 @@ impl Finding {
 
 /// Runs every check; exit code 1 if one is not good.
 pub async fn run(doctor: &Doctor, out: &Out) -> Result<(), Exit> {
+    if doctor.accept_clock {
+        clock_doubt::leave_word(&doctor.data)?;
+        out.say("the server of that folder takes the clock of this machine for right, within seconds");
+        out.next("midshift doctor");
+        return Ok(());
+    }
     let mut found = vec![Finding::good("version", env!("CARGO_PKG_VERSION"))];
     found.extend(machine::data(&doctor.data));
     match doctor.call.telemetry().await {
@@ -117,7 +126,7 @@ async fn server(doctor: &Doctor, found: &mut Vec<Finding>) -> Result<(), Exit> {
         let text = format!("{service} {}", if good { "serves" } else { "does not serve" });
         found.push(Finding { what: "service", good, text });
     }
-    found.extend(jump(&channel, now).await);
+    found.extend(wall(&channel, now).await);
     found.push(store(call).await);
     let (robots, online) = robots(doctor).await?;
     found.extend(robots);
@@ -131,11 +140,14 @@ async fn server(doctor: &Doctor, found: &mut Vec<Finding>) -> Result<(), Exit> {
     Ok(())
 }
 
-/// What the server's wall clock jumped while it ran, which it says in each answer to a health check; none: it did not.
-async fn jump(channel: &Line, now: Utc) -> Option<Finding> {
-    let answer = HealthClient::new(channel.clone()).check(unary(HealthCheckRequest::default())).await.ok()?;
-    let (step_ms, at) = site_answer::clock_jump(answer.metadata())?;
-    Some(shown::jump("the server's", step_ms, at, now))
+/// What the server's wall clock jumped while it ran, and whether it signs by it, which it says in each answer to a health check.
+async fn wall(channel: &Line, now: Utc) -> Vec<Finding> {
+    let answer = HealthClient::new(channel.clone()).check(unary(HealthCheckRequest::default())).await;
+    let Ok(answer) = answer else { return Vec::new() };
+    let jump =
+        site_answer::clock_jump(answer.metadata()).map(|(step_ms, at)| shown::jump("the server's", step_ms, at, now));
+    let doubt = site_answer::clock_doubt(answer.metadata()).map(|(step_ms, at)| shown::doubt(step_ms, at));
+    jump.into_iter().chain(doubt).collect()
 }
 
 /// When what was signed ends: root and targets, which people sign, and the timestamp, which the server signs.

@@ -112,7 +112,8 @@ enum Verb {
         #[arg(long)]
         watch: bool,
     },
-    /// Take one stop away. Robots that stood stay where they are until they are resumed.
+    /// Take one stop away. Robots that stood stay where they are until they are resumed. Exit code 9: nobody knows that stop; the reset is kept for a robot
+    /// that was away.
     Reset {
         #[command(flatten)]
         call: StopCall,
@@ -554,8 +555,11 @@ async fn reset(mut client: StopServiceClient<Line>, request: v1::ResetRequest, o
     let answer = client.reset(unary(request)).await?.into_inner();
     let reset = answer.reset.clone().unwrap_or_default();
     out.one(&answer, &reset.stop_id, || {
-        let was =
-            if answer.was_engaged { "was engaged and is reset" } else { "was not engaged here; its name is reset" };
+        let was = match (answer.was_engaged, answer.is_unknown) {
+            (true, _) => "was engaged and is reset",
+            (false, false) => "was not engaged here; its name is reset",
+            (false, true) => "is known to nobody; its name is reset",
+        };
         format!(
             "{} {was} since {} by {}: {}",
             reset.stop_id,
@@ -566,6 +570,10 @@ async fn reset(mut client: StopServiceClient<Line>, request: v1::ResetRequest, o
     })?;
     if !answer.durable {
         out.say("warning: the stop service's disk refused the reset; robots were told, and it is written as soon as it can be");
+    }
+    if answer.is_unknown {
+        let text = format!("nobody knows a stop {}: the reset is kept for a robot that was away", reset.stop_id);
+        return Err(Exit::new(9, text).or_try("if you meant another one: midshift stop status"));
     }
     out.next(&format!(
         "robots that stood stay where they are; when it is right that they move: midshift resume --stop {} --reason TEXT",

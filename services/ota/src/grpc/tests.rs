@@ -4,6 +4,7 @@ use crate::OtaService;
 use crate::encodings::tests::programs;
 use crate::fixture::{SEEDS, files, first_root, release, service, targets};
 use midshift_bundle::digest::Digest;
+use midshift_core::identity::Caller;
 use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_proto::ota::v1;
@@ -12,8 +13,9 @@ use midshift_proto::ota::v1::chunk_service_client::ChunkServiceClient;
 use midshift_proto::refusal_of;
 use tempfile::TempDir;
 use tokio_stream::wrappers::TcpListenerStream;
-use tonic::Status;
+use tonic::service::InterceptorLayer;
 use tonic::transport::{Channel, Endpoint, Server};
+use tonic::{Request, Status};
 
 struct World {
     _dir: TempDir,
@@ -25,7 +27,12 @@ struct World {
 async fn served(dir: TempDir, service: OtaService) -> World {
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
     let address = listener.local_addr().expect("an address");
-    let server = Server::builder().add_service(service.bundles()).add_service(service.chunks());
+    // As a port without login.
+    let port = InterceptorLayer::new(|mut request: Request<()>| {
+        request.extensions_mut().insert(Caller::local());
+        Ok::<_, Status>(request)
+    });
+    let server = Server::builder().layer(port).add_service(service.bundles()).add_service(service.chunks());
     tokio::spawn(server.serve_with_incoming(TcpListenerStream::new(listener)));
     let channel = Endpoint::from_shared(format!("http://{address}")).expect("a uri").connect_lazy();
     let bundles = BundleServiceClient::new(channel.clone()).max_decoding_message_size(16 * 1024 * 1024);

@@ -306,11 +306,14 @@ impl Loop {
         }
         let replies = self.take_requests(requests, now, &mut plan);
         // The service looks for one each second.
-        let key = opened.repository.directive_key().ok();
+        let key = opened.repository.directive_key().map_err(|keyless| keyless.reason().code);
         let heard = std::mem::take(&mut self.heard);
         let more = {
             let signer = key.as_deref().map(Signer);
-            let sign = signer.as_ref().map(|signer| signer as &dyn Sign);
+            let sign = match &signer {
+                Ok(signer) => Ok(signer as &dyn Sign),
+                Err(code) => Err(**code),
+            };
             cycle(&mut self.view, now, &self.board, &heard, sign, &mut plan)
         };
         for text in &plan.unreadable {

@@ -4,6 +4,7 @@ use crate::harness::{Folder, Robot, Server, code, eventually, fleet, halt, id_of
 use midshift_core::limits;
 use midshift_core::site::{DEMO, text};
 use midshift_core::time::{ScaledClock, Utc};
+use midshift_proto::access::local;
 use midshift_proto::refusal_of;
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::scope::Scope as W;
@@ -12,7 +13,7 @@ use midshift_stop::{Parts, StopService, announce_first_start};
 use std::fs;
 use std::sync::Arc;
 use tokio_util::sync::CancellationToken;
-use tonic::{Code, Request};
+use tonic::Code;
 
 #[tokio::test]
 async fn what_was_answered_as_durable_is_in_the_file() {
@@ -71,9 +72,9 @@ async fn the_first_reset_is_answered_and_one_that_comes_before_its_stop_counts()
     let was_told = told(&robot, &id);
     let first = server.reset(&id).await;
     let again = server.reset(&id).await;
-    assert_eq!((again.was_engaged, again.reset), (false, first.reset));
+    assert_eq!((again.was_engaged, again.is_unknown, again.reset), (false, false, first.reset));
     let unknown = server.reset("STOP-OF-ANOTHER").await;
-    assert!(!unknown.was_engaged && unknown.durable);
+    assert!(unknown.is_unknown && !unknown.was_engaged && unknown.durable, "it is taken all the same");
     let known_by_a_robot_only = midshift_core::stop::Stop { stop_id: "STOP-OF-ANOTHER".parse().unwrap(), ..was_told };
     let robot = Robot::dial(&server, "r2", vec![known_by_a_robot_only]).await.synced().await;
     assert!(robot.effective().is_empty());
@@ -323,11 +324,11 @@ async fn a_service_that_ends_takes_no_stop_and_no_reset_that_nobody_would_keep()
     let folder = Folder::new();
     let (service, shutdown) = opened(&folder);
     shutdown.cancel();
-    let refused = Face::engage(&service, Request::new(fleet())).await.expect_err("a refusal");
+    let refused = Face::engage(&service, local(fleet())).await.expect_err("a refusal");
     assert_eq!(refused.code(), Code::Unavailable, "{refused}");
     let stop_id = "STOP-20260601-ABCDEFGHJK".to_owned();
     let reset = v1::ResetRequest { stop_id, reason: "all clear".to_owned(), site_id: String::new() };
-    let refused = Face::reset(&service, Request::new(reset)).await.expect_err("a refusal");
+    let refused = Face::reset(&service, local(reset)).await.expect_err("a refusal");
     assert_eq!(refused.code(), Code::Unavailable);
     assert_eq!(service.engaged(), 0);
 }

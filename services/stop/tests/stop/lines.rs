@@ -128,7 +128,7 @@ async fn what_a_robot_brings_by_name_alone_is_shown_and_its_reset_reaches_it() {
     robot.until(|robot| is_told(robot, was_reset)).await;
     assert!(!is_told(&robot, unknown) && !is_told(&robot, &engaged));
     assert_eq!(server.status().await.robots[0].foreign_stops, [unknown]);
-    server.reset(unknown).await;
+    assert!(!server.reset(unknown).await.is_unknown, "a robot knows of it");
     robot.until(|robot| is_told(robot, unknown)).await;
 }
 

@@ -4,17 +4,18 @@ use crate::world::{World, reason, submit, transport};
 use midshift_core::fleet::rows::HoldToken;
 use midshift_core::rows::Record;
 use midshift_core::task::{Phase, TaskRequest};
+use midshift_proto::access::local;
 use midshift_proto::task::v1::task_service_server::TaskService as _;
 use midshift_proto::task::v1::{self, CancelTaskRequest, Resolution, ResolveTaskRequest, ResumeHeldRequest};
 use midshift_store::{Query, Store};
-use tonic::{Code, Request, Status};
+use tonic::{Code, Status};
 
 fn cancel(task_id: &str) -> CancelTaskRequest {
     CancelTaskRequest { task_id: task_id.into(), reason: "not wanted".into(), ..CancelTaskRequest::default() }
 }
 
 async fn call(world: &World, request: CancelTaskRequest) -> Result<v1::CancelTaskResponse, Status> {
-    Ok(world.service.cancel_task(Request::new(request)).await?.into_inner())
+    Ok(world.service.cancel_task(local(request)).await?.into_inner())
 }
 
 async fn call_while_fleet_works(world: &World, request: CancelTaskRequest) -> v1::CancelTaskResponse {
@@ -132,7 +133,7 @@ async fn what_has_ended_is_not_canceled_and_what_is_unknown_is_not_found() {
 async fn a_person_answers_what_the_person_saw_and_only_what_is_allowed() {
     let world = World::new().await;
     let (task_id, etag) = stuck(&world).await;
-    let call = async |request| world.service.resolve_task(Request::new(request)).await.map(|a| a.into_inner());
+    let call = async |request| world.service.resolve_task(local(request)).await.map(|a| a.into_inner());
     let blind = call(resolve(&task_id, "")).await.expect_err("no etag");
     assert_eq!(blind.code(), Code::InvalidArgument);
     let late = call(resolve(&task_id, "1")).await.expect_err("an old etag");
@@ -151,7 +152,7 @@ async fn a_person_answers_what_the_person_saw_and_only_what_is_allowed() {
 #[tokio::test(start_paused = true)]
 async fn a_resume_says_why_and_whom_and_whether_fleet_has_looked_at_it() {
     let world = World::new().await;
-    let call = async |request| world.service.resume_held(Request::new(request)).await.map(|a| a.into_inner());
+    let call = async |request| world.service.resume_held(local(request)).await.map(|a| a.into_inner());
     let refused = call(ResumeHeldRequest::default()).await.expect_err("no reason and nobody named");
     let fields: Vec<_> = midshift_proto::refusal_of(&refused).violations.into_iter().map(|v| v.field).collect();
     assert_eq!(fields, ["reason", "stop_id"]);
@@ -176,8 +177,11 @@ fn resume(stop_id: &str) -> ResumeHeldRequest {
 #[tokio::test(start_paused = true)]
 async fn a_resume_before_the_reset_is_refused_and_is_not_kept_for_later() {
     let world = World::new().await;
-    let call = async |request| world.service.resume_held(Request::new(request)).await.map(|a| a.into_inner());
+    let call = async |request| world.service.resume_held(local(request)).await.map(|a| a.into_inner());
     let unknown = call(resume("STOP-9")).await.expect_err("nobody knows of it");
+    assert_eq!((unknown.code(), reason(&unknown).as_str()), (Code::NotFound, "STOP_NOT_FOUND"));
+    let beside = ResumeHeldRequest { task_ids: vec!["T1".into()], ..resume("STOP-9") };
+    let unknown = call(beside).await.expect_err("nor beside a task");
     assert_eq!((unknown.code(), reason(&unknown).as_str()), (Code::NotFound, "STOP_NOT_FOUND"));
     world.copies_stop("STOP-1", false).await;
     world.fleet_holds(None, "stop:STOP-1").await;
@@ -199,7 +203,7 @@ async fn a_resume_right_after_the_reset_waits_until_fleet_has_seen_it() {
         let head = world.head();
         world.fleet_turns_after(head).await;
     };
-    let (answer, ()) = tokio::join!(world.service.resume_held(Request::new(resume("STOP-1"))), fleet_sees);
+    let (answer, ()) = tokio::join!(world.service.resume_held(local(resume("STOP-1"))), fleet_sees);
     let answer = answer.expect("durable").into_inner();
     assert_eq!((answer.robots, answer.pending, answer.still_stopped.len()), (Some(1), false, 0));
     let left = world.store.list(Query::all(HoldToken::TABLE)).await.expect("a store that answers");
@@ -211,10 +215,10 @@ async fn a_resume_names_the_robots_that_it_does_not_let_go() {
     let world = World::new().await;
     world.copies_stop("STOP-1", true).await;
     world.fleet_holds(None, "stop:STOP-1").await;
-    let answer = world.service.resume_held(Request::new(resume("STOP-1"))).await.expect("durable").into_inner();
+    let answer = world.service.resume_held(local(resume("STOP-1"))).await.expect("durable").into_inner();
     assert_eq!((answer.robots, answer.still_stopped), (Some(0), vec!["r1".to_owned()]));
     let others = ResumeHeldRequest { robot_ids: vec!["r2".into()], ..resume("STOP-1") };
-    let answer = world.service.resume_held(Request::new(others)).await.expect("durable").into_inner();
+    let answer = world.service.resume_held(local(others)).await.expect("durable").into_inner();
     assert_eq!((answer.robots, answer.still_stopped.len()), (Some(0), 0), "of those that it names");
 }
 

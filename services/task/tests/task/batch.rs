@@ -2,6 +2,7 @@
 
 use crate::world::{World, count, patrol, transport};
 use midshift_core::limits;
+use midshift_proto::access::local;
 use midshift_proto::task::v1::{self, SubmitTaskRequest, submit_task_request::Body, submit_task_result::Outcome};
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -10,7 +11,7 @@ use tonic::{Code, Status};
 
 async fn send(world: &World, items: Vec<SubmitTaskRequest>) -> Result<Vec<v1::SubmitTaskResult>, Status> {
     let stream = tokio_stream::iter(items.into_iter().map(|item| v1::SubmitTasksRequest { item: Some(item) }));
-    Ok(world.client().submit_tasks(stream).await?.into_inner().results)
+    Ok(world.client().submit_tasks(local(stream)).await?.into_inner().results)
 }
 
 fn shown(result: &v1::SubmitTaskResult) -> String {
@@ -104,6 +105,6 @@ async fn a_batch_over_its_limit_is_refused_while_its_sender_still_holds_the_stre
     let messages = items.map(|item| v1::SubmitTasksRequest { item: Some(item) });
     let stream = tokio_stream::iter(messages).chain(tokio_stream::pending());
     let mut client = world.client();
-    let answer = tokio::time::timeout(Duration::from_secs(60), client.submit_tasks(stream)).await;
+    let answer = tokio::time::timeout(Duration::from_secs(60), client.submit_tasks(local(stream))).await;
     assert_eq!(answer.expect("an answer").expect_err("10001 items").code(), Code::InvalidArgument);
 }

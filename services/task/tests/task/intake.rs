@@ -2,11 +2,12 @@
 
 use crate::world::{World, count, submit, transport};
 use midshift_core::task::bugs::{Bugs, SeededBug};
+use midshift_proto::access::local;
 use midshift_proto::task::v1::task_service_server::TaskService as _;
 use midshift_proto::task::v1::watch_tasks_response::Item;
 use midshift_proto::task::v1::{self, SubmitTaskRequest, submit_task_request::Body};
 use tokio_stream::StreamExt;
-use tonic::{Code, Request};
+use tonic::Code;
 
 #[tokio::test]
 async fn every_violation_is_heard_at_once_and_nothing_is_stored() {
@@ -93,7 +94,7 @@ async fn pages_are_newest_first_and_a_token_is_bound_to_its_filter() {
     let mut page_token = String::new();
     loop {
         let request = v1::ListTasksRequest { filter: None, page_size: 2, page_token };
-        let page = service.list_tasks(Request::new(request)).await.expect("a page").into_inner();
+        let page = service.list_tasks(local(request)).await.expect("a page").into_inner();
         numbers.extend(page.tasks.iter().map(|t| t.number));
         page_token = page.next_page_token;
         if page_token.is_empty() {
@@ -101,10 +102,7 @@ async fn pages_are_newest_first_and_a_token_is_bound_to_its_filter() {
         }
         let filter = Some(v1::TaskFilter { types: vec!["patrol".into()], ..v1::TaskFilter::default() });
         let other = v1::ListTasksRequest { filter, page_size: 2, page_token: page_token.clone() };
-        assert_eq!(
-            service.list_tasks(Request::new(other)).await.expect_err("another filter").code(),
-            Code::InvalidArgument
-        );
+        assert_eq!(service.list_tasks(local(other)).await.expect_err("another filter").code(), Code::InvalidArgument);
     }
     admitted.reverse();
     assert_eq!(numbers, admitted);
@@ -119,20 +117,19 @@ async fn a_cancel_is_durable_and_says_so_while_fleet_is_down() {
         reason: "not wanted".into(),
         ..v1::CancelTaskRequest::default()
     };
-    let answer = service.cancel_task(Request::new(request.clone())).await.expect("durable").into_inner();
+    let answer = service.cancel_task(local(request.clone())).await.expect("durable").into_inner();
     assert!(answer.pending);
     let stale = v1::CancelTaskRequest { etag: "77".into(), ..request.clone() };
-    assert_eq!(service.cancel_task(Request::new(stale)).await.expect_err("an old etag").code(), Code::Aborted);
+    assert_eq!(service.cancel_task(local(stale)).await.expect_err("an old etag").code(), Code::Aborted);
     let silent = v1::CancelTaskRequest { reason: String::new(), ..request };
-    assert_eq!(service.cancel_task(Request::new(silent)).await.expect_err("no reason").code(), Code::InvalidArgument);
+    assert_eq!(service.cancel_task(local(silent)).await.expect_err("no reason").code(), Code::InvalidArgument);
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_watch_shows_what_is_there_and_resumes_behind_its_cursor_without_loss() {
     let service = World::new().await.service;
     let first = submit(&service, transport("r1", "B03")).await.expect("admitted");
-    let mut watch =
-        service.watch_tasks(Request::new(v1::WatchTasksRequest::default())).await.expect("a watch").into_inner();
+    let mut watch = service.watch_tasks(local(v1::WatchTasksRequest::default())).await.expect("a watch").into_inner();
     let existing = watch.next().await.expect("a message").expect("no refusal");
     assert!(matches!(&existing.item, Some(Item::Existing(task)) if task.task_id == first.task_id));
     let bookmark = watch.next().await.expect("a message").expect("no refusal");
@@ -140,12 +137,12 @@ async fn a_watch_shows_what_is_there_and_resumes_behind_its_cursor_without_loss(
     drop(watch);
     let second = submit(&service, transport("r2", "B01")).await.expect("admitted");
     let request = v1::WatchTasksRequest { filter: None, cursor: bookmark.cursor.clone() };
-    let mut watch = service.watch_tasks(Request::new(request)).await.expect("a watch").into_inner();
+    let mut watch = service.watch_tasks(local(request)).await.expect("a watch").into_inner();
     let change = watch.next().await.expect("a message").expect("no refusal");
     assert!(
         matches!(&change.item, Some(Item::Change(c)) if c.task.as_ref().is_some_and(|t| t.task_id == second.task_id))
     );
     let foreign = v1::WatchTasksRequest { filter: None, cursor: "store-2:1".into() };
-    let refused = service.watch_tasks(Request::new(foreign)).await.expect_err("another store");
+    let refused = service.watch_tasks(local(foreign)).await.expect_err("another store");
     assert_eq!(midshift_proto::refusal_of(&refused).reason, "CURSOR_OF_OTHER_STORE");
 }

@@ -2,13 +2,14 @@
 
 use crate::world::{World, patrol, submit, transport};
 use midshift_core::task::AttemptPhase;
+use midshift_proto::access::local;
 use midshift_proto::task::v1::task_service_server::TaskService as _;
 use midshift_proto::task::v1::{self, ListTasksRequest, TaskFilter};
-use tonic::{Code, Request};
+use tonic::Code;
 
 async fn page(world: &World, filter: TaskFilter, size: u32, token: &str) -> v1::ListTasksResponse {
     let request = ListTasksRequest { filter: Some(filter), page_size: size, page_token: token.into() };
-    world.service.list_tasks(Request::new(request)).await.expect("a page").into_inner()
+    world.service.list_tasks(local(request)).await.expect("a page").into_inner()
 }
 
 async fn numbers(world: &World, filter: TaskFilter) -> Vec<u64> {
@@ -74,7 +75,7 @@ async fn a_page_too_large_and_a_token_made_up_are_refused() {
     let world = World::new().await;
     for (page_size, page_token) in [(1001, ""), (1, "x:y:z")] {
         let request = ListTasksRequest { filter: None, page_size, page_token: page_token.into() };
-        let status = world.service.list_tasks(Request::new(request)).await.expect_err("refused");
+        let status = world.service.list_tasks(local(request)).await.expect_err("refused");
         assert_eq!(status.code(), Code::InvalidArgument);
     }
 }
@@ -88,7 +89,7 @@ async fn a_task_is_shown_with_all_its_attempts_oldest_first() {
         attempt.phase = AttemptPhase::Failed;
         world.fleet_writes(&task, Some(&attempt)).await;
     }
-    let request = Request::new(v1::GetTaskRequest { task_id });
+    let request = local(v1::GetTaskRequest { task_id });
     let answer = world.service.get_task(request).await.expect("a task").into_inner();
     assert_eq!(answer.attempts.iter().map(|a| a.epoch).collect::<Vec<_>>(), [1, 2]);
     assert_eq!(answer.task.expect("always set").attempt, answer.attempts.last().cloned());

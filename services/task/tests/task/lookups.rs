@@ -7,12 +7,12 @@ use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::limits;
 use midshift_core::rows::{Item, Writer};
 use midshift_core::task::{Phase, TaskIntake, TaskState};
+use midshift_proto::access::local;
 use midshift_proto::task::v1::task_service_server::TaskService as _;
 use midshift_proto::task::v1::{self, ListTasksRequest, TaskFilter};
 use midshift_store::{Store, load};
 use midshift_task::{Parts, TaskService};
 use std::sync::Arc;
-use tonic::Request;
 
 /// Tasks that have ended: more than one call looks at.
 const ENDED: u64 = limits::LIST_ROWS_READ_MAX as u64 + 2_500;
@@ -55,7 +55,7 @@ impl Old {
     async fn page(&self, filter: TaskFilter, size: u32, token: &str) -> (v1::ListTasksResponse, usize) {
         let request = ListTasksRequest { filter: Some(filter), page_size: size, page_token: token.to_owned() };
         self.counted.take();
-        let page = self.service.list_tasks(Request::new(request)).await.expect("a page").into_inner();
+        let page = self.service.list_tasks(local(request)).await.expect("a page").into_inner();
         (page, self.counted.take())
     }
 }
@@ -137,7 +137,7 @@ async fn a_watch_of_one_task_reads_that_one() {
     let filter = TaskFilter { task_ids: vec![old.first.clone()], ..TaskFilter::default() };
     old.counted.take();
     let request = v1::WatchTasksRequest { filter: Some(filter), cursor: String::new() };
-    let stream = old.service.watch_tasks(Request::new(request)).await.expect("a watch").into_inner();
+    let stream = old.service.watch_tasks(local(request)).await.expect("a watch").into_inner();
     let mut watch = Watch::over(stream);
     let existing = watch.message().await;
     assert!(matches!(existing.item, Some(v1::watch_tasks_response::Item::Existing(task)) if task.task_id == old.first));
@@ -150,7 +150,7 @@ async fn a_watch_of_one_task_reads_that_one() {
 async fn a_task_is_shown_whatever_came_after_it() {
     let old = Old::site().await;
     old.counted.take();
-    let request = Request::new(v1::GetTaskRequest { task_id: old.first.clone() });
+    let request = local(v1::GetTaskRequest { task_id: old.first.clone() });
     let task = old.service.get_task(request).await.expect("a task").into_inner().task.expect("always set");
     assert_eq!(task.task_id, old.first);
     let rows = old.counted.take();
@@ -163,7 +163,7 @@ async fn a_watch_without_a_filter_begins_with_what_is_alive_and_reads_nothing_el
     let first = async |filter: Option<TaskFilter>| {
         old.counted.take();
         let request = v1::WatchTasksRequest { filter, cursor: String::new() };
-        let stream = old.service.watch_tasks(Request::new(request)).await.expect("a watch").into_inner();
+        let stream = old.service.watch_tasks(local(request)).await.expect("a watch").into_inner();
         let mut watch = Watch::over(stream);
         let mut told = Vec::new();
         while let Some(v1::watch_tasks_response::Item::Existing(task)) = watch.message().await.item {

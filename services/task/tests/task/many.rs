@@ -6,10 +6,10 @@ use midshift_core::identity::RobotIdentity;
 use midshift_core::ids::RobotId;
 use midshift_core::rows::{Item, Writer};
 use midshift_core::task::Phase;
+use midshift_proto::access::local;
 use midshift_proto::task::v1::task_service_server::TaskService as _;
 use midshift_proto::task::v1::{self, TaskState, submit_task_request::Body};
 use midshift_store::Store;
-use tonic::Request;
 
 fn cancel(states: &[TaskState], validate_only: bool) -> v1::CancelTasksRequest {
     let states = states.iter().map(|state| *state as i32).collect();
@@ -19,7 +19,7 @@ fn cancel(states: &[TaskState], validate_only: bool) -> v1::CancelTasksRequest {
 }
 
 async fn outcome(world: &World, request: v1::CancelTasksRequest) -> v1::BulkOutcome {
-    let answer = world.service.cancel_tasks(Request::new(request)).await.expect("durable").into_inner();
+    let answer = world.service.cancel_tasks(local(request)).await.expect("durable").into_inner();
     answer.outcome.expect("always set")
 }
 
@@ -58,7 +58,7 @@ async fn a_resolve_of_many_answers_only_those_that_wait_for_a_person() {
         ..v1::ResolveTasksRequest::default()
     };
     let head = world.head();
-    let (answer, ()) = tokio::join!(world.service.resolve_tasks(Request::new(request)), async {
+    let (answer, ()) = tokio::join!(world.service.resolve_tasks(local(request)), async {
         world.fleet_turns_after(head).await;
     });
     let done = answer.expect("durable").into_inner().outcome.expect("always set");
@@ -92,7 +92,7 @@ async fn a_pin_to_a_robot_that_nobody_knows_is_admitted_with_a_note() {
         request
     };
     let notes = async |request_id: &str| {
-        let answer = world.service.submit_task(Request::new(pinned(request_id))).await.expect("admitted").into_inner();
+        let answer = world.service.submit_task(local(pinned(request_id))).await.expect("admitted").into_inner();
         answer.notes.into_iter().map(|note| note.code).collect::<Vec<_>>()
     };
     assert_eq!(notes("r1").await, ["PINNED_ROBOT_UNKNOWN"]);

@@ -2,11 +2,11 @@
 
 use crate::world::{World, count, submit, transport};
 use midshift_core::rows::{Item, Key, Table, Writer};
+use midshift_proto::access::local;
 use midshift_proto::task::v1::task_service_server::TaskService as _;
 use midshift_proto::task::v1::{CancelTaskRequest, CancelTaskResponse};
 use midshift_store::{Query, Store};
 use midshift_task::TaskService;
-use tonic::Request;
 
 const DAY_MS: i64 = 86_400_000;
 
@@ -21,7 +21,7 @@ async fn cancel(service: &TaskService, task_id: &str) -> CancelTaskResponse {
         reason: "not wanted".into(),
         ..CancelTaskRequest::default()
     };
-    service.cancel_task(Request::new(request)).await.expect("durable").into_inner()
+    service.cancel_task(local(request)).await.expect("durable").into_inner()
 }
 
 #[tokio::test(start_paused = true)]

@@ -4,6 +4,7 @@ use crate::world::{World, reason, submit, transport};
 use midshift_core::ids::TaskId;
 use midshift_core::rows::{self, Writer};
 use midshift_core::task::{AttemptPhase, Phase, TaskIntake};
+use midshift_proto::access::local;
 use midshift_proto::task::v1::{self, AttemptState, TaskState, watch_tasks_response::Item};
 use midshift_store::{Store, load};
 use tonic::Code;
@@ -112,7 +113,7 @@ async fn a_cancel_obeyed_by_fleet_shows_the_task_and_its_attempt_stopping_togeth
     let mut watch = world.watch(None, "").await;
     watch.bookmark().await;
     let request = v1::CancelTaskRequest { task_id, reason: "enough".into(), ..v1::CancelTaskRequest::default() };
-    world.client().cancel_task(request).await.expect("durable");
+    world.client().cancel_task(local(request)).await.expect("durable");
     world.fleet_turns().await;
     assert_eq!(seen(&watch.changed().await), (TaskState::Stopping, Some(AttemptState::Stopping)));
 }
@@ -186,7 +187,7 @@ async fn a_cursor_that_is_gone_or_foreign_or_nonsense_is_refused_for_what_it_is(
     assert_eq!(ahead.code(), Code::OutOfRange);
     for (cursor, code) in [("store-2:7", Code::FailedPrecondition), ("7", Code::InvalidArgument)] {
         let request = v1::WatchTasksRequest { filter: None, cursor: cursor.into() };
-        let status = world.client().watch_tasks(request).await.expect_err("refused");
+        let status = world.client().watch_tasks(local(request)).await.expect_err("refused");
         assert_eq!(status.code(), code, "{cursor}");
     }
 }

@@ -11,6 +11,7 @@ use midshift_core::stop::{Reset, Scope, Stop};
 use midshift_core::task::bugs::Bugs;
 use midshift_core::task::{Attempt, AttemptPhase, Phase, TaskState};
 use midshift_core::time::{Clock, Now, SiteTime, Utc};
+use midshift_proto::access::local;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::task::v1::task_service_server::{TaskService as _, TaskServiceServer};
 use midshift_proto::task::v1::{self, SubmitTaskRequest, submit_task_request::Body, watch_tasks_response};
@@ -19,7 +20,6 @@ use midshift_task::{Parts, TaskService};
 use std::sync::Arc;
 use tokio_stream::{Stream, StreamExt};
 use tokio_util::sync::CancellationToken;
-use tonic::Request;
 
 /// 2027-01-15, 08:00 UTC.
 pub const NOON: Utc = Utc(1_800_000_000_000);
@@ -80,7 +80,7 @@ impl World {
     }
     pub async fn get(&self, task_id: &str) -> v1::Task {
         let request = v1::GetTaskRequest { task_id: task_id.to_owned() };
-        self.service.get_task(Request::new(request)).await.expect("a task").into_inner().task.expect("always set")
+        self.service.get_task(local(request)).await.expect("a task").into_inner().task.expect("always set")
     }
     pub async fn state(&self, task_id: &str) -> (TaskState, Revision) {
         load(self.store.as_ref(), task_id).await.expect("a store that answers").expect("a task")
@@ -155,7 +155,7 @@ impl World {
     }
     pub async fn watch(&self, filter: Option<v1::TaskFilter>, cursor: &str) -> Watch {
         let request = v1::WatchTasksRequest { filter, cursor: cursor.to_owned() };
-        let stream = self.service.watch_tasks(Request::new(request)).await.expect("a watch").into_inner();
+        let stream = self.service.watch_tasks(local(request)).await.expect("a watch").into_inner();
         Watch::over(stream)
     }
 }
@@ -258,12 +258,12 @@ pub fn patrol(request_id: &str, depends_on: &[&str]) -> SubmitTaskRequest {
 }
 
 pub async fn submit(service: &TaskService, request: SubmitTaskRequest) -> Result<v1::Task, tonic::Status> {
-    let answer = service.submit_task(Request::new(request)).await?;
+    let answer = service.submit_task(local(request)).await?;
     Ok(answer.into_inner().task.expect("an admitted task"))
 }
 
 pub async fn count(service: &TaskService) -> usize {
-    let page = service.list_tasks(Request::new(v1::ListTasksRequest::default())).await.expect("a page");
+    let page = service.list_tasks(local(v1::ListTasksRequest::default())).await.expect("a page");
     page.into_inner().tasks.len()
 }
 

@@ -1,16 +1,20 @@
 //! A robot's session: welcome, acknowledgements, desired state, succession, clones.
 
-use crate::world::{Otherwise, Result, Robot, World, hello, world, world_with};
+use crate::world::{Otherwise, Result, Robot, World, clock, hello, serve, world, world_with};
 use midshift_core::fleet::REPORT_TOO_LONG;
-use midshift_core::ids::{PlaceId, RobotId};
+use midshift_core::ids::{PlaceId, RobotId, SiteId};
 use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::robot::{HeldPlace, Lane, Mode, ReportedState};
 use midshift_core::rows::{Expect, Item, Log, Seq, Writer};
+use midshift_core::time::{Clock, Utc};
+use midshift_core::wall::WallClock;
 use midshift_core::work::{DesiredWork, InboxItem, RobotEvent, Sample, SampleBody, Session};
 use midshift_proto::session::{ClockSample, CloseCode, Downlink, Heartbeat, LaneAck, LaneBatch, Uplink};
-use midshift_store::load;
-use midshift_telemetry::{Bugs, SeededBug};
+use midshift_store::{LiveBoard, MemoryFrames, MemoryStore, StoreId, load};
+use midshift_telemetry::{Bugs, Parts, SeededBug};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering::Relaxed};
 use std::time::Duration;
 
 async fn inbox(world: &World) -> Result<usize> {
@@ -49,6 +53,29 @@ async fn lost_on_the_way(bugs: Bugs) -> Result<(u64, Option<u64>)> {
 async fn events_that_were_lost_on_the_way_are_missed_and_a_rule_that_takes_holes_acknowledges_them() -> Result<()> {
     assert_eq!(lost_on_the_way(Bugs::default()).await?.1, Some(3));
     assert_eq!(lost_on_the_way(Bugs::of(&[SeededBug::HolesAreTaken])).await?, (5, None));
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_wall_that_jumps_for_a_minute_costs_no_session_and_what_it_tells_is_marked() -> Result<()> {
+    let (steady, ahead_ms) = (clock(), Arc::<AtomicI64>::default());
+    let (mono, jumping) = (steady.clone(), ahead_ms.clone());
+    let wall = move || Utc(steady.now().wall.0 + jumping.load(Relaxed));
+    let clock: Arc<dyn Clock> = Arc::new(WallClock::new(move || mono.now().link.0 * 1000, wall, |_| {}));
+    let store = Arc::new(MemoryStore::new(SiteId::parse("s")?, StoreId(Arc::from("store-1")), clock.clone()));
+    let frames = Arc::new(MemoryFrames::new(clock.clone(), 1 << 20));
+    let (board, bugs) = (LiveBoard::new(), Bugs::default());
+    let world = serve(Parts { store, frames, board, heard: None, clock, bugs }).await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    let mut doubted = Vec::new();
+    for step_ms in [0, 30 * 24 * 3_600_000, 0, -30 * 24 * 3_600_000] {
+        ahead_ms.fetch_add(step_ms, Relaxed);
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        robot.beat().await?;
+        let hb = robot.hb;
+        doubted.push(robot.hears(|down| down.echo.filter(|e| e.hb == hb).map(|e| e.is_clock_doubted)).await?);
+    }
+    assert_eq!(doubted, [false, true, true, false]);
     Ok(())
 }
 

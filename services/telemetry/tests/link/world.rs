@@ -125,11 +125,12 @@ pub async fn serve_after(parts: Parts, read: impl Future<Output = ()> + Send + '
     Ok(World { store, channel, service, board, end, leaving, pipes })
 }
 
-/// Header in which a test says who asks; without it nobody is asked.
+/// Header in which a test says who asks; without it everybody may do everything, as at a port without login.
 const AS: &str = "as";
 
 /// As a port finds out who asks: `robot:r1`, `robot:r1#SERIAL` with the serial number of its certificate, or `name role@area ...` for the holder of a token.
 fn known(mut request: Request<()>) -> std::result::Result<Request<()>, Status> {
+    request.extensions_mut().insert(Caller::local());
     if let Some(said) = request.metadata().get(AS).and_then(|said| said.to_str().ok()).map(str::to_owned) {
         let unreadable = || Status::internal("a test says who asks in words that mean nothing");
         let mut words = said.split(' ');

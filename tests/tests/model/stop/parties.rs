@@ -288,7 +288,11 @@ impl Parties {
 
     /// A robot as it came to what it is.
     fn lives(&self, at: usize, robot: &Robot) -> RobotStop {
-        let mut stop = RobotStop::begin(robot_id(at), self.kept(at, robot.known), LinkTime(0));
+        // It has given the silence that goes on its name itself.
+        let silence = bit(SILENCE + usize::from(robot.silences));
+        let own = if robot.stage == Stage::Silent { silence } else { 0 };
+        let known = Known { awaiting: robot.known.awaiting & !own, ..robot.known };
+        let mut stop = RobotStop::begin(robot_id(at), self.kept(at, known), LinkTime(0));
         if robot.told {
             stop.told_all(Latch::default());
         }
@@ -299,7 +303,6 @@ impl Parties {
         if robot.stage == Stage::Silent {
             stop.look(&now(SILENT_MS, robot.silences), None, self.patience(at));
             // A silence that goes on after its resume has its name already.
-            let silence = bit(SILENCE + usize::from(robot.silences));
             if robot.known.awaiting & silence == 0 {
                 stop.resumed(&self.ids(at, silence));
             }
@@ -481,7 +484,9 @@ impl Parties {
             Action::Silence(at) => {
                 let robot = &mut next.robots[at];
                 robot.silences += 1;
-                if self.around[at] == Around::People {
+                // While one waits for its resume, no further one has a name.
+                let waits = numbers(robot.known.awaiting).any(|name| name >= SILENCE);
+                if self.around[at] == Around::People && !waits {
                     robot.stood |= bit(SILENCE + usize::from(robot.silences));
                 }
                 self.happens(at, robot, Stage::Silent, |_| {});

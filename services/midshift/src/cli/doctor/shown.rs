@@ -2,6 +2,7 @@
 
 use super::{DAY_MS, Finding};
 use crate::cli::client::{Exit, Resolved};
+use midshift_core::reason::Code;
 use midshift_core::time::Utc;
 use tokio_util::either::Either;
 use tonic::metadata::MetadataMap;
@@ -141,6 +142,17 @@ pub fn jump(whose: &str, step_ms: i64, at: Utc, now: Utc) -> Finding {
     Finding::look("clocks", format!("{text}; {then}"))
 }
 
+/// It signs nothing by its clock.
+pub fn doubt(step_ms: i64, at: Utc) -> Finding {
+    let way = if step_ms < 0 { "behind" } else { "ahead of" };
+    let (off_s, at) = (step_ms.unsigned_abs() / 1_000, at.rfc3339());
+    let then = Code::ClockDoubted.next_step();
+    Finding::look(
+        "clocks",
+        format!("the server signs nothing since {at}: its clock is {off_s} s {way} what it was; {then}"),
+    )
+}
+
 /// `Sun, 06 Nov 1994 08:49:37 GMT`.
 fn date(text: &str) -> Option<Utc> {
     const MONTHS: [&str; 12] = ["Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec"];
@@ -200,6 +212,20 @@ mod tests {
             (later.good, later.text.as_str()),
             (true, "the server's jumped 6 s back at 2027-01-15T08:00:00.000Z")
         );
+    }
+
+    #[test]
+    fn a_server_that_signs_nothing_is_told_with_the_way_out() {
+        let found = doubt(2_592_000_000, Utc(1_800_000_000_000));
+        assert!(!found.good);
+        assert!(
+            found
+                .text
+                .starts_with("the server signs nothing since 2027-01-15T08:00:00.000Z: its clock is 2592000 s ahead"),
+            "{}",
+            found.text
+        );
+        assert!(found.text.contains("midshift doctor --accept-clock"), "{}", found.text);
     }
 
     #[test]

@@ -19,6 +19,7 @@ use midshift_core::rollout::rows::{Bundle, OtaMark, Phase, Rollout};
 use midshift_core::rows::{Item, Log, Record, Revision, Table, Writer};
 use midshift_core::site::{DEMO, Site, text};
 use midshift_core::time::{Clock, ScaledClock};
+use midshift_proto::access::local;
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::bundle_service_server::BundleService as Bundles;
 use midshift_proto::ota::v1::rollout_service_server::RolloutService as Face;
@@ -29,7 +30,6 @@ use tempfile::TempDir;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
-use tonic::Request;
 
 /// So long after the beginning of a test what is published in it has to be signed anew: it was made at [`START`].
 const DUE_MS: u64 = 60_000;
@@ -126,7 +126,7 @@ impl Process {
             ..Default::default()
         };
         let request = v1::CreateRolloutRequest { rollout_id: id.to_owned(), spec: Some(spec) };
-        let created = Face::create_rollout(&self.face, Request::new(request)).await?;
+        let created = Face::create_rollout(&self.face, local(request)).await?;
         Ok(created.into_inner().rollout.expect("a roll-out"))
     }
     async fn phase(&self, id: &str) -> Option<Phase> {
@@ -264,12 +264,13 @@ async fn a_process_that_takes_over_without_a_current_directive_key_says_so_and_g
     let file = world.dir.path().join("keys/directive-2.pem");
     std::fs::remove_file(&file).expect("the next process was not given it");
     let next = world.process().await;
-    let keyless = async |process: &Process| process.face.look(|view, _, _| view.keyless).await.expect("it runs");
+    let keyless =
+        async |process: &Process| process.face.look(|view, _, _| view.keyless.is_some()).await.expect("it runs");
     assert!(!keyless(&leader).await);
     leader.end().await;
     secs(6).await;
     assert!(keyless(&next).await, "it leads and can sign nothing");
-    let request = Request::new(v1::ListBundlesRequest::default());
+    let request = local(v1::ListBundlesRequest::default());
     let listed = Bundles::list_bundles(&next.ota, request).await.expect("listed").into_inner();
     assert_eq!(listed.keyless.map(|why| why.code), Some("NO_DIRECTIVE_KEY".to_owned()));
     key(15).write(&file).expect("a key");
@@ -332,7 +333,7 @@ async fn a_bundle_is_taken_back_once_for_a_request_id_whichever_process_is_asked
     let revoke = async |process: &Process, reason: &str, validate_only: bool| {
         let (bundle, reason, request_id) = (bundle.clone(), reason.to_owned(), "r-1".to_owned());
         let request = v1::RevokeBundleRequest { bundle, reason, request_id, validate_only };
-        Face::revoke_bundle(&process.face, Request::new(request)).await
+        Face::revoke_bundle(&process.face, local(request)).await
     };
     for process in [&leader, &standby] {
         revoke(process, "it limps", true).await.expect("nothing is against it");

@@ -23,7 +23,7 @@ async fn told(watch: &mut (impl StreamExt<Item = Result<v1::WatchRolloutResponse
 /// The version that a watch tells first which begins now.
 async fn told_first(process: &Process, id: &str) -> u64 {
     let request = v1::WatchRolloutRequest { rollout_id: id.to_owned(), ..Default::default() };
-    let watch = Face::watch_rollout(&process.face, Request::new(request)).await.expect("a watch");
+    let watch = Face::watch_rollout(&process.face, local(request)).await.expect("a watch");
     told(&mut watch.into_inner()).await
 }
 
@@ -50,7 +50,7 @@ async fn a_watch_that_goes_on_tells_what_changed_in_its_order_at_both_processes(
     leader.create("r-1", &bundle).await.expect("created");
     for process in [&leader, &standby] {
         let request = v1::WatchRolloutRequest { rollout_id: "r-1".to_owned(), ..Default::default() };
-        let watch = Face::watch_rollout(&process.face, Request::new(request)).await.expect("a watch");
+        let watch = Face::watch_rollout(&process.face, local(request)).await.expect("a watch");
         let mut watch = watch.into_inner();
         let mut newest = told(&mut watch).await;
         for _ in 0..5 {

@@ -60,16 +60,16 @@ async fn what_has_ended_is_shown_and_listed_to_whoever_asks_and_let_go_of_again(
     let (leader, standby) = (world.process().await, world.process().await);
     for process in [&leader, &standby] {
         let get = v1::GetRolloutRequest { rollout_id: id(3) };
-        let shown = Face::get_rollout(&process.face, Request::new(get)).await.expect("shown").into_inner().rollout;
+        let shown = Face::get_rollout(&process.face, local(get)).await.expect("shown").into_inner().rollout;
         let shown = shown.expect("a roll-out");
         assert_eq!(shown.counts.as_ref().map(|counts| counts.committed), Some(ROBOTS as u32));
         let request = v1::ListRolloutRobotsRequest { rollout_id: id(3), ..Default::default() };
-        let robots = Face::list_rollout_robots(&process.face, Request::new(request)).await.expect("listed");
+        let robots = Face::list_rollout_robots(&process.face, local(request)).await.expect("listed");
         assert_eq!(robots.into_inner().robots.len() as u64, ROBOTS);
         let (mut listed, mut page_token) = (Vec::new(), String::new());
         loop {
             let request = v1::ListRolloutsRequest { page_size: 5, page_token, ..Default::default() };
-            let page = Face::list_rollouts(&process.face, Request::new(request)).await.expect("a page").into_inner();
+            let page = Face::list_rollouts(&process.face, local(request)).await.expect("a page").into_inner();
             listed.extend(page.rollouts);
             page_token = page.next_page_token;
             if page_token.is_empty() {
@@ -84,7 +84,7 @@ async fn what_has_ended_is_shown_and_listed_to_whoever_asks_and_let_go_of_again(
             "listed as it is shown"
         );
         let request = v1::ListRolloutsRequest { page_token: "7".to_owned(), ..Default::default() };
-        let refused = Face::list_rollouts(&process.face, Request::new(request)).await.expect_err("no such token");
+        let refused = Face::list_rollouts(&process.face, local(request)).await.expect_err("no such token");
         assert_eq!(refused.code(), tonic::Code::InvalidArgument);
         let taken = process.create(&id(3), &format!("{ROLLOUTS:064x}")).await.expect_err("the id is taken");
         assert_eq!(taken.code(), tonic::Code::AlreadyExists);
@@ -105,7 +105,7 @@ async fn a_robot_that_is_tried_again_at_the_standby_long_after_the_end_is_decide
     back.update(&RolloutRobot { step: Step::RolledBack, ..robot }, at, "robot.rolled_back");
     world.store.commit(vec![back]).await.remove(0).expect("applied");
     let request = v1::RetryRolloutRequest { rollout_id: id(5), ..Default::default() };
-    Face::retry_rollout(&standby.face, Request::new(request)).await.expect("tried again");
+    Face::retry_rollout(&standby.face, local(request)).await.expect("tried again");
     secs(3).await;
     let robot = world.row::<RolloutRobot>(&of).await.expect("a row").0;
     // No release lists the bundle any more: that is the leader's word.

@@ -4,7 +4,7 @@ use super::*;
 use midshift_core::audit::AuditRow;
 use midshift_core::identity::{Caller, TokenId};
 use midshift_store::Query;
-use tonic::{Code, Response, Status};
+use tonic::{Code, Request, Response, Status};
 
 fn asked<T>(by: &Caller, message: T) -> Request<T> {
     let mut request = Request::new(message);
@@ -111,7 +111,7 @@ async fn nobody_watches_a_roll_out_that_it_may_not_see() {
     release(&process.ota, &files("walk", "1.0.0")).await;
     secs(2).await;
     let create = v1::CreateRolloutRequest { rollout_id: "quality".to_owned(), spec: spec(&["quality"]) };
-    Face::create_rollout(&process.face, Request::new(create)).await.expect("everything");
+    Face::create_rollout(&process.face, local(create)).await.expect("everything");
     let first = async |by: &Caller| {
         let request = v1::WatchRolloutRequest { rollout_id: "quality".to_owned(), ..Default::default() };
         let mut stream = Face::watch_rollout(&process.face, asked(by, request)).await.expect("a stream").into_inner();

@@ -1,0 +1,158 @@
+//! Holds the clock of a start against the store, and takes a person's word for the clock of a running server.
+//!
+//! The word is a file in the data folder: whoever may write there is on the machine whose clock it is. Invariant: it counts for a doubt that stands when it is read. One that
+//! comes without a doubt is taken away and accepts nothing later.
+
+use anyhow::Context;
+use midshift_core::audit::Note;
+use midshift_core::rows::{Item, Log, Seq, Table, Writer};
+use midshift_core::time::{Clock, Utc};
+use midshift_store::{Error, Store};
+use std::fs;
+use std::io::ErrorKind;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::time::Duration;
+
+/// File of the data folder.
+const FILE: &str = "clock-accepted";
+/// What it is called in the audit.
+const ACTION: &str = "clock.accept";
+/// How often a server looks, real time.
+const LOOK_EVERY: Duration = Duration::from_secs(2);
+/// Entries of the log that are looked at for the newest time of the store.
+const ENTRIES: usize = 64;
+
+/// Leaves the word for the server of `data`.
+///
+/// # Errors
+/// The disk.
+pub fn leave_word(data: &Path) -> anyhow::Result<()> {
+    let path = data.join(FILE);
+    let by = format!("os:{}", rustix::process::getuid().as_raw());
+    midshift_durable::replace(&path, by.as_bytes()).with_context(|| format!("writing {}", path.display()))?;
+    // Whoever says it may be another user than the server; the data folder is closed to others.
+    fs::set_permissions(&path, fs::Permissions::from_mode(0o644)).with_context(|| format!("opening {}", path.display()))
+}
+
+/// Holds the clock of a start against the newest time that the store has.
+///
+/// # Errors
+/// The store.
+pub async fn check_start(clock: &dyn Clock, store: &dyn Store) -> anyhow::Result<()> {
+    if let Some(newest) = newest_time(store).await.context("reading the newest time of the store")? {
+        clock.check_start(newest);
+    }
+    if let Some(doubt) = clock.doubt() {
+        let (ahead_s, newest) = (doubt.step_ms / 1_000, Utc(doubt.at.0.saturating_sub(doubt.step_ms)).rfc3339());
+        tracing::error!(ahead_s, newest, "nothing is signed: the wall clock is far past what was written last");
+    }
+    Ok(())
+}
+
+/// None: nothing is in the log.
+async fn newest_time(store: &dyn Store) -> Result<Option<Utc>, Error> {
+    let head = store.snapshot(&[Table::OtaLeader]).await?.seq;
+    let after = Seq(head.0.saturating_sub(ENTRIES as u64));
+    let page = match store.feed(after, &Log::ALL, ENTRIES).await {
+        Err(Error::CursorExpired { asked, oldest }) if asked < oldest => store.feed(oldest, &Log::ALL, ENTRIES).await?,
+        page => page?,
+    };
+    Ok(page.entries.iter().map(|entry| Utc(entry.at_unix_ms)).max())
+}
+
+/// Takes words until it is dropped.
+pub async fn run(data: &Path, clock: &dyn Clock, store: &dyn Store) {
+    loop {
+        if let Err(error) = take_word(data, clock, store).await {
+            tracing::warn!(error = format!("{error:#}"), "a word about the clock was not taken: say it again");
+        }
+        tokio::time::sleep(LOOK_EVERY).await;
+    }
+}
+
+async fn take_word(data: &Path, clock: &dyn Clock, store: &dyn Store) -> anyhow::Result<()> {
+    let path = data.join(FILE);
+    let by = match fs::read_to_string(&path) {
+        Ok(by) => by,
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
+        Err(error) => return Err(error).with_context(|| format!("reading {}", path.display())),
+    };
+    fs::remove_file(&path).with_context(|| format!("removing {}", path.display()))?;
+    let Some(doubt) = clock.doubt() else { return Ok(()) };
+    let mut item = Item::new(Writer::Identity, &by);
+    item.audit(Note::new(ACTION).with("step_ms", doubt.step_ms));
+    if let Some(Err(error)) = store.commit(vec![item]).await.pop() {
+        return Err(error).context("writing the row of the audit");
+    }
+    clock.accept_wall();
+    tracing::warn!(by, step_ms = doubt.step_ms, "a person says that the wall clock is right");
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use midshift_core::audit::AuditRow;
+    use midshift_core::ids::SiteId;
+    use midshift_core::rows::Fact;
+    use midshift_core::wall::WallClock;
+    use midshift_store::{MemoryStore, Query, StoreId};
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicI64, Ordering::Relaxed};
+
+    const DAY_MS: i64 = 24 * 3_600_000;
+
+    /// A clock whose wall says what a test sets, and a store by it.
+    fn site() -> (Arc<AtomicI64>, Arc<dyn Clock>, MemoryStore) {
+        let wall = Arc::new(AtomicI64::new(1_800_000_000_000));
+        let said = wall.clone();
+        let clock: Arc<dyn Clock> = Arc::new(WallClock::new(|| 0, move || Utc(said.load(Relaxed)), |_| {}));
+        let store = MemoryStore::new(SiteId::parse("s").expect("a site"), StoreId("store-1".into()), clock.clone());
+        (wall, clock, store)
+    }
+
+    async fn write(store: &MemoryStore) {
+        let mut item = Item::new(Writer::Identity, "test");
+        let (subject, kind, body) = (Arc::from("s"), "test.wrote", Arc::from("{}"));
+        item.facts.push(Fact { log: Log::Identity, subject, kind, body });
+        store.commit(vec![item]).await.pop().expect("a result").expect("committed");
+    }
+
+    async fn accepted(store: &MemoryStore) -> usize {
+        let rows = store.list(Query::all(Table::IdentityAudit)).await.expect("rows");
+        let rows = rows.iter().map(|row| serde_json::from_str::<AuditRow>(&row.body).expect("a row"));
+        rows.filter(|row| row.action == ACTION && row.with.contains_key("step_ms")).count()
+    }
+
+    #[tokio::test]
+    async fn a_start_is_held_against_the_newest_entry_of_the_store() {
+        let (wall, clock, store) = site();
+        check_start(&*clock, &store).await.expect("an empty store says nothing");
+        for _ in 0..2 * ENTRIES {
+            write(&store).await;
+        }
+        for (days, is_doubted) in [(7, false), (8, true)] {
+            let begun = Utc(wall.load(Relaxed) + days * DAY_MS);
+            let next = WallClock::new(|| 0, move || begun, |_| {});
+            check_start(&next, &store).await.expect("read");
+            assert_eq!(next.doubt().is_some(), is_doubted, "{days} days");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_persons_word_counts_for_the_doubt_that_stands_and_leaves_a_row() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let (wall, clock, store) = site();
+        leave_word(dir.path()).expect("said");
+        take_word(dir.path(), &*clock, &store).await.expect("taken");
+        wall.fetch_add(30 * DAY_MS, Relaxed);
+        take_word(dir.path(), &*clock, &store).await.expect("nothing lies there");
+        assert!(clock.doubt().is_some(), "what was said before accepts nothing");
+        assert_eq!(accepted(&store).await, 0);
+        leave_word(dir.path()).expect("said");
+        take_word(dir.path(), &*clock, &store).await.expect("taken");
+        assert_eq!((clock.doubt(), accepted(&store).await), (None, 1));
+        assert_eq!(fs::read_dir(dir.path()).expect("a folder").count(), 0);
+    }
+}
