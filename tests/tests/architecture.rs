@@ -656,6 +656,7 @@ const WORDS: &[(&str, &[&str])] = &[
             "Ask",
             "Command",
             "Kind",
+            "Revocation",
             "Rule",
             "SmallWave",
             "SmallWaveFailure",
