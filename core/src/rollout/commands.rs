@@ -98,6 +98,13 @@ pub enum Command {
         /// Whom.
         robot_id: RobotId,
     },
+    /// The machine that shows this device key is the robot's.
+    AcceptKey {
+        /// Whose.
+        robot_id: RobotId,
+        /// The key, 64 lower-case hexadecimal digits.
+        device_key: String,
+    },
     /// A person has looked: the robot may have the bundle again.
     LiftQuarantine {
         /// Whom.
@@ -113,7 +120,8 @@ impl Command {
         match self {
             Self::Create { rollout_id, .. } | Self::Do { rollout_id, .. } => vec![rollout_id],
             Self::Rollback { of, rollout_id } => vec![of, rollout_id],
-            Self::Revoke { .. } | Self::Pin { .. } | Self::Unpin { .. } | Self::LiftQuarantine { .. } => Vec::new(),
+            Self::Revoke { .. } | Self::Pin { .. } | Self::Unpin { .. } => Vec::new(),
+            Self::AcceptKey { .. } | Self::LiftQuarantine { .. } => Vec::new(),
         }
     }
 }
@@ -256,6 +264,12 @@ pub fn check(view: &View, board: &Board, command: &Command, seen: Option<Revisio
             }
             let pinned = view.software_of(robot_id).pin.is_some();
             Ok(pinned == matches!(command, Command::Pin { .. }))
+        }
+        Command::AcceptKey { robot_id, device_key } => {
+            if !view.sessions.contains_key(robot_id.as_str()) {
+                return Err(not_found(Code::RobotNotFound, "robot_id", robot_id));
+            }
+            Ok(view.software_of(robot_id).device_key.as_ref() == Some(device_key))
         }
         Command::LiftQuarantine { robot_id, bundle } => {
             let known = view.quarantines.contains_key(&Quarantine::id_of(robot_id, bundle));
@@ -419,6 +433,10 @@ fn apply_one(tx: &mut Tx, board: &Board, command: &Command, actor: &Actor) {
             let row = tx.view.software_of(robot_id);
             tx.put(RobotSoftware { pin: None, ..row }, "robot.unpinned");
             tx.view.arrived.insert(robot_id.clone());
+        }
+        Command::AcceptKey { robot_id, device_key } => {
+            let row = tx.view.software_of(robot_id);
+            tx.put(RobotSoftware { device_key: Some(device_key.clone()), ..row }, "robot.device_key_accepted");
         }
         Command::LiftQuarantine { robot_id, bundle } => {
             tx.delete::<Quarantine>(&Quarantine::id_of(robot_id, bundle), "quarantine.lifted");
