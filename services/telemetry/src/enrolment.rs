@@ -33,7 +33,7 @@ impl Enrolment {
     ///
     /// # Errors
     /// The store does not answer.
-    pub async fn of(inner: &Inner, robot_id: &RobotId, by: &Caller) -> Result<Self, Error> {
+    pub async fn read(inner: &Inner, robot_id: &RobotId, by: &Caller) -> Result<Self, Error> {
         let Some(key) = by.key() else { return Ok(Self::None) };
         let robot = enrolled(inner, robot_id).await?.filter(|robot| robot.has_key(key));
         let unknown = || NotEnrolled { robot_id: robot_id.clone(), certificate: by.certificate().cloned(), key: *key };

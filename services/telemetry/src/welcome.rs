@@ -82,7 +82,7 @@ pub async fn begin(inner: &Inner, hello: &Hello, by: &Caller) -> Result<Begun, R
         let now = inner.parts.clock.now();
         let last = row.as_ref().map_or(0, |(r, _)| r.session_epoch);
         let session_epoch = (last + 1).max(now.wall.0.max(0) as u64);
-        let enrolment = Enrolment::of(inner, &hello.robot_id, by).await.map_err(unavailable)?;
+        let enrolment = Enrolment::read(inner, &hello.robot_id, by).await.map_err(unavailable)?;
         let robot = enrolment.own().cloned();
         let waits = match enrolment {
             Enrolment::Unknown(machine) => Some(Waits::Enrolment(machine)),

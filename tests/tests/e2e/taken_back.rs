@@ -55,6 +55,26 @@ enum With {
     NewTokens,
 }
 
+/// A restore that first asks what a person wants, and the server that starts from it.
+async fn restored(server: &mut Server, with: With, restore: &[&str], dir: &Path) -> anyhow::Result<()> {
+    let asked = heard(&mut command(restore)?)?;
+    let said = String::from_utf8_lossy(&asked.stderr).into_owned();
+    ensure!(!asked.status.success() && said.contains("--revocations FILE") && said.contains("re-issue"), "{said}");
+    ensure!(!server.data().exists(), "a person must say first");
+    if with == With::List {
+        let list = dir.join("list");
+        run(&[restore, &["--revocations", &list.to_string_lossy()]].concat())?;
+        return server.restart().await;
+    }
+    let told = run(&[restore, &["--identity", "re-issue", "-o", "json"]].concat())?;
+    let told: Value = serde_json::from_str(&told)?;
+    let token = dir.join("new-token");
+    std::fs::write(&token, format!("{}\n", told["token"].as_str().context("a token")?))?;
+    let (address, authority) = (server.address, server.data().join("identity/ca.pem"));
+    let (started, signed_in) = tokio::join!(server.restart(), sign_in_to(address, authority, &token));
+    started.and(signed_in)
+}
+
 async fn played(engine: Engine, with: With) -> anyhow::Result<()> {
     let dir = folder()?;
     let site: Site = text::parse(DEMO)?;
@@ -87,28 +107,8 @@ async fn played(engine: Engine, with: With) -> anyhow::Result<()> {
     server.kill()?;
     engine.lose(&server.data())?;
 
-    let restore = [&["restore", "--from", &backup, "--data", &data][..], &flags].concat();
-    let asked = heard(&mut command(&restore)?)?;
-    let said = String::from_utf8_lossy(&asked.stderr).into_owned();
-    ensure!(!asked.status.success() && said.contains("--revocations FILE") && said.contains("re-issue"), "{said}");
-    ensure!(!server.data().exists(), "a person must say first");
-    match with {
-        With::List => {
-            let list = list.to_string_lossy();
-            run(&[&restore[..], &["--revocations", &list]].concat())?;
-            server.restart().await?;
-        }
-        With::NewTokens => {
-            let told = run(&[&restore[..], &["--identity", "re-issue", "-o", "json"]].concat())?;
-            let told: Value = serde_json::from_str(&told)?;
-            let token = dir.path().join("new-token");
-            std::fs::write(&token, format!("{}\n", told["token"].as_str().context("a token")?))?;
-            let (at, authority) = (server.address, server.data().join("identity/ca.pem"));
-            let (started, signed_in) = tokio::join!(server.restart(), sign_in_to(at, authority, &token));
-            started.and(signed_in)?;
-        }
-    }
-
+    restored(&mut server, with, &[&["restore", "--from", &backup, "--data", &data][..], &flags].concat(), dir.path())
+        .await?;
     until_heard(&server, "rbt-01").await?;
     adopt(&server).await?;
     let refused = call_as(&server, &anna, &["robot", "ls"])?;

@@ -76,7 +76,7 @@ pub fn leave_note(data: &Path, summary: &Summary, to: &Path) -> anyhow::Result<(
     let Utc(begun_unix_ms) = summary.begun;
     let parts = summary.parts.iter().map(|(name, ..)| name.clone()).collect();
     let made = Made { by: whoever_asks(), to: to.display().to_string(), begun_unix_ms, parts };
-    leave(data, &format!("{begun_unix_ms}"), &Word::Made(made))
+    leave(data, &begun_unix_ms.to_string(), &Word::Made(made))
 }
 
 /// Leaves the file for the server of `data` that it was restored, and who is let in.
