@@ -23,7 +23,7 @@ fn answered<T>(answer: Result<T, Refusal>) -> Result<Response<T>, Status> {
     answer.map(Response::new).map_err(|refusal| status(&refusal, None))
 }
 
-pub fn robot_of(text: &str) -> Result<RobotId, Refusal> {
+fn robot_of(text: &str) -> Result<RobotId, Refusal> {
     RobotId::parse(text).map_err(|error| Refusal::field("robot_id", error.to_string()))
 }
 

@@ -2,11 +2,12 @@
 //!
 //! Invariant: it gives no certificate. A machine that is adopted has shown one of this authority, and shows it again.
 
-use crate::grpc::{known, robot_of};
+use crate::grpc::known;
 use crate::register::decided;
 use crate::{IdentityService, encode};
 use midshift_core::audit::Note;
 use midshift_core::identity::{Caller, Digest, Replace};
+use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::time::Utc;
@@ -23,7 +24,7 @@ impl IdentityService {
         actor: &Caller,
     ) -> Result<v1::AdoptRobotResponse, Refusal> {
         let mut bad = Violations::default();
-        let robot_id = bad.take("robot_id", robot_of(&r.robot_id).map_err(|_| "must be 1-64 of [a-z0-9-]"));
+        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
         let key = bad.take("key_sha256", r.key_sha256.parse::<Digest>());
         bad.finish()?;
         let (Some(robot_id), Some(key)) = (robot_id, key) else {
