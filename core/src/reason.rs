@@ -274,6 +274,8 @@ codes! {
     SkippedStuck = "SKIPPED_STUCK", "The robot did not get as far as it should in time: its download, or what it needs to activate. It is tried once more at the end.";
     SkippedIncompatible = "SKIPPED_INCOMPATIBLE", "The bundle is not for a robot of this model.";
     SkippedPinned = "SKIPPED_PINNED", "A person keeps the robot at what it runs. Unpin it.";
+    SkippedOtherKey = "SKIPPED_OTHER_KEY", "The robot shows another device key than before and was not enrolled since: it may be another machine."
+        => "`midshift robot replace ROBOT` enrols its machine anew; `--accept-key` takes the key that it shows now.";
     SkippedExcluded = "SKIPPED_EXCLUDED", "A person left the robot out of this roll-out.";
     SkippedQuarantined = "SKIPPED_QUARANTINED", "The robot went back from this bundle before. Lift the quarantine.";
     SkippedRetired = "SKIPPED_RETIRED", "The robot was taken out of the fleet.";
@@ -375,6 +377,8 @@ codes! {
     Overflow = "OVERFLOW", "The robot's ring was full and thinned its oldest status.";
     FreedAfterAck = "FREED_AFTER_ACK", "The robot freed this range after it was acknowledged.";
     Poison = "POISON", "A sample could not be read; it was recorded, acknowledged and skipped.";
+    RobotNotEnrolled = "ROBOT_NOT_ENROLLED", "A machine with a certificate of this site is not enrolled as this robot: the store was restored from a backup that is older than its enrolment, or another machine took its place. It is watched and gets no work."
+        => "If it is yours, `midshift robot adopt ROBOT`. If not, find the machine: its certificate is not renewed, and ends within 7 days.";
     CloneSeen = "CLONE_SEEN", "Two sessions with one robot id were alive at once." => "Find the second machine.";
     StoreBehindRobot = "STORE_BEHIND_ROBOT", "The robot says that it has applied a newer generation than this store gave: the store was restored from a backup, or the robot errs.";
     TaskBacklog = "TASK_BACKLOG", "Ready tasks wait for a robot for more than an hour. It closes by itself. `midshift task ls --state queued` lists them.";

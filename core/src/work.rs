@@ -416,6 +416,13 @@ pub struct Session {
     /// Another key signed what this session said of its software: it is another machine, or one that lost its memory.
     #[serde(default)]
     pub device_key_changed: bool,
+    /// That other key, 64 hexadecimal digits; none: it did not change.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub other_device_key: Option<String>,
+    /// When the robot was enrolled, as this session found it, UTC unix ms: what was known of its machine holds for that enrolment. None: it showed no
+    /// certificate.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub enrolled_unix_ms: Option<i64>,
 }
 
 impl Session {
@@ -435,6 +442,8 @@ impl Session {
             installed: None,
             device_key: None,
             device_key_changed: false,
+            other_device_key: None,
+            enrolled_unix_ms: None,
         }
     }
     /// The generation of section work that the server goes on from: none beyond what any server could have given.

@@ -698,6 +698,7 @@ const WORDS: &[(&str, &[&str])] = &[
             "Ask",
             "Command",
             "Kind",
+            "Revocation",
             "Rule",
             "SmallWave",
             "SmallWaveFailure",

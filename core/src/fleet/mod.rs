@@ -202,7 +202,7 @@ pub fn absorb(view: &mut View, now: Now, board: &Board, entries: &[Entry], plan:
                 }
                 Err(error) => plan.report.unreadable.push(format!("request {}: {error}", entry.seq.0)),
             },
-            (Log::Telemetry, None, _) if matches!(&*entry.kind, CLONE_SEEN | REPORT_TOO_LONG) => {
+            (Log::Telemetry, None, _) if matches!(&*entry.kind, CLONE_SEEN | NOT_ENROLLED_SEEN | REPORT_TOO_LONG) => {
                 plan.decide(view, now, "fleet", |tx| {
                     let robot_id = RobotId::parse(&entry.subject).ok();
                     incidents::open_once(tx, told_by_telemetry(entry), robot_id.as_ref());
@@ -297,15 +297,23 @@ pub fn obeyed(item: &Item) -> Option<Seq> {
 /// Kind of the fact that a second machine has attached with a robot's name, stated by telemetry.
 pub const CLONE_SEEN: &str = "session.clone_seen";
 
+/// Kind of the fact that a machine with a genuine certificate has attached that is not enrolled, stated by telemetry.
+pub const NOT_ENROLLED_SEEN: &str = "session.not_enrolled_seen";
+
 /// Kind of the fact that a heartbeat had a list longer than one may be and was not processed, stated by telemetry.
 pub const REPORT_TOO_LONG: &str = "session.report_too_long";
 
-/// What telemetry met: the start and certificate of a second machine, or the list that was too long.
+/// What telemetry met: the start and certificate of a second machine, the key and certificate of one that is not enrolled, or the list that was too long.
 fn told_by_telemetry(entry: &Entry) -> Reason {
     let said: BTreeMap<String, serde_json::Value> =
         entry.body.as_deref().and_then(|body| serde_json::from_str(body).ok()).unwrap_or_default();
-    let code = if &*entry.kind == CLONE_SEEN { Code::CloneSeen } else { Code::ReportTooLong };
-    let known = ["boot_id", "certificate", "list"].into_iter().filter_map(|key| Some((key, said.get(key)?.as_str()?)));
+    let code = match &*entry.kind {
+        CLONE_SEEN => Code::CloneSeen,
+        NOT_ENROLLED_SEEN => Code::RobotNotEnrolled,
+        _ => Code::ReportTooLong,
+    };
+    let known =
+        ["boot_id", "certificate", "key", "list"].into_iter().filter_map(|key| Some((key, said.get(key)?.as_str()?)));
     known.fold(code.into(), |reason: Reason, (key, value)| reason.with(key, value))
 }
 

@@ -1,7 +1,7 @@
 //! Who asks, and what it may.
 
 use super::grant::{Access, Grant, Permission, Scope};
-use super::token::TokenId;
+use super::token::{Digest, TokenId};
 use crate::ids::{AreaId, RobotId};
 use crate::reason::{Code, Kind, Reason, Refusal};
 use std::fmt;
@@ -33,6 +33,7 @@ pub struct Caller {
     /// Its token's time is over, for less than [`crate::limits::TOKEN_STOPS_AFTER_EXPIRY`]: it may engage stops and nothing else.
     expired: bool,
     certificate: Option<Arc<str>>,
+    key: Option<Digest>,
     person: Option<Arc<str>>,
 }
 
@@ -50,12 +51,17 @@ impl Caller {
         Self::without_grants(Who::Robot(robot_id))
     }
     fn without_grants(who: Who) -> Self {
-        Self { who, grants: Arc::default(), expired: false, certificate: None, person: None }
+        Self { who, grants: Arc::default(), expired: false, certificate: None, key: None, person: None }
     }
     /// The same with the serial number of the certificate that it showed, in hex.
     #[must_use]
     pub fn with_certificate(self, serial: Option<Arc<str>>) -> Self {
         Self { certificate: serial, ..self }
+    }
+    /// The same with the digest of the public key of its certificate.
+    #[must_use]
+    pub fn with_key(self, key: Digest) -> Self {
+        Self { key: Some(key), ..self }
     }
     /// The holder of a token; of one that is `expired`, it may still engage stops.
     pub fn holder(token: TokenId, name: Arc<str>, grants: Arc<[Grant]>, expired: bool) -> Self {
@@ -81,6 +87,10 @@ impl Caller {
     /// Serial number of the certificate that it showed, in hex; none: it showed none.
     pub const fn certificate(&self) -> Option<&Arc<str>> {
         self.certificate.as_ref()
+    }
+    /// Digest of the public key of its certificate; none: it showed none.
+    pub const fn key(&self) -> Option<&Digest> {
+        self.key.as_ref()
     }
     /// Whether its token's time is over: it may engage stops and nothing else.
     pub const fn is_expired(&self) -> bool {

@@ -133,6 +133,31 @@ impl RobotIdentity {
         Ok(())
     }
 
+    /// Takes a machine in that shows a genuine certificate of this key and is not known: it was enrolled after the backup of which the rows were restored.
+    ///
+    /// # Errors
+    /// The key was taken out; or the robot has another one, and this is no replacement.
+    pub fn adopt(&mut self, key: Digest, replace: Replace, now: Utc, expires: Utc) -> Result<(), Refusal> {
+        if self.denied.iter().any(|deny| deny.key == key) {
+            return Err(Refusal::new(Kind::Precondition, Code::KeyDenied));
+        }
+        if self.key.is_some_and(|own| own != key) {
+            if replace == Replace::No {
+                let text =
+                    format!("{} has another machine, whose key would be taken out: --replace says so", self.robot_id);
+                let reason = Reason::new(Code::RobotEnrolled, text).with("robot_id", &self.robot_id);
+                return Err(Refusal::new(Kind::Precondition, reason));
+            }
+            self.deny(now);
+        }
+        self.key = Some(key);
+        self.enrolled_unix_ms = Some(now.0);
+        self.expires_unix_ms = Some(expires.0);
+        self.enrolment = None;
+        self.revoked = None;
+        Ok(())
+    }
+
     /// Whether a machine was ever enrolled as this robot, also one that was revoked since.
     pub fn was_ever_enrolled(&self) -> bool {
         self.key.is_some() || self.enrolled_unix_ms.is_some() || !self.denied.is_empty()
@@ -220,6 +245,20 @@ mod tests {
         assert!(first.knows(&FIRST) && !first.knows(&SECOND) && !other.knows(&FIRST));
         first.revoke("anna", Utc(2));
         assert!(first.knows(&FIRST), "what was taken out is nobody's");
+    }
+
+    #[test]
+    fn a_machine_that_is_not_known_is_adopted_unless_its_key_was_taken_out_or_the_robot_has_another_one() {
+        let mut unknown = robot();
+        unknown.adopt(FIRST, Replace::No, Utc(5), Utc(100)).expect("adopted");
+        assert_eq!((unknown.key, unknown.enrolled_unix_ms, unknown.expires_unix_ms), (Some(FIRST), Some(5), Some(100)));
+        let mut robot = enrolled();
+        let refused = robot.adopt(SECOND, Replace::No, Utc(5), Utc(100)).expect_err("it has a machine");
+        assert_eq!((refused.reason.code, robot.key), (Code::RobotEnrolled, Some(FIRST)));
+        robot.adopt(SECOND, Replace::Yes, Utc(5), Utc(100)).expect("adopted");
+        assert_eq!((robot.key, robot.denied[0].key), (Some(SECOND), FIRST));
+        let refused = robot.adopt(FIRST, Replace::Yes, Utc(6), Utc(100)).expect_err("it was taken out");
+        assert_eq!((refused.reason.code, robot.key), (Code::KeyDenied, Some(SECOND)));
     }
 
     #[test]

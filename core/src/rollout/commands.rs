@@ -106,6 +106,13 @@ pub enum Command {
         /// What was done.
         reason: String,
     },
+    /// The machine that shows this device key is the robot's.
+    AcceptKey {
+        /// Whose.
+        robot_id: RobotId,
+        /// The key, 64 lower-case hexadecimal digits.
+        device_key: String,
+    },
     /// A person has looked: the robot may have the bundle again.
     LiftQuarantine {
         /// Whom.
@@ -122,7 +129,7 @@ impl Command {
             Self::Create { rollout_id, .. } | Self::Do { rollout_id, .. } => vec![rollout_id],
             Self::Rollback { of, rollout_id } => vec![of, rollout_id],
             Self::Revoke { .. } | Self::Pin { .. } | Self::Unpin { .. } => Vec::new(),
-            Self::Unstick { .. } | Self::LiftQuarantine { .. } => Vec::new(),
+            Self::Unstick { .. } | Self::AcceptKey { .. } | Self::LiftQuarantine { .. } => Vec::new(),
         }
     }
 }
@@ -276,6 +283,12 @@ pub fn check(view: &View, board: &Board, command: &Command, seen: Option<Revisio
             let reason = || Reason::from(Code::NotStuck).with("robot_id", robot_id);
             let is_told = hear::rows_of(view, robot_id).any(|r| r.step == Step::Reverting && r.way_back.unstuck);
             if is_told { Ok(true) } else { Err(Refusal::new(Kind::Precondition, reason())) }
+        }
+        Command::AcceptKey { robot_id, device_key } => {
+            if !view.sessions.contains_key(robot_id.as_str()) {
+                return Err(not_found(Code::RobotNotFound, "robot_id", robot_id));
+            }
+            Ok(view.software_of(robot_id).device_key.as_ref() == Some(device_key))
         }
         Command::LiftQuarantine { robot_id, bundle } => {
             let known = view.quarantines.contains_key(&Quarantine::id_of(robot_id, bundle));
@@ -454,6 +467,10 @@ fn apply_one(tx: &mut Tx, board: &Board, command: &Command, actor: &Actor) {
                 let way_back = WayBack { unstuck: true, ..WayBack::default() };
                 tx.put(RolloutRobot { step: Step::Reverting, since: tx.now.utc, way_back, ..row }, "robot.unstuck");
             }
+        }
+        Command::AcceptKey { robot_id, device_key } => {
+            let row = tx.view.software_of(robot_id);
+            tx.put(RobotSoftware { device_key: Some(device_key.clone()), ..row }, "robot.device_key_accepted");
         }
         Command::LiftQuarantine { robot_id, bundle } => {
             tx.delete::<Quarantine>(&Quarantine::id_of(robot_id, bundle), "quarantine.lifted");

@@ -169,6 +169,16 @@ pub fn pinned(pin: &Act) -> Reason {
     Reason::from(Code::SkippedPinned).with("pinned_by", &pin.actor).with("why", &pin.reason)
 }
 
+/// Its machine shows another device key than the one that is known, and nobody enrolled or took it: it is given nothing.
+pub fn other_key(view: &View, robot_id: &RobotId) -> Option<Reason> {
+    let key = view.sessions.get(robot_id.as_str())?.row.other_device_key.as_ref()?;
+    let accepted = view.software.get(robot_id.as_str()).and_then(|s| s.row.device_key.as_ref());
+    if accepted == Some(key) {
+        return None;
+    }
+    Some(Reason::from(Code::SkippedOtherKey).with("robot_id", robot_id).with("device_key", key))
+}
+
 /// Robots of a roll-out with wave, place and version they run, and how many each wave has.
 pub type Members = (Vec<(RobotId, u32, u64, String)>, Vec<u32>);
 
@@ -203,6 +213,9 @@ pub fn keeps(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
 pub fn may_have(view: &View, robot_id: &RobotId, stratum: &Stratum, bundle: &Bundle) -> Result<(), Reason> {
     if view.duty(robot_id) == Duty::Retired {
         return Err(Code::SkippedRetired.into());
+    }
+    if let Some(reason) = other_key(view, robot_id) {
+        return Err(reason);
     }
     let software = view.software.get(robot_id.as_str()).map(|s| &s.row);
     if let Some(pin) = software.and_then(|s| s.pin.as_ref()) {

@@ -18,6 +18,9 @@ pub(super) fn note(command: &Command) -> Note {
         Command::Pin { robot_id, reason } => Note::new("robot.pin").about("robot", robot_id).because(reason),
         Command::Unpin { robot_id } => Note::new("robot.unpin").about("robot", robot_id),
         Command::Unstick { robot_id, reason } => Note::new("robot.unstick").about("robot", robot_id).because(reason),
+        Command::AcceptKey { robot_id, device_key } => {
+            Note::new("robot.accept_key").about("robot", robot_id).with("device_key", device_key)
+        }
         Command::LiftQuarantine { robot_id, bundle } => {
             Note::new("quarantine.lift").about("robot", robot_id).about("bundle", bundle)
         }

@@ -119,7 +119,8 @@ fn left_out(view: &View, rollout: &Rollout, r: &RolloutRobot) -> Option<Reason> 
         return Some(Code::RolloutEnded.into());
     }
     let pin = view.software.get(r.robot_id.as_str()).and_then(|s| s.row.pin.as_ref());
-    pin.filter(|_| rollout.revert_of.is_none()).map(matching::pinned)
+    let pinned = pin.filter(|_| rollout.revert_of.is_none()).map(matching::pinned);
+    pinned.or_else(|| matching::other_key(view, &r.robot_id))
 }
 
 /// Nobody may be given its bundle any more: a person took it back, or no release lists it.

@@ -578,6 +578,9 @@ pub struct RobotSoftware {
     pub area: Option<AreaId>,
     /// UTC, site clock, of the last change.
     pub since: Utc,
+    /// The device key of its machine that a person took though another one was known, 64 lower-case hexadecimal digits; none: nobody did.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub device_key: Option<String>,
 }
 
 impl RobotSoftware {
@@ -593,6 +596,7 @@ impl RobotSoftware {
             pin: None,
             area: None,
             since: Utc(0),
+            device_key: None,
         }
     }
     /// The bundle that runs; none: what it came with.

@@ -71,6 +71,7 @@ pub fn encode_robot(view: RobotView<'_>, now: Now) -> v1::Robot {
         }),
         device_key: session.and_then(|s| s.device_key.clone()).unwrap_or_default(),
         device_key_changed: session.is_some_and(|s| s.device_key_changed),
+        other_device_key: session.and_then(|s| s.other_device_key.clone()).unwrap_or_default(),
         area_id: area_id.map(ToString::to_string).unwrap_or_default(),
         conditions: conditions.iter().map(Into::into).collect(),
         last_heard: last_heard.map(|last| encode_last_heard(last, now.wall)),

@@ -116,6 +116,8 @@ fn what_nobody_should_have_to_look_up_is_as_it_was_said() {
         ("/midshift.task.v1.TaskService/ResolveTasks", &["operator"]),
         ("/midshift.fleet.v1.FleetService/PutAreaPolicy", &["operator"]),
         ("/midshift.identity.v1.IdentityService/CreateToken", &["admin"]),
+        ("/midshift.identity.v1.IdentityService/AdoptRobot", &["admin"]),
+        ("/midshift.ota.v1.RolloutService/AcceptDeviceKey", &["admin"]),
         ("/midshift.sim.v1.SimService/InjectFault", &["operator"]),
     ] {
         assert_eq!(who(path), roles, "{path}");

@@ -40,19 +40,12 @@ fn installed() -> Installed {
 #[test]
 fn a_robot_shows_how_old_its_report_is_and_the_measured_clock_before_the_remembered_one() {
     let session = Session {
-        robot_id: robot(),
-        session_epoch: 7,
         secret: "s3cret".into(),
-        boot_id: "b".into(),
-        ring: "ring-a".into(),
-        inventory: Inventory::default(),
-        applied_work: 0,
-        applied_update: 0,
-        places: vec![],
         clock_offset_ms: Some(-3),
         installed: Some(installed()),
         device_key: Some("ab".repeat(32)),
         device_key_changed: true,
+        ..Session::new(robot(), 7, Inventory::default())
     };
     let presence = PresenceRow::new(robot(), Presence::Suspect, 4_000);
     let live = Live {

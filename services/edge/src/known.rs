@@ -45,9 +45,9 @@ impl Known {
         }
     }
 
-    fn robot(&self, leaf: &CertificateDer<'_>) -> Result<RobotId, Denied> {
+    fn robot(&self, leaf: &CertificateDer<'_>) -> Result<(RobotId, Digest), Denied> {
         let (robot_id, key) = robot_of(leaf, &self.site_id).ok_or(Denied::Unknown)?;
-        if self.directory.borrow().denies(&key) { Err(Denied::Revoked) } else { Ok(robot_id) }
+        if self.directory.borrow().denies(&key) { Err(Denied::Revoked) } else { Ok((robot_id, key)) }
     }
 
     /// What whoever shows a certificate that is denied is told.
@@ -88,8 +88,8 @@ impl Principals for Known {
 
     fn caller(&self, peer: &Peer, headers: &HeaderMap) -> Result<Caller, Refusal> {
         if let Some(leaf) = &peer.certificate {
-            let robot = self.robot(leaf).map(Caller::robot).map_err(|denied| self.refusal(leaf, denied))?;
-            return Ok(robot.with_certificate(serial_of(leaf)));
+            let (robot_id, key) = self.robot(leaf).map_err(|denied| self.refusal(leaf, denied))?;
+            return Ok(Caller::robot(robot_id).with_certificate(serial_of(leaf)).with_key(key));
         }
         let Some(shown) = headers.get(AUTHORIZATION) else { return Ok(Caller::nobody()) };
         let text = shown.to_str().ok().and_then(|text| {

@@ -33,7 +33,7 @@ fn hidden(error: &Error) -> Refusal {
 }
 
 impl IdentityService {
-    fn now(&self) -> Utc {
+    pub(crate) fn now(&self) -> Utc {
         self.0.clock.now().wall
     }
 
@@ -55,6 +55,16 @@ impl IdentityService {
         }
     }
 
+    /// What was taken back is on the list, durably, before whoever did it hears so: a restore goes by that list.
+    pub(crate) async fn recorded(&self) -> Result<(), Refusal> {
+        let Some(list) = &self.0.revoked else { return Ok(()) };
+        self.append_revocations(list).await.map_err(|error| {
+            tracing::error!(peer = "any", %error, "what was taken back is not on the list of revocations yet");
+            let text = "it is taken back at every port, and not yet on the list that a restore goes by: ask again";
+            Refusal::new(Kind::Unavailable, Reason::new(Code::StoreUnavailable, text))
+        })
+    }
+
     async fn make_token(&self, r: v1::CreateTokenRequest, actor: &Caller) -> Result<v1::CreateTokenResponse, Refusal> {
         let wanted = Wanted::check(&r)?;
         let (record, secret) = tokens::create(&self.0.register, &wanted, &actor.into(), self.now()).await?;
@@ -64,6 +74,7 @@ impl IdentityService {
     async fn turn_token(&self, r: v1::RotateTokenRequest, actor: &Caller) -> Result<v1::RotateTokenResponse, Refusal> {
         let turn = Turn::check(&r)?;
         let (record, secret) = tokens::rotate(&self.0.register, &turn, &actor.into(), self.now()).await?;
+        self.recorded().await?;
         let secret = secret.map(|secret| secret.reveal(Secret::TOKEN)).unwrap_or_default();
         Ok(v1::RotateTokenResponse { token: Some(encode::token(&record)), secret })
     }
@@ -85,6 +96,7 @@ impl IdentityService {
         let token_id =
             TokenId::new(&r.token_id).ok_or_else(|| Refusal::field("token_id", "must be 1-32 of [a-z0-9]"))?;
         let record = tokens::revoke(&self.0.register, &token_id, &actor.into(), self.now()).await?;
+        self.recorded().await?;
         Ok(v1::RevokeTokenResponse { token: Some(encode::token(&record)) })
     }
 
@@ -131,7 +143,9 @@ impl IdentityService {
                 robot,
             ))
         });
-        Ok(v1::RevokeRobotResponse { robot: Some(encode::robot(&revoked.await?)) })
+        let robot = revoked.await?;
+        self.recorded().await?;
+        Ok(v1::RevokeRobotResponse { robot: Some(encode::robot(&robot)) })
     }
 
     async fn robots(&self, r: v1::ListRobotIdentitiesRequest) -> Result<v1::ListRobotIdentitiesResponse, Refusal> {
@@ -186,6 +200,8 @@ impl IdentityService {
             })
             .await
             .map_err(|refusal| about(refusal, &robot_id))?;
+        // The key of the machine whose place it took.
+        self.recorded().await?;
         let Signed { chain_pem, expires } = authority.sign_robot(asked, &robot_id, now).map_err(|e| hidden(&e))?;
         tracing::info!(%robot_id, %key, "a robot was enrolled");
         Ok(v1::EnrolResponse {
@@ -231,9 +247,11 @@ fn about(mut refusal: Refusal, robot_id: &RobotId) -> Refusal {
     refusal
 }
 
-type Row<'a> = Option<&'a (RobotIdentity, midshift_core::rows::Revision)>;
+/// A robot's row, if it has one.
+pub type Row<'a> = Option<&'a (RobotIdentity, midshift_core::rows::Revision)>;
 
-fn known(row: Row<'_>, robot_id: &RobotId) -> (RobotIdentity, Option<midshift_core::rows::Revision>) {
+/// The robot of a row, or one that nothing is known of.
+pub fn known(row: Row<'_>, robot_id: &RobotId) -> (RobotIdentity, Option<midshift_core::rows::Revision>) {
     row.map_or_else(|| (RobotIdentity::new(robot_id.clone()), None), |(robot, at)| (robot.clone(), Some(*at)))
 }
 
@@ -297,6 +315,13 @@ impl IdentityFace for IdentityService {
     ) -> Result<Response<v1::RevokeRobotResponse>, Status> {
         let actor = caller(&request);
         answered(self.revoke(request.into_inner(), &actor).await)
+    }
+    async fn adopt_robot(
+        &self,
+        request: Request<v1::AdoptRobotRequest>,
+    ) -> Result<Response<v1::AdoptRobotResponse>, Status> {
+        let actor = caller(&request);
+        answered(self.adopt(request.into_inner(), &actor).await)
     }
     async fn list_robot_identities(
         &self,

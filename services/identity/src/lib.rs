@@ -8,19 +8,23 @@ mod authority;
 mod encode;
 mod files;
 mod grpc;
+mod machines;
 mod proof;
 mod register;
+pub mod restored;
 mod retention;
+mod revocation_list;
 mod tokens;
 
 pub use authority::PUBLIC_FILE;
 pub use files::make_folder;
 pub use proof::ServerProof;
 pub use retention::prune;
+pub use revocation_list::RevocationList;
 
 use authority::{Authority, asked};
 use midshift_core::audit::Note;
-use midshift_core::identity::{Authority as AuthorityRow, Directory, Secret, ServerCertificate};
+use midshift_core::identity::{Authority as AuthorityRow, Directory, Secret, ServerCertificate, revocations};
 use midshift_core::ids::SiteId;
 use midshift_core::limits;
 use midshift_core::reason::Refusal;
@@ -87,6 +91,16 @@ pub enum Error {
     /// Nobody answered.
     #[error("no process with role identity signed this server's certificate within {} s: start one on the same store", ANSWERED_WITHIN.as_secs())]
     NotAnswered,
+    /// A line of a list of revocations.
+    #[error("line {line} of {path} is no revocation that this release knows: {source}", path = path.display())]
+    Line {
+        /// Of which list.
+        path: PathBuf,
+        /// Which, from 1.
+        line: usize,
+        /// Why.
+        source: serde_json::Error,
+    },
     /// The store.
     #[error("reading who is known: {0}")]
     Store(#[source] midshift_store::Error),
@@ -132,6 +146,8 @@ struct Inner {
     own: OwnKey,
     proof: watch::Sender<ServerProof>,
     trust_json: String,
+    /// What was taken back, of a process with the authority: beside its key, and in no backup.
+    revoked: Option<RevocationList>,
     /// Held while a robot is enrolled.
     enrolling: tokio::sync::Mutex<()>,
 }
@@ -168,6 +184,7 @@ impl IdentityService {
         let proof = waited_for(&own, &register, &*store, shutdown).await?;
         files::write(&folder, PUBLIC_FILE, &proof.authority_pem, files::PUBLIC)?;
         let proof = watch::Sender::new(proof);
+        let revoked = authority.is_some().then(|| RevocationList::new(&folder));
         Ok(Self(Arc::new(Inner {
             site_id,
             clock,
@@ -177,6 +194,7 @@ impl IdentityService {
             own,
             proof,
             trust_json,
+            revoked,
             enrolling: tokio::sync::Mutex::default(),
         })))
     }
@@ -218,7 +236,22 @@ impl IdentityService {
                 differs
             });
         }
-        Ok(())
+        match &inner.revoked {
+            Some(list) => self.append_revocations(list).await,
+            None => Ok(()),
+        }
+    }
+
+    /// Appends to a list what the rows say as taken back and it has not, durably. Called for the list beside the authority before whoever takes something
+    /// back is answered, and by whoever keeps a copy of it elsewhere.
+    ///
+    /// # Errors
+    /// The store, or the disk.
+    pub async fn append_revocations(&self, list: &RevocationList) -> Result<(), Error> {
+        let revoked = self.0.register.look(|view| {
+            revocations(view.tokens.values().map(|(token, _)| token), view.robots.values().map(|(robot, _)| robot))
+        });
+        list.append(&revoked.await.map_err(Error::Store)?).await
     }
 
     /// What ports may know of people, programs and robots.

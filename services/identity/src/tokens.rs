@@ -122,6 +122,18 @@ impl Wanted {
     }
 }
 
+/// A token that may do everything, under a name that nobody has.
+pub fn everything_of(name: String, secret: &Secret, by: &Actor, now: Utc) -> TokenRecord {
+    TokenRecord { name, ..everything().record(secret, by, now) }
+}
+
+/// The first name of its kind that nobody has.
+pub fn spare_name(is_taken: impl Fn(&str) -> bool) -> String {
+    let more = (2_u64..).map(|n| format!("{FIRST}-{n}"));
+    let mut names = std::iter::once(FIRST.to_owned()).chain(more);
+    names.find(|name| !is_taken(name)).unwrap_or_else(|| FIRST.to_owned())
+}
+
 fn everything() -> Wanted {
     let site = |role| Grant { role, scope: Scope::Site };
     let roles = [Role::Admin, Role::Operator, Role::OtaAuthor, Role::OtaApprover, Role::StopResetter, Role::Auditor];
@@ -171,14 +183,10 @@ pub async fn first(register: &Register, now: Utc) -> Result<Option<Secret>, Refu
 /// Another token that may do everything, under the first name of its kind that nobody has.
 pub async fn spare(register: &Register, now: Utc) -> Result<Secret, Refusal> {
     let (secret, by) = (draw(), Actor::from("midshift"));
-    let record = everything().record(&secret, &by, now);
     register
         .decide(|view| {
-            let more = (2_u64..).map(|n| format!("{FIRST}-{n}"));
-            let mut names = std::iter::once(FIRST.to_owned()).chain(more);
-            let name = names.find(|name| standing(view, name, now).next().is_none());
-            let record = TokenRecord { name: name.unwrap_or_else(|| FIRST.to_owned()), ..record.clone() };
-            Ok((Some(created(view, &record, &by)), ()))
+            let name = spare_name(|name| standing(view, name, now).next().is_some());
+            Ok((Some(created(view, &everything_of(name, &secret, &by, now), &by)), ()))
         })
         .await?;
     Ok(secret)
@@ -241,7 +249,8 @@ pub async fn revoke(register: &Register, token_id: &TokenId, by: &Actor, now: Ut
         .await
 }
 
-fn administers(token: &TokenRecord, now: Utc) -> bool {
+/// Whether it may administer the site, now.
+pub fn administers(token: &TokenRecord, now: Utc) -> bool {
     let gives = |grant: &Grant| grant.role.permits(Permission::Administer) && grant.scope == Scope::Site;
     token.revoked.is_none() && token.expires_unix_ms > now.0 && token.grants.iter().any(gives)
 }

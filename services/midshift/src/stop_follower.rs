@@ -13,7 +13,7 @@ use midshift_core::rows::{BadRow, Log, Revision, Row, Seq, Table};
 use midshift_core::stop::Latch;
 use midshift_core::stop::record::{StopRecord, copy};
 use midshift_core::time::{Clock, Now, Utc};
-use midshift_identity::{IdentityService, ServerProof};
+use midshift_identity::{IdentityService, RevocationList, ServerProof};
 use midshift_stop::{Copied, Principals, Roster};
 use midshift_store::{CommitError, LeftOut, Store, follow};
 use std::collections::{BTreeMap, BTreeSet};
@@ -94,6 +94,8 @@ pub struct StopFollower {
     roster: Option<BTreeSet<RobotId>>,
     /// Who is known, and what that was when it was written last.
     identity: Option<(IdentityService, Option<Principals>)>,
+    /// A copy of what was taken back: this folder is not in the backup of the rows, and may be on another machine.
+    revoked: RevocationList,
     /// Rows of a newer version, which nothing here is done by.
     left_out: LeftOut,
     /// As the log was told.
@@ -110,8 +112,8 @@ impl StopFollower {
     ) -> Self {
         let (copied, told, attached, gone, roster) = (None, None, None, BTreeSet::new(), None);
         let identity = identity.map(|identity| (identity, None));
-        let left_out = LeftOut::default();
-        Self { folder, store, clock, copied, told, attached, gone, roster, identity, left_out, failing: false }
+        let (left_out, revoked) = (LeftOut::default(), RevocationList::new(&folder));
+        Self { folder, store, clock, copied, told, attached, gone, roster, identity, revoked, left_out, failing: false }
     }
 
     /// Until it is dropped.
@@ -161,10 +163,12 @@ impl StopFollower {
     async fn follow(&mut self, is_due: bool) -> anyhow::Result<()> {
         // One that begins finds what it may have lost before it is told who is known, for which it waits.
         let stops = self.tell_stops(is_due).await;
+        let has_changed = self.has_news_of_who_is_known();
         // Whatever the stop service and the store are doing. A disk that refuses it holds up no copy of a stop.
         let told = self.tell_who_is_known(is_due).await;
+        let revoked = if is_due || has_changed { self.copy_revocations().await } else { Ok(()) };
         let copied = self.copy_stops(is_due).await;
-        stops.and(told).and(copied)
+        stops.and(told).and(revoked).and(copied)
     }
 
     /// Writes what the store has as engaged, if that may have changed and has.
@@ -181,6 +185,18 @@ impl StopFollower {
         written.context("writing what is engaged")?.context("writing what is engaged")?;
         self.told = Some(newest);
         Ok(())
+    }
+
+    /// Whether who is known is not what was written last: something may have been taken back.
+    fn has_news_of_who_is_known(&self) -> bool {
+        let Some((identity, told)) = &self.identity else { return false };
+        told.as_ref().is_none_or(|told| told.directory != **identity.directory().borrow())
+    }
+
+    /// Appends what was taken back since.
+    async fn copy_revocations(&mut self) -> anyhow::Result<()> {
+        let Some((identity, _)) = &self.identity else { return Ok(()) };
+        identity.append_revocations(&self.revoked).await.context("copying what was taken back")
     }
 
     async fn copy_stops(&mut self, is_due: bool) -> anyhow::Result<()> {

@@ -7,6 +7,7 @@
 //! What is volatile (heartbeats, poses) is on the [`LiveBoard`], which several processes share through the [`HeardLog`]; what is bulky (samples) is in the [`FrameLog`]; neither is a row.
 
 pub mod aged;
+mod amend;
 mod audit;
 mod board;
 mod check;
@@ -42,7 +43,7 @@ pub use postgres::{
     RestoreError, Road, Wakes, migrate_postgres,
 };
 pub use projection::{Change, Fold, Projection};
-pub use sqlite::{Database, Described, SqliteFrames, SqliteStore, migrate, renew_identity};
+pub use sqlite::{Database, Described, SqliteFrames, SqliteRestored, SqliteStore, migrate, renew_identity};
 
 use async_trait::async_trait;
 use midshift_core::audit::Head;

@@ -5,6 +5,7 @@
 
 mod bugs;
 mod ear;
+mod enrolment;
 mod event_rate;
 mod events;
 mod grpc;

@@ -77,7 +77,7 @@ impl TelemetryService {
         tracing::info!(peer = Empty, robot_id = %hello.robot_id, session_epoch = begun.welcome.session_epoch, observed = begun.welcome.observed, "session begun");
         let (robot_id, epoch) = (hello.robot_id.clone(), begun.welcome.session_epoch);
         // Also if this future is dropped in the middle: the robot is no longer attached here.
-        let observed = begun.part.is_err().then(|| self.inner.parts.clock.now().wall);
+        let observed = begun.part.is_none().then(|| self.inner.parts.clock.now().wall);
         let _leave = Leave { service: self, robot_id: &robot_id, epoch, observed };
         if let Some(since) = observed {
             self.inner.registry.observe(&robot_id, since);

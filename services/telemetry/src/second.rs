@@ -70,24 +70,30 @@ impl Second {
         let body = serde_json::json!({
             "robot_id": robot_id, "boot_id": boot_id, "certificate": certificate, "code": Code::CloneSeen.as_str(),
         });
-        let mut item = Item::new(Writer::Telemetry, robot_id.as_str());
-        item.facts.push(Fact {
-            log: Log::Telemetry,
-            subject: Arc::from(robot_id.as_str()),
-            kind: CLONE_SEEN,
-            body: Arc::from(body.to_string()),
-        });
-        match inner.parts.store.commit(vec![item]).await.pop() {
-            Some(Ok(_)) => {
-                metrics::counter!("midshift_telemetry_clones_total").increment(1);
-                true
-            }
-            Some(Err(error)) => {
-                tracing::warn!(peer = %robot_id, %error, "a second machine could not be recorded yet");
-                false
-            }
-            None => false,
+        let is_told = state(inner, robot_id, CLONE_SEEN, &body).await;
+        if is_told {
+            metrics::counter!("midshift_telemetry_clones_total").increment(1);
         }
+        is_told
+    }
+}
+
+/// Whether a fact about a machine is on record, for fleet to make an incident of it.
+pub async fn state(inner: &Inner, robot_id: &RobotId, kind: &'static str, body: &serde_json::Value) -> bool {
+    let mut item = Item::new(Writer::Telemetry, robot_id.as_str());
+    item.facts.push(Fact {
+        log: Log::Telemetry,
+        subject: Arc::from(robot_id.as_str()),
+        kind,
+        body: Arc::from(body.to_string()),
+    });
+    match inner.parts.store.commit(vec![item]).await.pop() {
+        Some(Ok(_)) => true,
+        Some(Err(error)) => {
+            tracing::warn!(peer = %robot_id, %error, "a machine could not be recorded yet");
+            false
+        }
+        None => false,
     }
 }
 

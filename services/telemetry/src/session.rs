@@ -4,13 +4,13 @@
 //! Invariant: the stream is always drained; what is on its way to the store never holds up an echo.
 
 use crate::Inner;
+use crate::enrolment::Waits;
 use crate::event_rate::{self, lock};
 use crate::events::{Batch, Events, Outcome, commit};
 use crate::offset::Offset;
 use crate::picture::Sections;
 use crate::registry::InCharge;
 use crate::replay::{Replay, overloaded};
-use crate::second::Second;
 use crate::shared::{News, Shared};
 use crate::status::{self, Arrived, StatusLane};
 use crate::stops::StopNews;
@@ -63,8 +63,8 @@ struct Session {
     ring: Arc<str>,
     epoch: u64,
     in_charge: Option<InCharge>,
-    /// What it is observed as; none: it is in charge.
-    second: Option<Second>,
+    /// What ends it; none: nothing does.
+    waits: Option<Waits>,
     events: Events,
     rate: event_rate::SharedRate,
     committing: Option<Boxed<Outcome>>,
@@ -117,16 +117,12 @@ pub async fn run(
     let mut desired = inner.picture.watch(&robot_id);
     desired.mark_changed();
     let now = inner.parts.clock.now();
-    let (part, second) = match begun.part {
-        Ok(part) => (Some(part), None),
-        Err(second) => (None, Some(second)),
-    };
-    let (in_charge, replays) = part.unzip();
+    let (in_charge, replays) = begun.part.unzip();
     let mut session = Session {
         ring: Arc::from(hello.ring.as_str()),
         epoch,
         in_charge,
-        second,
+        waits: begun.waits,
         events: Events::new(begun.mark.0, begun.mark.1),
         rate: inner.event_rates.rate_of(&robot_id, Instant::now()),
         committing: None,
@@ -173,8 +169,8 @@ impl Session {
         };
         tokio::pin!(moves);
         let mut cut_off = self.inner.shared.as_ref().map(Shared::cut_off);
-        let alone = until_alone(self.inner.clone(), self.second.take());
-        tokio::pin!(alone);
+        let over = until_over(self.inner.clone(), self.waits.take());
+        tokio::pin!(over);
         let mut moves_until = None;
         loop {
             self.start_writes();
@@ -239,7 +235,7 @@ impl Session {
                     moves_until = Some(Instant::now() + MOVE_OVER_WITHIN);
                     self.move_over(down);
                 }
-                () = &mut alone => {
+                () = &mut over => {
                     return close(CloseCode::MoveOver, Code::MoveOver, LinkDuration(0));
                 }
             }
@@ -575,10 +571,10 @@ async fn is_cut_off(cut_off: &mut Option<watch::Receiver<bool>>) {
     }
 }
 
-/// The older session of an observed one is gone or silent; never, if this one is in charge.
-async fn until_alone(inner: Arc<Inner>, second: Option<Second>) {
-    match second {
-        Some(second) => second.until_alone(inner).await,
+/// What a session waits for has come; never, if it waits for nothing.
+async fn until_over(inner: Arc<Inner>, waits: Option<Waits>) {
+    match waits {
+        Some(waits) => waits.until_over(inner).await,
         None => std::future::pending().await,
     }
 }

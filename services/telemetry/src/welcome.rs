@@ -1,6 +1,7 @@
 //! The beginning of a session: checks the Hello, tells a succession from a clone, and makes the new epoch durable before the Welcome.
 
 use crate::Inner;
+use crate::enrolment::{Enrolment, Waits, accepts, known_device_key};
 use crate::registry::InCharge;
 use crate::replay::Replay;
 use crate::second::{Second, heard_elsewhere, in_gap};
@@ -25,8 +26,10 @@ const STATUS_PERIOD_MS: u32 = 2_000;
 
 /// What a session begins with.
 pub struct Begun {
-    /// Its place in the registry, and replays for it; or what it is observed as.
-    pub part: Result<(InCharge, mpsc::Receiver<Replay>), Second>,
+    /// Its place in the registry, and replays for it; none: it is observed only.
+    pub part: Option<(InCharge, mpsc::Receiver<Replay>)>,
+    /// What ends it, if something does.
+    pub waits: Option<Waits>,
     /// What the robot is told.
     pub welcome: Welcome,
     /// Durable numbers of its ring, with the revision of their row.
@@ -79,17 +82,32 @@ pub async fn begin(inner: &Inner, hello: &Hello, by: &Caller) -> Result<Begun, R
         let now = inner.parts.clock.now();
         let last = row.as_ref().map_or(0, |(r, _)| r.session_epoch);
         let session_epoch = (last + 1).max(now.wall.0.max(0) as u64);
-        if is_held && !proven && !inner.parts.bugs.no_clone_fence() {
+        let enrolment = Enrolment::read(inner, &hello.robot_id, by).await.map_err(unavailable)?;
+        let robot = enrolment.own().cloned();
+        let waits = match enrolment {
+            Enrolment::Unknown(machine) => Some(Waits::Enrolment(machine)),
+            _ if is_held && !proven && !inner.parts.bugs.no_clone_fence() => {
+                Some(Waits::Older(Second::new(inner, hello, by, has_other_ring)))
+            }
+            _ => None,
+        };
+        if waits.is_some() {
             // Its epoch and secret are in no row: they prove nothing later.
             let welcome = welcome(inner, session_epoch, draw_secret(), &mark.0, status, true);
-            return Ok(Begun { part: Err(Second::new(inner, hello, by, has_other_ring)), welcome, mark, status });
+            return Ok(Begun { part: None, waits, welcome, mark, status });
         }
         let live = inner.parts.board.get(&hello.robot_id);
         let measured = live.and_then(|live| live.clock_offset_ms).map(|(offset, _)| offset);
         let clock_offset_ms = measured.or(row.as_ref().and_then(|(row, _)| row.clock_offset_ms));
-        let known = row.as_ref().and_then(|(row, _)| row.device_key.clone());
-        let said = judge(hello, known);
-        let session = Session { clock_offset_ms, ..session_row(hello, session_epoch, &said) };
+        let known = row.as_ref().and_then(|(row, _)| known_device_key(row, robot.as_ref()));
+        let mut said = judge(hello, known);
+        if let Some(key) = &said.other_key
+            && accepts(inner, &hello.robot_id, key).await.map_err(unavailable)?
+        {
+            said = judge(hello, None);
+        }
+        let enrolled_unix_ms = robot.as_ref().and_then(|robot| robot.enrolled_unix_ms);
+        let session = Session { clock_offset_ms, enrolled_unix_ms, ..session_row(hello, session_epoch, &said) };
         let mut item = Item::new(Writer::Telemetry, hello.robot_id.as_str());
         item.put(&session, row.map_or(Expect::Absent, |(_, revision)| Expect::At(revision)), "session.begun");
         match store.commit(vec![item]).await.pop() {
@@ -104,7 +122,8 @@ pub async fn begin(inner: &Inner, hello: &Hello, by: &Caller) -> Result<Begun, R
             continue;
         }
         let welcome = welcome(inner, session_epoch, session.secret, &mark.0, status, false);
-        return Ok(Begun { part: Ok((in_charge, replays)), welcome, mark, status });
+        let waits = said.other_key.map(|key| Waits::DeviceKey(hello.robot_id.clone(), key));
+        return Ok(Begun { part: Some((in_charge, replays)), waits, welcome, mark, status });
     }
     Err(Refusal::new(Kind::Conflict, Code::CloneSeen))
 }
@@ -188,6 +207,8 @@ fn session_row(hello: &Hello, session_epoch: u64, said: &Said) -> Session {
         installed: said.installed.clone(),
         device_key: said.device_key.clone(),
         device_key_changed: said.other_key.is_some(),
+        other_device_key: said.other_key.clone(),
+        enrolled_unix_ms: None,
     }
 }
 

@@ -35,20 +35,20 @@ const TASKS: usize = 30;
 const LIMIT: Duration = Duration::from_secs(60);
 
 /// What the command line prints as JSON.
-fn json(server: &Server, arguments: &[&str]) -> anyhow::Result<Value> {
+pub fn json(server: &Server, arguments: &[&str]) -> anyhow::Result<Value> {
     let address = server.address.to_string();
     let output = call(&[arguments, &["-o", "json", "--server", &address]].concat())?;
     ensure!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
     Ok(serde_json::from_slice(&output.stdout)?)
 }
 
-fn incidents(server: &Server) -> anyhow::Result<Vec<Value>> {
+pub fn incidents(server: &Server) -> anyhow::Result<Vec<Value>> {
     let listed = json(server, &["incident", "ls", "--all"])?;
     Ok(listed["incidents"].as_array().cloned().unwrap_or_default())
 }
 
 /// Whether a second machine is attached with the robot's name, and whether the robot itself was heard a moment ago.
-async fn presence(server: SocketAddr, robot_id: &str) -> anyhow::Result<(bool, bool)> {
+pub async fn presence(server: SocketAddr, robot_id: &str) -> anyhow::Result<(bool, bool)> {
     let request = GetRobotRequest { robot_id: robot_id.to_owned() };
     let robot = TelemetryServiceClient::new(channel(server)?).get_robot(request).await?.into_inner().robot;
     let robot = robot.context("a robot")?;
@@ -231,7 +231,7 @@ async fn a_secret_that_enrolled_one_machine_is_refused_to_the_next_and_a_new_one
 }
 
 /// The command line as the holder of this token has it.
-fn call_as(server: &Server, token: &str, arguments: &[&str]) -> anyhow::Result<Output> {
+pub fn call_as(server: &Server, token: &str, arguments: &[&str]) -> anyhow::Result<Output> {
     let mut command = Command::new(midshift()?);
     sign_in(&mut command, server.address);
     command.env("MIDSHIFT_TOKEN", token).args(arguments).args(["--server", &server.address.to_string()]);

@@ -60,6 +60,7 @@ mod stopped_release;
 mod story;
 mod swallowed;
 mod swarm_software;
+mod taken_back;
 mod tuf;
 mod two_of_each;
 mod unheard;

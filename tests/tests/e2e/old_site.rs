@@ -6,7 +6,7 @@
 use crate::harness::{channel, free_port, tasks, until};
 use crate::room::LIMIT;
 use anyhow::{Context, ensure};
-use midshift::backup::{Places, back_up, restore, verify};
+use midshift::backup::{Access, Places, back_up, restore, verify};
 use midshift::clock::{at, clock, wall};
 use midshift::door;
 use midshift::planning::Planning;
@@ -383,7 +383,7 @@ async fn is_backed_up(engine: Engine) -> anyhow::Result<()> {
     back_up(&old.places("data", old.url.as_ref())?, &backup, wall()).await?;
     verify(&backup).await?;
     let url = old.url.as_ref().map(|_| tokio::task::block_in_place(|| PostgresServer::shared().database()));
-    restore(&backup, &old.places("restored", url.as_ref())?, wall()).await?;
+    restore(&backup, &old.places("restored", url.as_ref())?, &Access::default(), wall()).await?;
     let storage = open(&old.dir.path().join("restored"), url.clone(), &old.site).await?;
     let store = storage.store();
     for newest_first in [false, true] {

@@ -20,7 +20,7 @@ use std::time::Duration;
 const ROBOTS: usize = 6;
 const TASKS: usize = 12;
 
-fn run(arguments: &[&str]) -> anyhow::Result<String> {
+pub fn run(arguments: &[&str]) -> anyhow::Result<String> {
     let output = heard(&mut command(arguments)?)?;
     anyhow::ensure!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
     Ok(String::from_utf8(output.stdout)?)
@@ -82,38 +82,36 @@ async fn reasons_of_gaps(server: &Server) -> anyhow::Result<Vec<String>> {
 
 /// Where the server keeps its rows and samples, and how those are lost.
 #[derive(Clone, Copy, Debug)]
-enum Engine {
+pub enum Engine {
     Sqlite,
-    Postgres,
+    /// With the name of its database.
+    Postgres(&'static str),
 }
-
-/// Database of the drill on PostgreSQL.
-const DATABASE: &str = "drill";
 
 impl Engine {
     /// What `serve`, `backup` and `restore` are told.
-    fn flags(self) -> Vec<String> {
+    pub fn flags(self) -> Vec<String> {
         match self {
             Self::Sqlite => Vec::new(),
-            Self::Postgres => vec!["--store".to_owned(), PostgresServer::shared().url(DATABASE)],
+            Self::Postgres(database) => vec!["--store".to_owned(), PostgresServer::shared().url(database)],
         }
     }
     /// Names of the parts of a backup.
     const fn parts(self) -> &'static str {
         match self {
             Self::Sqlite => "control\ntelemetry\nidentity\n",
-            Self::Postgres => "postgresql\nidentity\n",
+            Self::Postgres(_) => "postgresql\nidentity\n",
         }
     }
-    fn prepare(self) {
-        if let Self::Postgres = self {
-            PostgresServer::shared().database_named(DATABASE);
+    pub fn prepare(self) {
+        if let Self::Postgres(database) = self {
+            PostgresServer::shared().database_named(database);
         }
     }
     /// Nothing of it is left.
-    fn lose(self, data: &Path) -> anyhow::Result<()> {
-        if let Self::Postgres = self {
-            PostgresServer::shared().emptied(DATABASE);
+    pub fn lose(self, data: &Path) -> anyhow::Result<()> {
+        if let Self::Postgres(database) = self {
+            PostgresServer::shared().emptied(database);
         }
         if data.exists() {
             std::fs::remove_dir_all(data)?;
@@ -129,7 +127,7 @@ async fn robots_carry_on_from_a_backup_of_sqlite_that_was_taken_while_they_worke
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn robots_carry_on_from_a_backup_of_postgresql_that_was_taken_while_they_worked() -> anyhow::Result<()> {
-    drill(Engine::Postgres).await
+    drill(Engine::Postgres("drill")).await
 }
 
 async fn drill(engine: Engine) -> anyhow::Result<()> {
@@ -151,7 +149,7 @@ async fn drill(engine: Engine) -> anyhow::Result<()> {
     until_done(&server, 6).await?;
     server.kill()?;
     engine.lose(&server.data())?;
-    run(&[&["restore", "--from", &backup, "--data", &data][..], &flags].concat())?;
+    run(&[&["restore", "--from", &backup, "--data", &data, "--identity", "as-backed-up"][..], &flags].concat())?;
     server.restart().await?;
     let after = submit(&server, &site, 2, "after").await?;
     let ended = until("every task to be over or with a person", Duration::from_secs(240), || async {
@@ -195,7 +193,7 @@ async fn a_restored_stop_service_stops_what_stood_at_the_backup_and_takes_later_
     server.kill()?;
     stops.kill()?;
     std::fs::remove_dir_all(server.data())?;
-    run(&["restore", "--from", &backup, "--data", &data])?;
+    run(&["restore", "--from", &backup, "--data", &data, "--identity", "as-backed-up"])?;
     server.restart().await?;
     stops.restart().await?;
 

@@ -117,6 +117,47 @@ fn a_robot_that_is_pinned_stays_at_what_it_runs_however_far_it_is() {
     assert_eq!(rig.robots.iter().filter(|r| r.version == "2.0.0").count(), 2);
 }
 
+/// A robot shows another device key than the one that is known.
+fn shows_another_key(rig: &mut Rig, n: usize) -> String {
+    let key = "ab".repeat(32);
+    let session = rig.row::<Session>(robot_id(n).as_str()).expect("it attached");
+    rig.put(Session { other_device_key: Some(key.clone()), ..session });
+    key
+}
+
+#[test]
+fn a_robot_that_shows_another_device_key_and_was_not_enrolled_since_gets_nothing_however_far_it_is() {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    let (canary, other) = (rig.order()[0], rig.order()[1]);
+    rig.robots[canary].fate = Fate::NeverReady;
+    rig.until(20, |r| r.step(canary) == Step::Activating && r.step(other) == Step::Staged);
+    for n in [canary, other] {
+        shows_another_key(&mut rig, n);
+    }
+    rig.until(300, |r| r.phase() == Phase::Completed);
+    for n in [canary, other] {
+        let why = rig.of("ro", n).why.expect("a reason");
+        assert_eq!((why.code, why.metadata["device_key"].as_str()), (Code::SkippedOtherKey, &*"ab".repeat(32)));
+        assert_eq!(rig.robots[n].version, "0.9.0");
+    }
+    assert_eq!(rig.robots.iter().filter(|r| r.version == "2.0.0").count(), 2);
+}
+
+#[test]
+fn another_device_key_that_a_person_took_keeps_a_robot_from_nothing() {
+    let mut rig = Rig::new(4);
+    for n in 0..4 {
+        let device_key = shows_another_key(&mut rig, n);
+        rig.tick();
+        let command = Command::AcceptKey { robot_id: robot_id(n), device_key };
+        rig.ask(&command).expect("allowed");
+    }
+    rig.start(spec());
+    rig.until(300, |r| r.phase() == Phase::Completed);
+    assert!(rig.robots.iter().all(|r| r.version == "2.0.0"));
+}
+
 #[test]
 fn an_excluded_robot_is_left_out_and_somebody_stands_in() {
     let mut rig = Rig::new(4);

@@ -44,6 +44,7 @@ impl Rig {
                 reason: "because".into(),
             },
             Command::Revoke { bundle: bundle_id(3), reason: "leaks".into() },
+            Command::AcceptKey { robot_id: robot_id(4), device_key: "ab".repeat(32) },
         ]
     }
 

@@ -170,4 +170,13 @@ fn software_of_a_robot_is_for_whoever_may_where_it_stands() {
     assert_eq!([sees(&blind, 0), sees(&blind, 5), sees(&anna, 5)], [true, false, true]);
     let revoke = Command::Revoke { bundle: bundle_id(3), reason: "leaks".into() };
     assert_eq!(rig.by(&anna, &revoke), DENIED, "a bundle is the site's");
+    let accept = |n: usize| Command::AcceptKey { robot_id: robot_id(n), device_key: "ab".repeat(32) };
+    assert_eq!(
+        rig.by(&holder("carl", &["ota-author"]), &accept(0)),
+        DENIED,
+        "who a machine is is no matter of software"
+    );
+    let admin = holder("dora", &["admin"]);
+    assert_eq!((rig.by(&admin, &accept(99)), rig.by(&admin, &accept(0))), (missing, Ok(())));
+    assert_eq!(rig.ota.software_of(&robot_id(0)).device_key, Some("ab".repeat(32)));
 }

@@ -1,6 +1,7 @@
 //! Hold tokens: the maker's stop holds, its release does not resume, a person does.
 
 use crate::harness::World;
+use midshift_core::fleet::NOT_ENROLLED_SEEN;
 use midshift_core::fleet::rows::HoldToken;
 use midshift_core::ids::RobotId;
 use midshift_core::reason::Code;
@@ -145,6 +146,23 @@ async fn a_second_machine_with_a_robots_name_is_an_incident() {
     w.robot("r1", "park-a").await;
     w.clone_seen("r1").await;
     w.until("a person is told", |s| s.incidents() == [Code::CloneSeen]).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_machine_that_is_not_enrolled_is_one_incident_that_names_its_key() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    for _ in 0..2 {
+        w.told_by_telemetry("r2", NOT_ENROLLED_SEEN, r#"{"key": "abcd", "certificate": "0a"}"#).await;
+    }
+    w.clone_seen("r1").await;
+    let seen = w.until("both are told of", |s| s.incidents().contains(&Code::CloneSeen)).await;
+    let told = seen.open_incidents(Code::RobotNotEnrolled.as_str());
+    let [of] = &told[..] else { panic!("{told:?}") };
+    assert_eq!(of.robot_id.as_ref().map(|id| id.as_str()), Some("r2"));
+    let metadata = ["key", "certificate"].map(|name| of.reason.metadata.get(name).map(String::as_str));
+    assert_eq!(metadata, [Some("abcd"), Some("0a")]);
     w.lawful().await;
 }
 

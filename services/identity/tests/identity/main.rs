@@ -4,5 +4,6 @@ mod authority;
 mod enrolled;
 mod retained;
 mod rotated;
+mod taken_back;
 mod tokens;
 mod world;

@@ -6,6 +6,7 @@ use super::{Places, blocking};
 use crate::serve::IDENTITY;
 use anyhow::ensure;
 use async_trait::async_trait;
+use midshift_identity::RevocationList;
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
@@ -46,14 +47,14 @@ impl Part for Identity {
     }
 }
 
-/// Files that are written, not those that are being.
+/// Files that are written, not those that are being; and not the list of what was taken back: one that is as old as the rows takes nothing back in them.
 fn carry(from: &Path, to: &Path) -> anyhow::Result<()> {
     fs::create_dir_all(to)?;
     fs::set_permissions(to, fs::Permissions::from_mode(0o700))?;
     let mut some = false;
     for path in entries(from)? {
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        if !name.starts_with('.') {
+        if !name.starts_with('.') && name != RevocationList::FILE {
             copy(&path, &to.join(name))?;
             some = true;
         }

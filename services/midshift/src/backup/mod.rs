@@ -5,6 +5,7 @@
 //! they name, so that what a copied row names was there when it was copied. A thing that is durable and in no part is a defect: who adds one
 //! adds its part.
 
+mod access;
 mod files;
 mod identity;
 mod keys;
@@ -16,6 +17,7 @@ mod rows;
 mod stops;
 pub mod told;
 
+pub use access::{Access, Identity, Settled};
 use anyhow::{Context, bail, ensure};
 use files::write;
 use midshift_bundle::digest::Digest;
@@ -144,7 +146,8 @@ pub async fn verify(backup: &Path) -> anyhow::Result<Summary> {
 /// # Errors
 /// If the backup is not good or of the other engine, the clock is before it, the database is not empty, or something cannot be written.
 /// Nothing is left at `to` then, unless the database went silent at its last word: the error says so, and what to do.
-pub async fn restore(backup: &Path, to: &Places, now: Utc) -> anyhow::Result<Summary> {
+pub async fn restore(backup: &Path, to: &Places, access: &Access, now: Utc) -> anyhow::Result<(Summary, Settled)> {
+    let revocations = access.list()?;
     let summary = verify(backup).await?;
     match (summary.has(POSTGRES), &to.store) {
         (true, None) => bail!(
@@ -174,9 +177,11 @@ pub async fn restore(backup: &Path, to: &Places, now: Utc) -> anyhow::Result<Sum
         // Before a database waits for its last word.
         place.sync().await?;
     }
+    let settled =
+        access.put_right(&revocations, &summary.site_id, &mut making).await.context("restoring who is known")?;
     let places = keys.into_iter().chain([(place, to.data.clone())]);
     name_all(places, making.rows).await?;
-    Ok(summary)
+    Ok((summary, settled))
 }
 
 /// Gives folders their names and commits the rows last: they alone make a server of it, and a folder without them belongs to no store.

@@ -2,8 +2,8 @@
 
 use super::part::POSTGRES;
 use super::place::Place;
-use super::tests::{NOW, release, site};
-use super::{Places, back_up, name_all, restore, verify};
+use super::tests::{NOW, let_in, list_of_both, release, site, somebody_known};
+use super::{Access, Identity, Places, back_up, name_all, restore, verify};
 use crate::clock;
 use crate::postgres_server::PostgresServer;
 use midshift_core::rows::{Expect, Index, Item, Key, RowChange, Table, Write, Writer};
@@ -80,7 +80,7 @@ async fn rows_of_postgresql_and_their_releases_become_one_store_of_its_own() {
     assert_eq!((summary.site_id.as_str(), summary.begun, names), ("north", NOW, vec![POSTGRES, "ota"]));
     let config = database();
     let to = restored(&used, &config);
-    restore(&backup, &to, NOW).await.expect("restored");
+    restore(&backup, &to, &Access::default(), NOW).await.expect("restored");
     let store = open(&config).await;
     assert_ne!(store.id(), used.store.id());
     assert_eq!(store.snapshot(&[Table::Bundle]).await.expect("rows").rows.len(), 1);
@@ -97,16 +97,43 @@ async fn rows_of_postgresql_and_their_releases_become_one_store_of_its_own() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn rows_of_postgresql_let_nobody_in_again_who_was_revoked_since_but_by_a_persons_word() {
+    let used = Used::new(Table::Attempt, Writer::Fleet).await;
+    used.store.commit(vec![somebody_known()]).await.remove(0).expect("applied");
+    let backup = used.backed_up().await;
+    let to = |name: &str, config: &PostgresConfig| Places {
+        data: used.at(name),
+        ota_keys: None,
+        store: Some(config.clone()),
+    };
+    let config = database();
+    let error = restore(&backup, &to("asked", &config), &Access::default(), NOW).await.expect_err("a person must say");
+    assert!(format!("{error:#}").contains("--revocations FILE"), "{error:#}");
+    assert!(!used.at("asked").exists());
+    let list = list_of_both(used.dir.path());
+    let (_, settled) = restore(&backup, &to("merged", &config), &list, NOW).await.expect("nothing was left");
+    assert_eq!((settled.tokens, settled.keys), (1, 1));
+    assert_eq!(let_in(&open(&config).await).await, (false, false));
+    let config = database();
+    let access = Access { revocations: None, identity: Some(Identity::ReIssue) };
+    let (_, settled) = restore(&backup, &to("issued", &config), &access, NOW).await.expect("restored");
+    assert!(settled.secret.is_some());
+    assert_eq!(let_in(&open(&config).await).await, (false, true));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_backup_of_one_engine_does_not_become_the_other() {
     let used = Used::new(Table::Attempt, Writer::Fleet).await;
     let backup = used.backed_up().await;
     let files = Places { store: None, ..restored(&used, &used.config) };
-    let error = restore(&backup, &files, NOW).await.expect_err("no database").to_string();
+    let error = restore(&backup, &files, &Access::default(), NOW).await.expect_err("no database").to_string();
     assert!(error.contains("rows of PostgreSQL") && error.contains("SQLite") && error.contains("--store"), "{error}");
     let sqlite = Places { data: used.at("sqlite"), ota_keys: None, store: None };
     drop(midshift_store::SqliteStore::open(&sqlite.data, site(), clock::clock(1000)).await.expect("a store"));
     back_up(&sqlite, &used.at("of-sqlite"), NOW).await.expect("a backup");
-    let error = restore(&used.at("of-sqlite"), &restored(&used, &database()), NOW).await.expect_err("a database");
+    let error = restore(&used.at("of-sqlite"), &restored(&used, &database()), &Access::default(), NOW)
+        .await
+        .expect_err("a database");
     let error = error.to_string();
     assert!(error.contains("rows of SQLite") && error.contains("PostgreSQL") && error.contains("--store"), "{error}");
     assert!(!used.at("restored").exists());
@@ -145,18 +172,19 @@ async fn spoiled_rows_are_each_named_and_nothing_is_restored_of_them() {
     assert!(told.iter().all(|told| error.contains(told)), "{error}");
     let config = database();
     let to = restored(&used, &config);
-    restore(&backup, &to, NOW).await.expect_err("it is not good");
+    restore(&backup, &to, &Access::default(), NOW).await.expect_err("it is not good");
     assert!(!to.data.exists());
     fs::write(&cut, &wholes[0]).expect("written");
     fs::write(&flipped, &wholes[1]).expect("written");
-    restore(&backup, &to, NOW).await.expect("nothing was left");
+    restore(&backup, &to, &Access::default(), NOW).await.expect("nothing was left");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn into_a_database_with_rows_nothing_is_restored() {
     let used = Used::new(Table::Attempt, Writer::Fleet).await;
     let backup = used.backed_up().await;
-    let error = restore(&backup, &restored(&used, &used.config), NOW).await.expect_err("it has rows");
+    let error =
+        restore(&backup, &restored(&used, &used.config), &Access::default(), NOW).await.expect_err("it has rows");
     assert!(format!("{error:#}").contains("goes into an empty one only"), "{error:#}");
     let mut left = used.left();
     left.sort();

@@ -9,6 +9,7 @@ use super::{Places, blocking};
 use crate::stop::{FOLDER, LOG};
 use anyhow::{Context, ensure};
 use async_trait::async_trait;
+use midshift_identity::RevocationList;
 use midshift_stop::{Copied, FIRST, HOLDER};
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -46,7 +47,8 @@ impl Part for Stops {
             latch(&from, &folder)?;
             for path in entries(&from)? {
                 let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-                if ![LATCH, LOG, FIRST, HOLDER, Copied::NAME].contains(&name.as_str()) && !name.ends_with(".new") {
+                let is_left_out = [LATCH, LOG, FIRST, HOLDER, Copied::NAME, RevocationList::FILE].contains(&name.as_str());
+                if !is_left_out && !name.ends_with(".new") {
                     copy_if_there(&path, &folder.join(name))?;
                 }
             }

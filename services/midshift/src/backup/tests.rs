@@ -1,19 +1,23 @@
 //! A backup is whole, says when it is not, and what is made of it is a store of its own.
 
-use super::{Places, back_up, restore, verify};
+use super::{Access, Identity, Places, Settled, back_up, restore, verify};
 use crate::clock;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::folder::Folder;
 use midshift_bundle::keys::SecretKey;
 use midshift_bundle::repository::{FileTarget, PEOPLE_LIFE_MS, Profile, sign_targets};
-use midshift_core::ids::SiteId;
+use midshift_core::identity::{
+    Act as By, Digest as KeyDigest, Revocation, RobotIdentity, TokenId, TokenRecord, revocations,
+};
+use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::rows::{Expect, Index, Item, Key, RowChange, Seq, Table, Write, Writer};
 use midshift_core::time::Utc;
+use midshift_identity::RevocationList;
 use midshift_ota::content::{Content, DiskContent, Held, Room, Wanted};
 use midshift_ota::folder::{Owner, mark};
 use midshift_ota::repository::{Act, OnlineKeys, Repository, raise_floor};
 use midshift_ota::{OtaService, Parts};
-use midshift_store::{FRAME_BYTES_DEFAULT, Frame, FrameLog, SqliteFrames, SqliteStore, Store};
+use midshift_store::{FRAME_BYTES_DEFAULT, Frame, FrameLog, SqliteFrames, SqliteStore, Store, load};
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
@@ -85,7 +89,7 @@ async fn what_is_restored_is_the_moment_of_the_copy_in_a_store_of_its_own() {
     let names: Vec<&str> = summary.parts.iter().map(|(name, ..)| name.as_str()).collect();
     assert_eq!(names, ["control", "telemetry"]);
     let to = Places { data: used.dir.path().join("restored"), ota_keys: None, store: None };
-    restore(&backup, &to, NOW).await.expect("restored");
+    restore(&backup, &to, &Access::default(), NOW).await.expect("restored");
     let (store, frames) = open(&to.data).await;
     assert_ne!(store.id(), used.store.id(), "nobody may go on from a number of the other");
     let rows = store.snapshot(&[Table::Attempt]).await.expect("rows");
@@ -120,7 +124,7 @@ async fn every_change_of_a_backup_is_found_and_nothing_is_restored_of_it() {
         spoil();
         let error = verify(&backup).await.expect_err("it is not good").to_string();
         assert!(error.contains(told), "{error}");
-        assert!(restore(&backup, &to, NOW).await.is_err());
+        assert!(restore(&backup, &to, &Access::default(), NOW).await.is_err());
         assert!(!to.data.exists());
     }
 }
@@ -131,7 +135,7 @@ async fn nothing_is_written_over() {
     let backup = used.backed_up().await;
     let again = back_up(&used.places(), &backup, NOW).await.expect_err("it is there");
     assert!(again.to_string().contains("is there already"), "{again}");
-    assert!(restore(&backup, &used.places(), NOW).await.is_err());
+    assert!(restore(&backup, &used.places(), &Access::default(), NOW).await.is_err());
     verify(&backup).await.expect("as it was");
     let nowhere = Places { data: used.dir.path().join("nowhere"), ota_keys: None, store: None };
     let to = used.dir.path().join("of-nothing");
@@ -179,7 +183,7 @@ async fn a_restored_repository_signs_above_what_robots_saw_by_the_clock_and_by_t
         back_up(&from, &backup, NOW).await.expect("a backup");
         let at = |name| used.dir.path().join(name);
         let to = Places { data: at("restored"), ota_keys: Some(at("restored-keys")), store: None };
-        restore(&backup, &to, NOW).await.expect("restored");
+        restore(&backup, &to, &Access::default(), NOW).await.expect("restored");
         let (content, repository) = repository(&to.data, &at("restored-keys")).await;
         let copied = repository.newest().expect("what was published").stamp;
         assert_eq!((copied.version, copied.snapshot_version), (version, version));
@@ -199,7 +203,7 @@ async fn restored_releases_belong_to_the_restored_store_and_those_of_the_lost_on
     mark(&folder, used.store.id()).expect("written");
     let backup = used.backed_up().await;
     let to = Places { data: used.dir.path().join("restored"), ota_keys: None, store: None };
-    restore(&backup, &to, NOW).await.expect("restored");
+    restore(&backup, &to, &Access::default(), NOW).await.expect("restored");
     let (store, _frames) = open(&to.data).await;
     let owned = |folder: &Path| Parts {
         folder: folder.to_owned(),
@@ -223,12 +227,12 @@ async fn keys_come_whole_or_not_at_all() {
     fs::create_dir(at("there")).expect("an empty folder");
     for (data, keys) in [("there", "new-keys"), ("new", "there")] {
         let to = Places { data: at(data), ota_keys: Some(at(keys)), store: None };
-        let error = restore(&backup, &to, NOW).await.expect_err("it is there").to_string();
+        let error = restore(&backup, &to, &Access::default(), NOW).await.expect_err("it is there").to_string();
         assert!(error.contains("is there already"), "{error}");
         assert!(!at("new").exists() && !at("new-keys").exists());
     }
     let inside = Places { data: at("one"), ota_keys: Some(at("one").join("keys")), store: None };
-    restore(&backup, &inside, NOW).await.expect("both in one folder");
+    restore(&backup, &inside, &Access::default(), NOW).await.expect("both in one folder");
     OnlineKeys::read(&at("one").join("keys")).expect("all of them");
     let left = fs::read_dir(used.dir.path()).expect("a folder").map(|entry| entry.expect("an entry").file_name());
     assert!(left.into_iter().all(|name| !name.to_string_lossy().starts_with(".midshift-")), "nothing half is left");
@@ -239,10 +243,10 @@ async fn with_a_clock_before_the_backup_or_keys_that_it_has_not_nothing_is_resto
     let used = Used::new().await;
     let backup = used.backed_up().await;
     let to = Places { data: used.dir.path().join("restored"), ota_keys: None, store: None };
-    let error = restore(&backup, &to, Utc(NOW.0 - 1)).await.expect_err("the clock").to_string();
+    let error = restore(&backup, &to, &Access::default(), Utc(NOW.0 - 1)).await.expect_err("the clock").to_string();
     assert!(error.contains("clock is before the moment of the backup"), "{error}");
     let with_keys = Places { ota_keys: Some(used.dir.path().join("keys")), ..to.clone() };
-    let error = restore(&backup, &with_keys, NOW).await.expect_err("it has none").to_string();
+    let error = restore(&backup, &with_keys, &Access::default(), NOW).await.expect_err("it has none").to_string();
     assert!(error.contains("no online keys"), "{error}");
     assert!(!to.data.exists());
 }
@@ -259,7 +263,7 @@ async fn a_backup_has_the_files_of_a_stop_service_that_runs_and_none_of_one_that
     let summary = verify(&backup).await.expect("it is good");
     assert!(summary.has("stop"), "{summary:?}");
     let to = Places { data: used.dir.path().join("restored"), ota_keys: None, store: None };
-    restore(&backup, &to, NOW).await.expect("restored");
+    restore(&backup, &to, &Access::default(), NOW).await.expect("restored");
     let restored = to.data.join("stop");
     assert!(!restored.join(crate::stop::LOG).exists(), "a log is nothing to bring back");
     assert_eq!(fs::metadata(&restored).expect("a folder").permissions().mode() & 0o777, 0o700);
@@ -275,4 +279,86 @@ async fn a_backup_has_the_files_of_a_stop_service_that_runs_and_none_of_one_that
     fs::remove_file(folder.join("latch")).expect("removed");
     let error = back_up(&used.places(), &used.dir.path().join("second"), NOW).await.expect_err("nobody knows");
     assert!(format!("{error:#}").contains("has lost a file: start `midshift stop serve` once"), "{error:#}");
+}
+
+/// A token and a robot that are known at the backup.
+fn known() -> (TokenRecord, RobotIdentity) {
+    let token = TokenRecord {
+        token_id: TokenId::new("t1").expect("an id"),
+        name: "anna".to_owned(),
+        person: None,
+        digest: KeyDigest([7; 32]),
+        grants: vec!["operator".parse().expect("a grant")],
+        created_unix_ms: NOW.0,
+        created_by: "bert".to_owned(),
+        expires_unix_ms: NOW.0 + 1_000_000,
+        revoked: None,
+        rotation: None,
+    };
+    let robot = RobotIdentity::new(RobotId::parse("r7").expect("an id"));
+    (token, RobotIdentity { key: Some(KeyDigest([1; 32])), enrolled_unix_ms: Some(NOW.0), ..robot })
+}
+
+/// Both of them, as identity writes them.
+pub fn somebody_known() -> Item {
+    let ((token, robot), mut item) = (known(), Item::new(Writer::Identity, "test"));
+    item.create(&token, "token.created").create(&robot, "robot.enrolled");
+    item
+}
+
+/// A list by which both of them were taken back after the backup.
+pub fn list_of_both(folder: &Path) -> Access {
+    let (token, mut robot) = known();
+    robot.revoke("anna", NOW);
+    let token = TokenRecord { revoked: Some(By::new("bert", NOW.0)), ..token };
+    let lines = revocations([&token], [&robot]);
+    let text: String =
+        lines.iter().map(|line: &Revocation| serde_json::to_string(line).expect("a line") + "\n").collect();
+    let path = folder.join("list");
+    fs::write(&path, text).expect("written");
+    Access { revocations: Some(path), identity: None }
+}
+
+/// Whether the token, and the robot's key, let somebody in.
+pub async fn let_in(store: &dyn Store) -> (bool, bool) {
+    let (token, _) = load::<TokenRecord>(store, "t1").await.expect("rows").expect("the token");
+    let (robot, _) = load::<RobotIdentity>(store, "r7").await.expect("rows").expect("the robot");
+    let is_denied = robot.denied.iter().any(|deny| deny.key == KeyDigest([1; 32]));
+    assert_ne!(robot.key.is_some(), is_denied);
+    (token.stands(NOW), robot.key.is_some())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn whoever_was_revoked_since_the_backup_is_let_in_again_by_nothing_but_a_persons_word() {
+    let used = Used::new().await;
+    used.store.commit(vec![somebody_known()]).await.remove(0).expect("applied");
+    let identity = used.places().data.join(crate::serve::IDENTITY);
+    fs::create_dir_all(&identity).expect("a folder");
+    fs::write(identity.join("authority.pem"), "PRIVATE KEY-----\n-----END CERTIFICATE-----\n").expect("written");
+    fs::write(identity.join(RevocationList::FILE), "").expect("written");
+    let backup = used.backed_up().await;
+    assert!(!backup.join("identity").join(RevocationList::FILE).exists(), "a list as old as the rows is worth nothing");
+    let to = |name: &str| Places { data: used.dir.path().join(name), ota_keys: None, store: None };
+    let error = restore(&backup, &to("asked"), &Access::default(), NOW).await.expect_err("a person must say");
+    let error = format!("{error:#}");
+    assert!(["--revocations FILE", "re-issue", "as-backed-up"].iter().all(|word| error.contains(word)), "{error}");
+    assert!(!to("asked").data.exists());
+
+    let list = list_of_both(used.dir.path());
+    let (_, settled) = restore(&backup, &to("merged"), &list, NOW).await.expect("restored");
+    assert_eq!(settled, Settled { tokens: 1, keys: 1, secret: None, is_orphaned: true });
+    assert_eq!(let_in(&open(&to("merged").data).await.0).await, (false, false));
+    let goes_on = RevocationList::read(&to("merged").data.join("identity").join(RevocationList::FILE)).expect("a list");
+    assert_eq!(goes_on.len(), 2, "for a later restore");
+
+    let both = Access { identity: Some(Identity::AsBackedUp), ..list };
+    let error = restore(&backup, &to("both"), &both, NOW).await.expect_err("either").to_string();
+    assert!(error.contains("takes nothing back"), "{error}");
+    let said = |identity| Access { revocations: None, identity: Some(identity) };
+    let (_, settled) = restore(&backup, &to("same"), &said(Identity::AsBackedUp), NOW).await.expect("restored");
+    assert_eq!((settled, let_in(&open(&to("same").data).await.0).await), (Settled::default(), (true, true)));
+    let (_, settled) = restore(&backup, &to("issued"), &said(Identity::ReIssue), NOW).await.expect("restored");
+    assert_eq!((settled.tokens, settled.keys, settled.is_orphaned), (1, 0, false));
+    assert_eq!(let_in(&open(&to("issued").data).await.0).await, (false, true));
+    assert!(settled.secret.is_some_and(|secret| secret.starts_with("mst.")));
 }

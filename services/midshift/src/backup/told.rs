@@ -1,10 +1,10 @@
-//! Tells the server of a data directory that a backup of it was made, and leaves the row of the audit for it.
+//! Tells the server of a data directory that a backup of it was made, or that it was restored, and leaves the row of the audit for it.
 //!
 //! Invariant: whoever copies files writes no rows: the store belongs to the server. The backup leaves a small file in the data directory, and a server
 //! with it, now or at its next start, writes the row and then takes the file away. A row is never lost, and comes once in each life of a server at most.
 //! The name of whoever made the backup is the one of the operating system: nobody signed in for it.
 
-use super::Summary;
+use super::{Access, Settled, Summary};
 use anyhow::Context;
 use midshift_core::audit::Note;
 use midshift_core::rows::{Item, Writer};
@@ -19,8 +19,9 @@ use std::time::Duration;
 
 /// Folder of the data directory.
 pub const FOLDER: &str = "backups-made";
-/// What it is called in the audit.
-const ACTION: &str = "backup.make";
+/// What they are called in the audit.
+const MADE: &str = "backup.make";
+const RESTORED: &str = "backup.restore";
 /// How often a server looks, real time.
 const LOOK_EVERY: Duration = Duration::from_secs(2);
 /// Bytes of such a file at most.
@@ -39,19 +40,66 @@ struct Made {
     parts: Vec<String>,
 }
 
-/// Leaves the file for the server of `data`.
+/// A restore that was made.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+struct Restored {
+    /// Who, as the operating system knows it: `os:UID`.
+    by: String,
+    /// Of which folder.
+    from: String,
+    /// What was said of who is let in: `revocations`, `as-backed-up`, `re-issue`, several of them, or nothing.
+    identity: String,
+    /// Tokens that ended.
+    tokens: usize,
+    /// Keys of robots that were taken out.
+    keys: usize,
+}
+
+/// What such a file says. Their fields tell them apart.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(untagged)]
+enum Word {
+    Made(Made),
+    Restored(Restored),
+}
+
+fn whoever_asks() -> String {
+    format!("os:{}", rustix::process::getuid().as_raw())
+}
+
+/// Leaves the file for the server of `data` that a backup was made.
 ///
 /// # Errors
 /// The disk.
 pub fn leave_note(data: &Path, summary: &Summary, to: &Path) -> anyhow::Result<()> {
+    let Utc(begun_unix_ms) = summary.begun;
+    let parts = summary.parts.iter().map(|(name, ..)| name.clone()).collect();
+    let made = Made { by: whoever_asks(), to: to.display().to_string(), begun_unix_ms, parts };
+    leave(data, &begun_unix_ms.to_string(), &Word::Made(made))
+}
+
+/// Leaves the file for the server of `data` that it was restored, and who is let in.
+///
+/// # Errors
+/// The disk.
+pub fn leave_restored(data: &Path, from: &Path, access: &Access, settled: &Settled) -> anyhow::Result<()> {
+    let list = access.revocations.iter().map(|_| "revocations");
+    let identity: Vec<&str> = list.chain(access.identity.map(super::Identity::as_str)).collect();
+    let restored = Restored {
+        by: whoever_asks(),
+        from: from.display().to_string(),
+        identity: identity.join(" "),
+        tokens: settled.tokens,
+        keys: settled.keys,
+    };
+    leave(data, "restored", &Word::Restored(restored))
+}
+
+fn leave(data: &Path, name: &str, word: &Word) -> anyhow::Result<()> {
     let folder = data.join(FOLDER);
     midshift_durable::make_folder(&folder).with_context(|| format!("making {}", folder.display()))?;
-    let Utc(begun_unix_ms) = summary.begun;
-    let by = format!("os:{}", rustix::process::getuid().as_raw());
-    let parts = summary.parts.iter().map(|(name, ..)| name.clone()).collect();
-    let made = Made { by, to: to.display().to_string(), begun_unix_ms, parts };
-    let path = folder.join(format!("{begun_unix_ms}-{:08x}.json", rand::random::<u32>()));
-    midshift_durable::replace(&path, &serde_json::to_vec(&made)?)
+    let path = folder.join(format!("{name}-{:08x}.json", rand::random::<u32>()));
+    midshift_durable::replace(&path, &serde_json::to_vec(word)?)
         .with_context(|| format!("writing {}", path.display()))?;
     // Whoever made the backup may be another user than the server; the data directory is closed to others.
     fs::set_permissions(&path, fs::Permissions::from_mode(0o644)).with_context(|| format!("opening {}", path.display()))
@@ -101,14 +149,18 @@ async fn take_all(data: &Path, store: &dyn Store, written: &mut BTreeSet<PathBuf
 
 /// The row for a file.
 fn row(path: &Path) -> Item {
-    let (by, note) = match made(path) {
-        Ok(Made { by, to, begun_unix_ms, parts }) => {
-            let note = Note::new(ACTION).with("to", to).with("parts", parts.join(" "));
+    let (by, note) = match word(path) {
+        Ok(Word::Made(Made { by, to, begun_unix_ms, parts })) => {
+            let note = Note::new(MADE).with("to", to).with("parts", parts.join(" "));
             (by, note.with("begun_unix_ms", begun_unix_ms))
+        }
+        Ok(Word::Restored(Restored { by, from, identity, tokens, keys })) => {
+            let note = Note::new(RESTORED).with("from", from).with("identity", identity);
+            (by, note.with("tokens", tokens).with("keys", keys))
         }
         Err(error) => {
             tracing::warn!(error = format!("{error:#}"), path = %path.display(), "this is no word of a backup");
-            ("os:unknown".to_owned(), Note::new(ACTION).with("unreadable", true))
+            ("os:unknown".to_owned(), Note::new(MADE).with("unreadable", true))
         }
     };
     let mut item = Item::new(Writer::Identity, &by);
@@ -116,7 +168,7 @@ fn row(path: &Path) -> Item {
     item
 }
 
-fn made(path: &Path) -> anyhow::Result<Made> {
+fn word(path: &Path) -> anyhow::Result<Word> {
     let bytes = path.metadata()?.len();
     anyhow::ensure!(bytes <= BYTES_MAX, "it has {bytes} bytes");
     Ok(serde_json::from_slice(&fs::read(path)?)?)
@@ -156,10 +208,19 @@ mod tests {
         );
         assert_eq!((with("begun_unix_ms"), row.actor.starts_with("os:")), (Some("5"), true));
         assert_eq!(fs::read_dir(dir.path().join(FOLDER)).expect("a folder").count(), 0);
+        let access = Access { identity: Some(super::super::Identity::ReIssue), ..Access::default() };
+        let settled = Settled { tokens: 3, keys: 0, secret: Some("mst.hush".to_owned()), is_orphaned: false };
+        leave_restored(dir.path(), Path::new("/mnt/backup"), &access, &settled).expect("told");
+        take_all(dir.path(), &store, &mut written).await.expect("written");
+        let newest = store.list(Query::all(Table::IdentityAudit)).await.expect("rows").pop().expect("a row");
+        let row: AuditRow = serde_json::from_str(&newest.body).expect("a row");
+        let with = ["from", "identity", "tokens"].map(|name| row.with.get(name).map(String::as_str));
+        assert_eq!((row.action.as_str(), with), ("backup.restore", [Some("/mnt/backup"), Some("re-issue"), Some("3")]));
+        assert!(!newest.body.contains("hush"));
         // A file that cannot be taken away leaves no second row.
         fs::write(dir.path().join(FOLDER).join("stays.json"), "{}").expect("written");
         written.insert(dir.path().join(FOLDER).join("stays.json"));
         take_all(dir.path(), &store, &mut written).await.expect("taken away");
-        assert_eq!(store.list(Query::all(Table::IdentityAudit)).await.expect("rows").len(), 2);
+        assert_eq!(store.list(Query::all(Table::IdentityAudit)).await.expect("rows").len(), 3);
     }
 }

@@ -2,7 +2,7 @@
 
 use super::client::Exit;
 use super::out::{Format, Out, columns};
-use crate::backup::{self, KEYS, Places, Summary};
+use crate::backup::{self, Access, Identity, KEYS, Places, Settled, Summary};
 use crate::clock;
 use crate::storage::Database;
 use midshift_proto::convert::timestamp;
@@ -40,8 +40,15 @@ pub struct Restore {
     /// The folder to make for online keys, which must not be there; without it the folder ota-keys of the data directory.
     #[arg(long, value_name = "DIR")]
     ota_keys: Option<PathBuf>,
+    /// What was revoked, the newest list that is left: revocations.jsonl in the folder identity of the lost server, or the copy in the folder stop of its stop
+    /// service. What it names stays out, and so do secrets that waited for their machine.
+    #[arg(long, value_name = "FILE")]
+    revocations: Option<PathBuf>,
+    /// What becomes of tokens and robots without that list, or re-issue beside it.
+    #[arg(long, value_enum)]
+    identity: Option<Identity>,
     /// Only look whether everything is there and as it was copied; write nothing, and ask no database.
-    #[arg(long, conflicts_with_all = ["data", "ota_keys"])]
+    #[arg(long, conflicts_with_all = ["data", "ota_keys", "revocations", "identity"])]
     verify: bool,
 }
 
@@ -49,7 +56,7 @@ pub struct Restore {
 pub async fn take(args: &Take, out: &Out) -> Result<(), Exit> {
     let from = Places { data: args.data.clone(), ota_keys: args.ota_keys.clone(), store: args.database.postgres()? };
     let summary = backup::back_up(&from, &args.to, clock::clock(1000).now().wall).await?;
-    show(&summary, out)?;
+    show(&summary, None, out)?;
     // The backup is whole, whether or not that can be said.
     if let Err(error) = backup::told::leave_note(&from.data, &summary, &args.to) {
         out.say(&format!("warning: the audit will have no row of this backup: {error:#}"));
@@ -64,16 +71,48 @@ pub async fn restore(args: &Restore, out: &Out) -> Result<(), Exit> {
         if args.database.store.is_some() {
             out.say("--verify reads the backup only and asks no database");
         }
-        return show(&backup::verify(&args.from).await?, out);
+        return show(&backup::verify(&args.from).await?, None, out);
     };
     let to = Places { data, ota_keys: args.ota_keys.clone(), store: args.database.postgres()? };
-    let summary = backup::restore(&args.from, &to, clock::clock(1000).now().wall).await?;
-    show(&summary, out)?;
+    let access = Access { revocations: args.revocations.clone(), identity: args.identity };
+    let (summary, settled) = backup::restore(&args.from, &to, &access, clock::clock(1000).now().wall).await?;
+    if let Err(error) = backup::told::leave_restored(&to.data, &args.from, &access, &settled) {
+        out.say(&format!("warning: the audit will have no row of this restore: {error:#}"));
+    }
+    show(&summary, Some(&settled), out)?;
+    who_is_let_in(&access, &settled).iter().for_each(|line| out.say(line));
     let keys = summary.has_keys().then(|| to.ota_keys.clone().unwrap_or_else(|| to.data.join(KEYS)));
     let (note, command) = serve(&to.data, args.database.store.as_deref(), keys.as_deref());
     note.iter().for_each(|note| out.say(note));
     out.next(&command);
     Ok(())
+}
+
+/// What a person is told of tokens and robots.
+fn who_is_let_in(access: &Access, settled: &Settled) -> Vec<String> {
+    let mut lines = Vec::new();
+    match (&access.revocations, access.identity) {
+        (None, None) => {}
+        (None, Some(Identity::AsBackedUp)) => lines.push(
+            "tokens and robots are let in as they were at the backup: revoke again what was revoked since".to_owned(),
+        ),
+        (list, identity) => {
+            lines.push(format!("taken back: {} tokens, {} keys of robots", settled.tokens, settled.keys));
+            if list.is_none() && identity.is_some() {
+                lines.push(
+                    "robots are let in as they were at the backup: revoke again those that were revoked since"
+                        .to_owned(),
+                );
+            }
+            if settled.secret.is_none() && settled.is_orphaned {
+                lines.push(
+                    "no token of the backup may administer the site any more: start the server with --spare-token"
+                        .to_owned(),
+                );
+            }
+        }
+    }
+    lines
 }
 
 /// The command that starts a server of a restored directory, and what must be done before it. No password is in either.
@@ -119,7 +158,8 @@ fn word(text: &str) -> String {
     format!("'{}'", text.replace('\'', "'\\''"))
 }
 
-fn show(summary: &Summary, out: &Out) -> Result<(), Exit> {
+/// What is in a backup; of one that was restored, what became of tokens and robots too.
+fn show(summary: &Summary, settled: Option<&Settled>, out: &Out) -> Result<(), Exit> {
     let begun = timestamp(summary.begun).to_string();
     match out.format {
         Format::Table => {
@@ -130,15 +170,26 @@ fn show(summary: &Summary, out: &Out) -> Result<(), Exit> {
                 .collect();
             out.line(&columns(&["PART", "FILES", "BYTES"], &rows));
             out.say(&format!("site {}, begun {begun}", summary.site_id));
+            if let Some(secret) = settled.and_then(|settled| settled.secret.as_ref()) {
+                out.line(&format!(
+                    "A token that may do everything on this site, for a year. It is shown once:\n\n  {secret}\n"
+                ));
+            }
         }
         Format::Name => summary.parts.iter().for_each(|(name, ..)| out.line(name)),
         Format::Json | Format::Jsonl => {
             let part = |(name, files, bytes): &(String, u64, u64)| serde_json::json!({"name": name, "files": files, "bytes": bytes.to_string()});
-            out.value(&serde_json::json!({
+            let mut value = serde_json::json!({
                 "siteId": summary.site_id,
                 "begun": begun,
                 "parts": summary.parts.iter().map(part).collect::<Vec<_>>(),
-            }))?;
+            });
+            if let (Some(settled), Some(fields)) = (settled, value.as_object_mut()) {
+                fields.insert("tokensTakenBack".to_owned(), settled.tokens.into());
+                fields.insert("keysTakenBack".to_owned(), settled.keys.into());
+                fields.extend(settled.secret.iter().map(|secret| ("token".to_owned(), secret.as_str().into())));
+            }
+            out.value(&value)?;
         }
     }
     Ok(())
@@ -171,6 +222,24 @@ mod tests {
             assert!(note.contains("MIDSHIFT_STORE") && note.contains("/site"), "{note}");
             assert!(!note.contains("s3c"), "{note}");
         }
+    }
+
+    #[test]
+    fn whoever_restores_is_told_who_is_let_in_and_what_is_left_to_do() {
+        let said = |revocations: Option<&str>, identity, settled: &Settled| {
+            let access = Access { revocations: revocations.map(Into::into), identity };
+            who_is_let_in(&access, settled).join("\n")
+        };
+        let settled = Settled { tokens: 2, keys: 1, ..Settled::default() };
+        assert_eq!(said(None, None, &settled), "", "there is nobody");
+        assert!(said(None, Some(Identity::AsBackedUp), &settled).contains("revoke again what was revoked since"));
+        assert_eq!(said(Some("list"), None, &settled), "taken back: 2 tokens, 1 keys of robots");
+        let orphaned = Settled { is_orphaned: true, ..settled.clone() };
+        assert!(said(Some("list"), None, &orphaned).contains("--spare-token"));
+        let issued = Settled { secret: Some("mst.x".to_owned()), ..settled };
+        let told = said(None, Some(Identity::ReIssue), &issued);
+        assert!(!told.contains("mst.x") && told.contains("robots are let in as they were"), "{told}");
+        assert!(!format!("{issued:?}").contains("mst.x"), "no log has it");
     }
 
     #[test]

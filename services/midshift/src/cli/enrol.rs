@@ -65,6 +65,15 @@ fn is_demo(site_id: &str) -> bool {
 }
 
 impl Machine {
+    /// Whom it is asked of.
+    pub const fn call(&self) -> &Call {
+        &self.call
+    }
+    /// Its name.
+    pub fn robot_id(&self) -> &str {
+        &self.robot_id
+    }
+
     /// What is run on the robot by a shell: the secret goes by the environment, where other users of the machine do not see it. Where stops are is said if it is not
     /// the usual port of the server, and where identities are if robots dial in elsewhere.
     fn line(&self, server: &str, stop_server: Option<&str>, secret: &str) -> String {

@@ -1,5 +1,6 @@
 //! `midshift robot …`
 
+mod adopt;
 mod table;
 
 pub use table::controls;
@@ -163,8 +164,29 @@ pub enum Verb {
     },
     /// Let a machine become this robot: prints the line to run on it, with a secret for one use within an hour.
     Enroll(Machine),
-    /// Let another machine take this robot's place: the old one's key is worth nothing as soon as the new one is enrolled.
-    Replace(Machine),
+    /// Let another machine take this robot's place: the old one's key is worth nothing as soon as the new one is enrolled. Or, with --accept-key, take the device
+    /// key that its machine shows now.
+    Replace {
+        #[command(flatten)]
+        machine: Machine,
+        /// Enrol no machine: the one that is attached is the robot's, though it signs what it has installed with another device key than before. Without KEY
+        /// the key that `robot get` shows.
+        #[arg(long, value_name = "KEY", num_args = 0..=1, require_equals = true, default_missing_value = "", conflicts_with_all = ["link_server", "identity_server", "site"])]
+        accept_key: Option<String>,
+    },
+    /// Take a machine in that shows a certificate of this site and is not enrolled here: after a restore, one that was enrolled since the backup.
+    Adopt {
+        #[command(flatten)]
+        call: Call,
+        /// Which robot it is.
+        robot_id: String,
+        /// SHA-256 of the key of its certificate. Without it the key that the robot's open incident ROBOT_NOT_ENROLLED names.
+        #[arg(long, value_name = "SHA256")]
+        key: Option<String>,
+        /// The robot has another machine, whose key is taken out.
+        #[arg(long)]
+        replace: bool,
+    },
     /// Take the robot's key out: it is cut off, and let in nowhere until it is enrolled anew.
     Revoke(One),
     /// Which robots are enrolled, and until when their certificates are good.
@@ -206,7 +228,7 @@ impl Verb {
             Self::Pin { one, .. } | Self::Unpin { one, .. } | Self::Exclude { one, .. } => Some(one),
             Self::Load { one, .. } | Self::Unstick { one, .. } => Some(one),
             // A robot that is enrolled needs not have been heard.
-            Self::Revoke(_) | Self::Enroll(_) | Self::Replace(_) => None,
+            Self::Revoke(_) | Self::Enroll(_) | Self::Replace { .. } | Self::Adopt { .. } => None,
             Self::Ls { .. } | Self::Watch { .. } | Self::Identities { .. } => None,
         }
     }
@@ -241,7 +263,11 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
         }
         Verb::Explain(one) => explain(&one, out).await,
         Verb::Enroll(machine) => enrol::offer(machine, false, out).await,
-        Verb::Replace(machine) => enrol::offer(machine, true, out).await,
+        Verb::Replace { machine, accept_key: None } => enrol::offer(machine, true, out).await,
+        Verb::Replace { machine, accept_key: Some(key) } => {
+            adopt::accept_key(machine.call(), machine.robot_id(), &key, out).await
+        }
+        Verb::Adopt { call, robot_id, key, replace } => adopt::run(&call, &robot_id, key, replace, out).await,
         Verb::Revoke(one) => enrol::revoke(&one.call, &one.robot_id, out).await,
         Verb::Identities { call } => enrol::list(&call, out).await,
         Verb::Cordon { one, reason, if_match, change } => {
@@ -470,6 +496,12 @@ fn software_lines(robot: &v1::Robot) -> Vec<String> {
     let mut lines = Vec::new();
     if robot.device_key_changed {
         lines.push("another machine's key signed what it says it has installed: not believed".to_owned());
+    }
+    if !robot.other_device_key.is_empty() {
+        lines.push(format!(
+            "other key  {}: no software until `midshift robot replace {}`, or --accept-key with it",
+            robot.other_device_key, robot.robot_id
+        ));
     }
     let Some(installed) = &robot.installed else { return lines };
     let role = |set: &str| match set {

@@ -287,6 +287,25 @@ impl RolloutService {
         Ok(v1::UnstickRobotResponse { software, done_before: done_before(taken) })
     }
 
+    async fn accept_key(
+        &self,
+        r: v1::AcceptDeviceKeyRequest,
+        by: &Caller,
+    ) -> Result<v1::AcceptDeviceKeyResponse, Refusal> {
+        let mut bad = Violations::default();
+        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        let request_id = request_id(&r.request_id, &mut bad);
+        if r.device_key.len() != 64 || !r.device_key.chars().all(|c| matches!(c, '0'..='9' | 'a'..='f')) {
+            bad.add("device_key", "must be 64 lower-case hexadecimal digits");
+        }
+        bad.finish()?;
+        let robot_id = robot_id.ok_or_else(internal)?;
+        let command = Command::AcceptKey { robot_id: robot_id.clone(), device_key: r.device_key };
+        let taken = self.act_once(command, by, None, check_only(r.validate_only), request_id).await?;
+        let software = self.software_of(robot_id).await?;
+        Ok(v1::AcceptDeviceKeyResponse { software, done_before: done_before(taken) })
+    }
+
     async fn software(
         &self,
         r: v1::ListRobotSoftwareRequest,
@@ -482,6 +501,13 @@ impl Face for RolloutService {
     ) -> Result<Response<v1::UnstickRobotResponse>, Status> {
         let by = caller(&r);
         answer(self.unstick(r.into_inner(), &by).await)
+    }
+    async fn accept_device_key(
+        &self,
+        r: Request<v1::AcceptDeviceKeyRequest>,
+    ) -> Result<Response<v1::AcceptDeviceKeyResponse>, Status> {
+        let by = caller(&r);
+        answer(self.accept_key(r.into_inner(), &by).await)
     }
     async fn list_robot_software(
         &self,

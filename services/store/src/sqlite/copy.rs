@@ -3,13 +3,15 @@
 //! Invariant: a copy is one moment of its file, whole and durable, or it is not there. A store that was restored is another store: it gets an
 //! id of its own, so that nobody goes on from a number that the copy never gave.
 
-use super::{CONTROL_DB, OpenError, TELEMETRY_DB};
+use super::{CONTROL_DB, OpenError, TELEMETRY_DB, schema, write_sql};
 use crate::StoreId;
+use crate::amend::amended;
 use crate::migrations::{self, Migration};
-use crate::sql::RENEW;
-use midshift_core::rows::Seq;
+use crate::sql::{self, RENEW};
+use midshift_core::ids::SiteId;
+use midshift_core::rows::{Item, Row as StoredRow, Seq, Table};
 use sqlx::sqlite::SqliteConnectOptions;
-use sqlx::{ConnectOptions, Connection, Row, SqliteConnection};
+use sqlx::{AssertSqlSafe, ConnectOptions, Connection, Row, SqliteConnection};
 use std::path::Path;
 use std::time::Duration;
 
@@ -109,11 +111,65 @@ impl Database {
 /// If the file cannot be written.
 pub async fn renew_identity(dir: &Path, id: &StoreId) -> Result<(), OpenError> {
     let sql = |source| OpenError::Sql { doing: "giving the restored store an id of its own", source };
-    let options = SqliteConnectOptions::new().filename(dir.join(CONTROL_DB)).busy_timeout(BUSY_TIMEOUT);
-    let mut connection = options.connect().await.map_err(sql)?;
-    sqlx::query("PRAGMA synchronous = FULL").execute(&mut connection).await.map_err(sql)?;
+    let mut connection = durable(dir).await.map_err(sql)?;
     sqlx::query(RENEW).bind(&*id.0).execute(&mut connection).await.map_err(sql)?;
     connection.close().await.map_err(sql)
+}
+
+/// A restored `control.db` that nobody serves from yet.
+pub struct SqliteRestored {
+    connection: SqliteConnection,
+    site_id: SiteId,
+}
+
+fn amending(source: sqlx::Error) -> OpenError {
+    OpenError::Sql { doing: "putting restored rows right", source }
+}
+
+impl SqliteRestored {
+    /// Opens the one in `dir`, and brings it up to this binary's schema.
+    ///
+    /// # Errors
+    /// If the file cannot be written, or is of a newer release.
+    pub async fn open(dir: &Path, site_id: SiteId) -> Result<Self, OpenError> {
+        let mut connection = durable(dir).await.map_err(amending)?;
+        schema::apply(&mut connection, CONTROL_DB, migrations::CONTROL).await?;
+        Ok(Self { connection, site_id })
+    }
+
+    /// All rows of these tables.
+    ///
+    /// # Errors
+    /// If the file cannot be read.
+    pub async fn rows(&mut self, tables: &[Table]) -> Result<Vec<StoredRow>, OpenError> {
+        let mut rows = Vec::new();
+        for table in tables {
+            let select = sqlx::query(AssertSqlSafe(sql::whole(*table))).bind(self.site_id.as_str());
+            for row in &select.fetch_all(&mut self.connection).await.map_err(amending)? {
+                rows.push(sql::row(*table, row).map_err(amending)?);
+            }
+        }
+        Ok(rows)
+    }
+
+    /// Writes rows of an item, all or none, and closes the file. No log has them: the restored store is another one, which everybody reads anew.
+    ///
+    /// # Errors
+    /// If the file cannot be written.
+    pub async fn amend(mut self, item: &Item) -> Result<(), OpenError> {
+        let mut transaction = self.connection.begin().await.map_err(amending)?;
+        write_sql::rows(&mut transaction, &self.site_id, &amended(item)).await.map_err(amending)?;
+        transaction.commit().await.map_err(amending)?;
+        self.connection.close().await.map_err(amending)
+    }
+}
+
+/// A connection to the `control.db` in `dir` whose commits are durable.
+async fn durable(dir: &Path) -> Result<SqliteConnection, sqlx::Error> {
+    let options = SqliteConnectOptions::new().filename(dir.join(CONTROL_DB)).busy_timeout(BUSY_TIMEOUT);
+    let mut connection = options.connect().await?;
+    sqlx::query("PRAGMA synchronous = FULL").execute(&mut connection).await?;
+    Ok(connection)
 }
 
 async fn read_only(path: &Path) -> Result<SqliteConnection, OpenError> {

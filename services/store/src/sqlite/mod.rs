@@ -15,7 +15,7 @@ mod tail;
 mod write_sql;
 mod writer;
 
-pub use copy::{Database, Described, renew_identity};
+pub use copy::{Database, Described, SqliteRestored, renew_identity};
 pub use frames::SqliteFrames;
 
 use crate::migrations::{CONTROL, Migrated, TELEMETRY};

@@ -11,11 +11,11 @@ use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceCli
 use midshift_proto::telemetry::v1::{self, GetRobotRequest};
 use midshift_store::load;
 
-fn key(seed: u8) -> SecretKey {
+pub fn key(seed: u8) -> SecretKey {
     SecretKey::of_seed([seed; 32])
 }
 
-fn installed() -> Result<Installed> {
+pub fn installed() -> Result<Installed> {
     let factory = SetId::parse("factory")?;
     Ok(Installed {
         robot_id: RobotId::parse("r1")?,

@@ -1,6 +1,7 @@
 //! The robot's session and the picture of robots over real gRPC connections in memory.
 
 mod disk;
+mod enrolled;
 mod flood;
 mod gateways;
 mod machines;

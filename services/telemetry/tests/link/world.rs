@@ -1,6 +1,6 @@
 //! Telemetry over a real gRPC connection in memory, and a robot that says what a test wants.
 
-use midshift_core::identity::{Caller, TokenId};
+use midshift_core::identity::{Caller, Digest, TokenId};
 use midshift_core::ids::{RobotId, SiteId, WaypointId};
 use midshift_core::robot::{Lane, Mode, ReportedState, Vitals};
 use midshift_core::time::{Clock, ScaledClock, Utc};
@@ -128,7 +128,8 @@ pub async fn serve_after(parts: Parts, read: impl Future<Output = ()> + Send + '
 /// Header in which a test says who asks; without it everybody may do everything, as at a port without login.
 const AS: &str = "as";
 
-/// As a port finds out who asks: `robot:r1`, `robot:r1#SERIAL` with the serial number of its certificate, or `name role@area ...` for the holder of a token.
+/// As a port finds out who asks: `robot:r1`, `robot:r1#SERIAL` with the serial number of its certificate, `robot:r1#SERIAL#BYTE` with its key too, of 32 such bytes,
+/// or `name role@area ...` for the holder of a token.
 fn known(mut request: Request<()>) -> std::result::Result<Request<()>, Status> {
     request.extensions_mut().insert(Caller::local());
     if let Some(said) = request.metadata().get(AS).and_then(|said| said.to_str().ok()).map(str::to_owned) {
@@ -137,9 +138,14 @@ fn known(mut request: Request<()>) -> std::result::Result<Request<()>, Status> {
         let name = words.next().ok_or_else(unreadable)?;
         let caller = match name.strip_prefix("robot:") {
             Some(robot) => {
-                let (robot_id, serial) = robot.split_once('#').map_or((robot, None), |(id, serial)| (id, Some(serial)));
+                let mut parts = robot.split('#');
+                let robot_id = parts.next().ok_or_else(unreadable)?;
                 let robot = Caller::robot(RobotId::parse(robot_id).map_err(|_| unreadable())?);
-                robot.with_certificate(serial.map(Into::into))
+                let robot = robot.with_certificate(parts.next().map(Into::into));
+                match parts.next().map(str::parse::<u8>) {
+                    Some(byte) => robot.with_key(Digest([byte.map_err(|_| unreadable())?; 32])),
+                    None => robot,
+                }
             }
             None => {
                 let grants: std::result::Result<_, _> = words.map(str::parse).collect();

@@ -248,12 +248,17 @@ impl World {
 
     /// Telemetry has met a second machine with the robot's name.
     pub async fn clone_seen(&self, id: &str) {
+        self.told_by_telemetry(id, midshift_core::fleet::CLONE_SEEN, "{}").await;
+    }
+
+    /// Telemetry states this about a machine with the robot's name.
+    pub async fn told_by_telemetry(&self, id: &str, kind: &'static str, body: &str) {
         let mut item = Item::new(Writer::Telemetry, id);
         item.facts.push(midshift_core::rows::Fact {
             log: midshift_core::rows::Log::Telemetry,
             subject: Arc::from(id),
-            kind: midshift_core::fleet::CLONE_SEEN,
-            body: "{}".into(),
+            kind,
+            body: body.into(),
         });
         self.commit(item).await;
     }

@@ -3,10 +3,13 @@
 use super::copy_out::in_time;
 use super::tables::{TableShape, tables};
 use super::{PostgresCopy, SCHEMAS, file};
+use crate::amend::amended;
 use crate::migrations::{Migration, pending};
 use crate::postgres::connect::{Database, PostgresConfig};
-use crate::postgres::{CONTROL_SCHEMA, migrate};
+use crate::postgres::{CONTROL_SCHEMA, migrate, write_sql};
 use crate::{OpenError, StoreId, sql};
+use midshift_core::ids::SiteId;
+use midshift_core::rows::{Item, Row as StoredRow, Table};
 use sqlx::{AssertSqlSafe, PgConnection, Row};
 use std::path::Path;
 use tokio::fs::File;
@@ -100,6 +103,29 @@ impl PostgresRestore {
         }
         in_time(sqlx::query(sql::RENEW).bind(&*id.0).execute(&mut connection)).await.map_err(failed)?;
         Ok(Self { connection, config: config.clone(), id: id.clone() })
+    }
+
+    /// All rows of these tables, as they are about to be.
+    ///
+    /// # Errors
+    /// The database.
+    pub async fn rows(&mut self, site_id: &SiteId, tables: &[Table]) -> Result<Vec<StoredRow>, RestoreError> {
+        let mut rows = Vec::new();
+        for table in tables {
+            let select = sqlx::query(AssertSqlSafe(sql::whole(*table))).bind(site_id.as_str());
+            for row in &in_time(select.fetch_all(&mut self.connection)).await.map_err(failed)? {
+                rows.push(sql::row(*table, row).map_err(failed)?);
+            }
+        }
+        Ok(rows)
+    }
+
+    /// Writes rows of an item with the others. No log has them: the restored store is another one, which everybody reads anew.
+    ///
+    /// # Errors
+    /// The database.
+    pub async fn amend(&mut self, site_id: &SiteId, item: &Item) -> Result<(), RestoreError> {
+        in_time(write_sql::rows(&mut self.connection, site_id, &amended(item))).await.map_err(failed)
     }
 
     /// Makes it what servers can open, durable.
