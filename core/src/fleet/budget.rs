@@ -2,14 +2,17 @@
 //!
 //! Called by `mod` before drains go on. Invariant: a drain that may wait begins only in an item that also writes its area's row, so two planners
 //! cannot both spend the last place; a robot that is out for several reasons counts once. Robots that charge or have no work are asked
-//! first. Drains of people and urgent ones count and do not wait. Whoever goes back from what was aborted waits for drains alone, and for
-//! those only that end by themselves: a robot that only a person brings back to work would otherwise keep it on bad software for as long. What an
-//! area's rules keep in work by capability holds for it too.
+//! first. Drains of people and urgent ones count and do not wait. Whoever changes to something new waits for the area's window too. The item in
+//! which a drain begins relies on the request and on the area's rules: whoever takes the one back or freezes the other is not passed unseen.
+//! Whoever goes back from what was aborted waits for drains alone, and for those only that end by themselves: a robot that only a person brings
+//! back to work would otherwise keep it on bad software for as long. What an area's rules keep in work by capability holds for it too.
 
 use super::rows::{AreaBudget, Drain, DrainState, RobotHolder};
 use super::view::View;
 use super::{Board, Plan, Tx, heard, objects};
 use crate::ids::{AreaId, RobotId};
+use crate::maintenance::{DrainRelease, DrainRequest};
+use crate::policy::AreaPolicy;
 use crate::reason::{Code, Reason};
 use crate::robot::{Duty, Presence};
 use crate::task::state::Errand;
@@ -70,8 +73,8 @@ fn is_same(known: &Reason, why: &Reason) -> bool {
 
 /// Lets waiting drains begin as far as the areas' rules allow, and keeps the areas' rows.
 pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
-    let mut waiting: Vec<Drain> =
-        view.drains.values().map(|d| &d.row).filter(|d| d.state == DrainState::Waiting).cloned().collect();
+    let waits = |d: &&Drain| d.state == DrainState::Waiting && !view.drain_releases.contains_key(d.drain_id.as_str());
+    let mut waiting: Vec<Drain> = view.drains.values().map(|d| &d.row).filter(waits).cloned().collect();
     if waiting.is_empty() && view.budgets.is_empty() {
         return;
     }
@@ -85,9 +88,8 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
         let here = objects::area_of(view, board, &drain.robot_id);
         let why = match (&here, view.drain_of(&drain.robot_id)) {
             (_, Some(other)) => Some(Reason::from(Code::RobotDraining).with("drain_id", &other.drain_id)),
-            (Some(area), None) if !drain.urgent => {
-                areas.get_mut(area).and_then(|a| refusal(view, board, &now, area, a, &drain))
-            }
+            (Some(area), None) if !drain.urgent => shut(view, &now, area, &drain)
+                .or_else(|| areas.get_mut(area).and_then(|a| refusal(view, board, &now, area, a, &drain))),
             _ => None,
         };
         if why.is_none()
@@ -107,8 +109,14 @@ fn begin(tx: &mut Tx, drain: Drain, area_id: Option<AreaId>, areas: &BTreeMap<Ar
     if let Some((id, area)) = area_id.as_ref().and_then(|id| areas.get_key_value(id)) {
         put_row(tx, id, area);
     }
-    let (state, since) = (DrainState::Draining, tx.now.utc);
+    let (state, since, drain_id) = (DrainState::Draining, tx.now.utc, drain.drain_id.clone());
+    let rules = area_id.clone();
     tx.put(Drain { state, since, area_id, why: None, ..drain }, "drain.begun");
+    tx.rely::<DrainRequest>(drain_id.as_str());
+    tx.rely::<DrainRelease>(drain_id.as_str());
+    if let Some(area_id) = rules {
+        tx.rely::<AreaPolicy>(area_id.as_str());
+    }
 }
 
 fn put_row(tx: &mut Tx, area_id: &AreaId, area: &Area) {
@@ -182,6 +190,13 @@ fn comes_to_an_end(board: &Board, now: &Now, robot_id: &RobotId) -> bool {
     let is_stuck =
         board.get(robot_id).and_then(|l| l.report.update.as_ref()).is_some_and(|u| u.state == UpdateState::Stuck);
     !is_stuck && heard::presence(board, robot_id, now) != Presence::Offline
+}
+
+/// Why a robot that changes to something new does not leave its work now, however many are out of it.
+fn shut(view: &View, now: &Now, area_id: &AreaId, drain: &Drain) -> Option<Reason> {
+    let forward = view.drain_requests.get(drain.drain_id.as_str()).is_some_and(|request| request.row.forward);
+    let shut = forward && !view.policy(area_id).software.is_open(now);
+    shut.then(|| Reason::from(Code::BlockedByWindow).with("area_id", area_id))
 }
 
 /// Why one more robot may not leave its work now.

@@ -409,6 +409,9 @@ fn apply_one(tx: &mut Tx, board: &Board, command: &Command, actor: &Actor) {
             let Some(row) = tx.view.bundles.get(bundle.as_str()).map(|b| b.row.clone()) else { return };
             let revoked = Some(act(tx, actor, reason));
             tx.put(Bundle { revoked, ..row }, "bundle.revoked");
+            let is_of = |r: &&Rollout| r.spec.bundle == *bundle && r.revert_of.is_none();
+            let of: Vec<Rollout> = tx.view.rollouts.values().map(|r| &r.row).filter(is_of).cloned().collect();
+            of.into_iter().for_each(|rollout| phases::revoke(tx, rollout));
         }
         Command::Pin { robot_id, reason } => {
             let pin = Some(act(tx, actor, reason));

@@ -1,11 +1,11 @@
 //! Writes what is due for a robot: its row, what it should run, drains asked for and released, permissions.
 //!
-//! Called with what [`super::robots::next`] said. Invariant: one move is one item; a permission relies on fleet's record of the robot and on the
-//! roll-out's row, and robots out of work are counted in that row.
+//! Called with what [`super::robots::next`] said. Invariant: one move is one item; a permission relies on fleet's record of the robot, on the rules
+//! of its area and on the roll-out's row, and robots out of work are counted in that row.
 
 use super::hear::{fail, is_hard, is_old, quarantine};
 use super::infrastructure::is_open_to;
-use super::robots::{Move, anchor, wants};
+use super::robots::{Move, anchor, area_ahead, is_asked, wants};
 use super::rows::{Given, Rollout, RolloutRobot, Step, WayBack};
 use super::stamp::Stamp;
 use super::turns::is_retried;
@@ -14,6 +14,7 @@ use super::{Board, Order, Sign, Tx, newcomers, verdict};
 use crate::ids::{DrainId, RobotId, RolloutId};
 use crate::limits;
 use crate::maintenance::{DrainRelease, DrainRequest, ReleasedBy};
+use crate::policy::AreaPolicy;
 use crate::reason::{Code, Reason};
 use crate::robot::Duty;
 use crate::time::Now;
@@ -71,14 +72,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             r.failure = r.failure.filter(|f| f.code != Code::RobotLost);
             tx.put(r, "robot.grant_not_used");
         }
-        Move::LeaveDrain(to) => {
-            if to == Step::Staged {
-                desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Stage, None, None));
-            }
-            let released_by = unpermitted(&r);
-            leave_drain(tx, &mut r, released_by);
-            step(tx, r, to, "robot.drain_left");
-        }
+        Move::LeaveDrain(to) => give_up_drain(tx, r, to),
         Move::Switched => {
             (r.moments.switched, r.moments.switched_link) = (Some(tx.now.utc), Some(stamp(tx)));
             // It runs, whatever the rows know of a permission: a store that was restored has forgotten some.
@@ -299,6 +293,7 @@ fn ask_drain(tx: &mut Tx, rollout: &Rollout, r: &mut RolloutRobot, urgent: bool)
         within_ms: rollout.spec.drain_within_ms,
         urgent,
         returns,
+        forward: rollout.revert_of.is_none() && r.step == Step::Staged,
     };
     tx.put(request, "drain.requested");
     r.drain_id = Some(drain_id);
@@ -313,6 +308,26 @@ fn leave_drain(tx: &mut Tx, r: &mut RolloutRobot, why: ReleasedBy) {
     count(tx, &r.rollout_id, -1);
 }
 
+/// Leaves a drain in which no permission may be alive.
+fn give_up_drain(tx: &mut Tx, mut r: RolloutRobot, to: Step) {
+    if to == Step::Staged {
+        desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Stage, None, None));
+    }
+    let released_by = unpermitted(&r);
+    leave_drain(tx, &mut r, released_by);
+    step(tx, r, to, "robot.drain_left");
+}
+
+/// Takes back what was asked of fleet for a roll-out that goes on no more, in the item that says so: no drain that waits begins after it. Those
+/// for which the item has no room are taken back one by one.
+pub fn take_back_asked(tx: &mut Tx, rollout_id: &RolloutId) {
+    // The robot, what it is told, and the release.
+    let room = limits::ITEM_ROWS_MAX.saturating_sub(tx.rows()) / 4;
+    let asked = tx.view.robots_of(rollout_id).filter(|r| is_asked(tx.view, r));
+    let asked: Vec<RolloutRobot> = asked.take(room).cloned().collect();
+    asked.into_iter().for_each(|r| give_up_drain(tx, r, Step::Staged));
+}
+
 /// One more or less is out of work for a roll-out: the row that two planners fight over.
 fn count(tx: &mut Tx, rollout_id: &RolloutId, by: i32) {
     let Some(rollout) = tx.view.rollout(rollout_id).cloned() else { return };
@@ -325,6 +340,9 @@ fn grant(tx: &mut Tx, board: &Board, rollout: &Rollout, mut r: RolloutRobot) {
     // Fleet's record must still say so when this is written.
     tx.rely::<crate::fleet::rows::RobotAuthority>(r.robot_id.as_str());
     tx.rely::<Rollout>(rollout.rollout_id.as_str());
+    if let Some(area) = area_ahead(tx.view, board, rollout, &r) {
+        tx.rely::<AreaPolicy>(area.as_str());
+    }
     let grant_id = number(tx);
     let given = ActivationGrant { grant_id, drain_id, authority };
     desire(tx, &r.robot_id, |d| d.grant = Some(given));

@@ -7,6 +7,7 @@ mod aborts;
 mod agents;
 mod asks;
 mod drains_and_grants;
+mod held_back;
 mod keyless;
 mod named;
 mod newcomers_and_pins;
@@ -407,6 +408,12 @@ impl Rig {
     }
 
     fn fleet_turn(&mut self) {
+        let items = self.fleet_plan();
+        self.commit(items);
+    }
+
+    /// What fleet decides, before it is committed.
+    fn fleet_plan(&mut self) -> Vec<Item> {
         let mut plan = fleet::Plan::default();
         let entries = self.feed[self.fleet_at..].to_vec();
         self.fleet_at = self.feed.len();
@@ -419,7 +426,7 @@ impl Rig {
         drain::obey(&mut self.fleet, self.now, &mut plan);
         budget::plan(&mut self.fleet, &self.board, self.now, &mut plan);
         drain::plan(&mut self.fleet, &self.board, self.now, &mut plan);
-        self.commit(plan.items);
+        plan.items
     }
 
     /// The service dies and reads everything again.
