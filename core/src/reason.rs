@@ -182,6 +182,8 @@ codes! {
         => "`midshift rollout get ROLLOUT --robots` says how far each of its robots is.";
     QuarantineNotFound = "QUARANTINE_NOT_FOUND", "This robot has no such bundle in quarantine."
         => "`midshift quarantine ls` lists them.";
+    RobotNotLost = "ROBOT_NOT_LOST", "The robot is heard, is not out of work for this roll-out, or has not been silent for as long as the roll-out bears."
+        => "`midshift rollout explain ROLLOUT ROBOT` says what it waits for; once it is lost, an incident says so.";
     // --- why a robot does not get a task
     RobotPinnedElsewhere = "ROBOT_PINNED_ELSEWHERE", "The task names another robot.";
     MissingCapability = "MISSING_CAPABILITY", "The robot cannot do one of the task's actions or lacks a required capability.";
@@ -279,6 +281,7 @@ codes! {
     // --- what a robot of a roll-out waits for
     BlockedByBudget = "BUDGET", "As many robots of the area as its rules allow are out of work.";
     BlockedByWindow = "WINDOW_CLOSED", "The area's maintenance window is closed, or the area is frozen.";
+    BlockedBySilence = "ROBOT_SILENT", "The robot is out of work for a roll-out and is not heard. Bring it back into reach. If it will not come, say so with midshift rollout lost: until it is heard it counts in no budget then, and keeps its drain.";
     BlockedByWave = "WAITING_FOR_WAVE", "Its wave has not begun.";
     BlockedByPlaceInWave = "WAITING_FOR_PLACE_IN_WAVE", "As many robots as the roll-out allows are out of work for it.";
     BlockedByPause = "ROLLOUT_PAUSED", "The roll-out stands still. Resume it.";

@@ -345,6 +345,7 @@ fn committed(rollout_id: &RolloutId, robot_id: RobotId, place: u64, at: Utc) -> 
         again: false,
         before: TaskTally::default(),
         moments: Default::default(),
+        lost: None,
     }
 }
 

@@ -1,7 +1,8 @@
 //! How many robots of an area may be out of work at once, and who is next.
 //!
 //! Called by `mod` before drains go on. Invariant: a drain that may wait begins only in an item that also writes its area's row, so two planners
-//! cannot both spend the last place; a robot that is out for several reasons counts once. Robots that charge or have no work are asked
+//! cannot both spend the last place; a robot that is out for several reasons counts once, and one that was written off does not until it is
+//! heard. Robots that charge or have no work are asked
 //! first. Drains of people and urgent ones count and do not wait. Whoever changes to something new waits for the area's window too. The item in
 //! which a drain begins relies on the request and on the area's rules: whoever takes the one back or freezes the other is not passed unseen.
 //! Whoever goes back from what was aborted waits for drains alone, and for those only that end by themselves: a robot that only a person brings
@@ -99,10 +100,20 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
         }
         plan.decide(view, now, "fleet", |tx| match why {
             Some(why) if drain.why.as_ref().is_some_and(|known| is_same(known, &why)) => {}
-            Some(why) => tx.put(Drain { why: Some(why), ..drain }, "drain.waits"),
+            Some(why) => wait(tx, drain, why, here, &areas),
             None => begin(tx, drain, here, &areas),
         });
     }
+}
+
+/// It waits on; the area's row says for whom, however they came out of work.
+fn wait(tx: &mut Tx, drain: Drain, why: Reason, area_id: Option<AreaId>, areas: &BTreeMap<AreaId, Area>) {
+    if let Some((id, area)) = area_id.as_ref().and_then(|id| areas.get_key_value(id))
+        && tx.view.budgets.get(id.as_str()).is_none_or(|b| b.row != row_of(tx.view, id, area))
+    {
+        put_row(tx, id, area);
+    }
+    tx.put(Drain { why: Some(why), ..drain }, "drain.waits");
 }
 
 fn begin(tx: &mut Tx, drain: Drain, area_id: Option<AreaId>, areas: &BTreeMap<AreaId, Area>) {
@@ -173,7 +184,8 @@ fn areas(view: &View, board: &Board, now: &Now) -> BTreeMap<AreaId, Area> {
             area.draining.insert(robot_id.clone());
         }
     }
-    for drain in view.drains.values().map(|d| &d.row).filter(|d| d.is_on()) {
+    let counts = |drain: &&Drain| drain.is_on() && !is_written_off(view, board, now, drain);
+    for drain in view.drains.values().map(|d| &d.row).filter(counts) {
         if let Some(area_id) = &drain.area_id {
             let area = areas.entry(area_id.clone()).or_default();
             area.off_work.insert(drain.robot_id.clone());
@@ -183,6 +195,12 @@ fn areas(view: &View, board: &Board, now: &Now) -> BTreeMap<AreaId, Area> {
         }
     }
     areas
+}
+
+/// The robot is not heard, and a person or its roll-out's policy said that it counts in no budget until it is.
+fn is_written_off(view: &View, board: &Board, now: &Now, drain: &Drain) -> bool {
+    let said = view.drain_requests.get(drain.drain_id.as_str()).is_some_and(|request| request.row.written_off);
+    said && heard::presence(board, &drain.robot_id, now) == Presence::Offline
 }
 
 /// The robot is heard, and is not stuck with what it runs: its drain ends without a person.

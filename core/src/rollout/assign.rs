@@ -46,5 +46,6 @@ pub fn fresh(
         again: false,
         before: TaskTally::default(),
         moments: Moments::default(),
+        lost: None,
     }
 }

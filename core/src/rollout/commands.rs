@@ -50,6 +50,8 @@ pub enum Verb {
     RetryFailed,
     /// Leave a robot out.
     Exclude(RobotId),
+    /// A robot that is lost counts in no budget until it is heard.
+    Lost(RobotId),
 }
 
 /// One request.
@@ -320,6 +322,14 @@ fn verb_fits(view: &View, board: &Board, rollout: &Rollout, verb: &Verb) -> Resu
             let known = known.ok_or_else(|| not_found(Code::RobotNotFound, "robot_id", robot_id))?;
             now_is(known.step < Step::Draining, known.step == Step::Skipped)
         }
+        Verb::Lost(robot_id) => {
+            let known = view.robot_of(&rollout.rollout_id, robot_id);
+            let known = known.ok_or_else(|| not_found(Code::RobotNotFound, "robot_id", robot_id))?;
+            let after = rollout.spec.lost_after_ms;
+            let reason = || Reason::from(Code::RobotNotLost).with("robot_id", robot_id).with("lost_after_ms", after);
+            let lost = known.lost.as_ref().ok_or_else(|| Refusal::new(Kind::Precondition, reason()))?;
+            Ok(lost.written_off.is_some())
+        }
     }
 }
 
@@ -492,6 +502,11 @@ fn verb_one(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor: &Act
         Verb::Exclude(robot_id) => {
             let row = RolloutRobot::id_of(id, robot_id);
             moves::make(tx, &super::NoSign, board, &row, robots::Move::Skip(why(Code::SkippedExcluded)));
+        }
+        Verb::Lost(robot_id) => {
+            let Some(row) = tx.view.robot_of(id, robot_id).cloned() else { return };
+            let act = act(tx, actor, reason);
+            moves::write_off(tx, row, act);
         }
         Verb::Start { .. } | Verb::RetryFailed => {}
     }

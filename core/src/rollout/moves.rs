@@ -6,7 +6,7 @@
 use super::hear::{fail, is_hard, is_old, quarantine};
 use super::infrastructure::is_open_to;
 use super::robots::{Move, anchor, area_ahead, is_asked, wants};
-use super::rows::{Given, Rollout, RolloutRobot, Step, WayBack};
+use super::rows::{Act, Given, Lost, Rollout, RolloutRobot, Step, WayBack};
 use super::stamp::Stamp;
 use super::turns::is_retried;
 use super::view::View;
@@ -133,6 +133,13 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             r.attempted = true;
             newcomers::failed(tx, &rollout, &r);
             step(tx, r, Step::Stuck, "robot.stuck");
+        }
+        Move::Lost => lose(tx, &rollout, r),
+        Move::Heard => {
+            if !r.counts() {
+                recount(tx, &r, 1);
+            }
+            tx.put(RolloutRobot { lost: None, ..r }, "robot.heard_again");
         }
     }
 }
@@ -294,18 +301,56 @@ fn ask_drain(tx: &mut Tx, rollout: &Rollout, r: &mut RolloutRobot, urgent: bool)
         urgent,
         returns,
         forward: rollout.revert_of.is_none() && r.step == Step::Staged,
+        written_off: !r.counts(),
     };
     tx.put(request, "drain.requested");
     r.drain_id = Some(drain_id);
     (r.ready, r.grant, r.not_used) = (false, None, false);
-    count(tx, &r.rollout_id, 1);
+    if r.counts() {
+        count(tx, &r.rollout_id, 1);
+    }
 }
 
 fn leave_drain(tx: &mut Tx, r: &mut RolloutRobot, why: ReleasedBy) {
     let Some(drain_id) = r.drain_id.take() else { return };
     (r.ready, r.grant) = (false, None);
     tx.put(DrainRelease { drain_id, why }, "drain.release");
-    count(tx, &r.rollout_id, -1);
+    if r.counts() {
+        count(tx, &r.rollout_id, -1);
+    }
+}
+
+/// A person is told of a robot that is lost; the roll-out's policy may say the rest.
+fn lose(tx: &mut Tx, rollout: &Rollout, mut r: RolloutRobot) {
+    let reason = Reason::from(Code::BlockedBySilence).with("rollout_id", &r.rollout_id);
+    super::incident(tx, Some(&r.robot_id), &reason.with("lost_after_ms", rollout.spec.lost_after_ms));
+    r.lost = Some(Lost { since: tx.now.utc, written_off: None });
+    if rollout.spec.writes_off_lost {
+        let reason = "its policy says so".to_owned();
+        let act = Act { actor: "ota".to_owned(), person: None, reason, at: tx.now.utc };
+        return write_off(tx, r, act);
+    }
+    tx.put(r, "robot.lost");
+}
+
+/// A robot that is lost counts in no budget until it is heard. It keeps its drain.
+pub fn write_off(tx: &mut Tx, mut r: RolloutRobot, act: Act) {
+    let counted = r.counts();
+    let Some(lost) = &mut r.lost else { return };
+    lost.written_off = Some(act);
+    if counted {
+        recount(tx, &r, -1);
+    }
+    tx.put(r, "robot.written_off");
+}
+
+/// The drain of a robot counts for fleet and for the roll-out from now on, or does not.
+fn recount(tx: &mut Tx, r: &RolloutRobot, by: i32) {
+    let request = r.drain_id.as_ref().and_then(|id| tx.view.requests.get(id.as_str())).map(|q| q.row.clone());
+    if let Some(request) = request {
+        tx.put(DrainRequest { written_off: by < 0, ..request }, "drain.recounted");
+        count(tx, &r.rollout_id, by);
+    }
 }
 
 /// Leaves a drain in which no permission may be alive.

@@ -10,11 +10,12 @@ use super::turns::{is_late, is_newcomer, is_on, is_retried};
 use super::view::View;
 use super::{Board, infrastructure, matching, served, verdict};
 use crate::authority::Authority;
+use crate::fleet::heard;
 use crate::fleet::rows::DrainState;
 use crate::ids::{AreaId, RobotId, RolloutId};
 use crate::limits;
 use crate::reason::{Code, Reason};
-use crate::robot::{Duty, HardwareStop};
+use crate::robot::{Duty, HardwareStop, Presence};
 use crate::time::Now;
 use crate::update::{Goal, UpdateReport, UpdateState};
 
@@ -65,6 +66,10 @@ pub enum Move {
     RolledBack(Reason),
     /// It could not go back.
     Stuck(Reason),
+    /// It is out of work and not heard for longer than the roll-out bears.
+    Lost,
+    /// It was lost, and is heard.
+    Heard,
 }
 
 /// What is due for `r` now, if anything.
@@ -72,8 +77,12 @@ pub fn next(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollou
     if view.duty(&r.robot_id) == Duty::Retired && !r.step.is_over() {
         return Some(Move::Skip(Code::SkippedRetired.into()));
     }
+    let is_silent = heard::presence(board, &r.robot_id, now) == Presence::Offline;
+    if r.lost.is_some() && !is_silent {
+        return Some(Move::Heard);
+    }
     let report = report_of(view, board, r).filter(|report| report.directive >= r.directive);
-    match r.step {
+    let due = match r.step {
         Step::Waiting => waiting(view, board, now, rollout, r),
         Step::Staging => staging(view, board, now, rollout, r, report),
         Step::Staged => staged(view, board, now, rollout, r, report),
@@ -90,7 +99,10 @@ pub fn next(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollou
         Step::Stuck => {
             report.filter(|r| r.state == UpdateState::RolledBack).map(|_| Move::RolledBack(Code::RollbackFailed.into()))
         }
-    }
+    };
+    let is_out = is_silent && r.drain_id.is_some() && r.lost.is_none();
+    let is_long = || infrastructure::silent_ms(view, board, now, &r.robot_id) >= rollout.spec.lost_after_ms;
+    due.or_else(|| (is_out && is_long()).then_some(Move::Lost))
 }
 
 fn is_tried_again(rollout: &Rollout, r: &RolloutRobot) -> bool {

@@ -299,7 +299,7 @@ pub struct Rollout {
     pub version: u64,
     /// Rises with each pause, resume and abort: permissions of an older one are not given any more.
     pub generation: u64,
-    /// Robots that are out of work for it: drains that were not released.
+    /// Robots that are out of work for it: drains that were not released, but for those of robots that were written off.
     pub in_flight: u32,
     /// The wave is only watched until then.
     pub soak: Option<Countdown>,
@@ -460,6 +460,15 @@ pub struct WayBack {
     pub again: bool,
 }
 
+/// A robot that is out of work for a roll-out and was not heard for longer than the roll-out bears.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Lost {
+    /// UTC, site clock, when a person was told.
+    pub since: Utc,
+    /// Who said that it counts in no budget until it is heard. None: nobody did.
+    pub written_off: Option<Act>,
+}
+
 /// One robot in one roll-out.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RolloutRobot {
@@ -505,9 +514,16 @@ pub struct RolloutRobot {
     pub before: TaskTally,
     /// When what happened.
     pub moments: Moments,
+    /// It is lost. None: it is heard, or has not been silent for long.
+    #[serde(default)]
+    pub lost: Option<Lost>,
 }
 
 impl RolloutRobot {
+    /// Its drain counts among the robots that are out of work.
+    pub fn counts(&self) -> bool {
+        self.lost.as_ref().is_none_or(|lost| lost.written_off.is_none())
+    }
     /// It was given no permission, or was seen to have left the last one unused.
     pub const fn never_ran(&self) -> bool {
         !self.attempted || (self.not_used && self.moments.switched.is_none())

@@ -19,6 +19,13 @@ pub const PROBATION_DEFAULT_MS: u64 = 180_000;
 /// Probation, milliseconds of site time.
 const PROBATION_MS: RangeInclusive<u64> = 1_000..=24 * 3_600_000;
 
+/// Silence after which a robot out of work is lost, milliseconds of link time.
+const LOST_AFTER_MS: RangeInclusive<u64> = 60_000..=30 * 24 * 3_600_000;
+/// As much where a spec says nothing, milliseconds of link time: long after the gates have judged what is theirs.
+const fn lost_after_ms() -> u64 {
+    900_000
+}
+
 /// Whom a roll-out is for. Everything that is named must hold; what is empty holds for all.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Selector {
@@ -122,6 +129,12 @@ pub struct RolloutSpec {
     /// The gate on rates of task failures ends the roll-out too; else it is only shown, unless rules of an area say otherwise:
     /// [`super::verdict::acts_on_rates`].
     pub acts_on_rates: bool,
+    /// Milliseconds of link time after which a robot that is out of work for it and is not heard is lost: an incident.
+    #[serde(default = "lost_after_ms")]
+    pub lost_after_ms: u64,
+    /// A robot that is lost counts in no budget until it is heard. Else a person has to say so.
+    #[serde(default)]
+    pub writes_off_lost: bool,
 }
 
 impl RolloutSpec {
@@ -143,6 +156,8 @@ impl RolloutSpec {
             allow_full_push: false,
             rate_bytes_s: 0,
             acts_on_rates: false,
+            lost_after_ms: lost_after_ms(),
+            writes_off_lost: false,
         }
     }
 
@@ -174,6 +189,7 @@ impl RolloutSpec {
         within("probation_ms", self.probation_ms, &PROBATION_MS);
         within("soak_ms", self.soak_ms, &(0..=*LIMIT_MS.end()));
         within("exposure_within_ms", self.exposure_within_ms, &LIMIT_MS);
+        within("lost_after_ms", self.lost_after_ms, &LOST_AFTER_MS);
         if self.exposure_tasks > 10_000 {
             bad.add("exposure_tasks", "must be at most 10000");
         }
@@ -226,6 +242,7 @@ mod tests {
             drain_within_ms: 0,
             max_in_flight: Some(0),
             exposure_tasks: 10_001,
+            lost_after_ms: 59_999,
             ..spec()
         };
         let expected = [
@@ -235,6 +252,7 @@ mod tests {
             "waves[3]",
             "drain_within_ms",
             "probation_ms",
+            "lost_after_ms",
             "exposure_tasks",
             "max_in_flight",
         ];

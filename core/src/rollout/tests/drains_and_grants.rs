@@ -304,6 +304,7 @@ fn request(n: usize, urgent: bool) -> crate::maintenance::DrainRequest {
         urgent,
         returns: false,
         forward: false,
+        written_off: false,
     }
 }
 

@@ -9,6 +9,7 @@ mod asks;
 mod drains_and_grants;
 mod held_back;
 mod keyless;
+mod lost;
 mod named;
 mod newcomers_and_pins;
 mod once;
@@ -476,7 +477,13 @@ impl Rig {
         for rollout in self.ota.rollouts.values().map(|r| &r.row) {
             let drains: Vec<&DrainId> =
                 self.ota.robots_of(&rollout.rollout_id).filter_map(|r| r.drain_id.as_ref()).collect();
-            assert_eq!(rollout.in_flight as usize, drains.len(), "in flight");
+            let counted = self.ota.robots_of(&rollout.rollout_id).filter(|r| r.drain_id.is_some() && r.counts());
+            assert_eq!(rollout.in_flight as usize, counted.count(), "in flight");
+            for r in self.ota.robots_of(&rollout.rollout_id) {
+                let waits = super::explain::blocked(&self.ota, &self.board, &self.now, rollout, r);
+                let until = waits.as_ref().and_then(|waits| waits.deadline);
+                assert!(until.is_none_or(|until| until > self.now.utc), "{} waits for the past: {waits:?}", r.robot_id);
+            }
             for drain_id in drains {
                 assert!(self.ota.requests.contains_key(drain_id.as_str()), "a drain without a request");
                 assert!(!self.ota.releases.contains_key(drain_id.as_str()), "a drain that was released");

@@ -44,6 +44,7 @@ pub fn spec(wire: &v1::RolloutSpec, bundle: BundleId, probation_ms: u64, bad: &m
     let probation_ms = ms("probation", &wire.probation, default.probation_ms);
     let soak_ms = ms("soak", &wire.soak, default.soak_ms);
     let exposure_within_ms = ms("exposure_within", &wire.exposure_within, default.exposure_within_ms);
+    let lost_after_ms = ms("lost_after", &wire.lost_after, default.lost_after_ms);
     let waves = if wire.waves.is_empty() { default.waves.clone() } else { waves(&wire.waves, bad) };
     RolloutSpec {
         selector: wire.selector.as_ref().map(|s| selector(s, bad)).unwrap_or_default(),
@@ -60,6 +61,8 @@ pub fn spec(wire: &v1::RolloutSpec, bundle: BundleId, probation_ms: u64, bad: &m
         allow_full_push: wire.allow_full_push,
         rate_bytes_s: wire.rate_bytes_s,
         acts_on_rates: wire.acts_on_rates,
+        lost_after_ms,
+        writes_off_lost: wire.writes_off_lost,
         bundle: default.bundle,
     }
 }

@@ -70,6 +70,8 @@ fn spec(spec: &RolloutSpec) -> v1::RolloutSpec {
         allow_full_push: spec.allow_full_push,
         rate_bytes_s: spec.rate_bytes_s,
         acts_on_rates: spec.acts_on_rates,
+        lost_after: Some(duration(spec.lost_after_ms)),
+        writes_off_lost: spec.writes_off_lost,
     }
 }
 
@@ -228,6 +230,8 @@ pub fn robot(view: &View, board: &Board, now: &Now, row: &Rollout, r: &RolloutRo
             probation: span(m.switched, m.on_trial),
         }),
         drain_id: text(r.drain_id.as_ref()),
+        lost: r.lost.as_ref().map(|lost| timestamp(lost.since)),
+        written_off: r.lost.as_ref().and_then(|lost| lost.written_off.as_ref()).map(act),
     }
 }
 

@@ -77,6 +77,12 @@ pub struct Create {
     /// A suspicion from rates of task failures ends it too. Without it that is only shown.
     #[arg(long)]
     acts_on_rates: bool,
+    /// Time after which a robot that is out of work for it and is not heard is lost, and somebody is told. Without it 15m.
+    #[arg(long, value_parser = crate::cli::duration)]
+    lost_after: Option<Duration>,
+    /// Lost robots count in no budget until they are heard. Without it somebody has to say so: rollout lost.
+    #[arg(long)]
+    write_off_lost: bool,
     /// Only tell what it would do now: whom it reaches, who is left out and why. Nothing is written.
     #[arg(long, conflicts_with_all = ["start", "supersede"])]
     dry_run: bool,
@@ -151,6 +157,8 @@ impl Create {
             allow_full_push: self.allow_full_push,
             rate_bytes_s: self.rate.unwrap_or_default(),
             acts_on_rates: self.acts_on_rates,
+            lost_after: site(self.lost_after),
+            writes_off_lost: self.write_off_lost,
         }
     }
 

@@ -226,6 +226,15 @@ rbt-04 in walk-1.5.0, wave 2/3: DRAINING since 1970-01-01T00:01:20.000Z
 }
 
 #[test]
+fn an_explanation_says_since_when_a_robot_is_lost_and_who_wrote_it_off() {
+    let act = v1::RolloutAct { actor: "ana".into(), reason: "crushed".into(), time: at(95) };
+    let lost = v1::RolloutRobot { lost: at(90), written_off: Some(act), deadline: None, ..draining() };
+    let told = look::explanation(&rollout(), &lost);
+    assert!(told.contains("  lost since ") && told.contains("as long as it takes"), "{told}");
+    assert!(told.contains("  counts in no budget, written off by ana ") && told.contains("(crushed)"), "{told}");
+}
+
+#[test]
 fn medians_are_of_each_part_alone_over_the_robots_that_have_it() {
     let robots = [draining(), on_trial(), robot("rbt-09", 1, RolloutStep::Staged)];
     let told = text::off_work_medians(robots.iter()).unwrap();
@@ -345,7 +354,7 @@ fn flags_become_the_spec_and_what_no_flag_says_is_left_to_the_server() {
     assert_eq!(plain, v1::RolloutSpec { bundle: "walk-1.5.0".into(), ..Default::default() });
     let flags = "create trial --bundle walk-1.5.0 --waves 1,25%,rest --soak 10s --probation 1m --drain-within 2h --exposure-tasks 0 \
         --exposure-within 90s --max-in-flight 2 --area hall,dock --robot r1 --robot r2 --label site=north --model h1 --from-version 1.4.0 \
-        --small-wave review --small-wave-failure review --abort-scope trial --allow-full-push --rate 5MiB --acts-on-rates";
+        --small-wave review --small-wave-failure review --abort-scope trial --allow-full-push --rate 5MiB --acts-on-rates --lost-after 1h --write-off-lost";
     let spec = Line::parse_from(flags.split_whitespace()).create.spec();
     let expected = v1::RolloutSpec {
         bundle: "walk-1.5.0".into(),
@@ -369,6 +378,8 @@ fn flags_become_the_spec_and_what_no_flag_says_is_left_to_the_server() {
         allow_full_push: true,
         rate_bytes_s: 5 << 20,
         acts_on_rates: true,
+        lost_after: Some(duration(3_600_000)),
+        writes_off_lost: true,
     };
     assert_eq!(spec, expected);
 }

@@ -94,6 +94,7 @@ fn on_trial() -> RolloutRobot {
         again: false,
         before: TaskTally::default(),
         moments: Moments { on_trial: Some(Utc(0)), ..Moments::default() },
+        lost: None,
     }
 }
 
