@@ -286,6 +286,7 @@ fn release(bundle: BundleId, number: u64, at: Utc) -> Bundle {
         is_irreversible: false,
         has_base: false,
         requires: Default::default(),
+        rollback_index: None,
         listed: false,
         revoked: None,
         published: at,

@@ -3,7 +3,7 @@
 //!
 //! Invariant: a command is checked against the whole picture before anything of it is written; asked twice it does the same once.
 
-use super::dry_run::{bundle, dry_run};
+use super::dry_run::{bundle, dry_run, meets_floor};
 use super::matching::{self, Members, keeps};
 use super::noted::{note, note_of_verb};
 use super::rows::{
@@ -218,7 +218,7 @@ pub fn check(view: &View, board: &Board, command: &Command, seen: Option<Revisio
             let mut bad = Violations::default();
             spec.check(&mut bad);
             bad.finish()?;
-            bundle(view, &spec.bundle)?;
+            meets_floor(bundle(view, &spec.bundle)?, spec)?;
             room(view)
         }
         Command::Rollback { of, rollout_id } => {

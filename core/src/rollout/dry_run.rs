@@ -48,15 +48,30 @@ pub fn bundle<'a>(view: &'a View, id: &BundleId) -> Result<&'a Bundle, Refusal> 
     Ok(bundle)
 }
 
+/// Whether the bundle meets the floor that is asked for.
+///
+/// # Errors
+/// Every robot would refuse it.
+pub fn meets_floor(bundle: &Bundle, spec: &RolloutSpec) -> Result<(), Refusal> {
+    match bundle.rollback_index.filter(|index| *index < spec.rollback_floor) {
+        Some(index) => {
+            let rule = format!("must be at most {index}, the lowest of the bundle: every robot would refuse it");
+            Err(Refusal::field("rollback_floor", rule))
+        }
+        None => Ok(()),
+    }
+}
+
 /// What a roll-out would do, or everything that speaks against it.
 ///
 /// # Errors
-/// A bundle that is not there; rules that are broken; nobody matched; a first wave that is too large; a budget that lets nobody out.
+/// A bundle that is not there; rules that are broken; a floor above the bundle; nobody matched; a first wave that is too large; a budget that lets nobody out.
 pub fn dry_run(view: &View, board: &Board, id: &RolloutId, spec: &RolloutSpec) -> Result<DryRun, Refusal> {
     let mut bad = Violations::default();
     spec.check(&mut bad);
     bad.finish()?;
     let bundle = bundle(view, &spec.bundle)?;
+    meets_floor(bundle, spec)?;
     let matching = matching::of(view, board, id, spec, bundle);
     let robots = matching.robots.len();
     if robots == 0 {

@@ -63,6 +63,8 @@ pub struct Order<'a> {
     pub bundle: &'a BundleId,
     /// Bytes of its manifest.
     pub manifest_length: u64,
+    /// No component may have a lower `rollback_index`.
+    pub rollback_floor: u64,
     /// For which roll-out.
     pub rollout_id: &'a RolloutId,
     /// UTC of the wall.

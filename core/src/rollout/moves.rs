@@ -230,6 +230,7 @@ fn direct(
         generation,
         bundle: &bundle.bundle,
         manifest_length: bundle.manifest_length,
+        rollback_floor: if goal == Goal::Revert { 0 } else { rollout.spec.rollback_floor },
         rollout_id: &rollout.rollout_id,
         issued_at: tx.now.wall,
     };

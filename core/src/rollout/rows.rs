@@ -71,6 +71,9 @@ pub struct Bundle {
     /// Components that its own need beside them, and their lowest versions.
     #[serde(default)]
     pub requires: BTreeMap<String, String>,
+    /// The lowest `rollback_index` of its components. None: it was published before that was kept.
+    #[serde(default)]
+    pub rollback_index: Option<u64>,
     /// The newest release lists it.
     pub listed: bool,
     /// A person took it back.

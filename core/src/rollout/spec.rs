@@ -135,6 +135,9 @@ pub struct RolloutSpec {
     /// A robot that is lost counts in no budget until it is heard. Else a person has to say so.
     #[serde(default)]
     pub writes_off_lost: bool,
+    /// No component of the bundle may have a lower `rollback_index`: each robot holds it against what it is given. Whoever goes back does not.
+    #[serde(default)]
+    pub rollback_floor: u64,
 }
 
 impl RolloutSpec {
@@ -158,6 +161,7 @@ impl RolloutSpec {
             acts_on_rates: false,
             lost_after_ms: lost_after_ms(),
             writes_off_lost: false,
+            rollback_floor: 0,
         }
     }
 

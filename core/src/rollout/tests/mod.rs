@@ -530,6 +530,7 @@ fn bundle(n: u32) -> Bundle {
         is_irreversible: false,
         has_base: false,
         requires: BTreeMap::new(),
+        rollback_index: Some(4),
         listed: true,
         revoked: None,
         published: Utc(BEGIN),

@@ -77,6 +77,32 @@ fn a_budget_that_lets_nobody_out_is_told_at_once_and_only_to_whom_it_concerns() 
     assert!(dry_run(&rig.ota, &rig.board, &rollout_id("ro"), &tow).is_ok(), "no robot that lifts is reached");
 }
 
+/// Keeps the floors that it was to sign.
+struct Floors(std::cell::RefCell<Vec<u64>>);
+
+impl Sign for Floors {
+    fn directive(&self, order: &Order) -> String {
+        self.0.borrow_mut().push(order.rollback_floor);
+        Plain.directive(order)
+    }
+}
+
+#[test]
+fn the_floor_that_is_asked_for_is_signed_and_one_above_the_bundle_is_refused() {
+    let mut rig = Rig::new(3);
+    let above = RolloutSpec { rollback_floor: 5, ..spec() };
+    let refused = dry_run(&rig.ota, &rig.board, &rollout_id("ro"), &above).expect_err("the bundle has 4");
+    assert_eq!(refused.violations.iter().map(|v| v.field.as_str()).collect::<Vec<_>>(), ["rollback_floor"]);
+    let create = Command::Create { rollout_id: rollout_id("no"), spec: Arc::new(above) };
+    assert!(rig.ask(&create).is_err(), "it is not even written down");
+    rig.keyless = true;
+    rig.start(RolloutSpec { rollback_floor: 4, ..spec() });
+    rig.pass(1_000);
+    let (floors, heard, mut plan) = (Floors(Vec::new().into()), std::mem::take(&mut rig.heard), Plan::default());
+    cycle(&mut rig.ota, rig.now, &rig.board, &heard, Some(&floors), &mut plan);
+    assert_eq!(floors.0.into_inner(), [4, 4, 4]);
+}
+
 #[test]
 fn who_is_left_out_is_told_with_the_reason() {
     let mut rig = Rig::new(6);

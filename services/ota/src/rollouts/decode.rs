@@ -63,6 +63,7 @@ pub fn spec(wire: &v1::RolloutSpec, bundle: BundleId, probation_ms: u64, bad: &m
         acts_on_rates: wire.acts_on_rates,
         lost_after_ms,
         writes_off_lost: wire.writes_off_lost,
+        rollback_floor: wire.rollback_floor,
         bundle: default.bundle,
     }
 }

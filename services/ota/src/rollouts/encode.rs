@@ -72,6 +72,7 @@ fn spec(spec: &RolloutSpec) -> v1::RolloutSpec {
         acts_on_rates: spec.acts_on_rates,
         lost_after: Some(duration(spec.lost_after_ms)),
         writes_off_lost: spec.writes_off_lost,
+        rollback_floor: spec.rollback_floor,
     }
 }
 

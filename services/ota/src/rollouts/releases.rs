@@ -91,6 +91,7 @@ fn fresh(bundle: BundleId, manifest: &Manifest, manifest_length: u64, published:
         is_irreversible: manifest.components.iter().any(|c| c.data_migration == Migration::Irreversible),
         has_base: manifest.components.iter().any(|c| c.kind == ComponentKind::Base),
         requires: required(manifest),
+        rollback_index: manifest.components.iter().map(|c| c.rollback_index).min(),
         listed: true,
         revoked: None,
         published,

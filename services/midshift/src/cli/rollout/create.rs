@@ -83,6 +83,9 @@ pub struct Create {
     /// Lost robots count in no budget until they are heard. Without it somebody has to say so: rollout lost.
     #[arg(long)]
     write_off_lost: bool,
+    /// No component may have a lower rollback index than this: robots refuse it. Without it 0; each robot holds its own floor beside it.
+    #[arg(long, default_value_t = 0)]
+    rollback_floor: u64,
     /// Only tell what it would do now: whom it reaches, who is left out and why. Nothing is written.
     #[arg(long, conflicts_with_all = ["start", "supersede"])]
     dry_run: bool,
@@ -159,6 +162,7 @@ impl Create {
             acts_on_rates: self.acts_on_rates,
             lost_after: site(self.lost_after),
             writes_off_lost: self.write_off_lost,
+            rollback_floor: self.rollback_floor,
         }
     }
 

@@ -354,7 +354,8 @@ fn flags_become_the_spec_and_what_no_flag_says_is_left_to_the_server() {
     assert_eq!(plain, v1::RolloutSpec { bundle: "walk-1.5.0".into(), ..Default::default() });
     let flags = "create trial --bundle walk-1.5.0 --waves 1,25%,rest --soak 10s --probation 1m --drain-within 2h --exposure-tasks 0 \
         --exposure-within 90s --max-in-flight 2 --area hall,dock --robot r1 --robot r2 --label site=north --model h1 --from-version 1.4.0 \
-        --small-wave review --small-wave-failure review --abort-scope trial --allow-full-push --rate 5MiB --acts-on-rates --lost-after 1h --write-off-lost";
+        --small-wave review --small-wave-failure review --abort-scope trial --allow-full-push --rate 5MiB --acts-on-rates --lost-after 1h --write-off-lost \
+        --rollback-floor 3";
     let spec = Line::parse_from(flags.split_whitespace()).create.spec();
     let expected = v1::RolloutSpec {
         bundle: "walk-1.5.0".into(),
@@ -380,6 +381,7 @@ fn flags_become_the_spec_and_what_no_flag_says_is_left_to_the_server() {
         acts_on_rates: true,
         lost_after: Some(duration(3_600_000)),
         writes_off_lost: true,
+        rollback_floor: 3,
     };
     assert_eq!(spec, expected);
 }

@@ -34,6 +34,7 @@ fn bundle(bundle: BundleId) -> Bundle {
         is_irreversible: false,
         has_base: false,
         requires: BTreeMap::new(),
+        rollback_index: None,
         listed: true,
         revoked: None,
         published: Utc(0),
