@@ -280,6 +280,7 @@ fn release(bundle: BundleId, number: u64, at: Utc) -> Bundle {
         version: version(number),
         manifest_length: 1_000,
         length: 1_000_000,
+        room: 0,
         hardware: Default::default(),
         needs: "restart".to_owned(),
         hard_stop_codes: Default::default(),

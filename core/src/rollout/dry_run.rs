@@ -176,8 +176,10 @@ fn caveats(view: &View, spec: &RolloutSpec, bundle: &Bundle, matching: &Matching
         let rest = if more > 0 { format!(" and {more} more") } else { String::new() };
         (!ids.is_empty()).then(|| format!("{}{rest}", ids[..ids.len().min(NAMED_MAX)].join(", ")))
     };
-    if let Some(robots) = named(&|i| i.free_bytes < bundle.length) {
-        caveats.push(format!("less room than its {} bytes, when last attached: {robots}", bundle.length));
+    let room = bundle.room.max(bundle.length);
+    if let Some(robots) = named(&|i| i.free_bytes < room) {
+        let what = "for a third set and a file as it comes";
+        caveats.push(format!("less room than {room} bytes, {what}, when last attached: {robots}"));
     }
     for (name, version) in &bundle.requires {
         if let Some(robots) = named(&|i| lacks(i, name, version)) {

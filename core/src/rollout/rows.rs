@@ -58,6 +58,10 @@ pub struct Bundle {
     pub manifest_length: u64,
     /// Bytes of all components.
     pub length: u64,
+    /// Bytes that a robot needs free beside the two sets that it keeps: all components, the file of the longest as it comes over the wire, which
+    /// is at most as long, and a new base once more, in its slot. 0: it was published before that was kept.
+    #[serde(default)]
+    pub room: u64,
     /// Models that every component runs on.
     pub hardware: BTreeSet<String>,
     /// What a robot must do to change to it: `none`, `restart`, `park`, `reboot`.

@@ -524,6 +524,7 @@ fn bundle(n: u32) -> Bundle {
         version: format!("{n}.0.0"),
         manifest_length: 100,
         length: 1_000,
+        room: 1_200,
         hardware: BTreeSet::from(["m1".to_owned()]),
         needs: "restart".into(),
         hard_stop_codes: BTreeSet::from([66]),

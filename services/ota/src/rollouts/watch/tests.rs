@@ -28,6 +28,7 @@ fn bundle(bundle: BundleId) -> Bundle {
         version: "1.5.0".into(),
         manifest_length: 1,
         length: 1,
+        room: 2,
         hardware: BTreeSet::new(),
         needs: "restart".into(),
         hard_stop_codes: BTreeSet::new(),
