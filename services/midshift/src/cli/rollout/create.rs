@@ -68,7 +68,7 @@ pub struct Create {
     /// Who goes back at an abort. Without it all.
     #[arg(long, value_enum)]
     abort_scope: Option<AbortScope>,
-    /// A large first wave, or a single one, is meant so.
+    /// A large first wave, or a single one, is meant so. Where people sign in that needs the role ota-full-push too.
     #[arg(long)]
     allow_full_push: bool,
     /// Bytes a second that each robot may download, e.g. 5MiB. Without it as fast as it goes.
