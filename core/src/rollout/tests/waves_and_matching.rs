@@ -104,6 +104,19 @@ fn the_floor_that_is_asked_for_is_signed_and_one_above_the_bundle_is_refused() {
 }
 
 #[test]
+fn a_label_of_a_person_goes_before_the_robots_own_in_selectors_and_waves() {
+    let mut rig = Rig::new(4);
+    rig.control(0, |c| drop(c.labels.insert("line".into(), "odd".into())));
+    rig.tick();
+    let odd = Wave::Label { key: "line".into(), value: "odd".into() };
+    assert_eq!(sizes(&rig, vec![odd, Wave::Rest]), [3, 1], "two say so of themselves");
+    let mut selected = RolloutSpec { waves: vec![Wave::Count(1), Wave::Rest], ..spec() };
+    selected.selector.labels.insert("line".into(), "odd".into());
+    let run = dry_run(&rig.ota, &rig.board, &rollout_id("ro"), &selected).expect("it may run");
+    assert!(run.matching.robots.iter().any(|m| m.robot_id == robot_id(0)), "{:?}", run.matching.robots);
+}
+
+#[test]
 fn who_is_left_out_is_told_with_the_reason() {
     let mut rig = Rig::new(6);
     rig.attach(0, |i| i.model = "m9".into());
