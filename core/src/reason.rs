@@ -312,6 +312,7 @@ codes! {
     FailureAmongFew = "FAILURE_AMONG_FEW", "A robot failed while fewer than ten were attempted.";
     TooManyFailed = "TOO_MANY_FAILED", "More robots failed than a good bundle lets fail.";
     RateTooHigh = "RATE_TOO_HIGH", "Robots with the bundle fail tasks at several times the rate of the others.";
+    EffortTooHigh = "EFFORT_TOO_HIGH", "Robots with the bundle need more time, energy or heat for their work than the others, beyond what the roll-out lets pass. A person must judge it.";
     PromotedByUser = "PROMOTED_BY_USER", "A person let it go on.";
     RetriedByUser = "RETRIED_BY_USER", "A person tries the robot again.";
     AbortedByUser = "ABORTED_BY_USER", "A person ended it.";

@@ -317,6 +317,7 @@ fn completed(rollout_id: &RolloutId, bundle: &BundleId, act: Act) -> Rollout {
         superseded_by: None,
         tasks: Default::default(),
         counted: Default::default(),
+        efforts: Default::default(),
         created: act.clone(),
         approved: Some(act.clone()),
         started: Some(act.at),
@@ -346,6 +347,7 @@ fn committed(rollout_id: &RolloutId, robot_id: RobotId, place: u64, at: Utc) -> 
         why: None,
         again: false,
         before: TaskTally::default(),
+        effort_before: Default::default(),
         moments: Default::default(),
         lost: None,
     }

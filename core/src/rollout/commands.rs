@@ -11,9 +11,9 @@ use super::rows::{
 };
 use super::spec::{RolloutSpec, Wave};
 use super::view::View;
-use super::{Board, Plan, Tx, assign, moves, objects, phases, robots, verdict};
+use super::{Board, Plan, Tx, assign, effort, moves, objects, phases, robots, verdict};
 use crate::audit::{self, Note};
-use crate::gates::FailureEvidence;
+use crate::gates::{Efforts, FailureEvidence};
 use crate::identity::{Actor, Caller};
 use crate::ids::{BundleId, RobotId, RolloutId};
 use crate::limits;
@@ -461,6 +461,7 @@ fn draft(tx: &Tx, rollout_id: &RolloutId, spec: Arc<RolloutSpec>, actor: &Actor)
         superseded_by: None,
         tasks: FailureEvidence::default(),
         counted: Arc::default(),
+        efforts: Efforts::default(),
         created: act(tx, actor, ""),
         approved: None,
         started: None,
@@ -517,7 +518,8 @@ fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bo
     let Ok((robots, sizes)) = members(view, board, &rollout) else { return };
     let others = overlapping(view, &rollout, robots.iter().map(|(id, ..)| id));
     let control = verdict::controls_of(view, &rollout);
-    let counted = Arc::new(Counted { at_ms: view.served_ms(&now), control, ..Counted::default() });
+    let effort = effort::of_controls(view, &rollout);
+    let counted = Arc::new(Counted { at_ms: view.served_ms(&now), control, effort, ..Counted::default() });
     if supersede {
         for other in &others {
             plan.decide(view, now, actor, |tx| {

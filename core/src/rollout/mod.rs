@@ -3,7 +3,7 @@
 //! [`cycle`] takes what happened and gives items to commit; the service around it only reads, signs, commits and publishes.
 //! Rooms: `spec` is what is asked for, `rows` and `view` are what is known; `hear` and `commands` are what happens; `matching` says who and `dry_run` what it would come to, `robots`
 //! says what is due for each (`turns`: whose turn it is) and `moves` writes it, `phases` the whole, `newcomers` who comes later (`served`: what they get; `assign`: how
-//! anybody comes in), `named` which bundles are still needed, `past` what the picture holds of what has ended; `verdict` and `infrastructure` judge; `explain` says
+//! anybody comes in), `named` which bundles are still needed, `past` what the picture holds of what has ended; `verdict` and `infrastructure` judge, with what `effort` saw; `explain` says
 //! what a robot waits for. Rooms name each other in one direction only.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
@@ -11,6 +11,7 @@ pub mod assign;
 pub mod bugs;
 pub mod commands;
 pub mod dry_run;
+pub mod effort;
 pub mod explain;
 pub mod hear;
 pub mod infrastructure;

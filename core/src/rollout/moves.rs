@@ -10,7 +10,7 @@ use super::rows::{Act, Given, Lost, Rollout, RolloutRobot, Step, WayBack};
 use super::stamp::Stamp;
 use super::turns::is_retried;
 use super::view::View;
-use super::{Board, Order, Sign, Tx, newcomers, verdict};
+use super::{Board, Order, Sign, Tx, effort, newcomers, verdict};
 use crate::ids::{DrainId, RobotId, RolloutId};
 use crate::limits;
 use crate::maintenance::{DrainRelease, DrainRequest, ReleasedBy};
@@ -84,6 +84,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             r.moments.switched_link.get_or_insert(stamp(tx));
             r.moments.on_trial = Some(tx.now.utc);
             r.before = verdict::work_of(tx.view, &rollout, &r.robot_id);
+            r.effort_before = effort::of_robot(tx.view, &rollout, &r.robot_id);
             if is_open_to(&rollout, &r) {
                 r.failure = r.failure.filter(|f| f.code != Code::RobotLost);
             }

@@ -4,7 +4,7 @@
 use super::spec::RolloutSpec;
 use super::stamp::Stamp;
 use crate::authority::Authority;
-use crate::gates::{FailureEvidence, OutcomeEvidence, Suspicion, TaskTally};
+use crate::gates::{Effort, Efforts, FailureEvidence, OutcomeEvidence, Suspicion, TaskTally};
 use crate::ids::{AreaId, BundleId, DrainId, RobotId, RolloutId};
 use crate::reason::Reason;
 use crate::rows::{Index, Record, Seq, Table};
@@ -251,6 +251,9 @@ pub struct Verdict {
     pub tasks: FailureEvidence,
     /// What follows from the tasks; it ends a roll-out only if its spec or the rules of an area say so.
     pub suspicion: Suspicion,
+    /// What work cost them, beside that of the others.
+    #[serde(default)]
+    pub efforts: Efforts,
     /// UTC, site clock.
     pub at: Utc,
     /// Who, if it was a person.
@@ -286,6 +289,9 @@ pub struct Counted {
     pub trial: BTreeMap<RobotId, TaskTally>,
     /// All that had ended with any other version by then, since ever.
     pub control: TaskTally,
+    /// What work had cost robots with any other version when the roll-out began, since ever.
+    #[serde(default)]
+    pub effort: Effort,
 }
 
 /// One roll-out.
@@ -332,6 +338,9 @@ pub struct Rollout {
     pub tasks: FailureEvidence,
     /// Up to where tasks were counted for that.
     pub counted: Arc<Counted>,
+    /// What work cost its robots and the others when tasks were counted last.
+    #[serde(default)]
+    pub efforts: Efforts,
     /// Who wrote it down.
     pub created: Act,
     /// Who stands for it.
@@ -519,6 +528,9 @@ pub struct RolloutRobot {
     pub again: bool,
     /// Tasks it had ended with this version when its trial began.
     pub before: TaskTally,
+    /// What work had cost it with this version by then.
+    #[serde(default)]
+    pub effort_before: Effort,
     /// When what happened.
     pub moments: Moments,
     /// It is lost. None: it is heard, or has not been silent for long.

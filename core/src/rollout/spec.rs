@@ -2,6 +2,7 @@
 //!
 //! Invariant: a checked spec never changes; what a roll-out does afterwards is in its row.
 
+use crate::gates::EffortLimits;
 use crate::ids::{AreaId, BundleId, RobotId};
 use crate::reason::Violations;
 use serde::{Deserialize, Serialize};
@@ -25,6 +26,9 @@ const LOST_AFTER_MS: RangeInclusive<u64> = 60_000..=30 * 24 * 3_600_000;
 const fn lost_after_ms() -> u64 {
     900_000
 }
+
+/// A limit of effort above this is none.
+const EFFORT_MAX: u32 = 10_000;
 
 /// Whom a roll-out is for. Everything that is named must hold; what is empty holds for all.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -138,6 +142,9 @@ pub struct RolloutSpec {
     /// No component of the bundle may have a lower `rollback_index`: each robot holds it against what it is given. Whoever goes back does not.
     #[serde(default)]
     pub rollback_floor: u64,
+    /// What its robots' work may cost more than that of the others.
+    #[serde(default)]
+    pub effort: EffortLimits,
 }
 
 impl RolloutSpec {
@@ -162,6 +169,7 @@ impl RolloutSpec {
             lost_after_ms: lost_after_ms(),
             writes_off_lost: false,
             rollback_floor: 0,
+            effort: EffortLimits::default(),
         }
     }
 
@@ -196,6 +204,16 @@ impl RolloutSpec {
         within("lost_after_ms", self.lost_after_ms, &LOST_AFTER_MS);
         if self.exposure_tasks > 10_000 {
             bad.add("exposure_tasks", "must be at most 10000");
+        }
+        let effort = [
+            ("slower_permille", self.effort.slower_permille),
+            ("energy_permille", self.effort.energy_permille),
+            ("hotter_decidegrees", self.effort.hotter_decidegrees),
+        ];
+        for (field, limit) in effort {
+            if limit.is_some_and(|limit| limit > EFFORT_MAX) {
+                bad.add(format!("effort.{field}"), format!("must be at most {EFFORT_MAX}"));
+            }
         }
         if self.max_in_flight == Some(0) {
             bad.add("max_in_flight", "must be at least 1");
@@ -247,6 +265,7 @@ mod tests {
             max_in_flight: Some(0),
             exposure_tasks: 10_001,
             lost_after_ms: 59_999,
+            effort: EffortLimits { energy_permille: Some(10_001), ..EffortLimits::default() },
             ..spec()
         };
         let expected = [
@@ -258,6 +277,7 @@ mod tests {
             "probation_ms",
             "lost_after_ms",
             "exposure_tasks",
+            "effort.energy_permille",
             "max_in_flight",
         ];
         assert_eq!(fields(&bad), expected);

@@ -145,6 +145,8 @@ struct Rig {
     robots: Vec<Robot>,
     /// Robots on trial end a task each second.
     works: bool,
+    /// What a task costs a robot with a new version, milliwatt-hours. With the old one it is 10.
+    trial_energy_mwh: u64,
     /// Fleet does nothing.
     fleet_sleeps: bool,
     /// The service has no key that robots know.
@@ -170,6 +172,7 @@ impl Rig {
             heard: BTreeSet::new(),
             robots: Vec::new(),
             works: true,
+            trial_energy_mwh: 10,
             fleet_sleeps: false,
             keyless: false,
             checks_rebuild: true,

@@ -1,5 +1,6 @@
 //! What callers ask for, as core's types. Every broken rule of a request is told at once.
 
+use midshift_core::gates::EffortLimits;
 use midshift_core::ids::{AreaId, BundleId, RobotId};
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::rollout::spec::{RolloutSpec, Selector, Wave};
@@ -64,7 +65,16 @@ pub fn spec(wire: &v1::RolloutSpec, bundle: BundleId, probation_ms: u64, bad: &m
         lost_after_ms,
         writes_off_lost: wire.writes_off_lost,
         rollback_floor: wire.rollback_floor,
+        effort: wire.effort.map(effort).unwrap_or_default(),
         bundle: default.bundle,
+    }
+}
+
+fn effort(wire: v1::EffortLimits) -> EffortLimits {
+    EffortLimits {
+        slower_permille: wire.slower_permille,
+        energy_permille: wire.energy_permille,
+        hotter_decidegrees: wire.hotter_decidegrees,
     }
 }
 

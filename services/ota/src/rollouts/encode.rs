@@ -1,6 +1,6 @@
 //! Rows as their messages. Nothing is decided here.
 
-use midshift_core::gates::{Suspicion, TaskTally};
+use midshift_core::gates::{Effort, EffortLimits, Suspicion, TaskTally};
 use midshift_core::rollout::Board;
 use midshift_core::rollout::dry_run::DryRun;
 use midshift_core::rollout::explain::blocked;
@@ -73,6 +73,11 @@ fn spec(spec: &RolloutSpec) -> v1::RolloutSpec {
         lost_after: Some(duration(spec.lost_after_ms)),
         writes_off_lost: spec.writes_off_lost,
         rollback_floor: spec.rollback_floor,
+        effort: (spec.effort != EffortLimits::default()).then_some(v1::EffortLimits {
+            slower_permille: spec.effort.slower_permille,
+            energy_permille: spec.effort.energy_permille,
+            hotter_decidegrees: spec.effort.hotter_decidegrees,
+        }),
     }
 }
 
@@ -96,6 +101,18 @@ fn verdict_of(verdict: &Verdict) -> v1::RolloutVerdict {
         suspicion: suspicion(&verdict.suspicion) as i32,
         time: Some(timestamp(verdict.at)),
         actor: verdict.actor.clone().unwrap_or_default(),
+        trial_effort: Some(effort(&verdict.efforts.trial)),
+        control_effort: Some(effort(&verdict.efforts.control)),
+    }
+}
+
+fn effort(effort: &Effort) -> v1::Effort {
+    v1::Effort {
+        tasks: effort.tasks,
+        duration: Some(duration(effort.duration_ms)),
+        path_mm: effort.path_mm,
+        energy_mwh: effort.energy_mwh,
+        hottest_joint_decidegrees: effort.hottest_joint_decidegrees,
     }
 }
 
@@ -199,6 +216,8 @@ pub fn counted(view: &View, now: &Now, row: &Rollout, counts: Counts) -> v1::Rol
             Some(ActsOnRates::Areas(areas)) => areas.iter().map(ToString::to_string).collect(),
             _ => Vec::new(),
         },
+        trial_effort: Some(effort(&row.efforts.trial)),
+        control_effort: Some(effort(&row.efforts.control)),
     }
 }
 

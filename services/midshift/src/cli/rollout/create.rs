@@ -86,6 +86,15 @@ pub struct Create {
     /// No component may have a lower rollback index than this: robots refuse it. Without it 0; each robot holds its own floor beside it.
     #[arg(long, default_value_t = 0)]
     rollback_floor: u64,
+    /// A person judges a wave whose robots take so many percent longer for a task than the others. Without it that is only shown.
+    #[arg(long, value_name = "PERCENT")]
+    max_slower: Option<u32>,
+    /// A person judges a wave whose robots need so many percent more energy for a kilometre than the others. Without it that is only shown.
+    #[arg(long, value_name = "PERCENT")]
+    max_energy: Option<u32>,
+    /// A person judges a wave whose joints get so many degrees hotter than those of the others ever were. Without it that is only shown.
+    #[arg(long, value_name = "DEGREES")]
+    max_hotter: Option<u32>,
     /// Only tell what it would do now: whom it reaches, who is left out and why. Nothing is written.
     #[arg(long, conflicts_with_all = ["start", "supersede"])]
     dry_run: bool,
@@ -163,7 +172,19 @@ impl Create {
             lost_after: site(self.lost_after),
             writes_off_lost: self.write_off_lost,
             rollback_floor: self.rollback_floor,
+            effort: self.effort(),
         }
+    }
+
+    /// Limits of what work may cost more, if there are any.
+    fn effort(&self) -> Option<v1::EffortLimits> {
+        let tenths = |limit: Option<u32>| limit.map(|limit| limit.saturating_mul(10));
+        let limits = v1::EffortLimits {
+            slower_permille: tenths(self.max_slower),
+            energy_permille: tenths(self.max_energy),
+            hotter_decidegrees: tenths(self.max_hotter),
+        };
+        (limits != v1::EffortLimits::default()).then_some(limits)
     }
 
     /// A refusal, with what to try where the bundle was only guessed.

@@ -66,6 +66,7 @@ fn soaking(bundle: BundleId) -> Rollout {
         superseded_by: None,
         tasks: FailureEvidence::default(),
         counted: Arc::default(),
+        efforts: Default::default(),
         created: Act { person: None, actor: "ana".into(), reason: String::new(), at: Utc(0) },
         approved: None,
         started: Some(Utc(0)),
@@ -95,6 +96,7 @@ fn on_trial() -> RolloutRobot {
         why: None,
         again: false,
         before: TaskTally::default(),
+        effort_before: Default::default(),
         moments: Moments { on_trial: Some(Utc(0)), ..Moments::default() },
         lost: None,
     }
