@@ -2,10 +2,9 @@
 //!
 //! Called by `mod` before drains go on. Invariant: a drain that may wait begins only in an item that also writes its area's row, so two planners
 //! cannot both spend the last place; a robot that is out for several reasons counts once, and one that was written off does not until it is
-//! heard. Robots that charge or have no work are asked
-//! first. Drains of people and urgent ones count and do not wait. Whoever changes to something new waits for the area's window too. The item in
-//! which a drain begins relies on the request and on the area's rules: whoever takes the one back or freezes the other is not passed unseen.
-//! Whoever goes back from what was aborted waits for drains alone, and for those only that end by themselves: a robot that only a person brings
+//! heard. Robots that charge or have no work are asked first. Drains of people and urgent ones count and do not wait. Whoever changes to
+//! something new waits for the area's window too. The item in which a drain begins relies on the request and on the area's rules: whoever takes
+//! the one back or freezes the other is not passed unseen. Whoever goes back from what was aborted waits for drains alone, and for those only that end by themselves: a robot that only a person brings
 //! back to work would otherwise keep it on bad software for as long. What an area's rules keep in work by capability holds for it too.
 
 use super::rows::{AreaBudget, Drain, DrainState, RobotHolder};

@@ -65,7 +65,8 @@ pub fn meets_floor(bundle: &Bundle, spec: &RolloutSpec) -> Result<(), Refusal> {
 /// What a roll-out would do, or everything that speaks against it.
 ///
 /// # Errors
-/// A bundle that is not there; rules that are broken; a floor above the bundle; nobody matched; a first wave that is too large; a budget that lets nobody out.
+/// A bundle that is not there; rules that are broken; a floor above the bundle; nobody matched; a first wave that is too large; a budget that
+/// lets nobody out.
 pub fn dry_run(view: &View, board: &Board, id: &RolloutId, spec: &RolloutSpec) -> Result<DryRun, Refusal> {
     let mut bad = Violations::default();
     spec.check(&mut bad);

@@ -59,7 +59,7 @@ fn a_lost_robot_is_named_and_told_of_and_counts_for_nobody_once_a_person_says_so
     rig.must("ro", of(first));
     assert!(rig.verb("ro", of(first)).expect("allowed"), "it was done before");
     assert_eq!(rig.rollout("ro").in_flight, 11);
-    rig.until(120, |r| r.count(Step::Trial) == 11);
+    rig.until(200, |r| r.count(Step::Trial) == 11);
     assert!(rig.of("ro", first).drain_id.is_some(), "it may still be about to change");
     rig.robots[first].is_off = false;
     rig.ticks(2);
@@ -73,7 +73,7 @@ fn the_policy_of_a_roll_out_may_write_lost_robots_off_and_a_person_is_told_all_t
     let lost = rig.of("ro", first).lost.expect("lost");
     assert_eq!(lost.written_off.map(|act| act.actor), Some("ota".to_owned()));
     assert_eq!((told(&rig), rig.rollout("ro").in_flight), (1, 11));
-    rig.until(120, |r| r.count(Step::Trial) == 11);
+    rig.until(200, |r| r.count(Step::Trial) == 11);
 }
 
 #[test]
